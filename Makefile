@@ -1,0 +1,39 @@
+# Two commands set everything up on a fresh Debian machine: `make demo` and `make test`.
+PYTHON ?= python3.11
+VENV   := .venv
+BIN    := $(VENV)/bin
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+
+.PHONY: help setup demo test check lint bench clean
+
+help:  ## show this list
+	@awk -F':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(VENV)/.ready: pyproject.toml constraints.txt deploy/setup.sh
+	@PYTHON=$(PYTHON) sh deploy/setup.sh $(VENV)
+	@touch $@
+
+setup: $(VENV)/.ready  ## create the virtual environment from the pinned constraints
+
+demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--lockstep", ARGS="--bus vcan", ...
+	@$(BIN)/timberhand demo $(ARGS)
+
+test: lint  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
+	@sh deploy/debian_packages.sh
+	@$(BIN)/pytest $(ARGS)
+
+check: lint  ## lint, types, architecture and the fast tests
+	@$(BIN)/pytest -q -m "not slow" $(ARGS)
+
+lint: setup  ## style, types and the three floors
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports --no-cache
+
+bench: setup  ## measure: codecs beside cantools
+	@$(BIN)/timberhand bench codec $(ARGS)
+
+clean:  ## remove the virtual environment and everything generated
+	rm -rf $(VENV) build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

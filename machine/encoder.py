@@ -1,0 +1,26 @@
+"""Encoder counts to joint position and back (CiA 406 objects 6001h, 6002h, 6004h).
+
+Input is the profile's ``Encoder`` and the position object as sent (u32 rotary, i32 linear); output is rad or
+m.  A rotary encoder counts modulo ``total_counts`` (6002h), so its position lies within half a range about
+``zero_counts`` whatever the raw value.  Pure and total: every integer has a position, plausibility is the
+caller's matter.
+"""
+
+from __future__ import annotations
+
+from machine.profile import Encoder
+
+
+def position_from_counts(encoder: Encoder, counts: int) -> float:
+    """Joint position in rad (m when linear) for a raw position value."""
+    delta = counts - encoder.zero_counts
+    if encoder.kind == "rotary":
+        half = encoder.total_counts // 2
+        delta = (delta + half) % encoder.total_counts - half
+    return encoder.direction * delta * encoder.unit_per_count
+
+
+def counts_from_position(encoder: Encoder, position: float) -> int:
+    """The raw value nearest to a joint position: 0..total_counts-1 when rotary, signed when linear."""
+    counts = encoder.zero_counts + round(encoder.direction * position / encoder.unit_per_count)
+    return counts % encoder.total_counts if encoder.kind == "rotary" else counts

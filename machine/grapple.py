@@ -1,0 +1,83 @@
+"""Geometry of the hanging grapple: yaw, rotator and tongs.
+
+Angles in the base frame, rad, counter-clockwise seen from above.  The grapple hangs straight down; its
+carrier frame is the base frame turned by ``slew + rot`` about z, and the tongs open along the carrier's x
+axis (pivots at x = -0.275 and +0.275 m on ``palms_471``).  So at slew 0 and rot 0 the tips part along base x,
+across the reach direction +y, and a log held then lies along y.  The **grapple yaw** is the direction of that
+opening axis; a log whose axis points to ``psi`` is gripped with yaw ``psi + pi/2``.  Log and grapple are
+symmetric, so a yaw counts modulo pi.  Tong angle 0 is fully open, the last value of the profile's table is
+closed without a load.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from math import ceil, degrees, floor, pi
+
+from machine.joints import Joint
+from machine.kinematics import Unreachable
+from machine.profile import Kinematics, Profile, TongTable, joint
+
+
+def grapple_yaw(q: Sequence[float]) -> float:
+    """Direction of the opening axis, rad, not wrapped; ``q`` is indexed by ``Joint``."""
+    return q[Joint.SLEW] + q[Joint.ROT]
+
+
+def rotator_for_yaw(profile: Profile, slew: float, yaw: float, near: float = 0.0) -> float:
+    """Rotator angle within its limits that gives ``yaw`` modulo pi at this slew, the one nearest to ``near``.
+
+    Raises ``Unreachable`` when the rotator turns less than pi and none fits.
+    """
+    spec = joint(profile, Joint.ROT)
+    first, last = ceil((spec.lower - (yaw - slew)) / pi), floor((spec.upper - (yaw - slew)) / pi)
+    fitting = [yaw - slew + k * pi for k in range(first, last + 1)]
+    if not fitting:
+        raise Unreachable(
+            f"grapple yaw {degrees(yaw):.1f} deg at slew {degrees(slew):.1f} deg is out of reach: "
+            f"the rotator turns only {degrees(spec.lower):.1f}..{degrees(spec.upper):.1f} deg"
+        )
+    return min(fitting, key=lambda angle: abs(angle - near))
+
+
+def pin_to_tong_pivot_m(kin: Kinematics) -> float:
+    """Height of the hanger pin above the tong pivots of the hanging grapple, m."""
+    return kin.hanger_to_fork_m + kin.fork_to_rotator_m + kin.rotator_to_tong_pivot_m
+
+
+def tip_below_pin_m(tongs: TongTable, tong_rad: float) -> float:
+    """Depth of the tong tips below the hanger pin, m; linear between table rows, held beyond them."""
+    return _interpolate(tongs.angle_rad, tongs.tip_below_pin_m, tong_rad)
+
+
+def half_gap_m(tongs: TongTable, tong_rad: float) -> float:
+    """Half the distance between the tips, m; negative when the tongs interleave."""
+    return _interpolate(tongs.angle_rad, tongs.half_gap_m, tong_rad)
+
+
+def lowest_tip_below_pin_m(tongs: TongTable) -> float:
+    """The greatest depth the tips sweep through while closing, m: the clearance a closing grapple needs."""
+    return max(tongs.tip_below_pin_m)
+
+
+def tong_angle_from_opening_pct(tongs: TongTable, opening_pct: float) -> float:
+    """Tong angle, rad, for the opening reported on the bus (100 = fully open, 0 = closed); out of range is
+    clipped.
+    """
+    return (1.0 - min(max(opening_pct, 0.0), 100.0) / 100.0) * tongs.angle_rad[-1]
+
+
+def opening_pct_from_tong_angle(tongs: TongTable, tong_rad: float) -> float:
+    """The inverse of ``tong_angle_from_opening_pct``."""
+    return 100.0 * (1.0 - min(max(tong_rad / tongs.angle_rad[-1], 0.0), 1.0))
+
+
+def _interpolate(xs: Sequence[float], ys: Sequence[float], x: float) -> float:
+    i = bisect_right(xs, x)
+    if i == 0:
+        return ys[0]
+    if i == len(xs):
+        return ys[-1]
+    share = (x - xs[i - 1]) / (xs[i] - xs[i - 1])
+    return ys[i - 1] + share * (ys[i] - ys[i - 1])

@@ -1,0 +1,297 @@
+"""Kinematics to the hanger pin against the raw joint table, its own derivative and its own inverse."""
+
+from __future__ import annotations
+
+import ast
+from itertools import pairwise
+from math import cos, hypot, pi, radians, sin
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+import machine.kinematics as kinematics
+from machine.joints import Joint
+from machine.kinematics import (
+    MARGIN,
+    MIN_BEND_RAD,
+    Unreachable,
+    chain_points,
+    inverse,
+    jacobian,
+    max_reach_m,
+    pin_position,
+    reachable_extensions,
+    solve,
+)
+from machine.load import load_profile
+from machine.profile import joint_limits
+
+PALMS = load_profile("palms_471")
+KIN = PALMS.kinematics
+LIMITS = joint_limits(PALMS)
+# Joint table of the public crane model: origin in the parent frame, joint axis, prismatic or not.
+TABLE = (
+    ((0.0, 0.0, 0.26881), (0.0, 0.0, 1.0), False),
+    ((0.0, -0.0601374, 1.09553), (1.0, 0.0, 0.0), False),
+    ((0.0, 3.04904, -0.00649), (1.0, 0.0, 0.0), False),
+    ((0.0, 0.1256771629, 0.21905106705), (0.0, 0.997833966, -0.065782793), True),
+)
+PIN_IN_TELESCOPE = (0.0, 2.03711, -0.20229)
+
+
+def rotation(axis: tuple[float, ...], angle: float) -> np.ndarray:
+    a = np.array(axis) / np.linalg.norm(axis)
+    k = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+    return np.eye(3) + sin(angle) * k + (1 - cos(angle)) * k @ k
+
+
+def table_frames(q) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(origin, rotation) of each link of the raw table, base frame."""
+    p, r, frames = np.zeros(3), np.eye(3), []
+    for (origin, axis, prismatic), value in zip(TABLE, q, strict=False):
+        p = p + r @ np.array(origin)
+        if prismatic:
+            p = p + r @ (np.array(axis) / np.linalg.norm(axis) * value)
+        else:
+            r = r @ rotation(axis, value)
+        frames.append((p, r))
+    return frames
+
+
+def table_pin(q) -> np.ndarray:
+    p, r = table_frames(q)[-1]
+    return p + r @ np.array(PIN_IN_TELESCOPE)
+
+
+def joint_values(margin: float = 0.0):
+    return st.tuples(*(st.floats(low + margin, high - margin) for low, high in LIMITS))
+
+
+def radius(q) -> float:
+    """Signed distance of the pin from the slew axis along the reach direction."""
+    x, y, _ = pin_position(KIN, q)
+    theta = q[0] + pi / 2
+    return x * cos(theta) + y * sin(theta)
+
+
+def elbow_is_up(q) -> bool:
+    """Boom pin - stick pin - hanger pin turns downward."""
+    _, b, s, _, p, *_ = chain_points(KIN, (0.0, *q[1:]))
+    return (s[1] - b[1]) * (p[2] - s[2]) - (s[2] - b[2]) * (p[1] - s[1]) < 0.0
+
+
+@given(joint_values())
+@settings(max_examples=300)
+def test_pin_agrees_with_the_raw_joint_table(q):
+    assert np.abs(np.array(pin_position(KIN, q)) - table_pin(q)).max() < 4e-10
+
+
+def test_signs_slew_zero_reaches_y_and_boom_and_stick_are_positive_upward():
+    level = (0.0, 0.0, -0.5, 1.0)
+    x, y, z = pin_position(KIN, level)
+    assert x == pytest.approx(0.0, abs=1e-12) and y > 4.0
+    assert pin_position(KIN, (0.1, *level[1:]))[0] < -0.3  # slew turns left seen from above
+    assert pin_position(KIN, (0.0, 0.1, -0.5, 1.0))[2] > z + 0.3
+    assert pin_position(KIN, (0.0, 0.0, -0.4, 1.0))[2] > z + 0.2
+    assert hypot(*pin_position(KIN, (0.0, 0.0, -0.5, 1.1))[:2]) > y
+
+
+def test_maximum_reach_is_6_949_m():
+    assert max_reach_m(PALMS) == pytest.approx(6.949, abs=5e-4)
+    rng = np.random.default_rng(2)
+    low, high = np.array(LIMITS).T
+    reach = max(hypot(*pin_position(KIN, q)[:2]) for q in rng.uniform(low, high, (20000, 5)).tolist())
+    assert 6.7 < reach <= max_reach_m(PALMS)
+
+
+@given(joint_values())
+def test_points_for_drawing_are_the_joints_of_the_table(q):
+    points = chain_points(KIN, q)
+    frames = table_frames(q)
+    assert points.base == (0.0, 0.0, 0.0)
+    for point, wanted in (
+        (points.boom_pin, frames[1][0]),
+        (points.stick_pin, frames[2][0]),
+        (points.telescope_front, table_pin((*q[:3], 0.0))),
+        (points.hanger_pin, table_pin(q)),
+    ):
+        assert np.abs(np.array(point) - wanted).max() < 4e-10
+    pin, rotator, grapple = points[-3:]
+    assert pin[:2] == rotator[:2] == grapple[:2]
+    assert pin[2] - rotator[2] == pytest.approx(0.415) and pin[2] - grapple[2] == pytest.approx(0.617)
+
+
+@given(joint_values(0.001))
+def test_jacobian_is_the_derivative_of_the_pin(q):
+    analytic = np.array(jacobian(KIN, q))
+    step = 1e-6
+    for i in range(4):
+        ahead, behind = list(q), list(q)
+        ahead[i] += step
+        behind[i] -= step
+        numeric = (np.array(pin_position(KIN, ahead)) - np.array(pin_position(KIN, behind))) / (2 * step)
+        assert np.abs(analytic[:, i] - numeric).max() < 1e-8
+
+
+@given(joint_values())
+@settings(max_examples=500)
+def test_inverse_round_trip_over_reachable_poses(q):
+    assume(radius(q) > 1e-3 and elbow_is_up(q))
+    x, y, z = pin_position(KIN, q)
+    found = inverse(KIN, LIMITS, x, y, z, q[3])
+    assert pin_position(KIN, (*found, q[3])) == pytest.approx((x, y, z), abs=1e-9)
+    if q[2] < -0.05:  # the straight arm is singular: there the angles are only as good as the root of rounding
+        assert found == pytest.approx(q[:3], abs=1e-9)
+
+
+@given(joint_values(), st.sampled_from(["none", "near", "wish"]))
+@settings(max_examples=300)
+def test_solve_reaches_every_reachable_pin_within_limits(q, how):
+    assume(radius(q) > 1e-3 and elbow_is_up(q))
+    x, y, z = pin_position(KIN, q)
+    preference = {"none": None, "near": q, "wish": q[3]}[how]
+    found = solve(PALMS, x, y, z, preference)
+    assert pin_position(KIN, found) == pytest.approx((x, y, z), abs=1e-9)
+    for value, (low, high) in zip(found, LIMITS, strict=False):
+        assert low - 1e-8 <= value <= high + 1e-8
+
+
+@given(joint_values())
+@settings(max_examples=200)
+def test_reachable_extensions_are_exactly_those_the_inverse_accepts(q):
+    assume(radius(q) > 1e-3 and elbow_is_up(q))
+    x, y, z = pin_position(KIN, q)
+    intervals = reachable_extensions(PALMS, x, y, z)
+    assert any(low - 1e-6 <= q[3] <= high + 1e-6 for low, high in intervals)
+    assert all(before[1] < after[0] for before, after in pairwise(intervals))
+    for ext in np.linspace(*LIMITS[3], 60).tolist():
+        if any(abs(ext - edge) < 1e-6 for pair in intervals for edge in pair):
+            continue
+        inside = any(low < ext < high for low, high in intervals)
+        if inside:
+            inverse(KIN, LIMITS, x, y, z, ext)
+        else:
+            with pytest.raises(Unreachable):
+                inverse(KIN, LIMITS, x, y, z, ext)
+
+
+@given(st.floats(0.5, 6.5), st.floats(-1.0, 4.0), st.floats(-1.7, 1.7), joint_values())
+@settings(max_examples=200)
+def test_solve_with_a_pose_takes_the_least_travel_time(r, z, slew, present):
+    x, y = -r * sin(slew), r * cos(slew)
+    speeds = [PALMS.joints[name].speed_limit for name in ("lift", "tilt", "ext")]
+
+    def travel_s(q):
+        return max(abs(a - b) / v for a, b, v in zip(q[1:4], present[1:4], speeds, strict=True))
+
+    try:
+        best = travel_s(solve(PALMS, x, y, z, present))
+    except Unreachable:
+        assume(False)
+    for wish in np.linspace(*LIMITS[3], 40).tolist():
+        assert best <= travel_s(solve(PALMS, x, y, z, wish)) + 0.01
+
+
+def test_solve_takes_the_wished_extension_or_the_nearest_one():
+    assert solve(PALMS, 0.0, 4.5, 0.5, 0.9)[3] == pytest.approx(0.9)
+    far = solve(PALMS, 0.0, 6.3, 0.5, 0.2)
+    assert far[3] > 0.2
+    inner = [(low, high) for low, high in reachable_extensions(PALMS, 0.0, 6.3, 0.5)]
+    assert far[3] - inner[0][0] < 0.05  # no longer than the bend of the elbow asks
+
+
+def test_solve_without_preference_keeps_off_the_stops_and_the_straight_arm():
+    for x, y, z in ((0.0, 4.5, -0.5), (-1.8, 4.4, 0.5), (3.47, 0.96, 1.0)):
+        q = solve(PALMS, x, y, z)
+        for i in (Joint.LIFT, Joint.TILT, Joint.EXT):
+            low, high = LIMITS[i]
+            assert min(q[i] - low, high - q[i]) > MARGIN * (high - low)
+        assert q[Joint.TILT] < -MIN_BEND_RAD
+
+
+def test_points_that_only_a_stretched_arm_reaches_are_still_reached():
+    z = KIN.d1_m
+    assert solve(PALMS, 0.0, 6.94, z)[3] > 1.78
+    edge = max_reach_m(PALMS)
+    q = solve(PALMS, 0.0, edge, z)
+    assert q[3] == LIMITS[3][1] and pin_position(KIN, q)[1] == pytest.approx(edge, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("point", "why"),
+    [
+        ((0.0, 7.269103, 1.36434), "point (0.00, 7.27, 1.36) m is out of reach: too far by 0.32 m"),
+        ((0.0, -5.0, 1.0), "180.0 deg is outside its limits -100.0..100.0 deg"),
+        ((4.0, -1.5, 1.0), "slew -110.6 deg is outside its limits -100.0..100.0 deg"),
+        ((0.0, 1.0, 5.2), "the boom would be 34.7 deg above its upper stop"),
+        ((0.0, 4.9, -3.3), "the boom would be 5.4 deg below its lower stop"),
+        ((0.0, -0.0601374, 1.36434), "180.0 deg is outside its limits"),
+    ],
+)
+def test_unreachable_says_why(point, why):
+    with pytest.raises(Unreachable) as caught:
+        solve(PALMS, *point)
+    assert why in str(caught.value)
+    assert reachable_extensions(PALMS, *point) == ()
+    with pytest.raises(Unreachable):
+        inverse(KIN, LIMITS, *point, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("point", "ext", "why"),
+    [
+        ((0.0, 4.0, 0.5), 2.0, "extension 2.00 m is outside its limits 0.13..1.80 m"),
+        ((0.0, 6.0, 1.36434), 0.2, "too far by 0.65 m"),
+        ((0.0, 0.1, 1.2), 1.8, "too close to the boom pin by 0.68 m"),
+        ((0.0, 0.3, 2.3), 1.8, "the boom would be 145.7 deg above its upper stop"),
+        ((0.0, 0.45, 1.9), 0.13, "too close to the boom pin by 0.02 m"),
+        ((-4.0, -1.5, 1.0), 1.0, "slew 110.6 deg is outside its limits"),
+    ],
+)
+def test_inverse_says_why(point, ext, why):
+    with pytest.raises(Unreachable) as caught:
+        inverse(KIN, LIMITS, *point, ext)
+    assert why in str(caught.value)
+
+
+def test_a_stick_that_stops_early_is_named():
+    stiff = [*LIMITS]
+    stiff[Joint.TILT] = (-2.0, -0.5)
+    with pytest.raises(Unreachable, match=r"the stick would be \d+\.\d deg above its straight stop"):
+        inverse(KIN, stiff, 0.0, 6.8, 1.4, 1.8)
+    with pytest.raises(Unreachable, match=r"the stick would be \d+\.\d deg below its folded stop"):
+        inverse(KIN, stiff, 0.0, 2.0, 1.4, 1.0)
+
+
+def test_the_boom_pin_itself_cannot_be_reached_with_any_extension():
+    turned = msgspec.structs.replace(KIN, a1_m=0.5)
+    profile = msgspec.structs.replace(PALMS, kinematics=turned)
+    with pytest.raises(Unreachable, match=r"too close to the boom pin by 0\.00 m"):
+        solve(profile, 0.0, 0.5, KIN.d1_m)
+
+
+def test_slew_wraps_into_its_limits_from_either_side():
+    for slew in (-1.7, -0.4, 0.0, 1.7):
+        x, y, z = pin_position(KIN, (slew, 0.4, -1.2, 0.8))
+        assert inverse(KIN, LIMITS, x, y, z, 0.8)[0] == pytest.approx(slew, abs=1e-12)
+    assert radians(99.9) < LIMITS[0][1]
+
+
+def test_kinematics_uses_no_numpy():
+    tree = ast.parse(Path(kinematics.__file__).read_text())
+    names = {n.name for node in ast.walk(tree) if isinstance(node, ast.Import) for n in node.names}
+    modules = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    allowed = {
+        "__future__",
+        "collections.abc",
+        "itertools",
+        "math",
+        "typing",
+        "machine.joints",
+        "machine.profile",
+    }
+    assert not names and modules <= allowed

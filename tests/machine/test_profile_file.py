@@ -1,0 +1,291 @@
+"""Loading profiles: names, paths, content hash and the sentence for every mistake."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import msgspec
+import pytest
+
+import machine
+from machine.joints import JOINTS, Joint
+from machine.load import ProfileError, load_profile, profile_hash, shipped_profiles
+from machine.profile import Profile, joint, joint_limits
+
+SHIPPED = Path(machine.__file__).parent / "palms_471.toml"
+RAW = tomllib.loads(SHIPPED.read_text())
+DELETE = object()
+
+
+def toml(value) -> str:
+    """A TOML document of nested dicts; everything after the top-level scalars as inline tables."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{json.dumps(k)} = {toml(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return json.dumps(value) if isinstance(value, (str, bool)) else repr(value)
+
+
+def write(folder: Path, changes: dict[str, object]) -> Path:
+    """A copy of the shipped profile with some key paths changed."""
+    raw = copy.deepcopy(RAW)
+    for path, value in changes.items():
+        *parents, key = path.split(".")
+        table = raw
+        for parent in parents:
+            table = table[parent]
+        if value is DELETE:
+            del table[key]
+        else:
+            table[key] = value
+    file = folder / "mine.toml"
+    file.write_text("".join(f"{k} = {toml(v)}\n" for k, v in raw.items()))
+    return file
+
+
+def problems(folder: Path, changes: dict[str, object]) -> list[str]:
+    file = write(folder, changes)
+    with pytest.raises(ProfileError) as caught:
+        load_profile(file)
+    prefix = f"{file}: "
+    assert all(line.startswith(prefix) for line in caught.value.problems)
+    assert str(caught.value) == "\n".join(caught.value.problems)
+    return [line.removeprefix(prefix) for line in caught.value.problems]
+
+
+def test_shipped_profile_loads_by_name_and_by_path(tmp_path):
+    assert "palms_471" in shipped_profiles()
+    by_name = load_profile("palms_471")
+    assert by_name == load_profile(SHIPPED) == load_profile(str(SHIPPED))
+    assert by_name == load_profile(write(tmp_path, {}))
+    assert by_name.name == "palms_471" and by_name.machine_bus is None
+
+
+def test_access_by_enum():
+    profile = load_profile("palms_471")
+    assert [joint(profile, j) for j in JOINTS] == [profile.joints[n] for n in ("slew", "lift", "tilt", "ext", "rot")]
+    assert joint_limits(profile)[Joint.EXT] == (0.13, 1.80)
+
+
+def test_every_value_of_the_shipped_profile_carries_its_mark():
+    for line in SHIPPED.read_text().splitlines():
+        if " = " in line and not line.startswith("#"):
+            assert re.search(r"# .*\[(A|FPI|man|derived|mem|est|set)\]", line), line
+
+
+def test_hash_is_a_u32_of_the_content_only(tmp_path):
+    profile = load_profile("palms_471")
+    wanted = profile_hash(profile)
+    assert 0 <= wanted < 2**32
+    assert profile_hash(load_profile(write(tmp_path, {}))) == wanted  # no comments, another layout
+    turned = msgspec.structs.replace(profile, joints=dict(reversed(profile.joints.items())))
+    assert profile_hash(turned) == wanted
+    assert profile_hash(load_profile(write(tmp_path, {"joints.lift.law.kp_1_s": 3.001}))) != wanted
+    assert profile_hash(load_profile(write(tmp_path, {"joints.lift.law.kp_1_s": 3}))) == wanted  # 3 is 3.0
+
+
+def test_a_joint_without_encoder_and_a_second_bus_are_allowed(tmp_path):
+    profile = load_profile(write(tmp_path, {"joints.rot.encoder": DELETE, "machine_bus": "mach0"}))
+    assert profile.joints["rot"].encoder is None and profile.machine_bus == "mach0"
+
+
+# One row per mistake: what is changed, and the sentence that must come (exactly one).
+STRUCTURE = [
+    ({"joints.lift.lower_deg": -22.0, "joints.lift.lower": DELETE},
+     'joints.lift.lower_deg: wrong unit in the name; write "lower" in SI '
+     '(rad, or m for the telescope; per second)'),
+    ({"kinematics.d1_mm": 1364.34, "kinematics.d1_m": DELETE},
+     'kinematics.d1_mm: wrong unit in the name; write "d1_m"'),
+    ({"joints.slew.speed_limit_deg_s": 20.0},
+     'joints.slew.speed_limit_deg_s: wrong unit in the name; write "speed_limit" in SI '
+     '(rad, or m for the telescope; per second)'),
+    ({"joints.slew.valve.dedband_plus_pct": 3.0},
+     'joints.slew.valve.dedband_plus_pct: unknown key; did you mean "deadband_plus_pct"?'),
+    ({"timeouts.zzz": 1}, "timeouts.zzz: unknown key; allowed: lease_max_ms, boot_ms, stop_ramp_ms"),
+    ({"rate": 200}, 'rate: wrong unit in the name; write "rate_hz"'),
+    ({"joints.boom": RAW["joints"]["lift"]},
+     "joints.boom: unknown joint; the joints are slew, lift, tilt, ext, rot"),
+    ({"joints.slw": RAW["joints"]["slew"]}, 'joints.slw: unknown joint; did you mean "slew"?'),
+    ({"joints.ext": DELETE}, "joints.ext: missing joint"),
+    ({"joints.ext.law": DELETE}, "joints.ext.law: missing"),
+    ({"bunk": DELETE}, "bunk: missing"),
+    ({"bunk": 3}, "bunk: must be a table, found 3"),
+    ({"joints": 3}, "joints: must be a table of joints, found 3"),
+    ({"joints.lift.lower": "-22 deg"}, "joints.lift.lower: expected `float`, got `str`"),
+    ({"rate_hz": 200.5}, "rate_hz: expected `int`, got `float`"),
+    ({"bunk.center_m": [1.0]}, "bunk.center_m: expected `array` of length 2, got 1"),
+    ({"bunk.center_m": [1.0, "x"]}, "bunk.center_m[1]: expected `float`, got `str`"),
+    ({"schema": 2}, "schema: 2 is not allowed; use one of 1"),
+    ({"joints.slew.valve.sign": 0}, "joints.slew.valve.sign: 0 is not allowed; use one of -1, 1"),
+    ({"joints.slew.valve.sign": True}, "joints.slew.valve.sign: True is not allowed; use one of -1, 1"),
+    ({"joints.slew.encoder.kind": "round"},
+     "joints.slew.encoder.kind: 'round' is not allowed; use one of 'rotary', 'linear'"),
+    ({"joints.slew.encoder.direction": [1]},
+     "joints.slew.encoder.direction: [1] is not allowed; use one of -1, 1"),
+]  # fmt: skip
+
+VALUES = [
+    ({"joints.lift.upper": 75.0},
+     "joints.lift.upper: 75 rad is outside -6.28319..6.28319 rad; was it given in deg?"),
+    ({"joints.slew.speed_limit": 0.0}, "joints.slew.speed_limit: 0 rad/s is outside 0.005..3.5 rad/s"),
+    ({"joints.slew.speed_limit": -0.1}, "joints.slew.speed_limit: -0.1 rad/s is outside 0.005..3.5 rad/s"),
+    ({"joints.slew.acceleration_limit": 23.0},
+     "joints.slew.acceleration_limit: 23 rad/s^2 is outside 0.01..20 rad/s^2; was it given in deg/s^2?"),
+    ({"joints.slew.valve.full_speed_plus": 30.0},
+     "joints.slew.valve.full_speed_plus: 30 rad/s is outside 0.005..3.5 rad/s; was it given in deg/s?"),
+    ({"joints.slew.valve.full_speed_minus": 0.3},
+     "joints.slew.valve.full_speed_minus: 0.3 rad/s is less than speed_limit = 0.35; it cannot follow"),
+    ({"kinematics.a2_m": 3049.0}, "kinematics.a2_m: 3049 m is outside 0.3..15 m; was it given in mm?"),
+    ({"kinematics.theta2_offset_rad": float("nan")},
+     "kinematics.theta2_offset_rad: nan rad is outside -6.28319..6.28319 rad"),
+    ({"bunk.center_m": [3470.0, 0.96]},
+     "bunk.center_m[0]: 3470 m is outside -20..20 m; was it given in mm?"),
+    ({"bunk.length_m": -1.0}, "bunk.length_m: -1 m is outside 0.5..15 m"),
+    ({"grapple.hold_pressure_bar": 1.5e7},
+     "grapple.hold_pressure_bar: 1.5e+07 bar is outside 10..350 bar; was it given in Pa?"),
+    ({"grapple.close_time_s": 3500.0},
+     "grapple.close_time_s: 3500 s is outside 0.2..20 s; was it given in ms?"),
+    ({"joints.lift.lower": 1.309}, "joints.lift.lower: 1.309 rad is not below upper = 1.309 rad"),
+    ({"joints.ext.lower": 1.9}, "joints.ext.lower: 1.9 m is not below upper = 1.8 m"),
+    ({"joints.slew.law.kp_1_s": 8.0},
+     "joints.slew.law.kp_1_s: 8.0 1/s with delay_s = 0.08 oscillates (gain times delay 0.64); "
+     "at most 6.25 1/s"),
+    ({"joints.slew.law.kp_1_s": -1.0}, "joints.slew.law.kp_1_s: -1 1/s is outside 0.05..50 1/s"),
+    ({"joints.slew.law.stop_band": 0.17},
+     "joints.slew.law.stop_band: 0.17 rad is outside 1e-05..0.05 rad; was it given in deg?"),
+    ({"joints.slew.valve.deadband_plus_pct": 50.0},
+     "joints.slew.valve.deadband_plus_pct: 50.0 % is outside the range from 0 to below 50 %"),
+    ({"joints.slew.valve.deadband_minus_pct": -1.0},
+     "joints.slew.valve.deadband_minus_pct: -1.0 % is outside the range from 0 to below 50 %"),
+    ({"joints.slew.valve.signal": "Boom"},
+     'joints.slew.valve.signal: "Boom" is no valve command; use one of Slew, Lift, Tilt, Ext, Rot'),
+    ({"joints.lift.valve.signal": "Slew"},
+     "joints.lift.valve.signal: Slew is already used by joints.slew.valve.signal; each joint needs its own"),
+    ({"joints.tilt.encoder.node": 2},
+     "joints.tilt.encoder.node: 2 is already used by joints.slew.encoder.node; each joint needs its own"),
+    ({"joints.tilt.encoder.message": "EncSlew"},
+     "joints.tilt.encoder.message: EncSlew is already used by joints.slew.encoder.message; "
+     "each joint needs its own"),
+    ({"joints.slew.encoder.node": 128}, "joints.slew.encoder.node: 128 is outside 1..127"),
+    ({"joints.slew.encoder.message": "EncArm"},
+     'joints.slew.encoder.message: "EncArm" is no encoder message; '
+     'use one of EncSlew, EncLift, EncTilt, EncExt, EncRot'),
+    ({"joints.slew.encoder.device_type": 0x00010191},
+     "joints.slew.encoder.device_type: 0x00010191 is no CiA 406 encoder; "
+     "the low half of object 1000h must be 0x0196"),
+    ({"joints.slew.encoder.zero_counts": 16384},
+     "joints.slew.encoder.zero_counts: 16384 is outside 0..16383"),
+    ({"joints.slew.encoder.noise": 2.0},
+     "joints.slew.encoder.noise: 2 rad is outside 0..0.05 rad; was it given in deg?"),
+    ({"joints.slew.encoder.total_counts": 8200, "joints.slew.encoder.zero_counts": 4100},
+     "joints.slew.encoder.total_counts: 8200 counts of 0.000383495 rad wrap at +-1.572 rad, "
+     "inside the joint's limits -1.74533..1.74533 rad"),
+    ({"joints.ext.encoder.total_counts": 204800},
+     "joints.ext.encoder.total_counts: 204800 counts of 5e-06 m are shorter than "
+     "the joint's range 0.13..1.8 m"),
+    ({"joints.ext.kind": "revolute"}, 'joints.ext.kind: "revolute" cannot be; this joint is prismatic'),
+    ({"bunk.floor_z_m": -1.5},
+     "bunk.floor_z_m: -1.5 m is below the ground at -1.39 m; a bunk floor is at or above it"),
+    ({"timeouts.lease_max_ms": 5000}, "timeouts.lease_max_ms: 5000 ms is outside 20..500 ms"),
+    ({"rate_hz": 300}, "rate_hz: 300 Hz gives no whole microseconds; use for example 100, 200 or 250"),
+    ({"rate_hz": 0}, "rate_hz: 0 Hz is outside 50..1000 Hz"),
+    ({"crane_bus": "can 0"},
+     'crane_bus: "can 0" is not a plain name; use a to z, 0 to 9 and _, a letter first'),
+    ({"machine_bus": "crane0"},
+     'machine_bus: "crane0" is the crane bus; the two buses need different names'),
+    ({"grapple.tongs.half_gap_m": [0.7, 0.1]},
+     "grapple.tongs.half_gap_m: 2 values for 6 angles; one for each angle_rad"),
+    ({"grapple.tongs.angle_rad": [0.1, 0.30, 0.60, 1.00, 1.222, 2.234]},
+     "grapple.tongs.angle_rad: needs at least two angles, starting with 0.0 (fully open)"),
+    ({"grapple.tongs.angle_rad": [0.0, 0.60, 0.30, 1.00, 1.222, 2.234]},
+     "grapple.tongs.angle_rad: must rise from row to row"),
+    ({"grapple.tongs.half_gap_m": [0.733, 0.577, 0.6, 0.137, 0.001, -0.368]},
+     "grapple.tongs.half_gap_m: must fall from row to row (angle 0 is fully open)"),
+    ({"workspace.pick_center_m": [0.0, 8.0]},
+     "workspace.pick_center_m: 8.00 m from the slew axis; the crane reaches 6.95 m"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "sentence"), STRUCTURE, ids=lambda v: "")
+def test_wrong_keys_and_types(tmp_path, changes, sentence):
+    assert problems(tmp_path, changes) == [sentence]
+
+
+@pytest.mark.parametrize(("changes", "sentence"), VALUES, ids=lambda v: "")
+def test_wrong_values(tmp_path, changes, sentence):
+    assert problems(tmp_path, changes) == [sentence]
+
+
+def test_a_speed_in_degrees_is_named_and_so_is_what_the_valve_gives(tmp_path):
+    found = problems(tmp_path, {"joints.slew.speed_limit": 20.0})
+    assert found == [
+        "joints.slew.speed_limit: 20 rad/s is outside 0.005..3.5 rad/s; was it given in deg/s?",
+        "joints.slew.valve.full_speed_plus: 0.5 rad/s is less than speed_limit = 20.0; it cannot follow",
+        "joints.slew.valve.full_speed_minus: 0.5 rad/s is less than speed_limit = 20.0; it cannot follow",
+    ]
+
+
+def test_encoder_kind_must_match_message_and_joint(tmp_path):
+    found = problems(tmp_path, {"joints.ext.encoder.kind": "rotary"})
+    assert 'joints.ext.encoder.message: "EncExt" carries a linear position but kind is "rotary"' in found
+    assert 'joints.ext.encoder.kind: "rotary" on a prismatic joint; it needs a linear encoder' in found
+    found = problems(tmp_path, {"joints.slew.encoder.kind": "linear"})
+    assert 'joints.slew.encoder.kind: "linear" on a revolute joint; it needs a rotary encoder' in found
+
+
+def test_a_delay_in_ms_is_named_before_its_gain(tmp_path):
+    found = problems(tmp_path, {"joints.slew.valve.delay_s": 80.0})
+    assert "joints.slew.valve.delay_s: 80 s is outside 0..0.5 s; was it given in ms?" in found
+
+
+def test_all_problems_come_at_once(tmp_path):
+    found = problems(
+        tmp_path,
+        {"timeouts.lease_max_ms": 5000, "rate_hz": 300, "joints.lift.lower": 2.0, "name": "My crane"},
+    )
+    assert [line.split(":")[0] for line in found] == [
+        "timeouts.lease_max_ms", "name", "rate_hz", "joints.lift.lower",
+    ]  # fmt: skip
+
+
+def test_unknown_name_lists_the_shipped_profiles():
+    names = ", ".join(shipped_profiles())
+    with pytest.raises(ProfileError) as caught:
+        load_profile("palms_417")
+    assert str(caught.value) == (
+        'unknown profile "palms_417"; did you mean "palms_471"?; '
+        f"shipped profiles: {names}; or give the path of a .toml file"
+    )
+    with pytest.raises(ProfileError, match=r'^unknown profile "volvo"; shipped profiles: '):
+        load_profile("volvo")
+
+
+def test_unreadable_files_are_named(tmp_path):
+    gone = tmp_path / "gone.toml"
+    with pytest.raises(ProfileError) as caught:
+        load_profile(str(gone))
+    assert str(caught.value) == f"{gone}: the profile cannot be read: No such file or directory"
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"a = 1\n\xff\xfe")
+    with pytest.raises(ProfileError) as caught:
+        load_profile(binary)
+    assert str(caught.value) == f"{binary}: not UTF-8 text at byte 6; a profile is a TOML file"
+
+
+def test_broken_toml_names_the_line(tmp_path):
+    broken = tmp_path / "broken.toml"
+    broken.write_text('schema = 1\nname = "x"\nrate_hz = = 3\n')
+    with pytest.raises(ProfileError) as caught:
+        load_profile(broken)
+    assert str(caught.value) == f"{broken}: broken TOML: Invalid value (at line 3, column 11)"
+
+
+def test_profiles_are_frozen():
+    profile = load_profile("palms_471")
+    assert isinstance(profile, Profile)
+    with pytest.raises(AttributeError):
+        profile.rate_hz = 100  # type: ignore[misc]
