@@ -1,0 +1,318 @@
+"""CANopen on the fast path: NMT, heartbeat, emergency, encoder position and expedited SDO as pure functions.
+
+Frames go in and out as ``(key, data)`` with keys of ``can_dbc.frame``; time is ``now_ns``, monotonic.
+Nothing here waits: an SDO transfer is a request frame now and a response frame in a later tick.  A frame
+that is not of the kind asked for gives None, never an exception.  Sources: CiA 301 4.2 (sections 7.2.4,
+7.2.8), CiA 406.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+NMT_ID: Final = 0x000
+SYNC_ID: Final = 0x080
+EMCY_BASE: Final = 0x080
+SDO_TO_CLIENT: Final = 0x580
+SDO_TO_SERVER: Final = 0x600
+HEARTBEAT_BASE: Final = 0x700
+MAX_NODE: Final = 127
+
+Wire = tuple[int, bytes]
+
+
+class NmtCommand(IntEnum):
+    """NMT node control."""
+
+    START = 0x01
+    STOP = 0x02
+    ENTER_PRE_OPERATIONAL = 0x80
+    RESET_NODE = 0x81
+    RESET_COMMUNICATION = 0x82
+
+
+class NodeState(IntEnum):
+    """What a heartbeat says."""
+
+    BOOT_UP = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+
+
+def nmt_frame(command: NmtCommand, node: int = 0) -> Wire:
+    """The NMT command for a node, or for all nodes with 0."""
+    return NMT_ID, bytes((command, node))
+
+
+def sync_frame(counter: int) -> Wire:
+    """SYNC with its counter, 1 to 240; see ``next_sync``."""
+    return SYNC_ID, bytes((counter,))
+
+
+def next_sync(counter: int) -> int:
+    """The SYNC counter after ``counter``: 1 to 240, then 1 again (1019h = 240)."""
+    return counter % 240 + 1
+
+
+def heartbeat_frame(node: int, state: NodeState) -> Wire:
+    """The heartbeat of a node; BOOT_UP is the boot-up message."""
+    return HEARTBEAT_BASE + node, bytes((state,))
+
+
+def parse_heartbeat(key: int, data: bytes) -> tuple[int, int] | None:
+    """(node, state byte without the toggle bit) of a heartbeat frame."""
+    node = key - HEARTBEAT_BASE
+    return (node, data[0] & 0x7F) if 0 < node <= MAX_NODE and len(data) == 1 else None
+
+
+# -- emergency ---------------------------------------------------------------------------------------------
+
+
+class Emergency(NamedTuple):
+    """An emergency message: error code, error register 1001h and five bytes of the maker."""
+
+    node: int
+    code: int
+    register: int
+    manufacturer: bytes
+
+    @property
+    def text(self) -> str:
+        """The meaning of the code's class (CiA 301, table 26)."""
+        exact = EMERGENCY_CODES.get(self.code)
+        return exact or EMERGENCY_CLASSES.get(self.code >> 8) or EMERGENCY_CLASSES.get(self.code >> 8 & 0xF0, "unknown")
+
+
+EMERGENCY_CODES: Final = {
+    0x8110: "CAN overrun", 0x8120: "CAN error passive", 0x8130: "heartbeat or life guard error",
+    0x8140: "recovered from bus-off", 0x8150: "CAN-ID collision", 0x8210: "PDO length too short",
+    0x8220: "PDO too long", 0x8240: "unexpected SYNC length", 0x8250: "RPDO timeout",
+}  # fmt: skip
+EMERGENCY_CLASSES: Final = {
+    0x00: "no error, or error reset", 0x10: "generic error", 0x20: "current", 0x30: "voltage", 0x40: "temperature",
+    0x42: "device temperature", 0x50: "device hardware", 0x60: "device software", 0x70: "additional modules",
+    0x80: "monitoring", 0x81: "communication", 0x82: "protocol", 0x90: "external error",
+    0xF0: "additional functions", 0xFF: "device specific",
+}  # fmt: skip
+
+
+def parse_emergency(key: int, data: bytes) -> Emergency | None:
+    """The emergency message in a frame."""
+    node = key - EMCY_BASE
+    if not 0 < node <= MAX_NODE or len(data) != 8:
+        return None
+    return Emergency(node, data[0] | data[1] << 8, data[2], data[3:8])
+
+
+def emergency_frame(emergency: Emergency) -> Wire:
+    """The frame of an emergency message; the maker's bytes are filled up with zeros."""
+    data = struct.pack("<HB5s", emergency.code, emergency.register, emergency.manufacturer)
+    return EMCY_BASE + emergency.node, data
+
+
+# -- heartbeat monitor -------------------------------------------------------------------------------------
+
+
+class Presence(IntEnum):
+    """What the monitor knows of a node."""
+
+    WAITING = 0
+    ALIVE = 1
+    LOST = 2
+    NEVER_SEEN = 3
+
+
+class HeartbeatMonitor:
+    """Watches the heartbeats of the nodes that must be there.
+
+    A CANopen heartbeat consumer starts with the first heartbeat and so never reports a node that is dead at
+    boot. Here a node that has not spoken ``boot_timeout_ns`` after ``start_ns`` is NEVER_SEEN; one that
+    fell silent for its own timeout is LOST.  ``timeouts_ns`` maps a node to that timeout.  ``boots`` counts
+    boot-up messages, so that a restart between two ticks is seen although the heartbeats went on.
+    """
+
+    __slots__ = ("_boot_deadline_ns", "_seen_ns", "_timeouts_ns", "boots", "states")
+
+    def __init__(self, timeouts_ns: Mapping[int, int], boot_timeout_ns: int, start_ns: int) -> None:
+        self._timeouts_ns = dict(timeouts_ns)
+        self._boot_deadline_ns = start_ns + boot_timeout_ns
+        self._seen_ns: dict[int, int] = {}
+        self.states: dict[int, int] = {}
+        self.boots = dict.fromkeys(self._timeouts_ns, 0)
+
+    def receive(self, key: int, data: bytes, now_ns: int) -> bool:
+        """Takes a frame; False if it is no heartbeat of a watched node."""
+        parsed = parse_heartbeat(key, data)
+        if parsed is None or parsed[0] not in self._timeouts_ns:
+            return False
+        node, state = parsed
+        self._seen_ns[node] = now_ns
+        self.states[node] = state
+        if state == NodeState.BOOT_UP:
+            self.boots[node] += 1
+        return True
+
+    def presence(self, node: int, now_ns: int) -> Presence:
+        """The presence of a watched node at ``now_ns``."""
+        seen_ns = self._seen_ns.get(node)
+        if seen_ns is None:
+            return Presence.WAITING if now_ns < self._boot_deadline_ns else Presence.NEVER_SEEN
+        return Presence.ALIVE if now_ns - seen_ns <= self._timeouts_ns[node] else Presence.LOST
+
+    def operational(self, node: int, now_ns: int) -> bool:
+        """Whether a node is alive and says OPERATIONAL."""
+        return self.states.get(node) == NodeState.OPERATIONAL and self.presence(node, now_ns) is Presence.ALIVE
+
+    def missing(self, now_ns: int) -> tuple[int, ...]:
+        """Nodes that are LOST or NEVER_SEEN."""
+        return tuple(n for n in self._timeouts_ns if self.presence(n, now_ns) >= Presence.LOST)
+
+
+# -- encoder position --------------------------------------------------------------------------------------
+
+
+class PositionUnwrapper:
+    """Turns the position value 6004h, which wraps at the total range 6002h, into a running count [steps].
+
+    ``total_range`` 0 means 2**32.  Between two updates the shaft must move by less than half the range.
+    The first update gives the value itself; ``position`` is the last result.
+    """
+
+    __slots__ = ("_half", "_range", "_raw", "position")
+
+    def __init__(self, total_range: int) -> None:
+        self._range = total_range or 1 << 32
+        self._half = self._range // 2
+        self._raw: int | None = None
+        self.position = 0
+
+    def update(self, raw: int) -> int:
+        """The running count for a new position value."""
+        if self._raw is None:
+            self.position = raw
+        else:
+            self.position += (raw - self._raw + self._half) % self._range - self._half
+        self._raw = raw
+        return self.position
+
+
+# -- SDO -----------------------------------------------------------------------------------------------------
+
+
+class SdoKind(IntEnum):
+    """What an SDO frame is; SEGMENTED is a transfer of more than four bytes, which this path does not
+    carry."""
+
+    UPLOAD = 0
+    DOWNLOAD = 1
+    ABORT = 2
+    SEGMENTED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Sdo:
+    """A parsed SDO frame.  ``data`` holds the value, little-endian; ``abort`` the abort code, 0 without
+    one."""
+
+    kind: SdoKind
+    node: int
+    index: int
+    sub: int
+    data: bytes
+    abort: int
+
+    @property
+    def unsigned(self) -> int:
+        """The value as an unsigned number."""
+        return int.from_bytes(self.data, "little")
+
+    @property
+    def signed(self) -> int:
+        """The value as a signed number of the transferred width."""
+        return int.from_bytes(self.data, "little", signed=True)
+
+
+ABORT_TEXTS: Final = {
+    0x05030000: "toggle bit not alternated", 0x05040000: "SDO protocol timed out",
+    0x05040001: "command specifier not valid", 0x05040002: "invalid block size",
+    0x05040003: "invalid sequence number", 0x05040004: "CRC error", 0x05040005: "out of memory",
+    0x06010000: "unsupported access to an object", 0x06010001: "attempt to read a write only object",
+    0x06010002: "attempt to write a read only object", 0x06020000: "object does not exist",
+    0x06040041: "object cannot be mapped to the PDO", 0x06040042: "mapped objects exceed the PDO length",
+    0x06040043: "general parameter incompatibility", 0x06040047: "general internal incompatibility",
+    0x06060000: "hardware error", 0x06070010: "data type does not match, length wrong",
+    0x06070012: "data type does not match, too long", 0x06070013: "data type does not match, too short",
+    0x06090011: "sub-index does not exist", 0x06090030: "invalid value", 0x06090031: "value too high",
+    0x06090032: "value too low", 0x06090036: "maximum is less than minimum",
+    0x060A0023: "resource not available", 0x08000000: "general error",
+    0x08000020: "data cannot be transferred or stored", 0x08000021: "refused because of local control",
+    0x08000022: "refused because of the device state", 0x08000023: "object dictionary is not present",
+    0x08000024: "no data available",
+}  # fmt: skip
+
+
+def abort_text(code: int) -> str:
+    """An abort code in words (CiA 301, table 22)."""
+    return f"{ABORT_TEXTS.get(code, 'unknown abort code')} (0x{code:08X})"
+
+
+def upload_request(node: int, index: int, sub: int) -> Wire:
+    """Client: ask a node for an object."""
+    return SDO_TO_SERVER + node, struct.pack("<BHB4x", 0x40, index, sub)
+
+
+def download_request(node: int, index: int, sub: int, data: bytes) -> Wire:
+    """Client: write 1 to 4 bytes, little-endian, to an object of a node."""
+    return SDO_TO_SERVER + node, _expedited(0x23, index, sub, data)
+
+
+def upload_response(node: int, index: int, sub: int, data: bytes) -> Wire:
+    """Server: answer an upload with 1 to 4 bytes."""
+    return SDO_TO_CLIENT + node, _expedited(0x43, index, sub, data)
+
+
+def download_response(node: int, index: int, sub: int) -> Wire:
+    """Server: confirm a download."""
+    return SDO_TO_CLIENT + node, struct.pack("<BHB4x", 0x60, index, sub)
+
+
+def abort_frame(base: int, node: int, index: int, sub: int, code: int) -> Wire:
+    """Either side ends a transfer; ``base`` is SDO_TO_CLIENT or SDO_TO_SERVER."""
+    return base + node, struct.pack("<BHBI", 0x80, index, sub, code)
+
+
+def parse_response(key: int, data: bytes) -> Sdo | None:
+    """Client: a server's answer; UPLOAD carries the value, DOWNLOAD is the confirmation."""
+    return _parse(key - SDO_TO_CLIENT, data, SdoKind.UPLOAD, carrying=2, bare=3)
+
+
+def parse_request(key: int, data: bytes) -> Sdo | None:
+    """Server: a client's request; DOWNLOAD carries the value, UPLOAD asks for it."""
+    return _parse(key - SDO_TO_SERVER, data, SdoKind.DOWNLOAD, carrying=1, bare=2)
+
+
+def _expedited(command: int, index: int, sub: int, data: bytes) -> bytes:
+    if not 1 <= len(data) <= 4:
+        raise ValueError(f"an expedited transfer carries 1 to 4 bytes, not {len(data)}")
+    return struct.pack("<BHB4s", command | (4 - len(data)) << 2, index, sub, data)
+
+
+def _parse(node: int, data: bytes, value_kind: SdoKind, carrying: int, bare: int) -> Sdo | None:
+    """``carrying`` and ``bare`` are the command specifiers with a value (of ``value_kind``) and without
+    one."""
+    if not 0 < node <= MAX_NODE or len(data) != 8:
+        return None
+    command, index, sub, value = struct.unpack("<BHB4s", data)
+    specifier, expedited, sized = command >> 5, command & 2, command & 1
+    if specifier == 4:
+        return Sdo(SdoKind.ABORT, node, index, sub, b"", int.from_bytes(value, "little"))
+    if specifier == carrying and expedited:
+        return Sdo(value_kind, node, index, sub, value[: 4 - (command >> 2 & 3)] if sized else value, 0)
+    if specifier == bare:
+        return Sdo(SdoKind(1 - value_kind), node, index, sub, b"", 0)
+    return Sdo(SdoKind.SEGMENTED, node, index, sub, value, 0)

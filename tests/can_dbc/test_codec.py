@@ -1,0 +1,376 @@
+"""The compiled codec: equal to cantools bit for bit, never wraps, refuses whole."""
+
+from __future__ import annotations
+
+import math
+import os
+import random
+import struct
+from dataclasses import replace
+from functools import cache
+from itertools import product
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from can_dbc import check, codec
+from can_dbc.frame import EXTENDED
+from can_dbc.signals import EncodeRefused, FrameRefused, Refusal
+
+DATA = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can"
+FOREIGN = sorted([*DATA.glob("*/dbc/*.dbc"), *DATA.glob("opendbc/*.dbc"), *DATA.glob("*/kcd/*.kcd")])
+REFUSED_BY_CANTOOLS = {
+    "bad_message_length.dbc", "message_layout.kcd", "hyundai_i30_2014.dbc", "vw_mqb.dbc", "test.dbc",
+}  # fmt: skip
+HEAD = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\n'
+MIXED = """VERSION ""
+NS_ :
+BS_:
+BU_: A
+BO_ 2147484672 Wide: 24 A
+ SG_ Le64 : 0|64@1- (1,0) [0|0] "" A
+ SG_ Be64 : 71|64@0+ (1,0) [0|0] "" A
+ SG_ Odd : 131|13@0- (0.1,-3) [-200|200] "m" A
+ SG_ F32 : 152|32@1- (1,0) [0|0] "V" A
+ SG_ Half : 189|3@1+ (0.5,0) [0|3.5] "m" A
+BO_ 257 Empty: 0 A
+BO_ 258 Double: 8 A
+ SG_ D : 7|64@0- (2,1) [-1000|1000] "V" A
+BO_ 259 Steps: 8 A
+ SG_ Whole : 0|16@1- (5,3) [0|0] "m" A
+ SG_ Falling : 16|16@1+ (-0.25,100) [-200|100] "m" A
+ SG_ Top : 39|16@0+ (1,-40) [-40|210] "degC" A
+BA_DEF_ BO_ "VFrameFormat" ENUM
+"StandardCAN","ExtendedCAN","reserved","J1939PG","r","r","r","r","r","r","r","r","r","r","StandardCAN_FD","ExtendedCAN_FD";
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN"; BA_ "VFrameFormat" BO_ 2147484672 15; SIG_VALTYPE_ 2147484672 F32
+: 1; SIG_VALTYPE_ 258 D : 2;
+"""
+
+
+@cache
+def shipped(name: str) -> codec.Database:
+    return codec.load(name)
+
+
+@pytest.fixture
+def crane() -> codec.Database:
+    return shipped("crane")
+
+
+def pairs_of(path: Path) -> list[tuple]:
+    return [(m, codec.compile_one(m, path)) for m in codec.parse(path).messages]
+
+
+def id_of(path: object) -> str:
+    return getattr(path, "name", str(path))
+
+
+# -- equal to cantools ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "path",
+    [codec.resolve(n) for n in codec.SHIPPED] + [p for p in FOREIGN if p.name not in REFUSED_BY_CANTOOLS],
+    ids=id_of,
+)
+def test_equals_cantools(path: Path) -> None:
+    pairs = [p for p in pairs_of(path) if p[1].length or not p[1].signals]
+
+    @settings(max_examples=120, deadline=None, derandomize=True, database=None)
+    @given(st.data())
+    def compare(data: st.DataObject) -> None:
+        message, ours = data.draw(st.sampled_from(pairs))
+        payload = data.draw(st.binary(min_size=ours.length, max_size=ours.length))
+        assert check.compare_decode(message, ours, payload) == []
+        values = check.random_values(random.Random(data.draw(st.integers(0, 2**32))), ours, payload)
+        if values is not None:
+            assert check.compare_encode(message, ours, values) == []
+
+    compare()
+    report = check.check(str(path), 15, 7)
+    assert (report.error, report.differences) == ("", ())
+    assert report.decoded == 15 * len(pairs)
+
+
+def test_foreign_data_is_present() -> None:
+    if not FOREIGN:
+        pytest.skip("no third-party DBC files under TIMBERHAND_DATA/can")
+    assert len(FOREIGN) == 28
+
+
+def test_mixed_layouts_equal_cantools(tmp_path: Path) -> None:
+    path = tmp_path / "mixed.dbc"
+    path.write_text(MIXED)
+    report = check.check(str(path), 500, 3)
+    assert (report.error, report.differences, report.messages) == ("", (), 4)
+    wide = codec.load(path).messages["Wide"]
+    values = (-(2**63), 2**64 - 1, 12.5, 1.5, 2.5)
+    assert wide.decode(wide.encode(*values)) == values
+    assert codec.load(path).messages["Empty"].encode() == b""
+
+
+def test_comparison_finds_a_wrong_codec(crane: codec.Database) -> None:
+    message = next(m for m in codec.parse(crane.path).messages if m.name == "PressA")
+    ours = crane.messages["PressA"]
+    wrong = replace(ours, decode=lambda d: (*ours.decode(d)[:-1], 0.3), encode=lambda *v: ours.encode(*v[:-1], 0.3))
+    payload = ours.encode(1, 2, 0, 1.0, 2.0, 3.0, 4.0)
+    assert check.compare_decode(message, ours, payload) == []
+    assert len(check.compare_decode(message, wrong, payload)) == 1
+    assert len(check.compare_encode(message, wrong, list(ours.decode(payload)))) == 1
+
+
+@pytest.mark.parametrize("name", codec.SHIPPED)
+def test_every_raw_value_survives_the_round_trip(name: str) -> None:
+    for message in shipped(name).messages.values():
+        for i, s in enumerate(message.signals):
+            if s.bits > 12:
+                continue
+            for raw in range(s.raw_low, s.raw_high + 1):
+                assert s.encode(s.physical(raw)) == raw & (1 << s.bits) - 1, (message.name, i, raw)
+
+
+# -- refusing ----------------------------------------------------------------------------------------------------
+
+GOOD = {
+    "ValveCmdA": (0, 0, 2, 10.0, -10.0, 0.0, 100.0),
+    "ValveFbA": (0, 0, 1, 10.0, -10.0, 0.0, 100.0),
+    "PressA": (0, 0, 0, 100.0, 0.0, 400.0, 1.0),
+}
+ENCODE_CASES = [
+    # message, signal index, value, refused, or the physical value that arrives
+    ("ValveCmdA", 3, math.nan, "finite"),
+    ("ValveCmdA", 3, math.inf, "finite"),
+    ("ValveCmdA", 3, -math.inf, "finite"),
+    ("ValveCmdA", 3, "10", "finite"),
+    ("ValveCmdA", 3, 100.06, "outside -100 to 100 %"),
+    ("ValveCmdA", 3, -1e300, "outside"),
+    ("ValveCmdA", 3, 102.35, "outside"),
+    ("ValveCmdA", 3, 204.8, "outside"),
+    ("ValveCmdA", 2, 4, "outside"),
+    ("ValveCmdA", 1, 16, "outside"),
+    ("ValveCmdA", 0, None, "no raw value"),
+    ("ValveCmdA", 3, 0.025, 0.0),
+    ("ValveCmdA", 3, 0.125, 0.1),
+    ("ValveCmdA", 3, -0.026, -0.05),
+    ("ValveFbA", 3, 130.0, 100.0),
+    ("ValveFbA", 3, -1e300, -100.0),
+    ("ValveFbA", 3, math.nan, "finite"),
+    ("ValveFbA", 3, math.inf, "finite"),
+    ("PressA", 3, -5.0, 0.0),
+    ("PressA", 3, 1e9, 400.0),
+]
+
+
+@pytest.mark.parametrize(("name", "index", "value", "expected"), ENCODE_CASES)
+def test_encoding_never_wraps(crane: codec.Database, name: str, index: int, value: object, expected: object) -> None:
+    message = crane.messages[name]
+    values = list(GOOD[name])
+    values[index] = value  # type: ignore[call-overload]
+    if isinstance(expected, str):
+        with pytest.raises(EncodeRefused, match=expected):
+            message.encode(*values)
+    else:
+        values[index] = expected  # type: ignore[call-overload]
+        got = message.decode(message.encode(*values[:index], value, *values[index + 1 :]))
+        assert got == pytest.approx(tuple(values))
+
+
+@given(st.floats(allow_nan=True, allow_infinity=True), st.integers(3, 6))
+@settings(max_examples=300, deadline=None, derandomize=True, database=None)
+def test_no_float_ever_wraps(value: float, index: int) -> None:
+    message = shipped("crane").messages["ValveCmdA"]
+    values = list(GOOD["ValveCmdA"])
+    values[index] = value
+    try:
+        got = message.receive(message.encode(*values))[index]
+    except EncodeRefused:
+        assert not -100.0 <= value <= 100.0
+    else:
+        assert abs(got - value) <= 0.025000001
+
+
+def frame(name: str, *values: object) -> bytes:
+    return shipped("crane").messages[name].encode(*values)
+
+
+def bits(data: bytes, shift: int, width: int, raw: int) -> bytes:
+    word = int.from_bytes(data, "little") & ~(((1 << width) - 1) << shift)
+    return (word | raw << shift).to_bytes(len(data), "little")
+
+
+RECEIVE_CASES = [
+    # payload, reason or the value of signal 3
+    (lambda: frame("ValveCmdA", *GOOD["ValveCmdA"]), 10.0),
+    (lambda: frame("ValveCmdA", *GOOD["ValveCmdA"])[:7], Refusal.LENGTH),
+    (lambda: frame("ValveCmdA", *GOOD["ValveCmdA"]) + b"\0", Refusal.LENGTH),
+    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 16, 12, 2000), 100.0),
+    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 16, 12, 2001), Refusal.RANGE),
+    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 16, 12, 4096 - 2001), Refusal.RANGE),
+    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 16, 12, 0x7FF), None),
+    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 16, 12, 0x800), None),
+    (lambda: bits(frame("ValveCmdA", *GOOD["ValveCmdA"]), 12, 4, 4), Refusal.RANGE),
+]
+
+
+@pytest.mark.parametrize(("payload", "expected"), RECEIVE_CASES)
+def test_receiving_is_strict(crane: codec.Database, payload, expected) -> None:  # type: ignore[no-untyped-def]
+    message = crane.messages["ValveCmdA"]
+    if isinstance(expected, Refusal):
+        with pytest.raises(FrameRefused) as refused:
+            message.receive(payload())
+        assert refused.value.reason is expected
+    else:
+        assert message.receive(payload())[3] == expected
+
+
+@given(st.sampled_from(codec.SHIPPED), st.data())
+@settings(max_examples=300, deadline=None, derandomize=True, database=None)
+def test_receive_is_decode_or_refusal(name: str, data: st.DataObject) -> None:
+    database = shipped(name)
+    message = data.draw(st.sampled_from(list(database.messages.values())))
+    payload = data.draw(st.binary(min_size=message.length, max_size=message.length))
+    plain = message.decode(payload)
+    little = int.from_bytes(payload, "little")
+    raws = [s.extract(little, 0) for s in message.signals]
+    sound = [s.raw_low <= raw <= s.raw_high or raw in s.choices for s, raw in zip(message.signals, raws, strict=True)]
+    try:
+        got = message.receive(payload)
+    except FrameRefused:
+        assert not all(sound)
+        return
+    assert all(sound)
+    for s, raw, value, checked in zip(message.signals, raws, plain, got, strict=True):
+        assert checked is None if raw in s.sentinels else checked == value
+
+
+def test_none_is_sent_as_not_available() -> None:
+    heading = shipped("gnss").messages["VesselHeading"]
+    assert heading.encode(None, 1.5, None, None, 0, None) == bytes.fromhex("ff983aff7fff7ffc")
+    assert heading.receive(bytes.fromhex("ff983aff7fff7ffc")) == (None, 1.5, None, None, 0, None)
+
+
+def test_floats(tmp_path: Path) -> None:
+    path = tmp_path / "mixed.dbc"
+    path.write_text(MIXED)
+    double = codec.load(path).messages["Double"]
+    assert double.encode(5.0) == struct.pack(">d", 2.0)
+    for bad in (math.nan, math.inf, 1000.1):
+        with pytest.raises(EncodeRefused):
+            double.encode(bad)
+        with pytest.raises(FrameRefused):
+            double.receive(struct.pack(">d", bad))
+
+
+# -- multiplexing ------------------------------------------------------------------------------------------------
+
+
+def test_multiplexed_signals_are_none_when_absent() -> None:
+    path = DATA / "cantools/dbc/issue_184_extended_mux_cascaded.dbc"
+    if not path.exists():
+        pytest.skip("no cantools files under TIMBERHAND_DATA/can")
+    (message,) = codec.load(path).messages.values()
+    seen = {}
+    for first, second in product(range(4), range(4)):
+        try:
+            values = message.decode(bytes((first, second, 34, 51, 0, 0, 0, 0)))
+        except FrameRefused as refused:
+            assert refused.reason is Refusal.MULTIPLEXER
+            continue
+        assert message.decode(message.encode(*values)) == values
+        seen[first, second] = set(message.named(values))
+        surplus = [0 if value is None else value for value in values]
+        with pytest.raises(EncodeRefused, match="absent"):
+            message.encode(*surplus)
+    cascade = {"MUX_A", "muxed_A_2_MUX_B"}
+    assert seen == {(1, n): {"MUX_A", "muxed_A_1"} for n in range(4)} | {
+        (2, 0): cascade | {"muxed_B_0"},
+        (2, 1): cascade | {"muxed_B_1"},
+    }
+
+
+def test_a_named_multiplexer_value_needs_no_signals(tmp_path: Path) -> None:
+    path = tmp_path / "f.dbc"
+    path.write_text(
+        HEAD + 'BO_ 1 M: 2 A\n SG_ S M : 0|8@1+ (1,0) [0|0] "" A\n SG_ X m1 : 8|8@1+ (1,0) [0|0] "" A\n'
+        'VAL_ 1 S 3 "Idle" ;\n'
+    )
+    report = check.check(str(path), 300, 1)
+    assert (report.error, report.differences) == ("", ())
+    message = codec.load(path).messages["M"]
+    assert message.receive(b"\x03\x07") == (3, None)
+    assert message.encode(3, None) == b"\x03\x00"
+    for refused in ((2, None), (3, 0), (1, None), (None, 0), (math.nan, 0)):
+        with pytest.raises(EncodeRefused):
+            message.encode(*refused)
+    with pytest.raises(TypeError):
+        message.encode(3)
+
+
+# -- loading -------------------------------------------------------------------------------------------------------
+
+BROKEN = [
+    ("BO_ 1 M: 8 A\n SG_ X 0|8@1+\n", r"f\.dbc:6: Invalid syntax"),
+    ('BO_ 1 M: 8 A\n SG_ X : 0|8@1+ (1,0) [0|0] "" A\n SG_ Y : 7|8@1+ (1,0) [0|0] "" A\n', r"f\.dbc:5: .*overlap"),
+    ('BO_ 1 M: 1 A\n SG_ X : 0|9@1+ (1,0) [0|0] "" A\n', r"f\.dbc:5: .*does not fit"),
+    ("BO_ 1 M: 1 A\nBO_ 1 N: 1 A\n", "share the identifier 001"),
+    ("BO_ 1 M: 1 A\nBO_ 2 M: 1 A\n", "share the name M"),
+    (
+        'BO_ 1 M: 8 A\nBA_DEF_ BO_ "E2EProfile" ENUM "None","P02";\nBA_DEF_DEF_ "E2EProfile" "None";\n'
+        'BA_ "E2EProfile" BO_ 1 1;\n',
+        "M needs 16 hexadecimal Data IDs",
+    ),
+]
+
+
+@pytest.mark.parametrize(("text", "reason"), BROKEN)
+def test_broken_files_name_line_and_reason(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / "f.dbc"
+    path.write_text(HEAD + text)
+    with pytest.raises(codec.DbcError, match=reason):
+        codec.load(path)
+
+
+@pytest.mark.parametrize("name", ["nowhere.dbc", "wheel"])
+def test_missing_files(name: str) -> None:
+    with pytest.raises(codec.DbcError, match="no such file"):
+        codec.load(name)
+
+
+@pytest.mark.parametrize("path", [p for p in FOREIGN if p.name in REFUSED_BY_CANTOOLS], ids=id_of)
+def test_files_cantools_refuses(path: Path) -> None:
+    with pytest.raises(codec.DbcError, match=rf"{path.name}:\d+: "):
+        codec.load(path)
+    report = check.check(str(path), 1, 1)
+    assert report.error
+    if path.name != "test.dbc":
+        assert {f.rule for f in report.warnings} & {"overlap", "length"}
+
+
+def test_unknown_message_is_a_clear_error(crane: codec.Database) -> None:
+    with pytest.raises(codec.DbcError, match="no message is called ValveCmdC"):
+        crane.message("ValveCmdC")
+
+
+FIND_CASES = [
+    # database, key, message
+    ("crane", 0x210, "ValveCmdA"),
+    ("crane", 0x210 | EXTENDED, None),
+    ("machine", 0x0CFF2203 | EXTENDED, "VehStat"),
+    ("machine", 0x0CFF2204 | EXTENDED, None),
+    ("machine", 0x0CF00400 | EXTENDED, "EEC1"),
+    ("machine", 0x18F00421 | EXTENDED, "EEC1"),
+    ("machine", 0x18EEFF80 | EXTENDED, "AddressClaim"),
+    ("machine", 0x18EE2780 | EXTENDED, "AddressClaim"),
+    ("machine", 0x0CF00400, None),
+    ("gnss", 0x09F8011C | EXTENDED, "PositionRapidUpdate"),
+    ("gnss", 0x19F80124 | EXTENDED, "PositionRapidUpdate"),
+    ("gnss", 0x09F80324 | EXTENDED, None),
+]
+
+
+@pytest.mark.parametrize(("name", "key", "expected"), FIND_CASES)
+def test_find_matches_exactly_or_by_pgn(name: str, key: int, expected: str | None) -> None:
+    found = shipped(name).find(key)
+    assert (found and found.name) == expected

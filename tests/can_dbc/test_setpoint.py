@@ -1,0 +1,231 @@
+"""The setpoint datagrams: round trip, every reason to refuse, and no surprise from arbitrary bytes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import struct
+import zlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from can_dbc.setpoint import (
+    MAX_KNOTS,
+    N_AXES,
+    CraneSetpoint,
+    Datagram,
+    DatagramFault,
+    DatagramRefused,
+    DriveSetpoint,
+    GrappleCommand,
+    Knot,
+    OperatorAction,
+    OperatorCommand,
+    StateReport,
+    decode,
+    encode,
+)
+
+KEY = b"a key of the two sides"
+BODY_AT = 24  # bytes of the header
+
+u32 = st.integers(0, 2**32 - 1)
+u16 = st.integers(0, 2**16 - 1)
+u8 = st.integers(0, 255)
+stamps = st.integers(0, 2**64 - 1)
+microseconds = st.integers(0, 2**32 - 1).map(lambda us: us * 1000)
+finite = st.floats(allow_nan=False, allow_infinity=False)
+axes = st.tuples(*[finite] * N_AXES)
+known_or_nan = st.tuples(*[st.floats(allow_infinity=False)] * N_AXES)
+
+
+@st.composite
+def crane_setpoints(draw: st.DrawFn) -> CraneSetpoint:
+    times = draw(st.lists(st.integers(0, 2**32 - 1), min_size=1, max_size=MAX_KNOTS, unique=True).map(sorted))
+    knots = tuple(Knot(us * 1000, draw(axes), draw(axes)) for us in times)
+    grapple = draw(st.sampled_from(GrappleCommand))
+    return CraneSetpoint(draw(u32), draw(u32), draw(stamps), draw(microseconds), grapple, draw(st.booleans()), knots)
+
+
+drive_setpoints = st.builds(
+    DriveSetpoint, u32, u32, stamps, microseconds, finite, finite, finite, st.tuples(*[finite] * 4)
+)
+operator_commands = st.builds(OperatorCommand, u32, u32, stamps, st.sampled_from(OperatorAction))
+reports = st.builds(
+    StateReport, u32, u32, stamps, u8, u8, u16, u32, u16, u16, u16,
+    known_or_nan, known_or_nan, known_or_nan, finite, finite, finite, u32, u32, u32, u32,
+)  # fmt: skip
+datagrams = st.one_of(crane_setpoints(), drive_setpoints, operator_commands, reports)
+
+
+def a_setpoint(knots: tuple[Knot, ...] | None = None) -> CraneSetpoint:
+    knots = knots or tuple(Knot(k * 50_000_000, (0.1, 0.2, -1.0, 0.5, 0.0), (0.0,) * 5) for k in range(9))
+    return CraneSetpoint(7, 0xABCD, 123_456_789, 200_000_000, GrappleCommand.HOLD, False, knots)
+
+
+def sealed(data: bytes) -> bytes:
+    """The bytes (without trailer) with a right CRC-32, as an encoder with a defect would send them."""
+    return data + struct.pack("<I", zlib.crc32(data))
+
+
+def fault_of(data: bytes, key: bytes | None = None) -> DatagramFault:
+    with pytest.raises(DatagramRefused) as refused:
+        decode(data, key)
+    return refused.value.fault
+
+
+def same(a: Datagram, b: Datagram) -> bool:
+    """Equal fields, NaN equal to NaN."""
+    return repr(dataclasses.astuple(a)) == repr(dataclasses.astuple(b))
+
+
+@given(datagrams, st.sampled_from([None, KEY]))
+def test_round_trip_keeps_every_field(message: Datagram, key: bytes | None) -> None:
+    back = decode(encode(message, key), key)
+    assert type(back) is type(message) and same(back, message)
+
+
+def test_times_finer_than_a_microsecond_are_cut() -> None:
+    sent = dataclasses.replace(a_setpoint(), lease_ns=200_000_999)
+    back = decode(encode(sent))
+    assert isinstance(back, CraneSetpoint) and back.lease_ns == 200_000_000
+
+
+@given(datagrams, st.data())
+def test_any_flipped_bit_is_refused(message: Datagram, data: st.DataObject) -> None:
+    raw = bytearray(encode(message))
+    bit = data.draw(st.integers(0, 8 * len(raw) - 1))
+    raw[bit // 8] ^= 1 << bit % 8
+    fault_of(bytes(raw))
+
+
+@given(st.binary(max_size=1500), st.sampled_from([None, KEY]))
+def test_noise_is_refused_and_never_raises_anything_else(noise: bytes, key: bytes | None) -> None:
+    fault_of(noise, key)
+
+
+@given(datagrams, st.data())
+def test_a_well_sealed_but_arbitrary_body_gives_a_message_or_a_refusal(message: Datagram, data: st.DataObject) -> None:
+    body = data.draw(st.binary(max_size=200))
+    kind = struct.pack("<H", data.draw(st.integers(0, 6)))
+    header = encode(message)[:BODY_AT]
+    try:
+        decode(sealed(header[:6] + kind + header[8:] + body))
+    except DatagramRefused as refused:
+        assert refused.fault in (
+            DatagramFault.LENGTH,
+            DatagramFault.KIND,
+            DatagramFault.VALUE,
+            DatagramFault.NOT_FINITE,
+        )
+
+
+@given(datagrams, st.data())
+def test_a_datagram_cut_short_or_grown_is_refused(message: Datagram, data: st.DataObject) -> None:
+    raw = encode(message)
+    cut = data.draw(st.integers(0, len(raw) - 1))
+    fault_of(raw[:cut])
+    fault_of(raw + b"\0")
+    if BODY_AT <= cut < len(raw) - 4:
+        assert fault_of(sealed(raw[:cut])) is DatagramFault.LENGTH
+
+
+def test_magic() -> None:
+    assert fault_of(b"XXXX" + encode(a_setpoint())[4:]) is DatagramFault.MAGIC
+
+
+def test_version() -> None:
+    raw = encode(a_setpoint())[:-4]
+    assert fault_of(sealed(raw[:4] + b"\x02\x00" + raw[6:])) is DatagramFault.VERSION
+
+
+def test_kind() -> None:
+    raw = encode(a_setpoint())[:-4]
+    assert fault_of(sealed(raw[:6] + b"\x63\x00" + raw[8:])) is DatagramFault.KIND
+
+
+def test_crc() -> None:
+    raw = encode(a_setpoint())
+    assert fault_of(raw[:-1] + bytes([raw[-1] ^ 1])) is DatagramFault.CRC
+
+
+def test_length() -> None:
+    assert fault_of(b"") is DatagramFault.LENGTH
+    assert fault_of(sealed(encode(a_setpoint())[:-12])) is DatagramFault.LENGTH
+
+
+@pytest.mark.parametrize(("sent_with", "read_with"), [(b"other", KEY), (None, KEY)])
+def test_authentication(sent_with: bytes | None, read_with: bytes) -> None:
+    assert fault_of(encode(a_setpoint(), sent_with), read_with) is DatagramFault.AUTHENTICATION
+
+
+def test_a_forged_body_with_a_right_crc_fails_authentication() -> None:
+    raw = bytearray(encode(a_setpoint(), KEY)[:-4])
+    raw[BODY_AT + 20] ^= 1
+    assert fault_of(sealed(bytes(raw)), KEY) is DatagramFault.AUTHENTICATION
+
+
+def test_a_receiver_without_a_key_refuses_an_authenticated_setpoint() -> None:
+    assert fault_of(encode(a_setpoint(), KEY)) is DatagramFault.LENGTH
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("in_velocity", [False, True])
+def test_not_finite(bad: float, in_velocity: bool) -> None:
+    good, poisoned = (0.0,) * 5, (0.0, 0.0, bad, 0.0, 0.0)
+    knot = Knot(0, good, poisoned) if in_velocity else Knot(0, poisoned, good)
+    assert fault_of(encode(a_setpoint((knot,)))) is DatagramFault.NOT_FINITE
+
+
+def test_a_drive_setpoint_that_is_not_finite_is_refused() -> None:
+    drive = DriveSetpoint(1, 2, 3, 1_000_000, 48.0, math.nan, 1.0, (0.0, 0.0, 0.0, 0.0))
+    assert fault_of(encode(drive)) is DatagramFault.NOT_FINITE
+
+
+def test_a_report_may_hold_unknown_values() -> None:
+    unknown = (math.nan,) * 5
+    report = StateReport(1, 2, 3, 2, 0, 0, 0, 0, 0, 0, unknown, unknown, unknown, math.nan, 0.0, 0.0, 1, 2, 3, 4)
+    back = decode(encode(report))
+    assert isinstance(back, StateReport) and math.isnan(back.opening_pct) and math.isnan(back.position[0])
+
+
+@pytest.mark.parametrize(
+    "knots",
+    [
+        tuple(Knot(k * 1_000_000, (0.0,) * 5, (0.0,) * 5) for k in range(MAX_KNOTS + 1)),
+        (Knot(50_000_000, (0.0,) * 5, (0.0,) * 5), Knot(50_000_000, (0.0,) * 5, (0.0,) * 5)),
+        (Knot(100_000_000, (0.0,) * 5, (0.0,) * 5), Knot(50_000_000, (0.0,) * 5, (0.0,) * 5)),
+    ],
+    ids=["too many knots", "equal times", "falling times"],
+)
+def test_value_knots(knots: tuple[Knot, ...]) -> None:
+    assert fault_of(encode(a_setpoint(knots))) is DatagramFault.VALUE
+
+
+def test_value_no_knots() -> None:
+    assert fault_of(encode(dataclasses.replace(a_setpoint(), knots=()))) is DatagramFault.VALUE
+
+
+def test_value_enumerations() -> None:
+    raw = bytearray(encode(a_setpoint())[:-4])
+    raw[BODY_AT + 4] = 9  # grapple command
+    assert fault_of(sealed(bytes(raw))) is DatagramFault.VALUE
+    raw = bytearray(encode(a_setpoint())[:-4])
+    raw[BODY_AT + 5] = 2  # final is 0 or 1
+    assert fault_of(sealed(bytes(raw))) is DatagramFault.VALUE
+    operator = bytearray(encode(OperatorCommand(1, 2, 3, OperatorAction.STOP))[:-4])
+    operator[BODY_AT] = 0
+    assert fault_of(sealed(bytes(operator))) is DatagramFault.VALUE
+
+
+def test_another_number_of_axes_is_refused() -> None:
+    raw = bytearray(encode(a_setpoint())[:-4])
+    raw[BODY_AT + 7] = 6
+    assert fault_of(sealed(bytes(raw))) is DatagramFault.LENGTH
+
+
+def test_a_refusal_says_why() -> None:
+    with pytest.raises(DatagramRefused, match="datagram refused: not finite"):
+        decode(encode(a_setpoint((Knot(0, (math.nan,) * 5, (0.0,) * 5),))))

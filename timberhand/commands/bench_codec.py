@@ -1,0 +1,138 @@
+"""``timberhand bench codec``: the compiled codec beside cantools, in one run, over the messages of
+crane.dbc."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final
+
+import typer
+
+ENCODE_NEEDED: Final = 5.0
+DECODE_NEEDED: Final = 2.0
+LOOPS: Final = 100
+
+
+def codec(
+    repetitions: Annotated[int, typer.Option(min=3, help="Interleaved repetitions; the median counts.")] = 31,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+) -> None:
+    """Time encode and decode of every message of crane.dbc, ours and cantools in turn.
+
+    Both sides check ranges when they encode.  Exit code 6 when encoding is not 5 times or decoding not 2
+    times as fast as cantools.
+    """
+    import json
+
+    from hil.exits import Exit
+
+    result = measure(repetitions)
+    if as_json:
+        typer.echo(json.dumps(result, indent=2))
+    else:
+        _show(result)
+    if not result["reached"]:
+        raise typer.Exit(Exit.FIGURE)
+
+
+def measure(repetitions: int) -> dict[str, Any]:
+    """Medians of interleaved repetitions [ns per frame] per message, and the ratios of their sums."""
+    import gc
+    import os
+    import platform
+    import random
+    from importlib.metadata import version
+
+    from can_dbc.check import random_values
+    from can_dbc.codec import EncodeRefused, FrameRefused, load, parse
+
+    database = load("crane")
+    reference = {m.name: m for m in parse(database.path).messages}
+    rng = random.Random(1)
+    rows = []
+    gc.disable()
+    try:
+        for name, ours in database.messages.items():
+            theirs = reference[name]
+            while True:
+                values = random_values(rng, ours, rng.randbytes(ours.length))
+                try:
+                    payload = ours.encode(*(values or ()))
+                    ours.receive(payload)
+                    break
+                except (EncodeRefused, FrameRefused):
+                    continue
+            named = dict(zip(ours.index, values or (), strict=True))
+            rows.append({"message": name} | _timed(ours, theirs, payload, values or [], named, repetitions))
+    finally:
+        gc.enable()
+    totals = {key: sum(row[key] for row in rows) for key in rows[0] if key != "message"}
+    ratios = {
+        "encode": totals["cantools_encode_ns"] / totals["encode_ns"],
+        "encode_unchecked": totals["cantools_encode_unchecked_ns"] / totals["encode_ns"],
+        "decode": totals["cantools_decode_ns"] / totals["decode_ns"],
+        "receive": totals["cantools_decode_ns"] / totals["receive_ns"],
+    }
+    return {
+        "environment": {
+            "python": platform.python_version(),
+            "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
+            "cpus": os.cpu_count(),
+            "cantools": version("cantools"),
+            "bitstruct": version("bitstruct"),
+        },
+        "repetitions": repetitions,
+        "needed": {"encode": ENCODE_NEEDED, "decode": DECODE_NEEDED},
+        "ratios": ratios,
+        "reached": ratios["encode"] >= ENCODE_NEEDED and ratios["decode"] >= DECODE_NEEDED,
+        "messages": rows,
+    }
+
+
+def _timed(
+    ours: Any, theirs: Any, payload: bytes, values: list[Any], named: dict[str, Any], repetitions: int
+) -> dict[str, float]:
+    from statistics import median
+    from time import perf_counter_ns
+
+    cases = {
+        "encode_ns": lambda: ours.encode(*values),
+        "cantools_encode_ns": lambda: theirs.encode(named),
+        "cantools_encode_unchecked_ns": lambda: theirs.encode(named, strict=False),
+        "decode_ns": lambda: ours.decode(payload),
+        "receive_ns": lambda: ours.receive(payload),
+        "cantools_decode_ns": lambda: theirs.decode(payload, decode_choices=False),
+    }
+    samples: dict[str, list[float]] = {name: [] for name in cases}
+    for _ in range(repetitions):
+        for name, call in cases.items():
+            start = perf_counter_ns()
+            for _ in range(LOOPS):
+                call()
+            samples[name].append((perf_counter_ns() - start) / LOOPS)
+    return {name: median(times) for name, times in samples.items()}
+
+
+def _show(result: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(soft_wrap=True, highlight=False)
+    console.print("  ".join(f"[dim]{name}[/dim] {value}" for name, value in result["environment"].items()))
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("message")
+    for column in ("encode µs", "cantools", "decode µs", "receive µs", "cantools"):
+        table.add_column(column, justify="right")
+    for row in result["messages"]:
+        if row["message"].startswith("Heartbeat") and row["message"] != "HeartbeatSafe":
+            continue
+        columns = ("encode_ns", "cantools_encode_ns", "decode_ns", "receive_ns", "cantools_decode_ns")
+        table.add_row(row["message"], *(f"{row[c] / 1000:.2f}" for c in columns))
+    console.print(table)
+    for name, needed in result["needed"].items():
+        ratio = result["ratios"][name]
+        mark = "[green]✔[/green]" if ratio >= needed else "[red]✘[/red]"
+        console.print(f"{mark} {name} {ratio:.1f} times as fast as cantools (needed {needed:.0f})")
+    console.print(
+        f"  receive with range check {result['ratios']['receive']:.1f} times, "
+        f"encode against cantools without its checks {result['ratios']['encode_unchecked']:.1f} times"
+    )

@@ -1,0 +1,75 @@
+"""``timberhand dbc``: what the DBC files say and whether the compiled codecs keep to it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="Check DBC and KCD files.")
+
+
+@app.callback()
+def group() -> None:
+    """Keeps ``check`` a subcommand while it is the only one."""
+
+
+@app.command(
+    epilog="Examples:  timberhand dbc check crane machine gnss  ·  timberhand dbc check my.dbc --frames 2000 --strict"
+)
+def check(
+    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Paths, or crane, machine, gnss.")],
+    frames: Annotated[int, typer.Option(min=1, help="Random frames per message to compare with cantools.")] = 200,
+    seed: Annotated[int, typer.Option(help="Seed of the random frames.")] = 1,
+    strict: Annotated[bool, typer.Option("--strict", help="Lint warnings fail, exit code 3.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+) -> None:
+    """Compile each FILE, compare the codecs with cantools over random frames, and lint it.
+
+    Exit code 3: a file cannot be loaded.  6: a compiled codec differs from cantools.
+    """
+    import json
+    from dataclasses import asdict
+
+    from can_dbc.check import check as check_file
+    from hil.exits import Exit
+
+    reports = [check_file(file, frames, seed) for file in files]
+    if as_json:
+        typer.echo(json.dumps({"frames": frames, "seed": seed, "files": [asdict(r) for r in reports]}, indent=2))
+    else:
+        _show(reports)
+    if any(r.error for r in reports) or (strict and any(r.warnings for r in reports)):
+        raise typer.Exit(Exit.CONFIGURATION)
+    if any(r.different for r in reports):
+        raise typer.Exit(Exit.FIGURE)
+
+
+def _show(reports: list) -> None:  # type: ignore[type-arg]
+    from pathlib import Path
+
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console(soft_wrap=True, highlight=False)
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("file")
+    for column in ("messages", "signals", "decoded", "encoded", "differ", "warnings"):
+        table.add_column(column, justify="right")
+    table.add_column("")
+    for r in reports:
+        verdict = "[red]✘ cannot be loaded[/red]" if r.error else "[green]✔[/green]"
+        if r.different:
+            verdict = "[red]✘ differs from cantools[/red]"
+        counts = (r.messages, r.signals, r.decoded, r.encoded, r.different, len(r.warnings))
+        table.add_row(escape(Path(r.path).name), *map(str, counts), verdict)
+    console.print(table)
+    for r in reports:
+        if r.error:
+            console.print(f"[red]error[/red] {escape(r.error)}")
+        for text in r.differences:
+            console.print(f"[red]differs[/red] {escape(text)}")
+        for w in r.warnings:
+            where = f"{Path(r.path).name}: {w.where}"
+            console.print(f"[yellow]warning[/yellow] {escape(where)}: {escape(w.text)} [dim]({w.rule})[/dim]")
