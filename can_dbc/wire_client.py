@@ -87,6 +87,9 @@ class WireClient(BaseBus):
         stats = self.stats
         if self.pending >= self._tx_queue:
             self._read(self._backlog)
+            if len(self._backlog) > _BACKLOG:  # somebody who only sends must not grow without bound
+                stats.dropped += len(self._backlog) - _BACKLOG
+                del self._backlog[:-_BACKLOG]
         if stats.state < BusState.OFF and self.pending < self._tx_queue and len(data) <= 8:
             try:
                 self._sock.send(RECORD.pack(key, len(data), data, 0, 0, 0, 0))
@@ -139,10 +142,6 @@ class WireClient(BaseBus):
                     if key & ERROR:
                         stats.note_error(key, data)
                     frames.append(Frame(stamp_ns, key, data[:length]))
-        # A reader that never drains must not grow without bound.
-        if frames is self._backlog and len(frames) > _BACKLOG:
-            stats.dropped += len(frames) - _BACKLOG
-            del frames[:-_BACKLOG]
 
 
 def control(name: str, message: dict[str, Any]) -> dict[str, Any]:

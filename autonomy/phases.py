@@ -1,0 +1,59 @@
+"""The phases of the first mission as a table: what the grapple does, how long each may take, what is wrong then."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+from can_dbc.setpoint import GrappleCommand
+
+
+class Phase(IntEnum):
+    """Where the activity is; the order is the order of a cycle without trouble."""
+
+    WAIT = 0
+    LOOK = 1
+    ABOVE = 2
+    DESCEND = 3
+    CLOSE = 4
+    LIFT = 5
+    CARRY = 6
+    LOWER = 7
+    OPEN = 8
+    RETREAT = 9
+    DONE = 10
+    FAILED = 11
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A phase: what the grapple does, rest after the motion [s], time beyond it [s], what is wrong after
+    that.
+    """
+
+    grapple: GrappleCommand
+    settle_s: float
+    slack_s: float
+    trouble: str
+
+
+_OPEN, _CLOSE, _HOLD = GrappleCommand.OPEN, GrappleCommand.CLOSE, GrappleCommand.HOLD
+RULES: Final = {
+    Phase.LOOK: Rule(_OPEN, 0.3, 5.0, "the detector sent no log list"),
+    Phase.ABOVE: Rule(_OPEN, 0.2, 6.0, "the crane did not get above the log with an open grapple"),
+    Phase.DESCEND: Rule(_OPEN, 0.2, 5.0, "the crane did not get down to the log"),
+    Phase.CLOSE: Rule(_CLOSE, 0.0, 6.0, "the grapple did not close"),
+    Phase.LIFT: Rule(_HOLD, 0.3, 5.0, "the crane did not lift the log, or no log list came"),
+    Phase.CARRY: Rule(_HOLD, 0.3, 6.0, "the crane did not get over the bunk, or no log list came"),
+    Phase.LOWER: Rule(_HOLD, 0.3, 5.0, "the crane did not get down into the bunk"),
+    Phase.OPEN: Rule(_OPEN, 0.3, 5.0, "the grapple did not open"),
+    Phase.RETREAT: Rule(_OPEN, 0.2, 6.0, "the crane did not leave the bunk, or no log list came"),
+}
+BEGIN_AGAIN: Final = {
+    Phase.DESCEND: Phase.ABOVE,
+    Phase.CLOSE: Phase.ABOVE,
+    Phase.LOWER: Phase.CARRY,
+    Phase.OPEN: Phase.CARRY,
+}
+"""Where an interrupted vertical phase begins again when the crane stands aside of its column."""

@@ -1,0 +1,155 @@
+"""What the page shows: the newest state report of the controller, in words and numbers for a browser.
+
+Pure: datagrams and integer times in, JSON-ready dictionaries out.  An unknown number (NaN) becomes None.  Peaks (tick
+time, lateness) are the worst of the last second, because the page is told less often than the controller reports.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+from autonomy.logs import LogObservation
+from can_dbc.setpoint import DatagramRefused, StateReport, decode
+from controller import faults
+from controller.inputs import ENCODER_BIT
+from machine import grapple, kinematics
+from machine.joints import JOINTS
+from machine.modes import Mode
+from machine.profile import Profile, joint
+
+ALIVE_NS: Final = 300_000_000
+"""A controller that has said nothing for this long is shown as lost."""
+WINDOW_NS: Final = 1_000_000_000
+
+PARTS: Final = ("column", "boom", "stick", "telescope", "grapple")
+_NAMES: Final = tuple((j.name.lower(), PARTS[j]) for j in JOINTS)
+STALE_NAMES: Final = {
+    0: "emergency stop", 1: "guard", 8: "valves A", 9: "valves B", 10: "PLC",
+    11: "pressures A", 12: "pressures B", 13: "pressures C", 14: "grapple",
+} | {ENCODER_BIT + j: f"{j.name.lower()} encoder" for j in JOINTS}  # fmt: skip
+"""Bits of ``StateReport.stale_mask``."""
+
+
+def describe_machine(profile: Profile) -> dict[str, Any]:
+    """What never changes: names, limits and the geometry of the surroundings."""
+    bunk, place = profile.bunk, profile.workspace
+    return {
+        "name": profile.name,
+        "title": profile.title,
+        "joints": [
+            {"name": name, "part": part, "kind": spec.kind, "lower": spec.lower, "upper": spec.upper}
+            for (name, part), spec in zip(_NAMES, (joint(profile, j) for j in JOINTS), strict=True)
+        ],
+        "hold_pressure_bar": profile.grapple.hold_pressure_bar,
+        "bunk": {name: getattr(bunk, name) for name in bunk.__struct_fields__},
+        "ground_z_m": place.ground_z_m,
+        "pick_center_m": place.pick_center_m,
+        "pick_half_size_m": place.pick_half_size_m,
+    }
+
+
+class Watch:
+    """Takes reports and log lists, gives the page's state."""
+
+    def __init__(self, profile: Profile, key: bytes | None = None) -> None:
+        self.logs: tuple[LogObservation, ...] = ()
+        self._profile = profile
+        self._key = key
+        self._report: StateReport | None = None
+        self._heard_ns = 0
+        self._recent: deque[tuple[int, StateReport]] = deque()
+
+    def on_report(self, datagram: bytes, now_ns: int) -> bool:
+        """Take a datagram; False when it is no state report of ours."""
+        try:
+            report = decode(datagram, self._key)
+        except DatagramRefused:
+            return False
+        if not isinstance(report, StateReport):
+            return False
+        self._report, self._heard_ns = report, now_ns
+        self._recent.append((now_ns, report))
+        self._forget(now_ns)
+        return True
+
+    def alive(self, now_ns: int) -> bool:
+        """Whether the controller has spoken lately."""
+        return self._report is not None and now_ns - self._heard_ns < ALIVE_NS
+
+    def state(self, now_ns: int) -> dict[str, Any]:
+        """The whole state for the page; before the first report only ``alive`` and ``logs``."""
+        r = self._report
+        base = {"alive": self.alive(now_ns), "logs": [asdict(log) for log in self.logs]}
+        if r is None:
+            return base
+        self._forget(now_ns)
+        window = [report for _, report in self._recent] or [r]
+        return base | {
+            "time_s": r.stamp_ns / 1e9,
+            "silent_s": round((now_ns - self._heard_ns) / 1e9, 2),
+            "mode": Mode(r.mode).name if r.mode in set(Mode) else f"MODE {r.mode}",
+            "reason": _sentence(r.reason),
+            "position": _numbers(r.position),
+            "reference": _numbers(r.reference),
+            "opening_pct": _number(r.opening_pct),
+            "clamp_bar": _number(r.clamp_bar),
+            "load_kg": _number(r.load_kg),
+            "tick_ms": max(w.tick_ns for w in window) / 1e6,
+            "late_ms": max(w.late_ns for w in window) / 1e6,
+            "missed_ticks": r.missed_ticks,
+            "frames_per_s": _rate(window),
+            "refused": r.refused,
+            "refusal": _sentence(r.refusal) if r.refusal else "",
+            "stale": [STALE_NAMES.get(b, f"bit {b}") for b in range(16) if r.stale_mask >> b & 1],
+            **self._drawing(r),
+        }
+
+    def _forget(self, now_ns: int) -> None:
+        while self._recent and self._recent[0][0] < now_ns - WINDOW_NS:
+            self._recent.popleft()
+
+    def _drawing(self, r: StateReport) -> dict[str, Any]:
+        kin, tongs = self._profile.kinematics, self._profile.grapple.tongs
+        if not all(map(math.isfinite, r.position)):
+            return {"points": None, "reference_points": None}
+        opening = r.opening_pct if math.isfinite(r.opening_pct) else 100.0
+        angle = grapple.tong_angle_from_opening_pct(tongs, opening)
+        ghost = all(map(math.isfinite, r.reference))
+        return {
+            "points": _points(kinematics.chain_points(kin, r.position)),
+            "reference_points": _points(kinematics.chain_points(kin, r.reference)) if ghost else None,
+            "tongs": {
+                "yaw_rad": round(grapple.grapple_yaw(r.position), 4),
+                "half_gap_m": round(grapple.half_gap_m(tongs, angle), 4),
+                "tip_below_m": round(grapple.tip_below_pin_m(tongs, angle), 4),
+            },
+        }
+
+
+def _points(points: kinematics.ChainPoints) -> list[list[float]]:
+    return [[round(v, 4) for v in point] for point in points]
+
+
+def _number(value: float) -> float | None:
+    return round(value, 5) if math.isfinite(value) else None
+
+
+def _numbers(values: Sequence[float]) -> list[float | None]:
+    return [_number(v) for v in values]
+
+
+def _rate(window: list[StateReport]) -> float | None:
+    first, last = window[0], window[-1]
+    elapsed_ns = last.stamp_ns - first.stamp_ns
+    return (last.frames_received - first.frames_received) * 1e9 / elapsed_ns if elapsed_ns > 0 else None
+
+
+def _sentence(reason: int) -> str:
+    try:
+        return faults.describe(reason)
+    except ValueError:
+        return f"The controller gives reason {reason & 0xFF}, which this console does not know; run one release."

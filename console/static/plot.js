@@ -1,0 +1,75 @@
+// A small time plot: one line per joint over the last seconds, drawn on a canvas.
+
+const SPAN_S = 20;
+export const LINES = [
+  { color: "#6fdc98", dash: [] },
+  { color: "#ffbe5c", dash: [7, 3] },
+  { color: "#7cc4ff", dash: [2, 3] },
+  { color: "#ff9ec4", dash: [9, 3, 2, 3] },
+  { color: "#d9d2ff", dash: [4, 4] },
+];
+
+/** Keeps samples of `{t, values}` (t in seconds, a value may be null) and draws them; returns `{add}`. */
+export function createPlot(canvas) {
+  const samples = [];
+
+  function add(t, values) {
+    if (samples.length && t < samples.at(-1).t) samples.length = 0;
+    samples.push({ t, values });
+    while (samples[0].t < t - SPAN_S) samples.shift();
+    draw(t);
+  }
+
+  function draw(now) {
+    const ratio = window.devicePixelRatio || 1;
+    const width = canvas.clientWidth, height = canvas.clientHeight;
+    if (!width || !height) return;
+    if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
+    if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
+    const g = canvas.getContext("2d");
+    g.setTransform(ratio, 0, 0, ratio, 0, 0);
+    g.clearRect(0, 0, width, height);
+
+    const left = 44, top = 6, bottom = height - 6;
+    let reach = 5;
+    for (const s of samples) for (const v of s.values) if (v !== null) reach = Math.max(reach, Math.abs(v));
+    const step = niceStep(reach);
+    reach = Math.ceil(reach / step) * step;
+    const x = (t) => left + (1 - (now - t) / SPAN_S) * (width - left - 4);
+    const y = (v) => (top + bottom) / 2 - (v / reach) * (bottom - top) / 2;
+
+    g.font = "11px system-ui, sans-serif";
+    g.textAlign = "right";
+    g.textBaseline = "middle";
+    g.lineWidth = 1;
+    for (let v = -reach; v <= reach + 1e-9; v += step) {
+      g.strokeStyle = Math.abs(v) < 1e-9 ? "#6b8076" : "#26322d";
+      g.beginPath(); g.moveTo(left, y(v)); g.lineTo(width - 4, y(v)); g.stroke();
+      g.fillStyle = "#b4c2ba";
+      g.fillText(String(Math.round(v)), left - 8, y(v));
+    }
+    LINES.forEach((line, j) => {
+      g.strokeStyle = line.color;
+      g.lineWidth = 1.6;
+      g.setLineDash(line.dash);
+      g.beginPath();
+      let down = false;
+      for (const s of samples) {
+        const v = s.values[j];
+        if (v === null) { down = false; continue; }
+        if (down) g.lineTo(x(s.t), y(v)); else g.moveTo(x(s.t), y(v));
+        down = true;
+      }
+      g.stroke();
+    });
+    g.setLineDash([]);
+  }
+
+  return { add };
+}
+
+function niceStep(reach) {
+  const rough = reach / 2;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  return [1, 2, 5, 10].map((m) => m * power).find((s) => s >= rough);
+}

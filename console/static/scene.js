@@ -1,0 +1,213 @@
+// The crane, the ground, the bunk and the logs in three dimensions.  Base frame: metres, z up, reach +y at slew 0.
+
+import * as THREE from "three";
+import { OrbitControls } from "./vendor/OrbitControls.js";
+
+const CRANE = 0xe0a22e, STEEL = 0x8b979f, DARK = 0x39443f, BARK = 0x8a5a35, WOOD = 0xe2b883, GHOST = 0xcfe3ff;
+const UP = new THREE.Vector3(0, 1, 0);
+const VIEWS = {
+  corner: [[6.2, 8.6, 4.2], [0.75, 2.3, 0.1]],
+  top: [[0.6, 2.3, 12], [0.6, 2.31, 0]],
+  side: [[10.5, 2.6, 1.4], [0, 2.6, 0.7]],
+};
+
+const v3 = (p) => new THREE.Vector3(p[0], p[1], p[2]);
+const paint = (color) => new THREE.MeshLambertMaterial({ color });
+
+/** A bar between two movable ends; round or square. */
+class Bar {
+  constructor(parent, radius, color, square = false) {
+    const shape = square
+      ? new THREE.CylinderGeometry(radius * 1.25, radius * 1.25, 1, 4, 1).rotateY(Math.PI / 4)
+      : new THREE.CylinderGeometry(radius, radius, 1, 20, 1);
+    if (square) shape.computeVertexNormals();
+    this.mesh = new THREE.Mesh(square ? shape.toNonIndexed() : shape, paint(color));
+    if (square) this.mesh.geometry.computeVertexNormals();
+    parent.add(this.mesh);
+  }
+  span(a, b) {
+    const along = b.clone().sub(a);
+    this.mesh.position.copy(a).addScaledVector(along, 0.5);
+    this.mesh.scale.y = Math.max(along.length(), 1e-3);
+    this.mesh.quaternion.setFromUnitVectors(UP, along.normalize());
+  }
+}
+
+function ball(parent, radius, color) {
+  const mesh = new THREE.Mesh(new THREE.SphereGeometry(radius, 20, 14), paint(color));
+  parent.add(mesh);
+  return mesh;
+}
+
+class Crane {
+  constructor(parent, machine) {
+    this.machine = machine;
+    this.pedestal = new Bar(parent, 0.3, DARK, true);
+    this.pedestal.span(new THREE.Vector3(0, 0, machine.ground_z_m), new THREE.Vector3(0, 0, 0.05));
+    this.column = new Bar(parent, 0.17, CRANE);
+    this.boom = new Bar(parent, 0.115, CRANE, true);
+    this.stick = new Bar(parent, 0.095, CRANE, true);
+    this.telescope = new Bar(parent, 0.06, STEEL, true);
+    this.link = new Bar(parent, 0.035, STEEL);
+    this.rotator = new Bar(parent, 0.11, DARK);
+    this.body = new Bar(parent, 0.07, CRANE, true);
+    this.pins = [0.15, 0.14, 0.07].map((r) => ball(parent, r, STEEL));
+    this.tongs = [0, 1].map(() => [new Bar(parent, 0.045, CRANE), new Bar(parent, 0.035, STEEL)]);
+    this.knees = [0, 1].map(() => ball(parent, 0.047, CRANE));
+  }
+  update(points, tongs) {
+    const [base, boomPin, stickPin, front, pin, rotator, grapple] = points.map(v3);
+    const axis = pin.clone().sub(front).normalize();
+    const back = front.clone().addScaledVector(axis, -axis.dot(front.clone().sub(stickPin)));
+    this.column.span(base, new THREE.Vector3(0, 0, boomPin.z + 0.1));
+    this.boom.span(boomPin, stickPin);
+    this.stick.span(back, front);
+    this.telescope.span(back, pin);
+    this.link.span(pin, rotator);
+    this.rotator.span(rotator.clone().setZ(rotator.z + 0.1), rotator.clone().setZ(rotator.z - 0.08));
+    [boomPin, stickPin, pin].forEach((p, i) => this.pins[i].position.copy(p));
+    const open = new THREE.Vector3(Math.cos(tongs.yaw_rad), Math.sin(tongs.yaw_rad), 0);
+    const at = (x, below) => pin.clone().addScaledVector(open, x).setZ(pin.z - below);
+    const depth = pin.z - grapple.z;
+    this.body.span(at(-0.3, depth), at(0.3, depth));
+    [-1, 1].forEach((side, i) => {
+      const pivot = at(side * 0.275, depth), tip = at(side * tongs.half_gap_m, tongs.tip_below_m);
+      const outward = Math.max(0.12, 0.5 * Math.abs(tongs.half_gap_m));
+      const knee = at(side * (0.275 + outward), depth + 0.45 * (tongs.tip_below_m - depth));
+      this.tongs[i][0].span(pivot, knee);
+      this.tongs[i][1].span(knee, tip);
+      this.knees[i].position.copy(knee);
+    });
+  }
+}
+
+function addGround(scene, machine) {
+  const z = machine.ground_z_m;
+  const ground = new THREE.Mesh(new THREE.CircleGeometry(14, 64), paint(0x22302a));
+  ground.position.z = z - 0.01;
+  scene.add(ground);
+  const grid = new THREE.GridHelper(20, 20, 0x51655b, 0x33443c);
+  grid.rotation.x = Math.PI / 2;
+  grid.position.z = z;
+  scene.add(grid);
+  const [x, y] = machine.pick_center_m, h = machine.pick_half_size_m;
+  const corners = [[-h, -h], [h, -h], [h, h], [-h, h]].map(([a, b]) => new THREE.Vector3(x + a, y + b, z + 0.01));
+  scene.add(new THREE.LineLoop(
+    new THREE.BufferGeometry().setFromPoints(corners), new THREE.LineBasicMaterial({ color: 0x6fdc98 })));
+}
+
+function addBunk(scene, machine) {
+  const b = machine.bunk;
+  const group = new THREE.Group();
+  group.position.set(b.center_m[0], b.center_m[1], b.floor_z_m);
+  group.rotation.z = b.yaw_rad;
+  const floor = new THREE.Mesh(new THREE.BoxGeometry(b.length_m, b.width_m, 0.1), paint(0x4a5952));
+  floor.position.z = -0.05;
+  group.add(floor);
+  const legs = b.floor_z_m - machine.ground_z_m - 0.1;
+  for (const sx of [-0.35, 0.35]) {
+    for (const sy of [-0.5, 0.5]) {
+      const stake = new Bar(group, 0.045, STEEL, true);
+      const x = sx * b.length_m, y = sy * b.width_m;
+      stake.span(new THREE.Vector3(x, y, 0), new THREE.Vector3(x, y, b.stake_height_m));
+    }
+    const sill = new THREE.Mesh(new THREE.BoxGeometry(0.16, b.width_m, legs), paint(DARK));
+    sill.position.set(sx * b.length_m, 0, -0.1 - legs / 2);
+    group.add(sill);
+  }
+  scene.add(group);
+}
+
+/** Builds the view into `container`; returns `{update(state), view(name)}`.  Throws without WebGL. */
+export function createScene(container, machine) {
+  const renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
+  renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
+  container.replaceChildren(renderer.domElement);
+
+  const scene = new THREE.Scene();
+  const sun = new THREE.DirectionalLight(0xffffff, 2.2);
+  sun.position.set(6, 3, 12);
+  scene.add(new THREE.HemisphereLight(0xe9f5ff, 0x3a4a40, 1.5), sun);
+  addGround(scene, machine);
+  addBunk(scene, machine);
+  const craneGroup = new THREE.Group();
+  craneGroup.visible = false;
+  scene.add(craneGroup);
+  const crane = new Crane(craneGroup, machine);
+  const ghost = new THREE.Line(
+    new THREE.BufferGeometry(), new THREE.LineDashedMaterial({ color: GHOST, dashSize: 0.14, gapSize: 0.08 }));
+  const ghostPin = new THREE.Mesh(
+    new THREE.SphereGeometry(0.12, 12, 8), new THREE.MeshBasicMaterial({ color: GHOST, wireframe: true }));
+  ghost.frustumCulled = false;
+  ghost.visible = ghostPin.visible = false;
+  scene.add(ghost, ghostPin);
+  const logs = new THREE.Group();
+  scene.add(logs);
+
+  const camera = new THREE.PerspectiveCamera(42, 1, 0.1, 80);
+  camera.up.set(0, 0, 1);
+  const controls = new OrbitControls(camera, renderer.domElement);
+  controls.minDistance = 2;
+  controls.maxDistance = 30;
+
+  let asked = false;
+  function draw() {
+    if (asked) return;
+    asked = true;
+    requestAnimationFrame(() => { asked = false; renderer.render(scene, camera); });
+  }
+  controls.addEventListener("change", draw);
+  new ResizeObserver(() => {
+    const { clientWidth: w, clientHeight: h } = container;
+    if (!w || !h) return;
+    renderer.setSize(w, h);
+    camera.aspect = w / h;
+    camera.fov = w > h ? 42 : 58;
+    camera.updateProjectionMatrix();
+    draw();
+  }).observe(container);
+
+  function view(name) {
+    const [position, target] = VIEWS[name];
+    camera.position.set(...position);
+    controls.target.set(...target);
+    controls.update();
+    draw();
+  }
+
+  let logsShown = "";
+  function showLogs(list) {
+    const key = JSON.stringify(list);
+    if (key === logsShown) return;
+    logsShown = key;
+    for (const old of logs.children) old.geometry.dispose();
+    logs.clear();
+    for (const log of list) {
+      const shape = new THREE.CylinderGeometry(log.diameter_m / 2, log.diameter_m / 2, log.length_m, 24);
+      const mesh = new THREE.Mesh(shape, [paint(BARK), paint(WOOD), paint(WOOD)]);
+      mesh.position.copy(v3(log.center_m));
+      mesh.quaternion.setFromUnitVectors(UP, v3(log.axis).normalize());
+      logs.add(mesh);
+    }
+  }
+
+  function update(state) {
+    // An unknown pose is not drawn at all.
+    craneGroup.visible = Boolean(state.points);
+    if (state.points) crane.update(state.points, state.tongs);
+    ghost.visible = Boolean(state.reference_points);
+    ghostPin.visible = ghost.visible && v3(state.reference_points[4]).distanceTo(v3(state.points[4])) > 0.1;
+    if (state.reference_points) {
+      const points = state.reference_points.map(v3);
+      ghost.geometry.dispose();
+      ghost.geometry = new THREE.BufferGeometry().setFromPoints(points);
+      ghost.computeLineDistances();
+      ghostPin.position.copy(points[4]);
+    }
+    showLogs(state.logs);
+    draw();
+  }
+
+  view("corner");
+  return { update, view };
+}

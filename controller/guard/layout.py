@@ -1,0 +1,83 @@
+"""The guard's own reading of ``crane.dbc``, by regular expression: it shares no fault with the codecs.
+
+Reads only what the guard needs: identifier, length, Data IDs, time-out and the bits of little-endian signals.
+Anything missing or of another form stops the start with `GuardConfigError`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Final
+
+_EXTENDED: Final = 1 << 31
+
+
+class GuardConfigError(Exception):
+    """The guard cannot start; the message says what is wrong, where, what to do."""
+
+
+class Field:
+    """One signal: where its bits lie, and raw and physical reading."""
+
+    __slots__ = ("_mask", "_shift", "_sign", "maximum", "minimum", "scale")
+
+    def __init__(self, shift: int, bits: int, signed: bool, scale: float, minimum: float, maximum: float) -> None:
+        self._shift, self._mask = shift, (1 << bits) - 1
+        self._sign = 1 << (bits - 1) if signed else 0
+        self.scale, self.minimum, self.maximum = scale, minimum, maximum
+
+    def raw(self, word: int) -> int:
+        """The raw value in a payload read as a little-endian number."""
+        value = word >> self._shift & self._mask
+        return value - 2 * self._sign if value & self._sign else value
+
+    def put(self, value: int) -> int:
+        """The bits of an unsigned raw value at their place."""
+        return (value & self._mask) << self._shift
+
+    def inside(self, raw: int) -> bool:
+        """Whether a raw value lies in the range that the DBC declares."""
+        return self.minimum - 1e-9 <= raw * self.scale <= self.maximum + 1e-9
+
+
+class Layout:
+    """One message of the DBC."""
+
+    __slots__ = ("data_ids", "fields", "key", "length", "timeout_ns")
+
+    def __init__(self, key: int, length: int, fields: dict[str, Field], data_ids: bytes, timeout_ns: int) -> None:
+        self.key, self.length, self.fields = key, length, fields
+        self.data_ids, self.timeout_ns = data_ids, timeout_ns
+
+
+def read_layouts(path: Path, names: list[str]) -> dict[str, Layout]:
+    """The layouts of the named messages; raises GuardConfigError."""
+    try:
+        text = path.read_text(encoding="cp1252")
+    except OSError as error:
+        raise GuardConfigError(f"{path}: cannot be read: {error.strerror}.") from error
+    return {name: _layout(text, name, path) for name in names}
+
+
+def _layout(text: str, name: str, path: Path) -> Layout:
+    head = re.search(rf"^BO_ (\d+) {name}: (\d+) \w+\n((?: SG_ .*\n)*)", text, re.MULTILINE)
+    if head is None:
+        raise GuardConfigError(f"{path}: message {name} is missing.")
+    number = int(head[1])
+    if number >= _EXTENDED:
+        raise GuardConfigError(f"{path}: {name} has a 29-bit identifier; the guard watches 11-bit ones.")
+    fields = {}
+    for line in head[3].splitlines():
+        match = re.match(r" SG_ (\w+) : (\d+)\|(\d+)@1([+-]) \(([^,]+),([^)]+)\) \[([^|]+)\|([^\]]+)\]", line)
+        if match is None or float(match[6]) != 0.0:
+            raise GuardConfigError(f"{path}: the guard cannot read this signal of {name}: {line.strip()}")
+        fields[match[1]] = Field(
+            int(match[2]), int(match[3]), match[4] == "-", float(match[5]), float(match[7]), float(match[8])
+        )
+    ids = re.search(rf'^BA_ "E2EDataIds" BO_ {number} "([0-9A-F ]+)";', text, re.MULTILINE)
+    timeout = re.search(rf'^BA_ "TimeoutMs" BO_ {number} (\d+);', text, re.MULTILINE)
+    data_ids = bytes.fromhex(ids[1]) if ids else b""
+    if data_ids and len(data_ids) != 16:
+        raise GuardConfigError(f"{path}: {name} needs 16 Data IDs.")
+    return Layout(number, int(head[2]), fields, data_ids, int(timeout[1]) * 1_000_000 if timeout else 0)

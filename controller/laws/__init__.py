@@ -1,0 +1,1 @@
+"""Control laws: a law may clip, the supervisor never does."""

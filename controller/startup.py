@@ -1,0 +1,202 @@
+"""Start-up of the encoders: identity, range, TPDO1 mapping, heartbeat, then NMT start; one SDO at a time per
+node.
+
+A state machine that advances by at most one request per tick over all nodes, so that no tick is long and the
+bus stays free.  A node is asked once its heartbeat or boot-up frame was seen.  300 ms per request, 3
+tries.  A node that restarts is set up again.  Failures are a `Reason` with the node number; an absent node is
+waited for, a wrong one is not asked again before a reset.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+from can_dbc.canopen import (
+    NmtCommand,
+    Sdo,
+    SdoKind,
+    Wire,
+    download_request,
+    nmt_frame,
+    parse_response,
+    upload_request,
+)
+from controller.faults import Reason
+from machine.joints import JOINTS
+from machine.profile import Encoder, Profile, joint
+
+TIMEOUT_NS: Final = 300_000_000
+TRIES: Final = 3
+HEARTBEAT_MS: Final = 100
+_TPDO1: Final = 0x180
+_DISABLED: Final = 0x8000_0000
+# CiA 406 mappings of can_bus.md section 3: index(16) sub(8) bits(8).
+_MAPPINGS: Final = {
+    "rotary": (0x6004_0020, 0x2120_0010, 0x6503_0010),
+    "linear": (0x6004_0020, 0x6030_0110, 0x5122_0108, 0x5122_0208),
+}
+
+
+class Request(NamedTuple):
+    """One SDO: a write of ``size`` bytes, or with size 0 a read to compare (``value`` None: to note)."""
+
+    entry: int
+    sub: int
+    value: int | None
+    size: int = 0
+
+
+def sequence(encoder: Encoder) -> tuple[Request, ...]:
+    """The SDO requests that set up one encoder, in order."""
+    cob = _TPDO1 + encoder.node
+    if encoder.kind == "rotary":
+        scale = Request(0x6001, 0, encoder.total_counts)
+    else:
+        scale = Request(0x6005, 1, round(encoder.unit_per_count * 1e9))  # nm per step
+    mapping = _MAPPINGS[encoder.kind]
+    return (
+        Request(0x1000, 0, encoder.device_type),
+        Request(0x1018, 1, None),
+        scale,
+        Request(0x6002, 0, encoder.total_counts),
+        Request(0x1800, 1, _DISABLED | cob, 4),
+        Request(0x1A00, 0, 0, 1),
+        *(Request(0x1A00, i, word, 4) for i, word in enumerate(mapping, 1)),
+        Request(0x1A00, 0, len(mapping), 1),
+        Request(0x1800, 2, 1, 1),
+        Request(0x1800, 1, cob, 4),
+        Request(0x1017, 0, HEARTBEAT_MS, 2),
+        Request(0x1A00, 0, len(mapping)),
+    )
+
+
+class Phase(IntEnum):
+    """Where the set-up of one node stands."""
+
+    SILENCING = 0
+    """To be sent to pre-operational, so that its PDOs are silent."""
+    ASKING = 1
+    STARTING = 2
+    READY = 3
+    FAILED = 4
+
+
+class EncoderSetup:
+    """Set-up of one encoder node."""
+
+    __slots__ = ("_deadline_ns", "_step", "_tries", "_vendor", "node", "phase", "reason", "requests")
+
+    def __init__(self, encoder: Encoder) -> None:
+        self.node = encoder.node
+        self.requests = sequence(encoder)
+        self._vendor: int | None = None
+        self.restart()
+
+    def restart(self) -> None:
+        """Begins again."""
+        self.phase = Phase.SILENCING
+        self.reason = Reason.NODE_ABSENT
+        self._step = self._tries = self._deadline_ns = 0
+
+    def frame(self, now_ns: int) -> Wire | None:
+        """The frame this node is due, if any."""
+        if self.phase is Phase.SILENCING:
+            self.phase = Phase.ASKING
+            return nmt_frame(NmtCommand.ENTER_PRE_OPERATIONAL, self.node)
+        if self.phase is Phase.STARTING:
+            self.phase, self.reason = Phase.READY, Reason.NONE
+            return nmt_frame(NmtCommand.START, self.node)
+        if self.phase is not Phase.ASKING or now_ns < self._deadline_ns:
+            return None
+        if self._tries == TRIES:
+            self.restart()
+            return None
+        self._tries += 1
+        self._deadline_ns = now_ns + TIMEOUT_NS
+        index, sub, value, size = self.requests[self._step]
+        if size and value is not None:
+            return download_request(self.node, index, sub, value.to_bytes(size, "little"))
+        return upload_request(self.node, index, sub)
+
+    def answer(self, response: Sdo) -> None:
+        """Takes a response; one that does not belong to the open request is ignored."""
+        index, sub, value, size = self.requests[self._step]
+        asked = self.phase is Phase.ASKING and self._tries > 0
+        if not asked or (response.index, response.sub) != (index, sub):
+            return
+        if response.kind is not (SdoKind.DOWNLOAD if size else SdoKind.UPLOAD):
+            self._fail(Reason.NODE_CONFIGURATION)
+            return
+        if not size:
+            got = response.unsigned
+            if value is None:  # the vendor: remembered, so that a device swapped at run time is noticed
+                value = self._vendor = got if self._vendor is None else self._vendor
+            if got != value:
+                self._fail(Reason.NODE_IDENTITY)
+                return
+        self._step += 1
+        self._tries = self._deadline_ns = 0
+        if self._step == len(self.requests):
+            self.phase, self._step = Phase.STARTING, 0
+
+    def _fail(self, reason: Reason) -> None:
+        self.phase, self.reason = Phase.FAILED, reason
+
+
+class Startup:
+    """Set-up of all encoders; `step` gives the frames to send."""
+
+    __slots__ = ("_by_node", "_released", "_setups", "_turn")
+
+    def __init__(self, profile: Profile) -> None:
+        encoders = [joint(profile, j).encoder for j in JOINTS]
+        self._setups = [EncoderSetup(e) for e in encoders if e is not None]
+        self._by_node = {s.node: s for s in self._setups}
+        self._turn = 0
+        self._released = False
+
+    @property
+    def complete(self) -> bool:
+        """Whether every encoder is set up and started."""
+        return all(s.phase is Phase.READY for s in self._setups)
+
+    def problem(self) -> tuple[Reason, int]:
+        """Why it is not complete: the worst reason and its node."""
+        worst = max(self._setups, key=lambda s: s.reason, default=None)
+        return (worst.reason, worst.node) if worst is not None and worst.reason else (Reason.NONE, 0)
+
+    def reset(self) -> None:
+        """An operator's reset: failed nodes are tried again."""
+        for setup in self._setups:
+            if setup.phase is Phase.FAILED:
+                setup.restart()
+
+    def receive(self, key: int, data: bytes) -> bool:
+        """Takes a frame; True when it was an SDO answer of one of our encoders."""
+        response = parse_response(key, data)
+        setup = None if response is None else self._by_node.get(response.node)
+        if response is None or setup is None:
+            return False
+        setup.answer(response)
+        return True
+
+    def booted(self, node: int) -> None:
+        """A boot-up frame: the set-up of this node is gone."""
+        setup = self._by_node.get(node)
+        if setup is not None:
+            setup.restart()
+
+    def step(self, now_ns: int, frames: list[Wire]) -> None:
+        """Appends what this tick has to say: at most one frame."""
+        n = len(self._setups)
+        for k in range(n):
+            frame = self._setups[(self._turn + k) % n].frame(now_ns)
+            if frame is not None:
+                self._turn = (self._turn + k + 1) % n
+                self._released = False
+                frames.append(frame)
+                return
+        if self.complete and not self._released:
+            self._released = True
+            frames.append(nmt_frame(NmtCommand.START))

@@ -1,0 +1,107 @@
+"""The reference between the planner's knots: cubic Hermite curves, evaluated at any time without allocation.
+
+Inputs: an accepted crane setpoint; a time.  Outputs: position and velocity of every joint at that time, and
+the extremes of a piece of curve.  Before the first knot the curve goes on linearly, after the last it rests
+at the last position.  Nothing here judges.
+"""
+
+from __future__ import annotations
+
+from array import array
+from typing import Final
+
+from can_dbc.setpoint import MAX_KNOTS, CraneSetpoint
+from machine.joints import N_JOINTS
+
+_NS: Final = 1e-9
+
+
+class Trajectory:
+    """Knot storage of fixed size and the cubic between them."""
+
+    __slots__ = ("_n", "_position", "_times_ns", "_velocity")
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._times_ns = array("q", [0] * MAX_KNOTS)
+        self._position = array("d", [0.0] * (MAX_KNOTS * N_JOINTS))
+        self._velocity = array("d", [0.0] * (MAX_KNOTS * N_JOINTS))
+
+    def load(self, setpoint: CraneSetpoint) -> None:
+        """Takes the knots of a decoded setpoint (1 to 16, times strictly growing)."""
+        self._n = len(setpoint.knots)
+        for i, knot in enumerate(setpoint.knots):
+            self._times_ns[i] = setpoint.stamp_ns + knot.after_ns
+            for joint in range(N_JOINTS):
+                self._position[i * N_JOINTS + joint] = knot.position[joint]
+                self._velocity[i * N_JOINTS + joint] = knot.velocity[joint]
+
+    @property
+    def end_ns(self) -> int:
+        """Time of the last knot."""
+        return self._times_ns[self._n - 1]
+
+    @property
+    def ends_at_rest(self) -> bool:
+        """Whether the last knot has no velocity."""
+        first = (self._n - 1) * N_JOINTS
+        return not any(self._velocity[first : first + N_JOINTS])
+
+    def sample(self, joint: int, now_ns: int) -> tuple[float, float]:
+        """Position and velocity of a joint at ``now_ns`` (rad or m, per second)."""
+        times, n = self._times_ns, self._n
+        if now_ns <= times[0]:
+            velocity = self._velocity[joint]
+            return self._position[joint] + velocity * (now_ns - times[0]) * _NS, velocity
+        last = (n - 1) * N_JOINTS + joint
+        if now_ns > times[n - 1]:
+            return self._position[last], 0.0
+        k = 1
+        while times[k] < now_ns:
+            k += 1
+        b = k * N_JOINTS + joint
+        a = b - N_JOINTS
+        h = (times[k] - times[k - 1]) * _NS
+        return hermite(
+            self._position[a], self._velocity[a], self._position[b], self._velocity[b],
+            h, (now_ns - times[k - 1]) * _NS / h,
+        )  # fmt: skip
+
+
+def hermite(p0: float, v0: float, p1: float, v1: float, h: float, s: float) -> tuple[float, float]:
+    """Position and velocity at the fraction ``s`` of a cubic from (p0, v0) to (p1, v1) in ``h`` seconds."""
+    c2 = 3.0 * (p1 - p0) - h * (2.0 * v0 + v1)
+    c3 = h * (v0 + v1) - 2.0 * (p1 - p0)
+    return p0 + s * (h * v0 + s * (c2 + s * c3)), v0 + s * (2.0 * c2 + 3.0 * s * c3) / h
+
+
+def peak_speed(p0: float, v0: float, p1: float, v1: float, h: float) -> float:
+    """Greatest speed on the cubic: its velocity is a parabola, so the ends or the vertex have it."""
+    c2 = 3.0 * (p1 - p0) - h * (2.0 * v0 + v1)
+    c3 = h * (v0 + v1) - 2.0 * (p1 - p0)
+    peak = max(abs(v0), abs(v1))
+    if c3 != 0.0:
+        s = -c2 / (3.0 * c3)
+        if 0.0 < s < 1.0:
+            peak = max(peak, abs(v0 + s * (2.0 * c2 + 3.0 * s * c3) / h))
+    return peak
+
+
+def extremes(p0: float, v0: float, p1: float, v1: float, h: float) -> tuple[float, float]:
+    """Least and greatest position on the cubic: the ends or where its velocity is zero."""
+    c2 = 3.0 * (p1 - p0) - h * (2.0 * v0 + v1)
+    c3 = h * (v0 + v1) - 2.0 * (p1 - p0)
+    low, high = min(p0, p1), max(p0, p1)
+    a, b, c = 3.0 * c3, 2.0 * c2, h * v0
+    discriminant = b * b - 4.0 * a * c
+    if discriminant < 0.0:
+        return low, high
+    # The form with q has no cancellation and needs no special case for a parabola that is nearly a line.
+    q = -0.5 * (b + discriminant**0.5) if b >= 0.0 else -0.5 * (b - discriminant**0.5)
+    for numerator, denominator in ((q, a), (c, q)):
+        if denominator != 0.0:
+            s = numerator / denominator
+            if 0.0 < s < 1.0:
+                p = p0 + s * (h * v0 + s * (c2 + s * c3))
+                low, high = min(low, p), max(high, p)
+    return low, high

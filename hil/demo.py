@@ -1,0 +1,115 @@
+"""The first job, live or in lockstep: one log from the ground into the bunk of the PALMS 4.71 test-bed (paper A)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+
+from autonomy.activity import Activity
+from can_dbc.setpoint import OperatorAction, StateReport
+from controller.config import Settings
+from controller.faults import describe
+from controller.guard.__main__ import build as build_guard
+from controller.guard.__main__ import profile_path
+from hil.display import Display
+from hil.live import LiveOptions, LiveRun
+from hil.lockstep import START_NS, Lockstep, Observer
+from hil.operator import Operator
+from hil.summary import Summary, verdict_sentence
+from machine.load import load_profile, profile_hash
+from machine.modes import Mode
+from machine.profile import Profile
+from recorder.manifest import describe as describe_run
+from recorder.recorder import Recorder
+from sim.plant import Plant
+
+SETTLE_NS: Final = 3_000_000_000
+
+
+def run_live(
+    name: str, seed: int, truth: str, bus: str, directory: Path, page: int, limit_s: float, console: Console
+) -> Summary:
+    """The job as separate processes in real time."""
+    profile = load_profile(name)
+    directory.mkdir(parents=True, exist_ok=True)
+    options = LiveOptions(name, profile, seed, truth, bus, directory, page, limit_s)
+    with Display(console, f"{profile.title}: one log into the bunk, live, seed {seed}") as display:
+        return LiveRun(options, display).run()
+
+
+def run_lockstep(name: str, seed: int, truth: str, directory: Path, limit_s: float, console: Console) -> Summary:
+    """The job in one process on virtual time; the same seed leaves the same bytes in ``directory``."""
+    profile = load_profile(name)
+    with Display(console, f"{profile.title}: one log into the bunk, lockstep, seed {seed}") as display:
+        recorder = Recorder(directory, profile, describe_run(profile, (profile.crane_bus,), seed))
+        try:
+            return _Job(name, profile, seed, truth, recorder, display).run(limit_s, str(directory))
+        finally:
+            recorder.close()
+
+
+class _Job:
+    """Lockstep run with a display: says what changes, ends when the planner does."""
+
+    def __init__(
+        self, name: str, profile: Profile, seed: int, truth: str, recorder: Recorder | None, display: Display
+    ) -> None:
+        settings = Settings(profile, profile_hash(profile), profile.rate_hz)
+        self._display = display
+        self._mode: int = -1
+        self._phase = ""
+        self.activity = Activity(profile, profile_hash(profile))
+        self.system = Lockstep(
+            settings,
+            build_guard(profile_path(name)),
+            Plant(profile, seed=seed, truth=truth),
+            self.activity,
+            Operator(profile_hash(profile), self._pressed),
+            Observer(recorder, [self._reported]),
+        )
+
+    def run(self, limit_s: float, directory: str) -> Summary:
+        system, activity = self.system, self.activity
+        limit_ns = START_NS + int(limit_s * 1e9)
+        while not activity.done and not activity.failure and system.now_ns < limit_ns:
+            system.advance()
+            if system.operator.gave_up:
+                break
+            if activity.phase.name != self._phase:
+                self._phase = activity.phase.name
+                self._display.phase(self._phase)
+        finished_ns = system.now_ns
+        verdict = system.plant.judge()
+        while not verdict.success and system.now_ns < finished_ns + SETTLE_NS:
+            system.advance()
+            verdict = system.plant.judge()
+        report = system.report
+        return Summary(
+            in_bunk=verdict.success,
+            verdict=verdict_sentence(asdict(verdict)),
+            failure=activity.failure or ("" if activity.done else f"not done within {limit_s:.0f} s"),
+            seconds=(finished_ns - START_NS) / 1e9,
+            stops=system.operator.stops,
+            ticks=system.ticks,
+            missed_ticks=0,
+            frames=system.frames,
+            refused_setpoints=report.refused if report else 0,
+            directory=directory,
+        )
+
+    def _reported(self, report: StateReport) -> None:
+        if report.mode != self._mode:
+            self._mode = report.mode
+            mode = Mode(report.mode)
+            stopped = mode in (Mode.STOP, Mode.FAULT)
+            self._display.event(
+                f"{mode.name}: {describe(report.reason)}" if stopped else f"controller {mode.name}",
+                "yellow" if stopped else "",
+            )
+        self._display.report(report)
+
+    def _pressed(self, action: OperatorAction, _: StateReport) -> None:
+        self._display.event(f"operator presses {action.name}", "magenta")

@@ -1,0 +1,230 @@
+"""The whole machine as separate processes on a real-time bus: the wire on any host, or vcan where the kernel has CAN.
+
+Starts wire (if used), recorder, plant, guard, controller, console and planner, shows what they say, plays the operator,
+asks the plant for its verdict and ends everything in an order that leaves the valves neutral and the logs complete.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from can_dbc import setpoint
+from can_dbc.bus import VCAN_NAMES, default_address
+from controller.faults import describe
+from hil.display import Display
+from hil.exits import Exit, Stopped
+from hil.operator import Operator
+from hil.processes import Family, free_udp_ports
+from hil.summary import Summary, verdict_sentence
+from machine.load import profile_hash
+from machine.modes import Mode
+from machine.profile import Profile
+
+HOST: Final = "127.0.0.1"
+BITRATES: Final = {"crane0": 1_000_000, "mach0": 250_000}
+END_ORDER: Final = ("autonomy", "controller", "guard", "console", "sim", "recorder", "wire")
+SETTLE_S: Final = 3.0
+HARDWARE_PRIORITY: Final = {"wire": 60, "sim": 50}
+"""SCHED_FIFO priorities below those of controller and guard."""
+
+
+def _address(name: str, backend: str) -> str:
+    """Where a logical bus is on the chosen backend: wire, vcan, or what the host offers."""
+    match backend:
+        case "wire":
+            return f"wire:{name}"
+        case "vcan":
+            return f"socketcan:{VCAN_NAMES[name]}"
+        case _:
+            return default_address(name)
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """What a live run is told; ``bus`` is "wire", "vcan" or "auto", ``console_port`` 0 means no page."""
+
+    profile_name: str
+    profile: Profile
+    seed: int
+    truth: str
+    bus: str
+    directory: Path
+    console_port: int
+    limit_s: float
+
+
+class LiveRun:
+    """One live run (module docstring: contract)."""
+
+    def __init__(self, options: LiveOptions, display: Display) -> None:
+        self._options = options
+        self._display = display
+        self._family = Family(options.directory)
+        self._report: setpoint.StateReport | None = None
+        self._first: setpoint.StateReport | None = None
+        self._failure = ""
+        self._done = False
+        self._operator = Operator(profile_hash(options.profile), self._pressed)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((HOST, 0))
+        self._socket.settimeout(0.02)
+
+    def run(self) -> Summary:
+        """Do the job and end every process, whatever happens.
+
+        Raises:
+            Stopped: when a process cannot start or dies.
+            KeyboardInterrupt: after everything has ended.
+        """
+        try:
+            ports = self._start()
+            self._follow(ports)
+            return self._summary(ports["sim"])
+        finally:
+            self._family.stop_all(END_ORDER)
+            self._socket.close()
+
+    def _start(self) -> dict[str, int]:
+        options, start = self._options, self._family.start
+        profile = options.profile
+        buses = [b for b in (profile.crane_bus, profile.machine_bus) if b]
+        wanted = [_address(b, options.bus) for b in buses]
+        if any(address.startswith("wire:") for address in wanted):
+            start("wire", "hil.wire.daemon", *(x for b in buses for x in ("--bus", f"{b}:{BITRATES[b]}")))
+            self._family.await_message("wire", "ready", 10)
+        addresses = [f"{b}={address}" for b, address in zip(buses, wanted, strict=True)]
+        names = ("control", "planner", "page", "record_tick", "record_report", "sim")
+        ports = dict(zip(names, free_udp_ports(len(names)), strict=True))
+        bus = [x for a in addresses for x in ("--bus", a)]
+        common = ("--profile", options.profile_name)
+        start(
+            "recorder", "recorder", *common, *bus, "--out", options.directory, "--seed", options.seed,
+            "--tick-port", ports["record_tick"], "--report-port", ports["record_report"],
+        )  # fmt: skip
+        start(
+            "sim", "sim", *common, *bus,
+            "--seed", options.seed, "--truth", options.truth, "--port", ports["sim"],
+        )  # fmt: skip
+        self._family.await_message("recorder", "ready", 20)
+        self._family.await_message("sim", "ready", 30)
+        # Emulated hardware must answer in time like hardware; controller and guard ask for more by themselves.
+        emulated = [name for name in HARDWARE_PRIORITY if name in self._family.children]
+        granted = [self._family.hasten(name, HARDWARE_PRIORITY[name]) for name in emulated]
+        if not all(granted):
+            self._display.event("no real-time priority here: a busy host may stop the machine", "yellow")
+        start("guard", "controller.guard", *common, *bus)
+        listeners = [self._socket.getsockname()[1], ports["planner"], ports["record_report"]]
+        if options.console_port:
+            listeners.append(ports["page"])
+            start(
+                "console", "console", *common, "--port", options.console_port,
+                "--report-port", ports["page"], "--controller", f"{HOST}:{ports['control']}",
+                "--scene", f"{HOST}:{ports['sim']}",
+            )  # fmt: skip
+        start(
+            "controller", "controller", *common, *bus, "--setpoint-port", ports["control"],
+            "--record", f"{HOST}:{ports['record_tick']}",
+            *(x for port in listeners for x in ("--report", f"{HOST}:{port}")),
+        )  # fmt: skip
+        start(
+            "autonomy", "autonomy", *common, "--controller", f"{HOST}:{ports['control']}",
+            "--report-port", ports["planner"], "--scene", f"{HOST}:{ports['sim']}",
+        )  # fmt: skip
+        return ports
+
+    def _follow(self, ports: dict[str, int]) -> None:
+        """Show and supervise until the planner is through, or a process dies, or time is up."""
+        limit = time.monotonic() + self._options.limit_s
+        while not (self._done or self._failure or self._operator.gave_up):
+            if time.monotonic() > limit:
+                self._failure = f"not done within {self._options.limit_s:.0f} s"
+            self._listen(ports["control"])
+            for name, message in self._family.messages():
+                self._heard(name, message)
+            gone = self._family.dead()
+            if gone and not (gone.name == "autonomy" and (self._done or self._failure)):
+                code = gone.process.returncode
+                raise Stopped(
+                    Exit(code) if code in set(Exit) and code else Exit.SAFETY,
+                    f"{gone.name} ended in the middle of the run: {gone.complaint()}",
+                )
+
+    def _listen(self, control_port: int) -> None:
+        try:
+            message = setpoint.decode(self._socket.recv(2048))
+        except (TimeoutError, setpoint.DatagramRefused):
+            return
+        if not isinstance(message, setpoint.StateReport):
+            return
+        if self._first is None:
+            self._first = message
+        if self._report is None or self._report.mode != message.mode:
+            self._say_mode(message)
+        self._report = message
+        self._display.report(message)
+        if press := self._operator.step(message):
+            self._socket.sendto(press, (HOST, control_port))
+
+    def _say_mode(self, report: setpoint.StateReport) -> None:
+        mode = Mode(report.mode)
+        if mode in (Mode.STOP, Mode.FAULT):
+            self._display.event(f"{mode.name}: {describe(report.reason)}", "yellow")
+        else:
+            self._display.event(f"controller {mode.name}")
+
+    def _pressed(self, action: setpoint.OperatorAction, _: setpoint.StateReport) -> None:
+        self._display.event(f"operator presses {action.name}", "magenta")
+
+    def _heard(self, name: str, message: dict[str, Any]) -> None:
+        match name, message.get("event"):
+            case "autonomy", "phase":
+                self._display.phase(str(message["phase"]))
+            case "autonomy", "done":
+                self._done = True
+            case "autonomy", "failed":
+                self._failure = str(message["reason"])
+            case "autonomy", "refused":
+                self._display.event(f"setpoint refused: {describe(int(message['number']))}", "yellow")
+            case "autonomy", "detector":
+                self._display.event(f"detector: {message['reason']}", "yellow")
+            case "console", _ if "url" in message:
+                self._display.event(f"watch it at {message['url']}", "bold")
+
+    def _summary(self, sim_port: int) -> Summary:
+        self._display.event("waiting for the plant's verdict")
+        limit = time.monotonic() + SETTLE_S
+        verdict = self._ask(sim_port, "verdict")
+        while not verdict["success"] and time.monotonic() < limit:
+            time.sleep(0.2)
+            verdict = self._ask(sim_port, "verdict")
+        first, last = self._first, self._report
+        seconds = (last.stamp_ns - first.stamp_ns) / 1e9 if first and last else 0.0
+        return Summary(
+            in_bunk=bool(verdict["success"]),
+            verdict=verdict_sentence(verdict),
+            failure=self._failure,
+            seconds=seconds,
+            stops=self._operator.stops,
+            ticks=round(seconds * self._options.profile.rate_hz),
+            missed_ticks=last.missed_ticks if last else 0,
+            frames=last.frames_received if last else 0,
+            refused_setpoints=last.refused if last else 0,
+            directory=str(self._options.directory),
+        )
+
+    def _ask(self, port: int, op: str) -> dict[str, Any]:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+            asking.settimeout(1.0)
+            for _ in range(5):
+                asking.sendto(json.dumps({"op": op}).encode(), (HOST, port))
+                try:
+                    answer: dict[str, Any] = json.loads(asking.recv(65536))
+                    return answer
+                except TimeoutError:
+                    continue
+        raise Stopped(Exit.CONFIGURATION, "the plant does not answer; see sim.err")

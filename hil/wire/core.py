@@ -1,0 +1,324 @@
+"""One CAN bus in time, without a clock or a socket: arbitration, bit times, error counters, bus-off.
+
+Time is an integer number of ns that only `WireCore.advance` moves.  A frame starts at the first moment at
+which the bus is idle and a frame is pending; of all that are pending then, the arbitration field decides.
+Frames submitted at the present moment all take part in the arbitration at that moment, whatever the order
+of the calls.  Receivers get a frame at its last bit.
+
+Model (ISO 11898-1): each participant sends its queue in order, as a SocketCAN queue does.  A frame that
+nobody acknowledges or whose CRC fails is destroyed by an error frame and sent again; the transmit error
+counter rises by 8, the receive counter by 1, and each good frame takes 1 off.  96 warns, 128 is error
+passive (8 bits of pause after an own frame; a missing acknowledge no longer counts), above 255 the node is
+off the bus, loses its queue, and comes back `restart_ns` later (0: never).  Error frames reach the receive
+queue of the node concerned as SocketCAN reports them.  Simplified: error frames take their least length (14
+bits); two equal arbitration fields at the same moment go out one after the other instead of colliding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from heapq import heapify, heappop, heappush
+from itertools import count
+from typing import Final
+
+from can_dbc.bus import ERR_ACK, ERR_BUSERROR, ERR_PROT, ERR_RESTARTED, BusState
+from can_dbc.frame import ERROR, Frame
+from hil.wire.faults import Damage, Fault, Kind
+from hil.wire.node import Flight, Node, Pending, Segment
+from hil.wire.stuffing import frame_bits, priority
+
+END_BITS: Final = 10  # CRC delimiter, acknowledge slot and delimiter, end of frame
+SPACE_BITS: Final = 3
+ERROR_BITS: Final = 2 + 14  # up to the acknowledge slot, then error flag and delimiter
+SUSPEND_BITS: Final = 8
+RESTART_BITS: Final = 128 * 11  # recessive bits a node counts before it takes part again
+
+
+class WireCore:
+    """One bus (module docstring).  `bitrate` in bit/s must divide 10**9."""
+
+    def __init__(self, bitrate: int, name: str = "wire", restart_ns: int = 100_000_000) -> None:
+        if bitrate <= 0 or 1_000_000_000 % bitrate:
+            raise ValueError(f"A bit of wire {name} at {bitrate} bit/s is not a whole number of ns long.")
+        self.name = name
+        self.bitrate = bitrate
+        self.bit_ns = 1_000_000_000 // bitrate
+        self.restart_ns = restart_ns
+        self.now_ns = 0
+        self.busy_ns = 0
+        """Bus time used by frames, error frames and the space after each; the bus load over a span is the
+        growth of this by the growth of `now_ns`."""
+        self.errors = 0
+        """Frames destroyed by an error frame."""
+        self.nodes: list[Node] = []
+        self._main = Segment()
+        self._segments = [self._main]
+        self._damage = Damage()
+        self._cuts: list[Fault] = []
+        self._events: list[tuple[int, int, Callable[[], None], bool]] = []
+        self._order = count()
+        self._finished: list[tuple[Node, Frame]] = []
+
+    # -- participants
+
+    def attach(
+        self,
+        name: str,
+        *,
+        keys: Iterable[int] | None = None,
+        receive_own: bool = False,
+        queue_limit: int = 10,
+        rx_limit: int = 1024,
+    ) -> Node:
+        """Adds a participant at the present moment; `keys` are the exact keys it receives (None: all)."""
+        node = Node(name, keys, receive_own, queue_limit, rx_limit)
+        self.nodes.append(node)
+        self._place(node)
+        return node
+
+    def detach(self, node: Node) -> None:
+        """Removes a participant; its pending frames and a frame it is sending are lost."""
+        self.nodes.remove(node)
+        node.queue.clear()
+        self._leave(node)
+
+    def retire(self, node: Node) -> None:
+        """Removes a participant that wants to hear no more, once its pending frames are out; at once when
+        nobody acknowledges them."""
+        node.keys, node.rx_limit, node.retiring = frozenset(), 0, True
+        if not node.queue or node.tec > 127:
+            self.detach(node)
+
+    def submit(self, node: Node, key: int, data: bytes) -> bool:
+        """Queues a frame at the present moment; False when the queue is full, the node is bus-off, or it is
+        no frame (more than 8 bytes, an error key)."""
+        if len(node.queue) >= node.queue_limit or node.state is BusState.OFF or key & ERROR or len(data) > 8:
+            node.refused += 1
+            return False
+        node.queue.append(Pending(self.now_ns, priority(key), key, data))
+        return True
+
+    def restart(self, node: Node) -> None:
+        """Brings a node that is bus-off back, as ``ip link set can0 type can restart`` does."""
+        if node.state is BusState.OFF and node in self.nodes:
+            node.tec = node.rec = 0
+            node.state = BusState.ACTIVE
+            self._place(node)
+            node.hold_ns = self.now_ns + RESTART_BITS * self.bit_ns
+            self._report(node, self.now_ns, ERR_RESTARTED)
+
+    def inject(self, fault: Fault) -> None:
+        """Puts a fault on the wire; it acts within its window, from now on at the earliest."""
+        if fault.kind is Kind.CUT:
+            self._at(fault.start_ns, lambda: self._cut(fault), of_fault=True)
+            self._at(fault.end_ns, lambda: self._mend(fault), of_fault=True)
+        elif fault.kind is Kind.BABBLE:
+            self._at(fault.start_ns, lambda: self._babble(fault), of_fault=True)
+        else:
+            self._damage.add(fault)
+
+    def heal(self) -> None:
+        """Takes every fault off the wire, those to come included."""
+        self._damage.clear()
+        self._events = [event for event in self._events if not event[3]]
+        heapify(self._events)
+        for fault in self._cuts[:]:
+            self._mend(fault)
+        for node in [node for node in self.nodes if node.refill_ns is not None]:
+            self.detach(node)
+
+    # -- time
+
+    def advance(self, to_ns: int) -> list[tuple[Node, Frame]]:
+        """Moves time on; returns (sender, frame) of every frame that ended, in order.
+
+        Frames may start before `to_ns`, not at it.  Raises ValueError when time would run back.
+        """
+        if to_ns < self.now_ns:
+            raise ValueError(f"Wire {self.name} is at {self.now_ns} ns and cannot go back to {to_ns} ns.")
+        while True:
+            for segment in self._segments[:]:
+                self._run(segment, to_ns)
+            if not self._events or self._events[0][0] > to_ns:
+                break
+            at_ns, _, action, _ = heappop(self._events)
+            self.now_ns = max(self.now_ns, at_ns)
+            action()
+        self.now_ns = to_ns
+        finished, self._finished = self._finished, []
+        return finished
+
+    def next_ns(self) -> int | None:
+        """When something happens next if nobody submits anything; None: never."""
+        times = [event[0] for event in self._events[:1]]
+        for segment in self._segments:
+            if segment.flight:
+                times.append(segment.flight.end_ns)
+            elif len(segment.nodes) != 1 or segment.nodes[0].tec < 128:  # else it tries in vain for ever
+                times.extend(node.ready_ns(segment) + 1 for node in segment.nodes if node.queue)
+        return min(times, default=None)
+
+    def _at(self, at_ns: int, action: Callable[[], None], of_fault: bool = False) -> None:
+        heappush(self._events, (max(at_ns, self.now_ns), next(self._order), action, of_fault))
+
+    # -- the bus
+
+    def _run(self, segment: Segment, to_ns: int) -> None:
+        """Runs one segment up to `to_ns` or to the next event, which it may itself have scheduled."""
+        events = self._events
+        while True:
+            limit_ns = events[0][0] if events and events[0][0] < to_ns else to_ns
+            flight = segment.flight
+            if flight is not None:
+                if flight.end_ns > limit_ns:
+                    return
+                segment.flight = None
+                self._finish(segment, flight)
+                continue
+            start_ns = limit_ns
+            winner = None
+            for node in segment.nodes:
+                if node.queue:
+                    ready_ns = node.ready_ns(segment)
+                    if ready_ns < start_ns or (
+                        ready_ns == start_ns and winner and node.queue[0].priority < winner.queue[0].priority
+                    ):
+                        start_ns, winner = ready_ns, node
+            if winner is None:
+                return
+            self._start(segment, winner, start_ns, limit_ns)
+
+    def _start(self, segment: Segment, sender: Node, start_ns: int, limit_ns: int) -> None:
+        frame = sender.queue[0]
+        alone = len(segment.nodes) == 1
+        verdict = None
+        if self._damage:
+            verdict = self._damage.judge(start_ns, sender.name, frame.key, frame.data)
+        destroyed = alone or (verdict is not None and verdict.error)
+        bits = frame_bits(frame.key, frame.data) + (ERROR_BITS if destroyed else END_BITS)
+        if alone and sender.tec > 127:
+            # Nothing changes from try to try: take all that fit in one step.
+            period_ns = (bits + SPACE_BITS + SUSPEND_BITS) * self.bit_ns
+            tries = max(1, (limit_ns - start_ns) // period_ns)
+            self.errors += tries
+            sender.hold_ns = start_ns + tries * period_ns
+            if segment is self._main:
+                self.busy_ns += tries * (bits + SPACE_BITS) * self.bit_ns
+            return
+        end_ns = start_ns + bits * self.bit_ns
+        segment.free_ns = end_ns + SPACE_BITS * self.bit_ns
+        if segment is self._main:
+            self.busy_ns += segment.free_ns - start_ns
+        segment.flight = Flight(end_ns, sender, frame, alone, verdict)
+
+    def _finish(self, segment: Segment, flight: Flight) -> None:
+        end_ns, sender, frame, alone, verdict = flight
+        if alone or (verdict is not None and verdict.error):
+            self._destroy(segment, flight)
+        else:
+            sender.queue.popleft()
+            sender.done += 1
+            if sender.refill_ns is not None:
+                sender.queue.append(frame._replace(ready_ns=end_ns + sender.refill_ns))
+            for node in segment.nodes:
+                if node is sender:
+                    if node.tec:
+                        node.tec -= 1
+                        self._report(node, end_ns)
+                elif node.rec:
+                    node.rec = min(node.rec - 1, 127)
+                    self._report(node, end_ns)
+            if verdict is None:
+                self._deliver(segment, sender, Frame(end_ns, frame.key, frame.data))
+            else:
+                for offset_ns in verdict.offsets_ns:
+                    late = Frame(end_ns + offset_ns, frame.key, verdict.data)
+                    self._at(late.stamp_ns, partial(self._deliver, segment, sender, late))
+        if sender.tec > 127:
+            sender.hold_ns = segment.free_ns + SUSPEND_BITS * self.bit_ns
+        if sender.retiring and (not sender.queue or sender.tec > 127):
+            self.detach(sender)
+
+    def _deliver(self, segment: Segment, sender: Node, frame: Frame) -> None:
+        self._finished.append((sender, frame))
+        key = frame.key
+        for node in segment.nodes:
+            if (node is sender and not node.receive_own) or (node.keys is not None and key not in node.keys):
+                continue
+            node.receive(frame)
+
+    # -- errors
+
+    def _destroy(self, segment: Segment, flight: Flight) -> None:
+        """Everyone on the segment sees the error; the frame stays at the head of its queue."""
+        self.errors += 1
+        for node in tuple(segment.nodes):
+            if node is flight.sender:
+                node.tec += 8
+                kind = ERR_ACK if flight.alone else 0
+                self._report(node, flight.end_ns, kind | ERR_PROT | ERR_BUSERROR, transmitter=True)
+            else:
+                node.rec = min(node.rec + 1, 255)
+                self._report(node, flight.end_ns, ERR_PROT | ERR_BUSERROR)
+
+    def _report(self, node: Node, at_ns: int, classes: int = 0, transmitter: bool = False) -> None:
+        """Settles the state by the counters and tells the node of the error and of a change of state."""
+        state = node.confinement()
+        changed = state is not node.state
+        node.state = state
+        if changed and state is BusState.OFF:
+            self._switch_off(node, at_ns)
+        if changed or classes:
+            node.receive(node.error_frame(at_ns, classes, changed, transmitter))
+
+    def _switch_off(self, node: Node, at_ns: int) -> None:
+        node.done += len(node.queue)
+        node.queue.clear()
+        self._leave(node)
+        if self.restart_ns:
+            self._at(at_ns + self.restart_ns, lambda: self.restart(node))
+
+    # -- cable
+
+    def _place(self, node: Node) -> None:
+        """Puts a node on the piece of cable it belongs to now."""
+        if node.state is BusState.OFF:
+            return
+        cut = any(fault.node in (None, node.name) for fault in self._cuts)
+        here = node.segment
+        if here is None or cut is (here is self._main):
+            self._leave(node)
+            node.hold_ns = max(node.hold_ns, self.now_ns)  # frames that waited start now, not in the past
+            node.segment = Segment() if cut else self._main
+            node.segment.nodes.append(node)
+            if cut:
+                self._segments.append(node.segment)
+
+    def _leave(self, node: Node) -> None:
+        """Takes a node off its cable; a frame it is sending breaks off."""
+        segment, node.segment = node.segment, None
+        if segment is None:
+            return
+        segment.nodes.remove(node)
+        if segment.flight is not None and segment.flight.sender is node:
+            segment.flight = None
+        if segment is not self._main:
+            self._segments.remove(segment)
+
+    def _cut(self, fault: Fault) -> None:
+        self._cuts.append(fault)
+        for node in self.nodes:
+            self._place(node)
+
+    def _mend(self, fault: Fault) -> None:
+        if fault in self._cuts:
+            self._cuts.remove(fault)
+            for node in self.nodes:
+                self._place(node)
+
+    def _babble(self, fault: Fault) -> None:
+        node = self.attach(fault.node or "babble", queue_limit=1, rx_limit=0)
+        node.refill_ns = fault.shift_ns
+        self.submit(node, fault.key, fault.data)
+        self._at(fault.end_ns, lambda: self.detach(node), of_fault=True)

@@ -1,0 +1,53 @@
+"""Starts a wire daemon as a child process and stops it again: for live runs and tests."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from can_dbc.bus import BusError
+
+_START_TIMEOUT_S: Final = 20.0
+_STOP_TIMEOUT_S: Final = 5.0
+
+
+@contextmanager
+def wire_daemon(
+    buses: Mapping[str, int], directory: Path | None = None, joined: Mapping[str, str] | None = None
+) -> Iterator[subprocess.Popen[str]]:
+    """A daemon that serves `buses` (name to bit/s), ready to take clients; ends with the block.
+
+    `joined` maps SocketCAN interfaces to the bus they take part in.  Raises `BusError` with the daemon's own
+    sentence when it does not start.
+    """
+    ready, child_end = os.pipe()
+    command = [sys.executable, "-m", "hil.wire.daemon", "--ready-fd", str(child_end)]
+    for name, bitrate in buses.items():
+        command += ["--bus", f"{name}:{bitrate}"]
+    for interface, name in (joined or {}).items():
+        command += ["--join", f"{name}={interface}"]
+    if directory is not None:
+        command += ["--dir", str(directory)]
+    process = subprocess.Popen(
+        command, pass_fds=[child_end], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    os.close(child_end)
+    try:
+        if not select.select([ready], [], [], _START_TIMEOUT_S)[0] or not os.read(ready, 16):
+            process.kill()
+            raise BusError(process.communicate()[1].strip() or "The wire daemon did not start.")
+        yield process
+    finally:
+        os.close(ready)
+        process.terminate()
+        try:
+            process.communicate(timeout=_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()

@@ -1,0 +1,259 @@
+"""The participants of a real-time wire bus and the loop that serves them (commands: `hil.wire.daemon`).
+
+A bus is a listening Unix socket and a `WireCore` on CLOCK_MONOTONIC.  Deliveries are batched `GRAIN_NS`
+apart; the stamps keep the exact end of each frame.  A slow client loses frames of its own receive queue,
+counted, and never holds up the others.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import select
+import socket
+import time
+from pathlib import Path
+from typing import Any, Final
+
+from can_dbc.bus import BusError
+from can_dbc.frame import Frame
+from can_dbc.socketcan import SocketCanBus
+from can_dbc.wire_client import BATCH, CONTROL, PACKET_BYTES, RECORD, STATUS
+from hil.wire.core import WireCore
+from hil.wire.faults import Fault
+from hil.wire.node import Node
+
+GRAIN_NS: Final = 250_000
+_SEND_BUFFER_BYTES: Final = 1 << 16
+_RX_LIMIT: Final = 4096
+
+
+class Client:
+    """One connection: a node of the core once it has said hello."""
+
+    def __init__(self, sock: socket.socket, core: WireCore) -> None:
+        sock.setblocking(False)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+        self.sock = sock
+        self._core = core
+        self._node: Node | None = None
+        self._told = 0
+        self.blocked = False
+        """Its socket is full; frames wait in the node's receive queue."""
+
+    def read(self) -> bool:
+        """Takes everything the client has sent; False when it has gone or breaks the protocol."""
+        while True:
+            try:
+                packet = self.sock.recv(PACKET_BYTES)
+            except BlockingIOError:
+                return True
+            except ConnectionResetError:
+                continue  # it closed without reading all we sent; what it sent before is still there
+            except OSError:
+                return False
+            if len(packet) < RECORD.size:
+                return False
+            key, length, data, _, flags, _, _ = RECORD.unpack_from(packet)
+            if flags & CONTROL:
+                self._answer(packet[RECORD.size :])
+            elif self._node is None:
+                return False
+            elif not self._core.submit(self._node, key, data[:length]):
+                self._node.done += 1  # it has left the client's queue, though not for the bus
+
+    def write(self) -> None:
+        """Sends what the node has received; that a client has gone is for `read` to find, after its last
+        frames."""
+        node = self._node
+        while node is not None and (node.rx or node.done != self._told):
+            done, dropped = node.done & 0xFFFF, node.dropped & 0xFFFF_FFFF
+            batch = node.rx[:BATCH]
+            packet = b"".join(
+                RECORD.pack(key, len(data), data, stamp_ns, 0, done, dropped) for stamp_ns, key, data in batch
+            )
+            try:
+                self.sock.send(packet or RECORD.pack(0, 0, b"", 0, STATUS, done, dropped))
+            except OSError as error:
+                self.blocked = error.errno == errno.EAGAIN
+                return
+            del node.rx[:BATCH]
+            self._told = node.done
+        self.blocked = False
+
+    def close(self) -> None:
+        self.sock.close()
+        if self._node is not None:
+            self._core.retire(self._node)
+
+    def _answer(self, body: bytes) -> None:
+        try:
+            reply = self._obey(json.loads(body))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            reply = {"error": str(error)}
+        try:
+            self.sock.send(RECORD.pack(0, 0, b"", 0, CONTROL, 0, 0) + json.dumps(reply).encode())
+        except OSError:
+            return  # the next read or write finds out
+
+    def _obey(self, request: dict[str, Any]) -> dict[str, Any]:
+        match request:
+            case {"hello": hello} if self._node is None:
+                self._node = self._core.attach(
+                    str(hello["name"]),
+                    keys=hello["keys"],
+                    receive_own=bool(hello["receive_own"]),
+                    queue_limit=int(hello["tx_queue"]),
+                    rx_limit=_RX_LIMIT,
+                )
+                return {"bus": self._core.name, "bitrate": self._core.bitrate}
+            case {"inject": fields}:
+                self._core.inject(Fault.from_json(fields))
+                return {}
+            case {"heal": True}:
+                self._core.heal()
+                return {}
+            case {"restart": str(name)}:
+                for node in self._core.nodes:
+                    if node.name == name:
+                        self._core.restart(node)
+                return {}
+            case {"stats": True}:
+                return _figures(self._core)
+        raise ValueError("unknown request; known are inject, heal, restart and stats")
+
+
+class Joined:
+    """A SocketCAN interface as a participant of a wire bus."""
+
+    blocked = False
+
+    def __init__(self, bus: SocketCanBus, core: WireCore) -> None:
+        self._bus = bus
+        self._core = core
+        self._node = core.attach(bus.name, queue_limit=100)
+        self._frames: list[Frame] = []
+
+    def read(self) -> bool:
+        self._bus.drain(self._frames)
+        for _, key, data in self._frames:
+            self._core.submit(self._node, key, data)
+        self._frames.clear()
+        return True
+
+    def write(self) -> None:
+        for _, key, data in self._node.take():
+            self._bus.send(key, data)
+
+    def close(self) -> None:
+        self._bus.close()
+        self._core.retire(self._node)
+
+
+class Server:
+    """One bus: its listening socket, its core and its participants."""
+
+    def __init__(self, name: str, bitrate: int, directory: Path) -> None:
+        self.core = WireCore(bitrate, name)
+        self.path = directory / name
+        self.core.advance(time.monotonic_ns())
+        self.sock = _listen(self.path)
+        self.members: dict[int, Client | Joined] = {}
+
+    def accept(self) -> None:
+        client = Client(self.sock.accept()[0], self.core)
+        self.members[client.sock.fileno()] = client
+
+    def join(self, interface: str) -> None:
+        bus = SocketCanBus(interface)
+        self.members[bus.fileno()] = Joined(bus, self.core)
+
+    def drop(self, descriptor: int) -> None:
+        self.members.pop(descriptor).close()
+
+    def close(self) -> None:
+        for descriptor in list(self.members):
+            self.drop(descriptor)
+        self.sock.close()
+        self.path.unlink(missing_ok=True)
+
+
+def serve(servers: list[Server], stop: socket.socket) -> None:
+    """Runs the buses until `stop` becomes readable."""
+    last_ns = 0
+    while True:
+        listening = {server.sock.fileno(): server for server in servers}
+        owner = {descriptor: server for server in servers for descriptor in server.members}
+        due_ns = [at_ns for server in servers if (at_ns := server.core.next_ns()) is not None]
+        timeout_s = None
+        if due_ns:
+            timeout_s = max(0, max(min(due_ns), last_ns + GRAIN_NS) - time.monotonic_ns()) * 1e-9
+        blocked = [d for d, server in owner.items() if server.members[d].blocked]
+        readable, _, _ = select.select([stop.fileno(), *listening, *owner], blocked, [], timeout_s)
+        last_ns = time.monotonic_ns()
+        if stop.fileno() in readable:
+            return
+        for server in servers:
+            server.core.advance(last_ns)
+        for descriptor in readable:
+            if descriptor in listening:
+                listening[descriptor].accept()
+            elif not owner[descriptor].members[descriptor].read():
+                owner[descriptor].drop(descriptor)
+        for server in servers:
+            server.core.advance(time.monotonic_ns())
+            for member in server.members.values():
+                member.write()
+
+
+def _listen(path: Path) -> socket.socket:
+    """A listening socket at `path`; a file left by a dead daemon is replaced, a living one is an error."""
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        try:
+            sock.bind(str(path))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE or not path.is_socket() or _answers(path):
+                raise
+            path.unlink()
+            sock.bind(str(path))
+        path.chmod(0o660)
+        sock.listen(32)
+    except OSError as error:
+        sock.close()
+        raise BusError(
+            f"The wire bus {path.name} cannot listen at {path} ({error.strerror or error}); is another wire "
+            "daemon running? Stop it, or choose another directory with --dir."
+        ) from error
+    return sock
+
+
+def _answers(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            return False
+    return True
+
+
+def _figures(core: WireCore) -> dict[str, Any]:
+    return {
+        "bus": core.name,
+        "bitrate": core.bitrate,
+        "now_ns": core.now_ns,
+        "busy_ns": core.busy_ns,
+        "errors": core.errors,
+        "nodes": [
+            {
+                "name": node.name,
+                "state": node.state.name,
+                "tec": node.tec,
+                "rec": node.rec,
+                "done": node.done,
+                "refused": node.refused,
+                "dropped": node.dropped,
+            }
+            for node in core.nodes
+        ],
+    }

@@ -1,0 +1,93 @@
+"""``manifest.json``: what a recording is of, so that a reader years later can tell.
+
+In lockstep a recording holds nothing of the host's clock or of the host, so that one seed gives the same bytes on
+every run.  Live, the manifest carries one pair of monotonic and UTC time; adding their difference to a monotonic
+stamp gives UTC.  It is written to a temporary file, flushed to the disk and renamed.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import os
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import msgspec
+
+from can_dbc.codec import resolve
+from machine.load import profile_hash
+from machine.profile import Profile
+
+NAME = "manifest.json"
+
+
+class Manifest(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Identity of a recording; ``complete`` and ``dropped`` (records lost to a full disk) are set when it closes."""
+
+    timberhand: str
+    profile: str
+    profile_hash: str
+    dbc_hash: dict[str, str]
+    buses: tuple[str, ...]
+    seed: int | None = None
+    start_monotonic_ns: int | None = None
+    start_utc_ns: int | None = None
+    start_utc: str | None = None
+    complete: bool = False
+    dropped: int = 0
+
+    @property
+    def live(self) -> bool:
+        """True for a recording in real time, which must outlive a power cut."""
+        return self.start_utc_ns is not None
+
+    @property
+    def utc_offset_ns(self) -> int:
+        """UTC minus monotonic time [ns]; 0 in lockstep."""
+        return (self.start_utc_ns or 0) - (self.start_monotonic_ns or 0)
+
+
+def describe(profile: Profile, buses: tuple[str, ...], seed: int | None = None, live: bool = False) -> Manifest:
+    """The manifest of a recording that starts now; only with ``live`` does it look at the clock."""
+    shipped = {name for bus, names in databases(profile).items() if bus in buses for name in names}
+    manifest = Manifest(
+        timberhand=version("timberhand"),
+        profile=profile.name,
+        profile_hash=f"{profile_hash(profile):08x}",
+        dbc_hash={name: hashlib.sha256(resolve(name).read_bytes()).hexdigest() for name in sorted(shipped)},
+        buses=buses,
+        seed=seed,
+    )
+    if not live:
+        return manifest
+    utc_ns = time.time_ns()
+    utc = datetime.datetime.fromtimestamp(utc_ns // 10**9, datetime.UTC)
+    return msgspec.structs.replace(
+        manifest,
+        start_monotonic_ns=time.monotonic_ns(),
+        start_utc_ns=utc_ns,
+        start_utc=utc.strftime("%Y-%m-%dT%H:%M:%SZ"),
+    )
+
+
+def databases(profile: Profile) -> dict[str, tuple[str, ...]]:
+    """Bus name to the databases whose messages are on it."""
+    buses = {profile.crane_bus: ("crane",)}
+    return buses | ({profile.machine_bus: ("machine", "gnss")} if profile.machine_bus else {})
+
+
+def write(directory: Path, manifest: Manifest) -> None:
+    """Puts the manifest into the run's directory in one step; raises OSError."""
+    new = directory / (NAME + ".new")
+    with new.open("wb") as file:
+        file.write(msgspec.json.format(msgspec.json.encode(manifest)) + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(new, directory / NAME)
+
+
+def read(directory: Path) -> Manifest:
+    """The manifest of a run; raises OSError or msgspec.MsgspecError."""
+    return msgspec.json.decode((directory / NAME).read_bytes(), type=Manifest)

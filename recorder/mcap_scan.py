@@ -1,0 +1,104 @@
+"""Reads an MCAP file from front to back and stops, without an error, where the good part ends.
+
+The index of an MCAP file stands at its end, so a file whose writer was killed cannot be read through it.  Every
+record carries its length and every chunk its CRC, so all but the unfinished chunk can be read in order (MCAP
+specification, "Record Content" and "Chunk").
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Schema
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.writer import MCAP0_MAGIC
+
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_FOOTER_BYTES = _RECORD.size + 20
+
+
+class NotMcap(ValueError):
+    """The file is something else; the message is a sentence that names it."""
+
+
+class Stored(NamedTuple):
+    """A message as it stands in the file: channel id, both times [ns] and the payload."""
+
+    channel_id: int
+    log_ns: int
+    publish_ns: int
+    data: bytes
+
+
+def is_complete(path: Path) -> bool:
+    """True when the file ends with a footer and the closing magic, that is when its writer finished."""
+    with path.open("rb") as file:
+        file.seek(0, 2)
+        if file.tell() < 2 * len(MCAP0_MAGIC) + _FOOTER_BYTES:
+            return False
+        file.seek(-len(MCAP0_MAGIC) - _FOOTER_BYTES, 2)
+        return file.read(1)[0] == Opcode.FOOTER and file.read()[-len(MCAP0_MAGIC) :] == MCAP0_MAGIC
+
+
+def scan(path: Path, topics: Collection[str] | None = None) -> Iterator[Schema | Channel | Stored]:
+    """Every schema, channel and message (of ``topics``; None: all) up to the end of the good part.
+
+    Raises:
+        NotMcap: when the file begins like no MCAP file.
+    """
+    with path.open("rb") as file:
+        magic = file.read(len(MCAP0_MAGIC))
+        if not MCAP0_MAGIC.startswith(magic):
+            raise NotMcap(f"{path} is not an MCAP file; give a run.mcap of the recorder")
+        skipped: set[int] = set()
+        while True:
+            head = file.read(_RECORD.size)
+            if len(head) < _RECORD.size:
+                return
+            opcode, length = _RECORD.unpack(head)
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                return
+            if length > path.stat().st_size - file.tell():
+                return
+            body = file.read(length)
+            if opcode == Opcode.CHUNK:
+                try:
+                    chunk = Chunk.read(ReadDataStream(BytesIO(body)))
+                    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+                except (ValueError, struct.error, McapError, zstandard.ZstdError):
+                    return
+                yield from _records(stream.read(size), topics, skipped)
+            else:
+                yield from _records(head + body, topics, skipped)
+
+
+def _records(data: bytes, topics: Collection[str] | None, skipped: set[int]) -> Iterator[Schema | Channel | Stored]:
+    at = 0
+    while at < len(data):
+        opcode, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        if opcode == Opcode.MESSAGE:
+            channel_id, _, log_ns, publish_ns = _MESSAGE.unpack_from(data, at)
+            if channel_id not in skipped:
+                yield Stored(channel_id, log_ns, publish_ns, data[at + _MESSAGE.size : at + length])
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(ReadDataStream(BytesIO(data[at : at + length])))
+            if topics is not None and channel.topic not in topics:
+                skipped.add(channel.id)
+            else:
+                yield channel
+        elif opcode == Opcode.SCHEMA:
+            yield Schema.read(ReadDataStream(BytesIO(data[at : at + length])))
+        at += length
+
+
+__all__ = ["Channel", "NotMcap", "Schema", "Stored", "is_complete", "scan"]

@@ -1,0 +1,236 @@
+"""The recorder itself: what it is told goes into a candump log per bus and into ``run.mcap``.
+
+Inputs: frames of the buses, the controller's tick records and its state reports, each with its own monotonic stamp;
+the recorder has no clock.  Outputs, in one directory:
+
+* ``<bus>.log``: ``candump -L`` text, for can-utils, SavvyCAN and python-can.
+* ``run.mcap`` (then ``run-0002.mcap`` and so on, one for each 512 MiB or after a full disk): ``/<bus>/raw`` (the
+  16 bytes of the kernel's ``struct can_frame``, then the sender's name where it is known), ``/<bus>/<message>``
+  (decoded signals, JSON), ``/controller/tick`` (raw, see ``can_dbc.tick_record``), ``/controller/report`` and
+  ``/manifest`` (JSON).
+  Publish time is monotonic, log time is UTC where the manifest has it (live), else monotonic too.
+* ``manifest.json``: see ``recorder.manifest``.
+
+A chunk closes at least every 200 ms of recorded time, and live it is flushed to the disk, so a killed process or a
+power cut loses no more than 250 ms.  A disk that fills up costs records, counted in ``dropped``, and nothing else.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import struct
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from mcap.writer import Writer
+
+from can_dbc import codec, setpoint, tick_record
+from can_dbc.frame import ERROR, REMOTE, Frame, describe
+from machine.profile import Profile
+from recorder import manifest as manifests
+from recorder.files import CommitFile
+from recorder.manifest import Manifest
+from recorder.recover import RUN_NAME, recover, run_files
+from recorder.signals import BusSignals, json_schema
+
+CHUNK_NS: Final = 200_000_000
+SEGMENT_BYTES: Final = 512 * 2**20
+TICK: Final = "/controller/tick"
+REPORT: Final = "/controller/report"
+
+_CAN_FRAME: Final = struct.Struct("<IB3x8s")
+_JSON: Final = msgspec.json.Encoder()
+_OBJECT: Final = b'{"type":"object"}'
+
+
+class RecordingRefused(Exception):
+    """The recording cannot start; the message is one sentence that says what to do."""
+
+
+class Recorder:
+    """One recording (module docstring: contract)."""
+
+    def __init__(self, directory: Path, profile: Profile, manifest: Manifest, key: bytes | None = None) -> None:
+        """Start a recording in ``directory``, which is created; ``key`` is that of authenticated reports.
+
+        Raises:
+            RecordingRefused: the directory cannot be written or holds a recording already.
+        """
+        self.dropped = 0
+        """Records lost because they could not be written."""
+        self.refused = 0
+        """Reports and tick records that were not what they should be."""
+        self._directory = directory
+        self._manifest = manifest
+        self._key = key
+        self._offset_ns = manifest.utc_offset_ns
+        databases = manifests.databases(profile)
+        self._signals = {bus: BusSignals(map(codec.load, databases[bus])) for bus in manifest.buses}
+        self._chunk_start_ns: int | None = None
+        self._chunk_end_ns: int | None = None
+        self._now_ns = manifest.start_monotonic_ns or 0
+        self._segments = 0
+        self._segment: _Segment | None = None
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            if run_files(directory):
+                recover(directory)
+                raise RecordingRefused(f"{directory} already holds a recording; name another directory")
+            manifests.write(directory, manifest)
+            self._text = {bus: CommitFile(directory / f"{bus}.log", manifest.live) for bus in manifest.buses}
+            self._open_segment()
+        except OSError as error:
+            raise RecordingRefused(
+                f"cannot record in {directory} ({error.strerror}); make room or name another directory"
+            ) from error
+
+    def on_frame(self, bus: str, frame: Frame, sent_by: str = "") -> None:
+        """A frame was on ``bus``; ``sent_by`` names the sender where it is known."""
+        stamp_ns, key, data = frame
+        self._at(stamp_ns)
+        us = (stamp_ns + self._offset_ns) // 1000
+        payload = "R" if key & REMOTE else data.hex().upper()
+        line = f"({us // 1_000_000}.{us % 1_000_000:06d}) {bus} {describe(key)}#{payload}\n"
+        self._text[bus].write(line.encode())
+        self._add(f"/{bus}/raw", stamp_ns, _CAN_FRAME.pack(key, len(data), data) + sent_by.encode())
+        if not key & (ERROR | REMOTE) and (decoded := self._signals[bus].decode(key, data)):
+            self._add(f"/{bus}/{decoded[0]}", stamp_ns, _JSON.encode(decoded[1]))
+
+    def on_tick(self, record: bytes) -> None:
+        """The controller's record of one tick, as it came."""
+        try:
+            stamp_ns = tick_record.decode(record).now_ns
+        except tick_record.RecordRefused:
+            self.refused += 1
+            return
+        self._at(stamp_ns)
+        self._add(TICK, stamp_ns, record)
+
+    def on_report(self, datagram: bytes) -> None:
+        """The controller's state report, as it came."""
+        try:
+            report = setpoint.decode(datagram, self._key)
+        except setpoint.DatagramRefused:
+            report = None
+        if not isinstance(report, setpoint.StateReport):
+            self.refused += 1
+            return
+        self._at(report.stamp_ns)
+        self._add(REPORT, report.stamp_ns, _JSON.encode(report))
+
+    def flush(self, now_ns: int) -> None:
+        """Close the chunk and bring everything to the files; what cannot be written is counted in ``dropped``."""
+        self._now_ns = now_ns
+        self._chunk_start_ns = self._chunk_end_ns = None
+        for text in self._text.values():
+            lines = text.buffer.count(b"\n")
+            try:
+                text.commit()
+            except OSError:
+                self.dropped += lines
+        try:
+            if self._segment is None:
+                self._open_segment()
+            elif self._segment.commit() > SEGMENT_BYTES:
+                segment, self._segment = self._segment, None
+                segment.finish()
+                self._open_segment()
+        except OSError:
+            self._abandon()
+
+    def close(self) -> None:
+        """Complete the files."""
+        self.flush(self._now_ns)
+        if self._segment:
+            try:
+                self._segment.finish()
+            except OSError:
+                self._abandon()
+        for text in self._text.values():
+            text.close()
+        complete = msgspec.structs.replace(self._manifest, complete=True, dropped=self.dropped)
+        try:
+            manifests.write(self._directory, complete)
+        except OSError:
+            self.dropped += 1
+
+    def _at(self, stamp_ns: int) -> None:
+        """Closes the chunk before a record that would make it longer than CHUNK_NS, in whatever order records come."""
+        start_ns = stamp_ns if self._chunk_start_ns is None else min(self._chunk_start_ns, stamp_ns)
+        if self._chunk_end_ns is not None and max(self._chunk_end_ns, stamp_ns) - start_ns >= CHUNK_NS:
+            self.flush(stamp_ns)
+            start_ns = stamp_ns
+        self._chunk_start_ns = start_ns
+        self._chunk_end_ns = stamp_ns if self._chunk_end_ns is None else max(self._chunk_end_ns, stamp_ns)
+
+    def _add(self, topic: str, stamp_ns: int, data: bytes) -> None:
+        if self._segment is None:
+            self.dropped += 1
+        else:
+            self._segment.add(topic, stamp_ns + self._offset_ns, stamp_ns, data)
+
+    def _open_segment(self) -> None:
+        """The next file; its first chunk holds every channel and the manifest, and is written at once."""
+        name = f"run-{self._segments + 1:04d}.mcap" if self._segments else RUN_NAME
+        segment = _Segment(self._directory / name, self._manifest.live)
+        for bus, signals in self._signals.items():
+            segment.channel(f"/{bus}/raw", "socketcan")
+            for message in signals.messages():
+                segment.channel(f"/{bus}/{message.name}", "json", message.name, json_schema(message))
+        segment.channel(TICK, "timberhand.tick")
+        segment.channel(REPORT, "json", "StateReport", _OBJECT)
+        segment.channel("/manifest", "json", "Manifest", _OBJECT)
+        segment.add("/manifest", self._now_ns + self._offset_ns, self._now_ns, _JSON.encode(self._manifest))
+        try:
+            segment.commit()
+        except OSError:
+            segment.close()
+            (self._directory / name).unlink()
+            raise
+        self._segments += 1
+        self._segment = segment
+
+    def _abandon(self) -> None:
+        """Leave a file that could not be written readable up to its last commit; the next flush tries anew."""
+        if self._segment:
+            self.dropped += self._segment.pending
+            self._segment.close()
+            self._segment = None
+
+
+class _Segment:
+    """One MCAP file; a commit is one chunk."""
+
+    def __init__(self, path: Path, durable: bool) -> None:
+        self.pending = 0
+        """Messages since the last commit."""
+        self._file = CommitFile(path, durable)
+        fcntl.flock(self._file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._writer = Writer(self._file, chunk_size=1 << 30)
+        self._writer.start(library="timberhand")
+        self._channels: dict[str, int] = {}
+
+    def channel(self, topic: str, encoding: str, schema: str = "", text: bytes = b"") -> None:
+        schema_id = self._writer.register_schema(schema, "jsonschema", text) if schema else 0
+        self._channels[topic] = self._writer.register_channel(topic, encoding, schema_id)
+
+    def add(self, topic: str, log_ns: int, publish_ns: int, data: bytes) -> None:
+        self._writer.add_message(self._channels[topic], log_ns, data, publish_ns)
+        self.pending += 1
+
+    def commit(self) -> int:
+        """Close the chunk and write it; the size of the file [bytes]; raises OSError."""
+        self._writer.flush()
+        self._file.commit()
+        self.pending = 0
+        return self._file.tell()
+
+    def finish(self) -> None:
+        """Write the index and close; raises OSError."""
+        self._writer.finish()
+        self._file.commit()
+        self._file.close()
+
+    def close(self) -> None:
+        self._file.close()

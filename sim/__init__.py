@@ -1,0 +1,1 @@
+"""The plant: a physics stand-in for the machine on the far side of the bus.  Start at ``sim.plant.Plant``."""

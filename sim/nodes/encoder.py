@@ -1,0 +1,207 @@
+"""CANopen encoders (CiA 406) on the ``canopen`` library's LocalNode, driven synchronously on virtual time.
+
+The library gives SDO server, object dictionary (from the project's EDS files), NMT slave, heartbeat and EMCY;
+``VirtualNetwork`` replaces its bus, threads and timers.  TPDO1 answers SYNC when operational, valid and of a
+synchronous type.  Read errors: quantisation, noise, eccentricity, latency, offset (``EncoderTruth``).
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import deque
+from pathlib import Path
+
+import canopen
+from canopen.objectdictionary import ODVariable
+
+import can_dbc
+from can_dbc.canopen import NMT_ID, SDO_TO_SERVER
+from machine.encoder import counts_from_position
+from machine.profile import Encoder
+from sim.nodes import Outbox
+from sim.truth import EncoderTruth
+
+EDS_FOLDER = Path(can_dbc.__file__).parent
+PDO_NOT_VALID = 0x8000_0000
+LAST_SYNCHRONOUS = 240
+OPERATIONAL, PRE_OPERATIONAL, INITIALISING = "OPERATIONAL", "PRE-OPERATIONAL", "INITIALISING"
+EMCY_POSITION = 0x5000
+TIMESTAMP_NS = 1_000  # the device's time stamp counts microseconds modulo 2**16
+
+
+class _Periodic:
+    """What ``Network.send_periodic`` returns: the library's heartbeat, on virtual time."""
+
+    def __init__(self, network: VirtualNetwork, can_id: int, data: bytes, period: float) -> None:
+        self._network, self._id, self._data = network, can_id, bytes(data)
+        self._period_ns = round(period * 1e9)
+        self._next_ns = network.now_ns + self._period_ns
+
+    def update(self, data: bytes) -> None:
+        self._data = bytes(data)
+
+    def stop(self) -> None:
+        self._network.periodic.remove(self)
+
+    def tick(self, now_ns: int) -> None:
+        if now_ns >= self._next_ns:
+            self._next_ns += self._period_ns * max(1, -(-(now_ns - self._next_ns + 1) // self._period_ns))
+            self._network.send_message(self._id, self._data)
+
+
+class VirtualNetwork(canopen.Network):
+    """The canopen library without bus, thread and clock: sends into an outbox, is fed by ``notify``."""
+
+    def __init__(self, outbox: Outbox) -> None:
+        super().__init__(None)
+        self.outbox = outbox
+        self.now_ns = 0
+        self.periodic: list[_Periodic] = []
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        self.outbox.append((can_id, bytes(data)))
+
+    def send_periodic(self, can_id: int, data: bytes, period: float, remote: bool = False) -> _Periodic:
+        task = _Periodic(self, can_id, data, period)
+        self.periodic.append(task)
+        return task
+
+
+class EncoderNode:
+    """One encoder.  ``observe`` feeds the true position every physics step; ``set_alarm`` breaks or repairs it."""
+
+    def __init__(
+        self, name: str, spec: Encoder, truth: EncoderTruth, step_ns: int, seed: int, network: VirtualNetwork
+    ) -> None:
+        self.spec, self._truth, self._network = spec, truth, network
+        self._rng = random.Random(f"encoder {name} {seed}")
+        self._history: deque[float] = deque(maxlen=1 + max(0, round(truth.latency_s * 1e9 / step_ns)))
+        self._speed = 0.0
+        self._syncs = 0
+        self.alarms = 0
+        self._values = {(0x6004, 0): 0, (0x6030, 1): 0, (0x2120, 0): 0, (0x6503, 0): 0, (0x5122, 1): 0, (0x5122, 2): 0}
+        self.node = canopen.LocalNode(spec.node, str(EDS_FOLDER / f"encoder_{spec.kind}.eds"))
+        # The library's SDO server answers a malformed first request with the index of the request before it.
+        self.node.sdo._index = self.node.sdo._subindex = 0
+        self.node.sdo._buffer = bytearray()
+        self.node.add_read_callback(self._read)
+        self.node.add_write_callback(self._written)
+        self._pdo: tuple[int, int, list[tuple[tuple[int, int], int]]] | None = None
+        network.add_node(self.node)
+        self._booted = False
+
+    def observe(self, now_ns: int, position: float, speed: float) -> None:
+        """True joint position and speed at ``now_ns``."""
+        self._history.append(position)
+        self._now_ns = now_ns
+        self._speed = speed
+
+    def tick(self, now_ns: int) -> None:
+        """Boot after power-on or NMT reset."""
+        if not self._booted or self.node.nmt.state == INITIALISING:
+            self._boot()
+
+    def _boot(self) -> None:
+        self._booted = True
+        stored = self.node.data_store
+        stored.clear()
+        self._pdo = None
+        spec = self.spec
+        self.node.set_data(0x1000, 0, spec.device_type.to_bytes(4, "little"))
+        if spec.kind == "rotary":
+            self.node.set_data(0x6001, 0, spec.total_counts.to_bytes(4, "little"))
+        else:
+            self.node.set_data(0x6005, 1, round(spec.unit_per_count * 1e9).to_bytes(4, "little"))
+        self.node.set_data(0x6002, 0, spec.total_counts.to_bytes(4, "little"))
+        self.node.nmt.send_command(0x82)  # boot-up frame
+        self.node.nmt.send_command(0x80)  # pre-operational, starts the heartbeat of 1017h
+
+    def set_alarm(self, alarms: int) -> None:
+        """Alarm bits of 6503h (rotary) or 5122h:01 (linear); a change sends an emergency message."""
+        if alarms == self.alarms:
+            return
+        self.alarms = alarms
+        register = 0x01 if alarms else 0x00
+        self.node.set_data(0x1001, 0, bytes((register,)))
+        code = EMCY_POSITION if alarms else 0x0000
+        self.node.emcy.send(code, register, alarms.to_bytes(2, "little"))
+
+    def sync(self, now_ns: int) -> None:
+        """SYNC: sample, and send TPDO1 if it is due."""
+        self._sample(now_ns)
+        node = self.node
+        if node.nmt.state != OPERATIONAL:
+            return
+        if self._pdo is None:
+            self._pdo = self._read_pdo()
+        cob, every, mapping = self._pdo
+        if cob & PDO_NOT_VALID or not 1 <= every <= LAST_SYNCHRONOUS:
+            return
+        self._syncs += 1
+        if self._syncs % every:
+            return
+        payload = bytearray()
+        for entry, size in mapping:
+            value = self._values.get(entry)
+            if value is None:
+                payload += node.get_data(*entry)[:size].ljust(size, b"\0")
+            else:
+                payload += (value & (1 << 8 * size) - 1).to_bytes(size, "little")
+        self._network.send_message(cob & 0x7FF, bytes(payload[:8]))
+
+    def _read_pdo(self) -> tuple[int, int, list[tuple[tuple[int, int], int]]]:
+        """TPDO1 as configured: COB-ID, transmission type, mapped (index, sub-index) with sizes in bytes."""
+        get = self.node.get_data
+        words = [int.from_bytes(get(0x1A00, i), "little") for i in range(1, get(0x1A00, 0)[0] + 1)]
+        mapping = [((w >> 16, w >> 8 & 0xFF), (w & 0xFF) // 8) for w in words]
+        return int.from_bytes(get(0x1800, 1), "little"), get(0x1800, 2)[0], mapping
+
+    def _written(self, index: int, subindex: int, od: ODVariable, data: bytes) -> None:
+        if index in (0x1800, 0x1A00):
+            self._pdo = None
+
+    def _sample(self, now_ns: int) -> None:
+        t = self._truth
+        position = self._history[0]
+        error = t.offset + t.eccentricity * math.sin(position + t.phase_rad) + self._rng.gauss(0.0, t.noise)
+        steps = round(self.spec.direction * self._speed / self.spec.unit_per_count)
+        if self.spec.kind == "linear":
+            steps = max(-32768, min(32767, steps))
+        v = self._values
+        v[0x6004, 0] = counts_from_position(self.spec, position + error)
+        v[0x6030, 1] = steps
+        v[0x2120, 0] = (now_ns // TIMESTAMP_NS) & 0xFFFF
+        v[0x6503, 0] = v[0x5122, 1] = self.alarms
+
+    def _read(self, index: int, subindex: int, od: ODVariable) -> int | None:
+        if (index, subindex) == (0x6004, 0) and self._history:
+            self._sample(self._now_ns)
+        return self._values.get((index, subindex))
+
+
+class EncoderBus:
+    """All encoders on one virtual network."""
+
+    def __init__(self, encoders: dict[str, EncoderNode], network: VirtualNetwork) -> None:
+        self.encoders, self._network = encoders, network
+
+    def receive(self, key: int, data: bytes, now_ns: int) -> None:
+        """NMT and SDO frames; malformed ones are ignored, as a CAN controller's filter would."""
+        self._network.now_ns = now_ns
+        is_sdo = SDO_TO_SERVER < key <= SDO_TO_SERVER + 0x7F and len(data) == 8
+        if is_sdo or (key == NMT_ID and len(data) == 2):
+            self._network.notify(key, bytearray(data), now_ns * 1e-9)
+
+    def tick(self, now_ns: int) -> None:
+        """Boots and heartbeats."""
+        self._network.now_ns = now_ns
+        for encoder in self.encoders.values():
+            encoder.tick(now_ns)
+        for task in list(self._network.periodic):
+            task.tick(now_ns)
+
+    def sync(self, now_ns: int) -> None:
+        """SYNC to all."""
+        for encoder in self.encoders.values():
+            encoder.sync(now_ns)

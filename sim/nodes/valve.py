@@ -1,0 +1,224 @@
+"""The valve node (PLC, 10h): takes ValveCmdA/B, gives spool commands; safe by absence.
+
+The spools follow only while ValveCmdA, ValveCmdB (E2E good, ArmKey 0xA) and GuardStat (Enable 0xA) are at most
+50 ms old, SYNC at most three cycles old and the pilot supply is on.  Lost while active: ramp to neutral in 100 ms,
+state FAULT until a fresh frame disarms; 300 ms without commands: pilot off.  The grapple never opens on a loss.  A
+disarm is neutral at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from can_dbc.codec import Database, FrameRefused
+from can_dbc.e2e import Checker
+from sim.nodes import Outbox
+from sim.nodes.device import MS, Device, Every, ProtectedMessage
+
+COMMAND_NS = GUARD_NS = 50 * MS
+SYNC_NS = 15 * MS
+RAMP_NS = 100 * MS
+PILOT_NS = 300 * MS
+CYCLE_NS = 5 * MS
+SLOW_NS = 20 * MS
+KEY = 0xA
+MODE_SPOOL = 2
+CYCLE_US = 400  # what this PLC reports as its longest cycle
+HOLD_PCT = -20.0  # a held grapple keeps a little closing flow, so that its pressure stays
+FUNCTIONS = ("slew", "lift", "tilt", "ext", "rot", "grapple")
+NO_AXIS = 15
+
+
+class ValveState(IntEnum):
+    """ValveFbA.State."""
+
+    NEUTRAL = 0
+    ACTIVE = 1
+    RAMP = 2
+    PILOT_OFF = 3
+    FAULT = 4
+
+
+class Exit(IntEnum):
+    """ValveFbB.ExitCode (ISO 11783-7 reasons)."""
+
+    OK = 0
+    SAFETY_STOP = 2
+    GUARD_MISSING = 4
+    COMMAND_TIMEOUT = 5
+    OUT_OF_RANGE = 6
+    NOT_ARMED = 8
+
+
+@dataclass(slots=True)
+class Measured:
+    """What the node's own inputs show: spools -1..1 in FUNCTIONS order and the grapple's sensors."""
+
+    spools: tuple[float, ...] = (0.0,) * 6
+    flow_limited: bool = False
+    opening: float = 1.0
+    clamp_bar: float = 0.0
+    load_kg: float = 0.0
+    rot_deg: float = 0.0
+
+
+class _Input:
+    """The newest good frame of one received message."""
+
+    def __init__(self, database: Database, name: str) -> None:
+        codec = database.message(name)
+        if codec.data_ids is None:
+            raise ValueError(f"{name} in the DBC has no E2E Data IDs")
+        self.key, self._receive, self._index = codec.key, codec.receive, codec.index
+        self._checker = Checker(codec.data_ids)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, as after a restart."""
+        self._checker.reset()
+        self.values: tuple[Any, ...] | None = None
+        self.stamp_ns = 0
+
+    def take(self, data: bytes, now_ns: int) -> bool:
+        """Whether the frame was accepted."""
+        if not self._checker.check(data).usable:
+            return False
+        try:
+            self.values = self._receive(data)
+        except FrameRefused:
+            return False
+        self.stamp_ns = now_ns
+        return True
+
+    def fresh(self, now_ns: int, limit_ns: int) -> bool:
+        return self.values is not None and now_ns - self.stamp_ns <= limit_ns
+
+    def get(self, signal: str) -> float:
+        """A signal of the newest frame, 0 when it is unknown or not available."""
+        value = None if self.values is None else self.values[self._index[signal]]
+        return 0.0 if value is None else value
+
+
+class ValveNode(Device):
+    """``outputs_pct`` are the spool commands now, in FUNCTIONS order; ``measured`` is filled by the plant."""
+
+    def __init__(self, database: Database, outbox: Outbox, pilot_on: Callable[[], bool]) -> None:
+        super().__init__(0x10, outbox)
+        self._pilot_on = pilot_on
+        self._a, self._b, self._guard = (_Input(database, n) for n in ("ValveCmdA", "ValveCmdB", "GuardStat"))
+        self._inputs = {i.key: i for i in (self._a, self._b, self._guard)}
+        self._fb_a, self._fb_b, self._grapple_stat, self._plc = (
+            ProtectedMessage(database, n) for n in ("ValveFbA", "ValveFbB", "GrappleStat", "PlcStatus")
+        )
+        self._fast, self._slow = Every(CYCLE_NS), Every(SLOW_NS, phase_ns=MS)
+        self.measured = Measured()
+        self._watchdog = 0
+        self.restart()
+
+    def restart(self) -> None:
+        for i in self._inputs.values():
+            i.reset()
+        self.valve_state, self.exit = ValveState.NEUTRAL, Exit.NOT_ARMED
+        self.outputs_pct = [0.0] * len(FUNCTIONS)
+        self._ramp_from = list(self.outputs_pct)
+        self._lost_ns: int | None = None
+        self._sync_ns: int | None = None
+        self._locked: Exit | None = None
+        self._echo = 0
+
+    def receive(self, key: int, data: bytes, now_ns: int) -> None:
+        """A command or guard frame; others and bad ones are ignored."""
+        source = self._inputs.get(key)
+        if source is None or not source.take(data, now_ns):
+            return
+        if source is self._a:
+            self._echo = data[1] & 0x0F
+        if source is self._b and self._b.get("ArmKey") != KEY:
+            self._locked = None
+
+    def sync(self, now_ns: int) -> None:
+        """SYNC seen."""
+        self._sync_ns = now_ns
+
+    def decide(self, now_ns: int) -> None:
+        """Set ``outputs_pct``, ``valve_state`` and ``exit`` for this physics step."""
+        missing = self._missing(now_ns)
+        if missing is not None and self.valve_state is ValveState.ACTIVE:
+            self._locked, self._lost_ns, self._ramp_from = missing, now_ns, list(self.outputs_pct)
+            self._ramp_from[-1] = 0.0  # the grapple's valve shuts at once and holds
+        wanted = [0.0] * len(FUNCTIONS)
+        armed = self._b.get("ArmKey") == KEY
+        if missing is Exit.SAFETY_STOP or (missing is not None and not self._heard(now_ns, PILOT_NS)):
+            self.valve_state, self.exit = ValveState.PILOT_OFF, missing
+        elif self._locked is not None:
+            self.exit = self._locked
+            left = 1.0 - (now_ns - (self._lost_ns or 0)) / RAMP_NS
+            self.valve_state = ValveState.RAMP if left > 0.0 else ValveState.FAULT
+            wanted = [max(0.0, left) * u for u in self._ramp_from]
+        elif missing is not None or not armed:
+            self.valve_state, self.exit = ValveState.NEUTRAL, missing or Exit.NOT_ARMED
+        else:
+            self.valve_state, self.exit = ValveState.ACTIVE, Exit.OK
+            wanted = self._commands()
+        self.outputs_pct = wanted
+
+    def _heard(self, now_ns: int, limit_ns: int) -> bool:
+        return self._a.fresh(now_ns, limit_ns) and self._b.fresh(now_ns, limit_ns)
+
+    def _missing(self, now_ns: int) -> Exit | None:
+        """What keeps the node from following, if anything."""
+        if not self._pilot_on():
+            return Exit.SAFETY_STOP
+        synchronous = self._sync_ns is not None and now_ns - self._sync_ns <= SYNC_NS
+        if not self._heard(now_ns, COMMAND_NS) or not synchronous:
+            return Exit.COMMAND_TIMEOUT
+        if not self._guard.fresh(now_ns, GUARD_NS) or self._guard.get("Enable") != KEY:
+            return Exit.GUARD_MISSING
+        return None
+
+    def _commands(self) -> list[float]:
+        a, b = self._a, self._b
+        out = [0.0] * len(FUNCTIONS)
+        mode = a.get("Mode")
+        if mode == MODE_SPOOL:
+            out[:5] = [a.get("Slew"), a.get("Lift"), a.get("Tilt"), a.get("Ext"), b.get("Rot")]
+        elif mode != 0:
+            self.exit = Exit.OUT_OF_RANGE  # this node closes no velocity loop
+        flow = abs(b.get("Grapple")) or 100.0
+        match b.get("GrappleMode"):
+            case 1:
+                out[5] = flow
+            case 2:
+                out[5] = -flow
+            case 3:
+                out[5] = HOLD_PCT
+        return out
+
+    def cycle(self, now_ns: int) -> None:
+        m = self.measured
+        if self._fast.due(now_ns):
+            pct = [100.0 * s for s in m.spools]
+            self.outbox.append(self._fb_a.frame(self.valve_state, *pct[:4]))
+            limit = int(m.flow_limited)
+            self.outbox.append(self._fb_b.frame(NO_AXIS, pct[4], pct[5], 0.0, self.exit, self._echo, limit))
+        if self._slow.due(now_ns):
+            self.outbox.append(
+                self._grapple_stat.frame(self._grapple_state(), 100.0 * m.opening, m.clamp_bar, m.load_kg, m.rot_deg)
+            )
+            self._watchdog = (self._watchdog + 1) & 0xFF
+            run = 2 if self.valve_state is ValveState.ACTIVE else 1
+            self.outbox.append(self._plc.frame(run, self._watchdog, CYCLE_US, 0))
+
+    def _grapple_state(self) -> int:
+        """GrappleStat.State: 1 open, 2 opening, 3 closing, 4 closed, 5 holding."""
+        command, m = self.outputs_pct[5], self.measured
+        if command > 0.0:
+            return 1 if m.opening > 0.98 else 2
+        if command == HOLD_PCT:
+            return 5
+        if command < 0.0:
+            return 4 if m.opening < 0.02 else 3
+        return 1 if m.opening > 0.98 else 4 if m.opening < 0.02 else 5

@@ -1,0 +1,229 @@
+"""A crane without mass: it follows every accepted setpoint exactly and grips what is really between its tongs.
+
+It judges setpoints as a controller does (order, lease, range, speed, jump) and records a trace of what happened.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from math import atan2, cos, hypot, inf, nan, pi, remainder, sin
+
+import numpy as np
+
+from autonomy.activity import Activity
+from autonomy.logs import LogObservation
+from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, StateReport, decode
+from machine.grapple import grapple_yaw, half_gap_m, opening_pct_from_tong_angle, tip_below_pin_m
+from machine.joints import JOINTS
+from machine.kinematics import pin_position
+from machine.load import profile_hash
+from machine.modes import Mode
+from machine.profile import Profile, joint
+
+GROUND_LOG = LogObservation(0, (-1.8, 4.4, -1.29), (0.6, 0.8, 0.0), 2.6, 0.2)
+HOME = (0.0, 0.75, -1.6, 0.30, 0.0)
+TICK_NS = 50_000_000
+GRIP_RAD = 1.15
+DROP_RAD = 0.95
+
+
+@dataclass
+class Moment:
+    """One instant of a run."""
+
+    phase: str
+    q: tuple[float, ...]
+    pin: tuple[float, float, float]
+    tong_rad: float
+    held: LogObservation | None
+
+
+@dataclass
+class StandIn:
+    """Controller, crane and yard in one; ``step`` is one tick of 50 ms."""
+
+    profile: Profile
+    logs: list[LogObservation]
+    q: tuple[float, ...] = HOME
+    mode: Mode = Mode.ARMED
+    feedback: bool = True
+    slippery: int = 0  # so many grips come up empty
+    now_ns: int = 5_000_000_000
+    tong_rad: float = 0.0
+    gripped: bool = False
+    held: int | None = None
+    setpoint: CraneSetpoint | None = None
+    trace: list[Moment] = field(default_factory=list)
+
+    def report(self) -> StateReport:
+        """What the controller says now."""
+        opening = opening_pct_from_tong_angle(self.profile.grapple.tongs, self.tong_rad)
+        state = 5 if self.gripped else 0
+        sequence = self.setpoint.sequence if self.setpoint else 0
+        return StateReport(
+            0, profile_hash(self.profile), self.now_ns, self.mode, state, 0, sequence, 0, 0, 0, self.q,
+            (0.0,) * 5, self.q, opening if self.feedback else nan, nan, nan, 0, 0, 0, 0,
+        )  # fmt: skip
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        """The log list of a perfect detector."""
+        return tuple(self.logs)
+
+    def run(self, activity: Activity, limit_s: float = 120.0) -> float:
+        """Runs the activity to its end; the time it took, s."""
+        start_ns = self.now_ns
+        while not activity.idle and self.now_ns - start_ns < limit_s * 1e9:
+            self.step(activity)
+        return (self.now_ns - start_ns) * 1e-9
+
+    def step(self, activity: Activity) -> bytes | None:
+        """One tick: the activity's datagram is judged, obeyed and its effect recorded."""
+        data = activity.step(self.now_ns, self.report(), self.seen())
+        if data is not None:
+            setpoint = decode(data)
+            assert isinstance(setpoint, CraneSetpoint)
+            self._judge(setpoint)
+            self.setpoint, self.mode = setpoint, Mode.ACTIVE
+        elif self.mode is Mode.ACTIVE and self.setpoint and not self.setpoint.final:
+            assert self.now_ns < self.setpoint.stamp_ns + self.setpoint.lease_ns, "the lease ran out in motion"
+        self.now_ns += TICK_NS
+        if self.setpoint is not None and self.mode is Mode.ACTIVE:
+            self.q = self._knot_at(self.now_ns).position
+            self._grapple(self.setpoint.grapple)
+        self._carry()
+        log = next((log for log in self.logs if log.id == self.held), None)
+        pin = pin_position(self.profile.kinematics, self.q)
+        self.trace.append(Moment(activity.phase.name, self.q, pin, self.tong_rad, log))
+        return data
+
+    def _knot_at(self, now_ns: int) -> Knot:
+        assert self.setpoint is not None
+        after = now_ns - self.setpoint.stamp_ns
+        return next((k for k in self.setpoint.knots if k.after_ns >= after), self.setpoint.knots[-1])
+
+    def _judge(self, new: CraneSetpoint) -> None:
+        assert new.stamp_ns == self.now_ns and new.profile_hash == profile_hash(self.profile)
+        assert new.lease_ns <= self.profile.timeouts.lease_max_ms * 1_000_000
+        assert self.mode in (Mode.ARMED, Mode.ACTIVE), f"a setpoint in {self.mode.name}"
+        if self.setpoint is not None:
+            assert new.sequence > self.setpoint.sequence and new.stamp_ns > self.setpoint.stamp_ns
+        assert not new.final or not any(new.knots[-1].velocity)
+        old = self._knot_at(self.now_ns).velocity if self.setpoint else (0.0,) * 5
+        for j, spec in enumerate(joint(self.profile, j) for j in JOINTS):
+            for k in new.knots:
+                assert spec.lower <= k.position[j] <= spec.upper
+                assert abs(k.velocity[j]) <= spec.speed_limit
+            assert abs(new.knots[0].position[j] - self.q[j]) <= 0.02 * spec.speed_limit
+            if self.mode is Mode.ACTIVE:
+                kick = abs(new.knots[0].velocity[j] - old[j])
+                assert kick <= 0.25 * spec.acceleration_limit + 0.1 * spec.speed_limit
+
+    def _grapple(self, command: GrappleCommand) -> None:
+        grapple = self.profile.grapple
+        full = grapple.tongs.angle_rad[-1]
+        step_s = TICK_NS * 1e-9
+        if command is GrappleCommand.OPEN:
+            self.gripped = False
+            self.tong_rad = max(0.0, self.tong_rad - full / grapple.open_time_s * step_s)
+            if self.held is not None and self.tong_rad < DROP_RAD:
+                self._drop()
+        elif command is GrappleCommand.CLOSE and not self.gripped:
+            before, self.tong_rad = self.tong_rad, self.tong_rad + full / grapple.close_time_s * step_s
+            if before < GRIP_RAD <= self.tong_rad:
+                self._grip()
+            self.gripped = self.held is not None or self.tong_rad >= full
+            self.tong_rad = min(self.tong_rad, full)
+
+    def _grip(self) -> None:
+        x, y, z = pin_position(self.profile.kinematics, self.q)
+        tip_z = z - tip_below_pin_m(self.profile.grapple.tongs, self.tong_rad)
+        for log in self.logs:
+            dx, dy = x - log.center_m[0], y - log.center_m[1]
+            along = dx * log.axis[0] + dy * log.axis[1]
+            across = dx * log.axis[1] - dy * log.axis[0]
+            yaw = atan2(log.axis[1], log.axis[0]) + pi / 2 - grapple_yaw(self.q)
+            under = tip_z < log.center_m[2]
+            if abs(along) < 0.35 and abs(across) < 0.05 and abs(remainder(yaw, pi)) < 0.1 and under:
+                if self.slippery > 0:
+                    self.slippery -= 1
+                else:
+                    self.held, self._along = log.id, along
+                    self._hangs_m = z - tip_z - log.diameter_m / 2  # its underside at the tips
+                    self._psi = atan2(log.axis[1], log.axis[0]) - grapple_yaw(self.q)
+
+    def _carry(self) -> None:
+        if self.held is None:
+            return
+        x, y, z = pin_position(self.profile.kinematics, self.q)
+        psi = self._psi + grapple_yaw(self.q)
+        at = (x - self._along * cos(psi), y - self._along * sin(psi), z - self._hangs_m)
+        self._move(self.held, at, (cos(psi), sin(psi), 0.0))
+
+    def _drop(self) -> None:
+        log = next(log for log in self.logs if log.id == self.held)
+        floor = self.profile.bunk.floor_z_m if over_bunk(self.profile, log.center_m) else None
+        support = self.profile.workspace.ground_z_m if floor is None else floor
+        self._move(log.id, (*log.center_m[:2], support + log.diameter_m / 2), log.axis)
+        self.held = None
+
+    def _move(self, which: int, center: tuple[float, ...], axis: tuple[float, float, float]) -> None:
+        x, y, z = center
+        self.logs = [dataclasses.replace(o, center_m=(x, y, z), axis=axis) if o.id == which else o for o in self.logs]
+
+
+def to_bunk(profile: Profile, point: tuple[float, ...]) -> tuple[float, float]:
+    """Along and across coordinates of a point in the bunk, m."""
+    b = profile.bunk
+    x, y = point[0] - b.center_m[0], point[1] - b.center_m[1]
+    return x * cos(b.yaw_rad) + y * sin(b.yaw_rad), y * cos(b.yaw_rad) - x * sin(b.yaw_rad)
+
+
+def over_bunk(profile: Profile, point: tuple[float, ...], margin_m: float = 0.0) -> bool:
+    """Whether a point is inside the bunk's rectangle, grown by a margin."""
+    along, across = to_bunk(profile, point)
+    b = profile.bunk
+    return abs(along) <= b.length_m / 2 + margin_m and abs(across) <= b.width_m / 2 + margin_m
+
+
+def log_ends(log: LogObservation) -> list[tuple[float, ...]]:
+    """Points along the axis of a log, end to end."""
+    shares = np.linspace(-0.5, 0.5, 9)
+    return [tuple(c + s * log.length_m * a for c, a in zip(log.center_m, log.axis, strict=True)) for s in shares]
+
+
+def tips(profile: Profile, moment: Moment) -> list[tuple[float, float, float]]:
+    """The two tong tips of the hanging grapple, base frame."""
+    gap = half_gap_m(profile.grapple.tongs, moment.tong_rad)
+    yaw = grapple_yaw(moment.q)
+    x, y, z = moment.pin
+    z -= tip_below_pin_m(profile.grapple.tongs, moment.tong_rad)
+    return [(x + s * gap * cos(yaw), y + s * gap * sin(yaw), z) for s in (-1, 1)]
+
+
+def clearances(profile: Profile, trace: list[Moment]) -> dict[str, float]:
+    """The least distances of a run, m: tips over ground and bunk, log over ground, bunk floor and stakes, base."""
+    ground, bunk = profile.workspace.ground_z_m, profile.bunk
+    top = bunk.floor_z_m + bunk.stake_height_m
+    least = dict.fromkeys(("tip", "log", "stakes", "tips_over_stakes", "base"), inf)
+
+    def note(what: str, value: float) -> None:
+        least[what] = min(least[what], value)
+
+    for moment in trace:
+        for tip in tips(profile, moment):
+            note("tip", tip[2] - (bunk.floor_z_m if over_bunk(profile, tip, 0.02) else ground))
+            note("base", hypot(*tip[:2]))
+            if over_bunk(profile, tip, 0.3) and moment.phase not in ("LOWER", "OPEN", "RETREAT", "DONE"):
+                note("tips_over_stakes", tip[2] - top)
+        if moment.held is None:
+            continue
+        bottom = moment.held.diameter_m / 2
+        for point in log_ends(moment.held):
+            note("base", hypot(*point[:2]))
+            inside = over_bunk(profile, point, 0.0)
+            note("log", point[2] - bottom - (bunk.floor_z_m if inside else ground))
+            across = abs(to_bunk(profile, point)[1])
+            if over_bunk(profile, point, 0.3) and point[2] - bottom < top:
+                note("stakes", bunk.width_m / 2 - across - bottom)  # between them: sideways
+    return least

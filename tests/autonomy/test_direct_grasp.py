@@ -1,0 +1,181 @@
+"""Grasp and place from a log's pose: where, how turned, how high; and one clear sentence when it is impossible."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from math import atan2, cos, pi, remainder, sin
+
+import numpy as np
+import pytest
+from crane_stand_in import GROUND_LOG, log_ends, over_bunk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autonomy.grasp.direct import (
+    CLEARANCE_M,
+    NoGrasp,
+    choose,
+    closing_height,
+    hover_height,
+    is_held,
+    lies_in,
+    plan_grasp,
+    plan_place,
+    travel_height,
+)
+from autonomy.logs import LogObservation
+from autonomy.mission import Mission
+from autonomy.motion.arm import Arm, Pose
+from machine.grapple import half_gap_m, lowest_tip_below_pin_m, tip_below_pin_m
+from machine.load import load_profile
+
+PROFILE = load_profile("palms_471")
+ARM = Arm(PROFILE)
+TONGS = PROFILE.grapple.tongs
+GROUND = PROFILE.workspace.ground_z_m
+BUNK = PROFILE.bunk
+
+
+def log_at(x: float, y: float, yaw: float = 0.7, number: int = 0, diameter: float = 0.2) -> LogObservation:
+    return LogObservation(number, (x, y, GROUND + diameter / 2), (cos(yaw), sin(yaw), 0.0), 2.6, diameter)
+
+
+def in_bunk(number: int, top_z_m: float) -> LogObservation:
+    axis = (cos(BUNK.yaw_rad), sin(BUNK.yaw_rad), 0.0)
+    return LogObservation(number, (*BUNK.center_m, top_z_m - 0.1), axis, 2.6, 0.2)
+
+
+def random_logs(n: int) -> list[LogObservation]:
+    rng = random.Random("logs")
+    (cx, cy), half = PROFILE.workspace.pick_center_m, PROFILE.workspace.pick_half_size_m
+    out = []
+    for _ in range(n):
+        x, y = cx + rng.uniform(-half, half), cy + rng.uniform(-half, half)
+        log = log_at(x, y, rng.uniform(-pi, pi), 0, rng.uniform(0.1, 0.3))
+        out.append(replace(log, length_m=rng.uniform(2.5, 2.8)))
+    return out
+
+
+@pytest.mark.parametrize("log", random_logs(200), ids=range(200))
+def test_every_log_of_the_pick_area_has_a_grasp_and_a_place(log: LogObservation) -> None:
+    grasp = plan_grasp(ARM, log, 0.0)
+    assert grasp.along_m == 0.0 and grasp.support_z_m == pytest.approx(GROUND)
+    assert ARM.xy(grasp.pose) == pytest.approx(log.center_m[:2])
+    opening = grasp.pose.slew_rad + grasp.pose.rot_rad
+    assert abs(remainder(opening - atan2(log.axis[1], log.axis[0]), pi)) == pytest.approx(pi / 2)
+    place = plan_place(ARM, Mission(), grasp, [log])
+    assert ARM.xy(place) == pytest.approx(BUNK.center_m)
+    assert remainder(place.slew_rad + place.rot_rad - BUNK.yaw_rad - pi / 2, pi) == pytest.approx(0.0)
+    assert abs(place.rot_rad - grasp.pose.rot_rad) <= pi / 2 + 1e-9
+    for pose in (grasp.pose, place):
+        ARM.joints(np.array([pose, pose.at_height(travel_height(PROFILE))]))  # raises when out of reach
+    assert hover_height(PROFILE, grasp) - tip_below_pin_m(TONGS, 0.0) > GROUND + log.diameter_m + 0.1
+
+
+@settings(max_examples=30)
+@given(st.floats(0.97, 1.03))
+def test_the_tips_sweep_just_above_the_ground_while_closing(pace: float) -> None:
+    height = closing_height(PROFILE, GROUND)
+    rate = TONGS.angle_rad[-1] / PROFILE.grapple.close_time_s
+    tips = {}
+    for t in np.arange(0.0, 3.5, 0.01):
+        angle = min(rate * pace * t, TONGS.angle_rad[-1])
+        tips[angle] = height(t) - tip_below_pin_m(TONGS, angle) - GROUND
+    meeting = [tip for angle, tip in tips.items() if half_gap_m(TONGS, angle) > 0.0]
+    assert min(meeting) > 0.5 * CLEARANCE_M
+    under = [tip for angle, tip in tips.items() if 0.0 < half_gap_m(TONGS, angle) < 0.08]
+    assert max(under) < 0.05  # under the middle of the thinnest log
+    assert tips[0.0] < 0.2
+
+
+def test_the_closing_height_starts_at_rest_and_is_smooth() -> None:
+    height = closing_height(PROFILE, GROUND)
+    z = np.array([height(t) for t in np.arange(0.0, 3.5, 0.02)])
+    speed = np.gradient(z, 0.02)
+    assert abs(speed[0]) < 0.02 and np.max(np.abs(speed)) < 0.2
+    assert np.max(np.abs(np.gradient(speed, 0.02))) < 1.0
+
+
+def test_a_log_on_others_is_gripped_at_its_own_height() -> None:
+    high = replace(GROUND_LOG, center_m=(-1.8, 4.4, -0.9))
+    assert plan_grasp(ARM, high, 0.0).pose.z_m - plan_grasp(ARM, GROUND_LOG, 0.0).pose.z_m == pytest.approx(0.39)
+
+
+def test_a_log_whose_centre_is_just_out_of_reach_is_gripped_off_its_centre() -> None:
+    distances = (float(r) for r in np.arange(6.2, 7.2, 0.05))
+    far = next(log for log in (log_at(0.0, r, pi / 2) for r in distances) if not centre_in_reach(log))
+    grasp = plan_grasp(ARM, far, 0.0)
+    assert grasp.along_m < 0.0 and ARM.xy(grasp.pose)[1] < far.center_m[1] - 0.05
+    place = plan_place(ARM, Mission(), grasp, [])
+    for point in log_ends(laid(grasp.log, grasp.pose, place)):
+        assert over_bunk(PROFILE, point, 0.001)
+
+
+def centre_in_reach(log: LogObservation) -> bool:
+    return plan_grasp(ARM, log, 0.0).along_m == 0.0
+
+
+def laid(log: LogObservation, grasp: Pose, place: Pose) -> LogObservation:
+    """The log after it went rigidly with the grapple from one pose to the other."""
+    (gx, gy), (px, py) = ARM.xy(grasp), ARM.xy(place)
+    turn = place.slew_rad + place.rot_rad - grasp.slew_rad - grasp.rot_rad
+    x, y = log.center_m[0] - gx, log.center_m[1] - gy
+    c, s = cos(turn), sin(turn)
+    axis = (c * log.axis[0] - s * log.axis[1], s * log.axis[0] + c * log.axis[1], 0.0)
+    return replace(log, center_m=(px + c * x - s * y, py + s * x + c * y, -0.9), axis=axis)
+
+
+@pytest.mark.parametrize(
+    ("log", "says"),
+    [
+        (log_at(-6.0, 6.0), r"log 0 cannot be picked: point .* is out of reach: .*"),
+        (log_at(0.5, -4.0), r"log 0 cannot be picked: point .* is out of reach: slew .* outside its limits .*"),
+        (replace(GROUND_LOG, axis=(0.0, 0.6, 0.8)), r"log 0 stands at 53 deg, too steep to grip"),
+    ],
+)
+def test_an_impossible_log_gives_one_clear_sentence(log: LogObservation, says: str) -> None:
+    with pytest.raises(NoGrasp, match=f"^{says}$"):
+        choose(ARM, Mission(), [log], 0.0, 0.0)
+
+
+def test_the_top_log_comes_first_then_the_nearest_and_never_one_in_the_bunk() -> None:
+    near, far = log_at(0.0, 4.5, number=1), log_at(-2.5, 4.5, number=2)
+    top = replace(log_at(-2.0, 4.0, number=3), center_m=(-2.0, 4.0, -0.9))
+    loaded = in_bunk(4, -0.8)
+    assert choose(ARM, Mission(), [far, near, loaded], 0.0, 0.0).log.id == 1
+    assert choose(ARM, Mission(), [near, far, top, loaded], 0.0, 0.0).log.id == 3
+    assert choose(ARM, Mission(log_id=2), [near, far, top], 0.0, 0.0).log.id == 2
+    with pytest.raises(NoGrasp, match="log 9 is not in view"):
+        choose(ARM, Mission(log_id=9), [near], 0.0, 0.0)
+    with pytest.raises(NoGrasp, match="no log lies outside the bunk"):
+        choose(ARM, Mission(), [loaded], 0.0, 0.0)
+    unreachable = log_at(-6.0, 6.0, number=5)
+    assert choose(ARM, Mission(), [unreachable, near], 0.0, 0.0).log.id == 1
+
+
+def test_a_place_is_above_what_is_in_the_bunk_until_the_bunk_is_full() -> None:
+    grasp = plan_grasp(ARM, GROUND_LOG, 0.0)
+    deepest = lowest_tip_below_pin_m(TONGS)
+    empty = plan_place(ARM, Mission(), grasp, [GROUND_LOG])
+    assert 0.04 < empty.z_m - deepest - BUNK.floor_z_m < 0.1
+    half = plan_place(ARM, Mission(), grasp, [in_bunk(1, -0.5)])
+    assert half.z_m - empty.z_m == pytest.approx(0.5)
+    with pytest.raises(NoGrasp, match="the bunk is full"):
+        plan_place(ARM, Mission(), grasp, [in_bunk(1, -0.1)])
+
+
+def test_a_mission_may_name_the_place() -> None:
+    grasp = plan_grasp(ARM, GROUND_LOG, 0.0)
+    assert ARM.xy(plan_place(ARM, Mission(place_m=(3.2, 1.0)), grasp, [])) == pytest.approx((3.2, 1.0))
+    with pytest.raises(NoGrasp, match=r"log 0 cannot be laid down: .*out of reach"):
+        plan_place(ARM, Mission(place_m=(9.0, 1.0)), grasp, [])
+
+
+def test_lying_in_the_bunk_and_hanging_from_the_grapple() -> None:
+    assert lies_in(BUNK, in_bunk(0, -0.8)) and not lies_in(BUNK, in_bunk(0, 0.4))
+    assert not lies_in(BUNK, GROUND_LOG)
+    up = plan_grasp(ARM, GROUND_LOG, 0.0).pose.at_height(travel_height(PROFILE))
+    assert not is_held(ARM, GROUND_LOG, up)
+    assert is_held(ARM, replace(GROUND_LOG, center_m=(-1.7, 4.5, up.z_m - 1.1)), up)
+    assert not is_held(ARM, replace(GROUND_LOG, center_m=(1.0, 4.5, up.z_m - 1.1)), up)

@@ -1,0 +1,318 @@
+"""The console: what the page may do, who may ask, and what the state says."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from autonomy.logs import QUESTION, parse_logs
+from can_dbc.setpoint import OperatorAction, OperatorCommand, StateReport, decode, encode
+from console.server import Console, create_app
+from console.state import ALIVE_NS, STALE_NAMES, Watch, describe_machine
+from controller import inputs as controller_inputs
+from controller.faults import Reason, pack
+from machine.joints import JOINTS
+from machine.load import load_profile, profile_hash
+from machine.modes import Mode
+
+PROFILE = load_profile("palms_471")
+HERE = "http://127.0.0.1:8471"
+REPORT = StateReport(
+    sequence=7,
+    profile_hash=profile_hash(PROFILE),
+    stamp_ns=5_000_000_000,
+    mode=Mode.ACTIVE,
+    grapple_state=4,
+    reason=pack(Reason.JOINT_STUCK, 2),
+    setpoint_sequence=3,
+    refusal=0,
+    refused=4,
+    stale_mask=1 << 4 | 1,
+    position=(0.1, 0.2, -1.0, 0.5, 0.3),
+    velocity=(0.0,) * 5,
+    reference=(0.2, 0.2, -1.0, 0.5, 0.3),
+    opening_pct=60.0,
+    clamp_bar=120.0,
+    load_kg=200.0,
+    tick_ns=600_000,
+    late_ns=80_000,
+    missed_ticks=2,
+    frames_received=1000,
+)
+
+
+@pytest.fixture
+def controller_socket():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("127.0.0.1", 0))
+        s.settimeout(5)
+        yield s
+
+
+@pytest.fixture
+def console(controller_socket):
+    return Console(PROFILE, profile_hash(PROFILE), controller_socket.getsockname(), clock=lambda: 10**10)
+
+
+def client_of(console, peer="127.0.0.1", **options):
+    return TestClient(create_app(console, **options), base_url=HERE, client=(peer, 40000))
+
+
+@pytest.fixture
+def client(console):
+    return client_of(console)
+
+
+def test_page_and_every_file_it_names_are_served_from_here(client):
+    page = client.get("/")
+    assert page.status_code == 200 and "STOP" in page.text
+    assert "http://" not in page.text and "https://" not in page.text
+    for name in ("app.js", "scene.js", "plot.js", "style.css", "icon.svg", "vendor/three.module.min.js",
+                 "vendor/three.core.min.js", "vendor/OrbitControls.js", "vendor/three.LICENSE.txt"):  # fmt: skip
+        assert client.get(f"/static/{name}").status_code == 200, name
+
+
+def test_policy_allows_no_other_source(client):
+    policy = client.get("/").headers["content-security-policy"]
+    assert policy.startswith("default-src 'none'; script-src 'self' 'sha256-")
+    assert "http" not in policy and "unsafe" not in policy and "*" not in policy
+    assert client.get("/static/app.js").headers["content-security-policy"] == policy
+    assert client.get("/healthz").headers["x-content-type-options"] == "nosniff"
+
+
+def test_policy_names_the_hash_of_the_import_map(client):
+    import base64
+    import hashlib
+
+    page = client.get("/").text
+    inline = page.split('<script type="importmap">')[1].split("</script>")[0]
+    digest = base64.b64encode(hashlib.sha256(inline.encode()).digest()).decode()
+    assert f"'sha256-{digest}'" in client.get("/").headers["content-security-policy"]
+    assert page.count("<script") == 2 and "<style" not in page and "onclick" not in page
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8471", "127.0.0.1.evil.example", ""])
+def test_foreign_host_is_refused(client, host):
+    assert client.get("/api/state", headers={"host": host}).status_code == 403
+    with pytest.raises(WebSocketDisconnect), client.websocket_connect("/ws", headers={"host": host}):
+        pass
+
+
+@pytest.mark.parametrize("host", ["localhost:8471", "[::1]:8471", "127.0.0.1:8471"])
+def test_own_names_are_served(client, host):
+    assert client.get("/api/state", headers={"host": host}).status_code == 200
+
+
+def test_allowed_host_is_served(console):
+    client = client_of(console, allow_hosts=("forwarder",))
+    assert client.get("/healthz", headers={"host": "forwarder:8471"}).status_code == 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:9999", "null"])
+def test_foreign_origin_is_refused(client, controller_socket, origin):
+    with (
+        pytest.raises(WebSocketDisconnect),
+        client.websocket_connect("ws://127.0.0.1:8471/ws", headers={"origin": origin}),
+    ):
+        pass
+    assert client.post("/api/operator/arm", headers={"origin": origin}).status_code == 403
+    controller_socket.settimeout(0.05)
+    with pytest.raises(TimeoutError):
+        controller_socket.recv(100)
+
+
+@pytest.mark.parametrize("action", list(OperatorAction))
+def test_command_sends_its_datagram(client, controller_socket, action):
+    answer = client.post(f"/api/operator/{action.name.lower()}", headers={"origin": HERE})
+    assert answer.status_code == 204
+    message = decode(controller_socket.recv(100))
+    assert isinstance(message, OperatorCommand)
+    assert (message.action, message.profile_hash) == (action, profile_hash(PROFILE))
+
+
+def test_command_sequence_grows(client, controller_socket):
+    for _ in range(3):
+        client.post("/api/operator/stop")
+    sequences = [decode(controller_socket.recv(100)).sequence for _ in range(3)]
+    assert sequences == sorted(set(sequences))
+
+
+def test_command_is_authenticated_with_a_key(console, controller_socket):
+    keyed = Console(PROFILE, 1, controller_socket.getsockname(), key=b"secret")
+    client_of(keyed).post("/api/operator/stop")
+    assert decode(controller_socket.recv(100), b"secret").action is OperatorAction.STOP
+
+
+def test_stop_from_elsewhere_is_sent_but_arm_is_refused(console, controller_socket):
+    client = client_of(console, peer="192.0.2.7")
+    assert client.post("/api/operator/stop").status_code == 204
+    assert decode(controller_socket.recv(100)).action is OperatorAction.STOP
+    for action in ("arm", "disarm", "reset"):
+        assert client.post(f"/api/operator/{action}").status_code == 403
+    assert client.get("/api/state").json()["may_command"] is False
+
+
+def test_command_by_get_or_unknown_is_refused(client):
+    assert client.get("/api/operator/stop").status_code == 405
+    assert client.post("/api/operator/launch").status_code == 404
+
+
+def test_stop_says_when_nobody_listens(console, controller_socket):
+    controller_socket.close()
+    answer = client_of(console).post("/api/operator/stop")
+    assert answer.status_code == 502 and "cannot be reached" in answer.text
+
+
+def test_console_without_a_controller_only_watches():
+    client = client_of(Console(PROFILE, 1))
+    assert client.post("/api/operator/stop").status_code == 409
+    assert client.get("/api/state").json()["may_stop"] is False
+
+
+def test_state_flows_over_the_websocket(console, client):
+    console.watch.on_report(encode(REPORT), 10**10)
+    with client.websocket_connect("ws://127.0.0.1:8471/ws", headers={"origin": HERE}) as ws:
+        state = ws.receive_json()
+        assert state["mode"] == "ACTIVE" and state["alive"] and state["may_command"]
+        console.watch.on_report(encode(replace(REPORT, mode=Mode.FAULT)), 10**10)
+        while ws.receive_json()["mode"] != "FAULT":
+            pass
+
+
+def test_reports_arrive_by_udp(controller_socket):
+    reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    reports.bind(("127.0.0.1", 0))
+    reports.setblocking(False)
+    console = Console(PROFILE, 1, reports=reports)
+    with client_of(console) as client:
+        with client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
+            assert not ws.receive_json()["alive"]
+            controller_socket.sendto(encode(REPORT), reports.getsockname())
+            while not ws.receive_json()["alive"]:
+                pass
+        assert client.get("/healthz").json() == {"console": "ok", "controller": "alive"}
+
+
+def test_logs_of_a_detector_are_shown(controller_socket):
+    console = Console(PROFILE, 1, scene=controller_socket.getsockname())
+    log = {"position_m": [1, 2, -1], "axis": [0, 2, 0], "length_m": 2.4, "diameter_m": 0.2}
+    answer = json.dumps([log]).encode()
+    (known,) = parse_logs(answer)
+    with client_of(console) as client:
+        question, peer = controller_socket.recvfrom(100)
+        assert question == QUESTION
+        controller_socket.sendto(b'{"nonsense": 1}', peer)
+        controller_socket.sendto(answer, peer)
+        with client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
+            while not (logs := ws.receive_json()["logs"]):
+                pass
+        (shown,) = logs
+        assert shown["axis"] == [0.0, 1.0, 0.0] and shown["center_m"] == list(known.center_m)
+        assert {"center_m", "axis", "length_m", "diameter_m"} <= set(shown)  # what scene.js draws
+
+
+# ---- the pure part ----------------------------------------------------------------------------------------------
+
+
+def watched(report=REPORT, at_ns=0, seen_ns=0):
+    watch = Watch(PROFILE)
+    assert watch.on_report(encode(report), at_ns)
+    return watch.state(seen_ns)
+
+
+def test_state_says_why_and_what_is_stale():
+    state = watched()
+    assert state["reason"].startswith("Joint tilt does not follow its command")
+    assert state["stale"] == ["emergency stop", "tilt encoder"]
+    assert state["refused"] == 4 and state["refusal"] == ""
+
+
+def test_unknown_reason_and_mode_are_still_shown():
+    state = watched(replace(REPORT, reason=250, mode=77))
+    assert "250" in state["reason"] and state["mode"] == "MODE 77"
+
+
+def test_unknown_numbers_are_none_and_the_state_is_json():
+    unknown = (math.nan,) * 5
+    state = watched(replace(REPORT, position=unknown, reference=unknown, clamp_bar=math.nan))
+    assert state["position"] == [None] * 5 and state["clamp_bar"] is None and state["points"] is None
+    json.dumps(state, allow_nan=False)
+
+
+def test_silence_is_noticed_within_a_second():
+    watch = Watch(PROFILE)
+    watch.on_report(encode(REPORT), 0)
+    assert watch.state(ALIVE_NS - 1)["alive"] and not watch.state(ALIVE_NS)["alive"]
+    # The page is told every 50 ms and looks every 100 ms.
+    assert ALIVE_NS + 150_000_000 < 1_000_000_000
+
+
+def test_peaks_hold_for_a_second():
+    watch = Watch(PROFILE)
+    for k, tick_ns in enumerate((900_000, 100_000, 100_000)):
+        report = replace(REPORT, tick_ns=tick_ns, stamp_ns=k * 20_000_000, frames_received=64 * k)
+        watch.on_report(encode(report), k * 20_000_000)
+    assert watch.state(50_000_000)["tick_ms"] == 0.9
+    assert watch.state(50_000_000)["frames_per_s"] == 3200
+    assert watch.state(1_010_000_000)["tick_ms"] == 0.1
+
+
+def test_foreign_datagrams_change_nothing():
+    watch = Watch(PROFILE)
+    good = encode(REPORT)
+    command = OperatorCommand(1, 2, 3, OperatorAction.STOP)
+    for bad in (b"", b"x", good[:-1], good[:40] + b"\xff" + good[41:], encode(command)):
+        assert not watch.on_report(bad, 0)
+    assert "mode" not in watch.state(0)
+
+
+def test_drawing_hangs_the_grapple_below_the_pin():
+    state = watched()
+    base, _, _, _, pin, rotator, grapple = state["points"]
+    assert base == [0, 0, 0] and pin[:2] == grapple[:2] and pin[2] > rotator[2] > grapple[2]
+    assert state["reference_points"][4] != pin
+    assert state["tongs"]["yaw_rad"] == pytest.approx(0.4)
+
+
+def test_stale_names_are_the_controllers_bits():
+    bits = set(controller_inputs._BITS.values()) | {controller_inputs.ENCODER_BIT + j for j in JOINTS}
+    assert set(STALE_NAMES) == bits
+
+
+def test_machine_description_names_every_joint_once():
+    names = [j["name"] for j in describe_machine(PROFILE)["joints"]]
+    assert names == [j.name.lower() for j in JOINTS]
+
+
+# ---- the process ------------------------------------------------------------------------------------------------
+
+
+def run_console(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "console", *map(str, arguments)], capture_output=True, text=True, timeout=30
+    )
+
+
+def test_busy_ports_and_wrong_settings_are_one_sentence():
+    with socket.socket() as page, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reports:
+        page.bind(("127.0.0.1", 0))
+        page.listen()
+        reports.bind(("127.0.0.1", 0))
+        busy, port = page.getsockname()[1], reports.getsockname()[1]
+        cases = [
+            (4, "--port", busy, "--report-port", 0),
+            (4, "--port", 0, "--report-port", port),
+            (3, "--port", 0, "--report-port", 0, "--profile", "palms"),
+            (2, "--port", 0, "--report-port", 0, "--controller", "nowhere"),
+        ]
+        for code, *arguments in cases:
+            done = run_console(*arguments)
+            assert (done.returncode, done.stderr.count("\n"), "Traceback" in done.stderr) == (code, 1, False)

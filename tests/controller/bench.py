@@ -1,0 +1,302 @@
+"""A bench for the controller: emulated nodes and an integrator for a crane, in virtual time, in one process.
+
+It answers SDO like an encoder, sends every input frame at its period with a valid E2E header, and turns spool
+commands into joint motion through dead time and dead-band.  Faults are put on by name: ``dropped`` messages,
+``changed`` signals, ``corrupt`` messages.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from can_dbc.canopen import (
+    SDO_TO_CLIENT,
+    SdoKind,
+    abort_frame,
+    download_response,
+    heartbeat_frame,
+    parse_request,
+    upload_response,
+)
+from can_dbc.codec import load
+from can_dbc.e2e import Sender
+from can_dbc.frame import Frame
+from can_dbc.setpoint import (
+    CraneSetpoint,
+    GrappleCommand,
+    Knot,
+    OperatorAction,
+    OperatorCommand,
+    StateReport,
+    decode,
+    encode,
+)
+from controller.config import load as load_settings
+from controller.step import Controller, Inputs, Outputs, step
+from machine.encoder import counts_from_position
+from machine.joints import JOINTS, N_JOINTS
+from machine.modes import Mode
+from machine.profile import joint
+
+DATABASE = load("crane")
+SETTINGS = load_settings("palms_471")
+PROFILE = SETTINGS.profile
+SPECS = [joint(PROFILE, j) for j in JOINTS]
+T = SETTINGS.period_ns
+MS = 1_000_000
+HOME = (0.0, 0.5, -1.2, 0.6, 0.0)
+PERIOD_MS = {"EstopStat": 10, "GuardStat": 10, "PressC": 20, "GrappleStat": 20, "PlcStatus": 20}
+VALUES: dict[str, dict[str, float]] = {
+    "EstopStat": {"ChannelA": 1, "ChannelB": 1, "PilotSupply": 1, "PilotPress": 30.0},
+    "GuardStat": {"Enable": 0xA},
+    "ValveFbA": {},
+    "ValveFbB": {},
+    "PressA": {},
+    "PressB": {},
+    "PressC": {"Pump": 180.0},
+    "PlcStatus": {"Mode": 2},
+    "GrappleStat": {"Opening": 100.0},
+}
+DEVICE = {"rotary": 0x00010196, "linear": 0x00080196}
+
+
+def count_until(tick: Callable[[], Any], done: Callable[[], bool], limit: int = 100) -> int:
+    """How many ticks it takes until ``done``; fails when it does not come about."""
+    for k in range(1, limit + 1):
+        tick()
+        if done():
+            return k
+    raise AssertionError(f"not after {limit} ticks")
+
+
+class EncoderNode:
+    """An encoder's object dictionary and NMT state."""
+
+    def __init__(self, spec: Any) -> None:
+        self.spec = spec
+        self.state = 0x7F
+        self.objects = {
+            (0x1000, 0): spec.device_type, (0x1018, 1): 7, (0x6001, 0): spec.total_counts,
+            (0x6005, 1): round(spec.unit_per_count * 1e9), (0x6002, 0): spec.total_counts, (0x1A00, 0): 2,
+        }  # fmt: skip
+        self.silent = False
+        self.refuses: set[tuple[int, int]] = set()
+        self.writes: list[tuple[int, int, int]] = []
+
+    def answer(self, key: int, data: bytes) -> tuple[int, bytes] | None:
+        request = parse_request(key, data)
+        if request is None or request.node != self.spec.node or self.silent:
+            return None
+        place = (request.index, request.sub)
+        if place in self.refuses or (request.kind is SdoKind.UPLOAD and place not in self.objects):
+            return abort_frame(SDO_TO_CLIENT, request.node, *place, 0x06020000)
+        if request.kind is SdoKind.UPLOAD:
+            return upload_response(request.node, *place, self.objects[place].to_bytes(4, "little"))
+        self.objects[place] = request.unsigned
+        self.writes.append((*place, request.unsigned))
+        return download_response(request.node, *place)
+
+
+class Bench:
+    """A controller and its surroundings; `tick` advances both by one period."""
+
+    def __init__(self, settings=SETTINGS, start_ns: int = 1_000_000_000, home=HOME, guard=None) -> None:
+        self.settings = settings
+        self.guard = guard
+        self.controller = Controller(settings, DATABASE)
+        self.inputs = Inputs()
+        self.now_ns = start_ns
+        self.count = 0
+        self.q = list(home)
+        self.v = [0.0] * N_JOINTS
+        self.stuck: set[int] = set()
+        self.backward: set[int] = set()
+        self.moves_alone: dict[int, float] = {}
+        self.lines = [deque([0.0] * max(1, round(s.valve.delay_s * 1e9 / T))) for s in SPECS]
+        self.senders = {n: Sender(m.data_ids) for n, m in DATABASE.messages.items() if m.data_ids}
+        self.dropped: set[str] = set()
+        self.corrupt: set[str] = set()
+        self.frozen: set[str] = set()
+        self.changed: dict[str, dict[str, float]] = {}
+        self.silent_nodes: set[int] = set()
+        self.encoders = {s.encoder.node: EncoderNode(s.encoder) for s in SPECS if s.encoder}
+        self.nodes = dict.fromkeys((1, 16, 32, 33, 34, 125), 5)
+        self.pending: list[tuple[int, bytes]] = [heartbeat_frame(n, 0) for n in (*self.nodes, *self.encoders)]
+        self.extra: list[tuple[int, bytes]] = []
+        self.echo = 0
+        self.sequence = 0
+        self.setpoint_sequence = 0
+        self.reports: list[StateReport] = []
+        self.commands_a: dict[str, Any] = {}
+        self.commands_b: dict[str, Any] = {}
+        self.last_frames: dict[str, Frame] = {}
+        if guard is not None:
+            self.dropped.add("GuardStat")
+            del self.nodes[0x7D]
+
+    # -- surroundings
+
+    def tick(self, datagrams: Iterable[bytes] = (), **measured: int) -> Outputs:
+        """One period: the frames answered to the last SYNC reach the controller, which then steps."""
+        self.now_ns += T
+        stamp = self.now_ns - T + 1 * MS
+        self.inputs.frames = [Frame(stamp, key, data) for key, data in self._answers()]
+        self.inputs.datagrams = list(datagrams)
+        self.inputs.late_ns = measured.pop("late_ns", 0)
+        for name, value in measured.items():
+            setattr(self.inputs, name, value)
+        outputs = step(self.controller, self.inputs, self.now_ns)
+        self._obey(outputs)
+        if self.guard is not None:
+            heard = [frame for frame in self.inputs.frames if frame.key not in (0x1FD, 0x77D)]
+            heard += [Frame(self.now_ns, key, data) for key, data in outputs.frames]
+            self.pending += self.guard.step(self.now_ns, heard)
+        if outputs.report is not None:
+            report = decode(outputs.report, self.settings.key)
+            assert isinstance(report, StateReport)
+            self.reports.append(report)
+        self.count += 1
+        return outputs
+
+    def run(self, ticks: int, **measured: int) -> Outputs:
+        for _ in range(ticks):
+            outputs = self.tick(**measured)
+        return outputs
+
+    def _answers(self) -> list[tuple[int, bytes]]:
+        frames, self.pending = self.pending, []
+        for j, spec in enumerate(SPECS):
+            encoder = spec.encoder
+            if self.encoders[encoder.node].state == 0x05 and encoder.message not in self.dropped:
+                counts = counts_from_position(encoder, self.q[j])
+                values = {"Position": counts}
+                codec = DATABASE.message(encoder.message)
+                if "TimeStamp" in codec.index and encoder.message not in self.frozen:
+                    values["TimeStamp"] = self.count & 0xFFFF
+                frames.append(self._frame(encoder.message, values))
+        for name, values in VALUES.items():
+            if (self.count * 5) % PERIOD_MS.get(name, 5) == 0 and name not in self.dropped:
+                more = {"EchoCounter": self.echo} if name == "ValveFbB" else {}
+                frames.append(self._frame(name, {**values, **more}))
+        if self.count % 20 == 0:
+            states = {**self.nodes, **{n: e.state for n, e in self.encoders.items()}}
+            frames += [heartbeat_frame(n, s) for n, s in states.items() if n not in self.silent_nodes]
+        frames += self.extra
+        self.extra = []
+        return frames
+
+    def _frame(self, name: str, values: dict[str, float]) -> tuple[int, bytes]:
+        codec = DATABASE.message(name)
+        values = {**values, **self.changed.get(name, {})}
+        data = codec.encode(*(values.get(s.name, 0) for s in codec.signals))
+        if codec.data_ids:
+            if name in self.frozen and name in self.last_frames:
+                return codec.key, self.last_frames[name].data
+            data = self.senders[name].protect(data)
+            self.last_frames[name] = Frame(0, codec.key, data)
+        if name in self.corrupt:
+            data = bytes([data[0] ^ 0x55]) + data[1:]
+        return codec.key, data
+
+    def _obey(self, outputs: Outputs) -> None:
+        a, b = DATABASE.message("ValveCmdA"), DATABASE.message("ValveCmdB")
+        for key, data in outputs.frames:
+            if key == a.key:
+                self.commands_a = a.named(a.decode(data))
+                self.echo = self.commands_a["Counter"]
+            elif key == b.key:
+                self.commands_b = b.named(b.decode(data))
+            elif key == 0:
+                for node, encoder in self.encoders.items():
+                    if data[1] in (0, node):
+                        encoder.state = {0x01: 0x05, 0x80: 0x7F}[data[0]]
+            else:
+                for encoder in self.encoders.values():
+                    answer = encoder.answer(key, data)
+                    if answer is not None:
+                        self.pending.append(answer)
+        for j, spec in enumerate(SPECS):
+            valve = spec.valve
+            command = {**self.commands_a, **self.commands_b}[valve.signal] / 100.0
+            self.lines[j].append(command)
+            opening = self.lines[j].popleft()
+            deadband = (valve.deadband_plus_pct if opening > 0 else valve.deadband_minus_pct) / 100.0
+            full = valve.full_speed_plus if opening > 0 else valve.full_speed_minus
+            share = max(0.0, abs(opening) - deadband) / (1.0 - deadband)
+            self.v[j] = 0.0 if j in self.stuck else (full if opening > 0 else -full) * share
+            self.v[j] = self.moves_alone.get(j, 0.0) + (-self.v[j] if j in self.backward else self.v[j])
+            self.q[j] += self.v[j] * T * 1e-9
+
+    # -- what a person and a planner say
+
+    def operator(self, action: OperatorAction, **fields: int) -> bytes:
+        self.sequence += 1
+        values = {"sequence": self.sequence, "profile_hash": self.settings.profile_hash,
+                  "stamp_ns": self.now_ns, **fields}  # fmt: skip
+        return encode(OperatorCommand(action=action, **values))
+
+    def setpoint(self, knots, grapple=GrappleCommand.NEUTRAL, final=False, lease_ms=200, **fields) -> bytes:
+        """``knots``: (after_ms, position, velocity)."""
+        self.setpoint_sequence += 1
+        values = {"sequence": self.setpoint_sequence, "profile_hash": self.settings.profile_hash,
+                  "stamp_ns": self.now_ns, "lease_ns": lease_ms * MS, **fields}  # fmt: skip
+        packed = tuple(Knot(round(ms * MS), tuple(p), tuple(v)) for ms, p, v in knots)
+        return encode(CraneSetpoint(grapple=grapple, final=final, knots=packed, **values))
+
+    def hold(self, **fields) -> bytes:
+        """A setpoint that stays where the reference is."""
+        reference = [r if r == r else 0.0 for r in self.controller.reference]
+        return self.setpoint([(0, reference, [0.0] * 5), (400, reference, [0.0] * 5)], **fields)
+
+    def moving(self, j: int, speed: float, lease_ms: int = 200, **fields) -> bytes:
+        """A setpoint that goes on from the reference with a constant velocity of one joint."""
+        start = list(self.controller.reference)
+        v = [0.0] * 5
+        v[j] = speed
+        end = list(start)
+        end[j] += speed * 0.4
+        return self.setpoint([(0, start, v), (400, end, v)], lease_ms=lease_ms, **fields)
+
+    # -- states
+
+    def boot(self) -> Bench:
+        for _ in range(400):
+            self.tick()
+            if self.controller.supervisor.mode is Mode.STANDBY and self.controller.supervisor.reason == 0:
+                return self
+        raise AssertionError(f"no standby: {self.controller.supervisor.reason!r}")
+
+    def armed(self) -> Bench:
+        self.boot()
+        self.tick([self.operator(OperatorAction.ARM)])
+        assert self.mode is Mode.ARMED, self.controller.gate.refusal
+        return self
+
+    def active(self, j: int = 0, speed: float = 0.08, ticks: int = 60) -> Bench:
+        """ACTIVE and moving: the planner renews its setpoint every 50 ms."""
+        self.armed()
+        self.tick([self.hold()])
+        self.drive(j, speed, ticks)
+        assert self.mode is Mode.ACTIVE, self.controller.supervisor.reason
+        return self
+
+    def drive(self, j: int, speed: float, ticks: int) -> None:
+        for k in range(ticks):
+            self.tick([self.moving(j, speed)] if k % 10 == 0 else ())
+
+    @property
+    def mode(self) -> Mode:
+        return self.controller.supervisor.mode
+
+    @property
+    def reason(self) -> int:
+        return self.controller.supervisor.reason
+
+    @property
+    def neutral(self) -> bool:
+        """Whether the last commands are neutral on every function."""
+        spools = [self.commands_a[s] for s in ("Slew", "Lift", "Tilt", "Ext")]
+        spools += [self.commands_b[s] for s in ("Rot", "Grapple", "Aux")]
+        return not any(spools) and self.commands_a["Mode"] == 0

@@ -1,0 +1,360 @@
+"""Loss and fault of every input: the reaction, its detection bound and neutral commands in time, in virtual time."""
+
+import pytest
+from bench import MS, Bench, T, count_until
+
+from can_dbc.canopen import Emergency, emergency_frame, heartbeat_frame
+from can_dbc.setpoint import OperatorAction
+from controller.faults import FAULTS, Reaction, Reason, describe, pack
+from machine.joints import Joint
+from machine.modes import Mode
+
+PROMISE_NS = 100 * MS
+
+
+def until_reason(bench: Bench, reason: Reason, limit: int = 100) -> int:
+    """Ticks until the reason stands; the planner goes on sending."""
+    for k in range(1, limit + 1):
+        bench.tick([bench.moving(0, 0.08)] if k % 10 == 0 and bench.mode is Mode.ACTIVE else ())
+        if bench.reason == reason:
+            return k
+    raise AssertionError(f"{reason.name} not seen; {bench.mode.name} {bench.controller.supervisor.reason.name}")
+
+
+def ticks_to_neutral(bench: Bench, limit: int = 100) -> int:
+    for k in range(limit):
+        if bench.neutral:
+            return k
+        bench.tick()
+    raise AssertionError("not neutral")
+
+
+LOSSES = [
+    ("EstopStat", Reason.ESTOP_LOST),
+    ("GuardStat", Reason.GUARD_LOST),
+    ("EncSlew", Reason.ENCODER_LOST),
+    ("EncLift", Reason.ENCODER_LOST),
+    ("EncTilt", Reason.ENCODER_LOST),
+    ("EncExt", Reason.ENCODER_LOST),
+    ("EncRot", Reason.ENCODER_LOST),
+    ("ValveFbA", Reason.VALVE_FEEDBACK_LOST),
+    ("ValveFbB", Reason.VALVE_FEEDBACK_LOST),
+    ("PlcStatus", Reason.PLC_LOST),
+]
+
+
+CASES = [
+    (name, reason, how)
+    for name, reason in LOSSES
+    for how in ("dropped", "corrupt", "frozen")
+    # An encoder frame has no checksum, and the linear one no time stamp that could stand still.
+    if not (name.startswith("Enc") and how == "corrupt") and (name, how) != ("EncExt", "frozen")
+]
+
+
+@pytest.mark.parametrize(("name", "reason", "how"), CASES)
+def test_loss_of_each_needed_input_is_neutral_within_the_promise(name, reason, how):
+    bench = Bench().active()
+    getattr(bench, how).add(name)
+    ticks = until_reason(bench, reason)
+    assert ticks * T <= FAULTS[reason].bound_ms * MS + T
+    ticks += ticks_to_neutral(bench)
+    assert ticks * T <= PROMISE_NS
+    bench.run(20)
+    assert bench.mode is Mode.FAULT and bench.neutral and bench.commands_b["ArmKey"] == 0
+    getattr(bench, how).clear()
+    bench.run(400)
+    assert bench.mode is Mode.FAULT, "a fault stays until a human resets it"
+
+
+@pytest.mark.parametrize("name", ["PressA", "PressB", "PressC", "GrappleStat"])
+def test_loss_of_a_helpful_input_halves_the_speed(name):
+    bench = Bench().active()
+    bench.dropped.add(name)
+    reason = Reason.GRAPPLE_STATUS_LOST if name == "GrappleStat" else Reason.PRESSURE_LOST
+    assert until_reason(bench, reason) * T <= FAULTS[reason].bound_ms * MS
+    assert bench.mode is Mode.ACTIVE and bench.controller.supervisor.half_speed
+    bench.dropped.clear()
+    bench.drive(0, 0.08, 230)
+    assert not bench.controller.supervisor.half_speed and bench.reason == Reason.NONE
+
+
+def test_one_lost_frame_and_one_bad_checksum_do_not_trip():
+    bench = Bench().active()
+    for name in ("EncSlew", "ValveFbA", "EstopStat"):
+        for what in (bench.dropped, bench.corrupt):
+            what.add(name)
+            bench.tick([bench.moving(0, 0.08)])
+            what.clear()
+            bench.drive(0, 0.08, 8)
+    assert bench.mode is Mode.ACTIVE
+
+
+VALUES = [
+    ("EstopStat", {"ChannelA": 0, "ChannelB": 0}, Reason.ESTOP_PRESSED),
+    ("EstopStat", {"ChannelA": 0}, Reason.ESTOP_PRESSED),
+    ("EstopStat", {"ChannelB": 2}, Reason.ESTOP_CHANNELS),
+    ("EstopStat", {"ChannelB": 3}, Reason.ESTOP_CHANNELS),
+    ("EstopStat", {"Person": 1}, Reason.PERSON_IN_ZONE),
+    ("GuardStat", {"Enable": 0}, Reason.GUARD_REFUSES),
+    ("ValveFbA", {"State": 4}, Reason.VALVE_NODE_FAULT),
+    ("ValveFbA", {"State": 3}, Reason.VALVE_NODE_FAULT),
+    ("ValveFbB", {"EchoCounter": 7}, Reason.VALVE_ECHO_STUCK),
+    ("PlcStatus", {"FaultBits": 1}, Reason.PLC_FAULT),
+    ("EncRot", {"Alarms": 4}, Reason.ENCODER_ALARM),
+]
+
+
+@pytest.mark.parametrize(("name", "values", "reason"), VALUES)
+def test_a_bad_value_is_found_in_time(name, values, reason):
+    bench = Bench().active()
+    bench.changed[name] = values
+    assert until_reason(bench, reason) * T <= FAULTS[reason].bound_ms * MS
+    bench.run(32)
+    assert bench.neutral
+    latched = FAULTS[reason].reaction >= Reaction.RAMP
+    assert bench.mode is (Mode.FAULT if latched else Mode.STOP)
+
+
+def test_encoder_jump_single_is_refused_and_the_third_stops():
+    bench = Bench().active()
+    refused = bench.controller.estimators[Joint.SLEW].refused
+    home = bench.q[0]
+    for k in range(3):
+        bench.q[0] = bench.q[0] + 0.2
+        bench.tick()
+        bench.q[0] -= 0.2
+        assert bench.controller.estimators[0].refused == refused + k + 1
+        if k == 0:
+            assert bench.mode is Mode.ACTIVE
+            assert abs(bench.controller.estimators[0].position - home) < 0.01
+            bench.tick([bench.moving(0, 0.08)])
+    bench.tick()
+    assert bench.reason == Reason.ENCODER_JUMP and bench.mode is Mode.STOP
+
+
+def test_position_outside_the_range_stops():
+    bench = Bench(home=(0.0, 1.356, -1.2, 0.6, 0.0)).armed()
+    for _ in range(100):
+        bench.q[1] += 0.0001
+        bench.tick()
+    assert bench.mode is Mode.FAULT and bench.reason == Reason.POSITION_OUTSIDE
+    assert bench.controller.supervisor.detail == Joint.LIFT
+
+
+@pytest.mark.parametrize(
+    ("node", "reason"),
+    [(1, Reason.SAFETY_NODE_LOST), (0x10, Reason.SAFETY_NODE_LOST), (0x7D, Reason.SAFETY_NODE_LOST),
+     (2, Reason.ENCODER_NODE_LOST), (6, Reason.ENCODER_NODE_LOST), (0x20, Reason.PRESSURE_NODE_LOST)],
+)  # fmt: skip
+def test_heartbeat_lost(node, reason):
+    bench = Bench().active()
+    bench.silent_nodes.add(node)
+    while bench.count % 20 != 1:
+        bench.tick([bench.moving(0, 0.08)])
+    assert until_reason(bench, reason) * T <= FAULTS[reason].bound_ms * MS
+    assert bench.controller.supervisor.detail == node
+
+
+@pytest.mark.parametrize("state", [0x00, 0x04, 0x7F])
+@pytest.mark.parametrize("node", [1, 0x10, 3])
+def test_restart_or_leaving_operational(node, state):
+    bench = Bench().active()
+    bench.extra.append(heartbeat_frame(node, state))
+    bench.tick()
+    assert bench.reason == Reason.NODE_RESTARTED and bench.mode is Mode.STOP
+    bench.run(13)
+    assert bench.mode is Mode.FAULT
+
+
+def test_a_restarted_encoder_is_set_up_again_before_arming():
+    bench = Bench().active()
+    bench.encoders[3].state = 0x7F
+    bench.encoders[3].writes.clear()
+    bench.extra.append(heartbeat_frame(3, 0))
+    bench.run(100)
+    assert bench.mode is Mode.FAULT and bench.encoders[3].state == 0x05
+    assert (0x1800, 2, 1) in bench.encoders[3].writes
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.ARMED
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [(0x5000, Reason.EMERGENCY_MESSAGE), (0x6100, Reason.EMERGENCY_MESSAGE), (0xFF01, Reason.EMERGENCY_MESSAGE),
+     (0x4200, Reason.EMERGENCY_WARNING), (0x1000, Reason.EMERGENCY_WARNING)],
+)  # fmt: skip
+def test_emergency_messages(code, reason):
+    bench = Bench().active()
+    bench.extra.append(emergency_frame(Emergency(4, code, 1, b"")))
+    bench.tick()
+    assert bench.reason == reason and bench.controller.supervisor.detail == 4
+    bench.extra.append(emergency_frame(Emergency(4, 0, 0, b"")))
+    bench.tick()
+    assert not bench.controller.received.nodes[4].emergency
+    assert not bench.controller.received.nodes[4].warning
+
+
+def test_three_communication_emergencies_in_ten_seconds_stop():
+    bench = Bench().active()
+    for k in range(3):
+        assert bench.mode is Mode.ACTIVE, k
+        bench.extra.append(emergency_frame(Emergency(4, 0x8100, 1, b"")))
+        bench.drive(0, 0.08, 10)
+    assert bench.reason == Reason.EMERGENCY_MESSAGE
+
+
+def test_another_controller_is_noticed_in_every_mode():
+    for prepare in (Bench.boot, Bench.armed, Bench.active):
+        bench = prepare(Bench())
+        bench.extra.append((0x210, bytes(8)))
+        bench.tick()
+        assert bench.mode is Mode.FAULT and bench.reason == Reason.FOREIGN_CONTROLLER and bench.neutral
+
+
+@pytest.mark.parametrize(
+    ("state", "reason", "mode"),
+    [(3, Reason.BUS_OFF, Mode.FAULT), (4, Reason.BUS_DOWN, Mode.FAULT), (2, Reason.BUS_PASSIVE, Mode.ACTIVE),
+     (1, Reason.NONE, Mode.ACTIVE)],
+)  # fmt: skip
+def test_bus_state(state, reason, mode):
+    bench = Bench().active()
+    bench.tick(bus_state=state)
+    assert bench.mode is mode and bench.reason == reason
+
+
+def test_three_refused_sends_in_a_row_stop_and_two_do_not():
+    bench = Bench().active()
+    bench.tick(bus_refused=1)
+    bench.tick(bus_refused=2)
+    bench.tick(bus_refused=2)
+    bench.tick(bus_refused=3)
+    bench.tick(bus_refused=4)
+    assert bench.mode is Mode.ACTIVE
+    bench.tick(bus_refused=5)
+    assert bench.reason == Reason.SEND_REFUSED and bench.mode is Mode.STOP
+
+
+def test_frames_of_an_overflowed_tick_are_not_used():
+    bench = Bench().active()
+    count = bench.controller.received.count
+    bench.tick([bench.moving(0, 0.08)], bus_dropped=3)
+    assert bench.controller.received.count == count
+    bench.tick(bus_dropped=3)
+    assert bench.controller.received.count > count and bench.mode is Mode.ACTIVE
+
+
+def test_late_loop_degrades_and_stalled_loop_stops():
+    bench = Bench().active()
+    bench.tick(late_ns=T + 1)
+    assert bench.mode is Mode.ACTIVE and bench.reason == Reason.LOOP_LATE
+    bench.tick([bench.moving(0, 0.08)], late_ns=3 * T + 1)
+    assert bench.mode is Mode.STOP and bench.reason == Reason.LOOP_STALLED
+    bench.run(31)
+    assert bench.neutral
+
+
+def test_a_second_fault_while_stopping_is_neutral_at_once():
+    bench = Bench().active()
+    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.run(3)
+    assert not bench.neutral
+    bench.dropped.add("EncSlew")
+    bench.run(4)
+    assert bench.mode is Mode.FAULT and bench.neutral
+
+
+def test_lease_lost_while_moving_slows_down_and_stops():
+    bench = Bench().active()
+    bench.tick([bench.moving(0, 0.08, lease_ms=100)])
+    k = count_until(bench.tick, lambda: bench.mode is Mode.STOP)
+    assert bench.reason == Reason.LEASE_LOST and k * T <= 110 * MS
+    bench.run(30)
+    assert bench.neutral and bench.mode is Mode.STOP
+
+
+def test_a_trajectory_that_ends_in_motion_ends_its_lease():
+    bench = Bench().active()
+    start = list(bench.controller.reference)
+    speed = [0.08, 0.0, 0.0, 0.0, 0.0]
+    bench.tick([bench.setpoint([(0, start, speed), (50, [start[0] + 0.004, *start[1:]], speed)])])
+    bench.run(12)
+    assert bench.mode is Mode.STOP and bench.reason == Reason.LEASE_LOST
+
+
+def test_three_refused_setpoints_in_a_second_stop():
+    bench = Bench().active()
+    for _ in range(2):
+        bench.tick([b"rubbish"])
+        bench.drive(0, 0.08, 20)
+    assert bench.mode is Mode.ACTIVE
+    bench.tick([b"rubbish"])
+    assert bench.mode is Mode.STOP and bench.reason == Reason.SETPOINTS_REFUSED
+
+
+def test_refusals_before_a_movement_do_not_stop_it():
+    bench = Bench().armed()
+    bench.tick([b"rubbish"] * 5)
+    bench.tick([bench.hold()])
+    bench.drive(0, 0.08, 20)
+    assert bench.mode is Mode.ACTIVE
+
+
+def test_stuck_joint_holds_within_400_ms():
+    bench = Bench().active(speed=0.13)
+    for _ in range(15):
+        bench.drive(0, bench.controller.reference_velocity[0] + 0.02, 10)
+        if bench.controller.reference_velocity[0] > 0.25:
+            break
+    bench.stuck.add(0)
+    for k in range(1, 81):
+        bench.tick([bench.moving(0, 0.28)] if k % 10 == 1 else ())
+        if bench.mode is not Mode.ACTIVE:
+            break
+    assert bench.reason == Reason.JOINT_STUCK and bench.controller.supervisor.detail == Joint.SLEW
+    assert k * T <= FAULTS[Reason.JOINT_STUCK].bound_ms * MS
+
+
+def test_joint_that_moves_alone_cuts_within_150_ms():
+    bench = Bench().armed()
+    bench.tick([bench.hold()])
+    bench.moves_alone[0] = 0.4
+    k = count_until(bench.tick, lambda: bench.mode is Mode.FAULT)
+    assert bench.reason == Reason.JOINT_RUNAWAY
+    assert k * T <= FAULTS[Reason.JOINT_RUNAWAY].bound_ms * MS
+
+
+def test_joint_that_moves_the_wrong_way_stops():
+    bench = Bench().armed()
+    bench.backward.add(0)
+    moving_ticks = 0
+    for k in range(100):
+        bench.tick([bench.moving(0, 0.13)] if k % 10 == 0 and bench.mode is not Mode.STOP else ())
+        moving_ticks += bench.v[0] != 0.0
+        if bench.mode is Mode.STOP:
+            break
+    assert bench.reason == Reason.JOINT_REVERSED and bench.controller.supervisor.detail == Joint.SLEW
+    bench.run(13)
+    assert bench.mode is Mode.FAULT and bench.neutral
+    assert moving_ticks * T <= FAULTS[Reason.JOINT_REVERSED].bound_ms * MS
+
+
+def test_descriptions_name_the_joint_and_the_node():
+    assert describe(Reason.ENCODER_LOST, Joint.TILT) == (
+        "The encoder of joint tilt is no longer received. Check its cable, then reset and arm."
+    )
+    assert "valve node" in describe(pack(Reason.SAFETY_NODE_LOST, 0x10))
+    assert describe(Reason.POSITION_OUTSIDE, Joint.EXT).startswith("Joint ext is outside")
+    assert describe(Reason.NODE_ABSENT, 5).startswith("Node 5 ")
+    for reason in Reason:
+        assert "{" not in describe(reason, 1)
+
+
+def test_a_final_setpoint_whose_lease_ends_on_the_way_stops():
+    bench = Bench().armed()
+    start = list(bench.controller.reference)
+    end = [start[0] + 0.1, *start[1:]]
+    bench.tick([bench.setpoint([(0, start, [0.0] * 5), (1500, end, [0.0] * 5)], final=True, lease_ms=300)])
+    bench.run(62)
+    assert bench.mode is Mode.STOP and bench.reason == Reason.LEASE_LOST

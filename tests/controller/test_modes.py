@@ -1,0 +1,244 @@
+"""The mode table, exhaustively, and how the operator moves through it."""
+
+import pytest
+from bench import MS, VALUES, Bench
+
+from can_dbc.setpoint import OperatorAction
+from controller.faults import FAULTS, Reaction, Reason
+from controller.supervisor import TRANSITIONS, Event
+from machine.modes import Mode
+
+B, S, A, X, P, F = Mode.BOOT, Mode.STANDBY, Mode.ARMED, Mode.ACTIVE, Mode.STOP, Mode.FAULT
+#                 BOOT STANDBY ARMED ACTIVE STOP FAULT
+TABLE = {
+    Event.BOOTED: (S, S, A, X, P, F),
+    Event.ARM: (B, A, A, X, A, F),
+    Event.DISARM: (B, S, S, P, S, F),
+    Event.RESET: (B, S, A, X, S, B),
+    Event.SETPOINT: (B, S, X, X, P, F),
+    Event.DONE: (B, S, A, A, P, F),
+    Event.HOLD: (B, P, P, P, P, F),
+    Event.RAMP: (B, S, F, P, F, F),
+    Event.CUT: (F, F, F, F, F, F),
+    Event.LATCHED: (B, S, A, X, F, F),
+}
+
+
+@pytest.mark.parametrize("event", Event)
+@pytest.mark.parametrize("mode", Mode)
+def test_every_mode_and_event(mode, event):
+    assert TRANSITIONS.get((mode, event), mode) is TABLE[event][mode]
+    bench = Bench()
+    bench.controller.supervisor.mode = mode
+    changed = bench.controller.supervisor.apply(event, Reason.LEASE_LOST, 0, 10**9)
+    assert bench.mode is TABLE[event][mode]
+    assert changed is (TABLE[event][mode] is not mode)
+
+
+def test_only_arm_leads_to_armed_but_the_end_of_a_motion():
+    ways = {event for (mode, event), after in TRANSITIONS.items() if after is Mode.ARMED}
+    assert ways == {Event.ARM, Event.DONE}
+    assert [key for key, after in TRANSITIONS.items() if after is Mode.ACTIVE] == [(Mode.ARMED, Event.SETPOINT)]
+    assert [key for key in TRANSITIONS if key[0] is Mode.FAULT] == [(Mode.FAULT, Event.RESET)]
+
+
+def test_boot_to_active_and_back_in_peace():
+    bench = Bench().armed()
+    assert bench.neutral and bench.commands_b["ArmKey"] == 0xA
+    bench.tick([bench.hold(final=True)])
+    assert bench.mode is Mode.ACTIVE
+    bench.run(38)
+    assert bench.mode is Mode.ACTIVE
+    bench.run(2)
+    assert bench.mode is Mode.ARMED and bench.reason == Reason.NONE
+
+
+def test_stop_from_every_mode():
+    assert Bench().boot().tick() is not None
+    for prepare in (Bench.boot, Bench.armed, Bench.active):
+        bench = prepare(Bench())
+        bench.tick([bench.operator(OperatorAction.STOP)])
+        assert bench.mode is Mode.STOP and bench.reason == Reason.OPERATOR_STOP
+        bench.run(31)
+        assert bench.neutral and bench.commands_b["ArmKey"] == 0
+        bench.run(300)
+        assert bench.mode is Mode.STOP
+
+
+def test_stop_is_obeyed_with_a_wrong_profile_and_an_old_stamp():
+    bench = Bench().active()
+    bench.tick([bench.operator(OperatorAction.STOP, profile_hash=1, stamp_ns=5, sequence=0)])
+    assert bench.mode is Mode.STOP
+
+
+def test_stop_ramps_monotonically_to_neutral_within_150_ms():
+    bench = Bench().active(speed=0.12)
+    before = abs(bench.commands_a["Slew"])
+    assert before > 12.0
+    bench.tick([bench.operator(OperatorAction.STOP)])
+    seen = [before, abs(bench.commands_a["Slew"])]
+    for _ in range(30):
+        bench.tick()
+        seen.append(abs(bench.commands_a["Slew"]))
+    assert seen == sorted(seen, reverse=True) and seen[10] > 12.0
+    assert bench.neutral
+
+
+def test_setpoints_after_a_stop_do_not_start_it_again():
+    bench = Bench().active()
+    bench.tick([bench.operator(OperatorAction.STOP)])
+    for _ in range(100):
+        bench.tick([bench.hold()])
+        assert bench.mode is Mode.STOP
+    assert bench.controller.gate.refusal is Reason.NOT_ARMED
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.ARMED
+
+
+def test_arm_is_refused_while_still_stopping_and_in_fault():
+    bench = Bench().active()
+    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.controller.gate.refusal is Reason.STILL_STOPPING
+    bench.tick([bench.operator(OperatorAction.DISARM)])
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    assert bench.mode is Mode.STOP and bench.controller.supervisor.ramping
+    bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
+    bench.run(3)
+    assert bench.mode is Mode.FAULT and bench.reason == Reason.ESTOP_PRESSED
+    del bench.changed["EstopStat"]
+    bench.run(10)
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.FAULT and bench.controller.gate.refusal is Reason.FAULT_LATCHED
+
+
+def test_reset_button_is_an_edge_and_arming_needs_the_operator_as_well():
+    bench = Bench().active()
+    bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0, "ResetReq": 1}
+    bench.run(10)
+    bench.changed["EstopStat"] = {"ResetReq": 1}
+    bench.run(20)
+    assert bench.mode is Mode.FAULT, "a button that was already down is no edge"
+    bench.changed["EstopStat"] = {"ResetReq": 0}
+    bench.run(4)
+    bench.changed["EstopStat"] = {"ResetReq": 1}
+    bench.run(4)
+    assert bench.mode is Mode.STANDBY
+    bench.run(200)
+    assert bench.mode is Mode.STANDBY
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.ARMED
+
+
+def test_reset_with_the_emergency_stop_still_pressed_stays_in_fault():
+    bench = Bench().armed()
+    bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
+    bench.run(3)
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    assert bench.mode is Mode.FAULT
+
+
+def test_disarm():
+    bench = Bench().armed()
+    bench.tick([bench.operator(OperatorAction.DISARM)])
+    assert bench.mode is Mode.STANDBY and bench.commands_b["ArmKey"] == 0
+    bench = Bench().active()
+    bench.tick([bench.operator(OperatorAction.DISARM)])
+    assert bench.mode is Mode.STOP and bench.reason == Reason.OPERATOR_DISARM
+
+
+ARMING = [
+    ("EstopStat dropped", {"dropped": {"EstopStat"}}, Reason.INPUT_MISSING),
+    ("encoder dropped", {"dropped": {"EncTilt"}}, Reason.INPUT_MISSING),
+    ("valve feedback dropped", {"dropped": {"ValveFbB"}}, Reason.INPUT_MISSING),
+    ("guard dropped", {"dropped": {"GuardStat"}}, Reason.INPUT_MISSING),
+    ("PLC dropped", {"dropped": {"PlcStatus"}}, Reason.INPUT_MISSING),
+    ("guard disables", {"changed": {"GuardStat": {"Enable": 0}}}, Reason.GUARD_NOT_READY),
+    ("guard nearly enables", {"changed": {"GuardStat": {"Enable": 0xB}}}, Reason.GUARD_NOT_READY),
+    ("valve fault", {"changed": {"ValveFbA": {"State": 4}}}, Reason.VALVE_NODE_NOT_READY),
+    ("PLC fault", {"changed": {"PlcStatus": {"FaultBits": 2}}}, Reason.PLC_FAULT),
+    ("person", {"changed": {"EstopStat": {"Person": 1}}}, Reason.PERSON_IN_ZONE),
+    ("valve node silent", {"silent_nodes": {0x10}}, Reason.NODE_NOT_OPERATIONAL),
+    ("guard node silent", {"silent_nodes": {0x7D}}, Reason.NODE_NOT_OPERATIONAL),
+    ("encoder alarm", {"changed": {"EncLift": {"Alarms": 1}}}, Reason.ENCODER_ALARM),
+    ("telescope alarm", {"changed": {"EncExt": {"SystemReg": 1}}}, Reason.ENCODER_ALARM),
+]
+
+
+@pytest.mark.parametrize(("what", "fault", "reason"), ARMING, ids=[a[0] for a in ARMING])
+def test_arming_is_refused(what, fault, reason):
+    bench = Bench().boot()
+    for name, value in fault.items():
+        getattr(bench, name).update(value)
+    bench.run(60)
+    assert bench.mode is Mode.STANDBY
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.STANDBY
+    assert bench.controller.gate.refusal is reason
+    for name, value in fault.items():
+        for key in value:
+            getattr(bench, name).pop(key) if name == "changed" else getattr(bench, name).discard(key)
+    bench.run(60)
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.ARMED
+
+
+def test_arming_with_the_emergency_stop_in_error_is_refused():
+    bench = Bench().boot()
+    bench.changed["EstopStat"] = {"ChannelA": 2}
+    bench.run(3)
+    assert bench.mode is Mode.FAULT and bench.reason == Reason.ESTOP_CHANNELS
+
+
+def test_arming_outside_the_range_is_refused():
+    bench = Bench(home=(0.0, 1.40, -1.2, 0.6, 0.0))
+    with pytest.raises(AssertionError, match="POSITION_OUTSIDE"):
+        bench.boot()
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.POSITION_OUTSIDE
+
+
+def test_operator_commands_are_refused_replayed_old_or_for_another_profile():
+    bench = Bench().boot()
+    arm = bench.operator(OperatorAction.ARM)
+    bench.tick([arm])
+    bench.tick([bench.operator(OperatorAction.DISARM)])
+    assert bench.mode is Mode.STANDBY
+    for data, reason in (
+        (arm, Reason.OUT_OF_ORDER),
+        (bench.operator(OperatorAction.ARM, profile_hash=3), Reason.WRONG_PROFILE),
+        (bench.operator(OperatorAction.ARM, stamp_ns=bench.now_ns + 100 * MS), Reason.STAMP_FUTURE),
+    ):
+        bench.tick([data])
+        assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is reason
+    late = bench.operator(OperatorAction.ARM)
+    bench.run(202)
+    bench.tick([late])
+    assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.STAMP_OLD
+
+
+def test_neutral_in_every_mode_but_active_and_the_ramp():
+    bench = Bench().boot()
+    assert bench.neutral and bench.commands_b["ArmKey"] == 0 and bench.commands_b["PumpReq"] == 0
+    bench = Bench().active()
+    bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
+    bench.run(3)
+    assert bench.mode is Mode.FAULT and bench.neutral
+    assert bench.commands_b["ArmKey"] == 0 and bench.commands_b["PumpReq"] == 0
+    assert set(VALUES) >= {"EstopStat"}
+
+
+def test_every_reason_is_described():
+    assert set(FAULTS) == set(Reason)
+    assert all(fault.sentence and fault.advice for fault in FAULTS.values())
+    assert all(fault.bound_ms > 0 for fault in FAULTS.values() if fault.reaction > Reaction.DEGRADE
+               and fault.sentence[:12] != "The operator")  # fmt: skip
+
+
+def test_the_last_arm_command_replayed_does_not_arm_again():
+    bench = Bench().boot()
+    arm = bench.operator(OperatorAction.ARM)
+    bench.tick([arm])
+    bench.tick([bench.operator(OperatorAction.STOP)])
+    bench.tick([arm])
+    assert bench.mode is Mode.STOP and bench.controller.gate.refusal is Reason.OUT_OF_ORDER

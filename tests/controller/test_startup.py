@@ -1,0 +1,99 @@
+"""Set-up of the encoders against emulated nodes."""
+
+import pytest
+from bench import MS, Bench, T
+
+from can_dbc.canopen import SDO_TO_SERVER, Sdo, SdoKind
+from controller.faults import Reason
+from controller.startup import EncoderSetup, Phase
+from machine.modes import Mode
+
+
+def test_every_encoder_is_set_up_as_the_bus_reference_says():
+    bench = Bench().boot()
+    rotary, linear = bench.encoders[2].objects, bench.encoders[5].objects
+    assert [rotary[0x1A00, i] for i in (1, 2, 3)] == [0x60040020, 0x21200010, 0x65030010]
+    assert [linear[0x1A00, i] for i in (1, 2, 3, 4)] == [0x60040020, 0x60300110, 0x51220108, 0x51220208]
+    assert rotary[0x1A00, 0] == 3 and linear[0x1A00, 0] == 4
+    for node, encoder in bench.encoders.items():
+        assert encoder.state == 0x05
+        assert encoder.objects[0x1800, 2] == 1 and encoder.objects[0x1017, 0] == 100
+        assert encoder.objects[0x1800, 1] == 0x180 + node
+        writes = [w[:2] for w in encoder.writes]
+        assert encoder.writes[0] == (0x1800, 1, 0x80000180 + node), "the PDO is off while it is mapped"
+        assert writes.index((0x1A00, 1)) < writes.index((0x1800, 2))
+    assert bench.now_ns - 10**9 < 2_000 * MS
+
+
+def test_at_most_one_frame_per_tick():
+    bench = Bench()
+    for _ in range(120):
+        outputs = bench.tick()
+        setup = [key for key, _ in outputs.frames if key == 0 or SDO_TO_SERVER < key < SDO_TO_SERVER + 128]
+        assert len(setup) <= 1
+
+
+def test_absent_encoder_is_named_and_taken_in_when_it_comes():
+    bench = Bench()
+    bench.encoders[4].silent = True
+    bench.run(500)
+    assert bench.mode is Mode.BOOT
+    assert bench.reason == Reason.NODE_ABSENT and bench.controller.supervisor.detail == 4
+    bench.tick([bench.operator(1)])
+    assert bench.mode is Mode.BOOT and bench.controller.gate.refusal is Reason.NODE_ABSENT
+    bench.encoders[4].silent = False
+    bench.run(200)
+    assert bench.mode is Mode.STANDBY
+
+
+@pytest.mark.parametrize(("place", "value"), [((0x1000, 0), 0x00080196), ((0x6001, 0), 4096), ((0x6002, 0), 1)])
+def test_wrong_identity_or_range_is_refused_until_reset(place, value):
+    bench = Bench()
+    good = bench.encoders[3].objects[place]
+    bench.encoders[3].objects[place] = value
+    bench.run(300)
+    assert bench.mode is Mode.BOOT
+    assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 3
+    bench.encoders[3].objects[place] = good
+    bench.run(100)
+    assert bench.mode is Mode.BOOT
+    bench.tick([bench.operator(4)])
+    bench.run(100)
+    assert bench.mode is Mode.STANDBY
+
+
+def test_a_device_that_refuses_its_set_up():
+    bench = Bench()
+    bench.encoders[6].refuses.add((0x1A00, 2))
+    bench.run(200)
+    assert bench.reason == Reason.NODE_CONFIGURATION and bench.controller.supervisor.detail == 6
+
+
+def test_a_device_swapped_while_running_is_noticed():
+    bench = Bench().boot()
+    bench.encoders[2].objects[0x1018, 1] = 8
+    bench.extra.append((0x702, b"\x00"))
+    bench.encoders[2].state = 0x7F
+    bench.run(100)
+    assert bench.mode is Mode.STANDBY
+    assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 2
+
+
+def test_three_tries_of_300_ms_then_over_again():
+    setup = EncoderSetup(Bench().settings.profile.joints["slew"].encoder)
+    sent = []
+    for k in range(400):
+        if setup.frame(k * T) is not None:
+            sent.append(k * T // MS)
+    assert sent[:5] == [0, 5, 305, 605, 910]
+    assert setup.reason is Reason.NODE_ABSENT
+
+
+def test_a_stray_answer_is_ignored():
+    setup = EncoderSetup(Bench().settings.profile.joints["slew"].encoder)
+    stray = Sdo(SdoKind.UPLOAD, 2, 0x6004, 0, b"\1\0\0\0", 0)
+    setup.answer(stray)
+    setup.frame(0)
+    setup.frame(T)
+    setup.answer(stray)
+    assert setup.phase is Phase.ASKING and setup.reason is Reason.NODE_ABSENT

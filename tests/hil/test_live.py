@@ -1,0 +1,112 @@
+"""The whole machine as processes in real time, on the wire and on vcan, and what happens when something dies.
+
+A host whose time is stolen for longer than a frame's time-out stops the machine, as it must; the run then shows it and
+the operator arms again.  What is asserted is the outcome, never a duration.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import can
+import pytest
+
+from can_dbc import codec
+from hil.exits import Exit
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+
+
+def demo(directory: Path, *arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "timberhand", "demo", "--no-console", "--out", str(directory), *arguments]
+    environment = os.environ | {"TIMBERHAND_WIRE_DIR": str(directory.parent / "wire")}
+    (directory.parent / "wire").mkdir(exist_ok=True)
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, stdin=subprocess.DEVNULL
+    )
+
+
+def await_line(process: subprocess.Popen[str], text: str) -> None:
+    assert process.stdout is not None
+    for line in process.stdout:
+        if text in line:
+            return
+    pytest.fail(f"the run ended before it said {text!r}: {process.communicate()[1]}")
+
+
+def last_commands(directory: Path) -> dict[str, dict[str, object]]:
+    """The last ValveCmdA and ValveCmdB in the bus log, decoded."""
+    database = codec.load("crane")
+    last = {}
+    for message in can.LogReader(str(directory / "crane0.log")):
+        known = database.by_key.get(message.arbitration_id)
+        if known is not None and known.name in ("ValveCmdA", "ValveCmdB"):
+            last[known.name] = known.named(known.decode(bytes(message.data)))
+    return last
+
+
+def assert_neutral_and_readable(directory: Path) -> None:
+    last = last_commands(directory)
+    assert [last["ValveCmdA"][s] for s in ("Mode", "Slew", "Lift", "Tilt", "Ext")] == [0, 0, 0, 0, 0]
+    assert last["ValveCmdB"]["ArmKey"] == 0
+    assert last["ValveCmdB"]["Rot"] == 0
+    assert json.loads((directory / "manifest.json").read_text())["complete"]
+
+
+def test_the_job_on_the_wire(tmp_path: Path) -> None:
+    process = demo(tmp_path / "run", "--bus", "wire", "--seed", "103")
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == Exit.FINE, out + err
+    assert "The log lies in the bunk" in out
+    assert_neutral_and_readable(tmp_path / "run")
+
+
+def test_the_job_on_vcan(tmp_path: Path) -> None:
+    check = [sys.executable, "-m", "hil.vcan_lab", "--check", "--json"]
+    way = json.loads(subprocess.run(check, capture_output=True, text=True).stdout)
+    if way["way"] is None:
+        pytest.skip(f"no vcan here: {way['why']}")
+    process = demo(tmp_path / "run", "--bus", "vcan", "--seed", "103")
+    out, err = process.communicate(timeout=380)
+    assert process.returncode == Exit.FINE, f"{way}: {out}{err}"
+    assert "The log lies in the bunk" in out
+    assert_neutral_and_readable(tmp_path / "run")
+
+
+def test_ctrl_c_leaves_the_valves_neutral_and_the_logs_readable(tmp_path: Path) -> None:
+    process = demo(tmp_path / "run", "--bus", "wire")
+    await_line(process, "→ ABOVE")
+    time.sleep(1.5)  # into the motion
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == Exit.INTERRUPTED, err
+    assert_neutral_and_readable(tmp_path / "run")
+
+
+@pytest.mark.parametrize("victim", ["autonomy", "controller", "controller.guard", "sim"])
+def test_a_killed_process_ends_the_run_with_one_sentence(tmp_path: Path, victim: str) -> None:
+    process = demo(tmp_path / "run", "--bus", "wire")
+    await_line(process, "→ ABOVE")
+    time.sleep(1.0)
+    os.kill(pid_of(process.pid, victim), signal.SIGKILL)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == Exit.SAFETY, err
+    assert "Traceback" not in err
+    assert "ended in the middle of the run" in err
+    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["complete"]
+
+
+def pid_of(parent: int, module: str) -> int:
+    """The child of ``parent`` that runs ``python -m module``."""
+    for task in Path(f"/proc/{parent}/task").iterdir():
+        for pid in (task / "children").read_text().split():
+            arguments = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+            if arguments[1:3] == [b"-m", module.encode()]:
+                return int(pid)
+    raise AssertionError(f"{module} does not run")

@@ -1,0 +1,52 @@
+"""The whole job on virtual time: a log gets into the bunk, and one seed always leaves the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from hil.demo import run_lockstep
+from hil.exits import Exit
+from hil.replay import files_of, replay
+from hil.summary import Summary
+
+pytestmark = pytest.mark.slow
+
+
+def job(seed: int, directory: Path, limit_s: float = 120.0) -> Summary:
+    return run_lockstep("palms_471", seed, "nominal", directory, limit_s, Console(file=io.StringIO()))
+
+
+def digest(directory: Path) -> dict[str, str]:
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(directory.iterdir())}
+
+
+def test_the_log_gets_into_the_bunk_and_the_record_replays(tmp_path: Path) -> None:
+    summary = job(101, tmp_path / "run")
+    assert summary.in_bunk, summary.verdict
+    assert summary.exit is Exit.FINE
+    assert summary.stops == 0
+    assert (tmp_path / "run" / "crane0.log").read_text().count("\n") > 50_000
+    result = replay(files_of(tmp_path / "run"))
+    assert result.agrees, result
+    assert result.ticks == summary.ticks
+
+
+def test_one_seed_leaves_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
+    first, again, other = (job(s, tmp_path / n, 4.0) for s, n in ((5, "a"), (5, "b"), (6, "c")))
+    assert digest(tmp_path / "a") == digest(tmp_path / "b")
+    assert digest(tmp_path / "a")["crane0.log"] != digest(tmp_path / "c")["crane0.log"]
+    assert first.ticks == again.ticks
+    assert first.ticks == other.ticks
+
+
+def test_a_job_that_is_not_done_is_not_called_done(tmp_path: Path) -> None:
+    summary = job(5, tmp_path / "short", 4.0)
+    assert not summary.in_bunk
+    assert summary.exit is Exit.FIGURE
+    assert "not done within 4 s" in summary.failure
+    assert "never lifted" in summary.verdict

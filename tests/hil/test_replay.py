@@ -1,0 +1,227 @@
+"""Replay: the same code gives the same bytes; anything else is found and named."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from typer.testing import CliRunner
+
+from can_dbc import setpoint, tick_record
+from can_dbc.codec import load
+from can_dbc.frame import Frame
+from controller.config import load as load_settings
+from controller.step import Controller, Inputs, step
+from hil.exits import Exit, Stopped
+from hil.replay import contents, files_of, manifest_of, replay
+from machine.load import load_profile
+from recorder import recorder as recorder_module
+from recorder.manifest import describe
+from recorder.recorder import Recorder
+
+PROFILE = load_profile("palms_471")
+SETTINGS = load_settings("palms_471")
+CRANE = load("crane")
+T_NS = SETTINGS.period_ns
+START_NS = 1_000_000_000
+TICKS = 120
+
+
+def inputs_of(k: int, inputs: Inputs) -> int:
+    """Fills the inputs of tick ``k``: sensors of a standing crane, a damaged frame, an operator; gives its time."""
+    now_ns = START_NS + k * T_NS
+    inputs.frames.clear()
+    for name in ("EncSlew", "EncLift", "EncTilt", "EncRot"):
+        message = CRANE.message(name)
+        values = {"Position": 8192 + k % 3, "TimeStamp": k, "Alarms": 0}
+        data = message.encode(*(values[s.name] for s in message.signals))
+        inputs.frames.append(Frame(now_ns - 1_000_000, message.key, data))
+    inputs.frames.append(Frame(now_ns - 900_000, CRANE.message("GuardStat").key, bytes([k & 255] * 8)))
+    stop = setpoint.OperatorCommand(k, SETTINGS.profile_hash, now_ns, setpoint.OperatorAction.STOP)
+    inputs.datagrams[:] = [setpoint.encode(stop)] if k % 10 == 3 else []
+    inputs.missed_ticks = 0
+    inputs.late_ns = 1000 * k
+    return now_ns
+
+
+def tick_records(ticks: int = TICKS) -> list[bytes]:
+    controller, inputs, records = Controller(SETTINGS), Inputs(), []
+    for k in range(ticks):
+        now_ns = inputs_of(k, inputs)
+        out = step(controller, inputs, now_ns)
+        records.append(
+            tick_record.encode(
+                now_ns, inputs.late_ns, 0, 0, (0, 0, 0, 0), inputs.frames, inputs.datagrams, out.frames, out.report
+            )
+        )
+    return records
+
+
+RECORDS = tick_records()
+
+
+def keep(directory: Path, records: list[bytes], **manifest) -> Path:
+    fields = describe(PROFILE, ("crane0",), seed=1)
+    recorder = Recorder(directory, PROFILE, recorder_module.msgspec.structs.replace(fields, **manifest))
+    for data in records:
+        recorder.on_tick(data)
+    recorder.close()
+    return directory
+
+
+def again(data: bytes, **changes) -> bytes:
+    """A tick record with some of its fields changed."""
+    t = replace(tick_record.decode(data), **changes)
+    bus = (t.bus_state, t.bus_dropped, t.bus_refused, t.bus_errors)
+    return tick_record.encode(
+        t.now_ns, t.late_ns, t.tick_ns, t.missed_ticks, bus, t.frames_in, t.datagrams, t.frames_out, t.report
+    )
+
+
+def run(*arguments: object):
+    """``timberhand replay ...`` with the exit code the shell sees."""
+    import typer
+
+    from timberhand.commands.replay import replay as command
+
+    app = typer.Typer()
+    app.command()(command)
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    if isinstance(result.exception, Stopped):
+        return result.exception.code, str(result.exception)
+    return result.exit_code, result.stdout
+
+
+def test_recorded_run_agrees_byte_for_byte(tmp_path):
+    seen = []
+    result = replay(files_of(keep(tmp_path, RECORDS)), progress=lambda *at: seen.append(at))
+    assert result.agrees and result.ticks == TICKS and result.rate_hz == SETTINGS.rate_hz
+    assert seen[-1] == (TICKS, TICKS)
+    # The inputs matter: the stream holds reports, refused datagrams and received frames.
+    reports = [setpoint.decode(t.report) for t in map(tick_record.decode, RECORDS) if t.report]
+    assert len(reports) > TICKS / 5 and reports[-1].frames_received > 0
+    code, text = run(tmp_path)
+    assert code == 0 and f"{TICKS} ticks agree byte for byte" in text
+
+
+def test_tampered_output_is_found_and_shown_decoded(tmp_path):
+    frames = list(tick_record.decode(RECORDS[50]).frames_out)
+    i = next(i for i, (key, _) in enumerate(frames) if key == CRANE.message("ValveCmdA").key)
+    key, data = frames[i]
+    frames[i] = (key, data[:2] + bytes([data[2] ^ 0x40]) + data[3:])
+    records = [*RECORDS[:50], again(RECORDS[50], frames_out=tuple(frames)), *RECORDS[51:]]
+    result = replay(files_of(keep(tmp_path, records)))
+    assert not result.agrees and result.ticks == 50 and result.difference["tick"] == 50
+    (recorded,), (replayed,) = result.difference["recorded"], result.difference["replayed"]
+    assert recorded != replayed and recorded.split()[1] == replayed.split()[1] == "ValveCmdA"
+    code, text = run(tmp_path)
+    assert code == Exit.FIGURE and "tick 50 (0.250 s) differs" in text and "ValveCmdA" in text
+
+
+@pytest.mark.parametrize("field", ["report", "order", "missing"])
+def test_every_part_of_the_output_counts(tmp_path, field):
+    at = next(k for k in range(60, TICKS) if tick_record.decode(RECORDS[k]).report)
+    t = tick_record.decode(RECORDS[at])
+    changes = {
+        "report": {"report": t.report[:-5] + bytes([t.report[-5] ^ 1]) + t.report[-4:]},
+        "order": {"frames_out": t.frames_out[::-1]},
+        "missing": {"frames_out": t.frames_out[:-1]},
+    }
+    records = [*RECORDS[:at], again(RECORDS[at], **changes[field])]
+    result = replay(files_of(keep(tmp_path, records)))
+    assert result.difference["tick"] == at
+
+
+def test_changed_input_changes_the_output(tmp_path):
+    stop = next(k for k in range(40, TICKS) if tick_record.decode(RECORDS[k]).datagrams)
+    records = [*RECORDS[:stop], again(RECORDS[stop], datagrams=(b"x",)), *RECORDS[stop + 1 :]]
+    assert replay(files_of(keep(tmp_path, records))).difference["tick"] >= stop
+
+
+def test_gap_is_said_and_not_followed(tmp_path):
+    code, text = run(keep(tmp_path, RECORDS[:70] + RECORDS[73:]), "--json")
+    result = json.loads(text)
+    assert code == Exit.FIGURE and not result["agrees"] and result["ticks"] == 70
+    assert result["missing"].startswith("3 ticks are missing after tick 69 (0.345 s)")
+    assert "cannot follow the state over a gap" in result["missing"]
+
+
+def test_ticks_the_controller_skipped_itself_are_no_gap(tmp_path):
+    controller, inputs, records = Controller(SETTINGS), Inputs(), []
+    for k in (*range(20), *range(22, 40)):
+        now_ns = inputs_of(k, inputs)
+        inputs.missed_ticks = 2 if k >= 22 else 0
+        out = step(controller, inputs, now_ns)
+        records.append(
+            tick_record.encode(
+                now_ns, inputs.late_ns, 0, inputs.missed_ticks, (0, 0, 0, 0),
+                inputs.frames, inputs.datagrams, out.frames, out.report,
+            )
+        )  # fmt: skip
+    assert replay(files_of(keep(tmp_path, records))).agrees
+
+
+def test_a_short_first_step_is_no_gap_and_not_the_rate(tmp_path):
+    """A run in lockstep may begin half a period before its first nominal tick."""
+    first = again(RECORDS[0], now_ns=START_NS + T_NS // 2)
+    result = replay(files_of(keep(tmp_path, [first, *RECORDS[1:3]])))
+    assert not result.missing
+    assert replay(files_of(keep(tmp_path / "all", [first, *RECORDS[1:]]))).rate_hz == SETTINGS.rate_hz
+
+
+def test_missing_beginning_is_said(tmp_path):
+    reports = [k for k in range(1, 20) if tick_record.decode(RECORDS[k]).report]
+    for k in (reports[0], reports[0] + 1):
+        result = replay(files_of(keep(tmp_path / str(k), RECORDS[k:])))
+        assert not result.agrees and "from the start" in result.missing
+    assert "no tick" in replay(files_of(keep(tmp_path / "empty", []))).missing
+
+
+def test_other_profile_is_refused_with_both_hashes(tmp_path):
+    code, text = run(keep(tmp_path, RECORDS, profile_hash="deadbeef"))
+    assert code == Exit.CONFIGURATION
+    assert "deadbeef" in text and f"{SETTINGS.profile_hash:08x}" in text
+
+
+def test_other_dbc_is_refused_with_both_hashes(tmp_path):
+    code, text = run(keep(tmp_path, RECORDS, dbc_hash={"crane": "0123456789abcdef"}))
+    assert code == Exit.CONFIGURATION and "0123456789ab" in text and "crane.dbc" in text
+
+
+def test_unknown_profile_name_asks_for_the_file(tmp_path):
+    code, text = run(keep(tmp_path, RECORDS, profile="field_crane"))
+    assert code == Exit.CONFIGURATION and "--profile" in text
+    shipped = Path(recorder_module.__file__).parents[1] / "machine" / "palms_471.toml"
+    assert run(tmp_path, "--profile", shipped)[0] == 0
+
+
+def test_truncated_recording_is_mended_and_agrees_as_far_as_it_goes(tmp_path):
+    path = keep(tmp_path, RECORDS) / "run.mcap"
+    with path.open("rb") as file:
+        last = make_reader(file).get_summary().chunk_indexes[-1]
+    path.write_bytes(path.read_bytes()[: last.chunk_start_offset + last.chunk_length // 2])
+    result = replay(files_of(tmp_path))
+    assert result.agrees and 0 < result.ticks < TICKS
+
+
+@pytest.mark.parametrize("make", [lambda d: d / "absent", lambda d: d, lambda d: d / "text.mcap"])
+def test_what_is_no_recording_is_refused(tmp_path, make):
+    (tmp_path / "text.mcap").write_text("hello, this is text")
+    code, text = run(make(tmp_path))
+    assert code == Exit.CONFIGURATION and str(tmp_path) in text
+
+
+def test_contents_are_listed(tmp_path):
+    files = files_of(keep(tmp_path, RECORDS))
+    assert contents(files) == {"/controller/tick": TICKS, "/manifest": 1}
+    assert manifest_of(files).seed == 1
+    code, text = run(tmp_path, "--contents")
+    assert code == 0 and "/controller/tick" in text and "palms_471" in text
+    assert json.loads(run(tmp_path, "--contents", "--json")[1])["topics"]["/controller/tick"] == TICKS
+
+
+def test_one_file_will_do(tmp_path):
+    assert replay(files_of(keep(tmp_path, RECORDS) / "run.mcap")).agrees

@@ -1,0 +1,245 @@
+"""A recording survives the death of its writer at any byte (fault 37)."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import can
+import pytest
+from mcap.reader import make_reader
+from recordings import PROFILE, T_NS, feed, manifest, record, tick
+
+from can_dbc import tick_record
+from can_dbc.bus import open_bus
+from recorder import manifest as manifests
+from recorder.__main__ import FLUSH_S, Shell, udp_socket, write_all
+from recorder.mcap_scan import NotMcap, Stored, is_complete, scan
+from recorder.recorder import CHUNK_NS, TICK, Recorder
+from recorder.recover import recover
+
+TICKS = 400
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("whole")
+    record(directory, TICKS)
+    return directory
+
+
+def chunk_ends(path):
+    """Where each chunk ends in the file; the first holds channels and manifest only."""
+    with path.open("rb") as file:
+        return [c.chunk_start_offset + c.chunk_length for c in make_reader(file).get_summary().chunk_indexes]
+
+
+def ticks_of(path):
+    """The tick records, read with the library's indexed reader."""
+    with path.open("rb") as file:
+        return [m.data for _, _, m in make_reader(file).iter_messages(topics=["/controller/tick"])]
+
+
+def test_truncated_anywhere_is_readable_again_and_loses_one_chunk_at_most(whole, tmp_path):
+    data = (whole / "run.mcap").read_bytes()
+    size, dice = len(data), random.Random(1)
+    ends = chunk_ends(whole / "run.mcap")
+    seen = []
+    for n in sorted({*range(0, 60, 7), *(dice.randrange(size) for _ in range(60)), *range(size - 40, size, 5)}):
+        path = tmp_path / "run.mcap"
+        path.write_bytes(data[:n])
+        (mended,) = recover(tmp_path)
+        assert mended.path == path and is_complete(path)
+        kept = ticks_of(path)
+        assert kept == [tick(k) for k in range(len(kept))]
+        whole_chunks = [end for end in ends if end <= n]
+        assert len(kept) == min(TICKS, CHUNK_NS // T_NS * max(0, len(whole_chunks) - 1))
+        seen.append(len(kept))
+    assert seen == sorted(seen) and seen[0] == 0 and seen[-1] == TICKS
+    assert len(set(seen)) > 8
+
+
+def test_flipped_byte_ends_the_good_part(whole, tmp_path):
+    data = bytearray((whole / "run.mcap").read_bytes())
+    data[len(data) // 2] ^= 0x55
+    (tmp_path / "run.mcap").write_bytes(data)
+    kept = [r.data for r in scan(tmp_path / "run.mcap", {"/controller/tick"}) if isinstance(r, Stored)]
+    assert 0 < len(kept) < TICKS and kept == [tick(k) for k in range(len(kept))]
+
+
+def test_what_is_in_order_is_not_touched(whole, tmp_path):
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
+    before = {p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in tmp_path.iterdir()}
+    assert recover(tmp_path) == []
+    assert {p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in tmp_path.iterdir()} == before
+
+
+def test_living_recorder_is_left_alone(tmp_path):
+    recorder = Recorder(tmp_path, PROFILE, manifest())
+    feed(recorder, range(100))
+    assert recover(tmp_path) == []
+    recorder.close()
+    assert ticks_of(tmp_path / "run.mcap") == [tick(k) for k in range(100)]
+
+
+def test_unfinished_line_of_the_text_log_is_cut(whole, tmp_path):
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
+    log = tmp_path / "crane0.log"
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join(lines[:10]) + lines[10][:15])
+    recover(tmp_path)
+    assert log.read_bytes() == b"".join(lines[:10])
+
+
+def test_another_file_is_refused_by_name(tmp_path):
+    (tmp_path / "run.mcap").write_text("this is no recording")
+    with pytest.raises(NotMcap, match="is not an MCAP file"):
+        list(scan(tmp_path / "run.mcap"))
+
+
+def test_write_of_the_manifest_is_old_or_new(tmp_path):
+    manifests.write(tmp_path, manifest())
+    assert manifests.read(tmp_path).complete is False
+    assert [p.name for p in tmp_path.iterdir()] == ["manifest.json"]
+
+
+# ---- the process ------------------------------------------------------------------------------------------------
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+class Process:
+    """``python -m recorder`` on a python-can bus of this machine that nobody else uses, and a sender of ticks."""
+
+    def __init__(self, out):
+        self.out, self.port = out, free_port()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "recorder", "--out", out, "--tick-port", str(self.port), "--report-port",
+             str(free_port()), "--bus", "crane0=virtual:recorder-test"],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert "ready" in self.process.stdout.readline()
+        self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sent = []
+
+    def send(self, seconds):
+        """Ticks stamped and sent in real time."""
+        start = time.monotonic_ns()
+        while time.monotonic_ns() - start < seconds * 1e9:
+            now = time.monotonic_ns()
+            data = tick_record.encode(now, 0, 0, 0, (0, 0, 0, 0), [], [], [], None)
+            self.sender.sendto(data, ("127.0.0.1", self.port))
+            self.sent.append(data)
+            time.sleep(T_NS / 1e9)
+
+    def end(self, number):
+        self.process.send_signal(number)
+        return self.process.wait(10)
+
+    def close(self):
+        """Leaves no process behind, also when a test fails half-way."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        self.process.stdout.close()
+        self.process.stderr.close()
+        self.sender.close()
+
+
+@pytest.fixture
+def live(tmp_path):
+    with contextlib.closing(Process(tmp_path)) as process:
+        yield process
+
+
+def test_killed_recorder_loses_only_what_was_not_yet_due(live, tmp_path):
+    assert CHUNK_NS / 1e9 <= 0.25 and FLUSH_S <= 0.25
+    live.send(0.4)
+    path, first, limit = tmp_path / "run.mcap", len(live.sent), time.monotonic() + 20
+    # The timer brings the last chunk to the file although nothing more comes.
+    while (seen := sum(isinstance(r, Stored) for r in scan(path, {TICK}))) < first and time.monotonic() < limit:
+        time.sleep(0.02)
+    assert seen == first
+    live.send(0.3)
+    live.end(signal.SIGKILL)
+    assert not is_complete(path)
+    assert len(recover(tmp_path)) == 1
+    kept = ticks_of(path)
+    assert kept == live.sent[: len(kept)] and len(kept) >= first
+    assert manifests.read(tmp_path).complete is False
+
+
+def test_shell_records_what_is_on_a_bus(tmp_path):
+    with open_bus("virtual:shell-test") as mine, open_bus("virtual:shell-test") as plant:
+        shell = Shell({"crane0": mine}, udp_socket(0), udp_socket(0))
+        recorder = Recorder(tmp_path, PROFILE, manifest(live=True))
+        writer = threading.Thread(target=write_all, args=(recorder, shell))
+        writer.start()
+        receiver = threading.Thread(target=shell.run)
+        receiver.start()
+        for k in range(50):
+            assert plant.send(0x80, bytes([k]))
+        limit = time.monotonic() + 20
+        while mine.stats.received < 50 and time.monotonic() < limit:
+            time.sleep(0.01)
+        shell.end()
+        receiver.join(10)
+        writer.join(10)
+    got = list(can.CanutilsLogReader(tmp_path / "crane0.log"))
+    assert [(m.arbitration_id, m.data[0]) for m in got] == [(0x80, k) for k in range(50)]
+    assert manifests.read(tmp_path).complete
+
+
+def test_what_does_not_fit_into_the_queue_is_counted(tmp_path, capfd):
+    shell = Shell({}, udp_socket(0), udp_socket(0))
+    shell.items = queue.Queue(2)
+    for k in range(5):
+        shell._put(("tick", "", tick(k)), 1)
+    recorder = Recorder(tmp_path, PROFILE, manifest())
+    writer = threading.Thread(target=write_all, args=(recorder, shell))
+    writer.start()
+    shell.items.put(None)
+    writer.join(10)
+    assert recorder.dropped == 3 and manifests.read(tmp_path).dropped == 3
+    assert "3 records could not be written" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_ended_recorder_leaves_complete_files(live, tmp_path, number):
+    live.send(0.3)
+    assert live.end(number) == 0
+    assert ticks_of(tmp_path / "run.mcap") == live.sent
+    assert manifests.read(tmp_path).complete is True
+    assert list(can.CanutilsLogReader(tmp_path / "crane0.log")) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "arguments"),
+    [
+        (3, ["--out", "/proc/nowhere"]),
+        (3, ["--out", "OUT", "--profile", "palms"]),
+        (4, ["--out", "OUT", "--bus", "crane0=nonsense"]),
+        (2, ["--out", "OUT", "--bus", "rail0=virtual:x"]),
+    ],
+)
+def test_what_cannot_be_used_is_said_at_once(tmp_path, code, arguments):
+    arguments = [str(tmp_path) if a == "OUT" else a for a in arguments]
+    done = subprocess.run(
+        [sys.executable, "-m", "recorder", "--tick-port", "0", "--report-port", "0", *arguments],
+        capture_output=True, text=True, timeout=30, env={**os.environ, "COLUMNS": "200"},
+    )  # fmt: skip
+    assert done.returncode == code and "Traceback" not in done.stderr
+    assert done.stderr.strip().splitlines()[-1].count("recorder: ") >= 1

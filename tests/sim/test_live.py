@@ -1,0 +1,103 @@
+"""The live shell: frames on a real bus, requests over UDP, clean end, one sentence per mistake."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import socket
+import threading
+import time
+
+import pytest
+
+from can_dbc.bus import open_bus
+from can_dbc.canopen import NmtCommand, nmt_frame, sync_frame
+from machine.load import load_profile
+from sim.__main__ import LivePlant, main
+from sim.plant import Plant
+
+PROFILE = load_profile("palms_471")
+_channels = itertools.count()
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+@pytest.fixture
+def live():
+    channel, port = f"virtual:sim{next(_channels)}", free_port()
+    plant = Plant(PROFILE, seed=0)
+    with open_bus(channel) as far, open_bus(channel) as near, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.settimeout(5.0)
+        udp.connect(("127.0.0.1", port))
+        shell = LivePlant(plant, near, port)
+        thread = threading.Thread(target=shell.run, daemon=True)
+        thread.start()
+        yield shell, far, udp, thread
+        shell.stop()
+        thread.join(5.0)
+    plant.close()
+
+
+def ask(udp: socket.socket, op: str):
+    udp.send(json.dumps({"op": op}).encode())
+    return json.loads(udp.recv(65536))
+
+
+def until(far, wanted: set[int]) -> set[int]:
+    """Keys received until all wanted ones are there (or ten seconds are over)."""
+    frames, seen, end = [], set(), time.monotonic() + 10.0
+    while not wanted <= seen and time.monotonic() < end:
+        frames.clear()
+        far.drain(frames)
+        seen |= {f.key for f in frames}
+        far.send(*sync_frame(1))
+        time.sleep(0.005)
+    return seen
+
+
+def test_sync_is_answered_on_the_bus_after_nmt_start(live):
+    _, far, _, _ = live
+    far.send(*nmt_frame(NmtCommand.START))
+    assert {0x182, 0x185, 0x190, 0x1A0, 0x181, 0x390, 0x490} <= until(
+        far, {0x182, 0x185, 0x190, 0x1A0, 0x390, 0x490, 0x181}
+    )
+
+
+def test_requests_show_the_truth_and_press_the_button(live):
+    shell, far, udp, thread = live
+    state = ask(udp, "state")
+    assert len(state["joints"]) == 5 and len(state["logs"]) == 1 and not state["verdict"]["success"]
+    assert state["poses"].keys() >= {"boom", "tong_left"} and len(ask(udp, "shapes")) > 20
+    assert ask(udp, "press") == {"ok": True}
+    assert 0x181 in until(far, {0x181})
+    assert "unknown op" in ask(udp, "fly")["error"]
+    udp.send(b"[")
+    assert "not a JSON object" in json.loads(udp.recv(65536))["error"]
+    assert ask(udp, "quit") == {"ok": True}
+    thread.join(5.0)
+    assert not thread.is_alive() and shell.report()["time_s"] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["--profile", "palms_472", "--bus", "crane0=virtual:x"], 3, "palms_472"),
+        (["--bus", "crane9=virtual:x"], 3, "crane9"),
+        (["--bus", "crane0=virtual:x", "--logs", "90"], 3, "fewer logs"),
+        (["--bus", "crane0=nonsense"], 4, "nonsense"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_an_exit_code(arguments, code, words, capsys):
+    assert main(arguments) == code
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+
+
+def test_a_bad_bus_argument_is_a_usage_error(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--bus", "crane0"])
+    assert stop.value.code == 2 and "NAME=ADDRESS" in capsys.readouterr().err

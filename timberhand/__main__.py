@@ -1,0 +1,5 @@
+"""``python -m timberhand``."""
+
+from timberhand.cli import main
+
+main()

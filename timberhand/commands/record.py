@@ -1,0 +1,43 @@
+"""``timberhand record``: the recorder in the foreground."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def record(
+    out: Annotated[Path, typer.Option(help="Directory of the recording; it must hold none yet.")],
+    bus: Annotated[
+        list[str] | None, typer.Option(help="NAME=ADDRESS, may be repeated (default: the profile's buses).")
+    ] = None,
+    tick_port: Annotated[int, typer.Option(help="UDP port of the controller's tick records.")] = 8473,
+    report_port: Annotated[int, typer.Option(help="UDP port of the controller's state reports.")] = 8474,
+    profile: Annotated[str, typer.Option(help="A shipped profile or a TOML file.")] = "palms_471",
+) -> None:
+    """Record the buses, the controller's ticks and its reports until Ctrl-C.
+
+    [bold]Examples[/bold]
+
+    timberhand record --out runs/field-1
+
+    timberhand record --out runs/field-1 --bus crane0=socketcan:can0
+    """
+    from can_dbc.bus import BusError, default_address
+    from hil.exits import Exit, Stopped
+    from machine.load import ProfileError, load_profile
+    from recorder.__main__ import main
+
+    try:
+        machine = load_profile(profile)
+        names = [name for name in (machine.crane_bus, machine.machine_bus) if name]
+        buses = bus or [f"{name}={default_address(name)}" for name in names]
+    except ProfileError as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from error
+    except BusError as error:
+        raise Stopped(Exit.BUS, str(error)) from error
+    arguments = ["--out", str(out), "--tick-port", str(tick_port), "--report-port", str(report_port)]
+    code = main([*arguments, "--profile", profile, *(x for b in buses for x in ("--bus", b))])
+    raise typer.Exit(code)
