@@ -197,7 +197,7 @@ class Activity:
         return travel(arm, start, self.place.at_height(high_m), high_m)
 
     def _closing(self, start: Pose, grasp: Grasp) -> Trajectory:
-        height = closing_height(self._profile, grasp.support_z_m)
+        height = closing_height(self._profile, grasp.support_z_m, grasp.log.diameter_m)
         measured_s = self._closed_for_s()
         self._close_from_s = begin_s = measured_s if isfinite(measured_s) else 0.0
 
@@ -298,6 +298,9 @@ class Activity:
         log = self._picked()
         if log is None or is_held(self._arm, log, self._arm.pose(self._motion.goal)):
             return Phase(self.phase + 1)
+        if lies_in(self._profile.bunk, log):
+            self._fail(f"log {log.id} fell from the grapple into the bunk")
+            return None
         self.missed += 1
         if self.missed < ATTEMPTS:
             return Phase.LOOK

@@ -14,18 +14,21 @@ import struct
 import time
 from typing import Final
 
+from can_dbc.batch import Batch
 from can_dbc.bus import DRAIN_LIMIT, BaseBus, BusError, BusState
 from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
 
 CAN_FRAME: Final = struct.Struct("=IB3x8s")  # struct can_frame, linux/can.h
-_TIMESPEC: Final = struct.Struct("@ll")
+_CONTROL: Final = struct.Struct("@NiillNiiI4x")
+"""Control data of a frame: struct cmsghdr and timespec of SO_TIMESTAMPNS, then, once frames were lost, SO_RXQ_OVFL."""
+_CONTROL_DROPPED: Final = 52
+"""Control data that holds the second message is at least this long."""
 # Options that Python does not name everywhere: asm-generic/socket.h and linux/can/raw.h.
 _SO_TIMESTAMPNS: Final = 35
 _SO_RXQ_OVFL: Final = 40
 _CAN_RAW_ERR_FILTER: Final = 2
 _ERR_MASK: Final = 0x1FFF_FFFF
 _RECEIVE_BUFFER_BYTES: Final = 1 << 20
-_ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(4)
 _LINK_LOST: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 
 
@@ -58,45 +61,49 @@ class SocketCanBus(BaseBus):
                 f"CAN interface {interface} cannot be opened ({error.strerror}); see `ip link`, and bring it "
                 f"up with `ip link set {interface} up`."
             ) from error
-        self._buffer = bytearray(CAN_FRAME.size)
-        self._buffers = [self._buffer]
+        self._batch = Batch(CAN_FRAME.size, _CONTROL.size)
         self._dropped = 0
 
     def fileno(self) -> int:
         return self._sock.fileno()
 
     def drain(self, frames: list[Frame]) -> int:
-        stats, receive, unpack = self.stats, self._sock.recvmsg_into, CAN_FRAME.unpack_from
-        before = len(frames)
-        offset_ns = time.monotonic_ns() - time.time_ns()
-        for _ in range(DRAIN_LIMIT):
+        batch, before = self._batch, len(frames)
+        for _ in range(DRAIN_LIMIT // batch.count):
             try:
-                size, ancillary, _, _ = receive(self._buffers, _ANCILLARY_BYTES)
-            except BlockingIOError:
-                break
+                waiting = batch.receive(self._sock.fileno())
             except OSError:  # the link went down; a later call may find it up again
-                stats.state = BusState.DOWN
+                self.stats.state = BusState.DOWN
                 break
-            if size != CAN_FRAME.size:
+            if waiting:
+                self._take(waiting, frames)
+            if waiting < batch.count:
+                break
+        taken = len(frames) - before
+        self.stats.received += taken
+        return taken
+
+    def _take(self, waiting: int, frames: list[Frame]) -> None:
+        stats, batch = self.stats, self._batch
+        now_ns = time.monotonic_ns()
+        offset_ns = now_ns - time.time_ns()
+        for i in range(waiting):
+            _, _, kind, seconds, nanoseconds, _, _, _, dropped = _CONTROL.unpack_from(batch.control, i * _CONTROL.size)
+            stamp_ns = now_ns
+            if kind == _SO_TIMESTAMPNS:
+                # A clock set back between arrival and drain must not make a frame look fresher.
+                stamp_ns = min(seconds * 1_000_000_000 + nanoseconds + offset_ns, now_ns)
+            if batch.control_length(i) >= _CONTROL_DROPPED:
+                self._count_dropped(dropped)
+            if batch.length(i) != CAN_FRAME.size:
                 continue  # a CAN FD frame: not ours
-            stamp_ns = now_ns = time.monotonic_ns()
-            for _, kind, value in ancillary:
-                if kind == _SO_TIMESTAMPNS:
-                    seconds, nanoseconds = _TIMESPEC.unpack(value)
-                    # A clock set back between arrival and drain must not make a frame look fresher.
-                    stamp_ns = min(seconds * 1_000_000_000 + nanoseconds + offset_ns, now_ns)
-                elif kind == _SO_RXQ_OVFL:
-                    self._count_dropped(int.from_bytes(value, "little"))
-            key, length, data = unpack(self._buffer)
+            key, length, data = CAN_FRAME.unpack_from(batch.data, i * CAN_FRAME.size)
             if key & ERROR:
                 stats.note_error(key, data)
                 continue
             if stats.state is BusState.DOWN:
                 stats.state = BusState.ACTIVE
             frames.append(Frame(stamp_ns, key, data[:length]))
-        taken = len(frames) - before
-        stats.received += taken
-        return taken
 
     def send(self, key: int, data: bytes) -> bool:
         stats = self.stats

@@ -31,6 +31,8 @@ END_ORDER: Final = ("autonomy", "controller", "guard", "console", "sim", "record
 SETTLE_S: Final = 3.0
 HARDWARE_PRIORITY: Final = {"wire": 60, "sim": 50}
 """SCHED_FIFO priorities below those of controller and guard."""
+NICENESS: Final = {"autonomy": -10, "recorder": 10, "console": 10}
+"""The planner's leases are short; who only watches can wait."""
 
 
 def _address(name: str, backend: str) -> str:
@@ -135,6 +137,8 @@ class LiveRun:
             "autonomy", "autonomy", *common, "--controller", f"{HOST}:{ports['control']}",
             "--report-port", ports["planner"], "--scene", f"{HOST}:{ports['sim']}",
         )  # fmt: skip
+        for name in NICENESS.keys() & self._family.children.keys():
+            self._family.weigh(name, NICENESS[name])
         return ports
 
     def _follow(self, ports: dict[str, int]) -> None:

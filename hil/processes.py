@@ -123,6 +123,11 @@ class Family:
             return False
         return True
 
+    def weigh(self, name: str, niceness: int) -> None:
+        """Set a child's share among the processes without a deadline; only root may raise it."""
+        with contextlib.suppress(PermissionError):
+            os.setpriority(os.PRIO_PROCESS, self.children[name].process.pid, niceness)
+
     def stop(self, name: str, seconds: float = 5.0) -> int | None:
         """End a child with SIGTERM, after ``seconds`` with SIGKILL; its exit code, or None when it never ran."""
         child = self.children.pop(name, None)

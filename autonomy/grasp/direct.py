@@ -1,9 +1,9 @@
 """Grasp and place of one log from its pose alone, as for a detector that makes no mistakes.
 
 The tongs open across the log's axis at its centre, or at the nearest point along it that the crane reaches;
-they go down in the open position and the pin follows their sweep while they close, so that the tips stay
-``CLEARANCE_M`` above what the log lies on.  The place is the bunk, the log along its axis.  Inputs: the
-machine, the mission, the log list. Failure: ``NoGrasp`` with one sentence.
+they go down in the open position and the pin follows their sweep while they close, so that the tips stay just
+above what the log lies on.  The place is the bunk, the log along its axis.  Inputs: the machine, the mission,
+the log list.  Failure: ``NoGrasp`` with one sentence.
 """
 
 from __future__ import annotations
@@ -22,8 +22,14 @@ from machine.grapple import lowest_tip_below_pin_m, rotator_for_yaw, tip_below_p
 from machine.kinematics import Unreachable
 from machine.profile import Bunk, Profile
 
-CLEARANCE_M: Final = 0.035
-"""Tips above the support while closing: 3 to 5 cm lift 19 of 20, 1.5 cm 13 of 20 (plant.md 1)."""
+CLEARANCE_M: Final = (0.025, 0.05)
+"""Least and greatest height of the tips over the support while closing: 3 to 5 cm lift 19 of 20, 1.5 cm 13 of
+20 (plant.md 1)."""
+TONG_HALF_PLATE_M: Final = 0.018
+_UNDER: Final = 0.35
+"""Tips under this share of a log's diameter scoop it, higher ones pinch it and lose it."""
+_TOUCH: Final = 0.45
+"""The tips touch a log when their half gap is this share of its diameter."""
 RELEASE_CLEARANCE_M: Final = 0.07
 HOVER_M: Final = 0.5
 """Open tips above the support before the vertical descent; more than a log's diameter."""
@@ -31,8 +37,9 @@ TRAVEL_CLEARANCE_M: Final = 0.40
 """Tips of a closed grapple above the stakes: a tilted log, its sway and the tracking error fit in between."""
 _ALONG_M: Final = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3)
 _STEEPEST: Final = 0.5
-_LEAD_S: Final = 0.3
-_LAG_S: Final = 0.05
+_RISE_LEAD_S: Final = 0.3
+_FALL_LEAD_S: Final = 0.1
+"""How far ahead of the tongs the pin rises and sinks: valve delay, and tips that would touch the ground."""
 _SMOOTH_S: Final = 0.4
 _STEP_S: Final = 0.02
 
@@ -63,29 +70,35 @@ def hover_height(profile: Profile, grasp: Grasp) -> float:
     return grasp.support_z_m + tip_below_pin_m(profile.grapple.tongs, 0.0) + HOVER_M
 
 
-def closing_height(profile: Profile, support_z_m: float) -> Callable[[float], float]:
+def clearance(diameter_m: float) -> float:
+    """Height of the tips over the support, m: in the middle between scraping and pinching the log."""
+    low, high = CLEARANCE_M
+    return min(max((TONG_HALF_PLATE_M + _UNDER * diameter_m) / 2, low), high)
+
+
+def closing_height(profile: Profile, support_z_m: float, diameter_m: float) -> Callable[[float], float]:
     """Height of the pin [m] over the closing time [s], smooth and at rest before 0.
 
-    It follows the deepest tip of the tong angles that ``_LAG_S`` of slowness and ``_LEAD_S`` of valve delay
-    allow, and stops where the tips meet: beyond, the log or nothing is between the tongs.
+    The tips, which sweep deeper and then rise while the tongs turn, stay ``clearance`` above the support until
+    they touch the log; from then on the pin stands still.
     """
     tongs = profile.grapple.tongs
     rate = tongs.angle_rad[-1] / profile.grapple.close_time_s
-    meet = float(np.interp(0.0, tongs.half_gap_m[::-1], tongs.angle_rad[::-1]))
+    meet = float(np.interp(_TOUCH * diameter_m, tongs.half_gap_m[::-1], tongs.angle_rad[::-1]))
     half = _SMOOTH_S / 2
-    grid = np.arange(-half, meet / rate + _LAG_S + _SMOOTH_S, _STEP_S)
+    grid = np.arange(-half, meet / rate + _SMOOTH_S, _STEP_S)
     angles = np.linspace(0.0, meet, 200)
     depth = np.interp(angles, tongs.angle_rad, tongs.tip_below_pin_m)
 
     def deepest(time_s: float) -> float:
         time_s = max(time_s, half)
-        early, late = np.searchsorted(angles, rate * np.array([time_s - _LAG_S, time_s + _LEAD_S]))
+        early, late = np.searchsorted(angles, rate * np.array([time_s + _FALL_LEAD_S, time_s + _RISE_LEAD_S]))
         return float(np.max(depth[min(early, 199) : min(late, 199) + 1]))
 
     window = np.hanning(int(_SMOOTH_S / _STEP_S) + 3)[1:-1]
     padded = [deepest(t) for t in np.arange(grid[0] - half, grid[-1] + half + _STEP_S / 2, _STEP_S)]
     smooth = np.convolve(padded, window / window.sum(), mode="same")
-    height = support_z_m + CLEARANCE_M + smooth
+    height = support_z_m + clearance(diameter_m) + smooth
     times = np.arange(len(height)) * _STEP_S + grid[0] - half
     inside = (times >= -1e-9) & (times <= grid[-1] + 1e-9)
     times, height = times[inside], height[inside]
@@ -125,7 +138,7 @@ def plan_grasp(arm: Arm, log: LogObservation, rot: float) -> Grasp:
     for along in _ALONG_M:
         x, y, z = (c + along * a for c, a in zip(log.center_m, log.axis, strict=True))
         support = max(profile.workspace.ground_z_m, z - log.diameter_m / 2)
-        low = closing_height(profile, support)(0.0)
+        low = closing_height(profile, support, log.diameter_m)(0.0)
         try:
             pose = arm.over(x, y, low, travel_height(profile))
             turn = rotator_for_yaw(profile, pose.slew_rad, yaw + pi / 2, rot)

@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> int:
         signal.signal(number, lambda which, _frame: ended.append(which))
     try:
         guard = build(profile_path(options.profile))
-        with open_bus(address or default_address("crane0")) as bus:
+        with open_bus(address or default_address("crane0"), filters=guard.keys) as bus:
             if not options.no_realtime:
                 for refusal in prepare(PRIORITY):
                     sys.stderr.write(f"guard: not granted: {refusal}\n")

@@ -259,6 +259,11 @@ class Guard:
         return out
 
     @property
+    def keys(self) -> tuple[int, ...]:
+        """The frames it needs to see: what it watches, and what nobody else may send."""
+        return (*self._watches, *self._joints, self._layout.key, HEARTBEAT_KEY)
+
+    @property
     def enabled(self) -> bool:
         """Whether the machine may move."""
         return self.verdict is Verdict.GOOD
