@@ -110,9 +110,12 @@ class Process:
                 message = decode(data)
             except DatagramRefused:
                 continue
-            if isinstance(message, StateReport):
-                self.foreign = self.foreign or message.profile_hash != self._hash
-                newest, self._mode = message, message.mode
+            if not isinstance(message, StateReport):
+                continue
+            if message.profile_hash != self._hash:
+                self.foreign = True
+                return None
+            newest, self._mode = message, message.mode
         return newest
 
     def _newest_logs(self) -> tuple[LogObservation, ...]:

@@ -13,14 +13,17 @@ from math import dist, isfinite
 from typing import Final
 
 from autonomy.grasp.direct import (
+    LIFT_M,
     Grasp,
     NoGrasp,
+    approach_length,
     choose,
     closing_height,
     hover_height,
     is_held,
     lies_in,
     plan_place,
+    retreat_height,
     travel_height,
 )
 from autonomy.logs import LogObservation
@@ -187,14 +190,17 @@ class Activity:
             case Phase.CLOSE:
                 return self._closing(start, grasp)
             case Phase.LIFT:
-                return travel(arm, start, grasp.pose.at_height(high_m), high_m)
+                up_m = grasp.pose.z_m + LIFT_M
+                return travel(arm, start, grasp.pose.at_height(up_m), up_m)
             case Phase.CARRY:
                 self.place = plan_place(arm, self._mission, grasp, self._logs)
-                return travel(arm, start, self.place.at_height(high_m), high_m)
+                free_m = approach_length(self._profile, grasp.log)
+                return travel(arm, start, self.place.at_height(high_m), high_m, free_m)
         assert self.place is not None
         if phase is Phase.LOWER:
             return straight(arm, start, self.place)
-        return travel(arm, start, self.place.at_height(high_m), high_m)
+        up_m = retreat_height(self._profile)
+        return travel(arm, start, self.place.at_height(up_m), up_m)
 
     def _closing(self, start: Pose, grasp: Grasp) -> Trajectory:
         height = closing_height(self._profile, grasp.support_z_m, grasp.log.diameter_m)

@@ -13,6 +13,7 @@ import socket
 import struct
 from typing import Final
 
+_SO_RCVBUFFORCE: Final = 33
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 _IOVEC: Final = struct.Struct("@PN")
 _HEADER: Final = struct.Struct("@PI4xPNPNi4xI4x")  # struct mmsghdr: name, its length, iovec, control, flags, length
@@ -64,3 +65,11 @@ class Batch:
     def control_length(self, i: int) -> int:
         """Bytes of control data of datagram i."""
         return int(_SIZE_T.unpack_from(self._headers, i * _HEADER.size + _CONTROL_AT)[0])
+
+
+def widen(sock: socket.socket, size: int) -> None:
+    """Give a socket a receive buffer of ``size`` bytes; beyond the system's limit only root can."""
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
+    except PermissionError:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)

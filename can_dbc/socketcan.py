@@ -14,7 +14,7 @@ import struct
 import time
 from typing import Final
 
-from can_dbc.batch import Batch
+from can_dbc.batch import Batch, widen
 from can_dbc.bus import DRAIN_LIMIT, BaseBus, BusError, BusState
 from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
 
@@ -28,7 +28,7 @@ _SO_TIMESTAMPNS: Final = 35
 _SO_RXQ_OVFL: Final = 40
 _CAN_RAW_ERR_FILTER: Final = 2
 _ERR_MASK: Final = 0x1FFF_FFFF
-_RECEIVE_BUFFER_BYTES: Final = 1 << 20
+_RECEIVE_BUFFER_BYTES: Final = 4 << 20
 _LINK_LOST: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 
 
@@ -47,7 +47,7 @@ class SocketCanBus(BaseBus):
         raw, general = socket.SOL_CAN_RAW, socket.SOL_SOCKET
         try:
             self._sock.setblocking(False)
-            self._sock.setsockopt(general, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+            widen(self._sock, _RECEIVE_BUFFER_BYTES)
             self._sock.setsockopt(general, _SO_TIMESTAMPNS, 1)
             self._sock.setsockopt(general, _SO_RXQ_OVFL, 1)
             self._sock.setsockopt(raw, _CAN_RAW_ERR_FILTER, _ERR_MASK)

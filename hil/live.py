@@ -28,10 +28,13 @@ from machine.profile import Profile
 HOST: Final = "127.0.0.1"
 BITRATES: Final = {"crane0": 1_000_000, "mach0": 250_000}
 END_ORDER: Final = ("autonomy", "controller", "guard", "console", "sim", "recorder", "wire")
+PORTS: Final = ("control", "planner", "page", "ticks", "reports", "sim")
+START_S: Final = 60.0
+LOOK_S: Final = 0.1
 SETTLE_S: Final = 3.0
 HARDWARE_PRIORITY: Final = {"wire": 60, "sim": 50}
 """SCHED_FIFO priorities below those of controller and guard."""
-NICENESS: Final = {"autonomy": -10, "recorder": 10, "console": 10}
+NICENESS: Final = {"autonomy": -10, "recorder": 5, "console": 10}
 """The planner's leases are short; who only watches can wait."""
 
 
@@ -67,6 +70,7 @@ class LiveRun:
         self._options = options
         self._display = display
         self._family = Family(options.directory)
+        self._profile = ("--profile", options.profile_name)
         self._report: setpoint.StateReport | None = None
         self._first: setpoint.StateReport | None = None
         self._failure = ""
@@ -84,70 +88,92 @@ class LiveRun:
             KeyboardInterrupt: after everything has ended.
         """
         try:
-            ports = self._start()
+            ports = self._start_all()
             self._follow(ports)
             return self._summary(ports["sim"])
         finally:
             self._family.stop_all(END_ORDER)
             self._socket.close()
 
-    def _start(self) -> dict[str, int]:
-        options, start = self._options, self._family.start
-        profile = options.profile
+    def _start_all(self) -> dict[str, int]:
+        ports = dict(zip(PORTS, free_udp_ports(len(PORTS)), strict=True))
+        bus = self._start_bus()
+        self._start_machine(bus, ports)
+        self._start_people(ports)
+        self._start_control(bus, ports)
+        return ports
+
+    def _start_bus(self) -> list[str]:
+        """The wire where it is used; the bus arguments that every process on it gets."""
+        profile = self._options.profile
         buses = [b for b in (profile.crane_bus, profile.machine_bus) if b]
-        wanted = [_address(b, options.bus) for b in buses]
-        if any(address.startswith("wire:") for address in wanted):
-            start("wire", "hil.wire.daemon", *(x for b in buses for x in ("--bus", f"{b}:{BITRATES[b]}")))
-            self._family.await_message("wire", "ready", 10)
-        addresses = [f"{b}={address}" for b, address in zip(buses, wanted, strict=True)]
-        names = ("control", "planner", "page", "record_tick", "record_report", "sim")
-        ports = dict(zip(names, free_udp_ports(len(names)), strict=True))
-        bus = [x for a in addresses for x in ("--bus", a)]
-        common = ("--profile", options.profile_name)
-        start(
-            "recorder", "recorder", *common, *bus, "--out", options.directory, "--seed", options.seed,
-            "--tick-port", ports["record_tick"], "--report-port", ports["record_report"],
+        addresses = [_address(b, self._options.bus) for b in buses]
+        if any(address.startswith("wire:") for address in addresses):
+            self._start("wire", "hil.wire.daemon", *(x for b in buses for x in ("--bus", f"{b}:{BITRATES[b]}")))
+            self._family.await_message("wire", "ready", START_S)
+        return [x for b, address in zip(buses, addresses, strict=True) for x in ("--bus", f"{b}={address}")]
+
+    def _start_machine(self, bus: list[str], ports: dict[str, int]) -> None:
+        """The emulated hardware, and the recorder that must not miss its first frames."""
+        options = self._options
+        self._start(
+            "recorder", "recorder", *self._profile, *bus, "--out", options.directory, "--seed", options.seed,
+            "--tick-port", ports["ticks"], "--report-port", ports["reports"],
         )  # fmt: skip
-        start(
-            "sim", "sim", *common, *bus,
+        self._family.await_message("recorder", "ready", START_S)
+        self._start(
+            "sim", "sim", *self._profile, *bus,
             "--seed", options.seed, "--truth", options.truth, "--port", ports["sim"],
         )  # fmt: skip
-        self._family.await_message("recorder", "ready", 20)
-        self._family.await_message("sim", "ready", 30)
+        self._family.await_message("sim", "ready", START_S)
         # Emulated hardware must answer in time like hardware; controller and guard ask for more by themselves.
         emulated = [name for name in HARDWARE_PRIORITY if name in self._family.children]
         granted = [self._family.hasten(name, HARDWARE_PRIORITY[name]) for name in emulated]
         if not all(granted):
             self._display.event("no real-time priority here: a busy host may stop the machine", "yellow")
-        start("guard", "controller.guard", *common, *bus)
-        listeners = [self._socket.getsockname()[1], ports["planner"], ports["record_report"]]
-        if options.console_port:
-            listeners.append(ports["page"])
-            start(
-                "console", "console", *common, "--port", options.console_port,
-                "--report-port", ports["page"], "--controller", f"{HOST}:{ports['control']}",
-                "--scene", f"{HOST}:{ports['sim']}",
+
+    def _start_people(self, ports: dict[str, int]) -> None:
+        """Page and planner, before anything has a deadline: their imports keep a small host busy for seconds."""
+        control, scene = f"{HOST}:{ports['control']}", f"{HOST}:{ports['sim']}"
+        if self._options.console_port:
+            self._start(
+                "console", "console", *self._profile, "--port", self._options.console_port,
+                "--report-port", ports["page"], "--controller", control, "--scene", scene,
             )  # fmt: skip
-        start(
-            "controller", "controller", *common, *bus, "--setpoint-port", ports["control"],
-            "--record", f"{HOST}:{ports['record_tick']}",
+            url = self._family.await_message("console", "url", START_S)["url"]
+            self._display.event(f"watch it at {url}", "bold")
+        self._start(
+            "autonomy", "autonomy", *self._profile,
+            "--controller", control, "--report-port", ports["planner"], "--scene", scene,
+        )  # fmt: skip
+        self._family.await_message("autonomy", "event", START_S)
+
+    def _start_control(self, bus: list[str], ports: dict[str, int]) -> None:
+        self._start("guard", "controller.guard", *self._profile, *bus)
+        listeners = [self._socket.getsockname()[1], ports["planner"], ports["reports"]]
+        listeners += [ports["page"]] if self._options.console_port else []
+        self._start(
+            "controller", "controller", *self._profile, *bus, "--setpoint-port", ports["control"],
+            "--record", f"{HOST}:{ports['ticks']}",
             *(x for port in listeners for x in ("--report", f"{HOST}:{port}")),
         )  # fmt: skip
-        start(
-            "autonomy", "autonomy", *common, "--controller", f"{HOST}:{ports['control']}",
-            "--report-port", ports["planner"], "--scene", f"{HOST}:{ports['sim']}",
-        )  # fmt: skip
-        for name in NICENESS.keys() & self._family.children.keys():
+
+    def _start(self, name: str, module: str, *arguments: object) -> None:
+        self._family.start(name, module, *arguments)
+        if name in NICENESS:
             self._family.weigh(name, NICENESS[name])
-        return ports
 
     def _follow(self, ports: dict[str, int]) -> None:
         """Show and supervise until the planner is through, or a process dies, or time is up."""
         limit = time.monotonic() + self._options.limit_s
+        look = 0.0
         while not (self._done or self._failure or self._operator.gave_up):
             if time.monotonic() > limit:
                 self._failure = f"not done within {self._options.limit_s:.0f} s"
             self._listen(ports["control"])
+            if time.monotonic() < look:
+                continue
+            look = time.monotonic() + LOOK_S
             for name, message in self._family.messages():
                 self._heard(name, message)
             gone = self._family.dead()
@@ -196,8 +222,6 @@ class LiveRun:
                 self._display.event(f"setpoint refused: {describe(int(message['number']))}", "yellow")
             case "autonomy", "detector":
                 self._display.event(f"detector: {message['reason']}", "yellow")
-            case "console", _ if "url" in message:
-                self._display.event(f"watch it at {message['url']}", "bold")
 
     def _summary(self, sim_port: int) -> Summary:
         self._display.event("waiting for the plant's verdict")

@@ -16,6 +16,8 @@ from machine.modes import Mode
 LOOK_NS: Final = 1_000_000_000
 REPEAT_NS: Final = 2_000_000_000
 PATIENCE: Final = 5
+STOPPED: Final = (Mode.STOP, Mode.FAULT)
+"""A stop that ends in a latched fault is one stop."""
 
 
 class Operator:
@@ -38,7 +40,7 @@ class Operator:
     def step(self, report: StateReport) -> bytes | None:
         """The operator command that a person would give on seeing this report, if any."""
         if report.mode != self._mode:
-            self.stops += report.mode in (Mode.STOP, Mode.FAULT)
+            self.stops += report.mode in STOPPED and self._mode not in STOPPED
             self._mode, self._since_ns = report.mode, report.stamp_ns
         action = {
             Mode.STANDBY: OperatorAction.ARM,

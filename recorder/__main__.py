@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
+from can_dbc.batch import widen
 from can_dbc.bus import Bus, BusError, BusState, open_bus
 from can_dbc.frame import Frame
 from machine.load import ProfileError, load_profile
@@ -135,7 +136,7 @@ def udp_socket(port: int) -> socket.socket:
     """A bound, non-blocking socket on loopback; raises OSError."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setblocking(False)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+    widen(sock, 4 << 20)
     sock.bind(("127.0.0.1", port))
     return sock
 

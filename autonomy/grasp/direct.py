@@ -35,6 +35,9 @@ HOVER_M: Final = 0.5
 """Open tips above the support before the vertical descent; more than a log's diameter."""
 TRAVEL_CLEARANCE_M: Final = 0.40
 """Tips of a closed grapple above the stakes: a tilted log, its sway and the tracking error fit in between."""
+RETREAT_CLEARANCE_M: Final = 0.20
+LIFT_M: Final = 0.7
+"""How far a log is lifted before the grasp is judged."""
 _ALONG_M: Final = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3)
 _STEEPEST: Final = 0.5
 _RISE_LEAD_S: Final = 0.3
@@ -63,6 +66,18 @@ def travel_height(profile: Profile) -> float:
     bunk = profile.bunk
     top = bunk.floor_z_m + bunk.stake_height_m
     return top + lowest_tip_below_pin_m(profile.grapple.tongs) + TRAVEL_CLEARANCE_M
+
+
+def retreat_height(profile: Profile) -> float:
+    """Height of the pin at which the open grapple is clear of the stakes, m."""
+    bunk = profile.bunk
+    top = bunk.floor_z_m + bunk.stake_height_m
+    return top + tip_below_pin_m(profile.grapple.tongs, 0.0) + RETREAT_CLEARANCE_M
+
+
+def approach_length(profile: Profile, log: LogObservation) -> float:
+    """How far before the place a carried log must be at its travel height, m."""
+    return (log.length_m + profile.bunk.length_m) / 2 + HOVER_M
 
 
 def hover_height(profile: Profile, grasp: Grasp) -> float:

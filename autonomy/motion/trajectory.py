@@ -168,14 +168,20 @@ def straight(arm: Arm, start: Pose, goal: Pose) -> Trajectory:
     return _run(arm, [(0.0, _leg(arm, start, goal))])
 
 
-def travel(arm: Arm, start: Pose, goal: Pose, height_m: float) -> Trajectory:
-    """To ``height_m``, over, and down to the goal, with rounded corners."""
+def travel(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: float = 0.0) -> Trajectory:
+    """To ``height_m``, over, and down to the goal, with rounded corners.
+
+    With ``free_m`` the pin may rise on the way, as long as it is up ``free_m`` before the goal; without, it goes
+    sideways only when it is almost up.
+    """
     up = _leg(arm, start, start.at_height(height_m))
     over = _leg(arm, start.at_height(height_m), goal.at_height(height_m))
     down = _leg(arm, goal.at_height(height_m), goal)
     rise, drop = abs(up.way[2]), abs(down.way[2])
     way_m = float(np.hypot(over.way[0] * max(start.r_m, goal.r_m), over.way[1]))
     over_at = up.time_left(_RISE_LEFT_M / rise) if rise > _RISE_LEFT_M else 0.0
+    if 0.0 < free_m < way_m:
+        over_at = max(0.0, up.duration_s - over.time_left(free_m / way_m))
     down_at = over_at + (over.time_left(_WAY_LEFT_M / way_m) if way_m > _WAY_LEFT_M else 0.0)
     down_at = max(down_at, up.duration_s if drop else 0.0)
     return _run(arm, [(0.0, up), (over_at, over), (down_at, down)])

@@ -35,6 +35,7 @@ SETTINGS = {
     "vm/dirty_writeback_centisecs": "50",  # the host sees what is written after a second, not after thirty
     "vm/dirty_expire_centisecs": "50",
 }
+SOFT_INTERRUPT_PRIORITY = 95
 STRAGGLER_S = 0.5
 """How long output may stay silent after the command's end before what still holds it is cut off."""
 
@@ -106,6 +107,18 @@ def _furnish(order: dict[str, Any]) -> None:
         Path("/proc/sys", setting).write_text(value)
     for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):
         resource.setrlimit(limit, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    _hasten_soft_interrupts()
+
+
+def _hasten_soft_interrupts() -> None:
+    """Gives the thread that delivers deferred frames and datagrams real-time priority.
+
+    Every frame goes through a soft interrupt; once one is left to ksoftirqd, all wait for it, and at its ordinary
+    priority busy processes held frames back for more than 15 ms while FIFO tasks ran on time (measured).
+    """
+    for comm in Path("/proc").glob("[0-9]*/comm"):
+        if comm.read_text().startswith("ksoftirqd"):
+            os.sched_setscheduler(int(comm.parent.name), os.SCHED_FIFO, os.sched_param(SOFT_INTERRUPT_PRIORITY))
 
 
 def _sentence(reason: OSError) -> str:

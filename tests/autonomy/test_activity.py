@@ -65,10 +65,10 @@ def test_a_random_log_goes_from_the_ground_into_the_bunk(seed: int) -> None:
     crane, planner = StandIn(PROFILE, [random_log(seed)]), activity()
     seconds = crane.run(planner)
     assert planner.done and planner.failure is None and planner.missed == 0
-    assert phases(crane) == CYCLE and 30.0 < seconds < 46.0
+    assert phases(crane) == CYCLE and 30.0 < seconds < 45.0
     assert lies_in(PROFILE.bunk, crane.logs[0])
     least = clearances(PROFILE, crane.trace[::2])
-    assert least["tip"] > 0.02 and least["log"] > 0.0
+    assert least["tip"] > 0.005 and least["log"] > 0.0
     assert least["tips_over_stakes"] > 0.25 and least["stakes"] > 0.15 and least["base"] > 1.5
     q = np.array([m.q for m in crane.trace])
     velocity = np.diff(q, axis=0) / (TICK_NS * 1e-9)
@@ -127,7 +127,7 @@ def test_a_stop_in_any_phase_pauses_and_arming_resumes_it(phase: Phase, mode: Mo
     assert not any(first.knots[0].velocity), "it starts at rest, where the crane stands"
     crane.run(planner)
     assert planner.done and planner.missed == 0
-    assert clearances(PROFILE, crane.trace[::2])["tip"] > 0.015
+    assert clearances(PROFILE, crane.trace[::2])["tip"] > 0.005
 
 
 def test_a_crane_that_was_driven_aside_first_goes_back_over_the_log() -> None:

@@ -139,3 +139,12 @@ def test_can_utils_talk_to_our_bus(tool: str) -> None:
                 assert dump.stdout and dump.stdout.read().split()[1:] == [b"vcan0", b"1FD#0011"]
     except FileNotFoundError:
         pytest.skip(f"{tool} is missing (apt-get install can-utils)")
+
+
+def test_soft_interrupts_outrank_every_process() -> None:
+    """Frames that wait for ksoftirqd at ordinary priority come late whenever something else is busy."""
+    if os.environ.get("TIMBERHAND_LAB") != "uml":
+        pytest.skip("the kernel is not the lab's own")
+    threads = [p for p in Path("/proc").glob("[0-9]*/comm") if p.read_text().startswith("ksoftirqd")]
+    assert threads
+    assert all(os.sched_getscheduler(int(p.parent.name)) == os.SCHED_FIFO for p in threads)
