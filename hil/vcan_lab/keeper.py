@@ -19,10 +19,12 @@ import os
 import select
 import signal
 import socket
+import struct
 import sys
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
-NICENESS = -15
+_SYS_SCHED_SETATTR = 314
+SLICE_NS = 100_000
 
 
 def claim_cpu() -> socket.socket | None:
@@ -38,11 +40,24 @@ def claim_cpu() -> socket.socket | None:
     return None
 
 
+def hasten() -> None:
+    """Go before everything ordinary on the CPU, for what runs inside may be hard-timed.
+
+    Kernel and guest process hand over to each other thousands of times a second, and each time a busy neighbour keeps
+    the CPU until the host's next tick.  Measured with one such neighbour per CPU, ticks of 5 ms inside: 161 of 5400
+    missed as an ordinary process, 1 with a finer slice (any user, from Linux 6.12 on); as SCHED_FIFO the usual lateness
+    is a third of that with the slice, but for a few stalls of 50 ms that the host reserves for others.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        attributes = struct.pack("IIQiIQQQ", 48, os.SCHED_OTHER, 0, 0, 0, SLICE_NS, 0, 0)
+        ctypes.CDLL(None).syscall(_SYS_SCHED_SETATTR, 0, attributes, 0)
+
+
 def main() -> None:
     claim = claim_cpu()  # noqa: F841  held until this process ends
-    with contextlib.suppress(PermissionError):
-        # What runs inside may be hard-timed; real-time priority out here made its tail much worse (measured).
-        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+    hasten()
     libc = ctypes.CDLL(None)
     libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
     keeper = os.getpid()

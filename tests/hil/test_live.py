@@ -67,16 +67,20 @@ def test_the_job_on_the_wire(tmp_path: Path) -> None:
     assert_neutral_and_readable(tmp_path / "run")
 
 
-def test_the_job_on_vcan(tmp_path: Path) -> None:
-    check = [sys.executable, "-m", "hil.vcan_lab", "--check", "--json"]
-    way = json.loads(subprocess.run(check, capture_output=True, text=True).stdout)
+def test_the_job_on_vcan_where_candump_sees_it(tmp_path: Path) -> None:
+    lab = [sys.executable, "-m", "hil.vcan_lab"]
+    way = json.loads(subprocess.run([*lab, "--check", "--json"], capture_output=True, text=True).stdout)
     if way["way"] is None:
         pytest.skip(f"no vcan here: {way['why']}")
-    process = demo(tmp_path / "run", "--bus", "vcan", "--seed", "103")
-    out, err = process.communicate(timeout=380)
-    assert process.returncode == Exit.FINE, f"{way}: {out}{err}"
-    assert "The log lies in the bunk" in out
-    assert_neutral_and_readable(tmp_path / "run")
+    seen, run = tmp_path / "candump.txt", tmp_path / "run"
+    job = f"{sys.executable} -m timberhand demo --bus vcan --no-console --seed 103 --out {run}"
+    script = f"candump -n 100 vcan0,210:7FF,182:7FF > {seen} & {job}"
+    result = subprocess.run([*lab, "--", "sh", "-c", script], capture_output=True, text=True, timeout=380)
+    assert result.returncode == Exit.FINE, f"{way}: {result.stdout}{result.stderr}"
+    assert "The log lies in the bunk" in result.stdout
+    assert_neutral_and_readable(run)
+    identifiers = {line.split()[1] for line in seen.read_text().splitlines()}
+    assert identifiers == {"210", "182"}, "candump shows the commands and the encoder of the slew"
 
 
 def test_ctrl_c_leaves_the_valves_neutral_and_the_logs_readable(tmp_path: Path) -> None:
