@@ -114,10 +114,15 @@ class LiveRun:
         return [x for b, address in zip(buses, addresses, strict=True) for x in ("--bus", f"{b}={address}")]
 
     def _start_machine(self, bus: list[str], ports: dict[str, int]) -> None:
-        """The emulated hardware, and the recorder that must not miss its first frames."""
+        """The emulated hardware, and the recorder that must not miss its first frames.
+
+        On a bench the recorder does not force its data to the disk: inside user-mode Linux the whole kernel would wait
+        for the host's disk, and every process with it (tens of ms, measured).
+        """
         options = self._options
         self._start(
             "recorder", "recorder", *self._profile, *bus, "--out", options.directory, "--seed", options.seed,
+            "--no-sync",
             "--tick-port", ports["ticks"], "--report-port", ports["reports"],
         )  # fmt: skip
         self._family.await_message("recorder", "ready", START_S)

@@ -125,8 +125,11 @@ class Family:
 
     def weigh(self, name: str, niceness: int) -> None:
         """Set a child's share among the processes without a deadline; only root may raise it."""
-        with contextlib.suppress(PermissionError):
-            os.setpriority(os.PRIO_PROCESS, self.children[name].process.pid, niceness)
+        pid = self.children[name].process.pid
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, pid, niceness)
+            # Each child is a session, and sessions compete as groups whatever their niceness (sched(7), autogroup).
+            Path(f"/proc/{pid}/autogroup").write_text(str(niceness))
 
     def stop(self, name: str, seconds: float = 5.0) -> int | None:
         """End a child with SIGTERM, after ``seconds`` with SIGKILL; its exit code, or None when it never ran."""

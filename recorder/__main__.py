@@ -151,6 +151,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file")
     parser.add_argument("--seed", type=int, help="of the run, for the manifest")
     parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
+    parser.add_argument(
+        "--no-sync", action="store_true", help="leave it to the system when data reaches the disk (on a bench)"
+    )
     a = parser.parse_args(arguments)
     addresses = dict(text.partition("=")[::2] for text in a.bus)
     try:
@@ -162,7 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ticks, reports = udp_socket(a.tick_port), udp_socket(a.report_port)
         buses = {name: open_bus(address) for name, address in addresses.items()}
         key = a.key_file.read_bytes().strip() if a.key_file else None
-        recorder = Recorder(a.out, profile, describe(profile, tuple(addresses), a.seed, live=True), key)
+        recorder = Recorder(a.out, profile, describe(profile, tuple(addresses), a.seed, live=True), key, not a.no_sync)
     except (ProfileError, RecordingRefused) as error:
         say(str(error))
         return 3

@@ -51,7 +51,9 @@ class RecordingRefused(Exception):
 class Recorder:
     """One recording (module docstring: contract)."""
 
-    def __init__(self, directory: Path, profile: Profile, manifest: Manifest, key: bytes | None = None) -> None:
+    def __init__(
+        self, directory: Path, profile: Profile, manifest: Manifest, key: bytes | None = None, sync: bool = True
+    ) -> None:
         """Start a recording in ``directory``, which is created; ``key`` is that of authenticated reports.
 
         Raises:
@@ -63,6 +65,7 @@ class Recorder:
         """Reports and tick records that were not what they should be."""
         self._directory = directory
         self._manifest = manifest
+        self._durable = sync and manifest.live
         self._key = key
         self._offset_ns = manifest.utc_offset_ns
         databases = manifests.databases(profile)
@@ -78,7 +81,7 @@ class Recorder:
                 recover(directory)
                 raise RecordingRefused(f"{directory} already holds a recording; name another directory")
             manifests.write(directory, manifest)
-            self._text = {bus: CommitFile(directory / f"{bus}.log", manifest.live) for bus in manifest.buses}
+            self._text = {bus: CommitFile(directory / f"{bus}.log", self._durable) for bus in manifest.buses}
             self._open_segment()
         except OSError as error:
             raise RecordingRefused(
@@ -173,7 +176,7 @@ class Recorder:
     def _open_segment(self) -> None:
         """The next file; its first chunk holds every channel and the manifest, and is written at once."""
         name = f"run-{self._segments + 1:04d}.mcap" if self._segments else RUN_NAME
-        segment = _Segment(self._directory / name, self._manifest.live)
+        segment = _Segment(self._directory / name, self._durable)
         for bus, signals in self._signals.items():
             segment.channel(f"/{bus}/raw", "socketcan")
             for message in signals.messages():
