@@ -4,8 +4,8 @@
 
 Events on stdout: ``phase``, ``paused`` (with its reason), ``refused`` (a setpoint, with the controller's number),
 ``done``, ``failed`` (with its reason).  SIGTERM and SIGINT stop the crane smoothly and end with a hold.
-Exit codes: 0 the log lies in the bunk, 2 usage, 3 profile, 5 interrupted while the controller was stopped,
-6 the mission failed, 130 interrupted.
+Exit codes: 0 the log lies in the bunk, 2 usage, 3 profile or key, 4 port, 5 interrupted while the controller was
+stopped, 6 the mission failed, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -25,22 +26,22 @@ import msgspec
 from autonomy.activity import Activity
 from autonomy.logs import QUESTION, LogObservation, LogsRefused, parse_logs
 from autonomy.mission import Mission
-from can_dbc.setpoint import DatagramRefused, StateReport, decode
+from can_dbc.setpoint import DatagramRefused, StateReport, decode, udp_address
 from machine.load import ProfileError, load_profile, profile_hash
 from machine.modes import Mode
 
-FINE, CONFIGURATION, SAFETY, FAILED, INTERRUPTED = 0, 3, 5, 6, 130
+FINE, CONFIGURATION, BUSY, SAFETY, FAILED, INTERRUPTED = 0, 3, 4, 5, 6, 130
 TURN_S: Final = 0.01
 LOOK_NS: Final = 250_000_000
 Address = tuple[str, int]
 
 
 def address(text: str) -> Address:
-    """HOST:PORT as a pair; raises ValueError."""
-    host, _, port = text.rpartition(":")
-    if not host or not 0 < int(port) < 65536:
-        raise ValueError(text)
-    return host, int(port)
+    """HOST:PORT of a command line; raises ArgumentTypeError."""
+    try:
+        return udp_address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def arguments(argv: list[str]) -> argparse.Namespace:
@@ -52,13 +53,17 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--scene", type=address, required=True, help="HOST:PORT of the log detector")
     parser.add_argument("--log", type=int, help="number of the log to pick (default: the best one)")
     parser.add_argument("--lease-ms", type=int, default=200, help="how long a setpoint is obeyed")
+    parser.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
     return parser.parse_args(argv)
 
 
 class Process:
     """The sockets around an activity."""
 
-    def __init__(self, activity: Activity, profile_hash: int, options: argparse.Namespace) -> None:
+    def __init__(
+        self, activity: Activity, profile_hash: int, options: argparse.Namespace, key: bytes | None = None
+    ) -> None:
+        self._key = key
         self.signals: list[int] = []
         self.foreign = False
         self._activity = activity
@@ -107,7 +112,7 @@ class Process:
         newest = None
         for data in _received(self._link):
             try:
-                message = decode(data)
+                message = decode(data, self._key)
             except DatagramRefused:
                 continue
             if not isinstance(message, StateReport):
@@ -177,11 +182,16 @@ def main(argv: list[str] | None = None) -> int:
         return _complain(str(error))
     if not 0 < options.lease_ms <= profile.timeouts.lease_max_ms:
         return _complain(f"--lease-ms {options.lease_ms}: {profile.name} allows 1..{profile.timeouts.lease_max_ms}")
-    activity = Activity(profile, profile_hash(profile), Mission(log_id=options.log), options.lease_ms * 1_000_000)
     try:
-        process = Process(activity, profile_hash(profile), options)
+        key = options.key_file.read_bytes().strip() if options.key_file else None
     except OSError as error:
-        return _complain(f"UDP port {options.report_port} cannot be opened: {error.strerror}; choose another one")
+        return _complain(f"{options.key_file}: the key cannot be read: {error.strerror}")
+    lease_ns = options.lease_ms * 1_000_000
+    activity = Activity(profile, profile_hash(profile), Mission(log_id=options.log), lease_ns, key)
+    try:
+        process = Process(activity, profile_hash(profile), options, key)
+    except (OSError, OverflowError) as error:
+        return _complain(f"UDP port {options.report_port} cannot be opened ({error}); choose another one", BUSY)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: process.signals.append(number))
     try:
@@ -199,9 +209,9 @@ def main(argv: list[str] | None = None) -> int:
     return SAFETY if process.stopped else INTERRUPTED
 
 
-def _complain(sentence: str) -> int:
+def _complain(sentence: str, code: int = CONFIGURATION) -> int:
     sys.stderr.write(f"{sentence}\n")
-    return CONFIGURATION
+    return code
 
 
 if __name__ == "__main__":

@@ -179,7 +179,7 @@ class Activity:
 
     def _plan(self, phase: Phase, q: tuple[float, ...]) -> Trajectory:
         arm, grasp, high_m = self._arm, self.grasp, travel_height(self._profile)
-        if phase in (Phase.LOOK, Phase.OPEN, Phase.DONE) or grasp is None:
+        if phase in (Phase.LOOK, Phase.OPEN, Phase.DONE, Phase.FAILED) or grasp is None:
             return hold(q)
         start = arm.pose(q)
         match phase:

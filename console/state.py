@@ -14,9 +14,7 @@ from typing import Any, Final
 
 from autonomy.logs import LogObservation
 from can_dbc.setpoint import DatagramRefused, StateReport, decode
-from controller import faults
-from controller.inputs import ENCODER_BIT
-from machine import grapple, kinematics
+from machine import faults, grapple, kinematics
 from machine.joints import JOINTS
 from machine.modes import Mode
 from machine.profile import Profile, joint
@@ -30,7 +28,7 @@ _NAMES: Final = tuple((j.name.lower(), PARTS[j]) for j in JOINTS)
 STALE_NAMES: Final = {
     0: "emergency stop", 1: "guard", 8: "valves A", 9: "valves B", 10: "PLC",
     11: "pressures A", 12: "pressures B", 13: "pressures C", 14: "grapple",
-} | {ENCODER_BIT + j: f"{j.name.lower()} encoder" for j in JOINTS}  # fmt: skip
+} | {faults.ENCODER_BIT + j: f"{j.name.lower()} encoder" for j in JOINTS}  # fmt: skip
 """Bits of ``StateReport.stale_mask``."""
 
 

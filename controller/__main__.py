@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Final
 
 from can_dbc.bus import BusError, default_address, open_bus
+from can_dbc.setpoint import udp_address
 from controller.config import ConfigError, Settings, load
-from controller.faults import describe
 from controller.loop import Address, Loop
 from controller.realtime import freeze, prepare
 from controller.step import Controller
+from machine.faults import describe
 from machine.modes import Mode
 
 PRIORITY: Final = 80
@@ -29,10 +30,10 @@ PRIORITY: Final = 80
 
 def address(text: str) -> Address:
     """HOST:PORT of a command line; raises ArgumentTypeError."""
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise argparse.ArgumentTypeError(f"{text}: write HOST:PORT, as in 127.0.0.1:5006")
-    return host, int(port)
+    try:
+        return udp_address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def parser() -> argparse.ArgumentParser:

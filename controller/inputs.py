@@ -15,6 +15,7 @@ from can_dbc.codec import Database, FrameRefused, MessageCodec
 from can_dbc.e2e import Checker
 from can_dbc.frame import Frame
 from controller.config import ConfigError
+from machine.faults import ENCODER_BIT
 from machine.joints import JOINTS
 from machine.profile import Profile, joint
 
@@ -22,12 +23,11 @@ PROMISE_NS: Final = 100_000_000
 """Within this time after a needed input is lost every function is at neutral (design section 7)."""
 _LONGEST_TIMEOUT_NS: Final = PROMISE_NS - 10_000_000
 
-ENCODER_BIT: Final = 2
 _BITS: Final = {
     "EstopStat": 0, "GuardStat": 1, "ValveFbA": 8, "ValveFbB": 9, "PlcStatus": 10,
     "PressA": 11, "PressB": 12, "PressC": 13, "GrappleStat": 14,
 }  # fmt: skip
-"""Bits of the stale mask; the encoder of a joint has bit ``ENCODER_BIT + joint``."""
+"""Bits of the stale mask; for the encoders see ``ENCODER_BIT``."""
 
 _OWN_MESSAGES: Final = ("Nmt", "Sync", "ValveCmdA", "ValveCmdB", "CtrlStatus", "HeartbeatCtrl")
 SAFETY_NODES: Final = (0x01, 0x10, 0x7D)

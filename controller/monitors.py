@@ -12,7 +12,7 @@ import math
 from array import array
 from typing import Final
 
-from controller.faults import Reason
+from machine.faults import Reason
 from machine.profile import JointSpec
 
 _MEMORY_S: Final = 0.5

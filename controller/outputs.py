@@ -16,7 +16,7 @@ from can_dbc.codec import Database, MessageCodec
 from can_dbc.e2e import Sender
 from can_dbc.setpoint import GrappleCommand
 from controller.config import ConfigError
-from controller.faults import FAULTS, Reaction, Reason
+from machine.faults import FAULTS, Reaction, Reason
 from machine.joints import JOINTS, N_JOINTS
 from machine.modes import Mode
 from machine.profile import Profile, joint
@@ -99,7 +99,7 @@ class Writer:
         armed: bool,
         frames: list[Wire],
     ) -> None:
-        """Appends ValveCmdA and ValveCmdB; ``moving`` False writes neutral whatever the spools say."""
+        """Appends ValveCmdA and ValveCmdB; not ``moving`` is neutral whatever the spools say, but for a HOLD."""
         for j in range(N_JOINTS):
             message, place = self._places[j]
             message.values[place] = spools_pct[j] if moving else 0.0
@@ -108,7 +108,8 @@ class Writer:
         values = self._b.values
         values[key] = ARM_KEY if armed else 0
         values[grapple] = grapple_pct if moving else 0.0
-        values[mode] = grapple_mode
+        kept = moving or grapple_mode is GrappleCommand.HOLD
+        values[mode] = grapple_mode if kept else GrappleCommand.NEUTRAL
         values[pump] = 1 if armed else 0
         values[flow] = _MAX_FLOW_PCT
         frames.append(self._a.frame())

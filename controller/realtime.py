@@ -49,8 +49,8 @@ def prepare(priority: int, cpu: int | None = None) -> list[str]:
     if cpu is not None:
         try:
             os.sched_setaffinity(0, {cpu})
-        except OSError as error:
-            refused.append(f"processor {cpu}: {error.strerror}")
+        except (OSError, ValueError) as error:  # ValueError: a negative number
+            refused.append(f"processor {cpu}: {error}")
     freeze()
     return refused
 

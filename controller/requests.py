@@ -19,8 +19,8 @@ from can_dbc.setpoint import (
     OperatorCommand,
     decode,
 )
-from controller.faults import Reason
 from controller.trajectory import Trajectory, extremes, peak_speed
+from machine.faults import Reason
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import Profile, joint
 

@@ -1,14 +1,15 @@
 """Start-up of the encoders: identity, range, TPDO1 mapping, heartbeat, then NMT start; one SDO at a time per
 node.
 
-A state machine that advances by at most one request per tick over all nodes, so that no tick is long and the
-bus stays free.  A node is asked once its heartbeat or boot-up frame was seen.  300 ms per request, 3
-tries.  A node that restarts is set up again.  Failures are a `Reason` with the node number; an absent node is
-waited for, a wrong one is not asked again before a reset.
+A state machine that advances by at most one request per tick over all nodes, so that no tick is long and the bus
+stays free.  Every node is silenced and asked from the first tick on, 300 ms per request, 3 tries, and one that does not
+answer is asked again for ever.  A node that restarts is set up again.  Failures are a `Reason` with the node number; a
+wrong node is not asked again before a reset.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Final, NamedTuple
 
@@ -22,15 +23,17 @@ from can_dbc.canopen import (
     parse_response,
     upload_request,
 )
-from controller.faults import Reason
+from machine.faults import Reason
 from machine.joints import JOINTS
 from machine.profile import Encoder, Profile, joint
 
 TIMEOUT_NS: Final = 300_000_000
 TRIES: Final = 3
 HEARTBEAT_MS: Final = 100
-_TPDO1: Final = 0x180
+TPDO1: Final = 0x180
 _DISABLED: Final = 0x8000_0000
+_REMEMBERED: Final = (0x6000, 0x6003, 0x6509)
+"""Code sequence, preset and offset (can_bus.md section 3): a device that loses them counts from another zero."""
 # CiA 406 mappings of can_bus.md section 3: index(16) sub(8) bits(8).
 _MAPPINGS: Final = {
     "rotary": (0x6004_0020, 0x2120_0010, 0x6503_0010),
@@ -49,7 +52,7 @@ class Request(NamedTuple):
 
 def sequence(encoder: Encoder) -> tuple[Request, ...]:
     """The SDO requests that set up one encoder, in order."""
-    cob = _TPDO1 + encoder.node
+    cob = TPDO1 + encoder.node
     if encoder.kind == "rotary":
         scale = Request(0x6001, 0, encoder.total_counts)
     else:
@@ -58,6 +61,7 @@ def sequence(encoder: Encoder) -> tuple[Request, ...]:
     return (
         Request(0x1000, 0, encoder.device_type),
         Request(0x1018, 1, None),
+        *(Request(entry, 0, None) for entry in _REMEMBERED),
         scale,
         Request(0x6002, 0, encoder.total_counts),
         Request(0x1800, 1, _DISABLED | cob, 4),
@@ -85,12 +89,12 @@ class Phase(IntEnum):
 class EncoderSetup:
     """Set-up of one encoder node."""
 
-    __slots__ = ("_deadline_ns", "_step", "_tries", "_vendor", "node", "phase", "reason", "requests")
+    __slots__ = ("_deadline_ns", "_first", "_step", "_tries", "node", "phase", "reason", "requests")
 
     def __init__(self, encoder: Encoder) -> None:
         self.node = encoder.node
         self.requests = sequence(encoder)
-        self._vendor: int | None = None
+        self._first: dict[tuple[int, int], int] = {}
         self.restart()
 
     def restart(self) -> None:
@@ -130,8 +134,8 @@ class EncoderSetup:
             return
         if not size:
             got = response.unsigned
-            if value is None:  # the vendor: remembered, so that a device swapped at run time is noticed
-                value = self._vendor = got if self._vendor is None else self._vendor
+            if value is None:  # remembered, so that a device swapped or a preset lost at run time is noticed
+                value = self._first.setdefault((index, sub), got)
             if got != value:
                 self._fail(Reason.NODE_IDENTITY)
                 return
@@ -166,10 +170,11 @@ class Startup:
         worst = max(self._setups, key=lambda s: s.reason, default=None)
         return (worst.reason, worst.node) if worst is not None and worst.reason else (Reason.NONE, 0)
 
-    def reset(self) -> None:
-        """An operator's reset: failed nodes are tried again."""
+    def reset(self, operational: Callable[[int], bool]) -> None:
+        """An operator's reset: failed nodes, and those that left OPERATIONAL by themselves, are set up again."""
+        self._released = False
         for setup in self._setups:
-            if setup.phase is Phase.FAILED:
+            if setup.phase is Phase.FAILED or (setup.phase is Phase.READY and not operational(setup.node)):
                 setup.restart()
 
     def receive(self, key: int, data: bytes) -> bool:
@@ -182,7 +187,8 @@ class Startup:
         return True
 
     def booted(self, node: int) -> None:
-        """A boot-up frame: the set-up of this node is gone."""
+        """A boot-up frame: the set-up of this node is gone, and whoever it is waits for START."""
+        self._released = False
         setup = self._by_node.get(node)
         if setup is not None:
             setup.restart()

@@ -20,21 +20,21 @@ from can_dbc.frame import Frame
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, OperatorAction, StateReport, encode
 from controller.config import ConfigError, Settings
 from controller.estimator import JointEstimator
-from controller.faults import Reason, pack
 from controller.inputs import Received
 from controller.laws.grapple import GrappleLaw
 from controller.laws.pd import PdLaw
 from controller.monitors import MotionMonitor
 from controller.outputs import Every, Writer
 from controller.requests import Gate, Refused
-from controller.startup import Startup
+from controller.startup import TPDO1, Startup
 from controller.supervisor import Event, Supervisor
 from controller.trajectory import Trajectory
 from controller.valve import ValveMap
 from machine.encoder import position_from_counts
+from machine.faults import Reason, pack
 from machine.joints import JOINTS, N_JOINTS
 from machine.modes import Mode
-from machine.profile import joint
+from machine.profile import Encoder, joint
 
 REPORT_NS: Final = 20_000_000
 HALF_SPEED: Final = 0.5
@@ -88,6 +88,8 @@ class Controller:
         except DbcError as error:
             raise ConfigError(str(error)) from error
         specs = [joint(profile, j) for j in JOINTS]
+        for j, spec in zip(JOINTS, specs, strict=True):
+            _check_message(database, j.name.lower(), spec.encoder)
         period_s = settings.period_ns * 1e-9
         self._settings = settings
         self._encoder_specs = [s.encoder for s in specs]
@@ -149,7 +151,8 @@ class Controller:
 
     def hear(self, inputs: Inputs, now_ns: int) -> None:
         """Datagrams and the reset button."""
-        late_ns = max(inputs.late_ns, 0)
+        # After a skip the nominal time is less than one period behind the clock, however long the stall was.
+        late_ns = min(max(inputs.late_ns, 0), self._settings.period_ns)
         for data in inputs.datagrams:
             try:
                 message = self.gate.take(data, now_ns, late_ns)
@@ -316,6 +319,18 @@ class Controller:
 def known(value: float | None) -> float:
     """A received value, NaN when there is none."""
     return math.nan if value is None else value
+
+
+def _check_message(database: Database, name: str, encoder: Encoder | None) -> None:
+    """Refuses a profile whose node cannot send the message it names; start-up would write to another device."""
+    if encoder is None:
+        return
+    key = database.message(encoder.message).key
+    if key != TPDO1 + encoder.node:
+        raise ConfigError(
+            f"joints.{name}.encoder.node: node {encoder.node} does not send {encoder.message} ({key:03X}); "
+            f"give it node {key - TPDO1} or another message"
+        )
 
 
 def step(state: Controller, inputs: Inputs, now_ns: int) -> Outputs:

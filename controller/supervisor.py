@@ -15,9 +15,9 @@ from typing import Any, Final
 
 from can_dbc.canopen import NodeState, Presence
 from controller.estimator import JointEstimator
-from controller.faults import FAULTS, Reaction, Reason
 from controller.inputs import PRESSURE_NODES, SAFETY_NODES, Received
 from controller.startup import Startup
+from machine.faults import FAULTS, Reaction, Reason
 from machine.joints import JOINTS
 from machine.modes import Mode
 from machine.profile import Profile, joint
@@ -161,7 +161,7 @@ class Supervisor:
         """The operator's RESET, by datagram or by the button on the safety module."""
         if not self.ramping:
             self.apply(Event.RESET, Reason.NONE, 0, now_ns)
-            self._startup.reset()
+            self._startup.reset(lambda node: self.received.heartbeats.operational(node, now_ns))
 
     def ask_disarm(self, now_ns: int) -> None:
         """The operator's DISARM."""

@@ -11,19 +11,20 @@ from rich.console import Console
 from autonomy.activity import Activity
 from can_dbc.setpoint import OperatorAction, StateReport
 from controller.config import Settings
-from controller.faults import describe
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from hil.display import Display
+from hil.exits import Exit, Stopped
 from hil.live import LiveOptions, LiveRun
 from hil.lockstep import START_NS, Lockstep, Observer
 from hil.operator import Operator
 from hil.summary import Summary, verdict_sentence
+from machine.faults import describe
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode
 from machine.profile import Profile
 from recorder.manifest import describe as describe_run
-from recorder.recorder import Recorder
+from recorder.recorder import Recorder, RecordingRefused
 from sim.plant import Plant
 
 SETTLE_NS: Final = 3_000_000_000
@@ -43,20 +44,22 @@ def run_live(
 def run_lockstep(name: str, seed: int, truth: str, directory: Path, limit_s: float, console: Console) -> Summary:
     """The job in one process on virtual time; the same seed leaves the same bytes in ``directory``."""
     profile = load_profile(name)
-    with Display(console, f"{profile.title}: one log into the bunk, lockstep, seed {seed}") as display:
+    try:
+        plant = Plant(profile, seed=seed, truth=truth)
         recorder = Recorder(directory, profile, describe_run(profile, (profile.crane_bus,), seed))
-        try:
-            return _Job(name, profile, seed, truth, recorder, display).run(limit_s, str(directory))
-        finally:
-            recorder.close()
+    except (ValueError, RecordingRefused) as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    try:
+        with Display(console, f"{profile.title}: one log into the bunk, lockstep, seed {seed}") as display:
+            return _Job(name, profile, plant, recorder, display).run(limit_s, str(directory))
+    finally:
+        recorder.close()
 
 
 class _Job:
     """Lockstep run with a display: says what changes, ends when the planner does."""
 
-    def __init__(
-        self, name: str, profile: Profile, seed: int, truth: str, recorder: Recorder | None, display: Display
-    ) -> None:
+    def __init__(self, name: str, profile: Profile, plant: Plant, recorder: Recorder | None, display: Display) -> None:
         settings = Settings(profile, profile_hash(profile), profile.rate_hz)
         self._display = display
         self._mode: int = -1
@@ -65,7 +68,7 @@ class _Job:
         self.system = Lockstep(
             settings,
             build_guard(profile_path(name)),
-            Plant(profile, seed=seed, truth=truth),
+            plant,
             self.activity,
             Operator(profile_hash(profile), self._pressed),
             Observer(recorder, [self._reported]),

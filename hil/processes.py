@@ -106,10 +106,11 @@ class Family:
         """
         limit = time.monotonic() + seconds
         while time.monotonic() < limit:
+            gone = self.dead()
             for who, message in self.messages():
                 if who == name and key in message:
                     return message
-            if gone := self.dead():
+            if gone:
                 code = gone.process.returncode
                 raise Stopped(Exit(code) if code in set(Exit) and code else Exit.CONFIGURATION, gone.complaint())
             self.selector.select(0.05)
@@ -119,7 +120,7 @@ class Family:
         """Give a child real-time priority (SCHED_FIFO), as the hardware it stands for would have; False if refused."""
         try:
             os.sched_setscheduler(self.children[name].process.pid, os.SCHED_FIFO, os.sched_param(priority))
-        except PermissionError:
+        except OSError:
             return False
         return True
 
@@ -133,7 +134,7 @@ class Family:
 
     def stop(self, name: str, seconds: float = 5.0) -> int | None:
         """End a child with SIGTERM, after ``seconds`` with SIGKILL; its exit code, or None when it never ran."""
-        child = self.children.pop(name, None)
+        child = self.children.get(name)
         if child is None:
             return None
         if child.process.poll() is None:
@@ -147,6 +148,7 @@ class Family:
             with contextlib.suppress(KeyError):
                 self.selector.unregister(child.process.stdout)
             child.process.stdout.close()
+        del self.children[name]
         return child.process.returncode
 
     def stop_all(self, order: tuple[str, ...]) -> None:

@@ -79,7 +79,7 @@ _BOUNDS: Final[dict[type[msgspec.Struct], dict[str, _Bounds]]] = {
         "zero_counts": (-(2**31), 2**32 - 1, "counts"),
     },
     Valve: {"delay_s": (0.0, 0.5, "s")},
-    Law: {"kp_1_s": (0.05, 50.0, "1/s"), "kd": (0.0, 1.0, ""), "velocity_filter_s": (0.0, 0.5, "s")},
+    Law: {"kp_1_s": (0.05, 50.0, "1/s"), "kd": (0.0, 1.0, ""), "velocity_filter_s": (0.001, 0.5, "s")},
     Grapple: {
         "close_time_s": (0.2, 20.0, "s"),
         "open_time_s": (0.2, 20.0, "s"),
@@ -101,7 +101,6 @@ _BOUNDS: Final[dict[type[msgspec.Struct], dict[str, _Bounds]]] = {
     Workspace: {"ground_z_m": _HEIGHT, "pick_center_m": _PLACE, "pick_half_size_m": (0.1, 10.0, "m")},
     Timeouts: {
         "lease_max_ms": (20, 500, "ms"),
-        "boot_ms": (100, 10000, "ms"),
         "stop_ramp_ms": (10, 300, "ms"),
     },
 }

@@ -126,7 +126,6 @@ class Timeouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Reaction times of the supervisor in ms; frame timeouts come from the DBC."""
 
     lease_max_ms: int
-    boot_ms: int
     stop_ramp_ms: int
 
 

@@ -172,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BusError as error:
         say(str(error))
         return 4
-    except OSError as error:
+    except (OSError, OverflowError) as error:
         say(f"a port or file cannot be used ({error}); choose another")
         return 4
     shell = Shell(buses, ticks, reports)

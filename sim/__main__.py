@@ -56,6 +56,11 @@ class LivePlant:
         answer_ns = 0
         while self._running:
             now_ns = time.monotonic_ns() - self._skipped_ns
+            behind_ns = now_ns - self._plant.next_ns if self._plant.next_ns else 0
+            if behind_ns > LAG_NS:
+                self._skipped_ns += behind_ns
+                self._stalls += 1
+                now_ns -= behind_ns
             frames.clear()
             self._bus.drain(frames)
             received = [(name, f._replace(stamp_ns=f.stamp_ns - self._skipped_ns)) for f in frames]
@@ -64,12 +69,9 @@ class LivePlant:
             if self._requests is not None and now_ns >= answer_ns:
                 self._answer(self._requests)
                 answer_ns = now_ns + ANSWER_NS
-            after_ns = time.monotonic_ns() - self._skipped_ns
-            if after_ns - now_ns > LAG_NS:
-                self._skipped_ns += after_ns - now_ns
-                self._stalls += 1
-            elif self._plant.next_ns > after_ns:
-                time.sleep((self._plant.next_ns - after_ns) * 1e-9)
+            pause_ns = self._plant.next_ns - (time.monotonic_ns() - self._skipped_ns)
+            if pause_ns > 0:
+                time.sleep(pause_ns * 1e-9)
 
     def report(self) -> dict[str, float]:
         """How well real time was kept: share of time that was lost, and how often."""

@@ -32,6 +32,7 @@ RATE_SLACK_PCT: Final = 3.0
 NO_AXIS: Final = 15
 GRAPPLE_AXIS, AUX_AXIS = 5, 6
 _NEUTRAL, _SPOOL = 0, 2
+_GRAPPLE_OPENS, _GRAPPLE_CLOSES = 1, 2
 _GOOD_NEEDED: Final = 2
 _BAD_ALLOWED: Final = 1
 _MAX_STEP: Final = 2
@@ -323,6 +324,8 @@ class Guard:
         return Verdict.GOOD, NO_AXIS
 
     def _neutral(self) -> bool:
+        if self._b.raw("GrappleMode") in (_GRAPPLE_OPENS, _GRAPPLE_CLOSES):  # these move at full flow by themselves
+            return False
         return self._b.raw("Grapple") == 0 and all(command.percent == 0.0 for command in self._commands)
 
     def _settle(self, verdict: Verdict, axis: int, now_ns: int) -> None:

@@ -41,7 +41,7 @@ STRAGGLER_S = 0.5
 
 _SYS_FINIT_MODULE = 313
 _POWER_OFF = 0x4321_FEDC
-_PR_SET_PDEATHSIG = 1
+_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -121,6 +121,21 @@ def _hasten_soft_interrupts() -> None:
             os.sched_setscheduler(int(comm.parent.name), os.SCHED_FIFO, os.sched_param(SOFT_INTERRUPT_PRIORITY))
 
 
+def _end_descendants() -> None:
+    """Kills whatever the command left behind; this process is their subreaper, so they are all below it."""
+    while children := _children(os.getpid()):
+        for pid in children:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(-1, 0)
+
+
+def _children(pid: int) -> list[int]:
+    tasks = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for task in tasks for child in task.read_text().split()]
+
+
 def _sentence(reason: OSError) -> str:
     return f"{reason.filename}: {reason.strerror}" if reason.filename else str(reason.strerror)
 
@@ -148,10 +163,11 @@ class Host:
 
     def receive_order(self) -> dict[str, Any]:
         self.say(ready=True)
-        while True:
-            for message in self.receive() or [{}]:
+        while (messages := self.receive()) is not None:
+            for message in messages:
                 if "argv" in message:
                     return message
+        sys.exit(1)  # the wrapper is gone
 
     def receive(self) -> list[dict[str, Any]] | None:
         """Messages that a readable channel holds; None at its end."""
@@ -177,6 +193,7 @@ class Supervisor:
         os.set_blocking(wake, False)
         signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
         signal.signal(signal.SIGCHLD, lambda *_: None)
+        _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
         self.host.say(started=True)
         if not self._start():
             return
@@ -200,7 +217,7 @@ class Supervisor:
             for sink in self.sinks.values():
                 termios.tcdrain(sink)
         else:
-            self._signal(signal.SIGKILL)
+            _end_descendants()
         assert self.status is not None  # only then does the wait end without news
         self.host.say(exit=os.waitstatus_to_exitcode(self.status))
 
@@ -242,7 +259,7 @@ class Supervisor:
     def _obey(self) -> None:
         messages = self.host.receive()
         if messages is None:  # the wrapper is gone
-            self._signal(signal.SIGKILL)
+            _end_descendants()
             sys.exit(1)
         for message in messages:
             if "signal" in message:

@@ -187,7 +187,7 @@ class ValveNode(Device):
             out[:5] = [a.get("Slew"), a.get("Lift"), a.get("Tilt"), a.get("Ext"), b.get("Rot")]
         elif mode != 0:
             self.exit = Exit.OUT_OF_RANGE  # this node closes no velocity loop
-        flow = abs(b.get("Grapple")) or 100.0
+        flow = abs(b.get("Grapple"))
         match b.get("GrappleMode"):
             case 1:
                 out[5] = flow

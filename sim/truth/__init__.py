@@ -126,9 +126,16 @@ class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def load_truth(name: str, seed: int) -> Truth:
-    """``"nominal"``, ``"sampled"`` (an individual drawn from ``seed``) or the path of a truth file."""
+    """``"nominal"``, ``"sampled"`` (an individual drawn from ``seed``) or the path of a truth file.
+
+    Raises:
+        ValueError: one sentence that names the file and what is wrong.
+    """
     path = Path(__file__).with_name("nominal.toml") if name in ("nominal", "sampled") else Path(name)
-    truth = msgspec.toml.decode(path.read_bytes(), type=Truth)
+    try:
+        truth = msgspec.toml.decode(path.read_bytes(), type=Truth)
+    except (OSError, msgspec.DecodeError) as error:
+        raise ValueError(f"truth file {path}: {error}; use nominal, sampled or a complete TOML file") from None
     return _sample(truth, random.Random(f"truth {seed}")) if name == "sampled" else truth
 
 

@@ -26,6 +26,7 @@ from can_dbc.setpoint import (
     StateReport,
     decode,
     encode,
+    udp_address,
 )
 
 KEY = b"a key of the two sides"
@@ -229,3 +230,15 @@ def test_another_number_of_axes_is_refused() -> None:
 def test_a_refusal_says_why() -> None:
     with pytest.raises(DatagramRefused, match="datagram refused: not finite"):
         decode(encode(a_setpoint((Knot(0, (math.nan,) * 5, (0.0,) * 5),))))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "5006", "127.0.0.1", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:65536", "nosuch.invalid:6"]
+)
+def test_an_address_that_is_none_is_one_sentence(text):
+    with pytest.raises(ValueError, match=r"127\.0\.0\.1:5006"):
+        udp_address(text)
+
+
+def test_an_address_is_resolved_once():
+    assert udp_address("localhost:5006") == ("127.0.0.1", 5006)

@@ -18,7 +18,7 @@ from can_dbc.setpoint import OperatorAction, OperatorCommand, StateReport, decod
 from console.server import Console, create_app
 from console.state import ALIVE_NS, STALE_NAMES, Watch, describe_machine
 from controller import inputs as controller_inputs
-from controller.faults import Reason, pack
+from machine.faults import ENCODER_BIT, Reason, pack
 from machine.joints import JOINTS
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode
@@ -283,7 +283,7 @@ def test_drawing_hangs_the_grapple_below_the_pin():
 
 
 def test_stale_names_are_the_controllers_bits():
-    bits = set(controller_inputs._BITS.values()) | {controller_inputs.ENCODER_BIT + j for j in JOINTS}
+    bits = set(controller_inputs._BITS.values()) | {ENCODER_BIT + j for j in JOINTS}
     assert set(STALE_NAMES) == bits
 
 

@@ -80,6 +80,7 @@ class EncoderNode:
         self.objects = {
             (0x1000, 0): spec.device_type, (0x1018, 1): 7, (0x6001, 0): spec.total_counts,
             (0x6005, 1): round(spec.unit_per_count * 1e9), (0x6002, 0): spec.total_counts, (0x1A00, 0): 2,
+            (0x6000, 0): 4, (0x6003, 0): 0, (0x6509, 0): 0,
         }  # fmt: skip
         self.silent = False
         self.refuses: set[tuple[int, int]] = set()

@@ -5,7 +5,7 @@ from bench import MS, Bench, T, count_until
 
 from can_dbc.canopen import Emergency, emergency_frame, heartbeat_frame
 from can_dbc.setpoint import OperatorAction
-from controller.faults import FAULTS, Reaction, Reason, describe, pack
+from machine.faults import FAULTS, Reaction, Reason, describe, pack
 from machine.joints import Joint
 from machine.modes import Mode
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from can_dbc.e2e import Sender, crc8
 from can_dbc.frame import Frame
 from can_dbc.setpoint import OperatorAction
-from controller.faults import Reason
 from controller.guard.__main__ import build, main, profile_path
 from controller.guard.envelope import read_envelope
 from controller.guard.judge import CALM_NS, Guard, Verdict, checksum
 from controller.guard.layout import GuardConfigError, read_layouts
+from machine.faults import Reason
 from machine.modes import Mode
 
 PROFILE = profile_path("palms_471")
@@ -335,3 +335,21 @@ def test_the_guard_is_small():
     folder = Path(__file__).parents[2] / "controller" / "guard"
     assert sum(len(p.read_text().splitlines()) for p in folder.glob("*.py")) <= 600
     assert Guard.__slots__
+
+
+@pytest.mark.parametrize("mode", [1, 2])
+def test_an_opening_or_closing_grapple_is_no_neutral_command(mode):
+    """The grapple moves by its mode alone, so the mode must be armed like any other motion."""
+    traffic = Traffic()
+    traffic.tick(60)
+    assert traffic.guard.verdict is Verdict.GOOD
+    traffic.b = {"ArmKey": 0, "GrappleMode": mode}
+    traffic.tick(2)
+    assert traffic.guard.verdict is Verdict.NOT_ARMED
+
+
+def test_a_held_grapple_is_neutral():
+    traffic = Traffic()
+    traffic.b = {"ArmKey": 0, "GrappleMode": 3}
+    traffic.tick(60)
+    assert traffic.guard.verdict is Verdict.GOOD

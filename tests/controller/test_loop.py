@@ -13,10 +13,10 @@ from can_dbc.bus import BusState, BusStats
 from can_dbc.setpoint import OperatorAction, OperatorCommand, StateReport, decode, encode
 from controller.__main__ import address, listen, main, parser
 from controller.config import ConfigError, load
-from controller.faults import Reason
 from controller.loop import BUS_GONE_NS, Histogram, Loop
 from controller.realtime import Notifier, sleep_until
 from controller.step import Controller
+from machine.faults import Reason
 
 
 class MemoryBus:
@@ -126,6 +126,7 @@ def test_records_hold_frames_datagrams_outputs_and_reports(udp):
 def test_neutral_and_disarmed_whatever_the_way_out(udp, how):
     clock, bus = Clock(), MemoryBus()
     loop = build(udp, clock, bus)
+    loop.controller = Bench().active().controller
     if how == "exception":
         loop._sleep = lambda _deadline: (_ for _ in ()).throw(KeyboardInterrupt)
         with pytest.raises(KeyboardInterrupt):
@@ -134,7 +135,10 @@ def test_neutral_and_disarmed_whatever_the_way_out(udp, how):
         run(loop, clock, 3)
     a, b, status = (DATABASE.message(n) for n in ("ValveCmdA", "ValveCmdB", "CtrlStatus"))
     assert [key for key, _ in bus.sent[-3:]] == [a.key, b.key, status.key]
-    assert b.named(b.decode(bus.sent[-2][1]))["ArmKey"] == 0
+    last_a, last_b = a.named(a.decode(bus.sent[-3][1])), b.named(b.decode(bus.sent[-2][1]))
+    assert [last_a[s] for s in ("Mode", "Slew", "Lift", "Tilt", "Ext")] == [0] * 5
+    assert last_b["ArmKey"] == last_b["Rot"] == last_b["Grapple"] == 0
+    assert last_b["GrappleMode"] in (0, 3), "neutral or hold"
     loop.close()
     assert bus.closed
 

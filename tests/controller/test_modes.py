@@ -4,8 +4,8 @@ import pytest
 from bench import MS, VALUES, Bench
 
 from can_dbc.setpoint import OperatorAction
-from controller.faults import FAULTS, Reaction, Reason
 from controller.supervisor import TRANSITIONS, Event
+from machine.faults import FAULTS, Reaction, Reason
 from machine.modes import Mode
 
 B, S, A, X, P, F = Mode.BOOT, Mode.STANDBY, Mode.ARMED, Mode.ACTIVE, Mode.STOP, Mode.FAULT

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from can_dbc.setpoint import DatagramFault, DriveSetpoint, StateReport, encode
 from controller.config import load
-from controller.faults import Reason
 from controller.trajectory import extremes, hermite, peak_speed
+from machine.faults import Reason
 from machine.joints import Joint
 from machine.modes import Mode
 

@@ -1,11 +1,16 @@
 """Set-up of the encoders against emulated nodes."""
 
+from dataclasses import replace
+
+import msgspec
 import pytest
-from bench import MS, Bench, T
+from bench import DATABASE, MS, PROFILE, SETTINGS, Bench, T
 
 from can_dbc.canopen import SDO_TO_SERVER, Sdo, SdoKind
-from controller.faults import Reason
+from controller.config import ConfigError
 from controller.startup import EncoderSetup, Phase
+from controller.step import Controller
+from machine.faults import Reason
 from machine.modes import Mode
 
 
@@ -97,3 +102,45 @@ def test_a_stray_answer_is_ignored():
     setup.frame(T)
     setup.answer(stray)
     assert setup.phase is Phase.ASKING and setup.reason is Reason.NODE_ABSENT
+
+
+def test_an_encoder_that_left_operational_by_itself_is_set_up_again_by_a_reset():
+    bench = Bench().boot()
+    bench.encoders[3].state = 0x7F  # what a CiA 301 device does after a communication error
+    bench.run(100)
+    bench.tick([bench.operator(1)])
+    assert bench.mode is Mode.STANDBY
+    bench.tick([bench.operator(4)])
+    bench.run(200)
+    assert bench.encoders[3].state == 0x05
+    bench.tick([bench.operator(1)])
+    assert bench.mode is Mode.ARMED
+
+
+def test_a_node_that_boots_late_is_started():
+    bench = Bench().boot()
+    starts = [f for f in _frames(bench, 40) if f == (0, b"\x01\x00")]
+    assert not starts
+    bench.extra.append((0x710, b"\x00"))  # boot-up of the valve node
+    assert (0, b"\x01\x00") in _frames(bench, 40)
+
+
+def _frames(bench, ticks):
+    return [frame for _ in range(ticks) for frame in list(bench.tick().frames)]
+
+
+def test_a_lost_preset_is_a_device_that_is_not_the_one_it_was():
+    bench = Bench().boot()
+    bench.encoders[4].objects[0x6003, 0] = 1234
+    bench.encoders[4].state = 0x7F
+    bench.pending.append((0x704, b"\x00"))
+    bench.run(300)
+    assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 4
+
+
+def test_a_node_that_cannot_send_its_message_is_a_configuration_error():
+    encoder = PROFILE.joints["slew"].encoder
+    slew = msgspec.structs.replace(PROFILE.joints["slew"], encoder=msgspec.structs.replace(encoder, node=16))
+    profile = msgspec.structs.replace(PROFILE, joints=PROFILE.joints | {"slew": slew})
+    with pytest.raises(ConfigError, match=r"node 16 does not send EncSlew \(182\); give it node 2"):
+        Controller(replace(SETTINGS, profile=profile), DATABASE)

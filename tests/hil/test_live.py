@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
@@ -23,13 +25,47 @@ from hil.exits import Exit
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
 
-def demo(directory: Path, *arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "timberhand", "demo", "--no-console", "--out", str(directory), *arguments]
-    environment = os.environ | {"TIMBERHAND_WIRE_DIR": str(directory.parent / "wire")}
-    (directory.parent / "wire").mkdir(exist_ok=True)
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, stdin=subprocess.DEVNULL
-    )
+Demo = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def demo(tmp_path: Path) -> Iterator[Demo]:
+    """Starts ``timberhand demo`` into ``tmp_path/run``, with a wire of its own; what still runs at the end is ended."""
+    started: list[subprocess.Popen[str]] = []
+    wire = tmp_path / "wire"
+    wire.mkdir()
+
+    def start(*arguments: str) -> subprocess.Popen[str]:
+        command = [
+            sys.executable,
+            "-m",
+            "timberhand",
+            "demo",
+            "--no-console",
+            "--out",
+            str(tmp_path / "run"),
+            *arguments,
+        ]
+        started.append(
+            subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=os.environ | {"TIMBERHAND_WIRE_DIR": str(wire)},
+            )
+        )
+        return started[-1]
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.communicate(timeout=60)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
 
 def await_line(process: subprocess.Popen[str], text: str) -> None:
@@ -59,8 +95,8 @@ def assert_neutral_and_readable(directory: Path) -> None:
     assert json.loads((directory / "manifest.json").read_text())["complete"]
 
 
-def test_the_job_on_the_wire(tmp_path: Path) -> None:
-    process = demo(tmp_path / "run", "--bus", "wire", "--seed", "103")
+def test_the_job_on_the_wire(tmp_path: Path, demo: Demo) -> None:
+    process = demo("--bus", "wire", "--seed", "103")
     out, err = process.communicate(timeout=300)
     assert process.returncode == Exit.FINE, out + err
     assert "The log lies in the bunk" in out
@@ -72,6 +108,8 @@ def test_the_job_on_vcan_where_candump_sees_it(tmp_path: Path) -> None:
     way = json.loads(subprocess.run([*lab, "--check", "--json"], capture_output=True, text=True).stdout)
     if way["way"] is None:
         pytest.skip(f"no vcan here: {way['why']}")
+    if shutil.which("candump") is None:
+        pytest.skip("candump is missing: apt-get install can-utils")
     seen, run = tmp_path / "candump.txt", tmp_path / "run"
     job = f"{sys.executable} -m timberhand demo --bus vcan --no-console --seed 103 --out {run}"
     script = f"candump -n 100 vcan0,210:7FF,182:7FF > {seen} & {job}"
@@ -83,8 +121,8 @@ def test_the_job_on_vcan_where_candump_sees_it(tmp_path: Path) -> None:
     assert identifiers == {"210", "182"}, "candump shows the commands and the encoder of the slew"
 
 
-def test_ctrl_c_leaves_the_valves_neutral_and_the_logs_readable(tmp_path: Path) -> None:
-    process = demo(tmp_path / "run", "--bus", "wire")
+def test_ctrl_c_leaves_the_valves_neutral_and_the_logs_readable(tmp_path: Path, demo: Demo) -> None:
+    process = demo("--bus", "wire")
     await_line(process, "→ ABOVE")
     time.sleep(1.5)  # into the motion
     process.send_signal(signal.SIGINT)
@@ -94,8 +132,8 @@ def test_ctrl_c_leaves_the_valves_neutral_and_the_logs_readable(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("victim", ["autonomy", "controller", "controller.guard", "sim"])
-def test_a_killed_process_ends_the_run_with_one_sentence(tmp_path: Path, victim: str) -> None:
-    process = demo(tmp_path / "run", "--bus", "wire")
+def test_a_killed_process_ends_the_run_with_one_sentence(tmp_path: Path, demo: Demo, victim: str) -> None:
+    process = demo("--bus", "wire")
     await_line(process, "→ ABOVE")
     time.sleep(1.0)
     os.kill(pid_of(process.pid, victim), signal.SIGKILL)

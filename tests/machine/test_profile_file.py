@@ -105,7 +105,7 @@ STRUCTURE = [
      '(rad, or m for the telescope; per second)'),
     ({"joints.slew.valve.dedband_plus_pct": 3.0},
      'joints.slew.valve.dedband_plus_pct: unknown key; did you mean "deadband_plus_pct"?'),
-    ({"timeouts.zzz": 1}, "timeouts.zzz: unknown key; allowed: lease_max_ms, boot_ms, stop_ramp_ms"),
+    ({"timeouts.zzz": 1}, "timeouts.zzz: unknown key; allowed: lease_max_ms, stop_ramp_ms"),
     ({"rate": 200}, 'rate: wrong unit in the name; write "rate_hz"'),
     ({"joints.boom": RAW["joints"]["lift"]},
      "joints.boom: unknown joint; the joints are slew, lift, tilt, ext, rot"),

@@ -12,6 +12,9 @@ from typing import Final, NamedTuple
 
 from machine.joints import JOINTS
 
+ENCODER_BIT: Final = 2
+"""In the mask of stale inputs (``StateReport.stale_mask``) the encoder of a joint has bit ``ENCODER_BIT + joint``."""
+
 
 class Reaction(IntEnum):
     """What a reason does, from mild to hard (safety_faults.md section 4; stop categories of IEC 60204-1)."""
