@@ -31,12 +31,20 @@ SETTLE_NS: Final = 3_000_000_000
 
 
 def run_live(
-    name: str, seed: int, truth: str, bus: str, directory: Path, page: int, limit_s: float, console: Console
+    name: str,
+    seed: int,
+    truth: str,
+    bus: str,
+    directory: Path,
+    page: int,
+    limit_s: float,
+    patience: int,
+    console: Console,
 ) -> Summary:
     """The job as separate processes in real time."""
     profile = load_profile(name)
     directory.mkdir(parents=True, exist_ok=True)
-    options = LiveOptions(name, profile, seed, truth, bus, directory, page, limit_s)
+    options = LiveOptions(name, profile, seed, truth, bus, directory, page, limit_s, patience)
     with Display(console, f"{profile.title}: one log into the bunk, live, seed {seed}") as display:
         return LiveRun(options, display).run()
 

@@ -15,7 +15,8 @@ from machine.modes import Mode
 
 LOOK_NS: Final = 1_000_000_000
 REPEAT_NS: Final = 2_000_000_000
-PATIENCE: Final = 5
+PATIENCE: Final = 20
+"""So many stops a person bears before calling the machine broken."""
 STOPPED: Final = (Mode.STOP, Mode.FAULT)
 """A stop that ends in a latched fault is one stop."""
 
@@ -23,8 +24,11 @@ STOPPED: Final = (Mode.STOP, Mode.FAULT)
 class Operator:
     """Presses ARM and RESET; ``stops`` counts the stops seen, ``gave_up`` that there were too many."""
 
-    def __init__(self, profile_hash: int, on_press: Callable[[OperatorAction, StateReport], None]) -> None:
+    def __init__(
+        self, profile_hash: int, on_press: Callable[[OperatorAction, StateReport], None], patience: int = PATIENCE
+    ) -> None:
         self.stops = 0
+        self._patience = patience
         self._profile_hash = profile_hash
         self._on_press = on_press
         self._sequence = 0
@@ -35,7 +39,7 @@ class Operator:
     @property
     def gave_up(self) -> bool:
         """Whether the machine has stopped too often to arm it once more."""
-        return self.stops > PATIENCE
+        return self.stops > self._patience
 
     def step(self, report: StateReport) -> bytes | None:
         """The operator command that a person would give on seeing this report, if any."""

@@ -36,7 +36,8 @@ def demo(
     ] = None,
     console: Annotated[bool, typer.Option(help="Serve the page that shows the crane.")] = True,
     console_port: Annotated[int, typer.Option(help="Port of the page on localhost.")] = 8471,
-    limit_s: Annotated[float, typer.Option(help="Give up after so many seconds.")] = 180.0,
+    limit_s: Annotated[float, typer.Option(help="Give up after so many seconds.")] = 300.0,
+    patience: Annotated[int, typer.Option(help="How many stops the stand-in operator arms again after (live).")] = 20,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")] = False,
 ) -> None:
     """A log goes from the ground into the bunk, over CAN.
@@ -73,7 +74,7 @@ def demo(
         from hil.demo import run_live
 
         page = console_port if console else 0
-        summary = run_live(profile, seed, truth, bus.value, directory, page, limit_s, screen)
+        summary = run_live(profile, seed, truth, bus.value, directory, page, limit_s, patience, screen)
     summary.show(screen)
     summary.save(directory / "summary.json")
     if as_json:
