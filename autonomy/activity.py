@@ -144,15 +144,24 @@ class Activity:
         if self._report.mode not in (Mode.ARMED, Mode.ACTIVE):
             name = next((mode.name for mode in Mode if mode == self._report.mode), str(self._report.mode))
             return f"the controller is in {name}"
-        if not all(map(isfinite, self._report.position)):
+        if not all(map(isfinite, self._position())):
             return "a joint position is unknown"
         return None
+
+    def _position(self) -> tuple[float, ...]:
+        """The measured joints; one without an encoder counts as standing where it was last sent."""
+        assert self._report is not None
+        sent, _ = self._motion.at(self._clock_s)
+        return tuple(
+            p if joint(self._profile, j).encoder is not None else q
+            for j, p, q in zip(JOINTS, self._report.position, sent, strict=True)
+        )
 
     def _resume(self) -> None:
         """Goes on from the measured pose, in the interrupted phase or at the way to it."""
         assert self._report is not None
         self.paused = None
-        measured = self._report.position
+        measured = self._position()
         follows = self._report.mode == Mode.ACTIVE and all(map(isfinite, self._report.reference))
         start = self._report.reference if follows else measured
         phase: Phase = Phase.LOOK if self.phase is Phase.WAIT else self.phase
@@ -242,11 +251,10 @@ class Activity:
 
     def _pace(self) -> float:
         """1 while the joints follow, less when one falls behind by more than ``_LAG_S``, 0 at twice that."""
-        assert self._report is not None
         wanted, _ = self._motion.at(self._clock_s)
         lags = [
             abs(q - p) / joint(self._profile, j).speed_limit
-            for j, q, p in zip(JOINTS, wanted, self._report.position, strict=True)
+            for j, q, p in zip(JOINTS, wanted, self._position(), strict=True)
         ]
         return min(max(2.0 - max(lags) / _LAG_S, 0.0), 1.0)
 
@@ -269,12 +277,11 @@ class Activity:
             self._fail(f"{rule.trouble} within {self._elapsed_s:.0f} s{self._worst_joint()}")
 
     def _at_goal(self, settle_s: float) -> bool:
-        assert self._report is not None
         if self.phase is Phase.CLOSE:
             return self._gripped() and self._rate == 0.0
         there = self._clock_s >= self._motion.duration_s + settle_s
         return there and all(
-            abs(p - g) <= near for p, g, near in zip(self._report.position, self._motion.goal, ARRIVED, strict=True)
+            abs(p - g) <= near for p, g, near in zip(self._position(), self._motion.goal, ARRIVED, strict=True)
         )
 
     def _next(self) -> Phase | None:
@@ -342,11 +349,10 @@ class Activity:
         return GrappleCommand.OPEN if self.phase is Phase.DONE else GrappleCommand.HOLD
 
     def _worst_joint(self) -> str:
-        assert self._report is not None
         wanted, _ = self._motion.at(self._clock_s)
         errors = [
             (abs(p - w) / near, j, p - w)
-            for j, p, w, near in zip(JOINTS, self._report.position, wanted, ARRIVED, strict=True)
+            for j, p, w, near in zip(JOINTS, self._position(), wanted, ARRIVED, strict=True)
         ]
         share, axis, error = max(errors)
         unit = "m" if axis is Joint.EXT else "rad"

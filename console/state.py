@@ -15,7 +15,7 @@ from typing import Any, Final
 from autonomy.logs import LogObservation
 from can_dbc.setpoint import DatagramRefused, StateReport, decode
 from machine import faults, grapple, kinematics
-from machine.joints import JOINTS
+from machine.joints import JOINTS, Joint
 from machine.modes import Mode
 from machine.profile import Profile, joint
 
@@ -112,16 +112,20 @@ class Watch:
 
     def _drawing(self, r: StateReport) -> dict[str, Any]:
         kin, tongs = self._profile.kinematics, self._profile.grapple.tongs
-        if not all(map(math.isfinite, r.position)):
+        q = r.position
+        if joint(self._profile, Joint.ROT).encoder is None:  # drawn where it was told to be
+            told = r.reference[Joint.ROT]
+            q = (*q[: Joint.ROT], told if math.isfinite(told) else 0.0)
+        if not all(map(math.isfinite, q)):
             return {"points": None, "reference_points": None}
         opening = r.opening_pct if math.isfinite(r.opening_pct) else 100.0
         angle = grapple.tong_angle_from_opening_pct(tongs, opening)
         ghost = all(map(math.isfinite, r.reference))
         return {
-            "points": _points(kinematics.chain_points(kin, r.position)),
+            "points": _points(kinematics.chain_points(kin, q)),
             "reference_points": _points(kinematics.chain_points(kin, r.reference)) if ghost else None,
             "tongs": {
-                "yaw_rad": round(grapple.grapple_yaw(r.position), 4),
+                "yaw_rad": round(grapple.grapple_yaw(self._profile, q), 4),
                 "half_gap_m": round(grapple.half_gap_m(tongs, angle), 4),
                 "tip_below_m": round(grapple.tip_below_pin_m(tongs, angle), 4),
             },

@@ -242,9 +242,8 @@ class Controller:
                     cap,
                     elapsed_ns * 1e-9,
                 )
-            status = self.received.grapple
-            clamp, opening = known(status.get("ClampPress")), known(status.get("Opening"))
-            self.grapple.step(self._grapple_wanted, clamp, opening, now_ns)
+            clamp = known(self.received.grapple.get("ClampPress"))
+            self.grapple.step(self._grapple_wanted, clamp, self._opening_pct(), now_ns)
         else:
             share = 0.0
             if supervisor.ramping:
@@ -278,6 +277,11 @@ class Controller:
         outputs.mode, outputs.reason, outputs.detail = supervisor.mode, supervisor.reason, supervisor.detail
         outputs.report = self._report(inputs, now_ns) if self._report_due.due(now_ns) else None
 
+    def _opening_pct(self) -> float:
+        """The measured opening; NaN on a machine that has no sensor for it, whatever the bus says."""
+        sensed = self._settings.profile.grapple.opening_sensor
+        return known(self.received.grapple.get("Opening")) if sensed else math.nan
+
     def _report(self, inputs: Inputs, now_ns: int) -> bytes:
         supervisor, gate, grapple = self.supervisor, self.gate, self.received.grapple
         self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
@@ -295,7 +299,7 @@ class Controller:
             position=tuple(e.position for e in self.estimators),
             velocity=tuple(e.velocity for e in self.estimators),
             reference=tuple(self.reference),
-            opening_pct=known(grapple.get("Opening")),
+            opening_pct=self._opening_pct(),
             clamp_bar=known(grapple.get("ClampPress")),
             load_kg=known(grapple.get("Load")),
             tick_ns=self._longest_tick_ns,

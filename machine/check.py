@@ -1,8 +1,7 @@
 """What a well-formed profile must satisfy to be a machine: units, ranges and consistency.
 
 ``problems_of`` returns one sentence per problem, each starting with the key path; an empty list is a usable
-profile. The ranges are generous physical bounds of road-going loader and forwarder cranes, so that they catch
-a wrong unit or a slipped digit and never a real machine.
+profile.  The range of each number alone is in ``machine.bounds``.
 """
 
 from __future__ import annotations
@@ -10,25 +9,21 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from itertools import pairwise
-from math import hypot, pi, radians
-from typing import Any, Final
+from math import dist, hypot
+from typing import Final
 
-import msgspec
-
+from machine.bounds import ANGLE, TURN_RAD, Bounds, bounded, out_of_range
+from machine.carrier import wheel_gap_m
 from machine.joints import Joint
 from machine.kinematics import max_reach_m
 from machine.profile import (
-    Bunk,
+    Camera,
+    Carrier,
+    CarrierValve,
     Encoder,
-    Grapple,
     JointSpec,
-    Kinematics,
-    Law,
     Profile,
-    Timeouts,
-    TongTable,
     Valve,
-    Workspace,
     joint,
 )
 
@@ -37,7 +32,10 @@ KP_DELAY_BOUND: Final = 0.5
 bound).
 """
 DEADBAND_BOUND_PCT: Final = 50.0
-TURN_RAD: Final = 2.0 * pi
+ANTENNAS_APART_M: Final = 0.3
+"""Least distance of the two antennas: nearer, the heading is worth nothing (machines.md 8)."""
+ARM_STEEPEST: Final = 0.9
+"""Greatest drop of a wheel hub over the length of its arm: a steeper arm hardly lifts."""
 
 _ENCODER_MESSAGES: Final = {
     "EncSlew": "rotary",
@@ -46,118 +44,25 @@ _ENCODER_MESSAGES: Final = {
     "EncExt": "linear",
     "EncRot": "rotary",
 }
+_STEERING_MESSAGE: Final = "EncArtic"
+_CRANE_LINKS: Final = ("base", "mast", "boom", "stick", "telescope")
+_CARRIER_LINKS: Final = ("front", "rear")
 _VALVE_SIGNALS: Final = ("Slew", "Lift", "Tilt", "Ext", "Rot")
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,31}")
-
-_Bounds = tuple[float, float, str]
-_LENGTH: Final[_Bounds] = (0.3, 15.0, "m")
-_OFFSET: Final[_Bounds] = (-2.0, 2.0, "m")
-_ANGLE: Final[_Bounds] = (-TURN_RAD, TURN_RAD, "rad")
-_PLACE: Final[_Bounds] = (-20.0, 20.0, "m")
-_HEIGHT: Final[_Bounds] = (-5.0, 5.0, "m")
-
-_BOUNDS: Final[dict[type[msgspec.Struct], dict[str, _Bounds]]] = {
-    Profile: {"rate_hz": (50, 1000, "Hz")},
-    Kinematics: {
-        "d1_m": (0.0, 10.0, "m"),
-        "a1_m": _OFFSET,
-        "theta1_offset_rad": _ANGLE,
-        "a2_m": _LENGTH,
-        "theta2_offset_rad": _ANGLE,
-        "a3_m": _OFFSET,
-        "theta3_offset_rad": _ANGLE,
-        "d4_m": _LENGTH,
-        "hanger_to_fork_m": (0.0, 2.0, "m"),
-        "fork_to_rotator_m": (0.0, 2.0, "m"),
-        "rotator_to_tong_pivot_m": (0.0, 2.0, "m"),
-    },
-    Encoder: {
-        "node": (1, 127, ""),
-        "device_type": (0, 2**32 - 1, ""),
-        "total_counts": (2, 2**32, "counts"),
-        "unit_per_count": (1e-9, 0.1, "per count"),
-        "zero_counts": (-(2**31), 2**32 - 1, "counts"),
-    },
-    Valve: {"delay_s": (0.0, 0.5, "s")},
-    Law: {"kp_1_s": (0.05, 50.0, "1/s"), "kd": (0.0, 1.0, ""), "velocity_filter_s": (0.001, 0.5, "s")},
-    Grapple: {
-        "close_time_s": (0.2, 20.0, "s"),
-        "open_time_s": (0.2, 20.0, "s"),
-        "hold_pressure_bar": (10.0, 350.0, "bar"),
-    },
-    TongTable: {
-        "angle_rad": (0.0, TURN_RAD, "rad"),
-        "half_gap_m": _OFFSET,
-        "tip_below_pin_m": (0.0, 3.0, "m"),
-    },
-    Bunk: {
-        "center_m": _PLACE,
-        "yaw_rad": _ANGLE,
-        "length_m": (0.5, 15.0, "m"),
-        "width_m": (0.3, 5.0, "m"),
-        "floor_z_m": _HEIGHT,
-        "stake_height_m": (0.0, 4.0, "m"),
-    },
-    Workspace: {"ground_z_m": _HEIGHT, "pick_center_m": _PLACE, "pick_half_size_m": (0.1, 10.0, "m")},
-    Timeouts: {
-        "lease_max_ms": (20, 500, "ms"),
-        "stop_ramp_ms": (10, 300, "ms"),
-    },
-}
-_SLIPS: Final = {
-    "m": (1e-3, "mm"),
-    "rad": (radians(1.0), "deg"),
-    "s": (1e-3, "ms"),
-    "m/s": (1e-3, "mm/s"),
-    "rad/s": (radians(1.0), "deg/s"),
-    "m/s^2": (1e-3, "mm/s^2"),
-    "rad/s^2": (radians(1.0), "deg/s^2"),
-    "bar": (1e-5, "Pa"),
-    "Hz": (1e9, "s per tick in ns"),
-}
 
 
 def problems_of(profile: Profile) -> list[str]:
     """Every problem of a profile, each as ``key path: what is wrong; what is allowed``."""
-    problems = [*_walk(profile, ""), *_whole(profile)]
+    problems = [*out_of_range(profile, ""), *_whole(profile)]
     for which in Joint:
         problems += _joint_problems(which, joint(profile, which))
     problems += _duplicates(profile)
     problems += _grapple_problems(profile)
+    for name, camera in profile.cameras.items():
+        problems += _camera_problems(name, camera, profile.carrier is not None)
+    if profile.carrier is not None:
+        problems += _carrier_problems(profile, profile.carrier)
     return problems or list(_reach_problems(profile))
-
-
-def _walk(struct: msgspec.Struct, path: str) -> Iterator[str]:
-    """The table of bounds over a whole profile."""
-    bounds = _BOUNDS.get(type(struct), {})
-    for name in struct.__struct_fields__:
-        value: Any = getattr(struct, name)
-        where = f"{path}{name}"
-        if isinstance(value, msgspec.Struct):
-            yield from _walk(value, f"{where}.")
-        elif isinstance(value, dict):
-            for key, item in value.items():
-                yield from _walk(item, f"{where}.{key}.")
-        elif name in bounds:
-            yield from _bounded_all(where, value, bounds[name])
-
-
-def _bounded_all(path: str, value: Any, bounds: _Bounds) -> Iterator[str]:
-    if isinstance(value, tuple):
-        for i, item in enumerate(value):
-            yield from _bounded(f"{path}[{i}]", item, bounds)
-    else:
-        yield from _bounded(path, value, bounds)
-
-
-def _bounded(path: str, value: float, bounds: _Bounds) -> Iterator[str]:
-    low, high, unit = bounds
-    if low <= value <= high:
-        return
-    factor, slip = _SLIPS.get(unit, (0.0, ""))
-    hint = f"; was it given in {slip}?" if factor and low <= value * factor <= high else ""
-    unit = f" {unit}" if unit else ""
-    yield f"{path}: {value:.6g}{unit} is outside {low:.6g}..{high:.6g}{unit}{hint}"
 
 
 def _whole(profile: Profile) -> Iterator[str]:
@@ -182,74 +87,88 @@ def _joint_problems(which: Joint, spec: JointSpec) -> Iterator[str]:
     if spec.kind != kind:
         yield f'{path}.kind: "{spec.kind}" cannot be; this joint is {kind}'
         return
-    unit, reach, fastest = ("m", (-1.0, 20.0, "m"), 2.0) if kind == "prismatic" else ("rad", _ANGLE, 3.5)
-    speed: _Bounds = (0.005, fastest, f"{unit}/s")
-    yield from _bounded(f"{path}.lower", spec.lower, reach)
-    yield from _bounded(f"{path}.upper", spec.upper, reach)
+    unit, reach, fastest = ("m", (-1.0, 20.0, "m"), 2.0) if kind == "prismatic" else ("rad", ANGLE, 3.5)
+    speed: Bounds = (0.005, fastest, f"{unit}/s")
+    yield from bounded(f"{path}.lower", spec.lower, reach)
+    yield from bounded(f"{path}.upper", spec.upper, reach)
     if spec.lower >= spec.upper:
         yield f"{path}.lower: {spec.lower} {unit} is not below upper = {spec.upper} {unit}"
-    yield from _bounded(f"{path}.speed_limit", spec.speed_limit, speed)
-    yield from _bounded(f"{path}.acceleration_limit", spec.acceleration_limit, (0.01, 20.0, f"{unit}/s^2"))
-    yield from _bounded(f"{path}.law.stop_band", spec.law.stop_band, (1e-5, 0.05, unit))
+    yield from bounded(f"{path}.speed_limit", spec.speed_limit, speed)
+    yield from bounded(f"{path}.acceleration_limit", spec.acceleration_limit, (0.01, 20.0, f"{unit}/s^2"))
+    yield from bounded(f"{path}.law.stop_band", spec.law.stop_band, (1e-5, 0.05, unit))
     yield from _valve_problems(path, spec, speed)
     if spec.encoder is not None:
-        yield from _encoder_problems(path, spec, spec.encoder, unit)
+        messages = tuple(_ENCODER_MESSAGES)
+        yield from _encoder_problems(f"{path}.encoder", kind, (spec.lower, spec.upper), spec.encoder, unit, messages)
 
 
-def _valve_problems(path: str, spec: JointSpec, speed: _Bounds) -> Iterator[str]:
+def _valve_problems(path: str, spec: JointSpec, speed: Bounds) -> Iterator[str]:
     valve, law = spec.valve, spec.law
     if valve.signal not in _VALVE_SIGNALS:
         allowed = ", ".join(_VALVE_SIGNALS)
         yield f'{path}.valve.signal: "{valve.signal}" is no valve command; use one of {allowed}'
+    yield from _side_problems(f"{path}.valve", valve, "speed_limit", spec.speed_limit, speed)
+    yield from _gain_problems(f"{path}.law.kp_1_s", law.kp_1_s, valve.delay_s)
+
+
+def _side_problems(path: str, valve: Valve | CarrierValve, key: str, limit: float, speed: Bounds) -> Iterator[str]:
+    """Dead-band and full speed of both sides of a valve whose function is asked for ``limit`` (its ``key``)."""
     for side in ("plus", "minus"):
         deadband = getattr(valve, f"deadband_{side}_pct")
         if not 0.0 <= deadband < DEADBAND_BOUND_PCT:
             yield (
-                f"{path}.valve.deadband_{side}_pct: {deadband} % is outside the range from 0 to below "
+                f"{path}.deadband_{side}_pct: {deadband} % is outside the range from 0 to below "
                 f"{DEADBAND_BOUND_PCT:.0f} %"
             )
-        key, full = f"{path}.valve.full_speed_{side}", getattr(valve, f"full_speed_{side}")
-        yield from _bounded(key, full, speed)
-        if spec.speed_limit > full:
-            yield f"{key}: {full} {speed[2]} is less than speed_limit = {spec.speed_limit}; it cannot follow"
-    gain_delay = law.kp_1_s * valve.delay_s
-    if gain_delay > KP_DELAY_BOUND:
+        where, full = f"{path}.full_speed_{side}", getattr(valve, f"full_speed_{side}")
+        yield from bounded(where, full, speed)
+        if limit > full:
+            yield f"{where}: {full} {speed[2]} is less than {key} = {limit}; it cannot follow"
+
+
+def _gain_problems(path: str, gain_1_s: float, delay_s: float) -> Iterator[str]:
+    if gain_1_s * delay_s > KP_DELAY_BOUND:
         yield (
-            f"{path}.law.kp_1_s: {law.kp_1_s} 1/s with delay_s = {valve.delay_s} oscillates "
-            f"(gain times delay {gain_delay:.2f}); at most {KP_DELAY_BOUND / valve.delay_s:.2f} 1/s"
+            f"{path}: {gain_1_s} 1/s with delay_s = {delay_s} oscillates "
+            f"(gain times delay {gain_1_s * delay_s:.2f}); at most {KP_DELAY_BOUND / delay_s:.2f} 1/s"
         )
 
 
-def _encoder_problems(path: str, spec: JointSpec, encoder: Encoder, unit: str) -> Iterator[str]:
-    path += ".encoder"
-    kind = "linear" if spec.kind == "prismatic" else "rotary"
-    sent = _ENCODER_MESSAGES.get(encoder.message)
-    if sent is None:
-        allowed = ", ".join(_ENCODER_MESSAGES)
-        yield f'{path}.message: "{encoder.message}" is no encoder message; use one of {allowed}'
+def _encoder_problems(
+    path: str,
+    joint_kind: str,
+    limits: tuple[float, float],
+    encoder: Encoder,
+    unit: str,
+    messages: tuple[str, ...],
+) -> Iterator[str]:
+    kind = "linear" if joint_kind == "prismatic" else "rotary"
+    sent = _ENCODER_MESSAGES.get(encoder.message, "rotary")
+    if encoder.message not in messages:
+        yield f'{path}.message: "{encoder.message}" is no encoder message; use one of {", ".join(messages)}'
     elif sent != encoder.kind:
         yield f'{path}.message: "{encoder.message}" carries a {sent} position but kind is "{encoder.kind}"'
     if encoder.kind != kind:
-        yield f'{path}.kind: "{encoder.kind}" on a {spec.kind} joint; it needs a {kind} encoder'
+        yield f'{path}.kind: "{encoder.kind}" on a {joint_kind} joint; it needs a {kind} encoder'
     if encoder.device_type & 0xFFFF != 0x0196:
         yield (
             f"{path}.device_type: {encoder.device_type:#010x} is no CiA 406 encoder; "
             "the low half of object 1000h must be 0x0196"
         )
-    yield from _bounded(f"{path}.noise", encoder.noise, (0.0, 0.05, unit))
+    yield from bounded(f"{path}.noise", encoder.noise, (0.0, 0.05, unit))
     if encoder.kind == "rotary":
         if not 0 <= encoder.zero_counts < encoder.total_counts:
             yield f"{path}.zero_counts: {encoder.zero_counts} is outside 0..{encoder.total_counts - 1}"
         half = 0.5 * encoder.total_counts * encoder.unit_per_count
-        if half <= max(abs(spec.lower), abs(spec.upper)) <= TURN_RAD:
+        if half <= max(map(abs, limits)) <= TURN_RAD:
             yield (
                 f"{path}.total_counts: {encoder.total_counts} counts of {encoder.unit_per_count:.6g} rad "
-                f"wrap at +-{half:.4g} rad, inside the joint's limits {spec.lower}..{spec.upper} rad"
+                f"wrap at +-{half:.4g} rad, inside the joint's limits {limits[0]}..{limits[1]} rad"
             )
-    elif encoder.total_counts * encoder.unit_per_count < spec.upper - spec.lower:
+    elif encoder.total_counts * encoder.unit_per_count < limits[1] - limits[0]:
         yield (
             f"{path}.total_counts: {encoder.total_counts} counts of {encoder.unit_per_count:.6g} m are "
-            f"shorter than the joint's range {spec.lower}..{spec.upper} m"
+            f"shorter than the joint's range {limits[0]}..{limits[1]} m"
         )
 
 
@@ -266,6 +185,13 @@ def _duplicates(profile: Profile) -> Iterator[str]:
                 yield (
                     f"joints.{name}.{key}: {value} is already used by joints.{other}.{key}; each joint needs its own"
                 )
+    node = None if profile.carrier is None else profile.carrier.articulation_encoder.node
+    if ("encoder.node", node) in seen:
+        other = seen["encoder.node", node]
+        yield (
+            f"carrier.articulation_encoder.node: {node} is already used by joints.{other}.encoder.node; "
+            "each encoder needs its own"
+        )
 
 
 def _grapple_problems(profile: Profile) -> Iterator[str]:
@@ -281,6 +207,79 @@ def _grapple_problems(profile: Profile) -> Iterator[str]:
         yield "grapple.tongs.angle_rad: must rise from row to row"
     if any(a <= b for a, b in pairwise(tongs.half_gap_m)):
         yield "grapple.tongs.half_gap_m: must fall from row to row (angle 0 is fully open)"
+
+
+def _camera_problems(name: str, camera: Camera, drives: bool) -> Iterator[str]:
+    path = f"cameras.{name}"
+    if not _NAME.fullmatch(name):
+        yield f'{path}: "{name}" is not a plain name; use a to z, 0 to 9 and _, a letter first'
+    if not camera.model.strip():
+        yield f"{path}.model: is empty; write the maker's name of the camera"
+    links = (*_CRANE_LINKS, *(_CARRIER_LINKS if drives else ()))
+    if camera.link not in links:
+        yield f'{path}.link: "{camera.link}" is no link of this machine; use one of {", ".join(links)}'
+    for key, value, size in (("cx_px", camera.cx_px, camera.width_px), ("cy_px", camera.cy_px, camera.height_px)):
+        if not 0.0 <= value <= size:
+            yield f"{path}.{key}: {value:.6g} px is outside the picture, 0..{size} px"
+    if camera.depth_min_m >= camera.depth_max_m:
+        yield f"{path}.depth_min_m: {camera.depth_min_m} m is not below depth_max_m = {camera.depth_max_m} m"
+
+
+def _carrier_problems(profile: Profile, carrier: Carrier) -> Iterator[str]:
+    path = "carrier"
+    if profile.machine_bus is None:
+        yield "machine_bus: missing; a machine with a carrier drives over its machine bus"
+    rate = carrier.articulation_rate_limit_rad_s
+    speed: Bounds = (0.005, 3.5, "rad/s")
+    yield from _side_problems(f"{path}.steer_valve", carrier.steer_valve, "articulation_rate_limit_rad_s", rate, speed)
+    lift: Bounds = (0.005, 2.0, "m/s")
+    rate = carrier.arm_rate_limit_m_s
+    yield from _side_problems(f"{path}.arm_valve", carrier.arm_valve, "arm_rate_limit_m_s", rate, lift)
+    yield from _gain_problems(f"{path}.arm_kp_1_s", carrier.arm_kp_1_s, carrier.arm_valve.delay_s)
+    limit = carrier.articulation_limit_rad
+    steer = carrier.articulation_encoder
+    where = f"{path}.articulation_encoder"
+    yield from _encoder_problems(where, "revolute", (-limit, limit), steer, "rad", (_STEERING_MESSAGE,))
+    if carrier.cruise_speed_m_s > carrier.speed_limit_m_s:
+        yield (
+            f"{path}.cruise_speed_m_s: {carrier.cruise_speed_m_s} m/s is above "
+            f"speed_limit_m_s = {carrier.speed_limit_m_s} m/s"
+        )
+    apart = dist(carrier.antenna_main_m, carrier.antenna_aux_m)
+    if not apart >= ANTENNAS_APART_M:
+        yield (
+            f"{path}.antenna_aux_m: {apart:.2f} m from antenna_main_m gives no heading; "
+            f"at least {ANTENNAS_APART_M} m apart"
+        )
+    yield from _suspension_problems(path, carrier)
+
+
+def _suspension_problems(path: str, carrier: Carrier) -> Iterator[str]:
+    """Swing arms and the turning circle as geometry."""
+    low, high = carrier.arm_drop_low_m, carrier.arm_drop_low_m + carrier.arm_travel_m
+    most = ARM_STEEPEST * carrier.arm_length_m
+    if max(abs(low), abs(high)) > most:
+        yield (
+            f"{path}.arm_travel_m: the hub would stand {low:.2f}..{high:.2f} m below its pivot; an arm of "
+            f"{carrier.arm_length_m:.2f} m reaches {-most:.2f}..{most:.2f} m"
+        )
+        return
+    if carrier.arm_transport_m > carrier.arm_travel_m:
+        yield (
+            f"{path}.arm_transport_m: {carrier.arm_transport_m} m is above the travel of "
+            f"arm_travel_m = {carrier.arm_travel_m} m"
+        )
+    if carrier.wheel_width_m >= carrier.track_width_m:
+        yield (
+            f"{path}.wheel_width_m: wheels {carrier.wheel_width_m} m wide overlap at "
+            f"track_width_m = {carrier.track_width_m} m"
+        )
+    gap = wheel_gap_m(carrier, carrier.articulation_limit_rad)
+    if not gap > 0.0:
+        yield (
+            f"{path}.articulation_limit_rad: at {carrier.articulation_limit_rad} rad the inner wheels overlap by "
+            f"{-gap:.2f} m; bend less or set the axles farther apart"
+        )
 
 
 def _reach_problems(profile: Profile) -> Iterator[str]:

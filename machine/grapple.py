@@ -1,12 +1,11 @@
 """Geometry of the hanging grapple: yaw, rotator and tongs.
 
-Angles in the base frame, rad, counter-clockwise seen from above.  The grapple hangs straight down; its
-carrier frame is the base frame turned by ``slew + rot`` about z, and the tongs open along the carrier's x
-axis (pivots at x = -0.275 and +0.275 m on ``palms_471``).  So at slew 0 and rot 0 the tips part along base x,
-across the reach direction +y, and a log held then lies along y.  The **grapple yaw** is the direction of that
-opening axis; a log whose axis points to ``psi`` is gripped with yaw ``psi + pi/2``.  Log and grapple are
-symmetric, so a yaw counts modulo pi.  Tong angle 0 is fully open, the last value of the profile's table is
-closed without a load.
+Angles in the base frame, rad, counter-clockwise seen from above.  The grapple hangs straight down; with the
+rotator at 0 its tongs open across the reach: along base x on ``palms_471``, whose reach is +y at slew 0, so a log
+held then lies along y.  The carrier's x axis is that opening axis and turns with ``slew + rot``.  The **grapple yaw**
+is the direction of the opening axis; a log whose axis points to ``psi`` is gripped with yaw ``psi + pi/2``.  Log and
+grapple are symmetric, so a yaw counts modulo pi.  Tong angle 0 is fully open, the last value of the profile's table
+is closed without a load.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from machine.kinematics import Unreachable
 from machine.profile import Kinematics, Profile, TongTable, joint
 
 
-def grapple_yaw(q: Sequence[float]) -> float:
+def grapple_yaw(profile: Profile, q: Sequence[float]) -> float:
     """Direction of the opening axis, rad, not wrapped; ``q`` is indexed by ``Joint``."""
-    return q[Joint.SLEW] + q[Joint.ROT]
+    return q[Joint.SLEW] + q[Joint.ROT] + _across(profile.kinematics)
 
 
 def rotator_for_yaw(profile: Profile, slew: float, yaw: float, near: float = 0.0) -> float:
@@ -31,14 +30,20 @@ def rotator_for_yaw(profile: Profile, slew: float, yaw: float, near: float = 0.0
     Raises ``Unreachable`` when the rotator turns less than pi and none fits.
     """
     spec = joint(profile, Joint.ROT)
-    first, last = ceil((spec.lower - (yaw - slew)) / pi), floor((spec.upper - (yaw - slew)) / pi)
-    fitting = [yaw - slew + k * pi for k in range(first, last + 1)]
+    turn = yaw - slew - _across(profile.kinematics)
+    first, last = ceil((spec.lower - turn) / pi), floor((spec.upper - turn) / pi)
+    fitting = [turn + k * pi for k in range(first, last + 1)]
     if not fitting:
         raise Unreachable(
             f"grapple yaw {degrees(yaw):.1f} deg at slew {degrees(slew):.1f} deg is out of reach: "
             f"the rotator turns only {degrees(spec.lower):.1f}..{degrees(spec.upper):.1f} deg"
         )
     return min(fitting, key=lambda angle: abs(angle - near))
+
+
+def _across(kin: Kinematics) -> float:
+    """Direction across the reach at slew 0, rad."""
+    return kin.theta1_offset_rad - pi / 2
 
 
 def pin_to_tong_pivot_m(kin: Kinematics) -> float:

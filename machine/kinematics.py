@@ -2,9 +2,10 @@
 
 Input is a joint vector ``q`` indexed by ``Joint`` (slew, lift, tilt in rad, extension in m; a fifth element,
 the rotator, is ignored) and the profile's ``Kinematics``.  Output is in the base frame: origin above the
-ground, z up, reach direction +y at slew 0, so x = -r sin(slew), y = r cos(slew); boom and stick angles are
-positive upward, the stick angle is relative to the boom.  The chain is the standard Denavit-Hartenberg one
-(RRRP) with twists +pi/2, 0, +pi/2, 0.  Encoder kinematics: structural sag is not in it.
+ground, z up, x = r cos(theta), y = r sin(theta) with theta = slew + theta1 offset, so slew 0 reaches +y on
+``palms_471`` and +x on ``aoro_fc8``; boom and stick angles are positive upward, the stick angle is relative to the
+boom.  The chain is the standard Denavit-Hartenberg one (RRRP) with twists +pi/2, 0, +pi/2, 0.  Encoder kinematics:
+structural sag is not in it.
 
 The crane always works in one vertical plane through the slew axis, so everything is done in (r, z) of that
 plane. Plain floats only: this runs in the control tick and in planning.  Failure: ``Unreachable``, which says

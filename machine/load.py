@@ -24,7 +24,7 @@ __all__ = ["ProfileError", "joint", "load_profile", "profile_hash", "shipped_pro
 _FOLDER: Final = Path(__file__).parent
 _UNIT_SUFFIXES: Final = (
     "_rad_s2", "_rad_s", "_deg_s2", "_deg_s", "_m_s2", "_m_s", "_mm_s", "_1_s", "_degrees", "_deg", "_rad",
-    "_mm", "_cm", "_ms", "_ns", "_us", "_hz", "_bar", "_mpa", "_pa", "_pct", "_percent", "_m", "_s",
+    "_mm", "_cm", "_ms", "_ns", "_us", "_hz", "_bar", "_mpa", "_pa", "_pct", "_percent", "_px", "_m", "_s",
 )  # fmt: skip
 _JOINT_NAMES: Final = tuple(j.name.lower() for j in JOINTS)
 
@@ -92,9 +92,9 @@ def _did_you_mean(word: str, known: tuple[str, ...]) -> str:
 def _build(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
     """``value`` converted to ``kind``; every mismatch is added to ``problems`` with its full key path."""
     if get_origin(kind) is types.UnionType:  # T | None, where an absent key means None
-        kind = get_args(kind)[0]
-    if kind == dict[str, JointSpec]:
-        return _build_joints(value, path, problems)
+        kind = next(k for k in get_args(kind) if k is not types.NoneType)
+    if get_origin(kind) is dict:
+        return _build_table(get_args(kind)[1], value, path, problems)
     if get_origin(kind) is Literal:
         # A bool equals 1 but is no sign.
         if value not in get_args(kind) or isinstance(value, bool):
@@ -119,27 +119,33 @@ def _build_struct(kind: type[msgspec.Struct], value: Any, path: str, problems: l
     dot = f"{path}." if path else ""
     fields = msgspec.structs.fields(kind)
     names = tuple(field.name for field in fields)
-    missing = [f.name for f in fields if f.name not in value and type(None) not in get_args(f.type)]
+    absent = [f for f in fields if f.name not in value]
+    missing = [f.name for f in absent if f.required and types.NoneType not in get_args(f.type)]
     for key in value:
         if key not in names:
             problems.append(f"{dot}{key}: {_unknown_key(key, names)}")
     stems = {_stem(key) for key in value if key not in names}
     problems += [f"{dot}{name}: missing" for name in missing if _stem(name) not in stems]
-    parts = {f.name: _build(f.type, value[f.name], dot + f.name, problems) if f.name in value else None for f in fields}
+    parts = {f.name: _build(f.type, value[f.name], dot + f.name, problems) for f in fields if f.name in value}
+    parts |= {f.name: None for f in absent if f.required}
     return kind(**parts) if len(problems) == found else None
 
 
-def _build_joints(value: Any, path: str, problems: list[str]) -> dict[str, JointSpec]:
+def _build_table(kind: Any, value: Any, path: str, problems: list[str]) -> dict[str, Any]:
+    """A table of named things, in the order of the file; the joints are a fixed set in chain order."""
+    thing = path.removesuffix("s")
     if not isinstance(value, dict):
-        problems.append(f"{path}: must be a table of joints, found {value!r}")
+        problems.append(f"{path}: must be a table of {path}, found {value!r}")
         return {}
-    for name in value:
-        if name not in _JOINT_NAMES:
-            hint = _did_you_mean(name, _JOINT_NAMES) or f"; the joints are {', '.join(_JOINT_NAMES)}"
-            problems.append(f"{path}.{name}: unknown joint{hint}")
-    present = [name for name in _JOINT_NAMES if name in value]
-    problems += [f"{path}.{name}: missing joint" for name in _JOINT_NAMES if name not in value]
-    return {name: _build(JointSpec, value[name], f"{path}.{name}", problems) for name in present}
+    names = tuple(value)
+    if kind is JointSpec:
+        for name in value:
+            if name not in _JOINT_NAMES:
+                hint = _did_you_mean(name, _JOINT_NAMES) or f"; the joints are {', '.join(_JOINT_NAMES)}"
+                problems.append(f"{path}.{name}: unknown {thing}{hint}")
+        problems += [f"{path}.{name}: missing {thing}" for name in _JOINT_NAMES if name not in value]
+        names = tuple(name for name in _JOINT_NAMES if name in value)
+    return {name: _build(kind, value[name], f"{path}.{name}", problems) for name in names}
 
 
 def _stem(key: str) -> str:

@@ -95,11 +95,12 @@ class TongTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Grapple(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The grapple: geometry, open-loop times and the pressures that say closed."""
+    """The grapple: geometry, open-loop times, the pressure that says closed, and whether its opening is measured."""
 
     close_time_s: float
     open_time_s: float
     hold_pressure_bar: float
+    opening_sensor: bool
     tongs: TongTable
 
 
@@ -122,6 +123,81 @@ class Workspace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pick_half_size_m: float
 
 
+class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A stereo camera as mounted and calibrated (machines.md 8): pinhole optics and depth range.
+
+    ``position_m`` and ``rpy_rad`` (about the fixed axes x, then y, then z) place its body frame, x forward, y left,
+    z up, in the frame of ``link``; a positive pitch looks down.  Its optical frame is x right, y down, z forward.
+    ``fx_px`` .. ``cy_px`` are of the rectified left picture of ``width_px`` by ``height_px``.
+    """
+
+    model: str
+    link: str
+    position_m: tuple[float, float, float]
+    rpy_rad: tuple[float, float, float]
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    baseline_m: float
+    rate_hz: float
+    depth_min_m: float
+    depth_max_m: float
+
+
+class CarrierValve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A valve that the carrier's own nodes drive: dead-band on either side [%], speed at full command [unit/s],
+    delay [s].
+    """
+
+    deadband_plus_pct: float
+    deadband_minus_pct: float
+    full_speed_plus: float
+    full_speed_minus: float
+    delay_s: float
+
+
+class Carrier(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An articulated four-wheel carrier on swing arms (machines.md 7); ``machine.carrier`` has its geometry.
+
+    Frames ``rear`` and ``front`` share the articulation axis: origin on it, x forward, y left, z up, z = 0 at the
+    pivots of the swing arms.  ``front_axle_m`` and ``rear_axle_m`` are their distances from the axis at the
+    transport height.  A height counts how far the frame stands above its lowest position; ``arm_drop_low_m`` is
+    the wheel hub below its pivot there (negative: above it).  Steering speeds are in rad/s, + bends left; swing-arm
+    speeds in m/s of height, + lifts the frame.
+    """
+
+    front_axle_m: float
+    rear_axle_m: float
+    track_width_m: float
+    wheel_radius_m: float
+    wheel_width_m: float
+    arm_length_m: float
+    arm_drop_low_m: float
+    arm_travel_m: float
+    arm_transport_m: float
+    arm_kp_1_s: float
+    arm_rate_limit_m_s: float
+    arm_in_band_m: float
+    articulation_limit_rad: float
+    articulation_rate_limit_rad_s: float
+    articulation_lag_s: float
+    articulation_encoder: Encoder
+    heading_kp_1_s: float
+    cruise_speed_m_s: float
+    speed_limit_m_s: float
+    crane_base_m: tuple[float, float, float]
+    crane_yaw_rad: float
+    antenna_main_m: tuple[float, float, float]
+    antenna_aux_m: tuple[float, float, float]
+    site_lat_deg: float
+    site_lon_deg: float
+    steer_valve: CarrierValve
+    arm_valve: CarrierValve
+
+
 class Timeouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Reaction times of the supervisor in ms; frame timeouts come from the DBC."""
 
@@ -130,7 +206,7 @@ class Timeouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A whole machine."""
+    """A whole machine; ``carrier`` is None when it stands still, ``cameras`` may be empty."""
 
     schema: Literal[1]
     name: str
@@ -144,6 +220,8 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bunk: Bunk
     workspace: Workspace
     timeouts: Timeouts
+    carrier: Carrier | None
+    cameras: dict[str, Camera] = {}
 
 
 def joint(profile: Profile, which: Joint) -> JointSpec:

@@ -142,7 +142,7 @@ class StandIn:
             dx, dy = x - log.center_m[0], y - log.center_m[1]
             along = dx * log.axis[0] + dy * log.axis[1]
             across = dx * log.axis[1] - dy * log.axis[0]
-            yaw = atan2(log.axis[1], log.axis[0]) + pi / 2 - grapple_yaw(self.q)
+            yaw = atan2(log.axis[1], log.axis[0]) + pi / 2 - grapple_yaw(self.profile, self.q)
             under = tip_z < log.center_m[2]
             if abs(along) < 0.35 and abs(across) < 0.05 and abs(remainder(yaw, pi)) < 0.1 and under:
                 if self.slippery > 0:
@@ -150,13 +150,13 @@ class StandIn:
                 else:
                     self.held, self._along = log.id, along
                     self._hangs_m = z - tip_z - log.diameter_m / 2  # its underside at the tips
-                    self._psi = atan2(log.axis[1], log.axis[0]) - grapple_yaw(self.q)
+                    self._psi = atan2(log.axis[1], log.axis[0]) - grapple_yaw(self.profile, self.q)
 
     def _carry(self) -> None:
         if self.held is None:
             return
         x, y, z = pin_position(self.profile.kinematics, self.q)
-        psi = self._psi + grapple_yaw(self.q)
+        psi = self._psi + grapple_yaw(self.profile, self.q)
         at = (x - self._along * cos(psi), y - self._along * sin(psi), z - self._hangs_m)
         self._move(self.held, at, (cos(psi), sin(psi), 0.0))
 
@@ -195,7 +195,7 @@ def log_ends(log: LogObservation) -> list[tuple[float, ...]]:
 def tips(profile: Profile, moment: Moment) -> list[tuple[float, float, float]]:
     """The two tong tips of the hanging grapple, base frame."""
     gap = half_gap_m(profile.grapple.tongs, moment.tong_rad)
-    yaw = grapple_yaw(moment.q)
+    yaw = grapple_yaw(profile, moment.q)
     x, y, z = moment.pin
     z -= tip_below_pin_m(profile.grapple.tongs, moment.tong_rad)
     return [(x + s * gap * cos(yaw), y + s * gap * sin(yaw), z) for s in (-1, 1)]

@@ -80,6 +80,7 @@ MACHINE_IDS = {
     "ArmHeightA": 0x0CFF2030, "ArmHeightB": 0x0CFF2130, "VehStat": 0x0CFF2203, "VehCmd": 0x0CFF2327,
     "ArmCmdA": 0x0CFF2827, "ArmCmdB": 0x0CFF2927, "CtrlAlive": 0x18FF2F27, "EEC1": 0x0CF00400,
     "CCVS": 0x18FEF100, "DM1": 0x18FECA00, "AddressClaim": 0x18EEFF27,
+    "Request": 0x18EAFF27,
 }  # fmt: skip
 
 
@@ -105,9 +106,34 @@ def test_heartbeats_of_all_thirteen_nodes() -> None:
 
 def test_machine_catalogue() -> None:
     assert {m.name: m.key for m in MACHINE.messages.values()} == {n: i | EXTENDED for n, i in MACHINE_IDS.items()}
-    own = [m for m in MACHINE.messages.values() if m.name not in ("EEC1", "CCVS", "DM1", "AddressClaim")]
+    own = [m for m in MACHINE.messages.values() if m.name not in ("EEC1", "CCVS", "DM1", "AddressClaim", "Request")]
     assert all(m.data_ids and not m.by_pgn and m.signals[0].name == "Crc" for m in own)
     assert MACHINE.messages["EEC1"].by_pgn and GNSS.messages["VesselHeading"].by_pgn
+
+
+def test_swing_arms_are_commanded_as_spools_and_reported_as_heights() -> None:
+    arms = [f"Arm{n}" for n in range(1, 5)]
+    header = ["Crc", "Counter"]
+    layouts = {
+        "ArmCmdA": [*header, "ArmKey", *arms],
+        "ArmCmdB": [*header, "ArmKey", "FloatFront", "FloatRear"],
+        "ArmHeightA": [*header, "State", *arms],
+        "ArmHeightB": [*header, "State", "FloatFront", "FloatRear", "Roll", "Pitch"],
+    }
+    for name, signals in layouts.items():
+        assert [s.name for s in MACHINE.messages[name].signals] == signals
+        assert MACHINE.messages[name].cycle_time_ns == 20_000_000 and MACHINE.messages[name].timeout_ns == 100_000_000
+    spool, height = MACHINE.messages["ArmCmdA"].signals[3], MACHINE.messages["ArmHeightA"].signals[3]
+    assert (spool.scale, spool.minimum, spool.maximum, spool.unit, spool.policy) == (
+        0.05, -100, 100, "%", codec.Policy.REFUSE,
+    )  # fmt: skip
+    assert (height.scale, height.offset, height.unit, height.policy) == (1, -2048, "mm", codec.Policy.SATURATE)
+    assert MACHINE.messages["ArmCmdB"].signals[3].bits == 2
+
+
+def test_a_request_is_matched_by_pgn_whoever_it_asks() -> None:
+    for identifier in (0x18EAFF27, 0x18EA0355, 0x0CEA30FE):
+        assert MACHINE.find(identifier | EXTENDED) is MACHINE.messages["Request"]
 
 
 def test_physical_units() -> None:

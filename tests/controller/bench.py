@@ -170,7 +170,7 @@ class Bench:
         frames, self.pending = self.pending, []
         for j, spec in enumerate(SPECS):
             encoder = spec.encoder
-            if self.encoders[encoder.node].state == 0x05 and encoder.message not in self.dropped:
+            if encoder and self.encoders[encoder.node].state == 0x05 and encoder.message not in self.dropped:
                 counts = counts_from_position(encoder, self.q[j])
                 values = {"Position": counts}
                 codec = DATABASE.message(encoder.message)

@@ -14,7 +14,7 @@ from can_dbc.setpoint import OperatorAction, OperatorCommand, StateReport, decod
 from controller.__main__ import address, listen, main, parser
 from controller.config import ConfigError, load
 from controller.loop import BUS_GONE_NS, Histogram, Loop
-from controller.realtime import Notifier, sleep_until
+from controller.realtime import sleep_until
 from controller.step import Controller
 from machine.faults import Reason
 
@@ -192,23 +192,6 @@ def test_sleep_until_the_past_returns_and_the_future_is_reached():
     until_ns = time.monotonic_ns() + 3 * MS
     sleep_until(until_ns)
     assert time.monotonic_ns() >= until_ns
-
-
-def test_systemd_is_told_ready_and_alive(tmp_path, monkeypatch):
-    path = str(tmp_path / "notify")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
-        server.bind(path)
-        server.settimeout(2)
-        monkeypatch.setenv("NOTIFY_SOCKET", path)
-        notifier = Notifier()
-        assert server.recv(99) == b"READY=1"
-        notifier.alive(10**9)
-        notifier.alive(10**9 + 50 * MS)
-        notifier.alive(10**9 + 100 * MS)
-        assert [server.recv(99) for _ in range(2)] == [b"WATCHDOG=1"] * 2
-        server.setblocking(False)
-        with pytest.raises(BlockingIOError):
-            server.recv(99)
 
 
 def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):

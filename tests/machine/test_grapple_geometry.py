@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from math import cos, pi, sin
+from math import atan2, cos, pi, sin
 
 import msgspec
 import pytest
@@ -20,7 +20,7 @@ from machine.grapple import (
     tip_below_pin_m,
     tong_angle_from_opening_pct,
 )
-from machine.kinematics import Unreachable
+from machine.kinematics import Unreachable, pin_position
 from machine.load import load_profile
 
 PALMS = load_profile("palms_471")
@@ -37,7 +37,7 @@ def same_axis(a: float, b: float) -> bool:
 def test_rotator_gives_the_yaw_modulo_pi_with_the_least_turn(slew, yaw, near):
     rot = rotator_for_yaw(PALMS, slew, yaw, near)
     assert ROT.lower <= rot <= ROT.upper
-    assert same_axis(grapple_yaw((slew, 0.0, 0.0, 0.0, rot)), yaw)
+    assert same_axis(grapple_yaw(PALMS, (slew, 0.0, 0.0, 0.0, rot)), yaw)
     for other in (rot - pi, rot + pi):
         if ROT.lower <= other <= ROT.upper:
             assert abs(rot - near) <= abs(other - near) + 1e-9
@@ -45,10 +45,20 @@ def test_rotator_gives_the_yaw_modulo_pi_with_the_least_turn(slew, yaw, near):
 
 def test_convention_at_rotator_zero_the_tongs_open_across_the_reach():
     # Reach +y at slew 0; the carrier's x axis is the opening axis.
-    assert grapple_yaw((0.0, 0.4, -1.0, 0.8, 0.0)) == 0.0
+    assert grapple_yaw(PALMS, (0.0, 0.4, -1.0, 0.8, 0.0)) == 0.0
     # A log along y (psi = pi/2) is gripped with yaw psi + pi/2 = pi, the same axis.
     assert rotator_for_yaw(PALMS, 0.0, pi / 2 + pi / 2) == pytest.approx(0.0, abs=1e-12)
     assert rotator_for_yaw(PALMS, 0.5, 0.0) == pytest.approx(-0.5)
+
+
+@pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
+@given(st.floats(-1.7, 1.7))
+def test_at_rotator_zero_the_tongs_open_across_the_reach_of_either_machine(name, slew):
+    profile = load_profile(name)
+    x, y, _ = pin_position(profile.kinematics, (slew, 0.4, -1.0, 0.8, 0.0))
+    assert same_axis(grapple_yaw(profile, (slew, 0.4, -1.0, 0.8, 0.0)), atan2(y, x) + pi / 2)
+    # A log that lies along the reach is gripped with the rotator at 0.
+    assert rotator_for_yaw(profile, slew, atan2(y, x) + pi / 2) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_stiff_rotator_says_so():
@@ -94,6 +104,26 @@ def test_tips_close_monotonically_and_sweep_0_18_m_lower():
 def test_outside_the_table_the_end_values_hold():
     assert half_gap_m(TONGS, -1.0) == 0.733 and half_gap_m(TONGS, 9.0) == -0.368
     assert tip_below_pin_m(TONGS, -1.0) == 1.075 and tip_below_pin_m(TONGS, 9.0) == 0.696
+
+
+def cr250_tip(tong_rad: float) -> tuple[float, float]:
+    """(half gap, depth below the pin): pivot 0.25 m off the middle, tip (0.45, -0.45) m from it when open."""
+    c, s = cos(tong_rad), sin(tong_rad)
+    return 0.25 + 0.45 * (c - s), 0.15 + 0.27 + 0.30 + 0.45 * (c + s)
+
+
+def test_the_table_of_the_cr250_is_one_rigid_tong_that_opens_1_40_m():
+    tongs = load_profile("aoro_fc8").grapple.tongs
+    for angle in tongs.angle_rad:
+        gap, depth = cr250_tip(angle)
+        assert half_gap_m(tongs, angle) == pytest.approx(gap, abs=6e-4)
+        assert tip_below_pin_m(tongs, angle) == pytest.approx(depth, abs=6e-4)
+    for angle in (i * 2.234 / 300 for i in range(301)):
+        gap, depth = cr250_tip(angle)
+        assert half_gap_m(tongs, angle) == pytest.approx(gap, abs=0.02)
+        assert tip_below_pin_m(tongs, angle) == pytest.approx(depth, abs=0.02)
+    assert 2.0 * half_gap_m(tongs, 0.0) == pytest.approx(1.40)
+    assert half_gap_m(tongs, 1.189) == pytest.approx(0.0, abs=1e-3)
 
 
 @given(st.floats(0.0, 100.0))

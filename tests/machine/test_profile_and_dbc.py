@@ -12,9 +12,12 @@ from machine.load import load_profile, shipped_profiles
 def test_every_encoder_and_valve_of_a_profile_is_in_the_dbc(name: str) -> None:
     crane = codec.load("crane")
     commands = {s.name for m in ("ValveCmdA", "ValveCmdB") for s in crane.message(m).signals}
-    for joint in load_profile(name).joints.values():
-        assert joint.valve.signal in commands
-        if joint.encoder is not None:
-            message = crane.message(joint.encoder.message)
-            assert message.key == 0x180 + joint.encoder.node, "TPDO1 of the encoder's node"
-            assert "Position" in message.index
+    profile = load_profile(name)
+    encoders = [joint.encoder for joint in profile.joints.values()]
+    if profile.carrier is not None:
+        encoders.append(profile.carrier.articulation_encoder)
+    assert all(joint.valve.signal in commands for joint in profile.joints.values())
+    for encoder in filter(None, encoders):
+        message = crane.message(encoder.message)
+        assert message.key == 0x180 + encoder.node, "TPDO1 of the encoder's node"
+        assert "Position" in message.index

@@ -16,8 +16,10 @@ from machine.joints import JOINTS, Joint
 from machine.load import ProfileError, load_profile, profile_hash, shipped_profiles
 from machine.profile import Profile, joint, joint_limits
 
-SHIPPED = Path(machine.__file__).parent / "palms_471.toml"
+FOLDER = Path(machine.__file__).parent
+SHIPPED = FOLDER / "palms_471.toml"
 RAW = tomllib.loads(SHIPPED.read_text())
+AORO = tomllib.loads((FOLDER / "aoro_fc8.toml").read_text())
 DELETE = object()
 
 
@@ -30,9 +32,9 @@ def toml(value) -> str:
     return json.dumps(value) if isinstance(value, (str, bool)) else repr(value)
 
 
-def write(folder: Path, changes: dict[str, object]) -> Path:
-    """A copy of the shipped profile with some key paths changed."""
-    raw = copy.deepcopy(RAW)
+def write(folder: Path, changes: dict[str, object], of: dict[str, object] = RAW) -> Path:
+    """A copy of a shipped profile with some key paths changed."""
+    raw = copy.deepcopy(of)
     for path, value in changes.items():
         *parents, key = path.split(".")
         table = raw
@@ -47,8 +49,8 @@ def write(folder: Path, changes: dict[str, object]) -> Path:
     return file
 
 
-def problems(folder: Path, changes: dict[str, object]) -> list[str]:
-    file = write(folder, changes)
+def problems(folder: Path, changes: dict[str, object], of: dict[str, object] = RAW) -> list[str]:
+    file = write(folder, changes, of)
     with pytest.raises(ProfileError) as caught:
         load_profile(file)
     prefix = f"{file}: "
@@ -58,7 +60,7 @@ def problems(folder: Path, changes: dict[str, object]) -> list[str]:
 
 
 def test_shipped_profile_loads_by_name_and_by_path(tmp_path):
-    assert "palms_471" in shipped_profiles()
+    assert shipped_profiles() == ("aoro_fc8", "palms_471")
     by_name = load_profile("palms_471")
     assert by_name == load_profile(SHIPPED) == load_profile(str(SHIPPED))
     assert by_name == load_profile(write(tmp_path, {}))
@@ -71,10 +73,28 @@ def test_access_by_enum():
     assert joint_limits(profile)[Joint.EXT] == (0.13, 1.80)
 
 
-def test_every_value_of_the_shipped_profile_carries_its_mark():
-    for line in SHIPPED.read_text().splitlines():
+@pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
+def test_every_value_of_a_shipped_profile_carries_its_mark(name):
+    for line in (FOLDER / f"{name}.toml").read_text().splitlines():
         if " = " in line and not line.startswith("#"):
-            assert re.search(r"# .*\[(A|FPI|man|derived|mem|est|set)\]", line), line
+            assert re.search(r"# .*\[(A|B|FPI|XT28|man|derived|mem|est|set)\]", line), line
+
+
+def test_the_forwarder_is_blind_in_rotator_and_opening_and_has_a_carrier():
+    profile = load_profile("aoro_fc8")
+    assert [j for j in JOINTS if joint(profile, j).encoder is None] == [Joint.ROT]
+    assert not profile.grapple.opening_sensor and load_profile("palms_471").grapple.opening_sensor
+    assert profile.machine_bus == "mach0"
+    assert profile.carrier is not None and profile.carrier.articulation_encoder.message == "EncArtic"
+    assert profile.carrier.cruise_speed_m_s == pytest.approx(2.3 / 3.6, abs=1e-3)
+    assert set(profile.cameras) == {"front"} and set(load_profile("palms_471").cameras) == {"stick", "d435"}
+
+
+def test_a_machine_may_have_no_carrier_and_no_cameras(tmp_path):
+    profile = load_profile(write(tmp_path, {"cameras": DELETE}))
+    assert profile.cameras == {} and profile.carrier is None
+    standing = load_profile(write(tmp_path, {"carrier": DELETE, "cameras": DELETE, "machine_bus": DELETE}, AORO))
+    assert standing.carrier is None and standing.machine_bus is None
 
 
 def test_hash_is_a_u32_of_the_content_only(tmp_path):
@@ -119,6 +139,12 @@ STRUCTURE = [
     ({"rate_hz": 200.5}, "rate_hz: expected `int`, got `float`"),
     ({"bunk.center_m": [1.0]}, "bunk.center_m: expected `array` of length 2, got 1"),
     ({"bunk.center_m": [1.0, "x"]}, "bunk.center_m[1]: expected `float`, got `str`"),
+    ({"cameras": 3}, "cameras: must be a table of cameras, found 3"),
+    ({"cameras.stick.fx": 530.0, "cameras.stick.fx_px": DELETE},
+     'cameras.stick.fx: wrong unit in the name; write "fx_px"'),
+    ({"cameras.d435.rate_hz": DELETE}, "cameras.d435.rate_hz: missing"),
+    ({"cameras.d435.rpy_rad": [0.0, 1.57]}, "cameras.d435.rpy_rad: expected `array` of length 3, got 2"),
+    ({"carrier": 3}, "carrier: must be a table, found 3"),
     ({"schema": 2}, "schema: 2 is not allowed; use one of 1"),
     ({"joints.slew.valve.sign": 0}, "joints.slew.valve.sign: 0 is not allowed; use one of -1, 1"),
     ({"joints.slew.valve.sign": True}, "joints.slew.valve.sign: True is not allowed; use one of -1, 1"),
@@ -207,6 +233,57 @@ VALUES = [
      "grapple.tongs.half_gap_m: must fall from row to row (angle 0 is fully open)"),
     ({"workspace.pick_center_m": [0.0, 8.0]},
      "workspace.pick_center_m: 8.00 m from the slew axis; the crane reaches 6.95 m"),
+    ({"cameras.stick.link": "front"},
+     'cameras.stick.link: "front" is no link of this machine; use one of base, mast, boom, stick, telescope'),
+    ({"cameras.stick.model": " "}, "cameras.stick.model: is empty; write the maker's name of the camera"),
+    ({"cameras.stick.rpy_rad": [0.0, 11.5, 0.0]},
+     "cameras.stick.rpy_rad[1]: 11.5 rad is outside -6.28319..6.28319 rad; was it given in deg?"),
+    ({"cameras.stick.cx_px": 1300.0}, "cameras.stick.cx_px: 1300 px is outside the picture, 0..1280 px"),
+    ({"cameras.stick.cy_px": float("nan")}, "cameras.stick.cy_px: nan px is outside the picture, 0..720 px"),
+    ({"cameras.stick.baseline_m": 120.0},
+     "cameras.stick.baseline_m: 120 m is outside 0.01..2 m; was it given in mm?"),
+    ({"cameras.stick.depth_min_m": 20.0},
+     "cameras.stick.depth_min_m: 20.0 m is not below depth_max_m = 20.0 m"),
+]  # fmt: skip
+
+DRIVING = [
+    ({"machine_bus": DELETE}, "machine_bus: missing; a machine with a carrier drives over its machine bus"),
+    ({"carrier.trak_width_m": 2.1},
+     'carrier.trak_width_m: unknown key; did you mean "track_width_m"?'),
+    ({"carrier.articulation_limit_rad": 35.0},
+     "carrier.articulation_limit_rad: 35 rad is outside 0.05..1.2 rad; was it given in deg?"),
+    ({"carrier.crane_base_m": [-0.4, float("inf"), 0.68]},
+     "carrier.crane_base_m[1]: inf m is outside -5..5 m"),
+    ({"carrier.site_lat_deg": 196.0}, "carrier.site_lat_deg: 196 deg is outside -85..85 deg"),
+    ({"carrier.antenna_aux_m": [0.5, 0.0, 2.0]},
+     "carrier.antenna_aux_m: 0.10 m from antenna_main_m gives no heading; at least 0.3 m apart"),
+    ({"carrier.arm_travel_m": 1.10},
+     "carrier.arm_travel_m: the hub would stand -0.15..0.95 m below its pivot; an arm of 1.00 m reaches "
+     "-0.90..0.90 m"),
+    ({"carrier.arm_transport_m": 0.7},
+     "carrier.arm_transport_m: 0.7 m is above the travel of arm_travel_m = 0.6 m"),
+    ({"carrier.wheel_width_m": 1.4, "carrier.track_width_m": 1.4},
+     "carrier.wheel_width_m: wheels 1.4 m wide overlap at track_width_m = 1.4 m"),
+    ({"carrier.front_axle_m": 0.9, "carrier.rear_axle_m": 0.6},
+     "carrier.articulation_limit_rad: at 0.610865 rad the inner wheels overlap by 0.44 m; "
+     "bend less or set the axles farther apart"),
+    ({"carrier.cruise_speed_m_s": 2.3},
+     "carrier.cruise_speed_m_s: 2.3 m/s is above speed_limit_m_s = 1.0 m/s"),
+    ({"carrier.steer_valve.full_speed_minus": 0.1},
+     "carrier.steer_valve.full_speed_minus: 0.1 rad/s is less than articulation_rate_limit_rad_s = 0.21; "
+     "it cannot follow"),
+    ({"carrier.arm_valve.deadband_plus_pct": 60.0},
+     "carrier.arm_valve.deadband_plus_pct: 60.0 % is outside the range from 0 to below 50 %"),
+    ({"carrier.arm_kp_1_s": 10.0},
+     "carrier.arm_kp_1_s: 10.0 1/s with delay_s = 0.08 oscillates (gain times delay 0.80); at most 6.25 1/s"),
+    ({"carrier.articulation_encoder.message": "EncRot"},
+     'carrier.articulation_encoder.message: "EncRot" is no encoder message; use one of EncArtic'),
+    ({"carrier.articulation_encoder.node": 3},
+     "carrier.articulation_encoder.node: 3 is already used by joints.lift.encoder.node; "
+     "each encoder needs its own"),
+    ({"joints.ext.encoder.message": "EncArtic"},
+     'joints.ext.encoder.message: "EncArtic" is no encoder message; '
+     'use one of EncSlew, EncLift, EncTilt, EncExt, EncRot'),
 ]  # fmt: skip
 
 
@@ -218,6 +295,11 @@ def test_wrong_keys_and_types(tmp_path, changes, sentence):
 @pytest.mark.parametrize(("changes", "sentence"), VALUES, ids=lambda v: "")
 def test_wrong_values(tmp_path, changes, sentence):
     assert problems(tmp_path, changes) == [sentence]
+
+
+@pytest.mark.parametrize(("changes", "sentence"), DRIVING, ids=lambda v: "")
+def test_wrong_carriers(tmp_path, changes, sentence):
+    assert problems(tmp_path, changes, AORO) == [sentence]
 
 
 def test_a_speed_in_degrees_is_named_and_so_is_what_the_valve_gives(tmp_path):

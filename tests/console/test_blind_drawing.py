@@ -1,0 +1,35 @@
+"""The page draws a crane whose rotator has no encoder."""
+
+from __future__ import annotations
+
+import json
+from math import nan
+
+import pytest
+
+from can_dbc.setpoint import StateReport, encode
+from console.state import Watch
+from machine.load import load_profile, profile_hash
+from machine.modes import Mode
+
+FORWARDER, PALMS = load_profile("aoro_fc8"), load_profile("palms_471")
+MEASURED = (0.5, 0.9, -2.0, 0.5, nan)
+
+
+def drawn(profile, told: float) -> dict:
+    watch = Watch(profile)
+    report = StateReport(
+        1, profile_hash(profile), 5_000_000_000, Mode.ACTIVE, 0, 0, 1, 0, 0, 0, MEASURED,
+        (0.0,) * 5, (*MEASURED[:4], told), nan, nan, nan, 0, 0, 0, 0,
+    )  # fmt: skip
+    assert watch.on_report(encode(report), 0)
+    state = watch.state(0)
+    json.dumps(state, allow_nan=False)
+    return state
+
+
+def test_a_rotator_without_encoder_is_drawn_where_it_was_told_to_be():
+    across = drawn(FORWARDER, nan)["tongs"]["yaw_rad"]
+    assert drawn(FORWARDER, 0.3)["tongs"]["yaw_rad"] == pytest.approx(across + 0.3)
+    assert drawn(FORWARDER, 0.3)["position"][4] is None and drawn(FORWARDER, 0.3)["opening_pct"] is None
+    assert drawn(PALMS, 0.3)["points"] is None, "a lost encoder is not guessed"
