@@ -1,22 +1,24 @@
-"""The live plant: ``python -m sim --profile palms_471 --seed 1 --bus crane0=wire:crane0 [--port 4710]``.
+"""The live plant: ``python -m sim --profile aoro_fc8 --bus crane0=wire:crane0 --bus mach0=wire:mach0 [--port 4710]``.
 
-Runs the plant against the monotonic clock with absolute deadlines and looks at the bus at every physics step: a SYNC
+Runs the plant against the monotonic clock with absolute deadlines and looks at its buses at every physics step: a SYNC
 is answered within 2.5 ms with the state at its own stamp.  A host too slow for real time makes the plant's time stand
 still for a moment (no burst); how often is counted and reported at the end.  ``--port`` answers JSON requests over UDP
-on the loopback interface:
-``{"op": "state" | "shapes" | "verdict" | "logs" | "poses" | "press" | "release" | "reset" | "quit"}``.
+on the loopback interface: ``{"op": "state" | "shapes" | "verdict" | "logs" | "poses" | "vehicle" | "press" | "release"
+| "reset" | "scene" | "view" | "quit"}`` and ``{"op": "lever", "name": NAME, "value": "-1".."1"}``.
 
-Exit codes: 0 stopped by SIGTERM, SIGINT or quit; 2 usage; 3 profile; 4 bus.
+Exit codes: 0 stopped by SIGTERM, SIGINT or quit; 2 usage; 3 profile, truth or scene; 4 bus.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import signal
 import socket
 import sys
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -24,7 +26,11 @@ import msgspec
 from can_dbc.bus import Bus, BusError, open_bus
 from can_dbc.frame import Frame
 from machine.load import ProfileError, load_profile
+from machine.profile import Profile
 from sim.plant import Plant
+from sim.scene import KINDS
+from sim.terrain import KINDS as TERRAINS
+from sim.view import scene_of, view_of
 
 TX_QUEUE = 256  # this process plays a dozen nodes
 LAG_NS = 25_000_000
@@ -32,10 +38,10 @@ ANSWER_NS = 20_000_000
 
 
 class LivePlant:
-    """A Plant on the clock and on a bus.  ``stop`` ends ``run``."""
+    """A Plant on the clock and on its buses, by name.  ``stop`` ends ``run``."""
 
-    def __init__(self, plant: Plant, bus: Bus, port: int | None) -> None:
-        self._plant, self._bus = plant, bus
+    def __init__(self, plant: Plant, buses: Mapping[str, Bus], port: int | None) -> None:
+        self._plant, self._buses = plant, dict(buses)
         self._running = True
         self._skipped_ns = self._started_ns = self._stalls = 0
         self._requests = None
@@ -51,7 +57,6 @@ class LivePlant:
     def run(self) -> None:
         """Until stopped."""
         frames: list[Frame] = []
-        name = self._plant.profile.crane_bus
         self._started_ns = time.monotonic_ns()
         answer_ns = 0
         while self._running:
@@ -61,11 +66,13 @@ class LivePlant:
                 self._skipped_ns += behind_ns
                 self._stalls += 1
                 now_ns -= behind_ns
-            frames.clear()
-            self._bus.drain(frames)
-            received = [(name, f._replace(stamp_ns=f.stamp_ns - self._skipped_ns)) for f in frames]
-            for _, key, data in self._plant.step(now_ns, received):
-                self._bus.send(key, data)
+            received = []
+            for name, bus in self._buses.items():
+                frames.clear()
+                bus.drain(frames)
+                received += [(name, f._replace(stamp_ns=f.stamp_ns - self._skipped_ns)) for f in frames]
+            for name, key, data in self._plant.step(now_ns, received):
+                self._buses[name].send(key, data)
             if self._requests is not None and now_ns >= answer_ns:
                 self._answer(self._requests)
                 answer_ns = now_ns + ANSWER_NS
@@ -80,7 +87,7 @@ class LivePlant:
             "time_s": elapsed_ns * 1e-9,
             "lost_share": self._skipped_ns / elapsed_ns,
             "stalls": self._stalls,
-            "refused_frames": self._bus.stats.refused,
+            "refused_frames": sum(bus.stats.refused for bus in self._buses.values()),
         }
 
     def _answer(self, requests: socket.socket) -> None:
@@ -91,14 +98,16 @@ class LivePlant:
                 return
             try:
                 request = msgspec.json.decode(datagram, type=dict[str, str])
-                reply = self._reply(request.get("op", ""))
+                reply = self._reply(request)
             except msgspec.DecodeError as error:
                 reply = {"error": f"not a JSON object of strings: {error}"}
+            except ValueError as error:
+                reply = {"error": str(error)}
             requests.sendto(msgspec.json.encode(reply), sender)
 
-    def _reply(self, op: str) -> Any:
+    def _reply(self, request: dict[str, str]) -> Any:
         plant = self._plant
-        match op:
+        match request.get("op", ""):
             case "state":
                 return {
                     "joints": plant.joint_positions(),
@@ -106,6 +115,7 @@ class LivePlant:
                     "tip_m": plant.tip(),
                     "poses": plant.link_poses(),
                     "logs": plant.logs(),
+                    "vehicle": plant.vehicle(),
                     "verdict": plant.judge(),
                     "host": self.report(),
                 }
@@ -117,13 +127,22 @@ class LivePlant:
                 return plant.link_poses()
             case "shapes":
                 return plant.shapes()
+            case "vehicle":
+                return plant.vehicle()
+            case "scene":
+                return scene_of(plant)
+            case "view":
+                return view_of(plant)
+            case "lever":
+                plant.lever(request.get("name", ""), float(request.get("value", "")))
+                return {"ok": True}
             case "press" | "release" | "reset":
-                getattr(plant.estop, op)()
+                getattr(plant.estop, request["op"])()
                 return {"ok": True}
             case "quit":
                 self.stop()
                 return {"ok": True}
-            case _:
+            case op:
                 return {"error": f"unknown op {op!r}"}
 
 
@@ -134,24 +153,40 @@ def _address(text: str) -> tuple[str, str]:
     return name, address
 
 
+def _check_buses(profile: Profile, given: Mapping[str, str]) -> None:
+    """ProfileError unless exactly the machine's buses are given."""
+    wanted = [b for b in (profile.crane_bus, profile.machine_bus) if b]
+    for name in given:
+        if name not in wanted:
+            raise ProfileError(f"{profile.name} has no bus {name}, only {' and '.join(wanted)}; change --bus")
+    for name in wanted:
+        if name not in given:
+            raise ProfileError(f"{profile.name} is on {' and '.join(wanted)}; give --bus {name}=ADDRESS too")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m sim", description="The live plant of a crane on a CAN bus.")
+    parser = argparse.ArgumentParser(prog="python -m sim", description="The live plant of a machine on its CAN buses.")
     parser.add_argument("--profile", default="palms_471", help="shipped profile name or TOML file")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--truth", default="nominal", help="nominal, sampled or a TOML file")
     parser.add_argument("--logs", type=int, default=1)
-    parser.add_argument("--bus", type=_address, required=True, metavar="NAME=ADDRESS")
+    parser.add_argument("--scene", default="random", help=f"how the logs lie: random, {', '.join(KINDS)}")
+    parser.add_argument("--terrain", default="flat", choices=TERRAINS, help="what the machine stands on")
+    parser.add_argument("--bus", type=_address, action="append", required=True, metavar="NAME=ADDRESS")
     parser.add_argument("--port", type=int, help="UDP port on the loopback interface for requests")
     options = parser.parse_args(arguments)
-    name, address = options.bus
+    addresses = dict(options.bus)
     try:
         profile = load_profile(options.profile)
-        if name != profile.crane_bus:
-            raise ProfileError(f"{profile.name} has its crane on {profile.crane_bus}, not on {name}; change --bus")
-        plant = Plant(profile, options.seed, options.truth, options.logs)
-        with open_bus(address, tx_queue=TX_QUEUE, participant="plant") as bus:
-            live = LivePlant(plant, bus, options.port)
+        _check_buses(profile, addresses)
+        plant = Plant(profile, options.seed, options.truth, options.logs, scene=options.scene, terrain=options.terrain)
+        with contextlib.ExitStack() as stack:
+            buses = {
+                name: stack.enter_context(open_bus(address, tx_queue=TX_QUEUE, participant="plant"))
+                for name, address in addresses.items()
+            }
+            live = LivePlant(plant, buses, options.port)
             signal.signal(signal.SIGTERM, live.stop)
             signal.signal(signal.SIGINT, live.stop)
             gc.collect()

@@ -1,25 +1,52 @@
-"""Ground, bunk and logs as bodies of the physics client, and the logs' state for display and judging."""
+"""Logs as bodies of the physics client, and their state for display and judging.
+
+A log is one rigid body of 3 or 5 coaxial cylinders along its bow (plant.md 1: cylinders roll, hulls have flats), with
+the mass, centre of mass and inertia of the tapered, bowed wood.  The scene comes to rest in a physics client of its
+own before the logs appear in the machine's, so nothing disturbs the crane.  A log at rest sleeps: it costs nothing
+and stands still until something touches it, where Bullet's friction alone would let a wedged one creep 1 mm/s.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Final
 
-from machine.profile import Bunk, Profile
-from sim.crane import Quaternion, Shape, Vector
-from sim.physics import BulletClient
-from sim.scene import LogSpec
-from sim.truth import Contact
+import numpy as np
+from numpy.typing import NDArray
 
-STAKE_M = 0.08
-# Stakes along the bunk, in bunk lengths: the grapple opens in the wide middle gap, two stakes still carry a log.
-STAKE_PLACES = (-0.40, -0.14, 0.40)
+from machine.profile import Profile
+from sim.bunk import bunk_boxes, from_bunk
+from sim.log_shape import LogSpec, Mass, log_segments, mass_of, quaternion_of
+from sim.physics import BulletClient, new_client
+from sim.shape import Quaternion, Vector, rpy_quaternion
+from sim.stacking import seen_from_above
+from sim.terrain import Terrain
+from sim.truth import Contact, Truth
+
+Pose = tuple[Vector, Quaternion]
+
+SLEEP: Final = 0.02  # [m/s, rad/s]
+SETTLE_STEP_S: Final = 0.0025
+SETTLE_S: Final = 20.0  # longest time to come to rest
+LOOK_STEPS: Final = 20
+STILL_LOOKS: Final = 8  # 0.4 s
+REST_M_S: Final = 0.004
+REST_RAD_S: Final = 0.02
+# While a scene comes to rest, air as thick as this [1/s, of Bullet's form] takes the energy out of rolling logs.
+SETTLE_DAMPING: Final = (0.3, 0.9)
+INSIDE_M: Final = 0.003  # deepest contact at the start that is not "inside"
+NUDGE_RAD_S: Final = 0.1
+NEIGHBOUR_M: Final = 0.05
+BARK: Final = (0.55, 0.35, 0.18, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class LogState:
-    """One log now: centre, orientation (x, y, z, w), unit vector along it, speed of its fastest point; base frame."""
+    """One log now, world frame: log frame (position of the pith at half length, orientation x, y, z, w), unit vector
+    along it towards the thin end, sizes, speed of its fastest point, both ends of the pith.
+    """
 
     position_m: Vector
     quaternion: Quaternion
@@ -28,93 +55,238 @@ class LogState:
     diameter_m: float
     mass_kg: float
     speed_m_s: float
-
-
-def bunk_shapes(profile: Profile) -> list[Shape]:
-    """Floor and stakes of the bunk, in the base frame."""
-    b = profile.bunk
-    half = b.yaw_rad / 2
-    turn = (0.0, 0.0, math.sin(half), math.cos(half))
-    ground = profile.workspace.ground_z_m
-    boxes = [((b.length_m, b.width_m, b.floor_z_m - ground), (0.0, 0.0, (b.floor_z_m + ground) / 2))]
-    side = b.width_m / 2 + STAKE_M / 2
-    stake = (STAKE_M, STAKE_M, b.stake_height_m)
-    boxes += [
-        (stake, (place * b.length_m, y, b.floor_z_m + b.stake_height_m / 2))
-        for place in STAKE_PLACES
-        for y in (-side, side)
-    ]
-    return [Shape("base", size, from_bunk(b, at), turn, (0.35, 0.37, 0.4)) for size, at in boxes]
-
-
-def from_bunk(b: Bunk, point: Vector) -> Vector:
-    """Point of the bunk's frame (x along it, z as in the base frame) in the base frame."""
-    c, s = math.cos(b.yaw_rad), math.sin(b.yaw_rad)
-    return (b.center_m[0] + c * point[0] - s * point[1], b.center_m[1] + s * point[0] + c * point[1], point[2])
-
-
-def to_bunk(b: Bunk, point: Sequence[float]) -> Vector:
-    """Point of the base frame in the bunk's frame."""
-    c, s = math.cos(b.yaw_rad), math.sin(b.yaw_rad)
-    x, y = point[0] - b.center_m[0], point[1] - b.center_m[1]
-    return (c * x + s * y, c * y - s * x, point[2])
+    taper_m_m: float
+    sweep_m: float
+    ends_m: tuple[Vector, Vector]
 
 
 class Yard:
-    """Ground, bunk and logs.  ``logs`` is a tuple of body ids in scene order."""
+    """The logs.  ``logs`` are body ids in scene order, ``masses`` in kg.
 
-    def __init__(self, client: BulletClient, profile: Profile, contact: Contact, scene: Sequence[LogSpec]) -> None:
-        self._p, self._scene = client, tuple(scene)
-        ground = profile.workspace.ground_z_m
-        box = client.createCollisionShape(client.GEOM_BOX, halfExtents=[15.0, 15.0, 0.5])
-        look = client.createVisualShape(client.GEOM_BOX, halfExtents=[15.0, 15.0, 0.5], rgbaColor=[0.55, 0.6, 0.45, 1])
-        self.ground: int = client.createMultiBody(0.0, box, look, basePosition=[0.0, 0.0, ground - 0.5])
-        client.changeDynamics(self.ground, -1, lateralFriction=contact.ground_friction)
-        self.bunk = tuple(self._fixed_box(s, contact.bunk_friction) for s in bunk_shapes(profile))
-        self.masses: list[float] = []
-        self.logs = tuple(self._log(spec, ground, contact) for spec in self._scene)
+    ``terrain`` is used in the private client alone; ``base`` is the crane's base frame in the world, for the bunk.
+    Raises ValueError when logs start in each other or in the machine, or do not come to rest.
+    """
 
-    def _fixed_box(self, s: Shape, friction: float) -> int:
-        p, half = self._p, [x / 2 for x in s.size_m]
-        shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=half)
-        look = p.createVisualShape(p.GEOM_BOX, halfExtents=half, rgbaColor=[*s.colour, 1])
-        body: int = p.createMultiBody(0.0, shape, look, basePosition=s.position_m, baseOrientation=s.quaternion)
-        p.changeDynamics(body, -1, lateralFriction=friction)
-        return body
-
-    def _log(self, s: LogSpec, ground: float, contact: Contact) -> int:
-        p, r = self._p, s.diameter_m / 2
-        mass = s.density_kg_m3 * math.pi * r * r * s.length_m
-        shape = p.createCollisionShape(p.GEOM_CYLINDER, radius=r, height=s.length_m)
-        look = p.createVisualShape(p.GEOM_CYLINDER, radius=r, length=s.length_m, rgbaColor=[0.55, 0.35, 0.18, 1])
-        turn = p.getQuaternionFromEuler([0.0, math.pi / 2, s.yaw_rad])
-        at = [s.x_m, s.y_m, ground + r]
-        body: int = p.createMultiBody(mass, shape, look, basePosition=at, baseOrientation=turn)
-        across = mass * (3.0 * r * r + s.length_m**2) / 12.0
-        p.changeDynamics(
-            body,
-            -1,
-            localInertiaDiagonal=[across, across, mass * r * r / 2.0],
-            lateralFriction=contact.log_friction,
-            rollingFriction=contact.log_rolling_m,
-            spinningFriction=contact.log_rolling_m,
-            linearDamping=0.0,
-            angularDamping=0.0,
+    def __init__(
+        self,
+        client: BulletClient,
+        profile: Profile,
+        truth: Truth,
+        scene: Sequence[LogSpec],
+        terrain: Terrain,
+        base: Pose,
+    ) -> None:
+        self._p, self.scene = client, tuple(scene)
+        wood = [mass_of(spec) for spec in self.scene]
+        self.masses = [m.mass_kg for m in wood]
+        poses = _settled(profile, truth.contact, self.scene, terrain, base) if self.scene else []
+        self.logs = tuple(
+            _body(client, spec, m, pose, truth.contact) for spec, m, pose in zip(self.scene, wood, poses, strict=True)
         )
-        self.masses.append(mass)
-        return body
+        _check_apart(client, self.logs, "at rest")
+        for state in (client.ACTIVATION_STATE_ENABLE_SLEEPING, client.ACTIVATION_STATE_SLEEP):
+            for body in self.logs:
+                client.changeDynamics(body, -1, activationState=state, sleepThreshold=SLEEP)
+        # Body axes -> log frame: the turn about y, and the log's origin seen from the centre of mass.
+        self._turn = np.array([m.turn_rad for m in wood])
+        self._com = np.array([m.com_m for m in wood]).reshape(-1, 3)
+        self._seen: list[Any] = [None] * len(self.logs)
+        self._last: list[Any] = [None] * len(self.logs)
+        self._size = np.array([(s.length_m, s.diameter_m, s.sweep_m) for s in self.scene]).reshape(-1, 3)
+
+    def wake(self) -> None:
+        """Wake all logs; needed before a pose, a speed or a force is put on one from outside."""
+        for body in self.logs:
+            self._p.changeDynamics(body, -1, activationState=self._p.ACTIVATION_STATE_WAKE_UP)
 
     def states(self) -> list[LogState]:
-        """The logs now, in scene order."""
-        out = []
-        for body, spec, mass in zip(self.logs, self._scene, self.masses, strict=True):
-            position, turn = self._p.getBasePositionAndOrientation(body)
-            m = self._p.getMatrixFromQuaternion(turn)
-            linear, angular = self._p.getBaseVelocity(body)
-            axis = (m[2], m[5], m[8])
-            roll = sum(w * a for w, a in zip(angular, axis, strict=True))
-            turn_rate = math.sqrt(max(0.0, sum(w * w for w in angular) - roll * roll))
-            # No point of the log is faster than this.
-            speed = math.hypot(*linear) + spec.length_m / 2 * turn_rate + spec.diameter_m / 2 * abs(roll)
-            out.append(LogState(position, turn, axis, spec.length_m, spec.diameter_m, mass, speed))
-        return out
+        """The logs now, in scene order.  Only those that moved since the last call are worked out."""
+        p = self._p
+        now = [(p.getBasePositionAndOrientation(body), p.getBaseVelocity(body)) for body in self.logs]
+        moved = [i for i, seen in enumerate(now) if seen != self._seen[i]]
+        if moved:
+            for i, state in zip(moved, self._states(moved, [now[i] for i in moved]), strict=True):
+                self._seen[i], self._last[i] = now[i], state
+        return list(self._last)
+
+    def _states(self, which: list[int], now: Sequence[tuple[Pose, tuple[Vector, Vector]]]) -> list[LogState]:
+        turned = _times(np.array([q for (_, q), _ in now]), -self._turn[which])
+        x, _, z = _axes(turned)
+        com, (length, diameter, sweep) = self._com[which], self._size[which].T
+        position = np.array([at for (at, _), _ in now]) - com[:, :1] * x - com[:, 2:] * z
+        half, back = length[:, None] / 2 * z, position - sweep[:, None] * x
+        linear, angular = np.array([velocity for _, velocity in now]).transpose(1, 0, 2)
+        roll = np.abs(np.sum(angular * z, axis=1))
+        across = np.sqrt(np.maximum(np.sum(angular * angular, axis=1) - roll * roll, 0.0))
+        # No point of the log is faster than this.
+        speed = (
+            np.linalg.norm(linear, axis=1) + (length / 2 + np.abs(com[:, 2])) * across + (diameter / 2 + sweep) * roll
+        )
+        columns = zip(which, *(c.tolist() for c in (position, turned, z, back - half, back + half, speed)), strict=True)
+        return [
+            LogState(
+                tuple(at), tuple(turn), tuple(axis), self.scene[i].length_m, self.scene[i].diameter_m, self.masses[i],
+                v, self.scene[i].taper_m_m, self.scene[i].sweep_m, (tuple(butt), tuple(top)),
+            )
+            for i, at, turn, axis, butt, top, v in columns
+        ]  # fmt: skip
+
+
+def _times(q: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternions [n, 4] followed by turns [n] about their own y."""
+    s, c = np.sin(angle / 2), np.cos(angle / 2)
+    x, y, z, w = q.T
+    return np.stack([c * x - s * z, c * y + s * w, c * z + s * x, c * w - s * y], axis=1)
+
+
+def _axes(q: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """The three axes [n, 3] of quaternions [n, 4]."""
+    x, y, z, w = q.T
+    return (
+        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1),
+        np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1),
+        np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1),
+    )
+
+
+def _body(p: BulletClient, spec: LogSpec, mass: Mass, pose: Pose, contact: Contact) -> int:
+    """A log in a client; ``pose`` is of the body's own frame: centre of mass, principal axes."""
+    half, (cx, _, cz) = -mass.turn_rad / 2, mass.com_m
+    c, s = math.cos(2 * half), math.sin(2 * half)
+    radii, lengths, middles, turns = [], [], [], []
+    for a, b, ra, rb in log_segments(spec):
+        radii.append((ra + rb) / 2)
+        lengths.append(math.dist(a, b))
+        x, z = (a[0] + b[0]) / 2 - cx, (a[2] + b[2]) / 2 - cz
+        middles.append([c * x + s * z, 0.0, c * z - s * x])
+        tilt = math.atan2(b[0] - a[0], b[2] - a[2]) / 2 + half
+        turns.append([0.0, math.sin(tilt), 0.0, math.cos(tilt)])
+    shape = p.createCollisionShapeArray(
+        shapeTypes=[p.GEOM_CYLINDER] * len(radii),
+        radii=radii,
+        lengths=lengths,
+        collisionFramePositions=middles,
+        collisionFrameOrientations=turns,
+    )
+    body: int = p.createMultiBody(
+        mass.mass_kg, shape, basePosition=pose[0], baseOrientation=pose[1], useMaximalCoordinates=1
+    )
+    p.changeDynamics(
+        body,
+        -1,
+        mass=mass.mass_kg,  # without it Bullet takes the inertia of a massless body
+        localInertiaDiagonal=mass.inertia_kg_m2,
+        lateralFriction=contact.log_friction,
+        rollingFriction=contact.log_rolling_m,
+        spinningFriction=contact.log_rolling_m,
+        linearDamping=0.0,
+        angularDamping=0.0,
+    )
+    return body
+
+
+def _lifts(scene: Sequence[LogSpec], terrain: Terrain) -> list[float]:
+    """Height of the ground under each log's lowest line; logs that are near each other share the highest."""
+    lifts = []
+    for s in scene:
+        points = s.spine()
+        radii = [s.radius(i / (len(points) - 1) - 0.5) for i in range(len(points))]
+        low = [pt[2] - r for pt, r in zip(points, radii, strict=True)]
+        least, d = min(low), s.diameter_m / 2
+        lifts.append(
+            max(
+                terrain.height(s.x_m + pt[0] + dx, s.y_m + pt[1] + dy) - (z - least)
+                for pt, z in zip(points, low, strict=True)
+                for dx, dy in ((0.0, 0.0), (d, 0.0), (-d, 0.0), (0.0, d), (0.0, -d))
+            )
+        )
+    near = [
+        (i, j)
+        for i, a in enumerate(scene)
+        for j in range(i)
+        if math.hypot(a.x_m - scene[j].x_m, a.y_m - scene[j].y_m) < 4.0 and seen_from_above(a, scene[j]) < NEIGHBOUR_M
+    ]
+    for _ in scene:
+        for i, j in near:
+            lifts[i] = lifts[j] = max(lifts[i], lifts[j])
+    return lifts
+
+
+def _settled(profile: Profile, contact: Contact, scene: Sequence[LogSpec], terrain: Terrain, base: Pose) -> list[Pose]:
+    """Poses of the bodies after the scene has come to rest on the terrain and in the bunk."""
+    p = new_client()
+    try:
+        p.setGravity(0.0, 0.0, -9.81)
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=SETTLE_STEP_S, numSolverIterations=40, numSubSteps=0, deterministicOverlappingPairs=1
+        )
+        terrain.add_to(p, contact.ground_friction)
+        b = profile.bunk
+        along = rpy_quaternion(0.0, 0.0, b.yaw_rad)
+        for size, middle in bunk_boxes(profile):
+            shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[x / 2 for x in size])
+            at, turn = p.multiplyTransforms(*base, from_bunk(b, middle), along)
+            box = p.createMultiBody(0.0, shape, basePosition=at, baseOrientation=turn)
+            p.changeDynamics(box, -1, lateralFriction=contact.bunk_friction)
+        free = [s for s in scene if not s.in_bunk]
+        lifts = iter(_lifts(free, terrain))
+        bodies = []
+        for s in scene:
+            m, turn = mass_of(s), quaternion_of(s)
+            n = s.pieces * 4
+            low = min(pt[2] - s.radius(i / n - 0.5) for i, pt in enumerate(s.spine(n + 1)))
+            at = (s.x_m, s.y_m, s.z_m - low)
+            if s.in_bunk:
+                at = from_bunk(b, (at[0], at[1], at[2] + b.floor_z_m))
+                at, turn = p.multiplyTransforms(*base, at, p.multiplyTransforms((0, 0, 0), along, (0, 0, 0), turn)[1])
+            else:
+                at = (at[0], at[1], at[2] + next(lifts))
+            own = (0.0, math.sin(m.turn_rad / 2), 0.0, math.cos(m.turn_rad / 2))
+            bodies.append(_body(p, s, m, p.multiplyTransforms(at, turn, m.com_m, own), contact))
+        _check_apart(p, bodies, "where they are let go")
+        _rest(p, bodies)
+        return [p.getBasePositionAndOrientation(body) for body in bodies]
+    finally:
+        p.disconnect()
+
+
+def _rest(p: BulletClient, bodies: Sequence[int]) -> None:
+    """Step until every log stands still: in thick air, then without, nudged so that none stays on a knife edge.
+
+    A log that has come through both sleeps while others still roll.
+    """
+    still, free = dict.fromkeys(bodies, 0), dict.fromkeys(bodies, False)
+    for body in bodies:
+        p.changeDynamics(body, -1, activationState=p.ACTIVATION_STATE_ENABLE_SLEEPING, sleepThreshold=SLEEP)
+        p.changeDynamics(body, -1, linearDamping=SETTLE_DAMPING[0], angularDamping=SETTLE_DAMPING[1])
+    for _ in range(round(SETTLE_S / SETTLE_STEP_S / LOOK_STEPS)):
+        for _ in range(LOOK_STEPS):
+            p.stepSimulation()
+        for i, body in enumerate(bodies):
+            v, w = p.getBaseVelocity(body)
+            still[body] = still[body] + 1 if math.hypot(*v) < REST_M_S and math.hypot(*w) < REST_RAD_S else 0
+            if still[body] >= STILL_LOOKS and free[body]:
+                p.changeDynamics(body, -1, activationState=p.ACTIVATION_STATE_SLEEP)
+            elif still[body] >= STILL_LOOKS:
+                free[body], still[body] = True, 0
+                p.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
+                along = p.getMatrixFromQuaternion(p.getBasePositionAndOrientation(body)[1])[2::3]
+                p.resetBaseVelocity(body, angularVelocity=[NUDGE_RAD_S * (-1) ** i * x for x in along])
+        if all(free.values()) and min(still.values()) >= STILL_LOOKS:
+            return
+    worst = min(range(len(bodies)), key=lambda i: (free[bodies[i]], still[bodies[i]]))
+    raise ValueError(
+        f"log {worst} still moves {SETTLE_S:.0f} s after it was let go; lay the logs on flatter ground or use fewer"
+    )
+
+
+def _check_apart(p: BulletClient, bodies: Sequence[int], when: str) -> None:
+    """Raise ValueError when a log is inside another body."""
+    p.performCollisionDetection()
+    number = {body: i for i, body in enumerate(bodies)}
+    for i, body in enumerate(bodies):
+        for contact in p.getContactPoints(body):
+            if contact[8] < -INSIDE_M:
+                j = number.get(contact[2])
+                other = "the machine, the bunk or the ground" if j is None else f"log {j}"
+                raise ValueError(f"log {i} is {-contact[8]:.3f} m inside {other} {when}; move it away")

@@ -1,48 +1,60 @@
-"""Crane, hydraulics and yard in one physics client: spool commands in, motion out, 2.5 ms a step, no bus.
+"""Machine, hydraulics, ground and logs in one physics client: spool commands in, motion out, 2.5 ms a step, no bus.
 
-A grasp is frictional contact; no constraint is ever made between grapple and log.  Bit-identical for equal inputs on
-one machine and build.
+A grasp is frictional contact; no constraint is ever made between grapple and log.  Every function is driven by the
+torque of its cylinder or motor.  Bit-identical for equal inputs on one machine and build.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 from machine.profile import Profile
-from sim.crane import ACTIVE, JOINTS, TONG_CLOSED_RAD, Crane, Vector
-from sim.hydraulics import Hydraulics, ValveSpool
+from sim.body import Body, Pose, fixed_boxes, magnitude
+from sim.bunk import bunk_shapes
+from sim.carrier import PARKED, Carrier, Drive, carrier_links
+from sim.column import Column
+from sim.crane import CRANE_LINKS, FLEX, PASSIVE, crane_links, rigid_pin
+from sim.hydraulics import Hydraulics
 from sim.logs import Yard
 from sim.physics import new_client
-from sim.scene import random_scene
-from sim.truth import Truth
+from sim.scene import LogSpec
+from sim.shape import UNIT, Vector
+from sim.terrain import Terrain
+from sim.truth import Truth, load_truth
+from sim.urdf import JointDef
 
 STEP_NS: Final = 2_500_000
 STEP_S: Final = STEP_NS * 1e-9
-SOLVER_ITERATIONS: Final = 40
-HOME: Final = {"slew": 0.0, "lift": 0.75, "tilt": -1.6, "ext": 0.30, "rot": 0.0}
-SETTLE_STEPS: Final = 200
-PRESSURE_LAG_S: Final = 0.03  # oil and hoses between tong torque and its transducer
 GRAVITY_M_S2: Final = 9.81
-
-
-@dataclass(slots=True)
-class Spools:
-    """Valve commands, -1..1 of full spool; ``grapple`` + opens."""
-
-    slew: float = 0.0
-    lift: float = 0.0
-    tilt: float = 0.0
-    ext: float = 0.0
-    rot: float = 0.0
-    grapple: float = 0.0
+SOLVER_ITERATIONS: Final = 40
+HOME: Final = {
+    "palms_471": {"slew": 0.0, "lift": 0.75, "tilt": -1.6, "ext": 0.30, "rot": 0.0},
+    "aoro_fc8": {"slew": 0.0, "lift": 1.25, "tilt": -2.39, "ext": 0.10, "rot": 0.0},
+}
+SETTLE_STEPS: Final = 240
+CARRIER_SETTLE_STEPS: Final = 960
+HAND_OVER_STEPS: Final = 80
+SETTLE_DAMPING_S: Final = 0.06  # of the column, until all is at rest
+HOLDING: Final = 1e7  # [Nm, N] motors that stand in for the valves until all is at rest
+LOOK_STEPS: Final = 4  # contacts are looked at every so many steps
+TONGS: Final = ("tong_left", "tong_right")
+GRAPPLE: Final = (*TONGS, "rotator", "telescope", "stick")
+MOVED_BY: Final = {"grapple": TONGS, "steer": ("articulation",)}
 
 
 class World:
     """The machine and its surroundings.  ``q`` and ``qd`` map joint names to position and velocity."""
 
     def __init__(
-        self, profile: Profile, truth: Truth, seed: int, logs: int, home: dict[str, float] | None = None
+        self,
+        profile: Profile,
+        truth: Truth,
+        seed: int,
+        scene: Sequence[LogSpec],
+        terrain: str = "flat",
+        home: Mapping[str, float] | None = None,
     ) -> None:
         self.profile, self.truth = profile, truth
         self.client = p = new_client()
@@ -54,62 +66,167 @@ class World:
             enableConeFriction=1,
             deterministicOverlappingPairs=1,
         )
-        self.yard = Yard(p, profile, truth.contact, random_scene(profile, truth.contact, seed, logs))
-        self.crane = Crane(p, profile, truth)
+        mobile = profile.carrier is not None
+        ground = (terrain, seed, 0.0 if mobile else profile.workspace.ground_z_m)
+        self.terrain = Terrain(*ground)
+        self.terrain.add_to(p, truth.contact.ground_friction)
+        self.crane = self._build()
+        self.carrier = Carrier(p, self.crane.body, self.crane.index, profile, truth, self.terrain) if mobile else None
         self.hydraulics = Hydraulics(truth, STEP_S)
-        self._rot = ValveSpool(truth.valves["rot"], STEP_S)
-        self._grapple = ValveSpool(truth.valves["grapple"], STEP_S)
-        # Spools of slew, lift, tilt, ext, rot, grapple.
-        self.spools = (*(a.spool for a in self.hydraulics.actuators), self._rot, self._grapple)
-        self.grapple_torque = 0.0
-        self.hanging_n = 0.0
+        self.functions: tuple[str, ...] = self.hydraulics.names
+        self._grapple = self.functions.index("grapple")
+        driven = [j for name in self.functions for j in MOVED_BY.get(name, (name,))]
+        self._driven = tuple(driven)
+        self._motors = [self.crane.index[j] for j in driven if j not in TONGS]
+        self._motors += [self.crane.index[j] for j in (*TONGS, *FLEX)]
+        self._hanger = self.crane.names.index("hanger")
+        self.column = self._level()
+        self._settle(HOME[profile.name] | dict(home or {}))
+        # The yard lets its logs come to rest in a client of its own, and so on ground of its own.
+        self.yard = Yard(p, profile, truth, scene, Terrain(*ground), self.base_pose())
+        self._log_of = {body: i for i, body in enumerate(self.yard.logs)}
+        self._tongs = {self.crane.link[n] for n in TONGS}
+        self._above = {self.crane.link[n] for n in CRANE_LINKS[1:]}  # the crane without what it stands on
         self.max_penetration_m = 0.0
-        self._settle(HOME if home is None else home)
+        self.grip_n = [0.0] * len(self.yard.logs)
+        self._touched = [False] * len(self.yard.logs)
+        self._steps = 0
+        laden = mobile and any(log.in_bunk for log in scene)
+        self._wait(CARRIER_SETTLE_STEPS if laden else HAND_OVER_STEPS)
+        self._hand_over()
+        self._look()
 
-    def _settle(self, home: dict[str, float]) -> None:
-        """Hold the joints by motors until all is at rest, then hand the load to the cylinders."""
-        self.crane.place(home)
-        for _ in range(SETTLE_STEPS):
-            for joint in (*ACTIVE, "rot", "tong_left", "tong_right"):
-                self.crane.drive(joint, 0.0, 1e6)
-            self.client.stepSimulation()
+    def _build(self) -> Body:
+        profile, truth = self.profile, self.truth
+        links, joints = crane_links(profile, truth)
+        self._chain = joints
+        bunk = tuple(bunk_shapes(profile))
+        if profile.carrier is None:
+            body = Body(self.client, links, joints, fixed=True)
+            fixed_boxes(self.client, bunk, truth.contact.bunk_friction)
+        else:
+            c = profile.carrier
+            under, wheels = carrier_links(profile, truth)
+            under = [replace(u, shapes=(*u.shapes, *bunk)) if u.name == "rear" else u for u in under]
+            foot = JointDef("foot", "fixed", "rear", "base", c.crane_base_m, (0.0, 0.0, c.crane_yaw_rad))
+            body = Body(
+                self.client,
+                [*under, *links],
+                [*wheels, foot, *joints],
+                fixed=False,
+                collides_with_itself=True,
+            )
+            body.collide_only(GRAPPLE, ("rear", "front"))
+            body.rub(["rear"], truth.contact.bunk_friction)
+        for joint in PASSIVE:
+            body.damp(joint, getattr(truth.structure, f"{joint}_damping_nm_s_rad"))
+        body.rub((*TONGS, "rotator"), truth.contact.tong_friction)
+        body.sense("hanger")
+        return body
+
+    def _moments(self) -> tuple[float, float]:
+        """Moments of the weight about the column's hinges now [Nm]."""
+        above = CRANE_LINKS[CRANE_LINKS.index("mast") :]
+        crane = self.crane
+        return (
+            crane.gravity_moment("flex_pitch", (1.0, 0.0, 0.0), above, GRAVITY_M_S2),
+            crane.gravity_moment("flex_roll", (0.0, 1.0, 0.0), above, GRAVITY_M_S2),
+        )
+
+    def _place(self, pose: Mapping[str, float]) -> None:
+        """The crane at rest in a pose, tongs open, the grapple hanging plumb."""
+        crane = dict.fromkeys((*FLEX, *PASSIVE, *TONGS), 0.0) | pose
+        hang = -(crane["lift"] + crane["tilt"] + crane["flex_pitch"])
+        self.crane.place(crane | {"hanger": pose.get("hanger", hang)})
+
+    def _level(self) -> Column:
+        """Zero the encoders: at the home pose with an empty grapple the column stands plumb."""
+        self._place(HOME[self.profile.name])
+        return Column(self.truth.structure, self._moments())
+
+    def _settle(self, home: Mapping[str, float]) -> None:
+        """Hold the joints by motors until the machine is at rest."""
+        if self.carrier is not None:
+            assert self.profile.carrier is not None
+            self.carrier.place(0.0, 0.0, 0.0, self.profile.carrier.arm_transport_m)
+        self._place(home)
+        self._place(dict(home) | dict(zip(FLEX, self.column.balance(self._moments()), strict=True)))
         self._read()
-        for actuator, joint in zip(self.hydraulics.actuators, ACTIVE, strict=True):
-            actuator.hold(self.crane.motor_torque(joint), self.q[joint])
-            self.crane.drive(joint, 0.0, 0.0)
+        self.crane.hold(self._driven, HOLDING)
+        self._wait(SETTLE_STEPS if self.carrier is None else CARRIER_SETTLE_STEPS)
+
+    def _wait(self, steps: int) -> None:
+        flex = [self.crane.index[j] for j in FLEX]
+        for _ in range(steps):
+            self.crane.apply(flex, self._column_torques(SETTLE_DAMPING_S))
+            if self.carrier is not None:
+                self.carrier.apply(PARKED)
+            self.client.stepSimulation()
+            self._read()
+
+    def _hand_over(self) -> None:
+        """From the motors to the oil."""
+        crane = self.crane
+        carried = dict(zip(crane.names, (s[3] for s in crane.states()), strict=True))
+        crane.hold(self._driven, 0.0)
+        torques = [sum(carried[j] for j in MOVED_BY.get(name, (name,))) for name in self.functions]
+        self.hydraulics.hold(torques, self._positions(self.q))
 
     def _read(self) -> None:
-        q, qd = self.crane.states()
-        self.q, self.qd = dict(zip(JOINTS, q, strict=True)), dict(zip(JOINTS, qd, strict=True))
+        states = self.crane.states()
+        names = self.crane.names
+        self.q = dict(zip(names, [s[0] for s in states], strict=True))
+        self.qd = dict(zip(names, [s[1] for s in states], strict=True))
+        self.hanging_n = magnitude(states[self._hanger][2])
 
-    def step(self, spools: Spools) -> None:
-        """Advance by STEP_NS."""
-        crane, q, qd = self.crane, self.q, self.qd
-        commands = [spools.slew, spools.lift, spools.tilt, spools.ext]
-        torques = self.hydraulics.step(commands, [q[j] for j in ACTIVE], [qd[j] for j in ACTIVE])
-        crane.apply_torques(torques)
-        valves, motors = self.truth.valves, self.truth.motors
-        opening = self._rot.advance(self._rot.delayed(spools.rot), STEP_S)
-        speed = opening * (valves["rot"].full_speed_plus if opening > 0.0 else valves["rot"].full_speed_minus)
-        crane.drive("rot", speed, motors.rotator_torque_nm)
-        opening = self._grapple.advance(self._grapple.delayed(spools.grapple), STEP_S)
-        rate = valves["grapple"].full_speed_plus if opening > 0.0 else valves["grapple"].full_speed_minus
-        close, apart = -opening * rate, motors.tong_sync_1_s * (q["tong_left"] - q["tong_right"]) / 2
-        crane.drive("tong_left", close - apart, motors.tong_torque_nm)
-        crane.drive("tong_right", close + apart, motors.tong_torque_nm)
+    def _positions(self, q: Mapping[str, float]) -> list[float]:
+        """Joint positions (or velocities) in the order of ``functions``; the grapple's is the mean of its tongs."""
+        out = [q[j] for j in self._driven]
+        at = self._grapple
+        out[at : at + 2] = [(out[at] + out[at + 1]) / 2]
+        return out
+
+    def _column_torques(self, extra_s: float = 0.0) -> list[float]:
+        q, qd = self.q, self.qd
+        return self.column.torques([q[j] for j in FLEX], [qd[j] for j in FLEX], extra_s)
+
+    def step(self, commands: Sequence[float], drive: Drive = PARKED) -> None:
+        """Advance by STEP_NS; commands -1..1 of full spool in ``functions`` order (grapple + opens)."""
+        q, qd, s = self.q, self.qd, self.truth.structure
+        torques = self.hydraulics.step(commands, self._positions(q), self._positions(qd))
+        half = torques.pop(self._grapple) / 2
+        # A rod couples the tongs; it is stiff, not rigid.
+        rod = s.tong_sync_nm_rad * (q["tong_left"] - q["tong_right"])
+        rod += s.tong_sync_nm_s_rad * (qd["tong_left"] - qd["tong_right"])
+        self.crane.apply(self._motors, [*torques, half - rod, half + rod, *self._column_torques()])
+        if self.carrier is not None:
+            self.carrier.apply(drive)
         self.client.stepSimulation()
         self._read()
-        torque = (crane.motor_torque("tong_left") + crane.motor_torque("tong_right")) / 2
-        self.grapple_torque += STEP_S / PRESSURE_LAG_S * (torque - self.grapple_torque)
-        self.hanging_n = crane.hanging_force()
-        self._watch_contacts()
+        self._steps += 1
+        if self._steps % LOOK_STEPS == 0:
+            self._look()
 
-    def _watch_contacts(self) -> None:
-        p, tongs = self.client, (self.crane.link["tong_left"], self.crane.link["tong_right"])
-        for log in self.yard.logs:
-            for c in p.getContactPoints(self.crane.body, log):
-                if c[3] in tongs:
-                    self.max_penetration_m = max(self.max_penetration_m, -c[8])
+    def _look(self) -> None:
+        """Take note of which logs the crane touches."""
+        n = len(self._log_of)
+        touched, grip = [False] * n, [0.0] * n
+        tongs, above = self._tongs, self._above
+        for c in self.client.getContactPoints(bodyA=self.crane.body):
+            log = self._log_of.get(c[2])
+            if log is None:
+                continue
+            if c[3] in above:
+                touched[log] = True
+            if c[3] in tongs:
+                grip[log] += c[9]
+                if -c[8] > self.max_penetration_m:
+                    self.max_penetration_m = -c[8]
+        self._touched, self.grip_n = touched, grip
+
+    def touched(self) -> list[bool]:
+        """For each log, whether the crane touches it, not older than LOOK_STEPS steps."""
+        return self._touched
 
     @property
     def tong_angle(self) -> float:
@@ -119,30 +236,52 @@ class World:
     @property
     def opening(self) -> float:
         """Grapple opening, 1 = fully open."""
-        return max(0.0, min(1.0, 1.0 - self.tong_angle / TONG_CLOSED_RAD))
+        return max(0.0, min(1.0, 1.0 - self.tong_angle / self.profile.grapple.tongs.angle_rad[-1]))
 
-    @property
-    def grapple_pressures_pa(self) -> tuple[float, float]:
-        """Closing and opening side of the grapple, from the tong motors' torque."""
-        m = self.truth.motors
-        share = self.grapple_torque / m.tong_torque_nm * m.tong_pressure_pa
-        tank = self.truth.supply.tank_pa
-        return max(tank, share), max(tank, -share)
+    def link_poses(self) -> dict[str, Pose]:
+        """Frames of all links in the world."""
+        return self.crane.poses()
+
+    def base_pose(self) -> Pose:
+        """The crane's base frame in the world."""
+        return self.crane.pose("base")
 
     def tip(self) -> Vector:
-        """True position of the hanger pin in the base frame."""
-        return self.crane.link_poses()["hanger"][0]
+        """True position of the hanger pin in the crane's base frame [m]."""
+        pin, _ = self.crane.pose("hanger")
+        if self.carrier is None:
+            return pin
+        inward = self.client.invertTransform(*self.base_pose())
+        return self.client.multiplyTransforms(*inward, pin, UNIT)[0]
+
+    def rigid_tip(self) -> Vector:
+        """The hanger pin in the crane's base frame if the column were rigid: what perfect encoders say [m]."""
+        return rigid_pin(self._chain, self.q)
 
     def load_kg(self) -> float:
         """What a load cell at the hanger pin shows beyond the empty grapple."""
-        hanging = sum(self.truth.links[n].mass_kg for n in ("hanger", "fork", "rotator"))
-        return max(0.0, self.hanging_n / GRAVITY_M_S2 - hanging - 2 * self.truth.links["tong"].mass_kg)
+        links = self.truth.links
+        grapple = sum(links[n].mass_kg for n in ("hanger", "fork", "rotator")) + 2 * links["tong"].mass_kg
+        return max(0.0, self.hanging_n / GRAVITY_M_S2 - grapple)
 
-    def touched(self) -> list[bool]:
-        """For each log, whether the crane touches it."""
-        return [bool(self.client.getContactPoints(self.crane.body, log)) for log in self.yard.logs]
+    def wheel_loads_n(self) -> tuple[float, ...]:
+        """Wheel loads fl fr rl rr [N]; none on a fixed machine."""
+        return () if self.carrier is None else tuple(self.carrier.wheel_loads_n)
 
     def close(self) -> None:
         """Release the physics client."""
         if self.client.isConnected():
             self.client.disconnect()
+
+
+def open_world(
+    profile: Profile,
+    *,
+    truth: str = "nominal",
+    seed: int = 0,
+    scene: Sequence[LogSpec] = (),
+    terrain: str = "flat",
+    home: Mapping[str, float] | None = None,
+) -> World:
+    """A World whose truth is given by name (nominal, sampled or a TOML file)."""
+    return World(profile, load_truth(truth, seed, profile.name), seed, scene, terrain, home)

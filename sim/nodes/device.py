@@ -1,47 +1,33 @@
-"""What the simple nodes share: NMT state, boot-up, heartbeat, E2E frames; the E-stop box and the pressure modules.
+"""What the simple nodes of crane0 share: NMT state, boot-up, heartbeat, emergency, identity; E-stop box, pressures.
 
 Unlike an encoder these nodes start by themselves (boot-up, then operational); NMT can stop and reset them.  A node
-that is not operational sends heartbeats only.
+that is not operational sends heartbeats and SDO answers only; its object dictionary holds what CiA 301 demands of
+every node: device type, error register, heartbeat period and identity, read only.
 """
 
 from __future__ import annotations
 
-from can_dbc.canopen import HEARTBEAT_BASE, NmtCommand, NodeState
+from collections.abc import Callable, Sequence
+
+from can_dbc.canopen import (
+    HEARTBEAT_BASE,
+    SDO_TO_CLIENT,
+    Emergency,
+    NmtCommand,
+    NodeState,
+    SdoKind,
+    abort_frame,
+    emergency_frame,
+    parse_request,
+    upload_response,
+)
 from can_dbc.codec import Database
-from can_dbc.e2e import Sender
 from sim.nodes import Outbox
+from sim.nodes.traffic import MS, Every, ProtectedMessage
 
-HEARTBEAT_NS = 100_000_000
-MS = 1_000_000
+HEARTBEAT_NS = 100 * MS
 PA_PER_BAR = 1e5
-
-
-class Every:
-    """A period on virtual time."""
-
-    def __init__(self, period_ns: int, phase_ns: int = 0) -> None:
-        self._period, self._next = period_ns, phase_ns
-
-    def due(self, now_ns: int) -> bool:
-        """Whether the period has come round since the last call; a late caller gets one, not a burst."""
-        if now_ns < self._next:
-            return False
-        self._next += self._period * max(1, -(-(now_ns - self._next + 1) // self._period))
-        return True
-
-
-class ProtectedMessage:
-    """Encodes one E2E message of the DBC; values in signal order without Crc and Counter."""
-
-    def __init__(self, database: Database, name: str) -> None:
-        codec = database.message(name)
-        if codec.data_ids is None:
-            raise ValueError(f"{name} in the DBC has no E2E Data IDs")
-        self.key, self._encode, self._sender = codec.key, codec.encode, Sender(codec.data_ids)
-
-    def frame(self, *values: float) -> tuple[int, bytes]:
-        """The next frame."""
-        return self.key, self._sender.protect(self._encode(0, 0, *values))
+NO_OBJECT, READ_ONLY, NO_SEGMENTS = 0x0602_0000, 0x0601_0002, 0x0504_0001
 
 
 class Device:
@@ -51,6 +37,15 @@ class Device:
         self.node, self.outbox = node, outbox
         self.state = NodeState.BOOT_UP
         self._heartbeat = Every(HEARTBEAT_NS, phase_ns=node * MS)
+        self._objects = {
+            (0x1000, 0): bytes(4),
+            (0x1001, 0): bytes(1),
+            (0x1017, 0): (HEARTBEAT_NS // MS).to_bytes(2, "little"),
+            (0x1018, 0): b"\x02",
+            (0x1018, 1): bytes(4),
+            (0x1018, 2): node.to_bytes(4, "little"),
+        }
+        self._emergency = 0
 
     @property
     def operational(self) -> bool:
@@ -73,6 +68,27 @@ class Device:
 
     def restart(self) -> None:
         """Forget run-time state after an NMT reset."""
+
+    def receive_sdo(self, key: int, data: bytes) -> None:
+        """Answer an SDO request to this node; others are ignored."""
+        request = parse_request(key, data)
+        if request is None or request.node != self.node or request.kind is SdoKind.ABORT:
+            return
+        node, index, sub = self.node, request.index, request.sub
+        value = self._objects.get((index, sub))
+        if request.kind is SdoKind.UPLOAD and value is not None:
+            self.outbox.append(upload_response(node, index, sub, value))
+            return
+        known = NO_SEGMENTS if request.kind is SdoKind.SEGMENTED else READ_ONLY
+        code = NO_OBJECT if value is None else known
+        self.outbox.append(abort_frame(SDO_TO_CLIENT, node, index, sub, code))
+
+    def set_emergency(self, code: int) -> None:
+        """The node finds a fault of its own (CiA 301 emergency code), or with 0 that it is over; a change is sent."""
+        register = bytes((int(code != 0),))
+        if code != self._emergency:
+            self._emergency, self._objects[0x1001, 0] = code, register
+            self.outbox.append(emergency_frame(Emergency(self.node, code, register[0], bytes(5))))
 
     def tick(self, now_ns: int) -> None:
         """Boot-up, heartbeat, and what the device sends by itself."""
@@ -145,13 +161,21 @@ class EstopBox(Device):
 
 
 class PressureModule(Device):
-    """One of three modules with four transducers each; ``pressures_pa`` is what they feel."""
+    """One of three modules with four transducers each; ``sense`` gives the pressures [Pa] they feel."""
 
-    def __init__(self, node: int, message: str, period_ns: int, database: Database, outbox: Outbox) -> None:
+    def __init__(
+        self,
+        node: int,
+        message: str,
+        period_ns: int,
+        database: Database,
+        outbox: Outbox,
+        sense: Callable[[], Sequence[float]],
+    ) -> None:
         super().__init__(node, outbox)
         self._message, self._period = ProtectedMessage(database, message), Every(period_ns)
-        self.pressures_pa: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+        self._sense = sense
 
     def cycle(self, now_ns: int) -> None:
         if self._period.due(now_ns):
-            self.outbox.append(self._message.frame(0, *(p / PA_PER_BAR for p in self.pressures_pa)))
+            self.outbox.append(self._message.frame(0, *(p / PA_PER_BAR for p in self._sense())))

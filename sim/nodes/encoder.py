@@ -28,6 +28,8 @@ LAST_SYNCHRONOUS = 240
 OPERATIONAL, PRE_OPERATIONAL, INITIALISING = "OPERATIONAL", "PRE-OPERATIONAL", "INITIALISING"
 EMCY_POSITION = 0x5000
 TIMESTAMP_NS = 1_000  # the device's time stamp counts microseconds modulo 2**16
+# COB-ID, transmission type, mapped objects as ((index, sub-index), mask, shift), length in bytes
+Pdo = tuple[int, int, list[tuple[tuple[int, int], int, int]], int]
 
 
 class _Periodic:
@@ -87,7 +89,7 @@ class EncoderNode:
         self.node.sdo._buffer = bytearray()
         self.node.add_read_callback(self._read)
         self.node.add_write_callback(self._written)
-        self._pdo: tuple[int, int, list[tuple[tuple[int, int], int]]] | None = None
+        self._pdo: Pdo | None = None
         network.add_node(self.node)
         self._booted = False
 
@@ -135,27 +137,30 @@ class EncoderNode:
             return
         if self._pdo is None:
             self._pdo = self._read_pdo()
-        cob, every, mapping = self._pdo
+        cob, every, mapping, length = self._pdo
         if cob & PDO_NOT_VALID or not 1 <= every <= LAST_SYNCHRONOUS:
             return
         self._syncs += 1
         if self._syncs % every:
             return
-        payload = bytearray()
-        for entry, size in mapping:
+        payload = 0
+        for entry, mask, shift in mapping:
             value = self._values.get(entry)
             if value is None:
-                payload += node.get_data(*entry)[:size].ljust(size, b"\0")
-            else:
-                payload += (value & (1 << 8 * size) - 1).to_bytes(size, "little")
-        self._network.send_message(cob & 0x7FF, bytes(payload[:8]))
+                value = int.from_bytes(node.get_data(*entry), "little")
+            payload |= (value & mask) << shift
+        self._network.send_message(cob & 0x7FF, payload.to_bytes(length, "little"))
 
-    def _read_pdo(self) -> tuple[int, int, list[tuple[tuple[int, int], int]]]:
-        """TPDO1 as configured: COB-ID, transmission type, mapped (index, sub-index) with sizes in bytes."""
+    def _read_pdo(self) -> Pdo:
+        """TPDO1 as configured; what does not fit into eight bytes is left out."""
         get = self.node.get_data
-        words = [int.from_bytes(get(0x1A00, i), "little") for i in range(1, get(0x1A00, 0)[0] + 1)]
-        mapping = [((w >> 16, w >> 8 & 0xFF), (w & 0xFF) // 8) for w in words]
-        return int.from_bytes(get(0x1800, 1), "little"), get(0x1800, 2)[0], mapping
+        mapping, shift = [], 0
+        for i in range(1, get(0x1A00, 0)[0] + 1):
+            word = int.from_bytes(get(0x1A00, i), "little")
+            bits = min(word & 0xF8, 64 - shift)
+            mapping.append(((word >> 16, word >> 8 & 0xFF), (1 << bits) - 1, shift))
+            shift += bits
+        return int.from_bytes(get(0x1800, 1), "little"), get(0x1800, 2)[0], mapping, shift // 8
 
     def _written(self, index: int, subindex: int, od: ODVariable, data: bytes) -> None:
         if index in (0x1800, 0x1A00):
@@ -165,11 +170,11 @@ class EncoderNode:
         t = self._truth
         position = self._history[0]
         error = t.offset + t.eccentricity * math.sin(position + t.phase_rad) + self._rng.gauss(0.0, t.noise)
-        steps = round(self.spec.direction * self._speed / self.spec.unit_per_count)
-        if self.spec.kind == "linear":
+        spec, v = self.spec, self._values
+        steps = round(spec.direction * self._speed / spec.unit_per_count)
+        if spec.kind == "linear":
             steps = max(-32768, min(32767, steps))
-        v = self._values
-        v[0x6004, 0] = counts_from_position(self.spec, position + error)
+        v[0x6004, 0] = counts_from_position(spec, position + error)
         v[0x6030, 1] = steps
         v[0x2120, 0] = (now_ns // TIMESTAMP_NS) & 0xFFFF
         v[0x6503, 0] = v[0x5122, 1] = self.alarms

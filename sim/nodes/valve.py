@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
 
-from can_dbc.codec import Database, FrameRefused
-from can_dbc.e2e import Checker
+from can_dbc.codec import Database
 from sim.nodes import Outbox
-from sim.nodes.device import MS, Device, Every, ProtectedMessage
+from sim.nodes.device import Device
+from sim.nodes.traffic import ARM_KEY, MS, Every, ProtectedInput, ProtectedMessage
 
 COMMAND_NS = GUARD_NS = 50 * MS
 SYNC_NS = 15 * MS
@@ -24,7 +23,7 @@ RAMP_NS = 100 * MS
 PILOT_NS = 300 * MS
 CYCLE_NS = 5 * MS
 SLOW_NS = 20 * MS
-KEY = 0xA
+END_BAR = 150.0  # a grapple cylinder at its end or on a log shows more than this while the pump pushes
 MODE_SPOOL = 2
 CYCLE_US = 400  # what this PLC reports as its longest cycle
 HOLD_PCT = -20.0  # a held grapple keeps a little closing flow, so that its pressure stays
@@ -53,69 +52,46 @@ class Exit(IntEnum):
     NOT_ARMED = 8
 
 
+class GrappleState(IntEnum):
+    """GrappleStat.State."""
+
+    UNKNOWN = 0
+    OPEN = 1
+    OPENING = 2
+    CLOSING = 3
+    CLOSED = 4
+    HOLDING = 5
+
+
 @dataclass(slots=True)
 class Measured:
-    """What the node's own inputs show: spools -1..1 in FUNCTIONS order and the grapple's sensors."""
+    """What the node's own inputs show: spools -1..1 in FUNCTIONS order and the grapple's sensors, None without one."""
 
     spools: tuple[float, ...] = (0.0,) * 6
     flow_limited: bool = False
-    opening: float = 1.0
+    opening: float | None = 1.0
     clamp_bar: float = 0.0
+    release_bar: float = 0.0
     load_kg: float = 0.0
-    rot_deg: float = 0.0
-
-
-class _Input:
-    """The newest good frame of one received message."""
-
-    def __init__(self, database: Database, name: str) -> None:
-        codec = database.message(name)
-        if codec.data_ids is None:
-            raise ValueError(f"{name} in the DBC has no E2E Data IDs")
-        self.key, self._receive, self._index = codec.key, codec.receive, codec.index
-        self._checker = Checker(codec.data_ids)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything, as after a restart."""
-        self._checker.reset()
-        self.values: tuple[Any, ...] | None = None
-        self.stamp_ns = 0
-
-    def take(self, data: bytes, now_ns: int) -> bool:
-        """Whether the frame was accepted."""
-        if not self._checker.check(data).usable:
-            return False
-        try:
-            self.values = self._receive(data)
-        except FrameRefused:
-            return False
-        self.stamp_ns = now_ns
-        return True
-
-    def fresh(self, now_ns: int, limit_ns: int) -> bool:
-        return self.values is not None and now_ns - self.stamp_ns <= limit_ns
-
-    def get(self, signal: str) -> float:
-        """A signal of the newest frame, 0 when it is unknown or not available."""
-        value = None if self.values is None else self.values[self._index[signal]]
-        return 0.0 if value is None else value
+    rot_deg: float | None = 0.0
 
 
 class ValveNode(Device):
-    """``outputs_pct`` are the spool commands now, in FUNCTIONS order; ``measured`` is filled by the plant."""
+    """``outputs_pct`` are the spool commands now, in FUNCTIONS order; ``sense`` reads the node's inputs."""
 
-    def __init__(self, database: Database, outbox: Outbox, pilot_on: Callable[[], bool]) -> None:
+    def __init__(
+        self, database: Database, outbox: Outbox, pilot_on: Callable[[], bool], sense: Callable[[], Measured]
+    ) -> None:
         super().__init__(0x10, outbox)
-        self._pilot_on = pilot_on
-        self._a, self._b, self._guard = (_Input(database, n) for n in ("ValveCmdA", "ValveCmdB", "GuardStat"))
+        self._pilot_on, self._sense = pilot_on, sense
+        self._a, self._b, self._guard = (ProtectedInput(database, n) for n in ("ValveCmdA", "ValveCmdB", "GuardStat"))
         self._inputs = {i.key: i for i in (self._a, self._b, self._guard)}
         self._fb_a, self._fb_b, self._grapple_stat, self._plc = (
             ProtectedMessage(database, n) for n in ("ValveFbA", "ValveFbB", "GrappleStat", "PlcStatus")
         )
         self._fast, self._slow = Every(CYCLE_NS), Every(SLOW_NS, phase_ns=MS)
-        self.measured = Measured()
         self._watchdog = 0
+        self._grapple = GrappleState.UNKNOWN
         self.restart()
 
     def restart(self) -> None:
@@ -127,16 +103,13 @@ class ValveNode(Device):
         self._lost_ns: int | None = None
         self._sync_ns: int | None = None
         self._locked: Exit | None = None
-        self._echo = 0
 
     def receive(self, key: int, data: bytes, now_ns: int) -> None:
         """A command or guard frame; others and bad ones are ignored."""
         source = self._inputs.get(key)
         if source is None or not source.take(data, now_ns):
             return
-        if source is self._a:
-            self._echo = data[1] & 0x0F
-        if source is self._b and self._b.get("ArmKey") != KEY:
+        if source is self._b and self._b.get("ArmKey") != ARM_KEY:
             self._locked = None
 
     def sync(self, now_ns: int) -> None:
@@ -150,7 +123,7 @@ class ValveNode(Device):
             self._locked, self._lost_ns, self._ramp_from = missing, now_ns, list(self.outputs_pct)
             self._ramp_from[-1] = 0.0  # the grapple's valve shuts at once and holds
         wanted = [0.0] * len(FUNCTIONS)
-        armed = self._b.get("ArmKey") == KEY
+        armed = self._b.get("ArmKey") == ARM_KEY
         if missing is Exit.SAFETY_STOP or (missing is not None and not self._heard(now_ns, PILOT_NS)):
             self.valve_state, self.exit = ValveState.PILOT_OFF, missing
         elif self._locked is not None:
@@ -175,7 +148,7 @@ class ValveNode(Device):
         synchronous = self._sync_ns is not None and now_ns - self._sync_ns <= SYNC_NS
         if not self._heard(now_ns, COMMAND_NS) or not synchronous:
             return Exit.COMMAND_TIMEOUT
-        if not self._guard.fresh(now_ns, GUARD_NS) or self._guard.get("Enable") != KEY:
+        if not self._guard.fresh(now_ns, GUARD_NS) or self._guard.get("Enable") != ARM_KEY:
             return Exit.GUARD_MISSING
         return None
 
@@ -198,27 +171,36 @@ class ValveNode(Device):
         return out
 
     def cycle(self, now_ns: int) -> None:
-        m = self.measured
-        if self._fast.due(now_ns):
+        fast, slow = self._fast.due(now_ns), self._slow.due(now_ns)
+        if not (fast or slow):
+            return
+        m = self._sense()
+        if fast:
             pct = [100.0 * s for s in m.spools]
             self.outbox.append(self._fb_a.frame(self.valve_state, *pct[:4]))
             limit = int(m.flow_limited)
-            self.outbox.append(self._fb_b.frame(NO_AXIS, pct[4], pct[5], 0.0, self.exit, self._echo, limit))
-        if self._slow.due(now_ns):
-            self.outbox.append(
-                self._grapple_stat.frame(self._grapple_state(), 100.0 * m.opening, m.clamp_bar, m.load_kg, m.rot_deg)
-            )
+            self.outbox.append(self._fb_b.frame(NO_AXIS, pct[4], pct[5], 0.0, self.exit, self._a.counter, limit))
+        if slow:
+            self._grapple = self._grapple_state(m)
+            opening = None if m.opening is None else 100.0 * m.opening
+            self.outbox.append(self._grapple_stat.frame(self._grapple, opening, m.clamp_bar, m.load_kg, m.rot_deg))
             self._watchdog = (self._watchdog + 1) & 0xFF
             run = 2 if self.valve_state is ValveState.ACTIVE else 1
             self.outbox.append(self._plc.frame(run, self._watchdog, CYCLE_US, 0))
 
-    def _grapple_state(self) -> int:
-        """GrappleStat.State: 1 open, 2 opening, 3 closing, 4 closed, 5 holding."""
-        command, m = self.outputs_pct[5], self.measured
+    def _grapple_state(self, m: Measured) -> GrappleState:
+        """By the opening where it is measured, else by the pressures at the ends."""
+        command = self.outputs_pct[5]
+        if m.opening is None:
+            opened, closed = m.release_bar > END_BAR, m.clamp_bar > END_BAR
+        else:
+            opened, closed = m.opening > 0.98, m.opening < 0.02
         if command > 0.0:
-            return 1 if m.opening > 0.98 else 2
+            return GrappleState.OPEN if opened else GrappleState.OPENING
         if command == HOLD_PCT:
-            return 5
+            return GrappleState.HOLDING
         if command < 0.0:
-            return 4 if m.opening < 0.02 else 3
-        return 1 if m.opening > 0.98 else 4 if m.opening < 0.02 else 5
+            return GrappleState.CLOSED if closed else GrappleState.CLOSING
+        if m.opening is None:
+            return self._grapple  # nothing pushes: it is where it was
+        return GrappleState.OPEN if opened else GrappleState.CLOSED if closed else GrappleState.HOLDING

@@ -1,7 +1,7 @@
 """A crude crane driver for plant tests: smooth references and a P law on the plant's true joints, spools out.
 
-It is not the controller: it reads the plant directly and knows the plant's dead-bands.  ``Driver.pick`` and
-``place`` take a log from the ground to the bunk.
+It is not the controller: it reads the plant directly and compensates the profile's dead-bands.  ``Driver.pick`` and
+``place`` take a log from the ground to the bunk.  Positions are of the hanger pin in the crane's base frame.
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ import math
 from collections.abc import Callable
 from itertools import pairwise
 
-from sim.crane import ACTIVE
-from sim.logs import from_bunk
-from sim.world import STEP_S, Spools, World
+from machine.kinematics import Unreachable, inverse, solve
+from machine.profile import joint_limits
+from sim.bunk import from_bunk
+from sim.world import STEP_S, World
 
+ACTIVE = ("slew", "lift", "tilt", "ext")
 SPEED = {"slew": 0.40, "lift": 0.17, "tilt": 0.30, "ext": 0.25, "rot": 1.0}
 KP = {"slew": 1.5, "lift": 3.0, "tilt": 3.0, "ext": 3.0, "rot": 3.0}
-CLEARANCE_M = 0.02
+CLEARANCE_M = 0.03
 Pin = tuple[float, float, float]
 
 
@@ -26,34 +28,30 @@ class Driver:
     def __init__(self, world: World, each_step: Callable[[], None] | None = None) -> None:
         self.w = world
         self.ref = {j: world.q[j] for j in SPEED}
-        self.spools = Spools()
+        self.commands = dict.fromkeys(world.functions, 0.0)
         self.each_step = each_step
+        self._limits = joint_limits(world.profile)
 
     def inverse(self, pin: Pin) -> dict[str, float]:
-        """Joint positions that put the hanger pin at ``pin``, the telescope kept in mid-range."""
-        k = self.w.profile.kinematics
-        x, y, z = pin
-        reach, height = math.hypot(x, y) - k.a1_m, z - k.d1_m
-        d = math.hypot(reach, height)
-        ext = max(0.2, min(1.75, d - 4.6))
-        forearm = math.hypot(k.a3_m, k.d4_m + ext)
-        elbow = math.acos((k.a2_m**2 + forearm**2 - d * d) / (2 * k.a2_m * forearm))
-        shoulder = math.acos((k.a2_m**2 + d * d - forearm**2) / (2 * k.a2_m * d))
-        lift = math.atan2(height, reach) + shoulder - k.theta2_offset_rad
-        bend = math.atan2(k.a3_m, k.d4_m + ext)  # the forearm line lies above the telescope's own axis
-        tilt = elbow - math.pi - bend + math.pi / 2 - k.theta3_offset_rad
-        return {"slew": math.atan2(-x, y), "lift": lift, "tilt": tilt, "ext": ext}
+        """Joint positions that put the hanger pin at ``pin``, the telescope where it is when that reaches."""
+        ext = self.ref["ext"]
+        try:
+            q = (*inverse(self.w.profile.kinematics, self._limits, *pin, ext), ext)
+        except Unreachable:
+            q = solve(self.w.profile, *pin, preference=ext)
+        return dict(zip(ACTIVE, q, strict=True))
 
     def tick(self, rates: dict[str, float]) -> None:
         """One physics step towards the reference, with feed-forward ``rates``."""
-        w, s = self.w, self.spools
+        w = self.w
         for joint, target in self.ref.items():
             v = rates.get(joint, 0.0) + KP[joint] * (target - w.q[joint])
-            t = w.truth.valves[joint]
-            full, band = (t.full_speed_plus, t.deadband_plus) if v > 0 else (t.full_speed_minus, t.deadband_minus)
-            u = min(1.0, abs(v) / full)
-            setattr(s, joint, 0.0 if abs(v) < 0.004 * full else math.copysign(band + (1 - band) * u, v))
-        w.step(s)
+            t = w.profile.joints[joint].valve
+            full = t.full_speed_plus if v > 0 else t.full_speed_minus
+            band = (t.deadband_plus_pct if v > 0 else t.deadband_minus_pct) / 100
+            u = band + (1 - band) * min(1.0, abs(v) / full)
+            self.commands[joint] = 0.0 if abs(v) < 0.004 * full else math.copysign(u, v)
+        w.step(list(self.commands.values()))
         if self.each_step:
             self.each_step()
 
@@ -99,17 +97,22 @@ class Driver:
                 return z0 + (z1 - z0) * (angle - a0) / (a1 - a0)
         return pairs[-1][1]
 
-    def pick(self, x: float, y: float, yaw: float, *, raising: bool = True) -> None:
+    def rotator_for(self, yaw: float, slew: float) -> float:
+        """Rotator angle that grips a log whose axis points to ``yaw`` in the base frame."""
+        turn = yaw - math.pi / 2 - slew - self.w.profile.kinematics.theta1_offset_rad + math.pi / 2
+        return (turn + math.pi / 2) % math.pi - math.pi / 2
+
+    def pick(self, x: float, y: float, yaw: float, *, ground_z_m: float | None = None, raising: bool = True) -> None:
         """Grasp at (x, y) with the log's axis at ``yaw`` and lift; the grapple is open before."""
-        ground = self.w.profile.workspace.ground_z_m
-        above = self.inverse((x, y, 0.9))
-        rot = (yaw - math.pi / 2 - above["slew"] + math.pi / 2) % math.pi - math.pi / 2
-        self.move({**above, "rot": rot})
+        ground = self.w.profile.workspace.ground_z_m if ground_z_m is None else ground_z_m
+        over, up = ground + 2.3, ground + 3.1
+        above = self.inverse((x, y, over))
+        self.move({**above, "rot": self.rotator_for(yaw, above["slew"])})
         self.wait(0.8)
         low = ground + CLEARANCE_M + self.tip_below_pin(0.0)
-        self.line((x, y, 0.9), (x, y, low))
+        self.line((x, y, over), (x, y, low))
         self.wait(0.5)
-        self.spools.grapple = -0.7
+        self.commands["grapple"] = -0.7
         z, still = low, 0
         for _ in range(round(8.0 / STEP_S)):
             angle = self.w.tong_angle
@@ -122,27 +125,26 @@ class Driver:
             still = 0 if moving or angle < 0.2 else still + 1
             if still > 0.3 / STEP_S:
                 break
-        self.spools.grapple = -0.2
-        self.line((x, y, z), (x, y, 1.7))
+        self.commands["grapple"] = -0.2
+        self.line((x, y, z), (x, y, up))
         self.wait(1.0)
 
     def place(self) -> None:
         """Carry to the middle of the bunk, lower, open, go up."""
         b = self.w.profile.bunk
         x, y, _ = from_bunk(b, (0.0, 0.0, 0.0))
-        above = self.inverse((x, y, 1.9))
-        rot = (b.yaw_rad - math.pi / 2 - above["slew"] + math.pi / 2) % math.pi - math.pi / 2
-        self.move({**above, "rot": rot})
+        high, low = b.floor_z_m + 2.9, b.floor_z_m + 1.35
+        above = self.inverse((x, y, high))
+        self.move({**above, "rot": self.rotator_for(b.yaw_rad, above["slew"])})
         self.wait(1.0)
-        low = b.floor_z_m + 1.30
-        self.line((x, y, 1.9), (x, y, low))
+        self.line((x, y, high), (x, y, low))
         self.wait(0.5)
-        self.spools.grapple = 1.0
+        self.commands["grapple"] = 1.0
         for _ in range(round(6.0 / STEP_S)):
             self.tick({})
             if self.w.tong_angle < 0.45:
                 break
-        self.spools.grapple = 0.0
+        self.commands["grapple"] = 0.0
         self.wait(0.5)
-        self.line((x, y, low), (x, y, 1.7))
+        self.line((x, y, low), (x, y, high))
         self.wait(1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import socket
@@ -12,6 +13,7 @@ import pytest
 
 from can_dbc.bus import open_bus
 from can_dbc.canopen import NmtCommand, nmt_frame, sync_frame
+from can_dbc.codec import load
 from machine.load import load_profile
 from sim.__main__ import LivePlant, main
 from sim.plant import Plant
@@ -33,7 +35,7 @@ def live():
     with open_bus(channel) as far, open_bus(channel) as near, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.settimeout(5.0)
         udp.connect(("127.0.0.1", port))
-        shell = LivePlant(plant, near, port)
+        shell = LivePlant(plant, {"crane0": near}, port)
         thread = threading.Thread(target=shell.run, daemon=True)
         thread.start()
         yield shell, far, udp, thread
@@ -87,6 +89,8 @@ def test_requests_show_the_truth_and_press_the_button(live):
     [
         (["--profile", "palms_472", "--bus", "crane0=virtual:x"], 3, "palms_472"),
         (["--bus", "crane9=virtual:x"], 3, "crane9"),
+        (["--profile", "aoro_fc8", "--bus", "crane0=virtual:x"], 3, "--bus mach0"),
+        (["--bus", "crane0=virtual:x", "--scene", "tower"], 3, "tower"),
         (["--bus", "crane0=virtual:x", "--logs", "90"], 3, "fewer logs"),
         (["--bus", "crane0=nonsense"], 4, "nonsense"),
     ],
@@ -101,3 +105,32 @@ def test_a_bad_bus_argument_is_a_usage_error(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["--bus", "crane0"])
     assert stop.value.code == 2 and "NAME=ADDRESS" in capsys.readouterr().err
+
+
+def test_a_carrier_lives_on_two_buses_and_answers_its_page():
+    profile, port = load_profile("aoro_fc8"), free_port()
+    channels = {name: f"virtual:{name}-{next(_channels)}" for name in ("crane0", "mach0")}
+    plant = Plant(profile, scene=())
+    with contextlib.ExitStack() as stack:
+        far = {name: stack.enter_context(open_bus(channel)) for name, channel in channels.items()}
+        near = {name: stack.enter_context(open_bus(channel)) for name, channel in channels.items()}
+        udp = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        udp.settimeout(10.0)
+        udp.connect(("127.0.0.1", port))
+        shell = LivePlant(plant, near, port)
+        thread = threading.Thread(target=shell.run, daemon=True)
+        thread.start()
+        veh_stat = load("machine").message("VehStat").key
+        assert veh_stat in until(far["mach0"], {veh_stat})
+        assert {0x190, 0x390} <= until(far["crane0"], {0x190, 0x390})
+        assert not until(far["crane0"], {0x190}) & {veh_stat}
+        assert ask(udp, "scene")["title"] == profile.title and "rear" in ask(udp, "view")["poses"]
+        assert len(ask(udp, "vehicle")["wheel_loads_n"]) == 4
+        udp.send(json.dumps({"op": "lever", "name": "drive", "value": "0.5"}).encode())
+        assert json.loads(udp.recv(65536)) == {"ok": True}
+        for value, words in (("fast", "fast"), ("7", "7")):
+            udp.send(json.dumps({"op": "lever", "name": "drive", "value": value}).encode())
+            assert words in json.loads(udp.recv(65536))["error"]
+        shell.stop()
+        thread.join(5.0)
+    plant.close()

@@ -1,0 +1,153 @@
+"""What stereo matching makes of exact depth.
+
+Depth z errs by about z^2 sigma_d / (f B), alike over neighbouring pixels, so that averaging a small window does not
+remove it, and anew in every frame; a scale error stays for the run.  Near surfaces grow over what is behind them;
+what one eye alone sees, blots on surfaces, more of them where there is no texture, and what lies outside the
+camera's range have no depth: NaN.  Noise is looked up in a periodic tile shifted by seeded offsets.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from functools import cache
+from statistics import NormalDist
+from typing import Final
+
+import numpy as np
+from numba import njit
+
+from machine.profile import Camera
+from sim.camera.geometry import Intrinsics
+from sim.camera.render import Picture
+from sim.truth.sensors import CameraTruth
+
+TILE_PX: Final = 1024
+_MASK = TILE_PX - 1
+BLOT_PX: Final = 12.0  # how wide a hole in a surface is
+PATCH_PX: Final = 16  # texture is judged over squares this wide
+PLAIN_STEP: Final = 5.0  # mean step of green from pixel to pixel below which a square has no texture
+
+
+@cache
+def _tile(length_px: float, seed: int) -> np.ndarray:
+    """Periodic Gaussian noise (TILE_PX, TILE_PX), unit variance, autocorrelation 1/e at ``length_px``."""
+    f = np.fft.fftfreq(TILE_PX)
+    reach = np.exp(-2.0 * (math.pi * length_px / 2.0) ** 2 * (f[:, None] ** 2 + f[None, : TILE_PX // 2 + 1] ** 2))
+    white = np.random.default_rng(seed).standard_normal((TILE_PX, TILE_PX))
+    tile = np.fft.irfft2(np.fft.rfft2(white) * reach, (TILE_PX, TILE_PX))
+    return ((tile - tile.mean()) / tile.std()).astype(np.float32)
+
+
+@njit(cache=True)
+def _plain(rgb):
+    """For squares of PATCH_PX, whether they lack texture."""
+    rows, columns = rgb.shape[0] // PATCH_PX + 1, rgb.shape[1] // PATCH_PX + 1
+    plain = np.zeros((rows, columns), np.bool_)
+    for i in range(rows):
+        for j in range(columns):
+            total, count = 0, 0
+            for row in range(i * PATCH_PX, min((i + 1) * PATCH_PX, rgb.shape[0]), 4):
+                for x in range(j * PATCH_PX, min((j + 1) * PATCH_PX, rgb.shape[1] - 2)):
+                    total += abs(np.int64(rgb[row, x + 2, 1]) - np.int64(rgb[row, x, 1]))
+                    count += 1
+            plain[i, j] = total < PLAIN_STEP * count
+    return plain
+
+
+@njit(cache=True)
+def _stamp(out, row, x, s, radius, margin):
+    """Let a near surface cover a disc of what is clearly behind it."""
+    height, width = out.shape
+    r2 = radius * radius
+    whole = int(radius)
+    for dy in range(-whole, whole + 1):
+        y = row + dy
+        if y < 0 or y >= height:
+            continue
+        half = int(math.sqrt(r2 - dy * dy))
+        for k in range(max(0, x - half), min(width - 1, x + half) + 1):
+            if out[y, k] < s - margin:
+                out[y, k] = s
+
+
+@njit(cache=True)
+def _fatten(inverse, jump, lowest, highest, tile, shift_row, shift_column):
+    """Inverse depth whose near surfaces are wider at every jump of more than ``jump``."""
+    height, width = inverse.shape
+    out = inverse.copy()
+    for row in range(height - 1):
+        for x in range(width - 1):
+            s = inverse[row, x]
+            right, down = inverse[row, x + 1] - s, inverse[row + 1, x] - s
+            # Every other pixel of an edge is enough: the discs are wider than that.
+            if (row + x) & 1 == 0 and (abs(right) > jump or abs(down) > jump):
+                n = tile[(row + shift_row) & _MASK, (x + shift_column) & _MASK]
+                share = min(max(0.5 + 0.4 * n, 0.0), 1.0)
+                radius = lowest + (highest - lowest) * share
+                if abs(right) > jump:
+                    near = x + 1 if right > 0.0 else x
+                    _stamp(out, row, near, inverse[row, near], radius, 0.5 * abs(right))
+                if abs(down) > jump:
+                    near = row + 1 if down > 0.0 else row
+                    _stamp(out, near, x, inverse[near, x], radius, 0.5 * abs(down))
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _matched(
+    inverse, fb, zoom, sigma, scale, z_min, z_max, tile, blots, cut, plain_cut, plain, shift, out
+):  # fmt: skip
+    """Noisy depth of ``inverse``; ``fb`` is focal length times baseline [px m], ``zoom`` delivered per native pixel."""
+    height, width = inverse.shape
+    root = sigma / math.sqrt(2.0)
+    for row in range(height):
+        a, b = tile[(row + shift[0]) & _MASK], tile[(row + shift[2]) & _MASK]
+        c = blots[(row + shift[4]) & _MASK]
+        hidden = 1e9
+        for x in range(width - 1, -1, -1):
+            s = inverse[row, x]
+            disparity = fb * s
+            other_eye = x / zoom - disparity
+            seen = other_eye <= hidden + 0.75
+            hidden = min(hidden, other_eye)
+            first, second = a[(x + shift[1]) & _MASK], b[(x + shift[3]) & _MASK]
+            z = scale * fb / (disparity + root * (first + second))
+            blot = c[(x + shift[5]) & _MASK]
+            known = s > 0.0 and seen and z_min <= z <= z_max and blot < cut
+            if known and blot > plain_cut:
+                # The squares' borders are frayed, or one would see them.
+                i = min(max(row + int(5.0 * first), 0), height - 1) // PATCH_PX
+                j = min(max(x + int(5.0 * second), 0), width - 1) // PATCH_PX
+                known = not plain[i, j]
+            out[row, x] = z if known else np.nan
+
+
+class StereoNoise:
+    """The depth errors of one camera in one run.  ``scale`` is the run's scale error (1 = none)."""
+
+    def __init__(self, camera: Camera, truth: CameraTruth, seed: int | str) -> None:
+        self._camera, self._truth, self._seed = camera, truth, seed
+        rng = random.Random(f"stereo {seed}")
+        self.scale = 1.0 + rng.choice((-1.0, 1.0)) * rng.uniform(*truth.scale_bias)
+        normal = NormalDist()
+        self._cut = normal.inv_cdf(1.0 - truth.hole_share)
+        self._plain_cut = normal.inv_cdf(1.0 - truth.plain_hole_share)
+
+    def apply(self, picture: Picture, pinhole: Intrinsics, frame: int) -> np.ndarray:
+        """Depth (H, W) float32 [m] as the camera's stereo gives it, NaN where it has none; ``pinhole`` is the picture's
+        (it may be smaller than the camera's own), ``frame`` picks this frame's errors."""
+        camera, truth = self._camera, self._truth
+        rng = random.Random(f"stereo {self._seed} {frame}")
+        shift = np.array([rng.randrange(TILE_PX) for _ in range(8)])
+        fb = camera.fx_px * camera.baseline_m
+        tile, blots = _tile(truth.correlation_px, 1), _tile(BLOT_PX, 2)
+        inverse = np.nan_to_num(1.0 / picture.depth_m, copy=False, nan=0.0)
+        wide = _fatten(inverse, truth.edge_jump_px / fb, *truth.edge_px, blots, shift[6], shift[7])
+        out = np.empty_like(inverse)
+        _matched(
+            wide, fb, pinhole.fx_px / camera.fx_px, truth.disparity_sigma_px, self.scale,
+            camera.depth_min_m, camera.depth_max_m, tile, blots, self._cut, self._plain_cut, _plain(picture.rgb),
+            shift, out,
+        )  # fmt: skip
+        return out

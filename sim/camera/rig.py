@@ -1,0 +1,111 @@
+"""The cameras of a machine: where they really are, what they deliver, and what their maker's plate says.
+
+A ``Frame`` carries both poses: the nominal mount, all that autonomy may know, and the true one, for judging.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from machine.profile import Profile
+from sim.camera.clutter import CLEARING, YARD, Clutter, Density
+from sim.camera.geometry import Intrinsics, View, intrinsics, mount_view
+from sim.camera.noise import StereoNoise
+from sim.camera.render import Look, Picture, render
+from sim.camera.scene import Scene, WorldScenes
+from sim.shape import Vector
+from sim.truth import Truth
+from sim.world import World
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """What the profile says: a link, and the body frame (x forward, y left, z up) in it."""
+
+    link: str
+    position_m: Vector
+    rpy_rad: Vector
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One delivered picture: rgb (H, W, 3) uint8; depth_m (H, W) float32, optical z, NaN = unknown (a hole, too near,
+    too far, sky, letterbox bar); ``stamp_ns`` when it was taken; ``true_position_m`` (3,) and ``true_rotation`` (3, 3)
+    of the optical frame in the world are the judge's alone."""
+
+    name: str
+    stamp_ns: int
+    rgb: np.ndarray
+    depth_m: np.ndarray
+    intrinsics: Intrinsics
+    mount: Mount
+    true_position_m: np.ndarray
+    true_rotation: np.ndarray
+
+
+class CameraRig:
+    """All cameras of ``profile``, mounted and erring as ``truth`` says; ``seed`` draws the day's light, the clutter
+    and every frame's noise.
+
+    ``source`` is a World or a function that gives the Scene now.  ``size_px`` letterboxes frames into a square (paper
+    B: 608), None keeps the camera's own size.  ``density`` is the clutter (of a World only).
+    """
+
+    def __init__(
+        self,
+        source: World | Callable[[], Scene],
+        profile: Profile,
+        truth: Truth,
+        seed: int,
+        size_px: int | None = 608,
+        density: Density | None = None,
+    ) -> None:
+        self.look = Look.random(seed)
+        self._profile, self._truth, self._size_px = profile, truth, size_px
+        self._scenes = WorldScenes(source) if isinstance(source, World) else source
+        self._clutter: Clutter | None = None
+        if isinstance(self._scenes, WorldScenes):
+            litter = density or (YARD if self._scenes.style == "asphalt" else CLEARING)
+            self._clutter = Clutter(self._scenes.ground, litter, seed)
+        self._noise = {
+            name: StereoNoise(camera, truth.cameras[name], f"{name} {seed}") for name, camera in profile.cameras.items()
+        }
+        self._counts = dict.fromkeys(profile.cameras, 0)
+
+    def view(self, name: str, scene: Scene) -> View:
+        """Where a camera really is; its own pinhole."""
+        camera, truth = self._profile.cameras[name], self._truth.cameras[name]
+        pose, error = scene.links[camera.link], (truth.mount_position_m, truth.mount_rpy_rad)
+        return mount_view(pose, intrinsics(camera), camera.position_m, camera.rpy_rad, *error)
+
+    def scene(self, name: str) -> Scene:
+        """What there is to see now, with the clutter near a camera."""
+        scene = self._scenes()
+        if self._clutter is not None:
+            x, y, _ = scene.links[self._profile.cameras[name].link][0]
+            scene = replace(scene, rods=scene.rods + self._clutter.around(x, y))
+        return scene
+
+    def picture(self, name: str) -> tuple[Scene, View, Picture]:
+        """What an ideal camera in the true place sees, for labels: scene, view and picture without bars or noise."""
+        scene = self.scene(name)
+        view = self.view(name, scene)
+        if self._size_px is not None:
+            view = View(view.intrinsics.letterbox(self._size_px).inner, view.position_m, view.rotation)
+        return scene, view, render(scene, view, self.look, self._counts[name])
+
+    def frame(self, name: str, now_ns: int) -> Frame:
+        """The next frame of camera ``name``; KeyError when the profile has none of that name."""
+        camera = self._profile.cameras[name]
+        _, view, picture = self.picture(name)
+        rgb, pin = picture.rgb, view.intrinsics
+        depth = self._noise[name].apply(picture, pin, self._counts[name])
+        self._counts[name] += 1
+        if self._size_px is not None:
+            box = intrinsics(camera).letterbox(self._size_px)
+            depth, rgb, pin = box.pad(depth, np.nan), box.pad(rgb, 0), box.outer
+        mount = Mount(camera.link, camera.position_m, camera.rpy_rad)
+        return Frame(name, now_ns, rgb, depth, pin, mount, view.position_m, view.rotation)

@@ -1,0 +1,46 @@
+"""Local metres to WGS-84: a point in the east-north-up frame of a site, as latitude, longitude and height.
+
+Exact to far below a millimetre near the surface: rotation into the Earth-centred frame, then one step of Bowring's
+formula (B. R. Bowring, Survey Review 1976).  Angles in degrees, lengths in m, heights above the ellipsoid.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+A: Final = 6378137.0
+F: Final = 1.0 / 298.257223563
+B: Final = A * (1.0 - F)
+E2: Final = F * (2.0 - F)
+EP2: Final = E2 / (1.0 - E2)
+Geodetic = tuple[float, float, float]
+
+
+class Site:
+    """The local frame whose origin lies at a latitude, longitude and height; x east, y north, z up."""
+
+    def __init__(self, lat_deg: float, lon_deg: float, height_m: float = 0.0) -> None:
+        lat, lon = math.radians(lat_deg), math.radians(lon_deg)
+        self._sin_lat, self._cos_lat, self._sin_lon, self._cos_lon = (
+            math.sin(lat),
+            math.cos(lat),
+            math.sin(lon),
+            math.cos(lon),
+        )
+        n = A / math.sqrt(1.0 - E2 * self._sin_lat**2)
+        across = (n + height_m) * self._cos_lat
+        self._origin = (across * self._cos_lon, across * self._sin_lon, (n * (1.0 - E2) + height_m) * self._sin_lat)
+
+    def geodetic(self, east_m: float, north_m: float, up_m: float) -> Geodetic:
+        """Latitude and longitude [deg] and height [m] of a local point."""
+        out = self._cos_lat * up_m - self._sin_lat * north_m
+        x = self._origin[0] + self._cos_lon * out - self._sin_lon * east_m
+        y = self._origin[1] + self._sin_lon * out + self._cos_lon * east_m
+        z = self._origin[2] + self._sin_lat * up_m + self._cos_lat * north_m
+        p = math.hypot(x, y)
+        parametric = math.atan2(z * A, p * B)
+        lat = math.atan2(z + EP2 * B * math.sin(parametric) ** 3, p - E2 * A * math.cos(parametric) ** 3)
+        s, c = math.sin(lat), math.cos(lat)
+        height = p * c + z * s - A * math.sqrt(1.0 - E2 * s * s)
+        return math.degrees(lat), math.degrees(math.atan2(y, x)), height

@@ -1,0 +1,87 @@
+"""The swing-arm controller (source address 30h): spool commands of the four arms and the two float valves.
+
+The spools follow ArmCmdA and the float valves ArmCmdB while both (E2E good, ArmKey 0xA) are at most 100 ms old and
+the emergency stop is released.  Otherwise the arms hold: spools neutral, float valves closed.  A loss while active,
+and a command that opens both float valves (which would let the machine roll), are a fault until fresh frames disarm.
+It reports the heights, which the controller's own loop closes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+
+from can_dbc.codec import Database
+from sim.nodes import Outbox
+from sim.nodes.j1939 import J1939Node
+from sim.nodes.traffic import ARM_KEY, MS, Every, ProtectedInput, ProtectedMessage
+
+ADDRESS = 0x30
+SUSPENSION_FUNCTION = 21  # J1939 NAME function of a suspension system controller
+COMMAND_NS = 100 * MS
+CYCLE_NS = 20 * MS
+ARMS = 4
+
+
+class ArmState(IntEnum):
+    """ArmHeightA.State."""
+
+    HOLD = 0
+    ACTIVE = 1
+    FAULT = 3
+
+
+class ArmNode(J1939Node):
+    """``spools`` (-1..1, + raises the frame; fl fr rl rr), ``float_front`` and ``float_rear`` are its outputs now; the
+    plant fills ``heights_mm`` relative to mid travel, ``roll_deg`` (+ right side down) and ``pitch_deg`` (+ nose up).
+    """
+
+    def __init__(self, machine: Database, outbox: Outbox, pilot_on: Callable[[], bool]) -> None:
+        super().__init__(ADDRESS, SUSPENSION_FUNCTION, machine, outbox)
+        self._pilot_on = pilot_on
+        self._a, self._b = ProtectedInput(machine, "ArmCmdA"), ProtectedInput(machine, "ArmCmdB")
+        self._inputs = {i.key: i for i in (self._a, self._b)}
+        self._height_a, self._height_b = (
+            ProtectedMessage(machine, "ArmHeightA"),
+            ProtectedMessage(machine, "ArmHeightB"),
+        )
+        self._period = Every(CYCLE_NS, phase_ns=5 * MS)
+        self.heights_mm = (0.0,) * ARMS
+        self.roll_deg = self.pitch_deg = 0.0
+        self.state = ArmState.HOLD
+        self._hold()
+
+    def _hold(self) -> None:
+        self.spools = [0.0] * ARMS
+        self.float_front = self.float_rear = False
+
+    def receive(self, key: int, data: bytes, now_ns: int) -> None:
+        source = self._inputs.get(key)
+        if source is None:
+            super().receive(key, data, now_ns)
+        elif source.take(data, now_ns) and source.get("ArmKey") != ARM_KEY:
+            self.state = ArmState.HOLD
+
+    def decide(self, now_ns: int) -> None:
+        """Set the outputs for this physics step."""
+        a, b = self._a, self._b
+        ready = (
+            a.fresh(now_ns, COMMAND_NS) and b.fresh(now_ns, COMMAND_NS) and self._pilot_on() and not self.address_lost
+        )
+        armed = a.get("ArmKey") == b.get("ArmKey") == ARM_KEY
+        front, rear = b.get("FloatFront") == 1, b.get("FloatRear") == 1
+        if (self.state is ArmState.ACTIVE and not ready) or (ready and armed and front and rear):
+            self.state = ArmState.FAULT
+        elif self.state is not ArmState.FAULT:
+            self.state = ArmState.ACTIVE if ready and armed else ArmState.HOLD
+        if self.state is not ArmState.ACTIVE:
+            self._hold()
+            return
+        self.spools = [(percent or 0.0) / 100.0 for percent in a.last(ARMS)]
+        self.float_front, self.float_rear = front, rear
+
+    def cycle(self, now_ns: int) -> None:
+        if self._period.due(now_ns):
+            self.outbox.append(self._height_a.frame(self.state, *self.heights_mm))
+            floats = (int(self.float_front), int(self.float_rear))
+            self.outbox.append(self._height_b.frame(self.state, *floats, self.roll_deg, self.pitch_deg))

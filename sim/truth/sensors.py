@@ -1,0 +1,92 @@
+"""Errors of the sensors that look outwards."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from sim.truth.spread import Draw
+
+Vector = tuple[float, float, float]
+
+
+class CameraTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One stereo camera: how it is really mounted and how its depth errs (perception.md 5, machines.md 8).
+
+    ``mount_position_m`` and ``mount_rpy_rad`` are the true body frame less the profile's, in the profile's body frame;
+    an individual is off by at most ``mount_bound_m`` and ``mount_bound_rad``.  Depth errs by ``disparity_sigma_px`` of
+    disparity (of the camera's own pixels), alike over ``correlation_px`` delivered pixels (1/e), and by a scale drawn
+    between the two ``scale_bias`` for each run, of either sign.  Where disparity jumps by more than ``edge_jump_px``
+    the nearer surface grows by between the two ``edge_px`` delivered pixels.  ``hole_share`` of a textured surface
+    and ``plain_hole_share`` of one without texture has no depth.
+    """
+
+    mount_position_m: Vector
+    mount_rpy_rad: Vector
+    mount_bound_m: float
+    mount_bound_rad: float
+    disparity_sigma_px: float
+    correlation_px: float
+    scale_bias: tuple[float, float]
+    edge_jump_px: float
+    edge_px: tuple[float, float]
+    hole_share: float
+    plain_hole_share: float
+
+    def sampled(self, draw: Draw) -> CameraTruth:
+        """The camera of an individual: shifted and turned some way, its matching better or worse by a third."""
+
+        def off(nominal: Vector, bound: float) -> Vector:
+            way = [draw.rng.gauss(0.0, 1.0) for _ in range(3)]
+            size = bound * draw.rng.random() / math.hypot(*way)
+            x, y, z = (n + size * w for n, w in zip(nominal, way, strict=True))
+            return (x, y, z)
+
+        return msgspec.structs.replace(
+            self,
+            mount_position_m=off(self.mount_position_m, self.mount_bound_m),
+            mount_rpy_rad=off(self.mount_rpy_rad, self.mount_bound_rad),
+            disparity_sigma_px=self.disparity_sigma_px * draw.factor(0.35),
+        )
+
+
+class FixTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One quality of position: white and slowly wandering horizontal error [m, root mean square], and what the
+    receiver says about it: dilution of precision and satellites in use.
+    """
+
+    noise_m: float
+    wander_m: float
+    hdop: float
+    satellites: int
+
+
+class GnssTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A dual-antenna RTK receiver (machines.md 8).
+
+    ``fixes`` are the qualities by name (rtk_fixed, rtk_float, dgnss, single).  ``wander_s`` is the correlation time of
+    the wander; heights err ``height_factor`` times as much.  ``phase_noise_m`` per antenna makes the heading noise:
+    sqrt(2) phase_noise / baseline.  A solution leaves the receiver between the two ``latency_s`` after its epoch.
+    ``main_offset_m`` and ``aux_offset_m`` are where the antennas really are, less where the profile has them (front
+    frame).  ``datum_m`` is the ellipsoidal height of the site's origin, ``geoid_m`` the geoid above the ellipsoid.
+    """
+
+    fixes: dict[str, FixTruth]
+    wander_s: float
+    height_factor: float
+    phase_noise_m: float
+    speed_noise_m_s: float
+    rate_noise_rad_s: float
+    attitude_noise_rad: float
+    latency_s: tuple[float, float]
+    main_offset_m: Vector
+    aux_offset_m: Vector
+    datum_m: float
+    geoid_m: float
+
+    def sampled(self, draw: Draw) -> GnssTruth:
+        """The receiver of an individual: antennas mounted a little beside their places."""
+        bound = draw.spread.antenna_m
+        main, aux = (tuple(x + draw.within(bound) for x in at) for at in (self.main_offset_m, self.aux_offset_m))
+        return msgspec.structs.replace(self, main_offset_m=main, aux_offset_m=aux)

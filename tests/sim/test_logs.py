@@ -1,0 +1,205 @@
+"""Logs as bodies: they lie still from the start, taper and bow are felt, a bunk holds them, a touch wakes them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import pytest
+
+from machine.load import load_profile
+from sim.bunk import bunk_link, bunk_shapes, from_bunk, to_bunk
+from sim.log_shape import LogSpec, mass_of
+from sim.logs import Yard
+from sim.physics import BulletClient, new_client
+from sim.scene import arrangement
+from sim.shape import UNIT
+from sim.terrain import Terrain
+from sim.truth import load_truth
+
+MACHINES = ("palms_471", "aoro_fc8")
+PROFILES = {name: load_profile(name) for name in MACHINES}
+TRUTHS = {name: load_truth("nominal", 0, name) for name in MACHINES}
+STEP_S = 0.0025
+
+
+class Stand:
+    """A yard on ground of its own, without a machine; the bunk stands at ``base``."""
+
+    def __init__(self, scene: tuple[LogSpec, ...], machine: str = "palms_471", kind: str = "flat") -> None:
+        profile, truth = PROFILES[machine], TRUTHS[machine]
+        ground = (kind, 0, profile.workspace.ground_z_m if profile.carrier is None else 0.0)
+        self.base = ((0.0, 0.0, 0.0), UNIT) if profile.carrier is None else ((0.0, 0.0, 1.4), UNIT)
+        self.client: BulletClient = new_client()
+        self.client.setGravity(0.0, 0.0, -9.81)
+        self.client.setPhysicsEngineParameter(
+            fixedTimeStep=STEP_S, numSolverIterations=40, enableConeFriction=1, deterministicOverlappingPairs=1
+        )
+        self.terrain = Terrain(*ground)
+        self.terrain.add_to(self.client, truth.contact.ground_friction)
+        if profile.carrier is None:
+            self._boxes(profile, truth)
+        self.yard = Yard(self.client, profile, truth, scene, Terrain(*ground), self.base)
+
+    def _boxes(self, profile, truth) -> None:
+        p = self.client
+        for s in bunk_shapes(profile):
+            shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[x / 2 for x in s.size_m])
+            box = p.createMultiBody(0.0, shape, basePosition=s.position_m, baseOrientation=s.quaternion)
+            p.changeDynamics(box, -1, lateralFriction=truth.contact.bunk_friction)
+
+    def awake(self) -> None:
+        """Let no log sleep, whatever it does."""
+        for log in self.yard.logs:
+            self.client.changeDynamics(log, -1, activationState=self.client.ACTIVATION_STATE_DISABLE_SLEEPING)
+
+    def fastest(self, seconds: float) -> float:
+        top = 0.0
+        for i in range(round(seconds / STEP_S)):
+            self.client.stepSimulation()
+            if i % 20 == 0:
+                top = max(top, max(log.speed_m_s for log in self.yard.states()))
+        return top
+
+
+@pytest.fixture
+def stands() -> Iterator[list[Stand]]:
+    made: list[Stand] = []
+    yield made
+    for stand in made:
+        stand.client.disconnect()
+
+
+def of(kind: str, seed: int, logs: int, machine: str = "palms_471") -> tuple[LogSpec, ...]:
+    return arrangement(kind, PROFILES[machine], TRUTHS[machine].wood, seed, logs)
+
+
+@pytest.mark.parametrize(
+    ("kind", "logs", "machine"),
+    [("separate", 3, "palms_471"), ("crossed", 3, "palms_471"), ("pile", 6, "palms_471"), ("pile", 5, "aoro_fc8")],
+)
+def test_logs_lie_still_from_the_start_and_in_nothing(stands, kind, logs, machine):
+    for seed in range(2):
+        stand = Stand(of(kind, seed, logs, machine), machine)
+        stands.append(stand)
+        stand.client.performCollisionDetection()
+        assert all(c[8] > -0.003 for log in stand.yard.logs for c in stand.client.getContactPoints(log))
+        before = [log.position_m for log in stand.yard.states()]
+        assert stand.fastest(1.0) < 5e-3
+        after = [log.position_m for log in stand.yard.states()]
+        assert max(math.dist(a, b) for a, b in zip(before, after, strict=True)) < 2e-3
+
+
+def test_even_without_sleep_a_pile_stands(stands):
+    stand = Stand(of("pile", 0, 6))
+    stands.append(stand)
+    stand.awake()
+    assert stand.fastest(3.0) < 5e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "logs"), [("separate", 3), ("pile", 6), ("bunk", 20)])
+def test_logs_rest_for_a_minute(stands, kind, logs):
+    stand = Stand(of(kind, 1, logs))
+    stands.append(stand)
+    assert stand.fastest(60.0) < 5e-3
+
+
+def test_the_same_scene_comes_to_rest_in_the_same_place_to_the_bit(stands):
+    stands += [Stand(of("pile", 4, 5)), Stand(of("pile", 4, 5))]
+    one, two = (stand.yard.states() for stand in stands)
+    assert one == two
+
+
+def test_a_tapered_log_rests_with_its_axis_falling_to_the_thin_end_and_a_bowed_one_on_its_side(stands):
+    stand = Stand((LogSpec(-2.0, 4.0, 0.3, 2.6, 0.2, 600.0, 0.012, 0.02, z_m=0.004, roll_rad=0.4),))
+    stands.append(stand)
+    (log,) = stand.yard.states()
+    assert log.axis[2] == pytest.approx(-0.006, rel=0.25)
+    p = stand.client
+    turn = p.getMatrixFromQuaternion(log.quaternion)
+    assert abs(turn[6]) < 0.15  # the side it bows to lies level
+    butt, top = log.ends_m
+    middle = [(a + b) / 2 for a, b in zip(butt, top, strict=True)]
+    assert math.dist(middle, log.position_m) == pytest.approx(log.sweep_m, rel=1e-6)
+    assert math.dist(butt, top) == pytest.approx(2.6) and log.sweep_m == pytest.approx(0.052)
+
+
+def test_bullet_moves_the_real_wood(stands):
+    spec = LogSpec(-2.0, 4.0, 0.3, 2.6, 0.2, 600.0, 0.012, 0.03, z_m=0.004, roll_rad=1.57)
+    stand = Stand((spec,))
+    stands.append(stand)
+    p, wood = stand.client, mass_of(spec)
+    mass, _, inertia, *_ = p.getDynamicsInfo(stand.yard.logs[0], -1)
+    assert mass == wood.mass_kg == stand.yard.masses[0] and inertia == pytest.approx(wood.inertia_kg_m2)
+    (log,) = stand.yard.states()
+    com = p.multiplyTransforms(log.position_m, log.quaternion, wood.com_m, UNIT)[0]
+    assert com == pytest.approx(p.getBasePositionAndOrientation(stand.yard.logs[0])[0], abs=1e-6)
+
+
+@pytest.mark.parametrize("diameter", [0.1, 0.3])
+def test_a_rolling_log_comes_to_a_stop(stands, diameter):
+    stand = Stand((LogSpec(-2.0, 4.0, 0.0, 2.6, diameter, 600.0, z_m=0.004),))
+    stands.append(stand)
+    stand.yard.wake()
+    v = 0.3
+    stand.client.resetBaseVelocity(stand.yard.logs[0], [0.0, v, 0.0], [-2 * v / diameter, 0.0, 0.0])
+    start = stand.yard.states()[0].position_m
+    stand.fastest(3.0)
+    log = stand.yard.states()[0]
+    assert log.speed_m_s < 5e-3 and 0.02 < math.dist(start, log.position_m) < 0.6
+
+
+def test_a_touch_wakes_a_sleeping_log(stands):
+    stand = Stand(of("single", 0, 1))
+    stands.append(stand)
+    p = stand.client
+    assert stand.fastest(0.1) == 0.0
+    x, y, z = stand.yard.states()[0].position_m
+    shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.1, 0.1, 0.1])
+    p.createMultiBody(80.0, shape, basePosition=[x, y + 0.05, z + 0.6])
+    assert stand.fastest(0.6) > 0.05
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+def test_a_full_bunk_holds_its_logs(stands, machine):
+    stand = Stand(of("bunk", 1, 20, machine), machine)
+    stands.append(stand)
+    b = PROFILES[machine].bunk
+    p = stand.client
+    inward = p.invertTransform(*stand.base)
+    for log in stand.yard.states():
+        x, y, z = to_bunk(b, p.multiplyTransforms(*inward, log.position_m, UNIT)[0])
+        assert abs(x) < b.length_m / 2 and abs(y) < b.width_m / 2
+        assert b.floor_z_m + log.diameter_m / 2 - 0.02 < z < b.floor_z_m + b.stake_height_m
+
+
+@pytest.mark.parametrize("kind", ["rough", "slope"])
+def test_logs_lie_on_uneven_ground(stands, kind):
+    stand = Stand(of("row", 0, 3, "aoro_fc8"), "aoro_fc8", kind)
+    stands.append(stand)
+    for log in stand.yard.states():
+        air = [x[2] - log.diameter_m / 2 - stand.terrain.height(x[0], x[1]) for x in (log.position_m, *log.ends_m)]
+        assert min(air) < 0.03 and max(air) < 0.3 and min(air) > -0.05
+    assert stand.fastest(0.5) < 5e-3
+
+
+def test_logs_in_each_other_and_in_the_bunk_are_refused():
+    a = LogSpec(-2.0, 4.0, 0.0, 2.6, 0.2, 600.0, z_m=0.004)
+    with pytest.raises(ValueError, match=r"log 0 is 0\.\d+ m inside log 1 where they are let go; move it away"):
+        Stand((a, LogSpec(-2.0, 4.1, 0.1, 2.6, 0.2, 600.0, z_m=0.004)))
+    x, y = PROFILES["palms_471"].bunk.center_m
+    with pytest.raises(ValueError, match="inside the machine, the bunk or the ground where they are let go"):
+        Stand((LogSpec(x, y, 0.0, 2.6, 0.2, 600.0, z_m=0.1),))
+
+
+def test_the_bunk_stands_where_the_profile_says_on_either_machine():
+    for machine in MACHINES:
+        profile = PROFILES[machine]
+        b, c = profile.bunk, profile.carrier
+        floor = bunk_shapes(profile)[0]
+        assert floor.link == bunk_link(profile) == ("base" if c is None else "rear")
+        top = floor.position_m[2] + floor.size_m[2] / 2
+        assert top == pytest.approx(b.floor_z_m + (0.0 if c is None else c.crane_base_m[2]))
+        assert to_bunk(b, from_bunk(b, (0.3, -0.2, 0.1))) == pytest.approx((0.3, -0.2, 0.1))
+    assert bunk_shapes(PROFILES["aoro_fc8"])[0].position_m[0] == pytest.approx(-2.8)  # behind the rear axle

@@ -1,0 +1,118 @@
+"""The hidden truth: complete files, bounded individuals, the same one for the same seed."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import sim.truth
+from machine.load import load_profile
+from sim.truth import load_truth
+
+MACHINES = ("palms_471", "aoro_fc8")
+SEEDS = st.integers(0, 2**31)
+machines = pytest.mark.parametrize("machine", MACHINES)
+
+
+def ratios(one, other) -> dict[str, float]:
+    """Field by field, one over other; fields that are zero or no numbers are left out."""
+    fields = {f: (getattr(one, f), getattr(other, f)) for f in one.__struct_fields__}
+    return {f: a / b for f, (a, b) in fields.items() if isinstance(a, float) and b}
+
+
+@machines
+def test_the_truth_is_about_the_joints_of_the_profile(machine):
+    truth, profile = load_truth("nominal", 0, machine), load_profile(machine)
+    assert truth.machine == machine and list(truth.functions)[:6] == [*profile.joints, "grapple"]
+    assert (truth.carrier is None) == (profile.carrier is None) == (len(truth.functions) == 6)
+    encoders = {n for n, j in profile.joints.items() if j.encoder} | ({"articulation"} if profile.carrier else set())
+    assert set(truth.encoders) == encoders and set(truth.cameras) == set(profile.cameras)
+    for name, joint in profile.joints.items():
+        f = truth.functions[name]
+        assert f.cylinder.arm_at[0] < joint.lower and f.cylinder.arm_at[-1] > joint.upper
+        assert f.valve.full_speed_plus == pytest.approx(joint.valve.full_speed_plus, rel=0.05)
+        assert f.valve.full_speed_minus == pytest.approx(joint.valve.full_speed_minus, rel=0.05)
+        assert 100 * f.valve.deadband_plus == pytest.approx(joint.valve.deadband_plus_pct, abs=1.0)
+        assert f.valve != joint.valve
+
+
+@machines
+@settings(max_examples=40, deadline=None)
+@given(seed=SEEDS)
+def test_every_individual_lies_within_the_bounds(machine, seed):
+    nominal, one = load_truth("nominal", 0, machine), load_truth("sampled", seed, machine)
+    s = nominal.spread
+    for name, link in one.links.items():
+        factor = link.mass_kg / nominal.links[name].mass_kg
+        assert abs(factor - 1.0) <= s.mass + 1e-9 <= 0.15 + 1e-9
+        assert link.inertia_kg_m2 == pytest.approx([factor * i for i in nominal.links[name].inertia_kg_m2])
+    for name, function in one.functions.items():
+        v, ratio = function.valve, ratios(function.valve, nominal.functions[name].valve)
+        assert 0.040 <= v.delay_s <= 0.150
+        assert all(abs(ratio[k] - 1.0) <= 0.20 + 1e-9 for k in ratio if k.startswith(("full_speed", "deadband")))
+        assert 0.008 <= v.hysteresis <= 0.04
+        c, ratio = function.cylinder, ratios(function.cylinder, nominal.functions[name].cylinder)
+        assert all(abs(ratio[k] - 1.0) <= 0.30 + 1e-9 for k in ("coulomb", "stiction", "viscous"))
+        assert c.stiction > c.coulomb and ratio["area_a"] == ratio["dead_volume_m3"] == 1.0
+    supply = ratios(one.supply, nominal.supply)
+    assert abs(supply["pump_flow_m3_s"] - 1.0) <= 0.10 + 1e-9
+    assert 0.7e9 <= one.supply.bulk_modulus_pa <= 1.0e9
+    structure = ratios(one.structure, nominal.structure)
+    assert all(abs(structure[k] - 1.0) <= 0.20 + 1e-9 for k in ("flex_pitch_nm_rad", "flex_roll_nm_rad"))
+    for name, encoder in one.encoders.items():
+        assert abs(encoder.offset) <= s.offset + 1e-12 and 0.0 <= encoder.phase_rad <= 2 * math.pi
+        assert 0.0 <= encoder.eccentricity <= 1.5 * nominal.encoders[name].eccentricity
+
+
+@machines
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS)
+def test_the_same_seed_makes_the_same_individual(machine, seed):
+    one = load_truth("sampled", seed, machine)
+    assert one == load_truth("sampled", seed, machine) != load_truth("sampled", seed + 1, machine)
+    assert load_truth("nominal", seed, machine) == load_truth("nominal", 0, machine) != one
+
+
+def test_another_process_draws_the_same_individual():
+    code = "from sim.truth import load_truth; print(load_truth('sampled', 7, 'aoro_fc8'))"
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert other.stdout.strip() == str(load_truth("sampled", 7, "aoro_fc8")), other.stderr
+
+
+def test_individuals_differ_among_themselves_and_are_near_the_nominal_one_on_average():
+    many = [load_truth("sampled", seed, "palms_471").functions["lift"] for seed in range(200)]
+    nominal = load_truth("nominal", 0, "palms_471").functions["lift"]
+    speeds = [f.valve.full_speed_plus / nominal.valve.full_speed_plus for f in many]
+    assert statistics.fmean(speeds) == pytest.approx(1.0, abs=0.03) and statistics.stdev(speeds) > 0.06
+    delays = [f.valve.delay_s for f in many]
+    assert 0.075 < statistics.fmean(delays) < 0.10 and min(delays) < 0.055 and max(delays) > 0.125
+
+
+def test_parts_draw_independently():
+    one, nominal = load_truth("sampled", 3, "palms_471"), load_truth("nominal", 0, "palms_471")
+    speeds = [f.valve.full_speed_plus / nominal.functions[n].valve.full_speed_plus for n, f in one.functions.items()]
+    assert len({round(s, 9) for s in speeds}) == len(speeds)
+
+
+def test_a_file_of_ones_own_is_read_and_a_bad_one_refused_in_a_sentence(tmp_path):
+    nominal, path = load_truth("nominal", 0, "palms_471"), tmp_path / "mine.toml"
+    text = Path(sim.truth.__file__).with_name("nominal.toml").read_text()
+    path.write_text(text.replace("relief_pa = 19.0e6", "relief_pa = 18.0e6"))
+    mine = load_truth(str(path), 0, "palms_471")
+    assert mine.supply.relief_pa == 18.0e6 and mine.functions == nominal.functions
+    with pytest.raises(ValueError, match="is of machine 'palms_471', not of 'aoro_fc8'"):
+        load_truth(str(path), 0, "aoro_fc8")
+    path.write_text(text.replace("relief_pa", "relieve_pa"))
+    with pytest.raises(ValueError, match=r"mine\.toml.*relie.*use nominal, sampled or a complete TOML file"):
+        load_truth(str(path), 0, "palms_471")
+    with pytest.raises(ValueError, match="no truth for machine 'tractor'; use palms_471, aoro_fc8"):
+        load_truth("nominal", 0, "tractor")
+    with pytest.raises(ValueError, match=r"missing\.toml"):
+        load_truth(str(tmp_path / "missing.toml"), 0, "palms_471")
