@@ -15,6 +15,7 @@ import socket
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from machine.load import ProfileError, load_profile, profile_hash
 
@@ -39,8 +40,6 @@ def serve(
     key_file: Path | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM; raises `Refused`."""
-    import uvicorn
-
     from console.server import Console, create_app
 
     try:
@@ -60,7 +59,22 @@ def serve(
         key=key,
         reports=reports,
     )
-    app = create_app(console, (*allow_hosts, bind))
+    _run(create_app(console, (*allow_hosts, bind)), page, bind)
+
+
+def serve_plant(*, port: int, plant: str, bind: str = "127.0.0.1", allow_hosts: Sequence[str] = ()) -> None:
+    """Serve the view of a simulated plant until SIGINT or SIGTERM; raises `Refused`."""
+    from console.plant_view import create_plant_app
+
+    address = _address(plant, "--plant")
+    assert address is not None
+    _run(create_plant_app(address, (*allow_hosts, bind)), _listen(socket.SOCK_STREAM, bind, port, "--port"), bind)
+
+
+def _run(app: Any, page: socket.socket, bind: str) -> None:
+    """Say where the page is and serve it."""
+    import uvicorn
+
     # A page that keeps its websocket open must not hold up the end.
     config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1, ws="websockets-sansio")
     host = f"[{bind}]" if ":" in bind else bind
@@ -98,7 +112,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The process; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m console", description="The operator's web page.")
     parser.add_argument("--port", type=int, default=8471, help="of the page (default 8471)")
-    parser.add_argument("--report-port", type=int, required=True, help="UDP port of the controller's reports")
+    parser.add_argument("--report-port", type=int, help="UDP port of the controller's reports")
+    parser.add_argument("--plant", metavar="HOST:PORT", help="show the simulated plant that answers there instead")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file")
     parser.add_argument("--controller", metavar="HOST:PORT", help="where commands go; without it the page only watches")
     parser.add_argument("--scene", metavar="HOST:PORT", help="a detector to ask for the logs that lie there")
@@ -106,8 +121,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--allow-host", action="append", default=[], help="a host name to serve besides this machine's")
     parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
     a = parser.parse_args(arguments)
+    if (a.report_port is None) == (a.plant is None):
+        parser.error("give --report-port (the operator's page) or --plant (the view of a simulated plant)")
     signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
     try:
+        if a.plant is not None:
+            serve_plant(port=a.port, plant=a.plant, bind=a.bind, allow_hosts=a.allow_host)
+            return 0
         serve(
             port=a.port,
             report_port=a.report_port,

@@ -1,0 +1,78 @@
+"""The view of a simulated plant: answers relayed, levers only from this machine, a silent plant named."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+
+import pytest
+from starlette.testclient import TestClient
+
+from console.plant_view import create_plant_app
+
+ANSWERS = {"scene": {"title": "a plant"}, "view": {"time_s": 1.5}, "lever": {"ok": True}}
+
+
+@pytest.fixture
+def plant() -> Iterator[tuple[tuple[str, int], list[dict[str, str]]]]:
+    """A stand-in that answers like the plant's request port, and what it was asked."""
+    asked: list[dict[str, str]] = []
+    port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    port.bind(("127.0.0.1", 0))
+
+    def answer() -> None:
+        while True:
+            question, sender = port.recvfrom(4096)
+            request = json.loads(question)
+            if request["op"] == "quit":
+                return
+            asked.append(request)
+            refused = request.get("name") == "boom"
+            reply = {"error": "no lever boom"} if refused else ANSWERS[request["op"]]
+            port.sendto(json.dumps(reply).encode(), sender)
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    yield port.getsockname(), asked
+    port.sendto(b'{"op": "quit"}', port.getsockname())
+    thread.join()
+    port.close()
+
+
+def test_the_page_and_what_never_changes(plant) -> None:
+    with TestClient(create_plant_app(plant[0]), base_url="http://127.0.0.1") as page:
+        assert "simulated plant" in page.get("/plant").text
+        assert page.get("/api/plant").json() == {"title": "a plant"}
+
+
+def test_what_moves_comes_by_itself(plant) -> None:
+    with (
+        TestClient(create_plant_app(plant[0]), base_url="http://127.0.0.1") as page,
+        page.websocket_connect("/ws/plant", headers={"host": "127.0.0.1"}) as ws,
+    ):
+        assert ws.receive_json() == {"time_s": 1.5}
+        assert ws.receive_json() == {"time_s": 1.5}
+
+
+def test_a_lever_goes_to_the_plant_and_its_refusal_comes_back(plant) -> None:
+    with TestClient(create_plant_app(plant[0]), base_url="http://127.0.0.1") as page:
+        assert page.post("/api/plant/lever?name=slew&value=0.6").status_code == 204
+        refused = page.post("/api/plant/lever?name=boom&value=0.6")
+    assert plant[1][0] == {"op": "lever", "name": "slew", "value": "0.6"}
+    assert (refused.status_code, refused.text) == (409, "no lever boom")
+
+
+def test_levers_are_refused_to_other_machines(plant) -> None:
+    with TestClient(create_plant_app(plant[0]), base_url="http://127.0.0.1", client=("192.0.2.7", 50000)) as page:
+        assert page.post("/api/plant/lever?name=slew&value=0.6").status_code == 403
+    assert plant[1] == []
+
+
+def test_a_silent_plant_is_named() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
+        deaf.bind(("127.0.0.1", 0))
+        with TestClient(create_plant_app(deaf.getsockname()), base_url="http://127.0.0.1") as page:
+            answer = page.get("/api/plant")
+    assert answer.status_code == 504 and "does not answer" in answer.text
