@@ -44,6 +44,12 @@ GRAPPLE: Final = (*TONGS, "rotator", "telescope", "stick")
 MOVED_BY: Final = {"grapple": TONGS, "steer": ("articulation",)}
 
 
+def home_of(profile: Profile) -> dict[str, float]:
+    """Where the crane stands at the start; a machine of another name starts like the shipped one of its kind."""
+    kind = "palms_471" if profile.carrier is None else "aoro_fc8"
+    return dict(HOME.get(profile.name, HOME[kind]))
+
+
 class World:
     """The machine and its surroundings.  ``q`` and ``qd`` map joint names to position and velocity."""
 
@@ -81,7 +87,7 @@ class World:
         self._motors += [self.crane.index[j] for j in (*TONGS, *FLEX)]
         self._hanger = self.crane.names.index("hanger")
         self.column = self._level()
-        self._settle(HOME[profile.name] | dict(home or {}))
+        self._settle(home_of(profile) | dict(home or {}))
         # The yard lets its logs come to rest in a client of its own, and so on ground of its own.
         self.yard = Yard(p, profile, truth, scene, Terrain(*ground), self.base_pose())
         self._log_of = {body: i for i, body in enumerate(self.yard.logs)}
@@ -141,7 +147,7 @@ class World:
 
     def _level(self) -> Column:
         """Zero the encoders: at the home pose with an empty grapple the column stands plumb."""
-        self._place(HOME[self.profile.name])
+        self._place(home_of(self.profile))
         return Column(self.truth.structure, self._moments())
 
     def _settle(self, home: Mapping[str, float]) -> None:
