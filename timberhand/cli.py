@@ -13,7 +13,7 @@ import sys
 import typer
 
 from hil.exits import Stopped
-from timberhand.commands import bench, console, dbc, demo, hil, log, record, replay
+from timberhand.commands import bench, console, dbc, demo, experiment, hil, log, record, replay, sim
 
 SENTENCE = "Drives a log-loading forestry machine by itself: crane control over CAN, planning, and a physics plant."
 app = typer.Typer(
@@ -26,6 +26,7 @@ app = typer.Typer(
     "130 interrupted.",
 )
 app.command("demo")(demo.demo)
+app.command("experiment")(experiment.experiment)
 app.command("replay")(replay.replay)
 app.command("record")(record.record)
 app.command("console")(console.console)
@@ -33,6 +34,7 @@ app.add_typer(dbc.app, name="dbc")
 app.add_typer(log.app, name="log")
 app.add_typer(bench.app, name="bench")
 app.add_typer(hil.app, name="hil")
+app.add_typer(sim.app, name="sim")
 
 
 def main() -> None:

@@ -1,0 +1,1 @@
+"""Experiments: repeatable commands that measure, judge against a limit, and write result.json, plots and docs."""

@@ -1,0 +1,180 @@
+"""An open-loop driver of the crane for plant trials: smooth joint references, feed-forward and P, spools out.
+
+It stands where the controller stands and knows what the controller knows: the profile's kinematics, dead-bands and
+speeds, and the joint positions an encoder would show.  It does not see the tip, the structure's bending, the pendulum
+or the logs; where to grasp is told once, before the motion.  Points and angles are in the crane's base frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from machine.grapple import grapple_yaw, lowest_tip_below_pin_m, rotator_for_yaw, tip_below_pin_m
+from machine.joints import Joint
+from machine.kinematics import Point, Unreachable, inverse, reachable_extensions, solve
+from machine.profile import joint_limits
+from sim.world import STEP_S, World
+
+ARM: Final = ("slew", "lift", "tilt", "ext")
+DRIVEN: Final = (*ARM, "rot")
+CLEARANCE_M: Final = 0.02  # tips over the ground; more, and they pinch a thin log instead of getting under it
+LINE_SPEED_M_S: Final = 0.6
+RAISE_SPEED_M_S: Final = 0.35
+REST_SHARE: Final = 0.004  # of full speed: below it the spool stays in its dead-band
+CLOSE_LIMIT_S: Final = 8.0
+GRIPPED_S: Final = 0.3
+STILL_RAD_S: Final = 0.02
+LOOK_AHEAD_RAD: Final = (0.0, 0.05, 0.10, 0.15)
+RELEASED_RAD: Final = 0.45  # tips clear of the load, not yet at the stakes
+
+
+class Driver:
+    """Moves one World; every method steps the physics until its motion is over."""
+
+    def __init__(self, world: World, each_step: Callable[[], None] | None = None) -> None:
+        self.world = world
+        self.reference = {name: world.q[name] for name in DRIVEN}
+        self.grapple = 0.0
+        self.extra: dict[str, float] = {}
+        self._each_step = each_step
+        self._kin, self._limits = world.profile.kinematics, joint_limits(world.profile)
+
+    def tick(self, rates: Mapping[str, float]) -> None:
+        """One physics step towards the reference, with feed-forward ``rates`` [unit/s]."""
+        spools = {"grapple": self.grapple, **self.extra}
+        for name, target in self.reference.items():
+            spec = self.world.profile.joints[name]
+            valve = spec.valve
+            speed = rates.get(name, 0.0) + spec.law.kp_1_s * (target - self.world.q[name])
+            plus = speed > 0.0
+            full = valve.full_speed_plus if plus else valve.full_speed_minus
+            band = (valve.deadband_plus_pct if plus else valve.deadband_minus_pct) / 100.0
+            share = min(1.0, abs(speed) / full)
+            spools[name] = 0.0 if share < REST_SHARE else math.copysign(band + (1.0 - band) * share, speed)
+        self.world.step([spools.get(name, 0.0) for name in self.world.functions])
+        if self._each_step:
+            self._each_step()
+
+    def wait(self, seconds: float) -> None:
+        """Hold the reference."""
+        for _ in range(round(seconds / STEP_S)):
+            self.tick({})
+
+    def rest(self, seconds: float) -> None:
+        """Every spool neutral: the cylinders are shut."""
+        neutral = [0.0] * len(self.world.functions)
+        for _ in range(round(seconds / STEP_S)):
+            self.world.step(neutral)
+            if self._each_step:
+                self._each_step()
+        self.reference = {name: self.world.q[name] for name in DRIVEN}
+
+    def move(self, goal: Mapping[str, float]) -> None:
+        """All joints to ``goal`` on one minimum-jerk profile whose peak speeds are the profile's limits."""
+        start = dict(self.reference)
+        delta = {name: value - start[name] for name, value in goal.items()}
+        peaks = (15 / 8 * abs(d) / self.world.profile.joints[name].speed_limit for name, d in delta.items())
+        steps = math.ceil(max(0.3, *peaks) / STEP_S)
+        for i in range(1, steps + 1):
+            share, rate = _minimum_jerk(i / steps, steps * STEP_S)
+            self.reference.update({name: start[name] + share * d for name, d in delta.items()})
+            self.tick({name: rate * d for name, d in delta.items()})
+
+    def line(self, start: Point, end: Point, ext_m: float) -> None:
+        """The hanger pin along a straight line with the telescope held."""
+        steps = math.ceil(max(0.3, 15 / 8 * math.dist(start, end) / LINE_SPEED_M_S) / STEP_S)
+        for i in range(1, steps + 1):
+            share, _ = _minimum_jerk(i / steps, steps * STEP_S)
+            x, y, z = (a + share * (b - a) for a, b in zip(start, end, strict=True))
+            self._follow((x, y, z), ext_m)
+
+    def pose(self, pin: Point, ext_m: float) -> dict[str, float]:
+        """Joint positions that put the pin there."""
+        return dict(zip(ARM, (*inverse(self._kin, self._limits, *pin, ext_m), ext_m), strict=True))
+
+    def extension_for(self, x: float, y: float, low_m: float, high_m: float) -> float:
+        """A telescope position [m] that serves the whole vertical line; raises ``Unreachable``."""
+        spans = [reachable_extensions(self.world.profile, x, y, z) for z in (low_m, (low_m + high_m) / 2, high_m)]
+        common = [(max(a[0], b[0], c[0]), min(a[1], b[1], c[1])) for a in spans[0] for b in spans[1] for c in spans[2]]
+        least, most = max(common, key=lambda span: span[1] - span[0], default=(0.0, -1.0))
+        if least > most:
+            raise Unreachable(f"no telescope position serves ({x:.2f}, {y:.2f}) m from {low_m:.2f} to {high_m:.2f} m")
+        margin = 0.1 * (most - least)
+        wish = solve(self.world.profile, x, y, (low_m + high_m) / 2)[Joint.EXT]
+        return min(max(wish, least + margin), most - margin)
+
+    def log_yaw(self) -> float:
+        """Direction [rad] of a log that the grapple holds squarely, by the present reference."""
+        q = [self.reference[name] for name in DRIVEN]
+        return grapple_yaw(self.world.profile, q) - math.pi / 2
+
+    def rotator(self, slew: float, log_yaw: float) -> float:
+        """Rotator position that closes the grapple across a log."""
+        return rotator_for_yaw(self.world.profile, slew, log_yaw + math.pi / 2, self.reference["rot"])
+
+    def pick(self, x: float, y: float, log_yaw: float, hover_m: float, ground_m: float, lift_to_m: float) -> float:
+        """Grasp at (x, y) across a log of this yaw, raise; heights [m] of the pin and the ground there.
+
+        The grapple is open before.  Returns the telescope position of the motion.
+        """
+        tongs = self.world.profile.grapple.tongs
+        floor = ground_m + CLEARANCE_M
+        low = floor + tip_below_pin_m(tongs, 0.0)
+        top = max(hover_m, lift_to_m, floor + lowest_tip_below_pin_m(tongs))
+        ext = self.extension_for(x, y, low, top)
+        above = self.pose((x, y, hover_m), ext)
+        self.move({**above, "rot": self.rotator(above["slew"], log_yaw)})
+        self.wait(0.8)
+        self.line((x, y, hover_m), (x, y, low), ext)
+        self.wait(0.5)
+        z = self._close_while_raising(x, y, low, floor, ext)
+        self.grapple = -0.2
+        self.line((x, y, z), (x, y, lift_to_m), ext)
+        self.wait(1.0)
+        return ext
+
+    def place(self, x: float, y: float, log_yaw: float, low_m: float, carry_m: float) -> None:
+        """Carry to (x, y), turn the load to ``log_yaw``, lower the pin to ``low_m``, open and go up again."""
+        ext = self.extension_for(x, y, low_m, carry_m)
+        above = self.pose((x, y, carry_m), ext)
+        self.move({**above, "rot": self.rotator(above["slew"], log_yaw)})
+        self.wait(1.0)
+        self.line((x, y, carry_m), (x, y, low_m), ext)
+        self.wait(0.5)
+        self.grapple = 1.0
+        for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
+            self.tick({})
+            if self.world.tong_angle < RELEASED_RAD:
+                break
+        self.grapple = 0.0
+        self.wait(0.5)
+        self.line((x, y, low_m), (x, y, carry_m), ext)
+
+    def _close_while_raising(self, x: float, y: float, z: float, floor: float, ext: float) -> float:
+        """Close until the tongs stand still on a load; the tips sweep lower, so the pin rises meanwhile."""
+        world, tongs = self.world, self.world.profile.grapple.tongs
+        self.grapple = -0.7
+        still_s = 0.0
+        for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
+            angle = world.tong_angle
+            wanted = floor + max(tip_below_pin_m(tongs, angle + ahead) for ahead in LOOK_AHEAD_RAD)
+            z = max(z, min(wanted, z + RAISE_SPEED_M_S * STEP_S))
+            self._follow((x, y, z), ext)
+            moving = abs(world.qd["tong_left"]) + abs(world.qd["tong_right"]) > STILL_RAD_S
+            still_s = 0.0 if moving or angle < 0.2 else still_s + STEP_S
+            if still_s > GRIPPED_S:
+                break
+        return z
+
+    def _follow(self, pin: Point, ext_m: float) -> None:
+        goal = self.pose(pin, ext_m)
+        rates = {name: (goal[name] - self.reference[name]) / STEP_S for name in ARM}
+        self.reference.update(goal)
+        self.tick(rates)
+
+
+def _minimum_jerk(t: float, duration_s: float) -> tuple[float, float]:
+    """Share of the way and its rate [1/s] at the share ``t`` of the time."""
+    return t**3 * (10 - 15 * t + 6 * t * t), 30 * t * t * (1 - t) ** 2 / duration_s

@@ -1,0 +1,105 @@
+"""Worlds for the trials, and small readings of one that several trials need."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, Final
+
+from machine.kinematics import Point, inverse, solve
+from machine.load import load_profile
+from machine.profile import Profile, joint_limits
+from sim.scene import LogSpec, arrangement
+from sim.world import World, open_world
+
+CARRIER_PROFILE: Final = "aoro_fc8"
+ARM: Final = ("slew", "lift", "tilt", "ext")
+
+
+@cache
+def profile_named(name: str) -> Profile:
+    """A profile, read once per process."""
+    return load_profile(name)
+
+
+def carrier_profile(name: str) -> str:
+    """The profile itself when it has a carrier, else the shipped machine that has one."""
+    return name if profile_named(name).carrier is not None else CARRIER_PROFILE
+
+
+@contextmanager
+def opened(
+    profile: str,
+    truth: str,
+    seed: int,
+    scene: str | Sequence[LogSpec] = (),
+    logs: int = 1,
+    home: dict[str, float] | None = None,
+) -> Iterator[World]:
+    """A world of one trial, closed at the end; the same arguments give the same world.
+
+    A scene by name is an arrangement of ``sim.scene`` with so many logs.
+    """
+    p = profile_named(profile)
+    specs = arrangement(scene, p, _wood(profile, truth), seed, logs) if isinstance(scene, str) else scene
+    world = open_world(p, truth=truth, seed=seed, scene=specs, home=home)
+    try:
+        yield world
+    finally:
+        world.close()
+
+
+@cache
+def _wood(profile: str, truth: str) -> Any:
+    """What the logs of a truth are like; the same for every individual machine."""
+    with opened(profile, truth, 0) as world:
+        return world.truth.wood
+
+
+def home_at(profile: str, reach_m: float, height_m: float, ext_m: float | None = None) -> dict[str, float]:
+    """Joint positions with slew 0 and the pin at this reach and height in the base frame."""
+    p = profile_named(profile)
+    turn = p.kinematics.theta1_offset_rad
+    point = (reach_m * math.cos(turn), reach_m * math.sin(turn), height_m)
+    if ext_m is None:
+        return dict(zip(ARM, solve(p, *point), strict=True))
+    return dict(zip(ARM, (*inverse(p.kinematics, joint_limits(p), *point, ext_m), ext_m), strict=True))
+
+
+def to_base(world: World, point: Sequence[float]) -> Point:
+    """A point of the world in the crane's base frame."""
+    p = world.client
+    x, y, z = p.multiplyTransforms(*p.invertTransform(*world.base_pose()), point, (0.0, 0.0, 0.0, 1.0))[0]
+    return x, y, z
+
+
+def yaw_in_base(world: World, axis: Sequence[float]) -> float:
+    """Direction [rad] of a horizontal axis of the world in the crane's base frame."""
+    foot, tip = to_base(world, (0.0, 0.0, 0.0)), to_base(world, axis)
+    return math.atan2(tip[1] - foot[1], tip[0] - foot[0])
+
+
+def hang(world: World, mass_kg: float) -> None:
+    """Make the rotator heavier by a load, its inertia as before: a dense weight on the hook."""
+    link = world.crane.link["rotator"]
+    own = world.truth.links["rotator"].mass_kg
+    world.client.changeDynamics(world.crane.body, link, mass=own + mass_kg)
+
+
+def mass_points(world: World, links: Sequence[str]) -> list[tuple[float, Point]]:
+    """Mass [kg] and centre of mass in the world of the given links."""
+    p, body = world.client, world.crane.body
+    out = []
+    for name in links:
+        index = world.crane.link[name]
+        out.append((p.getDynamicsInfo(body, index)[0], p.getLinkState(body, index, computeForwardKinematics=1)[0]))
+    return out
+
+
+def step_neutral(world: World, steps: int) -> None:
+    """Every spool shut."""
+    neutral = [0.0] * len(world.functions)
+    for _ in range(steps):
+        world.step(neutral)

@@ -1,0 +1,141 @@
+"""Many independent trials on all cores: spawned processes, results in the order of the jobs, a checkpoint on disk.
+
+A job is plain data; ``function(job)`` runs in a worker and returns plain (JSON) data that depends on the job alone, so
+the number of workers changes nothing.  Finished jobs are written to the checkpoint at once; after an interruption the
+same call takes them from there.  Workers never see Ctrl-C: the parent ends them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Final
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+WAITING_PER_WORKER: Final = 2
+ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One trial: a name that is unique in the run, the kind of trial, its seed and further plain arguments."""
+
+    name: str
+    kind: str
+    seed: int
+    options: dict[str, Any]
+
+
+class Checkpoint:
+    """Finished jobs in a file of JSON lines; the first line says which run they belong to."""
+
+    def __init__(self, path: Path, fingerprint: str) -> None:
+        self._path = path
+        self.done = self._read(fingerprint)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lines = [json.dumps({"run": fingerprint}), *(json.dumps([k, v]) for k, v in self.done.items())]
+        path.write_text("\n".join(lines) + "\n")
+        self._file = path.open("a")
+
+    def _read(self, fingerprint: str) -> dict[str, Any]:
+        try:
+            head, *lines = self._path.read_text().splitlines()
+            if json.loads(head) != {"run": fingerprint}:
+                return {}
+        except (OSError, ValueError):
+            return {}
+        done = {}
+        for line in lines:
+            try:
+                name, outcome = json.loads(line)
+            except ValueError:
+                break  # the run was cut off while it wrote this line
+            done[name] = outcome
+        return done
+
+    def add(self, name: str, outcome: Any) -> Any:
+        """Keep a finished job; returns it as it will be read back."""
+        line = json.dumps([name, outcome])
+        self._file.write(line + "\n")
+        self._file.flush()
+        self.done[name] = json.loads(line)[1]
+
+    def close(self) -> None:
+        """The file stays, for the next run."""
+        self._file.close()
+
+    def remove(self) -> None:
+        """The run is complete."""
+        self._file.close()
+        self._path.unlink()
+
+
+def run(
+    function: Callable[[Job], Any],
+    jobs: Sequence[Job],
+    checkpoint: Checkpoint,
+    workers: int,
+    title: str,
+    console: Console,
+) -> dict[str, Any]:
+    """Outcome of every job by name, in the order of ``jobs``; an exception in a trial comes out with its name."""
+    todo = [job for job in jobs if job.name not in checkpoint.done]
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(title, total=len(jobs), completed=len(jobs) - len(todo))
+        if workers <= 1:
+            for job in todo:
+                checkpoint.add(job.name, _named(function, job))
+                progress.advance(task)
+        else:
+            _run_parallel(function, todo, checkpoint, workers, lambda: progress.advance(task))
+    return {job.name: checkpoint.done[job.name] for job in jobs}
+
+
+def _run_parallel(
+    function: Callable[[Job], Any],
+    todo: Sequence[Job],
+    checkpoint: Checkpoint,
+    workers: int,
+    advance: Callable[[], None],
+) -> None:
+    for name in ONE_THREAD:
+        os.environ.setdefault(name, "1")
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_ignore_interrupt)
+    waiting: dict[Future[Any], Job] = {}
+    queue = iter(todo)
+    try:
+        while True:
+            while len(waiting) < WAITING_PER_WORKER * workers and (job := next(queue, None)):
+                waiting[pool.submit(_named, function, job)] = job
+            if not waiting:
+                break
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                checkpoint.add(waiting.pop(future).name, future.result())
+                advance()
+    except BaseException:
+        for process in list(pool._processes.values()):
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _ignore_interrupt() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _named(function: Callable[[Job], Any], job: Job) -> Any:
+    try:
+        return function(job)
+    except BaseException as error:
+        error.add_note(f"in trial {job.name}")
+        raise

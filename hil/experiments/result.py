@@ -1,0 +1,169 @@
+"""What an experiment leaves behind: figures with their limits, and result.json (design section 8).
+
+``metrics`` is a flat map from name to number; a rate has its Wilson 95 % interval beside it as ``NAME_low`` and
+``NAME_high``.  ``limits`` holds [least, most] (null: open) and ``missed`` the names outside theirs.  A clocked figure
+that misses its limit on a noisy host is ``inconclusive`` instead: noise can only slow a run down.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+SOURCES: Final = ("machine", "sim", "can_dbc", "hil/experiments")
+PACKAGES: Final = ("numpy", "numba", "pybullet")
+Z_95: Final = 1.959963984540054
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One figure: key in ``metrics``, what it is, unit, how it is measured, limits (None: only reported).
+
+    ``scale`` turns the number into the printed unit.  ``clocked``: depends on the host's clock.
+    """
+
+    name: str
+    title: str
+    unit: str
+    how: str
+    least: float | None = None
+    most: float | None = None
+    scale: float = 1.0
+    clocked: bool = False
+
+    def holds(self, value: float) -> bool:
+        """Whether a value is finite and inside the limits."""
+        low = self.least is None or value >= self.least
+        high = self.most is None or value <= self.most
+        return math.isfinite(value) and low and high
+
+    def limit_text(self) -> str:
+        """The limit in the printed unit."""
+        low, high = (None if v is None else f"{v * self.scale:.4g}" for v in (self.least, self.most))
+        if low and high:
+            return f"{low} to {high}"
+        return f"at least {low}" if low else f"at most {high}" if high else ""
+
+    def text(self, value: float) -> str:
+        """The value in the printed unit."""
+        return f"{value * self.scale:.4g}{' ' if self.unit and self.unit != '%' else ''}{self.unit}"
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """The content of result.json."""
+
+    experiment: str
+    commit: str
+    profile: str
+    seed: int
+    trials: int
+    metrics: dict[str, float]
+    paper: dict[str, float]
+    environment: dict[str, str]
+    limits: dict[str, tuple[float | None, float | None]] = field(default_factory=dict)
+    missed: tuple[str, ...] = ()
+    inconclusive: tuple[str, ...] = ()
+
+    def interval_text(self, figure: Figure) -> str:
+        """The interval beside a rate, with the number of trials; empty for other figures."""
+        low, high = (self.metrics.get(f"{figure.name}_{end}") for end in ("low", "high"))
+        if low is None or high is None:
+            return ""
+        n = self.metrics[f"{figure.name}_n"]
+        return f" ({low * figure.scale:.1f} to {high * figure.scale:.1f}, n = {n:.0f})"
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON with sorted metrics."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(self.json() + "\n")
+
+    def json(self) -> str:
+        """result.json as text; a figure that is no number stands as null."""
+        document = asdict(self)
+        document["metrics"] = {k: v if math.isfinite(v) else None for k, v in sorted(self.metrics.items())}
+        return json.dumps(document, indent=2)
+
+
+def judge(
+    figures: Iterable[Figure], metrics: Mapping[str, float], noisy: bool
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the figures that are missed, and of those a noisy host leaves open."""
+    failed = [f for f in figures if f.name in metrics and not f.holds(metrics[f.name])]
+    open_ = tuple(f.name for f in failed if f.clocked and noisy)
+    return tuple(f.name for f in failed if f.name not in open_), open_
+
+
+def wilson(hits: int, n: int) -> tuple[float, float]:
+    """Wilson's 95 % score interval of a rate; (0, 1) for no trials."""
+    if n == 0:
+        return 0.0, 1.0
+    p, z2 = hits / n, Z_95 * Z_95
+    middle = p + z2 / (2 * n)
+    half = Z_95 * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
+    return max(0.0, (middle - half) / (1 + z2 / n)), min(1.0, (middle + half) / (1 + z2 / n))
+
+
+def rate(name: str, hits: int, n: int) -> dict[str, float]:
+    """A rate and its interval as metrics."""
+    low, high = wilson(hits, n)
+    return {name: hits / n if n else math.nan, f"{name}_low": low, f"{name}_high": high, f"{name}_n": float(n)}
+
+
+def commit() -> str:
+    """Short hash of the checkout, ``+changes`` when tracked files differ from it; ``unknown`` outside git."""
+    try:
+        head = _git("rev-parse", "--short=12", "HEAD")
+        return head + ("+changes" if _git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def _git(*arguments: str) -> str:
+    done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def environment() -> dict[str, str]:
+    """Where the figures were measured."""
+    versions = {}
+    for name in PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "missing"
+    return {
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "processor": _processor(),
+        "cpus": str(len(os.sched_getaffinity(0))),
+        **versions,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+def source_hash() -> str:
+    """Of everything a trial's outcome depends on, so that a checkpoint of other code is not continued."""
+    digest = hashlib.sha256()
+    for folder in SOURCES:
+        for path in sorted((ROOT / folder).rglob("*")):
+            if path.suffix in (".py", ".toml", ".dbc", ".eds"):
+                digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]

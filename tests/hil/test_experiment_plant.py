@@ -1,0 +1,104 @@
+"""The plant experiment: its plan, its readings, one trial of a kind, and the whole quick run behind the command."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from hil.experiments.plant import endurance, experiment, physics, rolling, trial
+from hil.experiments.plant.figures import FIGURES, SECTIONS
+from hil.experiments.pool import Job
+from hil.experiments.registry import EXPERIMENTS, Options, load
+from timberhand.cli import app
+
+COMMON = {"profile": "palms_471", "truth": "nominal", "quick": True}
+
+
+def grasp(kind: str, seed: int) -> dict:
+    return trial.grasp(Job(kind, kind, seed, {**COMMON, **experiment.GRASPS[kind]}))
+
+
+def options(tmp_path, **changes) -> Options:
+    return Options(**{"seed": 1, "truth": "nominal", "profile": "palms_471", "out": tmp_path, **changes})
+
+
+def test_every_experiment_can_be_loaded():
+    assert all(callable(load(name)) for name in EXPERIMENTS)
+
+
+def test_the_plan_has_every_trial_once_and_the_longest_first(tmp_path):
+    jobs = experiment.plan(options(tmp_path), 5)
+    names = [job.name for job in jobs]
+    assert len(set(names)) == len(names) == 1 + len(experiment.FUNCTIONS) - 1 - 4 + 4 * 5
+    assert names[0] == "shift" and {job.kind for job in jobs} == set(experiment.FUNCTIONS)
+
+
+def test_a_truth_file_of_the_fixed_crane_does_not_reach_the_carrier(tmp_path):
+    jobs = {job.name: job.options for job in experiment.plan(options(tmp_path, truth="mine.toml"), 1)}
+    assert jobs["sag"]["truth"] == "mine.toml" and jobs["turning"]["truth"] == "nominal"
+    assert jobs["turning"]["profile"] == "aoro_fc8"
+
+
+def test_figures_have_one_name_each_and_pictures_one_section():
+    assert len({f.name for f in FIGURES}) == len(FIGURES)
+    files = [file for section in SECTIONS for file, _ in section.pictures]
+    assert len(set(files)) == len(files)
+
+
+def test_a_circle_is_found_from_an_arc():
+    arc = [(3.0 + 6.3 * math.cos(a), -2.0 + 6.3 * math.sin(a)) for a in (0.02 * i for i in range(60))]
+    centre, radius = rolling.fit_circle(arc)
+    assert centre == pytest.approx((3.0, -2.0), abs=1e-6) and radius == pytest.approx(6.3, abs=1e-6)
+
+
+def test_a_log_is_lifted_and_laid_into_the_bunk():
+    t = grasp("single", 100_001)
+    assert t["held"] == t["raised"] == t["in_bunk"] == 1
+    assert t["penetration_m"] < 5e-3 and t["log_speed_m_s"] < 3.0
+    assert t["load_kg"] == pytest.approx(t["true_load_kg"], rel=0.2)
+
+
+@pytest.mark.parametrize("kind", ["yaw90", "off1m"])
+def test_a_wrong_aim_lifts_nothing(kind):
+    assert grasp(kind, 100_001)["raised"] == 0
+
+
+def test_the_oil_spring_has_its_closed_form_frequency():
+    assert physics.cylinder_spring(Job("cylinder", "cylinder", 1, COMMON))["metrics"]["cylinder_hz_error"] < 0.02
+
+
+def test_another_seed_is_another_grasp():
+    jobs = [Job("repeat", "repeat", seed, {**COMMON, "scene": "single", "logs": 1}) for seed in (1, 1, 2)]
+    first, same, other = map(endurance.fingerprint, jobs)
+    assert first == same != other
+
+
+def test_a_truth_that_is_none_is_one_sentence(tmp_path):
+    done = CliRunner().invoke(
+        app, ["experiment", "plant", "--truth", str(tmp_path / "no.toml"), "--out", str(tmp_path)]
+    )
+    assert "no.toml" in str(done.exception) and done.exception.code == 3
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_quick_run_reaches_its_figures_and_writes_everything(tmp_path):
+    result = experiment.run(
+        options(tmp_path / "out", quick=True, workers=2, docs=tmp_path / "docs"), Console(quiet=True)
+    )
+    clocked = {f.name for f in FIGURES if f.clocked}
+    assert set(result.missed) <= clocked
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert document["experiment"] == "plant" and document["trials"] == experiment.QUICK_TRIALS
+    assert all(isinstance(v, float) for v in document["metrics"].values())
+    assert {f.name for f in FIGURES} <= document["metrics"].keys()
+    page = (tmp_path / "docs" / "plant.md").read_text()
+    for section in SECTIONS:
+        assert section.title in page
+        for file, _ in section.pictures:
+            assert (tmp_path / "docs" / "results" / "plant" / file).stat().st_size > 5000
+    assert not (tmp_path / "out" / "trials.jsonl").exists()

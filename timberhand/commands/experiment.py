@@ -1,0 +1,79 @@
+"""``timberhand experiment NAME``: measures, writes result.json and plots, and fails when a figure is missed."""
+
+from __future__ import annotations
+
+import os
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hil.experiments.registry import EXPERIMENTS
+
+Name = StrEnum("Name", {name.upper().replace("-", "_"): name for name in EXPERIMENTS})
+
+
+def experiment(
+    name: Annotated[
+        Name, typer.Argument(metavar="NAME", help="; ".join(f"{n}: {e.sentence}" for n, e in EXPERIMENTS.items()))
+    ],
+    trials: Annotated[
+        int | None, typer.Option(min=1, help="Trials of each kind (default: the experiment's own).")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same figures (but for timings).")] = 1,
+    truth: Annotated[str, typer.Option(help="The plant's hidden truth: nominal, sampled, or a TOML file.")] = "nominal",
+    profile: Annotated[str, typer.Option(help="A shipped profile or a TOML file.")] = "palms_471",
+    out: Annotated[Path | None, typer.Option(help="Where the results go (default: runs/NAME).")] = None,
+    quick: Annotated[bool, typer.Option(help="A few trials of everything, in under a minute.")] = False,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes (default: one per core).")] = None,
+    docs: Annotated[
+        Path | None, typer.Option(help="Also refresh the page, the pictures and results/NAME.json in this folder.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")] = False,
+) -> None:
+    """Run an experiment, judge its figures and write DIR/result.json with its plots.
+
+    Exit code 6 when a figure is not reached. Ctrl-C keeps the finished trials; the same command goes on from there.
+
+    [bold]Examples[/bold]
+
+      timberhand experiment plant --quick                   a look, in a minute
+
+      timberhand experiment plant --docs docs               the committed figures and docs/plant.md
+
+      timberhand experiment plant --truth sampled --seed 7  every trial on another individual machine
+    """
+    from rich.console import Console
+
+    from hil.exits import Exit, Stopped
+    from hil.experiments.registry import Options, load
+    from machine.load import ProfileError, load_profile
+
+    try:
+        load_profile(profile)
+    except ProfileError as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    options = Options(
+        seed=seed,
+        truth=truth,
+        profile=profile,
+        out=out or Path("runs") / name.value,
+        trials=trials,
+        quick=quick,
+        workers=workers or len(os.sched_getaffinity(0)),
+        docs=docs,
+    )
+    screen = Console(stderr=True)
+    try:
+        result = load(name.value)(options, screen)
+    except KeyboardInterrupt:
+        raise Stopped(
+            Exit.INTERRUPTED, f"interrupted; finished trials are kept in {options.out}, the same command goes on"
+        ) from None
+    if as_json:
+        print(result.json())
+    if result.missed:
+        raise Stopped(
+            Exit.FIGURE, f"figures not reached: {', '.join(result.missed)}; see {options.out / 'result.json'}"
+        )
