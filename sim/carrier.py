@@ -55,7 +55,8 @@ def _shapes(profile: Profile, link: str) -> tuple[Shape, ...]:
             Shape(link, (0.70, 0.90, z - 0.28), (x, y, (z + 0.28) / 2), UNIT, dark),
         )
     if link == "front":
-        masts = ((p[0], p[1], (p[2] + 1.15) / 2, p[2] - 1.15) for p in (c.antenna_main_m, c.antenna_aux_m))
+        feet = ((p, 1.15 if p[0] > 0.65 else 0.28) for p in (c.antenna_main_m, c.antenna_aux_m))  # on hood or frame
+        masts = ((p[0], p[1], (p[2] + foot) / 2, p[2] - foot) for p, foot in feet)
         return (
             Shape(link, (2.75, 0.90, 0.33), (1.475, 0.0, 0.115), UNIT, dark),
             Shape(link, (2.10, 1.30, 0.87), (1.70, 0.0, 0.715), UNIT, green),
