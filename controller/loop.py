@@ -18,6 +18,7 @@ from can_dbc import tick_record
 from can_dbc.bus import Bus, BusState
 from controller.realtime import Notifier, sleep_until
 from controller.step import Controller, Inputs, Outputs, step
+from machine.faults import describe
 
 Address = tuple[str, int]
 MAX_DATAGRAMS: Final = 16
@@ -86,7 +87,7 @@ class Loop:
         self._period_ns = period_ns
         self._clock_ns, self._sleep = clock_ns, sleep
         self._inputs = Inputs()
-        self._notifier = Notifier()
+        self._notifier = Notifier(self.words)
         self._down_since_ns = 0
         self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sender.setblocking(False)
@@ -132,15 +133,24 @@ class Loop:
             self._keep(inputs, outputs, now_ns, self._record)
         self._watch_link(now_ns)
         inputs.tick_ns = self._clock_ns() - begin_ns
-        self._notifier.alive(now_ns)
+        # Good: on time, done within its period, and heard on the bus.
+        good = late_ns < self._period_ns and inputs.tick_ns < self._period_ns and stats.state is not BusState.DOWN
+        self._notifier.ticked(now_ns, good)
         self.lateness.add(late_ns)
         self.work.add(inputs.tick_ns)
         return outputs
+
+    def words(self) -> str:
+        """How it is, in one line: mode, the reason in words, missed ticks."""
+        supervisor = self.controller.supervisor
+        reason = describe(supervisor.reason, supervisor.detail)
+        return f"{supervisor.mode.name}. {reason} Missed ticks: {self.missed} of {self.work.count + self.missed}."
 
     def leave(self) -> None:
         """Sends neutral commands and a last status, so that nobody waits for a time-out."""
         for key, data in self.controller.farewell():
             self.bus.send(key, data)
+        self._notifier.stopping()
 
     def close(self) -> None:
         """Closes the sockets and the bus."""

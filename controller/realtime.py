@@ -12,6 +12,7 @@ import errno
 import gc
 import os
 import socket
+from collections.abc import Callable
 from typing import Final
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
@@ -63,27 +64,48 @@ def freeze() -> None:
 
 
 class Notifier:
-    """Tells systemd that the process is ready and alive (sd_notify); does nothing elsewhere."""
+    """Tells systemd how the process is (sd_notify(3)); does nothing where nobody asked for it.
 
-    __slots__ = ("_address", "_next_ns", "_socket")
-    PERIOD_NS: Final = 100_000_000
+    Nothing is said before the first good tick: that is ``READY=1``.  From then on a good tick passes ``WATCHDOG=1``
+    on, ten times a second, and once a second what ``words`` answers (one line) as ``STATUS=``.  A tick that is not
+    good says nothing, so a process whose ticks are all bad is ended by the watchdog.  Never blocks, never raises; only
+    the tick that tells the status builds a text.
+    """
 
-    def __init__(self) -> None:
+    __slots__ = ("_address", "_alive_ns", "_ready", "_socket", "_status_ns", "_words")
+    ALIVE_NS: Final = 100_000_000
+    STATUS_NS: Final = 1_000_000_000
+
+    def __init__(self, words: Callable[[], str]) -> None:
         address = os.environ.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if address else None
-        self._next_ns = 0
         if self._socket is not None:
             self._socket.setblocking(False)
-        self._tell(b"READY=1")
+        self._words = words
+        self._ready = False
+        self._alive_ns = self._status_ns = 0
 
-    def alive(self, now_ns: int) -> None:
-        """Called at the end of a good tick; ten times a second it is passed on."""
-        if now_ns >= self._next_ns:
-            self._next_ns = now_ns + self.PERIOD_NS
+    def ticked(self, now_ns: int, good: bool) -> None:
+        """Called at the end of every tick."""
+        if self._socket is None or not good or now_ns < self._alive_ns:
+            return
+        self._alive_ns = now_ns + self.ALIVE_NS
+        if now_ns < self._status_ns:
             self._tell(b"WATCHDOG=1")
+            return
+        self._status_ns = now_ns + self.STATUS_NS
+        begin = "WATCHDOG=1" if self._ready else "READY=1\nWATCHDOG=1"
+        self._ready = self._tell(f"{begin}\nSTATUS={self._words()}".encode()) or self._ready
+        if not self._ready:
+            self._alive_ns = self._status_ns = 0
 
-    def _tell(self, what: bytes) -> None:
+    def stopping(self) -> None:
+        """Called on the way out, after the last frames."""
+        self._tell(b"STOPPING=1\nSTATUS=Ending.")
+
+    def _tell(self, what: bytes) -> bool:
         if self._socket is not None:
             with contextlib.suppress(OSError):
-                self._socket.sendto(what, self._address)
+                return self._socket.sendto(what, self._address) == len(what)
+        return False

@@ -6,8 +6,9 @@
 set -eu
 
 # user-mode-linux, gcc, libc6-dev: the vcan lab where the kernel has no CAN; can-utils, iproute2: looking at
-# buses; rt-tests: cyclictest, to which the timing figures are compared.
-wanted=${*:-user-mode-linux gcc libc6-dev can-utils iproute2 rt-tests}
+# buses; rt-tests: cyclictest, to which the timing figures are compared; systemd, python3-venv: the service lab.
+# For the scripts: shellcheck.
+wanted=${*:-user-mode-linux gcc libc6-dev can-utils iproute2 rt-tests systemd python3-venv shellcheck}
 
 if ! command -v apt-get >/dev/null; then
     echo "packages: no apt-get here; these Debian packages are used if present: $wanted" >&2

@@ -51,11 +51,12 @@ def run(guard: Guard, bus: Bus, ended: list[int], notifier: Notifier) -> bool:
         bus.drain(frames)
         for key, data in guard.step(deadline_ns, frames):
             bus.send(key, data)
-        notifier.alive(deadline_ns)
         down_ns = down_ns + PERIOD_NS if bus.stats.state is BusState.DOWN else 0
+        notifier.ticked(deadline_ns, late_ns < PERIOD_NS and not down_ns)
         if down_ns >= BUS_GONE_NS:
             return False
         deadline_ns += PERIOD_NS
+    notifier.stopping()
     return True
 
 
@@ -81,7 +82,8 @@ def main(arguments: list[str] | None = None) -> int:
             if not options.no_realtime:
                 for refusal in prepare(PRIORITY):
                     sys.stderr.write(f"guard: not granted: {refusal}\n")
-            if not run(guard, bus, ended, Notifier()):
+            notifier = Notifier(lambda: f"Valves {'' if guard.enabled else 'not '}enabled: {guard.verdict.name}.")
+            if not run(guard, bus, ended, notifier):
                 sys.stderr.write("guard: the crane bus is gone; bring it up and start the guard again.\n")
                 return 4
     except GuardConfigError as error:

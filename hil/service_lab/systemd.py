@@ -1,0 +1,45 @@
+"""What systemd and the kernel say about a service."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+
+def systemctl(*words: str) -> subprocess.CompletedProcess[str]:
+    """The command with its output."""
+    return subprocess.run(["systemctl", "--no-pager", *words], capture_output=True, text=True, check=False)
+
+
+def show(unit: str, *names: str) -> dict[str, str]:
+    """Properties of a unit."""
+    lines = systemctl("show", unit, "--property", ",".join(names)).stdout.splitlines()
+    return dict(line.partition("=")[::2] for line in lines)
+
+
+def main_pid(unit: str) -> int:
+    """The service's process; 0 when there is none."""
+    return int(show(unit, "MainPID").get("MainPID") or 0)
+
+
+def journal(unit: str) -> list[str]:
+    """Every line that the unit, and systemd about it, has said."""
+    subprocess.run(["journalctl", "--sync"], check=False)
+    command = ["journalctl", "--no-pager", "--output", "cat", "--unit", unit]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.splitlines()
+
+
+def process_facts(pid: int) -> dict[str, object]:
+    """How a live process is scheduled, what it may, and how much of its memory is locked."""
+    status = dict(line.partition(":\t")[::2] for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    return {
+        "policy": {os.SCHED_OTHER: "other", os.SCHED_FIFO: "fifo"}.get(os.sched_getscheduler(pid), "another"),
+        "priority": os.sched_getparam(pid).sched_priority,
+        "locked_kb": int(status["VmLck"].split()[0]),
+        "user": int(status["Uid"].split()[1]),
+        "capabilities": int(status["CapEff"], 16),
+        "no_new_privileges": status["NoNewPrivs"] == "1",
+        "seccomp": status["Seccomp"] == "2",
+        "threads": int(status["Threads"]),
+    }

@@ -1,0 +1,145 @@
+"""The unit files: judged by systemd's own tools, and held against the settings and the programs that they start."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from autonomy.__main__ import arguments as autonomy_arguments
+from controller.__main__ import parser as controller_parser
+
+DEPLOY = Path(__file__).parents[2] / "deploy"
+UNITS = sorted((DEPLOY / "units").glob("*.service"))
+PROCESSES = [unit for unit in UNITS if "@" not in unit.name]
+CONF = dict(
+    line.split("=", 1)
+    for line in (DEPLOY / "timberhand.conf").read_text().splitlines()
+    if not line.startswith("#") and line
+)
+SCORE = 1.5
+EPHEMERAL = 32768
+"""From here on the kernel gives ports to whoever asks for any (ip_local_port_range)."""
+INTENDED = {"RestrictRealtime", "RestrictAddressFamilies", "IPAddressAllow", "PrivateUsers", "CapabilityBoundingSet"}
+"""Lines of the hardening that may differ: FIFO, CAN, the network, and the one that configures interfaces."""
+
+needs_systemd = pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing (apt-get install systemd)"
+)
+
+
+def setting(unit: Path, name: str) -> list[str]:
+    """Every value of a setting."""
+    return re.findall(rf"^{name}=(.*)$", unit.read_text(), re.MULTILINE)
+
+
+def words(unit: Path) -> list[str]:
+    """The program's arguments as systemd expands them with the shipped settings."""
+    found = []
+    for word in setting(unit, "ExecStart")[0].split()[1:]:
+        if word.startswith("$") and not word.startswith("${"):
+            found += CONF[word[1:]].split()
+        else:
+            found.append(re.sub(r"\$\{(\w+)}", lambda m: CONF[m[1]], word))
+    return found
+
+
+def test_every_process_has_its_unit() -> None:
+    names = {unit.name.removesuffix(".service").removeprefix("timberhand-") for unit in UNITS}
+    assert names == {"controller", "guard", "autonomy", "recorder", "console", "can@"}
+
+
+@needs_systemd
+@pytest.mark.parametrize("unit", UNITS, ids=lambda u: u.stem)
+def test_exposure_is_small(unit: Path) -> None:
+    done = subprocess.run(
+        ["systemd-analyze", "security", "--offline=yes", "--no-pager", str(unit)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    level = re.search(r"Overall exposure level for .*: ([\d.]+)", done.stdout)
+    assert level, done.stderr
+    assert float(level[1]) <= SCORE, done.stdout
+
+
+@needs_systemd
+def test_systemd_finds_no_fault(tmp_path: Path) -> None:
+    for unit in (DEPLOY / "units").iterdir():
+        text = unit.read_text().replace("/opt/timberhand/bin/python", sys.executable)
+        (tmp_path / unit.name).write_text(text.replace("/usr/lib/timberhand/can-up", str(DEPLOY / "system/can-up")))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", *map(str, sorted(tmp_path.iterdir()))],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert [line for line in done.stderr.splitlines() if "timberhand" in line] == []
+    assert done.returncode == 0
+
+
+def test_the_hardening_is_the_same_everywhere() -> None:
+    bodies = []
+    for unit in UNITS:
+        body = unit.read_text().split("# No more rights than needed.\n")[1].split("\n\n")[0].splitlines()
+        bodies.append({line for line in body if line.split("=")[0] not in {*INTENDED, "AmbientCapabilities"}})
+    common = set.intersection(*bodies)
+    assert len(common) >= 24
+    for unit, body in zip(UNITS, bodies, strict=True):
+        timed = {"SystemCallFilter=sched_setscheduler sched_setaffinity mlockall"}
+        assert body - common <= timed, unit.name
+        assert bool(body - common) == ("CPUSchedulingPolicy=fifo" in unit.read_text()), unit.name
+
+
+def test_only_the_control_processes_are_hard_timed_and_the_guard_goes_first() -> None:
+    priority = {unit.stem: setting(unit, "CPUSchedulingPriority") for unit in UNITS}
+    timed = {name: int(value[0]) for name, value in priority.items() if value}
+    assert timed == {"timberhand-controller": 80, "timberhand-guard": 85}
+    for unit in (u for u in UNITS if u.stem in timed):
+        assert setting(unit, "Type") == ["notify"]
+        assert setting(unit, "WatchdogSec") == ["0.3"]
+        assert setting(unit, "Restart") == ["on-failure"]
+        assert setting(unit, "RestartPreventExitStatus") == ["2 3"]
+        assert setting(unit, "LimitRTPRIO") == [str(timed[unit.stem])]
+        assert setting(unit, "LimitMEMLOCK") == ["infinity"]
+
+
+def test_every_process_is_a_user_of_its_own_that_the_installation_makes() -> None:
+    users = [setting(unit, "User")[0] for unit in PROCESSES]
+    made = set(re.findall(r"^u (\S+)", (DEPLOY / "system/sysusers.conf").read_text(), re.MULTILINE))
+    assert len(set(users)) == len(users)
+    assert set(users) == made
+    for unit in UNITS:
+        assert setting(unit, "User") == setting(unit, "Group")
+
+
+def test_settings_and_units_fit_each_other() -> None:
+    used = set()
+    for text in [unit.read_text() for unit in UNITS] + [(DEPLOY / "system/can-up").read_text()]:
+        used |= set(re.findall(r"\$\{?([A-Z]+(?:_[A-Z]+)*)\b", text))
+    assert used - set(CONF) <= {"STATE_DIRECTORY", "CAN_WAIT_S"} | {"CAN_WAIT"}
+    assert set(CONF) <= used
+    ports = [value for name, value in CONF.items() if name.endswith("_PORT")]
+    assert len(set(ports)) == len(ports)
+    assert all(int(port) < EPHEMERAL for port in ports)
+
+
+def test_the_programs_understand_their_arguments() -> None:
+    unit = DEPLOY / "units"
+    control = words(unit / "timberhand-controller.service")
+    assert control[:3] == ["-P", "-m", "controller"]
+    options = controller_parser().parse_args(control[3:])
+    assert options.bus == "crane0=socketcan:crane0"
+    reports = {port for _, port in options.report}
+    assert reports == {int(CONF[f"{who}_PORT"]) for who in ("PLANNER", "CONSOLE_REPORT", "RECORDER_REPORT")}
+    planner = autonomy_arguments(words(unit / "timberhand-autonomy.service")[3:])
+    assert planner.controller == ("127.0.0.1", options.setpoint_port)
+    assert planner.report_port in reports
+
+
+def test_the_target_pulls_every_process_in_and_takes_it_along() -> None:
+    for unit in PROCESSES:
+        assert setting(unit, "WantedBy") == ["timberhand.target"], unit.name
+        assert setting(unit, "PartOf") == ["timberhand.target"], unit.name
