@@ -10,7 +10,7 @@ import math
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Final
 
 import numpy as np
@@ -174,16 +174,19 @@ def _moved(s: LogSpec, x: float, y: float, yaw: float) -> LogSpec:
     return replace(s, x_m=x + c * s.x_m - k * s.y_m, y_m=y + k * s.x_m + c * s.y_m, yaw_rad=s.yaw_rad + yaw)
 
 
-def _rows(lumber: Lumber, counts: Sequence[int], yaws: Callable[[], float]) -> list[LogSpec]:
+def _drawn(lumber: Lumber, logs: int, yaws: Callable[[], float]) -> list[LogSpec]:
+    return [lumber.log(lumber.rng.uniform(-0.2, 0.2), 0.0, yaws()) for _ in range(logs)]
+
+
+def _rows(counts: Sequence[int], logs: Sequence[LogSpec]) -> list[LogSpec]:
     """Rows of logs along x, side by side in y, each row upon the one below it and about its middle."""
-    rng = lumber.rng
+    following = iter(logs)
     out: list[LogSpec] = []
     middle = 0.0
     for count in counts:
         row: list[LogSpec] = []
-        for _ in range(count):
-            spec = lumber.log(rng.uniform(-0.2, 0.2), row[-1].y_m if row else 0.0, yaws())
-            row.append(beside(spec, row))
+        for spec in islice(following, count):
+            row.append(beside(replace(spec, y_m=row[-1].y_m if row else 0.0), row))
         shift = middle - (row[0].y_m + row[-1].y_m) / 2
         for spec in row:
             out.append(upon(replace(spec, y_m=spec.y_m + shift), out))
@@ -191,16 +194,18 @@ def _rows(lumber: Lumber, counts: Sequence[int], yaws: Callable[[], float]) -> l
 
 
 def _parallel(lumber: Lumber, logs: int) -> list[LogSpec]:
-    return _rows(lumber, (logs,), lambda: lumber.rng.uniform(-0.03, 0.03))
+    return _rows((logs,), _drawn(lumber, logs, lambda: lumber.rng.uniform(-0.03, 0.03)))
 
 
 def _pile(lumber: Lumber, logs: int) -> list[LogSpec]:
-    return _rows(lumber, PILE_ROWS[logs], lambda: lumber.rng.uniform(-0.08, 0.08))
+    """The thickest below: a thick log on thin ones rolls off, and what is left is no pile."""
+    drawn = _drawn(lumber, logs, lambda: lumber.rng.uniform(-0.08, 0.08))
+    return _rows(PILE_ROWS[logs], sorted(drawn, key=lambda log: -log.diameter_m))
 
 
 def _skewed(lumber: Lumber, logs: int) -> list[LogSpec]:
     turns = iter([0.0, math.radians(lumber.rng.uniform(15.0, 30.0))])
-    return _rows(lumber, (logs,), lambda: next(turns))
+    return _rows((logs,), _drawn(lumber, logs, lambda: next(turns)))
 
 
 def _crossed(lumber: Lumber, logs: int) -> list[LogSpec]:

@@ -26,6 +26,7 @@ REST_SHARE: Final = 0.004  # of full speed: below it the spool stays in its dead
 CLOSE_LIMIT_S: Final = 8.0
 GRIPPED_S: Final = 0.3
 STILL_RAD_S: Final = 0.02
+OPENING: Final = 0.6  # share of full spool: the pin keeps up with the tips
 LOOK_AHEAD_RAD: Final = (0.0, 0.05, 0.10, 0.15)
 RELEASED_RAD: Final = 0.45  # tips clear of the load, not yet at the stakes
 
@@ -135,22 +136,36 @@ class Driver:
         self.wait(1.0)
         return ext
 
-    def place(self, x: float, y: float, log_yaw: float, low_m: float, carry_m: float) -> None:
-        """Carry to (x, y), turn the load to ``log_yaw``, lower the pin to ``low_m``, open and go up again."""
-        ext = self.extension_for(x, y, low_m, carry_m)
+    def place(self, x: float, y: float, log_yaw: float, floor_m: float, carry_m: float) -> None:
+        """Carry to (x, y), turn the load to ``log_yaw``, set it down, open and go up again.
+
+        The tips stay ``floor_m`` high: closed ones are lowered until then, and while they open and sweep lower the
+        pin rises, so the load is laid down and not dropped.
+        """
+        tongs = self.world.profile.grapple.tongs
+        low = floor_m + tip_below_pin_m(tongs, self.world.tong_angle)
+        ext = self.extension_for(x, y, low, carry_m)
         above = self.pose((x, y, carry_m), ext)
         self.move({**above, "rot": self.rotator(above["slew"], log_yaw)})
         self.wait(1.0)
-        self.line((x, y, carry_m), (x, y, low_m), ext)
+        self.line((x, y, carry_m), (x, y, low), ext)
         self.wait(0.5)
-        self.grapple = 1.0
+        z = self._open_while_raising(x, y, low, floor_m, ext)
+        self.wait(0.5)
+        self.line((x, y, z), (x, y, carry_m), ext)
+
+    def _open_while_raising(self, x: float, y: float, z: float, floor: float, ext: float) -> float:
+        tongs = self.world.profile.grapple.tongs
+        self.grapple = OPENING
         for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
-            self.tick({})
-            if self.world.tong_angle < RELEASED_RAD:
+            angle = self.world.tong_angle
+            wanted = floor + max(tip_below_pin_m(tongs, angle - ahead) for ahead in LOOK_AHEAD_RAD)
+            z = max(z, min(wanted, z + RAISE_SPEED_M_S * STEP_S))
+            self._follow((x, y, z), ext)
+            if angle < RELEASED_RAD:
                 break
         self.grapple = 0.0
-        self.wait(0.5)
-        self.line((x, y, low_m), (x, y, carry_m), ext)
+        return z
 
     def _close_while_raising(self, x: float, y: float, z: float, floor: float, ext: float) -> float:
         """Close until the tongs stand still on a load; the tips sweep lower, so the pin rises meanwhile."""

@@ -18,7 +18,7 @@ from hil.experiments.plant.driver import DRIVEN, Driver
 from hil.experiments.plant.trial import take
 from hil.experiments.plant.worlds import opened
 from hil.experiments.pool import Job
-from machine.grapple import lowest_tip_below_pin_m
+from machine.grapple import lowest_tip_below_pin_m, tip_below_pin_m
 from machine.kinematics import Unreachable
 from sim.world import STEP_S, World
 
@@ -81,12 +81,13 @@ def _lay_down(world: World, driver: Driver, rng: random.Random) -> None:
     tips = lowest_tip_below_pin_m(tongs)
     while True:
         x, y = (c + rng.uniform(-1.0, 1.0) * space.pick_half_size_m for c in space.pick_center_m)
-        low = space.ground_z_m + LAY_DOWN_M + tips
+        floor = space.ground_z_m + LAY_DOWN_M
+        low, high = floor + tip_below_pin_m(tongs, world.tong_angle), floor + tips + 0.8
         try:
-            driver.extension_for(x, y, low, low + 0.8)
+            driver.extension_for(x, y, low, high)
         except Unreachable:
             continue
-        driver.place(x, y, rng.uniform(-math.pi / 2, math.pi / 2), low, low + 0.8)
+        driver.place(x, y, rng.uniform(-math.pi / 2, math.pi / 2), floor, high)
         return
 
 

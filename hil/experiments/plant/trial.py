@@ -140,8 +140,8 @@ def unload(world: World, driver: Driver, logs: Sequence[LogState]) -> None:
     c, s = math.cos(turn), math.sin(turn)
     off_x, off_y = c * (x - pin[0]) - s * (y - pin[1]), s * (x - pin[0]) + c * (y - pin[1])
     over_x, over_y, _ = from_bunk(bunk, (0.0, 0.0, 0.0))
-    low = bunk.floor_z_m + OVER_FLOOR_M + lowest_tip_below_pin_m(world.profile.grapple.tongs)
-    driver.place(over_x - off_x, over_y - off_y, driver.log_yaw() + turn, low, over_stakes_m(world))
+    floor = bunk.floor_z_m + OVER_FLOOR_M
+    driver.place(over_x - off_x, over_y - off_y, driver.log_yaw() + turn, floor, over_stakes_m(world))
 
 
 def _middle(world: World, logs: Sequence[LogState]) -> tuple[float, float, float]:
