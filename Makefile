@@ -21,10 +21,11 @@ demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--locks
 
 test: lint  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
 	@sh deploy/debian_packages.sh
-	@$(BIN)/pytest $(ARGS)
+	@$(BIN)/pytest -m "not slow" -n 2 $(ARGS)
+	@$(BIN)/pytest -m slow $(ARGS)
 
 check: lint  ## lint, types, architecture and the fast tests
-	@$(BIN)/pytest -q -m "not slow" $(ARGS)
+	@$(BIN)/pytest -q -m "not slow" -n 2 $(ARGS)
 
 lint: setup  ## style, types and the three floors
 	@$(BIN)/ruff check .
@@ -32,8 +33,9 @@ lint: setup  ## style, types and the three floors
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-cache
 
-bench: setup  ## measure: codecs beside cantools
+bench: setup  ## measure: codecs beside cantools, the plant against real time
 	@$(BIN)/timberhand bench codec $(ARGS)
+	@$(BIN)/timberhand bench plant $(ARGS)
 
 clean:  ## remove the virtual environment and everything generated
 	rm -rf $(VENV) build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
