@@ -21,8 +21,8 @@ demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--locks
 
 test: lint  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
 	@sh deploy/debian_packages.sh
-	@$(BIN)/pytest -m "not slow" -n 2 $(ARGS)
-	@$(BIN)/pytest -m slow $(ARGS)
+	@$(BIN)/pytest -m "not slow" -n 2 $(ARGS) || [ $$? -eq 5 ]
+	@$(BIN)/pytest -m slow $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
 
 check: lint  ## lint, types, architecture and the fast tests
 	@$(BIN)/pytest -q -m "not slow" -n 2 $(ARGS)

@@ -33,7 +33,7 @@ from autonomy.motion.trajectory import Trajectory, follow, hold, straight, trave
 from autonomy.phases import BEGIN_AGAIN, RULES, Phase
 from autonomy.stream import PERIOD_NS, SetpointStream
 from can_dbc.setpoint import GrappleCommand, StateReport
-from machine.grapple import tong_angle_from_opening_pct
+from machine.grapple import grapple_yaw, tong_angle_from_opening_pct
 from machine.joints import JOINTS, Joint
 from machine.kinematics import Unreachable
 from machine.modes import Mode
@@ -202,7 +202,8 @@ class Activity:
                 up_m = grasp.pose.z_m + LIFT_M
                 return travel(arm, start, grasp.pose.at_height(up_m), up_m)
             case Phase.CARRY:
-                self.place = plan_place(arm, self._mission, grasp, self._logs)
+                held_yaw = grapple_yaw(self._profile, q)
+                self.place = plan_place(arm, self._mission, grasp, self._logs, held_yaw)
                 free_m = approach_length(self._profile, grasp.log)
                 return travel(arm, start, self.place.at_height(high_m), high_m, free_m)
         assert self.place is not None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import atan2, cos, degrees, hypot, pi, sin
+from math import atan2, cos, degrees, hypot, pi, remainder, sin
 from typing import Final
 
 import numpy as np
@@ -164,8 +164,14 @@ def plan_grasp(arm: Arm, log: LogObservation, rot: float) -> Grasp:
     raise NoGrasp(trouble)
 
 
-def plan_place(arm: Arm, mission: Mission, grasp: Grasp, logs: Sequence[LogObservation]) -> Pose:
-    """The pose of the pin in which the tongs may open over the bunk; raises ``NoGrasp``."""
+def plan_place(
+    arm: Arm, mission: Mission, grasp: Grasp, logs: Sequence[LogObservation], held_yaw_rad: float | None = None
+) -> Pose:
+    """The pose of the pin in which the tongs may open over the bunk; raises ``NoGrasp``.
+
+    ``held_yaw_rad``: the grapple's yaw while the log was seen to hang in it.  A thin log may lie askew in closed tongs;
+    the grapple is turned so that the log, not the grapple, lies along the bunk.
+    """
     profile, bunk = arm.profile, arm.profile.bunk
     top = bunk.floor_z_m + bunk.stake_height_m
     below = [o.center_m[2] + o.diameter_m / 2 for o in logs if o.id != grasp.log.id and lies_in(bunk, o)]
@@ -179,10 +185,15 @@ def plan_place(arm: Arm, mission: Mission, grasp: Grasp, logs: Sequence[LogObser
     shift_m = out_m if grasp.along_m > 0.0 else -out_m
     log_yaw = atan2(grasp.log.axis[1], grasp.log.axis[0]) - grasp.pose.slew_rad - grasp.pose.rot_rad
     center_x, center_y = x, y = mission.place_m or bunk.center_m
+    seen = next((o for o in logs if o.id == grasp.log.id), None)
+    skew = 0.0
+    if seen is not None and held_yaw_rad is not None:
+        skew = remainder(atan2(seen.axis[1], seen.axis[0]) - (held_yaw_rad - pi / 2), pi)
+        log_yaw += skew
     try:
         for _ in range(2):  # which way the log points is known once the place is
             pose = arm.over(x, y, low, travel_height(profile))
-            rot = rotator_for_yaw(profile, pose.slew_rad, bunk.yaw_rad + pi / 2, grasp.pose.rot_rad)
+            rot = rotator_for_yaw(profile, pose.slew_rad, bunk.yaw_rad + pi / 2 - skew, grasp.pose.rot_rad)
             laid = log_yaw + pose.slew_rad + rot
             x, y = center_x + shift_m * cos(laid), center_y + shift_m * sin(laid)
     except Unreachable as error:

@@ -1,7 +1,7 @@
 """The valve node (PLC, 10h): takes ValveCmdA/B, gives spool commands; safe by absence.
 
 The spools follow only while ValveCmdA, ValveCmdB (E2E good, ArmKey 0xA) and GuardStat (Enable 0xA) are at most
-50 ms old, SYNC at most three cycles old and the pilot supply is on.  Lost while active: ramp to neutral in 70 ms,
+50 ms old, SYNC at most three cycles old and the pilot supply is on.  Lost while active: ramp to neutral in 60 ms,
 state FAULT until a fresh frame disarms; 300 ms without commands: pilot off.  The grapple never opens on a loss.  A
 disarm is neutral at once.
 """
@@ -19,7 +19,7 @@ from sim.nodes.traffic import ARM_KEY, MS, Every, ProtectedInput, ProtectedMessa
 
 COMMAND_NS = GUARD_NS = 50 * MS
 SYNC_NS = 15 * MS
-RAMP_NS = 70 * MS  # with 15 ms until SYNC counts as lost: neutral within 100 ms of a loss
+RAMP_NS = 60 * MS  # with 15 ms until SYNC counts as lost: neutral within 100 ms of a loss
 PILOT_NS = 300 * MS
 CYCLE_NS = 5 * MS
 SLOW_NS = 20 * MS

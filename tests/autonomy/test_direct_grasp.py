@@ -179,3 +179,14 @@ def test_lying_in_the_bunk_and_hanging_from_the_grapple() -> None:
     assert not is_held(ARM, GROUND_LOG, up)
     assert is_held(ARM, replace(GROUND_LOG, center_m=(-1.7, 4.5, up.z_m - 1.1)), up)
     assert not is_held(ARM, replace(GROUND_LOG, center_m=(1.0, 4.5, up.z_m - 1.1)), up)
+
+
+@pytest.mark.parametrize("skew", [-0.5, 0.0, 0.4])
+def test_a_log_that_hangs_askew_is_turned_along_the_bunk(skew):
+    grasp = plan_grasp(ARM, GROUND_LOG, 0.0)
+    held_yaw = 0.9
+    hangs = held_yaw - pi / 2 + skew
+    seen = replace(GROUND_LOG, axis=(cos(hangs), sin(hangs), 0.0))
+    place = plan_place(ARM, Mission(), grasp, [seen], held_yaw)
+    laid = hangs + (place.slew_rad + place.rot_rad - held_yaw)
+    assert remainder(laid - BUNK.yaw_rad, pi) == pytest.approx(0.0, abs=1e-6)

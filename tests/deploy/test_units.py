@@ -99,7 +99,7 @@ def test_only_the_control_processes_are_hard_timed_and_the_guard_goes_first() ->
     assert timed == {"timberhand-controller": 80, "timberhand-guard": 85}
     for unit in (u for u in UNITS if u.stem in timed):
         assert setting(unit, "Type") == ["notify"]
-        assert setting(unit, "WatchdogSec") == ["0.3"]
+        assert setting(unit, "WatchdogSec") == ["1"]
         assert setting(unit, "Restart") == ["on-failure"]
         assert setting(unit, "RestartPreventExitStatus") == ["2 3"]
         assert setting(unit, "LimitRTPRIO") == [str(timed[unit.stem])]

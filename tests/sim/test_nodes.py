@@ -238,14 +238,14 @@ def test_the_valve_goes_neutral_by_absence_and_needs_a_new_arming(bench, loss, e
     assert bench.last("ValveFbA")["State"] == ValveState.ACTIVE
 
 
-def test_the_ramp_to_neutral_takes_seventy_milliseconds(bench):
+def test_the_ramp_to_neutral_takes_sixty_milliseconds(bench):
     bench.cycle(60, spools=(60.0, 0.0, 0.0, 0.0))
     seen = []
     for _ in range(40):
         bench.cycle(1, commands=False)
         seen.append(bench.plant.valve.outputs_pct[0])
     assert seen == sorted(seen, reverse=True)
-    assert seen[8] == 60.0 and 0.0 < seen[20] < 40.0 and seen[26] == 0.0
+    assert seen[8] == 60.0 and 0.0 < seen[20] < 40.0 and seen[24] == 0.0
 
 
 def test_a_wrong_arm_key_or_a_broken_frame_moves_nothing(bench):
