@@ -2,7 +2,7 @@
 // World frame: metres, z up.  A pose is [x, y, z, qx, qy, qz, qw].
 
 import * as THREE from "three";
-import { OrbitControls } from "./vendor/OrbitControls.js";
+import { createViewport } from "./viewport.js";
 
 const LOST_AFTER_MS = 1500;
 const LEVER_MS = 150;
@@ -17,10 +17,8 @@ function place(object, pose) {
 
 /** Everything that is drawn; `update(view)` moves it. */
 function createView(container, scene) {
-  const renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
-  renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
-  container.replaceChildren(renderer.domElement);
-  const world = new THREE.Scene();
+  const { world, camera, controls, draw, look } = createViewport(
+    container, { nearest: 1, farthest: 80, sight: 300 });
   const sun = new THREE.DirectionalLight(0xfff4e0, 2.4);
   sun.position.set(8, -5, 14);
   world.add(new THREE.HemisphereLight(0xe9f5ff, 0x3a4a40, 1.4), sun, ground(scene.ground));
@@ -48,36 +46,13 @@ function createView(container, scene) {
     return mesh;
   });
 
-  const camera = new THREE.PerspectiveCamera(42, 1, 0.1, 300);
-  camera.up.set(0, 0, 1);
-  const controls = new OrbitControls(camera, renderer.domElement);
-  controls.minDistance = 1;
-  controls.maxDistance = 80;
   const centre = v3(scene.centre_m), size = scene.size_m;
   const VIEWS = {
     corner: [1.05, -1.0, 0.7], top: [0.0, -0.01, 1.9], side: [1.6, 0.0, 0.25],
   };
-  let asked = false;
-  const draw = () => {
-    if (asked) return;
-    asked = true;
-    requestAnimationFrame(() => { asked = false; renderer.render(world, camera); });
-  };
-  controls.addEventListener("change", draw);
-  new ResizeObserver(() => {
-    const { clientWidth: w, clientHeight: h } = container;
-    if (!w || !h) return;
-    renderer.setSize(w, h);
-    camera.aspect = w / h;
-    camera.updateProjectionMatrix();
-    draw();
-  }).observe(container);
 
   function view(name) {
-    camera.position.copy(centre).addScaledVector(v3(VIEWS[name]), size);
-    controls.target.copy(centre);
-    controls.update();
-    draw();
+    look(centre.clone().addScaledVector(v3(VIEWS[name]), size), centre);
   }
 
   function update(state, follow) {

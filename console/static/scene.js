@@ -1,7 +1,7 @@
 // The crane, the ground, the bunk and the logs in three dimensions.  Base frame: metres, z up, reach +y at slew 0.
 
 import * as THREE from "three";
-import { OrbitControls } from "./vendor/OrbitControls.js";
+import { createViewport } from "./viewport.js";
 
 const CRANE = 0xe0a22e, STEEL = 0x8b979f, DARK = 0x39443f, BARK = 0x8a5a35, WOOD = 0xe2b883, GHOST = 0xcfe3ff;
 const UP = new THREE.Vector3(0, 1, 0);
@@ -120,11 +120,7 @@ function addBunk(scene, machine) {
 
 /** Builds the view into `container`; returns `{update(state), view(name)}`.  Throws without WebGL. */
 export function createScene(container, machine) {
-  const renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
-  renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
-  container.replaceChildren(renderer.domElement);
-
-  const scene = new THREE.Scene();
+  const { world: scene, draw, look } = createViewport(container, { nearest: 2, farthest: 30, sight: 80 });
   const sun = new THREE.DirectionalLight(0xffffff, 2.2);
   sun.position.set(6, 3, 12);
   scene.add(new THREE.HemisphereLight(0xe9f5ff, 0x3a4a40, 1.5), sun);
@@ -144,35 +140,9 @@ export function createScene(container, machine) {
   const logs = new THREE.Group();
   scene.add(logs);
 
-  const camera = new THREE.PerspectiveCamera(42, 1, 0.1, 80);
-  camera.up.set(0, 0, 1);
-  const controls = new OrbitControls(camera, renderer.domElement);
-  controls.minDistance = 2;
-  controls.maxDistance = 30;
-
-  let asked = false;
-  function draw() {
-    if (asked) return;
-    asked = true;
-    requestAnimationFrame(() => { asked = false; renderer.render(scene, camera); });
-  }
-  controls.addEventListener("change", draw);
-  new ResizeObserver(() => {
-    const { clientWidth: w, clientHeight: h } = container;
-    if (!w || !h) return;
-    renderer.setSize(w, h);
-    camera.aspect = w / h;
-    camera.fov = w > h ? 42 : 58;
-    camera.updateProjectionMatrix();
-    draw();
-  }).observe(container);
-
   function view(name) {
     const [position, target] = VIEWS[name];
-    camera.position.set(...position);
-    controls.target.set(...target);
-    controls.update();
-    draw();
+    look(v3(position), v3(target));
   }
 
   let logsShown = "";

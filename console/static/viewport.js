@@ -1,0 +1,43 @@
+// A three-dimensional window: renderer, camera and controls; draws when something has changed.  Metres, z up.
+
+import * as THREE from "three";
+import { OrbitControls } from "./vendor/OrbitControls.js";
+
+/** Fills `container`; returns `{world, camera, controls, draw, look(position, target)}`.  Throws without WebGL. */
+export function createViewport(container, { nearest, farthest, sight }) {
+  const renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
+  renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
+  container.replaceChildren(renderer.domElement);
+
+  const world = new THREE.Scene();
+  const camera = new THREE.PerspectiveCamera(42, 1, 0.1, sight);
+  camera.up.set(0, 0, 1);
+  const controls = new OrbitControls(camera, renderer.domElement);
+  controls.minDistance = nearest;
+  controls.maxDistance = farthest;
+
+  let asked = false;
+  function draw() {
+    if (asked) return;
+    asked = true;
+    requestAnimationFrame(() => { asked = false; renderer.render(world, camera); });
+  }
+  controls.addEventListener("change", draw);
+  new ResizeObserver(() => {
+    const { clientWidth: w, clientHeight: h } = container;
+    if (!w || !h) return;
+    renderer.setSize(w, h);
+    camera.aspect = w / h;
+    camera.fov = w > h ? 42 : 58;
+    camera.updateProjectionMatrix();
+    draw();
+  }).observe(container);
+
+  function look(position, target) {
+    camera.position.copy(position);
+    controls.target.copy(target);
+    controls.update();
+    draw();
+  }
+  return { world, camera, controls, draw, look };
+}
