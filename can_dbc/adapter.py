@@ -6,32 +6,34 @@ now is of the second sort and is replaced by the time of the drain.
 
 from __future__ import annotations
 
+import contextlib
 import time
+from collections.abc import Sequence
 from typing import Final
 
 import can
 
 from can_dbc.bus import DRAIN_LIMIT, BaseBus, BusError, BusState
+from can_dbc.filters import Filter
 from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame, identifier
 
 _PLAUSIBLE_AGE_NS: Final = 1_000_000_000
+_FAILURES: Final = (can.CanError, OSError, ValueError, ImportError)
 
 
 class PythonCanBus(BaseBus):
-    """One python-can bus (contract: `can_dbc.bus.Bus`)."""
+    """One python-can bus (contract: `can_dbc.bus.Bus`).  `reopen` takes as long as the adapter's driver takes."""
 
-    def __init__(
-        self, interface: str, channel: str, keys: frozenset[int] | None = None, receive_own: bool = False
-    ) -> None:
+    def __init__(self, interface: str, channel: str, wanted: Filter | None = None, receive_own: bool = False) -> None:
         super().__init__(channel)
+        self._interface, self._wanted, self._receive_own = interface, wanted, receive_own
         try:
-            self._can = can.Bus(interface=interface, channel=channel, receive_own_messages=receive_own)
-        except (can.CanError, OSError, ValueError, ImportError) as error:
+            self._can = self._open()
+        except _FAILURES as error:
             raise BusError(
                 f"python-can cannot open {interface}:{channel} ({error}); check the interface name, the "
                 "channel and that the adapter's driver is installed."
             ) from error
-        self._keys = keys
 
     def fileno(self) -> int:
         try:
@@ -39,47 +41,61 @@ class PythonCanBus(BaseBus):
         except NotImplementedError:
             return -1
 
-    def drain(self, frames: list[Frame]) -> int:
-        if self.stats.state is BusState.DOWN:
-            return 0
-        before = len(frames)
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
+        stats, sent = self.stats, 0
+        if stats.state < BusState.OFF:
+            with contextlib.suppress(can.CanError, OSError):  # no room: this one and the rest are refused
+                for key, data in frames:
+                    if len(data) > 8:
+                        break
+                    self._can.send(message_of(key, data), timeout=0)
+                    sent += 1
+        stats.sent += sent
+        stats.refused += len(frames) - sent
+        return sent
+
+    def flush(self) -> None:
+        with contextlib.suppress(can.CanError, OSError, NotImplementedError):  # not every adapter can
+            self._can.flush_tx_buffer()
+        super().flush()
+
+    def _take(self, frames: list[Frame]) -> None:
+        stats, wanted, first = self.stats, self._wanted, len(frames)
         offset_ns = time.monotonic_ns() - time.time_ns()
         for _ in range(DRAIN_LIMIT):
             try:
                 message = self._can.recv(timeout=0)
             except (can.CanError, OSError):
-                self.stats.state = BusState.DOWN
-                break
+                stats.enter(BusState.DOWN)
+                return
             if message is None:
-                break
+                return
             if message.is_error_frame:
-                self.stats.note_error(message.arbitration_id, bytes(message.data).ljust(8, b"\0"))
+                if stats.note_error(message.arbitration_id, bytes(message.data).ljust(8, b"\0")):
+                    del frames[first:]
                 continue
             key = key_of(message)
-            if self._keys is None or key in self._keys:
+            if wanted is None or key in wanted:
                 now_ns = time.monotonic_ns()
                 stamp_ns = min(int(message.timestamp * 1e9) + offset_ns, now_ns)
                 if now_ns - stamp_ns > _PLAUSIBLE_AGE_NS:
                     stamp_ns = now_ns
                 frames.append(Frame(stamp_ns, key, payload_of(message)))
-        taken = len(frames) - before
-        self.stats.received += taken
-        return taken
 
-    def send(self, key: int, data: bytes) -> bool:
-        if self.stats.state < BusState.OFF and len(data) <= 8:
-            try:
-                self._can.send(message_of(key, data), timeout=0)
-                self.stats.sent += 1
-                return True
-            except (can.CanError, OSError):
-                pass  # refused below
-        self.stats.refused += 1
-        return False
+    def _open(self) -> can.BusABC:
+        return can.Bus(interface=self._interface, channel=self.name, receive_own_messages=self._receive_own)
 
-    def close(self) -> None:
-        self._can.shutdown()
-        self.stats.state = BusState.DOWN
+    def _open_again(self) -> bool:
+        self._leave()
+        try:
+            self._can = self._open()
+        except _FAILURES:
+            return False
+        return True
+
+    def _leave(self) -> None:
+        with contextlib.suppress(can.CanError, OSError):
+            self._can.shutdown()
 
 
 def message_of(key: int, data: bytes, timestamp_s: float = 0.0) -> can.Message:

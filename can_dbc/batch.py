@@ -1,7 +1,8 @@
-"""Many waiting datagrams in one system call: recvmmsg(2) into buffers that are made once.
+"""Many datagrams in one system call: recvmmsg(2) and sendmmsg(2) on buffers that are made once.
 
-A drain of a busy socket costs one call instead of one per frame, which counts in a 200 Hz tick and even more inside
-user-mode Linux, where a call costs a hundred times as much.  Standard library alone; Linux with glibc or musl.
+A drain of a busy socket costs one call instead of one per frame, and so do the frames of a tick, which counts at
+200 Hz and even more inside user-mode Linux, where a call costs a hundred times as much.  Standard library alone; Linux
+with glibc or musl.
 """
 
 from __future__ import annotations
@@ -11,60 +12,92 @@ import errno
 import os
 import socket
 import struct
+from collections.abc import Iterator
 from typing import Final
 
 _SO_RCVBUFFORCE: Final = 33
 _libc: Final = ctypes.CDLL(None, use_errno=True)
+_recvmmsg, _sendmmsg = _libc.recvmmsg, _libc.sendmmsg
 _IOVEC: Final = struct.Struct("@PN")
 _HEADER: Final = struct.Struct("@PI4xPNPNi4xI4x")  # struct mmsghdr: name, its length, iovec, control, flags, length
-_CONTROL_AT: Final = struct.calcsize("@PI4xPNP")
-_LENGTH_AT: Final = struct.calcsize("@PI4xPNPNi4x")
-_SIZE_T: Final = struct.Struct("@N")
-_UNSIGNED: Final = struct.Struct("@I")
+_LENGTH: Final = struct.Struct("@56xI4x")  # the same bytes, the length of the datagram alone
 
 
-class Batch:
-    """Buffers for ``count`` datagrams of at most ``size`` bytes with ``ancillary`` bytes of control data each.
+class _Buffers:
+    """``count`` message headers that point at ``size`` bytes of data and ``ancillary`` bytes of control data each."""
 
-    After `receive` datagram i lies at ``data[i * size]``, its control messages at ``control[i * ancillary]``.
-    """
+    __slots__ = ("_address", "_headers", "_keep", "ancillary", "control", "count", "data", "size")
 
-    __slots__ = ("_at", "_fresh", "_headers", "_keep", "ancillary", "control", "count", "data", "size")
-
-    def __init__(self, size: int, ancillary: int = 0, count: int = 64) -> None:
+    def __init__(self, size: int, ancillary: int, count: int) -> None:
         self.size, self.ancillary, self.count = size, ancillary, count
-        self.data = bytearray(size * count)
-        self.control = bytearray(max(ancillary * count, 1))
-        iovecs, self._headers = bytearray(_IOVEC.size * count), bytearray(_HEADER.size * count)
+        self.data = memoryview(bytearray(size * count))
+        self.control = memoryview(bytearray(max(ancillary * count, 1)))
+        iovecs, self._headers = bytearray(_IOVEC.size * count), memoryview(bytearray(_HEADER.size * count))
         buffers = (self.data, self.control, iovecs, self._headers)
-        self._keep = [ctypes.c_char.from_buffer(buffer) for buffer in buffers], iovecs
-        data_at, control_at, iovecs_at, self._at = (ctypes.addressof(view) for view in self._keep[0])
+        views = [ctypes.c_char.from_buffer(buffer) for buffer in buffers]
+        self._keep = views, iovecs
+        data_at, control_at, iovecs_at, headers_at = (ctypes.addressof(view) for view in views)
+        self._address = ctypes.c_void_p(headers_at)
         for i in range(count):
             _IOVEC.pack_into(iovecs, i * _IOVEC.size, data_at + i * size, size)
             where = control_at + i * ancillary if ancillary else 0
             _HEADER.pack_into(
                 self._headers, i * _HEADER.size, 0, 0, iovecs_at + i * _IOVEC.size, 1, where, ancillary, 0, 0
             )
-        self._fresh = bytes(self._headers)
+
+
+class Batch(_Buffers):
+    """Room for ``count`` datagrams of at most ``size`` bytes with ``ancillary`` bytes of control data each.
+
+    After `receive` datagram i lies at ``data[i * size]``, its control messages at ``control[i * ancillary]``; control
+    data that a datagram did not bring reads as zeros.
+    """
+
+    __slots__ = ("_fresh", "_used", "_zeros")
+
+    def __init__(self, size: int, ancillary: int = 0, count: int = 64) -> None:
+        super().__init__(size, ancillary, count)
+        self._fresh, self._zeros = bytes(self._headers), bytes(ancillary * count)
+        self._used = 0
 
     def receive(self, descriptor: int) -> int:
         """Takes what waits, at most ``count``, without blocking; 0 when nothing does.  Raises OSError otherwise."""
-        self._headers[:] = self._fresh  # the kernel writes the sizes it found over the sizes it is offered
-        taken = _libc.recvmmsg(descriptor, ctypes.c_void_p(self._at), self.count, socket.MSG_DONTWAIT, None)
+        if self._used:  # the kernel writes the sizes it found over the sizes it is offered
+            self._headers[: self._used * _HEADER.size] = self._fresh[: self._used * _HEADER.size]
+            self.control[: self._used * self.ancillary] = self._zeros[: self._used * self.ancillary]
+            self._used = 0
+        taken: int = _recvmmsg(descriptor, self._address, self.count, socket.MSG_DONTWAIT, None)
         if taken >= 0:
-            return int(taken)
+            self._used = taken
+            return taken
         code = ctypes.get_errno()
         if code in (errno.EAGAIN, errno.EINTR):
             return 0
         raise OSError(code, os.strerror(code))
 
-    def length(self, i: int) -> int:
-        """Bytes of datagram i."""
-        return int(_UNSIGNED.unpack_from(self._headers, i * _HEADER.size + _LENGTH_AT)[0])
+    def lengths(self) -> Iterator[int]:
+        """Bytes of each datagram that the last `receive` took."""
+        return (length for (length,) in _LENGTH.iter_unpack(self._headers[: self._used * _HEADER.size]))
 
-    def control_length(self, i: int) -> int:
-        """Bytes of control data of datagram i."""
-        return int(_SIZE_T.unpack_from(self._headers, i * _HEADER.size + _CONTROL_AT)[0])
+
+class Outbox(_Buffers):
+    """Room for ``count`` datagrams of exactly ``size`` bytes; datagram i is written to ``data[i * size]``."""
+
+    __slots__ = ()
+
+    def __init__(self, size: int, count: int = 64) -> None:
+        super().__init__(size, 0, count)
+
+    def send(self, descriptor: int, count: int) -> int:
+        """Sends the first ``count`` datagrams without blocking; returns how many the kernel took, from the first on.
+
+        Raises OSError with the reason when it took none.
+        """
+        sent: int = _sendmmsg(descriptor, self._address, count, socket.MSG_DONTWAIT)
+        if sent >= 0:
+            return sent
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
 
 
 def widen(sock: socket.socket, size: int) -> None:

@@ -3,10 +3,15 @@
 Address: ``wire:crane0`` (the user-space bus of ``hil.wire``), ``socketcan:vcan0`` (a kernel interface) or
 ``<python-can interface>:<channel>``.  `default_address` chooses one for a logical name.
 
-Contract of every `Bus`: `drain` and `send` never block.  `drain` gives data and remote frames in the order
-of the bus; error frames become `BusStats.state` and never reach a codec.  `send` returns False when the
-frame was not taken (queue full, bus off, link or daemon gone); such a frame is counted in `refused` and is
-never sent later.  Only opening raises: `BusError`, one sentence that says what to do.
+Contract of every `Bus`: nothing but opening raises, `BusError`, one sentence that says what to do.  `drain`, `send` and
+`send_all` never block.  `drain` gives data and remote frames in the order of the bus; error frames become
+`BusStats.state` and never reach a codec.  Own frames do not come back unless asked for, so a frame with an own
+identifier is somebody else's; on SocketCAN that may be another process on this machine.
+
+A frame that is not taken (queue full, bus off, link or daemon gone) is counted in `BusStats.refused` and is never
+sent later.  Bus-off ends by itself (restart-ms of the interface; the restart time of the wire).  A lost link stays DOWN
+until `reopen` finds it again.  Both ways back count in `BusStats.recoveries`, and no frame from before is delivered
+after them.
 
 This module and the wire and SocketCAN backends need the standard library alone (the guard imports them).
 """
@@ -15,19 +20,25 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Protocol, Self
 
+from can_dbc.filters import Wanted, filter_of
 from can_dbc.frame import Frame
 
 DRAIN_LIMIT: Final = 1024
-"""Most reads one `Bus.drain` makes, so that a flooded bus cannot hold the tick."""
+"""Most frames one `Bus.drain` takes (a few more where they arrive in packets): a flooded bus cannot hold the tick."""
+_FLUSH_DRAINS: Final = 16
+"""Most drains of one `Bus.flush`; what they leave is recognised by its stamp."""
 
 VCAN_NAMES: Final = {"crane0": "vcan0", "mach0": "vcan1"}
 
 # Error classes and controller flags of linux/can/error.h.
+ERR_TX_TIMEOUT: Final = 0x001
+ERR_LOSTARB: Final = 0x002
 ERR_CRTL: Final = 0x004
 ERR_PROT: Final = 0x008
 ERR_ACK: Final = 0x020
@@ -62,19 +73,34 @@ class BusStats:
 
     state: BusState = BusState.ACTIVE
     received: int = 0
+    """Data and remote frames that `Bus.drain` gave."""
     sent: int = 0
     """Frames taken for sending."""
     refused: int = 0
-    """Frames `Bus.send` did not take."""
+    """Frames that `Bus.send` and `Bus.send_all` did not take."""
     dropped: int = 0
     """Received frames lost because this reader was too slow."""
     error_frames: int = 0
+    recoveries: int = 0
+    """How often the state came back from OFF or DOWN."""
     tx_errors: int = 0
     """Transmit error counter of the node, where the backend tells it."""
     rx_errors: int = 0
 
-    def note_error(self, key: int, data: bytes) -> None:
-        """Takes one error frame (linux/can/error.h: class in the key, 8 data bytes) into the state."""
+    def enter(self, state: BusState) -> bool:
+        """Changes the state; True when that is a recovery."""
+        recovered = state < BusState.OFF <= self.state
+        self.recoveries += recovered
+        self.state = state
+        return recovered
+
+    def note_error(self, key: int, data: bytes) -> bool:
+        """Takes one error frame (linux/can/error.h: class in the key, 8 data bytes) into the state.
+
+        True when the node has recovered: what was received before is out of date.  Lost arbitration and the time-out
+        of the driver's transmitter are counted and change no state: the one is everyday life on a bus, and the other
+        shows as frames that find no room.
+        """
         self.error_frames += 1
         flags = data[1] if key & ERR_CRTL else 0
         if key & ERR_CNT:
@@ -82,15 +108,16 @@ class BusStats:
         if flags & CRTL_RX_OVERFLOW:
             self.dropped += 1
         if key & ERR_BUSOFF:
-            self.state = BusState.OFF
-        elif key & ERR_RESTARTED:
-            self.state = BusState.ACTIVE
-        elif flags & CRTL_PASSIVE:
-            self.state = BusState.PASSIVE
-        elif flags & CRTL_WARNING:
-            self.state = BusState.WARNING
-        elif flags & CRTL_ACTIVE:
-            self.state = BusState.ACTIVE
+            return self.enter(BusState.OFF)
+        if key & ERR_RESTARTED:
+            return self.enter(BusState.ACTIVE)
+        if flags & CRTL_PASSIVE:
+            return self.enter(BusState.PASSIVE)
+        if flags & CRTL_WARNING:
+            return self.enter(BusState.WARNING)
+        if flags & CRTL_ACTIVE:
+            return self.enter(BusState.ACTIVE)
+        return False
 
 
 class Bus(Protocol):
@@ -100,13 +127,28 @@ class Bus(Protocol):
     stats: BusStats
 
     def fileno(self) -> int:
-        """Descriptor that becomes readable when frames wait; -1 where the backend has none."""
+        """Descriptor that becomes readable when frames wait; -1 where the backend has none.  `reopen` changes it."""
 
     def drain(self, frames: list[Frame]) -> int:
-        """Appends every waiting frame, at most `DRAIN_LIMIT` reads; returns how many were appended."""
+        """Appends every waiting frame, at most `DRAIN_LIMIT`; returns how many were appended."""
 
     def send(self, key: int, data: bytes) -> bool:
         """Hands over one frame of 0 to 8 bytes; False when it was not taken."""
+
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
+        """Hands over (key, data) frames in order, in one system call where the backend can; returns how many were
+        taken.  The first frame that is not taken and all behind it are refused."""
+
+    def flush(self) -> None:
+        """Discards what was received up to now (error frames still change the state) and, where the backend can, own
+        frames that are not on the bus yet."""
+
+    def reopen(self) -> bool:
+        """One try to get a lost link back, never longer than a few milliseconds; True when the bus is usable.
+
+        Only DOWN asks for it: a bus that works is left alone (True), so is one that is bus-off or closed (False).  A
+        link that comes back is opened anew and holds no frames from before.  Cheap enough for every cycle.
+        """
 
     def close(self) -> None:
         """Leaves the bus; closing twice is fine."""
@@ -117,14 +159,67 @@ class Bus(Protocol):
 
 
 class BaseBus:
-    """What every backend shares: name, counters and the context manager."""
+    """What every backend shares.  A backend gives `_take`, `send_all`, `_open_again` and `_leave`."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.stats = BusStats()
+        self._flushed_ns = 0
+        """Frames stamped before this are thrown away; 0 once a newer one came."""
+        self._closed = False
+
+    def _take(self, frames: list[Frame]) -> None:
+        """Appends what waits, without blocking."""
+        raise NotImplementedError
+
+    def _open_again(self) -> bool:
+        """Leaves the lost link and opens it anew; True when it is usable."""
+        return False
+
+    def _leave(self) -> None:
+        """Gives back what the backend holds; never fails."""
+
+    def drain(self, frames: list[Frame]) -> int:
+        stats = self.stats
+        if stats.state is BusState.DOWN:
+            return 0
+        before = len(frames)
+        self._take(frames)
+        if self._flushed_ns and len(frames) > before:
+            frames[before:] = [frame for frame in frames[before:] if frame.stamp_ns >= self._flushed_ns]
+            if len(frames) > before:
+                self._flushed_ns = 0  # in the order of the bus nothing older follows
+        taken = len(frames) - before
+        stats.received += taken
+        return taken
+
+    def send(self, key: int, data: bytes) -> bool:
+        return self.send_all(((key, data),)) == 1
+
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
+        raise NotImplementedError
+
+    def flush(self) -> None:
+        self._flushed_ns = time.monotonic_ns()
+        for _ in range(_FLUSH_DRAINS):
+            scrap: list[Frame] = []
+            if self.stats.state is not BusState.DOWN:
+                self._take(scrap)
+            if not scrap:
+                return
+
+    def reopen(self) -> bool:
+        stats = self.stats
+        if stats.state is BusState.DOWN and not self._closed and self._open_again():
+            stats.enter(BusState.ACTIVE)
+            self.flush()
+        return stats.state < BusState.OFF
 
     def close(self) -> None:
-        """Leaves the bus; closing twice is fine."""
+        if not self._closed:
+            self._closed = True
+            self._leave()
+            self.stats.enter(BusState.DOWN)
 
     def __enter__(self) -> Self:
         return self
@@ -136,20 +231,21 @@ class BaseBus:
 def open_bus(
     address: str,
     *,
-    filters: Iterable[int] | None = None,
+    filters: Iterable[Wanted] | None = None,
     receive_own: bool = False,
     tx_queue: int = 10,
     participant: str | None = None,
 ) -> Bus:
     """Opens the bus at `address`; raises `BusError`.
 
-    `filters` are the exact keys to receive (None: all; error frames always arrive).  `receive_own` also
-    gives back own frames once they were on the bus.  `tx_queue` bounds the own frames that wait on the
+    `filters` are the exact keys and the (key, mask) pairs to receive (`can_dbc.filters`; None: all; error frames always
+    arrive); the kernel takes at most 512 and does a few dozen at no cost.  `receive_own` also gives back own frames
+    once they were on the bus.  `tx_queue` bounds the own frames that wait on the
     wire, like ``txqueuelen`` does in the kernel; a process that plays many nodes needs more than 10.
     `participant` is the name by which faults on the wire find this process (default: the program's name).
     """
     backend, _, channel = address.partition(":")
-    keys = None if filters is None else frozenset(filters)
+    wanted = filter_of(filters)
     if not backend or not channel:
         raise BusError(
             f"'{address}' is not a bus address; write wire:crane0, socketcan:can0 or another python-can "
@@ -159,14 +255,14 @@ def open_bus(
     if backend == "wire":
         from can_dbc.wire_client import WireClient
 
-        return WireClient(channel, keys, receive_own, tx_queue, participant)
+        return WireClient(channel, wanted, receive_own, tx_queue, participant)
     if backend == "socketcan":
         from can_dbc.socketcan import SocketCanBus
 
-        return SocketCanBus(channel, keys, receive_own)
+        return SocketCanBus(channel, wanted, receive_own)
     from can_dbc.adapter import PythonCanBus
 
-    return PythonCanBus(backend, channel, keys, receive_own)
+    return PythonCanBus(backend, channel, wanted, receive_own)
 
 
 def default_address(logical_name: str, explicit: str | None = None) -> str:

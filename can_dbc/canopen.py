@@ -145,6 +145,11 @@ class HeartbeatMonitor:
         self.states: dict[int, int] = {}
         self.boots = dict.fromkeys(self._timeouts_ns, 0)
 
+    def forget(self) -> None:
+        """As before the first heartbeat; boots stay counted."""
+        self._seen_ns.clear()
+        self.states.clear()
+
     def receive(self, key: int, data: bytes, now_ns: int) -> bool:
         """Takes a frame; False if it is no heartbeat of a watched node."""
         parsed = parse_heartbeat(key, data)
@@ -167,6 +172,11 @@ class HeartbeatMonitor:
     def operational(self, node: int, now_ns: int) -> bool:
         """Whether a node is alive and says OPERATIONAL."""
         return self.states.get(node) == NodeState.OPERATIONAL and self.presence(node, now_ns) is Presence.ALIVE
+
+    def next_loss_ns(self) -> int:
+        """The last moment until which every node that has spoken is ALIVE, if none speaks again."""
+        timeouts_ns = self._timeouts_ns
+        return min((seen_ns + timeouts_ns[node] for node, seen_ns in self._seen_ns.items()), default=0)
 
     def missing(self, now_ns: int) -> tuple[int, ...]:
         """Nodes that are LOST or NEVER_SEEN."""

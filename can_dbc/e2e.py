@@ -42,10 +42,13 @@ def crc8(data: bytes, start: int = 0xFF) -> int:
 
 def frame_crc(data: bytes, data_ids: bytes) -> int:
     """The CRC that belongs into byte 0 of a frame whose counter is set."""
-    table, crc = TABLE, 0xFF
+    t, crc = TABLE, 0xFF
+    if len(data) == 8:  # nearly all are; unrolled this takes three quarters of the loop's time
+        _, a, b, c, d, e, f, g = data
+        return t[t[t[t[t[t[t[t[crc ^ a] ^ b] ^ c] ^ d] ^ e] ^ f] ^ g] ^ data_ids[a & 0x0F]] ^ 0xFF
     for byte in data[1:]:
-        crc = table[crc ^ byte]
-    return table[crc ^ data_ids[data[1] & 0x0F]] ^ 0xFF
+        crc = t[crc ^ byte]
+    return t[crc ^ data_ids[data[1] & 0x0F]] ^ 0xFF
 
 
 def protect(payload: bytes, counter: int, data_ids: bytes) -> bytes:
@@ -87,9 +90,8 @@ class Status(IntEnum):
     WRONG_SEQUENCE = 4
     ERROR = 5
 
-    @property
-    def usable(self) -> bool:
-        return self <= Status.OK_SOME_LOST
+    def __init__(self, value: int) -> None:
+        self.usable: Final = value <= 1
 
 
 class Checker:
@@ -125,7 +127,8 @@ class Checker:
             self._last_bad = True
             self._good = 0
             return Status.ERROR
-        self._bad = self._bad << 1 & WINDOW_MASK
+        if self._bad:
+            self._bad = self._bad << 1 & WINDOW_MASK
         self._last_bad = False
         last, self.counter = self.counter, data[1] & 0x0F
         delta = (self.counter - last) & 0x0F
@@ -138,8 +141,8 @@ class Checker:
             self._distrust()
             self._good = 1
             return Status.WRONG_SEQUENCE
-        self._good += 1
         if not self.trusted:
+            self._good += 1
             if self._good < GOOD_TO_TRUST:
                 return Status.INITIAL
             self.trusted = True

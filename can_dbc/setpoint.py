@@ -1,6 +1,6 @@
 """The UDP datagrams between planner, operator and controller (design section 5).
 
-Four kinds share one header and one trailer, little-endian::
+Six kinds, and two of a mission (`can_dbc.mission_datagrams`), share one header and one trailer, little-endian::
 
     magic u32 | version u16 | kind u16 | sequence u32 | profile hash u32 | stamp u64 ns
     | body | [HMAC 16] | CRC-32
@@ -23,18 +23,31 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final
 
+from can_dbc.vehicle_datagrams import (
+    DriveSetpoint,
+    Driving,  # noqa: F401  (for those who import it from here)
+    Steering,  # noqa: F401
+    VehicleReport,
+    drive_body,
+    drive_from,
+    vehicle_body,
+    vehicle_from,
+)
+
 MAGIC: Final = 0x44524854  # "THRD"
 VERSION: Final = 1
 N_AXES: Final = 5
 MAX_KNOTS: Final = 16
 MAC_BYTES: Final = 16
+FULL_PCT: Final = 100.0
 
 _HEADER: Final = struct.Struct("<IHHIIQ")
 _CRC: Final = struct.Struct("<I")
 _CRANE: Final = struct.Struct("<IBBBB")
 _KNOT: Final = struct.Struct(f"<I{2 * N_AXES}d")
-_DRIVE: Final = struct.Struct("<I7d")
 _OPERATOR: Final = struct.Struct("<I")
+_SPOOL: Final = struct.Struct("<IBB")
+_SPOOL_KNOT: Final = struct.Struct("<Id")
 _REPORT: Final = struct.Struct(f"<BBHIHHH{3 * N_AXES + 3}d4I")
 
 
@@ -45,6 +58,10 @@ class Kind(IntEnum):
     DRIVE = 2
     OPERATOR = 3
     REPORT = 4
+    SPOOL = 5
+    VEHICLE = 6
+    ORDER = 7
+    MISSION = 8
 
 
 class GrappleCommand(IntEnum):
@@ -112,17 +129,26 @@ class CraneSetpoint:
 
 
 @dataclass(frozen=True, slots=True)
-class DriveSetpoint:
-    """A drive command: waypoint (WGS84 degrees), speed and the four swing-arm heights, with a lease."""
+class SpoolKnot:
+    """Command of one valve function [%, + moves the joint in its positive direction] at ``after_ns`` past the stamp."""
+
+    after_ns: int
+    percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class SpoolTest:
+    """A spool command for one function (a ``Joint`` number), to find out what its valve does; all others stay neutral.
+
+    Straight lines between the knots, neutral past the last one.  Obeyed until ``stamp_ns + lease_ns``.
+    """
 
     sequence: int
     profile_hash: int
     stamp_ns: int
     lease_ns: int
-    latitude_deg: float
-    longitude_deg: float
-    speed_m_s: float
-    heights_m: tuple[float, float, float, float]
+    function: int
+    knots: tuple[SpoolKnot, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +193,9 @@ class StateReport:
     frames_received: int
 
 
-Datagram = CraneSetpoint | DriveSetpoint | OperatorCommand | StateReport
+Common = tuple[int, int, int]
+"""Sequence, profile hash, stamp [ns]."""
+Datagram = CraneSetpoint | SpoolTest | DriveSetpoint | OperatorCommand | StateReport | VehicleReport
 
 
 def udp_address(text: str) -> tuple[str, int]:
@@ -193,14 +221,13 @@ def _body(message: Datagram) -> tuple[Kind, bytes]:
             )
             knots = (_KNOT.pack(k.after_ns // 1000, *k.position, *k.velocity) for k in message.knots)
             return Kind.CRANE, head + b"".join(knots)
+        case SpoolTest():
+            head = _SPOOL.pack(message.lease_ns // 1000, message.function, len(message.knots))
+            return Kind.SPOOL, head + b"".join(_SPOOL_KNOT.pack(k.after_ns // 1000, k.percent) for k in message.knots)
         case DriveSetpoint():
-            return Kind.DRIVE, _DRIVE.pack(
-                message.lease_ns // 1000,
-                message.latitude_deg,
-                message.longitude_deg,
-                message.speed_m_s,
-                *message.heights_m,
-            )
+            return Kind.DRIVE, drive_body(message)
+        case VehicleReport():
+            return Kind.VEHICLE, vehicle_body(message)
         case OperatorCommand():
             return Kind.OPERATOR, _OPERATOR.pack(message.action)
         case StateReport():
@@ -228,8 +255,12 @@ def _body(message: Datagram) -> tuple[Kind, bytes]:
 def encode(message: Datagram, key: bytes | None = None) -> bytes:
     """The bytes of a datagram; times finer than 1 us are cut.  With ``key`` it is authenticated."""
     kind, body = _body(message)
-    header = _HEADER.pack(MAGIC, VERSION, kind, message.sequence, message.profile_hash, message.stamp_ns)
-    data = header + body
+    return sealed(kind, (message.sequence, message.profile_hash, message.stamp_ns), body, key)
+
+
+def sealed(kind: Kind, common: Common, body: bytes, key: bytes | None) -> bytes:
+    """A body in its envelope."""
+    data = _HEADER.pack(MAGIC, VERSION, kind, *common) + body
     if key is not None:
         data += _mac(data, key)
     return data + _CRC.pack(zlib.crc32(data))
@@ -241,6 +272,32 @@ def decode(data: bytes, key: bytes | None = None) -> Datagram:
     Raises:
         DatagramRefused: with the reason; nothing of a refused datagram is used.
     """
+    kind, common, body = unsealed(data, key)
+    try:
+        match kind:
+            case Kind.CRANE:
+                return _crane(common, body)
+            case Kind.SPOOL:
+                return _spool(common, body)
+            case Kind.DRIVE:
+                return _drive(common, body)
+            case Kind.OPERATOR:
+                return OperatorCommand(*common, OperatorAction(*_OPERATOR.unpack(body)))
+            case Kind.REPORT:
+                return _report(common, body)
+            case Kind.VEHICLE:
+                return vehicle_from(common, body)
+    except struct.error:
+        raise DatagramRefused(DatagramFault.LENGTH) from None
+    except DatagramRefused:
+        raise
+    except ValueError:
+        raise DatagramRefused(DatagramFault.VALUE) from None
+    raise DatagramRefused(DatagramFault.KIND)
+
+
+def unsealed(data: bytes, key: bytes | None) -> tuple[int, Common, bytes]:
+    """Kind, common fields and body of a datagram; raises DatagramRefused."""
     trailer = _CRC.size + (MAC_BYTES if key is not None else 0)
     if len(data) < _HEADER.size + trailer:
         raise DatagramRefused(DatagramFault.LENGTH)
@@ -254,25 +311,7 @@ def decode(data: bytes, key: bytes | None = None) -> Datagram:
     signed = data[: len(data) - trailer]
     if key is not None and not hmac.compare_digest(_mac(signed, key), data[len(signed) : len(signed) + MAC_BYTES]):
         raise DatagramRefused(DatagramFault.AUTHENTICATION)
-    common = (sequence, profile_hash, stamp_ns)
-    body = signed[_HEADER.size :]
-    try:
-        match kind:
-            case Kind.CRANE:
-                return _crane(common, body)
-            case Kind.DRIVE:
-                return _drive(common, body)
-            case Kind.OPERATOR:
-                return OperatorCommand(*common, OperatorAction(*_OPERATOR.unpack(body)))
-            case Kind.REPORT:
-                return _report(common, body)
-    except struct.error:
-        raise DatagramRefused(DatagramFault.LENGTH) from None
-    except DatagramRefused:
-        raise
-    except ValueError:
-        raise DatagramRefused(DatagramFault.VALUE) from None
-    raise DatagramRefused(DatagramFault.KIND)
+    return kind, (sequence, profile_hash, stamp_ns), signed[_HEADER.size :]
 
 
 def _mac(data: bytes, key: bytes) -> bytes:
@@ -285,7 +324,7 @@ def _finite(values: tuple[float, ...]) -> tuple[float, ...]:
     return values
 
 
-def _crane(common: tuple[int, int, int], body: bytes) -> CraneSetpoint:
+def _crane(common: Common, body: bytes) -> CraneSetpoint:
     lease_us, grapple, final, n_knots, axes = _CRANE.unpack_from(body)
     if len(body) != _CRANE.size + n_knots * _KNOT.size or axes != N_AXES:
         raise DatagramRefused(DatagramFault.LENGTH)
@@ -301,14 +340,30 @@ def _crane(common: tuple[int, int, int], body: bytes) -> CraneSetpoint:
     return CraneSetpoint(*common, lease_us * 1000, GrappleCommand(grapple), bool(final), tuple(knots))
 
 
-def _drive(common: tuple[int, int, int], body: bytes) -> DriveSetpoint:
-    lease_us, latitude, longitude, speed, *heights = _DRIVE.unpack(body)
-    _finite((latitude, longitude, speed, *heights))
-    h1, h2, h3, h4 = heights
-    return DriveSetpoint(*common, lease_us * 1000, latitude, longitude, speed, (h1, h2, h3, h4))
+def _spool(common: Common, body: bytes) -> SpoolTest:
+    lease_us, function, n_knots = _SPOOL.unpack_from(body)
+    if len(body) != _SPOOL.size + n_knots * _SPOOL_KNOT.size:
+        raise DatagramRefused(DatagramFault.LENGTH)
+    if not 1 <= n_knots <= MAX_KNOTS or function >= N_AXES:
+        raise DatagramRefused(DatagramFault.VALUE)
+    knots: list[SpoolKnot] = []
+    for i in range(n_knots):
+        after_us, percent = _SPOOL_KNOT.unpack_from(body, _SPOOL.size + i * _SPOOL_KNOT.size)
+        _finite((percent,))
+        if abs(percent) > FULL_PCT or (knots and after_us * 1000 <= knots[-1].after_ns):
+            raise DatagramRefused(DatagramFault.VALUE)
+        knots.append(SpoolKnot(after_us * 1000, percent))
+    return SpoolTest(*common, lease_us * 1000, function, tuple(knots))
 
 
-def _report(common: tuple[int, int, int], body: bytes) -> StateReport:
+def _drive(common: Common, body: bytes) -> DriveSetpoint:
+    drive = drive_from(common, body)
+    _finite((drive.latitude_deg, drive.longitude_deg, drive.articulation_rad, drive.articulation_rate_rad_s))
+    _finite((drive.speed_m_s, *drive.heights_m))
+    return drive
+
+
+def _report(common: Common, body: bytes) -> StateReport:
     values = _REPORT.unpack(body)
     joints = values[7 : 7 + 3 * N_AXES]
     fields: list[Any] = [*common, *values[:7]]

@@ -1,137 +1,116 @@
-"""A CAN bus of the Linux kernel over a raw socket: the fast path, standard library only.
+"""A CAN bus of the Linux kernel over a raw socket: the fast path (`can_dbc.frame_socket`), standard library only.
 
-Receive stamps are the kernel's own (taken in the receive interrupt), turned from CLOCK_REALTIME into
-CLOCK_MONOTONIC with the offset at each drain; they never lie in the future.  Frames lost in the socket
-buffer are counted (SO_RXQ_OVFL).  A link that goes down makes the state DOWN; the first frame that passes
-again makes it ACTIVE.
+A link that goes down or is deleted makes the state DOWN.  `SocketCanBus.reopen` looks for an interface of the same
+name, whatever its index, that is up and has a carrier, and binds a new socket to it.  Own frames that wait in the queue
+of an interface cannot be called back; the kernel itself empties the queue when the link goes down or bus-off.  While
+bus-off nothing is handed over, for the kernel would take it and lose it in silence.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import fcntl
 import socket
 import struct
-import time
+from collections.abc import Sequence
 from typing import Final
 
-from can_dbc.batch import Batch, widen
 from can_dbc.bus import DRAIN_LIMIT, BaseBus, BusError, BusState
-from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
+from can_dbc.filters import Filter
+from can_dbc.frame import Frame
+from can_dbc.frame_socket import FrameSocket
 
-CAN_FRAME: Final = struct.Struct("=IB3x8s")  # struct can_frame, linux/can.h
-_CONTROL: Final = struct.Struct("@NiillNiiI4x")
-"""Control data of a frame: struct cmsghdr and timespec of SO_TIMESTAMPNS, then, once frames were lost, SO_RXQ_OVFL."""
-_CONTROL_DROPPED: Final = 52
-"""Control data that holds the second message is at least this long."""
-# Options that Python does not name everywhere: asm-generic/socket.h and linux/can/raw.h.
-_SO_TIMESTAMPNS: Final = 35
-_SO_RXQ_OVFL: Final = 40
+# Options that Python does not name everywhere: linux/can/raw.h, linux/sockios.h, linux/if.h.
 _CAN_RAW_ERR_FILTER: Final = 2
 _ERR_MASK: Final = 0x1FFF_FFFF
-_RECEIVE_BUFFER_BYTES: Final = 4 << 20
-_LINK_LOST: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
+_MOST_FILTERS: Final = 512
+_SIOCGIFFLAGS: Final = 0x8913
+_FLAGS: Final = struct.Struct("@16sH14x")  # struct ifreq; cut after the flags
+_IFF_UP: Final = 0x1
+_IFF_RUNNING: Final = 0x40
+_LINK_LOST: Final = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
 
 
 class SocketCanBus(BaseBus):
     """One raw socket on one interface (contract: `can_dbc.bus.Bus`)."""
 
-    def __init__(self, interface: str, keys: frozenset[int] | None = None, receive_own: bool = False) -> None:
+    def __init__(self, interface: str, wanted: Filter | None = None, receive_own: bool = False) -> None:
         super().__init__(interface)
-        try:
-            self._sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-        except OSError as error:
+        if wanted is not None and len(wanted.pairs) > _MOST_FILTERS:
             raise BusError(
-                f"This kernel has no raw CAN sockets ({error.strerror}), so socketcan:{interface} cannot be "
-                "opened; load the modules can and can_raw, or use the wire: wire:crane0."
-            ) from error
-        raw, general = socket.SOL_CAN_RAW, socket.SOL_SOCKET
+                f"{len(wanted.pairs)} filters are more than the {_MOST_FILTERS} that the kernel takes for "
+                f"{interface}; give pairs of key and mask."
+            )
+        self._wanted, self._receive_own = wanted, receive_own
         try:
-            self._sock.setblocking(False)
-            widen(self._sock, _RECEIVE_BUFFER_BYTES)
-            self._sock.setsockopt(general, _SO_TIMESTAMPNS, 1)
-            self._sock.setsockopt(general, _SO_RXQ_OVFL, 1)
-            self._sock.setsockopt(raw, _CAN_RAW_ERR_FILTER, _ERR_MASK)
-            self._sock.setsockopt(raw, socket.CAN_RAW_RECV_OWN_MSGS, int(receive_own))
-            if keys is not None:
-                self._sock.setsockopt(raw, socket.CAN_RAW_FILTER, b"".join(map(_kernel_filter, sorted(keys))))
-            self._sock.bind((interface,))
+            self._link = self._open(_IFF_UP)
         except OSError as error:
-            self._sock.close()
+            if error.errno in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
+                raise BusError(
+                    f"This kernel has no raw CAN sockets ({error.strerror}), so socketcan:{interface} cannot be "
+                    "opened; load the modules can and can_raw, or use the wire: wire:crane0."
+                ) from error
             raise BusError(
                 f"CAN interface {interface} cannot be opened ({error.strerror}); see `ip link`, and bring it "
                 f"up with `ip link set {interface} up`."
             ) from error
-        self._batch = Batch(CAN_FRAME.size, _CONTROL.size)
-        self._dropped = 0
 
     def fileno(self) -> int:
-        return self._sock.fileno()
+        return self._link.sock.fileno()
 
-    def drain(self, frames: list[Frame]) -> int:
-        batch, before = self._batch, len(frames)
-        for _ in range(DRAIN_LIMIT // batch.count):
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
+        stats, sent = self.stats, 0
+        if stats.state < BusState.OFF:
             try:
-                waiting = batch.receive(self._sock.fileno())
-            except OSError:  # the link went down; a later call may find it up again
-                self.stats.state = BusState.DOWN
-                break
-            if waiting:
-                self._take(waiting, frames)
-            if waiting < batch.count:
-                break
-        taken = len(frames) - before
-        self.stats.received += taken
-        return taken
-
-    def _take(self, waiting: int, frames: list[Frame]) -> None:
-        stats, batch = self.stats, self._batch
-        now_ns = time.monotonic_ns()
-        offset_ns = now_ns - time.time_ns()
-        for i in range(waiting):
-            _, _, kind, seconds, nanoseconds, _, _, _, dropped = _CONTROL.unpack_from(batch.control, i * _CONTROL.size)
-            stamp_ns = now_ns
-            if kind == _SO_TIMESTAMPNS:
-                # A clock set back between arrival and drain must not make a frame look fresher.
-                stamp_ns = min(seconds * 1_000_000_000 + nanoseconds + offset_ns, now_ns)
-            if batch.control_length(i) >= _CONTROL_DROPPED:
-                self._count_dropped(dropped)
-            if batch.length(i) != CAN_FRAME.size:
-                continue  # a CAN FD frame: not ours
-            key, length, data = CAN_FRAME.unpack_from(batch.data, i * CAN_FRAME.size)
-            if key & ERROR:
-                stats.note_error(key, data)
-                continue
-            if stats.state is BusState.DOWN:
-                stats.state = BusState.ACTIVE
-            frames.append(Frame(stamp_ns, key, data[:length]))
-
-    def send(self, key: int, data: bytes) -> bool:
-        stats = self.stats
-        # While bus-off the kernel would take the frame and lose it in silence.
-        if stats.state is not BusState.OFF:
-            try:
-                self._sock.send(CAN_FRAME.pack(key, len(data), data))
-            except OSError as error:
+                sent = self._link.send(frames)
+            except OSError as error:  # ENOBUFS and EAGAIN: no room
                 if error.errno in _LINK_LOST:
-                    stats.state = BusState.DOWN
-            else:
-                if stats.state is BusState.DOWN:
-                    stats.state = BusState.ACTIVE
-                stats.sent += 1
-                return True
-        stats.refused += 1
-        return False
+                    stats.enter(BusState.DOWN)
+        stats.sent += sent
+        stats.refused += len(frames) - sent
+        return sent
 
-    def close(self) -> None:
-        self._sock.close()
-        self.stats.state = BusState.DOWN
+    def _take(self, frames: list[Frame]) -> None:
+        link, stats = self._link, self.stats
+        before = link.dropped
+        try:
+            link.receive(frames, DRAIN_LIMIT, stats.note_error)
+        except OSError:
+            stats.enter(BusState.DOWN)
+        stats.dropped += link.dropped - before
 
-    def _count_dropped(self, kernel_count: int) -> None:
-        """The kernel's counter is 32 bits wide and wraps."""
-        self.stats.dropped += (kernel_count - self._dropped) & 0xFFFF_FFFF
-        self._dropped = kernel_count
+    def _open_again(self) -> bool:
+        try:
+            link = self._open(_IFF_UP | _IFF_RUNNING)
+        except OSError:
+            return False
+        self._link.close()
+        self._link = link
+        return True
 
+    def _leave(self) -> None:
+        self._link.close()
 
-def _kernel_filter(key: int) -> bytes:
-    mask = EXTENDED | REMOTE | (EXTENDED_MASK if key & EXTENDED else STANDARD_MASK)
-    return struct.pack("=II", key, mask)
+    def _open(self, needed: int) -> FrameSocket:
+        """A socket bound to the interface; OSError when it is missing or a flag that is needed is not set.
+
+        An interface that is bus-off is up but does not run.  The kernel takes up to a second to say that a fresh one
+        runs, so only a link that was lost is asked for that.
+        """
+        raw = socket.SOL_CAN_RAW
+        sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        with contextlib.ExitStack() as on_error:
+            on_error.callback(sock.close)
+            flags = fcntl.ioctl(sock, _SIOCGIFFLAGS, _FLAGS.pack(self.name.encode(), 0))
+            if _FLAGS.unpack(flags)[1] & needed != needed:
+                raise OSError(errno.ENETDOWN, "it is down")
+            link = FrameSocket(sock)
+            sock.setsockopt(raw, _CAN_RAW_ERR_FILTER, _ERR_MASK)
+            sock.setsockopt(raw, socket.CAN_RAW_RECV_OWN_MSGS, int(self._receive_own))
+            if self._wanted is not None:
+                pairs = b"".join(struct.pack("=II", *pair) for pair in self._wanted.pairs)
+                sock.setsockopt(raw, socket.CAN_RAW_FILTER, pairs)
+            sock.bind((self.name,))
+            on_error.pop_all()
+        return link

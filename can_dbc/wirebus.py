@@ -43,7 +43,7 @@ class WireBus(can.BusABC):
         Raises `can.CanInitializationError`.
         """
         try:
-            self._client = WireClient(channel, None, receive_own_messages, tx_queue)
+            self._client = WireClient(channel, None, receive_own_messages, tx_queue, error_frames=True)
         except BusError as error:
             raise can.CanInitializationError(str(error)) from error
         self.channel_info = f"timberhand wire {channel} at {self._client.bitrate} bit/s"
@@ -93,8 +93,13 @@ class WireBus(can.BusABC):
 
     def _fetch(self) -> None:
         frames: list[Frame] = []
-        self._client.receive(frames)
+        self._client.drain(frames)
         self._waiting.extend(frames)
+
+    def flush_tx_buffer(self) -> None:
+        """Takes back the own frames that have not begun on the bus."""
+        with self._lock:
+            self._client.discard()
 
     @property
     def state(self) -> can.BusState:

@@ -23,6 +23,7 @@ from itertools import count
 from typing import Final
 
 from can_dbc.bus import ERR_ACK, ERR_BUSERROR, ERR_PROT, ERR_RESTARTED, BusState
+from can_dbc.filters import Wanted, filter_of
 from can_dbc.frame import ERROR, Frame
 from hil.wire.faults import Damage, Fault, Kind
 from hil.wire.node import Flight, Node, Pending, Segment
@@ -66,13 +67,13 @@ class WireCore:
         self,
         name: str,
         *,
-        keys: Iterable[int] | None = None,
+        filters: Iterable[Wanted] | None = None,
         receive_own: bool = False,
         queue_limit: int = 10,
         rx_limit: int = 1024,
     ) -> Node:
-        """Adds a participant at the present moment; `keys` are the exact keys it receives (None: all)."""
-        node = Node(name, keys, receive_own, queue_limit, rx_limit)
+        """Adds a participant at the present moment; `filters` as in `can_dbc.bus.open_bus`."""
+        node = Node(name, filter_of(filters), receive_own, queue_limit, rx_limit)
         self.nodes.append(node)
         self._place(node)
         return node
@@ -86,7 +87,7 @@ class WireCore:
     def retire(self, node: Node) -> None:
         """Removes a participant that wants to hear no more, once its pending frames are out; at once when
         nobody acknowledges them."""
-        node.keys, node.rx_limit, node.retiring = frozenset(), 0, True
+        node.wanted, node.rx_limit, node.retiring = (), 0, True
         if not node.queue or node.tec > 127:
             self.detach(node)
 
@@ -244,7 +245,7 @@ class WireCore:
         self._finished.append((sender, frame))
         key = frame.key
         for node in segment.nodes:
-            if (node is sender and not node.receive_own) or (node.keys is not None and key not in node.keys):
+            if (node is sender and not node.receive_own) or (node.wanted is not None and key not in node.wanted):
                 continue
             node.receive(frame)
 

@@ -6,9 +6,10 @@ by it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from can_dbc.bus import BaseBus, BusState
+from can_dbc.filters import Wanted
 from can_dbc.frame import ERROR, Frame
 from hil.wire.core import WireCore
 
@@ -21,37 +22,41 @@ class InProcessBus(BaseBus):
         core: WireCore,
         participant: str,
         *,
-        filters: Iterable[int] | None = None,
+        filters: Iterable[Wanted] | None = None,
         receive_own: bool = False,
         tx_queue: int = 10,
     ) -> None:
         super().__init__(core.name)
         self._core = core
-        self.node = core.attach(participant, keys=filters, receive_own=receive_own, queue_limit=tx_queue)
+        self.node = core.attach(participant, filters=filters, receive_own=receive_own, queue_limit=tx_queue)
 
     def fileno(self) -> int:
         return -1
 
-    def drain(self, frames: list[Frame]) -> int:
-        stats, before = self.stats, len(frames)
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
+        stats, sent = self.stats, 0
+        if stats.state is not BusState.DOWN:
+            for key, data in frames:
+                if not self._core.submit(self.node, key, data):
+                    break
+                sent += 1
+        stats.sent += sent
+        stats.refused += len(frames) - sent
+        return sent
+
+    def flush(self) -> None:
+        self.node.discard()
+        self._take([])
+
+    def _take(self, frames: list[Frame]) -> None:
+        stats, first = self.stats, len(frames)
         for frame in self.node.take():
             if frame.key & ERROR:
-                stats.note_error(frame.key, frame.data)
+                if stats.note_error(frame.key, frame.data):
+                    del frames[first:]
             else:
                 frames.append(frame)
-        taken = len(frames) - before
-        stats.received += taken
         stats.dropped = self.node.dropped
-        return taken
 
-    def send(self, key: int, data: bytes) -> bool:
-        if self.stats.state is not BusState.DOWN and self._core.submit(self.node, key, data):
-            self.stats.sent += 1
-            return True
-        self.stats.refused += 1
-        return False
-
-    def close(self) -> None:
-        if self.stats.state is not BusState.DOWN:
-            self.stats.state = BusState.DOWN
-            self._core.retire(self.node)
+    def _leave(self) -> None:
+        self._core.retire(self.node)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Container
 from typing import Final, NamedTuple
 
 from can_dbc.bus import (
@@ -51,15 +51,15 @@ class Node:
     """One participant: its queues, counters and error state.  Read it freely; only the core writes it."""
 
     __slots__ = (
-        "done", "dropped", "hold_ns", "keys", "name", "queue", "queue_limit", "rec", "receive_own",
-        "refill_ns", "refused", "retiring", "rx", "rx_limit", "segment", "state", "tec",
+        "done", "dropped", "hold_ns", "name", "queue", "queue_limit", "rec", "receive_own",
+        "refill_ns", "refused", "retiring", "rx", "rx_limit", "segment", "state", "tec", "wanted",
     )  # fmt: skip
 
     def __init__(
-        self, name: str, keys: Iterable[int] | None, receive_own: bool, queue_limit: int, rx_limit: int
+        self, name: str, wanted: Container[int] | None, receive_own: bool, queue_limit: int, rx_limit: int
     ) -> None:
         self.name = name
-        self.keys = None if keys is None else frozenset(keys)
+        self.wanted = wanted
         self.receive_own = receive_own
         self.queue: deque[Pending] = deque()
         self.queue_limit = queue_limit
@@ -77,6 +77,14 @@ class Node:
         """Empties the receive queue."""
         taken, self.rx = self.rx, []
         return taken
+
+    def discard(self) -> None:
+        """Empties the transmit queue but for the frame on the bus."""
+        flight = self.segment.flight if self.segment else None
+        kept = 1 if flight is not None and flight.sender is self else 0
+        self.done += len(self.queue) - kept
+        while len(self.queue) > kept:
+            self.queue.pop()
 
     def receive(self, frame: Frame) -> None:
         """Puts a frame into the receive queue, or counts it as dropped."""

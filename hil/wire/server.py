@@ -2,23 +2,25 @@
 
 A bus is a listening Unix socket and a `WireCore` on CLOCK_MONOTONIC.  Deliveries are batched `GRAIN_NS`
 apart; the stamps keep the exact end of each frame.  A slow client loses frames of its own receive queue,
-counted, and never holds up the others.
+counted, and never holds up the others.  A SocketCAN interface that goes down is unplugged and tried again until it is
+back.
 """
 
 from __future__ import annotations
 
 import errno
 import json
+import os
 import select
 import socket
 import time
 from pathlib import Path
 from typing import Any, Final
 
-from can_dbc.bus import BusError
+from can_dbc.bus import BusError, BusState
 from can_dbc.frame import Frame
 from can_dbc.socketcan import SocketCanBus
-from can_dbc.wire_client import BATCH, CONTROL, PACKET_BYTES, RECORD, STATUS
+from can_dbc.wire_client import BATCH, CONTROL, CONTROL_BYTES, DISCARD, RECORD, STATUS
 from hil.wire.core import WireCore
 from hil.wire.faults import Fault
 from hil.wire.node import Node
@@ -26,6 +28,10 @@ from hil.wire.node import Node
 GRAIN_NS: Final = 250_000
 _SEND_BUFFER_BYTES: Final = 1 << 16
 _RX_LIMIT: Final = 4096
+_RETRY_NS: Final = 100_000_000
+"""An interface that was lost is tried again this often."""
+_SOCKET_PATH_BYTES: Final = 107
+"""The kernel's sun_path (unix(7)) less its end."""
 
 
 class Client:
@@ -45,7 +51,7 @@ class Client:
         """Takes everything the client has sent; False when it has gone or breaks the protocol."""
         while True:
             try:
-                packet = self.sock.recv(PACKET_BYTES)
+                packet = self.sock.recv(CONTROL_BYTES)
             except BlockingIOError:
                 return True
             except ConnectionResetError:
@@ -54,13 +60,19 @@ class Client:
                 return False
             if len(packet) < RECORD.size:
                 return False
-            key, length, data, _, flags, _, _ = RECORD.unpack_from(packet)
-            if flags & CONTROL:
+            if RECORD.unpack_from(packet)[4] & CONTROL:
                 self._answer(packet[RECORD.size :])
-            elif self._node is None:
+            elif self._node is None or len(packet) % RECORD.size:
                 return False
-            elif not self._core.submit(self._node, key, data[:length]):
-                self._node.done += 1  # it has left the client's queue, though not for the bus
+            else:
+                self._take(self._node, packet)
+
+    def _take(self, node: Node, packet: bytes) -> None:
+        for key, length, data, _, flags, _, _ in RECORD.iter_unpack(packet):
+            if flags & DISCARD:
+                node.discard()
+            elif not self._core.submit(node, key, data[:length]):
+                node.done += 1  # it has left the client's queue, though not for the bus
 
     def write(self) -> None:
         """Sends what the node has received; that a client has gone is for `read` to find, after its last
@@ -101,7 +113,7 @@ class Client:
             case {"hello": hello} if self._node is None:
                 self._node = self._core.attach(
                     str(hello["name"]),
-                    keys=hello["keys"],
+                    filters=hello["filters"],
                     receive_own=bool(hello["receive_own"]),
                     queue_limit=int(hello["tx_queue"]),
                     rx_limit=_RX_LIMIT,
@@ -129,17 +141,19 @@ class Joined:
     blocked = False
 
     def __init__(self, bus: SocketCanBus, core: WireCore) -> None:
+        self.interface = bus.name
         self._bus = bus
         self._core = core
         self._node = core.attach(bus.name, queue_limit=100)
         self._frames: list[Frame] = []
 
     def read(self) -> bool:
+        """Takes everything the interface has heard; False when it is lost."""
         self._bus.drain(self._frames)
         for _, key, data in self._frames:
             self._core.submit(self._node, key, data)
         self._frames.clear()
-        return True
+        return self._bus.stats.state is not BusState.DOWN
 
     def write(self) -> None:
         for _, key, data in self._node.take():
@@ -159,6 +173,8 @@ class Server:
         self.core.advance(time.monotonic_ns())
         self.sock = _listen(self.path)
         self.members: dict[int, Client | Joined] = {}
+        self.unplugged: dict[str, int] = {}
+        """Interfaces that were lost, and when to try them again [ns]."""
 
     def accept(self) -> None:
         client = Client(self.sock.accept()[0], self.core)
@@ -169,7 +185,22 @@ class Server:
         self.members[bus.fileno()] = Joined(bus, self.core)
 
     def drop(self, descriptor: int) -> None:
-        self.members.pop(descriptor).close()
+        member = self.members.pop(descriptor)
+        member.close()
+        if isinstance(member, Joined):
+            self.unplugged[member.interface] = 0
+
+    def plug_in(self, now_ns: int) -> None:
+        """Tries to join the interfaces that were lost."""
+        for interface, due_ns in list(self.unplugged.items()):
+            if now_ns < due_ns:
+                continue
+            try:
+                self.join(interface)
+            except BusError:
+                self.unplugged[interface] = now_ns + _RETRY_NS
+            else:
+                del self.unplugged[interface]
 
     def close(self) -> None:
         for descriptor in list(self.members):
@@ -185,6 +216,7 @@ def serve(servers: list[Server], stop: socket.socket) -> None:
         listening = {server.sock.fileno(): server for server in servers}
         owner = {descriptor: server for server in servers for descriptor in server.members}
         due_ns = [at_ns for server in servers if (at_ns := server.core.next_ns()) is not None]
+        due_ns += [at_ns for server in servers for at_ns in server.unplugged.values()]
         timeout_s = None
         if due_ns:
             timeout_s = max(0, max(min(due_ns), last_ns + GRAIN_NS) - time.monotonic_ns()) * 1e-9
@@ -194,6 +226,7 @@ def serve(servers: list[Server], stop: socket.socket) -> None:
         if stop.fileno() in readable:
             return
         for server in servers:
+            server.plug_in(last_ns)
             server.core.advance(last_ns)
         for descriptor in readable:
             if descriptor in listening:
@@ -208,6 +241,11 @@ def serve(servers: list[Server], stop: socket.socket) -> None:
 
 def _listen(path: Path) -> socket.socket:
     """A listening socket at `path`; a file left by a dead daemon is replaced, a living one is an error."""
+    if (length := len(os.fsencode(path))) > _SOCKET_PATH_BYTES:
+        raise BusError(
+            f"The wire bus {path.name} cannot listen at {path}: a socket's path has {_SOCKET_PATH_BYTES} bytes at "
+            f"most, this one {length}; choose a shorter directory with --dir or TIMBERHAND_WIRE_DIR."
+        )
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         try:

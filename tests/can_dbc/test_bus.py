@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
 
 import pytest
 
@@ -17,14 +19,17 @@ from can_dbc.bus import (
     ERR_BUSOFF,
     ERR_CNT,
     ERR_CRTL,
+    ERR_LOSTARB,
     ERR_RESTARTED,
+    ERR_TX_TIMEOUT,
+    BaseBus,
     BusError,
     BusState,
     BusStats,
     default_address,
     open_bus,
 )
-from can_dbc.frame import ERROR
+from can_dbc.frame import ERROR, Frame
 from can_dbc.socketcan import SocketCanBus
 
 
@@ -44,6 +49,11 @@ def test_a_missing_interface_is_told_with_the_remedy() -> None:
     expected = "ip link" if bus_module.kernel_has_can() else "has no raw CAN sockets"
     with pytest.raises(BusError, match=expected):
         open_bus("socketcan:nocan9")
+
+
+def test_more_filters_than_the_kernel_takes_are_told() -> None:
+    with pytest.raises(BusError, match="513 filters are more than the 512"):
+        open_bus("socketcan:can0", filters=range(513))
 
 
 def test_an_unknown_python_can_interface_is_told() -> None:
@@ -92,6 +102,24 @@ def test_error_frames_set_the_state_and_recovery_clears_it(classes: int, flags: 
     else:
         stats.note_error(ERROR | ERR_CRTL, bytes((0, CRTL_ACTIVE, 0, 0, 0, 0, 0, 0)))
     assert stats.state is BusState.ACTIVE
+    assert stats.recoveries == (state is BusState.OFF)
+
+
+@pytest.mark.parametrize("error_class", [ERR_TX_TIMEOUT, ERR_LOSTARB])
+@pytest.mark.parametrize("state", [BusState.ACTIVE, BusState.PASSIVE, BusState.OFF])
+def test_lost_arbitration_and_a_transmit_time_out_are_counted_only(error_class: int, state: BusState) -> None:
+    stats = BusStats(state)
+    assert not stats.note_error(ERROR | error_class, bytes(8))
+    assert (stats.state, stats.error_frames, stats.recoveries) == (state, 1, 0)
+
+
+@pytest.mark.parametrize("lost", [BusState.OFF, BusState.DOWN])
+@pytest.mark.parametrize("back", [BusState.ACTIVE, BusState.WARNING, BusState.PASSIVE])
+def test_only_the_way_back_from_off_or_down_is_a_recovery(lost: BusState, back: BusState) -> None:
+    stats = BusStats()
+    ways = [stats.enter(state) for state in (BusState.PASSIVE, lost, lost, back, BusState.ACTIVE, lost)]
+    assert ways == [False, False, False, True, False, False]
+    assert stats.recoveries == 1 and stats.state is lost
 
 
 def test_a_receiver_overflow_in_the_adapter_counts_as_dropped() -> None:
@@ -100,13 +128,13 @@ def test_a_receiver_overflow_in_the_adapter_counts_as_dropped() -> None:
     assert (stats.dropped, stats.state) == (1, BusState.ACTIVE)
 
 
-class FullSocket:
+class FullLink:
     """A raw socket whose interface answers every frame with one error."""
 
     def __init__(self, number: int) -> None:
         self.number = number
 
-    def send(self, _: bytes) -> int:
+    def send(self, _: Sequence[tuple[int, bytes]]) -> int:
         raise OSError(self.number, "refused")
 
 
@@ -117,9 +145,10 @@ class FullSocket:
 def test_a_kernel_queue_without_room_refuses(number: int, state: BusState) -> None:
     bus = SocketCanBus.__new__(SocketCanBus)
     bus.stats = BusStats()
-    bus._sock = FullSocket(number)
+    bus._link = FullLink(number)
     assert not bus.send(0x210, bytes(8))
-    assert (bus.stats.refused, bus.stats.sent, bus.stats.state) == (1, 0, state)
+    assert bus.send_all([(0x210, bytes(8)), (0x310, bytes(8))]) == 0
+    assert (bus.stats.refused, bus.stats.sent, bus.stats.state) == (3, 0, state)
 
 
 def test_the_guard_can_open_wire_and_socketcan_with_the_standard_library_alone() -> None:
@@ -130,3 +159,38 @@ def test_the_guard_can_open_wire_and_socketcan_with_the_standard_library_alone()
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+class Waiting(BaseBus):
+    """A bus on which bunches of frames wait, each for one drain."""
+
+    def __init__(self) -> None:
+        super().__init__("test")
+        self.bunches: list[list[Frame]] = []
+
+    def _take(self, frames: list[Frame]) -> None:
+        if self.bunches:
+            frames += self.bunches.pop(0)
+
+
+def test_a_flush_reads_until_nothing_waits_whatever_the_stamps() -> None:
+    """An adapter that stamps in its own time gives every frame the time of the drain."""
+    bus, far = Waiting(), 1 << 62
+    bus.bunches = [[Frame(far, key, b"old")] for key in range(3)]
+    bus.flush()
+    bus.bunches.append([Frame(far, 9, b"new")])
+    frames: list[Frame] = []
+    assert bus.drain(frames) == 1 and frames[0].data == b"new"
+    assert bus.stats.received == 1
+
+
+def test_after_a_flush_a_frame_from_before_is_known_by_its_stamp() -> None:
+    """The wire's daemon may hold frames back for a moment, and a flooded socket more than one flush reads."""
+    bus = Waiting()
+    before_ns = time.monotonic_ns()
+    bus.flush()
+    new = Frame(time.monotonic_ns(), 9, b"new")
+    bus.bunches = [[Frame(before_ns, 1, b"old")], [Frame(before_ns, 2, b"old"), new], [Frame(before_ns, 3, b"late")]]
+    kept = [Frame(before_ns, 0, b"kept")]
+    assert [bus.drain(kept), bus.drain(kept), bus.drain(kept)] == [0, 1, 1]
+    assert [frame.data for frame in kept] == [b"kept", b"new", b"late"]  # once one is newer, all are

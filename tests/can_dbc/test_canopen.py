@@ -71,6 +71,26 @@ def test_heartbeat_monitor_sees_a_node_that_is_dead_at_boot() -> None:
     assert monitor.states[2] == co.NodeState.PRE_OPERATIONAL
 
 
+def test_the_next_loss_is_that_of_the_node_whose_time_is_over_first() -> None:
+    monitor = co.HeartbeatMonitor({1: 250 * MS, 2: 150 * MS}, boot_timeout_ns=0, start_ns=0)
+    assert monitor.next_loss_ns() == 0
+    monitor.receive(0x701, b"\x05", 10 * MS)
+    assert monitor.next_loss_ns() == 260 * MS
+    monitor.receive(0x702, b"\x05", 50 * MS)
+    loss_ns = monitor.next_loss_ns()
+    assert loss_ns == 200 * MS
+    assert not monitor.missing(loss_ns) and monitor.missing(loss_ns + 1) == (2,)
+
+
+def test_a_monitor_that_forgot_knows_nobody() -> None:
+    monitor = co.HeartbeatMonitor({1: 250 * MS}, boot_timeout_ns=0, start_ns=0)
+    monitor.receive(0x701, b"\x00", 10 * MS)
+    monitor.receive(0x701, b"\x05", 20 * MS)
+    monitor.forget()
+    assert monitor.presence(1, 30 * MS) is co.Presence.NEVER_SEEN and not monitor.states
+    assert monitor.boots[1] == 1
+
+
 @settings(max_examples=200, deadline=None, derandomize=True, database=None)
 @given(
     st.sampled_from([0, 4096, 0x20000000, 1000]),

@@ -50,6 +50,11 @@ CATALOGUE = [
         {"Crc": 0, "Counter": 8, "Status": 12, "Pump": 16, "Tank": 28, "GrappleA": 40, "GrappleB": 52},
     ),
     (
+        "GrappleImu", 0x1A3, 8, 10, 50,
+        {"Crc": 0, "Counter": 8, "Status": 12, "LeanRadial": 16, "LeanTangential": 28, "RateRadial": 40,
+         "RateTangential": 52},
+    ),
+    (
         "GuardStat", 0x1FD, 8, 10, 50,
         {"Crc": 0, "Counter": 8, "Enable": 12, "Verdict": 16, "FaultAxis": 24, "SeenCounter": 28, "EventCount": 32},
     ),
@@ -75,6 +80,12 @@ CATALOGUE = [
         {"Crc": 0, "Counter": 8, "Mode": 12, "SafeState": 16, "Reason": 20, "StaleMask": 28, "LoopLate": 44,
          "BusErr": 52},
     ),
+    (
+        "JointRefA", 0x1FE, 8, 5, 50,
+        {"Crc": 0, "Counter": 8, "Slew": 12, "SlewRate": 27, "Lift": 38, "LiftRate": 53},
+    ),
+    ("JointRefB", 0x2FE, 8, 5, 50, {"Crc": 0, "Counter": 8, "Tilt": 12, "TiltRate": 27, "Ext": 38, "ExtRate": 53}),
+    ("JointRefC", 0x3FE, 8, 5, 50, {"Crc": 0, "Counter": 8, "Rot": 12, "RotRate": 32}),
 ]  # fmt: skip
 MACHINE_IDS = {
     "ArmHeightA": 0x0CFF2030, "ArmHeightB": 0x0CFF2130, "VehStat": 0x0CFF2203, "VehCmd": 0x0CFF2327,
@@ -96,12 +107,12 @@ def test_crane_catalogue(
     assert CRANE.by_key[identifier] is message
 
 
-def test_heartbeats_of_all_thirteen_nodes() -> None:
+def test_heartbeats_of_all_fourteen_nodes() -> None:
     beats = {m.key - 0x700: m for m in CRANE.messages.values() if m.name.startswith("Heartbeat")}
-    assert sorted(beats) == [1, 2, 3, 4, 5, 6, 7, 0x10, 0x20, 0x21, 0x22, 0x7D, 0x7E]
+    assert sorted(beats) == [1, 2, 3, 4, 5, 6, 7, 0x10, 0x20, 0x21, 0x22, 0x23, 0x7D, 0x7E]
     assert {m.timeout_ns for node, m in beats.items() if node != 0x7E} == {250_000_000}
     assert beats[0x7E].timeout_ns == 150_000_000
-    assert len(CRANE.messages) == len(CATALOGUE) + 13
+    assert len(CRANE.messages) == len(CATALOGUE) + 14
 
 
 def test_machine_catalogue() -> None:
@@ -147,7 +158,7 @@ def test_physical_units() -> None:
 
 def test_data_ids_tell_messages_apart() -> None:
     lists = [m.data_ids for m in chain(CRANE.messages.values(), MACHINE.messages.values()) if m.data_ids]
-    assert len(lists) == 19
+    assert len(lists) == 23
     for counter in range(16):
         assert len({ids[counter] for ids in lists}) == len(lists)
 

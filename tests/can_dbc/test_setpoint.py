@@ -23,7 +23,11 @@ from can_dbc.setpoint import (
     Knot,
     OperatorAction,
     OperatorCommand,
+    SpoolKnot,
+    SpoolTest,
     StateReport,
+    Steering,
+    VehicleReport,
     decode,
     encode,
     udp_address,
@@ -50,15 +54,33 @@ def crane_setpoints(draw: st.DrawFn) -> CraneSetpoint:
     return CraneSetpoint(draw(u32), draw(u32), draw(stamps), draw(microseconds), grapple, draw(st.booleans()), knots)
 
 
+heights = st.tuples(*[finite] * 4)
 drive_setpoints = st.builds(
-    DriveSetpoint, u32, u32, stamps, microseconds, finite, finite, finite, st.tuples(*[finite] * 4)
-)
+    DriveSetpoint, u32, u32, stamps, microseconds, st.sampled_from(Steering), finite, finite, finite, finite, finite,
+    heights, st.booleans(), st.booleans(), st.booleans(),
+)  # fmt: skip
+
+
+@st.composite
+def spool_tests(draw: st.DrawFn) -> SpoolTest:
+    times = draw(st.lists(st.integers(0, 2**32 - 1), min_size=1, max_size=MAX_KNOTS, unique=True).map(sorted))
+    knots = tuple(SpoolKnot(us * 1000, draw(st.floats(-100.0, 100.0))) for us in times)
+    return SpoolTest(draw(u32), draw(u32), draw(stamps), draw(microseconds), draw(st.integers(0, N_AXES - 1)), knots)
+
+
 operator_commands = st.builds(OperatorCommand, u32, u32, stamps, st.sampled_from(OperatorAction))
 reports = st.builds(
     StateReport, u32, u32, stamps, u8, u8, u16, u32, u16, u16, u16,
     known_or_nan, known_or_nan, known_or_nan, finite, finite, finite, u32, u32, u32, u32,
 )  # fmt: skip
-datagrams = st.one_of(crane_setpoints(), drive_setpoints, operator_commands, reports)
+maybe = st.floats(allow_infinity=False)
+vehicle_reports = st.builds(
+    VehicleReport, u32, u32, stamps, u32, u8, u16, u16, stamps, maybe, maybe, maybe, u8, u8, maybe, stamps, maybe,
+    maybe, stamps, maybe, maybe, maybe, maybe, st.tuples(*[maybe] * 4), u16,
+)  # fmt: skip
+datagrams = st.one_of(
+    crane_setpoints(), spool_tests(), drive_setpoints, operator_commands, reports, vehicle_reports
+)  # fmt: skip
 
 
 def a_setpoint(knots: tuple[Knot, ...] | None = None) -> CraneSetpoint:
@@ -110,7 +132,7 @@ def test_noise_is_refused_and_never_raises_anything_else(noise: bytes, key: byte
 @given(datagrams, st.data())
 def test_a_well_sealed_but_arbitrary_body_gives_a_message_or_a_refusal(message: Datagram, data: st.DataObject) -> None:
     body = data.draw(st.binary(max_size=200))
-    kind = struct.pack("<H", data.draw(st.integers(0, 6)))
+    kind = struct.pack("<H", data.draw(st.integers(0, 7)))
     header = encode(message)[:BODY_AT]
     try:
         decode(sealed(header[:6] + kind + header[8:] + body))
@@ -180,9 +202,39 @@ def test_not_finite(bad: float, in_velocity: bool) -> None:
     assert fault_of(encode(a_setpoint((knot,)))) is DatagramFault.NOT_FINITE
 
 
-def test_a_drive_setpoint_that_is_not_finite_is_refused() -> None:
-    drive = DriveSetpoint(1, 2, 3, 1_000_000, 48.0, math.nan, 1.0, (0.0, 0.0, 0.0, 0.0))
+def a_drive() -> DriveSetpoint:
+    heights = (0.35, 0.36, 0.37, 0.38)
+    return DriveSetpoint(
+        1, 2, 3, 1_000_000, Steering.ARTICULATION, 63.66, 19.9, 0.1, -0.02, 0.6, heights, False, True, True
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    "name",
+    ["latitude_deg", "longitude_deg", "articulation_rad", "articulation_rate_rad_s", "speed_m_s", "heights_m"],
+)
+def test_a_drive_setpoint_that_is_not_finite_is_refused(name: str, bad: float) -> None:
+    value = (0.35, 0.35, 0.35, bad) if name == "heights_m" else bad
+    drive = dataclasses.replace(a_drive(), **{name: value})  # type: ignore[arg-type]
     assert fault_of(encode(drive)) is DatagramFault.NOT_FINITE
+
+
+@pytest.mark.parametrize(("at", "value"), [(4, 2), (5, 8), (5, 0x80)], ids=["steering", "flag 3", "flag 7"])
+def test_value_of_a_drive_setpoint(at: int, value: int) -> None:
+    raw = bytearray(encode(a_drive())[:-4])
+    raw[BODY_AT + at] = value
+    assert fault_of(sealed(bytes(raw))) is DatagramFault.VALUE
+
+
+def test_a_vehicle_report_may_hold_unknown_values() -> None:
+    nan = math.nan
+    unknown = (nan,) * 4
+    report = VehicleReport(
+        1, 2, 3, 4, 1, 0, 0, 0, nan, nan, nan, 0, 0, nan, 0, nan, nan, 0, nan, nan, nan, nan, unknown, 0xFF
+    )  # fmt: skip
+    back = decode(encode(report))
+    assert isinstance(back, VehicleReport) and math.isnan(back.heights_m[3]) and back.stale_mask == 0xFF
 
 
 def test_a_report_may_hold_unknown_values() -> None:
@@ -242,3 +294,25 @@ def test_an_address_that_is_none_is_one_sentence(text):
 
 def test_an_address_is_resolved_once():
     assert udp_address("localhost:5006") == ("127.0.0.1", 5006)
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"knots": (SpoolKnot(0, 100.1),)}, DatagramFault.VALUE),
+        ({"knots": (SpoolKnot(0, math.nan),)}, DatagramFault.NOT_FINITE),
+        ({"knots": (SpoolKnot(5_000_000, 1.0), SpoolKnot(5_000_000, 2.0))}, DatagramFault.VALUE),
+        ({"knots": ()}, DatagramFault.VALUE),
+        ({"knots": tuple(SpoolKnot(k * 1000, 0.0) for k in range(MAX_KNOTS + 1))}, DatagramFault.VALUE),
+        ({"function": N_AXES}, DatagramFault.VALUE),
+    ],
+)
+def test_a_spool_test_is_refused_whole(change: dict[str, object], fault: DatagramFault) -> None:
+    good = SpoolTest(1, 2, 3, 200_000_000, 0, (SpoolKnot(0, 0.0), SpoolKnot(5_000_000, 12.0)))
+    assert decode(encode(good)) == good
+    assert fault_of(encode(dataclasses.replace(good, **change))) is fault  # type: ignore[arg-type]
+
+
+def test_a_spool_test_of_a_wrong_length_is_refused() -> None:
+    raw = encode(SpoolTest(1, 2, 3, 200_000_000, 0, (SpoolKnot(0, 0.0), SpoolKnot(5_000_000, 12.0))))
+    assert fault_of(sealed(raw[:-5])) is DatagramFault.LENGTH

@@ -1,37 +1,50 @@
-"""Tick records: what goes in comes out, and damage is refused."""
+"""Tick records: what goes in comes out, and damage and other versions are refused."""
+
+import dataclasses
+import struct
+import zlib
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from can_dbc.bus import BusState, BusStats
 from can_dbc.frame import Frame
-from can_dbc.tick_record import RecordRefused, decode, encode
+from can_dbc.tick_record import BusReading, RecordRefused, TickRecord, decode, encode
 
 u64 = st.integers(0, 2**64 - 1)
 payload = st.binary(max_size=8)
 key = st.integers(0, 2**32 - 1)
-ticks = st.tuples(
-    u64, st.integers(-(2**63), 2**63 - 1), u64, u64, st.tuples(st.integers(0, 65535), u64, u64, u64),
-    st.lists(st.builds(Frame, u64, key, payload), max_size=5), st.lists(st.binary(max_size=99), max_size=3),
-    st.lists(st.tuples(key, payload), max_size=5), st.binary(max_size=300),
+readings = st.builds(BusReading, st.integers(0, 65535), u64, u64, u64, u64)
+frames_in = st.lists(st.builds(Frame, u64, key, payload), max_size=5).map(tuple)
+frames_out = st.lists(st.tuples(key, payload), max_size=5).map(tuple)
+ticks = st.builds(
+    TickRecord,
+    u64, st.integers(-(2**63), 2**63 - 1), u64, u64, readings, readings, frames_in, frames_in,
+    st.lists(st.binary(max_size=99), max_size=3).map(tuple), frames_out, frames_out, st.binary(max_size=300),
+    st.binary(max_size=300),
 )  # fmt: skip
 
 
 @given(ticks)
 @settings(max_examples=100)
 def test_round_trip(tick):
-    now, late, work, missed, bus, frames, datagrams, out, report = tick
-    got = decode(encode(*tick))
-    assert (got.now_ns, got.late_ns, got.tick_ns, got.missed_ticks) == (now, late, work, missed)
-    assert (got.bus_state, got.bus_dropped, got.bus_refused, got.bus_errors) == bus
-    assert got.frames_in == tuple(frames) and got.datagrams == tuple(datagrams)
-    assert got.frames_out == tuple(out) and got.report == report
+    assert decode(encode(tick)) == tick
+
+
+@given(ticks)
+@settings(max_examples=30)
+def test_without_a_vehicle_the_record_is_what_it_was(tick):
+    """A machine that stands still has no vehicle report, and its bytes are those of an earlier release."""
+    whole, without = encode(tick), encode(dataclasses.replace(tick, vehicle_report=b""))
+    assert len(whole) - len(without) == len(tick.vehicle_report)
+    assert whole[: len(without) - 4] == without[:-4]
 
 
 @given(ticks, st.integers(0, 10**6), st.integers(1, 255))
 @settings(max_examples=100)
 def test_a_damaged_record_is_refused(tick, place, flip):
-    data = bytearray(encode(*tick))
+    data = bytearray(encode(tick))
     data[place % len(data)] ^= flip
     with pytest.raises(RecordRefused):
         decode(bytes(data))
@@ -41,3 +54,31 @@ def test_a_damaged_record_is_refused(tick, place, flip):
 def test_rubbish_is_refused(data):
     with pytest.raises(RecordRefused):
         decode(data)
+
+
+def sealed(body: bytes) -> bytes:
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+def test_a_record_of_version_1_is_refused_by_its_number():
+    # An empty tick as version 1 wrote it: one bus, its state and counters in the head.
+    old = sealed(struct.pack("<I6HQqQQQQQ", 0x52544854, 1, 0, 0, 0, 0, 0, 10**9, 0, 0, 0, 0, 0, 0))
+    with pytest.raises(RecordRefused, match="a tick record of version 1, this release reads version 2"):
+        decode(old)
+
+
+@pytest.mark.parametrize("bus", [2, 255])
+def test_a_frame_of_a_bus_that_is_not_there_is_refused(bus):
+    tick = TickRecord(1, 0, 0, 0, BusReading(), BusReading(), (Frame(1, 2, b""),), (), (), (), (), b"")
+    body = bytearray(encode(tick)[:-4])
+    at = body.index(struct.pack("<QIB", 1, 2, 0)) + 12
+    body[at] = bus
+    with pytest.raises(RecordRefused, match="do not fit"):
+        decode(sealed(bytes(body)))
+
+
+def test_a_reading_takes_the_counters_of_a_bus():
+    stats = BusStats(state=BusState.OFF, refused=1, dropped=2, error_frames=3, recoveries=4)
+    reading = BusReading()
+    reading.take(stats)
+    assert reading == BusReading(state=3, dropped=2, refused=1, errors=3, recoveries=4)

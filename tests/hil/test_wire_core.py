@@ -242,3 +242,37 @@ def test_the_in_process_bus_follows_the_state_of_its_node() -> None:
         core.advance(101 * MS)
         assert b.drain(frames) == b.stats.received == 1
     assert len(core.nodes) == 1 and a.fileno() == -1
+
+
+def test_the_in_process_bus_forgets_what_was_before_a_recovery() -> None:
+    core = WireCore(1_000_000, restart_ns=10 * MS)
+    a, b = InProcessBus(core, "a"), InProcessBus(core, "b")
+    b.send(0x100, b"old")
+    core.advance(1 * MS)
+    core.inject(Fault(Kind.ERROR, start_ns=core.now_ns, node="a"))
+    a.send(0x200, b"never")
+    core.advance(8 * MS)
+    assert a.node.state is BusState.OFF
+    core.heal()
+    core.advance(30 * MS)
+    b.send(0x101, b"new")
+    core.advance(31 * MS)
+    frames: list[Frame] = []
+    a.drain(frames)
+    assert [frame.key for frame in frames] == [0x101]
+    assert (a.stats.state, a.stats.recoveries, a.stats.received) == (BusState.ACTIVE, 1, 1)
+
+
+def test_discarding_spares_the_frame_on_the_bus_and_settles_the_counter() -> None:
+    core, (a, b) = core_with(2)
+    for i in range(5):
+        core.submit(a, 0x100 + i, b"")
+    core.advance(core.now_ns + 20_000)  # the first one is under way
+    a.discard()
+    assert a.done == 4 and len(a.queue) == 1
+    core.advance(core.now_ns + MS)
+    assert [frame.key for frame in b.take()] == [0x100] and a.done == 5
+    core.submit(a, 0x200, b"")
+    a.discard()  # not begun yet
+    core.advance(core.now_ns + MS)
+    assert b.take() == [] and a.done == 6

@@ -112,6 +112,12 @@ def test_a_launch_that_fails_says_why(daemon: subprocess.Popen[str]) -> None:
         pass
 
 
+def test_a_directory_too_deep_for_a_socket_is_told_so(tmp_path: Path) -> None:
+    deep = tmp_path / ("d" * 110)
+    with pytest.raises(BusError, match=r"107 bytes at most.*shorter directory"), wire_daemon({"a": 1_000_000}, deep):
+        pass
+
+
 def test_faults_act_and_heal_by_control_messages(daemon: subprocess.Popen[str]) -> None:
     with open_bus("wire:crane0", participant="left") as a, open_bus("wire:crane0") as b:
         control("crane0", {"inject": Fault(Kind.DROP, key=0x100, mask=0x7FF).to_json()})
@@ -165,8 +171,20 @@ def test_a_client_that_breaks_the_protocol_is_dropped(
     assert control("crane0", {"stats": True})["nodes"] == []
 
 
+def test_a_client_that_sends_half_a_record_is_dropped(daemon: subprocess.Popen[str], tmp_path: Path) -> None:
+    hello = {"hello": {"name": "half", "filters": None, "receive_own": False, "tx_queue": 10}}
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
+        sock.settimeout(PATIENCE_S)
+        sock.connect(str(tmp_path / "crane0"))
+        sock.send(RECORD.pack(0, 0, b"", 0, CONTROL, 0, 0) + json.dumps(hello).encode())
+        sock.recv(1000)
+        sock.send(bytes(RECORD.size + 1))
+        assert sock.recv(100) == b""
+    assert control("crane0", {"stats": True})["nodes"] == []
+
+
 def test_the_last_frames_of_a_client_that_never_read_still_count(daemon: subprocess.Popen[str], tmp_path: Path) -> None:
-    hello = {"hello": {"name": "mute", "keys": None, "receive_own": False, "tx_queue": 10}}
+    hello = {"hello": {"name": "mute", "filters": None, "receive_own": False, "tx_queue": 10}}
     with open_bus("wire:crane0") as bus:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
             sock.connect(str(tmp_path / "crane0"))

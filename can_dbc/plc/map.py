@@ -1,0 +1,334 @@
+"""The register map between bridge and PLC (can_bus.md section 10): values in SI units to 16-bit registers and back.
+
+Pure.  Two roles: in REFERENCES (A) the PLC closes the joint loops and a command carries positions and rates; in VALVES
+(B) it passes valve openings on, as shares of full opening.  A register holds 16 bits; a 32-bit number takes two, the
+high word first unless `WordOrder` says else.  Reading raises `MapError` and uses nothing; writing refuses what does not
+fit, it never clamps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Final
+
+N_AXES: Final = 7
+"""Slew, lift, tilt, extension, rotator, grapple, auxiliary.  The last two have no joint: their values are 0."""
+N_JOINTS: Final = 5
+N_PRESSURES: Final = 8
+"""Lift A and B, tilt A and B, extension A and B, grapple closing and opening side."""
+
+MAGIC: Final = 0x4352
+MAP_VERSION: Final = 1
+WORD_TEST: Final = 0x0102_0304
+ARM_KEY: Final = 0x5AA5
+
+STATUS_AT, STATUS_COUNT = 0, 48
+COMMAND_AT, COMMAND_COUNT = 100, 32
+HEARTBEAT_AT, SEQUENCE_AT, MODE_AT, ARM_AT = 100, 101, 102, 103
+WATCHDOG_AT: Final = 11
+"""The only register of the status block that may be written [ms]."""
+WATCHDOG_MS: Final = (50, 2_000)
+WATCHDOG_DEFAULT_MS: Final = 300
+
+_MICRO, _MILLI = 1e6, 1e3
+_U16: Final = 0xFFFF
+
+
+class Role(IntEnum):
+    """Who closes the joint loops; the number is that of the command's `Mode` that moves."""
+
+    REFERENCES = 1
+    VALVES = 2
+
+
+class WordOrder(IntEnum):
+    """Which half of a 32-bit number comes first."""
+
+    HIGH_FIRST = 0
+    LOW_FIRST = 1
+
+
+class Mode(IntEnum):
+    """What a command asks for; the numbers are those of ``ValveCmdA.Mode``."""
+
+    NEUTRAL = 0
+    REFERENCES = 1
+    VALVES = 2
+
+
+class State(IntEnum):
+    """State of the PLC; 3 is the end of a trajectory that a PLC stores (machines.md 1.6), which this map has not."""
+
+    INIT = 0
+    HOLD = 1
+    """Neutral: nothing asked for, or nothing heard for a moment."""
+    EXECUTE = 2
+    SAFE = 4
+    """The watchdog ran out or the emergency stop opened; latched until a reset edge."""
+
+
+class Fault(IntEnum):
+    """Why the PLC refused or stopped, register 6; 0 after a reset edge."""
+
+    NONE = 0
+    ILLEGAL_VALUE = 1
+    """A command held a value outside its range."""
+    WATCHDOG = 2
+    """No sign of life from the commanding side for the watchdog's time."""
+    EMERGENCY_STOP = 3
+
+
+class Estop(IntEnum):
+    """Bits of the emergency stop register; all of the first three are 1 when the machine may move."""
+
+    CHANNEL_A = 1
+    CHANNEL_B = 2
+    PILOT_ON = 4
+    RESET_PRESSED = 8
+    PERSON = 16
+
+
+class Grapple(IntEnum):
+    """Register 125."""
+
+    NEUTRAL = 0
+    OPEN = 1
+    CLOSE = 2
+    HOLD = 3
+
+
+NO_AXIS: Final = 15
+RANGE_MARGIN: Final = 0.05
+"""How far past a joint's range [rad, m] a reference may lie: a machine found there must be able to hold still."""
+HEADROOM: Final = 1.25
+"""Greatest rate over the joint's speed limit, so that a stop from a correction can fade out."""
+
+
+class MapError(ValueError):
+    """A value that the map cannot carry, or registers that mean nothing; ``axis`` is `NO_AXIS` where none is meant."""
+
+    def __init__(self, text: str, axis: int = NO_AXIS) -> None:
+        super().__init__(text)
+        self.axis = axis
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One command.  ``reference`` is rad or m in mode REFERENCES and a share of full opening, -1..1, in mode VALVES;
+    ``rate`` is rad/s or m/s, and 0 in mode VALVES.  A reset counts at its rising edge.
+    """
+
+    mode: Mode = Mode.NEUTRAL
+    armed: bool = False
+    reference: tuple[float, ...] = (0.0,) * N_AXES
+    rate: tuple[float, ...] = (0.0,) * N_AXES
+    grapple: Grapple = Grapple.NEUTRAL
+    grapple_pct: int = 0
+    max_speed_pct: int = 100
+    reset: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Feedback:
+    """What the PLC says: positions rad or m, velocities per second, pressures bar, opening 0..1, load kg."""
+
+    heartbeat: int = 0
+    state: State = State.INIT
+    fault: int = 0
+    fault_axis: int = NO_AXIS
+    estop: int = 0
+    accepted: int = 0
+    """Sequence number of the last accepted command."""
+    longest_cycle_us: int = 0
+    position: tuple[float, ...] = (0.0,) * N_AXES
+    velocity: tuple[float, ...] = (0.0,) * N_AXES
+    pressure_bar: tuple[float, ...] = (0.0,) * N_PRESSURES
+    opening: float = 0.0
+    load_kg: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What a command may hold on this machine: per axis, (lower, upper) of the reference and the greatest rate."""
+
+    role: Role
+    reference: tuple[tuple[float, float], ...]
+    rate: tuple[float, ...] = field(default=(0.0,) * N_AXES)
+
+    @classmethod
+    def references(cls, joints: Sequence[tuple[float, float, float]]) -> Bounds:
+        """Those of role REFERENCES, from (lower, upper, speed limit) of every joint."""
+        spare = N_AXES - N_JOINTS
+        return cls(
+            Role.REFERENCES,
+            tuple((lower - RANGE_MARGIN, upper + RANGE_MARGIN) for lower, upper, _ in joints) + ((0.0, 0.0),) * spare,
+            tuple(HEADROOM * speed for _, _, speed in joints) + (0.0,) * spare,
+        )
+
+    @classmethod
+    def valves(cls) -> Bounds:
+        """Those of role VALVES: full opening either way."""
+        return cls(Role.VALVES, ((-1.0, 1.0),) * N_JOINTS + ((0.0, 0.0),) * (N_AXES - N_JOINTS))
+
+    def check(self, command: Command) -> None:
+        """Raises MapError for a command that this machine cannot obey."""
+        if command.mode not in (Mode.NEUTRAL, int(self.role)):
+            raise MapError(f"mode {command.mode} is not of role {self.role.name}")
+        if command.mode is Mode.NEUTRAL:
+            return
+        for axis, (value, rate) in enumerate(zip(command.reference, command.rate, strict=True)):
+            lower, upper = self.reference[axis]
+            # Half a unit of the map: a limit that is no whole number of units is rounded on the way.
+            if not lower - 0.5e-6 <= value <= upper + 0.5e-6:
+                raise MapError(f"reference of axis {axis} is {value:.6f}, allowed {lower:g} to {upper:g}", axis)
+            if abs(rate) > self.rate[axis] + 0.5e-3:
+                raise MapError(f"rate of axis {axis} is {rate:.6f}, allowed {self.rate[axis]:g}", axis)
+
+
+def whole(value: float, scale: float, lowest: int, highest: int, what: str) -> int:
+    """``value * scale`` as a whole number in lowest..highest; raises MapError."""
+    scaled = value * scale
+    if not math.isfinite(scaled):
+        raise MapError(f"{what} is not a finite number")
+    number = round(scaled)
+    if not lowest <= number <= highest:
+        raise MapError(f"{what} is {value:g}, the map carries {lowest / scale:g} to {highest / scale:g}")
+    return number
+
+
+def micro(value: float, what: str) -> int:
+    """A value in units of 1e-6, 32 bits signed."""
+    return whole(value, _MICRO, -(1 << 31), (1 << 31) - 1, what)
+
+
+def signed16(value: float, scale: float, what: str) -> int:
+    """``value * scale``, 16 bits signed."""
+    return whole(value, scale, -(1 << 15), (1 << 15) - 1, what)
+
+
+def _pair(value: int, order: WordOrder) -> tuple[int, int]:
+    high, low = value >> 16 & _U16, value & _U16
+    return (high, low) if order is WordOrder.HIGH_FIRST else (low, high)
+
+
+def _long(registers: Sequence[int], at: int, order: WordOrder) -> int:
+    first, second = registers[at], registers[at + 1]
+    value = first << 16 | second if order is WordOrder.HIGH_FIRST else second << 16 | first
+    return value - (1 << 32) if value & 1 << 31 else value
+
+
+def _short(register: int) -> int:
+    return register - (1 << 16) if register & 1 << 15 else register
+
+
+def command_registers(command: Command, heartbeat: int, sequence: int, order: WordOrder) -> list[int]:
+    """The command block, registers 100 to 131; raises MapError."""
+    if len(command.reference) != N_AXES or len(command.rate) != N_AXES:
+        raise MapError(f"a command has {N_AXES} axes")
+    words = [heartbeat & _U16, sequence & _U16, command.mode, ARM_KEY if command.armed else 0]
+    for axis, value in enumerate(command.reference):
+        words += _pair(micro(value, f"reference of axis {axis}"), order)
+    words += [signed16(r, _MILLI, f"rate of axis {i}") & _U16 for i, r in enumerate(command.rate)]
+    grapple_pct = whole(command.grapple_pct, 1, 0, 100, "the grapple's share")
+    speed_pct = whole(command.max_speed_pct, 1, 0, 100, "the greatest speed")
+    return [*words, command.grapple, grapple_pct, speed_pct, int(command.reset), 0, 0, 0]
+
+
+_CHOICES: Final = {
+    MODE_AT: frozenset(Mode),
+    ARM_AT: frozenset((0, ARM_KEY)),
+    125: frozenset(Grapple),
+    126: range(101),
+    127: range(101),
+    128: range(2),
+    129: range(1),
+    130: range(1),
+    131: range(1),
+}
+
+
+def check_single(address: int, value: int) -> None:
+    """Raises MapError for a register of the command block whose value means nothing by itself."""
+    allowed = _CHOICES.get(address)
+    if allowed is not None and value not in allowed:
+        raise MapError(f"register {address} is {value}, which means nothing")
+
+
+def read_command(registers: Sequence[int], order: WordOrder) -> Command:
+    """The command in the 32 registers from `COMMAND_AT`; raises MapError."""
+    if len(registers) != COMMAND_COUNT:
+        raise MapError(f"a command block has {COMMAND_COUNT} registers, not {len(registers)}")
+    for offset, value in enumerate(registers):
+        check_single(COMMAND_AT + offset, value)
+    _, _, mode, arm = registers[:4]
+    return Command(
+        mode=Mode(mode),
+        armed=arm == ARM_KEY,
+        reference=tuple(_long(registers, 4 + 2 * i, order) / _MICRO for i in range(N_AXES)),
+        rate=tuple(_short(registers[18 + i]) / _MILLI for i in range(N_AXES)),
+        grapple=Grapple(registers[25]),
+        grapple_pct=registers[26],
+        max_speed_pct=registers[27],
+        reset=bool(registers[28]),
+    )
+
+
+def status_registers(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> list[int]:
+    """The status block, registers 0 to 47; raises MapError."""
+    f = feedback
+    words = [MAGIC, MAP_VERSION, *_pair(WORD_TEST, order)]
+    words += [f.heartbeat & _U16, f.state, f.fault & _U16, f.fault_axis & _U16]
+    words += [f.estop & _U16, f.accepted & _U16, min(f.longest_cycle_us, _U16), watchdog_ms]
+    for axis, value in enumerate(f.position):
+        words += _pair(micro(value, f"position of axis {axis}"), order)
+    words += [signed16(v, _MILLI, f"velocity of axis {i}") & _U16 for i, v in enumerate(f.velocity)]
+    words += [signed16(p, 10.0, f"pressure {i}") & _U16 for i, p in enumerate(f.pressure_bar)]
+    words += [whole(f.opening, _MILLI, 0, 1000, "the opening"), whole(f.load_kg, 1, 0, _U16, "the load")]
+    return words + [0] * (STATUS_COUNT - len(words))
+
+
+def check_identity(registers: Sequence[int], order: WordOrder) -> None:
+    """Raises MapError, with what to do, unless the block is of this map, this version and this word order."""
+    if len(registers) != STATUS_COUNT:
+        raise MapError(f"a status block has {STATUS_COUNT} registers, not {len(registers)}")
+    if registers[0] != MAGIC:
+        raise MapError(f"register 0 is 0x{registers[0]:04X}, not 0x{MAGIC:04X}; check the PLC's program and byte order")
+    if registers[1] != MAP_VERSION:
+        raise MapError(f"the PLC has map version {registers[1]}, we have {MAP_VERSION}; load the matching PLC program")
+    if _long(registers, 2, order) != WORD_TEST:
+        other = WordOrder(1 - order)
+        if _long(registers, 2, other) == WORD_TEST:
+            raise MapError(f"the PLC's word order is {other.name}, ours {order.name}; change our setting or the PLC's")
+        raise MapError(f"the word-order test reads 0x{registers[2]:04X}{registers[3]:04X}; check the PLC's byte order")
+
+
+def read_status(registers: Sequence[int], order: WordOrder) -> tuple[Feedback, int]:
+    """Feedback and watchdog [ms] in the 48 registers from `STATUS_AT`; raises MapError."""
+    check_identity(registers, order)
+    try:
+        state = State(registers[5])
+    except ValueError:
+        raise MapError(f"the PLC's state is {registers[5]}, which means nothing") from None
+    feedback = Feedback(
+        heartbeat=registers[4],
+        state=state,
+        fault=registers[6],
+        fault_axis=registers[7],
+        estop=registers[8],
+        accepted=registers[9],
+        longest_cycle_us=registers[10],
+        position=tuple(_long(registers, 12 + 2 * i, order) / _MICRO for i in range(N_AXES)),
+        velocity=tuple(_short(registers[26 + i]) / _MILLI for i in range(N_AXES)),
+        pressure_bar=tuple(_short(registers[33 + i]) / 10.0 for i in range(N_PRESSURES)),
+        opening=registers[41] / _MILLI,
+        load_kg=registers[42],
+    )
+    return feedback, registers[WATCHDOG_AT]
+
+
+def advances(sequence: int, last: int, bits: int = 16) -> bool:
+    """Whether a sequence number lies ahead of the last one, in a ring of ``bits``."""
+    return 0 < (sequence - last) & (1 << bits) - 1 < 1 << bits - 1

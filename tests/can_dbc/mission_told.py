@@ -1,0 +1,39 @@
+"""A mission report with something in every field."""
+
+from __future__ import annotations
+
+from can_dbc.mission_datagrams import Area, GivenUp, Lying, MissionReport, Pile, Whereabouts
+
+HERE = (63.657853, 19.895562)
+TOLD = MissionReport(
+    schema=1,
+    name="Test field",
+    state="APPROACH",
+    words="drives up to the log",
+    ended=False,
+    auto=True,
+    single_step=False,
+    paused="",
+    waits_for="",
+    failure="",
+    order=3,
+    refusal="",
+    loaded=4,
+    on_board=3,
+    on_board_m3=0.29,
+    unloaded=1,
+    missed=2,
+    given_up=(GivenUp(9, "log 9 was missed 3 times"),),
+    driven_m=41.5,
+    targets=(7,),
+    crane="",
+    here=Whereabouts(HERE, 92.5, 0.02),
+    route=(HERE, (63.657853, 19.896362), (63.658122, 19.896362)),
+    closed=True,
+    fences=(Area(((63.6577, 19.8953), (63.6577, 19.8966), (63.6583, 19.8966), (63.6583, 19.8953)), False, "field"),),
+    landings=(Pile((63.65800, 19.8957), "road"),),
+    logs=(
+        Lying(7, (63.657880, 19.895762), 90.0, 2.0, 0.25, 0.4, 0, False),
+        Lying(9, (63.657820, 19.895962), 45.0, 2.0, 0.25, 30.0, 3, True),
+    ),
+)

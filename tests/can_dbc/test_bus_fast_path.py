@@ -1,0 +1,240 @@
+"""The receive code of SocketCAN on an AF_UNIX pair that carries the same struct can_frame: runs on every kernel."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import time
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from can_dbc.batch import Batch
+from can_dbc.bus import ERR_BUSOFF, ERR_RESTARTED, BusStats
+from can_dbc.filters import Filter
+from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
+from can_dbc.frame_socket import CAN_FRAME, FrameSocket
+from can_dbc.stamps import DRIFT_PPM, HardwareClock
+
+LIMIT = 1024
+SO_TIMESTAMPNS, SO_TIMESTAMPING, SO_RXQ_OVFL = 35, 37, 40
+
+
+class Pair:
+    """A fast path and the far end that it hears."""
+
+    def __init__(self) -> None:
+        near, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.link = FrameSocket(near)
+        self.stats = BusStats()
+
+    def put(self, key: int, data: bytes) -> None:
+        self.far.send(CAN_FRAME.pack(key, len(data), data))
+
+    def take(self, limit: int = LIMIT) -> list[Frame]:
+        frames: list[Frame] = []
+        self.link.receive(frames, limit, self.stats.note_error)
+        return frames
+
+
+@pytest.fixture
+def pair() -> Iterator[Pair]:
+    pair = Pair()
+    yield pair
+    pair.link.close()
+    pair.far.close()
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The number of datagrams of each system call."""
+    counts: list[int] = []
+    receive = Batch.receive
+
+    def counting(batch: Batch, descriptor: int) -> int:
+        counts.append(receive(batch, descriptor))
+        return counts[-1]
+
+    monkeypatch.setattr(Batch, "receive", counting)
+    return counts
+
+
+def test_frames_keep_key_payload_order_and_time(pair: Pair) -> None:
+    sent = [(0x181, b"12345678"), (0x1FFF_FFFF | EXTENDED, b""), (0x7FF | REMOTE, bytes(3)), (0, b"\xff")]
+    before_ns = time.monotonic_ns()
+    for key, data in sent:
+        pair.put(key, data)
+    between_ns = time.monotonic_ns()
+    frames = pair.take()
+    assert [(frame.key, frame.data) for frame in frames] == sent
+    assert all(type(frame) is Frame and type(frame.data) is bytes for frame in frames)
+    stamps = [frame.stamp_ns for frame in frames]
+    assert stamps == sorted(stamps)
+    slack_ns = 1_000_000  # two clocks are read one after the other, and somebody may take the processor in between
+    assert before_ns - slack_ns <= stamps[0] and stamps[-1] <= between_ns + slack_ns
+
+
+def test_a_drain_is_one_system_call(pair: Pair, calls: list[int]) -> None:
+    for count in (0, 1, 9):
+        for _ in range(count):
+            pair.put(0x181, bytes(8))
+        calls.clear()
+        assert len(pair.take()) == count and calls == [count]
+
+
+def test_more_than_a_batch_comes_in_several(pair: Pair, calls: list[int]) -> None:
+    pair.link._batch = Batch(CAN_FRAME.size, pair.link._batch.ancillary, count=4)
+    for key in range(9):
+        pair.put(key, b"")
+    assert [frame.key for frame in pair.take()] == list(range(9)) and calls == [4, 4, 1]
+    for key in range(9):
+        pair.put(key, b"")
+    assert [frame.key for frame in pair.take(limit=8)] == list(range(8))
+    assert [frame.key for frame in pair.take()] == [8]
+
+
+def test_error_frames_never_come_out_and_a_recovery_takes_back_what_was_before(pair: Pair) -> None:
+    pair.put(0x100, b"")
+    pair.put(ERROR | ERR_BUSOFF, bytes(8))
+    assert [frame.key for frame in pair.take()] == [0x100]
+    pair.put(0x101, b"")
+    pair.put(ERROR | ERR_RESTARTED, bytes(8))
+    pair.put(0x102, b"")
+    kept = [Frame(1, 0x99, b"")]
+    pair.link.receive(kept, LIMIT, pair.stats.note_error)
+    assert [frame.key for frame in kept] == [0x99, 0x102]
+    assert (pair.stats.error_frames, pair.stats.recoveries) == (2, 1)
+
+
+def test_a_far_end_that_has_gone_is_an_error(pair: Pair) -> None:
+    pair.link.close()
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        pair.take()
+
+
+def test_frames_are_sent_up_to_the_first_that_finds_no_room(pair: Pair) -> None:
+    """A socket that nobody reads holds a few and answers EAGAIN, as a full queue answers ENOBUFS."""
+    pair.link.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
+    pair.far.setblocking(False)
+    wanted = [(i, bytes([i])) for i in range(200)]
+    taken = pair.link.send(wanted)
+    assert 0 < taken < 200
+    with pytest.raises(BlockingIOError):
+        pair.link.send(wanted[taken:])
+    got = [CAN_FRAME.unpack(pair.far.recv(100)) for _ in range(taken)]
+    assert [(key, data[:length]) for key, length, data in got] == wanted[:taken]
+    with pytest.raises(BlockingIOError):
+        pair.far.recv(100)
+
+
+def control_data(stamp_ns: int, hardware_ns: int | None = None, dropped: int | None = None) -> bytes:
+    """What the kernel writes beside a frame (struct cmsghdr: length, level, kind)."""
+    second = 1_000_000_000
+    text = struct.pack("@Niiqq", 32, 1, SO_TIMESTAMPNS, *divmod(stamp_ns, second))
+    if hardware_ns is not None:
+        text += struct.pack("@Niiqqqqqq", 64, 1, SO_TIMESTAMPING, 0, 0, 0, 0, *divmod(hardware_ns, second))
+    if dropped is not None:
+        text += struct.pack("@NiiI4x", 20, 1, SO_RXQ_OVFL, dropped)
+    return text
+
+
+def deliver(pair: Pair, monkeypatch: pytest.MonkeyPatch, controls: list[bytes]) -> list[Frame]:
+    """A drain that finds frames with this control data."""
+
+    def receive(batch: Batch, _: int) -> int:
+        batch.control[:] = bytes(len(batch.control))
+        for i, text in enumerate(controls):
+            batch.control[i * batch.ancillary : i * batch.ancillary + len(text)] = text
+            CAN_FRAME.pack_into(batch.data, i * batch.size, i, 0, b"")
+        return len(controls)
+
+    monkeypatch.setattr(Batch, "receive", receive)
+    return pair.take()
+
+
+@pytest.mark.parametrize("hardware_ns", [None, 5_000_000_000])
+def test_lost_frames_are_counted_over_the_wrap(
+    hardware_ns: int | None, pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_ns = time.time_ns()
+    for counted, lost in ((None, 0), (7, 7), (7, 7), (0xFFFF_FFF0, 0xFFFF_FFF0), (4, 0x1_0000_0004)):
+        first, last = control_data(now_ns, hardware_ns, None), control_data(now_ns, hardware_ns, counted)
+        assert len(deliver(pair, monkeypatch, [first, last])) == 2
+        assert pair.link.dropped == lost
+
+
+def test_an_adapter_that_stamps_by_itself_is_believed(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two frames a millisecond apart on the bus; the interrupt of the second came 300 us late."""
+    now_ns = time.time_ns() - 10_000_000
+    controls = [control_data(now_ns, 77_000_000_000), control_data(now_ns + 1_300_000, 77_001_000_000)]
+    first, second = deliver(pair, monkeypatch, controls)
+    assert second.stamp_ns - first.stamp_ns == pytest.approx(1_000_000, abs=1_000_000 * DRIFT_PPM // 1_000_000)
+
+
+def test_a_clock_set_back_makes_no_frame_of_the_future(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    (frame,) = deliver(pair, monkeypatch, [control_data(time.time_ns() + 10_000_000_000)])
+    assert frame.stamp_ns <= time.monotonic_ns()
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 50_000_000), st.integers(0, 5_000_000)), min_size=1, max_size=200),
+    st.integers(-DRIFT_PPM // 2, DRIFT_PPM // 2),
+    st.integers(-(10**18), 10**18),
+)
+@example([(0, 0), (1, 0)], -1, 0)
+@example([(4_999, 0)] * 200, -DRIFT_PPM // 2, 0)
+def test_hardware_stamps_are_never_early_and_never_later_than_the_interrupt(
+    frames: list[tuple[int, int]], drift_ppm: int, epoch_ns: int
+) -> None:
+    """Whatever the latencies: a stamp lies between the true time and the interrupt, and the order stays.
+
+    The adapter counts whole nanoseconds, so the true time is known to it to one.
+    """
+    clock, true_ns, last_ns = HardwareClock(), 10**18, 0
+    least_ns = frames[0][1]
+    for gap_ns, latency_ns in frames:
+        true_ns += gap_ns
+        hardware_ns = epoch_ns + 2 * 10**18 + true_ns + true_ns % 10**15 * drift_ppm // 1_000_000
+        software_ns = max(true_ns + latency_ns, last_ns)
+        least_ns = min(least_ns + gap_ns * 2 * DRIFT_PPM // 1_000_000 + 2, software_ns - true_ns)
+        stamp_ns = clock.stamp_ns(hardware_ns, software_ns)
+        assert true_ns - 1 <= stamp_ns <= software_ns
+        assert stamp_ns >= last_ns
+        assert stamp_ns - true_ns <= least_ns or stamp_ns == last_ns
+        last_ns = stamp_ns
+
+
+@pytest.mark.parametrize("jump_ns", [-(10**12), -(10**9), 10**9, 10**12])
+def test_an_adapter_that_starts_its_clock_anew_is_followed(jump_ns: int) -> None:
+    clock = HardwareClock()
+    for i in range(3):
+        clock.stamp_ns(10**13 + i * 10**6, 10**18 + i * 10**6)
+    for i in range(3, 6):
+        assert clock.stamp_ns(10**13 + jump_ns + i * 10**6, 10**18 + i * 10**6) == 10**18 + i * 10**6
+
+
+KEYS = st.builds(
+    lambda i, kind: i | kind, st.integers(0, EXTENDED_MASK), st.sampled_from([EXTENDED, EXTENDED | REMOTE])
+)
+SHORT = st.builds(lambda i, kind: i | kind, st.integers(0, STANDARD_MASK), st.sampled_from([0, REMOTE]))
+
+
+@given(st.lists(st.one_of(SHORT, KEYS, st.tuples(KEYS, st.integers(0, EXTENDED_MASK)))), st.one_of(SHORT, KEYS))
+def test_a_filter_says_what_the_kernel_says(wanted: list[int | tuple[int, int]], key: int) -> None:
+    """A frame passes when ``received & mask == filter & mask`` for one pair (linux/can/raw.h); kinds always count."""
+    wanted_one = Filter(wanted)
+    assert (key in wanted_one) == any(key & mask == pair_key & mask for pair_key, mask in wanted_one.pairs)
+    by_hand = False
+    for item in wanted:
+        other, mask = item if isinstance(item, tuple) else (item, EXTENDED_MASK)
+        by_hand |= not (key ^ other) & (mask | EXTENDED | REMOTE)
+    assert (key in wanted_one) == by_hand
+    assert set(Filter(wanted_one.pairs).pairs) == set(wanted_one.pairs)  # as it travels to the wire
+
+
+def test_what_is_no_filter_is_refused() -> None:
+    for wrong in (["x"], [(1, 2, 3)], [None]):
+        with pytest.raises((TypeError, ValueError)):
+            Filter(wrong)  # type: ignore[arg-type]

@@ -1,0 +1,99 @@
+"""Orders and mission reports: what goes in comes out, and what is not whole does not."""
+
+from __future__ import annotations
+
+import zlib
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from can_dbc.mission_datagrams import (
+    MAX_BYTES,
+    MissionOrder,
+    MissionReport,
+    Order,
+    decode_mission,
+    decode_order,
+    encode_mission,
+    encode_order,
+)
+from can_dbc.setpoint import DatagramFault, DatagramRefused, OperatorAction, OperatorCommand, decode, encode
+from tests.can_dbc.mission_told import TOLD
+
+KEY = b"secret"
+
+
+def told(report: MissionReport = TOLD, key: bytes | None = None) -> bytes:
+    return encode_mission(report, 5, 77, 10**9, key)
+
+
+def changed(**fields: object) -> bytes:
+    """A report with fields that its schema does not know or not allow, and a right checksum."""
+    whole = told()
+    body = msgspec.json.encode(msgspec.json.decode(whole[24:-4]) | fields)
+    data = whole[:24] + body
+    return data + zlib.crc32(data).to_bytes(4, "little")
+
+
+def fault_of(take, *arguments) -> DatagramFault:
+    with pytest.raises(DatagramRefused) as refused:
+        take(*arguments)
+    return refused.value.fault
+
+
+@pytest.mark.parametrize("key", [None, KEY])
+def test_what_is_told_arrives(key) -> None:
+    assert decode_mission(told(key=key), key) == (77, 10**9, TOLD)
+
+
+@given(st.sampled_from(Order), st.integers(0, 2**32 - 1), st.integers(0, 2**63), st.sampled_from([None, KEY]))
+def test_an_order_arrives(order, sequence, stamp_ns, key) -> None:
+    message = MissionOrder(sequence, 77, stamp_ns, order)
+    assert decode_order(encode_order(message, key), key) == message
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"schema": 2}, {"extra": 1}, {"loaded": -1}, {"words": "x" * 121}, {"state": None}, {"route": [[91.0, 0.0]]},
+     {"route": [[0.0]]}, {"route": [[1.0, 2.0]] * 301}, {"driven_m": "far"},
+     {"fences": [{"corners": [], "keep_out": False, "name": ""}] * 21},
+     {"fences": [{"corners": [[1.0, 2.0]] * 200, "keep_out": False, "name": ""}] * 2}],
+    )  # fmt: skip
+def test_a_report_that_does_not_fit_is_refused_whole(fields) -> None:
+    assert decode_mission(changed())[2] == TOLD, "the way to make one is right"
+    assert fault_of(decode_mission, changed(**fields)) is DatagramFault.VALUE
+
+
+def test_a_number_that_is_none_is_refused() -> None:
+    lost = msgspec.structs.replace(TOLD, driven_m=float("nan"))
+    assert fault_of(decode_mission, told(lost)) is DatagramFault.VALUE
+
+
+def test_keys_must_agree() -> None:
+    order = encode_order(MissionOrder(1, 2, 3, Order.ABORT), KEY)
+    assert fault_of(decode_order, order, b"other") is DatagramFault.AUTHENTICATION
+    assert fault_of(decode_order, encode_order(MissionOrder(1, 2, 3, Order.ABORT)), KEY) is not None
+    assert fault_of(decode_mission, told(), KEY) is DatagramFault.AUTHENTICATION
+
+
+def test_one_kind_is_never_taken_for_another() -> None:
+    """Least of all by the controller."""
+    order = encode_order(MissionOrder(1, 2, 3, Order.AUTO))
+    press = encode(OperatorCommand(1, 2, 3, OperatorAction.ARM))
+    for take, data in ((decode, order), (decode, told()), (decode_order, press), (decode_order, told()),
+                       (decode_mission, press), (decode_mission, order)):  # fmt: skip
+        assert fault_of(take, data) is DatagramFault.KIND
+
+
+def test_an_unknown_order_is_refused() -> None:
+    data = bytearray(encode_order(MissionOrder(1, 2, 3, Order.AUTO))[:-4])
+    data[24] = 99
+    assert fault_of(decode_order, bytes(data) + zlib.crc32(data).to_bytes(4, "little")) is DatagramFault.VALUE
+
+
+def test_a_report_beyond_one_datagram_is_not_sent() -> None:
+    long = msgspec.structs.replace(TOLD, logs=TOLD.logs * 1000)
+    with pytest.raises(ValueError, match=str(MAX_BYTES)):
+        told(long)

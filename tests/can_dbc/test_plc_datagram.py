@@ -1,0 +1,109 @@
+"""The cyclic datagrams: sizes, round trips, and nothing of a damaged one used."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from can_dbc.plc.datagram import (
+    COMMAND_BYTES,
+    REPLY_BYTES,
+    DatagramRefused,
+    Header,
+    decode_command,
+    decode_reply,
+    encode_command,
+    encode_reply,
+)
+from can_dbc.plc.map import Command, Feedback, Grapple, MapError, Mode, State
+
+HEADERS = st.builds(Header, st.integers(0, 0xFFFF_FFFF), st.integers(0, (1 << 64) - 1), st.integers(0, 0xFFFF_FFFF))
+MICROS = st.tuples(*[st.integers(-(1 << 31), (1 << 31) - 1).map(lambda n: n / 1e6)] * 7)
+COMMAND = Command(
+    Mode.REFERENCES, True, (0.1, -0.2, 0.3, 0.4, -0.5, 0.0, 0.0), (0.01,) * 7, Grapple.CLOSE, 100, 50, True
+)
+FEEDBACK = Feedback(7, State.EXECUTE, 1, 2, 7, 9, 444, (0.1,) * 7, (-0.2,) * 7, (-1.5,) * 8, 0.25, 120)
+
+
+@settings(max_examples=50)
+@given(HEADERS, MICROS, MICROS)
+def test_a_command_comes_back(header: Header, reference: tuple[float, ...], rate: tuple[float, ...]) -> None:
+    command = Command(Mode.REFERENCES, True, reference, rate, Grapple.OPEN, 100, 50)
+    data = encode_command(header, command)
+    assert len(data) == COMMAND_BYTES == 96
+    assert decode_command(data) == (header, command)
+
+
+@settings(max_examples=50)
+@given(HEADERS, MICROS, MICROS)
+def test_a_reply_comes_back(header: Header, position: tuple[float, ...], velocity: tuple[float, ...]) -> None:
+    feedback = Feedback(
+        header.sequence & 0xFFFF,
+        State.HOLD,
+        1,
+        2,
+        7,
+        header.echo & 0xFFFF,
+        10_000,
+        position,
+        velocity,
+        (12.5,) * 8,
+        1.0,
+        9,
+    )
+    data = encode_reply(header, feedback)
+    assert len(data) == REPLY_BYTES == 128
+    assert decode_reply(data) == (header, feedback)
+
+
+def test_the_layout_is_that_of_the_table() -> None:
+    """Read with plain offsets, little-endian: header 28, seven pairs, end."""
+    data = encode_command(Header(5, 1_000_000, 3), COMMAND)
+    assert struct.unpack_from("<4sHHIQIHH", data) == (b"CRN1", 1, 1, 5, 1_000_000, 3, 1, 0x5AA5)
+    assert struct.unpack_from("<ii", data, 28) == (100_000, 10_000)
+    assert struct.unpack_from("<4H", data, 84) == (2, 100, 50, 1)
+    assert struct.unpack_from("<I", data, 92)[0] == zlib.crc32(data[:92])
+    reply = encode_reply(Header(7, 8, 9), FEEDBACK)
+    assert struct.unpack_from("<4sHHIQIHH", reply) == (b"CRN1", 1, 2, 7, 8, 9, 2, 0x5AA5)
+    assert struct.unpack_from("<8h6H", reply, 84) == (*(-15,) * 8, 7, 1, 2, 444, 250, 120)
+
+
+@settings(max_examples=50)
+@given(st.data())
+def test_one_changed_byte_is_refused(data: st.DataObject) -> None:
+    for good, decode in ((encode_command(Header(1, 2, 3), COMMAND), decode_command),
+                         (encode_reply(Header(1, 2, 3), FEEDBACK), decode_reply)):  # fmt: skip
+        at = data.draw(st.integers(0, len(good) - 1))
+        flip = data.draw(st.integers(1, 255))
+        bad = good[:at] + bytes((good[at] ^ flip,)) + good[at + 1 :]
+        with pytest.raises(DatagramRefused):
+            decode(bad)
+
+
+@settings(max_examples=50)
+@given(st.binary(max_size=200))
+def test_noise_is_refused(data: bytes) -> None:
+    for decode in (decode_command, decode_reply):
+        with pytest.raises(DatagramRefused):
+            decode(data)
+
+
+@pytest.mark.parametrize(("at", "value"), [(24, 3), (26, 0x5AA4), (84, 4), (86, 101), (88, 101), (90, 2)])
+def test_a_command_that_means_nothing_is_refused_as_a_value(at: int, value: int) -> None:
+    """The checksum is right, so the PLC knows that the sender said it: that is a fault, not a damaged datagram."""
+    data = bytearray(encode_command(Header(1, 2, 3), COMMAND))
+    struct.pack_into("<H", data, at, value)
+    struct.pack_into("<I", data, 92, zlib.crc32(data[:92]))
+    with pytest.raises(MapError):
+        decode_command(bytes(data))
+
+
+def test_what_does_not_fit_is_not_sent() -> None:
+    with pytest.raises(MapError):
+        encode_command(Header(1, 2, 3), Command(reference=(3000.0,) + (0.0,) * 6))
+    with pytest.raises(MapError):
+        encode_reply(Header(1, 2, 3), Feedback(opening=1.5))

@@ -1,0 +1,178 @@
+"""The register map: round trips in both word orders, and what it refuses."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from can_dbc.plc import map as plc
+from can_dbc.plc.map import (
+    COMMAND_COUNT,
+    N_AXES,
+    N_PRESSURES,
+    STATUS_COUNT,
+    Bounds,
+    Command,
+    Feedback,
+    Grapple,
+    MapError,
+    Mode,
+    Role,
+    State,
+    WordOrder,
+    advances,
+    command_registers,
+    read_command,
+    read_status,
+    status_registers,
+)
+
+U16 = st.integers(0, 0xFFFF)
+MICROS = st.integers(-(1 << 31), (1 << 31) - 1).map(lambda n: n / 1e6)
+MILLIS = st.integers(-(1 << 15), (1 << 15) - 1).map(lambda n: n / 1e3)
+COMMANDS = st.builds(
+    Command,
+    mode=st.sampled_from(Mode),
+    armed=st.booleans(),
+    reference=st.tuples(*[MICROS] * N_AXES),
+    rate=st.tuples(*[MILLIS] * N_AXES),
+    grapple=st.sampled_from(Grapple),
+    grapple_pct=st.integers(0, 100),
+    max_speed_pct=st.integers(0, 100),
+    reset=st.booleans(),
+)
+FEEDBACKS = st.builds(
+    Feedback,
+    heartbeat=U16,
+    state=st.sampled_from(State),
+    fault=U16,
+    fault_axis=U16,
+    estop=U16,
+    accepted=U16,
+    longest_cycle_us=U16,
+    position=st.tuples(*[MICROS] * N_AXES),
+    velocity=st.tuples(*[MILLIS] * N_AXES),
+    pressure_bar=st.tuples(*[st.integers(-(1 << 15), (1 << 15) - 1).map(lambda n: n / 10.0)] * N_PRESSURES),
+    opening=st.integers(0, 1000).map(lambda n: n / 1e3),
+    load_kg=U16,
+)
+
+
+@settings(max_examples=50)
+@given(COMMANDS, U16, U16, st.sampled_from(WordOrder))
+def test_a_command_comes_back(command: Command, heartbeat: int, sequence: int, order: WordOrder) -> None:
+    registers = command_registers(command, heartbeat, sequence, order)
+    assert len(registers) == COMMAND_COUNT and all(0 <= r <= 0xFFFF for r in registers)
+    assert registers[:2] == [heartbeat, sequence]
+    assert read_command(registers, order) == command
+
+
+@settings(max_examples=50)
+@given(FEEDBACKS, U16, st.sampled_from(WordOrder))
+def test_a_status_comes_back(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> None:
+    registers = status_registers(feedback, watchdog_ms, order)
+    assert len(registers) == STATUS_COUNT and all(0 <= r <= 0xFFFF for r in registers)
+    assert read_status(registers, order) == (feedback, watchdog_ms)
+
+
+def test_the_addresses_are_those_of_the_map() -> None:
+    """Addresses 0-47 and 100-131 as written down, with values chosen so that each register is told apart."""
+    feedback = Feedback(
+        heartbeat=11, state=State.EXECUTE, fault=1, fault_axis=3, estop=7, accepted=21, longest_cycle_us=31,
+        position=(0.065537, -0.000001, 0.0, 0.0, 0.0, 0.0, 0.0), velocity=(0.001, -0.001, 0.0, 0.0, 0.0, 0.0, 0.007),
+        pressure_bar=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), opening=0.5, load_kg=77,
+    )  # fmt: skip
+    status = status_registers(feedback, 300, WordOrder.HIGH_FIRST)
+    assert status[:12] == [0x4352, 1, 0x0102, 0x0304, 11, 2, 1, 3, 7, 21, 31, 300]
+    assert status[12:16] == [1, 1, 0xFFFF, 0xFFFF]
+    assert (status[26], status[27], status[32]) == (1, 0xFFFF, 7)
+    assert status[33:48] == [1, 2, 3, 4, 5, 6, 7, 8, 500, 77, 0, 0, 0, 0, 0]
+    low = status_registers(feedback, 300, WordOrder.LOW_FIRST)
+    assert (low[2:4], low[12:14]) == ([0x0304, 0x0102], [1, 1])
+    command = Command(
+        mode=Mode.VALVES, armed=True, reference=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -0.000001), rate=(0.002,) * N_AXES,
+        grapple=Grapple.HOLD, grapple_pct=20, max_speed_pct=50, reset=True,
+    )  # fmt: skip
+    block = command_registers(command, 5, 6, WordOrder.HIGH_FIRST)
+    assert block[:6] == [5, 6, 2, 0x5AA5, 0x000F, 0x4240]
+    assert block[16:] == [0xFFFF, 0xFFFF, 2, 2, 2, 2, 2, 2, 2, 3, 20, 50, 1, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("order", "registers", "says"),
+    [
+        (WordOrder.HIGH_FIRST, (0x0304, 0x0102), "LOW_FIRST"),
+        (WordOrder.LOW_FIRST, (0x0102, 0x0304), "HIGH_FIRST"),
+        (WordOrder.HIGH_FIRST, (0x0201, 0x0403), "byte order"),
+    ],
+)
+def test_the_word_order_test_tells_what_is_wrong(order: WordOrder, registers: tuple[int, int], says: str) -> None:
+    status = status_registers(Feedback(), 300, order)
+    status[2:4] = registers
+    with pytest.raises(MapError, match=says):
+        read_status(status, order)
+
+
+@pytest.mark.parametrize(("register", "value"), [(0, 0x5243), (1, 2), (5, 3), (5, 9)])
+def test_a_status_of_another_map_is_refused(register: int, value: int) -> None:
+    status = status_registers(Feedback(), 300, WordOrder.HIGH_FIRST)
+    status[register] = value
+    with pytest.raises(MapError):
+        read_status(status, WordOrder.HIGH_FIRST)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        Command(reference=(math.nan,) + (0.0,) * 6),
+        Command(rate=(math.inf,) + (0.0,) * 6),
+        Command(reference=(2147.4836481,) + (0.0,) * 6),
+        Command(rate=(32.768,) + (0.0,) * 6),
+        Command(grapple_pct=101),
+        Command(max_speed_pct=-1),
+        Command(reference=(0.0,) * 6),
+    ],
+)
+def test_what_does_not_fit_is_refused_and_never_clamped(command: Command) -> None:
+    with pytest.raises(MapError):
+        command_registers(command, 0, 1, WordOrder.HIGH_FIRST)
+
+
+@pytest.mark.parametrize(
+    ("register", "value"), [(102, 3), (103, 0x5AA4), (125, 4), (126, 101), (127, 101), (128, 2), (129, 1), (131, 9)]
+)
+def test_a_command_that_means_nothing_is_refused(register: int, value: int) -> None:
+    block = command_registers(Command(), 0, 1, WordOrder.HIGH_FIRST)
+    block[register - plc.COMMAND_AT] = value
+    with pytest.raises(MapError, match=str(register)):
+        read_command(block, WordOrder.HIGH_FIRST)
+
+
+def test_bounds_name_the_axis() -> None:
+    bounds = Bounds.references([(-1.0, 1.0, 0.4)] * 5)
+    bounds.check(Command(Mode.REFERENCES, True, (1.05, *(0.0,) * 6), (0.5, *(0.0,) * 6)))
+    bounds.check(Command(Mode.NEUTRAL, True, (9.0,) * 7))
+    for reference, rate, axis in [
+        ((0.0, 1.051, 0, 0, 0, 0, 0), (0.0,) * 7, 1),
+        ((0.0,) * 7, (0.0, 0.0, -0.502, 0, 0, 0, 0), 2),
+        ((0.0, 0, 0, 0, 0, 0.1, 0), (0.0,) * 7, 5),
+    ]:
+        with pytest.raises(MapError) as refused:
+            bounds.check(Command(Mode.REFERENCES, True, reference, rate))
+        assert refused.value.axis == axis
+    with pytest.raises(MapError, match="REFERENCES"):
+        bounds.check(Command(Mode.VALVES, True))
+    with pytest.raises(MapError):
+        Bounds.valves().check(Command(Mode.VALVES, True, (1.01, *(0.0,) * 6)))
+    assert Bounds.valves().role is Role.VALVES
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 0xFFFF), st.integers(1, 0x7FFE))
+def test_a_sequence_advances_round_its_ring(last: int, step: int) -> None:
+    ahead = (last + step) & 0xFFFF
+    assert advances(ahead, last)
+    assert not advances(last, ahead) and not advances(last, last)

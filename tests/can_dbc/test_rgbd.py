@@ -1,0 +1,88 @@
+"""Frames on a stream: whole or refused."""
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from can_dbc.rgbd import (
+    QUESTION,
+    START_BYTES,
+    RgbdError,
+    RgbdFrame,
+    decode,
+    encode,
+    encode_question,
+    encode_refusal,
+    question_bytes,
+    start,
+)
+
+
+def frame(width: int = 5, height: int = 3, seed: int = 0) -> RgbdFrame:
+    rng = random.Random(seed)
+    pixels = width * height
+    return RgbdFrame(
+        "front", 123, width, height, 40.0, 41.0, 2.0, 1.0, rng.randbytes(3 * pixels), rng.randbytes(2 * pixels)
+    )
+
+
+@given(st.integers(1, 40), st.integers(1, 30), st.integers(0, 100))
+def test_a_frame_arrives_as_it_was_sent(width: int, height: int, seed: int) -> None:
+    sent = frame(width, height, seed)
+    data = encode(sent)
+    assert decode(data) == sent and len(data) == START_BYTES + start(data[:START_BYTES]).rest
+
+
+@given(st.data())
+def test_any_flipped_bit_refuses_the_frame(data: st.DataObject) -> None:
+    whole = bytearray(encode(frame()))
+    at = data.draw(st.integers(0, len(whole) - 1))
+    whole[at] ^= 1 << data.draw(st.integers(0, 7))
+    with pytest.raises(RgbdError):
+        decode(bytes(whole))
+
+
+@given(st.integers(0, 200), st.integers(1, 20))
+def test_a_cut_or_lengthened_frame_is_refused(kept: int, more: int) -> None:
+    whole = encode(frame())
+    for broken in (whole[: min(kept, len(whole) - 1)], whole + bytes(more)):
+        with pytest.raises(RgbdError):
+            decode(broken)
+
+
+@given(st.binary(min_size=START_BYTES, max_size=START_BYTES + 40))
+def test_noise_is_no_frame(noise: bytes) -> None:
+    with pytest.raises(RgbdError):
+        decode(noise)
+
+
+def test_a_refusal_says_why() -> None:
+    with pytest.raises(RgbdError, match="the lens is covered"):
+        decode(encode_refusal("front", "the lens is covered"))
+
+
+def test_what_is_asked_is_the_cameras_name() -> None:
+    asked = encode_question("front")
+    assert asked[QUESTION.size :] == b"front" and question_bytes(asked[: QUESTION.size]) == 5
+    with pytest.raises(RgbdError, match="ask for no frame"):
+        question_bytes(bytes(QUESTION.size))
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        (lambda f: RgbdFrame(**{**_fields(f), "rgb": b""}), "no 5 x 3 px"),
+        (lambda f: RgbdFrame(**{**_fields(f), "width_px": 0}), "cannot be sent"),
+        (lambda f: RgbdFrame(**{**_fields(f), "fx_px": float("nan")}), "not finite"),
+        (lambda f: RgbdFrame(**{**_fields(f), "camera": ""}), "name has 1 to"),
+    ],
+)
+def test_what_does_not_agree_is_not_sent(broken, words: str) -> None:
+    with pytest.raises(RgbdError, match=words):
+        encode(broken(frame()))
+
+
+def _fields(f: RgbdFrame) -> dict:
+    return {name: getattr(f, name) for name in RgbdFrame.__slots__}

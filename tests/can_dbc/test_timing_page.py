@@ -1,0 +1,135 @@
+"""The shared page of the controller's timing: what is written is read, whole or not at all."""
+
+import os
+import stat
+import struct
+import threading
+
+import pytest
+
+from can_dbc.durations import Durations
+from can_dbc.timing_page import (
+    STAGES,
+    BusCounters,
+    Facts,
+    InputAge,
+    ProcessCounters,
+    TimingRefused,
+    TimingWriter,
+    default_path,
+    read_timing,
+)
+
+
+def facts(ticks: int = 3, words: str = "STANDBY. All is well.") -> Facts:
+    return Facts(
+        pid=os.getpid(), started_ns=1, written_ns=2, period_ns=5_000_000, ticks=ticks, missed=1, late=0,
+        mode="STANDBY", words=words, buses=(BusCounters("crane0", "ACTIVE", 9, 8, 7, 6, 5, 4),),
+        process=ProcessCounters(1, 2, 3, 4, 5, 6, 7, 8), inputs={"EncSlew": InputAge(2_500_000, 3_000_000, 17)},
+        longest_ns=tuple(range(len(STAGES))), total_ns=(ticks,) * len(STAGES),
+    )  # fmt: skip
+
+
+def histograms(duration_ns: int = 1000, count: int = 1) -> dict[str, Durations]:
+    made = {name: Durations() for name in STAGES}
+    for i, histogram in enumerate(made.values()):
+        for _ in range(count):
+            histogram.add(duration_ns * (i + 1))
+    return made
+
+
+def test_what_is_written_is_read(tmp_path):
+    path = tmp_path / "sub" / "controller.timing"
+    writer = TimingWriter(path)
+    with pytest.raises(TimingRefused, match="not written its timing"):
+        read_timing(path)
+    writer.publish(facts(), histograms())
+    found = read_timing(path)
+    assert found.facts == facts()
+    assert [found.durations[name].quantile_ns(1.0) > 0 for name in STAGES[1:]] == [True] * (len(STAGES) - 1)
+    assert found.durations["sync"].bins == histograms()["sync"].bins
+    writer.close()
+    writer.close()
+    with pytest.raises(TimingRefused, match="No controller tells its timing"):
+        read_timing(path)
+
+
+def test_others_may_read_it_whatever_the_umask(tmp_path):
+    before = os.umask(0o077)
+    try:
+        writer = TimingWriter(tmp_path / "page")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "page").stat().st_mode) == 0o644
+    writer.close()
+
+
+def test_a_page_in_the_middle_of_a_change_or_of_another_release_is_refused(tmp_path):
+    path = tmp_path / "page"
+    writer = TimingWriter(path)
+    writer.publish(facts(), histograms())
+    with path.open("r+b") as file:
+        file.seek(8)
+        file.write(struct.pack("<Q", 3))
+    with pytest.raises(TimingRefused, match="not written"):
+        read_timing(path)
+    with path.open("r+b") as file:
+        file.write(struct.pack("<II", 0x504D4854, 99))
+    with pytest.raises(TimingRefused, match="same release"):
+        read_timing(path)
+    path.write_bytes(b"short")
+    with pytest.raises(TimingRefused):
+        read_timing(path)
+
+
+def test_a_reader_never_sees_a_mixture(tmp_path):
+    """The writer goes on without pause; every copy that is taken is of one state."""
+    path = tmp_path / "page"
+    writer = TimingWriter(path)
+    states = [(facts(k, f"{k} " * 100 * k), histograms(2000, k)) for k in (1, 5, 9)]
+    writer.publish(*states[0])
+    ended = threading.Event()
+
+    def write() -> None:
+        while not ended.is_set():
+            for state in states:
+                writer.publish(*state)
+                ended.wait(0.0005)
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    try:
+        for _ in range(100):
+            found = read_timing(path)
+            ticks = found.facts.ticks
+            assert found.facts.words == f"{ticks} " * 100 * ticks
+            assert {found.durations[name].count for name in STAGES} == {ticks}
+    finally:
+        ended.set()
+        thread.join()
+
+
+def test_a_second_controller_takes_the_place_and_the_first_leaves_it_alone(tmp_path):
+    path = tmp_path / "page"
+    first, second = TimingWriter(path), TimingWriter(path)
+    second.publish(facts(ticks=7), histograms())
+    first.publish(facts(ticks=1), histograms())
+    first.close()
+    assert read_timing(path).facts.ticks == 7
+    second.close()
+    assert not path.exists()
+
+
+def test_facts_that_do_not_fit_leave_the_former_page(tmp_path):
+    path = tmp_path / "page"
+    writer = TimingWriter(path)
+    writer.publish(facts(), histograms())
+    writer.publish(facts(words="x" * 20_000), histograms())
+    assert read_timing(path).facts.words == facts().words
+
+
+def test_the_path_is_that_of_the_service_or_of_the_user(monkeypatch):
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/timberhand:/run/other")
+    assert str(default_path()) == "/run/timberhand/controller.timing"
+    monkeypatch.delenv("RUNTIME_DIRECTORY")
+    assert str(default_path()) == f"/dev/shm/timberhand-{os.getuid()}/controller.timing"

@@ -1,0 +1,78 @@
+"""The measurement of the bus: its traffic, that every path takes all of it, and the verdict.  No times."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from can_dbc.codec import load
+from can_dbc.e2e import Checker, Status
+from hil import bus_bench
+from hil.bus_bench import LIMIT_US, Traffic, measure
+from hil.exits import Exit, Stopped
+from timberhand.commands.bench import app
+
+TICKS = 40
+
+
+def test_the_traffic_is_what_the_controller_hears() -> None:
+    """Every message at its cycle time, every value in range, every counter in step."""
+    database = load("crane")
+    heard = {c.key: c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders}
+    per_second = sum(10**9 // codec.cycle_time_ns for codec in heard.values())
+    checkers = {key: Checker(codec.data_ids) for key, codec in heard.items() if codec.data_ids}
+    frames = Traffic(database).take(per_second * TICKS // 200)
+    for key, count in Counter(key for key, _ in frames).items():
+        assert abs(count - TICKS * 5_000_000 / heard[key].cycle_time_ns) <= 1
+    first = set()
+    for key, data in frames:
+        assert None not in heard[key].receive(data)
+        if key in checkers:
+            assert checkers[key].check(data) is (Status.OK if key in first else Status.INITIAL)
+            first.add(key)
+    assert frames == Traffic(database).take(len(frames))
+
+
+@pytest.fixture(scope="module")
+def result() -> dict[str, Any]:
+    return measure(frames=30, rounds=10)
+
+
+def test_every_path_takes_every_frame(result: dict[str, Any]) -> None:
+    assert set(result["paths"]) == {"ours", "pythoncan", "wire"}
+    assert {"rx_us", "rx_decode_us", "rx_pythoncan_us", "rx_decode_pythoncan_us"} < set(result["metrics"])
+    assert all(value > 0 for value in result["metrics"].values())
+
+
+def test_a_path_that_loses_a_frame_is_no_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    take = Traffic.take
+    monkeypatch.setattr(Traffic, "take", lambda self, count: take(self, count)[:-1])
+    with pytest.raises(Stopped, match="13 of 14 frames"):
+        measure(frames=30, rounds=3)
+
+
+@pytest.mark.parametrize(
+    ("cost_us", "lab", "code"),
+    [(LIMIT_US, False, Exit.FINE), (LIMIT_US + 0.1, False, Exit.FIGURE), (LIMIT_US + 0.1, True, Exit.FINE)],
+)
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_the_verdict(
+    cost_us: float,
+    lab: bool,
+    code: Exit,
+    form: list[str],
+    result: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    measured = result | {"lab": lab, "metrics": result["metrics"] | {"rx_decode_us": cost_us}}
+    monkeypatch.setattr(bus_bench, "measure", lambda frames, rounds: measured)
+    done = CliRunner().invoke(app, ["bus", *form])
+    assert done.exit_code == code
+    if form:
+        assert json.loads(done.stdout)["metrics"]["rx_decode_us"] == cost_us
+    else:
+        assert ("lab:" in done.stdout) is lab and "python-can costs" in done.stdout

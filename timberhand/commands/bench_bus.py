@@ -1,0 +1,66 @@
+"""``timberhand bench bus``: what receiving a frame costs, ours beside python-can, in one run."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+
+def bus(
+    frames: Annotated[int, typer.Option(min=10, help="Frames per round and path.")] = 1000,
+    rounds: Annotated[int, typer.Option(min=3, help="Rounds in which the paths take turns; the median counts.")] = 31,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+) -> None:
+    """Time the way from the socket to checked and decoded values, per frame of crane0, along every path.
+
+    Over vcan where the kernel has it, else over a stand-in with the same code on top.  Exit code 6 when the fast path
+    needs more than 5 us per frame; inside user-mode Linux there is no such verdict.
+
+      timberhand bench bus
+
+      timberhand hil vcan -- timberhand bench bus --rounds 5
+    """
+    import json
+
+    from hil.bus_bench import LIMIT_US, measure
+    from hil.exits import Exit
+    from hil.experiments.result import environment
+
+    result = {"environment": environment()} | measure(frames, rounds)
+    metrics, lab = result["metrics"], result["lab"]
+    reached = metrics["rx_decode_us"] <= LIMIT_US
+    if as_json:
+        typer.echo(json.dumps(result, indent=2))
+    else:
+        _show(result, reached)
+    if not reached and not lab:
+        raise typer.Exit(Exit.FIGURE)
+
+
+def _show(result: dict, reached: bool) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    screen = Console(soft_wrap=True, highlight=False)
+    metrics = result["metrics"]
+    screen.print("  ".join(f"[dim]{name}[/dim] {value}" for name, value in result["environment"].items()))
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("path")
+    for column in ("receive µs", "+ check and decode µs"):
+        table.add_column(column, justify="right")
+    for name, label in result["paths"].items():
+        suffix = "" if name == "ours" else f"_{name}"
+        table.add_row(label, f"{metrics[f'rx{suffix}_us']:.2f}", f"{metrics[f'rx_decode{suffix}_us']:.2f}")
+    screen.print(table)
+    if "pair" in result["paths"]["ours"]:
+        screen.print(
+            "[dim]This kernel has no CAN: a pair of datagram sockets carries the frames, same code on top.[/dim]"
+        )
+    screen.print(f"python-can costs {metrics['rx_decode_ratio']:.1f} times as much")
+    if result["lab"]:
+        screen.print("[yellow]lab: user-mode Linux, where a system call costs a hundred times as much[/yellow]")
+    else:
+        mark = "[green]✔[/green]" if reached else "[red]✘[/red]"
+        screen.print(f"{mark} at most {result['limit_us']:.0f} µs per frame, received and decoded")
+    screen.print(f"[dim]{result['rounds']} rounds of {result['frames']} frames, {result['clock']}[/dim]")
