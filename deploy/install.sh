@@ -1,13 +1,15 @@
 #!/bin/sh
 # Install timberhand as services of this computer: users, program, units, settings.  It enables the services for the
 # next start and starts nothing; the machine itself is armed by a human alone.  Running it again mends and updates.
+# It travels in the wheel with all that it lays out: see __main__.py beside it.
 set -eu
 
 usage() {
     cat <<'TEXT'
 usage: sudo sh deploy/install.sh [options]
+       sudo python3.11 timberhand-VERSION.whl/deploy [options]
 
-  --wheel FILE            install this wheel (default: one that is built from this checkout)
+  --wheel FILE            install this wheel (default: the one this comes from, or one built from this checkout)
   --find-links DIR        take every package from DIR, without a network
   --from-environment DIR  use the packages of the virtual environment DIR instead of installing them
   --python PROGRAM        Python 3.11 or newer to run with (default: python3.11, else python3)
@@ -57,8 +59,10 @@ etc=$root/etc/timberhand
 conf=$etc/timberhand.conf
 shipped=$lib/timberhand/timberhand.conf
 venv=$root$opt
+link=$root/usr/local/bin/timberhand
 packages=
-constraints=
+constraints=$here/constraints.txt
+case $here in "$venv"/*) mending=yes ;; *) mending='' ;; esac # started by the installed program itself
 
 run() {
     if [ "$dry" ]; then echo "$*"; else "$@"; fi
@@ -90,6 +94,8 @@ check() {
 
 check_program() {
     [ -z "$wheel" ] || [ -f "$wheel" ] || fail 2 "--wheel $wheel is no file"
+    [ "$wheel" ] || [ "$mending" ] || [ -f "$here/../pyproject.toml" ] ||
+        fail 2 "there is no checkout around $here to build a wheel from; name a wheel with --wheel FILE"
     [ -z "$links" ] || [ -d "$links" ] || fail 2 "--find-links $links is no directory"
     if [ -z "$python" ]; then python=$(command -v python3.11 || command -v python3 || true); fi
     [ "$python" ] || fail 3 "there is no Python; apt-get install python3.11, or name one with --python"
@@ -106,7 +112,6 @@ check_program() {
         for packages in "$(realpath "$environment")"/lib/python3*/site-packages ''; do [ ! -d "$packages" ] || break; done
         [ "$packages" ] || fail 2 "--from-environment $environment holds no Python packages"
     fi
-    [ ! -f "$here/../constraints.txt" ] || constraints=$here/../constraints.txt
 }
 
 pip() { run "$venv/bin/python" -m pip --disable-pip-version-check --quiet "$@"; }
@@ -117,9 +122,9 @@ install_program() {
         run "$python" -m venv --clear "$venv"
     fi
     site=$venv/lib/python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')/site-packages
-    run rm -f "$site/timberhand-environment.pth"
+    [ "$mending" ] || run rm -f "$site/timberhand-environment.pth"
     if [ "$packages" ]; then run sh -c "echo '$packages' > '$site/timberhand-environment.pth'"; fi
-    if [ -z "$wheel" ]; then
+    if [ -z "$wheel$mending" ]; then
         say "building a wheel from $(dirname "$here")"
         work=$(mktemp -d)
         trap 'rm -rf "$work"' EXIT
@@ -127,11 +132,13 @@ install_program() {
         pip wheel ${links:+--no-index --find-links "$links"} --no-deps --wheel-dir "$work/wheel" "$work"
         wheel=$(echo "$work"/wheel/timberhand-*.whl)
     fi
-    say "installing $(basename "$wheel") and what it needs"
-    pip install --no-deps --force-reinstall --no-index "$wheel"
+    if [ "$wheel" ]; then
+        say "installing $(basename "$wheel") and what it needs"
+        pip install --no-deps --force-reinstall --no-index "$wheel"
+    fi
     if [ "$environment" ] && [ -z "$links" ]; then offline=yes; else offline=$links; fi
-    pip install ${offline:+--no-index} ${links:+--find-links "$links"} ${constraints:+--constraint "$constraints"} \
-        'timberhand[autonomy,console]'
+    pip install ${offline:+--no-index} ${links:+--find-links "$links"} --constraint "$constraints" \
+        'timberhand[autonomy,console,plc]'
     if [ "$root" ]; then # the programs will be called in the tree's own root
         run find "$venv/bin" -type f -exec sed -i "1s|^#!$venv/bin|#!$opt/bin|" {} +
     fi
@@ -160,14 +167,23 @@ install_all() {
     put "$here/system/sysusers.conf" "$lib/sysusers.d/timberhand.conf" 0644
     put "$here/system/sysctl.conf" "$lib/sysctl.d/60-timberhand.conf" 0644
     put "$here/system/modules.conf" "$lib/modules-load.d/timberhand.conf" 0644
+    put "$here/system/udev.rules" "$lib/udev/rules.d/60-timberhand.rules" 0644
     put "$here/system/can-up" "$lib/timberhand/can-up" 0755
     install_program
+    if [ ! -e "$link" ] || [ "$(readlink "$link")" = "$opt/bin/timberhand" ]; then
+        run install -d -m 0755 "${link%/*}"
+        run ln -sfn "$opt/bin/timberhand" "$link"
+    fi
     install_conf
     for unit in $(units); do put "$here/units/$unit" "$lib/systemd/system/$unit" 0644; done
     live systemd-sysusers timberhand.conf
     # A kernel without these says so when a bus is opened.
     live /lib/systemd/systemd-modules-load "$lib/modules-load.d/timberhand.conf" || true
     live /lib/systemd/systemd-sysctl "$lib/sysctl.d/60-timberhand.conf"
+    if [ "$dry" ] || command -v udevadm >/dev/null; then # else an adapter is not set up again, and no --dma-latency
+        live udevadm control --reload
+        live udevadm trigger --sysname-match=cpu_dma_latency
+    fi
     live systemctl daemon-reload
     # shellcheck disable=SC2046 # a list of words
     run systemctl --quiet ${root:+--root="$root"} enable $(enabled)
@@ -185,8 +201,9 @@ uninstall_all() {
         run rm -f "$conf"
     fi
     run rm -rf "$lib/timberhand" "$lib/sysusers.d/timberhand.conf" "$lib/sysctl.d/60-timberhand.conf" \
-        "$lib/modules-load.d/timberhand.conf" "$venv"
+        "$lib/modules-load.d/timberhand.conf" "$lib/udev/rules.d/60-timberhand.rules" "$venv"
     run rm -f "$conf.new"
+    if [ "$(readlink "$link")" = "$opt/bin/timberhand" ]; then run rm -f "$link"; fi
     [ ! -d "$etc" ] || run rmdir --ignore-fail-on-non-empty "$etc"
     say "removed"
     if [ -e "$conf" ] && [ -z "$dry" ]; then say "$conf was changed here and stays"; fi

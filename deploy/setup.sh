@@ -20,9 +20,9 @@ PY
 if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
     sh "$here/debian_packages.sh" python3.11-venv
 fi
-if ! "$venv/bin/python" -m pip --version >/dev/null 2>&1; then # none yet, or one that was interrupted
+if [ ! -e "$venv/.ready" ]; then # none yet, or one that was interrupted: half a package breaks pip itself
     echo "setup: creating $venv with $("$python" --version)" >&2
     "$python" -m venv --clear "$venv"
 fi
-echo "setup: installing the pinned packages (about 0.5 GB, once)" >&2
+echo "setup: installing the pinned packages (about 1 GB, once)" >&2
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c "$here/../constraints.txt" -e "$here/..[dev]"

@@ -13,8 +13,10 @@ import select
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -24,10 +26,22 @@ from hil.vcan_lab.spec import LabError
 from hil.vcan_lab.uml import KERNEL
 
 ROOT: Final = Path(__file__).resolve().parents[2]
+CHECKOUT: Final = ROOT / "pyproject.toml"
 MEM_MB: Final = 1536
 """The plant with its compiled parts, the installed program on the overlay, and systemd; the host gives what is used."""
 END_S: Final = 10.0
+WARM_UP_S: Final = 300.0
 LEFT_OUT: Final = shutil.ignore_patterns(".*", "runs", "build", "dist", "__pycache__", "*.egg-info")
+
+WARM_UP: Final = """\
+import hil.service_lab.guest
+from machine.load import load_profile
+from sim.plant import Plant
+plant = Plant(load_profile("palms_471"))
+for now_ms in range(1000, 1100, 5):
+    plant.step(now_ms * 1_000_000, [])
+"""
+"""Compiles what the guest runs: in the guest it would take long, and while services are timed."""
 
 CHECK_SERVICE: Final = """\
 [Unit]
@@ -36,7 +50,8 @@ After=basic.target
 [Service]
 Type=exec
 Environment=PYTHONDONTWRITEBYTECODE=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
-WorkingDirectory={root}
+Environment=PYTHONPATH={program}:{packages}
+WorkingDirectory=/
 ExecStart={python} -m hil.service_lab.guest {order}
 StandardOutput=tty
 StandardError=inherit
@@ -55,6 +70,8 @@ def missing() -> str | None:
         return f"{KERNEL} is missing: apt-get install user-mode-linux"
     if not Path("/lib/systemd/systemd").exists():
         return "systemd is missing: apt-get install systemd"
+    if not Path("/lib/systemd/systemd-udevd").exists():
+        return "udev is missing: apt-get install udev"
     if os.geteuid() != 0:
         return "the guest's root is this machine's files: only root can be root on them"
     python = python_for_services()
@@ -71,6 +88,8 @@ def python_for_services() -> str:
 
 def build_wheel(folder: Path) -> Path:
     """A wheel of this checkout in ``folder``; the checkout stays as it is."""
+    if not CHECKOUT.is_file():
+        raise LabError(f"there is no checkout around {ROOT} to build a wheel from; name one with --wheel")
     source = folder / "source"
     shutil.copytree(ROOT, source, ignore=LEFT_OUT)
     made = subprocess.run(
@@ -90,32 +109,58 @@ def _build_options() -> list[str]:
 
 
 def run(wheel: Path | None, timeout_s: float, tell: Callable[[str], None]) -> dict[str, Any]:
-    """The guest's result; ``tell`` gets a line for every step."""
+    """The guest's result; ``tell`` gets a line for every step.
+
+    Whatever runs in the guest comes out of the wheel, the check itself and the emulated machine included; a checkout
+    is hidden from it.
+    """
     if fault := missing():
         raise LabError(f"no service lab here: {fault}")
     with tempfile.TemporaryDirectory(prefix="timberhand-service-") as name:
         folder = Path(name)
-        order = {
-            "wheel": str(wheel.resolve() if wheel else build_wheel(folder)),
-            "install": str(ROOT / "deploy" / "install.sh"),
-            "python": python_for_services(),
-            "environment": "/opt/environment",
-        }
+        wheel = wheel.resolve() if wheel else build_wheel(folder)
+        program = folder / "program"
+        zipfile.ZipFile(wheel).extractall(program)
+        packages, python = f"/opt/environment/{_packages().relative_to(sys.prefix)}", python_for_services()
+        _warm_up(python, f"{program}:{_packages()}")
+        order = {"wheel": str(wheel), "python": python, "environment": "/opt/environment"}
         (folder / "order.json").write_text(json.dumps(order))
-        check = CHECK_SERVICE.format(root=ROOT, python=sys.executable, order=folder / "order.json")
+        check = CHECK_SERVICE.format(program=program, packages=packages, python=python, order=folder / "order.json")
         (folder / "check.service").write_text(check)
-        settings = [f"LAB={folder}", f"ENVIRONMENT={Path(sys.prefix).resolve()}", f"PYTHON={python_for_services()}"]
-        return _boot(settings, timeout_s, tell)
+        settings = [
+            f"LAB={folder}", f"ENVIRONMENT={Path(sys.prefix).resolve()}", f"PYTHON={python}",
+            *([f"CHECKOUT={ROOT}"] if CHECKOUT.is_file() else []),
+        ]  # fmt: skip
+        init = program / "hil" / "service_lab" / "init.sh"
+        init.chmod(0o755)
+        return _boot(init, settings, timeout_s, tell)
 
 
-def _boot(settings: list[str], timeout_s: float, tell: Callable[[str], None]) -> dict[str, Any]:
+def _packages() -> Path:
+    """Where this environment keeps its packages."""
+    return Path(sysconfig.get_path("purelib"))
+
+
+def _warm_up(python: str, path: str) -> None:
+    surroundings = {"PATH": os.defpath, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    try:
+        subprocess.run(
+            [python, "-c", WARM_UP], env=surroundings, cwd="/", capture_output=True, text=True, check=True,
+            timeout=WARM_UP_S,
+        )  # fmt: skip
+    except subprocess.SubprocessError as error:
+        said = getattr(error, "stderr", None) or str(error)
+        raise LabError(f"what is in the wheel does not run: {said.strip().splitlines()[-1]}") from error
+
+
+def _boot(init: Path, settings: list[str], timeout_s: float, tell: Callable[[str], None]) -> dict[str, Any]:
     said, far = os.pipe()
     log = os.memfd_create("kernel log")
     arguments = [
         f"mem={MEM_MB}M", "root=none", "rootfstype=hostfs", "rootflags=/", "rw",
         "con=null", "con0=null,fd:1", "ssl=null", f"con1=null,fd:{far}", "uml_dir=/proc/",
         "quiet", "panic=1", "noreboot", "initcall_blacklist=raid6_select_algo,calibrate_xor_blocks",
-        f"init={ROOT / 'hil' / 'service_lab' / 'init.sh'}", *settings,
+        f"init={init}", *settings,
     ]  # fmt: skip
     env = {"PATH": os.defpath}
     if shim.needed(Path("/proc/cpuinfo").read_text()):

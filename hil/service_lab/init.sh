@@ -1,7 +1,8 @@
 #!/bin/sh
 # First process of the guest: a throw-away overlay over the host's root, then systemd with nothing of the host enabled.
 # From the kernel's command line: LAB, a directory with check.service; ENVIRONMENT, the virtual environment whose packages
-# are used, which is shown at /opt/environment, outside every home directory; PYTHON, an interpreter.
+# are used, which is shown at /opt/environment, outside every home directory; PYTHON, an interpreter; CHECKOUT, if any, a
+# folder that is hidden.
 export PATH=/usr/sbin:/usr/bin:/sbin:/bin
 mount -t proc proc /proc
 modules=/usr/lib/uml/modules/$(uname -r)
@@ -17,7 +18,7 @@ units=$root/etc/systemd/system
 rm -rf "$units"/*.wants "$units"/*.requires
 mkdir -p "$units/multi-user.target.wants" "$root/opt/environment"
 for unit in getty.target getty@.service console-getty.service timers.target remote-fs.target dbus.socket dbus.service \
-    systemd-timesyncd.service systemd-udevd.service systemd-udev-trigger.service systemd-pstore.service \
+    systemd-timesyncd.service systemd-udev-trigger.service systemd-pstore.service \
     systemd-random-seed.service systemd-update-utmp.service systemd-logind.service e2scrub_reap.service \
     systemd-tmpfiles-setup.service systemd-tmpfiles-setup-dev.service systemd-binfmt.service systemd-sysusers.service; do
     ln -sf /dev/null "$units/$unit"
@@ -31,6 +32,7 @@ mkdir -p "$root/lib/modules"
 ln -sfn "$modules" "$root/lib/modules/$(uname -r)"
 echo vcan >"$root/etc/modules-load.d/vcan.conf"
 mount --bind "$root$ENVIRONMENT" "$root/opt/environment"
+[ ! "${CHECKOUT-}" ] || mount -t tmpfs -o mode=755 tmpfs "$root$CHECKOUT"
 umount /proc
 cd $root && mount -n --move . /
 exec chroot . /lib/systemd/systemd systemd.show_status=false

@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 from can_dbc import codec
 from can_dbc.bus import open_bus
 from can_dbc.frame import Frame
+from can_dbc.lost_link import LostLink
 from can_dbc.setpoint import (
     CraneSetpoint,
     DatagramRefused,
@@ -57,10 +58,11 @@ class Pilot:
             for j in JOINTS[: len(SPOOLS)]
         )
         self._hash = profile_hash(profile)
-        self._feedback, self._command, self._arm = (
-            codec.load("crane").message(name) for name in ("ValveFbA", "ValveCmdA", "ValveCmdB")
-        )
-        self._bus = open_bus(bus_address, filters=[m.key for m in (self._feedback, self._command, self._arm)])
+        self._feedback, self._command, self._arm, self._guard = messages = [
+            codec.load("crane").message(name) for name in ("ValveFbA", "ValveCmdA", "ValveCmdB", "GuardStat")
+        ]
+        self._bus = open_bus(bus_address, filters=[m.key for m in messages])
+        self._link_watch = LostLink(self._bus)
         self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._link.bind(("127.0.0.1", report_port))
         self._link.setblocking(False)
@@ -73,11 +75,13 @@ class Pilot:
         self.forget()
 
     def forget(self) -> None:
-        """Begin a new page.  ``farewell_ns`` is when the arm key was withdrawn, and in which mode."""
+        """Begin a new page.  ``farewell_ns`` is when the arm key was withdrawn, and in which mode; ``guarded_ns`` is
+        when the guard last said something.
+        """
         self.valves: list[Valve] = []
         self.modes: set[Mode] = set()
         self.commands = 0
-        self.armed_after_ns = self.farewell_ns = 0
+        self.armed_after_ns = self.farewell_ns = self.guarded_ns = 0
         self.mode_at_farewell = Mode.BOOT
         self.gaps: list[tuple[int, int]] = []
         self._looked_ns = time.monotonic_ns()
@@ -124,6 +128,7 @@ class Pilot:
         self._bus.drain(frames)
         for frame in frames:
             self._see(frame)
+        self._link_watch.watch(now_ns)
         while True:
             try:
                 message = decode(self._link.recv(2048))
@@ -145,6 +150,8 @@ class Pilot:
             self.valves.append(Valve(frame.stamp_ns, int(values["State"]), opening))
         elif frame.key == self._command.key:
             self.commands += 1
+        elif frame.key == self._guard.key:
+            self.guarded_ns = frame.stamp_ns
         elif self._arm.named(self._arm.decode(frame.data))["ArmKey"]:
             self.armed_after_ns, self.farewell_ns = frame.stamp_ns, 0
         elif not self.farewell_ns:

@@ -5,7 +5,8 @@ Three ways to the same result, chosen by ``choose.choose`` in this order:
 - ``existing``: the interfaces asked for are there and up; the command uses them as they are.
 - ``namespace``: the kernel has CAN and vcan; the interfaces are made in a network namespace of the lab's
   own, so two labs never meet and nothing is left behind.
-- ``uml``: Debian's user-mode Linux kernel runs as an ordinary process on the host's file system.
+- ``uml``: Debian's user-mode Linux kernel runs as an ordinary process on the host's file system, or, asked for, the
+  lab's own (``lab_kernel``), in real or in simulated time.
 
 Contract: the command's own exit status (128+N when signal N ended it), its stdout and stderr byte for byte
 and apart, an empty stdin, signals forwarded; nothing of the lab outlives it, whoever is killed, and it writes
@@ -23,6 +24,9 @@ Measured on Debian 12 with its 6.1 kernel, on a busy two-core virtual machine, a
   128 MB of guest memory carry numpy and pybullet.
 - Files: the host sees what is written inside within a second, all of it at the end.  Unix sockets work on the
   host's file system, so no private /tmp is needed; the runtime directory is the guest's own nevertheless.
+- Simulated time (the lab's own kernel) advances only when nothing can run.  Start, order and everything after come at
+  the same simulated instants in every run: the guest holds time while it waits for the host, output never waits, and
+  the clock on the wall begins at a fixed date.  An hour of sleep takes 0.2 s.
 - Inside, an ordinary user gets FIFO and locked memory; candump, cansend and UDP on 127.0.0.1 work.
 
 This package stays empty of imports: ``guest`` is loaded from it as the first process of a fresh kernel.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -16,6 +17,13 @@ from hil.vcan_lab.spec import DEFAULT_BOOT_TIMEOUT_S, DEFAULT_LINKS, DEFAULT_MEM
 
 CONTEXT = {"allow_interspersed_args": False}
 """The first word of the command ends the lab's own options, with or without ``--``."""
+
+
+class Kernel(StrEnum):
+    """A user-mode kernel by name."""
+
+    DEBIAN = "debian"
+    LAB = "lab"
 
 
 def vcan(
@@ -28,6 +36,12 @@ def vcan(
     ] = None,
     mem: Annotated[int, typer.Option(metavar="MB", min=128, help="Memory of the user-mode kernel.")] = DEFAULT_MEM_MB,
     root: Annotated[bool, typer.Option("--root", help="Be root inside (files stay the caller's).")] = False,
+    kernel: Annotated[
+        Kernel | None, typer.Option(help="Use this user-mode kernel, whatever else there is; lab: make lab-kernel.")
+    ] = None,
+    time_travel: Annotated[
+        bool, typer.Option("--time-travel", help="Simulated time, in the lab's own kernel: waiting takes no time.")
+    ] = False,
     boot_timeout: Annotated[
         float, typer.Option(metavar="S", min=0.001, help="Seconds until the interfaces must be there.")
     ] = DEFAULT_BOOT_TIMEOUT_S,
@@ -49,12 +63,16 @@ def vcan(
       timberhand hil vcan --timeout 120 -v -- python -m pytest tests/vcan
 
       timberhand hil vcan --link crane0 --link mach0 -- ip -brief link
+
+      timberhand hil vcan --time-travel -- sleep 3600
     """
     from hil.vcan_lab.choose import choose, survey
     from hil.vcan_lab.host import run
 
     if not command and not check:
         raise typer.BadParameter("no command: give one after --", param_hint="COMMAND")
+    if time_travel and kernel is Kernel.DEBIAN:
+        raise typer.BadParameter("Debian's kernel has no simulated time: leave --kernel away", param_hint="--kernel")
     for name in link or ():
         if fault := link_fault(name):
             raise typer.BadParameter(fault, param_hint="--link")
@@ -71,9 +89,11 @@ def vcan(
         mem_mb=mem,
         timeout_s=timeout,
         boot_timeout_s=boot_timeout,
+        kernel="lab" if time_travel else kernel and kernel.value,
+        time_travel=time_travel,
     )
     try:
-        way = choose(survey(request))
+        way = choose(survey(request), request.kernel)
         if check:
             found = {"way": way.kind, "why": way.why, "kernel": way.kernel, "links": request.links}
             typer.echo(json.dumps(found) if as_json else f"{way.kind}: {way.why}")

@@ -13,7 +13,7 @@ import sys
 from dataclasses import dataclass
 from typing import Literal
 
-from hil.vcan_lab import links
+from hil.vcan_lab import lab_kernel, links, shim
 from hil.vcan_lab.spec import PACKAGE_ROOT, LabError, Request
 from hil.vcan_lab.uml import KERNEL
 
@@ -33,6 +33,7 @@ class Machine:
     namespace_fault: str | None
     kernel: str | None
     architecture: str
+    lab_kernel: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +45,14 @@ class Way:
     kernel: str | None = None
 
 
-def choose(machine: Machine) -> Way:
-    """The first way that works: no kernel of its own before one, the machine's interfaces before new ones."""
-    if machine.can_fault is None:
+def choose(machine: Machine, kernel: str | None = None) -> Way:
+    """The first way that works: no kernel of its own before one, the machine's interfaces before new ones.
+
+    ``kernel``: as in `Request`; a kernel that is asked for is the only way.
+    """
+    if kernel is not None:
+        natively = f"the {kernel} kernel is asked for"
+    elif machine.can_fault is None:
         if machine.existing_fault is None:
             return Way("existing", "the interfaces are there and up")
         if machine.namespace_fault is None:
@@ -56,6 +62,10 @@ def choose(machine: Machine) -> Way:
         natively = f"this kernel has no AF_CAN ({machine.can_fault})"
     if machine.architecture != "x86_64":
         raise LabError(f"no vcan here: {natively}; user-mode Linux runs on x86_64 only, this is {machine.architecture}")
+    if kernel == "lab":
+        if machine.lab_kernel is None:
+            raise LabError(lab_kernel.MISSING)
+        return Way("uml", natively, machine.lab_kernel)
     if machine.kernel is None:
         raise LabError(f"no vcan here: {natively}; {KERNEL} is missing: apt-get install user-mode-linux")
     return Way("uml", natively, machine.kernel)
@@ -75,7 +85,8 @@ def survey(request: Request) -> Machine:
         existing_fault = "; ".join(faults) or None
         if existing_fault:
             namespace_fault = _namespace_fault(request)
-    return Machine(can_fault, existing_fault, namespace_fault, shutil.which(KERNEL), platform.machine())
+    own = lab_kernel.find(shim.user_cache())
+    return Machine(can_fault, existing_fault, namespace_fault, shutil.which(KERNEL), platform.machine(), own)
 
 
 def _namespace_fault(request: Request) -> str | None:

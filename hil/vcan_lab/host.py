@@ -1,7 +1,8 @@
 """Runs a command in the lab: starts the guest, carries streams and signals, watches the clocks.
 
 ``run`` returns the command's exit status, 128+N for signal N, 124 (as timeout(1)) when its time ran out.
-Failure: ``LabError`` when the guest does not come up or goes away.
+Failure: ``LabError`` when the guest does not come up or goes away.  A guest that is gone before the command was
+started is booted once more, and that is said: nothing has been done yet, so nothing is done twice.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from hil.vcan_lab.spec import PACKAGE_ROOT, RUN_GUEST, LabError, Request, order
 
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGUSR2)
 TIMED_OUT = 124
+BOOTS = 2
+"""A user-mode kernel very rarely (less than once in 400 boots) ends by itself before its first process speaks."""
 GRACE_S = 5.0
 """From SIGTERM to SIGKILL when the time is out, from there to the end of the guest, and from exit to halt."""
 
@@ -38,12 +41,18 @@ _NOISE = re.compile("umid|SELinux|mmapper_init|ubd device|^reboot:")
 
 def run(request: Request, way: Way, verbose: bool = False) -> int:
     """Run the command; returns when it and the guest have ended.  Main thread only: it handles signals."""
-    lab = Lab(request, way)
-    try:
-        lab.serve()
-        status = lab.status()
-    finally:
-        lab.end()
+    for boots_left in reversed(range(BOOTS)):
+        lab = Lab(request, way)
+        try:
+            lab.serve()
+            status = lab.status()
+            break
+        except LabError as reason:
+            if not boots_left or not lab.gone_while_booting:
+                raise
+            print(f"vcan lab: {reason}\nvcan lab: the command had not begun: booting once more", file=sys.stderr)
+        finally:
+            lab.end()
     if verbose:
         print(lab.summary(), file=sys.stderr)
     return status
@@ -141,6 +150,11 @@ class Lab:
         if status == -signal.SIGKILL and "Out of memory" in self._kernel_log():
             print(f"vcan lab: the guest's {self.request.mem_mb} MB were too little: --mem", file=sys.stderr)
         return status if status >= 0 else 128 - status
+
+    @property
+    def gone_while_booting(self) -> bool:
+        """The guest ended by itself, with no reason given, before the command was started."""
+        return not self.report.keys() & {"started", "error"}
 
     def end(self) -> None:
         """Kill what is left, wait for it, give back descriptors and signal handlers."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 DEFAULT_LINKS: Final = ("vcan0", "vcan1")
 DEFAULT_MEM_MB: Final = 1024
@@ -18,6 +18,9 @@ PACKAGE_ROOT: Final = str(Path(__file__).resolve().parents[2])
 GUEST_RUNTIME_DIR: Final = "/dev/runtime"
 RUN_GUEST: Final = "import sys; sys.path.append(sys.argv[1]); from hil.vcan_lab.guest import main; main(sys.argv[2:])"
 """Loads the guest without site packages: ``python -ISB -c RUN_GUEST <folder of hil> [descriptors]``."""
+
+VIRTUAL_START_NS: Final = 1_767_225_600_000_000_000
+"""What the clock on the wall shows at the start of simulated time, 2026-01-01: two runs are the same to the stamp."""
 
 _CON_OUT, _CON_ERR, _CON_CONTROL = 1, 2, 3
 _IFNAMSIZ = 15
@@ -29,7 +32,11 @@ class LabError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A command and the surroundings it asks for; ``uid``, ``gid``, ``groups`` are the caller's."""
+    """A command and the surroundings it asks for; ``uid``, ``gid``, ``groups`` are the caller's.
+
+    ``kernel``: a user-mode kernel that is asked for by name, Debian's or the lab's own; None takes the first way.
+    ``time_travel``: simulated time, which only the lab's own kernel has.
+    """
 
     argv: tuple[str, ...]
     cwd: str
@@ -43,6 +50,8 @@ class Request:
     mem_mb: int = DEFAULT_MEM_MB
     timeout_s: float | None = None
     boot_timeout_s: float = DEFAULT_BOOT_TIMEOUT_S
+    kernel: Literal["debian", "lab"] | None = None
+    time_travel: bool = False
 
 
 def link_fault(name: str) -> str | None:
@@ -83,6 +92,7 @@ def kernel_arguments(
     No console and no file of the kernel's own: ``uml_dir`` is a place where none can be made.  The two
     blacklisted initcalls only time RAID algorithms and are two thirds of the boot.
     """
+    travel = ["time-travel=inf-cpu", f"time-travel-start={VIRTUAL_START_NS}"] if request.time_travel else []
     return [
         f"mem={request.mem_mb}M",
         "root=none", "rootfstype=hostfs", "rootflags=/", "rw",
@@ -90,6 +100,7 @@ def kernel_arguments(
         f"con{_CON_OUT}=null,fd:{out_fd}", f"con{_CON_ERR}=null,fd:{err_fd}", f"con{_CON_CONTROL}=fd:{control_fd}",
         "uml_dir=/proc/", "quiet", "panic=1", "noreboot",
         "initcall_blacklist=raid6_select_algo,calibrate_xor_blocks",
+        *travel,
         f"init={_quoted(python)}",
         "--", "-ISB", "-c", _quoted(RUN_GUEST), _quoted(package_root),
     ]  # fmt: skip

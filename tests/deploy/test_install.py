@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+
+from hil.service_lab.host import build_wheel
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 INSTALL = DEPLOY / "install.sh"
@@ -25,7 +28,7 @@ def install(*words: object, python: str = sys.executable) -> subprocess.Complete
 
 @pytest.fixture
 def wheel(tmp_path: Path) -> Path:
-    """A wheel with one module and what the real one says of itself."""
+    """A wheel with one module, what the real one says of itself, and what it lays out."""
     path = tmp_path / "timberhand-0.1.0-py3-none-any.whl"
     info = "timberhand-0.1.0.dist-info"
     with zipfile.ZipFile(path, "w") as archive:
@@ -34,6 +37,9 @@ def wheel(tmp_path: Path) -> Path:
         archive.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
         archive.writestr(f"{info}/entry_points.txt", "[console_scripts]\ntimberhand = controller.__main__:main\n")
         archive.writestr(f"{info}/RECORD", "")
+        for file in DEPLOY.rglob("*"):
+            if file.is_file() and "__pycache__" not in file.parts:
+                archive.write(file, Path("deploy", file.relative_to(DEPLOY)))
     return path
 
 
@@ -45,12 +51,16 @@ def files(root: Path) -> set[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)
 @pytest.mark.skipif(shutil.which("systemctl") is None, reason="systemctl is missing (apt-get install systemd)")
 def test_install_twice_change_settings_and_remove(tmp_path: Path, wheel: Path) -> None:
     root = tmp_path / "root"
     root.mkdir()
     words = ("--root", root, "--wheel", wheel, "--from-environment", sys.prefix)
-    first = install(*words)
+    from_wheel = ("--root", root, "--from-environment", sys.prefix, "--python", sys.executable)
+    first = subprocess.run(  # with nothing but the wheel
+        [sys.executable, wheel / "deploy", *from_wheel], capture_output=True, text=True, check=False, cwd="/"
+    )
     assert first.returncode == 0, first.stderr
     assert "nothing runs yet and nothing is armed" in first.stderr
     units = [unit.name for unit in (DEPLOY / "units").iterdir()]
@@ -59,6 +69,7 @@ def test_install_twice_change_settings_and_remove(tmp_path: Path, wheel: Path) -
     wants = {unit for unit in units if unit.endswith(".service") and "@" not in unit}
     assert {f"etc/systemd/system/timberhand.target.wants/{unit}" for unit in wants} <= there
     assert "etc/systemd/system/multi-user.target.wants/timberhand.target" in there
+    assert os.readlink(root / "usr/local/bin/timberhand") == "/opt/timberhand/bin/timberhand"
     program = root / "opt/timberhand/bin/python"
     said = subprocess.run([program, "-P", "-m", "controller"], cwd="/", capture_output=True, text=True, check=True)
     assert said.stdout == "here\n"
@@ -66,6 +77,15 @@ def test_install_twice_change_settings_and_remove(tmp_path: Path, wheel: Path) -
 
     again = install(*words)
     assert again.returncode == 0, again.stderr
+    assert files(root) == there
+
+    units_of = root / "usr/lib/systemd/system"
+    (units_of / units[0]).unlink()
+    mended = subprocess.run(  # by the installed program itself, which keeps the packages that it was given
+        [program, "-P", "-m", "deploy", *from_wheel[:2], "--python", sys.executable, "--find-links", root],
+        capture_output=True, text=True, check=False, cwd="/",
+    )  # fmt: skip
+    assert mended.returncode == 0, mended.stderr
     assert files(root) == there
 
     conf = root / "etc/timberhand/timberhand.conf"
@@ -113,6 +133,25 @@ def test_every_mistake_is_one_sentence(words: list[str], status: int, sentence: 
     done = install(*words)
     assert (done.returncode, done.stdout) == (status, "")
     assert sentence in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_an_unpacked_wheel_cannot_be_built_from(tmp_path: Path) -> None:
+    shutil.copytree(DEPLOY, tmp_path / "deploy", ignore=shutil.ignore_patterns("__pycache__"))
+    script = tmp_path / "deploy/install.sh"
+    done = subprocess.run(["sh", script, "--dry-run"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "name a wheel with --wheel FILE" in done.stderr and done.stderr.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_the_real_wheel_carries_all_that_is_laid_out(tmp_path: Path) -> None:
+    wheel = build_wheel(tmp_path)
+    shipped = set(zipfile.ZipFile(wheel).namelist())
+    wanted = [file for name in ("units", "system") for file in (DEPLOY / name).iterdir()]
+    wanted += [DEPLOY / name for name in ("install.sh", "timberhand.conf", "constraints.txt", "__main__.py")]
+    assert {str(Path("deploy", file.relative_to(DEPLOY))) for file in wanted} <= shipped
+    done = subprocess.run([sys.executable, wheel / "deploy", "--help"], capture_output=True, text=True, check=True)
+    assert "timberhand-VERSION.whl/deploy" in done.stdout
 
 
 def test_a_python_in_a_home_directory_is_refused(tmp_path: Path) -> None:

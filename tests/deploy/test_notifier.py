@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import os
 import socket
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
 
-from can_dbc.bus import BusState, BusStats
-from can_dbc.frame import Frame
+from can_dbc.bus import BusState
 from controller.config import load
 from controller.guard.__main__ import build, profile_path
 from controller.guard.__main__ import run as run_guard
 from controller.loop import Loop
 from controller.realtime import Notifier
+from controller.rehearsal import NowhereBus, rehearse
 from controller.step import Controller
+from controller.timing import LoopTiming
+from machine.modes import Mode
 
 MS = 1_000_000
 T = 5 * MS
@@ -53,27 +56,18 @@ def systemd(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
     made.socket.close()
 
 
-class SilentBus:
-    """A bus that takes everything and brings nothing."""
+class SilentBus(NowhereBus):
+    """Keeps what it is given and brings nothing."""
 
     def __init__(self) -> None:
-        self.name, self.stats = "memory", BusStats()
+        super().__init__("memory")
         self.sent: list[tuple[int, bytes]] = []
         self.at_send: Callable[[], None] = lambda: None
 
-    def fileno(self) -> int:
-        return -1
-
-    def drain(self, frames: list[Frame]) -> int:
-        return 0
-
-    def send(self, key: int, data: bytes) -> bool:
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
         self.at_send()
-        self.sent.append((key, data))
-        return True
-
-    def close(self) -> None:
-        pass
+        self.sent += frames
+        return len(frames)
 
 
 @pytest.fixture
@@ -82,7 +76,11 @@ def loop() -> Iterator[Loop]:
     port.bind(("127.0.0.1", 0))
     port.setblocking(False)
     settings = load("palms_471")
-    made = Loop(Controller(settings), SilentBus(), port, [], None, settings.period_ns, clock_ns=lambda: START)
+    controller = Controller(settings)
+    made = Loop(
+        controller, [SilentBus()], port, [], None, LoopTiming(controller, clock_ns=lambda: START),
+        settings.period_ns, settings.sync_lead_ns, clock_ns=lambda: START,
+    )  # fmt: skip
     yield made
     made.close()
 
@@ -146,27 +144,46 @@ def test_the_loop_is_ready_with_its_first_tick_and_says_why_it_stands(systemd: S
     assert first["READY"] == "1" and first["WATCHDOG"] == "1"
     mode, sentence, *_ = first["STATUS"].split(". ")
     assert (mode, sentence) == ("BOOT", "Node 2 does not answer on the bus")
-    assert first["STATUS"].endswith("Missed ticks: 0 of 0.")
+    assert first["STATUS"].endswith("Missed ticks: 0 of 1.")
 
 
-@pytest.mark.parametrize("why", ["late", "long", "down"])
+@pytest.mark.parametrize("why", ["late", "long"])
 def test_a_tick_that_is_not_good_is_not_alive(systemd: Systemd, loop: Loop, why: str) -> None:
     now_ns = START
     if why == "long":
-        times = iter(range(START, START + 400 * T, T))
-        loop._clock_ns = lambda: next(times)
-    if why == "down":
-        loop.bus.stats.state = BusState.DOWN
+        loop.timing._clock_ns = itertools.count(START, T).__next__
     for _ in range(30):
         now_ns += T
         loop.tick(now_ns, T if why == "late" else 0)
     assert systemd.heard() == []
 
 
+def test_a_controller_without_a_bus_is_alive_and_says_so(systemd: Systemd, loop: Loop) -> None:
+    (bus,) = loop.buses
+    bus.stats.state = BusState.DOWN
+    loop.controller.supervisor.mode = Mode.ARMED
+    heard: list[dict[str, str]] = []
+    for tick in range(500):
+        loop.tick(START + tick * T, 0)
+        heard += systemd.heard()
+    assert len(heard) == 25 and all(h["WATCHDOG"] == "1" for h in heard)
+    status = [h["STATUS"] for h in heard if "STATUS" in h][-1]
+    assert status.startswith("FAULT. ") and "memory is DOWN. " in status
+
+
+def test_a_rehearsal_is_nobodys_business(systemd: Systemd) -> None:
+    """Systemd would take its farewell for the end of the service."""
+    settings = load("palms_471")
+    rehearse(settings, Controller(settings))
+    assert systemd.heard() == []
+    assert Notifier(lambda: "well")._socket is not None, "and the controller itself still speaks"
+
+
 def test_neutral_first_and_then_stopping(systemd: Systemd, loop: Loop) -> None:
     loop.tick(START, 0)
     systemd.heard()
-    loop.bus.at_send = lambda: said.extend(systemd.heard())
+    (bus,) = loop.buses
+    bus.at_send = lambda: said.extend(systemd.heard())
     said: list[dict[str, str]] = []
     loop.leave()
     assert said == [], "nothing is said before the last frame"
@@ -182,7 +199,7 @@ def test_ten_seconds_of_ticks_leaves_no_garbage(systemd: Systemd, loop: Loop) ->
         for _ in range(count):
             now_ns += T
             loop.tick(now_ns, 0)
-            loop.bus.sent.clear()
+            loop.buses[0].sent.clear()
             systemd.heard()
 
     tracemalloc.start()
@@ -201,15 +218,12 @@ def test_ten_seconds_of_ticks_leaves_no_garbage(systemd: Systemd, loop: Loop) ->
 
 
 @pytest.mark.parametrize("state", [BusState.ACTIVE, BusState.DOWN])
-def test_the_guard_is_ready_on_a_bus_that_works(systemd: Systemd, state: BusState) -> None:
+def test_the_guard_lives_with_a_bus_and_without_one(systemd: Systemd, state: BusState) -> None:
     guard, bus = build(profile_path("palms_471")), SilentBus()
     bus.stats.state = state
     ended: list[int] = []
     bus.at_send = lambda: ended.append(15) if len(bus.sent) == 10 else None
-    assert run_guard(guard, bus, ended, Notifier(lambda: guard.verdict.name))
+    run_guard(guard, bus, ended, Notifier(lambda: f"{guard.verdict.name} {bus.stats.state.name}"))
     *others, last = systemd.heard()
     assert last == {"STOPPING": "1", "STATUS": "Ending."}
-    if state is BusState.ACTIVE:
-        assert others[0] == {"READY": "1", "WATCHDOG": "1", "STATUS": "ESTOP"}
-    else:
-        assert others == []
+    assert others[0] == {"READY": "1", "WATCHDOG": "1", "STATUS": f"ESTOP {state.name}"}

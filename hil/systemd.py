@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 
@@ -14,8 +15,13 @@ def systemctl(*words: str) -> subprocess.CompletedProcess[str]:
 
 def show(unit: str, *names: str) -> dict[str, str]:
     """Properties of a unit."""
-    lines = systemctl("show", unit, "--property", ",".join(names)).stdout.splitlines()
-    return dict(line.partition("=")[::2] for line in lines)
+    return next(iter(show_all([unit], *names)), {})
+
+
+def show_all(units: Sequence[str], *names: str) -> list[dict[str, str]]:
+    """Properties of several units, in their order."""
+    blocks = systemctl("show", *units, "--property", ",".join(names)).stdout.split("\n\n")
+    return [dict(line.partition("=")[::2] for line in block.splitlines()) for block in blocks if block.strip()]
 
 
 def main_pid(unit: str) -> int:
@@ -30,12 +36,19 @@ def journal(unit: str) -> list[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.splitlines()
 
 
+def last_words(unit: str) -> str:
+    """The last line that a process of the unit has said; empty where this user may not read it."""
+    command = ["journalctl", "--no-pager", "--quiet", "--output", "cat", "--lines", "1", f"_SYSTEMD_UNIT={unit}"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+
 def process_facts(pid: int) -> dict[str, object]:
     """How a live process is scheduled, what it may, and how much of its memory is locked."""
     status = dict(line.partition(":\t")[::2] for line in Path(f"/proc/{pid}/status").read_text().splitlines())
     return {
         "policy": {os.SCHED_OTHER: "other", os.SCHED_FIFO: "fifo"}.get(os.sched_getscheduler(pid), "another"),
         "priority": os.sched_getparam(pid).sched_priority,
+        "processors": sorted(os.sched_getaffinity(pid)),
         "locked_kb": int(status["VmLck"].split()[0]),
         "user": int(status["Uid"].split()[1]),
         "capabilities": int(status["CapEff"], 16),

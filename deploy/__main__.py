@@ -1,0 +1,32 @@
+"""``python3.11 timberhand-VERSION.whl/deploy [options]``: `install.sh`, for whoever has nothing but the wheel.
+
+Needs Python alone, and nothing unpacked or installed before.  ``python3.11 -m deploy`` does the same with a checkout or
+an installed wheel.  The options, and the exit status, are the script's.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+HERE: Final = Path(__file__).resolve().parent
+SCRIPT: Final = "install.sh"
+
+
+def install(options: Sequence[str]) -> int:
+    """Run the script; inside a wheel it installs that wheel unless ``options`` name another one."""
+    wheel = next((folder for folder in HERE.parents if folder.is_file()), None)
+    if wheel is None:
+        return subprocess.call(["sh", str(HERE / SCRIPT), *options])
+    with tempfile.TemporaryDirectory(prefix="timberhand-") as folder, zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder, [name for name in archive.namelist() if name.startswith("deploy/")])
+        return subprocess.call(["sh", f"{folder}/deploy/{SCRIPT}", "--wheel", str(wheel), *options])
+
+
+if __name__ == "__main__":
+    sys.exit(install(sys.argv[1:]))

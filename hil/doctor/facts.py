@@ -1,0 +1,272 @@
+"""What a Linux computer says of itself that matters to a loop with deadlines: read once, from /proc, /sys and ip(8).
+
+``read(root, links)`` looks below any root, so a made-up tree does as well.  What is missing or may not be read is
+unknown (None, empty), never an error: an old kernel or a container has less.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+UNLIMITED: Final = -1
+"""A limit that is none."""
+_POLICIES: Final = {0: "OTHER", 1: "FIFO", 2: "RR"}
+_CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
+_UNIT: Final = "timberhand-controller.service"
+_UNIT_FOLDERS: Final = ("etc/systemd/system", "usr/lib/systemd/system")
+_CONF: Final = "etc/timberhand/timberhand.conf"
+
+
+@dataclass(frozen=True, slots=True)
+class IdleState:
+    """A state of a processor that has nothing to do: how long it takes to come back."""
+
+    name: str
+    latency_us: int
+    disabled: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CanLink:
+    """A CAN interface; a virtual one has no bit rate, no error counters and no interrupts.
+
+    ``counters``: restarts, bus_error, error_warning, error_passive, bus_off, tx and rx (the controller's own two).
+    """
+
+    name: str
+    virtual: bool
+    up: bool
+    state: str
+    bitrate: int
+    restart_ms: int
+    tx_queue: int
+    counters: dict[str, int]
+    interrupts: tuple[int, ...]
+    interrupt_cpus: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Everything of one computer.
+
+    ``control_cpu``: the processor that the controller is to run on, None when it may run on any; ``siblings`` and
+    ``idle`` are that processor's, or the first one's.  ``options``: the controller's further words in the settings.
+    ``may_prioritise``, ``may_lock``: this process has the capability, whatever the limits.
+    """
+
+    release: str
+    preemption: str
+    machine: str
+    online: frozenset[int]
+    control_cpu: int | None
+    siblings: frozenset[int]
+    isolated: frozenset[int]
+    tickless: frozenset[int]
+    rcu_offloaded: frozenset[int]
+    governors: dict[int, str]
+    idle: tuple[IdleState, ...]
+    dma_latency: bool
+    clock_source: str
+    rt_runtime_us: int | None
+    rt_period_us: int
+    rtprio_limit: int | None
+    memlock_limit: int | None
+    unit_rtprio: int | None
+    unit_memlock: int | None
+    unit_there: bool
+    may_prioritise: bool
+    may_lock: bool
+    options: str
+    swap: bool
+    hugepages: str
+    irqbalance: bool
+    irqbalance_banned: frozenset[int]
+    softirq_threads: dict[int, str]
+    slack_ns: int | None
+    links: tuple[CanLink, ...]
+
+
+def read(root: Path, links: str = "[]", control_cpu: int | None = None) -> Facts:
+    """Everything below ``root``; ``links``: what ``ip -details -statistics -json link`` says."""
+    cmdline = _text(root / "proc/cmdline")
+    cpus = root / "sys/devices/system/cpu"
+    unit = next((text for folder in _UNIT_FOLDERS if (text := _text(root / folder / _UNIT))), "")
+    options = _setting(_text(root / _CONF), "CONTROLLER_OPTIONS")
+    if control_cpu is None and (found := re.search(r"--cpu[ =](\d+)", options)):
+        control_cpu = int(found[1])
+    ours = cpus / f"cpu{control_cpu or 0}"
+    limits = _text(root / "proc/self/limits")
+    daemons, softirq = _processes(root / "proc")
+    banned = re.search(r"^IRQBALANCE_BANNED_CPULIST=\"?([\d,-]+)", _text(root / "etc/default/irqbalance"), re.MULTILINE)
+    return Facts(
+        release=_text(root / "proc/sys/kernel/osrelease"),
+        preemption=_preemption(root),
+        machine=_machine(root),
+        online=cpu_set(_text(cpus / "online")),
+        control_cpu=control_cpu,
+        siblings=cpu_set(_text(ours / "topology/thread_siblings_list")),
+        isolated=cpu_set(_text(cpus / "isolated")),
+        tickless=cpu_set(_text(cpus / "nohz_full")) or cpu_set(_word(cmdline, "nohz_full")),
+        rcu_offloaded=cpu_set(_word(cmdline, "rcu_nocbs")) | cpu_set(_text(cpus / "nohz_full")),
+        governors={int(p.parts[-3][3:]): _text(p) for p in sorted(cpus.glob("cpu[0-9]*/cpufreq/scaling_governor"))},
+        idle=tuple(_idle_state(p) for p in sorted((ours / "cpuidle").glob("state[0-9]*"))),
+        dma_latency=os.access(root / "dev/cpu_dma_latency", os.W_OK),
+        clock_source=_text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource"),
+        rt_runtime_us=_number(_text(root / "proc/sys/kernel/sched_rt_runtime_us")),
+        rt_period_us=_number(_text(root / "proc/sys/kernel/sched_rt_period_us")) or 1_000_000,
+        rtprio_limit=_limit(limits, "Max realtime priority"),
+        memlock_limit=_limit(limits, "Max locked memory"),
+        unit_rtprio=_number(_setting(unit, "LimitRTPRIO")),
+        unit_memlock=_number(_setting(unit, "LimitMEMLOCK")),
+        unit_there=bool(unit),
+        may_prioritise=_capable(root, _CAP_SYS_NICE),
+        may_lock=_capable(root, _CAP_IPC_LOCK),
+        options=options,
+        swap=len(_text(root / "proc/swaps").splitlines()) > 1,
+        hugepages=_chosen(_text(root / "sys/kernel/mm/transparent_hugepage/enabled")),
+        irqbalance="irqbalance" in daemons,
+        irqbalance_banned=cpu_set(banned[1]) if banned else frozenset(),
+        softirq_threads=softirq,
+        slack_ns=_number(_text(root / "proc/self/timerslack_ns")),
+        links=tuple(can_links(root, links)),
+    )
+
+
+def cpu_set(text: str) -> frozenset[int]:
+    """``0-2,5`` as numbers; words as in ``isolcpus=managed_irq,domain,3`` are passed over."""
+    found: set[int] = set()
+    for part in text.strip().split(","):
+        if match := re.fullmatch(r"(\d+)(?:-(\d+))?", part):
+            found.update(range(int(match[1]), int(match[2] or match[1]) + 1))
+    return frozenset(found)
+
+
+def can_links(root: Path, links: str) -> Iterable[CanLink]:
+    """The CAN interfaces in the answer of ip(8)."""
+    for link in json.loads(links or "[]"):
+        if link.get("link_type") != "can":
+            continue
+        info: dict[str, Any] = link.get("linkinfo", {})
+        data: dict[str, Any] = info.get("info_data", {})
+        name = str(link["ifname"])
+        interrupts = _interrupts(root, name)
+        cpus = [cpu_set(_text(root / f"proc/irq/{n}/smp_affinity_list")) for n in interrupts]
+        yield CanLink(
+            name=name,
+            virtual=info.get("info_kind") in ("vcan", "vxcan"),
+            up="UP" in link.get("flags", ()),
+            state=str(data.get("state", "")),
+            bitrate=int(data.get("bittiming", {}).get("bitrate", 0)),
+            restart_ms=int(data.get("restart_ms", 0)),
+            tx_queue=int(link.get("txqlen", 0)),
+            counters={k: int(v) for k, v in {**info.get("info_xstats", {}), **data.get("berr_counter", {})}.items()},
+            interrupts=interrupts,
+            interrupt_cpus=frozenset().union(*cpus),
+        )
+
+
+def _interrupts(root: Path, name: str) -> tuple[int, ...]:
+    """Of the device behind an interface, or of the nearest one above it that has any: a USB adapter's host."""
+    device = (root / "sys/class/net" / name / "device").resolve()
+    for place in (device, *device.parents):
+        if place == root.resolve():
+            break
+        several = sorted(int(p.name) for p in (place / "msi_irqs").glob("[0-9]*"))
+        if several:
+            return tuple(several)
+        if number := _number(_text(place / "irq")):
+            return (number,)
+    return ()
+
+
+def _preemption(root: Path) -> str:
+    """rt, full, lazy, voluntary, none; empty when the kernel does not say."""
+    version = _text(root / "proc/version")
+    if _text(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
+        return "rt"
+    chosen = re.search(r"\((\w+)\)", _text(root / "sys/kernel/debug/sched/preempt"))  # root alone may look
+    if chosen:
+        return chosen[1]
+    if "PREEMPT_DYNAMIC" in version:
+        word = _word(_text(root / "proc/cmdline"), "preempt")
+        return word or "dynamic"
+    return "full" if " PREEMPT " in version else ""
+
+
+def _machine(root: Path) -> str:
+    """ "" for real hardware, else what runs it."""
+    cpuinfo = _text(root / "proc/cpuinfo")
+    if "User Mode Linux" in cpuinfo:
+        return "user-mode Linux"
+    flags = re.search(r"^flags\s*:(.*)$", cpuinfo, re.MULTILINE)
+    if flags and "hypervisor" in flags[1].split():
+        return "a virtual machine"
+    if (root / ".dockerenv").exists() or (root / "run/systemd/container").exists():
+        return "a container"
+    return ""
+
+
+def _processes(proc: Path) -> tuple[set[str], dict[int, str]]:
+    """Names of all processes, and the scheduling of the threads that deliver deferred interrupts, by processor."""
+    names: set[str] = set()
+    softirq: dict[int, str] = {}
+    for stat in proc.glob("[0-9]*/stat"):
+        text = _text(stat)
+        name, _, rest = text.partition("(")[2].rpartition(")")
+        names.add(name)
+        if name.startswith("ksoftirqd/"):
+            fields = rest.split()
+            priority, policy = fields[37], _POLICIES.get(int(fields[38]), fields[38])
+            softirq[int(name[10:])] = policy if policy == "OTHER" else f"{policy} {priority}"
+    return names, softirq
+
+
+def _idle_state(place: Path) -> IdleState:
+    latency = _number(_text(place / "latency")) or 0
+    return IdleState(_text(place / "name"), latency, _text(place / "disable") == "1")
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace").strip("\0\n ")
+    except OSError:
+        return ""
+
+
+def _number(text: str) -> int | None:
+    if text in ("infinity", "unlimited"):
+        return UNLIMITED
+    return int(text) if re.fullmatch(r"-?\d+", text) else None
+
+
+def _limit(limits: str, name: str) -> int | None:
+    """The hard limit: a process may raise its soft one up to it."""
+    found = re.search(rf"^{name}\s+\S+\s+(\S+)", limits, re.MULTILINE)
+    return _number(found[1]) if found else None
+
+
+def _setting(unit: str, name: str) -> str:
+    found = re.search(rf"^{name}=(.*)$", unit, re.MULTILINE)
+    return found[1].strip() if found else ""
+
+
+def _capable(root: Path, bit: int) -> bool:
+    found = re.search(r"^CapEff:\s*([0-9a-f]+)", _text(root / "proc/self/status"), re.MULTILINE)
+    return found is not None and bool(int(found[1], 16) >> bit & 1)
+
+
+def _word(cmdline: str, name: str) -> str:
+    found = re.search(rf"(?:^|\s){name}=(\S+)", cmdline)
+    return found[1] if found else ""
+
+
+def _chosen(text: str) -> str:
+    """The word in brackets."""
+    found = re.search(r"\[(\w+)\]", text)
+    return found[1] if found else ""

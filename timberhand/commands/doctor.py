@@ -1,0 +1,55 @@
+"""``timberhand doctor``: is this installation sane, and is this computer ready for a hard-timed loop?"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def doctor(
+    rt: Annotated[bool, typer.Option("--rt", help="Look at the computer's timing too, and say what to tune.")] = False,
+    cpu: Annotated[
+        int | None,
+        typer.Option(min=0, metavar="N", help="Judge processor N as the controller's (default: from the settings)."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON instead of words.")] = False,
+) -> None:
+    """Examine this installation and, with --rt, this computer's timing; say what to change, the greatest gain first.
+
+    Changes nothing.  Exit status 3 only when something prevents every run.
+
+    [bold]Examples[/bold]
+
+      timberhand doctor
+
+      timberhand doctor --rt --cpu 3
+    """
+    import shutil
+    import subprocess
+
+    from rich.console import Console
+
+    from hil.doctor import facts, installation, timing
+    from hil.doctor.finding import Severity
+    from hil.doctor.show import show, verdict
+    from hil.exits import Exit
+
+    groups = {"installation": installation.examine()}
+    if rt:
+        links = "[]"
+        if ip := shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin"):
+            told = subprocess.run([ip, "-details", "-statistics", "-json", "link"], capture_output=True, text=True)
+            links = told.stdout or links
+        groups["timing"] = timing.judge(facts.read(Path("/"), links, cpu))
+    every = [finding for group in groups.values() for finding in group]
+    if as_json:
+        print(json.dumps({name: [f.document() for f in group] for name, group in groups.items()}, indent=2))
+    else:
+        console = Console(highlight=False)
+        for name, group in groups.items():
+            show(console, f"timberhand {name}", group)
+        console.print(verdict(every))
+    raise typer.Exit(Exit.CONFIGURATION if any(f.severity is Severity.FAULT for f in every) else Exit.FINE)

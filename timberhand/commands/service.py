@@ -1,0 +1,120 @@
+"""``timberhand service``: the processes as services of this computer."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="The processes as services of this computer: install, look, remove.")
+PERIOD_S = 1.0
+
+Root = Annotated[Path | None, typer.Option(help="Lay everything out in the tree DIR instead.", metavar="DIR")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would be done, and do nothing.")]
+
+
+@app.command(epilog="Examples:  sudo timberhand service install --wheel timberhand-0.1.0-py3-none-any.whl  ·  "
+             "timberhand service install --dry-run")  # fmt: skip
+def install(
+    wheel: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="What is installed; default: built from this checkout.")
+    ] = None,
+    find_links: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Take every package from there, without a network.")
+    ] = None,
+    from_environment: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Use the packages of this virtual environment.")
+    ] = None,
+    python: Annotated[str | None, typer.Option(metavar="PROGRAM", help="Python to run with, 3.11 or newer.")] = None,
+    root: Root = None,
+    dry_run: DryRun = False,
+) -> None:
+    """Install program, units, users and settings; run it again to mend or update.  Nothing is started or armed.
+
+    Started by the installed program itself, it mends everything around it.  With nothing but the wheel:
+    sudo python3.11 timberhand-VERSION.whl/deploy
+    """
+    options = {
+        "--wheel": wheel, "--find-links": find_links, "--from-environment": from_environment, "--python": python,
+        "--root": root,
+    }  # fmt: skip
+    _script([word for name, value in options.items() if value is not None for word in (name, str(value))], dry_run)
+
+
+@app.command()
+def uninstall(root: Root = None, dry_run: DryRun = False) -> None:
+    """Remove what was installed; recordings, users and changed settings stay."""
+    _script(["--uninstall", *(["--root", str(root)] if root else [])], dry_run)
+
+
+@app.command(epilog="Examples:  timberhand service status  ·  timberhand service status --watch  ·  "
+             "timberhand service status --json | jq .timing.durations.wake")  # fmt: skip
+def status(
+    watch: Annotated[bool, typer.Option("--watch", help="Once a second, until Ctrl-C.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON document on stdout (with --watch one a line).")
+    ] = False,
+    timing: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The controller's timing page; default: the service's.")
+    ] = None,
+) -> None:
+    """How every service is, and how punctual the controller: ticks, wake-ups, ages of inputs, buses, memory.
+
+    p50, p99 and p99.9 are quantiles since the controller's start; with --watch also those of the last second.  Works
+    without systemd too, for a controller that was started by hand.
+    """
+    import json
+
+    from hil.exits import Exit, Stopped
+    from timberhand.services import look
+
+    if watch:
+        _watch(timing, as_json)
+        return
+    found = look(timing)
+    if as_json:
+        print(json.dumps(found.named()))
+    elif found.units or found.timing:
+        from rich.console import Console
+
+        from timberhand.services_view import screen
+
+        Console(highlight=False).print(screen(found))
+    else:
+        raise Stopped(Exit.CONFIGURATION, " ".join(found.notes))
+
+
+def _watch(page: Path | None, as_json: bool) -> None:
+    import json
+
+    from hil.exits import Exit
+    from timberhand.services import look
+
+    before = None
+    try:
+        if as_json:
+            while True:
+                print(json.dumps(look(page).named()), flush=True)
+                time.sleep(PERIOD_S)
+        from rich.console import Console
+        from rich.live import Live
+
+        from timberhand.services_view import screen
+
+        console = Console(highlight=False)
+        with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
+            while True:
+                found = look(page)
+                live.update(screen(found, before), refresh=True)
+                before = found.timing or before
+                time.sleep(PERIOD_S)
+    except KeyboardInterrupt:
+        raise typer.Exit(Exit.INTERRUPTED) from None
+
+
+def _script(options: list[str], dry_run: bool) -> Any:
+    from deploy.__main__ import install as run
+
+    raise typer.Exit(run([*options, *(["--dry-run"] if dry_run else [])]))
