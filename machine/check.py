@@ -14,16 +14,19 @@ from typing import Final
 
 from machine.bounds import ANGLE, TURN_RAD, Bounds, bounded, out_of_range
 from machine.carrier import wheel_gap_m
-from machine.joints import Joint
+from machine.joints import N_JOINTS, Joint
 from machine.kinematics import max_reach_m
 from machine.profile import (
     Camera,
     Carrier,
     CarrierValve,
     Encoder,
+    Imu,
     JointSpec,
     Profile,
+    Sag,
     Valve,
+    encoders,
     joint,
 )
 
@@ -37,6 +40,9 @@ ANTENNAS_APART_M: Final = 0.3
 ARM_STEEPEST: Final = 0.9
 """Greatest drop of a wheel hub over the length of its arm: a steeper arm hardly lifts."""
 
+LEAN_BOUND_RAD: Final = 0.06
+"""Greatest lean of an empty crane: over half a metre of sag at full reach."""
+
 _ENCODER_MESSAGES: Final = {
     "EncSlew": "rotary",
     "EncLift": "rotary",
@@ -45,6 +51,8 @@ _ENCODER_MESSAGES: Final = {
     "EncRot": "rotary",
 }
 _STEERING_MESSAGE: Final = "EncArtic"
+_STEERING_ENCODER: Final = "carrier.articulation_encoder"
+IMU_MESSAGE: Final = "GrappleImu"
 _CRANE_LINKS: Final = ("base", "mast", "boom", "stick", "telescope")
 _CARRIER_LINKS: Final = ("front", "rear")
 _VALVE_SIGNALS: Final = ("Slew", "Lift", "Tilt", "Ext", "Rot")
@@ -62,6 +70,10 @@ def problems_of(profile: Profile) -> list[str]:
         problems += _camera_problems(name, camera, profile.carrier is not None)
     if profile.carrier is not None:
         problems += _carrier_problems(profile, profile.carrier)
+    if profile.imu is not None:
+        problems += _imu_problems(profile, profile.imu)
+    if profile.sag is not None:
+        problems += _sag_problems(profile, profile.sag)
     return problems or list(_reach_problems(profile))
 
 
@@ -96,6 +108,7 @@ def _joint_problems(which: Joint, spec: JointSpec) -> Iterator[str]:
     yield from bounded(f"{path}.speed_limit", spec.speed_limit, speed)
     yield from bounded(f"{path}.acceleration_limit", spec.acceleration_limit, (0.01, 20.0, f"{unit}/s^2"))
     yield from bounded(f"{path}.law.stop_band", spec.law.stop_band, (1e-5, 0.05, unit))
+    yield from bounded(f"{path}.law.layer", spec.law.layer, (1e-4, 0.5, unit))
     yield from _valve_problems(path, spec, speed)
     if spec.encoder is not None:
         messages = tuple(_ENCODER_MESSAGES)
@@ -108,6 +121,10 @@ def _valve_problems(path: str, spec: JointSpec, speed: Bounds) -> Iterator[str]:
         allowed = ", ".join(_VALVE_SIGNALS)
         yield f'{path}.valve.signal: "{valve.signal}" is no valve command; use one of {allowed}'
     yield from _side_problems(f"{path}.valve", valve, "speed_limit", spec.speed_limit, speed)
+    if len(valve.lever) != len(valve.lever_at) or len(valve.lever) == 1:
+        yield f"{path}.valve.lever: {len(valve.lever)} arms for {len(valve.lever_at)} positions; one for each lever_at"
+    if any(a >= b for a, b in pairwise(valve.lever_at)):
+        yield f"{path}.valve.lever_at: must rise from position to position"
     yield from _gain_problems(f"{path}.law.kp_1_s", law.kp_1_s, valve.delay_s)
 
 
@@ -192,6 +209,15 @@ def _duplicates(profile: Profile) -> Iterator[str]:
             f"carrier.articulation_encoder.node: {node} is already used by joints.{other}.encoder.node; "
             "each encoder needs its own"
         )
+
+
+def _imu_problems(profile: Profile, imu: Imu) -> Iterator[str]:
+    if imu.message != IMU_MESSAGE:
+        yield f'imu.message: "{imu.message}" is no message of a sensor on the grapple; use {IMU_MESSAGE}'
+    for number, encoder in encoders(profile).items():
+        if encoder.node == imu.node:
+            where = f"joints.{Joint(number).name.lower()}.encoder" if number < N_JOINTS else _STEERING_ENCODER
+            yield f"imu.node: {imu.node} is already used by {where}.node; the sensor needs its own"
 
 
 def _grapple_problems(profile: Profile) -> Iterator[str]:
@@ -280,6 +306,20 @@ def _suspension_problems(path: str, carrier: Carrier) -> Iterator[str]:
             f"{path}.articulation_limit_rad: at {carrier.articulation_limit_rad} rad the inner wheels overlap by "
             f"{-gap:.2f} m; bend less or set the axles farther apart"
         )
+
+
+def _sag_problems(profile: Profile, sag: Sag) -> Iterator[str]:
+    """A column that gives way is still a column, at the farthest reach of the boom."""
+    kin = profile.kinematics
+    head, pin = kin.a1_m + kin.a2_m, max_reach_m(profile)
+    lean = sag.head_rad_m * head + sag.pin_rad_m * pin - sag.rest_rad
+    if not abs(lean) <= LEAN_BOUND_RAD:
+        yield (
+            f"sag.pin_rad_m: the empty crane would lean {lean:.3f} rad at full reach, with head_rad_m and rest_rad; "
+            f"at most {LEAN_BOUND_RAD} rad; survey it anew"
+        )
+    if (sag.head_nm_m > 0.0) != (sag.pin_nm_m > 0.0):
+        yield "sag.head_nm_m: the moment of the empty crane needs head_nm_m and pin_nm_m; give both or neither"
 
 
 def _reach_problems(profile: Profile) -> Iterator[str]:

@@ -22,3 +22,5 @@ class Joint(IntEnum):
 
 JOINTS: Final = tuple(Joint)
 N_JOINTS: Final = len(JOINTS)
+ARTICULATION: Final = N_JOINTS
+"""The number of the carrier's articulation where encoders are counted: it follows the crane's joints."""

@@ -26,6 +26,7 @@ _UNIT_SUFFIXES: Final = (
     "_rad_s2", "_rad_s", "_deg_s2", "_deg_s", "_m_s2", "_m_s", "_mm_s", "_1_s", "_degrees", "_deg", "_rad",
     "_mm", "_cm", "_ms", "_ns", "_us", "_hz", "_bar", "_mpa", "_pa", "_pct", "_percent", "_px", "_m", "_s",
 )  # fmt: skip
+_NO_IMU: Final = b',"imu":null}'
 _JOINT_NAMES: Final = tuple(j.name.lower() for j in JOINTS)
 
 
@@ -66,9 +67,11 @@ def load_profile(name_or_path: str | Path) -> Profile:
 def profile_hash(profile: Profile) -> int:
     """CRC-32 of the canonical content: datagrams carry it so that both ends prove that they mean one machine.
 
-    Comments, order and layout of the file do not count; any value does.
+    Comments, order and layout of the file do not count; any value does.  An IMU that is not there does not count, so
+    that a machine without one keeps the hash that its recordings carry.
     """
-    return zlib.crc32(msgspec.json.encode(profile, order="deterministic"))
+    content = msgspec.json.encode(profile, order="deterministic")
+    return zlib.crc32(content.removesuffix(_NO_IMU) + b"}" if profile.imu is None else content)
 
 
 def _find(name_or_path: str | Path) -> Path:

@@ -12,7 +12,7 @@ from typing import Literal
 
 import msgspec
 
-from machine.joints import JOINTS, Joint
+from machine.joints import ARTICULATION, JOINTS, Joint
 
 
 class Kinematics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -51,7 +51,14 @@ class Encoder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Valve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A valve function: dead-band on either side [%], speed at full command [unit/s], delay [s], sign."""
+    """A valve function.
+
+    Dead-band on either side [%], metering ``exponent`` behind it, speed at full command [unit/s], sign; dead time and
+    lag of the spool behind it [s], and ``oil_s``, how much later still the joint follows, for pump and oil; pump flow
+    that a joint speed takes on either side [m^3 per unit]; ``hysteresis_pct``, the whole width of the spool's play [%
+    of the stroke].  ``lever``: arm of the cylinder at the joint positions ``lever_at``, as a share of where the full
+    speeds and flows hold; empty when it is the same everywhere.
+    """
 
     signal: str
     sign: Literal[-1, 1]
@@ -60,15 +67,74 @@ class Valve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     full_speed_plus: float
     full_speed_minus: float
     delay_s: float
+    lag_s: float
+    flow_plus: float
+    flow_minus: float
+    exponent: float = 1.0
+    hysteresis_pct: float = 0.0
+    oil_s: float = 0.0
+    lever_at: tuple[float, ...] = ()
+    lever: tuple[float, ...] = ()
 
 
 class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """PD law of machines.md 4: gains in 1/s (kp) and dimensionless (kd), stop band in the joint's unit."""
+    """A joint's law (machines.md 4).
 
+    ``kp_1_s`` [1/s] is what every ``kind`` may spend on small errors, ``kd`` [-] the gain of the PD's and PID's error
+    rate, ``layer`` [unit] the boundary layer of the sliding laws.  ``damping_per_bar`` [unit/s per bar] gives way to
+    vibrations of the load pressure.  Within ``stop_band`` [unit] a joint that came to rest is left alone.
+    ``velocity_filter_s`` filters the velocity where a PLC runs the law.
+    """
+
+    kind: Literal["pd", "pid", "sliding_mode", "super_twisting"]
     kp_1_s: float
     kd: float
+    layer: float
+    damping_per_bar: float
     stop_band: float
     velocity_filter_s: float
+
+
+class Hydraulics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What feeds the functions: the flow [m^3/s] that the pump gives at work."""
+
+    pump_flow_m3_s: float
+
+
+class Sag(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the column leans under the weight, as a survey found it; `machine.sag` says what it does to the pin.
+
+    Lean of the empty crane [rad] = ``head_rad_m`` * r_head + ``pin_rad_m`` * r_pin - ``rest_rad``, and
+    ``load_rad_nm`` per Nm that a load adds.  Moment of the empty crane at the lift joint [Nm] = ``head_nm_m`` *
+    (r_head - a1) + ``pin_nm_m`` * (r_pin - a1).  The last three are 0 where no pressures were measured: then nothing
+    is known of loads.
+    """
+
+    head_rad_m: float
+    pin_rad_m: float
+    rest_rad: float
+    load_rad_nm: float = 0.0
+    head_nm_m: float = 0.0
+    pin_nm_m: float = 0.0
+
+
+class Imu(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An inertial sensor on the grapple, and how its swing is damped (`controller.laws.sway`).
+
+    ``node`` and ``message`` in ``crane.dbc`` as for an encoder.  It is mounted on the part above the rotator that
+    swings on both hinges and does not turn, so that its axes are the crane's: radial lean and rate are positive when
+    the grapple hangs and swings outward, tangential ones to the left, as the slew turns.  ``gain`` [-] is twice the
+    damping ratio that the pin's motion adds to a pendulum of ``pendulum_m`` [m], the length of a point pendulum of the
+    grapple's period; the pin goes no faster than ``pin_speed_m_s`` for it, and within ``dead_zone_rad`` of swing
+    nothing is done.
+    """
+
+    node: int
+    message: str
+    gain: float
+    pendulum_m: float
+    pin_speed_m_s: float
+    dead_zone_rad: float
 
 
 class JointSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -165,7 +231,8 @@ class Carrier(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Frames ``rear`` and ``front`` share the articulation axis: origin on it, x forward, y left, z up, z = 0 at the
     pivots of the swing arms.  ``front_axle_m`` and ``rear_axle_m`` are their distances from the axis at the
     transport height.  A height counts how far the frame stands above its lowest position; ``arm_drop_low_m`` is
-    the wheel hub below its pivot there (negative: above it).  Steering speeds are in rad/s, + bends left; swing-arm
+    the wheel hub below its pivot there (negative: above it).  Beyond ``tilt_limit_rad`` of roll or pitch the machine
+    does not drive.  Steering speeds are in rad/s, + bends left; swing-arm
     speeds in m/s of height, + lifts the frame.
     """
 
@@ -188,6 +255,8 @@ class Carrier(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     heading_kp_1_s: float
     cruise_speed_m_s: float
     speed_limit_m_s: float
+    drive_acceleration_m_s2: float
+    tilt_limit_rad: float
     crane_base_m: tuple[float, float, float]
     crane_yaw_rad: float
     antenna_main_m: tuple[float, float, float]
@@ -198,6 +267,14 @@ class Carrier(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arm_valve: CarrierValve
 
 
+class Plc(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A machine PLC on Ethernet in place of the nodes on crane0 (can_bus.md 10).  ``role``: it closes the joint loops
+    on the controller's references, or passes the controller's valve commands on.
+    """
+
+    role: Literal["references", "valves"]
+
+
 class Timeouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Reaction times of the supervisor in ms; frame timeouts come from the DBC."""
 
@@ -206,7 +283,8 @@ class Timeouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A whole machine; ``carrier`` is None when it stands still, ``cameras`` may be empty."""
+    """A whole machine; ``carrier`` is None when it stands still, ``cameras`` may be empty, ``plc``, ``sag`` and
+    ``imu`` None without one."""
 
     schema: Literal[1]
     name: str
@@ -216,17 +294,29 @@ class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     machine_bus: str | None
     kinematics: Kinematics
     joints: dict[str, JointSpec]
+    hydraulics: Hydraulics
     grapple: Grapple
     bunk: Bunk
     workspace: Workspace
     timeouts: Timeouts
     carrier: Carrier | None
     cameras: dict[str, Camera] = {}
+    plc: Plc | None = None
+    sag: Sag | None = None
+    imu: Imu | None = None
 
 
 def joint(profile: Profile, which: Joint) -> JointSpec:
     """The specification of one joint."""
     return profile.joints[which.name.lower()]
+
+
+def encoders(profile: Profile) -> dict[int, Encoder]:
+    """Every encoder of the machine by the number of its joint, ``ARTICULATION`` for the carrier's."""
+    found = {int(j): spec for j in JOINTS if (spec := joint(profile, j).encoder) is not None}
+    if profile.carrier is not None:
+        found[ARTICULATION] = profile.carrier.articulation_encoder
+    return found
 
 
 def joint_limits(profile: Profile) -> tuple[tuple[float, float], ...]:

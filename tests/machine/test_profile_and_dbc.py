@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from can_dbc import codec
+from machine.check import IMU_MESSAGE
 from machine.load import load_profile, shipped_profiles
 
 
@@ -21,3 +22,8 @@ def test_every_encoder_and_valve_of_a_profile_is_in_the_dbc(name: str) -> None:
         message = crane.message(encoder.message)
         assert message.key == 0x180 + encoder.node, "TPDO1 of the encoder's node"
         assert "Position" in message.index
+
+
+def test_the_only_message_of_a_sensor_on_the_grapple_is_in_the_dbc() -> None:
+    message = codec.load("crane").message(IMU_MESSAGE)
+    assert message.key == 0x180 + 0x23, "TPDO1 of node 23h"
