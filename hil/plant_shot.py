@@ -10,8 +10,9 @@ from typing import Final
 import numpy as np
 from PIL import Image
 
+from machine.optics import pinhole
 from machine.profile import Profile
-from sim.camera.geometry import orbit, pinhole
+from sim.camera.geometry import orbit
 from sim.camera.render import Look, render
 from sim.camera.rig import CameraRig
 from sim.camera.scene import scene_from_world

@@ -1,10 +1,12 @@
-"""The live plant: ``python -m sim --profile aoro_fc8 --bus crane0=wire:crane0 --bus mach0=wire:mach0 [--port 4710]``.
+"""The live plant: ``python -m sim --profile aoro_fc8 --bus crane0=wire:crane0 --bus mach0=wire:mach0 [--port 4710]
+[--camera 4711] [--site FILE]``.
 
-Runs the plant against the monotonic clock with absolute deadlines and looks at its buses at every physics step: a SYNC
-is answered within 2.5 ms with the state at its own stamp.  A host too slow for real time makes the plant's time stand
-still for a moment (no burst); how often is counted and reported at the end.  ``--port`` answers JSON requests over UDP
-on the loopback interface: ``{"op": "state" | "shapes" | "verdict" | "logs" | "poses" | "vehicle" | "press" | "release"
-| "reset" | "scene" | "view" | "quit"}`` and ``{"op": "lever", "name": NAME, "value": "-1".."1"}``.
+Runs the plant against the monotonic clock (`sim.live`).  ``--port`` answers JSON requests over UDP
+on the loopback interface: ``{"op": "state" | "shapes" | "verdict" | "logs" | "poses" | "vehicle" | "survey" | "press"
+| "release" | "reset" | "scene" | "view" | "quit"}`` and ``{"op": "lever", "name": NAME, "value": "-1".."1"}``.
+With ``--site`` the logs of a mission lie about (`sim.site_file`), "logs" gives those that a camera could see, and where
+one was taken a new one is laid for the next lap.  ``--camera`` serves the pictures of its cameras over TCP on that
+interface (``can_dbc.rgbd``), drawn when asked for.
 
 Exit codes: 0 stopped by SIGTERM, SIGINT or quit; 2 usage; 3 profile, truth or scene; 4 bus.
 """
@@ -17,78 +19,67 @@ import gc
 import signal
 import socket
 import sys
-import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from can_dbc.bus import Bus, BusError, open_bus
-from can_dbc.frame import Frame
 from machine.load import ProfileError, load_profile
 from machine.profile import Profile
+from sim.detector import detect, detect_near
+from sim.live import TX_QUEUE, LiveMachine
 from sim.plant import Plant
 from sim.scene import KINDS
+from sim.site import Layer
+from sim.site_file import Site, load_site
+from sim.survey import TotalStation
 from sim.terrain import KINDS as TERRAINS
 from sim.view import scene_of, view_of
 
-TX_QUEUE = 256  # this process plays a dozen nodes
-LAG_NS = 25_000_000
 ANSWER_NS = 20_000_000
+LAY_NS = 1_000_000_000
 
 
-class LivePlant:
-    """A Plant on the clock and on its buses, by name.  ``stop`` ends ``run``."""
+class LivePlant(LiveMachine):
+    """A plant that also answers requests on a UDP port."""
 
-    def __init__(self, plant: Plant, buses: Mapping[str, Bus], port: int | None) -> None:
-        self._plant, self._buses = plant, dict(buses)
-        self._running = True
-        self._skipped_ns = self._started_ns = self._stalls = 0
+    def __init__(
+        self,
+        plant: Plant,
+        buses: Mapping[str, Bus],
+        port: int | None,
+        seed: int = 0,
+        cameras: int | None = None,
+        site: Site | None = None,
+    ) -> None:
+        super().__init__(plant, buses)
+        self._plant = plant
+        self._station = TotalStation(seed)
+        self._answer_ns = self._lay_ns = 0
+        self._layer = None if site is None else Layer(plant, site.places, site.rounds)
         self._requests = None
         if port is not None:
             self._requests = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             self._requests.setblocking(False)
             self._requests.bind(("127.0.0.1", port))
+        self.cameras = None
+        if cameras is not None:
+            from sim.camera.rig import CameraRig
+            from sim.camera.server import CameraServer
 
-    def stop(self, *_: object) -> None:
-        """End after the present step; usable as a signal handler."""
-        self._running = False
+            self.cameras = CameraServer(CameraRig(plant.world, plant.profile, plant.world.truth, seed), cameras)
 
-    def run(self) -> None:
-        """Until stopped."""
-        frames: list[Frame] = []
-        self._started_ns = time.monotonic_ns()
-        answer_ns = 0
-        while self._running:
-            now_ns = time.monotonic_ns() - self._skipped_ns
-            behind_ns = now_ns - self._plant.next_ns if self._plant.next_ns else 0
-            if behind_ns > LAG_NS:
-                self._skipped_ns += behind_ns
-                self._stalls += 1
-                now_ns -= behind_ns
-            received = []
-            for name, bus in self._buses.items():
-                frames.clear()
-                bus.drain(frames)
-                received += [(name, f._replace(stamp_ns=f.stamp_ns - self._skipped_ns)) for f in frames]
-            for name, key, data in self._plant.step(now_ns, received):
-                self._buses[name].send(key, data)
-            if self._requests is not None and now_ns >= answer_ns:
-                self._answer(self._requests)
-                answer_ns = now_ns + ANSWER_NS
-            pause_ns = self._plant.next_ns - (time.monotonic_ns() - self._skipped_ns)
-            if pause_ns > 0:
-                time.sleep(pause_ns * 1e-9)
-
-    def report(self) -> dict[str, float]:
-        """How well real time was kept: share of time that was lost, and how often."""
-        elapsed_ns = max(1, time.monotonic_ns() - self._started_ns)
-        return {
-            "time_s": elapsed_ns * 1e-9,
-            "lost_share": self._skipped_ns / elapsed_ns,
-            "stalls": self._stalls,
-            "refused_frames": sum(bus.stats.refused for bus in self._buses.values()),
-        }
+    def _stepped(self, now_ns: int) -> None:
+        if self.cameras is not None:
+            self.cameras.serve(now_ns)
+        if self._requests is not None and now_ns >= self._answer_ns:
+            self._answer(self._requests)
+            self._answer_ns = now_ns + ANSWER_NS
+        if self._layer is not None and now_ns >= self._lay_ns:
+            self._layer.step()
+            self._lay_ns = now_ns + LAY_NS
 
     def _answer(self, requests: socket.socket) -> None:
         while True:
@@ -120,7 +111,7 @@ class LivePlant:
                     "host": self.report(),
                 }
             case "logs":
-                return plant.logs()
+                return detect(plant) if self._layer is None else detect_near(plant)
             case "verdict":
                 return plant.judge()
             case "poses":
@@ -129,6 +120,8 @@ class LivePlant:
                 return plant.shapes()
             case "vehicle":
                 return plant.vehicle()
+            case "survey":
+                return {"pin_m": self._station.read(plant.tip())}
             case "scene":
                 return scene_of(plant)
             case "view":
@@ -164,6 +157,14 @@ def _check_buses(profile: Profile, given: Mapping[str, str]) -> None:
             raise ProfileError(f"{profile.name} is on {' and '.join(wanted)}; give --bus {name}=ADDRESS too")
 
 
+def _plant(profile: Profile, site: Site | None, options: argparse.Namespace) -> Plant:
+    """What the command line asks for; raises ValueError."""
+    seed, truth = options.seed, options.truth
+    if site is not None:
+        return site.plant(profile, truth, seed)
+    return Plant(profile, seed, truth, options.logs, scene=options.scene, terrain=options.terrain)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m sim", description="The live plant of a machine on its CAN buses.")
@@ -172,21 +173,24 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--truth", default="nominal", help="nominal, sampled or a TOML file")
     parser.add_argument("--logs", type=int, default=1)
     parser.add_argument("--scene", default="random", help=f"how the logs lie: random, {', '.join(KINDS)}")
+    parser.add_argument("--site", type=Path, help="file of a mission's site, instead of --logs and --scene")
     parser.add_argument("--terrain", default="flat", choices=TERRAINS, help="what the machine stands on")
     parser.add_argument("--bus", type=_address, action="append", required=True, metavar="NAME=ADDRESS")
     parser.add_argument("--port", type=int, help="UDP port on the loopback interface for requests")
+    parser.add_argument("--camera", type=int, help="TCP port on the loopback interface for pictures of the cameras")
     options = parser.parse_args(arguments)
     addresses = dict(options.bus)
     try:
         profile = load_profile(options.profile)
         _check_buses(profile, addresses)
-        plant = Plant(profile, options.seed, options.truth, options.logs, scene=options.scene, terrain=options.terrain)
+        site = None if options.site is None else load_site(options.site)
+        plant = _plant(profile, site, options)
         with contextlib.ExitStack() as stack:
             buses = {
                 name: stack.enter_context(open_bus(address, tx_queue=TX_QUEUE, participant="plant"))
                 for name, address in addresses.items()
             }
-            live = LivePlant(plant, buses, options.port)
+            live = LivePlant(plant, buses, options.port, options.seed, options.camera, site)
             signal.signal(signal.SIGTERM, live.stop)
             signal.signal(signal.SIGINT, live.stop)
             gc.collect()

@@ -31,6 +31,7 @@ CARRIER_LINKS: Final = ("rear", "front", *geometry.ARMS)
 STOP_MARGIN: Final = 0.03  # the hard stops stand a little outside the working range [rad]
 GRAVITY_M_S2: Final = 9.81
 FACETS: Final = 4  # boxes that make a wheel
+BEAM_M: Final = (0.12, 0.20)  # width and height of a swing arm
 POLYGON: Final = (0, 1, 3, 2)  # wheels clockwise seen from above: fl fr rr rl
 
 
@@ -63,7 +64,7 @@ def _shapes(profile: Profile, link: str) -> tuple[Shape, ...]:
             *(Shape(link, (0.05, 0.05, tall), at, UNIT, dark, False) for *at, tall in masts),
         )
     ahead, inward = (1 if link[4] == "f" else -1), (-1 if link[5] == "l" else 1)
-    beam = (c.arm_length_m + 0.20, 0.12, 0.20)
+    beam = (c.arm_length_m + 0.20, *BEAM_M)
     at = (ahead * c.arm_length_m / 2, inward * (c.wheel_width_m / 2 + 0.08), 0.0)
     half = math.pi / (2 * FACETS)
     facet = (2 * c.wheel_radius_m * math.cos(half), c.wheel_width_m, 2 * c.wheel_radius_m * math.sin(half))
@@ -73,13 +74,17 @@ def _shapes(profile: Profile, link: str) -> tuple[Shape, ...]:
 
 
 def _arm_link(profile: Profile, t: CarrierTruth, name: str) -> LinkDef:
-    """Arm as a rod and wheel as a disc.  The wheel's inertia about its axle is its spin's, not the arm's."""
+    """Arm as a beam and wheel as a disc.  The wheel's inertia about its axle is its spin's, not the arm's."""
     length, mass = profile.carrier.arm_length_m, t.arm_mass_kg + t.wheel_mass_kg
     com = (t.arm_mass_kg / 2 + t.wheel_mass_kg) / mass * length
     about = t.arm_mass_kg * (length**2 / 12 + (com - length / 2) ** 2) + t.wheel_mass_kg * (length - com) ** 2
     across = t.wheel_spin_inertia_kg_m2 / 2 + t.wheel_mass_kg * profile.carrier.wheel_width_m**2 / 12
+    # With a beam that has no thickness the largest would be the sum of the others to the last bit, and rounding then
+    # makes a body that cannot be, which Bullet gives no inertia at all.
+    wide, high = (t.arm_mass_kg * side**2 / 12 for side in BEAM_M)
+    inertia = (across + wide + high, about + high, across + about + wide)
     ahead = 1.0 if name[4] == "f" else -1.0
-    return LinkDef(name, mass, (ahead * com, 0.0, 0.0), (across, about, across + about), _shapes(profile, name))
+    return LinkDef(name, mass, (ahead * com, 0.0, 0.0), inertia, _shapes(profile, name))
 
 
 def carrier_links(profile: Profile, truth: Truth) -> tuple[list[LinkDef], list[JointDef]]:
@@ -121,18 +126,18 @@ class Carrier:
         self._index = {name: index[name] for name in CARRIER_JOINTS}
         self._arms = [index[name] for name in geometry.ARMS]
         self._com = self._t.rear.com_m
-        t = self._t
+        t, soil = self._t, terrain.soil
         self._tyre = Tyre(
             (self._c.wheel_radius_m + t.tyre_sink_m) * t.wheel_radius_scale,
             self._c.wheel_width_m,
             t.wheel_spin_inertia_kg_m2,
             t.tyre_stiffness_n_m,
             t.tyre_damping_n_s_m,
-            t.tread_n_m,
+            t.tread_n_m * soil.stiffness,
             t.tread_n_s_m,
             t.relaxation_m,
-            t.friction,
-            t.rolling_resistance,
+            t.friction * soil.friction,
+            t.rolling_resistance + soil.rolling,
             t.slip_limit,
         )
         self._hub = np.array([1.0, 1.0, -1.0, -1.0]) * self._c.arm_length_m
@@ -185,7 +190,7 @@ class Carrier:
         spin = self._reference / self._c.wheel_radius_m
         offer = 0.0
         if not drive.brake:
-            offer = t.drive_gain_nm_s_rad * (spin - float(self._speeds.mean()))
+            offer = t.drive_gain_nm_s_rad * (spin - sum(self._speeds.tolist()) / 4.0)
             offer = max(-t.drive_torque_nm, min(t.drive_torque_nm, offer))
         self._torque += h / (h + t.drive_lag_s) * (offer - self._torque)
         self._brake += h / (h + t.brake_lag_s) * (float(drive.brake) - self._brake)

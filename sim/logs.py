@@ -99,6 +99,12 @@ class Yard:
         for body in self.logs:
             self._p.changeDynamics(body, -1, activationState=self._p.ACTIVATION_STATE_WAKE_UP)
 
+    def carry(self, which: int, east_m: float, north_m: float) -> None:
+        """Someone takes a log, as it lies, to another place on level ground, by so much in the world."""
+        (x, y, z), turn = self._p.getBasePositionAndOrientation(self.logs[which])
+        self._p.resetBasePositionAndOrientation(self.logs[which], (x + east_m, y + north_m, z), turn)
+        self._p.resetBaseVelocity(self.logs[which], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
     def states(self) -> list[LogState]:
         """The logs now, in scene order.  Only those that moved since the last call are worked out."""
         p = self._p

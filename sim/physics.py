@@ -7,6 +7,8 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
 
 @contextmanager
@@ -31,9 +33,21 @@ def _silent() -> Iterator[None]:
 
 with _silent():
     import pybullet
-    from pybullet_utils.bullet_client import BulletClient
+    from pybullet_utils import bullet_client
 
 __all__ = ["BulletClient", "new_client"]
+
+
+class BulletClient(bullet_client.BulletClient):  # type: ignore[misc]
+    """The client, which keeps the functions it has bound to itself: to bind one anew takes as long as a short call."""
+
+    def __getattr__(self, name: str) -> Any:
+        attribute = super().__getattr__(name)
+        if name == "disconnect":  # what is kept must not reach a later client, which may get the same number
+            self.__dict__ = {k: v for k, v in self.__dict__.items() if not isinstance(v, partial)}
+        else:
+            self.__dict__[name] = attribute
+        return attribute
 
 
 def new_client() -> BulletClient:

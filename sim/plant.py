@@ -1,45 +1,32 @@
 """The plant: physics world and emulated CAN nodes behind one pure step, in place of the machine on the bus.
 
-``Plant.step(now_ns, received)`` advances physics on a 2.5 ms grid, which starts at the first call's ``now_ns``, up to
-``now_ns``; frames of either bus are delivered at their own stamps between physics steps, so a SYNC is answered with
-the state at that moment.  Returned are the frames sent meanwhile, with their buses.  No clock, no socket; equal inputs
-and seed give equal bytes.  A scene that cannot be made raises ValueError.
+``Plant.step(now_ns, received)`` (of `sim.emulation.EmulatedMachine`) advances physics on a 2.5 ms grid.  No clock, no
+socket; equal inputs and seed give equal bytes.  A scene that cannot be made raises ValueError.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from can_dbc.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
-from can_dbc.codec import load
-from can_dbc.frame import Frame
-from machine.carrier import ARMS, height_from_arm_angle
+from machine.carrier import ARMS
 from machine.joints import JOINTS
-from machine.profile import Encoder, Profile
+from machine.profile import Profile
 from sim.bunk import bunk_shapes
-from sim.carrier import PARKED, Carrier, Drive, carrier_links
+from sim.carrier import PARKED, Drive, carrier_links
 from sim.crane import crane_shapes
+from sim.emulation import EmulatedMachine
 from sim.judge import Judge, Verdict
 from sim.levers import DRIVE, HandLevers
 from sim.logs import LogState
-from sim.nodes import Outbox
-from sim.nodes.arms import ArmNode, ArmState
-from sim.nodes.device import EstopBox, PressureModule
-from sim.nodes.encoder import EncoderBus, EncoderNode, VirtualNetwork
-from sim.nodes.engine import EngineNode
-from sim.nodes.gnss import GnssNode
-from sim.nodes.traffic import MS
-from sim.nodes.valve import FUNCTIONS, Measured, ValveNode, ValveState
-from sim.nodes.vehicle import VehicleNode
+from sim.nodes.arms import ArmState
+from sim.nodes.valve import FUNCTIONS, ValveState
 from sim.scene import LogSpec, arrangement, random_scene
 from sim.shape import Quaternion, Shape, Vector
 from sim.truth import Truth, load_truth
 from sim.world import STEP_NS, World
 
 __all__ = ["LogState", "Plant", "Shape", "VehicleState", "Verdict"]
-SENSE_STEPS = 4  # the carrier's own sensors are read every 10 ms
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +46,10 @@ class VehicleState:
     wheel_loads_n: tuple[float, ...]
 
 
-class Plant:
-    """The whole machine.  ``estop`` is the operator's box; the rest of the public names show the truth to a harness.
+class Plant(EmulatedMachine):
+    """The whole machine: nodes, and in ``world`` the physics.  The public names show the truth to a harness.
 
     ``scene`` is the name of an arrangement of ``logs`` logs, or the logs themselves; by default they lie at random.
-    ``vehicle_node``, ``arms``, ``engine`` and ``gnss`` are None on a machine without carrier.
     """
 
     def __init__(
@@ -76,112 +62,25 @@ class Plant:
         scene: str | Sequence[LogSpec] | None = None,
         terrain: str = "flat",
     ) -> None:
-        self.profile = profile
         facts = load_truth(truth, seed, profile.name)
         self.world = World(profile, facts, seed, _scene(profile, facts, seed, logs, scene), terrain)
         self._judge = Judge(self.world)
-        self._time_ns: int | None = None
-        self._steps = 0
-        self._pressures_of = -1
-        self._received = {profile.crane_bus: self._deliver_crane, profile.machine_bus: self._deliver_machine}
         self._floats = (False, False)
-        self._crane_out: Outbox = []
-        self._machine_out: Outbox = []
-        self._place_crane_nodes(facts, seed)
         # Commands come node by node; the world wants them in its own order.
         self._order = (*FUNCTIONS, "steer", *ARMS)
         self._by_function = [self._order.index(name) for name in self.world.functions]
         self._levers = HandLevers(self.world.functions, self.world.carrier is not None)
-        self.vehicle_node: VehicleNode | None = None
-        self.arms: ArmNode | None = None
-        self.engine: EngineNode | None = None
-        self.gnss: GnssNode | None = None
-        self._machine_nodes: tuple[VehicleNode | ArmNode | EngineNode | GnssNode, ...] = ()
-        if self.world.carrier is not None:
-            self._place_machine_nodes(facts, seed, self.world.carrier)
-        self._measure(0)
+        super().__init__(profile, facts, seed, self.world, STEP_NS)
 
-    def _place_crane_nodes(self, facts: Truth, seed: int) -> None:
-        database, out = load("crane"), self._crane_out
-        self.estop = EstopBox(database, out)
-        self.valve = ValveNode(database, out, self._pilot_on, self._sense_valves)
-        self._devices = (
-            self.estop,
-            self.valve,
-            PressureModule(0x20, "PressA", 5 * MS, database, out, lambda: self._chambers("lift", "tilt")),
-            PressureModule(0x21, "PressB", 5 * MS, database, out, lambda: self._chambers("ext", "slew")),
-            PressureModule(0x22, "PressC", 20 * MS, database, out, self._grapple_pressures),
-        )
-        specs: dict[str, Encoder] = {n: s.encoder for n, s in self.profile.joints.items() if s.encoder is not None}
-        if self.profile.carrier is not None:
-            specs["articulation"] = self.profile.carrier.articulation_encoder
-        network = VirtualNetwork(out)
-        self.encoders = {
-            name: EncoderNode(name, spec, facts.encoders[name], STEP_NS, seed, network) for name, spec in specs.items()
-        }
-        self._encoder_bus = EncoderBus(self.encoders, network)
-
-    def _place_machine_nodes(self, facts: Truth, seed: int, carrier: Carrier) -> None:
-        spec, out = self.profile.carrier, self._machine_out
-        if spec is None or facts.gnss is None:
-            raise ValueError(f"the truth of {self.profile.name} needs a [gnss] table; add it to the truth file")
-        machine = load("machine")
-        self.vehicle_node = VehicleNode(machine, out, spec, self._pilot_on)
-        self.arms = ArmNode(machine, out, self._pilot_on)
-        self.engine = EngineNode(machine, out)
-        self.gnss = GnssNode(machine, load("gnss"), out, spec, facts.gnss, seed, lambda: carrier.pose("front"))
-        self._machine_nodes = (self.vehicle_node, self.arms, self.engine, self.gnss)
-
-    def _pilot_on(self) -> bool:
-        return self.estop.pilot_on
-
-    def step(self, now_ns: int, received: list[tuple[str, Frame]]) -> list[tuple[str, int, bytes]]:
-        """Advance to ``now_ns``; ``received`` are (bus, frame) sent by others since, stamps up to ``now_ns``."""
-        if self._time_ns is None:
-            self._time_ns = now_ns
-            self._tick(now_ns)
-        for bus, frame in sorted((pair for pair in received if pair[0] in self._received), key=_stamp):
-            stamp_ns = max(self._time_ns, min(now_ns, frame.stamp_ns))
-            self._advance(stamp_ns)
-            self._received[bus](frame.key, frame.data, stamp_ns)
-        self._advance(now_ns)
-        crane, machine = self.profile.crane_bus, self.profile.machine_bus or ""
-        sent = [(crane, key, data) for key, data in self._crane_out]
-        sent += [(machine, key, data) for key, data in self._machine_out]
-        self._crane_out.clear()
-        self._machine_out.clear()
-        return sent
-
-    @property
-    def next_ns(self) -> int:
-        """When the next physics step is due; 0 before the first ``step``."""
-        return 0 if self._time_ns is None else self._time_ns + STEP_NS
-
-    @property
-    def time_s(self) -> float:
-        """Physical time that has passed [s]."""
-        return self._steps * STEP_NS * 1e-9
-
-    def _advance(self, until_ns: int) -> None:
-        """Physics steps that end at or before ``until_ns``."""
-        assert self._time_ns is not None
-        while self._time_ns + STEP_NS <= until_ns:
-            self._time_ns += STEP_NS
-            self._steps += 1
-            self.world.step(*self._decide(self._time_ns))
-            self._judge.watch()
-            self._measure(self._time_ns)
-            self._tick(self._time_ns)
+    def _move(self, now_ns: int) -> None:
+        self.world.step(*self._decide(now_ns))
+        self._judge.watch()
 
     def _decide(self, now_ns: int) -> tuple[list[float], Drive]:
         """What the nodes and levers do to the valves and the drive in this step."""
-        self.valve.decide(now_ns)
-        commands = [u / 100.0 for u in self.valve.outputs_pct]
+        commands = self._spools(now_ns)
         drive = PARKED
         if self.vehicle_node is not None and self.arms is not None:
-            self.vehicle_node.decide(now_ns)
-            self.arms.decide(now_ns)
-            commands += [self.vehicle_node.steer, *self.arms.spools]
             self._float((self.arms.float_front, self.arms.float_rear))
             drive = Drive(self.vehicle_node.drive_m_s, self.vehicle_node.brake)
         held = self._levers.held(now_ns)
@@ -204,83 +103,6 @@ class Plant:
         carried = self.vehicle_node is not None and self.vehicle_node.active
         raised = self.arms is not None and self.arms.state is ArmState.ACTIVE
         return self.valve.valve_state is ValveState.ACTIVE or carried or raised
-
-    def _measure(self, now_ns: int) -> None:
-        """Let the sensors with a memory feel the present state."""
-        q, qd = self.world.q, self.world.qd
-        for name, encoder in self.encoders.items():
-            encoder.observe(now_ns, q[name], qd[name])
-        if self._machine_nodes and self._steps % SENSE_STEPS == 0:
-            self._measure_carrier()
-
-    def _sense_valves(self) -> Measured:
-        """What the PLC's inputs show now."""
-        w, h = self.world, self.world.hydraulics
-        spools, (opening, closing) = h.spools, self._pressures()["grapple"]
-        return Measured(
-            spools=tuple(spools[name] for name in FUNCTIONS),
-            flow_limited=h.flow_limited,
-            opening=w.opening if self.profile.grapple.opening_sensor else None,
-            clamp_bar=closing / 1e5,
-            release_bar=opening / 1e5,
-            load_kg=w.load_kg(),
-            rot_deg=math.degrees(math.remainder(w.q["rot"], math.tau)) if "rot" in self.encoders else None,
-        )
-
-    def _chambers(self, first: str, second: str) -> tuple[float, ...]:
-        pressures = self._pressures()
-        return (*pressures[first], *pressures[second])
-
-    def _pressures(self) -> dict[str, tuple[float, float]]:
-        """Chambers of every function [Pa]; made once a step, for three nodes ask."""
-        if self._pressures_of != self._steps:
-            self._pressures_of, self._pressures_pa = self._steps, self.world.hydraulics.pressures_pa
-        return self._pressures_pa
-
-    def _grapple_pressures(self) -> tuple[float, ...]:
-        """Pump, tank, closing and opening side of the grapple."""
-        h = self.world.hydraulics
-        opening, closing = self._pressures()["grapple"]
-        return (h.supply_pa, self.world.truth.supply.tank_pa, closing, opening)
-
-    def _measure_carrier(self) -> None:
-        """The carrier's own sensors: wheel speeds, articulation, arm heights, inclination, hydraulic power."""
-        spec, carrier, vehicle, arms, engine = (
-            self.profile.carrier, self.world.carrier, self.vehicle_node, self.arms, self.engine,
-        )  # fmt: skip
-        assert spec and carrier and vehicle and arms and engine
-        vehicle.speed_m_s = engine.speed_m_s = float(sum(carrier.wheel_speeds_rad_s)) / 4.0 * spec.wheel_radius_m
-        vehicle.articulation_rad = self.world.q["articulation"]
-        middle = spec.arm_travel_m / 2.0
-        arms.heights_mm = tuple(1e3 * (height_from_arm_angle(spec, self.world.q[arm]) - middle) for arm in ARMS)
-        roll, pitch, _ = carrier.attitude("rear")
-        arms.roll_deg, arms.pitch_deg = math.degrees(roll), -math.degrees(pitch)
-        engine.energy_j, engine.brake = self.world.hydraulics.energy_j, vehicle.brake
-
-    def _tick(self, now_ns: int) -> None:
-        self._encoder_bus.tick(now_ns)
-        for device in self._devices:
-            device.tick(now_ns)
-        for node in self._machine_nodes:
-            node.tick(now_ns)
-
-    def _deliver_crane(self, key: int, data: bytes, now_ns: int) -> None:
-        if key == SYNC_ID:
-            self._encoder_bus.sync(now_ns)
-            self.valve.sync(now_ns)
-            return
-        if key == NMT_ID:
-            for device in self._devices:
-                device.receive_nmt(data)
-        elif SDO_TO_SERVER < key <= SDO_TO_SERVER + 0x7F:
-            for device in self._devices:
-                device.receive_sdo(key, data)
-        self._encoder_bus.receive(key, data, now_ns)
-        self.valve.receive(key, data, now_ns)
-
-    def _deliver_machine(self, key: int, data: bytes, now_ns: int) -> None:
-        for node in self._machine_nodes:
-            node.receive(key, data, now_ns)
 
     def lever(self, name: str, value: float) -> None:
         """Pull a hand lever (``world.functions``, and ``drive``) to -1..1 for a moment.
@@ -351,7 +173,3 @@ def _scene(
     if scene is None or scene == "random":
         return random_scene(profile, facts.wood, seed, logs)
     return arrangement(scene, profile, facts.wood, seed, logs) if isinstance(scene, str) else scene
-
-
-def _stamp(received: tuple[str, Frame]) -> int:
-    return received[1].stamp_ns

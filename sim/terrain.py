@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import random
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,9 +19,22 @@ from numpy.typing import NDArray
 from sim.physics import BulletClient
 from sim.shape import Vector
 
-KINDS: Final = ("flat", "rough", "slope")
+
+class Soil(NamedTuple):
+    """What the ground makes of the truth's tyres: factors of their friction and slip stiffness, and what it adds to
+    their rolling resistance.
+    """
+
+    friction: float = 1.0
+    stiffness: float = 1.0
+    rolling: float = 0.0
+
+
+KINDS: Final = ("flat", "rough", "slope", "hill", "mud")
 SIDE_SLOPE: Final = 0.10  # rise per metre towards +y of kind "slope"
-EXTENT_M: Final = 120.0  # edge of flat and slope
+HILL_SLOPE: Final = math.tan(math.radians(10.0))  # of kind "hill"
+MUD: Final = Soil(0.5, 0.3, 0.10)  # assumed: a wheel pulls with a third of its load and sinks in
+EXTENT_M: Final = 120.0  # edge of all but rough
 ROUGH_CELLS: Final = 400
 ROUGH_CELL_M: Final = 0.2
 # Roughness: standard deviation and smoothing length [m] of each layer; correlation falls to 1/e at twice the length.
@@ -78,7 +91,8 @@ def _rough(seed: int) -> NDArray[np.float64]:
 
 
 class Terrain:
-    """Ground of a kind: ``flat`` at ``datum_m``, ``slope`` rising to +y, ``rough`` undulating, drawn from ``seed``.
+    """Ground of a kind: ``flat`` at ``datum_m``, ``slope`` and the steeper ``hill`` rising to +y, ``mud`` flat and
+    slippery, ``rough`` undulating, drawn from ``seed``.
 
     Raises:
         ValueError: the kind is not one of KINDS.
@@ -89,10 +103,12 @@ class Terrain:
             raise ValueError(f"terrain {kind!r} is unknown; use one of {', '.join(KINDS)}")
         self.kind = kind
         self.colour: Vector = (0.55, 0.60, 0.45)
+        self.soil = MUD if kind == "mud" else Soil()
         if kind == "rough":
             self.cell_m, heights = ROUGH_CELL_M, _rough(seed)
         else:
-            self.cell_m, edge = EXTENT_M, SIDE_SLOPE * EXTENT_M / 2 if kind == "slope" else 0.0
+            rise = {"slope": SIDE_SLOPE, "hill": HILL_SLOPE}.get(kind, 0.0)
+            self.cell_m, edge = EXTENT_M, rise * EXTENT_M / 2
             heights = np.array([[-edge, edge], [-edge, edge]])
         self.heights: NDArray[np.float64] = np.ascontiguousarray(heights + datum_m)
         half = (self.heights.shape[0] - 1) * self.cell_m / 2
@@ -144,4 +160,7 @@ class Terrain:
             turn = client.getQuaternionFromEuler([math.atan2(-normal[1], normal[2]), 0.0, 0.0])
         self.body: int = client.createMultiBody(0.0, shape, basePosition=at, baseOrientation=turn)
         client.changeDynamics(self.body, -1, lateralFriction=friction)
+        # Bullet works out the contacts of two bodies unless both sleep: ground that sleeps makes logs at rest free.
+        for state in (client.ACTIVATION_STATE_ENABLE_SLEEPING, client.ACTIVATION_STATE_SLEEP):
+            client.changeDynamics(self.body, -1, activationState=state)
         return self.body

@@ -6,6 +6,7 @@ torque of its cylinder or motor.  Bit-identical for equal inputs on one machine 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
@@ -269,6 +270,14 @@ class World:
         links = self.truth.links
         grapple = sum(links[n].mass_kg for n in ("hanger", "fork", "rotator")) + 2 * links["tong"].mass_kg
         return max(0.0, self.hanging_n / GRAVITY_M_S2 - grapple)
+
+    def lean_rad(self) -> tuple[float, float]:
+        """How far the part above the rotator, which does not turn, hangs from the vertical [rad]: outward of its pin
+        in the crane's plane, and to the left.
+        """
+        _, turn = self.crane.pose("fork")
+        x, y, z = self.client.getMatrixFromQuaternion(turn)[6:]  # the vertical, as that part has it
+        return math.atan2(y, z), math.atan2(-x, z)
 
     def wheel_loads_n(self) -> tuple[float, ...]:
         """Wheel loads fl fr rl rr [N]; none on a fixed machine."""

@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from machine.optics import Intrinsics, intrinsics
 from machine.profile import Profile
 from sim.camera.clutter import CLEARING, YARD, Clutter, Density
-from sim.camera.geometry import Intrinsics, View, intrinsics, mount_view
+from sim.camera.geometry import View, mount_view
 from sim.camera.noise import StereoNoise
 from sim.camera.render import Look, Picture, render
 from sim.camera.scene import Scene, WorldScenes
@@ -74,6 +75,7 @@ class CameraRig:
             name: StereoNoise(camera, truth.cameras[name], f"{name} {seed}") for name, camera in profile.cameras.items()
         }
         self._counts = dict.fromkeys(profile.cameras, 0)
+        self.names = tuple(profile.cameras)
 
     def view(self, name: str, scene: Scene) -> View:
         """Where a camera really is; its own pinhole."""
@@ -92,15 +94,16 @@ class CameraRig:
     def picture(self, name: str) -> tuple[Scene, View, Picture]:
         """What an ideal camera in the true place sees, for labels: scene, view and picture without bars or noise."""
         scene = self.scene(name)
-        view = self.view(name, scene)
-        if self._size_px is not None:
-            view = View(view.intrinsics.letterbox(self._size_px).inner, view.position_m, view.rotation)
-        return scene, view, render(scene, view, self.look, self._counts[name])
+        return scene, *self._picture(name, scene)
 
     def frame(self, name: str, now_ns: int) -> Frame:
         """The next frame of camera ``name``; KeyError when the profile has none of that name."""
+        return self.shoot(name, self.scene(name), now_ns)
+
+    def shoot(self, name: str, scene: Scene, now_ns: int) -> Frame:
+        """The next frame of camera ``name`` of a scene that was to be seen at ``now_ns``."""
         camera = self._profile.cameras[name]
-        _, view, picture = self.picture(name)
+        view, picture = self._picture(name, scene)
         rgb, pin = picture.rgb, view.intrinsics
         depth = self._noise[name].apply(picture, pin, self._counts[name])
         self._counts[name] += 1
@@ -109,3 +112,9 @@ class CameraRig:
             depth, rgb, pin = box.pad(depth, np.nan), box.pad(rgb, 0), box.outer
         mount = Mount(camera.link, camera.position_m, camera.rpy_rad)
         return Frame(name, now_ns, rgb, depth, pin, mount, view.position_m, view.rotation)
+
+    def _picture(self, name: str, scene: Scene) -> tuple[View, Picture]:
+        view = self.view(name, scene)
+        if self._size_px is not None:
+            view = View(view.intrinsics.letterbox(self._size_px).inner, view.position_m, view.rotation)
+        return view, render(scene, view, self.look, self._counts[name])

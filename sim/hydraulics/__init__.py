@@ -108,6 +108,15 @@ class Hydraulics:
         return float(total.sum() / (2.0 * self._bulk_pa))
 
     @property
+    def relief_pa(self) -> float:
+        """Pressure that the pump gives at most; set lower, the supply breaks down."""
+        return float(self._pump["relief"][0])
+
+    @relief_pa.setter
+    def relief_pa(self, value: float) -> None:
+        self._pump["relief"][0] = value
+
+    @property
     def peak_pa(self) -> float:
         """Highest chamber pressure since the start."""
         return float(self._balance["peak"][0])

@@ -123,6 +123,16 @@ class EstopBox(Device):
         self._wants_reset = self._changed = False
         self.pilot_on = True
 
+    @property
+    def channels(self) -> tuple[int, int]:
+        """The two contacts: 1 closed (released), 0 open (pressed)."""
+        return self._channels
+
+    @property
+    def reset_pressed(self) -> bool:
+        """Whether the reset button is down."""
+        return self._reset_until_ns is not None
+
     def press(self) -> None:
         """Both contacts open; the pilot supply drops at once and stays off until ``reset``."""
         self._channels, self._source, self.pilot_on = (0, 0), 1, False

@@ -17,7 +17,7 @@ from canopen.objectdictionary import ODVariable
 
 import can_dbc
 from can_dbc.canopen import NMT_ID, SDO_TO_SERVER
-from machine.encoder import counts_from_position
+from machine.encoder import counts_from_position, position_from_counts
 from machine.profile import Encoder
 from sim.nodes import Outbox
 from sim.truth import EncoderTruth
@@ -98,6 +98,11 @@ class EncoderNode:
         self._history.append(position)
         self._now_ns = now_ns
         self._speed = speed
+
+    def measure(self, now_ns: int) -> float:
+        """The position it reads now, with all its errors [rad or m]."""
+        self._sample(now_ns)
+        return position_from_counts(self.spec, self._values[0x6004, 0])
 
     def tick(self, now_ns: int) -> None:
         """Boot after power-on or NMT reset."""

@@ -80,7 +80,12 @@ class ValveNode(Device):
     """``outputs_pct`` are the spool commands now, in FUNCTIONS order; ``sense`` reads the node's inputs."""
 
     def __init__(
-        self, database: Database, outbox: Outbox, pilot_on: Callable[[], bool], sense: Callable[[], Measured]
+        self,
+        database: Database,
+        outbox: Outbox,
+        pilot_on: Callable[[], bool],
+        sense: Callable[[], Measured],
+        cycle_ns: int = CYCLE_NS,
     ) -> None:
         super().__init__(0x10, outbox)
         self._pilot_on, self._sense = pilot_on, sense
@@ -89,7 +94,7 @@ class ValveNode(Device):
         self._fb_a, self._fb_b, self._grapple_stat, self._plc = (
             ProtectedMessage(database, n) for n in ("ValveFbA", "ValveFbB", "GrappleStat", "PlcStatus")
         )
-        self._fast, self._slow = Every(CYCLE_NS), Every(SLOW_NS, phase_ns=MS)
+        self._fast, self._slow = Every(cycle_ns), Every(SLOW_NS, phase_ns=MS)
         self._watchdog = 0
         self._grapple = GrappleState.UNKNOWN
         self.restart()

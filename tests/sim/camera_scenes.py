@@ -3,7 +3,8 @@
 import math
 import random
 
-from sim.camera.geometry import look_at, pinhole
+from machine.optics import pinhole
+from sim.camera.geometry import look_at
 from sim.camera.scene import BUNK, CRANE, Ground, LogPose, Scene, SceneBuilder
 
 LENS = pinhole(320, 240, math.radians(80.0))

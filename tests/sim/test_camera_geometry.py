@@ -8,16 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from machine.load import load_profile
-from sim.camera.geometry import (
-    Intrinsics,
-    intrinsics,
-    look_at,
-    mount_view,
-    orbit,
-    pinhole,
-    quaternion_matrix,
-    rpy_matrix,
-)
+from machine.optics import Intrinsics, intrinsics, pinhole, rpy_matrix
+from sim.camera.geometry import look_at, mount_view, orbit, quaternion_matrix
 from sim.shape import rpy_quaternion
 
 angles = st.floats(-1.5, 1.5)

@@ -6,7 +6,7 @@ from camera_scenes import ABOVE, log, site
 from msgspec.structs import replace
 
 from machine.load import load_profile
-from sim.camera.geometry import Intrinsics
+from machine.optics import Intrinsics
 from sim.camera.noise import StereoNoise
 from sim.camera.render import Picture, render
 from sim.camera.scene import Ground, SceneBuilder

@@ -7,7 +7,8 @@ import pytest
 from msgspec.structs import replace
 
 from machine.load import load_profile
-from sim.camera.geometry import intrinsics, mount_view
+from machine.optics import intrinsics
+from sim.camera.geometry import mount_view
 from sim.camera.rig import CameraRig
 from sim.camera.scene import BUNK, CRANE, WorldScenes
 from sim.camera.tiny import TinyRenderer

@@ -10,8 +10,11 @@ import pytest
 from carrier_rig import GRAVITY, PROFILE, STEP_S, Rig, carrier_truth
 
 from machine import carrier as geometry
-from sim.carrier import PARKED, Drive
+from sim.carrier import PARKED, Drive, carrier_links
 from sim.terrain import SIDE_SLOPE, Terrain
+from sim.truth import load_truth
+
+pytestmark = pytest.mark.computed
 
 C = PROFILE.carrier
 CRUISE = Drive(C.cruise_speed_m_s)
@@ -41,6 +44,15 @@ def test_frames_agree_with_the_profile(rig):
     axle = r.carrier.front_axle()
     assert math.dist(axle[:2], (3.0, -2.0)) == pytest.approx(ahead)
     assert math.atan2(axle[1] + 2.0, axle[0] - 3.0) == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_part_has_an_inertia_that_bodies_cannot_have(seed):
+    """Bullet drops the whole inertia of a part whose largest exceeds the sum of the others, by rounding even."""
+    links, _ = carrier_links(PROFILE, load_truth("sampled", seed, PROFILE.name))
+    for link in links:
+        least, middle, most = sorted(link.inertia_kg_m2)
+        assert most < 0.9999 * (least + middle), link.name
 
 
 def test_wheel_loads_are_the_lever_rule(rig):
@@ -132,6 +144,7 @@ def test_coasting_only_loses_speed_to_rolling_resistance(rig):
     assert (speeds[0] - speeds[2]) / (400 * STEP_S) == pytest.approx(wanted, rel=0.05)
 
 
+@pytest.mark.slow
 def test_parked_machine_stays(rig):
     r = rig()
     r.run(6.0)
@@ -161,6 +174,7 @@ def _slew(r: Rig, seconds: float, since: float) -> None:
         r.step()
 
 
+@pytest.mark.slow
 def test_parked_machine_creeps_less_than_a_twentieth_of_a_millimetre_a_second_while_the_crane_slews(rig):
     r, cycle = rig(), 2 * math.pi / 0.8
     r.run(2.0)

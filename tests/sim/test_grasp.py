@@ -29,6 +29,8 @@ def attempt(seed: int, across_m: float = 0.0, turned_rad: float = 0.0):
     return w, judge, driver
 
 
+@pytest.mark.computed
+@pytest.mark.slow
 def test_a_log_is_grasped_carried_and_laid_into_the_bunk():
     w, judge, driver = attempt(403)
     held = judge.verdict()
@@ -43,6 +45,8 @@ def test_a_log_is_grasped_carried_and_laid_into_the_bunk():
     w.close()
 
 
+@pytest.mark.computed
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "least_m", "most_m"), [(423, 0.0, 0.13), (2, 0.29, 0.31)])
 def test_thin_and_thick_logs_are_scooped_up_held_and_let_go(seed, least_m, most_m):
     w, judge, driver = attempt(seed)

@@ -17,6 +17,8 @@ from sim.shape import UNIT
 from sim.terrain import Terrain
 from sim.truth import load_truth
 
+pytestmark = pytest.mark.computed
+
 MACHINES = ("palms_471", "aoro_fc8")
 PROFILES = {name: load_profile(name) for name in MACHINES}
 TRUTHS = {name: load_truth("nominal", 0, name) for name in MACHINES}
@@ -161,6 +163,26 @@ def test_a_touch_wakes_a_sleeping_log(stands):
     assert stand.fastest(0.6) > 0.05
 
 
+def test_ground_that_sleeps_carries_logs_as_ground_awake_does(stands):
+    """To the bit: while both sleep Bullet works out no contacts, and when a log is touched they are as they were."""
+    ways = []
+    for awake in (False, True):
+        stand = Stand(of("pile", 1, 2))
+        stands.append(stand)
+        p = stand.client
+        if awake:
+            state = p.ACTIVATION_STATE_DISABLE_SLEEPING | p.ACTIVATION_STATE_WAKE_UP
+            p.changeDynamics(stand.terrain.body, -1, activationState=state)
+        assert stand.fastest(0.1) == 0.0
+        x, y, z = stand.yard.states()[0].position_m
+        shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.1, 0.1, 0.1])
+        p.createMultiBody(80.0, shape, basePosition=[x, y + 0.05, z + 0.6])
+        assert stand.fastest(0.6) > 0.05
+        ways.append([p.getBasePositionAndOrientation(log) for log in stand.yard.logs])
+    assert ways[0] == ways[1]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("machine", MACHINES)
 def test_a_full_bunk_holds_its_logs(stands, machine):
     stand = Stand(of("bunk", 1, 20, machine), machine)
@@ -174,6 +196,7 @@ def test_a_full_bunk_holds_its_logs(stands, machine):
         assert b.floor_z_m + log.diameter_m / 2 - 0.02 < z < b.floor_z_m + b.stake_height_m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rough", "slope"])
 def test_logs_lie_on_uneven_ground(stands, kind):
     stand = Stand(of("row", 0, 3, "aoro_fc8"), "aoro_fc8", kind)

@@ -260,6 +260,8 @@ def test_what_the_page_asks_for_fits_into_a_datagram(terrain):
     bench.plant.close()
 
 
+@pytest.mark.computed
+@pytest.mark.slow
 def test_equal_seeds_give_equal_bytes():
     def digest(seed):
         b = Bench(seed)

@@ -84,6 +84,16 @@ def test_requests_show_the_truth_and_press_the_button(live):
     assert not thread.is_alive() and shell.report()["time_s"] > 0.0
 
 
+def test_a_surveyor_reads_the_pin_with_millimetres_of_noise(live):
+    _, _, udp, _ = live
+    tip = ask(udp, "state")["tip_m"]
+    readings = [ask(udp, "survey")["pin_m"] for _ in range(20)]
+    assert all(abs(a - b) < 0.02 for pin in readings for a, b in zip(pin, tip, strict=True))
+    assert len({tuple(pin) for pin in readings}) == 20, "every reading has noise of its own"
+    mean = [sum(axis) / 20 for axis in zip(*readings, strict=True)]
+    assert all(abs(a - b) < 0.003 for a, b in zip(mean, tip, strict=True))
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [

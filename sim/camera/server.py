@@ -1,0 +1,122 @@
+"""The plant's cameras on a local socket (``can_dbc.rgbd``): pictures are drawn only when somebody asks.
+
+The plant's loop gives away what there is to see, which takes no longer than a few steps; drawing and sending are done
+by a thread of each client, so that no client delays the machine's time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import socket
+import threading
+from typing import Protocol
+
+import numpy as np
+
+from can_dbc.rgbd import MM_M, QUESTION, RgbdError, RgbdFrame, encode, encode_refusal, question_bytes
+from sim.camera.rig import Frame
+from sim.camera.scene import Scene
+
+ANSWER_S = 1.0  # a client waits so long for the plant's loop
+CLIENTS = 4
+
+
+class Rig(Protocol):
+    """What is needed of a ``CameraRig``."""
+
+    names: tuple[str, ...]
+
+    def scene(self, name: str) -> Scene: ...
+
+    def shoot(self, name: str, scene: Scene, now_ns: int) -> Frame: ...
+
+
+class CameraServer:
+    """Serves the cameras of ``rig`` on a TCP port of the loopback interface (0: any free one, see ``port``).
+
+    Call ``serve`` from the loop that owns the world; ``close`` at the end.
+
+    Raises:
+        OSError: the port cannot be had.
+    """
+
+    def __init__(self, rig: Rig, port: int) -> None:
+        self._rig, self._drawing = rig, threading.Lock()
+        self._waiting: queue.SimpleQueue[tuple[str, queue.SimpleQueue[tuple[Scene, int]]]] = queue.SimpleQueue()
+        self._listener = socket.create_server(("127.0.0.1", port))
+        self.port: int = self._listener.getsockname()[1]
+        self._room = threading.Semaphore(CLIENTS)
+        self._clients: set[socket.socket] = set()
+        threading.Thread(target=self._listen, daemon=True, name="cameras").start()
+
+    def serve(self, now_ns: int) -> None:
+        """Give what there is to see now to those who wait for it."""
+        while True:
+            try:
+                name, answer = self._waiting.get_nowait()
+            except queue.Empty:
+                return
+            answer.put((self._rig.scene(name), now_ns))
+
+    def close(self) -> None:
+        """Hang up."""
+        for sock in (self._listener, *tuple(self._clients)):
+            with contextlib.suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
+            sock.close()
+
+    def _listen(self) -> None:
+        while True:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return
+            if not self._room.acquire(blocking=False):
+                client.close()
+                continue
+            self._clients.add(client)
+            threading.Thread(target=self._talk, args=(client,), daemon=True, name="camera client").start()
+
+    def _talk(self, client: socket.socket) -> None:
+        try:
+            with client:
+                while True:
+                    name = _read(client, question_bytes(_read(client, QUESTION.size))).decode(errors="replace")
+                    client.sendall(self._answer(name))
+        except (OSError, RgbdError):
+            return  # whoever talks nonsense is hung up on
+        finally:
+            self._clients.discard(client)
+            self._room.release()
+
+    def _answer(self, name: str) -> bytes:
+        if name not in self._rig.names:
+            return encode_refusal("none", f"no camera {name!r}; there are: {', '.join(self._rig.names) or 'none'}")
+        answer: queue.SimpleQueue[tuple[Scene, int]] = queue.SimpleQueue()
+        self._waiting.put((name, answer))
+        try:
+            scene, now_ns = answer.get(timeout=ANSWER_S)
+        except queue.Empty:
+            return encode_refusal(name, f"the plant did not answer within {ANSWER_S:g} s; does it run?")
+        with self._drawing:
+            frame = self._rig.shoot(name, scene, now_ns)
+        return encode(on_the_wire(frame))
+
+
+def on_the_wire(frame: Frame) -> RgbdFrame:
+    """A frame as it is sent: depth in whole millimetres, no true pose."""
+    pin, depth = frame.intrinsics, np.nan_to_num(frame.depth_m * np.float32(MM_M), nan=0.0)
+    millimetres = np.clip(np.rint(depth), 0, 65535).astype("<u2")
+    size = (pin.width_px, pin.height_px, pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px)
+    return RgbdFrame(frame.name, frame.stamp_ns, *size, frame.rgb.tobytes(), millimetres.tobytes())
+
+
+def _read(client: socket.socket, count: int) -> bytes:
+    data = b""
+    while len(data) < count:
+        chunk = client.recv(count - len(data))
+        if not chunk:
+            raise ConnectionError
+        data += chunk
+    return data

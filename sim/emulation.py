@@ -1,0 +1,258 @@
+"""The emulated CAN nodes of a whole machine around any world that moves: what physics and a calibration rig share.
+
+``EmulatedMachine.step(now_ns, received)`` advances its world on a grid of steps, which starts at the first call's
+``now_ns``, up to ``now_ns``; frames of either bus are delivered at their own stamps between the steps, so a SYNC is
+answered at once, with the state of the last step.  Returned are the frames sent meanwhile, with their buses.  No clock,
+no socket; equal inputs and seed give equal bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from can_dbc.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
+from can_dbc.codec import load
+from can_dbc.frame import Frame
+from machine.carrier import ARMS, height_from_arm_angle
+from machine.profile import Encoder, Profile
+from sim.nodes import Outbox
+from sim.nodes.arms import ArmNode
+from sim.nodes.device import Device, EstopBox, PressureModule
+from sim.nodes.encoder import EncoderBus, EncoderNode, VirtualNetwork
+from sim.nodes.engine import EngineNode
+from sim.nodes.gnss import GnssNode
+from sim.nodes.imu import ImuNode
+from sim.nodes.traffic import MS
+from sim.nodes.valve import CYCLE_NS, FUNCTIONS, Measured, ValveNode
+from sim.nodes.vehicle import VehicleNode
+from sim.truth import Truth
+
+SENSE_NS = 10 * MS
+"""How often the carrier's own sensors are read."""
+
+
+class Surroundings(Protocol):
+    """What the nodes feel of a world: joints by name, oil, and the carrier (None on a machine without one)."""
+
+    truth: Truth
+    hydraulics: Any
+    carrier: Any
+
+    @property
+    def q(self) -> Mapping[str, float]: ...
+    @property
+    def qd(self) -> Mapping[str, float]: ...
+    @property
+    def opening(self) -> float: ...
+    def load_kg(self) -> float: ...
+    def lean_rad(self) -> tuple[float, float]: ...
+
+
+class EmulatedMachine(ABC):
+    """All nodes of a machine.  ``estop`` is the operator's box.
+
+    ``vehicle_node``, ``arms``, ``engine`` and ``gnss`` are None on a machine without carrier, ``imu`` where the profile
+    has none.  ``cycle_ns`` is the
+    period of the valve node's feedback and of the fast pressures.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        facts: Truth,
+        seed: int,
+        world: Surroundings,
+        step_ns: int,
+        cycle_ns: int = CYCLE_NS,
+    ) -> None:
+        self.profile = profile
+        self._surroundings = world
+        self._step_ns, self._sense_steps = step_ns, max(1, SENSE_NS // step_ns)
+        self._time_ns: int | None = None
+        self._steps = 0
+        self._pressures_of = -1
+        self._received = {profile.crane_bus: self._deliver_crane, profile.machine_bus: self._deliver_machine}
+        self._crane_out: Outbox = []
+        self._machine_out: Outbox = []
+        self._place_crane_nodes(facts, seed, cycle_ns)
+        self.vehicle_node: VehicleNode | None = None
+        self.arms: ArmNode | None = None
+        self.engine: EngineNode | None = None
+        self.gnss: GnssNode | None = None
+        self._machine_nodes: tuple[VehicleNode | ArmNode | EngineNode | GnssNode, ...] = ()
+        if world.carrier is not None:
+            self._place_machine_nodes(facts, seed, world.carrier)
+        self._measure(0)
+
+    def _place_crane_nodes(self, facts: Truth, seed: int, cycle_ns: int) -> None:
+        database, out = load("crane"), self._crane_out
+        self.estop = EstopBox(database, out)
+        self.valve = ValveNode(database, out, self._pilot_on, self._sense_valves, cycle_ns)
+        spec = self.profile.imu
+        self.imu = None if spec is None else ImuNode(spec, database, out, self._step_ns, seed)
+        self._devices: tuple[Device, ...] = (
+            self.estop,
+            self.valve,
+            PressureModule(0x20, "PressA", cycle_ns, database, out, lambda: self._chambers("lift", "tilt")),
+            PressureModule(0x21, "PressB", cycle_ns, database, out, lambda: self._chambers("ext", "slew")),
+            PressureModule(0x22, "PressC", 20 * MS, database, out, self._grapple_pressures),
+            *([] if self.imu is None else [self.imu]),
+        )
+        specs: dict[str, Encoder] = {n: s.encoder for n, s in self.profile.joints.items() if s.encoder is not None}
+        if self.profile.carrier is not None:
+            specs["articulation"] = self.profile.carrier.articulation_encoder
+        network, step_ns = VirtualNetwork(out), self._step_ns
+        self.encoders = {
+            name: EncoderNode(name, spec, facts.encoders[name], step_ns, seed, network) for name, spec in specs.items()
+        }
+        self._encoder_bus = EncoderBus(self.encoders, network)
+
+    def _place_machine_nodes(self, facts: Truth, seed: int, carrier: Any) -> None:
+        spec, out = self.profile.carrier, self._machine_out
+        if spec is None or facts.gnss is None:
+            raise ValueError(f"the truth of {self.profile.name} needs a [gnss] table; add it to the truth file")
+        machine = load("machine")
+        self.vehicle_node = VehicleNode(machine, out, spec, self._pilot_on)
+        self.arms = ArmNode(machine, out, self._pilot_on)
+        self.engine = EngineNode(machine, out)
+        self.gnss = GnssNode(machine, load("gnss"), out, spec, facts.gnss, seed, lambda: carrier.pose("front"))
+        self._machine_nodes = (self.vehicle_node, self.arms, self.engine, self.gnss)
+
+    def _pilot_on(self) -> bool:
+        return self.estop.pilot_on
+
+    @abstractmethod
+    def _move(self, now_ns: int) -> None:
+        """One step of the world, which ends at ``now_ns``."""
+
+    def step(self, now_ns: int, received: list[tuple[str, Frame]]) -> list[tuple[str, int, bytes]]:
+        """Advance to ``now_ns``; ``received`` are (bus, frame) sent by others since, stamps up to ``now_ns``."""
+        if self._time_ns is None:
+            self._time_ns = now_ns
+            self._tick(now_ns)
+        for bus, frame in sorted((pair for pair in received if pair[0] in self._received), key=_stamp):
+            stamp_ns = max(self._time_ns, min(now_ns, frame.stamp_ns))
+            self._advance(stamp_ns)
+            self._received[bus](frame.key, frame.data, stamp_ns)
+        self._advance(now_ns)
+        crane, machine = self.profile.crane_bus, self.profile.machine_bus or ""
+        sent = [(crane, key, data) for key, data in self._crane_out]
+        sent += [(machine, key, data) for key, data in self._machine_out]
+        self._crane_out.clear()
+        self._machine_out.clear()
+        return sent
+
+    @property
+    def next_ns(self) -> int:
+        """When the next step is due; 0 before the first ``step``."""
+        return 0 if self._time_ns is None else self._time_ns + self._step_ns
+
+    @property
+    def time_s(self) -> float:
+        """Physical time that has passed [s]."""
+        return self._steps * self._step_ns * 1e-9
+
+    def _advance(self, until_ns: int) -> None:
+        """Steps that end at or before ``until_ns``."""
+        assert self._time_ns is not None
+        while self._time_ns + self._step_ns <= until_ns:
+            self._time_ns += self._step_ns
+            self._steps += 1
+            self._move(self._time_ns)
+            self._measure(self._time_ns)
+            self._tick(self._time_ns)
+
+    def _spools(self, now_ns: int) -> list[float]:
+        """What the nodes do to the valves in this step, -1..1: `FUNCTIONS`, then steering and `ARMS`."""
+        self.valve.decide(now_ns)
+        commands = [u / 100.0 for u in self.valve.outputs_pct]
+        if self.vehicle_node is not None and self.arms is not None:
+            self.vehicle_node.decide(now_ns)
+            self.arms.decide(now_ns)
+            commands += [self.vehicle_node.steer, *self.arms.spools]
+        return commands
+
+    def _measure(self, now_ns: int) -> None:
+        """Let the sensors with a memory feel the present state."""
+        q, qd = self._surroundings.q, self._surroundings.qd
+        for name, encoder in self.encoders.items():
+            encoder.observe(now_ns, q[name], qd[name])
+        if self.imu is not None:
+            self.imu.observe(self._surroundings.lean_rad())
+        if self._machine_nodes and self._steps % self._sense_steps == 0:
+            self._measure_carrier()
+
+    def _sense_valves(self) -> Measured:
+        """What the PLC's inputs show now."""
+        w, h = self._surroundings, self._surroundings.hydraulics
+        spools, (opening, closing) = h.spools, self._pressures()["grapple"]
+        return Measured(
+            spools=tuple(spools[name] for name in FUNCTIONS),
+            flow_limited=h.flow_limited,
+            opening=w.opening if self.profile.grapple.opening_sensor else None,
+            clamp_bar=closing / 1e5,
+            release_bar=opening / 1e5,
+            load_kg=w.load_kg(),
+            rot_deg=math.degrees(math.remainder(w.q["rot"], math.tau)) if "rot" in self.encoders else None,
+        )
+
+    def _chambers(self, first: str, second: str) -> tuple[float, ...]:
+        pressures = self._pressures()
+        return (*pressures[first], *pressures[second])
+
+    def _pressures(self) -> dict[str, tuple[float, float]]:
+        """Chambers of every function [Pa]; made once a step, for three nodes ask."""
+        if self._pressures_of != self._steps:
+            self._pressures_of, self._pressures_pa = self._steps, self._surroundings.hydraulics.pressures_pa
+        return self._pressures_pa
+
+    def _grapple_pressures(self) -> tuple[float, ...]:
+        """Pump, tank, closing and opening side of the grapple."""
+        w = self._surroundings
+        opening, closing = self._pressures()["grapple"]
+        return (w.hydraulics.supply_pa, w.truth.supply.tank_pa, closing, opening)
+
+    def _measure_carrier(self) -> None:
+        """The carrier's own sensors: wheel speeds, articulation, arm heights, inclination, hydraulic power."""
+        w, spec = self._surroundings, self.profile.carrier
+        vehicle, arms, engine = self.vehicle_node, self.arms, self.engine
+        assert spec and w.carrier and vehicle and arms and engine
+        vehicle.speed_m_s = engine.speed_m_s = float(sum(w.carrier.wheel_speeds_rad_s)) / 4.0 * spec.wheel_radius_m
+        vehicle.articulation_rad = w.q["articulation"]
+        middle = spec.arm_travel_m / 2.0
+        arms.heights_mm = tuple(1e3 * (height_from_arm_angle(spec, w.q[arm]) - middle) for arm in ARMS)
+        roll, pitch, _ = w.carrier.attitude("rear")
+        arms.roll_deg, arms.pitch_deg = math.degrees(roll), -math.degrees(pitch)
+        engine.energy_j, engine.brake = w.hydraulics.energy_j, vehicle.brake
+
+    def _tick(self, now_ns: int) -> None:
+        self._encoder_bus.tick(now_ns)
+        for device in self._devices:
+            device.tick(now_ns)
+        for node in self._machine_nodes:
+            node.tick(now_ns)
+
+    def _deliver_crane(self, key: int, data: bytes, now_ns: int) -> None:
+        if key == SYNC_ID:
+            self._encoder_bus.sync(now_ns)
+            self.valve.sync(now_ns)
+            return
+        if key == NMT_ID:
+            for device in self._devices:
+                device.receive_nmt(data)
+        elif SDO_TO_SERVER < key <= SDO_TO_SERVER + 0x7F:
+            for device in self._devices:
+                device.receive_sdo(key, data)
+        self._encoder_bus.receive(key, data, now_ns)
+        self.valve.receive(key, data, now_ns)
+
+    def _deliver_machine(self, key: int, data: bytes, now_ns: int) -> None:
+        for node in self._machine_nodes:
+            node.receive(key, data, now_ns)
+
+
+def _stamp(received: tuple[str, Frame]) -> int:
+    return received[1].stamp_ns

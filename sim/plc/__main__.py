@@ -1,0 +1,140 @@
+"""The live plant behind a PLC: ``python -m sim.plc --profile P --modbus 127.0.0.1:1502 --udp 127.0.0.1:1503``.
+
+As ``python -m sim``, without CAN: the emulated PLC reads the sensors and drives the valves, and is commanded over
+Modbus/TCP or cyclic UDP, in the role that the profile's [plc] gives it.  ``--port`` answers the same JSON requests.  On
+stdout ``ready`` with the ports in use.  Loopback only unless ``--allow-network`` is given.  Exit codes: 0 stopped, 2
+usage, 3 profile or truth, 4 an address that cannot be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import gc
+import signal
+import sys
+from dataclasses import asdict
+
+import msgspec
+
+from can_dbc.plc.map import Role, WordOrder
+from can_dbc.plc.modbus import LinkError, ModbusServer, is_loopback
+from can_dbc.setpoint import udp_address
+from machine.load import ProfileError, load_profile
+from sim.__main__ import LivePlant
+from sim.plc.plant import PlcPlant
+from sim.plc.server import Address, Datagrams, listen, serve
+
+
+class LivePlc(LivePlant):
+    """A plant and its PLC on the monotonic clock; the network is served between the physics' steps."""
+
+    def __init__(self, plant: PlcPlant, port: int | None, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__(plant, {}, port)
+        self._loop = loop
+        self._program = plant.plc
+        self._now_ns = 0
+        self.modbus: ModbusServer | None = None
+        self.datagrams: Datagrams | None = None
+
+    def clock_ns(self) -> int:
+        """The plant's time."""
+        return self._now_ns
+
+    def open(self, modbus: Address | None, udp: Address | None) -> dict[str, int]:
+        """Listens; the ports in use.  Raises LinkError."""
+        ports = {}
+        if modbus is not None:
+            self.modbus = self._loop.run_until_complete(serve(self._program, modbus, self.clock_ns))
+            ports["modbus"] = self.modbus.port
+        if udp is not None:
+            self.datagrams = self._loop.run_until_complete(listen(self._program, udp, self.clock_ns))
+            ports["udp"] = self.datagrams.port
+        return ports
+
+    def _stepped(self, now_ns: int) -> None:
+        self._now_ns = now_ns
+        if self.datagrams is not None:
+            self.datagrams.cycle()
+        self._loop.run_until_complete(asyncio.sleep(0))
+        super()._stepped(now_ns)
+
+    def _wait(self, pause_s: float) -> None:
+        self._loop.run_until_complete(asyncio.sleep(pause_s))
+
+    def report(self) -> dict[str, float]:
+        """Also what came over the network."""
+        gate = self._program.gate
+        counts = {"accepted": gate.accepted, "refused": gate.refused, "dropped": gate.dropped}
+        return super().report() | counts | (asdict(self.modbus.counts) if self.modbus else {})
+
+    def close(self) -> None:
+        """Ends listening."""
+        for server in (self.modbus, self.datagrams):
+            if server is not None:
+                server.close()
+        self._loop.run_until_complete(asyncio.sleep(0))
+
+
+def _address(text: str) -> Address:
+    try:
+        return udp_address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _listening(text: str) -> Address:
+    host, _, port = text.rpartition(":")
+    return (udp_address(f"{host}:1")[0], 0) if port == "0" and host else _address(text)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m sim.plc", description="The live plant behind an emulated PLC.")
+    parser.add_argument("--profile", required=True, help="shipped profile name or TOML file with a [plc] table")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--truth", default="nominal", help="nominal, sampled or a TOML file")
+    parser.add_argument("--logs", type=int, default=1)
+    parser.add_argument("--modbus", type=_listening, metavar="HOST:PORT", help="Modbus/TCP; port 0 takes a free one")
+    parser.add_argument("--udp", type=_listening, metavar="HOST:PORT", help="cyclic datagrams; port 0 takes a free one")
+    parser.add_argument("--word-order", choices=("high", "low"), default="high", help="first half of 32 bits")
+    parser.add_argument("--allow-network", action="store_true", help="listen on an address that others can reach")
+    parser.add_argument("--port", type=int, help="UDP port on the loopback interface for JSON requests")
+    options = parser.parse_args(arguments)
+    if options.modbus is None and options.udp is None:
+        parser.error("give --modbus HOST:PORT, --udp HOST:PORT or both")
+    for asked in (options.modbus, options.udp):
+        if asked and not options.allow_network and not is_loopback(asked[0]):
+            parser.error(f"{asked[0]} can be reached by others, and nothing is authenticated; give --allow-network")
+    loop = asyncio.new_event_loop()
+    try:
+        profile = load_profile(options.profile)
+        if profile.plc is None:
+            raise ProfileError(f"{profile.name} has no PLC; add [plc] with a role to the profile")
+        role = Role.REFERENCES if profile.plc.role == "references" else Role.VALVES
+        order = WordOrder.HIGH_FIRST if options.word_order == "high" else WordOrder.LOW_FIRST
+        plant = PlcPlant(profile, options.seed, options.truth, options.logs, role=role, order=order)
+        live = LivePlc(plant, options.port, loop)
+        ports = live.open(options.modbus, options.udp)
+        signal.signal(signal.SIGTERM, live.stop)
+        signal.signal(signal.SIGINT, live.stop)
+        gc.collect()
+        gc.freeze()
+        sys.stdout.write(msgspec.json.encode({"ready": ports}).decode() + "\n")
+        sys.stdout.flush()
+        live.run()
+        live.close()
+        sys.stderr.write(f"plc: {msgspec.json.encode(live.report()).decode()}\n")
+    except (ProfileError, ValueError) as error:
+        sys.stderr.write(f"plc: {error}\n")
+        return 3
+    except (LinkError, OSError) as error:
+        sys.stderr.write(f"plc: {error}\n")
+        return 4
+    finally:
+        loop.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

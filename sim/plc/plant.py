@@ -1,0 +1,66 @@
+"""The plant whose valves a PLC drives: the same physics and sensors as `sim.plant.Plant`, wired to the PLC's cards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from can_dbc.frame import Frame
+from can_dbc.plc.map import Estop, Role, State, WordOrder
+from machine.joints import JOINTS
+from machine.profile import Profile
+from sim.plant import Plant
+from sim.plc.program import Inputs, Program
+from sim.scene import LogSpec
+
+PA_PER_BAR = 1e5
+
+
+class PlcPlant(Plant):
+    """A machine on a fixed base behind a PLC, without any CAN bus; ``plc`` is its program."""
+
+    def __init__(
+        self,
+        profile: Profile,
+        seed: int = 0,
+        truth: str = "nominal",
+        logs: int = 1,
+        *,
+        role: Role,
+        order: WordOrder = WordOrder.HIGH_FIRST,
+        scene: str | Sequence[LogSpec] | None = None,
+    ) -> None:
+        if profile.carrier is not None:
+            raise ValueError(f"{profile.name} drives; the emulated PLC moves a crane on a fixed base, as palms_471")
+        self.plc = Program(profile, role, self._inputs, order)
+        super().__init__(profile, seed, truth, logs, scene=scene)
+
+    def step(self, now_ns: int, received: list[tuple[str, Frame]]) -> list[tuple[str, int, bytes]]:
+        """Advance to ``now_ns``; there is no bus, so nothing is heard and nothing said."""
+        super().step(now_ns, [])
+        return []
+
+    def _spools(self, now_ns: int) -> list[float]:
+        return list(self.plc.scan(now_ns))
+
+    def _tick(self, now_ns: int) -> None:
+        self.estop.tick(now_ns)
+
+    def _commanded(self) -> bool:
+        return self.plc.state is State.EXECUTE
+
+    def _inputs(self, now_ns: int) -> Inputs:
+        """What the PLC's cards read; an encoder is read as it would answer on its bus."""
+        pressures = self._pressures()
+        lift, tilt, ext = (pressures[name] for name in ("lift", "tilt", "ext"))
+        opening, closing = pressures["grapple"]
+        channels = self.estop.channels
+        estop = Estop.CHANNEL_A * (channels[0] == 1) | Estop.CHANNEL_B * (channels[1] == 1)
+        estop |= Estop.PILOT_ON * self.estop.pilot_on | Estop.RESET_PRESSED * self.estop.reset_pressed
+        names = [j.name.lower() for j in JOINTS]
+        return Inputs(
+            positions=tuple(self.encoders[n].measure(now_ns) if n in self.encoders else None for n in names),
+            pressure_bar=tuple(p / PA_PER_BAR for p in (*lift, *tilt, *ext, closing, opening)),
+            opening=self.world.opening,
+            load_kg=self.world.load_kg(),
+            estop=estop,
+        )

@@ -1,0 +1,163 @@
+"""The PLC program: every 10 ms read inputs, judge the command, set the valves; safe by absence.
+
+Pure: ``scan(now_ns)``.  HOLD is neutral; a command that is armed and at most 50 ms old makes it EXECUTE; older than
+that it ramps to neutral within 40 ms and holds.  A missing sign of life for the watchdog's time (300 ms), or an open
+emergency stop, makes it SAFE at once, and only a reset edge of a command that is not armed ends that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from can_dbc.plc import map as plc
+from can_dbc.plc.map import N_JOINTS, Bounds, Estop, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
+from machine.joints import JOINTS
+from machine.profile import Profile, joint
+from sim.plc.gate import MS, Gate
+from sim.plc.law import Pd
+
+CYCLE_NS = 10 * MS
+LAW_CYCLES = 2  # the joint law runs at 50 Hz
+HOLD_NS = 50 * MS
+RAMP_NS = 40 * MS
+HOLD_SHARE = -0.2  # a held grapple keeps a little closing flow, so that its pressure stays
+MAY_MOVE = Estop.CHANNEL_A | Estop.CHANNEL_B | Estop.PILOT_ON
+
+
+@dataclass(slots=True)
+class Inputs:
+    """What the PLC's input cards show: joint positions (None without encoder), pressures, grapple, emergency stop."""
+
+    positions: tuple[float | None, ...]
+    pressure_bar: tuple[float, ...]
+    opening: float
+    load_kg: float
+    estop: int
+
+
+def bounds_of(profile: Profile, role: Role) -> Bounds:
+    """What a command may hold on this machine."""
+    if role is Role.VALVES:
+        return Bounds.valves()
+    specs = [joint(profile, j) for j in JOINTS]
+    return Bounds.references([(s.lower, s.upper, s.speed_limit) for s in specs])
+
+
+class Program:
+    """The PLC: ``gate`` takes commands, ``outputs`` are the valves' openings -1..1 (five joints, grapple)."""
+
+    def __init__(
+        self, profile: Profile, role: Role, inputs: Callable[[int], Inputs], order: WordOrder = WordOrder.HIGH_FIRST
+    ) -> None:
+        self.gate = Gate(bounds_of(profile, role), order)
+        self.state = State.INIT
+        self.outputs = [0.0] * (N_JOINTS + 1)
+        self.feedback = Feedback()
+        self._inputs = inputs
+        self._laws = [Pd(joint(profile, j)) for j in JOINTS]
+        self._next_ns = self._measured_ns = 0
+        self._cycles = self._longest_us = 0
+        self._lost_ns: int | None = None
+        self._from = list(self.outputs)
+
+    def scan(self, now_ns: int) -> list[float]:
+        """The outputs at ``now_ns``; a cycle runs when it is due."""
+        if now_ns >= self._next_ns:
+            self._next_ns = max(self._next_ns + CYCLE_NS, now_ns + CYCLE_NS // 2)
+            self._cycle(now_ns)
+        return self.outputs
+
+    def status(self) -> list[int]:
+        """The status block as it reads now; what was accepted since the last cycle is in it."""
+        feedback = replace(self.feedback, accepted=self.gate.sequence & 0xFFFF)
+        return plc.status_registers(feedback, self.gate.watchdog_ms, self.gate.order)
+
+    def _cycle(self, now_ns: int) -> None:
+        inputs = self._inputs(now_ns)
+        self._cycles += 1
+        elapsed_ns, self._measured_ns = now_ns - self._measured_ns, now_ns
+        if self._cycles > 1:
+            self._longest_us = max(self._longest_us, elapsed_ns // 1000)
+        for law, position in zip(self._laws, inputs.positions, strict=True):
+            if position is not None:
+                law.measure(position, elapsed_ns * 1e-9)
+        self._decide(inputs.estop, now_ns)
+        if self.state is State.EXECUTE:
+            if self._cycles % LAW_CYCLES == 0 or self.gate.command.mode is not Mode.REFERENCES:
+                self.outputs = self._obey()
+        elif self._lost_ns is not None:
+            left = 1.0 - (now_ns - self._lost_ns) / RAMP_NS
+            self.outputs = [max(0.0, left) * u for u in self._from]
+        else:
+            self.outputs = [0.0] * len(self.outputs)
+        self.feedback = self._say(inputs)
+
+    def _decide(self, estop: int, now_ns: int) -> None:
+        """The state of this cycle."""
+        gate = self.gate
+        may_move = estop & MAY_MOVE == MAY_MOVE
+        reset = gate.reset_edge()
+        if not may_move:
+            self._make_safe(Fault.EMERGENCY_STOP)
+        elif gate.heard() and gate.commander(now_ns) is None:
+            self._make_safe(Fault.WATCHDOG)
+            gate.forget()
+        elif self.state is State.SAFE:
+            if reset and not gate.command.armed:
+                self.state = State.HOLD
+        elif gate.heard() and gate.command.armed and gate.age_ns(now_ns) <= HOLD_NS and gate.fault is Fault.NONE:
+            if self.state is not State.EXECUTE:
+                for law in self._laws:
+                    law.reset()
+            self.state, self._lost_ns = State.EXECUTE, None
+        elif self.state is State.EXECUTE:
+            self.state, self._lost_ns = State.HOLD, now_ns
+            self._from = list(self.outputs)
+            self._from[-1] = 0.0  # the grapple's valve shuts at once and holds
+        else:
+            self.state = State.HOLD
+
+    def _make_safe(self, fault: Fault) -> None:
+        self.state, self._lost_ns = State.SAFE, None
+        self.gate.note(fault)
+
+    def _obey(self) -> list[float]:
+        command = self.gate.command
+        out = [0.0] * (N_JOINTS + 1)
+        if command.mode is Mode.VALVES:
+            out[:N_JOINTS] = command.reference[:N_JOINTS]
+        elif command.mode is Mode.REFERENCES:
+            speed, cycle_s = command.max_speed_pct / 100.0, LAW_CYCLES * CYCLE_NS * 1e-9
+            out[:N_JOINTS] = [
+                law.step(command.reference[i], command.rate[i], speed, cycle_s) for i, law in enumerate(self._laws)
+            ]
+        if command.mode is not Mode.REFERENCES:
+            for law in self._laws:
+                law.reset()
+        flow = command.grapple_pct / 100.0
+        match command.grapple:
+            case Grapple.OPEN:
+                out[-1] = flow
+            case Grapple.CLOSE:
+                out[-1] = -flow
+            case Grapple.HOLD:
+                out[-1] = HOLD_SHARE
+        return out
+
+    def _say(self, inputs: Inputs) -> Feedback:
+        gate, spare = self.gate, (0.0,) * (plc.N_AXES - N_JOINTS)
+        return Feedback(
+            heartbeat=self._cycles & 0xFFFF,
+            state=self.state,
+            fault=gate.fault,
+            fault_axis=gate.fault_axis,
+            estop=inputs.estop,
+            accepted=gate.sequence & 0xFFFF,
+            longest_cycle_us=self._longest_us,
+            position=tuple(law.position for law in self._laws) + spare,
+            velocity=tuple(law.velocity for law in self._laws) + spare,
+            pressure_bar=inputs.pressure_bar,
+            opening=min(max(inputs.opening, 0.0), 1.0),
+            load_kg=min(max(round(inputs.load_kg), 0), 4093),
+        )

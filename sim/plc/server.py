@@ -1,0 +1,97 @@
+"""The emulated PLC on its two ports: Modbus/TCP registers and the cyclic datagram.  Nothing is decided here.
+
+Both live in the asyncio loop of the process; who speaks is told apart by connection, and by address for datagrams.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+from typing import cast
+
+from can_dbc.plc import map as plc
+from can_dbc.plc.datagram import Header, encode_reply
+from can_dbc.plc.modbus import LinkError, ModbusServer, RegisterRefused
+from sim.plc.program import Program
+
+Address = tuple[str, int]
+
+
+class PlcRegisters:
+    """The registers of a PLC as a Modbus server asks for them; ``clock_ns`` is the PLC's time."""
+
+    def __init__(self, program: Program, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._program, self._clock_ns = program, clock_ns
+
+    def read(self, address: int, count: int) -> list[int]:
+        """Status block or command block, or a part of one; both read alike as holding and as input registers."""
+        for begin, length in ((plc.STATUS_AT, plc.STATUS_COUNT), (plc.COMMAND_AT, plc.COMMAND_COUNT)):
+            if begin <= address and address + count <= begin + length:
+                block = self._program.status() if begin == plc.STATUS_AT else self._program.gate.block()
+                return block[address - begin : address - begin + count]
+        raise RegisterRefused(RegisterRefused.ADDRESS)
+
+    def write(self, client: int, address: int, values: Sequence[int]) -> None:
+        """A write by this connection."""
+        self._program.gate.write(client, address, values, self._clock_ns())
+
+    def commands(self, client: int) -> bool:
+        """Whether this connection commands."""
+        return self._program.gate.commander(self._clock_ns()) == client
+
+    def closed(self, client: int) -> None:
+        """Who commanded may come back on a new connection."""
+        self._program.gate.left(client)
+
+
+class Datagrams(asyncio.DatagramProtocol):
+    """The UDP side: commands in; a reply per PLC cycle goes to whoever commands, or last asked well-formed."""
+
+    def __init__(self, program: Program, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._program, self._clock_ns = program, clock_ns
+        self._transport: asyncio.DatagramTransport | None = None
+        self._peer: Address | None = None
+        self._sequence = self._beat = 0
+        self.port = 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.DatagramTransport, transport)
+        self.port = transport.get_extra_info("sockname")[1]
+
+    def datagram_received(self, data: bytes, addr: Address) -> None:
+        if self._program.gate.datagram(addr, data, self._clock_ns()) is not None:
+            self._peer = addr
+
+    def cycle(self) -> None:
+        """Sends the reply of a PLC cycle that has not been sent yet."""
+        feedback = self._program.feedback
+        if self._transport is None or self._peer is None or feedback.heartbeat == self._beat:
+            return
+        self._beat = feedback.heartbeat
+        self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
+        header = Header(self._sequence, self._clock_ns() // 1000, self._program.gate.sequence)
+        with contextlib.suppress(OSError):
+            self._transport.sendto(encode_reply(header, feedback), self._peer)
+
+    def close(self) -> None:
+        if self._transport is not None:
+            self._transport.close()
+
+
+async def listen(program: Program, address: Address, clock_ns: Callable[[], int]) -> Datagrams:
+    """The UDP side on an address; raises LinkError."""
+    protocol = Datagrams(program, clock_ns)
+    try:
+        await asyncio.get_running_loop().create_datagram_endpoint(lambda: protocol, local_addr=address)
+    except OSError as error:
+        raise LinkError(f"cannot listen on {address[0]}:{address[1]}: {error.strerror}") from error
+    return protocol
+
+
+async def serve(program: Program, address: Address, clock_ns: Callable[[], int]) -> ModbusServer:
+    """The Modbus side on an address; raises LinkError."""
+    server = ModbusServer(PlcRegisters(program, clock_ns), *address)
+    await server.start()
+    return server

@@ -1,0 +1,93 @@
+"""The plant's cameras on a socket: drawn when asked, refused in a sentence, and nothing of the truth goes out."""
+
+import contextlib
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from can_dbc.rgbd import START_BYTES, RgbdError, RgbdFrame, decode, encode_question, start
+from machine.optics import Intrinsics
+from sim.camera.rig import Frame, Mount
+from sim.camera.server import CameraServer, on_the_wire
+
+PIN = Intrinsics(4, 2, 3.0, 3.0, 1.5, 0.5)
+
+
+class Rig:
+    names = ("front",)
+
+    def __init__(self) -> None:
+        self.drawn: list[tuple[object, int]] = []
+
+    def scene(self, name: str) -> object:
+        assert threading.current_thread() is threading.main_thread()  # only the loop may touch the physics
+        return name.upper()
+
+    def shoot(self, name: str, scene: object, now_ns: int) -> Frame:
+        self.drawn.append((scene, now_ns))
+        depth = np.array([[1.0, np.nan, 2.0004, 99.0], [0.3, 5.0, 6.0, 7.0]], np.float32)
+        rgb = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+        return Frame(name, now_ns, rgb, depth, PIN, Mount("front", (0, 0, 0), (0, 0, 0)), np.ones(3), np.eye(3))
+
+
+def asked(server: CameraServer, camera: str) -> socket.socket:
+    client = socket.create_connection(("127.0.0.1", server.port), timeout=10.0)
+    client.sendall(encode_question(camera))
+    return client
+
+
+def answer(client: socket.socket) -> RgbdFrame:
+    data = b""
+    while len(data) < START_BYTES or len(data) < START_BYTES + start(data[:START_BYTES]).rest:
+        chunk = client.recv(4096)
+        assert chunk
+        data += chunk
+    return decode(data)
+
+
+def test_a_picture_is_drawn_only_when_somebody_asks() -> None:
+    rig = Rig()
+    server = CameraServer(rig, 0)
+    server.serve(1)
+    assert rig.drawn == []
+    with asked(server, "front") as client:
+        client.settimeout(0.01)
+        got = b""
+        for now_ns in range(2, 2000):
+            server.serve(now_ns)
+            try:
+                got = client.recv(START_BYTES)
+                break
+            except TimeoutError:
+                time.sleep(0.001)
+        client.settimeout(10.0)
+        got += client.recv(4096)
+    frame = decode(got)
+    assert len(rig.drawn) == 1 and rig.drawn[0] == ("FRONT", frame.stamp_ns)
+    assert (frame.camera, frame.width_px, frame.fx_px) == ("front", 4, 3.0)
+    assert np.frombuffer(frame.depth_mm, "<u2").tolist() == [1000, 0, 2000, 65535, 300, 5000, 6000, 7000]
+    server.close()
+
+
+def test_an_unknown_camera_is_refused_in_a_sentence() -> None:
+    server = CameraServer(Rig(), 0)
+    with asked(server, "rear") as client, pytest.raises(RgbdError, match="no camera 'rear'; there are: front"):
+        answer(client)
+    server.close()
+
+
+def test_who_talks_nonsense_is_hung_up_on() -> None:
+    server = CameraServer(Rig(), 0)
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as client:
+        client.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        with contextlib.suppress(ConnectionResetError):
+            assert client.recv(100) == b""
+    server.close()
+
+
+def test_the_true_pose_stays_in_the_plant() -> None:
+    sent = on_the_wire(Rig().shoot("front", None, 5))
+    assert not any("true" in name or "pose" in name for name in type(sent).__slots__)

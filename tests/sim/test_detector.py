@@ -1,0 +1,32 @@
+"""The perfect detector speaks of the crane's base frame, which a carrier carries about."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from machine.load import load_profile
+from sim.detector import detect
+from sim.plant import Plant
+
+
+def test_a_fixed_machine_is_its_own_world() -> None:
+    plant = Plant(load_profile("palms_471"), seed=3)
+    (seen,), (log,) = detect(plant), plant.logs()
+    assert (seen.position_m, seen.axis) == (log.position_m, log.axis)
+    assert (seen.length_m, seen.diameter_m) == (log.length_m, log.diameter_m)
+
+
+def test_on_a_carrier_logs_lie_below_the_raised_crane_and_behind_it_is_ahead() -> None:
+    """Slew 0 looks backward, and the base stands its height above the ground."""
+    plant = Plant(load_profile("aoro_fc8"), seed=3)
+    (seen,), (log,) = detect(plant), plant.logs()
+    (x, y, z), _ = plant.base_pose()
+    assert seen.position_m == pytest.approx(
+        (x - log.position_m[0], y - log.position_m[1], log.position_m[2] - z), abs=0.02
+    )
+    assert math.hypot(*seen.axis) == pytest.approx(1.0)
+    assert np.allclose(seen.axis[:2], np.negative(log.axis[:2]), atol=0.02)
+    assert seen.position_m[2] < -1.0

@@ -1,0 +1,33 @@
+"""The physics client: what it has bound it keeps, but never beyond its own life."""
+
+from __future__ import annotations
+
+import pytest
+
+from sim.physics import new_client
+
+pytestmark = pytest.mark.computed
+
+
+def test_a_closed_client_reaches_no_later_one():
+    first = new_client()
+    assert first.getNumBodies() == 0
+    number = first._client
+    first.disconnect()
+    second = new_client()
+    try:
+        assert second._client == number  # Bullet gives it anew
+        with pytest.raises(Exception, match=r"[Nn]ot connected"):
+            first.getNumBodies()
+    finally:
+        second.disconnect()
+
+
+def test_two_clients_do_not_share_what_they_have_bound():
+    one, other = new_client(), new_client()
+    try:
+        one.createMultiBody(1.0, one.createCollisionShape(one.GEOM_SPHERE, radius=0.1))
+        assert (one.getNumBodies(), other.getNumBodies()) == (1, 0)
+    finally:
+        one.disconnect()
+        other.disconnect()

@@ -1,0 +1,185 @@
+"""How the emulated PLC takes commands: split writes, sequence, one commander, watchdog, illegal values, datagrams."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from can_dbc.plc.datagram import Header, encode_command
+from can_dbc.plc.map import Bounds, Command, Fault, Grapple, Mode, WordOrder, command_registers
+from can_dbc.plc.modbus import RegisterRefused
+from sim.plc.gate import DRAFTS, MS, Gate
+
+ORDER = WordOrder.HIGH_FIRST
+MOVE = Command(Mode.VALVES, True, (0.5, -0.25, 0, 0, 0, 0, 0), grapple=Grapple.HOLD, grapple_pct=20)
+US, THEM = 1, 2
+
+
+def gate() -> Gate:
+    return Gate(Bounds.valves(), ORDER)
+
+
+def block(sequence: int, command: Command = MOVE, heartbeat: int | None = None) -> list[int]:
+    return command_registers(command, sequence if heartbeat is None else heartbeat, sequence, ORDER)
+
+
+def state(g: Gate) -> tuple[object, ...]:
+    return g.command, g.sequence, g.accepted, g.block(), g.watchdog_ms
+
+
+def refused(g: Gate, client: int, address: int, values: list[int], now_ns: int = 0) -> int:
+    before = state(g)
+    with pytest.raises(RegisterRefused) as refusal:
+        g.write(client, address, values, now_ns)
+    assert state(g) == before, "a refused write changed something"
+    return refusal.value.code
+
+
+def test_a_whole_block_counts_once_per_sequence_number() -> None:
+    g = gate()
+    g.write(US, 100, block(7), 0)
+    assert (g.command, g.sequence, g.accepted) == (MOVE, 7, 1)
+    g.write(US, 100, block(7, Command()), 1)
+    g.write(US, 100, block(6, Command()), 2)
+    assert (g.command, g.accepted) == (MOVE, 1), "a number that does not advance must not count"
+    g.write(US, 100, block(8, Command()), 3)
+    assert (g.command, g.accepted) == (Command(), 2)
+
+
+def test_the_sequence_goes_round() -> None:
+    g = gate()
+    g.write(US, 100, block(0xFFFF), 0)
+    g.write(US, 100, block(0, Command()), 1)
+    assert g.command == Command()
+
+
+@settings(max_examples=50)
+@given(st.lists(st.integers(1, 31), unique=True).map(sorted), st.booleans())
+def test_a_split_write_counts_when_its_number_is_written(cuts: list[int], one_by_one: bool) -> None:
+    """However a client cuts the block, nothing counts before register 101, and then everything."""
+    g, words = gate(), block(3)
+    edges = list(range(33)) if one_by_one else [0, *cuts, 32]
+    pieces = [(a, words[a:b]) for a, b in pairwise(edges)]
+    later = [(a, w) for a, w in pieces if not a <= 1 < a + len(w)]
+    for at, piece in later:
+        g.write(US, 100 + at, piece, 0)
+        assert g.accepted == 0 and g.command == Command()
+    commit = next((a, w) for a, w in pieces if a <= 1 < a + len(w))
+    g.write(US, 100 + commit[0], commit[1], 0)
+    assert (g.accepted, g.command) == (1, MOVE)
+
+
+def test_two_clients_do_not_finish_each_others_writes() -> None:
+    g, words = gate(), block(3)
+    g.write(US, 102, words[2:], 0)
+    g.write(THEM, 101, [9], 0)
+    assert g.command == Command(), "a bare sequence number of a stranger commits the stranger's own neutral block"
+
+
+@pytest.mark.parametrize(
+    ("register", "value"), [(102, 9), (102, 1), (103, 1), (125, 4), (126, 101), (127, 999), (128, 7), (130, 1)]
+)
+def test_an_illegal_value_is_exception_3_and_changes_nothing(register: int, value: int) -> None:
+    g = gate()
+    g.write(US, 100, block(1), 0)
+    words = block(2)
+    words[register - 100] = value
+    assert refused(g, US, 100, words) == 3
+    assert g.fault is Fault.ILLEGAL_VALUE and g.refused == 1
+    g.write(US, 100, block(2), 0)
+    assert g.accepted == 2, "the number of a refused command is not used up"
+    assert g.fault is Fault.ILLEGAL_VALUE, "the fault stays until a reset"
+    g.write(US, 100, block(3, Command(reset=True)), 0)
+    assert g.reset_edge() and not g.reset_edge()
+    assert g.fault is Fault.NONE
+
+
+def test_an_illegal_reference_names_its_axis_and_is_judged_at_the_commit() -> None:
+    g = gate()
+    g.write(US, 100, block(1), 0)
+    too_far = block(2, Command(Mode.VALVES, True, (0.0, 0.0, 1.000_001 + 1e-6, 0, 0, 0, 0)))
+    g.write(US, 102, too_far[2:], 0)  # unfinished: no harm yet
+    assert refused(g, US, 101, [2]) == 3
+    assert (g.fault, g.fault_axis) == (Fault.ILLEGAL_VALUE, 2)
+
+
+@pytest.mark.parametrize(
+    ("address", "count"), [(0, 1), (10, 1), (12, 4), (48, 1), (99, 2), (99, 32), (131, 2), (132, 1), (11, 2)]
+)
+def test_a_write_elsewhere_is_exception_2(address: int, count: int) -> None:
+    g = gate()
+    assert refused(g, US, address, [0] * count) == 2
+    assert g.fault is Fault.NONE
+
+
+def test_who_commands_keeps_the_command_until_the_watchdog() -> None:
+    g = gate()
+    g.write(US, 100, block(500), 0)
+    assert refused(g, THEM, 100, block(501), 100 * MS) == 6
+    assert refused(g, THEM, 125, [1], 100 * MS) == 6
+    assert refused(g, THEM, 11, [500], 100 * MS) == 6
+    assert g.fault is Fault.NONE, "a stranger cannot set a fault either"
+    assert g.commander(300 * MS) == US and g.commander(301 * MS) is None
+    g.write(THEM, 100, block(2, Command()), 301 * MS)
+    assert (g.commander(301 * MS), g.sequence) == (THEM, 2), "a new commander begins with its own numbers"
+
+
+def test_who_has_left_may_be_followed_at_once() -> None:
+    g = gate()
+    g.write(US, 100, block(500), 0)
+    g.left(THEM)
+    assert refused(g, THEM, 100, block(3), 10 * MS) == 6
+    g.left(US)
+    assert (g.commander(10 * MS), g.command) == (US, MOVE), "what was commanded stands until the watchdog"
+    g.write(THEM, 100, block(3, Command()), 10 * MS)
+    assert (g.commander(10 * MS), g.command) == (THEM, Command())
+    assert refused(g, US, 100, block(501), 20 * MS) == 6
+
+
+def test_a_moving_heartbeat_is_a_sign_of_life_and_a_frozen_one_is_none() -> None:
+    g = gate()
+    g.write(US, 100, block(1, heartbeat=10), 0)
+    g.write(US, 100, [11], 250 * MS)
+    assert g.commander(500 * MS) == US
+    g.write(US, 100, [11], 540 * MS)
+    assert g.commander(551 * MS) is None
+    assert g.age_ns(500 * MS) == 500 * MS, "a heartbeat makes no command younger"
+
+
+@pytest.mark.parametrize(("value", "code"), [(49, 3), (2001, 3), (0, 3)])
+def test_the_watchdog_register_is_bounded(value: int, code: int) -> None:
+    g = gate()
+    assert refused(g, US, 11, [value]) == code
+    g.write(US, 11, [50], 0)
+    g.write(US, 100, block(1), 0)
+    assert g.commander(51 * MS) is None
+
+
+def test_unfinished_writes_of_many_clients_take_bounded_memory() -> None:
+    g = gate()
+    for client in range(1000):
+        g.write(client, 127, [50], 0)
+    assert len(g._drafts) == DRAFTS
+
+
+def datagram(sequence: int, command: Command = MOVE) -> bytes:
+    return encode_command(Header(sequence, 0, 0), command)
+
+
+def test_datagrams_old_damaged_or_strange_are_dropped_and_illegal_ones_are_a_fault() -> None:
+    g, us, them = gate(), ("127.0.0.1", 5), ("127.0.0.1", 6)
+    assert g.datagram(us, datagram(9), 0) == Header(9, 0, 0)
+    assert g.datagram(us, datagram(9, Command()), 1) is None
+    assert g.datagram(us, datagram(8, Command()), 2) is None
+    assert g.datagram(us, datagram(10)[:-1], 3) is None
+    assert g.datagram(us, bytes((*datagram(10)[:-1], datagram(10)[-1] ^ 1)), 3) is None
+    assert g.datagram(them, datagram(11, Command()), 4) is None
+    assert (g.command, g.accepted, g.dropped, g.fault) == (MOVE, 1, 5, Fault.NONE)
+    bad = Command(Mode.REFERENCES, True)
+    assert g.datagram(them, datagram(12, bad), 5) is None and g.fault is Fault.NONE
+    assert g.datagram(us, datagram(12, bad), 5) is None and g.fault is Fault.ILLEGAL_VALUE
+    assert g.datagram(us, datagram(12), 6) is not None
+    assert g.datagram(us, datagram(13 + (1 << 31)), 7) is None

@@ -1,0 +1,53 @@
+"""The site of a mission as a file, and the plant that stands on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from machine.load import load_profile
+from sim.__main__ import main
+from sim.log_shape import LogSpec
+from sim.site_file import Site, load_site
+
+SITE = Site(63.5, 19.5, (LogSpec(8.0, 3.0, 0.3, 2.0, 0.25, 900.0), LogSpec(-35.0, 0.0, 0.0, 2.5, 0.2, 850.0)), 1, 2)
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    SITE.save(tmp_path / "site.json")
+    assert load_site(tmp_path / "site.json") == SITE
+
+
+def test_the_plant_stands_at_the_site_among_its_logs() -> None:
+    plant = SITE.plant(load_profile("aoro_fc8"), "nominal", 1)
+    carrier = plant.profile.carrier
+    assert (carrier.site_lat_deg, carrier.site_lon_deg) == (63.5, 19.5)
+    near = [log.position_m for log in plant.logs()]
+    assert [round(x) for x, *_ in near] == [8, -35]
+    plant.close()
+
+
+def test_a_machine_that_stands_still_has_no_site() -> None:
+    with pytest.raises(ValueError, match="palms_471 stands still"):
+        SITE.plant(load_profile("palms_471"), "nominal", 1)
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b'{"latitude_deg": 1}', b'{"latitude_deg": "x"}', b"\xff"])
+def test_a_file_that_is_none_is_one_sentence(
+    content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "site.json"
+    path.write_bytes(content)
+    said = run(path, capsys)
+    assert said.startswith(f"plant: {path}: this is no site: ") and said.count("\n") == 1
+
+
+def test_a_file_that_is_missing_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "the site cannot be read: No such file" in run(tmp_path / "none.json", capsys)
+
+
+def run(path: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    buses = ("--bus", "crane0=wire:crane0", "--bus", "mach0=wire:mach0")
+    assert main(["--profile", "aoro_fc8", *buses, "--site", str(path)]) == 3
+    return capsys.readouterr().err
