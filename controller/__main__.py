@@ -2,8 +2,8 @@
 5005``.
 
 Prints where it listens and what the system refused on stderr, and one JSON line with its timing on stdout at
-the end. Exit codes: 0 ended by SIGTERM, 2 usage, 3 configuration, 4 bus or port, 5 ended in a latched fault,
-130 SIGINT.
+the end; while it runs, its timing lies in shared memory (`can_dbc.timing_page`).  Exit codes: 0 ended by SIGTERM, 2
+usage, 3 configuration, 4 no bus or port at the start, 5 ended in a latched fault, 130 SIGINT.
 """
 
 from __future__ import annotations
@@ -16,12 +16,18 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from can_dbc.bus import BusError, default_address, open_bus
+from can_dbc.bus import Bus, BusError, default_address, open_bus
+from can_dbc.codec import DbcError
+from can_dbc.codec import load as read_dbc
+from can_dbc.filters import Wanted
 from can_dbc.setpoint import udp_address
+from can_dbc.timing_page import STAGES, TimingWriter, default_path
 from controller.config import ConfigError, Settings, load
 from controller.loop import Address, Loop
-from controller.realtime import freeze, prepare
+from controller.realtime import freeze, keep_heap, prepare, sleeper
+from controller.rehearsal import rehearse
 from controller.step import Controller
+from controller.timing import LoopTiming
 from machine.faults import describe
 from machine.modes import Mode
 
@@ -40,12 +46,13 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(
         prog="python -m controller",
-        description="Closes the joint and grapple loops of the crane over CAN.",
+        description="Closes the joint and grapple loops of the machine over CAN.",
         epilog="example: python -m controller --profile palms_471 --bus crane0=socketcan:can0 "
         "--setpoint-port 5005 --report 127.0.0.1:5006",
     )
     made.add_argument("--profile", required=True, help="shipped profile name or TOML file")
-    made.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="where the crane bus is")
+    made.add_argument("--bus", type=bus_address, action="append", default=[], metavar="NAME=ADDRESS",
+                      help="where crane0 and, on a machine with a carrier, mach0 is")  # fmt: skip
     made.add_argument("--setpoint-port", type=int, required=True, help="UDP port on 127.0.0.1; 0 takes a free one")
     made.add_argument("--report", type=address, action="append", default=[], metavar="HOST:PORT",
                       help="where state reports go; may be given more than once")  # fmt: skip
@@ -53,8 +60,21 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--rate", type=int, default=0, metavar="HZ", help="control rate; default: the profile's")
     made.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
     made.add_argument("--cpu", type=int, help="processor to run on; only one that is kept free for it")
+    made.add_argument("--spin-us", type=int, default=0, metavar="US",
+                      help="watch the clock for the last US before a wake-up; on a processor of its own")  # fmt: skip
+    made.add_argument("--dma-latency", action="store_true", help="keep the processors out of deep sleep")
+    made.add_argument("--sync-lead-us", type=int, metavar="US", help="SYNC before the tick; default: 0.6 periods")
+    made.add_argument("--timing", type=Path, metavar="FILE", help="page of the timing; default: in shared memory")
     made.add_argument("--no-realtime", action="store_true", help="do not ask for FIFO and locked memory")
     return made
+
+
+def bus_address(text: str) -> tuple[str, str]:
+    """NAME=ADDRESS of a command line; raises ArgumentTypeError."""
+    name, _, where = text.partition("=")
+    if name not in ("crane0", "mach0") or not where:
+        raise argparse.ArgumentTypeError(f"{text}: write NAME=ADDRESS, as in crane0=socketcan:can0")
+    return name, where
 
 
 def listen(port: int) -> socket.socket:
@@ -82,13 +102,50 @@ def settings_of(options: argparse.Namespace) -> Settings:
     return load(options.profile, options.rate, key)
 
 
+def addresses(settings: Settings, given: dict[str, str]) -> dict[str, str]:
+    """Name -> address of the machine's buses in the loop's order; raises ConfigError."""
+    profile = settings.profile
+    wanted = [name for name in (profile.crane_bus, profile.machine_bus) if name]
+    for name in given:
+        if name not in wanted:
+            raise ConfigError(f"{profile.name} has no bus {name}, only {' and '.join(wanted)}; leave --bus {name} out.")
+    return {name: given.get(name) or default_address(name) for name in wanted}
+
+
+def open_buses(where: dict[str, str], controller: Controller) -> list[Bus]:
+    """All of them or none, each filtered by what the controller looks at; raises BusError."""
+    wanted: list[list[Wanted]] = [[*controller.received.wanted()]]
+    if controller.machine_bus is not None:
+        wanted.append(controller.machine_bus.received.wanted())
+    opened: list[Bus] = []
+    try:
+        for address, filters in zip(where.values(), wanted, strict=True):
+            opened.append(open_bus(address, filters=filters, tx_queue=32))
+    except BusError:
+        for bus in opened:
+            bus.close()
+        raise
+    return opened
+
+
+def timing_writer(path: Path | None) -> TimingWriter | None:
+    """The timing page; without one the controller runs all the same, and says so."""
+    path = path or default_path()
+    try:
+        return TimingWriter(path)
+    except OSError as error:
+        sys.stderr.write(f"controller: not granted: timing page {path}: {error.strerror}\n")
+        return None
+
+
 def summary(loop: Loop) -> str:
     """One JSON line on how the loop ran."""
     supervisor = loop.controller.supervisor
     return json.dumps(
         {
-            "ticks": loop.work.count, "missed": loop.missed, "late": loop.lateness.summary(),
-            "tick": loop.work.summary(), "unsent": loop.unsent, "unrecorded": loop.unrecorded,
+            "ticks": loop.ticks, "missed": loop.missed, "late": supervisor.late,
+            "timing": {name: loop.timing.durations[name].summary() for name in STAGES},
+            "unsent": loop.unsent, "unrecorded": loop.unrecorded,
             "mode": supervisor.mode.name, "reason": supervisor.reason.name,
         }
     )  # fmt: skip
@@ -98,22 +155,29 @@ def main(arguments: list[str] | None = None) -> int:
     """Starts the controller; returns the exit code."""
     made = parser()
     options = made.parse_args(arguments)
-    name, _, where = options.bus.partition("=")
-    if options.bus and (name != "crane0" or not where):
-        made.error(f"--bus {options.bus}: write crane0=ADDRESS, as in crane0=socketcan:can0")
-    where = where or default_address("crane0")
+    keep_heap()
     try:
         settings = settings_of(options)
-        controller = Controller(settings)
-        bus = open_bus(where, tx_queue=32)
+        database = read_dbc("crane")
+        rehearse(settings, Controller(settings, database))
+        controller = Controller(settings, database)
+        lead_ns = settings.sync_lead_ns if options.sync_lead_us is None else options.sync_lead_us * 1000
+        if not 0 <= lead_ns < settings.period_ns:
+            raise ConfigError(f"--sync-lead-us {options.sync_lead_us}: the lead must be shorter than the period.")
+        where = addresses(settings, dict(options.bus))
+        buses = open_buses(where, controller)
         setpoints = listen(options.setpoint_port)
-    except ConfigError as error:
+    except (ConfigError, DbcError) as error:
         sys.stderr.write(f"controller: {error}\n")
         return 3
     except BusError as error:
         sys.stderr.write(f"controller: {error}\n")
         return 4
-    loop = Loop(controller, bus, setpoints, options.report, options.record, settings.period_ns)
+    timing = LoopTiming(controller, timing_writer(options.timing))
+    loop = Loop(
+        controller, buses, setpoints, options.report, options.record, timing, settings.period_ns, lead_ns,
+        sleep=sleeper(options.spin_us * 1000),
+    )  # fmt: skip
     ended: list[int] = []
 
     def end(number: int, _frame: object) -> None:
@@ -122,24 +186,21 @@ def main(arguments: list[str] | None = None) -> int:
 
     signal.signal(signal.SIGTERM, end)
     signal.signal(signal.SIGINT, end)
+    shown = " and ".join(f"{name}={address}" for name, address in where.items())
     sys.stderr.write(
-        f"controller: {settings.profile.name} at {settings.rate_hz} Hz on {where}, "
+        f"controller: {settings.profile.name} at {settings.rate_hz} Hz on {shown}, "
         f"setpoints on 127.0.0.1:{setpoints.getsockname()[1]}\n"
     )
-    if options.no_realtime:
-        freeze()
-    else:
-        for refusal in prepare(PRIORITY, options.cpu):
+    if not options.no_realtime:
+        for refusal in prepare(PRIORITY, options.cpu, options.dma_latency):
             sys.stderr.write(f"controller: not granted: {refusal}\n")
+    freeze()
     try:
         loop.run()
     finally:
         loop.close()
     sys.stdout.write(summary(loop) + "\n")
     supervisor = controller.supervisor
-    if loop.bus_lost:
-        sys.stderr.write(f"controller: the bus {where} is gone; bring it up and start the controller again.\n")
-        return 4
     if supervisor.mode is Mode.FAULT:
         sys.stderr.write(f"controller: {describe(supervisor.reason, supervisor.detail)}\n")
         return 5

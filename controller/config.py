@@ -27,6 +27,13 @@ class Settings:
         """The tick period T."""
         return 1_000_000_000 // self.rate_hz
 
+    @property
+    def sync_lead_ns(self) -> int:
+        """SYNC goes out this long before the tick that uses its answers: 0.6 T.  At 1 Mbit/s the encoders of a whole
+        machine have answered after 1.4 ms at worst (can_bus.md section 8); the rest is for an adapter that is slow.
+        """
+        return self.period_ns * 3 // 5
+
 
 def load(name_or_path: str | Path, rate_hz: int = 0, key: bytes | None = None) -> Settings:
     """Reads a profile by shipped name or path; ``rate_hz`` 0 takes the profile's rate; raises ConfigError."""

@@ -1,48 +1,105 @@
-"""Joint positions and velocities from quantised encoder counts.
+"""Joint positions and velocities from quantised encoder counts: a steady-state Kalman filter per joint.
 
-A critically damped alpha-beta tracker per joint (fading memory): it follows a ramp without lag and does not
-turn one count of 0.38 mrad into 0.08 rad/s as a difference would.  Gains are computed at start from the
-profile's filter time, so that no gain is per cycle.  A sample that no joint of this machine could have
-reached is refused and counted; three refusals within 100 ms are a fault (safety_faults.md, case 2), after
-which the tracker starts anew.
+The joint moves with a white acceleration; its encoder rounds and is noisy.  The gains are those at which the Riccati
+recursion rests, computed at start from the encoder's noise, its resolution and the joint's acceleration
+limit, so that no gain is per cycle; a tick is two scalar recurrences.  A sample belongs to the moment of SYNC, not to
+the tick: it is compared with the estimate carried back to its stamp.  A sample that no joint of this machine could
+have reached is refused and counted; three refusals within 100 ms are a fault (safety_faults.md, case 2), after which
+the filter starts anew.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
-from typing import Final
+from typing import Final, Protocol
 
-from machine.profile import JointSpec
+from machine.profile import CarrierValve, Encoder, Valve
 
+ACCELERATION_SHARE: Final = 1.0 / 3.0
+"""Root mean square of the acceleration over the joint's limit, ..."""
+ACCELERATION_S: Final = 0.1
+"""... which lasts about this long: together the spectral density of the white acceleration."""
+STILL_S: Final = 0.2
+"""A joint stands still when its velocity has been within `STILL_SHARE` for this long."""
+STILL_SHARE: Final = 0.012
 _JUMP_WINDOW_NS: Final = 100_000_000
 _JUMPS: Final = 3
 _NAN: Final = math.nan
+
+
+class Tracked(Protocol):
+    """What is known of a joint that is tracked: encoder, valve, limits [unit/s, unit/s^2]."""
+
+    @property
+    def encoder(self) -> Encoder | None: ...
+    @property
+    def valve(self) -> Valve | CarrierValve: ...
+    @property
+    def speed_limit(self) -> float: ...
+    @property
+    def acceleration_limit(self) -> float: ...
+
+
+def measurement_variance(encoder: Encoder) -> float:
+    """Variance of one sample [rad^2, m^2]: noise and rounding to whole counts."""
+    return encoder.noise**2 + encoder.unit_per_count**2 / 12.0
+
+
+def acceleration_density(spec: Tracked) -> float:
+    """Spectral density of the joint's acceleration [(rad/s^2)^2 s, (m/s^2)^2 s]."""
+    return (ACCELERATION_SHARE * spec.acceleration_limit) ** 2 * ACCELERATION_S
+
+
+def steady_gains(period_s: float, density: float, variance: float) -> tuple[float, float]:
+    """Gains of position and velocity [-, 1/s] of the Kalman filter that has settled.
+
+    Motion over a period: position += velocity T, driven by a white acceleration of this spectral ``density``; a
+    position is measured with this ``variance`` every period.  The second differences of the measurements are a moving
+    average of order two; its factor with zeros inside the unit circle is the filter's innovation form, so the zeros
+    are the filter's poles.
+    """
+    drive = density * period_s**3 / 6.0
+    root = cmath.sqrt(drive * (drive - 24.0 * variance))
+    short = []  # one less each pole
+    for w in ((root - drive) / (2.0 * variance), (-root - drive) / (2.0 * variance)):
+        spread = cmath.sqrt(w + 0.25 * w * w)
+        short.append(max((-0.5 * w + spread, -0.5 * w - spread), key=lambda rest: -abs(1.0 - rest)))
+    a, b = short
+    return (a + b - a * b).real, (a * b).real / period_s
 
 
 class JointEstimator:
     """Tracks one joint; ``known`` is False until the first sample, and then position and velocity are NaN."""
 
     __slots__ = (
-        "_alpha", "_beta", "_gate_speed", "_jump_stamps", "_measured", "_measured_ns", "_period_s",
-        "_predicted_ns", "_slack", "jumped", "known", "position", "refused", "velocity",
+        "_alpha", "_beta", "_gate_speed", "_jump_stamps", "_measured", "_measured_ns", "_moved_ns", "_period_s",
+        "_predicted_ns", "_slack", "_slow", "jumped", "known", "position", "refused", "velocity",
     )  # fmt: skip
 
-    def __init__(self, spec: JointSpec, period_s: float) -> None:
-        encoder = spec.encoder
-        theta = math.exp(-period_s / spec.law.velocity_filter_s)
-        self._alpha, self._beta = 1.0 - theta * theta, (1.0 - theta) ** 2
+    def __init__(self, spec: Tracked, period_s: float) -> None:
+        encoder, valve = spec.encoder, spec.valve
+        self._alpha, self._beta = 1.0, 0.0
+        self._slack = 0.0
+        if encoder is not None:
+            self._alpha, self._beta = steady_gains(period_s, acceleration_density(spec), measurement_variance(encoder))
+            self._slack = 4.0 * encoder.unit_per_count + 6.0 * encoder.noise
         self._period_s = period_s
-        valve = spec.valve
         self._gate_speed = 3.0 * max(valve.full_speed_plus, valve.full_speed_minus, spec.speed_limit)
-        self._slack = 4.0 * encoder.unit_per_count + 6.0 * encoder.noise if encoder else 0.0
+        self._slow = STILL_SHARE * min(valve.full_speed_plus, valve.full_speed_minus)
         self.refused = 0
         self.reset()
+
+    @property
+    def still(self) -> bool:
+        """Whether the joint stands."""
+        return self.known and self._predicted_ns - self._moved_ns >= STILL_S * 1e9
 
     def reset(self) -> None:
         """Forgets everything: the value is unknown again."""
         self.known = self.jumped = False
         self.position = self.velocity = self._measured = _NAN
-        self._measured_ns = self._predicted_ns = 0
+        self._measured_ns = self._predicted_ns = self._moved_ns = 0
         self._jump_stamps = [-_JUMP_WINDOW_NS] * _JUMPS
 
     def predict(self, now_ns: int) -> None:
@@ -51,30 +108,36 @@ class JointEstimator:
             self.position += self.velocity * (now_ns - self._predicted_ns) * 1e-9
         self._predicted_ns = now_ns
 
-    def sample(self, measured: float, now_ns: int) -> None:
-        """Takes the position measured for this tick; sets ``jumped`` at the third refusal within 100 ms."""
+    def sample(self, measured: float, stamp_ns: int) -> None:
+        """Takes a position measured at ``stamp_ns``, not after the last `predict`; sets ``jumped`` at the third
+        refusal within 100 ms.
+        """
         self.jumped = False
         if not self.known:
-            self._start(measured, now_ns)
+            self._start(measured, stamp_ns)
             return
-        elapsed_s = (now_ns - self._measured_ns) * 1e-9
-        if abs(measured - self._measured) > self._gate_speed * elapsed_s + self._slack:
+        elapsed_s = (stamp_ns - self._measured_ns) * 1e-9
+        if abs(measured - self._measured) > self._gate_speed * max(elapsed_s, 0.0) + self._slack:
             self.refused += 1
             stamps = self._jump_stamps
-            stamps[self.refused % _JUMPS] = now_ns
-            if now_ns - min(stamps) < _JUMP_WINDOW_NS:
+            stamps[self.refused % _JUMPS] = stamp_ns
+            if stamp_ns - min(stamps) < _JUMP_WINDOW_NS:
                 self.jumped = True
-                self._start(measured, now_ns)
+                self._start(measured, stamp_ns)
             return
-        residual = measured - self.position
-        self.position += self._alpha * residual
-        self.velocity += self._beta / max(elapsed_s, self._period_s) * residual
-        self._measured, self._measured_ns = measured, now_ns
+        age_s = (self._predicted_ns - stamp_ns) * 1e-9
+        residual = measured - (self.position - self.velocity * age_s)
+        correction = self._beta * residual
+        self.velocity += correction
+        self.position += self._alpha * residual + correction * age_s
+        self._measured, self._measured_ns = measured, stamp_ns
+        if abs(self.velocity) > self._slow:
+            self._moved_ns = self._predicted_ns
 
-    def _start(self, measured: float, now_ns: int) -> None:
+    def _start(self, measured: float, stamp_ns: int) -> None:
         self.known = True
         self.position = self._measured = measured
         self.velocity = 0.0
-        self._measured_ns = self._predicted_ns = now_ns
+        self._measured_ns, self._moved_ns = stamp_ns, self._predicted_ns
         for i in range(_JUMPS):
-            self._jump_stamps[i] = now_ns - _JUMP_WINDOW_NS
+            self._jump_stamps[i] = stamp_ns - _JUMP_WINDOW_NS

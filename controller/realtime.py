@@ -1,7 +1,8 @@
 """What a Linux process needs to wake on time: absolute sleep, FIFO, locked memory, no garbage collection.
 
-`prepare` returns in words what the system refused; the caller shows it and goes on, because a demonstration
-on a desktop must run too.  No second thread may live in the process (realtime.md section 2).
+`keep_heap` before anything is built, `prepare` when everything is, `freeze` last.  `prepare` returns in words what the
+system refused; the caller shows it and goes on, because a demonstration on a desktop must run too.  No second thread
+may live in the process (realtime.md section 2).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import errno
 import gc
 import os
 import socket
+import time
 from collections.abc import Callable
 from typing import Final
 
@@ -19,6 +21,8 @@ _libc: Final = ctypes.CDLL(None, use_errno=True)
 _CLOCK_MONOTONIC: Final = 1
 _TIMER_ABSTIME: Final = 1
 _MCL_CURRENT_AND_FUTURE: Final = 3
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # malloc.h
+DMA_LATENCY: Final = "/dev/cpu_dma_latency"
 
 
 class _Timespec(ctypes.Structure):
@@ -38,8 +42,26 @@ def sleep_until(deadline_ns: int) -> None:
         pass
 
 
-def prepare(priority: int, cpu: int | None = None) -> list[str]:
-    """FIFO at ``priority``, locked memory, one processor if given, no garbage passes; returns refusals."""
+def sleeper(spin_ns: int) -> Callable[[int], None]:
+    """`sleep_until`, or the same with the last ``spin_ns`` spent looking at the clock: it wakes a few microseconds
+    late instead of tens, for ``spin_ns`` per wake-up of a processor that should be its own (realtime.md section 2).
+    """
+    if spin_ns <= 0:
+        return sleep_until
+    clock_ns = time.monotonic_ns
+
+    def sleep_and_spin(deadline_ns: int) -> None:
+        sleep_until(deadline_ns - spin_ns)
+        while clock_ns() < deadline_ns:
+            pass
+
+    return sleep_and_spin
+
+
+def prepare(priority: int, cpu: int | None = None, dma_latency: bool = False) -> list[str]:
+    """FIFO at ``priority``, locked memory, one processor if given, processors kept awake if asked for
+    (``dma_latency``); returns what was refused, in words.
+    """
     refused = []
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
@@ -52,15 +74,39 @@ def prepare(priority: int, cpu: int | None = None) -> list[str]:
             os.sched_setaffinity(0, {cpu})
         except (OSError, ValueError) as error:  # ValueError: a negative number
             refused.append(f"processor {cpu}: {error}")
-    freeze()
+    if dma_latency:
+        try:
+            # The request holds for as long as the file is open: until the process ends (kernel, pm_qos_interface.rst).
+            os.write(os.open(DMA_LATENCY, os.O_WRONLY | os.O_CLOEXEC), bytes(4))
+        except OSError as error:
+            refused.append(f"{DMA_LATENCY}: {error.strerror}")
     return refused
+
+
+def keep_heap() -> None:
+    """Keeps glibc from giving memory back and asking for it anew, which would be a page fault in some tick."""
+    with contextlib.suppress(AttributeError):  # musl has no mallopt
+        _libc.mallopt(_M_TRIM_THRESHOLD, -1)
+        _libc.mallopt(_M_MMAP_MAX, 0)
 
 
 def freeze() -> None:
     """Collects garbage once, keeps what is left out of every later pass, and switches the passes off."""
     gc.collect()
+    _fill_tuple_lists()
     gc.freeze()
     gc.disable()
+
+
+def _fill_tuple_lists() -> None:
+    """Lets CPython keep as many freed tuples as it ever will: 2000 of each length up to 20 (3.11, tupleobject.c).
+
+    Some it keeps and never uses again, those of length 20 and those built from a generator; without this the heap
+    would grow by them for half an hour, and fault.  A garbage collection would empty the lists.
+    """
+    for length in range(1, 21):
+        kept = [tuple(range(length)) for _ in range(2000)]
+        del kept
 
 
 class Notifier:
@@ -76,8 +122,10 @@ class Notifier:
     ALIVE_NS: Final = 100_000_000
     STATUS_NS: Final = 1_000_000_000
 
-    def __init__(self, words: Callable[[], str]) -> None:
-        address = os.environ.get("NOTIFY_SOCKET", "")
+    def __init__(self, words: Callable[[], str], address: str | None = None) -> None:
+        """Tells it at ``address``, by default where systemd asks for it; nowhere if that is empty."""
+        if address is None:
+            address = os.environ.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) if address else None
         if self._socket is not None:

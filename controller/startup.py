@@ -23,9 +23,11 @@ from can_dbc.canopen import (
     parse_response,
     upload_request,
 )
-from machine.faults import Reason
-from machine.joints import JOINTS
-from machine.profile import Encoder, Profile, joint
+from can_dbc.codec import Database
+from controller.config import ConfigError
+from machine.joints import JOINTS, N_JOINTS
+from machine.profile import Encoder, Profile, encoders
+from machine.reasons import Reason
 
 TIMEOUT_NS: Final = 300_000_000
 TRIES: Final = 3
@@ -154,8 +156,7 @@ class Startup:
     __slots__ = ("_by_node", "_released", "_setups", "_turn")
 
     def __init__(self, profile: Profile) -> None:
-        encoders = [joint(profile, j).encoder for j in JOINTS]
-        self._setups = [EncoderSetup(e) for e in encoders if e is not None]
+        self._setups = [EncoderSetup(encoder) for encoder in encoders(profile).values()]
         self._by_node = {s.node: s for s in self._setups}
         self._turn = 0
         self._released = False
@@ -177,6 +178,12 @@ class Startup:
             if setup.phase is Phase.FAILED or (setup.phase is Phase.READY and not operational(setup.node)):
                 setup.restart()
 
+    def again(self) -> None:
+        """Every node is set up anew: nobody knows what happened to it."""
+        self._released = False
+        for setup in self._setups:
+            setup.restart()
+
     def receive(self, key: int, data: bytes) -> bool:
         """Takes a frame; True when it was an SDO answer of one of our encoders."""
         response = parse_response(key, data)
@@ -195,14 +202,35 @@ class Startup:
 
     def step(self, now_ns: int, frames: list[Wire]) -> None:
         """Appends what this tick has to say: at most one frame."""
+        if self._released:  # everything is set up and started; whatever undoes that takes this back
+            return
         n = len(self._setups)
         for k in range(n):
             frame = self._setups[(self._turn + k) % n].frame(now_ns)
             if frame is not None:
                 self._turn = (self._turn + k + 1) % n
-                self._released = False
                 frames.append(frame)
                 return
-        if self.complete and not self._released:
+        if self.complete:
             self._released = True
             frames.append(nmt_frame(NmtCommand.START))
+
+
+def check_nodes(database: Database, profile: Profile) -> None:
+    """Refuses a profile whose node cannot send the message it names, for start-up would write to another device; raises
+    ConfigError."""
+    for place, encoder in encoders(profile).items():
+        key = database.message(encoder.message).key
+        if key != TPDO1 + encoder.node:
+            jointed = place < N_JOINTS
+            where = f"joints.{JOINTS[place].name.lower()}.encoder" if jointed else "carrier.articulation_encoder"
+            raise ConfigError(
+                f"{where}.node: node {encoder.node} does not send {encoder.message} ({key:03X}); "
+                f"give it node {key - TPDO1} or another message"
+            )
+    imu = profile.imu
+    if imu is not None and database.message(imu.message).key != TPDO1 + imu.node:
+        key = database.message(imu.message).key
+        raise ConfigError(
+            f"imu.node: node {imu.node} does not send {imu.message} ({key:03X}); give it node {key - TPDO1}"
+        )

@@ -8,11 +8,15 @@ at the last position.  Nothing here judges.
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 from typing import Final
 
 from can_dbc.setpoint import MAX_KNOTS, CraneSetpoint
 from machine.joints import N_JOINTS
 
+HISTORY: Final = 20
+"""Knots of earlier setpoints that a trajectory keeps while its time is behind the planner's."""
+_ROOM: Final = MAX_KNOTS + HISTORY
 _NS: Final = 1e-9
 
 
@@ -23,9 +27,9 @@ class Trajectory:
 
     def __init__(self) -> None:
         self._n = 0
-        self._times_ns = array("q", [0] * MAX_KNOTS)
-        self._position = array("d", [0.0] * (MAX_KNOTS * N_JOINTS))
-        self._velocity = array("d", [0.0] * (MAX_KNOTS * N_JOINTS))
+        self._times_ns = array("q", [0] * _ROOM)
+        self._position = array("d", [0.0] * (_ROOM * N_JOINTS))
+        self._velocity = array("d", [0.0] * (_ROOM * N_JOINTS))
 
     def load(self, setpoint: CraneSetpoint) -> None:
         """Takes the knots of a decoded setpoint (1 to 16, times strictly growing)."""
@@ -35,6 +39,27 @@ class Trajectory:
             for joint in range(N_JOINTS):
                 self._position[i * N_JOINTS + joint] = knot.position[joint]
                 self._velocity[i * N_JOINTS + joint] = knot.velocity[joint]
+
+    def extend(self, newer: Trajectory, from_ns: int) -> None:
+        """Goes on as ``newer`` from its first knot; keeps what is before that and not before ``from_ns``."""
+        times, first_ns = self._times_ns, newer._times_ns[0]
+        end = 0
+        while end < self._n and times[end] < first_ns:
+            end += 1
+        start = max(0, end - HISTORY)
+        while start + 1 < end and times[start + 1] <= from_ns:
+            start += 1
+        for i in range(start, end):
+            self._copy(i - start, self, i)
+        for i in range(newer._n):
+            self._copy(end - start + i, newer, i)
+        self._n = end - start + newer._n
+
+    def _copy(self, to: int, other: Trajectory, knot: int) -> None:
+        self._times_ns[to] = other._times_ns[knot]
+        a, b = to * N_JOINTS, knot * N_JOINTS
+        for j in range(N_JOINTS):
+            self._position[a + j], self._velocity[a + j] = other._position[b + j], other._velocity[b + j]
 
     @property
     def end_ns(self) -> int:
@@ -47,25 +72,29 @@ class Trajectory:
         first = (self._n - 1) * N_JOINTS
         return not any(self._velocity[first : first + N_JOINTS])
 
-    def sample(self, joint: int, now_ns: int) -> tuple[float, float]:
-        """Position and velocity of a joint at ``now_ns`` (rad or m, per second)."""
+    def fill(self, joints: Sequence[int], now_ns: int, position: list[float], velocity: list[float]) -> None:
+        """Writes where ``joints`` are to be at ``now_ns`` (rad or m) and how fast (per second) into their places."""
         times, n = self._times_ns, self._n
+        p, v = self._position, self._velocity
         if now_ns <= times[0]:
-            velocity = self._velocity[joint]
-            return self._position[joint] + velocity * (now_ns - times[0]) * _NS, velocity
-        last = (n - 1) * N_JOINTS + joint
+            ahead_s = (now_ns - times[0]) * _NS
+            for j in joints:
+                position[j], velocity[j] = p[j] + v[j] * ahead_s, v[j]
+            return
         if now_ns > times[n - 1]:
-            return self._position[last], 0.0
+            last = (n - 1) * N_JOINTS
+            for j in joints:
+                position[j], velocity[j] = p[last + j], 0.0
+            return
         k = 1
         while times[k] < now_ns:
             k += 1
-        b = k * N_JOINTS + joint
-        a = b - N_JOINTS
         h = (times[k] - times[k - 1]) * _NS
-        return hermite(
-            self._position[a], self._velocity[a], self._position[b], self._velocity[b],
-            h, (now_ns - times[k - 1]) * _NS / h,
-        )  # fmt: skip
+        share = (now_ns - times[k - 1]) * _NS / h
+        for j in joints:
+            b = k * N_JOINTS + j
+            a = b - N_JOINTS
+            position[j], velocity[j] = hermite(p[a], v[a], p[b], v[b], h, share)
 
 
 def hermite(p0: float, v0: float, p1: float, v1: float, h: float, s: float) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """The guard process: ``python -m controller.guard --profile FILE --bus crane0=ADDRESS``.
 
-Every 5 ms: drain, judge, send.  Exit codes: 0 ended by SIGTERM, 3 configuration, 4 bus lost, 130 SIGINT.
+Every 5 ms: drain, judge, send.  A bus that is lost is tried again until it is back.  Exit codes: 0 ended by SIGTERM, 3
+configuration, 4 no bus at the start, 130 SIGINT.
 """
 
 from __future__ import annotations
@@ -12,17 +13,18 @@ import time
 from pathlib import Path
 from typing import Final
 
-from can_dbc.bus import Bus, BusError, BusState, default_address, open_bus
+from can_dbc.bus import Bus, BusError, default_address, open_bus
 from can_dbc.frame import Frame
+from can_dbc.tick_record import BusReading
 from controller.guard.envelope import read_envelope
 from controller.guard.judge import MESSAGES, Guard
 from controller.guard.layout import GuardConfigError, read_layouts
-from controller.realtime import Notifier, prepare, sleep_until
+from controller.link import Link
+from controller.realtime import Notifier, freeze, keep_heap, prepare, sleep_until
 
 PERIOD_NS: Final = 5_000_000
 PRIORITY: Final = 85
 ROOT: Final = Path(__file__).parents[2]
-BUS_GONE_NS: Final = 200_000_000
 
 
 def build(profile: Path, dbc: Path = ROOT / "can_dbc" / "crane.dbc") -> Guard:
@@ -37,27 +39,27 @@ def profile_path(name: str) -> Path:
     return shipped if shipped.is_file() else Path(name)
 
 
-def run(guard: Guard, bus: Bus, ended: list[int], notifier: Notifier) -> bool:
-    """Judges until a signal is in ``ended``; False when the bus is gone."""
+def run(guard: Guard, bus: Bus, ended: list[int], notifier: Notifier) -> None:
+    """Judges until a signal is in ``ended``."""
     frames: list[Frame] = []
+    link, reading = Link(bus), BusReading()
     deadline_ns = time.monotonic_ns() + PERIOD_NS
-    down_ns = 0
     while not ended:
         sleep_until(deadline_ns)
         late_ns = time.monotonic_ns() - deadline_ns
         if late_ns >= PERIOD_NS:
             deadline_ns += late_ns // PERIOD_NS * PERIOD_NS
-        frames.clear()
-        bus.drain(frames)
-        for key, data in guard.step(deadline_ns, frames):
-            bus.send(key, data)
-        down_ns = down_ns + PERIOD_NS if bus.stats.state is BusState.DOWN else 0
-        notifier.ticked(deadline_ns, late_ns < PERIOD_NS and not down_ns)
-        if down_ns >= BUS_GONE_NS:
-            return False
+        link.read(frames, reading)
+        link.send(guard.step(deadline_ns, frames))
+        link.watch(deadline_ns)
+        notifier.ticked(deadline_ns, late_ns < PERIOD_NS)
         deadline_ns += PERIOD_NS
     notifier.stopping()
-    return True
+
+
+def _words(guard: Guard, bus: Bus) -> str:
+    enabled = "enabled" if guard.enabled else "not enabled"
+    return f"Valves {enabled}: {guard.verdict.name}. The bus is {bus.stats.state.name}."
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -73,6 +75,7 @@ def main(arguments: list[str] | None = None) -> int:
     name, _, address = options.bus.partition("=")
     if options.bus and (name != "crane0" or not address):
         parser.error(f"--bus {options.bus}: write crane0=ADDRESS, as in crane0=socketcan:can0")
+    keep_heap()
     ended: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda which, _frame: ended.append(which))
@@ -82,10 +85,8 @@ def main(arguments: list[str] | None = None) -> int:
             if not options.no_realtime:
                 for refusal in prepare(PRIORITY):
                     sys.stderr.write(f"guard: not granted: {refusal}\n")
-            notifier = Notifier(lambda: f"Valves {'' if guard.enabled else 'not '}enabled: {guard.verdict.name}.")
-            if not run(guard, bus, ended, notifier):
-                sys.stderr.write("guard: the crane bus is gone; bring it up and start the guard again.\n")
-                return 4
+            freeze()
+            run(guard, bus, ended, Notifier(lambda: _words(guard, bus)))
     except GuardConfigError as error:
         sys.stderr.write(f"guard: {error}\n")
         return 3

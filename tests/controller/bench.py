@@ -1,12 +1,13 @@
 """A bench for the controller: emulated nodes and an integrator for a crane, in virtual time, in one process.
 
 It answers SDO like an encoder, sends every input frame at its period with a valid E2E header, and turns spool
-commands into joint motion through dead time and dead-band.  Faults are put on by name: ``dropped`` messages,
-``changed`` signals, ``corrupt`` messages.
+commands into joint motion through dead time, lag and dead-band.  A machine with a carrier (`AORO`) has mach0 too.
+Faults are put on by name: ``dropped`` messages, ``changed`` signals, ``corrupt`` messages.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -23,6 +24,7 @@ from can_dbc.canopen import (
 from can_dbc.codec import load
 from can_dbc.e2e import Sender
 from can_dbc.frame import Frame
+from can_dbc.nmea2000 import frames as packet
 from can_dbc.setpoint import (
     CraneSetpoint,
     GrappleCommand,
@@ -30,17 +32,22 @@ from can_dbc.setpoint import (
     OperatorAction,
     OperatorCommand,
     StateReport,
+    VehicleReport,
     decode,
     encode,
 )
 from controller.config import load as load_settings
 from controller.step import Controller, Inputs, Outputs, step
+from controller.valve import ValveMap
 from machine.encoder import counts_from_position
 from machine.joints import JOINTS, N_JOINTS
 from machine.modes import Mode
-from machine.profile import joint
+from machine.profile import encoders, joint
 
 DATABASE = load("crane")
+MACHINE, GNSS = load("machine"), load("gnss")
+CODECS = {**DATABASE.messages, **MACHINE.messages, **GNSS.messages}
+AORO = load_settings("aoro_fc8")
 SETTINGS = load_settings("palms_471")
 PROFILE = SETTINGS.profile
 SPECS = [joint(PROFILE, j) for j in JOINTS]
@@ -59,6 +66,19 @@ VALUES: dict[str, dict[str, float]] = {
     "PlcStatus": {"Mode": 2},
     "GrappleStat": {"Opening": 100.0},
 }
+MACHINE_PERIOD_MS = {
+    "VehStat": 20, "ArmHeightA": 20, "ArmHeightB": 20, "EEC1": 20, "CCVS": 100, "DM1": 1000, "PositionRapidUpdate": 100,
+    "VesselHeading": 100, "RateOfTurn": 100, "Attitude": 100, "CogSogRapidUpdate": 250, "GnssPositionData": 1000,
+    "SystemTime": 1000,
+}  # fmt: skip
+MACHINE_VALUES: dict[str, dict[str, float]] = {
+    "VehStat": {"Gear": 3, "Brake": 1, "ParkBrake": 1},
+    "EEC1": {"EngineSpeed": 1500.0},
+    "PositionRapidUpdate": {"Latitude": 63.66, "Longitude": 19.9},
+    "VesselHeading": {"Heading": 1.0},
+    "GnssPositionData": {"Method": 4},
+}
+SOURCES = {"GNSS": 0x1C, "ENGINE": 0x00}
 DEVICE = {"rotary": 0x00010196, "linear": 0x00080196}
 
 
@@ -106,7 +126,7 @@ class Bench:
     def __init__(self, settings=SETTINGS, start_ns: int = 1_000_000_000, home=HOME, guard=None) -> None:
         self.settings = settings
         self.guard = guard
-        self.controller = Controller(settings, DATABASE)
+        self.controller = Controller(settings, DATABASE, (MACHINE, GNSS))
         self.inputs = Inputs()
         self.now_ns = start_ns
         self.count = 0
@@ -115,14 +135,20 @@ class Bench:
         self.stuck: set[int] = set()
         self.backward: set[int] = set()
         self.moves_alone: dict[int, float] = {}
-        self.lines = [deque([0.0] * max(1, round(s.valve.delay_s * 1e9 / T))) for s in SPECS]
-        self.senders = {n: Sender(m.data_ids) for n, m in DATABASE.messages.items() if m.data_ids}
+        self.specs = [joint(settings.profile, j) for j in JOINTS]
+        self.carrier = settings.profile.carrier
+        self.articulation_rad = 0.0
+        self.valves = [ValveMap(s.valve) for s in self.specs]
+        self.spools = [0.0] * N_JOINTS
+        self.openings = [0.0] * N_JOINTS
+        self.lines = [deque([0.0] * max(1, round(s.valve.delay_s * 1e9 / T))) for s in self.specs]
+        self.senders = {n: Sender(m.data_ids) for n, m in CODECS.items() if m.data_ids}
         self.dropped: set[str] = set()
         self.corrupt: set[str] = set()
         self.frozen: set[str] = set()
         self.changed: dict[str, dict[str, float]] = {}
         self.silent_nodes: set[int] = set()
-        self.encoders = {s.encoder.node: EncoderNode(s.encoder) for s in SPECS if s.encoder}
+        self.encoders = {e.node: EncoderNode(e) for e in encoders(settings.profile).values()}
         self.nodes = dict.fromkeys((1, 16, 32, 33, 34, 125), 5)
         self.pending: list[tuple[int, bytes]] = [heartbeat_frame(n, 0) for n in (*self.nodes, *self.encoders)]
         self.extra: list[tuple[int, bytes]] = []
@@ -130,8 +156,13 @@ class Bench:
         self.sequence = 0
         self.setpoint_sequence = 0
         self.reports: list[StateReport] = []
+        self.vehicle_reports: list[VehicleReport] = []
         self.commands_a: dict[str, Any] = {}
         self.commands_b: dict[str, Any] = {}
+        self.machine_extra: list[tuple[int, bytes]] = []
+        self.machine_commands: dict[str, dict[str, Any]] = {}
+        self.machine_sent: list[tuple[int, bytes]] = []
+        """Everything the controller said on mach0."""
         self.last_frames: dict[str, Frame] = {}
         if guard is not None:
             self.dropped.add("GuardStat")
@@ -144,12 +175,18 @@ class Bench:
         self.now_ns += T
         stamp = self.now_ns - T + 1 * MS
         self.inputs.frames = [Frame(stamp, key, data) for key, data in self._answers()]
+        self.inputs.machine_frames = [Frame(stamp, key, data) for key, data in self._machine_answers()]
         self.inputs.datagrams = list(datagrams)
         self.inputs.late_ns = measured.pop("late_ns", 0)
-        for name, value in measured.items():
-            setattr(self.inputs, name, value)
+        for name, value in measured.items():  # bus_state, machine_bus_refused and so on go into the readings
+            which, of_bus, counter = name.partition("bus_")
+            if of_bus:
+                setattr(self.inputs.machine_bus if which else self.inputs.bus, counter, value)
+            else:
+                setattr(self.inputs, name, value)
         outputs = step(self.controller, self.inputs, self.now_ns)
         self._obey(outputs)
+        self._obey_machine(outputs)
         if self.guard is not None:
             heard = [frame for frame in self.inputs.frames if frame.key not in (0x1FD, 0x77D)]
             heard += [Frame(self.now_ns, key, data) for key, data in outputs.frames]
@@ -158,6 +195,10 @@ class Bench:
             report = decode(outputs.report, self.settings.key)
             assert isinstance(report, StateReport)
             self.reports.append(report)
+        if outputs.vehicle_report is not None:
+            vehicle = decode(outputs.vehicle_report, self.settings.key)
+            assert isinstance(vehicle, VehicleReport)
+            self.vehicle_reports.append(vehicle)
         self.count += 1
         return outputs
 
@@ -168,10 +209,9 @@ class Bench:
 
     def _answers(self) -> list[tuple[int, bytes]]:
         frames, self.pending = self.pending, []
-        for j, spec in enumerate(SPECS):
-            encoder = spec.encoder
-            if encoder and self.encoders[encoder.node].state == 0x05 and encoder.message not in self.dropped:
-                counts = counts_from_position(encoder, self.q[j])
+        for place, encoder in encoders(self.settings.profile).items():
+            if self.encoders[encoder.node].state == 0x05 and encoder.message not in self.dropped:
+                counts = counts_from_position(encoder, self.q[place] if place < N_JOINTS else self.articulation_rad)
                 values = {"Position": counts}
                 codec = DATABASE.message(encoder.message)
                 if "TimeStamp" in codec.index and encoder.message not in self.frozen:
@@ -188,8 +228,17 @@ class Bench:
         self.extra = []
         return frames
 
+    def _machine_answers(self) -> list[tuple[int, bytes]]:
+        frames, self.machine_extra = self.machine_extra, []
+        for name, period_ms in MACHINE_PERIOD_MS.items() if self.carrier else ():
+            if (self.count * 5) % period_ms == 0 and name not in self.dropped:
+                key, data = self._frame(name, MACHINE_VALUES.get(name, {}))
+                codec = CODECS[name]
+                frames += packet(codec, data, SOURCES[codec.senders[0]]) if codec.by_pgn else [(key, data)]
+        return frames
+
     def _frame(self, name: str, values: dict[str, float]) -> tuple[int, bytes]:
-        codec = DATABASE.message(name)
+        codec = CODECS[name]
         values = {**values, **self.changed.get(name, {})}
         data = codec.encode(*(values.get(s.name, 0) for s in codec.signals))
         if codec.data_ids:
@@ -218,17 +267,29 @@ class Bench:
                     answer = encoder.answer(key, data)
                     if answer is not None:
                         self.pending.append(answer)
-        for j, spec in enumerate(SPECS):
+        for j, spec in enumerate(self.specs):
             valve = spec.valve
             command = {**self.commands_a, **self.commands_b}[valve.signal] / 100.0
             self.lines[j].append(command)
-            opening = self.lines[j].popleft()
+            lag = 1.0 - math.exp(-T * 1e-9 / valve.lag_s) if valve.lag_s else 1.0
+            self.spools[j] += lag * (self.lines[j].popleft() - self.spools[j])
+            half, made = valve.hysteresis_pct / 200.0, self.valves[j]
+            opening = max(self.spools[j] - half, min(self.spools[j] + half, self.openings[j]))
+            self.openings[j] = opening
+            made.place(self.q[j])
             deadband = (valve.deadband_plus_pct if opening > 0 else valve.deadband_minus_pct) / 100.0
-            full = valve.full_speed_plus if opening > 0 else valve.full_speed_minus
-            share = max(0.0, abs(opening) - deadband) / (1.0 - deadband)
+            full = made.full_plus if opening > 0 else made.full_minus
+            share = max(0.0, abs(opening) - deadband) / (1.0 - half - deadband)
             self.v[j] = 0.0 if j in self.stuck else (full if opening > 0 else -full) * share
             self.v[j] = self.moves_alone.get(j, 0.0) + (-self.v[j] if j in self.backward else self.v[j])
             self.q[j] += self.v[j] * T * 1e-9
+
+    def _obey_machine(self, outputs: Outputs) -> None:
+        self.machine_sent += outputs.machine_frames
+        for key, data in outputs.machine_frames:
+            codec = MACHINE.find(key)
+            assert codec is not None
+            self.machine_commands[codec.name] = codec.named(codec.decode(data))
 
     # -- what a person and a planner say
 

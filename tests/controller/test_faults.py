@@ -5,9 +5,10 @@ from bench import MS, Bench, T, count_until
 
 from can_dbc.canopen import Emergency, emergency_frame, heartbeat_frame
 from can_dbc.setpoint import OperatorAction
-from machine.faults import FAULTS, Reaction, Reason, describe, pack
+from machine.faults import FAULTS, describe
 from machine.joints import Joint
 from machine.modes import Mode
+from machine.reasons import Reaction, Reason, pack
 
 PROMISE_NS = 100 * MS
 
@@ -192,8 +193,8 @@ def test_emergency_messages(code, reason):
     assert bench.reason == reason and bench.controller.supervisor.detail == 4
     bench.extra.append(emergency_frame(Emergency(4, 0, 0, b"")))
     bench.tick()
-    assert not bench.controller.received.nodes[4].emergency
-    assert not bench.controller.received.nodes[4].warning
+    assert not bench.controller.received.nodes.by_number[4].emergency
+    assert not bench.controller.received.nodes.by_number[4].warning
 
 
 def test_three_communication_emergencies_in_ten_seconds_stop():
@@ -247,12 +248,24 @@ def test_frames_of_an_overflowed_tick_are_not_used():
 
 def test_late_loop_degrades_and_stalled_loop_stops():
     bench = Bench().active()
-    bench.tick(late_ns=T + 1)
+    bench.tick(late_ns=2 * T)
+    assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE, "two periods are borne"
+    bench.tick([bench.moving(0, 0.08)], late_ns=2 * T + 1)
     assert bench.mode is Mode.ACTIVE and bench.reason == Reason.LOOP_LATE
-    bench.tick([bench.moving(0, 0.08)], late_ns=3 * T + 1)
+    bench.tick([bench.moving(0, 0.08)], late_ns=50 * MS + 1)
     assert bench.mode is Mode.STOP and bench.reason == Reason.LOOP_STALLED
     bench.run(31)
     assert bench.neutral
+
+
+@pytest.mark.parametrize(("apart", "mode"), [(90, Mode.STOP), (105, Mode.ACTIVE)])
+def test_three_late_cycles_stop_when_they_fall_within_a_second(apart, mode):
+    """At 200 Hz: two gaps of 90 ticks are 0.9 s, two of 105 are 1.05 s."""
+    bench = Bench().active()
+    for k in range(2 * apart + 1):
+        late_ns = 2 * T + 1 if k % apart == 0 else 0
+        bench.tick([bench.hold()] if k % 10 == 0 else (), late_ns=late_ns)
+    assert (bench.mode, bench.reason) == (mode, Reason.LOOP_STALLED if mode is Mode.STOP else Reason.LOOP_LATE)
 
 
 def test_a_second_fault_while_stopping_is_neutral_at_once():

@@ -15,8 +15,8 @@ from controller.guard.__main__ import build, main, profile_path
 from controller.guard.envelope import read_envelope
 from controller.guard.judge import CALM_NS, Guard, Verdict, checksum
 from controller.guard.layout import GuardConfigError, read_layouts
-from machine.faults import Reason
 from machine.modes import Mode
+from machine.reasons import Reason
 
 PROFILE = profile_path("palms_471")
 CENTRE = 8192

@@ -5,8 +5,9 @@ from bench import MS, VALUES, Bench
 
 from can_dbc.setpoint import OperatorAction
 from controller.supervisor import TRANSITIONS, Event
-from machine.faults import FAULTS, Reaction, Reason
+from machine.faults import FAULTS
 from machine.modes import Mode
+from machine.reasons import Reaction, Reason
 
 B, S, A, X, P, F = Mode.BOOT, Mode.STANDBY, Mode.ARMED, Mode.ACTIVE, Mode.STOP, Mode.FAULT
 #                 BOOT STANDBY ARMED ACTIVE STOP FAULT

@@ -9,12 +9,12 @@ from bench import MS, PROFILE, SETTINGS, SPECS, Bench
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.setpoint import DatagramFault, DriveSetpoint, StateReport, encode
+from can_dbc.setpoint import DatagramFault, DriveSetpoint, StateReport, Steering, encode
 from controller.config import load
 from controller.trajectory import extremes, hermite, peak_speed
-from machine.faults import Reason
 from machine.joints import Joint
 from machine.modes import Mode
+from machine.reasons import Reason
 
 ZERO = [0.0] * 5
 HASH = SETTINGS.profile_hash
@@ -60,7 +60,8 @@ BAD = {
     "final but moving": (Reason.FINAL_MOVING, 0, lambda b: b.setpoint(
         [(0, at(b), ZERO), (400, at(b, 0, 0.01), speed(0, 0.05))], final=True)),
     "drive": (Reason.CANNOT_DRIVE, 0, lambda b: encode(
-        DriveSetpoint(99, HASH, b.now_ns, 200 * MS, 63.0, 19.0, 0.5, (0.0, 0.0, 0.0, 0.0)))),
+        DriveSetpoint(99, HASH, b.now_ns, 200 * MS, Steering.WAYPOINT, 63.0, 19.0, 0.0, 0.0, 0.5, (0.3,) * 4,
+                      False, False))),
     "a report": (Reason.DATAGRAM_KIND, 0, lambda b: encode(StateReport(
         1, HASH, b.now_ns, 2, 0, 0, 0, 0, 0, 0, (0.0,) * 5, (0.0,) * 5, (0.0,) * 5, 0.0, 0.0, 0.0, 0, 0, 0, 0))),
     "truncated": (Reason.DATAGRAM_CRC, 0, lambda b: b.hold()[:-1]),
@@ -83,11 +84,11 @@ def test_refused_with_its_reason_and_nothing_moves(name):
     bench.tick([bench.hold()])
     bench.run(2)
     before = bench.controller.gate.refused
-    lease_end = bench.controller._lease_end_ns
+    lease_end = bench.controller.crane.lease_end_ns
     bench.tick([make(bench)])
     gate = bench.controller.gate
     assert (gate.refusal, gate.detail, gate.refused) == (reason, detail, before + 1)
-    assert bench.controller._lease_end_ns == lease_end and bench.mode is Mode.ACTIVE
+    assert bench.controller.crane.lease_end_ns == lease_end and bench.mode is Mode.ACTIVE
     bench.run(4)
     if bench.reports:
         assert bench.reports[-1].refusal == reason | detail << 8
@@ -95,6 +96,8 @@ def test_refused_with_its_reason_and_nothing_moves(name):
 
 def test_every_refusal_reason_is_tried():
     unreachable = {Reason.DATAGRAM_AUTHENTICATION, Reason.NOT_ARMED}  # own tests below and in test_modes
+    unreachable |= {Reason.TEST_FUNCTION, Reason.TEST_SPOOL, Reason.TEST_BUSY}  # in test_spool_tests
+    unreachable |= {r for r in Reason if Reason.DRIVE_SPEED <= r <= Reason.CARRIER_MOVES}  # in test_drive_setpoints
     tried = {reason for reason, _, _ in BAD.values()} | unreachable
     assert tried == {r for r in Reason if r > 100}
     assert {100 + f for f in DatagramFault} <= set(Reason)

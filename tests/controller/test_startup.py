@@ -10,8 +10,8 @@ from can_dbc.canopen import SDO_TO_SERVER, Sdo, SdoKind
 from controller.config import ConfigError
 from controller.startup import EncoderSetup, Phase
 from controller.step import Controller
-from machine.faults import Reason
 from machine.modes import Mode
+from machine.reasons import Reason
 
 
 def test_every_encoder_is_set_up_as_the_bus_reference_says():

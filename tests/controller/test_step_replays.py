@@ -4,19 +4,23 @@ import gc
 import tracemalloc
 from itertools import pairwise
 
-from bench import DATABASE, MS, SPECS, Bench, T
+import pytest
+from bench import AORO, DATABASE, GNSS, MACHINE, MS, SETTINGS, SPECS, Bench, T
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from can_dbc import tick_record
-from can_dbc.bus import BusState
 from can_dbc.frame import EXTENDED, Frame
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, encode
-from controller.laws.pd import HEADROOM
+from controller.laws.joint import HEADROOM
+from controller.record import record, refill, said
 from controller.step import Controller, Inputs, step
 from controller.valve import ValveMap
 from machine.modes import Mode
 
+pytestmark = pytest.mark.computed
+
+CLAIM = MACHINE.message("AddressClaim")
 KNOWN_KEYS = [m.key for m in DATABASE.messages.values()]
 frames = st.lists(
     st.tuples(
@@ -58,8 +62,9 @@ hostile = st.lists(st.tuples(frames, st.lists(st.one_of(st.binary(max_size=80), 
 
 def inside_the_envelope(bench):
     commands = {**bench.commands_a, **bench.commands_b}
-    for spec in SPECS:
+    for spec, estimator in zip(SPECS, bench.controller.estimators, strict=True):
         made = ValveMap(spec.valve)
+        made.place(estimator.position)
         limit = HEADROOM * spec.speed_limit
         low, high = made.spool_pct(-limit), made.spool_pct(limit)
         assert min(low, high) - 0.05 <= commands[spec.valve.signal] <= max(low, high) + 0.05
@@ -101,55 +106,58 @@ PREPARED = {
 }
 
 
-def record(bench, tape, datagrams=(), **measured):
-    outputs = bench.tick(datagrams, **measured)
-    i = bench.inputs
-    bus = (i.bus_state, i.bus_dropped, i.bus_refused, i.bus_errors)
-    tape.append(
-        tick_record.encode(
-            bench.now_ns, i.late_ns, i.tick_ns, i.missed_ticks, bus, i.frames, i.datagrams, outputs.frames,
-            outputs.report,
-        )
-    )  # fmt: skip
+def note(bench, tape, datagrams=(), **measured):
+    tape.append(record(bench.inputs, bench.tick(datagrams, **measured), bench.now_ns))
 
 
-def test_a_record_of_a_whole_life_replays_to_the_same_bytes():
-    bench, tape = Bench(), []
-    for _ in range(130):
-        record(bench, tape)
-    record(bench, tape, [bench.operator(1)])
-    record(bench, tape, [bench.hold()])
+@pytest.mark.parametrize("settings_", [SETTINGS, AORO], ids=lambda s: s.profile.name)
+def test_a_record_of_a_whole_life_replays_to_the_same_bytes(settings_):
+    bench, tape = Bench(settings_), []
+    for _ in range(150):
+        note(bench, tape)
+    note(bench, tape, [bench.operator(1)])
+    note(bench, tape, [bench.hold()])
     for k in range(100):
-        record(bench, tape, [bench.moving(0, 0.1)] if k % 10 == 0 else (), late_ns=k * 1000, tick_ns=k)
-    record(bench, tape, [b"rubbish"], late_ns=T + 1, bus_state=2, bus_dropped=1, bus_refused=1, bus_errors=3)
+        note(bench, tape, [bench.moving(0, 0.1)] if k % 10 == 0 else (), late_ns=k * 1000, tick_ns=k)
+    assert bench.mode is Mode.ACTIVE
+    note(bench, tape, [b"rubbish"], late_ns=T + 1, bus_state=2, bus_dropped=1, bus_refused=1, bus_errors=3)
+    note(bench, tape, machine_bus_dropped=1, machine_bus_refused=2)
+    bench.machine_extra += [(CLAIM.key, bytes(8))] if bench.carrier else []
     bench.dropped.add("EncSlew")
     for _ in range(40):
-        record(bench, tape, [bench.hold()])
+        note(bench, tape, [bench.hold()])
+    note(bench, tape, bus_recoveries=1, machine_bus_recoveries=2, bus_state=0)
+    for _ in range(100):
+        note(bench, tape)
     assert bench.mode is Mode.FAULT
 
-    controller, inputs = Controller(bench.settings, DATABASE), Inputs()
+    controller, inputs = Controller(bench.settings, DATABASE, (MACHINE, GNSS)), Inputs()
     for data in tape:
         tick = tick_record.decode(data)
-        inputs.frames, inputs.datagrams = list(tick.frames_in), list(tick.datagrams)
-        inputs.late_ns, inputs.tick_ns, inputs.missed_ticks = tick.late_ns, tick.tick_ns, tick.missed_ticks
-        inputs.bus_state, inputs.bus_dropped = tick.bus_state, tick.bus_dropped
-        inputs.bus_refused, inputs.bus_errors = tick.bus_refused, tick.bus_errors
+        refill(inputs, tick)
         outputs = step(controller, inputs, tick.now_ns)
-        assert tuple(outputs.frames) == tick.frames_out
-        assert (outputs.report or b"") == tick.report
+        assert said(outputs) == (tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report)
+        assert tick.frames_out[-1][0] == 0x080, "SYNC goes out last"
+    spoken = [said for data in tape for said in tick_record.decode(data).machine_frames_out]
+    assert bool(spoken) is (settings_ is AORO)
 
 
-def test_a_tick_leaves_nothing_behind():
-    bench = Bench().active()
-    planned = [(list(bench._answers()), [bench.moving(0, 0.08)] if k % 10 == 0 else []) for k in range(40)]
+@pytest.mark.parametrize("settings_", [SETTINGS, pytest.param(AORO, marks=pytest.mark.slow)])
+def test_a_tick_leaves_nothing_behind(settings_):
+    bench = Bench(settings_).active()
+    planned = []
+    for k in range(40):
+        bench.count += 1
+        datagrams = [bench.moving(0, 0.08)] if k % 10 == 0 else []
+        planned.append((list(bench._answers()), list(bench._machine_answers()), datagrams))
     state, inputs = bench.controller, Inputs()
 
     def ticks(n):
         for k in range(n):
             bench.now_ns += T
-            answers, datagrams = planned[k % 40]
+            answers, machine_answers, inputs.datagrams = planned[k % 40]
             inputs.frames = [Frame(bench.now_ns, key, data) for key, data in answers]
-            inputs.datagrams = datagrams
+            inputs.machine_frames = [Frame(bench.now_ns, key, data) for key, data in machine_answers]
             step(state, inputs, bench.now_ns)
 
     ticks(400)
@@ -186,19 +194,17 @@ def test_reports_come_50_times_a_second_and_tell_what_is_unknown():
     assert report.sequence == len(bench.reports) and report.frames_received > 0
 
 
-def test_status_heartbeat_and_sync_on_the_bus():
+def test_status_and_heartbeat_on_the_bus_and_sync_apart():
     bench = Bench().boot()
     seen, counters = {}, []
     for _ in range(200):
-        for key, data in bench.tick().frames:
+        outputs = bench.tick()
+        counters.append(outputs.sync[1][0])
+        for key, _ in (*outputs.frames, outputs.sync):
             seen[key] = seen.get(key, 0) + 1
-            if key == 0x080:
-                counters.append(data[0])
     assert seen[0x210] == seen[0x310] == seen[0x080] == 200
     assert seen[0x4FE] == 50 and seen[0x77E] == 10
     assert all(b == a % 240 + 1 for a, b in pairwise(counters))
-    bench.run(1, bus_state=BusState.ACTIVE)
-    assert bench.controller.outputs.frames[-1][0] == 0x080
 
 
 def test_farewell_is_neutral_and_disarmed():

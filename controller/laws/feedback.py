@@ -1,0 +1,131 @@
+"""Four ways to turn a joint's error into a velocity correction, behind one interface.
+
+All are of the velocity type (machines.md section 4) and share one budget: ``kp_1_s`` is the small-signal gain inside
+the ``layer``, which `timberhand bench loop-design` bounds; how a law spends it stands here and nowhere else.  Sliding
+mode and super-twisting are reconstructions: paper B names the first and cites La Hera and Ortiz Morales 2015, whose
+equations were not at hand.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, Protocol
+
+from machine.profile import Law
+
+REACHING_SHARE: Final = 0.5
+"""Share of the budget in the switching term; the rest is the proportional term lambda e."""
+INTEGRAL_SHARE: Final = 0.05
+"""Integral gain of the three laws that have one, inside the layer, over the budget squared [-]: more would cost the
+slew, whose load swings at its crossover, its gain margin.
+"""
+PID_SHARE: Final = 0.25
+"""Share of the budget that the plain PID spends: without delay compensation and pressure feedback a load that swings
+under the slew would take its margins with more.
+"""
+
+
+class Feedback(Protocol):
+    """A law's core."""
+
+    def reset(self) -> None:
+        """Forgets its integrals."""
+
+    def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
+        """Velocity correction [unit/s] for an error [unit]; ``frozen``: the command is limited, integrals stand."""
+
+
+class Pd:
+    """Paper A's law: Kp e + Kd e'."""
+
+    __slots__ = ("_kd", "_kp")
+
+    def __init__(self, law: Law) -> None:
+        self._kp, self._kd = law.kp_1_s, law.kd
+
+    def reset(self) -> None:
+        """Has no memory."""
+
+    def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
+        return self._kp * error + self._kd * error_rate
+
+
+class Pid:
+    """The baseline: PD with an integral.  Its shell gives it neither feed-forward nor delay compensation."""
+
+    __slots__ = ("_integral", "_kd", "_ki", "_kp")
+
+    def __init__(self, law: Law) -> None:
+        self._kp, self._kd = PID_SHARE * law.kp_1_s, law.kd
+        self._ki = INTEGRAL_SHARE * self._kp**2
+        self._integral = 0.0
+
+    def reset(self) -> None:
+        self._integral = 0.0
+
+    def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
+        if not frozen:
+            self._integral += self._ki * error * elapsed_s
+        return self._kp * error + self._kd * error_rate + self._integral
+
+
+class SlidingMode:
+    """lambda e + Kd e' + k1 tanh(sigma / phi),  sigma = e + mu integral e, a slower surface than machines.md's."""
+
+    __slots__ = ("_integral", "_k1", "_kd", "_lambda", "_layer", "_mu")
+
+    def __init__(self, law: Law) -> None:
+        self._kd, self._layer = law.kd, law.layer
+        self._k1 = REACHING_SHARE * law.kp_1_s * law.layer
+        self._lambda = (1.0 - REACHING_SHARE) * law.kp_1_s
+        self._mu = INTEGRAL_SHARE / REACHING_SHARE * law.kp_1_s
+        self._integral = 0.0
+
+    def reset(self) -> None:
+        self._integral = 0.0
+
+    def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
+        if not frozen:
+            self._integral = _within(self._integral + self._mu * error * elapsed_s, 2.0 * self._layer)
+        reaching = self._k1 * math.tanh((error + self._integral) / self._layer)
+        return self._lambda * error + self._kd * error_rate + reaching
+
+
+class SuperTwisting:
+    """lambda e + Kd e' + k1 |e|^1/2 sat(e / phi) + w,  w' = k2 sat(e / phi).
+
+    The surface is the error itself: with an integral of its own beside w the loop would be stable conditionally only.
+    """
+
+    __slots__ = ("_k1", "_k2", "_kd", "_lambda", "_layer", "_twist", "_twist_limit")
+
+    def __init__(self, law: Law) -> None:
+        kp = law.kp_1_s
+        self._kd, self._layer = law.kd, law.layer
+        self._k1 = REACHING_SHARE * kp * math.sqrt(law.layer)
+        self._k2 = INTEGRAL_SHARE * kp * kp * law.layer
+        self._lambda = (1.0 - REACHING_SHARE) * kp
+        self._twist_limit = kp * law.layer
+        self._twist = 0.0
+
+    def reset(self) -> None:
+        self._twist = 0.0
+
+    def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
+        side = _within(error / self._layer, 1.0)
+        if not frozen:
+            self._twist = _within(self._twist + self._k2 * side * elapsed_s, self._twist_limit)
+        reaching = self._k1 * math.sqrt(abs(error)) * side + self._twist
+        return self._lambda * error + self._kd * error_rate + reaching
+
+
+LAWS: Final[dict[str, type[Pd] | type[Pid] | type[SlidingMode] | type[SuperTwisting]]] = {
+    "pd": Pd,
+    "pid": Pid,
+    "sliding_mode": SlidingMode,
+    "super_twisting": SuperTwisting,
+}
+
+
+def _within(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)

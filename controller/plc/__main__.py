@@ -1,0 +1,180 @@
+"""The bridge process: ``python -m controller.plc --profile P --bus crane0=wire:crane0 --modbus 127.0.0.1:1502``.
+
+Plays the machine's nodes on crane0 with what a PLC says on Ethernet, and passes the supervised commands on.  One
+asyncio loop, one thread.  On stdout ``ready`` when it is on the bus, on stderr one JSON line at its end.  Nothing is
+authenticated, so it talks to loopback addresses alone unless ``--allow-network`` is given.  Exit codes: 0 ended by
+SIGTERM, 2 usage, 3 configuration, 4 no bus or address at the start, 130 SIGINT.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import signal
+import sys
+import time
+from dataclasses import asdict
+from typing import Final
+
+from can_dbc.bus import Bus, BusError, default_address, open_bus
+from can_dbc.codec import DbcError, load
+from can_dbc.frame import Frame
+from can_dbc.lost_link import LostLink
+from can_dbc.plc.map import WordOrder
+from can_dbc.plc.modbus import is_loopback
+from can_dbc.setpoint import udp_address
+from controller.config import ConfigError
+from controller.plc.bridge import Bridge
+from controller.plc.links import ModbusLink, UdpLink
+from controller.realtime import Notifier, freeze, keep_heap, prepare
+from machine.load import ProfileError, load_profile
+
+STEP_S: Final = 0.005
+PRIORITY: Final = 70
+TX_QUEUE: Final = 64
+"""This process plays a dozen nodes."""
+
+
+def address(text: str) -> tuple[str, int]:
+    """HOST:PORT of a command line; raises ArgumentTypeError."""
+    try:
+        return udp_address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="python -m controller.plc",
+        description="Connects crane0 to a machine PLC over Modbus/TCP or cyclic UDP.",
+        epilog="example: python -m controller.plc --profile palms_plc.toml --bus crane0=socketcan:vcan0 "
+        "--modbus 192.168.7.2:502 --allow-network",
+    )
+    made.add_argument("--profile", required=True, help="shipped profile name or TOML file with a [plc] table")
+    made.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="where the crane bus is")
+    way = made.add_mutually_exclusive_group(required=True)
+    way.add_argument("--modbus", type=address, metavar="HOST:PORT", help="the PLC's Modbus/TCP server")
+    way.add_argument("--udp", type=address, metavar="HOST:PORT", help="the PLC's port for cyclic datagrams")
+    made.add_argument("--word-order", choices=("high", "low"), default="high", help="which half of 32 bits comes first")
+    made.add_argument("--allow-network", action="store_true", help="the PLC may be on another host")
+    made.add_argument("--no-realtime", action="store_true", help="do not ask for FIFO and locked memory")
+    return made
+
+
+class Process:
+    """Bus and bridge in one loop; the link to the PLC is a task beside it."""
+
+    def __init__(self, bridge: Bridge, bus: Bus) -> None:
+        self._bridge, self._bus = bridge, bus
+        self._watch = LostLink(bus).watch
+        self._notifier = Notifier(self.words)
+        self._frames: list[Frame] = []
+
+    def step(self) -> None:
+        """Everything that waits on the bus, and what is due."""
+        frames = self._frames
+        frames.clear()
+        self._bus.drain(frames)
+        self._bus.send_all(self._bridge.step(time.monotonic_ns(), frames))
+
+    def words(self) -> str:
+        """How it is, in one line."""
+        shake, bus = self._bridge.handshake, self._bus
+        said = shake.problem or f"The PLC has answered {shake.answers} times."
+        return f"{said} The bus is {bus.stats.state.name}."
+
+    async def run(self, link: ModbusLink | UdpLink) -> None:
+        """Until cancelled."""
+        loop = asyncio.get_running_loop()
+        listening = -1
+        exchanging = asyncio.create_task(link.run())
+        try:
+            due = loop.time()
+            while not exchanging.done():
+                descriptor = self._bus.fileno()
+                if descriptor != listening:  # a reopened bus has a new one
+                    if listening >= 0:
+                        loop.remove_reader(listening)
+                    if descriptor >= 0:
+                        loop.add_reader(descriptor, self.step)
+                    listening = descriptor
+                self.step()
+                now_ns = time.monotonic_ns()
+                self._watch(now_ns)
+                self._notifier.ticked(now_ns, True)
+                due = max(due + STEP_S, loop.time())
+                await asyncio.sleep(due - loop.time())
+            exchanging.result()
+        finally:
+            exchanging.cancel()
+            link.close()
+            self._notifier.stopping()
+
+
+def summary(bridge: Bridge) -> str:
+    """One JSON line on how the conversation went."""
+    shake = bridge.handshake
+    return json.dumps(
+        {
+            "sent": shake.sent, "answers": shake.answers, "refused": shake.refused, "dropped": shake.dropped,
+            "refused_here": bridge.gate.refused, "round_trip": shake.round_trip.summary(), "problem": shake.problem,
+            "feedback": None if shake.feedback is None else asdict(shake.feedback),
+        }
+    )  # fmt: skip
+
+
+async def _until_ended(process: Process, link: ModbusLink | UdpLink, ended: list[int]) -> None:
+    loop, task = asyncio.get_running_loop(), asyncio.create_task(process.run(link))
+
+    def end(number: int) -> None:
+        ended.append(number)
+        task.cancel()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, end, number)
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    try:
+        await task
+    except asyncio.CancelledError:
+        if not ended:
+            raise
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Starts the bridge; returns the exit code."""
+    made = parser()
+    options = made.parse_args(arguments)
+    name, _, where = options.bus.partition("=")
+    if options.bus and (name != "crane0" or not where):
+        made.error(f"--bus {options.bus}: write crane0=ADDRESS, as in crane0=socketcan:can0")
+    host, port = options.modbus or options.udp
+    if not options.allow_network and not is_loopback(host):
+        made.error(f"{host} is on the network, and neither Modbus nor the datagrams are authenticated; "
+                   "use a network of their own and give --allow-network")  # fmt: skip
+    keep_heap()
+    ended: list[int] = []
+    try:
+        order = WordOrder.HIGH_FIRST if options.word_order == "high" else WordOrder.LOW_FIRST
+        bridge = Bridge(load_profile(options.profile), load("crane"), order)
+        with open_bus(where or default_address("crane0"), tx_queue=TX_QUEUE, participant="plc") as bus:
+            if not options.no_realtime:
+                for refusal in prepare(PRIORITY):
+                    sys.stderr.write(f"plc: not granted: {refusal}\n")
+            link = ModbusLink(bridge, host, port) if options.modbus else UdpLink(bridge, host, port)
+            freeze()
+            asyncio.run(_until_ended(Process(bridge, bus), link, ended))
+        sys.stderr.write(f"plc: {summary(bridge)}\n")
+    except (ConfigError, DbcError, ProfileError) as error:
+        sys.stderr.write(f"plc: {error}\n")
+        return 3
+    except (BusError, OSError) as error:
+        sys.stderr.write(f"plc: {error}\n")
+        return 4
+    return 130 if signal.SIGINT in ended else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

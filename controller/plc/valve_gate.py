@@ -1,0 +1,164 @@
+"""What the controller commands and the guard allows, read from crane0 and turned into a command for the PLC.
+
+Pure, and safe by absence, like every valve node: a command that moves needs ValveCmdA and B with the arm key, the
+guard's enable, and SYNC, all fresh; in role REFERENCES also the three reference frames.  After a loss while armed it
+stays neutral until the controller has disarmed.  What the PLC could not obey is refused here already, never clamped.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from can_dbc.codec import Database
+from can_dbc.frame import Frame
+from can_dbc.plc import map as plc
+from can_dbc.plc.map import N_AXES, N_JOINTS, Bounds, Command, Feedback, Grapple, MapError, Mode, Role, State
+from controller.outputs import ARM_KEY
+from controller.slot import Slot, age_out
+from machine.joints import JOINTS
+from machine.modes import Mode as ControllerMode
+from machine.profile import Profile, joint
+
+SYNC_NS: Final = 15_000_000
+RESET_NS: Final = 200_000_000
+_MOVES: Final = 2
+_DEGRADED: Final = 1
+_REFERENCES: Final = ("JointRefA", "JointRefB", "JointRefC")
+
+
+class Exit:
+    """ValveFbB.ExitCode (ISO 11783-7 reasons): why the node does not follow."""
+
+    OK, SAFETY_STOP, GUARD_MISSING, COMMAND_TIMEOUT, OUT_OF_RANGE, NOT_ARMED, FUNCTION_FAULT = 0, 2, 4, 5, 6, 8, 9
+
+
+class ValveGate:
+    """Reads crane0; ``command(now_ns, feedback)`` is what the PLC is to get next, ``exit`` why it is neutral."""
+
+    def __init__(self, profile: Profile, role: Role, database: Database) -> None:
+        self._role = role
+        specs = [joint(profile, j) for j in JOINTS]
+        self._bounds = (
+            Bounds.valves()
+            if role is Role.VALVES
+            else Bounds.references([(s.lower, s.upper, s.speed_limit) for s in specs])
+        )
+        names = ["ValveCmdA", "ValveCmdB", "GuardStat", "CtrlStatus"]
+        names += _REFERENCES if role is Role.REFERENCES else ()
+        slots = [Slot(database.message(name), bit) for bit, name in enumerate(names)]
+        self._a, self._b, self._guard, self._status, *self._references = slots
+        self._slots = tuple(slots)
+        self._by_key = {slot.codec.key: slot for slot in slots}
+        self._axes = [self._place(s.valve.signal) for s in specs]
+        self._places = [self._reference(j.name.capitalize()) for j in JOINTS] if self._references else []
+        self._sync_ns = -SYNC_NS
+        self._armed = False
+        self._locked = 0
+        self._reset_until_ns = 0
+        self.refused = 0
+        self.exit = Exit.NOT_ARMED
+
+    def _place(self, signal: str) -> tuple[Slot, str]:
+        return (self._a if signal in self._a.codec.index else self._b), signal
+
+    def _reference(self, name: str) -> tuple[Slot, str]:
+        return next(slot for slot in self._references if name in slot.codec.index), name
+
+    def receive(self, frame: Frame, now_ns: int) -> None:
+        """A frame from crane0; one that is not for us is ignored."""
+        slot = self._by_key.get(frame.key)
+        if slot is not None:
+            slot.take(frame, now_ns)
+            if slot is self._b and slot.fresh and slot.get("ArmKey") != ARM_KEY:
+                self._locked = 0
+
+    def sync(self, now_ns: int) -> None:
+        """SYNC seen."""
+        self._sync_ns = now_ns
+
+    @property
+    def locked(self) -> bool:
+        """Whether something was lost while armed, and nobody has disarmed since."""
+        return self._locked != 0
+
+    @property
+    def counter(self) -> int:
+        """E2E counter of the newest good ValveCmdA, 0 when it is stale."""
+        return self._a.get("Counter") or 0
+
+    def command(self, now_ns: int, feedback: Feedback | None) -> Command:
+        """The command for the PLC now."""
+        age_out(self._slots, now_ns)
+        missing = self._missing(now_ns)
+        if missing and self._armed:
+            self._locked = missing
+        asked = self._b.get("ArmKey") == ARM_KEY
+        self._armed = not missing and not self._locked and asked
+        self.exit = self._locked or missing or (Exit.OK if asked else Exit.NOT_ARMED)
+        if not self._armed:
+            return Command(reset=self._wants_reset(now_ns, feedback))
+        command = self._wanted()
+        try:
+            self._bounds.check(command)
+        except MapError:
+            self.refused += 1
+            self._armed, self._locked = False, Exit.OUT_OF_RANGE
+            self.exit = Exit.OUT_OF_RANGE
+            return Command()
+        return command
+
+    def _missing(self, now_ns: int) -> int:
+        """What keeps us from passing a command on, as an exit code; 0 when nothing does."""
+        slots = (self._a, self._b, *self._references)
+        if any(slot.values is None for slot in slots) or now_ns - self._sync_ns > SYNC_NS:
+            return Exit.COMMAND_TIMEOUT
+        if self._guard.get("Enable") != ARM_KEY:
+            return Exit.GUARD_MISSING
+        if self._a.get("Mode") not in (0, _MOVES):
+            return Exit.OUT_OF_RANGE
+        return 0
+
+    def _wanted(self) -> Command:
+        """What the controller asks for; a reference that is not available means that nothing is to move."""
+        b, spare = self._b, (0.0,) * (N_AXES - N_JOINTS)
+        mode, reference, rate = Mode.NEUTRAL, (0.0,) * N_AXES, (0.0,) * N_AXES
+        if self._a.get("Mode") == _MOVES and self._role is Role.VALVES:
+            mode = Mode.VALVES
+            reference = tuple(slot.get(signal) / 100.0 for slot, signal in self._axes) + spare
+        elif self._a.get("Mode") == _MOVES:
+            positions = [slot.get(name) for slot, name in self._places]
+            rates = [slot.get(f"{name}Rate") for slot, name in self._places]
+            if None not in positions and None not in rates:
+                mode, reference, rate = Mode.REFERENCES, (*positions, *spare), (*rates, *spare)
+        return Command(
+            mode=mode,
+            armed=True,
+            reference=reference,
+            rate=rate,
+            grapple=Grapple(b.get("GrappleMode")),
+            grapple_pct=min(100, round(abs(b.get("Grapple")))),
+            max_speed_pct=50 if self._status.get("SafeState") == _DEGRADED else 100,
+        )
+
+    def _wants_reset(self, now_ns: int, feedback: Feedback | None) -> bool:
+        """A pulse while the PLC is latched and the controller is not: an operator has acknowledged what happened.
+
+        A reset moves nothing; the arm key still has to be given by a human through the controller.
+        """
+        acknowledged = self._status.get("Mode") in (ControllerMode.BOOT, ControllerMode.STANDBY)
+        latched = feedback is not None and (feedback.state is State.SAFE or feedback.fault != 0)
+        if latched and acknowledged and now_ns >= self._reset_until_ns + RESET_NS:
+            self._reset_until_ns = now_ns + RESET_NS
+        return latched and now_ns < self._reset_until_ns
+
+
+def state_of(feedback: Feedback, gate: ValveGate) -> int:
+    """ValveFbA.State: 0 neutral, 1 active, 3 pilot off, 4 fault."""
+    if gate.locked:
+        return 4
+    return {State.EXECUTE: 1, State.SAFE: 3}.get(feedback.state, 0)
+
+
+def fault_bits(feedback: Feedback) -> int:
+    """PlcStatus.FaultBits: one bit per fault of the map."""
+    return 0 if feedback.fault == plc.Fault.NONE else 1 << (feedback.fault - 1) & 0xFFFF

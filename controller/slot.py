@@ -1,0 +1,103 @@
+"""The newest good frame of one message: values with an age, refused whole or taken whole, stale by the DBC's time-out.
+
+Every value starts as unknown.  A frame is refused whole when its length, checksum, counter or a value is
+wrong; the old value then only grows older, until it is stale by the time-out that the DBC gives, and it must
+qualify anew (two good frames).  A rotary encoder, which has no counter, is alive while its time stamp moves.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from can_dbc.codec import FrameRefused, MessageCodec
+from can_dbc.e2e import Checker
+from can_dbc.frame import Frame
+from controller.config import ConfigError
+
+PROMISE_NS: Final = 100_000_000
+"""Within this time after a needed input is lost every function is at neutral (design section 7)."""
+_LONGEST_TIMEOUT_NS: Final = PROMISE_NS - 10_000_000
+
+
+class Slot:
+    """One message; ``values`` is None before the first good frame and when it is stale."""
+
+    __slots__ = (
+        "_alive", "_checker", "_index", "_last_alive", "_receive", "bit", "codec", "fresh", "machine", "refused",
+        "stamp_ns", "timeout_ns", "values",
+    )  # fmt: skip
+
+    def __init__(self, codec: MessageCodec, bit: int, *, watched: bool = True, machine: bool = False) -> None:
+        """``bit`` is its place in the mask of stale inputs; the time-out of a ``watched`` one keeps the promise.
+
+        Raises:
+            ConfigError: the DBC has no time-out for it.
+        """
+        if not codec.timeout_ns:
+            raise ConfigError(f"The DBC gives no TimeoutMs for {codec.name}; add the attribute.")
+        self.codec = codec
+        self.machine = machine
+        """It comes on mach0, not on crane0."""
+        self._receive = codec.receive
+        self._index = dict(codec.index)
+        self._checker = Checker(codec.data_ids) if codec.data_ids else None
+        self._alive = codec.index.get("TimeStamp", -1)
+        self.bit = bit
+        self.timeout_ns = min(codec.timeout_ns, _LONGEST_TIMEOUT_NS) if watched else codec.timeout_ns
+        self._last_alive: Any = None
+        self.stamp_ns = 0
+        self.refused = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Unknown again: the next frames have to qualify it."""
+        self.values: tuple[Any, ...] | None = None
+        self.fresh = False
+        """A good frame came this tick."""
+        if self._checker is not None:
+            self._checker.reset()
+
+    def get(self, signal: str) -> Any:
+        """A signal's value; None when the message is unknown or stale, or the signal not available."""
+        return None if self.values is None else self.values[self._index[signal]]
+
+    def take(self, frame: Frame, now_ns: int) -> None:
+        """Judges a frame and takes its values when they are good."""
+        stamp_ns, _, data = frame
+        checker = self._checker
+        if checker is not None and not checker.check(data).usable:
+            self.refused += 1
+            if not checker.trusted:
+                self.values = None
+            return
+        try:
+            values = self._receive(data)
+        except FrameRefused:
+            self.refused += 1
+            return
+        if self._alive >= 0:
+            last, self._last_alive = self._last_alive, values[self._alive]
+            if last == self._last_alive:
+                self.refused += 1
+                return
+        self.values = values
+        self.stamp_ns = stamp_ns if stamp_ns < now_ns else now_ns
+        self.fresh = True
+
+
+def known(value: float | None) -> float:
+    """A received value, NaN when there is none."""
+    return math.nan if value is None else value
+
+
+def age_out(slots: tuple[Slot, ...], now_ns: int) -> int:
+    """Forgets values past their time-out; the mask of the slots in which nothing is known."""
+    mask = 0
+    for slot in slots:
+        if slot.values is None:
+            mask |= 1 << slot.bit
+        elif now_ns - slot.stamp_ns > slot.timeout_ns:
+            slot.forget()
+            mask |= 1 << slot.bit
+    return mask

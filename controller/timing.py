@@ -1,0 +1,159 @@
+"""What the loop knows of its own timing: how late, how long each stage, how old each input, what the system counts.
+
+Everything is kept in arrays and objects made at start; a tick adds to them and builds nothing.  Once a second they are
+published in shared memory (`can_dbc.timing_page`).
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from can_dbc.bus import Bus
+from can_dbc.durations import Durations
+from can_dbc.timing_page import STAGES, BusCounters, Facts, InputAge, ProcessCounters, TimingWriter
+from controller.slot import Slot
+from controller.step import Controller
+
+PUBLISH_NS: Final = 1_000_000_000
+_LAPS: Final = ("read", "decode", "estimate", "supervise", "law", "encode", "send", "tell")
+_PAGE_KB: Final = os.sysconf("SC_PAGESIZE") >> 10
+
+
+class LoopTiming:
+    """The loop's stopwatch.  In a tick: `begin`, `lap` after each stage, `commanded`, `end`."""
+
+    __slots__ = (
+        "_ages", "_at", "_begin_ns", "_clock_ns", "_cpu_begin_ns", "_cpu_ns", "_encoders", "_inputs", "_laps",
+        "_last_ns", "_previous_sync_ns", "_sync_ns", "_writer", "cpu", "durations", "publish_ns", "sample_to_command",
+        "started_ns", "sync", "tick", "wake",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        controller: Controller,
+        writer: TimingWriter | None = None,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        cpu_ns: Callable[[], int] = time.thread_time_ns,
+    ) -> None:
+        self.durations = {name: Durations() for name in STAGES}
+        self.wake, self.sync, self.tick, self.cpu, self.sample_to_command = (
+            self.durations[name] for name in ("wake", "sync", "tick", "cpu", "sample_to_command")
+        )
+        self._laps = [self.durations[name] for name in _LAPS]
+        self._inputs = controller.inputs_in_use
+        self._ages = [InputAge() for _ in self._inputs]
+        self._encoders: tuple[Slot, ...] = tuple(slot for slot in controller.received.encoders if slot is not None)
+        self._writer = writer
+        self._clock_ns, self._cpu_ns = clock_ns, cpu_ns
+        self.started_ns = clock_ns()
+        self.publish_ns = self._at = self._begin_ns = self._last_ns = self._cpu_begin_ns = 0
+        self._sync_ns = self._previous_sync_ns = 0
+
+    def synced(self, late_ns: int) -> None:
+        """SYNC is on its way: the encoders sample now."""
+        self._previous_sync_ns, self._sync_ns = self._sync_ns, self._clock_ns()
+        self.sync.add(late_ns)
+
+    def begin(self, late_ns: int) -> None:
+        """A tick begins."""
+        self._cpu_begin_ns = self._cpu_ns()
+        self._begin_ns = self._last_ns = self._clock_ns()
+        self._at = 0
+        self.wake.add(late_ns)
+
+    def lap(self) -> None:
+        """A stage ends."""
+        now_ns = self._clock_ns()
+        self._laps[self._at].add(now_ns - self._last_ns)
+        self._last_ns = now_ns
+        self._at += 1
+
+    def commanded(self) -> None:
+        """The valve commands are sent: how old are the samples they stand on?  As old as the oldest encoder's SYNC."""
+        oldest_ns = self._last_ns
+        for slot in self._encoders:
+            if slot.values is None:
+                return
+            if slot.stamp_ns < oldest_ns:
+                oldest_ns = slot.stamp_ns
+        for sync_ns in (self._sync_ns, self._previous_sync_ns):
+            if sync_ns <= oldest_ns:
+                self.sample_to_command.add(self._clock_ns() - sync_ns)
+                return
+        self.sample_to_command.add(self._clock_ns() - oldest_ns)
+
+    def end(self) -> int:
+        """A tick ends; returns its duration."""
+        begin_ns, ages = self._begin_ns, self._ages
+        for i, (_, slot) in enumerate(self._inputs):
+            if slot.fresh:
+                age, age_ns = ages[i], begin_ns - slot.stamp_ns
+                age.newest_ns = age_ns
+                age.count += 1
+                if age_ns > age.longest_ns:
+                    age.longest_ns = age_ns
+        self.lap()
+        duration_ns = self._last_ns - begin_ns
+        self.tick.add(duration_ns)
+        self.cpu.add(self._cpu_ns() - self._cpu_begin_ns)
+        return duration_ns
+
+    def publish(
+        self, now_ns: int, period_ns: int, missed: int, late: int, mode: str, words: str, buses: Sequence[Bus]
+    ) -> None:
+        """Writes the page; call it when ``publish_ns`` is reached."""
+        self.publish_ns = now_ns + PUBLISH_NS
+        if self._writer is None:
+            return
+        facts = Facts(
+            pid=os.getpid(),
+            started_ns=self.started_ns,
+            written_ns=now_ns,
+            period_ns=period_ns,
+            ticks=self.tick.count,
+            missed=missed,
+            late=late,
+            mode=mode,
+            words=words,
+            buses=tuple([_bus_counters(bus) for bus in buses]),
+            process=_process_counters(),
+            inputs={name: age for (name, _), age in zip(self._inputs, self._ages, strict=True)},
+            longest_ns=tuple([self.durations[name].longest_ns for name in STAGES]),
+            total_ns=tuple([self.durations[name].total_ns for name in STAGES]),
+        )
+        self._writer.publish(facts, self.durations)
+
+    def close(self) -> None:
+        """Takes the page away."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+def _bus_counters(bus: Bus) -> BusCounters:
+    stats = bus.stats
+    return BusCounters(
+        bus.name, stats.state.name, stats.received, stats.sent, stats.refused, stats.dropped, stats.error_frames,
+        stats.recoveries,
+    )  # fmt: skip
+
+
+def _process_counters() -> ProcessCounters:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    with open("/proc/self/statm", "rb") as statm:
+        resident_pages = int(statm.read().split()[1])
+    return ProcessCounters(
+        cpu_ns=round((used.ru_utime + used.ru_stime) * 1e9),
+        minor_faults=used.ru_minflt,
+        major_faults=used.ru_majflt,
+        voluntary_switches=used.ru_nvcsw,
+        involuntary_switches=used.ru_nivcsw,
+        gc_runs=sum(generation["collections"] for generation in gc.get_stats()),
+        allocated_blocks=sys.getallocatedblocks(),
+        resident_kb=resident_pages * _PAGE_KB,
+    )

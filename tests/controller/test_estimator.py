@@ -1,0 +1,146 @@
+"""The Kalman filter of a joint: its gains against independent solvers, and what it makes of an encoder's samples."""
+
+import math
+
+import numpy as np
+import pytest
+from bench import MS, SPECS, T
+from filterpy.kalman import KalmanFilter
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import solve_discrete_are
+
+from controller.estimator import (
+    STILL_S,
+    JointEstimator,
+    acceleration_density,
+    measurement_variance,
+    steady_gains,
+)
+from machine.encoder import counts_from_position, position_from_counts
+from machine.load import load_profile
+
+SLEW = SPECS[0]
+PERIOD_S = T * 1e-9
+SENSED = [s for name in ("palms_471", "aoro_fc8") for s in load_profile(name).joints.values() if s.encoder]
+
+
+def model(period_s, density):
+    """Transition and process noise of a white acceleration."""
+    q = density * np.array([[period_s**3 / 3, period_s**2 / 2], [period_s**2 / 2, period_s]])
+    return np.array([[1.0, period_s], [0.0, 1.0]]), q
+
+
+@pytest.mark.parametrize("spec", SENSED, ids=lambda s: s.encoder.message)
+def test_gains_are_the_solution_of_the_riccati_equation(spec):
+    density, variance = acceleration_density(spec), measurement_variance(spec.encoder)
+    f, q = model(PERIOD_S, density)
+    h = np.array([[1.0, 0.0]])
+    p = solve_discrete_are(f.T, h.T, q, np.array([[variance]]))
+    wanted = p @ h.T / (p[0, 0] + variance)
+    assert steady_gains(PERIOD_S, density, variance) == pytest.approx(wanted.ravel().tolist(), rel=1e-6)
+
+
+@given(st.floats(1e-3, 0.02), st.floats(1e-6, 1.0), st.floats(1e-10, 1e-4))
+def test_gains_of_any_noise(period_s, density, variance):
+    f, q = model(period_s, density)
+    h = np.array([[1.0, 0.0]])
+    p = solve_discrete_are(f.T, h.T, q, np.array([[variance]]))
+    wanted = p @ h.T / (p[0, 0] + variance)
+    assert steady_gains(period_s, density, variance) == pytest.approx(wanted.ravel().tolist(), rel=1e-4)
+
+
+def test_estimates_are_those_of_a_kalman_filter_that_has_settled():
+    density, variance = acceleration_density(SLEW), measurement_variance(SLEW.encoder)
+    reference = KalmanFilter(2, 1)
+    reference.F, reference.Q = model(PERIOD_S, density)
+    reference.H, reference.R = np.array([[1.0, 0.0]]), np.array([[variance]])
+    predicted = solve_discrete_are(reference.F.T, reference.H.T, reference.Q, reference.R)
+    reference.P = predicted - predicted @ reference.H.T @ reference.H @ predicted / (predicted[0, 0] + variance)
+    ours = JointEstimator(SLEW, PERIOD_S)
+    ours.sample(0.0, 0)
+    reference.x = np.zeros((2, 1))
+    for k in range(1, 600):
+        measured = round(0.2 * math.sin(0.01 * k) / 4e-4) * 4e-4
+        ours.predict(k * T)
+        ours.sample(measured, k * T)
+        reference.predict()
+        reference.update(measured)
+        assert [ours.position, ours.velocity] == pytest.approx(reference.x.ravel().tolist(), abs=1e-9)
+
+
+@given(st.sampled_from(SENSED), st.floats(-0.9, 0.9), st.floats(0.05, 2.0), st.sets(st.integers(1, 199), max_size=60))
+@settings(max_examples=20, deadline=None)
+def test_whole_counts_are_tracked_as_filterpys_steady_state_does(spec, share, hz, lost):
+    """Sines of any joint, rounded to its encoder's counts, some samples lost: two scalar recurrences, one filter."""
+    density, variance = acceleration_density(spec), measurement_variance(spec.encoder)
+    reference = KalmanFilter(2, 1)
+    reference.F, reference.H = model(PERIOD_S, density)[0], np.array([[1.0, 0.0]])
+    p = solve_discrete_are(reference.F.T, reference.H.T, model(PERIOD_S, density)[1], np.array([[variance]]))
+    reference.K = p @ reference.H.T / (p[0, 0] + variance)
+    ours, amplitude = JointEstimator(spec, PERIOD_S), share * spec.speed_limit / (2.0 * math.pi * hz)
+    for k in range(200):
+        true = 0.5 * (spec.lower + spec.upper) + amplitude * math.sin(2.0 * math.pi * hz * k * PERIOD_S)
+        measured = position_from_counts(spec.encoder, counts_from_position(spec.encoder, true))
+        assert abs(measured - true) <= 0.501 * spec.encoder.unit_per_count
+        ours.predict(k * T)
+        reference.predict_steadystate()
+        if k == 0:
+            ours.sample(measured, 0)
+            reference.x = np.array([[measured], [0.0]])
+        elif k not in lost:
+            ours.sample(measured, k * T)
+            reference.update_steadystate(np.array([[measured]]))
+        assert abs(ours.position - reference.x[0, 0]) < 1e-7 and abs(ours.velocity - reference.x[1, 0]) < 1e-6
+    assert ours.refused == 0
+
+
+def follow(estimator, positions, age_ns=0, start_ns=10**9):
+    """``positions`` are those at the moment of each sample."""
+    for k, position in enumerate(positions):
+        now_ns = start_ns + k * T
+        estimator.predict(now_ns)
+        counts = counts_from_position(SLEW.encoder, position)
+        estimator.sample(position_from_counts(SLEW.encoder, counts), now_ns - age_ns)
+
+
+@pytest.mark.parametrize("age_ns", [0, T // 2, T])
+def test_a_ramp_is_tracked_without_lag_whatever_the_age_of_the_sample(age_ns):
+    estimator = JointEstimator(SLEW, PERIOD_S)
+    assert not estimator.known and math.isnan(estimator.position)
+    follow(estimator, [0.1 * (k * T - age_ns) * 1e-9 for k in range(400)], age_ns)
+    assert estimator.position == pytest.approx(0.1 * 399 * PERIOD_S, abs=3e-4)
+    assert estimator.velocity == pytest.approx(0.1, abs=0.01)
+    estimator.reset()
+    assert not estimator.known and math.isnan(estimator.velocity)
+
+
+def test_the_rate_does_not_change_what_the_filter_does():
+    slow, fast = JointEstimator(SLEW, 0.01), JointEstimator(SLEW, 0.005)
+    for estimator, dt in ((slow, 10 * MS), (fast, 5 * MS)):
+        for k in range(1, int(0.1e9 / dt) + 1):
+            estimator.predict(k * dt)
+            estimator.sample(0.2 * k * dt * 1e-9, k * dt)
+    assert slow.velocity == pytest.approx(fast.velocity, rel=0.15)
+
+
+def test_a_missing_sample_is_coasted_over():
+    estimator = JointEstimator(SLEW, PERIOD_S)
+    follow(estimator, [0.2 * k * PERIOD_S for k in range(200)])
+    before = estimator.position
+    estimator.predict(10**9 + 200 * T)
+    assert estimator.position == pytest.approx(before + 0.2 * PERIOD_S, abs=2e-4)
+
+
+def test_a_joint_stands_still_a_while_after_it_stopped_and_noise_does_not_move_it():
+    estimator = JointEstimator(SLEW, PERIOD_S)
+    assert not estimator.still, "unknown is not still"
+    follow(estimator, [0.1 * k * PERIOD_S for k in range(100)])
+    assert not estimator.still
+    end = 0.1 * 99 * PERIOD_S
+    ticks = round(STILL_S / PERIOD_S)
+    follow(estimator, [end] * (ticks // 2), start_ns=10**9 + 100 * T)
+    assert not estimator.still
+    rest = [end + 1.5e-4 * (-1) ** k for k in range(3 * ticks)]
+    follow(estimator, rest, start_ns=10**9 + (100 + ticks // 2) * T)
+    assert estimator.still

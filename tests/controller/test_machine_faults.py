@@ -1,0 +1,260 @@
+"""Losses and faults of mach0 and of both buses: reaction, bound, neutral in time; and a bus that comes back."""
+
+import pytest
+from bench import AORO, MACHINE, MS, Bench, T
+
+from can_dbc.canopen import heartbeat_frame
+from can_dbc.setpoint import OperatorAction
+from machine.faults import FAULTS, describe
+from machine.modes import Mode
+from machine.reasons import Reaction, Reason
+
+PROMISE_NS = 100 * MS
+S = 1_000_000_000
+
+
+def until_reason(bench, reason, limit=120):
+    """Ticks until the reason stands; the planner goes on sending."""
+    for k in range(1, limit + 1):
+        bench.tick([bench.moving(0, 0.08)] if k % 10 == 0 and bench.mode is Mode.ACTIVE else ())
+        if bench.reason == reason:
+            return k
+    raise AssertionError(f"{reason.name} not seen; {bench.mode.name} {bench.controller.supervisor.reason.name}")
+
+
+LOSSES = [
+    ("VehStat", Reason.CARRIER_LOST),
+    ("ArmHeightA", Reason.SWING_ARMS_LOST),
+    ("ArmHeightB", Reason.SWING_ARMS_LOST),
+]
+
+
+@pytest.mark.parametrize(("name", "reason"), LOSSES)
+@pytest.mark.parametrize("how", ["dropped", "corrupt", "frozen"])
+def test_loss_of_the_carrier_or_its_arms_is_neutral_within_the_promise(name, reason, how):
+    bench = Bench(AORO).active()
+    while name not in [MACHINE.find(f.key).name for f in bench.inputs.machine_frames if MACHINE.find(f.key)]:
+        bench.drive(0, 0.08, 1)
+    getattr(bench, how).add(name)
+    ticks = until_reason(bench, reason)
+    assert ticks * T <= FAULTS[reason].bound_ms * MS
+    assert bench.mode is Mode.FAULT and bench.neutral and bench.commands_b["ArmKey"] == 0
+    assert ticks * T <= PROMISE_NS
+    getattr(bench, how).clear()
+    bench.run(100)
+    assert bench.mode is Mode.FAULT, "a fault stays until a human resets it"
+
+
+def test_without_the_carrier_nothing_is_armed():
+    bench = Bench(AORO)
+    bench.dropped.add("ArmHeightA")
+    bench.run(200)
+    assert bench.mode is Mode.STANDBY and bench.reason == Reason.INPUT_MISSING
+    assert bench.controller.stale_mask == 1 << 15
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.INPUT_MISSING
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("PositionRapidUpdate", Reason.GNSS_LOST), ("VesselHeading", Reason.GNSS_LOST), ("EEC1", Reason.ENGINE_LOST)],
+)
+def test_position_and_engine_are_missed_in_words_only(name, reason):
+    bench = Bench(AORO).active()
+    bench.dropped.add(name)
+    assert until_reason(bench, reason, 140) * T <= FAULTS[reason].bound_ms * MS + 100 * MS  # one period before it
+    assert bench.mode is Mode.ACTIVE and FAULTS[reason].reaction is Reaction.NOTE
+    assert not bench.controller.supervisor.half_speed and bench.commands_b["ArmKey"] == 0xA
+    bench.dropped.clear()
+    bench.drive(0, 0.08, 21)
+    assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE
+
+
+def test_a_receiver_without_a_fix_is_a_lost_position():
+    bench = Bench(AORO).boot()
+    bench.changed["PositionRapidUpdate"] = {"Latitude": None, "Longitude": None}
+    bench.run(21)
+    assert bench.mode is Mode.STANDBY and bench.reason == Reason.GNSS_LOST
+
+
+def test_another_controller_on_mach0_is_noticed_in_every_mode():
+    for prepare in (Bench.boot, Bench.armed, Bench.active):
+        bench = prepare(Bench(AORO))
+        bench.machine_extra.append((MACHINE.message("VehCmd").key, bytes(8)))
+        bench.tick()
+        assert bench.mode is Mode.FAULT and bench.reason == Reason.FOREIGN_CONTROLLER and bench.neutral
+        assert bench.controller.supervisor.detail == 1
+    assert describe(Reason.FOREIGN_CONTROLLER, 1).startswith("Another controller sends our frames on the machine bus.")
+
+
+def test_a_lost_address_stops_the_machine():
+    bench = Bench(AORO).active()
+    bench.machine_extra.append((MACHINE.message("AddressClaim").key, bytes(8)))
+    assert until_reason(bench, Reason.ADDRESS_LOST) * T <= FAULTS[Reason.ADDRESS_LOST].bound_ms * MS
+    bench.run(14)
+    assert bench.mode is Mode.FAULT and bench.neutral
+
+
+@pytest.mark.parametrize(
+    ("state", "reason", "mode"),
+    [(3, Reason.BUS_OFF, Mode.FAULT), (4, Reason.BUS_DOWN, Mode.FAULT), (2, Reason.BUS_PASSIVE, Mode.ACTIVE),
+     (1, Reason.NONE, Mode.ACTIVE)],
+)  # fmt: skip
+def test_machine_bus_state(state, reason, mode):
+    bench = Bench(AORO).active()
+    bench.tick(machine_bus_state=state)
+    assert bench.mode is mode and bench.reason == reason
+    assert bench.controller.supervisor.detail == (reason is not Reason.NONE)
+    assert bench.neutral is (mode is Mode.FAULT)
+
+
+@pytest.mark.parametrize("prepare", [Bench.boot, Bench.armed])
+def test_machine_bus_off_latches_while_nothing_moves(prepare):
+    bench = prepare(Bench(AORO))
+    bench.tick(machine_bus_state=3)
+    assert bench.mode is Mode.FAULT and bench.reason == Reason.BUS_OFF
+
+
+def test_three_refused_sends_in_a_row_on_mach0_stop_and_two_do_not():
+    bench = Bench(AORO).active()
+
+    def send(refused):
+        """Up to the tick in which a refusal of the next commands is seen."""
+        while not bench.controller.outputs.machine_frames:
+            bench.drive(0, 0.08, 1)
+        bench.tick([bench.moving(0, 0.08)], machine_bus_refused=refused)
+
+    for refused in (3, 6, 6, 9, 12):
+        send(refused)
+    assert bench.mode is Mode.ACTIVE
+    begin = bench.count
+    send(15)
+    assert bench.reason == Reason.SEND_REFUSED and bench.mode is Mode.STOP
+    assert bench.controller.supervisor.detail == 1
+    assert 3 * (bench.count - begin) * T <= FAULTS[Reason.SEND_REFUSED].bound_ms * MS
+
+
+def test_frames_of_an_overflowed_tick_of_mach0_are_not_used():
+    bench = Bench(AORO).active()
+    machine, crane = bench.controller.machine_bus.received, bench.controller.received
+    while bench.count % 4:
+        bench.drive(0, 0.08, 1)
+    heard, others = machine.count, crane.count
+    bench.tick([bench.moving(0, 0.08)], machine_bus_dropped=3)
+    assert machine.count == heard and crane.count > others
+    bench.drive(0, 0.08, 4)
+    assert machine.count > heard and bench.mode is Mode.ACTIVE
+
+
+# -- a bus that comes back ----------------------------------------------------------------------------------
+
+PREPARED = {"start": lambda b: b.run(60), "standby": Bench.boot, "armed": Bench.armed, "active": Bench.active}
+
+
+@pytest.mark.parametrize("prepare", PREPARED.values(), ids=PREPARED)
+def test_a_recovery_of_crane0_begins_anew(prepare):
+    bench = Bench()
+    prepare(bench)
+    received = bench.controller.received
+    count = received.count
+    bench.encoders[3].writes.clear()
+    outputs = bench.tick(bus_recoveries=1)
+    assert bench.mode is Mode.FAULT and bench.reason == Reason.BUS_OFF and bench.neutral
+    assert received.count == count, "what came with it is not trusted"
+    assert all(slot.values is None for slot in received.slots)
+    assert not any(received.nodes.operational(n, bench.now_ns) for n in received.nodes.by_number)
+    silenced = [data[1] for key, data in outputs.frames if key == 0 and data[0] == 0x80]
+    assert len(silenced) == 1 and silenced[0] in bench.encoders, "an encoder is silenced, to be asked anew"
+    bench.run(2)
+    assert received.guard.values is None, "two good frames qualify"
+    bench.run(200)
+    assert bench.mode is Mode.FAULT and (0x1800, 2, 1) in bench.encoders[3].writes
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.FAULT
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.ARMED
+
+
+def test_a_device_swapped_while_the_bus_was_off_is_noticed():
+    bench = Bench().boot()
+    bench.encoders[2].objects[0x1018, 1] = 8
+    bench.tick(bus_recoveries=1)
+    bench.run(200)
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    bench.run(100)
+    assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 2
+
+
+def test_a_reset_does_not_pass_by_the_start_up_of_a_bus_that_came_back():
+    bench = Bench().active()
+    bench.tick(bus_recoveries=1)
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    assert bench.mode is Mode.BOOT
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.BOOT
+    bench.run(150)
+    assert bench.mode is Mode.STANDBY and bench.reason == Reason.NONE
+
+
+def test_a_node_that_is_silent_after_a_recovery_is_missed():
+    bench = Bench().boot()
+    bench.silent_nodes.add(0x10)
+    bench.tick(bus_recoveries=1)
+    bench.run(150)
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    bench.run(2)
+    assert bench.reason == Reason.NODE_NOT_OPERATIONAL and bench.controller.supervisor.detail == 0x10
+    bench.extra.append(heartbeat_frame(0x10, 5))
+    bench.run(1)
+    assert bench.reason == Reason.NONE
+
+
+@pytest.mark.parametrize("prepare", PREPARED.values(), ids=PREPARED)
+def test_a_recovery_of_mach0_begins_anew(prepare):
+    bench = Bench(AORO)
+    prepare(bench)
+    machine = bench.controller.machine_bus.received
+    count, start_up = machine.count, bench.controller.startup.complete
+    bench.machine_sent.clear()
+    bench.tick(machine_bus_recoveries=1)
+    assert bench.mode is Mode.FAULT and bench.reason == Reason.BUS_OFF and bench.neutral
+    assert bench.controller.supervisor.detail == 1
+    assert machine.count == count and all(slot.values is None for slot in machine.slots)
+    assert bench.machine_sent[0][0] == MACHINE.message("AddressClaim").key
+    assert bench.controller.startup.complete is start_up, "crane0 was not touched"
+    bench.run(150)
+    bench.tick([bench.operator(OperatorAction.RESET)])
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.ARMED
+
+
+@pytest.mark.parametrize(("settings", "which", "bus"), [(AORO, "bus", 0), (AORO, "machine_bus", 1)])
+def test_three_recoveries_within_a_minute_refuse_arming_for_a_minute(settings, which, bus):
+    bench = Bench(settings).boot()
+    for k in range(1, 4):
+        bench.run(150, **{f"{which}_recoveries": k})
+        bench.tick([bench.operator(OperatorAction.RESET)])
+        bench.run(2)
+        assert bench.mode is Mode.STANDBY
+        assert bench.reason == (Reason.BUS_UNSTABLE if k == 3 else Reason.NONE)
+    last_ns = bench.now_ns - 152 * T
+    assert bench.controller.supervisor.detail == bus
+    assert "the crane bus" in describe(Reason.BUS_UNSTABLE, 0)
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.BUS_UNSTABLE
+    watch = bench.controller.supervisor._watches[bus]
+    assert not watch.fit(last_ns + 60 * S - 1) and watch.fit(last_ns + 60 * S)
+
+
+def test_recoveries_that_are_far_apart_do_no_harm():
+    bench = Bench().boot()
+    watch = bench.controller.crane_watch
+    reading = bench.inputs.bus
+    for k in range(1, 12):
+        reading.recoveries = k
+        watch.read(reading, True, k * 31 * S)
+        assert watch.fit(k * 31 * S)
+    reading.recoveries = 14  # three between two ticks
+    watch.read(reading, True, 400 * S)
+    assert not watch.fit(459 * S)

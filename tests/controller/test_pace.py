@@ -1,0 +1,183 @@
+"""The trajectory's own time: slowed for the pump and at half speed, on the path, joined to what the planner says."""
+
+from itertools import pairwise
+
+import msgspec
+import pytest
+from bench import MS, PROFILE, SETTINGS, SPECS, Bench, T
+
+from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot
+from controller.config import Settings
+from controller.follower import Follower
+from controller.laws.pace import BEHIND_LIMIT_NS, FLOW_SHARE, RATE_CHANGE_1_S, Pace
+from controller.trajectory import HISTORY, Trajectory
+from controller.valve import ValveMap
+from machine.load import profile_hash
+from machine.modes import Mode
+
+VALVES = [ValveMap(s.valve) for s in SPECS]
+ZERO = (0.0,) * 5
+
+
+def with_pump(flow_m3_s):
+    return msgspec.structs.replace(
+        PROFILE, hydraulics=msgspec.structs.replace(PROFILE.hydraulics, pump_flow_m3_s=flow_m3_s)
+    )
+
+
+def setpoint(stamp_ns, positions, velocity=ZERO, every_ms=50):
+    knots = tuple(Knot(i * every_ms * MS, tuple(q), tuple(velocity)) for i, q in enumerate(positions))
+    return CraneSetpoint(1, 0, stamp_ns, 200 * MS, GrappleCommand.NEUTRAL, False, knots)
+
+
+def line(stamp_ns, velocity, n=9):
+    """Knots on a straight line through 0 at time 0."""
+    return setpoint(
+        stamp_ns, [[v * (stamp_ns * 1e-9 + 0.05 * i) for v in velocity] for i in range(n)], velocity
+    )  # fmt: skip
+
+
+def test_the_rate_is_one_while_the_pump_and_the_joints_can():
+    pace = Pace(with_pump(1.0))
+    for _ in range(100):
+        pace.step([s.speed_limit for s in SPECS], VALVES, 1.0, T)
+    assert (pace.rate, pace.behind_ns) == (1.0, 0)
+
+
+def test_the_rate_falls_smoothly_to_what_the_pump_gives_and_the_time_behind_is_bounded():
+    velocity = [0.2, 0.1, -0.2, 0.2, 0.0]
+    flow = sum(
+        (v * s.valve.flow_plus if v >= 0 else -v * s.valve.flow_minus) for v, s in zip(velocity, SPECS, strict=True)
+    )
+    pace, rates = Pace(with_pump(0.5 * flow)), [1.0]
+    for _ in range(80):
+        pace.step(velocity, VALVES, 1.0, T)
+        rates.append(pace.rate)
+    assert max(a - b for a, b in pairwise(rates)) <= RATE_CHANGE_1_S * T * 1e-9 + 1e-12
+    assert pace.rate == pytest.approx(0.5 * FLOW_SHARE)
+    for _ in range(4000):
+        pace.step(velocity, VALVES, 1.0, T)
+    assert BEHIND_LIMIT_NS <= pace.behind_ns < 1.3 * BEHIND_LIMIT_NS
+    pace.reset()
+    assert (pace.rate, pace.behind_ns) == (1.0, 0)
+
+
+def test_a_lower_cap_slows_the_time_when_a_joint_is_faster():
+    pace = Pace(with_pump(1.0))
+    for _ in range(200):
+        pace.step([SPECS[0].speed_limit, 0.0, 0.0, 0.0, 0.0], VALVES, 0.5, T)
+    assert 0.5 < pace.rate < 0.6
+
+
+def follower(flow_m3_s):
+    return Follower(with_pump(flow_m3_s), VALVES, [120 * MS] * 5)
+
+
+def test_a_slowed_reference_stays_on_the_path():
+    made, velocity = follower(1.0e-4), [0.2, 0.1, -0.1, 0.1, 0.0]
+    for k in range(160):
+        now_ns = 10**9 + k * T
+        if k % 10 == 0:
+            made.candidate.load(line(now_ns, velocity))
+            made.take(now_ns, True)
+        made.follow(now_ns, 1.0)
+        own_s = (now_ns - made.behind_ns) * 1e-9
+        assert made.reference == pytest.approx([v * own_s for v in velocity], abs=1e-9)
+        assert made.velocity == pytest.approx([v * made.rate for v in velocity], abs=1e-9)
+    assert made.behind_ns > 300 * MS and made.rate < 0.6
+    assert made.planned(now_ns)[0] == pytest.approx([v * now_ns * 1e-9 for v in velocity], abs=1e-9)
+
+
+def test_it_catches_up_at_rest_and_a_hold_forgets():
+    made, velocity = follower(1.0e-4), [0.2, 0.1, -0.1, 0.1, 0.0]
+    made.candidate.load(line(10**9, velocity))
+    made.take(10**9, True)
+    for k in range(40):
+        made.follow(10**9 + k * T, 1.0)
+    behind = made.behind_ns
+    assert behind > 0
+    goal = [v * 1.4 for v in velocity]
+    made.candidate.load(setpoint(10**9 + 400 * MS, [goal] * 9))
+    made.take(10**9 + 400 * MS, True)
+    for k in range(40, 600):
+        made.follow(10**9 + k * T, 1.0)
+    assert made.behind_ns == 0 and made.reference == pytest.approx(goal) and not any(made.velocity)
+    made.hold(0, 0.3, 10**9)
+    assert made.reference[0] == 0.3 and made.behind_ns == 0
+
+
+def test_a_trajectory_keeps_its_past_while_it_is_behind_and_no_more():
+    old, new = Trajectory(), Trajectory()
+    old.load(line(10**9, [0.1] * 5))
+    for k in range(1, 60):
+        new.load(line(10**9 + k * 50 * MS, [0.1] * 5))
+        old.extend(new, 10**9 + k * 50 * MS - 300 * MS)
+        q, v = [0.0] * 5, [0.0] * 5
+        for back in range(0, 300, 20):
+            at_ns = 10**9 + k * 50 * MS - min(back, k * 50) * MS
+            old.fill(range(5), at_ns, q, v)
+            assert q == pytest.approx([0.1 * at_ns * 1e-9] * 5)
+    old.extend(new, 0)
+    assert old._n <= HISTORY + 9 and old.end_ns == 10**9 + 59 * 50 * MS + 400 * MS
+
+
+# -- in the controller
+
+
+GOALS = (0.8, 0.35, 0.6, 0.5, 1.2)
+
+
+def bench_with(flow_m3_s):
+    profile = with_pump(flow_m3_s)
+    return Bench(Settings(profile, profile_hash(profile), profile.rate_hz))
+
+
+def drive(bench, total_s, seconds):
+    """A planner that plans all joints together; yields after each tick."""
+    start, origin_ns = list(bench.q), bench.now_ns
+
+    def plan(t_s):
+        x = min(max(t_s / total_s, 0.0), 1.0)
+        s = 35 * x**4 - 84 * x**5 + 70 * x**6 - 20 * x**7
+        ds = (140 * x**3 - 420 * x**4 + 420 * x**5 - 140 * x**6) / total_s
+        return [p + d * s for p, d in zip(start, GOALS, strict=True)], [d * ds for d in GOALS]
+
+    for k in range(int(seconds * 200)):
+        datagrams = []
+        if k % 10 == 0:
+            t_s = (bench.now_ns - origin_ns) * 1e-9
+            datagrams = [
+                bench.setpoint([(50 * i, *plan(t_s + 0.05 * i)) for i in range(9)], final=t_s + 0.4 >= total_s)
+            ]
+        bench.tick(datagrams)
+        assert bench.mode is Mode.ACTIVE, (bench.reason, k)
+        yield start
+
+
+def test_a_motion_that_asks_for_too_much_oil_is_done_later_on_its_path():
+    bench = bench_with(SETTINGS.profile.hydraulics.pump_flow_m3_s * 0.85)
+    bench.armed()
+    behind, off = 0, 0.0
+    for start in drive(bench, 9.0, 13.0):
+        follower = bench.controller.follower
+        behind = max(behind, follower.behind_ns)
+        shares = [(q - p) / d for q, p, d in zip(bench.q, start, GOALS, strict=True)]
+        off = max(off, max(shares[:4]) - min(shares[:4]))
+    assert behind > 100 * MS, "the motion should need more than the pump gives"
+    assert off < 0.03, "all joints are at the same place of the path"
+    for q, p, d, spec in zip(bench.q, start, GOALS, SPECS, strict=True):
+        assert abs(q - p - d) <= 2.0 * spec.law.stop_band
+
+
+def test_a_setpoint_that_begins_at_the_slowed_reference_is_taken_too():
+    bench = bench_with(SETTINGS.profile.hydraulics.pump_flow_m3_s * 0.5)
+    bench.armed()
+    for _ in drive(bench, 9.0, 4.0):
+        pass
+    follower = bench.controller.follower
+    assert follower.behind_ns > 100 * MS
+    here = list(bench.controller.reference)
+    speed = list(bench.controller.reference_velocity)
+    end = [h + 0.2 * v for h, v in zip(here, speed, strict=True)]
+    bench.tick([bench.setpoint([(0, here, speed), (400, end, [0.0] * 5)])])
+    assert bench.mode is Mode.ACTIVE and follower.behind_ns == 0

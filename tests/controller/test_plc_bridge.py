@@ -1,0 +1,347 @@
+"""The PLC bridge on virtual time: what it plays on crane0, what it lets through, what it does without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import pytest
+
+from can_dbc.canopen import Wire, parse_heartbeat
+from can_dbc.codec import load
+from can_dbc.e2e import Sender
+from can_dbc.frame import Frame
+from can_dbc.plc import map as plc
+from can_dbc.plc.datagram import Header, encode_reply
+from can_dbc.plc.map import Command, Estop, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
+from controller.config import ConfigError
+from controller.plc.bridge import Bridge, role_of
+from controller.plc.handshake import Handshake
+from controller.plc.played import Between
+from controller.startup import Startup
+from machine.load import load_profile
+from machine.modes import Mode as ControllerMode
+from machine.profile import Plc, Profile
+
+MS = 1_000_000
+DATABASE = load("crane")
+MAY_MOVE = int(Estop.CHANNEL_A | Estop.CHANNEL_B | Estop.PILOT_ON)
+HOME = (0.1, 0.7, -1.6, 0.3, 0.2, 0.0, 0.0)
+ARMED, MOVES = 0xA, 2
+
+
+def profile(role: str) -> Profile:
+    return msgspec.structs.replace(load_profile("palms_471"), plc=Plc(role))  # type: ignore[arg-type]
+
+
+class Rig:
+    """Controller and guard as frames on one side, the PLC as feedback on the other; 5 ms per step."""
+
+    def __init__(self, role: str = "valves") -> None:
+        self.bridge = Bridge(profile(role), DATABASE)
+        self.feedback = Feedback(state=State.HOLD, fault_axis=15, estop=MAY_MOVE, position=HOME, opening=0.5)
+        self.now_ns = 1_000 * MS
+        self.answers = True
+        self.acknowledges = True
+        self.said: list[Frame] = []
+        self.sent: list[Wire] = []
+        self.command = Command()
+        self.mode = ControllerMode.ACTIVE
+        self._senders: dict[str, Sender] = {}
+
+    def frame(self, name: str, **values: Any) -> Frame:
+        """A good protected frame; what is not given is 0."""
+        codec = DATABASE.message(name)
+        sender = self._senders.setdefault(name, Sender(codec.data_ids or bytes(16)))
+        data = codec.encode(*(values.get(s.name, 0) for s in codec.signals))
+        return Frame(self.now_ns, codec.key, sender.protect(data))
+
+    def control(self, arm: int = ARMED, mode: int = MOVES, enable: int = ARMED, **values: Any) -> list[Frame]:
+        """What controller and guard say in a tick."""
+        a = {k: v for k, v in values.items() if k in ("Slew", "Lift", "Tilt", "Ext")}
+        b = {k: v for k, v in values.items() if k in ("Rot", "Grapple", "GrappleMode")}
+        return [
+            Frame(self.now_ns, 0x080, b"\x01"),
+            self.frame("ValveCmdA", Mode=mode, **a),
+            self.frame("ValveCmdB", ArmKey=arm, **b),
+            self.frame("GuardStat", Enable=enable),
+            self.frame("CtrlStatus", Mode=self.mode, SafeState=values.get("SafeState", 0)),
+        ]
+
+    def step(self, frames: list[Frame] | None = None) -> list[Wire]:
+        """5 ms; every second one exchanges with the PLC."""
+        bridge = self.bridge
+        self.now_ns += 5 * MS
+        out = bridge.step(self.now_ns, frames or [])
+        if self.now_ns % (10 * MS) == 0:
+            self.command = bridge.command(self.now_ns)
+            block = bridge.handshake.registers(self.command, self.now_ns)
+            if self.answers:
+                accepted = block[1] if self.acknowledges else self.feedback.accepted
+                beat = (self.feedback.heartbeat + 1) & 0xFFFF
+                self.feedback = replace(self.feedback, heartbeat=beat, accepted=accepted)
+                status = plc.status_registers(self.feedback, 300, WordOrder.HIGH_FIRST)
+                assert bridge.handshake.take_registers(status, self.now_ns)
+        self.sent = out
+        return out
+
+    def run(self, ms: int, **values: Any) -> None:
+        """The controller says the same for a while."""
+        for _ in range(ms // 5):
+            self.step(self.control(**values))
+
+    def decoded(self, name: str) -> dict[str, Any] | None:
+        """The newest frame of that name in the last step, decoded."""
+        codec = DATABASE.message(name)
+        found = [data for key, data in self.sent if key == codec.key]
+        return dict(zip((s.name for s in codec.signals), codec.receive(found[-1]), strict=True)) if found else None
+
+
+def await_frame(rig: Rig, name: str, **values: Any) -> dict[str, Any]:
+    for _ in range(10):
+        rig.step(rig.control(**values))
+        if found := rig.decoded(name):
+            return found
+    raise AssertionError(f"no {name}")
+
+
+def test_it_is_silent_before_the_plc_answers_and_while_it_initialises() -> None:
+    rig = Rig()
+    rig.answers = False
+    rig.run(300)
+    assert not rig.sent
+    rig.answers, rig.feedback = True, replace(rig.feedback, state=State.INIT, estop=0)
+    rig.run(100)
+    assert not rig.sent
+
+
+def test_the_controllers_own_start_up_sets_up_the_played_encoders() -> None:
+    rig = Rig()
+    startup, ours = Startup(profile("valves")), list[Frame]()
+    for _ in range(400):
+        out = rig.step(ours)
+        for key, data in out:
+            startup.receive(key, data)
+        asked: list[Wire] = []
+        startup.step(rig.now_ns, asked)
+        ours = [Frame(rig.now_ns, key, data) for key, data in asked]
+    assert startup.complete, startup.problem()
+    rig.step([Frame(rig.now_ns, 0x080, b"\x01")])
+    slew, ext = rig.decoded("EncSlew"), rig.decoded("EncExt")
+    assert slew is not None and slew["Position"] == 8192 + round(0.1 / 3.834951969714103e-4)
+    assert ext is not None and ext["Position"] == round(0.3 / 5e-6)
+    rig.step()
+    assert rig.decoded("EncSlew") is None, "only SYNC makes an encoder answer"
+
+
+def test_nothing_is_said_50_ms_after_the_last_answer_and_the_nodes_boot_after_a_long_silence() -> None:
+    rig = Rig()
+    rig.run(300)
+    rig.answers = False
+    rig.run(50)
+    rig.run(10)
+    assert not rig.sent
+    rig.answers = True
+    rig.run(20)
+    assert rig.sent and not any(parse_heartbeat(k, d) for k, d in rig.sent if d == b"\x00"), "a short gap is no boot"
+    rig.answers = False
+    rig.run(400)
+    rig.answers = True
+    boots = []
+    for _ in range(4):
+        rig.step()
+        boots += [beat[0] for k, d in rig.sent if (beat := parse_heartbeat(k, d)) and beat[1] == 0]
+    assert sorted(boots) == [1, 2, 3, 4, 5, 6, 0x10, 0x20, 0x21, 0x22]
+
+
+def test_a_frozen_heartbeat_of_the_plc_is_silence() -> None:
+    rig = Rig()
+    rig.run(100)
+    rig.answers = False
+    shake = rig.bridge.handshake
+    for _ in range(20):
+        rig.step(rig.control())
+        shake.take_registers(plc.status_registers(rig.feedback, 300, WordOrder.HIGH_FIRST), rig.now_ns)
+    assert not rig.sent
+
+
+def test_armed_commands_of_role_valves_pass_as_shares() -> None:
+    rig = Rig()
+    rig.run(100, Slew=50.0, Lift=-25.05, Rot=100.0, Grapple=-100.0, GrappleMode=2)
+    command = rig.command
+    assert (command.mode, command.armed, command.grapple, command.grapple_pct) == (
+        Mode.VALVES,
+        True,
+        Grapple.CLOSE,
+        100,
+    )
+    assert command.reference == pytest.approx((0.5, -0.2505, 0.0, 0.0, 1.0, 0.0, 0.0))
+    assert command.rate == (0.0,) * 7 and command.max_speed_pct == 100
+    assert rig.bridge.gate.exit == 0
+    rig.run(30, Slew=50.0, SafeState=1)
+    assert rig.command.max_speed_pct == 50
+
+
+@pytest.mark.parametrize(
+    ("missing", "exit_code"),
+    [({"arm": 0}, 8), ({"enable": 0}, 4), ({"mode": 3}, 6)],
+)
+def test_without_arm_key_enable_or_a_known_mode_it_is_neutral(missing: dict[str, int], exit_code: int) -> None:
+    rig = Rig()
+    rig.run(100, Slew=50.0)
+    assert rig.command.mode is Mode.VALVES
+    rig.run(20, Slew=50.0, **missing)
+    assert rig.command == Command()
+    assert rig.bridge.gate.exit == exit_code
+
+
+@pytest.mark.parametrize("lost", ["ValveCmdA", "ValveCmdB", "GuardStat"])
+def test_a_loss_while_armed_is_neutral_in_time_and_stays_so_until_a_disarm(lost: str) -> None:
+    rig = Rig()
+    rig.run(100, Slew=50.0)
+    key = DATABASE.message(lost).key
+    began_ns = rig.now_ns
+    while rig.command.mode is Mode.VALVES:
+        rig.step([f for f in rig.control(Slew=50.0) if f.key != key])
+    assert rig.now_ns - began_ns <= 60 * MS
+    rig.run(200, Slew=50.0)
+    assert rig.command == Command() and rig.bridge.gate.locked
+    assert await_frame(rig, "ValveFbA", Slew=50.0)["State"] == 4
+    rig.run(20, arm=0, mode=0)
+    rig.run(20, Slew=50.0)
+    assert rig.command.mode is Mode.VALVES
+
+
+def test_sync_lost_is_neutral() -> None:
+    rig = Rig()
+    rig.run(100, Slew=50.0)
+    for _ in range(5):
+        rig.step(rig.control(Slew=50.0)[1:])
+    assert rig.command == Command()
+
+
+NAMES = ("Slew", "Lift", "Tilt", "Ext", "Rot")
+
+
+def referring(rig: Rig, values: dict[str, float | None], ms: int, **control: Any) -> None:
+    for _ in range(ms // 5):
+        frames = rig.control(**control)
+        frames += [rig.frame(n, **{k: v for k, v in values.items() if k in DATABASE.message(n).index})
+                   for n in ("JointRefA", "JointRefB", "JointRefC")]  # fmt: skip
+        rig.step(frames)
+
+
+def test_role_references_passes_references_and_ignores_spools() -> None:
+    rig = Rig("references")
+    values = {"Slew": 0.5, "SlewRate": 0.1, "Lift": 0.7, "Tilt": -1.6, "Ext": 0.5, "ExtRate": -0.05, "Rot": 1.5}
+    referring(rig, values, 100, Slew=77.0, GrappleMode=3)
+    command = rig.command
+    assert (command.mode, command.grapple) == (Mode.REFERENCES, Grapple.HOLD)
+    assert command.reference == pytest.approx((0.5, 0.7, -1.6, 0.5, 1.5, 0, 0), abs=1e-4)
+    assert command.rate == pytest.approx((0.1, 0, 0, -0.05, 0, 0, 0), abs=5e-4)
+    referring(rig, dict.fromkeys([*NAMES, *(f"{n}Rate" for n in NAMES)]), 20)
+    assert (rig.command.mode, rig.command.armed) == (Mode.NEUTRAL, True), "not available: nothing is to move"
+    rig.run(100)
+    assert rig.command == Command() and rig.bridge.gate.exit == 5, "the references are gone"
+
+
+@pytest.mark.parametrize("values", [{"Lift": 1.4}, {"Slew": 0.0, "LiftRate": 0.2}, {"Ext": 0.0}])
+def test_a_reference_outside_the_machine_is_refused_and_never_clamped(values: dict[str, float]) -> None:
+    rig = Rig("references")
+    inside = {"Lift": 0.7, "Tilt": -1.6, "Ext": 0.5}
+    referring(rig, inside, 100)
+    assert rig.command.mode is Mode.REFERENCES
+    referring(rig, inside | values, 20)
+    assert rig.command == Command() and rig.bridge.gate.refused == 1
+    assert rig.bridge.gate.exit == 6
+    referring(rig, inside, 50)
+    assert rig.command == Command(), "until a disarm"
+
+
+def test_the_echo_moves_only_while_the_plc_takes_commands() -> None:
+    rig = Rig()
+    rig.run(200)
+    first = await_frame(rig, "ValveFbB")["EchoCounter"]
+    assert await_frame(rig, "ValveFbB")["EchoCounter"] == (first + 1) % 16
+    rig.acknowledges = False
+    rig.run(100)
+    assert len({await_frame(rig, "ValveFbB")["EchoCounter"] for _ in range(5)}) == 1
+
+
+def test_what_the_plc_says_is_on_the_bus_and_what_it_does_not_measure_is_not_available() -> None:
+    rig = Rig()
+    rig.feedback = replace(
+        rig.feedback, state=State.EXECUTE, pressure_bar=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0), load_kg=80,
+        longest_cycle_us=11_000, fault=Fault.ILLEGAL_VALUE, fault_axis=2, estop=MAY_MOVE & ~Estop.CHANNEL_B,
+    )  # fmt: skip
+    rig.run(100)
+    valve_a, valve_b = await_frame(rig, "ValveFbA"), await_frame(rig, "ValveFbB")
+    assert valve_a["State"] == 1 and valve_a["SpoolSlew"] is None and valve_b["FaultAxis"] == 2
+    estop, status = await_frame(rig, "EstopStat"), await_frame(rig, "PlcStatus")
+    assert (estop["ChannelA"], estop["ChannelB"], estop["PilotPress"]) == (1, 0, None)
+    assert (status["Mode"], status["LongestCycle"], status["FaultBits"]) == (2, 11_000, 1)
+    assert [await_frame(rig, "PressA")[n] for n in ("LiftA", "LiftB", "TiltA", "TiltB")] == [1.0, 2.0, 3.0, 4.0]
+    press = await_frame(rig, "PressB")
+    assert (press["ExtA"], press["ExtB"], press["SlewA"]) == (5.0, 6.0, None)
+    grapple = await_frame(rig, "GrappleStat")
+    assert (grapple["Opening"], grapple["ClampPress"], grapple["Load"]) == (50.0, 7.0, 80)
+
+
+def test_a_reset_is_asked_only_after_an_operator_acknowledged_and_never_armed() -> None:
+    rig = Rig()
+    rig.run(100, Slew=50.0)
+    rig.feedback = replace(rig.feedback, state=State.SAFE, fault=Fault.WATCHDOG)
+    asked = []
+    for mode, arm in ((ControllerMode.ACTIVE, ARMED), (ControllerMode.FAULT, 0), (ControllerMode.STOP, 0)):
+        rig.mode = mode
+        rig.run(300, arm=arm)
+        asked.append(rig.command.reset)
+    assert asked == [False, False, False]
+    rig.mode = ControllerMode.STANDBY
+    edges, before = 0, False
+    for _ in range(120):
+        rig.step(rig.control(arm=0, mode=0))
+        edges += rig.command.reset and not before
+        before = rig.command.reset
+        assert not (rig.command.reset and rig.command.armed)
+    assert edges == 2, "a pulse of 200 ms, again after as long"
+
+
+def test_positions_arrive_without_steps() -> None:
+    between = Between()
+    between.sample(1.0, 10 * MS, 50 * MS)
+    assert between.at(10 * MS) == 1.0
+    between.sample(2.0, 20 * MS, 50 * MS)
+    assert [between.at(t * MS) for t in (20, 25, 30, 40)] == [1.0, 1.5, 2.0, 2.0]
+    between.sample(4.0, 200 * MS, 50 * MS)
+    assert [between.at(t * MS) for t in (200, 225, 250)] == [2.0, 3.0, 4.0], "a gap is bridged over 50 ms at most"
+
+
+def test_the_handshake_times_the_round_trip_by_the_echo() -> None:
+    shake = Handshake()
+    for n in range(1, 11):
+        shake.datagram(Command(), n * 10 * MS)
+    reply = Feedback(state=State.HOLD)
+    assert shake.take_datagram(encode_reply(Header(1, 0, 4), reply), 104 * MS)
+    assert (shake.round_trip.count, shake.round_trip.longest_ns) == (1, 64 * MS)
+    assert shake.acknowledged(154 * MS) and not shake.acknowledged(155 * MS)
+    assert not shake.take_datagram(encode_reply(Header(1, 0, 5), reply), 105 * MS), "old"
+    assert not shake.take_datagram(encode_reply(Header(2, 0, 6), reply)[:-1], 106 * MS), "cut"
+    assert shake.take_datagram(encode_reply(Header(3, 0, 99), reply), 107 * MS)
+    assert (shake.round_trip.count, shake.dropped) == (1, 2), "a number that we never sent proves nothing"
+
+
+def test_a_plc_of_another_word_order_is_not_believed() -> None:
+    shake = Handshake(WordOrder.HIGH_FIRST)
+    status = plc.status_registers(Feedback(state=State.HOLD), 300, WordOrder.LOW_FIRST)
+    assert not shake.take_registers(status, 0)
+    assert shake.feedback is None and "LOW_FIRST" in shake.problem
+
+
+def test_a_machine_without_a_plc_or_with_a_carrier_is_refused_in_words() -> None:
+    with pytest.raises(ConfigError, match="add \\[plc\\]"):
+        role_of(load_profile("palms_471"))
+    with pytest.raises(ConfigError, match="carrier"):
+        role_of(msgspec.structs.replace(load_profile("aoro_fc8"), plc=Plc("valves")))
+    assert role_of(profile("references")) is Role.REFERENCES

@@ -1,0 +1,129 @@
+"""A spool test in force: what it lets through, what it refuses, and when it stops; the controller around it."""
+
+from __future__ import annotations
+
+import pytest
+
+from can_dbc.setpoint import SpoolKnot, SpoolTest
+from controller.spool_test import LONGEST_NS, Refusal, SpoolRun
+from machine.joints import Joint
+from machine.load import load_profile
+from machine.reasons import Reason
+
+PALMS = load_profile("palms_471")
+MS = 1_000_000
+NOW = 5_000 * MS
+
+
+def asked(*points: tuple[float, float], joint: int = Joint.SLEW, stamp_ns: int = NOW) -> SpoolTest:
+    """A test from points (ms, %)."""
+    knots = tuple(SpoolKnot(int(ms * MS), percent) for ms, percent in points)
+    return SpoolTest(1, 0, stamp_ns, 200 * MS, joint, knots)
+
+
+def reason_of(run: SpoolRun, test: SpoolTest, now_ns: int = NOW) -> Reason:
+    with pytest.raises(Refusal) as refusal:
+        run.take(test, now_ns)
+    return refusal.value.reason
+
+
+def test_lines_between_the_knots_and_neutral_past_the_last() -> None:
+    run = SpoolRun(PALMS)
+    run.take(asked((0, 0.0), (5, 10.0), (105, 20.0)), NOW)
+    assert run.percent(NOW) == 0.0
+    assert run.percent(NOW + 55 * MS) == pytest.approx(15.0)
+    assert run.percent(NOW + 105 * MS) == 20.0
+    assert run.percent(NOW + 106 * MS) == 0.0
+    assert run.cut_short(NOW + 106 * MS) and not run.ends_neutral(NOW + 106 * MS)
+
+
+def test_a_joint_without_encoder_is_refused() -> None:
+    run = SpoolRun(load_profile("aoro_fc8"))
+    assert reason_of(run, asked((0, 0.0), joint=Joint.ROT)) is Reason.TEST_FUNCTION
+    assert not run.running
+
+
+def test_more_speed_than_the_limit_is_refused() -> None:
+    run = SpoolRun(PALMS)
+    # 0.35 of 0.5 rad/s: 12 + 88 * 0.7 = 73.6 %
+    run.take(asked((0, 0.0), (500, 73.0)), NOW)
+    assert reason_of(SpoolRun(PALMS), asked((0, 0.0), (500, 74.0))) is Reason.TEST_SPOOL
+
+
+def test_the_dead_band_may_be_stepped_over_and_the_opening_not() -> None:
+    run = SpoolRun(PALMS)
+    run.take(asked((0, 0.0), (5, 12.0), (105, 20.0)), NOW)
+    assert reason_of(SpoolRun(PALMS), asked((0, 0.0), (5, 20.0), (105, 20.0))) is Reason.TEST_SPOOL
+
+
+def test_a_step_from_the_present_command_is_refused_and_closing_is_free() -> None:
+    run = SpoolRun(PALMS)
+    run.take(asked((0, 0.0), (400, 40.0)), NOW)
+    at = NOW + 200 * MS
+    assert reason_of(run, asked((0, 40.0), (100, 40.0), stamp_ns=at), at) is Reason.TEST_SPOOL
+    assert run.percent(at) == pytest.approx(20.0), "the refused one changes nothing"
+    run.take(asked((0, 0.0), stamp_ns=at), at)
+    assert run.percent(at) == 0.0
+
+
+def test_a_late_window_of_the_same_program_is_taken() -> None:
+    run = SpoolRun(PALMS)
+    run.take(asked((0, 0.0), (200, 30.0), (400, 60.0)), NOW)
+    run.take(asked((0, 15.0), (100, 30.0), (300, 60.0), stamp_ns=NOW + 100 * MS), NOW + 110 * MS)
+    assert run.percent(NOW + 110 * MS) == pytest.approx(16.5)
+
+
+def test_another_function_waits_until_the_valve_is_shut() -> None:
+    run = SpoolRun(PALMS)
+    run.take(asked((0, 0.0), (400, 30.0)), NOW)
+    at = NOW + 300 * MS
+    assert reason_of(run, asked((0, 0.0), joint=Joint.LIFT, stamp_ns=at), at) is Reason.TEST_BUSY
+    later = NOW + 401 * MS
+    run.take(asked((0, 0.0), joint=Joint.LIFT, stamp_ns=later), later)
+    assert run.function == Joint.LIFT
+
+
+@pytest.mark.parametrize(
+    ("position", "velocity", "percent", "reason"),
+    [
+        (0.0, 0.3, 30.0, Reason.NONE),
+        (0.0, 0.45, 30.0, Reason.TEST_SPEED),
+        (1.70, 0.2, 30.0, Reason.TEST_RANGE),
+        (1.70, 0.2, -30.0, Reason.NONE),
+        (-1.70, -0.2, -30.0, Reason.TEST_RANGE),
+    ],
+)
+def test_range_and_speed_are_judged_from_the_encoder(
+    position: float, velocity: float, percent: float, reason: Reason
+) -> None:
+    run = SpoolRun(PALMS)
+    run.take(asked((0, 0.0), (400, percent)), NOW)
+    assert run.judge(position, velocity, 1.0, NOW + 300 * MS) is reason
+
+
+def test_half_speed_halves_what_it_may_reach() -> None:
+    run = SpoolRun(PALMS)
+    run.take(asked((0, 0.0), (400, 30.0)), NOW)
+    assert run.judge(0.0, 0.25, 1.0, NOW) is Reason.NONE
+    assert run.judge(0.0, 0.25, 0.5, NOW) is Reason.TEST_SPEED
+
+
+def test_it_lasts_twenty_seconds_at_most_whatever_windows_come() -> None:
+    run = SpoolRun(PALMS)
+    run.take(asked((0, 0.0), (100, 5.0)), NOW)
+    now, reason = NOW, Reason.NONE
+    while reason is Reason.NONE and now < NOW + 2 * LONGEST_NS:
+        now += 50 * MS
+        run.take(asked((0, 5.0), (100, 5.0), stamp_ns=now), now)
+        reason = run.judge(0.0, 0.0, 1.0, now)
+    assert reason is Reason.TEST_TOO_LONG
+    assert LONGEST_NS <= now - NOW <= LONGEST_NS + 200 * MS
+
+
+def test_the_command_carries_the_profiles_sign_and_fades() -> None:
+    run = SpoolRun(PALMS)
+    run.take(asked((0, 0.0), (400, 40.0), joint=Joint.LIFT), NOW)
+    spool, speed = run.drive(1.0, NOW + 400 * MS)
+    assert spool == pytest.approx(40.0 * PALMS.joints["lift"].valve.sign)
+    assert speed == pytest.approx((40.0 - 12.0) / 88.0 * 0.2)
+    assert run.drive(0.5, NOW + 500 * MS)[0] == pytest.approx(0.5 * spool)

@@ -1,0 +1,298 @@
+"""Damping of a swinging grapple: the law on a pendulum of its own, the joints' part, and the sensor that helps."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import msgspec
+import pytest
+from bench import AORO, DATABASE, MS, SETTINGS, Bench, T, count_until
+
+from can_dbc.setpoint import OperatorAction
+from controller.config import ConfigError, Settings
+from controller.laws.joint import JointLaw
+from controller.laws.sway import FADE_S, LONGEST_S, RETURN_1_S, SENSOR_S, START, Damper, Sway
+from controller.step import Controller
+from controller.valve import ValveMap
+from machine.joints import JOINTS, Joint
+from machine.kinematics import pin_position
+from machine.load import profile_hash
+from machine.modes import Mode
+from machine.profile import Imu, joint
+
+T_S = T * 1e-9
+KEY = DATABASE.message("GrappleImu").key
+IMU = Imu(0x23, "GrappleImu", gain=0.4, pendulum_m=0.8, pin_speed_m_s=0.12, dead_zone_rad=0.014)
+PROFILE = msgspec.structs.replace(AORO.profile, imu=IMU)
+LEADS = [150_000_000] * len(JOINTS)
+POSE = (0.3, 0.6, -1.4, 0.8, 0.0)
+GRAVITY_M_S2 = 9.81
+
+
+@dataclass
+class Pendulum:
+    """A point on a massless rod of ``length_m`` whose pin is driven; the motion without small angles."""
+
+    length_m: float
+    lean: float
+    rate: float = 0.0
+    pin_m: float = 0.0
+    speed_m_s: float = 0.0
+
+    def step(self, speed_m_s: float, elapsed_s: float) -> None:
+        push = (speed_m_s - self.speed_m_s) / elapsed_s
+        self.speed_m_s = speed_m_s
+        self.rate -= (GRAVITY_M_S2 * math.sin(self.lean) + push * math.cos(self.lean)) / self.length_m * elapsed_s
+        self.lean += self.rate * elapsed_s
+        self.pin_m += speed_m_s * elapsed_s
+
+    @property
+    def swing(self) -> float:
+        return math.hypot(self.lean, self.rate / math.sqrt(GRAVITY_M_S2 / self.length_m))
+
+
+def damped(pendulum, seconds, imu=IMU, delay_s=0.15, age_s=0.0):
+    """The damper with its way back on a pendulum behind a dead time; the swing over time."""
+    damper = Damper(imu, delay_s)
+    line, seen = deque([0.0] * round(delay_s / T_S)), deque()
+    swings, displaced = [], 0.0
+    for _ in range(round(seconds / T_S)):
+        seen.append((pendulum.lean, pendulum.rate))
+        lean, rate = seen[0] if len(seen) <= round((SENSOR_S + age_s) / T_S) else seen.popleft()
+        damper.step(lean, rate, age_s, T_S)
+        velocity = damper.velocity_m_s - RETURN_1_S * displaced
+        displaced += velocity * T_S
+        line.append(velocity)
+        pendulum.step(line.popleft(), T_S)
+        swings.append(pendulum.swing)
+    return swings
+
+
+def decay(swings, begin_s, end_s, period_s):
+    """The damping ratio between two times."""
+    begin, end = swings[round(begin_s / T_S)], swings[round(end_s / T_S)]
+    return math.log(begin / end) / (2.0 * math.pi * (end_s - begin_s) / period_s)
+
+
+def test_the_pendulum_alone_keeps_its_swing():
+    swings = damped(Pendulum(0.8, 0.1), 4.0, msgspec.structs.replace(IMU, gain=0.0))
+    assert min(swings) == pytest.approx(0.1, rel=0.02)
+
+
+@pytest.mark.parametrize("delay_s", [0.1, 0.25])
+@pytest.mark.parametrize("age_s", [0.0, 0.03])
+def test_half_the_gain_is_the_damping_ratio_whatever_the_delay(delay_s, age_s):
+    fast = msgspec.structs.replace(IMU, pin_speed_m_s=0.5, dead_zone_rad=0.003)
+    pendulum = Pendulum(0.8, 0.15)
+    swings = damped(pendulum, 4.0, fast, delay_s, age_s)
+    assert decay(swings, 0.5, 2.5, 2.0 * math.pi * math.sqrt(0.8 / GRAVITY_M_S2)) == pytest.approx(0.2, rel=0.25)
+
+
+@pytest.mark.parametrize("length_m", [0.56, 0.7, 0.95, 1.1])
+def test_a_pendulum_of_another_length_is_damped_too_and_the_pin_comes_back(length_m):
+    pendulum = Pendulum(length_m, 0.12)
+    swings = damped(pendulum, 6.0)
+    assert swings[round(3.6 / T_S)] < 0.5 * 0.12
+    assert max(swings[round(4.0 / T_S) :]) < START * IMU.dead_zone_rad, "no limit cycle"
+    assert abs(pendulum.pin_m) < 0.01
+
+
+@pytest.mark.parametrize("age_s", [0.01, 0.05])
+def test_an_old_swing_counts_as_what_has_become_of_it(age_s):
+    w = math.sqrt(GRAVITY_M_S2 / IMU.pendulum_m)
+    lean, rate, turned = 0.05, 0.12, w * age_s
+    now = (lean * math.cos(turned) + rate / w * math.sin(turned), rate * math.cos(turned) - w * lean * math.sin(turned))
+    old, new = Damper(IMU, 0.15), Damper(IMU, 0.15)
+    old.step(lean, rate, age_s, T_S)
+    new.step(*now, 0.0, T_S)
+    assert old.velocity_m_s == pytest.approx(new.velocity_m_s, rel=1e-9) and old.velocity_m_s > 0.0
+
+
+def test_it_begins_above_the_dead_zone_and_ends_in_it():
+    damper = Damper(IMU, 0.15)
+    damper.step((START - 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
+    assert damper.velocity_m_s == 0.0
+    damper.step((START + 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
+    assert damper.velocity_m_s > 0.0
+    for _ in range(100):
+        damper.step((START - 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
+    assert damper.velocity_m_s > 0.0
+    for _ in range(round(FADE_S / T_S) + 1):
+        damper.step(0.9 * IMU.dead_zone_rad, 0.0, 0.0, T_S)
+    assert damper.velocity_m_s == 0.0
+
+
+def test_the_pin_is_never_faster_than_allowed_and_nothing_jumps_when_it_starts_or_stops():
+    damper, before = Damper(IMU, 0.0), 0.0
+    for k in range(400):
+        if k < 200:
+            damper.step(0.6, 0.0, 0.0, T_S)
+        else:
+            damper.stop(T_S)
+        assert abs(damper.velocity_m_s) <= IMU.pin_speed_m_s
+        assert abs(damper.velocity_m_s - before) <= IMU.pin_speed_m_s * T_S / FADE_S * 1.001
+        before = damper.velocity_m_s
+        if k == 199:
+            assert before == IMU.pin_speed_m_s
+    assert before == 0.0
+
+
+def sway(imu=IMU):
+    return Sway(PROFILE, imu, LEADS)
+
+
+@pytest.mark.parametrize(("swing", "ahead"), [((0.2, 0.0, 0.0, 0.0), (1, 0)), ((0.0, 0.2, 0.0, 0.0), (0, 1))])
+@pytest.mark.parametrize("pose", [POSE, (-1.2, 1.1, -2.3, 0.2, 0.5), (0.9, 0.2, -0.4, 2.2, 0.0)])
+def test_the_joints_move_the_pin_level_and_towards_the_grapple(swing, ahead, pose):
+    law = sway()
+    for _ in range(round(FADE_S / T_S) + 1):
+        law.step(swing, 0.0, True, pose, T_S)
+    kin, small = PROFILE.kinematics, 1e-5
+    before = pin_position(kin, pose)
+    after = pin_position(kin, [p + small * v for p, v in zip(pose, law.velocity, strict=True)])
+    x, y, z = ((b - a) / small for a, b in zip(before, after, strict=True))
+    turn = pose[0] + kin.theta1_offset_rad
+    out, left = x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn)
+    speed = math.hypot(out, left)
+    assert 0.07 < speed < IMU.pin_speed_m_s
+    assert (out / speed, left / speed) == pytest.approx(ahead, abs=0.01)
+    assert abs(z) < 0.01 * speed
+    assert law.velocity[Joint.LIFT] == law.velocity[Joint.ROT] == 0.0
+
+
+def test_after_its_time_it_takes_the_pin_back_and_is_exactly_over():
+    law, moved = sway(), []
+
+    def tick():
+        law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, POSE, T_S)
+        moved.append(abs(law.displacement[Joint.SLEW]))
+
+    ticks = count_until(tick, lambda: not law.active, round((LONGEST_S + 4.0) / T_S))
+    assert ticks * T_S > LONGEST_S
+    assert max(moved) > 0.01
+    assert not any(law.velocity) and not any(law.displacement)
+    for _ in range(200):
+        law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, POSE, T_S)
+    assert not law.active and not any(law.velocity)
+
+
+def test_while_the_reference_moves_nothing_begins_and_what_was_begun_fades():
+    law = sway()
+    for _ in range(100):
+        law.step((0.2, 0.2, 0.0, 0.0), 0.0, False, POSE, T_S)
+    assert not law.active
+    for _ in range(100):
+        law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, POSE, T_S)
+    assert law.active
+    for unknown in (True, False):  # stale first, then a new motion
+        before = list(law.velocity)
+        law.step(None if unknown else (0.2, 0.2, 0.0, 0.0), 0.0, unknown, POSE, T_S)
+        steps = [abs(a - b) for a, b in zip(law.velocity, before, strict=True)]
+        assert 0.0 < max(steps) < 1.1 * IMU.pin_speed_m_s * T_S / FADE_S
+    count_until(lambda: law.step(None, 0.0, True, POSE, T_S), lambda: not law.active, 1000)
+    assert not any(law.velocity) and not any(law.displacement)
+
+
+def test_joints_that_nobody_knows_are_not_moved():
+    law = sway()
+    law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, POSE, T_S)
+    law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, (0.3, math.nan, -1.4, 0.8, 0.0), T_S)
+    assert not law.active and not any(law.velocity) and not any(law.displacement)
+
+
+def test_a_joint_that_is_moved_on_top_of_its_reference_does_not_rest_and_rests_afterwards():
+    spec = joint(PROFILE, Joint.SLEW)
+    law = JointLaw(spec, ValveMap(spec.valve), T_S)
+    law.wanted(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S)
+    assert law.resting
+    assert law.wanted(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S, 0.01, 0.0) == pytest.approx(0.01)
+    assert not law.resting
+    # Where it was taken to is where it is to be.
+    assert law.wanted(0.2, 0.0, 0.0, 0.203, 0.0, math.nan, T_S, 0.0, 0.003) == pytest.approx(0.0, abs=1e-4)
+    assert not law.resting
+    for _ in range(400):
+        law.wanted(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S)
+    assert law.resting
+
+
+# The sensor behind the controller's bus.
+
+
+def sensing(imu=IMU) -> Settings:
+    profile = msgspec.structs.replace(SETTINGS.profile, imu=imu)
+    return Settings(profile, profile_hash(profile), SETTINGS.rate_hz)
+
+
+def feel(bench: Bench, **values: float) -> None:
+    """One frame of the sensor in the next tick."""
+    bench.extra.append(bench._frame("GrappleImu", values))
+
+
+def at_rest(bench: Bench) -> Bench:
+    """ACTIVE, with a reference that stands and a lease that does not run out."""
+    bench.armed()
+    bench.tick([bench.hold(lease_ms=500)])
+    assert bench.mode is Mode.ACTIVE
+    return bench
+
+
+def test_the_controller_damps_with_a_sensor_and_stops_when_it_is_silent():
+    bench = at_rest(Bench(sensing()))
+    for k in range(60):
+        if k % 2 == 0:
+            feel(bench, LeanTangential=0.15)
+        bench.tick([bench.hold(lease_ms=500)] if k % 20 == 0 else [])
+    moving = bench.controller.commands[Joint.SLEW]
+    assert moving > 0.01
+    assert bench.controller.received.stale_mask == 0
+    for k in range(80):
+        bench.tick([bench.hold(lease_ms=500)] if k % 20 == 0 else [])
+    swung = bench.controller.sway
+    assert bench.controller.received.imu.values is None
+    assert bench.controller.received.stale_mask == 0 and bench.mode is Mode.ACTIVE
+    assert swung.velocity[Joint.SLEW] <= 0.0, "only the way back is left"
+
+
+@pytest.mark.parametrize("values", [{"Status": 2}, {"LeanRadial": None}, {"RateTangential": None}])
+def test_a_sensor_that_says_it_is_broken_is_not_believed(values):
+    bench = at_rest(Bench(sensing()))
+    for k in range(60):
+        feel(bench, **{"LeanTangential": 0.15, "LeanRadial": 0.15, **values})
+        bench.tick([bench.hold(lease_ms=500)] if k % 20 == 0 else [])
+    assert bench.controller.received.imu.values is not None
+    assert not bench.controller.sway.active
+
+
+def test_nothing_is_damped_in_standby_and_the_sensor_is_not_needed_to_arm():
+    bench = Bench(sensing()).boot()
+    for _ in range(20):
+        feel(bench, LeanTangential=0.15)
+        bench.tick()
+    assert not bench.controller.sway.active
+    for _ in range(40):
+        bench.tick()
+    assert bench.controller.received.imu.values is None
+    bench.tick([bench.operator(OperatorAction.ARM)])
+    assert bench.mode is Mode.ARMED
+
+
+def test_a_machine_without_one_does_not_listen_for_it():
+    bench = Bench().boot()
+    received = bench.controller.received
+    assert received.imu is None and bench.controller.sway is None
+    assert KEY not in received.wanted() and KEY in Controller(sensing(), DATABASE).received.wanted()
+    unknown = received.unknown
+    feel(bench, LeanTangential=0.15)
+    bench.tick()
+    assert received.unknown == unknown + 1
+
+
+def test_a_node_that_cannot_send_the_frame_is_refused():
+    with pytest.raises(ConfigError, match=r"imu.node: node 36 does not send GrappleImu \(1A3\); give it node 35"):
+        Controller(sensing(msgspec.structs.replace(IMU, node=0x24)), DATABASE)
+
+
+def test_its_time_out_is_the_dbcs():
+    assert Controller(sensing(), DATABASE).received.imu.timeout_ns == 50 * MS

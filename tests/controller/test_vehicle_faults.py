@@ -1,0 +1,300 @@
+"""Faults of the carrier: each is found within its bound while the machine drives, reacts as it should, and does no harm
+where it does not matter.
+"""
+
+import math
+
+import pytest
+from driving import CARRIER, MS, DriveBench, T
+
+from can_dbc.setpoint import Driving
+from controller.vehicle import UNSURE_SHARE
+from controller.vehicle_watch import ARM_STUCK_NS, DISAGREE_RAD, OWN_GAIN, OWN_M_S
+from controller.whereabouts import JUMP_M, OFF_M
+from machine.faults import FAULTS, describe
+from machine.joints import ARTICULATION
+from machine.modes import Mode
+from machine.reasons import Reaction, Reason
+
+SWAY = math.degrees(CARRIER.tilt_limit_rad)
+
+
+def turning() -> DriveBench:
+    """On its way through a bend to the left."""
+    return DriveBench().under_way(300, 4.0, 30.0)
+
+
+def aside() -> DriveBench:
+    """Just told to turn around: it bends as fast as it may."""
+    return DriveBench().under_way(20, 2.0, 30.0)
+
+
+def straight() -> DriveBench:
+    return DriveBench().under_way(250)
+
+
+def until(bench: DriveBench, reason: Reason, limit_ms: int, *place: float, **fields) -> int:
+    """Milliseconds until the reason stands, the planner going on; fails when it does not come in time."""
+    since = bench.now_ns
+    while bench.now_ns - since < limit_ms * MS:
+        bench.go(1, *(place or (50.0, 0.0)), **fields) if bench.count % 10 == 0 else bench.run(1)
+        if bench.reason == reason:
+            return (bench.now_ns - since) // MS
+    raise AssertionError(f"{reason.name} not seen within {limit_ms} ms: {bench.mode.name} {bench.reason!r}")
+
+
+def go(bench: DriveBench, ticks: int, *place: float, **fields) -> None:
+    for _ in range(ticks):
+        bench.go(1, *(place or (50.0, 0.0)), **fields) if bench.count % 10 == 0 else bench.run(1)
+
+
+def lose_position(b):
+    b.dropped.add("PositionRapidUpdate")
+
+
+def no_position(b):
+    b.lies["PositionRapidUpdate"] = {"Latitude": None, "Longitude": None}
+
+
+def lose_heading(b):
+    b.dropped.add("VesselHeading")
+
+
+def no_heading(b):
+    b.lies["VesselHeading"] = {"Heading": None}
+
+
+def lose_fix(b):
+    b.lies["GnssPositionData"] = {"Method": 1}
+
+
+def jump_position(b):
+    b.east_m += 3.0
+
+
+def swap_antennas(b):
+    b.lies["VesselHeading"] = {"Heading": (b.changed["VesselHeading"]["Heading"] + math.pi) % math.tau}
+
+
+def freeze_heading(b):
+    b.lies["VesselHeading"] = dict(b.changed["VesselHeading"])
+
+
+def carrier_fault(b):
+    b.lies["VehStat"] = {"Fault": 1}
+
+
+def arms_fault(b):
+    b.lies["ArmHeightA"] = {"State": 3}
+
+
+def run_away(b):
+    b.lies["VehStat"] = {"Speed": OWN_GAIN * 0.6 + OWN_M_S + 0.02}
+
+
+def roll_back(b):
+    b.lies["VehStat"] = {"Speed": -OWN_M_S - 0.02}
+
+
+def block(b):
+    b.blocked, b.speed_m_s = True, 0.0
+
+
+def disagree(b):
+    b.lies["VehStat"] = {"Articulation": b.bend_rad + DISAGREE_RAD + 0.01}
+
+
+def roll(b):
+    b.lies["ArmHeightB"] = {"Roll": SWAY + 0.5}
+
+
+def pitch(b):
+    b.lies["ArmHeightB"] = {"Pitch": -SWAY - 0.5}
+
+
+def arm_outside(b):
+    b.lies["ArmHeightA"] = {"Arm3": 400.0}
+
+
+def bend_outside(b):
+    b.bend_rad = CARRIER.articulation_limit_rad + 0.08
+
+
+def stick_steering(b):
+    b.steering_gain = 0.0
+
+
+def reverse_steering(b):
+    b.steering_gain = -1.0
+
+
+def open_steering(b):
+    b.steering_drift = 0.2
+
+
+CASES = {
+    "position lost": (Reason.POSITION_LOST, straight, lose_position),
+    "position not available": (Reason.POSITION_LOST, straight, no_position),
+    "heading lost": (Reason.HEADING_LOST, straight, lose_heading),
+    "heading not available": (Reason.HEADING_LOST, straight, no_heading),
+    "fix lost": (Reason.FIX_LOST, straight, lose_fix),
+    "position jump": (Reason.POSITION_JUMP, straight, jump_position),
+    "heading flipped": (Reason.HEADING_JUMP, straight, swap_antennas),
+    "heading frozen": (Reason.HEADING_FROZEN, turning, freeze_heading),
+    "carrier fault": (Reason.CARRIER_FAULT, straight, carrier_fault),
+    "arms fault": (Reason.ARMS_FAULT, straight, arms_fault),
+    "runaway": (Reason.CARRIER_RUNAWAY, straight, run_away),
+    "rolls back": (Reason.CARRIER_RUNAWAY, straight, roll_back),
+    "stuck": (Reason.CARRIER_STUCK, straight, block),
+    "steering disagrees": (Reason.STEERING_DISAGREES, straight, disagree),
+    "tilted aside": (Reason.TILTED, straight, roll),
+    "tilted down": (Reason.TILTED, straight, pitch),
+    "steering stuck": (Reason.STEERING_STUCK, aside, stick_steering),
+    "steering reversed": (Reason.STEERING_RUNAWAY, aside, reverse_steering),
+    "steering valve stuck open": (Reason.STEERING_RUNAWAY, straight, open_steering),
+    "arm outside": (Reason.ARM_OUTSIDE, straight, arm_outside),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_found_within_its_bound_and_the_machine_stops(name):
+    reason, prepare, inject = CASES[name]
+    bench = prepare()
+    inject(bench)
+    place = {turning: (4.0, 30.0), aside: (2.0, 30.0)}.get(prepare, ())
+    until(bench, reason, FAULTS[reason].bound_ms + 25, *place)  # a frame of mach0 may just have gone
+    reaction = FAULTS[reason].reaction
+    assert reaction >= Reaction.HOLD
+    assert bench.mode is (Mode.FAULT if reaction is Reaction.CUT else Mode.STOP)
+    if reaction > Reaction.HOLD:
+        assert bench.braked and bench.drive_command["ArmKey"] == 0
+    else:
+        assert bench.vehicle.driving is Driving.BRAKING
+    bench.run(300)
+    assert bench.braked and bench.mode in (Mode.STOP, Mode.FAULT), "and nothing starts by itself"
+    assert describe(reason, bench.controller.supervisor.detail)[0].isupper()
+
+
+GNSS = {name: case for name, case in CASES.items() if Reason.POSITION_LOST <= case[0] <= Reason.HEADING_REVERSED}
+
+
+@pytest.mark.parametrize("name", GNSS)
+def test_gnss_does_not_matter_while_the_planner_steers_by_the_articulation(name):
+    _, _, inject = GNSS[name]
+    bench = DriveBench().armed()
+    bench.run(40)
+    for k in range(400):
+        if k == 200:
+            inject(bench)
+        bench.tick([bench.bend(0.1)] if k % 10 == 0 else ())
+    assert bench.mode is Mode.ACTIVE and bench.vehicle.driving is Driving.DRIVING
+
+
+@pytest.mark.parametrize("name", [n for n in CASES if n not in ("runaway", "rolls back")])
+def test_a_machine_that_does_not_drive_is_not_stopped(name):
+    _, _, inject = CASES[name]
+    bench = DriveBench().armed()
+    bench.run(60)
+    inject(bench)
+    bench.run(300)
+    assert bench.mode is Mode.ARMED
+
+
+def test_a_carrier_that_rolls_under_the_crane_is_a_runaway():
+    bench = DriveBench().armed()
+    bench.lies["VehStat"] = {"Speed": OWN_M_S + 0.02}
+    until(bench, Reason.CARRIER_RUNAWAY, FAULTS[Reason.CARRIER_RUNAWAY].bound_ms, speed_m_s=0.0)
+    assert bench.mode is Mode.FAULT
+
+
+def test_antennas_swapped_from_the_start_show_once_it_moves():
+    bench = DriveBench().armed()
+    bench.yaw_rad = math.pi  # backwards to what it says
+    bench.run(60)
+    bench.lies["VesselHeading"] = {"Heading": math.pi / 2}
+    bench.run(60)
+    elapsed_ms, since = 0, None
+    for k in range(800):
+        bench.tick([bench.to(30, 0)] if k % 10 == 0 and bench.operating else ())
+        if since is None and bench.speed_m_s > 0.3:
+            since = bench.now_ns
+        if bench.reason == Reason.HEADING_REVERSED:
+            elapsed_ms = (bench.now_ns - (since or bench.now_ns)) // MS
+            break
+    assert bench.reason == Reason.HEADING_REVERSED
+    assert elapsed_ms <= FAULTS[Reason.HEADING_REVERSED].bound_ms
+
+
+def test_a_float_position_slows_the_way_to_a_waypoint_and_nothing_else():
+    bench = straight()
+    bench.lies["GnssPositionData"] = {"Method": 5}
+    go(bench, 400)
+    assert bench.mode is Mode.ACTIVE
+    assert bench.drive_command["Speed"] == pytest.approx(UNSURE_SHARE * CARRIER.speed_limit_m_s)
+    for k in range(300):
+        bench.tick([bench.bend(0.0, speed_m_s=0.6)] if k % 10 == 0 else ())
+    assert bench.drive_command["Speed"] == pytest.approx(0.6)
+
+
+def test_a_step_aside_of_the_position_needs_two_samples_and_a_small_one_does_no_harm():
+    bench = straight()
+    bench.north_m += OFF_M - 0.1
+    go(bench, 100)
+    assert bench.mode is Mode.ACTIVE
+    bench.north_m += OFF_M + 0.2  # the next samples agree with it again: one is odd, not two
+    go(bench, 100)
+    assert bench.mode is Mode.ACTIVE and OFF_M + 0.2 < JUMP_M
+
+
+def test_a_position_that_wanders_off_step_by_step_is_found():
+    bench = straight()
+    for _ in range(100):
+        bench.north_m += 0.03  # 6 m/s aside
+        go(bench, 1)
+    assert bench.reason == Reason.POSITION_JUMP
+
+
+def test_the_articulation_outside_its_range_latches():
+    bench = straight()
+    bend_outside(bench)
+    bench.lies["VehStat"] = {"Articulation": bench.bend_rad}
+    go(bench, 12)
+    assert bench.controller.supervisor.reason in (Reason.POSITION_OUTSIDE, Reason.ENCODER_JUMP)
+    assert bench.controller.supervisor.detail == ARTICULATION and bench.braked
+    assert describe(Reason.POSITION_OUTSIDE, ARTICULATION).startswith("The articulation is outside")
+
+
+def test_arm_stuck():
+    bench = DriveBench().armed()
+    bench.run(40)
+    go(bench, 20, speed_m_s=0.0, heights_m=(0.45,) * 4)
+    held = [1e3 * (h - CARRIER.arm_travel_m / 2) for h in bench.heights_m]
+    bench.lies["ArmHeightA"] = {"Arm2": held[1]}
+    ms = until(bench, Reason.ARM_STUCK, ARM_STUCK_NS // MS + 100, speed_m_s=0.0, heights_m=(0.45,) * 4)
+    assert ms >= ARM_STUCK_NS // MS - 100 and bench.controller.supervisor.detail == 1
+    assert describe(Reason.ARM_STUCK, 1).startswith("The front right arm does not follow")
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_a_long_drive_around_trips_nothing():
+    bench = DriveBench().armed()
+    bench.run(40)
+    places = [(12.0, 0.0), (12.0, 8.0), (0.0, 8.0), (0.0, 0.0)]
+    for k in range(12000):
+        if k % 10 == 0:
+            east, north = places[0]
+            if math.hypot(east - bench.east_m, north - bench.north_m) < 3.0:
+                places.append(places.pop(0))
+            bench.tick([bench.to(*places[0], float_rear=True)])
+        else:
+            bench.tick()
+    assert bench.mode is Mode.ACTIVE and bench.vehicle.order.refused == 0
+    assert 30.0 < 12000 * T * 1e-9 * 0.6 < 40.0
+
+
+def test_every_fault_of_the_carrier_is_tried():
+    elsewhere = {Reason.HEADING_REVERSED, Reason.ARM_STUCK}
+    assert {reason for reason, _, _ in CASES.values()} | elsewhere == {
+        r for r in Reason if Reason.POSITION_LOST <= r <= Reason.STEERING_RUNAWAY
+    }
