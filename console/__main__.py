@@ -34,10 +34,12 @@ def serve(
     report_port: int,
     profile: str,
     controller: str | None = None,
+    planner: str | None = None,
     scene: str | None = None,
     bind: str = "127.0.0.1",
     allow_hosts: Sequence[str] = (),
     key_file: Path | None = None,
+    timing: Path | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM; raises `Refused`."""
     from console.server import Console, create_app
@@ -55,9 +57,11 @@ def serve(
         profile=machine,
         profile_hash=profile_hash(machine),
         controller=_address(controller, "--controller"),
+        planner=_address(planner, "--planner"),
         scene=_address(scene, "--scene"),
         key=key,
         reports=reports,
+        timing_page=timing,
     )
     _run(create_app(console, (*allow_hosts, bind)), page, bind)
 
@@ -112,14 +116,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The process; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m console", description="The operator's web page.")
     parser.add_argument("--port", type=int, default=8471, help="of the page (default 8471)")
-    parser.add_argument("--report-port", type=int, help="UDP port of the controller's reports")
+    parser.add_argument("--report-port", type=int, help="UDP port of the reports of controller and planner")
     parser.add_argument("--plant", metavar="HOST:PORT", help="show the simulated plant that answers there instead")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file")
     parser.add_argument("--controller", metavar="HOST:PORT", help="where commands go; without it the page only watches")
+    parser.add_argument("--planner", metavar="HOST:PORT", help="where the orders to a mission go")
     parser.add_argument("--scene", metavar="HOST:PORT", help="a detector to ask for the logs that lie there")
     parser.add_argument("--bind", default="127.0.0.1", help="address to serve on (default: this machine only)")
     parser.add_argument("--allow-host", action="append", default=[], help="a host name to serve besides this machine's")
     parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
+    parser.add_argument("--timing", type=Path, metavar="FILE", help="the controller's timing page, to be shown")
     a = parser.parse_args(arguments)
     if (a.report_port is None) == (a.plant is None):
         parser.error("give --report-port (the operator's page) or --plant (the view of a simulated plant)")
@@ -133,10 +139,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             report_port=a.report_port,
             profile=a.profile,
             controller=a.controller,
+            planner=a.planner,
             scene=a.scene,
             bind=a.bind,
             allow_hosts=a.allow_host,
             key_file=a.key_file,
+            timing=a.timing,
         )
     except Refused as refused:
         sys.stderr.write(f"console: {refused}\n")

@@ -1,11 +1,14 @@
-"""The operator's web page: watch the crane, stop it, arm it.
+"""The operator's web page: watch crane and mission, stop them, arm them, order the mission about.
 
-Inputs: the controller's state reports (UDP), the detector's log list (UDP, asked twice a second, optional) and the
-operator's commands (POST).  Outputs: a page, ``/ws`` with the state 20 times a second, ``/api/state``,
-``/api/machine``, ``/healthz``, and one ``OperatorCommand`` datagram per command to the controller.
+Inputs: the controller's reports of crane and vehicle and the planner's of its mission (UDP, one port), the detector's
+log list (UDP, asked twice a second, optional), the controller's timing page (read once a second, optional) and the
+operator's commands and orders (POST).  Outputs: a page, ``/ws`` with the state 20 times a second (and the mission when
+something new was told of it), ``/api/state``, ``/api/trail`` (where the vehicle was), ``/api/machine``, ``/healthz``;
+one ``OperatorCommand`` datagram per command to the controller, one ``MissionOrder`` per order to the planner.
 
-STOP is accepted from every page that may see the console; ARM, DISARM and RESET only from this machine (an ssh tunnel
-counts as this machine).  Everything is served from the package: no other host is ever asked for anything.
+STOP is accepted from every page that may see the console; ARM, DISARM, RESET and the orders of a mission only from this
+machine (an ssh tunnel counts as this machine).  Everything is served from the package: no other host is ever asked for
+anything.
 """
 
 from __future__ import annotations
@@ -29,14 +32,17 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from autonomy.logs import QUESTION, LogsRefused, parse_logs
+from autonomy.logs import LogsRefused, parse_logs, question
+from can_dbc.mission_datagrams import MissionOrder, Order, encode_order
 from can_dbc.setpoint import OperatorAction, OperatorCommand, encode
+from can_dbc.timing_page import TimingRefused, read_timing
 from console.guards import LOOPBACK_NAMES, Guards, content_security_policy, is_loopback
 from console.state import Watch, describe_machine
 from machine.profile import Profile
 
 PERIOD_S: Final = 0.05
 ASK_LOGS_S: Final = 0.5
+LOOK_AT_TIMING_S: Final = 1.0
 STATIC: Final = Path(__file__).with_name("static")
 
 Address = tuple[str, int]
@@ -44,7 +50,9 @@ Address = tuple[str, int]
 
 @dataclass(slots=True)
 class Console:
-    """The console's configuration and what it knows.  ``controller`` None: the page only watches."""
+    """The console's configuration and what it knows.  ``controller`` None: the page only watches; ``planner`` None: the
+    mission cannot be ordered about.
+    """
 
     profile: Profile
     profile_hash: int
@@ -52,27 +60,32 @@ class Console:
     scene: Address | None = None
     key: bytes | None = None
     reports: socket.socket | None = None
-    """A bound UDP socket on which the controller's reports arrive."""
+    """A bound UDP socket on which the reports of controller and planner arrive."""
+    planner: Address | None = None
+    timing_page: Path | None = None
     clock: Callable[[], int] = time.monotonic_ns
     watch: Watch = field(init=False)
     _sequence: int = 0
 
     def __post_init__(self) -> None:
-        self.watch = Watch(self.profile, self.key)
+        self.watch = Watch(self.profile, self.key, self.profile_hash)
 
     def command(self, action: OperatorAction) -> None:
         """Send one operator command; raises OSError."""
         assert self.controller is not None
-        now_ns = self.clock()
+        message = OperatorCommand(self._next(), self.profile_hash, self.clock(), action)
+        _send(encode(message, self.key), self.controller)
+
+    def order(self, order: Order) -> None:
+        """Send one order to the planner; raises OSError."""
+        assert self.planner is not None
+        message = MissionOrder(self._next(), self.profile_hash, self.clock(), order)
+        _send(encode_order(message, self.key), self.planner)
+
+    def _next(self) -> int:
         # Starts from the clock, so that a restarted console is no replay of the one before.
-        self._sequence = max(self._sequence + 1, now_ns // 1_000_000 & 0x7FFF_FFFF)
-        message = OperatorCommand(self._sequence, self.profile_hash, now_ns, action)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            out.connect(self.controller)
-            out.send(encode(message, self.key))
-            # On loopback the kernel says at once when nobody listens.
-            if code := out.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-                raise OSError(code, os.strerror(code))
+        self._sequence = max(self._sequence + 1, self.clock() // 1_000_000 & 0x7FFF_FFFF)
+        return self._sequence
 
     def state_for(self, peer: str | None) -> dict[str, Any]:
         """The page's state with what the viewer at ``peer`` may do."""
@@ -81,7 +94,17 @@ class Console:
             **self.watch.state(self.clock()),
             "may_stop": can,
             "may_command": can and is_loopback(peer),
+            "may_order": self.planner is not None and is_loopback(peer),
         }
+
+
+def _send(data: bytes, to: Address) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        out.connect(to)
+        out.send(data)
+        # On loopback the kernel says at once when nobody listens.
+        if code := out.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            raise OSError(code, os.strerror(code))
 
 
 class _Reports(asyncio.DatagramProtocol):
@@ -103,8 +126,28 @@ class _Logs(asyncio.DatagramProtocol):
 
 async def _ask_logs(transport: asyncio.DatagramTransport) -> None:
     while True:
-        transport.sendto(QUESTION)
+        transport.sendto(question(()))  # what is known already will do
         await asyncio.sleep(ASK_LOGS_S)
+
+
+async def _watch_timing(watch: Watch, page: Path) -> None:
+    while True:
+        with contextlib.suppress(TimingRefused):  # none, or none yet; what was read before grows old
+            watch.on_timing(await asyncio.to_thread(read_timing, page))
+        await asyncio.sleep(LOOK_AT_TIMING_S)
+
+
+def _elsewhere(name: str) -> Response:
+    return PlainTextResponse(f"{name} is accepted only from the machine that runs the console.", 403)
+
+
+def _answer(send: Callable[[], None], who: str, where: Address) -> Response:
+    """Send, and say when nobody is there."""
+    try:
+        send()
+    except OSError as error:
+        return PlainTextResponse(f"The {who} at {where[0]}:{where[1]} cannot be reached: {error.strerror}.", 502)
+    return Response(status_code=204)
 
 
 def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette:
@@ -124,6 +167,8 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
                 asking = asyncio.create_task(_ask_logs(scene))
                 stack.callback(scene.close)
                 stack.callback(asking.cancel)
+            if console.timing_page:
+                stack.callback(asyncio.create_task(_watch_timing(console.watch, console.timing_page)).cancel)
             yield
 
     async def index(_: Request) -> Response:
@@ -133,7 +178,11 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
         return JSONResponse(machine)
 
     async def api_state(request: Request) -> Response:
-        return JSONResponse(console.state_for(request.client.host if request.client else None))
+        state = console.state_for(request.client.host if request.client else None)
+        return JSONResponse(state | {"mission": console.watch.forwarding.mission()})
+
+    async def api_trail(_: Request) -> Response:
+        return JSONResponse(list(console.watch.forwarding.trail))
 
     async def healthz(_: Request) -> Response:
         alive = console.watch.alive(console.clock())
@@ -147,21 +196,29 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
             return PlainTextResponse("This console only watches; start it with --controller HOST:PORT.", 409)
         peer = request.client.host if request.client else None
         if name != "STOP" and not is_loopback(peer):
-            return PlainTextResponse(f"{name} is accepted only from the machine that runs the console.", 403)
-        try:
-            console.command(OperatorAction[name])
-        except OSError as error:
-            host, port = console.controller
-            reason = error.strerror
-            return PlainTextResponse(f"The controller at {host}:{port} cannot be reached: {reason}.", 502)
-        return Response(status_code=204)
+            return _elsewhere(name)
+        return _answer(lambda: console.command(OperatorAction[name]), "controller", console.controller)
+
+    async def mission(request: Request) -> Response:
+        name = request.path_params["order"].upper().replace("-", "_")
+        if name not in Order.__members__:
+            return PlainTextResponse(f"There is no order {name}.", 404)
+        if console.planner is None:
+            return PlainTextResponse("This console gives no orders; start it with --planner HOST:PORT.", 409)
+        if not is_loopback(request.client.host if request.client else None):
+            return _elsewhere(name)
+        return _answer(lambda: console.order(Order[name]), "planner", console.planner)
 
     async def ws(socket: WebSocket) -> None:
         await socket.accept()
         peer = socket.client.host if socket.client else None
         with contextlib.suppress(WebSocketDisconnect):
+            told = 0
             while True:
-                await socket.send_text(json.dumps(console.state_for(peer), separators=(",", ":")))
+                state, forwarding = console.state_for(peer), console.watch.forwarding
+                if told != forwarding.told:
+                    told, state["mission"] = forwarding.told, forwarding.mission()
+                await socket.send_text(json.dumps(state, separators=(",", ":")))
                 await asyncio.sleep(PERIOD_S)
 
     return Starlette(
@@ -169,7 +226,9 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
             Route("/", index),
             Route("/api/machine", api_machine),
             Route("/api/state", api_state),
+            Route("/api/trail", api_trail),
             Route("/api/operator/{action}", operator, methods=["POST"]),
+            Route("/api/mission/{order}", mission, methods=["POST"]),
             Route("/healthz", healthz),
             WebSocketRoute("/ws", ws),
             Mount("/static", StaticFiles(directory=STATIC)),

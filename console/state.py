@@ -13,22 +13,28 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from autonomy.logs import LogObservation
-from can_dbc.setpoint import DatagramRefused, StateReport, decode
+from can_dbc.setpoint import DatagramRefused, StateReport, VehicleReport, decode
+from can_dbc.timing_page import Timing
+from console.mission_state import MissionWatch, describe_carrier
 from machine import faults, grapple, kinematics
-from machine.joints import JOINTS, Joint
+from machine.joints import ARTICULATION, JOINTS, Joint
 from machine.modes import Mode
 from machine.profile import Profile, joint
+from machine.reasons import ENCODER_BIT
 
 ALIVE_NS: Final = 300_000_000
 """A controller that has said nothing for this long is shown as lost."""
 WINDOW_NS: Final = 1_000_000_000
+TIMING_OLD_NS: Final = 3_000_000_000
+"""The controller writes its timing once a second."""
 
 PARTS: Final = ("column", "boom", "stick", "telescope", "grapple")
 _NAMES: Final = tuple((j.name.lower(), PARTS[j]) for j in JOINTS)
 STALE_NAMES: Final = {
     0: "emergency stop", 1: "guard", 8: "valves A", 9: "valves B", 10: "PLC",
-    11: "pressures A", 12: "pressures B", 13: "pressures C", 14: "grapple",
-} | {faults.ENCODER_BIT + j: f"{j.name.lower()} encoder" for j in JOINTS}  # fmt: skip
+    11: "pressures A", 12: "pressures B", 13: "pressures C", 14: "grapple", 15: "carrier",
+    ENCODER_BIT + ARTICULATION: "articulation encoder",
+} | {ENCODER_BIT + j: f"{j.name.lower()} encoder" for j in JOINTS}  # fmt: skip
 """Bits of ``StateReport.stale_mask``."""
 
 
@@ -47,26 +53,34 @@ def describe_machine(profile: Profile) -> dict[str, Any]:
         "ground_z_m": place.ground_z_m,
         "pick_center_m": place.pick_center_m,
         "pick_half_size_m": place.pick_half_size_m,
+        "reach_m": round(kinematics.max_reach_m(profile), 2),
+        "carrier": describe_carrier(profile),
     }
 
 
 class Watch:
-    """Takes reports and log lists, gives the page's state."""
+    """Takes reports and log lists, gives the page's state; ``forwarding`` is what it knows of vehicle and mission."""
 
-    def __init__(self, profile: Profile, key: bytes | None = None) -> None:
+    def __init__(self, profile: Profile, key: bytes | None = None, profile_hash: int = 0) -> None:
         self.logs: tuple[LogObservation, ...] = ()
+        self.forwarding = MissionWatch(profile, profile_hash, key)
         self._profile = profile
         self._key = key
         self._report: StateReport | None = None
         self._heard_ns = 0
         self._recent: deque[tuple[int, StateReport]] = deque()
+        self._timing: dict[str, Any] | None = None
+        self._timing_ns = 0
 
     def on_report(self, datagram: bytes, now_ns: int) -> bool:
-        """Take a datagram; False when it is no state report of ours."""
+        """Take a datagram; False when it is none of the reports that are shown."""
         try:
             report = decode(datagram, self._key)
         except DatagramRefused:
-            return False
+            return self.forwarding.on_mission(datagram, now_ns)
+        if isinstance(report, VehicleReport):
+            self.forwarding.on_vehicle(report, now_ns)
+            return True
         if not isinstance(report, StateReport):
             return False
         self._report, self._heard_ns = report, now_ns
@@ -74,14 +88,21 @@ class Watch:
         self._forget(now_ns)
         return True
 
+    def on_timing(self, timing: Timing) -> None:
+        """Take a state of the controller's timing page."""
+        self._timing, self._timing_ns = _punctuality(timing), timing.facts.written_ns
+
     def alive(self, now_ns: int) -> bool:
         """Whether the controller has spoken lately."""
         return self._report is not None and now_ns - self._heard_ns < ALIVE_NS
 
     def state(self, now_ns: int) -> dict[str, Any]:
-        """The whole state for the page; before the first report only ``alive`` and ``logs``."""
+        """The state for the page; before the controller's first report without what it says of the crane."""
         r = self._report
-        base = {"alive": self.alive(now_ns), "logs": [asdict(log) for log in self.logs]}
+        base = {"alive": self.alive(now_ns), "logs": [asdict(log) for log in self.logs], "timing": None}
+        base |= self.forwarding.state(now_ns)
+        if self._timing and now_ns - self._timing_ns < TIMING_OLD_NS:
+            base["timing"] = self._timing
         if r is None:
             return base
         self._forget(now_ns)
@@ -130,6 +151,22 @@ class Watch:
                 "tip_below_m": round(grapple.tip_below_pin_m(tongs, angle), 4),
             },
         }
+
+
+def _punctuality(timing: Timing) -> dict[str, Any]:
+    """How punctual the controller has been since its start; durations are p99, the input is the oldest ever used."""
+    facts, found = timing.facts, timing.durations
+    inputs = {name: age.longest_ns for name, age in facts.inputs.items() if age.count}
+    oldest = max(inputs, key=inputs.__getitem__, default="")
+    return {
+        "ticks": facts.ticks,
+        "missed": facts.missed,
+        "wake_us": found["wake"].quantile_ns(0.99) / 1e3,
+        "cpu_us": found["cpu"].quantile_ns(0.99) / 1e3,
+        "sample_to_command_ms": found["sample_to_command"].quantile_ns(0.99) / 1e6,
+        "oldest_input": oldest,
+        "oldest_input_ms": inputs[oldest] / 1e6 if oldest else None,
+    }
 
 
 def _points(points: kinematics.ChainPoints) -> list[list[float]]:

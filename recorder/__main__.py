@@ -1,4 +1,4 @@
-"""``python -m recorder``: records buses, tick records and state reports until SIGTERM or SIGINT.
+"""``python -m recorder``: records buses, tick records, state reports and timing until SIGTERM or SIGINT.
 
 The receiving thread only takes and queues, the writing thread only writes, so a disk that hangs for seconds costs
 nothing, and one that hangs longer costs records, which are counted and told on stderr at most once a second.
@@ -10,6 +10,7 @@ Exit codes: 0 ended in good order, 2 usage, 3 the directory or profile cannot be
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import queue
 import select
@@ -25,6 +26,8 @@ from typing import Final
 from can_dbc.batch import widen
 from can_dbc.bus import Bus, BusError, BusState, open_bus
 from can_dbc.frame import Frame
+from can_dbc.lost_link import LostLink
+from can_dbc.timing_page import Timing, TimingRefused, read_timing
 from machine.load import ProfileError, load_profile
 from recorder.manifest import describe
 from recorder.recorder import Recorder, RecordingRefused
@@ -34,8 +37,9 @@ QUEUE_ITEMS: Final = 50_000
 FLUSH_S: Final = 0.1
 LOOK_S: Final = 0.02
 BATCH_BYTES: Final = 65536
+TIMING_S: Final = 1.0
 
-Item = tuple[str, str, list[Frame] | bytes]
+Item = tuple[str, str, list[Frame] | bytes | Timing]
 
 
 class Shell:
@@ -45,12 +49,16 @@ class Shell:
     recorder that sleeps leaves the processor to those who are in a hurry.
     """
 
-    def __init__(self, buses: dict[str, Bus], ticks: socket.socket, reports: socket.socket) -> None:
+    def __init__(
+        self, buses: dict[str, Bus], ticks: socket.socket, reports: socket.socket, timing: Path | None = None
+    ) -> None:
         self.items: queue.Queue[Item | None] = queue.Queue(QUEUE_ITEMS)
         self.dropped = 0
+        self._buses = tuple(buses.values())
         self.wake, self._ask = socket.socketpair()
         self._takers = [self._taker(name, bus) for name, bus in buses.items()]
         self._takers += [self._datagrams(kind, sock) for kind, sock in (("tick", ticks), ("report", reports))]
+        self._takers += [self._page(timing)] if timing else []
 
     def run(self) -> None:
         """Receive until ``end``, and then what still waits."""
@@ -65,6 +73,11 @@ class Shell:
         """Make ``run`` return; callable from a signal handler."""
         self._ask.send(b"x")
 
+    @property
+    def lost(self) -> int:
+        """Frames and records that were there and that nobody will write: the kernel's buffer or the queue was full."""
+        return self.dropped + sum(bus.stats.dropped for bus in self._buses)
+
     def _put(self, item: Item, count: int) -> None:
         try:
             self.items.put_nowait(item)
@@ -72,16 +85,38 @@ class Shell:
             self.dropped += count
 
     def _taker(self, name: str, bus: Bus) -> Callable[[], None]:
-        told = False
+        link, told = LostLink(bus), False
+        lost, tell_after = 0, 0.0
 
         def take() -> None:
-            nonlocal told
+            nonlocal told, lost, tell_after
             frames: list[Frame] = []
             if bus.drain(frames):
                 self._put(("frames", name, frames), len(frames))
-            elif bus.stats.state is BusState.DOWN and not told:
-                told = True
-                say(f"{name} is down; nothing more is recorded of it")
+            down = bus.stats.state is BusState.DOWN
+            if down != told:
+                told = down
+                say(f"{name} is {'down; recording goes on when it is back' if down else 'back'}")
+            if bus.stats.dropped > lost and (now := time.monotonic()) >= tell_after:
+                lost, tell_after = bus.stats.dropped, now + 1.0
+                say(f"{lost} frames of {name} came too fast to be recorded; give the recorder more processor time")
+            link.watch(time.monotonic_ns())
+
+        return take
+
+    def _page(self, path: Path) -> Callable[[], None]:
+        look_at, written_ns = 0.0, 0
+
+        def take() -> None:
+            nonlocal look_at, written_ns
+            if (now := time.monotonic()) < look_at:
+                return
+            look_at = now + TIMING_S
+            with contextlib.suppress(TimingRefused):  # no controller, or one that has not begun
+                timing = read_timing(path)
+                if timing.facts.written_ns != written_ns:
+                    written_ns = timing.facts.written_ns
+                    self._put(("timing", "", timing), 1)
 
         return take
 
@@ -111,6 +146,8 @@ def write_all(recorder: Recorder, shell: Shell) -> None:
         if isinstance(what, list):
             for frame in what:
                 recorder.on_frame(name, frame)
+        elif isinstance(what, Timing):
+            recorder.on_timing(what)
         elif kind == "tick":
             recorder.on_tick(what)
         elif kind == "report":
@@ -123,7 +160,7 @@ def write_all(recorder: Recorder, shell: Shell) -> None:
         if lost > told and now >= tell_after:
             say(f"{lost} records could not be written so far; make room on the disk")
             told, tell_after = lost, now + 1.0
-    recorder.dropped += shell.dropped
+    recorder.dropped += shell.lost
     recorder.close()
 
 
@@ -149,6 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--tick-port", type=int, required=True, help="UDP port of the controller's tick records")
     parser.add_argument("--report-port", type=int, required=True, help="UDP port of the controller's state reports")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file")
+    parser.add_argument("--timing", type=Path, metavar="FILE", help="the controller's timing page, kept once a second")
     parser.add_argument("--seed", type=int, help="of the run, for the manifest")
     parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
     parser.add_argument(
@@ -175,7 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (OSError, OverflowError) as error:
         say(f"a port or file cannot be used ({error}); choose another")
         return 4
-    shell = Shell(buses, ticks, reports)
+    shell = Shell(buses, ticks, reports, a.timing)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: shell.end())
     writer = threading.Thread(target=write_all, args=(recorder, shell), name="writer")

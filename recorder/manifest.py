@@ -24,7 +24,10 @@ NAME = "manifest.json"
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Identity of a recording; ``complete`` and ``dropped`` (records lost to a full disk) are set when it closes."""
+    """Identity of a recording; ``complete`` and ``dropped`` are set when it closes.
+
+    ``dropped`` counts what was lost to a full disk, and the frames that came faster than the recorder could take them.
+    """
 
     timberhand: str
     profile: str

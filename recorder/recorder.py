@@ -1,13 +1,13 @@
 """The recorder itself: what it is told goes into a candump log per bus and into ``run.mcap``.
 
-Inputs: frames of the buses, the controller's tick records and its state reports, each with its own monotonic stamp;
-the recorder has no clock.  Outputs, in one directory:
+Inputs: frames of the buses, the controller's tick records, state reports and timing page, each with its own monotonic
+stamp; the recorder has no clock.  Outputs, in one directory:
 
 * ``<bus>.log``: ``candump -L`` text, for can-utils, SavvyCAN and python-can.
 * ``run.mcap`` (then ``run-0002.mcap`` and so on, one for each 512 MiB or after a full disk): ``/<bus>/raw`` (the
   16 bytes of the kernel's ``struct can_frame``, then the sender's name where it is known), ``/<bus>/<message>``
-  (decoded signals, JSON), ``/controller/tick`` (raw, see ``can_dbc.tick_record``), ``/controller/report`` and
-  ``/manifest`` (JSON).
+  (decoded signals, JSON), ``/controller/tick`` (raw, see ``can_dbc.tick_record``), ``/controller/report``,
+  ``/timing`` (the controller's timing page) and ``/manifest`` (JSON).
   Publish time is monotonic, log time is UTC where the manifest has it (live), else monotonic too.
 * ``manifest.json``: see ``recorder.manifest``.
 
@@ -23,14 +23,15 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
-from mcap.writer import Writer
 
 from can_dbc import codec, setpoint, tick_record
 from can_dbc.frame import ERROR, REMOTE, Frame, describe
+from can_dbc.timing_page import Timing
 from machine.profile import Profile
 from recorder import manifest as manifests
 from recorder.files import CommitFile
 from recorder.manifest import Manifest
+from recorder.mcap_file import McapFile
 from recorder.recover import RUN_NAME, recover, run_files
 from recorder.signals import BusSignals, json_schema
 
@@ -38,6 +39,8 @@ CHUNK_NS: Final = 200_000_000
 SEGMENT_BYTES: Final = 512 * 2**20
 TICK: Final = "/controller/tick"
 REPORT: Final = "/controller/report"
+VEHICLE: Final = "/controller/vehicle"
+TIMING: Final = "/timing"
 
 _CAN_FRAME: Final = struct.Struct("<IB3x8s")
 _JSON: Final = msgspec.json.Encoder()
@@ -66,7 +69,7 @@ class Recorder:
         self._directory = directory
         self._manifest = manifest
         self._durable = sync and manifest.live
-        self._key = key
+        self._key, self._drives = key, profile.carrier is not None
         self._offset_ns = manifest.utc_offset_ns
         databases = manifests.databases(profile)
         self._signals = {bus: BusSignals(map(codec.load, databases[bus])) for bus in manifest.buses}
@@ -111,16 +114,26 @@ class Recorder:
         self._add(TICK, stamp_ns, record)
 
     def on_report(self, datagram: bytes) -> None:
-        """The controller's state report, as it came."""
+        """The controller's state report or vehicle report, as it came."""
         try:
             report = setpoint.decode(datagram, self._key)
         except setpoint.DatagramRefused:
             report = None
-        if not isinstance(report, setpoint.StateReport):
+        if isinstance(report, setpoint.VehicleReport) and self._drives:
+            topic = VEHICLE
+        elif isinstance(report, setpoint.StateReport):
+            topic = REPORT
+        else:
             self.refused += 1
             return
         self._at(report.stamp_ns)
-        self._add(REPORT, report.stamp_ns, _JSON.encode(report))
+        self._add(topic, report.stamp_ns, _JSON.encode(report))
+
+    def on_timing(self, timing: Timing) -> None:
+        """The controller's timing, once for each state of its page."""
+        stamp_ns = timing.facts.written_ns
+        self._at(stamp_ns)
+        self._add(TIMING, stamp_ns, _JSON.encode(timing.named()))
 
     def flush(self, now_ns: int) -> None:
         """Close the chunk and bring everything to the files; what cannot be written is counted in ``dropped``."""
@@ -160,7 +173,11 @@ class Recorder:
 
     def _at(self, stamp_ns: int) -> None:
         """Closes the chunk before a record that would make it longer than CHUNK_NS, in whatever order records come."""
-        start_ns = stamp_ns if self._chunk_start_ns is None else min(self._chunk_start_ns, stamp_ns)
+        start_ns = self._chunk_start_ns
+        if start_ns is not None and start_ns <= stamp_ns < start_ns + CHUNK_NS:  # as nearly always
+            self._chunk_end_ns = max(self._chunk_end_ns or 0, stamp_ns)
+            return
+        start_ns = stamp_ns if start_ns is None else min(start_ns, stamp_ns)
         if self._chunk_end_ns is not None and max(self._chunk_end_ns, stamp_ns) - start_ns >= CHUNK_NS:
             self.flush(stamp_ns)
             start_ns = stamp_ns
@@ -183,6 +200,9 @@ class Recorder:
                 segment.channel(f"/{bus}/{message.name}", "json", message.name, json_schema(message))
         segment.channel(TICK, "timberhand.tick")
         segment.channel(REPORT, "json", "StateReport", _OBJECT)
+        if self._drives:
+            segment.channel(VEHICLE, "json", "VehicleReport", _OBJECT)
+        segment.channel(TIMING, "json", "Timing", _OBJECT)
         segment.channel("/manifest", "json", "Manifest", _OBJECT)
         segment.add("/manifest", self._now_ns + self._offset_ns, self._now_ns, _JSON.encode(self._manifest))
         try:
@@ -210,8 +230,7 @@ class _Segment:
         """Messages since the last commit."""
         self._file = CommitFile(path, durable)
         fcntl.flock(self._file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        self._writer = Writer(self._file, chunk_size=1 << 30)
-        self._writer.start(library="timberhand")
+        self._writer = McapFile(self._file, "timberhand")
         self._channels: dict[str, int] = {}
 
     def channel(self, topic: str, encoding: str, schema: str = "", text: bytes = b"") -> None:

@@ -1,5 +1,6 @@
 // The operator's page: takes the state from the websocket, shows it, and sends the operator's commands by POST.
 
+import { createMission } from "./mission.js";
 import { createPlot, LINES } from "./plot.js";
 
 const LOST_AFTER_MS = 700;
@@ -9,6 +10,7 @@ const $ = (id) => document.getElementById(id);
 
 let machine = null;
 let scene = null;
+let mission = null;
 let rows = [];
 let lastMessage = 0;
 let reportAlive = false;
@@ -18,15 +20,18 @@ const plot = createPlot($("plot"));
 
 // ---- commands --------------------------------------------------------------------------------------------
 
-async function command(action) {
+async function send(path, name, otherwise) {
   try {
-    const answer = await fetch(`api/operator/${action}`, { method: "POST", signal: AbortSignal.timeout(2000) });
+    const answer = await fetch(path, { method: "POST", signal: AbortSignal.timeout(2000) });
     if (!answer.ok) throw new Error((await answer.text()) || answer.statusText);
   } catch (error) {
-    const more = action === "stop" ? "Press the hard-wired emergency stop." : "Nothing was done.";
-    alarm(`${action.toUpperCase()} was not sent (${error.message}). ${more}`, 10000);
+    alarm(`${name.toUpperCase()} was not sent (${error.message}). ${otherwise}`, 10000);
   }
 }
+
+const HARD_WIRED = "Press the hard-wired emergency stop.", NOTHING = "Nothing was done.";
+const command = (action) => send(`api/operator/${action}`, action, action === "stop" ? HARD_WIRED : NOTHING);
+const order = (name) => send(`api/mission/${name}`, name.replace("-", " "), NOTHING);
 
 $("stop").addEventListener("click", () => command("stop"));
 $("reset").addEventListener("click", () => command("reset"));
@@ -39,7 +44,7 @@ window.addEventListener("keydown", (event) => {
   if (event.key !== "Escape" && event.key !== " ") return;
   event.preventDefault();
   event.stopPropagation();
-  if ($("confirm").open) $("confirm").close();
+  for (const id of ["confirm", "end"]) if ($(id).open) $(id).close();
   if (!event.repeat) command("stop");
 }, { capture: true });
 // A focused button is clicked by the release of the space bar, which means STOP here.
@@ -56,6 +61,7 @@ function connect() {
     show(JSON.parse(event.data));
     watch();
   });
+  socket.addEventListener("open", () => mission?.recall());
   socket.addEventListener("close", () => setTimeout(connect, 500));
 }
 
@@ -85,6 +91,8 @@ function show(state) {
   reportAlive = state.alive;
   for (const id of ["arm", "disarm", "reset"]) $(id).disabled = !state.may_command;
   $("stop").disabled = !state.may_stop;
+  showTiming(state.timing);
+  mission?.show(state);
   if (!state.mode) return;
   document.body.dataset.mode = mode = state.mode;
   text("reason", state.reason);
@@ -121,6 +129,16 @@ function showJoint(j, q, reference) {
   row.tr.classList.toggle("limit", q !== null && (q < spec.lower + margin || q > spec.upper - margin));
   row.position.textContent = human(spec, q);
   row.error.textContent = q === null || reference === null ? "–" : error(spec, reference - q);
+}
+
+function showTiming(timing) {
+  $("timing").hidden = !timing;
+  if (!timing) return;
+  text("wake", number(timing.wake_us, 0));
+  text("cpu", number(timing.cpu_us, 0));
+  text("sample", number(timing.sample_to_command_ms, 1));
+  text("missed-share", `${timing.missed} of ${timing.ticks + timing.missed}`);
+  text("oldest-input", timing.oldest_input ? `${number(timing.oldest_input_ms, 1)} ms ${timing.oldest_input}` : "–");
 }
 
 function human(spec, value) {
@@ -170,8 +188,8 @@ function build() {
   machine.joints.forEach((spec, j) => {
     const item = document.createElement("span");
     item.innerHTML = '<svg width="26" height="8"><line x1="0" y1="4" x2="26" y2="4" stroke-width="2"/></svg>';
-    item.querySelector("line").setAttribute("stroke", LINES[j].color);
-    item.querySelector("line").setAttribute("stroke-dasharray", LINES[j].dash.join(" "));
+    item.querySelector("line").setAttribute("class", `joint-${j}`);
+    item.querySelector("line").setAttribute("stroke-dasharray", LINES[j].join(" "));
     item.append(spec.name);
     $("plot-legend").appendChild(item);
   });
@@ -181,6 +199,7 @@ async function start() {
   // STOP is wired above and works even if everything below fails.
   machine = await (await fetch("api/machine")).json();
   build();
+  if (machine.carrier) mission = createMission(machine, order, { number, text });
   connect();
   setInterval(watch, 100);
   try {

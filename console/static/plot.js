@@ -1,17 +1,14 @@
 // A small time plot: one line per joint over the last seconds, drawn on a canvas.
 
 const SPAN_S = 20;
-export const LINES = [
-  { color: "#6fdc98", dash: [] },
-  { color: "#ffbe5c", dash: [7, 3] },
-  { color: "#7cc4ff", dash: [2, 3] },
-  { color: "#ff9ec4", dash: [9, 3, 2, 3] },
-  { color: "#d9d2ff", dash: [4, 4] },
-];
+/** Dashes by joint; the colours are the style sheet's. */
+export const LINES = [[], [7, 3], [2, 3], [9, 3, 2, 3], [4, 4]];
 
 /** Keeps samples of `{t, values}` (t in seconds, a value may be null) and draws them; returns `{add}`. */
 export function createPlot(canvas) {
   const samples = [];
+  const style = getComputedStyle(document.documentElement);
+  const ink = (name) => style.getPropertyValue(`--${name}`);
 
   function add(t, values) {
     if (samples.length && t < samples.at(-1).t) samples.length = 0;
@@ -43,15 +40,15 @@ export function createPlot(canvas) {
     g.textBaseline = "middle";
     g.lineWidth = 1;
     for (let v = -reach; v <= reach + 1e-9; v += step) {
-      g.strokeStyle = Math.abs(v) < 1e-9 ? "#6b8076" : "#26322d";
+      g.strokeStyle = ink(Math.abs(v) < 1e-9 ? "soft" : "line");
       g.beginPath(); g.moveTo(left, y(v)); g.lineTo(width - 4, y(v)); g.stroke();
-      g.fillStyle = "#b4c2ba";
+      g.fillStyle = ink("soft");
       g.fillText(String(Math.round(v)), left - 8, y(v));
     }
-    LINES.forEach((line, j) => {
-      g.strokeStyle = line.color;
+    LINES.forEach((dash, j) => {
+      g.strokeStyle = ink(`joint-${j}`);
       g.lineWidth = 1.6;
-      g.setLineDash(line.dash);
+      g.setLineDash(dash);
       g.beginPath();
       let down = false;
       for (const s of samples) {

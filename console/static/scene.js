@@ -5,6 +5,10 @@ import { createViewport } from "./viewport.js";
 
 const CRANE = 0xe0a22e, STEEL = 0x8b979f, DARK = 0x39443f, BARK = 0x8a5a35, WOOD = 0xe2b883, GHOST = 0xcfe3ff;
 const UP = new THREE.Vector3(0, 1, 0);
+/** For a crane of this reach; a longer one is looked at from farther away. */
+const VIEWED_M = 6.95;
+/** A machine that drives works on all sides: its views look at its bunk. */
+const VEHICLE = [1.5, 0, 0.6];
 const VIEWS = {
   corner: [[6.2, 8.6, 4.2], [0.75, 2.3, 0.1]],
   top: [[0.6, 2.3, 12], [0.6, 2.31, 0]],
@@ -142,7 +146,9 @@ export function createScene(container, machine) {
 
   function view(name) {
     const [position, target] = VIEWS[name];
-    look(v3(position), v3(target));
+    const off = v3(position).sub(v3(target)).multiplyScalar(Math.max(1, machine.reach_m / VIEWED_M));
+    const at = v3(machine.carrier ? VEHICLE : target);
+    look(off.add(at), at);
   }
 
   let logsShown = "";

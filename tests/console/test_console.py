@@ -13,15 +13,17 @@ import pytest
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from autonomy.logs import QUESTION, parse_logs
+from autonomy.logs import parse_logs, parse_question
 from can_dbc.setpoint import OperatorAction, OperatorCommand, StateReport, decode, encode
+from can_dbc.timing_page import TimingWriter
 from console.server import Console, create_app
-from console.state import ALIVE_NS, STALE_NAMES, Watch, describe_machine
-from controller import inputs as controller_inputs
-from machine.faults import ENCODER_BIT, Reason, pack
-from machine.joints import JOINTS
+from console.state import ALIVE_NS, STALE_NAMES, TIMING_OLD_NS, Watch, describe_machine
+from controller.inputs import BITS
+from controller.machine_inputs import STALE_BIT
+from machine.joints import ARTICULATION, JOINTS
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode
+from machine.reasons import ENCODER_BIT, Reason, pack
 
 PROFILE = load_profile("palms_471")
 HERE = "http://127.0.0.1:8471"
@@ -208,7 +210,7 @@ def test_logs_of_a_detector_are_shown(controller_socket):
     (known,) = parse_logs(answer)
     with client_of(console) as client:
         question, peer = controller_socket.recvfrom(100)
-        assert question == QUESTION
+        assert all(value != value for value in parse_question(question)), "it has no joints to tell"
         controller_socket.sendto(b'{"nonsense": 1}', peer)
         controller_socket.sendto(answer, peer)
         with client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
@@ -265,6 +267,39 @@ def test_peaks_hold_for_a_second():
     assert watch.state(1_010_000_000)["tick_ms"] == 0.1
 
 
+def test_timing_is_shown_while_the_controller_writes_it(timing):
+    watch = Watch(PROFILE)
+    assert watch.state(0)["timing"] is None
+    page = timing(100, missed=3, written_ns=10**10)
+    watch.on_timing(page)
+    seen = watch.state(10**10)["timing"]
+    wake, cpu = page.durations["wake"], page.durations["cpu"]
+    assert (seen["ticks"], seen["missed"]) == (100, 3)
+    assert (seen["wake_us"], seen["cpu_us"]) == (wake.quantile_ns(0.99) / 1e3, cpu.quantile_ns(0.99) / 1e3)
+    assert seen["sample_to_command_ms"] == page.durations["sample_to_command"].quantile_ns(0.99) / 1e6
+    assert (seen["oldest_input"], seen["oldest_input_ms"]) == ("Input6", 16.0)
+    json.dumps(seen, allow_nan=False)
+    assert watch.state(10**10 + TIMING_OLD_NS - 1)["timing"] and not watch.state(10**10 + TIMING_OLD_NS)["timing"]
+
+
+def test_the_page_file_is_read_and_its_end_is_noticed(timing, tmp_path, monkeypatch):
+    monkeypatch.setattr("console.server.LOOK_AT_TIMING_S", 0.01)
+    monkeypatch.setattr("console.state.TIMING_OLD_NS", 200_000_000)
+    path = tmp_path / "controller.timing"
+    console = Console(PROFILE, 1, timing_page=path)
+    with client_of(console) as client, client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
+        assert ws.receive_json()["timing"] is None
+        writer, written = TimingWriter(path), timing(100)
+        writer.publish(written.facts, written.durations)
+        while not (seen := ws.receive_json()["timing"]):
+            written = timing(100)
+            writer.publish(written.facts, written.durations)
+        assert seen["ticks"] == 100
+        writer.close()
+        while ws.receive_json()["timing"]:
+            pass
+
+
 def test_foreign_datagrams_change_nothing():
     watch = Watch(PROFILE)
     good = encode(REPORT)
@@ -283,7 +318,7 @@ def test_drawing_hangs_the_grapple_below_the_pin():
 
 
 def test_stale_names_are_the_controllers_bits():
-    bits = set(controller_inputs._BITS.values()) | {ENCODER_BIT + j for j in JOINTS}
+    bits = set(BITS.values()) | {STALE_BIT} | {ENCODER_BIT + j for j in (*JOINTS, ARTICULATION)}
     assert set(STALE_NAMES) == bits
 
 

@@ -36,7 +36,8 @@ def frames(k: int) -> list[Frame]:
 
 def tick(k: int) -> bytes:
     now_ns = START_NS + k * T_NS
-    return tick_record.encode(now_ns, 0, 0, 0, (0, 0, 0, 0), frames(k), [], [(0x210, bytes(8))], None)
+    quiet, out = tick_record.BusReading(), [(0x210, bytes(8))]
+    return tick_record.encode(tick_record.TickRecord(now_ns, 0, 0, 0, quiet, quiet, frames(k), (), (), out, (), b""))
 
 
 def report(k: int) -> bytes:

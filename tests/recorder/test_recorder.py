@@ -10,10 +10,11 @@ import struct
 import can
 import pytest
 from mcap.reader import make_reader
-from recordings import CRANE, PROFILE, START_NS, T_NS, feed, frames, manifest, record, tick
+from recordings import CRANE, PROFILE, START_NS, T_NS, feed, frames, manifest, record, report, tick
 
 from can_dbc.frame import Frame
 from can_dbc.logread import read as read_log
+from can_dbc.setpoint import VehicleReport, encode
 from recorder import files
 from recorder import manifest as manifests
 from recorder import recorder as recorder_module
@@ -93,6 +94,19 @@ def test_channels_say_how_they_are_encoded(run):
     assert {f"/crane0/{name}" for name in CRANE.messages} <= set(channels)
 
 
+def test_every_state_of_the_timing_page_is_a_message(timing, tmp_path):
+    recorder = Recorder(tmp_path, PROFILE, manifest())
+    for k in range(3):
+        recorder.on_timing(timing(100 + k, written_ns=START_NS + k * 10**9))
+    recorder.close()
+    told = by_topic(tmp_path / "run.mcap")["/timing"]
+    assert [publish_ns for _, publish_ns, _ in told] == [START_NS + k * 10**9 for k in range(3)]
+    first = json.loads(told[0][2])
+    assert first["ticks"] == 100 and first["buses"][0]["name"] == "crane0"
+    assert first["durations"]["wake"]["count"] == 100 and first["durations"]["wake"]["max_us"] == 10.099
+    assert first["inputs"]["Input6"]["longest_ns"] == 16_000_000
+
+
 def test_sender_stands_behind_the_raw_frame(tmp_path):
     recorder = Recorder(tmp_path, PROFILE, manifest())
     recorder.on_frame("crane0", Frame(START_NS, 0x80, b"\x01"), "plant")
@@ -163,8 +177,14 @@ def test_damaged_datagrams_are_counted(tmp_path):
     recorder = Recorder(tmp_path, PROFILE, manifest())
     recorder.on_tick(tick(0)[:-1])
     recorder.on_report(b"nonsense")
+    recorder.on_report(report(0))
+    nan = float("nan")
+    of_a_vehicle = VehicleReport(
+        1, 2, 3, 4, 1, 0, 0, 0, nan, nan, nan, 0, 0, nan, 0, nan, nan, 0, nan, nan, nan, nan, (nan,) * 4, 0
+    )  # fmt: skip
+    recorder.on_report(encode(of_a_vehicle))  # this machine stands still
     recorder.close()
-    assert recorder.refused == 2
+    assert recorder.refused == 3
 
 
 def test_directory_with_a_recording_is_refused_and_kept(run):

@@ -21,6 +21,7 @@ from recordings import PROFILE, T_NS, feed, manifest, record, tick
 
 from can_dbc import tick_record
 from can_dbc.bus import open_bus
+from can_dbc.timing_page import TimingWriter
 from recorder import manifest as manifests
 from recorder.__main__ import FLUSH_S, Shell, udp_socket, write_all
 from recorder.mcap_scan import NotMcap, Stored, is_complete, scan
@@ -140,7 +141,8 @@ class Process:
         start = time.monotonic_ns()
         while time.monotonic_ns() - start < seconds * 1e9:
             now = time.monotonic_ns()
-            data = tick_record.encode(now, 0, 0, 0, (0, 0, 0, 0), [], [], [], None)
+            quiet = tick_record.BusReading()
+            data = tick_record.encode(tick_record.TickRecord(now, 0, 0, 0, quiet, quiet, (), (), (), (), (), b""))
             self.sender.sendto(data, ("127.0.0.1", self.port))
             self.sent.append(data)
             time.sleep(T_NS / 1e9)
@@ -201,6 +203,39 @@ def test_shell_records_what_is_on_a_bus(tmp_path):
     got = list(can.CanutilsLogReader(tmp_path / "crane0.log"))
     assert [(m.arbitration_id, m.data[0]) for m in got] == [(0x80, k) for k in range(50)]
     assert manifests.read(tmp_path).complete
+
+
+def test_frames_that_the_kernel_had_to_drop_are_told(tmp_path, capfd):
+    with open_bus("virtual:shell-loses") as bus:
+        shell = Shell({"crane0": bus}, udp_socket(0), udp_socket(0))
+        take = shell._takers[0]
+        take()
+        assert not capfd.readouterr().err
+        bus.stats.dropped += 7
+        take()
+        take()
+        assert capfd.readouterr().err.count("7 frames of crane0 came too fast") == 1
+        shell.items.put(None)
+        write_all(Recorder(tmp_path, PROFILE, manifest()), shell)
+    assert manifests.read(tmp_path).dropped == 7, "a recording with gaps says so"
+
+
+def test_shell_takes_each_state_of_the_timing_page_once(timing, tmp_path, monkeypatch):
+    monkeypatch.setattr("recorder.__main__.TIMING_S", 0.0)
+    page = tmp_path / "controller.timing"
+    shell = Shell({}, udp_socket(0), udp_socket(0), page)
+    *_, take = shell._takers
+    take()
+    assert shell.items.empty(), "no controller yet"
+    writer = TimingWriter(page)
+    for k in (1, 1, 2):
+        written = timing(100, written_ns=k)
+        writer.publish(written.facts, written.durations)
+        take()
+    writer.close()
+    take()
+    taken = [shell.items.get_nowait() for _ in range(shell.items.qsize())]
+    assert [(kind, told.facts.written_ns) for kind, _, told in taken] == [("timing", 1), ("timing", 2)]
 
 
 def test_what_does_not_fit_into_the_queue_is_counted(tmp_path, capfd):

@@ -1,0 +1,186 @@
+"""What the page shows of a mission and of the vehicle that does it; pure, as `console.state` is.
+
+Everything for the map is in metres east and north of one origin (`console.ground`), angles in radians counter-clockwise
+from east.  A mission report is taken when it is for this machine and newer than the last; then it stays, and its age is
+told with it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any, Final
+
+from can_dbc.mission_datagrams import LatLon, Lying, MissionReport, decode_mission
+from can_dbc.setpoint import DatagramRefused, Driving, VehicleReport
+from can_dbc.vehicle_datagrams import VEHICLE_INPUTS
+from console.ground import Ground, Metres
+from machine.profile import Profile
+
+TOLD_NS: Final = 2_000_000_000
+"""A planner that has said nothing for this long is shown as lost; it tells twice a second."""
+VEHICLE_NS: Final = 500_000_000
+"""So, too, a vehicle of which nothing came; it reports 20 times a second."""
+AHEAD_NS: Final = 1_000_000_000
+TRAIL_M: Final = 0.25
+TRAIL_POINTS: Final = 8_000
+"""Two kilometres."""
+FIXES: Final = {
+    0: "no position",
+    1: "rough",
+    2: "corrected",
+    3: "precise",
+    4: "RTK fixed",
+    5: "RTK float",
+    6: "reckoned",
+}
+"""Method of PGN 129029."""
+DRIVING: Final = {Driving.STANDING: "stands", Driving.DRIVING: "led by the planner", Driving.BRAKING: "brakes"}
+INPUT_NAMES: Final = dict(
+    zip(
+        VEHICLE_INPUTS,
+        ("vehicle state", "front arms", "rear arms", "position", "heading", "turn rate", "position quality",
+         "articulation"),
+        strict=True,
+    )
+)  # fmt: skip
+
+
+def describe_carrier(profile: Profile) -> dict[str, Any] | None:
+    """What the map needs to draw the machine, [m, rad]; None for one that stands still."""
+    c = profile.carrier
+    if c is None:
+        return None
+    names = (
+        "front_axle_m", "rear_axle_m", "track_width_m", "wheel_radius_m", "wheel_width_m", "crane_base_m",
+        "crane_yaw_rad", "arm_travel_m", "arm_transport_m", "tilt_limit_rad",
+    )  # fmt: skip
+    return {name: getattr(c, name) for name in names}
+
+
+class MissionWatch:
+    """Takes mission and vehicle reports; gives what the page shows of them."""
+
+    def __init__(self, profile: Profile, profile_hash: int, key: bytes | None = None) -> None:
+        self.told = 0
+        """Mission reports taken: the page is sent the mission when this has grown."""
+        self.trail: deque[Metres] = deque(maxlen=TRAIL_POINTS)
+        """Where the articulation axis was."""
+        self._carrier = profile.carrier
+        self._hash, self._key = profile_hash, key
+        self._ground = Ground()
+        self._mission: MissionReport | None = None
+        self._stamp_ns = self._told_ns = self._heard_ns = self._placed_ns = 0
+        self._vehicle: VehicleReport | None = None
+        self._place: dict[str, float] | None = None
+
+    def on_mission(self, datagram: bytes, now_ns: int) -> bool:
+        """Take a datagram; False when it is no report of this machine's mission, or an old one."""
+        try:
+            profile_hash, stamp_ns, report = decode_mission(datagram, self._key)
+        except DatagramRefused:
+            return False
+        if profile_hash != self._hash or not self._stamp_ns < stamp_ns <= now_ns + AHEAD_NS:
+            return False
+        self._mission, self._stamp_ns, self._told_ns = report, stamp_ns, now_ns
+        self.told += 1
+        return True
+
+    def on_vehicle(self, report: VehicleReport, now_ns: int) -> None:
+        """Take the newest report of the vehicle."""
+        self._vehicle, self._heard_ns = report, now_ns
+        place = self._placed(report)
+        if place is None:
+            return
+        self._place, self._placed_ns = place, now_ns
+        here = (place["x_m"], place["y_m"])
+        if not self.trail or math.dist(here, self.trail[-1]) >= TRAIL_M:
+            self.trail.append(here)
+
+    def alive(self, now_ns: int) -> bool:
+        """Whether the planner has spoken lately."""
+        return self._mission is not None and now_ns - self._told_ns < TOLD_NS
+
+    def state(self, now_ns: int) -> dict[str, Any]:
+        """For every state of the page: the vehicle, how old the mission is, and when to ask for the latter."""
+        told_s = None if self._mission is None else round((now_ns - self._told_ns) * 1e-9, 1)
+        return {"mission_age_s": told_s, "mission_alive": self.alive(now_ns), "vehicle": self._shown(now_ns)}
+
+    def mission(self) -> dict[str, Any] | None:
+        """The mission as it was told last; None before the first report."""
+        m = self._mission
+        if m is None:
+            return None
+        same = (
+            "name", "state", "words", "ended", "auto", "single_step", "paused", "waits_for", "failure", "refusal",
+            "loaded", "on_board", "on_board_m3", "unloaded", "missed", "driven_m", "targets", "crane", "closed",
+        )  # fmt: skip
+        return {name: getattr(m, name) for name in same} | {
+            "given_up": [{"log": g.log, "reason": g.reason} for g in m.given_up],
+            "sigma_m": None if m.here is None else m.here.sigma_m,
+            "route": [self._metres(p) for p in m.route],
+            "fences": [
+                {"corners": [self._metres(p) for p in f.corners], "keep_out": f.keep_out, "name": f.name}
+                for f in m.fences
+            ],
+            "landings": [{"at": self._metres(x.place), "name": x.name} for x in m.landings],
+            "logs": [self._log(log) for log in m.logs],
+        }
+
+    def _log(self, log: Lying) -> dict[str, Any]:
+        return {
+            "number": log.number,
+            "at": self._metres(log.place),
+            "yaw_rad": round(math.radians(90.0 - log.bearing_deg), 4),
+            "length_m": log.length_m,
+            "diameter_m": log.diameter_m,
+            "age_s": log.age_s,
+            "misses": log.misses,
+            "given_up": log.given_up,
+        }
+
+    def _metres(self, place: LatLon) -> Metres:
+        return self._ground.metres(*place)
+
+    def _placed(self, r: VehicleReport) -> dict[str, float] | None:
+        """The articulation axis and the directions of both halves; None when not all of it is known."""
+        known = (r.latitude_deg, r.longitude_deg, r.heading_rad, r.articulation_rad)
+        if self._carrier is None or not all(map(math.isfinite, known)):
+            return None
+        east, north = self._ground.metres(r.latitude_deg, r.longitude_deg)
+        yaw = 0.5 * math.pi - r.heading_rad
+        ahead, left, _ = self._carrier.antenna_main_m
+        c, s = math.cos(yaw), math.sin(yaw)
+        return {
+            "x_m": round(east - c * ahead + s * left, 3),
+            "y_m": round(north - s * ahead - c * left, 3),
+            "front_rad": round(math.remainder(yaw, math.tau), 4),
+            "rear_rad": round(math.remainder(yaw - r.articulation_rad, math.tau), 4),
+        }
+
+    def _shown(self, now_ns: int) -> dict[str, Any] | None:
+        r = self._vehicle
+        if r is None:
+            return None
+        return {
+            "age_s": round((now_ns - self._heard_ns) * 1e-9, 1),
+            "alive": now_ns - self._heard_ns < VEHICLE_NS,
+            "place": self._place,
+            "place_alive": self._place is not None and now_ns - self._placed_ns < VEHICLE_NS,
+            "driving": DRIVING.get(Driving(r.driving), "?") if r.driving in set(Driving) else "?",
+            "speed_m_s": _number(r.speed_m_s),
+            "heading_deg": _number(math.degrees(r.heading_rad)),
+            "articulation_deg": _number(math.degrees(r.articulation_rad)),
+            "roll_deg": _number(math.degrees(r.roll_rad)),
+            "pitch_deg": _number(math.degrees(r.pitch_rad)),
+            "heights_m": [_number(h) for h in r.heights_m],
+            "fix": FIXES.get(r.fix, f"method {r.fix}"),
+            "satellites": r.satellites,
+            "sigma_m": _number(r.sigma_m),
+            "stale": [INPUT_NAMES[name] for bit, name in enumerate(VEHICLE_INPUTS) if r.stale_mask >> bit & 1],
+            "refused": r.refused,
+        }
+
+
+def _number(value: float) -> float | None:
+    return round(value, 3) if math.isfinite(value) else None

@@ -1,0 +1,118 @@
+// The mission and the vehicle in words and numbers, and the orders that a person gives.  Shown once a mission was told.
+
+import { createMap } from "./map.js";
+
+const $ = (id) => document.getElementById(id);
+const ORDERS = { auto: "auto", pause: "pause", "next-step": "next-step" };
+const ARMS = ["front left", "front right", "rear left", "rear right"];
+
+/** `order(name)` sends one; returns `{show(state)}`. */
+export function createMission(machine, order, { number, text }) {
+  let map = null, mission = null;
+
+  for (const [id, name] of Object.entries(ORDERS)) $(id).addEventListener("click", () => order(name));
+  $("single").addEventListener("click", () => order(mission?.single_step ? "run-through" : "single-step"));
+  $("abort").addEventListener("click", () => { $("end").show(); $("end-no").focus(); });
+  $("end-no").addEventListener("click", () => $("end").close());
+  $("end-yes").addEventListener("click", () => { $("end").close(); order("abort"); });
+
+  function begin() {
+    document.body.dataset.mission = "there";
+    for (const id of ["mission", "vehicle", "site"]) $(id).hidden = false;
+    const buttons = [...document.querySelectorAll("[data-map]")];
+    const press = (name) => buttons.forEach((b) => b.setAttribute("aria-pressed", b.dataset.map === name));
+    map = createMap($("map"), machine, () => press(""));
+    for (const b of buttons) b.addEventListener("click", () => { press(b.dataset.map); map.view(b.dataset.map); });
+    recall();
+  }
+
+  /** The way driven before this page was opened, or while it had no contact. */
+  async function recall() {
+    const answer = await fetch("api/trail");
+    if (answer.ok) map?.trail(await answer.json());
+  }
+
+  function show(state) {
+    if (state.mission) {
+      mission = state.mission;
+      if (!map) begin();
+      showMission(mission);
+    }
+    if (!mission) return;
+    const m = mission, told = state.mission_alive, open = told && !m.ended && state.may_order;
+    $("mission").classList.toggle("old", !told);
+    text("mission-age", told ? m.name : `told ${age(state.mission_age_s)} ago`);
+    text("mission-note", note(m, told));
+    $("auto").disabled = !open || m.auto;
+    $("pause").disabled = !open || !m.auto;
+    $("single").disabled = $("abort").disabled = !open;
+    $("next-step").disabled = !open || !m.waits_for || !m.auto;
+    $("single").setAttribute("aria-pressed", m.single_step);
+    if (!open && $("end").open) $("end").close();
+    map.mission(mission, told);
+    map.crane(state.points ?? null);
+    map.vehicle(state.vehicle);
+    showVehicle(state.vehicle);
+    $("site").classList.toggle("old", !told && !state.vehicle?.place_alive);
+  }
+
+  function showMission(m) {
+    const doing = m.crane && !m.ended ? `${m.words}: ${m.crane}` : m.words;
+    text("mission-words", `The machine ${doing}.`);
+    text("on-board", `${m.on_board} · ${number(m.on_board_m3, 2)} m³`);
+    text("loaded", String(m.loaded));
+    text("unloaded", String(m.unloaded));
+    text("driven", `${number(m.driven_m, 0)} m`);
+    text("known", String(m.logs.filter((log) => !log.given_up).length));
+    text("target", m.targets.length ? `log ${m.targets.join(", ")}` : "–");
+    text("missed-grasps", String(m.missed));
+    const left = m.given_up.map((g) => `Log ${g.log} is left: ${g.reason}.`);
+    if ($("given-up").dataset.shown !== left.join()) {
+      $("given-up").dataset.shown = left.join();
+      $("given-up").replaceChildren(...left.map((words) => Object.assign(document.createElement("li"), { textContent: words })));
+    }
+  }
+
+  function note(m, told) {
+    if (!told) return m.ended ? "The mission has ended." : "The planner is silent: what you see here is old.";
+    if (m.ended) return m.failure ? `It ended early: ${m.failure}.` : "";
+    if (m.refusal) return `Not obeyed: ${m.refusal}.`;
+    if (!m.auto) return "Paused. Press Auto to go on.";
+    if (m.paused) return `It waits: ${m.paused}.`;
+    if (m.waits_for) return `It waits for you, because ${m.waits_for}. Press Next step.`;
+    return "";
+  }
+
+  function showVehicle(v) {
+    $("vehicle").classList.toggle("old", !v?.alive);
+    text("vehicle-age", !v ? "not reported yet" : v.alive ? v.driving : `told ${age(v.age_s)} ago`);
+    if (!v) return;
+    text("speed", v.speed_m_s === null ? "–" : `${number(v.speed_m_s * 3.6, 1)} km/h`);
+    text("heading", v.heading_deg === null ? "–" : `${number((v.heading_deg + 360) % 360, 0)}°`);
+    text("bend", sided(v.articulation_deg, "left", "right"));
+    text("roll", sided(v.roll_deg, "right", "left"));
+    text("pitch", sided(v.pitch_deg, "up", "down"));
+    text("fix", v.sigma_m === null ? v.fix : `${v.fix}, ±${number(v.sigma_m * 100, 0)} cm`);
+    const limit = (machine.carrier.tilt_limit_rad * 180) / Math.PI;
+    for (const [id, value] of [["roll", v.roll_deg], ["pitch", v.pitch_deg]]) {
+      $(id).classList.toggle("warn", value !== null && Math.abs(value) > 0.8 * limit);
+    }
+    v.heights_m.forEach((h, i) => {
+      $(`arm-${i}`).title = ARMS[i];
+      text(`arm-${i}`, h === null ? "–" : `${number(h * 100, 0)} cm`);
+    });
+    text("vehicle-note", v.stale.length ? `Nothing fresh of: ${v.stale.join(", ")}.` : "");
+  }
+
+  function sided(degrees, plus, minus) {
+    if (degrees === null) return "–";
+    const shown = number(Math.abs(degrees), 1);
+    return shown === "0.0" ? "0.0°" : `${shown}° ${degrees > 0 ? plus : minus}`;
+  }
+
+  function age(seconds) {
+    return seconds < 100 ? `${number(seconds, 0)} s` : `${number(seconds / 60, 0)} min`;
+  }
+
+  return { show, recall: () => { if (map) recall(); } };
+}

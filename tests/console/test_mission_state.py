@@ -1,0 +1,199 @@
+"""What the page is told of mission and vehicle, and who may order the mission about."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+from dataclasses import replace
+
+import pymap3d
+import pytest
+from starlette.testclient import TestClient
+
+from can_dbc.mission_datagrams import MissionOrder, Order, decode_order, encode_mission
+from can_dbc.setpoint import Driving, VehicleReport, encode
+from can_dbc.vehicle_datagrams import VEHICLE_INPUTS
+from console.ground import Ground
+from console.mission_state import INPUT_NAMES, TOLD_NS, TRAIL_M, VEHICLE_NS
+from console.server import Console, create_app
+from console.state import Watch, describe_machine
+from machine.load import load_profile, profile_hash
+from tests.can_dbc.mission_told import HERE, TOLD
+
+PROFILE = load_profile("aoro_fc8")
+HASH = profile_hash(PROFILE)
+BASE = "http://127.0.0.1:8471"
+VEHICLE = VehicleReport(
+    1, HASH, 10**9, 3, Driving.DRIVING, 0, 0, 10**9, *HERE, 102.0, 4, 18, 0.014, 10**9, math.pi / 2, 0.0, 10**9,
+    0.64, 0.2, 0.02, -0.03, (0.35, 0.34, 0.33, 0.32), 0,
+)  # fmt: skip
+
+
+def watch(profile=PROFILE, key=None) -> Watch:
+    return Watch(profile, key, profile_hash(profile))
+
+
+def told(watch: Watch, report=TOLD, stamp_ns: int = 10**9, code: int = HASH, key=None, now_ns: int = 10**9) -> bool:
+    return watch.on_report(encode_mission(report, 1, code, stamp_ns, key), now_ns)
+
+
+# ---- the mission ------------------------------------------------------------------------------------------------
+
+
+def test_a_mission_is_shown_in_words_and_metres() -> None:
+    seen = watch()
+    assert seen.forwarding.mission() is None and seen.state(0)["mission_age_s"] is None
+    assert told(seen)
+    mission = seen.forwarding.mission()
+    json.dumps(mission, allow_nan=False)
+    assert (mission["words"], mission["on_board"], mission["targets"]) == ("drives up to the log", 3, (7,))
+    assert mission["given_up"] == [{"log": 9, "reason": "log 9 was missed 3 times"}]
+    assert mission["route"][0] == (0.0, 0.0) and mission["route"][1] == pytest.approx((39.7, 0.0), abs=0.1)
+    log = mission["logs"][1]
+    assert (log["number"], log["given_up"]) == (9, True) and log["yaw_rad"] == pytest.approx(math.pi / 4, abs=1e-3)
+
+
+def test_a_silent_planner_is_noticed_and_its_age_is_told() -> None:
+    seen = watch()
+    told(seen, now_ns=10**9)
+    assert seen.state(10**9 + TOLD_NS - 1)["mission_alive"]
+    late = seen.state(10**9 + 4 * TOLD_NS)
+    assert not late["mission_alive"] and late["mission_age_s"] == 8.0
+
+
+def test_only_newer_reports_of_this_machine_with_its_key_are_taken() -> None:
+    seen = watch(key=b"right")
+    assert not told(seen) and not told(seen, key=b"wrong") and not told(seen, key=b"right", code=HASH ^ 1)
+    assert not told(seen, key=b"right", stamp_ns=5 * 10**9), "from the future"
+    assert seen.forwarding.told == 0
+    assert told(seen, key=b"right")
+    assert not told(seen, key=b"right"), "once more"
+    assert told(seen, key=b"right", stamp_ns=10**9 + 1) and seen.forwarding.told == 2
+
+
+# ---- the vehicle ------------------------------------------------------------------------------------------------
+
+
+def test_the_vehicle_is_shown_in_degrees_and_where_its_joint_is() -> None:
+    seen = watch()
+    assert seen.state(0)["vehicle"] is None
+    assert seen.on_report(encode(VEHICLE), 10**9)
+    shown = seen.state(10**9)["vehicle"]
+    json.dumps(shown, allow_nan=False)
+    assert (shown["driving"], shown["fix"], shown["satellites"]) == ("led by the planner", "RTK fixed", 18)
+    assert (shown["heading_deg"], shown["articulation_deg"]) == (pytest.approx(90.0), pytest.approx(11.459, abs=1e-3))
+    place, carrier = shown["place"], PROFILE.carrier
+    # It heads east: the antenna stands so far east of the joint.
+    assert place["x_m"] == pytest.approx(-carrier.antenna_main_m[0]) and place["y_m"] == pytest.approx(0.0, abs=1e-3)
+    assert place["front_rad"] == pytest.approx(0.0, abs=1e-3) and place["rear_rad"] == pytest.approx(-0.2, abs=1e-3)
+    assert not seen.state(10**9 + VEHICLE_NS)["vehicle"]["alive"]
+
+
+def test_it_turns_with_its_heading() -> None:
+    seen = watch()
+    seen.on_report(encode(replace(VEHICLE, heading_rad=math.radians(30.0))), 1)
+    place, ahead = seen.state(1)["vehicle"]["place"], PROFILE.carrier.antenna_main_m[0]
+    assert place["x_m"] == pytest.approx(-ahead * 0.5, abs=2e-3)
+    assert place["y_m"] == pytest.approx(-ahead * math.sqrt(0.75), abs=2e-3)
+
+
+def test_an_unknown_place_keeps_the_last_one_and_says_so() -> None:
+    seen = watch()
+    seen.on_report(encode(VEHICLE), 0)
+    lost = replace(VEHICLE, latitude_deg=math.nan, roll_rad=math.nan, fix=0, stale_mask=1 << 3 | 1 << 7)
+    seen.on_report(encode(lost), VEHICLE_NS)
+    shown = seen.state(VEHICLE_NS)["vehicle"]
+    assert shown["alive"] and not shown["place_alive"] and shown["place"] is not None
+    assert shown["roll_deg"] is None and shown["fix"] == "no position"
+    assert shown["stale"] == ["position", "articulation"]
+    assert set(INPUT_NAMES) == set(VEHICLE_INPUTS)
+
+
+def test_the_trail_grows_with_the_way() -> None:
+    seen = watch()
+    for k in range(100):
+        seen.on_report(encode(replace(VEHICLE, longitude_deg=HERE[1] + 1e-6 * k)), k)
+    trail, step_m = seen.forwarding.trail, 0.0495
+    assert len(trail) == pytest.approx(99 * step_m / (TRAIL_M + step_m / 2), abs=2)
+    assert trail[-1][0] - trail[0][0] == pytest.approx(99 * step_m, abs=0.3)
+
+
+def test_the_ground_is_that_of_the_ellipsoid() -> None:
+    ground = Ground()
+    ground.metres(*HERE)
+    for lat, lon in ((63.6600, 19.8955), (63.6578, 19.9050), (63.6550, 19.8900)):
+        east, north, _ = pymap3d.geodetic2enu(lat, lon, 0.0, *HERE, 0.0)
+        assert ground.metres(lat, lon) == pytest.approx((east, north), abs=0.05)
+    assert Ground().metres(*HERE) == (0.0, 0.0)
+
+
+def test_a_machine_that_stands_still_has_no_carrier_to_draw() -> None:
+    assert describe_machine(load_profile("palms_471"))["carrier"] is None
+    carrier = describe_machine(PROFILE)["carrier"]
+    assert describe_machine(PROFILE)["reach_m"] == pytest.approx(9.0, abs=0.1) and carrier["track_width_m"] == 2.1
+
+
+# ---- the server -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def planner():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("127.0.0.1", 0))
+        s.settimeout(5)
+        yield s
+
+
+def client_of(console: Console, peer: str = "127.0.0.1") -> TestClient:
+    return TestClient(create_app(console), base_url=BASE, client=(peer, 40000))
+
+
+def console_of(planner=None, key=None) -> Console:
+    return Console(PROFILE, HASH, key=key, planner=planner and planner.getsockname(), clock=lambda: 10**10)
+
+
+@pytest.mark.parametrize("order", list(Order))
+def test_an_order_sends_its_datagram(planner, order) -> None:
+    client = client_of(console_of(planner, b"key"))
+    for _ in range(2):
+        name = order.name.lower().replace("_", "-")
+        assert client.post(f"/api/mission/{name}", headers={"origin": BASE}).status_code == 204
+    first, second = (decode_order(planner.recv(100), b"key") for _ in range(2))
+    assert first == MissionOrder(first.sequence, HASH, 10**10, order) and second.sequence > first.sequence
+
+
+def test_orders_pass_the_same_guards_as_commands(planner) -> None:
+    console = console_of(planner)
+    assert client_of(console, "192.0.2.7").post("/api/mission/pause").status_code == 403
+    here = client_of(console)
+    assert here.post("/api/mission/pause", headers={"origin": "http://evil.example"}).status_code == 403
+    assert here.post("/api/mission/pause", headers={"host": "evil.example"}).status_code == 403
+    assert here.get("/api/mission/pause").status_code == 405 and here.post("/api/mission/dance").status_code == 404
+    planner.settimeout(0.05)
+    with pytest.raises(TimeoutError):
+        planner.recv(100)
+    assert here.get("/api/state").json()["may_order"] is True
+    assert client_of(console, "192.0.2.7").get("/api/state").json()["may_order"] is False
+
+
+def test_an_order_that_nobody_takes_is_not_called_done(planner) -> None:
+    assert client_of(console_of()).post("/api/mission/pause").status_code == 409
+    console = console_of(planner)
+    planner.close()
+    answer = client_of(console).post("/api/mission/pause")
+    assert answer.status_code == 502 and "planner" in answer.text
+
+
+def test_the_mission_comes_by_the_websocket_when_it_is_new() -> None:
+    console = console_of()
+    with client_of(console) as client, client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
+        assert "mission" not in ws.receive_json()
+        console.watch.on_report(encode(VEHICLE), 10**10)
+        told(console.watch, stamp_ns=10**10, now_ns=10**10)
+        while "mission" not in (state := ws.receive_json()):
+            pass
+        assert state["mission"]["words"] == TOLD.words and state["vehicle"]["place"]
+        assert "mission" not in ws.receive_json()
+        assert client.get("/api/state").json()["mission"]["targets"] == [7]
+        assert len(client.get("/api/trail").json()) == 1
