@@ -1,0 +1,100 @@
+"""Dead time and lag of one valve's spool, from the commands on the bus and the spools that the valve node reports.
+
+    spool'' = w^2 (command(t - dead time) - spool) - 2 z w spool'          (machines.md 3)
+
+``delay_s`` is the pure dead time from the command's frame to the spool's first motion; ``lag_s`` = 2 z / w is how far
+a moving spool stays behind after it.  Joints show neither cleanly: pump and oil stand between.  How long the joint
+itself takes, command to encoder, is `response_s`, for the report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from autonomy.calibration.trace import FINE, GRID_S, Record
+
+LONGEST_S: Final = 0.3
+QUANTUM: Final = 0.0005
+"""Spools are reported in 0.05 %."""
+_STARTS_S: Final = (0.04, 0.08, 0.12, 0.16)
+MOVED_SHARE: Final = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class DelayFit:
+    """Dead time and lag [s], their values from either side alone (plus, minus), and the residual [share of full]."""
+
+    delay_s: float
+    lag_s: float
+    sides_s: tuple[float, float]
+    residual: float
+
+
+def fit_delay(tests: Sequence[Record]) -> DelayFit | None:
+    """From the staircases of both sides; None where the valve node reports no spools."""
+    usable = [t for t in tests if t.spool is not None and float(np.ptp(t.spool)) > 0.02]
+    if not usable:
+        return None
+    both = _fit(usable)
+    sides = [_fit(chosen)[0] for side in (1, -1) if (chosen := [t for t in usable if t.side == side])]
+    return DelayFit(both[0], both[1], (sides[0], sides[-1]), both[2])
+
+
+def _fit(tests: Sequence[Record]) -> tuple[float, float, float]:
+    """Dead time, lag, residual."""
+    step_s = GRID_S / FINE
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        out = []
+        for t in tests:
+            assert t.spool is not None
+            command = t.fine_command
+            time = np.arange(len(command)) * step_s
+            delayed = np.interp(time - p[0], time, command, left=command[0])
+            out.append((t.spool - lfilter(*_spool(p[1], p[2], step_s), delayed)[FINE - 1 :: FINE]) / QUANTUM)
+        return np.concatenate(out)
+
+    best = min(
+        (
+            least_squares(
+                residuals, (start, 40.0, 0.8), bounds=((0.0, 10.0, 0.3), (LONGEST_S, 150.0, 1.5)),
+                x_scale=(0.01, 10.0, 0.2), loss="soft_l1", diff_step=1e-3, max_nfev=40,
+            )
+            for start in _STARTS_S
+        ),
+        key=lambda found: float(found.cost),
+    )  # fmt: skip
+    delay, omega, zeta = best.x
+    misfit = residuals(best.x) * QUANTUM
+    return float(delay), float(2.0 * zeta / omega), float(np.sqrt(np.mean(misfit**2)))
+
+
+def _spool(omega: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """The spool as a digital filter."""
+    k = 2.0 / step_s
+    first = k * k + 2.0 * zeta * omega * k + omega * omega
+    b = np.array([1.0, 2.0, 1.0]) * omega * omega / first
+    a = np.array([1.0, (2.0 * omega**2 - 2.0 * k * k) / first, (k * k - 2.0 * zeta * omega * k + omega**2) / first])
+    return b, a
+
+
+def response_s(test: Record, deadband: float) -> float:
+    """From the command that leaves the dead-band to the joint's first motion in a staircase [s]; NaN if it never moves.
+
+    Motion is seen when the joint has gone `MOVED_SHARE` of what it goes in the first 0.3 s of steady motion.
+    """
+    opened = np.flatnonzero(test.side * test.command > deadband)
+    if not len(opened):
+        return float("nan")
+    way = test.side * (test.position - float(np.mean(test.position[: max(1, opened[0])])))
+    settled = min(len(way) - 1, opened[0] + round(0.6 / GRID_S))
+    before = max(opened[0], settled - round(0.3 / GRID_S))
+    threshold = MOVED_SHARE * (way[settled] - way[before])
+    moved = np.flatnonzero(way[opened[0] :] > threshold)
+    return float(moved[0] * GRID_S) if len(moved) else float("nan")

@@ -1,0 +1,138 @@
+"""The calibration on a machine that runs: sockets and bus around the pure procedure.
+
+It listens on the crane's bus and never sends there; what moves the machine are setpoint datagrams to the controller,
+which judges them like any planner's.  One thread, no waiting but for the next turn.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
+
+import msgspec
+
+from autonomy.calibration.procedure import Calibration
+from can_dbc.bus import Bus
+from can_dbc.frame import Frame
+from can_dbc.setpoint import DatagramRefused, StateReport, decode
+from machine.kinematics import Point
+
+TURN_S: Final = 0.005
+QUESTION: Final = b'{"op":"survey"}'
+Address = tuple[str, int]
+
+
+class Surveyed(msgspec.Struct):
+    """A surveying instrument's answer: the hanger pin in the crane's base frame [m]."""
+
+    pin_m: tuple[float, float, float]
+
+
+class Instrument:
+    """Asks a surveying instrument over UDP: one question under way at a time."""
+
+    def __init__(self, address: Address) -> None:
+        self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._link.setblocking(False)
+        self._address = address
+        self._asked_ns = 0
+
+    def read(self, now_ns: int) -> Point | None:
+        """The newest answer, or None; asks ten times a second."""
+        found = None
+        while True:
+            try:
+                data = self._link.recv(4096)
+            except (BlockingIOError, ConnectionRefusedError):
+                break
+            with suppress(msgspec.DecodeError):
+                found = msgspec.json.decode(data, type=Surveyed).pin_m
+        if now_ns - self._asked_ns >= 100_000_000:
+            self._asked_ns = now_ns
+            with suppress(OSError):
+                self._link.sendto(QUESTION, self._address)
+        return found
+
+    def close(self) -> None:
+        """Gives the port back."""
+        self._link.close()
+
+
+class Link:
+    """Reports in, datagrams out; ``foreign`` when the controller means another profile."""
+
+    def __init__(self, controller: Address, report_port: int, profile_hash: int, key: bytes | None) -> None:
+        self.foreign = False
+        self._controller, self._hash, self._key = controller, profile_hash, key
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", report_port))
+        self._socket.setblocking(False)
+
+    def wait(self, seconds: float) -> None:
+        """Until something came, or for a moment."""
+        select.select([self._socket], [], [], seconds)
+
+    def newest(self) -> StateReport | None:
+        """The newest report that has come since the last call."""
+        newest = None
+        while True:
+            try:
+                data = self._socket.recv(65535)
+            except BlockingIOError:
+                return newest
+            except ConnectionRefusedError:
+                continue
+            with suppress(DatagramRefused):
+                message = decode(data, self._key)
+                if isinstance(message, StateReport):
+                    self.foreign = self.foreign or message.profile_hash != self._hash
+                    newest = message
+
+    def send(self, data: bytes) -> None:
+        """To the controller; one that nobody hears is followed by the next."""
+        with suppress(ConnectionRefusedError, BlockingIOError):
+            self._socket.sendto(data, self._controller)
+
+    def close(self) -> None:
+        """Gives the port back."""
+        self._socket.close()
+
+
+def first_report(link: Link, within_s: float, ready: tuple[int, ...]) -> StateReport | None:
+    """The first report of a controller that could be armed; None when none comes in time."""
+    end_ns = time.monotonic_ns() + int(within_s * 1e9)
+    while time.monotonic_ns() < end_ns and not link.foreign:
+        link.wait(TURN_S)
+        report = link.newest()
+        if report is not None and report.mode in ready:
+            return report
+    return None
+
+
+def run(
+    calibration: Calibration,
+    link: Link,
+    bus: Bus,
+    survey: Callable[[int], Point | None],
+    turn: Callable[[Calibration], None],
+) -> None:
+    """Turns until the procedure is over; ``turn`` is called each time and may abort it."""
+    frames: list[Frame] = []
+    while not (calibration.idle or calibration.done):
+        link.wait(TURN_S)
+        # A person may take minutes to read an instrument: the time of the turn is the time after it.
+        reading = survey(time.monotonic_ns()) if calibration.wants_reading else None
+        now_ns = time.monotonic_ns()
+        frames.clear()
+        bus.drain(frames)
+        data = calibration.step(now_ns, link.newest(), frames, reading)
+        if data is not None:
+            link.send(data)
+        turn(calibration)
+        if link.foreign:
+            calibration.abort("the controller runs another profile")
+            return

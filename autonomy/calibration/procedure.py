@@ -1,0 +1,349 @@
+"""The calibration run as a pure step machine: reports and bus frames in, setpoints out, a list of tests at the end.
+
+``Calibration.step(now_ns, report, frames, survey)`` returns the datagram to send now, or None.  It waits until a human
+has armed, wiggles every joint a little to see that it moves the right way, then takes joint after joint to its pose by
+an ordinary trajectory and runs its slow sweep and its staircase on either side by spool tests, closes and opens the
+grapple, and stands at the survey's poses.  One function moves at a time.
+
+It never insists: a stop, a refusal, a joint that moves the wrong way or not at all, or too little room ends the run
+with a sentence in ``failure``; ``abort`` closes the valve and ends it.  Nothing goes on after that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+from typing import Final
+
+from autonomy.calibration.plan import BEGIN_SHARE, Plan
+from autonomy.calibration.spool_attempt import LEAD_S, TAIL_S, SpoolAttempt, programmed
+from autonomy.calibration.survey import Reading
+from autonomy.calibration.tasks import Findings, Grip, Look, Spool, Task, Travel, tasks_of
+from autonomy.calibration.trace import BusTrace
+from autonomy.motion.arm import Arm
+from autonomy.motion.trajectory import Trajectory, across, hold
+from autonomy.stream import SetpointStream
+from can_dbc.codec import Database
+from can_dbc.frame import Frame
+from can_dbc.setpoint import GrappleCommand, StateReport
+from machine.faults import describe
+from machine.joints import JOINTS, Joint
+from machine.kinematics import Point
+from machine.modes import Mode
+from machine.profile import JointSpec, Profile, joint
+
+SETTLE_S: Final = 0.4
+SURVEY_SETTLE_S: Final = 1.5
+READINGS: Final = 8
+READING_NS: Final = 100_000_000
+SILENT_NS: Final = 300_000_000
+GRAPPLE_S: Final = 12.0
+GRIP_LEAST_S, BLIND_S = 0.5, 1.0
+ARRIVED: Final = (0.02, 0.02, 0.03, 0.03, 0.08)
+_LATE: Final = 2.0
+_BRAKE_S: Final = 0.8
+_OPEN, _CLOSED, _HOLDING = 1, 4, 5  # GrappleStat.State
+_LONGEST_TURN_S: Final = 0.1
+
+
+class Calibration:
+    """One run.  ``task`` is what it does now (None before and after), ``failure`` why it ended early, ``done`` that it
+    is complete; ``wants_reading`` asks the surveyor for the pin's position now.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        profile_hash: int,
+        plan: Plan,
+        database: Database,
+        lease_ns: int = 200_000_000,
+        key: bytes | None = None,
+        asked_readings: int = READINGS,
+    ) -> None:
+        self.trace = BusTrace(profile, database)
+        self.found = Findings()
+        self.failure: str | None = None
+        self.waiting: str | None = "the controller has not reported"
+        self.idle = False
+        self.wants_reading = False
+        self.begun_ns: int | None = None
+        self.elapsed_s = 0.0
+        self._profile, self._plan = profile, plan
+        self._plans = {p.joint: p for p in plan.joints}
+        self._tasks = tasks_of(plan)
+        self._at = 0
+        self._arm = Arm(profile)
+        self._stream = SetpointStream(profile_hash, lease_ns, key)
+        self._readings = asked_readings
+        self._report: StateReport | None = None
+        self._report_ns = 0
+        self._refused: int | None = None
+        self._task_ns = 0
+        self._last_ns: int | None = None
+        self._entered = False
+        self._motion: Trajectory = hold((0.0,) * len(JOINTS))
+        self._clock_s = 0.0
+        self._rate = 1.0
+        self._spool: SpoolAttempt | None = None
+        self._points: list[Point] = []
+        self._point_ns = 0
+        self._poses: list[tuple[float, ...]] = []
+        self._at_end = False
+
+    @property
+    def done(self) -> bool:
+        """Whether every task is done."""
+        return self._at >= len(self._tasks) and self.failure is None
+
+    @property
+    def task(self) -> Task | None:
+        """What is being done."""
+        return self._tasks[self._at] if self.begun_ns is not None and self._at < len(self._tasks) else None
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Tasks done, and all."""
+        return self._at, len(self._tasks)
+
+    def remaining_s(self) -> float:
+        """How long the rest should take."""
+        return sum(self._expected_s(task) for task in self._tasks[self._at :])
+
+    def abort(self, reason: str) -> None:
+        """Ends the run: a spool test closes its valve, a motion brakes on its path."""
+        if self.failure is None and not self.done:
+            self.failure = reason
+
+    def step(
+        self,
+        now_ns: int,
+        report: StateReport | None,
+        frames: Sequence[Frame] = (),
+        survey: Point | None = None,
+    ) -> bytes | None:
+        """One turn (20 Hz or faster): the datagram to send now, or None."""
+        self.trace.take(frames)
+        dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _LONGEST_TURN_S)
+        self._last_ns = now_ns
+        if report is not None:
+            self._report, self._report_ns = report, now_ns
+        if self.idle:
+            return None
+        obstacle = self._obstacle(now_ns)
+        if obstacle is not None:
+            self._stand_back(obstacle)
+            return None
+        self.waiting = None
+        if self.begun_ns is None:
+            self.begun_ns = now_ns
+        self.elapsed_s = (now_ns - self.begun_ns) * 1e-9
+        self._watch_refusals()
+        if self.failure is not None:
+            return self._brake(now_ns, dt_s)
+        if self.done:
+            self.idle = True
+            return None
+        if not self._entered:
+            self._enter(now_ns)
+        return self._proceed(now_ns, dt_s, survey)
+
+    def _obstacle(self, now_ns: int) -> str | None:
+        report = self._report
+        if report is None:
+            return "the controller has not reported"
+        if now_ns - self._report_ns > SILENT_NS:
+            return "the controller is silent"
+        if report.mode not in (Mode.ARMED, Mode.ACTIVE):
+            name = next((mode.name for mode in Mode if mode == report.mode), str(report.mode))
+            stopped = report.mode in (Mode.STOP, Mode.FAULT)
+            return f"the controller is in {name}: {describe(report.reason)}" if stopped else f"it is in {name}"
+        sensed = (p for j, p in zip(JOINTS, report.position, strict=True) if joint(self._profile, j).encoder)
+        return None if all(map(isfinite, sensed)) else "a joint position is unknown"
+
+    def _stand_back(self, obstacle: str) -> None:
+        """Before the start it waits; a run that was interrupted is over, for nobody knows what moved meanwhile."""
+        self.waiting = obstacle
+        if self.begun_ns is not None:
+            self.failure = self.failure or obstacle
+            self.idle = True
+
+    def _watch_refusals(self) -> None:
+        assert self._report is not None
+        before, self._refused = self._refused, self._report.refused
+        if before is not None and self._report.refused != before:
+            self.abort(describe(self._report.refusal))
+
+    def _position(self) -> tuple[float, ...]:
+        """The measured joints; one without an encoder stands where it was."""
+        assert self._report is not None
+        return tuple(p if isfinite(p) else 0.0 for p in self._report.position)
+
+    def _spec(self, which: Joint) -> JointSpec:
+        return joint(self._profile, which)
+
+    def _expected_s(self, task: Task) -> float:
+        match task:
+            case Spool():
+                whole = LEAD_S + programmed(self._spec(task.joint), task).duration_s + TAIL_S
+                return 0.75 * whole if task.kind != "staircase" else whole
+            case Travel():
+                return 4.0
+            case Grip():
+                return 1.2 * self._profile.grapple.close_time_s
+        return SURVEY_SETTLE_S + self._readings * READING_NS * 1e-9
+
+    def _enter(self, now_ns: int) -> None:
+        """Begins the task."""
+        self._entered, self._task_ns = True, now_ns
+        self._clock_s, self._rate = 0.0, 1.0
+        task = self._tasks[self._at]
+        assert self._report is not None
+        follows = self._report.mode == Mode.ACTIVE and all(map(isfinite, self._report.reference[:4]))
+        start = tuple(r if isfinite(r) else 0.0 for r in self._report.reference) if follows else self._position()
+        match task:
+            case Travel():
+                self._motion = across(self._arm, start, task.pose)
+            case Spool():
+                self._spool = SpoolAttempt(self._spec(task.joint), task, self._position()[task.joint])
+                self._check_room(task, self._spool.end)
+            case _:
+                self._motion = hold(start)
+                self._points, self._poses, self._point_ns = [], [], 0
+
+    def _check_room(self, task: Spool, end: float) -> None:
+        """A test that might come to the end of the joint's range begins from farther away, or is not tried."""
+        spec, plan = self._spec(task.joint), self._plans[task.joint]
+        if task.kind == "wiggle" or spec.lower < end < spec.upper:
+            return
+        aside = BEGIN_SHARE * (plan.high - plan.low)
+        start = list(self._position())
+        stands = start[task.joint]
+        start[task.joint] = plan.low + aside if task.side > 0 else plan.high - aside
+        name = task.joint.name.lower()
+        if abs(start[task.joint] - stands) < 3.0 * ARRIVED[task.joint]:
+            self.abort(f"the {name} has no room for its {task.kind}: it would end at {end:.2f}, past its stop")
+            return
+        self._tasks.insert(self._at, Travel(tuple(start), f"back for more room of the {name}"))
+        self._enter(self._task_ns)
+
+    def _next(self) -> None:
+        self._at += 1
+        self._entered = False
+        self.wants_reading = False
+
+    def _proceed(self, now_ns: int, dt_s: float, survey: Point | None) -> bytes | None:
+        task = self._tasks[self._at]
+        time_s = (now_ns - self._task_ns) * 1e-9
+        match task:
+            case Spool():
+                return self._run_spool(task, time_s, now_ns)
+            case Travel():
+                self._clock_s += dt_s
+                if self._clock_s >= self._motion.duration_s + SETTLE_S and self._arrived():
+                    self._next()
+                elif self._clock_s > _LATE * self._motion.duration_s + 6.0:
+                    self.abort(f"the crane did not come {task.why}")
+                return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
+            case Grip():
+                self._run_grip(task, time_s)
+                return self._motion_datagram(now_ns, task.command)
+            case Look():
+                self._run_look(task, time_s, now_ns, survey)
+                return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
+        return None
+
+    def _arrived(self) -> bool:
+        return all(
+            abs(p - g) <= near
+            for j, p, g, near in zip(JOINTS, self._position(), self._motion.goal, ARRIVED, strict=True)
+            if self._spec(j).encoder is not None
+        )
+
+    def _motion_datagram(self, now_ns: int, grapple: GrappleCommand) -> bytes | None:
+        if not self._stream.due(now_ns):
+            return None
+        return self._stream.datagram(now_ns, self._motion, self._clock_s, grapple, self._rate)
+
+    def _run_spool(self, task: Spool, time_s: float, now_ns: int) -> bytes | None:
+        assert self._spool is not None and self._report is not None
+        run, position = self._spool, self._position()[task.joint]
+        run_s = time_s - LEAD_S
+        if run_s >= 0.0 and not run.begun:
+            # However late this turn is, the program begins at its beginning.
+            run.begun, self._task_ns, run_s = True, now_ns - round(LEAD_S * 1e9), 0.0
+        if wrong := run.follow(run_s, position, self._report.velocity[task.joint]):
+            self.abort(wrong)
+            return None
+        if run_s >= run.program.duration_s + TAIL_S:
+            self._finish_spool(task, run.judged(position), now_ns)
+            return None
+        # A program that has just been changed is told at once, and its end always, however late this turn is.
+        if run.silent(run_s) or not (self._stream.due(now_ns) or run.changed):
+            return None
+        return self._stream.spool(now_ns, task.joint, run.window(run_s))
+
+    def _finish_spool(self, task: Spool, wrong: str | None, now_ns: int) -> None:
+        if wrong:
+            self.abort(wrong)
+            return
+        test = self.trace.test(task.joint, task.side, task.kind, self._task_ns, now_ns)
+        (self.found.wiggles if task.kind == "wiggle" else self.found.tests).append(test)
+        self._next()
+
+    def _run_grip(self, task: Grip, time_s: float) -> None:
+        """Until the valve node says that the grapple is at its end; only a time from end to end counts.
+
+        A grapple without an opening sensor is opened for the profile's time and may fall short of its end: then its
+        opening time stays unknown, and so does the next closing time.
+        """
+        state = self.trace.grapple_state.values[-1] if self.trace.grapple_state.values else 0.0
+        opens, grapple = task.command is GrappleCommand.OPEN, self._profile.grapple
+        if time_s > GRIP_LEAST_S and state in ((_OPEN,) if opens else (_CLOSED, _HOLDING)):
+            if self._at_end:
+                self.found.grapple_s[task.command] = time_s
+            self._at_end = True
+            self._next()
+        elif opens and not grapple.opening_sensor and time_s > grapple.open_time_s + BLIND_S:
+            self._at_end = False
+            self._next()
+        elif time_s > GRAPPLE_S:
+            self.abort(f"the grapple did not {task.command.name.lower()} within {GRAPPLE_S:.0f} s")
+
+    def _run_look(self, task: Look, time_s: float, now_ns: int, survey: Point | None) -> None:
+        self.wants_reading = time_s >= SURVEY_SETTLE_S and now_ns >= self._point_ns
+        if survey is None or time_s < SURVEY_SETTLE_S:
+            return
+        self._points.append(survey)
+        self._poses.append(self._position())
+        self._point_ns = now_ns + READING_NS
+        if len(self._points) >= self._readings:
+            count = len(self._points)
+            x, y, z = (sum(p[i] for p in self._points) / count for i in range(3))
+            position = tuple(sum(q[j] for q in self._poses) / count for j in JOINTS)
+            since_ns = self._task_ns + round(SURVEY_SETTLE_S * 1e9)
+            moment_nm = self.trace.lift_moment_nm(position[Joint.LIFT], since_ns, now_ns)
+            self.found.readings.append(Reading(position, (x, y, z), moment_nm))
+            self._next()
+
+    def _brake(self, now_ns: int, dt_s: float) -> bytes | None:
+        """The end of a run that failed: valve closed, or the motion slowed to a stand on its path."""
+        task = self._tasks[self._at] if self._at < len(self._tasks) else None
+        if isinstance(task, Spool) and self._entered:
+            run_s = (now_ns - self._task_ns) * 1e-9 - LEAD_S
+            assert self._spool is not None
+            if self._rate != 0.0:
+                self._rate = 0.0
+                self._spool.close(run_s)
+            if run_s > self._spool.program.duration_s:
+                self.idle = True
+                return None
+            return self._stream.spool(now_ns, task.joint, self._spool.window(run_s))
+        if task is None or not self._entered or self._rate == 0.0:
+            self.idle = True
+            return None
+        self._clock_s += self._rate * dt_s
+        self._rate = max(0.0, self._rate - dt_s / _BRAKE_S)
+        if self._rate == 0.0:
+            self._motion = hold(self._motion.at(self._clock_s)[0])
+        return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)

@@ -1,0 +1,135 @@
+"""The profile with what was found in it: a copy of the file, its comments kept, every changed value marked [cal].
+
+The shipped file is never touched and an existing one never overwritten.  The copy is loaded and checked before it
+gets its name, so a profile that this release would refuse is never left behind.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Final
+
+import tomlkit
+from tomlkit.items import Item
+
+from autonomy.calibration.result import JointResult, Result
+from autonomy.calibration.survey import OFFSETS, SurveyFit
+from can_dbc.setpoint import GrappleCommand
+from machine.joints import Joint
+from machine.lift import lever_share
+from machine.load import ProfileError, load_profile
+from machine.profile import JointSpec, Profile, joint
+
+SPEED_SHARE: Final = 0.9
+"""A joint that cannot reach its speed limit gets one at this share of what it can."""
+SAG_DIGITS: Final = 5
+"""Significant digits of a sag value."""
+COMMENT_AT: Final = 40
+"""Column of the comments, as in the shipped profiles."""
+Change = tuple[tuple[str, ...], Any, str]
+
+
+class NotWritten(ValueError):
+    """No profile was written; the text says why and what to do."""
+
+
+def changes(profile: Profile, result: Result) -> list[Change]:
+    """What a calibration changes in its profile: key path, value, remark."""
+    found: list[Change] = []
+    for j, r in result.joints.items():
+        found += _joint_changes(("joints", j.name.lower()), joint(profile, j), r)
+    if result.survey is not None:
+        found += _survey_changes(profile, result.survey)
+    for command, key in ((GrappleCommand.CLOSE, "close_time_s"), (GrappleCommand.OPEN, "open_time_s")):
+        if command in result.grapple_s:
+            found.append((("grapple", key), round(result.grapple_s[command], 2), "empty"))
+    return found
+
+
+def _survey_changes(profile: Profile, survey: SurveyFit) -> list[Change]:
+    """Zeros and sag, all of them or none: they were fitted together, and one explains what another leaves."""
+    found: list[Change] = []
+    for j, offset in zip(OFFSETS, survey.offsets, strict=True):
+        encoder = joint(profile, j).encoder
+        if encoder is not None:
+            zero = encoder.zero_counts + round(encoder.direction * offset / encoder.unit_per_count)
+            zero = zero % encoder.total_counts if encoder.kind == "rotary" else zero
+            remark = f"by survey, {offset:+.4f} {'m' if j is Joint.EXT else 'rad'}"
+            found.append((("joints", j.name.lower(), "encoder", "zero_counts"), zero, remark))
+    remarks = {
+        "head_rad_m": "lean of the column per metre of the stick pin's reach",
+        "pin_rad_m": "and per metre of the hanger pin's reach",
+        "rest_rad": "less this",
+        "load_rad_nm": "lean per Nm of a load",
+        "head_nm_m": "moment of the empty crane at the lift joint, by its pressures",
+        "pin_nm_m": "and per metre of the hanger pin's reach",
+    }
+    for name, remark in remarks.items():
+        value = float(f"{getattr(survey.sag, name):.{SAG_DIGITS}g}")
+        found.append((("sag", name), value, remark))
+    return found
+
+
+def _joint_changes(path: tuple[str, ...], spec: JointSpec, r: JointResult) -> list[Change]:
+    valve, unit = r.valve, "m" if r.joint is Joint.EXT else "rad"
+    # A profile's full speeds hold where the lever has its nominal arm; they were measured somewhere else.
+    arm = lever_share(spec.valve, valve.at)
+    fulls = [arm * full for full in valve.full_speeds]
+    where = f"measured at {r.joint.name.lower()} {valve.at:+.2f} {unit}"
+    found: list[Change] = []
+    for i, side in enumerate(("plus", "minus")):
+        deadband = round(100.0 * valve.deadbands[i], 2)
+        found.append(((*path, "valve", f"deadband_{side}_pct"), deadband, "middle of the hysteresis"))
+    for i, side in enumerate(("plus", "minus")):
+        found.append(((*path, "valve", f"full_speed_{side}"), round(fulls[i], 4), f"{unit}/s {where}"))
+    hysteresis, exponent = round(100.0 * valve.hysteresis, 2), round(valve.exponent, 3)
+    found.append(((*path, "valve", "hysteresis_pct"), hysteresis, "play of the spool, whole width"))
+    found.append(((*path, "valve", "exponent"), exponent, "metering curve from dead-band to full speed"))
+    slowest = min(fulls)
+    if slowest < spec.speed_limit:
+        limit = round(SPEED_SHARE * slowest, 4)
+        found.insert(0, ((*path, "speed_limit"), limit, f"{unit}/s, the valve gives no more than {slowest:.3f}"))
+    if r.delay is not None:
+        found.append(((*path, "valve", "delay_s"), round(r.delay.delay_s, 4), "dead time, command to spool"))
+        found.append(((*path, "valve", "lag_s"), round(r.delay.lag_s, 4), "of the spool"))
+    return found
+
+
+def write_profile(source: Path, out: Path, changed: list[Change], date: str) -> None:
+    """Writes the calibrated copy of ``source``.
+
+    Raises:
+        NotWritten: ``out`` is there already, cannot be written, or would be no valid profile.
+    """
+    document = tomlkit.parse(source.read_text(encoding="utf-8"))
+    for path, value, remark in changed:
+        table: Any = document
+        for key in path[:-1]:
+            if key not in table:
+                table.append(key, tomlkit.table())
+            table = table[key]
+        _put(table, path[-1], value, f"# [cal] {date} {remark}")
+    text = f"# Calibrated on {date}; [cal] marks what was measured on this machine.\n" + tomlkit.dumps(document)
+    scratch = out.with_name(f".{out.stem}.part.toml")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        scratch.write_text(text, encoding="utf-8")
+        load_profile(scratch)
+        os.link(scratch, out)  # never over an existing file, whole or not at all
+    except ProfileError as error:
+        raise NotWritten(f"the calibrated profile would be refused: {error}") from None
+    except FileExistsError:
+        raise NotWritten(f"{out} exists and is not overwritten; choose another --out") from None
+    except OSError as error:
+        raise NotWritten(f"{out}: the profile cannot be written: {error.strerror}; choose another --out") from None
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def _put(table: Any, key: str, value: Any, comment: str) -> None:
+    item: Item = tomlkit.item(value)
+    room = COMMENT_AT - len(f"{key} = {item.as_string()}") - 1
+    table[key] = item
+    table[key].trivia.comment_ws = " " * max(1, room)
+    table[key].trivia.comment = comment

@@ -1,0 +1,153 @@
+"""The report of a calibration: result.json and a page of pictures per joint, for the person who decides.
+
+Everything comes from the `Result`; the same result gives the same files.
+"""
+
+from __future__ import annotations
+
+import json
+from math import isfinite
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from autonomy.calibration.profile_file import Change
+from autonomy.calibration.result import JointResult, Result
+from autonomy.calibration.survey import OFFSETS
+from machine.joints import Joint
+
+ROUND: Final = 6
+SMALL, ROUND_SMALL = 1e-3, 12
+
+
+def document(result: Result, facts: dict[str, Any], changed: list[Change]) -> dict[str, Any]:
+    """Everything that was found, as plain data."""
+    joints = {j.name.lower(): _joint(r) for j, r in result.joints.items()}
+    survey = None
+    if (s := result.survey) is not None:
+        survey = {
+            "offsets": {j.name.lower(): o for j, o in zip(OFFSETS, s.offsets, strict=True)},
+            "offset_errors": {j.name.lower(): e for j, e in zip(OFFSETS, s.errors, strict=True)},
+            "sag": {name: getattr(s.sag, name) for name in s.sag.__struct_fields__},
+            "moments_left_nm": list(s.moments_nm),
+            "before_mm": [1e3 * d for d in s.before_m], "after_mm": [1e3 * d for d in s.after_m],
+        }  # fmt: skip
+    return _rounded(
+        {
+            **facts,
+            "plausible": not result.implausible,
+            "implausible": list(result.implausible),
+            "joints": joints,
+            "grapple_s": {c.name.lower(): t for c, t in result.grapple_s.items()},
+            "survey": survey,
+            "changes": {".".join(path): value for path, value, _ in changed},
+        }
+    )
+
+
+def _joint(r: JointResult) -> dict[str, Any]:
+    v, d = r.valve, r.delay
+    return {
+        "deadband_pct": [100.0 * x for x in v.deadbands],
+        "hysteresis_pct": 100.0 * v.hysteresis,
+        "full_speed": list(v.full_speeds),
+        "at": v.at,
+        "exponent": v.exponent,
+        "lever_1_rad": v.lever,
+        "ringing_rad_s": v.ringing[0],
+        "delay_s": None if d is None else d.delay_s,
+        "spool_lag_s": None if d is None else d.lag_s,
+        "response_s": list(r.responses_s),
+        "repeat_pct": [100.0 * x for x in r.repeats],
+        "fastest": r.fastest,
+        "residual": v.residual,
+        "errors": v.errors,
+    }
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers to six decimals, small ones to twelve, so that a last bit does not show; what is no number is null."""
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(v) for v in value]
+    if isinstance(value, float):
+        if not isfinite(value):
+            return None
+        return round(value, ROUND if abs(value) >= SMALL else ROUND_SMALL)
+    return value
+
+
+def write_report(folder: Path, result: Result, facts: dict[str, Any], changed: list[Change]) -> None:
+    """``result.json``, ``JOINT.png`` for every joint and ``survey.png``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "result.json").write_text(json.dumps(document(result, facts, changed), indent=2) + "\n")
+    for j, r in result.joints.items():
+        _draw_joint(folder / f"{j.name.lower()}.png", r)
+    if result.survey is not None:
+        _draw_survey(folder / "survey.png", result)
+
+
+def _figure(columns: int) -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot.subplots(1, columns, figsize=(4.2 * columns, 3.4), layout="constrained")
+
+
+def _save(figure: Any, path: Path) -> None:
+    from matplotlib import pyplot
+
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+    pyplot.close(figure)
+
+
+def _draw_joint(path: Path, r: JointResult) -> None:
+    """Speed over spool with the fitted curve; sweep (dead-band and hysteresis); staircase; spool after its command."""
+    unit = "m" if r.joint is Joint.EXT else "rad"
+    figure, (curve, sweep, stairs, delay) = _figure(4)
+    for test, modelled in zip(r.tests, r.valve.modelled, strict=True):
+        step = test.time_s[1] - test.time_s[0]
+        spool = 100.0 * (test.command if test.spool is None else test.spool)
+        wide = 16
+        speed = (test.position[wide:] - test.position[:-wide]) / (wide * step)
+        if test.kind == "sweep":
+            sweep.plot(test.time_s, test.side * (test.position - test.position[0]), lw=1.2)
+            sweep.plot(test.time_s, test.side * (modelled - modelled[0]), "k--", lw=0.8)
+            curve.plot(spool[wide // 2 : -wide // 2], speed, lw=0.6, alpha=0.6)
+        else:
+            stairs.plot(test.time_s, test.position, lw=1.2)
+            stairs.plot(test.time_s, modelled, "k--", lw=0.8)
+            curve.plot(spool[wide // 2 : -wide // 2], speed, ".", ms=1.0, alpha=0.4)
+            delay.plot(test.time_s, 100.0 * test.side * test.command, "k", lw=0.6)
+            delay.plot(test.time_s, test.side * spool, lw=1.0)
+    v = r.valve
+    for side, i in ((1, 0), (-1, 1)):
+        x = np.linspace(0.0, 1.0, 201)
+        opening = np.clip((x - v.deadbands[i]) / (1.0 - v.deadbands[i]), 0.0, 1.0)
+        curve.plot(100.0 * side * x, side * v.full_speeds[i] * opening**v.exponent, "k", lw=0.9)
+    name = r.joint.name.lower()
+    curve.set(title=f"{name}: speed over spool", xlabel="spool [%]", ylabel=f"{unit}/s")
+    sweep.set(title="sweeps: out of the dead-band, back", xlabel="s", ylabel=f"way [{unit}], dashed: fit")
+    stairs.set(title="staircases, dashed: fit", xlabel="s", ylabel=unit)
+    late = "" if r.delay is None else f": {1e3 * r.delay.delay_s:.0f} ms dead, {1e3 * r.delay.lag_s:.0f} ms lag"
+    delay.set(title=f"spool{late}", xlabel="s", ylabel="%")
+    for axis in (curve, sweep, stairs, delay):
+        axis.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def _draw_survey(path: Path, result: Result) -> None:
+    """What encoders and survey disagree about at every pose, before and after."""
+    s = result.survey
+    assert s is not None
+    figure, axis = _figure(1)
+    at = np.arange(len(s.before_m))
+    axis.bar(at - 0.2, [1e3 * d for d in s.before_m], 0.4, label="as shipped")
+    axis.bar(at + 0.2, [1e3 * d for d in s.after_m], 0.4, label="with zeros and sag")
+    axis.set(title="surveyed pin against computed pin", xlabel="pose", ylabel="mm")
+    axis.legend(frameon=False)
+    _save(figure, path)

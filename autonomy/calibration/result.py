@@ -1,0 +1,185 @@
+"""What a calibration found, judged: values per joint, and a sentence for everything that cannot be believed.
+
+``identify`` turns the tests of a run into `Result`; ``implausible`` holds one sentence per value that is outside what
+such machines have, that differs between repetitions, or that the data do not pin down.  A profile is written only when
+there is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from math import degrees, isfinite
+from typing import Final
+
+from autonomy.calibration.delay_fit import DelayFit, fit_delay, response_s
+from autonomy.calibration.survey import LEAST_POSES, OFFSETS, SurveyFit, fit_survey
+from autonomy.calibration.tasks import Findings
+from autonomy.calibration.trace import Record
+from autonomy.calibration.valve_fit import ValveFit, fit_valve, repeated
+from can_dbc.setpoint import GrappleCommand
+from machine.joints import JOINTS, Joint
+from machine.profile import JointSpec, Profile, joint
+
+DEADBANDS: Final = (0.01, 0.35)
+"""Shares of full command that a mobile valve's overlap may have."""
+HYSTERESIS_MOST: Final = 0.06
+FULL_SHARES: Final = (0.5, 2.0)
+"""Found full speed over the profile's: beyond it, profile, pump or unit is wrong, not the guess."""
+SIDES_MOST: Final = 2.5
+"""One side's full speed over the other's: more than any cylinder's ratio of areas with a load."""
+DEADBAND_ERROR: Final = 0.008
+GAIN_ERROR: Final = 0.04
+"""Greatest standard errors: twice them is what a calibration promises."""
+REPEAT_MOST: Final = 0.03
+"""Dead-band of the wiggle against that of the tests: a quick look, so a coarse bound."""
+RESIDUAL_S: Final = 0.03
+"""Root mean square misfit of the positions, as time at the joint's speed limit."""
+DELAYS_S: Final = (0.01, 0.25)
+LAGS_S: Final = (0.005, 0.2)
+SIDE_DELAY_S: Final = 0.01
+SPOOL_RESIDUAL: Final = 0.01
+OFFSET_MOST: Final = (0.1, 0.03, 0.03, 0.03)
+"""Zero errors [rad, m] beyond which an encoder was mounted wrongly, not inexactly."""
+SAG_MOST_RAD_M: Final = 0.02
+GIVE_MOST_RAD_NM: Final = 6e-6
+"""A column that gives more than this bends 0.1 rad under a small crane's own weight."""
+MOMENT_MOST_NM: Final = 2000.0
+"""Root mean square moment that the weighing may leave: over twice the friction of a lift cylinder."""
+AFTER_MOST_M: Final = 0.012
+"""Root mean square distance that surveyed pins may keep after the fit."""
+GRAPPLE_S: Final = (0.5, 10.0)
+
+
+@dataclass(frozen=True, slots=True)
+class JointResult:
+    """One joint: its valve, its delay (None without spool feedback), response times and repetition, plus and minus."""
+
+    joint: Joint
+    valve: ValveFit
+    delay: DelayFit | None
+    responses_s: tuple[float, float]
+    repeats: tuple[float, float]
+    fastest: float
+    """Greatest speed that was reached [rad/s, m/s]."""
+    tests: tuple[Record, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A whole calibration; ``survey`` is None when nobody surveyed."""
+
+    joints: dict[Joint, JointResult]
+    grapple_s: dict[GrappleCommand, float]
+    survey: SurveyFit | None
+    implausible: tuple[str, ...] = field(default=())
+
+
+def identify(profile: Profile, found: Findings) -> Result:
+    """Every fit of a complete run, judged."""
+    joints = {}
+    for j in JOINTS:
+        tests = [t for t in found.tests if t.joint is j]
+        if tests:
+            joints[j] = _joint_result(j, joint(profile, j), tests, [w for w in found.wiggles if w.joint is j])
+    survey = fit_survey(profile.kinematics, found.readings, profile.sag) if len(found.readings) >= LEAST_POSES else None
+    sentences = [s for r in joints.values() for s in _joint_sentences(r, joint(profile, r.joint))]
+    sentences += list(_grapple_sentences(found.grapple_s))
+    if survey is not None:
+        sentences += list(_survey_sentences(survey))
+    return Result(joints, dict(found.grapple_s), survey, tuple(sentences))
+
+
+def _joint_result(which: Joint, spec: JointSpec, tests: Sequence[Record], wiggles: Sequence[Record]) -> JointResult:
+    valve = fit_valve(tests, spec)
+    stairs = [t for t in tests if t.kind == "staircase"]
+
+    def side(sign: int) -> tuple[float, float]:
+        first = next((t for t in stairs if t.side == sign), None)
+        again = next((w for w in wiggles if w.side == sign), None)
+        deadband = valve.deadbands[0 if sign > 0 else 1]
+        response = response_s(first, deadband) if first else float("nan")
+        return response, repeated(valve, again) if again else float("nan")
+
+    (plus_s, plus), (minus_s, minus) = side(+1), side(-1)
+    steps = 20
+    fastest = max(
+        float(max(abs(t.position[steps:] - t.position[:-steps])) / (steps * (t.time_s[1] - t.time_s[0])))
+        for t in stairs
+    )
+    return JointResult(which, valve, fit_delay(stairs), (plus_s, minus_s), (plus, minus), fastest, tuple(tests))
+
+
+def _outside(name: str, what: str, value: float, bounds: tuple[float, float], scale: float, unit: str) -> Iterator[str]:
+    low, high = bounds
+    if not low <= value <= high:
+        yield (
+            f"{name}: {what} {scale * value:.3g} {unit} is outside {scale * low:.3g} to {scale * high:.3g} {unit} "
+            "of such machines"
+        )
+
+
+def _joint_sentences(r: JointResult, spec: JointSpec) -> Iterator[str]:
+    name, valve = r.joint.name.lower(), r.valve
+    for side, i in (("plus", 0), ("minus", 1)):
+        yield from _outside(f"{name} {side}", "dead-band", valve.deadbands[i], DEADBANDS, 100.0, "%")
+        nominal = spec.valve.full_speed_plus if i == 0 else spec.valve.full_speed_minus
+        share = valve.full_speeds[i] / nominal
+        yield from _outside(f"{name} {side}", "full speed over the profile's", share, FULL_SHARES, 1.0, "")
+        error = valve.errors[f"deadband_{side}"]
+        if not error <= DEADBAND_ERROR:
+            yield f"{name} {side}: the dead-band is known only within {100 * error:.1f} %; repeat at rest, without load"
+        error = valve.errors[f"full_{side}"] / valve.full_speeds[i]
+        if not error <= GAIN_ERROR:
+            yield f"{name} {side}: the full speed is known only within {100 * error:.0f} %; repeat with warm oil"
+        if not abs(r.repeats[i]) <= REPEAT_MOST:
+            yield (
+                f"{name} {side}: the dead-band of the wiggle differs by {100 * r.repeats[i]:.1f} % of the spool; "
+                "look for a sticking spool"
+            )
+    if not 0.0 <= valve.hysteresis <= HYSTERESIS_MOST:
+        yield f"{name}: a hysteresis of {100 * valve.hysteresis:.1f} % of the spool: look for dirt or missing dither"
+    if not 1.0 / SIDES_MOST <= valve.full_speeds[0] / valve.full_speeds[1] <= SIDES_MOST:
+        yield f"{name}: one side is over {SIDES_MOST} times faster than the other; look for a throttle or a load"
+    if valve.residual > RESIDUAL_S * spec.speed_limit:
+        yield f"{name}: the motion does not fit a valve (residual {valve.residual:.4f}); look for contact or play"
+    yield from _delay_sentences(name, r.delay)
+
+
+def _delay_sentences(name: str, delay: DelayFit | None) -> Iterator[str]:
+    if delay is None:
+        return
+    yield from _outside(name, "dead time", delay.delay_s, DELAYS_S, 1e3, "ms")
+    yield from _outside(name, "spool lag", delay.lag_s, LAGS_S, 1e3, "ms")
+    apart = abs(delay.sides_s[0] - delay.sides_s[1])
+    if not apart <= SIDE_DELAY_S:
+        yield f"{name}: the dead times of the two sides differ by {1e3 * apart:.0f} ms; look at the bus load and repeat"
+    if delay.residual > SPOOL_RESIDUAL:
+        yield f"{name}: the reported spool does not follow its command like a spool; look at the valve node"
+
+
+def _grapple_sentences(times_s: dict[GrappleCommand, float]) -> Iterator[str]:
+    for command, seconds in times_s.items():
+        yield from _outside("grapple", f"time to {command.name.lower()}", seconds, GRAPPLE_S, 1.0, "s")
+
+
+def _survey_sentences(fit: SurveyFit) -> Iterator[str]:
+    for j, offset, most in zip(OFFSETS, fit.offsets, OFFSET_MOST, strict=True):
+        if not abs(offset) <= most:
+            shown = f"{1e3 * offset:.0f} mm" if j is Joint.EXT else f"{degrees(offset):.1f} deg"
+            yield f"{j.name.lower()}: its zero is {shown} off; check the encoder's mounting and the survey's frame"
+    sag = fit.sag
+    if not max(abs(sag.head_rad_m), abs(sag.pin_rad_m)) <= SAG_MOST_RAD_M:
+        yield "the column leans more than any steel column does; check the survey's frame and its units"
+    if fit.moments_nm:
+        if not 0.0 <= sag.load_rad_nm <= GIVE_MOST_RAD_NM:
+            yield (
+                f"the column would give {1e6 * sag.load_rad_nm:.2f} rad/MNm under a load; check the lift's pressure "
+                "sensors, flow_plus and lever in the profile, and the survey's frame"
+            )
+        left = (sum(m * m for m in fit.moments_nm) / len(fit.moments_nm)) ** 0.5
+        if not (left <= MOMENT_MOST_NM and sag.head_nm_m > 0.0 and sag.pin_nm_m > 0.0):
+            yield f"the lift's pressures do not weigh a crane ({1e-3 * left:.1f} kNm are left); check PressA's sensors"
+    after = (sum(d * d for d in fit.after_m) / len(fit.after_m)) ** 0.5
+    if not (isfinite(after) and after <= AFTER_MOST_M):
+        yield f"the survey does not fit the crane: {1e3 * after:.0f} mm are left; check the surveyed points"

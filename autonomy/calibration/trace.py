@@ -1,0 +1,148 @@
+"""What the bus said while a function was tested: commands, spools, joint positions, lift pressures, with their times.
+
+Frames go in as they come (`BusTrace.take`, any number at a time), columns over a stretch of time come out.  Nothing
+here sends.  Positions are the encoder's counts through the profile, not the controller's estimate; commands and spools
+carry the profile's sign, so that + is positive joint motion everywhere.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import nan
+from typing import Final
+
+import numpy as np
+
+from can_dbc.codec import Database
+from can_dbc.frame import Frame
+from machine.encoder import position_from_counts
+from machine.joints import JOINTS, Joint
+from machine.lift import lift_moment_nm
+from machine.profile import Profile, joint
+
+GRID_S: Final = 0.005
+FINE: Final = 4
+_NS: Final = 1e-9
+
+
+class Column:
+    """Times [ns] and values of one signal."""
+
+    __slots__ = ("times_ns", "values")
+
+    def __init__(self) -> None:
+        self.times_ns, self.values = array("q"), array("d")
+
+    def add(self, stamp_ns: int, value: float) -> None:
+        """One more sample; an older one than the last is left out."""
+        if not self.times_ns or stamp_ns > self.times_ns[-1]:
+            self.times_ns.append(stamp_ns)
+            self.values.append(value)
+
+    def between(self, from_ns: int, to_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Times [s after ``from_ns``] and values of a stretch."""
+        times = np.frombuffer(self.times_ns, np.int64)
+        first, last = np.searchsorted(times, (from_ns, to_ns))
+        values = np.frombuffer(self.values, float)[first:last].copy()
+        return (times[first:last] - from_ns) * _NS, values
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One program as it was run: which joint and side, what for, and the bus's columns on a grid of `GRID_S`.
+
+    ``command`` and ``spool`` in shares of full (1 = 100 %), ``position`` in rad or m.  ``fine_command`` has `FINE`
+    values per grid step, for a dead time is looked for between them.  ``spool`` is None where the valve node reports
+    none.
+    """
+
+    joint: Joint
+    side: int
+    kind: str
+    time_s: np.ndarray
+    command: np.ndarray
+    fine_command: np.ndarray
+    spool: np.ndarray | None
+    position: np.ndarray
+
+
+class BusTrace:
+    """Everything about valves and joints since the start."""
+
+    def __init__(self, profile: Profile, database: Database) -> None:
+        self._profile = profile
+        self.commands = [Column() for _ in JOINTS]
+        self.spools = [Column() for _ in JOINTS]
+        self.positions = [Column() for _ in JOINTS]
+        self.grapple_state, self.opening, self.grapple_spool = Column(), Column(), Column()
+        self.lift_bar = (Column(), Column())
+        """Pressures of the lift cylinder: the side that pushes upward, the other."""
+        self._readers = {}
+        for message, columns in (("ValveCmdA", self.commands), ("ValveCmdB", self.commands)):
+            self._read_valves(database, message, "", columns)
+        for message in ("ValveFbA", "ValveFbB"):
+            self._read_valves(database, message, "Spool", self.spools)
+        grapple = database.message("ValveFbB")
+        self._readers[grapple.key][1].append((grapple.index["SpoolGrapple"], 0.01, self.grapple_spool))
+        status = database.message("GrappleStat")
+        signals = [(status.index["State"], 1.0, self.grapple_state), (status.index["Opening"], 1.0, self.opening)]
+        self._readers[status.key] = (status, signals)
+        press = database.message("PressA")
+        sides = zip(("LiftA", "LiftB"), self.lift_bar, strict=True)
+        self._readers[press.key] = (press, [(press.index[name], 1.0, column) for name, column in sides])
+        self._encoders = {}
+        for j in JOINTS:
+            encoder = joint(profile, j).encoder
+            if encoder is not None:
+                codec = database.message(encoder.message)
+                self._encoders[codec.key] = (codec, codec.index["Position"], encoder, self.positions[j])
+
+    def _read_valves(self, database: Database, message: str, prefix: str, columns: list[Column]) -> None:
+        codec = database.message(message)
+        wanted = []
+        for j in JOINTS:
+            valve = joint(self._profile, j).valve
+            if f"{prefix}{valve.signal}" in codec.index:
+                wanted.append((codec.index[f"{prefix}{valve.signal}"], 0.01 * valve.sign, columns[j]))
+        self._readers[codec.key] = (codec, wanted)
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """The frames it wants."""
+        return (*self._readers, *self._encoders)
+
+    def take(self, frames: Iterable[Frame]) -> None:
+        """Frames as they came; what cannot be read is left out."""
+        for stamp_ns, key, data in frames:
+            if (encoder := self._encoders.get(key)) is not None:
+                codec, at, spec, column = encoder
+                if len(data) == codec.length:
+                    column.add(stamp_ns, position_from_counts(spec, int(codec.decode(data)[at])))
+            elif (reader := self._readers.get(key)) is not None and len(data) == reader[0].length:
+                values = reader[0].decode(data)
+                for at, scale, column in reader[1]:
+                    if values[at] is not None:
+                        column.add(stamp_ns, scale * values[at])
+
+    def lift_moment_nm(self, position: float, from_ns: int, to_ns: int) -> float:
+        """Mean moment at a lift joint that stands at ``position`` [rad], by the pressures; NaN without any."""
+        a, b = (column.between(from_ns, to_ns)[1] for column in self.lift_bar)
+        if not (len(a) and len(b)):
+            return nan
+        return lift_moment_nm(self._profile, position, float(np.mean(a)), float(np.mean(b)))
+
+    def test(self, which: Joint, side: int, kind: str, from_ns: int, to_ns: int) -> Record:
+        """The columns of one joint between two times."""
+        grid = np.arange(0.0, (to_ns - from_ns) * _NS, GRID_S)
+        times, commands = self.commands[which].between(from_ns, to_ns)
+        # A command holds until the next one; a spool and a joint move between their samples.
+        fine = (np.arange(len(grid) * FINE) - FINE + 1) * (GRID_S / FINE)
+        index = np.clip(np.searchsorted(times, fine, side="right") - 1, 0, None)
+        held = commands[index] if len(commands) else np.zeros_like(fine)
+        times, spools = self.spools[which].between(from_ns, to_ns)
+        spool = np.interp(grid, times, spools) if len(spools) > 1 else None
+        times, positions = self.positions[which].between(from_ns, to_ns)
+        position = np.interp(grid, times, positions) if len(positions) else np.full_like(grid, np.nan)
+        return Record(which, side, kind, grid, held[FINE - 1 :: FINE], held, spool, position)

@@ -1,0 +1,187 @@
+"""Dead-band, hysteresis, gain and metering curve of one valve function, from its sweeps and staircases.
+
+The model is the spool section as it is built (machines.md 3): the measured spool passes a play of the hysteresis'
+width, a dead-band and a metering curve ``speed = full * opening^n``; a cylinder's lever makes the joint faster or
+slower along its way, and the oil between valve and joint is a spring that rings.  All tests of both sides are fitted
+together, on positions, so that no noisy derivative is ever taken.  Least squares with a soft loss; no randomness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from scipy.optimize import least_squares, minimize_scalar
+from scipy.signal import lfilter
+
+from autonomy.calibration.trace import GRID_S, Record
+from machine.joints import Joint
+from machine.profile import JointSpec
+
+EXPONENT, EXPONENT_SPREAD = 1.05, 0.05
+"""Metering edges of compensated spools are nearly straight; the data decide within this."""
+HYSTERESIS, HYSTERESIS_SPREAD = 0.02, 0.02
+LEVER_SPREAD: Final = 0.7
+"""Relative change of a joint's speed per rad along a cylinder's lever; a gear and a telescope have none."""
+RESOLUTION: Final = 0.004
+"""Of the speed limit times one second: residuals far above it are down-weighted."""
+THINNED: Final = 2
+"""The fit looks at every second sample."""
+_LEVERS: Final = (Joint.LIFT, Joint.TILT)
+_EVALUATIONS: Final = 60
+WEIGHT: Final = 10.0
+"""Of what is known beforehand against the data: neighbouring residuals are alike, a hundred of them count as one."""
+_NAMES: Final = (
+    "deadband_plus", "deadband_minus", "hysteresis", "exponent", "full_plus", "full_minus", "lever", "ring_rad_s",
+    "ring_zeta", "lag_plus_s", "lag_minus_s",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ValveFit:
+    """What the fit found: shares of full command, speeds at full command and ``at`` (rad, m), and how well it fits.
+
+    ``ringing`` is the oil spring (rad/s, damping ratio), ``lags_s`` oil and pump between the spool's opening and the
+    joint, plus and minus side; ``residual`` the root mean square of the position residuals [rad, m]; ``modelled`` the
+    fitted positions of every test, in order.
+    ``errors`` are standard errors by name of the parameter.
+    """
+
+    deadbands: tuple[float, float]
+    hysteresis: float
+    exponent: float
+    full_speeds: tuple[float, float]
+    lever: float
+    at: float
+    ringing: tuple[float, float]
+    lags_s: tuple[float, float]
+    residual: float
+    modelled: tuple[np.ndarray, ...]
+    errors: dict[str, float]
+
+
+class _Stretch:
+    """One test, ready for the model."""
+
+    def __init__(self, test: Record, reference: float) -> None:
+        self.side = test.side
+        spool = test.command if test.spool is None else test.spool
+        self.spool = test.side * spool[::THINNED]
+        self.step_s = GRID_S * THINNED
+        self.position = test.position[::THINNED]
+        self.along = self.position - reference
+        self.start = float(np.mean(self.position[:10]))
+        self._played: dict[float, np.ndarray] = {}
+
+    def play(self, half: float) -> np.ndarray:
+        """The spool behind its play; kept, because most evaluations of a gradient share it."""
+        if half not in self._played:
+            if len(self._played) > 3:
+                self._played.clear()
+            out, at = [], 0.0
+            for x in self.spool.tolist():
+                if x - half > at:
+                    at = x - half
+                elif x + half < at:
+                    at = x + half
+                out.append(at)
+            self._played[half] = np.array(out)
+        return self._played[half]
+
+    def model(self, p: np.ndarray) -> np.ndarray:
+        """Positions for the parameters `_NAMES`."""
+        first = 0 if self.side > 0 else 1
+        deadband, full, lag_s = p[first], p[4 + first], p[9 + first]
+        half = 0.5 * p[2]
+        opening = np.clip((self.play(half) - deadband) / (1.0 - half - deadband), 0.0, 1.0)
+        speed = self.side * full * (1.0 + p[6] * self.along) * opening ** p[3]
+        way = np.cumsum(speed) * self.step_s
+        time = np.arange(len(way)) * self.step_s
+        b, a = _ringing(p[7], p[8], self.step_s)
+        return self.start + lfilter(b, a, np.interp(time - lag_s, time, way))
+
+
+def _ringing(rad_s: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """A second-order lag as a digital filter (bilinear)."""
+    k = 2.0 / step_s
+    first = k * k + 2.0 * zeta * rad_s * k + rad_s * rad_s
+    b = np.array([1.0, 2.0, 1.0]) * rad_s * rad_s / first
+    a = np.array([1.0, (2.0 * rad_s**2 - 2.0 * k * k) / first, (k * k - 2.0 * zeta * rad_s * k + rad_s**2) / first])
+    return b, a
+
+
+def fit_valve(tests: Sequence[Record], spec: JointSpec) -> ValveFit:
+    """The valve of one joint from its tests (both sides, sweep and staircase each)."""
+    joint = tests[0].joint
+    at = float(np.mean([np.mean(t.position) for t in tests]))
+    stretches = [_Stretch(t, at) for t in tests]
+    valve = spec.valve
+    start = np.array(
+        [
+            valve.deadband_plus_pct / 100.0, valve.deadband_minus_pct / 100.0, HYSTERESIS, EXPONENT,
+            valve.full_speed_plus, valve.full_speed_minus, 0.0, 10.0, 0.4, 0.03, 0.03,
+        ]
+    )  # fmt: skip
+    full = start[4:6]
+    low = np.array([0.005, 0.005, 0.0, 0.9, *(0.3 * full), -2.0, 2.0, 0.02, 0.0, 0.0])
+    high = np.array([0.45, 0.45, 0.1, 1.6, *(3.0 * full), 2.0, 80.0, 3.0, 0.3, 0.3])
+    scale = np.array([0.01, 0.01, 0.01, 0.1, *(0.1 * full), 0.3, 3.0, 0.2, 0.02, 0.02])
+    noise = RESOLUTION * spec.speed_limit
+    lever = LEVER_SPREAD if joint in _LEVERS else 1e-4
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        prior = [
+            (p[2] - HYSTERESIS) / HYSTERESIS_SPREAD, (p[3] - EXPONENT) / EXPONENT_SPREAD, p[6] / lever,
+        ]  # fmt: skip
+        return np.concatenate([*((s.position - s.model(p)) / noise for s in stretches), np.array(prior) * WEIGHT])
+
+    found = least_squares(residuals, start, bounds=(low, high), x_scale=scale, loss="soft_l1", max_nfev=_EVALUATIONS)
+    p = found.x
+    modelled = tuple(
+        np.interp(t.time_s, t.time_s[::THINNED], s.model(p)) for t, s in zip(tests, stretches, strict=True)
+    )
+    errors = np.concatenate([t.position - m for t, m in zip(tests, modelled, strict=True)])
+    return ValveFit(
+        deadbands=(float(p[0]), float(p[1])),
+        hysteresis=float(p[2]),
+        exponent=float(p[3]),
+        full_speeds=(float(p[4]), float(p[5])),
+        lever=float(p[6]),
+        at=at,
+        ringing=(float(p[7]), float(p[8])),
+        lags_s=(float(p[9]), float(p[10])),
+        residual=float(np.sqrt(np.mean(errors**2))),
+        modelled=modelled,
+        errors=_standard_errors(found),
+    )
+
+
+def _standard_errors(found: Any) -> dict[str, float]:
+    """Of the parameters, from the curvature of the cost; neighbouring residuals are alike, so few of them count."""
+    try:
+        covariance = np.linalg.inv(found.jac.T @ found.jac)
+    except np.linalg.LinAlgError:
+        return dict.fromkeys(_NAMES, float("inf"))
+    scale = 2.0 * found.cost / len(found.fun) * WEIGHT**2
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0) * scale)
+    return dict(zip(_NAMES, errors.tolist(), strict=True))
+
+
+def repeated(fit: ValveFit, test: Record) -> float:
+    """By how much the dead-band of another test of that side differs from the fit's [share of full]; NaN if unclear.
+
+    The test is not one of those that were fitted.  Everything but the dead-band is taken from the fit.
+    """
+    stretch = _Stretch(test, fit.at)
+    first = 0 if test.side > 0 else 1
+    p = np.array([*fit.deadbands, fit.hysteresis, fit.exponent, *fit.full_speeds, fit.lever, *fit.ringing, *fit.lags_s])
+
+    def misfit(shift: float) -> float:
+        q = p.copy()
+        q[first] += shift
+        return float(np.sum((stretch.position - stretch.model(q)) ** 2))
+
+    best = minimize_scalar(misfit, bounds=(-0.06, 0.06), method="bounded")
+    return float(best.x) if abs(best.x) < 0.059 else float("nan")

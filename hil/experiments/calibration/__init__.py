@@ -1,0 +1,1 @@
+"""Does ``timberhand calibrate`` recover what the plant hides?"""

@@ -1,0 +1,190 @@
+"""The calibration run: a good machine is done, any other is told why not and left with its valves shut."""
+
+from __future__ import annotations
+
+from math import nan
+
+import msgspec
+import pytest
+from commissioned_crane import HOME, SAG, Crane
+
+from autonomy.calibration.plan import NoRoom, make_plan, sentences
+from autonomy.calibration.program import STEP_SHARES, command_for, staircase, sweep, turned, wiggle
+from autonomy.calibration.survey import fit_survey
+from autonomy.calibration.tasks import Spool, Travel
+from can_dbc.setpoint import CraneSetpoint, SpoolTest
+from machine.joints import JOINTS, Joint
+from machine.kinematics import pin_position
+from machine.load import load_profile
+from machine.modes import Mode
+
+PALMS = load_profile("palms_471")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
+def test_a_good_machine_is_done_in_under_four_minutes(name: str) -> None:
+    crane = Crane(name)
+    run = crane.run()
+    assert run.failure is None and run.done
+    assert run.elapsed_s < 240.0
+    sensed = [j for j in JOINTS if crane.profile.joints[j.name.lower()].encoder]
+    assert len(run.found.tests) == 4 * len(sensed) and len(run.found.wiggles) == 2 * len(sensed)
+    assert len(run.found.readings) == len(crane.plan.survey) and len(run.found.grapple_s) == 2
+    assert all(crane.fastest[j] < 1.0 for j in sensed)
+    survey = fit_survey(crane.profile.kinematics, run.found.readings)
+    assert survey.sag.load_rad_nm == pytest.approx(SAG.load_rad_nm, rel=0.05), "it weighs the crane at every pose"
+    assert max(map(abs, survey.moments_nm)) < 50.0 and max(survey.after_m) < 1e-3
+
+
+def test_every_joint_is_wiggled_before_anything_travels() -> None:
+    crane = Crane()
+    run = crane.run(done=lambda c: isinstance(c.calibration.task, Travel))
+    assert run.failure is None
+    assert [(w.joint, w.side) for w in run.found.wiggles] == [(j, s) for j in JOINTS for s in (1, -1)]
+    assert all(isinstance(m, SpoolTest) for m in crane.heard)
+    assert all(abs(a - b) < 0.03 for a, b in zip(crane.q, HOME["palms_471"], strict=True)), "a wiggle is small"
+
+
+@pytest.mark.parametrize("joint", [Joint.SLEW, Joint.EXT])
+def test_a_joint_that_moves_the_wrong_way_ends_the_run_at_once(joint: Joint) -> None:
+    crane = Crane(backward={joint})
+    before = crane.q[joint]
+    run = crane.run()
+    assert run.failure is not None and f"the {joint.name.lower()} moves the wrong way" in run.failure
+    assert abs(crane.q[joint] - before) < 0.03
+    assert ends_shut(crane)
+
+
+def test_a_joint_that_does_not_move_ends_the_run() -> None:
+    crane = Crane(stuck={Joint.LIFT})
+    run = crane.run()
+    assert run.failure is not None and "the lift does not move" in run.failure
+    assert ends_shut(crane)
+
+
+@pytest.mark.parametrize("after_s", [1.0, 40.0])
+def test_an_abort_shuts_the_valve_within_a_tenth_of_a_second(after_s: float) -> None:
+    crane = Crane()
+    crane.run(after_s)
+    crane.run(20.0, lambda c: any(c._spools()))
+    crane.calibration.abort("interrupted")
+    aborted_ns = crane.now_ns
+    run = crane.run()
+    assert run.failure == "interrupted" and not run.done
+    assert crane.now_ns - aborted_ns < 200_000_000
+    assert ends_shut(crane)
+
+
+def test_an_abort_while_travelling_ends_at_rest() -> None:
+    crane = Crane()
+    crane.run(done=lambda c: isinstance(c.calibration.task, Travel))
+    crane.run(1.5)
+    crane.calibration.abort("interrupted")
+    run = crane.run(5.0)
+    assert run.idle
+    last = crane.heard[-1]
+    assert isinstance(last, CraneSetpoint) and last.final and not any(last.knots[-1].velocity)
+
+
+def test_a_stop_ends_the_run_and_nothing_is_sent_after_it() -> None:
+    crane = Crane()
+    crane.run(3.0)
+    crane.mode = Mode.STOP
+    run = crane.run(1.0)
+    sent = len(crane.heard)
+    crane.mode = Mode.ARMED
+    crane.run(5.0)
+    assert run.idle and "STOP" in (run.failure or "") and len(crane.heard) == sent
+
+
+def test_a_refused_setpoint_ends_the_run() -> None:
+    crane = Crane()
+    crane.run(3.0)
+    crane.refuses = 1
+    run = crane.run()
+    assert run.failure is not None and "refused" in run.failure
+
+
+def test_it_waits_until_a_human_arms() -> None:
+    crane = Crane(mode=Mode.STANDBY)
+    run = crane.run(5.0)
+    assert not crane.heard and run.begun_ns is None and run.failure is None and "STANDBY" in (run.waiting or "")
+
+
+def ends_shut(crane: Crane) -> bool:
+    """Whether the last spool test that was sent ends neutral, and nothing is open a moment later."""
+    last = next(m for m in reversed(crane.heard) if isinstance(m, SpoolTest))
+    crane.run(0.3)
+    return last.knots[-1].percent == 0.0 and not any(crane._spools())
+
+
+@pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
+def test_a_plan_stays_clear_of_ground_bunk_and_stops(name: str) -> None:
+    profile = load_profile(name)
+    plan = make_plan(profile, HOME[name], surveyed=True)
+    for p in plan.joints:
+        spec = profile.joints[p.joint.name.lower()]
+        assert spec.lower < p.low < p.high < spec.upper
+        for at in (p.low, p.pose[p.joint], p.high):
+            q = list(p.pose)
+            q[p.joint] = at
+            assert pin_position(profile.kinematics, q)[2] >= plan.clear_z_m - 1e-9
+    for q in plan.survey:
+        assert pin_position(profile.kinematics, q)[2] >= plan.clear_z_m - 1e-9
+    lines = sentences(profile, plan)
+    assert len(lines) == len(JOINTS) + 2
+    assert list(plan.skipped) == ([Joint.ROT] if name == "aoro_fc8" else [])
+
+
+def test_a_machine_without_room_is_refused_before_anything_moves() -> None:
+    bunk = msgspec.structs.replace(PALMS.bunk, stake_height_m=9.0)
+    with pytest.raises(NoRoom, match="clear of ground and bunk"):
+        make_plan(msgspec.structs.replace(PALMS, bunk=bunk), (0.0, 0.7, -1.5, 0.3, nan), surveyed=False)
+
+
+def test_programs_begin_and_end_neutral_and_reach_their_speeds() -> None:
+    for name, spec in PALMS.joints.items():
+        for side in (1, -1):
+            stairs = staircase(spec, side)
+            for program in (wiggle(spec, side), sweep(spec, side), stairs, turned(sweep(spec, side), 1.7)):
+                assert program.at(0.0) == program.at(program.duration_s) == 0.0, name
+                assert program.window(program.duration_s - 0.1, 0.4)[-1].percent == 0.0
+                assert all(side * p >= 0.0 for _, p in program.points)
+            top = max(side * p for _, p in stairs.points)
+            assert top == pytest.approx(command_for(spec, side, STEP_SHARES[-1] * spec.speed_limit))
+
+
+def test_a_program_begins_at_its_beginning_however_late_the_turn_is() -> None:
+    crane = Crane()
+    crane.run(0.1)
+    assert not crane.heard
+    crane.now_ns += 90_000_000  # this host had something else to do
+    crane.run(0.2)
+    first = crane.heard[0]
+    assert isinstance(first, SpoolTest) and first.knots[0].percent == 0.0 and first.knots[1].after_ns == 5_000_000
+
+
+def test_a_task_tells_what_it_is() -> None:
+    crane = Crane()
+    crane.run(1.0)
+    assert crane.calibration.task == Spool(Joint.SLEW, 1, "wiggle")
+    at, count = crane.calibration.progress
+    assert at == 0 and count > 40 and 150.0 < crane.calibration.remaining_s() < 260.0
+
+
+def test_a_changed_program_is_told_at_once_and_its_end_however_late() -> None:
+    crane = Crane()
+    crane.run(done=lambda c: any(c._spools()))
+    crane.run(3.0, lambda c: c.calibration._spool.closed)
+    last = crane.heard[-1]
+    assert isinstance(last, SpoolTest) and last.stamp_ns == crane.now_ns and last.knots[-1].percent == 0.0
+    other = Crane()
+    other.run(done=lambda c: isinstance(c.calibration.task, Travel))
+    other.run(done=lambda c: isinstance(c.calibration.task, Spool) and any(c._spools()))
+    heard = len(other.heard)
+    spool = other.calibration._spool
+    assert spool is not None
+    other.now_ns += int(spool.program.duration_s * 1e9)
+    other.run(0.05)
+    assert len(other.heard) > heard and other.heard[-1].knots[-1].percent == 0.0

@@ -1,0 +1,309 @@
+"""``timberhand calibrate``: find out what a new machine really does, and write its profile."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hil.exits import Exit, Stopped
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rich.console import Console
+
+    from autonomy.calibration.plan import Plan
+    from autonomy.calibration.procedure import Calibration
+    from machine.profile import Profile
+
+
+def calibrate(
+    profile: Annotated[str, typer.Option(help="The machine as it is known: a shipped profile or a TOML file.")],
+    out: Annotated[Path, typer.Option(help="The calibrated profile, a new TOML file.")] = Path("calibrated.toml"),
+    report: Annotated[Path | None, typer.Option(help="Folder of the report (default: beside --out).")] = None,
+    survey: Annotated[
+        str | None, typer.Option(help="HOST:PORT of a surveying instrument, or 'ask' to type its readings in.")
+    ] = None,
+    controller: Annotated[str, typer.Option(help="HOST:PORT that takes setpoints.")] = "127.0.0.1:47001",
+    report_port: Annotated[int, typer.Option(help="Local UDP port of the state reports.")] = 47002,
+    bus: Annotated[str, typer.Option(help="The crane's bus, as in socketcan:can0; only listened to.")] = "wire:crane0",
+    key_file: Annotated[Path | None, typer.Option(help="Key that authenticates datagrams.")] = None,
+    lease_ms: Annotated[int, typer.Option(help="How long a setpoint is obeyed.")] = 200,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the machine moves.")] = False,
+    lockstep: Annotated[bool, typer.Option(help="A virtual machine in virtual time instead of a real one.")] = False,
+    truth: Annotated[str, typer.Option(help="With --lockstep: nominal, sampled or a truth file.")] = "sampled",
+    seed: Annotated[int, typer.Option(help="With --lockstep: which individual machine.")] = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report's result.json on stdout.")] = False,
+) -> None:
+    """Find dead-bands, gains, delays, zeros and sag of a machine through its bus, and write them into a new profile.
+
+    The crane moves by itself for about four minutes, one function at a time. Ctrl-C stops it at any time. A profile is
+    written only when every value can be believed; else the exit code is 6 and the report says why.
+
+    [bold]Examples[/bold]
+
+      timberhand calibrate --profile palms_471 --bus socketcan:can0 --survey ask --out my_crane.toml
+
+      timberhand calibrate --profile palms_471 --lockstep --seed 7 --survey sim --out my_crane.toml
+    """
+    from rich.console import Console
+
+    from autonomy.calibration.profile_file import NotWritten, changes, write_profile
+    from autonomy.calibration.report import document, write_report
+    from autonomy.calibration.result import identify
+    from machine.load import ProfileError, load_profile
+
+    try:
+        known = load_profile(profile)
+    except ProfileError as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    if out.exists():
+        raise Stopped(Exit.USAGE, f"{out} exists and is not overwritten; choose another --out")
+    folder = report or out.with_suffix("")
+    screen = Console(stderr=True)
+    if lockstep:
+        calibration = _lockstep(profile, known, truth, seed, survey is not None, folder, screen)
+    else:
+        calibration = _live(
+            known,
+            (controller, report_port, bus, key_file, lease_ms),
+            survey,
+            lambda plan: _agree(known, plan, yes),
+            screen,
+        )
+    with screen.status("fitting"):
+        result = identify(known, calibration.found)
+    changed = changes(known, result)
+    facts: dict[str, Any] = {"profile": known.name, "date": _today(), "seconds": calibration.elapsed_s}
+    facts |= {"lockstep": {"truth": truth, "seed": seed}} if lockstep else {}
+    write_report(folder, result, facts, changed)
+    if as_json:
+        print(json.dumps(document(result, facts, changed), indent=2))
+    _show(result, screen)
+    if result.implausible:
+        screen.print("\n".join(f"[red]✘[/red] {sentence}" for sentence in result.implausible), highlight=False)
+        raise Stopped(
+            Exit.FIGURE, f"no profile is written: {len(result.implausible)} values are implausible; see {folder}"
+        )
+    try:
+        write_profile(_source(profile), out, changed, facts["date"])
+    except NotWritten as error:
+        raise Stopped(Exit.FIGURE, str(error)) from None
+    screen.print(f"[green]✔[/green] {out} written, {len(changed)} values; report in {folder}", highlight=False)
+    if result.survey is None:
+        screen.print("zeros and sag stay as they were: nothing was surveyed (--survey)", highlight=False)
+
+
+def _today() -> str:
+    import datetime
+
+    return datetime.date.today().isoformat()
+
+
+def _source(profile: str) -> Path:
+    from controller.guard.__main__ import profile_path
+
+    return Path(profile_path(profile))
+
+
+def _agree(profile: Profile, plan: Plan, yes: bool) -> None:
+    """Says what will move and waits for a yes; anything else ends the command."""
+    from autonomy.calibration.plan import sentences
+
+    print(f"{profile.title}: these will move, one at a time:", file=sys.stderr)
+    for line in sentences(profile, plan):
+        print(f"  {line}", file=sys.stderr)
+    print("Clear the zone: nobody and no log within reach, the grapple empty, the machine at rest.", file=sys.stderr)
+    if not yes and not typer.confirm("Move now?", err=True):
+        raise Stopped(Exit.INTERRUPTED, "nothing was moved")
+
+
+def _lockstep(
+    name: str, profile: Profile, truth: str, seed: int, surveyed: bool, folder: Path, screen: Console
+) -> Calibration:
+    from hil.calibration import run_lockstep
+    from recorder.manifest import describe
+    from recorder.recorder import Recorder, RecordingRefused
+
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+    recorder = None
+    try:
+        buses = tuple(bus for bus in (profile.crane_bus, profile.machine_bus) if bus)
+        recorder = Recorder(folder / "log", profile, describe(profile, buses, seed))
+        with _Progress(screen) as progress:
+            outcome = run_lockstep(
+                name, truth, seed, surveyed=surveyed, recorder=recorder,
+                show=lambda plan: _agree(profile, plan, yes=True), watch=progress.show, aborted=lambda: bool(pressed),
+            )  # fmt: skip
+    except (ValueError, RecordingRefused) as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if recorder is not None:
+            recorder.close()
+    if pressed:
+        raise Stopped(Exit.INTERRUPTED, "interrupted; the valves are neutral and nothing is written")
+    if outcome.failure is not None or outcome.calibration is None:
+        raise Stopped(Exit.SAFETY, f"calibration ended: {outcome.failure}; nothing is written")
+    return outcome.calibration
+
+
+def _live(
+    profile: Profile,
+    link_options: tuple[str, int, str, Path | None, int],
+    survey: str | None,
+    agree: Callable[[Plan], None],
+    screen: Console,
+) -> Calibration:
+    from autonomy.calibration import live
+    from autonomy.calibration.plan import NoRoom, make_plan
+    from autonomy.calibration.procedure import READINGS, Calibration
+    from can_dbc.bus import BusError, open_bus
+    from can_dbc.codec import load
+    from can_dbc.setpoint import udp_address
+    from machine.load import profile_hash
+    from machine.modes import Mode
+
+    controller, report_port, address, key_file, lease_ms = link_options
+    if not 0 < lease_ms <= profile.timeouts.lease_max_ms:
+        raise Stopped(Exit.USAGE, f"--lease-ms {lease_ms}: {profile.name} allows 1..{profile.timeouts.lease_max_ms}")
+    pressed: list[int] = []
+    try:
+        where = udp_address(controller)
+        reader = _surveyor(survey, screen)
+        key = key_file.read_bytes().strip() if key_file else None
+        link = live.Link(where, report_port, profile_hash(profile), key)
+    except ValueError as error:
+        raise Stopped(Exit.USAGE, str(error)) from None
+    except OSError as error:
+        raise Stopped(Exit.BUS, f"UDP port {report_port} or the key file: {error}; choose another one") from None
+    try:
+        report = live.first_report(link, 10.0, (Mode.STANDBY, Mode.ARMED, Mode.STOP))
+        if link.foreign:
+            raise Stopped(Exit.CONFIGURATION, "the controller runs another profile: start both with the same one")
+        if report is None:
+            raise Stopped(Exit.BUS, f"no controller in STANDBY reports on port {report_port} within 10 s; start it")
+        plan = make_plan(profile, report.position, survey is not None)
+        agree(plan)
+        readings = 1 if survey == "ask" else READINGS
+        run = Calibration(profile, profile_hash(profile), plan, load("crane"), lease_ms * 1_000_000, key, readings)
+        before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+        try:
+            with (
+                open_bus(address, filters=run.trace.keys, participant="calibrate") as heard,
+                _Progress(screen) as shown,
+            ):
+
+                def turn(calibration: Calibration) -> None:
+                    if pressed:
+                        calibration.abort("interrupted")
+                        calibration.idle = calibration.idle or calibration.begun_ns is None
+                    shown.show(calibration)
+
+                live.run(run, link, heard, reader, turn)
+        finally:
+            signal.signal(signal.SIGINT, before)
+    except NoRoom as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    except BusError as error:
+        raise Stopped(Exit.BUS, str(error)) from None
+    finally:
+        link.close()
+    if pressed:
+        raise Stopped(Exit.INTERRUPTED, "interrupted; the valves are neutral and nothing is written")
+    if not run.done:
+        raise Stopped(Exit.SAFETY, f"calibration ended: {run.failure}; nothing is written")
+    return run
+
+
+def _surveyor(survey: str | None, screen: Console) -> Callable[[int], tuple[float, float, float] | None]:
+    """How a reading is got: never, typed in, or from an instrument."""
+    from autonomy.calibration.live import Instrument
+    from can_dbc.setpoint import udp_address
+
+    if survey is None:
+        return lambda now_ns: None
+    if survey != "ask":
+        return Instrument(udp_address(survey)).read
+
+    def typed(now_ns: int) -> tuple[float, float, float] | None:
+        # The crane stands, its last setpoint was final: the lease may run out while a person reads and types.
+        text = typer.prompt("hanger pin x y z [m, crane base frame]", err=True)
+        try:
+            x, y, z = map(float, text.replace(",", " ").split())
+        except ValueError:
+            screen.print("three numbers, as in 0.12 5.43 2.10")
+            return None
+        return x, y, z
+
+    return typed
+
+
+class _Progress:
+    """A bar with the remaining time, and what is being done."""
+
+    def __init__(self, screen: Console) -> None:
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        columns = (TextColumn("{task.description:<34}"), BarColumn(), TextColumn("{task.fields[left]:>3.0f} s left"))
+        self._bar = Progress(*columns, console=screen, transient=True)
+        self._task = self._bar.add_task("waiting", total=1.0, left=0.0)
+        self._waiting: str | None = None
+        self._screen = screen
+
+    def __enter__(self) -> _Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, calibration: Calibration) -> None:
+        """The state of the run now."""
+        left = calibration.remaining_s()
+        if calibration.waiting and calibration.begun_ns is None and calibration.waiting != self._waiting:
+            self._waiting = calibration.waiting
+            self._screen.print(f"waiting for ARM: {self._waiting}", highlight=False)
+        whole = max(calibration.elapsed_s + left, 1.0)
+        self._bar.update(self._task, completed=calibration.elapsed_s / whole, description=_says(calibration), left=left)
+
+
+def _says(calibration: Calibration) -> str:
+    from autonomy.calibration.tasks import Grip, Look, Spool, Travel
+
+    match calibration.task:
+        case Spool(joint=j, side=side, kind=kind):
+            return f"{j.name.lower()} {'+' if side > 0 else '-'} {kind}"
+        case Travel(why=why):
+            return f"travels {why}"
+        case Grip(command=command):
+            return f"grapple: {command.name.lower()}"
+        case Look(number=number):
+            return f"survey pose {number + 1}"
+    return "waiting"
+
+
+def _show(result: Any, screen: Console) -> None:
+    """The values as a table."""
+    from rich.table import Table
+
+    table = Table("joint", "dead-band + / - [%]", "full speed + / -", "dead time [ms]", "lag [ms]", "response [ms]")
+    for j, r in result.joints.items():
+        delay = ("-", "-") if r.delay is None else (f"{1e3 * r.delay.delay_s:.0f}", f"{1e3 * r.delay.lag_s:.0f}")
+        table.add_row(
+            j.name.lower(),
+            " / ".join(f"{100 * d:.1f}" for d in r.valve.deadbands),
+            " / ".join(f"{f:.3f}" for f in r.valve.full_speeds),
+            *delay,
+            " / ".join(f"{1e3 * s:.0f}" for s in r.responses_s),
+        )
+    screen.print(table)
+    if result.survey is not None:
+        before, after = (1e3 * max(d) for d in (result.survey.before_m, result.survey.after_m))
+        screen.print(f"survey: pin off by up to {before:.0f} mm as shipped, {after:.0f} mm with zeros and sag")
