@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.grasp.direct import (
+    BELOW_TOP_M,
     NoGrasp,
     choose,
     closing_height,
@@ -23,6 +24,7 @@ from autonomy.grasp.direct import (
     plan_place,
     travel_height,
 )
+from autonomy.grasp.proposal import BunkFull
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
 from autonomy.motion.arm import Arm, Pose
@@ -161,8 +163,11 @@ def test_a_place_is_above_what_is_in_the_bunk_until_the_bunk_is_full() -> None:
     assert 0.04 < empty.z_m - deepest - BUNK.floor_z_m < 0.1
     half = plan_place(ARM, Mission(), grasp, [in_bunk(1, -0.5)])
     assert half.z_m - empty.z_m == pytest.approx(0.5)
-    with pytest.raises(NoGrasp, match="the bunk is full"):
-        plan_place(ARM, Mission(), grasp, [in_bunk(1, -0.1)])
+    top_m, radius_m = BUNK.floor_z_m + BUNK.stake_height_m, GROUND_LOG.diameter_m / 2
+    last = plan_place(ARM, Mission(), grasp, [in_bunk(1, top_m - BELOW_TOP_M - radius_m - 0.01)])
+    assert last.z_m - deepest + radius_m < top_m + 0.03, "its middle comes to lie below the top of the stakes"
+    with pytest.raises(BunkFull, match="the bunk is full"):
+        plan_place(ARM, Mission(), grasp, [in_bunk(1, top_m - BELOW_TOP_M - radius_m + 0.01)])
 
 
 def test_a_mission_may_name_the_place() -> None:

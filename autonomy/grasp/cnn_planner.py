@@ -1,0 +1,145 @@
+"""Paper A's grasp planner (section II): virtual world, depth picture, network, argmax, and back to the crane's base.
+
+The network says where and how turned, not how deep: the tips go 0.25 m under the surface that the camera sees there, as
+on the test-bed (machines.md 1.5), and never into the ground.  What comes up is not its business; the logs between the
+tongs are named for the closing of the tongs.  Inputs: log list, a network.  Failure: ``NoGrasp``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+
+from autonomy.grasp.cylinders import Cylinders, cylinders, lowest_m
+from autonomy.grasp.direct import known_ground_m
+from autonomy.grasp.jaws import Jaws, jaws_of
+from autonomy.grasp.network import Best, GraspMaps, best
+from autonomy.grasp.proposal import GraspProposal, NoGrasp
+from autonomy.grasp.quality import lies_upon, rate, sections
+from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, cuboid, render, trimmed
+from autonomy.logs import LogObservation
+from autonomy.motion.arm import Arm
+
+DEPTH_M: Final = 0.25
+"""How far under the surface of the pile the tips close."""
+
+
+class Network(Protocol):
+    """``autonomy.grasp.network.GraspNet``: a 300 x 300 depth picture [m] in, the grasp of eq. 4 or whole maps out."""
+
+    def best(self, depth_m: np.ndarray) -> Best: ...
+
+    def maps(self, depth_m: np.ndarray) -> GraspMaps: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What a plan was made from, for pictures: camera, depth (300, 300) [m] and the grasp found in it."""
+
+    camera: Camera
+    depth_m: np.ndarray
+    best: Best
+
+
+class CnnPlanner:
+    """A planner (``autonomy.grasp.proposal``).
+
+    ``by_rule`` takes the height from the rule that physical labels are made by, where that holds.
+    ``cameras`` over 1 moves the virtual camera on a circle of ``reach_m`` and averages the predictions (II-C); the
+    paper's results are with one that stands still.
+    """
+
+    def __init__(self, network: Network, by_rule: bool = False, cameras: int = 1, reach_m: float = 0.3) -> None:
+        self._network, self._by_rule, self._cameras, self._reach_m = network, by_rule, cameras, reach_m
+
+    def look(self, world: Cylinders, jaws: Jaws, ground_z_m: float) -> Seen:
+        """The virtual camera's picture of a world and the grasp in it.
+
+        Raises ValueError when there is nothing to see.
+        """
+        recreated = trimmed(world, jaws.blade_m)
+        box = cuboid(recreated)
+        if self._cameras <= 1:
+            camera = camera_above(box)
+            depth = render(recreated, camera, ground_z_m)
+            return Seen(camera, depth, self._network.best(depth))
+        views = cameras_along(box, self._reach_m, self._cameras)
+        pictures = [render(recreated, camera, ground_z_m) for camera in views]
+        mean = averaged([self._network.maps(depth) for depth in pictures], views, float(box.centroid_m[2]))
+        return Seen(views[0], pictures[0], best(mean))
+
+    def __call__(self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float) -> GraspProposal:
+        """The grasp of eq. 4; raises ``NoGrasp`` without a log."""
+        if not logs:
+            raise NoGrasp("no log is in view")
+        world, jaws = cylinders(logs), jaws_of(arm.profile)
+        ground = known_ground_m(arm.profile)
+        ground = ground if math.isfinite(ground) else lowest_m(world)
+        try:
+            seen = self.look(world, jaws, ground)
+        except ValueError as error:
+            raise NoGrasp(f"the network has nothing to plan from: {error}") from None
+        found = seen.best
+        depth = float(seen.depth_m[round(found.v_px), round(found.u_px)])
+        x, y, surface = seen.camera.to_base(found.u_px, found.v_px, depth).tolist()
+        # Seen from above the picture's y runs against the base's.
+        yaw, level = -found.theta_rad, max(ground, surface - DEPTH_M)
+        if self._by_rule:
+            level = safe_level(jaws, world, x, y, yaw, ground, level)
+        taken = between(jaws, world, x, y, yaw, level)
+        quality = min(max(found.q, 0.0), 1.0)
+        reason = f"the network's best pixel ({found.u_px:.0f}, {found.v_px:.0f}) has quality {found.q:.2f}"
+        return GraspProposal(x, y, yaw, level, taken, quality, reason)
+
+
+def between(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, level: float) -> tuple[int, ...]:
+    """The logs between the tongs of a grasp and above its tips; without any, the nearest one."""
+    at = sections(jaws, world, np.array(x), np.array(y), np.array(yaw))
+    middle = np.abs(at.low_u + at.high_u) / 2
+    inside = at.inside & (middle < jaws.half_gap_m) & (at.middle > level)
+    if not inside.any():
+        off = np.linalg.norm(world.center[:, :2] - (x, y), axis=1)
+        return (int(np.argmin(np.where(at.inside, middle, off + 10.0))),)
+    return tuple(int(i) for i in np.flatnonzero(inside))
+
+
+def safe_level(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, ground: float, level: float) -> float:
+    """The height at which the rule takes most wood at a place; ``level`` where it takes none."""
+    heights = np.append(world.center[:, 2] + world.radius, ground)
+    at = sections(jaws, world, *(np.full(len(heights), v) for v in (x, y, yaw)))
+    found = rate(jaws, world, lies_upon(world), at, heights)
+    mass = np.where(found.safe, found.mass_kg, 0.0)
+    return float(heights[np.argmax(mass)]) if mass.any() else level
+
+
+def averaged(maps: Sequence[GraspMaps], cameras: Sequence[Camera], height_m: float) -> GraspMaps:
+    """Mean of the predictions of cameras that look straight down, shifted onto the first one's picture at a height.
+
+    Pixels that a camera does not see count for it as worthless.
+    """
+    first = cameras[0]
+    sums = np.zeros((3, *maps[0].q.shape))
+    for found, camera in zip(maps, cameras, strict=True):
+        away = float(camera.position_m[2]) - height_m
+        step = (camera.position_m - first.position_m)[:2] / away / found.scale_px
+        right, down = round(step[0] * camera.intrinsics.fx_px), round(-step[1] * camera.intrinsics.fy_px)
+        for total, layer in zip(sums, (found.q, found.cos2, found.sin2), strict=True):
+            total += _shifted(layer, down, right)
+    sums /= len(maps)
+    return GraspMaps(*sums, maps[0].scale_px)
+
+
+def _shifted(layer: np.ndarray, down: int, right: int) -> np.ndarray:
+    """A map moved by whole entries, zeros where nothing comes from."""
+    out = np.zeros_like(layer)
+    height, width = layer.shape
+    rows, columns = math.fabs(down), math.fabs(right)
+    if rows < height and columns < width:
+        to = (slice(max(0, down), height + min(0, down)), slice(max(0, right), width + min(0, right)))
+        come = (slice(max(0, -down), height + min(0, -down)), slice(max(0, -right), width + min(0, -right)))
+        out[to] = layer[come]
+    return out

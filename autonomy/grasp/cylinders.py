@@ -1,0 +1,121 @@
+"""Logs as perfect cylinders in arrays, and random draws of them from what perception is unsure of.
+
+Base frame, m.  Every array has the logs on its last axis but the coordinates': ``center`` and ``axis`` (..., n, 3),
+``length`` and ``radius`` (..., n); leading axes are draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from autonomy.logs import LogObservation
+from autonomy.perception.estimate import ACROSS_1, ACROSS_2, END, RADIUS, SIZE, START, TILT_1, TILT_2, unpacked
+
+LEAST_RADIUS_M: Final = 0.02
+SUNK_M: Final = 0.12
+"""Logs that are seen further off the ground than this lie on something else."""
+OWN_SHARE: Final = 0.4
+"""Of the standard deviation of a log's height, the part that is its own and not the camera's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinders:
+    """See the module."""
+
+    center: np.ndarray
+    axis: np.ndarray
+    length: np.ndarray
+    radius: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """How many logs."""
+        return int(self.length.shape[-1])
+
+    def ends(self) -> np.ndarray:
+        """Both ends of every axis (..., n, 2, 3): paper A, eq. (1)."""
+        half = (self.axis * self.length[..., None] / 2)[..., None, :]
+        return self.center[..., None, :] + np.concatenate([-half, half], axis=-2)
+
+    def shortened(self, by_m: float, share: float) -> Cylinders:
+        """Every log shorter by ``by_m`` and then by a ``share`` of what is left, never shorter than it is wide."""
+        length = np.maximum((self.length - by_m) * (1.0 - share), 2.0 * self.radius)
+        return Cylinders(self.center, self.axis, np.minimum(length, self.length), self.radius)
+
+
+def cylinders(logs: Sequence[LogObservation]) -> Cylinders:
+    """The logs of a list, no draws."""
+    return Cylinders(
+        np.array([log.center_m for log in logs], float).reshape(-1, 3),
+        np.array([log.axis for log in logs], float).reshape(-1, 3),
+        np.array([log.length_m for log in logs], float),
+        np.array([log.diameter_m for log in logs], float) / 2.0,
+    )
+
+
+def lowest_m(world: Cylinders) -> float:
+    """Height of the lowest point of any log."""
+    thick = world.radius * np.sqrt(np.maximum(1.0 - world.axis[..., 2] ** 2, 0.0))
+    return float(np.min(np.min(world.ends()[..., 2], axis=-1) - thick))
+
+
+def grounded(world: Cylinders, ground_z_m: float) -> Cylinders:
+    """The logs moved together so that the lowest end lies on the ground, where they are within ``SUNK_M`` of it.
+
+    What a camera's mount and depth scale have wrong raises or sinks all logs alike; the ground's height is known.
+    """
+    if not world.count:
+        return world
+    off = ground_z_m - lowest_m(world)
+    if abs(off) > SUNK_M:
+        return world
+    return Cylinders(world.center + np.array([0.0, 0.0, off]), world.axis, world.length, world.radius)
+
+
+def grounded_covariance(covariance: np.ndarray) -> np.ndarray:
+    """The covariances (n, 7, 7) after ``grounded``: of the height, what the logs do not share is left."""
+    scale = np.ones(SIZE)
+    scale[ACROSS_2] = OWN_SHARE
+    return covariance * scale[:, None] * scale
+
+
+def covariance_of(log: LogObservation) -> np.ndarray:
+    """(7, 7) of ``LogEstimate`` as perception has it, or for a log of which only the pose is told."""
+    return default_covariance(log) if log.covariance is None else unpacked(log.covariance)
+
+
+def default_covariance(log: LogObservation) -> np.ndarray:
+    """(7, 7) for a pose that is known well: 1.5 cm across, 1 deg, 5 cm at the ends."""
+    sigma = np.zeros(SIZE)
+    sigma[[ACROSS_1, ACROSS_2]], sigma[[TILT_1, TILT_2]] = 0.015, 0.017
+    sigma[[START, END]], sigma[RADIUS] = 0.05, 0.05 * log.diameter_m
+    return np.diag(sigma**2)
+
+
+def draws_of(world: Cylinders, covariances: np.ndarray, count: int, seed: int) -> Cylinders:
+    """``count`` draws of a world (n logs) from covariances (n, 7, 7); the same seed draws the same.
+
+    Raises ValueError when a covariance is none.
+    """
+    if not np.all(np.isfinite(covariances)):
+        raise ValueError("the covariance of a log has an entry that is not finite; leave that log out")
+    value, vector = np.linalg.eigh(covariances)
+    root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
+    normal = np.random.default_rng(seed).standard_normal((count, world.count, SIZE))
+    e = np.einsum("nij,dnj->dni", root, normal)
+    level = np.stack([-world.axis[:, 1], world.axis[:, 0], np.zeros(world.count)], axis=1)
+    steep = np.hypot(level[:, 0], level[:, 1]) < 0.05
+    level[steep] = (0.0, 1.0, 0.0)
+    level /= np.linalg.norm(level, axis=1)[:, None]
+    up = np.cross(world.axis, level)
+    axis = world.axis + e[..., TILT_1, None] * level + e[..., TILT_2, None] * up
+    axis /= np.linalg.norm(axis, axis=-1)[..., None]
+    along = 0.5 * (e[..., START] + e[..., END])
+    center = world.center + e[..., ACROSS_1, None] * level + e[..., ACROSS_2, None] * up + along[..., None] * axis
+    radius = np.maximum(world.radius + e[..., RADIUS], LEAST_RADIUS_M)
+    length = np.maximum(world.length + e[..., END] - e[..., START], 2.0 * radius)
+    return Cylinders(center, axis, length, radius)

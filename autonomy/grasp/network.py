@@ -1,0 +1,278 @@
+"""Paper A's grasp network (section II-D, Table I): a depth picture in, grasp quality and closing direction out.
+
+78 803 parameters.  Table I prints 12 832 for the second 32-channel layer; its sum holds only with 25 632.  The faster
+forms below compute the same function.  (Both first convolutions as one of 17 x 17 would not: the zero padding between
+them is lost, and what stands at the border of a picture then draws the grasp.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from autonomy.networks.graph import AveragePool, BatchNorm, Conv, MaxPool, Network, Relu, Resize
+from autonomy.networks.openvino_net import OpenVinoNet
+from autonomy.networks.weights import SHIPPED, load
+
+SIDE_PX: Final = 300
+"""Side of the depth picture and of the full maps."""
+POOL: Final = 3
+"""The network works at a third of the picture's side."""
+SHAPE: Final = (1, 1, SIDE_PX, SIDE_PX)
+HEADS: Final = ("q", "cos2", "sin2")
+CANDIDATES: Final = 32
+NOT_FINITE: Final = "the quality map is not finite: no grasp can be chosen from it"
+PRECISIONS: Final = ("f32", "mixed")
+WEIGHTS: Final = SHIPPED / "grasp_cornell.safetensors"
+FAINT: Final = 0.005
+"""What stands out by this share of the ground's distance is plain to see; twice as much is not twice as plain."""
+MOST: Final = 0.5
+"""Nothing is told to stand out more than this."""
+STEP_PX: Final = 6
+SCALES: Final = (0.2, 0.1, 0.05, 0.03, 0.02, 0.015, 0.01, 0.01, 0.01, 0.01)
+FARTHER: Final = 3.0
+RIDGE: Final = np.diag([0.0, 1e-6, 1e-6])
+
+PAPER: Final = Network(
+    "grasp",
+    1,
+    (
+        AveragePool("pool", POOL),
+        Conv("conv1", 16, 11),
+        Conv("conv2", 16, 7),
+        Relu("relu2"),
+        BatchNorm("norm2"),
+        MaxPool("half", 2),
+        Conv("conv3", 16, 5),
+        Relu("relu3"),
+        Conv("conv4", 16, 5),
+        BatchNorm("norm4"),
+        Conv("conv5", 32, 5),
+        Conv("conv6", 32, 5),
+        Relu("relu6"),
+        BatchNorm("norm6"),
+        Resize("up2", 2),
+        Conv("conv7", 16, 5),
+        Relu("relu7"),
+        Resize("up3", POOL),
+        *(Conv(head, 1, 1, source="up3") for head in HEADS),
+    ),
+    HEADS,
+)
+"""Table I."""
+
+Arrays = Mapping[str, np.ndarray]
+Form = tuple[Network, dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True, slots=True)
+class GraspMaps:
+    """Quality and direction at every pixel: ``q``, ``cos2``, ``sin2`` (H, W), one entry every ``scale_px`` pixels of
+    the 300 x 300 picture.
+
+    The tongs close along (cos theta, sin theta) in pixels, x right and y down, theta = atan2(sin2, cos2) / 2.
+    """
+
+    q: np.ndarray
+    cos2: np.ndarray
+    sin2: np.ndarray
+    scale_px: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Best:
+    """Eq. 4: the pixel of the greatest quality, the closing direction in [-pi/2, pi/2] and the quality there."""
+
+    u_px: float
+    v_px: float
+    theta_rad: float
+    q: float
+
+
+class NoDepth(ValueError):
+    """A depth picture without one known pixel."""
+
+
+def best(maps: GraspMaps) -> Best:
+    """The grasp of eq. 4.
+
+    Maps at a third of the side give the same grasp as the full ones: bilinear interpolation by an odd factor keeps
+    every sample and never exceeds it.
+
+    Raises:
+        ValueError: the quality is not finite everywhere.
+    """
+    if not (np.isfinite(maps.q).all() and maps.q.size):
+        raise ValueError(NOT_FINITE)
+    return _at(maps, int(np.argmax(maps.q)))
+
+
+def _at(maps: GraspMaps, place: int) -> Best:
+    v, u = divmod(place, maps.q.shape[1])
+    middle = (maps.scale_px - 1) / 2
+    theta = 0.5 * math.atan2(float(maps.sin2[v, u]), float(maps.cos2[v, u]))
+    return Best(u * maps.scale_px + middle, v * maps.scale_px + middle, theta, float(maps.q[v, u]))
+
+
+def prepare(depth_m: np.ndarray) -> np.ndarray:
+    """The network's input (H, W) float32 from depth [m], NaN where unknown: how far things stand out of the ground.
+
+    The ground is the plane that most of the picture lies on or before; what stands out is told as a share of its
+    distance, so that a scene and its copy at another scale and slant give the same picture: what was learned from
+    objects of a hand's size on a table holds for logs. An arsinh lets a pen and a crate both be seen. Unknown pixels
+    count as ground; a picture without ground behind its objects has to be given one.
+
+    Raises:
+        NoDepth: no pixel is known.
+    """
+    known = np.isfinite(depth_m) & (depth_m > 0.0)
+    if not known.any():
+        raise NoDepth("the depth picture holds no known pixel; check the camera and what it looks at")
+    out = 1.0 - np.where(known, depth_m, 1.0).astype(np.float32) * _ground(depth_m, known)
+    return np.where(known, np.arcsinh(np.clip(out, -MOST, MOST) / np.float32(FAINT)), np.float32(0.0))
+
+
+def _ground(depth_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Inverse depth (H, W) float32 [1/m] of the ground: a plane is linear in the picture there.
+
+    Reweighted least squares over every sixth pixel, the scale shrinking; nearer pixels lose weight sooner than farther
+    ones, for things lie on the ground.
+    """
+    height, width = depth_m.shape
+    u, v = (np.arange(n) / max(height, width) - 0.5 for n in (width, height))
+    step = STEP_PX if known[::STEP_PX, ::STEP_PX].any() else 1
+    rows, columns = np.nonzero(known[::step, ::step])
+    inverse = 1.0 / depth_m[::step, ::step][rows, columns].astype(np.float64)
+    terms = np.stack([np.ones(len(inverse)), u[::step][columns], v[::step][rows]])
+    weight = np.ones(len(inverse))
+    for scale in SCALES:
+        weighted = terms * weight
+        plane = np.linalg.solve(weighted @ terms.T + weight.sum() * RIDGE, weighted @ inverse)
+        ground = plane @ terms
+        if ground.min() <= 0.0:  # it passes the camera, so it is none: take a level one
+            plane = np.array([np.median(inverse), 0.0, 0.0])
+            ground = plane @ terms
+        miss = inverse / ground - 1.0
+        weight = 1.0 / (1.0 + (miss / np.where(miss > 0.0, scale, FARTHER * scale)) ** 2)
+    found = (plane[0] + plane[1] * u)[None, :] + (plane[2] * v)[:, None]
+    return np.maximum(found, 1e-3 * inverse.min()).astype(np.float32)
+
+
+def heads_first(network: Network, arrays: Arrays) -> Form:
+    """The three heads as one, and before the upsampling: a 1 x 1 convolution commutes with bilinear interpolation."""
+    body = tuple(layer for layer in network.layers if layer.name not in (*HEADS, "up3"))
+    joint = Conv("heads", len(HEADS), 1, source=body[-1].name)
+    kept = {name: a for name, a in arrays.items() if name.split(".")[0] not in HEADS}
+    for kind in ("weight", "bias"):
+        kept[f"heads.{kind}"] = np.concatenate([arrays[f"{head}.{kind}"] for head in HEADS])
+    return replace(network, layers=(*body, joint, Resize("up3", POOL)), outputs=("up3",)), kept
+
+
+def low_resolution(network: Network, arrays: Arrays) -> Form:
+    """Maps at a third of the side, for ``best``; after ``heads_first``."""
+    return replace(network, layers=network.layers[:-1], outputs=("heads",)), dict(arrays)
+
+
+class GraspNet:
+    """The network as it runs on the machine: all maps to look at, and the grasp alone from maps at a third of the side.
+
+    Args:
+        arrays: weights of ``PAPER``.
+        precision: "f32", or "mixed": bf16 where the processor has it, and f32 where the grasp is decided.
+    """
+
+    def __init__(self, arrays: Arrays, precision: str = "f32") -> None:
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
+        self._form = heads_first(PAPER, arrays)
+        self._full: OpenVinoNet | None = None
+        self._choose = chooser(arrays, precision)
+
+    @classmethod
+    def shipped(cls, path: Path = WEIGHTS, precision: str = "f32") -> GraspNet:
+        """The net with the weights of a file.
+
+        Raises:
+            WeightsRefused: damaged or foreign weights.
+        """
+        return cls(load(path, PAPER)[0], precision)
+
+    def maps(self, depth_m: np.ndarray) -> GraspMaps:
+        """Maps of all pixels of a 300 x 300 depth picture [m], f32.
+
+        Raises:
+            ValueError: another size, or no depth at all (``NoDepth``).
+        """
+        self._full = self._full or OpenVinoNet(*self._form, SHAPE)
+        return stack(self._full(_picture(depth_m)))
+
+    def best(self, depth_m: np.ndarray) -> Best:
+        """The grasp of eq. 4 in a 300 x 300 depth picture [m].
+
+        Raises:
+            ValueError: another size, or no depth at all (``NoDepth``).
+        """
+        return self._choose(_picture(depth_m))
+
+
+def chooser(arrays: Arrays, precision: str = "f32") -> Callable[[np.ndarray], Best]:
+    """From a prepared picture (1, 1, 300, 300) to its grasp, by maps at a third of the side; as of ``GraspNet``.
+
+    "mixed" runs all in bf16, where neighbours become equal on flat quality and the grasp would wander; so the last
+    convolution and the heads are taken again in f32 at the best pixels, and these decide.
+    """
+    network, kept = low_resolution(*heads_first(PAPER, arrays))
+    if precision == "f32":
+        net = OpenVinoNet(network, kept, SHAPE)
+        return lambda picture: best(stack(net(picture)))
+    front = OpenVinoNet(replace(network, outputs=("norm6", "heads")), kept, SHAPE, "bf16")
+    weight = kept["conv7.weight"].reshape(len(kept["conv7.bias"]), -1).T
+    heads = kept["heads.weight"][:, :, 0, 0].T
+
+    def choose(picture: np.ndarray) -> Best:
+        found = front(picture)
+        quality = found["heads"][0, 0]
+        if not np.isfinite(quality).all():
+            raise ValueError(NOT_FINITE)
+        v, u = np.divmod(np.argpartition(quality, -CANDIDATES, axis=None)[-CANDIDATES:], quality.shape[1])
+        hidden = np.maximum(_patches(found["norm6"][0], v, u) @ weight + kept["conv7.bias"], 0.0)
+        again = hidden @ heads + kept["heads.bias"]
+        maps = np.full((len(HEADS), *quality.shape), -np.inf, np.float32)
+        maps[:, v, u] = again.T
+        return _at(GraspMaps(*maps, POOL), int(np.argmax(maps[0])))
+
+    return choose
+
+
+def _patches(features: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """What the last 5 x 5 convolution sees at places of the doubled features (C, H, W): (places, C * 25)."""
+    sides = []
+    for at, size in ((v, features.shape[1]), (u, features.shape[2])):
+        places = at[:, None] + np.arange(-2, 3)
+        source = np.maximum((places + 0.5) / 2 - 0.5, 0.0)
+        low = np.minimum(source.astype(int), size - 1)
+        share = (source - low).astype(np.float32)
+        inside = ((places >= 0) & (places < 2 * size)).astype(np.float32)
+        sides.append((low, np.minimum(low + 1, size - 1), (1.0 - share) * inside, share * inside))
+    (v0, v1, a0, a1), (u0, u1, b0, b1) = sides
+    rows = [(v0[:, :, None], a0[:, :, None]), (v1[:, :, None], a1[:, :, None])]
+    columns = [(u0[:, None, :], b0[:, None, :]), (u1[:, None, :], b1[:, None, :])]
+    seen = sum(features[:, y, x] * (a * b) for y, a in rows for x, b in columns)
+    return seen.transpose(1, 0, 2, 3).reshape(len(v), -1)
+
+
+def stack(found: Mapping[str, np.ndarray]) -> GraspMaps:
+    """The maps of the first picture in any form's outputs."""
+    q, cos2, sin2 = np.concatenate([v[0] for v in found.values()])
+    return GraspMaps(q, cos2, sin2, SIDE_PX // len(q))
+
+
+def _picture(depth_m: np.ndarray) -> np.ndarray:
+    if depth_m.shape != (SIDE_PX, SIDE_PX):
+        raise ValueError(f"the grasp network takes {SIDE_PX} x {SIDE_PX} depth pictures, not {depth_m.shape}")
+    return prepare(depth_m)[None, None]

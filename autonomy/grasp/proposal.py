@@ -1,0 +1,45 @@
+"""What a grasp planner proposes: one grasp in the base frame, with what it expects to come up and why.
+
+A planner is a callable ``(arm, logs, slew_rad, rot_rad) -> GraspProposal``; it raises ``NoGrasp``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from autonomy.logs import LogObservation
+from autonomy.motion.arm import Arm
+
+
+class NoGrasp(ValueError):
+    """No log can be picked or placed; the message says which and why."""
+
+
+class BunkFull(NoGrasp):
+    """A log has no room in the bunk."""
+
+
+@dataclass(frozen=True, slots=True)
+class GraspProposal:
+    """Where the middle between the tips comes to (base frame), how it is turned and what comes up.
+
+    ``yaw_rad`` is the direction of the opening axis; ``support_z_m`` the height that the tips sweep along, just above
+    it.  ``logs`` are places in the list that was planned from.
+    ``probability`` is that of success as the planner sees it, ``reason`` one sentence.
+    """
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    support_z_m: float
+    logs: tuple[int, ...]
+    probability: float
+    reason: str
+
+
+class Planner(Protocol):
+    """See the module."""
+
+    def __call__(self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float) -> GraspProposal: ...

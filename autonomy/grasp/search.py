@@ -1,0 +1,261 @@
+"""Grasps found by looking at all of them: the virtual world is known, so every candidate is scored in it directly.
+
+Stations along every log, shifted sideways and turned, at every height that a layer of logs may be taken from, are
+judged by the rule of ``autonomy.grasp.quality``; the best go through draws of what perception and crane are unsure of.
+Among grasps that are equally safe the one with more wood wins, then the one nearer to the wood's middle.  A machine on
+wheels knows no height of the ground: there the undersides of the logs that lie on no other tell it.  Inputs: log list,
+with covariances where perception gives them.  Failure: ``NoGrasp`` with one sentence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from math import isfinite, pi
+from typing import Final
+
+import numpy as np
+
+from autonomy.grasp.cylinders import (
+    LEAST_RADIUS_M,
+    Cylinders,
+    covariance_of,
+    cylinders,
+    draws_of,
+    grounded,
+    grounded_covariance,
+)
+from autonomy.grasp.direct import clearance, closing_height, known_ground_m, travel_height
+from autonomy.grasp.jaws import Jaws, jaws_of
+from autonomy.grasp.proposal import GraspProposal, NoGrasp
+from autonomy.grasp.quality import HEAP, LAYER, STRICT, WIDE, Rule, Scores, Sections, lies_upon, rate, sections
+from autonomy.logs import LogObservation
+from autonomy.motion.arm import Arm
+from autonomy.perception.estimate import RADIUS
+from machine.grapple import rotator_for_yaw
+from machine.kinematics import Unreachable
+
+ALONG: Final = np.linspace(-0.21, 0.21, 7)
+"""Stations, in lengths of the log from its middle; nearer to its ends an operator would not grip it."""
+SIDEWAYS_M: Final = np.linspace(-0.48, 0.48, 9)
+TURNED_RAD: Final = np.radians([-14.0, -7.0, 0.0, 7.0, 14.0])
+ABOUT: Final = 8
+"""So many logs, the topmost in reach, have candidates about them."""
+MIDDLE_M: Final = 0.15
+"""Off the middle by this much a grasp is worth a third of one in it."""
+SQUARE: Final = 0.04
+"""Mean squared sine of the logs' angles at which it is worth a third: 11 deg."""
+DRAWS: Final = 32
+FINALISTS: Final = 40
+CRANE_M: Final = (0.02, 0.02, 0.01)
+"""Standard deviation of where the crane puts the grapple."""
+CRANE_RAD: Final = 0.02
+HIDDEN_M: Final = 0.02
+"""Standard deviation of the radius of a log under others, at least: a camera sees a part of it."""
+SAFER: Final = 0.08
+"""So much less probable may a grasp be that takes more."""
+LEAST: Final = 0.75
+"""When no grasp is more probable than this, those are looked at too that only pinch or squeeze."""
+RULES: Final = ((STRICT, 1.0), (LAYER, 0.95), (WIDE, 0.65))
+"""First the strict one, with the success of such grasps over what the draws say."""
+FROM_BUNK: Final = (*RULES, (HEAP, 0.4))
+"""Where what lies there is all to go somewhere else, it does not matter which of it comes up."""
+SEED: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Arrays of one length: place [m], opening axis [rad], height that logs are taken above [m]."""
+
+    x: np.ndarray
+    y: np.ndarray
+    yaw: np.ndarray
+    level: np.ndarray
+
+
+class Search:
+    """A planner (``autonomy.grasp.proposal``).  Logs without a covariance count as known well.
+
+    ``rules``: how strict a grasp must be, the strictest first, each with its success over what the draws say.
+    """
+
+    def __init__(self, rules: Sequence[tuple[Rule, float]] = RULES) -> None:
+        self._rules = rules
+
+    def __call__(self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float) -> GraspProposal:
+        """The best grasp that the crane reaches; raises ``NoGrasp``."""
+        if not logs:
+            raise NoGrasp("no log is in view")
+        ground = known_ground_m(arm.profile)
+        jaws, world = jaws_of(arm.profile), cylinders(logs)
+        sigma = np.stack([covariance_of(log) for log in logs])
+        if isfinite(ground):
+            world, sigma = grounded(world, ground), grounded_covariance(sigma)
+        upon = lies_upon(world)
+        at = candidates(world, *_in_reach(arm, logs))
+        seen = sections(jaws, world, *at)
+        floor = np.full(len(at[0]), ground) if isfinite(ground) else _floor(jaws, seen, upon)
+        tops = np.unique(np.round(world.center[:, 2] + world.radius, 3))
+        levels = np.concatenate([floor[:, None], np.broadcast_to(tops, (len(floor), len(tops)))], axis=1)
+        under = upon.any(axis=1) & [log.covariance is not None for log in logs]
+        sigma[under, RADIUS, RADIUS] = np.maximum(sigma[under, RADIUS, RADIUS], HIDDEN_M**2)
+        drawn = draws_of(world, sigma, DRAWS, SEED)
+        plans = []
+        for rule, trust in self._rules:
+            reached = [float(np.max(plan[2])) for plan in plans]
+            if reached and (reached[0] >= LEAST or max(reached) >= trust):
+                break
+            found = rate(jaws, world, upon, _spread(seen), levels, rule)
+            if found.safe.any():
+                best, found = _finalists(at, levels, seen, found)
+                plans.append((best, found, trust * self._probability(jaws, drawn, upon, best, found.captured, rule)))
+        if not plans:
+            raise NoGrasp(
+                f"no grasp of the {_counted(logs)} is safe: every one closes on a log that stays, takes one from "
+                "under another or more than the grapple holds"
+            )
+        best, found, probability = max(plans, key=lambda plan: float(np.max(plan[2])))
+        captured, trouble = found.captured, ""
+        for i in _ranking(probability, found.count):
+            try:
+                self._reach(arm, best, int(i), logs, captured[i], rot_rad)
+            except Unreachable as error:
+                trouble = str(error)
+                continue
+            return self._proposal(best, int(i), captured[i], float(probability[i]), logs)
+        raise NoGrasp(f"no grasp of the {_counted(logs)} is in reach: {trouble}")
+
+    def _probability(
+        self, jaws: Jaws, drawn: Cylinders, upon: np.ndarray, best: Candidates, captured: np.ndarray, rule: Rule
+    ) -> np.ndarray:
+        """Share of the draws in which the rule holds and one of the wanted logs comes up."""
+        rng = np.random.default_rng(SEED + 1)
+        error = rng.standard_normal((DRAWS, 4)) * (*CRANE_M, CRANE_RAD)
+        world = Cylinders(drawn.center[:, None], drawn.axis[:, None], drawn.length[:, None], drawn.radius[:, None])
+        moved = [c[None, :] + error[:, k, None] for k, c in enumerate((best.x, best.y, best.level, best.yaw))]
+        found = rate(jaws, world, upon, sections(jaws, world, moved[0], moved[1], moved[3]), moved[2], rule)
+        return np.mean(found.safe & np.any(found.captured & captured, axis=-1), axis=0)
+
+    def _reach(
+        self, arm: Arm, best: Candidates, i: int, logs: Sequence[LogObservation], captured: np.ndarray, rot: float
+    ) -> None:
+        thinnest = min(log.diameter_m for log, c in zip(logs, captured, strict=True) if c)
+        low = closing_height(arm.profile, float(best.level[i]), thinnest)(0.0)
+        pose = arm.over(float(best.x[i]), float(best.y[i]), low, travel_height(arm.profile))
+        rotator_for_yaw(arm.profile, pose.slew_rad, float(best.yaw[i]), rot)
+
+    def _proposal(
+        self, best: Candidates, i: int, captured: np.ndarray, probability: float, logs: Sequence[LogObservation]
+    ) -> GraspProposal:
+        taken = tuple(int(k) for k in np.flatnonzero(captured))
+        names = ", ".join(str(logs[k].id) for k in taken)
+        left = len(logs) - len(taken)
+        reason = (
+            f"{_counted(taken)} ({names}) of {len(logs)} at once, "
+            f"{100 * probability:.0f} % of {DRAWS} draws hold it"
+            + (f"; {left} left lying" if left else "")
+            + ("; nothing better is there" if probability < LEAST else "")
+        )
+        return GraspProposal(
+            float(best.x[i]), float(best.y[i]), float(best.yaw[i]), float(best.level[i]), taken, probability, reason
+        )
+
+
+def _counted(logs: Sequence[object]) -> str:
+    return f"{len(logs)} log{'s' if len(logs) > 1 else ''}"
+
+
+def _in_reach(arm: Arm, logs: Sequence[LogObservation]) -> tuple[np.ndarray, np.ndarray]:
+    """The topmost logs (k,) that the crane reaches somewhere, and at which of the stations ``ALONG`` (k, stations).
+
+    Raises ``NoGrasp`` when it reaches none.
+    """
+    high = travel_height(arm.profile)
+    over_support = closing_height(arm.profile, 0.0, 2.0 * LEAST_RADIUS_M)(0.0) - clearance(2.0 * LEAST_RADIUS_M)
+    top, reached, trouble = list[int](), list[list[bool]](), ""
+
+    def served(log: LogObservation, along: float) -> bool:
+        nonlocal trouble
+        x, y, z = (c + along * log.length_m * a for c, a in zip(log.center_m, log.axis, strict=True))
+        try:
+            arm.over(x, y, z - log.diameter_m / 2 + clearance(log.diameter_m) + over_support, high)
+        except Unreachable as error:
+            trouble = trouble or f"log {log.id}: {error}"
+            return False
+        return True
+
+    for i in sorted(range(len(logs)), key=lambda i: -logs[i].center_m[2]):
+        whole = all(served(logs[i], along) for along in (0.0, ALONG[0], ALONG[-1]))
+        stations = [whole or served(logs[i], along) for along in ALONG]
+        if any(stations):
+            top.append(i)
+            reached.append(stations)
+        if len(top) == ABOUT:
+            break
+    if not top:
+        raise NoGrasp(f"no log is in reach; {trouble}")
+    return np.array(top), np.array(reached)
+
+
+def candidates(world: Cylinders, top: np.ndarray, reached: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All that are looked at, about the logs ``top`` (k,) where these are ``reached`` (k, stations): x, y [m] and
+    opening axis [rad].
+    """
+    center, axis, length = world.center[top], world.axis[top], world.length[top]
+    flat = np.arctan2(axis[:, 1], axis[:, 0])[:, None, None, None]
+    along = ALONG[:, None, None] * length[:, None, None, None]
+    side, turned = SIDEWAYS_M[:, None], TURNED_RAD
+    cx, cy, ax, ay = (v[:, k, None, None, None] for v in (center, axis) for k in (0, 1))
+    x = cx + along * ax - side * np.sin(flat)
+    y = cy + along * ay + side * np.cos(flat)
+    keep = np.broadcast_to(reached[:, :, None, None], np.broadcast_shapes(x.shape, turned.shape))
+    return tuple(a[keep] for a in np.broadcast_arrays(x, y, flat + turned + pi / 2))
+
+
+def _floor(jaws: Jaws, seen: Sections, upon: np.ndarray) -> np.ndarray:
+    """Height (c,) of the ground between the tongs of every candidate, by the logs that lie on it; -inf without any."""
+    between = seen.inside & (np.minimum(np.abs(seen.low_u), np.abs(seen.high_u)) < jaws.half_gap_m)
+    return np.asarray(np.max(np.where(between & ~upon.any(axis=0), seen.bottom, -np.inf), axis=-1))
+
+
+def _finalists(
+    at: tuple[np.ndarray, np.ndarray, np.ndarray], levels: np.ndarray, seen: Sections, found: Scores
+) -> tuple[Candidates, Scores]:
+    """The best of every set of logs that can be taken, best first."""
+    where = np.nonzero(found.safe)
+    safe = Scores(*(getattr(found, f.name)[where] for f in fields(Scores)))
+    near = Sections(*(getattr(seen, f.name)[where[0]] for f in fields(Sections)))
+    order = _varied(safe.lever * (1.0 + 0.3 * safe.count) * middling(near, safe.captured), safe.captured)
+    x, y, yaw = (c[where[0]][order] for c in at)
+    chosen = Scores(*(getattr(safe, f.name)[order] for f in fields(Scores)))
+    return Candidates(x, y, yaw, levels[where][order]), chosen
+
+
+def middling(at: Sections, captured: np.ndarray) -> np.ndarray:
+    """How well the captured logs stand in the middle between the tongs and square to them, 0..1."""
+    low = np.min(np.where(captured, at.low_u, np.inf), axis=-1)
+    high = np.max(np.where(captured, at.high_u, -np.inf), axis=-1)
+    askew = np.sum(np.where(captured, at.askew, 0.0), axis=-1) / np.sum(captured, axis=-1)
+    return np.exp(-(((low + high) / 2 / MIDDLE_M) ** 2) - askew / SQUARE)
+
+
+def _spread(at: Sections) -> Sections:
+    """The sections of candidates (c, n) with an axis for the heights, (c, 1, n)."""
+    return Sections(*(getattr(at, f.name)[:, None, :] for f in fields(Sections)))
+
+
+def _varied(rough: np.ndarray, captured: np.ndarray) -> np.ndarray:
+    """Indices of the finalists: the best of every set of captured logs first, so that no set crowds the others out."""
+    code = captured @ np.random.default_rng(SEED).random(captured.shape[1])
+    order = np.argsort(-rough, kind="stable")
+    sets, first = np.unique(code[order], return_index=True)
+    each = max(2, FINALISTS // len(sets))
+    keep = [order[code[order] == s][:each] for s in sets[np.argsort(first)][: FINALISTS // 2]]
+    chosen: np.ndarray = np.concatenate(keep)
+    return chosen[np.argsort(-rough[chosen], kind="stable")]
+
+
+def _ranking(probability: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Best first: as probable as the best but ``SAFER``, then more logs, then the order they come in."""
+    safe = probability >= np.max(probability) - SAFER
+    return np.lexsort((-np.where(safe, count, 0), -np.where(safe, 1.0, probability)))

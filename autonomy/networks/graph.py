@@ -1,0 +1,198 @@
+"""A convolutional network as plain data: layers by name, in the order in which they run.
+
+A layer reads the layer before it unless it names its ``source`` (``INPUT`` is the network's input).  Tensors are NCHW
+float32.  Every convolution pads with zeros so that its output has the input's size divided by the stride ("same").
+``torch_net`` and ``openvino_net`` both run such a description and agree; ``weights`` ties a file to it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from typing import Final
+
+INPUT: Final = "input"
+STATISTICS: Final = ("running_mean", "running_var")
+EPSILON: Final = 1e-5
+"""Added to the variance by every batch norm."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conv:
+    """A convolution to ``out`` channels; ``kernel`` is odd."""
+
+    name: str
+    out: int
+    kernel: int
+    stride: int = 1
+    dilation: int = 1
+    groups: int = 1
+    bias: bool = True
+    source: str = ""
+
+    @property
+    def padding(self) -> int:
+        """Zeros on every side [px]."""
+        return self.dilation * (self.kernel - 1) // 2
+
+
+@dataclass(frozen=True, slots=True)
+class BatchNorm:
+    """Batch normalisation; in use it is one scale and one shift a channel."""
+
+    name: str
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Relu:
+    """max(x, 0)."""
+
+    name: str
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Sigmoid:
+    """1 / (1 + exp(-x))."""
+
+    name: str
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MaxPool:
+    """The greatest of every ``factor`` x ``factor`` block; a rest at the far border is left out."""
+
+    name: str
+    factor: int
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class AveragePool:
+    """The mean of every ``factor`` x ``factor`` block; a rest at the far border is left out."""
+
+    name: str
+    factor: int
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Resize:
+    """Bilinear upsampling by a whole ``factor``; pixel areas correspond (corners not aligned), borders repeat."""
+
+    name: str
+    factor: int
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Concat:
+    """The channels of all sources, one after the other."""
+
+    name: str
+    sources: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Add:
+    """The sum of the sources."""
+
+    name: str
+    sources: tuple[str, ...]
+
+
+Layer = Conv | BatchNorm | Relu | Sigmoid | MaxPool | AveragePool | Resize | Concat | Add
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """A named network: input channels, layers, and the names of the layers whose results come out.
+
+    Raises:
+        ValueError: two layers of one name, a source that does not come before its reader, an even kernel, channels
+            that do not fit, or an output that is no layer.
+    """
+
+    name: str
+    channels: int
+    layers: tuple[Layer, ...]
+    outputs: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        widths = channels(self)
+        for name in self.outputs:
+            if name not in widths:
+                raise ValueError(f"network {self.name}: output {name!r} is no layer")
+
+
+def wired(network: Network) -> list[tuple[Layer, tuple[str, ...]]]:
+    """Every layer with the names of what it reads."""
+    found: list[tuple[Layer, tuple[str, ...]]] = []
+    before = INPUT
+    for layer in network.layers:
+        found.append((layer, layer.sources if isinstance(layer, Concat | Add) else (layer.source or before,)))
+        before = layer.name
+    return found
+
+
+def channels(network: Network) -> dict[str, int]:
+    """Channels of the input and of every layer's result.
+
+    Raises:
+        ValueError: as of ``Network``.
+    """
+    widths = {INPUT: network.channels}
+    for layer, sources in wired(network):
+        where = f"network {network.name}, layer {layer.name!r}"
+        if layer.name in widths or "." in layer.name or not layer.name:
+            raise ValueError(f"{where}: a name must be new, not empty and without a dot")
+        if unknown := [s for s in sources if s not in widths]:
+            raise ValueError(f"{where}: {unknown[0]!r} does not come before it")
+        width = [widths[s] for s in sources]
+        if isinstance(layer, Conv):
+            if layer.kernel % 2 == 0:
+                raise ValueError(f"{where}: kernel {layer.kernel} is even, only odd ones keep the size")
+            if width[0] % layer.groups or layer.out % layer.groups:
+                raise ValueError(f"{where}: {layer.groups} groups do not divide {width[0]} and {layer.out} channels")
+            widths[layer.name] = layer.out
+        elif isinstance(layer, Concat):
+            widths[layer.name] = sum(width)
+        elif isinstance(layer, Add) and len(set(width)) != 1:
+            raise ValueError(f"{where}: cannot add {width} channels")
+        else:
+            widths[layer.name] = width[0]
+    return widths
+
+
+def parameter_shapes(network: Network) -> dict[str, tuple[int, ...]]:
+    """Shape of every stored array by name, ``LAYER.weight`` and so on; statistics of batch norms included."""
+    widths = channels(network)
+    shapes: dict[str, tuple[int, ...]] = {}
+    for layer, sources in wired(network):
+        if isinstance(layer, Conv):
+            shapes[f"{layer.name}.weight"] = (
+                layer.out,
+                widths[sources[0]] // layer.groups,
+                layer.kernel,
+                layer.kernel,
+            )
+            if layer.bias:
+                shapes[f"{layer.name}.bias"] = (layer.out,)
+        elif isinstance(layer, BatchNorm):
+            for kind in ("weight", "bias", *STATISTICS):
+                shapes[f"{layer.name}.{kind}"] = (widths[layer.name],)
+    return shapes
+
+
+def parameter_count(network: Network) -> int:
+    """Trained numbers (a batch norm's statistics are not trained)."""
+    trained = (s for name, s in parameter_shapes(network).items() if not name.endswith(STATISTICS))
+    return sum(math.prod(shape) for shape in trained)
+
+
+def fingerprint(network: Network) -> str:
+    """Of everything that decides what the weights mean; the name does not count."""
+    return hashlib.sha256(repr((network.channels, network.layers, network.outputs)).encode()).hexdigest()[:16]

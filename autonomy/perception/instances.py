@@ -1,0 +1,257 @@
+"""The logs of a picture: the network's maps, the regions that edges part, and of each mask, box, axis and ends.
+
+A mask's outline runs through the picture's pixels: the map's probabilities are interpolated and cut at a half.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy import ndimage
+
+from autonomy.networks.openvino_net import OpenVinoNet
+from autonomy.networks.weights import SHIPPED, load
+from autonomy.perception.frame import Frame, check
+from autonomy.perception.network import (
+    COS2,
+    EDGE,
+    ENDS,
+    MASK,
+    MULTIPLE,
+    OFFSET_PX,
+    OFFSET_U,
+    OFFSET_V,
+    SIN2,
+    STRIDE,
+    channels,
+    unet,
+)  # fmt: skip
+from autonomy.perception.regions import Region, parted, sigmoid
+from autonomy.perception.resize import bilinear, doubled, shrunk
+from machine.optics import Intrinsics
+
+SIZE_PX: Final = 304
+LEAST_MASK: Final = 0.5
+LEAST_END: Final = 0.3
+TWICE: Final = 1.5  # pictures so many times longer than what is asked for are looked at at half the size too
+MASK_SHARE, EDGE_SHARE = 0.4, 0.8  # of the finer look in what two looks give
+
+
+@dataclass(frozen=True, slots=True)
+class Instance:
+    """One log in one picture.
+
+    mask (H, W) bool; ``box_px`` left, top, right, bottom of the mask, the last two exclusive; score 0..1; ``axis_px``
+    angle of the log's axis in the picture [rad, -pi/2..pi/2); ``ends_px`` both ends of the axis (u, v) [px] in its
+    direction; ``ends_seen`` which of them are the log's own, not where something hides it.
+    """
+
+    mask: np.ndarray
+    box_px: tuple[int, int, int, int]
+    score: float
+    axis_px: float
+    ends_px: tuple[tuple[float, float], tuple[float, float]]
+    ends_seen: tuple[bool, bool]
+
+
+class LogFinder:
+    """The network with its weights, for frames of any size; one thread.
+
+    Args:
+        variant: "rgbd" or "depth".
+        weights: file; None are the shipped ones of the variant.
+        size_px: about how long the network's picture is; frames are shrunk by a whole factor, or doubled when they
+            are shorter.  Of a picture longer than SIZE_PX a look at half the size is taken first, and so on.
+        precision: of the network, see ``OpenVinoNet``.
+
+    Raises:
+        WeightsRefused: the weights are missing, damaged or of another network.
+    """
+
+    def __init__(
+        self, variant: str = "rgbd", weights: Path | None = None, size_px: int = 2 * SIZE_PX, precision: str = "f32"
+    ) -> None:
+        self.variant, self.size_px, self._precision = variant, size_px, precision
+        self._network = unet(variant)
+        self._arrays, self.facts = load(weights or SHIPPED / f"logs_{variant}.safetensors", self._network)
+        self._nets: dict[tuple[int, int], OpenVinoNet] = {}
+
+    def segment(self, frame: Frame) -> tuple[Instance, ...]:
+        """The logs of a frame, the surest first; none is an empty tuple.
+
+        Raises:
+            FrameRefused: the frame cannot be a picture of its camera.
+        """
+        check(frame)
+        return self.find(frame.rgb, frame.depth_m, frame.intrinsics)
+
+    def find(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[Instance, ...]:
+        """As ``segment``; depth may be unknown everywhere (a photograph)."""
+        top, bottom, left, right = inside_bars(rgb)
+        window = (slice(top, bottom), slice(left, right))
+        own = pinhole.crop(left, top, right - left, bottom - top)
+        maps, scale = self._looks(rgb[window], depth_m[window], own)
+        found = instances(maps, scale, (bottom - top, right - left))
+        shape = depth_m.shape
+        return tuple(_placed(i, left, top, shape) for i in found) if shape != (bottom - top, right - left) else found
+
+    def _looks(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[np.ndarray, int]:
+        """Maps of a picture, looked at once or more, and how many of its pixels one of theirs is wide."""
+        longest = max(depth_m.shape)
+        factor = max(1, round(longest / self.size_px))
+        pictures = [(shrunk(rgb, depth_m, pinhole, factor), factor * STRIDE)]
+        while longest >= TWICE * factor * SIZE_PX:
+            factor *= 2
+            pictures.append((shrunk(rgb, depth_m, pinhole, factor), factor * STRIDE))
+        if self.size_px >= TWICE * longest:
+            pictures.insert(0, (doubled(rgb, depth_m, pinhole), STRIDE // 2))
+        maps = self.maps(*pictures[-1][0])
+        for picture, _ in reversed(pictures[:-1]):
+            maps = both(self.maps(*picture), maps)
+        return maps, pictures[0][1]
+
+    def maps(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> np.ndarray:
+        """Maps (8, h / 2, w / 2) of a picture of the network's size; padded to what the network takes."""
+        image = channels(rgb, depth_m, pinhole, self.variant)
+        h, w = image.shape[1:]
+        high, wide = -(-h // MULTIPLE) * MULTIPLE, -(-w // MULTIPLE) * MULTIPLE
+        padded = np.zeros((1, len(image), high, wide), np.float32)
+        padded[0, :, :h, :w] = image
+        if (high, wide) not in self._nets:
+            self._nets[high, wide] = OpenVinoNet(self._network, self._arrays, padded.shape, self._precision)
+        maps = self._nets[high, wide](padded)["maps"][0]
+        return maps[:, : -(-h // STRIDE), : -(-w // STRIDE)]
+
+
+@cache
+def _shipped() -> LogFinder:
+    return LogFinder()
+
+
+def segment(frame: Frame) -> tuple[Instance, ...]:
+    """The logs of a frame by the shipped RGB-D weights; see ``LogFinder.segment``."""
+    return _shipped().segment(frame)
+
+
+def inside_bars(rgb: np.ndarray) -> tuple[int, int, int, int]:
+    """Top, bottom, left, right of what a letterbox's black bars leave (all of it when all is black)."""
+    lit = rgb.any(axis=2)
+    rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
+    if not len(rows):
+        return 0, rgb.shape[0], 0, rgb.shape[1]
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+
+
+def both(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
+    """Maps (8, h, w) of a picture and of the same at half the size as one: votes from the coarse ones, which saw the
+    logs as wholes; masks, angles and edges from both, ends from the fine ones."""
+    h, w = fine.shape[1:]
+    y, x = (np.minimum(np.arange(n) // 2, n2 - 1) for n, n2 in ((h, coarse.shape[1]), (w, coarse.shape[2])))
+    near = coarse[:, y][:, :, x]
+    maps = fine.copy()
+    maps[COS2 : SIN2 + 1] += near[COS2 : SIN2 + 1]
+    pixel = STRIDE / OFFSET_PX
+    maps[OFFSET_U] = 2.0 * near[OFFSET_U] + pixel * (2.0 * x + 0.5 - np.arange(w))
+    maps[OFFSET_V] = 2.0 * near[OFFSET_V] + pixel * (2.0 * y + 0.5 - np.arange(h))[:, None]
+    down, across = (bilinear(n2, 2) for n2 in coarse.shape[1:])
+    rows, columns = np.minimum(np.arange(h), len(down) - 1), np.minimum(np.arange(w), len(across) - 1)
+    for i, share in ((MASK, MASK_SHARE), (EDGE, EDGE_SHARE)):
+        smooth = (down[rows] @ coarse[i] @ across[columns].T).astype(np.float32)
+        maps[i] = share * fine[i] + (1.0 - share) * smooth
+    return maps
+
+
+def instances(maps: np.ndarray, scale: int, shape: tuple[int, int]) -> tuple[Instance, ...]:
+    """The logs of maps (8, h, w), one pixel of which is ``scale`` pixels wide in a picture of ``shape`` (H, W)."""
+    sure = sigmoid(maps[MASK])
+    y, x = np.nonzero(sure > LEAST_MASK)
+    regions = parted(maps, x, y, sure[y, x], max(1, STRIDE // scale) ** 2)
+    if not regions:
+        return ()
+    labels = np.zeros(sure.shape, np.int32)
+    for number, region in enumerate(regions, 1):
+        labels[y[region.own], x[region.own]] = number
+    sure = np.where((sure > LEAST_MASK) & (labels == 0), 0.0, sure)
+    # Beside a log its half sure pixels belong to it too, for the outline runs through them.
+    nearest = ndimage.distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
+    labels = labels[tuple(nearest)]
+    ends = sigmoid(maps[ENDS])
+    found = []
+    for number, region in enumerate(regions, 1):
+        if instance := _instance(region, number, x, y, labels, sure, ends, scale, shape):
+            found.append(instance)
+    return tuple(sorted(found, key=lambda i: -i.score))
+
+
+def _instance(
+    region: Region,
+    number: int,
+    x: np.ndarray,
+    y: np.ndarray,
+    labels: np.ndarray,
+    sure: np.ndarray,
+    ends: np.ndarray,
+    scale: int,
+    shape: tuple[int, int],
+) -> Instance | None:
+    """The region at the resolution of the picture, ``scale`` pixels for each of a map's."""
+    px, py = x[region.own], y[region.own]
+    x0, x1 = max(0, int(px.min()) - 2), min(sure.shape[1], int(px.max()) + 3)
+    y0, y1 = max(0, int(py.min()) - 2), min(sure.shape[0], int(py.max()) + 3)
+    window = sure[y0:y1, x0:x1] * (labels[y0:y1, x0:x1] == number)
+    fine = bilinear(y1 - y0, scale) @ window @ bilinear(x1 - x0, scale).T
+    top, left = y0 * scale, x0 * scale
+    inside = fine[: shape[0] - top, : shape[1] - left] > LEAST_MASK
+    v, u = np.nonzero(inside)
+    if not len(u):
+        return None
+    v, u = v + top, u + left
+    mask = np.zeros(shape, bool)
+    mask[top : top + inside.shape[0], left : left + inside.shape[1]] = inside
+    axis = region.axis if region.axis[0] >= 0.0 else -region.axis
+    across = np.array([-axis[1], axis[0]])
+    along, side = u * axis[0] + v * axis[1], float(np.median(u * across[0] + v * across[1]))
+    low, high = np.percentile(along, (0.5, 99.5))
+    half = float(np.percentile(np.abs(u * across[0] + v * across[1] - side), 90))
+    points, seen = [], []
+    for reach in (low, high):
+        point, own = _end(reach * axis + side * across, ends, scale, max(2.0 * scale, 1.2 * half))
+        points.append(point)
+        seen.append(own)
+    box = (int(u.min()), int(v.min()), int(u.max()) + 1, int(v.max()) + 1)
+    return Instance(
+        mask, box, region.score, math.atan2(float(axis[1]), float(axis[0])), (points[0], points[1]), (seen[0], seen[1])
+    )
+
+
+def _end(point: np.ndarray, ends: np.ndarray, scale: int, reach_px: float) -> tuple[tuple[float, float], bool]:
+    """The end near ``point`` where the map of ends has one, else the point itself; and whether it has."""
+    at, reach = (point + 0.5) / scale - 0.5, reach_px / scale
+    x0, y0 = (max(0, math.floor(c - reach)) for c in at)
+    patch = ends[y0 : math.ceil(at[1] + reach) + 1, x0 : math.ceil(at[0] + reach) + 1]
+    if not patch.size or patch.max() < LEAST_END:
+        return (float(point[0]), float(point[1])), False
+    row, column = np.unravel_index(int(np.argmax(patch)), patch.shape)
+    weight = patch * (patch > 0.5 * patch.max())
+    rows, columns = np.ogrid[: patch.shape[0], : patch.shape[1]]
+    weight = weight * ((rows - row) ** 2 + (columns - column) ** 2 <= 9)
+    total = weight.sum()
+    u = (x0 + float((weight * columns).sum() / total) + 0.5) * scale - 0.5
+    v = (y0 + float((weight * rows).sum() / total) + 0.5) * scale - 0.5
+    return (u, v), True
+
+
+def _placed(found: Instance, left: int, top: int, shape: tuple[int, int]) -> Instance:
+    """An instance of a window at (left, top) in the whole picture."""
+    mask = np.zeros(shape, bool)
+    mask[top : top + found.mask.shape[0], left : left + found.mask.shape[1]] = found.mask
+    x0, y0, x1, y1 = found.box_px
+    (a, b), (c, d) = found.ends_px
+    ends = ((a + left, b + top), (c + left, d + top))
+    box = (x0 + left, y0 + top, x1 + left, y1 + top)
+    return Instance(mask, box, found.score, found.axis_px, ends, found.ends_seen)

@@ -1,0 +1,378 @@
+"""Render and compare: the cylinder whose outline and depth are those of a mask and its stereo picture.
+
+Robust least squares over seven numbers (across the view, along it, two tilts, both ends, radius) and the taper, with
+analytic rendering in place of pixels: outline points of the mask must touch the body, depth inside must be that of its
+visible surface.  Where something nearer cuts the mask, or the picture ends, the outline is not the log's: such points
+must only lie inside the body, an end without outline of its own is not an end, and a log of which one side shows is as
+wide as logs usually are, which the covariance says.  Stereo draws depth there to what is nearer, so it counts for less.
+Neighbouring points err alike, so they count for less than their number too.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from autonomy.perception.cylinder import MIN_PIXELS, Bodies, Cylinder, depth, outline, outline_and_depth, rays_of
+from autonomy.perception.estimate import END, START
+from machine.optics import Intrinsics
+
+OUTLINE_POINTS: Final = 80
+DEPTH_POINTS: Final = 80
+OUTLINE_SIGMA_PX: Final = 0.6  # of the mask's border, and of bark and bow against a straight cylinder
+ALIKE_PX: Final = 17.7  # sqrt(pi) x 10 px: along a line, stereo errs alike over this
+ALIKE_OUTLINE_PX: Final = 5.0
+FATTENED_PX: Final = 8  # so far do edges grow
+PROBE_PX: Final = 3  # this far outside the mask it is asked what is nearer
+PROBE_MARGIN_M: Final = 0.08
+RIM_PX: Final = 8  # a mask ends so near to the picture's rim without reaching it: that is no end of the log
+SHARED_PX: Final = 1.5  # so near to another log's outline a border is not surely a log's own
+DRAWN_M: Final = 0.15  # by so much is depth wrong that was drawn to what lies before, standard deviation
+USUAL_M, USUAL_SIGMA_M = 0.12, 0.05  # radius of a log of which one side is seen
+HALF_SEEN: Final = 0.8  # share of a border that is a log's own below which one of its sides may be hidden
+END_SIGMA_M: Final = 0.6  # of an end that is not seen
+OUTLINE_BEND: Final = 3.0  # standard deviations beyond which a point begins to count for less
+DEPTH_BEND, NEAR_BEND = 2.5, 1.5
+WIDE: Final = 6.0
+EXPLAINED: Final = 0.7  # share of the outline below which a fit is tried again
+GROWTH: Final = 0.006  # of the radius along a log [m/m], standard deviation; which end is the butt is not known
+ITERATIONS: Final = 14
+SETTLED: Final = 0.02  # squared length of a step, in standard deviations, that is the last
+STEP: Final = 1e-3  # of the numerical derivatives [m, rad]
+_EYE: Final = np.eye(8)
+_STEPS: Final = np.concatenate([np.zeros((1, 8)), STEP * _EYE])
+_LONGER: Final = np.zeros((3, 8))
+_LONGER[1, 4], _LONGER[2, 5] = -0.5, 0.5
+_REACH: Final = np.array([0.4, 0.6, 0.5, 0.5, 0.6, 0.6, 0.08, 0.02])  # greatest change of one iteration
+SHARE_PX, END_PX, GROWN_PX = 0.2, 1.0, 4.0  # of an outline, of an end, and of one seen along the axis
+GRASS: Final = 0.12  # of the noise of depth
+# What a straight cylinder cannot say of a log that tapers, bows and has bark: m, m, rad, rad, m, m, m.
+FLOOR: Final = np.array([0.004, 0.004, 0.004, 0.004, 0.008, 0.008, 0.003])
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What is known of a stereo camera's depth: focal length times baseline [px m] of its own picture, and the
+    standard deviation of its disparity [px]."""
+
+    fb_px_m: float
+    sigma_d_px: float = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A cylinder in the optical frame, its middle as the point; ``covariance`` (7, 7) of one frame's errors, in the
+    order of ``estimate`` but along ``across_view``'s directions, without the depth's common scale error;
+    ``ends_seen``; the share of the outline that is explained; pixels between model and outline (root mean square)."""
+
+    body: Cylinder
+    covariance: np.ndarray
+    ends_seen: tuple[bool, bool]
+    explained: float
+    misfit_px: float
+    lasting: np.ndarray
+    """Standard deviations (7,), in ``covariance`` too, of what pictures like this one get wrong alike."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """Border points (N,) of a mask [px], whether each is the log's own outline, and the number of the mask that it
+    touches there, 0 for none."""
+
+    u_px: np.ndarray
+    v_px: np.ndarray
+    own: np.ndarray
+    beside: np.ndarray
+
+    def without(self, fitted: dict[int, Cylinder], pin: Intrinsics) -> Outline:
+        """The points that are on the outline of a log beside it, by the fits so far, are that log's and not its own.
+
+        What lies before it is mostly seen whole and told well; the guess of what is half hidden is not, and would take
+        the other's outline for its own.
+        """
+        own = self.own.copy()
+        for number, body in fitted.items():
+            touch = np.flatnonzero(own & (self.beside == number))
+            if len(touch):
+                rays = rays_of(pin, self.u_px[touch], self.v_px[touch])
+                own[touch] = outline(Bodies.of(body), rays)[0] < -SHARED_PX * body.center_m[2] / pin.fx_px
+        return Outline(self.u_px, self.v_px, own, self.beside)
+
+
+def border(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Between every mask pixel and a neighbour outside it: the point between (u, v) (N,) [px] and the way out (N,).
+
+    Half-way points err by less than half a pixel and without bias.  The picture's own rim is no border.
+    """
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    top, left = max(0, int(rows[0]) - 1), max(0, int(columns[0]) - 1)
+    m = mask[top : rows[-1] + 2, left : columns[-1] + 2]
+    right, down = m[:, :-1] != m[:, 1:], m[:-1] != m[1:]
+    v1, u1 = np.nonzero(right)
+    v2, u2 = np.nonzero(down)
+    out_u = np.where(m[v1, u1], 1, -1)
+    out_v = np.where(m[v2, u2], 1, -1)
+    u = np.concatenate([u1 + 0.5, u2]) + left
+    v = np.concatenate([v1, v2 + 0.5]) + top
+    zero_1, zero_2 = np.zeros(len(u1), int), np.zeros(len(u2), int)
+    return u, v, np.concatenate([out_u, zero_2]), np.concatenate([zero_1, out_v])
+
+
+def own_outline(
+    mask: np.ndarray,
+    depth_m: np.ndarray,
+    pin: Intrinsics,
+    body: Cylinder,
+    sensor: Sensor,
+    window: tuple[int, int, int, int],
+    labels: np.ndarray | None = None,
+    others: dict[int, Cylinder] | None = None,
+) -> Outline:
+    """The mask's border, thinned to ``OUTLINE_POINTS``, and which of it is the log's own.
+
+    ``window`` (left, top, right, bottom) is where the picture shows anything; ``labels`` (H, W) numbers the masks and
+    ``others`` are the first guesses of the logs by their number.
+    """
+    u, v, du, dv = border(mask)
+    if len(u) > OUTLINE_POINTS:
+        pick = np.linspace(0, len(u) - 1, OUTLINE_POINTS).astype(int)
+        order = np.argsort(np.arctan2(v - v.mean(), u - u.mean()), kind="stable")[pick]
+        u, v, du, dv = u[order], v[order], du[order], dv[order]
+    left, top, right, bottom = window
+    pu = np.rint(u + (PROBE_PX - 0.5) * du).astype(int)
+    pv = np.rint(v + (PROBE_PX - 0.5) * dv).astype(int)
+    inside = (u >= left + RIM_PX) & (u < right - RIM_PX) & (v >= top + RIM_PX) & (v < bottom - RIM_PX)
+    pu, pv = np.clip(pu, 0, mask.shape[1] - 1), np.clip(pv, 0, mask.shape[0] - 1)
+    rays = rays_of(pin, u, v)
+    bodies = Bodies.of(body)
+    own_m, there_m = depth(bodies, rays)[0], depth_m[pv, pu]
+    margin = PROBE_MARGIN_M + 3.0 * own_m * own_m * sensor.sigma_d_px / sensor.fb_px_m
+    own = inside & ~(there_m < own_m - margin)
+    beside = np.zeros(len(u), int) if labels is None else labels[pv, pu]
+    if others:
+        for number, other in others.items():
+            touch = beside == number
+            if touch.any():
+                theirs = depth(Bodies.of(other), rays[touch])[0]
+                own[touch] = inside[touch] & (theirs > own_m[touch] + 0.02)
+    return Outline(u, v, own, beside)
+
+
+def refine(
+    mask: np.ndarray, depth_m: np.ndarray, pin: Intrinsics, first: Cylinder, border_px: Outline, sensor: Sensor
+) -> Fit | None:
+    """The best cylinder near ``first``; None when the mask has too little depth or outline, or no cylinder fits."""
+    problem = _Problem.of(mask, depth_m, pin, first, border_px, sensor)
+    if problem is None:
+        return None
+    first = problem.widened(first)
+    body = _descended(problem, first, 1.0)
+    fit = problem.judged(body) if body is not None else None
+    if fit is None or fit.explained < EXPLAINED:
+        # From a poor guess much of a true outline looks like outliers: forgive it at first.
+        body = _descended(problem, first, WIDE)
+        body = _descended(problem, body, 1.0) if body is not None else None
+        second = problem.judged(body) if body is not None else None
+        if fit is None or (second is not None and second.explained > fit.explained):
+            fit = second
+    return fit
+
+
+def _descended(problem: _Problem, body: Cylinder, forgive: float) -> Cylinder | None:
+    """Levenberg and Marquardt's way down from ``body``; None when numbers overflow."""
+    damping = 1e-3
+    for i in range(ITERATIONS):
+        if i in (0, 2):
+            metres_px = problem.gradient(body)
+            raw = problem.residuals(Bodies.around(body, _STEPS), metres_px)
+        residuals, jacobian, weights, cost = problem.linearised(raw, forgive)
+        wj = jacobian * weights[:, None]
+        normal, gradient = jacobian.T @ wj, wj.T @ residuals
+        if not (math.isfinite(cost) and np.isfinite(normal).all()):
+            return None
+        stiff = normal.diagonal() + 1e-6
+        for _ in range(4):
+            step = -np.linalg.solve(normal + damping * stiff * _EYE, gradient)
+            step *= min(1.0, 1.0 / float((np.abs(step) / _REACH).max()))
+            one = Bodies.around(body, step[None]).one(0)
+            if one.radius_m > 0.01 and one.length_m > 0.05 and one.center_m[2] > 0.1:
+                # With its neighbours: mostly it is taken, and these are wanted next.
+                raw = problem.residuals(Bodies.around(one, _STEPS), metres_px)
+                if problem.cost(raw[0], forgive) < cost:
+                    break
+            damping *= 10.0
+        else:
+            return body
+        body, damping = one, max(1e-6, damping * 0.1)
+        if step @ normal @ step < SETTLED * forgive * forgive:
+            return body
+    return body
+
+
+def _innermost(mask: np.ndarray) -> np.ndarray:
+    """The half of a mask (H, W) or more, that is furthest from any border, at most ``FATTENED_PX``."""
+    sums = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), np.int32)
+    np.cumsum(np.cumsum(mask, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
+    wanted = 0.4 * int(sums[-1, -1])
+    for reach in (FATTENED_PX, 5, 3, 2, 1):
+        side = 2 * reach + 1
+        if side > min(mask.shape):
+            continue
+        inside = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
+        if np.count_nonzero(inside == side**2) >= wanted:
+            inner = np.zeros(mask.shape, bool)
+            inner[reach:-reach, reach:-reach] = inside == side**2
+            return inner
+    return mask
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """Rays of the outline, rays of depth with inverse depths and their deviations, what all weigh, and the guess."""
+
+    rays: np.ndarray
+    own: np.ndarray
+    inverse: np.ndarray
+    spread: np.ndarray
+    weight: np.ndarray
+    bend: np.ndarray
+    pixel: float
+    noise: float
+    prior: Cylinder
+    drawn: float
+    """Share, of what depth tells, that is so near to something before the log that stereo may have drawn it there."""
+
+    @classmethod
+    def of(
+        cls, mask: np.ndarray, depth_m: np.ndarray, pin: Intrinsics, first: Cylinder, edge: Outline, sensor: Sensor
+    ) -> _Problem | None:
+        known = mask & np.isfinite(depth_m)
+        v, u = np.nonzero(known)
+        if len(u) < MIN_PIXELS or np.count_nonzero(edge.own) < 8:
+            return None
+        area = len(u)
+        long_px = max(math.hypot(float(np.ptp(edge.u_px)), float(np.ptp(edge.v_px))), 1.0)
+        cells = (1.0 + long_px / ALIKE_PX) * (1.0 + area / long_px / ALIKE_PX)
+        # Stereo lets near edges grow over what is behind them: what lies furthest from any border is least touched.
+        inner = _innermost(mask)[v, u]
+        u, v = u[inner], v[inner]
+        if len(u) > DEPTH_POINTS:
+            pick = np.linspace(0, len(u) - 1, DEPTH_POINTS).astype(int)
+            u, v = u[pick], v[pick]
+        inverse, noise = 1.0 / depth_m[v, u].astype(float), sensor.sigma_d_px / sensor.fb_px_m
+        du, dv = u[:, None] - edge.u_px[~edge.own], v[:, None] - edge.v_px[~edge.own]
+        touched = np.min(du * du + dv * dv, axis=1, initial=np.inf) < FATTENED_PX**2
+        spread = np.hypot(noise, touched * DRAWN_M * inverse * inverse)
+        worth = spread**-2.0
+        spacing = 2.0 * (long_px + area / long_px) / len(edge.u_px)
+        n, m = len(edge.u_px), len(u)
+        return cls(
+            rays_of(pin, np.concatenate([edge.u_px, u]), np.concatenate([edge.v_px, v])), edge.own, inverse, spread,
+            np.repeat([min(1.0, spacing / ALIKE_OUTLINE_PX), min(1.0, cells / m), 1.0], [n, m, 4]),
+            np.repeat([OUTLINE_BEND, DEPTH_BEND, 1e6], [n, m, 4]),
+            1.0 / pin.fx_px, noise, first, float(worth @ touched / worth.sum()),
+        )  # fmt: skip
+
+    def widened(self, first: Cylinder) -> Cylinder:
+        """``first``, or where one of its sides is hidden a log of usual width with its other side there, if that is
+        likelier: from the narrow strip that is seen there is no way down to it.
+        """
+        more = USUAL_M - first.radius_m
+        if more <= 0.0 or np.count_nonzero(self.own) > HALF_SEEN * len(self.own):
+            return first
+        steps = np.zeros((3, 8))
+        steps[1:, 6], steps[1:, 0] = more, (-more, more)
+        bodies = Bodies.around(first, steps)
+        raw = self.residuals(bodies, self.gradient(first))
+        return bodies.one(int(np.argmin([self.cost(r, WIDE) for r in raw])))
+
+    def gradient(self, body: Cylinder) -> np.ndarray:
+        """Metres of ``outline`` per pixel (N,)."""
+        one, p, rays = Bodies.of(body), self.pixel, self.rays[: len(self.own)]
+        shifts = np.array([(p, 0.0, 0.0), (0.0, p, 0.0), (-p, 0.0, 0.0), (0.0, -p, 0.0)])
+        g = outline(one, (rays + shifts[:, None]).reshape(-1, 3))[0].reshape(4, -1)
+        return np.maximum(0.5 * np.hypot(g[0] - g[2], g[1] - g[3]), 1e-4)
+
+    def residuals(self, bodies: Bodies, metres_px: np.ndarray) -> np.ndarray:
+        """What is left (K, N) of the K bodies, in standard deviations: outline, depth, two ends, radius, growth."""
+        edge, deep_m = outline_and_depth(bodies, self.rays, len(self.own))
+        edge /= metres_px
+        edge = np.where(self.own, edge, np.maximum(edge, 0.0)) / OUTLINE_SIGMA_PX
+        deep = (self.inverse - 1.0 / deep_m) / self.spread
+        start, end, radius, growth = bodies.size
+        usual = (radius - USUAL_M) / USUAL_SIGMA_M
+        ends = ((start - self.prior.start_m) / END_SIGMA_M, (end - self.prior.end_m) / END_SIGMA_M)
+        return np.concatenate([edge, deep, *ends, usual, growth / GROWTH], axis=1)
+
+    def linearised(self, raw: np.ndarray, forgive: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """Residuals (N,), their derivatives (N, 8), weights (N,) and cost by the residuals (9, N) around a body."""
+        bend = self._bend(raw[0], forgive)
+        far = (raw[0] / bend) ** 2
+        return raw[0], (raw[1:] - raw[0]).T / STEP, self.weight / (1.0 + far), self._loss(bend, far)
+
+    def cost(self, residuals: np.ndarray, forgive: float = 1.0) -> float:
+        """Cauchy's loss, whose weights ``linearised`` gives."""
+        bend = self._bend(residuals, forgive)
+        return self._loss(bend, (residuals / bend) ** 2)
+
+    def _loss(self, bend: np.ndarray, far: np.ndarray) -> float:
+        return float((self.weight * bend * bend) @ np.log1p(far))
+
+    def _bend(self, residuals: np.ndarray, forgive: float) -> np.ndarray:
+        """Where (N,) a residual begins to count as an outlier: sooner for depth that is too near, for grass is."""
+        wide = np.where(self.bend == OUTLINE_BEND, forgive * OUTLINE_BEND, self.bend)
+        return np.where((self.bend == DEPTH_BEND) & (residuals > 0.0), NEAR_BEND, wide)
+
+    def judged(self, body: Cylinder) -> Fit | None:
+        """The fit with its covariance; None when the data do not determine it."""
+        around = Bodies.around(body, _STEPS)
+        residuals, jacobian, weights, _ = self.linearised(self.residuals(around, self.gradient(body)))
+        edge = residuals[: len(self.own)]
+        weights[: len(self.own)][~self.own] = 0.0  # what only has to be inside tells of no width
+        normal = jacobian.T @ (jacobian * weights[:, None])
+        try:
+            covariance = np.linalg.inv(normal)
+        except np.linalg.LinAlgError:
+            return None
+        own = edge[self.own] * OUTLINE_SIGMA_PX
+        misfit = float(np.sqrt(np.mean(np.minimum(own * own, 25.0))))
+        covariance *= max(1.0, (misfit / OUTLINE_SIGMA_PX) ** 2)
+        lasting = self._lasting(body)
+        covariance[:7, :7] += np.diag(lasting**2)
+        ends = self._ends(body)
+        for row, seen in zip((START, END), ends, strict=True):
+            covariance[row, row] += 0.0 if seen else END_SIGMA_M**2  # whatever a few points of its sides pretend
+        move = 0.5 * (body.start_m + body.end_m)
+        shift = np.eye(7, 8)
+        shift[0, 2] = shift[1, 3] = shift[6, 7] = move
+        return Fit(
+            body.centered(), shift @ covariance @ shift.T, ends, float(np.mean(np.abs(own) < 2.0)), misfit, lasting
+        )
+
+    def _lasting(self, body: Cylinder) -> np.ndarray:
+        """Bark and bow, a share of a pixel of outline, grass before the log, which draws depth nearer; and, seen along
+        its axis, the nearer parts of the log itself, which stereo lets grow over the further ones; so it does with what
+        lies before it."""
+        z = float(body.center_m[2])
+        slant2 = min(0.99, float(body.axis @ body.center_m) ** 2 / float(body.center_m @ body.center_m))
+        across = math.sqrt(1.0 - slant2)
+        pixel, tilt = z * self.pixel, 2.0 / body.length_m
+        deep = math.hypot(GRASS * z * z * self.noise, DRAWN_M * self.drawn)
+        end = (END_PX + GROWN_PX * slant2) * pixel / across
+        tilt_deep = tilt * math.hypot(deep, 0.5 * end * across)
+        found = (SHARE_PX * pixel, deep, SHARE_PX * pixel * tilt, tilt_deep, end, end, SHARE_PX * pixel)
+        return np.hypot(FLOOR, found)
+
+    def _ends(self, body: Cylinder) -> tuple[bool, bool]:
+        """Whether each end has outline of its own: most of what of the border lies at it."""
+        three = Bodies.around(body, _LONGER)
+        here, start, end = outline(three, self.rays[: len(self.own)])
+        slack = 0.3 * self.pixel * float(body.center_m[2])
+        seen = []
+        for moved in (start, end):
+            at = here - moved > slack  # the border that a longer log would not have
+            seen.append(bool(np.count_nonzero(at & self.own) >= max(3, 0.5 * np.count_nonzero(at))))
+        return seen[0], seen[1]

@@ -1,0 +1,111 @@
+"""Frames over a local stream socket (``can_dbc.rgbd``): what a plant or a camera process on this host serves.
+
+Pull-style: the newest frame is asked for.  A call never takes longer than its timeout; what has come by then is kept
+for the next one.  A connection that breaks, or on which anything broken comes, is opened anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+
+import numpy as np
+
+from autonomy.perception.frame import Frame
+from can_dbc.rgbd import MM_M, START_BYTES, RgbdError, RgbdFrame, decode, encode_question, start
+from machine.optics import Intrinsics
+
+CHUNK: int = 1 << 20
+
+
+class StreamCamera:
+    """One camera of a server at ``address``: ``HOST:PORT``, or ``unix:PATH``.
+
+    ``problem`` says why the last call gave no frame, empty when it did.
+    """
+
+    def __init__(self, address: str, camera: str, timeout_s: float = 0.1) -> None:
+        self._address, self._camera, self._timeout_s = address, camera, timeout_s
+        self._socket: socket.socket | None = None
+        self._asked, self._data = False, bytearray()
+        self.problem = ""
+
+    def frame(self) -> Frame | None:
+        """The newest frame, or None with ``problem`` set."""
+        end_s = time.monotonic() + self._timeout_s
+        try:
+            frame = self._answer(end_s)
+        except (OSError, RgbdError) as error:
+            self.close()
+            self.problem = f"no frame of camera {self._camera} from {self._address}: {error or type(error).__name__}"
+            return None
+        self.problem = "" if frame else f"no frame of camera {self._camera} within {1000 * self._timeout_s:.0f} ms"
+        return frame
+
+    def close(self) -> None:
+        """Hang up; the next call connects again."""
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.close()
+        self._socket, self._asked = None, False
+        self._data.clear()
+
+    def _answer(self, end_s: float) -> Frame | None:
+        sock = self._socket or self._connected(end_s)
+        if not self._asked:
+            sock.settimeout(_left(end_s))
+            sock.sendall(encode_question(self._camera))
+            self._asked = True
+        wanted = START_BYTES
+        while True:
+            if len(self._data) >= START_BYTES:
+                wanted = START_BYTES + start(bytes(self._data[:START_BYTES])).rest
+            if len(self._data) >= wanted > START_BYTES:
+                break
+            left_s = end_s - time.monotonic()
+            if left_s <= 0.0:
+                return None
+            sock.settimeout(left_s)
+            try:
+                chunk = sock.recv(min(CHUNK, wanted - len(self._data)))
+            except TimeoutError:
+                return None
+            if not chunk:
+                raise ConnectionError("the server hung up")
+            self._data += chunk
+        data = bytes(self._data)
+        self._data.clear()
+        self._asked = False
+        return received(decode(data))
+
+    def _connected(self, end_s: float) -> socket.socket:
+        if self._address.startswith("unix:"):
+            sock, target = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM), self._address[5:]
+        else:
+            host, _, port = self._address.rpartition(":")
+            if not host or not port.isdigit():
+                raise RgbdError(f"'{self._address}' is neither HOST:PORT nor unix:PATH")
+            sock, target = socket.socket(socket.AF_INET, socket.SOCK_STREAM), (host, int(port))
+        sock.settimeout(_left(end_s))
+        try:
+            sock.connect(target)
+        except OSError:
+            sock.close()
+            raise
+        self._socket = sock
+        return sock
+
+
+def _left(end_s: float) -> float:
+    return max(1e-3, end_s - time.monotonic())
+
+
+def received(sent: RgbdFrame) -> Frame:
+    """A frame as it came over the wire: depth in m, NaN where it is unknown."""
+    shape = (sent.height_px, sent.width_px)
+    depth_m = np.frombuffer(sent.depth_mm, "<u2").reshape(shape).astype(np.float32) / np.float32(MM_M)
+    depth_m[depth_m == 0.0] = np.nan
+    pin = Intrinsics(sent.width_px, sent.height_px, sent.fx_px, sent.fy_px, sent.cx_px, sent.cy_px)
+    rgb = np.frombuffer(sent.rgb, np.uint8).reshape(*shape, 3)
+    return Frame(sent.camera, sent.stamp_ns, rgb, depth_m, pin)

@@ -1,0 +1,90 @@
+"""Training of paper B's detector in its role: boxes of logs from colour, learnt from labelled pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from rich.console import Console
+from torch.nn import functional as F
+
+from autonomy.networks.torch_net import TorchNet, random_net
+from autonomy.perception.detector import STRIDE, box_net, colour
+from autonomy.training.labels import ID, IGNORED, Labelled
+from autonomy.training.loop import Schedule, train
+from autonomy.training.segmentation import Picture, changed
+
+CROP_PX: Final = 256
+CORE: Final = 0.5  # cells whose spot is higher than this learn the box's sides
+SIDE_SHARE: Final = 1.0
+LEAST_PX: Final = 20
+
+
+def targets(sample: Labelled) -> tuple[np.ndarray, np.ndarray]:
+    """Maps (5, h, w) float32: spots (probability) at the middles of boxes, and logarithms of the distances to the sides
+    in STRIDE; weights (2, h, w) of both."""
+    h, w = (n // STRIDE for n in sample.ids.shape)
+    maps, weights = np.zeros((5, h, w), np.float32), np.ones((2, h, w), np.float32)
+    x, y = np.arange(w), np.arange(h)[:, None]
+    weights[1] = 0.0
+    for log in sample.logs:
+        rows, columns = (np.flatnonzero((sample.ids == log[ID]).any(axis=a)) for a in (1, 0))
+        if len(rows) * len(columns) < LEAST_PX:
+            continue
+        left, top, right, bottom = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
+        u, v = ((left + right) / 2 / STRIDE - 0.5, (top + bottom) / 2 / STRIDE - 0.5)
+        spread = 0.8 + 0.05 * min(right - left, bottom - top) / STRIDE
+        # The cell that the middle falls into is always a full hit.
+        near_u, near_v = (min(max(round(c), 0), n - 1) for c, n in ((u, w), (v, h)))
+        spot = np.exp(-((x - near_u) ** 2 + (y - near_v) ** 2) / (2.0 * spread * spread)).astype(np.float32)
+        core = (spot > CORE) & (spot >= maps[0])
+        middle = (x + 0.5) * STRIDE + 0.0 * y, (y + 0.5) * STRIDE + 0.0 * x
+        sides = (middle[0] - left, middle[1] - top, right - middle[0], bottom - middle[1])
+        for i, side in enumerate(sides, 1):
+            maps[i][core] = np.log(np.maximum(side[core], 0.5) / STRIDE)
+        weights[1][core] = 1.0
+        maps[0] = np.maximum(maps[0], spot)
+    blocks = sample.ids[: h * STRIDE, : w * STRIDE].reshape(h, STRIDE, w, STRIDE)
+    weights[0][(blocks == IGNORED).any(axis=(1, 3)) & (maps[0] < CORE)] = 0.0
+    return maps, weights
+
+
+def loss(net: torch.nn.Module, images: torch.Tensor, maps: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    """Focal cross entropy of the spots (Zhou et al. 2019) and distance of the sides' logarithms."""
+    found = net(images)["boxes"].float()
+    spot, logit = maps[:, 0], found[:, 0]
+    probability = torch.sigmoid(logit)
+    hit = (spot == 1.0).float()
+    away = (1.0 - spot) ** 4 * probability**2 * -F.logsigmoid(-logit)
+    near = (1.0 - probability) ** 2 * -F.logsigmoid(logit)
+    score = ((hit * near + (1.0 - hit) * away) * weights[:, 0]).sum() / (hit.sum() + 1.0)
+    sides = ((found[:, 1:] - maps[:, 1:]).abs().sum(1) * weights[:, 1]).sum() / (weights[:, 1].sum() + 1.0)
+    return score + SIDE_SHARE * sides
+
+
+def run(
+    picture: Picture, count: int, schedule: Schedule, size: int, seed: int, checkpoint: Path | None, console: Console
+) -> tuple[TorchNet, list[float]]:
+    """Train on ``count`` pictures in batches of ``size``; the net and the loss of every step."""
+    net = random_net(box_net(), seed).to(memory_format=torch.channels_last)
+    what = f"boxes, {count} pictures, batch {size}, seed {seed}"
+    losses = train(net, batches(picture, count, size, seed), loss, schedule, checkpoint, what, "boxes of logs", console)
+    return net.eval(), losses
+
+
+def batches(picture: Picture, count: int, size: int, seed: int) -> Callable[[int], tuple[torch.Tensor, ...]]:
+    """Batch of a step from ``count`` pictures."""
+
+    def batch(step: int) -> tuple[torch.Tensor, ...]:
+        rng = np.random.default_rng([seed, step])
+        rows = []
+        for index in rng.integers(0, count, size):
+            sample = changed(picture(int(index)), rng, CROP_PX)
+            rows.append((colour(sample.rgb), *targets(sample)))
+        images, maps, weights = (torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True))
+        return images.contiguous(memory_format=torch.channels_last), maps, weights
+
+    return batch

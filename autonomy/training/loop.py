@@ -1,0 +1,150 @@
+"""One training loop for every network: AdamW, warm-up and cosine, deterministic by seed, resumable at any step.
+
+What a step learns from is a function of its number, so a run that was stopped goes on as if it had not been.  Progress
+goes to stderr.  Ctrl-C ends the step, writes a checkpoint and leaves with KeyboardInterrupt.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import pickle
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+Batch = tuple[torch.Tensor, ...]
+WARM_UP: Final = 0.05
+"""Share of the steps in which the learning rate rises."""
+SMOOTHING: Final = 0.98
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """How long and how fast: steps, greatest learning rate, weight decay, whether products are taken in bf16."""
+
+    steps: int
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    bf16: bool = False
+    checkpoint_every_s: float = 120.0
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step (0-based)."""
+        warm = max(1, round(WARM_UP * self.steps))
+        if step < warm:
+            return self.learning_rate * (step + 1) / warm
+        return self.learning_rate * 0.5 * (1.0 + math.cos(math.pi * (step - warm) / max(1, self.steps - warm)))
+
+
+def train(
+    net: torch.nn.Module,
+    batch: Callable[[int], Batch],
+    loss: Callable[..., torch.Tensor],
+    schedule: Schedule,
+    checkpoint: Path | None,
+    run: str,
+    title: str,
+    console: Console,
+) -> list[float]:
+    """Train in place; returns the loss of every step.
+
+    Args:
+        net: what is trained.
+        batch: the tensors of a step, by its number alone.
+        loss: of the net and these tensors, a scalar.
+        schedule: as above.
+        checkpoint: file that is written now and then and removed at the end; None keeps nothing.
+        run: says what is trained on what; a checkpoint of another run is not continued.
+        title: of the progress bar.
+        console: where the bar is drawn.
+    """
+    optimiser = torch.optim.AdamW(net.parameters(), schedule.learning_rate, weight_decay=schedule.weight_decay)
+    name = f"{run} {asdict(schedule) | {'checkpoint_every_s': 0}}"
+    losses = _resumed(checkpoint, name, net, optimiser)
+    net.train()
+    written_s = time.monotonic()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+               TextColumn("{task.fields[loss]}"))  # fmt: skip
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(title, total=schedule.steps, completed=len(losses), loss="")
+        smooth = losses[-1] if losses else None
+        with _held_interrupt() as interrupted:
+            for step in range(len(losses), schedule.steps):
+                value = _step(net, optimiser, batch(step), loss, schedule, step)
+                if not math.isfinite(value):
+                    raise ValueError(f"{title}: the loss of step {step} is {value}; lower the learning rate")
+                losses.append(value)
+                smooth = value if smooth is None else SMOOTHING * smooth + (1.0 - SMOOTHING) * value
+                progress.update(task, advance=1, loss=f"loss {smooth:.4f}")
+                due = time.monotonic() - written_s > schedule.checkpoint_every_s
+                if checkpoint and (due or interrupted):
+                    _keep(checkpoint, name, net, optimiser, losses)
+                    written_s = time.monotonic()
+                if interrupted:
+                    raise KeyboardInterrupt
+    if checkpoint:
+        checkpoint.unlink(missing_ok=True)
+    return losses
+
+
+@contextmanager
+def _held_interrupt() -> Iterator[list[int]]:
+    """Ctrl-C is noted here instead of raised in the middle of a step, where the weights are half changed."""
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield noted  # only the main thread gets signals
+        return
+    before = signal.signal(signal.SIGINT, lambda number, _: noted.append(number))
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _step(
+    net: torch.nn.Module,
+    optimiser: torch.optim.Optimizer,
+    tensors: Batch,
+    loss: Callable[..., torch.Tensor],
+    schedule: Schedule,
+    step: int,
+) -> float:
+    for group in optimiser.param_groups:
+        group["lr"] = schedule.rate(step)
+    optimiser.zero_grad(set_to_none=True)
+    with torch.autocast("cpu", torch.bfloat16, enabled=schedule.bf16):
+        value = loss(net, *tensors)
+    value.backward()
+    optimiser.step()
+    return value.item()
+
+
+def _keep(path: Path, name: str, net: torch.nn.Module, optimiser: torch.optim.Optimizer, losses: list[float]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(path.name + ".part")
+    torch.save({"run": name, "net": net.state_dict(), "optimiser": optimiser.state_dict(), "losses": losses}, draft)
+    os.replace(draft, path)
+
+
+def _resumed(path: Path | None, name: str, net: torch.nn.Module, optimiser: torch.optim.Optimizer) -> list[float]:
+    if path is None or not path.is_file():
+        return []
+    try:
+        kept: dict[str, Any] = torch.load(path, weights_only=True)
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError):
+        return []
+    if kept.get("run") != name:
+        return []
+    net.load_state_dict(kept["net"])
+    optimiser.load_state_dict(kept["optimiser"])
+    return list(kept["losses"])

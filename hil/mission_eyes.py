@@ -1,0 +1,97 @@
+"""What sees the logs on a mission in lockstep: a detector without mistakes, or the front camera of the plant.
+
+``perfect`` is told where logs truly lie, round the crane and before the machine.  ``faithful`` and ``ours`` are given
+pictures of the front camera, whose mount was surveyed, while the crane rests; they find the logs in them with the
+shipped network and measure them as paper B did or as we do, and the crane works from what is remembered.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+
+from autonomy.front_eyes import FrontEyes, Ours, PaperB
+from autonomy.logs import LogObservation
+from autonomy.manager.manager import Manager
+from autonomy.manager.table import ENDS, RULES
+from autonomy.perception.frame import Frame, rescaled
+from autonomy.perception.instances import LogFinder
+from autonomy.perception.tracks import Errors
+from hil.camera_survey import survey
+from hil.lockstep import Eyes
+from hil.rig_camera import RigCamera
+from machine.profile import Profile
+from sim.camera.noise import StereoNoise
+from sim.camera.rig import CameraRig
+from sim.detector import detect_near
+from sim.plant import Plant
+
+CAMERA: Final = "front"
+SURVEYED: Final = Errors(scale=0.0015, mount_rad=0.0015, mount_m=0.004, pose_rad=0.002, pose_m=0.012)
+"""What a surveyed mount and a dual-antenna RTK receiver leave."""
+
+
+class NearEyes:
+    """Every log that a camera could see, where it truly lies."""
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant = plant
+
+    def look(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...]:
+        """The logs in the crane's base frame, which looks backwards."""
+        return tuple(
+            LogObservation(log.id, log.position_m, log.axis, log.length_m, log.diameter_m)
+            for log in detect_near(self._plant)
+        )
+
+
+class RouteEyes:
+    """The front camera, asked while the crane rests."""
+
+    def __init__(self, front: FrontEyes, manager: Manager) -> None:
+        self._front, self._manager = front, manager
+
+    def look(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
+        """The logs of a picture taken now."""
+        manager = self._manager
+        outlook = manager.outlook
+        if RULES[manager.state].crane or manager.state in ENDS or not outlook.located or outlook.vehicle is None:
+            return None
+        return self._front.look(outlook.base_at(now_ns), q, outlook.vehicle.articulation_rad)
+
+
+class Surveyed:
+    """A camera whose depth is set right by what a survey found."""
+
+    def __init__(self, source: RigCamera, depth_scale: float) -> None:
+        self._source, self._depth_scale = source, depth_scale
+
+    def frame(self) -> Frame:
+        """What it sees now."""
+        return rescaled(self._source.frame(), self._depth_scale)
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self._source.close()
+
+
+def eyes_of(kind: str, plant: Plant, profile: Profile, manager: Manager, seed: int) -> Eyes:
+    """Eyes of a kind.
+
+    Raises:
+        ValueError: the machine has no front camera, or the network's weights are missing.
+    """
+    if kind == "perfect":
+        return NearEyes(plant)
+    if CAMERA not in profile.cameras:
+        raise ValueError(f"{profile.name} has no camera {CAMERA!r}; add [cameras.{CAMERA}] to the profile")
+    camera, truth = profile.cameras[CAMERA], plant.world.truth
+    scale = StereoNoise(camera, truth.cameras[CAMERA], f"{CAMERA} {seed}").scale  # as the rig's own camera has it
+    known = survey(camera, truth.cameras[CAMERA], scale, random.Random(f"survey {seed}"))
+    seeing = msgspec.structs.replace(profile, cameras={**profile.cameras, CAMERA: known.camera})
+    source = Surveyed(RigCamera(CameraRig(plant.world, profile, truth, seed), CAMERA), known.depth_scale)
+    sight = Ours(seeing, SURVEYED) if kind == "ours" else PaperB()
+    return RouteEyes(FrontEyes(seeing, CAMERA, source, LogFinder().segment, sight), manager)

@@ -1,0 +1,163 @@
+"""The log networks' weight files: trained on drawn pictures, judged on drawn pictures of piles kept apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from autonomy.networks.weights import load
+from autonomy.perception.detector import box_net
+from autonomy.perception.instances import LogFinder
+from autonomy.perception.network import unet
+from autonomy.training import boxes
+from autonomy.training.card import Card, write
+from autonomy.training.labels import ID, Labelled
+from autonomy.training.loop import Schedule
+from autonomy.training.segmentation import CROPS, run
+from hil.experiments.detector.precision import Matches, average_precision, box_overlaps, curve, mask_overlaps
+from hil.training import samples
+from hil.training.piles import HELD_OUT
+from hil.training.samples import pictures, shard
+
+BATCH: Final = 16
+LEARNING_RATE: Final = 3e-3
+JUDGED: Final = 128  # pictures
+LEAST_PX: Final = 30  # of a log that counts when the card's figures are made
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is learnt from how many pictures, in how many steps, from which weights (None: from scratch)."""
+
+    count: int
+    steps: int
+    seed: int
+    learning_rate: float = LEARNING_RATE
+    start: Path | None = None
+
+    def words(self, crops_px: str) -> str:
+        """For the card."""
+        begin = f", begun with {self.start.name}" if self.start else ""
+        return (
+            f"{self.steps} steps of up to {BATCH} windows of {crops_px} px, AdamW with {self.learning_rate} and a "
+            f"cosine, products in bf16{begin}"
+        )
+
+    def command(self, what: str, out: Path) -> str:
+        """That makes the weights again."""
+        start = f" --start {self.start.name}" if self.start else ""
+        return (
+            f"timberhand train {what} --pictures {self.count} --steps {self.steps} --seed {self.seed} "
+            f"--learning-rate {self.learning_rate}{start} --out {out.name}"
+        )
+
+
+def produce(variant: str, plan: Plan, folder: Path, out: Path, console: Console) -> Path:
+    """Train on pictures kept in ``folder`` (drawn first where missing) and write weights and card; a run that was
+    stopped goes on.  Returns the card's path.
+
+    Raises:
+        WeightsRefused: the weights to start from are missing, damaged or of another network.
+    """
+    start = load(plan.start, unet(variant))[0] if plan.start else None
+    source = ready(folder, plan.count, console)
+    schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
+    kept = out.with_suffix(".checkpoint")
+    net, losses = run(source, plan.count, variant, schedule, BATCH, plan.seed, kept, console, start)
+    return ship(variant, net.arrays(), losses, plan, source, out)
+
+
+def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path:
+    """Paper B's detector in its role, in the same way (always from scratch).  Returns the card's path."""
+    source = ready(folder, plan.count, console)
+    schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
+    kept = out.with_suffix(".checkpoint")
+    net, losses = boxes.run(source, plan.count, schedule, BATCH, plan.seed, kept, console)
+    card = Card(
+        "Boxes of logs in colour pictures",
+        "Letterboxed colour picture of 608 x 608 px in, boxes of logs out: the role of paper B's YOLOv3 (3.2.2).",
+        f"{plan.count} pictures drawn by the analytic renderer of settled piles (hil.training); nothing photographed",
+        plan.words(str(boxes.CROP_PX)),
+        plan.seed,
+        {"loss, mean of the last 100 steps": f"{np.mean(losses[-100:]):.4f}"},
+        "photographs: its colours are drawn. How it does on worlds that are drawn otherwise is in docs/detector.md.",
+        plan.command("detector", out),
+    )
+    return write(out, box_net(), net.arrays(), card, {})
+
+
+def ready(folder: Path, count: int, console: Console) -> Callable[[int], Labelled]:
+    """Draw what is missing of the first ``count`` pictures and of the ones kept apart."""
+    numbers = [*range(-(-count // samples.SHARD)), HELD_OUT]
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task("drawing pictures", total=samples.SHARD * len(numbers))
+        for done, number in enumerate(numbers, 1):
+            shard(folder, number, tick=lambda: progress.advance(task))
+            progress.update(task, completed=done * samples.SHARD)
+    return pictures(folder)
+
+
+def ship(
+    variant: str,
+    arrays: dict[str, np.ndarray],
+    losses: list[float],
+    plan: Plan,
+    source: Callable[[int], Labelled],
+    out: Path,
+) -> Path:
+    """Write trained weights with their card; returns the card's path."""
+    network = unet(variant)
+    card = Card(
+        f"Logs in pictures, from {'colour and depth' if variant == 'rgbd' else 'depth alone'}",
+        "Picture in, eight maps out, of which single logs are made: mask, centre, offset to it, angle, ends, edges.",
+        f"{plan.count} pictures drawn by the analytic renderer of settled piles (hil.training); nothing photographed",
+        plan.words(" and ".join(str(crop) for crop, _ in CROPS)),
+        plan.seed,
+        {"loss, mean of the last 100 steps": f"{np.mean(losses[-100:]):.4f}"},
+        "wood that is no log on the ground: standing trees, stumps, planks. Its colours are drawn: on "
+        "photographs it is a sketch. What it does on worlds that are drawn otherwise is in docs/detector.md.",
+        plan.command(f"segmentation --variant {variant}", out),
+    )
+    write(out, network, arrays, card, {})
+    figures = judged(LogFinder(variant, out), source)
+    return write(out, network, arrays, replace(card, metrics={**card.metrics, **figures}), {})
+
+
+def judged(finder: LogFinder, source: Callable[[int], Labelled]) -> dict[str, str]:
+    """Average precision on drawn pictures of piles kept apart, as text."""
+    by_masks, by_boxes = [], []
+    for index in range(HELD_OUT * samples.SHARD, HELD_OUT * samples.SHARD + JUDGED):
+        by_mask, by_box = matches(finder, source(index))
+        by_masks.append(by_mask)
+        by_boxes.append(by_box)
+    told = {}
+    for name, found in (("boxes", by_boxes), ("masks", by_masks)):
+        told[f"{name}, mAP@0.5 on {JUDGED} pictures of piles kept apart"] = f"{curve(found, 0.5).average:.3f}"
+        told[f"{name}, mAP@0.5:0.95 on them"] = f"{average_precision(found):.3f}"
+    return told
+
+
+def matches(finder: LogFinder, sample: Labelled) -> tuple[Matches, Matches]:
+    """What is found in a picture against its truth, by masks and by boxes."""
+    found = finder.find(sample.rgb, sample.depth_m, sample.intrinsics)
+    truth = [sample.ids == log[ID] for log in sample.logs]
+    small = np.array([t.sum() < LEAST_PX for t in truth], bool)
+    scores = np.array([i.score for i in found])
+    by_box = box_overlaps(np.array([i.box_px for i in found]), np.array([box_of(t) for t in truth]))
+    return (
+        Matches(scores, mask_overlaps([i.mask for i in found], truth), small),
+        Matches(scores, by_box, small),
+    )
+
+
+def box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of a mask that is not empty, the last two exclusive."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)

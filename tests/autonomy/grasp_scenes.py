@@ -1,0 +1,37 @@
+"""Logs for grasp planners: beside, upon and across each other, in the pick area of palms_471."""
+
+from __future__ import annotations
+
+from math import cos, sin, sqrt
+
+from autonomy.logs import LogObservation
+from autonomy.motion.arm import Arm
+from machine.load import load_profile
+
+PROFILE = load_profile("palms_471")
+ARM = Arm(PROFILE)
+GROUND = PROFILE.workspace.ground_z_m
+X, Y = PROFILE.workspace.pick_center_m
+
+
+def log(
+    number: int, across_m: float = 0.0, z_m: float = 0.0, yaw: float = 0.0, diameter: float = 0.2, along_m: float = 0.0
+) -> LogObservation:
+    """A log of 2.6 m whose underside is ``z_m`` over the ground, axis along +x turned by ``yaw``."""
+    center = (X + along_m, Y + across_m, GROUND + z_m + diameter / 2)
+    return LogObservation(number, center, (cos(yaw), sin(yaw), 0.0), 2.6, diameter)
+
+
+def pair() -> list[LogObservation]:
+    """Two logs side by side."""
+    return [log(0, -0.105), log(1, 0.105)]
+
+
+def small_pile() -> list[LogObservation]:
+    """Two logs and a third in their valley."""
+    return [*pair(), log(2, 0.0, sqrt(0.205**2 - 0.105**2))]
+
+
+def cross() -> list[LogObservation]:
+    """One log across two others that lie apart."""
+    return [log(0, -0.4), log(1, 0.4), log(2, 0.0, 0.2, yaw=1.4)]

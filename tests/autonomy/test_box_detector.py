@@ -1,0 +1,69 @@
+"""Paper B's detector in its role: decoding, targets, refusals."""
+
+import numpy as np
+import pytest
+from drawn_logs import picture
+from rich.console import Console
+
+from autonomy.networks.graph import parameter_count
+from autonomy.networks.torch_net import random_net
+from autonomy.networks.weights import WeightsRefused, save
+from autonomy.perception.detector import SIZE_PX, BoxFinder, box_net, decoded
+from autonomy.training import boxes
+from autonomy.training.boxes import run, targets
+from autonomy.training.loop import Schedule
+
+LOGS = (((60.0, 70.0), 0.4, 80, 14), ((140.0, 120.0), 1.2, 100, 16))
+
+
+def perfect(maps):
+    out = maps.copy()
+    p = np.clip(maps[0], 1e-3, 1.0 - 1e-3)
+    out[0] = np.log(p / (1.0 - p))
+    return out
+
+
+def test_boxes_of_perfect_maps_are_those_of_the_logs():
+    sample = picture(*LOGS, size=208)
+    found, scores = decoded(perfect(targets(sample)[0]))
+    assert len(found) == 2 and (scores > 0.9).all()
+    for number in (1, 2):
+        v, u = np.nonzero(sample.ids == number)
+        box = (u.min(), v.min(), u.max() + 1, v.max() + 1)
+        assert np.abs(found - box).max(axis=1).min() < 0.51
+
+
+def test_a_second_box_upon_the_first_is_dropped_and_a_neighbour_is_kept():
+    maps = np.full((5, 30, 30), -9.0, np.float32)
+    for x, score in ((10, 3.0), (12, 2.0), (20, 1.0)):
+        maps[:, 10, x] = (score, *np.log([6.0, 3.0, 6.0, 3.0]))
+    found, scores = decoded(maps)
+    assert len(found) == 3  # two steps of 8 px aside: overlap 0.71
+    maps[1:, 10, 12] = np.log([7.0, 3.0, 5.0, 3.0])  # now the same box
+    found, scores = decoded(maps)
+    assert len(found) == 2 and scores[0] > scores[1]
+
+
+def test_nothing_is_found_in_nothing():
+    found, scores = decoded(np.full((5, 10, 10), -9.0, np.float32))
+    assert found.shape == (0, 4) and scores.shape == (0,)
+
+
+def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
+    path = tmp_path / "boxes.safetensors"
+    save(path, box_net(), random_net(box_net(), 1).arrays(), {})
+    finder = BoxFinder(path)
+    with pytest.raises(ValueError, match="608 x 608"):
+        finder.boxes(np.zeros((304, 304, 3), np.uint8))
+    found, _ = finder.boxes(np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8))
+    assert found.shape[1] == 4
+    with pytest.raises(WeightsRefused):
+        BoxFinder(tmp_path / "none.safetensors")
+    assert parameter_count(box_net()) < 500_000
+
+
+def test_a_few_steps_learn(monkeypatch):
+    monkeypatch.setattr(boxes, "CROP_PX", 64)
+    samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 60, 14), size=160) for i in range(4)]
+    _, losses = run(samples.__getitem__, 4, Schedule(10, 3e-3), 2, 5, None, Console(stderr=True, quiet=True))
+    assert np.mean(losses[-3:]) < 0.8 * np.mean(losses[:2])

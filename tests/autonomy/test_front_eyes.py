@@ -1,0 +1,136 @@
+"""The front camera of a machine that drives: a drawn log comes out where it lies, bent machine or straight."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from autonomy.front_eyes import FARTHEST_M, PATIENCE, FrontEyes, Ours, PaperB
+from autonomy.logs import LogObservation
+from autonomy.perception.frame import Frame, Pose
+from autonomy.perception.mount import optical_pose
+from autonomy.perception.sources import SourceError
+from machine.load import load_profile
+from machine.optics import intrinsics
+from tests.autonomy.test_manager_field import base
+
+PROFILE = load_profile("aoro_fc8")
+PIN = intrinsics(PROFILE.cameras["front"]).scaled(0.5)
+Q = (0.0, 1.2, -2.4, 0.1, 0.0)
+RADIUS_M, LENGTH_M = 0.125, 2.0
+
+
+@dataclass
+class Mask:
+    mask: np.ndarray
+
+
+class Field:
+    """One log on level ground at z = 0 of the plane; a camera and a detector of it."""
+
+    def __init__(self, x_m: float, y_m: float, yaw_rad: float) -> None:
+        self.center = np.array([x_m, y_m, RADIUS_M])
+        self.axis = np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
+        self.pose: Pose | None = None
+        self.mask = np.zeros((PIN.height_px, PIN.width_px), bool)
+        self.trouble = ""
+        self.count = 0
+
+    def stand(self, at: Pose, articulation_rad: float) -> None:
+        mount = optical_pose(PROFILE, PROFILE.cameras["front"], Q, articulation_rad)
+        self.pose = Pose(at.to_base(mount.position_m), at.rotation @ mount.rotation)
+
+    def frame(self) -> Frame | None:
+        if self.trouble:
+            raise SourceError(self.trouble)
+        assert self.pose is not None
+        self.count += 1
+        u, v = np.meshgrid(np.arange(PIN.width_px), np.arange(PIN.height_px))
+        ahead = np.ones(u.shape)
+        rays = np.stack([(u - PIN.cx_px) / PIN.fx_px, (v - PIN.cy_px) / PIN.fy_px, ahead], axis=-1)
+        rays = rays @ self.pose.rotation.T
+        eye = self.pose.position_m
+        depth = np.where(rays[..., 2] < -1e-3, -eye[2] / np.minimum(rays[..., 2], -1e-3), np.nan)
+        across = rays - (rays @ self.axis)[..., None] * self.axis
+        off = eye - self.center - ((eye - self.center) @ self.axis) * self.axis
+        a, b = np.sum(across**2, axis=-1), across @ off
+        root = b * b - a * (off @ off - RADIUS_M**2)
+        near = (-b - np.sqrt(np.maximum(root, 0.0))) / a
+        along = (eye + near[..., None] * rays - self.center) @ self.axis
+        self.mask = (root > 0.0) & (near > 0.0) & (np.abs(along) < 0.5 * LENGTH_M)
+        depth = np.where(self.mask, near, np.where(depth < 20.0, depth, np.nan)).astype(np.float32)
+        return Frame("front", self.count, np.full((*depth.shape, 3), 90, np.uint8), depth, PIN)
+
+    def close(self) -> None: ...
+
+    def found(self, frame: Frame) -> list[Mask]:
+        return [Mask(self.mask)]
+
+
+def look(field: Field, at: Pose, articulation_rad: float, sight, times: int = 3) -> tuple[LogObservation, ...]:
+    eyes = FrontEyes(PROFILE, "front", field, field.found, sight)
+    field.stand(at, articulation_rad)
+    for _ in range(times):
+        logs = eyes.look(at, Q, articulation_rad)
+    assert logs is not None and not eyes.trouble
+    return logs
+
+
+def plane_error_m(log: LogObservation, at: Pose, field: Field) -> float:
+    return float(np.linalg.norm(at.to_base(np.array(log.center_m)) - field.center))
+
+
+@pytest.mark.parametrize("articulation_rad", [0.0, 0.4])
+@pytest.mark.parametrize("yaw_rad", [0.0, 1.2])
+def test_ours_finds_the_log_to_centimetres_from_a_machine_that_looks_anywhere(
+    articulation_rad: float, yaw_rad: float
+) -> None:
+    at = base(10.0, -5.0, yaw_rad + math.pi)  # the base looks backwards
+    ahead = yaw_rad + articulation_rad
+    field = Field(10.0 + 9.0 * math.cos(ahead), -5.0 + 9.0 * math.sin(ahead), ahead + 1.3)
+    (log,) = look(field, at, articulation_rad, Ours(PROFILE))
+    assert plane_error_m(log, at, field) < 0.04
+    assert abs(np.dot(at.rotation @ np.array(log.axis), field.axis)) > math.cos(math.radians(3.0))
+    assert log.diameter_m == pytest.approx(0.25, abs=0.03) and log.covariance is not None
+
+
+def test_paper_b_is_a_point_with_the_size_of_its_mean_log() -> None:
+    at = base(0.0, 0.0, math.pi)
+    field = Field(8.0, 0.5, 1.5)
+    (log,) = look(field, at, 0.0, PaperB())
+    assert plane_error_m(log, at, field) < 0.15
+    assert (log.length_m, log.diameter_m) == (2.0, 0.25) and log.axis[2] == pytest.approx(0.0)
+    assert abs(np.dot(at.rotation @ np.array(log.axis), field.axis)) > math.cos(math.radians(10.0))
+
+
+def test_paper_b_is_short_of_a_log_seen_end_on_as_the_paper_says() -> None:
+    at = base(0.0, 0.0, math.pi)
+    across, along = Field(7.5, 0.0, math.pi / 2), Field(7.5, 0.0, 0.0)
+    errors = [plane_error_m(look(f, at, 0.0, PaperB())[0], at, f) for f in (across, along)]
+    assert errors[0] < 0.1 < errors[1] < 0.5
+
+
+@pytest.mark.parametrize("sight", [PaperB(), Ours(PROFILE)], ids=["paper_b", "ours"])
+def test_a_log_far_off_is_not_measured(sight) -> None:
+    at = base(0.0, 0.0, math.pi)
+    assert look(Field(FARTHEST_M + 8.0, 0.0, 1.5), at, 0.0, sight) == ()
+
+
+def test_a_piece_at_the_edge_of_the_picture_is_no_log_before_it_was_seen_often() -> None:
+    at = base(0.0, 0.0, math.pi)
+    beside = Field(4.9, 2.6, 0.0)
+    assert look(beside, at, 0.0, Ours(PROFILE), PATIENCE - 1) == ()
+    assert beside.mask.any() and beside.mask[:, 0].any(), "it is cut by the picture's edge"
+    assert len(look(Field(7.5, 0.5, 1.5), at, 0.0, Ours(PROFILE), PATIENCE - 1)) == 1
+
+
+def test_a_camera_in_trouble_is_told_in_words_and_gives_nothing() -> None:
+    field = Field(9.0, 0.0, 1.5)
+    field.trouble = "the camera fell off"
+    eyes = FrontEyes(PROFILE, "front", field, field.found, PaperB())
+    assert eyes.look(base(0.0, 0.0, 0.0), Q, 0.0) is None and eyes.trouble == "the camera fell off"
+    with pytest.raises(KeyError):
+        FrontEyes(PROFILE, "rear view", field, field.found, PaperB())

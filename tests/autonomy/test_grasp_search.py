@@ -1,0 +1,184 @@
+"""The rule and the search: what they take, what they leave, and when they say that nothing can be had."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import atan2, pi, remainder
+
+import numpy as np
+import pytest
+from grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
+
+from autonomy.grasp.cylinders import cylinders, default_covariance, draws_of, grounded, grounded_covariance
+from autonomy.grasp.direct import Planned, hover_height, only
+from autonomy.grasp.jaws import jaws_of
+from autonomy.grasp.proposal import GraspProposal, NoGrasp
+from autonomy.grasp.quality import lies_upon, rate, sections
+from autonomy.grasp.search import Search
+from autonomy.logs import LogObservation
+from autonomy.mission import Mission
+from autonomy.motion.arm import Arm
+from autonomy.perception.estimate import LogEstimate
+from machine.grapple import tip_below_pin_m
+from machine.load import load_profile
+
+JAWS = jaws_of(PROFILE)
+
+
+def planned(logs: list[LogObservation]) -> GraspProposal:
+    return Search()(ARM, logs, 0.0, 0.0)
+
+
+def is_safe(logs: list[LogObservation], across_m: float, yaw: float = pi / 2, level: float = GROUND) -> bool:
+    world = cylinders(logs)
+    at = sections(JAWS, world, np.array([X]), np.array([Y + across_m]), np.array([yaw]))
+    return bool(rate(JAWS, world, lies_upon(world), at, np.array([level])).safe[0])
+
+
+def test_the_jaws_are_those_of_the_profile() -> None:
+    assert JAWS.half_gap_m == 0.733 and JAWS.blade_m == pytest.approx(0.36, abs=0.005)
+    assert list(JAWS.height_m) == sorted(JAWS.height_m)
+    assert list(JAWS.half_width_m) == sorted(JAWS.half_width_m, reverse=True)
+
+
+def test_a_single_log_is_taken_across_its_middle() -> None:
+    turned = log(7, yaw=0.6)
+    p = planned([turned])
+    assert p.logs == (0,) and p.probability > 0.9
+    assert np.hypot(p.x_m - turned.center_m[0], p.y_m - turned.center_m[1]) < 0.1
+    assert abs(remainder(p.yaw_rad - 0.6 - pi / 2, pi)) < 0.15
+    assert p.support_z_m == pytest.approx(GROUND, abs=1e-3)
+    assert p.reason.startswith("1 log (7) of 1 at once") and "\n" not in p.reason
+
+
+@pytest.mark.parametrize("logs", [pair(), small_pile()])
+def test_what_fits_comes_up_together(logs: list[LogObservation]) -> None:
+    p = planned(logs)
+    assert p.logs == tuple(range(len(logs)))
+    assert abs(p.y_m - Y) < 0.1, "in the middle of all"
+
+
+def test_the_log_on_top_is_taken_and_those_below_are_left() -> None:
+    assert planned(cross()).logs == (2,)
+
+
+@pytest.mark.parametrize(
+    ("logs", "across_m", "yaw", "safe"),
+    [
+        ([log(0)], 0.0, pi / 2, True),
+        ([log(0)], 0.0, pi / 2 + 0.6, False),  # (d) askew
+        ([log(0)], 0.72, pi / 2, False),  # (b) a tong comes down on it
+        ([log(0)], 1.2, pi / 2, False),  # nothing between the tongs
+        ([log(0, along_m=1.25)], 0.0, pi / 2, False),  # only its end
+        ([log(i, 0.31 * (i - 1.5), diameter=0.3) for i in range(4)], 0.0, pi / 2, False),  # (a) too much
+        (small_pile(), 0.0, pi / 2, True),
+    ],
+)
+def test_the_rule(logs: list[LogObservation], across_m: float, yaw: float, safe: bool) -> None:
+    assert is_safe(logs, across_m, yaw) is safe
+
+
+def test_no_log_is_drawn_from_under_another() -> None:
+    """(c): the lower log alone between the tongs, the upper one far off its middle across it."""
+    under, over = log(0), log(1, 0.0, 0.2, yaw=pi / 2, along_m=0.8)
+    assert is_safe([under], 0.0)
+    assert not is_safe([under, over], 0.0)
+    upon = lies_upon(cylinders([under, over]))
+    assert upon.tolist() == [[False, True], [False, False]]
+
+
+def test_from_above_a_layer_only_that_layer_is_taken() -> None:
+    pile = small_pile()
+    world = cylinders(pile)
+    at = sections(JAWS, world, np.array([X]), np.array([Y]), np.array([pi / 2]))
+    levels = np.array([GROUND, GROUND + 0.2])
+    found = rate(JAWS, world, lies_upon(world), *_both(at), levels)
+    assert found.captured[0].tolist() == [[True, True, True], [False, False, True]]
+
+
+def _both(at: object) -> tuple[object]:
+    from dataclasses import fields
+
+    return (type(at)(*(getattr(at, f.name)[:, None, :] for f in fields(at))),)  # type: ignore[arg-type]
+
+
+def test_what_perception_is_unsure_of_makes_a_grasp_less_probable() -> None:
+    wide = LogEstimate(np.zeros(3), np.ones(3), 1.0, 0.1, np.diag([0.3, 0.05, 0.2, 0.05, 0.2, 0.2, 0.02]) ** 2)
+    known = wide.observation(0).covariance
+    unsure = [replace(o, covariance=known) for o in pair()]
+    assert planned(unsure).probability < planned(pair()).probability - 0.1
+
+
+@pytest.mark.parametrize("sunk_m", [-0.1, 0.0, 0.1])
+def test_a_machine_on_wheels_takes_the_ground_from_the_logs(sunk_m: float) -> None:
+    """Its frame goes up and down: what the profile says of the ground is nothing to go by."""
+    arm = Arm(load_profile("aoro_fc8"))
+    ground = arm.profile.workspace.ground_z_m - sunk_m
+    x, y = arm.profile.workspace.pick_center_m
+    logs = [
+        LogObservation(i, (x, y + side, ground + 0.1), (1.0, 0.0, 0.0), 2.6, 0.2) for i, side in ((0, 0), (1, 0.21))
+    ]
+    upon = LogObservation(2, (x, y + 0.105, ground + 0.27), (1.0, 0.0, 0.0), 2.6, 0.2)
+    p = Search()(arm, [*logs, upon], 0.0, 0.0)
+    assert set(p.logs) == {0, 1, 2} and p.support_z_m == pytest.approx(ground, abs=1e-3)
+    higher = replace(logs[0], id=3, center_m=(x, y + 3.0, ground + 0.4))
+    alone = Search()(arm, [higher], 0.0, 0.0)
+    assert alone.support_z_m == pytest.approx(ground + 0.3, abs=1e-3), "it lies on a bank"
+
+
+def test_draws_have_the_spread_they_are_asked_for() -> None:
+    world = cylinders([log(0, yaw=0.8)])
+    sigma = np.sqrt(np.diag(default_covariance(log(0))))
+    drawn = draws_of(world, np.diag(sigma**2)[None], 4000, 3)
+    off = drawn.center[:, 0] - world.center
+    across = off @ np.array([-np.sin(0.8), np.cos(0.8), 0.0])
+    assert np.std(across) == pytest.approx(sigma[0], rel=0.05)
+    assert np.std(off[:, 2]) == pytest.approx(sigma[1], rel=0.05)
+    assert np.std(drawn.length) == pytest.approx(np.hypot(sigma[4], sigma[5]), rel=0.05)
+    again = draws_of(world, np.diag(sigma**2)[None], 4000, 3)
+    assert np.array_equal(again.center, drawn.center)
+    with pytest.raises(ValueError, match="not finite"):
+        draws_of(world, np.full((1, 7, 7), np.nan), 2, 0)
+
+
+def test_logs_that_a_camera_sees_too_high_are_set_on_the_ground_together() -> None:
+    pile = small_pile()
+    raised = [replace(o, center_m=(*o.center_m[:2], o.center_m[2] + 0.06)) for o in pile]
+    assert grounded(cylinders(raised), GROUND).center == pytest.approx(cylinders(pile).center)
+    far = cylinders([replace(o, center_m=(*o.center_m[:2], o.center_m[2] + 0.5)) for o in pile])
+    assert grounded(far, GROUND) is far, "they lie on something else"
+    sigma = default_covariance(pile[0])[None]
+    assert np.all(np.diag(grounded_covariance(sigma)[0]) <= np.diag(sigma[0]))
+    assert planned(raised).support_z_m == pytest.approx(GROUND, abs=1e-3)
+
+
+def test_higher_logs_out_of_reach_hide_none_in_reach() -> None:
+    far = [log(i, along_m=-9.0, z_m=0.3 + 0.1 * i) for i in range(12)]
+    assert planned([*far, log(12)]).logs == (12,)
+
+
+def test_nothing_to_take_is_said_in_one_sentence() -> None:
+    with pytest.raises(NoGrasp, match=r"^no log is in view$"):
+        planned([])
+    standing = replace(log(0), axis=(0.0, 0.1, 0.995))
+    with pytest.raises(NoGrasp, match=r"^no grasp of the 1 log is safe: .*$"):
+        planned([standing])
+    with pytest.raises(NoGrasp, match=r"^no log is in reach; log 0: point "):
+        planned([replace(log(0), center_m=(-6.0, 7.0, GROUND + 0.1))])
+
+
+def test_a_proposal_becomes_a_grasp_of_several_logs() -> None:
+    grasp = Planned(Search())(ARM, Mission(), small_pile(), 0.0, 0.0)
+    assert {o.id for o in grasp.logs} == {0, 1, 2} and grasp.gathered and grasp.thinnest_m == 0.2
+    top = GROUND + small_pile()[2].center_m[2] - GROUND + 0.1
+    assert hover_height(PROFILE, grasp) - tip_below_pin_m(PROFILE.grapple.tongs, 0.0) > top
+    rest = only(ARM, grasp, [2])
+    assert rest.log.id == 2 and rest.others == () and abs(rest.along_m) < 0.2
+    assert only(ARM, grasp, [0, 1, 2]) is grasp
+
+
+def test_a_mission_that_names_its_log_is_served_directly() -> None:
+    grasp = Planned(Search())(ARM, Mission(log_id=1), pair(), 0.0, 0.0)
+    assert [o.id for o in grasp.logs] == [1] and not grasp.gathered
+    opening = grasp.pose.slew_rad + grasp.pose.rot_rad
+    assert abs(remainder(opening - atan2(0.0, 1.0), pi)) == pytest.approx(pi / 2)

@@ -1,0 +1,158 @@
+"""From maps to logs, on maps that a perfect network would give."""
+
+import math
+
+import numpy as np
+import pytest
+from drawn_logs import perfect_maps, picture
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autonomy.networks.torch_net import random_net
+from autonomy.networks.weights import WeightsRefused, save
+from autonomy.perception.frame import Frame, FrameRefused
+from autonomy.perception.instances import LogFinder, both, inside_bars, instances
+from autonomy.perception.network import STRIDE, unet
+from autonomy.perception.resize import doubled, shrunk
+from autonomy.training.segmentation import targets
+from machine.optics import Intrinsics
+
+CROSSED = (((80, 80), 0.3, 100, 12), ((80, 80), 1.7, 90, 12))
+PARALLEL = (((80, 60), 0.2, 100, 12), ((80, 73), 0.2, 100, 12), ((80, 86), 0.2, 100, 12))
+
+
+def found(*logs, size=160):
+    sample = picture(*logs, size=size)
+    maps, _ = targets(sample)
+    return sample, instances(perfect_maps(maps), STRIDE, sample.ids.shape)
+
+
+def overlap(a, b):
+    return np.count_nonzero(a & b) / np.count_nonzero(a | b)
+
+
+@pytest.mark.parametrize("logs", [CROSSED, PARALLEL, CROSSED[:1]], ids=["crossed", "parallel", "single"])
+def test_every_log_is_one_instance(logs):
+    sample, out = found(*logs)
+    assert len(out) == len(logs)
+    for number in range(1, len(logs) + 1):
+        assert max(overlap(i.mask, sample.ids == number) for i in out) > 0.85
+
+
+@settings(max_examples=25, deadline=None)
+@given(angle=st.floats(-1.5, 1.5), length=st.floats(40, 120), width=st.floats(8, 16))
+def test_axis_box_and_ends_are_those_of_the_log(angle, length, width):
+    sample, (log,) = found(((80.0, 80.0), angle, length, width))
+    assert abs(math.remainder(log.axis_px - angle, math.pi)) < 0.03
+    v, u = np.nonzero(sample.ids)
+    assert np.abs(np.array(log.box_px) - (u.min(), v.min(), u.max() + 1, v.max() + 1)).max() <= 2
+    half = length / 2 * np.array([math.cos(angle), math.sin(angle)])
+    ends = sorted(log.ends_px), sorted([tuple(80.0 - half), tuple(80.0 + half)])
+    assert np.abs(np.array(ends[0]) - ends[1]).max() < 2.5
+    assert log.ends_seen == (True, True)
+
+
+def test_two_looks_make_one():
+    logs = (((160, 120), 0.2, 200, 24), ((160, 146), 0.2, 200, 24), ((200, 140), 1.5, 180, 20))
+    fine = picture(*logs, size=320)
+    small = [((u / 2, v / 2), angle, length / 2, width / 2) for (u, v), angle, length, width in logs]
+    looks = [perfect_maps(targets(s)[0]) for s in (fine, picture(*small, size=160))]
+    looks[0][2:4] = 0.0  # a fine look need not know where the middle is
+    out = instances(both(*looks), STRIDE, fine.ids.shape)
+    assert len(out) == 3
+    for number in (1, 2, 3):
+        assert max(overlap(i.mask, fine.ids == number) for i in out) > 0.85
+
+
+def test_an_end_outside_the_picture_is_not_seen():
+    _, (log,) = found(((10.0, 80.0), 0.0, 120, 14))
+    assert log.ends_seen == (False, True)
+    assert log.box_px[0] == 0
+
+
+def test_a_speck_beside_a_log_is_not_in_its_mask():
+    sample = picture(((80.0, 80.0), 0.8, 110, 12))
+    maps = perfect_maps(targets(sample)[0])
+    maps[0, 30, 50] = maps[0, 5, 75] = 5.0  # in the log's box and outside it
+    (log,) = instances(maps, STRIDE, sample.ids.shape)
+    assert not log.mask[60, 100] and not log.mask[10, 150]
+    assert overlap(log.mask, sample.ids == 1) > 0.85
+
+
+def test_no_log_no_instance():
+    maps = np.zeros((8, 40, 40), np.float32)
+    maps[0] = -5.0
+    assert instances(maps, 4, (160, 160)) == ()
+
+
+def test_a_coarse_map_gives_an_outline_between_its_pixels():
+    sample, (log,) = found(((80.0, 80.0), 0.5, 100, 14))
+    double, (fine,) = sample, instances(perfect_maps(targets(sample)[0]), 4, (320, 320))
+    assert abs(np.count_nonzero(fine.mask) / (4.0 * np.count_nonzero(double.ids)) - 1.0) < 0.06
+    assert np.abs(np.array(fine.box_px) / 2.0 - log.box_px).max() <= 1.0
+
+
+def test_letterbox_bars_are_found_and_a_black_picture_is_kept_whole():
+    rgb = np.zeros((40, 40, 3), np.uint8)
+    assert inside_bars(rgb) == (0, 40, 0, 40)
+    rgb[9:31] = 5
+    assert inside_bars(rgb) == (9, 31, 0, 40)
+
+
+def test_a_shrunk_pixel_looks_at_the_middle_of_its_block():
+    pin = Intrinsics(12, 6, 10.0, 10.0, 5.5, 2.5)
+    rgb = np.arange(12 * 6 * 3, dtype=np.uint8).reshape(6, 12, 3)
+    small, depth, lens = shrunk(rgb, np.arange(72, dtype=np.float32).reshape(6, 12), pin, 3)
+    assert small.shape == (2, 4, 3) and depth.shape == (2, 4)
+    assert depth[0, 0] == 13.0  # row 1, column 1
+    assert small[0, 0, 0] == int(rgb[:3, :3, 0].mean())
+    # The ray of the small pixel 0 is that of the middle of pixels 0, 1, 2.
+    assert (0 - lens.cx_px) / lens.fx_px == pytest.approx((1 - pin.cx_px) / pin.fx_px)
+
+
+def test_a_doubled_picture_shrinks_to_itself():
+    pin = Intrinsics(12, 6, 10.0, 10.0, 5.5, 2.5)
+    rgb = np.linspace(0, 250, 216).astype(np.uint8).reshape(6, 12, 3)
+    depth = np.arange(72, dtype=np.float32).reshape(6, 12)
+    large = doubled(rgb, depth, pin)
+    assert large[0].shape == (12, 24, 3) and large[0][0, 0, 0] == rgb[0, 0, 0]
+    again, near, lens = shrunk(*large, 2)
+    assert np.abs(again[1:-1, 1:-1].astype(int) - rgb[1:-1, 1:-1]).max() <= 2
+    assert np.array_equal(near, depth) and lens == pin
+
+
+@pytest.fixture(scope="module")
+def untrained(tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "logs.safetensors"
+    network = unet("rgbd")
+    save(path, network, random_net(network, 3).arrays(), {})
+    return path
+
+
+def test_any_size_of_picture_goes_through_and_masks_are_as_large(untrained):
+    for shape, size_px in (((70, 101), 96), ((192, 192), 96), ((70, 101), 200), ((340, 480), 480)):
+        finder = LogFinder("rgbd", untrained, size_px=size_px)
+        rgb = np.full((*shape, 3), 80, np.uint8)
+        rgb[:10] = 0
+        depth = np.full(shape, 3.0, np.float32)
+        pin = Intrinsics(shape[1], shape[0], 90.0, 90.0, shape[1] / 2, shape[0] / 2)
+        for log in finder.find(rgb, depth, pin):
+            assert log.mask.shape == shape
+            assert not log.mask[:9].any()
+
+
+def test_frames_that_are_none_are_refused(untrained):
+    finder = LogFinder("rgbd", untrained, size_px=96)
+    pin = Intrinsics(64, 64, 60.0, 60.0, 31.5, 31.5)
+    blind = Frame("stick", 0, np.zeros((64, 64, 3), np.uint8), np.full((64, 64), np.nan, np.float32), pin)
+    with pytest.raises(FrameRefused, match="no depth anywhere"):
+        finder.segment(blind)
+
+
+def test_corrupt_or_foreign_weights_are_refused(untrained, tmp_path):
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes(untrained.read_bytes()[:5000])
+    with pytest.raises(WeightsRefused):
+        LogFinder("rgbd", cut)
+    with pytest.raises(WeightsRefused, match="do not fit"):
+        LogFinder("depth", untrained)

@@ -1,0 +1,177 @@
+"""Logs over time: identities, honest uncertainty, what motion tells and what standing still does not."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autonomy.perception.cylinder import Cylinder, across_view
+from autonomy.perception.frame import Pose
+from autonomy.perception.merge import groups, joined, of_one_log
+from autonomy.perception.refine import Fit
+from autonomy.perception.tracks import LOST, Errors, Tracks
+from machine.optics import BODY_FROM_OPTICAL, rpy_matrix
+
+QUIET = Errors(scale=1e-5, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6)
+SIGMA = np.array([0.01, 0.03, 0.01, 0.02, 0.03, 0.03, 0.005])
+
+
+def pose_at(x: float = 0.0, yaw: float = 0.0) -> Pose:
+    """A camera 2.4 m up that looks ahead and down."""
+    return Pose(np.array([x, 0.0, 2.4]), rpy_matrix((0.0, 0.5, yaw)) @ BODY_FROM_OPTICAL)
+
+
+def fit_of(pose: Pose, center, yaw: float = 1.5, length: float = 2.0, scale: float = 1.0, noise=None) -> Fit:
+    """What a camera would make of a level log; ``noise`` (7,) in standard deviations."""
+    axis = pose.rotation.T @ np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    at = pose.to_optical(np.asarray(center, float)) * scale
+    n = np.zeros(7) if noise is None else noise * SIGMA
+    e1, e2 = across_view(axis, at)
+    at = at + n[0] * e1 + n[1] * e2
+    axis = axis + n[2] * e1 + n[3] * e2
+    axis /= np.linalg.norm(axis)
+    half = 0.5 * length * scale
+    start, end = -half + n[4], half + n[5]
+    body = Cylinder(at, axis, start, end, 0.125 * scale + n[6]).centered()
+    return Fit(body, np.diag(SIGMA**2), (True, True), 1.0, 0.5, np.full(7, 1e-4))
+
+
+def test_a_log_is_believed_from_its_second_picture_and_keeps_its_number() -> None:
+    tracks, pose = Tracks(QUIET), pose_at()
+    places = [(5.0, -1.0, 0.12), (6.0, 1.0, 0.12)]
+    assert tracks.step([fit_of(pose, p) for p in places], pose, 0) == ()
+    for k in range(1, 6):
+        order = places if k % 2 else places[::-1]
+        found = tracks.step([fit_of(pose, p) for p in order], pose, k)
+        assert [t.id for t in found] == [1, 2] and found[0].hits == k + 1 and found[0].last_seen_ns == k
+        assert np.allclose([t.estimate.center_m for t in found], places, atol=1e-6)
+
+
+def test_a_log_turned_round_by_a_fit_is_the_same_log() -> None:
+    tracks, pose = Tracks(QUIET), pose_at()
+    fit = fit_of(pose, (5.0, 0.0, 0.12))
+    turned = replace(fit, body=replace(fit.body, axis=-fit.body.axis), ends_seen=(False, True))
+    fit = replace(fit, ends_seen=(True, False))
+    for k, one in enumerate((fit, turned, fit, turned)):
+        found = tracks.step([one], pose, k)
+    assert len(found) == 1 and found[0].estimate.ends_seen == (True, False)
+    assert found[0].estimate.length_m == pytest.approx(2.0, abs=1e-4)
+    assert np.allclose(found[0].estimate.center_m, (5.0, 0.0, 0.12), atol=1e-6)
+
+
+def test_noise_averages_and_the_claim_is_honest() -> None:
+    rng, squares = np.random.default_rng(1), []
+    for _ in range(25):
+        tracks, pose = Tracks(QUIET), pose_at()
+        for k in range(12):
+            found = tracks.step([fit_of(pose, (5.0, 0.3, 0.12), noise=rng.normal(size=7))], pose, k)
+        estimate = found[0].estimate
+        miss = estimate.center_m - (5.0, 0.3, 0.12)
+        parts = np.array([miss @ e for e in (*estimate.frame(), estimate.axis)])
+        squares.append((parts / estimate.position_sigma_m()) ** 2)
+        assert np.linalg.norm(miss) < 0.06
+    assert 0.5 < np.mean(squares) < 1.8
+
+
+def test_a_scale_error_stays_while_the_camera_stands_and_shows_when_it_drives() -> None:
+    center, errors = (8.0, 0.2, 0.12), Errors(scale=0.01, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6)
+    claims, misses = [], []
+    for drive in (0.0, 4.0):
+        tracks = Tracks(errors)
+        for k in range(120):
+            pose = pose_at(drive * k / 119)
+            found = tracks.step([fit_of(pose, center, scale=1.01)], pose, k)
+        estimate = found[0].estimate
+        claims.append(float(np.linalg.norm(estimate.position_sigma_m())))
+        misses.append(float(np.linalg.norm(estimate.center_m - center)))
+    assert claims[0] > 0.06 and claims[1] < 0.5 * claims[0]
+    assert misses[0] > 0.06 and misses[1] < 0.4 * misses[0]
+
+
+def test_pictures_alike_do_not_make_sure_of_what_they_share() -> None:
+    shared = np.array([0.01, 0.02, 0.01, 0.02, 0.05, 0.05, 0.004])
+    tracks, pose = Tracks(QUIET), pose_at()
+    fit = replace(fit_of(pose, (5.0, 0.0, 0.12)), lasting=shared, covariance=np.diag(SIGMA**2 + shared**2))
+    for k in range(200):
+        found = tracks.step([fit], pose, k)
+    assert found[0].estimate.length_sigma_m() > 0.06
+
+
+def test_many_pictures_from_one_place_do_not_outvote_few_from_others() -> None:
+    shared = np.array([0.01, 0.02, 0.01, 0.02, 0.1, 0.1, 0.004])
+    tracks = Tracks(QUIET)
+    places = [(0.0, 2.2)] * 60 + [(x, 2.0) for x in (1.0, 2.0, 2.8, 3.5)]
+    for k, (x, length) in enumerate(places):
+        pose = pose_at(x)
+        fit = fit_of(pose, (8.0, 0.0, 0.12), length=length)
+        fit = replace(fit, lasting=shared, covariance=np.diag(SIGMA**2 + shared**2))
+        found = tracks.step([fit], pose, k)
+    assert found[0].estimate.length_m < 2.1
+
+
+def test_an_outlier_changes_nothing_but_a_wrong_beginning_is_given_up() -> None:
+    pose, truth = pose_at(), (5.0, 0.0, 0.12)
+    tracks = Tracks(QUIET)
+    for k in range(6):
+        tracks.step([fit_of(pose, truth)], pose, k)
+    found = tracks.step([fit_of(pose, truth, length=3.5)], pose, 6)
+    assert found[0].estimate.length_m == pytest.approx(2.0, abs=1e-3) and len(found) == 1
+    tracks = Tracks(QUIET)
+    for k in range(2):
+        tracks.step([fit_of(pose, truth, length=3.5)], pose, k)
+    for k in range(2, 9):
+        found = tracks.step([fit_of(pose, truth)], pose, k)
+    assert [t.id for t in found] == [1] and found[0].estimate.length_m == pytest.approx(2.0, abs=0.01)
+
+
+def test_a_log_that_is_gone_is_given_up_and_a_new_one_gets_a_new_number() -> None:
+    tracks, pose = Tracks(QUIET), pose_at()
+    for k in range(3):
+        tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
+    for k in range(LOST - 1):
+        assert len(tracks.step([], pose, 3 + k)) == 1
+    assert tracks.step([], pose, 20) == ()
+    for k in range(2):
+        found = tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, 30 + k)
+    assert [t.id for t in found] == [2]
+
+
+@settings(max_examples=40)
+@given(st.floats(-0.4, 0.4), st.floats(-3.1, 3.1), st.floats(0.0, 2.0))
+def test_where_the_camera_stands_does_not_matter_to_an_exact_fit(yaw: float, log_yaw: float, moved: float) -> None:
+    tracks, center = Tracks(QUIET), (6.0, 0.4, 0.12)
+    for k in range(3):
+        pose = pose_at(moved * k / 2, yaw)
+        found = tracks.step([fit_of(pose, center, yaw=log_yaw)], pose, k)
+    assert len(found) == 1 and np.allclose(found[0].estimate.center_m, center, atol=1e-5)
+
+
+def piece(start: float, end: float, seen: tuple[bool, bool], radius: float = 0.12, y: float = 0.0) -> Fit:
+    """A piece of a log along x, 5 m away."""
+    body = Cylinder(np.array([0.0, y, 5.0]), np.array([1.0, 0.0, 0.0]), start, end, radius).centered()
+    return Fit(body, np.diag(np.full(7, 1e-4)), seen, 1.0, 0.5, np.zeros(7))
+
+
+def test_pieces_that_miss_the_ends_facing_each_other_are_one_log() -> None:
+    a, b = piece(-1.0, -0.2, (True, False)), piece(0.3, 1.0, (False, True))
+    assert of_one_log(a, b) and of_one_log(b, a) and groups([a, None, b]) == [[0, 2]]
+    whole = joined(a.body, b.body)
+    assert whole.length_m == pytest.approx(2.0) and np.allclose(whole.center_m, (0.0, 0.0, 5.0))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        piece(0.3, 1.0, (True, True)),
+        piece(0.3, 1.0, (False, True), radius=0.2),
+        piece(0.3, 1.0, (False, True), y=0.4),
+        piece(2.0, 3.0, (False, True)),
+    ],
+    ids=["its own end", "another width", "beside", "far away"],
+)
+def test_what_is_no_piece_of_it_stays_apart(other: Fit) -> None:
+    a = piece(-1.0, -0.2, (True, False))
+    assert not of_one_log(a, other) and groups([a, other]) == [[0], [1]]

@@ -1,0 +1,116 @@
+"""The training loop: deterministic, resumable at any step, Ctrl-C keeps what was learnt."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from autonomy.networks.graph import BatchNorm, Conv, Network, Relu
+from autonomy.networks.torch_net import TorchNet, random_net
+from autonomy.training.loop import Schedule, train
+
+SMALL = Network("small", 1, (Conv("a", 4, 3), BatchNorm("n"), Relu("r"), Conv("y", 1, 1)), ("y",))
+
+
+def batch(step: int) -> tuple[torch.Tensor, ...]:
+    x = torch.randn(2, 1, 8, 8, generator=torch.Generator().manual_seed(step))
+    return x, 0.5 * x
+
+
+def loss(net: TorchNet, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    return (net(x)["y"] - y).square().mean()
+
+
+def run(path: Path | None, steps: int = 40, give=batch, every_s: float = 1e9, run_name: str = "r"):
+    net = random_net(SMALL, 1)
+    schedule = Schedule(steps, 1e-2, checkpoint_every_s=every_s)
+    return net, train(net, give, loss, schedule, path, run_name, "small", Console(file=io.StringIO()))
+
+
+def same(a: TorchNet, b: TorchNet) -> bool:
+    return all(torch.equal(x, b.state_dict()[k]) for k, x in a.state_dict().items())
+
+
+def test_it_learns_the_same_twice() -> None:
+    (a, losses), (b, again) = run(None), run(None)
+    assert losses == again and same(a, b)
+    assert len(losses) == 40 and losses[-1] < 0.5 * losses[0]
+
+
+def test_the_rate_rises_then_falls() -> None:
+    schedule = Schedule(100, 1.0)
+    rates = [schedule.rate(i) for i in range(100)]
+    assert rates[:5] == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
+    assert rates[5:] == sorted(rates[5:], reverse=True) and 0.0 < rates[-1] < 0.01
+
+
+def stopped_at(step: int):
+    def give(i: int) -> tuple[torch.Tensor, ...]:
+        if i == step:
+            os.kill(os.getpid(), signal.SIGINT)
+        return batch(i)
+
+    return give
+
+
+@pytest.mark.slow  # signals go to the main thread, where tests that run side by side are not
+def test_ctrl_c_ends_a_step_and_the_same_call_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "kept.pt"
+    whole, losses = run(None)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        run(path, give=stopped_at(17))
+    assert signal.getsignal(signal.SIGINT) is before
+    asked: list[int] = []
+
+    def listed(i: int) -> tuple[torch.Tensor, ...]:
+        asked.append(i)
+        return batch(i)
+
+    net, again = run(path, give=listed)
+    assert asked == list(range(18, 40))
+    assert again == losses and same(net, whole)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow  # signals go to the main thread, where tests that run side by side are not
+def test_a_kept_run_of_something_else_is_not_continued(tmp_path: Path) -> None:
+    path = tmp_path / "kept.pt"
+    with pytest.raises(KeyboardInterrupt):
+        run(path, give=stopped_at(17))
+    asked: list[int] = []
+
+    def listed(i: int) -> tuple[torch.Tensor, ...]:
+        asked.append(i)
+        return batch(i)
+
+    run(path, give=listed, run_name="other")
+    assert asked == list(range(40))
+    with pytest.raises(KeyboardInterrupt):
+        run(path, give=stopped_at(5))
+    path.write_bytes(path.read_bytes()[:100])
+    assert run(path)[1] == run(None)[1]
+
+
+def test_a_checkpoint_is_written_on_the_way(tmp_path: Path) -> None:
+    path = tmp_path / "kept.pt"
+
+    def fails(i: int) -> tuple[torch.Tensor, ...]:
+        if i == 3:
+            raise OSError("no data")
+        return batch(i)
+
+    with pytest.raises(OSError, match="no data"):
+        run(path, give=fails, every_s=0.0)
+    assert len(torch.load(path, weights_only=True)["losses"]) == 3
+
+
+def test_a_loss_that_is_no_number_stops_the_run() -> None:
+    with pytest.raises(ValueError, match="step 2 is nan; lower the learning rate"):
+        run(None, give=lambda i: (batch(i)[0] * (float("nan") if i == 2 else 1.0), batch(i)[1]))

@@ -1,0 +1,176 @@
+"""Paper A's virtual world: trimmed cylinders, cuboid, the camera above it; and the planner that looks through it."""
+
+from __future__ import annotations
+
+from math import cos, hypot, pi, remainder, sin
+
+import numpy as np
+import pytest
+from grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autonomy.grasp.cnn_planner import CnnPlanner, averaged
+from autonomy.grasp.cylinders import cylinders
+from autonomy.grasp.jaws import jaws_of
+from autonomy.grasp.network import WEIGHTS, Best, GraspMaps, GraspNet
+from autonomy.grasp.proposal import NoGrasp
+from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, cuboid, render, trimmed
+from autonomy.logs import LogObservation
+from autonomy.motion.arm import Arm
+from machine.load import load_profile
+
+JAWS = jaws_of(PROFILE)
+
+
+class Chosen:
+    """A network that always finds the same pixel."""
+
+    def __init__(self, u_px: float, v_px: float, theta: float) -> None:
+        self.found, self.seen = Best(u_px, v_px, theta, 0.9), None
+
+    def best(self, depth_m: np.ndarray) -> Best:
+        self.seen = depth_m
+        return self.found
+
+    def maps(self, depth_m: np.ndarray) -> GraspMaps:
+        nearest = (depth_m < depth_m.min() + 0.01).astype(float)
+        return GraspMaps(nearest, -np.ones_like(nearest), np.zeros_like(nearest))
+
+
+def test_logs_are_shortened_by_the_grapple_and_a_tenth_but_never_to_discs() -> None:
+    world = cylinders(pair())
+    assert trimmed(world, 0.36).length == pytest.approx([(2.6 - 0.36) * 0.9] * 2)
+    assert trimmed(world, 2.5).length == pytest.approx([0.2, 0.2])
+    assert np.array_equal(trimmed(world, 0.36).center, world.center)
+
+
+def test_the_cuboid_holds_the_ends_and_the_camera_hangs_three_metres_over_its_middle() -> None:
+    turned = log(0, yaw=0.5)
+    box = cuboid(cylinders([turned]))
+    half = np.array([1.3 * cos(0.5), 1.3 * sin(0.5), 0.0])
+    assert box.low_m == pytest.approx(np.array(turned.center_m) - half)
+    assert box.high_m == pytest.approx(np.array(turned.center_m) + half)
+    assert camera_above(box).position_m == pytest.approx((*turned.center_m[:2], turned.center_m[2] + 3.0))
+    with pytest.raises(ValueError, match="no log"):
+        cuboid(cylinders([]))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-pi, pi), st.floats(0.1, 0.3), st.floats(-0.2, 0.2))
+def test_depth_is_that_of_the_surface(dx: float, dy: float, yaw: float, diameter: float, slope: float) -> None:
+    """Every pixel's point lies on the cylinder's side or caps, or on the ground."""
+    one = log(0, dy, 0.2, yaw, diameter, dx)
+    world = cylinders([one])
+    world.axis[0, 2] = slope
+    world.axis[0] /= np.linalg.norm(world.axis[0])
+    camera = Camera(np.array([X, Y, GROUND + 3.0]))
+    depth = render(world, camera, GROUND)
+    v, u = np.mgrid[0:300:7, 0:300:7]
+    z = depth[v, u].astype(float)
+    pin = camera.intrinsics
+    points = camera.position_m + np.stack(
+        [(u - pin.cx_px) / pin.fx_px * z, -(v - pin.cy_px) / pin.fy_px * z, -z], axis=-1
+    )
+    away = points - world.center[0]
+    along = away @ world.axis[0]
+    off = np.linalg.norm(away - along[..., None] * world.axis[0], axis=-1)
+    side = (np.abs(off - diameter / 2) < 2e-3) & (np.abs(along) < 1.301)
+    cap = (np.abs(np.abs(along) - 1.3) < 2e-3) & (off < diameter / 2 + 2e-3)
+    ground = np.abs(points[..., 2] - GROUND) < 1e-4
+    assert np.all(side | cap | ground)
+    inside = (np.abs(along) < 1.298) & (off < diameter / 2 - 2e-3)
+    assert not inside.any()
+
+
+def test_a_log_fills_the_pixels_it_should() -> None:
+    camera = Camera(np.array([X, Y, GROUND + 3.0]))
+    depth = render(cylinders([log(0, diameter=0.2)]), camera, GROUND)
+    assert depth.min() == pytest.approx(2.8, abs=1e-3)
+    rows, columns = np.nonzero(depth < 2.95)
+    assert columns.min() == 0 and columns.max() == 299, "longer than the picture is wide"
+    assert np.ptp(rows) == pytest.approx(0.2 / 2.9 * 385, abs=2)
+
+
+def test_a_camera_that_cannot_see_is_refused() -> None:
+    with pytest.raises(ValueError, match="look down"):
+        render(cylinders(pair()), Camera(np.array([X, Y, GROUND])), GROUND)
+    with pytest.raises(ValueError, match="inside a log"):
+        render(cylinders(pair()), Camera(np.array([X, Y, GROUND + 0.2])), GROUND)
+
+
+@pytest.mark.parametrize("theta", [0.3, -1.2])
+def test_a_pixel_becomes_a_grasp_in_the_base(theta: float) -> None:
+    """Right in the picture is base +x, up is base +y; the closing direction turns with it."""
+    planner = CnnPlanner(Chosen(180.0, 90.0, theta))
+    one = log(0, 0.0)
+    p = planner(ARM, [one], 0.0, 0.0)
+    seen = planner.look(cylinders([one]), JAWS, GROUND)
+    z = float(seen.depth_m[90, 180])
+    assert (p.x_m, p.y_m) == pytest.approx((X + 30 / 385 * z, Y + 60 / 385 * z))
+    assert remainder(p.yaw_rad + theta, pi) == pytest.approx(0.0)
+    assert p.logs == (0,) and p.support_z_m == pytest.approx(GROUND)
+
+
+def test_the_tips_go_a_hand_under_the_surface_of_a_pile() -> None:
+    pile = [*small_pile(), log(3, 0.0, 0.38)]
+    p = CnnPlanner(Chosen(150.0, 150.0, pi / 2))(ARM, pile, 0.0, 0.0)
+    assert p.support_z_m == pytest.approx(GROUND + 0.58 - 0.25, abs=0.01) and 3 in p.logs
+
+
+def test_with_physical_labels_the_height_is_that_of_the_rule() -> None:
+    def height(logs: list, by_rule: bool) -> float:
+        return CnnPlanner(Chosen(150.0, 150.0, pi / 2), by_rule)(ARM, logs, 0.0, 0.0).support_z_m
+
+    assert height(small_pile(), True) == pytest.approx(GROUND)
+    assert height(small_pile(), False) == pytest.approx(GROUND + 0.38 - 0.25, abs=0.01)
+    aside = [log(0, 0.6)]
+    assert height(aside, True) == height(aside, False) == pytest.approx(GROUND), "where no grasp is safe"
+
+
+@pytest.mark.parametrize("yaw", [-0.8, 0.0, 0.8])
+def test_the_shipped_weights_from_physical_labels_close_across_a_log_near_its_middle(yaw: float) -> None:
+    net = GraspNet.shipped(WEIGHTS.with_name("grasp_physical.safetensors"))
+    p = CnnPlanner(net, by_rule=True)(ARM, [log(0, yaw=yaw, diameter=0.24)], 0.0, 0.0)
+    assert p.logs == (0,) and hypot(p.x_m - X, p.y_m - Y) < 0.6, "on a log of 2.6 m"
+    assert abs(remainder(p.yaw_rad - yaw - pi / 2, pi)) < 0.25
+
+
+def test_on_wheels_the_lowest_log_tells_where_the_ground_is() -> None:
+    arm = Arm(load_profile("aoro_fc8"))
+    x, y = arm.profile.workspace.pick_center_m
+    one = LogObservation(0, (x, y, arm.profile.workspace.ground_z_m + 0.2), (1.0, 0.0, 0.0), 2.6, 0.2)
+    p = CnnPlanner(Chosen(150.0, 150.0, pi / 2))(arm, [one], 0.0, 0.0)
+    assert p.support_z_m == pytest.approx(one.center_m[2] - 0.1)
+
+
+def test_nothing_to_see_is_no_grasp() -> None:
+    with pytest.raises(NoGrasp, match="no log is in view"):
+        CnnPlanner(Chosen(1.0, 1.0, 0.0))(ARM, [], 0.0, 0.0)
+
+
+def test_a_moving_camera_agrees_with_one_that_stands() -> None:
+    planner = CnnPlanner(Chosen(0.0, 0.0, 0.0), cameras=5)
+    seen = planner.look(cylinders(cross()), JAWS, GROUND)
+    point = seen.camera.to_base(seen.best.u_px, seen.best.v_px, 2.6)
+    assert abs(remainder(seen.best.theta_rad - pi / 2, pi)) < 1e-6
+    upper = cross()[2]
+    off = (point[:2] - upper.center_m[:2]) @ np.array([-upper.axis[1], upper.axis[0]])
+    assert abs(off) < 0.05, "the mean is highest on the topmost log"
+
+
+def test_predictions_are_averaged_where_they_belong() -> None:
+    box = cuboid(cylinders(pair()))
+    cameras = cameras_along(box, 0.3, 4)
+    maps = []
+    for camera in cameras:
+        q = np.zeros((300, 300))
+        u, v = (
+            camera.intrinsics.project(((box.centroid_m - camera.position_m) * np.array([1.0, -1.0, -1.0]))[None])[0]
+            .round()
+            .astype(int)
+        )
+        q[v, u] = 1.0
+        maps.append(GraspMaps(q, q, q))
+    mean = averaged(maps, cameras, float(box.centroid_m[2]))
+    assert mean.q[149:152, 149:152].sum() == pytest.approx(1.0) and mean.q[150, 150] >= 0.25
