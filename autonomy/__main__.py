@@ -1,11 +1,16 @@
 """The planning process: controller reports and log lists in, setpoints out, phase changes as JSON lines.
 
 ``python -m autonomy --profile palms_471 --controller 127.0.0.1:47001 --report-port 47002 --scene 127.0.0.1:47003``
+lays one log into the bunk; with ``--mission FILE`` and a machine that drives, the whole mission is done.
+``--tell HOST:PORT`` is told twice a second how the mission stands, and ``--order-port`` takes a person's orders
+(`can_dbc.mission_datagrams` has both), from this machine only.
 
-Events on stdout: ``phase``, ``paused`` (with its reason), ``refused`` (a setpoint, with the controller's number),
-``done``, ``failed`` (with its reason).  SIGTERM and SIGINT stop the crane smoothly and end with a hold.
-Exit codes: 0 the log lies in the bunk, 2 usage, 3 profile or key, 4 port, 5 interrupted while the controller was
-stopped, 6 the mission failed, 130 interrupted.
+Events on stdout: ``phase``, ``grasp`` (the logs that are to come up, why they and with what probability), ``paused``
+(with its reason), ``running``, ``refused`` (a setpoint, with the controller's number), of a mission ``state`` and
+``load`` (logs on board), ``order`` (a person's, and why it is refused), ``done``, ``failed`` (with its reason).
+SIGTERM and SIGINT stop crane and machine smoothly and end with a hold.
+Exit codes: 0 the log lies in the bunk or the mission is finished, 2 usage, 3 profile, mission or key, 4 port, 5
+interrupted while the controller was stopped, 6 the job failed, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -24,15 +29,27 @@ from typing import Final
 import msgspec
 
 from autonomy.activity import Activity
-from autonomy.logs import QUESTION, LogObservation, LogsRefused, parse_logs
+from autonomy.grasp.direct import Planned
+from autonomy.grasp.search import Search
+from autonomy.jobs import Forwarding, Job, OneLog
+from autonomy.logs import LogObservation, LogsRefused, parse_logs, question
+from autonomy.manager.manager import Manager
+from autonomy.manager.table import WAYS
 from autonomy.mission import Mission
-from can_dbc.setpoint import DatagramRefused, StateReport, decode, udp_address
+from autonomy.missions.files import load_mission
+from autonomy.missions.model import MissionError
+from autonomy.orders import OrderRefused, Orders
+from can_dbc.mission_datagrams import encode_mission
+from can_dbc.setpoint import DatagramRefused, StateReport, VehicleReport, decode, udp_address
 from machine.load import ProfileError, load_profile, profile_hash
 from machine.modes import Mode
+from machine.profile import Profile
 
 FINE, CONFIGURATION, BUSY, SAFETY, FAILED, INTERRUPTED = 0, 3, 4, 5, 6, 130
 TURN_S: Final = 0.01
 LOOK_NS: Final = 250_000_000
+TELL_NS: Final = 500_000_000
+NOT_PAUSED: Final = {"reason": None}
 Address = tuple[str, int]
 
 
@@ -46,43 +63,52 @@ def address(text: str) -> Address:
 
 def arguments(argv: list[str]) -> argparse.Namespace:
     """The command line; ends the process with code 2 when it is wrong."""
-    parser = argparse.ArgumentParser(prog="python -m autonomy", description="Picks one log into the bunk.")
+    parser = argparse.ArgumentParser(prog="python -m autonomy", description="Picks one log, or does a mission.")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file of the machine")
     parser.add_argument("--controller", type=address, required=True, help="HOST:PORT that takes setpoints")
     parser.add_argument("--report-port", type=int, required=True, help="local UDP port for state reports")
     parser.add_argument("--scene", type=address, required=True, help="HOST:PORT of the log detector")
     parser.add_argument("--log", type=int, help="number of the log to pick (default: the best one)")
+    parser.add_argument("--mission", type=Path, help="file of a mission to do, in any format of `timberhand plan`")
+    parser.add_argument("--way", choices=WAYS, default="ours", help="whose way the mission is done")
+    parser.add_argument("--tell", type=address, action="append", default=[], help="HOST:PORT to tell of the mission")
+    parser.add_argument("--order-port", type=int, help="local UDP port for a person's orders to the mission")
     parser.add_argument("--lease-ms", type=int, default=200, help="how long a setpoint is obeyed")
     parser.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
     return parser.parse_args(argv)
 
 
 class Process:
-    """The sockets around an activity."""
+    """The sockets around a job."""
 
-    def __init__(
-        self, activity: Activity, profile_hash: int, options: argparse.Namespace, key: bytes | None = None
-    ) -> None:
+    def __init__(self, job: Job, profile_hash: int, options: argparse.Namespace, key: bytes | None = None) -> None:
         self._key = key
         self.signals: list[int] = []
         self.foreign = False
-        self._activity = activity
+        self._job = job
         self._hash = profile_hash
         self._controller: Address = options.controller
         self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._link.bind(("127.0.0.1", options.report_port))
         self._scene = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._scene.connect(options.scene)
-        for each in (self._link, self._scene):
+        self._orders = Orders(profile_hash, key)
+        self._ordered = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        if options.order_port is not None:
+            self._ordered.bind(("127.0.0.1", options.order_port))
+        self._watchers: list[Address] = options.tell
+        self._sequence = 0
+        for each in (self._link, self._scene, self._ordered):
             each.setblocking(False)
-        self._look_ns = 0
+        self._look_ns = self._tell_ns = 0
         self._mode = -1
+        self._joints: tuple[float, ...] = ()
         self._told: dict[str, object] = {}
 
     def close(self) -> None:
         """Gives the ports back."""
-        self._link.close()
-        self._scene.close()
+        for each in (self._link, self._scene, self._ordered):
+            each.close()
 
     @property
     def stopped(self) -> bool:
@@ -90,38 +116,66 @@ class Process:
         return self._mode in (Mode.STOP, Mode.FAULT)
 
     def run(self) -> None:
-        """Turns until the activity has nothing more to send."""
-        while not self._activity.idle and not self.foreign:
-            select.select([self._link, self._scene], [], [], TURN_S)
+        """Turns until the job has nothing more to send."""
+        while not self._job.idle and not self.foreign:
+            select.select([self._link, self._scene, self._ordered], [], [], TURN_S)
             if self.signals:
-                self._activity.abort(f"ended by {signal.Signals(self.signals[0]).name}")
+                self._job.abort(f"ended by {signal.Signals(self.signals[0]).name}")
             self.turn(time.monotonic_ns())
+        self._report_mission(time.monotonic_ns())
 
     def turn(self, now_ns: int) -> None:
         """One turn: ask, take what came, step, send, tell."""
         if now_ns >= self._look_ns:
             self._look_ns = now_ns + LOOK_NS
-            self._send(self._scene.send, QUESTION)
-        report, logs = self._newest_report(), self._newest_logs()
-        data = self._activity.step(now_ns, report, logs)
-        if data is not None:
+            self._send(self._scene.send, question(self._joints))
+        self._obey(now_ns)
+        (report, vehicle), logs = self._newest_reports(), self._newest_logs()
+        for data in self._job.step(now_ns, report, vehicle, logs):
             self._send(lambda d: self._link.sendto(d, self._controller), data)
         self._tell(report)
+        if now_ns >= self._tell_ns:
+            self._tell_ns = now_ns + TELL_NS
+            self._report_mission(now_ns)
 
-    def _newest_report(self) -> StateReport | None:
-        newest = None
+    def _obey(self, now_ns: int) -> None:
+        """Do what a person orders, and say so."""
+        for data in _received(self._ordered):
+            try:
+                order = self._orders.take(data, now_ns)
+            except OrderRefused as error:
+                say("order", order=None, refused=str(error))
+                continue
+            refused = self._job.obey(order)
+            say("order", order=order.order.name, refused=refused or None)
+            self._tell_ns = 0  # who has ordered it sees at once what comes of it
+
+    def _report_mission(self, now_ns: int) -> None:
+        report = self._job.report(now_ns) if self._watchers else None
+        if report is None:
+            return
+        self._sequence += 1
+        data = encode_mission(report, self._sequence, self._hash, now_ns, self._key)
+        for watcher in self._watchers:
+            self._send(lambda d, to=watcher: self._link.sendto(d, to), data)
+
+    def _newest_reports(self) -> tuple[StateReport | None, VehicleReport | None]:
+        newest, vehicle = None, None
         for data in _received(self._link):
             try:
                 message = decode(data, self._key)
             except DatagramRefused:
                 continue
-            if not isinstance(message, StateReport):
+            if not isinstance(message, StateReport | VehicleReport):
                 continue
             if message.profile_hash != self._hash:
                 self.foreign = True
-                return None
-            newest, self._mode = message, message.mode
-        return newest
+                return None, None
+            if isinstance(message, VehicleReport):
+                vehicle = message
+            else:
+                newest, self._mode, self._joints = message, message.mode, message.position
+        return newest, vehicle
 
     def _newest_logs(self) -> tuple[LogObservation, ...]:
         logs: tuple[LogObservation, ...] = ()
@@ -141,11 +195,9 @@ class Process:
 
     def _tell(self, report: StateReport | None) -> None:
         """Says what is not as it was in the last turn."""
-        activity = self._activity
-        if self._changed("phase", activity.phase):
-            say("phase", phase=activity.phase.name)
-        if self._changed("paused", activity.paused):
-            say("paused" if activity.paused else "running", reason=activity.paused)
+        for event, what in self._job.news():
+            if self._changed(event, what):
+                say("running" if what == NOT_PAUSED else event, **what)
         if report is not None and self._changed("refused", report.refused) and report.refused:
             say("refused", number=report.refusal, count=report.refused)
 
@@ -187,11 +239,15 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         return _complain(f"{options.key_file}: the key cannot be read: {error.strerror}")
     lease_ns = options.lease_ms * 1_000_000
-    activity = Activity(profile, profile_hash(profile), Mission(log_id=options.log), lease_ns, key)
     try:
-        process = Process(activity, profile_hash(profile), options, key)
+        job = _job(options, profile, lease_ns, key)
+    except MissionError as error:
+        return _complain(str(error))
+    try:
+        process = Process(job, profile_hash(profile), options, key)
     except (OSError, OverflowError) as error:
-        return _complain(f"UDP port {options.report_port} cannot be opened ({error}); choose another one", BUSY)
+        ports = f"{options.report_port}" + (f" or {options.order_port}" if options.order_port is not None else "")
+        return _complain(f"UDP port {ports} cannot be opened ({error}); choose another one", BUSY)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: process.signals.append(number))
     try:
@@ -200,13 +256,26 @@ def main(argv: list[str] | None = None) -> int:
         process.close()
     if process.foreign:
         return _complain("the controller runs another profile than this planner: start both with the same one")
-    if activity.done:
-        say("done")
+    if job.done:
+        say("done", **job.outcome())
         return FINE
-    say("failed", reason=activity.failure)
+    say("failed", reason=job.failure, **job.outcome())
     if not process.signals:
         return FAILED
     return SAFETY if process.stopped else INTERRUPTED
+
+
+def _job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: bytes | None) -> Job:
+    """What the command line asks for; raises MissionError."""
+    code, chooser = profile_hash(profile), Planned(Search())
+    if options.mission is None:
+        return OneLog(Activity(profile, code, Mission(log_id=options.log), lease_ns, key, chooser))
+    if profile.carrier is None:
+        raise MissionError(f"{profile.name} stands still; a mission needs a machine that drives, such as aoro_fc8")
+    site = (profile.carrier.site_lat_deg, profile.carrier.site_lon_deg)
+    mission = load_mission(options.mission, route_wanted=True, site=site).mission
+    manager = Manager(profile, code, mission, WAYS[options.way], chooser, key=key, lease_ns=lease_ns)
+    return Forwarding(manager, mission)
 
 
 def _complain(sentence: str, code: int = CONFIGURATION) -> int:

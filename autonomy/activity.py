@@ -1,4 +1,4 @@
-"""The first mission as a state machine: one log from the ground into the bunk.
+"""The first mission as a state machine: one log, or what one grasp holds, from the ground into the bunk.
 
 ``Activity.step`` is pure: monotonic time, the controller's newest report and the detector's newest log list
 go in, a setpoint datagram comes out, every 50 ms while the controller obeys (ARMED, ACTIVE) and something is
@@ -9,50 +9,41 @@ interrupted phase is planned anew from the measured pose.  Every phase has a tim
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import dist, isfinite
 from typing import Final
 
-from autonomy.grasp.direct import (
-    LIFT_M,
-    Grasp,
-    NoGrasp,
-    approach_length,
-    choose,
-    closing_height,
-    hover_height,
-    is_held,
-    lies_in,
-    plan_place,
-    retreat_height,
-    travel_height,
-)
+from autonomy import tongs
+from autonomy.carried import ASIDE_M, came_up, picked, place_as_seen
+from autonomy.course import above, aimed, carrying, closing, gathering, stowing
+from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, choose, lies_in, plan_place, retreat_height
+from autonomy.grasp.proposal import BunkFull, NoGrasp
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
 from autonomy.motion.arm import Arm, Pose
-from autonomy.motion.trajectory import Trajectory, follow, hold, straight, travel
+from autonomy.motion.trajectory import Trajectory, hold, straight, turned
+from autonomy.motion.ways import Motions, Swiftest
 from autonomy.phases import BEGIN_AGAIN, RULES, Phase
-from autonomy.stream import PERIOD_NS, SetpointStream
+from autonomy.pursuit import BRAKE_S, Pursuit
+from autonomy.stream import SetpointStream
 from can_dbc.setpoint import GrappleCommand, StateReport
-from machine.grapple import grapple_yaw, tong_angle_from_opening_pct
+from machine.grapple import grapple_yaw
 from machine.joints import JOINTS, Joint
 from machine.kinematics import Unreachable
 from machine.modes import Mode
 from machine.profile import Profile, joint
+from machine.sag import sane_load_kg
 
 ATTEMPTS: Final = 3
 SILENT_NS: Final = 300_000_000
-ARRIVED: Final = (0.015, 0.015, 0.02, 0.02, 0.06)
-"""How near each joint comes to its goal before the next phase, rad (EXT m): a few cm at the pin."""
-ASIDE_M: Final = 0.15
-"""Farther than this from its column, an interrupted vertical phase begins again with the way to it."""
-_GRIPPED: Final = (4, 5)  # GrappleStat.State: closed, holding
-_OPEN_PCT: Final = 92.0
-_BRAKE_S: Final = 0.8
-_LAG_S: Final = 0.4
+_LAYING: Final = 2.0
+"""So much less near to its goal than elsewhere a log over the bunk need come: it need not lie so exactly."""
+FRESH_NS: Final = 600_000_000
+"""A log list that is no older says what hangs in the grapple now."""
+GATE_S: Final = 3.0
+"""With so much of its way left an arm waits until the tongs are open: they are still high."""
 _SLOWEST: Final = 2.0
-_LAST_HOLD_S: Final = 0.3
-_CLOSE_GAIN_1_S: Final = 2.0
-_CLOSE_FASTEST: Final = 1.3
+_LAST_HOLD_S: Final = 0.1
 _LONGEST_TICK_S: Final = 0.1
 
 
@@ -60,7 +51,12 @@ class Activity:
     """Picks the mission's log and lays it down; see the module's contract.
 
     ``phase``, ``paused`` (why it waits, or None), ``failure`` (why it ended, or None) and ``missed`` (grasps
-    that came up empty) are for the operator; ``idle`` says that nothing more will be sent.
+    that came up empty) and ``lifted_kg`` (what hung in the grapple; 0 when nobody weighs it) are for the operator;
+    ``idle`` says that nothing more will be sent.  ``rests`` is where an earlier job left the joints: one without an
+    encoder is taken to stand there.  ``motions``: whose motions it makes.  ``onward`` says of a log whether the next
+    job would fetch it; where there is such a log the crane stays between the stakes, with open tongs, to go on from
+    there, and otherwise rises above them.  With ``stows`` no log is fetched: the crane goes over the bunk, holding
+    what it may hold, for the machine to drive; where it rests there already nothing moves.
     """
 
     def __init__(
@@ -70,38 +66,73 @@ class Activity:
         mission: Mission | None = None,
         lease_ns: int = 200_000_000,
         key: bytes | None = None,
+        chooser: Chooser = choose,
+        rests: tuple[float, ...] = (0.0,) * len(JOINTS),
+        motions: Motions | None = None,
+        onward: Callable[[LogObservation], bool] | None = None,
+        stows: bool = False,
     ) -> None:
         self.phase = Phase.WAIT
         self.paused: str | None = "the controller has not reported"
         self.failure: str | None = None
         self.missed = 0
         self.idle = False
+        self.halted = False
+        """A person lets it stand: it stops smoothly on its way; a grip that has begun is ended first."""
         self.grasp: Grasp | None = None
         self.place: Pose | None = None
-        self._arm = Arm(profile)
+        self.lifted_kg = 0.0
+        self.no_room = False
+        """What was gripped has no room in the bunk."""
+        self._motions, self._onward = motions or Swiftest(), onward
+        self._arm = Arm(profile, stretches=self._motions.stretches)
         self._profile = profile
         self._mission = mission or Mission()
+        self._target = self._mission.to(profile.bunk)
+        self._choose = chooser
+        self._first = Phase.STOW if stows else Phase.LOOK
         self._stream = SetpointStream(profile_hash, lease_ns, key)
         self._report: StateReport | None = None
         self._report_ns = 0
         self._logs: tuple[LogObservation, ...] = ()
         self._logs_ns = -1
-        self._motion = hold((0.0,) * len(JOINTS))
-        self._clock_s = 0.0
-        self._rate = 1.0
+        self._pursuit = Pursuit(profile, rests)
         self._elapsed_s = 0.0
         self._close_from_s = 0.0
         self._arrived_ns: int | None = None
+        self._ready_ns: int | None = None
+        self._begun_z_m = 0.0
+        self._anew: Phase | None = None
+        self._sorry = ""
+        """Why what was gripped is put back."""
         self._last_ns: int | None = None
-        self._due_ns = 0
 
     @property
     def done(self) -> bool:
         """Whether the log lies in the bunk and the crane is clear of it."""
         return self.phase is Phase.DONE
 
+    @property
+    def arrived(self) -> bool:
+        """Whether the motion of the present phase is done; it may still wait for something."""
+        return self._arrived_ns is not None
+
+    @property
+    def rests(self) -> tuple[float, ...]:
+        """Where the joints were last sent, rad (EXT m)."""
+        return self._pursuit.sent
+
+    @property
+    def motion(self) -> Trajectory:
+        """What the crane drives in the present phase."""
+        return self._pursuit.motion
+
+    @property
+    def _held(self) -> bool:
+        return self.halted and self.phase not in (Phase.CLOSE, Phase.DONE, Phase.FAILED)
+
     def abort(self, reason: str) -> None:
-        """Ends the mission: the crane stops smoothly on its path within ``_BRAKE_S``."""
+        """Ends the mission: the crane stops smoothly on its path within ``BRAKE_S``."""
         if self.phase not in (Phase.DONE, Phase.FAILED):
             self._fail(reason)
 
@@ -129,11 +160,10 @@ class Activity:
         else:
             self._advance(dt_s)
         self._proceed(now_ns)
-        if self.idle or now_ns < self._due_ns:
+        if self.idle or not self._stream.due(now_ns):
             return None
-        on_time = self._due_ns > now_ns - PERIOD_NS // 2
-        self._due_ns = (self._due_ns if on_time else now_ns) + PERIOD_NS
-        return self._stream.datagram(now_ns, self._motion, self._clock_s, self._grapple(), self._rate)
+        way = self._pursuit
+        return self._stream.datagram(now_ns, way.motion, way.clock_s, self._grapple(), way.rate)
 
     def _obstacle(self, now_ns: int) -> str | None:
         """Why no setpoint would be obeyed now."""
@@ -151,10 +181,9 @@ class Activity:
     def _position(self) -> tuple[float, ...]:
         """The measured joints; one without an encoder counts as standing where it was last sent."""
         assert self._report is not None
-        sent, _ = self._motion.at(self._clock_s)
         return tuple(
             p if joint(self._profile, j).encoder is not None else q
-            for j, p, q in zip(JOINTS, self._report.position, sent, strict=True)
+            for j, p, q in zip(JOINTS, self._report.position, self._pursuit.sent, strict=True)
         )
 
     def _resume(self) -> None:
@@ -164,7 +193,7 @@ class Activity:
         measured = self._position()
         follows = self._report.mode == Mode.ACTIVE and all(map(isfinite, self._report.reference))
         start = self._report.reference if follows else measured
-        phase: Phase = Phase.LOOK if self.phase is Phase.WAIT else self.phase
+        phase = self._first if self.phase is Phase.WAIT else self.phase
         if phase in BEGIN_AGAIN:
             assert self.grasp is not None
             column = self.grasp.pose if phase < Phase.CARRY else self.place
@@ -172,192 +201,273 @@ class Activity:
             if dist(self._arm.xy(self._arm.pose(measured)), self._arm.xy(column)) > ASIDE_M:
                 phase = BEGIN_AGAIN[phase]
         self._enter(phase, start)
-        self._rate = 0.0
+        self._pursuit.rate = 0.0
 
     def _enter(self, phase: Phase, start: tuple[float, ...]) -> None:
         """Plans a phase from a joint position and begins it."""
         self.phase = phase
-        self._clock_s = self._elapsed_s = 0.0
-        self._rate = 1.0
-        self._arrived_ns = None
+        self._elapsed_s = 0.0
+        self._arrived_ns = self._ready_ns = self._anew = None
+        self._begun_z_m = self._arm.pose(start).z_m
         try:
-            self._motion = self._plan(phase, start)
+            self._pursuit.begin(self._plan(phase, start))
         except (Unreachable, NoGrasp) as error:
-            self._motion = hold(start)
-            self._fail(str(error))
+            self._pursuit.begin(hold(start))
+            self.no_room = isinstance(error, BunkFull)
+            if phase in (Phase.LIFT, Phase.CARRY) and self._over_its_place(start):
+                self._put_back(str(error), start)
+            else:
+                self._fail(str(error))
+
+    def _over_its_place(self, q: tuple[float, ...]) -> bool:
+        """Whether what hangs in the grapple would come down where it was gripped."""
+        assert self.grasp is not None
+        return dist(self._arm.xy(self._arm.pose(q)), self._arm.xy(self.grasp.pose)) < ASIDE_M
+
+    def _put_back(self, reason: str, start: tuple[float, ...]) -> None:
+        """There is no way on with what is gripped: down again where it lay, and open the tongs."""
+        assert self.grasp is not None
+        self._sorry, self.place = reason, self.grasp.pose
+        self._enter(Phase.LOWER, start)
 
     def _plan(self, phase: Phase, q: tuple[float, ...]) -> Trajectory:
-        arm, grasp, high_m = self._arm, self.grasp, travel_height(self._profile)
+        arm = self._arm = self._arm.loaded(self._hanging_kg(phase))
+        grasp, start = self.grasp, arm.pose(q)
+        if phase is Phase.STOW:
+            return stowing(arm, self._motions, start, self._logs)
         if phase in (Phase.LOOK, Phase.OPEN, Phase.DONE, Phase.FAILED) or grasp is None:
             return hold(q)
-        start = arm.pose(q)
         match phase:
             case Phase.ABOVE:
-                return travel(arm, start, grasp.pose.at_height(hover_height(self._profile, grasp)), high_m)
+                return above(arm, self._motions, start, grasp, self._logs)
             case Phase.DESCEND:
+                self.grasp = grasp = aimed(arm, grasp, self._logs)
                 return straight(arm, start, grasp.pose)
             case Phase.CLOSE:
-                return self._closing(start, grasp)
+                measured_s = self._closed_for_s()
+                self._close_from_s = measured_s if isfinite(measured_s) else 0.0
+                return closing(arm, start, grasp, self._close_from_s)
             case Phase.LIFT:
-                up_m = grasp.pose.z_m + LIFT_M
-                return travel(arm, start, grasp.pose.at_height(up_m), up_m)
+                if grasp.gathered:
+                    return gathering(arm, start, grasp)
+                if not self._motions.direct:
+                    return straight(arm, start, grasp.pose.at_height(grasp.pose.z_m + LIFT_M))
+                self.place = plan_place(arm, self._mission, grasp, self._logs)
+                return carrying(arm, self._motions, start, self.place, grasp, self._logs, hangs=False)
             case Phase.CARRY:
-                held_yaw = grapple_yaw(self._profile, q)
-                self.place = plan_place(arm, self._mission, grasp, self._logs, held_yaw)
-                free_m = approach_length(self._profile, grasp.log)
-                return travel(arm, start, self.place.at_height(high_m), high_m, free_m)
+                self.lifted_kg = arm.load_kg
+                self.place = plan_place(arm, self._mission, grasp, self._logs, grapple_yaw(self._profile, q))
+                return carrying(arm, self._motions, start, self.place, grasp, self._logs, hangs=True)
         assert self.place is not None
         if phase is Phase.LOWER:
             return straight(arm, start, self.place)
-        up_m = retreat_height(self._profile)
-        return travel(arm, start, self.place.at_height(up_m), up_m)
+        return straight(arm, start, start.at_height(max(start.z_m, retreat_height(self._profile))))
 
-    def _closing(self, start: Pose, grasp: Grasp) -> Trajectory:
-        height = closing_height(self._profile, grasp.support_z_m, grasp.log.diameter_m)
-        measured_s = self._closed_for_s()
-        self._close_from_s = begin_s = measured_s if isfinite(measured_s) else 0.0
-
-        def path(time_s: float) -> Pose:
-            return grasp.pose.at_height(height(begin_s + time_s))
-
-        return follow(self._arm, start, path, self._profile.grapple.close_time_s, 1.0)
+    def _hanging_kg(self, phase: Phase) -> float:
+        """What the crane carries in a phase: a log that it has lifted bends it, and nothing else does."""
+        assert self._report is not None
+        return sane_load_kg(self._report.load_kg) if Phase.LIFT < phase < Phase.RETREAT else 0.0
 
     def _closed_for_s(self) -> float:
-        """How long tongs of the nominal speed have been closing to be where they are measured; NaN if
-        unknown.
-        """
         assert self._report is not None
-        opening = self._report.opening_pct
-        if not isfinite(opening):
-            return opening
-        tongs, close_s = self._profile.grapple.tongs, self._profile.grapple.close_time_s
-        return tong_angle_from_opening_pct(tongs, opening) / tongs.angle_rad[-1] * close_s
+        return tongs.closed_for_s(self._profile, self._report)
 
     def _advance(self, dt_s: float) -> None:
-        """Moves the clock of the motion; it slows down smoothly to wait for the tongs or to stop for good."""
-        self._elapsed_s += dt_s
+        """Moves on along the motion, or smoothly slower to wait for the tongs or to stop for good."""
+        way = self._pursuit
+        self._elapsed_s += 0.0 if self._held else dt_s
         wanted = 1.0
-        if self.phase is Phase.FAILED or (self.phase is Phase.CLOSE and self._gripped()):
+        if self._stops():
             wanted = 0.0
         elif self.phase is Phase.CLOSE:
-            behind_s = self._closed_for_s() - self._close_from_s - self._clock_s
-            if isfinite(behind_s):
-                wanted = min(max(1.0 + _CLOSE_GAIN_1_S * behind_s, 0.0), _CLOSE_FASTEST)
-        wanted = min(wanted, self._pace())
-        self._clock_s += self._rate * dt_s  # as the last window foretold
-        most = dt_s / _BRAKE_S
-        self._rate += min(max(wanted - self._rate, -most), most)
-        if self.phase is Phase.FAILED and self._rate == 0.0:
-            self._motion = hold(self._motion.at(self._clock_s)[0])
+            wanted = tongs.pace(self._closed_for_s() - self._close_from_s - way.clock_s)
+        elif self._gathers() and not self._gripped():
+            wanted = 0.0  # the logs have settled: up again when the tongs have followed
+        way.advance(dt_s, wanted, self._position())
+        if self.phase is Phase.FAILED and way.stands:
+            way.stand()
 
-    def _pace(self) -> float:
-        """1 while the joints follow, less when one falls behind by more than ``_LAG_S``, 0 at twice that."""
-        wanted, _ = self._motion.at(self._clock_s)
-        lags = [
-            abs(q - p) / joint(self._profile, j).speed_limit
-            for j, q, p in zip(JOINTS, wanted, self._position(), strict=True)
-        ]
-        return min(max(2.0 - max(lags) / _LAG_S, 0.0), 1.0)
+    def _stops(self) -> bool:
+        """Whether the motion is to come to a stop on its way: for good, for another, or until the tongs are ready."""
+        if self._held:
+            return True
+        if self.phase is Phase.CLOSE:
+            return self._gripped()
+        if self.phase is Phase.ABOVE and self._pursuit.left_s < GATE_S and not self._opened():
+            return True
+        return self.phase is Phase.FAILED or self._anew is not None
 
     def _proceed(self, now_ns: int) -> None:
         """Ends the phase when its work is done, or the mission when its time is over."""
         if self.phase is Phase.FAILED:
-            self.idle = self._elapsed_s > _BRAKE_S + _LAST_HOLD_S
+            self.idle = self._elapsed_s > BRAKE_S + _LAST_HOLD_S
             return
         if self.phase is Phase.DONE:
             self.idle = self._elapsed_s > _LAST_HOLD_S
             return
+        if self._held:
+            return
+        if self._anew is not None:
+            if self._pursuit.stands:
+                self._enter(self._anew, self._pursuit.sent)
+            return
         rule = RULES[self.phase]
         if self._arrived_ns is None and self._at_goal(rule.settle_s):
             self._arrived_ns = now_ns
-        following = self._next() if self._arrived_ns is not None else None
+        if self.phase in (Phase.LIFT, Phase.CARRY) and self._motions.direct and not self._gathers():
+            self._watch(now_ns)
+        following = self._next(now_ns) if self._arrived_ns is not None else None
+        if following is not None and self.halted:
+            return
         if following is not None:
             resting = self.phase is not Phase.CLOSE
-            self._enter(following, self._motion.goal if resting else self._motion.at(self._clock_s)[0])
-        elif self._elapsed_s > _SLOWEST * self._motion.duration_s + rule.settle_s + rule.slack_s:
-            self._fail(f"{rule.trouble} within {self._elapsed_s:.0f} s{self._worst_joint()}")
+            self._enter(following, self.motion.goal if resting else self._pursuit.sent)
+        elif self._elapsed_s > _SLOWEST * self.motion.duration_s + rule.settle_s + rule.slack_s:
+            off = self._pursuit.worst_joint(self._position())
+            self._fail(f"{rule.trouble} within {self._elapsed_s:.0f} s{off}")
 
     def _at_goal(self, settle_s: float) -> bool:
+        way = self._pursuit
         if self.phase is Phase.CLOSE:
-            return self._gripped() and self._rate == 0.0
-        there = self._clock_s >= self._motion.duration_s + settle_s
-        return there and all(
-            abs(p - g) <= near for p, g, near in zip(self._position(), self._motion.goal, ARRIVED, strict=True)
-        )
+            return self._gripped() and (way.stands or way.left_s <= 0.0)
+        share = _LAYING if self.phase in (Phase.CARRY, Phase.LOWER) else 1.0
+        return way.clock_s >= way.motion.duration_s + settle_s and way.arrived(self._position(), share)
 
-    def _next(self) -> Phase | None:
+    def _next(self, now_ns: int) -> Phase | None:
         """The phase after this one, whose motion is done; None while it still waits for something."""
         seen = self._arrived_ns is not None and self._logs_ns >= self._arrived_ns
         match self.phase:
             case Phase.LOOK:
                 return self._after_look() if seen else None
-            case Phase.ABOVE | Phase.OPEN:
-                return Phase(self.phase + 1) if self._opened() else None
+            case Phase.ABOVE:
+                return Phase.DESCEND if self._opened() else None
             case Phase.LIFT | Phase.CARRY:
+                if self.phase is Phase.CARRY and self._carried(now_ns):
+                    return Phase.LOWER
                 return self._after_lift() if seen else None
+            case Phase.OPEN:
+                return self._after_open(now_ns)
             case Phase.RETREAT:
                 return self._after_retreat() if seen else None
+            case Phase.STOW:
+                return Phase.DONE
         return Phase(self.phase + 1)
 
     def _after_look(self) -> Phase | None:
-        q = self._motion.goal
+        q = self.motion.goal
         try:
-            self.grasp = choose(self._arm, self._mission, self._logs, q[Joint.SLEW], q[Joint.ROT])
+            self.grasp = self._choose(self._arm, self._mission, self._logs, q[Joint.SLEW], q[Joint.ROT])
         except NoGrasp as error:
             self._fail(str(error))
             return None
         return Phase.ABOVE
 
     def _after_lift(self) -> Phase | None:
-        log = self._picked()
-        if log is None or is_held(self._arm, log, self._arm.pose(self._motion.goal)):
+        assert self.grasp is not None
+        seen = self._picked()
+        pins = [self._arm.pose(q) for q in (self._position(), self._pursuit.sent)]
+        held = came_up(self._arm, self.grasp, seen, pins)
+        self.grasp = held or self.grasp
+        if held or not seen:
             return Phase(self.phase + 1)
-        if lies_in(self._profile.bunk, log):
-            self._fail(f"log {log.id} fell from the grapple into the bunk")
+        lost = next((log for log in seen if lies_in(self._target, log)), None)
+        if lost is not None:
+            self._fail(f"log {lost.id} fell from the grapple into the bunk")
             return None
         self.missed += 1
         if self.missed < ATTEMPTS:
             return Phase.LOOK
-        self._fail(f"log {log.id} was missed {ATTEMPTS} times")
+        self._fail(f"log {seen[0].id} was missed {ATTEMPTS} times")
         return None
+
+    def _watch(self, now_ns: int) -> None:
+        """Judges on the way what hangs in the grapple; where it is not what the way was planned for, a stop and
+        another.
+        """
+        assert self.grasp is not None
+        if self._ready_ns is None:
+            risen_m = self._arm.pose(self._position()).z_m - self._begun_z_m
+            if self.phase is Phase.CARRY or risen_m > LIFT_M or self._arrived_ns is not None:
+                self._ready_ns = now_ns
+            return
+        if self._logs_ns <= self._ready_ns:
+            return
+        self._ready_ns = self._logs_ns
+        before = self.grasp
+        following = self._after_lift()
+        if following is Phase.LOOK:
+            self._anew = Phase.LOOK
+        elif following is Phase.CARRY:
+            if self.phase is Phase.LIFT and not (self.grasp is before and self._goes_on_so()):
+                self._anew = Phase.CARRY
+            elif self.phase is Phase.LIFT:
+                self.phase, self.lifted_kg = Phase.CARRY, self._hanging_kg(Phase.CARRY)
+
+    def _gathers(self) -> bool:
+        """Whether a bundle comes up slowly."""
+        return self.phase is Phase.LIFT and self.grasp is not None and self.grasp.gathered
+
+    def _goes_on_so(self) -> bool:
+        """Whether the motion will do for the log as it is now seen to hang, with another turn of the rotator."""
+        assert self.grasp is not None and self.place is not None
+        place = place_as_seen(self._arm, self._mission, self.grasp, self.place, self._logs, self._position())
+        if place is None:
+            return False
+        if turn := place.rot_rad - self.place.rot_rad:
+            self._pursuit.motion = turned(self.motion, self._pursuit.clock_s, turn)
+            self.place = place
+        return True
+
+    def _carried(self, now_ns: int) -> bool:
+        """Whether the log was seen in the grapple a moment ago."""
+        return self._motions.direct and self._ready_ns == self._logs_ns and now_ns - self._logs_ns < FRESH_NS
+
+    def _after_open(self, now_ns: int) -> Phase | None:
+        """Up and away, or done here with the next log in view."""
+        assert self._report is not None and self.grasp is not None
+        if not tongs.released(self._profile, self._report, self.grasp, self._elapsed_s):
+            return None
+        if self._sorry:
+            self._fail(self._sorry)
+            return None
+        if self._onward is None or not self._motions.direct:
+            return Phase.RETREAT
+        self._ready_ns = self._ready_ns or now_ns
+        if self._logs_ns < self._ready_ns:
+            return None
+        picked = {log.id for log in self._picked()}
+        if any(log.id not in picked and self._onward(log) for log in self._logs):
+            return self._after_retreat()
+        return Phase.RETREAT
 
     def _after_retreat(self) -> Phase | None:
-        log = self._picked()
-        if log is None or lies_in(self._profile.bunk, log):
+        astray = next((log for log in self._picked() if not lies_in(self._target, log)), None)
+        if astray is None:
             return Phase.DONE
-        x, y, z = log.center_m
-        self._fail(f"log {log.id} was released but lies at ({x:.2f}, {y:.2f}, {z:.2f}) m, not in the bunk")
+        x, y, z = astray.center_m
+        self._fail(f"log {astray.id} was released but lies at ({x:.2f}, {y:.2f}, {z:.2f}) m, not in the bunk")
         return None
 
-    def _picked(self) -> LogObservation | None:
-        """The log of the grasp as it is seen now; None when it is hidden."""
+    def _picked(self) -> list[LogObservation]:
+        """The logs of the grasp as they are seen now, without those that are hidden."""
         assert self.grasp is not None
-        return next((log for log in self._logs if log.id == self.grasp.log.id), None)
+        return picked(self.grasp, self._logs)
 
     def _gripped(self) -> bool:
-        report = self._report
-        return report is not None and self._elapsed_s > 0.5 and report.grapple_state in _GRIPPED
+        assert self._report is not None
+        return tongs.gripped(self._report, self._elapsed_s)
 
     def _opened(self) -> bool:
         assert self._report is not None
-        if isfinite(self._report.opening_pct):
-            return self._report.opening_pct >= _OPEN_PCT
-        return self._elapsed_s > self._profile.grapple.open_time_s
+        return tongs.opened(self._profile, self._report, self._elapsed_s)
 
     def _grapple(self) -> GrappleCommand:
+        if Phase.LIFT <= self.phase <= Phase.LOWER and self.grasp is not None and self.grasp.gathered:
+            return GrappleCommand.CLOSE  # the logs of a bundle settle; the tongs follow
         if self.phase in RULES:
             return RULES[self.phase].grapple
-        return GrappleCommand.OPEN if self.phase is Phase.DONE else GrappleCommand.HOLD
-
-    def _worst_joint(self) -> str:
-        wanted, _ = self._motion.at(self._clock_s)
-        errors = [
-            (abs(p - w) / near, j, p - w)
-            for j, p, w, near in zip(JOINTS, self._position(), wanted, ARRIVED, strict=True)
-        ]
-        share, axis, error = max(errors)
-        unit = "m" if axis is Joint.EXT else "rad"
-        return f": the {axis.name.lower()} is {error:+.3f} {unit} off" if share > 1.0 else ""
+        opens = self.phase is Phase.DONE and self._first is not Phase.STOW
+        return GrappleCommand.OPEN if opens else GrappleCommand.HOLD
 
     def _fail(self, reason: str) -> None:
         self.failure = reason

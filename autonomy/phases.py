@@ -10,7 +10,7 @@ from can_dbc.setpoint import GrappleCommand
 
 
 class Phase(IntEnum):
-    """Where the activity is; the order is the order of a cycle without trouble."""
+    """Where the activity is; the order is the order of a cycle without trouble.  STOW is a job of its own."""
 
     WAIT = 0
     LOOK = 1
@@ -22,8 +22,9 @@ class Phase(IntEnum):
     LOWER = 7
     OPEN = 8
     RETREAT = 9
-    DONE = 10
-    FAILED = 11
+    STOW = 10
+    DONE = 11
+    FAILED = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,15 +41,16 @@ class Rule:
 
 _OPEN, _CLOSE, _HOLD = GrappleCommand.OPEN, GrappleCommand.CLOSE, GrappleCommand.HOLD
 RULES: Final = {
-    Phase.LOOK: Rule(_OPEN, 0.3, 5.0, "the detector sent no log list"),
-    Phase.ABOVE: Rule(_OPEN, 0.2, 6.0, "the crane did not get above the log with an open grapple"),
-    Phase.DESCEND: Rule(_OPEN, 0.2, 5.0, "the crane did not get down to the log"),
+    Phase.LOOK: Rule(_OPEN, 0.0, 5.0, "the detector sent no log list"),
+    Phase.ABOVE: Rule(_OPEN, 0.0, 6.0, "the crane did not get above the log with an open grapple"),
+    Phase.DESCEND: Rule(_OPEN, 0.1, 5.0, "the crane did not get down to the log"),
     Phase.CLOSE: Rule(_CLOSE, 0.0, 6.0, "the grapple did not close"),
-    Phase.LIFT: Rule(_HOLD, 0.3, 5.0, "the crane did not lift the log, or no log list came"),
-    Phase.CARRY: Rule(_HOLD, 0.3, 6.0, "the crane did not get over the bunk, or no log list came"),
-    Phase.LOWER: Rule(_HOLD, 0.3, 5.0, "the crane did not get down into the bunk"),
-    Phase.OPEN: Rule(_OPEN, 0.3, 5.0, "the grapple did not open"),
-    Phase.RETREAT: Rule(_OPEN, 0.2, 6.0, "the crane did not leave the bunk, or no log list came"),
+    Phase.LIFT: Rule(_HOLD, 0.0, 5.0, "the crane did not lift the log, or no log list came"),
+    Phase.CARRY: Rule(_HOLD, 0.0, 6.0, "the crane did not get over the bunk, or no log list came"),
+    Phase.LOWER: Rule(_HOLD, 0.1, 5.0, "the crane did not get down into the bunk"),
+    Phase.OPEN: Rule(_OPEN, 0.0, 5.0, "the grapple did not open"),
+    Phase.RETREAT: Rule(_OPEN, 0.1, 6.0, "the crane did not leave the bunk, or no log list came"),
+    Phase.STOW: Rule(_HOLD, 0.1, 6.0, "the crane did not get over the bunk"),
 }
 BEGIN_AGAIN: Final = {
     Phase.DESCEND: Phase.ABOVE,

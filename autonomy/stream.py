@@ -2,14 +2,15 @@
 
 A motion is a function of time; a datagram shows a window of it, so that the controller can interpolate and a
 late planner does not reach the valves.  Before its start and past its end a motion stands still, so a hold is
-nothing special: its window is one pose, and ``final`` is set.
+nothing special: its window is one pose, and ``final`` is set.  One that has come to a stop on its way is a hold, too:
+whoever thinks about the way on for longer than the lease does not end in a stop of the controller.
 """
 
 from __future__ import annotations
 
 from typing import Final, Protocol
 
-from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, encode
+from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, SpoolKnot, SpoolTest, encode
 
 PERIOD_NS: Final = 50_000_000
 HORIZON_KNOTS: Final = 8
@@ -40,12 +41,20 @@ class SetpointStream:
         self._lease_ns = lease_ns
         self._key = key
         self._sequence: int | None = None
+        self._due_ns = 0
+
+    def due(self, now_ns: int) -> bool:
+        """Whether a datagram is to be sent now; then the next is due ``PERIOD_NS`` after this one was."""
+        if now_ns < self._due_ns:
+            return False
+        on_time = self._due_ns > now_ns - PERIOD_NS // 2
+        self._due_ns = (self._due_ns if on_time else now_ns) + PERIOD_NS
+        return True
 
     def datagram(self, now_ns: int, motion: Motion, time_s: float, grapple: GrappleCommand, rate: float = 1.0) -> bytes:
         """The window of ``motion`` that starts at its ``time_s``, now; ``rate`` is its seconds per real
         second.
         """
-        self._sequence = now_ns // 1_000_000 if self._sequence is None else self._sequence + 1
         knots = []
         for index in range(HORIZON_KNOTS + 1):
             after_ns = index * PERIOD_NS
@@ -53,12 +62,21 @@ class SetpointStream:
             knots.append(Knot(after_ns, position, tuple(rate * v for v in velocity)))
         end_s = time_s + rate * HORIZON_KNOTS * PERIOD_NS * 1e-9
         setpoint = CraneSetpoint(
-            self._sequence & 0xFFFF_FFFF,
+            self._next(now_ns),
             self._profile_hash,
             now_ns,
             self._lease_ns,
             grapple,
-            end_s >= motion.duration_s,
+            rate == 0.0 or end_s >= motion.duration_s,
             tuple(knots),
         )
         return encode(setpoint, self._key)
+
+    def spool(self, now_ns: int, function: int, knots: tuple[SpoolKnot, ...]) -> bytes:
+        """A stretch of a spool program, from now on."""
+        test = SpoolTest(self._next(now_ns), self._profile_hash, now_ns, self._lease_ns, function, knots)
+        return encode(test, self._key)
+
+    def _next(self, now_ns: int) -> int:
+        self._sequence = now_ns // 1_000_000 if self._sequence is None else self._sequence + 1
+        return self._sequence & 0xFFFF_FFFF

@@ -1,50 +1,41 @@
-"""Smooth, synchronised, sway-aware joint motions between poses.
+"""Smooth, synchronised joint motions between poses that leave the grapple hanging still.
 
-A leg is a straight line in poses.  Its progress has velocity ramps of ``smoothstep5`` with a cruise between
-them, so velocity, acceleration and jerk are zero at both ends (as s = 35t^4-84t^5+70t^6-20t^7 of machines.md
-1.6, whose peak it equals without cruise, but faster over long ways).  The ramp and the duration are the
-shortest that keep every joint inside its limits and leave less than ``SWAY_M`` of swing: for a pendulum of
-frequency w under the pin's acceleration a the amplitude that stays is |integral a(t) e^(iwt) dt| / w.  Legs
-over different coordinates may overlap.  Failure: ``machine.kinematics.Unreachable``.  No clock: a plan is a
-function of its own time.
+A leg is a straight line in poses, driven by a time law of `autonomy.motion.timing`.  Legs over different coordinates
+may overlap; a motion has at most one leg that moves the pin sideways, so that leg's law decides about the swing.
+Failure: ``machine.kinematics.Unreachable``.  No clock: a plan is a function of its own time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from autonomy.motion.arm import Arm, Pose
+from autonomy.motion.timing import SHORTEST_S, Way, time_law
+from machine.joints import Joint
 
 STEP_S: Final = 0.02
-SWAY_M: Final = 0.03
-PENDULUM_S: Final = (1.5, 1.65, 1.8, 1.95, 2.1)
-"""Periods of the empty and the loaded grapple (machines.md 5), with some spread."""
-_RAMPS: Final = (0.5, 0.42, 0.34, 0.27, 0.21, 0.16)
-_SHORTEST_S: Final = 0.6
-_GRID: Final = np.linspace(0.0, 1.0, 121)
+_GENTLE: Final = 0.5
+"""Share of the acceleration limits that a motion without regard to the arm's reach uses."""
+_GRID: Final = np.linspace(0.0, 1.0, 81)
 _RISE_LEFT_M: Final = 0.12
 """How far under its height a rising grapple may still be when it starts to move sideways."""
 _WAY_LEFT_M: Final = 0.35
 """How far from the point under it a grapple may be when it starts to go down."""
+_SAME: Final = 1e-6
 
 Axes = tuple[float, ...]
 
 
-def progress(tau: np.ndarray, ramp: float) -> np.ndarray:
-    """Progress 0..1 over ``tau`` = time / duration (clipped); ``ramp`` in (0, 0.5] is each ramp's share."""
-    tau = np.clip(tau, 0.0, 1.0)
-    top = 1.0 / (1.0 - ramp)
-
-    def rising(t: np.ndarray) -> np.ndarray:
-        w = np.minimum(t / ramp, 1.0)
-        way: np.ndarray = top * (ramp * w**4 * (2.5 - 3.0 * w + w * w) + np.maximum(t - ramp, 0.0))
-        return way
-
-    return np.where(tau <= 0.5, rising(tau), 1.0 - rising(1.0 - tau))
+def progress(tau: np.ndarray) -> np.ndarray:
+    """Progress 0..1 over ``tau`` = time / duration (clipped), at rest up to the jerk at both ends (machines.md 1.6)."""
+    t = np.clip(tau, 0.0, 1.0)
+    way: np.ndarray = t**4 * (35.0 + t * (-84.0 + t * (70.0 - 20.0 * t)))
+    return way
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,9 +70,25 @@ class Trajectory:
         return tuple(q), tuple(v)
 
 
+def _curve(position: np.ndarray) -> CubicSpline:
+    """Positions every ``STEP_S``, from rest to rest, as a curve whose acceleration does not jump."""
+    return CubicSpline(np.arange(len(position)) * STEP_S, position, bc_type="clamped")
+
+
 def _table(position: np.ndarray) -> Trajectory:
-    velocity = np.gradient(position, STEP_S, axis=0)
-    velocity[0] = velocity[-1] = 0.0
+    curve = _curve(position)
+    return Trajectory([tuple(q) for q in position.tolist()], [tuple(v) for v in curve(curve.x, 1).tolist()])
+
+
+def turned(motion: Trajectory, from_s: float, by_rad: float) -> Trajectory:
+    """The motion with the rotator turned by so much more from a time on, until its end."""
+    position, velocity = np.array(motion.position), np.array(motion.velocity)
+    span_s = motion.duration_s - from_s
+    time = (np.arange(len(position)) * STEP_S - from_s) / span_s
+    done = progress(time)
+    position[:, Joint.ROT] += by_rad * done
+    t = np.clip(time, 0.0, 1.0)
+    velocity[:, Joint.ROT] += by_rad * 140.0 * t**3 * (1.0 - t) ** 3 / span_s
     return Trajectory([tuple(q) for q in position.tolist()], [tuple(v) for v in velocity.tolist()])
 
 
@@ -90,82 +97,97 @@ def hold(q: Sequence[float]) -> Trajectory:
     return _table(np.array([q, q], dtype=float))
 
 
-def _load(arm: Arm, position: np.ndarray, step: float) -> float:
-    """By how much a motion sampled every ``step`` is to be stretched in time to keep the arm's limits (1 =
-    just).
-    """
-    velocity = np.gradient(position, step, axis=0)
-    acceleration = np.gradient(velocity, step, axis=0)
-    speed = np.max(np.abs(velocity) / arm.speed)
-    return float(max(speed, np.sqrt(np.max(np.abs(acceleration) / arm.acceleration))))
+class Law(Protocol):
+    """How far a way is done over time."""
 
+    @property
+    def duration_s(self) -> float:
+        """When it is done."""
 
-def _sway_m(pin_xy: np.ndarray, duration_s: float) -> float:
-    """Greatest swing that stays after the pin went along (n, 2) points, evenly spaced in time."""
-    step = duration_s / (len(pin_xy) - 1)
-    acceleration = np.gradient(np.gradient(pin_xy, step, axis=0), step, axis=0)
-    time = np.arange(len(pin_xy)) * step
-    omega = 2.0 * np.pi / np.array(PENDULUM_S)
-    left = np.exp(1j * np.outer(omega, time)) @ acceleration * step / omega[:, None]
-    return float(np.max(np.linalg.norm(np.abs(left), axis=1)))
+    def progress(self, time_s: np.ndarray) -> np.ndarray:
+        """Progress (0 to 1) at times; 0 before and 1 after the motion."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Leg:
-    """A straight way in poses with its timing."""
+class Leg:
+    """A straight way in poses with its time law; None where there is nowhere to go."""
 
     start: np.ndarray
     way: np.ndarray
-    duration_s: float
-    ramp: float
+    law: Law | None
+
+    @property
+    def duration_s(self) -> float:
+        """Time of the leg alone."""
+        return self.law.duration_s if self.law else 0.0
 
     def progress_at(self, time_s: np.ndarray) -> np.ndarray:
-        if self.duration_s == 0.0:
-            return np.zeros_like(time_s)
-        return progress(time_s / self.duration_s, self.ramp)
+        """Progress at times from its own start."""
+        return self.law.progress(time_s) if self.law else np.zeros_like(time_s)
 
-    def time_left(self, left: float) -> float:
-        """The time from which the progress that is left is at most ``left`` (a share)."""
+    def times_left(self, *left: float) -> list[float]:
+        """The times from which the progress that is left is at most so much (shares)."""
         done = self.progress_at(_GRID * self.duration_s)
-        return float(np.argmax(done >= 1.0 - left)) / (len(_GRID) - 1) * self.duration_s
+        return [float(_GRID[np.argmax(done >= 1.0 - share)]) * self.duration_s for share in left]
 
 
-def _leg(arm: Arm, start: Pose, goal: Pose) -> _Leg:
+def leg(arm: Arm, start: Pose, goal: Pose, law: Callable[[Way], Law] = time_law) -> Leg:
+    """The straight way from start to goal, driven by a law of `autonomy.motion.timing` or of another maker."""
     first, way = np.array(start), np.array(goal) - np.array(start)
-    if np.max(np.abs(way)) < 1e-6:
-        return _Leg(first, way, 0.0, 0.5)
-    q = arm.joints(first + _GRID[:, None] * way)
-    slew, r = (first[:2] + _GRID[:, None] * way[:2]).T
-    pin = np.column_stack([r * np.cos(slew), r * np.sin(slew)])
-    best = (np.inf, 0.5)
-    for ramp in _RAMPS:
-        done = progress(_GRID, ramp)
-        timed = np.column_stack([np.interp(done, _GRID, column) for column in q.T])
-        duration = max(_SHORTEST_S, _load(arm, timed, _GRID[1]))
-        xy = np.column_stack([np.interp(done, _GRID, column) for column in pin.T])
-        while duration < best[0] and _sway_m(xy, duration) > SWAY_M:
-            duration *= 1.05
-        best = min(best, (duration, ramp))
-    return _Leg(first, way, *best)
+    if np.max(np.abs(way)) < _SAME:
+        return Leg(first, way, None)
+    return Leg(first, way, law(_way(arm, first, way)))
 
 
-def _run(arm: Arm, legs: Sequence[tuple[float, _Leg]]) -> Trajectory:
+def _way(arm: Arm, first: np.ndarray, way: np.ndarray) -> Way:
+    return Way(arm, first + _GRID[:, None] * way)
+
+
+def summed(arm: Arm, legs: Sequence[tuple[float, Leg]]) -> Trajectory:
     """The sum of legs, each from its starting time, slowed down as a whole if their overlap asks for it."""
     end_s = max(at + leg.duration_s for at, leg in legs)
 
-    def sampled(stretch: float) -> np.ndarray:
-        time = np.arange(int(np.ceil(end_s * stretch / STEP_S)) + 2) * STEP_S / stretch
-        ways = sum(leg.progress_at(time - at)[:, None] * leg.way for at, leg in legs)
-        return arm.joints(legs[0][1].start + ways)
+    def sampled(duration_s: float) -> np.ndarray:
+        steps = max(1, int(np.ceil(duration_s / STEP_S)))
+        time = np.linspace(0.0, end_s, steps + 1)
+        return arm.joints(legs[0][1].start + sum(leg.progress_at(time - at)[:, None] * leg.way for at, leg in legs))
 
-    q = sampled(1.0)
-    load = _load(arm, q, STEP_S)
-    return _table(q if load <= 1.0 else sampled(load * 1.005))
+    return paced(arm, sampled, end_s, arm.sampled_acceleration if len(legs) == 1 else arm.acceleration)
 
 
-def straight(arm: Arm, start: Pose, goal: Pose) -> Trajectory:
-    """A straight line in poses; vertical when only the height differs."""
-    return _run(arm, [(0.0, _leg(arm, start, goal))])
+def paced(
+    arm: Arm, sampled: Callable[[float], np.ndarray], end_s: float, accelerations: np.ndarray | None = None
+) -> Trajectory:
+    """A motion of ``end_s``, or as much longer as the arm's limits (or these ``accelerations``) ask for.
+
+    ``sampled(duration_s)`` gives its joint vectors (n, 5) every ``STEP_S``, from rest to rest.
+    """
+    q = sampled(end_s)
+    load = _load(arm, q, arm.acceleration if accelerations is None else accelerations)
+    return _table(q if load <= 1.0 else sampled(load * end_s))
+
+
+def _load(arm: Arm, position: np.ndarray, accelerations: np.ndarray) -> float:
+    """By how much a motion sampled every ``STEP_S`` is to be stretched in time to keep the arm's limits and these
+    ``accelerations`` (1 = just).
+    """
+    curve = _curve(position)
+    velocity, acceleration = curve(curve.x, 1), curve(curve.x, 2)
+    speed = max(np.max(np.abs(velocity) / arm.speed), np.max(arm.pump_load(position, velocity)))
+    return float(max(speed, np.sqrt(np.max(np.abs(acceleration) / accelerations))))
+
+
+def straight(arm: Arm, start: Pose, goal: Pose, shaped: bool = True) -> Trajectory:
+    """A straight line in poses; vertical when only the height differs.
+
+    ``shaped=False``, for comparison, takes as long without regard to swing: it is the fastest law, evenly slowed.
+    """
+    line = leg(arm, start, goal)
+    motion = summed(arm, [(0.0, line)])
+    if shaped or line.law is None:
+        return motion
+    plain = time_law(_way(arm, line.start, line.way), shaped=False).slowed(motion.duration_s)
+    return summed(arm, [(0.0, Leg(line.start, line.way, plain))])
 
 
 def travel(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: float = 0.0) -> Trajectory:
@@ -174,17 +196,31 @@ def travel(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: float = 0
     With ``free_m`` the pin may rise on the way, as long as it is up ``free_m`` before the goal; without, it goes
     sideways only when it is almost up.
     """
-    up = _leg(arm, start, start.at_height(height_m))
-    over = _leg(arm, start.at_height(height_m), goal.at_height(height_m))
-    down = _leg(arm, goal.at_height(height_m), goal)
+    up = leg(arm, start, start.at_height(height_m))
+    over = leg(arm, start.at_height(height_m), goal.at_height(height_m))
+    down = leg(arm, goal.at_height(height_m), goal)
     rise, drop = abs(up.way[2]), abs(down.way[2])
     way_m = float(np.hypot(over.way[0] * max(start.r_m, goal.r_m), over.way[1]))
-    over_at = up.time_left(_RISE_LEFT_M / rise) if rise > _RISE_LEFT_M else 0.0
+    over_at = up.times_left(_RISE_LEFT_M / rise)[0] if rise > _RISE_LEFT_M else 0.0
     if 0.0 < free_m < way_m:
-        over_at = max(0.0, up.duration_s - over.time_left(free_m / way_m))
-    down_at = over_at + (over.time_left(_WAY_LEFT_M / way_m) if way_m > _WAY_LEFT_M else 0.0)
+        over_at = max(0.0, up.duration_s - over.times_left(free_m / way_m)[0])
+    down_at = over_at + (over.times_left(_WAY_LEFT_M / way_m)[0] if way_m > _WAY_LEFT_M else 0.0)
     down_at = max(down_at, up.duration_s if drop else 0.0)
-    return _run(arm, [(0.0, up), (over_at, over), (down_at, down)])
+    return summed(arm, [(0.0, up), (over_at, over), (down_at, down)])
+
+
+def across(arm: Arm, start: Sequence[float], goal: Sequence[float]) -> Trajectory:
+    """Every joint straight from start to goal, together, within the limits but gently, whatever the arm's reach."""
+    first, way = np.array(start, dtype=float), np.array(goal, dtype=float) - np.array(start, dtype=float)
+    tau = np.linspace(0.0, 1.0, 121)
+    done = progress(tau)
+    speed = np.gradient(done, tau[1])
+    steepest = float(np.max(np.abs(np.gradient(speed, tau[1]))))
+    fastest = float(np.max(np.abs(way) / arm.speed)) * float(np.max(speed))
+    pushed = float(np.sqrt(np.max(np.abs(way) / (_GENTLE * arm.acceleration)) * steepest))
+    duration = max(SHORTEST_S, fastest, pushed)
+    time = np.arange(int(np.ceil(duration / STEP_S)) + 2) * STEP_S
+    return _table(first + progress(time / duration)[:, None] * way)
 
 
 def follow(arm: Arm, start: Pose, path: Callable[[float], Pose], end_s: float, blend_s: float) -> Trajectory:
@@ -193,5 +229,5 @@ def follow(arm: Arm, start: Pose, path: Callable[[float], Pose], end_s: float, b
     """
     time = np.arange(int(np.ceil(end_s / STEP_S)) + 1) * STEP_S
     nominal = np.array([path(t) for t in time])
-    fade = 1.0 - progress(time / blend_s, 0.5)
+    fade = 1.0 - progress(time / blend_s)
     return _table(arm.joints(nominal + fade[:, None] * (np.array(start) - nominal[0])))

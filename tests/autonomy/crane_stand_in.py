@@ -16,10 +16,10 @@ from autonomy.logs import LogObservation
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, StateReport, decode
 from machine.grapple import grapple_yaw, half_gap_m, opening_pct_from_tong_angle, tip_below_pin_m
 from machine.joints import JOINTS
-from machine.kinematics import pin_position
 from machine.load import profile_hash
 from machine.modes import Mode
 from machine.profile import Profile, joint
+from machine.sag import true_pin
 
 GROUND_LOG = LogObservation(0, (-1.8, 4.4, -1.29), (0.6, 0.8, 0.0), 2.6, 0.2)
 HOME = (0.0, 0.75, -1.6, 0.30, 0.0)
@@ -48,6 +48,7 @@ class StandIn:
     q: tuple[float, ...] = HOME
     mode: Mode = Mode.ARMED
     feedback: bool = True
+    log_kg: float = nan  # what a load cell shows of a held log, and what the column feels
     slippery: int = 0  # so many grips come up empty
     now_ns: int = 5_000_000_000
     tong_rad: float = 0.0
@@ -63,8 +64,18 @@ class StandIn:
         sequence = self.setpoint.sequence if self.setpoint else 0
         return StateReport(
             0, profile_hash(self.profile), self.now_ns, self.mode, state, 0, sequence, 0, 0, 0, self.q,
-            (0.0,) * 5, self.q, opening if self.feedback else nan, nan, nan, 0, 0, 0, 0,
+            (0.0,) * 5, self.q, opening if self.feedback else nan, nan, self.load_kg, 0, 0, 0, 0,
         )  # fmt: skip
+
+    @property
+    def load_kg(self) -> float:
+        """What hangs in the grapple, by its load cell; NaN without one."""
+        return self.log_kg if self.held is not None else 0.0 * self.log_kg
+
+    def pin(self) -> tuple[float, float, float]:
+        """Where the hanger pin truly is."""
+        load_kg = self.load_kg if 0.0 <= self.load_kg < 1e4 else 0.0  # else the cell is broken, and nothing is known
+        return true_pin(self.profile.sag, self.profile.kinematics, self.q, load_kg)
 
     def seen(self) -> tuple[LogObservation, ...]:
         """The log list of a perfect detector."""
@@ -93,7 +104,7 @@ class StandIn:
             self._grapple(self.setpoint.grapple)
         self._carry()
         log = next((log for log in self.logs if log.id == self.held), None)
-        pin = pin_position(self.profile.kinematics, self.q)
+        pin = self.pin()
         self.trace.append(Moment(activity.phase.name, self.q, pin, self.tong_rad, log))
         return data
 
@@ -136,7 +147,7 @@ class StandIn:
             self.tong_rad = min(self.tong_rad, full)
 
     def _grip(self) -> None:
-        x, y, z = pin_position(self.profile.kinematics, self.q)
+        x, y, z = self.pin()
         tip_z = z - tip_below_pin_m(self.profile.grapple.tongs, self.tong_rad)
         for log in self.logs:
             dx, dy = x - log.center_m[0], y - log.center_m[1]
@@ -155,7 +166,7 @@ class StandIn:
     def _carry(self) -> None:
         if self.held is None:
             return
-        x, y, z = pin_position(self.profile.kinematics, self.q)
+        x, y, z = self.pin()
         psi = self._psi + grapple_yaw(self.profile, self.q)
         at = (x - self._along * cos(psi), y - self._along * sin(psi), z - self._hangs_m)
         self._move(self.held, at, (cos(psi), sin(psi), 0.0))
@@ -205,7 +216,7 @@ def clearances(profile: Profile, trace: list[Moment]) -> dict[str, float]:
     """The least distances of a run, m: tips over ground and bunk, log over ground, bunk floor and stakes, base."""
     ground, bunk = profile.workspace.ground_z_m, profile.bunk
     top = bunk.floor_z_m + bunk.stake_height_m
-    least = dict.fromkeys(("tip", "log", "stakes", "tips_over_stakes", "base"), inf)
+    least = dict.fromkeys(("tip", "log", "stakes", "tips_in_stakes", "base"), inf)
 
     def note(what: str, value: float) -> None:
         least[what] = min(least[what], value)
@@ -214,8 +225,9 @@ def clearances(profile: Profile, trace: list[Moment]) -> dict[str, float]:
         for tip in tips(profile, moment):
             note("tip", tip[2] - (bunk.floor_z_m if over_bunk(profile, tip, 0.02) else ground))
             note("base", hypot(*tip[:2]))
-            if over_bunk(profile, tip, 0.3) and moment.phase not in ("LOWER", "OPEN", "RETREAT", "DONE"):
-                note("tips_over_stakes", tip[2] - top)
+            opens = moment.phase in ("OPEN", "RETREAT", "DONE")  # between single stakes, not walls
+            if over_bunk(profile, tip, 0.3) and tip[2] < top and not opens:
+                note("tips_in_stakes", bunk.width_m / 2 - abs(to_bunk(profile, tip)[1]))  # between them: sideways
         if moment.held is None:
             continue
         bottom = moment.held.diameter_m / 2

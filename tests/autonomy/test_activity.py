@@ -5,28 +5,33 @@ from __future__ import annotations
 import random
 import re
 from dataclasses import replace
-from math import cos, nan, pi, sin
+from math import atan2, cos, hypot, nan, pi, remainder, sin
 
+import msgspec
 import numpy as np
 import pytest
 from crane_stand_in import GROUND_LOG, HOME, TICK_NS, StandIn, clearances
 
 from autonomy.activity import Activity, Phase
-from autonomy.grasp.direct import lies_in
+from autonomy.course import aimed
+from autonomy.grasp.direct import LIFT_M, lies_in, plan_grasp
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
+from autonomy.motion.arm import Arm
+from autonomy.motion.ways import Swiftest
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, StateReport, decode
 from machine.joints import JOINTS, Joint
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode
-from machine.profile import joint
+from machine.profile import Sag, joint
+from machine.sag import true_pin
 
 PROFILE = load_profile("palms_471")
 CYCLE = ["LOOK", "ABOVE", "DESCEND", "CLOSE", "LIFT", "CARRY", "LOWER", "OPEN", "RETREAT", "DONE"]
 
 
-def activity(mission: Mission | None = None) -> Activity:
-    return Activity(PROFILE, profile_hash(PROFILE), mission)
+def activity(mission: Mission | None = None, direct: bool = True) -> Activity:
+    return Activity(PROFILE, profile_hash(PROFILE), mission, motions=Swiftest(direct))
 
 
 def random_log(seed: int) -> LogObservation:
@@ -60,22 +65,113 @@ def report(crane: StandIn, **changes: object) -> StateReport:
     return replace(crane.report(), **changes)  # type: ignore[arg-type]
 
 
+def test_a_column_that_leans_under_the_log_is_known_where_the_log_is_laid_down() -> None:
+    sag = Sag(0.0054, 0.0036, 0.028, 2.0e-6, 4500.0, 3000.0)
+    profile = msgspec.structs.replace(PROFILE, sag=sag)
+    crane = StandIn(profile, [GROUND_LOG], log_kg=260.0)
+    planner = Activity(profile, profile_hash(profile))
+    crane.run(planner)
+    assert planner.done and planner.failure is None and planner.missed == 0
+    assert lies_in(profile.bunk, crane.logs[0])
+    last = {m.phase: m for m in crane.trace}
+    assert planner.grasp is not None and planner.place is not None
+    assert last["DESCEND"].pin[2] == pytest.approx(planner.grasp.pose.z_m, abs=1e-3)
+    lowered, place = last["LOWER"], planner.place
+    assert lowered.pin[2] == pytest.approx(place.z_m, abs=1e-3)
+    assert hypot(*lowered.pin[:2]) == pytest.approx(place.r_m, abs=1e-3)
+    assert true_pin(sag, profile.kinematics, lowered.q)[2] > place.z_m + 0.03, "planned for the load, not without it"
+
+
+@pytest.mark.parametrize("load_kg", [nan, -3.0, 1e5])
+def test_a_load_that_cannot_be_is_not_planned_for(load_kg: float) -> None:
+    profile = msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 2.0e-6))
+    crane = StandIn(profile, [GROUND_LOG], log_kg=load_kg)
+    planner = Activity(profile, profile_hash(profile))
+    crane.run(planner)
+    assert planner.done and planner.failure is None
+
+
 @pytest.mark.parametrize("seed", range(40))
 def test_a_random_log_goes_from_the_ground_into_the_bunk(seed: int) -> None:
     crane, planner = StandIn(PROFILE, [random_log(seed)]), activity()
     seconds = crane.run(planner)
     assert planner.done and planner.failure is None and planner.missed == 0
-    assert phases(crane) == CYCLE and 30.0 < seconds < 45.0
+    assert phases(crane) == CYCLE and 15.0 < seconds < 30.0
     assert lies_in(PROFILE.bunk, crane.logs[0])
     least = clearances(PROFILE, crane.trace[::2])
     assert least["tip"] > 0.005 and least["log"] > 0.0
-    assert least["tips_over_stakes"] > 0.25 and least["stakes"] > 0.15 and least["base"] > 1.5
+    assert least["tips_in_stakes"] > 0.15 and least["stakes"] > 0.08 and least["base"] > 1.5
     q = np.array([m.q for m in crane.trace])
     velocity = np.diff(q, axis=0) / (TICK_NS * 1e-9)
     acceleration = np.diff(velocity, axis=0) / (TICK_NS * 1e-9)
     for j in JOINTS:
-        assert np.max(np.abs(velocity[:, j])) < 0.95 * joint(PROFILE, j).speed_limit
+        assert np.max(np.abs(velocity[:, j])) < joint(PROFILE, j).speed_limit
         assert np.max(np.abs(acceleration[:, j])) < 1.2 * joint(PROFILE, j).acceleration_limit
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_motions_that_are_made_one_by_one_lead_there_too(seed: int) -> None:
+    crane, planner = StandIn(PROFILE, [random_log(seed)]), activity(direct=False)
+    crane.run(planner)
+    assert planner.done and phases(crane) == CYCLE and lies_in(PROFILE.bunk, crane.logs[0])
+    heights = {m.phase: m.pin[2] for m in crane.trace}
+    assert heights["LIFT"] == pytest.approx(heights["CLOSE"] + LIFT_M, abs=0.08), "it stands there to be judged"
+    least = clearances(PROFILE, crane.trace[::2])
+    assert least["tip"] > 0.005 and least["stakes"] > 0.08
+
+
+def test_with_another_log_in_view_the_crane_stays_in_the_bunk_and_goes_on_from_there() -> None:
+    other = replace(GROUND_LOG, id=1, center_m=(1.5, 4.8, GROUND_LOG.center_m[2]))
+    crane = StandIn(PROFILE, [GROUND_LOG, other])
+    wanted: list[int] = []
+
+    def onward(log: LogObservation) -> bool:
+        wanted.append(log.id)
+        return not lies_in(PROFILE.bunk, log)
+
+    def job() -> Activity:
+        return Activity(PROFILE, profile_hash(PROFILE), onward=onward)
+
+    first, second = job(), job()
+    first_s = crane.run(first)
+    assert first.done and "RETREAT" not in phases(crane)
+    assert first.place is not None and crane.pin()[2] == pytest.approx(first.place.z_m, abs=0.02)
+    assert first.grasp is not None and first.grasp.log.id not in wanted, "what was laid down is not asked about"
+    begin = len(crane.trace)
+    crane.run(second)
+    assert second.done and phases(crane)[-2:] == ["RETREAT", "DONE"] and first_s < 30.0
+    assert all(lies_in(PROFILE.bunk, log) for log in crane.logs)
+    least = clearances(PROFILE, crane.trace[begin::2])
+    assert least["tip"] > 0.005 and least["stakes"] > 0.08
+
+
+def test_a_log_that_hangs_askew_is_turned_on_the_way() -> None:
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
+    run_until(crane, planner, Phase.LIFT)
+    crane._psi += 0.15  # it slipped while it was gripped
+    crane.run(planner)
+    assert planner.done and phases(crane).count("CARRY") == 1
+    yaw = atan2(crane.logs[0].axis[1], crane.logs[0].axis[0])
+    assert abs(remainder(yaw - PROFILE.bunk.yaw_rad, pi)) < 0.02
+    rate = np.abs(np.diff([m.q[Joint.SLEW] for m in crane.trace if m.phase in ("LIFT", "CARRY")]))
+    moving = np.flatnonzero(rate > 1e-4)
+    assert np.all(np.diff(moving) == 1), "without a stop"
+
+
+def test_nothing_is_let_go_in_the_air_while_a_joint_hangs_back() -> None:
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
+    run_until(crane, planner, Phase.CARRY)
+    stuck = crane.q[Joint.SLEW]
+    for _ in range(60):
+        position = (stuck, *crane.q[1:])
+        data = planner.step(crane.now_ns, report(crane, position=position, mode=Mode.ACTIVE), crane.seen())
+        if data is not None:
+            sent = decode(data)
+            assert isinstance(sent, CraneSetpoint) and sent.grapple is GrappleCommand.HOLD
+            crane.setpoint = sent
+        crane.now_ns += TICK_NS
+        crane.q = crane._knot_at(crane.now_ns).position
+        crane._carry()
 
 
 def test_without_grapple_feedback_time_alone_does_it() -> None:
@@ -143,6 +239,40 @@ def test_a_crane_that_was_driven_aside_first_goes_back_over_the_log() -> None:
     assert planner.done
 
 
+def test_what_turns_out_to_lie_a_little_elsewhere_is_gripped_there() -> None:
+    """As where the machine leans towards the crane that reaches out."""
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
+    run_until(crane, planner, Phase.ABOVE, more_s=1.0)
+    x, y, z = GROUND_LOG.center_m
+    crane.logs[0] = replace(GROUND_LOG, center_m=(x + 0.03, y - 0.05, z + 0.04))
+    run_until(crane, planner, Phase.CLOSE)
+    above = crane.trace[-1].pin
+    assert hypot(above[0] - x - 0.03, above[1] - y + 0.05) < 0.005
+    crane.run(planner)
+    assert planner.done
+
+
+@pytest.mark.parametrize(
+    ("moved_m", "why"),
+    [((0.01, 0.0, 0.01), "the tongs forgive it"), ((0.25, 0.2, 0.0), "another log"), ((0.0, 0.0, -0.9), "another log")],
+)
+def test_other_news_of_a_log_change_no_aim(moved_m: tuple[float, float, float], why: str) -> None:
+    arm = Arm(PROFILE)
+    grasp = plan_grasp(arm, GROUND_LOG, 0.0)
+    seen = replace(GROUND_LOG, center_m=tuple(c + d for c, d in zip(GROUND_LOG.center_m, moved_m, strict=True)))
+    assert aimed(arm, grasp, [seen]) is grasp, why
+    assert aimed(arm, grasp, []) is grasp
+
+
+def test_nothing_is_aimed_at_below_the_ground() -> None:
+    arm = Arm(PROFILE)
+    grasp = plan_grasp(arm, GROUND_LOG, 0.0)
+    x, y, z = GROUND_LOG.center_m
+    lower = aimed(arm, grasp, [replace(GROUND_LOG, center_m=(x, y, z - 0.2))])
+    assert lower.support_z_m == pytest.approx(PROFILE.workspace.ground_z_m)
+    assert lower.pose.z_m == pytest.approx(grasp.pose.z_m + lower.support_z_m - grasp.support_z_m)
+
+
 def test_a_silent_controller_pauses() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     run_until(crane, planner, Phase.ABOVE, more_s=1.0)
@@ -205,18 +335,22 @@ def test_what_cannot_be_done_ends_the_mission_with_one_sentence(
 
 
 @pytest.mark.parametrize(
-    ("phase", "freeze", "says"),
+    ("phase", "direct", "freeze", "says"),
     [
-        (Phase.ABOVE, "slew", "the crane did not get above the log with an open grapple within .* the slew is"),
-        (Phase.DESCEND, "lift", "the crane did not get down to the log within .* the lift is"),
-        (Phase.LIFT, "lift", "the crane did not lift the log, or no log list came within .* the lift is"),
-        (Phase.CARRY, "slew", "the crane did not get over the bunk, or no log list came within .* the slew is"),
-        (Phase.LOWER, "lift", "the crane did not get down into the bunk within .* the lift is"),
-        (Phase.RETREAT, "lift", "the crane did not leave the bunk, or no log list came within .* the lift is"),
+        (Phase.ABOVE, True, "slew", "the crane did not get above the log with an open grapple within .* the slew is"),
+        (Phase.ABOVE, False, "slew", "the crane did not get above the log with an open grapple within .* the slew is"),
+        (Phase.DESCEND, False, "lift", "the crane did not get down to the log within .* the lift is"),
+        (Phase.LIFT, True, "lift", "the crane did not lift the log, or no log list came within .* the lift is"),
+        (Phase.LIFT, False, "lift", "the crane did not lift the log, or no log list came within .* the lift is"),
+        (Phase.CARRY, True, "slew", "the crane did not get over the bunk, or no log list came within .* the slew is"),
+        (Phase.CARRY, False, "slew", "the crane did not get over the bunk, or no log list came within .* the slew is"),
+        (Phase.RETREAT, True, "lift", "the crane did not leave the bunk, or no log list came within .* the lift is"),
     ],
 )
-def test_a_joint_that_does_not_move_ends_the_phase_by_its_name(phase: Phase, freeze: str, says: str) -> None:
-    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
+def test_a_joint_that_does_not_move_ends_the_phase_by_its_name(
+    phase: Phase, direct: bool, freeze: str, says: str
+) -> None:
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity(direct=direct)
     run_until(crane, planner, phase)
     j = Joint[freeze.upper()]
     stuck = crane.q[j]
@@ -229,6 +363,7 @@ def test_a_joint_that_does_not_move_ends_the_phase_by_its_name(phase: Phase, fre
             crane.setpoint = sent[-1]  # type: ignore[assignment]
         crane.now_ns += TICK_NS
         crane.q = crane._knot_at(crane.now_ns).position
+        crane._carry()
         if planner.idle:
             break
     assert planner.phase is Phase.FAILED

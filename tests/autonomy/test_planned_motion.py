@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.motion.arm import Arm, Pose
-from autonomy.motion.trajectory import SWAY_M, Trajectory, follow, hold, progress, straight, travel
+from autonomy.motion.timing import SWING_RAD
+from autonomy.motion.trajectory import Trajectory, follow, hold, progress, straight, travel
 from machine.joints import JOINTS
 from machine.kinematics import Unreachable, pin_position
 from machine.load import load_profile
@@ -49,30 +50,34 @@ def assert_within_limits(motion: Trajectory) -> None:
     for j in JOINTS:
         spec = joint(PROFILE, j)
         assert q[:, j].min() >= spec.lower and q[:, j].max() <= spec.upper
-        assert np.max(np.abs(velocity[:, j])) < 0.9 * spec.speed_limit
-        assert np.max(np.abs(acceleration[:, j])) < 0.9 * spec.acceleration_limit
+        assert np.max(np.abs(velocity[:, j])) < spec.speed_limit
+        assert np.max(np.abs(acceleration[:, j])) < spec.acceleration_limit
+    assert flow_m3_s(q, stated).max() < 0.96 * PROFILE.hydraulics.pump_flow_m3_s
 
 
-@given(st.floats(0.16, 0.5))
-def test_progress_goes_from_0_to_1_with_rest_up_to_the_jerk_at_both_ends(ramp: float) -> None:
+def flow_m3_s(q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """What the valves of all joints take, by the profile."""
+    total = np.zeros(len(q))
+    for j in JOINTS:
+        valve = joint(PROFILE, j).valve
+        for i, (at, v) in enumerate(zip(q[:, j], velocity[:, j], strict=True)):
+            arm = np.interp(at, valve.lever_at, valve.lever) if valve.lever else 1.0
+            total[i] += abs(v) * arm * (valve.flow_plus if v >= 0.0 else valve.flow_minus)
+    return total
+
+
+def test_progress_goes_from_0_to_1_with_rest_up_to_the_jerk_at_both_ends() -> None:
     tau = np.linspace(-0.1, 1.1, 2401)
-    s = progress(tau, ramp)
+    s = progress(tau)
     assert s[0] == 0.0 and s[-1] == 1.0 and np.all(np.diff(s) >= 0.0)
     assert s == pytest.approx(1.0 - s[::-1])
     jerk = np.diff(s, 3) / (tau[1] - tau[0]) ** 3
     assert np.max(np.abs(np.diff(jerk))) < 0.05 * np.max(np.abs(jerk))  # no step in it
 
 
-def test_without_cruise_the_peaks_are_those_of_the_seventh_order_polynomial() -> None:
-    tau = np.linspace(0.0, 1.0, 1001)
-    s = progress(tau, 0.5)
-    seventh = 35 * tau**4 - 84 * tau**5 + 70 * tau**6 - 20 * tau**7
-    acceleration = [np.max(np.abs(np.diff(x, 2))) / 1e-6 for x in (s, seventh)]
-    assert acceleration[0] == pytest.approx(acceleration[1], rel=0.01)
-    assert np.max(np.abs(s - seventh)) < 0.02
-
-
-@settings(deadline=None, max_examples=25)
+@pytest.mark.computed
+@pytest.mark.slow
+@settings(deadline=None, max_examples=20)
 @given(poses(), poses())
 def test_a_travel_keeps_the_limits_and_ends_at_the_goal(start: Pose, goal: Pose) -> None:
     motion = travel(ARM, start, goal, TOP)
@@ -111,7 +116,8 @@ def test_a_hanging_log_swings_little_after_a_slew(period_s: float) -> None:
         speed += FINE_S * (-a - omega**2 * swing)
         swing += FINE_S * speed
         largest = max(largest, float(np.hypot(*swing)))
-    assert np.hypot(np.hypot(*swing), np.hypot(*speed) / omega) < 1.2 * SWAY_M < largest
+    left = np.hypot(np.hypot(*swing), np.hypot(*speed) / omega) * omega**2 / 9.81
+    assert left < 1.1 * SWING_RAD < largest * omega**2 / 9.81
 
 
 def test_a_slew_to_the_bunk_takes_about_ten_seconds() -> None:

@@ -1,0 +1,62 @@
+"""What hangs in the grapple, judged by the newest log list: which logs came up, whether the way planned for them
+will do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from math import dist
+from typing import Final
+
+from autonomy.grasp.direct import Grasp, is_held, only, plan_place
+from autonomy.grasp.proposal import NoGrasp
+from autonomy.logs import LogObservation
+from autonomy.mission import Mission
+from autonomy.motion.arm import Arm, Pose
+from machine.grapple import grapple_yaw
+
+ASIDE_M: Final = 0.15
+"""Farther than this from where it was meant to be, a column or a place is another one."""
+TILTED_M: Final = 0.20
+"""A log one of whose ends hangs so much lower than reckoned with is not carried on: its way is planned anew."""
+TURN_RAD: Final = 0.03
+MOST_TURN_RAD: Final = 0.4
+"""The rotator corrects on the way between these how a log is seen to hang; what is more asks for a new way."""
+
+
+def picked(grasp: Grasp, logs: Sequence[LogObservation]) -> list[LogObservation]:
+    """The logs of the grasp as they are seen now, without those that are hidden."""
+    wanted = [log.id for log in grasp.logs]
+    return [log for log in logs if log.id in wanted]
+
+
+def came_up(arm: Arm, grasp: Grasp, seen: Sequence[LogObservation], pins: Iterable[Pose]) -> Grasp | None:
+    """The grasp with the logs that hang under one of the pins, and those that are hidden; None when none is seen to."""
+    poses = list(pins)
+    held = [log.id for log in seen if any(is_held(arm, log, pin) for pin in poses)]
+    if not held:
+        return None
+    hidden = [log.id for log in grasp.logs if log.id not in [o.id for o in seen]]
+    return only(arm, grasp, held + hidden)
+
+
+def place_as_seen(
+    arm: Arm, mission: Mission, grasp: Grasp, place: Pose, logs: Sequence[LogObservation], position: Sequence[float]
+) -> Pose | None:
+    """The place with the rotator turned for the log as it is now seen to hang; None when another way is asked for.
+
+    ``position``: the measured joints, rad (EXT m).
+    """
+    seen = next((log for log in picked(grasp, logs) if log.id == grasp.log.id), None)
+    if seen is None:
+        return place
+    if 0.5 * seen.length_m * (abs(seen.axis[2]) - abs(grasp.log.axis[2])) > TILTED_M:
+        return None
+    try:
+        wanted = plan_place(arm, mission, grasp, logs, grapple_yaw(arm.profile, position))
+    except NoGrasp:
+        return None  # and why, when it is planned anew
+    turn = abs(wanted.rot_rad - place.rot_rad)
+    if turn > MOST_TURN_RAD or dist(arm.xy(wanted), arm.xy(place)) > ASIDE_M:
+        return None
+    return place._replace(rot_rad=wanted.rot_rad) if turn > TURN_RAD else place

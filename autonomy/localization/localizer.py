@@ -1,0 +1,228 @@
+"""From the controller's reports of the vehicle to its location: dead reckoning, gates, loss and return.
+
+``Localizer.step(report)`` takes every ``VehicleReport`` and gives a ``Location`` at its stamp.  It holds no clock.
+Positions and headings count from when they were true, not from when they came (``LATENCY_NS``).  Without a position
+and a heading that fit, the machine is located by its wheels for ``RECKONING_NS`` and then is lost, with a reason; it
+is located again once ``AGREEING`` positions in a row fit, or agree with each other about another place.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from autonomy.localization.estimate import Location, Status
+from autonomy.localization.filter import Filter
+from autonomy.localization.motion import Noise, Odometry, State, antenna_reach, drift_rad, front_attitude
+from autonomy.localization.plane import Plane, wrapped, yaw_from_heading
+from can_dbc.setpoint import VehicleReport
+from machine.profile import Carrier
+
+LATENCY_NS: Final = 75_000_000
+"""From a measurement of the receiver to its reception: 50 to 100 ms (machines.md 8, assumed)."""
+TURN_OVER_NS: Final = 50_000_000
+"""The receiver's rate of turn is a mean over this time (assumed)."""
+FRESH_NS: Final = 500_000_000
+"""Older, a position is missing: five of its periods."""
+RECKONING_NS: Final = 2_000_000_000
+MOTION_NS: Final = 300_000_000
+"""Without speed and articulation for so long there is nothing to reckon with; before, the last ones hold."""
+CREEP: Final = 0.8
+"""A braked wheel turns with its swing arm and takes the machine along, unseen by the drive: metres per metre of height
+(measured on the plant: 0.14 m for 0.35 m).
+"""
+AGREEING: Final = 5
+AGREE_SIGMAS: Final = 4.0
+FORGOTTEN_NS: Final = 1_000_000_000
+"""After a longer gap between reports nobody knows what the machine did meanwhile."""
+BEGIN_M: Final = 3.0
+SECOND: Final = 1e9
+
+
+class Localizer:
+    """One machine.  ``plane`` None: its origin becomes the first position.
+
+    ``rejected`` counts measurements outside their gates.
+    """
+
+    def __init__(self, carrier: Carrier, plane: Plane | None = None, noise: Noise | None = None) -> None:
+        self.plane = plane
+        self.rejected = 0
+        self._carrier, self._noise = carrier, noise or Noise()
+        self._filter = Filter(carrier, self._noise)
+        self._status = Status.STARTING
+        self._last: VehicleReport | None = None
+        self._position_ns = self._heading_ns = 0
+        self._fitting = 0
+        self._strays: list[np.ndarray] = []
+        self._jumps = 0
+        self._z = (math.nan, math.inf)
+
+    def step(self, report: VehicleReport) -> Location:
+        """Where the machine is at ``report.stamp_ns``."""
+        last = self._last
+        if last is not None and report.stamp_ns <= last.stamp_ns:
+            return self._location(last)
+        if last is not None and not _finite(report.speed_m_s, report.articulation_rad):
+            report = replace(report, speed_m_s=last.speed_m_s, articulation_rad=last.articulation_rad)
+            if report.motion_ns > last.motion_ns:
+                report = replace(report, motion_ns=last.motion_ns)
+        self._last = report
+        moving = report.stamp_ns - report.motion_ns <= MOTION_NS and _finite(report.speed_m_s, report.articulation_rad)
+        if self._status is not Status.STARTING:
+            gap = report.stamp_ns - last.stamp_ns if last else 0
+            if not moving or gap > FORGOTTEN_NS:
+                self._status = Status.STARTING
+            else:
+                self._go(report, last, gap)
+        new = last is None or report.position_ns != last.position_ns
+        if moving and new and _finite(report.latitude_deg, report.longitude_deg) and report.fix in self._noise.fixes:
+            self._see(report)
+        self._judge(report, moving)
+        return self._location(report)
+
+    def _go(self, report: VehicleReport, last: VehicleReport | None, gap: int) -> None:
+        """On by what wheels and articulation did since the last report."""
+        assert last is not None
+        roll, pitch = self._lean(report)
+        wheels = 0.5 * (report.speed_m_s + last.speed_m_s) * gap / SECOND
+        way = wheels * math.cos(pitch)
+        odometry = Odometry(gap / SECOND, way, last.articulation_rad, report.articulation_rad, roll)
+        self._filter.go(odometry, report.stamp_ns)
+        if changed := max(abs(now - then) for now, then in zip(report.heights_m, last.heights_m, strict=True)):
+            self._filter.creep(CREEP * changed if math.isfinite(changed) else 0.0)
+        z, spread = self._z
+        self._z = z + wheels * math.sin(pitch), math.hypot(spread, 0.02 * math.sqrt(abs(wheels)))
+        if report.heading_ns != last.heading_ns and math.isfinite(report.heading_rad):
+            then = report.heading_ns - LATENCY_NS
+            if self._filter.heading(yaw_from_heading(report.heading_rad), then):
+                self._heading_ns = report.heading_ns
+            else:
+                self.rejected += 1
+            if math.isfinite(report.yaw_rate_rad_s):
+                self._filter.turn(report.yaw_rate_rad_s, report.speed_m_s, TURN_OVER_NS, then)
+
+    def _see(self, report: VehicleReport) -> None:
+        """A new position."""
+        if self.plane is None:
+            altitude = report.altitude_m if math.isfinite(report.altitude_m) else 0.0
+            self.plane = Plane(report.latitude_deg, report.longitude_deg, altitude)
+        east, north, _ = self.plane.local(report.latitude_deg, report.longitude_deg)
+        roll, pitch = self._lean(report)
+        reach = antenna_reach(self._carrier, roll, pitch, self._front_height(report))
+        then = report.position_ns - LATENCY_NS
+        if self._status is Status.STARTING and self._fitting == 0:
+            if not math.isfinite(report.heading_rad) or report.stamp_ns - report.heading_ns > FRESH_NS:
+                return
+            yaw = yaw_from_heading(report.heading_rad)
+            c, s = math.cos(yaw), math.sin(yaw)
+            x, y = east - c * reach[0] + s * reach[1], north - s * reach[0] - c * reach[1]
+            self._filter.begin(x, y, yaw, report.fix, BEGIN_M, report.stamp_ns)
+            self._heading_ns = report.heading_ns
+            self._z = math.nan, math.inf
+        fits = self._filter.position(east, north, reach, report.fix, report.sigma_m, then)
+        self._height(report, reach[2])
+        if fits:
+            self._position_ns = report.position_ns
+            self._fitting += 1
+            self._strays.clear()
+            return
+        self.rejected += 1
+        self._fitting = 0
+        if self._status is Status.LOST:
+            self._strays.append(np.array([east, north]) - self._filter.shown(reach, then))
+            self._return(report)
+
+    def _return(self, report: VehicleReport) -> None:
+        """Take the position anew where the last ones agree about another place."""
+        del self._strays[:-AGREEING]
+        sigma = self._noise.fixes[report.fix][0]
+        middle = np.mean(self._strays, axis=0)
+        apart = max(math.dist(stray, middle) for stray in self._strays)
+        if len(self._strays) < AGREEING or apart > AGREE_SIGMAS * sigma:
+            return
+        at = self._filter.x[[State.X, State.Y]] + middle
+        self._filter.begin_place(float(at[0]), float(at[1]), sigma + self._noise.fixes[report.fix][1])
+        self._position_ns, self._fitting = report.position_ns, AGREEING
+        self._jumps += 1
+        self._strays.clear()
+
+    def _height(self, report: VehicleReport, reach_m: float) -> None:
+        """The axle's height: the receiver's altitudes, smoothed by how they scatter."""
+        assert self.plane is not None
+        if not math.isfinite(report.altitude_m):
+            return
+        seen, spread = report.altitude_m - self.plane.altitude_m - reach_m, 2.0 * self._noise.fixes[report.fix][0]
+        z, sigma = self._z
+        gain = 1.0 if not math.isfinite(z) else sigma**2 / (sigma**2 + spread**2)
+        self._z = (
+            (seen if not math.isfinite(z) else z + gain * (seen - z)),
+            (spread if not math.isfinite(sigma) else sigma * math.sqrt(1.0 - gain)),
+        )
+
+    def _judge(self, report: VehicleReport, moving: bool) -> None:
+        """Status from the ages of what fitted last."""
+        if self._status is Status.STARTING or not moving:
+            self._status = Status.TRACKING if moving and self._fitting >= AGREEING else Status.STARTING
+            if not moving:
+                self._fitting = 0
+            return
+        age = report.stamp_ns - min(self._position_ns, self._heading_ns)
+        if self._status is Status.LOST:
+            if age <= FRESH_NS and self._fitting >= AGREEING:
+                self._status = Status.TRACKING
+        elif age > RECKONING_NS:
+            self._status, self._fitting = Status.LOST, 0
+        else:
+            self._status = Status.TRACKING if age <= FRESH_NS else Status.DEAD_RECKONING
+
+    def _reason(self, report: VehicleReport) -> str:
+        """Why the machine is not tracked."""
+        if self._status is Status.TRACKING:
+            return ""
+        stamp = report.stamp_ns
+        if stamp - report.motion_ns > MOTION_NS or not _finite(report.speed_m_s, report.articulation_rad):
+            return "speed and articulation are not known"
+        for what, seen, fitted, value in (
+            ("position", report.position_ns, self._position_ns, report.latitude_deg),
+            ("heading", report.heading_ns, self._heading_ns, report.heading_rad),
+        ):
+            if not seen or not math.isfinite(value) or stamp - seen > FRESH_NS:
+                return f"no {what} from the receiver"
+            if what == "position" and report.fix not in self._noise.fixes:
+                return "the receiver has no fix"
+            if self._status is not Status.STARTING and stamp - fitted > FRESH_NS:
+                return f"the {what} from the receiver does not fit what the wheels do"
+        return "not enough positions that fit yet"
+
+    def _location(self, report: VehicleReport) -> Location:
+        reason = self._reason(report)
+        if self._status is Status.STARTING:
+            return Location(report.stamp_ns, self._status, reason, jumps=self._jumps)
+        x, p = self._filter.x, self._filter.P
+        roll, pitch = (v if math.isfinite(v) else 0.0 for v in (report.roll_rad, report.pitch_rad))
+        seen = [State.X, State.Y, State.YAW]
+        yaw = wrapped(float(x[State.YAW]))
+        return Location(
+            report.stamp_ns, self._status, reason, float(x[State.X]), float(x[State.Y]), self._z[0], yaw,
+            p[np.ix_(seen, seen)], self._z[1], wrapped(yaw + drift_rad(x, self._lean(report)[0])),
+            report.speed_m_s * (1.0 + float(x[State.SCALE])), float(x[State.CURVE]), report.articulation_rad,
+            roll, pitch, self._front_height(report), self._jumps,
+        )  # fmt: skip
+
+    def _lean(self, report: VehicleReport) -> tuple[float, float]:
+        """Roll and pitch of the front half; level where they are not known."""
+        if not _finite(report.roll_rad, report.pitch_rad):
+            return 0.0, 0.0
+        return front_attitude(report.roll_rad, report.pitch_rad, report.articulation_rad)
+
+    def _front_height(self, report: VehicleReport) -> float:
+        height = 0.5 * (report.heights_m[0] + report.heights_m[1])
+        return height if math.isfinite(height) else self._carrier.arm_transport_m
+
+
+def _finite(*values: float) -> bool:
+    return all(map(math.isfinite, values))

@@ -1,0 +1,194 @@
+"""The filter's model: how the state of an articulated machine goes on, and what its antennas then show.
+
+State (``State``): middle of the front axle [m] and yaw of the front half [rad] in the plane; what slip adds to the
+curvature of its path [1/m] and to its direction [rad]; share by which the ground passes faster than the wheels say;
+error of the receiver's heading [rad]; the receiver's slowly wandering position error [m]; where the main antenna stands
+beside its place, ahead and to the left [m]; how far its direction turns downhill for each radian that it leans.
+Without slip (machines.md 7.1)
+
+    x' = v cos psi,  y' = v sin psi,  psi' = (v sin g + lr g') / (lf cos g + lr)
+
+with the speed v of the front axle and the articulation g.  Slip comes with the way that is driven: a machine that
+stands does not grow uncertain.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from machine.carrier import Point
+from machine.profile import Carrier
+
+Array = np.ndarray
+
+
+class State(IntEnum):
+    """Places in the state vector."""
+
+    X = 0
+    Y = 1
+    YAW = 2
+    CURVE = 3
+    SIDE = 4
+    SCALE = 5
+    HEADING = 6
+    WANDER_X = 7
+    WANDER_Y = 8
+    ANTENNA_X = 9
+    ANTENNA_Y = 10
+    SLIDE = 11
+
+
+SIZE: Final = len(State)
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """A quantity that wanders about zero: standard deviation, and the way [m] or time [s] over which it forgets."""
+
+    sigma: float
+    over: float
+
+    def step(self, by: float) -> tuple[float, float]:
+        """What is kept of it, and the variance that comes in, after ``by`` m or s."""
+        keep = math.exp(-by / self.over)
+        return keep, self.sigma**2 * (1.0 - keep * keep)
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """What the filter expects; all of it assumed.  ``fixes`` by number of the method in PGN 129029: white and wandering
+    horizontal error of a position, root mean square [m].
+    """
+
+    curve: Drift = Drift(0.02, 4.0)
+    side: Drift = Drift(0.02, 6.0)
+    slide: Drift = Drift(0.25, 200.0)
+    scale: Drift = Drift(0.12, 30.0)
+    way_m: float = 0.01
+    """Of the position, per square root of a metre driven."""
+    way_rad: float = 0.003
+    """Of the yaw, per square root of a metre driven."""
+    rest_m: float = 0.002
+    """Of the position, per square root of a second: the machine rocks while its crane works."""
+    heading_start_rad: float = 0.015
+    heading_rad: float = 2e-5
+    """Of the heading's error, per square root of a second."""
+    antenna_m: float = 0.02
+    attitude_rad: float = 0.004
+    articulation_rad: float = 0.004
+    """Of the articulation encoder, its zero in it."""
+    phase_m: float = 0.003
+    """Per antenna, to measure a heading by."""
+    turn_rad_s: float = 0.006
+    wander_s: float = 60.0
+    fixes: dict[int, tuple[float, float]] = field(
+        default_factory=lambda: {1: (0.5, 2.5), 2: (0.2, 0.8), 4: (0.012, 0.010), 5: (0.07, 0.35)}
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """What the machine did since the last step: time [s], way of the wheels over ground seen from above [m],
+    articulation before and now [rad], roll of the front half, + right side down [rad].
+    """
+
+    seconds: float
+    way_m: float
+    bend_before_rad: float
+    bend_rad: float
+    lean_rad: float = 0.0
+
+
+def turned_without_slip(carrier: Carrier, odometry: Odometry, way_m: float) -> float:
+    """By how much the front half turns on a way of ``way_m`` of its axle [rad]."""
+    bend = 0.5 * (odometry.bend_before_rad + odometry.bend_rad)
+    swing = odometry.bend_rad - odometry.bend_before_rad
+    lf, lr = carrier.front_axle_m, carrier.rear_axle_m
+    return (way_m * math.sin(bend) + lr * swing) / (lf * math.cos(bend) + lr)
+
+
+def advance(carrier: Carrier, noise: Noise, x: Array, odometry: Odometry) -> tuple[Array, Array, Array]:
+    """State (12,), its Jacobian (12, 12) and the covariance (12, 12) that comes in, one step later."""
+    s, d = State, odometry
+    way = d.way_m * (1.0 + x[s.SCALE])
+    turned = turned_without_slip(carrier, d, way) + x[s.CURVE] * way
+    course = x[s.YAW] + 0.5 * turned + drift_rad(x, d.lean_rad)
+    c, si = math.cos(course), math.sin(course)
+    out = x.copy()
+    out[s.X] += way * c
+    out[s.Y] += way * si
+    out[s.YAW] += turned
+    jacobian = np.eye(SIZE)
+    bend = 0.5 * (d.bend_before_rad + d.bend_rad)
+    of_way = math.sin(bend) / (carrier.front_axle_m * math.cos(bend) + carrier.rear_axle_m) + x[s.CURVE]
+    for place, of_turn, of_length in ((s.CURVE, way, 0.0), (s.SCALE, of_way * d.way_m, d.way_m)):
+        jacobian[s.YAW, place] = of_turn
+        jacobian[s.X, place] = c * of_length - 0.5 * way * si * of_turn
+        jacobian[s.Y, place] = si * of_length + 0.5 * way * c * of_turn
+    for place, of_course in ((s.YAW, 1.0), (s.SIDE, 1.0), (s.SLIDE, -d.lean_rad)):
+        jacobian[s.X, place], jacobian[s.Y, place] = -of_course * way * si, of_course * way * c
+    driven = abs(d.way_m)
+    added = np.zeros(SIZE)
+    added[[s.X, s.Y]] = noise.way_m**2 * driven + noise.rest_m**2 * d.seconds
+    added[s.YAW] = noise.way_rad**2 * driven
+    added[s.HEADING] = noise.heading_rad**2 * d.seconds
+    for place, drift in (
+        (s.CURVE, noise.curve), (s.SIDE, noise.side), (s.SCALE, noise.scale), (s.SLIDE, noise.slide)
+    ):  # fmt: skip
+        keep, added[place] = drift.step(driven)
+        out[place] *= keep
+        jacobian[place, place] = keep
+    return out, jacobian, np.diag(added)
+
+
+def drift_rad(x: Array, lean_rad: float) -> float:
+    """By how much the front axle goes to the left of where the front half points [rad]."""
+    return float(x[State.SIDE] - x[State.SLIDE] * lean_rad)
+
+
+def tilt(roll_rad: float, pitch_rad: float) -> Array:
+    """Rotation (3, 3) of a half that leans, its yaw left out: roll + right side down, pitch + nose up."""
+    cr, sr, cp, sp = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
+    roll = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    return np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]]) @ roll
+
+
+def axle_m(carrier: Carrier, height_m: float) -> Point:
+    """The middle of the front axle, between the hubs, in the front frame."""
+    return carrier.front_axle_m, 0.0, -(carrier.arm_drop_low_m + height_m)
+
+
+def antenna_reach(carrier: Carrier, roll_rad: float, pitch_rad: float, height_m: float) -> Array:
+    """From the middle of the front axle to the main antenna (3,), along the front's yaw, to its left and up [m]."""
+    lever = np.subtract(carrier.antenna_main_m, axle_m(carrier, height_m))
+    return tilt(roll_rad, pitch_rad) @ lever
+
+
+def antenna(x: Array, reach: Array) -> tuple[Array, Array]:
+    """Where the receiver would show the main antenna (2,), and the Jacobian (2, 12)."""
+    s = State
+    c, si = math.cos(x[s.YAW]), math.sin(x[s.YAW])
+    ahead, left = reach[0] + x[s.ANTENNA_X], reach[1] + x[s.ANTENNA_Y]
+    shown = np.array([
+        x[s.X] + c * ahead - si * left + x[s.WANDER_X],
+        x[s.Y] + si * ahead + c * left + x[s.WANDER_Y],
+    ])  # fmt: skip
+    jacobian = np.zeros((2, SIZE))
+    jacobian[:, [s.X, s.Y]] = jacobian[:, [s.WANDER_X, s.WANDER_Y]] = np.eye(2)
+    jacobian[:, s.YAW] = -si * ahead - c * left, c * ahead - si * left
+    jacobian[:, [s.ANTENNA_X, s.ANTENNA_Y]] = [[c, -si], [si, c]]
+    return shown, jacobian
+
+
+def front_attitude(roll_rad: float, pitch_rad: float, bend_rad: float) -> tuple[float, float]:
+    """Roll and pitch of the front half from those of the rear: the axis between them leans with both."""
+    down = tilt(roll_rad, pitch_rad)[2]
+    c, s = math.cos(bend_rad), math.sin(bend_rad)
+    ahead, left, up = c * down[0] + s * down[1], -s * down[0] + c * down[1], down[2]
+    return math.atan2(left, up), math.asin(max(-1.0, min(1.0, ahead)))

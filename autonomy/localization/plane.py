@@ -1,0 +1,61 @@
+"""The local plane in which the machine is located and drives: x east, y north, z up [m] about an origin on WGS-84.
+
+Angles in the plane count counter-clockwise from east; headings and bearings clockwise from true north stay at the bus
+and in the controller's reports.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pymap3d
+
+from machine.carrier import Point
+
+
+@dataclass(frozen=True, slots=True)
+class Plane:
+    """East, north and up about a point given in degrees and metres above the ellipsoid."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        good = abs(self.latitude_deg) <= 90.0 and abs(self.longitude_deg) <= 180.0 and math.isfinite(self.altitude_m)
+        if not good:
+            raise ValueError(
+                f"no origin of a plane: latitude {self.latitude_deg} deg, longitude {self.longitude_deg} deg, "
+                f"altitude {self.altitude_m} m"
+            )
+
+    def local(self, latitude_deg: float, longitude_deg: float, altitude_m: float | None = None) -> Point:
+        """East, north and up [m]; a point without an altitude lies at that of the origin."""
+        altitude = self.altitude_m if altitude_m is None else altitude_m
+        e, n, u = pymap3d.geodetic2enu(
+            latitude_deg, longitude_deg, altitude, self.latitude_deg, self.longitude_deg, self.altitude_m
+        )
+        return float(e), float(n), float(u)
+
+    def geodetic(self, east_m: float, north_m: float, up_m: float = 0.0) -> Point:
+        """Latitude and longitude [deg] and altitude [m]."""
+        lat, lon, altitude = pymap3d.enu2geodetic(
+            east_m, north_m, up_m, self.latitude_deg, self.longitude_deg, self.altitude_m
+        )
+        return float(lat), float(lon), float(altitude)
+
+
+def wrapped(angle_rad: float) -> float:
+    """The same direction as an angle between -pi and pi."""
+    return math.remainder(angle_rad, 2.0 * math.pi)
+
+
+def yaw_from_heading(heading_rad: float) -> float:
+    """Counter-clockwise from east, from clockwise from north."""
+    return wrapped(0.5 * math.pi - heading_rad)
+
+
+def heading_from_yaw(yaw_rad: float) -> float:
+    """Clockwise from north 0..2 pi, from counter-clockwise from east."""
+    return (0.5 * math.pi - yaw_rad) % (2.0 * math.pi)

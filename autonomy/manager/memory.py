@@ -1,0 +1,137 @@
+"""Logs that no camera sees now, as they are remembered: for a machine whose only camera looks ahead.
+
+Paper B's crane works from what the front camera saw on the way: the places of the logs in the plane (3.2.6), the
+kinematic chain and the receiver say where they are from the crane's foot now.  A log in the grapple goes with it while
+the scale feels one; what was laid into the bunk stays there.  Four times a second this is a list like a detector's,
+with the field's numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from autonomy.activity import Activity
+from autonomy.grasp.direct import lies_in
+from autonomy.logs import LogObservation
+from autonomy.manager.field import Field
+from autonomy.motion.arm import Arm
+from autonomy.perception.frame import Pose
+from autonomy.phases import Phase
+from can_dbc.setpoint import StateReport
+from machine.grapple import grapple_yaw
+from machine.joints import JOINTS
+from machine.profile import Profile, joint
+
+EVERY_NS: Final = 250_000_000
+AROUND_M: Final = 12.0
+FELT_KG: Final = 12.0
+"""What the scale must feel of a log that hangs in the grapple; less, and it stayed where it was."""
+LIFTED_M: Final = 0.5
+"""Above this the scale is asked: before, the log may still lie."""
+
+
+class Memory:
+    """``list`` is called every turn; see the module's contract."""
+
+    def __init__(self, profile: Profile) -> None:
+        self._profile, self._arm = profile, Arm(profile)
+        self._due_ns = 0
+        self._aboard: list[LogObservation] = []
+        self._job: Activity | None = None
+        self._held: dict[int, LogObservation] = {}
+        """Logs of the grasp relative to pin and yaw of the grapple, from when it closed."""
+        self._low_m = 0.0
+        self._laid: list[LogObservation] = []
+        self._slipped = False
+
+    @property
+    def aboard(self) -> int:
+        """Logs that were laid into the bunk."""
+        return len(self._aboard)
+
+    def list(
+        self, now_ns: int, field: Field, base: Pose, report: StateReport | None, job: Activity | None
+    ) -> tuple[LogObservation, ...] | None:
+        """What is remembered, in the base frame; None when it is not yet time for a new list."""
+        if job is not self._job:
+            self._end()
+            self._job = job
+        if job is not None and report is not None:
+            self._follow(job, report)
+        if now_ns < self._due_ns:
+            return None
+        self._due_ns = now_ns + EVERY_NS
+        hanging = self._hanging(report)
+        gone = {log.id for log in (*hanging, *self._laid)}
+        near = [
+            log.observation(base) for log in field.logs
+            if log.number not in gone and math.dist(log.center_m[:2], base.position_m[:2]) < AROUND_M
+        ]  # fmt: skip
+        return (*near, *hanging, *self._laid, *(log for log in self._aboard if log.id not in gone))
+
+    def _end(self) -> None:
+        """The job is over: what it laid into the bunk is on board, and what it took from there is not."""
+        moved = {log.id for log in self._laid}
+        self._aboard = [log for log in self._aboard if log.id not in moved]
+        self._aboard += [log for log in self._laid if lies_in(self._profile.bunk, log)]
+        self._laid, self._held, self._slipped = [], {}, False
+
+    def _follow(self, job: Activity, report: StateReport) -> None:
+        """Note what the grapple closes on, what it loses and where it opens."""
+        grasp = job.grasp
+        if grasp is None:
+            return
+        if job.phase < Phase.CLOSE:
+            self._held, self._slipped = {}, False
+        elif Phase.LIFT <= job.phase < Phase.OPEN and not self._held and not self._slipped:
+            pin, yaw = self._pin(report)
+            self._low_m = pin[2]
+            self._held = {log.id: _relative(log, pin, yaw) for log in grasp.logs}
+        elif Phase.LIFT <= job.phase < Phase.OPEN and self._held:
+            risen = self._pin(report)[0][2] > self._low_m + LIFTED_M
+            if risen and math.isfinite(report.load_kg) and report.load_kg < FELT_KG:
+                self._held, self._slipped = {}, True
+        elif Phase.OPEN <= job.phase <= Phase.DONE and self._held:
+            self._laid, self._held = self._hanging(report), {}
+
+    def _hanging(self, report: StateReport | None) -> list[LogObservation]:
+        if not self._held or report is None:
+            return []
+        pin, yaw = self._pin(report)
+        return [_absolute(log, pin, yaw) for log in self._held.values()]
+
+    def _pin(self, report: StateReport) -> tuple[np.ndarray, float]:
+        """The hanger pin in the base frame and the yaw of the grapple; without an encoder, where it was sent."""
+        assert self._job is not None
+        sent = self._job.rests
+        q = tuple(
+            p if joint(self._profile, j).encoder is not None else s
+            for j, p, s in zip(JOINTS, report.position, sent, strict=True)
+        )
+        pose = self._arm.pose(q)
+        x, y = self._arm.xy(pose)
+        return np.array([x, y, pose.z_m]), grapple_yaw(self._profile, q)
+
+
+def _relative(log: LogObservation, pin: np.ndarray, yaw: float) -> LogObservation:
+    """A log as it hangs: closing tongs draw it between them, along its axis it stays where it was gripped."""
+    axis = np.asarray(log.axis)
+    off = np.asarray(log.center_m) - pin
+    level = axis * (1.0, 1.0, 0.0)
+    drawn = level * float(off @ level) / max(float(level @ level), 1e-9)
+    center = _turned((float(drawn[0]), float(drawn[1]), float(off[2])), -yaw)
+    return replace(log, center_m=center, axis=_turned(log.axis, -yaw), covariance=None)
+
+
+def _absolute(log: LogObservation, pin: np.ndarray, yaw: float) -> LogObservation:
+    x, y, z = _turned(log.center_m, yaw)
+    return replace(log, center_m=(pin[0] + x, pin[1] + y, pin[2] + z), axis=_turned(log.axis, yaw))
+
+
+def _turned(v: tuple[float, float, float], yaw: float) -> tuple[float, float, float]:
+    c, s = math.cos(yaw), math.sin(yaw)
+    return (c * v[0] - s * v[1], s * v[0] + c * v[1], v[2])

@@ -1,0 +1,137 @@
+"""Where along its way the machine stops to load: at the place from which the crane reaches most logs, and best.
+
+A log that the machine passes is lost, so the search goes no further than the last place from which every log that can
+be reached at all still is.  Of the places before it, the one with most logs in reach wins; of these, the one with the
+shortest crane work.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from typing import Final
+
+import numpy as np
+
+from autonomy.grasp.direct import NoGrasp, plan_grasp
+from autonomy.logs import LogObservation
+from autonomy.manager.field import FieldLog
+from autonomy.motion.arm import Arm
+from autonomy.perception.frame import Pose
+from machine.carrier import pivot_height_m, rear_from_base
+from machine.profile import Carrier
+
+STEP_M: Final = 0.25
+ASIDE_M: Final = 0.35
+"""A log's middle lies at least so far outside the machine's sides, beyond its own half width."""
+
+SPARE_M: Final = 0.15
+"""The telescope keeps so much for what is not where it was seen."""
+
+BESIDE_M: Final = 0.5
+"""No log is taken whose middle is farther than this beyond the straight arm: it may be gripped beside it, and the
+column leans.
+"""
+
+BaseAt = Callable[[float], Pose]
+"""The crane's base in the plane when the machine stands at a distance [m] along its way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A place along the way [m], the logs to take there, best first, and the crane's work for them [s]."""
+
+    along_m: float
+    numbers: tuple[int, ...]
+    work_s: float
+
+
+class Reach:
+    """Which logs the crane can take where, with the frame at loading height."""
+
+    def __init__(self, arm: Arm, carrier: Carrier) -> None:
+        self._arm, self.ground_z_m = arm, arm.profile.workspace.ground_z_m
+        self._aside_m = 0.5 * (carrier.track_width_m + carrier.wheel_width_m) + ASIDE_M
+        bunk = arm.profile.bunk
+        self._rear_end_m = bunk.center_m[0] + 0.5 * bunk.length_m + ASIDE_M
+        slew = arm.profile.joints["slew"]
+        self._slew_rad_s = slew.speed_limit
+        self._out_m_s = arm.profile.joints["ext"].speed_limit
+        self._longest_m = arm.profile.joints["ext"].upper - SPARE_M
+        kin = arm.profile.kinematics
+        self.farthest_m = kin.a1_m + kin.a2_m + math.hypot(kin.a3_m, kin.d4_m + self._longest_m) + BESIDE_M
+
+    def work_s(self, log: LogObservation) -> float:
+        """How long the crane's way to a log and back is, roughly [s]; infinite when it cannot take it."""
+        x, y, _ = log.center_m
+        if abs(y) < self._aside_m + 0.5 * log.diameter_m and x < self._rear_end_m + 0.5 * log.length_m:
+            return math.inf  # under the machine, or its bunk
+        try:
+            pose = plan_grasp(self._arm, log, 0.0).pose
+        except NoGrasp:
+            return math.inf
+        if pose.ext_m > self._longest_m:
+            return math.inf
+        home = self._arm.profile.bunk.center_m
+        out_m = abs(pose.r_m - math.hypot(*home))
+        return 2.0 * max(abs(pose.slew_rad - math.atan2(home[1], home[0])) / self._slew_rad_s, out_m / self._out_m_s)
+
+
+def best_stop(logs: Sequence[FieldLog], reach: Reach, base_at: BaseAt, begin_m: float, end_m: float) -> Stop | None:
+    """The next stop between two distances along the way [m]; None when no log can be taken from there."""
+    places = np.arange(begin_m, end_m + 1e-9, STEP_M)
+    bases = [base_at(along_m) for along_m in places.tolist()]
+
+    @cache
+    def work_s(i: int, j: int) -> float:
+        log, base = logs[j], bases[i]
+        if math.dist(log.center_m[:2], base.position_m[:2]) > reach.farthest_m:
+            return math.inf
+        return reach.work_s(_level(log.observation(base), reach.ground_z_m))
+
+    # From the far end, for of the work at a place beyond the last nothing but whether it can be done matters.
+    lasts = (
+        next((i for i in reversed(range(len(places))) if math.isfinite(work_s(i, j))), None) for j in range(len(logs))
+    )
+    last = min((i for i in lasts if i is not None), default=None)
+    if last is None:
+        return None
+    work = np.array([[work_s(i, j) for j in range(len(logs))] for i in range(last + 1)])
+    taken = np.isfinite(work)
+    counts, sums = taken.sum(axis=1), np.where(taken, work, 0.0).sum(axis=1)
+    best = min(range(last + 1), key=lambda i: (-counts[i], sums[i], places[i]))
+    order = sorted(np.flatnonzero(taken[best]).tolist(), key=lambda j: work[best, j])
+    return Stop(float(places[best]), tuple(logs[j].number for j in order), float(sums[best]))
+
+
+def _level(log: LogObservation, ground_z_m: float) -> LogObservation:
+    """The log on the ground on which the machine will stand: how high that is where it will, nobody knows yet."""
+    x, y, _ = log.center_m
+    return replace(log, center_m=(x, y, ground_z_m + 0.5 * log.diameter_m))
+
+
+def base_on_way(
+    carrier: Carrier, front: tuple[float, float, float], rear_m: tuple[float, float], height_m: float
+) -> Pose:
+    """The crane's base when the middle of the front axle stands at ``front`` (x, y [m], direction [rad]) and that of
+    the rear axle at ``rear_m`` (x, y [m]), on level ground z = 0 with the frame at a height [m].
+    """
+    x, y, yaw = front
+    joint = (x - carrier.front_axle_m * math.cos(yaw), y - carrier.front_axle_m * math.sin(yaw))
+    rear = math.atan2(joint[1] - rear_m[1], joint[0] - rear_m[0])
+    c, s = math.cos(rear), math.sin(rear)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    foot, axes = _base_in_rear(carrier)
+    origin = np.array([*joint, pivot_height_m(carrier, height_m)])
+    return Pose(origin + turn @ foot, turn @ axes)
+
+
+@lru_cache(maxsize=8)
+def _base_in_rear(carrier: Carrier) -> tuple[np.ndarray, np.ndarray]:
+    """The crane's base in the rear frame: where (3,) and turned how (3, 3)."""
+    foot, *ends = (
+        np.array(rear_from_base(carrier, (float(p[0]), float(p[1]), float(p[2])))) for p in (np.zeros(3), *np.eye(3))
+    )
+    return foot, np.stack([end - foot for end in ends], axis=1)

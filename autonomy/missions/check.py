@@ -1,0 +1,271 @@
+"""What makes a mission one that can be driven: places that belong together, a fence that is one, the route inside.
+
+Every problem is one sentence with a hint, and a key that says which part of the mission it is about; the reader of the
+file knows the line.  Everything is judged in local metres, so the antimeridian and the poles are places like any other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from autonomy.missions.area import Area, crossing, signed_area_m2
+from autonomy.missions.features import Key
+from autonomy.missions.local import LocalFrame, site_frame
+from autonomy.missions.model import MAX_CORNERS, MAX_LOGS, MAX_WAYPOINTS, ForwardingMission, Options, Point
+
+EXTENT_M: Final = 20_000.0
+"""Farthest that two places of a mission lie apart; forwarders drive some hundred metres (machines.md 10)."""
+SITE_M: Final = 100_000.0
+SAME_M: Final = 0.1
+"""Waypoints nearer than this to the one before are the same place."""
+LEAST_FENCE_M2: Final = 1.0
+HEIGHTS_M: Final = (-500.0, 9000.0)
+SPEEDS_M_S: Final = (0.05, 3.0)
+LENGTHS_M: Final = (0.3, 30.0)
+DIAMETERS_M: Final = (0.02, 2.0)
+MAX_LAPS: Final = 1000
+
+SWAPPED: Final = "longitude and latitude look swapped"
+_METRES: Final = "this looks like metres of a map projection; export the file as WGS84 (EPSG:4326)"
+Problem = tuple[Key | None, str]
+
+
+def problems_of(
+    mission: ForwardingMission, route_wanted: bool = True, site: tuple[float, float] | None = None
+) -> list[Problem]:
+    """Every problem of a mission; an empty list is a mission that can be driven.
+
+    ``route_wanted`` is False where logs alone are worth having.  ``site`` is the latitude and longitude [deg] where the
+    machine works: with it a mission is found out that is consistent in itself but has all its axes swapped.
+    """
+    counts = list(_counts(mission, route_wanted))
+    if counts:
+        return counts
+    found = [*_coordinates(mission), *_options(mission.options), *_sizes(mission)]
+    if found:
+        return found
+    found = list(_together(mission)) or list(_at_site(mission, site))
+    if found or not _named(mission):
+        return found
+    return [*_fences(mission), *_route(mission)] or list(_within(mission))
+
+
+def area_of(mission: ForwardingMission, frame: LocalFrame) -> Area:
+    """The fences in local metres."""
+    rings = [(frame.points_enu(fence.corners)[:, :2], fence.keep_out) for fence in mission.fences]
+    return Area(tuple(r for r, out in rings if not out), tuple(r for r, out in rings if out))
+
+
+def _named(mission: ForwardingMission) -> list[tuple[Key, Point]]:
+    """Every place with its key."""
+    return [
+        *((("waypoint", i), p) for i, p in enumerate(mission.waypoints)),
+        *((("corner", i, j), p) for i, f in enumerate(mission.fences) for j, p in enumerate(f.corners)),
+        *((("landing", i), x.position) for i, x in enumerate(mission.landings)),
+        *((("log", i), x.position) for i, x in enumerate(mission.logs)),
+    ]
+
+
+def what(key: Key) -> str:
+    """A key in words, counted from 1."""
+    name, *numbers = key
+    if name == "corner":
+        return f"corner {numbers[1] + 1} of fence {numbers[0] + 1}"
+    return f"{name} {numbers[0] + 1}"
+
+
+def _counts(mission: ForwardingMission, route_wanted: bool) -> Iterator[Problem]:
+    if len(mission.waypoints) > MAX_WAYPOINTS:
+        yield None, f"has {len(mission.waypoints)} waypoints; at most {MAX_WAYPOINTS}, so thin the route out"
+    corners = sum(len(fence.corners) for fence in mission.fences)
+    if corners > MAX_CORNERS:
+        yield None, f"has {corners} corners of fences; at most {MAX_CORNERS}, so simplify them"
+    if len(mission.logs) > MAX_LOGS:
+        yield None, f"has {len(mission.logs)} logs; at most {MAX_LOGS}, so split the mission"
+    if route_wanted and not mission.waypoints:
+        yield None, "has no waypoints; draw a route as a line"
+
+
+def _coordinates(mission: ForwardingMission) -> Iterator[Problem]:
+    """Each place alone."""
+    for key, at in _named(mission):
+        latitude, longitude, height = at.latitude_deg, at.longitude_deg, at.altitude_m
+        if not (math.isfinite(latitude) and math.isfinite(longitude) and math.isfinite(height or 0.0)):
+            yield key, f"{what(key)} has a coordinate that is no number (NaN or infinite); survey it again"
+        elif abs(latitude) > 90.0 and abs(latitude) <= 180.0 and abs(longitude) <= 90.0:
+            yield key, f"{what(key)} has latitude {latitude:.6f}, which is beyond the poles; {SWAPPED}"
+        elif abs(latitude) > 360.0 or abs(longitude) > 360.0:
+            yield key, f"{what(key)} has latitude {latitude:.0f} and longitude {longitude:.0f}; {_METRES}"
+        elif abs(latitude) > 90.0:
+            yield key, f"{what(key)} has latitude {latitude:.6f}; it goes from -90 to 90 degrees"
+        elif abs(longitude) > 180.0:
+            yield key, f"{what(key)} has longitude {longitude:.6f}; it goes from -180 to 180 degrees"
+        elif height is not None and not HEIGHTS_M[0] <= height <= HEIGHTS_M[1]:
+            yield key, f"{what(key)} is {height:.0f} m high; heights are metres, {HEIGHTS_M[0]:.0f}..{HEIGHTS_M[1]:.0f}"
+
+
+def _options(options: Options) -> Iterator[Problem]:
+    for name, value, (low, high), unit in (
+        ("laps", options.laps, (1, MAX_LAPS), ""),
+        ("speed_m_s", options.speed_m_s, SPEEDS_M_S, " m/s"),
+        ("transport_height_m", options.transport_height_m, (0.0, 2.0), " m"),
+        ("loading_height_m", options.loading_height_m, (0.0, 2.0), " m"),
+        ("logs_wanted", options.logs_wanted, (1, MAX_LOGS), ""),
+    ):
+        if value is not None and not low <= value <= high:
+            yield None, f"{name} is {value:g}; it goes from {low:g} to {high:g}{unit}"
+
+
+def _sizes(mission: ForwardingMission) -> Iterator[Problem]:
+    """Logs and landings: what is said of them besides where they are."""
+    for i, log in enumerate(mission.logs):
+        key: Key = ("log", i)
+        for name, value, limits in (("length_m", log.length_m, LENGTHS_M), ("diameter_m", log.diameter_m, DIAMETERS_M)):
+            if value is not None and not limits[0] <= value <= limits[1]:
+                hint = " (is it in another unit?)" if value > limits[1] else ""
+                yield key, f"{what(key)}: {name} is {value:g}; logs have {limits[0]:g} to {limits[1]:g} m{hint}"
+                break
+        else:
+            if log.length_m is not None and log.diameter_m is not None and log.diameter_m >= log.length_m:
+                yield key, f"{what(key)} is {log.length_m:g} m long and {log.diameter_m:g} m wide, which is no log"
+        if log.sigma_m is not None and not 0.0 <= log.sigma_m <= 100.0:
+            yield key, f"{what(key)}: sigma_m is {log.sigma_m:g}; it goes from 0 to 100 m"
+    for name, pieces in (("log", mission.logs), ("landing", mission.landings)):
+        for i, piece in enumerate(pieces):
+            if piece.bearing_deg is not None and not -360.0 <= piece.bearing_deg <= 360.0:
+                key = (name, i)
+                yield key, f"{what(key)}: bearing_deg is {piece.bearing_deg:g}; it goes from 0 to 360, clockwise"
+
+
+def _anchor(mission: ForwardingMission) -> tuple[str, Point] | None:
+    """What the rest of the mission is measured from: the fence, else the route, else the first place."""
+    for fence in mission.fences:
+        if fence.corners:
+            return "the fence", fence.corners[0]
+    for key, at in _named(mission):
+        return what(key), at
+    return None
+
+
+def _together(mission: ForwardingMission) -> Iterator[Problem]:
+    """No place lies so far from the others that it must be a mistake."""
+    anchor = _anchor(mission)
+    if anchor is None:
+        return
+    named = _named(mission)
+    origin = LocalFrame(anchor[1].latitude_deg, anchor[1].longitude_deg)
+    flat = [Point(p.latitude_deg, p.longitude_deg) for _, p in named]
+    away = np.linalg.norm(origin.points_enu(flat), axis=1)
+    for (key, at), distance in zip(named, away, strict=True):
+        if distance > EXTENT_M:
+            swapped = _swapped_m(origin, at) <= EXTENT_M
+            hint = SWAPPED if swapped else f"a mission spans at most {EXTENT_M / 1000:.0f} km"
+            yield key, f"{what(key)} is {distance / 1000:.0f} km away from {anchor[0]}; {hint}"
+
+
+def _swapped_m(origin: LocalFrame, at: Point) -> float:
+    """How far a place would be from the origin with its axes exchanged, m."""
+    if abs(at.longitude_deg) > 90.0:
+        return math.inf
+    other = origin.points_enu([Point(at.longitude_deg, at.latitude_deg)])
+    return float(np.linalg.norm(other))
+
+
+def _at_site(mission: ForwardingMission, site: tuple[float, float] | None) -> Iterator[Problem]:
+    anchor = _anchor(mission)
+    if site is None or anchor is None:
+        return
+    origin = LocalFrame(*site)
+    away = float(np.linalg.norm(origin.points_enu([Point(anchor[1].latitude_deg, anchor[1].longitude_deg)])))
+    if away > SITE_M >= _swapped_m(origin, anchor[1]):
+        yield None, f"the mission is {away / 1000:.0f} km away from where the machine works; {SWAPPED}"
+
+
+def _fences(mission: ForwardingMission) -> Iterator[Problem]:
+    frame = site_frame(mission)
+    for i, fence in enumerate(mission.fences):
+        key: Key = ("fence", i)
+        if len(fence.corners) < 3:
+            yield key, f"{what(key)} has {len(fence.corners)} corners; a polygon has at least three"
+            continue
+        ring = frame.points_enu(fence.corners)[:, :2]
+        steps = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
+        if (steps < 1e-3).any():
+            at = int(np.argmin(steps))
+            corner = ("corner", i, (at + 1) % len(ring))
+            yield corner, f"{what(corner)} is the same place as corner {at + 1}; delete one of them"
+            continue
+        crossed = crossing(ring)
+        if crossed is not None:
+            a, b = crossed
+            yield (
+                ("corner", i, b),
+                f"{what(key)} crosses itself: its edges from corner {a + 1} and from corner {b + 1} meet; "
+                "are two corners in the wrong order?",
+            )
+        elif abs(signed_area_m2(ring)) < LEAST_FENCE_M2:
+            yield key, f"{what(key)} encloses less than {LEAST_FENCE_M2:g} m2; draw it round the site"
+
+
+def _route(mission: ForwardingMission) -> Iterator[Problem]:
+    at = site_frame(mission).points_enu(mission.waypoints)[:, :2]
+    steps = np.linalg.norm(np.diff(at, axis=0), axis=1) if len(at) > 1 else np.empty(0)
+    for i in np.flatnonzero(steps < SAME_M):
+        key: Key = ("waypoint", int(i) + 1)
+        yield key, f"{what(key)} is the same place as waypoint {i + 1}; delete one of them"
+    if mission.options.laps > 1 and len(at) < 2:
+        yield None, f"laps is {mission.options.laps} but there is one waypoint; a round has at least two"
+    if mission.options.sort_by_assortment and mission.landings:
+        takers = {name for landing in mission.landings for name in landing.assortments}
+        if not all(landing.assortments for landing in mission.landings):
+            return
+        for i, log in enumerate(mission.logs):
+            if log.assortment and log.assortment not in takers:
+                yield ("log", i), f'log {i + 1} is "{log.assortment}", which no landing takes; name it at a landing'
+
+
+def _within(mission: ForwardingMission) -> Iterator[Problem]:
+    """Waypoints, legs and landings against the fence."""
+    if not mission.fences:
+        return
+    frame = site_frame(mission)
+    area = area_of(mission, frame)
+    at = frame.points_enu(mission.waypoints)[:, :2]
+    outside = area.outside_m(at)
+    for i in np.flatnonzero(outside):
+        key: Key = ("waypoint", int(i))
+        swapped = SWAPPED + "; or " if _inside_swapped(mission.waypoints[i], frame, area) else ""
+        yield key, f"{what(key)} is {outside[i]:.1f} m outside of the fence; {swapped}move it or widen the fence"
+    for i, j in legs(mission):
+        strayed = area.leaves_m(at[i], at[j]) if outside[i] == outside[j] == 0.0 else 0.0
+        if strayed:
+            yield (
+                ("waypoint", j),
+                f"the leg from waypoint {i + 1} to waypoint {j + 1} leaves the fence by {strayed:.1f} m or more; "
+                "put a waypoint where it has to bend",
+            )
+    places = frame.points_enu([landing.position for landing in mission.landings])[:, :2]
+    for i, away in enumerate(area.outside_m(places)):
+        if away > 0.0:
+            key = ("landing", i)
+            yield key, f"{what(key)} is {away:.1f} m outside of the fence; move it or widen the fence"
+
+
+def _inside_swapped(at: Point, frame: LocalFrame, area: Area) -> bool:
+    if abs(at.longitude_deg) > 90.0:
+        return False
+    other = frame.points_enu([Point(at.longitude_deg, at.latitude_deg)])[:, :2]
+    return bool(area.keep_in) and float(area.outside_m(other)[0]) == 0.0
+
+
+def legs(mission: ForwardingMission) -> list[tuple[int, int]]:
+    """The straight ways between waypoints, by their numbers; with more than one lap also the one that closes it."""
+    count = len(mission.waypoints)
+    found = [(i, i + 1) for i in range(count - 1)]
+    if mission.options.laps > 1 and count > 1 and mission.waypoints[0] != mission.waypoints[-1]:
+        found.append((count - 1, 0))
+    return found

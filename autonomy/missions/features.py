@@ -1,0 +1,249 @@
+"""What every format is read into: named shapes with properties, and how they become a mission.
+
+A shape's ``role`` says what it is: ``route``, ``waypoint``, ``fence``, ``keep-out``, ``log``, ``landing``.  Without
+one, a line is the route, a polygon a fence that keeps in, and points are waypoints in their order if there is no line.
+That is how files from programs that know nothing of logs are understood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from autonomy.missions.area import signed_area_m2
+from autonomy.missions.local import LocalFrame
+from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Landing, MissionError, Options, Point
+from autonomy.missions.source import Place, Source
+
+ROLES: Final = ("route", "waypoint", "fence", "keep-out", "log", "landing")
+Key = tuple[str, int] | tuple[str, int, int]
+"""("waypoint", i), ("fence", i), ("corner", fence, i), ("landing", i), ("log", i)."""
+
+_LOG_NUMBERS: Final = ("bearing_deg", "length_m", "diameter_m", "sigma_m")
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """One position of a shape, as read and not yet checked, and where it stands in its file."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float | None
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """A point, a line or a polygon (its outer ring, then its holes) with its properties."""
+
+    kind: Literal["point", "line", "polygon"]
+    rings: tuple[tuple[Position, ...], ...]
+    properties: dict[str, Any]
+    place: Place
+
+
+@dataclass(slots=True)
+class Draft:
+    """A mission as read: what it says, where that stands, what was left out of it."""
+
+    mission: ForwardingMission
+    source: Source
+    format: str
+    places: dict[Key, Place] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def assemble(
+    shapes: Sequence[Shape], source: Source, kind: str, name: str = "", options: Options | None = None
+) -> Draft:
+    """The mission that shapes make; coordinates are not yet judged (``autonomy.missions.check``).
+
+    Raises:
+        MissionError: a role that is none or does not fit its shape, a property of the wrong type, or two routes.
+    """
+    draft = Draft(ForwardingMission(), source, kind)
+    troubles: list[tuple[Place, str]] = []
+    roles = [_role(shape, troubles) for shape in shapes]
+    points, lines = ([s for s, role in zip(shapes, roles, strict=True) if role == r] for r in ("waypoint", "route"))
+    loose = [s for s, role in zip(shapes, roles, strict=True) if role == ""]
+    if loose and not lines and not points:
+        points, loose = loose, []
+    if loose:
+        draft.notes.append(f"{_counted(len(loose), 'point')} without a role beside the route left out")
+    troubles += [
+        (line.place, 'is a second route; a mission has one, so delete one of them or give it another "role"')
+        for line in lines[1:]
+    ]
+    if lines and points:
+        troubles.append((points[0].place, "a waypoint beside a route: keep the line or the points, not both"))
+    reader = _Reader(draft, troubles)
+    route = [p for shape in (lines[:1] or points) for p in shape.rings[0]]
+    waypoints = tuple(reader.point(("waypoint", i), position) for i, position in enumerate(route))
+    fences, landings, logs = [], [], []
+    for shape, role in zip(shapes, roles, strict=True):
+        if role in ("fence", "keep-out"):
+            fences += reader.fences(shape, role == "keep-out", len(fences))
+        elif role == "landing":
+            landings.append(reader.landing(shape, len(landings)))
+        elif role == "log":
+            logs.append(reader.log(shape, len(logs)))
+    if troubles:
+        raise source.errors(troubles)
+    draft.mission = ForwardingMission(
+        name, waypoints, tuple(fences), tuple(landings), tuple(logs), options or Options()
+    )
+    return draft
+
+
+def merged(route: Draft, harvest: Draft) -> Draft:
+    """The route's mission with the logs of another file added to its own."""
+    both = (*route.mission.logs, *harvest.mission.logs)
+    fields = {name: getattr(route.mission, name) for name in ("name", "waypoints", "fences", "landings", "options")}
+    return Draft(
+        ForwardingMission(**fields, logs=both), route.source, route.format, dict(route.places),
+        [*route.notes, *harvest.notes],
+    )  # fmt: skip
+
+
+def _role(shape: Shape, troubles: list[tuple[Place, str]]) -> str:
+    """The role of a shape; "" for a point that has none."""
+    role = shape.properties.get("role")
+    if role is None:
+        return {"point": "", "line": "route", "polygon": "fence"}[shape.kind]
+    if role not in ROLES:
+        troubles.append((shape.place, f"role {_shown(role)} is none; use one of {', '.join(ROLES)}"))
+        return "none"
+    fits = {"route": ("line",), "waypoint": ("point",), "fence": ("polygon",), "keep-out": ("polygon",),
+            "log": ("point", "line"), "landing": ("point",)}[role]  # fmt: skip
+    if shape.kind not in fits:
+        troubles.append((shape.place, f"a {shape.kind} cannot be a {role}; draw a {' or a '.join(fits)}"))
+        return "none"
+    return str(role)
+
+
+class _Reader:
+    """Turns shapes into parts of a mission, remembers where they stand, and collects what is wrong."""
+
+    def __init__(self, draft: Draft, troubles: list[tuple[Place, str]]) -> None:
+        self.draft, self.troubles = draft, troubles
+
+    def point(self, key: Key, position: Position) -> Point:
+        self.draft.places[key] = position.place
+        return Point(position.latitude_deg, position.longitude_deg, position.altitude_m)
+
+    def fences(self, shape: Shape, keep_out: bool, first: int) -> list[Fence]:
+        found = []
+        for number, ring in enumerate(shape.rings, first):
+            open_ring = ring[:-1] if len(ring) > 1 and _same(ring[0], ring[-1]) else ring
+            ordered = _counter_clockwise(open_ring)
+            corners = tuple(self.point(("corner", number, i), position) for i, position in enumerate(ordered))
+            self.draft.places[("fence", number)] = shape.place
+            found.append(Fence(corners, keep_out or number > first, self.text(shape, "name")))
+        return found
+
+    def landing(self, shape: Shape, number: int) -> Landing:
+        return Landing(
+            self.point(("landing", number), shape.rings[0][0]),
+            self.text(shape, "name"),
+            self.number(shape, "bearing_deg"),
+            self.words(shape, "assortments"),
+        )
+
+    def log(self, shape: Shape, number: int) -> KnownLog:
+        """A log from its middle, or from its two ends."""
+        ring = shape.rings[0]
+        known = {name: self.number(shape, name) for name in _LOG_NUMBERS}
+        at = self.point(("log", number), ring[0])
+        if shape.kind == "line":
+            if len(ring) != 2:
+                self.troubles.append((shape.place, f"a log drawn as a line has its two ends, not {len(ring)} points"))
+            elif not _far_from_sane(ring):
+                at, known["bearing_deg"], known["length_m"] = _from_ends(*ring)
+        key = self.number(shape, "product_key")
+        if key is not None and not (key.is_integer() and 0.0 < key < 2**31):
+            self.troubles.append((shape.place, f"product_key is {key:g}; StanForD numbers products from 1"))
+            key = None
+        return KnownLog(
+            at,
+            self.text(shape, "key"),
+            **known,
+            species=self.text(shape, "species"),
+            assortment=self.text(shape, "assortment"),
+            product_key=None if key is None else int(key),
+        )
+
+    def number(self, shape: Shape, name: str) -> float | None:
+        value = shape.properties.get(name)
+        if value is None or value == "":
+            return None
+        if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+            self.troubles.append((shape.place, f"{name} is {_shown(value)}, which is no number"))
+            return None
+        try:
+            return float(value)
+        except (ValueError, OverflowError):
+            self.troubles.append((shape.place, f"{name} is {_shown(value)}, which is no number"))
+            return None
+
+    def text(self, shape: Shape, name: str) -> str:
+        value = shape.properties.get(name)
+        if value is None:
+            return ""
+        if isinstance(value, bool) or not isinstance(value, (str, int)):
+            self.troubles.append((shape.place, f"{name} is {_shown(value)}, which is no text"))
+            return ""
+        return str(value)
+
+    def words(self, shape: Shape, name: str) -> tuple[str, ...]:
+        value = shape.properties.get(name)
+        if value is None:
+            return ()
+        if isinstance(value, str):
+            return tuple(word.strip() for word in value.split(",") if word.strip())
+        if isinstance(value, list) and all(isinstance(word, str) for word in value):
+            return tuple(value)
+        self.troubles.append((shape.place, f"{name} is {_shown(value)}; write a list of names"))
+        return ()
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def _same(a: Position, b: Position) -> bool:
+    return (a.latitude_deg, a.longitude_deg) == (b.latitude_deg, b.longitude_deg)
+
+
+def _far_from_sane(positions: Iterable[Position]) -> bool:
+    """Whether coordinates are no place on Earth, so that nothing may be computed from them."""
+    return any(not (abs(p.latitude_deg) <= 90.0 and abs(p.longitude_deg) <= 180.0) for p in positions)
+
+
+def _counter_clockwise(ring: tuple[Position, ...]) -> tuple[Position, ...]:
+    """The ring, turned round if it runs clockwise; its first corner stays the first."""
+    if len(ring) < 3 or _far_from_sane(ring):
+        return ring
+    frame = LocalFrame(ring[0].latitude_deg, ring[0].longitude_deg)
+    corners = frame.points_enu([Point(p.latitude_deg, p.longitude_deg) for p in ring])[:, :2]
+    return ring if signed_area_m2(corners) >= 0.0 else (ring[0], *reversed(ring[1:]))
+
+
+def _from_ends(a: Position, b: Position) -> tuple[Point, float, float]:
+    """Middle, bearing [deg] and length [m] of a log between two ends."""
+    frame = LocalFrame(a.latitude_deg, a.longitude_deg, a.altitude_m or 0.0)
+    end = frame.points_enu([Point(b.latitude_deg, b.longitude_deg, b.altitude_m)])[0]
+    middle = frame.point(*(0.5 * end))
+    heights = None if a.altitude_m is None or b.altitude_m is None else middle.altitude_m
+    bearing = float(np.degrees(np.arctan2(end[0], end[1])) % 360.0)
+    return Point(middle.latitude_deg, middle.longitude_deg, heights), bearing, float(np.linalg.norm(end))
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+__all__ = ["ROLES", "Draft", "Key", "MissionError", "Position", "Shape", "assemble", "merged"]

@@ -1,0 +1,165 @@
+"""StanForD 2010 ``hpr``, a harvester's production: what was felled where becomes the logs that are known beforehand.
+
+Read from ``HarvestedProduction`` in the namespace ``urn:skogforsk:stanford2010`` (versions 2 and 3): species groups and
+products by key, and per stem its coordinates and its logs.  Lengths are cm, diameters mm, volumes m3.
+
+The file does not say where a log came to lie.  The best it has is where the crane's tip felled the tree; where it has
+only the harvester's own place, the log lies somewhere within its crane's reach.  ``sigma_m`` says which of the two, and
+logs of one stem share one place.  Nothing is known of their direction.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from autonomy.missions.features import Draft, Key
+from autonomy.missions.maps import decimal
+from autonomy.missions.model import MAX_LOGS, ForwardingMission, KnownLog, Point
+from autonomy.missions.source import Place, Source
+from autonomy.missions.xml_tree import ANY, Element, tree
+
+HPR: Final = "StanForD 2010 hpr"
+NAMESPACE: Final = "urn:skogforsk:stanford2010"
+TIP_SIGMA_M: Final = 4.0
+"""A stem is processed beside where it stood: about half its length away [est]."""
+MACHINE_SIGMA_M: Final = 7.0
+"""A log lies within the 10 m of a harvester's crane from the machine [est]."""
+
+_WANTED: Final = frozenset({
+    "Machine", "SpeciesGroupDefinition", "SpeciesGroupKey", "SpeciesGroupName", "ProductDefinition", "ProductKey",
+    "ClassifiedProductDefinition", "UnclassifiedProductDefinition", "ProductName", "Stem", "StemKey", "StemNumber",
+    "StemCoordinates", "Latitude", "Longitude", "SingleTreeProcessedStem", "MultiTreeProcessedStem", "Log",
+    "LogKey", "LogVolume", "LogMeasurement", "LogDiameter", "LogLength", "ObjectDefinition", "ObjectName",
+})  # fmt: skip
+_LIMITS: Final = {"Log": (MAX_LOGS, "logs"), "Stem": (MAX_LOGS, "stems"), ANY: (1_000_000, "elements")}
+_MIDDLE: Final = ("Mid ob", "Mid ub")
+_ENDS: Final = ("Butt ob", "Top ob")
+
+
+def read_hpr(data: bytes, name: str) -> Draft:
+    """The logs of a harvester's production; a mission without a route.
+
+    Raises:
+        MissionError: no such file, a coordinate system that is not WGS84, or a value that cannot be.
+    """
+    root = tree(data, name, _WANTED, _LIMITS)
+    source = Source(name)
+    if root.namespace != NAMESPACE:
+        raise source.error(root.line, f'the namespace "{root.namespace[:60]}" is not {NAMESPACE}, StanForD 2010')
+    if root.attributes.get("messageType", "hpr") != "hpr":
+        raise source.error(root.line, f"message type {root.attributes['messageType'][:20]!r}; logs come from an hpr")
+    logs: list[KnownLog] = []
+    places: dict[Key, Place] = {}
+    lost = 0
+    title = ""
+    for machine in root.all("Machine"):
+        title = title or machine.value("ObjectDefinition", "ObjectName")
+        species = {
+            s.value("SpeciesGroupKey"): s.value("SpeciesGroupName") for s in machine.all("SpeciesGroupDefinition")
+        }
+        products = {p.value("ProductKey"): _product_name(p) for p in machine.all("ProductDefinition")}
+        for stem in machine.all("Stem"):
+            found = [log for processed in stem.children for log in processed.all("Log")]
+            at = _position(stem, source)
+            if at is None:
+                lost += len(found)
+                continue
+            for log in found:
+                places[("log", len(logs))] = log.line
+                logs.append(_log(log, stem, *at, species, products, source))
+    draft = Draft(ForwardingMission(title, logs=tuple(logs)), source, HPR, places)
+    if lost:
+        draft.notes.append(f"{lost} logs of stems without coordinates left out")
+    return draft
+
+
+def _product_name(product: Element) -> str:
+    return product.value("ClassifiedProductDefinition", "ProductName") or product.value(
+        "UnclassifiedProductDefinition", "ProductName"
+    )
+
+
+def _position(stem: Element, source: Source) -> tuple[Point, float] | None:
+    """Where a stem was felled and how well that is known, or None."""
+    best: tuple[Point, float] | None = None
+    for given in stem.all("StemCoordinates"):
+        system = given.attributes.get("coordinateReferenceSystem", "WGS84")
+        if system.replace(" ", "").upper() != "WGS84":
+            raise source.error(given.line, f'coordinates are in "{system[:40]}"; a mission is in WGS84')
+        latitude, longitude = given.first("Latitude"), given.first("Longitude")
+        if latitude is None or longitude is None:
+            continue
+        at = Point(_angle(latitude, "South", source), _angle(longitude, "West", source))
+        tip = given.attributes.get("receiverPosition", "").startswith("Crane tip")
+        if tip or best is None:
+            best = at, TIP_SIGMA_M if tip else MACHINE_SIGMA_M
+    return best
+
+
+def _angle(element: Element, negative: str, source: Source) -> float:
+    value = _number(element, source)
+    category = element.attributes.get(f"{element.name.lower()}Category", "")
+    return -value if category == negative else value
+
+
+def _log(
+    log: Element,
+    stem: Element,
+    at: Point,
+    sigma_m: float,
+    species: dict[str, str],
+    products: dict[str, str],
+    source: Source,
+) -> KnownLog:
+    key = log.first("ProductKey")
+    length = log.first("LogMeasurement", "LogLength")
+    product = None if key is None or not key.text.strip() else int(_number(key, source))
+    return KnownLog(
+        at,
+        f"{stem.value('StemKey') or stem.value('StemNumber')}/{log.value('LogKey')}",
+        None,
+        None if length is None else _number(length, source) / 100.0,
+        _diameter_m(log, length, source),
+        species.get(stem.value("SpeciesGroupKey"), "") or species.get(_species_key(stem), ""),
+        "" if key is None else products.get(key.text.strip(), ""),
+        product,
+        sigma_m,
+    )
+
+
+def _species_key(stem: Element) -> str:
+    """Trees that are processed together carry their species themselves."""
+    return next((child.value("SpeciesGroupKey") for child in stem.children if child.first("SpeciesGroupKey")), "")
+
+
+def _diameter_m(log: Element, length: Element | None, source: Source) -> float | None:
+    """The diameter at the middle over bark, else the mean of both ends, else that of the volume."""
+    given = {
+        d.attributes.get("logDiameterCategory", ""): d
+        for measurement in log.all("LogMeasurement")
+        for d in measurement.all("LogDiameter")
+    }
+    for name in _MIDDLE:
+        if name in given:
+            return _number(given[name], source) / 1000.0
+    ends = [_number(given[name], source) / 1000.0 for name in _ENDS if name in given]
+    if len(ends) == len(_ENDS):
+        return sum(ends) / len(ends)
+    volumes = {v.attributes.get("logVolumeCategory", ""): v for v in log.all("LogVolume")}
+    solid = volumes.get("m3sob") or volumes.get("m3sub")
+    if solid is not None and length is not None:
+        volume, length_m = _number(solid, source), _number(length, source) / 100.0
+        if volume > 0.0 and length_m > 0.0:
+            return math.sqrt(4.0 * volume / (math.pi * length_m))
+    return ends[0] if ends else None
+
+
+def _number(element: Element, source: Source) -> float:
+    try:
+        value = decimal(element.text, element.name)
+    except ValueError as error:
+        raise source.error(element.line, str(error)) from None
+    if not math.isfinite(value):
+        raise source.error(element.line, f"{element.name} is {element.text.strip()}, which is no number")
+    return value

@@ -1,0 +1,132 @@
+"""QGroundControl's ``.plan``: JSON; positions are latitude, longitude, height.
+
+Read: waypoints, the ground speed, fences (polygons and circles).  Heights are those of a flight and are left out, as is
+every command that a forwarder cannot follow; what was left out is said.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any, Final
+
+from autonomy.missions.features import Draft, Position, Shape, assemble
+from autonomy.missions.local import LocalFrame
+from autonomy.missions.model import MAX_WAYPOINTS, Options
+from autonomy.missions.source import Source
+
+NAV_WAYPOINT: Final = 16
+NAV_SPLINE_WAYPOINT: Final = 82
+DO_CHANGE_SPEED: Final = 178
+CIRCLE_CORNERS: Final = 48
+Path = tuple[str | int, ...]
+
+
+def read(document: dict[str, Any], source: Source) -> Draft:
+    """The mission in a plan; raises MissionError with the line of what is wrong."""
+    reader = _Reader(source)
+    mission = document.get("mission")
+    if not isinstance(mission, dict) or not isinstance(mission.get("items"), list):
+        raise source.error(("mission",), "the plan has no list of mission items; draw a route and save it again")
+    reader.items(mission["items"])
+    fence = document.get("geoFence", {})
+    if not isinstance(fence, dict):
+        raise source.error(("geoFence",), "geoFence is no object")
+    reader.fences(fence)
+    draft = assemble(reader.shapes, source, "QGroundControl plan", "", Options(speed_m_s=reader.speed_m_s))
+    draft.notes += [f"{count} × {what} left out" for what, count in reader.left_out.items()]
+    rally = document.get("rallyPoints")
+    if isinstance(rally, dict) and rally.get("points"):
+        draft.notes.append("rally points left out")
+    return draft
+
+
+class _Reader:
+    """Collects shapes and the speed."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.shapes: list[Shape] = []
+        self.left_out: Counter[str] = Counter()
+        self.speed_m_s: float | None = None
+
+    def items(self, items: list[Any]) -> None:
+        """The route: every waypoint item in its order."""
+        if len(items) > 2 * MAX_WAYPOINTS:
+            raise self.source.error(
+                ("mission", "items"), f"has {len(items)} items; a route has at most {MAX_WAYPOINTS} waypoints"
+            )
+        route = []
+        for i, item in enumerate(items):
+            path: Path = ("mission", "items", i)
+            if not isinstance(item, dict):
+                raise self.source.error(path, "this is no mission item")
+            command, given = item.get("command"), item.get("params")
+            if item.get("type") == "ComplexItem":
+                self.left_out[str(item.get("complexItemType", "complex item"))[:40]] += 1
+            elif command in (NAV_WAYPOINT, NAV_SPLINE_WAYPOINT):
+                if not isinstance(given, list) or len(given) < 6:
+                    raise self.source.error(path, "a waypoint has seven params; the 5th and 6th are its place")
+                route.append(self.position(given[4:6], (*path, "params")))
+            elif command == DO_CHANGE_SPEED and isinstance(given, list) and len(given) > 1 and _number(given[1]):
+                self.speed_m_s = float(given[1]) if self.speed_m_s is None else self.speed_m_s
+            else:
+                self.left_out[f"command {command}"[:40]] += 1
+        if route:
+            kind: Any = "line" if len(route) > 1 else "point"
+            self.shapes.append(Shape(kind, (tuple(route),), {}, ("mission", "items")))
+
+    def fences(self, fence: dict[str, Any]) -> None:
+        """Polygons of version 2, the single one of version 1, and circles."""
+        if isinstance(fence.get("polygon"), list) and fence["polygon"]:
+            self.polygon(fence["polygon"], True, ("geoFence", "polygon"))
+        for kind, inner in (("polygons", "polygon"), ("circles", "circle")):
+            listed = fence.get(kind) or []
+            if not isinstance(listed, list):
+                raise self.source.error(("geoFence", kind), f"{kind} is no list")
+            for i, entry in enumerate(listed):
+                path: Path = ("geoFence", kind, i)
+                shape = entry.get(inner) if isinstance(entry, dict) else None
+                if kind == "polygons" and isinstance(shape, list):
+                    self.polygon(shape, bool(entry.get("inclusion", True)), (*path, inner))
+                elif kind == "circles" and isinstance(shape, dict):
+                    self.circle(shape, bool(entry.get("inclusion", True)), (*path, inner))
+                else:
+                    raise self.source.error(path, f"this fence has no {inner}")
+
+    def polygon(self, corners: list[Any], inclusion: bool, path: Path) -> None:
+        if not corners:
+            return
+        ring = tuple(self.position(corner, (*path, i)) for i, corner in enumerate(corners[: MAX_WAYPOINTS + 1]))
+        self.shapes.append(Shape("polygon", (ring,), {"role": _role(inclusion)}, path))
+
+    def circle(self, circle: dict[str, Any], inclusion: bool, path: Path) -> None:
+        """As a polygon that errs to the safe side: inside of a circle that keeps in, round one that keeps out."""
+        center = self.position(circle.get("center"), (*path, "center"))
+        radius = circle.get("radius")
+        if not _number(radius) or not 0.0 < radius < 1e5:
+            raise self.source.error((*path, "radius"), f"radius {radius!r} is none; it is given in metres")
+        if not (abs(center.latitude_deg) <= 90.0 and abs(center.longitude_deg) <= 180.0):
+            self.shapes.append(Shape("polygon", ((center,) * 3,), {"role": _role(inclusion)}, path))
+            return
+        frame = LocalFrame(center.latitude_deg, center.longitude_deg)
+        reach = radius if inclusion else radius / math.cos(math.pi / CIRCLE_CORNERS)
+        ring = []
+        for i in range(CIRCLE_CORNERS):
+            angle = math.tau * i / CIRCLE_CORNERS
+            at = frame.point(reach * math.cos(angle), reach * math.sin(angle))
+            ring.append(Position(at.latitude_deg, at.longitude_deg, None, path))
+        self.shapes.append(Shape("polygon", (tuple(ring),), {"role": _role(inclusion)}, path))
+
+    def position(self, value: Any, path: Path) -> Position:
+        if not isinstance(value, list) or len(value) < 2 or not all(_number(x) for x in value[:2]):
+            raise self.source.error(path, "a place is [latitude, longitude], two numbers")
+        return Position(float(value[0]), float(value[1]), None, path)
+
+
+def _role(inclusion: bool) -> str:
+    return "fence" if inclusion else "keep-out"
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

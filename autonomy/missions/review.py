@@ -1,0 +1,184 @@
+"""What a machine will make of a mission: length, time, and what will be hard for it; says so, forbids nothing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from autonomy.missions.area import path_distance_m
+from autonomy.missions.check import SITE_M, area_of, legs
+from autonomy.missions.local import LocalFrame, site_frame
+from autonomy.missions.model import ForwardingMission
+from machine.carrier import turning_radius_m
+from machine.kinematics import max_reach_m
+from machine.profile import Carrier, Profile
+
+SWITCH_LEAST_M: Final = 3.0
+"""Nearest a waypoint is passed before the next one is steered to (machines.md 7.2: 3 to 4 m, else R tan(turn / 2))."""
+LOG_S: Final = 25.0
+"""Seconds for one log from the ground into the bunk, as an expert needs (machines.md 10)."""
+SHARPEST_RAD: Final = math.radians(150.0)
+SHOWN: Final = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Corner:
+    """A bend of the route: its waypoint, how far it turns [rad], how far before it the machine turns in [m]."""
+
+    waypoint: int
+    turn_rad: float
+    switch_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Review:
+    """Figures of a mission on a machine; lengths over all laps."""
+
+    length_m: float
+    drive_s: float
+    logs: int
+    crane_s: float
+    corners: tuple[Corner, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def total_s(self) -> float:
+        """Driving and loading."""
+        return self.drive_s + self.crane_s
+
+
+def review(mission: ForwardingMission, profile: Profile) -> Review:
+    """Judge a checked mission for a machine that drives; raises ValueError for one that does not."""
+    carrier = profile.carrier
+    if carrier is None:
+        raise ValueError(f"{profile.name} does not drive; choose a machine with a carrier")
+    frame = site_frame(mission)
+    at = frame.points_enu(mission.waypoints)[:, :2]
+    ways = legs(mission)
+    laps = mission.options.laps
+    lengths = [float(np.linalg.norm(at[j] - at[i])) for i, j in ways]
+    closing = lengths[-1] if laps > 1 and len(ways) == len(at) else 0.0
+    length = laps * sum(lengths) - closing
+    speed = mission.options.speed_m_s or carrier.cruise_speed_m_s
+    radius = turning_radius_m(carrier, carrier.articulation_limit_rad)
+    corners = _corners(at, ways, radius)
+    logs = _wanted(mission)
+    warnings = [
+        *_site(mission, carrier),
+        *_speed(mission, carrier),
+        *_tight(corners, ways, lengths, radius),
+        *_room(mission, frame, carrier),
+        *_logs(mission, frame, at, ways, profile),
+    ]
+    return Review(length, length / speed, logs, LOG_S * logs, corners, tuple(warnings))
+
+
+def _wanted(mission: ForwardingMission) -> int:
+    """How many of the known logs are to be fetched; in paper B's way the same places are filled anew for every lap."""
+    wanted = mission.options.assortments
+    logs = sum(1 for log in mission.logs if not wanted or log.assortment in wanted)
+    if mission.options.logs == "search":
+        logs *= mission.options.laps
+    most = mission.options.logs_wanted
+    if most is None:
+        return logs
+    return min(logs, most) if logs else most
+
+
+def _corners(at: np.ndarray, ways: list[tuple[int, int]], radius_m: float) -> tuple[Corner, ...]:
+    """Every waypoint at which one leg follows another."""
+    found = []
+    follows = list(pairwise(ways))
+    if len(ways) > 1 and ways[-1][1] == ways[0][0]:
+        follows.append((ways[-1], ways[0]))
+    for (a, b), (_, c) in follows:
+        one, two = at[b] - at[a], at[c] - at[b]
+        turn = abs(math.atan2(one[0] * two[1] - one[1] * two[0], float(one @ two)))
+        switch = radius_m * math.tan(0.5 * turn) if turn < SHARPEST_RAD else math.inf
+        found.append(Corner(b, turn, max(switch, SWITCH_LEAST_M)))
+    return tuple(found)
+
+
+def _site(mission: ForwardingMission, carrier: Carrier) -> list[str]:
+    origin = LocalFrame(carrier.site_lat_deg, carrier.site_lon_deg)
+    away = float(np.linalg.norm(origin.points_enu(mission.waypoints[:1])))
+    return [f"it is {away / 1000:.0f} km from the site in the machine's profile"] if away > SITE_M else []
+
+
+def _speed(mission: ForwardingMission, carrier: Carrier) -> list[str]:
+    speed, height = mission.options.speed_m_s, mission.options.transport_height_m
+    found = []
+    if speed is not None and speed > carrier.speed_limit_m_s:
+        found.append(f"speed_m_s is {speed:g}; the machine drives at most {carrier.speed_limit_m_s:g} m/s")
+    if height is not None and height > carrier.arm_travel_m:
+        found.append(f"transport_height_m is {height:g}; the swing arms lift {carrier.arm_travel_m:g} m")
+    return found
+
+
+def _tight(
+    corners: tuple[Corner, ...], ways: list[tuple[int, int]], lengths: list[float], radius_m: float
+) -> list[str]:
+    """Corners that the machine cannot drive as drawn: too sharp, or with legs too short to turn in and out."""
+    found = []
+    room = {corner.waypoint: corner.switch_m for corner in corners if math.isfinite(corner.switch_m)}
+    for corner in corners:
+        if math.isinf(corner.switch_m):
+            found.append(
+                f"waypoint {corner.waypoint + 1}: the route turns by {math.degrees(corner.turn_rad):.0f} degrees on "
+                f"the spot; the machine's smallest circle has a radius of {radius_m:.1f} m, so draw a loop"
+            )
+    for (i, j), length in zip(ways, lengths, strict=True):
+        needed = room.get(i, 0.0) + room.get(j, 0.0)
+        if length < needed:
+            found.append(
+                f"leg {i + 1} to {j + 1} is {length:.1f} m long and its corners need {needed:.1f} m at a turning "
+                f"radius of {radius_m:.1f} m; the machine will cut or overshoot them"
+            )
+    return _few(found)
+
+
+def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> list[str]:
+    """Waypoints so near the fence that a wheel would leave it."""
+    if not mission.fences:
+        return ["there is no fence; nothing says where the machine must not drive"]
+    area = area_of(mission, frame)
+    half = 0.5 * (carrier.track_width_m + carrier.wheel_width_m)
+    at = frame.points_enu(mission.waypoints)[:, :2]
+    rings = (*area.keep_in, *area.keep_out)
+    near = np.min([path_distance_m(np.vstack([ring, ring[:1]]), at) for ring in rings], axis=0)
+    return _few(
+        [
+            f"waypoint {i + 1} is {near[i]:.1f} m from the fence; the machine is {2 * half:.1f} m wide"
+            for i in np.flatnonzero(near < half)
+        ]
+    )
+
+
+def _logs(
+    mission: ForwardingMission, frame: LocalFrame, at: np.ndarray, ways: list[tuple[int, int]], profile: Profile
+) -> list[str]:
+    """Logs that the crane cannot reach from the route, or that lie under the wheels."""
+    if not mission.logs or not len(at) or profile.carrier is None:
+        return []
+    path = at[[ways[0][0], *(j for _, j in ways)]] if ways else at
+    away = path_distance_m(path, frame.points_enu([log.position for log in mission.logs])[:, :2])
+    reach = max_reach_m(profile)
+    half = 0.5 * (profile.carrier.track_width_m + profile.carrier.wheel_width_m)
+    far = [
+        f"log {i + 1} lies {away[i]:.1f} m from the route; the crane reaches {reach:.1f} m"
+        for i in np.flatnonzero(away > reach)
+    ]
+    known = np.array([(log.sigma_m or 0.0) < half for log in mission.logs])
+    on_route = np.flatnonzero((away < half) & known)
+    under = [f"log {i + 1} lies on the route; the wheels would roll over it" for i in on_route]
+    return [*_few(far), *_few(under)]
+
+
+def _few(sentences: list[str]) -> list[str]:
+    """The first few of many sentences of one kind."""
+    more = len(sentences) - SHOWN
+    return sentences if more <= 0 else [*sentences[:SHOWN], f"and {more} more like the last"]

@@ -1,0 +1,163 @@
+"""XML without its dangers: a tree of the elements that are wanted, each with its line.
+
+Document types, entities and references to other files are refused (defusedxml); elements that nobody asked for are
+skipped with all they hold; numbers of elements, depth and text are limited, so a hostile file costs bounded time and
+memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Final
+from xml.etree.ElementTree import ParseError
+
+from defusedxml.common import DefusedXmlException
+from defusedxml.ElementTree import DefusedXMLParser
+
+from autonomy.missions.model import MissionError
+
+MAX_ELEMENTS: Final = 2_000_000
+MAX_DEPTH: Final = 100
+ANY: Final = "*"
+"""The name under which all kept elements are limited."""
+_CHUNK: Final = 1 << 16
+
+
+@dataclass(slots=True)
+class Element:
+    """An element: its local name, namespace, attributes by local name, text before its first child, line."""
+
+    name: str
+    namespace: str
+    attributes: dict[str, str]
+    line: int
+    parts: list[str] = field(default_factory=list)
+    children: list[Element] = field(default_factory=list)
+
+    @property
+    def text(self) -> str:
+        """The text before the first child."""
+        return "".join(self.parts)
+
+    def all(self, *names: str) -> Iterator[Element]:
+        """The children of these names."""
+        return (child for child in self.children if child.name in names)
+
+    def first(self, *path: str) -> Element | None:
+        """The first descendant along a path of names, or None."""
+        at: Element | None = self
+        for name in path:
+            at = next(at.all(name), None) if at is not None else None
+        return at
+
+    def value(self, *path: str) -> str:
+        """The stripped text of the first descendant along a path, "" without one."""
+        found = self.first(*path)
+        return "" if found is None else found.text.strip()
+
+
+class TooMany(Exception):
+    """A file has more elements than allowed; args: line, sentence."""
+
+
+class _Builder:
+    """What the parser calls: keeps wanted elements, counts all."""
+
+    def __init__(self, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]]) -> None:
+        self.wanted, self.limits = wanted, dict(limits)
+        self.counts: dict[str, int] = {}
+        self.elements = 0
+        self.skipping = 0
+        self.open: list[Element] = []
+        self.root: Element | None = None
+        self.line = lambda: 0
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        """An element begins."""
+        self.elements += 1
+        if self.elements > MAX_ELEMENTS:
+            raise TooMany(self.line(), f"has more than {MAX_ELEMENTS} elements")
+        if self.skipping:
+            self.skipping += 1
+            return
+        namespace, _, name = tag.rpartition("}")
+        if self.open and name not in self.wanted:
+            self.skipping = 1
+            return
+        if len(self.open) >= MAX_DEPTH:
+            raise TooMany(self.line(), "is nested deeper than any mission")
+        for counted in (name, ANY):
+            if counted in self.limits:
+                most, what = self.limits[counted]
+                self.counts[counted] = self.counts.get(counted, 0) + 1
+                if self.counts[counted] > most:
+                    raise TooMany(self.line(), f"has more than {most} {what}")
+        local = {key.rpartition("}")[2]: value for key, value in attributes.items()}
+        element = Element(name, namespace.lstrip("{"), local, self.line())
+        if self.open:
+            self.open[-1].children.append(element)
+        else:
+            self.root = element
+        self.open.append(element)
+
+    def end(self, _tag: str) -> None:
+        """An element ends."""
+        if self.skipping:
+            self.skipping -= 1
+        else:
+            self.open.pop()
+
+    def data(self, text: str) -> None:
+        """Text of the element that is open."""
+        if self.open and not self.skipping and not self.open[-1].children:
+            self.open[-1].parts.append(text)
+
+    def close(self) -> Element | None:
+        """The tree."""
+        return self.root
+
+
+def root_name(data: bytes) -> str:
+    """The local name of the root element, "" when there is none to be found in the first 64 kB."""
+    builder = _Builder(frozenset(), {})
+    parser = DefusedXMLParser(target=builder, forbid_dtd=True)
+    with suppress(ParseError, DefusedXmlException, TooMany, ValueError, LookupError):
+        parser.feed(data[:_CHUNK])
+    return builder.root.name if builder.root is not None else ""
+
+
+def tree(data: bytes, name: str, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]]) -> Element:
+    """The root of an XML document with the elements named ``wanted`` below it.
+
+    ``limits`` is the greatest number of elements by name (``ANY``: of all that are kept), and what to call them.
+
+    Raises:
+        MissionError: no well-formed XML, a document type or an entity, or more than the limits allow.
+    """
+    builder = _Builder(wanted, limits)
+    parser = DefusedXMLParser(target=builder, forbid_dtd=True)
+    builder.line = lambda: parser.parser.CurrentLineNumber
+    try:
+        for start in range(0, len(data), _CHUNK):
+            parser.feed(data[start : start + _CHUNK])
+        root = parser.close()
+    except DefusedXmlException:
+        raise MissionError(
+            f"{name}:{builder.line()}: declares a document type or entities, which no mission needs and which can do "
+            "harm; delete the <!DOCTYPE ...> part"
+        ) from None
+    except TooMany as error:
+        line, sentence = error.args
+        raise MissionError(f"{name}:{line}: {sentence}; thin it out, or split the mission") from None
+    except ParseError as error:
+        line = error.position[0]
+        reason = str(error).partition(":")[0]
+        raise MissionError(f"{name}:{line}: this is no well-formed XML: {reason}; was the file cut off?") from None
+    except (ValueError, LookupError) as error:
+        raise MissionError(f"{name}: its encoding cannot be read ({error}); save the file with UTF-8") from None
+    if root is None:
+        raise MissionError(f"{name}: is empty")
+    found: Element = root
+    return found

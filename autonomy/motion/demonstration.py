@@ -1,0 +1,160 @@
+"""Demonstrations: what an operator's hands did with the crane, cut out of a recording of its bus.
+
+Encoder frames become joint positions over time, smoothed without delay; a motion begins where a joint begins to move
+and ends where all of them stand for a while.  Motions that bring the pin nowhere (corrections, levers tried out) teach
+nothing and are left out.  A file of demonstrations is text: a line of names, then numbers, motions separated by their
+number.  No clock; equal frames give equal demonstrations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from can_dbc.codec import Database
+from can_dbc.frame import Frame
+from machine.encoder import position_from_counts
+from machine.joints import JOINTS, Joint
+from machine.kinematics import pin_position
+from machine.profile import Profile, joint
+
+AXES: Final = (Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT)
+"""The joints of a demonstration (paper B: q1 to q4)."""
+GRID_S: Final = 0.05
+SMOOTH_S: Final = 0.15
+"""Standard deviation of the smoothing: shorter than a hand's motion, longer than its tremor."""
+MOVING: Final = 0.03
+"""Share of a joint's greatest speed from which it moves."""
+PAUSE_S: Final = 0.7
+"""A rest at least this long ends a motion; shorter ones are hesitation within it."""
+LEAST_WAY_M: Final = 1.0
+LEAST_S: Final = 1.5
+_HEAD: Final = ("motion", "time_s", "slew_rad", "lift_rad", "tilt_rad", "ext_m")
+
+
+class RecordingRefused(ValueError):
+    """A recording or a file without demonstrations; the text says what is missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Positions (n, 4) of `AXES` [rad, m] at times (n,) [s], on an even grid."""
+
+    time_s: np.ndarray
+    position: np.ndarray
+
+
+def track(profile: Profile, database: Database, frames: Iterable[Frame]) -> Track:
+    """The joints over time from the encoder frames of a crane bus, raw, every `GRID_S` from the first to the last.
+
+    Raises:
+        RecordingRefused: an encoder is never heard.
+    """
+    encoders = [joint(profile, j).encoder for j in AXES]
+    missing = next((j for j, e in zip(AXES, encoders, strict=True) if e is None), None)
+    if missing is not None:
+        raise RecordingRefused(f"the {missing.name.lower()} of {profile.name} has no encoder to learn from")
+    codecs = {database.messages[e.message].key: (i, e, database.messages[e.message]) for i, e in enumerate(encoders)}
+    heard: list[tuple[list[int], list[float]]] = [([], []) for _ in AXES]
+    for stamp_ns, key, data in frames:
+        found = codecs.get(key)
+        if found is None or len(data) != found[2].length:
+            continue
+        i, encoder, codec = found
+        if heard[i][0] and stamp_ns <= heard[i][0][-1]:
+            continue
+        heard[i][0].append(stamp_ns)
+        counts = int(codec.named(codec.decode(data))["Position"])
+        heard[i][1].append(position_from_counts(encoder, counts))
+    for j, e, (stamps, _) in zip(AXES, encoders, heard, strict=True):
+        if len(stamps) < 2:
+            raise RecordingRefused(f"the recording holds no frames {e.message} of the {j.name.lower()} encoder")
+    begin, end = max(h[0][0] for h in heard), min(h[0][-1] for h in heard)
+    if end - begin < LEAST_S * 1e9:
+        raise RecordingRefused(f"the recording holds {max(0, end - begin) * 1e-9:.1f} s of all encoders together")
+    time_s = np.arange(int((end - begin) * 1e-9 / GRID_S) + 1) * GRID_S
+    columns = [
+        np.interp(time_s, (np.array(t) - begin) * 1e-9, _unwrapped(e, v))
+        for e, (t, v) in zip(encoders, heard, strict=True)
+    ]
+    return Track(time_s, np.column_stack(columns))
+
+
+def _unwrapped(encoder, positions: list[float]) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """A slew that passes the end of its encoder's range does not jump."""
+    if encoder.kind != "rotary":
+        return np.array(positions)
+    return np.unwrap(positions, period=encoder.total_counts * encoder.unit_per_count)
+
+
+def smooth(positions: np.ndarray, sigma_s: float = SMOOTH_S) -> np.ndarray:
+    """Positions (n, m) every `GRID_S` without tremor and noise and without delay; the ends stay."""
+    half = int(np.ceil(4.0 * sigma_s / GRID_S))
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * GRID_S / sigma_s) ** 2)
+    kernel /= kernel.sum()
+    padded = np.pad(positions, ((half, half), (0, 0)), mode="edge")
+    return np.column_stack([np.convolve(column, kernel, mode="valid") for column in padded.T])
+
+
+def cut(profile: Profile, whole: Track) -> tuple[Track, ...]:
+    """The point-to-point motions of a track, smoothed, each from rest to rest and from time 0."""
+    if len(whole.time_s) < LEAST_S / GRID_S:
+        return ()
+    y = smooth(whole.position)
+    limits = np.array([joint(profile, j).speed_limit for j in AXES])
+    moves = np.max(np.abs(np.gradient(y, GRID_S, axis=0)) / limits, axis=1) > MOVING
+    at = np.flatnonzero(moves)
+    if not at.size:
+        return ()
+    pieces = np.split(at, np.flatnonzero(np.diff(at) > PAUSE_S / GRID_S) + 1)
+    spare = int(2.0 * SMOOTH_S / GRID_S)
+    found = []
+    for piece in pieces:
+        first, last = max(0, piece[0] - spare), min(len(y) - 1, piece[-1] + spare)
+        motion = y[first : last + 1]
+        ends = [np.array(pin_position(profile.kinematics, q)) for q in (motion[0], motion[-1])]
+        if float(np.linalg.norm(ends[1] - ends[0])) >= LEAST_WAY_M:
+            found.append(Track(np.arange(len(motion)) * GRID_S, motion))
+    return tuple(found)
+
+
+def to_text(profile_name: str, motions: Sequence[Track], every: int = 2) -> str:
+    """Demonstrations as a file: names in a comment and a head, then every ``every``-th sample."""
+    lines = [f"# demonstrations of {profile_name}; joint positions as recorded, smoothed", ",".join(_HEAD)]
+    for number, motion in enumerate(motions, 1):
+        keep = sorted({*range(0, len(motion.time_s), every), len(motion.time_s) - 1})
+        for t, q in zip(motion.time_s[keep], motion.position[keep], strict=True):
+            lines.append(f"{number},{t:.2f}," + ",".join(f"{v:.5f}" for v in q))
+    return "\n".join(lines) + "\n"
+
+
+def from_text(path: Path) -> tuple[str, tuple[Track, ...]]:
+    """Name of the machine and the motions of a file; raises RecordingRefused."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingRefused(f"{path} cannot be read ({error})") from None
+    if len(lines) < 3 or not lines[0].startswith("# demonstrations of ") or lines[1] != ",".join(_HEAD):
+        raise RecordingRefused(f"{path} is no file of demonstrations; give a recording or a file that `learn` reads")
+    name = lines[0].removeprefix("# demonstrations of ").split(";")[0].strip()
+    try:
+        table = np.array([[float(x) for x in line.split(",")] for line in lines[2:] if line])
+        assert table.shape[1] == len(_HEAD) and np.all(np.isfinite(table))
+    except (ValueError, AssertionError, IndexError):
+        raise RecordingRefused(f"{path} holds a line that is not {len(_HEAD)} numbers") from None
+    motions = []
+    for number in np.unique(table[:, 0]):
+        rows = table[table[:, 0] == number]
+        time_s = np.arange(int(np.ceil(rows[-1, 1] / GRID_S - 1e-6)) + 1) * GRID_S
+        curve = [np.interp(time_s, rows[:, 1], column) for column in rows[:, 2:].T]
+        motions.append(Track(time_s, smooth(np.column_stack(curve), GRID_S)))
+    return name, tuple(motions)
+
+
+def joints_of(motion: Track) -> np.ndarray:
+    """Joint vectors (n, 5) of a motion; the rotator, which nobody measures, at 0."""
+    return np.column_stack([motion.position, np.zeros((len(motion.position), len(JOINTS) - len(AXES)))])

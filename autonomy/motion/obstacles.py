@@ -1,0 +1,404 @@
+"""What a moving crane may touch, and how near it comes: boxes, rods and the ground, against swept rods.
+
+Everything that moves is a rod with round ends (a capsule): boom, stick with telescope, the hanging grapple and the log
+in it.  Everything that stands still is a box that is turned about the vertical, a rod (logs, trees) or the ground.
+Distances are exact for every sample, negative inside of rods and the ground (0 inside of a box's core), and vectorised;
+what a part does between two samples is covered by its greatest movement.  Crane base frame, m and rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import asin, atan2, cos, pi, remainder, sin
+from typing import Final
+
+import numpy as np
+
+from autonomy.logs import LogObservation
+from autonomy.motion.arm import Arm, Pose
+from machine.grapple import grapple_yaw, lowest_tip_below_pin_m, pin_to_tong_pivot_m
+from machine.joints import Joint
+from machine.profile import Bunk, Profile
+
+STAKE_M: Final = 0.08
+FLOOR_M: Final = 0.12
+FRAME_HALF_M: Final = 0.45
+HOOD_M: Final = (0.6, 0.65, 0.6)
+"""Where the hood begins ahead of the articulation, half its width, half its height."""
+AHEAD_M: Final = 0.85
+BEHIND_M: Final = 2.0
+"""The frames beyond their axles."""
+BOOM_M: Final = 0.17
+STICK_M: Final = 0.14
+GRAPPLE_M: Final = 0.20
+TONG_M: Final = 0.10
+_SMALL: Final = 1e-12
+
+Ground = float | Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""A height, or heights at x and y."""
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A box with a vertical edge: middle, half edges, turn about the vertical [rad]; ``name`` for sentences."""
+
+    name: str
+    center_m: tuple[float, float, float]
+    half_m: tuple[float, float, float]
+    yaw_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Rod:
+    """A capsule between two points."""
+
+    name: str
+    a_m: tuple[float, float, float]
+    b_m: tuple[float, float, float]
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What stands still as arrays: k boxes (middles, half edges, cos and sin of their turn) and j rods (middles, half
+    ways from end to end, radii); names of the ground and of them all.
+    """
+
+    ground: Ground
+    names: tuple[str, ...]
+    center: np.ndarray
+    half: np.ndarray
+    turn: np.ndarray
+    middle: np.ndarray
+    along: np.ndarray
+    radius: np.ndarray
+
+    def near(self, low: np.ndarray, high: np.ndarray) -> Standing:
+        """Without what is wholly outside of a range (3,) to (3,)."""
+        wide = np.hypot(self.half[:, 0], self.half[:, 1])
+        box = np.column_stack([wide, wide, self.half[:, 2]])
+        rod = np.abs(self.along) + self.radius[:, None]
+        boxes = np.all((self.center - box < high) & (self.center + box > low), axis=1)
+        rods = np.all((self.middle - rod < high) & (self.middle + rod > low), axis=1)
+        names = tuple(n for n, kept in zip(self.names, [True, *boxes, *rods], strict=True) if kept)
+        return Standing(
+            self.ground,
+            names,
+            self.center[boxes],
+            self.half[boxes],
+            self.turn[boxes],
+            self.middle[rods],
+            self.along[rods],
+            self.radius[rods],
+        )
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What stands still about the crane."""
+
+    ground: Ground
+    boxes: tuple[Box, ...] = ()
+    rods: tuple[Rod, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The ground, the boxes, the rods: the columns of `clearances`."""
+        return ("the ground", *(b.name for b in self.boxes), *(r.name for r in self.rods))
+
+    @cached_property
+    def standing(self) -> Standing:
+        """The same as arrays."""
+        yaw = np.array([b.yaw_rad for b in self.boxes])
+        begin, end = (np.array([getattr(r, f) for r in self.rods]).reshape(-1, 3) for f in ("a_m", "b_m"))
+        return Standing(
+            self.ground,
+            self.names,
+            np.array([b.center_m for b in self.boxes]).reshape(-1, 3),
+            np.array([b.half_m for b in self.boxes]).reshape(-1, 3),
+            np.column_stack([np.cos(yaw), np.sin(yaw)]),
+            (begin + end) / 2,
+            (end - begin) / 2,
+            np.array([r.radius_m for r in self.rods]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A log in the grapple: the point gripped is ``along_m`` from its middle, its axis ``skew_rad`` off the tongs' and
+    ``tilt_rad`` off the level.
+    """
+
+    length_m: float
+    diameter_m: float
+    along_m: float = 0.0
+    skew_rad: float = 0.0
+    tilt_rad: float = 0.0
+
+
+def held_log(arm: Arm, pose: Pose, log: LogObservation) -> Held:
+    """A log as it is held by a grapple at a pose: seen hanging in it, or lying where it will be gripped."""
+    yaw = grapple_yaw(arm.profile, (pose.slew_rad, 0.0, 0.0, 0.0, pose.rot_rad)) - pi / 2
+    skew = remainder(atan2(log.axis[1], log.axis[0]) - yaw, pi)
+    x, y = arm.xy(pose)
+    ahead = cos(yaw + skew), sin(yaw + skew)
+    along = (x - log.center_m[0]) * ahead[0] + (y - log.center_m[1]) * ahead[1]
+    up = log.axis[2] if log.axis[0] * ahead[0] + log.axis[1] * ahead[1] > 0.0 else -log.axis[2]
+    return Held(log.length_m, log.diameter_m, along, skew, asin(min(max(up, -1.0), 1.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class Swept:
+    """Moving rods: ends (n, m, 3) of m parts at n samples, radii (m,), names, and which of them hang (m,)."""
+
+    a: np.ndarray
+    b: np.ndarray
+    radius: np.ndarray
+    names: tuple[str, ...]
+    hangs: np.ndarray = field(repr=False)
+
+    def rows(self, at: list[int]) -> Swept:
+        """Some samples alone."""
+        return Swept(self.a[at], self.b[at], self.radius, self.names, self.hangs)
+
+    def shifted(self, offset: np.ndarray, depth_m: float) -> Swept:
+        """With the hanging parts swung: ``offset`` (n, 2) is how far a point ``depth_m`` below the pin is aside."""
+        move = np.zeros((len(offset), 1, 3))
+        move[:, 0, :2] = offset
+        hanging = self.hangs[None, :, None]
+        # Parts that begin at the pin stay there at their upper end; the log moves as a whole.
+        top = self.a + move * hanging * (self.depth(self.a) / depth_m)
+        low = self.b + move * hanging * (self.depth(self.b) / depth_m)
+        return Swept(top, low, self.radius, self.names, self.hangs)
+
+    def depth(self, points: np.ndarray) -> np.ndarray:
+        """How far points (n, m, 3) are below the pin, (n, m, 1)."""
+        pin_z = self.b[:, 1:2, 2:3]
+        return np.maximum(pin_z - points[..., 2:3], 0.0)
+
+
+def bunk_boxes(bunk: Bunk) -> tuple[Box, ...]:
+    """The floor, and each row of stakes as a wall: a log is to pass over it wherever they stand."""
+    c, s = cos(bunk.yaw_rad), sin(bunk.yaw_rad)
+    x, y = bunk.center_m
+    side = bunk.width_m / 2 + STAKE_M / 2
+    middle_z = bunk.floor_z_m + bunk.stake_height_m / 2
+    walls = tuple(
+        Box(
+            f"the {name} stakes",
+            (x - k * side * s, y + k * side * c, middle_z),
+            (bunk.length_m / 2, STAKE_M / 2, bunk.stake_height_m / 2),
+            bunk.yaw_rad,
+        )
+        for name, k in (("left", 1.0), ("right", -1.0))
+    )
+    floor = (bunk.length_m / 2, bunk.width_m / 2, FLOOR_M / 2)
+    return (Box("the bunk's floor", (x, y, bunk.floor_z_m - FLOOR_M / 2), floor, bunk.yaw_rad), *walls)
+
+
+def carrier_boxes(profile: Profile) -> tuple[Box, ...]:
+    """Frames, hood and wheels of the carrier, straight and lowest; none on a machine without wheels."""
+    c = profile.carrier
+    if c is None:
+        return ()
+    x0, y0, z0 = c.crane_base_m
+    turn, s = cos(c.crane_yaw_rad), sin(c.crane_yaw_rad)
+
+    def box(name: str, at: tuple[float, float, float], half: tuple[float, float, float]) -> Box:
+        x, y = at[0] - x0, at[1] - y0
+        return Box(name, (turn * x + s * y, turn * y - s * x, at[2] - z0), half, -c.crane_yaw_rad)
+
+    front, rear = c.front_axle_m + AHEAD_M, c.rear_axle_m + BEHIND_M
+    wheel = (c.wheel_radius_m, c.wheel_width_m / 2, c.wheel_radius_m)
+    return (
+        box("the rear frame", (-rear / 2, 0.0, 0.1), (rear / 2, FRAME_HALF_M, 0.2)),
+        box("the front half", ((front + HOOD_M[0]) / 2, 0.0, HOOD_M[2] / 2), ((front - HOOD_M[0]) / 2, *HOOD_M[1:])),
+        *(
+            box("a wheel", (axle, side * c.track_width_m / 2, -c.arm_drop_low_m), wheel)
+            for axle in (c.front_axle_m, -c.rear_axle_m)
+            for side in (-1.0, 1.0)
+        ),
+    )
+
+
+def log_rods(logs: Iterable[LogObservation]) -> tuple[Rod, ...]:
+    """Logs as rods; their round ends stay inside of them."""
+    rods = []
+    for log in logs:
+        half = max(log.length_m - log.diameter_m, 0.0) / 2
+        ends = ((c - half * a, c + half * a) for c, a in zip(log.center_m, log.axis, strict=True))
+        a, b = zip(*ends, strict=True)
+        rods.append(Rod(f"log {log.id}", a, b, log.diameter_m / 2))
+    return tuple(rods)
+
+
+def tree(x_m: float, y_m: float, radius_m: float, foot_z_m: float, height_m: float = 15.0, number: int = 1) -> Rod:
+    """A standing tree."""
+    return Rod(f"tree {number}", (x_m, y_m, foot_z_m), (x_m, y_m, foot_z_m + height_m), radius_m)
+
+
+def surroundings(
+    profile: Profile,
+    logs: Iterable[LogObservation] = (),
+    trees: Iterable[Rod] = (),
+    ground: Ground | None = None,
+    without: Iterable[int] = (),
+) -> Surroundings:
+    """The machine's own obstacles, the logs but for those ``without`` (the one to grasp), the trees and the ground."""
+    left_out = set(without)
+    rods = (*log_rods(log for log in logs if log.id not in left_out), *trees)
+    level = profile.workspace.ground_z_m if ground is None else ground
+    return Surroundings(level, (*carrier_boxes(profile), *bunk_boxes(profile.bunk)), rods)
+
+
+def swept(profile: Profile, q: np.ndarray, pin: np.ndarray, held: Held | None, opened: bool = True) -> Swept:
+    """The crane at joints (n, 5) whose pin truly is at (n, 3), with what it holds; ``opened``: its tongs."""
+    kin, n = profile.kinematics, len(q)
+    theta = q[:, Joint.SLEW] + kin.theta1_offset_rad
+    c, s = np.cos(theta), np.sin(theta)
+    lift = q[:, Joint.LIFT] + kin.theta2_offset_rad
+
+    def at(r: np.ndarray, z: np.ndarray) -> np.ndarray:
+        return np.column_stack([r * c, r * s, z])
+
+    foot = at(np.full(n, kin.a1_m), np.full(n, kin.d1_m))
+    elbow = at(kin.a1_m + kin.a2_m * np.cos(lift), kin.d1_m + kin.a2_m * np.sin(lift))
+    # The stick reaches back behind its pin no farther than its radius; the telescope ends at the hanger.
+    yaw = q[:, Joint.SLEW] + q[:, Joint.ROT] + (grapple_yaw(profile, np.zeros(len(Joint))))
+    opening = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(n)])
+    tongs = profile.grapple.tongs
+    pivot = pin - np.array([0.0, 0.0, pin_to_tong_pivot_m(kin)])
+    parts: list[tuple[str, np.ndarray, np.ndarray, float, bool]] = [
+        ("boom", foot, elbow, BOOM_M, False),
+        ("stick", elbow, pin, STICK_M, False),
+        ("grapple", pin, pivot, GRAPPLE_M, True),
+    ]
+    half_gap = tongs.half_gap_m[0] if opened and held is None else 0.25
+    deep = tongs.tip_below_pin_m[0] if opened and held is None else lowest_tip_below_pin_m(tongs)
+    for side in (-1.0, 1.0):
+        tip = pin + side * half_gap * opening - np.array([0.0, 0.0, deep - TONG_M])
+        parts.append(("tong", pivot, tip, TONG_M, True))
+    if held is not None:
+        turn = yaw - pi / 2 + held.skew_rad
+        level, up = cos(held.tilt_rad), sin(held.tilt_rad)
+        axis = np.column_stack([level * np.cos(turn), level * np.sin(turn), np.full(n, up)])
+        low = lowest_tip_below_pin_m(tongs) - held.diameter_m / 2
+        middle = pin - held.along_m * axis - np.array([0.0, 0.0, low])
+        half = max(held.length_m - held.diameter_m, 0.0) / 2
+        parts.append(("log", middle - half * axis, middle + half * axis, held.diameter_m / 2, True))
+    names, a, b, radius, hangs = zip(*parts, strict=True)
+    return Swept(np.stack(a, 1), np.stack(b, 1), np.array(radius), names, np.array(hangs))
+
+
+def segment_segment(p0: np.ndarray, p1: np.ndarray, q0: np.ndarray, q1: np.ndarray) -> np.ndarray:
+    """Distances of segments p0-p1 and q0-q1 (..., 3), exact, also for points and parallels."""
+    u, v, w = p1 - p0, q1 - q0, p0 - q0
+    a, b, c = _dot(u, u), _dot(u, v), _dot(v, v)
+    d, e = _dot(u, w), _dot(v, w)
+    det = a * c - b * b
+    s = np.where(det > _SMALL * np.maximum(a * c, _SMALL), (b * e - c * d) / np.maximum(det, _SMALL), 0.0)
+    s = np.clip(s, 0.0, 1.0)
+    t = np.clip((b * s + e) / np.maximum(c, _SMALL), 0.0, 1.0)
+    s = np.clip((b * t - d) / np.maximum(a, _SMALL), 0.0, 1.0)
+    t = np.clip((b * s + e) / np.maximum(c, _SMALL), 0.0, 1.0)
+    return np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
+
+
+def segment_box(p0: np.ndarray, p1: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Distances of segments (..., 3) and boxes of half edges (..., 3) about the origin, exact; 0 inside.
+
+    The squared distance along the segment is convex and a quadratic between the places where it crosses a face's
+    plane: its slope, a broken line, is looked up there.
+    """
+    way = p1 - p0
+    safe = np.where(np.abs(way) > _SMALL, way, 1.0)
+    crossings = np.concatenate([(half - p0) / safe, (-half - p0) / safe], axis=-1)
+    crossings = np.where(np.concatenate([np.abs(way) > _SMALL] * 2, axis=-1), crossings, 0.0)
+    ends = np.zeros((*crossings.shape[:-1], 1))
+    t = np.sort(np.clip(np.concatenate([ends, crossings, ends + 1.0], axis=-1), 0.0, 1.0), axis=-1)
+
+    def out(at: np.ndarray) -> np.ndarray:
+        points = p0[..., None, :] + at[..., None] * way[..., None, :]
+        return points - np.clip(points, -half[..., None, :], half[..., None, :])
+
+    slope = np.sum(out(t) * way[..., None, :], axis=-1)
+    k = np.clip(np.sum(slope < 0.0, axis=-1), 1, t.shape[-1] - 1)[..., None]
+    s0, s1 = np.take_along_axis(slope, k - 1, -1), np.take_along_axis(slope, k, -1)
+    t0, t1 = np.take_along_axis(t, k - 1, -1), np.take_along_axis(t, k, -1)
+    rise = s1 - s0
+    best = np.where(s0 >= 0.0, t0, np.where(s1 <= 0.0, t1, t0 - s0 * (t1 - t0) / np.where(rise > _SMALL, rise, 1.0)))
+    return np.linalg.norm(out(best)[..., 0, :], axis=-1)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("...i,...i->...", a, b)
+
+
+def clearances(around: Surroundings, body: Swept, near_m: float = np.inf) -> np.ndarray:
+    """Distances (n, m, k) of m parts at n samples from the ground, the boxes and the rods (`Surroundings.names`).
+
+    Beyond ``near_m`` what is given may be less than the distance, but not less than ``near_m``.
+    """
+    return apart(around.standing, body, np.array(near_m))
+
+
+def apart(things: Standing, body: Swept, near_m: np.ndarray) -> np.ndarray:
+    """The same from things as arrays; ``near_m`` broadcasts to (n, m, 1)."""
+    limit = near_m + body.radius[:, None]
+    middle, way = (body.a + body.b) / 2, (body.b - body.a) / 2
+    columns = [_over_ground(things.ground, body.a, body.b)]
+    # Axis by axis a part and a thing are at least as far from each other as what encloses them.
+    x, y, z = (middle[..., i, None] - things.center[:, i] for i in range(3))
+    cos_, sin_ = things.turn.T
+    x, y = cos_ * x + sin_ * y, cos_ * y - sin_ * x
+    wx, wy, wz = (way[..., i, None] for i in range(3))
+    wx, wy = cos_ * wx + sin_ * wy, cos_ * wy - sin_ * wx
+    hx, hy, hz = things.half.T
+    far = _beyond(np.abs(x) - np.abs(wx) - hx, np.abs(y) - np.abs(wy) - hy, np.abs(z) - np.abs(wz) - hz)
+    i, m, k = np.nonzero(far < limit)
+    at, to = np.stack([x[i, m, k], y[i, m, k], z[i, m, k]], -1), np.stack([wx[i, m, k], wy[i, m, k], wz[i, m, 0]], -1)
+    far[i, m, k] = segment_box(at - to, at + to, things.half[k])
+    columns.append(far)
+    far = _beyond(
+        *(
+            np.abs(middle[..., i, None] - things.middle[:, i]) - np.abs(way[..., i, None]) - np.abs(things.along[:, i])
+            for i in range(3)
+        )
+    )
+    far -= things.radius
+    i, m, k = np.nonzero(far < limit)
+    begin, end = things.middle[k] - things.along[k], things.middle[k] + things.along[k]
+    far[i, m, k] = segment_segment(body.a[i, m], body.b[i, m], begin, end) - things.radius[k]
+    columns.append(far)
+    return np.concatenate(columns, axis=2) - body.radius[:, None]
+
+
+def _beyond(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Length of a gap (n, m, k) given by what it is along each axis; negative is none."""
+    x, y, z = np.maximum(x, 0.0), np.maximum(y, 0.0), np.maximum(z, 0.0)
+    return np.sqrt(x * x + y * y + z * z)
+
+
+def _over_ground(ground: Ground, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Height of both ends and the middle over the ground, the least of them, (n, m, 1)."""
+    heights = []
+    for share in (0.0, 0.5, 1.0):
+        p = a + share * (b - a)
+        heights.append(p[..., 2] - (ground(p[..., 0], p[..., 1]) if callable(ground) else ground))
+    return np.min(np.stack(heights, axis=-1), axis=-1)[..., None]
+
+
+def between(body: Swept) -> np.ndarray:
+    """By how much a part may be nearer between two samples than at either, (n, m): half of its movement."""
+    move = np.maximum(np.linalg.norm(np.diff(body.a, axis=0), axis=2), np.linalg.norm(np.diff(body.b, axis=0), axis=2))
+    nothing = np.zeros((1, move.shape[1]))
+    return 0.5 * np.maximum(np.concatenate([nothing, move]), np.concatenate([move, nothing]))
+
+
+def least(around: Surroundings, body: Swept) -> tuple[float, str, str, int]:
+    """The least clearance [m], of which part from what, and at which sample."""
+    apart = clearances(around, body)
+    i, m, k = np.unravel_index(int(np.argmin(apart)), apart.shape)
+    return float(apart[i, m, k]), body.names[m], around.names[k], int(i)

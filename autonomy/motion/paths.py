@@ -1,0 +1,342 @@
+"""Ways that touch nothing: over, around or with the arm drawn in, the fastest that stays clear, from rest to rest.
+
+A way is straight, or up, over and down, its legs overlapping in time.  Only one leg moves the pin sideways, so its law
+alone decides about the swing, and it is not disturbed by what the height does meanwhile.  First the height is found at
+which sharp corners are clear; there the overlaps are tried from the fastest on.  Each way is checked with everything
+that moves against everything that stands (`autonomy.motion.clearance`), with a margin and with the grapple leaning as
+this very motion makes it swing.  Laws are those of `autonomy.motion.swift`.  No clock, no randomness.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from autonomy.motion.arm import Arm, Pose
+from autonomy.motion.clearance import SAMPLES, judged, pins, spare
+from autonomy.motion.obstacles import Held, Surroundings
+from autonomy.motion.swift import swift_law
+from autonomy.motion.telescope import eased
+from autonomy.motion.trajectory import Leg, Trajectory, leg, summed, travel
+from machine.joints import Joint
+from machine.kinematics import Unreachable
+
+TRIES: Final = 8
+"""So many overlaps at one height are checked, the fastest first, before the next shape's turn."""
+MOST: Final = 64
+"""No more ways than so many are checked at all."""
+HIGHEST_M: Final = 4.0
+"""So far over the higher end a way is looked for, ..."""
+HIGHER_M: Final = (0.0, 0.4, 0.9)
+"""... and where none is clear as it swings, so much higher."""
+_STEP_UP_M: Final = 0.05
+REACHES: Final = (None, 0.6, 1.25)
+"""Distance from the slew axis half-way, as a share of the nearer or the farther end's: as it comes, drawn in,
+stretched out."""
+EARLY: Final = (1.0, 0.7, 0.45, 0.3, 0.2, 0.08)
+"""Share of a rise that may be left when the way over begins, and of the way over when the way down begins."""
+_HEIGHT_M_S: Final = 0.7
+_REACH_M_S: Final = 0.9
+"""Speeds of the pin by which ways are compared before their laws are known, ..."""
+_SOFT: Final = 0.3
+"""... and the share of a leg in which it sets in and ends."""
+_POSES: Final = 65
+_SURE: Final = 0.7
+"""A way that is higher by this share of what was missing may be clear."""
+_THROUGH_M: Final = 0.2
+"""A way that is by so much too near to a thing, with room for swing, is so however it swings: it gets no law."""
+_SAME: Final = 1e-6
+_COARSE: Final = 25
+
+
+class Blocked(Unreachable):
+    """No way is clear; the text says what is in the way of the best."""
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """A way that is clear: the motion, its least clearance beyond what is asked for [m], its shape in words, how many
+    ways were looked at.
+    """
+
+    motion: Trajectory
+    spare_m: float
+    name: str
+    tried: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A way: via points, how early over and down begin, its height, its shape in words."""
+
+    via: tuple[Pose, ...]
+    up_left: float
+    over_left: float
+    height_m: float
+    shape: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Failure:
+    """What one way taught: by how much it was too near, where from what, and in which half."""
+
+    way: _Candidate
+    short_m: float
+    why: str
+    late: bool
+
+    def rules_out(self, other: _Candidate) -> bool:
+        """Whether another is no farther away where this one was too near."""
+        if other.shape != self.way.shape or other.height_m > self.way.height_m + _SURE * self.short_m:
+            return False
+        if self.late:
+            return other.over_left >= self.way.over_left
+        return other.up_left >= self.way.up_left
+
+
+def plan(
+    arm: Arm,
+    start: Pose,
+    goal: Pose,
+    around: Surroundings,
+    held: Held | None = None,
+    least_height_m: float = -np.inf,
+) -> Path:
+    """The fastest clear way from rest at ``start`` to rest at ``goal``.
+
+    ``held`` is what hangs in the grapple, empty tongs are open; ``least_height_m``: the way goes at least so high.
+
+    Raises:
+        Blocked: nothing is clear; in one sentence.
+        machine.kinematics.Unreachable: an end is out of reach.
+    """
+    arm.joints(np.array([start, goal]))
+    planner = _Planner(arm, start, goal, around, held)
+    top = max(start.z_m, goal.z_m)
+    line = _Candidate((start, goal), 1.0, 1.0, top, "straight")
+    if least_height_m <= top and planner.may_pass(line) and (found := planner.driven(line)):
+        return found
+    for reach in REACHES:
+        height = planner.least_height(max(top, least_height_m), top + HIGHEST_M, reach)
+        for more in HIGHER_M if height is not None else ():
+            if planner.tried >= MOST:
+                break
+            if found := planner.best(height + more, reach):
+                return found
+    best = max(planner.failures, key=lambda f: -f.short_m, default=None)
+    reason = best.why if best else "every way leaves the crane's reach"
+    raise Blocked(f"no way is clear from ({_said(arm, start)}) to ({_said(arm, goal)}) m: {reason}")
+
+
+class Clear:
+    """A source of motions with the signature of `autonomy.motion.trajectory.travel` that stays clear of a scene.
+
+    ``patient``: `travel` itself is looked at as well, which takes some tenths of a second: on a level way its slower
+    laws are the shorter ones.
+    """
+
+    def __init__(self, around: Surroundings, held: Held | None = None, patient: bool = False) -> None:
+        self._around, self._held, self._patient = around, held, patient
+
+    def __call__(self, arm: Arm, start: Pose, goal: Pose, height_m: float = 0.0, free_m: float = 0.0) -> Trajectory:
+        """The fastest clear way; only ``patient`` looks at heights, the scene says how high is high enough.
+
+        Raises:
+            Blocked: nothing is clear; in one sentence.
+        """
+        ours = plan(arm, start, goal, self._around, self._held).motion
+        if not self._patient:
+            return ours
+        always = travel(arm, start, goal, max(height_m, start.z_m, goal.z_m), free_m)
+        shorter = always.duration_s < ours.duration_s
+        return always if shorter and spare(arm, always, self._around, self._held)[0] >= 0.0 else ours
+
+
+def _said(arm: Arm, pose: Pose) -> str:
+    x, y = arm.xy(pose)
+    return f"{x:.2f}, {y:.2f}, {pose.z_m:.2f}"
+
+
+@dataclass(slots=True)
+class _Planner:
+    """One question; what was tried, and failures."""
+
+    arm: Arm
+    start: Pose
+    goal: Pose
+    around: Surroundings
+    held: Held | None
+    tried: int = 0
+    spare_m: float = 0.0
+    failures: list[_Failure] = field(default_factory=list)
+    made: dict[tuple[float, str], tuple[list[Leg], list[dict[float, float]]]] = field(default_factory=dict)
+    easy: dict[tuple[Pose, ...], tuple[Pose, ...]] = field(default_factory=dict)
+
+    def least_height(self, low_m: float, high_m: float, reach: float | None) -> float | None:
+        """The least height, within a few cm, at which the way with sharp corners is clear; None where none is."""
+        height = low_m
+        while height <= high_m and self.tried < MOST:
+            sharp = self._way(height, reach, EARLY[-1], EARLY[-1])
+            poses = self._poses(sharp)
+            try:
+                spare_m = self._judged(sharp, poses, self.arm.joints_about(poses), None)
+            except Unreachable:
+                return None
+            if spare_m >= 0.0:
+                return height
+            height += _STEP_UP_M - spare_m
+        return None
+
+    def may_pass(self, way: _Candidate) -> bool:
+        """Whether a law may make a way clear."""
+        poses = self._poses(way)
+        try:
+            q = self.arm.joints_about(poses)
+        except Unreachable:
+            return False
+        spare_m, why, _ = judged(self.arm, q, pins(self.arm, poses), self.around, self.held, None)
+        if spare_m > -_THROUGH_M:
+            return True
+        self.tried += 1
+        self.failures.append(_Failure(way, -spare_m, why, False))
+        return False
+
+    def driven(self, way: _Candidate) -> Path | None:
+        """The motion of a way if it is clear as it swings."""
+        if any(failure.rules_out(way) for failure in self.failures):
+            return None
+        try:
+            legs = self._legs(way)
+            time_s, poses, q = self._sampled(legs)
+            # Slowed down as a whole it will swing less than it is judged for here.
+            spare_m = self._judged(way, poses, q, float(time_s[1]))
+            return Path(summed(self.arm, legs), spare_m, way.shape, self.tried) if spare_m >= 0.0 else None
+        except Unreachable:
+            return None
+
+    def best(self, height_m: float, reach: float | None) -> Path | None:
+        """The fastest clear way of a shape, at this height."""
+        ways = [self._way(height_m, reach, u, o) for u in EARLY for o in EARLY]
+        seconds = self._seconds(ways)
+        tries = self.tried + TRIES
+        for i in np.argsort(seconds, kind="stable"):
+            if not np.isfinite(seconds[i]) or self.tried >= tries:
+                break
+            if found := self.driven(ways[i]):
+                return found
+        return self.driven(ways[-1])
+
+    def _way(self, height: float, reach: float | None, up_left: float, over_left: float) -> _Candidate:
+        start, goal = self.start, self.goal
+        up, down = start.at_height(height), goal.at_height(height)
+        if reach is None:
+            return _Candidate(self._eased((start, up, down, goal)), up_left, over_left, height, "over")
+        r = reach * (min(start.r_m, goal.r_m) if reach < 1.0 else max(start.r_m, goal.r_m))
+        via = self._eased((start, up, up._replace(r_m=r), down._replace(r_m=r), down, goal))
+        return _Candidate(via, up_left, over_left, height, "drawn in" if reach < 1.0 else "stretched out")
+
+    def _eased(self, via: tuple[Pose, ...]) -> tuple[Pose, ...]:
+        if via not in self.easy:
+            self.easy[via] = eased(self.arm, via)
+        return self.easy[via]
+
+    def _speeds(self) -> np.ndarray:
+        slew, ext, rot = self.arm.speed[[Joint.SLEW, Joint.EXT, Joint.ROT]]
+        return np.array([slew, _REACH_M_S, _HEIGHT_M_S, ext, rot])
+
+    def _spans(self, way: _Candidate) -> tuple[np.ndarray, list[tuple[float, float]]]:
+        """The legs (k, 5), and from when to when each runs [s, about]."""
+        via = np.array(way.via)
+        legs = np.diff(via, axis=0)
+        long = np.max(np.abs(legs) / self._speeds(), axis=1)
+        spans, at = [], 0.0
+        for i, seconds in enumerate(long):
+            spans.append((at, at + seconds))
+            left = way.up_left if i == 0 else way.over_left if i == len(long) - 2 else EARLY[-1]
+            at += seconds * (1.0 - left)
+        if len(spans) > 2:
+            # Down only when the way up is done.
+            begin = max(spans[-1][0], spans[0][1] if long[-1] > _SAME else 0.0)
+            spans[-1] = begin, begin + float(long[-1])
+        return legs, spans
+
+    def _legs(self, way: _Candidate) -> list[tuple[float, Leg]]:
+        """The legs of a way and when they begin; raises Unreachable."""
+        key = way.height_m, way.shape
+        if key not in self.made:
+            legs = [leg(self.arm, a, b, lambda line: swift_law(self.arm, line)) for a, b in pairwise(way.via)]
+            early = [dict(zip(EARLY, part.times_left(*EARLY), strict=True)) for part in legs]
+            self.made[key] = legs, early
+        legs, early = self.made[key]
+        if len(legs) == 1:
+            return [(0.0, legs[0])]
+        up, *middle, down = legs
+        at = early[0][way.up_left]
+        timed = [(0.0, up)]
+        for part in middle:
+            timed.append((at, part))
+            at += part.duration_s
+        after = timed[-1][0] + early[-2][way.over_left]
+        timed.append((max(after, up.duration_s) if down.law else after, down))
+        return timed
+
+    def _sampled(self, legs: list[tuple[float, Leg]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times (n,), poses (n, 5) and joints (n, 5) of legs; raises Unreachable."""
+        time_s = np.linspace(0.0, max(max(at + part.duration_s for at, part in legs), _SAME), SAMPLES)
+        poses = np.array(self.start) + sum(part.progress_at(time_s - at)[:, None] * part.way for at, part in legs)
+        return time_s, poses, self.arm.joints_about(poses)
+
+    def _seconds(self, ways: list[_Candidate]) -> np.ndarray:
+        """How long ways of the same legs take, slower where the legs together ask for too much, about (n,); infinite
+        where they are out of reach.
+        """
+        try:
+            timed = [self._legs(way) for way in ways]
+            end_s = np.array([max(max(at + part.duration_s for at, part in legs), _SAME) for legs in timed])
+            time_s = np.linspace(0.0, end_s, _COARSE, axis=1)
+            poses = np.array(self.start) + sum(
+                part.progress_at(time_s - np.array([[legs[k][0]] for legs in timed]))[..., None] * part.way
+                for k, (_, part) in enumerate(timed[0])
+            )
+            q, outside = self.arm.joints_or_outside(poses.reshape(-1, 5))
+        except Unreachable:
+            return np.full(len(ways), np.inf)
+        q = q.reshape(len(ways), _COARSE, 5)
+        speed = np.diff(q, axis=1) / time_s[:, 1, None, None]
+        middle = 0.5 * (q[:, 1:] + q[:, :-1])
+        flow = self.arm.pump_load(middle.reshape(-1, 5), speed.reshape(-1, 5)).reshape(len(ways), -1)
+        load = np.maximum(np.max(flow, axis=1), np.max(np.abs(speed) / self.arm.speed, axis=(1, 2)))
+        reached = ~np.any(outside.reshape(len(ways), -1), axis=1)
+        return np.where(reached, end_s * np.maximum(load, 1.0), np.inf)
+
+    def _poses(self, way: _Candidate) -> np.ndarray:
+        """Poses (n, 5) evenly along a way."""
+        legs, spans = self._spans(way)
+        time_s = np.linspace(0.0, max(max(end for _, end in spans), _SAME), 2 * _POSES)
+        line = np.array(self.start) + np.zeros((len(time_s), 1))
+        for step, (begin, end) in zip(legs, spans, strict=True):
+            if end - begin > _SAME:
+                line = line + _ramp((time_s - begin) / (end - begin))[:, None] * step
+        along = np.cumsum(np.append(0.0, np.linalg.norm(np.diff(line, axis=0) / self._speeds(), axis=1) + _SAME**2))
+        even = np.linspace(0.0, along[-1], _POSES)
+        return np.column_stack([np.interp(even, along, column) for column in line.T])
+
+    def _judged(self, way: _Candidate, poses: np.ndarray, q: np.ndarray, step_s: float | None) -> float:
+        self.tried += 1
+        spare_m, why, at = judged(self.arm, q, pins(self.arm, poses), self.around, self.held, step_s)
+        if spare_m < 0.0:
+            begun, left = (np.hypot(*(poses[at, :2] - poses[i, :2])) for i in (0, -1))
+            self.failures.append(_Failure(way, -spare_m, why, bool(begun > left)))
+        return spare_m
+
+
+def _ramp(tau: np.ndarray) -> np.ndarray:
+    """From 0 to 1 with an even middle and soft ends."""
+    t = np.clip(tau, 0.0, 1.0)
+    full = 1.0 / (1.0 - _SOFT)
+    soft = 0.5 * full / _SOFT
+    middle = full * (t - 0.5 * _SOFT)
+    return np.where(t < _SOFT, soft * t**2, np.where(t > 1.0 - _SOFT, 1.0 - soft * (1.0 - t) ** 2, middle))

@@ -1,0 +1,223 @@
+"""Motions between bunk and log as a person showed them: the primitives of one machine, and Algorithm 1 of paper B.
+
+A primitive moves the pin in the crane's plane: slew, distance, height and telescope.  There a quasi-parabola over the
+stakes stays one whatever the goal; the slew alone is scaled, so that the other side is the mirror image
+(`autonomy.motion.dmp`).  ``out`` leads from the bunk to a log, ``back`` from it to the bunk; where only one was shown,
+the other is its reverse (paper B 3.2.5).  The rotator turns along with the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from autonomy.motion.arm import Arm, Pose
+from autonomy.motion.demonstration import Track, joints_of
+from autonomy.motion.dmp import BASES, DemonstrationRefused, Dmp, learn
+from autonomy.motion.trajectory import STEP_S, Trajectory, paced, progress
+from can_dbc.setpoint import GrappleCommand
+from machine.kinematics import Unreachable, reachable_extensions
+from machine.profile import Bunk, Profile
+
+SCHEMA: Final = 1
+OVER_BUNK_M: Final = 0.4
+"""A motion that ends within this of the bunk's sides ends at the bunk."""
+SHIPPED: Final = Path(__file__).parent / "shown"
+_SCALED: Final = (True, False, False, False)
+_EASE_M: Final = 0.08
+"""How far inside its limits a telescope is that gives way to a height or a distance."""
+
+
+class PrimitivesRefused(ValueError):
+    """A file of primitives that cannot be used; the text says why."""
+
+
+class Primitive(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A `Dmp` of (slew, r, z, ext) and the number of demonstrations behind it."""
+
+    duration_s: float
+    demonstrations: int
+    weights: list[list[float]]
+
+    def dmp(self) -> Dmp:
+        """The same as equations."""
+        return Dmp(self.duration_s, np.array(self.weights), _SCALED)
+
+
+class Primitives(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What one machine was shown: out to a log and back to the bunk."""
+
+    schema: int
+    profile: str
+    out: Primitive
+    back: Primitive
+
+
+def pose_track(arm: Arm, motion: Track) -> np.ndarray:
+    """A demonstration in the crane's plane: slew, r, z, ext (n, 4)."""
+    return np.array([arm.pose(q)[:4] for q in joints_of(motion)])
+
+
+def over_bunk(bunk: Bunk, xy: Sequence[float]) -> bool:
+    """Whether a point is over the bunk or next to it."""
+    x, y = xy[0] - bunk.center_m[0], xy[1] - bunk.center_m[1]
+    c, s = np.cos(bunk.yaw_rad), np.sin(bunk.yaw_rad)
+    along, across = x * c + y * s, y * c - x * s
+    return bool(abs(along) < bunk.length_m / 2 + OVER_BUNK_M and abs(across) < bunk.width_m / 2 + OVER_BUNK_M)
+
+
+def sorted_motions(arm: Arm, motions: Sequence[Track]) -> tuple[list[Track], list[Track]]:
+    """Motions out of the bunk, and into it; others, which lead nowhere near it, are left out."""
+    out, back = [], []
+    for motion in motions:
+        q = joints_of(motion)
+        begins, ends = (over_bunk(arm.profile.bunk, arm.xy(arm.pose(q[i]))) for i in (0, -1))
+        if begins != ends:
+            (back if ends else out).append(motion)
+    return out, back
+
+
+def learn_primitives(profile: Profile, motions: Sequence[Track], bases: int = BASES) -> Primitives:
+    """Primitives from demonstrations of the machine.
+
+    Raises:
+        DemonstrationRefused: none of them leads between the bunk and another place.
+    """
+    arm = Arm(profile)
+    out, back = sorted_motions(arm, motions)
+    if not out and not back:
+        raise DemonstrationRefused(
+            f"none of the {len(motions)} motions leads between the bunk and another place; "
+            "show some from the bunk to a log and back"
+        )
+    shown = [[(m.time_s, pose_track(arm, m)) for m in group] for group in (out, back)]
+    for mine, other in ((0, 1), (1, 0)):
+        if not shown[mine]:
+            shown[mine] = [(t, poses[::-1]) for t, poses in shown[other]]
+    counts = len(out), len(back)
+    made = [learn(group, _SCALED, bases) for group in shown]
+    packed = [Primitive(d.duration_s, n, d.weights.tolist()) for d, n in zip(made, counts, strict=True)]
+    return Primitives(SCHEMA, profile.name, *packed)
+
+
+def encode(primitives: Primitives) -> bytes:
+    """The file of primitives, weights to seven digits."""
+
+    def short(p: Primitive) -> Primitive:
+        rows = [[float(f"{w:.7g}") for w in row] for row in p.weights]
+        return msgspec.structs.replace(p, duration_s=round(p.duration_s, 3), weights=rows)
+
+    primitives = msgspec.structs.replace(primitives, out=short(primitives.out), back=short(primitives.back))
+    return msgspec.json.encode(primitives) + b"\n"
+
+
+def load(profile: Profile, path: Path | None = None) -> Primitives:
+    """The primitives in a file, by default those that ship for the machine; raises PrimitivesRefused."""
+    path = path or SHIPPED / f"{profile.name}.json"
+    hint = "learn some with `timberhand plan learn LOG --out FILE`"
+    try:
+        found = msgspec.json.decode(path.read_bytes(), type=Primitives)
+    except OSError as error:
+        raise PrimitivesRefused(f"{path} cannot be read ({error.strerror}); {hint}") from None
+    except msgspec.MsgspecError as error:
+        raise PrimitivesRefused(f"{path} is no file of primitives ({error}); {hint}") from None
+    if found.schema != SCHEMA or found.profile != profile.name:
+        raise PrimitivesRefused(f"{path} is of {found.profile}, schema {found.schema}, not of {profile.name}; {hint}")
+    for primitive in (found.out, found.back):
+        rows = primitive.weights
+        good = len(rows) == len(_SCALED) and len({len(row) for row in rows}) == 1 and len(rows[0]) >= 2
+        if not good or not 0.5 < primitive.duration_s < 120.0 or not np.all(np.isfinite(primitive.weights)):
+            raise PrimitivesRefused(f"{path} holds a primitive that makes no sense; {hint}")
+    return found
+
+
+class Shown:
+    """A source of motions with the signature of `autonomy.motion.trajectory.travel`: as people move, by primitives.
+
+    Heights that are asked for are not looked at: the way over the stakes is in what was shown.
+    """
+
+    def __init__(self, primitives: Primitives) -> None:
+        self._out, self._back = primitives.out.dmp(), primitives.back.dmp()
+
+    def __call__(self, arm: Arm, start: Pose, goal: Pose, height_m: float = 0.0, free_m: float = 0.0) -> Trajectory:
+        """Back where the goal is at the bunk, else out.
+
+        Raises:
+            machine.kinematics.Unreachable: the motion would leave the crane's reach.
+        """
+        dmp = self._back if over_bunk(arm.profile.bunk, arm.xy(goal)) else self._out
+        return by_primitive(arm, dmp, start, goal)
+
+
+def by_primitive(arm: Arm, dmp: Dmp, start: Pose, goal: Pose) -> Trajectory:
+    """The motion of a primitive from rest to rest, slowed down to the arm's limits if need be; raises Unreachable."""
+    way = dmp.rollout(np.array(start[:4]), np.array(goal[:4]))
+
+    def sampled(duration_s: float) -> np.ndarray:
+        time_s = np.linspace(0.0, duration_s, max(2, int(np.ceil(duration_s / STEP_S)) + 1))
+        turned = start.rot_rad + progress(time_s / duration_s) * (goal.rot_rad - start.rot_rad)
+        return _joints(arm, np.column_stack([way.at(time_s, duration_s), turned]))
+
+    return paced(arm, sampled, way.duration_s)
+
+
+def _joints(arm: Arm, poses: np.ndarray) -> np.ndarray:
+    """Joints of poses; where the arm is too short or too long for a pose, its telescope gives way, smoothly."""
+    try:
+        return arm.joints(poses)
+    except Unreachable:
+        pass
+    coarse = np.unique(np.append(np.arange(0, len(poses), 10), len(poses) - 1))
+    low, high = np.empty(len(coarse)), np.empty(len(coarse))
+    for i, pose in enumerate(map(Pose._make, poses[coarse].tolist())):
+        spans = reachable_extensions(arm.profile, *arm.xy(pose), pose.z_m)
+        if not spans:
+            arm.joints(poses[coarse[i] : coarse[i] + 1])  # says what is in the way
+            raise Unreachable(f"the shown way leaves the crane's reach at a height of {pose.z_m:.2f} m")
+        low[i], high[i] = min(spans, key=lambda s: max(s[0] - pose.ext_m, pose.ext_m - s[1], 0.0))
+    room = np.minimum(_EASE_M, (high - low) / 2)
+    ext = poses[coarse, 3]
+    wanted = np.clip(ext, low + room, high - room) - ext
+    wanted[0] = wanted[-1] = 0.0
+    # A bump wide enough for every sample, at rest at both ends.
+    share = coarse / coarse[-1]
+    bump = np.maximum(np.sin(np.pi * share) ** 2, 1e-3)
+    shape = np.zeros(len(coarse))
+    for i in np.flatnonzero(np.abs(wanted) > 0.0):
+        there = wanted[i] * np.minimum(bump / bump[i], 1.0)
+        shape = np.where(np.abs(there) > np.abs(shape), there, shape)
+    kernel = np.hanning(9)[1:-1]
+    shape = np.convolve(shape, kernel / kernel.sum(), mode="same") * (np.sin(np.pi * share) > 0.0)
+    eased = poses.copy()
+    eased[:, 3] += np.interp(np.arange(len(poses)), coarse, shape)
+    return arm.joints(eased)
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A step of Algorithm 1: the motion, and what the grapple does during it and after it."""
+
+    motion: Trajectory
+    meanwhile: GrappleCommand
+    then: GrappleCommand
+
+
+def algorithm_1(arm: Arm, primitives: Primitives, start: Pose, target: Pose, bunk: Pose) -> tuple[Stage, Stage]:
+    """Paper B's Algorithm 1: from the bunk towards the log while the grapple opens, then it closes (lines 2 to 5);
+    with the log to the bunk, then it opens (lines 6 to 9).
+
+    The second stage is to begin when the first has reached its target and the grapple is closed (line 7).  Raises
+    ``Unreachable``.
+    """
+    move = Shown(primitives)
+    out = by_primitive(arm, primitives.out.dmp(), start, target)
+    return (
+        Stage(out, GrappleCommand.OPEN, GrappleCommand.CLOSE),
+        Stage(move(arm, target, bunk), GrappleCommand.HOLD, GrappleCommand.OPEN),
+    )

@@ -1,0 +1,283 @@
+"""A fast planner's time law: along a given way as fast as the limits allow, shaped so that the grapple hangs still.
+
+`autonomy.motion.timing` finds a law by linear programs in a few tenths of a second; this one takes some milliseconds.
+It goes through the phase plane of progress and speed once backward and once forward (Bobrow 1985, Pham 2018), which is
+the fastest law under speeds, pump and accelerations, and then averages the progress over a window in time.  Averaging
+keeps the way, bounds the jerk by twice the acceleration over the window's first part, and takes out the swing whose
+periods the window holds: of a family of windows the shortest is taken that leaves at most `SWING_RAD`, judged by the
+same pendulums.  Where averaging cut a corner of the limits, the speed there is lowered and the law made again.
+
+No clock, no randomness: equal ways have equal laws.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Final
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import nnls
+
+from autonomy.motion.arm import Arm
+from autonomy.motion.timing import _GRAVITY_M_S2, _OMEGA, _POLES, SWING_RAD, Way
+from autonomy.motion.trajectory import STEP_S
+from machine.joints import N_JOINTS
+
+GRID: Final = 128
+"""Pieces of the way on which the phase plane is walked through."""
+FINE: Final = 4
+"""Samples of the way's joints per piece."""
+JERK_S: Final = 0.24
+"""Least window: accelerations rise within it."""
+TAP_S: Final = 0.04
+"""Impulses of a window stand so far apart, ..."""
+TAPS: Final = (0, 12, 18, 22, 26, 30, 34, 38, 43, 48, 53)
+"""... and there are one of these numbers of them more than one: at most, a period of the slowest pendulum."""
+SEARCHES: Final = 3
+"""How often the swing of a window is made straight about it: a way is bent, so two impulses do not just add up."""
+ROUNDS: Final = 2
+_LONGEST_S: Final = 60.0
+_TINY: Final = 1e-9
+_EVERY: Final = round(TAP_S / STEP_S)
+_LATE: Final = np.exp(-np.outer(_POLES, np.arange(int(_LONGEST_S / TAP_S)) * TAP_S))
+"""What is left of a pendulum's swing some taps later."""
+_GAIN: Final = (_OMEGA**2 / _GRAVITY_M_S2)[:, None]
+_WELL: Final = 0.6
+"""A window is good enough at this share of the bound."""
+_SUM: Final = 3.0
+"""Weight of the wish that a window's impulses sum to 1, in bounds of the swing."""
+
+
+def _box() -> np.ndarray:
+    n = round(JERK_S / STEP_S / 2)
+    kernel = np.convolve(np.ones(n), np.ones(n))
+    return kernel / kernel.sum()
+
+
+_BOX: Final = _box()
+
+
+@dataclass(frozen=True)
+class Swift:
+    """A law: progress (n,) every `STEP_S` from 0 to 1, and the swing [rad] it leaves."""
+
+    done: np.ndarray
+    swing_rad: float
+
+    @cached_property
+    def _curve(self) -> CubicSpline:
+        return CubicSpline(np.arange(len(self.done)) * STEP_S, self.done, bc_type="clamped")
+
+    @property
+    def duration_s(self) -> float:
+        """When it is at its end."""
+        return (len(self.done) - 1) * STEP_S
+
+    def progress(self, time_s: np.ndarray) -> np.ndarray:
+        """Progress (0 to 1) at times; 0 before and 1 after the motion."""
+        at: np.ndarray = self._curve(np.clip(time_s, 0.0, self.duration_s))
+        return np.clip(at, 0.0, 1.0)
+
+
+class Limits:
+    """A way's limits on its grid: slope and bend of the moving joints, greatest speed by speeds and pump."""
+
+    def __init__(self, arm: Arm, way: Way) -> None:
+        self.s = np.linspace(0.0, 1.0, GRID + 1)
+        self.slope = way.curve(self.s, 1)[:, way.moving]
+        self.bend = way.curve(self.s, 2)[:, way.moving]
+        self.most = way.acceleration
+        self.speed = 1.0 / np.maximum(way.cost(self.s)[0], _TINY)
+        fine = np.linspace(0.0, 1.0, FINE * GRID + 1)
+        self.fine, self.table = fine, way.curve(fine)
+        self.pin = self.table[:, N_JOINTS:]
+        self._pin_slope = np.gradient(self.pin, fine, axis=0)
+        self.sideways = way.sideways
+
+    def pin_at(self, progress: np.ndarray) -> np.ndarray:
+        """The pin (n, 2) at progress (n,)."""
+        return np.column_stack([np.interp(progress, self.fine, column) for column in self.pin.T])
+
+    def pin_slope_at(self, progress: np.ndarray) -> np.ndarray:
+        """Its change with the progress (n, 2) there."""
+        return np.column_stack([np.interp(progress, self.fine, column) for column in self._pin_slope.T])
+
+    def fastest(self, brake: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Times and speeds of the fastest law on the grid; ``brake`` (n,) lowers the speed there."""
+        step = 1.0 / GRID
+        most = self.most
+        slope = np.where(np.abs(self.slope) < 1e-6, 1e-6, self.slope)
+        # |slope a + bend b| <= most, with b the squared speed: two lines a over b for every joint.
+        size = most / np.abs(slope)
+        tilt = -self.bend / slope
+        ceiling = (self.speed * brake) ** 2
+        spread = size[:, :, None] + size[:, None, :]
+        apart = tilt[:, :, None] - tilt[:, None, :]
+        crossing = np.where(apart > _TINY, spread / np.maximum(apart, _TINY), np.inf)
+        ceiling = np.minimum(ceiling, np.min(crossing, axis=(1, 2)))
+        low, top = (-size).tolist(), ceiling.tolist()
+        lean, high = tilt.tolist(), size.tolist()
+        two = 2.0 * step
+        reach = [0.0] * (GRID + 1)
+        for k in range(GRID - 1, -1, -1):
+            best, beyond = top[k], reach[k + 1] / two
+            for a0, m in zip(low[k], lean[k], strict=True):
+                rise = m + 1.0 / two
+                if rise > 0.0:
+                    best = min(best, (beyond - a0) / rise)
+            reach[k] = max(best, 0.0)
+        b, squared = 0.0, [0.0] * (GRID + 1)
+        for k in range(GRID):
+            push = min(a1 + m * b for a1, m in zip(high[k], lean[k], strict=True))
+            b = min(reach[k + 1], max(b + two * push, 0.0))
+            squared[k + 1] = b
+        v = np.sqrt(np.array(squared))
+        pace = np.maximum(v[1:] + v[:-1], 1e-4)
+        return np.concatenate([[0.0], np.cumsum(2.0 * step / pace)]), v
+
+
+def _sampled(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Progress every `STEP_S` of a law given on the grid."""
+    end = max(int(np.ceil(time[-1] / STEP_S)), 2)
+    at = np.linspace(0.0, time[-1], end + 1)
+    i = np.minimum(np.searchsorted(time, at, side="right") - 1, GRID - 1)
+    span = np.maximum(time[i + 1] - time[i], _TINY)
+    part = at - time[i]
+    done = i / GRID + speed[i] * part + 0.5 * (speed[i + 1] - speed[i]) / span * part**2
+    return np.clip(done, 0.0, 1.0)
+
+
+@lru_cache(maxsize=256)
+def _weights(length: int) -> np.ndarray:
+    """What a way of so many places, one every `TAP_S`, from rest to rest, leaves of swing [rad]: real and imaginary
+    parts for every pendulum, (2 n, length).
+    """
+    late = _GAIN * _LATE[:, : length - 1][:, ::-1]
+    none = np.zeros((len(late), 1))
+    weights = np.hstack([none, late]) - np.hstack([late, none])
+    return np.vstack([weights.real, weights.imag])
+
+
+def _left(pin: np.ndarray) -> np.ndarray:
+    """Swing [rad] that ways (t, m), every `TAP_S` from rest to rest, leave: of every pendulum, real and imaginary, (2
+    n, m).
+    """
+    found: np.ndarray = _weights(len(pin)) @ pin
+    return found
+
+
+def _greatest(left: np.ndarray) -> float:
+    size = np.sum(left**2, axis=1)
+    return float(np.sqrt(np.max(size[: len(size) // 2] + size[len(size) // 2 :])))
+
+
+def swift_law(arm: Arm, way: Way, shaped: bool = True) -> Swift:
+    """The fastest law of a way that keeps the limits and, if ``shaped``, leaves at most `SWING_RAD` of swing."""
+    limits = Limits(arm, way)
+    brake = np.ones(GRID + 1)
+    taps = None if shaped and limits.sideways else 0
+    for turn in range(ROUNDS + 1):
+        raw = np.convolve(np.pad(_sampled(*limits.fastest(brake)), len(_BOX) - 1, mode="edge"), _BOX, mode="valid")
+        taps, law = _shaped(limits, raw, taps)
+        load = _load(arm, limits, law.done)
+        over = float(np.max(load))
+        if over <= 1.0 or turn == ROUNDS:
+            break
+        brake = _braked(brake, load, law.done)
+    return law if over <= 1.0 else _slowed(limits, law, over)
+
+
+def _shaped(limits: Limits, raw: np.ndarray, taps: int | None) -> tuple[int, Swift]:
+    """The law through a window of so many taps, None: through the shortest that leaves little swing."""
+    if taps is not None:
+        return taps, _through(limits, raw, taps)
+    low, high = 0, len(TAPS) - 1
+    law = _through(limits, raw, TAPS[high])
+    while low < high:
+        middle = (low + high) // 2
+        tried = _through(limits, raw, TAPS[middle])
+        if tried.swing_rad <= SWING_RAD:
+            high, law = middle, tried
+        else:
+            low = middle + 1
+    return TAPS[high], law
+
+
+def _through(limits: Limits, raw: np.ndarray, taps: int) -> Swift:
+    """A law averaged over the window of so many taps that leaves least swing."""
+    whole = len(raw) + taps * _EVERY
+    whole += (whole + 1) % _EVERY
+    impulses = np.full(taps + 1, 1.0 / (taps + 1))
+    if not limits.sideways:
+        return Swift(_averaged(raw, impulses, whole), 0.0)
+    # The raw law every `TAP_S` up to the common end, once later with every impulse.
+    at = np.arange((whole - 1) % _EVERY - taps * _EVERY, whole, _EVERY)
+    places = np.where(at < 0, 0.0, raw[np.clip(at, 0, len(raw) - 1)])
+    delayed = np.lib.stride_tricks.sliding_window_view(places, taps + 1)[:, ::-1]
+    left = _left(limits.pin_at(delayed @ impulses))
+    for _ in range(SEARCHES if taps else 0):
+        if _greatest(left) <= _WELL * SWING_RAD:
+            break
+        wish = _better(limits, delayed, left, impulses)
+        for share in (1.0, 0.5, 0.25):  # a way is bent: half a step may be better than a whole one
+            tried = impulses + share * (wish - impulses)
+            then = _left(limits.pin_at(delayed @ tried))
+            if _greatest(then) < _greatest(left):
+                impulses, left = tried, then
+                break
+        else:
+            break
+    return Swift(_averaged(raw, impulses, whole), _greatest(left))
+
+
+def _averaged(raw: np.ndarray, impulses: np.ndarray, length: int) -> np.ndarray:
+    """The raw law once later with every impulse, ``length`` samples."""
+    kernel = np.zeros((len(impulses) - 1) * _EVERY + 1)
+    kernel[::_EVERY] = impulses
+    late = length - len(raw)
+    begun = np.concatenate([np.zeros(len(kernel) - 1), raw, np.full(late, raw[-1])])
+    return np.convolve(begun, kernel, mode="valid")
+
+
+def _better(limits: Limits, delayed: np.ndarray, left: np.ndarray, impulses: np.ndarray) -> np.ndarray:
+    """Impulses whose swing, linearised about the present ones, is least."""
+    slope = limits.pin_slope_at(delayed @ impulses) / SWING_RAD
+    weights = _weights(len(delayed))
+    rows = np.vstack([weights * column for column in slope.T]) @ delayed
+    wish = rows @ impulses - left.T.ravel() / SWING_RAD
+    size = _SUM * max(1.0, float(np.max(np.abs(rows))))
+    system = np.vstack([rows, np.full((1, len(impulses)), size)])
+    try:
+        found, _ = nnls(system, np.append(wish, size))
+    except RuntimeError:
+        return impulses
+    total = float(found.sum())
+    return found / total if total > 0.0 else impulses
+
+
+def _load(arm: Arm, limits: Limits, progress: np.ndarray) -> np.ndarray:
+    """Shares of the limits at the samples, as a factor of time (1 = just)."""
+    q = np.column_stack([np.interp(progress, limits.fine, column) for column in limits.table[:, :N_JOINTS].T])
+    v = np.gradient(q, STEP_S, axis=0)
+    a = np.gradient(v, STEP_S, axis=0)
+    fast = np.maximum(np.max(np.abs(v) / arm.speed, axis=1), arm.pump_load(q, v))
+    return np.maximum(fast, np.sqrt(np.max(np.abs(a) / arm.acceleration, axis=1)))
+
+
+def _braked(brake: np.ndarray, load: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Lower speeds on the grid about where a limit was broken."""
+    worst = np.ones(GRID + 1)
+    at = np.clip(np.rint(where * GRID).astype(int), 0, GRID)
+    np.maximum.at(worst, at, load)
+    wide = np.max(np.stack([np.roll(worst, k) for k in range(-3, 4)]), axis=0)
+    return brake / np.clip(wide, 1.0, 1.6)
+
+
+def _slowed(limits: Limits, law: Swift, factor: float) -> Swift:
+    """The same, evenly slowed."""
+    n = max(int(np.ceil((len(law.done) - 1) * factor)), 2)
+    n += n % _EVERY
+    done = law.progress(np.linspace(0.0, law.duration_s, n + 1))
+    return Swift(done, _greatest(_left(limits.pin_at(done[::_EVERY]))) if limits.sideways else 0.0)

@@ -1,0 +1,139 @@
+"""Our way: along a path by the follower, with the speed that bends, ground and the place to stop at allow."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+from autonomy.localization.estimate import Location, Status
+from autonomy.navigation.curves import Path
+from autonomy.navigation.follower import Following, Steer, follow
+from autonomy.navigation.order import Order
+from autonomy.navigation.speed import (
+    Rocking,
+    bend_speed_m_s,
+    stopping_speed_m_s,
+    terrain_share,
+    tip_margin_m,
+)
+from can_dbc.setpoint import Steering
+from machine.profile import Carrier
+
+SIGMA_M: Final = 0.25
+"""A position that is worse than this is none to drive by."""
+ASTRAY_M: Final = 1.5
+"""A machine that was on the path and is so far beside it is somewhere else."""
+ON_M: Final = 0.5
+ON_RAD: Final = 0.3
+"""Nearer than this to the path and its direction it is on it."""
+RECKONING_SHARE: Final = 0.5
+STOP_M: Final = 0.015
+"""From the order to stand to standing, at the creep (assumed)."""
+SPEED_GAIN_1_S: Final = 0.5
+SPEED_SPARE_M_S: Final = 0.15
+SPEED_NEAR_M_S: Final = 0.2
+"""Only so near to the wanted speed the rest of the error is learned: not while it starts."""
+HALTED_M_S: Final = 0.03
+HALT_NS: Final = 2_000_000_000
+"""A machine that does not come to rest in this time is braked."""
+
+
+class Along:
+    """One drive along ``path``; ``stop_m`` is where along it to stop, None for its end.
+
+    ``steer`` is what the follower wanted last.
+    """
+
+    def __init__(
+        self, carrier: Carrier, path: Path, stop_m: float | None = None, speed_m_s: float | None = None
+    ) -> None:
+        self.path = path
+        self.steer: Steer | None = None
+        self._carrier = carrier
+        self._speed = carrier.cruise_speed_m_s if speed_m_s is None else speed_m_s
+        self._following = Following()
+        self._rocking = Rocking()
+        self._on = False
+        self._correction = 0.0
+        self._stamp_ns = self._halting_ns = 0
+        self.stop_at(path.length_m if stop_m is None else stop_m)
+
+    def stop_at(self, s_m: float) -> None:
+        """Stop there along the path instead; a place already passed is stopped at as soon as it can be."""
+        self._stop_m = min(max(s_m, 0.0), self.path.length_m)
+
+    @property
+    def left_m(self) -> float:
+        """The way left to the place to stop at."""
+        return self._stop_m - (self.steer.s_m if self.steer else 0.0)
+
+    def step(self, location: Location) -> Order:
+        """The order by one location."""
+        if trouble := self._trouble(location):
+            self._following = replace(self._following, articulation_rad=None, stamp_ns=0)
+            self._correction = 0.0
+            return Order(trouble=trouble)
+        wanted = self._wanted(location)
+        self._following, steer = follow(self._carrier, self.path, self._following, location, wanted)
+        self.steer = steer
+        self._on = self._on or (abs(steer.off_m) < ON_M and abs(steer.off_rad) < ON_RAD)
+        if self._on and abs(steer.off_m) > ASTRAY_M:
+            return Order(trouble=f"{abs(steer.off_m):.1f} m beside the path; plan the drive anew")
+        if self.left_m <= STOP_M:
+            return self._halt(location)
+        self._halting_ns = 0
+        speed = self._corrected(min(wanted, stopping_speed_m_s(self.left_m - STOP_M)), location)
+        return Order(
+            Steering.ARTICULATION, 0.0, 0.0, steer.articulation_rad, steer.articulation_rate_rad_s, speed, False
+        )
+
+    def rest(self, location: Location) -> None:
+        """The machine stands for a while: what was learned about its speed does not hold for the start."""
+        self._following = replace(self._following, articulation_rad=None, stamp_ns=0)
+        self._correction = 0.0
+        self._stamp_ns = location.stamp_ns
+
+    def _halt(self, location: Location) -> Order:
+        """Come to rest; on a slope the drive must push back to stand, and the brake comes on once it does."""
+        self._halting_ns = self._halting_ns or location.stamp_ns
+        rests = abs(location.speed_m_s) < HALTED_M_S or location.stamp_ns - self._halting_ns > HALT_NS
+        speed = 0.0 if rests else self._corrected(0.0, location)
+        return Order(Steering.ARTICULATION, 0.0, 0.0, location.articulation_rad, 0.0, speed, rests)
+
+    def _trouble(self, location: Location) -> str:
+        if not location.usable:
+            return f"not located: {location.reason}"
+        if location.sigma_m > SIGMA_M:
+            return f"the position is only good to {location.sigma_m:.2f} m"
+        margin = self._margin(location)
+        if terrain_share(margin, self._rocking.step(location)) == 0.0:
+            return f"the machine stands too near to tipping over: {margin:.2f} m left"
+        return ""
+
+    def _margin(self, location: Location) -> float:
+        bend = location.articulation_rad
+        lf, lr = self._carrier.front_axle_m, self._carrier.rear_axle_m
+        return tip_margin_m(
+            self._carrier, location, location.speed_m_s**2 * math.sin(bend) / (lf * math.cos(bend) + lr)
+        )
+
+    def _wanted(self, location: Location) -> float:
+        """The speed for bends and ground."""
+        share = terrain_share(self._margin(location), self._rocking.rate_rad_s)
+        if location.status is Status.DEAD_RECKONING:
+            share *= RECKONING_SHARE
+        s = self._following.s_m
+        bend = math.inf if s is None else bend_speed_m_s(self._carrier, self.path, s)
+        wanted = min(share * self._speed, bend)
+        return wanted if self.steer is None else min(wanted, stopping_speed_m_s(self.left_m - STOP_M))
+
+    def _corrected(self, wanted_m_s: float, location: Location) -> float:
+        """The speed to ask for: wheels that slip and a drive that droops are made up for."""
+        seconds = min(0.2, (location.stamp_ns - self._stamp_ns) * 1e-9) if self._stamp_ns else 0.0
+        self._stamp_ns = location.stamp_ns
+        error = wanted_m_s - location.speed_m_s
+        if abs(error) < SPEED_NEAR_M_S:
+            change = SPEED_GAIN_1_S * seconds * error
+            self._correction = min(max(self._correction + change, -SPEED_SPARE_M_S), SPEED_SPARE_M_S)
+        return min(wanted_m_s + self._correction, self._carrier.speed_limit_m_s)

@@ -1,0 +1,246 @@
+"""A polyline as a path the machine can drive: straight legs, corners rounded by clothoid, arc, clothoid.
+
+``drivable(points, limits)`` first drops points that the line does not need, then rounds every corner with at most the
+curvature and the change of curvature in ``Limits``; a corner whose legs are too short for that gets the sharpest bend
+the machine can drive, and is refused when that is not enough.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from machine.carrier import turning_radius_m
+from machine.profile import Carrier
+
+SPACING_M: Final = 0.05
+TOLERANCE_M: Final = 0.05
+"""Points this near to the line between their neighbours are dropped."""
+COMFORT: Final = 0.80
+"""Share of the sharpest bend that a corner uses, so that something is left for correction."""
+RATE_SHARE: Final = 0.70
+"""Share of the articulation's rate that a corner uses at cruising speed."""
+HARDEST: Final = 0.95
+"""Of both, where the legs are short."""
+Point2 = tuple[float, float]
+
+
+class PathRefused(ValueError):
+    """A polyline that cannot be driven; the message says where and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Curvature [1/m] and its change along the path [1/m^2]."""
+
+    curve_1_m: float
+    change_1_m2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Samples ``SPACING_M`` apart, or a little less: way ``s_m`` (n,), ``xy_m`` (n, 2), ``heading_rad`` (n,) that goes
+    on without jumps, ``curve_1_m`` (n,).  ``corners_m``: where along it the middle of each corner is.
+    """
+
+    s_m: np.ndarray
+    xy_m: np.ndarray
+    heading_rad: np.ndarray
+    curve_1_m: np.ndarray
+    corners_m: tuple[float, ...]
+
+    @property
+    def length_m(self) -> float:
+        """The whole way."""
+        return float(self.s_m[-1])
+
+    def at(self, s_m: float) -> tuple[float, float, float, float]:
+        """x, y [m], heading [rad] and curvature [1/m] at ``s_m``; past either end the path goes on straight."""
+        s = min(max(s_m, 0.0), self.length_m)
+        x, y = (float(np.interp(s, self.s_m, self.xy_m[:, k])) for k in (0, 1))
+        heading = float(np.interp(s, self.s_m, self.heading_rad))
+        beyond = s_m - s
+        curve = 0.0 if beyond else float(np.interp(s, self.s_m, self.curve_1_m))
+        return x + beyond * math.cos(heading), y + beyond * math.sin(heading), heading, curve
+
+    def nearest(self, x_m: float, y_m: float, low_m: float = -math.inf, high_m: float = math.inf) -> float:
+        """The way of the point nearest to (x, y) among those between ``low_m`` and ``high_m``; before the start and
+        past the end of the path it counts on along its first or last direction.
+        """
+        first, last = np.searchsorted(self.s_m, (low_m, high_m))
+        first, last = int(min(first, len(self.s_m) - 1)), int(max(first + 1, last))
+        off = self.xy_m[first:last] - (x_m, y_m)
+        i = first + int(np.argmin(np.einsum("ij,ij->i", off, off)))
+        heading = float(self.heading_rad[i])
+        px, py = self.xy_m[i]
+        along = (x_m - px) * math.cos(heading) + (y_m - py) * math.sin(heading)
+        back = -math.inf if i == 0 else -SPACING_M
+        forth = math.inf if i == len(self.s_m) - 1 else SPACING_M
+        return float(self.s_m[i]) + min(max(along, back), forth)
+
+
+def limits_of(carrier: Carrier, share: float = COMFORT, rate_share: float = RATE_SHARE) -> Limits:
+    """What the machine can drive at its cruising speed."""
+    sharpest = 1.0 / turning_radius_m(carrier, carrier.articulation_limit_rad)
+    swing_1_m = rate_share * carrier.articulation_rate_limit_rad_s / carrier.cruise_speed_m_s
+    return Limits(share * sharpest, swing_1_m / (carrier.front_axle_m + carrier.rear_axle_m))
+
+
+def drivable(points: Sequence[Point2], carrier: Carrier) -> Path:
+    """The path along ``points`` [m] in the plane.
+
+    Raises:
+        PathRefused: fewer than two different points, a point that is no number, or corners too sharp for their legs.
+    """
+    xy = np.asarray(points, float).reshape(-1, 2)
+    if not np.all(np.isfinite(xy)):
+        i = int(np.argmin(np.all(np.isfinite(xy), axis=1)))
+        raise PathRefused(f"point {i + 1} of the path is no place in the plane: {tuple(xy[i])}")
+    xy = _needed(xy) if len(xy) else xy
+    if len(xy) < 2:
+        raise PathRefused("a path needs two different points at least")
+    hard = limits_of(carrier, HARDEST, HARDEST)
+    bends = _bends(xy, limits_of(carrier), hard)
+    return _sampled(xy, bends)
+
+
+@dataclass(frozen=True, slots=True)
+class _Bend:
+    """One corner: by how much it turns [rad], its limits, and its reach along each leg [m]."""
+
+    turn_rad: float
+    limits: Limits
+    reach_m: float
+
+
+def _needed(xy: np.ndarray) -> np.ndarray:
+    """The points without repetitions and without those that lie on the line (Douglas and Peucker)."""
+    apart = np.hypot(*np.diff(xy, axis=0).T) if len(xy) > 1 else np.empty(0)
+    xy = xy[np.concatenate([[True], apart > 1e-3])]
+    keep = np.zeros(len(xy), bool)
+    keep[[0, -1]] = True
+    todo = [(0, len(xy) - 1)]
+    while todo:
+        a, b = todo.pop()
+        if b - a < 2:
+            continue
+        between, leg = xy[a + 1 : b] - xy[a], xy[b] - xy[a]
+        length = max(float(leg @ leg), 1e-12)
+        share = np.clip(between @ leg / length, 0.0, 1.0)
+        off = np.hypot(*(between - share[:, None] * leg).T)
+        worst = int(np.argmax(off))
+        if off[worst] > TOLERANCE_M:
+            middle = a + 1 + worst
+            keep[middle] = True
+            todo += [(a, middle), (middle, b)]
+    return xy[keep]
+
+
+def _bends(xy: np.ndarray, soft: Limits, hard: Limits) -> list[_Bend]:
+    legs = np.diff(xy, axis=0)
+    lengths = np.hypot(*legs.T)
+    headings = np.arctan2(legs[:, 1], legs[:, 0])
+    turns = [math.remainder(b - a, 2.0 * math.pi) for a, b in pairwise(headings)]
+    bends = []
+    for i, turn in enumerate(turns):
+        if abs(turn) > math.radians(170.0):
+            raise PathRefused(f"the path turns back on itself at {_place(xy[i + 1])}; put a point beside it")
+        bends.append(_Bend(turn, soft, _reach(turn, soft)))
+    for i, length in enumerate(lengths):
+        ends = [k for k in (i - 1, i) if 0 <= k < len(bends)]
+        if sum(bends[k].reach_m for k in ends) > length:
+            for k in ends:
+                bends[k] = _Bend(bends[k].turn_rad, hard, _reach(bends[k].turn_rad, hard))
+    for i, length in enumerate(lengths):
+        needed = sum(bends[k].reach_m for k in (i - 1, i) if 0 <= k < len(bends))
+        if needed > length:
+            raise PathRefused(
+                f"the leg from {_place(xy[i])} to {_place(xy[i + 1])} is {length:.1f} m long, but the bends at its "
+                f"ends need {needed:.1f} m; move the points apart or make the corners flatter"
+            )
+    return bends
+
+
+def _place(point: np.ndarray) -> str:
+    return f"({point[0]:.1f}, {point[1]:.1f}) m"
+
+
+def _profile(turn_rad: float, limits: Limits) -> tuple[float, float]:
+    """Length of each clothoid and of the arc between them [m]."""
+    size = abs(turn_rad)
+    ramp = limits.curve_1_m / limits.change_1_m2
+    if size < limits.curve_1_m * ramp:
+        return math.sqrt(size / limits.change_1_m2), 0.0
+    return ramp, size / limits.curve_1_m - ramp
+
+
+def _corner(turn_rad: float, limits: Limits) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Way, points, heading and curvature of a corner that starts at the origin along x."""
+    ramp, arc = _profile(turn_rad, limits)
+    length = 2.0 * ramp + arc
+    n = max(2, math.ceil(length / SPACING_M)) + 1
+    s = np.linspace(0.0, length, n)
+    peak = math.copysign(limits.change_1_m2 * ramp, turn_rad)
+    curve = peak * np.clip(np.minimum(s, length - s) / ramp, 0.0, 1.0)
+    fine = np.linspace(0.0, length, 4 * (n - 1) + 1)
+    bent = peak * np.clip(np.minimum(fine, length - fine) / ramp, 0.0, 1.0)
+    step = fine[1]
+    heading = np.concatenate([[0.0], np.cumsum(0.5 * step * (bent[1:] + bent[:-1]))])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    x = np.concatenate([[0.0], np.cumsum(step * np.cos(middle))])
+    y = np.concatenate([[0.0], np.cumsum(step * np.sin(middle))])
+    return s, np.column_stack([x, y])[::4], heading[::4], curve
+
+
+def _reach(turn_rad: float, limits: Limits) -> float:
+    """How far before the corner point a bend begins [m]; it ends as far behind it."""
+    if abs(turn_rad) < 1e-6:
+        return 0.0
+    return float(_corner(turn_rad, limits)[1][-1, 0]) / (1.0 + math.cos(turn_rad))
+
+
+def _sampled(xy: np.ndarray, bends: Sequence[_Bend]) -> Path:
+    """All legs and corners, one behind the other."""
+    s: list[np.ndarray] = []
+    points: list[np.ndarray] = []
+    headings: list[np.ndarray] = []
+    curves: list[np.ndarray] = []
+    corners: list[float] = []
+    way = 0.0
+    heading = math.atan2(*(xy[1] - xy[0])[::-1])
+    begin = 0.0
+    for i in range(len(xy) - 1):
+        ahead = np.array([math.cos(heading), math.sin(heading)])
+        end = bends[i].reach_m if i < len(bends) else 0.0
+        length = math.dist(xy[i], xy[i + 1]) - begin - end
+        n = max(2, math.ceil(length / SPACING_M) + 1)
+        along = np.linspace(0.0, length, n)
+        s.append(way + along)
+        points.append(xy[i] + np.outer(begin + along, ahead))
+        headings.append(np.full(n, heading))
+        curves.append(np.zeros(n))
+        way += length
+        if i < len(bends) and end > 0.0:
+            ds, local, turned, curve = _corner(bends[i].turn_rad, bends[i].limits)
+            side = np.array([-ahead[1], ahead[0]])
+            start = xy[i + 1] - end * ahead
+            s.append(way + ds)
+            points.append(start + np.outer(local[:, 0], ahead) + np.outer(local[:, 1], side))
+            headings.append(heading + turned)
+            curves.append(curve)
+            corners.append(way + 0.5 * float(ds[-1]))
+            way += float(ds[-1])
+        if i < len(bends):
+            heading += bends[i].turn_rad
+        begin = end
+    flat = np.concatenate(s)
+    keep = np.concatenate([[True], np.diff(flat) > 1e-9])
+    return Path(
+        flat[keep], np.concatenate(points)[keep], np.concatenate(headings)[keep], np.concatenate(curves)[keep],
+        tuple(corners),
+    )  # fmt: skip

@@ -1,0 +1,121 @@
+"""Path following by articulation: feed-forward from the path's curvature, feedback on lateral and course error.
+
+The front axle's middle follows the path.  Without slip its path bends by kappa = (sin g + lr g_s) / (lf cos g + lr),
+with g_s the articulation's change per metre, so a wanted curvature is driven by
+
+    g_s = (kappa (lf cos g + lr) - sin g) / lr,
+
+which is stable forwards and needs no look-ahead.  With the lateral error e (+ left of the path) and the course error c,
+
+    c_wanted = -atan(LAMBDA e),   kappa = path's + d c_wanted / ds - GAMMA (c - c_wanted) - what slip adds,
+
+so that far from the path the machine comes back at an angle that is bounded, and near it the error decays as
+exp(-LAMBDA s) for every way s.  Course and slip are the filter's: on a side slope the front points uphill and goes
+straight.  What they leave is integrated, slowly and only near the path, and added to e.  All errors are taken where the
+machine will be when the valve acts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from autonomy.localization.estimate import Location
+from autonomy.localization.plane import wrapped
+from autonomy.navigation.curves import Path
+from machine.profile import Carrier
+
+LAMBDA_1_M: Final = 0.55
+GAMMA_1_M: Final = 1.1
+INTEGRAL_M: Final = 6.0
+"""A lateral error that stays for so long a way counts twice."""
+INTEGRAL_LIMIT_M: Final = 0.10
+NEAR_M: Final = 0.25
+NEAR_RAD: Final = 0.15
+"""Only nearer than this to the path and its direction anything is integrated."""
+REACTION_S: Final = 0.10
+"""Report to setpoint to valve and oil, beyond what the controller's own loop makes up for (assumed)."""
+BACK_M: Final = 1.0
+FORTH_M: Final = 2.0
+"""The nearest point of the path is looked for so far around the last one: a path may cross itself."""
+RATE_SHARE: Final = 0.95
+ANGLE_SPARE_RAD: Final = 0.005
+APART_RAD: Final = 0.12
+"""The wanted angle runs no further ahead of the measured one."""
+LONGEST_S: Final = 0.2
+"""A wanted angle moves on no longer than this by itself."""
+STEEPEST_RAD: Final = 1.1
+"""Greatest angle between course and path on the way back to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Steer:
+    """What the follower wants now: articulation [rad] and its rate [rad/s], + bends left; and how it stands to the
+    path: nearest point ``s_m``, lateral error ``off_m`` (+ left of it), course error ``off_rad``.
+    """
+
+    articulation_rad: float
+    articulation_rate_rad_s: float
+    s_m: float
+    off_m: float
+    off_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Following:
+    """The follower's state: where it is along the path, and the last wanted articulation; None at the beginning."""
+
+    s_m: float | None = None
+    articulation_rad: float | None = None
+    articulation_rate_rad_s: float = 0.0
+    stamp_ns: int = 0
+    integral_m: float = 0.0
+
+
+def follow(
+    carrier: Carrier, path: Path, state: Following, location: Location, speed_m_s: float
+) -> tuple[Following, Steer]:
+    """One step, at the location's stamp; ``speed_m_s`` is the speed that is about to be driven."""
+    bend, speed = location.articulation_rad, location.speed_m_s
+    turn_1_m = math.sin(bend) / (carrier.front_axle_m * math.cos(bend) + carrier.rear_axle_m) + location.slip_curve_1_m
+    way = speed * REACTION_S
+    course = location.course_rad + 0.5 * way * turn_1_m
+    x, y = location.x_m + way * math.cos(course), location.y_m + way * math.sin(course)
+    course = location.course_rad + way * turn_1_m
+    around = () if state.s_m is None else (state.s_m - BACK_M, state.s_m + FORTH_M)
+    s = path.nearest(x, y, *around)
+    px, py, heading, curve = path.at(s)
+    off = -math.sin(heading) * (x - px) + math.cos(heading) * (y - py)
+    off_course = wrapped(course - heading)
+    integral = state.integral_m
+    if abs(off) < NEAR_M and abs(off_course) < NEAR_RAD and state.s_m is not None:
+        integral += max(0.0, min(FORTH_M, s - state.s_m)) * off / INTEGRAL_M
+        integral = max(-INTEGRAL_LIMIT_M, min(INTEGRAL_LIMIT_M, integral))
+    pull = LAMBDA_1_M * (off + integral)
+    wanted = max(-STEEPEST_RAD, min(STEEPEST_RAD, -math.atan(pull)))
+    of_way = -LAMBDA_1_M / (1.0 + pull**2) * math.sin(off_course)
+    own = curve * math.cos(off_course) / max(0.3, 1.0 - curve * off)
+    kappa = own + of_way - GAMMA_1_M * wrapped(off_course - wanted) - location.slip_curve_1_m
+    angle, rate = _articulation(carrier, state, location, kappa, speed_m_s)
+    return Following(s, angle, rate, location.stamp_ns, integral), Steer(angle, rate, s, off, off_course)
+
+
+def _articulation(
+    carrier: Carrier, state: Following, location: Location, kappa: float, speed_m_s: float
+) -> tuple[float, float]:
+    """The wanted articulation at the location's stamp, and its rate from there, within what the machine can do."""
+    angle = measured = location.articulation_rad
+    if state.articulation_rad is not None:
+        seconds = min(LONGEST_S, (location.stamp_ns - state.stamp_ns) * 1e-9)
+        angle = state.articulation_rad + seconds * state.articulation_rate_rad_s
+    limit = carrier.articulation_limit_rad - ANGLE_SPARE_RAD
+    low, high = max(-limit, measured - APART_RAD), min(limit, measured + APART_RAD)
+    angle = max(low, min(high, angle))
+    lf, lr = carrier.front_axle_m, carrier.rear_axle_m
+    fastest = RATE_SHARE * carrier.articulation_rate_limit_rad_s
+    rate = speed_m_s * (kappa * (lf * math.cos(angle) + lr) - math.sin(angle)) / lr
+    rate = max(-fastest, min(fastest, rate))
+    if abs(angle) >= limit and angle * rate > 0.0:
+        rate = 0.0
+    return angle, rate

@@ -1,0 +1,61 @@
+"""From where the machine stands onto the way along its waypoints, whichever way it looks.
+
+A first corner may be too sharp for its legs, or the machine may look elsewhere.  Points straight ahead and points about
+the first waypoint are tried before it, and the shortest path that can be driven is taken; what the machine looks past
+the beginning of its path costs as if it had to be driven.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from autonomy.localization.plane import wrapped
+from autonomy.navigation.curves import Path, PathRefused, Point2, drivable
+from machine.profile import Carrier
+
+AHEAD_M: Final = (7.0, 10.0, 14.0)
+ABOUT_M: Final = (10.0, 15.0)
+ABOUT: Final = 8
+"""Points on each circle about the first waypoint."""
+LEGS: Final = 3
+"""Waypoints that a trial path has: what comes later does not depend on how it begins."""
+TURN_M_RAD: Final = 8.0
+"""A metre of way for each of so many metres of turning circle: what a radian the machine looks past its path costs."""
+
+
+def joined(here: Point2, yaw_rad: float, points: Sequence[Point2], carrier: Carrier) -> Path:
+    """A path that begins ``here`` [m], where the front axle's middle is, and goes along ``points``.
+
+    Raises:
+        PathRefused: with the reason for the straight way, when none can be driven.
+    """
+    first = points[:LEGS]
+    best: tuple[float, list[Point2]] | None = None
+    for before in _ways(here, yaw_rad, first):
+        try:
+            path = drivable([here, *before, *first], carrier)
+        except PathRefused:
+            continue
+        past = abs(wrapped(float(path.heading_rad[0]) - yaw_rad))
+        cost = path.length_m + TURN_M_RAD * past
+        if best is None or cost < best[0] - 1e-6:
+            best = cost, before
+    return drivable([here, *(best[1] if best else []), *points], carrier)
+
+
+def _ways(here: Point2, yaw_rad: float, points: Sequence[Point2]) -> Iterator[list[Point2]]:
+    """Points to go through before the first one."""
+    yield []
+    if not points:
+        return
+    goal = points[0]
+    ahead = [_off(here, yaw_rad, way) for way in AHEAD_M]
+    about = [_off(goal, 2.0 * math.pi * k / ABOUT, way) for way in ABOUT_M for k in range(ABOUT)]
+    yield from ([point] for point in (*ahead, *about))
+    yield from ([a, b] for a in ahead for b in about)
+
+
+def _off(point: Point2, yaw_rad: float, way_m: float) -> Point2:
+    return point[0] + way_m * math.cos(yaw_rad), point[1] + way_m * math.sin(yaw_rad)

@@ -1,0 +1,140 @@
+"""Drives the machine by one of the two ways, with a lease on every setpoint; pause, resume, stop, reasons.
+
+``Navigator.step`` takes a report of the vehicle and its location and gives the setpoint to send, or None when nothing
+is to be sent.  What stops the machine keeps it stopped until ``resume`` or another ``drive``; a setpoint that asks
+for no speed goes out until the machine stands, and then the lease runs out in peace.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import Final
+
+from autonomy.localization.estimate import Location
+from autonomy.navigation.along import Along
+from autonomy.navigation.order import Order
+from autonomy.navigation.waypoints import PaperB
+from can_dbc.setpoint import DriveSetpoint, Driving, VehicleReport
+from machine.profile import Carrier
+
+LEASE_NS: Final = 250_000_000
+"""Five reports."""
+STANDS_M_S: Final = 0.02
+REST_NS: Final = 500_000_000
+"""The brake is on by then: on a slope the drive pushes back until it is."""
+OBEYS_NS: Final = 2_000_000_000
+"""A controller that does not drive for so long does not want to."""
+MOVES_NS: Final = 5_000_000_000
+"""Wheels that do not turn for so long are stuck."""
+STUCK_M_S: Final = 0.02
+Heights = tuple[float, float, float, float]
+
+
+class Phase(IntEnum):
+    """What the navigator does."""
+
+    IDLE = 0
+    DRIVING = 1
+    PAUSED = 2
+    STOPPED = 3
+    """Something was wrong; ``reason`` says what."""
+    ARRIVED = 4
+
+
+class Navigator:
+    """One machine.  ``phase`` and ``reason`` say how things stand."""
+
+    def __init__(
+        self,
+        carrier: Carrier,
+        profile_hash: int,
+        heights_m: Heights | None = None,
+        level: bool = False,
+        lease_ns: int = LEASE_NS,
+    ) -> None:
+        self.phase = Phase.IDLE
+        self.reason = ""
+        self.stands = True
+        """Whether it was told to stand, and its wheels have stood since for ``REST_NS``."""
+        self.heights_m = heights_m or (carrier.arm_transport_m,) * 4
+        self.level = level
+        self.holds = False
+        """Setpoints go out while the machine stands, too: its heights are being set."""
+        self._profile_hash, self._limit_rad = profile_hash, carrier.articulation_limit_rad
+        self._lease_ns = lease_ns
+        self.way: Along | PaperB | None = None
+        """What is driven, or was."""
+        self._sequence = 0
+        self._asked_ns = self._obeyed_ns = self._moved_ns = self._rolled_ns = 0
+
+    def drive(self, way: Along | PaperB) -> None:
+        """Begin this drive; another one under way is over."""
+        self.way = way
+        self._begin()
+
+    def pause(self) -> None:
+        """Stand until ``resume``."""
+        if self.phase is Phase.DRIVING:
+            self.phase, self.reason = Phase.PAUSED, "paused"
+
+    def resume(self) -> None:
+        """Drive on from a pause or from what stopped the machine."""
+        if self.phase in (Phase.PAUSED, Phase.STOPPED) and self.way is not None:
+            self._begin()
+
+    def stop(self, reason: str) -> None:
+        """Stand, with a reason, until ``resume`` or another drive."""
+        if self.phase is Phase.DRIVING or self.phase is Phase.PAUSED:
+            self.phase, self.reason = Phase.STOPPED, reason
+
+    def step(self, now_ns: int, report: VehicleReport, location: Location) -> DriveSetpoint | None:
+        """The setpoint to send now."""
+        still = abs(report.speed_m_s) < STANDS_M_S and report.driving != Driving.BRAKING
+        self.stands = still and now_ns - self._rolled_ns >= REST_NS
+        order = Order()
+        if self.phase is Phase.DRIVING:
+            order = self.way.step(report) if isinstance(self.way, PaperB) else self.way.step(location)  # type: ignore[union-attr]
+            self._look(now_ns, report, order)
+        if self.phase is not Phase.DRIVING:
+            if isinstance(self.way, Along):
+                self.way.rest(location)
+            idle = (self.phase is Phase.IDLE or self.stands) and not self.holds
+            if idle or not math.isfinite(report.articulation_rad):
+                return None
+            order = Order(articulation_rad=report.articulation_rad)
+        if not still or order.speed_m_s:
+            self._rolled_ns = now_ns
+        limit = self._limit_rad
+        bend = min(max(order.articulation_rad, -limit), limit)
+        # As a beam axle: paper B opens it just before the machine moves, and closes it for the crane to stand firm.
+        floats = self.phase is Phase.DRIVING
+        # From the clock at the start: a planner that is started again is never taken for a replay.
+        self._sequence = self._sequence + 1 if self._sequence else now_ns // 1_000_000 & 0xFFFF_FFFF
+        return DriveSetpoint(
+            self._sequence, self._profile_hash, now_ns, self._lease_ns, order.steering, order.latitude_deg,
+            order.longitude_deg, bend, order.articulation_rate_rad_s, order.speed_m_s,
+            self.heights_m, floats, False, self.level,
+        )  # fmt: skip
+
+    def _begin(self) -> None:
+        self.phase, self.reason = Phase.DRIVING, ""
+        self._asked_ns = self._obeyed_ns = self._moved_ns = 0
+
+    def _look(self, now_ns: int, report: VehicleReport, order: Order) -> None:
+        """End the drive when it is over, or when something is wrong with it."""
+        if not self._asked_ns:
+            self._asked_ns = self._obeyed_ns = self._moved_ns = now_ns
+        if report.driving == Driving.DRIVING:
+            self._obeyed_ns = now_ns
+        if abs(report.speed_m_s) > STUCK_M_S or not order.speed_m_s or report.driving != Driving.DRIVING:
+            self._moved_ns = now_ns
+        if order.trouble:
+            self.stop(order.trouble)
+        elif order.arrived:
+            if self.stands:
+                self.phase = Phase.ARRIVED
+        elif now_ns - self._obeyed_ns > OBEYS_NS:
+            self.stop(f"the controller does not drive, last refusal {report.refusal}")
+        elif now_ns - self._moved_ns > MOVES_NS:
+            self.stop("the wheels do not turn")

@@ -1,0 +1,23 @@
+"""What a way of driving asks of the machine at one moment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from can_dbc.setpoint import Steering
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """Steering as in ``DriveSetpoint`` and a speed [m/s]; ``arrived``: nothing is left to drive; ``trouble`` says why
+    the machine must stand, empty when it need not.
+    """
+
+    steering: Steering = Steering.ARTICULATION
+    latitude_deg: float = 0.0
+    longitude_deg: float = 0.0
+    articulation_rad: float = 0.0
+    articulation_rate_rad_s: float = 0.0
+    speed_m_s: float = 0.0
+    arrived: bool = False
+    trouble: str = ""

@@ -1,0 +1,102 @@
+"""How fast the machine may drive here: bends, tip-over margin, rough ground, the way left to where it is to stop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+from autonomy.localization.estimate import Location
+from autonomy.navigation.curves import Path
+from machine.carrier import ARMS, hub_m, pivot_height_m, rear_from_front
+from machine.profile import Carrier
+
+MASS_HEIGHT_M: Final = 0.55
+"""Height of the centre of mass above the pivots, crane in its transport pose, bunk full (assumed)."""
+MASS_REACH: Final = 0.9
+"""Each half is as heavy as the other, and its weight acts so far out towards its axle (assumed)."""
+FULL_MARGIN_M: Final = 0.55
+"""With this margin to the edge of the wheels' polygon, full speed; ..."""
+LEAST_MARGIN_M: Final = 0.20
+"""... with this one the machine does not drive."""
+SLOWEST: Final = 0.3
+"""Share of the wanted speed with little more than the least margin, or on the roughest ground."""
+CALM_RAD_S: Final = 0.06
+ROUGH_RAD_S: Final = 0.30
+"""Rate at which the machine rocks: full speed, slowest."""
+ROCKING_S: Final = 2.0
+RATE_SHARE: Final = 0.85
+"""Share of the articulation's rate limit that a bend may ask for."""
+BRAKING_M_S2: Final = 0.15
+CREEP_M_S: Final = 0.10
+GRAVITY_M_S2: Final = 9.81
+LOOK_M: Final = 1.5
+"""So far ahead bends are looked at."""
+LOOK_STEP_M: Final = 0.25
+
+
+def tip_margin_m(carrier: Carrier, location: Location, acceleration_m_s2: float = 0.0) -> float:
+    """How far the weight acts inside the wheels' polygon [m], by roll, pitch and articulation; 0 or less: it tips.
+
+    ``acceleration_m_s2`` is towards the left, as in a bend to the left.  The masses are assumed: the profile has none.
+    """
+    height = pivot_height_m(carrier, location.front_height_m) + MASS_HEIGHT_M
+    side = math.atan2(acceleration_m_s2, GRAVITY_M_S2)
+    front = rear_from_front(location.articulation_rad, (MASS_REACH * carrier.front_axle_m, 0.0, 0.0))
+    x = 0.5 * (front[0] - MASS_REACH * carrier.rear_axle_m) - height * math.tan(location.pitch_rad)
+    y = 0.5 * front[1] - height * math.tan(side) - height * math.tan(location.roll_rad)
+    points = []
+    for arm in (ARMS[0], ARMS[2], ARMS[3], ARMS[1]):
+        hub = hub_m(carrier, arm, location.front_height_m)
+        points.append(rear_from_front(location.articulation_rad, hub) if arm.startswith("arm_f") else hub)
+    margin = math.inf
+    for (ax, ay, _), (bx, by, _) in zip(points, (*points[1:], points[0]), strict=True):
+        ex, ey = bx - ax, by - ay
+        margin = min(margin, (ex * (y - ay) - ey * (x - ax)) / math.hypot(ex, ey))
+    return margin
+
+
+@dataclass(slots=True)
+class Rocking:
+    """How fast roll and pitch change, smoothed over ``ROCKING_S``."""
+
+    rate_rad_s: float = 0.0
+    _last: tuple[int, float, float] | None = None
+
+    def step(self, location: Location) -> float:
+        """One location later; rad/s."""
+        now = location.stamp_ns, location.roll_rad, location.pitch_rad
+        if self._last is not None and now[0] > self._last[0]:
+            seconds = (now[0] - self._last[0]) * 1e-9
+            rate = math.hypot(now[1] - self._last[1], now[2] - self._last[2]) / seconds
+            self.rate_rad_s += min(1.0, seconds / ROCKING_S) * (rate - self.rate_rad_s)
+        self._last = now
+        return self.rate_rad_s
+
+
+def terrain_share(margin_m: float, rocking_rad_s: float) -> float:
+    """Share of the wanted speed that ground and slope allow, 0 to stand."""
+    if margin_m < LEAST_MARGIN_M:
+        return 0.0
+    steady = min(1.0, (margin_m - LEAST_MARGIN_M) / (FULL_MARGIN_M - LEAST_MARGIN_M))
+    calm = min(1.0, max(0.0, (ROUGH_RAD_S - rocking_rad_s) / (ROUGH_RAD_S - CALM_RAD_S)))
+    return SLOWEST + (1.0 - SLOWEST) * min(steady, calm)
+
+
+def bend_speed_m_s(carrier: Carrier, path: Path, s_m: float) -> float:
+    """The greatest speed at which the articulation keeps up with the path ahead of ``s_m``."""
+    fastest = math.inf
+    lf, lr = carrier.front_axle_m, carrier.rear_axle_m
+    limit = RATE_SHARE * carrier.articulation_rate_limit_rad_s
+    curves = [path.at(s_m + k * LOOK_STEP_M)[3] for k in range(int(LOOK_M / LOOK_STEP_M) + 2)]
+    for before, after in pairwise(curves):
+        swing_1_m = abs(after - before) / LOOK_STEP_M * (lf + lr)
+        if swing_1_m > 0.0:
+            fastest = min(fastest, limit / swing_1_m)
+    return fastest
+
+
+def stopping_speed_m_s(left_m: float) -> float:
+    """The speed with ``left_m`` to go: a steady slowing down that ends in a creep."""
+    return max(CREEP_M_S, math.sqrt(2.0 * BRAKING_M_S2 * max(0.0, left_m)))

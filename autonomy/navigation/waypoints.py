@@ -1,0 +1,96 @@
+"""Paper B's way (3.2.1): drive at the waypoint, and turn to the next one within a distance of the steering radius.
+
+The law itself is closed in the controller; here the waypoints are switched.  The front axle is where the receiver says
+it is, without a filter, as in the paper.  The distance is R tan(turn / 2), with the radius R at full articulation and
+the turn at the waypoint: what a circle needs (machines.md 7.2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from autonomy.localization.plane import Plane, wrapped, yaw_from_heading
+from autonomy.navigation.order import Order
+from can_dbc.setpoint import Steering, VehicleReport
+from machine.carrier import turning_radius_m
+from machine.profile import Carrier
+
+LEAST_M: Final = 1.0
+"""No waypoint is switched nearer than this, or a machine that misses it would circle round it."""
+MOST_M: Final = 12.0
+FRESH_NS: Final = 500_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Waypoint:
+    """A place on WGS-84 [deg]."""
+
+    latitude_deg: float
+    longitude_deg: float
+
+
+class PaperB:
+    """One drive along ``waypoints``; ``number`` is the one that it drives at.
+
+    The last one is reached within ``LEAST_M`` of it, or once it lies behind.
+    """
+
+    def __init__(self, carrier: Carrier, waypoints: Sequence[Waypoint], speed_m_s: float | None = None) -> None:
+        if not waypoints:
+            raise ValueError("a drive needs one waypoint at least")
+        self.number = 0
+        self._plane = Plane(waypoints[0].latitude_deg, waypoints[0].longitude_deg)
+        self._waypoints = tuple(waypoints)
+        self._points = [self._plane.local(w.latitude_deg, w.longitude_deg)[:2] for w in waypoints]
+        self._ahead_m = carrier.front_axle_m - carrier.antenna_main_m[0]
+        self._radius_m = turning_radius_m(carrier, carrier.articulation_limit_rad)
+        self._speed = carrier.cruise_speed_m_s if speed_m_s is None else speed_m_s
+        self._from: tuple[float, float] | None = None
+
+    def switch_m(self, number: int) -> float:
+        """At this distance from a waypoint the next one becomes the goal [m]."""
+        if self._from is None or number + 1 >= len(self._points):
+            return LEAST_M
+        before = self._points[number - 1] if number else self._from
+        here, after = self._points[number], self._points[number + 1]
+        turn = wrapped(_bearing(here, after) - _bearing(before, here))
+        return min(MOST_M, max(LEAST_M, self._radius_m * math.tan(min(abs(turn), 3.0) / 2.0)))
+
+    def step(self, report: VehicleReport) -> Order:
+        """The order by one report."""
+        seen = report.position_ns and report.stamp_ns - report.position_ns <= FRESH_NS
+        if not seen or not math.isfinite(report.latitude_deg + report.longitude_deg):
+            return Order(Steering.WAYPOINT, trouble="no position from the receiver")
+        if not math.isfinite(report.heading_rad) or report.stamp_ns - report.heading_ns > FRESH_NS:
+            return Order(Steering.WAYPOINT, trouble="no heading from the receiver")
+        east, north, _ = self._plane.local(report.latitude_deg, report.longitude_deg)
+        yaw = yaw_from_heading(report.heading_rad)
+        at = east + self._ahead_m * math.cos(yaw), north + self._ahead_m * math.sin(yaw)
+        if self._from is None:
+            self._from = at
+        while math.dist(at, self._points[self.number]) <= self.switch_m(self.number):
+            if self.number + 1 == len(self._points):
+                return self._order(0.0, arrived=True)
+            self.number += 1
+        last = self.number + 1 == len(self._points)
+        if last and self._behind(at):
+            return self._order(0.0, arrived=True)
+        return self._order(self._speed)
+
+    def _behind(self, at: tuple[float, float]) -> bool:
+        """Whether the machine has passed the waypoint, seen along the leg that leads to it."""
+        assert self._from is not None
+        before = self._points[self.number - 1] if self.number else self._from
+        here = self._points[self.number]
+        return (at[0] - here[0]) * (here[0] - before[0]) + (at[1] - here[1]) * (here[1] - before[1]) > 0.0
+
+    def _order(self, speed_m_s: float, arrived: bool = False) -> Order:
+        goal = self._waypoints[self.number]
+        return Order(Steering.WAYPOINT, goal.latitude_deg, goal.longitude_deg, 0.0, 0.0, speed_m_s, arrived)
+
+
+def _bearing(a: tuple[float, float], b: tuple[float, float]) -> float:
+    return math.atan2(b[1] - a[1], b[0] - a[0])

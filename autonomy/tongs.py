@@ -1,0 +1,61 @@
+"""What the controller's report says of the tongs: open, closed, clear of the logs; without a sensor they are timed."""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Final
+
+from autonomy.grasp.direct import Grasp, opened_angle
+from can_dbc.setpoint import StateReport
+from machine.grapple import opening_pct_from_tong_angle, tong_angle_from_opening_pct
+from machine.profile import Profile
+
+_GRIPPED: Final = (4, 5)  # GrappleStat.State: closed, holding
+_OPEN_PCT: Final = 92.0
+_GRIPPED_RAD: Final = 1.5
+"""Tongs without a sensor are taken to have been closed as far when they let go of a log: past tips that meet."""
+_LEAST_S: Final = 0.5
+"""Of closing, before the report can be of it."""
+_VALVE_S: Final = 0.4
+_SLOW_TONGS: Final = 1.3
+"""Before they move, and how much slower they may be than the profile says."""
+_CLOSE_GAIN_1_S: Final = 2.0
+_CLOSE_FASTEST: Final = 1.3
+
+
+def pace(ahead_s: float) -> float:
+    """How fast the pin follows the sweep of closing tongs that are so far ahead of it; NaN: at its own pace."""
+    return min(max(1.0 + _CLOSE_GAIN_1_S * ahead_s, 0.0), _CLOSE_FASTEST) if isfinite(ahead_s) else 1.0
+
+
+def gripped(report: StateReport, closing_s: float) -> bool:
+    """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""
+    return closing_s > _LEAST_S and report.grapple_state in _GRIPPED
+
+
+def opened(profile: Profile, report: StateReport, opening_s: float) -> bool:
+    """Whether they stand open."""
+    if isfinite(report.opening_pct):
+        return report.opening_pct >= _OPEN_PCT
+    return opening_s > profile.grapple.open_time_s
+
+
+def released(profile: Profile, report: StateReport, grasp: Grasp, opening_s: float) -> bool:
+    """Whether they have left the logs that they held."""
+    grapple = profile.grapple
+    angle = opened_angle(profile, max(log.diameter_m for log in grasp.logs))
+    if grasp.others:
+        angle = 0.0  # logs beside each other reach farther out
+    if isfinite(report.opening_pct):
+        return report.opening_pct >= min(opening_pct_from_tong_angle(grapple.tongs, angle), _OPEN_PCT)
+    turned = max(_GRIPPED_RAD - angle, 0.0) / grapple.tongs.angle_rad[-1]
+    return opening_s > _VALVE_S + _SLOW_TONGS * turned * grapple.open_time_s
+
+
+def closed_for_s(profile: Profile, report: StateReport) -> float:
+    """How long tongs of the nominal speed have been closing to be where they are measured; NaN if unknown."""
+    opening = report.opening_pct
+    if not isfinite(opening):
+        return opening
+    tongs = profile.grapple.tongs
+    return tong_angle_from_opening_pct(tongs, opening) / tongs.angle_rad[-1] * profile.grapple.close_time_s

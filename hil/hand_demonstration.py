@@ -1,0 +1,224 @@
+"""A scripted operator at the hand levers of the plant: shows motions between bunk and logs, as a person would.
+
+The controller stands by, the crane follows the levers.  The operator keeps an eye on a point that wanders along a
+quasi-parabola over the stakes (paper B 3.2.5), pushes each lever as fast as the joint should go, feels most of the
+valve's dead-band, reacts late, moves the levers no faster than a hand does, trembles, hesitates and pauses between
+motions.  What is learned comes from the encoder frames of the bus, as from any recording.  Equal seeds give equal
+frames.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from autonomy.grasp.direct import travel_height
+from autonomy.logs import LogObservation
+from autonomy.motion.arm import Arm, Pose
+from autonomy.motion.demonstration import AXES
+from can_dbc.frame import Frame
+from can_dbc.setpoint import StateReport
+from controller.config import Settings
+from controller.guard.__main__ import build as build_guard
+from controller.guard.__main__ import profile_path
+from hil.lockstep import Lockstep, Observer
+from hil.operator import Operator
+from hil.wire.inprocess import InProcessBus
+from machine.grapple import lowest_tip_below_pin_m
+from machine.kinematics import Unreachable
+from machine.load import load_profile, profile_hash
+from machine.profile import Profile, joint
+from recorder.recorder import Recorder
+from sim.plant import Plant
+
+WAKE_S: Final = 2.0
+"""The machine wakes up before anybody touches a lever."""
+TURN_NS: Final = 20_000_000
+BRISK: Final = 0.75
+"""Share of the profile's speeds that the operator drives at."""
+LATE_TURNS: Final = 8
+"""Reaction: the operator sees the joints as they were 0.16 s ago, ..."""
+HAND_1_S: Final = 3.0
+"""... moves a lever over its whole way in a third of a second, ..."""
+TREMOR: Final = 0.02
+"""... trembles by this share of the lever's way, ..."""
+FEELS: Final = 0.9
+"""... and knows this share of the dead-band."""
+GAIN_1_S: Final = 1.6
+NEAR: Final = 0.03
+OVER_LOG_M: Final = 0.10
+LONGEST_S: Final = 600.0
+_POINTS: Final = 81
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A motion to show: the joints on its way (n, 4) by progress, the shortest time [s], the rest before it [s]."""
+
+    joints: np.ndarray
+    time_s: float
+    pause_s: float
+
+
+def script(profile: Profile, seed: int, targets: int, standing: Sequence[float]) -> list[Shown]:
+    """From where the crane stands (joints, 5) to ``targets`` places beside the machine, and after each to the bunk.
+
+    Raises:
+        ValueError: the crane cannot reach such places.
+    """
+    rng, arm, bunk, ground = random.Random(seed), Arm(profile), profile.bunk, profile.workspace.ground_z_m
+    high = travel_height(profile)
+    over_bunk = arm.reach(*bunk.center_m, bunk.floor_z_m + lowest_tip_below_pin_m(profile.grapple.tongs) + 0.3, high)
+    shown: list[Shown] = []
+    here = arm.pose(standing)
+    cx, cy = profile.workspace.pick_center_m
+    for number in range(targets):
+        side = -1.0 if number % 2 and profile.carrier is not None else 1.0
+        x, y = cx + rng.uniform(-0.8, 0.8), side * (cy + rng.uniform(-0.8, 0.8))
+        try:
+            log = arm.reach(x, y, ground + profile.grapple.tongs.tip_below_pin_m[0] + OVER_LOG_M, high)
+            shown.append(_motion(arm, here, log, high, rng))
+            shown.append(_motion(arm, log, over_bunk, high, rng))
+            here = over_bunk
+        except Unreachable as error:
+            raise ValueError(f"no demonstration is possible there: {error}") from None
+    return shown
+
+
+def _motion(arm: Arm, start: Pose, goal: Pose, high_m: float, rng: random.Random) -> Shown:
+    """A quasi-parabola in height over an even way in the plane, as high as the stakes ask for and a little more."""
+    share = np.linspace(0.0, 1.0, _POINTS)
+    ends = np.array(start), np.array(goal)
+    poses = ends[0] + share[:, None] * (ends[1] - ends[0])
+    middle = (start.z_m + goal.z_m) / 2
+    poses[:, 2] += (max(0.0, high_m - middle) + rng.uniform(0.0, 0.25)) * 4.0 * share * (1.0 - share)
+    q = arm.joints(poses)[:, : len(AXES)]
+    speed = BRISK * arm.speed[: len(AXES)] * rng.uniform(0.85, 1.1)
+    time_s = float(np.max(np.sum(np.abs(np.diff(q, axis=0)), axis=0) / speed))
+    return Shown(q, 1.3 * time_s + 0.8, rng.uniform(1.2, 2.5))
+
+
+class Hands:
+    """Pulls the levers; in the planner's seat of a lockstep run, where it never sends a setpoint."""
+
+    def __init__(self, profile: Profile, plant: Plant, shown: list[Shown], seed: int) -> None:
+        self._plant, self._left, self._count = plant, deque(shown), len(shown)
+        self._rng = random.Random(seed + 1)
+        self._specs = [joint(profile, j) for j in AXES]
+        self._seen: deque[np.ndarray] = deque(maxlen=LATE_TURNS)
+        self._levers = np.zeros(len(AXES))
+        self._tremor = np.zeros(len(AXES))
+        self._now: Shown | None = None
+        self._clock_s = 0.0
+        self._next_ns = 0
+        self._hesitates = (0.0, 0.0)
+        self.done = False
+
+    @property
+    def shown(self) -> int:
+        """How many motions have begun."""
+        return self._count - len(self._left)
+
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+        """One look and one pull every 20 ms."""
+        if now_ns < self._next_ns or now_ns < WAKE_S * 1e9:
+            return None
+        self._next_ns = now_ns + TURN_NS
+        self._seen.append(np.array(self._plant.joint_positions()[: len(AXES)]))
+        self._proceed(TURN_NS * 1e-9)
+        return None
+
+    def _proceed(self, dt_s: float) -> None:
+        seen = self._seen[0]
+        if self._now is None:
+            if not self._left:
+                self.done = True
+                return
+            self._now = self._left.popleft()
+            self._clock_s = -self._now.pause_s
+            middle = self._rng.uniform(0.3, 0.7) * self._now.time_s
+            self._hesitates = (middle, self._rng.choice((0.0, 0.0, 0.35)))
+        before = self._carrot(self._clock_s)
+        at, wait_s = self._hesitates
+        self._clock_s += dt_s
+        if wait_s > 0.0 and self._clock_s >= at:
+            self._hesitates = (at, wait_s - dt_s)
+            self._clock_s -= dt_s
+        wanted = self._carrot(self._clock_s)
+        moving = self._clock_s > 0.0
+        speed = (wanted - before) / dt_s + GAIN_1_S * (wanted - seen) if moving else np.zeros(len(AXES))
+        close = np.abs(wanted - seen) < NEAR
+        over = self._clock_s > self._now.time_s
+        if over:
+            speed = np.where(close, 0.0, speed)
+        self._pull(speed, dt_s)
+        if (over and bool(np.all(close))) or self._clock_s > self._now.time_s + 6.0:
+            self._now = None
+
+    def _carrot(self, clock_s: float) -> np.ndarray:
+        """Where the eye is: along the way, faster in the middle."""
+        assert self._now is not None
+        tau = min(max(clock_s / self._now.time_s, 0.0), 1.0)
+        share = tau * tau * (3.0 - 2.0 * tau)
+        grid = np.linspace(0.0, 1.0, _POINTS)
+        return np.array([np.interp(share, grid, column) for column in self._now.joints.T])
+
+    def _pull(self, speed: np.ndarray, dt_s: float) -> None:
+        for i, (axis, spec) in enumerate(zip(AXES, self._specs, strict=True)):
+            v, valve = float(speed[i]), spec.valve
+            full = valve.full_speed_plus if v >= 0.0 else valve.full_speed_minus
+            dead = FEELS * (valve.deadband_plus_pct if v >= 0.0 else valve.deadband_minus_pct) / 100.0
+            share = min(abs(v) / full, 1.0) ** (1.0 / valve.exponent)
+            goal = valve.sign * (dead + (1.0 - dead) * share) * (1.0 if v > 0.0 else -1.0) if abs(v) > 1e-3 else 0.0
+            most = HAND_1_S * dt_s
+            self._levers[i] += min(max(goal - self._levers[i], -most), most)
+            self._tremor[i] += 0.3 * (self._rng.gauss(0.0, TREMOR) - self._tremor[i])
+            held = self._levers[i] + (self._tremor[i] if self._levers[i] else 0.0)
+            self._plant.lever(axis.name.lower(), min(max(held, -1.0), 1.0))
+
+
+class _Bystander(Operator):
+    """Nobody arms the machine: the levers move it."""
+
+    def step(self, report: StateReport) -> bytes | None:
+        return None
+
+
+def show(
+    name: str,
+    seed: int = 1,
+    targets: int = 6,
+    truth: str = "nominal",
+    recorder: Recorder | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Frame]:
+    """Shows the script of a machine on its plant; the frames of the crane bus that the encoders sent.
+
+    Raises:
+        ValueError: the scene or the script cannot be made.
+    """
+    profile = load_profile(name)
+    plant = Plant(profile, seed, truth, logs=0)
+    try:
+        shown = script(profile, seed, targets, plant.joint_positions())
+        hands = Hands(profile, plant, shown, seed)
+        settings = Settings(profile, profile_hash(profile), profile.rate_hz)
+        bystander = _Bystander(profile_hash(profile), lambda action, report: None)
+        guard = build_guard(profile_path(name))
+        system = Lockstep(settings, guard, plant, hands, bystander, Observer(recorder, []))
+        ear, frames, turns = InProcessBus(system.core, "learner"), [], 0
+        end_ns = system.now_ns + int(LONGEST_S * 1e9)
+        while not hands.done and system.now_ns < end_ns:
+            system.advance()
+            ear.drain(frames)
+            turns += 1
+            if turns % 800 == 0:
+                progress(hands.shown, len(shown))
+        return frames
+    finally:
+        plant.close()

@@ -1,0 +1,220 @@
+"""StanForD 2010: logs from a harvester's hpr, and the fpr of what was forwarded against the structure of its schema."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+
+import pytest
+from mission_texts import SITE, at
+
+from autonomy.missions.files import load_mission, read, verify
+from autonomy.missions.forwarded import ForwardedLoad, ForwardedLog, Forwarder, write_fpr
+from autonomy.missions.harvest import MACHINE_SIGMA_M, TIP_SIGMA_M
+from autonomy.missions.model import Landing, MissionError, Point
+
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "harvest.hpr"
+TEXT = EXAMPLE.read_text(encoding="utf-8")
+NS = {"s": "urn:skogforsk:stanford2010"}
+
+
+def told(text: str) -> str:
+    """What is said of an hpr that is refused."""
+    with pytest.raises(MissionError) as refused:
+        verify(read(text.encode(), "h"), route_wanted=False)
+    return str(refused.value)
+
+
+# -- hpr --------------------------------------------------------------------------------------------------------
+
+
+def test_logs_of_a_harvesters_production() -> None:
+    logs = load_mission(EXAMPLE).mission.logs
+    assert [log.key for log in logs] == ["4001/1", "4001/2", "4002/1", "4002/2", "4003/1", "4004/1", "4004/2"]
+    assert [(log.species, log.assortment, log.product_key) for log in logs[1:3]] == [
+        ("birch", "pulpwood", 31),
+        ("pine", "saw logs", 11),
+    ]
+    assert (logs[0].length_m, logs[0].diameter_m) == (pytest.approx(3.0), pytest.approx(0.210))
+    assert all(log.bearing_deg is None for log in logs)
+
+
+def test_a_tips_place_is_better_than_the_harvesters_own() -> None:
+    logs = load_mission(EXAMPLE).mission.logs
+    places = SITE.points_enu([log.position for log in logs])
+    assert places[0, :2] == pytest.approx((-10.0, -9.0), abs=0.02) and logs[0].sigma_m == TIP_SIGMA_M
+    assert places[-1, :2] == pytest.approx((0.0, -12.0), abs=0.02) and logs[-1].sigma_m == MACHINE_SIGMA_M
+
+
+def test_south_and_west() -> None:
+    turned = TEXT.replace('"North"', '"South"').replace('"East"', '"West"')
+    at_first = read(turned.encode(), "h").mission.logs[0].position
+    assert (at_first.latitude_deg, at_first.longitude_deg) == (
+        pytest.approx(-63.65777, abs=1e-3),
+        pytest.approx(-19.8954, abs=1e-3),
+    )
+
+
+def test_diameters_of_harvesters_that_measure_less() -> None:
+    ends = TEXT.replace('"Mid ob">210', '"Butt ob">230')
+    assert read(ends.encode(), "h").mission.logs[0].diameter_m == pytest.approx(0.5 * (0.230 + 0.190))
+    lines = [line for line in TEXT.splitlines() if "LogDiameter" not in line]
+    by_volume = read("\n".join(lines).encode(), "h").mission.logs[0]
+    assert by_volume.diameter_m == pytest.approx(0.210, rel=1e-3)  # the sample's volumes are cylinders
+
+
+def test_stems_without_coordinates_are_counted() -> None:
+    start = TEXT.index("<StemCoordinates", TEXT.index("<StemKey>4004"))
+    end = TEXT.index("</StemCoordinates>", start) + len("</StemCoordinates>")
+    draft = read((TEXT[:start] + TEXT[end:]).encode(), "h")
+    assert len(draft.mission.logs) == 5 and draft.notes == ["2 logs of stems without coordinates left out"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("urn:skogforsk:stanford2010", "urn:else", "is not urn:skogforsk:stanford2010"),
+        ('messageType="hpr"', 'messageType="pri"', "message type 'pri'; logs come from an hpr"),
+        ('"WGS84"', '"RT90"', 'coordinates are in "RT90"; a mission is in WGS84'),
+        ("<LogLength>300", "<LogLength>3x0", 'LogLength "3x0" is no number'),
+        ("<LogLength>300", "<LogLength>inf", "LogLength is inf, which is no number"),
+        ("<LogLength>300", "<LogLength>30000", "length_m is 300; logs have 0.3 to 30 m (is it in another unit?)"),
+        ("</Machine>", "</Machin>", "no well-formed XML"),
+    ],
+)
+def test_what_an_hpr_must_be(old: str, new: str, sentence: str) -> None:
+    said = told(TEXT.replace(old, new))
+    assert sentence in said and said.startswith("h:")
+
+
+def test_the_line_of_a_bad_log() -> None:
+    bad = TEXT.replace("<LogLength>430", "<LogLength>x", 1)
+    assert told(bad).startswith(f"h:{1 + bad[: bad.index('<LogLength>x')].count(chr(10))}: ")
+
+
+def test_an_hpr_alone_is_no_route() -> None:
+    with pytest.raises(MissionError, match="has no waypoints"):
+        load_mission(EXAMPLE, route_wanted=True)
+    both = load_mission(EXAMPLE.with_name("route.gpx"), logs=EXAMPLE)
+    assert (len(both.mission.waypoints), len(both.mission.logs)) == (3, 7)
+
+
+def test_logs_of_another_site_do_not_fit_the_route(tmp_path: Path) -> None:
+    (tmp_path / "far.hpr").write_text(TEXT.replace(">63.", ">33."))
+    with pytest.raises(MissionError, match=r"far\.hpr: log 1 is \d+ km away from waypoint 1"):
+        load_mission(EXAMPLE.with_name("route.gpx"), logs=tmp_path / "far.hpr")
+
+
+# -- fpr --------------------------------------------------------------------------------------------------------
+
+NOON = datetime(2026, 6, 1, 12, 0, tzinfo=timezone(timedelta(hours=2)))
+ROAD, YARD = Landing(at(22, 17), "Road side"), Landing(at(-22, 17), "Yard")
+BIRCH = ForwardedLog(at(-10, -9), NOON, 0.0982, "birch", "pulpwood", 31)
+PINE = ForwardedLog(Point(-33.5, -70.25, 512.4), NOON + timedelta(seconds=30), 0.2111, "pine", "saw logs", 11)
+STRAY = ForwardedLog(at(3, 4), NOON, 0.05)
+LOADS = (
+    ForwardedLoad((BIRCH, replace(BIRCH, volume_m3=0.1), PINE), ROAD, NOON + timedelta(minutes=20), 640.4),
+    ForwardedLoad((STRAY,), YARD, NOON + timedelta(minutes=50)),
+)
+WHO = Forwarder("AORO-1", "FC8", "Hörnefors <12> & co")
+
+ORDER = {
+    "Machine": [
+        "MachineKey", "MachineUserID", "MachineApplicationVersion", "MachineBaseManufacturer", "MachineBaseModel",
+        "BaseMachineManufacturerID", "OperatorDefinition", "SpeciesGroupDefinition", "ProductDefinition",
+        "ObjectDefinition", "LocationDefinition", "DeliveryDefinition", "Load",
+    ],
+    "Load": ["LoadKey", "OperatorKey", "LoadNumber", "DistanceFromLastUnloading", "UnloadingTime", "PartialLoad"],
+    "PartialLoad": [
+        "PartialLoadKey", "DeliveryKey", "LocationKey", "LoadNumberOfItems", "LoadVolume", "LoadingCoordinates",
+    ],
+    "LoadingCoordinates": ["Latitude", "Longitude", "Altitude", "CoordinateDate"],
+    "LocationDefinition": ["LocationUserID", "LocationName", "LocationCoordinates", "LocationKey", "ObjectKey"],
+    "ProductDefinition": ["ProductKey", "ClassifiedProductDefinition"],
+    "DeliveryDefinition": ["DeliveryKey", "ProductKey"],
+}  # fmt: skip
+"""The sequences of the schema (version 3.6), as far as we write them."""
+
+
+def report(loads: tuple[ForwardedLoad, ...] = LOADS) -> ET.Element:
+    """The report, read by another parser than wrote it."""
+    return ET.fromstring(write_fpr(loads, WHO, NOON + timedelta(hours=1), "timberhand 0.1.0"))
+
+
+def texts(root: ET.Element, path: str) -> list[str]:
+    return [element.text or "" for element in root.findall(path, NS)]
+
+
+def test_the_elements_come_in_the_order_of_the_schema() -> None:
+    root = report()
+    assert root.tag == "{urn:skogforsk:stanford2010}ForwardedProduction"
+    assert (root.get("messageType"), root.get("version"), root.get("volumeUnit")) == ("fpr", "3.6", "m3")
+    for name, order in ORDER.items():
+        found = root.findall(f".//s:{name}", NS)
+        assert found
+        for element in found:
+            places = [order.index(child.tag.partition("}")[2]) for child in element]
+            assert places == sorted(places), name
+
+
+def test_every_log_has_its_place_time_product_and_volume() -> None:
+    root = report()
+    parts = root.findall(".//s:PartialLoad", NS)
+    deliveries = {d.findtext("s:DeliveryKey", "", NS): d.findtext("s:ProductKey", "", NS)
+                  for d in root.findall(".//s:DeliveryDefinition", NS)}  # fmt: skip
+    assert [deliveries[p.findtext("s:DeliveryKey", "", NS)] for p in parts] == ["31", "31", "11", "1"]
+    assert [float(p.findtext("s:LoadVolume", "", NS)) for p in parts] == [0.0982, 0.1, 0.2111, 0.05]
+    assert {p.findtext("s:LoadNumberOfItems", "", NS) for p in parts} == {"1"}
+    assert [datetime.fromisoformat(t) for t in texts(root, ".//s:CoordinateDate")][2] == PINE.taken
+    pine = parts[2].find("s:LoadingCoordinates", NS)
+    assert pine is not None
+    latitude, longitude = pine.find("s:Latitude", NS), pine.find("s:Longitude", NS)
+    assert latitude is not None and longitude is not None
+    assert (latitude.get("latitudeCategory"), float(latitude.text or "")) == ("South", 33.5)
+    assert (longitude.get("longitudeCategory"), float(longitude.text or "")) == ("West", 70.25)
+
+
+def test_every_key_that_is_used_is_defined_once() -> None:
+    root = report()
+    for used, defined in (
+        (".//s:PartialLoad/s:LocationKey", ".//s:LocationDefinition/s:LocationKey"),
+        (".//s:PartialLoad/s:DeliveryKey", ".//s:DeliveryDefinition/s:DeliveryKey"),
+        (".//s:DeliveryDefinition/s:ProductKey", ".//s:ProductDefinition/s:ProductKey"),
+        (".//s:ClassifiedProductDefinition/s:SpeciesGroupKey", ".//s:SpeciesGroupDefinition/s:SpeciesGroupKey"),
+        (".//s:LocationDefinition/s:ObjectKey", ".//s:ObjectDefinition/s:ObjectKey"),
+        (".//s:Load/s:OperatorKey", ".//s:OperatorDefinition/s:OperatorKey"),
+    ):
+        keys = texts(root, defined)
+        assert len(set(keys)) == len(keys) and set(texts(root, used)) <= set(keys)
+    assert len(set(texts(root, ".//s:PartialLoadKey"))) == 4
+
+
+def test_two_assortments_with_one_number_are_told_apart() -> None:
+    logs = (BIRCH, replace(BIRCH, assortment="fuel"), replace(BIRCH, assortment="veneer", product_key=1), STRAY)
+    root = report((ForwardedLoad(logs, ROAD, NOON),))
+    assert sorted(texts(root, ".//s:ProductDefinition/s:ProductKey"), key=int) == ["1", "2", "3", "31"]
+
+
+def test_names_are_text_whatever_is_in_them() -> None:
+    assert texts(report(), ".//s:ObjectName") == ["Hörnefors <12> & co"]
+    odd = replace(WHO, site="a\x00b\ud800\U0001f332")
+    root = ET.fromstring(write_fpr(LOADS, odd, NOON, "x"))
+    assert texts(root, ".//s:ObjectName") == ["ab\U0001f332"]
+
+
+def test_a_report_of_nothing_that_can_be() -> None:
+    assert report(()).find(".//s:Load", NS) is None
+    for load, sentence in (
+        (ForwardedLoad((), ROAD, NOON), "load 1 has no logs"),
+        (ForwardedLoad((replace(BIRCH, volume_m3=float("nan")),), ROAD, NOON), "has a log of nan m3"),
+        (ForwardedLoad((BIRCH,), ROAD, NOON.replace(tzinfo=None)), "a time has no zone"),
+    ):
+        with pytest.raises(MissionError, match=sentence):
+            write_fpr((load,), WHO, datetime(2026, 6, 1, tzinfo=UTC), "x")
+
+
+def test_an_fpr_is_no_mission() -> None:
+    with pytest.raises(MissionError, match="<ForwardedProduction>, which is no mission"):
+        read(write_fpr(LOADS, WHO, NOON, "x"), "f")

@@ -1,0 +1,115 @@
+"""The planning process's jobs: what they tell, when they are idle, how they end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from autonomy.jobs import COME_TO_REST_NS, Forwarding
+from autonomy.manager.manager import Manager
+from autonomy.manager.table import OURS, State
+from autonomy.missions.model import ForwardingMission, Point
+from can_dbc.mission_datagrams import MissionOrder, Order
+from can_dbc.setpoint import DriveSetpoint, decode
+from machine.load import profile_hash
+from tests.autonomy.forwarder_stand_in import Forwarder
+from tests.autonomy.test_manager import LOGS, PLANE, PROFILE
+from tests.autonomy.test_manager_field import lying
+
+
+def begin(*logs, end_m: float = 26.0, **told: Any) -> tuple[Forwarder, Forwarding, Manager]:
+    way = tuple(Point(*PLANE.geodetic(x, 0.0)[:2]) for x in (10.0, end_m))
+    mission = ForwardingMission("test", way)
+    manager = Manager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE, **told)
+    forwarder = Forwarder(PROFILE, PLANE, [lying(*log) for log in logs], (0.0, 0.1, 0.05))
+    return forwarder, Forwarding(manager, mission), manager
+
+
+def run(forwarder: Forwarder, job: Forwarding, enough, limit: int = 20_000) -> list[tuple[str, dict[str, Any]]]:
+    """What is told on the way, each time that it has changed."""
+    told: dict[str, Any] = {}
+    said = []
+    for _ in range(limit):
+        for event, what in job.news():
+            if told.get(event) != what:
+                told[event] = what
+                said.append((event, dict(what)))
+        if enough(job):
+            return said
+        forwarder.step(job)  # type: ignore[arg-type]
+    raise AssertionError(said[-5:])
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_a_mission_tells_its_states_its_grasps_and_its_load_and_ends_idle() -> None:
+    forwarder, job, _ = begin(LOGS[0])
+    said = run(forwarder, job, lambda j: j.idle)
+    assert job.done and job.failure is None
+    states = [what["state"] for event, what in said if event == "state"]
+    assert states[0] == "IDLE" and states[-1] == "DONE" and states.count("COLLECT") == 1
+    assert [what["logs"] for event, what in said if event == "load"] == [0, 1]
+    assert "grasp" in {event for event, _ in said} and ("paused", {"reason": None}) in said
+    outcome = job.outcome()
+    assert outcome["loaded"] == 1 and outcome["given_up"] == []
+    assert outcome["driven_m"] == pytest.approx(26.0, abs=1.0)
+
+
+def test_an_aborted_mission_stands_before_it_is_idle() -> None:
+    forwarder, job, manager = begin()
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    job.abort("ended by SIGTERM")
+    assert not job.idle and not job.done
+    run(forwarder, job, lambda j: j.idle)
+    assert job.failure == "ended by SIGTERM" and forwarder.speed_m_s < 0.05 and manager.state is State.FAILED
+
+
+def test_a_mission_whose_machine_does_not_come_to_rest_ends_all_the_same() -> None:
+    forwarder, job, _ = begin()
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    job.abort("enough")
+    ended_ns = forwarder.crane.now_ns
+    forwarder._move = lambda: None  # type: ignore[method-assign]
+    run(forwarder, job, lambda j: j.idle)
+    assert COME_TO_REST_NS <= forwarder.crane.now_ns - ended_ns < 2 * COME_TO_REST_NS
+
+
+def test_what_a_mission_asks_for_holds_as_long_as_it_is_told() -> None:
+    forwarder, job, _ = begin(lease_ns=350_000_000)
+    run(forwarder, job, lambda j: forwarder.drive is not None)
+    assert forwarder.drive is not None and forwarder.drive.lease_ns == 350_000_000
+
+
+def test_an_ended_job_sends_no_speed() -> None:
+    forwarder, job, _ = begin()
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    job.abort("enough")
+    crane = forwarder.crane
+    sent = [decode(d) for d in job.step(crane.now_ns, crane.report(), forwarder.vehicle(), ())]
+    assert all(isinstance(s, DriveSetpoint) and s.speed_m_s == 0.0 for s in sent) and sent
+
+
+def ordered(number: int, order: Order) -> MissionOrder:
+    return MissionOrder(number, 0, 0, order)
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+@pytest.mark.parametrize("phase", ["ABOVE", "DESCEND", "CLOSE", "CARRY", "LOWER", "OPEN"])
+def test_a_pause_stops_the_crane_smoothly_and_auto_takes_the_log_on(phase: str) -> None:
+    forwarder, job, manager = begin(LOGS[0])
+    run(forwarder, job, lambda j: manager.activity is not None and manager.activity.phase.name == phase)
+    for _ in range(10):
+        forwarder.step(job)  # type: ignore[arg-type]
+    assert job.obey(ordered(1, Order.PAUSE)) == "" and not job.report(0).auto
+    for _ in range(100):  # a grip that has begun is ended; then the crane stands
+        forwarder.step(job)  # type: ignore[arg-type]
+    before, stands = manager.activity, forwarder.crane.q
+    for _ in range(700):  # longer than any phase may take
+        forwarder.step(job)  # type: ignore[arg-type]
+    assert forwarder.crane.q == stands and manager.state is State.COLLECT and manager.activity is before
+    assert forwarder.crane.setpoint is not None, "it is held, not abandoned"
+    assert job.obey(ordered(2, Order.AUTO)) == ""
+    run(forwarder, job, lambda j: j.idle)
+    assert job.done and manager.tally.loaded == 1 and forwarder.in_bunk == 1

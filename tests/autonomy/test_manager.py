@@ -1,0 +1,368 @@
+"""Missions on the stand-in: what is done, what is never done at once, and what ends in words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from autonomy.grasp.direct import lies_in, plan_place
+from autonomy.grasp.proposal import BunkFull
+from autonomy.localization.plane import Plane
+from autonomy.logs import LogObservation
+from autonomy.manager.manager import Manager
+from autonomy.manager.table import ENDS, OURS, PAPER_B, RULES, State
+from autonomy.manager.tally import Tally
+from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Landing, Options, Point
+from autonomy.navigation.curves import PathRefused
+from machine.load import load_profile, profile_hash
+from machine.modes import Mode
+from tests.autonomy.forwarder_stand_in import Forwarder
+from tests.autonomy.test_manager_field import lying
+
+PROFILE = load_profile("aoro_fc8")
+PLANE = Plane(63.657853, 19.895562, 100.0)
+LOGS = ((1, 15.0, 4.2, 0.0), (2, 18.0, -4.4, 0.5))
+
+
+def place(x_m: float, y_m: float) -> Point:
+    return Point(*PLANE.geodetic(x_m, y_m)[:2])
+
+
+def begin(
+    lie=LOGS, table=OURS, end_m: float = 26.0, landing=None, known=(), fences=(), **options
+) -> tuple[Forwarder, Manager]:
+    """A machine that looks east, logs along its way, and a manager with the switch at Auto."""
+    way = (place(10.0, 0.0), place(end_m, 0.0))
+    landings = () if landing is None else (Landing(place(*landing)),)
+    mission = ForwardingMission("test", way, fences, landings, known, Options(**options))
+    manager = Manager(PROFILE, profile_hash(PROFILE), mission, table, plane=PLANE)
+    manager.auto()
+    return Forwarder(PROFILE, PLANE, [lying(*log) for log in lie], (0.0, 0.1, 0.05)), manager
+
+
+def whole(test):
+    """A mission with crane work: seconds of planning."""
+    return pytest.mark.slow(pytest.mark.computed(test))
+
+
+def ended(manager: Manager) -> bool:
+    return manager.state in ENDS
+
+
+def at(state: State):
+    return lambda manager: manager.state is state
+
+
+def states(manager: Manager) -> list[State]:
+    return [change.state for change in manager.changes]
+
+
+@whole
+def test_all_logs_in_reach_are_taken_from_one_stop() -> None:
+    forwarder, manager = begin()
+    forwarder.run(manager, ended)
+    assert manager.state is State.DONE, manager.failure
+    assert forwarder.in_bunk == manager.tally.loaded == 2
+    assert states(manager).count(State.APPROACH) == 1 and states(manager).count(State.COLLECT) == 2
+    assert math.dist((forwarder.x_m, forwarder.y_m), (26.0, 0.0)) < 0.05
+    assert forwarder.heights_m == pytest.approx([PROFILE.carrier.arm_transport_m] * 4, abs=0.02)
+
+
+@whole
+def test_a_mission_that_has_as_many_logs_as_it_wants_ends_where_it_is() -> None:
+    forwarder, manager = begin(logs_wanted=1)
+    forwarder.run(manager, ended)
+    assert manager.state is State.DONE and forwarder.in_bunk == manager.tally.loaded == 1
+    assert forwarder.x_m < 24.0 and forwarder.speed_m_s == 0.0
+
+
+def test_the_machine_stops_at_a_log_that_its_mission_lists_before_anybody_has_seen_it() -> None:
+    listed = KnownLog(place(15.0, 4.2), bearing_deg=80.0, length_m=2.4)
+    forwarder, manager = begin((), known=(listed,), logs="listed")
+    forwarder.run(manager, at(State.CHECK))
+    (log,) = manager.outlook.field.logs
+    assert log.center_m[:2] == pytest.approx([15.0, 4.2], abs=0.01) and log.length_m == 2.4
+    assert math.atan2(log.axis[1], log.axis[0]) == pytest.approx(math.radians(10.0))
+    assert abs(float(manager.outlook.base.to_optical(log.center_m)[2]) - PROFILE.workspace.ground_z_m) < 0.3
+    forwarder, manager = begin((), known=(listed,))
+    forwarder.run(manager, ended)
+    assert State.CHECK not in states(manager), "searched for, it does not exist before it is seen"
+
+
+@pytest.mark.parametrize("keep_out", [False, True])
+def test_a_machine_that_has_left_its_fence_stands(keep_out: bool) -> None:
+    reach = (16.0, 40.0) if keep_out else (-10.0, 16.0)
+    corners = tuple(place(x, y) for x, y in ((reach[0], -9.0), (reach[1], -9.0), (reach[1], 9.0), (reach[0], 9.0)))
+    forwarder, manager = begin((), fences=(Fence(corners, keep_out),))
+    forwarder.run(manager, ended)
+    assert manager.state is State.FAILED and "the machine has left its fence by 0." in manager.failure
+    for _ in range(60):
+        forwarder.step(manager)
+    assert forwarder.speed_m_s == 0.0 and 16.4 < forwarder.x_m < 17.6
+
+
+@whole
+def test_paper_b_takes_a_log_by_the_steps_of_its_flowchart() -> None:
+    forwarder, manager = begin(LOGS[:1], PAPER_B)
+    forwarder.run(manager, ended)
+    assert manager.state is State.DONE and forwarder.in_bunk == 1
+    steps = "RAISE SEARCH HALT LOOK APPROACH PASS STOP CHECK LOWER COLLECT STOW RAISE SEARCH DONE"
+    assert " ".join(state.name for state in states(manager)) == steps
+
+
+@whole
+def test_paper_b_comes_back_to_a_log_that_it_came_past_while_it_went_on_to_another() -> None:
+    forwarder, manager = begin(((1, 13.0, 2.8, 0.0), (2, 17.0, -2.8, 0.0)), PAPER_B, end_m=32.0)
+    forwarder.run(manager, ended)
+    assert manager.state is State.DONE and forwarder.in_bunk == manager.tally.loaded == 2
+
+
+def test_the_circle_is_left_on_its_far_side_alone() -> None:
+    forwarder, manager = begin((), PAPER_B)
+    forwarder.run(manager, at(State.SEARCH))
+    outlook = manager.outlook
+    for away_m, inside, past in ((5.4, False, False), (5.2, True, False), (-5.2, True, False), (-5.4, False, True)):
+        log = replace(lying(1, 0.0, 0.0), center_m=outlook.base.to_base(np.array([-away_m, 0.0, 0.0])))
+        assert (outlook.in_circle(log), outlook.past(log)) == (inside, past), away_m
+    assert outlook.past(None), "a log that is gone keeps nobody waiting"
+
+
+def test_without_logs_the_machine_drives_to_the_end_and_no_further() -> None:
+    forwarder, manager = begin(())
+    forwarder.run(manager, ended)
+    assert states(manager) == [State.RAISE, State.SEARCH, State.DONE]
+    assert forwarder.driven_m == pytest.approx(26.0, abs=0.3)
+
+
+@whole
+def test_heights_of_the_mission_are_used() -> None:
+    forwarder, manager = begin(LOGS[:1], transport_height_m=0.3, loading_height_m=0.05)
+    forwarder.run(manager, at(State.SEARCH))
+    assert forwarder.heights_m == pytest.approx([0.3] * 4, abs=0.02)
+    forwarder.run(manager, at(State.COLLECT))
+    assert forwarder.heights_m == pytest.approx([0.05] * 4, abs=0.02)
+
+
+@whole
+@pytest.mark.parametrize("state", [State.SEARCH, State.APPROACH, State.LOWER, State.COLLECT])
+def test_a_stop_in_any_state_pauses_and_the_mission_goes_on_when_armed(state: State) -> None:
+    forwarder, manager = begin(LOGS[:1])
+    forwarder.run(manager, at(state))
+    forwarder.crane.mode = Mode.STOP
+    forwarder.drive = forwarder.crane.setpoint = None
+    for _ in range(60):
+        forwarder.step(manager)
+    assert manager.paused == "the controller is in STOP" and manager.state is state
+    assert forwarder.speed_m_s == 0.0 and forwarder.drive is None and forwarder.crane.setpoint is None
+    forwarder.crane.mode = Mode.ARMED
+    forwarder.run(manager, ended)
+    assert manager.state is State.DONE and forwarder.in_bunk == 1
+
+
+@whole
+def test_the_switch_to_idle_stops_the_machine_and_auto_goes_on() -> None:
+    forwarder, manager = begin(LOGS[:1])
+    forwarder.run(manager, at(State.SEARCH))
+    for _ in range(100):
+        forwarder.step(manager)
+    manager.idle()
+    driven = forwarder.driven_m
+    for _ in range(100):
+        forwarder.step(manager)
+    assert manager.paused == "the switch is at Idle" and forwarder.speed_m_s == 0.0
+    assert forwarder.driven_m - driven < 1.0
+    manager.auto()
+    forwarder.run(manager, ended)
+    assert manager.state is State.DONE and forwarder.in_bunk == 1
+
+
+def test_in_single_step_every_change_waits_for_the_operator() -> None:
+    forwarder, manager = begin(LOGS[:1])
+    manager.single_step = True
+    for _ in range(40):
+        forwarder.step(manager)
+    assert manager.state is State.IDLE
+    for wanted in (State.RAISE, State.SEARCH):
+        manager.step_on()
+        forwarder.run(manager, at(wanted), 30.0)
+        for _ in range(20):
+            forwarder.step(manager)
+        assert manager.state is wanted
+
+
+@whole
+def test_in_single_step_nothing_that_comes_about_is_lost_while_the_operator_thinks() -> None:
+    forwarder, manager = begin(LOGS[:1])
+    manager.single_step = True
+    while not ended(manager):
+        for _ in range(1200):
+            forwarder.step(manager)
+        manager.step_on()
+        forwarder.step(manager)
+        assert forwarder.crane.now_ns < 1500e9, (manager.state, manager.failure)
+    assert manager.state is State.DONE, manager.failure
+    assert manager.tally.loaded == forwarder.in_bunk == 1
+
+
+def test_abort_ends_in_words_and_the_machine_stands() -> None:
+    forwarder, manager = begin(LOGS[:1])
+    forwarder.run(manager, at(State.SEARCH))
+    for _ in range(60):
+        forwarder.step(manager)
+    manager.abort("the supervisor wants it")
+    for _ in range(60):
+        forwarder.step(manager)
+    assert manager.state is State.FAILED and manager.failure == "the supervisor wants it"
+    assert forwarder.speed_m_s == 0.0
+    manager.abort("again")
+    assert manager.failure == "the supervisor wants it"
+
+
+def test_arms_that_do_not_move_end_the_mission_with_their_sentence() -> None:
+    forwarder, manager = begin(())
+    while not ended(manager):
+        forwarder.step(manager)
+        forwarder.heights_m = [0.1] * 4
+    assert manager.failure == RULES[State.RAISE].trouble
+    assert forwarder.crane.now_ns - 5_000_000_000 < 40e9
+
+
+def test_wheels_that_do_not_turn_end_the_mission_with_a_reason() -> None:
+    forwarder, manager = begin(())
+    forwarder.run(manager, at(State.SEARCH))
+    while not ended(manager):
+        forwarder.speed_m_s = 0.0
+        forwarder.step(manager)
+        forwarder.x_m = 0.0
+    assert manager.state is State.FAILED and manager.failure
+
+
+@whole
+def test_a_log_that_slips_away_is_given_up_and_the_next_one_taken() -> None:
+    forwarder, manager = begin(((1, 15.0, 4.2, 0.0), (2, 26.0, 4.2, 0.0)), end_m=36.0)
+    forwarder.crane.slippery = 9  # three grasps in each of three tries
+    forwarder.run(manager, ended, 900.0)
+    assert manager.state is State.DONE and forwarder.in_bunk == 1
+    assert list(manager.tally.given_up) == [1] and "missed 3 times" in manager.tally.given_up[1]
+    assert manager.tally.missed == 3
+
+
+@whole
+def test_at_the_end_of_the_route_the_load_goes_to_the_landing() -> None:
+    forwarder, manager = begin(landing=(30.0, 12.0))
+    forwarder.run(manager, ended, 900.0)
+    assert manager.state is State.DONE, manager.failure
+    assert manager.tally.loaded == manager.tally.unloaded == 2 and forwarder.in_bunk == manager.tally.on_board == 0
+    assert [s.name for s in states(manager)][-7:] == ["HAUL", "SETTLE", "UNLOAD", "STOW", "RAISE", "SEARCH", "DONE"]
+    for log in forwarder.field.values():
+        assert math.dist(log.center_m[:2], (30.0, 12.0)) < 1.6
+    (load,) = manager.tally.loads
+    lay = sorted(PLANE.local(t.position.latitude_deg, t.position.longitude_deg)[:2] for t in load.logs)
+    assert lay == [pytest.approx(log[1:3], abs=0.1) for log in LOGS], "where they had lain, not where they are"
+    assert load.driven_m == pytest.approx(manager.ride.driven_m) and load.logs[0].at_ns < load.at_ns
+    assert all(t.volume_m3 == pytest.approx(math.pi * 0.125**2 * 2.0, rel=0.5) for t in load.logs)
+
+
+@whole
+def test_what_lay_in_the_bunk_before_the_mission_is_unloaded_too() -> None:
+    forwarder, manager = begin((), landing=(30.0, 12.0))
+    x, y = PROFILE.bunk.center_m
+    aboard = LogObservation(7, (x, y, PROFILE.bunk.floor_z_m + 0.15), (1.0, 0.0, 0.0), 2.0, 0.25)
+    forwarder.crane.logs = [aboard]
+    forwarder.field[7] = lying(7, 0.0, 0.0)
+    forwarder.run(manager, ended, 900.0)
+    assert manager.state is State.DONE, manager.failure
+    assert manager.tally.unloaded == 1 and manager.tally.on_board == manager.tally.loaded == forwarder.in_bunk == 0
+    assert not manager.tally.loads, "what was on board before was forwarded by somebody else"
+    assert math.dist(forwarder.field[7].center_m[:2], (30.0, 12.0)) < 1.6
+
+
+@whole
+def test_a_full_bunk_is_brought_to_the_landing_and_the_rest_of_the_route_is_searched(monkeypatch) -> None:
+    monkeypatch.setattr(Tally, "full", lambda self, _bunk, _next_m3=0.0: self.on_board >= 1)
+    logs = ((1, 15.0, 4.2, 0.0), (2, 36.0, 4.2, 0.0))
+    forwarder, manager = begin(logs, end_m=50.0, landing=(20.0, -20.0))
+    forwarder.run(manager, ended, 1800.0)
+    assert manager.state is State.DONE, manager.failure
+    assert manager.tally.unloaded == 2 and [s.name for s in states(manager)].count("HAUL") == 2
+    assert sum(load.driven_m for load in manager.tally.loads) == pytest.approx(manager.ride.driven_m, abs=60.0)
+    assert [len(load.logs) for load in manager.tally.loads] == [1, 1]
+
+
+@whole
+@pytest.mark.parametrize("table", [OURS, PAPER_B])
+def test_a_bunk_that_is_full_to_the_brim_ends_the_collecting(table, monkeypatch) -> None:
+    def place(arm, mission, grasp, logs, *held):
+        if any(lies_in(PROFILE.bunk, log) for log in logs):
+            raise BunkFull("the bunk is full")
+        return plan_place(arm, mission, grasp, logs, *held)
+
+    monkeypatch.setattr("autonomy.activity.plan_place", place)
+    forwarder, manager = begin((*LOGS, (3, 40.0, 4.2, 0.0)), table, end_m=50.0)
+    forwarder.run(manager, ended, 900.0)
+    assert manager.state is State.DONE, (manager.failure, states(manager)[-6:])
+    assert forwarder.in_bunk == manager.tally.loaded == 1
+    assert manager.tally.missed == 1 and list(manager.tally.given_up.values()) == ["the bunk is full"]
+    assert forwarder.crane.held is None
+
+
+def test_a_landing_without_room_is_refused_in_words() -> None:
+    forwarder, manager = begin((), landing=(12.0, 0.0))
+    manager.tally.on_board = 1
+    manager.ride.haul = refuse  # type: ignore[method-assign]
+    forwarder.run(manager, ended)
+    assert manager.failure == "the route cannot be driven: no room"
+
+
+def refuse(*_: object) -> None:
+    raise PathRefused("no room")
+
+
+@whole
+def test_a_grasp_that_the_controller_stops_again_and_again_is_given_up() -> None:
+    forwarder, manager = begin(LOGS[:1], PAPER_B)
+    while not ended(manager):
+        forwarder.run(manager, lambda m: ended(m) or (m.state is State.COLLECT and not m.paused))
+        for _ in range(30):
+            forwarder.step(manager)
+        if manager.state is State.COLLECT:
+            forwarder.crane.mode, forwarder.crane.setpoint = Mode.STOP, None
+            forwarder.step(manager)
+            forwarder.crane.mode = Mode.ARMED
+    assert manager.state is State.DONE and manager.tally.missed == 1
+    assert list(manager.tally.given_up.values()) == ["the controller stopped the crane 3 times"]
+
+
+def test_paper_b_drives_on_when_the_log_is_not_seen_again_at_standstill() -> None:
+    forwarder, manager = begin(LOGS[:1], PAPER_B)
+    forwarder.run(manager, at(State.LOOK))
+    forwarder.blind = {1}
+    forwarder.run(manager, ended)
+    assert manager.state is State.DONE and forwarder.in_bunk == 0
+    assert State.COLLECT not in states(manager)
+
+
+def test_the_same_inputs_give_the_same_bytes() -> None:
+    def datagrams() -> list[bytes]:
+        forwarder, manager = begin(LOGS[:1])
+        sent: list[bytes] = []
+        step = manager.step
+        manager.step = lambda *a: sent.extend(step(*a)) or []  # type: ignore[method-assign, func-returns-value]
+        for _ in range(200):
+            forwarder.step(manager)
+        return sent
+
+    assert datagrams() == datagrams()
+
+
+def test_a_route_that_cannot_be_driven_is_refused_in_words() -> None:
+    points = ((10.0, 0.0), (10.5, 0.0), (10.5, 1.0), (9.0, 1.0))
+    way = tuple(Point(*PLANE.geodetic(*p)[:2]) for p in points)
+    manager = Manager(PROFILE, profile_hash(PROFILE), ForwardingMission("test", way), plane=PLANE)
+    manager.auto()
+    forwarder = Forwarder(PROFILE, PLANE, [], (0.0, 0.0, 0.0))
+    forwarder.run(manager, ended)
+    assert manager.failure.startswith("the route cannot be driven: ")

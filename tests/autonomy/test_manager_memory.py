@@ -1,0 +1,117 @@
+"""Logs that no camera sees: where they are remembered to be, on the ground, in the grapple and in the bunk."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from autonomy.grasp.direct import is_held, lies_in, plan_grasp
+from autonomy.manager.field import Field
+from autonomy.manager.memory import EVERY_NS, Memory
+from autonomy.motion.arm import Arm
+from autonomy.phases import Phase
+from machine.load import load_profile
+from tests.autonomy.test_manager_field import base, lying, seen
+
+PROFILE = load_profile("aoro_fc8")
+ARM = Arm(PROFILE)
+HERE = base(0.0, 0.0, math.pi)
+
+
+def field_of(*places: tuple[float, float]) -> Field:
+    """A field with logs that were seen twice, 0.15 m over the ground under a base that is 1.5 m up."""
+    field = Field(PROFILE.bunk)
+    logs = [lying(i, x, y, 0.3) for i, (x, y) in enumerate(places)]
+    for k in range(2):
+        field.see(seen(logs, HERE), HERE, k)
+    return field
+
+
+class Hands:
+    """A job whose crane is where a test says; `step` makes one turn of memory."""
+
+    def __init__(self, field: Field) -> None:
+        self.memory, self.field, self.now_ns = Memory(PROFILE), field, 0
+        self.job: Any = None
+        self.load_kg, self.q = math.nan, (0.0,) * 5
+
+    def begin(self) -> None:
+        log = self.field.logs[0].observation(HERE)
+        grasp = plan_grasp(ARM, log, 0.0)
+        self.job = SimpleNamespace(grasp=grasp, phase=Phase.LOOK, rests=(0.0,) * 5)
+        self.to(grasp.pose)
+
+    def to(self, pose: Any) -> None:
+        self.q = tuple(ARM.joints(np.array([pose]))[0].tolist())
+        self.job.rests = self.q
+
+    def step(self, phase: Phase | None = None) -> tuple:
+        if phase is not None:
+            self.job.phase = phase
+        self.now_ns += EVERY_NS
+        report = SimpleNamespace(position=self.q, load_kg=self.load_kg)
+        logs = self.memory.list(self.now_ns, self.field, HERE, report, self.job)
+        assert logs is not None
+        return logs
+
+
+def test_what_lies_on_the_ground_stays_in_the_plane_while_the_machine_moves() -> None:
+    field, memory = field_of((-4.0, 3.0), (-4.0, -30.0)), Memory(PROFILE)
+    (first,) = memory.list(EVERY_NS, field, HERE, None, None) or ()
+    assert memory.list(EVERY_NS + 1, field, HERE, None, None) is None, "four times a second"
+    there = base(2.0, 1.0, math.pi)
+    (after,) = memory.list(2 * EVERY_NS, field, there, None, None) or ()
+    assert first.id == after.id == field.logs[0].number
+    assert there.to_base(np.array(after.center_m)) == pytest.approx(HERE.to_base(np.array(first.center_m)))
+
+
+def test_a_log_goes_with_the_grapple_and_stays_in_the_bunk() -> None:
+    hands = Hands(field_of((-4.0, 3.0)))
+    hands.begin()
+    grasp = hands.job.grasp
+    for phase in (Phase.LOOK, Phase.ABOVE, Phase.CLOSE, Phase.LIFT):
+        (log,) = hands.step(phase)
+        assert log.center_m == pytest.approx(grasp.log.center_m, abs=0.02)
+    hands.load_kg = 80.0
+    high = grasp.pose.at_height(grasp.pose.z_m + 1.0)
+    hands.to(high)
+    (log,) = hands.step(Phase.CARRY)
+    assert log.center_m[2] == pytest.approx(grasp.log.center_m[2] + 1.0, abs=0.02) and is_held(ARM, log, high)
+    x, y = PROFILE.bunk.center_m
+    place = ARM.over(x, y, 1.7, 2.0)
+    hands.to(place)
+    (log,) = hands.step(Phase.OPEN)
+    assert lies_in(PROFILE.bunk, log)
+    hands.to(place.at_height(1.9))
+    hands.step(Phase.DONE)
+    hands.field.remove(grasp.log.id)
+    hands.job = None
+    (aboard,) = hands.step()
+    assert aboard.center_m == pytest.approx(log.center_m) and hands.memory.aboard == 1
+
+
+def test_a_log_that_the_scale_does_not_feel_lies_where_it_was() -> None:
+    hands = Hands(field_of((-4.0, 3.0)))
+    hands.begin()
+    grasp, hands.load_kg = hands.job.grasp, 3.0
+    for phase in (Phase.CLOSE, Phase.LIFT):
+        hands.step(phase)
+    hands.to(grasp.pose.at_height(grasp.pose.z_m + 1.0))
+    hands.step()
+    (log,) = hands.step()
+    assert log.center_m == pytest.approx(grasp.log.center_m, abs=1e-6)
+    assert hands.memory.aboard == 0
+
+
+def test_without_a_scale_the_log_is_believed_to_hang() -> None:
+    hands = Hands(field_of((-4.0, 3.0)))
+    hands.begin()
+    for phase in (Phase.CLOSE, Phase.LIFT):
+        hands.step(phase)
+    hands.to(hands.job.grasp.pose.at_height(hands.job.grasp.pose.z_m + 1.0))
+    (log,) = hands.step()
+    assert log.center_m[2] > hands.job.grasp.log.center_m[2] + 0.9

@@ -1,0 +1,85 @@
+"""Every transition of both tables, and what a table must be like."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+
+from autonomy.manager.table import ENDS, EVENTS, OURS, PAPER_B, RULES, Event, Height, State, awaited, following
+
+TABLES = {"paper_b": PAPER_B, "ours": OURS}
+PAIRS = list(itertools.product(TABLES, State, Event))
+
+
+@pytest.mark.parametrize(("name", "state", "event"), PAIRS)
+def test_what_is_in_the_table_follows_and_nothing_else_can(name: str, state: State, event: Event) -> None:
+    table = TABLES[name]
+    if (state, event) in table:
+        assert following(table, state, event) is table[state, event]
+    elif event is Event.TIME_OUT:
+        assert following(table, state, event) is State.FAILED
+    else:
+        with pytest.raises(KeyError):
+            following(table, state, event)
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
+def test_every_state_is_reached_and_left(table) -> None:
+    used = {state for state, _ in table} | set(table.values())
+    reached, front = {State.IDLE}, [State.IDLE]
+    while front:
+        state = front.pop()
+        for (begin, _), end in table.items():
+            if begin is state and end not in reached:
+                reached.add(end)
+                front.append(end)
+    assert reached == used
+    assert State.DONE in reached
+    for state in used - ENDS:
+        assert awaited(table, state), state
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
+def test_nothing_leads_out_of_the_end(table) -> None:
+    assert not any(state in ENDS for state, _ in table)
+
+
+def test_every_state_and_event_is_said_in_words_and_has_an_end() -> None:
+    assert set(RULES) == set(State) and set(EVENTS) == set(Event)
+    for state, rule in RULES.items():
+        assert rule.words
+        waits = state in ENDS or state is State.IDLE
+        assert math.isinf(rule.patience_s) == waits and bool(rule.trouble) != waits
+
+
+def test_the_machine_drives_only_after_the_crane_was_brought_over_the_bunk() -> None:
+    for table in TABLES.values():
+        seen, todo = set(), [end for (begin, _), end in table.items() if begin in (State.COLLECT, State.UNLOAD)]
+        while todo:
+            if (state := todo.pop()) not in seen | {State.STOW}:
+                seen.add(state)
+                todo += [end for (begin, _), end in table.items() if begin is state]
+        assert not any(RULES[state].drives for state in seen), seen
+
+
+def test_the_crane_works_only_where_the_machine_stands_and_the_frame_was_lowered() -> None:
+    for table in TABLES.values():
+        for (begin, event), end in table.items():
+            if end is not State.STOW and RULES[end].crane and not RULES[begin].crane:  # there it has been at work
+                assert RULES[begin].height is Height.LOADING and event is Event.AT_HEIGHT
+    assert not any(rule.crane and rule.drives for rule in RULES.values())
+
+
+def test_paper_b_looks_at_standstill_and_passes_the_log_before_it_loads() -> None:
+    """Fig. 8: no way from the search to the crane leaves one of these out."""
+    for needed in (State.HALT, State.LOOK, State.APPROACH, State.CHECK, State.LOWER):
+        reached, front = {State.SEARCH}, [State.SEARCH]
+        while front:
+            state = front.pop()
+            for (begin, _), end in PAPER_B.items():
+                if begin is state and end not in reached and end is not needed:
+                    reached.add(end)
+                    front.append(end)
+        assert State.COLLECT not in reached, needed

@@ -1,0 +1,111 @@
+"""What a machine makes of a mission: lengths, times, corners, and warnings that name what is hard."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from mission_texts import FENCE, at
+
+from autonomy.missions.files import load_mission
+from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Options, Point
+from autonomy.missions.review import LOG_S, SWITCH_LEAST_M, Review, review
+from machine.carrier import turning_radius_m
+from machine.load import load_profile
+
+AORO = load_profile("aoro_fc8")
+assert AORO.carrier is not None
+CARRIER = AORO.carrier
+RADIUS = turning_radius_m(CARRIER, CARRIER.articulation_limit_rad)
+SQUARE = [(-20, -15), (20, -15), (20, 15), (-20, 15)]
+YARD = Fence(tuple(at(*c) for c in ((-60, -60), (60, -60), (60, 60), (-60, 60))))
+
+
+@dataclass(frozen=True)
+class Way:
+    """A route in metres east and north of the site."""
+
+    points: list[tuple[float, float]]
+
+    def review(self, *logs: KnownLog, fences: tuple[Fence, ...] = (YARD,), **options: object) -> Review:
+        mission = ForwardingMission(
+            "way", tuple(at(*p) for p in self.points), fences, (), logs, Options(**options)  # type: ignore[arg-type]
+        )  # fmt: skip
+        return review(mission, AORO)
+
+
+def test_paper_bs_mission_is_easy_for_its_machine() -> None:
+    mission = load_mission(Path(__file__).parents[2] / "docs" / "examples" / "paper_b.geojson").mission
+    found = review(mission, AORO)
+    assert found.length_m == pytest.approx(2 * (40 + 30 + 40 + 30) - 30, abs=0.01)
+    assert found.drive_s == pytest.approx(found.length_m / 0.639)
+    assert (found.logs, found.crane_s) == (24, 24 * LOG_S)
+    assert found.warnings == ()
+    for corner in found.corners:
+        assert math.degrees(corner.turn_rad) == pytest.approx(90.0, abs=0.01)
+        assert corner.switch_m == pytest.approx(RADIUS, abs=0.01)  # R tan(45 degrees)
+
+
+def test_a_round_has_a_corner_at_every_waypoint_and_one_way_has_none_at_its_ends() -> None:
+    assert [c.waypoint for c in Way(SQUARE).review().corners] == [1, 2]
+    assert sorted(c.waypoint for c in Way(SQUARE).review(laps=2).corners) == [0, 1, 2, 3]
+    assert Way(SQUARE[:1]).review().length_m == 0.0
+    closed = Way([*SQUARE, SQUARE[0]]).review(laps=3)
+    assert closed.length_m == pytest.approx(3 * 140.0, abs=0.01)
+
+
+def test_gentle_corners_are_switched_at_the_least_distance() -> None:
+    assert Way([(0, 0), (20, 0), (40, 5)]).review().corners[0].switch_m == SWITCH_LEAST_M
+
+
+def test_legs_too_short_for_their_corners() -> None:
+    warnings = Way([(0, 0), (30, 0), (30, 10), (0, 10)]).review().warnings
+    assert warnings == (
+        f"leg 2 to 3 is 10.0 m long and its corners need {2 * RADIUS:.1f} m at a turning radius of {RADIUS:.1f} m; "
+        "the machine will cut or overshoot them",
+    )
+    assert not Way([(0, 0), (30, 0), (30, 2 * RADIUS + 0.1), (0, 2 * RADIUS + 0.1)]).review().warnings
+
+
+def test_a_turn_on_the_spot() -> None:
+    (warning,) = Way([(0, 0), (30, 0), (0, 1)]).review().warnings
+    assert warning.startswith("waypoint 2: the route turns by 178 degrees on the spot")
+    assert f"radius of {RADIUS:.1f} m" in warning
+
+
+def test_near_the_fence_without_a_fence_and_too_fast() -> None:
+    edge = Way([(-20, -24), (20, -24)]).review(fences=(Fence(tuple(FENCE)),))
+    assert edge.warnings[0] == "waypoint 1 is 1.0 m from the fence; the machine is 2.7 m wide"
+    assert "there is no fence" in Way(SQUARE).review(fences=()).warnings[0]
+    assert "drives at most 1 m/s" in Way(SQUARE).review(speed_m_s=2.0).warnings[0]
+    assert "swing arms lift 0.6 m" in Way(SQUARE).review(transport_height_m=0.9).warnings[0]
+
+
+def test_logs_out_of_reach_and_under_the_wheels() -> None:
+    far, under, vague = KnownLog(at(0, 0)), KnownLog(at(0, -14.5)), KnownLog(at(0, -14.5), sigma_m=4.0)
+    warnings = Way(SQUARE).review(far, under, vague).warnings
+    assert warnings == (
+        "log 1 lies 15.0 m from the route; the crane reaches 9.0 m",
+        "log 2 lies on the route; the wheels would roll over it",
+    )
+    many = Way(SQUARE).review(*[far] * 20).warnings
+    assert len(many) == 6 and many[-1] == "and 15 more like the last"
+
+
+def test_how_many_logs_are_fetched() -> None:
+    logs = [KnownLog(at(0, -12), assortment=name) for name in ("a", "a", "b")]
+    assert Way(SQUARE).review(*logs).logs == 3
+    assert Way(SQUARE).review(*logs, laps=2).logs == 6  # searched for, and laid anew for every lap
+    assert Way(SQUARE).review(*logs, laps=2, logs="listed").logs == 3
+    assert Way(SQUARE).review(*logs, assortments=("a",)).logs == 2
+    assert Way(SQUARE).review(*logs, logs_wanted=1).logs == 1
+    assert Way(SQUARE).review(logs_wanted=7).logs == 7
+
+
+def test_another_country_and_a_machine_that_does_not_drive() -> None:
+    chile = ForwardingMission("", (Point(-38.0, -72.0), Point(-38.0, -72.001)), (), (), ())
+    assert "km from the site in the machine's profile" in review(chile, AORO).warnings[0]
+    with pytest.raises(ValueError, match="does not drive"):
+        review(chile, load_profile("palms_471"))

@@ -1,0 +1,249 @@
+"""Drives on the model, paper B's waypoints, how the navigator stops."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from driven_carrier import CARRIER, at
+
+from autonomy.localization.estimate import Location, Status
+from autonomy.localization.localizer import Localizer
+from autonomy.localization.plane import Plane
+from autonomy.navigation.along import Along
+from autonomy.navigation.curves import drivable
+from autonomy.navigation.navigator import LEASE_NS, MOVES_NS, OBEYS_NS, Navigator, Phase
+from autonomy.navigation.waypoints import LEAST_M, PaperB, Waypoint
+from can_dbc.setpoint import DriveSetpoint, Driving, Steering, VehicleReport, decode, encode
+from hil.experiments.navigation.model import FIRM, MUD, Ground, Individual, Vehicle, individual
+from machine.carrier import turning_radius_m
+
+# -- drives on the model
+
+
+def drive(
+    way: Along | PaperB, ground: Ground = FIRM, own: Individual | None = None, seconds: float = 120.0,
+    pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> tuple[Vehicle, Navigator, list[Location]]:  # fmt: skip
+    """A drive on the model to its end."""
+    vehicle = Vehicle(CARRIER, pose, ground, own or Individual(), 1)
+    localizer, navigator, seen = Localizer(CARRIER, vehicle.plane), Navigator(CARRIER, 7), []
+    for _ in range(round(seconds * 200)):
+        report = vehicle.step()
+        if report is None:
+            continue
+        location = localizer.step(report)
+        seen.append(location)
+        if navigator.phase is Phase.IDLE and location.status is Status.TRACKING:
+            navigator.drive(way)
+        vehicle.order(navigator.step(vehicle.now_ns, report, location))
+        if navigator.phase in (Phase.ARRIVED, Phase.STOPPED):
+            break
+    return vehicle, navigator, seen
+
+
+@pytest.mark.parametrize("ground", [FIRM, MUD], ids=["firm", "mud"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_it_stops_within_five_centimetres_of_where_it_should(ground: Ground, seed: int) -> None:
+    path = drivable([(0.0, 0.0), (12.0, 0.0), (20.0, 6.0)], CARRIER)
+    vehicle, navigator, _ = drive(Along(CARRIER, path, 9.0), ground, replace(individual(seed), main_off_m=(0.0, 0.0)))
+    assert navigator.phase is Phase.ARRIVED
+    assert vehicle.x == pytest.approx(9.0, abs=0.05) and abs(vehicle.y) < 0.08
+
+
+def test_the_last_setpoints_ask_for_no_speed() -> None:
+    """A lease may only run out in peace while the machine is told to stand."""
+    navigator, way, here = begun()
+    navigator.step(10**9, report(), here)
+    way.stop_at(1.0)
+    asked, now_ns = [], 10**9
+    while navigator.phase is Phase.DRIVING and now_ns < 9 * 10**9:
+        now_ns += 50_000_000
+        still = replace(here, stamp_ns=now_ns, speed_m_s=0.0)
+        asked.append(navigator.step(now_ns, report(speed_m_s=0.0, stamp_ns=now_ns), still))
+    assert navigator.phase is Phase.ARRIVED and asked[-1] is None
+    assert [a.speed_m_s for a in asked[:-1] if a] == [0.0] * 9
+
+
+def test_who_was_just_told_to_drive_is_told_to_stand() -> None:
+    navigator, _, here = begun()
+    asked = navigator.step(10**9, report(speed_m_s=0.0), here)
+    assert asked is not None and asked.speed_m_s > 0.0
+    navigator.pause()
+    asked = navigator.step(10**9 + 50_000_000, report(speed_m_s=0.0), here)
+    assert asked is not None and asked.speed_m_s == 0.0
+
+
+def test_the_place_to_stop_at_can_be_moved() -> None:
+    way = Along(CARRIER, drivable([(0.0, 0.0), (30.0, 0.0)], CARRIER))
+    assert way.left_m == 30.0
+    way.stop_at(4.0)
+    vehicle, navigator, _ = drive(way)
+    assert navigator.phase is Phase.ARRIVED and vehicle.x == pytest.approx(4.0, abs=0.05)
+    way.stop_at(1e9)
+    assert way.left_m == pytest.approx(26.0, abs=0.05)
+
+
+def test_paper_b_goes_from_waypoint_to_waypoint() -> None:
+    plane = Plane(CARRIER.site_lat_deg, CARRIER.site_lon_deg, 260.0)
+    places = [Waypoint(*plane.geodetic(*p)[:2]) for p in ((14.0, 0.0), (14.0, 22.0))]
+    way = PaperB(CARRIER, places)
+    vehicle, navigator, _ = drive(way)
+    assert navigator.phase is Phase.ARRIVED and way.number == 1
+    assert math.dist((vehicle.x, vehicle.y), (14.0, 22.0)) < LEAST_M + 0.5
+    assert way.switch_m(0) == pytest.approx(turning_radius_m(CARRIER, CARRIER.articulation_limit_rad), rel=0.05)
+    assert way.switch_m(1) == LEAST_M
+
+
+def report(**values: float) -> VehicleReport:
+    """A machine at the origin of the site that stands and is fine."""
+    base = VehicleReport(
+        sequence=1, profile_hash=0, stamp_ns=10**9, drive_sequence=0, driving=Driving.DRIVING, refusal=0, refused=0,
+        position_ns=10**9, latitude_deg=CARRIER.site_lat_deg, longitude_deg=CARRIER.site_lon_deg, altitude_m=260.0,
+        fix=4, satellites=19, sigma_m=0.01, heading_ns=10**9, heading_rad=0.0, yaw_rate_rad_s=0.0, motion_ns=10**9,
+        speed_m_s=0.6, articulation_rad=0.1, roll_rad=0.0, pitch_rad=0.0, heights_m=(0.35,) * 4, stale_mask=0,
+    )  # fmt: skip
+    return replace(base, **values)
+
+
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ({"latitude_deg": math.nan}, "no position"),
+        ({"position_ns": 1}, "no position"),
+        ({"heading_rad": math.nan}, "no heading"),
+        ({"heading_ns": 1}, "no heading"),
+    ],
+)
+def test_paper_b_stands_without_a_receiver(what: dict[str, float], reason: str) -> None:
+    plane = Plane(CARRIER.site_lat_deg, CARRIER.site_lon_deg)
+    way = PaperB(CARRIER, [Waypoint(*plane.geodetic(0.0, 40.0)[:2])])
+    assert way.step(report()).speed_m_s == CARRIER.cruise_speed_m_s
+    order = way.step(report(**what))
+    assert order.speed_m_s == 0.0 and reason in order.trouble
+    with pytest.raises(ValueError, match="one waypoint at least"):
+        PaperB(CARRIER, [])
+
+
+def test_a_last_waypoint_that_was_passed_is_reached() -> None:
+    plane = Plane(CARRIER.site_lat_deg, CARRIER.site_lon_deg)
+    way = PaperB(CARRIER, [Waypoint(*plane.geodetic(4.0, 10.0)[:2])])
+    assert not way.step(report()).arrived
+    lat, lon, _ = plane.geodetic(0.0, 12.0)
+    assert way.step(report(latitude_deg=lat, longitude_deg=lon)).arrived
+
+
+# -- navigator
+
+
+def begun(location: Location | None = None) -> tuple[Navigator, Along, Location]:
+    """A navigator that drives along x from the origin."""
+    navigator = Navigator(CARRIER, 7, (0.3, 0.3, 0.35, 0.35))
+    way = Along(CARRIER, drivable([(0.0, 0.0), (30.0, 0.0)], CARRIER))
+    navigator.drive(way)
+    return navigator, way, location or at(1.0, 0.0, 0.0)
+
+
+def test_every_setpoint_has_a_lease_and_survives_the_wire() -> None:
+    navigator, _, here = begun()
+    first = navigator.step(10**9, report(), here)
+    second = navigator.step(10**9 + 50_000_000, report(stamp_ns=10**9 + 50_000_000), here)
+    assert isinstance(first, DriveSetpoint) and isinstance(second, DriveSetpoint)
+    assert first.lease_ns == LEASE_NS <= 500_000_000 and second.sequence == first.sequence + 1
+    assert first.steering is Steering.ARTICULATION and first.speed_m_s > 0.0
+    assert first.heights_m == (0.3, 0.3, 0.35, 0.35)
+    assert decode(encode(first)) == first
+
+
+def test_the_front_axle_floats_while_it_drives_and_no_longer() -> None:
+    navigator, _, here = begun()
+    driven = navigator.step(10**9, report(), here)
+    assert driven is not None and (driven.float_front, driven.float_rear) == (True, False)
+    navigator.pause()
+    braked = navigator.step(2 * 10**9, report(), here)
+    assert braked is not None and not (braked.float_front or braked.float_rear)
+    navigator.holds = True
+    held = navigator.step(9 * 10**9, report(speed_m_s=0.0), here)
+    assert held is not None and not (held.float_front or held.float_rear), "while the crane works it stands firm"
+
+
+def test_pause_stands_and_resume_drives_on() -> None:
+    navigator, way, here = begun()
+    navigator.step(10**9, report(), here)
+    navigator.pause()
+    asked = navigator.step(2 * 10**9, report(), here)
+    assert navigator.phase is Phase.PAUSED and asked is not None and asked.speed_m_s == 0.0
+    assert asked.articulation_rad == pytest.approx(0.1)
+    asked = navigator.step(2_200_000_000, report(speed_m_s=0.0), here)
+    assert asked is not None and asked.speed_m_s == 0.0 and not navigator.stands  # until the brake is on
+    assert navigator.step(3 * 10**9, report(speed_m_s=0.0), here) is None  # it stands: the lease runs out
+    assert navigator.stands
+    navigator.resume()
+    asked = navigator.step(4 * 10**9, report(speed_m_s=0.0), replace(here, stamp_ns=4 * 10**9))
+    assert navigator.phase is Phase.DRIVING and asked is not None and asked.speed_m_s > 0.0
+    assert way.steer is not None and way.steer.s_m == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("here", "reason"),
+    [
+        (Location(10**9, Status.LOST, "no position from the receiver"), "not located: no position"),
+        (Location(10**9, Status.STARTING, "not enough positions that fit yet"), "not located"),
+        (at(1.0, 0.0, 0.0, covariance=np.eye(3)), "only good to 1.00 m"),
+    ],
+)
+def test_who_does_not_know_where_it_is_stands_until_told(here: Location, reason: str) -> None:
+    navigator, _, good = begun()
+    navigator.step(10**9, report(), good)
+    asked = navigator.step(2 * 10**9, report(), here)
+    assert navigator.phase is Phase.STOPPED and reason in navigator.reason
+    assert asked is not None and asked.speed_m_s == 0.0
+    navigator.step(3 * 10**9, report(), good)
+    assert navigator.phase is Phase.STOPPED  # being located again is no reason to drive on by itself
+    navigator.resume()
+    assert navigator.step(4 * 10**9, report(), good) is not None and navigator.phase is Phase.DRIVING
+
+
+def test_dead_reckoning_drives_slowly() -> None:
+    _, way, here = begun()
+    fast = way.step(here).speed_m_s
+    _, way, here = begun()
+    slow = way.step(replace(here, status=Status.DEAD_RECKONING)).speed_m_s
+    assert 0.0 < slow < 0.7 * fast
+
+
+def test_a_machine_that_is_carried_away_stops() -> None:
+    navigator, _, here = begun()
+    navigator.step(10**9, report(), here)
+    navigator.step(2 * 10**9, report(), replace(here, y_m=2.2))
+    assert navigator.phase is Phase.STOPPED and "beside the path" in navigator.reason
+
+
+def test_a_controller_that_does_not_drive_is_not_asked_for_ever() -> None:
+    navigator, _, here = begun()
+    for k in range(2):
+        navigator.step(10**9 + k * (OBEYS_NS + 1), report(driving=Driving.STANDING, refusal=512, speed_m_s=0.0), here)
+    assert navigator.phase is Phase.STOPPED and "512" in navigator.reason
+
+
+def test_wheels_that_do_not_turn_are_given_up() -> None:
+    navigator, _, here = begun()
+    for k in range(2):
+        navigator.step(10**9 + k * (MOVES_NS + 1), report(speed_m_s=0.0), here)
+    assert navigator.phase is Phase.STOPPED and "do not turn" in navigator.reason
+
+
+def test_an_unknown_articulation_sends_nothing() -> None:
+    navigator, _, here = begun()
+    navigator.stop("because")
+    assert navigator.step(10**9, report(articulation_rad=math.nan), here) is None
+    assert navigator.reason == "because"
+
+
+def test_an_articulation_past_its_end_is_asked_for_at_its_end() -> None:
+    navigator, _, here = begun()
+    navigator.stop("because")
+    asked = navigator.step(10**9, report(articulation_rad=0.7), here)
+    assert asked is not None and asked.articulation_rad == CARRIER.articulation_limit_rad

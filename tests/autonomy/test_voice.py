@@ -1,0 +1,159 @@
+"""What a mission tells: how it stands, where things lie, and never more than a datagram takes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from autonomy.jobs import ABORTED, Forwarding, OneLog
+from autonomy.manager.manager import Manager
+from autonomy.manager.outlook import ATTEMPTS
+from autonomy.manager.table import EVENTS, OURS, Event, State
+from autonomy.missions.model import Fence, ForwardingMission, Landing, Options, Point
+from can_dbc.mission_datagrams import (
+    MAX_CORNERS,
+    MAX_LOGS,
+    MAX_ROUTE,
+    Order,
+    decode_mission,
+    encode_mission,
+)
+from machine.load import profile_hash
+from tests.autonomy.forwarder_stand_in import Forwarder
+from tests.autonomy.test_jobs import begin, ordered, run
+from tests.autonomy.test_manager import LOGS, PLANE, PROFILE
+from tests.autonomy.test_manager_field import lying
+
+
+def near(place, x_m, y_m, within_m=0.15) -> bool:
+    return math.dist(PLANE.local(*place)[:2], (x_m, y_m)) < within_m
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_it_tells_where_the_machine_is_and_which_logs_it_knows() -> None:
+    forwarder, job, manager = begin(LOGS[0])
+    run(forwarder, job, lambda j: manager.state is State.APPROACH)
+    told = job.report(forwarder.crane.now_ns)
+    assert (told.name, told.state, told.words) == ("test", "APPROACH", "drives up to the log")
+    assert told.auto and not told.paused and not told.ended and told.crane == ""
+    assert near(told.route[0], 10.0, 0.0, 0.01) and near(told.route[1], 26.0, 0.0, 0.01) and not told.closed
+    assert told.here is not None and near(told.here.place, forwarder.x_m, forwarder.y_m)
+    assert told.here.heading_deg == pytest.approx(90.0 - math.degrees(forwarder.yaw_rad), abs=1.0)
+    (log,) = told.logs
+    true = next(iter(forwarder.field.values()))
+    assert (log.number,) == told.targets and near(log.place, *true.center_m[:2])
+    bearing = 90.0 - math.degrees(math.atan2(true.axis[1], true.axis[0]))
+    assert math.sin(math.radians(log.bearing_deg - bearing)) == pytest.approx(0.0, abs=0.05)
+    assert (log.length_m, log.diameter_m) == (pytest.approx(true.length_m, abs=0.05), pytest.approx(0.25, abs=0.02))
+    assert log.age_s < 1.0 and not log.given_up
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_what_the_crane_aims_at_is_its_grasp() -> None:
+    """It may begin with another log than the one that the machine stopped for."""
+    forwarder, job, manager = begin(LOGS[0], (9, LOGS[0][1], -LOGS[0][2], 0.0))
+    run(forwarder, job, lambda j: manager.activity is not None and manager.activity.grasp is not None)
+    assert manager.activity is not None and manager.activity.grasp is not None
+    (taken,) = manager.activity.grasp.logs
+    told = job.report(forwarder.crane.now_ns)
+    (aimed,) = (log for log in told.logs if log.number in told.targets)
+    assert near(aimed.place, *forwarder.base().to_base(np.array(taken.center_m))[:2])
+    assert told.crane == "moves above the log" and len(told.logs) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_orders_are_done_and_told() -> None:
+    forwarder, job, manager = begin()
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+
+    def give(number: int, order: Order) -> str:
+        refusal = job.obey(ordered(number, order))
+        told = job.report(forwarder.crane.now_ns)
+        assert (told.order, told.refusal) == (number, refusal)
+        return refusal
+
+    assert give(1, Order.PAUSE) == "" and not job.report(0).auto
+    run(forwarder, job, lambda j: forwarder.speed_m_s == 0.0)
+    assert job.report(forwarder.crane.now_ns).paused
+    assert give(2, Order.NEXT_STEP) == "nothing waits for the next step"
+    assert give(3, Order.SINGLE_STEP) == "" and job.report(0).single_step
+    assert give(4, Order.AUTO) == "" and job.report(0).auto
+    run(forwarder, job, lambda j: manager.waiting is not None)
+    assert job.report(forwarder.crane.now_ns).waits_for == EVENTS[Event.ROUTE_END] and manager.state is State.SEARCH
+    assert give(5, Order.NEXT_STEP) == ""
+    run(forwarder, job, lambda j: manager.state is State.DONE)
+    assert give(6, Order.AUTO) == "the mission has ended" and job.report(0).ended
+
+
+def test_it_speaks_before_the_machine_is_located() -> None:
+    mission = ForwardingMission("test", (Point(*PLANE.geodetic(10.0, 0.0)[:2]),))
+    manager = Manager(PROFILE, profile_hash(PROFILE), mission, OURS)
+    forwarder, job = Forwarder(PROFILE, PLANE, [], (0.0, 0.1, 0.05)), Forwarding(manager, mission)
+    assert job.report(0).here is None
+    blind = replace(forwarder.vehicle(), fix=0, latitude_deg=math.nan, heading_rad=math.nan)
+    job.step(forwarder.crane.now_ns, forwarder.crane.report(), blind, ())
+    told = job.report(forwarder.crane.now_ns)
+    assert manager.outlook.location is not None and told.here is None and told.logs == ()
+    assert told.paused.startswith("not located")
+
+
+def test_run_through_needs_no_more_steps() -> None:
+    forwarder, job, manager = begin()
+    job.obey(ordered(1, Order.SINGLE_STEP))
+    run(forwarder, job, lambda j: manager.waiting is Event.AUTO)
+    job.obey(ordered(2, Order.RUN_THROUGH))
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    assert not job.report(0).single_step
+
+
+def test_an_ordered_abort_ends_the_mission_and_says_by_whom() -> None:
+    forwarder, job, _ = begin()
+    run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
+    assert job.obey(ordered(1, Order.ABORT)) == ""
+    run(forwarder, job, lambda j: j.idle)
+    told = job.report(forwarder.crane.now_ns)
+    assert told.ended and told.failure == job.failure == ABORTED and forwarder.speed_m_s < 0.05
+
+
+def test_one_log_can_be_ended_but_has_no_mission() -> None:
+    class Crane:
+        failure = ""
+
+        def abort(self, reason: str) -> None:
+            self.failure = reason
+
+    job = OneLog(crane := Crane())  # type: ignore[arg-type]
+    assert "no mission" in job.obey(ordered(1, Order.PAUSE)) and not crane.failure
+    assert job.obey(ordered(2, Order.ABORT)) == "" and crane.failure == ABORTED
+    assert job.report(0) is None
+
+
+def test_the_longest_mission_fits_in_a_datagram() -> None:
+    corners = tuple(Point(*PLANE.geodetic(9e3 * math.cos(a), 9e3 * math.sin(a))[:2]) for a in np.linspace(0, 6, 2000))
+    mission = ForwardingMission(
+        "w" * 500, corners, tuple(Fence(corners[:50], True, '"' * 300) for _ in range(200)),
+        tuple(Landing(corners[0], "x" * 300) for _ in range(90)), options=Options(laps=3),
+    )  # fmt: skip
+    manager = Manager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE)
+    forwarder = Forwarder(PROFILE, PLANE, [], (0.0, 0.1, 0.05))
+    job = Forwarding(manager, mission)
+    for _ in range(20):
+        forwarder.step(job)  # type: ignore[arg-type]
+    for k in range(500):
+        far = lying(k, 100.0 - 0.2 * k, 3.0)
+        manager.outlook.field.known(replace(far, misses=ATTEMPTS))
+        manager.tally.given_up[k] = "ß\n" * 400
+    told = job.report(forwarder.crane.now_ns)
+    assert decode_mission(encode_mission(told, 1, 2, 3, b"key"), b"key") == (2, 3, told)
+    assert (len(told.route), len(told.logs)) == (MAX_ROUTE, MAX_LOGS) and told.closed
+    assert sum(len(f.corners) for f in told.fences) <= MAX_CORNERS
+    assert near(told.route[0], *PLANE.local(corners[0].latitude_deg, corners[0].longitude_deg)[:2])
+    assert near(told.route[-1], *PLANE.local(corners[-1].latitude_deg, corners[-1].longitude_deg)[:2])
+    assert max(math.dist(PLANE.local(*log.place)[:2], (0.0, 0.0)) for log in told.logs) < 31.0, "the nearest are told"
+    assert [g.log for g in told.given_up][-1] == 499 and told.given_up[0].reason.endswith("…")

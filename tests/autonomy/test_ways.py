@@ -1,0 +1,104 @@
+"""Whose motions the crane makes, and what is done where there is none that is clear."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autonomy.course import LEAN_M, above, carrying
+from autonomy.grasp.direct import hover_height, plan_grasp, plan_place, travel_height
+from autonomy.logs import LogObservation
+from autonomy.mission import Mission
+from autonomy.motion import ways
+from autonomy.motion.arm import Arm, Pose
+from autonomy.motion.clearance import MARGIN_M, spare
+from autonomy.motion.obstacles import Surroundings, held_log, surroundings, tree
+from autonomy.motion.paths import Blocked, plan
+from autonomy.motion.primitives import load
+from autonomy.motion.trajectory import Trajectory, travel
+from autonomy.motion.ways import AsShown, Swiftest
+from machine.load import load_profile
+
+PROFILE = load_profile("aoro_fc8")
+ARM, HIGH = Arm(PROFILE), travel_height(PROFILE)
+GROUND = PROFILE.workspace.ground_z_m
+LOG = LogObservation(0, (3.6, 3.2, GROUND + 0.12), (1.0, 0.0, 0.0), 2.0, 0.24)
+GRASP = plan_grasp(ARM, LOG, 0.0)
+PLACE = plan_place(ARM, Mission(), GRASP, [LOG])
+OVER = GRASP.pose.at_height(hover_height(PROFILE, GRASP))
+
+
+def pins(motion: Trajectory) -> np.ndarray:
+    return np.array([ARM.pose(q)[:3] for q in motion.position])
+
+
+def blocked(*_: object) -> None:
+    raise Blocked("no way is clear: so it was asked for")
+
+
+def test_ours_goes_down_to_the_log_in_one_and_with_it_into_the_bunk() -> None:
+    """On tyres to just above it: the machine leans, and the rest of the way is straight down."""
+    out = above(ARM, Swiftest(), PLACE, GRASP, [LOG])
+    back = carrying(ARM, Swiftest(), GRASP.pose, PLACE, GRASP, [LOG], hangs=False)
+    assert pins(out)[-1] == pytest.approx(GRASP.pose.at_height(GRASP.pose.z_m + LEAN_M)[:3], abs=1e-3)
+    assert pins(back)[-1] == pytest.approx(PLACE[:3], abs=1e-3)
+    assert max(out.duration_s, back.duration_s) < 10.5
+    held = held_log(ARM, GRASP.pose, LOG)
+    assert spare(ARM, back, surroundings(PROFILE), held)[0] >= -0.01
+
+
+def test_a_place_that_is_reached_from_above_alone_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    def only_high(arm: Arm, start: Pose, goal: Pose, *more: object) -> object:
+        if goal.z_m < HIGH:
+            raise Blocked("too near to the stakes")
+        return plan(arm, start, goal, *more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ways, "plan", only_high)
+    monkeypatch.setattr(ways, "spare", lambda *_: (-1.0, ""))
+    motion = carrying(ARM, Swiftest(), GRASP.pose, PLACE, GRASP, [LOG], hangs=False)
+    assert pins(motion)[-1] == pytest.approx((PLACE.slew_rad, PLACE.r_m, HIGH), abs=2e-3)
+
+
+def test_the_last_of_the_way_down_is_over_the_log() -> None:
+    pin = pins(above(ARM, Swiftest(), PLACE, GRASP, [LOG]))
+    aside = np.abs(pin[:, 1] - GRASP.pose.r_m)
+    assert np.max(aside[pin[:, 2] < GRASP.pose.z_m + 0.3]) < 0.25
+
+
+def test_among_other_logs_it_stops_above() -> None:
+    beside = LogObservation(1, (3.6, 3.55, GROUND + 0.12), (1.0, 0.0, 0.0), 2.0, 0.24)
+    gathered = GRASP.__class__(LOG, GRASP.pose, GRASP.support_z_m, 0.0, (), GROUND + 0.24)
+    out = above(ARM, Swiftest(), PLACE, gathered, [LOG, beside])
+    assert pins(out)[-1, 2] == pytest.approx(hover_height(PROFILE, gathered), abs=1e-3)
+
+
+def test_where_no_swift_way_is_clear_the_one_at_full_height_is_taken_only_if_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(ways, "plan", blocked)
+    free = Surroundings(GROUND)
+    slow = Swiftest()(ARM, PLACE, OVER, free, None, HIGH, 0.0)
+    assert slow == travel(ARM, PLACE, OVER, HIGH, 0.0)
+    x, y = (0.5 * (a + b) for a, b in zip(ARM.xy(PLACE), ARM.xy(OVER), strict=True))
+    stands = surroundings(PROFILE, trees=[tree(x, y, 0.2, GROUND)])
+    with pytest.raises(Blocked, match="so it was asked for"):
+        Swiftest()(ARM, PLACE, OVER, stands, None, HIGH, 0.0)
+
+
+def test_a_search_for_a_way_comes_to_an_end() -> None:
+    wall = [tree(2.0 + 0.3 * k, 2.2, 0.15, GROUND) for k in range(12)]
+    with pytest.raises(Blocked):
+        plan(ARM, PLACE, GRASP.pose, surroundings(PROFILE, trees=wall))
+
+
+def test_paper_bs_way_is_the_primitive_unless_it_would_touch_something() -> None:
+    shown = AsShown(load(PROFILE))
+    free = surroundings(PROFILE)
+    start = PLACE.at_height(PLACE.z_m + 0.9)
+    motion = shown(ARM, start, OVER, free, None, HIGH, 0.0)
+    assert not shown.direct and spare(ARM, motion, free)[0] >= -MARGIN_M
+    assert motion != travel(ARM, start, OVER, HIGH, 0.0)
+    z = pins(motion)[len(motion.position) // 2][2]
+    in_the_way = surroundings(PROFILE, trees=[tree(*ARM.xy(ARM.pose(motion.position[len(motion.position) // 2])), 0.1,
+                                                   GROUND, z - GROUND - 0.3)])  # fmt: skip
+    assert shown(ARM, start, OVER, in_the_way, None, HIGH, 0.0) == travel(ARM, start, OVER, HIGH, 0.0)

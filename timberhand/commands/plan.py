@@ -1,0 +1,223 @@
+"""``timberhand plan``: missions from the formats people plan with, checked, converted and drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hil.exits import Exit, Stopped
+
+if TYPE_CHECKING:
+    from autonomy.missions.features import Draft
+    from autonomy.missions.review import Review
+    from machine.profile import Profile
+
+app = typer.Typer(no_args_is_help=True, help="Plan missions: check, convert and draw GeoJSON, .plan, GPX, KML and hpr.")
+
+File = Annotated[Path, typer.Argument(metavar="FILE", help="GeoJSON, QGroundControl .plan, GPX, KML or StanForD hpr.")]
+Logs = Annotated[Path | None, typer.Option(metavar="FILE", help="Add the logs of this file, for example an hpr.")]
+Machine = Annotated[str, typer.Option(help="The machine that is to drive: a shipped profile or a TOML file.")]
+Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
+
+
+@app.command()
+def check(
+    file: File,
+    logs: Logs = None,
+    profile: Machine = "aoro_fc8",
+    strict: Annotated[bool, typer.Option("--strict", help="Warnings fail, exit code 3.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Say what FILE holds, how long it takes, and what is wrong or hard with it.
+
+    Exit code 3: the mission cannot be driven; every reason is a sentence with its line.
+
+    [bold]Examples[/bold]
+
+      timberhand plan check docs/examples/paper_b.geojson
+
+      timberhand plan check route.gpx --logs harvest.hpr --json
+    """
+    import json
+
+    from autonomy.missions.model import MissionError
+
+    machine = _machine(profile)
+    try:
+        draft, review = _read(file, logs, machine)
+    except MissionError as error:
+        if as_json:
+            typer.echo(json.dumps({"file": str(file), "problems": list(error.problems)}, indent=2))
+            raise typer.Exit(Exit.CONFIGURATION) from None
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    if as_json:
+        typer.echo(json.dumps(_facts(file, draft, review), indent=2))
+    else:
+        _show(file, draft, review)
+    if strict and review is not None and review.warnings:
+        raise typer.Exit(Exit.CONFIGURATION)
+
+
+@app.command()
+def convert(
+    file: File,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The GeoJSON to write.")],
+    logs: Logs = None,
+    as_json: Json = False,
+) -> None:
+    """Write the mission in FILE as GeoJSON, the mission's own format, in which it can be completed.
+
+    [bold]Examples[/bold]
+
+      timberhand plan convert route.plan mission.geojson
+
+      timberhand plan convert route.kml mission.geojson --logs harvest.hpr
+    """
+    import json
+
+    from autonomy.missions.files import load_mission, save_mission
+    from autonomy.missions.model import MissionError
+
+    if out.suffix.lower() not in (".geojson", ".json"):
+        raise Stopped(Exit.USAGE, f"{out}: missions are written as GeoJSON; name it {out.with_suffix('.geojson')}")
+    try:
+        draft = load_mission(file, logs=logs)
+        save_mission(out, draft.mission)
+    except MissionError as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    if as_json:
+        typer.echo(json.dumps(_facts(file, draft, None) | {"out": str(out)}, indent=2))
+        return
+    from rich.console import Console
+    from rich.markup import escape
+
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(f"[green]✔[/green] {escape(str(out))}: {escape(_contents(draft))}")
+    for note in draft.notes:
+        console.print(f"[yellow]note[/yellow] {escape(note)}")
+
+
+@app.command()
+def show(
+    file: File,
+    png: Annotated[Path, typer.Option(metavar="OUT", help="The picture to write.")],
+    logs: Logs = None,
+    profile: Machine = "aoro_fc8",
+    as_json: Json = False,
+) -> None:
+    """Draw FILE as a map in metres: route, fence, logs, landings, and where the machine turns in.
+
+    [bold]Examples[/bold]
+
+      timberhand plan show docs/examples/paper_b.geojson --png map.png
+    """
+    import json
+
+    from autonomy.missions.model import MissionError
+
+    machine = _machine(profile)
+    try:
+        draft, review = _read(file, logs, machine)
+    except MissionError as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    if png.suffix.lower() != ".png":
+        raise Stopped(Exit.USAGE, f"{png}: the map is a PNG; name it {png.with_suffix('.png')}")
+    try:
+        from timberhand.plan_map import draw
+    except ImportError:
+        raise Stopped(Exit.CONFIGURATION, "drawing needs matplotlib: pip install 'timberhand[tools]'") from None
+    try:
+        draw(draft.mission, review, png)
+    except OSError as error:
+        raise Stopped(Exit.CONFIGURATION, f"{png}: cannot be written: {error.strerror}") from None
+    typer.echo(json.dumps(_facts(file, draft, review) | {"png": str(png)}, indent=2) if as_json else str(png))
+
+
+def _machine(name: str) -> Profile:
+    """A machine that drives."""
+    from machine.load import ProfileError, load_profile
+
+    try:
+        profile = load_profile(name)
+    except ProfileError as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    if profile.carrier is None:
+        raise Stopped(Exit.CONFIGURATION, f"{profile.name} does not drive; choose a machine with a carrier")
+    return profile
+
+
+def _read(file: Path, logs: Path | None, machine: Profile) -> tuple[Draft, Review | None]:
+    """The checked mission, and what the machine will make of it if it has a route."""
+    from autonomy.missions.files import load_mission
+    from autonomy.missions.review import review
+
+    carrier = machine.carrier
+    site = None if carrier is None else (carrier.site_lat_deg, carrier.site_lon_deg)
+    draft = load_mission(file, logs=logs, site=site)
+    return draft, review(draft.mission, machine) if draft.mission.waypoints else None
+
+
+def _facts(file: Path, draft: Draft, review: Review | None) -> dict[str, Any]:
+    """Everything as plain data."""
+    from math import degrees, isfinite
+
+    mission = draft.mission
+    facts: dict[str, Any] = {
+        "file": str(file), "format": draft.format, "name": mission.name, "waypoints": len(mission.waypoints),
+        "laps": mission.options.laps, "fences": len(mission.fences), "landings": len(mission.landings),
+        "logs": len(mission.logs), "notes": draft.notes,
+    }  # fmt: skip
+    if review is not None:
+        corners = [
+            {
+                "waypoint": corner.waypoint + 1,
+                "turn_deg": round(degrees(corner.turn_rad), 1),
+                "switch_m": round(corner.switch_m, 2) if isfinite(corner.switch_m) else None,
+            }
+            for corner in review.corners
+        ]
+        facts |= {
+            "length_m": round(review.length_m, 2), "drive_s": round(review.drive_s, 1), "logs_to_fetch": review.logs,
+            "crane_s": round(review.crane_s, 1), "total_s": round(review.total_s, 1), "corners": corners,
+            "warnings": list(review.warnings),
+        }  # fmt: skip
+    return facts
+
+
+def _contents(draft: Draft) -> str:
+    """What a mission consists of, in words."""
+    mission = draft.mission
+    parts = (("waypoint", mission.waypoints), ("fence", mission.fences), ("landing", mission.landings))
+    counted = [f"{len(p)} {word}{'' if len(p) == 1 else 's'}" for word, p in (*parts, ("log", mission.logs)) if p]
+    return ", ".join(counted)
+
+
+def _show(file: Path, draft: Draft, review: Review | None) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console(soft_wrap=True, highlight=False)
+    mission = draft.mission
+    title = f" · {mission.name}" if mission.name else ""
+    console.print(f"[bold]{escape(file.name + title)}[/bold] [dim]{draft.format}[/dim]")
+    table = Table.grid(padding=(0, 2))
+    table.add_row("holds", escape(_contents(draft)))
+    if mission.logs:
+        volume = sum(log.volume_m3 or 0.0 for log in mission.logs)
+        kinds = sorted({log.species or log.assortment for log in mission.logs} - {""})
+        table.add_row("logs", escape(f"{volume:.2f} m³" + (f", {', '.join(kinds)}" if kinds else "")))
+    if review is not None:
+        laps = f" in {mission.options.laps} laps" if mission.options.laps > 1 else ""
+        table.add_row("route", f"{review.length_m:.1f} m{laps}")
+        loading = f" and {review.crane_s / 60:.1f} min of loading {review.logs} logs" if review.logs else ""
+        table.add_row("time", f"about {review.total_s / 60:.1f} min: {review.drive_s / 60:.1f} min of driving{loading}")
+    console.print(table)
+    for note in draft.notes:
+        console.print(f"[yellow]note[/yellow] {escape(note)}")
+    for warning in review.warnings if review is not None else ():
+        console.print(f"[yellow]warning[/yellow] {escape(warning)}")
+    if review is not None and not review.warnings:
+        console.print("[green]✔[/green] nothing in it is hard for this machine")

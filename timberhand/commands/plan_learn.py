@@ -1,0 +1,125 @@
+"""``timberhand plan learn`` and ``demonstrate``: motions of the crane as people show them (paper B 3.2.5)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hil.exits import Exit, Stopped
+
+
+def learn(
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="A run's directory, run.mcap, a CAN log, or demonstrations (.csv).")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The primitives to write (JSON).")],
+    profile: Annotated[str | None, typer.Option(help="The machine; by default the recorded one.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="PNG", help="A picture of demonstrated and learned.")] = None,
+    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the demonstrations found, too.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+) -> None:
+    """Learn the motions between bunk and log from a recording of somebody moving the crane.
+
+    The encoders on the bus are enough.  Show several motions, each from rest to rest, out to logs and back.
+
+    [bold]Examples[/bold]
+
+      timberhand plan learn runs/by-hand --out forwarder.json --plot learned.png
+
+      timberhand plan learn crane0.log --profile aoro_fc8 --out forwarder.json
+    """
+    import json
+
+    from autonomy.motion.dmp import DemonstrationRefused
+    from autonomy.motion.primitives import encode, learn_primitives
+    from hil.learning import draw, motions_in
+
+    machine, motions = motions_in(log, profile)
+    try:
+        primitives = learn_primitives(machine, motions)
+    except DemonstrationRefused as error:
+        raise Stopped(Exit.CONFIGURATION, f"{log}: {error}") from None
+    _write(out, encode(primitives))
+    if csv is not None:
+        from autonomy.motion.demonstration import to_text
+
+        _write(csv, to_text(machine.name, motions).encode())
+    if plot is not None:
+        draw(plot, machine, motions, primitives)
+    found = {
+        "profile": machine.name,
+        "motions": len(motions),
+        "out": primitives.out.demonstrations,
+        "back": primitives.back.demonstrations,
+        "out_s": round(primitives.out.duration_s, 2),
+        "back_s": round(primitives.back.duration_s, 2),
+    }
+    if as_json:
+        typer.echo(json.dumps(found))
+        return
+    typer.echo(
+        f"{out}: learned from {found['out']} motions out and {found['back']} back of {len(motions)} of {machine.name}, "
+        f"{primitives.out.duration_s:.1f} s and {primitives.back.duration_s:.1f} s"
+    )
+
+
+def demonstrate(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The demonstrations to write (.csv).")],
+    profile: Annotated[str, typer.Option(help="A shipped profile or a TOML file.")] = "aoro_fc8",
+    seed: Annotated[int, typer.Option(help="Chooses the places and the hand's tremor.")] = 1,
+    targets: Annotated[int, typer.Option(min=1, max=40, help="So many places are shown, out and back.")] = 6,
+    truth: Annotated[str, typer.Option(help="The plant's truth: nominal, sampled, or a TOML file.")] = "nominal",
+    record: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Keep the whole recording, too: `plan learn DIR` reads it.")
+    ] = None,
+) -> None:
+    """Let a scripted operator move the plant's crane by its hand levers, and keep the motions.
+
+    [bold]Examples[/bold]
+
+      timberhand plan demonstrate demonstrations.csv
+
+      timberhand plan demonstrate shown.csv --targets 2 --record runs/by-hand
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from autonomy.motion.demonstration import cut, to_text, track
+    from can_dbc.codec import load
+    from hil.hand_demonstration import show
+    from machine.load import ProfileError, load_profile
+    from recorder.manifest import describe
+    from recorder.recorder import Recorder, RecordingRefused
+
+    error_console = Console(stderr=True)
+    try:
+        machine = load_profile(profile)
+        buses = tuple(name for name in (machine.crane_bus, machine.machine_bus) if name)
+        recorder = Recorder(record, machine, describe(machine, buses, seed)) if record is not None else None
+        with Progress(console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
+            task = bar.add_task("motions", total=None)
+            frames = show(
+                profile,
+                seed,
+                targets,
+                truth,
+                recorder,
+                lambda done, total: bar.update(task, completed=done, total=total),
+            )
+        if recorder is not None:
+            recorder.close()
+    except (ProfileError, ValueError, RecordingRefused) as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    motions = cut(machine, track(machine, load("crane"), frames))
+    _write(out, to_text(machine.name, motions).encode())
+    typer.echo(f"{out}: {len(motions)} motions of {machine.name}")
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    except OSError as error:
+        raise Stopped(Exit.CONFIGURATION, f"{path} cannot be written ({error.strerror}); give another file") from None
