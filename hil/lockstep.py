@@ -1,32 +1,55 @@
 """The whole machine in one process on virtual time: controller, guard, planner, plant and recorder, real CAN bytes.
 
-The parts are the same pure cores that the processes of a live run wrap; only the bus (`hil.wire.core`) and the clock
-differ.  Time moves in slices of 2.5 ms; the bus delivers every frame at the end of its transmission time.  Nothing
-here reads a clock or draws a random number, so a seed gives the same bytes every time.
+The parts are the same pure cores that the processes of a live run wrap; only the buses (`hil.wire.core`) and the clock
+differ.  Time moves in slices of 1.25 ms; a bus delivers every frame at the end of its transmission time.  SYNC goes out
+its lead before each tick, so that the encoders' answers to it are in when the tick begins.  Nothing here reads a
+clock or draws a random number, so a seed gives the same bytes every time.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol
 
-from autonomy.activity import Activity
 from autonomy.logs import LogObservation
-from can_dbc import setpoint, tick_record
+from can_dbc import setpoint
+from can_dbc.canopen import Wire
 from can_dbc.frame import Frame
 from controller.config import Settings
 from controller.guard.judge import Guard
-from controller.step import Controller, Inputs, Outputs, step
+from controller.link import Link
+from controller.record import record
+from controller.step import Controller, Inputs, step
 from hil.operator import Operator
 from hil.wire.core import WireCore
 from hil.wire.inprocess import InProcessBus
 from recorder.recorder import Recorder
+from sim.detector import detect
 from sim.plant import Plant
 
-SLICE_NS: Final = 2_500_000
+SLICE_NS: Final = 1_250_000
+"""Half the SYNC lead at 200 Hz: the plant hears SYNC in one slice, and its answers cross the bus in the next."""
 CRANE_BITRATE: Final = 1_000_000
+MACHINE_BITRATE: Final = 250_000
 START_NS: Final = 1_000_000_000
 """Virtual time of the first slice; not zero, so that a forgotten "unknown" cannot pass for a time stamp."""
+
+
+class Planner(Protocol):
+    """What asks for motion; `autonomy.activity.Activity` is one."""
+
+    def step(
+        self, now_ns: int, report: setpoint.StateReport | None, logs: tuple[LogObservation, ...]
+    ) -> bytes | list[bytes] | None:
+        """The datagrams to send now, or None."""
+
+
+class Eyes(Protocol):
+    """What sees the logs; `autonomy.eyes.Eyes` does."""
+
+    def look(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
+        """The logs seen with the joints there [rad, m]; None when there is nothing new."""
 
 
 @dataclass(slots=True)
@@ -35,47 +58,65 @@ class Observer:
 
     recorder: Recorder | None = None
     on_report: list = field(default_factory=list)
+    on_vehicle: list = field(default_factory=list)
 
 
 class Lockstep:
-    """One crane, its controller, guard and planner on one virtual bus."""
+    """One machine, its controller, guard and planner on virtual buses: crane0, and mach0 where the profile has one.
+
+    Without ``eyes`` the planner is told where the logs truly lie.
+    """
 
     def __init__(
         self,
         settings: Settings,
         guard: Guard,
         plant: Plant,
-        activity: Activity,
+        activity: Planner,
         operator: Operator,
         observer: Observer,
+        eyes: Eyes | None = None,
     ) -> None:
+        profile = settings.profile
         self.now_ns = START_NS
         self.ticks = 0
         self.frames = 0
         self.report: setpoint.StateReport | None = None
-        self.core = WireCore(CRANE_BITRATE, settings.profile.crane_bus)
+        self.vehicle_report: setpoint.VehicleReport | None = None
         self.plant, self.activity, self.operator = plant, activity, operator
+        self._eyes = eyes
+        self.core = WireCore(CRANE_BITRATE, profile.crane_bus)
+        self._cores = [self.core]
+        if profile.machine_bus is not None:
+            self._cores.append(WireCore(MACHINE_BITRATE, profile.machine_bus))
         self._observer = observer
         self._settings = settings
         self._period_ns = 1_000_000_000 // settings.rate_hz
+        self._sync_lead_ns = settings.sync_lead_ns
         self._controller = Controller(settings)
         self._guard = guard
         self._inputs = Inputs()
         self._datagrams: list[bytes] = []
-        self._plant_bus = InProcessBus(self.core, "plant", tx_queue=64)
-        self._control_bus = InProcessBus(self.core, "controller")
+        self._plant_buses = {core.name: InProcessBus(core, "plant", tx_queue=64) for core in self._cores}
+        self._crane, *more = (Link(InProcessBus(core, "controller")) for core in self._cores)
+        self._machine = more[0] if self._controller.machine_bus and more else None
         self._guard_bus = InProcessBus(self.core, "guard")
-        self._listener = InProcessBus(self.core, "recorder")
+        self._listeners = [InProcessBus(core, "recorder") for core in self._cores]
         self._next_tick_ns = START_NS
+        self._sync: Wire | None = None
 
     def advance(self) -> None:
         """Move the whole system one slice on."""
         self.now_ns += SLICE_NS
-        self.core.advance(self.now_ns)
-        self._record_bus()
-        name = self.core.name
-        for _, key, data in self.plant.step(self.now_ns, [(name, f) for f in _drained(self._plant_bus)]):
-            self._plant_bus.send(key, data)
+        for core in self._cores:
+            core.advance(self.now_ns)
+        self._record_buses()
+        heard = [(name, frame) for name, bus in self._plant_buses.items() for frame in _drained(bus)]
+        for name, key, data in self.plant.step(self.now_ns, heard):
+            self._plant_buses[name].send(key, data)
+        if self._sync is not None and self.now_ns >= self._next_tick_ns - self._sync_lead_ns:
+            self._crane.bus.send(*self._sync)
+            self._sync = None
         if self.now_ns >= self._next_tick_ns:
             self._next_tick_ns = self.now_ns + self._period_ns
             self._tick()
@@ -83,21 +124,21 @@ class Lockstep:
     def _tick(self) -> None:
         for key, data in self._guard.step(self.now_ns, _drained(self._guard_bus)):
             self._guard_bus.send(key, data)
-        inputs = self._inputs
-        inputs.frames.clear()
-        self._control_bus.drain(inputs.frames)
+        inputs, machine = self._inputs, self._machine
+        self._crane.read(inputs.frames, inputs.bus)
+        if machine is not None:
+            machine.read(inputs.machine_frames, inputs.machine_bus)
         inputs.datagrams[:] = self._datagrams
         self._datagrams.clear()
-        stats = self._control_bus.stats
-        inputs.bus_state, inputs.bus_dropped = int(stats.state), stats.dropped
-        inputs.bus_refused, inputs.bus_errors = stats.refused, stats.error_frames
         outputs = step(self._controller, inputs, self.now_ns)
         self.ticks += 1
-        self.frames += len(inputs.frames)
-        for key, data in outputs.frames:
-            self._control_bus.send(key, data)
+        self.frames += len(inputs.frames) + len(inputs.machine_frames)
+        self._crane.send(outputs.frames)
+        if machine is not None:
+            machine.send(outputs.machine_frames)
+        self._sync = outputs.sync
         if self._observer.recorder:
-            self._observer.recorder.on_tick(_record(inputs, outputs, self.now_ns))
+            self._observer.recorder.on_tick(record(inputs, outputs, self.now_ns))
         report = None
         if outputs.report is not None:
             message = setpoint.decode(outputs.report, self._settings.key)
@@ -109,33 +150,39 @@ class Lockstep:
                 hook(report)
             if press := self.operator.step(report):
                 self._datagrams.append(press)
-        if asked := self.activity.step(self.now_ns, report, self._look()):
-            self._datagrams.append(asked)
+        if outputs.vehicle_report is not None:
+            vehicle = setpoint.decode(outputs.vehicle_report, self._settings.key)
+            assert isinstance(vehicle, setpoint.VehicleReport)
+            self.vehicle_report = vehicle
+            if self._observer.recorder:
+                self._observer.recorder.on_report(outputs.vehicle_report)
+            for hook in self._observer.on_vehicle:
+                hook(vehicle)
+        asked = self.activity.step(self.now_ns, report, self._look())
+        if asked:
+            self._datagrams.extend([asked] if isinstance(asked, bytes) else asked)
 
     def _look(self) -> tuple[LogObservation, ...]:
-        """The perfect detector: what lies where, as the plant knows it, four times a second."""
+        """What lies where, four times a second: through a camera, or as the plant knows it."""
         if self.ticks % (self._settings.rate_hz // 4):
             return ()
+        if self._eyes is not None:
+            return self._eyes.look(self.report.position, self.now_ns) or () if self.report else ()
         return tuple(
             LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m)
-            for i, log in enumerate(self.plant.logs())
+            for i, log in enumerate(detect(self.plant))
         )
 
-    def _record_bus(self) -> None:
-        frames = _drained(self._listener)
-        if self._observer.recorder:
-            for frame in frames:
-                self._observer.recorder.on_frame(self.core.name, frame)
+    def _record_buses(self) -> None:
+        recorder = self._observer.recorder
+        for bus in self._listeners:
+            frames = _drained(bus)
+            if recorder:
+                for frame in frames:
+                    recorder.on_frame(bus.name, frame)
 
 
 def _drained(bus: InProcessBus) -> list[Frame]:
     frames: list[Frame] = []
     bus.drain(frames)
     return frames
-
-
-def _record(inputs: Inputs, outputs: Outputs, now_ns: int) -> bytes:
-    bus = (inputs.bus_state, inputs.bus_dropped, inputs.bus_refused, inputs.bus_errors)
-    return tick_record.encode(
-        now_ns, 0, 0, 0, bus, inputs.frames, inputs.datagrams, outputs.frames, outputs.report
-    )  # fmt: skip

@@ -54,19 +54,27 @@ class Family:
     directory: Path
     children: dict[str, Child] = field(default_factory=dict)
     selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
+    environment: dict[str, str] = field(default_factory=dict)
+    """What the children get beside the harness's own variables."""
+    own_sessions: bool = True
+    """Each child in a session of its own; else in the harness's, where the scheduler has them share one weight."""
 
     def start(self, name: str, module: str, *arguments: object) -> Child:
         """Start ``python -m module arguments...`` under ``name``."""
+        return self.launch(name, sys.executable, "-m", module, *arguments)
+
+    def launch(self, name: str, *command: object) -> Child:
+        """Start a program under ``name``."""
         errors = self.directory / f"{name}.err"
         with errors.open("wb") as stderr:
             process = subprocess.Popen(
-                [sys.executable, "-m", module, *map(str, arguments)],
+                [*map(str, command)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=stderr,
-                start_new_session=True,
+                start_new_session=self.own_sessions,
                 preexec_fn=_die_with_parent,
-                env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+                env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", **self.environment},
             )
         assert process.stdout is not None
         os.set_blocking(process.stdout.fileno(), False)
@@ -117,9 +125,10 @@ class Family:
         raise Stopped(Exit.CONFIGURATION, f"{name} did not start within {seconds:.0f} s; see {name}.err")
 
     def hasten(self, name: str, priority: int) -> bool:
-        """Give a child real-time priority (SCHED_FIFO), as the hardware it stands for would have; False if refused."""
+        """Give every thread that a child has real-time priority (SCHED_FIFO); False if refused."""
         try:
-            os.sched_setscheduler(self.children[name].process.pid, os.SCHED_FIFO, os.sched_param(priority))
+            for thread in os.listdir(f"/proc/{self.children[name].process.pid}/task"):
+                os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority))
         except OSError:
             return False
         return True

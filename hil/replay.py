@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import islice, pairwise
 from pathlib import Path
@@ -19,11 +19,13 @@ from typing import Any, Final
 import msgspec
 
 from can_dbc import setpoint, tick_record
+from can_dbc.canopen import Wire
 from can_dbc.codec import Database, load, resolve
 from can_dbc.frame import describe
 from can_dbc.tick_record import RecordRefused, TickRecord
 from controller.config import ConfigError, Settings
 from controller.config import load as load_settings
+from controller.record import refill, said
 from controller.step import Controller, Inputs, step
 from hil.exits import Exit, Stopped
 from recorder.manifest import Manifest
@@ -31,6 +33,8 @@ from recorder.mcap_scan import Channel, NotMcap, Stored, scan
 from recorder.recorder import TICK
 from recorder.recover import recover, run_files
 
+_Said = tuple[Sequence[Wire], Sequence[Wire], bytes, bytes]
+"""Frames on crane0, frames on mach0, report."""
 _FIRST: Final = 64
 """Ticks from which the control rate is told."""
 
@@ -170,9 +174,11 @@ def replay(
                 "cannot follow the state over a gap"
             )
             return result
-        frames, report = _again(controller, inputs, tick)
-        if frames != tick.frames_out or report != tick.report:
-            result.difference = _difference(result.ticks, first[0], tick, frames, report, key)
+        refill(inputs, tick)
+        replayed = said(step(controller, inputs, tick.now_ns))
+        if replayed != (recorded := (tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report)):
+            at = {"tick": result.ticks, "at": _seconds(first[0], tick), "now_ns": tick.now_ns}
+            result.difference = at | _difference(recorded, replayed, key)
             return result
         result.ticks += 1
         before = tick
@@ -188,16 +194,6 @@ def _ticks(files: list[Path]) -> Iterator[TickRecord]:
         raise Stopped(
             Exit.CONFIGURATION, f"{files[0].parent}: {error}; replay it with the release that made it"
         ) from error
-
-
-def _again(controller: Controller, inputs: Inputs, tick: TickRecord) -> tuple[tuple[tuple[int, bytes], ...], bytes]:
-    inputs.frames[:] = tick.frames_in
-    inputs.datagrams[:] = tick.datagrams
-    inputs.late_ns, inputs.missed_ticks, inputs.tick_ns = tick.late_ns, tick.missed_ticks, tick.tick_ns
-    inputs.bus_state, inputs.bus_dropped = tick.bus_state, tick.bus_dropped
-    inputs.bus_refused, inputs.bus_errors = tick.bus_refused, tick.bus_errors
-    outputs = step(controller, inputs, tick.now_ns)
-    return tuple(outputs.frames), outputs.report or b""
 
 
 def _rate_hz(ticks: list[TickRecord]) -> int:
@@ -231,23 +227,17 @@ def _seconds(first: TickRecord, tick: TickRecord) -> str:
     return f"{(tick.now_ns - first.now_ns) / 1e9:.3f} s"
 
 
-def _difference(
-    index: int,
-    first: TickRecord,
-    tick: TickRecord,
-    frames: tuple[tuple[int, bytes], ...],
-    report: bytes,
-    key: bytes | None,
-) -> dict[str, Any]:
-    database = load("crane")
-    recorded = [_words(database, *frame) for frame in tick.frames_out] + _report_words(tick.report, key)
-    replayed = [_words(database, *frame) for frame in frames] + _report_words(report, key)
+def _difference(recorded: _Said, replayed: _Said, key: bytes | None) -> dict[str, list[str]]:
+    """What was said on either side, in words, without what was said on both."""
+    databases = load("crane"), load("machine")
+    lines = []
+    for crane, machine, *reports in (recorded, replayed):
+        spoken = [_words(databases[0], *frame) for frame in crane] + [_words(databases[1], *frame) for frame in machine]
+        lines.append(spoken + [line for report in reports for line in _report_words(report, key)])
+    before, now = lines
     return {
-        "tick": index,
-        "at": _seconds(first, tick),
-        "now_ns": tick.now_ns,
-        "recorded": [line for line in recorded if line not in replayed] or recorded,
-        "replayed": [line for line in replayed if line not in recorded] or replayed,
+        "recorded": [line for line in before if line not in now] or before,
+        "replayed": [line for line in now if line not in before] or now,
     }
 
 

@@ -25,6 +25,7 @@ class Summary:
     missed_ticks: int
     frames: int
     refused_setpoints: int
+    grasp: str
     directory: str
 
     @property
@@ -40,6 +41,8 @@ class Summary:
         console.print(f"{mark} {self.verdict}", highlight=False, soft_wrap=True)
         if self.failure:
             console.print(f"  the planner gave up: {self.failure}", highlight=False, soft_wrap=True)
+        if self.grasp:
+            console.print(f"  grasp: {self.grasp}", highlight=False, soft_wrap=True)
         console.print(
             f"  {self.seconds:.1f} s, {self.ticks} control ticks ({self.missed_ticks} missed), "
             f"{self.frames} frames, {self.stops} stops, {self.refused_setpoints} setpoints refused",

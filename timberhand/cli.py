@@ -13,7 +13,25 @@ import sys
 import typer
 
 from hil.exits import Stopped
-from timberhand.commands import bench, console, dbc, demo, experiment, hil, log, record, replay, sim
+from timberhand.commands import (
+    bench,
+    calibrate,
+    console,
+    dbc,
+    demo,
+    doctor,
+    experiment,
+    hil,
+    log,
+    mission,
+    plan,
+    plan_learn,
+    record,
+    replay,
+    service,
+    sim,
+    train,
+)
 
 SENTENCE = "Drives a log-loading forestry machine by itself: crane control over CAN, planning, and a physics plant."
 app = typer.Typer(
@@ -26,15 +44,23 @@ app = typer.Typer(
     "130 interrupted.",
 )
 app.command("demo")(demo.demo)
+app.command("calibrate")(calibrate.calibrate)
 app.command("experiment")(experiment.experiment)
 app.command("replay")(replay.replay)
 app.command("record")(record.record)
 app.command("console")(console.console)
+app.command("doctor")(doctor.doctor)
 app.add_typer(dbc.app, name="dbc")
 app.add_typer(log.app, name="log")
+app.add_typer(plan.app, name="plan")
+plan.app.command("learn")(plan_learn.learn)
+plan.app.command("demonstrate")(plan_learn.demonstrate)
+app.add_typer(mission.app, name="mission")
 app.add_typer(bench.app, name="bench")
 app.add_typer(hil.app, name="hil")
 app.add_typer(sim.app, name="sim")
+app.add_typer(service.app, name="service")
+app.add_typer(train.app, name="train")
 
 
 def main() -> None:

@@ -72,10 +72,14 @@ class Checkpoint:
         """The file stays, for the next run."""
         self._file.close()
 
-    def remove(self) -> None:
-        """The run is complete."""
-        self._file.close()
-        self._path.unlink()
+    def __enter__(self) -> Checkpoint:
+        return self
+
+    def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
+        """A run that is complete removes the file, one that broke off leaves it."""
+        self.close()
+        if failure is None:
+            self._path.unlink()
 
 
 def run(

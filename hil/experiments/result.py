@@ -7,20 +7,18 @@ that misses its limit on a noisy host is ``inconclusive`` instead: noise can onl
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-SOURCES: Final = ("machine", "sim", "can_dbc", "hil/experiments")
 PACKAGES: Final = ("numpy", "numba", "pybullet")
 Z_95: Final = 1.959963984540054
 
@@ -49,14 +47,19 @@ class Figure:
 
     def limit_text(self) -> str:
         """The limit in the printed unit."""
-        low, high = (None if v is None else f"{v * self.scale:.4g}" for v in (self.least, self.most))
+        low, high = (None if v is None else _digits(v * self.scale) for v in (self.least, self.most))
         if low and high:
-            return f"{low} to {high}"
+            return f"{low} to {high}" if low != high else f"exactly {low}"
         return f"at least {low}" if low else f"at most {high}" if high else ""
 
     def text(self, value: float) -> str:
         """The value in the printed unit."""
-        return f"{value * self.scale:.4g}{' ' if self.unit and self.unit != '%' else ''}{self.unit}"
+        return f"{_digits(value * self.scale)}{' ' if self.unit and self.unit != '%' else ''}{self.unit}"
+
+
+def _digits(value: float) -> str:
+    """Four digits, but a great whole number in full."""
+    return f"{value:.0f}" if value >= 1e4 and value.is_integer() else f"{value:.4g}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +107,35 @@ def judge(
     return tuple(f.name for f in failed if f.name not in open_), open_
 
 
+def judged(
+    experiment: str,
+    figures: Sequence[Figure],
+    metrics: dict[str, float],
+    *,
+    profile: str,
+    seed: int,
+    trials: int,
+    more: Mapping[str, str],
+    paper: Mapping[str, float] | None = None,
+    noisy: bool = False,
+) -> Result:
+    """The result of an experiment whose figures all have one judge; ``more`` is told beside the host's environment."""
+    missed, inconclusive = judge(figures, metrics, noisy)
+    return Result(
+        experiment=experiment,
+        commit=commit(),
+        profile=profile,
+        seed=seed,
+        trials=trials,
+        metrics=metrics,
+        paper=dict(paper or {}),
+        environment={**environment(), **more},
+        limits={f.name: (f.least, f.most) for f in figures if f.least is not None or f.most is not None},
+        missed=missed,
+        inconclusive=inconclusive,
+    )
+
+
 def wilson(hits: int, n: int) -> tuple[float, float]:
     """Wilson's 95 % score interval of a rate; (0, 1) for no trials."""
     if n == 0:
@@ -118,6 +150,11 @@ def rate(name: str, hits: int, n: int) -> dict[str, float]:
     """A rate and its interval as metrics."""
     low, high = wilson(hits, n)
     return {name: hits / n if n else math.nan, f"{name}_low": low, f"{name}_high": high, f"{name}_n": float(n)}
+
+
+def mean(values: Sequence[float]) -> float:
+    """Of nothing it is NaN."""
+    return sum(values) / len(values) if values else math.nan
 
 
 def commit() -> str:
@@ -157,13 +194,3 @@ def _processor() -> str:
     except OSError:
         return platform.processor()
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
-
-
-def source_hash() -> str:
-    """Of everything a trial's outcome depends on, so that a checkpoint of other code is not continued."""
-    digest = hashlib.sha256()
-    for folder in SOURCES:
-        for path in sorted((ROOT / folder).rglob("*")):
-            if path.suffix in (".py", ".toml", ".dbc", ".eds"):
-                digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]

@@ -11,11 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from hil.exits import Stopped
 from hil.experiments import pool
 from hil.experiments.plant.signals import ringing
 from hil.experiments.pool import Checkpoint, Job
+from hil.experiments.registry import Options
 from hil.experiments.report import page
 from hil.experiments.result import Figure, Result, judge, rate, wilson
+from hil.experiments.trials import check_truth, checkpoint
 
 QUIET = Console(quiet=True)
 SPEED = Figure("speed", "How fast", "m/s", "With a watch.", least=2.0, clocked=True)
@@ -74,9 +77,8 @@ def test_no_trials_make_no_rate():
 def test_the_number_of_workers_changes_nothing(tmp_path):
     outcomes = []
     for workers in (1, 2):
-        checkpoint = Checkpoint(tmp_path / f"{workers}.jsonl", "run")
-        outcomes.append(pool.run(square, jobs(7), checkpoint, workers, "trials", QUIET))
-        checkpoint.close()
+        with Checkpoint(tmp_path / f"{workers}.jsonl", "run") as checkpoint:
+            outcomes.append(pool.run(square, jobs(7), checkpoint, workers, "trials", QUIET))
     one, two = outcomes
     assert list(one) == list(two) == [job.name for job in jobs(7)]
     assert [o["square"] for o in one.values()] == [o["square"] for o in two.values()]
@@ -86,17 +88,14 @@ def test_the_number_of_workers_changes_nothing(tmp_path):
 
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
     path = tmp_path / "trials.jsonl"
-    checkpoint = Checkpoint(path, "run")
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt), Checkpoint(path, "run") as checkpoint:
         pool.run(interrupted, jobs(6), checkpoint, 1, "trials", QUIET)
-    checkpoint.close()
     path.write_text(path.read_text() + '["square/5", {"squ')  # cut off while writing
-    again = Checkpoint(path, "run")
-    assert sorted(again.done) == ["square/0", "square/1", "square/2"]
     ran = []
-    outcomes = pool.run(lambda job: ran.append(job.seed) or square(job), jobs(6), again, 1, "trials", QUIET)
+    with Checkpoint(path, "run") as again:
+        assert sorted(again.done) == ["square/0", "square/1", "square/2"]
+        outcomes = pool.run(lambda job: ran.append(job.seed) or square(job), jobs(6), again, 1, "trials", QUIET)
     assert ran == [3, 4, 5] and [o["square"] for o in outcomes.values()] == [0, 1, 4, 9, 16, 25]
-    again.remove()
     assert not path.exists()
 
 
@@ -107,6 +106,27 @@ def test_a_checkpoint_of_another_run_is_not_taken(tmp_path):
     first.close()
     assert Checkpoint(path, "one").done == {"square/0": 0}
     assert Checkpoint(path, "two").done == {}
+
+
+def test_a_run_with_another_truth_begins_anew(tmp_path):
+    truth = tmp_path / "truth.toml"
+    truth.write_text("a = 1")
+    options = Options(seed=1, truth=str(truth), profile="palms_471", out=tmp_path / "run")
+
+    def begun() -> Checkpoint:
+        return checkpoint(options, jobs(2), ["palms_471"], options.truth)
+
+    first = begun()
+    first.add("square/0", 0)
+    first.close()
+    assert begun().done == {"square/0": 0}
+    truth.write_text("a = 2")
+    assert begun().done == {}
+
+
+def test_a_truth_that_is_none_stops_before_any_trial(tmp_path):
+    with pytest.raises(Stopped, match=r"none\.toml"):
+        check_truth("palms_471", str(tmp_path / "none.toml"))
 
 
 def test_an_error_says_which_trial(tmp_path):

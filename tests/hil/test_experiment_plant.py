@@ -15,6 +15,8 @@ from hil.experiments.pool import Job
 from hil.experiments.registry import EXPERIMENTS, Options, load
 from timberhand.cli import app
 
+pytestmark = pytest.mark.computed
+
 COMMON = {"profile": "palms_471", "truth": "nominal", "quick": True}
 
 
@@ -55,6 +57,7 @@ def test_a_circle_is_found_from_an_arc():
     assert centre == pytest.approx((3.0, -2.0), abs=1e-6) and radius == pytest.approx(6.3, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_log_is_lifted_and_laid_into_the_bunk():
     t = grasp("single", 100_001)
     assert t["held"] == t["raised"] == t["in_bunk"] == 1
@@ -71,6 +74,7 @@ def test_the_oil_spring_has_its_closed_form_frequency():
     assert physics.cylinder_spring(Job("cylinder", "cylinder", 1, COMMON))["metrics"]["cylinder_hz_error"] < 0.02
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_grasp():
     jobs = [Job("repeat", "repeat", seed, {**COMMON, "scene": "single", "logs": 1}) for seed in (1, 1, 2)]
     first, same, other = map(endurance.fingerprint, jobs)

@@ -14,11 +14,11 @@ from hil.exits import Exit
 from hil.replay import files_of, replay
 from hil.summary import Summary
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.computed]
 
 
-def job(seed: int, directory: Path, limit_s: float = 120.0) -> Summary:
-    return run_lockstep("palms_471", seed, "nominal", directory, limit_s, Console(file=io.StringIO()))
+def job(seed: int, directory: Path, limit_s: float = 120.0, machine: str = "palms_471") -> Summary:
+    return run_lockstep(machine, seed, "nominal", directory, limit_s, Console(file=io.StringIO()))
 
 
 def digest(directory: Path) -> dict[str, str]:
@@ -30,10 +30,17 @@ def test_the_log_gets_into_the_bunk_and_the_record_replays(tmp_path: Path) -> No
     assert summary.in_bunk, summary.verdict
     assert summary.exit is Exit.FINE
     assert summary.stops == 0
+    assert summary.grasp.startswith("1 log (0) of 1 at once, ")
     assert (tmp_path / "run" / "crane0.log").read_text().count("\n") > 50_000
     result = replay(files_of(tmp_path / "run"))
     assert result.agrees, result
     assert result.ticks == summary.ticks
+
+
+def test_the_machine_on_wheels_loads_its_log_at_the_height_it_drives_at(tmp_path: Path) -> None:
+    summary = job(104, tmp_path / "run", machine="aoro_fc8")
+    assert summary.in_bunk, summary.verdict
+    assert (summary.exit, summary.stops) == (Exit.FINE, 0)
 
 
 def test_one_seed_leaves_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from can_dbc import setpoint, tick_record
 from can_dbc.codec import load
 from can_dbc.frame import Frame
 from controller.config import load as load_settings
+from controller.record import record
 from controller.step import Controller, Inputs, step
 from hil.exits import Exit, Stopped
 from hil.replay import contents, files_of, manifest_of, replay
@@ -52,20 +54,16 @@ def tick_records(ticks: int = TICKS) -> list[bytes]:
     for k in range(ticks):
         now_ns = inputs_of(k, inputs)
         out = step(controller, inputs, now_ns)
-        records.append(
-            tick_record.encode(
-                now_ns, inputs.late_ns, 0, 0, (0, 0, 0, 0), inputs.frames, inputs.datagrams, out.frames, out.report
-            )
-        )
+        records.append(record(inputs, out, now_ns))
     return records
 
 
 RECORDS = tick_records()
 
 
-def keep(directory: Path, records: list[bytes], **manifest) -> Path:
-    fields = describe(PROFILE, ("crane0",), seed=1)
-    recorder = Recorder(directory, PROFILE, recorder_module.msgspec.structs.replace(fields, **manifest))
+def keep(directory: Path, records: list[bytes], machine=PROFILE, **manifest) -> Path:
+    fields = describe(machine, ("crane0",), seed=1)
+    recorder = Recorder(directory, machine, recorder_module.msgspec.structs.replace(fields, **manifest))
     for data in records:
         recorder.on_tick(data)
     recorder.close()
@@ -74,11 +72,7 @@ def keep(directory: Path, records: list[bytes], **manifest) -> Path:
 
 def again(data: bytes, **changes) -> bytes:
     """A tick record with some of its fields changed."""
-    t = replace(tick_record.decode(data), **changes)
-    bus = (t.bus_state, t.bus_dropped, t.bus_refused, t.bus_errors)
-    return tick_record.encode(
-        t.now_ns, t.late_ns, t.tick_ns, t.missed_ticks, bus, t.frames_in, t.datagrams, t.frames_out, t.report
-    )
+    return tick_record.encode(replace(tick_record.decode(data), **changes))
 
 
 def run(*arguments: object):
@@ -121,6 +115,23 @@ def test_tampered_output_is_found_and_shown_decoded(tmp_path):
     assert code == Exit.FIGURE and "tick 50 (0.250 s) differs" in text and "ValveCmdA" in text
 
 
+def test_what_was_said_on_mach0_counts_too(tmp_path):
+    aoro = load_settings("aoro_fc8")
+    controller, inputs, records = Controller(aoro), Inputs(), []
+    for k in range(20):
+        now_ns = inputs_of(k, inputs)
+        inputs.datagrams.clear()
+        records.append(record(inputs, step(controller, inputs, now_ns), now_ns))
+    assert replay(files_of(keep(tmp_path / "good", records, machine=aoro.profile))).agrees
+    at = next(k for k in range(5, 20) if tick_record.decode(records[k]).machine_frames_out)
+    (key, data), *more = tick_record.decode(records[at]).machine_frames_out
+    records[at] = again(records[at], machine_frames_out=((key, data[:6] + b"\x00" + data[7:]), *more))
+    result = replay(files_of(keep(tmp_path / "bad", records, machine=aoro.profile)))
+    assert result.difference["tick"] == at
+    assert "VehCmd" in result.difference["recorded"][0] and "Brake=0" in result.difference["recorded"][0]
+    assert "Brake=100" in result.difference["replayed"][0]
+
+
 @pytest.mark.parametrize("field", ["report", "order", "missing"])
 def test_every_part_of_the_output_counts(tmp_path, field):
     at = next(k for k in range(60, TICKS) if tick_record.decode(RECORDS[k]).report)
@@ -141,6 +152,20 @@ def test_changed_input_changes_the_output(tmp_path):
     assert replay(files_of(keep(tmp_path, records))).difference["tick"] >= stop
 
 
+def test_a_recording_of_an_older_release_is_refused_in_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(tick_record, "VERSION", 1)
+    old = keep(tmp_path, [again(data) for data in map(_as_version_1, RECORDS[:5])])
+    monkeypatch.undo()
+    code, text = run(old)
+    assert code == Exit.CONFIGURATION
+    assert "a tick record of version 1, this release reads version 2; replay it with the release" in text
+
+
+def _as_version_1(data: bytes) -> bytes:
+    body = data[:4] + (1).to_bytes(2, "little") + data[6:-4]
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
 def test_gap_is_said_and_not_followed(tmp_path):
     code, text = run(keep(tmp_path, RECORDS[:70] + RECORDS[73:]), "--json")
     result = json.loads(text)
@@ -155,12 +180,7 @@ def test_ticks_the_controller_skipped_itself_are_no_gap(tmp_path):
         now_ns = inputs_of(k, inputs)
         inputs.missed_ticks = 2 if k >= 22 else 0
         out = step(controller, inputs, now_ns)
-        records.append(
-            tick_record.encode(
-                now_ns, inputs.late_ns, 0, inputs.missed_ticks, (0, 0, 0, 0),
-                inputs.frames, inputs.datagrams, out.frames, out.report,
-            )
-        )  # fmt: skip
+        records.append(record(inputs, out, now_ns))
     assert replay(files_of(keep(tmp_path, records))).agrees
 
 

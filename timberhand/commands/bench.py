@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import typer
 
-from timberhand.commands import bench_codec, bench_plant
+from timberhand.commands import bench_bus, bench_codec, bench_loop_design, bench_motion, bench_plant
 
 app = typer.Typer(no_args_is_help=True, help="Measure: every claimed figure has the command that makes it.")
+app.command("bus")(bench_bus.bus)
 app.command("codec")(bench_codec.codec)
+app.command("loop-design")(bench_loop_design.loop_design)
 app.command("plant")(bench_plant.plant)
+app.command("motion")(bench_motion.motion)

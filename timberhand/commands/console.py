@@ -15,6 +15,9 @@ def console(
     controller: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Where commands go; without it the page only watches.")
     ] = None,
+    planner: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Where the orders to a mission go: its --order-port.")
+    ] = None,
     scene: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="A detector to ask for the logs that lie there.")
     ] = None,
@@ -23,6 +26,9 @@ def console(
         list[str] | None, typer.Option(help="A host name to serve besides this machine's own; may be repeated.")
     ] = None,
     key_file: Annotated[Path | None, typer.Option(help="File with the key of authenticated datagrams.")] = None,
+    timing: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The controller's timing page, to be shown too.")
+    ] = None,
 ) -> None:
     """Serve the page that shows the crane and stops it; STOP is also on Space and Escape.
 
@@ -39,10 +45,12 @@ def console(
             report_port=report_port,
             profile=profile,
             controller=controller,
+            planner=planner,
             scene=scene,
             bind=bind,
             allow_hosts=allow_host or (),
             key_file=key_file,
+            timing=timing,
         )
     except Refused as refused:
         raise Stopped(Exit(refused.code), str(refused)) from refused

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
@@ -13,14 +11,21 @@ from typing import Annotated
 import typer
 
 from hil.exits import Exit, Stopped
+from timberhand.commands.runs import Backend, enter_lab, new_directory
 
 
-class Backend(StrEnum):
-    """Where the frames travel."""
+class PlcRole(StrEnum):
+    """Who closes the joint loops when a PLC drives the valves."""
 
-    AUTO = "auto"
-    WIRE = "wire"
-    VCAN = "vcan"
+    REFERENCES = "references"
+    VALVES = "valves"
+
+
+class PlcLink(StrEnum):
+    """How the bridge speaks to the PLC."""
+
+    MODBUS = "modbus"
+    UDP = "udp"
 
 
 def demo(
@@ -38,6 +43,14 @@ def demo(
     console_port: Annotated[int, typer.Option(help="Port of the page on localhost.")] = 8471,
     limit_s: Annotated[float, typer.Option(help="Give up after so many seconds.")] = 300.0,
     patience: Annotated[int, typer.Option(help="How many stops the stand-in operator arms again after (live).")] = 20,
+    plc: Annotated[bool, typer.Option(help="Through a PLC on Ethernet, as on paper A's machine.")] = False,
+    plc_role: Annotated[
+        PlcRole, typer.Option(help="The PLC closes the joint loops on our references, or passes our valves on.")
+    ] = PlcRole.REFERENCES,
+    plc_link: Annotated[PlcLink, typer.Option(help="Modbus/TCP or the cyclic datagram (live).")] = PlcLink.MODBUS,
+    camera: Annotated[
+        str, typer.Option(help="See the logs through this camera of the profile instead of being told where they lie.")
+    ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")] = False,
 ) -> None:
     """A log goes from the ground into the bunk, over CAN.
@@ -51,50 +64,43 @@ def demo(
       timberhand demo --bus vcan --seed 3    live on real SocketCAN
 
       timberhand demo --lockstep --seed 3    the same job in virtual time
+
+      timberhand demo --plc                  a PLC closes the joint loops, over Modbus/TCP
+
+      timberhand demo --camera stick         the log is found by the camera on the stick
     """
     from rich.console import Console
 
     from machine.load import ProfileError, load_profile
 
-    if bus is Backend.VCAN and not lockstep and "TIMBERHAND_LAB" not in os.environ:
-        from hil.vcan_lab.__main__ import vcan
-
-        vcan([sys.executable, "-m", "timberhand", *_without_page(sys.argv[1:])])
+    if not lockstep:
+        enter_lab(bus)
     try:
-        load_profile(profile)
+        cameras = load_profile(profile).cameras
     except ProfileError as error:
         raise Stopped(Exit.CONFIGURATION, str(error)) from None
-    directory = out or _new_directory(f"{'lockstep' if lockstep else bus.value}-seed{seed}")
+    if camera and (plc or camera not in cameras):
+        known = "the emulated PLC shows no pictures" if plc else f"it has: {', '.join(cameras) or 'none'}"
+        raise Stopped(Exit.USAGE, f"--camera {camera}: {profile} has no such camera for this run; {known}")
+    directory = out or new_directory(f"{'lockstep' if lockstep else bus.value}{'-plc' if plc else ''}-seed{seed}")
+    if plc:
+        from hil.plc_profile import write_plc_profile
+
+        profile = str(write_plc_profile(profile, plc_role.value, directory))
     screen = Console(stderr=as_json)
     if lockstep:
         from hil.demo import run_lockstep
 
-        summary = run_lockstep(profile, seed, truth, directory, limit_s, screen)
+        summary = run_lockstep(profile, seed, truth, directory, limit_s, screen, camera)
     else:
         from hil.demo import run_live
 
         page = console_port if console else 0
-        summary = run_live(profile, seed, truth, bus.value, directory, page, limit_s, patience, screen)
+        summary = run_live(
+            profile, seed, truth, bus.value, directory, page, limit_s, patience, screen, plc_link.value, camera
+        )
     summary.show(screen)
     summary.save(directory / "summary.json")
     if as_json:
         print(json.dumps(asdict(summary)))
     raise typer.Exit(summary.exit)
-
-
-def _without_page(arguments: list[str]) -> list[str]:
-    """Inside user-mode Linux nobody can reach the page, so it is not started there."""
-    return arguments if "--no-console" in arguments else [*arguments, "--no-console"]
-
-
-def _new_directory(name: str) -> Path:
-    """``runs/<name>-<n>`` with the first free n, and ``runs/LAST`` pointing at it."""
-    runs = Path("runs")
-    number = 1
-    while (directory := runs / f"{name}-{number}").exists():
-        number += 1
-    runs.mkdir(exist_ok=True)
-    last = runs / "LAST"
-    last.unlink(missing_ok=True)
-    last.symlink_to(directory.name)
-    return directory

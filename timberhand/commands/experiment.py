@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,13 @@ import typer
 from hil.experiments.registry import EXPERIMENTS
 
 Name = StrEnum("Name", {name.upper().replace("-", "_"): name for name in EXPERIMENTS})
+
+
+class Bus(StrEnum):
+    """Where the frames of a live experiment travel."""
+
+    WIRE = "wire"
+    VCAN = "vcan"
 
 
 def experiment(
@@ -30,6 +38,14 @@ def experiment(
     docs: Annotated[
         Path | None, typer.Option(help="Also refresh the page, the pictures and results/NAME.json in this folder.")
     ] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="soak: how long (default: 30).")] = None,
+    repetitions: Annotated[
+        int | None, typer.Option(min=1, help="crane-accuracy: motions to every goal of a machine (default: 20).")
+    ] = None,
+    bus: Annotated[Bus, typer.Option(help="soak: vcan (in user-mode Linux if need be) or the wire.")] = Bus.WIRE,
+    data: Annotated[
+        Path | None, typer.Option(help="grasp-network: judge the shipped weights on this folder in the Cornell layout.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")] = False,
 ) -> None:
     """Run an experiment, judge its figures and write DIR/result.json with its plots.
@@ -43,6 +59,10 @@ def experiment(
       timberhand experiment plant --docs docs               the committed figures and docs/plant.md
 
       timberhand experiment plant --truth sampled --seed 7  every trial on another individual machine
+
+      timberhand experiment timing --docs docs              a quarter of an hour on a quiet machine, as root for FIFO
+
+      timberhand experiment soak --bus vcan --minutes 30    half an hour on SocketCAN
     """
     from rich.console import Console
 
@@ -50,6 +70,10 @@ def experiment(
     from hil.experiments.registry import Options, load
     from machine.load import ProfileError, load_profile
 
+    if bus is Bus.VCAN and "TIMBERHAND_LAB" not in os.environ:
+        from hil.vcan_lab.__main__ import vcan
+
+        vcan([sys.executable, "-m", "timberhand", *sys.argv[1:]])
     try:
         load_profile(profile)
     except ProfileError as error:
@@ -63,6 +87,10 @@ def experiment(
         quick=quick,
         workers=workers or len(os.sched_getaffinity(0)),
         docs=docs,
+        minutes=minutes,
+        repetitions=repetitions,
+        bus=bus.value,
+        data=data,
     )
     screen = Console(stderr=True)
     try:

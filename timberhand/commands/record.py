@@ -16,6 +16,9 @@ def record(
     tick_port: Annotated[int, typer.Option(help="UDP port of the controller's tick records.")] = 8473,
     report_port: Annotated[int, typer.Option(help="UDP port of the controller's state reports.")] = 8474,
     profile: Annotated[str, typer.Option(help="A shipped profile or a TOML file.")] = "palms_471",
+    timing: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The controller's timing page, recorded once a second.")
+    ] = None,
 ) -> None:
     """Record the buses, the controller's ticks and its reports until Ctrl-C.
 
@@ -39,5 +42,6 @@ def record(
     except BusError as error:
         raise Stopped(Exit.BUS, str(error)) from error
     arguments = ["--out", str(out), "--tick-port", str(tick_port), "--report-port", str(report_port)]
+    arguments += ["--timing", str(timing)] if timing else []
     code = main([*arguments, "--profile", profile, *(x for b in buses for x in ("--bus", b))])
     raise typer.Exit(code)

@@ -20,6 +20,8 @@ class Ground(StrEnum):
     FLAT = "flat"
     ROUGH = "rough"
     SLOPE = "slope"
+    HILL = "hill"
+    MUD = "mud"
 
 
 class Scene(StrEnum):

@@ -20,6 +20,7 @@ from sim.world import STEP_S, World
 ARM: Final = ("slew", "lift", "tilt", "ext")
 DRIVEN: Final = (*ARM, "rot")
 CLEARANCE_M: Final = 0.02  # tips over the ground; more, and they pinch a thin log instead of getting under it
+GAIN_1_S: Final = 3.0
 LINE_SPEED_M_S: Final = 0.6
 RAISE_SPEED_M_S: Final = 0.35
 REST_SHARE: Final = 0.004  # of full speed: below it the spool stays in its dead-band
@@ -48,7 +49,7 @@ class Driver:
         for name, target in self.reference.items():
             spec = self.world.profile.joints[name]
             valve = spec.valve
-            speed = rates.get(name, 0.0) + spec.law.kp_1_s * (target - self.world.q[name])
+            speed = rates.get(name, 0.0) + GAIN_1_S * (target - self.world.q[name])
             plus = speed > 0.0
             full = valve.full_speed_plus if plus else valve.full_speed_minus
             band = (valve.deadband_plus_pct if plus else valve.deadband_minus_pct) / 100.0

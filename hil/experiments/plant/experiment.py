@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
 
-from hil.exits import Exit, Stopped
 from hil.experiments import pool
 from hil.experiments.plant import bench, endurance, energy, physics, rolling, trial
 from hil.experiments.plant.figures import FIGURES, PAPER, SECTIONS
 from hil.experiments.plant.pictures import draw
-from hil.experiments.plant.worlds import carrier_profile, opened, profile_named
+from hil.experiments.plant.worlds import carrier_profile, profile_named
 from hil.experiments.pool import Job
 from hil.experiments.registry import Options
-from hil.experiments.report import refresh
-from hil.experiments.result import Figure, Result, commit, environment, judge, rate, source_hash
-from machine.load import profile_hash
+from hil.experiments.report import tell
+from hil.experiments.result import Result, judged, mean, rate
+from hil.experiments.trials import check_truth, checkpoint
 
 TRIALS: Final = 200
 QUICK_TRIALS: Final = 2
@@ -88,44 +85,22 @@ def run(options: Options, console: Console) -> Result:
     Raises:
         Stopped: the truth file or a scene cannot be used.
     """
-    try:
-        with opened(options.profile, options.truth, 0):
-            pass
-    except ValueError as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    check_truth(options.profile, options.truth)
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     jobs = plan(options, trials)
-    checkpoint = pool.Checkpoint(options.out / "trials.jsonl", _fingerprint(options, jobs))
-    try:
-        outcomes = pool.run(perform, jobs, checkpoint, options.workers, "plant trials", console)
-    finally:
-        checkpoint.close()
-    metrics, traces = gather(outcomes)
-    metrics["repeat_equal"] = float(_repeats(options))
-    speed, noisy, costs = bench.measure(options.profile, options.truth, options.quick, console)
-    metrics |= speed
-    traces |= costs
-    missed, inconclusive = judge(FIGURES, metrics, noisy)
-    result = Result(
-        experiment="plant",
-        commit=commit(),
-        profile=profile_named(options.profile).name,
-        seed=options.seed,
-        trials=trials,
-        metrics=metrics,
-        paper=PAPER,
-        environment={**environment(), "truth": options.truth},
-        limits={f.name: (f.least, f.most) for f in FIGURES if f.least is not None or f.most is not None},
-        missed=missed,
-        inconclusive=inconclusive,
-    )
-    options.out.mkdir(parents=True, exist_ok=True)
-    draw(metrics, traces, options.out)
-    result.save(options.out / "result.json")
-    checkpoint.remove()
-    show(result, console)
-    if options.docs is not None:
-        refresh(result, "The plant, measured", INTRODUCTION, SECTIONS, options.out, options.docs)
+    with checkpoint(options, jobs, [options.profile], options.truth) as kept:
+        outcomes = pool.run(perform, jobs, kept, options.workers, "plant trials", console)
+        metrics, traces = gather(outcomes)
+        metrics["repeat_equal"] = float(_repeats(options))
+        speed, noisy, costs = bench.measure(options.profile, options.truth, options.quick, console)
+        metrics |= speed
+        traces |= costs
+        result = judged(
+            "plant", FIGURES, metrics, profile=profile_named(options.profile).name, seed=options.seed, trials=trials,
+            more={"truth": options.truth}, paper=PAPER, noisy=noisy,
+        )  # fmt: skip
+        draw(metrics, traces, options.out)
+        tell(result, "The plant, measured", INTRODUCTION, SECTIONS, options, console)
     return result
 
 
@@ -134,14 +109,6 @@ INTRODUCTION: Final = (
     "much of a machine it is. `timberhand experiment plant --docs docs` measures everything and writes the page; no "
     "number is typed."
 )
-
-
-def _fingerprint(options: Options, jobs: list[Job]) -> str:
-    """Of all that the outcomes depend on."""
-    truth = Path(options.truth)
-    parts = [repr(jobs), source_hash(), repr(profile_hash(profile_named(options.profile)))]
-    parts += [truth.read_text()] if truth.is_file() else []
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
 def _repeats(options: Options) -> bool:
@@ -183,34 +150,9 @@ def gather(outcomes: dict[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
         "log_speed_max_m_s": max((t["log_speed_m_s"] for t in good), default=math.nan),
         "log_speed_bound_max_m_s": max((t["log_speed_bound_m_s"] for t in good), default=math.nan),
         "peak_bar_max": max(t["peak_bar"] for t in (*single, *pile)),
-        "load_cell_error": _mean([abs(t["load_kg"] / t["true_load_kg"] - 1.0) for t in good]),
-        "grasp_energy_j": _mean([t["energy_j"] for t in lifted]),
-        "grasp_time_s": _mean([t["time_s"] for t in lifted]),
+        "load_cell_error": mean([abs(t["load_kg"] / t["true_load_kg"] - 1.0) for t in good]),
+        "grasp_energy_j": mean([t["energy_j"] for t in lifted]),
+        "grasp_time_s": mean([t["time_s"] for t in lifted]),
     }
     traces["good"] = [[t["penetration_m"], t["log_speed_m_s"], t["true_load_kg"], t["load_kg"]] for t in good]
     return metrics, traces
-
-
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values) if values else math.nan
-
-
-def show(result: Result, console: Console) -> None:
-    """The figures as a table for a person."""
-    for section in SECTIONS:
-        console.print(f"\n[bold]{section.title}[/bold]", highlight=False)
-        for f in section.figures:
-            if f.name in result.metrics:
-                console.print(_line(f, result), highlight=False, soft_wrap=True)
-
-
-def _line(f: Figure, result: Result) -> str:
-    mark = "[dim]·[/dim]" if not f.limit_text() else "[green]✔[/green]"
-    if f.name in result.missed:
-        mark = "[red]✘[/red]"
-    elif f.name in result.inconclusive:
-        mark = "[yellow]?[/yellow]"
-    interval = result.interval_text(f)
-    limit = f"[dim]({f.limit_text()})[/dim]" if f.limit_text() else ""
-    note = " [yellow]inconclusive: the host is too noisy[/yellow]" if f.name in result.inconclusive else ""
-    return f"{mark} {f.title}: {f.text(result.metrics[f.name])}{interval} {limit}{note}"

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 from hil.experiments.plant.bench import FIGURES as SPEED
+from hil.experiments.report import Section
 from hil.experiments.result import Figure
 
 MM, PERCENT, MPA, DEG = 1e3, 100.0, 1e-6, 57.29577951308232
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """A heading of the page: an introduction, its figures, and pictures (file name, caption)."""
-
-    title: str
-    text: str
-    figures: tuple[Figure, ...]
-    pictures: tuple[tuple[str, str], ...] = ()
 
 
 SECTIONS: Final = (

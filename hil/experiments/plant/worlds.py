@@ -43,7 +43,7 @@ def opened(
     A scene by name is an arrangement of ``sim.scene`` with so many logs.
     """
     p = profile_named(profile)
-    specs = arrangement(scene, p, _wood(profile, truth), seed, logs) if isinstance(scene, str) else scene
+    specs = arrangement(scene, p, wood_of(profile, truth), seed, logs) if isinstance(scene, str) else scene
     world = open_world(p, truth=truth, seed=seed, scene=specs, home=home)
     try:
         yield world
@@ -52,7 +52,7 @@ def opened(
 
 
 @cache
-def _wood(profile: str, truth: str) -> Any:
+def wood_of(profile: str, truth: str) -> Any:
     """What the logs of a truth are like; the same for every individual machine."""
     with opened(profile, truth, 0) as world:
         return world.truth.wood

@@ -1,0 +1,66 @@
+"""What one motion was worth, from what was seen of it: errors at rest, time, swing, quiet valves.
+
+Times in s from the begin of the reference.  The motion is over when the pin by encoder kinematics is within `NEAR_M` of
+its end and stays; it arrived when, besides, the reference is at its end.  Swing counts from the end of the reference:
+the grapple does not wait for the pin to settle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+NEAR_M: Final = 0.02
+REST_S: Final = (2.5, 3.0)
+"""After arrival: the mean of this stretch is where the crane rests."""
+SWING_S: Final = (1.0, 3.0)
+"""After the end of the reference."""
+QUIET_S: Final = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """One motion and its rest: (n,) times, (n, 3) pins [m] by encoder kinematics and in truth (crane base frame), (n,)
+    lean of the grapple against the vertical [deg]; (m,) times of valve commands and whether all were exactly zero.
+    """
+
+    time_s: np.ndarray
+    encoder_m: np.ndarray
+    true_m: np.ndarray
+    lean_deg: np.ndarray
+    command_s: np.ndarray
+    shut: np.ndarray
+
+
+def figures(trace: Trace, commanded_m: Any, goal_m: Any, reference_end_s: float) -> dict[str, Any]:
+    """Plain data: vectors [m] of the encoder error (reached less commanded), of encoders and true pin against the goal,
+    motion time [s] (None when the pin did not stay near its end), swing [deg], counts of shut and of all commands.
+    """
+    near = np.linalg.norm(trace.encoder_m - commanded_m, axis=1) <= NEAR_M
+    away = np.flatnonzero(~near)
+    ended = bool(len(near)) and bool(near[-1])
+    settled = int(away[-1]) + 1 if len(away) else 0
+    motion_s = float(trace.time_s[settled]) if ended else None
+    arrived_s = max(reference_end_s, motion_s or 0.0)
+    rest = _within(trace.time_s, arrived_s, REST_S)
+    swing = _within(trace.time_s, reference_end_s, SWING_S)
+    reached, true = trace.encoder_m[rest].mean(axis=0), trace.true_m[rest].mean(axis=0)
+    quiet = trace.shut[trace.command_s >= arrived_s + QUIET_S]
+    return {
+        "encoder_m": (reached - commanded_m).tolist(),
+        "encoder_to_goal_m": (reached - goal_m).tolist(),
+        "true_m": (true - goal_m).tolist(),
+        "motion_s": motion_s,
+        "arrived_s": arrived_s,
+        "swing_deg": float(trace.lean_deg[swing].max()),
+        "shut": int(quiet.sum()),
+        "commands": len(quiet),
+    }
+
+
+def _within(time_s: np.ndarray, from_s: float, stretch: tuple[float, float]) -> np.ndarray:
+    """Samples of a stretch after a time; the last half second of a record that is too short for it."""
+    found = (time_s >= from_s + stretch[0]) & (time_s <= from_s + stretch[1])
+    return found if found.any() else time_s >= time_s[-1] - 0.5

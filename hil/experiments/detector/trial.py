@@ -1,0 +1,92 @@
+"""One test picture: what is found in it against what is there.  Plain data out, for the pool."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+
+from autonomy.networks.weights import SHIPPED
+from autonomy.perception.detector import BoxFinder
+from autonomy.perception.instances import Instance, LogFinder
+from hil.experiments.detector.precision import Matches, box_overlaps, mask_overlaps
+from hil.experiments.detector.worlds import SIZE_PX, TestPicture, picture
+from hil.experiments.pool import Job
+from hil.training.produce import box_of
+
+SIZES: Final = {"rgbd": 2 * SIZE_PX, "whole": SIZE_PX, "half": SIZE_PX // 2, "depth": 2 * SIZE_PX}
+"""The networks judged, by the length of the largest picture they see: colour and depth at double, whole and half the
+size, and depth alone."""
+
+
+FAITHFUL: Final = "faithful"
+"""Paper B's detector in its role: colour alone, boxes alone."""
+
+
+def shipped() -> tuple[str, ...]:
+    """Which of SIZES and FAITHFUL have weights."""
+    files = {name: f"logs_{_variant(name)}" for name in SIZES} | {FAITHFUL: "log_boxes"}
+    return tuple(name for name, file in files.items() if (SHIPPED / f"{file}.safetensors").is_file())
+
+
+def _variant(name: str) -> str:
+    return "depth" if name == "depth" else "rgbd"
+
+
+@cache
+def finder(name: str) -> LogFinder:
+    """The network of a name in SIZES with its shipped weights."""
+    return LogFinder(_variant(name), size_px=SIZES[name])
+
+
+@cache
+def box_finder() -> BoxFinder:
+    """Paper B's detector with its shipped weights."""
+    return BoxFinder()
+
+
+def paper_boxes(seen: TestPicture) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (N, 4) and scores (N,) that paper B's detector finds in a picture that is SIZE_PX wide."""
+    height, width = seen.rgb.shape[:2]
+    top = (SIZE_PX - height) // 2
+    square = np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8)
+    square[top : top + height, :width] = seen.rgb
+    boxes, scores = box_finder().boxes(square)
+    return boxes - (0, top, 0, top), scores
+
+
+def perform(job: Job) -> dict[str, Any]:
+    """A picture by its machine (``kind``) and number."""
+    seen = picture(job.kind, job.options["number"], job.seed, job.options["truth"])
+    masks, ignored = seen.truths()
+    boxes = np.array([box_of(m) for m in masks])
+    found = {}
+    for name in job.options["networks"]:
+        if name == FAITHFUL:
+            places, scores = paper_boxes(seen)
+            found[name] = {"scores": scores.tolist(), "boxes": box_overlaps(places, boxes).tolist()}
+            continue
+        logs = finder(name).find(seen.rgb, seen.depth_m, seen.intrinsics)
+        found[name] = {
+            "scores": [i.score for i in logs],
+            "boxes": box_overlaps(np.array([i.box_px for i in logs]), boxes).tolist(),
+            "masks": mask_overlaps([i.mask for i in logs], masks).tolist(),
+        }
+    return {
+        "machine": job.kind, "kind": seen.kind, "camera": seen.camera, "range_m": seen.range_m,
+        "ignored": ignored.tolist(), "found": found,
+    }  # fmt: skip
+
+
+def matches(outcome: dict[str, Any], name: str, by: str) -> Matches:
+    """What ``name`` found in a picture, compared ``by`` boxes or masks."""
+    found, truths = outcome["found"][name], len(outcome["ignored"])
+    overlaps = np.array(found[by], float).reshape(len(found["scores"]), truths)
+    return Matches(np.array(found["scores"]), overlaps, np.array(outcome["ignored"], bool))
+
+
+def look(machine: str, number: int, seed: int, truth: str, name: str) -> tuple[TestPicture, tuple[Instance, ...]]:
+    """A picture with what is found in it, to be drawn."""
+    seen = picture(machine, number, seed, truth)
+    return seen, finder(name).find(seen.rgb, seen.depth_m, seen.intrinsics)

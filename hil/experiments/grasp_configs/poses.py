@@ -1,0 +1,147 @@
+"""Where a grasp planner's logs come from: the plant itself, or the camera on the stick and a perception.
+
+``true``: as a detector without errors.  ``ours``: this project's perception with its own segmentation; ``masked``: the
+same with true masks.  ``faithful``: paper A's steps on our masks (bounding extents of each mask's points).  The logs
+are seen once, from where the crane stands at the start.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from autonomy.logs import LogObservation
+from autonomy.perception import paper_a
+from autonomy.perception.frame import Frame, Pose
+from autonomy.perception.mount import optical_pose
+from autonomy.perception.pipeline import Masked, Perception
+from machine.profile import Profile
+from sim.camera.rig import CameraRig
+from sim.logs import LogState
+from sim.plant import Plant
+
+CAMERA: Final = "stick"
+PICTURES: Final = 3
+LEAST_PX: Final = 60
+RATE_NS: Final = 66_666_667
+MISSED_M, MISSED_RAD, MISSED_WIDTH_M = 0.15, math.radians(8.0), 0.06
+"""A log that is seen further off than this, or more turned, or so much thicker or thinner, misleads a planner."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """The logs, and what seeing took."""
+
+    logs: tuple[LogObservation, ...]
+    seconds: float = 0.0
+
+
+def true_poses(plant: Plant, seed: int) -> Seen:
+    """What lies where, as the plant knows it."""
+    return Seen(
+        tuple(
+            LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m)
+            for i, log in enumerate(plant.logs())
+        )
+    )
+
+
+def ours(plant: Plant, seed: int) -> Seen:
+    """Three pictures of the standing camera through the whole perception."""
+    from autonomy.perception.instances import segment
+
+    return _perceived(_look(plant, seed), segment)
+
+
+def masked(plant: Plant, seed: int) -> Seen:
+    """The same, but a perfect segmentation: the masks are the renderer's."""
+    look = _look(plant, seed)
+    return _perceived(look, lambda frame: look.masks)
+
+
+def _perceived(look: Look, segment: Callable[[Frame], Sequence[Masked]]) -> Seen:
+    perception, begun = Perception(look.profile), time.perf_counter()
+    for frame in look.frames:
+        tracks = perception.step(frame, look.pose, segment(frame))
+    seconds = (time.perf_counter() - begun) / len(look.frames)
+    logs = tuple(t.estimate.observation(i) for i, t in enumerate(t for t in tracks if t.hits > 1))
+    return Seen(logs, seconds)
+
+
+def faithful(plant: Plant, seed: int) -> Seen:
+    """Paper A's way with one picture: points under each mask, their middle, main direction and extents."""
+    from autonomy.perception.instances import segment
+
+    look, begun = _look(plant, seed), time.perf_counter()
+    frame, pose = look.frames[0], look.pose
+    found = [paper_a.log_of(frame, one.mask) for one in segment(frame)]
+    logs = []
+    for log in found:
+        if log is not None and log.diameter_m > 0.0 and log.length_m > 0.0:
+            at, axis = pose.to_base(log.center_m), pose.rotation @ log.axis
+            logs.append(
+                LogObservation(len(logs), _triple(at), _triple(axis), float(log.length_m), float(log.diameter_m))
+            )
+    return Seen(tuple(logs), time.perf_counter() - begun)
+
+
+POSES: Final[dict[str, Callable[[Plant, int], Seen]]] = {
+    "true": true_poses,
+    "ours": ours,
+    "masked": masked,
+    "faithful": faithful,
+}
+
+
+def misled(truth: Sequence[LogState], seen: Sequence[LogObservation]) -> bool:
+    """Whether perception missed a log, made one up, or has one far from where it is (paper A's SE)."""
+    if len(seen) != len(truth):
+        return True
+    apart = [[math.dist(o.center_m, log.position_m) for o in seen] for log in truth]
+    for i, j in zip(*linear_sum_assignment(np.reshape(apart, (len(truth), len(seen)))), strict=True):
+        log, near = truth[i], seen[j]
+        away = np.asarray(near.center_m) - log.position_m
+        across = float(np.linalg.norm(away - (away @ np.asarray(log.axis)) * np.asarray(log.axis)))
+        turned = math.acos(min(1.0, abs(float(np.dot(near.axis, log.axis)))))
+        wide = abs(near.diameter_m - log.diameter_m)
+        if across > MISSED_M or turned > MISSED_RAD or wide > MISSED_WIDTH_M:
+            return True
+    return False
+
+
+@dataclass(frozen=True, slots=True)
+class Mask:
+    """A log's pixels (H, W) bool."""
+
+    mask: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Pictures of the standing camera, where the profile says it stands, and the true masks in them."""
+
+    profile: Profile
+    frames: tuple[Frame, ...]
+    pose: Pose
+    masks: tuple[Mask, ...]
+
+
+def _look(plant: Plant, seed: int) -> Look:
+    rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
+    pose = optical_pose(plant.profile, plant.profile.cameras[CAMERA], plant.joint_positions())
+    ids = rig.picture(CAMERA)[2].mask
+    masks = tuple(Mask(ids == i + 1) for i in range(len(plant.logs())) if np.count_nonzero(ids == i + 1) >= LEAST_PX)
+    taken = [rig.frame(CAMERA, i * RATE_NS) for i in range(PICTURES)]
+    frames = tuple(Frame(f.name, f.stamp_ns, f.rgb, f.depth_m, f.intrinsics) for f in taken)
+    return Look(plant.profile, frames, pose, masks)
+
+
+def _triple(v: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(a) for a in v)
+    return x, y, z

@@ -1,0 +1,1 @@
+"""Navigation: paper B's way and ours along four waypoints, on the machine on the bus."""

@@ -1,0 +1,93 @@
+"""What the host did meanwhile: time that the hypervisor took, pressure, load; and what kind of host it is.
+
+Sources: proc(5) for stat and loadavg, the kernel's accounting/psi.rst for pressure.  What a host does not tell is None
+or "unknown", never 0.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+_STEAL: Final = 7
+"""Place of steal in a line of /proc/stat: user nice system idle iowait irq softirq steal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Totals since boot: steal and busy time of all processors, time that somebody waited for one [us]."""
+
+    at_ns: int
+    steal_ms: float
+    pressure_us: int | None
+    load: float
+
+
+def sample() -> Sample:
+    """Now."""
+    words = _read("/proc/stat").split("\n", 1)[0].split()[1:]
+    tick_ms = 1e3 / os.sysconf("SC_CLK_TCK")
+    steal = float(words[_STEAL]) * tick_ms if len(words) > _STEAL else 0.0
+    load = os.getloadavg()[0]
+    return Sample(time.monotonic_ns(), steal, pressure_us(_read("/proc/pressure/cpu")), load)
+
+
+def pressure_us(text: str) -> int | None:
+    """The total of the line ``some`` of a pressure file."""
+    for line in text.splitlines():
+        kind, _, rest = line.partition(" ")
+        if kind == "some":
+            return int(rest.rpartition("total=")[2])
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class Meanwhile:
+    """Between two samples: seconds, steal over all processors [ms], share of time somebody waited, load at the end."""
+
+    seconds: float
+    steal_ms: float
+    pressure: float | None
+    load: float
+
+
+def between(first: Sample, last: Sample) -> Meanwhile:
+    """What happened between two samples."""
+    seconds = (last.at_ns - first.at_ns) * 1e-9
+    waited = None
+    if first.pressure_us is not None and last.pressure_us is not None:
+        waited = (last.pressure_us - first.pressure_us) * 1e-6 / seconds
+    return Meanwhile(seconds, last.steal_ms - first.steal_ms, waited, last.load)
+
+
+def describe() -> dict[str, str]:
+    """Kernel, preemption model, frequency governor, isolated processors, hypervisor, for the report's head."""
+    return {
+        "kernel": platform.release(),
+        "preemption": preemption(platform.version(), _read("/sys/kernel/debug/sched/preempt")),
+        "governor": _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").strip() or "none told",
+        "isolated": _read("/sys/devices/system/cpu/isolated").strip() or "none",
+        "clock": _read("/sys/devices/system/clocksource/clocksource0/current_clocksource").strip() or "unknown",
+        "hypervisor": "yes" if " hypervisor" in _read("/proc/cpuinfo") else "no",
+        "rt_runtime_us": _read("/proc/sys/kernel/sched_rt_runtime_us").strip() or "unknown",
+    }
+
+
+def preemption(version: str, dynamic: str) -> str:
+    """The preemption model by ``uname -v`` and, for a dynamic one, the mode in brackets of sched/preempt."""
+    for word in ("PREEMPT_RT", "PREEMPT_DYNAMIC", "PREEMPT"):
+        if word in version:
+            mode = dynamic.partition("(")[2].partition(")")[0]
+            return f"{word} ({mode})" if word == "PREEMPT_DYNAMIC" and mode else word
+    return "none"
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text()
+    except OSError:
+        return ""

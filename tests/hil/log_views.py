@@ -1,0 +1,65 @@
+"""Logs seen by the analytic renderer and its stereo noise, for the tests of perception."""
+
+import math
+from functools import cache
+
+import numpy as np
+
+from autonomy.perception.frame import Frame, Pose
+from hil.experiments.log_localization.trial import TrueMask
+from hil.experiments.plant.worlds import opened, profile_named
+from machine.optics import Intrinsics, intrinsics
+from sim.camera.geometry import View, look_at
+from sim.camera.noise import StereoNoise
+from sim.camera.render import Look, Picture, render
+from sim.camera.scene import Ground, LogPose, Scene, SceneBuilder
+
+PROFILE = profile_named("aoro_fc8")
+CAMERA = PROFILE.cameras["front"]
+PIN = intrinsics(CAMERA)
+
+
+@cache
+def camera_truth():
+    with opened("aoro_fc8", "nominal", 0) as world:
+        return world.truth.cameras["front"]
+
+
+def lying(number: int, x: float, y: float, yaw_deg: float, length: float = 2.0, diameter: float = 0.25, z: float = 0.0):
+    """A level log on the ground; 0 degrees lies along the view."""
+    yaw, r = math.radians(yaw_deg), math.sqrt(0.5)
+    c, s = math.cos(yaw / 2), math.sin(yaw / 2)
+    return LogPose(number, (x, y, z + diameter / 2), (-s * r, c * r, s * r, c * r), length, diameter)
+
+
+def scene_of(*logs: LogPose) -> Scene:
+    b = SceneBuilder(Ground.flat(), "forest")
+    for log in logs:
+        b.log(log)
+    return b.build()
+
+
+def view_from(x: float = 0.0, pin: Intrinsics = PIN) -> View:
+    """2.4 m above the ground, looking down as on the machine."""
+    return look_at((x, 0.0, 2.4), (x + 4.4, 0.0, 0.0), pin)
+
+
+def pose_of(view: View) -> Pose:
+    return Pose(view.position_m, view.rotation)
+
+
+def seen(scene: Scene, view: View) -> Picture:
+    return render(scene, view, Look())
+
+
+def frame_of(picture: Picture, view: View, number: int = 0, exact: bool = False) -> Frame:
+    """A frame with stereo's noise but without its scale error, or with exact depth."""
+    depth_m = picture.depth_m
+    if not exact:
+        noise = StereoNoise(CAMERA, camera_truth(), 1)
+        depth_m = noise.apply(picture, view.intrinsics, number) / np.float32(noise.scale)
+    return Frame("front", 66_000_000 * (number + 1), picture.rgb, depth_m, view.intrinsics)
+
+
+def masks_of(picture: Picture) -> list[TrueMask]:
+    return [TrueMask(picture.mask == i) for i in np.unique(picture.mask) if 0 < i < 1000]

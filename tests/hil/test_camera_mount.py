@@ -1,0 +1,87 @@
+"""Where the optical frame stands: from joint positions against the plant, and from a survey."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from autonomy.perception.frame import Pose
+from autonomy.perception.mount import MountRefused, optical_pose, surveyed
+from hil.experiments.plant.worlds import opened, profile_named
+from machine.optics import BODY_FROM_OPTICAL, intrinsics, rpy_matrix
+from sim.camera.geometry import mount_view, quaternion_matrix
+
+
+@pytest.mark.parametrize(
+    ("machine", "camera", "home"),
+    [
+        ("palms_471", "stick", {"slew": 0.7, "lift": 0.5, "tilt": -1.2, "ext": 0.2}),
+        ("palms_471", "d435", {}),
+        ("aoro_fc8", "front", {}),
+    ],
+)
+def test_the_chain_puts_the_camera_where_the_plant_has_it(machine: str, camera: str, home: dict[str, float]) -> None:
+    profile = profile_named(machine)
+    spec = profile.cameras[camera]
+    with opened(machine, "nominal", 1, home=home or None) as world:
+        # The column gives way under the crane's weight, which no encoder sees: here it is rigid.
+        if home:
+            world._place(home | {"flex_pitch": 0.0, "flex_roll": 0.0})
+            world._read()
+        q = [world.q[name] for name in ("slew", "lift", "tilt", "ext")]
+        bend = world.carrier.articulation_rad if world.carrier else 0.0
+        true = mount_view(world.link_poses()[spec.link], intrinsics(spec), spec.position_m, spec.rpy_rad)
+        at, turn = world.base_pose()
+    base = quaternion_matrix(turn)
+    pose = optical_pose(profile, spec, q, bend)
+    assert np.abs(base.T @ (true.position_m - at) - pose.position_m).max() < 1e-6
+    assert np.abs(base.T @ true.rotation - pose.rotation).max() < 1e-6
+
+
+def test_a_bent_carrier_turns_its_front_camera() -> None:
+    profile = profile_named("aoro_fc8")
+    q = [0.0, 1.0, -2.0, 0.0]
+    straight, bent = (optical_pose(profile, profile.cameras["front"], q, a) for a in (0.0, 0.4))
+    turned = straight.rotation.T @ bent.rotation
+    assert np.arccos((np.trace(turned) - 1.0) / 2.0) == pytest.approx(0.4)
+
+
+def test_a_camera_on_a_part_that_swings_is_refused() -> None:
+    profile = profile_named("palms_471")
+    with pytest.raises(MountRefused, match="on link 'rotator'"):
+        optical_pose(profile, replace(profile.cameras["stick"], link="rotator"), [0.0, 0.5, -1.0, 0.0])
+
+
+def targets(seed: int, wrong_m: float = 0.0):
+    """What a camera that is 3 cm and 1.5 degrees off its profile, with 0.7 % too much depth, sees of a survey."""
+    rng = np.random.default_rng(seed)
+    camera = profile_named("aoro_fc8").cameras["front"]
+    pin = intrinsics(camera)
+    body = rpy_matrix(camera.rpy_rad)
+    at = np.array(camera.position_m) + body @ (0.02, -0.02, 0.01)
+    optical = body @ rpy_matrix((0.01, -0.02, 0.015)) @ BODY_FROM_OPTICAL
+    z = rng.uniform(3.0, 8.0, 14)
+    pixels = np.stack([rng.uniform(60, 1220, 14), rng.uniform(60, 660, 14)], axis=1)
+    local = np.stack([pin.deproject(u, v, d) for (u, v), d in zip(pixels, z, strict=True)])
+    places = local @ optical.T + at + rng.normal(0.0, 0.002 + wrong_m, (14, 3))
+    return camera, pixels + rng.normal(0.0, 0.3, (14, 2)), 1.007 * z, places, at, optical
+
+
+def test_a_survey_finds_mount_and_scale() -> None:
+    link = Pose(np.zeros(3), np.eye(3))
+    camera, pixels, depths, places, at, optical = targets(1)
+    depths[3] = np.nan
+    found = surveyed(camera, link, pixels, depths, places)
+    assert np.linalg.norm(np.array(found.camera.position_m) - at) < 0.008
+    assert np.abs(rpy_matrix(found.camera.rpy_rad) @ BODY_FROM_OPTICAL - optical).max() < 0.002
+    assert found.depth_scale == pytest.approx(1.007, abs=0.001)
+
+
+def test_a_survey_that_cannot_be_is_refused() -> None:
+    link = Pose(np.zeros(3), np.eye(3))
+    camera, pixels, depths, places, _, _ = targets(2)
+    with pytest.raises(MountRefused, match="survey at least 6"):
+        surveyed(camera, link, pixels[:5], depths[:5], places[:5])
+    with pytest.raises(MountRefused, match="which target is which"):
+        surveyed(camera, link, pixels[::-1], depths, places)
+    with pytest.raises(MountRefused, match="baseline"):
+        surveyed(camera, link, pixels, 1.3 * depths, places)

@@ -1,0 +1,47 @@
+"""The plant's camera seen through the socket: the live plant draws when asked, and perception can use what comes."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from autonomy.perception.frame import check
+from autonomy.perception.sources.stream import StreamCamera
+from can_dbc.bus import open_bus
+from hil.experiments.plant.worlds import profile_named
+from sim.__main__ import LivePlant
+from sim.plant import Plant
+
+
+@pytest.mark.slow
+def test_a_live_plant_serves_its_cameras_when_they_are_asked_for() -> None:
+    profile = profile_named("palms_471")
+    plant = Plant(profile, seed=0)
+    try:
+        with open_bus("virtual:camera-stream") as bus:
+            shell = LivePlant(plant, {"crane0": bus}, None, cameras=0)
+            assert shell.cameras is not None
+            thread = threading.Thread(target=shell.run, daemon=True)
+            thread.start()
+            camera = StreamCamera(f"127.0.0.1:{shell.cameras.port}", "d435", timeout_s=1.0)
+            first = later = None
+            end = time.monotonic() + 60.0
+            while later is None and time.monotonic() < end:
+                frame = camera.frame()
+                first, later = (first, frame) if first is not None else (frame, None)
+            unknown = StreamCamera(f"127.0.0.1:{shell.cameras.port}", "rear", timeout_s=5.0)
+            assert unknown.frame() is None and "there are: stick, d435" in unknown.problem
+            unknown.close()
+            shell.stop()
+            thread.join(10.0)
+            camera.close()
+            shell.cameras.close()
+    finally:
+        plant.close()
+    assert first is not None and later is not None
+    check(first)
+    assert first.camera == "d435" and later.stamp_ns > first.stamp_ns
+    assert first.rgb.shape == (608, 608, 3) and first.rgb.max() > 60
+    assert np.nanmedian(first.depth_m) == pytest.approx(3.1, abs=0.2)
+    assert not np.array_equal(first.depth_m, later.depth_m, equal_nan=True)

@@ -1,0 +1,87 @@
+"""The detector's experiment: its worlds, its figures, its photographs."""
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from hil.exits import Exit, Stopped
+from hil.experiments.detector import experiment, photos, trial, worlds
+from hil.experiments.registry import Options
+from hil.experiments.report import page
+from hil.experiments.result import judged
+
+
+@pytest.fixture
+def few_piles(monkeypatch, tmp_path):
+    monkeypatch.setattr("hil.training.piles.CHUNK", 1)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+def test_a_test_picture_repeats_and_its_truths_are_its_logs(few_piles):
+    one = worlds.picture("palms_471", 0, 1)
+    two = worlds.picture("palms_471", 0, 1)
+    assert np.array_equal(one.rgb, two.rgb) and np.array_equal(one.depth_m, two.depth_m, equal_nan=True)
+    assert not np.array_equal(one.mask, worlds.picture("palms_471", 0, 2).mask)
+    masks, ignored = one.truths()
+    assert masks and all(m.any() for m in masks)
+    assert ignored.tolist() == [np.count_nonzero(m) < worlds.LEAST_PX for m in masks]
+    assert one.rgb.shape[:2] == one.depth_m.shape == (one.intrinsics.height_px, one.intrinsics.width_px)
+
+
+def outcome(machine, scores, boxes, ignored):
+    found = {"scores": scores, "boxes": boxes, "masks": boxes}
+    return {"machine": machine, "ignored": ignored, "found": {"rgbd": found}}
+
+
+def test_figures_follow_from_what_was_found():
+    outcomes = [
+        outcome("palms_471", [0.9, 0.6], [[0.92, 0.0], [0.0, 0.1]], [False, False]),
+        outcome("aoro_fc8", [0.8], [[0.96]], [False]),
+    ]
+    metrics = experiment.gather(outcomes, ("rgbd",))
+    assert metrics["map50"] == pytest.approx(67 / 101)  # two of three truths, before the false one
+    assert metrics["aoro_fc8.map50"] == pytest.approx(1.0)
+    assert metrics["palms_471.map50"] == pytest.approx(51 / 101)
+    assert metrics["recall"] == pytest.approx(2 / 3)
+    assert metrics["false_per_picture"] == pytest.approx(0.5)
+    assert metrics["map50_95"] < metrics["map50"]
+    text = page(judged("detector", experiment.FIGURES, metrics, profile="p", seed=1, trials=1,
+                       more={"truth": "nominal"}, paper={"map50": 0.8051}),
+                "t", "i", experiment.SECTIONS)  # fmt: skip
+    assert "**missed**" in text and "80.51%" in text
+
+
+def test_without_weights_it_says_what_to_do(monkeypatch, tmp_path):
+    monkeypatch.setattr(trial, "SHIPPED", tmp_path)
+    options = Options(seed=1, truth="nominal", profile="palms_471", out=tmp_path)
+    with pytest.raises(Stopped, match="timberhand train segmentation") as stop:
+        experiment.run(options, Console(quiet=True))
+    assert stop.value.code == Exit.CONFIGURATION
+
+
+def test_photographs_are_cut_at_white_gutters():
+    rng = np.random.default_rng(0)
+    sheet = np.full((300, 400, 3), 255, np.uint8)
+    wood = np.zeros((300, 400), bool)
+    places = ((10, 110, 10, 190), (10, 110, 210, 390), (130, 290, 10, 390))
+    for y0, y1, x0, x1 in places:
+        sheet[y0:y1, x0:x1] = rng.integers(0, 200, (y1 - y0, x1 - x0, 3))
+    wood[20:60, 20:60] = True
+    wood[20:60, 250] = True  # an outline
+    shots = photos.cut("sheet", sheet, wood)
+    assert [s.rgb.shape[:2] for s in shots] == [(y1 - y0, x1 - x0) for y0, y1, x0, x1 in places]
+    assert [int(s.wood.sum()) for s in shots] == [1600, 0, 0]
+
+
+def test_overlap_of_wood():
+    a = np.zeros((4, 4), bool)
+    assert np.isnan(photos.overlap(a, a))
+    assert photos.overlap(~a, ~a) == 1.0
+
+
+def test_the_real_photographs_are_found():
+    if not photos.folder().is_dir():
+        pytest.skip(f"no photographs in {photos.folder()}; set TIMBERHAND_DATA")
+    shots = photos.photos(photos.folder())
+    assert len(shots) > 15
+    assert all(0.0 < s.wood.mean() < 0.7 for s in shots)

@@ -1,0 +1,44 @@
+"""The report of a run: what went to the landing, with places and times."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from xml.etree import ElementTree
+
+from autonomy.manager.tally import Load, Taken
+from autonomy.missions.model import ForwardingMission, Landing, Point
+from hil.forwarded_report import report_loads
+from machine.load import load_profile
+
+PROFILE = load_profile("aoro_fc8")
+MISSION = ForwardingMission("Kiruna 7", (), landings=(Landing(Point(63.6, 19.9), "road"),))
+BEGUN = datetime(2026, 5, 4, 12, 0, tzinfo=UTC)
+
+
+def taken(at_s: int, volume_m3: float = 0.1, assortment: str = "") -> Taken:
+    return Taken(Point(63.65, 19.89), at_s * 1_000_000_000, volume_m3, assortment)
+
+
+def test_a_run_leaves_a_report_of_its_loads(tmp_path: Path) -> None:
+    loads = [
+        Load((taken(10), taken(70, 0.2, "pulp")), 130_000_000_000, 41.7),
+        Load((taken(200),), 260_000_000_000, 9.0),
+    ]
+    path = report_loads(tmp_path, loads, MISSION, PROFILE, BEGUN, 0)
+    assert path == tmp_path / "forwarded.fpr"
+    root = ElementTree.fromstring(path.read_bytes())
+    text = {tag: [e.text for e in root.iter() if e.tag.endswith("}" + tag)] for tag in
+            ("UnloadingTime", "LoadVolume", "CoordinateDate", "ObjectName", "LocationName", "DistanceFromLastUnloading",
+             "ProductName", "CreationDate")}  # fmt: skip
+    assert text["UnloadingTime"] == ["2026-05-04T12:02:10+00:00", "2026-05-04T12:04:20+00:00"]
+    assert text["LoadVolume"] == ["0.1000", "0.2000", "0.1000"]
+    assert text["CoordinateDate"][1] == "2026-05-04T12:01:10+00:00"
+    assert text["ObjectName"] == ["Kiruna 7"] and text["LocationName"] == ["road"]
+    assert text["DistanceFromLastUnloading"] == ["42", "9"] and sorted(text["ProductName"]) == ["pulp", "unknown"]
+    assert text["CreationDate"] == ["2026-05-04T12:04:20+00:00"]
+
+
+def test_a_run_that_forwarded_nothing_leaves_none(tmp_path: Path) -> None:
+    assert report_loads(tmp_path, [], MISSION, PROFILE, BEGUN, 0) is None
+    assert not list(tmp_path.iterdir())

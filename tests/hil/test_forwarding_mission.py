@@ -1,0 +1,165 @@
+"""The forwarding-mission experiment: its figures on missions whose answers are known, its fields, and one log."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from autonomy.localization.plane import Plane
+from autonomy.missions.check import problems_of
+from autonomy.missions.files import load_mission
+from hil.experiments.forwarding_mission.experiment import FILE, MACHINES, NOMINAL, calibrations, missions, trial
+from hil.experiments.forwarding_mission.figures import FIGURES, PAPER_TABLE_MM, by_log, gather, table
+from hil.experiments.forwarding_mission.pictures import PAPER_MM, draw
+from hil.experiments.forwarding_mission.trial import ACROSS_M, ALONG_M, TURN_DEG, perform, short, shuffled
+
+OPTIONS = SimpleNamespace(seed=3, quick=False)
+MISSION = load_mission(FILE, route_wanted=True).mission
+
+
+def grasp(log: int | None, off_m: tuple[float, float, float], logs: int = 1, state: str = "COLLECT") -> dict[str, Any]:
+    """A grasp of 30 s that holds."""
+    at = {"log": log, "logs": logs, "meant_m": 0.0, "off_m": list(off_m)}
+    phases = [["LOOK", 0.0, 0.0], ["ABOVE", 1.0, 4.0], ["CLOSE", 10.0, 0.0]]
+    return {"begin_s": 0.0, "state": state, "phases": phases, "attempts": [at], "failure": None,
+            "end_s": 30.0}  # fmt: skip
+
+
+def outcome(logs: int = 3, off_m: tuple[float, float, float] = (0.03, 0.04, 0.0), **changes: Any) -> dict[str, Any]:
+    """A mission that takes every log, ``off_m`` beside it."""
+    lying = [
+        {"place_m": [float(i), 3.0, 0.1], "size_m": [2.0, 0.25], "detected": True, "in_bunk": True, "landed": False}
+        for i in range(logs)
+    ]
+    return {
+        "finished": True, "failure": "", "loaded": logs, "given_up": {}, "seconds": 900.0, "driven_m": 100.0,
+        "stops": 0, "refused": 0, "states": [], "logs": lying, "places": logs,
+        "grasps": [grasp(i, off_m) for i in range(logs)], "path": [[0.0, 0.0, 0.0, 0], [1.0, 1.0, 0.0, 0]],
+        "stands": [[0.0, 0.0, 0.0]],
+    } | changes  # fmt: skip
+
+
+def test_an_offset_of_five_centimetres_is_measured_as_that() -> None:
+    metrics = gather({"first/ours": outcome(), "mission/0": outcome(off_m=(-0.03, -0.04, 0.0))})
+    assert metrics["grasp_offset_mean_m"] == pytest.approx(0.05)
+    assert metrics["grasp_offset_across_m"] == pytest.approx(0.03)
+    assert metrics["grasp_offset_along_m"] == pytest.approx(0.04)
+    assert metrics["detected"] == metrics["loaded"] == metrics["finished"] == 1.0
+    assert metrics["missions"] == 2.0 and metrics["faults"] == 0.0 and metrics["stops_mean"] == 1.0
+    assert "faithful.loaded" not in metrics
+
+
+def test_grasps_of_several_logs_and_grasps_from_the_bunk_are_no_offsets() -> None:
+    off = (1.0, 0.0, 0.0)
+    others = [grasp(0, off, logs=2), grasp(0, off, state="UNLOAD"), grasp(None, off)]
+    metrics = gather({"first/ours": outcome() | {"grasps": [grasp(0, (0.01, 0.0, 0.0)), *others]}})
+    assert metrics["grasp_offset_mean_m"] == pytest.approx(0.01)
+
+
+def test_a_log_that_was_lost_a_stop_and_a_mission_that_failed_miss_their_limits() -> None:
+    bad = outcome(finished=False, stops=2)
+    bad["logs"][0] |= {"in_bunk": False, "detected": False}
+    metrics = gather({"mission/0": bad, "machine/0": {"profile": None, "failure": "x"}})
+    limits = {f.name: f for f in FIGURES}
+    for name, value in {
+        "detected": 2 / 3,
+        "loaded": 2 / 3,
+        "finished": 0.0,
+        "faults": 2.0,
+        "uncalibrated": 1.0,
+    }.items():
+        assert metrics[name] == pytest.approx(value)
+        assert not limits[name].holds(metrics[name]), name
+    assert not limits["grasp_offset_mean_m"].holds(0.09)
+
+
+def test_paper_b_s_way_is_told_apart() -> None:
+    metrics = gather({"first/ours": outcome(), "first/paper-b": outcome(off_m=(0.3, 0.4, 0.0))})
+    assert metrics["faithful.grasp_offset_mean_m"] == pytest.approx(0.5)
+    assert metrics["grasp_offset_mean_m"] == metrics["first.grasp_offset_mean_m"] == pytest.approx(0.05)
+
+
+def test_the_table_is_the_paper_s_with_a_dash_where_nothing_was_reached_for() -> None:
+    ours = outcome()
+    ours["grasps"] = ours["grasps"][:2]
+    ours["logs"][2]["in_bunk"] = False
+    lines = table({"first/ours": ours}).splitlines()
+    assert lines[4].startswith("| 1 | 30 | 40 | 0 | 50 | yes | – |")
+    assert lines[6].startswith("| 3 | – | – | – | – | **no** |")
+    assert "| mean size | 30 | 40 | 0 | 50 | 2 of 3 |" in lines[7]
+    assert [row["off_m"] for row in by_log(ours)][2] is None
+
+
+def test_the_paper_s_numbers_fit_together() -> None:
+    assert len(PAPER_MM) == 23
+    assert np.mean(PAPER_MM) == pytest.approx(PAPER_TABLE_MM["distance"], abs=15.0)
+
+
+def test_the_last_try_at_a_log_is_the_one_in_the_table() -> None:
+    again = outcome()
+    again["grasps"].append(grasp(0, (0.0, 0.0, 0.02)))
+    assert by_log(again)[0]["off_m"] == [0.0, 0.0, 0.02]
+
+
+def test_every_mission_has_a_field_of_its_own_and_the_individuals_take_turns() -> None:
+    machines = calibrations(OPTIONS, "aoro_fc8", "sampled", MACHINES)
+    texts = {job.name: {"profile": f"text {job.name}"} for job in machines}
+    jobs = missions(OPTIONS, "aoro_fc8", "sampled", 20, texts)
+    assert len(jobs) == len({job.options["field"] for job in jobs}) == 20
+    assert {job.seed for job in jobs} == {job.seed for job in machines if job.name != NOMINAL}
+    for job in jobs:
+        machine = next(m for m in machines if m.seed == job.seed and m.name != NOMINAL)
+        assert job.options["text"] == f"text {machine.name}"
+    texts["machine/1"]["profile"] = None
+    assert len(missions(OPTIONS, "aoro_fc8", "sampled", 20, texts)) == 16
+    first = trial(OPTIONS, "aoro_fc8", texts)
+    assert [job.options["way"] for job in first] == ["ours", "paper-b"]
+    assert {job.options["text"] for job in first} == {f"text {NOMINAL}"}
+    assert not calibrations(OPTIONS, "aoro_fc8", "sampled", 0)
+
+
+def test_a_shuffled_field_can_be_driven_and_is_another_every_time() -> None:
+    plane = Plane(MISSION.waypoints[0].latitude_deg, MISSION.waypoints[0].longitude_deg)
+    seen = set()
+    for seed in range(5):
+        other = shuffled(MISSION, seed)
+        assert shuffled(MISSION, seed) == other and not list(problems_of(other, True))
+        for log, was in zip(other.logs, MISSION.logs, strict=True):
+            x, y, _ = plane.local(log.position.latitude_deg, log.position.longitude_deg)
+            x0, y0, _ = plane.local(was.position.latitude_deg, was.position.longitude_deg)
+            assert abs(x - x0) <= ALONG_M + 0.01 and abs(y - y0) <= ACROSS_M + 0.01
+            assert abs(math.remainder(log.bearing_deg - was.bearing_deg, 360.0)) <= TURN_DEG + 1e-9
+        seen.add(other.logs[0].position)
+    assert len(seen) == 5
+
+
+def test_a_short_mission_has_one_log_on_a_straight_way() -> None:
+    mission = short(MISSION)
+    assert len(mission.waypoints) == 2 and len(mission.logs) == mission.options.laps == 1
+
+
+def test_pictures_are_drawn(tmp_path: Path) -> None:
+    nothing = outcome(1, path=[], stands=[], grasps=[])
+    draw({"first/ours": outcome(), "first/paper-b": outcome(), "mission/0": nothing}, tmp_path)
+    draw({"first/ours": nothing}, tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == {"map.png", "offsets.png"}
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+@pytest.mark.timeout(900)
+def test_a_judged_mission_of_one_log() -> None:
+    job = trial(SimpleNamespace(seed=1, quick=True), "aoro_fc8", {})[0]
+    done = perform(job)
+    assert done["finished"] and done["stops"] == 0, done["failure"]
+    metrics = gather({job.name: done})
+    assert metrics["detected"] == metrics["loaded"] == 1.0
+    assert 0.0 < metrics["grasp_offset_mean_m"] < 0.15
+    (one,) = done["grasps"]
+    assert one["attempts"][-1]["log"] == 0 and one["failure"] is None
+    assert done["path"][-1][1] > done["path"][0][1] + 10.0

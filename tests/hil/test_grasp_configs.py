@@ -1,0 +1,128 @@
+"""The grasping experiment: its words from plain states, its metrics from plain outcomes, and one whole attempt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from autonomy.logs import LogObservation
+from hil.experiments.grasp_configs.experiment import PAPER_ATTEMPTS, gather, jobs_of
+from hil.experiments.grasp_configs.figures import FIGURES, SECTIONS
+from hil.experiments.grasp_configs.outcome import Grip, category, lies_on, lifted
+from hil.experiments.grasp_configs.poses import misled
+from hil.experiments.grasp_configs.trial import attempt
+from hil.experiments.pool import Job
+from hil.experiments.registry import Options
+from sim.logs import LogState
+from sim.scene import CONFIGURATIONS
+
+GROUND = -1.39
+OPTIONS = Options(0, "nominal", "palms_471", Path("unused"))
+
+
+def state(x: float = 0.0, y: float = 0.0, up: float = 0.0, yaw: float = 0.0, tilt: float = 0.0) -> LogState:
+    """A log of 2.6 m by 0.2 m whose middle is ``up`` over where it lies on the ground."""
+    axis = (math.cos(yaw) * math.cos(tilt), math.sin(yaw) * math.cos(tilt), math.sin(tilt))
+    at = (x, y, GROUND + 0.1 + up)
+    ends = tuple(tuple(p + s * 1.3 * a for p, a in zip(at, axis, strict=True)) for s in (-1, 1))
+    return LogState(at, (0.0, 0.0, 0.0, 1.0), axis, 2.6, 0.2, 45.0, 0.0, 0.0, 0.0, ends)  # type: ignore[arg-type]
+
+
+CENTRE = Grip(0.0, 0.0, math.pi / 2)
+
+
+def test_a_log_that_drags_is_not_lifted_and_one_pushed_onto_another_is_not_either() -> None:
+    before = [state(), state(y=0.3)]
+    assert lifted(before, [state(up=0.8), state(y=0.3)], GROUND) == [0]
+    assert lifted(before, [state(up=0.8, tilt=0.7), state(y=0.3)], GROUND) == []
+    assert lifted(before, [state(up=0.2), state(y=0.3)], GROUND) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "before", "up", "grip", "wrong", "word"),
+    [
+        (1, [state()], [], CENTRE, False, "failed"),
+        (1, [state()], [0], CENTRE, False, "optimal"),
+        (1, [state()], [0], CENTRE, True, "optimal"),
+        (1, [state()], [0], replace(CENTRE, x_m=0.9), False, "NI"),
+        (1, [state()], [0], replace(CENTRE, x_m=0.9), True, "SE"),
+        (1, [state()], [0], replace(CENTRE, yaw_rad=math.pi / 2 + 0.5), False, "MA"),
+        (1, [state()], [0], replace(CENTRE, yaw_rad=-math.pi / 2), False, "optimal"),
+        (3, [state(), state(up=0.2, yaw=1.4)], [0], CENTRE, False, "NI"),
+        (3, [state(), state(up=0.2, yaw=1.4)], [1], replace(CENTRE, yaw_rad=1.4 + math.pi / 2), False, "optimal"),
+        (2, [state(), state(y=0.21)], [0, 1], CENTRE, False, "optimal"),
+        (6, [state(), state(y=0.1, up=0.18)], [0], CENTRE, False, "NI"),
+    ],
+)
+def test_the_papers_words(
+    number: int, before: list[LogState], up: list[int], grip: Grip, wrong: bool, word: str
+) -> None:
+    assert category(number, before, up, grip, wrong) == word
+
+
+def test_what_lies_on_what() -> None:
+    assert lies_on(state(up=0.2, yaw=1.2), state()) and not lies_on(state(), state(up=0.2, yaw=1.2))
+    assert not lies_on(state(y=0.21), state()) and not lies_on(state(y=1.0, up=0.3), state())
+
+
+def test_a_log_that_is_missed_misplaced_or_made_up_misleads() -> None:
+    def seen(x: float, y: float, yaw: float = 0.0, diameter: float = 0.2) -> LogObservation:
+        return LogObservation(0, (x, y, GROUND + 0.1), (math.cos(yaw), math.sin(yaw), 0.0), 2.6, diameter)
+
+    truth = [state()]
+    assert not misled(truth, [seen(0.3, 0.05)]), "along itself a log may be off"
+    for bad in ([], [seen(0, 0), seen(1, 1)], [seen(0, 0.2)], [seen(0, 0, 0.2)], [seen(0, 0, 0.0, 0.3)]):
+        assert misled(truth, bad)
+    beside = [state(), state(y=0.2)]
+    assert not misled(beside, [seen(0, 0.09), seen(0, -0.14)]), "the nearest one may be another's"
+
+
+def outcome(number: int, word: str, up: int, plan_ms: float = 10.0) -> dict[str, Any]:
+    return {
+        "configuration": number, "category": word, "lifted": up, "logs": CONFIGURATIONS[number][1], "plan_ms": plan_ms,
+        "see_ms": 50.0, "failure": None, "reason": "",
+    }  # fmt: skip
+
+
+def test_the_metrics_are_those_of_the_judged_pair_and_of_every_pair_by_name() -> None:
+    found = {}
+    for number in CONFIGURATIONS:
+        for k in range(6):
+            found[f"ours.search/{number}/{k}"] = outcome(number, "optimal", CONFIGURATIONS[number][1])
+            found[f"true.cnn/{number}/{k}"] = outcome(number, "NI", 1)
+    found["ours.search/5/5"] = outcome(5, "failed", 0)
+    found["ours.search/7/0"] = outcome(7, "MA", 1)
+    metrics = gather(found, ("ours", "search"))
+    assert metrics["success"] == pytest.approx(71 / 72) and metrics["success_wilson_low"] < 71 / 72
+    assert metrics["paper60_success"] == 1.0 and metrics["paper60_success_n"] == 12 * PAPER_ATTEMPTS
+    assert metrics["optimal"] == pytest.approx(70 / 71) and metrics["ma"] == 1.0 and metrics["ni"] == 0.0
+    assert metrics["logs_per_grasp_10_12"] == 5.0 and metrics["all_logs"] == pytest.approx(28 / 30)
+    assert metrics["true.cnn.optimal"] == 0.0 and metrics["true.cnn.ni"] == 72.0
+    assert metrics["config5.success"] == pytest.approx(5 / 6) and metrics["config12.logs"] == 6.0
+    judged = SECTIONS[0].figures + SECTIONS[1].figures
+    assert {f.name for f in judged} <= metrics.keys()
+    assert [f.name for f in FIGURES if f.name in metrics and not f.holds(metrics[f.name])] == [
+        "success", "success_wilson_low"
+    ]  # fmt: skip
+
+
+def test_every_pair_sees_the_same_scenes_and_the_first_gets_most() -> None:
+    jobs = jobs_of(OPTIONS, [("true", "search"), ("true", "cnn")], 120)
+    assert len(jobs) == 12 * (120 + 6) and len({job.name for job in jobs}) == len(jobs)
+    first = {(j.options["configuration"], j.seed) for j in jobs if j.options["planner"] == "search"}
+    assert {(j.options["configuration"], j.seed) for j in jobs if j.options["planner"] == "cnn"} < first
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_a_small_pile_comes_up_whole_over_the_bus() -> None:
+    options = {
+        "profile": "palms_471", "truth": "nominal", "configuration": 7, "poses": "true", "planner": "search",
+    }  # fmt: skip
+    found = attempt(Job("one", "grasp", 7000, options))
+    assert found["category"] == "optimal" and found["up"] == [0, 1, 2] and found["stops"] == 0
+    assert set(found["expected"]) == {0, 1, 2} and math.dist(found["grip"][:2], found["asked"][:2]) < 0.06

@@ -1,0 +1,97 @@
+"""From an operator's hands on the plant's levers to primitives, through the recording of the bus."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from autonomy.motion.arm import Arm
+from autonomy.motion.demonstration import cut, track
+from autonomy.motion.primitives import SHIPPED, learn_primitives, over_bunk
+from can_dbc.codec import load as load_database
+from hil.exits import Exit, Stopped
+from hil.hand_demonstration import AXES, script, show
+from hil.learning import motions_in
+from machine.load import load_profile
+from recorder.manifest import describe
+from recorder.recorder import Recorder
+from sim.world import home_of
+from timberhand.cli import app
+
+PROFILE = load_profile("aoro_fc8")
+HOME = tuple(home_of(PROFILE)[name] for name in ("slew", "lift", "tilt", "ext", "rot"))
+SHOWN = SHIPPED / "aoro_fc8.csv"
+
+
+def test_the_script_goes_out_and_back_on_both_sides_over_the_stakes() -> None:
+    arm = Arm(PROFILE)
+    shown = script(PROFILE, 3, 4, HOME)
+    assert len(shown) == 8
+    sides = set()
+    for out, back in zip(shown[::2], shown[1::2], strict=True):
+        log = arm.pose((*out.joints[-1], 0.0))
+        assert back.joints[0] == pytest.approx(out.joints[-1])
+        assert over_bunk(PROFILE.bunk, arm.xy(arm.pose((*back.joints[-1], 0.0)))) and not over_bunk(
+            PROFILE.bunk, arm.xy(log)
+        )
+        sides.add(np.sign(log.slew_rad))
+        assert max(arm.pose((*q, 0.0)).z_m for q in back.joints) > 2.9
+    assert sides == {-1.0, 1.0}
+    again = script(PROFILE, 3, 4, HOME)
+    assert all(np.array_equal(a.joints, b.joints) for a, b in zip(shown, again, strict=True))
+
+
+def test_learn_reads_the_shipped_demonstrations(tmp_path: Path) -> None:
+    out, picture = tmp_path / "learned.json", tmp_path / "learned.png"
+    result = CliRunner().invoke(app, ["plan", "learn", str(SHOWN), "--out", str(out), "--plot", str(picture), "--json"])
+    assert result.exit_code == 0
+    assert json.loads(result.stdout) | {"out_s": 0, "back_s": 0} == {
+        "profile": "aoro_fc8", "motions": 12, "out": 6, "back": 6, "out_s": 0, "back_s": 0,
+    }  # fmt: skip
+    assert picture.stat().st_size > 10_000
+    learned, shipped = (json.loads(path.read_bytes()) for path in (out, SHIPPED / "aoro_fc8.json"))
+    assert np.array(learned["out"]["weights"]) == pytest.approx(np.array(shipped["out"]["weights"]), rel=1e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("log.csv", "x", "no file of demonstrations"),
+        ("log.txt", "(0.1) crane0 182#0011223344556677\n", "holds no frames"),
+        ("missing", None, "holds no recording"),
+        ("run.mcap", "x", "MCAP"),
+    ],
+)
+def test_what_holds_no_motion_is_refused_in_a_sentence(tmp_path: Path, name: str, text: str | None, words: str) -> None:
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    with pytest.raises(Stopped, match=words) as stopped:
+        motions_in(tmp_path / name)
+    assert stopped.value.code == Exit.CONFIGURATION
+    with pytest.raises(Stopped, match="not of palms_471"):
+        motions_in(SHOWN, "palms_471")
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_a_recording_of_hands_on_the_levers_is_learned_from(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "run", PROFILE, describe(PROFILE, ("crane0", "mach0"), 2))
+    frames = show("aoro_fc8", seed=2, targets=1, recorder=recorder)
+    recorder.close()
+    heard = cut(PROFILE, track(PROFILE, load_database("crane"), frames))
+    for log in (tmp_path / "run", tmp_path / "run" / "crane0.log"):
+        _, motions = motions_in(log)
+        assert len(motions) == len(heard) == 2
+        for a, b in zip(motions, heard, strict=True):
+            n = min(len(a.position), len(b.position))
+            assert np.max(np.abs(a.position[:n] - b.position[:n])) < 0.01
+    learned = learn_primitives(PROFILE, heard)
+    assert (learned.out.demonstrations, learned.back.demonstrations) == (1, 1)
+    # The crane really went there: the hands are no exact machine, but they arrive.
+    for motion, planned in zip(heard, script(PROFILE, 2, 1, HOME), strict=True):
+        assert np.max(np.abs(motion.position[-1] - planned.joints[-1])) < 0.05
+        assert motion.position.shape[1] == len(AXES)

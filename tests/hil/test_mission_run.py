@@ -1,0 +1,82 @@
+"""A short mission on the plant, both ways, and the page of the activity manager."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from autonomy.localization.plane import Plane
+from autonomy.manager.chart import diagram, page
+from autonomy.manager.table import OURS, PAPER_B
+from autonomy.missions.files import save_mission
+from autonomy.missions.model import ForwardingMission, KnownLog, Options, Point
+from hil.exits import Exit
+from hil.mission import unheeded
+from timberhand.cli import app
+
+DOCS = Path(__file__).parents[2] / "docs"
+PLANE = Plane(63.657853, 19.895562)
+
+
+def point(east_m: float, north_m: float) -> Point:
+    return Point(*PLANE.geodetic(east_m, north_m)[:2])
+
+
+def mission_file(path: Path, *logs: tuple[float, float, float]) -> Path:
+    """A route of 18 m to the east, and logs beside it (east, north [m], bearing [deg])."""
+    known = tuple(KnownLog(point(e, n), bearing_deg=b, length_m=2.0, diameter_m=0.25) for e, n, b in logs)
+    save_mission(path, ForwardingMission("short", (point(0.0, 0.0), point(18.0, 0.0)), logs=known))
+    return path
+
+
+def test_the_page_of_the_activity_manager_is_as_the_code_has_it() -> None:
+    assert (DOCS / "activity.md").read_text() == page(), "run `timberhand mission states --docs docs`"
+
+
+@pytest.mark.parametrize("table", [PAPER_B, OURS], ids=["paper_b", "ours"])
+def test_every_change_is_in_the_diagram(table) -> None:
+    text = diagram(table)
+    for (begin, event), end in table.items():
+        line = next(x for x in text.splitlines() if x.strip().startswith(f"{begin.name} --> {end.name} "))
+        assert event.name.lower().replace("_", " ") in line
+
+
+def test_a_mission_that_is_none_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "mission.geojson"
+    path.write_text("{}")
+    result = CliRunner().invoke(app, ["mission", "run", str(path), "--lockstep", "--out", str(tmp_path / "run")])
+    assert getattr(result.exception, "code", None) == Exit.CONFIGURATION and str(path) in str(result.exception)
+
+
+def test_a_machine_that_stands_still_drives_no_mission(tmp_path: Path) -> None:
+    path = mission_file(tmp_path / "mission.geojson")
+    result = CliRunner().invoke(
+        app, ["mission", "run", str(path), "--lockstep", "--profile", "palms_471", "--out", str(tmp_path / "run")]
+    )
+    assert "palms_471 stands still" in str(result.exception)
+
+
+def test_what_a_mission_asks_for_in_vain_is_said() -> None:
+    assert unheeded(ForwardingMission("plain", (point(0.0, 0.0),))) == []
+    asks = ForwardingMission(
+        "asks", (point(0.0, 0.0),), options=Options(assortments=("pulp",), sort_by_assortment=True)
+    )
+    assert len(unheeded(asks)) == 2 and "every assortment" in unheeded(asks)[0]
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("way", ["ours", "paper-b"])
+def test_a_log_beside_the_route_is_brought_to_its_end(tmp_path: Path, way: str) -> None:
+    path = mission_file(tmp_path / "mission.geojson", (8.0, 3.6, 80.0))
+    command = ["mission", "run", str(path), "--lockstep", "--way", way, "--out", str(tmp_path / "run")]
+    result = CliRunner().invoke(app, command)
+    told = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert result.exit_code == 0, (told, result.output[-2000:])
+    assert told["finished"] and told["in_bunk"] == told["loaded"] == told["logs"] == 1
+    assert told["stops"] == told["refused"] == 0
+    assert told["states"][-1][1] == "DONE"

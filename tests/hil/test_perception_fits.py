@@ -1,0 +1,233 @@
+"""Cylinder fits against the renderer's truth, in one frame: exact depth, stereo, occlusion, borders, bad input."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from log_views import CAMERA, PIN, PROFILE, frame_of, lying, masks_of, scene_of, seen, view_from
+
+from autonomy.perception import paper_a
+from autonomy.perception.cylinder import Bodies, Cylinder, across_view, depth, guess, outline, rays_of
+from autonomy.perception.frame import FrameRefused
+from autonomy.perception.merge import refused
+from autonomy.perception.pipeline import Perception
+from autonomy.perception.refine import Sensor, own_outline, refine
+from hil.experiments.log_localization.trial import TrueMask
+from sim.camera.scene import BUNK, SceneBuilder
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    return math.degrees(math.acos(min(1.0, abs(float(a @ b)))))
+
+
+def fits_of(*logs, exact: bool = True, **options):
+    scene, view = scene_of(*logs), view_from()
+    picture = seen(scene, view)
+    perception = Perception(PROFILE)
+    return perception.fits(frame_of(picture, view, exact=exact, **options), masks_of(picture)), view, perception
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0, 55.0, 90.0])
+def test_outline_and_depth_are_the_renderers(degrees: float) -> None:
+    log, view = lying(1, 4.6, 0.2, degrees), view_from()
+    picture = seen(scene_of(log), view)
+    v, u = np.mgrid[200:420:3, 400:900:3]
+    body = Cylinder(view.to_optical(np.array([log.position_m]))[0], view.rotation.T @ log.axis, -1.0, 1.0, 0.125)
+    rays = rays_of(PIN, u.ravel(), v.ravel())
+    inside = outline(Bodies.of(body), rays)[0] < 0.0
+    truly = (picture.mask[v, u] == 1).ravel()
+    assert np.mean(inside != truly) < 0.004
+    both = inside & truly
+    apart = np.abs(depth(Bodies.of(body), rays[both])[0] - picture.depth_m[v, u].ravel()[both])
+    assert np.quantile(apart, 0.98) < 0.01 and np.median(apart) < 1e-3
+
+
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 60.0, 90.0])
+def test_with_exact_depth_a_log_is_found_to_a_centimetre(degrees: float) -> None:
+    log = lying(1, 4.6, 0.2, degrees)
+    (fit,), view, _ = fits_of(log)
+    assert np.linalg.norm(view.to_world(fit.body.center_m[None])[0] - log.position_m) < 0.02
+    assert angle_deg(view.rotation @ fit.body.axis, log.axis) < 0.6
+    assert abs(2 * fit.body.radius_m - 0.25) < 0.005 and abs(fit.body.length_m - 2.0) < 0.04
+    assert fit.ends_seen == (True, True) and fit.explained > 0.98
+
+
+@pytest.mark.parametrize("degrees", [0.0, 45.0, 90.0])
+def test_claimed_uncertainty_covers_stereos_errors(degrees: float) -> None:
+    log, view = lying(1, 4.6, 0.2, degrees), view_from()
+    picture = seen(scene_of(log), view)
+    perception, squares = Perception(PROFILE), []
+    for i in range(6):
+        (fit,) = perception.fits(frame_of(picture, view, i), masks_of(picture))
+        miss = fit.body.center_m - view.to_optical(np.array([log.position_m]))[0]
+        across = miss - (miss @ fit.body.axis) * fit.body.axis
+        spread = fit.covariance[0, 0] + fit.covariance[1, 1]
+        squares.append(float(across @ across) / spread)
+        assert np.linalg.norm(miss) < 0.15
+        assert np.all(np.linalg.eigvalsh(fit.covariance) > 0.0)
+    assert np.mean(squares) < 3.0
+
+
+def test_an_end_behind_another_log_is_no_end() -> None:
+    back, front = lying(1, 5.2, 0.0, 90.0), lying(2, 4.3, 0.8, 10.0, length=1.6, diameter=0.5)
+    fits, view, _ = fits_of(back, front)
+    fit = min(fits, key=lambda f: abs(f.body.radius_m - 0.125))
+    left = 1 if (view.rotation @ fit.body.axis)[1] < 0 else 0  # the end towards -y is free
+    assert fit.ends_seen[left] and not fit.ends_seen[1 - left]
+    start, end = fit.covariance[4, 4], fit.covariance[5, 5]
+    free, hidden = (start, end) if left == 0 else (end, start)
+    assert math.sqrt(hidden) > 0.2 > 5.0 * math.sqrt(free)
+    ends = view.to_world(fit.body.center_m + np.outer((-0.5, 0.5), fit.body.length_m * fit.body.axis))
+    assert ends[left] == pytest.approx([5.2, -1.0, 0.125], abs=0.04)
+
+
+def test_a_border_that_is_anothers_tells_of_no_width() -> None:
+    """The same log, once with its lower side said to be behind something: it may go on there."""
+    view, sensor = view_from(), Sensor(CAMERA.fx_px * CAMERA.baseline_m)
+    picture = seen(scene_of(lying(1, 4.6, 0.0, 90.0)), view)
+    mask, depth_m = picture.mask == 1, frame_of(picture, view).depth_m
+    first = guess(mask, depth_m, PIN, 3.0 * 0.2 / sensor.fb_px_m)
+    assert first is not None
+    whole = own_outline(mask, depth_m, PIN, first, sensor, (0, 0, PIN.width_px, PIN.height_px))
+    half = replace(whole, own=whole.own & (whole.v_px < np.median(whole.v_px)))
+    sure, unsure = (refine(mask, depth_m, PIN, first, edge, sensor) for edge in (whole, half))
+    assert sure is not None and unsure is not None
+    assert sure.covariance[6, 6] < 0.006**2 and unsure.covariance[6, 6] > 0.02**2
+    assert unsure.covariance[1, 1] > 3.0 * sure.covariance[1, 1], "depth beside it may be that of what hides it"
+
+
+@pytest.mark.parametrize(("away_m", "diameter"), [(4.75, 0.25), (4.72, 0.28)])
+def test_a_log_half_hidden_by_the_one_before_it_is_not_taken_for_a_thin_one(away_m: float, diameter: float) -> None:
+    back, front = lying(1, 5.0, 0.0, 90.0), lying(2, away_m, 0.1, 92.0, length=2.6, diameter=diameter)
+    view = view_from()
+    picture = seen(scene_of(back, front), view)
+    true_m = view.to_optical(np.array([back.position_m]))[0]
+    for i in range(3):
+        fits = Perception(PROFILE).fits(frame_of(picture, view, i), masks_of(picture))
+        fit, other = sorted(fits, key=lambda f: f.body.length_m)
+        sigma = np.sqrt(np.diag(fit.covariance))
+        assert abs(fit.body.radius_m - 0.125) < min(2.0 * sigma[6], 0.035)
+        off = (fit.body.center_m - true_m) @ np.stack(across_view(fit.body.axis, fit.body.point_m), axis=1)
+        assert np.all(np.abs(off) < 2.0 * sigma[:2])
+        assert abs(fit.covariance[0, 6]) > 0.9 * sigma[0] * sigma[6], "a thicker log would lie lower"
+        assert math.sqrt(other.covariance[6, 6]) < 0.006, "the one before it is seen whole"
+
+
+def test_pieces_on_either_side_of_an_occluder_are_one_log() -> None:
+    log = lying(1, 5.2, 0.0, 90.0, length=2.6)
+    b = SceneBuilder(scene_of().ground, "forest")
+    b.log(log)
+    b.box((0.3, 0.5, 0.9), (4.4, 0.1, 0.45), (0.0, 0.0, 0.0, 1.0), (0.3, 0.3, 0.3), BUNK)
+    view = view_from()
+    picture = seen(b.build(), view)
+    columns = np.arange(picture.mask.shape[1])
+    middle = int(np.median(np.nonzero(picture.mask == BUNK)[1]))
+    halves = [TrueMask((picture.mask == 1) & side) for side in (columns < middle, columns >= middle)]
+    assert all(h.mask.any() for h in halves)
+    (fit,) = Perception(PROFILE).fits(frame_of(picture, view, exact=True), halves)
+    assert fit.body.length_m == pytest.approx(2.6, abs=0.06) and fit.ends_seen == (True, True)
+    assert view.to_world(fit.body.center_m[None])[0] == pytest.approx(log.position_m, abs=0.04)
+
+
+def test_two_logs_in_line_stay_two() -> None:
+    fits, _, _ = fits_of(lying(1, 5.0, -1.3, 90.0), lying(2, 5.0, 1.3, 90.0))
+    assert sorted(round(f.body.length_m, 1) for f in fits) == [2.0, 2.0]
+
+
+def test_a_log_half_outside_the_picture_has_one_end() -> None:
+    log = lying(1, 3.2, 4.0, 90.0, length=3.0)
+    (fit,), view, _ = fits_of(log)
+    seen_ends = view.to_world(fit.body.center_m + np.outer((-0.5, 0.5), fit.body.length_m * fit.body.axis))
+    inner = int(np.argmin(np.abs(seen_ends[:, 1])))
+    assert fit.ends_seen[inner] and not fit.ends_seen[1 - inner]
+    assert seen_ends[inner] == pytest.approx([3.2, 2.5, 0.125], abs=0.06)
+
+
+@pytest.mark.parametrize("short_px", [0, 2, 5])
+@pytest.mark.parametrize("degrees", [0.0, 75.0, 90.0])
+def test_where_the_picture_cuts_a_log_its_end_is_not_known(degrees: float, short_px: int) -> None:
+    """A network's mask may stop a few pixels before the rim: that is no end of the log either."""
+    view = view_from()
+    picture = seen(scene_of(lying(1, 2.6, 3.3, degrees, length=3.0)), view)
+    mask = picture.mask == 1
+    mask[:, :short_px] = mask[-short_px or mask.shape[0] :] = False
+    (fit,) = Perception(PROFILE).fits(frame_of(picture, view), [TrueMask(mask)])
+    assert sorted(fit.ends_seen) == [False, True]
+    unseen = fit.ends_seen.index(False)
+    sigmas_m = np.sqrt(np.diag(fit.covariance))[4:6]
+    assert sigmas_m[unseen] > 0.5 and sigmas_m[1 - unseen] < 0.1
+
+
+def test_what_is_no_log_is_refused_with_a_reason() -> None:
+    (fit,), _, _ = fits_of(lying(1, 4.6, 0.0, 90.0))
+    assert refused(fit) == ""
+    short = replace(fit.body, start_m=-0.1, end_m=0.1, radius_m=0.11)
+    assert "0.22 m wide and 0.20 m long, which is no log" in refused(replace(fit, body=short))
+    assert "which no log here is" in refused(replace(fit, body=replace(fit.body, radius_m=0.6)))
+    assert "30 % of its outline" in refused(replace(fit, explained=0.3))
+    vague = fit.covariance.copy()
+    vague[3, 3] = 0.5
+    assert "direction is not determined" in refused(replace(fit, covariance=vague))
+
+
+def test_no_log_no_depth_and_a_wrong_frame_make_no_log() -> None:
+    scene, view = scene_of(lying(1, 4.6, 0.2, 90.0)), view_from()
+    picture = seen(scene, view)
+    frame, perception = frame_of(picture, view, exact=True), Perception(PROFILE)
+    assert perception.fits(frame, []) == []
+    assert perception.fits(frame, [TrueMask(np.zeros_like(picture.mask, bool))]) == []
+    blind = replace(frame, depth_m=np.where(picture.mask == 1, np.nan, frame.depth_m))
+    assert perception.fits(blind, masks_of(picture)) == []
+    assert "depth" in perception.refusals[0].why
+    with pytest.raises(FrameRefused, match="no depth anywhere"):
+        perception.fits(replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), [])
+    with pytest.raises(FrameRefused, match="'rear', which the machine does not have; it has: front"):
+        perception.fits(replace(frame, camera="rear"), [])
+    with pytest.raises(FrameRefused, match="mask 0 is"):
+        perception.fits(frame, [TrueMask(np.zeros((3, 3), bool))])
+    with pytest.raises(FrameRefused, match="intrinsics are for"):
+        perception.fits(replace(frame, intrinsics=PIN.scaled(0.5)), [])
+
+
+def test_noise_of_any_shape_in_a_mask_is_a_log_or_a_refusal_but_no_crash() -> None:
+    rng, view = np.random.default_rng(3), view_from()
+    picture = seen(scene_of(), view)
+    frame = frame_of(picture, view, exact=True)
+    perception = Perception(PROFILE)
+    for _ in range(12):
+        mask = np.zeros(picture.mask.shape, bool)
+        top, left = rng.integers(0, 600), rng.integers(0, 1200)
+        mask[top : top + rng.integers(1, 120), left : left + rng.integers(1, 80)] = rng.random() < 0.8
+        mask &= rng.random(mask.shape) < rng.choice([0.2, 0.9, 1.0])
+        wild = replace(frame, depth_m=rng.uniform(0.3, 20.0, mask.shape).astype(np.float32))
+        fits = perception.fits(wild, [TrueMask(mask)])
+        assert len(fits) + len(perception.refusals) == 1
+        assert all(np.isfinite(f.covariance).all() for f in fits)
+
+
+def test_the_first_guess_needs_depth_and_ignores_outliers() -> None:
+    view = view_from()
+    picture = seen(scene_of(lying(1, 4.6, 0.2, 90.0)), view)
+    mask, depth_m = picture.mask == 1, picture.depth_m.copy()
+    slack = 3.0 * 0.2 / (CAMERA.fx_px * CAMERA.baseline_m)
+    clean = guess(mask, depth_m, PIN, slack)
+    rng = np.random.default_rng(1)
+    depth_m[mask & (rng.random(mask.shape) < 0.3)] = 1.5
+    dirty = guess(mask, depth_m, PIN, slack)
+    assert clean is not None and dirty is not None
+    assert np.linalg.norm(clean.center_m - dirty.center_m) < 0.05
+    assert guess(mask, np.full_like(depth_m, np.nan), PIN, slack) is None
+
+
+def test_paper_a_takes_the_surface_for_the_log() -> None:
+    log, view = lying(1, 4.6, 0.2, 90.0), view_from()
+    picture = seen(scene_of(log), view)
+    frame = frame_of(picture, view, exact=True)
+    found = paper_a.log_of(frame, picture.mask == 1)
+    assert found is not None
+    assert found.length_m == pytest.approx(2.0, abs=0.05) and found.diameter_m == pytest.approx(0.25, abs=0.06)
+    assert angle_deg(view.rotation @ found.axis, log.axis) < 1.0
+    off = view.to_world(found.center_m[None])[0] - log.position_m
+    assert 0.06 < np.linalg.norm(off) < 0.13  # towards the camera
+    assert paper_a.log_of(frame, np.zeros_like(picture.mask, bool)) is None

@@ -1,0 +1,265 @@
+"""The timing stand's parts without a clock: readings, verdicts, the light machine, the planner, the witness."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import pytest
+
+from can_dbc.codec import load
+from can_dbc.durations import Durations
+from can_dbc.e2e import Sender
+from can_dbc.timing_page import STAGES, BusCounters, Facts, ProcessCounters
+from hil.experiments.timing import experiment
+from hil.experiments.timing.figures import FIGURES, SECTIONS
+from hil.timing import host, reference, verdict
+from hil.timing.continuity import Continuity
+from hil.timing.host import Meanwhile
+from hil.timing.reference import Plain
+from hil.timing.windows import Window, pooled
+
+PERIOD_NS = 5_000_000
+
+
+def histogram(*late_us: float, times: int = 1) -> Durations:
+    made = Durations()
+    for _ in range(times):
+        for us in late_us:
+            made.add(round(1000 * us))
+    return made
+
+
+def facts(ticks: int, missed: int = 0, faults: int = 0, blocks: int = 1000) -> Facts:
+    process = ProcessCounters(ticks * 300_000, faults, 0, 2 * ticks, 0, 0, blocks, 50_000)
+    bus = BusCounters("crane0", "ACTIVE", 12 * ticks, 5 * ticks, 0, 0, 0, 0)
+    return Facts(1, 0, ticks * PERIOD_NS, PERIOD_NS, ticks, missed, 0, "ACTIVE", "", (bus,), process, {}, (), ())
+
+
+def window(
+    late: Sequence[float] = (30.0,),
+    theirs: Sequence[float] = (25.0,),
+    plain: Plain | None = None,
+    *,
+    ticks: int = 2000,
+    at: int = 0,
+    missed: int = 0,
+    steal_ms: float = 0.0,
+    faults: int = 0,
+) -> Window:
+    """``ticks`` wake-ups that go round through ``late``, and as many of cyclictest's."""
+    durations = {name: histogram(300.0, times=ticks) for name in STAGES}
+    durations["wake"] = histogram(*late, times=max(1, ticks // len(late)))
+    return Window(
+        facts(at),
+        facts(at + ticks, missed, faults),
+        durations,
+        histogram(*theirs, times=max(1, ticks // len(theirs))),
+        plain or Plain(histogram(400.0, times=ticks), 0),
+        Meanwhile(10.0, steal_ms, 0.1, 0.5),
+    )
+
+
+def metrics_of(quiet: list[Window], loaded: list[Window]) -> dict[str, float]:
+    slow = experiment.Measured(quiet, loaded, ({"clock_nanosleep": 4000, "recvmsg": 8000}, 2000.0), 0, [])
+    fast = experiment.Measured(quiet[:1], loaded[:1], None, 0, [])
+    return experiment.gather(slow, fast)[0]
+
+
+def test_a_pressure_file_gives_the_time_somebody_waited():
+    text = "some avg10=31.01 avg60=14.01 avg300=7.94 total=5137622117\nfull avg10=0.00 total=7\n"
+    assert host.pressure_us(text) == 5137622117
+    assert host.pressure_us("") is None
+    between = host.between(host.Sample(0, 10.0, 1_000_000, 0.0), host.Sample(2_000_000_000, 40.0, 1_500_000, 3.0))
+    assert (between.seconds, between.steal_ms, between.pressure, between.load) == (2.0, 30.0, 0.25, 3.0)
+    assert host.between(host.Sample(0, 0, None, 0), host.Sample(1, 0, 5, 0)).pressure is None
+
+
+@pytest.mark.parametrize(
+    ("version", "dynamic", "model"),
+    [
+        ("#1 SMP PREEMPT_DYNAMIC @0", "none voluntary (full)", "PREEMPT_DYNAMIC (full)"),
+        ("#1 SMP PREEMPT_DYNAMIC @0", "", "PREEMPT_DYNAMIC"),
+        ("#1 SMP PREEMPT_RT Debian", "", "PREEMPT_RT"),
+        ("#1 SMP Debian 6.1", "", "none"),
+    ],
+)
+def test_the_preemption_model_is_read_from_the_kernel(version, dynamic, model):
+    assert host.preemption(version, dynamic) == model
+
+
+@pytest.mark.parametrize(("stamp_ns", "period_ns"), [(7_001_234_567, 5_000_000), (12_000_999_999, 1_000_000)])
+def test_cyclictest_wakes_at_a_fixed_distance_from_our_ticks(stamp_ns, period_ns):
+    offset_ns = 1000 * reference.offset_us(stamp_ns, period_ns)
+    assert 0 <= offset_ns < period_ns
+    distance = (offset_ns - stamp_ns) % period_ns
+    assert distance == pytest.approx(reference.QUIET_PHASE * period_ns, abs=1000)
+
+
+def test_cyclictests_report_becomes_a_histogram():
+    thread = {"cycles": 10, "min": 12, "max": 200_001, "avg": 20.0, "histogram": {"12": 6, "1500": 3}}
+    found = reference.read_cyclictest(json.dumps({"thread": {"0": thread}}))
+    assert found.count == 10 and found.longest_ns == 200_001_000
+    assert found.over(100_000_000 - 1) == 1 and found.over(PERIOD_NS) == 1
+    assert found.quantile_ns(0.5) == 13_000
+
+
+def test_the_plain_loops_words_become_a_histogram():
+    plain = reference.read_plain({"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4})
+    assert plain.lateness.count == 3 and plain.missed == 4
+
+
+def test_system_calls_are_counted_from_the_tables_rows():
+    table = (
+        "% time     seconds  usecs/call     calls    errors syscall\n"
+        "------ ----------- ----------- --------- --------- ----------------\n"
+        " 60.00    0.000300           1       300           clock_nanosleep\n"
+        " 40.00    0.000200           0       900       300 recvmsg\n"
+        "------ ----------- ----------- --------- --------- ----------------\n"
+        "100.00    0.000500           0      1200       300 total\n"
+    )
+    assert reference.count_calls(table) == {"clock_nanosleep": 300, "recvmsg": 900}
+
+
+def test_histograms_add_up():
+    total = pooled([histogram(10.0, 20.0), histogram(3000.0)])
+    assert total.count == 3 and total.longest_ns == 3_000_000
+    assert pooled([]).count == 0
+
+
+def test_a_quantile_lies_inside_its_bin():
+    found = verdict.spread_us("x", histogram(*(10.0 + 0.01 * i for i in range(100))))
+    assert 10.0 < found["x_p50_us"] < found["x_p99_us"] <= 11.0
+    assert found["x_max_us"] == pytest.approx(10.99)
+
+
+@pytest.mark.parametrize(
+    ("made", "is_quiet"),
+    [
+        (window(), True),
+        (window(theirs=[25.0] * 999 + [1001.0]), False),  # a stall that could have made us miss
+        (window(theirs=[25.0] * 98 + [260.0] * 2), False),
+        (window(steal_ms=60.0), False),
+        (window(late=[25.0] * 999 + [4000.0]), True),  # ours alone is late: that is ours to answer for
+    ],
+)
+def test_cyclictest_says_whether_a_window_was_quiet(made, is_quiet):
+    assert verdict.quiet(made) is is_quiet
+
+
+def test_only_quiet_windows_are_judged_where_they_are_at_least_half():
+    noisy = window(theirs=[2000.0], at=2000)
+    good = window()
+    assert verdict.chosen([good, noisy]) == ([good], True)
+    assert verdict.chosen([good, noisy, noisy]) == ([good, noisy, noisy], False)
+
+
+def test_a_ratio_compares_quantiles_and_has_an_interval():
+    found = verdict.ratio("r", [histogram(30.0, times=50)] * 4, [histogram(20.0, times=50)] * 4, 0.5)
+    assert found["r"] == pytest.approx(1.5, abs=0.05) and found["r_n"] == 4
+    assert found["r_low"] <= found["r"] <= found["r_high"]
+
+
+def test_a_long_quiet_run_is_judged_and_a_slow_loop_misses():
+    quiet = [window(late=[60.0], ticks=6000, at=6000 * i) for i in range(20)]
+    loaded = [window(plain=Plain(histogram(9000.0), 500))]
+    metrics = metrics_of(quiet, loaded)
+    assert metrics["host_verdict"] == 1.0 and metrics["judged_cycles"] == 120_000
+    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    assert found.missed == ("wakeup_p50_ratio", "wakeup_p99_ratio")
+    assert not {"missed", "page_faults", "missed_loaded_share"} & found.inconclusive.keys()
+
+
+def test_a_noisy_host_never_passes_what_hangs_on_its_clock():
+    metrics = metrics_of([window(theirs=[3000.0], late=[3000.0], ticks=6000) for _ in range(20)], [window()])
+    assert metrics["host_verdict"] == 0.0 and metrics["wakeup_p50_ratio"] == pytest.approx(1.0, abs=0.01)
+    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    assert {"wakeup_p50_ratio", "wakeup_p99_ratio"} <= found.inconclusive.keys()
+    assert found.missed == ()
+
+
+def test_a_short_run_cannot_tell():
+    metrics = metrics_of([window(ticks=600)], [window()])
+    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    open_ = {"wakeup_p50_ratio", "missed", "page_faults", "gc_runs", "tick_cpu_p99_us", "missed_loaded_share"}
+    assert open_ <= found.inconclusive.keys() and not found.missed
+
+
+def test_what_does_not_hang_on_the_clock_is_missed_on_any_host():
+    metrics = metrics_of([window(theirs=[3000.0], ticks=600, faults=2)], [window()])
+    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    assert "page_faults" in found.missed
+
+
+def test_a_deadline_missed_in_a_quiet_window_is_ours():
+    metrics = metrics_of([window(missed=1)], [window()])
+    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    assert "missed" in found.missed
+
+
+@pytest.mark.parametrize(
+    ("ours", "plain", "theirs", "outcome"),
+    [
+        (0, 500, 25.0, "reached"),
+        (4, 500, 25.0, "reached"),
+        (6, 500, 25.0, "missed"),
+        (6, 500, 9000.0, "inconclusive"),  # cyclictest missed too
+        (0, 50, 25.0, "inconclusive"),  # too few to tell a hundredth
+        (0, 0, 25.0, "inconclusive"),
+    ],
+)
+def test_missed_deadlines_under_load_are_compared_with_the_plain_loop(ours, plain, theirs, outcome):
+    pressed = window(theirs=[theirs], plain=Plain(histogram(9000.0), plain), missed=ours)
+    metrics = metrics_of([window()], [pressed])
+    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    name = "missed_loaded_share"
+    assert outcome == (
+        "missed" if name in found.missed else "inconclusive" if name in found.inconclusive else "reached"
+    )
+
+
+def test_a_figure_without_a_number_is_inconclusive():
+    metrics = metrics_of([window()], [window()]) | experiment.system_call_metrics(None)
+    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    assert "syscalls_per_tick" in found.inconclusive and "syscalls_per_tick" not in found.missed
+
+
+def test_the_names_others_rely_on_are_there():
+    metrics = metrics_of([window()], [window()])
+    frames = {"rx_decode_us", "rx_decode_pythoncan_us"}  # of the bus bench
+    assert set(metrics) >= {
+        "tick_cpu_p50_us", "tick_cpu_p99_us", "tick1k_cpu_p99_us", "wakeup_p50_ratio", "wakeup_p99_ratio", "missed",
+        "missed_loaded", "missed_loaded_plain", "sample_to_command_p99_us", "page_faults", "gc_runs", "host_verdict",
+        "missed_1k", "syscalls_per_tick", "voluntary_switches_per_tick", "steal_ms", "cyclictest_p99_us",
+    }  # fmt: skip
+    assert {f.name for f in FIGURES} <= set(metrics) | frames | {"stops"}
+    assert len({f.name for f in FIGURES}) == len(FIGURES)
+    assert len({file for s in SECTIONS for file, _ in s.pictures}) == 4
+
+
+def test_blocks_that_breathe_do_not_grow():
+    made = [window(at=2000 * i) for i in range(6)]
+    assert verdict.block_growth(made) == 0
+
+
+def test_a_lost_frame_is_a_gap_in_the_counter():
+    database = load("crane")
+    codec = database.message("ValveCmdA")
+    sender, seen = Sender(codec.data_ids), Continuity([database])
+    frames = [sender.protect(codec.encode(*(0 for _ in codec.signals))) for _ in range(20)]
+    for data in frames[:5] + frames[6:]:
+        seen.take(codec.key, data)
+    seen.take(codec.key, bytes(8))
+    seen.take(0x182, b"\x01\x02")  # an encoder's, unprotected
+    assert (seen.gaps, seen.damaged, seen.frames[codec.key], seen.frames[0x182]) == (1, 1, 20, 1)
+
+
+def test_counters_of_different_messages_are_kept_apart():
+    database = load("crane")
+    a, b = database.message("ValveCmdA"), database.message("ValveCmdB")
+    seen = Continuity([database])
+    senders = {c.key: Sender(c.data_ids, start) for c, start in ((a, 3), (b, 9))}
+    for _ in range(40):
+        for codec in (a, b):
+            seen.take(codec.key, senders[codec.key].protect(codec.encode(*(0 for _ in codec.signals))))
+    assert seen.gaps == seen.damaged == 0

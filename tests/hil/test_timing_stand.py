@@ -1,0 +1,237 @@
+"""The timing stand: its light machine and planner with the real controller in virtual time, its witness, the soak."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import replace
+
+import pytest
+from msgspec import structs
+from typer.testing import CliRunner
+
+from can_dbc.frame import Frame
+from can_dbc.setpoint import CraneSetpoint, StateReport, decode
+from can_dbc.timing_page import Facts, ProcessCounters
+from controller.config import load as settings_of
+from controller.guard.__main__ import build, profile_path
+from controller.record import record
+from controller.step import Controller, Inputs, step
+from hil.exits import Exit
+from hil.experiments import soak
+from hil.timing.planner import BEHIND_NS, Planner, Swing
+from hil.timing.reference import missing_tools
+from hil.timing.witness import Witness
+from machine.joints import JOINTS
+from machine.load import load_profile
+from machine.modes import Mode
+from machine.reasons import Reason
+from sim.kinematic import KinematicMachine, KinematicWorld
+from sim.nodes.valve import FUNCTIONS
+from sim.truth import load_truth
+from timberhand.cli import app
+
+START_NS = 1_000_000_000
+PALMS = load_profile("palms_471")
+
+
+class Virtual:
+    """Controller, guard, planner, witness and the light machine in one process, in steps of a period."""
+
+    def __init__(self, profile: str, rate_hz: int) -> None:
+        settings = settings_of(profile, rate_hz)
+        self.profile, self.period_ns = settings.profile, settings.period_ns
+        self.controller, self.guard = Controller(settings), build(profile_path(profile))
+        cycle_ns = min(5_000_000, self.period_ns)
+        self.machine = KinematicMachine(settings.profile, 1, step_ns=min(cycle_ns, 2_500_000), cycle_ns=cycle_ns)
+        self.planner = Planner(settings.profile)
+        self.witness = Witness(settings.profile, self.period_ns)
+        self.now_ns, self.guard_ns = START_NS, 0
+        self.inputs = Inputs()
+        self.heard: list[tuple[str, Frame]] = []
+        self.for_guard: list[Frame] = []
+        self.datagrams: list[bytes] = []
+        self.modes: list[tuple[int, int]] = []
+
+    def tick(self) -> None:
+        self.now_ns += self.period_ns
+        crane, machine = self.profile.crane_bus, self.profile.machine_bus
+        sent = self.machine.step(self.now_ns, self.heard)
+        inputs = self.inputs
+        inputs.frames[:] = [Frame(self.now_ns, key, data) for bus, key, data in sent if bus == crane]
+        inputs.machine_frames[:] = [Frame(self.now_ns, key, data) for bus, key, data in sent if bus == machine]
+        self.for_guard += inputs.frames
+        self.heard, guarded = [], []
+        if self.now_ns >= self.guard_ns:
+            self.guard_ns = self.now_ns + 5_000_000
+            guarded = self.guard.step(self.now_ns, self.for_guard)
+            self.for_guard = []
+        inputs.frames += [Frame(self.now_ns, key, data) for key, data in guarded]
+        inputs.datagrams[:], self.datagrams = self.datagrams, []
+        outputs = step(self.controller, inputs, self.now_ns)
+        self.witness.take(record(inputs, outputs, self.now_ns))
+        self.heard = [(crane, Frame(self.now_ns, *wire)) for wire in (*outputs.frames, outputs.sync, *guarded)]
+        self.heard += [(machine or "", Frame(self.now_ns, *wire)) for wire in outputs.machine_frames]
+        self.for_guard += [Frame(self.now_ns, *wire) for wire in outputs.frames]
+        if outputs.report is not None:
+            report = decode(outputs.report)
+            assert isinstance(report, StateReport)
+            if not self.modes or self.modes[-1][0] != report.mode:
+                self.modes.append((report.mode, report.reason))
+            self.datagrams += [d for d in (self.planner.hear(report),) if d]
+        if self.now_ns % 50_000_000 < self.period_ns:
+            self.datagrams += [d for d in (self.planner.setpoint(self.now_ns),) if d]
+
+
+@pytest.mark.parametrize(("profile", "rate_hz", "seconds"), [("aoro_fc8", 200, 5.0), ("palms_471", 1000, 4.0)])
+def test_the_light_machine_is_armed_moved_and_never_stopped(profile, rate_hz, seconds):
+    bench = Virtual(profile, rate_hz)
+    begin = bench.machine.joint_positions()
+    for _ in range(round(seconds * rate_hz)):
+        bench.tick()
+    assert [mode for mode, _ in bench.modes] == [Mode.BOOT, Mode.STANDBY, Mode.ARMED, Mode.ACTIVE]
+    moved = [abs(b - a) for a, b in zip(begin, bench.machine.joint_positions(), strict=True)]
+    assert min(moved) > 0.005
+    report = bench.planner.report
+    assert report is not None and report.refused == 0
+    for measured, wanted, spec in zip(report.position, report.reference, bench.profile.joints.values(), strict=True):
+        if spec.encoder is not None:
+            assert measured == pytest.approx(wanted, abs=0.1 * spec.speed_limit)
+    totals = bench.witness.totals()
+    assert totals["records"] == seconds * rate_hz
+    assert not any(totals[name] for name in ("records_lost", "records_unreadable", "gaps", "damaged", "unanswered"))
+
+
+def test_a_joint_follows_its_valve_through_dead_time_and_dead_band():
+    world = KinematicWorld(PALMS, load_truth("nominal", 1, PALMS.name), 5_000_000)
+    valve, lift = PALMS.joints["lift"].valve, FUNCTIONS.index("lift")
+    command = [0.0] * len(FUNCTIONS)
+    begin = world.q["lift"]
+
+    def run(percent: float, steps: int) -> float:
+        command[lift] = valve.sign * percent / 100.0
+        for _ in range(steps):
+            world.step(command)
+        return world.qd["lift"]
+
+    delay = round(valve.delay_s / 0.005)
+    assert run(0.5 * valve.deadband_plus_pct, 2 * delay) == 0.0
+    assert run(100.0, delay) == 0.0 and world.q["lift"] == begin
+    assert run(100.0, 1) == pytest.approx(valve.full_speed_plus)
+    assert world.q["lift"] == pytest.approx(begin + 0.005 * valve.full_speed_plus)
+    assert run(100.0, 4000) == 0.0 and world.q["lift"] == PALMS.joints["lift"].upper
+
+
+def test_a_swing_begins_at_rest_and_stays_within_range_and_speed():
+    for joint in JOINTS:
+        spec = PALMS.joints[joint.name.lower()]
+        for start in (spec.lower, spec.upper, (spec.lower + spec.upper) / 2):
+            swing = Swing(start, spec.lower, spec.upper, spec.speed_limit, spec.acceleration_limit)
+            assert swing.at(0.0) == (start, 0.0)
+            samples = [swing.at(0.01 * i) for i in range(4000)]
+            assert all(spec.lower - 1e-9 <= q <= spec.upper + 1e-9 for q, _ in samples)
+            assert 0.0 < max(abs(v) for _, v in samples) < 0.5 * spec.speed_limit
+
+
+def test_the_planner_says_nothing_to_a_machine_that_is_not_armed():
+    planner = Planner(PALMS)
+    report = StateReport(
+        1, 0, START_NS, Mode.STANDBY, 0, 0, 0, 0, 0, 0, (0.0,) * 5, (0.0,) * 5, (0.1, math.nan, 0.0, 0.5, 0.0),
+        1.0, 0.0, 0.0, 0, 0, 0, 0,
+    )  # fmt: skip
+    planner.hear(report)
+    assert planner.setpoint(START_NS) is None
+    planner.hear(replace(report, mode=Mode.ARMED))
+    first = decode(planner.setpoint(START_NS) or b"")
+    assert isinstance(first, CraneSetpoint) and first.stamp_ns == START_NS - BEHIND_NS
+    assert first.knots[0].position == (0.1, 0.0, 0.0, 0.5, 0.0) and first.knots[0].velocity == (0.0,) * 5
+
+
+def test_the_witness_misses_a_record_but_not_a_missed_period():
+    bench = Virtual("palms_471", 200)
+    records = []
+    bench.witness.take = records.append  # type: ignore[method-assign]
+    for _ in range(400):
+        bench.tick()
+    witness = Witness(PALMS, 5_000_000)
+    for data in records[:100] + records[101:]:
+        witness.take(data)
+    witness.take(records[-1][:-1] + bytes([records[-1][-1] ^ 1]))
+    totals = witness.totals()
+    assert totals["records_lost"] == 1 and totals["records_unreadable"] == 1 and totals["gaps"] > 0
+
+
+def test_growth_is_what_the_second_half_holds_beyond_the_first():
+    process = ProcessCounters(0, 5, 0, 0, 0, 3, 1000, 0)
+    facts = Facts(1, 0, 0, 5_000_000, 0, 0, 0, "ACTIVE", "", (), process, {}, (), ())
+
+    def reading(at_s: float, kb: int, blocks: int) -> soak.Reading:
+        grown = structs.replace(facts, process=structs.replace(process, allocated_blocks=blocks))
+        return soak.Reading(at_s, grown, kb, 10_000, "ACTIVE")
+
+    breathing = [reading(i, 50_000 + 4 * (i % 2), 1000 + i % 3) for i in range(10)]
+    assert soak.memory(breathing)["controller_growth_kb"] == soak.memory(breathing)["allocated_blocks_growth"] == 0.0
+    growing = [reading(i, 50_000 + 100 * i, 1000 + i) for i in range(10)]
+    assert soak.memory(growing)["controller_growth_kb"] == 500.0
+    assert soak.memory(growing)["allocated_blocks_growth"] == 5.0
+
+
+def test_a_machine_kept_still_by_the_host_alone_is_inconclusive():
+    still = dict.fromkeys(soak.LOSSES, 0.0) | {"active_share": 0.2, "ticks": 4000.0, "allocated_blocks_growth": 0.0}
+    late = {Reason.ENCODER_LOST, Reason.LOOP_LATE}
+    assert "active_share" in soak.untold(still, late)
+    assert not soak.untold(still, late | {Reason.JOINT_RUNAWAY})  # the laws stopped it
+    assert not soak.untold(still, set())  # nobody says why
+    assert not soak.untold(still | {"unanswered": 1.0}, late)  # an input is missing, not late
+    assert not soak.untold(still | {"active_share": 0.9}, late)
+
+
+def test_a_short_soak_cannot_tell_a_leak_from_a_breath_but_a_long_one_can():
+    moving = dict.fromkeys(soak.LOSSES, 0.0) | {"active_share": 1.0, "ticks": 4000.0, "allocated_blocks_growth": 2.0}
+    assert "allocated_blocks_growth" in soak.untold(moving, set())
+    assert not soak.untold(moving | {"allocated_blocks_growth": 20.0}, set())
+    stopped = moving | {"allocated_blocks_growth": 15.0}
+    assert "allocated_blocks_growth" in soak.untold(stopped, {Reason.VALVE_FEEDBACK_LOST}) and not soak.untold(
+        stopped, set()
+    )
+    assert not soak.untold(stopped | {"allocated_blocks_growth": 50.0}, {Reason.VALVE_FEEDBACK_LOST})
+    assert not soak.untold(moving | {"ticks": 360_000.0}, set())
+
+
+def test_the_commands_have_help_and_refuse_what_they_do_not_know():
+    text = CliRunner().invoke(app, ["experiment", "--help"], env={"COLUMNS": "200"}).output
+    assert "timing" in text and "soak" in text and "--minutes" in text
+    assert CliRunner().invoke(app, ["experiment", "soak", "--bus", "can0"]).exit_code == 2
+
+
+@pytest.mark.slow
+def test_a_short_soak_loses_nothing_and_grows_by_nothing(tmp_path):
+    result = CliRunner().invoke(app, ["experiment", "soak", "--quick", "--profile", "aoro_fc8", "--out", str(tmp_path)])
+    document = json.loads((tmp_path / "result.json").read_text())
+    assert result.exit_code == 0, (document["missed"], result.output[-2000:])
+    metrics = document["metrics"]
+    assert metrics["received"] > 40_000 and metrics["gaps"] == metrics["frames_lost"] == metrics["unanswered"] == 0
+    assert (tmp_path / "memory.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_quick_measurement_writes_everything_and_passes_nothing_it_cannot_tell(tmp_path):
+    if missing := missing_tools():
+        pytest.skip(f"not installed here: {', '.join(missing.values())}")
+    if os.geteuid():
+        pytest.skip("cyclictest gets SCHED_FIFO as root only")
+    command = ["experiment", "timing", "--quick", "--out", str(tmp_path / "out"), "--docs", str(tmp_path / "docs")]
+    result = CliRunner().invoke(app, command)
+    assert getattr(result.exception, "code", 0) in (Exit.FINE, Exit.FIGURE), result.output[-2000:]
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
+    open_ = {"wakeup_p50_ratio", "wakeup_p99_ratio", "missed", "page_faults", "gc_runs"}
+    assert open_ <= {*document["inconclusive"], *document["missed"]}
+    metrics = document["metrics"]
+    assert metrics["ticks"] > 600 and metrics["ticks_1k"] > 2000 and metrics["frames_per_s"] > 3000
+    assert metrics["cyclictest_p50_us"] > 0 and metrics["rx_decode_us"] > 0 and metrics["syscalls_per_tick"] > 4
+    page = (tmp_path / "docs" / "timing.md").read_text()
+    assert "Verdict on the host" in page and "inconclusive" in page
+    pictures = {path.name for path in (tmp_path / "docs" / "results" / "timing").iterdir()}
+    assert pictures == {"wakeups.png", "stages.png", "sample-to-command.png", "ages.png"}

@@ -1,0 +1,89 @@
+"""``timberhand bench loop-design``: margins of every loop over all machines that the truth's spread allows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+def loop_design(
+    profile: Annotated[
+        list[str] | None, typer.Option(help="A shipped profile or a TOML file; may be given again (default: both).")
+    ] = None,
+    truth: Annotated[str, typer.Option(help="The plant's truth and its spread: nominal or a TOML file.")] = "nominal",
+    out: Annotated[Path | None, typer.Option(help="Where the pictures go (default: none are drawn).")] = None,
+    docs: Annotated[
+        Path | None, typer.Option(help="Folder whose loop-design.md is written anew, with every law and pictures.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+) -> None:
+    """Linear model of every joint, and of the carrier, with its law; phase and gain margins, bandwidth, worst machine.
+
+    Near, working and far reach, empty and loaded, dead times and gains over the whole spread of the truth; for the
+    heading slow and fast, near a waypoint and far from it. Exit code 6
+    when a phase margin is below 40 deg or a gain margin below 6 dB anywhere.
+
+    [bold]Examples[/bold]
+
+      timberhand bench loop-design                              both shipped machines
+
+      timberhand bench loop-design --profile my.toml --out runs/loops   gains of your own, with pictures
+
+      timberhand bench loop-design --docs docs                  every law, and the page that shows them
+    """
+    import json
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from hil.exits import Exit, Stopped
+    from hil.loop_design import carrier
+    from hil.loop_design.study import GAIN_DB, PHASE_DEG, study, work_of
+    from machine.load import ProfileError, load_profile
+
+    screen = Console(stderr=as_json, highlight=False, soft_wrap=True)
+    documents: dict[str, Any] = {}
+    machines = []
+    holds = True
+    for source in profile or ["palms_471", "aoro_fc8"]:
+        try:
+            machine = load_profile(source)
+            with screen.status(f"{machine.name}: margins over all machines"):
+                work = work_of(source, truth)
+                studies = study(machine, work) + carrier.studies(machine, work)
+        except (ProfileError, ValueError) as error:
+            raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        table = Table(box=None, header_style="bold", pad_edge=False, title=machine.title, title_justify="left")
+        for column in ("joint", "law", "kp 1/s", "phase deg", "gain dB", "bandwidth Hz", "worst machine"):
+            table.add_column(column, justify="left" if column in ("joint", "law", "worst machine") else "right")
+        for joint in studies:
+            mark = "[green]✔[/green]" if joint.holds else "[red]✘[/red]"
+            law = joint.spec.law
+            table.add_row(
+                f"{mark} {joint.name}", law.kind, f"{law.kp_1_s:g}", f"{joint.phase_deg:.0f}", f"{joint.gain_db:.1f}",
+                f"{joint.bandwidth_hz:.2f}", str(joint.worst),
+            )  # fmt: skip
+            holds = holds and joint.holds
+        screen.print(table)
+        machines.append((machine, studies, work))
+        documents[machine.name] = {joint.name: joint.document() for joint in studies}
+        if out is not None:
+            from hil.loop_design.pictures import draw
+
+            for file in draw(machine.name, studies, out):
+                screen.print(f"[dim]{file}[/dim]")
+    if docs is not None:
+        from hil.loop_design.page import write
+
+        with screen.status("every law"):
+            holds = write(machines, docs) and holds
+        screen.print(f"[dim]{docs / 'loop-design.md'}[/dim]")
+    needed = {"phase_deg": PHASE_DEG, "gain_db": GAIN_DB}
+    if as_json:
+        typer.echo(json.dumps({"needed": needed, "reached": holds, "machines": documents}, indent=2))
+    else:
+        screen.print(f"needed everywhere: {PHASE_DEG:.0f} deg and {GAIN_DB:.0f} dB")
+    if not holds:
+        raise typer.Exit(Exit.FIGURE)
