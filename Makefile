@@ -5,10 +5,10 @@ BIN    := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help setup demo test check lint bench clean
+.PHONY: help setup demo test check lint bench soak lab-kernel clean
 
 help:  ## show this list
-	@awk -F':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(VENV)/.ready: pyproject.toml constraints.txt deploy/setup.sh
 	@PYTHON=$(PYTHON) sh deploy/setup.sh $(VENV)
@@ -22,7 +22,8 @@ demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--locks
 test: lint  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
 	@sh deploy/debian_packages.sh
 	@$(BIN)/pytest -m "not slow" -n 2 $(ARGS) || [ $$? -eq 5 ]
-	@$(BIN)/pytest -m slow $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
+	@$(BIN)/pytest -m "slow and computed" -n 2 $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
+	@$(BIN)/pytest -m "slow and not computed" $(ARGS) || [ $$? -eq 5 ]
 
 check: lint  ## lint, types, architecture and the fast tests
 	@$(BIN)/pytest -q -m "not slow" -n 2 $(ARGS)
@@ -33,9 +34,17 @@ lint: setup  ## style, types and the three floors
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-cache
 
-bench: setup  ## measure: codecs beside cantools, the plant against real time
+bench: setup  ## measure: codecs beside cantools, the bus beside python-can, the plant against real time
 	@$(BIN)/timberhand bench codec $(ARGS)
+	@$(BIN)/timberhand bench bus $(ARGS)
 	@$(BIN)/timberhand bench plant $(ARGS)
+
+soak: setup  ## half an hour at the control rate on vcan: nothing may grow, no frame may be lost
+	@sh deploy/debian_packages.sh
+	@$(BIN)/timberhand experiment soak --bus vcan $(ARGS)
+
+lab-kernel:  ## build the vcan lab's own kernel with simulated time, once (minutes, optional)
+	@sh deploy/lab_kernel/build.sh
 
 clean:  ## remove the virtual environment and everything generated
 	rm -rf $(VENV) build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
