@@ -130,18 +130,19 @@ def _furnish(order: dict[str, Any]) -> None:
         Path("/proc/sys", setting).write_text(value)
     for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):
         resource.setrlimit(limit, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    _hasten_soft_interrupts()
+    hasten_soft_interrupts(Path("/proc"))
 
 
-def _hasten_soft_interrupts() -> None:
+def hasten_soft_interrupts(proc: Path) -> None:
     """Gives the thread that delivers deferred frames and datagrams real-time priority.
 
     Every frame goes through a soft interrupt; once one is left to ksoftirqd, all wait for it, and at its ordinary
     priority busy processes held frames back for more than 15 ms while FIFO tasks ran on time (measured).
     """
-    for comm in Path("/proc").glob("[0-9]*/comm"):
-        if comm.read_text().startswith("ksoftirqd"):
-            os.sched_setscheduler(int(comm.parent.name), os.SCHED_FIFO, os.sched_param(SOFT_INTERRUPT_PRIORITY))
+    for comm in proc.glob("[0-9]*/comm"):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a worker of the kernel that just ended
+            if comm.read_text().startswith("ksoftirqd"):
+                os.sched_setscheduler(int(comm.parent.name), os.SCHED_FIFO, os.sched_param(SOFT_INTERRUPT_PRIORITY))
 
 
 def _end_descendants() -> None:

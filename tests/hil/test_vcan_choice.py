@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.vcan_lab import lab_kernel, shim
+from hil.vcan_lab import guest, lab_kernel, shim
 from hil.vcan_lab.choose import Machine, choose
 from hil.vcan_lab.spec import LabError
 
@@ -96,3 +96,24 @@ def test_without_a_compiler_a_sentence_says_what_to_install(tmp_path: Path, monk
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(LabError, match="apt-get install gcc libc6-dev"):
         shim.library(tmp_path)
+
+
+def test_workers_that_end_while_they_are_looked_at_do_not_end_the_guest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kernel workers come and go while the guest starts; one of twenty boots ended with status 4 for that."""
+    for pid, name in ((13, "ksoftirqd/0"), (14, "kworker/0:1"), (16, "ksoftirqd/1")):
+        (tmp_path / str(pid)).mkdir()
+        (tmp_path / str(pid) / "comm").write_text(f"{name}\n")
+    (tmp_path / "15").mkdir()
+    (tmp_path / "15" / "comm").symlink_to("gone")
+    hastened = []
+
+    def schedule(pid: int, policy: int, param: os.sched_param) -> None:
+        if pid == 13:
+            raise ProcessLookupError
+        hastened.append((pid, policy, param.sched_priority))
+
+    monkeypatch.setattr(os, "sched_setscheduler", schedule)
+    guest.hasten_soft_interrupts(tmp_path)
+    assert hastened == [(16, os.SCHED_FIFO, guest.SOFT_INTERRUPT_PRIORITY)]
