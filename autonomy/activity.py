@@ -25,6 +25,7 @@ from autonomy.motion.trajectory import Trajectory, hold, straight, turned
 from autonomy.motion.ways import Motions, Swiftest
 from autonomy.phases import BEGIN_AGAIN, RULES, Phase
 from autonomy.pursuit import BRAKE_S, Pursuit
+from autonomy.rotator import Rotator, hanging, is_counted, planned
 from autonomy.stream import SetpointStream
 from can_dbc.setpoint import GrappleCommand, StateReport
 from machine.grapple import grapple_yaw
@@ -56,7 +57,8 @@ class Activity:
     encoder is taken to stand there.  ``motions``: whose motions it makes.  ``onward`` says of a log whether the next
     job would fetch it; where there is such a log the crane stays between the stakes, with open tongs, to go on from
     there, and otherwise rises above them.  With ``stows`` no log is fetched: the crane goes over the bunk, holding
-    what it may hold, for the machine to drive; where it rests there already nothing moves.
+    what it may hold, for the machine to drive; where it rests there already nothing moves.  ``rotator``: what earlier
+    jobs found out about one without an encoder; afterwards what is known now.
     """
 
     def __init__(
@@ -71,6 +73,7 @@ class Activity:
         motions: Motions | None = None,
         onward: Callable[[LogObservation], bool] | None = None,
         stows: bool = False,
+        rotator: Rotator | None = None,
     ) -> None:
         self.phase = Phase.WAIT
         self.paused: str | None = "the controller has not reported"
@@ -85,8 +88,9 @@ class Activity:
         self.no_room = False
         """What was gripped has no room in the bunk."""
         self._motions, self._onward = motions or Swiftest(), onward
-        self._arm = Arm(profile, stretches=self._motions.stretches)
-        self._profile = profile
+        self.rotator = self._count = rotator or Rotator()
+        self._profile = planned(profile, self._count)
+        self._arm = Arm(self._profile, stretches=self._motions.stretches)
         self._mission = mission or Mission()
         self._target = self._mission.to(profile.bunk)
         self._choose = chooser
@@ -98,6 +102,9 @@ class Activity:
         self._logs_ns = -1
         self._pursuit = Pursuit(profile, rests)
         self._elapsed_s = 0.0
+        self._opening_s = 0.0
+        """How long the tongs have been told to open since they were closed."""
+        self._command = GrappleCommand.HOLD
         self._close_from_s = 0.0
         self._arrived_ns: int | None = None
         self._ready_ns: int | None = None
@@ -119,8 +126,8 @@ class Activity:
 
     @property
     def rests(self) -> tuple[float, ...]:
-        """Where the joints were last sent, rad (EXT m)."""
-        return self._pursuit.sent
+        """Where the joints were last sent, rad (EXT m), as far as is known now."""
+        return self.rotator.believed(self._count.counted(self._pursuit.sent))
 
     @property
     def motion(self) -> Trajectory:
@@ -160,10 +167,11 @@ class Activity:
         else:
             self._advance(dt_s)
         self._proceed(now_ns)
+        self._tell_tongs(dt_s)
         if self.idle or not self._stream.due(now_ns):
             return None
         way = self._pursuit
-        return self._stream.datagram(now_ns, way.motion, way.clock_s, self._grapple(), way.rate)
+        return self._stream.datagram(now_ns, self._count.motion(way.motion), way.clock_s, self._command, way.rate)
 
     def _obstacle(self, now_ns: int) -> str | None:
         """Why no setpoint would be obeyed now."""
@@ -192,7 +200,7 @@ class Activity:
         self.paused = None
         measured = self._position()
         follows = self._report.mode == Mode.ACTIVE and all(map(isfinite, self._report.reference))
-        start = self._report.reference if follows else measured
+        start = self._count.believed(self._report.reference) if follows else measured
         phase = self._first if self.phase is Phase.WAIT else self.phase
         if phase in BEGIN_AGAIN:
             assert self.grasp is not None
@@ -319,6 +327,8 @@ class Activity:
         following = self._next(now_ns) if self._arrived_ns is not None else None
         if following is not None and self.halted:
             return
+        if following is Phase.OPEN and now_ns - self._logs_ns < FRESH_NS:
+            self._see_rotator()
         if following is not None:
             resting = self.phase is not Phase.CLOSE
             self._enter(following, self.motion.goal if resting else self._pursuit.sent)
@@ -368,6 +378,8 @@ class Activity:
         pins = [self._arm.pose(q) for q in (self._position(), self._pursuit.sent)]
         held = came_up(self._arm, self.grasp, seen, pins)
         self.grasp = held or self.grasp
+        if held and self.phase is Phase.LIFT:
+            self._see_rotator()
         if held or not seen:
             return Phase(self.phase + 1)
         lost = next((log for log in seen if lies_in(self._target, log)), None)
@@ -418,6 +430,15 @@ class Activity:
             self.place = place
         return True
 
+    def _see_rotator(self) -> None:
+        """What hangs in the tongs tells how the rotator stands: the next job is to know."""
+        assert self.grasp is not None
+        seen = next((log for log in self._picked() if log.id == self.grasp.log.id), None)
+        if seen is not None and is_counted(self._profile):
+            q = self._position()
+            stands = hanging(self._profile, seen, q[Joint.SLEW])
+            self.rotator = self.rotator.seen(self._count.sent(q[Joint.ROT]), stands)
+
     def _carried(self, now_ns: int) -> bool:
         """Whether the log was seen in the grapple a moment ago."""
         return self._motions.direct and self._ready_ns == self._logs_ns and now_ns - self._logs_ns < FRESH_NS
@@ -459,9 +480,21 @@ class Activity:
 
     def _opened(self) -> bool:
         assert self._report is not None
-        return tongs.opened(self._profile, self._report, self._elapsed_s)
+        return tongs.opened(self._profile, self._report, self._opening_s)
+
+    def _tell_tongs(self, dt_s: float) -> None:
+        command = self._command = self._grapple()
+        if command is GrappleCommand.OPEN:
+            self._opening_s += dt_s
+        elif command is not GrappleCommand.NEUTRAL:
+            self._opening_s = 0.0
 
     def _grapple(self) -> GrappleCommand:
+        wanted = self._wanted()
+        low = self.phase is not Phase.OPEN and tongs.among_stakes(self._arm, self._target, self._position())
+        return GrappleCommand.NEUTRAL if wanted is GrappleCommand.OPEN and low else wanted
+
+    def _wanted(self) -> GrappleCommand:
         if Phase.LIFT <= self.phase <= Phase.LOWER and self.grasp is not None and self.grasp.gathered:
             return GrappleCommand.CLOSE  # the logs of a bundle settle; the tongs follow
         if self.phase in RULES:

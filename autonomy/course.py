@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import cos, hypot, sin
+from math import hypot
 from typing import Final
 
 import numpy as np
@@ -22,6 +22,7 @@ from autonomy.grasp.direct import (
     retreat_height,
     travel_height,
 )
+from autonomy.grasp.heap import point_in_bunk
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.obstacles import held_log, surroundings
@@ -127,10 +128,7 @@ def gathering(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
 def stowing(arm: Arm, motions: Motions, start: Pose, logs: Sequence[LogObservation]) -> Trajectory:
     """Over the bunk, high enough for what hangs open to be clear of the stakes; no motion where it is there."""
     bunk, high_m = arm.profile.bunk, retreat_height(arm.profile)
-    x, y = arm.xy(start)
-    ahead, aside = x - bunk.center_m[0], y - bunk.center_m[1]
-    c, s = cos(bunk.yaw_rad), sin(bunk.yaw_rad)
-    along, across = c * ahead + s * aside, c * aside - s * ahead
+    along, across = point_in_bunk(bunk, *arm.xy(start))
     if abs(along) < 0.5 * bunk.length_m and abs(across) < 0.5 * bunk.width_m:
         return straight(arm, start, start.at_height(max(start.z_m, high_m)))
     over = arm.over(*bunk.center_m, high_m, high_m)._replace(rot_rad=start.rot_rad)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isfinite
 from typing import Final
 
-from autonomy.grasp.direct import Grasp, opened_angle
+from autonomy.grasp.direct import RETREAT_CLEARANCE_M, Grasp, opened_angle, retreat_height
+from autonomy.grasp.heap import point_in_bunk
+from autonomy.motion.arm import Arm
 from can_dbc.setpoint import StateReport
 from machine.grapple import opening_pct_from_tong_angle, tong_angle_from_opening_pct
-from machine.profile import Profile
+from machine.profile import Bunk, Profile
 
 _GRIPPED: Final = (4, 5)  # GrappleStat.State: closed, holding
 _OPEN_PCT: Final = 92.0
@@ -50,6 +53,15 @@ def released(profile: Profile, report: StateReport, grasp: Grasp, opening_s: flo
         return report.opening_pct >= min(opening_pct_from_tong_angle(grapple.tongs, angle), _OPEN_PCT)
     turned = max(_GRIPPED_RAD - angle, 0.0) / grapple.tongs.angle_rad[-1]
     return opening_s > _VALVE_S + _SLOW_TONGS * turned * grapple.open_time_s
+
+
+def among_stakes(arm: Arm, bunk: Bunk, q: Sequence[float]) -> bool:
+    """Whether tongs that have let a log go stand so low over a bunk that to open further would stir the heap."""
+    pose = arm.pose(q)
+    x, y = arm.xy(pose)
+    along, across = point_in_bunk(bunk, x, y)
+    over = abs(along) < bunk.length_m / 2 and abs(across) < bunk.width_m / 2
+    return over and pose.z_m < retreat_height(arm.profile) - RETREAT_CLEARANCE_M
 
 
 def closed_for_s(profile: Profile, report: StateReport) -> float:

@@ -17,6 +17,7 @@ from typing import Final
 
 import numpy as np
 
+from autonomy.grasp.heap import Heap, in_bunk, point_in_bunk
 from autonomy.grasp.proposal import BunkFull, NoGrasp, Planner
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
@@ -47,14 +48,10 @@ LIFT_M: Final = 0.7
 """How far a log is lifted before the grasp is judged."""
 SIDE_M: Final = 0.15
 """Between a log that is laid down and the stakes: sway and the tracking error."""
-TONGS_SIDE_M: Final = 0.48
+TONGS_SIDE_M: Final = 0.40
 """Between the middle of closed tongs and the stakes: their half width, and the way's margin."""
-ASIDE_M: Final = 0.3
-"""Places across the bunk are about so far apart."""
 BESIDE_M: Final = 0.15
 """Tips that are so far beside a log when they leave it do not take it along."""
-ROOM_M: Final = 0.20
-"""What the tongs need beside a log while they open."""
 ALONE_M: Final = 0.9
 """A grasp with no other log so near to it cannot scoop one up: the tongs' half opening, and some."""
 _ALONG_M: Final = (0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3)
@@ -298,12 +295,16 @@ def plan_place(
     profile, bunk = arm.profile, mission.to(arm.profile.bunk)
     top, thickest = bunk.floor_z_m + bunk.stake_height_m, max(log.diameter_m for log in grasp.logs)
     taken = {log.id for log in grasp.logs}
-    (center_x, center_y), support = _roomiest(bunk, [o for o in logs if o.id not in taken], thickest)
+    heap = Heap(bunk, [o for o in logs if o.id not in taken], thickest, grasp.log.length_m)
+    rest = heap.lowest(bunk.width_m / 2 - max(thickest / 2 + SIDE_M, TONGS_SIDE_M))
+    c, s = cos(bunk.yaw_rad), sin(bunk.yaw_rad)
+    center_x, center_y = bunk.center_m[0] - rest.across_m * s, bunk.center_m[1] + rest.across_m * c
     if mission.place_m is not None:
         center_x, center_y = mission.place_m
-    if support + thickest / 2 > top - BELOW_TOP_M:
+        rest = heap.at(point_in_bunk(bunk, *mission.place_m)[1])
+    if rest.rest_z_m > top - BELOW_TOP_M:
         raise BunkFull(f"the bunk is full: log {grasp.log.id} would lie above the stakes, empty the bunk")
-    low = support + RELEASE_CLEARANCE_M + lowest_tip_below_pin_m(profile.grapple.tongs)
+    low = rest.support_z_m + RELEASE_CLEARANCE_M + lowest_tip_below_pin_m(profile.grapple.tongs)
     # The tongs open at the place itself, which is free of stakes; a log gripped off its centre moves them
     # only as far as it would stick out of the bunk.
     out_m = max(0.0, abs(grasp.along_m) + grasp.log.length_m / 2 - bunk.length_m / 2)
@@ -326,43 +327,11 @@ def plan_place(
     return pose._replace(rot_rad=rot)
 
 
-def _roomiest(bunk: Bunk, logs: Sequence[LogObservation], diameter_m: float) -> tuple[tuple[float, float], float]:
-    """Where across a bunk a log comes to lie lowest, the middle first, and the height of what is below it there.
-
-    The tongs need room on both sides, so what lies beside the place counts as below it, too.
-    """
-    inside = [(_in_bunk(bunk, log)[1], log) for log in logs if lies_in(bunk, log)]
-    most = max(0.0, 0.5 * bunk.width_m - max(0.5 * diameter_m + SIDE_M, TONGS_SIDE_M))
-    count = int(most / ASIDE_M)
-    places = [k * most / count for k in range(-count, count + 1)] if count else [0.0]
-
-    def below_m(at_m: float) -> float:
-        near = [
-            o.center_m[2] + o.diameter_m / 2
-            for a, o in inside
-            if abs(a - at_m) < (o.diameter_m + diameter_m) / 2 + ROOM_M
-        ]
-        return max([bunk.floor_z_m, *near])
-
-    best = min(places, key=lambda at: (round(below_m(at), 2), abs(at)))
-    c, s = cos(bunk.yaw_rad), sin(bunk.yaw_rad)
-    return (bunk.center_m[0] - best * s, bunk.center_m[1] + best * c), below_m(best)
-
-
 def lies_in(bunk: Bunk, log: LogObservation) -> bool:
     """Whether the log's centre is between the stakes."""
-    along, across = _in_bunk(bunk, log)
+    along, across = in_bunk(bunk, log)
     inside = abs(along) <= bunk.length_m / 2 and abs(across) <= bunk.width_m / 2
     return inside and log.center_m[2] < bunk.floor_z_m + bunk.stake_height_m
-
-
-def _in_bunk(bunk: Bunk, log: LogObservation) -> tuple[float, float]:
-    """How far along and across a bunk from its middle a log's centre is, m."""
-    x, y = log.center_m[0] - bunk.center_m[0], log.center_m[1] - bunk.center_m[1]
-    return (
-        x * cos(bunk.yaw_rad) + y * sin(bunk.yaw_rad),
-        -x * sin(bunk.yaw_rad) + y * cos(bunk.yaw_rad),
-    )
 
 
 def is_held(arm: Arm, log: LogObservation, pin: Pose) -> bool:

@@ -32,6 +32,7 @@ from autonomy.motion.primitives import load
 from autonomy.motion.ways import AsShown, Motions, Swiftest
 from autonomy.navigation.curves import PathRefused, Point2
 from autonomy.navigation.navigator import LEASE_NS, Navigator, Phase
+from autonomy.rotator import Rotator
 from can_dbc.setpoint import StateReport, VehicleReport, encode
 from machine.joints import N_JOINTS
 from machine.profile import Profile
@@ -91,7 +92,7 @@ class Manager:
         self.changes: deque[Change] = deque(maxlen=HISTORY)
         self.target: int | None = None
         self.activity: Activity | None = None
-        self._rests = (0.0,) * N_JOINTS
+        self._rests, self._rotator = (0.0,) * N_JOINTS, Rotator()
         self.single_step = False
         """Every change waits for `step_on`."""
         self.outlook = Outlook(profile, mission, plane)
@@ -243,7 +244,7 @@ class Manager:
         chooser = self._emptier if mission is not None and mission.source is not None else self._chooser
         self.activity = Activity(
             self._profile, self._hash, mission, self._lease_ns, self._key, chooser, self._rests,
-            self._motions, None if self.ride.faithful else self._goes_on, stows=mission is None,
+            self._motions, None if self.ride.faithful else self._goes_on, mission is None, self._rotator,
         )  # fmt: skip
 
     def _goes_on(self, log: LogObservation) -> bool:
@@ -255,7 +256,7 @@ class Manager:
 
     def _end_grasp(self) -> None:
         assert self.activity is not None
-        self._rests, self.activity = self.activity.rests, None
+        self._rests, self._rotator, self.activity = self.activity.rests, self.activity.rotator, None
 
     def _drive(self, state: State) -> None:
         here = self.outlook.location

@@ -47,6 +47,15 @@ def in_bunk(number: int, top_z_m: float) -> LogObservation:
     return LogObservation(number, (*BUNK.center_m, top_z_m - 0.1), axis, 2.6, 0.2)
 
 
+def layer(top_z_m: float) -> list[LogObservation]:
+    """Logs side by side from stake to stake, so close that none rolls in between, so far over the top of the stakes."""
+    log = in_bunk(0, BUNK.floor_z_m + BUNK.stake_height_m + top_z_m)
+    places = [k * 0.05 for k in range(-20, 21) if abs(k * 0.05) <= BUNK.width_m / 2]
+    c, s = cos(BUNK.yaw_rad), sin(BUNK.yaw_rad)
+    x, y, z = log.center_m
+    return [replace(log, id=k, center_m=(x - s * a, y + c * a, z)) for k, a in enumerate(places, 1)]
+
+
 def random_logs(n: int) -> list[LogObservation]:
     rng = random.Random("logs")
     (cx, cy), half = PROFILE.workspace.pick_center_m, PROFILE.workspace.pick_half_size_m
@@ -161,13 +170,13 @@ def test_a_place_is_above_what_is_in_the_bunk_until_the_bunk_is_full() -> None:
     deepest = lowest_tip_below_pin_m(TONGS)
     empty = plan_place(ARM, Mission(), grasp, [GROUND_LOG])
     assert 0.04 < empty.z_m - deepest - BUNK.floor_z_m < 0.1
-    half = plan_place(ARM, Mission(), grasp, [in_bunk(1, -0.5)])
+    half = plan_place(ARM, Mission(), grasp, layer(-0.5))
     assert half.z_m - empty.z_m == pytest.approx(0.5)
     top_m, radius_m = BUNK.floor_z_m + BUNK.stake_height_m, GROUND_LOG.diameter_m / 2
-    last = plan_place(ARM, Mission(), grasp, [in_bunk(1, top_m - BELOW_TOP_M - radius_m - 0.01)])
+    last = plan_place(ARM, Mission(), grasp, layer(-BELOW_TOP_M - radius_m - 0.01))
     assert last.z_m - deepest + radius_m < top_m + 0.03, "its middle comes to lie below the top of the stakes"
     with pytest.raises(BunkFull, match="the bunk is full"):
-        plan_place(ARM, Mission(), grasp, [in_bunk(1, top_m - BELOW_TOP_M - radius_m + 0.01)])
+        plan_place(ARM, Mission(), grasp, layer(-BELOW_TOP_M - radius_m + 0.01))
 
 
 def test_a_mission_may_name_the_place() -> None:
