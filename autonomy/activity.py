@@ -18,6 +18,7 @@ from autonomy.carried import ASIDE_M, came_up, picked, place_as_seen
 from autonomy.course import above, aimed, carrying, closing, gathering, stowing
 from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, choose, lies_in, plan_place, retreat_height
 from autonomy.grasp.proposal import BunkFull, NoGrasp
+from autonomy.heard import Heard
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
 from autonomy.motion.arm import Arm, Pose
@@ -32,15 +33,12 @@ from machine.grapple import grapple_yaw
 from machine.joints import JOINTS, Joint
 from machine.kinematics import Unreachable
 from machine.modes import Mode
-from machine.profile import Profile, joint
+from machine.profile import Profile
 from machine.sag import sane_load_kg
 
 ATTEMPTS: Final = 3
-SILENT_NS: Final = 300_000_000
 _LAYING: Final = 2.0
 """So much less near to its goal than elsewhere a log over the bunk need come: it need not lie so exactly."""
-FRESH_NS: Final = 600_000_000
-"""A log list that is no older says what hangs in the grapple now."""
 GATE_S: Final = 3.0
 """With so much of its way left an arm waits until the tongs are open: they are still high."""
 _SLOWEST: Final = 2.0
@@ -96,10 +94,7 @@ class Activity:
         self._choose = chooser
         self._first = Phase.STOW if stows else Phase.LOOK
         self._stream = SetpointStream(profile_hash, lease_ns, key)
-        self._report: StateReport | None = None
-        self._report_ns = 0
-        self._logs: tuple[LogObservation, ...] = ()
-        self._logs_ns = -1
+        self._heard = Heard(self._profile)
         self._pursuit = Pursuit(profile, rests)
         self._elapsed_s = 0.0
         self._opening_s = 0.0
@@ -151,13 +146,10 @@ class Activity:
         """
         dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _LONGEST_TICK_S)
         self._last_ns = now_ns
-        if report is not None:
-            self._report, self._report_ns = report, now_ns
-        if logs:
-            self._logs, self._logs_ns = logs, now_ns
+        self._heard.take(now_ns, report, logs)
         if self.idle:
             return None
-        obstacle = self._obstacle(now_ns)
+        obstacle = self._heard.obstacle(now_ns, self._pursuit.sent)
         if obstacle is not None:
             self.paused = obstacle
             self.idle = self.phase in (Phase.DONE, Phase.FAILED)
@@ -173,34 +165,15 @@ class Activity:
         way = self._pursuit
         return self._stream.datagram(now_ns, self._count.motion(way.motion), way.clock_s, self._command, way.rate)
 
-    def _obstacle(self, now_ns: int) -> str | None:
-        """Why no setpoint would be obeyed now."""
-        if self._report is None:
-            return "the controller has not reported"
-        if now_ns - self._report_ns > SILENT_NS:
-            return "the controller is silent"
-        if self._report.mode not in (Mode.ARMED, Mode.ACTIVE):
-            name = next((mode.name for mode in Mode if mode == self._report.mode), str(self._report.mode))
-            return f"the controller is in {name}"
-        if not all(map(isfinite, self._position())):
-            return "a joint position is unknown"
-        return None
-
     def _position(self) -> tuple[float, ...]:
-        """The measured joints; one without an encoder counts as standing where it was last sent."""
-        assert self._report is not None
-        return tuple(
-            p if joint(self._profile, j).encoder is not None else q
-            for j, p, q in zip(JOINTS, self._report.position, self._pursuit.sent, strict=True)
-        )
+        return self._heard.position(self._pursuit.sent)
 
     def _resume(self) -> None:
         """Goes on from the measured pose, in the interrupted phase or at the way to it."""
-        assert self._report is not None
         self.paused = None
         measured = self._position()
-        follows = self._report.mode == Mode.ACTIVE and all(map(isfinite, self._report.reference))
-        start = self._count.believed(self._report.reference) if follows else measured
+        follows = self._heard.report.mode == Mode.ACTIVE and all(map(isfinite, self._heard.report.reference))
+        start = self._count.believed(self._heard.report.reference) if follows else measured
         phase = self._first if self.phase is Phase.WAIT else self.phase
         if phase in BEGIN_AGAIN:
             assert self.grasp is not None
@@ -242,14 +215,14 @@ class Activity:
         arm = self._arm = self._arm.loaded(self._hanging_kg(phase))
         grasp, start = self.grasp, arm.pose(q)
         if phase is Phase.STOW:
-            return stowing(arm, self._motions, start, self._logs)
+            return stowing(arm, self._motions, start, self._heard.logs)
         if phase in (Phase.LOOK, Phase.OPEN, Phase.DONE, Phase.FAILED) or grasp is None:
             return hold(q)
         match phase:
             case Phase.ABOVE:
-                return above(arm, self._motions, start, grasp, self._logs)
+                return above(arm, self._motions, start, grasp, self._heard.logs)
             case Phase.DESCEND:
-                self.grasp = grasp = aimed(arm, grasp, self._logs)
+                self.grasp = grasp = aimed(arm, grasp, self._heard.logs)
                 return straight(arm, start, grasp.pose)
             case Phase.CLOSE:
                 measured_s = self._closed_for_s()
@@ -260,12 +233,12 @@ class Activity:
                     return gathering(arm, start, grasp)
                 if not self._motions.direct:
                     return straight(arm, start, grasp.pose.at_height(grasp.pose.z_m + LIFT_M))
-                self.place = plan_place(arm, self._mission, grasp, self._logs)
-                return carrying(arm, self._motions, start, self.place, grasp, self._logs, hangs=False)
+                self.place = plan_place(arm, self._mission, grasp, self._heard.logs)
+                return carrying(arm, self._motions, start, self.place, grasp, self._heard.logs, hangs=False)
             case Phase.CARRY:
                 self.lifted_kg = arm.load_kg
-                self.place = plan_place(arm, self._mission, grasp, self._logs, grapple_yaw(self._profile, q))
-                return carrying(arm, self._motions, start, self.place, grasp, self._logs, hangs=True)
+                self.place = plan_place(arm, self._mission, grasp, self._heard.logs, grapple_yaw(self._profile, q))
+                return carrying(arm, self._motions, start, self.place, grasp, self._heard.logs, hangs=True)
         assert self.place is not None
         if phase is Phase.LOWER:
             return straight(arm, start, self.place)
@@ -273,12 +246,10 @@ class Activity:
 
     def _hanging_kg(self, phase: Phase) -> float:
         """What the crane carries in a phase: a log that it has lifted bends it, and nothing else does."""
-        assert self._report is not None
-        return sane_load_kg(self._report.load_kg) if Phase.LIFT < phase < Phase.RETREAT else 0.0
+        return sane_load_kg(self._heard.report.load_kg) if Phase.LIFT < phase < Phase.RETREAT else 0.0
 
     def _closed_for_s(self) -> float:
-        assert self._report is not None
-        return tongs.closed_for_s(self._profile, self._report)
+        return tongs.closed_for_s(self._profile, self._heard.report)
 
     def _advance(self, dt_s: float) -> None:
         """Moves on along the motion, or smoothly slower to wait for the tongs or to stop for good."""
@@ -327,7 +298,7 @@ class Activity:
         following = self._next(now_ns) if self._arrived_ns is not None else None
         if following is not None and self.halted:
             return
-        if following is Phase.OPEN and now_ns - self._logs_ns < FRESH_NS:
+        if following is Phase.OPEN and self._heard.fresh(now_ns):
             self._see_rotator()
         if following is not None:
             resting = self.phase is not Phase.CLOSE
@@ -345,7 +316,7 @@ class Activity:
 
     def _next(self, now_ns: int) -> Phase | None:
         """The phase after this one, whose motion is done; None while it still waits for something."""
-        seen = self._arrived_ns is not None and self._logs_ns >= self._arrived_ns
+        seen = self._arrived_ns is not None and self._heard.logs_ns >= self._arrived_ns
         match self.phase:
             case Phase.LOOK:
                 return self._after_look() if seen else None
@@ -366,7 +337,7 @@ class Activity:
     def _after_look(self) -> Phase | None:
         q = self.motion.goal
         try:
-            self.grasp = self._choose(self._arm, self._mission, self._logs, q[Joint.SLEW], q[Joint.ROT])
+            self.grasp = self._choose(self._arm, self._mission, self._heard.logs, q[Joint.SLEW], q[Joint.ROT])
         except NoGrasp as error:
             self._fail(str(error))
             return None
@@ -402,9 +373,9 @@ class Activity:
             if self.phase is Phase.CARRY or risen_m > LIFT_M or self._arrived_ns is not None:
                 self._ready_ns = now_ns
             return
-        if self._logs_ns <= self._ready_ns:
+        if self._heard.logs_ns <= self._ready_ns:
             return
-        self._ready_ns = self._logs_ns
+        self._ready_ns = self._heard.logs_ns
         before = self.grasp
         following = self._after_lift()
         if following is Phase.LOOK:
@@ -422,7 +393,7 @@ class Activity:
     def _goes_on_so(self) -> bool:
         """Whether the motion will do for the log as it is now seen to hang, with another turn of the rotator."""
         assert self.grasp is not None and self.place is not None
-        place = place_as_seen(self._arm, self._mission, self.grasp, self.place, self._logs, self._position())
+        place = place_as_seen(self._arm, self._mission, self.grasp, self.place, self._heard.logs, self._position())
         if place is None:
             return False
         if turn := place.rot_rad - self.place.rot_rad:
@@ -441,12 +412,12 @@ class Activity:
 
     def _carried(self, now_ns: int) -> bool:
         """Whether the log was seen in the grapple a moment ago."""
-        return self._motions.direct and self._ready_ns == self._logs_ns and now_ns - self._logs_ns < FRESH_NS
+        return self._motions.direct and self._ready_ns == self._heard.logs_ns and self._heard.fresh(now_ns)
 
     def _after_open(self, now_ns: int) -> Phase | None:
         """Up and away, or done here with the next log in view."""
-        assert self._report is not None and self.grasp is not None
-        if not tongs.released(self._profile, self._report, self.grasp, self._elapsed_s):
+        assert self.grasp is not None
+        if not tongs.released(self._profile, self._heard.report, self.grasp, self._elapsed_s):
             return None
         if self._sorry:
             self._fail(self._sorry)
@@ -454,10 +425,10 @@ class Activity:
         if self._onward is None or not self._motions.direct:
             return Phase.RETREAT
         self._ready_ns = self._ready_ns or now_ns
-        if self._logs_ns < self._ready_ns:
+        if self._heard.logs_ns < self._ready_ns:
             return None
         picked = {log.id for log in self._picked()}
-        if any(log.id not in picked and self._onward(log) for log in self._logs):
+        if any(log.id not in picked and self._onward(log) for log in self._heard.logs):
             return self._after_retreat()
         return Phase.RETREAT
 
@@ -472,15 +443,13 @@ class Activity:
     def _picked(self) -> list[LogObservation]:
         """The logs of the grasp as they are seen now, without those that are hidden."""
         assert self.grasp is not None
-        return picked(self.grasp, self._logs)
+        return picked(self.grasp, self._heard.logs)
 
     def _gripped(self) -> bool:
-        assert self._report is not None
-        return tongs.gripped(self._report, self._elapsed_s)
+        return tongs.gripped(self._heard.report, self._elapsed_s)
 
     def _opened(self) -> bool:
-        assert self._report is not None
-        return tongs.opened(self._profile, self._report, self._opening_s)
+        return tongs.opened(self._profile, self._heard.report, self._opening_s)
 
     def _tell_tongs(self, dt_s: float) -> None:
         command = self._command = self._grapple()
