@@ -3,7 +3,10 @@
 The joint laws undo a dead-band with the profile's idea of it, so nobody can measure it through them.  A test goes past
 the laws and past nothing else: lease, order and arming are the gate's as for every setpoint; range, speed and duration
 are judged here, every tick, from what the encoder says.  The command may not grow faster, nor ask for more speed by
-the profile's valve map, than a law would; a joint without an encoder cannot be tested.
+the profile's valve map, than a law would.
+
+A joint without an encoder cannot be tested, but for a rotator: it only turns the grapple on the spot.  Its way counts
+as commanded, over all its tests since the start, and stays within its range; none of them lasts over 5 s.
 
 Inputs: accepted `SpoolTest` datagrams, the joint's position and velocity.  Outputs: the spool [%], and a
 reason to stop.  Fixed size; nothing raises but `Refusal` while a datagram is judged.
@@ -16,7 +19,7 @@ from array import array
 from typing import Final
 
 from can_dbc.setpoint import MAX_KNOTS, SpoolTest
-from machine.joints import JOINTS
+from machine.joints import JOINTS, Joint
 from machine.profile import JointSpec, Profile, joint
 from machine.reasons import Reason
 
@@ -29,6 +32,10 @@ SLACK_S: Final = 0.002
 STOP_S: Final = 0.3
 """A joint stops within its speed times this: dead time, stop ramp and oil."""
 LONGEST_NS: Final = 20_000_000_000
+LONGEST_BLIND_NS: Final = 5_000_000_000
+"""A rotator that nobody watches creeps at most so long by a command that is thought to be inside its dead-band."""
+STEP_NS: Final = 20_000_000
+"""After a pause the commanded way counts at most so much time."""
 AT_REST: Final = 0.05
 """Share of the speed limit below which a joint counts as standing."""
 NONE: Final = -1
@@ -45,12 +52,13 @@ class Refusal(Exception):
 class Bounds:
     """What the test of one joint may do."""
 
-    __slots__ = ("_deadband", "_full", "lower", "rate_pct_s", "sensed", "sign", "speed_limit", "upper")
+    __slots__ = ("_deadband", "_full", "longest_ns", "lower", "rate_pct_s", "sensed", "sign", "speed_limit", "upper")
 
     def __init__(self, spec: JointSpec) -> None:
         valve = spec.valve
         self.lower, self.upper, self.speed_limit = spec.lower, spec.upper, spec.speed_limit
         self.sensed = spec.encoder is not None
+        self.longest_ns = LONGEST_NS if self.sensed else LONGEST_BLIND_NS
         self.sign = valve.sign
         self._deadband = (valve.deadband_plus_pct, valve.deadband_minus_pct)
         self._full = (valve.full_speed_plus, valve.full_speed_minus)
@@ -84,7 +92,7 @@ class Bounds:
 class SpoolRun:
     """The test that is in force, or none (``function`` is `NONE`)."""
 
-    __slots__ = ("_begun_ns", "_bounds", "_last", "_n", "_percents", "_times_ns", "function")
+    __slots__ = ("_begun_ns", "_bounds", "_driven_ns", "_last", "_n", "_percents", "_times_ns", "function", "way")
 
     def __init__(self, profile: Profile) -> None:
         self._bounds = tuple(Bounds(joint(profile, j)) for j in JOINTS)
@@ -92,8 +100,11 @@ class SpoolRun:
         self._percents = array("d", [0.0] * MAX_KNOTS)
         self._n = 0
         self._begun_ns = 0
+        self._driven_ns = 0
         self._last = 0.0
         self.function = NONE
+        self.way = 0.0
+        """How far a rotator without an encoder was told to turn by all its tests [rad]."""
 
     @property
     def running(self) -> bool:
@@ -108,7 +119,7 @@ class SpoolRun:
         """Judges a datagram against the profile and the present command, and puts it in force; raises Refusal."""
         j = test.function
         bounds = self._bounds[j]
-        if not bounds.sensed:
+        if not bounds.sensed and j != Joint.ROT:
             raise Refusal(Reason.TEST_FUNCTION)
         if self.running and j != self.function and self.percent(now_ns) != 0.0:
             raise Refusal(Reason.TEST_BUSY)
@@ -164,7 +175,11 @@ class SpoolRun:
         if share == 1.0:
             self._last = self.percent(now_ns)
         percent = share * self._last
-        return bounds.sign * percent, bounds.speed(percent)
+        speed = bounds.speed(percent)
+        if not bounds.sensed:
+            self.way += speed * min(now_ns - self._driven_ns, STEP_NS) * 1e-9
+            self._driven_ns = now_ns
+        return bounds.sign * percent, speed
 
     def ends_neutral(self, now_ns: int) -> bool:
         """Whether the program is over and its last command was neutral: the lease may run out in peace."""
@@ -176,17 +191,19 @@ class SpoolRun:
 
     def judge(self, position: float, velocity: float, cap: float, now_ns: int) -> Reason:
         """What is wrong with the tested joint now; NONE while all is well.  ``cap`` scales the speed limit; an unknown
-        value is the supervisor's business.
+        value is the supervisor's business.  Of a joint without an encoder the commanded way is judged instead.
         """
         bounds = self._bounds[self.function]
+        percent = self.percent(now_ns)
+        if not bounds.sensed:
+            position, velocity = self.way, bounds.speed(percent)
         if abs(velocity) > cap * HEADROOM * bounds.speed_limit:
             return Reason.TEST_SPEED
         ahead = position + STOP_S * velocity
-        percent = self.percent(now_ns)
         if (ahead > bounds.upper and percent > 0.0) or (ahead < bounds.lower and percent < 0.0):
             return Reason.TEST_RANGE
         if percent == 0.0:
             self._begun_ns = now_ns
-        elif now_ns - self._begun_ns > LONGEST_NS:
+        elif now_ns - self._begun_ns > bounds.longest_ns:
             return Reason.TEST_TOO_LONG
         return Reason.NONE

@@ -27,7 +27,7 @@ from machine.modes import Mode
 from machine.profile import Profile
 from recorder.recorder import Recorder
 from sim.plant import Plant
-from sim.survey import TotalStation
+from sim.survey import TotalStation, grapple_yaw
 
 LONGEST_S: Final = 420.0
 AFTER_NS: Final = 500_000_000
@@ -67,7 +67,8 @@ class _Calibrator:
         if self.bus is not None:
             self.bus.drain(self._frames)
         reading = self._station.read(self._plant.tip()) if self.calibration.wants_reading else None
-        return self.calibration.step(now_ns, report, self._frames, reading)
+        yaw_rad = self._station.read_yaw(grapple_yaw(self._plant)) if self.calibration.wants_yaw else None
+        return self.calibration.step(now_ns, report, self._frames, reading, yaw_rad)
 
     def _plan(self, report: StateReport) -> None:
         try:

@@ -241,7 +241,7 @@ FAULTS: Final[dict[Reason, Fault]] = {
         Reaction.HOLD,
         10,
         _J,
-        "The spool test of {} lasts over 20 s without a pause",
+        "The spool test of {} lasts too long without a pause",
         "Cut it into shorter ones, then arm.",
     ),
     **DRIVING,

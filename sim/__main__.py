@@ -34,7 +34,7 @@ from sim.plant import Plant
 from sim.scene import KINDS
 from sim.site import Layer
 from sim.site_file import Site, load_site
-from sim.survey import TotalStation
+from sim.survey import TotalStation, grapple_yaw
 from sim.terrain import KINDS as TERRAINS
 from sim.view import scene_of, view_of
 
@@ -121,7 +121,8 @@ class LivePlant(LiveMachine):
             case "vehicle":
                 return plant.vehicle()
             case "survey":
-                return {"pin_m": self._station.read(plant.tip())}
+                station = self._station
+                return {"pin_m": station.read(plant.tip()), "yaw_rad": station.read_yaw(grapple_yaw(plant))}
             case "scene":
                 return scene_of(plant)
             case "view":

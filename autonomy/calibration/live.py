@@ -11,7 +11,8 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Final
+from math import nan
+from typing import Final, Protocol
 
 import msgspec
 
@@ -27,9 +28,12 @@ Address = tuple[str, int]
 
 
 class Surveyed(msgspec.Struct):
-    """A surveying instrument's answer: the hanger pin in the crane's base frame [m]."""
+    """A surveying instrument's answer, in the crane's base frame: the hanger pin [m], and the direction along which the
+    grapple opens [rad], where the instrument can tell it.
+    """
 
     pin_m: tuple[float, float, float]
+    yaw_rad: float | None = None
 
 
 class Instrument:
@@ -42,7 +46,16 @@ class Instrument:
         self._asked_ns = 0
 
     def read(self, now_ns: int) -> Point | None:
-        """The newest answer, or None; asks ten times a second."""
+        """Where the newest answer has the pin, or None; asks ten times a second."""
+        found = self._newest(now_ns)
+        return None if found is None else found.pin_m
+
+    def read_yaw(self, now_ns: int) -> float | None:
+        """The direction of the newest answer, NaN when the instrument tells none, or None; asks as often."""
+        found = self._newest(now_ns)
+        return None if found is None else nan if found.yaw_rad is None else found.yaw_rad
+
+    def _newest(self, now_ns: int) -> Surveyed | None:
         found = None
         while True:
             try:
@@ -50,7 +63,7 @@ class Instrument:
             except (BlockingIOError, ConnectionRefusedError):
                 break
             with suppress(msgspec.DecodeError):
-                found = msgspec.json.decode(data, type=Surveyed).pin_m
+                found = msgspec.json.decode(data, type=Surveyed)
         if now_ns - self._asked_ns >= 100_000_000:
             self._asked_ns = now_ns
             with suppress(OSError):
@@ -60,6 +73,16 @@ class Instrument:
     def close(self) -> None:
         """Gives the port back."""
         self._link.close()
+
+
+class Surveyor(Protocol):
+    """Whoever reads the hanger pin and the grapple's direction, as `Instrument` does; None: nothing yet."""
+
+    def read(self, now_ns: int) -> Point | None:
+        """The pin, base frame, m."""
+
+    def read_yaw(self, now_ns: int) -> float | None:
+        """The direction along which the grapple opens, base frame, rad modulo pi; NaN where it cannot be read."""
 
 
 class Link:
@@ -117,7 +140,7 @@ def run(
     calibration: Calibration,
     link: Link,
     bus: Bus,
-    survey: Callable[[int], Point | None],
+    surveyor: Surveyor | None,
     turn: Callable[[Calibration], None],
 ) -> None:
     """Turns until the procedure is over; ``turn`` is called each time and may abort it."""
@@ -125,11 +148,15 @@ def run(
     while not (calibration.idle or calibration.done):
         link.wait(TURN_S)
         # A person may take minutes to read an instrument: the time of the turn is the time after it.
-        reading = survey(time.monotonic_ns()) if calibration.wants_reading else None
+        reading = yaw_rad = None
+        if surveyor is not None and calibration.wants_reading:
+            reading = surveyor.read(time.monotonic_ns())
+        elif surveyor is not None and calibration.wants_yaw:
+            yaw_rad = surveyor.read_yaw(time.monotonic_ns())
         now_ns = time.monotonic_ns()
         frames.clear()
         bus.drain(frames)
-        data = calibration.step(now_ns, link.newest(), frames, reading)
+        data = calibration.step(now_ns, link.newest(), frames, reading, yaw_rad)
         if data is not None:
             link.send(data)
         turn(calibration)

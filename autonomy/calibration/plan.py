@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.calibration.program import staircase, sweep, travel_of
+from autonomy.calibration.program import PULSES, staircase, sweep, travel_of
 from autonomy.calibration.survey import telling_poses
 from machine.joints import JOINTS, Joint
 from machine.kinematics import pin_position
@@ -60,12 +60,15 @@ class JointPlan:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """All tests in their order; ``skipped`` are the joints without an encoder."""
+    """All tests in their order; ``skipped`` are the joints without an encoder, ``turned`` is the one of them that is
+    tested by the surveyor's readings.
+    """
 
     joints: tuple[JointPlan, ...]
     survey: tuple[tuple[float, ...], ...]
     skipped: tuple[Joint, ...]
     clear_z_m: float
+    turned: Joint | None = None
 
 
 def free_range(spec: JointSpec) -> tuple[float, float]:
@@ -95,7 +98,9 @@ def make_plan(profile: Profile, position: Sequence[float], surveyed: bool) -> Pl
     for j in sensed:
         plans.append(_joint_plan(profile, j, plans[-1].pose if plans else here, here[Joint.SLEW], clear))
     survey = _survey_poses(profile, here, clear) if surveyed else ()
-    return Plan(tuple(plans), survey, tuple(j for j in JOINTS if j not in sensed), clear)
+    blind = tuple(j for j in JOINTS if j not in sensed)
+    turned = Joint.ROT if surveyed and Joint.ROT in blind else None
+    return Plan(tuple(plans), survey, blind, clear, turned)
 
 
 def _grids(profile: Profile) -> list[list[float]]:
@@ -193,9 +198,14 @@ def sentences(profile: Profile, plan: Plan) -> list[str]:
             f"{p.joint.name.lower()}: within {p.low:+.2f} to {p.high:+.2f} {unit}, up to {p.fastest:.2f} {unit}/s; "
             f"boom tip at {hypot(x, y):.1f} m reach, {z:.1f} m high"
         )
-    lines += [f"{j.name.lower()}: not tested, it has no encoder" for j in plan.skipped]
+    lines += [f"{j.name.lower()}: not tested, it has no encoder" for j in plan.skipped if j is not plan.turned]
     lines.append("grapple: opens, closes and opens once, empty")
     if plan.survey:
         reach = max(hypot(*pin_position(profile.kinematics, q)[:2]) for q in plan.survey)
         lines.append(f"survey: {len(plan.survey)} poses within {reach:.1f} m reach")
+    if plan.turned is not None:
+        share, far = PULSES[-1]
+        speed = share * joint(profile, plan.turned).speed_limit
+        name = plan.turned.name.lower()
+        lines.append(f"{name}: there and back by {far:.1f} rad at the last pose, up to {speed:.2f} rad/s")
     return lines

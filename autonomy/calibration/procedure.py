@@ -3,7 +3,8 @@
 ``Calibration.step(now_ns, report, frames, survey)`` returns the datagram to send now, or None.  It waits until a human
 has armed, wiggles every joint a little to see that it moves the right way, then takes joint after joint to its pose by
 an ordinary trajectory and runs its slow sweep and its staircase on either side by spool tests, closes and opens the
-grapple, and stands at the survey's poses.  One function moves at a time.
+grapple, and stands at the survey's poses.  A rotator without an encoder turns there and back at the last of them,
+while the surveyor reads the grapple's direction at every rest.  One function moves at a time.
 
 It never insists: a stop, a refusal, a joint that moves the wrong way or not at all, or too little room ends the run
 with a sentence in ``failure``; ``abort`` closes the valve and ends it.  Nothing goes on after that.
@@ -12,14 +13,15 @@ with a sentence in ``failure``; ``abort`` closes the valve and ends it.  Nothing
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
+from math import isfinite, isnan
 from typing import Final
 
 from autonomy.calibration.plan import BEGIN_SHARE, Plan
-from autonomy.calibration.spool_attempt import LEAD_S, TAIL_S, SpoolAttempt, programmed
+from autonomy.calibration.spool_attempt import LEAD_S, TAIL_S, BlindAttempt, SpoolAttempt, programmed
 from autonomy.calibration.survey import Reading
-from autonomy.calibration.tasks import Findings, Grip, Look, Spool, Task, Travel, tasks_of
+from autonomy.calibration.tasks import Bearing, Findings, Grip, Look, Pulse, Spool, Task, Travel, tasks_of
 from autonomy.calibration.trace import BusTrace
+from autonomy.calibration.turning import Turning
 from autonomy.motion.arm import Arm
 from autonomy.motion.trajectory import Trajectory, across, hold
 from autonomy.stream import SetpointStream
@@ -34,13 +36,19 @@ from machine.profile import JointSpec, Profile, joint
 
 SETTLE_S: Final = 0.4
 SURVEY_SETTLE_S: Final = 1.5
+BEARING_SETTLE_S: Final = 0.4
+"""The grapple rests soon after a turn: nothing but its rotator has moved."""
 READINGS: Final = 8
 READING_NS: Final = 100_000_000
 SILENT_NS: Final = 300_000_000
 GRAPPLE_S: Final = 12.0
 GRIP_LEAST_S, BLIND_S = 0.5, 1.0
 ARRIVED: Final = (0.02, 0.02, 0.03, 0.03, 0.08)
+PULSE_S: Final = 2.0
+"""About how long a pulse takes."""
 _LATE: Final = 2.0
+_INCHING_S: Final = 20.0
+"""A joint whose dead-band is not known yet may have to be inched to where it is sent."""
 _BRAKE_S: Final = 0.8
 _OPEN, _CLOSED, _HOLDING = 1, 4, 5  # GrappleStat.State
 _LONGEST_TURN_S: Final = 0.1
@@ -48,7 +56,8 @@ _LONGEST_TURN_S: Final = 0.1
 
 class Calibration:
     """One run.  ``task`` is what it does now (None before and after), ``failure`` why it ended early, ``done`` that it
-    is complete; ``wants_reading`` asks the surveyor for the pin's position now.
+    is complete; ``wants_reading`` asks the surveyor for the pin's position now, ``wants_yaw`` for the direction along
+    which the grapple opens.
     """
 
     def __init__(
@@ -66,7 +75,7 @@ class Calibration:
         self.failure: str | None = None
         self.waiting: str | None = "the controller has not reported"
         self.idle = False
-        self.wants_reading = False
+        self.wants_reading = self.wants_yaw = False
         self.begun_ns: int | None = None
         self.elapsed_s = 0.0
         self._profile, self._plan = profile, plan
@@ -85,7 +94,8 @@ class Calibration:
         self._motion: Trajectory = hold((0.0,) * len(JOINTS))
         self._clock_s = 0.0
         self._rate = 1.0
-        self._spool: SpoolAttempt | None = None
+        self._spool: BlindAttempt | None = None
+        self._turning = Turning(joint(profile, Joint.ROT), self.found.turns)
         self._points: list[Point] = []
         self._point_ns = 0
         self._poses: list[tuple[float, ...]] = []
@@ -121,8 +131,13 @@ class Calibration:
         report: StateReport | None,
         frames: Sequence[Frame] = (),
         survey: Point | None = None,
+        yaw_rad: float | None = None,
     ) -> bytes | None:
-        """One turn (20 Hz or faster): the datagram to send now, or None."""
+        """One turn (20 Hz or faster): the datagram to send now, or None.
+
+        ``survey`` and ``yaw_rad`` are the surveyor's answers, base frame, m and rad modulo pi; NaN: no direction can be
+        read, and the rotator is not tested.
+        """
         self.trace.take(frames)
         dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _LONGEST_TURN_S)
         self._last_ns = now_ns
@@ -146,7 +161,7 @@ class Calibration:
             return None
         if not self._entered:
             self._enter(now_ns)
-        return self._proceed(now_ns, dt_s, survey)
+        return self._proceed(now_ns, dt_s, survey, yaw_rad)
 
     def _obstacle(self, now_ns: int) -> str | None:
         report = self._report
@@ -191,6 +206,10 @@ class Calibration:
                 return 4.0
             case Grip():
                 return 1.2 * self._profile.grapple.close_time_s
+            case Pulse():
+                return LEAD_S + PULSE_S + TAIL_S
+            case Bearing():
+                return BEARING_SETTLE_S + self._readings * READING_NS * 1e-9
         return SURVEY_SETTLE_S + self._readings * READING_NS * 1e-9
 
     def _enter(self, now_ns: int) -> None:
@@ -207,6 +226,8 @@ class Calibration:
             case Spool():
                 self._spool = SpoolAttempt(self._spec(task.joint), task, self._position()[task.joint])
                 self._check_room(task, self._spool.end)
+            case Pulse():
+                self._spool = BlindAttempt(self._turning.program(task))
             case _:
                 self._motion = hold(start)
                 self._points, self._poses, self._point_ns = [], [], 0
@@ -230,19 +251,19 @@ class Calibration:
     def _next(self) -> None:
         self._at += 1
         self._entered = False
-        self.wants_reading = False
+        self.wants_reading = self.wants_yaw = False
 
-    def _proceed(self, now_ns: int, dt_s: float, survey: Point | None) -> bytes | None:
+    def _proceed(self, now_ns: int, dt_s: float, survey: Point | None, yaw_rad: float | None) -> bytes | None:
         task = self._tasks[self._at]
         time_s = (now_ns - self._task_ns) * 1e-9
         match task:
-            case Spool():
+            case Spool() | Pulse():
                 return self._run_spool(task, time_s, now_ns)
             case Travel():
                 self._clock_s += dt_s
                 if self._clock_s >= self._motion.duration_s + SETTLE_S and self._arrived():
                     self._next()
-                elif self._clock_s > _LATE * self._motion.duration_s + 6.0:
+                elif self._clock_s > _LATE * self._motion.duration_s + _INCHING_S:
                     self.abort(f"the crane did not come {task.why}")
                 return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
             case Grip():
@@ -250,6 +271,9 @@ class Calibration:
                 return self._motion_datagram(now_ns, task.command)
             case Look():
                 self._run_look(task, time_s, now_ns, survey)
+                return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
+            case Bearing():
+                self._run_bearing(time_s, now_ns, yaw_rad)
                 return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
         return None
 
@@ -265,7 +289,7 @@ class Calibration:
             return None
         return self._stream.datagram(now_ns, self._motion, self._clock_s, grapple, self._rate)
 
-    def _run_spool(self, task: Spool, time_s: float, now_ns: int) -> bytes | None:
+    def _run_spool(self, task: Spool | Pulse, time_s: float, now_ns: int) -> bytes | None:
         assert self._spool is not None and self._report is not None
         run, position = self._spool, self._position()[task.joint]
         run_s = time_s - LEAD_S
@@ -283,9 +307,13 @@ class Calibration:
             return None
         return self._stream.spool(now_ns, task.joint, run.window(run_s))
 
-    def _finish_spool(self, task: Spool, wrong: str | None, now_ns: int) -> None:
+    def _finish_spool(self, task: Spool | Pulse, wrong: str | None, now_ns: int) -> None:
         if wrong:
             self.abort(wrong)
+            return
+        if isinstance(task, Pulse):
+            self._turning.ran(self.trace.test(task.joint, task.side, "pulse", self._task_ns, now_ns))
+            self._next()
             return
         test = self.trace.test(task.joint, task.side, task.kind, self._task_ns, now_ns)
         (self.found.wiggles if task.kind == "wiggle" else self.found.tests).append(test)
@@ -326,10 +354,25 @@ class Calibration:
             self.found.readings.append(Reading(position, (x, y, z), moment_nm))
             self._next()
 
+    def _run_bearing(self, time_s: float, now_ns: int, yaw_rad: float | None) -> None:
+        self.wants_yaw = time_s >= BEARING_SETTLE_S and now_ns >= self._point_ns
+        if yaw_rad is None or time_s < BEARING_SETTLE_S:
+            return
+        if isnan(yaw_rad):
+            del self._tasks[self._at :]  # nothing but the rotator's turns is left
+            self.wants_yaw = False
+            return
+        self._point_ns = now_ns + READING_NS
+        if self._turning.see(yaw_rad, self._position()[Joint.SLEW]) >= self._readings:
+            if wrong := self._turning.rest():
+                self.abort(wrong)
+                return
+            self._next()
+
     def _brake(self, now_ns: int, dt_s: float) -> bytes | None:
         """The end of a run that failed: valve closed, or the motion slowed to a stand on its path."""
         task = self._tasks[self._at] if self._at < len(self._tasks) else None
-        if isinstance(task, Spool) and self._entered:
+        if isinstance(task, Spool | Pulse) and self._entered:
             run_s = (now_ns - self._task_ns) * 1e-9 - LEAD_S
             assert self._spool is not None
             if self._rate != 0.0:

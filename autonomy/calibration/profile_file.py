@@ -7,6 +7,7 @@ gets its name, so a profile that this release would refuse is never left behind.
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +16,7 @@ from tomlkit.items import Item
 
 from autonomy.calibration.result import JointResult, Result
 from autonomy.calibration.survey import OFFSETS, SurveyFit
+from autonomy.calibration.turn_fit import TurnFit
 from can_dbc.setpoint import GrappleCommand
 from machine.joints import Joint
 from machine.lift import lever_share
@@ -39,6 +41,8 @@ def changes(profile: Profile, result: Result) -> list[Change]:
     found: list[Change] = []
     for j, r in result.joints.items():
         found += _joint_changes(("joints", j.name.lower()), joint(profile, j), r)
+    if result.turns is not None:
+        found += _turn_changes(("joints", "rot"), joint(profile, Joint.ROT), result.turns)
     if result.survey is not None:
         found += _survey_changes(profile, result.survey)
     for command, key in ((GrappleCommand.CLOSE, "close_time_s"), (GrappleCommand.OPEN, "open_time_s")):
@@ -77,23 +81,45 @@ def _joint_changes(path: tuple[str, ...], spec: JointSpec, r: JointResult) -> li
     arm = lever_share(spec.valve, valve.at)
     fulls = [arm * full for full in valve.full_speeds]
     where = f"measured at {r.joint.name.lower()} {valve.at:+.2f} {unit}"
-    found: list[Change] = []
-    for i, side in enumerate(("plus", "minus")):
-        deadband = round(100.0 * valve.deadbands[i], 2)
-        found.append(((*path, "valve", f"deadband_{side}_pct"), deadband, "middle of the hysteresis"))
-    for i, side in enumerate(("plus", "minus")):
-        found.append(((*path, "valve", f"full_speed_{side}"), round(fulls[i], 4), f"{unit}/s {where}"))
+    found = _valve_changes(path, valve.deadbands, fulls, ("middle of the hysteresis", f"{unit}/s {where}"))
     hysteresis, exponent = round(100.0 * valve.hysteresis, 2), round(valve.exponent, 3)
     found.append(((*path, "valve", "hysteresis_pct"), hysteresis, "play of the spool, whole width"))
     found.append(((*path, "valve", "exponent"), exponent, "metering curve from dead-band to full speed"))
-    slowest = min(fulls)
-    if slowest < spec.speed_limit:
-        limit = round(SPEED_SHARE * slowest, 4)
-        found.insert(0, ((*path, "speed_limit"), limit, f"{unit}/s, the valve gives no more than {slowest:.3f}"))
+    found[:0] = _limit_changes(path, spec, fulls, unit)
     if r.delay is not None:
         found.append(((*path, "valve", "delay_s"), round(r.delay.delay_s, 4), "dead time, command to spool"))
         found.append(((*path, "valve", "lag_s"), round(r.delay.lag_s, 4), "of the spool"))
     return found
+
+
+def _turn_changes(path: tuple[str, ...], spec: JointSpec, turns: TurnFit) -> list[Change]:
+    sides = (turns.plus, turns.minus)
+    fulls = [side.full_speed for side in sides]
+    remarks = ("by surveyed turns, play and exponent as they were", "rad/s, by the same turns")
+    changed = _valve_changes(path, [side.deadband for side in sides], fulls, remarks)
+    return _limit_changes(path, spec, fulls, "rad") + changed
+
+
+def _valve_changes(
+    path: tuple[str, ...], deadbands: Sequence[float], fulls: Sequence[float], remarks: tuple[str, str]
+) -> list[Change]:
+    """Dead-bands [share of full command] and full speeds, plus and minus."""
+    sides = ("plus", "minus")
+    found: list[Change] = []
+    for side, deadband in zip(sides, deadbands, strict=True):
+        found.append(((*path, "valve", f"deadband_{side}_pct"), round(100.0 * deadband, 2), remarks[0]))
+    for side, full in zip(sides, fulls, strict=True):
+        found.append(((*path, "valve", f"full_speed_{side}"), round(full, 4), remarks[1]))
+    return found
+
+
+def _limit_changes(path: tuple[str, ...], spec: JointSpec, fulls: Sequence[float], unit: str) -> list[Change]:
+    """A lower speed limit where the valve cannot reach the profile's."""
+    slowest = min(fulls)
+    if slowest >= spec.speed_limit:
+        return []
+    limit = round(SPEED_SHARE * slowest, 4)
+    return [((*path, "speed_limit"), limit, f"{unit}/s, the valve gives no more than {slowest:.3f}")]
 
 
 def write_profile(source: Path, out: Path, changed: list[Change], date: str) -> None:

@@ -7,6 +7,7 @@ valve by half the rate that the controller allows.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
@@ -27,6 +28,12 @@ SWEEP_PCT_S, SWEEP_OVER_PCT = 7.0, 16.0
 STEP_SHARES: Final = (0.3, 0.55, 0.8)
 """Steady speeds of the staircase, as shares of the speed limit by the profile's valve map."""
 HOLD_S: Final = 0.9
+PULSE_FACTOR: Final = 0.5
+"""A pulse opens and shuts as gently as the planner's motions do: one that jerks loses 0.05 s of its way to the pump."""
+PULSES: Final = ((0.12, 0.4), (0.35, 0.9), (0.7, 1.6))
+"""A rotator without an encoder turns there and back at these shares of its speed limit, so far [rad]: the slow turns
+tell the dead-band, and each is short enough that those before it tell its half turns.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,14 +120,23 @@ def turned(program: SpoolProgram, time_s: float) -> SpoolProgram:
 
 def staircase(spec: JointSpec, side: int) -> SpoolProgram:
     """Three steady speeds, each long enough for the oil to come to rest, and shut."""
-    rate_pct_s = 100.0 * OPENING_FACTOR * spec.acceleration_limit
+    return _steps(spec, side, STEP_SHARES, HOLD_S, OPENING_FACTOR)
+
+
+def pulse(spec: JointSpec, side: int, share: float, hold_s: float) -> SpoolProgram:
+    """One steady speed, by the profile's valve map a ``share`` of the speed limit, for so long, and shut."""
+    return _steps(spec, side, (share,), hold_s, PULSE_FACTOR)
+
+
+def _steps(spec: JointSpec, side: int, shares: Sequence[float], hold_s: float, factor: float) -> SpoolProgram:
+    rate_pct_s = 100.0 * factor * spec.acceleration_limit
     rate_pct_s /= max(spec.valve.full_speed_plus, spec.valve.full_speed_minus)
     before = max(0.0, deadband_pct(spec, side) - 0.5)
     points = [(0.0, 0.0), (STEP_S, before)]
-    for share in STEP_SHARES:
+    for share in shares:
         level = command_for(spec, side, share * spec.speed_limit)
         t = points[-1][0] + max((level - before) / rate_pct_s, STEP_S)
-        points += [(t, level), (t + HOLD_S, level)]
+        points += [(t, level), (t + hold_s, level)]
         before = level
     floor = max(0.0, deadband_pct(spec, side) - 0.5)
     t = points[-1][0] + (before - floor) / rate_pct_s

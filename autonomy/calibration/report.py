@@ -15,6 +15,7 @@ import numpy as np
 from autonomy.calibration.profile_file import Change
 from autonomy.calibration.result import JointResult, Result
 from autonomy.calibration.survey import OFFSETS
+from autonomy.calibration.turn_fit import TurnFit
 from machine.joints import Joint
 
 ROUND: Final = 6
@@ -41,6 +42,8 @@ def document(result: Result, facts: dict[str, Any], changed: list[Change]) -> di
             "joints": joints,
             "grapple_s": {c.name.lower(): t for c, t in result.grapple_s.items()},
             "survey": survey,
+            **({} if result.turns is None else {"rotator": _rotator(result.turns)}),
+            **({"kept": list(result.kept)} if result.kept else {}),
             "changes": {".".join(path): value for path, value, _ in changed},
         }
     )
@@ -63,6 +66,18 @@ def _joint(r: JointResult) -> dict[str, Any]:
         "fastest": r.fastest,
         "residual": v.residual,
         "errors": v.errors,
+    }
+
+
+def _rotator(turns: TurnFit) -> dict[str, Any]:
+    sides = (turns.plus, turns.minus)
+    return {
+        "deadband_pct": [100.0 * s.deadband for s in sides],
+        "deadband_errors_pct": [100.0 * s.errors[0] for s in sides],
+        "full_speed": [s.full_speed for s in sides],
+        "full_speed_errors": [s.errors[1] for s in sides],
+        "turns_rad": [list(s.turns_rad) for s in sides],
+        "left_rad": [list(s.left_rad) for s in sides],
     }
 
 

@@ -16,6 +16,7 @@ from autonomy.calibration.delay_fit import DelayFit, fit_delay, response_s
 from autonomy.calibration.survey import LEAST_POSES, OFFSETS, SurveyFit, fit_survey
 from autonomy.calibration.tasks import Findings
 from autonomy.calibration.trace import Record
+from autonomy.calibration.turn_fit import SIDES, TurnFit, fit_turns
 from autonomy.calibration.valve_fit import ValveFit, fit_valve, repeated
 from can_dbc.setpoint import GrappleCommand
 from machine.joints import JOINTS, Joint
@@ -46,6 +47,12 @@ GIVE_MOST_RAD_NM: Final = 6e-6
 """A column that gives more than this bends 0.1 rad under a small crane's own weight."""
 MOMENT_MOST_NM: Final = 2000.0
 """Root mean square moment that the weighing may leave: over twice the friction of a lift cylinder."""
+TURN_LEFT_MOST_RAD: Final = 0.1
+"""What the fit may leave of a turn: four times the noise of two single readings; a mistaken half turn leaves more."""
+TURN_DEADBAND_ERROR: Final = 0.01
+"""Greatest standard error of a dead-band by turns, in which six rests stand for thousands of samples."""
+TURNS_LEAST: Final = 2
+"""On either side: one turn alone tells no dead-band from a full speed."""
 AFTER_MOST_M: Final = 0.012
 """Root mean square distance that surveyed pins may keep after the fit."""
 GRAPPLE_S: Final = (0.5, 10.0)
@@ -67,12 +74,16 @@ class JointResult:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A whole calibration; ``survey`` is None when nobody surveyed."""
+    """A whole calibration; ``survey`` is None when nobody surveyed, ``turns`` when no rotator was tested by surveyed
+    directions.  ``kept``: a sentence for what stays as the profile has it, for want of a sensor.
+    """
 
     joints: dict[Joint, JointResult]
     grapple_s: dict[GrappleCommand, float]
     survey: SurveyFit | None
     implausible: tuple[str, ...] = field(default=())
+    turns: TurnFit | None = None
+    kept: tuple[str, ...] = ()
 
 
 def identify(profile: Profile, found: Findings) -> Result:
@@ -87,7 +98,14 @@ def identify(profile: Profile, found: Findings) -> Result:
     sentences += list(_grapple_sentences(found.grapple_s))
     if survey is not None:
         sentences += list(_survey_sentences(survey))
-    return Result(joints, dict(found.grapple_s), survey, tuple(sentences))
+    turns, kept = None, []
+    if joint(profile, Joint.ROT).encoder is None:
+        if all(sum(t.record.side == side for t in found.turns) >= TURNS_LEAST for side in SIDES):
+            turns = fit_turns(found.turns, joint(profile, Joint.ROT))
+            sentences += list(_turn_sentences(turns, joint(profile, Joint.ROT)))
+        else:
+            kept.append("rot: its valve's values stay as they were, it has no encoder and no turn of it was surveyed")
+    return Result(joints, dict(found.grapple_s), survey, tuple(sentences), turns, tuple(kept))
 
 
 def _joint_result(which: Joint, spec: JointSpec, tests: Sequence[Record], wiggles: Sequence[Record]) -> JointResult:
@@ -119,19 +137,42 @@ def _outside(name: str, what: str, value: float, bounds: tuple[float, float], sc
         )
 
 
+def _side_sentences(
+    name: str, deadband: float, full_speed: float, errors: tuple[float, float], nominal: float, most: float
+) -> Iterator[str]:
+    """One side of a valve: its values, and their standard errors; ``most`` is the greatest of the dead-band's."""
+    yield from _outside(name, "dead-band", deadband, DEADBANDS, 100.0, "%")
+    yield from _outside(name, "full speed over the profile's", full_speed / nominal, FULL_SHARES, 1.0, "")
+    if not errors[0] <= most:
+        yield f"{name}: the dead-band is known only within {100 * errors[0]:.1f} %; repeat at rest, without load"
+    share = errors[1] / full_speed
+    if not share <= GAIN_ERROR:
+        yield f"{name}: the full speed is known only within {100 * share:.0f} %; repeat with warm oil"
+
+
+def _pair_sentences(name: str, full_speeds: tuple[float, float]) -> Iterator[str]:
+    if not 1.0 / SIDES_MOST <= full_speeds[0] / full_speeds[1] <= SIDES_MOST:
+        yield f"{name}: one side is over {SIDES_MOST} times faster than the other; look for a throttle or a load"
+
+
+def _turn_sentences(fit: TurnFit, spec: JointSpec) -> Iterator[str]:
+    for name, side, nominal in (
+        ("rot plus", fit.plus, spec.valve.full_speed_plus), ("rot minus", fit.minus, spec.valve.full_speed_minus),
+    ):  # fmt: skip
+        yield from _side_sentences(name, side.deadband, side.full_speed, side.errors, nominal, TURN_DEADBAND_ERROR)
+        left = max(map(abs, side.left_rad))
+        if not left <= TURN_LEFT_MOST_RAD:
+            yield f"{name}: its turns do not fit a valve, {degrees(left):.0f} deg are left; check the directions read"
+    yield from _pair_sentences("rot", (fit.plus.full_speed, fit.minus.full_speed))
+
+
 def _joint_sentences(r: JointResult, spec: JointSpec) -> Iterator[str]:
     name, valve = r.joint.name.lower(), r.valve
     for side, i in (("plus", 0), ("minus", 1)):
-        yield from _outside(f"{name} {side}", "dead-band", valve.deadbands[i], DEADBANDS, 100.0, "%")
         nominal = spec.valve.full_speed_plus if i == 0 else spec.valve.full_speed_minus
-        share = valve.full_speeds[i] / nominal
-        yield from _outside(f"{name} {side}", "full speed over the profile's", share, FULL_SHARES, 1.0, "")
-        error = valve.errors[f"deadband_{side}"]
-        if not error <= DEADBAND_ERROR:
-            yield f"{name} {side}: the dead-band is known only within {100 * error:.1f} %; repeat at rest, without load"
-        error = valve.errors[f"full_{side}"] / valve.full_speeds[i]
-        if not error <= GAIN_ERROR:
-            yield f"{name} {side}: the full speed is known only within {100 * error:.0f} %; repeat with warm oil"
+        errors = (valve.errors[f"deadband_{side}"], valve.errors[f"full_{side}"])
+        found = (valve.deadbands[i], valve.full_speeds[i], errors, nominal)
+        yield from _side_sentences(f"{name} {side}", *found, DEADBAND_ERROR)
         if not abs(r.repeats[i]) <= REPEAT_MOST:
             yield (
                 f"{name} {side}: the dead-band of the wiggle differs by {100 * r.repeats[i]:.1f} % of the spool; "
@@ -139,8 +180,7 @@ def _joint_sentences(r: JointResult, spec: JointSpec) -> Iterator[str]:
             )
     if not 0.0 <= valve.hysteresis <= HYSTERESIS_MOST:
         yield f"{name}: a hysteresis of {100 * valve.hysteresis:.1f} % of the spool: look for dirt or missing dither"
-    if not 1.0 / SIDES_MOST <= valve.full_speeds[0] / valve.full_speeds[1] <= SIDES_MOST:
-        yield f"{name}: one side is over {SIDES_MOST} times faster than the other; look for a throttle or a load"
+    yield from _pair_sentences(name, valve.full_speeds)
     if valve.residual > RESIDUAL_S * spec.speed_limit:
         yield f"{name}: the motion does not fit a valve (residual {valve.residual:.4f}); look for contact or play"
     yield from _delay_sentences(name, r.delay)

@@ -1,4 +1,5 @@
-"""One spool program while it runs: broken off or turned as soon as the joint has shown enough, and watched.
+"""One spool program while it runs: broken off or turned as soon as the joint has shown enough, and watched; that of a
+joint without an encoder is only told, from its beginning to its end.
 
 Times are of the program, in s: it begins at 0, and its record ``LEAD_S`` before it.
 """
@@ -35,16 +36,50 @@ def programmed(spec: JointSpec, task: Spool) -> SpoolProgram:
     return build(spec, task.side)
 
 
-class SpoolAttempt:
-    """``program`` is what is told from now on; ``begun``: it is on its way, ``closed``: on its way out."""
+class BlindAttempt:
+    """``program`` is what is told from now on; ``begun``: it is on its way."""
+
+    def __init__(self, first: SpoolProgram) -> None:
+        self.program = first
+        self.begun = self._told_end = False
+        self._told: SpoolProgram | None = None
+
+    def follow(self, run_s: float, position: float, velocity: float) -> str | None:
+        """Nobody sees what the joint does."""
+        return None
+
+    def judged(self, position: float) -> str | None:
+        """Nor what it has done."""
+        return None
+
+    def close(self, run_s: float) -> None:
+        """The valve shuts from now on."""
+        self.program = self.program.closing(run_s, CLOSE_S)
+
+    def silent(self, run_s: float) -> bool:
+        """Whether there is nothing to tell now: before its begin, and once its end is told."""
+        return run_s < 0.0 or (run_s > self.program.duration_s and self._told_end)
+
+    @property
+    def changed(self) -> bool:
+        """Whether the program is another than the one that was told last."""
+        return self._told is not self.program
+
+    def window(self, run_s: float) -> tuple[SpoolKnot, ...]:
+        """What is told now."""
+        self._told = self.program
+        self._told_end = run_s + HORIZON_S >= self.program.duration_s
+        return self.program.window(run_s, HORIZON_S)
+
+
+class SpoolAttempt(BlindAttempt):
+    """The program of a joint with an encoder; ``closed``: it is on its way out."""
 
     def __init__(self, spec: JointSpec, task: Spool, position: float) -> None:
-        self.program = programmed(spec, task)
-        self.begun = False
+        super().__init__(programmed(spec, task))
         self._spec, self._task, self._from = spec, task, position
         self._name = task.joint.name.lower()
-        self.closed = self._told_end = False
-        self._told: SpoolProgram | None = None
+        self.closed = False
 
     @property
     def end(self) -> float:
@@ -69,30 +104,11 @@ class SpoolAttempt:
             self.closed = True
         return None
 
-    def close(self, run_s: float) -> None:
-        """The valve shuts from now on."""
-        self.program = self.program.closing(run_s, CLOSE_S)
-
     def judged(self, position: float) -> str | None:
         """At its end: a sentence when the joint has not moved."""
         if self._moved(position) >= _enough(self._spec):
             return None
         return f"the {self._name} does not move: check its valve, pump and encoder, or correct deadband in the profile"
-
-    def silent(self, run_s: float) -> bool:
-        """Whether there is nothing to tell now: before its begin, and once its end is told."""
-        return run_s < 0.0 or (run_s > self.program.duration_s and self._told_end)
-
-    @property
-    def changed(self) -> bool:
-        """Whether the program is another than the one that was told last."""
-        return self._told is not self.program
-
-    def window(self, run_s: float) -> tuple[SpoolKnot, ...]:
-        """What is told now."""
-        self._told = self.program
-        self._told_end = run_s + HORIZON_S >= self.program.duration_s
-        return self.program.window(run_s, HORIZON_S)
 
     def _moved(self, position: float) -> float:
         return self._task.side * (position - self._from)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from autonomy.calibration.plan import Plan
+from autonomy.calibration.program import PULSES
 from autonomy.calibration.survey import Reading
 from autonomy.calibration.trace import Record
+from autonomy.calibration.turn_fit import Turn
 from can_dbc.setpoint import GrappleCommand
 from machine.joints import Joint
 
@@ -42,7 +44,26 @@ class Look:
     number: int
 
 
-Task = Travel | Spool | Grip | Look
+@dataclass(frozen=True, slots=True)
+class Pulse:
+    """A joint without an encoder turns by its spool alone, by the profile at a ``share`` of its speed limit, to an
+    angle counted from where it stood before its first pulse [rad].
+    """
+
+    joint: Joint
+    side: int
+    share: float
+    to_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Bearing:
+    """Stand still until the surveyor has read the grapple's direction."""
+
+    number: int
+
+
+Task = Travel | Spool | Grip | Look | Pulse | Bearing
 
 
 @dataclass(slots=True)
@@ -53,6 +74,7 @@ class Findings:
     tests: list[Record] = field(default_factory=list)
     grapple_s: dict[GrappleCommand, float] = field(default_factory=dict)
     readings: list[Reading] = field(default_factory=list)
+    turns: list[Turn] = field(default_factory=list)
 
 
 def tasks_of(plan: Plan) -> list[Task]:
@@ -67,4 +89,9 @@ def tasks_of(plan: Plan) -> list[Task]:
     tasks += [Grip(GrappleCommand.OPEN), Grip(GrappleCommand.CLOSE), Grip(GrappleCommand.OPEN)]
     for number, pose in enumerate(plan.survey):
         tasks += [Travel(pose, f"to survey pose {number + 1}"), Look(number)]
+    if plan.turned is not None:
+        tasks.append(Bearing(0))
+        pulses = [Pulse(plan.turned, s, share, to) for share, far in PULSES for s, to in ((+1, far), (-1, 0.0))]
+        for number, pulse in enumerate(pulses):
+            tasks += [pulse, Bearing(number + 1)]
     return tasks

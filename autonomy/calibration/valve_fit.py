@@ -62,6 +62,18 @@ class ValveFit:
     errors: dict[str, float]
 
 
+def played(spool: np.ndarray, half: float) -> np.ndarray:
+    """A spool that was neutral before, behind a play of twice ``half``."""
+    out, at = [], 0.0
+    for x in spool.tolist():
+        if x - half > at:
+            at = x - half
+        elif x + half < at:
+            at = x + half
+        out.append(at)
+    return np.array(out)
+
+
 class _Stretch:
     """One test, ready for the model."""
 
@@ -80,14 +92,7 @@ class _Stretch:
         if half not in self._played:
             if len(self._played) > 3:
                 self._played.clear()
-            out, at = [], 0.0
-            for x in self.spool.tolist():
-                if x - half > at:
-                    at = x - half
-                elif x + half < at:
-                    at = x + half
-                out.append(at)
-            self._played[half] = np.array(out)
+            self._played[half] = played(self.spool, half)
         return self._played[half]
 
     def model(self, p: np.ndarray) -> np.ndarray:

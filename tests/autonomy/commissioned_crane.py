@@ -1,14 +1,15 @@
 """A crane whose valves are exactly as its profile says, its controller and its bus: for tests of the procedure.
 
 It obeys setpoints and spool tests without judging them, and says on the bus what it does.  Faults by name:
-``backward`` and ``stuck`` joints, a controller that ``refuses``, a ``mode``.
+``backward`` and ``stuck`` joints, a controller that ``refuses``, a ``mode``, an instrument that is ``no_compass``: it
+cannot tell the grapple's direction.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
-from math import nan
+from dataclasses import dataclass, field, replace
+from math import nan, pi
 
 from autonomy.calibration.plan import Plan, make_plan
 from autonomy.calibration.procedure import Calibration
@@ -16,6 +17,7 @@ from can_dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, SpoolTest, StateReport, decode
 from machine.encoder import counts_from_position
+from machine.grapple import grapple_yaw
 from machine.joints import JOINTS, Joint
 from machine.lift import empty_moment_nm, lever_share
 from machine.load import load_profile, profile_hash
@@ -39,6 +41,8 @@ class Crane:
     mode: Mode = Mode.ARMED
     backward: set[Joint] = field(default_factory=set)
     stuck: set[Joint] = field(default_factory=set)
+    no_compass: bool = False
+    only_turns: bool = False
     refuses: int = 0
     now_ns: int = 5_000_000_000
     said: SpoolTest | CraneSetpoint | None = None
@@ -53,6 +57,8 @@ class Crane:
         self.lines = [deque([0.0] * round(joint(self.profile, j).valve.delay_s / STEP_S)) for j in JOINTS]
         self.ticks = 0
         self.plan: Plan = make_plan(self.profile, HOME[self.name], self.surveyed)
+        if self.only_turns:
+            self.plan = replace(self.plan, joints=(), survey=())
         self.calibration = Calibration(self.profile, profile_hash(self.profile), self.plan, DATABASE)
 
     def run(self, until_s: float = 400.0, done=lambda crane: False) -> Calibration:
@@ -71,13 +77,18 @@ class Crane:
             self._move(j, spools[j])
         report = self._report() if self.ticks % REPORT_EVERY == 0 else None
         pin = true_pin(SAG, self.profile.kinematics, self.q) if self.calibration.wants_reading else None
-        data = self.calibration.step(self.now_ns, report, self._frames(spools), pin)
+        yaw_rad = self._yaw_rad() if self.calibration.wants_yaw else None
+        data = self.calibration.step(self.now_ns, report, self._frames(spools), pin, yaw_rad)
         if data is not None:
             message = decode(data)
             assert isinstance(message, SpoolTest | CraneSetpoint)
             self.said = message
             self.heard.append(message)
         return data
+
+    def _yaw_rad(self) -> float:
+        """What an instrument without noise shows of the grapple."""
+        return nan if self.no_compass else grapple_yaw(self.profile, self.q) % pi
 
     def _spools(self) -> list[float]:
         spools = [0.0] * len(JOINTS)

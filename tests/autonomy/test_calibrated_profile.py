@@ -10,6 +10,7 @@ import machine
 from autonomy.calibration.profile_file import NotWritten, changes, write_profile
 from autonomy.calibration.result import JointResult, Result
 from autonomy.calibration.survey import SurveyFit
+from autonomy.calibration.turn_fit import SideFit, TurnFit
 from autonomy.calibration.valve_fit import ValveFit
 from machine.joints import Joint
 from machine.load import load_profile, profile_hash, shipped_profiles
@@ -83,6 +84,19 @@ def test_a_full_speed_is_written_for_the_nominal_arm_of_the_lever() -> None:
     assert found["full_speed_plus"] == pytest.approx(0.2 * lever.lever[5], abs=1e-4)
     assert found["full_speed_minus"] == pytest.approx(0.22 * lever.lever[5], abs=1e-4)
     assert (found["hysteresis_pct"], found["exponent"]) == (2.1, 1.04)
+
+
+def test_surveyed_turns_are_written_and_a_rotator_that_is_slower_gets_a_lower_limit() -> None:
+    profile = load_profile("aoro_fc8")
+    turns = TurnFit(SideFit(0.1134, 2.21, (0.002, 0.02)), SideFit(0.0951, 1.4, (0.002, 0.02)))
+    found = {path: value for path, value, _ in changes(profile, Result({}, {}, None, turns=turns))}
+    assert found == {
+        ("joints", "rot", "speed_limit"): 1.26,
+        ("joints", "rot", "valve", "deadband_plus_pct"): 11.34,
+        ("joints", "rot", "valve", "deadband_minus_pct"): 9.51,
+        ("joints", "rot", "valve", "full_speed_plus"): 2.21,
+        ("joints", "rot", "valve", "full_speed_minus"): 1.4,
+    }
 
 
 def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import socket
 import time
+from collections.abc import Callable
+from math import isnan
+from typing import Any
 
 import pytest
 
@@ -32,6 +35,14 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+def waited_for(read: Callable[[int], Any]) -> Any:
+    """The answer that is on its way."""
+    end = time.monotonic() + 5.0
+    while (reading := read(10**9 + 1)) is None and time.monotonic() < end:
+        time.sleep(0.005)
+    return reading
+
+
 def test_an_instrument_is_asked_and_its_answer_is_read(far: socket.socket) -> None:
     instrument = Instrument(far.getsockname())
     assert instrument.read(10**9) is None
@@ -39,10 +50,19 @@ def test_an_instrument_is_asked_and_its_answer_is_read(far: socket.socket) -> No
     assert question == QUESTION
     for answer in (b'{"error":"no prism"}', b"nonsense", b'{"pin_m":[1.0,2.0,3.0]}'):
         far.sendto(answer, asker)
-    end = time.monotonic() + 5.0
-    while (reading := instrument.read(10**9 + 1)) is None and time.monotonic() < end:
-        time.sleep(0.005)
-    assert reading == (1.0, 2.0, 3.0)
+    assert waited_for(instrument.read) == (1.0, 2.0, 3.0)
+    instrument.close()
+
+
+def test_an_instrument_tells_the_grapples_direction_or_that_it_cannot(far: socket.socket) -> None:
+    instrument = Instrument(far.getsockname())
+    assert instrument.read_yaw(10**9) is None
+    _, asker = far.recvfrom(100)
+    far.sendto(b'{"pin_m":[1.0,2.0,3.0],"yaw_rad":0.7}', asker)
+    assert waited_for(instrument.read_yaw) == 0.7
+    far.sendto(b'{"pin_m":[1.0,2.0,3.0]}', asker)
+    told = waited_for(instrument.read_yaw)
+    assert told is not None and isnan(told)
     instrument.close()
 
 

@@ -9,9 +9,13 @@ import pytest
 from commissioned_crane import HOME, SAG, Crane
 
 from autonomy.calibration.plan import NoRoom, make_plan, sentences
+from autonomy.calibration.profile_file import changes
 from autonomy.calibration.program import STEP_SHARES, command_for, staircase, sweep, turned, wiggle
+from autonomy.calibration.report import document
+from autonomy.calibration.result import Result, identify
 from autonomy.calibration.survey import fit_survey
 from autonomy.calibration.tasks import Spool, Travel
+from autonomy.calibration.turn_fit import fit_turns
 from can_dbc.setpoint import CraneSetpoint, SpoolTest
 from machine.joints import JOINTS, Joint
 from machine.kinematics import pin_position
@@ -35,6 +39,53 @@ def test_a_good_machine_is_done_in_under_four_minutes(name: str) -> None:
     survey = fit_survey(crane.profile.kinematics, run.found.readings)
     assert survey.sag.load_rad_nm == pytest.approx(SAG.load_rad_nm, rel=0.05), "it weighs the crane at every pose"
     assert max(map(abs, survey.moments_nm)) < 50.0 and max(survey.after_m) < 1e-3
+    assert len(run.found.turns) == (6 if name == "aoro_fc8" else 0)
+
+
+def test_a_rotator_without_encoder_turns_there_and_back_and_its_valve_is_found() -> None:
+    crane = Crane("aoro_fc8", only_turns=True)
+    run = crane.run()
+    assert run.failure is None and run.done and run.elapsed_s < 35.0
+    spec = crane.profile.joints["rot"]
+    fit = fit_turns(run.found.turns, spec)
+    for side, deadband, full in (
+        (fit.plus, spec.valve.deadband_plus_pct, spec.valve.full_speed_plus),
+        (fit.minus, spec.valve.deadband_minus_pct, spec.valve.full_speed_minus),
+    ):
+        # This crane's spool has no play; the profile's has: 1 % of the stroke.
+        assert 100.0 * side.deadband == pytest.approx(deadband, abs=1.5)
+        assert side.full_speed == pytest.approx(full, rel=0.03)
+    assert abs(crane.q[Joint.ROT]) < 0.1 and abs(fit.stands_rad - crane.q[Joint.ROT]) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [({"backward": {Joint.ROT}}, "rot moves the wrong way"), ({"stuck": {Joint.ROT}}, "rot does not move")],
+)
+def test_a_rotator_that_does_not_do_as_it_is_told_ends_the_run(fault: dict, says: str) -> None:
+    crane = Crane("aoro_fc8", only_turns=True, **fault)
+    run = crane.run()
+    assert run.failure is not None and says in run.failure
+    assert ends_shut(crane) and abs(crane.q[Joint.ROT]) < 0.6
+
+
+def test_an_abort_while_the_rotator_turns_shuts_its_valve() -> None:
+    crane = Crane("aoro_fc8", only_turns=True)
+    crane.run(done=lambda c: c._spools()[Joint.ROT] > 12.0)
+    crane.calibration.abort("interrupted")
+    run = crane.run()
+    assert run.failure == "interrupted" and ends_shut(crane)
+
+
+def test_without_a_readable_direction_the_rotator_stays_as_it_was() -> None:
+    crane = Crane("aoro_fc8", only_turns=True, no_compass=True)
+    run = crane.run()
+    assert run.failure is None and run.done and not run.found.turns
+    assert not any(isinstance(m, SpoolTest) for m in crane.heard)
+    result = identify(crane.profile, run.found)
+    assert result.turns is None and len(result.kept) == 1 and "no encoder" in result.kept[0]
+    assert document(result, {}, [])["kept"] == list(result.kept)
+    assert not changes(crane.profile, Result({}, {}, None, kept=result.kept))
 
 
 def test_every_joint_is_wiggled_before_anything_travels() -> None:

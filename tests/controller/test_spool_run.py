@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from math import nan
+
+import msgspec
 import pytest
 
 from can_dbc.setpoint import SpoolKnot, SpoolTest
@@ -10,7 +13,7 @@ from machine.joints import Joint
 from machine.load import load_profile
 from machine.reasons import Reason
 
-PALMS = load_profile("palms_471")
+PALMS, AORO = load_profile("palms_471"), load_profile("aoro_fc8")
 MS = 1_000_000
 NOW = 5_000 * MS
 
@@ -38,9 +41,53 @@ def test_lines_between_the_knots_and_neutral_past_the_last() -> None:
 
 
 def test_a_joint_without_encoder_is_refused() -> None:
-    run = SpoolRun(load_profile("aoro_fc8"))
-    assert reason_of(run, asked((0, 0.0), joint=Joint.ROT)) is Reason.TEST_FUNCTION
+    tilt = msgspec.structs.replace(AORO.joints["tilt"], encoder=None)
+    run = SpoolRun(msgspec.structs.replace(AORO, joints={**AORO.joints, "tilt": tilt}))
+    assert reason_of(run, asked((0, 0.0), joint=Joint.TILT)) is Reason.TEST_FUNCTION
     assert not run.running
+
+
+def stopped(run: SpoolRun, percent: float, most_s: float = 10.0) -> tuple[Reason, float]:
+    """A rotator's test, driven tick by tick: why it is to stop, and after how long [s]."""
+    ramp = 200 * MS
+    for now in range(NOW, NOW + int(most_s * 1e9), 5 * MS):
+        if now == NOW:
+            run.take(asked((0, 0.0), (200, percent), (400, percent), joint=Joint.ROT), now)
+        elif now >= NOW + ramp and now % (50 * MS) == 0:
+            run.take(asked((0, percent), (400, percent), joint=Joint.ROT, stamp_ns=now), now)
+        if (reason := run.judge(nan, nan, 1.0, now)) is not Reason.NONE:
+            return reason, (now - NOW) * 1e-9
+        run.drive(1.0, now)
+    return Reason.NONE, most_s
+
+
+def test_a_rotator_without_encoder_stays_within_its_range_by_what_it_is_told() -> None:
+    run = SpoolRun(AORO)
+    # 70 % is 1.33 rad/s, with 0.4 rad for stopping: 5.88 of 6.28 rad
+    reason, after_s = stopped(run, 70.0)
+    assert reason is Reason.TEST_RANGE and after_s == pytest.approx(5.88 / 1.333 + 0.1, abs=0.1)
+    assert run.way == pytest.approx(5.88, abs=0.02)
+    run.take(asked((0, 0.0), joint=Joint.ROT), NOW)
+    run.end()
+    assert stopped(run, 70.0)[1] < 0.25, "its way counts over all tests"
+    run.take(asked((0, 0.0), joint=Joint.ROT), NOW)
+    run.end()
+    assert stopped(run, -70.0, most_s=3.0) == (Reason.NONE, 3.0), "the way back is free"
+
+
+def test_a_rotator_without_encoder_is_tested_five_seconds_at_most() -> None:
+    run = SpoolRun(AORO)
+    reason, after_s = stopped(run, 9.0)
+    assert reason is Reason.TEST_TOO_LONG and after_s == pytest.approx(5.0, abs=0.02)
+    assert run.way == 0.0, "inside the dead-band, as it seems"
+
+
+def test_a_rotator_without_encoder_keeps_to_speed_and_half_speed() -> None:
+    assert reason_of(SpoolRun(AORO), asked((0, 0.0), (500, 78.0), joint=Joint.ROT)) is Reason.TEST_SPOOL
+    run = SpoolRun(AORO)
+    run.take(asked((0, 0.0), (500, 70.0), (600, 70.0), joint=Joint.ROT), NOW)
+    assert run.judge(nan, nan, 1.0, NOW + 500 * MS) is Reason.NONE
+    assert run.judge(nan, nan, 0.5, NOW + 500 * MS) is Reason.TEST_SPEED
 
 
 def test_more_speed_than_the_limit_is_refused() -> None:

@@ -124,10 +124,23 @@ def test_not_before_a_human_armed() -> None:
     assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.NOT_ARMED
 
 
-def test_a_joint_without_encoder_and_a_wild_command_are_refused() -> None:
+def test_a_rotator_without_encoder_is_driven_and_its_commanded_way_counts() -> None:
     blind = Bench(AORO).armed()
-    blind.tick([asked(blind, (0, 0.0), joint=Joint.ROT)])
-    assert (blind.controller.gate.refusal, blind.controller.gate.detail) == (Reason.TEST_FUNCTION, Joint.ROT)
+    running(blind, 40.0, 0.6, Joint.ROT)
+    assert blind.mode is Mode.ACTIVE and spools(blind) == [0.0, 0.0, 0.0, 0.0, pytest.approx(40.0, abs=0.1)]
+    assert blind.controller.spool_run.way == pytest.approx(0.667 * 0.42, abs=0.05)
+
+
+def test_a_rotator_without_encoder_that_is_told_to_go_on_is_stopped() -> None:
+    blind = Bench(AORO).armed()
+    running(blind, 60.0, 8.0, Joint.ROT, step=lambda bench: bench.mode is Mode.STOP)
+    supervisor = blind.controller.supervisor
+    assert (supervisor.reason, supervisor.detail) == (Reason.TEST_TOO_LONG, Joint.ROT)
+    blind.run(60)
+    assert spools(blind) == [0.0] * 5
+
+
+def test_a_wild_command_is_refused() -> None:
     bench = Bench().armed()
     bench.tick([asked(bench, (0, 0.0), (5, 40.0))])
     assert (bench.controller.gate.refusal, bench.controller.gate.detail) == (Reason.TEST_SPOOL, Joint.SLEW)

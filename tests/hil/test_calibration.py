@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -41,6 +42,25 @@ def test_the_hidden_truth_is_recovered_in_four_minutes(profile: str) -> None:
     assert len(tip["empty"]) >= 6 and max(tip["empty"]) < 6.0 < max(tip["before"])
     assert max(tip["loaded"]) < 20.0 < 40.0 < max(tip["loaded_before"])
     assert abs(found["give"]) < 0.15 and max(map(abs, tip["load_kg"])) < 30.0
+    assert ("rotator" in found) == (profile == "aoro_fc8"), "the other has an encoder there"
+    if "rotator" in found:
+        its_rotator_is_found(found["rotator"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_nominal_forwarder_turns_what_it_is_told_to_once_its_rotator_was_surveyed() -> None:
+    found = calibrated(Job("one", "calibration", 1, {"profile": "aoro_fc8", "truth": "nominal"}))
+    assert found["failure"] is None and found["implausible"] == [] and found["seconds"] < 240.0
+    its_rotator_is_found(found["rotator"])
+    assert max(map(abs, found["rotator"]["profile"]["quarter"])) > 0.06, "with the shipped profile it was off"
+
+
+def its_rotator_is_found(rotator: dict[str, Any]) -> None:
+    """Dead-band, full speed and what comes of them: a commanded quarter turn."""
+    assert max(map(abs, rotator["deadband_pct"])) < 2.0
+    assert max(map(abs, rotator["gain"])) < 0.05
+    assert max(map(abs, rotator["quarter"])) < 0.03
 
 
 def test_a_valve_that_is_connected_the_wrong_way_round_ends_the_run(tmp_path: Path) -> None:

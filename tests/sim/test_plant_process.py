@@ -8,12 +8,14 @@ import json
 import socket
 import threading
 import time
+from math import pi, remainder
 
 import pytest
 
 from can_dbc.bus import open_bus
 from can_dbc.canopen import NmtCommand, nmt_frame, sync_frame
 from can_dbc.codec import load
+from machine.grapple import grapple_yaw
 from machine.load import load_profile
 from sim.__main__ import LivePlant, main
 from sim.plant import Plant
@@ -92,6 +94,16 @@ def test_a_surveyor_reads_the_pin_with_millimetres_of_noise(live):
     assert len({tuple(pin) for pin in readings}) == 20, "every reading has noise of its own"
     mean = [sum(axis) / 20 for axis in zip(*readings, strict=True)]
     assert all(abs(a - b) < 0.003 for a, b in zip(mean, tip, strict=True))
+
+
+def test_a_surveyor_reads_the_grapples_direction_within_a_degree_and_modulo_half_a_turn(live):
+    _, _, udp, _ = live
+    slew, *_, rot = ask(udp, "state")["joints"]
+    along = grapple_yaw(PROFILE, (slew, 0.0, 0.0, 0.0, rot))
+    readings = [ask(udp, "survey")["yaw_rad"] for _ in range(20)]
+    assert all(0.0 <= yaw < pi for yaw in readings) and len(set(readings)) == 20
+    off = [remainder(yaw - along, pi) for yaw in readings]
+    assert max(map(abs, off)) < 0.07 and abs(sum(off)) / 20 < 0.015
 
 
 @pytest.mark.parametrize(

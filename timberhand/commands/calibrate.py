@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from autonomy.calibration.live import Surveyor
     from autonomy.calibration.plan import Plan
     from autonomy.calibration.procedure import Calibration
     from machine.profile import Profile
@@ -97,6 +99,8 @@ def calibrate(
     screen.print(f"[green]✔[/green] {out} written, {len(changed)} values; report in {folder}", highlight=False)
     if result.survey is None:
         screen.print("zeros and sag stay as they were: nothing was surveyed (--survey)", highlight=False)
+    for sentence in result.kept:
+        screen.print(sentence, highlight=False)
 
 
 def _today() -> str:
@@ -222,27 +226,43 @@ def _live(
     return run
 
 
-def _surveyor(survey: str | None, screen: Console) -> Callable[[int], tuple[float, float, float] | None]:
+def _surveyor(survey: str | None, screen: Console) -> Surveyor | None:
     """How a reading is got: never, typed in, or from an instrument."""
     from autonomy.calibration.live import Instrument
     from can_dbc.setpoint import udp_address
 
     if survey is None:
-        return lambda now_ns: None
-    if survey != "ask":
-        return Instrument(udp_address(survey)).read
+        return None
+    return _Typed(screen) if survey == "ask" else Instrument(udp_address(survey))
 
-    def typed(now_ns: int) -> tuple[float, float, float] | None:
-        # The crane stands, its last setpoint was final: the lease may run out while a person reads and types.
+
+class _Typed:
+    """A person reads an instrument and types.
+
+    The crane stands, its last setpoint was final: the lease may run out meanwhile.
+    """
+
+    def __init__(self, screen: Console) -> None:
+        self._screen = screen
+
+    def read(self, now_ns: int) -> tuple[float, float, float] | None:
+        """The hanger pin."""
         text = typer.prompt("hanger pin x y z [m, crane base frame]", err=True)
         try:
             x, y, z = map(float, text.replace(",", " ").split())
         except ValueError:
-            screen.print("three numbers, as in 0.12 5.43 2.10")
+            self._screen.print("three numbers, as in 0.12 5.43 2.10")
             return None
         return x, y, z
 
-    return typed
+    def read_yaw(self, now_ns: int) -> float | None:
+        """The grapple's direction."""
+        text = typer.prompt("direction along which the grapple opens [deg from x towards y, - for none]", err=True)
+        try:
+            return math.nan if text.strip() == "-" else math.radians(float(text))
+        except ValueError:
+            self._screen.print("degrees, as in 92.5; or - when nobody can read it: then the rotator is not tested")
+            return None
 
 
 class _Progress:
@@ -275,7 +295,7 @@ class _Progress:
 
 
 def _says(calibration: Calibration) -> str:
-    from autonomy.calibration.tasks import Grip, Look, Spool, Travel
+    from autonomy.calibration.tasks import Bearing, Grip, Look, Pulse, Spool, Travel
 
     match calibration.task:
         case Spool(joint=j, side=side, kind=kind):
@@ -286,6 +306,10 @@ def _says(calibration: Calibration) -> str:
             return f"grapple: {command.name.lower()}"
         case Look(number=number):
             return f"survey pose {number + 1}"
+        case Pulse(joint=j, side=side):
+            return f"{j.name.lower()} {'+' if side > 0 else '-'} turn"
+        case Bearing(number=number):
+            return f"direction of the grapple {number + 1}"
     return "waiting"
 
 
@@ -303,6 +327,10 @@ def _show(result: Any, screen: Console) -> None:
             *delay,
             " / ".join(f"{1e3 * s:.0f}" for s in r.responses_s),
         )
+    if (turns := result.turns) is not None:
+        sides = (turns.plus, turns.minus)
+        deadbands = " / ".join(f"{100 * s.deadband:.1f}" for s in sides)
+        table.add_row("rot", deadbands, " / ".join(f"{s.full_speed:.3f}" for s in sides), "-", "-", "-")
     screen.print(table)
     if result.survey is not None:
         before, after = (1e3 * max(d) for d in (result.survey.before_m, result.survey.after_m))

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from rich.console import Console
 
 from hil.experiments import pool
 from hil.experiments.calibration.trial import calibrated
+from hil.experiments.plant.worlds import profile_named
 from hil.experiments.plots import MOSS, OIL, STEEL, limit_band, sheet
 from hil.experiments.pool import Job
 from hil.experiments.registry import Options
 from hil.experiments.report import Section, tell
 from hil.experiments.result import Figure, Result, judged, rate
 from hil.experiments.trials import checkpoint, individuals
+from machine.joints import Joint
+from machine.profile import joint
 
 MACHINES: Final = {"palms": "palms_471", "aoro": "aoro_fc8"}
 TRIALS: Final = 20
@@ -26,6 +29,7 @@ SEEDS_PER_RUN: Final = 1000
 TIP_EMPTY_MM, TIP_LOADED_MM = 6.0, 20.0
 """Small beside the centimetres that the crane may be off by all told."""
 DEADBAND_PCT, GAIN, DELAY_MS, SECONDS = 1.0, 0.05, 10.0, 240.0
+ROT_DEADBAND_PCT, ROT_QUARTER = 2.5, 0.03
 SOURCES: Final = ("autonomy", "controller", "hil/lockstep.py", "hil/calibration.py")
 
 
@@ -79,6 +83,33 @@ def _figures(short: str) -> tuple[Figure, ...]:
         f("zero_lift", "Zero of the lift, greatest error", "mrad",
           "The same for the boom; a column that leans looks nearly like a boom that is off.", scale=1e3),
         f("zero_ext", "Zero of the telescope, greatest error", "mm", "The same for the telescope.", scale=1e3),
+        *(_rotator_figures(f) if _blind(short) else ()),
+    )  # fmt: skip
+
+
+def _blind(short: str) -> bool:
+    """Whether the machine's rotator has no encoder."""
+    return joint(profile_named(MACHINES[short]), Joint.ROT).encoder is None
+
+
+def _rotator_figures(f: Callable[..., Figure]) -> tuple[Figure, ...]:
+    """Of a rotator without an encoder."""
+    return (
+        f("rot_deadband_max", "Rotator without encoder: dead-band, greatest error", "% of spool",
+          "By surveyed turns; they are fitted with the profile's metering curve, which is another than the truth's.",
+          most=ROT_DEADBAND_PCT),
+        f("rot_deadband_before", "Rotator: dead-band of the shipped profile, greatest error", "% of spool",
+          "What was there before."),
+        f("rot_gain_max", "Rotator without encoder: full speed, greatest error", "%",
+          "Against the truth of its valve.", most=GAIN, scale=100.0),
+        f("rot_gain_before", "Rotator: full speed of the shipped profile, greatest error", "%",
+          "What was there before.", scale=100.0),
+        f("rot_quarter_max", "Rotator without encoder: quarter turn, greatest error", "%",
+          "True way of the quarter turns that a planner commands, two to either side; so fast drifts the count.",
+          most=ROT_QUARTER, scale=100.0),
+        f("rot_quarter_rms", "Rotator: quarter turn, root mean square error", "%", "The same values.", scale=100.0),
+        f("rot_quarter_before", "Rotator: quarter turn with the shipped profile, greatest error", "%",
+          "What was there before.", scale=100.0),
     )  # fmt: skip
 
 
@@ -158,6 +189,12 @@ def gather(short: str, outcomes: Sequence[dict[str, Any]]) -> dict[str, float]:
     values |= {
         f"zero_{n}": _most(o["zeros"][n] for o in ended if "zeros" in o) for n in ("slew", "lift", "tilt", "ext")
     }
+    if _blind(short):
+        blind = [o["rotator"] for o in good if "rotator" in o]
+        for name, key in (("deadband", "deadband_pct"), ("gain", "gain"), ("quarter", "quarter")):
+            values[f"rot_{name}_max"] = _most(x for r in blind for x in r[key])
+            values[f"rot_{name}_before"] = _most(x for r in blind for x in r["profile"][key])
+        values["rot_quarter_rms"] = _rms(x for r in blind for x in r["quarter"])
     return {
         **{f"{short}_{name}": value for name, value in values.items()},
         **rate(f"{short}_complete", len(good), len(outcomes)),

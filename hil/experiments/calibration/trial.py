@@ -11,8 +11,10 @@ from autonomy.calibration.plan import Plan
 from autonomy.calibration.profile_file import changes, write_profile
 from autonomy.calibration.result import JointResult, Result, identify
 from autonomy.calibration.survey import OFFSETS
+from autonomy.calibration.turn_fit import TurnFit
 from controller.guard.__main__ import profile_path
 from hil.calibration import run_lockstep
+from hil.experiments.calibration.rotator import turn_errors
 from hil.experiments.calibration.tip import tip_errors
 from hil.experiments.plant.worlds import opened, profile_named
 from hil.experiments.pool import Job
@@ -40,21 +42,38 @@ def calibrated(job: Job) -> dict[str, Any]:
     joints = {}
     for j, r in result.joints.items():
         joints[j.name.lower()] = _joint_errors(job, profile, outcome.plan, truth, j, r)
-    return {
+    found = {
         **facts,
         "implausible": list(result.implausible),
         "joints": joints,
         **_survey_errors(truth, result),
-        **({} if result.implausible else {"tip": tip_errors(job, profile, _written(name, profile, result))}),
     }
-
-
-def _written(name: str, profile: Profile, result: Result) -> Profile:
-    """The profile as a calibration leaves it: written to a file and read again."""
+    if result.implausible:
+        return found
     with TemporaryDirectory() as folder:
         out = Path(folder) / "calibrated.toml"
         write_profile(profile_path(name), out, changes(profile, result), "today")
-        return load_profile(out)
+        if result.turns is not None:
+            found["rotator"] = _rotator_errors(job, profile, truth, result.turns, out)
+        return {**found, "tip": tip_errors(job, profile, load_profile(out))}
+
+
+def _rotator_errors(job: Job, profile: Profile, truth: Any, turns: TurnFit, calibrated: Path) -> dict[str, Any]:
+    """Of a rotator without an encoder, against the truth of its valve; and what is wrong of commanded quarter turns."""
+    valve, known = truth.functions["rot"].valve, profile.joints["rot"].valve
+    deadbands, fulls = (valve.deadband_plus, valve.deadband_minus), (valve.full_speed_plus, valve.full_speed_minus)
+    sides = (turns.plus, turns.minus)
+    before = ((known.deadband_plus_pct, known.full_speed_plus), (known.deadband_minus_pct, known.full_speed_minus))
+    return {
+        "deadband_pct": [100.0 * (s.deadband - true) for s, true in zip(sides, deadbands, strict=True)],
+        "gain": [s.full_speed / true - 1.0 for s, true in zip(sides, fulls, strict=True)],
+        "quarter": turn_errors(job, calibrated),
+        "profile": {
+            "deadband_pct": [pct - 100.0 * true for (pct, _), true in zip(before, deadbands, strict=True)],
+            "gain": [full / true - 1.0 for (_, full), true in zip(before, fulls, strict=True)],
+            "quarter": turn_errors(job, Path(profile_path(job.options["profile"]))),
+        },
+    }
 
 
 def _joint_errors(job: Job, profile: Profile, plan: Plan, truth: Any, which: Joint, r: JointResult) -> dict[str, Any]:

@@ -1,0 +1,146 @@
+"""Dead-band and full speed of a rotator without an encoder, from how far known spool programs turned it.
+
+    turn = full * integral of ((play(spool) - dead-band) / (1 - half of the play - dead-band))^n      (machines.md 3)
+
+A surveyor reads the grapple's direction at rest before and after every program.  Dead time and lag of the spool come at
+its opening and at its closing alike: they shift a turn and do not change it.  Play and exponent are the profile's, so
+the values are those with which its valve map makes the turns that were seen.  A grapple looks the same after half a
+turn; the turns of a side grow from one that cannot be mistaken, and each tells the half turns of the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi, radians, remainder, sqrt
+from typing import Final
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from autonomy.calibration.program import SpoolProgram, deadband_pct, pulse
+from autonomy.calibration.trace import GRID_S, Record
+from autonomy.calibration.valve_fit import played
+from machine.profile import JointSpec
+
+NOISE_RAD: Final = radians(1.0)
+"""Of one reading of the direction, 1 sigma; several readings at one rest are averaged by the caller."""
+DEADBAND_SPREAD, FULL_SPREAD = 0.04, 0.4
+"""How far a valve is from its profile, share of the stroke and of the full speed: it leads where turns are few."""
+HOLD_S: Final = (0.2, 3.0)
+"""Bounds of how long a pulse holds: the controller ends a test of a joint without encoder after five seconds."""
+SIDES: Final = (1, -1)
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One program as it was run, and the rotator's direction at rest before and after it [rad], modulo pi and without
+    the slew; either is the mean of so many ``readings``.
+    """
+
+    record: Record
+    before_rad: float
+    after_rad: float
+    readings: int
+
+
+@dataclass(frozen=True, slots=True)
+class SideFit:
+    """One side: dead-band [share of full command], full speed [rad/s], the standard errors of both, and of each of its
+    turns how far it went and what the fit leaves of that [rad, + is to this side].
+    """
+
+    deadband: float
+    full_speed: float
+    errors: tuple[float, float]
+    turns_rad: tuple[float, ...] = ()
+    left_rad: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TurnFit:
+    """Both sides of a rotator."""
+
+    plus: SideFit
+    minus: SideFit
+
+    @property
+    def stands_rad(self) -> float:
+        """Where it stands now, counted from where it stood before its first turn."""
+        return sum(self.plus.turns_rad) - sum(self.minus.turns_rad)
+
+    def side(self, side: int) -> SideFit:
+        """The fit of a side (+1, -1)."""
+        return self.plus if side > 0 else self.minus
+
+
+def fit_turns(turns: Sequence[Turn], spec: JointSpec) -> TurnFit:
+    """From the turns so far; a side without any is as the profile has it."""
+    plus, minus = (_fit_side([t for t in turns if t.record.side == side], spec, side) for side in SIDES)
+    return TurnFit(plus, minus)
+
+
+def pulse_to(spec: JointSpec, fit: TurnFit, side: int, share: float, to_rad: float) -> SpoolProgram:
+    """A pulse that should end at an angle, counted as ``stands_rad``."""
+    known = fit.side(side)
+
+    def turn_rad(hold_s: float) -> float:
+        program = pulse(spec, side, share, hold_s)
+        times = np.arange(0.0, program.duration_s, GRID_S)
+        spool = np.array([side * program.at(t) / 100.0 for t in times])
+        return known.full_speed * _seconds(played(spool, _half(spec)), spec, known.deadband)
+
+    shut, held = turn_rad(0.0), turn_rad(1.0)
+    wanted = side * (to_rad - fit.stands_rad)
+    least, most = HOLD_S
+    hold_s = (wanted - shut) / (held - shut) if held > shut else most
+    return pulse(spec, side, share, min(max(hold_s, least), most))
+
+
+def _half(spec: JointSpec) -> float:
+    return spec.valve.hysteresis_pct / 200.0
+
+
+def _seconds(spool: np.ndarray, spec: JointSpec, deadband: float) -> float:
+    """How long the full speed would take for the turn that a spool behind its play makes, on the grid of a record."""
+    opening = np.clip((spool - deadband) / (1.0 - _half(spec) - deadband), 0.0, 1.0)
+    return float(np.sum(opening**spec.valve.exponent)) * GRID_S
+
+
+def _fit_side(turns: Sequence[Turn], spec: JointSpec, side: int) -> SideFit:
+    deadband = deadband_pct(spec, side) / 100.0
+    full = spec.valve.full_speed_plus if side > 0 else spec.valve.full_speed_minus
+    fit = SideFit(deadband, full, (DEADBAND_SPREAD, FULL_SPREAD * full))
+    records = [t.record for t in turns]
+    spools = [played(side * (r.command if r.spool is None else r.spool), _half(spec)) for r in records]
+    noises = np.array([NOISE_RAD * sqrt(2.0 / t.readings) for t in turns])
+    seen: list[float] = []
+    for turn, spool in zip(turns, spools, strict=True):
+        expected = fit.full_speed * _seconds(spool, spec, fit.deadband)
+        seen.append(expected + remainder(side * (turn.after_rad - turn.before_rad) - expected, pi))
+        fit = _least_squares(spools[: len(seen)], seen, noises[: len(seen)], spec, (deadband, full))
+    return fit
+
+
+def _least_squares(
+    spools: Sequence[np.ndarray],
+    seen: Sequence[float],
+    noises: np.ndarray,
+    spec: JointSpec,
+    known: tuple[float, float],
+) -> SideFit:
+    deadband, full = known
+
+    def left(p: np.ndarray) -> np.ndarray:
+        return np.array(seen) - [p[1] * full * _seconds(s, spec, p[0]) for s in spools]
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        before = [(p[0] - deadband) / DEADBAND_SPREAD, (p[1] - 1.0) / FULL_SPREAD]
+        return np.concatenate([left(p) / noises, before])
+
+    found = least_squares(residuals, (deadband, 1.0), bounds=((0.0, 0.1), (0.6, 5.0)), x_scale=(0.01, 0.1))
+    error = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    p = found.x
+    return SideFit(
+        float(p[0]), float(p[1]) * full, (float(error[0]), float(error[1]) * full), tuple(seen), tuple(left(p).tolist())
+    )

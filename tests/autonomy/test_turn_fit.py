@@ -1,0 +1,102 @@
+"""The valve of a rotator that has no encoder, from surveyed turns: found through noise, half turns not mistaken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+import pytest
+from valve_stand_in import StandIn
+
+from autonomy.calibration.program import PULSES
+from autonomy.calibration.result import identify
+from autonomy.calibration.tasks import Findings
+from autonomy.calibration.turn_fit import NOISE_RAD, Turn, TurnFit, fit_turns, pulse_to
+from machine.joints import Joint
+from machine.load import load_profile
+
+AORO = load_profile("aoro_fc8")
+ROT = AORO.joints["rot"]
+READINGS = 8
+SLOW_PLUS = StandIn(deadbands=(0.122, 0.085), full_speeds=(1.65, 2.35), hysteresis=0.024)
+SLOW_MINUS = StandIn(deadbands=(0.083, 0.12), full_speeds=(2.4, 1.6), hysteresis=0.015)
+FAR_OFF = StandIn(deadbands=(0.14, 0.07), full_speeds=(3.2, 1.3))
+
+
+def surveyed(machine: StandIn, seed: int = 3, readings: int = READINGS) -> tuple[list[Turn], list[float]]:
+    """The turns of a calibration, and where the rotator stood after each [rad]."""
+    rng = np.random.default_rng(seed)
+
+    def read() -> float:
+        return (0.3 + angle + rng.normal(0.0, NOISE_RAD / readings**0.5)) % pi
+
+    angle, turns, stood = 0.0, [], []
+    before = read()
+    for share, far in PULSES:
+        for side, goal in ((1, far), (-1, 0.0)):
+            program = pulse_to(ROT, fit_turns(turns, ROT), side, share, goal)
+            record = machine.run(Joint.ROT, side, "pulse", program, angle)
+            angle = float(record.position[-1])
+            after = read()
+            turns.append(Turn(record, before, after, readings))
+            stood.append(angle)
+            before = after
+    return turns, stood
+
+
+def errors(fit: TurnFit, machine: StandIn) -> tuple[list[float], list[float]]:
+    """Of dead-bands [share of the stroke] and full speeds [relative]."""
+    sides = (fit.plus, fit.minus)
+    return (
+        [abs(s.deadband - true) for s, true in zip(sides, machine.deadbands, strict=True)],
+        [abs(s.full_speed / true - 1.0) for s, true in zip(sides, machine.full_speeds, strict=True)],
+    )
+
+
+@pytest.mark.parametrize("machine", [SLOW_PLUS, SLOW_MINUS], ids=["slow to plus", "slow to minus"])
+def test_the_valve_is_found_though_its_metering_is_another(machine: StandIn) -> None:
+    turns, stood = surveyed(machine)
+    fit = fit_turns(turns, ROT)
+    deadbands, fulls = errors(fit, machine)
+    assert max(deadbands) < 0.02 and max(fulls) < 0.05
+    assert max(fit.plus.errors[0], fit.minus.errors[0]) < 0.004
+    assert max(map(abs, (*fit.plus.left_rad, *fit.minus.left_rad))) < 0.03
+    assert fit.stands_rad == pytest.approx(stood[-1], abs=0.03) and abs(stood[-1]) < 0.15, "it is back"
+    result = identify(AORO, Findings(turns=turns))
+    assert result.turns == fit and result.implausible == () and result.kept == ()
+
+
+def test_half_turns_are_not_mistaken_on_a_machine_far_from_its_profile() -> None:
+    turns, stood = surveyed(FAR_OFF)
+    fit = fit_turns(turns, ROT)
+    assert max(abs(a - b) for a, b in zip(stood, (0.0, *stood), strict=False)) > pi / 2, "a turn that looks shorter"
+    true = [b - a for a, b in zip((0.0, *stood), stood, strict=False)]
+    assert fit.plus.turns_rad == pytest.approx(true[::2], abs=0.03)
+    assert fit.minus.turns_rad == pytest.approx([-turn for turn in true[1::2]], abs=0.03)
+    assert min(stood) > -0.3 and max(stood) < pi, "never farther than half a turn"
+    assert abs(stood[-1]) < 0.15
+
+
+def test_single_readings_of_a_person_are_enough_to_be_believed() -> None:
+    turns, _ = surveyed(SLOW_PLUS, readings=1)
+    result = identify(AORO, Findings(turns=turns))
+    assert result.turns is not None and result.implausible == ()
+    assert max(errors(result.turns, SLOW_PLUS)[1]) < 0.1
+
+
+def test_without_turns_a_side_is_as_the_profile_has_it() -> None:
+    fit = fit_turns([], ROT)
+    assert (fit.plus.deadband, fit.minus.full_speed) == (0.01 * ROT.valve.deadband_plus_pct, ROT.valve.full_speed_minus)
+    assert fit.stands_rad == 0.0
+
+
+def test_what_cannot_be_believed_of_turns_is_said() -> None:
+    turns, _ = surveyed(SLOW_PLUS)
+    wrong = [*turns[:-2], replace(turns[-2], after_rad=turns[-2].after_rad + 0.9), turns[-1]]
+    sentences = identify(AORO, Findings(turns=wrong)).implausible
+    assert any("rot plus" in s for s in sentences), sentences
+    crawling, _ = surveyed(replace(SLOW_PLUS, full_speeds=(0.8, 2.35)))
+    sentences = identify(AORO, Findings(turns=crawling)).implausible
+    assert any("full speed over the profile's 0.4" in s for s in sentences), sentences
+    assert any("faster than the other" in s for s in sentences), sentences
