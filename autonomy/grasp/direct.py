@@ -34,8 +34,8 @@ UNDER: Final = 0.35
 """Tips under this share of a log's diameter scoop it, higher ones pinch it and lose it."""
 _TOUCH: Final = 0.45
 """The tips touch a log when their half gap is this share of its diameter."""
-BELOW_TOP_M: Final = 0.12
-"""The middle of a log is laid so far below the top of the stakes or lower: with 5 cm two of 17 ended outside."""
+BELOW_TOP_M: Final = 0.05
+"""The middle of a log is to come to rest so far below the top of the stakes or lower."""
 RELEASE_CLEARANCE_M: Final = 0.07
 HOVER_M: Final = 0.5
 """Open tips above the support before the vertical descent; more than a log's diameter."""

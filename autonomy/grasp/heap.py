@@ -22,7 +22,7 @@ ASTRAY_M: Final = 0.05
 """A log that is let go is so far beside where it was to be: tracking error, sway, a bent log."""
 TONGS_M: Final = 0.17
 """What the tongs need beside a log while they open: its tips' way, and their thickness."""
-_FALL_COST: Final = 0.3
+_FALL_COST: Final = 0.6
 """A fall of a metre is worth so much height: what drops far may roll on or push others."""
 _EVEN_M: Final = 0.03
 """Places that differ by less are as good as each other."""
