@@ -54,6 +54,8 @@ def poses(w: Cylinders) -> list[LogPose]:
     return found
 
 
+@pytest.mark.slow
+@pytest.mark.computed
 def test_the_virtual_camera_sees_what_the_simulations_renderer_sees() -> None:
     w = world(1)
     camera = Camera(np.array([0.0, 0.0, GROUND + 3.1]))
