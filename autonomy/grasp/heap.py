@@ -8,8 +8,8 @@ bunk, the logs that may lie in it, the new log.  No clock, no randomness.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import cos, sin
+from dataclasses import dataclass, replace
+from math import cos, hypot, sin
 from typing import Final
 
 import numpy as np
@@ -58,11 +58,17 @@ class Heap:
         self._empty = bool(np.all(self._bed <= bunk.floor_z_m + radius))
         near = np.where(beside < wide + TONGS_M, height + other, -np.inf)
         self._under = np.max(near, axis=1, initial=bunk.floor_z_m)
-        self._rest = self._bed[_hollows(self._bed)]
+        self._hollow = _hollows(self._bed)
+        self._rest = self._bed[self._hollow]
 
     def at(self, across_m: float) -> Rest:
         """What a log that is let go there comes to; beyond the stakes it counts as beside them."""
         return self._found(int(np.argmin(np.abs(self._across - across_m))))
+
+    def falls(self, across_m: float) -> tuple[float, float]:
+        """Where the middle of a log that is let go there comes to lie: across the bunk and its height, m."""
+        i = int(self._hollow[np.argmin(np.abs(self._across - across_m))])
+        return float(self._across[i]), float(self._bed[i])
 
     def lowest(self, reach_m: float) -> Rest:
         """Where, at most ``reach_m`` from the middle, it comes to lie lowest.
@@ -101,6 +107,19 @@ def in_bunk(bunk: Bunk, log: LogObservation) -> tuple[float, float]:
 def point_in_bunk(bunk: Bunk, x_m: float, y_m: float) -> tuple[float, float]:
     """How far along and across a bunk from its middle a point is, m."""
     return _turned(bunk, x_m - bunk.center_m[0], y_m - bunk.center_m[1])
+
+
+def fallen(bunk: Bunk, log: LogObservation, logs: Sequence[LogObservation]) -> LogObservation:
+    """A log that was let go over a bunk in which others lie, as it then lies; one beside the bunk stays as it is."""
+    along, across = in_bunk(bunk, log)
+    if abs(along) > bunk.length_m / 2 or abs(across) > bunk.width_m / 2:
+        return log
+    at, z = Heap(bunk, logs, log.diameter_m, log.length_m).falls(across)
+    c, s, aside = cos(bunk.yaw_rad), sin(bunk.yaw_rad), at - across
+    level = hypot(*log.axis[:2])
+    axis = (log.axis[0] / level, log.axis[1] / level, 0.0) if level > 0.0 else log.axis
+    x, y, _ = log.center_m
+    return replace(log, center_m=(x - s * aside, y + c * aside, z), axis=axis, covariance=None)
 
 
 def _turned(bunk: Bunk, x: float, y: float) -> tuple[float, float]:

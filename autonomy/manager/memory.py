@@ -2,8 +2,8 @@
 
 Paper B's crane works from what the front camera saw on the way: the places of the logs in the plane (3.2.6), the
 kinematic chain and the receiver say where they are from the crane's foot now.  A log in the grapple goes with it while
-the scale feels one; what was laid into the bunk stays there.  Four times a second this is a list like a detector's,
-with the field's numbers.
+the scale feels one; what was laid into the bunk lies where it fell to on what is there already.  Four times a second
+this is a list like a detector's, with the field's numbers.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 
 from autonomy.activity import Activity
 from autonomy.grasp.direct import lies_in
+from autonomy.grasp.heap import fallen
 from autonomy.logs import LogObservation
 from autonomy.manager.field import Field
 from autonomy.motion.arm import Arm
@@ -96,7 +97,11 @@ class Memory:
             if risen and math.isfinite(report.load_kg) and report.load_kg < FELT_KG:
                 self._held, self._slipped = {}, True
         elif Phase.OPEN <= job.phase <= Phase.DONE and self._held:
-            self._laid, self._held = self._hanging(report), {}
+            under = [log for log in self._aboard if log.id not in self._held]
+            laid: list[LogObservation] = []
+            for log in self._hanging(report):
+                laid.append(fallen(self._profile.bunk, log, under + laid))
+            self._laid, self._held = laid, {}
 
     def _hanging(self, report: StateReport | None) -> list[LogObservation]:
         if not self._held or report is None:

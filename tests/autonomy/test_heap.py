@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from math import cos, pi, sin, sqrt
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.grasp.heap import STEP_M, Heap, in_bunk
+from autonomy.grasp.heap import STEP_M, Heap, fallen, in_bunk
 from autonomy.logs import LogObservation
 from machine.load import load_profile
 from machine.profile import Bunk
@@ -70,6 +71,16 @@ def test_what_lies_across_counts_everywhere_between_its_ends() -> None:
     z = FLOOR_M + R_M
     across = heap(lying(0.0, z, skew_rad=pi / 2))
     assert all(across.at(a).support_z_m == pytest.approx(z + R_M) for a in (0.0, 0.4))
+
+
+def test_a_log_that_was_let_go_lies_where_it_fell_to() -> None:
+    z = FLOOR_M + R_M
+    bed = [lying(-0.13, z), lying(0.13, z)]
+    laid = fallen(BUNK, replace(lying(0.05, z + 0.9), axis=(0.99, 0.1, 0.1)), bed)
+    assert in_bunk(BUNK, laid)[1] == pytest.approx(0.0, abs=STEP_M)
+    assert laid.center_m[2] == pytest.approx(z + sqrt(D_M**2 - 0.13**2), abs=2e-3) and laid.axis[2] == 0.0
+    beside = lying(HALF_M + 0.5, 1.0)
+    assert fallen(BUNK, beside, bed) is beside
 
 
 def test_logs_on_the_ground_do_not_matter() -> None:

@@ -86,6 +86,7 @@ def test_a_log_goes_with_the_grapple_and_stays_in_the_bunk() -> None:
     hands.to(place)
     (log,) = hands.step(Phase.OPEN)
     assert lies_in(PROFILE.bunk, log)
+    assert log.center_m[2] == pytest.approx(PROFILE.bunk.floor_z_m + log.diameter_m / 2), "it fell to the floor"
     hands.to(place.at_height(1.9))
     hands.step(Phase.DONE)
     hands.field.remove(grasp.log.id)
