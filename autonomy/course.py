@@ -22,7 +22,7 @@ from autonomy.grasp.direct import (
     retreat_height,
     travel_height,
 )
-from autonomy.grasp.heap import point_in_bunk
+from autonomy.grasp.heap import is_over
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.obstacles import held_log, surroundings
@@ -128,8 +128,7 @@ def gathering(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
 def stowing(arm: Arm, motions: Motions, start: Pose, logs: Sequence[LogObservation]) -> Trajectory:
     """Over the bunk, high enough for what hangs open to be clear of the stakes; no motion where it is there."""
     bunk, high_m = arm.profile.bunk, retreat_height(arm.profile)
-    along, across = point_in_bunk(bunk, *arm.xy(start))
-    if abs(along) < 0.5 * bunk.length_m and abs(across) < 0.5 * bunk.width_m:
+    if is_over(bunk, *arm.xy(start)):
         return straight(arm, start, start.at_height(max(start.z_m, high_m)))
     over = arm.over(*bunk.center_m, high_m, high_m)._replace(rot_rad=start.rot_rad)
     return motions(arm, start, over, surroundings(arm.profile, logs), None, travel_height(arm.profile), 0.0)

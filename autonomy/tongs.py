@@ -7,7 +7,7 @@ from math import isfinite
 from typing import Final
 
 from autonomy.grasp.direct import RETREAT_CLEARANCE_M, Grasp, opened_angle, retreat_height
-from autonomy.grasp.heap import point_in_bunk
+from autonomy.grasp.heap import is_over
 from autonomy.motion.arm import Arm
 from can_dbc.setpoint import StateReport
 from machine.grapple import opening_pct_from_tong_angle, tong_angle_from_opening_pct
@@ -58,10 +58,7 @@ def released(profile: Profile, report: StateReport, grasp: Grasp, opening_s: flo
 def among_stakes(arm: Arm, bunk: Bunk, q: Sequence[float]) -> bool:
     """Whether tongs that have let a log go stand so low over a bunk that to open further would stir the heap."""
     pose = arm.pose(q)
-    x, y = arm.xy(pose)
-    along, across = point_in_bunk(bunk, x, y)
-    over = abs(along) < bunk.length_m / 2 and abs(across) < bunk.width_m / 2
-    return over and pose.z_m < retreat_height(arm.profile) - RETREAT_CLEARANCE_M
+    return is_over(bunk, *arm.xy(pose)) and pose.z_m < retreat_height(arm.profile) - RETREAT_CLEARANCE_M
 
 
 def closed_for_s(profile: Profile, report: StateReport) -> float:

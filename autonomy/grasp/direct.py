@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.heap import Heap, in_bunk, point_in_bunk
+from autonomy.grasp.heap import Heap, is_over, point_in_bunk
 from autonomy.grasp.proposal import BunkFull, NoGrasp, Planner
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
@@ -329,9 +329,7 @@ def plan_place(
 
 def lies_in(bunk: Bunk, log: LogObservation) -> bool:
     """Whether the log's centre is between the stakes."""
-    along, across = in_bunk(bunk, log)
-    inside = abs(along) <= bunk.length_m / 2 and abs(across) <= bunk.width_m / 2
-    return inside and log.center_m[2] < bunk.floor_z_m + bunk.stake_height_m
+    return is_over(bunk, *log.center_m[:2]) and log.center_m[2] < bunk.floor_z_m + bunk.stake_height_m
 
 
 def is_held(arm: Arm, log: LogObservation, pin: Pose) -> bool:

@@ -109,11 +109,17 @@ def point_in_bunk(bunk: Bunk, x_m: float, y_m: float) -> tuple[float, float]:
     return _turned(bunk, x_m - bunk.center_m[0], y_m - bunk.center_m[1])
 
 
+def is_over(bunk: Bunk, x_m: float, y_m: float) -> bool:
+    """Whether a point is between the stakes, seen from above."""
+    along, across = point_in_bunk(bunk, x_m, y_m)
+    return abs(along) <= bunk.length_m / 2 and abs(across) <= bunk.width_m / 2
+
+
 def fallen(bunk: Bunk, log: LogObservation, logs: Sequence[LogObservation]) -> LogObservation:
     """A log that was let go over a bunk in which others lie, as it then lies; one beside the bunk stays as it is."""
-    along, across = in_bunk(bunk, log)
-    if abs(along) > bunk.length_m / 2 or abs(across) > bunk.width_m / 2:
+    if not is_over(bunk, *log.center_m[:2]):
         return log
+    across = in_bunk(bunk, log)[1]
     at, z = Heap(bunk, logs, log.diameter_m, log.length_m).falls(across)
     c, s, aside = cos(bunk.yaw_rad), sin(bunk.yaw_rad), at - across
     level = hypot(*log.axis[:2])
