@@ -1,4 +1,4 @@
-"""The logs of a picture: the network's maps, the regions that edges part, and of each mask, box, axis and ends.
+"""The logs of a picture: the network's maps, the regions they are parted into, and of each mask, box, axis and ends.
 
 A mask's outline runs through the picture's pixels: the map's probabilities are interpolated and cut at a half.
 """
@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.weights import SHIPPED, load
+from autonomy.perception.flood import sigmoid
 from autonomy.perception.frame import Frame, check
 from autonomy.perception.network import (
     COS2,
@@ -31,13 +32,15 @@ from autonomy.perception.network import (
     channels,
     unet,
 )  # fmt: skip
-from autonomy.perception.regions import Region, parted, sigmoid
+from autonomy.perception.pieces import Scene, scene
+from autonomy.perception.regions import Judges, Region, parted, shipped_judges
 from autonomy.perception.resize import bilinear, doubled, shrunk
 from machine.optics import Intrinsics
 
 SIZE_PX: Final = 304
 LEAST_MASK: Final = 0.5
 LEAST_END: Final = 0.3
+LEAST_DEPTH_M: Final = 0.1
 TWICE: Final = 1.5  # pictures so many times longer than what is asked for are looked at at half the size too
 MASK_SHARE, EDGE_SHARE = 0.4, 0.8  # of the finer look in what two looks give
 
@@ -68,17 +71,24 @@ class LogFinder:
         size_px: about how long the network's picture is; frames are shrunk by a whole factor, or doubled when they
             are shorter.  Of a picture longer than SIZE_PX a look at half the size is taken first, and so on.
         precision: of the network, see ``OpenVinoNet``.
+        judges: who says what is one log; None are the shipped ones.
 
     Raises:
         WeightsRefused: the weights are missing, damaged or of another network.
     """
 
     def __init__(
-        self, variant: str = "rgbd", weights: Path | None = None, size_px: int = 2 * SIZE_PX, precision: str = "f32"
+        self,
+        variant: str = "rgbd",
+        weights: Path | None = None,
+        size_px: int = 2 * SIZE_PX,
+        precision: str = "f32",
+        judges: Judges | None = None,
     ) -> None:
         self.variant, self.size_px, self._precision = variant, size_px, precision
         self._network = unet(variant)
         self._arrays, self.facts = load(weights or SHIPPED / f"logs_{variant}.safetensors", self._network)
+        self._judges = judges or shipped_judges()
         self._nets: dict[tuple[int, int], OpenVinoNet] = {}
 
     def segment(self, frame: Frame) -> tuple[Instance, ...]:
@@ -95,12 +105,12 @@ class LogFinder:
         top, bottom, left, right = inside_bars(rgb)
         window = (slice(top, bottom), slice(left, right))
         own = pinhole.crop(left, top, right - left, bottom - top)
-        maps, scale = self._looks(rgb[window], depth_m[window], own)
-        found = instances(maps, scale, (bottom - top, right - left))
+        maps, scale = self.looks(rgb[window], depth_m[window], own)
+        found = instances(maps, scale, depth_m[window], self._judges)
         shape = depth_m.shape
         return tuple(_placed(i, left, top, shape) for i in found) if shape != (bottom - top, right - left) else found
 
-    def _looks(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[np.ndarray, int]:
+    def looks(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[np.ndarray, int]:
         """Maps of a picture, looked at once or more, and how many of its pixels one of theirs is wide."""
         longest = max(depth_m.shape)
         factor = max(1, round(longest / self.size_px))
@@ -166,13 +176,13 @@ def both(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
     return maps
 
 
-def instances(maps: np.ndarray, scale: int, shape: tuple[int, int]) -> tuple[Instance, ...]:
-    """The logs of maps (8, h, w), one pixel of which is ``scale`` pixels wide in a picture of ``shape`` (H, W)."""
-    sure = sigmoid(maps[MASK])
-    y, x = np.nonzero(sure > LEAST_MASK)
-    regions = parted(maps, x, y, sure[y, x], max(1, STRIDE // scale) ** 2)
+def instances(maps: np.ndarray, scale: int, depth_m: np.ndarray, judges: Judges) -> tuple[Instance, ...]:
+    """The logs of maps (8, h, w), one pixel of which is ``scale`` pixels wide in a picture with depth (H, W) [m]."""
+    seen = scene_of(maps, scale, depth_m)
+    regions = parted(seen, judges)
     if not regions:
         return ()
+    sure, x, y, shape = sigmoid(maps[MASK]), seen.x, seen.y, depth_m.shape
     labels = np.zeros(sure.shape, np.int32)
     for number, region in enumerate(regions, 1):
         labels[y[region.own], x[region.own]] = number
@@ -186,6 +196,15 @@ def instances(maps: np.ndarray, scale: int, shape: tuple[int, int]) -> tuple[Ins
         if instance := _instance(region, number, x, y, labels, sure, ends, scale, shape):
             found.append(instance)
     return tuple(sorted(found, key=lambda i: -i.score))
+
+
+def scene_of(maps: np.ndarray, scale: int, depth_m: np.ndarray) -> Scene:
+    """What the regions are parted from: maps (8, h, w) and the depth in the middle of each of their pixels."""
+    sure = sigmoid(maps[MASK])
+    inverse = np.full(sure.shape, np.nan, np.float32)
+    middle = depth_m[scale // 2 :: scale, scale // 2 :: scale][: sure.shape[0], : sure.shape[1]]
+    inverse[: middle.shape[0], : middle.shape[1]] = 1.0 / np.maximum(middle, LEAST_DEPTH_M)
+    return scene(maps, sure, sure > LEAST_MASK, inverse, max(1, STRIDE // scale) ** 2)
 
 
 def _instance(

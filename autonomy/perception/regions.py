@@ -1,33 +1,82 @@
-"""Regions: the foreground parted along the edges between logs, and what is one log's put together again.
+"""Regions: the foreground parted into pieces, and the pieces of one log put together again, the likeliest pair first.
 
-An edge is seen from near by, so a small network draws it where it cannot tell how far away the middle of a log is.  The
-map of edges is flooded from its valleys; a valley that is deep enough before it meets another is a region.  A log that
-another one crosses is several regions: they lie on one line, vote for one centre, and there is no ground between them.
+What is one log, and how good a region is, two small networks judge that learnt it from drawn pictures.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Final
 
 import numpy as np
-from scipy import ndimage
 
-from autonomy.perception.network import COS2, EDGE, OFFSET_PX, OFFSET_U, OFFSET_V, SIN2, STRIDE
+from autonomy.networks.graph import Conv, Network, Relu
+from autonomy.networks.weights import SHIPPED, load
+from autonomy.perception.flood import flooded, sigmoid
+from autonomy.perception.pieces import LOOKS, RELATIONS, Piece, Scene, look, parted_between, piece, relation
 
 LEAST_PX: Final = 6  # of a map: what is smaller is no log
-SURE_PX: Final = 12.0  # scores of smaller regions are lowered
-LEVELS: Final = (*np.arange(0.05, 1.0, 0.05), 1.1)
-DEPTH: Final = 0.18  # of a valley that is a region
-LEAST_CORE: Final = 3  # pixels of a valley
-SIDE, STRAY = 0.6, 0.05
-"""How far a region's middle may lie beside another one's axis: share of its half width, and of how far along it is."""
-ALIKE: Final = 0.3  # votes of one log differ by less, in its length
-TURN_LONG, TURN_SHORT = 0.18, 0.4  # sine of the angle between regions of one log
-GAP_PX: Final = 3.0
-GROUND_SHARE: Final = 0.3  # of a gap between regions of one log that may be ground
+MOST: Final = 100  # pieces of a picture, the largest: what has more is noise
+HIDDEN: Final = 24
+LEAST_CHANCE: Final = 0.5  # that two pieces are one log
+BESIDE, LEAN = 3.0, 0.1  # pieces further beside a line than so many half widths, and share of how far along, are apart
+
+
+def head(name: str, inputs: int) -> Network:
+    """A judge: ``inputs`` numbers in, the logit of a chance out, as a picture's channels."""
+    return Network(name, inputs, (Conv("first", HIDDEN, 1), Relu("bent"), Conv("logit", 1, 1)), ("logit",))
+
+
+JOINS: Final = head("joins", len(RELATIONS))
+WORTH: Final = head("worth", len(LOOKS))
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """A judge's numbers: weights and biases of its two layers."""
+
+    first: np.ndarray
+    bias: np.ndarray
+    second: np.ndarray
+    offset: float
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray]) -> Head:
+        """From the arrays of a ``head``."""
+        return cls(arrays["first.weight"][:, :, 0, 0], arrays["first.bias"], arrays["logit.weight"][0, :, 0, 0],
+                   float(arrays["logit.bias"][0]))  # fmt: skip
+
+    def chance(self, told: np.ndarray) -> np.ndarray:
+        """Chances (N,) from numbers (N, inputs)."""
+        return sigmoid(np.maximum(told @ self.first.T + self.bias, 0.0) @ self.second + self.offset)
+
+
+@dataclass(frozen=True, slots=True)
+class Judges:
+    """Who says whether two pieces are one log, and what overlap with a log a region has."""
+
+    joins: Head
+    worth: Head
+
+
+def judges(folder: Path = SHIPPED) -> Judges:
+    """From ``joins.safetensors`` and ``worth.safetensors`` of a folder.
+
+    Raises:
+        WeightsRefused: they are missing, damaged or of other networks.
+    """
+    heads = (Head.of(load(folder / f"{network.name}.safetensors", network)[0]) for network in (JOINS, WORTH))
+    return Judges(*heads)
+
+
+@cache
+def shipped_judges() -> Judges:
+    """Those that come with the package."""
+    return judges()
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,143 +88,116 @@ class Region:
     score: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Line:
-    """A region's middle (2,), axis (2,), half width, range along the axis from the middle [pixels of the maps], and how
-    many times longer than wide it is."""
-
-    middle: np.ndarray
-    axis: np.ndarray
-    half: float
-    low: float
-    high: float
-    slender: float
+def parted(scene: Scene, by: Judges) -> list[Region]:
+    """The foreground of a scene as logs, the largest first."""
+    pieces = cut(scene)
+    joined = Joining(scene, pieces)
+    joined.join(by.joins)
+    chances = by.worth.chance(joined.looks(by.joins)) if pieces else np.zeros(0)
+    regions = [Region(p.own, p.told, float(c)) for p, c in zip(joined.pieces, chances, strict=True)]
+    return sorted(regions, key=lambda r: -len(r.own))
 
 
-def parted(maps: np.ndarray, x: np.ndarray, y: np.ndarray, sure: np.ndarray, grain: int = 1) -> list[Region]:
-    """The foreground's pixels (x, y) (N,), with their probabilities ``sure`` (N,), as logs, the largest first;
-    ``grain`` pixels count as one."""
-    foreground = np.zeros(maps.shape[1:], bool)
-    foreground[y, x] = True
-    labels = flooded(sigmoid(maps[EDGE]), foreground)[y, x]
-    place = np.stack([x, y], axis=1).astype(np.float32)
-    votes = place + OFFSET_PX / STRIDE * maps[OFFSET_U : OFFSET_V + 1, y, x].T
-    double = maps[COS2 : SIN2 + 1, y, x].T
+def cut(scene: Scene) -> list[Piece]:
+    """The scene's pieces, too many rather than too few, the largest first."""
+    labels = flooded(scene.wall, scene.foreground)[scene.y, scene.x]
     order = np.argsort(labels, kind="stable")
     cuts = np.searchsorted(labels[order], np.arange(1, labels.max(initial=0) + 2))
-    parts = [order[a:b] for a, b in pairwise(cuts) if b - a >= LEAST_PX * grain]
-    return _joined([_region(own, double, sure, grain) for own in parts], place, votes, double, sure, foreground, grain)
+    parts = [order[a:b] for a, b in pairwise(cuts) if b - a >= LEAST_PX * scene.grain]
+    return [piece(scene, own) for own in sorted(parts, key=lambda own: -len(own))[:MOST]]
 
 
-def flooded(wall: np.ndarray, foreground: np.ndarray) -> np.ndarray:
-    """Labels (h, w) int32, 0 outside ``foreground``, of the valleys of ``wall`` (h, w), 0..1.
+class Joining:
+    """Pieces of a scene, their borders with each other, and their relations, as they grow together."""
 
-    The water rises in LEVELS.  A pool without a label is a new valley; where pools with labels meet, those less than
-    DEPTH deep are forgotten, and from there on nothing is labelled.  What is left goes to the nearest label that is in
-    its patch of foreground.
-    """
-    labels = np.zeros(wall.shape, np.int32)
-    birth = [0.0]
-    for level in LEVELS:
-        pools, count = ndimage.label(foreground & (wall < level))
-        taken = labels > 0
-        pairs = np.unique(pools[taken].astype(np.int64) * len(birth) + labels[taken])
-        pool, label = pairs // len(birth), pairs % len(birth)
-        many, size = (np.bincount(of, minlength=count + 1) for of in (pool, pools.ravel()))
-        into = np.zeros(count + 1, np.int32)  # what a pool's pixels are labelled
-        new = 1 + np.flatnonzero((many[1:] == 0) & (size[1:] >= LEAST_CORE))
-        into[new] = len(birth) + np.arange(len(new))
-        alone = many[pool] == 1
-        into[pool[alone]] = label[alone]
-        shallow: list[int] = []
-        for meeting in np.flatnonzero(many > 1):
-            here = sorted(label[pool == meeting].tolist(), key=lambda i: birth[i])
-            low = [i for i in here[1:] if level - birth[i] < DEPTH]
-            shallow += low
-            if len(low) == len(here) - 1:
-                into[meeting] = here[0]
-        labels[np.isin(labels, shallow)] = 0
-        birth += [float(level)] * len(new)
-        fill = (labels == 0) & (pools > 0)
-        labels[fill] = into[pools[fill]]
-    if labels.any():
-        nearest = tuple(ndimage.distance_transform_edt(labels == 0, return_distances=False, return_indices=True))
-        patch, _ = ndimage.label(foreground, np.ones((3, 3)))
-        rest = foreground & (labels == 0) & (patch[nearest] == patch)  # what is far from any valley is no log's
-        labels[rest] = labels[nearest][rest]
-    return labels
+    def __init__(self, scene: Scene, pieces: list[Piece]) -> None:
+        self.scene, self.pieces = scene, list(pieces)
+        self._touch, self._wall = _borders(scene, pieces)
+        n = len(pieces)
+        self._told = np.zeros((n, n, len(RELATIONS)), np.float32)
+        self._may = np.zeros((n, n), bool)  # be one log; below the diagonal as above
+        for i in range(n):
+            self._relate(i, range(i))
 
+    def _relate(self, i: int, others: Iterable[int]) -> None:
+        """Note what piece ``i`` has to do with others."""
+        for j in others:
+            a, b = self.pieces[i], self.pieces[j]
+            big, small = (a, b) if len(a.own) >= len(b.own) else (b, a)
+            touch = float(self._touch[i, j])
+            self._may[i, j] = self._may[j, i] = (touch > 0.0 or _in_line(big, small)) and (
+                not parted_between(self.scene, big, small)
+            )
+            if self._may[i, j]:
+                between = float(self._wall[i, j]) / touch if touch else 0.0
+                self._told[i, j] = self._told[j, i] = relation(self.scene, big, small, touch, between)
 
-def _region(own: np.ndarray, double: np.ndarray, sure: np.ndarray, grain: int) -> Region:
-    c, s = (double[own] * sure[own, None]).sum(axis=0)
-    angle = 0.5 * math.atan2(float(s), float(c))
-    size = 1.0 - math.exp(-len(own) / (SURE_PX * grain))
-    return Region(own, np.array([math.cos(angle), math.sin(angle)], np.float32), float(sure[own].mean()) * size)
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Every pair (N, 2) that may be one log, and its RELATIONS (N, 19)."""
+        pairs = np.argwhere(np.tril(self._may))
+        return pairs, self._told[pairs[:, 0], pairs[:, 1]]
 
+    def join(self, judge: Head) -> None:
+        """Put together what is likely to be one log, the likeliest first, until nothing is."""
+        chances = self.chances(judge)
+        while chances.size and chances.max() >= LEAST_CHANCE:
+            i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(chances)), chances.shape))
+            self.merge(i, j)
+            chances = np.delete(np.delete(chances, j, 0), j, 1)
+            chances[i] = chances[:, i] = np.where(self._may[i], judge.chance(self._told[i]), 0.0)
 
-def _joined(
-    regions: list[Region],
-    place: np.ndarray,
-    votes: np.ndarray,
-    double: np.ndarray,
-    sure: np.ndarray,
-    foreground: np.ndarray,
-    grain: int,
-) -> list[Region]:
-    """Regions of one log made one, until no two are."""
-    while True:
-        kept: list[Region] = []
-        lines: list[_Line] = []
-        for region in sorted(regions, key=lambda r: -len(r.own)):
-            line = _line(region, place)
-            for i, other in enumerate(kept):
-                apart = np.median(votes[region.own], axis=0) - np.median(votes[other.own], axis=0)
-                if _one_log(line, lines[i], apart, foreground):
-                    kept[i] = _region(np.concatenate([other.own, region.own]), double, sure, grain)
-                    lines[i] = _line(kept[i], place)
-                    break
-            else:
-                kept.append(region)
-                lines.append(line)
-        if len(kept) == len(regions):
-            return kept
-        regions = kept
+    def chances(self, judge: Head) -> np.ndarray:
+        """That two pieces are one log (n, n), 0 for a piece with itself."""
+        pairs, told = self.pairs()
+        chances = np.zeros(self._may.shape)
+        chances[pairs[:, 0], pairs[:, 1]] = chances[pairs[:, 1], pairs[:, 0]] = judge.chance(told)
+        return chances
+
+    def merge(self, i: int, j: int) -> None:
+        """Make pieces ``i`` and ``j``, ``i`` the earlier one, one in its place."""
+        self.pieces[i] = piece(self.scene, np.concatenate([self.pieces[i].own, self.pieces[j].own]))
+        for of in (self._touch, self._wall):
+            of[i] += of[j]
+            of[:, i] += of[:, j]
+            of[i, i] = 0.0
+        del self.pieces[j]
+        self._touch, self._wall, self._told, self._may = (
+            np.delete(np.delete(of, j, 0), j, 1) for of in (self._touch, self._wall, self._told, self._may)
+        )
+        self._relate(i, (k for k in range(len(self.pieces)) if k != i))
+
+    def looks(self, judge: Head) -> np.ndarray:
+        """LOOKS (n, 14) of the pieces as they are now."""
+        likeness = self.chances(judge).max(axis=1, initial=0.0)
+        touch, around = self._touch.sum(axis=1), self._wall.sum(axis=1)
+        around = np.divide(around, touch, out=np.ones_like(around), where=touch > 0.0)
+        return np.array([
+            look(self.scene, p, float(touch[k]), float(around[k]), float(likeness[k]))
+            for k, p in enumerate(self.pieces)
+        ], np.float32).reshape(-1, len(LOOKS))  # fmt: skip
 
 
-def _line(region: Region, place: np.ndarray) -> _Line:
-    """By the spread of the pixels where they are long enough for it, else by their angles."""
-    own = place[region.own]
-    middle = own.mean(axis=0)
-    away = own - middle
-    spread, ways = np.linalg.eigh(away.T @ away / len(own))
-    axis = ways[:, 1] if spread[1] > 4.0 * spread[0] else region.axis
-    along, across = away @ axis, away[:, 1] * axis[0] - away[:, 0] * axis[1]
-    half = float(np.percentile(np.abs(across - np.median(across)), 90)) + 0.5
-    slender = math.sqrt(max(float(spread[1]), 0.0) / (max(float(spread[0]), 0.0) + 0.1))
-    return _Line(middle, axis, half, float(along.min()), float(along.max()), slender)
+def _in_line(big: Piece, small: Piece) -> bool:
+    away = small.middle - big.middle
+    beside = abs(float(big.axis[0] * away[1] - big.axis[1] * away[0]))
+    return beside <= BESIDE * big.half + LEAN * abs(float(away @ big.axis))
 
 
-def _one_log(small: _Line, big: _Line, apart: np.ndarray, foreground: np.ndarray) -> bool:
-    """Whether two regions, whose votes differ by ``apart`` (2,), lie on one line, vote alike, and touch or have
-    something before the ground between them."""
-    axis, away = big.axis, small.middle - big.middle
-    along, across = float(away @ axis), abs(float(away[1] * axis[0] - away[0] * axis[1]))
-    if across > SIDE * big.half + STRAY * abs(along) or small.half > 1.5 * big.half + 1.0:
-        return False
-    turn = abs(float(small.axis[0] * axis[1] - small.axis[1] * axis[0]))
-    if turn > (TURN_LONG if small.slender > 3.0 else TURN_SHORT):
-        return False
-    near, far = along + small.low, along + small.high
-    if abs(float(apart @ axis)) > ALIKE * (max(big.high, far) - min(big.low, near)) + 1.0:
-        return False
-    start, end = (big.high, near) if along > 0.0 else (far, big.low)
-    if end - start < GAP_PX:
-        return True
-    column, row = np.rint(big.middle + np.linspace(start, end, 12)[1:-1, None] * axis).astype(int).T
-    row, column = np.clip(row, 0, foreground.shape[0] - 1), np.clip(column, 0, foreground.shape[1] - 1)
-    return float(foreground[row, column].mean()) > 1.0 - GROUND_SHARE
-
-
-def sigmoid(x: np.ndarray) -> np.ndarray:
-    """1 / (1 + exp(-x))."""
-    return 1.0 / (1.0 + np.exp(-x))
+def _borders(scene: Scene, pieces: list[Piece]) -> tuple[np.ndarray, np.ndarray]:
+    """How many pixels of border every two pieces (n, n) share, and the wall's sum along it."""
+    n = len(pieces)
+    labels = np.zeros(scene.foreground.shape, np.int64)
+    for number, one in enumerate(pieces, 1):
+        labels[scene.y[one.own], scene.x[one.own]] = number
+    touch, wall = np.zeros((n + 1) ** 2), np.zeros((n + 1) ** 2)
+    # A pixel or two of wall may lie between what meets there.
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]), (np.s_[:, :-2], np.s_[:, 2:]),
+                 (np.s_[:-2], np.s_[2:])):  # fmt: skip
+        i, j = labels[a], labels[b]
+        meet = (i != j) & (i > 0) & (j > 0)
+        pair = i[meet] * (n + 1) + j[meet]
+        touch += np.bincount(pair, minlength=(n + 1) ** 2)
+        wall += np.bincount(pair, np.maximum(scene.wall[a], scene.wall[b])[meet], (n + 1) ** 2)
+    grids = (of.reshape(n + 1, n + 1)[1:, 1:] for of in (touch, wall))
+    touch, wall = ((g + g.T) / 4.0 for g in grids)  # four looks at each border
+    return touch, wall

@@ -40,7 +40,7 @@ from autonomy.training.loop import Schedule, train
 
 SPOT_PX: Final = 1.5  # sigma of the spots at centres and ends, in pixels of the maps
 SPOT_WEIGHT: Final = 20.0
-EDGE_WEIGHT, BETWEEN_WEIGHT = 3.0, 4.0  # of edges, and beside those between two logs
+EDGE_WEIGHT, BETWEEN_WEIGHT = 3.0, 8.0  # of edges, and beside those between two logs
 SMALL_WEIGHT, OUTLINE_WEIGHT = 10.0, 2.0
 OFFSET_SHARE, ANGLE_SHARE, SPOT_SHARE, EDGE_SHARE = 0.6, 2.0, 0.7, 2.0
 ALONG, ACROSS = (0.08, 1.0), (0.2, 0.4)

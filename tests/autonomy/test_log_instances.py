@@ -13,6 +13,7 @@ from autonomy.networks.weights import WeightsRefused, save
 from autonomy.perception.frame import Frame, FrameRefused
 from autonomy.perception.instances import LogFinder, both, inside_bars, instances
 from autonomy.perception.network import STRIDE, unet
+from autonomy.perception.regions import shipped_judges
 from autonomy.perception.resize import doubled, shrunk
 from autonomy.training.segmentation import targets
 from machine.optics import Intrinsics
@@ -24,7 +25,7 @@ PARALLEL = (((80, 60), 0.2, 100, 12), ((80, 73), 0.2, 100, 12), ((80, 86), 0.2, 
 def found(*logs, size=160):
     sample = picture(*logs, size=size)
     maps, _ = targets(sample)
-    return sample, instances(perfect_maps(maps), STRIDE, sample.ids.shape)
+    return sample, instances(perfect_maps(maps), STRIDE, sample.depth_m, shipped_judges())
 
 
 def overlap(a, b):
@@ -58,7 +59,7 @@ def test_two_looks_make_one():
     small = [((u / 2, v / 2), angle, length / 2, width / 2) for (u, v), angle, length, width in logs]
     looks = [perfect_maps(targets(s)[0]) for s in (fine, picture(*small, size=160))]
     looks[0][2:4] = 0.0  # a fine look need not know where the middle is
-    out = instances(both(*looks), STRIDE, fine.ids.shape)
+    out = instances(both(*looks), STRIDE, fine.depth_m, shipped_judges())
     assert len(out) == 3
     for number in (1, 2, 3):
         assert max(overlap(i.mask, fine.ids == number) for i in out) > 0.85
@@ -74,7 +75,7 @@ def test_a_speck_beside_a_log_is_not_in_its_mask():
     sample = picture(((80.0, 80.0), 0.8, 110, 12))
     maps = perfect_maps(targets(sample)[0])
     maps[0, 30, 50] = maps[0, 5, 75] = 5.0  # in the log's box and outside it
-    (log,) = instances(maps, STRIDE, sample.ids.shape)
+    (log,) = instances(maps, STRIDE, sample.depth_m, shipped_judges())
     assert not log.mask[60, 100] and not log.mask[10, 150]
     assert overlap(log.mask, sample.ids == 1) > 0.85
 
@@ -82,12 +83,13 @@ def test_a_speck_beside_a_log_is_not_in_its_mask():
 def test_no_log_no_instance():
     maps = np.zeros((8, 40, 40), np.float32)
     maps[0] = -5.0
-    assert instances(maps, 4, (160, 160)) == ()
+    assert instances(maps, 4, np.full((160, 160), np.nan, np.float32), shipped_judges()) == ()
 
 
 def test_a_coarse_map_gives_an_outline_between_its_pixels():
     sample, (log,) = found(((80.0, 80.0), 0.5, 100, 14))
-    double, (fine,) = sample, instances(perfect_maps(targets(sample)[0]), 4, (320, 320))
+    depth = sample.depth_m.repeat(2, axis=0).repeat(2, axis=1)
+    double, (fine,) = sample, instances(perfect_maps(targets(sample)[0]), 4, depth, shipped_judges())
     assert abs(np.count_nonzero(fine.mask) / (4.0 * np.count_nonzero(double.ids)) - 1.0) < 0.06
     assert np.abs(np.array(fine.box_px) / 2.0 - log.box_px).max() <= 1.0
 

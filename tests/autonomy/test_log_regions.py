@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from drawn_logs import perfect_maps, picture
 
-from autonomy.perception.regions import flooded, parted, sigmoid
+from autonomy.networks.weights import WeightsRefused
+from autonomy.perception.flood import flooded, wall
+from autonomy.perception.instances import scene_of
+from autonomy.perception.network import STRIDE
+from autonomy.perception.pieces import LOOKS, RELATIONS, piece, relation
+from autonomy.perception.regions import Joining, cut, judges, parted, shipped_judges
+from autonomy.training.judging import relations, worths
 from autonomy.training.segmentation import targets
 
 ROOM = np.ones((20, 60), bool)
@@ -21,7 +27,7 @@ def test_a_wall_parts_and_a_ripple_does_not():
     labels = flooded(walled(0.6), ROOM)
     assert len(np.unique(labels[:10])) == len(np.unique(labels[11:])) == 1
     assert labels[0, 0] != labels[19, 0] and labels.all()
-    assert len(np.unique(flooded(walled(0.25), ROOM))) == 1
+    assert len(np.unique(flooded(walled(0.14), ROOM))) == 1
 
 
 def test_a_shallow_basin_above_goes_to_the_deep_one_it_meets():
@@ -53,12 +59,15 @@ def test_a_speck_is_no_part_of_a_log():
     assert labels[3, 55] == 0 and labels[some].astype(bool).sum() == some.sum() - 1
 
 
-def regions(*logs):
+def seen(*logs):
+    """A scene of perfect maps, and the logs of the maps' pixels."""
     sample = picture(*logs, size=208)
-    maps = perfect_maps(targets(sample)[0])
-    sure = sigmoid(maps[0])
-    y, x = np.nonzero(sure > 0.5)
-    return parted(maps, x, y, sure[y, x])
+    scene = scene_of(perfect_maps(targets(sample)[0]), STRIDE, sample.depth_m)
+    return scene, sample.ids[1::STRIDE, 1::STRIDE].astype(int)
+
+
+def regions(*logs):
+    return parted(seen(*logs)[0], shipped_judges())
 
 
 @pytest.mark.parametrize("away", [30.0, 60.0])
@@ -76,3 +85,69 @@ def test_the_larger_comes_first_and_all_pixels_are_somebody_s():
     assert len(found[0].own) > len(found[1].own)
     assert abs(np.arctan2(found[0].axis[1], found[0].axis[0]) - 0.4) < 0.02
     assert len(np.unique(np.concatenate([r.own for r in found]))) == sum(len(r.own) for r in found)
+
+
+CROSSED = (((100, 100), 0.3, 150, 16), ((115, 100), 1.7, 120, 16))
+
+
+def related(scene, a, b, touch=0.0):
+    big, small = (piece(scene, np.flatnonzero(own)) for own in (a, b))
+    return dict(zip(RELATIONS, relation(scene, big, small, touch, 0.0).tolist(), strict=True))
+
+
+def test_the_axis_turning_is_a_wall_where_no_edge_is():
+    maps = np.zeros((8, 20, 40), np.float32)
+    maps[7] = -9.0
+    maps[4, :, :20], maps[5, :, 20:] = 1.0, 1.0
+    high = wall(maps)
+    assert (high[:, 19:21] > 0.4).all() and (high[:, :18] < 0.01).all()
+
+
+def test_both_parts_of_a_crossed_log_are_on_one_line_in_depth_too():
+    scene, ids = seen(*CROSSED)
+    of = ids[scene.y, scene.x] == 1
+    left, right = of & (scene.x < 45), of & (scene.x > 65)
+    told = related(scene, left, right)
+    assert told["depth_known"] == 1.0 and told["depth_apart"] < 0.3
+    assert told["gap"] > 0.1 and told["gap_ground"] == 0.0 and told["turn"] < 0.1
+
+
+def test_what_hides_a_gap_is_no_ground_and_ground_is():
+    scene, ids = seen(((60, 100), 0.0, 60, 14), ((150, 100), 0.0, 60, 14))
+    own = [ids[scene.y, scene.x] == i for i in (1, 2)]
+    assert related(scene, *own)["gap_ground"] > 0.9
+    scene.inverse[:, 46:60] *= 1.2  # a post before both
+    assert related(scene, *own)["gap_ground"] < 0.4
+
+
+def test_a_joined_piece_takes_the_borders_of_both():
+    scene, _ = seen(*CROSSED)
+    joining = Joining(scene, cut(scene))
+    touch = joining._touch.copy()
+    n = len(joining.pieces)
+    joining.merge(0, n - 1)
+    assert len(joining.pieces) == n - 1
+    assert joining._touch[0, 1] == touch[0, 1] + touch[n - 1, 1] and joining._touch[0, 0] == 0.0
+    pairs, told = joining.pairs()
+    fresh_pairs, fresh = Joining(scene, joining.pieces).pairs()
+    assert np.array_equal(pairs, fresh_pairs)
+    assert np.abs(told - fresh)[:, 3:].max() < 1e-6  # what does not depend on borders between the two
+
+
+def test_examples_say_what_is_one_log():
+    scene, ids = seen(*CROSSED)
+    pairs = relations(scene, ids, np.random.default_rng(1))
+    assert pairs.told.shape[1] == len(RELATIONS) and set(pairs.answer) == {0.0, 1.0}
+    whole = worths(scene, ids, shipped_judges().joins)
+    assert whole.told.shape == (2, len(LOOKS)) and (whole.answer > 0.85).all()
+
+
+def test_a_picture_without_logs_has_no_regions():
+    scene, ids = seen()
+    none = worths(scene, ids, shipped_judges().joins)
+    assert regions() == [] and none.told.shape == (0, len(LOOKS)) and none.told.dtype == np.float32
+
+
+def test_missing_judges_are_named(tmp_path):
+    with pytest.raises(WeightsRefused, match="no such weight file"):
+        judges(tmp_path)

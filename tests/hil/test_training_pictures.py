@@ -12,8 +12,9 @@ from autonomy.perception.detector import BoxFinder
 from autonomy.perception.instances import LogFinder
 from autonomy.perception.network import unet
 from autonomy.perception.plane import height_over_plane
+from autonomy.perception.regions import judges as judges_in
 from autonomy.training.labels import ANGLE, CENTRE_U, CENTRE_V, ID, IGNORED
-from hil.training import frames, piles, produce, samples
+from hil.training import frames, judges, piles, produce, samples
 from hil.training.frames import MOST_LOGS, draw, labelled
 from hil.training.piles import HELD_OUT, chunk, profile_of, settle
 from hil.training.props import Steel
@@ -166,3 +167,14 @@ def test_weights_come_with_a_card_and_find_logs_by_themselves(few, monkeypatch):
         load(few / f"{name}.safetensors", unet("depth"))[0]["maps.weight"] for name in ("logs_depth", "on")
     )
     assert np.abs(before - after).max() < 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_judges_come_with_their_cards(few, monkeypatch):
+    monkeypatch.setattr(judges, "STEPS", 40)
+    monkeypatch.setattr(judges, "SIZE_PX", 304)
+    card = judges.produce(4, 1, few, few / "judges", None, Console(quiet=True))
+    assert "timberhand train judges --pictures 4 --seed 1" in card.read_text()
+    told = judges_in(few / "judges").joins.chance(np.zeros((3, 19), np.float32))
+    assert told.shape == (3,) and (told > 0.0).all() and (told < 1.0).all()

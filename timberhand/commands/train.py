@@ -158,6 +158,32 @@ def detector(
     _made(out, folder, lambda kept, screen: produce_boxes(plan, kept, out, screen))
 
 
+@app.command()
+def judges(
+    out: Annotated[Path, typer.Option(help="Folder for joins and worth, .safetensors and .md.")] = Path(),
+    seed: Seed = 1,
+    pictures: Annotated[int, typer.Option(min=2, help="How many pictures are drawn; 2.5 MB each.")] = 1024,
+    folder: Folder = None,
+    weights: Annotated[
+        Path | None, typer.Option(help="Of the network that looks at them (default: the shipped one).")
+    ] = None,
+) -> None:
+    """Train the judges that say which pieces of a picture are one log, and how well a region fits one.
+
+    They learn from what the network of [bold]train segmentation[/bold] sees: train them again after it.
+
+    [bold]Examples[/bold]
+
+      timberhand train judges
+
+      timberhand train judges --pictures 64     a look at it in a minute
+    """
+    torch_on_one_thread()
+    from hil.training.judges import produce
+
+    _made(out, folder, lambda kept, screen: produce(pictures, seed, kept, out, weights, screen))
+
+
 def _made(weights: Path, folder: Path | None, make: Callable[[Path, Console], Path]) -> None:
     """Make weights of drawn pictures and say where they are."""
     from rich.console import Console
