@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -27,6 +27,7 @@ from hil.training.samples import pictures, shard
 
 BATCH: Final = 16
 LEARNING_RATE: Final = 3e-3
+SMALL_PX, LARGE_PX, FIRST_LARGE = 304, 608, 40  # sizes of pictures, and the first shard of large ones
 JUDGED: Final = 128  # pictures
 LEAST_PX: Final = 30  # of a log that counts when the card's figures are made
 
@@ -40,6 +41,8 @@ class Plan:
     seed: int
     learning_rate: float = LEARNING_RATE
     start: Path | None = None
+    large: int = 0
+    """Pictures of twice the size, of which half of the windows are cut when there are any: bark seen from near by."""
 
     def words(self, crops_px: str) -> str:
         """For the card."""
@@ -53,8 +56,8 @@ class Plan:
         """That makes the weights again."""
         start = f" --start {self.start.name}" if self.start else ""
         return (
-            f"timberhand train {what} --pictures {self.count} --steps {self.steps} --seed {self.seed} "
-            f"--learning-rate {self.learning_rate}{start} --out {out.name}"
+            f"timberhand train {what} --pictures {self.count}{f' --large {self.large}' if self.large else ''} "
+            f"--steps {self.steps} --seed {self.seed} --learning-rate {self.learning_rate}{start} --out {out.name}"
         )
 
 
@@ -67,9 +70,10 @@ def produce(variant: str, plan: Plan, folder: Path, out: Path, console: Console)
     """
     start = load(plan.start, unet(variant))[0] if plan.start else None
     source = ready(folder, plan.count, console)
+    some, count = (mixed(source, plan, folder, console), 2 * plan.count) if plan.large else (source, plan.count)
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
     kept = out.with_suffix(".checkpoint")
-    net, losses = run(source, plan.count, variant, schedule, BATCH, plan.seed, kept, console, start)
+    net, losses = run(some, count, variant, schedule, BATCH, plan.seed, kept, console, start)
     return ship(variant, net.arrays(), losses, plan, source, out)
 
 
@@ -94,14 +98,24 @@ def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path
 
 def ready(folder: Path, count: int, console: Console) -> Callable[[int], Labelled]:
     """Draw what is missing of the first ``count`` pictures and of the ones kept apart."""
-    numbers = [*range(-(-count // samples.SHARD)), HELD_OUT]
+    _draw(folder, [*range(-(-count // samples.SHARD)), HELD_OUT], SMALL_PX, console)
+    return pictures(folder)
+
+
+def mixed(small: Callable[[int], Labelled], plan: Plan, folder: Path, console: Console) -> Callable[[int], Labelled]:
+    """Small and large pictures in turn, the large ones drawn where they are missing."""
+    _draw(folder, range(FIRST_LARGE, FIRST_LARGE - (-plan.large // samples.SHARD)), LARGE_PX, console)
+    large, first = pictures(folder, LARGE_PX), FIRST_LARGE * samples.SHARD
+    return lambda i: large(first + i // 2 % plan.large) if i % 2 else small(i // 2)
+
+
+def _draw(folder: Path, numbers: Sequence[int], size_px: int, console: Console) -> None:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("drawing pictures", total=samples.SHARD * len(numbers))
         for done, number in enumerate(numbers, 1):
-            shard(folder, number, tick=lambda: progress.advance(task))
+            shard(folder, number, size_px, tick=lambda: progress.advance(task))
             progress.update(task, completed=done * samples.SHARD)
-    return pictures(folder)
 
 
 def ship(

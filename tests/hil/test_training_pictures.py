@@ -169,6 +169,13 @@ def test_weights_come_with_a_card_and_find_logs_by_themselves(few, monkeypatch):
     assert np.abs(before - after).max() < 1e-4
 
 
+def test_small_and_large_pictures_come_in_turn(few):
+    source = produce.mixed(pictures(few), produce.Plan(2, 1, 1, large=2), few, Console(quiet=True))
+    assert [source(i).ids.shape[0] for i in range(4)] == [304, 608, 304, 608]
+    assert np.array_equal(source(1).ids, source(5).ids) and not np.array_equal(source(1).ids, source(3).ids)
+    assert "--pictures 2 --large 2 --steps 1" in produce.Plan(2, 1, 1, large=2).command("segmentation", few / "x")
+
+
 @pytest.mark.slow
 @pytest.mark.computed
 def test_judges_come_with_their_cards(few, monkeypatch):

@@ -106,6 +106,9 @@ def segmentation(
     folder: Folder = None,
     learning_rate: Rate = 3e-3,
     start: Annotated[Path | None, typer.Option(help="Weights to go on from (default: from scratch).")] = None,
+    large: Annotated[
+        int, typer.Option(min=0, help="Pictures of twice the size for half of the windows; 2.5 MB each.")
+    ] = 0,
 ) -> None:
     """Train the network that finds logs, on pictures drawn for it, on one core.
 
@@ -127,7 +130,7 @@ def segmentation(
     if variant not in CHANNELS:
         raise Stopped(Exit.USAGE, f"variant {variant!r} is unknown; use one of {', '.join(CHANNELS)}")
     weights = out or Path(f"logs_{variant}.safetensors")
-    plan = Plan(pictures, steps, seed, learning_rate, start)
+    plan = Plan(pictures, steps, seed, learning_rate, start, large)
     _made(weights, folder, lambda kept, screen: produce(variant, plan, kept, weights, screen))
 
 
