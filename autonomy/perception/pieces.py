@@ -20,6 +20,7 @@ LEAST_SLOPE_PX: Final = 6.0  # of a map: shorter pieces have one depth
 NEARER: Final = 1.03  # inverse depth of what hides a log, over the log's own
 GAP_PX: Final = 3.0
 GAP_LOOKS: Final = 12
+BESIDE, LEAN = 3.0, 0.1  # pieces further beside a line than so many half widths, and share of how far along, are apart
 LEAST_SEEN: Final = 0.6  # of a gap, that parts
 LEAST_END: Final = 0.5
 LEAST_TALL: Final = 2.0  # spread along over spread across, of a piece whose shape says where it points
@@ -127,7 +128,7 @@ def relation(scene: Scene, big: Piece, small: Piece, touch_px: float, between: f
     near, far = along + small.low, along + small.high
     span = max(big.high, far) - min(big.low, near)
     apart = small.vote - big.vote
-    start, end = (big.high, near) if along > 0.0 else (far, big.low)
+    start, end = _between(big, small, along)
     gap = max(0.0, end - start)
     thin = max(small.half, 1.0)
     return np.array([
@@ -175,23 +176,30 @@ def _ground(scene: Scene, big: Piece, start: float, end: float) -> float:
     return 1.0 - float((hidden | (inverse > NEARER * line)).mean())
 
 
-def parted_between(scene: Scene, big: Piece, small: Piece) -> bool:
-    """Whether two pieces in line are no one log: one looks past them at what is clearly farther between them, or
-    there an end is seen."""
+def may_be_one(scene: Scene, big: Piece, small: Piece, touch_px: float) -> bool:
+    """Whether a judge need be asked: two pieces touch or lie near one line, and nothing parts them there: one neither
+    looks past them at what is clearly farther nor sees an end."""
     away = small.middle - big.middle
-    along = float(big.axis @ away)
-    start, end = (big.high, along + small.low) if along > 0.0 else (along + small.high, big.low)
-    if abs(along) <= 0.5 * (big.high - big.low) or abs(_cross(big.axis, away)) > big.half:
+    along, beside = float(away @ big.axis), abs(_cross(big.axis, away))
+    if touch_px == 0.0 and beside > BESIDE * big.half + LEAN * abs(along):
         return False
+    start, end = _between(big, small, along)
+    if abs(along) <= 0.5 * (big.high - big.low) or beside > big.half:
+        return True
     column, row = np.rint(big.middle + 0.5 * (start + end) * big.axis).astype(int)
     reach = max(1, round(0.5 * small.half))
     here = scene.ends[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
     if here.size and float(here.max()) > LEAST_END and end - start < small.half:
-        return True
-    if end - start <= GAP_PX:
         return False
+    if end - start <= GAP_PX:
+        return True
     hidden, inverse, line = _gap(scene, big, start, end)
-    return float((~hidden & (inverse < line / NEARER)).mean()) > LEAST_SEEN
+    return float((~hidden & (inverse < line / NEARER)).mean()) <= LEAST_SEEN
+
+
+def _between(big: Piece, small: Piece, along: float) -> tuple[float, float]:
+    """Where the gap between two pieces begins and ends on the big one's axis; they overlap where it ends first."""
+    return (big.high, along + small.low) if along > 0.0 else (along + small.high, big.low)
 
 
 def _gap(scene: Scene, big: Piece, start: float, end: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

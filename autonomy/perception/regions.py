@@ -17,13 +17,12 @@ import numpy as np
 from autonomy.networks.graph import Conv, Network, Relu
 from autonomy.networks.weights import SHIPPED, load
 from autonomy.perception.flood import flooded, sigmoid
-from autonomy.perception.pieces import LOOKS, RELATIONS, Piece, Scene, look, parted_between, piece, relation
+from autonomy.perception.pieces import LOOKS, RELATIONS, Piece, Scene, look, may_be_one, piece, relation
 
 LEAST_PX: Final = 6  # of a map: what is smaller is no log
 MOST: Final = 100  # pieces of a picture, the largest: what has more is noise
 HIDDEN: Final = 24
 LEAST_CHANCE: Final = 0.5  # that two pieces are one log
-BESIDE, LEAN = 3.0, 0.1  # pieces further beside a line than so many half widths, and share of how far along, are apart
 
 
 def head(name: str, inputs: int) -> Network:
@@ -125,9 +124,7 @@ class Joining:
             a, b = self.pieces[i], self.pieces[j]
             big, small = (a, b) if len(a.own) >= len(b.own) else (b, a)
             touch = float(self._touch[i, j])
-            self._may[i, j] = self._may[j, i] = (touch > 0.0 or _in_line(big, small)) and (
-                not parted_between(self.scene, big, small)
-            )
+            self._may[i, j] = self._may[j, i] = may_be_one(self.scene, big, small, touch)
             if self._may[i, j]:
                 between = float(self._wall[i, j]) / touch if touch else 0.0
                 self._told[i, j] = self._told[j, i] = relation(self.scene, big, small, touch, between)
@@ -175,12 +172,6 @@ class Joining:
             look(self.scene, p, float(touch[k]), float(around[k]), float(likeness[k]))
             for k, p in enumerate(self.pieces)
         ], np.float32).reshape(-1, len(LOOKS))  # fmt: skip
-
-
-def _in_line(big: Piece, small: Piece) -> bool:
-    away = small.middle - big.middle
-    beside = abs(float(big.axis[0] * away[1] - big.axis[1] * away[0]))
-    return beside <= BESIDE * big.half + LEAN * abs(float(away @ big.axis))
 
 
 def _borders(scene: Scene, pieces: list[Piece]) -> tuple[np.ndarray, np.ndarray]:

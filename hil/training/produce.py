@@ -27,7 +27,7 @@ from hil.training.samples import pictures, shard
 
 BATCH: Final = 16
 LEARNING_RATE: Final = 3e-3
-SMALL_PX, LARGE_PX, FIRST_LARGE = 304, 608, 40  # sizes of pictures, and the first shard of large ones
+SMALL_PX, LARGE_PX, FIRST_LARGE = 304, 608, 10_000  # sizes of pictures, and the first shard of large ones
 JUDGED: Final = 128  # pictures
 LEAST_PX: Final = 30  # of a log that counts when the card's figures are made
 
