@@ -30,6 +30,7 @@ import msgspec
 
 from autonomy.activity import Activity
 from autonomy.grasp.direct import Planned
+from autonomy.grasp.press import Press
 from autonomy.grasp.search import Search
 from autonomy.jobs import Forwarding, Job, OneLog
 from autonomy.logs import LogObservation, LogsRefused, parse_logs, question
@@ -274,7 +275,9 @@ def _job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: byte
         raise MissionError(f"{profile.name} stands still; a mission needs a machine that drives, such as aoro_fc8")
     site = (profile.carrier.site_lat_deg, profile.carrier.site_lon_deg)
     mission = load_mission(options.mission, route_wanted=True, site=site).mission
-    manager = Manager(profile, code, mission, WAYS[options.way], chooser, key=key, lease_ns=lease_ns)
+    manager = Manager(
+        profile, code, mission, WAYS[options.way], chooser, key=key, lease_ns=lease_ns, emptier=Planned(Press(Search()))
+    )
     return Forwarding(manager, mission)
 
 

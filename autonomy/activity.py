@@ -14,7 +14,7 @@ from math import dist, isfinite
 from typing import Final
 
 from autonomy import tongs
-from autonomy.carried import ASIDE_M, came_up, picked, place_as_seen
+from autonomy.carried import ASIDE_M, came_up, laid, picked, place_as_seen
 from autonomy.course import above, aimed, carrying, closing, gathering, stowing
 from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, choose, lies_in, plan_place, retreat_height
 from autonomy.grasp.proposal import BunkFull, NoGrasp
@@ -39,6 +39,8 @@ from machine.sag import sane_load_kg
 ATTEMPTS: Final = 3
 _LAYING: Final = 2.0
 """So much less near to its goal than elsewhere a log over the bunk need come: it need not lie so exactly."""
+_PRESS_S: Final = 0.6
+"""So long tongs that are pressed into a heap may still sink."""
 GATE_S: Final = 3.0
 """With so much of its way left an arm waits until the tongs are open: they are still high."""
 _SLOWEST: Final = 2.0
@@ -301,8 +303,7 @@ class Activity:
         if following is Phase.OPEN and self._heard.fresh(now_ns):
             self._see_rotator()
         if following is not None:
-            resting = self.phase is not Phase.CLOSE
-            self._enter(following, self.motion.goal if resting else self._pursuit.sent)
+            self._enter(following, self._pursuit.sent)
         elif self._elapsed_s > _SLOWEST * self.motion.duration_s + rule.settle_s + rule.slack_s:
             off = self._pursuit.worst_joint(self._position())
             self._fail(f"{rule.trouble} within {self._elapsed_s:.0f} s{off}")
@@ -311,6 +312,8 @@ class Activity:
         way = self._pursuit
         if self.phase is Phase.CLOSE:
             return self._gripped() and (way.stands or way.left_s <= 0.0)
+        if self.phase is Phase.DESCEND and self._presses() and self._elapsed_s > way.motion.duration_s + _PRESS_S:
+            return True  # the tongs rest on wood; they sink as they close
         share = _LAYING if self.phase in (Phase.CARRY, Phase.LOWER) else 1.0
         return way.clock_s >= way.motion.duration_s + settle_s and way.arrived(self._position(), share)
 
@@ -390,6 +393,10 @@ class Activity:
         """Whether a bundle comes up slowly."""
         return self.phase is Phase.LIFT and self.grasp is not None and self.grasp.gathered
 
+    def _presses(self) -> bool:
+        """Whether the tongs go down among logs."""
+        return self.grasp is not None and self.grasp.pressed
+
     def _goes_on_so(self) -> bool:
         """Whether the motion will do for the log as it is now seen to hang, with another turn of the rotator."""
         assert self.grasp is not None and self.place is not None
@@ -433,7 +440,7 @@ class Activity:
         return Phase.RETREAT
 
     def _after_retreat(self) -> Phase | None:
-        astray = next((log for log in self._picked() if not lies_in(self._target, log)), None)
+        astray = next((log for log in self._picked() if not laid(self._mission, self._target, log)), None)
         if astray is None:
             return Phase.DONE
         x, y, z = astray.center_m

@@ -8,12 +8,14 @@ from collections.abc import Iterable, Sequence
 from math import dist
 from typing import Final
 
-from autonomy.grasp.direct import Grasp, is_held, only, plan_place
+from autonomy.grasp.direct import Grasp, is_held, lies_in, only, plan_place
+from autonomy.grasp.heap import is_over
 from autonomy.grasp.proposal import NoGrasp
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
 from autonomy.motion.arm import Arm, Pose
 from machine.grapple import grapple_yaw
+from machine.profile import Bunk
 
 ASIDE_M: Final = 0.15
 """Farther than this from where it was meant to be, a column or a place is another one."""
@@ -38,6 +40,15 @@ def came_up(arm: Arm, grasp: Grasp, seen: Sequence[LogObservation], pins: Iterab
         return None
     hidden = [log.id for log in grasp.logs if log.id not in [o.id for o in seen]]
     return only(arm, grasp, held + hidden)
+
+
+def laid(mission: Mission, target: Bunk, log: LogObservation) -> bool:
+    """Whether a log that was let go lies where it was to be: in the target, or, where logs only have to get out of
+    their source, low beside it, for it may roll.
+    """
+    if lies_in(target, log) or mission.source is None:
+        return lies_in(target, log)
+    return not is_over(mission.source, *log.center_m[:2]) and log.center_m[2] < target.floor_z_m + target.stake_height_m
 
 
 def place_as_seen(

@@ -11,8 +11,6 @@ from dataclasses import replace
 from math import hypot
 from typing import Final
 
-import numpy as np
-
 from autonomy.grasp.direct import (
     Grasp,
     approach_length,
@@ -26,7 +24,7 @@ from autonomy.grasp.heap import is_over
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.obstacles import held_log, surroundings
-from autonomy.motion.trajectory import Trajectory, follow, progress, straight
+from autonomy.motion.trajectory import Trajectory, follow, slowly, straight
 from autonomy.motion.ways import Motions
 from machine.kinematics import Unreachable
 
@@ -40,6 +38,8 @@ ASTRAY_M: Final = 0.3
 """What lies farther off may be another log."""
 GATHER_S: Final = 10.0
 """Time in which what may settle is lifted to the travel height: also logs that hang askew are clear of the ground."""
+OUT_S: Final = 4.0
+"""The same out of a heap, which is nearer to that height."""
 
 
 def above(arm: Arm, motions: Motions, start: Pose, grasp: Grasp, logs: Sequence[LogObservation]) -> Trajectory:
@@ -117,12 +117,7 @@ def closing(arm: Arm, start: Pose, grasp: Grasp, begin_s: float) -> Trajectory:
 def gathering(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
     """A bundle up, slowly: its logs settle, and the tongs follow them under it."""
     goal = grasp.pose.at_height(travel_height(arm.profile))
-
-    def path(time_s: float) -> Pose:
-        share = float(progress(np.array(time_s / GATHER_S)))
-        return goal.at_height(start.z_m + share * (goal.z_m - start.z_m))
-
-    return follow(arm, start, path, GATHER_S, 1.0)
+    return slowly(arm, start, goal, OUT_S if grasp.pressed else GATHER_S)
 
 
 def stowing(arm: Arm, motions: Motions, start: Pose, logs: Sequence[LogObservation]) -> Trajectory:

@@ -15,7 +15,8 @@ from pathlib import Path
 from rich.console import Console
 
 from autonomy.grasp.direct import Planned
-from autonomy.grasp.search import FROM_BUNK, Search
+from autonomy.grasp.press import Press
+from autonomy.grasp.search import Search
 from autonomy.logs import LogObservation
 from autonomy.manager.manager import Manager
 from autonomy.manager.table import ENDS, RULES, WAYS, State
@@ -160,7 +161,7 @@ class MissionRun:
         remembers = eyes != "perfect"
         self.manager = Manager(
             profile, code, mission, WAYS[way], chooser=Planned(Search()), remembers=remembers,
-            emptier=Planned(Search(FROM_BUNK)),
+            emptier=Planned(Press(Search())),
         )  # fmt: skip
         self.manager.auto()
         self.plant = plant

@@ -68,7 +68,8 @@ class Grasp:
     """Where closing begins: the pose of the pin, the height of the support, the point along the axis of ``log``.
 
     ``others`` come up with it; ``top_z_m`` is the highest point of a log under the way down, or None; ``reason`` is a
-    sentence for the operator, ``probability`` that of success where a planner reckons with one.
+    sentence for the operator, ``probability`` that of success where a planner reckons with one; ``pressed``: the tongs
+    go down among other logs, as far as these let them.
     """
 
     log: LogObservation
@@ -79,6 +80,7 @@ class Grasp:
     top_z_m: float | None = None
     reason: str = ""
     probability: float | None = None
+    pressed: bool = False
 
     @property
     def logs(self) -> tuple[LogObservation, ...]:
@@ -256,7 +258,7 @@ class Planned:
         # What lies alone cannot settle, and comes up as `choose` would lift it.
         top = _top(free) if near or others else None
         found = pose._replace(rot_rad=turn)
-        return Grasp(first, found, p.support_z_m, along, tuple(others), top, p.reason, p.probability)
+        return Grasp(first, found, p.support_z_m, along, tuple(others), top, p.reason, p.probability, p.pressed)
 
 
 def _top(logs: Sequence[LogObservation]) -> float:

@@ -27,7 +27,8 @@ class GraspProposal:
 
     ``yaw_rad`` is the direction of the opening axis; ``support_z_m`` the height that the tips sweep along, just above
     it.  ``logs`` are places in the list that was planned from.
-    ``probability`` is that of success as the planner sees it, ``reason`` one sentence.
+    ``probability`` is that of success as the planner sees it, ``reason`` one sentence.  ``pressed``: the tongs go down
+    among logs, and close where they meet too much.
     """
 
     x_m: float
@@ -37,6 +38,7 @@ class GraspProposal:
     logs: tuple[int, ...]
     probability: float
     reason: str
+    pressed: bool = False
 
 
 class Planner(Protocol):

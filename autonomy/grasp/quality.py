@@ -61,9 +61,6 @@ LAYER: Final = Rule(0.6, 1.0, 1.0, 0.2, 0.03)
 WIDE: Final = Rule(0.35, 1.35, 1.35, 1.0, 0.01)
 """Also squeezes a row that the tongs may not get under, or more than they hold: some of it comes up, often."""
 
-HEAP: Final = Rule(0.35, 2.0, 1.35, 1.0, 0.01)
-"""Also squeezes a whole row, as a driver empties a bunk: some of it rolls up into the tongs, the rest lies looser."""
-
 
 @dataclass(frozen=True, slots=True)
 class Scores:

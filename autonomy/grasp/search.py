@@ -28,7 +28,7 @@ from autonomy.grasp.cylinders import (
 from autonomy.grasp.direct import clearance, closing_height, known_ground_m, travel_height
 from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
-from autonomy.grasp.quality import HEAP, LAYER, STRICT, WIDE, Rule, Scores, Sections, lies_upon, rate, sections
+from autonomy.grasp.quality import LAYER, STRICT, WIDE, Rule, Scores, Sections, lies_upon, rate, sections
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
 from autonomy.perception.estimate import RADIUS
@@ -58,8 +58,6 @@ LEAST: Final = 0.75
 """When no grasp is more probable than this, those are looked at too that only pinch or squeeze."""
 RULES: Final = ((STRICT, 1.0), (LAYER, 0.95), (WIDE, 0.65))
 """First the strict one, with the success of such grasps over what the draws say."""
-FROM_BUNK: Final = (*RULES, (HEAP, 0.4))
-"""Where what lies there is all to go somewhere else, it does not matter which of it comes up."""
 SEED: Final = 1
 
 

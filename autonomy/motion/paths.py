@@ -328,9 +328,17 @@ class _Planner:
         self.tried += 1
         spare_m, why, at = judged(self.arm, q, pins(self.arm, poses), self.around, self.held, step_s)
         if spare_m < 0.0:
-            begun, left = (np.hypot(*(poses[at, :2] - poses[i, :2])) for i in (0, -1))
-            self.failures.append(_Failure(way, -spare_m, why, bool(begun > left)))
+            self.failures.append(_Failure(way, -spare_m, why, _is_late(poses, at)))
         return spare_m
+
+
+def _is_late(poses: np.ndarray, at: int) -> bool:
+    """Whether what happened at a sample is the way down's to mend: it had begun, or, on the level, is nearer."""
+    top = int(np.argmax(poses[:, 2]))
+    if poses[at, 2] < poses[top, 2] - _STEP_UP_M:
+        return at > top
+    begun, left = (np.hypot(*(poses[at, :2] - poses[i, :2])) for i in (0, -1))
+    return bool(begun > left)
 
 
 def _ramp(tau: np.ndarray) -> np.ndarray:

@@ -223,6 +223,17 @@ def across(arm: Arm, start: Sequence[float], goal: Sequence[float]) -> Trajector
     return _table(first + progress(time / duration)[:, None] * way)
 
 
+def slowly(arm: Arm, start: Pose, goal: Pose, least_s: float) -> Trajectory:
+    """A straight line in poses in ``least_s``, or as much longer as the arm's limits ask for."""
+    first, way = np.array(start), np.array(goal) - np.array(start)
+
+    def sampled(duration_s: float) -> np.ndarray:
+        time = np.arange(int(np.ceil(duration_s / STEP_S)) + 1) * STEP_S
+        return arm.joints(first + progress(time / duration_s)[:, None] * way)
+
+    return paced(arm, sampled, least_s)
+
+
 def follow(arm: Arm, start: Pose, path: Callable[[float], Pose], end_s: float, blend_s: float) -> Trajectory:
     """A motion along given poses over time; what ``start`` is off the path at time 0 fades out within
     ``blend_s``.

@@ -29,10 +29,11 @@ from sim.studio import varied_stereo
 
 MOST_LOGS: Final = 16
 LEAST_PX: Final = 14
-PLAIN_SHARE: Final = 0.6
+PLAIN_SHARE: Final = 0.35
 PLAIN_SKY_SHARE: Final = 0.4  # of the other pictures
 HELD_SHARE: Final = 0.12  # of pictures in which a grapple holds a log
 AWAY_SHARE: Final = 0.05  # of pictures that look past the logs
+NEAREST: Final = 4.2  # zoom of the largest window: of letterboxes of the size and of up to four times the size
 LEAST_CONTRAST: Final = 45.0  # between logs and ground, in most plain pictures
 
 
@@ -126,12 +127,13 @@ def _scene(pile: Pile, rng: random.Random, held: bool) -> tuple[Scene, tuple[Log
 
 
 def _pinhole(pile: Pile, camera: str, rng: random.Random, size_px: int) -> Intrinsics:
-    """The whole picture letterboxed, or a window at a zoom between those of letterboxes of once and twice the size."""
+    """The whole picture letterboxed, or a window at a zoom between those of letterboxes of once and of NEAREST times
+    the size."""
     pin = intrinsics(profile_of(pile.machine).cameras[camera])
     whole = size_px / max(pin.width_px, pin.height_px)
     if rng.random() < 0.1:
         return pin.letterbox(size_px).outer
-    zoomed = pin.scaled(whole * math.exp(rng.uniform(-0.1, math.log(2.3))))
+    zoomed = pin.scaled(whole * math.exp(rng.uniform(-0.1, math.log(NEAREST))))
     left = rng.uniform(-0.1, 1.1) * (zoomed.width_px - size_px)
     top = rng.uniform(-0.1, 1.1) * (zoomed.height_px - size_px)
     return zoomed.crop(round(left), round(top), size_px, size_px)

@@ -24,7 +24,7 @@ from hil.training.frames import MOST_LOGS, draw
 from hil.training.piles import HELD_OUT, MACHINES, Pile, chunk
 from machine.optics import Intrinsics
 
-EDITION: Final = 2
+EDITION: Final = 3
 SHARD: Final = 256
 REUSE_PILES: Final = 12  # chunks of piles that training pictures are drawn from
 MM: Final = 1000.0

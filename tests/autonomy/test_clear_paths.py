@@ -16,7 +16,7 @@ from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.clearance import spare
 from autonomy.motion.obstacles import Held, Rod, Surroundings, clearances, surroundings, swept, tree
 from autonomy.motion.paths import Blocked, Clear, plan
-from autonomy.motion.trajectory import Trajectory, travel
+from autonomy.motion.trajectory import Trajectory, slowly, travel
 from machine.joints import JOINTS
 from machine.kinematics import Unreachable
 from machine.load import load_profile
@@ -202,3 +202,24 @@ def test_standing_still_is_a_way() -> None:
     arm, (start, _) = ARMS["palms_471"], places(PALMS, 8)
     path = plan(arm, start, start, surroundings(PALMS))
     assert np.ptp(np.array(path.motion.position), axis=0) == pytest.approx(np.zeros(5))
+
+
+def test_from_a_landing_into_a_full_bunk_the_way_is_over_the_stakes_not_around_them() -> None:
+    # Begun before the tongs are up, this way is too near to the load: it is the rise that must be done first.
+    bunk = AORO.bunk
+    heap = [(0.33 * i - 0.8, bunk.floor_z_m + 0.13 + 0.2 * row) for row in range(4) for i in range(5)]
+    logs = [LogObservation(n, (bunk.center_m[0], y, z), (1.0, 0.0, 0.0), 2.0, 0.25) for n, (y, z) in enumerate(heap)]
+    arm = ARMS["aoro_fc8"]
+    start, goal = Pose(-1.425, 2.852, 0.272, 0.05, -1.585), Pose(-0.295, 2.611, 2.67, 0.408, -2.842)
+    path = plan(arm, start, goal, surroundings(AORO, logs))
+    assert_kept(AORO, path.motion, start, goal)
+    assert path.name == "over" and path.motion.duration_s < 12.0
+
+
+def test_a_slow_lift_keeps_the_arms_limits_however_short_it_is_asked_to_be() -> None:
+    arm = ARMS["aoro_fc8"]
+    start = arm.over(2.4, 0.3, 0.4, travel_height(AORO))
+    goal = start.at_height(travel_height(AORO))
+    hasty, slow = (slowly(arm, start, goal, seconds) for seconds in (2.0, 20.0))
+    assert_kept(AORO, hasty, start, goal)
+    assert hasty.duration_s > 4.0 and slow.duration_s == pytest.approx(20.0, abs=0.05)

@@ -22,6 +22,7 @@ from hil.experiments.crane_accuracy.minimum_time import full_limits, minimum_tim
 from hil.lockstep import START_NS
 from hil.mission import MissionRun
 from machine.grapple import tip_below_pin_m
+from machine.joints import N_JOINTS, Joint
 from machine.profile import Profile
 from sim.camera.geometry import quaternion_matrix
 
@@ -54,6 +55,7 @@ class Witness:
         self._below_m = self._tips_m - pin_to_rotator
         self._phase: Phase | None = None
         self._activity: Activity | None = None
+        self._driven = np.zeros((0, N_JOINTS))
         self._state = run.manager.state
         self._next_path_ns = self._next_look_ns = 0
         self._lay: dict[int, np.ndarray] = {}
@@ -125,8 +127,13 @@ class Witness:
             note["end_s"] = round(self._seconds(), 2)
 
     def _shortest(self, activity: Activity) -> float:
-        """Shortest time for the path of the phase's motion by speeds, accelerations and the pump's flow [s]."""
-        position = np.array(activity.motion.position)
+        """Shortest time for the path of the phase's motion by speeds, accelerations and the pump's flow [s]; 0 where it
+        is still the motion of the phase before, but for a turn of the rotator.
+        """
+        before, position = self._driven, np.array(activity.motion.position)
+        self._driven = position
+        if position.shape == before.shape and np.allclose(position[:, : Joint.ROT], before[:, : Joint.ROT]):
+            return 0.0
         if len(position) < FEWEST_POINTS or float(np.ptp(position, axis=0).max()) < 1e-3:
             return 0.0
         return round(float(minimum_time_s(position, self._limits)), 3)
