@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Final
 
-from autonomy.grasp.direct import RETREAT_CLEARANCE_M, Grasp, opened_angle, retreat_height
+from autonomy.grasp.direct import Grasp, opened_angle
 from autonomy.grasp.heap import is_over
 from autonomy.motion.arm import Arm
 from can_dbc.setpoint import StateReport
-from machine.grapple import opening_pct_from_tong_angle, tong_angle_from_opening_pct
+from machine.grapple import opening_pct_from_tong_angle, tip_below_pin_m, tong_angle_from_opening_pct
 from machine.profile import Bunk, Profile
 
 _GRIPPED: Final = (4, 5)  # GrappleStat.State: closed, holding
@@ -57,8 +57,8 @@ def released(profile: Profile, report: StateReport, grasp: Grasp, opening_s: flo
 
 def among_stakes(arm: Arm, bunk: Bunk, q: Sequence[float]) -> bool:
     """Whether tongs that have let a log go stand so low over a bunk that to open further would stir the heap."""
-    pose = arm.pose(q)
-    return is_over(bunk, *arm.xy(pose)) and pose.z_m < retreat_height(arm.profile) - RETREAT_CLEARANCE_M
+    pose, top_m = arm.pose(q), bunk.floor_z_m + bunk.stake_height_m
+    return is_over(bunk, *arm.xy(pose)) and pose.z_m < top_m + tip_below_pin_m(arm.profile.grapple.tongs, 0.0)
 
 
 def closed_for_s(profile: Profile, report: StateReport) -> float:
