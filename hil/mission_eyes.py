@@ -17,8 +17,8 @@ from autonomy.front_eyes import FrontEyes, Ours, PaperB
 from autonomy.logs import LogObservation
 from autonomy.manager.manager import Manager
 from autonomy.manager.table import ENDS, RULES
+from autonomy.perception.finder import LogFinder
 from autonomy.perception.frame import Frame, rescaled
-from autonomy.perception.instances import LogFinder
 from autonomy.perception.tracks import Errors
 from hil.camera_survey import survey
 from hil.lockstep import Eyes

@@ -28,7 +28,7 @@ import msgspec
 from autonomy.eyes import Eyes
 from autonomy.logs import LogsRefused, answer, answer_trouble, parse_question
 from autonomy.networks.weights import WeightsRefused
-from autonomy.perception.instances import LogFinder
+from autonomy.perception.finder import LogFinder
 from autonomy.perception.sources import CameraSource, SourceError
 from machine.load import ProfileError, load_profile
 from machine.profile import Profile

@@ -7,42 +7,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 from scipy import ndimage
 
-from autonomy.networks.openvino_net import OpenVinoNet
-from autonomy.networks.weights import SHIPPED, load
 from autonomy.perception.flood import sigmoid
-from autonomy.perception.frame import Frame, check
-from autonomy.perception.network import (
-    COS2,
-    EDGE,
-    ENDS,
-    MASK,
-    MULTIPLE,
-    OFFSET_PX,
-    OFFSET_U,
-    OFFSET_V,
-    SIN2,
-    STRIDE,
-    channels,
-    unet,
-)  # fmt: skip
+from autonomy.perception.network import ENDS, MASK, STRIDE
 from autonomy.perception.pieces import Scene, scene
-from autonomy.perception.regions import Judges, Region, parted, shipped_judges
-from autonomy.perception.resize import bilinear, doubled, shrunk
-from machine.optics import Intrinsics
+from autonomy.perception.regions import Judges, Region, parted
+from autonomy.perception.resize import bilinear
 
-SIZE_PX: Final = 304
 LEAST_MASK: Final = 0.5
 LEAST_END: Final = 0.3
 LEAST_DEPTH_M: Final = 0.1
-TWICE: Final = 1.5  # pictures so many times longer than what is asked for are looked at at half the size too
-MASK_SHARE, EDGE_SHARE = 0.4, 0.8  # of the finer look in what two looks give
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,120 +38,6 @@ class Instance:
     axis_px: float
     ends_px: tuple[tuple[float, float], tuple[float, float]]
     ends_seen: tuple[bool, bool]
-
-
-class LogFinder:
-    """The network with its weights, for frames of any size; one thread.
-
-    Args:
-        variant: "rgbd" or "depth".
-        weights: file; None are the shipped ones of the variant.
-        size_px: about how long the network's picture is; frames are shrunk by a whole factor, or doubled when they
-            are shorter.  Of a picture longer than SIZE_PX a look at half the size is taken first, and so on.
-        precision: of the network, see ``OpenVinoNet``.
-        judges: who says what is one log; None are the shipped ones.
-
-    Raises:
-        WeightsRefused: the weights are missing, damaged or of another network.
-    """
-
-    def __init__(
-        self,
-        variant: str = "rgbd",
-        weights: Path | None = None,
-        size_px: int = 2 * SIZE_PX,
-        precision: str = "f32",
-        judges: Judges | None = None,
-    ) -> None:
-        self.variant, self.size_px, self._precision = variant, size_px, precision
-        self._network = unet(variant)
-        self._arrays, self.facts = load(weights or SHIPPED / f"logs_{variant}.safetensors", self._network)
-        self._judges = judges or shipped_judges()
-        self._nets: dict[tuple[int, int], OpenVinoNet] = {}
-
-    def segment(self, frame: Frame) -> tuple[Instance, ...]:
-        """The logs of a frame, the surest first; none is an empty tuple.
-
-        Raises:
-            FrameRefused: the frame cannot be a picture of its camera.
-        """
-        check(frame)
-        return self.find(frame.rgb, frame.depth_m, frame.intrinsics)
-
-    def find(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[Instance, ...]:
-        """As ``segment``; depth may be unknown everywhere (a photograph)."""
-        top, bottom, left, right = inside_bars(rgb)
-        window = (slice(top, bottom), slice(left, right))
-        own = pinhole.crop(left, top, right - left, bottom - top)
-        maps, scale = self.looks(rgb[window], depth_m[window], own)
-        found = instances(maps, scale, depth_m[window], self._judges)
-        shape = depth_m.shape
-        return tuple(_placed(i, left, top, shape) for i in found) if shape != (bottom - top, right - left) else found
-
-    def looks(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[np.ndarray, int]:
-        """Maps of a picture, looked at once or more, and how many of its pixels one of theirs is wide."""
-        longest = max(depth_m.shape)
-        factor = max(1, round(longest / self.size_px))
-        pictures = [(shrunk(rgb, depth_m, pinhole, factor), factor * STRIDE)]
-        while longest >= TWICE * factor * SIZE_PX:
-            factor *= 2
-            pictures.append((shrunk(rgb, depth_m, pinhole, factor), factor * STRIDE))
-        if self.size_px >= TWICE * longest:
-            pictures.insert(0, (doubled(rgb, depth_m, pinhole), STRIDE // 2))
-        maps = self.maps(*pictures[-1][0])
-        for picture, _ in reversed(pictures[:-1]):
-            maps = both(self.maps(*picture), maps)
-        return maps, pictures[0][1]
-
-    def maps(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> np.ndarray:
-        """Maps (8, h / 2, w / 2) of a picture of the network's size; padded to what the network takes."""
-        image = channels(rgb, depth_m, pinhole, self.variant)
-        h, w = image.shape[1:]
-        high, wide = -(-h // MULTIPLE) * MULTIPLE, -(-w // MULTIPLE) * MULTIPLE
-        padded = np.zeros((1, len(image), high, wide), np.float32)
-        padded[0, :, :h, :w] = image
-        if (high, wide) not in self._nets:
-            self._nets[high, wide] = OpenVinoNet(self._network, self._arrays, padded.shape, self._precision)
-        maps = self._nets[high, wide](padded)["maps"][0]
-        return maps[:, : -(-h // STRIDE), : -(-w // STRIDE)]
-
-
-@cache
-def _shipped() -> LogFinder:
-    return LogFinder()
-
-
-def segment(frame: Frame) -> tuple[Instance, ...]:
-    """The logs of a frame by the shipped RGB-D weights; see ``LogFinder.segment``."""
-    return _shipped().segment(frame)
-
-
-def inside_bars(rgb: np.ndarray) -> tuple[int, int, int, int]:
-    """Top, bottom, left, right of what a letterbox's black bars leave (all of it when all is black)."""
-    lit = rgb.any(axis=2)
-    rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
-    if not len(rows):
-        return 0, rgb.shape[0], 0, rgb.shape[1]
-    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
-
-
-def both(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
-    """Maps (8, h, w) of a picture and of the same at half the size as one: votes from the coarse ones, which saw the
-    logs as wholes; masks, angles and edges from both, ends from the fine ones."""
-    h, w = fine.shape[1:]
-    y, x = (np.minimum(np.arange(n) // 2, n2 - 1) for n, n2 in ((h, coarse.shape[1]), (w, coarse.shape[2])))
-    near = coarse[:, y][:, :, x]
-    maps = fine.copy()
-    maps[COS2 : SIN2 + 1] += near[COS2 : SIN2 + 1]
-    pixel = STRIDE / OFFSET_PX
-    maps[OFFSET_U] = 2.0 * near[OFFSET_U] + pixel * (2.0 * x + 0.5 - np.arange(w))
-    maps[OFFSET_V] = 2.0 * near[OFFSET_V] + pixel * (2.0 * y + 0.5 - np.arange(h))[:, None]
-    down, across = (bilinear(n2, 2) for n2 in coarse.shape[1:])
-    rows, columns = np.minimum(np.arange(h), len(down) - 1), np.minimum(np.arange(w), len(across) - 1)
-    for i, share in ((MASK, MASK_SHARE), (EDGE, EDGE_SHARE)):
-        smooth = (down[rows] @ coarse[i] @ across[columns].T).astype(np.float32)
-        maps[i] = share * fine[i] + (1.0 - share) * smooth
-    return maps
 
 
 def instances(maps: np.ndarray, scale: int, depth_m: np.ndarray, judges: Judges) -> tuple[Instance, ...]:
@@ -265,7 +129,7 @@ def _end(point: np.ndarray, ends: np.ndarray, scale: int, reach_px: float) -> tu
     return (u, v), True
 
 
-def _placed(found: Instance, left: int, top: int, shape: tuple[int, int]) -> Instance:
+def placed(found: Instance, left: int, top: int, shape: tuple[int, int]) -> Instance:
     """An instance of a window at (left, top) in the whole picture."""
     mask = np.zeros(shape, bool)
     mask[top : top + found.mask.shape[0], left : left + found.mask.shape[1]] = found.mask

@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from autonomy.networks.graph import Network
-from autonomy.perception.instances import LogFinder, scene_of
+from autonomy.perception.finder import LogFinder
+from autonomy.perception.instances import scene_of
 from autonomy.perception.pieces import Scene
 from autonomy.perception.regions import HIDDEN, JOINS, WORTH, Head, Judges
 from autonomy.training.card import Card, write

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from autonomy.networks.weights import load
 from autonomy.perception.detector import box_net
-from autonomy.perception.instances import LogFinder
+from autonomy.perception.finder import LogFinder
 from autonomy.perception.network import unet
 from autonomy.training import boxes
 from autonomy.training.card import Card, write

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from autonomy.networks.torch_net import random_net
 from autonomy.networks.weights import WeightsRefused, save
+from autonomy.perception.finder import LogFinder, both, inside_bars
 from autonomy.perception.frame import Frame, FrameRefused
-from autonomy.perception.instances import LogFinder, both, inside_bars, instances
-from autonomy.perception.network import STRIDE, unet
+from autonomy.perception.instances import instances
+from autonomy.perception.network import OFFSET_PX, STRIDE, unet
 from autonomy.perception.regions import shipped_judges
 from autonomy.perception.resize import doubled, shrunk
 from autonomy.training.segmentation import targets
@@ -141,6 +142,59 @@ def test_any_size_of_picture_goes_through_and_masks_are_as_large(untrained):
         for log in finder.find(rgb, depth, pin):
             assert log.mask.shape == shape
             assert not log.mask[:9].any()
+
+
+class Recorded(LogFinder):
+    """A finder whose network sees wood where a picture is bright, and notes how large its pictures are."""
+
+    def maps(self, rgb, depth_m, pinhole):
+        self.sizes = [*getattr(self, "sizes", []), rgb.shape[:2]]
+        maps = np.zeros((8, -(-rgb.shape[0] // STRIDE), -(-rgb.shape[1] // STRIDE)), np.float32)
+        wood = rgb[::STRIDE, ::STRIDE, 0] > 128
+        maps[0], maps[4], maps[7] = np.where(wood, 9.0, -9.0), 1.0, -9.0
+        v, u = np.nonzero(wood)
+        middle = (0.0, 0.0) if not len(u) else (u.mean(), v.mean())
+        maps[2], maps[3] = (
+            (m - g) * STRIDE / OFFSET_PX
+            for m, g in zip(middle, np.mgrid[: wood.shape[0], : wood.shape[1]][::-1], strict=True)
+        )
+        return maps
+
+
+def bright(top, left, high, wide, shape=(720, 1280)):
+    rgb = np.full((*shape, 3), 40, np.uint8)
+    rgb[top : top + high, left : left + wide] = 200
+    pin = Intrinsics(shape[1], shape[0], 600.0, 600.0, shape[1] / 2, shape[0] / 2)
+    return rgb, np.full(shape, 4.0, np.float32), pin
+
+
+@pytest.mark.parametrize(
+    ("log", "largest"),
+    [
+        ((400, 900, 40, 300), (352, 608)),
+        ((100, 900, 520, 40), (608, 352)),
+        ((300, 600, 12, 80), (352, 608)),
+        ((300, 20, 40, 1200), (360, 640)),
+    ],
+    ids=["in a part", "upright", "small, doubled", "across the picture"],
+)
+def test_where_all_wood_is_in_a_part_that_part_is_looked_at_from_nearer(untrained, log, largest):
+    finder = Recorded("rgbd", untrained)
+    (seen,) = finder.find(*bright(*log))
+    assert max(finder.sizes, key=math.prod) == largest
+    top, left, high, wide = log
+    assert np.abs(np.array(seen.box_px) - (left, top, left + wide, top + high)).max() <= 4
+    assert seen.mask.shape == (720, 1280) and seen.mask[top + high // 2, left + wide // 2]
+    finder = Recorded("rgbd", untrained, nearer=False)
+    finder.find(*bright(*log))
+    assert finder.sizes == [(180, 320), (360, 640)] or finder.sizes == [(360, 640), (180, 320)]
+
+
+def test_the_window_stays_in_the_picture_and_no_wood_is_no_log(untrained):
+    finder = Recorded("rgbd", untrained)
+    (seen,) = finder.find(*bright(0, 0, 40, 260))
+    assert np.abs(np.array(seen.box_px) - (0, 0, 260, 40)).max() <= 4
+    assert finder.find(*bright(0, 0, 0, 0)) == ()
 
 
 def test_frames_that_are_none_are_refused(untrained):

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from autonomy.networks.weights import load
 from autonomy.perception.detector import BoxFinder
-from autonomy.perception.instances import LogFinder
+from autonomy.perception.finder import LogFinder
 from autonomy.perception.network import unet
 from autonomy.perception.plane import height_over_plane
 from autonomy.perception.regions import judges as judges_in

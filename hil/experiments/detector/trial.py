@@ -9,15 +9,19 @@ import numpy as np
 
 from autonomy.networks.weights import SHIPPED
 from autonomy.perception.detector import BoxFinder
-from autonomy.perception.instances import Instance, LogFinder
+from autonomy.perception.finder import LogFinder
+from autonomy.perception.instances import Instance
 from hil.experiments.detector.precision import Matches, box_overlaps, mask_overlaps
 from hil.experiments.detector.worlds import SIZE_PX, TestPicture, picture
 from hil.experiments.pool import Job
 from hil.training.produce import box_of
 
-SIZES: Final = {"rgbd": 2 * SIZE_PX, "whole": SIZE_PX, "half": SIZE_PX // 2, "depth": 2 * SIZE_PX}
-"""The networks judged, by the length of the largest picture they see: colour and depth at double, whole and half the
-size, and depth alone."""
+SIZES: Final = {
+    "rgbd": SIZE_PX, "double": 2 * SIZE_PX, "whole": SIZE_PX, "half": SIZE_PX // 2, "depth": SIZE_PX,
+}  # fmt: skip
+"""What is judged, by the length of the largest picture that the network sees of the whole."""
+NEARER: Final = ("rgbd", "depth")
+"""Those that look at the wood from nearer, as the machine does."""
 
 
 FAITHFUL: Final = "faithful"
@@ -37,7 +41,7 @@ def _variant(name: str) -> str:
 @cache
 def finder(name: str) -> LogFinder:
     """The network of a name in SIZES with its shipped weights."""
-    return LogFinder(_variant(name), size_px=SIZES[name])
+    return LogFinder(_variant(name), size_px=SIZES[name], nearer=name in NEARER)
 
 
 @cache

@@ -54,7 +54,7 @@ def true_poses(plant: Plant, seed: int) -> Seen:
 
 def ours(plant: Plant, seed: int) -> Seen:
     """Three pictures of the standing camera through the whole perception."""
-    from autonomy.perception.instances import segment
+    from autonomy.perception.finder import segment
 
     return _perceived(_look(plant, seed), segment)
 
@@ -76,7 +76,7 @@ def _perceived(look: Look, segment: Callable[[Frame], Sequence[Masked]]) -> Seen
 
 def faithful(plant: Plant, seed: int) -> Seen:
     """Paper A's way with one picture: points under each mask, their middle, main direction and extents."""
-    from autonomy.perception.instances import segment
+    from autonomy.perception.finder import segment
 
     look, begun = _look(plant, seed), time.perf_counter()
     frame, pose = look.frames[0], look.pose

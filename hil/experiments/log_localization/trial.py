@@ -49,7 +49,7 @@ def true_masks(frame: Frame, shot: Shot) -> list[TrueMask]:
 
 def network_masks(frame: Frame, shot: Shot) -> Sequence[Masked]:
     """The masks that the shipped network finds."""
-    from autonomy.perception.instances import segment
+    from autonomy.perception.finder import segment
 
     return segment(frame)
 
