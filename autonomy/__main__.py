@@ -4,13 +4,16 @@
 lays one log into the bunk; with ``--mission FILE`` and a machine that drives, the whole mission is done.
 ``--tell HOST:PORT`` is told twice a second how the mission stands, and ``--order-port`` takes a person's orders
 (`can_dbc.mission_datagrams` has both), from this machine only.
+``--progress FILE`` keeps how far the mission has come; where there is such a file already the mission goes on from
+there, once a person has ordered Auto.
 
 Events on stdout: ``phase``, ``grasp`` (the logs that are to come up, why they and with what probability), ``paused``
 (with its reason), ``running``, ``refused`` (a setpoint, with the controller's number), of a mission ``state`` and
-``load`` (logs on board), ``order`` (a person's, and why it is refused), ``done``, ``failed`` (with its reason).
+``load`` (logs on board), ``order`` (a person's, and why it is refused), ``resumed`` (with what was done before),
+``progress`` (why it cannot be kept), ``done``, ``failed`` (with its reason).
 SIGTERM and SIGINT stop crane and machine smoothly and end with a hold.
-Exit codes: 0 the log lies in the bunk or the mission is finished, 2 usage, 3 profile, mission or key, 4 port, 5
-interrupted while the controller was stopped, 6 the job failed, 130 interrupted.
+Exit codes: 0 the log lies in the bunk or the mission is finished, 2 usage, 3 profile, mission, progress or key, 4 port,
+5 interrupted while the controller was stopped, 6 the job failed, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ from autonomy.grasp.press import Press
 from autonomy.grasp.search import Search
 from autonomy.jobs import Forwarding, Job, OneLog
 from autonomy.logs import LogObservation, LogsRefused, parse_logs, question
+from autonomy.manager.logbook import Logbook, MissionFinished, read
 from autonomy.manager.manager import Manager
 from autonomy.manager.table import WAYS
 from autonomy.mission import Mission
@@ -71,12 +75,16 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--scene", type=address, required=True, help="HOST:PORT of the log detector")
     parser.add_argument("--log", type=int, help="number of the log to pick (default: the best one)")
     parser.add_argument("--mission", type=Path, help="file of a mission to do, in any format of `timberhand plan`")
+    parser.add_argument("--progress", type=Path, help="file that keeps how far the mission has come, to go on from")
     parser.add_argument("--way", choices=WAYS, default="ours", help="whose way the mission is done")
     parser.add_argument("--tell", type=address, action="append", default=[], help="HOST:PORT to tell of the mission")
     parser.add_argument("--order-port", type=int, help="local UDP port for a person's orders to the mission")
     parser.add_argument("--lease-ms", type=int, default=200, help="how long a setpoint is obeyed")
     parser.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
-    return parser.parse_args(argv)
+    options = parser.parse_args(argv)
+    if options.progress is not None and (options.mission is None or options.order_port is None):
+        parser.error("--progress needs --mission, and --order-port: a mission that goes on waits for a person's order")
+    return options
 
 
 class Process:
@@ -98,6 +106,7 @@ class Process:
         if options.order_port is not None:
             self._ordered.bind(("127.0.0.1", options.order_port))
         self._watchers: list[Address] = options.tell
+        self._logbook = None if options.progress is None else Logbook(options.progress)
         self._sequence = 0
         for each in (self._link, self._scene, self._ordered):
             each.setblocking(False)
@@ -124,6 +133,7 @@ class Process:
                 self._job.abort(f"ended by {signal.Signals(self.signals[0]).name}")
             self.turn(time.monotonic_ns())
         self._report_mission(time.monotonic_ns())
+        self._keep_on(time.monotonic_ns())
 
     def turn(self, now_ns: int) -> None:
         """One turn: ask, take what came, step, send, tell."""
@@ -138,6 +148,23 @@ class Process:
         if now_ns >= self._tell_ns:
             self._tell_ns = now_ns + TELL_NS
             self._report_mission(now_ns)
+        if self._logbook is not None and self._logbook.due(now_ns):
+            self._keep_on(now_ns)
+
+    def keep(self, now_ns: int) -> None:
+        """The progress into its file; raises OSError."""
+        progress = self._job.progress()
+        if self._logbook is not None and progress is not None:
+            self._logbook.keep(progress, now_ns, time.time_ns())
+
+    def _keep_on(self, now_ns: int) -> None:
+        """A disk that takes no more does not stop a machine that works."""
+        try:
+            self.keep(now_ns)
+        except OSError as error:
+            trouble = f"the progress cannot be kept: {error.strerror}"
+            if self._changed("progress", trouble):
+                say("progress", reason=trouble)
 
     def _obey(self, now_ns: int) -> None:
         """Do what a person orders, and say so."""
@@ -244,11 +271,19 @@ def main(argv: list[str] | None = None) -> int:
         job = _job(options, profile, lease_ns, key)
     except MissionError as error:
         return _complain(str(error))
+    except MissionFinished as told:
+        say("done", reason=str(told))
+        return FINE
     try:
         process = Process(job, profile_hash(profile), options, key)
     except (OSError, OverflowError) as error:
         ports = f"{options.report_port}" + (f" or {options.order_port}" if options.order_port is not None else "")
         return _complain(f"UDP port {ports} cannot be opened ({error}); choose another one", BUSY)
+    try:
+        process.keep(time.monotonic_ns())
+    except OSError as error:
+        process.close()
+        return _complain(f"{options.progress}: the progress cannot be kept there: {error.strerror}")
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: process.signals.append(number))
     try:
@@ -267,7 +302,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: bytes | None) -> Job:
-    """What the command line asks for; raises MissionError."""
+    """What the command line asks for; raises MissionError, MissionFinished."""
     code, chooser = profile_hash(profile), Planned(Search())
     if options.mission is None:
         return OneLog(Activity(profile, code, Mission(log_id=options.log), lease_ns, key, chooser))
@@ -275,9 +310,14 @@ def _job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: byte
         raise MissionError(f"{profile.name} stands still; a mission needs a machine that drives, such as aoro_fc8")
     site = (profile.carrier.site_lat_deg, profile.carrier.site_lon_deg)
     mission = load_mission(options.mission, route_wanted=True, site=site).mission
+    progress = options.progress and read(options.progress, mission, time.monotonic_ns(), time.time_ns())
     manager = Manager(
-        profile, code, mission, WAYS[options.way], chooser, key=key, lease_ns=lease_ns, emptier=Planned(Press(Search()))
-    )
+        profile, code, mission, WAYS[options.way], chooser, key=key, lease_ns=lease_ns,
+        emptier=Planned(Press(Search())), progress=progress,
+    )  # fmt: skip
+    if progress:
+        tally = manager.tally
+        say("resumed", loaded=tally.loaded, on_board=tally.on_board, loads=len(tally.loads))
     return Forwarding(manager, mission)
 
 

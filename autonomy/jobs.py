@@ -16,7 +16,8 @@ from autonomy.activity import Activity
 from autonomy.grasp.direct import Grasp
 from autonomy.logs import LogObservation
 from autonomy.manager.manager import Manager
-from autonomy.manager.table import ENDS, RULES, State
+from autonomy.manager.progress import Progress
+from autonomy.manager.table import ENDS, State
 from autonomy.missions.model import ForwardingMission
 from autonomy.voice import Voice
 from can_dbc.mission_datagrams import MissionOrder, MissionReport, Order
@@ -63,6 +64,9 @@ class Job(Protocol):
 
     def report(self, now_ns: int) -> MissionReport | None:
         """What those who watch it are told, if there is more to tell than the controller does."""
+
+    def progress(self) -> Progress | None:
+        """What a planner that is started again must know to go on, if it can."""
 
 
 class OneLog:
@@ -117,17 +121,24 @@ class OneLog:
         """Nothing."""
         return None
 
+    def progress(self) -> Progress | None:
+        """Nothing: it begins anew with what is seen."""
+        return None
+
 
 class Forwarding:
-    """An activity manager as a job, with its switch at Auto from the beginning."""
+    """An activity manager as a job, with its switch at Auto from the beginning; a mission that goes on where another
+    planner ended waits at Idle, for nobody knows what was done to the machine meanwhile.
+    """
 
     def __init__(self, manager: Manager, mission: ForwardingMission) -> None:
         self._manager = manager
         self._ended_ns = self._now_ns = 0
         self._voice = Voice(manager, mission)
-        self._auto = True
+        self._auto = not manager.resumed
         self._order, self._refusal = 0, ""
-        manager.auto()
+        if self._auto:
+            manager.auto()
 
     @property
     def idle(self) -> bool:
@@ -165,7 +176,7 @@ class Forwarding:
     def news(self) -> Iterator[News]:
         """The state, the load, the crane's grasp and phase, and what it waits for."""
         manager, activity = self._manager, self._manager.activity
-        yield "state", {"state": manager.state.name, "words": RULES[manager.state].words}
+        yield "state", {"state": manager.state.name, "words": manager.words}
         yield "load", {"logs": manager.tally.loaded}
         if activity is not None:
             yield from _of_crane(activity.grasp, activity.phase.name)
@@ -211,6 +222,10 @@ class Forwarding:
     def report(self, now_ns: int) -> MissionReport:
         """How the mission stands."""
         return self._voice.report(now_ns, self._auto, self._order, self._refusal)
+
+    def progress(self) -> Progress:
+        """How far the mission has come."""
+        return self._manager.progress()
 
 
 def _of_crane(grasp: Grasp | None, phase: str) -> Iterator[News]:

@@ -16,7 +16,7 @@ import pymap3d
 from autonomy.localization.plane import Plane
 from autonomy.manager.manager import Manager
 from autonomy.manager.outlook import ATTEMPTS
-from autonomy.manager.table import ENDS, EVENTS, RULES
+from autonomy.manager.table import ENDS, EVENTS
 from autonomy.missions.local import bearing_from_yaw
 from autonomy.missions.model import ForwardingMission, Point
 from autonomy.phases import Phase
@@ -51,6 +51,7 @@ CRANE: Final = {
     Phase.LOWER: "lowers the log",
     Phase.OPEN: "lets the log go",
     Phase.RETREAT: "leaves the load",
+    Phase.STOW: "goes over the bunk",
     Phase.DONE: "is done",
     Phase.FAILED: "has given up",
 }
@@ -81,7 +82,7 @@ class Voice:
             schema=1,
             name=self._name,
             state=manager.state.name,
-            words=RULES[manager.state].words,
+            words=_text(manager.words),
             ended=manager.state in ENDS,
             auto=auto,
             single_step=manager.single_step,

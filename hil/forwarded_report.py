@@ -28,11 +28,10 @@ def report_loads(
     def when(at_ns: int) -> datetime:
         return (epoch + timedelta(microseconds=(at_ns - epoch_ns) // 1000)).astimezone(UTC)
 
-    landing = mission.landings[0]
     forwarded = [
         ForwardedLoad(
             tuple(ForwardedLog(x.position, when(x.at_ns), x.volume_m3, assortment=x.assortment) for x in load.logs),
-            landing, when(load.at_ns), load.driven_m,
+            mission.landings[load.landing], when(load.at_ns), load.driven_m,
         )
         for load in loads
     ]  # fmt: skip

@@ -19,7 +19,7 @@ from autonomy.grasp.press import Press
 from autonomy.grasp.search import Search
 from autonomy.logs import LogObservation
 from autonomy.manager.manager import Manager
-from autonomy.manager.table import ENDS, RULES, WAYS, State
+from autonomy.manager.table import ENDS, WAYS, State
 from autonomy.missions.model import ForwardingMission
 from can_dbc.setpoint import OperatorAction, StateReport, VehicleReport
 from controller.config import Settings
@@ -129,13 +129,8 @@ def run_mission(
 
 def unheeded(mission: ForwardingMission) -> list[str]:
     """What a mission asks for and the activity manager does not do yet, a sentence each."""
-    options = mission.options
-    asked = {
-        "logs of every assortment are collected": bool(options.assortments),
-        "logs are not sorted by assortment": options.sort_by_assortment,
-        "everything goes to the first landing": len(mission.landings) > 1,
-    }
-    return [sentence for sentence, so in asked.items() if so]
+    turned = any(landing.bearing_deg is not None for landing in mission.landings)
+    return ["logs are laid down along the machine, not along the bearing_deg of a landing"] if turned else []
 
 
 class MissionRun:
@@ -227,7 +222,7 @@ class MissionRun:
             seconds = (self.system.now_ns - START_NS) / 1e9
             self.states.append((round(seconds, 2), manager.state.name))
             self._display.phase(manager.state.name)
-            self._display.event(f"  {RULES[manager.state].words}; {manager.tally.loaded} logs on board")
+            self._display.event(f"  {manager.words}; {manager.tally.loaded} logs on board")
         if manager.paused != before[1]:
             self._display.event(f"paused: {manager.paused}" if manager.paused else "goes on", "yellow")
         if failure and failure != before[3]:

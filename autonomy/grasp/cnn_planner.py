@@ -8,7 +8,7 @@ tongs are named for the closing of the tongs.  Inputs: log list, a network.  Fai
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -46,7 +46,8 @@ class Seen:
 
 
 class CnnPlanner:
-    """A planner (``autonomy.grasp.proposal``).
+    """A planner (``autonomy.grasp.proposal``).  Like the paper's, it knows nothing of logs that are to stay lying: it
+    plans from the list without them, and may take one along.
 
     ``by_rule`` takes the height from the rule that physical labels are made by, where that holds.
     ``cameras`` over 1 moves the virtual camera on a circle of ``reach_m`` and averages the predictions (II-C); the
@@ -72,8 +73,17 @@ class CnnPlanner:
         mean = averaged([self._network.maps(depth) for depth in pictures], views, float(box.centroid_m[2]))
         return Seen(views[0], pictures[0], best(mean))
 
-    def __call__(self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float) -> GraspProposal:
+    def __call__(
+        self,
+        arm: Arm,
+        logs: Sequence[LogObservation],
+        slew_rad: float,
+        rot_rad: float,
+        stay: Collection[int] = (),
+    ) -> GraspProposal:
         """The grasp of eq. 4; raises ``NoGrasp`` without a log."""
+        places = [i for i in range(len(logs)) if i not in stay]
+        logs = [logs[i] for i in places]
         if not logs:
             raise NoGrasp("no log is in view")
         world, jaws = cylinders(logs), jaws_of(arm.profile)
@@ -90,7 +100,7 @@ class CnnPlanner:
         yaw, level = -found.theta_rad, max(ground, surface - DEPTH_M)
         if self._by_rule:
             level = safe_level(jaws, world, x, y, yaw, ground, level)
-        taken = between(jaws, world, x, y, yaw, level)
+        taken = tuple(places[i] for i in between(jaws, world, x, y, yaw, level))
         quality = min(max(found.q, 0.0), 1.0)
         reason = f"the network's best pixel ({found.u_px:.0f}, {found.v_px:.0f}) has quality {found.q:.2f}"
         return GraspProposal(x, y, yaw, level, taken, quality, reason)

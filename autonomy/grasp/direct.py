@@ -204,6 +204,13 @@ def choose(arm: Arm, mission: Mission, logs: Sequence[LogObservation], slew: flo
 
 def waiting(profile: Profile, mission: Mission, logs: Sequence[LogObservation]) -> tuple[list[LogObservation], str]:
     """The logs that are still to be picked, and the sentence for when there is none."""
+    there, missing = _there(profile, mission, logs)
+    found = [log for log in there if log.id not in mission.leave]
+    return found, "every log that lies there is to stay" if there else missing
+
+
+def _there(profile: Profile, mission: Mission, logs: Sequence[LogObservation]) -> tuple[list[LogObservation], str]:
+    """The logs that lie where logs come from, also those that are to stay; and the sentence for when none does."""
     if mission.source is not None:
         return [log for log in logs if lies_in(mission.source, log)], "no log is left where logs come from"
     target = mission.to(profile.bunk)
@@ -241,11 +248,13 @@ class Planned:
         """The proposal as a grasp; a mission that names its log is served by ``choose``."""
         if mission.log_id is not None:
             return choose(arm, mission, logs, slew, rot)
-        free, missing = waiting(arm.profile, mission, logs)
-        if not free:
+        wanted, missing = waiting(arm.profile, mission, logs)
+        if not wanted:
             raise NoGrasp(missing)
-        p = self._planner(arm, free, slew, rot)
-        first, *others = sorted((free[i] for i in p.logs), key=lambda log: -log.length_m)
+        there, _ = _there(arm.profile, mission, logs)
+        stay = {i for i, log in enumerate(there) if log.id in mission.leave}
+        p = self._planner(arm, there, slew, rot, stay)
+        first, *others = sorted((there[i] for i in p.logs), key=lambda log: -log.length_m)
         thinnest = min(log.diameter_m for log in (first, *others))
         low = closing_height(arm.profile, p.support_z_m, thinnest)(0.0)
         try:
@@ -254,9 +263,9 @@ class Planned:
         except Unreachable as error:
             raise NoGrasp(f"the planner's grasp is out of reach: {error}") from None
         along = _along((p.x_m, p.y_m), first)
-        near = [log for log in free if log is not first and _beside((p.x_m, p.y_m), log) < ALONE_M]
+        near = [log for log in there if log is not first and _beside((p.x_m, p.y_m), log) < ALONE_M]
         # What lies alone cannot settle, and comes up as `choose` would lift it.
-        top = _top(free) if near or others else None
+        top = _top(there) if near or others else None
         found = pose._replace(rot_rad=turn)
         return Grasp(first, found, p.support_z_m, along, tuple(others), top, p.reason, p.probability, p.pressed)
 

@@ -4,13 +4,14 @@ Tips that stay over a heap take one log off it, if any: they pinch what is on to
 in a hollow.  Drivers lower the open tongs until these have gone in among the logs, or rest on some, and close there.
 Of places and depths the one is taken that has most wood between the tongs, not more than they hold, and where the tips
 come down beside logs rather than on their middles.  It is not asked whether each log lies well: the rest of the heap
-holds it.  A place where nothing came up is not tried again until something did.  Logs that lie on no others are left to
-another planner.  Heights of the heap come from the log list alone.  Failure: ``NoGrasp`` with one sentence.
+holds it.  A place where nothing came up is not tried again until something did, nor one with a log between the tongs
+that is to stay.  Logs that lie on no others are left to another planner.  Heights of the heap come from the log list
+alone.  Failure: ``NoGrasp`` with one sentence.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from math import atan2, pi
 from typing import Final
@@ -39,8 +40,12 @@ MOST_PUSH: Final = 0.85
 """A tip that meets a log nearer to its middle than this share of its radius stands on it."""
 OFF_M: Final = 0.5
 """Logs whose middles are this far from the tongs make a place worth a third: they would hang askew."""
+STANDING: Final = 0.02
+"""What such a place is worth beside others; it is a last resort, for closing tongs slide off."""
 FULL: Final = 0.9
 """So much of what closed tongs hold may be between them: with more they stand wide open, and hold little of it."""
+FULLER: Final = 0.1
+"""So much more of it makes a place worth a third."""
 SHUNNED_M: Final = 0.2
 """So near to a place where nothing came up none is tried."""
 STAYED_M: Final = 0.05
@@ -73,15 +78,25 @@ class Press:
         self._last: tuple[tuple[float, float], dict[int, tuple[float, float, float]]] | None = None
         self._shunned: list[tuple[float, float]] = []
 
-    def __call__(self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float) -> GraspProposal:
+    def __call__(
+        self,
+        arm: Arm,
+        logs: Sequence[LogObservation],
+        slew_rad: float,
+        rot_rad: float,
+        stay: Collection[int] = (),
+    ) -> GraspProposal:
         """The best place to press down, else the best grasp of ``single``; raises ``NoGrasp``."""
         if not logs:
             raise NoGrasp("no log is in view")
         self._learn(logs)
         world = cylinders(logs)
         if not lies_upon(world).any():
-            return self._noted(self._single(arm, logs, slew_rad, rot_rad), logs)
-        places = self._places(arm, world)
+            try:
+                return self._noted(self._single(arm, logs, slew_rad, rot_rad, stay), logs)
+            except NoGrasp:  # a row from stake to stake: the tongs come down on some of it, and slide off
+                pass
+        places = self._places(arm, world, stay)
         for i in np.argsort(-places.worth, kind="stable"):
             if places.worth[i] <= 0.0:
                 break
@@ -90,7 +105,7 @@ class Press:
             except Unreachable:
                 continue
             return self._noted(_proposal(places, int(i), logs), logs)
-        return self._noted(self._single(arm, logs, slew_rad, rot_rad), logs)
+        return self._noted(self._single(arm, logs, slew_rad, rot_rad, stay), logs)
 
     def _learn(self, logs: Sequence[LogObservation]) -> None:
         """Whether the last proposal brought something up: if not, its place is shunned."""
@@ -112,7 +127,7 @@ class Press:
         self._last = (found.x_m, found.y_m), {logs[i].id: logs[i].center_m for i in found.logs}
         return found
 
-    def _places(self, arm: Arm, world: Cylinders) -> _Places:
+    def _places(self, arm: Arm, world: Cylinders, stay: Collection[int]) -> _Places:
         """All that are looked at."""
         jaws, bunk = jaws_of(arm.profile), arm.profile.bunk
         middle = np.average(world.center[:, :2], axis=0)
@@ -128,6 +143,7 @@ class Press:
         top = np.max(np.where(close, at.top, -np.inf), axis=-1)
         level = np.maximum(top - depth, bunk.floor_z_m)
         between, worth = _worth(jaws, world, at, level)
+        worth = np.where(between[:, list(stay)].any(axis=-1), 0.0, worth)
         for sx, sy in self._shunned:
             worth = np.where(np.hypot(x - sx, y - sy) < SHUNNED_M, 0.0, worth)
         return _Places(x, y, yaw, level, worth, between)
@@ -158,7 +174,8 @@ def _worth(jaws: Jaws, world: Cylinders, at: Sections, level: np.ndarray) -> tup
     share = wood / jaws.holds_m2
     off_m = np.sum(np.where(between, pi * r**2 * np.abs(at.along), 0.0), axis=-1) / np.maximum(wood, 1e-9)
     worth = share * np.exp(-push / PUSH_M - (off_m / OFF_M) ** 2)
-    return between, np.where(stands | (share > FULL) | ~between.any(axis=-1), 0.0, worth)
+    worth = worth * np.where(stands, STANDING, 1.0) * np.exp(-np.maximum(share - FULL, 0.0) / FULLER)
+    return between, worth
 
 
 def _proposal(at: _Places, i: int, logs: Sequence[LogObservation]) -> GraspProposal:

@@ -1,11 +1,12 @@
 """What a grasp planner proposes: one grasp in the base frame, with what it expects to come up and why.
 
-A planner is a callable ``(arm, logs, slew_rad, rot_rad) -> GraspProposal``; it raises ``NoGrasp``.
+A planner is a callable ``(arm, logs, slew_rad, rot_rad, stay=()) -> GraspProposal``; it raises ``NoGrasp``.  ``stay``
+are places in the list: those logs are to stay lying, but they are there and in the way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -44,4 +45,11 @@ class GraspProposal:
 class Planner(Protocol):
     """See the module."""
 
-    def __call__(self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float) -> GraspProposal: ...
+    def __call__(
+        self,
+        arm: Arm,
+        logs: Sequence[LogObservation],
+        slew_rad: float,
+        rot_rad: float,
+        stay: Collection[int] = (),
+    ) -> GraspProposal: ...

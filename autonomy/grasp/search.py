@@ -9,8 +9,8 @@ with covariances where perception gives them.  Failure: ``NoGrasp`` with one sen
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, replace
 from math import isfinite, pi
 from typing import Final
 
@@ -80,17 +80,26 @@ class Search:
     def __init__(self, rules: Sequence[tuple[Rule, float]] = RULES) -> None:
         self._rules = rules
 
-    def __call__(self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float) -> GraspProposal:
+    def __call__(
+        self,
+        arm: Arm,
+        logs: Sequence[LogObservation],
+        slew_rad: float,
+        rot_rad: float,
+        stay: Collection[int] = (),
+    ) -> GraspProposal:
         """The best grasp that the crane reaches; raises ``NoGrasp``."""
         if not logs:
             raise NoGrasp("no log is in view")
+        stays = np.isin(np.arange(len(logs)), list(stay))
+        wanted = _counted(np.flatnonzero(~stays).tolist())
         ground = known_ground_m(arm.profile)
         jaws, world = jaws_of(arm.profile), cylinders(logs)
         sigma = np.stack([covariance_of(log) for log in logs])
         if isfinite(ground):
             world, sigma = grounded(world, ground), grounded_covariance(sigma)
         upon = lies_upon(world)
-        at = candidates(world, *_in_reach(arm, logs))
+        at = candidates(world, *_in_reach(arm, logs, stays))
         seen = sections(jaws, world, *at)
         floor = np.full(len(at[0]), ground) if isfinite(ground) else _floor(jaws, seen, upon)
         tops = np.unique(np.round(world.center[:, 2] + world.radius, 3))
@@ -103,13 +112,14 @@ class Search:
             reached = [float(np.max(plan[2])) for plan in plans]
             if reached and (reached[0] >= LEAST or max(reached) >= trust):
                 break
-            found = rate(jaws, world, upon, _spread(seen), levels, rule)
+            found = _leaving(rate(jaws, world, upon, _spread(seen), levels, rule), stays)
             if found.safe.any():
                 best, found = _finalists(at, levels, seen, found)
-                plans.append((best, found, trust * self._probability(jaws, drawn, upon, best, found.captured, rule)))
+                share = self._probability(jaws, drawn, upon, best, found.captured, rule, stays)
+                plans.append((best, found, trust * share))
         if not plans:
             raise NoGrasp(
-                f"no grasp of the {_counted(logs)} is safe: every one closes on a log that stays, takes one from "
+                f"no grasp of the {wanted} is safe: every one closes on a log that stays, takes one from "
                 "under another or more than the grapple holds"
             )
         best, found, probability = max(plans, key=lambda plan: float(np.max(plan[2])))
@@ -121,17 +131,25 @@ class Search:
                 trouble = str(error)
                 continue
             return self._proposal(best, int(i), captured[i], float(probability[i]), logs)
-        raise NoGrasp(f"no grasp of the {_counted(logs)} is in reach: {trouble}")
+        raise NoGrasp(f"no grasp of the {wanted} is in reach: {trouble}")
 
     def _probability(
-        self, jaws: Jaws, drawn: Cylinders, upon: np.ndarray, best: Candidates, captured: np.ndarray, rule: Rule
+        self,
+        jaws: Jaws,
+        drawn: Cylinders,
+        upon: np.ndarray,
+        best: Candidates,
+        captured: np.ndarray,
+        rule: Rule,
+        stays: np.ndarray,
     ) -> np.ndarray:
         """Share of the draws in which the rule holds and one of the wanted logs comes up."""
         rng = np.random.default_rng(SEED + 1)
         error = rng.standard_normal((DRAWS, 4)) * (*CRANE_M, CRANE_RAD)
         world = Cylinders(drawn.center[:, None], drawn.axis[:, None], drawn.length[:, None], drawn.radius[:, None])
         moved = [c[None, :] + error[:, k, None] for k, c in enumerate((best.x, best.y, best.level, best.yaw))]
-        found = rate(jaws, world, upon, sections(jaws, world, moved[0], moved[1], moved[3]), moved[2], rule)
+        at = sections(jaws, world, moved[0], moved[1], moved[3])
+        found = _leaving(rate(jaws, world, upon, at, moved[2], rule), stays)
         return np.mean(found.safe & np.any(found.captured & captured, axis=-1), axis=0)
 
     def _reach(
@@ -159,12 +177,20 @@ class Search:
         )
 
 
+def _leaving(found: Scores, stays: np.ndarray) -> Scores:
+    """No grasp that takes one of the logs that are to stay (n,) is safe."""
+    if not stays.any():
+        return found
+    return replace(found, safe=found.safe & ~np.any(found.captured & stays, axis=-1))
+
+
 def _counted(logs: Sequence[object]) -> str:
     return f"{len(logs)} log{'s' if len(logs) > 1 else ''}"
 
 
-def _in_reach(arm: Arm, logs: Sequence[LogObservation]) -> tuple[np.ndarray, np.ndarray]:
-    """The topmost logs (k,) that the crane reaches somewhere, and at which of the stations ``ALONG`` (k, stations).
+def _in_reach(arm: Arm, logs: Sequence[LogObservation], stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The topmost logs (k,) that may be taken and that the crane reaches somewhere, and at which of the stations
+    ``ALONG`` (k, stations).
 
     Raises ``NoGrasp`` when it reaches none.
     """
@@ -182,7 +208,7 @@ def _in_reach(arm: Arm, logs: Sequence[LogObservation]) -> tuple[np.ndarray, np.
             return False
         return True
 
-    for i in sorted(range(len(logs)), key=lambda i: -logs[i].center_m[2]):
+    for i in sorted(np.flatnonzero(~stays).tolist(), key=lambda i: -logs[i].center_m[2]):
         whole = all(served(logs[i], along) for along in (0.0, ALONG[0], ALONG[-1]))
         stations = [whole or served(logs[i], along) for along in ALONG]
         if any(stations):
@@ -191,7 +217,7 @@ def _in_reach(arm: Arm, logs: Sequence[LogObservation]) -> tuple[np.ndarray, np.
         if len(top) == ABOUT:
             break
     if not top:
-        raise NoGrasp(f"no log is in reach; {trouble}")
+        raise NoGrasp(f"no log is in reach; {trouble or 'all that are in view are to stay'}")
     return np.array(top), np.array(reached)
 
 

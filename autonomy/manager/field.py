@@ -82,10 +82,28 @@ class Field:
         """Those that were seen often enough to be believed, by number."""
         return tuple(log for log in self._logs.values() if log.hits >= CONFIRMED)
 
+    @property
+    def missed_ones(self) -> tuple[FieldLog, ...]:
+        """Those that grasps came back from empty, given up or not."""
+        return tuple(log for log in self._logs.values() if log.misses)
+
+    @property
+    def free(self) -> int:
+        """The next number."""
+        return self._next
+
     def known(self, log: FieldLog) -> None:
         """A log that is known before it is seen, as from a harvester; it gets a number of its own."""
         self._logs[self._next] = replace(log, number=self._next, hits=max(log.hits, CONFIRMED))
         self._next += 1
+
+    def restore(self, log: FieldLog) -> None:
+        """A log as it was known before, with its number."""
+        self._logs[log.number] = log
+
+    def number_from(self, free: int) -> None:
+        """Numbers below this one are those of logs that were known before."""
+        self._next = max(self._next, free)
 
     def get(self, number: int) -> FieldLog | None:
         """The log of this number, if it still lies there."""

@@ -14,27 +14,27 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-import numpy as np
-
 from autonomy.activity import Activity
 from autonomy.grasp.direct import Chooser, choose, lies_in
 from autonomy.localization.plane import Plane
 from autonomy.logs import LogObservation
+from autonomy.manager.cargo import Cargo
 from autonomy.manager.field import FieldLog
+from autonomy.manager.hand import Hand
 from autonomy.manager.memory import Memory
 from autonomy.manager.outlook import Outlook
+from autonomy.manager.progress import Progress, copied, digest
 from autonomy.manager.rides import Ride
 from autonomy.manager.table import ENDS, OURS, PAPER_B, RULES, Event, Height, State, Table, awaited, following
-from autonomy.manager.tally import Taken, Tally, volume_m3
+from autonomy.manager.tally import Tally
 from autonomy.mission import Mission
-from autonomy.missions.model import ForwardingMission, Point
+from autonomy.missions.model import ForwardingMission
 from autonomy.motion.primitives import load
 from autonomy.motion.ways import AsShown, Motions, Swiftest
-from autonomy.navigation.curves import PathRefused, Point2
+from autonomy.navigation.curves import PathRefused
 from autonomy.navigation.navigator import LEASE_NS, Navigator, Phase
 from autonomy.rotator import Rotator
 from can_dbc.setpoint import StateReport, VehicleReport, encode
-from machine.joints import N_JOINTS
 from machine.profile import Profile
 
 SECOND: Final = 1_000_000_000
@@ -69,7 +69,8 @@ class Manager:
     ``table`` is whose way it is done: `OURS` or `PAPER_B`.  ``chooser`` picks the grasps,
     ``emptier`` those from the bunk at a landing; ``motions`` are the crane's:
     by default ours, or in paper B's way those that ship as shown to the machine.
-    ``remembers``: logs are seen on the way alone, and the crane works from memory.
+    ``remembers``: logs are seen on the way alone, and the crane works from memory.  ``progress``: it goes on where a
+    planner before it ended; what lay in the bunk then is seen, not remembered.
     """
 
     def __init__(
@@ -85,25 +86,29 @@ class Manager:
         motions: Motions | None = None,
         remembers: bool = False,
         emptier: Chooser | None = None,
+        progress: Progress | None = None,
     ) -> None:
-        assert profile.carrier is not None
+        assert profile.carrier is not None and not (remembers and progress)
+        self.resumed = progress is not None
         self.state, self.paused, self.failure = State.IDLE, "the controller has not reported", ""
-        self.tally = Tally()
         self.changes: deque[Change] = deque(maxlen=HISTORY)
         self.target: int | None = None
         self.activity: Activity | None = None
-        self._rests, self._rotator = (0.0,) * N_JOINTS, Rotator()
         self.single_step = False
         """Every change waits for `step_on`."""
-        self.outlook = Outlook(profile, mission, plane)
+        self.outlook = Outlook(profile, mission, plane, progress and progress.known)
+        self.cargo = Cargo(profile, mission, self.outlook, progress)
+        self._digest = digest(mission)
         self.memory = Memory(profile) if remembers else None
         self._auto = self._may_step = False
         self.waiting: Event | None = None
         """In single step: what has come about and waits for `step_on`."""
-        self._profile, self._hash, self._mission, self._table = profile, profile_hash, mission, table
-        self._chooser, self._emptier = chooser, emptier or chooser
-        self._key, self._lease_ns = key, lease_ns
-        self._motions = motions or (AsShown(load(profile)) if table is PAPER_B else Swiftest())
+        self._profile, self._table, self._key = profile, table, key
+        motions = motions or (AsShown(load(profile)) if table is PAPER_B else Swiftest())
+        self._hand = Hand(
+            profile, profile_hash, self.cargo, chooser, emptier or chooser, motions, lease_ns, key,
+            progress.rotator if progress else Rotator(),
+        )  # fmt: skip
         options, carrier = mission.options, profile.carrier
         transport, loading = options.transport_height_m, options.loading_height_m
         self._heights = {
@@ -112,11 +117,43 @@ class Manager:
         }
         self._height = Height.TRANSPORT
         self._navigator = Navigator(carrier, profile_hash, lease_ns=lease_ns)
-        self.ride = Ride(carrier, self._navigator, mission, faithful=table is PAPER_B)
+        left, driven_m = (progress.left, progress.driven_m) if progress else (None, 0.0)
+        self.ride = Ride(carrier, self._navigator, mission, table is PAPER_B, left, driven_m)
         self._begun = self._was_inside = self._unloaded = False
         self._stop_m = self._progress_m = 0.0
         self._stops = self._failures = 0
         self._since_ns = self._settled_ns = self._progress_ns = self._weighed_ns = 0
+
+    @property
+    def tally(self) -> Tally:
+        """What is on board, and what was done."""
+        return self.cargo.tally
+
+    @property
+    def words(self) -> str:
+        """What the machine is about, where there are several landings or rounds with which one it is."""
+        words, rounds = RULES[self.state].words, self.outlook.sorting.rounds
+        if self.state in (State.HAUL, State.SETTLE, State.UNLOAD) and (name := self.cargo.bound_for):
+            return f"{words} ({name})"
+        if self.state is State.IDLE and self.resumed:
+            return f"{words}, to go on where it was left"
+        return f"{words} (round {rounds + 1})" if self.state is State.SEARCH and rounds else words
+
+    def progress(self) -> Progress:
+        """How far the mission has come."""
+        outlook, sorting = self.outlook, self.outlook.sorting
+        return Progress(
+            mission=self._digest,
+            tally=copied(self.tally),
+            known=outlook.known(),
+            left=self.ride.left(outlook.plane if outlook.located else None),
+            landing=sorting.landing,
+            served=tuple(sorted(sorting.served)),
+            rounds=sorting.rounds,
+            driven_m=self.ride.driven_m,
+            rotator=self._hand.rotator if self.activity is None else self.activity.rotator,
+            finished=self.state is State.DONE,
+        )
 
     # ------------------------------------------------------------------ the operator
     def auto(self) -> None:
@@ -199,8 +236,12 @@ class Manager:
                 self.ride.halt()
             return
         self._may_step, self.waiting = False, None
-        if event is Event.INVALID and self.target is not None and not self._full():
+        if event is Event.INVALID and self.target is not None and not self.cargo.full:
             self.outlook.missed(self.target)  # it looked better from afar: not again and again
+        if event is Event.ROUND_END:
+            self.outlook.sorting.begins_anew()
+            self.ride.renew()
+            self._begun = False
         state = following(self._table, self.state, event)
         if state is State.FAILED:
             self._fail(RULES[self.state].trouble)
@@ -241,31 +282,30 @@ class Manager:
     def _begin_grasp(self, mission: Mission | None) -> None:
         """A new job for the crane; None: to go over the bunk."""
         self._stops = 0
-        chooser = self._emptier if mission is not None and mission.source is not None else self._chooser
-        self.activity = Activity(
-            self._profile, self._hash, mission, self._lease_ns, self._key, chooser, self._rests,
-            self._motions, None if self.ride.faithful else self._goes_on, mission is None, self._rotator,
-        )  # fmt: skip
+        onward = None if self.ride.faithful else self._goes_on
+        self.activity = self._hand.begin(mission, self.target, onward, self.outlook.report)
 
     def _goes_on(self, log: LogObservation) -> bool:
         """Whether the next grasp would be of such a log."""
         if self.state is State.UNLOAD:
             return lies_in(self._profile.bunk, log)
         number = self.outlook.number_of(log.id)
-        return number is not None and not self._full() and number in {g.number for g in self.outlook.takable()}
+        return number is not None and not self.cargo.full and number in {g.number for g in self.outlook.takable()}
 
     def _end_grasp(self) -> None:
         assert self.activity is not None
-        self._rests, self._rotator, self.activity = self.activity.rests, self.activity.rotator, None
+        self._hand.end(self.activity)
+        self.activity = None
 
     def _drive(self, state: State) -> None:
         here = self.outlook.location
         assert here is not None
         try:
             if state is State.HAUL:
-                self.ride.haul(here, self._landing(), partial(self.outlook.landing_ahead, self._landing()))
+                landing = self.cargo.landing()
+                self.ride.haul(here, landing, partial(self.outlook.landing_ahead, landing))
                 return
-            if not self._begun:
+            if not self._begun and not self.ride.ended:
                 self.ride.begin(here, self.outlook.plane)
                 self._begun = True
             elif self._unloaded:
@@ -280,10 +320,6 @@ class Manager:
             self.target, self._was_inside = None, False
         self.ride.go(None if state is State.SEARCH or self.ride.faithful else self._stop_m)
 
-    def _landing(self) -> Point2:
-        """The middle of the landing in the plane."""
-        return self.outlook.landings[0]
-
     def _fail(self, reason: str) -> None:
         self.failure, self.state = reason, State.FAILED
         self.ride.halt()
@@ -294,6 +330,8 @@ class Manager:
     def _has(self, event: Event, now_ns: int) -> bool:
         """Whether an event has come about."""
         match event:
+            case Event.RESUMED:
+                return self._auto and self.resumed
             case Event.AUTO:
                 return self._auto
             case Event.AT_HEIGHT:
@@ -322,13 +360,15 @@ class Manager:
             case Event.MISSED:
                 return self._missed()
             case Event.LOADED:
-                return bool(self._mission.landings) and self._loaded() and (self._full() or self.ride.ended)
+                return self.cargo.loaded and (self.cargo.full or self.ride.ended)
             case Event.EMPTY:
                 return self._emptied(now_ns)
             case Event.STOWED:
                 return self._stowed()
+            case Event.ROUND_END:
+                return self.ride.ended and self.cargo.another_round
             case Event.ROUTE_END:
-                return self.ride.ended or self._enough()
+                return self.ride.ended or self.cargo.enough
         return False
 
     def _settled(self, so: bool, now_ns: int) -> bool:
@@ -341,7 +381,7 @@ class Manager:
 
     def _log_near(self, now_ns: int) -> bool:
         """Paper B stops for the nearest log; we, where the best place to stop is just ahead; full, for none."""
-        if self._full():
+        if self.cargo.full:
             return False
         if self.ride.faithful:
             log = self.outlook.near()
@@ -359,46 +399,18 @@ class Manager:
 
     def _takable(self) -> bool:
         """Whether a log can be taken from here: paper B checks its target, we all that are seen."""
-        found = [] if self._full() else self.outlook.takable(self.target if self.ride.faithful else None)
+        found = [] if self.cargo.full else self.outlook.takable(self.target if self.ride.faithful else None)
         if found:
             self.target = found[0].number
         return bool(found)
-
-    def _enough(self) -> bool:
-        """Whether as many logs were taken as the mission wants."""
-        wanted = self._mission.options.logs_wanted
-        return wanted is not None and self.tally.loaded >= wanted
-
-    def _full(self) -> bool:
-        """Whether no more log is wanted: there are enough, or the bunk is full, to the brim, or as full as it need be
-        where there is a landing to bring it to.
-        """
-        full = self.tally.brimful or (bool(self._mission.landings) and self.tally.full(self._profile.bunk))
-        return full or self._enough()
-
-    def _loaded(self) -> bool:
-        """Whether logs are on board: taken in this mission, or seen there."""
-        return self.tally.on_board > 0 or self.outlook.in_bunk > 0
 
     def _collected(self, now_ns: int) -> bool:
         done = self.activity
         if done is None or not done.idle or not done.done or done.grasp is None:
             return False
-        self.tally.took([self._taken(log, now_ns) for log in done.grasp.logs], done.lifted_kg)
+        self.cargo.took(done, now_ns)
         self._end_grasp()
         return True
-
-    def _taken(self, log: LogObservation, now_ns: int) -> Taken:
-        """A log of the grasp no longer lies in the field; in the tally it does with where it had lain."""
-        outlook = self.outlook
-        number = outlook.number_of(log.id)
-        lay = None if number is None else outlook.field.get(number)
-        if number is not None:
-            outlook.field.remove(number)
-        at = outlook.base.to_base(np.asarray(log.center_m)) if lay is None else lay.center_m
-        lat, lon, _ = outlook.plane.geodetic(float(at[0]), float(at[1]))
-        wood = volume_m3(log.length_m, log.diameter_m)
-        return Taken(Point(lat, lon), now_ns, wood, "" if lay is None else lay.assortment)
 
     def _stowed(self) -> bool:
         """Whether the crane is out of the way for driving; one that does not get there ends the mission."""
@@ -416,14 +428,7 @@ class Manager:
         done = self.activity
         if done is None or not done.idle or done.failure is None:
             return False
-        self.tally.missed += 1
-        number = self.outlook.number_of(done.grasp.log.id) if done.grasp is not None else self.target
-        if done.no_room:
-            self.tally.brimful = True
-            if number is not None and not self._mission.landings:
-                self.tally.given_up[number] = done.failure
-        elif number is not None and self.outlook.missed(number, for_good=self.ride.faithful):
-            self.tally.given_up[number] = done.failure
+        self.cargo.missed(done, self.target, for_good=self.ride.faithful)
         self._end_grasp()
         return True
 
@@ -431,10 +436,7 @@ class Manager:
         """Whether nothing is left in the bunk; while there is, the next grasp begins."""
         done = self.activity
         if done is not None and done.idle:
-            self.tally.missed += done.failure is not None
-            self._failures = self._failures + 1 if done.failure is not None else 0
-            if done.done and done.grasp is not None:
-                self.tally.laid_down(len(done.grasp.logs))
+            self._failures = self._failures + 1 if self.cargo.unloaded(done) else 0
             self._since_ns = now_ns
             self._end_grasp()
             if self._failures >= STOPS:
@@ -443,9 +445,9 @@ class Manager:
         if self.activity is not None or self.outlook.counted_ns <= self._since_ns:
             return False
         if self.outlook.in_bunk:
-            self._begin_grasp(Mission(source=self._profile.bunk, target=self.outlook.pile_at(self._landing())))
+            self._begin_grasp(Mission(source=self._profile.bunk, target=self.outlook.pile_at(self.cargo.landing())))
             return False
-        self.tally.emptied(now_ns, self.ride.driven_m)
+        self.cargo.emptied(now_ns, self.ride.driven_m)
         self._unloaded = True
         return True
 

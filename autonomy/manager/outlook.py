@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -22,9 +23,12 @@ from autonomy.localization.plane import Plane
 from autonomy.logs import LogObservation
 from autonomy.manager.field import CONFIRMED, Field, FieldLog, nearest, told
 from autonomy.manager.memory import Memory
+from autonomy.manager.progress import Known, Missed
+from autonomy.manager.sorting import Sorting
 from autonomy.manager.stops import BaseAt, Reach, Stop, best_stop
 from autonomy.missions.area import Area
-from autonomy.missions.model import ForwardingMission
+from autonomy.missions.local import bearing_from_yaw
+from autonomy.missions.model import ForwardingMission, KnownLog, Point
 from autonomy.motion.arm import Arm
 from autonomy.navigation.curves import Point2
 from autonomy.perception.frame import Pose
@@ -50,11 +54,15 @@ PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M = 3.0, 2.6, 1.5
 
 
 class Outlook:
-    """One machine's view.  ``field`` are the logs that lie about; ``location`` is the newest, None before the first."""
+    """One machine's view.  ``field`` are the logs that lie about, of which ``sorting`` says what is wanted;
+    ``location`` is the newest, None before the first.  ``known`` is what was known of logs when the mission was left.
+    """
 
-    def __init__(self, profile: Profile, mission: ForwardingMission, plane: Plane | None = None) -> None:
+    def __init__(
+        self, profile: Profile, mission: ForwardingMission, plane: Plane | None = None, known: Known | None = None
+    ) -> None:
         assert profile.carrier is not None
-        self.field = Field(profile.bunk)
+        self.field, self.sorting = Field(profile.bunk), Sorting(mission)
         self.location: Location | None = None
         self.report: StateReport | None = None
         self.vehicle: VehicleReport | None = None
@@ -67,8 +75,11 @@ class Outlook:
         self._report_ns = self._vehicle_ns = 0
         self._bases: deque[tuple[int, Pose]] = deque(maxlen=POSES)
         self._numbers: dict[int, int] = {}
+        self.landings: list[Point2] = []
+        """In the plane, once that is known."""
         self._places = tuple(landing.position for landing in mission.landings)
         self._listed = mission.logs if mission.options.logs == "listed" else ()
+        self._known = known or Known()
         self._fences, self._area = mission.fences, Area()
 
     @property
@@ -76,11 +87,6 @@ class Outlook:
         """The local plane; known once the machine is located."""
         assert self._localizer.plane is not None
         return self._localizer.plane
-
-    @property
-    def landings(self) -> list[Point2]:
-        """The landings in the plane."""
-        return [self.plane.local(p.latitude_deg, p.longitude_deg)[:2] for p in self._places]
 
     @property
     def located(self) -> bool:
@@ -120,8 +126,11 @@ class Outlook:
                     self._look_up()
 
     def _look_up(self) -> None:
-        """What the mission says of places, in the plane that is now known: fences, and logs that need not be found."""
+        """What the mission says of places, in the plane that is now known: landings, fences, and logs that need not be
+        found.
+        """
         plane = self.plane
+        self.landings = [plane.local(p.latitude_deg, p.longitude_deg)[:2] for p in self._places]
         rings = [
             (np.array([plane.local(c.latitude_deg, c.longitude_deg)[:2] for c in fence.corners]), fence.keep_out)
             for fence in self._fences
@@ -130,7 +139,26 @@ class Outlook:
         ground_m = float(self.base.position_m[2]) + self._ground_z_m
         for log in self._listed:
             self.field.known(told(log, plane, ground_m))
-        self._listed = ()
+        for number in self._known.gone:
+            self.field.remove(number)
+        for missed in self._known.missed:
+            lay = told(missed.log, plane, ground_m)
+            self.field.restore(replace(lay, number=missed.number, misses=missed.misses, hits=0))
+        self.field.number_from(self._known.free)
+
+    def known(self) -> Known:
+        """What is to be remembered of the logs when the mission is left now."""
+        if not self._bases:
+            return self._known
+        gone = tuple(n for n in range(1, len(self._listed) + 1) if self.field.get(n) is None)
+        return Known(gone, tuple(self._as_missed(log) for log in self.field.missed_ones), self.field.free)
+
+    def _as_missed(self, log: FieldLog) -> Missed:
+        x, y, _ = log.center_m.tolist()
+        place = Point(*self.plane.geodetic(x, y)[:2])
+        bearing = bearing_from_yaw(math.atan2(log.axis[1], log.axis[0]))
+        kept = KnownLog(place, "", bearing, log.length_m, log.diameter_m, "", log.assortment, None, log.sigma_m)
+        return Missed(log.number, kept, log.misses)
 
     def strayed_m(self) -> float:
         """How far the front axle or the crane's foot is from where the fences let the machine drive, m; 0 inside."""
@@ -267,13 +295,17 @@ class Outlook:
         work = sorted((self._reach.work_s(g.observation(self.base)), g.number, g) for g in logs)
         return [g for seconds, _, g in work if math.isfinite(seconds)]
 
+    def lying(self) -> list[FieldLog]:
+        """The logs that can be collected: not given up, and not on a landing."""
+        return [g for g in self.field.logs if g.misses < ATTEMPTS and not self.on_landing(g)]
+
+    def on_landing(self, log: FieldLog) -> bool:
+        """Whether a log has come to a landing."""
+        return any(math.dist(log.center_m[:2], at) <= PILE_LENGTH_M for at in self.landings)
+
     def _wanted(self) -> list[FieldLog]:
-        """The logs that are to be collected: not given up, and not on a landing."""
-        landings = self.landings if self._places else []
-        return [
-            g for g in self.field.logs
-            if g.misses < ATTEMPTS and all(math.dist(g.center_m[:2], at) > PILE_LENGTH_M for at in landings)
-        ]  # fmt: skip
+        """Those of them that are to come into the load on board."""
+        return [g for g in self.lying() if self.sorting.wants(g.assortment)]
 
     def _matter(self) -> list[FieldLog]:
         """Those of them for which it may be worth to stop soon."""

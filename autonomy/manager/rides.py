@@ -6,19 +6,22 @@ A `Ride` wraps the navigator and the way under it, so that the manager only says
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from typing import Final
 
 from autonomy.localization.estimate import Location
 from autonomy.localization.plane import Plane
+from autonomy.manager.progress import Left
 from autonomy.manager.stops import base_on_way
-from autonomy.missions.model import ForwardingMission
+from autonomy.manager.turning import turns
+from autonomy.missions.model import ForwardingMission, Point
 from autonomy.navigation.along import Along
 from autonomy.navigation.curves import Path, PathRefused, Point2, drivable
 from autonomy.navigation.navigator import Navigator, Phase
 from autonomy.navigation.waypoints import PaperB, Waypoint
 from autonomy.perception.frame import Pose
+from machine.carrier import turning_radius_m
 from machine.profile import Carrier
 
 AHEAD_M: Final = 3.0
@@ -29,6 +32,10 @@ BESIDE_M: Final = 4.2
 """The machine passes a landing at this distance: there the crane lays down best."""
 BEFORE_M, BEYOND_M = 10.0, 10.0
 """The way past a landing is straight from so far before it to so far beyond."""
+ROOMY: Final = 1.5
+"""The machine turns round in circles that are so much wider than its smallest: the bends begin and end gently."""
+NEAR_M: Final = 10.0
+"""A corner that is so near may be cut: the machine was in its bend when it was left there."""
 DIRECTIONS: Final = 12
 AGAIN_M: Final = 6.0
 """After a landing the machine comes back to its route so far before the place where it left it."""
@@ -40,11 +47,21 @@ StopOn = Callable[[Callable[[float], Pose], float], float | None]
 class Ride:
     """The mission's route.  ``faithful`` drives it by paper B's law.
 
-    ``along_m`` is the way driven on it, ``length_m`` all of it; ``driven_m`` is all that was driven.
+    ``along_m`` is the way driven on it, ``length_m`` all of it; ``driven_m`` is all that was driven.  ``left``: it goes
+    on where it was left, after so much way.
     """
 
-    def __init__(self, carrier: Carrier, navigator: Navigator, mission: ForwardingMission, faithful: bool) -> None:
-        self.along_m = self.length_m = self.driven_m = 0.0
+    def __init__(
+        self,
+        carrier: Carrier,
+        navigator: Navigator,
+        mission: ForwardingMission,
+        faithful: bool,
+        left: Left | None = None,
+        driven_m: float = 0.0,
+    ) -> None:
+        self.along_m = self.length_m = 0.0
+        self.driven_m = driven_m
         self.faithful = faithful
         self._carrier, self._navigator, self._mission = carrier, navigator, mission
         self._speed = mission.options.speed_m_s
@@ -52,7 +69,11 @@ class Ride:
         self._path: Path | None = None
         self._marks: list[tuple[float, Point2]] = []
         self._haul: Along | None = None
-        self._over = False
+        self._left, self._to_come, self._new = left, 0, True
+        self._begun: Left | None = None
+        """Where the route was begun that is driven now, if it was left before."""
+        self._plane: Plane | None = None
+        self._over = left is not None and left.ended
         self._last: Point2 | None = None
 
     @property
@@ -68,16 +89,45 @@ class Ride:
         return self._navigator.phase is Phase.ARRIVED and self._navigator.stands
 
     def begin(self, location: Location, plane: Plane) -> None:
-        """Plan the route from where the machine stands; raises PathRefused when it cannot be driven."""
+        """Plan the route from where the machine stands, all of it or what is left of it; raises PathRefused when it
+        cannot be driven.
+        """
+        left, self._left, self._plane = self._left, None, plane
+        self._begun = left
         places = [p for _ in range(self._mission.options.laps) for p in self._mission.waypoints]
-        points = [plane.local(p.latitude_deg, p.longitude_deg)[:2] for p in places]
-        self.along_m, self._last = 0.0, None
+        places = places if left is None else places[len(places) - left.to_come :]
+        points = _points(plane, places)
+        self.along_m, self._last, self._over, self._haul = 0.0, None, False, None
+        self._to_come = len(points)
         if self.faithful:
             ways = [Waypoint(p.latitude_deg, p.longitude_deg) for p in places]
             self._way = PaperB(self._carrier, ways, self._speed)
             self.length_m = sum(math.dist(a, b) for a, b in pairwise([(location.x_m, location.y_m), *points]))
             return
-        self._route(location, points)
+        by, back = ([], []) if left is None else (_points(plane, left.by), _points(plane, left.at or ()))
+        if back or by or points:
+            self._again(location, back, by, points, turn=left is not None or not self._new)
+            self._new = False
+        else:
+            self._over = True
+
+    def renew(self) -> None:
+        """The route is to begin once more."""
+        self._way, self._path, self._left = None, None, None
+        self.along_m, self.length_m, self._over = 0.0, math.inf, False
+
+    def left(self, plane: Plane | None) -> Left | None:
+        """Where the route is left now, for one that goes on with it later; None before it was begun."""
+        if isinstance(self._way, PaperB):
+            return Left(self._to_come - self._way.number, ended=self.ended)
+        if self._path is None:
+            return self._left
+        if self._begun is not None and self.along_m < AT_M:
+            return self._begun
+        assert plane is not None
+        by, rest = self._ahead()
+        before, at = (_place(plane, p) for p in self._back())
+        return Left(len(rest), (before, at), tuple(_place(plane, p) for p in by), bool(self.ended))
 
     def go(self, stop_m: float | None = None) -> None:
         """Drive on, and stop at a distance along the route [m], or (None) at its end."""
@@ -94,32 +144,92 @@ class Ride:
     def haul(self, location: Location, landing: Point2, stop_on: StopOn) -> None:
         """Drive to a landing by the shortest way that passes it with room for the crane; PathRefused when none does."""
         if self._haul is None:
-            ways = []
-            for points in _past(landing):
-                try:
-                    path = self._from(location, points)
-                except PathRefused:
-                    continue
-                stop_m = stop_on(lambda s, path=path: self._base(path, s), path.length_m)
-                if stop_m is not None:
-                    ways.append((stop_m, path))
+            ways = self._reaching(location, _past(landing), stop_on)
+            # Beside it or too near to it for a plain way: a little ahead, or round about.
+            ways = ways or self._reaching(location, [[]], stop_on)
+            round_about = ([*turn, *points] for points in _past(landing) for turn in self._turned(location, points))
+            ways = ways or self._reaching(location, round_about, stop_on)
             if not ways:
                 raise PathRefused("no way leads past the landing with room to turn; move it or give it more room")
             stop_m, path = min(ways, key=lambda w: w[0])
             self._haul = Along(self._carrier, path, stop_m, self._speed)
         self._drive(self._haul)
 
+    def _reaching(self, location: Location, ways: Iterable[list[Point2]], stop_on: StopOn) -> list[tuple[float, Path]]:
+        """Of the ways by these points those that can be driven and stopped on, each with where to stop [m]."""
+        found = []
+        for points in ways:
+            try:
+                path = self._from(location, points)
+            except PathRefused:
+                continue
+            stop_m = stop_on(lambda s, path=path: self._base(path, s), path.length_m)
+            if stop_m is not None:
+                found.append((stop_m, path))
+        return found
+
     def rejoin(self, location: Location) -> None:
         """Plan the rest of the route anew, from the landing to where it was left."""
         self._haul = None
         if self._over or self._path is None:
             return
-        rest = [point for mark, point in self._marks if mark > self.along_m + AT_M]
-        left = [self._path.at(self.along_m - AGAIN_M)[:2], self._path.at(self.along_m)[:2]]
-        try:
-            self._route(location, [*left, *rest])
-        except PathRefused:
-            self._route(location, rest)
+        if self._begun is not None and self.along_m < AT_M:
+            assert self._plane is not None
+            self._left = self._begun
+            self.begin(location, self._plane)
+            return
+        by, rest = self._ahead()
+        self._to_come = len(rest)
+        self._again(location, self._back(), by, rest, turn=True)
+
+    def _again(
+        self, location: Location, back: Sequence[Point2], by: Sequence[Point2], rest: Sequence[Point2], turn: bool
+    ) -> None:
+        """The route from where it was left by other places and the rest; where there is no room to come back, as for a
+        machine that is there still, by what is ahead of it or past a place that is too near to turn at, and where there
+        is none for that either, with a turn before it.
+        """
+        here = (location.x_m, location.y_m)
+        ways = [[*back, *by, *rest]] if back else []
+        ways += [[*by, *rest]] if by else []
+        ways, refused = [*ways, list(rest)], []
+        past = [list(rest[1:])] if turn and len(rest) > 1 and math.dist(here, rest[0]) < NEAR_M else []
+        for points in (*ways, *past):
+            try:
+                self._route(location, points)
+                return
+            except PathRefused as error:
+                refused.append(error)
+        for points in ways if turn else ():
+            for corners in self._turned(location, points):
+                try:
+                    self._route(location, [*corners, *points])
+                    return
+                except PathRefused:
+                    continue
+        raise refused[-1]
+
+    def _turned(self, location: Location, points: Sequence[Point2]) -> Iterator[list[Point2]]:
+        """Places to drive by so that the machine comes to the first of these points along their first leg."""
+        if not points:
+            return
+        here, yaw = (location.x_m, location.y_m), location.yaw_rad
+        ahead = (here[0] + AHEAD_M * math.cos(yaw), here[1] + AHEAD_M * math.sin(yaw))
+        a, b = points[:2] if len(points) > 1 else (here, points[0])
+        leg = math.atan2(b[1] - a[1], b[0] - a[0])
+        radius_m = ROOMY * turning_radius_m(self._carrier, self._carrier.articulation_limit_rad)
+        yield from turns((*ahead, yaw), (*points[0], leg), radius_m)
+
+    def _back(self) -> tuple[Point2, Point2]:
+        """Where the route is left, and a bit before."""
+        assert self._path is not None
+        return self._path.at(self.along_m - AGAIN_M)[:2], self._path.at(self.along_m)[:2]
+
+    def _ahead(self) -> tuple[list[Point2], list[Point2]]:
+        """The places that the route still leads to: those that are no waypoints, and then the waypoints."""
+        ahead = [point for mark, point in self._marks if mark > self.along_m + AT_M]
+        others = len(ahead) - min(len(ahead), self._to_come)
+        return ahead[:others], ahead[others:]
 
     def moved(self, location: Location) -> None:
         """Keep account of the way that was driven."""
@@ -143,9 +253,9 @@ class Ride:
             del points[0]
         self._path = path = self._from(location, points)
         self._way, self.length_m, self.along_m = Along(self._carrier, path, None, self._speed), path.length_m, 0.0
-        self._marks, low = [], 0.0
-        for point in points:
-            low = path.nearest(*point, low)
+        self._marks, low, before = [], 0.0, (location.x_m, location.y_m)
+        for point in points:  # bends are shorter than their corners; beyond that it may be the place of another lap
+            low, before = path.nearest(*point, low, low + math.dist(before, point) + 2.0 * AHEAD_M), point
             self._marks.append((low, point))
 
     def _from(self, location: Location, points: Sequence[Point2]) -> Path:
@@ -167,6 +277,14 @@ class Ride:
             self._navigator.resume()
         else:
             self._navigator.drive(way)
+
+
+def _points(plane: Plane, places: Iterable[Point]) -> list[Point2]:
+    return [plane.local(p.latitude_deg, p.longitude_deg)[:2] for p in places]
+
+
+def _place(plane: Plane, point: Point2) -> Point:
+    return Point(*plane.geodetic(*point)[:2])
 
 
 def _past(landing: Point2) -> Iterator[list[Point2]]:

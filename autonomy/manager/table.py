@@ -39,27 +39,30 @@ class State(IntEnum):
 class Event(IntEnum):
     """What has come about; the order is the order in which they are asked for."""
 
-    AUTO = 0
-    AT_HEIGHT = 1
-    LOG_NEAR = 2
-    STANDING = 3
-    AVERAGED = 4
-    GONE = 5
-    INSIDE = 6
-    OUTSIDE = 7
-    ARRIVED = 8
-    VALID = 9
-    INVALID = 10
-    COLLECTED = 11
-    MISSED = 12
-    LOADED = 13
-    EMPTY = 14
-    STOWED = 15
-    ROUTE_END = 16
-    TIME_OUT = 17
+    RESUMED = 0
+    AUTO = 1
+    AT_HEIGHT = 2
+    LOG_NEAR = 3
+    STANDING = 4
+    AVERAGED = 5
+    GONE = 6
+    INSIDE = 7
+    OUTSIDE = 8
+    ARRIVED = 9
+    VALID = 10
+    INVALID = 11
+    COLLECTED = 12
+    MISSED = 13
+    LOADED = 14
+    EMPTY = 15
+    STOWED = 16
+    ROUND_END = 17
+    ROUTE_END = 18
+    TIME_OUT = 19
 
 
 EVENTS: Final[Mapping[Event, str]] = {
+    Event.RESUMED: "the switch is at Auto, and the mission was begun before the planner was started again",
     Event.AUTO: "the switch is at Auto",
     Event.AT_HEIGHT: "all four arms are at the wanted height",
     Event.LOG_NEAR: "a log is near enough to stop for",
@@ -76,6 +79,7 @@ EVENTS: Final[Mapping[Event, str]] = {
     Event.LOADED: "the bunk is full or holds all that is wanted, or the route has ended with logs on board",
     Event.EMPTY: "nothing is left in the bunk",
     Event.STOWED: "the crane rests over the bunk",
+    Event.ROUND_END: "the last waypoint is reached, and logs that other landings take still lie along the route",
     Event.ROUTE_END: "the last waypoint is reached, or all logs that are wanted are taken",
     Event.TIME_OUT: "it takes too long",
 }
@@ -134,6 +138,7 @@ RULES: Final[Mapping[State, Rule]] = {
 Table = Mapping[tuple[State, Event], State]
 
 PAPER_B: Final[Table] = {
+    (State.IDLE, Event.RESUMED): State.STOW,
     (State.IDLE, Event.AUTO): State.RAISE,
     (State.RAISE, Event.AT_HEIGHT): State.SEARCH,
     (State.SEARCH, Event.LOG_NEAR): State.HALT,
@@ -156,10 +161,12 @@ PAPER_B: Final[Table] = {
 }
 
 OURS: Final[Table] = {
+    (State.IDLE, Event.RESUMED): State.STOW,
     (State.IDLE, Event.AUTO): State.RAISE,
     (State.RAISE, Event.AT_HEIGHT): State.SEARCH,
     (State.SEARCH, Event.LOADED): State.HAUL,
     (State.SEARCH, Event.LOG_NEAR): State.APPROACH,
+    (State.SEARCH, Event.ROUND_END): State.RAISE,
     (State.SEARCH, Event.ROUTE_END): State.DONE,
     (State.APPROACH, Event.ARRIVED): State.CHECK,
     (State.APPROACH, Event.GONE): State.SEARCH,

@@ -31,16 +31,19 @@ class Taken(msgspec.Struct, frozen=True):
 
 
 class Load(msgspec.Struct, frozen=True):
-    """What the mission brought to a landing at once; ``driven_m`` since the load before."""
+    """What was brought at once to a landing, by its place in the mission; ``driven_m`` since the load before."""
 
     logs: tuple[Taken, ...]
     at_ns: int
     driven_m: float
+    landing: int = 0
 
 
 @dataclass(slots=True)
 class Tally:
-    """Counts and sums of a mission; ``on_board`` are the logs in the bunk now, ``loads`` what went to landings."""
+    """Counts and sums of a mission; ``on_board`` logs are in the bunk now, ``board`` are those of them that the mission
+    took, ``loads`` went to landings, the last one after ``counted_m`` of the mission's way.
+    """
 
     loaded: int = 0
     unloaded: int = 0
@@ -53,15 +56,15 @@ class Tally:
     """A log was gripped for which the bunk had no room."""
     given_up: dict[int, str] = field(default_factory=dict)
     loads: list[Load] = field(default_factory=list)
-    _board: list[Taken] = field(default_factory=list)
-    _driven_m: float = 0.0
+    board: list[Taken] = field(default_factory=list)
+    counted_m: float = 0.0
 
     def took(self, logs: Sequence[Taken], load_kg: float) -> None:
         """A grasp that went into the bunk."""
         self.grasps += 1
         self.loaded += len(logs)
         self.on_board += len(logs)
-        self._board += logs
+        self.board += logs
         self.board_m3 += sum(log.volume_m3 for log in logs)
         self.board_kg += load_kg if math.isfinite(load_kg) else 0.0
 
@@ -76,9 +79,9 @@ class Tally:
         self.unloaded += logs
         self.on_board = max(0, self.on_board - logs)
 
-    def emptied(self, now_ns: int, driven_m: float) -> None:
+    def emptied(self, now_ns: int, driven_m: float, landing: int = 0) -> None:
         """Nothing is left in the bunk, after so much way of the whole mission [m]."""
-        if self._board:  # and not only what was on board before
-            self.loads.append(Load(tuple(self._board), now_ns, driven_m - self._driven_m))
-        self._board, self._driven_m = [], driven_m
+        if self.board:  # and not only what was on board before
+            self.loads.append(Load(tuple(self.board), now_ns, driven_m - self.counted_m, landing))
+        self.board, self.counted_m = [], driven_m
         self.on_board, self.board_m3, self.board_kg, self.brimful = 0, 0.0, 0.0, False

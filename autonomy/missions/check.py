@@ -51,7 +51,7 @@ def problems_of(
     found = list(_together(mission)) or list(_at_site(mission, site))
     if found or not _named(mission):
         return found
-    return [*_fences(mission), *_route(mission)] or list(_within(mission))
+    return [*_fences(mission), *_route(mission), *_assortments(mission)] or list(_within(mission))
 
 
 def area_of(mission: ForwardingMission, frame: LocalFrame) -> Area:
@@ -219,12 +219,30 @@ def _route(mission: ForwardingMission) -> Iterator[Problem]:
         yield key, f"{what(key)} is the same place as waypoint {i + 1}; delete one of them"
     if mission.options.laps > 1 and len(at) < 2:
         yield None, f"laps is {mission.options.laps} but there is one waypoint; a round has at least two"
-    if mission.options.sort_by_assortment and mission.landings:
-        takers = {name for landing in mission.landings for name in landing.assortments}
-        if not all(landing.assortments for landing in mission.landings):
-            return
+
+
+def _assortments(mission: ForwardingMission) -> Iterator[Problem]:
+    """Choosing and sorting: nobody sees what a log is for, so the mission must say it.
+
+    A mission without logs may get them from a harvester's file.
+    """
+    options = mission.options
+    name = "sort_by_assortment" if options.sort_by_assortment else "assortments" if options.assortments else ""
+    if not name:
+        return
+    if options.logs != "listed":
+        yield None, f'{name} needs to know what each log is; list the logs and set logs to "listed", or leave it out'
+    elif mission.logs and not any(log.assortment for log in mission.logs):
+        yield None, f"{name} needs to know what each log is, and no log says it; give the logs an assortment"
+    if not options.sort_by_assortment:
+        return
+    if not mission.landings:
+        yield None, "sort_by_assortment is on, and there is no landing to sort to; add landings"
+    elif all(landing.assortments for landing in mission.landings):
+        takers = {kind for landing in mission.landings for kind in landing.assortments}
         for i, log in enumerate(mission.logs):
-            if log.assortment and log.assortment not in takers:
+            wanted = not options.assortments or log.assortment in options.assortments
+            if log.assortment and wanted and log.assortment not in takers:
                 yield ("log", i), f'log {i + 1} is "{log.assortment}", which no landing takes; name it at a landing'
 
 

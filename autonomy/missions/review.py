@@ -73,6 +73,7 @@ def review(mission: ForwardingMission, profile: Profile) -> Review:
         *_tight(corners, ways, lengths, radius),
         *_room(mission, frame, carrier),
         *_logs(mission, frame, at, ways, profile),
+        *_unlisted(mission),
     ]
     return Review(length, length / speed, logs, LOG_S * logs, corners, tuple(warnings))
 
@@ -176,6 +177,13 @@ def _logs(
     on_route = np.flatnonzero((away < half) & known)
     under = [f"log {i + 1} lies on the route; the wheels would roll over it" for i in on_route]
     return [*_few(far), *_few(under)]
+
+
+def _unlisted(mission: ForwardingMission) -> list[str]:
+    """Assortments that are to be collected, and of which no log is."""
+    listed = {log.assortment for log in mission.logs}
+    return _few([f'no log is "{name}", which is to be collected' for name in mission.options.assortments
+                 if name not in listed])  # fmt: skip
 
 
 def _few(sentences: list[str]) -> list[str]:

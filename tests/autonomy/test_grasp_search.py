@@ -10,7 +10,7 @@ import pytest
 from grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
 
 from autonomy.grasp.cylinders import cylinders, default_covariance, draws_of, grounded, grounded_covariance
-from autonomy.grasp.direct import Planned, hover_height, only
+from autonomy.grasp.direct import Planned, choose, hover_height, only
 from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.quality import lies_upon, rate, sections
@@ -182,3 +182,34 @@ def test_a_mission_that_names_its_log_is_served_directly() -> None:
     assert [o.id for o in grasp.logs] == [1] and not grasp.gathered
     opening = grasp.pose.slew_rad + grasp.pose.rot_rad
     assert abs(remainder(opening - atan2(0.0, 1.0), pi)) == pytest.approx(pi / 2)
+
+
+def test_what_is_to_stay_is_never_taken_and_still_in_the_way() -> None:
+    apart = [log(0, -0.3), log(1, 0.3)]
+    assert Search()(ARM, apart, 0.0, 0.0).logs == (0, 1)
+    p = Search()(ARM, apart, 0.0, 0.0, stay={0})
+    assert p.logs == (1,) and p.y_m > Y + 0.3, "the tongs come down beside it"
+    with pytest.raises(NoGrasp, match="no grasp of the 1 log is safe"):
+        Search()(ARM, pair(), 0.0, 0.0, stay=(0,))
+    with pytest.raises(NoGrasp, match="all that are in view are to stay"):
+        Search()(ARM, pair(), 0.0, 0.0, stay=(0, 1))
+
+
+def test_nothing_is_taken_from_under_a_log_that_is_to_stay() -> None:
+    logs = small_pile()
+    assert 2 not in Search()(ARM, [*logs[:2], log(2, 1.0)], 0.0, 0.0, stay=(2,)).logs
+    with pytest.raises(NoGrasp):
+        Search()(ARM, logs, 0.0, 0.0, stay=(2,))
+
+
+def test_a_mission_says_which_logs_are_left_by_their_numbers() -> None:
+    apart = [log(7, -0.3), log(8, 0.3)]
+    grasp = Planned(Search())(ARM, Mission(leave=(7,)), apart, 0.0, 0.0)
+    assert grasp.log.id == 8 and not grasp.others
+    assert ARM.xy(grasp.pose)[1] > Y + 0.3, "the planner knows of the one that stays"
+    assert choose(ARM, Mission(leave=(8,)), apart, 0.0, 0.0).log.id == 7
+    for chooser in (choose, Planned(Search())):
+        with pytest.raises(NoGrasp, match="every log that lies there is to stay"):
+            chooser(ARM, Mission(leave=(7, 8)), apart, 0.0, 0.0)
+        with pytest.raises(NoGrasp, match="no log lies outside the bunk"):
+            chooser(ARM, Mission(leave=(7, 8)), [], 0.0, 0.0)

@@ -198,7 +198,26 @@ def test_sorting_needs_a_landing_for_every_assortment() -> None:
     log = feature("Point", lon_lat([at(0, -9)])[0], role="log", assortment="veneer")
     landing = feature("Point", lon_lat([at(0, 9)])[0], role="landing", assortments=["pulpwood"])
     sort = {"timberhand": {"schema": 1, "options": {"sort_by_assortment": True}}}
+    sort["timberhand"]["options"]["logs"] = "listed"
     assert 'log 1 is "veneer", which no landing takes' in told(collection(line(), log, landing, **sort))
+    sort["timberhand"]["options"]["assortments"] = ["pulpwood"]
+    good(collection(line(), log, landing, **sort))  # it stays lying
+    assert "there is no landing to sort to; add landings" in told(collection(line(), log, **sort))
+
+
+@pytest.mark.parametrize("name", ["sort_by_assortment", "assortments"])
+def test_choosing_needs_logs_that_say_what_they_are(name: str) -> None:
+    landing = feature("Point", lon_lat([at(0, 9)])[0], role="landing")
+    log = feature("Point", lon_lat([at(0, -9)])[0], role="log")
+    options: dict[str, object] = {name: True if name.startswith("sort") else ["pulpwood"]}
+    head = {"timberhand": {"schema": 1, "options": options}}
+    searched = told(collection(line(), log, landing, **head))
+    assert searched == (
+        f'm: {name} needs to know what each log is; list the logs and set logs to "listed", or leave it out'
+    )
+    options["logs"] = "listed"
+    assert "and no log says it; give the logs an assortment" in told(collection(line(), log, landing, **head))
+    good(collection(line(), landing, **head))  # a harvester's file may bring the logs
 
 
 def test_the_line_of_every_kind_of_problem() -> None:

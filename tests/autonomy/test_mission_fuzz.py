@@ -136,12 +136,14 @@ def missions(draw: st.DrawFn) -> ForwardingMission:
         )
         for _ in range(draw(st.integers(0, 2)))
     ]  # fmt: skip
+    source = draw(st.sampled_from(["search", "listed"]))
+    chooses = source == "listed" and (not logs or any(log.assortment for log in logs))
     options = Options(
         laps=draw(st.integers(1, 3)) if count > 1 else 1,
         speed_m_s=draw(maybe(st.floats(0.1, 2.0))),
-        logs=draw(st.sampled_from(["search", "listed"])),
+        logs=source,
         logs_wanted=draw(maybe(st.integers(1, 100))),
-        assortments=tuple(draw(st.lists(TEXT, max_size=2))),
+        assortments=tuple(draw(st.lists(TEXT, max_size=2))) if chooses else (),
     )
     return ForwardingMission(draw(TEXT), tuple(way), tuple(fences), tuple(landings), tuple(logs), options)
 

@@ -104,6 +104,12 @@ def test_how_many_logs_are_fetched() -> None:
     assert Way(SQUARE).review(logs_wanted=7).logs == 7
 
 
+def test_an_assortment_of_which_there_is_no_log() -> None:
+    log = KnownLog(at(0, -12), assortment="pulpwood")
+    warnings = Way(SQUARE).review(log, assortments=("pulpwood", "pulp wood"), logs="listed").warnings
+    assert warnings == ('no log is "pulp wood", which is to be collected',)
+
+
 def test_another_country_and_a_machine_that_does_not_drive() -> None:
     chile = ForwardingMission("", (Point(-38.0, -72.0), Point(-38.0, -72.001)), (), (), ())
     assert "km from the site in the machine's profile" in review(chile, AORO).warnings[0]

@@ -15,7 +15,7 @@ from autonomy.carried import laid
 from autonomy.grasp.direct import Planned, lies_in
 from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.press import DEPTH_M, SHUNNED_M, Press
-from autonomy.grasp.proposal import NoGrasp
+from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.search import Search
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
@@ -71,6 +71,14 @@ def test_no_tip_comes_down_on_the_middle_of_a_log() -> None:
 def test_logs_that_lie_on_no_others_are_left_to_the_other_planner() -> None:
     p = planner()(ARM, row(0, 3, 0), 0.0, 0.0)
     assert not p.pressed and p == Search()(ARM, row(0, 3, 0), 0.0, 0.0)
+
+
+def test_a_row_of_which_no_grasp_is_safe_is_pressed_into() -> None:
+    def never(*_: object) -> GraspProposal:
+        raise NoGrasp("no grasp of the 6 logs is safe")
+
+    p = Press(never)(ARM, row(0, 6, 0), 0.0, 0.0)
+    assert p.pressed and p.logs and p.support_z_m >= BUNK.floor_z_m
 
 
 def test_nothing_in_view_is_no_grasp() -> None:
@@ -144,3 +152,12 @@ def test_a_log_that_rolls_beside_a_landing_is_laid_down_but_not_one_that_still_h
     assert not lies_in(pile, rolled) and laid(unloading, pile, rolled)
     assert not laid(unloading, pile, hanging) and not laid(loading, pile, rolled)
     assert not laid(unloading, pile, replace(rolled, center_m=(*BUNK.center_m, 0.6)))
+
+
+def test_no_place_is_pressed_into_where_a_log_that_is_to_stay_is_between_the_tongs() -> None:
+    logs = heap()
+    taken = planner()(ARM, logs, 0.0, 0.0).logs
+    other = planner()(ARM, logs, 0.0, 0.0, stay=taken[:1])
+    assert other.pressed and taken[0] not in other.logs and other.logs
+    with pytest.raises(NoGrasp):
+        planner()(ARM, logs, 0.0, 0.0, stay=range(len(logs)))

@@ -174,3 +174,13 @@ def test_predictions_are_averaged_where_they_belong() -> None:
         maps.append(GraspMaps(q, q, q))
     mean = averaged(maps, cameras, float(box.centroid_m[2]))
     assert mean.q[149:152, 149:152].sum() == pytest.approx(1.0) and mean.q[150, 150] >= 0.25
+
+
+def test_the_network_plans_as_if_logs_that_are_to_stay_were_not_there() -> None:
+    logs = [log(0, -0.4), log(1), log(2, 0.4)]
+    planner = CnnPlanner(Chosen(150.0, 150.0, pi / 2))
+    without = planner(ARM, [logs[1]], 0.0, 0.0)
+    p = planner(ARM, logs, 0.0, 0.0, stay={0, 2})
+    assert p.logs == (1,) and (p.x_m, p.y_m) == (without.x_m, without.y_m)
+    with pytest.raises(NoGrasp, match="no log is in view"):
+        planner(ARM, logs, 0.0, 0.0, stay=range(3))

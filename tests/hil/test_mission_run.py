@@ -12,7 +12,7 @@ from autonomy.localization.plane import Plane
 from autonomy.manager.chart import diagram, page
 from autonomy.manager.table import OURS, PAPER_B
 from autonomy.missions.files import save_mission
-from autonomy.missions.model import ForwardingMission, KnownLog, Options, Point
+from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Point
 from hil.exits import Exit
 from hil.mission import unheeded
 from timberhand.cli import app
@@ -61,10 +61,8 @@ def test_a_machine_that_stands_still_drives_no_mission(tmp_path: Path) -> None:
 
 def test_what_a_mission_asks_for_in_vain_is_said() -> None:
     assert unheeded(ForwardingMission("plain", (point(0.0, 0.0),))) == []
-    asks = ForwardingMission(
-        "asks", (point(0.0, 0.0),), options=Options(assortments=("pulp",), sort_by_assortment=True)
-    )
-    assert len(unheeded(asks)) == 2 and "every assortment" in unheeded(asks)[0]
+    asks = ForwardingMission("asks", (point(0.0, 0.0),), landings=(Landing(point(5.0, 5.0), bearing_deg=40.0),))
+    assert len(unheeded(asks)) == 1 and "bearing_deg" in unheeded(asks)[0]
 
 
 @pytest.mark.slow

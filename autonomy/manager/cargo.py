@@ -1,0 +1,123 @@
+"""The load: what is on board, whether more is wanted, what comes up together, and what each grasp is to the tally."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from autonomy.activity import Activity
+from autonomy.logs import LogObservation
+from autonomy.manager.outlook import Outlook
+from autonomy.manager.progress import Progress, copied
+from autonomy.manager.tally import Taken, Tally, volume_m3
+from autonomy.missions.model import ForwardingMission, Point
+from autonomy.navigation.curves import Point2
+from machine.profile import Profile
+
+
+class Cargo:
+    """Of one mission; logs of a list are known by the outlook's numbers.  ``progress``: where it goes on."""
+
+    def __init__(
+        self, profile: Profile, mission: ForwardingMission, outlook: Outlook, progress: Progress | None = None
+    ) -> None:
+        self.tally, self.sorting = Tally(), outlook.sorting
+        if progress is not None:
+            self.tally = copied(progress.tally)
+            self.sorting.goes_on(progress.landing, progress.served, progress.rounds)
+        self._outlook, self._bunk = outlook, profile.bunk
+        self._wanted, self._lands = mission.options.logs_wanted, bool(mission.landings)
+
+    @property
+    def enough(self) -> bool:
+        """Whether as many logs were taken as the mission wants."""
+        return self._wanted is not None and self.tally.loaded >= self._wanted
+
+    @property
+    def full(self) -> bool:
+        """Whether no more log is wanted: there are enough, or the bunk is full, to the brim, or as full as it need be
+        where there is a landing to bring it to.
+        """
+        full = self.tally.brimful or (self._lands and self.tally.full(self._bunk))
+        return full or self.enough
+
+    @property
+    def loaded(self) -> bool:
+        """Whether there is something to bring to a landing: taken in this mission, or seen on board."""
+        tally = self.tally
+        return self._lands and (tally.on_board > 0 or bool(tally.board) or self._outlook.in_bunk > 0)
+
+    @property
+    def another_round(self) -> bool:
+        """Whether the route is to be driven anew for logs of other landings."""
+        return not self.enough and self.sorting.anew(log.assortment for log in self._outlook.lying())
+
+    @property
+    def bound_for(self) -> str:
+        """The landing that the load goes to, as people call it; empty where there is one alone, or none is decided."""
+        return self.sorting.called(self.sorting.landing)
+
+    def landing(self) -> Point2:
+        """The middle of the landing that the load is brought to now, in the plane."""
+        here, places = self._outlook.location, self._outlook.landings
+        assert here is not None
+        return places[self.sorting.sets_out(places, (here.x_m, here.y_m))]
+
+    def leave(self, logs: Sequence[LogObservation], target: int | None) -> tuple[int, ...]:
+        """The numbers of a list's logs that are to stay when one grasp takes the target and others with it."""
+        field, outlook = self._outlook.field, self._outlook
+        first = None if target is None else field.get(target)
+        found = []
+        for log in logs:
+            number = outlook.number_of(log.id)
+            lay = None if number is None else field.get(number)
+            kind, with_ = ("" if known is None else known.assortment for known in (lay, first))
+            if not self.sorting.together(kind, with_) or (lay is not None and outlook.on_landing(lay)):
+                found.append(log.id)
+        return tuple(found)
+
+    def took(self, job: Activity, now_ns: int) -> None:
+        """A grasp lies in the bunk."""
+        assert job.grasp is not None
+        taken = [self._taken(log, now_ns) for log in job.grasp.logs]
+        self.tally.took(taken, job.lifted_kg)
+        self.sorting.took(log.assortment for log in taken)
+
+    def _taken(self, log: LogObservation, now_ns: int) -> Taken:
+        """A log of the grasp no longer lies in the field; in the tally it does with where it had lain."""
+        outlook = self._outlook
+        number = outlook.number_of(log.id)
+        lay = None if number is None else outlook.field.get(number)
+        if number is not None:
+            outlook.field.remove(number)
+        at = outlook.base.to_base(np.asarray(log.center_m)) if lay is None else lay.center_m
+        lat, lon, _ = outlook.plane.geodetic(float(at[0]), float(at[1]))
+        wood = volume_m3(log.length_m, log.diameter_m)
+        return Taken(Point(lat, lon), now_ns, wood, "" if lay is None else lay.assortment)
+
+    def missed(self, job: Activity, target: int | None, for_good: bool) -> None:
+        """The crane came back empty; a log that was missed too often (``for_good``: now) is given up."""
+        assert job.failure is not None
+        tally = self.tally
+        tally.missed += 1
+        number = self._outlook.number_of(job.grasp.log.id) if job.grasp is not None else target
+        if job.no_room:
+            tally.brimful = True
+            if number is not None and not self._lands:
+                tally.given_up[number] = job.failure
+        elif number is not None and self._outlook.missed(number, for_good):
+            tally.given_up[number] = job.failure
+
+    def unloaded(self, job: Activity) -> bool:
+        """A grasp from the bunk is over; whether it was none."""
+        failed = job.failure is not None
+        self.tally.missed += failed
+        if job.done and job.grasp is not None:
+            self.tally.laid_down(len(job.grasp.logs))
+        return failed
+
+    def emptied(self, now_ns: int, driven_m: float) -> None:
+        """Nothing is left in the bunk."""
+        self.tally.emptied(now_ns, driven_m, self.sorting.landing or 0)
+        self.sorting.unloaded()

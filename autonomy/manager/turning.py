@@ -1,0 +1,61 @@
+"""How a machine that looks elsewhere turns onto a way: two arcs and a straight piece between them (Dubins 1957).
+
+The ways are given by the corners of polygons round the arcs; `autonomy.navigation.curves.drivable` rounds them with
+bends of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from autonomy.navigation.curves import Point2
+
+Heading = tuple[float, float, float]
+"""A place [m] and a direction there [rad]."""
+
+
+def turns(start: Heading, goal: Heading, radius_m: float) -> Iterator[list[Point2]]:
+    """The corners of all ways from one heading to another with two arcs of a radius, the shortest way first."""
+    ways = []
+    for first in (1.0, -1.0):
+        for last in (1.0, -1.0):
+            begin, end = _middle(start, first, radius_m), _middle(goal, last, radius_m)
+            apart = math.dist(begin, end)
+            straight = math.atan2(end[1] - begin[1], end[0] - begin[0])
+            if first != last:
+                if apart < 2.0 * radius_m:
+                    continue  # the circles overlap: no straight way leads from one side to the other
+                straight += first * math.asin(2.0 * radius_m / apart)
+            out, back = _angle(first * (straight - start[2])), _angle(last * (goal[2] - straight))
+            along = apart if first == last else math.sqrt(apart**2 - 4.0 * radius_m**2)
+            ways.append((radius_m * (out + back) + along, first, out, last, back))
+    for _, first, out, last, back in sorted(ways):
+        onto = (goal[0], goal[1], goal[2] + math.pi)
+        yield [*_corners(start, first, out, radius_m), *reversed(_corners(onto, -last, back, radius_m))]
+
+
+def _middle(at: Heading, side: float, radius_m: float) -> Point2:
+    """The middle of the circle to the left (1) or right (-1)."""
+    x, y, yaw = at
+    return x - side * radius_m * math.sin(yaw), y + side * radius_m * math.cos(yaw)
+
+
+def _angle(turn_rad: float) -> float:
+    """Of an arc that turns by this, 0 to 2 pi; rounding makes no circle of none."""
+    angle = turn_rad % (2.0 * math.pi)
+    return 0.0 if angle > 2.0 * math.pi - 1e-6 else angle
+
+
+def _corners(at: Heading, side: float, angle_rad: float, radius_m: float) -> list[Point2]:
+    """Of a polygon round an arc from a heading to the left (1) or right (-1); none turns by more than a right angle."""
+    x, y, yaw = at
+    count = math.ceil(angle_rad / (0.5 * math.pi) - 1e-9)
+    found = []
+    for _ in range(count):
+        reach_m = radius_m * math.tan(0.5 * angle_rad / count)
+        x, y = x + reach_m * math.cos(yaw), y + reach_m * math.sin(yaw)
+        found.append((x, y))
+        yaw += side * angle_rad / count
+        x, y = x + reach_m * math.cos(yaw), y + reach_m * math.sin(yaw)
+    return found

@@ -1,0 +1,212 @@
+"""Which logs are collected and where they go: the rules alone, and whole missions on the stand-in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from autonomy.grasp.direct import Planned
+from autonomy.grasp.search import Search
+from autonomy.manager.manager import Manager
+from autonomy.manager.sorting import Sorting
+from autonomy.manager.table import State
+from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
+from machine.load import profile_hash
+from tests.autonomy.forwarder_stand_in import Forwarder
+from tests.autonomy.test_manager import PLANE, PROFILE, at, ended, place, states, whole
+from tests.autonomy.test_manager_field import lying
+
+SAW, PULP, ALL, NONE = ("saw logs",), ("pulpwood",), (), ("energy",)
+Lie = tuple[str, float, float]
+"""A log's assortment and place [m]; it lies along the way."""
+
+
+def sorting(*takes: tuple[str, ...], sorts: bool = True, only: tuple[str, ...] = ()) -> Sorting:
+    landings = tuple(Landing(Point(63.0, 19.0), "", None, names) for names in takes)
+    options = Options(logs="listed", sort_by_assortment=sorts, assortments=only)
+    return Sorting(ForwardingMission(landings=landings, options=options))
+
+
+def mission(
+    lie: Sequence[Lie], landings: Sequence[tuple[float, float, tuple[str, ...]]] = (), end_m: float = 26.0, **options
+) -> ForwardingMission:
+    way = (place(10.0, 0.0), place(end_m, 0.0))
+    known = tuple(KnownLog(place(x, y), "", 90.0, 2.0, 0.25, "", kind) for kind, x, y in lie)
+    piles = tuple(Landing(place(x, y), "" if i else "Road", None, kinds) for i, (x, y, kinds) in enumerate(landings))
+    return ForwardingMission("test", way, (), piles, known, Options(logs="listed", **options))
+
+
+def forwarder(lie: Sequence[Lie]) -> Forwarder:
+    logs = [lying(number, x, y, 0.0) for number, (_, x, y) in enumerate(lie, 1)]
+    return Forwarder(PROFILE, PLANE, logs, (0.0, 0.1, 0.05))
+
+
+def managed(told: ForwardingMission, **how) -> Manager:
+    manager = Manager(PROFILE, profile_hash(PROFILE), told, plane=PLANE, **how)
+    manager.auto()
+    return manager
+
+
+# ---------------------------------------------------------------------- the rules
+def test_without_a_choice_every_log_is_wanted() -> None:
+    plain = sorting(SAW, PULP, sorts=False)
+    assert not plain.chooses and plain.wants("") and plain.wants("veneer")
+
+
+def test_logs_of_other_assortments_and_unknown_ones_stay_lying() -> None:
+    only = sorting(sorts=False, only=SAW)
+    assert only.chooses and only.wants("saw logs") and not only.wants("pulpwood") and not only.wants("")
+
+
+def test_the_first_landing_that_names_an_assortment_takes_it_else_the_first_that_names_none() -> None:
+    several = sorting(ALL, SAW, ALL, (*PULP, *SAW))
+    assert [several.taker(kind) for kind in ("saw logs", "pulpwood", "veneer", "")] == [1, 3, 0, 0]
+    assert sorting(SAW).taker("pulpwood") is None and not sorting(SAW).wants("pulpwood")
+
+
+def test_the_first_log_aboard_decides_until_the_load_is_unloaded() -> None:
+    both = sorting(SAW, PULP)
+    assert both.wants("saw logs") and both.wants("pulpwood")
+    both.took(["pulpwood", "saw logs"])
+    assert both.landing == 1 and both.wants("pulpwood") and not both.wants("saw logs")
+    both.took(["saw logs"])
+    assert both.landing == 1, "one that came up by mistake changes nothing"
+    both.unloaded()
+    assert both.wants("saw logs")
+
+
+def test_a_first_grasp_holds_what_one_landing_takes() -> None:
+    both = sorting(SAW, PULP)
+    assert both.together("pulpwood", "pulpwood") and not both.together("saw logs", "pulpwood")
+    assert sorting(SAW, PULP, sorts=False).together("saw logs", "pulpwood")
+
+
+def test_a_load_goes_to_the_nearest_landing_and_does_not_change_its_mind() -> None:
+    plain = sorting(ALL, ALL, sorts=False)
+    assert plain.sets_out([(0.0, 0.0), (9.0, 0.0)], (8.0, 0.0)) == 1
+    assert plain.sets_out([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 1
+    plain.unloaded()
+    assert plain.sets_out([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 0
+    sorted_ = sorting(SAW, PULP)
+    sorted_.took(PULP)
+    assert sorted_.sets_out([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 1
+
+
+def test_another_round_is_for_what_the_load_of_this_one_had_no_place_for() -> None:
+    both = sorting(SAW, PULP)
+    assert not both.anew(PULP), "nothing was loaded"
+    both.took(SAW)
+    assert both.anew(PULP) and not both.anew(SAW) and not both.anew(NONE)
+    both.unloaded()
+    both.took(PULP)
+    assert both.anew(SAW), "some of it was passed while the other was on board"
+    both.begins_anew()
+    assert both.rounds == 1 and not both.anew(SAW)
+    assert not sorting(SAW, PULP, sorts=False).anew(PULP)
+
+
+def test_a_landing_is_called_by_its_name_or_number_where_there_are_several() -> None:
+    several = Sorting(mission((), ((0.0, 0.0, ()), (9.0, 0.0, ()))))
+    assert [several.called(i) for i in (0, 1, None)] == ["Road", "landing 2", ""]
+    assert sorting(ALL).called(0) == ""
+
+
+KINDS = st.sampled_from(["", "saw logs", "pulpwood", "energy"])
+
+
+@given(
+    st.lists(st.lists(KINDS.filter(bool), max_size=2).map(tuple), min_size=1, max_size=4),
+    st.lists(KINDS.filter(bool), max_size=2).map(tuple),
+    st.lists(st.lists(KINDS, min_size=1, max_size=3), max_size=6),
+)
+def test_what_is_wanted_always_goes_where_the_load_goes(takes, only, grasps) -> None:
+    rules = sorting(*takes, only=only)
+    for kinds in grasps:
+        taken = [k for k in kinds if rules.wants(k) and rules.together(k, kinds[0])]
+        rules.took(taken)
+        assert not taken or {rules.taker(k) for k in taken} == {rules.landing}
+        assert all(rules.taker(k) == rules.landing for k in taken) and (not only or set(taken) <= set(only))
+
+
+# ---------------------------------------------------------------------- whole missions
+@whole
+def test_unwanted_logs_stay_lying_and_nobody_stops_for_them() -> None:
+    lie = (("pulpwood", 14.0, 4.2), ("saw logs", 22.0, 4.4))
+    machine, manager = forwarder(lie), managed(mission(lie, assortments=SAW))
+    machine.run(manager, ended)
+    assert manager.state is State.DONE, manager.failure
+    assert machine.in_bunk == manager.tally.loaded == 1 and states(manager).count(State.APPROACH) == 1
+    assert machine.field[1].center_m[:2] == pytest.approx((14.0, 4.2), abs=0.01)
+
+
+@whole
+@pytest.mark.parametrize(("only", "grasp"), [(SAW, (2,)), ((), (1, 2))])
+def test_a_log_that_nobody_wants_is_not_scooped_up_with_its_neighbour(only, grasp) -> None:
+    lie = (("pulpwood", 18.0, 4.4), ("saw logs", 18.0, 4.9))
+    machine, manager = forwarder(lie), managed(mission(lie, assortments=only), chooser=Planned(Search()))
+    machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
+    assert manager.activity is not None and manager.activity.grasp is not None
+    assert sorted(log.id for log in manager.activity.grasp.logs) == list(grasp)
+
+
+@whole
+def test_the_first_grasp_of_a_sorted_load_is_of_one_landing() -> None:
+    lie = (("pulpwood", 18.0, 4.4), ("saw logs", 18.0, 4.9))
+    told = mission(lie, ((34.0, 14.0, SAW), (34.0, -14.0, PULP)), sort_by_assortment=True)
+    machine, manager = forwarder(lie), managed(told, chooser=Planned(Search()))
+    machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
+    assert manager.activity is not None and manager.activity.grasp is not None
+    assert len(manager.activity.grasp.logs) == 1
+
+
+@whole
+def test_two_landings_get_their_own_assortments_in_two_rounds() -> None:
+    lie = (("saw logs", 15.0, 4.2), ("pulpwood", 18.0, -4.4), ("veneer", 21.0, 4.4))
+    landings = ((34.0, 14.0, SAW), (34.0, -14.0, PULP))
+    machine, manager = forwarder(lie), managed(mission(lie, landings, sort_by_assortment=True))
+    words = set()
+
+    def over(_: Manager) -> bool:
+        words.add(manager.words)
+        return ended(manager)
+
+    machine.run(manager, over, 1500.0)
+    assert manager.state is State.DONE, manager.failure
+    first, second = (manager.tally.loads[k] for k in (0, 1))
+    assert {(load.landing, *(log.assortment for log in load.logs)) for load in (first, second)} == {
+        (0, "saw logs"), (1, "pulpwood"),
+    }  # fmt: skip
+    for number, (x, y, _) in zip((1, 2), landings, strict=True):
+        assert math.dist(machine.field[number].center_m[:2], (x, y)) < 1.6
+    assert machine.field[3].center_m[:2] == pytest.approx((21.0, 4.4), abs=0.01), "no landing takes it"
+    assert manager.outlook.sorting.rounds == 1, "in the second one both were served"
+    assert {"drives the load to the landing (Road)", "unloads the bunk (landing 2)"} <= words
+    assert "follows the waypoints and looks for logs (round 2)" in words
+
+
+@whole
+def test_the_round_in_which_nothing_was_loaded_is_the_last() -> None:
+    """A listed log that nobody finds calls for one more round, not for ever more."""
+    lie = (("saw logs", 15.0, 4.2), ("pulpwood", 18.0, -9.5))
+    landings = ((34.0, 14.0, SAW), (34.0, -14.0, PULP))
+    machine, manager = forwarder(lie), managed(mission(lie, landings, sort_by_assortment=True))
+    machine.run(manager, ended, 1500.0)
+    assert manager.state is State.DONE, manager.failure
+    assert manager.outlook.sorting.rounds == 1 and manager.tally.loaded == manager.tally.unloaded == 1
+    assert machine.field[2].center_m[:2] == pytest.approx((18.0, -9.5), abs=0.01)
+
+
+@whole
+def test_unsorted_a_load_goes_to_the_landing_that_is_nearest_when_the_machine_sets_out() -> None:
+    lie = (("saw logs", 15.0, 4.2),)
+    landings = ((-30.0, 12.0, SAW), (34.0, 14.0, PULP))
+    machine, manager = forwarder(lie), managed(mission(lie, landings))
+    machine.run(manager, at(State.HAUL))
+    machine.run(manager, ended, 900.0)
+    assert manager.state is State.DONE, manager.failure
+    (load,) = manager.tally.loads
+    assert load.landing == 1 and math.dist(machine.field[1].center_m[:2], (34.0, 14.0)) < 1.6
