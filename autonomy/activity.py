@@ -40,7 +40,7 @@ ATTEMPTS: Final = 3
 _LAYING: Final = 2.0
 """So much less near to its goal than elsewhere a log over the bunk need come: it need not lie so exactly."""
 _PRESS_S: Final = 0.6
-"""So long tongs that are pressed into a heap may still sink."""
+"""So long what is pressed onto a heap may still sink."""
 GATE_S: Final = 3.0
 """With so much of its way left an arm waits until the tongs are open: they are still high."""
 _SLOWEST: Final = 2.0
@@ -312,8 +312,8 @@ class Activity:
         way = self._pursuit
         if self.phase is Phase.CLOSE:
             return self._gripped() and (way.stands or way.left_s <= 0.0)
-        if self.phase is Phase.DESCEND and self._presses() and self._elapsed_s > way.motion.duration_s + _PRESS_S:
-            return True  # the tongs rest on wood; they sink as they close
+        if self._rests_on_wood():
+            return True
         share = _LAYING if self.phase in (Phase.CARRY, Phase.LOWER) else 1.0
         return way.clock_s >= way.motion.duration_s + settle_s and way.arrived(self._position(), share)
 
@@ -393,9 +393,12 @@ class Activity:
         """Whether a bundle comes up slowly."""
         return self.phase is Phase.LIFT and self.grasp is not None and self.grasp.gathered
 
-    def _presses(self) -> bool:
-        """Whether the tongs go down among logs."""
-        return self.grasp is not None and self.grasp.pressed
+    def _rests_on_wood(self) -> bool:
+        """Whether open tongs that are pressed into a heap get no deeper; they sink as they close."""
+        if self.phase is not Phase.DESCEND or self.grasp is None or not self.grasp.pressed:
+            return False
+        late = self._elapsed_s > self.motion.duration_s + _PRESS_S
+        return late or (self._pursuit.stands and self._elapsed_s > _PRESS_S)
 
     def _goes_on_so(self) -> bool:
         """Whether the motion will do for the log as it is now seen to hang, with another turn of the rotator."""

@@ -83,6 +83,7 @@ def test_a_held_log_is_between_the_tongs():
 def test_a_plain_sky_is_of_one_colour(pile, monkeypatch):
     monkeypatch.setattr(frames, "PLAIN_SHARE", 1.0)
     monkeypatch.setattr(frames, "_lens", lambda rgb, rng: rgb)
+    monkeypatch.setattr(frames, "_noisy", lambda machine, camera, picture, pin, rng: picture.depth_m)  # no holes
     seen = 0
     for seed in range(12):
         sample = draw(pile, seed, 96)
