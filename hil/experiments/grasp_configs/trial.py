@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
@@ -74,11 +74,13 @@ class Timed:
     proposal: GraspProposal | None = None
     seconds: float = math.nan
 
-    def __call__(self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float) -> GraspProposal:
+    def __call__(
+        self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float, stay: Collection[int] = ()
+    ) -> GraspProposal:
         """See ``autonomy.grasp.proposal``."""
         begun = time.perf_counter()
         try:
-            self.proposal = self.planner(arm, logs, slew_rad, rot_rad)
+            self.proposal = self.planner(arm, logs, slew_rad, rot_rad, stay)
         finally:
             self.seconds = time.perf_counter() - begun
         return self.proposal
