@@ -41,6 +41,8 @@ _LAYING: Final = 2.0
 """So much less near to its goal than elsewhere a log over the bunk need come: it need not lie so exactly."""
 _PRESS_S: Final = 0.6
 """So long what is pressed onto a heap may still sink."""
+_LOOSE_M: Final = 0.2
+"""So far over where it was gripped a bundle is let go again: pressed onto others, it would stop the crane."""
 GATE_S: Final = 3.0
 """With so much of its way left an arm waits until the tongs are open: they are still high."""
 _SLOWEST: Final = 2.0
@@ -210,7 +212,8 @@ class Activity:
     def _put_back(self, reason: str, start: tuple[float, ...]) -> None:
         """There is no way on with what is gripped: down again where it lay, and open the tongs."""
         assert self.grasp is not None
-        self._sorry, self.place = reason, self.grasp.pose
+        above_m = _LOOSE_M if self.grasp.gathered else 0.0  # what lay under a bundle has settled, and hangs lower now
+        self._sorry, self.place = reason, self.grasp.pose.at_height(self.grasp.pose.z_m + above_m)
         self._enter(Phase.LOWER, start)
 
     def _plan(self, phase: Phase, q: tuple[float, ...]) -> Trajectory:

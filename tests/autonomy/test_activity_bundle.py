@@ -16,6 +16,7 @@ from autonomy.grasp.search import Search
 from autonomy.logs import LogObservation
 from autonomy.phases import Phase
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, decode
+from machine.kinematics import Unreachable
 from machine.load import profile_hash
 
 
@@ -107,3 +108,14 @@ def test_a_single_log_of_many_is_taken_from_the_top_and_laid_down() -> None:
     until(crane, planner, Phase.CARRY)
     assert planner.grasp is not None and planner.grasp.log.id == 2
     assert not any(lies_in(PROFILE.bunk, log) for log in crane.logs)
+
+
+def test_a_bundle_without_a_way_on_is_let_go_a_little_over_where_it_lay(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise Unreachable("no way is clear")
+
+    monkeypatch.setattr("autonomy.activity.carrying", refuse)
+    crane, planner = made(pair())
+    until(crane, planner, Phase.OPEN)
+    assert planner.grasp is not None
+    assert 0.1 < crane.pin()[2] - planner.grasp.pose.z_m < 0.3
