@@ -48,10 +48,8 @@ FULLER: Final = 0.1
 """So much more of it makes a place worth a third."""
 SHUNNED_M: Final = 0.2
 """So near to a place where nothing came up none is tried."""
-STAYED_M: Final = 0.05
-"""What moved less than this did not come up."""
-SUCCESS: Final = 0.85
-"""Share of such grasps that bring something up (docs/productivity.md)."""
+SUCCESS: Final = 0.8
+"""Share of such grasps that bring something up: 22 of 28 while two bunks of 24 logs were emptied in the plant."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +73,7 @@ class Press:
 
     def __init__(self, single: Planner) -> None:
         self._single = single
-        self._last: tuple[tuple[float, float], dict[int, tuple[float, float, float]]] | None = None
+        self._last: tuple[tuple[float, float], set[int]] | None = None
         self._shunned: list[tuple[float, float]] = []
 
     def __call__(
@@ -111,20 +109,15 @@ class Press:
         """Whether the last proposal brought something up: if not, its place is shunned."""
         if self._last is None:
             return
-        at, then = self._last
-        here = {log.id: log.center_m for log in logs}
-        stayed = all(
-            number in here and np.linalg.norm(np.subtract(here[number], was)) < STAYED_M for number, was in then.items()
-        )
-        gone = any(number not in here for number in then)
+        at, wanted = self._last
         self._last = None
-        if stayed or not gone:
+        if wanted <= {log.id for log in logs}:
             self._shunned.append(at)
         else:
             self._shunned.clear()
 
     def _noted(self, found: GraspProposal, logs: Sequence[LogObservation]) -> GraspProposal:
-        self._last = (found.x_m, found.y_m), {logs[i].id: logs[i].center_m for i in found.logs}
+        self._last = (found.x_m, found.y_m), {logs[i].id for i in found.logs}
         return found
 
     def _places(self, arm: Arm, world: Cylinders, stay: Collection[int]) -> _Places:
