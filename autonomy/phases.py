@@ -59,3 +59,14 @@ BEGIN_AGAIN: Final = {
     Phase.OPEN: Phase.CARRY,
 }
 """Where an interrupted vertical phase begins again when the crane stands aside of its column."""
+
+
+def grapple(phase: Phase, gathered: bool, stows: bool) -> GrappleCommand:
+    """What the grapple does in a phase: with a bundle (``gathered``) it closes on, for the logs settle and the tongs
+    follow; at the end of a job that only ``stows`` the crane it does not open.
+    """
+    if gathered and Phase.LIFT <= phase <= Phase.LOWER:
+        return _CLOSE
+    if phase in RULES:
+        return RULES[phase].grapple
+    return _OPEN if phase is Phase.DONE and not stows else _HOLD

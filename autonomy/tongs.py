@@ -1,4 +1,7 @@
-"""What the controller's report says of the tongs: open, closed, clear of the logs; without a sensor they are timed."""
+"""The tongs: what they are told, and what the controller's report says of them, open, closed, clear of the logs.
+
+Without a sensor they are timed.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,9 @@ from typing import Final
 
 from autonomy.grasp.direct import Grasp, opened_angle
 from autonomy.grasp.heap import is_over
+from autonomy.heard import Heard
 from autonomy.motion.arm import Arm
-from can_dbc.setpoint import StateReport
+from can_dbc.setpoint import GrappleCommand, StateReport
 from machine.grapple import opening_pct_from_tong_angle, tip_below_pin_m, tong_angle_from_opening_pct
 from machine.profile import Bunk, Profile
 
@@ -68,3 +72,43 @@ def closed_for_s(profile: Profile, report: StateReport) -> float:
         return opening
     tongs = profile.grapple.tongs
     return tong_angle_from_opening_pct(tongs, opening) / tongs.angle_rad[-1] * profile.grapple.close_time_s
+
+
+class Tongs:
+    """Those of one job.  ``command`` is what they are told now."""
+
+    def __init__(self, profile: Profile, heard: Heard) -> None:
+        self.command = GrappleCommand.HOLD
+        self._profile, self._heard = profile, heard
+        self._opening_s = self._close_from_s = 0.0
+
+    def tell(self, command: GrappleCommand, dt_s: float) -> None:
+        """A command, from now on for so long."""
+        self.command = command
+        if command is GrappleCommand.OPEN:
+            self._opening_s += dt_s
+        elif command is not GrappleCommand.NEUTRAL:
+            self._opening_s = 0.0
+
+    @property
+    def open(self) -> bool:
+        """Whether they stand open."""
+        return opened(self._profile, self._heard.report, self._opening_s)
+
+    def gripped(self, closing_s: float) -> bool:
+        """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""
+        return gripped(self._heard.report, closing_s)
+
+    def released(self, grasp: Grasp, opening_s: float) -> bool:
+        """Whether they have left the logs of a grasp, ``opening_s`` after they were told to open there."""
+        return released(self._profile, self._heard.report, grasp, opening_s)
+
+    def follow(self) -> float:
+        """The pin is to follow them from now on: how long they have been closing, s; 0 where no sensor tells."""
+        measured_s = closed_for_s(self._profile, self._heard.report)
+        self._close_from_s = measured_s if isfinite(measured_s) else 0.0
+        return self._close_from_s
+
+    def pace(self, clock_s: float) -> float:
+        """How fast the pin is to go that has followed them for so much of its motion."""
+        return pace(closed_for_s(self._profile, self._heard.report) - self._close_from_s - clock_s)

@@ -19,6 +19,7 @@ from autonomy.grasp.direct import lies_in
 from autonomy.grasp.heap import fallen
 from autonomy.logs import LogObservation
 from autonomy.manager.field import Field
+from autonomy.manager.scale import Scale
 from autonomy.motion.arm import Arm
 from autonomy.perception.frame import Pose
 from autonomy.phases import Phase
@@ -29,8 +30,6 @@ from machine.profile import Profile, joint
 
 EVERY_NS: Final = 250_000_000
 AROUND_M: Final = 12.0
-FELT_KG: Final = 12.0
-"""What the scale must feel of a log that hangs in the grapple; less, and it stayed where it was."""
 LIFTED_M: Final = 0.5
 """Above this the scale is asked: before, the log may still lie."""
 
@@ -47,6 +46,7 @@ class Memory:
         """Logs of the grasp relative to pin and yaw of the grapple, from when it closed."""
         self._low_m = 0.0
         self._laid: list[LogObservation] = []
+        self._scale: Scale | None = None
         self._slipped = False
 
     @property
@@ -79,7 +79,7 @@ class Memory:
         moved = {log.id for log in self._laid}
         self._aboard = [log for log in self._aboard if log.id not in moved]
         self._aboard += [log for log in self._laid if lies_in(self._profile.bunk, log)]
-        self._laid, self._held, self._slipped = [], {}, False
+        self._laid, self._held, self._scale, self._slipped = [], {}, None, False
 
     def _follow(self, job: Activity, report: StateReport) -> None:
         """Note what the grapple closes on, what it loses and where it opens."""
@@ -87,21 +87,21 @@ class Memory:
         if grasp is None:
             return
         if job.phase < Phase.CLOSE:
-            self._held, self._slipped = {}, False
+            self._held, self._scale, self._slipped = {}, None, False
         elif Phase.LIFT <= job.phase < Phase.OPEN and not self._held and not self._slipped:
             pin, yaw = self._pin(report)
             self._low_m = pin[2]
-            self._held = {log.id: _relative(log, pin, yaw) for log in grasp.logs}
-        elif Phase.LIFT <= job.phase < Phase.OPEN and self._held:
-            risen = self._pin(report)[0][2] > self._low_m + LIFTED_M
-            if risen and math.isfinite(report.load_kg) and report.load_kg < FELT_KG:
-                self._held, self._slipped = {}, True
+            self._held, self._scale = {log.id: _relative(log, pin, yaw) for log in grasp.logs}, Scale(grasp.logs)
+        elif Phase.LIFT <= job.phase < Phase.OPEN and self._scale is not None:
+            self._scale.feel(report.stamp_ns, report.load_kg)
+            if self._scale.light and self._pin(report)[0][2] > self._low_m + LIFTED_M:
+                self._held, self._scale, self._slipped = {}, None, True
         elif Phase.OPEN <= job.phase <= Phase.DONE and self._held:
             under = [log for log in self._aboard if log.id not in self._held]
             laid: list[LogObservation] = []
             for log in self._hanging(report):
                 laid.append(fallen(self._profile.bunk, log, under + laid))
-            self._laid, self._held = laid, {}
+            self._laid, self._held, self._scale = laid, {}, None
 
     def _hanging(self, report: StateReport | None) -> list[LogObservation]:
         if not self._held or report is None:

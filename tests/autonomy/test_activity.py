@@ -295,6 +295,25 @@ def test_a_log_that_is_missed_three_times_ends_the_mission() -> None:
     assert not planner.done and planner.idle and crane.trace[-1].phase == "FAILED"
 
 
+@pytest.mark.parametrize("slips", [1, 9])
+def test_a_list_that_comes_late_is_judged_once(slips: int) -> None:
+    crane, planner = StandIn(PROFILE, [GROUND_LOG], slippery=slips), activity()
+    told, arrived_ns = crane.seen, None
+
+    def late() -> tuple[LogObservation, ...]:
+        """Nothing from the lift on until half a second after its end."""
+        nonlocal arrived_ns
+        if planner.phase in (Phase.LIFT, Phase.CARRY) and not (arrived_ns and crane.now_ns > arrived_ns + 500_000_000):
+            arrived_ns = (arrived_ns or crane.now_ns) if planner.arrived else None
+            return ()
+        return told()
+
+    crane.seen = late  # type: ignore[method-assign]
+    crane.run(planner)
+    assert planner.missed == min(slips, 3) and planner.done == (slips < 3)
+    assert phases(crane).count("LOOK") == min(slips + 1, 3)
+
+
 def test_a_log_that_is_lost_on_the_way_is_picked_again() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     run_until(crane, planner, Phase.CARRY, more_s=2.0)

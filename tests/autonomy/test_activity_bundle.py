@@ -114,7 +114,7 @@ def test_a_bundle_without_a_way_on_is_let_go_a_little_over_where_it_lay(monkeypa
     def refuse(*_: object, **__: object) -> None:
         raise Unreachable("no way is clear")
 
-    monkeypatch.setattr("autonomy.activity.carrying", refuse)
+    monkeypatch.setattr("autonomy.cycle.carrying", refuse)
     crane, planner = made(pair())
     until(crane, planner, Phase.OPEN)
     assert planner.grasp is not None

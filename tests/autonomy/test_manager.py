@@ -300,7 +300,7 @@ def test_a_bunk_that_is_full_to_the_brim_ends_the_collecting(table, monkeypatch)
             raise BunkFull("the bunk is full")
         return plan_place(arm, mission, grasp, logs, *held)
 
-    monkeypatch.setattr("autonomy.activity.plan_place", place)
+    monkeypatch.setattr("autonomy.cycle.plan_place", place)
     forwarder, manager = begin((*LOGS, (3, 40.0, 4.2, 0.0)), table, end_m=50.0)
     forwarder.run(manager, ended, 900.0)
     assert manager.state is State.DONE, (manager.failure, states(manager)[-6:])

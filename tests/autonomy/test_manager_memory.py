@@ -12,6 +12,7 @@ import pytest
 from autonomy.grasp.direct import is_held, lies_in, plan_grasp
 from autonomy.manager.field import Field
 from autonomy.manager.memory import EVERY_NS, Memory
+from autonomy.manager.scale import FEELING_NS
 from autonomy.motion.arm import Arm
 from autonomy.phases import Phase
 from machine.load import load_profile
@@ -53,7 +54,7 @@ class Hands:
         if phase is not None:
             self.job.phase = phase
         self.now_ns += EVERY_NS
-        report = SimpleNamespace(position=self.q, load_kg=self.load_kg)
+        report = SimpleNamespace(stamp_ns=self.now_ns, position=self.q, load_kg=self.load_kg)
         logs = self.memory.list(self.now_ns, self.field, HERE, report, self.job)
         assert logs is not None
         return logs
@@ -102,10 +103,23 @@ def test_a_log_that_the_scale_does_not_feel_lies_where_it_was() -> None:
     for phase in (Phase.CLOSE, Phase.LIFT):
         hands.step(phase)
     hands.to(grasp.pose.at_height(grasp.pose.z_m + 1.0))
-    hands.step()
-    (log,) = hands.step()
+    for _ in range(FEELING_NS // EVERY_NS + 2):
+        (log,) = hands.step()
     assert log.center_m == pytest.approx(grasp.log.center_m, abs=1e-6)
     assert hands.memory.aboard == 0
+
+
+def test_a_log_that_is_light_for_a_moment_still_hangs() -> None:
+    hands = Hands(field_of((-4.0, 3.0)))
+    hands.begin()
+    grasp, hands.load_kg = hands.job.grasp, 90.0
+    for phase in (Phase.CLOSE, Phase.LIFT):
+        hands.step(phase)
+    hands.to(grasp.pose.at_height(grasp.pose.z_m + 1.0))
+    for load_kg in (130.0, 160.0, 110.0, 90.0, 40.0, 3.0, 0.0, 0.0, 30.0, 90.0, 110.0):
+        hands.load_kg = load_kg
+        (log,) = hands.step()
+        assert log.center_m[2] > grasp.log.center_m[2] + 0.9
 
 
 def test_without_a_scale_the_log_is_believed_to_hang() -> None:

@@ -1,0 +1,184 @@
+"""One crane cycle: what is gripped, where it goes, the motion of each phase, and whether the newest list bears it out.
+
+A `Cycle` is asked by the activity, which alone knows when a phase begins and ends.  Joints are in ``Joint`` order, rad
+(EXT m).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import dist
+from typing import Final
+
+from autonomy import tongs
+from autonomy.carried import ASIDE_M, came_up, laid, picked, place_as_seen
+from autonomy.course import above, aimed, carrying, closing, gathering, stowing
+from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, lies_in, plan_place, retreat_height
+from autonomy.heard import Heard
+from autonomy.logs import LogObservation
+from autonomy.mission import Mission
+from autonomy.motion.arm import Arm, Pose
+from autonomy.motion.trajectory import Trajectory, hold, straight
+from autonomy.motion.ways import Motions
+from autonomy.phases import Phase
+from autonomy.stream import Axes
+from machine.grapple import grapple_yaw
+from machine.joints import Joint
+from machine.profile import Profile
+from machine.sag import sane_load_kg
+
+ATTEMPTS: Final = 3
+_LOOSE_M: Final = 0.2
+"""So far over where it was gripped a bundle is let go again: pressed onto others, it would stop the crane."""
+
+
+class Cycle:
+    """``grasp`` is what is gripped and ``place`` where it goes, each once it is chosen; ``lifted_kg`` hung in the
+    grapple, 0 when nobody weighs it; ``missed`` grasps came up empty.  ``profile`` is the machine as motions are
+    planned for it.
+    """
+
+    def __init__(self, profile: Profile, mission: Mission, motions: Motions, chooser: Chooser, heard: Heard) -> None:
+        self.grasp: Grasp | None = None
+        self.place: Pose | None = None
+        self.lifted_kg = 0.0
+        self.missed = 0
+        self._profile, self._mission, self._motions, self._choose = profile, mission, motions, chooser
+        self._target = mission.to(profile.bunk)
+        self._heard = heard
+        self._arm = Arm(profile, stretches=motions.stretches)
+        """With what hangs in the grapple in the present phase."""
+        self._begun_z_m = 0.0
+
+    @property
+    def gathered(self) -> bool:
+        """Whether a bundle is gripped: its logs settle when it is lifted, and the tongs follow."""
+        return self.grasp is not None and self.grasp.gathered
+
+    def choose(self, q: Axes) -> None:
+        """A grasp among the logs of the newest list, from where the crane stands; raises ``NoGrasp``."""
+        self.grasp = self._choose(self._arm, self._mission, self._heard.logs, q[Joint.SLEW], q[Joint.ROT])
+
+    def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
+        """The motion of a phase that begins at ``q``, with the grasp and the place as they are now seen to be best.
+        ``closing_s``: how long tongs that close have been closing.
+
+        Raises:
+            Unreachable, NoGrasp: there is no way, in one sentence.
+        """
+        self._begun_z_m = self._arm.pose(q).z_m
+        arm = self._arm = self._arm.loaded(self._hanging_kg(phase))
+        grasp, start, logs = self.grasp, arm.pose(q), self._heard.logs
+        if phase is Phase.STOW:
+            return stowing(arm, self._motions, start, logs)
+        if phase in (Phase.LOOK, Phase.OPEN, Phase.DONE, Phase.FAILED) or grasp is None:
+            return hold(q)
+        match phase:
+            case Phase.ABOVE:
+                return above(arm, self._motions, start, grasp, logs)
+            case Phase.DESCEND:
+                self.grasp = grasp = aimed(arm, grasp, logs)
+                return straight(arm, start, grasp.pose)
+            case Phase.CLOSE:
+                return closing(arm, start, grasp, closing_s)
+            case Phase.LIFT:
+                if grasp.gathered:
+                    return gathering(arm, start, grasp)
+                if not self._motions.direct:
+                    return straight(arm, start, grasp.pose.at_height(grasp.pose.z_m + LIFT_M))
+                self.place = plan_place(arm, self._mission, grasp, logs)
+                return carrying(arm, self._motions, start, self.place, grasp, logs, hangs=False)
+            case Phase.CARRY:
+                self.lifted_kg = arm.load_kg
+                self.place = plan_place(arm, self._mission, grasp, logs, grapple_yaw(self._profile, q))
+                return carrying(arm, self._motions, start, self.place, grasp, logs, hangs=True)
+        assert self.place is not None
+        if phase is Phase.LOWER:
+            return straight(arm, start, self.place)
+        return straight(arm, start, start.at_height(max(start.z_m, retreat_height(self._profile))))
+
+    def _hanging_kg(self, phase: Phase) -> float:
+        """What the crane carries in a phase: a log that it has lifted bends it, and nothing else does."""
+        return sane_load_kg(self._heard.report.load_kg) if Phase.LIFT < phase < Phase.RETREAT else 0.0
+
+    # ------------------------------------------------------------------ where the crane is
+    def is_aside(self, phase: Phase, q: Axes) -> bool:
+        """Whether it stands aside of the column in which it grips or lays down in a phase."""
+        assert self.grasp is not None
+        column = self.grasp.pose if phase < Phase.CARRY else self.place
+        assert column is not None
+        return self._off_m(q, column) > ASIDE_M
+
+    def is_over_the_grasp(self, q: Axes) -> bool:
+        """Whether what hangs in the grapple would come down where it was gripped."""
+        assert self.grasp is not None
+        return self._off_m(q, self.grasp.pose) < ASIDE_M
+
+    def _off_m(self, q: Axes, column: Pose) -> float:
+        return dist(self._arm.xy(self._arm.pose(q)), self._arm.xy(column))
+
+    def risen_m(self, q: Axes) -> float:
+        """How much higher it stands than where the phase began."""
+        return self._arm.pose(q).z_m - self._begun_z_m
+
+    def is_among_stakes(self, q: Axes) -> bool:
+        """Whether tongs that open farther would stir what lies where the logs go."""
+        return tongs.among_stakes(self._arm, self._target, q)
+
+    # ------------------------------------------------------------------ what the newest list says
+    def first(self) -> LogObservation | None:
+        """The log that the grasp is of, as it is now seen; None when it is hidden."""
+        assert self.grasp is not None
+        return next((log for log in self._picked() if log.id == self.grasp.log.id), None)
+
+    def others(self) -> list[LogObservation]:
+        """The logs that are not of the grasp."""
+        taken = {log.id for log in self._picked()}
+        return [log for log in self._heard.logs if log.id not in taken]
+
+    def came_up(self, positions: Iterable[Axes]) -> bool:
+        """Whether what was gripped hangs under the crane, measured or sent, or is hidden; the grasp is of that now."""
+        assert self.grasp is not None
+        seen = self._picked()
+        held = came_up(self._arm, self.grasp, seen, [self._arm.pose(q) for q in positions])
+        self.grasp = held or self.grasp
+        return held is not None or not seen
+
+    def came_up_empty(self) -> str:
+        """Count a grasp that did; why there is to be no other, or empty."""
+        seen = self._picked()
+        lost = next((log for log in seen if lies_in(self._target, log)), None)
+        if lost is not None:
+            return f"log {lost.id} fell from the grapple into the bunk"
+        self.missed += 1
+        return "" if self.missed < ATTEMPTS else f"log {seen[0].id} was missed {ATTEMPTS} times"
+
+    def turn_on_the_way(self, q: Axes) -> float | None:
+        """How much farther the rotator is to turn [rad] on a way that is driven already, for what is now seen to hang;
+        None when it asks for another way.
+        """
+        assert self.grasp is not None and self.place is not None
+        place = place_as_seen(self._arm, self._mission, self.grasp, self.place, self._heard.logs, q)
+        if place is None:
+            return None
+        turn = place.rot_rad - self.place.rot_rad
+        self.place, self.lifted_kg = place, self._hanging_kg(Phase.CARRY)
+        return turn
+
+    def put_back(self) -> None:
+        """There is no way on with what is gripped: its place is where it lay."""
+        assert self.grasp is not None
+        above_m = _LOOSE_M if self.grasp.gathered else 0.0  # what lay under a bundle has settled, and hangs lower now
+        self.place = self.grasp.pose.at_height(self.grasp.pose.z_m + above_m)
+
+    def astray(self) -> str:
+        """Why what was let go does not lie where it was to be; empty when it does."""
+        log = next((log for log in self._picked() if not laid(self._mission, self._target, log)), None)
+        if log is None:
+            return ""
+        x, y, z = log.center_m
+        return f"log {log.id} was released but lies at ({x:.2f}, {y:.2f}, {z:.2f}) m, not in the bunk"
+
+    def _picked(self) -> list[LogObservation]:
+        assert self.grasp is not None
+        return picked(self.grasp, self._heard.logs)
