@@ -35,6 +35,8 @@ KINDS: Final = {
 }
 """Arrangements and how many logs they may have."""
 PILE_ROWS: Final = {2: (2,), 3: (2, 1), 4: (3, 1), 5: (3, 2), 6: (3, 2, 1)}
+ROUTE_BEND_M: Final = 6.5
+"""Radius of the bends in which a machine rounds the corners of its route."""
 ROUTE_CLEAR_M: Final = 1.8  # half a machine and a margin: no log lies nearer to the route
 ROUTE_START_M: Final = 6.0
 HEAP_M: Final = 0.5  # so far above its stakes a bunk is filled; it sinks as it comes to rest
@@ -245,8 +247,27 @@ def _row(lumber: Lumber, logs: int, route: Sequence[tuple[float, float]]) -> tup
 
 def _off_route(s: LogSpec, route: Sequence[tuple[float, float]]) -> bool:
     flat = np.array([1.0, 1.0, 0.0])
-    way = np.array([(*point, 0.0) for point in route])
+    way = np.array([(*point, 0.0) for point in _driven(route)])
     return float(np.min(distances(spine(s)[0] * flat, way))) > ROUTE_CLEAR_M + s.diameter_m / 2
+
+
+def _driven(route: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The route with its corners rounded, each as widely as its legs allow."""
+    out = [route[0]]
+    for before, corner, after in zip(route, route[1:], route[2:], strict=False):
+        into = math.atan2(corner[1] - before[1], corner[0] - before[0])
+        turn = math.remainder(math.atan2(after[1] - corner[1], after[0] - corner[0]) - into, math.tau)
+        reach = min(math.dist(before, corner), math.dist(corner, after)) / 2.0
+        cut = min(ROUTE_BEND_M * math.tan(min(abs(turn), 3.0) / 2.0), reach)
+        if cut < 0.1:
+            out.append(corner)
+            continue
+        radius = math.copysign(cut / math.tan(min(abs(turn), 3.0) / 2.0), turn)
+        x, y = corner[0] - cut * math.cos(into), corner[1] - cut * math.sin(into)
+        for share in np.linspace(0.0, 1.0, 9):
+            bent = into + share * turn
+            out.append((x + radius * (math.sin(bent) - math.sin(into)), y - radius * (math.cos(bent) - math.cos(into))))
+    return [*out, route[-1]]
 
 
 def _bunk(lumber: Lumber, logs: int, profile: Profile) -> tuple[LogSpec, ...]:

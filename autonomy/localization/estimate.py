@@ -28,7 +28,7 @@ class Location:
     ``z_m`` the height of that middle, NaN while no altitude is known.  ``covariance`` (3, 3) is of x, y and yaw.
     ``course_rad`` is where the front axle really goes, ``speed_m_s`` how fast, ``slip_curve_1_m`` the curvature that
     slip adds to what the articulation makes.  Roll (+ right side down) and pitch (+ nose up) are of the rear half.
-    ``jumps`` counts how often the position was taken anew after it had been lost.
+    ``jumps`` counts how often position or heading were taken anew after they had been lost.
     """
 
     stamp_ns: int

@@ -62,6 +62,25 @@ class Filter(ExtendedKalmanFilter):
         self.P[places, :] = self.P[:, places] = 0.0
         self.P[places, places] = sigma_m**2
 
+    def begin_yaw(self, turn_rad: float, reach_m: float) -> None:
+        """The yaw anew, so much more than it was, all else as it was; the antenna is ``reach_m`` from the axle."""
+        places = [State.X, State.Y]
+        self.x[State.YAW] = wrapped(self.x[State.YAW] + turn_rad)
+        self.P[State.YAW, :] = self.P[:, State.YAW] = 0.0
+        self.P[State.YAW, State.YAW] = self._noise.heading_start_rad**2
+        self.P[places, places] += (reach_m * turn_rad) ** 2
+
+    @property
+    def heading_sigma_rad(self) -> float:
+        """Of one heading by both antennas."""
+        base = math.dist(self._carrier.antenna_main_m[:2], self._carrier.antenna_aux_m[:2])
+        return math.sqrt(2.0) * self._noise.phase_m / base
+
+    def heading_off(self, yaw_rad: float, stamp_ns: int) -> float:
+        """How much more a yaw by both antennas is than it ought to have been then [rad]."""
+        then = self._then(self._since(stamp_ns))
+        return wrapped(yaw_rad - then[State.YAW] - then[State.HEADING])
+
     def go(self, odometry: Odometry, stamp_ns: int) -> None:
         """On by what the machine did, to ``stamp_ns``."""
         before = self.x
@@ -102,12 +121,10 @@ class Filter(ExtendedKalmanFilter):
 
     def heading(self, yaw_rad: float, stamp_ns: int) -> bool:
         """A yaw of the front half by both antennas; False: outside the gate."""
-        base = math.dist(self._carrier.antenna_main_m[:2], self._carrier.antenna_aux_m[:2])
         h = np.zeros((1, SIZE))
         h[0, [State.YAW, State.HEADING]] = 1.0
-        then = self._then(self._since(stamp_ns))
-        off = wrapped(yaw_rad - then[State.YAW] - then[State.HEADING])
-        return self._take(np.array([off]), h, np.array([[2.0 * (self._noise.phase_m / base) ** 2]]))
+        off = self.heading_off(yaw_rad, stamp_ns)
+        return self._take(np.array([off]), h, np.array([[self.heading_sigma_rad**2]]))
 
     def turn(self, rate_rad_s: float, speed_m_s: float, over_ns: int, stamp_ns: int) -> bool:
         """A yaw rate, mean of the ``over_ns`` before ``stamp_ns``; False: outside the gate."""

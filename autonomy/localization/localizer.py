@@ -3,7 +3,8 @@
 ``Localizer.step(report)`` takes every ``VehicleReport`` and gives a ``Location`` at its stamp.  It holds no clock.
 Positions and headings count from when they were true, not from when they came (``LATENCY_NS``).  Without a position
 and a heading that fit, the machine is located by its wheels for ``RECKONING_NS`` and then is lost, with a reason; it
-is located again once ``AGREEING`` positions in a row fit, or agree with each other about another place.
+is located again once ``AGREEING`` positions in a row fit, or agree with each other about another place; so
+with headings, where the machine stands.
 """
 
 from __future__ import annotations
@@ -36,6 +37,11 @@ CREEP: Final = 0.8
 """
 AGREEING: Final = 5
 AGREE_SIGMAS: Final = 4.0
+MOST_TURN_RAD: Final = 0.5
+"""What turns the machine otherwise than its wheels say, as a log it ran into, turns it less; a heading that is farther
+off is a fault.
+"""
+STANDS_M_S: Final = 0.05
 FORGOTTEN_NS: Final = 1_000_000_000
 """After a longer gap between reports nobody knows what the machine did meanwhile."""
 BEGIN_M: Final = 3.0
@@ -58,6 +64,8 @@ class Localizer:
         self._position_ns = self._heading_ns = 0
         self._fitting = 0
         self._strays: list[np.ndarray] = []
+        self._turned: list[float] = []
+        """By how much the last headings did not fit."""
         self._jumps = 0
         self._z = (math.nan, math.inf)
 
@@ -100,8 +108,10 @@ class Localizer:
             then = report.heading_ns - LATENCY_NS
             if self._filter.heading(yaw_from_heading(report.heading_rad), then):
                 self._heading_ns = report.heading_ns
+                self._turned.clear()
             else:
                 self.rejected += 1
+                self._turn(report, then)
             if math.isfinite(report.yaw_rate_rad_s):
                 self._filter.turn(report.yaw_rate_rad_s, report.speed_m_s, TURN_OVER_NS, then)
 
@@ -149,6 +159,24 @@ class Localizer:
         self._position_ns, self._fitting = report.position_ns, AGREEING
         self._jumps += 1
         self._strays.clear()
+
+    def _turn(self, report: VehicleReport, then: int) -> None:
+        """Take the heading anew where the last ones of a machine that stands agree about another one."""
+        if self._status is not Status.LOST or abs(report.speed_m_s) > STANDS_M_S:
+            self._turned.clear()
+            return
+        self._turned.append(self._filter.heading_off(yaw_from_heading(report.heading_rad), then))
+        del self._turned[:-AGREEING]
+        turn = sum(self._turned) / len(self._turned)
+        apart = max(abs(t - turn) for t in self._turned)
+        agree = len(self._turned) == AGREEING and apart <= AGREE_SIGMAS * self._filter.heading_sigma_rad
+        if agree and abs(turn) <= MOST_TURN_RAD:
+            roll, pitch = self._lean(report)
+            reach = antenna_reach(self._carrier, roll, pitch, self._front_height(report))
+            self._filter.begin_yaw(turn, math.hypot(reach[0], reach[1]))
+            self._heading_ns = report.heading_ns
+            self._jumps += 1
+            self._turned.clear()
 
     def _height(self, report: VehicleReport, reach_m: float) -> None:
         """The axle's height: the receiver's altitudes, smoothed by how they scatter."""

@@ -211,13 +211,21 @@ class Manager:
     def _off(self) -> str:
         return "the switch is at Idle" if not self._auto and self.state not in ENDS | {State.IDLE} else ""
 
+    def _danger(self) -> str:
+        """Why a machine that drives must not drive on; empty while it may."""
+        if (strayed_m := self.outlook.strayed_m()) > STRAYED_M:
+            return f"the machine has left its fence by {strayed_m:.1f} m; drive it back by hand, and see its route"
+        if (log := self.outlook.in_the_way()) is not None:
+            return f"log {log.number} lies in the way of the wheels; clear it away, or lead the route round it"
+        return ""
+
     def _proceed(self, now_ns: int) -> None:
         """Change the state when something has come about."""
         if self._navigator.phase is Phase.STOPPED and RULES[self.state].drives:
             self._fail(self._navigator.reason)
             return
-        if RULES[self.state].drives and (strayed_m := self.outlook.strayed_m()) > STRAYED_M:
-            self._fail(f"the machine has left its fence by {strayed_m:.1f} m; drive it back by hand, and see its route")
+        if RULES[self.state].drives and (danger := self._danger()):
+            self._fail(danger)
             return
         event = self.waiting
         if event is None:

@@ -44,6 +44,10 @@ CIRCLE_M: Final = 5.3
 HORIZON_M: Final = 16.0
 """Logs that lie farther away along the way are no matter yet."""
 AHEAD_M: Final = 0.5
+BRAKING_M: Final = 0.5
+"""The machine comes to rest in this way from its usual speed."""
+SPINE: Final = 15
+"""Points along a log where it is asked whether a wheel meets it."""
 ATTEMPTS: Final = 3
 STANDS_M_S: Final = 0.02
 POSES: Final = 40
@@ -165,6 +169,20 @@ class Outlook:
         assert self.location is not None
         x, y, _ = self.base.position_m.tolist()
         return float(self._area.outside_m(np.array([[self.location.x_m, self.location.y_m], [x, y]])).max())
+
+    def in_the_way(self) -> FieldLog | None:
+        """The first log that a front wheel would run into next."""
+        assert self.location is not None
+        here, c = self.location, self._carrier
+        cos, sin = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
+        turn = np.array([[cos, -sin], [sin, cos]])
+        for log in self.field.logs:
+            spine = log.center_m + np.linspace(-0.5, 0.5, SPINE)[:, None] * log.length_m * log.axis
+            ahead, aside = ((spine[:, :2] - (here.x_m, here.y_m)) @ turn).T
+            near = (ahead > 0.0) & (ahead < c.wheel_radius_m + 0.5 * log.diameter_m + BRAKING_M)
+            if np.any(near & (np.abs(np.abs(aside) - 0.5 * c.track_width_m) < 0.5 * c.wheel_width_m)):
+                return log
+        return None
 
     def see(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
         """A list of logs in the base frame as it was at a moment; none counts before the machine is located."""

@@ -32,7 +32,7 @@ class Drive:
     def __init__(self, ground: Ground = FIRM, own: Individual | None = None, seed: int = 0, bend_rad: float = 0.2):
         self.vehicle = Vehicle(CARRIER, (3.0, -2.0, 1.0), ground, own or individual(seed), seed)
         self.localizer = Localizer(CARRIER, self.vehicle.plane)
-        self.bend_rad = bend_rad
+        self.bend_rad, self.speed_m_s = bend_rad, 0.6
         self.report: VehicleReport | None = None
         self.tamper = lambda report: report
 
@@ -47,7 +47,7 @@ class Drive:
             rate = 0.5 * self.bend_rad * math.cos(0.5 * t)
             self.vehicle.order(DriveSetpoint(
                 1, 0, report.stamp_ns, 10**9, Steering.ARTICULATION, 0.0, 0.0, self.bend_rad * math.sin(0.5 * t), rate,
-                0.6, (0.35,) * 4, False, False,
+                self.speed_m_s, (0.35,) * 4, False, False,
             ))  # fmt: skip
             self.report = self.tamper(report)
             out.append(self.localizer.step(self.report))
@@ -180,6 +180,30 @@ def test_positions_that_stay_elsewhere_are_believed_after_a_loss() -> None:
     assert "does not fit what the wheels do" in during[lost].reason
     assert statuses[-1] is Status.TRACKING and during[-1].jumps == 1
     assert np.hypot(during[-1].x_m - drive.vehicle.x - 4.0, during[-1].y_m - drive.vehicle.y + 3.0) < 0.15
+
+
+@pytest.mark.parametrize("turn_rad", [0.25, -0.4])
+def test_a_machine_that_was_turned_finds_its_heading_again_where_it_stands(turn_rad: float) -> None:
+    drive = Drive()
+    drive.on(5.0)
+    drive.speed_m_s = 0.0
+    drive.on(4.0)
+    drive.vehicle.yaw += turn_rad
+    after = drive.on(6.0)
+    assert Status.LOST in [one.status for one in after]
+    assert after[-1].status is Status.TRACKING and after[-1].jumps
+    x_m, y_m, yaw_rad = drive.off(after[-1])
+    assert abs(yaw_rad) < 0.03 and math.hypot(x_m, y_m) < 0.1
+
+
+def test_a_heading_that_nothing_can_have_made_is_not_believed() -> None:
+    drive = Drive()
+    drive.on(5.0)
+    drive.speed_m_s = 0.0
+    drive.on(4.0)
+    drive.vehicle.yaw += 1.2
+    last = drive.on(8.0)[-1]
+    assert last.status is Status.LOST and "does not fit what the wheels do" in last.reason
 
 
 def test_two_seconds_without_satellites_are_reckoned_and_then_it_is_lost() -> None:

@@ -23,6 +23,8 @@ from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.test_manager_field import lying
 
 PROFILE = load_profile("aoro_fc8")
+CARRIER = PROFILE.carrier
+assert CARRIER is not None
 PLANE = Plane(63.657853, 19.895562, 100.0)
 LOGS = ((1, 15.0, 4.2, 0.0), (2, 18.0, -4.4, 0.5))
 
@@ -102,6 +104,19 @@ def test_a_machine_that_has_left_its_fence_stands(keep_out: bool) -> None:
     for _ in range(60):
         forwarder.step(manager)
     assert forwarder.speed_m_s == 0.0 and 16.4 < forwarder.x_m < 17.6
+
+
+@pytest.mark.parametrize(("y_m", "yaw", "hit"), [(1.1, 0.0, True), (-1.4, 1.4, True), (0.0, 0.0, False)])
+def test_a_machine_does_not_run_into_a_log(y_m: float, yaw: float, hit: bool) -> None:
+    forwarder, manager = begin(((1, 15.0, y_m, yaw),), end_m=20.0)
+    forwarder.run(manager, ended)
+    if not hit:  # it passes below the machine, between the wheels
+        assert "in the way" not in manager.failure
+        return
+    assert manager.state is State.FAILED and manager.failure.startswith("log 1 lies in the way of the wheels")
+    for _ in range(60):
+        forwarder.step(manager)
+    assert forwarder.speed_m_s == 0.0 and forwarder.x_m + CARRIER.wheel_radius_m < 15.0
 
 
 @whole
