@@ -18,9 +18,10 @@ from autonomy.heard import Heard
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
 from autonomy.motion.arm import Arm, Pose
-from autonomy.motion.trajectory import Trajectory, hold, straight
+from autonomy.motion.trajectory import Trajectory, brisk, hold, straight
 from autonomy.motion.ways import Motions
 from autonomy.phases import Phase
+from autonomy.rotator import is_counted
 from autonomy.stream import Axes
 from machine.grapple import grapple_yaw
 from machine.joints import Joint
@@ -45,6 +46,7 @@ class Cycle:
         self.missed = 0
         self._profile, self._mission, self._motions, self._choose = profile, mission, motions, chooser
         self._target = mission.to(profile.bunk)
+        self._brisk = is_counted(profile) and motions.direct
         self._heard = heard
         self._arm = Arm(profile, stretches=motions.stretches)
         """With what hangs in the grapple in the present phase."""
@@ -67,7 +69,12 @@ class Cycle:
             Unreachable, NoGrasp: there is no way, in one sentence.
         """
         self._begun_z_m = self._arm.pose(q).z_m
-        arm = self._arm = self._arm.loaded(self._hanging_kg(phase))
+        self._arm = self._arm.loaded(self._hanging_kg(phase))
+        motion = self._planned(phase, q, closing_s)
+        return brisk(self._arm, motion) if self._brisk else motion
+
+    def _planned(self, phase: Phase, q: Axes, closing_s: float) -> Trajectory:
+        arm = self._arm
         grasp, start, logs = self.grasp, arm.pose(q), self._heard.logs
         if phase is Phase.STOW:
             return stowing(arm, self._motions, start, logs)

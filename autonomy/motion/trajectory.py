@@ -27,6 +27,8 @@ _RISE_LEFT_M: Final = 0.12
 _WAY_LEFT_M: Final = 0.35
 """How far from the point under it a grapple may be when it starts to go down."""
 _SAME: Final = 1e-6
+_STEEPEST, _STRONGEST = 2.1875, 7.5132
+"""Greatest slope and greatest curvature of `progress`."""
 
 Axes = tuple[float, ...]
 
@@ -89,6 +91,28 @@ def turned(motion: Trajectory, from_s: float, by_rad: float) -> Trajectory:
     position[:, Joint.ROT] += by_rad * done
     t = np.clip(time, 0.0, 1.0)
     velocity[:, Joint.ROT] += by_rad * 140.0 * t**3 * (1.0 - t) ** 3 / span_s
+    return Trajectory([tuple(q) for q in position.tolist()], [tuple(v) for v in velocity.tolist()])
+
+
+def brisk(arm: Arm, motion: Trajectory) -> Trajectory:
+    """The motion with its turn of the rotator made at one go, when half of it was to be done.
+
+    For a rotator that is counted and not measured: what its valve gives is known to a few per mille of its stroke, a
+    third of a slow turn (measured on the plant: 6 deg of 23 over 6 s) and nothing of a quick one.
+    """
+    position, velocity = np.array(motion.position), np.array(motion.velocity)
+    angle = position[:, Joint.ROT]
+    turn = float(angle[-1] - angle[0])
+    speed, push = arm.speed[Joint.ROT], arm.acceleration[Joint.ROT]
+    span_s = max(_STEEPEST * abs(turn) / speed, float(np.sqrt(_STRONGEST * abs(turn) / push)), SHORTEST_S)
+    quicker = span_s < motion.duration_s and _STEEPEST * abs(turn) / span_s > np.max(np.abs(velocity[:, Joint.ROT]))
+    if not quicker or np.ptp(angle) > abs(turn) + _SAME:
+        return motion
+    half_s = float(np.argmin(np.abs(angle - angle[0] - 0.5 * turn))) * STEP_S
+    begin_s = min(max(half_s - 0.5 * span_s, 0.0), motion.duration_s - span_s)
+    t = np.clip((np.arange(len(position)) * STEP_S - begin_s) / span_s, 0.0, 1.0)
+    position[:, Joint.ROT] = angle[0] + turn * progress(t)
+    velocity[:, Joint.ROT] = turn * 140.0 * t**3 * (1.0 - t) ** 3 / span_s
     return Trajectory([tuple(q) for q in position.tolist()], [tuple(v) for v in velocity.tolist()])
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.timing import SWING_RAD
-from autonomy.motion.trajectory import Trajectory, follow, hold, progress, straight, travel
+from autonomy.motion.trajectory import Trajectory, across, brisk, follow, hold, progress, straight, travel
 from machine.joints import JOINTS
 from machine.kinematics import Unreachable, pin_position
 from machine.load import load_profile
@@ -146,3 +146,20 @@ def test_a_pose_outside_the_limits_is_refused_in_words() -> None:
         straight(ARM, near, near._replace(r_m=9.0))
     with pytest.raises(Unreachable, match="slew"):
         ARM.over(0.5, -4.0, -0.1, TOP)
+
+
+def test_a_brisk_turn_is_the_same_turn_in_less_time_and_within_the_limits() -> None:
+    arm = Arm(load_profile("aoro_fc8"))
+    start = np.array([0.0, 0.3, -1.5, 0.5, 0.0])
+    slow = across(arm, start, start + np.array([1.5, 0.2, 0.1, 0.4, 0.7]))
+    quick = brisk(arm, slow)
+    before, after = np.array(slow.position), np.array(quick.position)
+    assert after[:, :4] == pytest.approx(before[:, :4]) and len(after) == len(before)
+    assert after[[0, -1], 4] == pytest.approx(before[[0, -1], 4])
+    turns = [float(np.count_nonzero(np.abs(np.array(m.velocity)[:, 4]) > 0.02)) for m in (slow, quick)]
+    assert turns[1] < 0.7 * turns[0]
+    assert np.max(np.abs(np.array(quick.velocity)[:, 4])) <= arm.speed[4] + 1e-9
+    push = np.gradient(np.array(quick.velocity)[:, 4], 0.02)
+    assert np.max(np.abs(push)) <= 1.01 * arm.acceleration[4]
+    assert np.array(quick.velocity)[:, 4] == pytest.approx(np.gradient(after[:, 4], 0.02), abs=0.02)
+    assert brisk(arm, hold(start)).position == hold(start).position
