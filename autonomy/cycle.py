@@ -32,6 +32,9 @@ ATTEMPTS: Final = 3
 _LOOSE_M: Final = 0.2
 """So far over where it was gripped a bundle is let go again: pressed onto others, it would stop the crane."""
 
+_THERE_M, _THERE_RAD = 0.03, 0.03
+"""A crane so near to where it lets a log go need not go nearer."""
+
 
 class Cycle:
     """``grasp`` is what is gripped and ``place`` where it goes, each once it is chosen; ``lifted_kg`` hung in the
@@ -101,7 +104,7 @@ class Cycle:
                 return carrying(arm, self._motions, start, self.place, grasp, logs, hangs=True)
         assert self.place is not None
         if phase is Phase.LOWER:
-            return straight(arm, start, self.place)
+            return hold(q) if self._is_there(start, self.place) else straight(arm, start, self.place)
         return straight(arm, start, start.at_height(max(start.z_m, retreat_height(self._profile))))
 
     def _hanging_kg(self, phase: Phase) -> float:
@@ -120,6 +123,11 @@ class Cycle:
         """Whether what hangs in the grapple would come down where it was gripped."""
         assert self.grasp is not None
         return self._off_m(q, self.grasp.pose) < ASIDE_M
+
+    def _is_there(self, start: Pose, place: Pose) -> bool:
+        """Whether a log that is let go here is as well laid as at its place."""
+        apart_m = dist((*self._arm.xy(start), start.z_m), (*self._arm.xy(place), place.z_m))
+        return apart_m < _THERE_M and abs(start.rot_rad - place.rot_rad) < _THERE_RAD
 
     def _off_m(self, q: Axes, column: Pose) -> float:
         return dist(self._arm.xy(self._arm.pose(q)), self._arm.xy(column))

@@ -295,6 +295,17 @@ def test_a_log_that_is_missed_three_times_ends_the_mission() -> None:
     assert not planner.done and planner.idle and crane.trace[-1].phase == "FAILED"
 
 
+def test_a_log_that_has_come_to_its_place_is_let_go_at_once() -> None:
+    profile = msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 2.0e-6))
+    crane = StandIn(profile, [GROUND_LOG], log_kg=90.0)
+    planner = Activity(profile, profile_hash(profile), motions=Swiftest())
+    run_until(crane, planner, Phase.CARRY, more_s=1.0)
+    crane.log_kg = 70.0  # it swings, and weighs less for the moment in which the scale is asked
+    crane.run(planner)
+    lowers_s = sum(moment.phase == "LOWER" for moment in crane.trace) * TICK_NS * 1e-9
+    assert planner.done and 0.0 < lowers_s < 0.3
+
+
 @pytest.mark.parametrize("slips", [1, 9])
 def test_a_list_that_comes_late_is_judged_once(slips: int) -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG], slippery=slips), activity()
