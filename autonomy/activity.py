@@ -35,6 +35,10 @@ from machine.kinematics import Unreachable
 from machine.modes import Mode
 from machine.profile import Profile
 
+SETTLED_NS: Final = 300_000_000
+"""A crane that has come to rest over logs looks at them so much later, ..."""
+PATIENCE_NS: Final = 1_500_000_000
+"""... and without that look it goes on after so long."""
 _SLOWEST: Final = 2.0
 _LAST_HOLD_S: Final = 0.1
 _LONGEST_TICK_S: Final = 0.1
@@ -200,6 +204,8 @@ class Activity:
                 self._sorry = str(error)
                 self._cycle.put_back()
                 self._enter(Phase.LOWER, start)
+            elif phase is Phase.ABOVE and self._cycle.take_former():
+                self._enter(Phase.DESCEND, start)
             else:
                 self._fail(str(error))
 
@@ -267,7 +273,7 @@ class Activity:
             case Phase.LOOK:
                 return self._after_look() if seen else None
             case Phase.ABOVE:
-                return Phase.DESCEND if self._tongs.open else None
+                return self._after_above(now_ns) if self._tongs.open else None
             case Phase.LIFT | Phase.CARRY:
                 if self.phase is Phase.CARRY and self._carried(now_ns):
                     return Phase.LOWER
@@ -287,6 +293,15 @@ class Activity:
             self._fail(str(error))
             return None
         return Phase.ABOVE
+
+    def _after_above(self, now_ns: int) -> Phase | None:
+        """Down, or first over a better grasp: from above, logs that a camera measured from aside are known better."""
+        assert self._arrived_ns is not None
+        if not self._cycle.unsure:
+            return Phase.DESCEND
+        if self._heard.logs_ns < self._arrived_ns + SETTLED_NS:
+            return None if now_ns < self._arrived_ns + PATIENCE_NS else Phase.DESCEND
+        return Phase.ABOVE if self._cycle.choose_better(self.motion.goal) else Phase.DESCEND
 
     def _after_lift(self) -> Phase | None:
         if self._cycle.came_up((self._position(), self._pursuit.sent)):

@@ -14,6 +14,7 @@ from autonomy import tongs
 from autonomy.carried import ASIDE_M, came_up, laid, picked, place_as_seen
 from autonomy.course import above, aimed, carrying, closing, gathering, stowing
 from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, lies_in, plan_place, retreat_height
+from autonomy.grasp.proposal import NoGrasp
 from autonomy.heard import Heard
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
@@ -29,6 +30,10 @@ from machine.profile import Profile
 from machine.sag import sane_load_kg
 
 ATTEMPTS: Final = 3
+LOOKS: Final = 2
+"""So often a grasp is chosen again from over it."""
+_SAME_M, _SAME_RAD = 0.02, 0.03
+"""Grasps that differ by less are gone down to from the same place."""
 _LOOSE_M: Final = 0.2
 """So far over where it was gripped a bundle is let go again: pressed onto others, it would stop the crane."""
 
@@ -54,6 +59,8 @@ class Cycle:
         self._arm = Arm(profile, stretches=motions.stretches)
         """With what hangs in the grapple in the present phase."""
         self._begun_z_m = 0.0
+        self._looks = 0
+        self._before: Grasp | None = None
 
     @property
     def gathered(self) -> bool:
@@ -62,7 +69,38 @@ class Cycle:
 
     def choose(self, q: Axes) -> None:
         """A grasp among the logs of the newest list, from where the crane stands; raises ``NoGrasp``."""
+        self._looks, self._before = 0, None
         self.grasp = self._choose(self._arm, self._mission, self._heard.logs, q[Joint.SLEW], q[Joint.ROT])
+
+    @property
+    def unsure(self) -> bool:
+        """Whether the grasp is worth another look from above: of logs among others that a camera has measured."""
+        grasp = self.grasp
+        measured = grasp is not None and grasp.gathered and any(log.covariance is not None for log in grasp.logs)
+        return measured and self._looks < LOOKS
+
+    def choose_better(self, q: Axes) -> bool:
+        """Choose again by what is seen from over the grasp; whether the crane has to go over another place for it."""
+        before = self.grasp
+        assert before is not None
+        looks = self._looks + 1
+        try:
+            self.choose(q)
+        except NoGrasp:
+            return False
+        finally:
+            self._looks = looks
+        assert self.grasp is not None
+        self._before, after = before, self.grasp.pose
+        apart_m = dist((*self._arm.xy(before.pose), before.pose.z_m), (*self._arm.xy(after), after.z_m))
+        return apart_m > _SAME_M or abs(before.pose.rot_rad - after.rot_rad) > _SAME_RAD
+
+    def take_former(self) -> bool:
+        """Go back to the grasp before the last look, over which the crane stands; whether there is one."""
+        if self._before is None:
+            return False
+        self.grasp, self._before, self._looks = self._before, None, LOOKS
+        return True
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
         """The motion of a phase that begins at ``q``, with the grasp and the place as they are now seen to be best.

@@ -3,7 +3,8 @@
 Stations along every log, shifted sideways and turned, at every height that a layer of logs may be taken from, are
 judged by the rule of ``autonomy.grasp.quality``; the best go through draws of what perception and crane are unsure of.
 Among grasps that are equally safe the one with more wood wins, then the one nearer to the wood's middle.  A machine on
-wheels knows no height of the ground: there the undersides of the logs that lie on no other tell it.  Inputs: log list,
+wheels knows no height of the ground: there the undersides of the logs that lie on no other tell it.  Where a camera
+measured the logs, tongs that come down on a heap are pressed into it, and one always is proposed.  Inputs: log list,
 with covariances where perception gives them.  Failure: ``NoGrasp`` with one sentence.
 """
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
-from math import isfinite, pi
+from math import atan2, isfinite, pi
 from typing import Final
 
 import numpy as np
@@ -28,7 +29,7 @@ from autonomy.grasp.cylinders import (
 from autonomy.grasp.direct import clearance, closing_height, known_ground_m, travel_height
 from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
-from autonomy.grasp.quality import LAYER, STRICT, WIDE, Rule, Scores, Sections, lies_upon, rate, sections
+from autonomy.grasp.quality import LAYER, ROW_M, STRICT, WIDE, Rule, Scores, Sections, lies_upon, rate, sections
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
 from autonomy.perception.estimate import RADIUS
@@ -58,6 +59,11 @@ LEAST: Final = 0.75
 """When no grasp is more probable than this, those are looked at too that only pinch or squeeze."""
 RULES: Final = ((STRICT, 1.0), (LAYER, 0.95), (WIDE, 0.65))
 """First the strict one, with the success of such grasps over what the draws say."""
+PRESSED_M: Final = 0.15
+"""So much lower than planned, but for the ground, open tongs are pressed in among logs that a camera measured: it sees
+what lies high up to 0.1 m too high, and tips that are too high close over it; those too low rest on what lies there."""
+LAST: Final = 0.3
+"""Success of such tongs over the topmost log where no grasp is safe."""
 SEED: Final = 1
 
 
@@ -99,12 +105,14 @@ class Search:
         if isfinite(ground):
             world, sigma = grounded(world, ground), grounded_covariance(sigma)
         upon = lies_upon(world)
-        at = candidates(world, *_in_reach(arm, logs, stays))
+        top, stations = _in_reach(arm, logs, stays)
+        at = candidates(world, top, stations)
         seen = sections(jaws, world, *at)
         floor = np.full(len(at[0]), ground) if isfinite(ground) else _floor(jaws, seen, upon)
         tops = np.unique(np.round(world.center[:, 2] + world.radius, 3))
         levels = np.concatenate([floor[:, None], np.broadcast_to(tops, (len(floor), len(tops)))], axis=1)
-        under = upon.any(axis=1) & [log.covariance is not None for log in logs]
+        measured = np.array([log.covariance is not None for log in logs])
+        under = upon.any(axis=1) & measured
         sigma[under, RADIUS, RADIUS] = np.maximum(sigma[under, RADIUS, RADIUS], HIDDEN_M**2)
         drawn = draws_of(world, sigma, DRAWS, SEED)
         plans = []
@@ -117,7 +125,10 @@ class Search:
                 best, found = _finalists(at, levels, seen, found)
                 share = self._probability(jaws, drawn, upon, best, found.captured, rule, stays)
                 plans.append((best, found, trust * share))
+        lowest = ground if isfinite(ground) else float(np.min(world.center[:, 2] - world.radius))
         if not plans:
+            if measured.any():
+                return self._over(arm, logs, int(top[0]), stations[0], lowest, rot_rad)
             raise NoGrasp(
                 f"no grasp of the {wanted} is safe: every one closes on a log that stays, takes one from "
                 "under another or more than the grapple holds"
@@ -130,8 +141,28 @@ class Search:
             except Unreachable as error:
                 trouble = str(error)
                 continue
-            return self._proposal(best, int(i), captured[i], float(probability[i]), logs)
+            proposal = self._proposal(best, int(i), captured[i], float(probability[i]), logs)
+            return _pressed(proposal, lowest) if measured.any() else proposal
         raise NoGrasp(f"no grasp of the {wanted} is in reach: {trouble}")
+
+    def _over(
+        self, arm: Arm, logs: Sequence[LogObservation], i: int, stations: np.ndarray, lowest_m: float, rot: float
+    ) -> GraspProposal:
+        """Tongs pressed in over a log where it is reached."""
+        log = logs[i]
+        along = log.length_m * float(min(ALONG[stations], key=abs))
+        x, y, z = (c + along * a for c, a in zip(log.center_m, log.axis, strict=True))
+        yaw, captured = atan2(log.axis[1], log.axis[0]) + pi / 2, np.arange(len(logs)) == i
+        level = max(z - log.diameter_m / 2, lowest_m)
+        at = Candidates(*(np.array([v]) for v in (x, y, yaw, level)))
+        try:
+            self._reach(arm, at, 0, logs, captured, rot)
+        except Unreachable as error:
+            raise NoGrasp(
+                f"no grasp of the {_counted(logs)} is safe, and log {log.id} is out of reach: {error}"
+            ) from None
+        reason = f"no grasp of the {_counted(logs)} is sure to be safe: over log {log.id}, the topmost"
+        return _pressed(GraspProposal(x, y, yaw, level, (i,), LAST, reason), lowest_m)
 
     def _probability(
         self,
@@ -175,6 +206,13 @@ class Search:
         return GraspProposal(
             float(best.x[i]), float(best.y[i]), float(best.yaw[i]), float(best.level[i]), taken, probability, reason
         )
+
+
+def _pressed(p: GraspProposal, lowest_m: float) -> GraspProposal:
+    """Pressed in where its tongs come down over what others lie on, and as planned on the ground."""
+    if p.support_z_m < lowest_m + ROW_M:
+        return p
+    return replace(p, support_z_m=max(p.support_z_m - PRESSED_M, lowest_m), pressed=True)
 
 
 def _leaving(found: Scores, stays: np.ndarray) -> Scores:

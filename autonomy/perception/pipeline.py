@@ -17,6 +17,9 @@ from machine.optics import Intrinsics
 from machine.profile import Profile
 
 MARGIN_PX: Final = 8  # of the window that is cut out around a mask
+STEEPEST: Final = 0.5
+"""Sine of the angle to the level from which on a thing is no log but a tong of the crane, a stump, a tree: what stands
+so is not gripped either."""
 SIGMA_D_PX: Final = 0.2  # of stereo disparity, assumed
 
 
@@ -52,7 +55,7 @@ class Perception:
         Raises:
             FrameRefused: the frame is none, or from a camera that the profile does not know.
         """
-        fits = self.fits(frame, instances)
+        fits = [fit for fit in self.fits(frame, instances) if abs(fit.body.axis @ pose.rotation[2]) < STEEPEST]
         return self._tracks.step(fits, pose, frame.stamp_ns)
 
     def fits(self, frame: Frame, instances: Sequence[Masked]) -> list[Fit]:

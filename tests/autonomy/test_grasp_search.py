@@ -213,3 +213,37 @@ def test_a_mission_says_which_logs_are_left_by_their_numbers() -> None:
             chooser(ARM, Mission(leave=(7, 8)), apart, 0.0, 0.0)
         with pytest.raises(NoGrasp, match="no log lies outside the bunk"):
             chooser(ARM, Mission(leave=(7, 8)), [], 0.0, 0.0)
+
+
+def measured(logs: list[LogObservation]) -> list[LogObservation]:
+    """As a good camera measures them."""
+    well = LogEstimate(np.zeros(3), np.ones(3), 1.0, 0.1, np.diag([0.01, 0.02, 0.01, 0.02, 0.1, 0.1, 0.005]) ** 2)
+    return [replace(o, covariance=well.observation(0).covariance) for o in logs]
+
+
+def test_tongs_are_pressed_into_a_heap_that_a_camera_measured_but_not_into_the_ground() -> None:
+    heap = [*(log(i, 0.21 * i) for i in range(-3, 4)), log(9, 0.105, 0.18)]
+    known, seen = planned(heap), planned(measured(heap))
+    assert known.logs == seen.logs == (7,)
+    assert not known.pressed and seen.pressed
+    assert seen.support_z_m == pytest.approx(max(known.support_z_m - 0.15, GROUND), abs=0.02)
+    whole = planned(measured(pair()))
+    assert not whole.pressed and whole.support_z_m == pytest.approx(GROUND, abs=1e-3)
+
+
+def test_where_no_grasp_is_safe_a_camera_s_logs_are_gripped_at_the_top_all_the_same() -> None:
+    wall = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
+    with pytest.raises(NoGrasp, match="is safe"):
+        planned(wall)
+    p = planned(measured(wall))
+    assert p.probability == 0.3 and len(p.logs) == 1 and "sure" in p.reason and "\n" not in p.reason
+    one = wall[p.logs[0]]
+    assert np.hypot(p.x_m - one.center_m[0], p.y_m - one.center_m[1]) < 0.01
+
+
+def test_on_wheels_nothing_is_pressed_lower_than_the_lowest_log() -> None:
+    arm = Arm(load_profile("aoro_fc8"))
+    x, y = arm.profile.workspace.pick_center_m
+    logs = measured([LogObservation(i, (x, y + 0.25 * i, -1.0), (1.0, 0.0, 0.0), 2.6, 0.2) for i in range(-4, 5)])
+    p = Search()(arm, logs, 0.0, 0.0)
+    assert p.support_z_m >= -1.1 - 1e-6

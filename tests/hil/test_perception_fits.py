@@ -9,7 +9,7 @@ from log_views import CAMERA, PIN, PROFILE, frame_of, lying, masks_of, scene_of,
 
 from autonomy.perception import paper_a
 from autonomy.perception.cylinder import Bodies, Cylinder, across_view, depth, guess, outline, rays_of
-from autonomy.perception.frame import FrameRefused
+from autonomy.perception.frame import FrameRefused, Pose
 from autonomy.perception.merge import refused
 from autonomy.perception.pipeline import Perception
 from autonomy.perception.refine import Sensor, own_outline, refine
@@ -231,3 +231,16 @@ def test_paper_a_takes_the_surface_for_the_log() -> None:
     off = view.to_world(found.center_m[None])[0] - log.position_m
     assert 0.06 < np.linalg.norm(off) < 0.13  # towards the camera
     assert paper_a.log_of(frame, np.zeros_like(picture.mask, bool)) is None
+
+
+@pytest.mark.parametrize(("lean_deg", "believed"), [(20.0, 1), (40.0, 0)])
+def test_what_stands_too_steep_for_a_log_is_none(lean_deg: float, believed: int) -> None:
+    view = view_from()
+    picture = seen(scene_of(lying(1, 4.6, 0.0, 90.0)), view)
+    c, s = math.cos(math.radians(lean_deg)), math.sin(math.radians(lean_deg))
+    leaning = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]) @ view.rotation
+    perception = Perception(PROFILE)
+    for i in range(3):
+        frame = frame_of(picture, view, i)
+        tracks = perception.step(frame, Pose(view.position_m, leaning), masks_of(picture))
+    assert len(tracks) == believed

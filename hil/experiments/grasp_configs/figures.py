@@ -57,7 +57,9 @@ SECTIONS: Final = (
     Section(
         "Twelve configurations",
         "Logs of random size lie at a random place in a random direction in one of paper A's arrangements (rebuilt "
-        "from its sentences). One look, one plan, one grasp; lifted and held for two seconds. Physics alone judges.",
+        "from its sentences). One grasp, lifted and held for two seconds; physics alone judges. "
+        "Logs are seen from where the crane stands at first; where a grasp is of logs among others, ours looks again "
+        "from above it, twice at most, and plans anew.",
         JUDGED,
         (("chain.png", "As paper A's Fig. 5: the pile, the virtual depth picture with the grasp of the search, "
           "the network's quality with its grasp."),),

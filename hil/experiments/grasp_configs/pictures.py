@@ -35,7 +35,7 @@ def draw_chain(path: Path, name: str, truth: str, seed: int) -> None:
     profile = profile_named(name)
     plant = Plant(profile, seed, truth, scene=arranged(name, truth, SHOWN, seed))
     try:
-        logs = true_poses(plant, seed).logs
+        logs = true_poses(plant)
         x, y, z = (float(v) for v in np.mean([log.center_m for log in logs], axis=0))
         view = orbit((x, y, z), 4.5, math.radians(-60.0), math.radians(35.0), pinhole(480, 480, 0.75))
         picture = render(scene_from_world(plant.world), view, Look()).rgb

@@ -2,7 +2,7 @@
 
 ``true``: as a detector without errors.  ``ours``: this project's perception with its own segmentation; ``masked``: the
 same with true masks.  ``faithful``: paper A's steps on our masks (bounding extents of each mask's points).  The logs
-are seen once, from where the crane stands at the start.
+are seen from where the crane stands at the start, and again from above where the activity waits for that.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from functools import partial
+from typing import Final, Protocol
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -21,7 +22,6 @@ from autonomy.perception import paper_a
 from autonomy.perception.frame import Frame, Pose
 from autonomy.perception.mount import optical_pose
 from autonomy.perception.pipeline import Masked, Perception
-from machine.profile import Profile
 from sim.camera.rig import CameraRig
 from sim.logs import LogState
 from sim.plant import Plant
@@ -38,64 +38,91 @@ MISSED_M, MISSED_RAD, MISSED_WIDTH_M = 0.15, math.radians(8.0), 0.06
 class Seen:
     """The logs, and what seeing took."""
 
-    logs: tuple[LogObservation, ...]
+    logs: tuple[LogObservation, ...] = ()
     seconds: float = 0.0
 
 
-def true_poses(plant: Plant, seed: int) -> Seen:
+def true_poses(plant: Plant) -> tuple[LogObservation, ...]:
     """What lies where, as the plant knows it."""
-    return Seen(
-        tuple(
-            LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m)
-            for i, log in enumerate(plant.logs())
-        )
+    return tuple(
+        LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m) for i, log in enumerate(plant.logs())
     )
 
 
-def ours(plant: Plant, seed: int) -> Seen:
-    """Three pictures of the standing camera through the whole perception."""
-    from autonomy.perception.finder import segment
+class Known:
+    """The poses that the plant knows."""
 
-    return _perceived(_look(plant, seed), segment)
+    def __init__(self, plant: Plant, seed: int) -> None:
+        self._plant = plant
 
-
-def masked(plant: Plant, seed: int) -> Seen:
-    """The same, but a perfect segmentation: the masks are the renderer's."""
-    look = _look(plant, seed)
-    return _perceived(look, lambda frame: look.masks)
+    def look(self, stamp_ns: int) -> Seen:
+        """What lies where now."""
+        return Seen(true_poses(self._plant))
 
 
-def _perceived(look: Look, segment: Callable[[Frame], Sequence[Masked]]) -> Seen:
-    perception, begun = Perception(look.profile), time.perf_counter()
-    for frame in look.frames:
-        tracks = perception.step(frame, look.pose, segment(frame))
-    seconds = (time.perf_counter() - begun) / len(look.frames)
-    logs = tuple(t.estimate.observation(i) for i, t in enumerate(t for t in tracks if t.hits > 1))
-    return Seen(logs, seconds)
+class Ours:
+    """Three pictures of the standing camera at a look, through the whole perception; each look adds to the ones before.
+
+    ``masked``: with a perfect segmentation, the renderer's masks.
+    """
+
+    def __init__(self, plant: Plant, seed: int, masked: bool = False) -> None:
+        self._plant, self._seed, self._masked = plant, seed, masked
+        self._perception = Perception(plant.profile)
+        self._rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
+
+    def look(self, stamp_ns: int) -> Seen:
+        """The logs as they are known after the pictures."""
+        from autonomy.perception.finder import segment
+
+        seen = _look(self._plant, self._rig, stamp_ns)
+        begun = time.perf_counter()
+        for frame in seen.frames:
+            masks: Sequence[Masked] = seen.masks if self._masked else segment(frame)
+            tracks = self._perception.step(frame, seen.pose, masks)
+        seconds = (time.perf_counter() - begun) / len(seen.frames)
+        return Seen(tuple(t.estimate.observation(t.id) for t in tracks if t.hits > 1), seconds)
 
 
-def faithful(plant: Plant, seed: int) -> Seen:
-    """Paper A's way with one picture: points under each mask, their middle, main direction and extents."""
-    from autonomy.perception.finder import segment
+class Faithful:
+    """Paper A's way with one picture: points under each mask, their middle, main direction and extents.
 
-    look, begun = _look(plant, seed), time.perf_counter()
-    frame, pose = look.frames[0], look.pose
-    found = [paper_a.log_of(frame, one.mask) for one in segment(frame)]
-    logs = []
-    for log in found:
-        if log is not None and log.diameter_m > 0.0 and log.length_m > 0.0:
-            at, axis = pose.to_base(log.center_m), pose.rotation @ log.axis
-            logs.append(
-                LogObservation(len(logs), _triple(at), _triple(axis), float(log.length_m), float(log.diameter_m))
-            )
-    return Seen(tuple(logs), time.perf_counter() - begun)
+    What it sees is as good as known to it: nothing is looked at twice.
+    """
+
+    def __init__(self, plant: Plant, seed: int) -> None:
+        self._plant = plant
+        self._rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
+
+    def look(self, stamp_ns: int) -> Seen:
+        """The logs of a picture."""
+        from autonomy.perception.finder import segment
+
+        seen, begun = _look(self._plant, self._rig, stamp_ns), time.perf_counter()
+        frame, pose = seen.frames[0], seen.pose
+        found = [paper_a.log_of(frame, one.mask) for one in segment(frame)]
+        logs = []
+        for log in found:
+            if log is not None and log.diameter_m > 0.0 and log.length_m > 0.0:
+                at, axis = pose.to_base(log.center_m), pose.rotation @ log.axis
+                logs.append(
+                    LogObservation(len(logs), _triple(at), _triple(axis), float(log.length_m), float(log.diameter_m))
+                )
+        return Seen(tuple(logs), time.perf_counter() - begun)
 
 
-POSES: Final[dict[str, Callable[[Plant, int], Seen]]] = {
-    "true": true_poses,
-    "ours": ours,
-    "masked": masked,
-    "faithful": faithful,
+class Sight(Protocol):
+    """Sees the logs from where the crane stands."""
+
+    def look(self, stamp_ns: int) -> Seen:
+        """The logs, now."""
+
+
+POSES: Final[dict[str, Callable[[Plant, int], Sight]]] = {
+    "true": Known,
+    "ours": Ours,
+    "masked": partial(Ours, masked=True),
+    "faithful": Faithful,
 }
 
 
@@ -126,20 +153,18 @@ class Mask:
 class Look:
     """Pictures of the standing camera, where the profile says it stands, and the true masks in them."""
 
-    profile: Profile
     frames: tuple[Frame, ...]
     pose: Pose
     masks: tuple[Mask, ...]
 
 
-def _look(plant: Plant, seed: int) -> Look:
-    rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
+def _look(plant: Plant, rig: CameraRig, stamp_ns: int) -> Look:
     pose = optical_pose(plant.profile, plant.profile.cameras[CAMERA], plant.joint_positions())
     ids = rig.picture(CAMERA)[2].mask
     masks = tuple(Mask(ids == i + 1) for i in range(len(plant.logs())) if np.count_nonzero(ids == i + 1) >= LEAST_PX)
-    taken = [rig.frame(CAMERA, i * RATE_NS) for i in range(PICTURES)]
+    taken = [rig.frame(CAMERA, stamp_ns + i * RATE_NS) for i in range(PICTURES)]
     frames = tuple(Frame(f.name, f.stamp_ns, f.rgb, f.depth_m, f.intrinsics) for f in taken)
-    return Look(plant.profile, frames, pose, masks)
+    return Look(frames, pose, masks)
 
 
 def _triple(v: np.ndarray) -> tuple[float, float, float]:

@@ -1,7 +1,7 @@
 """One grasping attempt of paper A IV-A: a fresh arrangement, see, plan, crane on the bus, lift, hold; physics judges.
 
-Controller, guard, CAN bytes and plant as in every lockstep run.  The logs are seen once, by the camera on the stick
-from where the crane stands at the start, or as the plant knows them (poses ``true``).
+Controller, guard, CAN bytes and plant as in every lockstep run.  The logs are seen by the camera on the stick from
+where the crane rests, at the start and where the activity looks again, or as the plant knows them (poses ``true``).
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final
 
-from autonomy.activity import Activity
+from autonomy.activity import SETTLED_NS, Activity
 from autonomy.grasp.cnn_planner import CnnPlanner
 from autonomy.grasp.direct import Planned
 from autonomy.grasp.network import WEIGHTS, GraspNet
@@ -28,7 +28,7 @@ from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from hil.experiments.grasp_configs.outcome import Grip, category, lifted
-from hil.experiments.grasp_configs.poses import POSES, misled
+from hil.experiments.grasp_configs.poses import POSES, Seen, Sight, misled
 from hil.experiments.plant.worlds import profile_named, wood_of
 from hil.experiments.pool import Job
 from hil.lockstep import START_NS, Lockstep, Observer
@@ -46,20 +46,46 @@ NETWORKS: Final = {"cnn": "grasp_cornell", "cnn_physical": "grasp_physical"}
 
 @dataclass(slots=True)
 class Attempt:
-    """The planner's seat in a lockstep run: autonomy's activity, shown what is seen once; notes what it does."""
+    """The planner's seat in a lockstep run: autonomy's activity, shown what is seen from where it rests; notes what it
+    does.
+    """
 
     activity: Activity
-    seen: tuple[LogObservation, ...]
+    sight: Sight
+    seen: Seen = field(default_factory=Seen)
+    """The last look, ..."""
+    looks: int = 0
+    """... and how many there were."""
     _up_ns: int = 0
     """Since when the lift is done."""
+    _rested_ns: int = 0
+    """Since when the crane rests above the logs."""
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """One turn (contract of ``hil.lockstep.Planner``); after the look nothing more is seen."""
+        """One turn (contract of ``hil.lockstep.Planner``): a look at the start, and one at each rest above the logs."""
         activity = self.activity
-        data = activity.step(now_ns, report, self.seen if logs and activity.phase <= Phase.LOOK else ())
+        data = activity.step(now_ns, report, self._looked(now_ns) if logs else ())
         if self._up_ns == 0 and activity.phase is Phase.LIFT and activity.arrived:
             self._up_ns = now_ns
         return data
+
+    def _looked(self, now_ns: int) -> tuple[LogObservation, ...]:
+        phase = self.activity.phase
+        if phase <= Phase.LOOK:
+            if self.looks == 0:
+                self._look(now_ns)
+            return self.seen.logs
+        rests = phase is Phase.ABOVE and self.activity.arrived
+        self._rested_ns = (self._rested_ns or now_ns) if rests else 0
+        if not rests or now_ns < self._rested_ns + SETTLED_NS:
+            return ()
+        self._rested_ns = now_ns + SETTLED_NS
+        self._look(now_ns)
+        return self.seen.logs
+
+    def _look(self, now_ns: int) -> None:
+        self.seen = self.sight.look(now_ns)
+        self.looks += 1
 
     def over(self, now_ns: int) -> bool:
         """Whether the grapple is up and has been held still for two seconds."""
@@ -118,10 +144,9 @@ def attempt(job: Job) -> dict[str, Any]:
     plant = Plant(profile, job.seed, o["truth"], scene=scene)
     try:
         before = plant.logs()
-        seen = POSES[o["poses"]](plant, job.seed)
         timed = Timed(planner_named(o["planner"]))
         activity = Activity(profile, digest, chooser=Planned(timed), motions=Swiftest(direct=False))
-        seat = Attempt(activity, seen.logs)
+        seat = Attempt(activity, POSES[o["poses"]](plant, job.seed))
         operator = Operator(digest, lambda *_: None)
         settings = Settings(profile, digest, profile.rate_hz)
         guard = build_guard(profile_path(o["profile"]))
@@ -140,11 +165,13 @@ def attempt(job: Job) -> dict[str, Any]:
         up = lifted(before, plant.logs(), ground) if seat.over(system.now_ns) else []
         verdict = plant.judge()
         up = [i for i in up if verdict.logs[i].left_ground or not verdict.logs[i].max_grip_n]
-        p, wrong = timed.proposal, misled(before, seen.logs)
+        p, seen = timed.proposal, seat.seen
+        wrong = misled(before, seen.logs)
         rise = [now.position_m[2] - was.position_m[2] for was, now in zip(before, plant.logs(), strict=True)]
         return {
             "configuration": number, "category": category(number, before, up, grip, wrong), "lifted": len(up),
-            "misled": wrong, "seen": len(seen.logs), "see_ms": 1e3 * seen.seconds, "logs": len(before), "up": up,
+            "misled": wrong, "looks": seat.looks, "seen": len(seen.logs), "see_ms": 1e3 * seen.seconds,
+            "logs": len(before), "up": up,
             "failure": activity.failure, "stops": operator.stops, "expected": list(p.logs) if p else [],
             "probability": p.probability if p else math.nan, "reason": p.reason if p else "",
             "plan_ms": 1e3 * timed.seconds, "grip": [grip.x_m, grip.y_m, grip.yaw_rad], "rise_m": rise,

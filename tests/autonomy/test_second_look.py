@@ -1,0 +1,119 @@
+"""A grasp among logs that a camera measured from aside is chosen again from above it, where these are seen better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import hypot
+
+import pytest
+from crane_stand_in import TICK_NS, StandIn
+from grasp_scenes import PROFILE, pair
+
+from autonomy.activity import PATIENCE_NS, Activity
+from autonomy.grasp.direct import Planned
+from autonomy.grasp.proposal import NoGrasp
+from autonomy.grasp.search import Search
+from autonomy.logs import TRIANGLE, LogObservation
+from autonomy.phases import Phase
+from machine.kinematics import Unreachable
+from machine.load import profile_hash
+
+OFF_M = 0.09
+
+
+class Camera(StandIn):
+    """A crane whose camera sees logs beside where they lie, but from above; ``covered``: there it sees nothing."""
+
+    covered = False
+    off_m = OFF_M
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        """Measured logs."""
+        x, y, _ = self.pin()
+        above = hypot(x - self.logs[0].center_m[0], y - self.logs[0].center_m[1]) < 1.0
+        if above and self.covered:
+            return ()
+        return tuple(measured(log, 0.0 if above else self.off_m) for log in self.logs)
+
+
+def measured(log: LogObservation, off_m: float) -> LogObservation:
+    x, y, z = log.center_m
+    variances = [0.0] * TRIANGLE
+    variances[0] = variances[7] = 1e-4
+    return replace(log, center_m=(x, y + off_m, z), covariance=tuple(variances))
+
+
+def made(chooser: Planned | None = None) -> tuple[Camera, Activity]:
+    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=chooser or Planned(Search()))
+    return Camera(PROFILE, pair()), planner
+
+
+def until(crane: StandIn, planner: Activity, phase: Phase) -> list[tuple[float, float]]:
+    """Where the grasps were that the crane went to."""
+    found: list[tuple[float, float]] = []
+    for _ in range(1200):
+        if planner.phase is phase or planner.idle:
+            break
+        crane.step(planner)
+        if planner.grasp is not None:
+            at = (planner.grasp.pose.slew_rad, planner.grasp.pose.rot_rad)
+            if not found or found[-1] != at:
+                found.append(at)
+    assert planner.phase is phase, planner.failure
+    return found
+
+
+def test_from_above_the_grasp_is_chosen_again_and_gone_over() -> None:
+    crane, planner = made()
+    assert len(until(crane, planner, Phase.CLOSE)) > 1
+    middle = sum(log.center_m[1] for log in crane.logs) / 2
+    assert crane.pin()[1] == pytest.approx(middle, abs=0.05), "and not off it by what was seen from aside"
+    phases = [m.phase for m in crane.trace]
+    assert phases.count("LOOK") and phases.index("DESCEND") > phases.index("ABOVE")
+
+
+def test_logs_that_nobody_measured_are_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Camera, "seen", StandIn.seen)
+    crane, planner = made()
+    assert len(until(crane, planner, Phase.CLOSE)) == 1
+
+
+def test_where_nothing_is_seen_from_above_the_crane_goes_on_after_a_moment() -> None:
+    crane, planner = made()
+    crane.covered = True
+    until(crane, planner, Phase.ABOVE)
+    while not planner.arrived:
+        crane.step(planner)
+    since_ns = crane.now_ns
+    assert len(until(crane, planner, Phase.DESCEND)) == 1
+    assert crane.now_ns - since_ns <= PATIENCE_NS + 4 * TICK_NS
+
+
+def test_a_better_grasp_to_which_there_is_no_way_is_let_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    crane, planner = made()
+    until(crane, planner, Phase.ABOVE)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise Unreachable("no way is clear")
+
+    monkeypatch.setattr("autonomy.cycle.above", refuse)
+    until(crane, planner, Phase.CLOSE)
+    assert planner.failure is None
+
+
+def test_a_second_look_that_finds_no_grasp_changes_none() -> None:
+    search = Search()
+    asked = []
+
+    def once(*args: object, **more: object) -> object:
+        asked.append(1)
+        if len(asked) > 1:
+            raise NoGrasp("nothing is safe")
+        return search(*args, **more)  # type: ignore[arg-type]
+
+    crane, planner = made(Planned(once))  # type: ignore[arg-type]
+    until(crane, planner, Phase.ABOVE)
+    first = planner.grasp
+    assert first is not None
+    until(crane, planner, Phase.CLOSE)
+    assert len(asked) > 1 and planner.grasp is not None and planner.grasp.reason == first.reason
