@@ -5,7 +5,6 @@ What is one log, and how good a region is, two small networks judge that learnt 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -17,7 +16,8 @@ import numpy as np
 from autonomy.networks.graph import Conv, Network, Relu
 from autonomy.networks.weights import SHIPPED, load
 from autonomy.perception.flood import flooded, sigmoid
-from autonomy.perception.pieces import LOOKS, RELATIONS, Piece, Scene, look, may_be_one, piece, relation
+from autonomy.perception.pieces import LOOKS, Piece, Scene, look, piece
+from autonomy.perception.relations import RELATIONS, Row, may_be_one, relations
 
 LEAST_PX: Final = 6  # of a map: what is smaller is no log
 MOST: Final = 100  # pieces of a picture, the largest: what has more is noise
@@ -115,19 +115,20 @@ class Joining:
         n = len(pieces)
         self._told = np.zeros((n, n, len(RELATIONS)), np.float32)
         self._may = np.zeros((n, n), bool)  # be one log; below the diagonal as above
-        for i in range(n):
-            self._relate(i, range(i))
+        self._row = Row.of(pieces)
+        self._relate(*np.tril_indices(n, -1))
 
-    def _relate(self, i: int, others: Iterable[int]) -> None:
-        """Note what piece ``i`` has to do with others."""
-        for j in others:
-            a, b = self.pieces[i], self.pieces[j]
-            big, small = (a, b) if len(a.own) >= len(b.own) else (b, a)
-            touch = float(self._touch[i, j])
-            self._may[i, j] = self._may[j, i] = may_be_one(self.scene, big, small, touch)
-            if self._may[i, j]:
-                between = float(self._wall[i, j]) / touch if touch else 0.0
-                self._told[i, j] = self._told[j, i] = relation(self.scene, big, small, touch, between)
+    def _relate(self, i: np.ndarray, j: np.ndarray) -> None:
+        """Note what pieces ``i`` (n,) have to do with pieces ``j`` (n,)."""
+        first = self._row.count[i] >= self._row.count[j]
+        big, small = self._row.take(np.where(first, i, j)), self._row.take(np.where(first, j, i))
+        touch = self._touch[i, j]
+        may = may_be_one(self.scene, big, small, touch)
+        self._may[i, j] = self._may[j, i] = may
+        i, j, touch = i[may], j[may], touch[may]
+        between = np.divide(self._wall[i, j], touch, out=np.zeros_like(touch), where=touch > 0.0)
+        told = relations(self.scene, big.take(may), small.take(may), touch, between)
+        self._told[i, j] = self._told[j, i] = told
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """Every pair (N, 2) that may be one log, and its RELATIONS (N, 19)."""
@@ -161,7 +162,9 @@ class Joining:
         self._touch, self._wall, self._told, self._may = (
             np.delete(np.delete(of, j, 0), j, 1) for of in (self._touch, self._wall, self._told, self._may)
         )
-        self._relate(i, (k for k in range(len(self.pieces)) if k != i))
+        self._row = Row.of(self.pieces)
+        others = np.delete(np.arange(len(self.pieces)), i)
+        self._relate(np.full(len(others), i), others)
 
     def looks(self, judge: Head) -> np.ndarray:
         """LOOKS (n, 14) of the pieces as they are now."""

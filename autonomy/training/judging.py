@@ -15,8 +15,9 @@ from torch.nn import functional as F
 
 from autonomy.networks.graph import Network
 from autonomy.networks.torch_net import random_net
-from autonomy.perception.pieces import LOOKS, RELATIONS, Piece, Scene
+from autonomy.perception.pieces import LOOKS, Piece, Scene
 from autonomy.perception.regions import Head, Joining, cut
+from autonomy.perception.relations import RELATIONS
 from autonomy.training.loop import Schedule, train
 
 ROUNDS: Final = 3  # of a picture: all its pieces, and twice with some of them put together

@@ -8,9 +8,11 @@ from autonomy.networks.weights import WeightsRefused
 from autonomy.perception.flood import flooded, wall
 from autonomy.perception.instances import scene_of
 from autonomy.perception.network import STRIDE
-from autonomy.perception.pieces import LOOKS, RELATIONS, piece, relation
+from autonomy.perception.pieces import LOOKS, piece
 from autonomy.perception.regions import Joining, cut, judges, parted, shipped_judges
-from autonomy.training.judging import relations, worths
+from autonomy.perception.relations import RELATIONS, Row, relations
+from autonomy.training import judging
+from autonomy.training.judging import worths
 from autonomy.training.segmentation import targets
 
 ROOM = np.ones((20, 60), bool)
@@ -91,8 +93,9 @@ CROSSED = (((100, 100), 0.3, 150, 16), ((115, 100), 1.7, 120, 16))
 
 
 def related(scene, a, b, touch=0.0):
-    big, small = (piece(scene, np.flatnonzero(own)) for own in (a, b))
-    return dict(zip(RELATIONS, relation(scene, big, small, touch, 0.0).tolist(), strict=True))
+    big, small = (Row.of([piece(scene, np.flatnonzero(own))]) for own in (a, b))
+    told = relations(scene, big, small, np.array([touch]), np.zeros(1))
+    return dict(zip(RELATIONS, told[0].tolist(), strict=True))
 
 
 def test_the_axis_turning_is_a_wall_where_no_edge_is():
@@ -136,7 +139,7 @@ def test_a_joined_piece_takes_the_borders_of_both():
 
 def test_examples_say_what_is_one_log():
     scene, ids = seen(*CROSSED)
-    pairs = relations(scene, ids, np.random.default_rng(1))
+    pairs = judging.relations(scene, ids, np.random.default_rng(1))
     assert pairs.told.shape[1] == len(RELATIONS) and set(pairs.answer) == {0.0, 1.0}
     whole = worths(scene, ids, shipped_judges().joins)
     assert whole.told.shape == (2, len(LOOKS)) and (whole.answer > 0.85).all()
