@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from scipy.ndimage import binary_opening
 
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.weights import SHIPPED, load
@@ -40,7 +41,10 @@ MAYBE: Final = 0.3  # what may be wood
 WINDOWS: Final = ((352, 608), (464, 464), (608, 352))
 """Height and width of a nearer look [px of the network]; few, for the network is compiled for each."""
 NEAREST: Final = 0.5  # a picture is not more than doubled
+LIKELY: Final = 0.3
+"""The best log of a nearer look is at least so good, or the whole picture is looked at."""
 EDGE_PX: Final = 16  # left about the wood [px of the network]
+THIN_PX: Final = 5  # of the finer maps: what is narrower is hardly two wide in the coarser ones
 MASK_SHARE, EDGE_SHARE = 0.4, 0.8  # of the finer look in what two looks give
 
 Shot = tuple[np.ndarray, np.ndarray, Intrinsics]
@@ -69,7 +73,7 @@ class LogFinder:
         variant: str = "rgbd",
         weights: Path | None = None,
         size_px: int = 2 * SIZE_PX,
-        precision: str = "f32",
+        precision: str = "bf16",
         judges: Judges | None = None,
         nearer: bool = True,
     ) -> None:
@@ -99,13 +103,28 @@ class LogFinder:
             known = coarse, self.maps(*shrunk(*shot, coarse))
             inner, finer = self._nearer(sigmoid(known[1][MASK]), coarse * STRIDE, shot[1].shape, factor)
             if finer < factor:
-                shot, factor, known = cut(shot, inner), finer, None
-                window = window[0] + inner[0], window[0] + inner[1], window[2] + inner[2], window[2] + inner[3]
+                found = self._found(
+                    cut(shot, inner), finer, None, (window[0] + inner[0], window[2] + inner[2]), depth_m
+                )
+                if found and found[0].score > LIKELY:
+                    return found
+        # The glance is blind to thin logs: what drew the look nearer was something else.
+        return self._found(shot, factor, known, (window[0], window[2]), depth_m)
+
+    def _found(
+        self,
+        shot: Shot,
+        factor: float,
+        known: tuple[int, np.ndarray] | None,
+        corner: tuple[int, int],
+        whole: np.ndarray,
+    ) -> tuple[Instance, ...]:
+        """The logs of a part of a picture that begins at a corner (row, column) of the ``whole`` (H, W)."""
         maps, scale = self.looks(*shot, factor, known)
         found = instances(maps, scale, shot[1], self._judges)
-        if shot[1].shape == depth_m.shape:
+        if shot[1].shape == whole.shape:
             return found
-        return tuple(placed(i, window[2], window[0], depth_m.shape) for i in found)
+        return tuple(placed(i, corner[1], corner[0], whole.shape) for i in found)
 
     def looks(
         self,
@@ -210,7 +229,9 @@ def inside_bars(rgb: np.ndarray) -> Window:
 
 def both(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
     """Maps (8, h, w) of a picture and of the same at half the size as one: votes from the coarse ones, which saw the
-    logs as wholes; masks, angles and edges from both, ends from the fine ones."""
+    logs as wholes; masks, angles and edges from both, ends from the fine ones.  What is so thin that the coarse ones
+    are blind to it is as the fine ones have it.
+    """
     h, w = fine.shape[1:]
     y, x = (np.minimum(np.arange(n) // 2, n2 - 1) for n, n2 in ((h, coarse.shape[1]), (w, coarse.shape[2])))
     near = coarse[:, y][:, :, x]
@@ -224,4 +245,7 @@ def both(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
     for i, share in ((MASK, MASK_SHARE), (EDGE, EDGE_SHARE)):
         smooth = (down[rows] @ coarse[i] @ across[columns].T).astype(np.float32)
         maps[i] = share * fine[i] + (1.0 - share) * smooth
+    wood = fine[MASK] > 0.0
+    thin = wood & ~binary_opening(wood, np.ones((THIN_PX, THIN_PX), bool))
+    maps[:, thin] = fine[:, thin]
     return maps

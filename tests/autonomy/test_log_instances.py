@@ -197,6 +197,24 @@ def test_the_window_stays_in_the_picture_and_no_wood_is_no_log(untrained):
     assert finder.find(*bright(0, 0, 0, 0)) == ()
 
 
+class Glancing(Recorded):
+    """One whose glance takes a patch at the right for wood, and is blind to all else."""
+
+    def maps(self, rgb, depth_m, pinhole):
+        maps = super().maps(rgb, depth_m, pinhole)
+        if rgb.shape[:2] == (180, 320):
+            maps[0], maps[0, 40:44, 140:150] = -9.0, 1.0
+        return maps
+
+
+def test_a_log_too_thin_for_the_glance_is_found_all_the_same(untrained):
+    finder = Glancing("rgbd", untrained)
+    (seen,) = finder.find(*bright(500, 100, 14, 300))
+    assert (360, 640) in finder.sizes and (352, 608) in finder.sizes, "the nearer look found nothing"
+    assert np.abs(np.array(seen.box_px) - (100, 500, 400, 514)).max() <= 6
+    assert finder.find(*bright(400, 20, 60, 260)) == (), "a thick log that the glance does not see is none"
+
+
 def test_frames_that_are_none_are_refused(untrained):
     finder = LogFinder("rgbd", untrained, size_px=96)
     pin = Intrinsics(64, 64, 60.0, 60.0, 31.5, 31.5)
