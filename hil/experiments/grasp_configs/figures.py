@@ -41,8 +41,8 @@ JUDGED: Final = (
            least=1.5),
     Figure("all_logs", "All logs at once in configurations 2, 4, 5, 6, 7", "%",
            "As the paper observed consistently.", scale=100.0),
-    Figure("plan_ms", "Planning time", "ms", "Median, one thread.", clocked=True),
-    Figure("perceive_ms", "Perception time per picture", "ms", "Median, one thread.", clocked=True),
+    Figure("plan_ms", "Planning time", "ms", "Median, of the processor.", clocked=True),
+    Figure("perceive_ms", "Perception time per picture", "ms", "Median, of the processor.", clocked=True),
 )  # fmt: skip
 ABLATION: Final = tuple(f for poses in WORDS for planner in BY for f in _pair(poses, planner))
 PER_CONFIGURATION: Final = tuple(

@@ -104,11 +104,11 @@ class Timed:
         self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float, stay: Collection[int] = ()
     ) -> GraspProposal:
         """See ``autonomy.grasp.proposal``."""
-        begun = time.perf_counter()
+        begun = time.process_time()
         try:
             self.proposal = self.planner(arm, logs, slew_rad, rot_rad, stay)
         finally:
-            self.seconds = time.perf_counter() - begun
+            self.seconds = time.process_time() - begun
         return self.proposal
 
 
