@@ -24,8 +24,13 @@ TONGS_M: Final = 0.17
 """What the tongs need beside a log while they open: its tips' way, and their thickness."""
 _FALL_COST: Final = 0.6
 """A fall of a metre is worth so much height: what drops far may roll on or push others."""
+_SPREAD_COST: Final = 2.0
+"""A spread of a metre of where it comes to lie (a standard deviation) is worth so much height: what is let go on top
+of another log rolls to either side, or stays there, and the last ones lie over the stakes."""
 _EVEN_M: Final = 0.03
 """Places that differ by less are as good as each other."""
+_NEAR_M: Final = 0.1
+"""A log that rolls less far comes to lie where it was let go."""
 _ENDS: Final = 0.35
 """Sections through the new log, in its lengths from the middle."""
 
@@ -73,27 +78,33 @@ class Heap:
     def lowest(self, reach_m: float) -> Rest:
         """Where, at most ``reach_m`` from the middle, it comes to lie lowest.
 
-        Of places as good as each other the middle of an empty bunk, then those by the stakes: what lies there cannot
-        roll, and the middle fills by itself.
+        Of places as good as each other those where it rolls least, of these the middle of an empty bunk, then those by
+        the stakes: what lies there cannot roll, and the middle fills by itself.
         """
         places = np.flatnonzero(np.abs(self._across) <= reach_m + 0.5 * STEP_M)
         found = [(i, self._found(int(i))) for i in places] or [(0, self.at(0.0))]
         sign = 1.0 if self._empty else -1.0
 
-        def worth(item: tuple[int, Rest]) -> tuple[int, float]:
+        def worth(item: tuple[int, Rest]) -> tuple[int, int, float]:
             i, rest = item
             low = self._mean(i)
-            cost = low + _FALL_COST * (rest.support_z_m + self._radius_m - low)
-            return round(cost / _EVEN_M), sign * abs(rest.across_m)
+            cost = low + _FALL_COST * (rest.support_z_m + self._radius_m - low) + _SPREAD_COST * self._spread(i)
+            rolls = abs(float(self._across[self._hollow[i]]) - rest.across_m)
+            return round(cost / _EVEN_M), round(rolls / _NEAR_M), sign * abs(rest.across_m)
 
         return min(found, key=worth)[1]
 
-    def _around(self, i: int) -> slice:
-        few = round(ASTRAY_M / STEP_M)
+    def _around(self, i: int, off_m: float = ASTRAY_M) -> slice:
+        few = round(off_m / STEP_M)
         return slice(max(i - few, 0), i + few + 1)
 
     def _mean(self, i: int) -> float:
         return float(np.mean(self._rest[self._around(i)]))
+
+    def _spread(self, i: int) -> float:
+        """How much more what it comes to varies than the places it may be let go at."""
+        around = self._around(i, 2.0 * ASTRAY_M)
+        return max(float(np.std(self._across[self._hollow[around]]) - np.std(self._across[around])), 0.0)
 
     def _found(self, i: int) -> Rest:
         return Rest(float(self._across[i]), float(self._under[i]), float(np.max(self._rest[self._around(i)])))

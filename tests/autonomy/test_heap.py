@@ -60,6 +60,13 @@ def test_on_the_back_of_a_log_the_worse_side_counts() -> None:
     assert wall.at(-0.1).rest_z_m > z + R_M, "it may roll into the high hollow as well as down to the floor"
 
 
+def test_a_place_is_chosen_where_what_falls_does_not_roll_to_either_side() -> None:
+    z = FLOOR_M + R_M
+    rest = heap(*(lying(y, z) for y in (-0.6, 0.0, 0.6))).lowest(REACH_M)
+    assert 0.2 < abs(rest.across_m) < 0.4, "into the gap, and not on the back of the log beside the stakes"
+    assert rest.rest_z_m == pytest.approx(z, abs=1e-3)
+
+
 def test_logs_that_lie_askew_count_at_their_ends() -> None:
     z = FLOOR_M + R_M
     straight, askew = heap(lying(0.4, z)), heap(lying(0.4, z, skew_rad=0.3))
