@@ -259,6 +259,8 @@ class _Problem:
         # Stereo lets near edges grow over what is behind them: what lies furthest from any border is least touched.
         inner = _innermost(mask)[v, u]
         u, v = u[inner], v[inner]
+        if not len(u):
+            return None
         if len(u) > DEPTH_POINTS:
             pick = np.linspace(0, len(u) - 1, DEPTH_POINTS).astype(int)
             u, v = u[pick], v[pick]

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from log_views import CAMERA, PIN, PROFILE, frame_of, lying, masks_of, scene_of, seen, view_from
+from scipy.ndimage import binary_erosion
 
 from autonomy.perception import paper_a
 from autonomy.perception.cylinder import Bodies, Cylinder, across_view, depth, guess, outline, rays_of
@@ -244,3 +245,13 @@ def test_what_stands_too_steep_for_a_log_is_none(lean_deg: float, believed: int)
         frame = frame_of(picture, view, i)
         tracks = perception.step(frame, Pose(view.position_m, leaning), masks_of(picture))
     assert len(tracks) == believed
+
+
+def test_a_log_whose_depth_is_known_at_its_border_alone_is_refused() -> None:
+    view = view_from()
+    picture = seen(scene_of(lying(1, 4.6, 0.0, 90.0)), view)
+    frame = frame_of(picture, view, exact=True)
+    inner = binary_erosion(picture.mask == 1, iterations=3)
+    perception = Perception(PROFILE)
+    assert perception.fits(replace(frame, depth_m=np.where(inner, np.nan, frame.depth_m)), masks_of(picture)) == []
+    assert [r.why for r in perception.refusals] == ["too little of its depth is known"]
