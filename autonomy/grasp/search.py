@@ -29,7 +29,19 @@ from autonomy.grasp.cylinders import (
 from autonomy.grasp.direct import clearance, closing_height, known_ground_m, travel_height
 from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
-from autonomy.grasp.quality import LAYER, ROW_M, STRICT, WIDE, Rule, Scores, Sections, lies_upon, rate, sections
+from autonomy.grasp.quality import (
+    ACROSS,
+    LAYER,
+    ROW_M,
+    STRICT,
+    WIDE,
+    Rule,
+    Scores,
+    Sections,
+    lies_upon,
+    rate,
+    sections,
+)
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
 from autonomy.perception.estimate import RADIUS
@@ -142,7 +154,8 @@ class Search:
                 trouble = str(error)
                 continue
             proposal = self._proposal(best, int(i), captured[i], float(probability[i]), logs)
-            return _pressed(proposal, lowest) if measured.any() else proposal
+            crossed = _crossed(jaws, world, proposal)
+            return _pressed(proposal, lowest) if measured.any() and not crossed else proposal
         raise NoGrasp(f"no grasp of the {wanted} is in reach: {trouble}")
 
     def _over(
@@ -213,6 +226,14 @@ def _pressed(p: GraspProposal, lowest_m: float) -> GraspProposal:
     if p.support_z_m < lowest_m + ROW_M:
         return p
     return replace(p, support_z_m=max(p.support_z_m - PRESSED_M, lowest_m), pressed=True)
+
+
+def _crossed(jaws: Jaws, world: Cylinders, p: GraspProposal) -> bool:
+    """Whether a log between the tongs lies across those that are taken: pressed in, the tongs would take it, too."""
+    at = sections(jaws, world, *(np.array(v) for v in (p.x_m, p.y_m, p.yaw_rad)))
+    between = at.inside & (at.low_u < jaws.half_gap_m) & (at.high_u > -jaws.half_gap_m)
+    between[list(p.logs)] = False
+    return bool(np.any(between & (at.askew > ACROSS**2)))
 
 
 def _leaving(found: Scores, stays: np.ndarray) -> Scores:

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import binary_opening
 
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.weights import SHIPPED, load
 from autonomy.perception.flood import sigmoid
-from autonomy.perception.frame import Frame, check
+from autonomy.perception.frame import Frame, check, inside_bars
 from autonomy.perception.instances import Instance, instances, placed
 from autonomy.perception.network import (
     COS2,
@@ -218,15 +217,6 @@ def cut(shot: Shot, window: Window) -> Shot:
     return rgb[at], depth_m[at], pinhole.crop(left, top, right - left, bottom - top)
 
 
-def inside_bars(rgb: np.ndarray) -> Window:
-    """Top, bottom, left, right of what a letterbox's black bars leave (all of it when all is black)."""
-    lit = rgb.any(axis=2)
-    rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
-    if not len(rows):
-        return 0, rgb.shape[0], 0, rgb.shape[1]
-    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
-
-
 def both(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
     """Maps (8, h, w) of a picture and of the same at half the size as one: votes from the coarse ones, which saw the
     logs as wholes; masks, angles and edges from both, ends from the fine ones.  What is so thin that the coarse ones
@@ -234,18 +224,30 @@ def both(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
     """
     h, w = fine.shape[1:]
     y, x = (np.minimum(np.arange(n) // 2, n2 - 1) for n, n2 in ((h, coarse.shape[1]), (w, coarse.shape[2])))
-    near = coarse[:, y][:, :, x]
+    east, south, *arrow = coarse[[OFFSET_U, OFFSET_V, COS2, SIN2]].take(x, axis=2).take(y, axis=1)
     maps = fine.copy()
-    maps[COS2 : SIN2 + 1] += near[COS2 : SIN2 + 1]
-    pixel = STRIDE / OFFSET_PX
-    maps[OFFSET_U] = 2.0 * near[OFFSET_U] + pixel * (2.0 * x + 0.5 - np.arange(w))
-    maps[OFFSET_V] = 2.0 * near[OFFSET_V] + pixel * (2.0 * y + 0.5 - np.arange(h))[:, None]
+    maps[COS2 : SIN2 + 1] += arrow
+    pixel = np.float32(STRIDE / OFFSET_PX)
+    maps[OFFSET_U] = 2.0 * east + pixel * (2.0 * x + 0.5 - np.arange(w)).astype(np.float32)
+    maps[OFFSET_V] = 2.0 * south + pixel * (2.0 * y + 0.5 - np.arange(h)).astype(np.float32)[:, None]
     down, across = (bilinear(n2, 2) for n2 in coarse.shape[1:])
     rows, columns = np.minimum(np.arange(h), len(down) - 1), np.minimum(np.arange(w), len(across) - 1)
     for i, share in ((MASK, MASK_SHARE), (EDGE, EDGE_SHARE)):
         smooth = (down[rows] @ coarse[i] @ across[columns].T).astype(np.float32)
         maps[i] = share * fine[i] + (1.0 - share) * smooth
     wood = fine[MASK] > 0.0
-    thin = wood & ~binary_opening(wood, np.ones((THIN_PX, THIN_PX), bool))
+    thin = wood & ~_opened(wood, THIN_PX)
     maps[:, thin] = fine[:, thin]
     return maps
+
+
+def _opened(wood: np.ndarray, size: int) -> np.ndarray:
+    """What of ``wood`` (h, w) bool a square of ``size`` (odd) pixels inside it covers."""
+    for grow in (False, True):
+        for axis in (0, 1):
+            beyond = np.pad(wood, [(size // 2, size // 2) if a == axis else (0, 0) for a in (0, 1)])
+            wood = np.full(wood.shape, not grow)
+            for i in range(size):
+                part = beyond[i : i + len(wood)] if axis == 0 else beyond[:, i : i + wood.shape[1]]
+                wood = wood | part if grow else wood & part
+    return wood

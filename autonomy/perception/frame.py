@@ -50,6 +50,16 @@ def rescaled(frame: Frame, depth_scale: float) -> Frame:
     return replace(frame, depth_m=frame.depth_m / np.float32(depth_scale))
 
 
+def inside_bars(rgb: np.ndarray) -> tuple[int, int, int, int]:
+    """Top, bottom, left, right, the second and fourth exclusive, of what a letterbox's black bars leave of a picture
+    (H, W, 3) uint8 (all of it when all is black)."""
+    rows = np.flatnonzero(rgb.reshape(len(rgb), -1).max(axis=1))
+    columns = np.flatnonzero(rgb.max(axis=0).any(axis=1))
+    if not len(rows):
+        return 0, rgb.shape[0], 0, rgb.shape[1]
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+
+
 def check(frame: Frame) -> None:
     """Raise FrameRefused, with a sentence, unless the frame can be one: sizes agree, intrinsics are those of a camera
     that took it, and some depth is known."""
@@ -75,7 +85,8 @@ def check(frame: Frame) -> None:
         raise FrameRefused(f"{name}: focal lengths {pin.fx_px:g}, {pin.fy_px:g} px fit no picture of its size")
     if not (-0.5 <= pin.cx_px <= pin.width_px - 0.5 and -0.5 <= pin.cy_px <= pin.height_px - 0.5):
         raise FrameRefused(f"{name}: its centre ({pin.cx_px:g}, {pin.cy_px:g}) px lies outside the picture")
-    if not np.isfinite(depth).any():
+    nearest = float(np.fmin.reduce(depth, axis=None))
+    if math.isnan(nearest) or nearest == math.inf:
         raise FrameRefused(f"{name} has no depth anywhere; is the lens covered, or is all of it nearer than the range?")
-    if np.nanmin(depth) <= 0.0:
+    if nearest <= 0.0:
         raise FrameRefused(f"{name} has depth of 0 m or less; unknown depth must be NaN")

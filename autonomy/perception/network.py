@@ -85,19 +85,24 @@ def channels(
     where it is known beforehand), depth known."""
     height = height_over_plane(depth_m, pinhole) if height_m is None else height_m
     known = np.isfinite(height)
-    scaled = np.where(known, np.clip(height, *CLIP_M), 0.0) / HEIGHT_M
-    depth = np.stack([scaled, known]).astype(np.float32)
-    if variant == "depth":
-        return depth
-    return np.concatenate([standard_colour(rgb, known), depth])
+    image = np.empty((CHANNELS[variant], *height.shape), np.float32)
+    np.clip(height, *CLIP_M, out=image[-2])
+    image[-2] /= np.float32(HEIGHT_M)
+    image[-2][~known] = 0.0
+    image[-1] = known
+    if variant == "rgbd":
+        _standard_colour(rgb, known, image[:3])
+    return image
 
 
-def standard_colour(rgb: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Colours (3, H, W) float32 of mean 0 and spread 1: what exposure and white balance do is gone.  Only what has a
-    depth counts where enough has one: a bright sky would press everything else together."""
+def _standard_colour(rgb: np.ndarray, known: np.ndarray, out: np.ndarray) -> None:
+    """Colours (3, H, W) of mean 0 and spread 1: what exposure and white balance do is gone.  Only what has a depth
+    counts where enough has one: a bright sky would press everything else together."""
     sparse = rgb[::4, ::4].reshape(-1, 3).astype(np.float32)
     solid = known[::4, ::4].ravel()
     if solid.mean() > LEAST_KNOWN:
         sparse = sparse[solid]
     scale = 1.0 / (sparse.std(axis=0) + LEAST_SPREAD)
-    return ((rgb - sparse.mean(axis=0)) * scale).transpose(2, 0, 1).astype(np.float32)
+    out[:] = rgb.transpose(2, 0, 1)
+    out -= sparse.mean(axis=0)[:, None, None]
+    out *= scale[:, None, None]

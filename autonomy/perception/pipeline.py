@@ -9,7 +9,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from autonomy.perception.cylinder import Cylinder, guess
-from autonomy.perception.frame import Frame, FrameRefused, Pose, check
+from autonomy.perception.frame import Frame, FrameRefused, Pose, check, inside_bars
 from autonomy.perception.merge import groups, joined, refused
 from autonomy.perception.refine import Fit, Outline, Sensor, own_outline, refine
 from autonomy.perception.tracks import NOMINAL, Errors, Track, Tracks
@@ -110,6 +110,7 @@ class _Scene:
     @classmethod
     def of(cls, frame: Frame, masks: Sequence[np.ndarray], sensor: Sensor) -> _Scene:
         labels, areas, boxes = np.zeros(frame.depth_m.shape, np.int16), [], []
+        top, bottom, left, right = inside_bars(frame.rgb)
         for i, mask in enumerate(masks):
             if mask.shape != labels.shape or mask.dtype != bool:
                 raise FrameRefused(
@@ -125,7 +126,7 @@ class _Scene:
             labels[box[1] : box[3], box[0] : box[2]][part] = i + 1
             areas.append(int(np.count_nonzero(part)))
             boxes.append(box)
-        return cls(frame, labels, tuple(areas), tuple(boxes), _window(frame.rgb), sensor)
+        return cls(frame, labels, tuple(areas), tuple(boxes), (left, top, right, bottom), sensor)
 
     def _cut(self, group: list[int]) -> tuple[int, int, int, int]:
         boxes = [self.boxes[i] for i in group]
@@ -166,12 +167,3 @@ class _Scene:
         for i in group[1:]:
             mask |= labels == i + 1
         return mask, depth_m, labels, pin, (left, top)
-
-
-def _window(rgb: np.ndarray) -> tuple[int, int, int, int]:
-    """(left, top, right, bottom) of what is not black bars."""
-    rows = np.flatnonzero(rgb[:, ::8].any(axis=(1, 2)))
-    columns = np.flatnonzero(rgb[::8].any(axis=(0, 2)))
-    if not len(rows) or not len(columns):
-        return (0, 0, rgb.shape[1], rgb.shape[0])
-    return (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)

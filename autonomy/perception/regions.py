@@ -140,8 +140,8 @@ class Joining:
         chances = self.chances(judge)
         while chances.size and chances.max() >= LEAST_CHANCE:
             i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(chances)), chances.shape))
-            self.merge(i, j)
-            chances = np.delete(np.delete(chances, j, 0), j, 1)
+            kept = self.merge(i, j)
+            chances = chances[kept[:, None], kept]
             chances[i] = chances[:, i] = np.where(self._may[i], judge.chance(self._told[i]), 0.0)
 
     def chances(self, judge: Head) -> np.ndarray:
@@ -151,20 +151,24 @@ class Joining:
         chances[pairs[:, 0], pairs[:, 1]] = chances[pairs[:, 1], pairs[:, 0]] = judge.chance(told)
         return chances
 
-    def merge(self, i: int, j: int) -> None:
-        """Make pieces ``i`` and ``j``, ``i`` the earlier one, one in its place."""
+    def merge(self, i: int, j: int) -> np.ndarray:
+        """Make pieces ``i`` and ``j``, ``i`` the earlier one, one in its place; the places (n - 1,) that the pieces had
+        before."""
         self.pieces[i] = piece(self.scene, np.concatenate([self.pieces[i].own, self.pieces[j].own]))
         for of in (self._touch, self._wall):
             of[i] += of[j]
             of[:, i] += of[:, j]
             of[i, i] = 0.0
+        self._row.put(i, self.pieces[i])
+        kept = np.flatnonzero(np.arange(len(self.pieces)) != j)
         del self.pieces[j]
         self._touch, self._wall, self._told, self._may = (
-            np.delete(np.delete(of, j, 0), j, 1) for of in (self._touch, self._wall, self._told, self._may)
+            of[kept[:, None], kept] for of in (self._touch, self._wall, self._told, self._may)
         )
-        self._row = Row.of(self.pieces)
-        others = np.delete(np.arange(len(self.pieces)), i)
+        self._row = self._row.take(kept)
+        others = np.flatnonzero(np.arange(len(kept)) != i)
         self._relate(np.full(len(others), i), others)
+        return kept
 
     def looks(self, judge: Head) -> np.ndarray:
         """LOOKS (n, 14) of the pieces as they are now."""

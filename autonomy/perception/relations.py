@@ -62,6 +62,12 @@ class Row:
             *lines.T,
         )
 
+    def put(self, place: int, piece: Piece) -> None:
+        """Write a piece over the one at a place."""
+        one = Row.of([piece])
+        for f in fields(self):
+            getattr(self, f.name)[place] = getattr(one, f.name)[0]
+
     def take(self, which: np.ndarray) -> Row:
         """Those of these places."""
         return Row(*(getattr(self, f.name)[which] for f in fields(self)))

@@ -188,11 +188,11 @@ class Tracks:
         for i, j in zip(*linear_sum_assignment(costs), strict=True):
             if costs[i, j] < BAR:
                 # A fit of this log that errs beyond the gate changes nothing, and is no other log either; but when
-                # several in a row do, it is the log that was wrong from the start.
+                # several in a row do, or the log was in one picture only, it is that which was wrong from the start.
                 taken.add(j)
                 log = self._logs[i]
                 log.odd = 0 if costs[i, j] < GATE else log.odd + 1
-                if log.odd >= ODD:
+                if log.odd >= (ODD if log.hits >= CONFIRMED else 1):
                     self._logs[i] = log = _Log(log.id, fits[j], pose, self._errors, log.hits)
                 if log.odd == 0:
                     log.update(fits[j], pose, stamp_ns)

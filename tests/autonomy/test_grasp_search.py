@@ -231,6 +231,17 @@ def test_tongs_are_pressed_into_a_heap_that_a_camera_measured_but_not_into_the_g
     assert not whole.pressed and whole.support_z_m == pytest.approx(GROUND, abs=1e-3)
 
 
+def test_tongs_are_not_pressed_in_over_a_log_that_lies_across() -> None:
+    """They would take it, too, and hang askew."""
+    row = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
+    on_top = log(9, 0.0, 0.22)
+    across = LogObservation(8, on_top.center_m, (0.0, 1.0, 0.0), 2.0, 0.2)
+    beneath = measured([*row, replace(on_top, center_m=(X, Y, on_top.center_m[2] + 0.2)), across])
+    p = planned(beneath)
+    assert p.logs == (7,) and not p.pressed
+    assert planned(measured([*row, on_top])).pressed
+
+
 def test_where_no_grasp_is_safe_a_camera_s_logs_are_gripped_at_the_top_all_the_same() -> None:
     wall = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
     with pytest.raises(NoGrasp, match="is safe"):

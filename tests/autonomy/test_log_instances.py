@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from autonomy.networks.torch_net import random_net
 from autonomy.networks.weights import WeightsRefused, save
-from autonomy.perception.finder import LogFinder, both, inside_bars
-from autonomy.perception.frame import Frame, FrameRefused
+from autonomy.perception.finder import LogFinder, both
+from autonomy.perception.frame import Frame, FrameRefused, inside_bars
 from autonomy.perception.instances import instances
 from autonomy.perception.network import OFFSET_PX, STRIDE, unet
 from autonomy.perception.regions import shipped_judges
