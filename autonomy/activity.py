@@ -274,6 +274,8 @@ class Activity:
                 return self._after_look() if seen else None
             case Phase.ABOVE:
                 return self._after_above(now_ns) if self._tongs.open else None
+            case Phase.CLOSE if self._tongs.jammed and self._cycle.grip_higher():
+                return Phase.DESCEND
             case Phase.LIFT | Phase.CARRY:
                 if self.phase is Phase.CARRY and self._carried(now_ns):
                     return Phase.LOWER

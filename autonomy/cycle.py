@@ -7,6 +7,7 @@ A `Cycle` is asked by the activity, which alone knows when a phase begins and en
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from math import dist
 from typing import Final
 
@@ -32,6 +33,8 @@ from machine.sag import sane_load_kg
 ATTEMPTS: Final = 3
 LOOKS: Final = 2
 """So often a grasp is chosen again from over it."""
+CLIMBS, _CLIMB_M = 3, 0.1
+"""A heap too wide for the tongs is gripped so much higher, so often: they take from its top what they get round."""
 _SAME_M, _SAME_RAD = 0.02, 0.03
 """Grasps that differ by less are gone down to from the same place."""
 _LOOSE_M: Final = 0.2
@@ -59,7 +62,7 @@ class Cycle:
         self._arm = Arm(profile, stretches=motions.stretches)
         """With what hangs in the grapple in the present phase."""
         self._begun_z_m = 0.0
-        self._looks = 0
+        self._looks = self._climbs = 0
         self._before: Grasp | None = None
 
     @property
@@ -69,15 +72,14 @@ class Cycle:
 
     def choose(self, q: Axes) -> None:
         """A grasp among the logs of the newest list, from where the crane stands; raises ``NoGrasp``."""
-        self._looks, self._before = 0, None
+        self._looks = self._climbs = 0
+        self._before = None
         self.grasp = self._choose(self._arm, self._mission, self._heard.logs, q[Joint.SLEW], q[Joint.ROT])
 
     @property
     def unsure(self) -> bool:
         """Whether the grasp is worth another look from above: of logs among others that a camera has measured."""
-        grasp = self.grasp
-        measured = grasp is not None and grasp.gathered and any(log.covariance is not None for log in grasp.logs)
-        return measured and self._looks < LOOKS
+        return self.grasp is not None and _measured(self.grasp) and self._looks < LOOKS
 
     def choose_better(self, q: Axes) -> bool:
         """Choose again by what is seen from over the grasp; whether the crane has to go over another place for it."""
@@ -100,6 +102,16 @@ class Cycle:
         if self._before is None:
             return False
         self.grasp, self._before, self._looks = self._before, None, LOOKS
+        return True
+
+    def grip_higher(self) -> bool:
+        """Of a bundle that a camera measured, for the tongs do not get round it; whether there is a higher grasp."""
+        grasp = self.grasp
+        if grasp is None or not _measured(grasp) or self._climbs == CLIMBS:
+            return False
+        self._climbs += 1
+        pose = grasp.pose.at_height(grasp.pose.z_m + _CLIMB_M)
+        self.grasp = replace(grasp, pose=pose, support_z_m=grasp.support_z_m + _CLIMB_M)
         return True
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
@@ -235,3 +247,8 @@ class Cycle:
     def _picked(self) -> list[LogObservation]:
         assert self.grasp is not None
         return picked(self.grasp, self._heard.logs)
+
+
+def _measured(grasp: Grasp) -> bool:
+    """Whether it is a planner's among others, of logs that a camera has measured."""
+    return grasp.gathered and any(log.covariance is not None for log in grasp.logs)

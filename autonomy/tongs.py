@@ -21,6 +21,8 @@ _GRIPPED: Final = (4, 5)  # GrappleStat.State: closed, holding
 _OPEN_PCT: Final = 92.0
 _GRIPPED_RAD: Final = 1.5
 """Tongs without a sensor are taken to have been closed as far when they let go of a log: past tips that meet."""
+_JAMMED_PCT: Final = 70.0
+"""Tongs that stop closing so wide open clasp a heap's sides: their tips are not under it."""
 _LEAST_S: Final = 0.5
 """Of closing, before the report can be of it."""
 _VALVE_S: Final = 0.4
@@ -94,6 +96,11 @@ class Tongs:
     def open(self) -> bool:
         """Whether they stand open."""
         return opened(self._profile, self._heard.report, self._opening_s)
+
+    @property
+    def jammed(self) -> bool:
+        """Whether they are seen to stand too wide open to lift what they hold; without a sensor nobody knows."""
+        return self._heard.report.opening_pct > _JAMMED_PCT
 
     def gripped(self, closing_s: float) -> bool:
         """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""

@@ -74,8 +74,14 @@ RULES: Final = ((STRICT, 1.0), (LAYER, 0.95), (WIDE, 0.65))
 PRESSED_M: Final = 0.15
 """So much lower than planned, but for the ground, open tongs are pressed in among logs that a camera measured: it sees
 what lies high up to 0.1 m too high, and tips that are too high close over it; those too low rest on what lies there."""
+FREE_M: Final = 0.05
+"""The same where they come down beside all logs: nothing stops them, and what they close round may be too much."""
+TIP_SIDE_M: Final = 0.08
+"""Half the width of a tong's tip, with what its place is unsure by."""
 LAST: Final = 0.3
 """Success of such tongs over the topmost log where no grasp is safe."""
+FLOATS_M, FLOATS_ON_WHEELS_M = 0.4, 1.5
+"""A log whose middle is so high over the ground lies on others; on wheels, over the lowest log, for ground slopes."""
 SEED: Final = 1
 
 
@@ -109,6 +115,13 @@ class Search:
         """The best grasp that the crane reaches; raises ``NoGrasp``."""
         if not logs:
             raise NoGrasp("no log is in view")
+        lying = _lying(arm, logs)
+        if len(lying) < len(logs):
+            if not lying:
+                raise NoGrasp(f"none of the {_counted(logs)} in view lies on anything")
+            staying = {lying.index(i) for i in stay if i in lying}
+            found = self(arm, [logs[i] for i in lying], slew_rad, rot_rad, staying)
+            return replace(found, logs=tuple(lying[i] for i in found.logs))
         stays = np.isin(np.arange(len(logs)), list(stay))
         wanted = _counted(np.flatnonzero(~stays).tolist())
         ground = known_ground_m(arm.profile)
@@ -154,8 +167,8 @@ class Search:
                 trouble = str(error)
                 continue
             proposal = self._proposal(best, int(i), captured[i], float(probability[i]), logs)
-            crossed = _crossed(jaws, world, proposal)
-            return _pressed(proposal, lowest) if measured.any() and not crossed else proposal
+            deep_m = _depth_m(jaws, world, proposal) if measured.any() else 0.0
+            return _pressed(proposal, deep_m, lowest)
         raise NoGrasp(f"no grasp of the {wanted} is in reach: {trouble}")
 
     def _over(
@@ -175,7 +188,7 @@ class Search:
                 f"no grasp of the {_counted(logs)} is safe, and log {log.id} is out of reach: {error}"
             ) from None
         reason = f"no grasp of the {_counted(logs)} is sure to be safe: over log {log.id}, the topmost"
-        return _pressed(GraspProposal(x, y, yaw, level, (i,), LAST, reason), lowest_m)
+        return _pressed(GraspProposal(x, y, yaw, level, (i,), LAST, reason), PRESSED_M, lowest_m)
 
     def _probability(
         self,
@@ -221,19 +234,35 @@ class Search:
         )
 
 
-def _pressed(p: GraspProposal, lowest_m: float) -> GraspProposal:
-    """Pressed in where its tongs come down over what others lie on, and as planned on the ground."""
-    if p.support_z_m < lowest_m + ROW_M:
-        return p
-    return replace(p, support_z_m=max(p.support_z_m - PRESSED_M, lowest_m), pressed=True)
-
-
-def _crossed(jaws: Jaws, world: Cylinders, p: GraspProposal) -> bool:
-    """Whether a log between the tongs lies across those that are taken: pressed in, the tongs would take it, too."""
+def _depth_m(jaws: Jaws, world: Cylinders, p: GraspProposal) -> float:
+    """How much lower than planned the tongs may be pressed in: not at all where a log between them lies across those
+    that are taken, which they would take, too; little where nothing stops them."""
     at = sections(jaws, world, *(np.array(v) for v in (p.x_m, p.y_m, p.yaw_rad)))
     between = at.inside & (at.low_u < jaws.half_gap_m) & (at.high_u > -jaws.half_gap_m)
     between[list(p.logs)] = False
-    return bool(np.any(between & (at.askew > ACROSS**2)))
+    if np.any(between & (at.askew > ACROSS**2)):
+        return 0.0
+    beneath = [
+        np.any(at.inside & (at.low_u < tip + TIP_SIDE_M) & (at.high_u > tip - TIP_SIDE_M))
+        for tip in (-jaws.half_gap_m, jaws.half_gap_m)
+    ]
+    return PRESSED_M if any(beneath) else FREE_M
+
+
+def _pressed(p: GraspProposal, deep_m: float, lowest_m: float) -> GraspProposal:
+    """Pressed in where its tongs come down over what others lie on, and as planned on the ground."""
+    if deep_m == 0.0 or p.support_z_m < lowest_m + ROW_M:
+        return p
+    return replace(p, support_z_m=max(p.support_z_m - deep_m, lowest_m), pressed=True)
+
+
+def _lying(arm: Arm, logs: Sequence[LogObservation]) -> list[int]:
+    """Which logs lie on something: one that floats in the air is a mistake of who saw it, or hangs in a grapple."""
+    world, ground = cylinders(logs), known_ground_m(arm.profile)
+    bottom = world.center[:, 2] - world.radius
+    above = bottom - (ground if isfinite(ground) else bottom.min())
+    aloft = (above > (FLOATS_M if isfinite(ground) else FLOATS_ON_WHEELS_M)) & ~lies_upon(world).any(axis=0)
+    return np.flatnonzero(~aloft).tolist()
 
 
 def _leaving(found: Scores, stays: np.ndarray) -> Scores:

@@ -188,12 +188,14 @@ class Tracks:
         for i, j in zip(*linear_sum_assignment(costs), strict=True):
             if costs[i, j] < BAR:
                 # A fit of this log that errs beyond the gate changes nothing, and is no other log either; but when
-                # several in a row do, or the log was in one picture only, it is that which was wrong from the start.
+                # several in a row do, it is the log that was wrong from the start.  One that was in a single picture
+                # is not believed by two that do not agree: it begins with the second.
                 taken.add(j)
                 log = self._logs[i]
                 log.odd = 0 if costs[i, j] < GATE else log.odd + 1
-                if log.odd >= (ODD if log.hits >= CONFIRMED else 1):
-                    self._logs[i] = log = _Log(log.id, fits[j], pose, self._errors, log.hits)
+                known = log.hits >= CONFIRMED
+                if log.odd >= (ODD if known else 1):
+                    self._logs[i] = log = _Log(log.id, fits[j], pose, self._errors, log.hits if known else 0)
                 if log.odd == 0:
                     log.update(fits[j], pose, stamp_ns)
                     found.add(i)

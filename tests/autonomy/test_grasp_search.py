@@ -242,6 +242,17 @@ def test_tongs_are_not_pressed_in_over_a_log_that_lies_across() -> None:
     assert planned(measured([*row, on_top])).pressed
 
 
+def test_what_floats_in_the_air_is_not_gripped_and_in_nobody_s_way() -> None:
+    """A glimpse of the crane's own tongs, as a camera that looked past them once measured it."""
+    ghost = LogObservation(9, (X, Y, GROUND + 1.6), (-0.8, 0.38, -0.46), 1.92, 0.09)
+    logs = measured(pair())
+    alone, haunted = planned(logs), planned([ghost, *logs])
+    assert haunted.logs == tuple(i + 1 for i in alone.logs) and (haunted.x_m, haunted.y_m) == (alone.x_m, alone.y_m)
+    assert Search()(ARM, [log(0, -0.4), ghost, log(1, 0.4)], 0.0, 0.0, stay=(0,)).logs == (2,)
+    with pytest.raises(NoGrasp, match="lies on anything"):
+        planned([ghost])
+
+
 def test_where_no_grasp_is_safe_a_camera_s_logs_are_gripped_at_the_top_all_the_same() -> None:
     wall = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
     with pytest.raises(NoGrasp, match="is safe"):

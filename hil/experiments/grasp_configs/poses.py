@@ -30,6 +30,7 @@ CAMERA: Final = "stick"
 PICTURES: Final = 3
 LEAST_PX: Final = 60
 RATE_NS: Final = 66_666_667
+LOOK_NS: Final = PICTURES * RATE_NS
 MISSED_M, MISSED_RAD, MISSED_WIDTH_M = 0.15, math.radians(8.0), 0.06
 """A log that is seen further off than this, or more turned, or so much thicker or thinner, misleads a planner."""
 

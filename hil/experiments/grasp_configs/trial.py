@@ -28,7 +28,7 @@ from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from hil.experiments.grasp_configs.outcome import Grip, category, lifted
-from hil.experiments.grasp_configs.poses import POSES, Seen, Sight, misled
+from hil.experiments.grasp_configs.poses import LOOK_NS, POSES, Seen, Sight, misled
 from hil.experiments.plant.worlds import profile_named, wood_of
 from hil.experiments.pool import Job
 from hil.lockstep import START_NS, Lockstep, Observer
@@ -58,11 +58,13 @@ class Attempt:
     """... and how many there were."""
     _up_ns: int = 0
     """Since when the lift is done."""
+    _looked_ns: int = 0
     _rested_ns: int = 0
     """Since when the crane rests above the logs."""
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """One turn (contract of ``hil.lockstep.Planner``): a look at the start, and one at each rest above the logs."""
+        """One turn (contract of ``hil.lockstep.Planner``): looks at the start until logs are seen, and one at each rest
+        above them."""
         activity = self.activity
         data = activity.step(now_ns, report, self._looked(now_ns) if logs else ())
         if self._up_ns == 0 and activity.phase is Phase.LIFT and activity.arrived:
@@ -72,7 +74,7 @@ class Attempt:
     def _looked(self, now_ns: int) -> tuple[LogObservation, ...]:
         phase = self.activity.phase
         if phase <= Phase.LOOK:
-            if self.looks == 0:
+            if not self.seen.logs and now_ns >= self._looked_ns + LOOK_NS:
                 self._look(now_ns)
             return self.seen.logs
         rests = phase is Phase.ABOVE and self.activity.arrived
@@ -85,7 +87,7 @@ class Attempt:
 
     def _look(self, now_ns: int) -> None:
         self.seen = self.sight.look(now_ns)
-        self.looks += 1
+        self.looks, self._looked_ns = self.looks + 1, now_ns
 
     def over(self, now_ns: int) -> bool:
         """Whether the grapple is up and has been held still for two seconds."""

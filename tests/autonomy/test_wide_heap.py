@@ -1,0 +1,80 @@
+"""A heap too wide for the tongs: these stall at its sides, open again and close higher up, round what lies on top."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from crane_stand_in import StandIn
+from grasp_scenes import GROUND, PROFILE, small_pile
+
+from autonomy.activity import Activity
+from autonomy.cycle import CLIMBS
+from autonomy.grasp.direct import Planned
+from autonomy.grasp.search import Search
+from autonomy.logs import TRIANGLE, LogObservation
+from autonomy.phases import Phase
+from can_dbc.setpoint import GrappleCommand
+from machine.grapple import tip_below_pin_m
+from machine.load import profile_hash
+
+STALL_RAD = 0.5  # of 2.25: opened by four fifths
+
+
+class Heap(StandIn):
+    """Tongs that come down deeper than ``shoulder_m`` meet logs on both sides."""
+
+    shoulder_m = GROUND + 0.12
+    measures = True
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        if not self.measures:
+            return tuple(self.logs)
+        variances = [1e-6 if i in (0, 7, 13) else 0.0 for i in range(TRIANGLE)]
+        return tuple(replace(log, covariance=tuple(variances)) for log in self.logs)
+
+    def _grapple(self, command: GrappleCommand) -> None:
+        tip_m = self.pin()[2] - tip_below_pin_m(self.profile.grapple.tongs, self.tong_rad)
+        if command is GrappleCommand.CLOSE and self.tong_rad >= STALL_RAD and tip_m < self.shoulder_m:
+            self.gripped = True
+        else:
+            super()._grapple(command)
+
+
+def driven(heap: Heap) -> tuple[list[Phase], Activity]:
+    """The phases from the first descent to the lift."""
+    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(Search()))
+    phases = [planner.phase]
+    for _ in range(2400):
+        if planner.phase is Phase.LIFT or planner.idle:
+            break
+        heap.step(planner)
+        if planner.phase is not phases[-1]:
+            phases.append(planner.phase)
+    assert planner.phase is Phase.LIFT, planner.failure
+    return phases[phases.index(Phase.DESCEND) :], planner
+
+
+def test_tongs_that_stall_at_the_sides_of_a_heap_close_higher_up() -> None:
+    heap = Heap(PROFILE, small_pile())
+    phases, _ = driven(heap)
+    closes = [i for i, p in enumerate(phases) if p is Phase.CLOSE]
+    assert 2 <= len(closes) <= 1 + CLIMBS
+    assert all(phases[i + 1] is Phase.DESCEND for i in closes[:-1])
+    assert heap.tong_rad > STALL_RAD + 0.5, "in the end they close"
+    lows = [m.pin[2] for was, m in pairwise(heap.trace) if m.phase == "CLOSE" != was.phase]
+    assert all(after - before == pytest.approx(0.1, abs=0.02) for before, after in pairwise(lows))
+
+
+def test_what_gives_nowhere_is_lifted_after_all() -> None:
+    heap = Heap(PROFILE, small_pile())
+    heap.shoulder_m = 9.0
+    assert driven(heap)[0].count(Phase.CLOSE) == 1 + CLIMBS
+
+
+def test_logs_that_nobody_measured_and_tongs_without_a_sensor_are_lifted_as_they_are() -> None:
+    known, blind = Heap(PROFILE, small_pile()), Heap(PROFILE, small_pile(), feedback=False)
+    known.measures = False
+    for heap in (known, blind):
+        assert driven(heap)[0].count(Phase.CLOSE) == 1
