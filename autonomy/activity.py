@@ -274,8 +274,8 @@ class Activity:
                 return self._after_look() if seen else None
             case Phase.ABOVE:
                 return self._after_above(now_ns) if self._tongs.open else None
-            case Phase.CLOSE if self._tongs.jammed and self._cycle.grip_higher():
-                return Phase.DESCEND
+            case Phase.CLOSE if self._tongs.wide and self._cycle.may_grip_higher:
+                return self._higher() if self._tongs.still else None
             case Phase.LIFT | Phase.CARRY:
                 if self.phase is Phase.CARRY and self._carried(now_ns):
                     return Phase.LOWER
@@ -304,6 +304,11 @@ class Activity:
         if self._heard.logs_ns < self._arrived_ns + SETTLED_NS:
             return None if now_ns < self._arrived_ns + PATIENCE_NS else Phase.DESCEND
         return Phase.ABOVE if self._cycle.choose_better(self.motion.goal) else Phase.DESCEND
+
+    def _higher(self) -> Phase:
+        """Open again and close higher up."""
+        self._cycle.grip_higher()
+        return Phase.DESCEND
 
     def _after_lift(self) -> Phase | None:
         if self._cycle.came_up((self._position(), self._pursuit.sent)):

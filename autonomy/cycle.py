@@ -104,15 +104,17 @@ class Cycle:
         self.grasp, self._before, self._looks = self._before, None, LOOKS
         return True
 
-    def grip_higher(self) -> bool:
-        """Of a bundle that a camera measured, for the tongs do not get round it; whether there is a higher grasp."""
-        grasp = self.grasp
-        if grasp is None or not _measured(grasp) or self._climbs == CLIMBS:
-            return False
+    @property
+    def may_grip_higher(self) -> bool:
+        """Whether a bundle that the tongs do not get round may be gripped higher up: one that a camera measured."""
+        return self.grasp is not None and _measured(self.grasp) and self._climbs < CLIMBS
+
+    def grip_higher(self) -> None:
+        """Grip it there next."""
+        assert self.grasp is not None
         self._climbs += 1
-        pose = grasp.pose.at_height(grasp.pose.z_m + _CLIMB_M)
-        self.grasp = replace(grasp, pose=pose, support_z_m=grasp.support_z_m + _CLIMB_M)
-        return True
+        pose = self.grasp.pose.at_height(self.grasp.pose.z_m + _CLIMB_M)
+        self.grasp = replace(self.grasp, pose=pose, support_z_m=self.grasp.support_z_m + _CLIMB_M)
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
         """The motion of a phase that begins at ``q``, with the grasp and the place as they are now seen to be best.

@@ -21,8 +21,10 @@ _GRIPPED: Final = (4, 5)  # GrappleStat.State: closed, holding
 _OPEN_PCT: Final = 92.0
 _GRIPPED_RAD: Final = 1.5
 """Tongs without a sensor are taken to have been closed as far when they let go of a log: past tips that meet."""
-_JAMMED_PCT: Final = 70.0
+_WIDE_PCT: Final = 70.0
 """Tongs that stop closing so wide open clasp a heap's sides: their tips are not under it."""
+_STILL_PCT, _STILL_S = 0.5, 0.8
+"""Tongs stand that move by less in this time; logs that give way are pressed together slowly."""
 _LEAST_S: Final = 0.5
 """Of closing, before the report can be of it."""
 _VALVE_S: Final = 0.4
@@ -82,11 +84,16 @@ class Tongs:
     def __init__(self, profile: Profile, heard: Heard) -> None:
         self.command = GrappleCommand.HOLD
         self._profile, self._heard = profile, heard
-        self._opening_s = self._close_from_s = 0.0
+        self._opening_s = self._close_from_s = self._still_s = 0.0
+        self._stood_pct = 0.0
 
     def tell(self, command: GrappleCommand, dt_s: float) -> None:
         """A command, from now on for so long."""
         self.command = command
+        opening = self._heard.report.opening_pct if self._heard.report is not None else 0.0
+        self._still_s += dt_s
+        if abs(opening - self._stood_pct) > _STILL_PCT:
+            self._stood_pct, self._still_s = opening, 0.0
         if command is GrappleCommand.OPEN:
             self._opening_s += dt_s
         elif command is not GrappleCommand.NEUTRAL:
@@ -98,9 +105,14 @@ class Tongs:
         return opened(self._profile, self._heard.report, self._opening_s)
 
     @property
-    def jammed(self) -> bool:
+    def wide(self) -> bool:
         """Whether they are seen to stand too wide open to lift what they hold; without a sensor nobody knows."""
-        return self._heard.report.opening_pct > _JAMMED_PCT
+        return self._heard.report.opening_pct > _WIDE_PCT
+
+    @property
+    def still(self) -> bool:
+        """Whether they have not moved for a while."""
+        return self._still_s > _STILL_S
 
     def gripped(self, closing_s: float) -> bool:
         """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""

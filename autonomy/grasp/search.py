@@ -42,6 +42,7 @@ from autonomy.grasp.quality import (
     rate,
     sections,
 )
+from autonomy.grasp.row import drawn_out
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
 from autonomy.perception.estimate import RADIUS
@@ -151,6 +152,11 @@ class Search:
                 share = self._probability(jaws, drawn, upon, best, found.captured, rule, stays)
                 plans.append((best, found, trust * share))
         lowest = ground if isfinite(ground) else float(np.min(world.center[:, 2] - world.radius))
+        likely = bool(plans) and max(float(np.max(plan[2])) for plan in plans) >= LEAST
+        if measured.any() and not likely and not upon.any():
+            drawn = drawn_out(arm, jaws, world, logs, stays, lowest, rot_rad)
+            if drawn is not None:
+                return drawn
         if not plans:
             if measured.any():
                 return self._over(arm, logs, int(top[0]), stations[0], lowest, rot_rad)

@@ -253,13 +253,29 @@ def test_what_floats_in_the_air_is_not_gripped_and_in_nobody_s_way() -> None:
         planned([ghost])
 
 
-def test_where_no_grasp_is_safe_a_camera_s_logs_are_gripped_at_the_top_all_the_same() -> None:
-    wall = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
+WALL = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
+
+
+def test_a_log_is_drawn_out_of_a_row_that_is_too_wide() -> None:
     with pytest.raises(NoGrasp, match="is safe"):
-        planned(wall)
-    p = planned(measured(wall))
+        planned(WALL)
+    p = planned(measured(WALL))
+    assert p.pressed and p.logs in {(0,), (6,)} and "drawn out of a row of 7 logs" in p.reason
+    end = WALL[p.logs[0]].center_m[1]
+    inner, outer = sorted((p.y_m - JAWS.half_gap_m, p.y_m + JAWS.half_gap_m), key=lambda y: abs(y - Y))
+    assert abs(inner - end) == pytest.approx(0.14, abs=0.001) and abs(inner - Y) < abs(end - Y), (
+        "in the valley beside it"
+    )
+    assert abs(outer - Y) > abs(end - Y) + 1.0, "and on free ground"
+    assert p.logs == (0,)
+    beside = Search()(ARM, measured([*WALL, log(9, -1.6)]), 0.0, 0.0, stay=(7,))
+    assert beside.logs == (6,), "where another lies there is no room"
+
+
+def test_where_no_grasp_is_safe_a_camera_s_logs_are_gripped_at_the_top_all_the_same() -> None:
+    p = Search()(ARM, measured(WALL), 0.0, 0.0, stay=(0, 6))
     assert p.probability == 0.3 and len(p.logs) == 1 and "sure" in p.reason and "\n" not in p.reason
-    one = wall[p.logs[0]]
+    one = WALL[p.logs[0]]
     assert np.hypot(p.x_m - one.center_m[0], p.y_m - one.center_m[1]) < 0.01
 
 

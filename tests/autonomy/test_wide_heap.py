@@ -27,6 +27,7 @@ class Heap(StandIn):
 
     shoulder_m = GROUND + 0.12
     measures = True
+    gives_rad = 0.0  # in a tick
 
     def seen(self) -> tuple[LogObservation, ...]:
         if not self.measures:
@@ -38,6 +39,7 @@ class Heap(StandIn):
         tip_m = self.pin()[2] - tip_below_pin_m(self.profile.grapple.tongs, self.tong_rad)
         if command is GrappleCommand.CLOSE and self.tong_rad >= STALL_RAD and tip_m < self.shoulder_m:
             self.gripped = True
+            self.tong_rad += self.gives_rad
         else:
             super()._grapple(command)
 
@@ -65,6 +67,13 @@ def test_tongs_that_stall_at_the_sides_of_a_heap_close_higher_up() -> None:
     assert heap.tong_rad > STALL_RAD + 0.5, "in the end they close"
     lows = [m.pin[2] for was, m in pairwise(heap.trace) if m.phase == "CLOSE" != was.phase]
     assert all(after - before == pytest.approx(0.1, abs=0.02) for before, after in pairwise(lows))
+
+
+def test_a_heap_that_gives_way_slowly_is_not_let_go() -> None:
+    heap = Heap(PROFILE, small_pile())
+    heap.gives_rad = 0.002
+    assert driven(heap)[0].count(Phase.CLOSE) == 1
+    assert heap.tong_rad > STALL_RAD + 0.1
 
 
 def test_what_gives_nowhere_is_lifted_after_all() -> None:

@@ -1,0 +1,66 @@
+"""A log at the end of a row that is too wide for the tongs is drawn out of it.
+
+One open tong is pressed into the valley between it and its neighbour, the other comes down on free ground beyond;
+closing, they roll the log away from the row until both are under it.  Tongs round the whole row, instead, stall at its
+sides, pull, and slip off over it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import atan2, pi
+from typing import Final
+
+import numpy as np
+
+from autonomy.grasp.cylinders import Cylinders
+from autonomy.grasp.direct import closing_height, travel_height
+from autonomy.grasp.jaws import Jaws
+from autonomy.grasp.proposal import GraspProposal
+from autonomy.logs import LogObservation
+from autonomy.motion.arm import Arm
+from machine.grapple import rotator_for_yaw
+from machine.kinematics import Unreachable
+
+SUCCESS: Final = 0.9
+"""In the plant's rows of three of which no other grasp was probable: 12 of 13."""
+VALLEY_M: Final = 0.02
+"""The tip comes down so far beyond the log's side: logs that touch part when it is pressed between them."""
+BESIDE_M: Final = 0.05
+"""What lies on one side of a log lies so far over there, at least."""
+ROUND_M: Final = 2.5
+"""Logs whose middles are farther away are of no row with it."""
+
+
+def drawn_out(
+    arm: Arm,
+    jaws: Jaws,
+    world: Cylinders,
+    logs: Sequence[LogObservation],
+    stays: np.ndarray,
+    lowest_m: float,
+    rot_rad: float,
+) -> GraspProposal | None:
+    """The thickest log at an end of a row on the ground at ``lowest_m`` that is in reach with free ground beside it and
+    is none of those that are to stay (n,); None where there is none.  ``rot_rad`` is where the rotator stands.
+    """
+    for i in np.argsort(-world.radius, kind="stable").tolist():
+        if stays[i]:
+            continue
+        yaw = atan2(world.axis[i, 1], world.axis[i, 0]) + pi / 2
+        for side in (1.0, -1.0):
+            out = side * np.array([np.cos(yaw), np.sin(yaw)])
+            away = world.center[:, :2] - world.center[i, :2]
+            beyond, near = away @ out, np.hypot(*away.T) < ROUND_M
+            if np.any(near & (beyond > BESIDE_M)) or not np.any(near & (beyond < -BESIDE_M)):
+                continue
+            x, y = world.center[i, :2] + out * (jaws.half_gap_m - world.radius[i] - VALLEY_M)
+            low_m = closing_height(arm.profile, lowest_m, logs[i].diameter_m)(0.0)
+            try:
+                pose = arm.over(float(x), float(y), low_m, travel_height(arm.profile))
+                rotator_for_yaw(arm.profile, pose.slew_rad, yaw, rot_rad)
+            except Unreachable:
+                continue
+            reason = f"log {logs[i].id} is drawn out of a row of {len(logs)} logs that is too wide for the tongs"
+            return GraspProposal(float(x), float(y), yaw, lowest_m, (i,), SUCCESS, reason, pressed=True)
+    return None
