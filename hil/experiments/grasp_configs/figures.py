@@ -59,7 +59,8 @@ SECTIONS: Final = (
         "Logs of random size lie at a random place in a random direction in one of paper A's arrangements (rebuilt "
         "from its sentences). One grasp, lifted and held for two seconds; physics alone judges. "
         "Logs are seen from where the crane stands at first; where a grasp is of logs among others, ours looks again "
-        "from above it, twice at most, and plans anew.",
+        "from above it, twice at most, and plans anew. Tongs that stall wide open at the sides of a heap open again "
+        "and close higher up before they lift, three times at most; that counts as the same grasp.",
         JUDGED,
         (("chain.png", "As paper A's Fig. 5: the pile, the virtual depth picture with the grasp of the search, "
           "the network's quality with its grasp."),),
