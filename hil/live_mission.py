@@ -16,7 +16,7 @@ from hil.display import Display
 from hil.exits import Exit, Stopped
 from hil.forwarded_report import report_loads
 from hil.live import LiveOptions, LiveRun
-from hil.mission import MissionSummary, unheeded
+from hil.mission import MissionSummary
 from hil.mission_site import site_of
 
 SITE: Final = "site.json"
@@ -39,8 +39,6 @@ class LiveMission(LiveRun[MissionSummary]):
         self.planner_is_told = ("--mission", file, "--way", way)
         self._states: list[tuple[float, str]] = []
         self._mission = mission
-        for sentence in unheeded(mission):
-            display.event(f"not done yet: {sentence}", "yellow")
 
     def _heard(self, name: str, message: dict[str, Any]) -> None:
         match name, message.get("event"):

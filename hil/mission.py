@@ -117,20 +117,12 @@ def run_mission(
         raise Stopped(Exit.CONFIGURATION, str(error)) from None
     try:
         with Display(console, f"{profile.title}: {mission.name or 'a mission'}, lockstep, seed {seed}") as display:
-            for sentence in unheeded(mission):
-                display.event(f"not done yet: {sentence}", "yellow")
             run = MissionRun(mission, name, profile, plant, recorder, display, way, site, eyes, seed)
             summary = run.run(limit_s, str(directory))
         report_loads(directory, run.manager.tally.loads, mission, profile, EPOCH, START_NS)
         return summary
     finally:
         recorder.close()
-
-
-def unheeded(mission: ForwardingMission) -> list[str]:
-    """What a mission asks for and the activity manager does not do yet, a sentence each."""
-    turned = any(landing.bearing_deg is not None for landing in mission.landings)
-    return ["logs are laid down along the machine, not along the bearing_deg of a landing"] if turned else []
 
 
 class MissionRun:

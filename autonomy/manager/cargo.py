@@ -11,6 +11,7 @@ from autonomy.logs import LogObservation
 from autonomy.manager.outlook import Outlook
 from autonomy.manager.progress import Progress, copied
 from autonomy.manager.tally import Taken, Tally, volume_m3
+from autonomy.missions.local import yaw_from_bearing
 from autonomy.missions.model import ForwardingMission, Point
 from autonomy.navigation.curves import Point2
 from machine.profile import Profile
@@ -28,6 +29,8 @@ class Cargo:
             self.sorting.goes_on(progress.landing, progress.served, progress.rounds)
         self._outlook, self._bunk = outlook, profile.bunk
         self._wanted, self._lands = mission.options.logs_wanted, bool(mission.landings)
+        bearings = [landing.bearing_deg for landing in mission.landings]
+        self._lie_rad = [None if deg is None else yaw_from_bearing(deg) for deg in bearings]
 
     @property
     def enough(self) -> bool:
@@ -58,11 +61,13 @@ class Cargo:
         """The landing that the load goes to, as people call it; empty where there is one alone, or none is decided."""
         return self.sorting.called(self.sorting.landing)
 
-    def landing(self) -> Point2:
-        """The middle of the landing that the load is brought to now, in the plane."""
+    def landing(self) -> tuple[Point2, float | None]:
+        """The landing that the load is brought to now: its middle in the plane, and the direction in which its logs are
+        to lie [rad], None where any will do."""
         here, places = self._outlook.location, self._outlook.landings
         assert here is not None
-        return places[self.sorting.sets_out(places, (here.x_m, here.y_m))]
+        which = self.sorting.sets_out(places, (here.x_m, here.y_m))
+        return places[which], self._lie_rad[which] if self._lie_rad else None
 
     def leave(self, logs: Sequence[LogObservation], target: int | None) -> tuple[int, ...]:
         """The numbers of a list's logs that are to stay when one grasp takes the target and others with it."""

@@ -75,7 +75,7 @@ class Hand:
 
     def unload(self) -> None:
         """Bring logs from the bunk to the landing of the load."""
-        pile = self._outlook.pile_at(self._cargo.landing())
+        pile = self._outlook.pile_at(*self._cargo.landing())
         self._begin(Mission(source=self._profile.bunk, target=pile), None)
 
     def stow(self) -> None:

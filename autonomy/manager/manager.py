@@ -291,8 +291,8 @@ class Manager:
         assert here is not None
         try:
             if state is State.HAUL:
-                landing = self.cargo.landing()
-                self.ride.haul(here, landing, partial(self.outlook.landing_ahead, landing))
+                landing, lie_rad = self.cargo.landing()
+                self.ride.haul(here, landing, lie_rad, partial(self.outlook.landing_ahead, landing))
                 return
             if not self._begun and not self.ride.ended:
                 self.ride.begin(here, self.outlook.plane)

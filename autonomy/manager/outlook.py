@@ -220,10 +220,14 @@ class Outlook:
         stop = best_stop([pile], self._reach, base_at, 0.0, end_m)
         return None if stop is None else stop.along_m
 
-    def pile_at(self, point: Point2) -> Bunk:
-        """A landing as the crane lays logs there: a bunk on the ground beside the machine, along it."""
+    def pile_at(self, point: Point2, lie_rad: float | None = None) -> Bunk:
+        """A landing as the crane lays logs there: a bunk on the ground beside the machine, along it or along a
+        direction in the plane.
+        """
         x, y, _ = self.base.to_optical(np.array([*point, self.base.position_m[2]])).tolist()
-        return Bunk((x, y), 0.0, PILE_LENGTH_M, PILE_WIDTH_M, self._ground_z_m, PILE_HEIGHT_M)
+        looks = math.atan2(self.base.rotation[1, 0], self.base.rotation[0, 0])
+        yaw = 0.0 if lie_rad is None else math.remainder(lie_rad - looks, math.pi)
+        return Bunk((x, y), yaw, PILE_LENGTH_M, PILE_WIDTH_M, self._ground_z_m, PILE_HEIGHT_M)
 
     def obstacle(self, now_ns: int) -> str:
         """Why nothing that is asked for would be obeyed now; empty when it would."""

@@ -34,9 +34,13 @@ BEFORE_M, BEYOND_M = 10.0, 10.0
 """The way past a landing is straight from so far before it to so far beyond."""
 ROOMY: Final = 1.5
 """The machine turns round in circles that are so much wider than its smallest: the bends begin and end gently."""
+ASTRAY_RAD: Final = 1.4
+"""Onto a first leg that begins so far off its direction the machine does not turn well."""
 NEAR_M: Final = 10.0
 """A corner that is so near may be cut: the machine was in its bend when it was left there."""
 DIRECTIONS: Final = 12
+ALONG_RAD: Final = 0.2
+"""A machine that stands so along the logs of a landing lays them well."""
 AGAIN_M: Final = 6.0
 """After a landing the machine comes back to its route so far before the place where it left it."""
 
@@ -141,26 +145,48 @@ class Ride:
         """Stand as soon as is smooth."""
         self._navigator.pause()
 
-    def haul(self, location: Location, landing: Point2, stop_on: StopOn) -> None:
-        """Drive to a landing by the shortest way that passes it with room for the crane; PathRefused when none does."""
+    def haul(self, location: Location, landing: Point2, lie_rad: float | None, stop_on: StopOn) -> None:
+        """Drive to a landing by the shortest way that passes it with room for the crane, along its logs (``lie_rad``,
+        None: anyhow) where there is such a way; PathRefused when none does.
+        """
         if self._haul is None:
-            ways = self._reaching(location, _past(landing), stop_on)
+            ways = list[tuple[float, Path]]()
+            if lie_rad is not None:
+                ways = self._passing(location, landing, (lie_rad, lie_rad + math.pi), [], stop_on)
+                # A way round about may pass the landing before its last leg, and otherwise.
+                ways = [w for w in ways if abs(math.remainder(w[1].at(w[0])[2] - lie_rad, math.pi)) < ALONG_RAD]
             # Beside it or too near to it for a plain way: a little ahead, or round about.
-            ways = ways or self._reaching(location, [[]], stop_on)
-            round_about = ([*turn, *points] for points in _past(landing) for turn in self._turned(location, points))
-            ways = ways or self._reaching(location, round_about, stop_on)
+            ways = ways or self._passing(location, landing, _ALL_ROUND, [[]], stop_on)
             if not ways:
                 raise PathRefused("no way leads past the landing with room to turn; move it or give it more room")
             stop_m, path = min(ways, key=lambda w: w[0])
             self._haul = Along(self._carrier, path, stop_m, self._speed)
         self._drive(self._haul)
 
+    def _passing(
+        self,
+        location: Location,
+        landing: Point2,
+        directions: Sequence[float],
+        else_: list[list[Point2]],
+        stop_on: StopOn,
+    ) -> list[tuple[float, Path]]:
+        """Ways past a landing in one of these directions; where there are none, those by ``else_``; where there are
+        none either, ways round about.
+        """
+        ways = self._reaching(location, _past(landing, directions), stop_on)
+        ways = ways or self._reaching(location, else_, stop_on)
+        turned = ([*turn, *p] for p in _past(landing, directions) for turn in self._turned(location, p))
+        return ways or self._reaching(location, turned, stop_on)
+
     def _reaching(self, location: Location, ways: Iterable[list[Point2]], stop_on: StopOn) -> list[tuple[float, Path]]:
-        """Of the ways by these points those that can be driven and stopped on, each with where to stop [m]."""
+        """Of the ways by these points those that can be driven and stopped on, each with where to stop [m].  The
+        machine is on them from the first: it does not stop well on one that it has yet to come to.
+        """
         found = []
         for points in ways:
             try:
-                path = self._from(location, points)
+                path = self._as_it_stands(location, points)
             except PathRefused:
                 continue
             stop_m = stop_on(lambda s, path=path: self._base(path, s), path.length_m)
@@ -192,22 +218,25 @@ class Ride:
         here = (location.x_m, location.y_m)
         ways = [[*back, *by, *rest]] if back else []
         ways += [[*by, *rest]] if by else []
-        ways, refused = [*ways, list(rest)], []
+        ways.append(list(rest))
         past = [list(rest[1:])] if turn and len(rest) > 1 and math.dist(here, rest[0]) < NEAR_M else []
-        for points in (*ways, *past):
-            try:
-                self._route(location, points)
-                return
-            except PathRefused as error:
-                refused.append(error)
-        for points in ways if turn else ():
-            for corners in self._turned(location, points):
+        turned = (
+            [*corners, *points] for points in (ways if turn else ()) for corners in self._turned(location, points)
+        )
+        refused = PathRefused("there is no way")
+        for begins, choice in (
+            (self._as_it_stands, (*ways, *past)),
+            (self._nearly, (*ways, *past)),
+            (self._as_it_stands, turned),
+            (self._onto, (*ways, *past)),
+        ):
+            for points in choice:
                 try:
-                    self._route(location, [*corners, *points])
+                    self._route(location, points, begins)
                     return
-                except PathRefused:
-                    continue
-        raise refused[-1]
+                except PathRefused as error:
+                    refused = error
+        raise refused
 
     def _turned(self, location: Location, points: Sequence[Point2]) -> Iterator[list[Point2]]:
         """Places to drive by so that the machine comes to the first of these points along their first leg."""
@@ -246,26 +275,36 @@ class Ride:
         assert self._path is not None
         return self._base(self._path, along_m)
 
-    def _route(self, location: Location, points: Sequence[Point2]) -> None:
-        """The route by these points is what is driven now."""
+    def _route(self, location: Location, points: Sequence[Point2], begins: Callable[..., Path]) -> None:
+        """The route by these points is what is driven now; ``begins`` makes its path."""
         points = list(points)
         if len(points) > 1 and math.dist((location.x_m, location.y_m), points[0]) < AT_M:
             del points[0]
-        self._path = path = self._from(location, points)
+        self._path = path = begins(location, points)
         self._way, self.length_m, self.along_m = Along(self._carrier, path, None, self._speed), path.length_m, 0.0
         self._marks, low, before = [], 0.0, (location.x_m, location.y_m)
         for point in points:  # bends are shorter than their corners; beyond that it may be the place of another lap
             low, before = path.nearest(*point, low, low + math.dist(before, point) + 2.0 * AHEAD_M), point
             self._marks.append((low, point))
 
-    def _from(self, location: Location, points: Sequence[Point2]) -> Path:
-        """A path by these points that begins as the machine stands."""
+    def _as_it_stands(self, location: Location, points: Sequence[Point2]) -> Path:
+        """A path by these points that the machine is on from where it stands."""
         here, yaw = (location.x_m, location.y_m), location.yaw_rad
         ahead = (here[0] + AHEAD_M * math.cos(yaw), here[1] + AHEAD_M * math.sin(yaw))
-        try:
-            return drivable([here, ahead, *points], self._carrier)
-        except PathRefused:  # too little room for a bend: then the follower turns onto the first leg
-            return drivable([here, *points], self._carrier)
+        return drivable([here, ahead, *points], self._carrier)
+
+    def _nearly(self, location: Location, points: Sequence[Point2]) -> Path:
+        """A path by these points whose first leg begins about as the machine stands."""
+        path = self._onto(location, points)
+        if abs(math.remainder(path.at(0.0)[2] - location.yaw_rad, math.tau)) > ASTRAY_RAD:
+            raise PathRefused(
+                "the way begins far off the direction in which the machine stands; drive it there by hand"
+            )
+        return path
+
+    def _onto(self, location: Location, points: Sequence[Point2]) -> Path:
+        """A path by these points; the follower turns onto its first leg, beside it at first."""
+        return drivable([(location.x_m, location.y_m), *points], self._carrier)
 
     def _base(self, path: Path, along_m: float) -> Pose:
         wheelbase = self._carrier.front_axle_m + self._carrier.rear_axle_m
@@ -287,10 +326,12 @@ def _place(plane: Plane, point: Point2) -> Point:
     return Point(*plane.geodetic(*point)[:2])
 
 
-def _past(landing: Point2) -> Iterator[list[Point2]]:
-    """Straight ways past a landing, in every direction and on both of its sides."""
-    for k in range(DIRECTIONS):
-        angle = 2.0 * math.pi * k / DIRECTIONS
+_ALL_ROUND: Final = [2.0 * math.pi * k / DIRECTIONS for k in range(DIRECTIONS)]
+
+
+def _past(landing: Point2, directions: Iterable[float]) -> Iterator[list[Point2]]:
+    """Straight ways past a landing, in these directions and on both of its sides."""
+    for angle in directions:
         c, s = math.cos(angle), math.sin(angle)
         for side in (BESIDE_M, -BESIDE_M):
             x, y = landing[0] - side * s, landing[1] + side * c

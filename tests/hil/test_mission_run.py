@@ -12,9 +12,8 @@ from autonomy.localization.plane import Plane
 from autonomy.manager.chart import diagram, page
 from autonomy.manager.table import OURS, PAPER_B
 from autonomy.missions.files import save_mission
-from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Point
+from autonomy.missions.model import ForwardingMission, KnownLog, Point
 from hil.exits import Exit
-from hil.mission import unheeded
 from timberhand.cli import app
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -57,12 +56,6 @@ def test_a_machine_that_stands_still_drives_no_mission(tmp_path: Path) -> None:
         app, ["mission", "run", str(path), "--lockstep", "--profile", "palms_471", "--out", str(tmp_path / "run")]
     )
     assert "palms_471 stands still" in str(result.exception)
-
-
-def test_what_a_mission_asks_for_in_vain_is_said() -> None:
-    assert unheeded(ForwardingMission("plain", (point(0.0, 0.0),))) == []
-    asks = ForwardingMission("asks", (point(0.0, 0.0),), landings=(Landing(point(5.0, 5.0), bearing_deg=40.0),))
-    assert len(unheeded(asks)) == 1 and "bearing_deg" in unheeded(asks)[0]
 
 
 @pytest.mark.slow
