@@ -27,9 +27,10 @@ MOST_TURN_RAD: Final = 0.4
 
 
 def picked(grasp: Grasp, logs: Sequence[LogObservation]) -> list[LogObservation]:
-    """The logs of the grasp as they are seen now, without those that are hidden."""
+    """The logs of the grasp as they are seen now, without those that are hidden: a log that hung in the tongs hangs no
+    longer where it is remembered."""
     wanted = [log.id for log in grasp.logs]
-    return [log for log in logs if log.id in wanted]
+    return [log for log in logs if log.seen and log.id in wanted]
 
 
 def came_up(arm: Arm, grasp: Grasp, seen: Sequence[LogObservation], pins: Iterable[Pose]) -> Grasp | None:

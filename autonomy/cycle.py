@@ -204,21 +204,23 @@ class Cycle:
         return [log for log in self._heard.logs if log.id not in taken]
 
     def came_up(self, positions: Iterable[Axes]) -> bool:
-        """Whether what was gripped hangs under the crane, measured or sent, or is hidden; the grasp is of that now."""
+        """Whether what was gripped hangs under the crane, measured or sent, or is hidden in tongs that did not shut on
+        nothing; the grasp is of that now."""
         assert self.grasp is not None
         seen = self._picked()
         held = came_up(self._arm, self.grasp, seen, [self._arm.pose(q) for q in positions])
         self.grasp = held or self.grasp
-        return held is not None or not seen
+        return held is not None or (not seen and not tongs.is_empty(self._heard.report))
 
     def came_up_empty(self) -> str:
         """Count a grasp that did; why there is to be no other, or empty."""
+        assert self.grasp is not None
         seen = self._picked()
         lost = next((log for log in seen if lies_in(self._target, log)), None)
         if lost is not None:
             return f"log {lost.id} fell from the grapple into the bunk"
         self.missed += 1
-        return "" if self.missed < ATTEMPTS else f"log {seen[0].id} was missed {ATTEMPTS} times"
+        return "" if self.missed < ATTEMPTS else f"log {(seen or self.grasp.logs)[0].id} was missed {ATTEMPTS} times"
 
     def turn_on_the_way(self, q: Axes) -> float | None:
         """How much farther the rotator is to turn [rad] on a way that is driven already, for what is now seen to hang;

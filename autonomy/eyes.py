@@ -69,5 +69,5 @@ class Eyes:
             self.trouble = str(error)
             return None
         self.trouble = ""
-        self.logs = tuple(track.estimate.observation(track.id) for track in tracks)
+        self.logs = tuple(t.estimate.observation(t.id, t.last_seen_ns == frame.stamp_ns) for t in tracks)
         return self.logs

@@ -2,11 +2,11 @@
 
 The question is ``{"op":"logs","q":"..."}`` with the joint positions [rad, m] in the order of ``Joint``, "nan" for what
 is not measured: a detector whose camera rides on the crane needs them.  The answer is
-``[{"position_m","axis","length_m","diameter_m","id","covariance"}, ...]`` in the base frame, ``id`` being the log's
-number (without it, its place in the list) and ``covariance`` how well the rest is known (it may be missing), or
-``{"error": SENTENCE}``.  An answer is taken or refused whole: a number that is not finite, an axis without length, a
-log that is wider than long (paper A's only real failures come from such diameters), a negative variance or a number
-given twice refuses it.
+``[{"position_m","axis","length_m","diameter_m","id","covariance","seen"}, ...]`` in the base frame, ``id`` being the
+log's number (without it, its place in the list), ``covariance`` how well the rest is known (it may be missing) and
+``seen`` false when the log is remembered from an earlier look, or ``{"error": SENTENCE}``.  An answer is taken or
+refused whole: a number that is not finite, an axis without length, a log that is wider than long (paper A's only real
+failures come from such diameters), a negative variance or a number given twice refuses it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ class LogObservation:
     size.
 
     ``covariance`` is that of ``autonomy.perception.estimate``, its upper triangle row by row (``TRIANGLE`` numbers), or
-    None when nobody says how well the log is known.
+    None when nobody says how well the log is known.  ``seen``: the newest look shows it; otherwise it is remembered
+    from an earlier one, and one that hung in the grapple is there no longer.
     """
 
     id: int
@@ -40,6 +41,7 @@ class LogObservation:
     length_m: float
     diameter_m: float
     covariance: tuple[float, ...] | None = None
+    seen: bool = True
 
 
 class LogsRefused(ValueError):
@@ -53,6 +55,7 @@ class _Log(msgspec.Struct):
     diameter_m: float
     id: int | None = None
     covariance: tuple[float, ...] | None = None
+    seen: bool = True
 
 
 class _Trouble(msgspec.Struct, forbid_unknown_fields=True):
@@ -91,7 +94,8 @@ def parse_question(data: bytes) -> tuple[float, ...]:
 
 def answer(logs: Iterable[LogObservation]) -> bytes:
     """A detector's answer."""
-    return msgspec.json.encode([_Log(o.center_m, o.axis, o.length_m, o.diameter_m, o.id, o.covariance) for o in logs])
+    told = [_Log(o.center_m, o.axis, o.length_m, o.diameter_m, o.id, o.covariance, o.seen) for o in logs]
+    return msgspec.json.encode(told)
 
 
 def answer_trouble(sentence: str) -> bytes:
@@ -127,4 +131,4 @@ def _checked(number: int, log: _Log) -> LogObservation:
     if c is not None and (len(c) != TRIANGLE or not all(map(math.isfinite, c)) or min(c[i] for i in _DIAGONAL) < 0.0):
         raise LogsRefused(f"log {number} has a covariance that is none: {TRIANGLE} finite numbers, no variance below 0")
     axis = (log.axis[0] / norm, log.axis[1] / norm, log.axis[2] / norm)
-    return LogObservation(number, log.position_m, axis, log.length_m, log.diameter_m, c)
+    return LogObservation(number, log.position_m, axis, log.length_m, log.diameter_m, c, log.seen)

@@ -17,7 +17,8 @@ from can_dbc.setpoint import GrappleCommand, StateReport
 from machine.grapple import opening_pct_from_tong_angle, tip_below_pin_m, tong_angle_from_opening_pct
 from machine.profile import Bunk, Profile
 
-_GRIPPED: Final = (4, 5)  # GrappleStat.State: closed, holding
+_SHUT, _HOLDING = 4, 5
+"""Of GrappleStat.State: at the end of its way with nothing in it, and stopped by what it holds."""
 _OPEN_PCT: Final = 92.0
 _GRIPPED_RAD: Final = 1.5
 """Tongs without a sensor are taken to have been closed as far when they let go of a log: past tips that meet."""
@@ -41,7 +42,12 @@ def pace(ahead_s: float) -> float:
 
 def gripped(report: StateReport, closing_s: float) -> bool:
     """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""
-    return closing_s > _LEAST_S and report.grapple_state in _GRIPPED
+    return closing_s > _LEAST_S and report.grapple_state in (_SHUT, _HOLDING)
+
+
+def is_empty(report: StateReport) -> bool:
+    """Whether they shut on nothing, and nothing weighs in them."""
+    return report.grapple_state == _SHUT
 
 
 def opened(profile: Profile, report: StateReport, opening_s: float) -> bool:

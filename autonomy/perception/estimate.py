@@ -65,13 +65,14 @@ class LogEstimate:
         ends = (self.ends_seen[1], self.ends_seen[0])
         return LogEstimate(self.center_m, -self.axis, self.length_m, self.diameter_m, turned, ends, self.score)
 
-    def observation(self, number: int) -> LogObservation:
-        """What a grasp is planned for."""
+    def observation(self, number: int, seen: bool = True) -> LogObservation:
+        """What a grasp is planned for; ``seen``: the newest picture shows it."""
         x, y, z = (float(v) for v in self.center_m)
         ax, ay, az = (float(v) for v in self.axis)
         # Four digits do, and an answer about a hundred logs goes into one datagram.
         known = tuple(float(f"{v:.4g}") for v in self.covariance[np.triu_indices(SIZE)])
-        return LogObservation(number, (x, y, z), (ax, ay, az), float(self.length_m), float(self.diameter_m), known)
+        length_m, diameter_m = float(self.length_m), float(self.diameter_m)
+        return LogObservation(number, (x, y, z), (ax, ay, az), length_m, diameter_m, known, seen)
 
 
 def unpacked(triangle: tuple[float, ...]) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from autonomy.perception.cylinder import Cylinder, guess
 from autonomy.perception.frame import Frame, FrameRefused, Pose, check, inside_bars
 from autonomy.perception.merge import groups, joined, refused
+from autonomy.perception.moved import has_moved
 from autonomy.perception.refine import Fit, Outline, Sensor, own_outline, refine
 from autonomy.perception.tracks import NOMINAL, Errors, Track, Tracks
 from machine.optics import Intrinsics
@@ -56,7 +58,7 @@ class Perception:
             FrameRefused: the frame is none, or from a camera that the profile does not know.
         """
         fits = [fit for fit in self.fits(frame, instances) if abs(fit.body.axis @ pose.rotation[2]) < STEEPEST]
-        return self._tracks.step(fits, pose, frame.stamp_ns)
+        return self._tracks.step(fits, pose, frame.stamp_ns, partial(has_moved, frame, pose))
 
     def fits(self, frame: Frame, instances: Sequence[Masked]) -> list[Fit]:
         """The logs of one frame alone, in its optical frame; what was refused is in ``refusals``."""

@@ -1,14 +1,15 @@
 """Logs over time: an information filter each, identities, and errors that do not average out.
 
-A log lies still in the frame in which poses are given.  Its state is its seven numbers about a fixed line, and the
-camera's errors that stay: scale of depth, turn and shift of the mount.  These are told apart from the log's place only
-where the camera moves; standing still their prior remains, so that a thousand frames never claim a millimetre.
+A log lies still in the frame in which poses are given, until a picture shows it elsewhere.  Its state is its seven
+numbers about a fixed line, and the camera's errors that stay: scale of depth, turn and shift of the mount.  These are
+told apart from the log's place only where the camera moves; standing still their prior remains, so that a thousand
+frames never claim a millimetre.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -29,6 +30,8 @@ CONFIRMED: Final = 2  # pictures after which a log is believed
 ODD: Final = 4  # fits in a row beyond the gate after which a log is begun anew
 SAME_VIEW: Final = 0.1  # a camera that moved by less than this share of the range sees the same
 LOST: Final = 8  # pictures in a row without it after which it is given up
+INSIDE, PARALLEL, AS_LONG_M = 0.7, 0.94, 0.25
+"""Two logs of a length, their axes nearer than this share of their radii's sum, 20 degrees askew at most, are one."""
 BAR: Final = 1e9  # a gap in the table of costs
 _PLACES: Final = [0, 1, 4, 5]  # of the seven numbers, those that are places; 2 and 3 are directions
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
@@ -172,40 +175,96 @@ class _Log:
         return Track(self.id, estimate, self.hits, self.stamp_ns)
 
 
+def _lies_still(log: LogEstimate, fit: Fit) -> bool:
+    """What is known of a log's ways without its picture: none."""
+    return False
+
+
+def _are_one(log: LogEstimate, other: LogEstimate) -> bool:
+    """Whether they would lie in each other, as two logs cannot."""
+    off = log.center_m - other.center_m
+    along = float(off @ other.axis)
+    apart_m = float(np.linalg.norm(off - along * other.axis))
+    inside = apart_m < INSIDE * 0.5 * (log.diameter_m + other.diameter_m) and abs(along) < 0.5 * other.length_m
+    as_long = abs(log.length_m - other.length_m) < AS_LONG_M  # a piece of a log is no reason to forget the whole
+    return inside and as_long and abs(float(log.axis @ other.axis)) > PARALLEL
+
+
 class Tracks:
     """All logs of a scene."""
 
     def __init__(self, errors: Errors = NOMINAL) -> None:
         self._errors, self._logs, self._next = errors, [], 1
 
-    def step(self, fits: Sequence[Fit], pose: Pose, stamp_ns: int) -> tuple[Track, ...]:
-        """Take one picture's fits in; the logs believed in, by number."""
+    def step(
+        self, fits: Sequence[Fit], pose: Pose, stamp_ns: int, moved: Callable[[LogEstimate, Fit], bool] = _lies_still
+    ) -> tuple[Track, ...]:
+        """Take one picture's fits in; the logs believed in, by number.
+
+        ``moved`` says whether the picture shows a log that is not where it was as another fit: it keeps its number.
+        """
+        pairs, found = self._paired(fits, pose)
+        for i, j in self._elsewhere({i: pairs[i] for i in found}, fits, moved):
+            self._logs[i] = self._anew(self._logs[i], fits[j], pose)
+            pairs[i] = j
+            found.add(i)
+        for i, j in pairs.items():
+            # A fit of this log that errs beyond the gate changes nothing, and is no other log either; but when
+            # several in a row do, it is the log that was wrong from the start.  One that was in a single picture
+            # is not believed by two that do not agree: it begins with the second.
+            log = self._logs[i]
+            log.odd = 0 if i in found else log.odd + 1
+            if log.odd >= (ODD if log.hits >= CONFIRMED else 1):
+                self._logs[i] = log = self._anew(log, fits[j], pose)
+            if log.odd == 0:
+                log.update(fits[j], pose, stamp_ns)
+                found.add(i)
+        self._forget(found)
+        for j in sorted(set(range(len(fits))) - set(pairs.values())):
+            log = _Log(self._next, fits[j], pose, self._errors)
+            log.update(fits[j], pose, stamp_ns)
+            self._logs.append(log)
+            self._next += 1
+        return tuple(log.track() for log in self._logs if log.hits >= CONFIRMED)
+
+    def _paired(self, fits: Sequence[Fit], pose: Pose) -> tuple[dict[int, int], set[int]]:
+        """Which fit is nearest to which log, and which logs theirs agrees with."""
         costs = np.full((len(self._logs), len(fits)), BAR)
         for i, log in enumerate(self._logs):
             for j, fit in enumerate(fits):
                 costs[i, j] = min(BAR, log.distance2(fit, pose))
-        taken, found = set(), set()
-        for i, j in zip(*linear_sum_assignment(costs), strict=True):
-            if costs[i, j] < BAR:
-                # A fit of this log that errs beyond the gate changes nothing, and is no other log either; but when
-                # several in a row do, it is the log that was wrong from the start.  One that was in a single picture
-                # is not believed by two that do not agree: it begins with the second.
-                taken.add(j)
-                log = self._logs[i]
-                log.odd = 0 if costs[i, j] < GATE else log.odd + 1
-                known = log.hits >= CONFIRMED
-                if log.odd >= (ODD if known else 1):
-                    self._logs[i] = log = _Log(log.id, fits[j], pose, self._errors, log.hits if known else 0)
-                if log.odd == 0:
-                    log.update(fits[j], pose, stamp_ns)
-                    found.add(i)
+        pairs = {i: j for i, j in zip(*linear_sum_assignment(costs), strict=True) if costs[i, j] < BAR}
+        return pairs, {i for i, j in pairs.items() if costs[i, j] < GATE}
+
+    def _elsewhere(
+        self, found: dict[int, int], fits: Sequence[Fit], moved: Callable[[LogEstimate, Fit], bool]
+    ) -> list[tuple[int, int]]:
+        """Logs that are believed in and not found where they were, each with the fit that shows it elsewhere."""
+        shown, free = [], [j for j in range(len(fits)) if j not in found.values()]
         for i, log in enumerate(self._logs):
-            log.missed += i not in found
+            if i in found or log.hits < CONFIRMED:
+                continue
+            estimate = log.track().estimate
+            at = [j for j in free if moved(estimate, fits[j])]
+            if at:
+                best = min(at, key=lambda j: abs(fits[j].body.length_m - estimate.length_m))
+                free.remove(best)
+                shown.append((i, best))
+        return shown
+
+    def _anew(self, log: _Log, fit: Fit, pose: Pose) -> _Log:
+        """The log begun again where a fit shows it, with its number."""
+        return _Log(log.id, fit, pose, self._errors, log.hits if log.hits >= CONFIRMED else 0)
+
+    def _forget(self, found: set[int]) -> None:
+        """Give up the logs that were long not found, and at once those in whose place another is found."""
+        shown = [(self._logs[i], self._logs[i].track().estimate) for i in found]
+        for i, log in enumerate(self._logs):
+            if i in found:
+                continue
+            log.missed += 1
+            estimate = log.track().estimate
+            twin = next((other for other, at in shown if _are_one(estimate, at)), None)
+            if twin is not None:  # it keeps the older number
+                twin.id, log.id, log.missed = min(twin.id, log.id), max(twin.id, log.id), LOST
         self._logs = [log for log in self._logs if log.missed < (LOST if log.hits >= CONFIRMED else CONFIRMED)]
-        for j, fit in enumerate(fits):
-            if j not in taken:
-                log = _Log(self._next, fit, pose, self._errors)
-                log.update(fit, pose, stamp_ns)
-                self._logs.append(log)
-                self._next += 1
-        return tuple(log.track() for log in self._logs if log.hits >= CONFIRMED)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from enum import StrEnum
+from itertools import count
 from pathlib import Path
 
 
@@ -30,13 +31,17 @@ def _without_page(arguments: list[str]) -> list[str]:
 
 
 def new_directory(name: str) -> Path:
-    """``runs/<name>-<n>`` with the first free n, and ``runs/LAST`` pointing at it."""
+    """``runs/<name>-<n>``, made with the first free n, and ``runs/LAST`` pointing at it, also beside other runs."""
     runs = Path("runs")
-    number = 1
-    while (directory := runs / f"{name}-{number}").exists():
-        number += 1
     runs.mkdir(exist_ok=True)
-    last = runs / "LAST"
-    last.unlink(missing_ok=True)
-    last.symlink_to(directory.name)
+    for number in count(1):
+        directory = runs / f"{name}-{number}"
+        try:
+            directory.mkdir()
+        except FileExistsError:
+            continue
+        break
+    link = runs / f".LAST-{directory.name}"
+    link.symlink_to(directory.name)
+    link.replace(runs / "LAST")
     return directory
