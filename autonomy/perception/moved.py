@@ -45,8 +45,7 @@ def _left(frame: Frame, pose: Pose, log: LogEstimate, fit: Fit) -> bool:
     u, v = np.rint(frame.intrinsics.project(surface_m)).astype(int).T
     height, width = frame.depth_m.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    depth_m = frame.depth_m[v[inside], u[inside]]
-    surface_m, depth_m = surface_m[inside], depth_m[inside]
+    surface_m, depth_m = surface_m[inside], frame.depth_m[v[inside], u[inside]]
     nearer_m = surface_m[:, 2] - depth_m  # NaN where no depth is known
     seen_m = surface_m * (depth_m / surface_m[:, 2])[:, None]
     own = (nearer_m > THERE_M) & (_from_axis_m(seen_m, fit) < fit.body.radius_m + THERE_M)

@@ -41,6 +41,12 @@ def test_numbers_that_a_detector_gives_are_kept_and_must_differ() -> None:
         parse_logs(logs.answer([seen[0], seen[0]]))
 
 
+def test_whether_the_newest_look_shows_a_log_goes_with_it() -> None:
+    told = [LogObservation(n, (1.0, 2.0, -1.0), (0.0, 1.0, 0.0), 3.0, 0.2, seen=n == 7) for n in (7, 3)]
+    assert [log.seen for log in parse_logs(logs.answer(told))] == [True, False]
+    assert all(log.seen for log in parse_logs(answer())), "who does not say so has seen it"
+
+
 def test_how_well_a_log_is_known_goes_with_it() -> None:
     root = np.random.default_rng(1).normal(0.0, 0.02, (7, 7))
     estimate = LogEstimate(np.array([1.0, 2.0, -1.0]), np.array([0.0, 1.0, 0.0]), 3.0, 0.2, root @ root.T)

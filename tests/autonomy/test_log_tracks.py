@@ -148,6 +148,37 @@ def test_a_log_that_is_gone_is_given_up_and_a_new_one_gets_a_new_number() -> Non
     assert [t.id for t in found] == [2]
 
 
+def test_a_log_that_is_seen_to_have_moved_keeps_its_number_wherever_it_is() -> None:
+    tracks, pose = Tracks(QUIET), pose_at()
+    for k in range(3):
+        tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
+    for k, up in enumerate((0.5, 0.9, 1.3)):
+        found = tracks.step([fit_of(pose, (5.0, 0.0, 0.12 + up))], pose, 3 + k, moved=lambda log, fit: True)
+        assert [t.id for t in found] == [1]
+        assert found[0].estimate.center_m[2] == pytest.approx(0.12 + up, abs=1e-3)
+
+
+def test_two_numbers_for_one_log_become_the_older_one() -> None:
+    """A wrong fit took a log's number, a new number began where it is, and then the picture is clear again."""
+    tracks, pose = Tracks(QUIET), pose_at()
+    for k in range(3):
+        tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
+    tracks.step([fit_of(pose, (5.0, 0.0, 0.12), length=2.1), fit_of(pose, (5.0, 0.0, 0.2))], pose, 3)
+    for k in range(2):
+        found = tracks.step([fit_of(pose, (5.0, 0.0, 0.2))], pose, 4 + k)
+    assert [t.id for t in found] == [1] and found[0].estimate.center_m[2] == pytest.approx(0.2, abs=0.01)
+
+
+def test_a_piece_of_a_log_is_no_reason_to_forget_the_whole() -> None:
+    tracks, pose = Tracks(QUIET), pose_at()
+    for k in range(3):
+        tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
+    for k in range(3):
+        found = tracks.step([fit_of(pose, (5.0, 0.6, 0.12), length=0.8)], pose, 3 + k)
+    whole = next(t.estimate for t in found if t.id == 1)
+    assert whole.length_m == pytest.approx(2.0, abs=0.01)
+
+
 @settings(max_examples=40)
 @given(st.floats(-0.4, 0.4), st.floats(-3.1, 3.1), st.floats(0.0, 2.0))
 def test_where_the_camera_stands_does_not_matter_to_an_exact_fit(yaw: float, log_yaw: float, moved: float) -> None:

@@ -1,0 +1,56 @@
+"""A log that hangs in the grapple is not where it was last seen: a camera that cannot show it remembers wrongly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import dist
+
+import pytest
+from crane_stand_in import GROUND_LOG, StandIn
+from grasp_scenes import PROFILE
+
+from autonomy.activity import Activity
+from autonomy.logs import LogObservation
+from can_dbc.setpoint import StateReport
+from machine.load import profile_hash
+
+_SHUT = 4
+
+
+@dataclass
+class Remembering(StandIn):
+    """A crane whose camera shows only what lies near the pin, not what hangs under it, and remembers the rest."""
+
+    def __post_init__(self) -> None:
+        self.last = {log.id: log for log in self.logs}
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        """The logs, remembered where they cannot be seen."""
+        told = []
+        for log in self.logs:
+            near = dist(self.pin()[:2], log.center_m[:2]) < 1.0 and log.id != self.held
+            if near:
+                self.last[log.id] = log
+            told.append(replace(self.last[log.id], seen=near))
+        return tuple(told)
+
+    def report(self) -> StateReport:
+        """As a controller with a sensor at the tongs says it: shut on nothing, or holding."""
+        told = super().report()
+        return replace(told, grapple_state=_SHUT) if self.gripped and self.held is None else told
+
+
+@pytest.mark.parametrize("slips", [0, 1])
+def test_a_remembered_log_does_not_tell_whether_it_was_lifted_but_the_tongs_do(slips: int) -> None:
+    crane = Remembering(PROFILE, [GROUND_LOG], slippery=slips)
+    planner = Activity(PROFILE, profile_hash(PROFILE))
+    crane.run(planner)
+    assert planner.done and planner.failure is None, planner.failure
+    assert planner.missed == slips
+
+
+def test_tongs_that_shut_on_nothing_three_times_end_it() -> None:
+    crane = Remembering(PROFILE, [GROUND_LOG], slippery=9)
+    planner = Activity(PROFILE, profile_hash(PROFILE))
+    crane.run(planner)
+    assert planner.failure == "log 0 was missed 3 times"

@@ -1,0 +1,96 @@
+"""A log that is seen elsewhere, and no longer where it was, is the same one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from autonomy.perception.cylinder import Cylinder
+from autonomy.perception.estimate import LogEstimate
+from autonomy.perception.frame import Frame, Pose
+from autonomy.perception.moved import has_moved
+from autonomy.perception.refine import Fit
+from machine.optics import Intrinsics
+
+HEIGHT_M = 4.0
+LENGTH_M, RADIUS_M = 2.0, 0.1
+PIN = Intrinsics(320, 240, 220.0, 220.0, 159.5, 119.5)
+DOWN = Pose(np.array([0.0, 0.0, HEIGHT_M]), np.diag([1.0, -1.0, -1.0]))
+"""A camera that looks straight down on a level ground."""
+
+Place = tuple[float, float]
+"""Across its axis, and up, of a log along x."""
+
+
+def picture(*logs: Place, tongs: slice | None = None) -> Frame:
+    """Depth of logs over the ground, and of tongs close to the camera in some of the picture's columns."""
+    v, u = np.mgrid[: PIN.height_px, : PIN.width_px]
+    depth = np.full(u.shape, HEIGHT_M)
+    for across, up in logs:
+        z = HEIGHT_M - up
+        off = -(v - PIN.cy_px) / PIN.fy_px * z - across
+        inside = (np.abs(off) < RADIUS_M) & (np.abs((u - PIN.cx_px) / PIN.fx_px * z) < 0.5 * LENGTH_M)
+        surface = z - np.sqrt(np.maximum(RADIUS_M**2 - off**2, 0.0))
+        depth = np.where(inside, np.minimum(depth, surface), depth)
+    if tongs is not None:
+        depth[:, tongs] = 2.0
+    rgb = np.full((*depth.shape, 3), 90, np.uint8)
+    return Frame("stick", 1, rgb, depth.astype(np.float32), PIN)
+
+
+def log_at(place: Place, x_m: float = 0.0) -> LogEstimate:
+    return LogEstimate(np.array([x_m, *place]), np.array([1.0, 0.0, 0.0]), LENGTH_M, 2.0 * RADIUS_M, np.eye(7) * 1e-4)
+
+
+def fit_at(place: Place, length_m: float = LENGTH_M, radius_m: float = RADIUS_M, x_m: float = 0.0) -> Fit:
+    middle, half = DOWN.to_optical(np.array([x_m, *place])), length_m / 2
+    body = Cylinder(middle, np.array([1.0, 0.0, 0.0]), -half, half, radius_m)
+    return Fit(body, np.eye(7) * 1e-4, (True, True), 1.0, 0.5, np.zeros(7))
+
+
+LAY = (0.0, RADIUS_M)
+
+
+@pytest.mark.parametrize("now", [(0.0, 0.6), (0.3, 0.5), (0.6, RADIUS_M)], ids=["lifted", "carried", "rolled away"])
+def test_a_log_that_is_seen_elsewhere_and_not_there_has_moved(now: Place) -> None:
+    assert has_moved(picture(now), DOWN, log_at(LAY), fit_at(now))
+
+
+def test_tongs_over_its_middle_do_not_hide_that_it_is_gone() -> None:
+    now = (0.0, 0.6)
+    assert has_moved(picture(now, tongs=slice(140, 180)), DOWN, log_at(LAY), fit_at(now))
+
+
+def test_a_log_that_still_lies_there_is_not_the_like_one_beside_it() -> None:
+    beside = (0.5, RADIUS_M)
+    assert not has_moved(picture(LAY, beside), DOWN, log_at(LAY), fit_at(beside))
+
+
+def test_what_is_hidden_may_lie_there_still() -> None:
+    now = (0.5, 0.6)
+    assert not has_moved(picture(now, tongs=slice(0, 320)), DOWN, log_at(LAY), fit_at(now))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [fit_at((0.0, 0.6), length_m=1.2), fit_at((0.0, 0.6), radius_m=0.2), fit_at((1.6, 0.6))],
+    ids=["a shorter log", "a thicker log", "far away"],
+)
+def test_another_log_is_not_it(other: Fit) -> None:
+    assert not has_moved(picture((0.0, 0.6)), DOWN, log_at(LAY), other)
+
+
+def test_a_log_out_of_the_picture_is_not_missed_in_it() -> None:
+    outside = log_at((4.0, RADIUS_M))
+    assert not has_moved(picture((3.0, 0.6)), DOWN, outside, fit_at((3.0, 0.6)))
+
+
+def test_half_a_log_in_the_picture_tells_of_the_whole() -> None:
+    half_outside = log_at(LAY, x_m=2.4)
+    assert has_moved(picture(), DOWN, half_outside, fit_at((0.6, 0.6), x_m=1.6)), "what is in view is the ground"
+
+
+def test_nothing_is_known_where_no_depth_is() -> None:
+    frame = picture((0.0, 0.6))
+    frame.depth_m[:] = np.nan
+    assert not has_moved(frame, DOWN, log_at(LAY), fit_at((0.0, 0.6)))

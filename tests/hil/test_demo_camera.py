@@ -1,0 +1,21 @@
+"""The job of the demo by what the camera on the stick sees: in virtual time, the log gets into the bunk."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from hil.demo import run_lockstep
+from hil.exits import Exit
+
+pytestmark = [pytest.mark.slow, pytest.mark.computed]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_log_that_only_a_camera_sees_gets_into_the_bunk(seed: int, tmp_path: Path) -> None:
+    summary = run_lockstep("palms_471", seed, "nominal", tmp_path, 120.0, Console(file=io.StringIO()), "stick")
+    assert summary.in_bunk, f"{summary.verdict} {summary.failure}"
+    assert summary.exit is Exit.FINE
