@@ -19,13 +19,18 @@ _SHUT = 4
 
 @dataclass
 class Remembering(StandIn):
-    """A crane whose camera shows only what lies near the pin, not what hangs under it, and remembers the rest."""
+    """A crane whose camera looks while it rests, shows only what lies near the pin, not what hangs under it, and
+    remembers the rest."""
 
     def __post_init__(self) -> None:
         self.last = {log.id: log for log in self.logs}
+        self.was = self.q
 
     def seen(self) -> tuple[LogObservation, ...]:
         """The logs, remembered where they cannot be seen."""
+        rests, self.was = self.q == self.was, self.q
+        if not rests:
+            return ()
         told = []
         for log in self.logs:
             near = dist(self.pin()[:2], log.center_m[:2]) < 1.0 and log.id != self.held

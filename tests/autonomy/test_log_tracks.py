@@ -173,8 +173,9 @@ def test_a_piece_of_a_log_is_no_reason_to_forget_the_whole() -> None:
     tracks, pose = Tracks(QUIET), pose_at()
     for k in range(3):
         tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
+    pieces = [fit_of(pose, (5.0, y, 0.12), length=0.7) for y in (0.3, -0.3)]
     for k in range(3):
-        found = tracks.step([fit_of(pose, (5.0, 0.6, 0.12), length=0.8)], pose, 3 + k)
+        found = tracks.step(pieces, pose, 3 + k)
     whole = next(t.estimate for t in found if t.id == 1)
     assert whole.length_m == pytest.approx(2.0, abs=0.01)
 

@@ -22,14 +22,14 @@ Place = tuple[float, float]
 """Across its axis, and up, of a log along x."""
 
 
-def picture(*logs: Place, tongs: slice | None = None) -> Frame:
+def picture(*logs: Place, tongs: slice | None = None, length_m: float = LENGTH_M) -> Frame:
     """Depth of logs over the ground, and of tongs close to the camera in some of the picture's columns."""
     v, u = np.mgrid[: PIN.height_px, : PIN.width_px]
     depth = np.full(u.shape, HEIGHT_M)
     for across, up in logs:
         z = HEIGHT_M - up
         off = -(v - PIN.cy_px) / PIN.fy_px * z - across
-        inside = (np.abs(off) < RADIUS_M) & (np.abs((u - PIN.cx_px) / PIN.fx_px * z) < 0.5 * LENGTH_M)
+        inside = (np.abs(off) < RADIUS_M) & (np.abs((u - PIN.cx_px) / PIN.fx_px * z) < 0.5 * length_m)
         surface = z - np.sqrt(np.maximum(RADIUS_M**2 - off**2, 0.0))
         depth = np.where(inside, np.minimum(depth, surface), depth)
     if tongs is not None:
@@ -73,11 +73,16 @@ def test_what_is_hidden_may_lie_there_still() -> None:
 
 @pytest.mark.parametrize(
     "other",
-    [fit_at((0.0, 0.6), length_m=1.2), fit_at((0.0, 0.6), radius_m=0.2), fit_at((1.6, 0.6))],
+    [fit_at((0.0, 0.6), length_m=1.2), fit_at((0.0, 0.6), radius_m=0.2), fit_at((0.0, 1.8))],
     ids=["a shorter log", "a thicker log", "far away"],
 )
 def test_another_log_is_not_it(other: Fit) -> None:
-    assert not has_moved(picture((0.0, 0.6)), DOWN, log_at(LAY), other)
+    assert not has_moved(picture(), DOWN, log_at(LAY), other)
+
+
+def test_a_log_half_of_which_is_still_seen_there_has_not_moved() -> None:
+    frame = picture(LAY, length_m=0.4 * LENGTH_M)
+    assert not has_moved(frame, DOWN, log_at(LAY), fit_at((0.6, RADIUS_M)))
 
 
 def test_a_log_out_of_the_picture_is_not_missed_in_it() -> None:
