@@ -33,6 +33,8 @@ from machine.sag import sane_load_kg
 ATTEMPTS: Final = 3
 LOOKS: Final = 2
 """So often a grasp is chosen again from over it."""
+ANEW: Final = 2
+"""So often are missed logs gripped again before the crane goes up empty."""
 CLIMBS, _CLIMB_M = 3, 0.1
 """A heap too wide for the tongs is gripped so much higher, so often: they take from its top what they get round."""
 _SAME_M, _SAME_RAD = 0.02, 0.03
@@ -46,8 +48,8 @@ _THERE_M, _THERE_RAD = 0.03, 0.03
 
 class Cycle:
     """``grasp`` is what is gripped and ``place`` where it goes, each once it is chosen; ``lifted_kg`` hung in the
-    grapple, 0 when nobody weighs it; ``missed`` grasps came up empty.  ``profile`` is the machine as motions are
-    planned for it.
+    grapple, 0 when nobody weighs it; ``missed`` grasps came up empty; this one was taken higher up ``climbs`` times.
+    ``profile`` is the machine as motions are planned for it.
     """
 
     def __init__(self, profile: Profile, mission: Mission, motions: Motions, chooser: Chooser, heard: Heard) -> None:
@@ -62,7 +64,7 @@ class Cycle:
         self._arm = Arm(profile, stretches=motions.stretches)
         """With what hangs in the grapple in the present phase."""
         self._begun_z_m = 0.0
-        self._looks = self._climbs = 0
+        self._looks = self._begun_anew = self.climbs = 0
         self._before: Grasp | None = None
 
     @property
@@ -72,7 +74,11 @@ class Cycle:
 
     def choose(self, q: Axes) -> None:
         """A grasp among the logs of the newest list, from where the crane stands; raises ``NoGrasp``."""
-        self._looks = self._climbs = 0
+        self._begun_anew = 0
+        self._choose_now(q)
+
+    def _choose_now(self, q: Axes) -> None:
+        self._looks = self.climbs = 0
         self._before = None
         self.grasp = self._choose(self._arm, self._mission, self._heard.logs, q[Joint.SLEW], q[Joint.ROT])
 
@@ -87,7 +93,7 @@ class Cycle:
         assert before is not None
         looks = self._looks + 1
         try:
-            self.choose(q)
+            self._choose_now(q)
         except NoGrasp:
             return False
         finally:
@@ -107,14 +113,25 @@ class Cycle:
     @property
     def may_grip_higher(self) -> bool:
         """Whether a bundle that the tongs do not get round may be gripped higher up: one that a camera measured."""
-        return self.grasp is not None and _measured(self.grasp) and self._climbs < CLIMBS
+        return self.grasp is not None and _measured(self.grasp) and self.climbs < CLIMBS
 
     def grip_higher(self) -> None:
         """Grip it there next."""
         assert self.grasp is not None
-        self._climbs += 1
+        self.climbs += 1
         pose = self.grasp.pose.at_height(self.grasp.pose.z_m + _CLIMB_M)
         self.grasp = replace(self.grasp, pose=pose, support_z_m=self.grasp.support_z_m + _CLIMB_M)
+
+    @property
+    def may_begin_anew(self) -> bool:
+        """Whether a bundle that was missed may be looked at and gripped again before it is lifted: one that a camera
+        measured."""
+        return self.grasp is not None and _measured(self.grasp) and self._begun_anew < ANEW
+
+    def begin_anew(self) -> None:
+        """Look at it again from above, once, for the tongs have stirred it."""
+        self._begun_anew += 1
+        self._looks = min(self._looks, LOOKS - 1)
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
         """The motion of a phase that begins at ``q``, with the grasp and the place as they are now seen to be best.

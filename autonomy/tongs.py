@@ -14,7 +14,12 @@ from autonomy.grasp.heap import is_over
 from autonomy.heard import Heard
 from autonomy.motion.arm import Arm
 from can_dbc.setpoint import GrappleCommand, StateReport
-from machine.grapple import opening_pct_from_tong_angle, tip_below_pin_m, tong_angle_from_opening_pct
+from machine.grapple import (
+    half_gap_m,
+    opening_pct_from_tong_angle,
+    tip_below_pin_m,
+    tong_angle_from_opening_pct,
+)
 from machine.profile import Bunk, Profile
 
 _SHUT, _HOLDING = 4, 5
@@ -22,8 +27,13 @@ _SHUT, _HOLDING = 4, 5
 _OPEN_PCT: Final = 92.0
 _GRIPPED_RAD: Final = 1.5
 """Tongs without a sensor are taken to have been closed as far when they let go of a log: past tips that meet."""
-_WIDE_PCT: Final = 70.0
-"""Tongs that stop closing so wide open clasp a heap's sides: their tips are not under it."""
+_WIDE_PCT, _CLIMB_PCT, _WIDER_M = 70.0, 3.0, 0.15
+"""Tongs that stop closing so wide open, or so much wider than the wood they are to hold lies side by side, clasp a
+heap's sides: their tips are not under it."""
+_HELD_M: Final = 0.2
+"""Thinner logs are held in tongs that have shut."""
+_UNDER: Final = 0.85
+"""The tips are under a log when they are nearer to each other than so much of its diameter."""
 _STILL_PCT, _STILL_S = 0.5, 0.8
 """Tongs stand that move by less in this time; logs that give way are pressed together slowly."""
 _LEAST_S: Final = 0.5
@@ -110,10 +120,26 @@ class Tongs:
         """Whether they stand open."""
         return opened(self._profile, self._heard.report, self._opening_s)
 
-    @property
-    def wide(self) -> bool:
-        """Whether they are seen to stand too wide open to lift what they hold; without a sensor nobody knows."""
-        return self._heard.report.opening_pct > _WIDE_PCT
+    def are_wide(self, grasp: Grasp, climbs: int) -> bool:
+        """Whether they are seen to stand too wide open to lift what they hold, gripped higher so often already, where
+        there is less; without a sensor nobody knows.
+        """
+        wood_m = sum(log.diameter_m for log in grasp.logs)
+        too_open = self._heard.report.opening_pct > _WIDE_PCT - _CLIMB_PCT * climbs
+        return too_open or self._gap_m() > wood_m + _WIDER_M
+
+    def have_missed(self, grasp: Grasp) -> bool:
+        """Whether they are seen to have shut on nothing where thick logs were, or to pinch the upper half of a log that
+        they were to be under; without a sensor nobody knows.
+        """
+        if is_empty(self._heard.report):
+            return grasp.thinnest_m > _HELD_M
+        return grasp.drawn and self._gap_m() > _UNDER * grasp.thinnest_m
+
+    def _gap_m(self) -> float:
+        """Between the tips; 0 when no sensor tells."""
+        opening, tongs = self._heard.report.opening_pct, self._profile.grapple.tongs
+        return 2.0 * half_gap_m(tongs, tong_angle_from_opening_pct(tongs, opening)) if isfinite(opening) else 0.0
 
     @property
     def still(self) -> bool:

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import math
 import random
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 
 from autonomy.perception.frame import Pose
 from autonomy.perception.mount import Survey, surveyed
+from autonomy.perception.tracks import Errors
 from machine.optics import intrinsics
-from machine.profile import Camera
+from machine.profile import Camera, Profile
 from sim.camera.geometry import mount_view
+from sim.camera.noise import StereoNoise
 from sim.shape import UNIT
 
 TARGETS: Final = 14
@@ -24,6 +28,27 @@ SIGMA_M, SIGMA_PX, FRAMES = 0.002, 0.3, 30
 """Of a target's surveyed place, of where it is seen in a picture; pictures of each."""
 MARGIN_PX: Final = 60
 RANGE_M: Final = (3.0, 8.0)
+SURVEYED: Final = Errors(scale=0.0015, mount_rad=0.0015, mount_m=0.004)
+"""What is left to err of a camera on the crane; ..."""
+SURVEYED_BY_GNSS: Final = replace(SURVEYED, pose_rad=0.002, pose_m=0.012)
+"""... and on a vehicle that a dual-antenna RTK receiver locates."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """A profile whose camera stands where a survey found it, and by what that camera's depth must be divided."""
+
+    profile: Profile
+    depth_scale: float
+
+
+def known(profile: Profile, truth: Any, name: str, seed: int) -> Known:
+    """What a survey before run ``seed`` finds of camera ``name`` of a plant (``truth``: ``plant.world.truth``)."""
+    camera, hidden = profile.cameras[name], truth.cameras[name]
+    scale = StereoNoise(camera, hidden, f"{name} {seed}").scale  # as the rig's own camera has it
+    found = survey(camera, hidden, scale, random.Random(f"survey {seed}"))
+    cameras = {**profile.cameras, name: found.camera}
+    return Known(msgspec.structs.replace(profile, cameras=cameras), found.depth_scale)
 
 
 def survey(camera: Camera, truth: Any, depth_scale: float, rng: random.Random) -> Survey:

@@ -7,11 +7,8 @@ shipped network and measure them as paper B did or as we do, and the crane works
 
 from __future__ import annotations
 
-import random
 from collections.abc import Sequence
 from typing import Final
-
-import msgspec
 
 from autonomy.front_eyes import FrontEyes, Ours, PaperB
 from autonomy.logs import LogObservation
@@ -19,19 +16,15 @@ from autonomy.manager.manager import Manager
 from autonomy.manager.table import ENDS, RULES
 from autonomy.perception.finder import LogFinder
 from autonomy.perception.frame import Frame, rescaled
-from autonomy.perception.tracks import Errors
-from hil.camera_survey import survey
+from hil.camera_survey import SURVEYED_BY_GNSS, known
 from hil.lockstep import Eyes
 from hil.rig_camera import RigCamera
 from machine.profile import Profile
-from sim.camera.noise import StereoNoise
 from sim.camera.rig import CameraRig
 from sim.detector import detect_near
 from sim.plant import Plant
 
 CAMERA: Final = "front"
-SURVEYED: Final = Errors(scale=0.0015, mount_rad=0.0015, mount_m=0.004, pose_rad=0.002, pose_m=0.012)
-"""What a surveyed mount and a dual-antenna RTK receiver leave."""
 
 
 class NearEyes:
@@ -88,10 +81,9 @@ def eyes_of(kind: str, plant: Plant, profile: Profile, manager: Manager, seed: i
         return NearEyes(plant)
     if CAMERA not in profile.cameras:
         raise ValueError(f"{profile.name} has no camera {CAMERA!r}; add [cameras.{CAMERA}] to the profile")
-    camera, truth = profile.cameras[CAMERA], plant.world.truth
-    scale = StereoNoise(camera, truth.cameras[CAMERA], f"{CAMERA} {seed}").scale  # as the rig's own camera has it
-    known = survey(camera, truth.cameras[CAMERA], scale, random.Random(f"survey {seed}"))
-    seeing = msgspec.structs.replace(profile, cameras={**profile.cameras, CAMERA: known.camera})
-    source = Surveyed(RigCamera(CameraRig(plant.world, profile, truth, seed), CAMERA), known.depth_scale)
-    sight = Ours(seeing, SURVEYED) if kind == "ours" else PaperB()
+    surveyed = known(profile, plant.world.truth, CAMERA, seed)
+    rig = CameraRig(plant.world, profile, plant.world.truth, seed)
+    source = Surveyed(RigCamera(rig, CAMERA), surveyed.depth_scale)
+    seeing = surveyed.profile
+    sight = Ours(seeing, SURVEYED_BY_GNSS) if kind == "ours" else PaperB()
     return RouteEyes(FrontEyes(seeing, CAMERA, source, LogFinder().segment, sight), manager)

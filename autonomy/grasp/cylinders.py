@@ -16,10 +16,6 @@ from autonomy.logs import LogObservation
 from autonomy.perception.estimate import ACROSS_1, ACROSS_2, END, RADIUS, SIZE, START, TILT_1, TILT_2, unpacked
 
 LEAST_RADIUS_M: Final = 0.02
-SUNK_M: Final = 0.12
-"""Logs that are seen further off the ground than this lie on something else."""
-OWN_SHARE: Final = 0.4
-"""Of the standard deviation of a log's height, the part that is its own and not the camera's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,26 +59,6 @@ def lowest_m(world: Cylinders) -> float:
     return float(np.min(np.min(world.ends()[..., 2], axis=-1) - thick))
 
 
-def grounded(world: Cylinders, ground_z_m: float) -> Cylinders:
-    """The logs moved together so that the lowest end lies on the ground, where they are within ``SUNK_M`` of it.
-
-    What a camera's mount and depth scale have wrong raises or sinks all logs alike; the ground's height is known.
-    """
-    if not world.count:
-        return world
-    off = ground_z_m - lowest_m(world)
-    if abs(off) > SUNK_M:
-        return world
-    return Cylinders(world.center + np.array([0.0, 0.0, off]), world.axis, world.length, world.radius)
-
-
-def grounded_covariance(covariance: np.ndarray) -> np.ndarray:
-    """The covariances (n, 7, 7) after ``grounded``: of the height, what the logs do not share is left."""
-    scale = np.ones(SIZE)
-    scale[ACROSS_2] = OWN_SHARE
-    return covariance * scale[:, None] * scale
-
-
 def covariance_of(log: LogObservation) -> np.ndarray:
     """(7, 7) of ``LogEstimate`` as perception has it, or for a log of which only the pose is told."""
     return default_covariance(log) if log.covariance is None else unpacked(log.covariance)
@@ -106,12 +82,21 @@ def draws_of(world: Cylinders, covariances: np.ndarray, count: int, seed: int) -
     value, vector = np.linalg.eigh(covariances)
     root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
     normal = np.random.default_rng(seed).standard_normal((count, world.count, SIZE))
-    e = np.einsum("nij,dnj->dni", root, normal)
-    level = np.stack([-world.axis[:, 1], world.axis[:, 0], np.zeros(world.count)], axis=1)
+    return changed(world, np.einsum("nij,dnj->dni", root, normal))
+
+
+def across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors (n, 3) across unit axes (n, 3), along which errors count: the first level, the second upward."""
+    level = np.stack([-axis[:, 1], axis[:, 0], np.zeros(len(axis))], axis=1)
     steep = np.hypot(level[:, 0], level[:, 1]) < 0.05
     level[steep] = (0.0, 1.0, 0.0)
     level /= np.linalg.norm(level, axis=1)[:, None]
-    up = np.cross(world.axis, level)
+    return level, np.cross(axis, level)
+
+
+def changed(world: Cylinders, e: np.ndarray) -> Cylinders:
+    """The logs (n) with errors (..., n, 7), in the order of ``LogEstimate``'s covariance, added to them."""
+    level, up = across(world.axis)
     axis = world.axis + e[..., TILT_1, None] * level + e[..., TILT_2, None] * up
     axis /= np.linalg.norm(axis, axis=-1)[..., None]
     along = 0.5 * (e[..., START] + e[..., END])

@@ -69,7 +69,7 @@ class Grasp:
 
     ``others`` come up with it; ``top_z_m`` is the highest point of a log under the way down, or None; ``reason`` is a
     sentence for the operator, ``probability`` that of success where a planner reckons with one; ``pressed``: the tongs
-    go down among other logs, as far as these let them.
+    go down among other logs, as far as these let them; ``drawn``: to draw the log out of a row.
     """
 
     log: LogObservation
@@ -81,6 +81,7 @@ class Grasp:
     reason: str = ""
     probability: float | None = None
     pressed: bool = False
+    drawn: bool = False
 
     @property
     def logs(self) -> tuple[LogObservation, ...]:
@@ -267,7 +268,9 @@ class Planned:
         # What lies alone cannot settle, and comes up as `choose` would lift it.
         top = _top(there) if near or others else None
         found = pose._replace(rot_rad=turn)
-        return Grasp(first, found, p.support_z_m, along, tuple(others), top, p.reason, p.probability, p.pressed)
+        return Grasp(
+            first, found, p.support_z_m, along, tuple(others), top, p.reason, p.probability, p.pressed, p.drawn
+        )
 
 
 def _top(logs: Sequence[LogObservation]) -> float:

@@ -29,7 +29,7 @@ class GraspProposal:
     ``yaw_rad`` is the direction of the opening axis; ``support_z_m`` the height that the tips sweep along, just above
     it.  ``logs`` are places in the list that was planned from.
     ``probability`` is that of success as the planner sees it, ``reason`` one sentence.  ``pressed``: the tongs go down
-    among logs, and close where they meet too much.
+    among logs, and close where they meet too much; ``drawn``: one of them between two that touch, to draw one out.
     """
 
     x_m: float
@@ -40,6 +40,7 @@ class GraspProposal:
     probability: float
     reason: str
     pressed: bool = False
+    drawn: bool = False
 
 
 class Planner(Protocol):

@@ -38,12 +38,16 @@ ROW_M: Final = 0.08
 TOUCH_M: Final = 0.06
 """A log this near to another and over it lies on it."""
 RISES: Final = 0.3
+"""A log so much higher than another, over the sum of their radii, lies on it, ..."""
+LIFTED_M: Final = 0.05
+"""... and its underside so much higher: a thick log beside a thin one on the ground does not."""
 POINTS: Final = 15
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """How strict: tips under a share of a log's diameter above its underside scoop it; how far apart the outer logs of
+    """How strict: tips under a share of a log's diameter above its underside scoop it, for a log on the ground at most
+    ``GROUND_SCOOP``; how far apart the outer logs of
     a row may be, over what the tongs get under; how much wood there may be, over what they hold; tips pass over a log
     up to this share of its radius over its axis; heights may be off by ``slack_m``.
     """
@@ -55,8 +59,11 @@ class Rule:
     slack_m: float
 
 
-STRICT: Final = Rule(0.35, 1.0, 1.0, 1.0, 0.01)
-LAYER: Final = Rule(0.6, 1.0, 1.0, 0.2, 0.03)
+GROUND_SCOOP: Final = 0.35
+PASSED_M: Final = 0.02
+"""Tips that ride up over a log come down on nothing whose axis is lower than its top by more than this."""
+STRICT: Final = Rule(GROUND_SCOOP, 1.0, 1.0, 1.0, 0.01)
+LAYER: Final = Rule(0.5, 1.0, 1.0, 0.2, 0.02)
 """Also takes logs that lie deep between others below them: the tips brush these and roll up what they pinch."""
 WIDE: Final = Rule(0.35, 1.35, 1.35, 1.0, 0.01)
 """Also squeezes a row that the tongs may not get under, or more than they hold: some of it comes up, often."""
@@ -85,8 +92,9 @@ def lies_upon(world: Cylinders) -> np.ndarray:
     along = np.clip(np.einsum("ijkc,ic->ijk", away, world.axis), -half, half)
     off = away - along[..., None] * world.axis[:, None, None]
     radii = (world.radius[:, None] + world.radius[None, :])[..., None]
+    thicker = (world.radius[None, :] - world.radius[:, None])[..., None]
     near = np.linalg.norm(off, axis=-1) < radii + TOUCH_M
-    upon: np.ndarray = np.any(near & (off[..., 2] > RISES * radii), axis=-1)
+    upon: np.ndarray = np.any(near & (off[..., 2] > np.maximum(RISES * radii, thicker + LIFTED_M)), axis=-1)
     return upon
 
 
@@ -144,8 +152,11 @@ def rate(
     r, tip, gap = world.radius, level[..., None] + TIP_M, jaws.half_gap_m
     over = at.inside & (at.middle + rule.passed * (at.top - at.middle) > tip - jaws.plate_m / 2)
     farthest, nearest = np.maximum(-at.low_u, at.high_u), np.maximum(at.low_u, -at.high_u)
-    taken = at.bottom + (2.0 * rule.scoop) * r >= level[..., None] + _clearance(2.0 * r) - rule.slack_m
+    scoop = np.where(upon.any(axis=0), rule.scoop, min(rule.scoop, GROUND_SCOOP))
+    taken = at.bottom + 2.0 * scoop * r >= level[..., None] + _clearance(2.0 * r) - rule.slack_m
     captured = over & taken & (farthest < gap)
+    swept = np.max(np.where(at.inside & ~captured & (nearest < gap), at.top, -np.inf), axis=-1)
+    captured &= at.middle > swept[..., None] - PASSED_M
     clear = ~over | captured | (nearest > gap + jaws.plate_m)
     fits = (farthest < jaws.half_width_at(at.middle - tip)) & (at.top - tip < jaws.room_m) & at.good
     safe = np.all(clear & (fits | ~captured), axis=-1) & np.any(captured, axis=-1)

@@ -62,5 +62,5 @@ def drawn_out(
             except Unreachable:
                 continue
             reason = f"log {logs[i].id} is drawn out of a row of {len(logs)} logs that is too wide for the tongs"
-            return GraspProposal(float(x), float(y), yaw, lowest_m, (i,), SUCCESS, reason, pressed=True)
+            return GraspProposal(float(x), float(y), yaw, lowest_m, (i,), SUCCESS, reason, pressed=True, drawn=True)
     return None

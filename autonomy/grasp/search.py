@@ -23,8 +23,6 @@ from autonomy.grasp.cylinders import (
     covariance_of,
     cylinders,
     draws_of,
-    grounded,
-    grounded_covariance,
 )
 from autonomy.grasp.direct import clearance, closing_height, known_ground_m, travel_height
 from autonomy.grasp.jaws import Jaws, jaws_of
@@ -43,6 +41,7 @@ from autonomy.grasp.quality import (
     sections,
 )
 from autonomy.grasp.row import drawn_out
+from autonomy.grasp.settled import settled
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
 from autonomy.perception.estimate import RADIUS
@@ -72,6 +71,8 @@ LEAST: Final = 0.75
 """When no grasp is more probable than this, those are looked at too that only pinch or squeeze."""
 RULES: Final = ((STRICT, 1.0), (LAYER, 0.95), (WIDE, 0.65))
 """First the strict one, with the success of such grasps over what the draws say."""
+FAR_OFF, NEAR = 0.3, 0.3
+"""So much less probable is a grasp far off the middle; one whose lever is better than this is not."""
 PRESSED_M: Final = 0.15
 """So much lower than planned, but for the ground, open tongs are pressed in among logs that a camera measured: it sees
 what lies high up to 0.1 m too high, and tips that are too high close over it; those too low rest on what lies there."""
@@ -129,7 +130,7 @@ class Search:
         jaws, world = jaws_of(arm.profile), cylinders(logs)
         sigma = np.stack([covariance_of(log) for log in logs])
         if isfinite(ground):
-            world, sigma = grounded(world, ground), grounded_covariance(sigma)
+            world, sigma = settled(world, sigma, ground)
         upon = lies_upon(world)
         top, stations = _in_reach(arm, logs, stays)
         at = candidates(world, top, stations)
@@ -150,7 +151,8 @@ class Search:
             if found.safe.any():
                 best, found = _finalists(at, levels, seen, found)
                 share = self._probability(jaws, drawn, upon, best, found.captured, rule, stays)
-                plans.append((best, found, trust * share))
+                held = 1.0 - FAR_OFF * np.maximum(1.0 - found.lever / NEAR, 0.0)
+                plans.append((best, found, trust * held * share))
         lowest = ground if isfinite(ground) else float(np.min(world.center[:, 2] - world.radius))
         likely = bool(plans) and max(float(np.max(plan[2])) for plan in plans) >= LEAST
         if measured.any() and not likely and not upon.any():

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
 
-from autonomy.grasp.cylinders import cylinders, default_covariance, draws_of, grounded, grounded_covariance
+from autonomy.grasp.cylinders import cylinders, default_covariance, draws_of
 from autonomy.grasp.direct import Planned, choose, hover_height, only
 from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
-from autonomy.grasp.quality import lies_upon, rate, sections
+from autonomy.grasp.quality import LAYER, STRICT, Rule, lies_upon, rate, sections
 from autonomy.grasp.search import Search
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
@@ -29,16 +29,37 @@ def planned(logs: list[LogObservation]) -> GraspProposal:
     return Search()(ARM, logs, 0.0, 0.0)
 
 
-def is_safe(logs: list[LogObservation], across_m: float, yaw: float = pi / 2, level: float = GROUND) -> bool:
+def is_safe(
+    logs: list[LogObservation], across_m: float, yaw: float = pi / 2, level: float = GROUND, rule: Rule = STRICT
+) -> bool:
     world = cylinders(logs)
     at = sections(JAWS, world, np.array([X]), np.array([Y + across_m]), np.array([yaw]))
-    return bool(rate(JAWS, world, lies_upon(world), at, np.array([level])).safe[0])
+    return bool(rate(JAWS, world, lies_upon(world), at, np.array([level]), rule).safe[0])
 
 
 def test_the_jaws_are_those_of_the_profile() -> None:
     assert JAWS.half_gap_m == 0.733 and JAWS.blade_m == pytest.approx(0.36, abs=0.005)
     assert list(JAWS.height_m) == sorted(JAWS.height_m)
     assert list(JAWS.half_width_m) == sorted(JAWS.half_width_m, reverse=True)
+
+
+def test_logs_on_the_ground_are_not_pinched_above_a_thinner_one_between_them() -> None:
+    row = [log(0, -0.22, diameter=0.29), log(1, 0.0, diameter=0.13), log(2, 0.22, diameter=0.29)]
+    assert is_safe([row[0], row[2]], 0.0)
+    assert not is_safe(row, 0.0, level=GROUND + 0.14, rule=LAYER)
+
+
+def test_tips_that_ride_up_over_its_neighbours_do_not_come_down_on_a_log_deep_between_them() -> None:
+    beside = [log(0, -0.18, diameter=0.26), log(1, 0.16, diameter=0.24)]
+    deep, high = log(2, 0.0, 0.15, diameter=0.1), log(2, 0.0, 0.22, diameter=0.1)
+    level = GROUND + 0.19
+    assert is_safe([*beside, high], 0.0, level=level, rule=LAYER)
+    assert not is_safe([*beside, deep], 0.0, level=level, rule=LAYER)
+
+
+def test_a_thick_log_beside_a_thin_one_does_not_lie_on_it() -> None:
+    assert not lies_upon(cylinders([log(0, diameter=0.12), log(1, 0.21, diameter=0.3)])).any()
+    assert lies_upon(cylinders(small_pile())).tolist() == [[False, False, True], [False, False, True], [False] * 3]
 
 
 def test_a_single_log_is_taken_across_its_middle() -> None:
@@ -141,14 +162,8 @@ def test_draws_have_the_spread_they_are_asked_for() -> None:
         draws_of(world, np.full((1, 7, 7), np.nan), 2, 0)
 
 
-def test_logs_that_a_camera_sees_too_high_are_set_on_the_ground_together() -> None:
-    pile = small_pile()
-    raised = [replace(o, center_m=(*o.center_m[:2], o.center_m[2] + 0.06)) for o in pile]
-    assert grounded(cylinders(raised), GROUND).center == pytest.approx(cylinders(pile).center)
-    far = cylinders([replace(o, center_m=(*o.center_m[:2], o.center_m[2] + 0.5)) for o in pile])
-    assert grounded(far, GROUND) is far, "they lie on something else"
-    sigma = default_covariance(pile[0])[None]
-    assert np.all(np.diag(grounded_covariance(sigma)[0]) <= np.diag(sigma[0]))
+def test_logs_that_a_camera_sees_too_high_are_gripped_at_the_ground() -> None:
+    raised = [replace(o, center_m=(*o.center_m[:2], o.center_m[2] + 0.05)) for o in small_pile()]
     assert planned(raised).support_z_m == pytest.approx(GROUND, abs=1e-3)
 
 

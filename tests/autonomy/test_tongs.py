@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from math import nan
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from autonomy.grasp.direct import travel_height
-from autonomy.motion.arm import Arm
-from autonomy.tongs import among_stakes
+from autonomy.grasp.direct import Grasp, travel_height
+from autonomy.logs import LogObservation
+from autonomy.motion.arm import Arm, Pose
+from autonomy.tongs import Tongs, among_stakes
 from machine.grapple import tip_below_pin_m
 from machine.load import load_profile
 from machine.profile import Bunk
@@ -29,3 +33,48 @@ def test_they_are_among_it_until_open_tips_are_over_its_top(bunk: Bunk) -> None:
 def test_beside_it_they_may_open_at_any_height() -> None:
     q = ARM.joints(np.array([ARM.over(*PILE.center_m, 0.0, travel_height(AORO))]))[0].tolist()
     assert among_stakes(ARM, PILE, tuple(q)) and not among_stakes(ARM, AORO.bunk, tuple(q))
+
+
+@pytest.mark.parametrize(
+    ("opening_pct", "diameters_m", "climbs", "wide"),
+    [
+        (67.0, [0.13], 0, True),  # the sides of the heap that the log lies on
+        (50.0, [0.13], 0, False),
+        (67.0, [0.3, 0.28], 0, False),
+        (71.0, [0.3, 0.28], 0, True),
+        (69.0, [0.3, 0.28], 0, False),
+        (69.0, [0.3, 0.28], 1, True),  # higher up a heap there is less
+        (nan, [0.13], 3, False),  # no sensor
+    ],
+)
+def test_tongs_are_wide_by_what_they_are_to_hold(
+    opening_pct: float, diameters_m: list[float], climbs: int, wide: bool
+) -> None:
+    logs = [LogObservation(i, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, d) for i, d in enumerate(diameters_m)]
+    grasp = Grasp(logs[0], Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, tuple(logs[1:]))
+    assert tongs_at(opening_pct).are_wide(grasp, climbs) is wide
+
+
+@pytest.mark.parametrize(
+    ("opening_pct", "state", "diameter_m", "drawn", "missed"),
+    [
+        (0.0, 4, 0.3, False, True),  # shut on nothing
+        (0.0, 4, 0.15, False, False),  # a thin log may be in them
+        (56.0, 5, 0.28, True, True),  # its upper half is pinched
+        (20.0, 5, 0.28, True, False),
+        (56.0, 5, 0.28, False, False),
+        (nan, 0, 0.28, True, False),
+    ],
+)
+def test_tongs_tell_that_they_have_missed(
+    opening_pct: float, state: int, diameter_m: float, drawn: bool, missed: bool
+) -> None:
+    log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, diameter_m)
+    grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, drawn=drawn)
+    assert tongs_at(opening_pct, state).have_missed(grasp) is missed
+
+
+def tongs_at(opening_pct: float, state: int = 5) -> Tongs:
+    """Tongs by what is reported of them."""
+    report = SimpleNamespace(opening_pct=opening_pct, grapple_state=state)
+    return Tongs(load_profile("palms_471"), SimpleNamespace(report=report))

@@ -84,7 +84,7 @@ def test_a_log_that_is_missed_misplaced_or_made_up_misleads() -> None:
 def outcome(number: int, word: str, up: int, plan_ms: float = 10.0) -> dict[str, Any]:
     return {
         "configuration": number, "category": word, "lifted": up, "logs": CONFIGURATIONS[number][1], "plan_ms": plan_ms,
-        "see_ms": 50.0, "failure": None, "reason": "",
+        "see_ms": 50.0, "failure": None, "reason": "", "closings": 2 if number == 4 else 1,
     }  # fmt: skip
 
 
@@ -98,6 +98,7 @@ def test_the_metrics_are_those_of_the_judged_pair_and_of_every_pair_by_name() ->
     found["ours.search/7/0"] = outcome(7, "MA", 1)
     metrics = gather(found, ("ours", "search"))
     assert metrics["success"] == pytest.approx(71 / 72) and metrics["success_wilson_low"] < 71 / 72
+    assert metrics["first_closing"] == pytest.approx(65 / 72)
     assert metrics["paper60_success"] == 1.0 and metrics["paper60_success_n"] == 12 * PAPER_ATTEMPTS
     assert metrics["optimal"] == pytest.approx(70 / 71) and metrics["ma"] == 1.0 and metrics["ni"] == 0.0
     assert metrics["logs_per_grasp_10_12"] == 5.0 and metrics["all_logs"] == pytest.approx(28 / 30)

@@ -74,6 +74,7 @@ def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[
             sixty = [o["lifted"] > 0 for k, o in trials if k < PAPER_ATTEMPTS]
             metrics |= rate("paper60_success", sum(sixty), len(sixty))
             metrics["success_wilson_low"] = metrics["success_low"]
+            metrics["first_closing"] = _mean([float(o["lifted"] > 0 and o["closings"] == 1) for _, o in trials])
             for number in CONFIGURATIONS:
                 its = [o for _, o in trials if o["configuration"] == number]
                 metrics |= rate(f"config{number}.success", sum(o["lifted"] > 0 for o in its), len(its))

@@ -1,8 +1,9 @@
 """Where a grasp planner's logs come from: the plant itself, or the camera on the stick and a perception.
 
 ``true``: as a detector without errors.  ``ours``: this project's perception with its own segmentation; ``masked``: the
-same with true masks.  ``faithful``: paper A's steps on our masks (bounding extents of each mask's points).  The logs
-are seen from where the crane stands at the start, and again from above where the activity waits for that.
+same with true masks.  ``faithful``: paper A's steps on our masks (bounding extents of each mask's points).  The camera
+was surveyed; it sees the logs from where the crane stands at the start, and again from above where the activity waits
+for that.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ from scipy.optimize import linear_sum_assignment
 
 from autonomy.logs import LogObservation
 from autonomy.perception import paper_a
-from autonomy.perception.frame import Frame, Pose
+from autonomy.perception.frame import Frame, Pose, rescaled
 from autonomy.perception.mount import optical_pose
 from autonomy.perception.pipeline import Masked, Perception
+from hil.camera_survey import SURVEYED, known
 from sim.camera.rig import CameraRig
 from sim.logs import LogState
 from sim.plant import Plant
@@ -68,15 +70,15 @@ class Ours:
     """
 
     def __init__(self, plant: Plant, seed: int, masked: bool = False) -> None:
-        self._plant, self._seed, self._masked = plant, seed, masked
-        self._perception = Perception(plant.profile)
-        self._rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
+        self._masked = masked
+        self._camera = _Surveyed(plant, seed)
+        self._perception = Perception(plant.profile, SURVEYED)
 
     def look(self, stamp_ns: int) -> Seen:
         """The logs as they are known after the pictures."""
         from autonomy.perception.finder import segment
 
-        seen = _look(self._plant, self._rig, stamp_ns)
+        seen = self._camera.look(stamp_ns)
         begun = time.process_time()
         for frame in seen.frames:
             masks: Sequence[Masked] = seen.masks if self._masked else segment(frame)
@@ -92,14 +94,13 @@ class Faithful:
     """
 
     def __init__(self, plant: Plant, seed: int) -> None:
-        self._plant = plant
-        self._rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
+        self._camera = _Surveyed(plant, seed)
 
     def look(self, stamp_ns: int) -> Seen:
         """The logs of a picture."""
         from autonomy.perception.finder import segment
 
-        seen, begun = _look(self._plant, self._rig, stamp_ns), time.process_time()
+        seen, begun = self._camera.look(stamp_ns), time.process_time()
         frame, pose = seen.frames[0], seen.pose
         found = [paper_a.log_of(frame, one.mask) for one in segment(frame)]
         logs = []
@@ -159,13 +160,23 @@ class Look:
     masks: tuple[Mask, ...]
 
 
-def _look(plant: Plant, rig: CameraRig, stamp_ns: int) -> Look:
-    pose = optical_pose(plant.profile, plant.profile.cameras[CAMERA], plant.joint_positions())
-    ids = rig.picture(CAMERA)[2].mask
-    masks = tuple(Mask(ids == i + 1) for i in range(len(plant.logs())) if np.count_nonzero(ids == i + 1) >= LEAST_PX)
-    taken = [rig.frame(CAMERA, stamp_ns + i * RATE_NS) for i in range(PICTURES)]
-    frames = tuple(Frame(f.name, f.stamp_ns, f.rgb, f.depth_m, f.intrinsics) for f in taken)
-    return Look(frames, pose, masks)
+class _Surveyed:
+    """The camera on the stick, its mount and depth as a survey before the run left them."""
+
+    def __init__(self, plant: Plant, seed: int) -> None:
+        self._plant = plant
+        self._rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
+        self._known = known(plant.profile, plant.world.truth, CAMERA, seed)
+
+    def look(self, stamp_ns: int) -> Look:
+        """``PICTURES`` of what lies there now."""
+        plant, ids = self._plant, self._rig.picture(CAMERA)[2].mask
+        profile = self._known.profile
+        pose = optical_pose(profile, profile.cameras[CAMERA], plant.joint_positions())
+        masks = [Mask(ids == i + 1) for i in range(len(plant.logs())) if np.count_nonzero(ids == i + 1) >= LEAST_PX]
+        taken = [self._rig.frame(CAMERA, stamp_ns + i * RATE_NS) for i in range(PICTURES)]
+        frames = [Frame(f.name, f.stamp_ns, f.rgb, f.depth_m, f.intrinsics) for f in taken]
+        return Look(tuple(rescaled(f, self._known.depth_scale) for f in frames), pose, tuple(masks))
 
 
 def _triple(v: np.ndarray) -> tuple[float, float, float]:

@@ -153,12 +153,13 @@ def attempt(job: Job) -> dict[str, Any]:
         settings = Settings(profile, digest, profile.rate_hz)
         guard = build_guard(profile_path(o["profile"]))
         system = Lockstep(settings, guard, plant, seat, operator, Observer(None, []))
-        grip = Grip(0.0, 0.0, 0.0)
+        grip, closings = Grip(0.0, 0.0, 0.0), 0
         phase = activity.phase
         while not activity.failure and not operator.gave_up and not seat.over(system.now_ns):
             system.advance()
             if activity.phase is not phase:
                 phase = activity.phase
+                closings += phase is Phase.CLOSE
                 if phase is Phase.LIFT:
                     grip = _grip(plant)
             if system.now_ns > START_NS + LIMIT_NS:
@@ -172,8 +173,8 @@ def attempt(job: Job) -> dict[str, Any]:
         rise = [now.position_m[2] - was.position_m[2] for was, now in zip(before, plant.logs(), strict=True)]
         return {
             "configuration": number, "category": category(number, before, up, grip, wrong), "lifted": len(up),
-            "misled": wrong, "looks": seat.looks, "seen": len(seen.logs), "see_ms": 1e3 * seen.seconds,
-            "logs": len(before), "up": up,
+            "misled": wrong, "looks": seat.looks, "closings": closings, "seen": len(seen.logs),
+            "see_ms": 1e3 * seen.seconds, "logs": len(before), "up": up,
             "failure": activity.failure, "stops": operator.stops, "expected": list(p.logs) if p else [],
             "probability": p.probability if p else math.nan, "reason": p.reason if p else "",
             "plan_ms": 1e3 * timed.seconds, "grip": [grip.x_m, grip.y_m, grip.yaw_rad], "rise_m": rise,

@@ -13,7 +13,7 @@ from autonomy.perception import paper_a
 from autonomy.perception.frame import Frame, Pose
 from autonomy.perception.paper_b import DETECTOR_PX, Box, RunningAverage, in_picture, position_of
 from autonomy.perception.pipeline import Masked, Perception
-from autonomy.perception.tracks import Errors
+from hil.camera_survey import SURVEYED_BY_GNSS
 from hil.experiments.log_localization.site import APART_M, STOP_M, Shape, Shot, Site
 from hil.experiments.plant.worlds import profile_named
 from hil.experiments.pool import Job
@@ -26,8 +26,6 @@ RATE_NS: Final = 66_666_667
 LEAST_PX: Final = 60  # a mask with fewer pixels is not seen
 MEAN_RADIUS_M: Final = 0.125  # of paper B's logs
 FOUND_M: Final = 1.0  # an estimate further from a log is not of it
-DRIVING: Final = Errors(scale=0.0015, mount_rad=0.0015, mount_m=0.004, pose_rad=0.002, pose_m=0.012)
-"""What a surveyed mount and a dual-antenna RTK receiver leave."""
 RANGES_M: Final = (3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 
 Segmenter = Callable[[Frame, Shot], Sequence[Masked]]
@@ -71,7 +69,8 @@ def perform(job: Job) -> dict[str, Any]:
 
 def approach(site: Site, segment: Segmenter) -> dict[str, Any]:
     """Drive up to log 1, stop, take it away, drive up to log 2: errors of each at its own stop."""
-    ours, faithful, centred = Perception(site.profile, DRIVING), RunningAverage(), RunningAverage(MEAN_RADIUS_M)
+    ours = Perception(site.profile, SURVEYED_BY_GNSS)
+    faithful, centred = RunningAverage(), RunningAverage(MEAN_RADIUS_M)
     clock, out = 0, []
     start = -FURTHEST_M
     for number, log in enumerate(site.logs):

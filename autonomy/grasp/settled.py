@@ -1,0 +1,135 @@
+"""Logs as they can lie: on the ground or on others, not in the ground and not in each other.
+
+A camera sees a strip of a log that others hide, and tells its height and width badly, which its covariance says.  What
+is known of heavy things does the rest, as measurements of a Kalman filter: a log that may lie on the ground lies on it
+with both ends, and two logs that reach into each other touch; each is moved by as much as it is unsure.  What raises or
+sinks all logs alike, a camera's mount or scale of depth, is taken from those on others, too.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from autonomy.grasp.cylinders import Cylinders, across, changed
+from autonomy.perception.estimate import ACROSS_1, ACROSS_2, RADIUS, SIZE, TILT_1, TILT_2
+
+LEVEL_M: Final = 0.015
+"""Standard deviation of the ground's height under an end of a log, with its bow and taper."""
+LIKELY: Final = 9.0
+"""Squared standard deviations, of two numbers, up to which a log may lie on the ground: 99 %."""
+SUNK_M: Final = 0.12
+"""A log whose middle is seen further over the ground than this lies on something."""
+CROOKED_M: Final = 0.015
+"""Logs that touch reach so far into each other as cylinders."""
+INTO_M: Final = 0.04
+"""A log that would reach further into another if it lay on the ground does not lie there."""
+OWN_SHARE: Final = 0.4
+"""Of the standard deviation of the height of a log on others, the part that is its own and not the camera's."""
+ROUNDS: Final = 3
+POINTS: Final = 15
+
+
+def settled(world: Cylinders, covariances: np.ndarray, ground_z_m: float) -> tuple[Cylinders, np.ndarray]:
+    """The logs (n) and their covariances (n, 7, 7), with level ground at ``ground_z_m``."""
+    sigma, before = covariances.copy(), apart(world)
+    common = float(np.min(sigma[:, ACROSS_2, ACROSS_2], initial=np.inf))  # no log is known better than the camera
+    lying, off, sure = np.zeros(world.count, bool), np.zeros(world.count), np.zeros(world.count)
+    for i in np.argsort(sigma[:, ACROSS_2, ACROSS_2], kind="stable").tolist():
+        height, slope = _undersides(world, i, ground_z_m)
+        off[i] = height.mean()
+        spread = slope @ sigma[i] @ slope.T + LEVEL_M**2 * np.eye(2)
+        if off[i] > SUNK_M or (off[i] > 0.0 and height @ np.linalg.solve(spread, height) > LIKELY):
+            continue
+        laid = _moved(world, sigma, i, height, slope, LEVEL_M)
+        if off[i] > 0.0 and np.any(apart(laid)[i] < np.minimum(before[i], 0.0) - INTO_M):
+            continue
+        world, lying[i] = laid, True
+        sure[i] = 1.0 / max(float(spread.mean()) - common, LEVEL_M**2)
+        sigma[i] = _known(sigma[i], slope, LEVEL_M)
+    if lying.any():
+        shift = np.where(lying, 0.0, sure @ off / (1.0 / common + sure.sum()))
+        center = world.center - shift[:, None] * (0.0, 0.0, 1.0)
+        world = Cylinders(center, world.axis, world.length, world.radius)
+        scale = np.ones((world.count, SIZE))
+        scale[~lying, ACROSS_2] = OWN_SHARE
+        sigma *= scale[:, :, None] * scale[:, None, :]
+    for _ in range(ROUNDS):
+        pairs = np.argwhere(np.triu(apart(world) < -CROOKED_M)).tolist()
+        if not pairs:
+            break
+        for i, j in pairs:
+            world = _parted(world, sigma, i, j)
+        for i in np.flatnonzero(lying).tolist():
+            world = _moved(world, sigma, i, *_undersides(world, i, ground_z_m), LEVEL_M)
+    return world, sigma
+
+
+def apart(world: Cylinders) -> np.ndarray:
+    """(n, n) [m]: the least distance between the surfaces of every two logs by points of the one's axis, negative where
+    they reach into each other; infinite between a log and itself."""
+    part = world.length[:, None] * np.linspace(-0.5, 0.5, POINTS)
+    points = world.center[:, None] + part[..., None] * world.axis[:, None]
+    away = points[None] - world.center[:, None, None]
+    half = world.length[:, None, None] / 2
+    along = np.clip(np.einsum("ijkc,ic->ijk", away, world.axis), -half, half)
+    off = np.linalg.norm(away - along[..., None] * world.axis[:, None, None], axis=-1).min(axis=-1)
+    gap: np.ndarray = np.minimum(off, off.T) - world.radius[:, None] - world.radius[None, :]
+    np.fill_diagonal(gap, np.inf)
+    return gap
+
+
+def _undersides(world: Cylinders, i: int, ground_z_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Heights (2,) of the undersides of both ends of log ``i`` over the ground, and their derivatives (2, 7)."""
+    half = 0.5 * float(world.length[i])
+    level = float(np.sqrt(max(1.0 - world.axis[i, 2] ** 2, 0.0)))
+    middle = world.center[i, 2] - world.radius[i] * level - ground_z_m
+    slope = np.zeros((2, SIZE))
+    slope[:, ACROSS_2], slope[:, RADIUS] = level, -level
+    slope[:, TILT_2] = -half * level, half * level
+    rise = half * world.axis[i, 2]
+    return np.array([middle - rise, middle + rise]), slope
+
+
+def _known(covariance: np.ndarray, slope: np.ndarray, noise_m: float) -> np.ndarray:
+    """A covariance (7, 7) after a measurement with derivatives (k, 7)."""
+    spread = slope @ covariance @ slope.T + noise_m**2 * np.eye(len(slope))
+    known: np.ndarray = covariance - covariance @ slope.T @ np.linalg.solve(spread, slope @ covariance)
+    return 0.5 * (known + known.T)
+
+
+def _moved(
+    world: Cylinders, sigma: np.ndarray, i: int, over_m: np.ndarray, slope: np.ndarray, noise_m: float
+) -> Cylinders:
+    """The logs with ``i`` changed so that what is ``over_m`` (k,) over its place is as near to it as both are known."""
+    spread = slope @ sigma[i] @ slope.T + noise_m**2 * np.eye(len(slope))
+    error = np.zeros((world.count, SIZE))
+    error[i] = -sigma[i] @ slope.T @ np.linalg.solve(spread, over_m)
+    return changed(world, error)
+
+
+def _parted(world: Cylinders, sigma: np.ndarray, i: int, j: int) -> Cylinders:
+    """The logs with two of them moved apart until they touch, each by as much as it is unsure."""
+    level, up = across(world.axis)
+    half = 0.5 * world.length
+    points = world.center[j] + np.linspace(-half[j], half[j], POINTS)[:, None] * world.axis[j]
+    along = np.clip((points - world.center[i]) @ world.axis[i], -half[i], half[i])
+    away = points - world.center[i] - along[:, None] * world.axis[i]
+    distance = np.linalg.norm(away, axis=1)
+    k = int(np.argmin(distance))
+    reach = float(distance[k] - world.radius[i] - world.radius[j]) + CROOKED_M
+    if reach >= 0.0:
+        return world
+    way = away[k] / max(float(distance[k]), 1e-6)
+    error, slopes = np.zeros((world.count, SIZE)), []
+    for log, sense, at in ((i, -1.0, along[k]), (j, 1.0, (points[k] - world.center[j]) @ world.axis[j])):
+        slope = np.zeros(SIZE)
+        slope[[ACROSS_1, ACROSS_2]] = sense * (way @ level[log]), sense * (way @ up[log])
+        slope[[TILT_1, TILT_2]] = at * slope[[ACROSS_1, ACROSS_2]]
+        slope[RADIUS] = -1.0
+        slopes.append((log, slope))
+    spread = sum(float(slope @ sigma[log] @ slope) for log, slope in slopes) + 1e-6
+    for log, slope in slopes:
+        error[log] = -sigma[log] @ slope * (reach / spread)
+    return changed(world, error)
