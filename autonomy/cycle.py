@@ -85,7 +85,7 @@ class Cycle:
     @property
     def unsure(self) -> bool:
         """Whether the grasp is worth another look from above: of logs among others that a camera has measured."""
-        return self.grasp is not None and _measured(self.grasp) and self._looks < LOOKS
+        return self.grasp is not None and self.gathered and _measured(self.grasp) and self._looks < LOOKS
 
     def choose_better(self, q: Axes) -> bool:
         """Choose again by what is seen from over the grasp; whether the crane has to go over another place for it."""
@@ -112,7 +112,8 @@ class Cycle:
 
     @property
     def may_grip_higher(self) -> bool:
-        """Whether a bundle that the tongs do not get round may be gripped higher up: one that a camera measured."""
+        """Whether what the tongs do not get round may be gripped higher up: a camera measured it, and may have missed
+        what lies there, too."""
         return self.grasp is not None and _measured(self.grasp) and self.climbs < CLIMBS
 
     def grip_higher(self) -> None:
@@ -124,8 +125,7 @@ class Cycle:
 
     @property
     def may_begin_anew(self) -> bool:
-        """Whether a bundle that was missed may be looked at and gripped again before it is lifted: one that a camera
-        measured."""
+        """Whether what was missed may be looked at and gripped again before the crane goes up: a camera measured it."""
         return self.grasp is not None and _measured(self.grasp) and self._begun_anew < ANEW
 
     def begin_anew(self) -> None:
@@ -271,5 +271,5 @@ class Cycle:
 
 
 def _measured(grasp: Grasp) -> bool:
-    """Whether it is a planner's among others, of logs that a camera has measured."""
-    return grasp.gathered and any(log.covariance is not None for log in grasp.logs)
+    """Whether it is of logs that a camera has measured."""
+    return any(log.covariance is not None for log in grasp.logs)
