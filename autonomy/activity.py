@@ -320,7 +320,9 @@ class Activity:
         return self._cycle.may_begin_anew and self._tongs.have_missed(self.grasp)
 
     def _anew_from_above(self) -> Phase:
-        """Open again, go up and look."""
+        """Drag out what they pinch, or open again, go up and look."""
+        if not self._tongs.empty and self._cycle.drag():
+            return Phase.CLOSE
         self._cycle.begin_anew()
         return Phase.ABOVE
 

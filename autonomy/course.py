@@ -38,6 +38,8 @@ ASTRAY_M: Final = 0.3
 """What lies farther off may be another log."""
 GATHER_S: Final = 10.0
 """Time in which what may settle is lifted to the travel height: also logs that hang askew are clear of the ground."""
+DRAG_M, DRAG_S = 0.35, 2.5
+"""How far and in what time a log is dragged out of a row."""
 OUT_S: Final = 4.0
 """The same out of a heap, which is nearer to that height."""
 
@@ -114,10 +116,26 @@ def closing(arm: Arm, start: Pose, grasp: Grasp, begin_s: float) -> Trajectory:
     return follow(arm, start, path, arm.profile.grapple.close_time_s, 1.0)
 
 
+def dragging(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
+    """The log that the tongs pinch out of its row, along the ground; no motion where that is out of reach."""
+    (x, y), log = arm.xy(start), grasp.log
+    way = x - log.center_m[0], y - log.center_m[1]
+    along = way[0] * log.axis[0] + way[1] * log.axis[1]
+    out = way[0] - along * log.axis[0], way[1] - along * log.axis[1]
+    far = DRAG_M / max(hypot(*out), 1e-3)
+    try:
+        aside = arm.over(x + far * out[0], y + far * out[1], start.z_m, travel_height(arm.profile))
+    except Unreachable:
+        return straight(arm, start, start)
+    turned = start.rot_rad - (aside.slew_rad - start.slew_rad)
+    return slowly(arm, start, aside._replace(rot_rad=turned), DRAG_S)
+
+
 def gathering(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
     """A bundle up, slowly: its logs settle, and the tongs follow them under it."""
-    goal = grasp.pose.at_height(travel_height(arm.profile))
-    return slowly(arm, start, goal, OUT_S if grasp.pressed else GATHER_S)
+    column = start if grasp.drags else grasp.pose
+    goal = column.at_height(travel_height(arm.profile))
+    return slowly(arm, start, goal, OUT_S if grasp.pressed and not grasp.drags else GATHER_S)
 
 
 def stowing(arm: Arm, motions: Motions, start: Pose, logs: Sequence[LogObservation]) -> Trajectory:

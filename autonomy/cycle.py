@@ -13,7 +13,7 @@ from typing import Final
 
 from autonomy import tongs
 from autonomy.carried import ASIDE_M, came_up, laid, picked, place_as_seen
-from autonomy.course import above, aimed, carrying, closing, gathering, stowing
+from autonomy.course import above, aimed, carrying, closing, dragging, gathering, stowing
 from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, lies_in, plan_place, retreat_height
 from autonomy.grasp.proposal import NoGrasp
 from autonomy.heard import Heard
@@ -128,6 +128,13 @@ class Cycle:
         """Whether what was missed may be looked at and gripped again before the crane goes up: a camera measured it."""
         return self.grasp is not None and _measured(self.grasp) and self._begun_anew < ANEW
 
+    def drag(self) -> bool:
+        """Drag it out of its row, if that is what was to be and was not done; whether it is so."""
+        assert self.grasp is not None
+        drags = self.grasp.drawn and not self.grasp.drags
+        self.grasp = replace(self.grasp, drags=self.grasp.drawn)
+        return drags
+
     def begin_anew(self) -> None:
         """Look at it again from above, once, for the tongs have stirred it."""
         self._begun_anew += 1
@@ -159,7 +166,7 @@ class Cycle:
                 self.grasp = grasp = aimed(arm, grasp, logs)
                 return straight(arm, start, grasp.pose)
             case Phase.CLOSE:
-                return closing(arm, start, grasp, closing_s)
+                return dragging(arm, start, grasp) if grasp.drags else closing(arm, start, grasp, closing_s)
             case Phase.LIFT:
                 if grasp.gathered:
                     return gathering(arm, start, grasp)

@@ -142,6 +142,11 @@ class Tongs:
         return 2.0 * half_gap_m(tongs, tong_angle_from_opening_pct(tongs, opening)) if isfinite(opening) else 0.0
 
     @property
+    def empty(self) -> bool:
+        """Whether they have shut on nothing that is seen."""
+        return is_empty(self._heard.report)
+
+    @property
     def still(self) -> bool:
         """Whether they have not moved for a while."""
         return self._still_s > _STILL_S

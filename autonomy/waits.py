@@ -24,7 +24,7 @@ _PRESS_S: Final = 0.6
 def pace(phase: Phase, elapsed_s: float, way: Pursuit, tongs: Tongs, grasp: Grasp | None) -> float:
     """Seconds of the motion in a second that are wanted; 0 where it is to come to a stop and wait."""
     match phase:
-        case Phase.CLOSE:
+        case Phase.CLOSE if grasp is None or not grasp.drags:
             return 0.0 if tongs.gripped(elapsed_s) else tongs.pace(way.clock_s)
         case Phase.ABOVE if way.left_s < GATE_S and not tongs.open:
             return 0.0
@@ -38,7 +38,8 @@ def at_goal(
 ) -> bool:
     """Whether the motion is done and at rest with the joints measured at ``position``, rad (EXT m)."""
     if phase is Phase.CLOSE:
-        return tongs.gripped(elapsed_s) and (way.stands or way.left_s <= 0.0)
+        held = way.stands and not (grasp is not None and grasp.drags)
+        return tongs.gripped(elapsed_s) and (held or way.left_s <= 0.0)
     if phase is Phase.DESCEND and grasp is not None and grasp.pressed and _rests_on_wood(elapsed_s, way):
         return True
     share = _LAYING if phase in (Phase.CARRY, Phase.LOWER) else 1.0

@@ -69,7 +69,8 @@ class Grasp:
 
     ``others`` come up with it; ``top_z_m`` is the highest point of a log under the way down, or None; ``reason`` is a
     sentence for the operator, ``probability`` that of success where a planner reckons with one; ``pressed``: the tongs
-    go down among other logs, as far as these let them; ``drawn``: to draw the log out of a row.
+    go down among other logs, as far as these let them; ``drawn``: to draw the log out of a row; ``drags``: pinched by
+    its upper half it is dragged out, to be gripped there.
     """
 
     log: LogObservation
@@ -82,6 +83,7 @@ class Grasp:
     probability: float | None = None
     pressed: bool = False
     drawn: bool = False
+    drags: bool = False
 
     @property
     def logs(self) -> tuple[LogObservation, ...]:

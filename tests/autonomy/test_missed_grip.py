@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from math import hypot, pi
 
 import pytest
 from crane_stand_in import StandIn
-from grasp_scenes import PROFILE, pair
+from grasp_scenes import GROUND, PROFILE, log, pair
 
 from autonomy.activity import Activity
+from autonomy.course import DRAG_M
 from autonomy.cycle import ANEW
 from autonomy.grasp.direct import Planned
+from autonomy.grasp.proposal import GraspProposal
 from autonomy.grasp.search import Search
 from autonomy.logs import TRIANGLE, LogObservation
+from autonomy.motion.arm import Arm
 from autonomy.phases import Phase
-from can_dbc.setpoint import StateReport
+from can_dbc.setpoint import GrappleCommand, StateReport
 from machine.load import profile_hash
 
 SHUT, HOLDING = 4, 5
+PINCH_RAD = 0.92  # of 2.25
 
 
 class Slipping(StandIn):
@@ -79,3 +85,57 @@ def test_what_nobody_measured_or_may_be_in_shut_tongs_is_lifted_as_it_is(known_h
     if known_how == "blind":
         crane.misses = 0  # nobody tells
     assert phases_until_lifted(crane).count(Phase.CLOSE) == 1
+
+
+class Pinching(Slipping):
+    """Tongs pinch the upper half of a thick log in a row until it has been dragged ``free_m`` aside."""
+
+    free_m = 0.3
+    misses = 0
+
+    def _grapple(self, command: GrappleCommand) -> None:
+        closed_at = next((m.pin for m in self.trace if m.phase == "CLOSE"), self.pin())
+        pinches = hypot(self.pin()[0] - closed_at[0], self.pin()[1] - closed_at[1]) < self.free_m
+        if command is GrappleCommand.CLOSE and pinches and self.tong_rad >= PINCH_RAD:
+            self.gripped = True
+        else:
+            self.gripped = self.gripped and not (command is GrappleCommand.CLOSE and self.tong_rad < 2.0)
+            super()._grapple(command)
+
+
+def drawing(arm: Arm, logs: Sequence[LogObservation], *_: object) -> GraspProposal:
+    """The end log of a row, out towards +y."""
+    end = logs[-1]
+    x, y, _ = end.center_m
+    return GraspProposal(x, y + 0.5, pi / 2, GROUND, (len(logs) - 1,), 0.9, "drawn", pressed=True, drawn=True)
+
+
+def test_a_log_that_is_pinched_in_its_row_is_dragged_out_and_gripped_there() -> None:
+    crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
+    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(drawing))
+    for _ in range(3000):
+        if planner.phase is Phase.LIFT or planner.idle:
+            break
+        crane.step(planner)
+    assert planner.phase is Phase.LIFT, planner.failure
+    pins = [m.pin for m in crane.trace if m.phase == "CLOSE"]
+    assert pins[-1][1] - pins[0][1] == pytest.approx(DRAG_M, abs=0.03), "away from the others"
+    assert abs(pins[-1][2] - pins[0][2]) < 0.15 and abs(pins[-1][0] - pins[0][0]) < 0.05
+    for _ in range(60):
+        crane.step(planner)
+    assert crane.pin()[1] == pytest.approx(pins[-1][1], abs=0.03), "it goes up from there"
+
+
+def test_what_is_pinched_still_after_the_drag_is_looked_at_anew() -> None:
+    crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
+    crane.free_m = 9.0
+    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(drawing))
+    phases = [planner.phase]
+    for _ in range(4000):
+        if planner.phase is Phase.LIFT or planner.idle:
+            break
+        crane.step(planner)
+        if planner.phase is not phases[-1]:
+            phases.append(planner.phase)
+    assert planner.phase is Phase.LIFT, planner.failure
+    assert phases.count(Phase.ABOVE) == 1 + ANEW

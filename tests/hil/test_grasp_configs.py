@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from autonomy.logs import LogObservation
-from hil.experiments.grasp_configs.experiment import PAPER_ATTEMPTS, gather, jobs_of
+from hil.experiments.grasp_configs.experiment import MACHINES, PAPER_ATTEMPTS, gather, jobs_of, machines_of
 from hil.experiments.grasp_configs.figures import FIGURES, SECTIONS
 from hil.experiments.grasp_configs.outcome import Grip, category, lies_on, lifted
 from hil.experiments.grasp_configs.poses import misled
@@ -84,7 +84,8 @@ def test_a_log_that_is_missed_misplaced_or_made_up_misleads() -> None:
 def outcome(number: int, word: str, up: int, plan_ms: float = 10.0) -> dict[str, Any]:
     return {
         "configuration": number, "category": word, "lifted": up, "logs": CONFIGURATIONS[number][1], "plan_ms": plan_ms,
-        "see_ms": 50.0, "failure": None, "reason": "", "closings": 2 if number == 4 else 1,
+        "individual": number % 2 > 0, "closings": 2 if number == 4 else 1, "see_ms": 50.0, "failure": None,
+        "reason": "",
     }  # fmt: skip
 
 
@@ -116,6 +117,20 @@ def test_every_pair_sees_the_same_scenes_and_the_first_gets_most() -> None:
     assert len(jobs) == 12 * (120 + 6) and len({job.name for job in jobs}) == len(jobs)
     first = {(j.options["configuration"], j.seed) for j in jobs if j.options["planner"] == "search"}
     assert {(j.options["configuration"], j.seed) for j in jobs if j.options["planner"] == "cnn"} < first
+
+
+def test_after_the_papers_attempts_machines_take_turns_on_scenes_of_their_own() -> None:
+    calibrations = machines_of(OPTIONS, 17)
+    assert len(calibrations) == MACHINES and machines_of(OPTIONS, PAPER_ATTEMPTS) == []
+    known = {job.name: {"profile": f"text {job.name}"} for job in calibrations}
+    known["machine/2"] = {"profile": None}
+    jobs = [j for j in jobs_of(OPTIONS, [("ours", "search")], 17, known) if j.options["configuration"] == 3]
+    texts = [j.options.get("text") for j in jobs]
+    turn = [None, "text machine/0", "text machine/1", None, "text machine/3", "text machine/4"]
+    assert texts == [None] * PAPER_ATTEMPTS + turn * 2
+    assert len({j.options.get("scene", j.seed) for j in jobs}) == 17, "no scene twice"
+    by_machine = {j.options["text"]: j.seed for j in jobs if "text" in j.options}
+    assert by_machine == {f"text machine/{i}": calibrations[i].seed for i in (0, 1, 3, 4)}
 
 
 @pytest.mark.slow

@@ -1,8 +1,10 @@
-"""One individual machine calibrated before an experiment lets it work: the profile that it then has."""
+"""One individual machine calibrated before an experiment lets it work: the profile that it then has, as a file."""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,3 +38,15 @@ def calibrated(job: Job) -> dict[str, Any]:
         except NotWritten as error:
             return {"profile": None, "failure": str(error)}
         return {"profile": path.read_text(encoding="utf-8"), "failure": None}
+
+
+@contextmanager
+def believed(name: str, text: str | None) -> Iterator[str]:
+    """The profile that controller, guard and planner read: the shipped one, or a calibrated text in a file."""
+    if text is None:
+        yield str(profile_path(name))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.toml"
+        path.write_text(text, encoding="utf-8")
+        yield str(path)

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,9 +13,8 @@ from rich.console import Console
 from autonomy.localization.plane import Plane
 from autonomy.missions.files import load_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
-from controller.guard.__main__ import profile_path
 from hil.display import Display
-from hil.experiments.calibration.individual import calibrated
+from hil.experiments.calibration.individual import believed, calibrated
 from hil.experiments.forwarding_mission.witness import Witness
 from hil.experiments.plant.worlds import profile_named
 from hil.experiments.pool import Job
@@ -101,18 +97,6 @@ def summary_of(summary: MissionSummary) -> dict[str, Any]:
         "driven_m": round(summary.driven_m, 2), "stops": summary.stops, "refused": summary.refused,
         "states": [list(s) for s in summary.states],
     }  # fmt: skip
-
-
-@contextmanager
-def believed(name: str, text: str | None) -> Iterator[str]:
-    """The profile that controller, guard and planner read: the shipped one, or a calibrated text in a file."""
-    if text is None:
-        yield str(profile_path(name))
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{name}.toml"
-        path.write_text(text, encoding="utf-8")
-        yield str(path)
 
 
 def shuffled(mission: ForwardingMission, seed: int) -> ForwardingMission:

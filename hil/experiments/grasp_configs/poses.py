@@ -24,6 +24,7 @@ from autonomy.perception.frame import Frame, Pose, rescaled
 from autonomy.perception.mount import optical_pose
 from autonomy.perception.pipeline import Masked, Perception
 from hil.camera_survey import SURVEYED, known
+from machine.profile import Profile
 from sim.camera.rig import CameraRig
 from sim.logs import LogState
 from sim.plant import Plant
@@ -55,10 +56,10 @@ def true_poses(plant: Plant) -> tuple[LogObservation, ...]:
 class Known:
     """The poses that the plant knows."""
 
-    def __init__(self, plant: Plant, seed: int) -> None:
+    def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
         self._plant = plant
 
-    def look(self, stamp_ns: int) -> Seen:
+    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
         """What lies where now."""
         return Seen(true_poses(self._plant))
 
@@ -69,16 +70,16 @@ class Ours:
     ``masked``: with a perfect segmentation, the renderer's masks.
     """
 
-    def __init__(self, plant: Plant, seed: int, masked: bool = False) -> None:
+    def __init__(self, plant: Plant, profile: Profile, seed: int, masked: bool = False) -> None:
         self._masked = masked
-        self._camera = _Surveyed(plant, seed)
-        self._perception = Perception(plant.profile, SURVEYED)
+        self._camera = _Surveyed(plant, profile, seed)
+        self._perception = Perception(profile, SURVEYED)
 
-    def look(self, stamp_ns: int) -> Seen:
+    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
         """The logs as they are known after the pictures."""
         from autonomy.perception.finder import segment
 
-        seen = self._camera.look(stamp_ns)
+        seen = self._camera.look(stamp_ns, q)
         begun = time.process_time()
         for frame in seen.frames:
             masks: Sequence[Masked] = seen.masks if self._masked else segment(frame)
@@ -93,14 +94,14 @@ class Faithful:
     What it sees is as good as known to it: nothing is looked at twice.
     """
 
-    def __init__(self, plant: Plant, seed: int) -> None:
-        self._camera = _Surveyed(plant, seed)
+    def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
+        self._camera = _Surveyed(plant, profile, seed)
 
-    def look(self, stamp_ns: int) -> Seen:
+    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
         """The logs of a picture."""
         from autonomy.perception.finder import segment
 
-        seen, begun = self._camera.look(stamp_ns), time.process_time()
+        seen, begun = self._camera.look(stamp_ns, q), time.process_time()
         frame, pose = seen.frames[0], seen.pose
         found = [paper_a.log_of(frame, one.mask) for one in segment(frame)]
         logs = []
@@ -116,11 +117,11 @@ class Faithful:
 class Sight(Protocol):
     """Sees the logs from where the crane stands."""
 
-    def look(self, stamp_ns: int) -> Seen:
-        """The logs, now."""
+    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
+        """The logs, now that the joints are measured at ``q`` [rad, EXT m]."""
 
 
-POSES: Final[dict[str, Callable[[Plant, int], Sight]]] = {
+POSES: Final[dict[str, Callable[[Plant, Profile, int], Sight]]] = {
     "true": Known,
     "ours": Ours,
     "masked": partial(Ours, masked=True),
@@ -161,19 +162,19 @@ class Look:
 
 
 class _Surveyed:
-    """The camera on the stick, its mount and depth as a survey before the run left them."""
+    """The camera on the stick of a machine known as ``profile``, as a survey of its mount and depth left it."""
 
-    def __init__(self, plant: Plant, seed: int) -> None:
+    def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
         self._plant = plant
         self._rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
-        self._known = known(plant.profile, plant.world.truth, CAMERA, seed)
+        self._known = known(profile, plant.world.truth, CAMERA, seed)
 
-    def look(self, stamp_ns: int) -> Look:
+    def look(self, stamp_ns: int, q: Sequence[float]) -> Look:
         """``PICTURES`` of what lies there now."""
-        plant, ids = self._plant, self._rig.picture(CAMERA)[2].mask
-        profile = self._known.profile
-        pose = optical_pose(profile, profile.cameras[CAMERA], plant.joint_positions())
-        masks = [Mask(ids == i + 1) for i in range(len(plant.logs())) if np.count_nonzero(ids == i + 1) >= LEAST_PX]
+        profile, ids = self._known.profile, self._rig.picture(CAMERA)[2].mask
+        pose = optical_pose(profile, profile.cameras[CAMERA], q)
+        numbers = range(1, len(self._plant.logs()) + 1)
+        masks = [Mask(ids == i) for i in numbers if np.count_nonzero(ids == i) >= LEAST_PX]
         taken = [self._rig.frame(CAMERA, stamp_ns + i * RATE_NS) for i in range(PICTURES)]
         frames = [Frame(f.name, f.stamp_ns, f.rgb, f.depth_m, f.intrinsics) for f in taken]
         return Look(tuple(rescaled(f, self._known.depth_scale) for f in frames), pose, tuple(masks))

@@ -11,6 +11,7 @@ import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Any, Final
 
 from autonomy.activity import SETTLED_NS, Activity
@@ -26,14 +27,14 @@ from autonomy.phases import Phase
 from can_dbc.setpoint import StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
-from controller.guard.__main__ import profile_path
+from hil.experiments.calibration.individual import believed
 from hil.experiments.grasp_configs.outcome import Grip, category, lifted
 from hil.experiments.grasp_configs.poses import LOOK_NS, POSES, Seen, Sight, misled
 from hil.experiments.plant.worlds import profile_named, wood_of
 from hil.experiments.pool import Job
 from hil.lockstep import START_NS, Lockstep, Observer
 from hil.operator import Operator
-from machine.load import profile_hash
+from machine.load import load_profile, profile_hash
 from sim.plant import Plant
 from sim.scene import LogSpec, configuration
 
@@ -56,6 +57,8 @@ class Attempt:
     """The last look, ..."""
     looks: int = 0
     """... and how many there were."""
+    _q: tuple[float, ...] = ()
+    """Where the joints were last measured."""
     _up_ns: int = 0
     """Since when the lift is done."""
     _looked_ns: int = 0
@@ -66,7 +69,8 @@ class Attempt:
         """One turn (contract of ``hil.lockstep.Planner``): looks at the start until logs are seen, and one at each rest
         above them."""
         activity = self.activity
-        data = activity.step(now_ns, report, self._looked(now_ns) if logs else ())
+        self._q = self._q if report is None else report.position
+        data = activity.step(now_ns, report, self._looked(now_ns) if logs and self._q else ())
         if self._up_ns == 0 and activity.phase is Phase.LIFT and activity.arrived:
             self._up_ns = now_ns
         return data
@@ -86,7 +90,7 @@ class Attempt:
         return self.seen.logs
 
     def _look(self, now_ns: int) -> None:
-        self.seen = self.sight.look(now_ns)
+        self.seen = self.sight.look(now_ns, self._q)
         self.looks, self._looked_ns = self.looks + 1, now_ns
 
     def over(self, now_ns: int) -> bool:
@@ -138,20 +142,27 @@ def planner_named(name: str) -> Planner:
 
 
 def attempt(job: Job) -> dict[str, Any]:
-    """Options: profile, truth, configuration, poses (of ``poses.POSES``), planner (search, cnn or cnn_physical)."""
+    """Options: profile, truth, configuration, poses (of ``poses.POSES``), planner (search, cnn or cnn_physical), scene
+    (its seed, for the job's is that of the machine), text (of the calibrated profile; None: as shipped).
+    """
+    with believed(job.options["profile"], job.options.get("text")) as name:
+        return _attempt(job, name, job.options.get("scene", job.seed))
+
+
+def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
     o = job.options
-    profile, number = profile_named(o["profile"]), o["configuration"]
+    profile, number = load_profile(name), o["configuration"]
     digest = profile_hash(profile)
-    scene = arranged(o["profile"], o["truth"], number, job.seed)
-    plant = Plant(profile, job.seed, o["truth"], scene=scene)
+    scene = arranged(o["profile"], o["truth"], number, field)
+    plant = Plant(profile_named(o["profile"]), job.seed, o["truth"], scene=scene)
     try:
         before = plant.logs()
         timed = Timed(planner_named(o["planner"]))
         activity = Activity(profile, digest, chooser=Planned(timed), motions=Swiftest(direct=False))
-        seat = Attempt(activity, POSES[o["poses"]](plant, job.seed))
+        seat = Attempt(activity, POSES[o["poses"]](plant, profile, field))
         operator = Operator(digest, lambda *_: None)
         settings = Settings(profile, digest, profile.rate_hz)
-        guard = build_guard(profile_path(o["profile"]))
+        guard = build_guard(Path(name))
         system = Lockstep(settings, guard, plant, seat, operator, Observer(None, []))
         grip, closings = Grip(0.0, 0.0, 0.0), 0
         phase = activity.phase
@@ -172,7 +183,8 @@ def attempt(job: Job) -> dict[str, Any]:
         wrong = misled(before, seen.logs)
         rise = [now.position_m[2] - was.position_m[2] for was, now in zip(before, plant.logs(), strict=True)]
         return {
-            "configuration": number, "category": category(number, before, up, grip, wrong), "lifted": len(up),
+            "configuration": number, "individual": o["truth"] == "sampled",
+            "category": category(number, before, up, grip, wrong), "lifted": len(up),
             "misled": wrong, "looks": seat.looks, "closings": closings, "seen": len(seen.logs),
             "see_ms": 1e3 * seen.seconds, "logs": len(before), "up": up,
             "failure": activity.failure, "stops": operator.stops, "expected": list(p.logs) if p else [],
