@@ -274,10 +274,8 @@ class Activity:
                 return self._after_look() if seen else None
             case Phase.ABOVE:
                 return self._after_above(now_ns) if self._tongs.open else None
-            case Phase.CLOSE if self._clasps_too_much:
-                return self._higher() if self._tongs.still else None
-            case Phase.CLOSE if self._has_missed:
-                return self._anew_from_above() if self._tongs.still else None
+            case Phase.CLOSE:
+                return self._cycle.after_closing(self._tongs)
             case Phase.LIFT | Phase.CARRY:
                 if self.phase is Phase.CARRY and self._carried(now_ns):
                     return Phase.LOWER
@@ -306,30 +304,6 @@ class Activity:
         if self._heard.logs_ns < self._arrived_ns + SETTLED_NS:
             return None if now_ns < self._arrived_ns + PATIENCE_NS else Phase.DESCEND
         return Phase.ABOVE if self._cycle.choose_better(self.motion.goal) else Phase.DESCEND
-
-    @property
-    def _clasps_too_much(self) -> bool:
-        """Whether the tongs stand too wide and may close anew higher up."""
-        assert self.grasp is not None
-        return self._cycle.may_grip_higher and self._tongs.are_wide(self.grasp, self._cycle.climbs)
-
-    @property
-    def _has_missed(self) -> bool:
-        """Whether the tongs have not got hold of the logs and may try again."""
-        assert self.grasp is not None
-        return self._cycle.may_begin_anew and self._tongs.have_missed(self.grasp)
-
-    def _anew_from_above(self) -> Phase:
-        """Drag out what they pinch, or open again, go up and look."""
-        if not self._tongs.empty and self._cycle.drag():
-            return Phase.CLOSE
-        self._cycle.begin_anew()
-        return Phase.ABOVE
-
-    def _higher(self) -> Phase:
-        """Open again and close higher up."""
-        self._cycle.grip_higher()
-        return Phase.DESCEND
 
     def _after_lift(self) -> Phase | None:
         if self._cycle.came_up((self._position(), self._pursuit.sent)):

@@ -7,11 +7,9 @@ A `Cycle` is asked by the activity, which alone knows when a phase begins and en
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from math import dist
 from typing import Final
 
-from autonomy import tongs
 from autonomy.carried import ASIDE_M, came_up, laid, picked, place_as_seen
 from autonomy.course import above, aimed, carrying, closing, dragging, gathering, stowing
 from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, lies_in, plan_place, retreat_height
@@ -23,8 +21,10 @@ from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.trajectory import Trajectory, brisk, hold, straight
 from autonomy.motion.ways import Motions
 from autonomy.phases import Phase
+from autonomy.regrip import Regrip, measured
 from autonomy.rotator import is_counted
 from autonomy.stream import Axes
+from autonomy.tongs import Tongs, among_stakes, is_empty
 from machine.grapple import grapple_yaw
 from machine.joints import Joint
 from machine.profile import Profile
@@ -33,10 +33,6 @@ from machine.sag import sane_load_kg
 ATTEMPTS: Final = 3
 LOOKS: Final = 2
 """So often a grasp is chosen again from over it."""
-ANEW: Final = 2
-"""So often are missed logs gripped again before the crane goes up empty."""
-CLIMBS, _CLIMB_M = 3, 0.1
-"""A heap too wide for the tongs is gripped so much higher, so often: they take from its top what they get round."""
 _SAME_M, _SAME_RAD = 0.02, 0.03
 """Grasps that differ by less are gone down to from the same place."""
 _LOOSE_M: Final = 0.2
@@ -48,8 +44,8 @@ _THERE_M, _THERE_RAD = 0.03, 0.03
 
 class Cycle:
     """``grasp`` is what is gripped and ``place`` where it goes, each once it is chosen; ``lifted_kg`` hung in the
-    grapple, 0 when nobody weighs it; ``missed`` grasps came up empty; this one was taken higher up ``climbs`` times.
-    ``profile`` is the machine as motions are planned for it.
+    grapple, 0 when nobody weighs it; ``missed`` grasps came up empty.  ``profile`` is the machine as motions are
+    planned for it.
     """
 
     def __init__(self, profile: Profile, mission: Mission, motions: Motions, chooser: Chooser, heard: Heard) -> None:
@@ -64,7 +60,7 @@ class Cycle:
         self._arm = Arm(profile, stretches=motions.stretches)
         """With what hangs in the grapple in the present phase."""
         self._begun_z_m = 0.0
-        self._looks = self._begun_anew = self.climbs = 0
+        self._looks, self._regrip = 0, Regrip()
         self._before: Grasp | None = None
 
     @property
@@ -74,18 +70,18 @@ class Cycle:
 
     def choose(self, q: Axes) -> None:
         """A grasp among the logs of the newest list, from where the crane stands; raises ``NoGrasp``."""
-        self._begun_anew = 0
+        self._regrip = Regrip()
         self._choose_now(q)
 
     def _choose_now(self, q: Axes) -> None:
-        self._looks = self.climbs = 0
+        self._looks = 0
         self._before = None
         self.grasp = self._choose(self._arm, self._mission, self._heard.logs, q[Joint.SLEW], q[Joint.ROT])
 
     @property
     def unsure(self) -> bool:
         """Whether the grasp is worth another look from above: of logs among others that a camera has measured."""
-        return self.grasp is not None and self.gathered and _measured(self.grasp) and self._looks < LOOKS
+        return self.grasp is not None and self.gathered and measured(self.grasp) and self._looks < LOOKS
 
     def choose_better(self, q: Axes) -> bool:
         """Choose again by what is seen from over the grasp; whether the crane has to go over another place for it."""
@@ -110,35 +106,13 @@ class Cycle:
         self.grasp, self._before, self._looks = self._before, None, LOOKS
         return True
 
-    @property
-    def may_grip_higher(self) -> bool:
-        """Whether what the tongs do not get round may be gripped higher up: a camera measured it, and may have missed
-        what lies there, too."""
-        return self.grasp is not None and _measured(self.grasp) and self.climbs < CLIMBS
-
-    def grip_higher(self) -> None:
-        """Grip it there next."""
+    def after_closing(self, tongs: Tongs) -> Phase | None:
+        """The phase that follows, None while the tongs still move."""
         assert self.grasp is not None
-        self.climbs += 1
-        pose = self.grasp.pose.at_height(self.grasp.pose.z_m + _CLIMB_M)
-        self.grasp = replace(self.grasp, pose=pose, support_z_m=self.grasp.support_z_m + _CLIMB_M)
-
-    @property
-    def may_begin_anew(self) -> bool:
-        """Whether what was missed may be looked at and gripped again before the crane goes up: a camera measured it."""
-        return self.grasp is not None and _measured(self.grasp) and self._begun_anew < ANEW
-
-    def drag(self) -> bool:
-        """Drag it out of its row, if that is what was to be and was not done; whether it is so."""
-        assert self.grasp is not None
-        drags = self.grasp.drawn and not self.grasp.drags
-        self.grasp = replace(self.grasp, drags=self.grasp.drawn)
-        return drags
-
-    def begin_anew(self) -> None:
-        """Look at it again from above, once, for the tongs have stirred it."""
-        self._begun_anew += 1
-        self._looks = min(self._looks, LOOKS - 1)
+        following, self.grasp = self._regrip.after_closing(self.grasp, tongs)
+        if following is Phase.ABOVE:
+            self._looks = min(self._looks, LOOKS - 1)  # the tongs have stirred the logs
+        return following
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
         """The motion of a phase that begins at ``q``, with the grasp and the place as they are now seen to be best.
@@ -214,7 +188,7 @@ class Cycle:
 
     def is_among_stakes(self, q: Axes) -> bool:
         """Whether tongs that open farther would stir what lies where the logs go."""
-        return tongs.among_stakes(self._arm, self._target, q)
+        return among_stakes(self._arm, self._target, q)
 
     # ------------------------------------------------------------------ what the newest list says
     def first(self) -> LogObservation | None:
@@ -234,7 +208,7 @@ class Cycle:
         seen = self._picked()
         held = came_up(self._arm, self.grasp, seen, [self._arm.pose(q) for q in positions])
         self.grasp = held or self.grasp
-        return held is not None or (not seen and not tongs.is_empty(self._heard.report))
+        return held is not None or (not seen and not is_empty(self._heard.report))
 
     def came_up_empty(self) -> str:
         """Count a grasp that did; why there is to be no other, or empty."""
@@ -275,8 +249,3 @@ class Cycle:
     def _picked(self) -> list[LogObservation]:
         assert self.grasp is not None
         return picked(self.grasp, self._heard.logs)
-
-
-def _measured(grasp: Grasp) -> bool:
-    """Whether it is of logs that a camera has measured."""
-    return any(log.covariance is not None for log in grasp.logs)

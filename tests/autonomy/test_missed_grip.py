@@ -12,13 +12,13 @@ from grasp_scenes import GROUND, PROFILE, log, pair
 
 from autonomy.activity import Activity
 from autonomy.course import DRAG_M
-from autonomy.cycle import ANEW
 from autonomy.grasp.direct import Planned
-from autonomy.grasp.proposal import GraspProposal
+from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.search import Search
 from autonomy.logs import TRIANGLE, LogObservation
 from autonomy.motion.arm import Arm
 from autonomy.phases import Phase
+from autonomy.regrip import ANEW
 from can_dbc.setpoint import GrappleCommand, StateReport
 from machine.load import profile_hash
 
@@ -139,3 +139,25 @@ def test_what_is_pinched_still_after_the_drag_is_looked_at_anew() -> None:
             phases.append(planner.phase)
     assert planner.phase is Phase.LIFT, planner.failure
     assert phases.count(Phase.ABOVE) == 1 + ANEW
+
+
+def test_where_no_better_grasp_is_seen_after_a_drag_the_old_one_is_closed_on_before_it_drags_again() -> None:
+    asked = []
+
+    def once(*args: object) -> GraspProposal:
+        asked.append(1)
+        if len(asked) > 3:
+            raise NoGrasp("nothing is safe")
+        return drawing(*args)  # type: ignore[arg-type]
+
+    crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
+    crane.free_m = 9.0
+    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(once))
+    while planner.phase is not Phase.LIFT and not planner.idle and len(crane.trace) < 4000:
+        crane.step(planner)
+    assert len(asked) > 3 and planner.phase is Phase.LIFT
+    phases = [m.phase for m in crane.trace]
+    again = len(phases) - next(i for i, p in enumerate(reversed(phases)) if p == "DESCEND")
+    closing = crane.trace[again : again + 15]
+    assert {m.phase for m in closing} == {"CLOSE"} and closing[-1].tong_rad > closing[0].tong_rad
+    assert max(abs(m.pin[1] - closing[0].pin[1]) for m in closing) < 0.02

@@ -10,11 +10,11 @@ from crane_stand_in import StandIn
 from grasp_scenes import GROUND, PROFILE, small_pile
 
 from autonomy.activity import Activity
-from autonomy.cycle import CLIMBS
 from autonomy.grasp.direct import Planned
 from autonomy.grasp.search import Search
 from autonomy.logs import TRIANGLE, LogObservation
 from autonomy.phases import Phase
+from autonomy.regrip import CLIMBS
 from can_dbc.setpoint import GrappleCommand
 from machine.grapple import tip_below_pin_m
 from machine.load import profile_hash

@@ -1,0 +1,52 @@
+"""What closed tongs tell of a grasp before anything is lifted, and what is tried then.
+
+Tongs that stall too wide open clasp the sides of a heap: they close again higher up, round what lies on top.  Those
+that pinch the upper half of a log in a row drag it out, and close on it there.  Those that shut on nothing open, and
+the logs are looked at from above once more.  Only of what a camera measured: what is told exactly lies where it is said
+to, and without a sensor of their opening nobody knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+from autonomy.grasp.direct import Grasp
+from autonomy.phases import Phase
+from autonomy.tongs import Tongs
+
+CLIMBS, CLIMB_M = 3, 0.1
+"""A heap too wide for the tongs is gripped so much higher, so often."""
+ANEW: Final = 2
+"""So often are missed logs gripped again before the crane goes up empty."""
+
+
+@dataclass(slots=True)
+class Regrip:
+    """How often one grasp was taken higher up since its logs were last looked at, and begun anew."""
+
+    climbs: int = 0
+    begun: int = 0
+
+    def after_closing(self, grasp: Grasp, tongs: Tongs) -> tuple[Phase | None, Grasp]:
+        """The phase that follows, None while the tongs still move, and the grasp as it is then tried."""
+        if not measured(grasp):
+            return Phase.LIFT, grasp
+        wide = self.climbs < CLIMBS and tongs.are_wide(grasp, self.climbs)
+        if not wide and not (self.begun < ANEW and tongs.have_missed(grasp)):
+            return Phase.LIFT, grasp
+        if not tongs.still:
+            return None, grasp
+        if wide:
+            self.climbs += 1
+            pose = grasp.pose.at_height(grasp.pose.z_m + CLIMB_M)
+            return Phase.DESCEND, replace(grasp, pose=pose, support_z_m=grasp.support_z_m + CLIMB_M)
+        if grasp.drawn and not grasp.drags and not tongs.empty:
+            return Phase.CLOSE, replace(grasp, drags=True)
+        self.begun, self.climbs = self.begun + 1, 0
+        return Phase.ABOVE, replace(grasp, drags=False)
+
+
+def measured(grasp: Grasp) -> bool:
+    """Whether it is of logs that a camera has measured."""
+    return any(log.covariance is not None for log in grasp.logs)
