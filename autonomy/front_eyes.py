@@ -15,12 +15,12 @@ import numpy as np
 
 from autonomy.logs import LogObservation
 from autonomy.perception.frame import Frame, FrameRefused, Pose
+from autonomy.perception.log_filter import NOMINAL, Errors
 from autonomy.perception.mount import MountRefused, optical_pose
 from autonomy.perception.paper_a import log_of
 from autonomy.perception.paper_b import position_of
 from autonomy.perception.pipeline import Masked, Perception
 from autonomy.perception.sources import CameraSource, SourceError
-from autonomy.perception.tracks import NOMINAL, Errors
 from machine.profile import Profile
 
 FARTHEST_M: Final = 10.0

@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 
 from autonomy.perception.frame import Pose
+from autonomy.perception.log_filter import Errors
 from autonomy.perception.mount import Survey, surveyed
-from autonomy.perception.tracks import Errors
 from machine.optics import intrinsics
 from machine.profile import Camera, Profile
 from sim.camera.geometry import mount_view

@@ -11,10 +11,11 @@ import numpy as np
 
 from autonomy.perception.cylinder import Cylinder, guess
 from autonomy.perception.frame import Frame, FrameRefused, Pose, check, inside_bars
+from autonomy.perception.log_filter import NOMINAL, Errors, Track
 from autonomy.perception.merge import groups, joined, refused
 from autonomy.perception.moved import has_moved
 from autonomy.perception.refine import Fit, Outline, Sensor, own_outline, refine
-from autonomy.perception.tracks import NOMINAL, Errors, Track, Tracks
+from autonomy.perception.tracks import Tracks
 from machine.optics import Intrinsics
 from machine.profile import Profile
 
