@@ -271,7 +271,7 @@ class Activity:
         seen = self._arrived_ns is not None and self._heard.logs_ns >= self._arrived_ns
         match self.phase:
             case Phase.LOOK:
-                return self._after_look() if seen else None
+                return self._after_look(now_ns) if seen else None
             case Phase.ABOVE:
                 return self._after_above(now_ns) if self._tongs.open else None
             case Phase.CLOSE:
@@ -288,11 +288,17 @@ class Activity:
                 return Phase.DONE
         return Phase(self.phase + 1)
 
-    def _after_look(self) -> Phase | None:
+    def _after_look(self, now_ns: int) -> Phase | None:
+        """Over a grasp.  What a camera measures is looked at for a while before there is said to be none."""
+        first_ns = self._ready_ns
+        if first_ns is not None and self._heard.logs_ns < now_ns <= first_ns + PATIENCE_NS:
+            return None  # nothing new is known
         try:
             self._cycle.choose(self.motion.goal)
         except NoGrasp as error:
-            self._fail(str(error))
+            self._ready_ns = first_ns or now_ns
+            if now_ns > self._ready_ns + PATIENCE_NS or not self._heard.measured:
+                self._fail(str(error))
             return None
         return Phase.ABOVE
 

@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from math import dist
 from typing import Final
 
+import msgspec
+
 from autonomy.carried import ASIDE_M, came_up, laid, picked, place_as_seen
 from autonomy.course import above, aimed, carrying, closing, dragging, gathering, stowing
 from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, lies_in, plan_place, retreat_height
@@ -61,6 +63,8 @@ class Cycle:
         """With what hangs in the grapple in the present phase."""
         self._begun_z_m = 0.0
         self._looks, self._regrip = 0, Regrip()
+        self._stubborn: tuple[int, ...] = ()
+        """A log that could not be drawn out of its row: another is tried."""
         self._before: Grasp | None = None
 
     @property
@@ -70,13 +74,14 @@ class Cycle:
 
     def choose(self, q: Axes) -> None:
         """A grasp among the logs of the newest list, from where the crane stands; raises ``NoGrasp``."""
-        self._regrip = Regrip()
+        self._regrip, self._stubborn = Regrip(), ()
         self._choose_now(q)
 
     def _choose_now(self, q: Axes) -> None:
         self._looks = 0
         self._before = None
-        self.grasp = self._choose(self._arm, self._mission, self._heard.logs, q[Joint.SLEW], q[Joint.ROT])
+        mission = msgspec.structs.replace(self._mission, leave=self._mission.leave + self._stubborn)
+        self.grasp = self._choose(self._arm, mission, self._heard.logs, q[Joint.SLEW], q[Joint.ROT])
 
     @property
     def unsure(self) -> bool:
@@ -112,6 +117,7 @@ class Cycle:
         following, self.grasp = self._regrip.after_closing(self.grasp, tongs)
         if following is Phase.ABOVE:
             self._looks = min(self._looks, LOOKS - 1)  # the tongs have stirred the logs
+            self._stubborn = (self.grasp.log.id,) if self.grasp.drawn else ()
         return following
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:

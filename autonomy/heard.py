@@ -37,6 +37,11 @@ class Heard:
             self.logs, self.logs_ns = logs, now_ns
 
     @property
+    def measured(self) -> bool:
+        """Whether a camera measured one of the logs: what it sees next may be better."""
+        return any(log.covariance is not None for log in self.logs)
+
+    @property
     def report(self) -> StateReport:
         """The newest report, once there is one."""
         assert self._report is not None

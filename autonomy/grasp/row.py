@@ -22,8 +22,8 @@ from autonomy.motion.arm import Arm
 from machine.grapple import rotator_for_yaw
 from machine.kinematics import Unreachable
 
-SUCCESS: Final = 0.9
-"""In the plant's rows of three of which no other grasp was probable: 12 of 13."""
+SUCCESS: Final = 0.65
+"""In the plant's rows of three: 14 of 21, without another try."""
 VALLEY_M: Final = 0.02
 """The tip comes down so far beyond the log's side: logs that touch part when it is pressed between them."""
 BESIDE_M: Final = 0.05

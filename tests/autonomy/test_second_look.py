@@ -117,3 +117,36 @@ def test_a_second_look_that_finds_no_grasp_changes_none() -> None:
     assert first is not None
     until(crane, planner, Phase.CLOSE)
     assert len(asked) > 1 and planner.grasp is not None and planner.grasp.reason == first.reason
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_where_a_camera_shows_no_grasp_it_is_asked_again_before_there_is_said_to_be_none(better: bool) -> None:
+    search = Search()
+    asked: list[int] = []
+
+    def at_last(*args: object, **more: object) -> object:
+        asked.append(crane.now_ns)
+        if better and len(asked) > 3:
+            return search(*args, **more)  # type: ignore[arg-type]
+        raise NoGrasp("nothing is safe")
+
+    crane, planner = made(Planned(at_last))  # type: ignore[arg-type]
+    while planner.phase <= Phase.LOOK and not planner.failure:
+        crane.step(planner)
+    if better:
+        assert planner.phase is Phase.ABOVE and len(asked) == 4
+    else:
+        assert planner.failure == "nothing is safe"
+        assert asked[-1] - asked[0] == pytest.approx(PATIENCE_NS, abs=3 * TICK_NS)
+
+
+def test_where_logs_are_told_exactly_there_is_none_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Camera, "seen", StandIn.seen)
+
+    def refuse(*_: object, **__: object) -> object:
+        raise NoGrasp("nothing is safe")
+
+    crane, planner = made(Planned(refuse))  # type: ignore[arg-type]
+    while not planner.failure:
+        crane.step(planner)
+    assert len([m for m in crane.trace if m.phase == "LOOK"]) <= 6

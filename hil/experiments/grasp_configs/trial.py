@@ -66,8 +66,8 @@ class Attempt:
     """Since when the crane rests above the logs."""
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """One turn (contract of ``hil.lockstep.Planner``): looks at the start until logs are seen, and one at each rest
-        above them."""
+        """One turn (contract of ``hil.lockstep.Planner``): looks at the start until a grasp is chosen, and one at each
+        rest above it."""
         activity = self.activity
         self._q = self._q if report is None else report.position
         data = activity.step(now_ns, report, self._looked(now_ns) if logs and self._q else ())
@@ -78,7 +78,8 @@ class Attempt:
     def _looked(self, now_ns: int) -> tuple[LogObservation, ...]:
         phase = self.activity.phase
         if phase <= Phase.LOOK:
-            if not self.seen.logs and now_ns >= self._looked_ns + LOOK_NS:
+            wants = phase is Phase.LOOK or not self.seen.logs
+            if wants and now_ns >= self._looked_ns + LOOK_NS:
                 self._look(now_ns)
             return self.seen.logs
         rests = phase is Phase.ABOVE and self.activity.arrived
