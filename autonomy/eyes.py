@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from autonomy.logs import LogObservation
-from autonomy.perception.frame import Frame, FrameRefused
+from autonomy.perception.frame import Frame, FrameRefused, rescaled
 from autonomy.perception.mount import MountRefused, optical_pose
 from autonomy.perception.pipeline import Masked, Perception
 from autonomy.perception.sources import CameraSource, SourceError
@@ -64,6 +64,7 @@ class Eyes:
             if frame is None:
                 self.trouble = getattr(self._source, "problem", "") or "the camera gives no picture"
                 return None
+            frame = rescaled(frame, self._camera.depth_scale)
             tracks = self._perception.step(frame, pose, self._find(frame))
         except (SourceError, FrameRefused, MountRefused) as error:
             self.trouble = str(error)

@@ -14,7 +14,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from autonomy.logs import LogObservation
-from autonomy.perception.frame import Frame, FrameRefused, Pose
+from autonomy.perception.frame import Frame, FrameRefused, Pose, rescaled
 from autonomy.perception.log_filter import NOMINAL, Errors
 from autonomy.perception.mount import MountRefused, optical_pose
 from autonomy.perception.paper_a import log_of
@@ -112,6 +112,7 @@ class FrontEyes:
             if frame is None:
                 self.trouble = getattr(self._source, "problem", "") or "the camera gives no picture"
                 return None
+            frame = rescaled(frame, self._camera.depth_scale)
             pose = Pose(base.to_base(mount.position_m), base.rotation @ mount.rotation)
             seen = self._sight.see(frame, pose, self._find(frame))
         except (SourceError, FrameRefused, MountRefused) as error:

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import msgspec
 import numpy as np
 
+from autonomy.perception.camera_survey import surveyed
 from autonomy.perception.frame import Pose
 from autonomy.perception.log_filter import Errors
-from autonomy.perception.mount import Survey, surveyed
 from machine.optics import intrinsics
 from machine.profile import Camera, Profile
 from sim.camera.geometry import mount_view
@@ -34,24 +34,17 @@ SURVEYED_BY_GNSS: Final = replace(SURVEYED, pose_rad=0.002, pose_m=0.012)
 """... and on a vehicle that a dual-antenna RTK receiver locates."""
 
 
-@dataclass(frozen=True, slots=True)
-class Known:
-    """A profile whose camera stands where a survey found it, and by what that camera's depth must be divided."""
-
-    profile: Profile
-    depth_scale: float
-
-
-def known(profile: Profile, truth: Any, name: str, seed: int) -> Known:
-    """What a survey before run ``seed`` finds of camera ``name`` of a plant (``truth``: ``plant.world.truth``)."""
+def surveyed_profile(profile: Profile, truth: Any, name: str, seed: int) -> Profile:
+    """The profile with what a survey before run ``seed`` finds of camera ``name`` of a plant (``truth``:
+    ``plant.world.truth``).
+    """
     camera, hidden = profile.cameras[name], truth.cameras[name]
     scale = StereoNoise(camera, hidden, f"{name} {seed}").scale  # as the rig's own camera has it
     found = survey(camera, hidden, scale, random.Random(f"survey {seed}"))
-    cameras = {**profile.cameras, name: found.camera}
-    return Known(msgspec.structs.replace(profile, cameras=cameras), found.depth_scale)
+    return msgspec.structs.replace(profile, cameras={**profile.cameras, name: found})
 
 
-def survey(camera: Camera, truth: Any, depth_scale: float, rng: random.Random) -> Survey:
+def survey(camera: Camera, truth: Any, depth_scale: float, rng: random.Random) -> Camera:
     """What the survey says of a camera whose true mount errors and noise are ``truth`` (``plant.world.truth.cameras``)
     and whose depth is ``depth_scale`` of the true one.
     """

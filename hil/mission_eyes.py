@@ -15,8 +15,7 @@ from autonomy.logs import LogObservation
 from autonomy.manager.manager import Manager
 from autonomy.manager.table import ENDS, RULES
 from autonomy.perception.finder import LogFinder
-from autonomy.perception.frame import Frame, rescaled
-from hil.camera_survey import SURVEYED_BY_GNSS, known
+from hil.camera_survey import SURVEYED_BY_GNSS, surveyed_profile
 from hil.lockstep import Eyes
 from hil.rig_camera import RigCamera
 from machine.profile import Profile
@@ -56,21 +55,6 @@ class RouteEyes:
         return self._front.look(outlook.base_at(now_ns), q, outlook.vehicle.articulation_rad)
 
 
-class Surveyed:
-    """A camera whose depth is set right by what a survey found."""
-
-    def __init__(self, source: RigCamera, depth_scale: float) -> None:
-        self._source, self._depth_scale = source, depth_scale
-
-    def frame(self) -> Frame:
-        """What it sees now."""
-        return rescaled(self._source.frame(), self._depth_scale)
-
-    def close(self) -> None:
-        """Let go of the camera."""
-        self._source.close()
-
-
 def eyes_of(kind: str, plant: Plant, profile: Profile, manager: Manager, seed: int) -> Eyes:
     """Eyes of a kind.
 
@@ -81,9 +65,7 @@ def eyes_of(kind: str, plant: Plant, profile: Profile, manager: Manager, seed: i
         return NearEyes(plant)
     if CAMERA not in profile.cameras:
         raise ValueError(f"{profile.name} has no camera {CAMERA!r}; add [cameras.{CAMERA}] to the profile")
-    surveyed = known(profile, plant.world.truth, CAMERA, seed)
-    rig = CameraRig(plant.world, profile, plant.world.truth, seed)
-    source = Surveyed(RigCamera(rig, CAMERA), surveyed.depth_scale)
-    seeing = surveyed.profile
+    seeing = surveyed_profile(profile, plant.world.truth, CAMERA, seed)
+    source = RigCamera(CameraRig(plant.world, profile, plant.world.truth, seed), CAMERA)
     sight = Ours(seeing, SURVEYED_BY_GNSS) if kind == "ours" else PaperB()
     return RouteEyes(FrontEyes(seeing, CAMERA, source, LogFinder().segment, sight), manager)

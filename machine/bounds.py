@@ -34,6 +34,7 @@ from machine.profile import (
 TURN_RAD: Final = 2.0 * pi
 
 Bounds = tuple[float, float, str]
+DEPTH_SCALE: Final[Bounds] = (0.9, 1.1, "")
 _LENGTH: Final[Bounds] = (0.3, 15.0, "m")
 _OFFSET: Final[Bounds] = (-2.0, 2.0, "m")
 ANGLE: Final[Bounds] = (-TURN_RAD, TURN_RAD, "rad")
@@ -124,6 +125,7 @@ _BOUNDS: Final[dict[type[msgspec.Struct], dict[str, Bounds]]] = {
         "rate_hz": (0.1, 240.0, "Hz"),
         "depth_min_m": (0.01, 100.0, "m"),
         "depth_max_m": (0.01, 100.0, "m"),
+        "depth_scale": DEPTH_SCALE,
     },
     Carrier: {
         "front_axle_m": (0.5, 6.0, "m"),

@@ -189,12 +189,13 @@ class Workspace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pick_half_size_m: float
 
 
-class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A stereo camera as mounted and calibrated (machines.md 8): pinhole optics and depth range.
 
     ``position_m`` and ``rpy_rad`` (about the fixed axes x, then y, then z) place its body frame, x forward, y left,
     z up, in the frame of ``link``; a positive pitch looks down.  Its optical frame is x right, y down, z forward.
-    ``fx_px`` .. ``cy_px`` are of the rectified left picture of ``width_px`` by ``height_px``.
+    ``fx_px`` .. ``cy_px`` are of the rectified left picture of ``width_px`` by ``height_px``.  Its depth is to be
+    divided by ``depth_scale``, which a survey finds.
     """
 
     model: str
@@ -211,6 +212,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: float
     depth_min_m: float
     depth_max_m: float
+    depth_scale: float = 1.0
 
 
 class CarrierValve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

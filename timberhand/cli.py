@@ -30,6 +30,7 @@ from timberhand.commands import (
     replay,
     service,
     sim,
+    survey_camera,
     train,
 )
 
@@ -45,6 +46,7 @@ app = typer.Typer(
 )
 app.command("demo")(demo.demo)
 app.command("calibrate")(calibrate.calibrate)
+app.command("survey-camera")(survey_camera.survey_camera)
 app.command("experiment")(experiment.experiment)
 app.command("replay")(replay.replay)
 app.command("record")(record.record)

@@ -47,6 +47,8 @@ class Pose:
 
 def rescaled(frame: Frame, depth_scale: float) -> Frame:
     """The frame with its depth divided by the scale that a survey of its camera found."""
+    if depth_scale == 1.0:
+        return frame
     return replace(frame, depth_m=frame.depth_m / np.float32(depth_scale))
 
 

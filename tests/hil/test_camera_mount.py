@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from autonomy.perception.camera_survey import surveyed
 from autonomy.perception.frame import Pose
-from autonomy.perception.mount import MountRefused, optical_pose, surveyed
+from autonomy.perception.mount import MountRefused, optical_pose
 from hil.experiments.plant.worlds import opened, profile_named
 from machine.optics import BODY_FROM_OPTICAL, intrinsics, rpy_matrix
 from sim.camera.geometry import mount_view, quaternion_matrix
@@ -71,8 +72,8 @@ def test_a_survey_finds_mount_and_scale() -> None:
     camera, pixels, depths, places, at, optical = targets(1)
     depths[3] = np.nan
     found = surveyed(camera, link, pixels, depths, places)
-    assert np.linalg.norm(np.array(found.camera.position_m) - at) < 0.008
-    assert np.abs(rpy_matrix(found.camera.rpy_rad) @ BODY_FROM_OPTICAL - optical).max() < 0.002
+    assert np.linalg.norm(np.array(found.position_m) - at) < 0.008
+    assert np.abs(rpy_matrix(found.rpy_rad) @ BODY_FROM_OPTICAL - optical).max() < 0.002
     assert found.depth_scale == pytest.approx(1.007, abs=0.001)
 
 

@@ -23,7 +23,7 @@ from autonomy.perception import paper_a
 from autonomy.perception.frame import Frame, Pose, rescaled
 from autonomy.perception.mount import optical_pose
 from autonomy.perception.pipeline import Masked, Perception
-from hil.camera_survey import SURVEYED, known
+from hil.camera_survey import SURVEYED, surveyed_profile
 from machine.profile import Profile
 from sim.camera.rig import CameraRig
 from sim.logs import LogState
@@ -167,17 +167,17 @@ class _Surveyed:
     def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
         self._plant = plant
         self._rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
-        self._known = known(profile, plant.world.truth, CAMERA, seed)
+        self._profile = surveyed_profile(profile, plant.world.truth, CAMERA, seed)
 
     def look(self, stamp_ns: int, q: Sequence[float]) -> Look:
         """``PICTURES`` of what lies there now."""
-        profile, ids = self._known.profile, self._rig.picture(CAMERA)[2].mask
-        pose = optical_pose(profile, profile.cameras[CAMERA], q)
+        camera, ids = self._profile.cameras[CAMERA], self._rig.picture(CAMERA)[2].mask
+        pose = optical_pose(self._profile, camera, q)
         numbers = range(1, len(self._plant.logs()) + 1)
         masks = [Mask(ids == i) for i in numbers if np.count_nonzero(ids == i) >= LEAST_PX]
         taken = [self._rig.frame(CAMERA, stamp_ns + i * RATE_NS) for i in range(PICTURES)]
         frames = [Frame(f.name, f.stamp_ns, f.rgb, f.depth_m, f.intrinsics) for f in taken]
-        return Look(tuple(rescaled(f, self._known.depth_scale) for f in frames), pose, tuple(masks))
+        return Look(tuple(rescaled(f, camera.depth_scale) for f in frames), pose, tuple(masks))
 
 
 def _triple(v: np.ndarray) -> tuple[float, float, float]:

@@ -85,7 +85,7 @@ class Site:
         self._gnss = (rtk.noise_m, rtk.wander_m, gnss.height_factor, gnss.attitude_noise_rad, gnss.phase_noise_m)
         self._wander = np.array([self._rng.gauss(0.0, rtk.wander_m) for _ in range(3)]) * (1, 1, gnss.height_factor)
         self._oval = self._rng.uniform(0.0, OVAL)
-        self.survey = survey(self.camera, self._truth.cameras[CAMERA], self._noise.scale, self._rng)
+        self.surveyed = survey(self.camera, self._truth.cameras[CAMERA], self._noise.scale, self._rng)
 
     def close(self) -> None:
         """Release the renderers."""
@@ -160,7 +160,7 @@ class Site:
         heard = shot.at_m + self._wander + np.array([self._rng.gauss(0.0, noise * f) for f in (1.0, 1.0, up)])
         heading = math.sqrt(2.0) * phase / 1.8
         wrong = rpy_matrix([self._rng.gauss(0.0, s) for s in (attitude, attitude, heading)])
-        return _optical(heard, shot.turn @ wrong, self.survey.camera)
+        return _optical(heard, shot.turn @ wrong, self.surveyed)
 
     def _view(self, at: np.ndarray, turn: np.ndarray) -> View:
         truth, camera = self._truth.cameras[CAMERA], self.camera
@@ -173,7 +173,7 @@ class Site:
         depth_m = self._noise.apply(shot.picture, pin, self._frames)
         self._frames += 1
         raw = Frame(CAMERA, stamp_ns, shot.picture.rgb, depth_m, pin)
-        return rescaled(raw, self.survey.depth_scale)
+        return rescaled(raw, self.surveyed.depth_scale)
 
     def single(self, range_m: float) -> Shot:
         """Log 1 from a camera so far away, at its height and aimed as on the machine, its pose known exactly."""

@@ -1,0 +1,65 @@
+"""Targets of a camera's survey as a CSV file: where each is, and where and how deep the camera sees it."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+COLUMNS: Final = ("u_px", "v_px", "x_m", "y_m", "z_m")
+DEPTH: Final = "depth_m"
+
+
+class TargetsRefused(ValueError):
+    """The file is no list of targets; the message names the line and what is wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """Pixels (N, 2), depths (N,) [m], NaN where none is known, and places in the crane's base frame (N, 3) [m]."""
+
+    pixels_px: np.ndarray
+    depths_m: np.ndarray
+    places_m: np.ndarray
+
+
+def load_targets(path: Path) -> Targets:
+    """The targets of a file with the columns ``COLUMNS`` and, where the camera measures it, ``DEPTH``.
+
+    Raises:
+        TargetsRefused: it cannot be read, a column is missing or a value is no finite number.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise TargetsRefused(f"{path}: cannot be read as text: {error}") from None
+    rows = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    names = [(name or "").strip() for name in rows.fieldnames or ()]
+    missing = [name for name in COLUMNS if name not in names]
+    if missing:
+        raise TargetsRefused(
+            f"{path}:1: column {missing[0]} is missing; the first line is {','.join((*COLUMNS, DEPTH))}"
+        )
+    rows.fieldnames = names
+    values, depths = [], []
+    for row in rows:
+        where = f"{path}:{rows.line_num}"
+        values.append([_number(row[name], name, where) for name in COLUMNS])
+        depth = (row.get(DEPTH) or "").strip()
+        depths.append(_number(depth, DEPTH, where) if depth else math.nan)
+    table = np.array(values, float).reshape(-1, len(COLUMNS))
+    return Targets(table[:, :2], np.array(depths), table[:, 2:])
+
+
+def _number(text: str | None, name: str, where: str) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise TargetsRefused(f"{where}: {name} is {text!r}, which is no number; decimals have a point")
+    return value

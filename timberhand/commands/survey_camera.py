@@ -1,0 +1,102 @@
+"""``timberhand survey-camera``: where a camera truly sits and what its depth is worth, into a new profile."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hil.exits import Exit, Stopped
+
+if TYPE_CHECKING:
+    from machine.profile import Camera
+
+
+def survey_camera(
+    camera: Annotated[str, typer.Argument(help="Its name in the profile.")],
+    targets: Annotated[Path, typer.Argument(help="CSV with u_px,v_px,x_m,y_m,z_m,depth_m, a target a line.")],
+    profile: Annotated[str, typer.Option(help="The machine as it is known: a shipped profile or a TOML file.")],
+    out: Annotated[Path, typer.Option(help="The profile with the surveyed camera, a new TOML file.")] = Path(
+        "surveyed.toml"
+    ),
+    joints: Annotated[
+        str | None,
+        typer.Option(help="Slew, lift and tilt in degrees and telescope in m, for a camera on the crane."),
+    ] = None,
+    articulation_deg: Annotated[float, typer.Option(help="Bend of the carrier, for a camera on its front.")] = 0.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was found on stdout.")] = False,
+) -> None:
+    """Find a camera's mount and scale of depth from targets that were surveyed, and write them into a new profile.
+
+    Set up six targets or more in the picture, near and far, left and right. Survey each in the crane's base frame,
+    and note at which pixel the camera sees it and how deep. The crane stands still meanwhile.
+
+    [bold]Example[/bold]
+
+      timberhand survey-camera stick targets.csv --profile my_crane.toml --joints "0 43 -92 0.3" --out seeing.toml
+    """
+    import datetime
+
+    from rich.console import Console
+
+    from autonomy.calibration.profile_file import NotWritten, write_profile
+    from autonomy.calibration.targets_file import TargetsRefused, load_targets
+    from autonomy.perception.camera_survey import surveyed
+    from autonomy.perception.mount import MountRefused, link_pose
+    from controller.guard.__main__ import profile_path
+    from machine.load import ProfileError, load_profile
+
+    try:
+        known = load_profile(profile)
+        seen = load_targets(targets)
+    except (ProfileError, TargetsRefused) as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    if camera not in known.cameras:
+        names = ", ".join(known.cameras) or "none"
+        raise Stopped(Exit.USAGE, f"{known.name} has no camera {camera!r}; it has: {names}")
+    before = known.cameras[camera]
+    q = _joints(joints, before)
+    try:
+        link = link_pose(known, before.link, q, math.radians(articulation_deg))
+        found = surveyed(before, link, seen.pixels_px, seen.depths_m, seen.places_m)
+    except MountRefused as error:
+        raise Stopped(Exit.FIGURE, f"no profile is written: {error}") from None
+    remark = f"by {len(seen.places_m)} surveyed targets"
+    values = {
+        "position_m": [round(v, 4) for v in found.position_m],
+        "rpy_rad": [round(v, 5) for v in found.rpy_rad],
+        "depth_scale": round(found.depth_scale, 5),
+    }
+    changed = [(("cameras", camera, name), value, remark) for name, value in values.items()]
+    try:
+        write_profile(Path(profile_path(profile)), out, changed, datetime.date.today().isoformat())
+    except NotWritten as error:
+        raise Stopped(Exit.FIGURE, str(error)) from None
+    if as_json:
+        print(json.dumps({"camera": camera, "targets": len(seen.places_m), **values}, indent=2))
+    moved_mm = 1000.0 * math.dist(before.position_m, found.position_m)
+    turns = (math.remainder(b - a, math.tau) for a, b in zip(before.rpy_rad, found.rpy_rad, strict=True))
+    turned = math.degrees(max(map(abs, turns)))
+    Console(stderr=True).print(
+        f"[green]✔[/green] {out} written: {camera} sits {moved_mm:.0f} mm and {turned:.1f} deg off what the profile "
+        f"said, its depth is {100.0 * (found.depth_scale - 1.0):+.2f} % off",
+        highlight=False,
+    )
+
+
+def _joints(text: str | None, camera: Camera) -> list[float]:
+    """Joint positions [rad, m] in ``Joint`` order."""
+    if text is None:
+        if camera.link in ("boom", "stick"):
+            raise Stopped(Exit.USAGE, f"the camera is on the {camera.link}; say where the crane stands with --joints")
+        return [0.0] * 5
+    try:
+        slew, lift, tilt, ext = (float(word) for word in text.replace(",", " ").split())
+    except ValueError:
+        raise Stopped(
+            Exit.USAGE, f'--joints "{text}": four numbers are wanted, slew, lift and tilt in deg and telescope in m'
+        ) from None
+    return [*map(math.radians, (slew, lift, tilt)), ext, 0.0]
