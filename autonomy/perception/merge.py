@@ -19,6 +19,7 @@ GAP_M: Final = 1.5
 RADII: Final = 0.35  # by how much of the larger one radii may differ
 DIRECTION_RAD: Final = 0.25  # standard deviation of an axis that says nothing of where a log lies
 THINNEST_M, THICKEST_M = 0.02, 0.45  # radius of anything that is lifted
+LONGEST_M: Final = 8.0  # of logs that a crane loads
 
 
 def refused(fit: Fit) -> str:
@@ -28,6 +29,8 @@ def refused(fit: Fit) -> str:
         return f"{2 * body.radius_m:.2f} m wide and {body.length_m:.2f} m long, which is no log"
     if not THINNEST_M <= body.radius_m <= THICKEST_M:
         return f"{2 * body.radius_m:.2f} m wide, which no log here is"
+    if body.length_m > LONGEST_M:
+        return f"{body.length_m:.1f} m long, which no log here is"
     if fit.explained < 0.5:
         return f"only {100 * fit.explained:.0f} % of its outline is a cylinder's"
     if math.sqrt(max(np.diag(fit.covariance)[2:4].max(), 0.0)) > DIRECTION_RAD:

@@ -8,11 +8,12 @@ from functools import partial
 from typing import Final, Protocol
 
 import numpy as np
+from scipy.ndimage import label
 
 from autonomy.perception.cylinder import Cylinder, guess
 from autonomy.perception.frame import Frame, FrameRefused, Pose, check, inside_bars
 from autonomy.perception.log_filter import NOMINAL, Errors, Track
-from autonomy.perception.merge import groups, joined, refused
+from autonomy.perception.merge import LONGEST_M, groups, joined, refused
 from autonomy.perception.moved import has_moved
 from autonomy.perception.refine import Fit, Outline, Sensor, own_outline, refine
 from autonomy.perception.tracks import Tracks
@@ -76,6 +77,10 @@ def measure(frame: Frame, masks: Sequence[np.ndarray], sensor: Sensor) -> tuple[
     """Fits of all masks, pieces of one log joined, and what was refused."""
     scene = _Scene.of(frame, masks, sensor)
     firsts = {i: scene.first(i) for i in range(len(masks))}
+    stray = [i for i, body in firsts.items() if body is not None and body.length_m > LONGEST_M]
+    if stray:  # a log, and something else in line with it
+        scene = _Scene.of(frame, [_main_part(m) if i in stray else m for i, m in enumerate(masks)], sensor)
+        firsts |= {i: scene.first(i) for i in stray}
     known = {i: body for i, body in firsts.items() if body is not None}
     borders = {i: scene.border([i], body, known) for i, body in known.items()}
     fits: list[Fit | None] = [None] * len(masks)
@@ -97,6 +102,12 @@ def measure(frame: Frame, masks: Sequence[np.ndarray], sensor: Sensor) -> tuple[
         else:
             found.append(fit)
     return found, refusals
+
+
+def _main_part(mask: np.ndarray) -> np.ndarray:
+    """The largest connected part of a mask (H, W)."""
+    parts, count = label(mask)
+    return mask if count < 2 else np.asarray(parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:])))
 
 
 @dataclass(frozen=True, slots=True)

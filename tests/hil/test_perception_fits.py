@@ -136,6 +136,19 @@ def test_two_logs_in_line_stay_two() -> None:
     assert sorted(round(f.body.length_m, 1) for f in fits) == [2.0, 2.0]
 
 
+def test_what_a_mask_has_in_line_with_a_log_is_left_out_where_the_whole_is_too_long_for_one() -> None:
+    log = lying(1, 4.6, 0.0, 0.0)
+    picture, view = seen(scene_of(log), view_from()), view_from()
+    frame = frame_of(picture, view, exact=True)
+    v, u = np.nonzero(picture.mask == 1)
+    stray = np.zeros(picture.mask.shape, bool)
+    stray[v.min() - 260 : v.min() - 180, int(u.mean()) - 15 : int(u.mean()) + 15] = True  # the far end of a boom, say
+    depth_m = np.where(stray, np.float32(14.0), frame.depth_m)
+    (fit,) = Perception(PROFILE).fits(replace(frame, depth_m=depth_m), [TrueMask((picture.mask == 1) | stray)])
+    assert fit.body.length_m == pytest.approx(2.0, abs=0.2)
+    assert np.linalg.norm(view.to_world(fit.body.center_m[None])[0] - log.position_m) < 0.1
+
+
 def test_a_log_half_outside_the_picture_has_one_end() -> None:
     log = lying(1, 3.2, 4.0, 90.0, length=3.0)
     (fit,), view, _ = fits_of(log)
