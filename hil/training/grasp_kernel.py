@@ -13,9 +13,9 @@ import numpy as np
 from numba import njit
 
 from autonomy.grasp import quality
+from autonomy.grasp.candidates import MIDDLE_M
 from autonomy.grasp.direct import CLEARANCE_M, TONG_HALF_PLATE_M, UNDER
 from autonomy.grasp.jaws import Jaws
-from autonomy.grasp.search import MIDDLE_M
 
 GAP, BLADE, PLATE, HOLDS, GRIP, SCOOPS, ROOM = range(7)
 _TIP, _SLACK, _ACROSS, _LEVER = quality.TIP_M, quality.STRICT.slack_m, quality.ACROSS, quality.LEVER_M

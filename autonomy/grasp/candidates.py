@@ -1,0 +1,123 @@
+"""Where tongs may come down among logs: stations along the topmost in reach, shifted sideways and turned; and which of
+those that a rule calls safe are worth a closer look.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from math import pi
+from typing import Final
+
+import numpy as np
+
+from autonomy.grasp.cylinders import LEAST_RADIUS_M, Cylinders
+from autonomy.grasp.direct import clearance, closing_height, travel_height
+from autonomy.grasp.proposal import NoGrasp
+from autonomy.grasp.quality import Scores, Sections
+from autonomy.logs import LogObservation
+from autonomy.motion.arm import Arm
+from machine.kinematics import Unreachable
+
+ALONG: Final = np.linspace(-0.21, 0.21, 7)
+"""Stations, in lengths of the log from its middle; nearer to its ends an operator would not grip it."""
+SIDEWAYS_M: Final = np.linspace(-0.48, 0.48, 9)
+TURNED_RAD: Final = np.radians([-14.0, -7.0, 0.0, 7.0, 14.0])
+ABOUT: Final = 8
+"""So many logs, the topmost in reach, have candidates about them."""
+MIDDLE_M: Final = 0.15
+"""Off the middle by this much a grasp is worth a third of one in it."""
+SQUARE: Final = 0.04
+"""Mean squared sine of the logs' angles at which it is worth a third: 11 deg."""
+FINALISTS: Final = 40
+SEED: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Arrays of one length: place [m], opening axis [rad], height that logs are taken above [m]."""
+
+    x: np.ndarray
+    y: np.ndarray
+    yaw: np.ndarray
+    level: np.ndarray
+
+
+def in_reach(arm: Arm, logs: Sequence[LogObservation], stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The topmost logs (k,) that may be taken and that the crane reaches somewhere, and at which of the stations
+    ``ALONG`` (k, stations).
+
+    Raises ``NoGrasp`` when it reaches none.
+    """
+    high = travel_height(arm.profile)
+    over_support = closing_height(arm.profile, 0.0, 2.0 * LEAST_RADIUS_M)(0.0) - clearance(2.0 * LEAST_RADIUS_M)
+    top, reached, trouble = list[int](), list[list[bool]](), ""
+
+    def served(log: LogObservation, along: float) -> bool:
+        nonlocal trouble
+        x, y, z = (c + along * log.length_m * a for c, a in zip(log.center_m, log.axis, strict=True))
+        try:
+            arm.over(x, y, z - log.diameter_m / 2 + clearance(log.diameter_m) + over_support, high)
+        except Unreachable as error:
+            trouble = trouble or f"log {log.id}: {error}"
+            return False
+        return True
+
+    for i in sorted(np.flatnonzero(~stays).tolist(), key=lambda i: -logs[i].center_m[2]):
+        whole = all(served(logs[i], along) for along in (0.0, ALONG[0], ALONG[-1]))
+        stations = [whole or served(logs[i], along) for along in ALONG]
+        if any(stations):
+            top.append(i)
+            reached.append(stations)
+        if len(top) == ABOUT:
+            break
+    if not top:
+        raise NoGrasp(f"no log is in reach; {trouble or 'all that are in view are to stay'}")
+    return np.array(top), np.array(reached)
+
+
+def candidates(world: Cylinders, top: np.ndarray, reached: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All that are looked at, about the logs ``top`` (k,) where these are ``reached`` (k, stations): x, y [m] and
+    opening axis [rad].
+    """
+    center, axis, length = world.center[top], world.axis[top], world.length[top]
+    flat = np.arctan2(axis[:, 1], axis[:, 0])[:, None, None, None]
+    along = ALONG[:, None, None] * length[:, None, None, None]
+    side, turned = SIDEWAYS_M[:, None], TURNED_RAD
+    cx, cy, ax, ay = (v[:, k, None, None, None] for v in (center, axis) for k in (0, 1))
+    x = cx + along * ax - side * np.sin(flat)
+    y = cy + along * ay + side * np.cos(flat)
+    keep = np.broadcast_to(reached[:, :, None, None], np.broadcast_shapes(x.shape, turned.shape))
+    return tuple(a[keep] for a in np.broadcast_arrays(x, y, flat + turned + pi / 2))
+
+
+def finalists(
+    at: tuple[np.ndarray, np.ndarray, np.ndarray], levels: np.ndarray, seen: Sections, found: Scores
+) -> tuple[Candidates, Scores]:
+    """The best of every set of logs that can be taken, best first."""
+    where = np.nonzero(found.safe)
+    safe = Scores(*(getattr(found, f.name)[where] for f in fields(Scores)))
+    near = Sections(*(getattr(seen, f.name)[where[0]] for f in fields(Sections)))
+    order = _varied(safe.lever * (1.0 + 0.3 * safe.count) * middling(near, safe.captured), safe.captured)
+    x, y, yaw = (c[where[0]][order] for c in at)
+    chosen = Scores(*(getattr(safe, f.name)[order] for f in fields(Scores)))
+    return Candidates(x, y, yaw, levels[where][order]), chosen
+
+
+def middling(at: Sections, captured: np.ndarray) -> np.ndarray:
+    """How well the captured logs stand in the middle between the tongs and square to them, 0..1."""
+    low = np.min(np.where(captured, at.low_u, np.inf), axis=-1)
+    high = np.max(np.where(captured, at.high_u, -np.inf), axis=-1)
+    askew = np.sum(np.where(captured, at.askew, 0.0), axis=-1) / np.sum(captured, axis=-1)
+    return np.exp(-(((low + high) / 2 / MIDDLE_M) ** 2) - askew / SQUARE)
+
+
+def _varied(rough: np.ndarray, captured: np.ndarray) -> np.ndarray:
+    """Indices of the finalists: the best of every set of captured logs first, so that no set crowds the others out."""
+    code = captured @ np.random.default_rng(SEED).random(captured.shape[1])
+    order = np.argsort(-rough, kind="stable")
+    sets, first = np.unique(code[order], return_index=True)
+    each = max(2, FINALISTS // len(sets))
+    keep = [order[code[order] == s][:each] for s in sets[np.argsort(first)][: FINALISTS // 2]]
+    chosen: np.ndarray = np.concatenate(keep)
+    return chosen[np.argsort(-rough[chosen], kind="stable")]
