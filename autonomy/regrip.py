@@ -33,7 +33,9 @@ class Regrip:
         if not measured(grasp):
             return Phase.LIFT, grasp
         wide = self.climbs < CLIMBS and tongs.are_wide(grasp, self.climbs)
-        if not wide and not (self.begun < ANEW and tongs.have_missed(grasp)):
+        # Higher up there may be a thin log that nobody saw, which shut tongs hold.
+        missed = self.climbs == 0 and self.begun < ANEW and tongs.have_missed(grasp)
+        if not wide and not missed:
             return Phase.LIFT, grasp
         if not tongs.still:
             return None, grasp
@@ -43,7 +45,7 @@ class Regrip:
             return Phase.DESCEND, replace(grasp, pose=pose, support_z_m=grasp.support_z_m + CLIMB_M)
         if grasp.drawn and not grasp.drags and not tongs.empty:
             return Phase.CLOSE, replace(grasp, drags=True)
-        self.begun, self.climbs = self.begun + 1, 0
+        self.begun += 1
         return Phase.ABOVE, replace(grasp, drags=False)
 
 

@@ -1,0 +1,78 @@
+"""What is tried when closed tongs tell that they hold too much, the wrong part or nothing."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from autonomy.grasp.direct import Grasp
+from autonomy.logs import TRIANGLE, LogObservation
+from autonomy.motion.arm import Pose
+from autonomy.phases import Phase
+from autonomy.regrip import ANEW, CLIMB_M, CLIMBS, Regrip
+
+MEASURED = tuple(1e-6 if i in (0, 7, 13) else 0.0 for i in range(TRIANGLE))
+
+
+class Told(SimpleNamespace):
+    """Tongs of which everything is told."""
+
+    still, empty, wide, missed = True, False, False, False
+
+    def are_wide(self, grasp: Grasp, climbs: int) -> bool:
+        return self.wide
+
+    def have_missed(self, grasp: Grasp) -> bool:
+        return self.missed
+
+
+def grasp(drawn: bool = False, measured: bool = True) -> Grasp:
+    log = LogObservation(1, (0.0, 4.0, -1.2), (1.0, 0.0, 0.0), 2.6, 0.28, MEASURED if measured else None)
+    return Grasp(log, Pose(0.0, 4.0, -0.4, 0.3, 0.1), -1.3, 0.0, drawn=drawn)
+
+
+def test_what_is_held_is_lifted() -> None:
+    first = grasp()
+    assert Regrip().after_closing(first, Told()) == (Phase.LIFT, first)
+
+
+@pytest.mark.parametrize("trouble", ["wide", "missed"])
+def test_they_are_waited_for_while_they_move(trouble: str) -> None:
+    assert Regrip().after_closing(grasp(), Told(still=False, **{trouble: True}))[0] is None
+
+
+def test_too_wide_is_closed_higher_up_some_times() -> None:
+    regrip, now = Regrip(), grasp()
+    for i in range(CLIMBS):
+        phase, now = regrip.after_closing(now, Told(wide=True))
+        assert phase is Phase.DESCEND
+        assert now.pose.z_m == pytest.approx(grasp().pose.z_m + (i + 1) * CLIMB_M)
+    assert regrip.after_closing(now, Told(wide=True))[0] is Phase.LIFT
+
+
+def test_a_miss_is_begun_anew_from_above_some_times() -> None:
+    regrip = Regrip()
+    phases = [regrip.after_closing(grasp(), Told(missed=True, empty=True))[0] for _ in range(ANEW + 1)]
+    assert phases == [Phase.ABOVE] * ANEW + [Phase.LIFT]
+
+
+def test_what_is_pinched_in_a_row_is_dragged_once_before_it_is_begun_anew() -> None:
+    regrip = Regrip()
+    phase, now = regrip.after_closing(grasp(drawn=True), Told(missed=True))
+    assert phase is Phase.CLOSE and now.drags
+    phase, now = regrip.after_closing(now, Told(missed=True))
+    assert phase is Phase.ABOVE and not now.drags
+    assert regrip.after_closing(grasp(drawn=True), Told(missed=True, empty=True))[0] is Phase.ABOVE, "nothing to drag"
+
+
+def test_shut_tongs_higher_up_may_hold_a_thin_log_that_nobody_saw() -> None:
+    regrip = Regrip()
+    _, now = regrip.after_closing(grasp(), Told(wide=True))
+    assert regrip.after_closing(now, Told(missed=True, empty=True))[0] is Phase.LIFT
+
+
+def test_what_is_told_exactly_is_lifted_as_it_is() -> None:
+    told = grasp(measured=False)
+    for tongs in (Told(wide=True), Told(missed=True, empty=True)):
+        assert Regrip().after_closing(told, tongs) == (Phase.LIFT, told)
