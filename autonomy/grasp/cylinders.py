@@ -16,6 +16,8 @@ from autonomy.logs import LogObservation
 from autonomy.perception.estimate import ACROSS_1, ACROSS_2, END, RADIUS, SIZE, START, TILT_1, TILT_2, unpacked
 
 LEAST_RADIUS_M: Final = 0.02
+POINTS: Final = 15
+"""Of an axis, where its distance to others is asked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +39,12 @@ class Cylinders:
         half = (self.axis * self.length[..., None] / 2)[..., None, :]
         return self.center[..., None, :] + np.concatenate([-half, half], axis=-2)
 
+    def points(self) -> np.ndarray:
+        """Points of every axis from end to end (..., n, POINTS, 3)."""
+        part = self.length[..., None] * np.linspace(-0.5, 0.5, POINTS)
+        points: np.ndarray = self.center[..., None, :] + part[..., None] * self.axis[..., None, :]
+        return points
+
     def shortened(self, by_m: float, share: float) -> Cylinders:
         """Every log shorter by ``by_m`` and then by a ``share`` of what is left, never shorter than it is wide."""
         length = np.maximum((self.length - by_m) * (1.0 - share), 2.0 * self.radius)
@@ -57,6 +65,15 @@ def lowest_m(world: Cylinders) -> float:
     """Height of the lowest point of any log."""
     thick = world.radius * np.sqrt(np.maximum(1.0 - world.axis[..., 2] ** 2, 0.0))
     return float(np.min(np.min(world.ends()[..., 2], axis=-1) - thick))
+
+
+def between_axes(world: Cylinders) -> np.ndarray:
+    """(n, n, POINTS, 3): from the nearest point of the axis of log i (first) to points of that of log j, no draws."""
+    away = world.points()[None] - world.center[:, None, None]
+    half = world.length[:, None, None] / 2
+    along = np.clip(np.einsum("ijkc,ic->ijk", away, world.axis), -half, half)
+    off: np.ndarray = away - along[..., None] * world.axis[:, None, None]
+    return off
 
 
 def covariance_of(log: LogObservation) -> np.ndarray:

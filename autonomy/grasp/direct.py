@@ -181,6 +181,17 @@ def _sweep(tongs: TongTable, close_time_s: float, diameter_m: float) -> tuple[np
     return times[inside], smooth[inside]
 
 
+def pose_over(
+    arm: Arm, x_m: float, y_m: float, yaw_rad: float, support_z_m: float, thinnest_m: float, rot_rad: float
+) -> Pose:
+    """The pose in which tongs that open along ``yaw_rad`` begin to close over a support round logs of which the
+    thinnest is ``thinnest_m``, the rotator turned from ``rot_rad``; raises ``Unreachable``.
+    """
+    low = closing_height(arm.profile, support_z_m, thinnest_m)(0.0)
+    pose = arm.over(x_m, y_m, low, travel_height(arm.profile))
+    return pose._replace(rot_rad=rotator_for_yaw(arm.profile, pose.slew_rad, yaw_rad, rot_rad))
+
+
 def choose(arm: Arm, mission: Mission, logs: Sequence[LogObservation], slew: float, rot: float) -> Grasp:
     """The grasp of the mission's log, or of the topmost log outside the bunk and of these the nearest by
     slewing.
@@ -230,14 +241,12 @@ def plan_grasp(arm: Arm, log: LogObservation, rot: float) -> Grasp:
     for along in _ALONG_M:
         x, y, z = (c + along * a for c, a in zip(log.center_m, log.axis, strict=True))
         support = max(known_ground_m(profile), z - log.diameter_m / 2)
-        low = closing_height(profile, support, log.diameter_m)(0.0)
         try:
-            pose = arm.over(x, y, low, travel_height(profile))
-            turn = rotator_for_yaw(profile, pose.slew_rad, yaw + pi / 2, rot)
+            pose = pose_over(arm, x, y, yaw + pi / 2, support, log.diameter_m, rot)
         except Unreachable as error:
             trouble = trouble or f"log {log.id} cannot be picked: {error}"
             continue
-        return Grasp(log, pose._replace(rot_rad=turn), support, along)
+        return Grasp(log, pose, support, along)
     raise NoGrasp(trouble)
 
 
@@ -259,20 +268,15 @@ class Planned:
         p = self._planner(arm, there, slew, rot, stay)
         first, *others = sorted((there[i] for i in p.logs), key=lambda log: -log.length_m)
         thinnest = min(log.diameter_m for log in (first, *others))
-        low = closing_height(arm.profile, p.support_z_m, thinnest)(0.0)
         try:
-            pose = arm.over(p.x_m, p.y_m, low, travel_height(arm.profile))
-            turn = rotator_for_yaw(arm.profile, pose.slew_rad, p.yaw_rad, rot)
+            pose = pose_over(arm, p.x_m, p.y_m, p.yaw_rad, p.support_z_m, thinnest, rot)
         except Unreachable as error:
             raise NoGrasp(f"the planner's grasp is out of reach: {error}") from None
         along = _along((p.x_m, p.y_m), first)
         near = [log for log in there if log is not first and _beside((p.x_m, p.y_m), log) < ALONE_M]
         # What lies alone cannot settle, and comes up as `choose` would lift it.
         top = _top(there) if near or others else None
-        found = pose._replace(rot_rad=turn)
-        return Grasp(
-            first, found, p.support_z_m, along, tuple(others), top, p.reason, p.probability, p.pressed, p.drawn
-        )
+        return Grasp(first, pose, p.support_z_m, along, tuple(others), top, p.reason, p.probability, p.pressed, p.drawn)
 
 
 def _top(logs: Sequence[LogObservation]) -> float:

@@ -19,13 +19,12 @@ from typing import Final
 import numpy as np
 
 from autonomy.grasp.cylinders import Cylinders, cylinders
-from autonomy.grasp.direct import closing_height, travel_height
+from autonomy.grasp.direct import pose_over
 from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.proposal import GraspProposal, NoGrasp, Planner
 from autonomy.grasp.quality import STRICT, Sections, lies_upon, sections
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
-from machine.grapple import rotator_for_yaw
 from machine.kinematics import Unreachable
 
 ACROSS_M: Final = np.linspace(-0.72, 0.72, 37)
@@ -143,9 +142,7 @@ class Press:
 
     def _reach(self, arm: Arm, at: _Places, i: int, world: Cylinders, rot_rad: float) -> None:
         thin = 2.0 * float(np.min(world.radius[at.between[i]]))
-        low = closing_height(arm.profile, float(at.level[i]), thin)(0.0)
-        pose = arm.over(float(at.x[i]), float(at.y[i]), low, travel_height(arm.profile))
-        rotator_for_yaw(arm.profile, pose.slew_rad, float(at.yaw[i]), rot_rad)
+        pose_over(arm, float(at.x[i]), float(at.y[i]), float(at.yaw[i]), float(at.level[i]), thin, rot_rad)
 
 
 def _worth(jaws: Jaws, world: Cylinders, at: Sections, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.cylinders import Cylinders
+from autonomy.grasp.cylinders import Cylinders, between_axes
 from autonomy.grasp.direct import CLEARANCE_M, TONG_HALF_PLATE_M, UNDER
 from autonomy.grasp.jaws import Jaws
 
@@ -41,7 +41,6 @@ RISES: Final = 0.3
 """A log so much higher than another, over the sum of their radii, lies on it, ..."""
 LIFTED_M: Final = 0.05
 """... and its underside so much higher: a thick log beside a thin one on the ground does not."""
-POINTS: Final = 15
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +84,7 @@ class Scores:
 
 def lies_upon(world: Cylinders) -> np.ndarray:
     """(n, n) bool: log j (last) lies on log i, by where any of some points of its axis are over the other's."""
-    part = world.length[:, None] * np.linspace(-0.5, 0.5, POINTS)
-    points = world.center[:, None] + part[..., None] * world.axis[:, None]
-    away = points[None] - world.center[:, None, None]
-    half = world.length[:, None, None] / 2
-    along = np.clip(np.einsum("ijkc,ic->ijk", away, world.axis), -half, half)
-    off = away - along[..., None] * world.axis[:, None, None]
+    off = between_axes(world)
     radii = (world.radius[:, None] + world.radius[None, :])[..., None]
     thicker = (world.radius[None, :] - world.radius[:, None])[..., None]
     near = np.linalg.norm(off, axis=-1) < radii + TOUCH_M

@@ -14,12 +14,11 @@ from typing import Final
 import numpy as np
 
 from autonomy.grasp.cylinders import Cylinders
-from autonomy.grasp.direct import closing_height, travel_height
+from autonomy.grasp.direct import pose_over
 from autonomy.grasp.jaws import Jaws
 from autonomy.grasp.proposal import GraspProposal
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
-from machine.grapple import rotator_for_yaw
 from machine.kinematics import Unreachable
 
 SUCCESS: Final = 0.65
@@ -55,10 +54,8 @@ def drawn_out(
             if np.any(near & (beyond > BESIDE_M)) or not np.any(near & (beyond < -BESIDE_M)):
                 continue
             x, y = world.center[i, :2] + out * (jaws.half_gap_m - world.radius[i] - VALLEY_M)
-            low_m = closing_height(arm.profile, lowest_m, logs[i].diameter_m)(0.0)
             try:
-                pose = arm.over(float(x), float(y), low_m, travel_height(arm.profile))
-                rotator_for_yaw(arm.profile, pose.slew_rad, yaw, rot_rad)
+                pose_over(arm, float(x), float(y), yaw, lowest_m, logs[i].diameter_m, rot_rad)
             except Unreachable:
                 continue
             reason = f"log {logs[i].id} is drawn out of a row of {len(logs)} logs that is too wide for the tongs"

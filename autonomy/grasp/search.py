@@ -18,13 +18,8 @@ from typing import Final
 import numpy as np
 
 from autonomy.grasp.candidates import ALONG, Candidates, candidates, finalists, in_reach
-from autonomy.grasp.cylinders import (
-    Cylinders,
-    covariance_of,
-    cylinders,
-    draws_of,
-)
-from autonomy.grasp.direct import closing_height, known_ground_m, travel_height
+from autonomy.grasp.cylinders import Cylinders, covariance_of, cylinders, draws_of
+from autonomy.grasp.direct import known_ground_m, pose_over
 from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.quality import (
@@ -45,7 +40,6 @@ from autonomy.grasp.settled import settled
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
 from autonomy.perception.estimate import RADIUS
-from machine.grapple import rotator_for_yaw
 from machine.kinematics import Unreachable
 
 DRAWS: Final = 32
@@ -100,13 +94,13 @@ class Search:
         if not logs:
             raise NoGrasp("no log is in view")
         lying = _lying(arm, logs)
-        if len(lying) < len(logs):
-            if not lying:
-                raise NoGrasp(f"none of the {_counted(logs)} in view lies on anything")
-            staying = {lying.index(i) for i in stay if i in lying}
-            found = self(arm, [logs[i] for i in lying], slew_rad, rot_rad, staying)
-            return replace(found, logs=tuple(lying[i] for i in found.logs))
-        stays = np.isin(np.arange(len(logs)), list(stay))
+        if not lying:
+            raise NoGrasp(f"none of the {_counted(logs)} in view lies on anything")
+        found = self._best(arm, [logs[i] for i in lying], np.isin(lying, list(stay)), rot_rad)
+        return replace(found, logs=tuple(lying[i] for i in found.logs))
+
+    def _best(self, arm: Arm, logs: Sequence[LogObservation], stays: np.ndarray, rot_rad: float) -> GraspProposal:
+        """The best grasp of logs that lie on something and none of which floats; ``stays`` (n,) are not to be taken."""
         wanted = _counted(np.flatnonzero(~stays).tolist())
         ground = known_ground_m(arm.profile)
         jaws, world = jaws_of(arm.profile), cylinders(logs)
@@ -203,9 +197,8 @@ class Search:
         self, arm: Arm, best: Candidates, i: int, logs: Sequence[LogObservation], captured: np.ndarray, rot: float
     ) -> None:
         thinnest = min(log.diameter_m for log, c in zip(logs, captured, strict=True) if c)
-        low = closing_height(arm.profile, float(best.level[i]), thinnest)(0.0)
-        pose = arm.over(float(best.x[i]), float(best.y[i]), low, travel_height(arm.profile))
-        rotator_for_yaw(arm.profile, pose.slew_rad, float(best.yaw[i]), rot)
+        x, y, yaw, level = (float(v[i]) for v in (best.x, best.y, best.yaw, best.level))
+        pose_over(arm, x, y, yaw, level, thinnest, rot)
 
     def _proposal(
         self, best: Candidates, i: int, captured: np.ndarray, probability: float, logs: Sequence[LogObservation]

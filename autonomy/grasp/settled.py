@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.cylinders import Cylinders, across, changed
+from autonomy.grasp.cylinders import Cylinders, across, between_axes, changed
 from autonomy.perception.estimate import ACROSS_1, ACROSS_2, RADIUS, SIZE, TILT_1, TILT_2
 
 LEVEL_M: Final = 0.015
@@ -28,7 +28,6 @@ INTO_M: Final = 0.04
 OWN_SHARE: Final = 0.4
 """Of the standard deviation of the height of a log on others, the part that is its own and not the camera's."""
 ROUNDS: Final = 3
-POINTS: Final = 15
 
 
 def settled(world: Cylinders, covariances: np.ndarray, ground_z_m: float) -> tuple[Cylinders, np.ndarray]:
@@ -69,12 +68,7 @@ def settled(world: Cylinders, covariances: np.ndarray, ground_z_m: float) -> tup
 def apart(world: Cylinders) -> np.ndarray:
     """(n, n) [m]: the least distance between the surfaces of every two logs by points of the one's axis, negative where
     they reach into each other; infinite between a log and itself."""
-    part = world.length[:, None] * np.linspace(-0.5, 0.5, POINTS)
-    points = world.center[:, None] + part[..., None] * world.axis[:, None]
-    away = points[None] - world.center[:, None, None]
-    half = world.length[:, None, None] / 2
-    along = np.clip(np.einsum("ijkc,ic->ijk", away, world.axis), -half, half)
-    off = np.linalg.norm(away - along[..., None] * world.axis[:, None, None], axis=-1).min(axis=-1)
+    off = np.linalg.norm(between_axes(world), axis=-1).min(axis=-1)
     gap: np.ndarray = np.minimum(off, off.T) - world.radius[:, None] - world.radius[None, :]
     np.fill_diagonal(gap, np.inf)
     return gap
@@ -112,10 +106,7 @@ def _moved(
 def _parted(world: Cylinders, sigma: np.ndarray, i: int, j: int) -> Cylinders:
     """The logs with two of them moved apart until they touch, each by as much as it is unsure."""
     level, up = across(world.axis)
-    half = 0.5 * world.length
-    points = world.center[j] + np.linspace(-half[j], half[j], POINTS)[:, None] * world.axis[j]
-    along = np.clip((points - world.center[i]) @ world.axis[i], -half[i], half[i])
-    away = points - world.center[i] - along[:, None] * world.axis[i]
+    points, away = world.points()[j], between_axes(world)[i, j]
     distance = np.linalg.norm(away, axis=1)
     k = int(np.argmin(distance))
     reach = float(distance[k] - world.radius[i] - world.radius[j]) + CROOKED_M
@@ -123,7 +114,8 @@ def _parted(world: Cylinders, sigma: np.ndarray, i: int, j: int) -> Cylinders:
         return world
     way = away[k] / max(float(distance[k]), 1e-6)
     error, slopes = np.zeros((world.count, SIZE)), []
-    for log, sense, at in ((i, -1.0, along[k]), (j, 1.0, (points[k] - world.center[j]) @ world.axis[j])):
+    for log, sense, point in ((i, -1.0, points[k] - away[k]), (j, 1.0, points[k])):
+        at = (point - world.center[log]) @ world.axis[log]
         slope = np.zeros(SIZE)
         slope[[ACROSS_1, ACROSS_2]] = sense * (way @ level[log]), sense * (way @ up[log])
         slope[[TILT_1, TILT_2]] = at * slope[[ACROSS_1, ACROSS_2]]

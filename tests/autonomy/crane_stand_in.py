@@ -13,6 +13,7 @@ import numpy as np
 
 from autonomy.activity import Activity
 from autonomy.logs import LogObservation
+from autonomy.phases import Phase
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, StateReport, decode
 from machine.grapple import grapple_yaw, half_gap_m, opening_pct_from_tong_angle, tip_below_pin_m
 from machine.joints import JOINTS
@@ -87,6 +88,16 @@ class StandIn:
         while not activity.idle and self.now_ns - start_ns < limit_s * 1e9:
             self.step(activity)
         return (self.now_ns - start_ns) * 1e-9
+
+    def until(self, activity: Activity, phase: Phase, limit_s: float = 200.0) -> list[Phase]:
+        """Runs the activity until it is in a phase, which it has to reach; the phases up to there."""
+        phases, start_ns = [activity.phase], self.now_ns
+        while activity.phase is not phase and not activity.idle and self.now_ns - start_ns < limit_s * 1e9:
+            self.step(activity)
+            if activity.phase is not phases[-1]:
+                phases.append(activity.phase)
+        assert activity.phase is phase, activity.failure
+        return phases
 
     def step(self, activity: Activity) -> bytes | None:
         """One tick: the activity's datagram is judged, obeyed and its effect recorded."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import cos, sin, sqrt
 
-from autonomy.logs import LogObservation
+from autonomy.logs import TRIANGLE, LogObservation
 from autonomy.motion.arm import Arm
 from machine.load import load_profile
 
@@ -12,6 +13,8 @@ PROFILE = load_profile("palms_471")
 ARM = Arm(PROFILE)
 GROUND = PROFILE.workspace.ground_z_m
 X, Y = PROFILE.workspace.pick_center_m
+MEASURED = tuple(1e-6 if i in (0, 7, 13) else 0.0 for i in range(TRIANGLE))
+"""Of a log that a camera sees well: 1 mm across and at one end."""
 
 
 def log(
@@ -20,6 +23,11 @@ def log(
     """A log of 2.6 m whose underside is ``z_m`` over the ground, axis along +x turned by ``yaw``."""
     center = (X + along_m, Y + across_m, GROUND + z_m + diameter / 2)
     return LogObservation(number, center, (cos(yaw), sin(yaw), 0.0), 2.6, diameter)
+
+
+def measured(log: LogObservation) -> LogObservation:
+    """A log as a camera sees it that sees it well."""
+    return replace(log, covariance=MEASURED)
 
 
 def pair() -> list[LogObservation]:

@@ -52,11 +52,7 @@ def phases(crane: StandIn) -> list[str]:
 
 
 def run_until(crane: StandIn, planner: Activity, phase: Phase, more_s: float = 0.0) -> None:
-    for _ in range(2000):
-        if planner.phase is phase:
-            break
-        crane.step(planner)
-    assert planner.phase is phase, planner.failure
+    crane.until(planner, phase)
     for _ in range(int(more_s * 1e9 / TICK_NS)):
         crane.step(planner)
 

@@ -8,14 +8,14 @@ from math import hypot, pi
 
 import pytest
 from crane_stand_in import StandIn
-from grasp_scenes import GROUND, PROFILE, log, pair
+from grasp_scenes import GROUND, PROFILE, log, measured, pair
 
 from autonomy.activity import Activity
 from autonomy.course import DRAG_M
 from autonomy.grasp.direct import Planned
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.search import Search
-from autonomy.logs import TRIANGLE, LogObservation
+from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
 from autonomy.phases import Phase
 from autonomy.regrip import ANEW
@@ -42,8 +42,7 @@ class Slipping(StandIn):
         return sum(now == "CLOSE" != was for was, now in zip(["", *phases], phases, strict=False))
 
     def seen(self) -> tuple[LogObservation, ...]:
-        variances = tuple(1e-6 if i in (0, 7, 13) else 0.0 for i in range(TRIANGLE))
-        return tuple(replace(log, covariance=variances) if self.measures else log for log in self.logs)
+        return tuple(measured(log) if self.measures else log for log in self.logs)
 
 
 def thick_pair() -> list[LogObservation]:
@@ -51,15 +50,7 @@ def thick_pair() -> list[LogObservation]:
 
 
 def phases_until_lifted(crane: Slipping) -> list[Phase]:
-    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(Search()))
-    phases = [planner.phase]
-    for _ in range(3000):
-        if planner.phase is Phase.LIFT or planner.idle:
-            break
-        crane.step(planner)
-        if planner.phase is not phases[-1]:
-            phases.append(planner.phase)
-    assert planner.phase is Phase.LIFT, planner.failure
+    phases = crane.until(Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(Search())), Phase.LIFT)
     return phases[phases.index(Phase.CLOSE) :]
 
 
@@ -113,11 +104,7 @@ def drawing(arm: Arm, logs: Sequence[LogObservation], *_: object) -> GraspPropos
 def test_a_log_that_is_pinched_in_its_row_is_dragged_out_and_gripped_there() -> None:
     crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
     planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(drawing))
-    for _ in range(3000):
-        if planner.phase is Phase.LIFT or planner.idle:
-            break
-        crane.step(planner)
-    assert planner.phase is Phase.LIFT, planner.failure
+    crane.until(planner, Phase.LIFT)
     pins = [m.pin for m in crane.trace if m.phase == "CLOSE"]
     assert pins[-1][1] - pins[0][1] == pytest.approx(DRAG_M, abs=0.03), "away from the others"
     assert abs(pins[-1][2] - pins[0][2]) < 0.15 and abs(pins[-1][0] - pins[0][0]) < 0.05
@@ -130,14 +117,7 @@ def test_what_is_pinched_still_after_the_drag_is_looked_at_anew() -> None:
     crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
     crane.free_m = 9.0
     planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(drawing))
-    phases = [planner.phase]
-    for _ in range(4000):
-        if planner.phase is Phase.LIFT or planner.idle:
-            break
-        crane.step(planner)
-        if planner.phase is not phases[-1]:
-            phases.append(planner.phase)
-    assert planner.phase is Phase.LIFT, planner.failure
+    phases = crane.until(planner, Phase.LIFT)
     assert phases.count(Phase.ABOVE) == 1 + ANEW
 
 
@@ -153,9 +133,8 @@ def test_where_no_better_grasp_is_seen_after_a_drag_the_old_one_is_closed_on_bef
     crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
     crane.free_m = 9.0
     planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(once))
-    while planner.phase is not Phase.LIFT and not planner.idle and len(crane.trace) < 4000:
-        crane.step(planner)
-    assert len(asked) > 3 and planner.phase is Phase.LIFT
+    crane.until(planner, Phase.LIFT)
+    assert len(asked) > 3
     phases = [m.phase for m in crane.trace]
     again = len(phases) - next(i for i, p in enumerate(reversed(phases)) if p == "DESCEND")
     closing = crane.trace[again : again + 15]

@@ -131,11 +131,8 @@ def test_tongs_that_rest_on_wood_close_there_where_they_were_pressed(pressed: bo
 
     crane = Resisting(PALMS, logs)
     activity = Activity(PALMS, profile_hash(PALMS), chooser=chooser)
-    for _ in range(600):
-        if activity.phase is Phase.DESCEND or activity.idle:
-            break
-        crane.step(activity)
-    assert activity.phase is Phase.DESCEND and activity.grasp is not None
+    crane.until(activity, Phase.DESCEND)
+    assert activity.grasp is not None
     begun_ns = crane.now_ns
     crane.floor_z_m = activity.grasp.pose.z_m + short_m
     for _ in range(400):

@@ -5,14 +5,13 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
+from grasp_scenes import MEASURED
 
 from autonomy.grasp.direct import Grasp
-from autonomy.logs import TRIANGLE, LogObservation
+from autonomy.logs import LogObservation
 from autonomy.motion.arm import Pose
 from autonomy.phases import Phase
 from autonomy.regrip import ANEW, CLIMB_M, CLIMBS, Regrip
-
-MEASURED = tuple(1e-6 if i in (0, 7, 13) else 0.0 for i in range(TRIANGLE))
 
 
 class Told(SimpleNamespace):

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 from crane_stand_in import StandIn
-from grasp_scenes import GROUND, PROFILE, small_pile
+from grasp_scenes import GROUND, PROFILE, measured, small_pile
 
 from autonomy.activity import Activity
 from autonomy.grasp.direct import Planned
 from autonomy.grasp.search import Search
-from autonomy.logs import TRIANGLE, LogObservation
+from autonomy.logs import LogObservation
 from autonomy.phases import Phase
 from autonomy.regrip import CLIMBS
 from can_dbc.setpoint import GrappleCommand
@@ -30,10 +29,7 @@ class Heap(StandIn):
     gives_rad = 0.0  # in a tick
 
     def seen(self) -> tuple[LogObservation, ...]:
-        if not self.measures:
-            return tuple(self.logs)
-        variances = [1e-6 if i in (0, 7, 13) else 0.0 for i in range(TRIANGLE)]
-        return tuple(replace(log, covariance=tuple(variances)) for log in self.logs)
+        return tuple(measured(log) if self.measures else log for log in self.logs)
 
     def _grapple(self, command: GrappleCommand) -> None:
         tip_m = self.pin()[2] - tip_below_pin_m(self.profile.grapple.tongs, self.tong_rad)
@@ -47,14 +43,7 @@ class Heap(StandIn):
 def driven(heap: Heap) -> tuple[list[Phase], Activity]:
     """The phases from the first descent to the lift."""
     planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(Search()))
-    phases = [planner.phase]
-    for _ in range(2400):
-        if planner.phase is Phase.LIFT or planner.idle:
-            break
-        heap.step(planner)
-        if planner.phase is not phases[-1]:
-            phases.append(planner.phase)
-    assert planner.phase is Phase.LIFT, planner.failure
+    phases = heap.until(planner, Phase.LIFT)
     return phases[phases.index(Phase.DESCEND) :], planner
 
 
