@@ -16,7 +16,8 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.obstacles import Held, Surroundings, apart, between, swept
+from autonomy.motion.distances import apart, between
+from autonomy.motion.obstacles import Held, Surroundings, swept
 from autonomy.motion.timing import PENDULUM_S
 from autonomy.motion.trajectory import Trajectory
 

@@ -1,9 +1,8 @@
-"""What a moving crane may touch, and how near it comes: boxes, rods and the ground, against swept rods.
+"""What a moving crane may touch, as boxes, rods and the ground, and what of it moves, as swept rods.
 
 Everything that moves is a rod with round ends (a capsule): boom, stick with telescope, the hanging grapple and the log
 in it.  Everything that stands still is a box that is turned about the vertical, a rod (logs, trees) or the ground.
-Distances are exact for every sample, negative inside of rods and the ground (0 inside of a box's core), and vectorised;
-what a part does between two samples is covered by its greatest movement.  Crane base frame, m and rad.
+How near they come to each other: ``autonomy.motion.distances``.  Crane base frame, m and rad.
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ BOOM_M: Final = 0.17
 STICK_M: Final = 0.14
 GRAPPLE_M: Final = 0.20
 TONG_M: Final = 0.10
-_SMALL: Final = 1e-12
 
 Ground = float | Callable[[np.ndarray, np.ndarray], np.ndarray]
 """A height, or heights at x and y."""
@@ -290,115 +288,3 @@ def swept(profile: Profile, q: np.ndarray, pin: np.ndarray, held: Held | None, o
         parts.append(("log", middle - half * axis, middle + half * axis, held.diameter_m / 2, True))
     names, a, b, radius, hangs = zip(*parts, strict=True)
     return Swept(np.stack(a, 1), np.stack(b, 1), np.array(radius), names, np.array(hangs))
-
-
-def segment_segment(p0: np.ndarray, p1: np.ndarray, q0: np.ndarray, q1: np.ndarray) -> np.ndarray:
-    """Distances of segments p0-p1 and q0-q1 (..., 3), exact, also for points and parallels."""
-    u, v, w = p1 - p0, q1 - q0, p0 - q0
-    a, b, c = _dot(u, u), _dot(u, v), _dot(v, v)
-    d, e = _dot(u, w), _dot(v, w)
-    det = a * c - b * b
-    s = np.where(det > _SMALL * np.maximum(a * c, _SMALL), (b * e - c * d) / np.maximum(det, _SMALL), 0.0)
-    s = np.clip(s, 0.0, 1.0)
-    t = np.clip((b * s + e) / np.maximum(c, _SMALL), 0.0, 1.0)
-    s = np.clip((b * t - d) / np.maximum(a, _SMALL), 0.0, 1.0)
-    t = np.clip((b * s + e) / np.maximum(c, _SMALL), 0.0, 1.0)
-    return np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
-
-
-def segment_box(p0: np.ndarray, p1: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Distances of segments (..., 3) and boxes of half edges (..., 3) about the origin, exact; 0 inside.
-
-    The squared distance along the segment is convex and a quadratic between the places where it crosses a face's
-    plane: its slope, a broken line, is looked up there.
-    """
-    way = p1 - p0
-    safe = np.where(np.abs(way) > _SMALL, way, 1.0)
-    crossings = np.concatenate([(half - p0) / safe, (-half - p0) / safe], axis=-1)
-    crossings = np.where(np.concatenate([np.abs(way) > _SMALL] * 2, axis=-1), crossings, 0.0)
-    ends = np.zeros((*crossings.shape[:-1], 1))
-    t = np.sort(np.clip(np.concatenate([ends, crossings, ends + 1.0], axis=-1), 0.0, 1.0), axis=-1)
-
-    def out(at: np.ndarray) -> np.ndarray:
-        points = p0[..., None, :] + at[..., None] * way[..., None, :]
-        return points - np.clip(points, -half[..., None, :], half[..., None, :])
-
-    slope = np.sum(out(t) * way[..., None, :], axis=-1)
-    k = np.clip(np.sum(slope < 0.0, axis=-1), 1, t.shape[-1] - 1)[..., None]
-    s0, s1 = np.take_along_axis(slope, k - 1, -1), np.take_along_axis(slope, k, -1)
-    t0, t1 = np.take_along_axis(t, k - 1, -1), np.take_along_axis(t, k, -1)
-    rise = s1 - s0
-    best = np.where(s0 >= 0.0, t0, np.where(s1 <= 0.0, t1, t0 - s0 * (t1 - t0) / np.where(rise > _SMALL, rise, 1.0)))
-    return np.linalg.norm(out(best)[..., 0, :], axis=-1)
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("...i,...i->...", a, b)
-
-
-def clearances(around: Surroundings, body: Swept, near_m: float = np.inf) -> np.ndarray:
-    """Distances (n, m, k) of m parts at n samples from the ground, the boxes and the rods (`Surroundings.names`).
-
-    Beyond ``near_m`` what is given may be less than the distance, but not less than ``near_m``.
-    """
-    return apart(around.standing, body, np.array(near_m))
-
-
-def apart(things: Standing, body: Swept, near_m: np.ndarray) -> np.ndarray:
-    """The same from things as arrays; ``near_m`` broadcasts to (n, m, 1)."""
-    limit = near_m + body.radius[:, None]
-    middle, way = (body.a + body.b) / 2, (body.b - body.a) / 2
-    columns = [_over_ground(things.ground, body.a, body.b)]
-    # Axis by axis a part and a thing are at least as far from each other as what encloses them.
-    x, y, z = (middle[..., i, None] - things.center[:, i] for i in range(3))
-    cos_, sin_ = things.turn.T
-    x, y = cos_ * x + sin_ * y, cos_ * y - sin_ * x
-    wx, wy, wz = (way[..., i, None] for i in range(3))
-    wx, wy = cos_ * wx + sin_ * wy, cos_ * wy - sin_ * wx
-    hx, hy, hz = things.half.T
-    far = _beyond(np.abs(x) - np.abs(wx) - hx, np.abs(y) - np.abs(wy) - hy, np.abs(z) - np.abs(wz) - hz)
-    i, m, k = np.nonzero(far < limit)
-    at, to = np.stack([x[i, m, k], y[i, m, k], z[i, m, k]], -1), np.stack([wx[i, m, k], wy[i, m, k], wz[i, m, 0]], -1)
-    far[i, m, k] = segment_box(at - to, at + to, things.half[k])
-    columns.append(far)
-    far = _beyond(
-        *(
-            np.abs(middle[..., i, None] - things.middle[:, i]) - np.abs(way[..., i, None]) - np.abs(things.along[:, i])
-            for i in range(3)
-        )
-    )
-    far -= things.radius
-    i, m, k = np.nonzero(far < limit)
-    begin, end = things.middle[k] - things.along[k], things.middle[k] + things.along[k]
-    far[i, m, k] = segment_segment(body.a[i, m], body.b[i, m], begin, end) - things.radius[k]
-    columns.append(far)
-    return np.concatenate(columns, axis=2) - body.radius[:, None]
-
-
-def _beyond(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Length of a gap (n, m, k) given by what it is along each axis; negative is none."""
-    x, y, z = np.maximum(x, 0.0), np.maximum(y, 0.0), np.maximum(z, 0.0)
-    return np.sqrt(x * x + y * y + z * z)
-
-
-def _over_ground(ground: Ground, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Height of both ends and the middle over the ground, the least of them, (n, m, 1)."""
-    heights = []
-    for share in (0.0, 0.5, 1.0):
-        p = a + share * (b - a)
-        heights.append(p[..., 2] - (ground(p[..., 0], p[..., 1]) if callable(ground) else ground))
-    return np.min(np.stack(heights, axis=-1), axis=-1)[..., None]
-
-
-def between(body: Swept) -> np.ndarray:
-    """By how much a part may be nearer between two samples than at either, (n, m): half of its movement."""
-    move = np.maximum(np.linalg.norm(np.diff(body.a, axis=0), axis=2), np.linalg.norm(np.diff(body.b, axis=0), axis=2))
-    nothing = np.zeros((1, move.shape[1]))
-    return 0.5 * np.maximum(np.concatenate([nothing, move]), np.concatenate([move, nothing]))
-
-
-def least(around: Surroundings, body: Swept) -> tuple[float, str, str, int]:
-    """The least clearance [m], of which part from what, and at which sample."""
-    apart = clearances(around, body)
-    i, m, k = np.unravel_index(int(np.argmin(apart)), apart.shape)
-    return float(apart[i, m, k]), body.names[m], around.names[k], int(i)

@@ -14,7 +14,8 @@ from autonomy.logs import LogObservation
 from autonomy.motion import clearance
 from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.clearance import spare
-from autonomy.motion.obstacles import Held, Rod, Surroundings, clearances, surroundings, swept, tree
+from autonomy.motion.distances import clearances
+from autonomy.motion.obstacles import Held, Rod, Surroundings, surroundings, swept, tree
 from autonomy.motion.paths import Blocked, Clear, plan
 from autonomy.motion.trajectory import Trajectory, slowly, travel
 from machine.joints import JOINTS

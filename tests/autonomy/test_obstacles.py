@@ -11,20 +11,16 @@ from scipy.optimize import minimize_scalar
 
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
+from autonomy.motion.distances import between, clearances, least, segment_box, segment_segment
 from autonomy.motion.obstacles import (
     Box,
     Held,
     Rod,
     Surroundings,
     Swept,
-    between,
     bunk_boxes,
     carrier_boxes,
-    clearances,
     held_log,
-    least,
-    segment_box,
-    segment_segment,
     surroundings,
     swept,
     tree,

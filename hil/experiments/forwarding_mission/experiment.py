@@ -43,7 +43,7 @@ def run(options: Options, console: Console) -> Result:
     check_truth(name, truth)
     trials = 0 if options.quick else options.trials or TRIALS
     machines = calibrations(options, name, truth, MACHINES if trials else 0)
-    with checkpoint(options, (machines, trials), [name], truth, SOURCES) as kept:
+    with checkpoint(options, machines, [name], truth, SOURCES) as kept:  # more missions go on from fewer
         outcomes = pool.run(perform, machines, kept, options.workers, "calibrations", console)
         jobs = [*trial(options, name, outcomes), *missions(options, name, truth, trials, outcomes)]
         outcomes |= pool.run(perform, jobs, kept, options.workers, "missions", console)
