@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from hil.experiments import overview
 from hil.experiments.registry import Options
 from hil.experiments.result import Figure, Result
 
@@ -48,7 +49,8 @@ def refresh(
     docs: Path,
     setting: str | None = None,
 ) -> None:
-    """Write ``docs/NAME.md``, ``docs/results/NAME.json`` and the pictures beside it in ``docs/results/NAME``.
+    """Write ``docs/NAME.md``, ``docs/results/NAME.json``, the pictures beside it in ``docs/results/NAME``, and the page
+    of all experiments anew.
 
     ``setting`` says what was measured where, in place of the usual sentence on profile, truth and packages.
     """
@@ -60,6 +62,7 @@ def refresh(
         for file, _ in section.pictures:
             shutil.copyfile(pictures / file, folder / file)
     (docs / f"{name}.md").write_text(page(result, title, introduction, sections, setting))
+    overview.write(docs)
 
 
 def _setting(result: Result) -> str:

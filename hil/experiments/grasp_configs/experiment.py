@@ -118,21 +118,26 @@ def of_trials(trials: Sequence[dict[str, Any]], prefix: str) -> dict[str, float]
     up = [o for o in trials if o["lifted"] > 0]
     piles = [o["lifted"] for o in trials if o["configuration"] in PILES]
     all_of = [o["lifted"] == o["logs"] for o in trials if o["configuration"] in ALL_LOGS]
-    times = [o["plan_ms"] for o in trials if math.isfinite(o["plan_ms"])]
+    planned = [o for o in trials if math.isfinite(o["plan_ms"])]
     return {
         **rate(f"{prefix}success", len(up), len(trials)),
         **rate(f"{prefix}optimal", sum(o["category"] == "optimal" for o in up), len(up)),
         **{f"{prefix}{c.lower()}": float(sum(o["category"] == c for o in up)) for c in ("NI", "SE", "MA")},
         f"{prefix}logs_per_grasp_10_12": _mean(piles),
         f"{prefix}all_logs": _mean([float(a) for a in all_of]),
-        f"{prefix}plan_ms": median(times) if times else math.nan,
-        f"{prefix}perceive_ms": median([o["see_ms"] for o in trials]) if trials else math.nan,
+        f"{prefix}plan_ms": _median([o["see_ms"] + o["plan_ms"] for o in planned]),
+        f"{prefix}perceive_ms": _median([o["see_ms"] for o in trials]),
+        f"{prefix}choose_ms": _median([o["plan_ms"] for o in planned]),
     }
 
 
 def _share(trials: Sequence[dict[str, Any]], category: str) -> float:
     up = [o for o in trials if o["lifted"] > 0]
     return _mean([float(o["category"] == category) for o in up])
+
+
+def _median(values: Sequence[float]) -> float:
+    return median(values) if values else math.nan
 
 
 def _mean(values: Sequence[float]) -> float:

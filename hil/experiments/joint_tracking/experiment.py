@@ -17,8 +17,8 @@ from hil.experiments.joint_tracking.trial import perform
 from hil.experiments.plant.worlds import profile_named
 from hil.experiments.pool import Job
 from hil.experiments.registry import Options
-from hil.experiments.report import tell
-from hil.experiments.result import Result, judged
+from hil.experiments.report import Section, tell
+from hil.experiments.result import Figure, Result, judged
 from hil.experiments.trials import check_truth, checkpoint, individuals
 
 TRIALS: Final = 6
@@ -86,7 +86,7 @@ def run(options: Options, console: Console) -> Result:
     with checkpoint(options, jobs, profiles.values(), options.truth, ["controller"]) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "joint-tracking trials", console)
         metrics = gather(outcomes)
-        shown = sections({short: own_law(profile) for short, profile in profiles.items()}, metrics)
+        shown = sections_of(profiles, metrics)
         result = judged(
             "joint-tracking", [f for section in shown for f in section.figures], metrics,
             profile=", ".join(profiles.values()), seed=options.seed, trials=trials,
@@ -95,6 +95,16 @@ def run(options: Options, console: Console) -> Result:
         draw(metrics, outcomes, profiles, options.out)
         tell(result, "Joint laws, compared", INTRODUCTION, shown, options, console)
     return result
+
+
+def sections_of(profiles: Mapping[str, str], metrics: Mapping[str, float]) -> tuple[Section, ...]:
+    """The page's sections for profiles by short name."""
+    return sections({short: own_law(profile) for short, profile in profiles.items()}, metrics)
+
+
+def figures(metrics: Mapping[str, float]) -> list[Figure]:
+    """Those of the shipped machines."""
+    return [f for section in sections_of(MACHINES, metrics) for f in section.figures]
 
 
 def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
