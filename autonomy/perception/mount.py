@@ -1,8 +1,8 @@
 """Where a camera's optical frame stands in the crane's base frame, from joint positions.
 
-Links that carry cameras: ``base``, the moving parts of the crane (``turntable`` and ``mast``, ``boom``, ``stick``) and
-the carrier's ``rear`` and ``front``.  Link frames are the machine's: from the turntable upwards y is along the reach,
-x to the right, z up, the origin at the joint (machines.md 1.1); the carrier's are those of ``machine.carrier``.
+Links that carry cameras: ``base``, ``boom`` and ``stick`` of the crane, ``rear`` and ``front`` of the carrier.  Link
+frames are the machine's: of boom and stick y is along the reach, x to the right, z up, the origin at the joint
+(machines.md 1.1); the carrier's are those of ``machine.carrier``.
 Rigid kinematics: sag and the tyres' give are not in them.
 """
 

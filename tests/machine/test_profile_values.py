@@ -85,7 +85,7 @@ VALUES = [
     ({"workspace.pick_center_m": [0.0, 8.0]},
      "workspace.pick_center_m: 8.00 m from the slew axis; the crane reaches 6.95 m"),
     ({"cameras.stick.link": "front"},
-     'cameras.stick.link: "front" is no link of this machine; use one of base, mast, boom, stick, telescope'),
+     'cameras.stick.link: "front" is no link of this machine; use one of base, boom, stick'),
     ({"cameras.stick.model": " "}, "cameras.stick.model: is empty; write the maker's name of the camera"),
     ({"cameras.stick.rpy_rad": [0.0, 11.5, 0.0]},
      "cameras.stick.rpy_rad[1]: 11.5 rad is outside -6.28319..6.28319 rad; was it given in deg?"),
