@@ -8,6 +8,7 @@ same call takes them from there.  Workers never see Ctrl-C: the parent ends them
 from __future__ import annotations
 
 import json
+import lzma
 import os
 import signal
 from collections.abc import Callable, Sequence
@@ -35,31 +36,20 @@ class Job:
 
 
 class Checkpoint:
-    """Finished jobs in a file of JSON lines; the first line says which run they belong to."""
+    """Finished jobs in a file of JSON lines; the first line says which run they belong to.
 
-    def __init__(self, path: Path, fingerprint: str) -> None:
-        self._path = path
-        self.done = self._read(fingerprint)
+    Where there is none of this run, those are taken that were ``published``, the same lines as an xz file.
+    """
+
+    def __init__(self, path: Path, fingerprint: str, published: Path | None = None) -> None:
+        self._path, self._published = path, published
+        self.done = _read(path, fingerprint)
+        if not self.done and published is not None:
+            self.done = _read(published, fingerprint)
         path.parent.mkdir(parents=True, exist_ok=True)
         lines = [json.dumps({"run": fingerprint}), *(json.dumps([k, v]) for k, v in self.done.items())]
         path.write_text("\n".join(lines) + "\n")
         self._file = path.open("a")
-
-    def _read(self, fingerprint: str) -> dict[str, Any]:
-        try:
-            head, *lines = self._path.read_text().splitlines()
-            if json.loads(head) != {"run": fingerprint}:
-                return {}
-        except (OSError, ValueError):
-            return {}
-        done = {}
-        for line in lines:
-            try:
-                name, outcome = json.loads(line)
-            except ValueError:
-                break  # the run was cut off while it wrote this line
-            done[name] = outcome
-        return done
 
     def add(self, name: str, outcome: Any) -> Any:
         """Keep a finished job; returns it as it will be read back."""
@@ -67,6 +57,13 @@ class Checkpoint:
         self._file.write(line + "\n")
         self._file.flush()
         self.done[name] = json.loads(line)[1]
+
+    def publish(self) -> None:
+        """Write what is done where it is to be published, if anywhere."""
+        if self._published is not None:
+            self._published.parent.mkdir(parents=True, exist_ok=True)
+            with lzma.open(self._published, "wb") as file:
+                file.write(self._path.read_bytes())
 
     def close(self) -> None:
         """The file stays, for the next run."""
@@ -80,6 +77,25 @@ class Checkpoint:
         self.close()
         if failure is None:
             self._path.unlink()
+
+
+def _read(path: Path, fingerprint: str) -> dict[str, Any]:
+    """The finished jobs in a file, by name; none when it is of another run or cannot be read."""
+    try:
+        data = path.read_bytes()
+        head, *lines = (lzma.decompress(data) if path.suffix == ".xz" else data).decode().splitlines()
+        if json.loads(head) != {"run": fingerprint}:
+            return {}
+    except (OSError, ValueError, lzma.LZMAError):
+        return {}
+    done = {}
+    for line in lines:
+        try:
+            name, outcome = json.loads(line)
+        except ValueError:
+            break  # the run was cut off while it wrote this line
+        done[name] = outcome
+    return done
 
 
 def run(

@@ -38,17 +38,24 @@ def check_truth(profile: str, truth: str) -> None:
 
 
 def checkpoint(
-    options: Options, asked: object, profiles: Iterable[str], truth: str, sources: Sequence[str] = ()
+    options: Options,
+    asked: object,
+    profiles: Iterable[str],
+    truth: str,
+    sources: Sequence[str] = (),
+    published: str = "",
 ) -> Checkpoint:
     """The run's checkpoint in its folder; that of a run whose outcomes might be others is not continued.
 
     ``asked``: what of the run decides them, jobs or seed and counts; ``sources``: folders and files of the checkout
-    that they depend on beside ``SOURCES``.
+    that they depend on beside ``SOURCES``; ``published``: a file of the docs that holds all outcomes of a long run, so
+    that a later one goes on from there.
     """
     parts = [repr(asked), *(repr(profile_hash(profile_named(p))) for p in profiles), source_hash(*sources), truth]
     parts += [Path(truth).read_text()] if Path(truth).is_file() else []
     fingerprint = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
-    return Checkpoint(options.out / "trials.jsonl", fingerprint)
+    file = options.docs / published if options.docs is not None and published else None
+    return Checkpoint(options.out / "trials.jsonl", fingerprint, file)
 
 
 def source_hash(*more: str) -> str:

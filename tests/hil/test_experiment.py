@@ -108,6 +108,22 @@ def test_a_checkpoint_of_another_run_is_not_taken(tmp_path):
     assert Checkpoint(path, "two").done == {}
 
 
+def test_what_was_published_is_gone_on_from_where_nothing_else_is_left(tmp_path):
+    path, published = tmp_path / "run" / "trials.jsonl", tmp_path / "docs" / "trials.jsonl.xz"
+    with Checkpoint(path, "run", published) as checkpoint:
+        checkpoint.add("square/0", 0)
+        checkpoint.publish()
+    assert not path.exists() and published.exists()
+    assert Checkpoint(tmp_path / "other.jsonl", "another", published).done == {}
+    again = Checkpoint(path, "run", published)
+    assert again.done == {"square/0": 0}
+    again.add("square/1", 1)
+    again.close()
+    assert Checkpoint(path, "run", published).done == {"square/0": 0, "square/1": 1}
+    published.write_bytes(b"no xz")
+    assert Checkpoint(tmp_path / "third.jsonl", "run", published).done == {}
+
+
 def test_a_run_with_another_truth_begins_anew(tmp_path):
     truth = tmp_path / "truth.toml"
     truth.write_text("a = 1")

@@ -29,6 +29,8 @@ EYES: Final = {"ours": "ours", "paper-b": "faithful"}
 NOMINAL: Final = "machine/nominal"
 LIMIT_S: Final = 5400.0
 FILE: Final = ROOT / "docs" / "examples" / "paper_b.geojson"
+RAW: Final = "results/forwarding-mission/trials.jsonl.xz"
+"""What became of every log, way and grasp of all missions, in the docs."""
 SOURCES: Final = ("autonomy", "controller", "hil/lockstep.py", "hil/mission.py", "hil/mission_site.py",
                   "hil/operator.py", "hil/calibration.py", "docs/examples/paper_b.geojson")  # fmt: skip
 
@@ -43,7 +45,7 @@ def run(options: Options, console: Console) -> Result:
     check_truth(name, truth)
     trials = 0 if options.quick else options.trials or TRIALS
     machines = calibrations(options, name, truth, MACHINES if trials else 0)
-    with checkpoint(options, machines, [name], truth, SOURCES) as kept:  # more missions go on from fewer
+    with checkpoint(options, machines, [name], truth, SOURCES, RAW) as kept:  # more missions go on from fewer
         outcomes = pool.run(perform, machines, kept, options.workers, "calibrations", console)
         jobs = [*trial(options, name, outcomes), *missions(options, name, truth, trials, outcomes)]
         outcomes |= pool.run(perform, jobs, kept, options.workers, "missions", console)
@@ -57,6 +59,7 @@ def run(options: Options, console: Console) -> Result:
             machines=len(machines) - 1, along=CM * ALONG_M, across=CM * ACROSS_M, turn=TURN_DEG, eyes=SEEN_BY
         )
         tell(result, "The forwarding mission", words, sections(outcomes), options, console)
+        kept.publish()
     return result
 
 

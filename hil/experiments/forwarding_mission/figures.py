@@ -40,7 +40,8 @@ OURS: Final = (
     Figure("faults", "Stops and faults", "", "Times the controller stopped the machine, so that somebody had to press "
            "a button; all missions of ours.", most=0.0),
     Figure("refused", "Setpoints refused", "", "All missions of ours.", most=0.0),
-    Figure("missions", "Missions driven", "", "Ours: the one on the field of the file, and those on others."),
+    Figure("missions", "Missions driven", "", "Ours: the one on the field of the file, and those on others, of which "
+           "20 are wanted."),
     Figure("finished", "Missions driven to the end of the route", "%", "Of these.", least=1.0, scale=100.0),
     Figure("uncalibrated", "Machines without a calibrated profile", "", "The calibration stopped or doubted a value; "
            "such a machine drives no mission.", most=0.0),
@@ -70,7 +71,9 @@ INTRODUCTION: Final = (
     "individuals whose steel, oil and sensors the plant hides, every one on another field: each log up to "
     "{along:.0f} cm along, {across:.0f} cm across and {turn:.0f} degrees off. {eyes} "
     "`timberhand experiment forwarding-mission --docs docs` measures everything and writes this page; no number is "
-    "typed."
+    "typed. It takes hours: `--trials` asks for fewer missions, and the same code goes on from those that are "
+    "published, with what became of every log, way and grasp, as "
+    "[trials.jsonl.xz](results/forwarding-mission/trials.jsonl.xz)."
 )
 SEEN_BY: Final = (
     "The logs are seen by the front camera alone, drawn with its noise and mounted as the plant hides it; its mount "
