@@ -117,7 +117,7 @@ class Ride:
 
     def renew(self) -> None:
         """The route is to begin once more."""
-        self._way, self._path, self._left = None, None, None
+        self._way, self._path, self._left, self._new = None, None, None, False
         self.along_m, self.length_m, self._over = 0.0, math.inf, False
 
     def left(self, plane: Plane | None) -> Left | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -19,6 +20,7 @@ from machine.load import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.test_manager import PLANE, PROFILE, at, ended, place, states, whole
 from tests.autonomy.test_manager_field import lying
+from tests.autonomy.test_manager_resume import again
 
 SAW, PULP, ALL, NONE = ("saw logs",), ("pulpwood",), (), ("energy",)
 Lie = tuple[str, float, float]
@@ -188,6 +190,19 @@ def test_two_landings_get_their_own_assortments_in_two_rounds() -> None:
     assert manager.outlook.sorting.rounds == 1, "in the second one both were served"
     assert {"drives the load to the landing (Road)", "unloads the bunk (landing 2)"} <= words
     assert "follows the waypoints and looks for logs (round 2)" in words
+
+
+@whole
+def test_a_planner_that_starts_anew_with_the_load_under_way_drives_the_second_round(tmp_path: Path) -> None:
+    lie = (("saw logs", 15.0, 4.2), ("pulpwood", 18.0, -4.4))
+    told = mission(lie, ((34.0, 14.0, SAW), (34.0, -14.0, PULP)), sort_by_assortment=True)
+    machine, manager = forwarder(lie), managed(told)
+    machine.run(manager, at(State.HAUL))
+    manager = again(machine, manager, told, tmp_path / "progress.json")
+    manager.auto()
+    machine.run(manager, ended, 1500.0)
+    assert manager.state is State.DONE, manager.failure
+    assert manager.tally.unloaded == 2 and manager.outlook.sorting.rounds == 1
 
 
 @whole
