@@ -32,7 +32,18 @@ PATIENCE: Final = 6
 FLAT: Final = 0.3
 """An axis whose level part is shorter says nothing of a log on the ground."""
 
-Find = Callable[[Frame], Sequence[Masked]]
+SURE: Final = 0.25
+"""What the finder believes in less is no log: one within ``FARTHEST_M`` has 0.5 and more, a gap in a shadow 0.2."""
+
+
+class Found(Masked, Protocol):
+    """A mask, and how much it is believed in, 0..1."""
+
+    @property
+    def score(self) -> float: ...
+
+
+Find = Callable[[Frame], Sequence[Found]]
 
 
 class Sighted(Protocol):
@@ -114,7 +125,7 @@ class FrontEyes:
                 return None
             frame = rescaled(frame, self._camera.depth_scale)
             pose = Pose(base.to_base(mount.position_m), base.rotation @ mount.rotation)
-            seen = self._sight.see(frame, pose, self._find(frame))
+            seen = self._sight.see(frame, pose, [one for one in self._find(frame) if one.score >= SURE])
         except (SourceError, FrameRefused, MountRefused) as error:
             self.trouble = str(error)
             return None
