@@ -7,9 +7,13 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from can_dbc.durations import Durations
 from can_dbc.timing_page import STAGES, BusCounters, Facts, InputAge, ProcessCounters, Timing
+
+settings.register_profile("no clock", deadline=None)  # how long an example takes is the host's affair, and no failure
+settings.load_profile("no clock")
 
 
 def a_timing(count: int = 100, **facts: Any) -> Timing:

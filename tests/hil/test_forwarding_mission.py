@@ -78,6 +78,11 @@ def test_a_log_that_was_lost_a_stop_and_a_mission_that_failed_miss_their_limits(
     assert not limits["grasp_offset_mean_m"].holds(0.09)
 
 
+def test_several_logs_that_are_loaded_from_one_stand_are_one_stop() -> None:
+    stands = [[0.0, 0.0, 1.0], [0.02, 0.0, 30.0], [5.0, 0.0, 60.0], [5.0, 0.01, 90.0], [0.0, 0.0, 120.0]]
+    assert gather({"first/ours": outcome() | {"stands": stands}})["stops_mean"] == 3.0
+
+
 def test_paper_b_s_way_is_told_apart() -> None:
     metrics = gather({"first/ours": outcome(), "first/paper-b": outcome(off_m=(0.3, 0.4, 0.0))})
     assert metrics["faithful.grasp_offset_mean_m"] == pytest.approx(0.5)

@@ -12,6 +12,8 @@ from hil.experiments.report import Section
 from hil.experiments.result import Figure, rate
 
 CM: Final = 100.0
+MOVED_M: Final = 0.3
+"""A machine that stands so far from where it stood has driven on."""
 FIRST: Final = {"ours": "first/ours", "faithful": "first/paper-b"}
 """The nominal machine on the field as the file has it, both ways; by the prefix of its figures."""
 PAPER: Final = {
@@ -169,6 +171,11 @@ def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
     return metrics
 
 
+def _stops(stands: Sequence[Sequence[float]]) -> int:
+    """How often the machine stopped: it may load several logs from one stand."""
+    return sum(i == 0 or math.dist(at[:2], stands[i - 1][:2]) > MOVED_M for i, at in enumerate(stands))
+
+
 def figures(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Of some missions together."""
     logs = [log for o in outcomes for log in o["logs"]]
@@ -190,5 +197,5 @@ def figures(outcomes: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     metrics["missed"] = float(sum(g.get("failure") is not None for o in outcomes for g in o["grasps"]))
     if done:
         metrics["mission_mean_s"] = float(np.mean([o["seconds"] for o in done]))
-        metrics["stops_mean"] = float(np.mean([len(o["stands"]) for o in done]))
+        metrics["stops_mean"] = float(np.mean([_stops(o["stands"]) for o in done]))
     return metrics
