@@ -5,7 +5,7 @@ will do.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from math import dist
+from math import dist, hypot
 from typing import Final
 
 from autonomy.grasp.direct import Grasp, is_held, lies_in, only, plan_place
@@ -14,7 +14,7 @@ from autonomy.grasp.proposal import NoGrasp
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
 from autonomy.motion.arm import Arm, Pose
-from machine.grapple import grapple_yaw
+from machine.grapple import grapple_yaw, lowest_tip_below_pin_m
 from machine.profile import Bunk
 
 ASIDE_M: Final = 0.15
@@ -41,6 +41,19 @@ def came_up(arm: Arm, grasp: Grasp, seen: Sequence[LogObservation], pins: Iterab
         return None
     hidden = [log.id for log in grasp.logs if log.id not in [o.id for o in seen]]
     return only(arm, grasp, held + hidden)
+
+
+def is_between_tongs(arm: Arm, log: LogObservation, pin: Pose) -> bool:
+    """Whether a log lies on the middle line of closed tongs under a pin: none can but what they hold.  A list may have
+    that twice, when it was measured amiss while it moved and begun as another log.
+    """
+    (x, y), c, a = arm.xy(pin), log.center_m, log.axis
+    level2 = a[0] ** 2 + a[1] ** 2
+    along_m = ((x - c[0]) * a[0] + (y - c[1]) * a[1]) / level2 if level2 > 0.0 else 0.0
+    along_m = min(max(along_m, -0.5 * log.length_m), 0.5 * log.length_m)
+    below_m = pin.z_m - c[2] - along_m * a[2]
+    aside_m = hypot(c[0] + along_m * a[0] - x, c[1] + along_m * a[1] - y)
+    return aside_m < 0.5 * log.diameter_m and 0.0 < below_m < lowest_tip_below_pin_m(arm.profile.grapple.tongs)
 
 
 def laid(mission: Mission, target: Bunk, log: LogObservation) -> bool:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from math import hypot
 from typing import Final
 
+from autonomy.carried import is_between_tongs
 from autonomy.grasp.direct import (
     Grasp,
     approach_length,
@@ -92,7 +93,7 @@ def carrying(
     hangs: bool,
 ) -> Trajectory:
     """With the log to its place; ``hangs``: it is seen in the grapple, else it lies as it was gripped."""
-    taken = {log.id for log in grasp.logs}
+    taken = {log.id for log in grasp.logs} | {log.id for log in logs if is_between_tongs(arm, log, start)}
     around = surroundings(arm.profile, logs, without=taken)
     seen = next((log for log in logs if log.id == grasp.log.id), None) if hangs else None
     held = held_log(arm, grasp.pose, grasp.log) if seen is None else held_log(arm, start, seen)

@@ -12,9 +12,12 @@ from crane_stand_in import GROUND_LOG, HOME, TICK_NS, StandIn, clearances
 from test_activity import CYCLE, PROFILE, activity, phases, report, run_until
 
 from autonomy.activity import Phase
+from autonomy.carried import is_between_tongs
 from autonomy.logs import LogObservation
 from autonomy.mission import Mission
+from autonomy.motion.arm import Arm
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, decode
+from machine.grapple import lowest_tip_below_pin_m
 from machine.joints import JOINTS, Joint
 from machine.modes import Mode
 from machine.profile import joint
@@ -72,6 +75,35 @@ def test_a_silent_controller_pauses() -> None:
     answers = [planner.step(crane.now_ns + n * TICK_NS, None, crane.seen()) for n in range(20)]
     assert planner.paused == "the controller is silent"
     assert sum(a is not None for a in answers) <= 6 and answers[-1] is None
+
+
+def test_a_log_in_the_tongs_that_is_listed_twice_stands_in_no_way() -> None:
+    crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
+    crane.until(planner, Phase.CLOSE)
+    while crane.held is None:
+        crane.step(planner)
+    held = crane.logs[0]
+    off_m = np.array(held.center_m) + 0.2 * np.array(held.axis) + (0.0, 0.0, 0.05)
+    crane.logs.append(replace(held, id=7, center_m=tuple(off_m), length_m=held.length_m - 0.4, diameter_m=0.21))
+    crane.run(planner)
+    assert planner.done, planner.failure
+
+
+def test_only_what_lies_in_closed_tongs_is_between_them() -> None:
+    arm = Arm(PROFILE)
+    x, y, z = GROUND_LOG.center_m
+    pin = arm.over(x, y, z + lowest_tip_below_pin_m(PROFILE.grapple.tongs) - 0.1, 2.0)
+    assert is_between_tongs(arm, GROUND_LOG, pin)
+    assert not is_between_tongs(arm, GROUND_LOG, pin.at_height(pin.z_m + 0.15)), "it lies under them"
+    upright = replace(GROUND_LOG, axis=(0.0, 0.0, 1.0))
+    assert is_between_tongs(arm, upright, pin)
+    ax, ay, _ = GROUND_LOG.axis
+    aside_m = 0.6 * GROUND_LOG.diameter_m
+    beside = replace(GROUND_LOG, center_m=(x - aside_m * ay, y + aside_m * ax, z))
+    assert not is_between_tongs(arm, beside, pin), "another one, beside it"
+    half_m = 0.5 * GROUND_LOG.length_m
+    ends = replace(GROUND_LOG, center_m=(x + (half_m + 0.2) * ax, y + (half_m + 0.2) * ay, z))
+    assert not is_between_tongs(arm, ends, pin), "it ends before them"
 
 
 def test_a_missed_log_is_looked_for_again() -> None:
