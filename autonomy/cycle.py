@@ -63,8 +63,6 @@ class Cycle:
         """With what hangs in the grapple in the present phase."""
         self._begun_z_m = 0.0
         self._looks, self._regrip = 0, Regrip()
-        self._stubborn: tuple[int, ...] = ()
-        """A log that could not be drawn out of its row: another is tried."""
         self._before: Grasp | None = None
 
     @property
@@ -74,13 +72,13 @@ class Cycle:
 
     def choose(self, q: Axes) -> None:
         """A grasp among the logs of the newest list, from where the crane stands; raises ``NoGrasp``."""
-        self._regrip, self._stubborn = Regrip(), ()
+        self._regrip = Regrip()
         self._choose_now(q)
 
     def _choose_now(self, q: Axes) -> None:
         self._looks = 0
         self._before = None
-        mission = msgspec.structs.replace(self._mission, leave=self._mission.leave + self._stubborn)
+        mission = msgspec.structs.replace(self._mission, leave=self._mission.leave + self._regrip.stubborn)
         self.grasp = self._choose(self._arm, mission, self._heard.logs, q[Joint.SLEW], q[Joint.ROT])
 
     @property
@@ -117,7 +115,6 @@ class Cycle:
         following, self.grasp = self._regrip.after_closing(self.grasp, tongs)
         if following is Phase.ABOVE:
             self._looks = min(self._looks, LOOKS - 1)  # the tongs have stirred the logs
-            self._stubborn = (self.grasp.log.id,) if self.grasp.drawn else ()
         return following
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:

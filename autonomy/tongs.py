@@ -32,6 +32,8 @@ _WIDE_PCT, _CLIMB_PCT, _WIDER_M = 70.0, 3.0, 0.15
 heap's sides: their tips are not under it."""
 _HELD_M: Final = 0.2
 """Thinner logs are held in tongs that have shut."""
+_NOTHING_KG: Final = 8.0
+"""Less than the thinnest log weighs, half of it lying on others."""
 _UNDER: Final = 0.85
 """The tips are under a log when they are nearer to each other than so much of its diameter."""
 _STILL_PCT, _STILL_S = 0.5, 0.8
@@ -135,6 +137,11 @@ class Tongs:
         if is_empty(self._heard.report):
             return grasp.thinnest_m > _HELD_M
         return grasp.drawn and self._gap_m() > _UNDER * grasp.thinnest_m
+
+    @property
+    def hold_nothing(self) -> bool:
+        """Whether they are seen to have shut, and nothing weighs in them; without a load cell nobody knows."""
+        return is_empty(self._heard.report) and self._heard.report.load_kg < _NOTHING_KG
 
     def _gap_m(self) -> float:
         """Between the tips; 0 when no sensor tells."""

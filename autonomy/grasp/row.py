@@ -35,16 +35,19 @@ def drawn_out(
     arm: Arm,
     jaws: Jaws,
     world: Cylinders,
+    upon: np.ndarray,
     logs: Sequence[LogObservation],
     stays: np.ndarray,
     lowest_m: float,
     rot_rad: float,
 ) -> GraspProposal | None:
     """The thickest log at an end of a row on the ground at ``lowest_m`` that is in reach with free ground beside it and
-    is none of those that are to stay (n,); None where there is none.  ``rot_rad`` is where the rotator stands.
+    is none of those that are to stay (n,), nor lies on others or under them (``upon`` (n, n) of `quality.lies_upon`);
+    None where there is none.  ``rot_rad`` is where the rotator stands.
     """
+    barred = stays | upon.any(axis=0) | upon.any(axis=1)
     for i in np.argsort(-world.radius, kind="stable").tolist():
-        if stays[i]:
+        if barred[i]:
             continue
         yaw = atan2(world.axis[i, 1], world.axis[i, 0]) + pi / 2
         for side in (1.0, -1.0):

@@ -131,8 +131,8 @@ class Search:
                 plans.append((best, found, trust * held * share))
         lowest = ground if isfinite(ground) else float(np.min(world.center[:, 2] - world.radius))
         likely = bool(plans) and max(float(np.max(plan[2])) for plan in plans) >= TRIED
-        if measured.any() and not likely and not upon.any():
-            drawn = drawn_out(arm, jaws, world, logs, stays, lowest, rot_rad)
+        if measured.any() and not likely:
+            drawn = drawn_out(arm, jaws, world, upon, logs, stays, lowest, rot_rad)
             if drawn is not None:
                 return drawn
         if not plans:

@@ -285,6 +285,14 @@ def test_a_log_is_drawn_out_of_a_row_that_is_too_wide() -> None:
     assert p.logs == (0,)
     beside = Search()(ARM, measured([*WALL, log(9, -1.6)]), 0.0, 0.0, stay=(7,))
     assert beside.logs == (6,), "where another lies there is no room"
+    laden = Search()(ARM, measured([*WALL, on_top(WALL[0], WALL[1])]), 0.0, 0.0, stay=(7,))
+    assert laden.logs == (6,), "none that another lies on, where the others are free"
+
+
+def on_top(a: LogObservation, b: LogObservation) -> LogObservation:
+    """A log in the valley between two."""
+    (x, ya, z), yb = a.center_m, b.center_m[1]
+    return replace(a, id=8, center_m=(x, 0.5 * (ya + yb), z + 0.21))
 
 
 def test_where_no_grasp_is_safe_a_camera_s_logs_are_gripped_at_the_top_all_the_same() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -17,7 +18,7 @@ from autonomy.regrip import ANEW, CLIMB_M, CLIMBS, Regrip
 class Told(SimpleNamespace):
     """Tongs of which everything is told."""
 
-    still, empty, wide, missed = True, False, False, False
+    still, empty, wide, missed, hold_nothing = True, False, False, False, False
 
     def are_wide(self, grasp: Grasp, climbs: int) -> bool:
         return self.wide
@@ -69,6 +70,29 @@ def test_shut_tongs_higher_up_may_hold_a_thin_log_that_nobody_saw() -> None:
     regrip = Regrip()
     _, now = regrip.after_closing(grasp(), Told(wide=True))
     assert regrip.after_closing(now, Told(missed=True, empty=True))[0] is Phase.LIFT
+
+
+def row(*across_m: float) -> Grasp:
+    first, *others = (replace(grasp().log, id=i, center_m=(0.0, 4.0 + y, -1.2)) for i, y in enumerate(across_m, 1))
+    return replace(grasp(), log=first, others=tuple(others))
+
+
+def test_a_row_that_was_closed_round_in_vain_is_looked_at_without_what_is_inside_of_it() -> None:
+    regrip, wide = Regrip(), row(0.3, -0.3, 0.0)
+    _, now = regrip.after_closing(wide, Told(wide=True))
+    assert regrip.after_closing(now, Told(empty=True, hold_nothing=True))[0] is Phase.ABOVE
+    assert regrip.stubborn == (3,) and regrip.climbs == 0, "one at its end is taken, from the ground"
+    drawn = replace(row(0.3), drawn=True)
+    regrip.after_closing(drawn, Told(missed=True, empty=True))
+    assert regrip.stubborn == (3, 1)
+    _, now = regrip.after_closing(row(0.3), Told(wide=True))
+    assert regrip.after_closing(now, Told(empty=True, hold_nothing=True))[0] is Phase.LIFT, "twice, and no more"
+
+
+def test_a_grasp_of_two_has_nothing_inside() -> None:
+    regrip = Regrip()
+    _, now = regrip.after_closing(row(0.0, 0.3), Told(wide=True))
+    assert regrip.after_closing(now, Told(hold_nothing=True))[0] is Phase.ABOVE and regrip.stubborn == ()
 
 
 def test_what_is_told_exactly_is_lifted_as_it_is() -> None:

@@ -74,7 +74,14 @@ def test_tongs_tell_that_they_have_missed(
     assert tongs_at(opening_pct, state).have_missed(grasp) is missed
 
 
-def tongs_at(opening_pct: float, state: int = 5) -> Tongs:
+@pytest.mark.parametrize(
+    ("state", "load_kg", "nothing"), [(4, 2.0, True), (4, 15.0, False), (5, 2.0, False), (4, nan, False)]
+)
+def test_shut_tongs_that_weigh_nothing_hold_nothing(state: int, load_kg: float, nothing: bool) -> None:
+    assert tongs_at(0.0, state, load_kg).hold_nothing is nothing
+
+
+def tongs_at(opening_pct: float, state: int = 5, load_kg: float = nan) -> Tongs:
     """Tongs by what is reported of them."""
-    report = SimpleNamespace(opening_pct=opening_pct, grapple_state=state)
+    report = SimpleNamespace(opening_pct=opening_pct, grapple_state=state, load_kg=load_kg)
     return Tongs(load_profile("palms_471"), SimpleNamespace(report=report))

@@ -40,6 +40,8 @@ FIRST_SEED: Final = 20_000
 """Judged on scenes that nobody looked at while the planner was made (those had seeds from 7000 on)."""
 PLANNERS: Final = ("search", *NETWORKS)
 BEST: Final = ("ours", "search")
+RAW: Final = "results/grasp-configs/trials.jsonl.xz"
+"""What became of every attempt, in the docs."""
 SOURCES: Final = ("autonomy", "controller", "hil/lockstep.py")
 
 
@@ -150,7 +152,7 @@ def run(options: Options, console: Console) -> Result:
     attempts = options.trials or (1 if options.quick else ATTEMPTS)
     calibrations = machines_of(options, attempts)
     asked = (options.seed, pairs)  # more attempts go on from fewer
-    with checkpoint(options, asked, [options.profile], options.truth, SOURCES) as kept:
+    with checkpoint(options, asked, [options.profile], options.truth, SOURCES, RAW) as kept:
         machines = pool.run(calibrated, calibrations, kept, options.workers, "calibrations", console)
         jobs = jobs_of(options, pairs[:1] if options.quick else pairs, attempts, machines)
         outcomes = machines | pool.run(attempt, jobs, kept, options.workers, "grasping attempts", console)
@@ -162,6 +164,7 @@ def run(options: Options, console: Console) -> Result:
         draw_table(options.out / "configurations.png", outcomes, ".".join(pairs[0]))
         _tell_failures(outcomes, ".".join(pairs[0]), console)
         tell(result, "Grasping logs in twelve configurations", INTRODUCTION, SECTIONS, options, console)
+        kept.publish()
     return result
 
 
