@@ -47,13 +47,13 @@ INPUT_NAMES: Final = dict(
 
 
 def describe_carrier(profile: Profile) -> dict[str, Any] | None:
-    """What the map needs to draw the machine, [m, rad]; None for one that stands still."""
+    """What map and view need to draw the machine, [m, rad]; None for one that stands still."""
     c = profile.carrier
     if c is None:
         return None
     names = (
         "front_axle_m", "rear_axle_m", "track_width_m", "wheel_radius_m", "wheel_width_m", "crane_base_m",
-        "crane_yaw_rad", "arm_travel_m", "arm_transport_m", "tilt_limit_rad",
+        "crane_yaw_rad", "arm_drop_low_m", "arm_travel_m", "arm_transport_m", "tilt_limit_rad",
     )  # fmt: skip
     return {name: getattr(c, name) for name in names}
 

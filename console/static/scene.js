@@ -1,16 +1,17 @@
-// The crane, the ground, the bunk and the logs in three dimensions.  Base frame: metres, z up, reach +y at slew 0.
+// The crane, the ground, the bunk and the logs in three dimensions.  Base frame of the crane: metres, z up.
 
 import * as THREE from "three";
+import { createCarrier } from "./carrier.js";
 import { createViewport } from "./viewport.js";
 
 const CRANE = 0xe0a22e, STEEL = 0x8b979f, DARK = 0x39443f, BARK = 0x8a5a35, WOOD = 0xe2b883, GHOST = 0xcfe3ff;
 const UP = new THREE.Vector3(0, 1, 0);
 /** For a crane of this reach; a longer one is looked at from farther away. */
 const VIEWED_M = 6.95;
-/** A machine that drives works on all sides: its views look at its bunk. */
-const VEHICLE = [1.5, 0, 0.6];
+/** A machine that drives works on all sides: its views look at its middle. */
+const VEHICLE = [0.5, 0, 0.5];
 const VIEWS = {
-  corner: [[6.2, 8.6, 4.2], [0.75, 2.3, 0.1]],
+  corner: [[6.8, 9.4, 4.9], [0.75, 2.2, 0.7]],
   top: [[0.6, 2.3, 12], [0.6, 2.31, 0]],
   side: [[10.5, 2.6, 1.4], [0, 2.6, 0.7]],
 };
@@ -47,7 +48,8 @@ class Crane {
   constructor(parent, machine) {
     this.machine = machine;
     this.pedestal = new Bar(parent, 0.3, DARK, true);
-    this.pedestal.span(new THREE.Vector3(0, 0, machine.ground_z_m), new THREE.Vector3(0, 0, 0.05));
+    const foot = machine.carrier ? 0.25 - machine.carrier.crane_base_m[2] : machine.ground_z_m;
+    this.pedestal.span(new THREE.Vector3(0, 0, foot), new THREE.Vector3(0, 0, 0.05));
     this.column = new Bar(parent, 0.17, CRANE);
     this.boom = new Bar(parent, 0.115, CRANE, true);
     this.stick = new Bar(parent, 0.095, CRANE, true);
@@ -85,19 +87,22 @@ class Crane {
   }
 }
 
+/** The ground, with the yard where a machine that stands still picks its logs; returns what may be moved. */
 function addGround(scene, machine) {
-  const z = machine.ground_z_m;
-  const ground = new THREE.Mesh(new THREE.CircleGeometry(14, 64), paint(0x22302a));
-  ground.position.z = z - 0.01;
-  scene.add(ground);
+  const z = machine.ground_z_m, ground = new THREE.Group();
+  const disc = new THREE.Mesh(new THREE.CircleGeometry(14, 64), paint(0x22302a));
+  disc.position.z = z - 0.01;
   const grid = new THREE.GridHelper(20, 20, 0x51655b, 0x33443c);
   grid.rotation.x = Math.PI / 2;
   grid.position.z = z;
-  scene.add(grid);
+  ground.add(disc, grid);
+  scene.add(ground);
+  if (machine.carrier) return ground;
   const [x, y] = machine.pick_center_m, h = machine.pick_half_size_m;
   const corners = [[-h, -h], [h, -h], [h, h], [-h, h]].map(([a, b]) => new THREE.Vector3(x + a, y + b, z + 0.01));
-  scene.add(new THREE.LineLoop(
+  ground.add(new THREE.LineLoop(
     new THREE.BufferGeometry().setFromPoints(corners), new THREE.LineBasicMaterial({ color: 0x6fdc98 })));
+  return ground;
 }
 
 function addBunk(scene, machine) {
@@ -108,7 +113,8 @@ function addBunk(scene, machine) {
   const floor = new THREE.Mesh(new THREE.BoxGeometry(b.length_m, b.width_m, 0.1), paint(0x4a5952));
   floor.position.z = -0.05;
   group.add(floor);
-  const legs = b.floor_z_m - machine.ground_z_m - 0.1;
+  const frame = machine.carrier ? 0.25 - machine.carrier.crane_base_m[2] : machine.ground_z_m;
+  const legs = Math.max(b.floor_z_m - frame - 0.1, 0.02);
   for (const sx of [-0.35, 0.35]) {
     for (const sy of [-0.5, 0.5]) {
       const stake = new Bar(group, 0.045, STEEL, true);
@@ -128,7 +134,8 @@ export function createScene(container, machine) {
   const sun = new THREE.DirectionalLight(0xffffff, 2.2);
   sun.position.set(6, 3, 12);
   scene.add(new THREE.HemisphereLight(0xe9f5ff, 0x3a4a40, 1.5), sun);
-  addGround(scene, machine);
+  const ground = addGround(scene, machine);
+  const carrier = machine.carrier ? createCarrier(scene, machine, ground) : null;
   addBunk(scene, machine);
   const craneGroup = new THREE.Group();
   craneGroup.visible = false;
@@ -148,6 +155,7 @@ export function createScene(container, machine) {
     const [position, target] = VIEWS[name];
     const off = v3(position).sub(v3(target)).multiplyScalar(Math.max(1, machine.reach_m / VIEWED_M));
     const at = v3(machine.carrier ? VEHICLE : target);
+    if (machine.carrier) off.applyAxisAngle(new THREE.Vector3(0, 0, 1), Math.PI / 2);
     look(off.add(at), at);
   }
 
@@ -180,6 +188,7 @@ export function createScene(container, machine) {
       ghost.computeLineDistances();
       ghostPin.position.copy(points[4]);
     }
+    carrier?.update(state.vehicle);
     showLogs(state.logs);
     draw();
   }

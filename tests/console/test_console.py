@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import socket
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from starlette.websockets import WebSocketDisconnect
 from autonomy.logs import parse_logs, parse_question
 from can_dbc.setpoint import OperatorAction, OperatorCommand, StateReport, decode, encode
 from can_dbc.timing_page import TimingWriter
-from console.server import Console, create_app
+from console.server import STATIC, Console, create_app
 from console.state import ALIVE_NS, STALE_NAMES, TIMING_OLD_NS, Watch, describe_machine
 from controller.inputs import BITS
 from controller.machine_inputs import STALE_BIT
@@ -77,9 +78,16 @@ def test_page_and_every_file_it_names_are_served_from_here(client):
     page = client.get("/")
     assert page.status_code == 200 and "STOP" in page.text
     assert "http://" not in page.text and "https://" not in page.text
-    for name in ("app.js", "scene.js", "plot.js", "style.css", "icon.svg", "vendor/three.module.min.js",
+    for name in ("app.js", "scene.js", "carrier.js", "plot.js", "style.css", "icon.svg", "vendor/three.module.min.js",
                  "vendor/three.core.min.js", "vendor/OrbitControls.js", "vendor/three.LICENSE.txt"):  # fmt: skip
         assert client.get(f"/static/{name}").status_code == 200, name
+
+
+@pytest.mark.parametrize("file", ["carrier.js", "map.js"])
+def test_the_page_is_told_all_that_it_draws_the_carrier_with(file):
+    told = describe_machine(load_profile("aoro_fc8"))["carrier"]
+    wanted = set(re.findall(r"\bc\.(\w+)", (STATIC / file).read_text()))
+    assert wanted and wanted <= set(told)
 
 
 def test_policy_allows_no_other_source(client):
