@@ -228,6 +228,8 @@ class Activity:
         command = grapple(self.phase, self._cycle.gathered, stows=self._first is Phase.STOW)
         if command is GrappleCommand.OPEN and self.phase is not Phase.OPEN:
             command = GrappleCommand.NEUTRAL if self._cycle.is_among_stakes(self._position()) else command
+        if self.phase is Phase.OPEN and self._tongs.pushed:
+            command = GrappleCommand.NEUTRAL
         self._tongs.tell(command, dt_s)
 
     # ------------------------------------------------------------------ what follows

@@ -34,6 +34,11 @@ _HELD_M: Final = 0.2
 """Thinner logs are held in tongs that have shut."""
 _NOTHING_KG: Final = 8.0
 """Less than the thinnest log weighs, half of it lying on others."""
+_EMPTY_KG: Final = 30.0
+"""What hangs in the tongs when they have let go, at most."""
+_PUSH_KG, _PUSH = 250.0, 1.5
+"""Tongs that bear more after that, and so many times what hung in them, push against logs or stakes and lift the crane;
+what only rebounds bears less."""
 _UNDER: Final = 0.85
 """The tips are under a log when they are nearer to each other than so much of its diameter."""
 _STILL_PCT, _STILL_S = 0.5, 0.8
@@ -103,7 +108,9 @@ class Tongs:
         self.command = GrappleCommand.HOLD
         self._profile, self._heard = profile, heard
         self._opening_s = self._close_from_s = self._still_s = 0.0
-        self._stood_pct = 0.0
+        self._stood_pct = self._held_kg = 0.0
+        self._let_go = self.pushed = False
+        """``pushed``: while opening they came to push against something; a load cell tells."""
 
     def tell(self, command: GrappleCommand, dt_s: float) -> None:
         """A command, from now on for so long."""
@@ -112,10 +119,23 @@ class Tongs:
         self._still_s += dt_s
         if abs(opening - self._stood_pct) > _STILL_PCT:
             self._stood_pct, self._still_s = opening, 0.0
+        self._feel(command)
         if command is GrappleCommand.OPEN:
             self._opening_s += dt_s
         elif command is not GrappleCommand.NEUTRAL:
             self._opening_s = 0.0
+
+    def _feel(self, command: GrappleCommand) -> None:
+        load_kg = self._heard.report.load_kg if self._heard.report is not None else 0.0
+        if command not in (GrappleCommand.OPEN, GrappleCommand.NEUTRAL):
+            self._held_kg, self._let_go, self.pushed = load_kg, False, False
+            return
+        self._let_go |= load_kg < _EMPTY_KG
+        self.pushed |= self._let_go and self._pushes
+
+    @property
+    def _pushes(self) -> bool:
+        return self._heard.report.load_kg > max(_PUSH_KG, _PUSH * self._held_kg)
 
     @property
     def open(self) -> bool:
@@ -163,8 +183,10 @@ class Tongs:
         return gripped(self._heard.report, closing_s)
 
     def released(self, grasp: Grasp, opening_s: float) -> bool:
-        """Whether they have left the logs of a grasp, ``opening_s`` after they were told to open there."""
-        return released(self._profile, self._heard.report, grasp, opening_s)
+        """Whether they have left the logs of a grasp, ``opening_s`` after they were told to open there, or opened until
+        they pushed against something, and do so no longer.
+        """
+        return not self._pushes if self.pushed else released(self._profile, self._heard.report, grasp, opening_s)
 
     def follow(self) -> float:
         """The pin is to follow them from now on: how long they have been closing, s; 0 where no sensor tells."""

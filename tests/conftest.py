@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +15,10 @@ from can_dbc.timing_page import STAGES, BusCounters, Facts, InputAge, ProcessCou
 
 settings.register_profile("no clock", deadline=None)  # how long an example takes is the host's affair, and no failure
 settings.load_profile("no clock")
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell starts so what it runs in the background, and the children of the tests would inherit it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def a_timing(count: int = 100, **facts: Any) -> Timing:

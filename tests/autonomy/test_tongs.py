@@ -12,6 +12,7 @@ from autonomy.grasp.direct import Grasp, travel_height
 from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm, Pose
 from autonomy.tongs import Tongs, among_stakes
+from can_dbc.setpoint import GrappleCommand
 from machine.grapple import tip_below_pin_m
 from machine.load import load_profile
 from machine.profile import Bunk
@@ -79,6 +80,32 @@ def test_tongs_tell_that_they_have_missed(
 )
 def test_shut_tongs_that_weigh_nothing_hold_nothing(state: int, load_kg: float, nothing: bool) -> None:
     assert tongs_at(0.0, state, load_kg).hold_nothing is nothing
+
+
+@pytest.mark.parametrize(
+    ("loads_kg", "pushed"),
+    [
+        ((80.0, 60.0, 10.0, 120.0, 357.0), True),  # a tip comes to bear on what lies beside
+        ((80.0, 60.0, 10.0, 120.0, 40.0), False),  # what was let go swings on
+        ((300.0, 310.0, 300.0), False),  # it still holds the bundle
+        ((300.0, 10.0, 400.0, 20.0), False),  # a bundle's rebound
+        ((nan, nan, nan), False),
+    ],
+)
+def test_opening_tongs_that_come_to_bear_push(loads_kg: tuple[float, ...], pushed: bool) -> None:
+    tongs = tongs_at(nan)
+    log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, 0.25)
+    grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0)
+    for load_kg, command in zip(loads_kg, ["HOLD", *["OPEN"] * 4], strict=False):
+        tongs._heard.report.load_kg = load_kg
+        tongs.tell(GrappleCommand[command], 0.05)
+    assert tongs.pushed is pushed
+    if pushed:
+        assert not tongs.released(grasp, 10.0), "they still do"
+        tongs._heard.report.load_kg = 90.0
+        assert tongs.released(grasp, 0.3)
+    tongs.tell(GrappleCommand.CLOSE, 0.05)
+    assert not tongs.pushed
 
 
 def tongs_at(opening_pct: float, state: int = 5, load_kg: float = nan) -> Tongs:

@@ -76,10 +76,12 @@ def judged(job: Job, mission: ForwardingMission, site: Site) -> dict[str, Any]:
                 "logs": [
                     {"place_m": [s.x_m, s.y_m, s.yaw_rad], "size_m": [s.length_m, s.diameter_m],
                      "detected": i in witness.known, "in_bunk": verdict.logs[i].in_bunk,
+                     "lies_m": [[round(v, 3) for v in at] for at in (lying[i].position_m, *lying[i].ends_m)],
                      "landed": not verdict.logs[i].in_bunk
                      and any(math.dist(lying[i].position_m[:2], at) < PILE_M for at in landings)}
                     for i, s in enumerate(site.logs)
                 ],
+                "base": plant.base_pose(),
                 "places": site.places,
                 "grasps": witness.grasps,
                 "path": witness.path,
