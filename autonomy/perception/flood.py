@@ -51,31 +51,37 @@ def flooded(wall: np.ndarray, foreground: np.ndarray) -> np.ndarray:
 
 
 def _flooded(wall: np.ndarray, foreground: np.ndarray) -> np.ndarray:
-    labels = np.zeros(wall.shape, np.int32)
+    at = np.flatnonzero(foreground)
+    height, label = wall.ravel()[at], np.zeros(len(at), np.int32)
     birth = [0.0]
+    water = np.zeros(foreground.shape, bool)
     for level in LEVELS:
-        pools, count = ndimage.label(foreground & (wall < level))
-        taken = labels > 0
-        pairs = np.unique(pools[taken].astype(np.int64) * len(birth) + labels[taken])
-        pool, label = pairs // len(birth), pairs % len(birth)
-        many, size = (np.bincount(of, minlength=count + 1) for of in (pool, pools.ravel()))
+        water.ravel()[at] = height < level
+        pools, count = ndimage.label(water)
+        pool = pools.ravel()[at]
+        taken = label > 0
+        pairs = np.unique(pool[taken].astype(np.int64) * len(birth) + label[taken])
+        of_pool, of_label = pairs // len(birth), pairs % len(birth)
+        many, size = (np.bincount(of, minlength=count + 1) for of in (of_pool, pool))
         into = np.zeros(count + 1, np.int32)  # what a pool's pixels are labelled
         new = 1 + np.flatnonzero((many[1:] == 0) & (size[1:] >= LEAST_CORE))
         into[new] = len(birth) + np.arange(len(new))
-        alone = many[pool] == 1
-        into[pool[alone]] = label[alone]
-        shallow: list[int] = []
+        alone = many[of_pool] == 1
+        into[of_pool[alone]] = of_label[alone]
+        forgotten = np.zeros(len(birth), bool)
         for meeting in np.flatnonzero(many > 1):
-            here = sorted(label[pool == meeting].tolist(), key=lambda i: birth[i])
+            here = sorted(of_label[of_pool == meeting].tolist(), key=lambda i: birth[i])
             low = [i for i in here[1:] if level - birth[i] < DEPTH]
-            shallow += low
+            forgotten[low] = True
             if len(low) == len(here) - 1:
                 into[meeting] = here[0]
-        labels[np.isin(labels, shallow)] = 0
+        label[forgotten[label]] = 0
         birth += [float(level)] * len(new)
-        fill = (labels == 0) & (pools > 0)
-        labels[fill] = into[pools[fill]]
-    if labels.any():
+        fill = (label == 0) & (pool > 0)
+        label[fill] = into[pool[fill]]
+    labels = np.zeros(wall.shape, np.int32)
+    labels.ravel()[at] = label
+    if label.any():
         nearest = tuple(ndimage.distance_transform_edt(labels == 0, return_distances=False, return_indices=True))
         patch, _ = ndimage.label(foreground, np.ones((3, 3)))
         rest = foreground & (labels == 0) & (patch[nearest] == patch)  # what is far from any valley is no log's

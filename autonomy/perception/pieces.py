@@ -26,16 +26,13 @@ LOOKS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A picture's foreground: maps (8, h, w), pixels (x, y) (N,) with their probabilities ``sure`` (N,), places and
-    votes (N, 2), arrows of the double angle (N, 2), the wall (h, w), the ends' chance (h, w), the foreground (h, w),
-    inverse depth (h, w) [1/m], NaN unknown; ``grain`` pixels count as one."""
+    """A picture's foreground: its pixels (x, y) (N,) and what is told of them, ``pixels`` (7, N): x, y, probability,
+    arrow of the double angle (2), vote (2); the wall (h, w), the ends' chance (h, w), the foreground (h, w), inverse
+    depth (h, w) [1/m], NaN unknown; ``grain`` pixels count as one."""
 
     x: np.ndarray
     y: np.ndarray
-    sure: np.ndarray
-    place: np.ndarray
-    votes: np.ndarray
-    double: np.ndarray
+    pixels: np.ndarray
     wall: np.ndarray
     ends: np.ndarray
     foreground: np.ndarray
@@ -65,29 +62,33 @@ class Piece:
 def scene(maps: np.ndarray, sure: np.ndarray, foreground: np.ndarray, inverse: np.ndarray | None, grain: int) -> Scene:
     """Of maps (8, h, w) whose mask's probabilities are ``sure`` (h, w)."""
     y, x = np.nonzero(foreground)
-    place = np.stack([x, y], axis=1).astype(np.float32)
-    votes = place + OFFSET_PX / STRIDE * maps[OFFSET_U : OFFSET_V + 1, y, x].T
-    double = maps[COS2 : SIN2 + 1, y, x].T
+    votes = OFFSET_PX / STRIDE * maps[OFFSET_U : OFFSET_V + 1, y, x]
+    pixels = np.stack([x, y, sure[y, x], *maps[COS2 : SIN2 + 1, y, x], x + votes[0], y + votes[1]]).astype(np.float32)
     depth = np.full(foreground.shape, np.nan, np.float32) if inverse is None else inverse
-    return Scene(x, y, sure[y, x], place, votes, double, wall(maps), sigmoid(maps[ENDS]), foreground, depth, grain)
+    return Scene(x, y, pixels, wall(maps), sigmoid(maps[ENDS]), foreground, depth, grain)
 
 
 def piece(scene: Scene, own: np.ndarray) -> Piece:
     """Of a scene's pixels ``own`` (n,)."""
-    place = scene.place[own]
-    middle = place.mean(axis=0)
-    away = place - middle
-    c, s = (scene.double[own] * scene.sure[own, None]).sum(axis=0)
-    angle = 0.5 * math.atan2(float(s), float(c))
-    told = np.array([math.cos(angle), math.sin(angle)])
-    spread, ways = np.linalg.eigh(away.T @ away / len(own))
-    axis = ways[:, 1].astype(float) if spread[1] > LEAST_TALL**2 * spread[0] else told
-    along, across = away @ axis, away[:, 1] * axis[0] - away[:, 0] * axis[1]
-    half = _quantile(np.abs(across - _median(across)), 0.9) + 0.5
-    slender = math.sqrt(max(float(spread[1]), 0.0) / (max(float(spread[0]), 0.0) + 0.1))
+    x, y, sure, c, s, *votes = scene.pixels.take(own, axis=1)
+    n = len(own)
+    angle = 0.5 * math.atan2(float(s @ sure), float(c @ sure))
+    axis = told = np.array([math.cos(angle), math.sin(angle)])
+    middle = np.array([float(x.sum()) / n, float(y.sum()) / n])
+    x, y = x - np.float32(middle[0]), y - np.float32(middle[1])
+    xx, xy, yy = float(x @ x) / n, float(x @ y) / n, float(y @ y) / n
+    mean, differ = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    thin, tall = max(mean - differ, 0.0), mean + differ
+    if tall > LEAST_TALL**2 * thin:
+        angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+        axis = np.array([math.cos(angle), math.sin(angle)])
+    to_east, to_south = np.float32(axis)
+    along, across = to_east * x + to_south * y, to_east * y - to_south * x
+    half = _quantile(np.abs(across - np.float32(_median(across))), 0.9) + 0.5
     line, rough = _line(along, scene.inverse[scene.y[own], scene.x[own]])
-    vote = np.array([_median(v) for v in scene.votes[own].T])
-    return Piece(own, middle, axis, told, half, float(along.min()), float(along.max()), slender, vote, line, rough)
+    low, high = float(along.min()), float(along.max())
+    vote = np.array([_median(v) for v in votes])
+    return Piece(own, middle, axis, told, half, low, high, math.sqrt(tall / (thin + 0.1)), vote, line, rough)
 
 
 def _line(along: np.ndarray, inverse: np.ndarray) -> tuple[tuple[float, float] | None, float]:
@@ -97,15 +98,20 @@ def _line(along: np.ndarray, inverse: np.ndarray) -> tuple[tuple[float, float] |
         return None, 0.0
     t, s = along[known], inverse[known]
     middle = _median(s)
-    if np.ptp(t) < LEAST_SLOPE_PX:
-        return (middle, 0.0), _median(np.abs(s - middle)) / middle
+    reach = _reach(t)
+    if reach < LEAST_SLOPE_PX:
+        return (middle, 0.0), _median(np.abs(s - np.float32(middle))) / middle
     slope, at = _straight(t, s)
-    error = np.abs(s - at - slope * t)
+    error = np.abs(s - np.float32(at) - np.float32(slope) * t)
     usual = _median(error)
     good = error <= 2.0 * usual
-    if np.ptp(t[good]) > 0.5 * np.ptp(t):
+    if _reach(t[good]) > 0.5 * reach:
         slope, at = _straight(t[good], s[good])
     return (at, slope), usual / middle
+
+
+def _reach(values: np.ndarray) -> float:
+    return float(values.max()) - float(values.min())
 
 
 def _median(values: np.ndarray) -> float:
@@ -128,9 +134,9 @@ def _quantile(values: np.ndarray, share: float) -> float:
 
 def _straight(t: np.ndarray, s: np.ndarray) -> tuple[float, float]:
     """Slope and value at 0 of the straight line through s (n,) over t (n,), by least squares."""
-    t0, s0 = float(t.mean()), float(s.mean())
-    away = t - t0
-    slope = float(away @ (s - s0)) / float(away @ away)
+    t0, s0 = float(t.sum()) / len(t), float(s.sum()) / len(s)
+    away = t - np.float32(t0)
+    slope = float(away @ (s - np.float32(s0))) / float(away @ away)
     return slope, s0 - slope * t0
 
 
@@ -139,15 +145,13 @@ def look(scene: Scene, one: Piece, touch_px: float, around: float, likeness: flo
     ``around``; ``likeness`` is the greatest chance that it and another one are one log."""
     own = one.own
     length, root = one.high - one.low + 1.0, math.sqrt(scene.grain)
-    stray = scene.votes[own] - one.vote
-    strays = (
-        _median(np.abs(stray @ one.axis)),
-        _median(np.abs(stray[:, 1] * one.axis[0] - stray[:, 0] * one.axis[1])),
-    )
-    arrows = scene.double[own]
-    told = float(np.hypot(*arrows.sum(axis=0)) / (np.hypot(*arrows.T).sum() + 1e-6))
+    _, _, sure, c, s, *votes = scene.pixels.take(own, axis=1)
+    east, south = votes[0] - np.float32(one.vote[0]), votes[1] - np.float32(one.vote[1])
+    to_east, to_south = np.float32(one.axis)
+    strays = _median(np.abs(to_east * east + to_south * south)), _median(np.abs(to_east * south - to_south * east))
+    told = math.hypot(float(c.sum()), float(s.sum())) / (float(np.hypot(c, s).sum()) + 1e-6)
     return np.array([
-        float(scene.sure[own].mean()),
+        float(sure.sum()) / len(own),
         0.3 * math.log(len(own) / scene.grain),
         0.3 * math.log(one.half / root),
         0.2 * min(one.slender, 20.0),
@@ -155,7 +159,7 @@ def look(scene: Scene, one: Piece, touch_px: float, around: float, likeness: flo
         told,
         min(4.0 * strays[0] / length, 3.0),
         min(strays[1] / one.half, 3.0),
-        float(scene.wall[scene.y[own], scene.x[own]].mean()),
+        float(scene.wall[scene.y[own], scene.x[own]].sum()) / len(own),
         around,
         min(touch_px / (2.0 * (length + 2.0 * one.half)), 1.0),
         likeness,

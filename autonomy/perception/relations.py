@@ -7,7 +7,7 @@ middle, and what lies between them lies before them.  All numbers are free of sc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -17,7 +17,9 @@ from autonomy.perception.pieces import Piece, Scene
 NEARER: Final = 1.03  # inverse depth of what hides a log, over the log's own
 GAP_PX: Final = 3.0
 GAP_LOOKS: Final = 12
+LOOK_AT: Final = np.arange(1, GAP_LOOKS + 1) / (GAP_LOOKS + 1.0)  # shares of a gap
 BESIDE, LEAN = 3.0, 0.1  # pieces further beside a line than so many half widths, and share of how far along, are apart
+UNKNOWN: Final = (np.nan, np.nan)
 LEAST_SEEN: Final = 0.6  # of a gap, that parts
 LEAST_END: Final = 0.5
 SLENDER: Final = 3.0  # a piece so many times longer than wide says itself how its depth goes on
@@ -29,48 +31,46 @@ RELATIONS: Final = (
 """What ``relations`` tells of two pieces, in this order."""
 
 
+def _columns(first: int, last: int | None = None) -> property:
+    return property(lambda row: row.numbers[:, first] if last is None else row.numbers[:, first:last])
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Pieces (n,) as arrays, their fields as in ``Piece``; ``count`` of pixels; the line of inverse depth as its value
-    at the middle and its slope, NaN unknown."""
+    """Pieces as ``numbers`` (n, 15), one array because many at a time are taken from it; the columns as the fields of
+    ``Piece``, ``count`` of pixels, and the line of inverse depth as its value at the middle and its slope, NaN unknown.
+    """
 
-    count: np.ndarray
-    middle: np.ndarray
-    axis: np.ndarray
-    told: np.ndarray
-    half: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    slender: np.ndarray
-    vote: np.ndarray
-    line_at: np.ndarray
-    line_slope: np.ndarray
+    numbers: np.ndarray
+
+    count = _columns(0)
+    middle = _columns(1, 3)
+    axis = _columns(3, 5)
+    told = _columns(5, 7)
+    half = _columns(7)
+    low = _columns(8)
+    high = _columns(9)
+    slender = _columns(10)
+    vote = _columns(11, 13)
+    line_at = _columns(13)
+    line_slope = _columns(14)
 
     @classmethod
     def of(cls, pieces: Sequence[Piece]) -> Row:
         """Of a list."""
-
-        def numbers(name: str) -> np.ndarray:
-            return np.array([getattr(p, name) for p in pieces], float)
-
-        lines = np.array([p.line or (np.nan, np.nan) for p in pieces], float).reshape(-1, 2)
-        return cls(
-            np.array([len(p.own) for p in pieces]),
-            *(numbers(name).reshape(-1, 2) for name in ("middle", "axis", "told")),
-            *(numbers(name) for name in ("half", "low", "high", "slender")),
-            numbers("vote").reshape(-1, 2),
-            *lines.T,
-        )
+        rows = [
+            (len(p.own), *p.middle, *p.axis, *p.told, p.half, p.low, p.high, p.slender, *p.vote, *(p.line or UNKNOWN))
+            for p in pieces
+        ]
+        return cls(np.array(rows, float).reshape(-1, 15))
 
     def put(self, place: int, piece: Piece) -> None:
         """Write a piece over the one at a place."""
-        one = Row.of([piece])
-        for f in fields(self):
-            getattr(self, f.name)[place] = getattr(one, f.name)[0]
+        self.numbers[place] = Row.of([piece]).numbers[0]
 
     def take(self, which: np.ndarray) -> Row:
         """Those of these places."""
-        return Row(*(getattr(self, f.name)[which] for f in fields(self)))
+        return Row(self.numbers[which])
 
 
 def relations(scene: Scene, big: Row, small: Row, touch_px: np.ndarray, between: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ def relations(scene: Scene, big: Row, small: Row, touch_px: np.ndarray, between:
     gap, thin = np.maximum(0.0, end - start), np.maximum(small.half, 1.0)
     ground, parted = np.zeros(len(gap)), gap > GAP_PX
     hidden, inverse, line = _gap(scene, big.take(parted), start[parted], end[parted])
-    ground[parted] = 1.0 - (hidden | (inverse > NEARER * line)).mean(axis=1)
+    ground[parted] = 1.0 - (hidden | (inverse > NEARER * line)).sum(axis=1) / GAP_LOOKS
     return np.stack([
         np.minimum(touch_px / (2.0 * np.minimum(small.half, big.half)), 3.0),
         between,
@@ -125,7 +125,7 @@ def may_be_one(scene: Scene, big: Row, small: Row, touch_px: np.ndarray) -> np.n
         may[k] = not (here.size and float(here.max()) > LEAST_END and end[k] - start[k] < small.half[k])
     ask = ask[may[ask] & (end - start > GAP_PX)[ask]]
     hidden, inverse, line = _gap(scene, big.take(ask), start[ask], end[ask])
-    may[ask] = (~hidden & (inverse < line / NEARER)).mean(axis=1) <= LEAST_SEEN
+    may[ask] = (~hidden & (inverse < line / NEARER)).sum(axis=1) <= LEAST_SEEN * GAP_LOOKS
     return may
 
 
@@ -144,7 +144,8 @@ def _depth_apart(big: Row, small: Row, along: np.ndarray) -> np.ndarray:
     miss = np.abs(big.line_at + big.line_slope * along - small.line_at) / np.maximum(small.line_at, 1e-3)
     turned = np.where(_dot(big.axis, small.axis) > 0.0, 1.0, -1.0)
     back = np.abs(small.line_at - turned * small.line_slope * along - big.line_at) / np.maximum(big.line_at, 1e-3)
-    return np.nan_to_num(np.where(small.slender > SLENDER, np.minimum(miss, back), miss))
+    apart = np.where(small.slender > SLENDER, np.minimum(miss, back), miss)
+    return np.where(np.isnan(apart), 0.0, apart)
 
 
 def _between(big: Row, small: Row, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -155,7 +156,7 @@ def _between(big: Row, small: Row, along: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _gap(scene: Scene, big: Row, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Along gaps (n, GAP_LOOKS): foreground, inverse depth, and that of the big piece's line, NaN unknown."""
-    at = np.linspace(start, end, GAP_LOOKS + 2, axis=1)[:, 1:-1]
+    at = start[:, None] + (end - start)[:, None] * LOOK_AT
     place = np.rint(big.middle[:, None] + at[..., None] * big.axis[:, None]).astype(int)
     row = np.clip(place[..., 1], 0, scene.foreground.shape[0] - 1)
     column = np.clip(place[..., 0], 0, scene.foreground.shape[1] - 1)
