@@ -155,6 +155,16 @@ def outline_and_depth(bodies: Bodies, rays: np.ndarray, first: int) -> tuple[np.
     return _outline(bodies, near.part(slice(first))), _depth(bodies, near.part(slice(first, None)))
 
 
+def places(body: Cylinder, rays: np.ndarray, first: int) -> np.ndarray:
+    """Where along the axis from its point (N,) [m] the first so many rays pass nearest to the body, and where the
+    others meet its surface."""
+    bodies = Bodies.of(body)
+    near = _Closest.of(bodies, rays)
+    met = _depth(bodies, near) * near.along - near.point
+    at = np.concatenate([near.place[0, :first], met[0, first:]])
+    return np.clip(at, body.start_m, body.end_m)
+
+
 def _outline(bodies: Bodies, near: _Closest) -> np.ndarray:
     dist, r, dist2 = np.sqrt(near.dist2), near.radius, near.dist2
     beyond = np.maximum(bodies.size[0] - near.place, near.place - bodies.size[1])

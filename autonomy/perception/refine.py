@@ -16,7 +16,16 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.perception.cylinder import MIN_PIXELS, Bodies, Cylinder, depth, outline, outline_and_depth, rays_of
+from autonomy.perception.cylinder import (
+    MIN_PIXELS,
+    Bodies,
+    Cylinder,
+    depth,
+    outline,
+    outline_and_depth,
+    places,
+    rays_of,
+)
 from autonomy.perception.estimate import END, START
 from machine.optics import Intrinsics
 
@@ -39,6 +48,10 @@ DEPTH_BEND, NEAR_BEND = 2.5, 1.5
 WIDE: Final = 6.0
 EXPLAINED: Final = 0.7  # share of the outline below which a fit is tried again
 GROWTH: Final = 0.006  # of the radius along a log [m/m], standard deviation; which end is the butt is not known
+BOW: Final = 0.018  # rise of a log's arch over its length, standard deviation in each direction
+STRAIGHT_M: Final = 1e-4
+LEAST_M: Final = 0.01  # radius
+BOWED: Final = 2  # steps from the straight log to the arch
 ITERATIONS: Final = 14
 SETTLED: Final = 0.02  # squared length of a step, in standard deviations, that is the last
 STEP: Final = 1e-3  # of the numerical derivatives [m, rad]
@@ -198,7 +211,7 @@ def _descended(problem: _Problem, body: Cylinder, forgive: float) -> Cylinder | 
             step = -np.linalg.solve(normal + damping * stiff * _EYE, gradient)
             step *= min(1.0, 1.0 / float((np.abs(step) / _REACH).max()))
             one = Bodies.around(body, step[None]).one(0)
-            if one.radius_m > 0.01 and one.length_m > 0.05 and one.center_m[2] > 0.1:
+            if one.radius_m > LEAST_M and one.length_m > 0.05 and one.center_m[2] > 0.1:
                 # With its neighbours: mostly it is taken, and these are wanted next.
                 raw = problem.residuals(Bodies.around(one, _STEPS), metres_px)
                 if problem.cost(raw[0], forgive) < cost:
@@ -330,21 +343,17 @@ class _Problem:
 
     def judged(self, body: Cylinder) -> Fit | None:
         """The fit with its covariance; None when the data do not determine it."""
-        around = Bodies.around(body, _STEPS)
-        residuals, jacobian, weights, _ = self.linearised(self.residuals(around, self.gradient(body)))
-        edge = residuals[: len(self.own)]
-        weights[: len(self.own)][~self.own] = 0.0  # what only has to be inside tells of no width
-        normal = jacobian.T @ (jacobian * weights[:, None])
-        try:
-            covariance = np.linalg.inv(normal)
-        except np.linalg.LinAlgError:
+        ends = self._ends(body)
+        rise_m = BOW * body.length_m if all(ends) else STRAIGHT_M  # what is not seen whole says little of an arch
+        found = self._arched(body, rise_m)
+        if found is None:
             return None
+        body, edge, covariance = found
         own = edge[self.own] * OUTLINE_SIGMA_PX
         misfit = float(np.sqrt(np.mean(np.minimum(own * own, 25.0))))
         covariance *= max(1.0, (misfit / OUTLINE_SIGMA_PX) ** 2)
         lasting = self._lasting(body)
         covariance[:7, :7] += np.diag(lasting**2)
-        ends = self._ends(body)
         for row, seen in zip((START, END), ends, strict=True):
             covariance[row, row] += 0.0 if seen else END_SIGMA_M**2  # whatever a few points of its sides pretend
         move = 0.5 * (body.start_m + body.end_m)
@@ -353,6 +362,40 @@ class _Problem:
         return Fit(
             body.centered(), shift @ covariance @ shift.T, ends, float(np.mean(np.abs(own) < 2.0)), misfit, lasting
         )
+
+    def _arched(self, body: Cylinder, rise_m: float) -> tuple[Cylinder, np.ndarray, np.ndarray] | None:
+        """The body as an arch whose rise has a standard deviation of ``rise_m``: the straight one that it is bent from,
+        residuals of the outline and covariance (8, 8); None when the data do not determine it."""
+        bow = np.zeros(2)
+        told = np.diag(np.repeat([0.0, rise_m**-2.0], [8, 2]))
+        try:
+            for _ in range(BOWED):
+                residuals, jacobian, weights = self._bowed(body, bow)
+                normal = jacobian.T @ (jacobian * weights[:, None]) + told
+                covariance = np.linalg.inv(normal)
+                step = -covariance @ (jacobian.T @ (weights * residuals) + told[:, 8:] @ bow)
+                bow = bow + step[8:]
+                step = step[:8] * min(1.0, 1.0 / float((np.abs(step[:8]) / _REACH).max()))
+                body = Bodies.around(body, step[None]).one(0)
+                if body.radius_m < LEAST_M:
+                    return None
+        except np.linalg.LinAlgError:
+            return None
+        return body, self._bowed(body, bow)[0][: len(self.own)], covariance[:8, :8]
+
+    def _bowed(self, body: Cylinder, bow: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals (N,), derivatives (N, 10) and weights (N,) of a body whose axis is an arch: ``bow`` (2,) [m] is its
+        rise across the view and along it.  Where a ray passes, it is the straight body moved aside."""
+        raw = self.residuals(Bodies.around(body, _STEPS), self.gradient(body))
+        half = 0.5 * body.length_m
+        at = (places(body, self.rays, len(self.own)) - body.start_m) / half - 1.0
+        arch = np.concatenate([1.0 / 3.0 - at * at, np.zeros(4)])  # its mean is 0: the middle of all of it stays
+        jacobian = (raw[1:] - raw[0]).T / STEP
+        jacobian = np.hstack([jacobian, jacobian[:, :2] * arch[:, None]])
+        raw = raw + jacobian[:, 8:] @ bow
+        weights = self.linearised(raw)[2]
+        weights[: len(self.own)][~self.own] = 0.0  # what only has to be inside tells of no width
+        return raw[0], jacobian, weights
 
     def _lasting(self, body: Cylinder) -> np.ndarray:
         """Bark and bow, a share of a pixel of outline, grass before the log, which draws depth nearer; and, seen along

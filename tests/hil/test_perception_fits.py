@@ -54,6 +54,15 @@ def test_with_exact_depth_a_log_is_found_to_a_centimetre(degrees: float) -> None
     assert fit.ends_seen == (True, True) and fit.explained > 0.98
 
 
+@pytest.mark.parametrize("sweep_m", [0.02, 0.04, 0.06])
+def test_the_middle_of_a_log_that_sags_is_found_though_a_straight_one_would_end_further_off(sweep_m: float) -> None:
+    log = replace(lying(1, 4.6, 0.2, 0.0), sweep_m=sweep_m)  # a straight one was found 6 and 10 cm off
+    truth = log.spine(40)[0].mean(axis=0)
+    (fit,), view, _ = fits_of(log)
+    miss = view.to_world(fit.body.center_m[None])[0] - truth
+    assert np.linalg.norm(miss) < 0.035, miss
+
+
 @pytest.mark.parametrize("degrees", [0.0, 45.0, 90.0])
 def test_claimed_uncertainty_covers_stereos_errors(degrees: float) -> None:
     log, view = lying(1, 4.6, 0.2, degrees), view_from()
