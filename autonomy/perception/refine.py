@@ -53,7 +53,7 @@ STRAIGHT_M: Final = 1e-4
 LEAST_M: Final = 0.01  # radius
 BOWED: Final = 2  # steps from the straight log to the arch
 ITERATIONS: Final = 14
-SETTLED: Final = 0.02  # squared length of a step, in standard deviations, that is the last
+SETTLED: Final = 0.1  # squared length of a step, in standard deviations, after which two more are enough
 STEP: Final = 1e-3  # of the numerical derivatives [m, rad]
 _EYE: Final = np.eye(8)
 _STEPS: Final = np.concatenate([np.zeros((1, 8)), STEP * _EYE])
@@ -344,8 +344,7 @@ class _Problem:
     def judged(self, body: Cylinder) -> Fit | None:
         """The fit with its covariance; None when the data do not determine it."""
         ends = self._ends(body)
-        rise_m = BOW * body.length_m if all(ends) else STRAIGHT_M  # what is not seen whole says little of an arch
-        found = self._arched(body, rise_m)
+        found = self._arched(body, all(ends))
         if found is None:
             return None
         body, edge, covariance = found
@@ -363,14 +362,14 @@ class _Problem:
             body.centered(), shift @ covariance @ shift.T, ends, float(np.mean(np.abs(own) < 2.0)), misfit, lasting
         )
 
-    def _arched(self, body: Cylinder, rise_m: float) -> tuple[Cylinder, np.ndarray, np.ndarray] | None:
-        """The body as an arch whose rise has a standard deviation of ``rise_m``: the straight one that it is bent from,
-        residuals of the outline and covariance (8, 8); None when the data do not determine it."""
-        bow = np.zeros(2)
-        told = np.diag(np.repeat([0.0, rise_m**-2.0], [8, 2]))
+    def _arched(self, body: Cylinder, whole: bool) -> tuple[Cylinder, np.ndarray, np.ndarray] | None:
+        """The body as an arch, or straight where it is not seen whole, which says little of an arch: the straight one
+        that it is bent from, residuals of the outline and covariance (8, 8); None when the data do not determine it."""
+        metres_px, bow = self.gradient(body), np.zeros(2)
+        told = np.diag(np.repeat([0.0, (BOW * body.length_m if whole else STRAIGHT_M) ** -2.0], [8, 2]))
         try:
             for _ in range(BOWED):
-                residuals, jacobian, weights = self._bowed(body, bow)
+                residuals, jacobian, weights = self._bowed(body, bow, metres_px)
                 normal = jacobian.T @ (jacobian * weights[:, None]) + told
                 covariance = np.linalg.inv(normal)
                 step = -covariance @ (jacobian.T @ (weights * residuals) + told[:, 8:] @ bow)
@@ -381,12 +380,15 @@ class _Problem:
                     return None
         except np.linalg.LinAlgError:
             return None
-        return body, self._bowed(body, bow)[0][: len(self.own)], covariance[:8, :8]
+        left = self.residuals(Bodies.of(body), metres_px)[0] + jacobian[:, 8:] @ bow
+        return body, left[: len(self.own)], covariance[:8, :8]
 
-    def _bowed(self, body: Cylinder, bow: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _bowed(
+        self, body: Cylinder, bow: np.ndarray, metres_px: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residuals (N,), derivatives (N, 10) and weights (N,) of a body whose axis is an arch: ``bow`` (2,) [m] is its
         rise across the view and along it.  Where a ray passes, it is the straight body moved aside."""
-        raw = self.residuals(Bodies.around(body, _STEPS), self.gradient(body))
+        raw = self.residuals(Bodies.around(body, _STEPS), metres_px)
         half = 0.5 * body.length_m
         at = (places(body, self.rays, len(self.own)) - body.start_m) / half - 1.0
         arch = np.concatenate([1.0 / 3.0 - at * at, np.zeros(4)])  # its mean is 0: the middle of all of it stays
