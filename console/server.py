@@ -41,7 +41,7 @@ from console.state import Watch, describe_machine
 from machine.profile import Profile
 
 PERIOD_S: Final = 0.05
-ASK_LOGS_S: Final = 0.5
+ASK_LOGS_S: Final = 0.1  # a log in the tongs is drawn where they are
 LOOK_AT_TIMING_S: Final = 1.0
 STATIC: Final = Path(__file__).with_name("static")
 

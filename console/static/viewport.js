@@ -28,7 +28,8 @@ export function createViewport(container, { nearest, farthest, sight }) {
     if (!w || !h) return;
     renderer.setSize(w, h);
     camera.aspect = w / h;
-    camera.fov = w > h ? 42 : 58;
+    // As wide as a crane reaches to both sides, in a tall panel too.
+    camera.fov = Math.max(42, 2 * Math.atan(0.58 * h / w) * 180 / Math.PI);
     camera.updateProjectionMatrix();
     draw();
   }).observe(container);
