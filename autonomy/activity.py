@@ -228,9 +228,10 @@ class Activity:
         command = grapple(self.phase, self._cycle.gathered, stows=self._first is Phase.STOW)
         if command is GrappleCommand.OPEN and self.phase is not Phase.OPEN:
             command = GrappleCommand.NEUTRAL if self._cycle.is_among_stakes(self._position()) else command
-        if self.phase is Phase.OPEN and self._tongs.pushed:
-            command = GrappleCommand.NEUTRAL
-        self._tongs.tell(command, dt_s)
+        if self.phase is Phase.OPEN:
+            self._tongs.let_go(dt_s)
+        else:
+            self._tongs.tell(command, dt_s)
 
     # ------------------------------------------------------------------ what follows
     def _proceed(self, now_ns: int) -> None:

@@ -107,35 +107,45 @@ class Tongs:
     def __init__(self, profile: Profile, heard: Heard) -> None:
         self.command = GrappleCommand.HOLD
         self._profile, self._heard = profile, heard
-        self._opening_s = self._close_from_s = self._still_s = 0.0
+        self._opening_s = self._close_from_s = self._still_s = self._calm_s = 0.0
         self._stood_pct = self._held_kg = 0.0
         self._let_go = self.pushed = False
         """``pushed``: while opening they came to push against something; a load cell tells."""
 
-    def tell(self, command: GrappleCommand, dt_s: float) -> None:
-        """A command, from now on for so long."""
+    def let_go(self, dt_s: float) -> None:
+        """Open, from now on for so long; once they push, back as far as they do so, and hold still."""
+        gives_way = self.pushed and self._pushes
+        back = GrappleCommand.CLOSE if gives_way else GrappleCommand.NEUTRAL
+        self.tell(back if self.pushed else GrappleCommand.OPEN, dt_s, gives_way)
+
+    def tell(self, command: GrappleCommand, dt_s: float, gives_way: bool = False) -> None:
+        """A command, from now on for so long; ``gives_way``: not to close, but to push no longer."""
         self.command = command
         opening = self._heard.report.opening_pct if self._heard.report is not None else 0.0
         self._still_s += dt_s
         if abs(opening - self._stood_pct) > _STILL_PCT:
             self._stood_pct, self._still_s = opening, 0.0
-        self._feel(command)
+        if gives_way or command in (GrappleCommand.OPEN, GrappleCommand.NEUTRAL):
+            self._feel(dt_s)
+        else:
+            self._held_kg, self._let_go, self.pushed = self._load_kg, False, False
         if command is GrappleCommand.OPEN:
             self._opening_s += dt_s
         elif command is not GrappleCommand.NEUTRAL:
             self._opening_s = 0.0
 
-    def _feel(self, command: GrappleCommand) -> None:
-        load_kg = self._heard.report.load_kg if self._heard.report is not None else 0.0
-        if command not in (GrappleCommand.OPEN, GrappleCommand.NEUTRAL):
-            self._held_kg, self._let_go, self.pushed = load_kg, False, False
-            return
-        self._let_go |= load_kg < _EMPTY_KG
+    def _feel(self, dt_s: float) -> None:
+        self._let_go |= self._load_kg < _EMPTY_KG
         self.pushed |= self._let_go and self._pushes
+        self._calm_s = 0.0 if self._pushes else self._calm_s + dt_s
+
+    @property
+    def _load_kg(self) -> float:
+        return self._heard.report.load_kg if self._heard.report is not None else 0.0
 
     @property
     def _pushes(self) -> bool:
-        return self._heard.report.load_kg > max(_PUSH_KG, _PUSH * self._held_kg)
+        return self._load_kg > max(_PUSH_KG, _PUSH * self._held_kg)
 
     @property
     def open(self) -> bool:
@@ -184,9 +194,9 @@ class Tongs:
 
     def released(self, grasp: Grasp, opening_s: float) -> bool:
         """Whether they have left the logs of a grasp, ``opening_s`` after they were told to open there, or opened until
-        they pushed against something, and do so no longer.
+        they pushed against something, gave way, and the crane has swung out.
         """
-        return not self._pushes if self.pushed else released(self._profile, self._heard.report, grasp, opening_s)
+        return self._calm_s > _STILL_S if self.pushed else released(self._profile, self._heard.report, grasp, opening_s)
 
     def follow(self) -> float:
         """The pin is to follow them from now on: how long they have been closing, s; 0 where no sensor tells."""

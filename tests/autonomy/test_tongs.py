@@ -101,8 +101,14 @@ def test_opening_tongs_that_come_to_bear_push(loads_kg: tuple[float, ...], pushe
         tongs.tell(GrappleCommand[command], 0.05)
     assert tongs.pushed is pushed
     if pushed:
-        assert not tongs.released(grasp, 10.0), "they still do"
+        tongs.let_go(0.05)
+        assert tongs.command is GrappleCommand.CLOSE and tongs.pushed and not tongs.released(grasp, 10.0)
         tongs._heard.report.load_kg = 90.0
+        for _ in range(10):
+            tongs.let_go(0.05)
+        assert tongs.command is GrappleCommand.NEUTRAL and not tongs.released(grasp, 10.0), "the crane still swings"
+        for _ in range(10):
+            tongs.let_go(0.05)
         assert tongs.released(grasp, 0.3)
     tongs.tell(GrappleCommand.CLOSE, 0.05)
     assert not tongs.pushed
