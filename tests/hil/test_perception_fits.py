@@ -9,11 +9,12 @@ from log_views import CAMERA, PIN, PROFILE, frame_of, lying, masks_of, scene_of,
 from scipy.ndimage import binary_erosion
 
 from autonomy.perception import paper_a
+from autonomy.perception.contour import Sensor, own_outline
 from autonomy.perception.cylinder import Bodies, Cylinder, across_view, depth, guess, outline, rays_of
 from autonomy.perception.frame import FrameRefused, Pose
 from autonomy.perception.merge import refused
 from autonomy.perception.pipeline import Perception
-from autonomy.perception.refine import Sensor, own_outline, refine
+from autonomy.perception.refine import refine
 from hil.experiments.log_localization.trial import TrueMask
 from sim.camera.scene import BUNK, SceneBuilder
 
