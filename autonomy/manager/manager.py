@@ -213,7 +213,7 @@ class Manager:
 
     def _danger(self) -> str:
         """Why a machine that drives must not drive on; empty while it may."""
-        if (strayed_m := self.outlook.strayed_m()) > STRAYED_M:
+        if (strayed_m := self.outlook.strayed_m) > STRAYED_M:
             return f"the machine has left its fence by {strayed_m:.1f} m; drive it back by hand, and see its route"
         if not self.ride.faithful and (log := self.outlook.in_the_way()) is not None:
             return f"log {log.number} lies in the way of the wheels; clear it away, or lead the route round it"

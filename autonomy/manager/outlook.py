@@ -73,6 +73,8 @@ class Outlook:
         self.list_ns = 0
         """When the newest list of logs was seen."""
         self.in_bunk, self.counted_ns = 0, 0
+        self.strayed_m = 0.0
+        """How far the front axle or the crane's foot is from where the fences let the machine drive; 0 inside."""
         self._carrier, self._bunk, self._ground_z_m = profile.carrier, profile.bunk, profile.workspace.ground_z_m
         self._localizer = Localizer(profile.carrier, plane)
         self._reach = Reach(Arm(profile), profile.carrier)
@@ -128,6 +130,8 @@ class Outlook:
                 self._bases.append((self.location.stamp_ns, Frames(self._carrier, self.location).base()))
                 if len(self._bases) == 1:
                     self._look_up()
+                places = np.array([(self.location.x_m, self.location.y_m), self.base.position_m[:2]])
+                self.strayed_m = float(self._area.outside_m(places).max())
 
     def _look_up(self) -> None:
         """What the mission says of places, in the plane that is now known: landings, fences, and logs that need not be
@@ -163,12 +167,6 @@ class Outlook:
         bearing = bearing_from_yaw(math.atan2(log.axis[1], log.axis[0]))
         kept = KnownLog(place, "", bearing, log.length_m, log.diameter_m, "", log.assortment, None, log.sigma_m)
         return Missed(log.number, kept, log.misses)
-
-    def strayed_m(self) -> float:
-        """How far the front axle or the crane's foot is from where the fences let the machine drive, m; 0 inside."""
-        assert self.location is not None
-        x, y, _ = self.base.position_m.tolist()
-        return float(self._area.outside_m(np.array([[self.location.x_m, self.location.y_m], [x, y]])).max())
 
     def in_the_way(self) -> FieldLog | None:
         """The first log that a front wheel would run into next."""
