@@ -90,14 +90,16 @@ class Yard:
         # Body axes -> log frame: the turn about y, and the log's origin seen from the centre of mass.
         self._turn = np.array([m.turn_rad for m in wood])
         self._com = np.array([m.com_m for m in wood]).reshape(-1, 3)
+        self.stowed: tuple[int, ...] = ()
         self._seen: list[Any] = [None] * len(self.logs)
         self._last: list[Any] = [None] * len(self.logs)
         self._size = np.array([(s.length_m, s.diameter_m, s.sweep_m) for s in self.scene]).reshape(-1, 3)
 
     def wake(self) -> None:
-        """Wake all logs; needed before a pose, a speed or a force is put on one from outside."""
-        for body in self.logs:
-            self._p.changeDynamics(body, -1, activationState=self._p.ACTIVATION_STATE_WAKE_UP)
+        """Wake all logs that are not stowed; needed before a pose, a speed or a force is put on one from outside."""
+        for i, body in enumerate(self.logs):
+            if i not in self.stowed:
+                self._p.changeDynamics(body, -1, activationState=self._p.ACTIVATION_STATE_WAKE_UP)
 
     def carry(self, which: int, east_m: float, north_m: float) -> None:
         """Someone takes a log, as it lies, to another place on level ground, by so much in the world."""

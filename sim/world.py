@@ -22,6 +22,7 @@ from sim.logs import Yard
 from sim.physics import new_client
 from sim.scene import LogSpec
 from sim.shape import UNIT, Vector
+from sim.stowage import Stowage
 from sim.terrain import Terrain
 from sim.truth import Truth, load_truth
 from sim.urdf import JointDef
@@ -101,6 +102,7 @@ class World:
         laden = mobile and any(log.in_bunk for log in scene)
         self._wait(CARRIER_SETTLE_STEPS if laden else HAND_OVER_STEPS)
         self._hand_over()
+        self.stowage = Stowage(p, self.crane, profile, GRAPPLE, self.yard, LOOK_STEPS * STEP_S) if mobile else None
         self._look()
 
     def _build(self) -> Body:
@@ -230,6 +232,8 @@ class World:
                 if -c[8] > self.max_penetration_m:
                     self.max_penetration_m = -c[8]
         self._touched, self.grip_n = touched, grip
+        if self.stowage is not None:
+            self.stowage.watch()
 
     def touched(self) -> list[bool]:
         """For each log, whether the crane touches it, not older than LOOK_STEPS steps."""
