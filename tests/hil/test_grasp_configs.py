@@ -10,13 +10,21 @@ from typing import Any
 import pytest
 
 from autonomy.logs import LogObservation
-from hil.experiments.grasp_configs.experiment import MACHINES, PAPER_ATTEMPTS, gather, jobs_of, machines_of
-from hil.experiments.grasp_configs.figures import FIGURES, SECTIONS
+from hil.experiments.grasp_configs.experiment import (
+    MACHINES,
+    PAPER_ATTEMPTS,
+    gather,
+    jobs_of,
+    machines_of,
+    published_ablation,
+)
+from hil.experiments.grasp_configs.figures import FIGURES, SECTIONS, sections
 from hil.experiments.grasp_configs.outcome import Grip, category, lies_on, lifted
 from hil.experiments.grasp_configs.poses import misled
 from hil.experiments.grasp_configs.trial import attempt
 from hil.experiments.pool import Job
 from hil.experiments.registry import Options
+from hil.experiments.result import judged
 from sim.logs import LogState
 from sim.scene import CONFIGURATIONS
 
@@ -110,6 +118,18 @@ def test_the_metrics_are_those_of_the_judged_pair_and_of_every_pair_by_name() ->
     assert [f.name for f in FIGURES if f.name in metrics and not f.holds(metrics[f.name])] == [
         "success", "success_wilson_low"
     ]  # fmt: skip
+
+
+def test_a_quick_look_keeps_the_published_ablation_and_tells_its_commit(tmp_path: Path) -> None:
+    pair = ("ours", "search")
+    assert published_ablation(None, pair) == published_ablation(tmp_path, pair) == ({}, "")
+    metrics = {"success": 0.5, "config1.success": 0.5, "ours.search.success": 0.5, "true.cnn.success": 0.9}
+    kept = {"true.cnn.success": 0.9}
+    for more, since in (({}, "new"), ({"ablation": "old"}, "old")):
+        saved = judged("grasp-configs", FIGURES, metrics, profile="palms_471", seed=1, trials=1, more=more)
+        replace(saved, commit="new").save(tmp_path / "results" / "grasp-configs.json")
+        assert published_ablation(tmp_path, pair) == (kept, since)
+    assert sections() == SECTIONS and sections("old")[:-1] == SECTIONS[:-1] and "`old`" in sections("old")[-1].text
 
 
 def test_every_pair_sees_the_same_scenes_and_the_first_gets_most() -> None:

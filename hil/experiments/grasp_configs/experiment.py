@@ -3,22 +3,25 @@
 The paper made 5 attempts with each of its 12 configurations.  Here ``--trials`` is how many attempts each configuration
 gets with our perception and our search (default 100: 1,200 attempts); the first 5 of each are the paper's 60, on the
 nominal machine, and the rest is made by that one and by calibrated individuals in turn.  The other pairs of the
-ablation get a twentieth, at least 5, on the nominal machine.
+ablation get a twentieth, at least 5, on the nominal machine.  ``--quick`` leaves them out; the page then keeps those
+that are published, and says of which commit they are.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
 from statistics import fmean, median
 from types import MappingProxyType
 from typing import Any, Final
 
 from rich.console import Console
 
-from hil.experiments import pool
+from hil.experiments import overview, pool
 from hil.experiments.calibration.individual import calibrated
-from hil.experiments.grasp_configs.figures import FIGURES, INTRODUCTION, SECTIONS
+from hil.experiments.grasp_configs.figures import FIGURES, INTRODUCTION, sections
 from hil.experiments.grasp_configs.outcome import ALL_LOGS, PILES
 from hil.experiments.grasp_configs.pictures import draw_chain, draw_table
 from hil.experiments.grasp_configs.poses import POSES
@@ -133,6 +136,16 @@ def of_trials(trials: Sequence[dict[str, Any]], prefix: str) -> dict[str, float]
     }
 
 
+def published_ablation(docs: Path | None, judged_pair: tuple[str, str]) -> tuple[dict[str, float], str]:
+    """The metrics of the other pairs that a folder of docs holds, and of which commit they are; ({}, "") for none."""
+    saved = None if docs is None else overview.results_in(docs).get("grasp-configs")
+    if saved is None:
+        return {}, ""
+    pairs = {".".join(pair) for pair in product(POSES, PLANNERS)} - {".".join(judged_pair)}
+    kept = {name: value for name, value in saved.metrics.items() if name.rpartition(".")[0] in pairs}
+    return kept, saved.environment.get("ablation", saved.commit) if kept else ""
+
+
 def _share(trials: Sequence[dict[str, Any]], category: str) -> float:
     up = [o for o in trials if o["lifted"] > 0]
     return _mean([float(o["category"] == category) for o in up])
@@ -156,14 +169,16 @@ def run(options: Options, console: Console) -> Result:
         machines = pool.run(calibrated, calibrations, kept, options.workers, "calibrations", console)
         jobs = jobs_of(options, pairs[:1] if options.quick else pairs, attempts, machines)
         outcomes = machines | pool.run(attempt, jobs, kept, options.workers, "grasping attempts", console)
+        kept_metrics, since = published_ablation(options.docs, pairs[0]) if options.quick else ({}, "")
+        more = {"truth": options.truth, "judged": " poses, ".join(pairs[0])} | ({"ablation": since} if since else {})
         result = judged(
-            "grasp-configs", FIGURES, gather(outcomes, pairs[0]), profile=options.profile, seed=options.seed,
-            trials=len(jobs), more={"truth": options.truth, "judged": " poses, ".join(pairs[0])}, paper=PAPER,
+            "grasp-configs", FIGURES, kept_metrics | gather(outcomes, pairs[0]), profile=options.profile,
+            seed=options.seed, trials=len(jobs), more=more, paper=PAPER,
         )  # fmt: skip
         draw_chain(options.out / "chain.png", options.profile, options.truth, FIRST_SEED)
         draw_table(options.out / "configurations.png", outcomes, ".".join(pairs[0]))
         _tell_failures(outcomes, ".".join(pairs[0]), console)
-        tell(result, "Grasping logs in twelve configurations", INTRODUCTION, SECTIONS, options, console)
+        tell(result, "Grasping logs in twelve configurations", INTRODUCTION, sections(since), options, console)
         kept.publish()
     return result
 

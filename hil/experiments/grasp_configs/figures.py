@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 from hil.experiments.report import Section
@@ -89,6 +90,17 @@ SECTIONS: Final = (
         (),
     ),
 )  # fmt: skip
+
+
+def sections(since: str = "") -> tuple[Section, ...]:
+    """The page's parts; ``since``: the commit at which the ablation was measured, where that is not the result's."""
+    *parts, ablation = SECTIONS
+    return (
+        *parts,
+        replace(ablation, text=f"{ablation.text} Measured before, at commit `{since}`.") if since else ablation,
+    )
+
+
 INTRODUCTION: Final = (
     "Paper A's grasping attempts on the virtual test-bed: camera, segmentation, plan, crane on the bus, lift. "
     "`timberhand experiment grasp-configs --docs docs` measures everything and writes this page; no number is typed."
