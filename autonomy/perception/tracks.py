@@ -22,6 +22,8 @@ ODD: Final = 4  # fits in a row beyond the gate after which a log is begun anew
 LOST: Final = 8  # pictures in a row without it after which it is given up
 INSIDE, PARALLEL, AS_LONG_M = 0.7, 0.94, 0.25
 """Two logs of a length, their axes nearer than this share of their radii's sum, 20 degrees askew at most, are one."""
+PIECE: Final = 0.5
+"""A shorter log whose axis is nearer to that of a longer one than this share of their radii's sum is a piece of it."""
 BAR: Final = 1e9  # a gap in the table of costs
 
 
@@ -32,12 +34,27 @@ def _lies_still(log: LogEstimate, fit: Fit) -> bool:
 
 def _are_one(log: LogEstimate, other: LogEstimate) -> bool:
     """Whether they would lie in each other, as two logs cannot."""
+    as_long = abs(log.length_m - other.length_m) < AS_LONG_M  # a piece of a log is no reason to forget the whole
+    return as_long and _lies_in(log, other, INSIDE)
+
+
+def _lies_in(log: LogEstimate, other: LogEstimate, share: float) -> bool:
+    """Whether a log's middle lies in another of its direction, its axis within a share of their radii's sum."""
     off = log.center_m - other.center_m
     along = float(off @ other.axis)
     apart_m = float(np.linalg.norm(off - along * other.axis))
-    inside = apart_m < INSIDE * 0.5 * (log.diameter_m + other.diameter_m) and abs(along) < 0.5 * other.length_m
-    as_long = abs(log.length_m - other.length_m) < AS_LONG_M  # a piece of a log is no reason to forget the whole
-    return inside and as_long and abs(float(log.axis @ other.axis)) > PARALLEL
+    inside = apart_m < share * 0.5 * (log.diameter_m + other.diameter_m) and abs(along) < 0.5 * other.length_m
+    return inside and abs(float(log.axis @ other.axis)) > PARALLEL
+
+
+def _whole(tracks: Sequence[Track]) -> tuple[Track, ...]:
+    """Those that are no piece of a longer one: a mask that fell apart shows one log twice, picture after picture."""
+
+    def is_piece(log: Track) -> bool:
+        one = log.estimate
+        return any(o.estimate.length_m > one.length_m and _lies_in(one, o.estimate, PIECE) for o in tracks)
+
+    return tuple(log for log in tracks if not is_piece(log))
 
 
 class Tracks:
@@ -76,7 +93,7 @@ class Tracks:
             log.update(fits[j], pose, stamp_ns)
             self._logs.append(log)
             self._next += 1
-        return tuple(log.track() for log in self._logs if log.hits >= CONFIRMED)
+        return _whole([log.track() for log in self._logs if log.hits >= CONFIRMED])
 
     def _paired(self, fits: Sequence[Fit], pose: Pose) -> tuple[dict[int, int], set[int]]:
         """Which fit is nearest to which log, and which logs theirs agrees with."""

@@ -181,6 +181,22 @@ def test_a_piece_of_a_log_is_no_reason_to_forget_the_whole() -> None:
     assert whole.length_m == pytest.approx(2.0, abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("center", "length", "count"),
+    [
+        ((5.0, 0.3, 0.12), 1.4, 1),  # a piece of it
+        ((5.0, 0.3, 0.32), 1.4, 2),  # on it, seen a little too low
+        ((5.25, 0.3, 0.12), 1.4, 2),  # beside it
+        ((5.0, 1.8, 0.12), 1.4, 2),  # before its end
+    ],
+)
+def test_a_piece_of_a_log_that_is_seen_beside_the_whole_is_no_log(center, length: float, count: int) -> None:
+    tracks, pose = Tracks(QUIET), pose_at()
+    for k in range(3):
+        found = tracks.step([fit_of(pose, (5.0, 0.0, 0.12)), fit_of(pose, center, length=length)], pose, k)
+    assert [t.id for t in found] == [1, 2][:count]
+
+
 @settings(max_examples=40)
 @given(st.floats(-0.4, 0.4), st.floats(-3.1, 3.1), st.floats(0.0, 2.0))
 def test_where_the_camera_stands_does_not_matter_to_an_exact_fit(yaw: float, log_yaw: float, moved: float) -> None:
