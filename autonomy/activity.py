@@ -254,6 +254,9 @@ class Activity:
         ):
             self._arrived_ns = now_ns
         gathers = self.phase is Phase.LIFT and self._cycle.gathered
+        if gathers and self._cycle.slid_off(self._tongs, self._position()):
+            self._anew = Phase.ABOVE
+            return
         if self.phase in (Phase.LIFT, Phase.CARRY) and self._direct and not gathers:
             self._watch(now_ns)
             if self._anew is not None or self.phase is Phase.FAILED:

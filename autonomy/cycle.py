@@ -35,6 +35,8 @@ from machine.sag import sane_load_kg
 ATTEMPTS: Final = 3
 LOOKS: Final = 2
 """So often a grasp is chosen again from over it."""
+WEIGHS_M: Final = 0.2
+"""What is gripped weighs in tongs that have risen so far, half of it at least."""
 _SAME_M, _SAME_RAD = 0.02, 0.03
 """Grasps that differ by less are gone down to from the same place."""
 _LOOSE_M: Final = 0.2
@@ -114,8 +116,21 @@ class Cycle:
         assert self.grasp is not None
         following, self.grasp = self._regrip.after_closing(self.grasp, tongs)
         if following is Phase.ABOVE:
-            self._looks = min(self._looks, LOOKS - 1)  # the tongs have stirred the logs
+            self._look_again()
         return following
+
+    def slid_off(self, tongs: Tongs, q: Axes) -> bool:
+        """Whether tongs that begin to rise are seen to hold nothing: the grasp is to be begun anew, from above."""
+        assert self.grasp is not None
+        anew = self._regrip.after_rising(self.grasp, tongs) if WEIGHS_M < self.risen_m(q) < LIFT_M else None
+        if anew is None:
+            return False
+        self.grasp = anew
+        self._look_again()
+        return True
+
+    def _look_again(self) -> None:
+        self._looks = min(self._looks, LOOKS - 1)  # the tongs have stirred the logs
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
         """The motion of a phase that begins at ``q``, with the grasp and the place as they are now seen to be best.

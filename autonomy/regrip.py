@@ -3,8 +3,9 @@
 Tongs that stall too wide open clasp the sides of a heap: they close again higher up, round what lies on top.  Those
 that pinch the upper half of a log in a row drag it out, and close on it there.  Those that shut on nothing open, and
 the logs are looked at from above once more; where they slid over a row that was too wide for them, a log at its end is
-taken then.  Only of what a camera measured: what is told exactly lies where it is said to, and without a sensor of
-their opening nobody knows.
+taken then.  The same where they turn out to be shut and to weigh nothing as soon as they rise: they slid off, or a thin
+log that might have been in them is not.  Only of what a camera measured: what is told exactly lies where it is said to,
+and without a sensor of their opening nobody knows.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ class Regrip:
         wide = self.climbs < CLIMBS and tongs.are_wide(grasp, self.climbs)
         # Higher up there may be a thin log that nobody saw, which shut tongs hold: its weight tells.
         vain = tongs.hold_nothing if self.climbs else tongs.have_missed(grasp)
+        if self.climbs and tongs.empty and not tongs.still:
+            return None, grasp  # the crane still swings, and its load with it
         missed = vain and self.begun < ANEW
         if not wide and not missed:
             return Phase.LIFT, grasp
@@ -50,9 +53,17 @@ class Regrip:
             return Phase.DESCEND, replace(grasp, pose=pose, support_z_m=grasp.support_z_m + CLIMB_M)
         if grasp.drawn and not grasp.drags and not tongs.empty:
             return Phase.CLOSE, replace(grasp, drags=True)
+        return Phase.ABOVE, self._anew(grasp)
+
+    def after_rising(self, grasp: Grasp, tongs: Tongs) -> Grasp | None:
+        """The grasp, to be begun anew, where the tongs hold nothing that would weigh by now; None where they may."""
+        empty = measured(grasp) and tongs.still and tongs.hold_nothing
+        return self._anew(grasp) if empty and self.begun < ANEW else None
+
+    def _anew(self, grasp: Grasp) -> Grasp:
         self.stubborn += _inside(grasp) if self.climbs else (grasp.log.id,) if grasp.drawn else ()
         self.begun, self.climbs = self.begun + 1, 0
-        return Phase.ABOVE, replace(grasp, drags=False)
+        return replace(grasp, drags=False)
 
 
 def _inside(grasp: Grasp) -> tuple[int, ...]:

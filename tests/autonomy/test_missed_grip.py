@@ -12,7 +12,7 @@ from grasp_scenes import GROUND, PROFILE, log, measured, pair
 
 from autonomy.activity import Activity
 from autonomy.course import DRAG_M
-from autonomy.grasp.direct import Planned
+from autonomy.grasp.direct import LIFT_M, Planned
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.search import Search
 from autonomy.logs import LogObservation
@@ -76,6 +76,31 @@ def test_what_nobody_measured_or_may_be_in_shut_tongs_is_lifted_as_it_is(known_h
     if known_how == "blind":
         crane.misses = 0  # nobody tells
     assert phases_until_lifted(crane).count(Phase.CLOSE) == 1
+
+
+class Weighed(Slipping):
+    """With a load cell: tongs that shut on nothing weigh ``empty_kg`` as they rise."""
+
+    empty_kg = 1.0
+
+    @property
+    def load_kg(self) -> float:
+        """What it shows."""
+        return self.empty_kg if self.gripped and self._closings <= self.misses else super().load_kg
+
+
+@pytest.mark.parametrize(("empty_kg", "anew"), [(1.0, True), (12.0, False)])
+def test_shut_tongs_that_weigh_nothing_as_they_rise_are_sent_anew(empty_kg: float, anew: bool) -> None:
+    crane = Weighed(PROFILE, [replace(log, diameter_m=0.15) for log in pair()], log_kg=40.0)
+    crane.empty_kg = empty_kg
+    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(Search()))
+    crane.until(planner, Phase.LIFT)
+    low = crane.pin()[2]
+    while planner.phase is Phase.LIFT and crane.pin()[2] < low + LIFT_M:
+        crane.step(planner)
+    assert planner.phase is (Phase.ABOVE if anew else Phase.LIFT)
+    if anew:
+        assert crane.until(planner, Phase.LIFT) == [Phase.ABOVE, Phase.DESCEND, Phase.CLOSE, Phase.LIFT]
 
 
 class Pinching(Slipping):

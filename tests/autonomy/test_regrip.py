@@ -72,6 +72,21 @@ def test_shut_tongs_higher_up_may_hold_a_thin_log_that_nobody_saw() -> None:
     assert regrip.after_closing(now, Told(missed=True, empty=True))[0] is Phase.LIFT
 
 
+def test_shut_tongs_higher_up_are_weighed_once_the_crane_swings_no_more() -> None:
+    regrip = Regrip()
+    _, now = regrip.after_closing(grasp(), Told(wide=True))
+    assert regrip.after_closing(now, Told(empty=True, still=False))[0] is None, "its load swings, too"
+    assert regrip.after_closing(now, Told(empty=True, hold_nothing=True))[0] is Phase.ABOVE
+
+
+def test_what_weighs_nothing_as_it_rises_is_begun_anew_as_often_as_what_shut_on_nothing() -> None:
+    regrip, empty = Regrip(), Told(empty=True, hold_nothing=True)
+    assert regrip.after_rising(grasp(), Told()) is None
+    assert regrip.after_rising(grasp(), Told(hold_nothing=True, still=False)) is None, "they may close on it yet"
+    assert regrip.after_rising(grasp(measured=False), empty) is None
+    assert [regrip.after_rising(grasp(), empty) is not None for _ in range(ANEW + 1)] == [True] * ANEW + [False]
+
+
 def row(*across_m: float) -> Grasp:
     first, *others = (replace(grasp().log, id=i, center_m=(0.0, 4.0 + y, -1.2)) for i, y in enumerate(across_m, 1))
     return replace(grasp(), log=first, others=tuple(others))
