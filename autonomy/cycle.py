@@ -37,6 +37,9 @@ LOOKS: Final = 2
 """So often a grasp is chosen again from over it."""
 WEIGHS_M: Final = 0.2
 """What is gripped weighs in tongs that have risen so far, half of it at least."""
+WEDGE_M: Final = 0.1
+"""Open tongs that draw a log are pressed in beside it so much lower than others begin to close: those sweep down from
+0.15 m over the ground or more, and would slide over the log before they are beside its middle."""
 _SAME_M, _SAME_RAD = 0.02, 0.03
 """Grasps that differ by less are gone down to from the same place."""
 _LOOSE_M: Final = 0.2
@@ -156,7 +159,8 @@ class Cycle:
                 return above(arm, self._motions, start, grasp, logs)
             case Phase.DESCEND:
                 self.grasp = grasp = aimed(arm, grasp, logs)
-                return straight(arm, start, grasp.pose)
+                deeper_m = WEDGE_M if grasp.drawn else 0.0
+                return straight(arm, start, grasp.pose.at_height(grasp.pose.z_m - deeper_m))
             case Phase.CLOSE:
                 return dragging(arm, start, grasp) if grasp.drags else closing(arm, start, grasp, closing_s)
             case Phase.LIFT:

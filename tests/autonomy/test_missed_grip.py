@@ -12,6 +12,7 @@ from grasp_scenes import GROUND, PROFILE, log, measured, pair
 
 from autonomy.activity import Activity
 from autonomy.course import DRAG_M
+from autonomy.cycle import WEDGE_M
 from autonomy.grasp.direct import LIFT_M, Planned
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.search import Search
@@ -20,6 +21,7 @@ from autonomy.motion.arm import Arm
 from autonomy.phases import Phase
 from autonomy.regrip import ANEW
 from can_dbc.setpoint import GrappleCommand, StateReport
+from machine.grapple import tip_below_pin_m
 from machine.load import profile_hash
 
 SHUT, HOLDING = 4, 5
@@ -132,10 +134,22 @@ def test_a_log_that_is_pinched_in_its_row_is_dragged_out_and_gripped_there() -> 
     crane.until(planner, Phase.LIFT)
     pins = [m.pin for m in crane.trace if m.phase == "CLOSE"]
     assert pins[-1][1] - pins[0][1] == pytest.approx(DRAG_M, abs=0.03), "away from the others"
-    assert abs(pins[-1][2] - pins[0][2]) < 0.15 and abs(pins[-1][0] - pins[0][0]) < 0.05
+    assert abs(pins[-1][2] - pins[0][2] - WEDGE_M) < 0.15 and abs(pins[-1][0] - pins[0][0]) < 0.05
     for _ in range(60):
         crane.step(planner)
     assert crane.pin()[1] == pytest.approx(pins[-1][1], abs=0.03), "it goes up from there"
+
+
+def test_tongs_that_draw_a_log_go_in_beside_it_before_they_close() -> None:
+    pair_of = [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)]
+    over = {}
+    for draws in (True, False):
+        crane, chooser = Pinching(PROFILE, pair_of), lambda *args, d=draws: replace(drawing(*args), drawn=d)
+        crane.until(Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(chooser)), Phase.CLOSE)
+        tip = crane.pin()[2] - tip_below_pin_m(PROFILE.grapple.tongs, crane.tong_rad)
+        over[draws] = tip - GROUND
+    assert 0.02 < over[True] < 0.1, "under the middle of the log, and over the ground"
+    assert over[False] > 0.15, "they sweep deeper as they close"
 
 
 def test_what_is_pinched_still_after_the_drag_is_looked_at_anew() -> None:
