@@ -68,10 +68,11 @@ SECTIONS: Final = (
         "from its sentences). One grasp, lifted and held for two seconds; physics alone judges. The camera's mount "
         "and scale of depth are surveyed before the run. Logs are seen from where the crane stands at first; where "
         "a grasp is of logs among others, ours looks again from above it, twice at most, and plans anew. What the "
-        "tongs tell before the lift is used, too: where they stall at the sides of a heap, or wider than what they "
-        "are to hold, they open again and close higher up, three times at most; where they have shut on nothing or "
-        "pinch a log that they were to be under, they open, look again and are sent anew, twice at most. That "
-        "counts as the same attempt; how many needed no second closing is told beside it.",
+        "tongs tell before anything is lifted is used, too: where they stall at the sides of a heap, or wider than "
+        "what they are to hold, they open again and close higher up, three times at most; where they have shut on "
+        "nothing or pinch a log that they were to be under, or turn out to be shut and to weigh nothing when they "
+        "have risen by 0.2 m, they open, look again and are sent anew, twice at most. That counts as the same "
+        "attempt; how many needed no second closing is told beside it.",
         JUDGED,
         (("chain.png", "As paper A's Fig. 5: the pile, the virtual depth picture with the grasp of the search, "
           "the network's quality with its grasp."),),
