@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -17,7 +17,9 @@ from autonomy.training.labels import ID, IGNORED, Labelled
 from autonomy.training.loop import Schedule, train
 from autonomy.training.segmentation import Picture, changed
 
-CROP_PX: Final = 256
+CROPS: Final = ((256, 1.0), (512, 0.25))
+"""Sizes of the windows of small and of large pictures [px] and their share of a batch's pictures: a log that is longer
+than its window teaches nothing of where it ends."""
 CORE: Final = 0.5  # cells whose spot is higher than this learn the box's sides
 SIDE_SHARE: Final = 1.0
 LEAST_PX: Final = 20
@@ -66,23 +68,31 @@ def loss(net: torch.nn.Module, images: torch.Tensor, maps: torch.Tensor, weights
 
 
 def run(
-    picture: Picture, count: int, schedule: Schedule, size: int, seed: int, checkpoint: Path | None, console: Console
+    sources: Sequence[tuple[Picture, int]],
+    schedule: Schedule,
+    size: int,
+    seed: int,
+    checkpoint: Path | None,
+    console: Console,
 ) -> tuple[TorchNet, list[float]]:
-    """Train on ``count`` pictures in batches of ``size``; the net and the loss of every step."""
+    """Train on ``sources``, small pictures and, where there are any, large ones, each with their number, in batches of
+    ``size``; the net and the loss of every step."""
     net = random_net(box_net(), seed).to(memory_format=torch.channels_last)
-    what = f"boxes, {count} pictures, batch {size}, seed {seed}"
-    losses = train(net, batches(picture, count, size, seed), loss, schedule, checkpoint, what, "boxes of logs", console)
+    what = f"boxes, {' and '.join(str(count) for _, count in sources)} pictures, batch {size}, seed {seed}"
+    losses = train(net, batches(sources, size, seed), loss, schedule, checkpoint, what, "boxes of logs", console)
     return net.eval(), losses
 
 
-def batches(picture: Picture, count: int, size: int, seed: int) -> Callable[[int], tuple[torch.Tensor, ...]]:
-    """Batch of a step from ``count`` pictures."""
+def batches(sources: Sequence[tuple[Picture, int]], size: int, seed: int) -> Callable[[int], tuple[torch.Tensor, ...]]:
+    """Batch of a step, of the sources in turn."""
 
     def batch(step: int) -> tuple[torch.Tensor, ...]:
         rng = np.random.default_rng([seed, step])
+        turn = step % len(sources)
+        (picture, count), (crop_px, share) = sources[turn], CROPS[turn]
         rows = []
-        for index in rng.integers(0, count, size):
-            sample = changed(picture(int(index)), rng, CROP_PX)
+        for index in rng.integers(0, count, max(2, round(share * size))):
+            sample = changed(picture(int(index)), rng, crop_px)
             rows.append((colour(sample.rgb), *targets(sample)))
         images, maps, weights = (torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True))
         return images.contiguous(memory_format=torch.channels_last), maps, weights

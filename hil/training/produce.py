@@ -11,10 +11,10 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from autonomy.networks.weights import load
+from autonomy.networks.weights import WeightsRefused, load
 from autonomy.perception.detector import box_net
 from autonomy.perception.finder import LogFinder
-from autonomy.perception.network import unet
+from autonomy.perception.network import CHANNELS, unet
 from autonomy.training import boxes
 from autonomy.training.card import Card, write
 from autonomy.training.labels import ID, Labelled
@@ -68,7 +68,7 @@ def produce(variant: str, plan: Plan, folder: Path, out: Path, console: Console)
     Raises:
         WeightsRefused: the weights to start from are missing, damaged or of another network.
     """
-    start = load(plan.start, unet(variant))[0] if plan.start else None
+    start = begun(plan.start, variant) if plan.start else None
     source = ready(folder, plan.count, console)
     some, count = (mixed(source, plan, folder, console), 2 * plan.count) if plan.large else (source, plan.count)
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
@@ -77,17 +77,38 @@ def produce(variant: str, plan: Plan, folder: Path, out: Path, console: Console)
     return ship(variant, net.arrays(), losses, plan, source, out)
 
 
+def begun(weights: Path, variant: str) -> dict[str, np.ndarray]:
+    """The arrays of a file to start from: one of the same variant, or for ``depth`` one of ``rgbd``, without what looks
+    at colours.
+
+    Raises:
+        WeightsRefused: as ``load``.
+    """
+    try:
+        return load(weights, unet(variant))[0]
+    except WeightsRefused:
+        if variant != "depth":
+            raise
+    arrays = load(weights, unet("rgbd"))[0]
+    first = unet(variant).layers[0].name
+    return arrays | {f"{first}.weight": arrays[f"{first}.weight"][:, -CHANNELS[variant] :]}
+
+
 def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path:
     """Paper B's detector in its role, in the same way (always from scratch).  Returns the card's path."""
     source = ready(folder, plan.count, console)
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
     kept = out.with_suffix(".checkpoint")
-    net, losses = boxes.run(source, plan.count, schedule, BATCH, plan.seed, kept, console)
+    sources = [(source, plan.count)]
+    if plan.large:
+        sources.append((large(plan, folder, console), plan.large))
+    net, losses = boxes.run(sources, schedule, BATCH, plan.seed, kept, console)
     card = Card(
         "Boxes of logs in colour pictures",
         "Letterboxed colour picture of 608 x 608 px in, boxes of logs out: the role of paper B's YOLOv3 (3.2.2).",
-        f"{plan.count} pictures drawn by the analytic renderer of settled piles (hil.training); nothing photographed",
-        plan.words(str(boxes.CROP_PX)),
+        f"{plan.count + plan.large} pictures drawn by the analytic renderer of settled piles (hil.training); nothing "
+        "photographed",
+        plan.words(" and ".join(str(crop) for (crop, _), _ in zip(boxes.CROPS, sources, strict=False))),
         plan.seed,
         {"loss, mean of the last 100 steps": f"{np.mean(losses[-100:]):.4f}"},
         "photographs: its colours are drawn. How it does on worlds that are drawn otherwise is in docs/detector.md.",
@@ -104,9 +125,15 @@ def ready(folder: Path, count: int, console: Console) -> Callable[[int], Labelle
 
 def mixed(small: Callable[[int], Labelled], plan: Plan, folder: Path, console: Console) -> Callable[[int], Labelled]:
     """Small and large pictures in turn, the large ones drawn where they are missing."""
+    some = large(plan, folder, console)
+    return lambda i: some(i // 2 % plan.large) if i % 2 else small(i // 2)
+
+
+def large(plan: Plan, folder: Path, console: Console) -> Callable[[int], Labelled]:
+    """The large pictures of a plan by their number, drawn where they are missing."""
     _draw(folder, range(FIRST_LARGE, FIRST_LARGE - (-plan.large // samples.SHARD)), LARGE_PX, console)
-    large, first = pictures(folder, LARGE_PX), FIRST_LARGE * samples.SHARD
-    return lambda i: large(first + i // 2 % plan.large) if i % 2 else small(i // 2)
+    source, first = pictures(folder, LARGE_PX), FIRST_LARGE * samples.SHARD
+    return lambda i: source(first + i)
 
 
 def _draw(folder: Path, numbers: Sequence[int], size_px: int, console: Console) -> None:

@@ -63,7 +63,14 @@ def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
 
 
 def test_a_few_steps_learn(monkeypatch):
-    monkeypatch.setattr(boxes, "CROP_PX", 64)
+    monkeypatch.setattr(boxes, "CROPS", ((64, 1.0),))
     samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 60, 14), size=160) for i in range(4)]
-    _, losses = run(samples.__getitem__, 4, Schedule(10, 3e-3), 2, 5, None, Console(stderr=True, quiet=True))
+    _, losses = run([(samples.__getitem__, 4)], Schedule(10, 3e-3), 2, 5, None, Console(stderr=True, quiet=True))
     assert np.mean(losses[-3:]) < 0.8 * np.mean(losses[:2])
+
+
+def test_small_and_large_pictures_give_batches_in_turn():
+    small, large = ([picture(((90.0, 80.0), 0.3, 60, 14), size=size)] for size in (304, 608))
+    batch = boxes.batches([(small.__getitem__, 1), (large.__getitem__, 1)], 8, 5)
+    assert [batch(step)[0].shape for step in (0, 1, 2)] == [(8, 3, 256, 256), (2, 3, 512, 512), (8, 3, 256, 256)]
+    assert batch(1)[1].shape == (2, 5, 64, 64)

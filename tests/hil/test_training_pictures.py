@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from autonomy.networks.weights import load
+from autonomy.networks.torch_net import random_net
+from autonomy.networks.weights import WeightsRefused, load, save
 from autonomy.perception.detector import BoxFinder
 from autonomy.perception.finder import LogFinder
 from autonomy.perception.network import unet
@@ -159,8 +160,8 @@ def test_weights_come_with_a_card_and_find_logs_by_themselves(few, monkeypatch):
     assert "mAP@0.5" in card.read_text() and "timberhand train segmentation --variant depth" in card.read_text()
     assert LogFinder("depth", out).facts["seed"] == "1"
     boxes = few / "log_boxes.safetensors"
-    produce.produce_boxes(produce.Plan(2, 2, 1), few, boxes, Console(quiet=True))
-    assert BoxFinder(boxes).facts["command"].startswith("timberhand train detector")
+    produce.produce_boxes(produce.Plan(2, 2, 1, large=2), few, boxes, Console(quiet=True))
+    assert BoxFinder(boxes).facts["command"].startswith("timberhand train detector --pictures 2 --large 2")
     on = produce.Plan(2, 1, 1, 1e-6, out)
     text = produce.produce("depth", on, few, few / "on.safetensors", Console(quiet=True)).read_text()
     assert "begun with logs_depth.safetensors" in text
@@ -168,6 +169,20 @@ def test_weights_come_with_a_card_and_find_logs_by_themselves(few, monkeypatch):
         load(few / f"{name}.safetensors", unet("depth"))[0]["maps.weight"] for name in ("logs_depth", "on")
     )
     assert np.abs(before - after).max() < 1e-4
+
+
+def test_the_depth_variant_begins_with_what_colour_and_depth_were_looked_at_with(tmp_path):
+    """Its first layer has the depth's part of the other's; other networks than these are refused as they were."""
+    both, alone = tmp_path / "logs_rgbd.safetensors", tmp_path / "logs_depth.safetensors"
+    arrays = random_net(unet("rgbd"), 1).arrays()
+    save(both, unet("rgbd"), arrays, {})
+    taken = produce.begun(both, "depth")
+    assert np.array_equal(taken["in2.weight"], arrays["in2.weight"][:, 3:])
+    assert all(np.array_equal(taken[k], arrays[k]) for k in arrays if k != "in2.weight")
+    save(alone, unet("depth"), taken, {})
+    assert np.array_equal(produce.begun(alone, "depth")["in2.weight"], taken["in2.weight"])
+    with pytest.raises(WeightsRefused, match="logs_rgbd"):
+        produce.begun(alone, "rgbd")
 
 
 def test_small_and_large_pictures_come_in_turn(few):

@@ -20,6 +20,7 @@ Out = Annotated[Path, typer.Option(help="The weights; the card goes beside them 
 Seed = Annotated[int, typer.Option(help="Same seed and computer, same weights.")]
 Pictures = Annotated[int, typer.Option(min=1, help="How many pictures are drawn; 0.6 MB each.")]
 Rate = Annotated[float, typer.Option(min=1e-6, max=0.1, help="Greatest learning rate.")]
+Large = Annotated[int, typer.Option(min=0, help="Pictures of twice the size, for half of what is learnt; 2.5 MB each.")]
 Folder = Annotated[Path | None, typer.Option(help="Where they are kept (default: ~/.cache/timberhand/pictures).")]
 
 
@@ -105,10 +106,10 @@ def segmentation(
     pictures: Pictures = 25_088,
     folder: Folder = None,
     learning_rate: Rate = 3e-3,
-    start: Annotated[Path | None, typer.Option(help="Weights to go on from (default: from scratch).")] = None,
-    large: Annotated[
-        int, typer.Option(min=0, help="Pictures of twice the size for half of the windows; 2.5 MB each.")
-    ] = 0,
+    start: Annotated[
+        Path | None, typer.Option(help="Weights to go on from, for depth also those of rgbd (default: from scratch).")
+    ] = None,
+    large: Large = 0,
 ) -> None:
     """Train the network that finds logs, on pictures drawn for it, on one core.
 
@@ -142,6 +143,7 @@ def detector(
     pictures: Pictures = 25_088,
     folder: Folder = None,
     learning_rate: Rate = 3e-3,
+    large: Large = 0,
 ) -> None:
     """Train paper B's detector in its role, boxes of logs from colour, on pictures drawn for it, on one core.
 
@@ -157,7 +159,7 @@ def detector(
     torch_on_one_thread()
     from hil.training.produce import Plan, produce_boxes
 
-    plan = Plan(pictures, steps, seed, learning_rate)
+    plan = Plan(pictures, steps, seed, learning_rate, None, large)
     _made(out, folder, lambda kept, screen: produce_boxes(plan, kept, out, screen))
 
 
