@@ -26,6 +26,7 @@ from typing import Final
 import msgspec
 
 from autonomy.eyes import Eyes
+from autonomy.heap import keep_heap
 from autonomy.logs import LogsRefused, answer, answer_trouble, parse_question
 from autonomy.networks.weights import WeightsRefused
 from autonomy.perception.finder import LogFinder
@@ -89,6 +90,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--variant", choices=("rgbd", "depth"), default="rgbd", help="what the network looks at")
     parser.add_argument("--weights", type=Path, help="weights of the network (default: the shipped ones)")
     options = parser.parse_args(argv)
+    keep_heap()
     try:
         profile = load_profile(options.profile)
         if options.camera not in profile.cameras:
