@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +21,7 @@ CROPS: Final = ((256, 1.0), (512, 0.25))
 """Sizes of the windows of small and of large pictures [px] and their share of a batch's pictures: a log that is longer
 than its window teaches nothing of where it ends."""
 CORE: Final = 0.5  # cells whose spot is higher than this learn the box's sides
-SIDE_SHARE: Final = 1.0
+SIDE_SHARE, OVERLAP_SHARE = 1.0, 2.0
 LEAST_PX: Final = 20
 
 
@@ -55,7 +55,8 @@ def targets(sample: Labelled) -> tuple[np.ndarray, np.ndarray]:
 
 
 def loss(net: torch.nn.Module, images: torch.Tensor, maps: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """Focal cross entropy of the spots (Zhou et al. 2019) and distance of the sides' logarithms."""
+    """Focal cross entropy of the spots (Zhou et al. 2019), distance of the sides' logarithms, and what the boxes'
+    overlap lacks."""
     found = net(images)["boxes"].float()
     spot, logit = maps[:, 0], found[:, 0]
     probability = torch.sigmoid(logit)
@@ -63,8 +64,22 @@ def loss(net: torch.nn.Module, images: torch.Tensor, maps: torch.Tensor, weights
     away = (1.0 - spot) ** 4 * probability**2 * -F.logsigmoid(-logit)
     near = (1.0 - probability) ** 2 * -F.logsigmoid(logit)
     score = ((hit * near + (1.0 - hit) * away) * weights[:, 0]).sum() / (hit.sum() + 1.0)
-    sides = ((found[:, 1:] - maps[:, 1:]).abs().sum(1) * weights[:, 1]).sum() / (weights[:, 1].sum() + 1.0)
-    return score + SIDE_SHARE * sides
+    sides = (found[:, 1:] - maps[:, 1:]).abs().sum(1) + OVERLAP_SHARE * _apart(found[:, 1:], maps[:, 1:])
+    return score + SIDE_SHARE * (sides * weights[:, 1]).sum() / (weights[:, 1].sum() + 1.0)
+
+
+def _apart(found: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """1 less the generalised overlap (N, h, w) (Rezatofighi et al. 2019) of boxes about the same cells, by the
+    logarithms of their sides (N, 4, h, w)."""
+    one, other = (x.clamp(-4.0, 5.0).exp() for x in (found, truth))
+    shared, around = _area(torch.minimum(one, other)), _area(torch.maximum(one, other))
+    union = _area(one) + _area(other) - shared
+    return 2.0 - shared / union - union / around
+
+
+def _area(sides: torch.Tensor) -> torch.Tensor:
+    left, top, right, bottom = sides.unbind(1)
+    return (left + right) * (top + bottom)
 
 
 def run(
@@ -74,10 +89,14 @@ def run(
     seed: int,
     checkpoint: Path | None,
     console: Console,
+    start: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[TorchNet, list[float]]:
     """Train on ``sources``, small pictures and, where there are any, large ones, each with their number, in batches of
-    ``size``; the net and the loss of every step."""
-    net = random_net(box_net(), seed).to(memory_format=torch.channels_last)
+    ``size``, from the arrays ``start`` or from scratch; the net and the loss of every step."""
+    net = random_net(box_net(), seed)
+    if start is not None:
+        net.load(start)
+    net = net.to(memory_format=torch.channels_last)
     what = f"boxes, {' and '.join(str(count) for _, count in sources)} pictures, batch {size}, seed {seed}"
     losses = train(net, batches(sources, size, seed), loss, schedule, checkpoint, what, "boxes of logs", console)
     return net.eval(), losses

@@ -29,6 +29,10 @@ BATCH: Final = 16
 LEARNING_RATE: Final = 3e-3
 SMALL_PX, LARGE_PX, FIRST_LARGE = 304, 608, 10_000  # sizes of pictures, and the first shard of large ones
 JUDGED: Final = 128  # pictures
+PHOTOS: Final = {
+    "rgbd": "Its colours are drawn: on photographs it is a sketch.",
+    "depth": "Photographs, which have no depth.",
+}
 LEAST_PX: Final = 30  # of a log that counts when the card's figures are made
 
 
@@ -95,14 +99,19 @@ def begun(weights: Path, variant: str) -> dict[str, np.ndarray]:
 
 
 def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path:
-    """Paper B's detector in its role, in the same way (always from scratch).  Returns the card's path."""
+    """Paper B's detector in its role, in the same way.  Returns the card's path.
+
+    Raises:
+        WeightsRefused: as ``produce``.
+    """
+    start = load(plan.start, box_net())[0] if plan.start else None
     source = ready(folder, plan.count, console)
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
     kept = out.with_suffix(".checkpoint")
     sources = [(source, plan.count)]
     if plan.large:
         sources.append((large(plan, folder, console), plan.large))
-    net, losses = boxes.run(sources, schedule, BATCH, plan.seed, kept, console)
+    net, losses = boxes.run(sources, schedule, BATCH, plan.seed, kept, console, start)
     card = Card(
         "Boxes of logs in colour pictures",
         "Letterboxed colour picture of 608 x 608 px in, boxes of logs out: the role of paper B's YOLOv3 (3.2.2).",
@@ -162,8 +171,8 @@ def ship(
         plan.words(" and ".join(str(crop) for crop, _ in CROPS)),
         plan.seed,
         {"loss, mean of the last 100 steps": f"{np.mean(losses[-100:]):.4f}"},
-        "wood that is no log on the ground: standing trees, stumps, planks. Its colours are drawn: on "
-        "photographs it is a sketch. What it does on worlds that are drawn otherwise is in docs/detector.md.",
+        f"wood that is no log on the ground: standing trees, stumps, planks. {PHOTOS[variant]} What it does on worlds "
+        "that are drawn otherwise is in docs/detector.md.",
         plan.command(f"segmentation --variant {variant}", out),
     )
     write(out, network, arrays, card, {})

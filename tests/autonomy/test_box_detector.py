@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from drawn_logs import picture
 from rich.console import Console
 
@@ -67,6 +68,32 @@ def test_a_few_steps_learn(monkeypatch):
     samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 60, 14), size=160) for i in range(4)]
     _, losses = run([(samples.__getitem__, 4)], Schedule(10, 3e-3), 2, 5, None, Console(stderr=True, quiet=True))
     assert np.mean(losses[-3:]) < 0.8 * np.mean(losses[:2])
+
+
+def test_what_the_overlap_of_two_boxes_lacks():
+    """Of boxes about one cell: nothing of equal ones, a half of one in another of twice the size."""
+
+    def box(*sides):
+        return torch.log(torch.tensor(sides, dtype=torch.float32)).reshape(1, 4, 1, 1)
+
+    def lacks(a, b):
+        return boxes._apart(a, b).item()
+
+    one = box(2.0, 3.0, 2.0, 3.0)
+    assert lacks(one, one) == pytest.approx(0.0, abs=1e-6)
+    assert lacks(one, box(2.0, 3.0, 6.0, 3.0)) == pytest.approx(0.5)  # overlap a half, and it is all that is around
+    left, right = box(4.0, 1.0, 0.05, 1.0), box(0.05, 1.0, 4.0, 1.0)
+    assert lacks(left, right) == pytest.approx(1.0, abs=0.05), "beside each other they share next to nothing"
+
+
+def test_training_goes_on_from_weights(tmp_path):
+    sample = [picture(((90.0, 80.0), 0.3, 60, 14), size=304)]
+    start = random_net(box_net(), 7).arrays()
+    quiet = Console(stderr=True, quiet=True)
+    net, _ = run([(sample.__getitem__, 1)], Schedule(1, 1e-9), 2, 5, None, quiet, start)
+    assert np.abs(net.arrays()["boxes.weight"] - start["boxes.weight"]).max() < 1e-6
+    other, _ = run([(sample.__getitem__, 1)], Schedule(1, 1e-9), 2, 5, None, quiet)
+    assert np.abs(other.arrays()["boxes.weight"] - start["boxes.weight"]).max() > 1e-3
 
 
 def test_small_and_large_pictures_give_batches_in_turn():

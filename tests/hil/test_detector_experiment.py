@@ -30,7 +30,9 @@ def test_a_test_picture_repeats_and_its_truths_are_its_logs(few_piles):
 
 def outcome(machine, scores, boxes, ignored):
     found = {"scores": scores, "boxes": boxes, "masks": boxes}
-    return {"machine": machine, "ignored": ignored, "found": {"rgbd": found}}
+    whole = {"scores": [1.0] * len(ignored), "boxes": (0.9 * np.eye(len(ignored))).tolist()}
+    pixels = [5000, 300][: len(ignored)]
+    return {"machine": machine, "ignored": ignored, "pixels": pixels, "found": {"rgbd": found, "parted": whole}}
 
 
 def test_figures_follow_from_what_was_found():
@@ -45,10 +47,23 @@ def test_figures_follow_from_what_was_found():
     assert metrics["recall"] == pytest.approx(2 / 3)
     assert metrics["false_per_picture"] == pytest.approx(0.5)
     assert metrics["map50_95"] < metrics["map50"]
+    assert metrics["parted.map50"] == 1.0 and metrics["parted.map50_95"] == pytest.approx(0.9)
+    assert metrics["found_large"] == 1.0 and metrics["found_small"] == 0.0
     text = page(judged("detector", experiment.FIGURES, metrics, profile="p", seed=1, trials=1,
                        more={"truth": "nominal"}, paper={"map50": 0.8051}),
                 "t", "i", experiment.SECTIONS)  # fmt: skip
     assert "**missed**" in text and "80.51%" in text
+
+
+def test_wood_that_is_parted_right_is_as_good_as_the_wood():
+    masks = [np.zeros((20, 30), bool) for _ in range(3)]
+    masks[0][5:10, :20], masks[1][10:15, :20], masks[2][16:18, 25:28] = True, True, True
+    wood = np.zeros((20, 30), bool)
+    wood[5:15, :15] = True  # two logs as one, three quarters of each; the third is not seen
+    ideal = trial.parted(wood, masks, np.array([trial.box_of(m) for m in masks]))
+    assert ideal["scores"] == [1.0, 1.0]
+    assert ideal["boxes"] == [[0.75, 0.0, 0.0], [0.0, 0.75, 0.0]]
+    assert trial.parted(np.any([], axis=0), masks, np.zeros((3, 4)))["boxes"] == []
 
 
 def test_without_weights_it_says_what_to_do(monkeypatch, tmp_path):

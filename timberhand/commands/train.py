@@ -144,6 +144,7 @@ def detector(
     folder: Folder = None,
     learning_rate: Rate = 3e-3,
     large: Large = 0,
+    start: Annotated[Path | None, typer.Option(help="Weights to go on from (default: from scratch).")] = None,
 ) -> None:
     """Train paper B's detector in its role, boxes of logs from colour, on pictures drawn for it, on one core.
 
@@ -159,7 +160,7 @@ def detector(
     torch_on_one_thread()
     from hil.training.produce import Plan, produce_boxes
 
-    plan = Plan(pictures, steps, seed, learning_rate, None, large)
+    plan = Plan(pictures, steps, seed, learning_rate, start, large)
     _made(out, folder, lambda kept, screen: produce_boxes(plan, kept, out, screen))
 
 

@@ -14,8 +14,8 @@ from hil.exits import Exit, Stopped
 from hil.experiments import pool
 from hil.experiments.detector import photos
 from hil.experiments.detector.pictures import PAPER, contact_sheet, gallery, overlaid, precision_recall
-from hil.experiments.detector.precision import average_precision, curve
-from hil.experiments.detector.trial import FAITHFUL, box_finder, finder, look, matches, perform, shipped
+from hil.experiments.detector.precision import average_precision, curve, taken
+from hil.experiments.detector.trial import FAITHFUL, PARTED, box_finder, finder, look, matches, perform, shipped
 from hil.experiments.pool import Job
 from hil.experiments.registry import Options
 from hil.experiments.report import Section, tell
@@ -35,6 +35,7 @@ NAMES: Final = {
     "depth": "depth alone",
     FAITHFUL: "paper B's role: colour alone",
 }
+LARGE_PX: Final = 800  # a log of 2 m and 25 cm across the view shows so many at 6.3 m from the front camera
 PHOTO_VIEW_RAD: Final = 1.4
 
 BOXES: Final = (
@@ -44,6 +45,14 @@ BOXES: Final = (
     Figure("recall", "Logs found", "%", "With a score of at least 0.5 and an overlap of at least 0.5.", None, None,
            100.0),
     Figure("false_per_picture", "False finds in a picture", "", "With a score of at least 0.5."),
+)  # fmt: skip
+LOST: Final = (
+    Figure("parted.map50", "Boxes, mAP@0.5, were the wood parted right", "%", "All that is called wood, cut up as the "
+           "truth cuts it up.", None, None, 100.0),
+    Figure("parted.map50_95", "Boxes, mAP@0.5:0.95, were the wood parted right", "%", "The same.", None, None, 100.0),
+    Figure("found_large", f"Found of logs that show at least {LARGE_PX} px", "%", "With an overlap of at least 0.5, at "
+           "any score.", None, None, 100.0),
+    Figure("found_small", "Found of those that show less", "%", "As above.", None, None, 100.0),
 )  # fmt: skip
 MASKS: Final = (
     Figure("mask_map50", "Masks, mAP@0.5", "%", "As for boxes, with masks.", None, None, 100.0),
@@ -59,7 +68,7 @@ PHOTOS: Final = (
     Figure("photos_iou", "Overlap of the wood found with the wood marked, median", "%",
            "All masks of a picture together; the marked wood was derived from coloured overlays.", None, None, 100.0),
 )  # fmt: skip
-FIGURES: Final = (*BOXES, *MASKS, *PHOTOS)
+FIGURES: Final = (*BOXES, *LOST, *MASKS, *PHOTOS)
 SECTIONS: Final = (
     Section(
         "Logs found on worlds of another kind",
@@ -70,6 +79,13 @@ SECTIONS: Final = (
         BOXES,
         (("precision_recall.png", "Precision and recall, as paper B's Fig. 7"), ("found.png", "Logs found in test "
          "pictures: boxes, masks, scores and ends; a filled dot is an end that is the log's own")),
+    ),
+    Section(
+        "What is lost, and where",
+        "Wood is seen nearly everywhere. What fails is to part it: of logs that lie close together the hind ones show "
+        "as strips a few pixels wide, and a strip is taken for a part of its neighbour or falls to pieces.",
+        LOST,
+        (),
     ),
     Section(
         "Masks, machines, variants",
@@ -132,6 +148,7 @@ def gather(outcomes: list[dict[str, Any]], networks: tuple[str, ...]) -> dict[st
         masks = [matches(o, name, "masks") for o in outcomes]
         metrics[f"{own}mask_map50"] = curve(masks, 0.5).average
         metrics[f"{own}mask_map50_95"] = average_precision(masks)
+    metrics |= lost(outcomes)
     for machine in MACHINES:
         boxes = [matches(o, "rgbd", "boxes") for o in outcomes if o["machine"] == machine]
         metrics[f"{machine}.map50"] = curve(boxes, 0.5).average
@@ -141,6 +158,21 @@ def gather(outcomes: list[dict[str, Any]], networks: tuple[str, ...]) -> dict[st
     wrong = sure * (1.0 - float(whole.precision[sure - 1])) if sure else 0.0
     metrics["false_per_picture"] = wrong / max(1, len(outcomes))
     return metrics
+
+
+def lost(outcomes: list[dict[str, Any]]) -> dict[str, float]:
+    """What perfect parting would give, and how many of the logs that show much and little are found."""
+    ideal = [matches(o, PARTED, "boxes") for o in outcomes]
+    found, pixels = [], []
+    for outcome in outcomes:
+        picture = matches(outcome, "rgbd", "boxes")
+        found.append(taken(picture, 0.5)[~picture.ignored])
+        pixels.append(np.array(outcome["pixels"])[~picture.ignored])
+    every, large = np.concatenate(found), np.concatenate(pixels) >= LARGE_PX
+    shares = {"found_large": every[large], "found_small": every[~large]}
+    return {"parted.map50": curve(ideal, 0.5).average, "parted.map50_95": average_precision(ideal)} | {
+        name: float(own.mean()) if len(own) else math.nan for name, own in shares.items()
+    }
 
 
 def draw(outcomes: list[dict[str, Any]], networks: tuple[str, ...], options: Options) -> None:

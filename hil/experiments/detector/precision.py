@@ -77,8 +77,18 @@ def average_precision(pictures: Sequence[Matches], thresholds: Sequence[float] =
     return float(np.mean([curve(pictures, t).average for t in thresholds]))
 
 
+def taken(picture: Matches, threshold: float) -> np.ndarray:
+    """Which truths (M,) were found, at whatever score."""
+    return _dealt(picture, threshold)[1]
+
+
 def _judged(picture: Matches, threshold: float) -> list[tuple[float, bool]]:
     """Score and verdict of everything found that counts."""
+    return _dealt(picture, threshold)[0]
+
+
+def _dealt(picture: Matches, threshold: float) -> tuple[list[tuple[float, bool]], np.ndarray]:
+    """Score and verdict of everything found that counts, and which truths (M,) it took."""
     free = np.ones(len(picture.ignored), bool)
     out = []
     for i in np.argsort(-picture.scores, kind="stable"):
@@ -89,7 +99,7 @@ def _judged(picture: Matches, threshold: float) -> list[tuple[float, bool]]:
             out.append((float(picture.scores[i]), True))
         elif not (picture.overlaps[i][picture.ignored] >= threshold).any():
             out.append((float(picture.scores[i]), False))
-    return out
+    return out, ~free
 
 
 def _average(precision: np.ndarray, recall: np.ndarray) -> float:

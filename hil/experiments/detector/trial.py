@@ -24,6 +24,8 @@ NEARER: Final = ("rgbd", "depth")
 """Those that look at the wood from nearer, as the machine does."""
 
 
+PARTED: Final = "parted"
+"""The wood that the first of SIZES finds, cut up into logs as the truth cuts it up."""
 FAITHFUL: Final = "faithful"
 """Paper B's detector in its role: colour alone, boxes alone."""
 
@@ -77,10 +79,18 @@ def perform(job: Job) -> dict[str, Any]:
             "boxes": box_overlaps(np.array([i.box_px for i in logs]), boxes).tolist(),
             "masks": mask_overlaps([i.mask for i in logs], masks).tolist(),
         }
+        if name == "rgbd":
+            found[PARTED] = parted(np.any([i.mask for i in logs], axis=0), masks, boxes)
     return {
         "machine": job.kind, "kind": seen.kind, "camera": seen.camera, "range_m": seen.range_m,
-        "ignored": ignored.tolist(), "found": found,
+        "ignored": ignored.tolist(), "pixels": [int(np.count_nonzero(m)) for m in masks], "found": found,
     }  # fmt: skip
+
+
+def parted(wood: np.ndarray, masks: list[np.ndarray], boxes: np.ndarray) -> dict[str, Any]:
+    """What ``wood`` (H, W) would be worth, were it cut up as the true ``masks`` with their ``boxes`` (M, 4) are."""
+    places = [box_of(wood & m) for m in masks if (wood & m).any()]
+    return {"scores": [1.0] * len(places), "boxes": box_overlaps(np.array(places), boxes).tolist()}
 
 
 def matches(outcome: dict[str, Any], name: str, by: str) -> Matches:
