@@ -28,7 +28,7 @@ STYLE: Final = {
     "axes.axisbelow": True,
     "lines.linewidth": 1.3,
     "legend.frameon": False,
-    "axes.prop_cycle": matplotlib.cycler(color=[OIL, TIMBER, MOSS, RUST, STEEL]),
+    "axes.prop_cycle": matplotlib.cycler(ls=["-", "--"]) * matplotlib.cycler(color=[OIL, TIMBER, MOSS, RUST, STEEL]),
 }
 
 

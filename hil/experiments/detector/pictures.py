@@ -24,13 +24,14 @@ PAPER: Final = 0.8051
 
 def precision_recall(path: Path, curves: Mapping[str, Curve]) -> None:
     """As paper B's Fig. 7."""
-    with sheet(path, width=5.4, height=3.8) as axis:
+    with sheet(path, width=8.0, height=3.6) as axis:
         for name, curve in curves.items():
             recall, precision = np.append(0.0, curve.recall), np.append(1.0, curve.precision)
             axis.plot(recall, precision, label=f"{name}: AP {100 * curve.average:.1f} %")
         axis.set(xlabel="recall", ylabel="precision", xlim=(0.0, 1.01), ylim=(0.0, 1.02))
         axis.set_title("Boxes of logs, least overlap 0.5")
-        axis.legend(loc="lower left", title=f"paper B: AP {100 * PAPER:.2f} % on its own photographs")
+        words = f"paper B: AP {100 * PAPER:.2f} % on its own photographs"
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), alignment="left", title=words)
 
 
 def overlaid(rgb: np.ndarray, found: Sequence[Instance]) -> Image.Image:
