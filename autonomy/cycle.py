@@ -26,7 +26,7 @@ from autonomy.phases import Phase
 from autonomy.regrip import Regrip, measured
 from autonomy.rotator import is_counted
 from autonomy.stream import Axes
-from autonomy.tongs import Tongs, among_stakes, is_empty
+from autonomy.tongs import Tongs, among_stakes, lifts_nothing
 from machine.grapple import grapple_yaw
 from machine.joints import Joint
 from machine.profile import Profile
@@ -225,12 +225,12 @@ class Cycle:
 
     def came_up(self, positions: Iterable[Axes]) -> bool:
         """Whether what was gripped hangs under the crane, measured or sent, or is hidden in tongs that did not shut on
-        nothing; the grasp is of that now."""
+        nothing or in which something weighs; the grasp is of that now."""
         assert self.grasp is not None
         seen = self._picked()
         held = came_up(self._arm, self.grasp, seen, [self._arm.pose(q) for q in positions])
         self.grasp = held or self.grasp
-        return held is not None or (not seen and not is_empty(self._heard.report))
+        return held is not None or (not seen and not lifts_nothing(self._heard.report))
 
     def came_up_empty(self) -> str:
         """Count a grasp that did; why there is to be no other, or empty."""

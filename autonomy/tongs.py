@@ -34,6 +34,9 @@ _HELD_M: Final = 0.2
 """Thinner logs are held in tongs that have shut."""
 _NOTHING_KG: Final = 8.0
 """Less than the thinnest log weighs, half of it lying on others."""
+_HUNG_KG: Final = 12.0
+"""Less than the thinnest log weighs that hangs, more than a crane at rest reads for nothing.  The controller says that
+tongs hold something from 30 kg on: thin logs weigh less and vanish in tongs that have shut."""
 _EMPTY_KG: Final = 30.0
 """What hangs in the tongs when they have let go, at most."""
 _PUSH_KG, _PUSH = 250.0, 1.5
@@ -65,6 +68,11 @@ def gripped(report: StateReport, closing_s: float) -> bool:
 def is_empty(report: StateReport) -> bool:
     """Whether they shut on nothing, and nothing weighs in them."""
     return report.grapple_state == _SHUT
+
+
+def lifts_nothing(report: StateReport) -> bool:
+    """Whether they shut and came up with nothing that is known to weigh."""
+    return is_empty(report) and not report.load_kg >= _HUNG_KG
 
 
 def opened(profile: Profile, report: StateReport, opening_s: float) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import hypot, pi
+from math import hypot, nan, pi
 
 import pytest
 from crane_stand_in import StandIn
@@ -103,6 +103,28 @@ def test_shut_tongs_that_weigh_nothing_as_they_rise_are_sent_anew(empty_kg: floa
     assert planner.phase is (Phase.ABOVE if anew else Phase.LIFT)
     if anew:
         assert crane.until(planner, Phase.LIFT) == [Phase.ABOVE, Phase.DESCEND, Phase.CLOSE, Phase.LIFT]
+
+
+class Hiding(Weighed):
+    """The first log is hidden from the camera by tongs that have shut; another one lies in sight."""
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        return super().seen()[self.gripped :]
+
+
+@pytest.mark.parametrize(("weighs_kg", "follows"), [(20.0, Phase.CARRY), (9.0, Phase.LOOK), (nan, Phase.LOOK)])
+def test_a_thin_log_that_vanished_in_shut_tongs_is_carried_on_where_it_weighs(weighs_kg: float, follows: Phase) -> None:
+    """The controller says that tongs hold something from 30 kg on; a log of 20 kg was let go again, now and then."""
+    thin = replace(pair()[0], diameter_m=0.12)
+    x, y, z = thin.center_m
+    aside = replace(thin, id=thin.id + 7, center_m=(x, y - 2.0, z))
+    crane = Hiding(PROFILE, [thin, aside], log_kg=weighs_kg)
+    crane.empty_kg = weighs_kg
+    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(Search()))
+    crane.until(planner, Phase.LIFT)
+    while planner.phase is Phase.LIFT:
+        crane.step(planner)
+    assert planner.phase is follows
 
 
 class Pinching(Slipping):
