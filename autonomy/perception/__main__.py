@@ -26,8 +26,8 @@ from typing import Final
 import msgspec
 
 from autonomy.eyes import Eyes
-from autonomy.heap import keep_heap
 from autonomy.logs import LogsRefused, answer, answer_trouble, parse_question
+from autonomy.memory import keep_memory
 from autonomy.networks.weights import WeightsRefused
 from autonomy.perception.finder import LogFinder
 from autonomy.perception.sources import CameraSource, SourceError
@@ -90,7 +90,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--variant", choices=("rgbd", "depth"), default="rgbd", help="what the network looks at")
     parser.add_argument("--weights", type=Path, help="weights of the network (default: the shipped ones)")
     options = parser.parse_args(argv)
-    keep_heap()
+    keep_memory()
     try:
         profile = load_profile(options.profile)
         if options.camera not in profile.cameras:

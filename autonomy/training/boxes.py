@@ -11,10 +11,10 @@ import torch
 from rich.console import Console
 from torch.nn import functional as F
 
-from autonomy.networks.torch_net import TorchNet, random_net
+from autonomy.networks.torch_net import TorchNet
 from autonomy.perception.detector import STRIDE, box_net, colour
 from autonomy.training.labels import ID, IGNORED, Labelled
-from autonomy.training.loop import Schedule, train
+from autonomy.training.loop import Schedule, begun, stacked, train
 from autonomy.training.segmentation import Picture, changed
 
 CROPS: Final = ((256, 1.0), (512, 0.25))
@@ -93,10 +93,7 @@ def run(
 ) -> tuple[TorchNet, list[float]]:
     """Train on ``sources``, small pictures and, where there are any, large ones, each with their number, in batches of
     ``size``, from the arrays ``start`` or from scratch; the net and the loss of every step."""
-    net = random_net(box_net(), seed)
-    if start is not None:
-        net.load(start)
-    net = net.to(memory_format=torch.channels_last)
+    net = begun(box_net(), seed, start)
     what = f"boxes, {' and '.join(str(count) for _, count in sources)} pictures, batch {size}, seed {seed}"
     losses = train(net, batches(sources, size, seed), loss, schedule, checkpoint, what, "boxes of logs", console)
     return net.eval(), losses
@@ -113,7 +110,6 @@ def batches(sources: Sequence[tuple[Picture, int]], size: int, seed: int) -> Cal
         for index in rng.integers(0, count, max(2, round(share * size))):
             sample = changed(picture(int(index)), rng, crop_px)
             rows.append((colour(sample.rgb), *targets(sample)))
-        images, maps, weights = (torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True))
-        return images.contiguous(memory_format=torch.channels_last), maps, weights
+        return stacked(rows)
 
     return batch

@@ -12,15 +12,19 @@ import pickle
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from autonomy.networks.graph import Network
+from autonomy.networks.torch_net import TorchNet, random_net
 
 Batch = tuple[torch.Tensor, ...]
 WARM_UP: Final = 0.05
@@ -95,6 +99,20 @@ def train(
     if checkpoint:
         checkpoint.unlink(missing_ok=True)
     return losses
+
+
+def begun(network: Network, seed: int, start: Mapping[str, np.ndarray] | None) -> TorchNet:
+    """A network of pictures to be trained, from the arrays ``start`` or from scratch."""
+    net = random_net(network, seed)
+    if start is not None:
+        net.load(start)
+    return net.to(memory_format=torch.channels_last)
+
+
+def stacked(rows: Sequence[tuple[np.ndarray, ...]]) -> tuple[torch.Tensor, ...]:
+    """A batch of samples, whose first array is the picture."""
+    images, *rest = (torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True))
+    return (images.contiguous(memory_format=torch.channels_last), *rest)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from rich.console import Console
 from scipy import ndimage
 from torch.nn import functional as F
 
-from autonomy.networks.torch_net import TorchNet, random_net
+from autonomy.networks.torch_net import TorchNet
 from autonomy.perception.network import MAPS, MASK, OFFSET_PX, STRIDE, channels, unet
 from autonomy.training.labels import (
     ANGLE,
@@ -36,7 +36,7 @@ from autonomy.training.labels import (
     enlarged,
     mirrored,
 )
-from autonomy.training.loop import Schedule, train
+from autonomy.training.loop import Schedule, begun, stacked, train
 
 SPOT_PX: Final = 1.5  # sigma of the spots at centres and ends, in pixels of the maps
 SPOT_WEIGHT: Final = 20.0
@@ -226,8 +226,7 @@ def batches(
             sample = changed(picture(int(index)), rng, crop_px)
             image = channels(sample.rgb, sample.depth_m, sample.intrinsics, variant, sample.height_m)
             rows.append((image, *targets(sample)))
-        images, maps, weights = (torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True))
-        return images.contiguous(memory_format=torch.channels_last), maps, weights
+        return stacked(rows)
 
     return batch
 
@@ -245,10 +244,7 @@ def run(
 ) -> tuple[TorchNet, list[float]]:
     """Train a variant on ``count`` pictures in batches of ``size``, from the arrays ``start`` or from scratch; the net
     and the loss of every step."""
-    net = random_net(unet(variant), seed)
-    if start is not None:
-        net.load(start)
-    net = net.to(memory_format=torch.channels_last)
+    net = begun(unet(variant), seed, start)
     what = (
         f"segmentation {variant}, {count} pictures, batch {size}, seed {seed}, {'scratch' if start is None else 'on'}"
     )

@@ -21,7 +21,7 @@ from typing import Any, Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from autonomy.heap import keep_heap
+from autonomy.memory import keep_memory
 
 WAITING_PER_WORKER: Final = 2
 ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -114,7 +114,7 @@ def run(
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(title, total=len(jobs), completed=len(jobs) - len(todo))
         if workers <= 1:
-            keep_heap()
+            keep_memory()
             for job in todo:
                 checkpoint.add(job.name, _named(function, job))
                 progress.advance(task)
@@ -154,7 +154,7 @@ def _run_parallel(
 
 def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    keep_heap()  # as the machine's eyes do, whose time is measured
+    keep_memory()  # as the machine's eyes do, whose time is measured
 
 
 def _named(function: Callable[[Job], Any], job: Job) -> Any:

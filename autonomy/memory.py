@@ -16,7 +16,7 @@ _M_MMAP_MAX: Final = -4
 """As in glibc's malloc.h."""
 
 
-def keep_heap() -> None:
+def keep_memory() -> None:
     """Keep glibc from giving memory back to the system and asking for it anew; does nothing with another library."""
     libc = ctypes.CDLL(None)
     with contextlib.suppress(AttributeError):  # musl has no mallopt
