@@ -31,19 +31,19 @@ from typing import Final
 
 import msgspec
 
-from autonomy.activity import Activity
+from autonomy.crane_job.activity import Activity
 from autonomy.grasp.direct import Planned
 from autonomy.grasp.press import Press
 from autonomy.grasp.search import Search
-from autonomy.jobs import Forwarding, Job, OneLog
-from autonomy.logs import LogObservation, LogsRefused, parse_logs, question
 from autonomy.manager.logbook import Logbook, MissionFinished, read
 from autonomy.manager.manager import Manager
 from autonomy.manager.table import WAYS
-from autonomy.mission import Mission
+from autonomy.missions.crane_job import Mission
 from autonomy.missions.files import load_mission
 from autonomy.missions.model import MissionError
-from autonomy.orders import OrderRefused, Orders
+from autonomy.perception.logs import LogObservation, LogsRefused, parse_logs, question
+from autonomy.process.jobs import Forwarding, Job, OneLog
+from autonomy.process.operator_commands import OrderRefused, Orders
 from can_dbc.mission_datagrams import encode_mission
 from can_dbc.setpoint import DatagramRefused, StateReport, VehicleReport, decode, udp_address
 from machine.load import ProfileError, load_profile, profile_hash

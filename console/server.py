@@ -32,7 +32,7 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from autonomy.logs import LogsRefused, parse_logs, question
+from autonomy.perception.logs import LogsRefused, parse_logs, question
 from can_dbc.mission_datagrams import MissionOrder, Order, encode_order
 from can_dbc.setpoint import OperatorAction, OperatorCommand, encode
 from can_dbc.timing_page import TimingRefused, read_timing

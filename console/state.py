@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from autonomy.logs import LogObservation
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import DatagramRefused, StateReport, VehicleReport, decode
 from can_dbc.timing_page import Timing
 from console.mission_state import MissionWatch, describe_carrier

@@ -25,9 +25,9 @@ from can_dbc.timing_page import STAGES, TimingWriter, default_path
 from controller.config import ConfigError, Settings, load
 from controller.loop import Address, Loop
 from controller.realtime import freeze, keep_heap, prepare, sleeper
-from controller.rehearsal import rehearse
 from controller.step import Controller
 from controller.timing import LoopTiming
+from controller.warm_up import rehearse
 from machine.faults import describe
 from machine.modes import Mode
 
@@ -115,8 +115,8 @@ def addresses(settings: Settings, given: dict[str, str]) -> dict[str, str]:
 def open_buses(where: dict[str, str], controller: Controller) -> list[Bus]:
     """All of them or none, each filtered by what the controller looks at; raises BusError."""
     wanted: list[list[Wanted]] = [[*controller.received.wanted()]]
-    if controller.machine_bus is not None:
-        wanted.append(controller.machine_bus.received.wanted())
+    if controller.carrier.bus is not None:
+        wanted.append(controller.carrier.bus.received.wanted())
     opened: list[Bus] = []
     try:
         for address, filters in zip(where.values(), wanted, strict=True):

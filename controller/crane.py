@@ -19,8 +19,8 @@ from controller.laws.crane import LOADS, CraneLaw
 from controller.laws.grapple import GrappleLaw
 from controller.laws.joint import STANDING
 from controller.laws.sway import STATUS_USABLE, SWING, Sway
+from controller.message_state import known
 from controller.requests import Gate, Refused
-from controller.slot import known
 from controller.spool_test import Refusal, SpoolRun
 from machine.joints import JOINTS, N_JOINTS, Joint
 from machine.reasons import Reason

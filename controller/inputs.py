@@ -12,8 +12,8 @@ from typing import Final
 from can_dbc.canopen import EMCY_BASE, HEARTBEAT_BASE, SDO_TO_CLIENT
 from can_dbc.codec import Database
 from can_dbc.frame import Frame
+from controller.message_state import Slot, age_out
 from controller.nodes import Nodes
-from controller.slot import Slot, age_out
 from machine.joints import ARTICULATION, JOINTS
 from machine.profile import Profile, encoders
 from machine.reasons import ENCODER_BIT
@@ -22,7 +22,7 @@ BITS: Final = {
     "EstopStat": 0, "GuardStat": 1, "ValveFbA": 8, "ValveFbB": 9, "PlcStatus": 10,
     "PressA": 11, "PressB": 12, "PressC": 13, "GrappleStat": 14,
 }  # fmt: skip
-"""Bits of the stale mask; for the encoders see ``ENCODER_BIT``, for mach0 `controller.machine_inputs`."""
+"""Bits of the stale mask; for the encoders see ``ENCODER_BIT``, for mach0 `controller.carrier.inputs`."""
 
 _OWN_MESSAGES: Final = ("Nmt", "Sync", "ValveCmdA", "ValveCmdB", "CtrlStatus", "HeartbeatCtrl")
 

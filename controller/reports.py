@@ -11,9 +11,9 @@ from controller.crane import Crane
 from controller.estimator import JointEstimator
 from controller.inputs import Received
 from controller.load import LoadEstimate
+from controller.message_state import known
 from controller.outputs import Every
 from controller.requests import Gate
-from controller.slot import known
 from controller.supervisor import Supervisor
 from machine.joints import Joint
 from machine.reasons import pack

@@ -22,6 +22,7 @@ from can_dbc.setpoint import CraneSetpoint, OperatorAction, SpoolTest
 from can_dbc.tick_record import BusReading
 from can_dbc.vehicle_datagrams import DriveSetpoint
 from controller.bus_watch import BusWatch
+from controller.carrier.vehicle import Vehicle
 from controller.config import ConfigError, Settings
 from controller.crane import Crane
 from controller.estimator import JointEstimator
@@ -32,7 +33,6 @@ from controller.reports import Reports
 from controller.requests import Gate, Refused
 from controller.startup import Startup, check_nodes
 from controller.supervisor import OPERATING, Event, Supervisor
-from controller.vehicle import Vehicle
 from machine.encoder import position_from_counts
 from machine.joints import JOINTS
 from machine.modes import Mode

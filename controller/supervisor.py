@@ -14,10 +14,10 @@ from enum import IntEnum
 from typing import Any, Final
 
 from controller.bus_watch import BusWatch
+from controller.carrier.bus import MachineBus
+from controller.carrier.inputs import MachineReceived
 from controller.estimator import JointEstimator
 from controller.inputs import Received
-from controller.machine_bus import MachineBus
-from controller.machine_inputs import MachineReceived
 from controller.startup import Startup
 from machine.faults import FAULTS
 from machine.joints import JOINTS

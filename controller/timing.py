@@ -17,7 +17,7 @@ from typing import Final
 from can_dbc.bus import Bus
 from can_dbc.durations import Durations
 from can_dbc.timing_page import STAGES, BusCounters, Facts, InputAge, ProcessCounters, TimingWriter
-from controller.slot import Slot
+from controller.message_state import Slot
 from controller.step import Controller
 
 PUBLISH_NS: Final = 1_000_000_000

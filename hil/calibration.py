@@ -12,7 +12,7 @@ from typing import Final
 
 from autonomy.calibration.plan import NoRoom, Plan, make_plan
 from autonomy.calibration.procedure import Calibration
-from autonomy.logs import LogObservation
+from autonomy.perception.logs import LogObservation
 from can_dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.setpoint import OperatorAction, StateReport

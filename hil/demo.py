@@ -8,7 +8,7 @@ from typing import Final
 
 from rich.console import Console
 
-from autonomy.activity import Activity
+from autonomy.crane_job.activity import Activity
 from autonomy.grasp.direct import Planned
 from autonomy.grasp.search import Search
 from can_dbc.setpoint import OperatorAction, StateReport
@@ -16,13 +16,13 @@ from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from hil.display import Display
-from hil.exits import Exit, Stopped
 from hil.live import LiveOptions
 from hil.live_demo import OneLogRun
 from hil.lockstep import START_NS, Eyes, Lockstep, Observer
 from hil.operator import Operator
 from hil.plc_path import BridgedPlant
 from hil.summary import Summary, verdict_sentence
+from host.exits import Exit, Stopped
 from machine.faults import describe
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode

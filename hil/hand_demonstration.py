@@ -18,9 +18,9 @@ from typing import Final
 import numpy as np
 
 from autonomy.grasp.direct import travel_height
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.demonstration import AXES
+from autonomy.perception.logs import LogObservation
 from can_dbc.frame import Frame
 from can_dbc.setpoint import StateReport
 from controller.config import Settings

@@ -20,9 +20,9 @@ from can_dbc import setpoint
 from can_dbc.bus import VCAN_NAMES, kernel_has_can
 from can_dbc.timing_page import default_path
 from hil.display import Display
-from hil.exits import Exit, Stopped
 from hil.operator import Operator
 from hil.processes import Family, free_udp_ports
+from host.exits import Exit, Stopped
 from machine.faults import describe
 from machine.load import profile_hash
 from machine.modes import Mode

@@ -13,11 +13,11 @@ from rich.console import Console
 from autonomy.manager.tally import Load
 from autonomy.missions.model import ForwardingMission
 from hil.display import Display
-from hil.exits import Exit, Stopped
 from hil.forwarded_report import report_loads
 from hil.live import LiveOptions, LiveRun
 from hil.mission import MissionSummary
 from hil.mission_site import site_of
+from host.exits import Exit, Stopped
 
 SITE: Final = "site.json"
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from autonomy.logs import LogObservation
+from autonomy.perception.logs import LogObservation
 from can_dbc import setpoint
 from can_dbc.canopen import Wire
 from can_dbc.frame import Frame
@@ -37,7 +37,7 @@ START_NS: Final = 1_000_000_000
 
 
 class Planner(Protocol):
-    """What asks for motion; `autonomy.activity.Activity` is one."""
+    """What asks for motion; `autonomy.crane_job.activity.Activity` is one."""
 
     def step(
         self, now_ns: int, report: setpoint.StateReport | None, logs: tuple[LogObservation, ...]
@@ -46,7 +46,7 @@ class Planner(Protocol):
 
 
 class Eyes(Protocol):
-    """What sees the logs; `autonomy.eyes.Eyes` does."""
+    """What sees the logs; `autonomy.perception.log_detector.Eyes` does."""
 
     def look(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
         """The logs seen with the joints there [rad, m]; None when there is nothing new."""

@@ -17,21 +17,21 @@ from rich.console import Console
 from autonomy.grasp.direct import Planned
 from autonomy.grasp.press import Press
 from autonomy.grasp.search import Search
-from autonomy.logs import LogObservation
 from autonomy.manager.manager import Manager
 from autonomy.manager.table import ENDS, WAYS, State
 from autonomy.missions.model import ForwardingMission
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import OperatorAction, StateReport, VehicleReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from hil.display import Display
-from hil.exits import Exit, Stopped
 from hil.forwarded_report import report_loads
 from hil.lockstep import START_NS, Lockstep, Observer
 from hil.mission_eyes import eyes_of
 from hil.mission_site import site_of
 from hil.operator import Operator
+from host.exits import Exit, Stopped
 from machine.faults import describe
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from autonomy.front_eyes import FrontEyes, Ours, PaperB
-from autonomy.logs import LogObservation
 from autonomy.manager.manager import Manager
 from autonomy.manager.table import ENDS, RULES
+from autonomy.perception.driving_log_detector import FrontEyes, Ours, PaperB
 from autonomy.perception.finder import LogFinder
+from autonomy.perception.logs import LogObservation
 from hil.camera_survey import SURVEYED_BY_GNSS, surveyed_profile
 from hil.lockstep import Eyes
 from hil.rig_camera import RigCamera

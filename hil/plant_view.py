@@ -12,9 +12,9 @@ from typing import Final
 
 from rich.console import Console
 
-from hil.exits import Exit, Stopped
 from hil.live import BITRATES, HOST, START_S
 from hil.processes import Family, free_udp_ports
+from host.exits import Exit, Stopped
 from machine.profile import Profile
 
 END_ORDER: Final = ("console", "sim", "wire")

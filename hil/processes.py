@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 
 _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None)

@@ -27,7 +27,7 @@ from controller.config import ConfigError, Settings
 from controller.config import load as load_settings
 from controller.record import refill, said
 from controller.step import Controller, Inputs, step
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 from recorder.manifest import Manifest
 from recorder.mcap_scan import Channel, NotMcap, Stored, scan
 from recorder.recorder import TICK

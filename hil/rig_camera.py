@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from autonomy.eyes import Eyes
 from autonomy.perception.finder import LogFinder
 from autonomy.perception.frame import Frame
+from autonomy.perception.log_detector import Eyes
 from autonomy.perception.sources.stream import received
 from can_dbc.rgbd import decode, encode
 from machine.profile import Profile

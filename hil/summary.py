@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
-from hil.exits import Exit
+from host.exits import Exit
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from sim.bunk import bunk_shapes
 from sim.carrier import PARKED, Drive, carrier_links
 from sim.crane import crane_shapes
 from sim.emulation import EmulatedMachine
-from sim.judge import Judge, Verdict
+from sim.evaluator import Judge, Verdict
 from sim.levers import DRIVE, HandLevers
 from sim.logs import LogState
 from sim.nodes.arms import ArmState

@@ -12,7 +12,7 @@ import sys
 
 import typer
 
-from hil.exits import Stopped
+from host.exits import Stopped
 from timberhand.commands import (
     bench,
     calibrate,

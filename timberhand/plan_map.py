@@ -13,7 +13,7 @@ from autonomy.missions.check import legs
 from autonomy.missions.local import site_frame, yaw_from_bearing
 from autonomy.missions.model import ForwardingMission, KnownLog
 from autonomy.missions.review import Review
-from hil.experiments.plots import MOSS, OIL, RUST, STEEL, TIMBER, sheet
+from experiments.common.plots import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 
 LOG_LENGTH_M = 3.0
 """Drawn where a log's length is not known."""

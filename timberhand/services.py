@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from can_dbc.timing_page import InputAge, Timing, TimingRefused, default_path, read_timing
-from hil.exits import Exit
-from hil.systemd import last_words, show_all
+from host.exits import Exit
+from host.systemd import last_words, show_all
 
 NAMES: Final = ("controller", "guard", "autonomy", "recorder", "console", "plc", "can@crane0", "can@mach0")
 PROPERTIES: Final = (

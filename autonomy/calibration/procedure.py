@@ -23,8 +23,8 @@ from autonomy.calibration.tasks import Bearing, Findings, Grip, Look, Pulse, Spo
 from autonomy.calibration.trace import BusTrace
 from autonomy.calibration.turning import Turning
 from autonomy.motion.arm import Arm
+from autonomy.motion.setpoint_stream import SetpointStream
 from autonomy.motion.trajectory import Trajectory, across, hold
-from autonomy.stream import SetpointStream
 from can_dbc.codec import Database
 from can_dbc.frame import Frame
 from can_dbc.setpoint import GrappleCommand, StateReport

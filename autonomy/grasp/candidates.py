@@ -15,8 +15,8 @@ from autonomy.grasp.cylinders import LEAST_RADIUS_M, Cylinders
 from autonomy.grasp.direct import clearance, closing_height, travel_height
 from autonomy.grasp.proposal import NoGrasp
 from autonomy.grasp.quality import Scores, Sections
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
+from autonomy.perception.logs import LogObservation
 from machine.kinematics import Unreachable
 
 ALONG: Final = np.linspace(-0.21, 0.21, 7)

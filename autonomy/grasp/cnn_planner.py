@@ -21,8 +21,8 @@ from autonomy.grasp.network import Best, GraspMaps, best
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.quality import lies_upon, rate, sections
 from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, cuboid, render, trimmed
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
+from autonomy.perception.logs import LogObservation
 
 DEPTH_M: Final = 0.25
 """How far under the surface of the pile the tips close."""

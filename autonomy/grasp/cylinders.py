@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.logs import LogObservation
 from autonomy.perception.estimate import ACROSS_1, ACROSS_2, END, RADIUS, SIZE, START, TILT_1, TILT_2, unpacked
+from autonomy.perception.logs import LogObservation
 
 LEAST_RADIUS_M: Final = 0.02
 POINTS: Final = 15

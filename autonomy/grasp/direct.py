@@ -19,9 +19,9 @@ import numpy as np
 
 from autonomy.grasp.heap import Heap, is_over, point_in_bunk
 from autonomy.grasp.proposal import BunkFull, NoGrasp, Planner
-from autonomy.logs import LogObservation
-from autonomy.mission import Mission
+from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm, Pose
+from autonomy.perception.logs import LogObservation
 from machine.grapple import lowest_tip_below_pin_m, rotator_for_yaw, tip_below_pin_m
 from machine.kinematics import Unreachable
 from machine.profile import Bunk, Profile, TongTable

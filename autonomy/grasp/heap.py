@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.logs import LogObservation
+from autonomy.perception.logs import LogObservation
 from machine.profile import Bunk
 
 STEP_M: Final = 0.01

@@ -23,8 +23,8 @@ from autonomy.grasp.direct import pose_over
 from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.proposal import GraspProposal, NoGrasp, Planner
 from autonomy.grasp.quality import STRICT, Sections, lies_upon, sections
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
+from autonomy.perception.logs import LogObservation
 from machine.kinematics import Unreachable
 
 ACROSS_M: Final = np.linspace(-0.72, 0.72, 37)

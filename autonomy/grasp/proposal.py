@@ -10,8 +10,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
+from autonomy.perception.logs import LogObservation
 
 
 class NoGrasp(ValueError):

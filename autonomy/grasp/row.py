@@ -17,8 +17,8 @@ from autonomy.grasp.cylinders import Cylinders
 from autonomy.grasp.direct import pose_over
 from autonomy.grasp.jaws import Jaws
 from autonomy.grasp.proposal import GraspProposal
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
+from autonomy.perception.logs import LogObservation
 from machine.kinematics import Unreachable
 
 SUCCESS: Final = 0.9

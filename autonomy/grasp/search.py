@@ -37,9 +37,9 @@ from autonomy.grasp.quality import (
 )
 from autonomy.grasp.row import drawn_out
 from autonomy.grasp.settled import settled
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
 from autonomy.perception.estimate import RADIUS
+from autonomy.perception.logs import LogObservation
 from machine.kinematics import Unreachable
 
 DRAWS: Final = 32

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from autonomy.activity import Activity
-from autonomy.logs import LogObservation
-from autonomy.manager.outlook import Outlook
+from autonomy.crane_job.activity import Activity
 from autonomy.manager.progress import Progress, copied
 from autonomy.manager.tally import Taken, Tally, volume_m3
+from autonomy.manager.world_model import Outlook
 from autonomy.missions.local import yaw_from_bearing
 from autonomy.missions.model import ForwardingMission, Point
 from autonomy.navigation.curves import Point2
+from autonomy.perception.logs import LogObservation
 from machine.profile import Profile
 
 

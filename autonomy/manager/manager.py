@@ -14,26 +14,26 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from autonomy.activity import Activity
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.rotator import Rotator
 from autonomy.grasp.direct import Chooser, choose
 from autonomy.localization.plane import Plane
-from autonomy.logs import LogObservation
 from autonomy.manager.cargo import Cargo
+from autonomy.manager.crane_executor import Hand
 from autonomy.manager.events import Events
-from autonomy.manager.hand import Hand
 from autonomy.manager.memory import Memory
-from autonomy.manager.outlook import Outlook
 from autonomy.manager.progress import Progress, copied, digest
-from autonomy.manager.rides import Ride
+from autonomy.manager.route_driver import Ride
 from autonomy.manager.table import ENDS, OURS, PAPER_B, RULES, Event, Height, State, Table, awaited, following
 from autonomy.manager.tally import Tally
 from autonomy.manager.target import Target
+from autonomy.manager.world_model import Outlook
 from autonomy.missions.model import ForwardingMission
+from autonomy.motion.planners import AsShown, Motions, Swiftest
 from autonomy.motion.primitives import load
-from autonomy.motion.ways import AsShown, Motions, Swiftest
 from autonomy.navigation.curves import PathRefused
 from autonomy.navigation.navigator import LEASE_NS, Navigator, Phase
-from autonomy.rotator import Rotator
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import StateReport, VehicleReport, encode
 from machine.profile import Profile
 

@@ -14,15 +14,15 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.activity import Activity
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.direct import lies_in
 from autonomy.grasp.heap import fallen
-from autonomy.logs import LogObservation
-from autonomy.manager.field import Field
+from autonomy.manager.log_map import Field
 from autonomy.manager.scale import Scale
 from autonomy.motion.arm import Arm
 from autonomy.perception.frame import Pose
-from autonomy.phases import Phase
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import StateReport
 from machine.grapple import grapple_yaw
 from machine.joints import JOINTS

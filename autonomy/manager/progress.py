@@ -12,9 +12,9 @@ from typing import Annotated, Final, Literal
 
 import msgspec
 
+from autonomy.crane_job.rotator import Rotator
 from autonomy.manager.tally import Taken, Tally
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
-from autonomy.rotator import Rotator
 
 SCHEMA: Final = 1
 Count = Annotated[int, msgspec.Meta(ge=0)]

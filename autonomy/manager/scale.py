@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Final
 
-from autonomy.logs import LogObservation
 from autonomy.manager.tally import volume_m3
+from autonomy.perception.logs import LogObservation
 
 FEELING_NS: Final = 2_000_000_000
 """As long as a lift takes from its start to its stop (measured on the plant: at the longest arm one second of either

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 from autonomy.manager.cargo import Cargo
-from autonomy.manager.field import FieldLog
-from autonomy.manager.outlook import Outlook
-from autonomy.manager.rides import Ride
+from autonomy.manager.log_map import FieldLog
+from autonomy.manager.route_driver import Ride
+from autonomy.manager.world_model import Outlook
 
 COMMIT_M: Final = 2.5
 """A stop that is no further ahead is driven to."""

@@ -3,7 +3,7 @@
 Places are WGS84: degrees, and metres above the ellipsoid where a height is known.  Bearings are degrees clockwise from
 true north, as maps and the bus have them; what drives turns both into local metres with ``autonomy.missions.local``.
 A mission is only data: ``autonomy.missions.check`` says what makes it one, ``autonomy.missions.files`` reads and writes
-it.  (``autonomy.mission`` is the record of a single grasp, which the console sends.)
+it.  (``autonomy.missions.crane_job`` is the record of a single grasp, which the console sends.)
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm, Pose
+from autonomy.perception.logs import LogObservation
 from machine.grapple import grapple_yaw, lowest_tip_below_pin_m, pin_to_tong_pivot_m
 from machine.joints import Joint
 from machine.profile import Bunk, Profile

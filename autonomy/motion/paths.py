@@ -4,7 +4,7 @@ A way is straight, or up, over and down, its legs overlapping in time.  Only one
 alone decides about the swing, and it is not disturbed by what the height does meanwhile.  First the height is found at
 which sharp corners are clear; there the overlaps are tried from the fastest on.  Each way is checked with everything
 that moves against everything that stands (`autonomy.motion.clearance`), with a margin and with the grapple leaning as
-this very motion makes it swing.  Laws are those of `autonomy.motion.swift`.  No clock, no randomness.
+this very motion makes it swing.  Laws are those of `autonomy.motion.time_optimal`.  No clock, no randomness.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.clearance import SAMPLES, judged, pins, spare
 from autonomy.motion.obstacles import Held, Surroundings
-from autonomy.motion.swift import swift_law
 from autonomy.motion.telescope import eased
+from autonomy.motion.time_optimal import swift_law
 from autonomy.motion.trajectory import Leg, Trajectory, leg, summed, travel
 from machine.joints import Joint
 from machine.kinematics import Unreachable

@@ -2,7 +2,7 @@
 
 ``python -m autonomy.perception --profile palms_471 --camera stick --frames 127.0.0.1:47004 --port 47003``
 
-Answers the planner's questions (``autonomy.logs``) over UDP on the loopback interface: each is a look through the
+Answers the planner's questions (``autonomy.perception.logs``) over UDP on the loopback interface: each is a look through the
 camera, and as long as that has nothing new to say there is no answer.  A question without joints, as of a page that
 only shows what is known, gets the last list.  ``--frames`` is where the camera's pictures are served
 (``can_dbc.rgbd``), ``zed`` a Stereolabs camera on this computer, or the folder of a recording.
@@ -25,11 +25,11 @@ from typing import Final
 
 import msgspec
 
-from autonomy.eyes import Eyes
-from autonomy.logs import LogsRefused, answer, answer_trouble, parse_question
 from autonomy.memory import keep_memory
 from autonomy.networks.weights import WeightsRefused
 from autonomy.perception.finder import LogFinder
+from autonomy.perception.log_detector import Eyes
+from autonomy.perception.logs import LogsRefused, answer, answer_trouble, parse_question
 from autonomy.perception.sources import CameraSource, SourceError
 from machine.load import ProfileError, load_profile
 from machine.profile import Profile

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.logs import LogObservation
+from autonomy.perception.logs import LogObservation
 
 ACROSS_1, ACROSS_2, TILT_1, TILT_2, START, END, RADIUS = range(7)
 SIZE: Final = 7

@@ -15,9 +15,9 @@ import numpy as np
 from filterpy.kalman import InformationFilter
 
 from autonomy.perception.cylinder import across_view
+from autonomy.perception.cylinder_fit import Fit
 from autonomy.perception.estimate import SIZE, LogEstimate, across
 from autonomy.perception.frame import Pose
-from autonomy.perception.refine import Fit
 
 STATES: Final = SIZE + 7  # and scale, three turns, three shifts
 CLOSE_M: Final = 0.25  # middles of one log in two pictures, across its axis, at most this and what is uncertain

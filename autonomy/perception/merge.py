@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from autonomy.perception.cylinder import Cylinder
-from autonomy.perception.refine import Fit
+from autonomy.perception.cylinder_fit import Fit
 
 ANGLE_RAD: Final = math.radians(6.0)
 GAP_M: Final = 1.5

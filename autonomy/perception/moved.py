@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
+from autonomy.perception.cylinder_fit import Fit
 from autonomy.perception.estimate import LogEstimate
 from autonomy.perception.frame import Frame, Pose
-from autonomy.perception.refine import Fit
 
 FARTHEST_M: Final = 1.5  # that a log goes between two pictures and still is known by its looks
 ALIKE_M: Final = 0.25  # lengths, and

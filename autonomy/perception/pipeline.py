@@ -12,11 +12,11 @@ from scipy.ndimage import label
 
 from autonomy.perception.contour import Outline, Sensor, own_outline
 from autonomy.perception.cylinder import Cylinder, guess
+from autonomy.perception.cylinder_fit import Fit, refine
 from autonomy.perception.frame import Frame, FrameRefused, Pose, check, inside_bars
 from autonomy.perception.log_filter import NOMINAL, Errors, Track
 from autonomy.perception.merge import LONGEST_M, groups, joined, refused
 from autonomy.perception.moved import has_moved
-from autonomy.perception.refine import Fit, refine
 from autonomy.perception.tracks import Tracks
 from machine.optics import Intrinsics
 from machine.profile import Profile

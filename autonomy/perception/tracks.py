@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from autonomy.perception.cylinder_fit import Fit
 from autonomy.perception.estimate import LogEstimate
 from autonomy.perception.frame import Pose
 from autonomy.perception.log_filter import NOMINAL, Errors, LogFilter, Track
-from autonomy.perception.refine import Fit
 
 GATE: Final = 24.3  # chi squared of seven numbers, 99.9 %
 CONFIRMED: Final = 2  # pictures after which a log is believed

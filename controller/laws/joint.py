@@ -16,8 +16,8 @@ import math
 from array import array
 from typing import Final
 
+from controller.laws.end_positioning import Rest
 from controller.laws.feedback import LAWS
-from controller.laws.rest import Rest
 from controller.valve import ValveMap
 from machine.profile import JointSpec
 

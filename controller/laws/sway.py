@@ -8,7 +8,7 @@ theta + t theta'.)
 
 The pin's displacement is pulled back with `RETURN_1_S`, so it ends where it began; that leads by atan(RETURN_1_S / w),
 which the prediction leaves out again.  Displacement and velocity go to the joint laws as a motion of the reference:
-they follow it and have nothing to correct.  When it is over both are exactly zero, and `controller.laws.rest` takes
+they follow it and have nothing to correct.  When it is over both are exactly zero, and `controller.laws.end_positioning` takes
 over.
 
 Tangential swing is damped by the slew, radial swing by stick and telescope: one moves the pin across the stick, the

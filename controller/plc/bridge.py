@@ -17,8 +17,8 @@ from can_dbc.frame import Frame
 from can_dbc.plc.map import Command, Estop, Feedback, Grapple, Role, State, WordOrder
 from controller.config import ConfigError
 from controller.outputs import Every, Message
+from controller.plc.emulated_nodes import Between, PlayedEncoder, PlayedNode
 from controller.plc.handshake import FRESH_NS, Handshake
-from controller.plc.played import Between, PlayedEncoder, PlayedNode
 from controller.plc.valve_gate import ValveGate, fault_bits, state_of
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint

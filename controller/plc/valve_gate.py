@@ -13,8 +13,8 @@ from can_dbc.codec import Database
 from can_dbc.frame import Frame
 from can_dbc.plc import map as plc
 from can_dbc.plc.map import N_AXES, N_JOINTS, Bounds, Command, Feedback, Grapple, MapError, Mode, Role, State
+from controller.message_state import Slot, age_out
 from controller.outputs import ARM_KEY
-from controller.slot import Slot, age_out
 from machine.joints import JOINTS
 from machine.modes import Mode as ControllerMode
 from machine.profile import Profile, joint

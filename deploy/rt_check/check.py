@@ -30,7 +30,13 @@ HERE = Path(__file__).resolve().parent
 CHECKOUT = HERE.parents[1]
 META_PACKAGE = "linux-image-rt-amd64"
 OURS = ("can_dbc", "machine", "controller", "sim", "hil")
-ENTRIES = ("controller.__main__", "controller.guard.__main__", "hil.timing.rig", "hil.vcan_lab.links", "ctypes")
+ENTRIES = (
+    "controller.__main__",
+    "controller.guard.__main__",
+    "experiments.timing.rig",
+    "host.vcan_lab.links",
+    "ctypes",
+)
 LEFT_OUT = ("test", "idlelib", "tkinter", "ensurepip", "lib2to3", "turtledemo", "site-packages", "__pycache__")
 LOOK = """
 import importlib, json, sys, sysconfig

@@ -67,7 +67,7 @@ def furnish() -> None:
         with open(f"/lib/modules/{os.uname().release}/kernel/{name}.ko", "rb") as module:
             if libc.syscall(_SYS_FINIT_MODULE, module.fileno(), b"", 0):
                 raise OSError(ctypes.get_errno(), f"module {name}: {os.strerror(ctypes.get_errno())}")
-    from hil.vcan_lab import links
+    from host.vcan_lab import links
 
     links.create([BUS])
 
@@ -78,8 +78,8 @@ def run(python: str, checkout: Path) -> dict[str, Any]:
     reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     reports.bind(("127.0.0.1", REPORTS))
     began_s = time.monotonic()
-    nodes, _ = start(python, checkout, "hil.timing.rig", *bus)
-    if not await_word(nodes, RUNTIME / "hil.timing.rig.out", "ready"):
+    nodes, _ = start(python, checkout, "experiments.timing.rig", *bus)
+    if not await_word(nodes, RUNTIME / "experiments.timing.rig.out", "ready"):
         raise TimeoutError("the emulated nodes do not start")
     guard, guard_ready = start(python, checkout, "controller.guard", *bus)
     controller, controller_ready = start(

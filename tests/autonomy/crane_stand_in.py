@@ -11,9 +11,9 @@ from math import atan2, cos, hypot, inf, nan, pi, remainder, sin
 
 import numpy as np
 
-from autonomy.activity import Activity
-from autonomy.logs import LogObservation
-from autonomy.phases import Phase
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.phases import Phase
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, StateReport, decode
 from machine.grapple import grapple_yaw, half_gap_m, opening_pct_from_tong_angle, tip_below_pin_m
 from machine.joints import JOINTS

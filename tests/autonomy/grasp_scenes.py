@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from math import cos, sin, sqrt
 
-from autonomy.logs import TRIANGLE, LogObservation
 from autonomy.motion.arm import Arm
+from autonomy.perception.logs import TRIANGLE, LogObservation
 from machine.load import load_profile
 
 PROFILE = load_profile("palms_471")

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from crane_stand_in import GROUND_LOG, TICK_NS, StandIn, clearances
 
-from autonomy.activity import Activity, Phase
-from autonomy.course import aimed
+from autonomy.crane_job.activity import Activity, Phase
+from autonomy.crane_job.phase_motions import aimed
 from autonomy.grasp.direct import LIFT_M, lies_in, plan_grasp
-from autonomy.logs import LogObservation
-from autonomy.mission import Mission
+from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm
-from autonomy.motion.ways import Swiftest
+from autonomy.motion.planners import Swiftest
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, StateReport, decode
 from machine.joints import JOINTS, Joint
 from machine.load import load_profile, profile_hash

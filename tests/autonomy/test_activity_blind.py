@@ -9,9 +9,9 @@ from math import cos, isfinite, nan, pi, sin
 import pytest
 from crane_stand_in import StandIn
 
-from autonomy.activity import Activity
+from autonomy.crane_job.activity import Activity
 from autonomy.grasp.direct import lies_in
-from autonomy.logs import LogObservation
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import StateReport
 from machine.joints import Joint
 from machine.load import load_profile, profile_hash

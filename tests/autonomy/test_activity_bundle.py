@@ -9,12 +9,12 @@ import pytest
 from crane_stand_in import StandIn
 from grasp_scenes import PROFILE, cross, pair
 
-from autonomy.activity import Activity
-from autonomy.course import GATHER_S
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.phase_motions import GATHER_S
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.direct import Planned, lies_in, travel_height
 from autonomy.grasp.search import Search
-from autonomy.logs import LogObservation
-from autonomy.phases import Phase
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, decode
 from machine.kinematics import Unreachable
 from machine.load import profile_hash
@@ -114,7 +114,7 @@ def test_a_bundle_without_a_way_on_is_let_go_a_little_over_where_it_lay(monkeypa
     def refuse(*_: object, **__: object) -> None:
         raise Unreachable("no way is clear")
 
-    monkeypatch.setattr("autonomy.cycle.carrying", refuse)
+    monkeypatch.setattr("autonomy.crane_job.cycle.carrying", refuse)
     crane, planner = made(pair())
     until(crane, planner, Phase.OPEN)
     assert planner.grasp is not None

@@ -9,8 +9,8 @@ import pytest
 from crane_stand_in import GROUND_LOG, StandIn
 from grasp_scenes import PROFILE
 
-from autonomy.activity import Activity
-from autonomy.logs import LogObservation
+from autonomy.crane_job.activity import Activity
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import StateReport
 from machine.load import profile_hash
 

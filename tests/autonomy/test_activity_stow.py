@@ -7,7 +7,7 @@ import pytest
 from crane_stand_in import GROUND_LOG, StandIn
 from test_activity import PROFILE, activity, phases, run_until
 
-from autonomy.activity import Activity, Phase
+from autonomy.crane_job.activity import Activity, Phase
 from autonomy.grasp.direct import retreat_height
 from autonomy.grasp.proposal import NoGrasp
 from autonomy.motion.arm import Arm
@@ -63,7 +63,7 @@ def test_a_log_for_which_there_is_no_way_on_is_let_go_where_it_lay(
     def refuse(*_: object, **__: object) -> None:
         raise trouble
 
-    monkeypatch.setattr("autonomy.cycle.carrying", refuse)
+    monkeypatch.setattr("autonomy.crane_job.cycle.carrying", refuse)
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     crane.run(planner)
     assert planner.failure == str(trouble) and planner.idle
@@ -75,7 +75,7 @@ def test_a_log_for_which_there_is_no_way_on_is_let_go_where_it_lay(
 
 def test_a_log_in_the_air_without_a_way_on_goes_down_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lifted alone first, it hangs over where it lay when there turns out to be no room."""
-    monkeypatch.setattr("autonomy.cycle.plan_place", refuse_room)
+    monkeypatch.setattr("autonomy.crane_job.cycle.plan_place", refuse_room)
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity(direct=False)
     crane.run(planner)
     assert planner.failure == "no room"

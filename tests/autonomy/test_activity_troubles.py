@@ -11,11 +11,11 @@ import pytest
 from crane_stand_in import GROUND_LOG, HOME, TICK_NS, StandIn, clearances
 from test_activity import CYCLE, PROFILE, activity, phases, report, run_until
 
-from autonomy.activity import Phase
-from autonomy.carried import is_between_tongs
-from autonomy.logs import LogObservation
-from autonomy.mission import Mission
+from autonomy.crane_job.activity import Phase
+from autonomy.crane_job.grasp_verification import is_between_tongs
+from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import CraneSetpoint, GrappleCommand, decode
 from machine.grapple import lowest_tip_below_pin_m
 from machine.joints import JOINTS, Joint

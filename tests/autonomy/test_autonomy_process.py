@@ -15,7 +15,7 @@ import pytest
 from crane_stand_in import GROUND_LOG, StandIn
 
 from autonomy.__main__ import BUSY, CONFIGURATION, FAILED, INTERRUPTED, SAFETY, main
-from autonomy.logs import parse_question
+from autonomy.perception.logs import parse_question
 from can_dbc.setpoint import CraneSetpoint, decode, encode
 from machine.load import load_profile
 from machine.modes import Mode

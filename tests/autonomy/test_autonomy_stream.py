@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from autonomy.motion.setpoint_stream import HORIZON_KNOTS, PERIOD_NS, SetpointStream
 from autonomy.motion.trajectory import hold
-from autonomy.stream import HORIZON_KNOTS, PERIOD_NS, SetpointStream
 from can_dbc.setpoint import CraneSetpoint, DatagramFault, DatagramRefused, GrappleCommand, decode
 
 

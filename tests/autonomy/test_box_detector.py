@@ -10,9 +10,9 @@ from autonomy.networks.graph import parameter_count
 from autonomy.networks.torch_net import random_net
 from autonomy.networks.weights import WeightsRefused, save
 from autonomy.perception.detector import SIZE_PX, BoxFinder, box_net, decoded
-from autonomy.training import boxes
-from autonomy.training.boxes import run, targets
-from autonomy.training.loop import Schedule
+from training.detection import boxes
+from training.detection.boxes import run, targets
+from training.loop import Schedule
 
 LOGS = (((60.0, 70.0), 0.4, 80, 14), ((140.0, 120.0), 1.2, 100, 16))
 

@@ -10,7 +10,6 @@ import pytest
 from motion_figures import figures
 
 from autonomy.grasp.direct import travel_height
-from autonomy.logs import LogObservation
 from autonomy.motion import clearance
 from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.clearance import spare
@@ -18,6 +17,7 @@ from autonomy.motion.distances import clearances
 from autonomy.motion.obstacles import Held, Rod, Surroundings, surroundings, swept, tree
 from autonomy.motion.paths import Blocked, Clear, plan
 from autonomy.motion.trajectory import Trajectory, slowly, travel
+from autonomy.perception.logs import LogObservation
 from machine.joints import JOINTS
 from machine.kinematics import Unreachable
 from machine.load import load_profile

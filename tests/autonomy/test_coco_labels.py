@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from autonomy.training.coco import _unpacked, labelled, load
-from autonomy.training.cornell import DataRefused
-from autonomy.training.labels import IGNORED
+from training.detection.coco import _unpacked, labelled, load
+from training.detection.labels import IGNORED
+from training.grasp.cornell import DataRefused
 
 POLYGON = [[10, 10, 70, 10, 70, 20, 10, 20]]
 

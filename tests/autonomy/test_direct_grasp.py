@@ -25,9 +25,9 @@ from autonomy.grasp.direct import (
     travel_height,
 )
 from autonomy.grasp.proposal import BunkFull
-from autonomy.logs import LogObservation
-from autonomy.mission import Mission
+from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm, Pose
+from autonomy.perception.logs import LogObservation
 from machine.grapple import half_gap_m, lowest_tip_below_pin_m, tip_below_pin_m
 from machine.load import load_profile
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from autonomy.eyes import FAMILIAR_NS, Eyes
 from autonomy.perception.frame import Frame
+from autonomy.perception.log_detector import FAMILIAR_NS, Eyes
 from autonomy.perception.sources import SourceError
 from machine.load import load_profile
 from machine.optics import intrinsics

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from autonomy.front_eyes import FARTHEST_M, PATIENCE, FrontEyes, Ours, PaperB
-from autonomy.logs import LogObservation
+from autonomy.perception.driving_log_detector import FARTHEST_M, PATIENCE, FrontEyes, Ours, PaperB
 from autonomy.perception.frame import Frame, Pose
+from autonomy.perception.logs import LogObservation
 from autonomy.perception.mount import optical_pose
 from autonomy.perception.sources import SourceError
 from machine.load import load_profile

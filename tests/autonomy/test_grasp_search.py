@@ -15,10 +15,10 @@ from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.quality import LAYER, STRICT, Rule, lies_upon, rate, sections
 from autonomy.grasp.search import Search
-from autonomy.logs import LogObservation
-from autonomy.mission import Mission
+from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm
 from autonomy.perception.estimate import LogEstimate
+from autonomy.perception.logs import LogObservation
 from machine.grapple import tip_below_pin_m
 from machine.load import load_profile
 

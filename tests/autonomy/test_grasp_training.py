@@ -18,10 +18,10 @@ from rich.console import Console
 from autonomy.grasp.network import PAPER, GraspMaps, heads_first
 from autonomy.networks.graph import parameter_shapes
 from autonomy.networks.torch_net import random_net
-from autonomy.training import grasp
-from autonomy.training.cornell import DataRefused, Sample, grouped_folds, load, paper_folds, rectangles
-from autonomy.training.rectangles import Rectangle, angle_between, from_corners, iou, right, wrapped
-from autonomy.training.views import View, centre, cut, drawn, label_maps, seen
+from training.grasp import train
+from training.grasp.cornell import DataRefused, Sample, grouped_folds, load, paper_folds, rectangles
+from training.grasp.rectangles import Rectangle, angle_between, from_corners, iou, right, wrapped
+from training.grasp.views import View, centre, cut, drawn, label_maps, seen
 
 CORNELL = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "cornell_rgbd_01"
 OBJECTS = (100, 102, 106, 110, 114, 118, 122, 126, *range(129, 180, 4))
@@ -195,24 +195,24 @@ def test_equation_5_at_a_third_of_the_side() -> None:
     maps = torch.from_numpy(near.astype(np.float32))
     full = torch.nn.functional.interpolate(maps, scale_factor=3, mode="bilinear").numpy()
     wanted = np.square(full - labels).sum() / (2 * 300 * 300)
-    up = grasp.upsampling()
+    up = train.upsampling()
     pulled = torch.from_numpy(up.T @ labels @ up)
     square = torch.from_numpy(np.square(labels).sum((1, 2, 3)))
-    got = grasp.equation_5(maps, pulled, square, torch.from_numpy(up.T @ up)).item()
+    got = train.equation_5(maps, pulled, square, torch.from_numpy(up.T @ up)).item()
     assert math.isclose(got, wanted, rel_tol=1e-4)
 
 
 def test_what_is_trained_is_the_paper_s_network() -> None:
-    assert parameter_shapes(grasp.BODY) == parameter_shapes(PAPER)
+    assert parameter_shapes(train.BODY) == parameter_shapes(PAPER)
     arrays = random_net(PAPER, 1).arrays()
-    full, body = random_net(PAPER, 0).eval(), random_net(grasp.BODY, 0).eval()
+    full, body = random_net(PAPER, 0).eval(), random_net(train.BODY, 0).eval()
     full.load(arrays)
     body.load(arrays)
     picture = torch.randn(1, 1, 300, 300, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         wanted = full(picture)
         low = body(torch.nn.functional.avg_pool2d(picture, 3))
-        for head in grasp.HEADS:
+        for head in train.HEADS:
             got = torch.nn.functional.interpolate(low[head], scale_factor=3, mode="bilinear")
             assert (got - wanted[head]).abs().max() <= 1e-5
     assert heads_first(PAPER, arrays)[1]["heads.weight"].shape == (3, 16, 1, 1)
@@ -232,12 +232,12 @@ def bar(number: int, theta: float) -> Sample:
 def test_a_few_bars_are_learnt() -> None:
     torch.set_num_threads(1)
     samples = [bar(i, a) for i, a in enumerate((0.0, 0.8, -0.8, 1.5))]
-    examples = grasp.copies(samples, 1, 8)
-    net, losses = grasp.fit(examples, 1, "bars", Console(file=io.StringIO()), epochs=12)
+    examples = train.copies(samples, 1, 8)
+    net, losses = train.fit(examples, 1, "bars", Console(file=io.StringIO()), epochs=12)
     assert np.mean(losses[-8:]) < 0.6 * np.mean(losses[:8])
-    asked = grasp.copies(samples, 2, 4)
-    size = grasp.usual_size(asked)
-    hits = [grasp.judge(m, e.grasps, size)["right"] for m, e in zip(grasp.predict(net, asked), asked, strict=True)]
+    asked = train.copies(samples, 2, 4)
+    size = train.usual_size(asked)
+    hits = [train.judge(m, e.grasps, size)["right"] for m, e in zip(train.predict(net, asked), asked, strict=True)]
     assert sum(hits) >= 12
 
 
@@ -245,6 +245,6 @@ def test_a_grasp_is_judged_by_its_place_and_direction() -> None:
     q = np.zeros((100, 100), np.float32)
     q[50, 40] = 1.0
     maps = GraspMaps(q, np.ones_like(q), np.zeros_like(q), 3)
-    found = grasp.judge(maps, [Rectangle(121, 151, 0.1, 90, 80)], (30.0, 20.0))
+    found = train.judge(maps, [Rectangle(121, 151, 0.1, 90, 80)], (30.0, 20.0))
     assert (found["u_px"], found["v_px"]) == (121, 151)
     assert not found["right"] and found["own_size"]

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.grasp.heap import STEP_M, Heap, fallen, in_bunk
-from autonomy.logs import LogObservation
+from autonomy.perception.logs import LogObservation
 from machine.load import load_profile
 from machine.profile import Bunk
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from autonomy.jobs import COME_TO_REST_NS, Forwarding
 from autonomy.manager.manager import Manager
 from autonomy.manager.table import OURS, State
 from autonomy.missions.model import ForwardingMission, Point
+from autonomy.process.jobs import COME_TO_REST_NS, Forwarding
 from can_dbc.mission_datagrams import MissionOrder, Order
 from can_dbc.setpoint import DriveSetpoint, decode
 from machine.load import profile_hash

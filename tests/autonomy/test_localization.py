@@ -16,7 +16,7 @@ from autonomy.localization.localizer import AGREEING, Localizer
 from autonomy.localization.motion import SIZE, Noise, Odometry, State, advance, antenna, antenna_reach, front_attitude
 from autonomy.localization.plane import Plane, heading_from_yaw, wrapped, yaw_from_heading
 from can_dbc.setpoint import DriveSetpoint, Steering, VehicleReport
-from hil.experiments.navigation.model import FIRM, MUD, SLOPE, Ground, Individual, Vehicle, individual
+from experiments.navigation.model import FIRM, MUD, SLOPE, Ground, Individual, Vehicle, individual
 from machine.load import load_profile
 from sim.geodesy import Site
 

@@ -16,8 +16,8 @@ from autonomy.perception.instances import instances
 from autonomy.perception.network import OFFSET_PX, STRIDE, unet
 from autonomy.perception.regions import shipped_judges
 from autonomy.perception.resize import doubled, shrunk
-from autonomy.training.segmentation import targets
 from machine.optics import Intrinsics
+from training.detection.segmentation import targets
 
 CROSSED = (((80, 80), 0.3, 100, 12), ((80, 80), 1.7, 90, 12))
 PARALLEL = (((80, 60), 0.2, 100, 12), ((80, 73), 0.2, 100, 12), ((80, 86), 0.2, 100, 12))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from drawn_logs import picture, strip
 
-from autonomy.training.labels import (
+from training.detection.labels import (
     ANGLE,
     CENTRE_U,
     ELONGATION,

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy import logs
-from autonomy.logs import LogObservation, LogsRefused, parse_logs, parse_question, question
+from autonomy.perception import logs
 from autonomy.perception.estimate import LogEstimate, unpacked
+from autonomy.perception.logs import LogObservation, LogsRefused, parse_logs, parse_question, question
 
 LOG: dict[str, Any] = {
     "position_m": [-1.8, 4.4, -1.3],

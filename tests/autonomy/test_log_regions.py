@@ -11,9 +11,9 @@ from autonomy.perception.network import STRIDE
 from autonomy.perception.pieces import LOOKS, piece
 from autonomy.perception.regions import Joining, cut, judges, parted, shipped_judges
 from autonomy.perception.relations import RELATIONS, Row, relations
-from autonomy.training import judging
-from autonomy.training.judging import worths
-from autonomy.training.segmentation import targets
+from training.detection import evaluator_training
+from training.detection.evaluator_training import worths
+from training.detection.segmentation import targets
 
 ROOM = np.ones((20, 60), bool)
 
@@ -139,7 +139,7 @@ def test_a_joined_piece_takes_the_borders_of_both():
 
 def test_examples_say_what_is_one_log():
     scene, ids = seen(*CROSSED)
-    pairs = judging.relations(scene, ids, np.random.default_rng(1))
+    pairs = evaluator_training.relations(scene, ids, np.random.default_rng(1))
     assert pairs.told.shape[1] == len(RELATIONS) and set(pairs.answer) == {0.0, 1.0}
     whole = worths(scene, ids, shipped_judges().joins)
     assert whole.told.shape == (2, len(LOOKS)) and (whole.answer > 0.85).all()

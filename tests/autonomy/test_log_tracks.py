@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.perception.cylinder import Cylinder, across_view
+from autonomy.perception.cylinder_fit import Fit
 from autonomy.perception.frame import Pose
 from autonomy.perception.log_filter import Errors
 from autonomy.perception.merge import groups, joined, of_one_log
-from autonomy.perception.refine import Fit
 from autonomy.perception.tracks import LOST, Tracks
 from machine.optics import BODY_FROM_OPTICAL, rpy_matrix
 

@@ -11,12 +11,12 @@ import pytest
 from autonomy.grasp.direct import lies_in, plan_place
 from autonomy.grasp.proposal import BunkFull
 from autonomy.localization.plane import Plane
-from autonomy.logs import LogObservation
 from autonomy.manager.manager import Manager
 from autonomy.manager.table import ENDS, OURS, PAPER_B, RULES, State
 from autonomy.manager.tally import Tally
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Landing, Options, Point
 from autonomy.navigation.curves import PathRefused
+from autonomy.perception.logs import LogObservation
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode
 from tests.autonomy.forwarder_stand_in import Forwarder
@@ -330,7 +330,7 @@ def test_a_bunk_that_is_full_to_the_brim_ends_the_collecting(table, monkeypatch)
             raise BunkFull("the bunk is full")
         return plan_place(arm, mission, grasp, logs, *held)
 
-    monkeypatch.setattr("autonomy.cycle.plan_place", place)
+    monkeypatch.setattr("autonomy.crane_job.cycle.plan_place", place)
     forwarder, manager = begin((*LOGS, (3, 40.0, 4.2, 0.0)), table, end_m=50.0)
     forwarder.run(manager, ended, 900.0)
     assert manager.state is State.DONE, (manager.failure, states(manager)[-6:])

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.logs import LogObservation
-from autonomy.manager.field import CONFIRMED, Field, FieldLog, nearest
+from autonomy.manager.log_map import CONFIRMED, Field, FieldLog, nearest
 from autonomy.perception.frame import Pose
+from autonomy.perception.logs import LogObservation
 from machine.load import load_profile
 
 PROFILE = load_profile("aoro_fc8")

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.__main__ import CONFIGURATION, FINE, main
-from autonomy.jobs import Forwarding
+from autonomy.crane_job.rotator import Rotator
 from autonomy.manager.logbook import EVERY_NS, Logbook, MissionFinished, read
 from autonomy.manager.manager import Manager
 from autonomy.manager.progress import Known, Left, Missed, Progress, copied, digest
@@ -24,7 +24,7 @@ from autonomy.manager.turning import turns
 from autonomy.missions.files import load_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, MissionError, Options, Point
 from autonomy.navigation.curves import PathRefused, drivable
-from autonomy.rotator import Rotator
+from autonomy.process.jobs import Forwarding
 from can_dbc.mission_datagrams import MissionOrder, Order
 from machine.load import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder

@@ -10,16 +10,16 @@ import pytest
 from crane_stand_in import StandIn
 from grasp_scenes import GROUND, PROFILE, log, measured, pair
 
-from autonomy.activity import Activity
-from autonomy.course import DRAG_M
-from autonomy.cycle import WEDGE_M
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.cycle import WEDGE_M
+from autonomy.crane_job.grasp_recovery import ANEW
+from autonomy.crane_job.phase_motions import DRAG_M
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.direct import LIFT_M, Planned
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.search import Search
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
-from autonomy.phases import Phase
-from autonomy.regrip import ANEW
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import GrappleCommand, StateReport
 from machine.grapple import tip_below_pin_m
 from machine.load import profile_hash

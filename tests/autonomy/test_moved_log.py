@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from autonomy.perception.cylinder import Cylinder
+from autonomy.perception.cylinder_fit import Fit
 from autonomy.perception.estimate import LogEstimate
 from autonomy.perception.frame import Frame, Pose
 from autonomy.perception.moved import has_moved
-from autonomy.perception.refine import Fit
 from machine.optics import Intrinsics
 
 HEIGHT_M = 4.0

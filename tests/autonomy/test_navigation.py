@@ -17,7 +17,7 @@ from autonomy.navigation.curves import drivable
 from autonomy.navigation.navigator import LEASE_NS, MOVES_NS, OBEYS_NS, Navigator, Phase
 from autonomy.navigation.waypoints import LEAST_M, PaperB, Waypoint
 from can_dbc.setpoint import DriveSetpoint, Driving, Steering, VehicleReport, decode, encode
-from hil.experiments.navigation.model import FIRM, MUD, Ground, Individual, Vehicle, individual
+from experiments.navigation.model import FIRM, MUD, Ground, Individual, Vehicle, individual
 from machine.carrier import turning_radius_m
 
 # -- drives on the model

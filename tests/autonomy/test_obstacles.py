@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import minimize_scalar
 
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
 from autonomy.motion.distances import between, clearances, least, segment_box, segment_segment
 from autonomy.motion.obstacles import (
@@ -25,6 +24,7 @@ from autonomy.motion.obstacles import (
     swept,
     tree,
 )
+from autonomy.perception.logs import LogObservation
 from machine.load import load_profile
 from sim.bunk import bunk_boxes as plant_boxes
 from sim.bunk import to_bunk

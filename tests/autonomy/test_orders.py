@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from autonomy.orders import AGE_NS, OrderRefused, Orders
+from autonomy.process.operator_commands import AGE_NS, OrderRefused, Orders
 from can_dbc.mission_datagrams import MissionOrder, Order, encode_order
 from can_dbc.setpoint import OperatorAction, OperatorCommand, encode
 

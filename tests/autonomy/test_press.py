@@ -10,17 +10,17 @@ import pytest
 from crane_stand_in import StandIn
 from grasp_scenes import PROFILE as PALMS
 
-from autonomy.activity import Activity
-from autonomy.carried import laid
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.grasp_verification import laid
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.direct import Planned, lies_in
 from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.press import DEPTH_M, SHUNNED_M, Press
 from autonomy.grasp.proposal import GraspProposal, NoGrasp
 from autonomy.grasp.search import Search
-from autonomy.logs import LogObservation
-from autonomy.mission import Mission
+from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm
-from autonomy.phases import Phase
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import StateReport
 from machine.load import load_profile, profile_hash
 from machine.profile import Bunk

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import pytest
 from grasp_scenes import MEASURED
 
+from autonomy.crane_job.grasp_recovery import ANEW, CLIMB_M, CLIMBS, Regrip
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.direct import Grasp
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Pose
-from autonomy.phases import Phase
-from autonomy.regrip import ANEW, CLIMB_M, CLIMBS, Regrip
+from autonomy.perception.logs import LogObservation
 
 
 class Told(SimpleNamespace):

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_activity_blind import HOME, Blind, birch
 
-from autonomy.activity import Activity
-from autonomy.rotator import PACES, Rotator, is_counted, planned
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.rotator import PACES, Rotator, is_counted, planned
 from machine.grapple import grapple_yaw
 from machine.joints import Joint
 from machine.load import load_profile, profile_hash

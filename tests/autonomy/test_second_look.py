@@ -9,12 +9,12 @@ import pytest
 from crane_stand_in import TICK_NS, StandIn
 from grasp_scenes import PROFILE, pair
 
-from autonomy.activity import PATIENCE_NS, Activity
+from autonomy.crane_job.activity import PATIENCE_NS, Activity
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.direct import Planned
 from autonomy.grasp.proposal import NoGrasp
 from autonomy.grasp.search import Search
-from autonomy.logs import TRIANGLE, LogObservation
-from autonomy.phases import Phase
+from autonomy.perception.logs import TRIANGLE, LogObservation
 from machine.kinematics import Unreachable
 from machine.load import profile_hash
 
@@ -96,7 +96,7 @@ def test_a_better_grasp_to_which_there_is_no_way_is_let_be(monkeypatch: pytest.M
     def refuse(*_: object, **__: object) -> None:
         raise Unreachable("no way is clear")
 
-    monkeypatch.setattr("autonomy.cycle.above", refuse)
+    monkeypatch.setattr("autonomy.crane_job.cycle.above", refuse)
     until(crane, planner, Phase.CLOSE)
     assert planner.failure is None
 

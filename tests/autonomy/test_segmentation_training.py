@@ -8,10 +8,10 @@ from rich.console import Console
 
 from autonomy.networks.graph import parameter_count
 from autonomy.perception.network import CHANNELS, MAPS, OFFSET_PX, STRIDE, channels, unet
-from autonomy.training import segmentation
-from autonomy.training.labels import IGNORED
-from autonomy.training.loop import Schedule
-from autonomy.training.segmentation import batches, changed, loss, recoloured, run, targets
+from training.detection import segmentation
+from training.detection.labels import IGNORED
+from training.detection.segmentation import batches, changed, loss, recoloured, run, targets
+from training.loop import Schedule
 
 LOGS = (((90.0, 100.0), 0.4, 120, 14), ((140.0, 120.0), 1.2, 100, 16))
 

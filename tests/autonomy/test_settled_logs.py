@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from autonomy.grasp.cylinders import Cylinders, cylinders, default_covariance
 from autonomy.grasp.settled import CROOKED_M, apart, settled
-from autonomy.logs import LogObservation
 from autonomy.perception.estimate import ACROSS_2, RADIUS, TILT_2
+from autonomy.perception.logs import LogObservation
 
 WELL = np.array([0.012, 0.018, 0.007, 0.017, 0.02, 0.03, 0.005])
 """Standard deviations of a log that a surveyed camera sees whole, in the order of ``LogEstimate``, ..."""

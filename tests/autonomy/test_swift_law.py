@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.swift import STEP_S, swift_law
+from autonomy.motion.time_optimal import STEP_S, swift_law
 from autonomy.motion.timing import SWING_RAD, Way, time_law
 from machine.joints import N_JOINTS
 from machine.load import load_profile

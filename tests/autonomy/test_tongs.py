@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from autonomy.crane_job.grapple import Tongs, among_stakes
 from autonomy.grasp.direct import Grasp, travel_height
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm, Pose
-from autonomy.tongs import Tongs, among_stakes
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import GrappleCommand
 from machine.grapple import tip_below_pin_m
 from machine.load import load_profile

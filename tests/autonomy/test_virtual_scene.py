@@ -16,8 +16,8 @@ from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.network import WEIGHTS, Best, GraspMaps, GraspNet
 from autonomy.grasp.proposal import NoGrasp
 from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, cuboid, render, trimmed
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
+from autonomy.perception.logs import LogObservation
 from machine.load import load_profile
 
 JAWS = jaws_of(PROFILE)

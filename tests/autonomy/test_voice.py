@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autonomy.jobs import ABORTED, Forwarding, OneLog
 from autonomy.manager.manager import Manager
-from autonomy.manager.outlook import ATTEMPTS
 from autonomy.manager.table import EVENTS, OURS, Event, State
+from autonomy.manager.world_model import ATTEMPTS
 from autonomy.missions.model import Fence, ForwardingMission, Landing, Options, Point
+from autonomy.process.jobs import ABORTED, Forwarding, OneLog
 from can_dbc.mission_datagrams import (
     MAX_CORNERS,
     MAX_LOGS,

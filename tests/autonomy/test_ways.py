@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autonomy.course import LEAN_M, above, carrying
+from autonomy.crane_job.phase_motions import LEAN_M, above, carrying
 from autonomy.grasp.direct import hover_height, plan_grasp, plan_place, travel_height
-from autonomy.logs import LogObservation
-from autonomy.mission import Mission
-from autonomy.motion import ways
+from autonomy.missions.crane_job import Mission
+from autonomy.motion import planners
 from autonomy.motion.arm import Arm, Pose
 from autonomy.motion.clearance import MARGIN_M, spare
 from autonomy.motion.obstacles import Surroundings, held_log, surroundings, tree
 from autonomy.motion.paths import Blocked, plan
+from autonomy.motion.planners import AsShown, Swiftest
 from autonomy.motion.primitives import load
 from autonomy.motion.trajectory import Trajectory, travel
-from autonomy.motion.ways import AsShown, Swiftest
+from autonomy.perception.logs import LogObservation
 from machine.load import load_profile
 
 PROFILE = load_profile("aoro_fc8")
@@ -53,8 +53,8 @@ def test_a_place_that_is_reached_from_above_alone_is(monkeypatch: pytest.MonkeyP
             raise Blocked("too near to the stakes")
         return plan(arm, start, goal, *more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(ways, "plan", only_high)
-    monkeypatch.setattr(ways, "spare", lambda *_: (-1.0, ""))
+    monkeypatch.setattr(planners, "plan", only_high)
+    monkeypatch.setattr(planners, "spare", lambda *_: (-1.0, ""))
     motion = carrying(ARM, Swiftest(), GRASP.pose, PLACE, GRASP, [LOG], hangs=False)
     assert pins(motion)[-1] == pytest.approx((PLACE.slew_rad, PLACE.r_m, HIGH), abs=2e-3)
 
@@ -75,7 +75,7 @@ def test_among_other_logs_it_stops_above() -> None:
 def test_where_no_swift_way_is_clear_the_one_at_full_height_is_taken_only_if_it_is(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(ways, "plan", blocked)
+    monkeypatch.setattr(planners, "plan", blocked)
     free = Surroundings(GROUND)
     slow = Swiftest()(ARM, PLACE, OVER, free, None, HIGH, 0.0)
     assert slow == travel(ARM, PLACE, OVER, HIGH, 0.0)

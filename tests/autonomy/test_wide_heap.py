@@ -8,12 +8,12 @@ import pytest
 from crane_stand_in import StandIn
 from grasp_scenes import GROUND, PROFILE, measured, small_pile
 
-from autonomy.activity import Activity
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.grasp_recovery import CLIMBS
+from autonomy.crane_job.phases import Phase
 from autonomy.grasp.direct import Planned
 from autonomy.grasp.search import Search
-from autonomy.logs import LogObservation
-from autonomy.phases import Phase
-from autonomy.regrip import CLIMBS
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import GrappleCommand
 from machine.grapple import tip_below_pin_m
 from machine.load import profile_hash

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from can_dbc import codec
 from can_dbc.e2e import protect
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 from timberhand.commands import bench_codec, dbc, log
 
 OVERLAP = (

@@ -14,13 +14,13 @@ import pytest
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from autonomy.logs import parse_logs, parse_question
+from autonomy.perception.logs import parse_logs, parse_question
 from can_dbc.setpoint import OperatorAction, OperatorCommand, StateReport, decode, encode
 from can_dbc.timing_page import TimingWriter
 from console.server import STATIC, Console, create_app
 from console.state import ALIVE_NS, STALE_NAMES, TIMING_OLD_NS, Watch, describe_machine
+from controller.carrier.inputs import STALE_BIT
 from controller.inputs import BITS
-from controller.machine_inputs import STALE_BIT
 from machine.joints import ARTICULATION, JOINTS
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from controller.estimator import JointEstimator
 from controller.laws.crane import FLOW_SHARE, CraneLaw
+from controller.laws.end_positioning import INCH_SHARE, OPEN_LIMIT, Rest
 from controller.laws.feedback import INTEGRAL_SHARE, LAWS, PID_SHARE
 from controller.laws.joint import ACCELERATION_FACTOR, HEADROOM, InFlight, JointLaw, Vibration
-from controller.laws.rest import INCH_SHARE, OPEN_LIMIT, Rest
 from controller.valve import ValveMap
 from machine.joints import JOINTS, Joint
 

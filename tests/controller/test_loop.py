@@ -15,13 +15,13 @@ from can_dbc.lost_link import GONE_NS, RETRY_NS
 from can_dbc.setpoint import Driving, OperatorAction, OperatorCommand, StateReport, decode, encode
 from can_dbc.timing_page import TimingWriter, read_timing
 from controller.__main__ import address, bus_address, listen, main, parser
+from controller.carrier.vehicle import Vehicle
 from controller.config import ConfigError, load
 from controller.loop import Loop
 from controller.realtime import sleep_until, sleeper
-from controller.rehearsal import NowhereBus, rehearse
 from controller.step import Controller
 from controller.timing import LoopTiming
-from controller.vehicle import Vehicle
+from controller.warm_up import NowhereBus, rehearse
 from machine.reasons import Reason
 
 LEAD = SETTINGS.sync_lead_ns
@@ -300,8 +300,8 @@ def test_the_rehearsal_walks_through_every_mode_and_leaves_nothing(profile, monk
     assert {"ARMED", "ACTIVE"} <= seen
     assert all(slot.stamp_ns for _, slot in controller.inputs_in_use), "every input has been decoded"
     assert controller.gate.refused > 100, "nonsense was refused"
-    assert len(worked) > 100 and (not controller.vehicle or driven == {Driving.DRIVING, Driving.BRAKING})
-    assert not controller.vehicle or controller.vehicle.order.sequence, "a drive setpoint was obeyed"
+    assert len(worked) > 100 and (not controller.carrier.vehicle or driven == {Driving.DRIVING, Driving.BRAKING})
+    assert not controller.carrier.vehicle or controller.carrier.vehicle.order.sequence, "a drive setpoint was obeyed"
 
 
 def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):
@@ -390,9 +390,9 @@ def test_the_bus_is_filtered_by_all_that_is_looked_at_and_nothing_more(profile):
         assert {0x80 + node, 0x580 + node, 0x700 + node} <= {k for k in range(0x800) if k in crane}
     assert DATABASE.message("ValveCmdA").key in crane, "another who speaks for us is heard"
     assert 0x600 not in crane and 0x7FF not in crane
-    if controller.machine_bus is None:
+    if controller.carrier.bus is None:
         return
-    machine = Filter(controller.machine_bus.received.wanted())
+    machine = Filter(controller.carrier.bus.received.wanted())
     for _, slot in controller.inputs_in_use:
         if slot.machine:
             other_source = (slot.codec.key & ~0xFF | 0x55) ^ 0x0400_0000  # and another priority

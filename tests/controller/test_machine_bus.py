@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from can_dbc.e2e import Checker, Status
 from can_dbc.frame import EXTENDED, REMOTE
 from can_dbc.nmea2000 import encode, frames, join_id
+from controller.carrier.bus import MachineBus
+from controller.carrier.outputs import STANDING, CarrierCommand
 from controller.config import ConfigError
-from controller.machine_bus import MachineBus
-from controller.machine_outputs import STANDING, CarrierCommand
 from controller.step import Controller
 from machine.faults import describe
 from machine.joints import ARTICULATION

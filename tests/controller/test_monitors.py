@@ -6,7 +6,7 @@ from collections import deque
 import pytest
 from bench import SPECS, T
 
-from controller.laws.rest import INCH_SHARE
+from controller.laws.end_positioning import INCH_SHARE
 from controller.monitors import EARLY_S, LATE_S, MotionMonitor
 from machine.faults import FAULTS
 from machine.reasons import Reason

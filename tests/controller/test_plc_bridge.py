@@ -17,8 +17,8 @@ from can_dbc.plc.datagram import Header, encode_reply
 from can_dbc.plc.map import Command, Estop, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
 from controller.config import ConfigError
 from controller.plc.bridge import Bridge, role_of
+from controller.plc.emulated_nodes import Between
 from controller.plc.handshake import Handshake
-from controller.plc.played import Between
 from controller.startup import Startup
 from machine.load import load_profile
 from machine.modes import Mode as ControllerMode

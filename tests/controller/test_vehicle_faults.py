@@ -8,9 +8,9 @@ import pytest
 from driving import CARRIER, MS, DriveBench, T
 
 from can_dbc.setpoint import Driving
-from controller.vehicle import UNSURE_SHARE
-from controller.vehicle_watch import ARM_STUCK_NS, DISAGREE_RAD, OWN_GAIN, OWN_M_S
-from controller.whereabouts import JUMP_M, OFF_M
+from controller.carrier.dead_reckoning import JUMP_M, OFF_M
+from controller.carrier.monitors import ARM_STUCK_NS, DISAGREE_RAD, OWN_GAIN, OWN_M_S
+from controller.carrier.vehicle import UNSURE_SHARE
 from machine.faults import FAULTS, describe
 from machine.joints import ARTICULATION
 from machine.modes import Mode

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.service_lab.host import build_wheel
+from host.service_lab.host import build_wheel
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 INSTALL = DEPLOY / "install.sh"

@@ -18,9 +18,9 @@ from controller.guard.__main__ import build, profile_path
 from controller.guard.__main__ import run as run_guard
 from controller.loop import Loop
 from controller.realtime import Notifier
-from controller.rehearsal import NowhereBus, rehearse
 from controller.step import Controller
 from controller.timing import LoopTiming
+from controller.warm_up import NowhereBus, rehearse
 from machine.modes import Mode
 
 MS = 1_000_000

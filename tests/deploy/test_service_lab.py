@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from hil.service_lab.host import missing
-from hil.service_lab.trial import MOVING
+from host.service_lab.host import missing
+from host.service_lab.trial import MOVING
 
 ROOT = Path(__file__).parents[2]
 
@@ -21,7 +21,7 @@ def test_controller_and_guard_die_and_lose_their_bus_and_the_valves_are_neutral(
     if fault := missing():
         pytest.skip(f"service lab: {fault}")
     done = subprocess.run(
-        [sys.executable, "-m", "hil.service_lab", "--timeout", "900"],
+        [sys.executable, "-m", "host.service_lab", "--timeout", "900"],
         cwd=ROOT, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.stdout, done.stderr

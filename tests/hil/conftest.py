@@ -12,7 +12,7 @@ from lab_runs import LAB, ROOT, Run, environment, require_lab
 
 @pytest.fixture(scope="module")
 def lab() -> Iterator[Run]:
-    """Runs ``python -m hil.vcan_lab *arguments``; skips where this machine has no way to a lab."""
+    """Runs ``python -m host.vcan_lab *arguments``; skips where this machine has no way to a lab."""
     require_lab()
 
     def run(*arguments: str, cwd: Path = ROOT, **env: str) -> subprocess.CompletedProcess[bytes]:

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from hil.vcan_lab.choose import choose, survey
-from hil.vcan_lab.spec import LabError, Request
+from host.vcan_lab.choose import choose, survey
+from host.vcan_lab.spec import LabError, Request
 
 ROOT = Path(__file__).parents[2]
-LAB = [sys.executable, "-m", "hil.vcan_lab"]
+LAB = [sys.executable, "-m", "host.vcan_lab"]
 REQUEST = Request(
     argv=("true",), cwd="/", env={"A": "b"}, uid=1000, gid=100, groups=(100, 4), umask=0o22, mem_mb=256
 )  # fmt: skip

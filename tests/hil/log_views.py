@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 
 from autonomy.perception.frame import Frame, Pose
-from hil.experiments.log_localization.trial import TrueMask
-from hil.experiments.plant.worlds import opened, profile_named
+from experiments.common.worlds import opened, profile_named
+from experiments.log_localization.trial import TrueMask
 from machine.optics import Intrinsics, intrinsics
 from sim.camera.geometry import View, look_at
 from sim.camera.noise import StereoNoise

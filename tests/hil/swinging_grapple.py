@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 import machine
-from autonomy.logs import LogObservation
 from autonomy.motion.arm import Arm
+from autonomy.motion.setpoint_stream import PERIOD_NS, SetpointStream
 from autonomy.motion.trajectory import Trajectory, hold, straight
-from autonomy.stream import PERIOD_NS, SetpointStream
+from autonomy.perception.logs import LogObservation
 from can_dbc.setpoint import GrappleCommand, StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard

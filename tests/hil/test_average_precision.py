@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hil.experiments.detector.precision import (
+from training.average_precision import (
     Matches,
     average_precision,
     box_overlaps,

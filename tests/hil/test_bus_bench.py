@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from can_dbc.codec import load
 from can_dbc.e2e import Checker, Status
-from hil import bus_bench
-from hil.bus_bench import LIMIT_US, Traffic, measure
-from hil.exits import Exit, Stopped
+from experiments.benches import bus
+from experiments.benches.bus import LIMIT_US, Traffic, measure
+from host.exits import Exit, Stopped
 from timberhand.commands.bench import app
 
 TICKS = 40
@@ -69,7 +69,7 @@ def test_the_verdict(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     measured = result | {"lab": lab, "metrics": result["metrics"] | {"rx_decode_us": cost_us}}
-    monkeypatch.setattr(bus_bench, "measure", lambda frames, rounds: measured)
+    monkeypatch.setattr(bus, "measure", lambda frames, rounds: measured)
     done = CliRunner().invoke(app, ["bus", *form])
     assert done.exit_code == code
     if form:

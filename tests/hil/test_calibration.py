@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 import machine
 from autonomy.calibration.procedure import Calibration
 from autonomy.calibration.tasks import Spool
+from experiments.calibration.trial import calibrated
+from experiments.common.pool import Job
 from hil.calibration import run_lockstep
-from hil.experiments.calibration.trial import calibrated
-from hil.experiments.pool import Job
 from hil.replay import files_of, replay
 from machine.load import load_profile
 from recorder.manifest import describe

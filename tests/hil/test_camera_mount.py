@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from autonomy.perception.camera_survey import surveyed
 from autonomy.perception.frame import Pose
 from autonomy.perception.mount import MountRefused, optical_pose
-from hil.experiments.plant.worlds import opened, profile_named
+from experiments.common.worlds import opened, profile_named
 from machine.optics import BODY_FROM_OPTICAL, intrinsics, rpy_matrix
 from sim.camera.geometry import mount_view, quaternion_matrix
 

@@ -9,7 +9,7 @@ import pytest
 from autonomy.perception.frame import check
 from autonomy.perception.sources.stream import StreamCamera
 from can_dbc.bus import open_bus
-from hil.experiments.plant.worlds import profile_named
+from experiments.common.worlds import profile_named
 from sim.__main__ import LivePlant
 from sim.plant import Plant
 

@@ -14,11 +14,11 @@ import pytest
 
 from controller.estimator import JointEstimator
 from controller.laws.heading import AngleLaw, WaypointLaw
-from hil.loop_design import carrier as loops
-from hil.loop_design.carrier import CarrierCase, angle_spec, arm_loop, heading_loop, natural
-from hil.loop_design.loop import FREQUENCY_RAD_S, LawResponse, Spool, margins
-from hil.loop_design.page import write
-from hil.loop_design.study import GAIN_DB, PHASE_DEG, Work, study, work_of
+from experiments.loop_design import carrier as loops
+from experiments.loop_design.carrier import CarrierCase, angle_spec, arm_loop, heading_loop, natural
+from experiments.loop_design.loop import FREQUENCY_RAD_S, LawResponse, Spool, margins
+from experiments.loop_design.page import write
+from experiments.loop_design.study import GAIN_DB, PHASE_DEG, Work, study, work_of
 from machine.carrier import heading_rate_rad_s
 from machine.load import load_profile
 

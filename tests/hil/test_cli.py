@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 from timberhand.cli import app
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -15,11 +15,13 @@ from rich.console import Console
 from autonomy.motion.arm import Arm
 from autonomy.motion.trajectory import straight
 from can_dbc.setpoint import CraneSetpoint, StateReport, decode
-from hil.experiments.crane_accuracy import experiment, measure
-from hil.experiments.crane_accuracy.figures import FIGURES, gather
-from hil.experiments.crane_accuracy.measure import Trace
-from hil.experiments.crane_accuracy.minimum_time import Limits, full_limits, minimum_time_s
-from hil.experiments.crane_accuracy.plan import (
+from experiments.common.minimum_time import Limits, full_limits, minimum_time_s
+from experiments.common.pool import Job
+from experiments.common.registry import Options
+from experiments.crane_accuracy import experiment, measure
+from experiments.crane_accuracy.figures import FIGURES, gather
+from experiments.crane_accuracy.measure import Trace
+from experiments.crane_accuracy.plan import (
     GOALS_M,
     LAWS,
     OWN,
@@ -33,10 +35,8 @@ from hil.experiments.crane_accuracy.plan import (
     variants,
     visits,
 )
-from hil.experiments.crane_accuracy.rounds import Part, Rounds
-from hil.experiments.crane_accuracy.trial import varied
-from hil.experiments.pool import Job
-from hil.experiments.registry import Options
+from experiments.crane_accuracy.rounds import Part, Rounds
+from experiments.crane_accuracy.trial import varied
 from machine.kinematics import pin_position
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode

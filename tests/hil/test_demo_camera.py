@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from hil.demo import run_lockstep
-from hil.exits import Exit
+from host.exits import Exit
 
 pytestmark = [pytest.mark.slow, pytest.mark.computed]
 

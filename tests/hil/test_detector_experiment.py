@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from hil.exits import Exit, Stopped
-from hil.experiments.detector import experiment, photos, trial, worlds
-from hil.experiments.registry import Options
-from hil.experiments.report import page
-from hil.experiments.result import judged
+from experiments.common.registry import Options
+from experiments.common.report import page
+from experiments.common.result import judged
+from experiments.detector import experiment, photos, trial, worlds
+from host.exits import Exit, Stopped
 
 
 @pytest.fixture
 def few_piles(monkeypatch, tmp_path):
-    monkeypatch.setattr("hil.training.piles.CHUNK", 1)
+    monkeypatch.setattr("training.detection.piles.CHUNK", 1)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 

@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from hil.doctor import installation
-from hil.doctor.facts import UNLIMITED, CanLink, Facts, cpu_set, read
-from hil.doctor.finding import Finding, Severity, fine
-from hil.doctor.show import show, verdict
-from hil.doctor.timing import judge
+from host.doctor import installation
+from host.doctor.facts import UNLIMITED, CanLink, Facts, cpu_set, read
+from host.doctor.finding import Finding, Severity, fine
+from host.doctor.show import show, verdict
+from host.doctor.timing import judge
 from machine.load import ProfileError
 
 ROOT = Path(__file__).parents[2]

@@ -11,14 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from hil.exits import Stopped
-from hil.experiments import pool
-from hil.experiments.plant.signals import ringing
-from hil.experiments.pool import Checkpoint, Job
-from hil.experiments.registry import Options
-from hil.experiments.report import page
-from hil.experiments.result import Figure, Result, judge, rate, wilson
-from hil.experiments.trials import check_truth, checkpoint
+from experiments.common import pool
+from experiments.common.pool import Checkpoint, Job
+from experiments.common.registry import Options
+from experiments.common.report import page
+from experiments.common.result import Figure, Result, judge, rate, wilson
+from experiments.common.trials import check_truth, checkpoint
+from experiments.plant.signals import ringing
+from host.exits import Stopped
 
 QUIET = Console(quiet=True)
 SPEED = Figure("speed", "How fast", "m/s", "With a watch.", least=2.0, clocked=True)

@@ -9,10 +9,10 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from hil.experiments.plant import endurance, experiment, physics, rolling, trial
-from hil.experiments.plant.figures import FIGURES, SECTIONS
-from hil.experiments.pool import Job
-from hil.experiments.registry import EXPERIMENTS, Options, load
+from experiments.common.pool import Job
+from experiments.common.registry import EXPERIMENTS, Options, load
+from experiments.plant import endurance, experiment, physics, rolling, trial
+from experiments.plant.figures import FIGURES, SECTIONS
 from timberhand.cli import app
 
 pytestmark = pytest.mark.computed

@@ -13,10 +13,10 @@ import pytest
 from autonomy.localization.plane import Plane
 from autonomy.missions.check import problems_of
 from autonomy.missions.files import load_mission
-from hil.experiments.forwarding_mission.experiment import FILE, MACHINES, NOMINAL, calibrations, missions, trial
-from hil.experiments.forwarding_mission.figures import FIGURES, PAPER_TABLE_MM, by_log, gather, table
-from hil.experiments.forwarding_mission.pictures import PAPER_MM, draw
-from hil.experiments.forwarding_mission.trial import ACROSS_M, ALONG_M, TURN_DEG, perform, short, shuffled
+from experiments.forwarding_mission.experiment import FILE, MACHINES, NOMINAL, calibrations, missions, trial
+from experiments.forwarding_mission.figures import FIGURES, PAPER_TABLE_MM, by_log, gather, table
+from experiments.forwarding_mission.pictures import PAPER_MM, draw
+from experiments.forwarding_mission.trial import ACROSS_M, ALONG_M, TURN_DEG, perform, short, shuffled
 
 OPTIONS = SimpleNamespace(seed=3, quick=False)
 MISSION = load_mission(FILE, route_wanted=True).mission

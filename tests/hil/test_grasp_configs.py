@@ -9,8 +9,11 @@ from typing import Any
 
 import pytest
 
-from autonomy.logs import LogObservation
-from hil.experiments.grasp_configs.experiment import (
+from autonomy.perception.logs import LogObservation
+from experiments.common.pool import Job
+from experiments.common.registry import Options
+from experiments.common.result import judged
+from experiments.grasp_configs.experiment import (
     MACHINES,
     PAPER_ATTEMPTS,
     gather,
@@ -18,13 +21,10 @@ from hil.experiments.grasp_configs.experiment import (
     machines_of,
     published_ablation,
 )
-from hil.experiments.grasp_configs.figures import FIGURES, SECTIONS, sections
-from hil.experiments.grasp_configs.outcome import Grip, category, lies_on, lifted
-from hil.experiments.grasp_configs.poses import misled
-from hil.experiments.grasp_configs.trial import attempt
-from hil.experiments.pool import Job
-from hil.experiments.registry import Options
-from hil.experiments.result import judged
+from experiments.grasp_configs.figures import FIGURES, SECTIONS, sections
+from experiments.grasp_configs.outcome import Grip, category, lies_on, lifted
+from experiments.grasp_configs.poses import misled
+from experiments.grasp_configs.trial import attempt
 from sim.logs import LogState
 from sim.scene import CONFIGURATIONS
 

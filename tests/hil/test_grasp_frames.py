@@ -15,15 +15,15 @@ from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.network import GraspNet
 from autonomy.grasp.quality import lies_upon, rate, sections
 from autonomy.grasp.virtual_scene import DOWNWARD, Camera, render
-from hil.exits import Exit, Stopped
-from hil.training.grasp_frames import LOW_PX, frames
-from hil.training.grasp_kernel import draw, facts_of, judge
-from hil.training.piles import Pile
+from host.exits import Exit, Stopped
 from machine.load import load_profile
 from sim.camera.geometry import View
 from sim.camera.render import render as sim_render
 from sim.camera.scene import Ground, LogPose, SceneBuilder
 from timberhand.commands import train
+from training.detection.piles import Pile
+from training.grasp.frames import LOW_PX, frames
+from training.grasp.kernel import draw, facts_of, judge
 
 GROUND = -1.39
 JAWS = jaws_of(load_profile("palms_471"))
@@ -121,8 +121,8 @@ def test_a_frame_is_a_picture_with_quality_on_the_wood_and_equal_seeds_are_equal
 def test_frames_become_examples_of_equation_5() -> None:
     """Against the sums over all 90 000 pixels."""
     torch = pytest.importorskip("torch")
-    from autonomy.training.grasp import equation_5, upsampling
-    from hil.training.grasp_physical import examples
+    from training.grasp.physical import examples
+    from training.grasp.train import equation_5, upsampling
 
     single = [LogPose(1, (0.3, 0.2, GROUND + 0.1), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)), 2.6, 0.2)]
     found = list(frames(single, GROUND, JAWS, 3, 2))
@@ -141,7 +141,7 @@ def test_frames_become_examples_of_equation_5() -> None:
 @pytest.mark.computed
 def test_weights_from_physical_labels_come_with_their_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch")
-    from hil.training import grasp_physical
+    from training.grasp import physical
 
     def lain(machine: str, first: int, count: int, folder: Path | None) -> list[Pile]:
         z = GROUND + 0.1
@@ -151,10 +151,10 @@ def test_weights_from_physical_labels_come_with_their_card(tmp_path: Path, monke
         )
         return [Pile(machine, first, "parallel", "flat", 0, GROUND, logs)]
 
-    monkeypatch.setattr(grasp_physical, "piles", lain)
-    monkeypatch.setattr(grasp_physical, "HELD_BACK", 4)
+    monkeypatch.setattr(physical, "piles", lain)
+    monkeypatch.setattr(physical, "HELD_BACK", 4)
     out = tmp_path / "grasp_physical.safetensors"
-    made, card = grasp_physical.produce(3, out, Console(quiet=True), count=8, epochs=1)
+    made, card = physical.produce(3, out, Console(quiet=True), count=8, epochs=1)
     assert made == out and GraspNet.shipped(out).maps(np.full((300, 300), 3.0, np.float32)).q.shape[0] > 0
     told = card.read_text()
     assert "8 frames of settled piles" in told and "no real data" in told

@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 
 from autonomy.grasp.network import PAPER, WEIGHTS, GraspNet, best, prepare
 from autonomy.networks.weights import load
-from autonomy.training.cornell import load as load_samples
-from hil.exits import Exit, Stopped
-from hil.experiments.grasp_network import experiment, folds, latency
-from hil.experiments.registry import Options
+from experiments.common.registry import Options
+from experiments.grasp_network import experiment, folds, latency
+from host.exits import Exit, Stopped
 from timberhand.commands import train
+from training.grasp.cornell import load as load_samples
 
 QUIET = Console(file=io.StringIO())
 

@@ -13,14 +13,14 @@ from autonomy.motion.arm import Arm
 from autonomy.motion.demonstration import cut, track
 from autonomy.motion.primitives import SHIPPED, learn_primitives, over_bunk
 from can_dbc.codec import load as load_database
-from hil.exits import Exit, Stopped
 from hil.hand_demonstration import AXES, script, show
-from hil.learning import motions_in
+from host.exits import Exit, Stopped
 from machine.load import load_profile
 from recorder.manifest import describe
 from recorder.recorder import Recorder
 from sim.world import home_of
 from timberhand.cli import app
+from training.movement_primitives import motions_in
 
 PROFILE = load_profile("aoro_fc8")
 HOME = tuple(home_of(PROFILE)[name] for name in ("slew", "lift", "tilt", "ext", "rot"))

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from hil.experiments.joint_tracking import experiment, individuals, motions
-from hil.experiments.joint_tracking.figures import LAWS, sections, table, verdict
-from hil.experiments.joint_tracking.individuals import CORNERS
-from hil.experiments.joint_tracking.rig import NAMES, Calibration
-from hil.experiments.joint_tracking.trial import _slow, perform
-from hil.experiments.pool import Job
-from hil.experiments.registry import Options
+from experiments.common.pool import Job
+from experiments.common.registry import Options
+from experiments.joint_tracking import experiment, individuals, motions
+from experiments.joint_tracking.figures import LAWS, sections, table, verdict
+from experiments.joint_tracking.individuals import CORNERS
+from experiments.joint_tracking.rig import NAMES, Calibration
+from experiments.joint_tracking.trial import _slow, perform
 from machine.load import load_profile
 
 pytestmark = pytest.mark.computed

@@ -20,7 +20,7 @@ import can
 import pytest
 
 from can_dbc import codec
-from hil.exits import Exit
+from host.exits import Exit
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(700)]
 
@@ -106,7 +106,7 @@ def test_the_job_on_the_wire(tmp_path: Path, demo: Demo) -> None:
 
 
 def test_the_job_on_vcan_where_candump_sees_it(tmp_path: Path) -> None:
-    lab = [sys.executable, "-m", "hil.vcan_lab"]
+    lab = [sys.executable, "-m", "host.vcan_lab"]
     way = json.loads(subprocess.run([*lab, "--check", "--json"], capture_output=True, text=True).stdout)
     if way["way"] is None:
         pytest.skip(f"no vcan here: {way['why']}")

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from test_mission_run import mission_file
 
-from hil.vcan_lab import lab_kernel, shim
+from host.vcan_lab import lab_kernel, shim
 
 ROOT = Path(__file__).parents[2]
 FROZEN = """
@@ -60,7 +60,7 @@ def test_a_log_comes_aboard_although_the_planner_freezes_on_the_way(tmp_path: Pa
         pytest.skip(lab_kernel.MISSING)
     path, out = mission_file(tmp_path / "mission.geojson", (8.0, 3.6, 80.0)), tmp_path / "run"
     done = subprocess.run(
-        [sys.executable, "-m", "hil.vcan_lab", "--time-travel", "--", sys.executable, "-c", FROZEN, path, out],
+        [sys.executable, "-m", "host.vcan_lab", "--time-travel", "--", sys.executable, "-c", FROZEN, path, out],
         cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, (done.stdout[-3000:], done.stderr[-3000:])

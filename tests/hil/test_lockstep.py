@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 
 from hil.demo import run_lockstep
-from hil.exits import Exit
 from hil.replay import files_of, replay
 from hil.summary import Summary
+from host.exits import Exit
 
 pytestmark = [pytest.mark.slow, pytest.mark.computed]
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hil.exits import Exit, Stopped
-from hil.experiments.log_localization.experiment import plan
-from hil.experiments.log_localization.figures import explanation, gather, sections
-from hil.experiments.log_localization.pictures import draw
-from hil.experiments.log_localization.site import APART_M, STOP_M, Site
-from hil.experiments.log_localization.trial import RANGES_M, detected, true_masks
-from hil.experiments.plant.worlds import profile_named
-from hil.experiments.registry import Options
+from experiments.common.registry import Options
+from experiments.common.worlds import profile_named
+from experiments.log_localization.experiment import plan
+from experiments.log_localization.figures import explanation, gather, sections
+from experiments.log_localization.pictures import draw
+from experiments.log_localization.site import APART_M, STOP_M, Site
+from experiments.log_localization.trial import RANGES_M, detected, true_masks
+from host.exits import Exit, Stopped
 from timberhand.cli import app
 
 

@@ -18,12 +18,12 @@ from controller.estimator import JointEstimator
 from controller.laws.feedback import LAWS
 from controller.laws.joint import JointLaw
 from controller.valve import ValveMap
-from hil.exits import Exit, Stopped
-from hil.experiments.plant.worlds import home_at, opened
-from hil.loop_design.loop import FREQUENCY_RAD_S, LawResponse, Spool, margins, open_loop
-from hil.loop_design.mechanics import mechanics
-from hil.loop_design.page import with_law, write
-from hil.loop_design.study import GAIN_DB, PHASE_DEG, study, work_of
+from experiments.common.worlds import home_at, opened
+from experiments.loop_design.loop import FREQUENCY_RAD_S, LawResponse, Spool, margins, open_loop
+from experiments.loop_design.mechanics import mechanics
+from experiments.loop_design.page import with_law, write
+from experiments.loop_design.study import GAIN_DB, PHASE_DEG, study, work_of
+from host.exits import Exit, Stopped
 from machine.load import load_profile
 from timberhand.cli import app
 

@@ -13,7 +13,7 @@ from autonomy.manager.chart import diagram, page
 from autonomy.manager.table import OURS, PAPER_B
 from autonomy.missions.files import save_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
-from hil.exits import Exit
+from host.exits import Exit
 from timberhand.cli import app
 
 DOCS = Path(__file__).parents[2] / "docs"

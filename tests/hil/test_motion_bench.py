@@ -7,8 +7,8 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from hil.experiments.plant.worlds import wood_of
-from hil.motion_bench import Bench, observed
+from experiments.benches.motion import Bench, observed
+from experiments.common.worlds import wood_of
 from machine.load import load_profile
 from sim.scene import arrangement
 from timberhand.cli import app

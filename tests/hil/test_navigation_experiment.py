@@ -12,12 +12,12 @@ import pytest
 
 from autonomy.navigation.curves import drivable
 from autonomy.navigation.join import joined
-from hil.experiments.navigation import measure
-from hil.experiments.navigation.experiment import CORNERS, LAPS, QUICK_START, STARTS, plan
-from hil.experiments.navigation.figures import FIGURES, GROUNDS, LAP, gather
-from hil.experiments.navigation.measure import Drive
-from hil.experiments.navigation.pictures import draw
-from hil.experiments.navigation.trial import COLUMNS, perform
+from experiments.navigation import measure
+from experiments.navigation.experiment import CORNERS, LAPS, QUICK_START, STARTS, plan
+from experiments.navigation.figures import FIGURES, GROUNDS, LAP, gather
+from experiments.navigation.measure import Drive
+from experiments.navigation.pictures import draw
+from experiments.navigation.trial import COLUMNS, perform
 from machine.load import load_profile
 
 CARRIER = load_profile("aoro_fc8").carrier

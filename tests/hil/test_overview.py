@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from hil.experiments.overview import page, read, results_in, write
-from hil.experiments.registry import EXPERIMENTS
+from experiments.common.overview import page, read, results_in, write
+from experiments.common.registry import EXPERIMENTS
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -11,11 +11,11 @@ from scipy.ndimage import binary_erosion
 from autonomy.perception import paper_a
 from autonomy.perception.contour import Sensor, own_outline
 from autonomy.perception.cylinder import Bodies, Cylinder, across_view, depth, guess, outline, rays_of
+from autonomy.perception.cylinder_fit import refine
 from autonomy.perception.frame import FrameRefused, Pose
 from autonomy.perception.merge import refused
 from autonomy.perception.pipeline import Perception
-from autonomy.perception.refine import refine
-from hil.experiments.log_localization.trial import TrueMask
+from experiments.log_localization.trial import TrueMask
 from sim.camera.scene import BUNK, SceneBuilder
 
 

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from hil.exits import Exit, Stopped
-from hil.experiments.plots import MOSS, OIL, RUST, TIMBER
+from experiments.common.plots import MOSS, OIL, RUST, TIMBER
+from host.exits import Exit, Stopped
 from timberhand.cli import app
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from hil.experiments.plc import FIGURES, WAYS, gather, slope
+from experiments.plc import FIGURES, WAYS, gather, slope
 
 
 def outcome(success: bool, rests_mm: list[float]) -> dict[str, Any]:

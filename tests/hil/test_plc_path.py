@@ -7,7 +7,7 @@ from typing import Literal
 
 import pytest
 
-from autonomy.activity import Activity
+from autonomy.crane_job.activity import Activity
 from can_dbc.plc.map import Fault, State
 from controller.config import load
 from controller.guard.__main__ import build as build_guard

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from autonomy.missions.check import problems_of
-from hil.experiments.productivity.experiment import AMOUNTS, QUICK, plan
-from hil.experiments.productivity.figures import FIGURES, cycles, gather
-from hil.experiments.productivity.pictures import draw
-from hil.experiments.productivity.work import KINDS, work
+from experiments.productivity.experiment import AMOUNTS, QUICK, plan
+from experiments.productivity.figures import FIGURES, cycles, gather
+from experiments.productivity.pictures import draw
+from experiments.productivity.work import KINDS, work
 from machine.load import load_profile
 
 PROFILE = load_profile("aoro_fc8")

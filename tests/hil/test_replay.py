@@ -17,8 +17,8 @@ from can_dbc.frame import Frame
 from controller.config import load as load_settings
 from controller.record import record
 from controller.step import Controller, Inputs, step
-from hil.exits import Exit, Stopped
 from hil.replay import contents, files_of, manifest_of, replay
+from host.exits import Exit, Stopped
 from machine.load import load_profile
 from recorder import recorder as recorder_module
 from recorder.manifest import describe

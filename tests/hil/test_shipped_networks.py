@@ -8,11 +8,11 @@ import pytest
 from autonomy.networks.weights import SHIPPED
 from autonomy.perception.detector import SIZE_PX, BoxFinder
 from autonomy.perception.finder import LogFinder
-from autonomy.training.labels import ID
-from hil.experiments.detector.precision import box_overlaps
-from hil.training.frames import draw
-from hil.training.piles import settle
-from hil.training.produce import box_of
+from training.average_precision import box_overlaps
+from training.detection.frames import draw
+from training.detection.labels import ID
+from training.detection.piles import settle
+from training.detection.produce import box_of
 
 WELL_SHOWN_PX = 600
 

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from typer.testing import CliRunner
 
 from autonomy.perception.mount import optical_pose
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 from machine.load import load_profile, profile_hash
 from machine.optics import intrinsics
 from timberhand.cli import app

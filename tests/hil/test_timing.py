@@ -11,13 +11,12 @@ from can_dbc.codec import load
 from can_dbc.durations import Durations
 from can_dbc.e2e import Sender
 from can_dbc.timing_page import STAGES, BusCounters, Facts, ProcessCounters
-from hil.experiments.timing import experiment
-from hil.experiments.timing.figures import FIGURES, SECTIONS
-from hil.timing import host, reference, verdict
-from hil.timing.continuity import Continuity
-from hil.timing.host import Meanwhile
-from hil.timing.reference import Plain
-from hil.timing.windows import Window, pooled
+from experiments.timing import experiment, host, reference, verdict
+from experiments.timing.continuity import Continuity
+from experiments.timing.figures import FIGURES, SECTIONS
+from experiments.timing.host import Meanwhile
+from experiments.timing.reference import Plain
+from experiments.timing.windows import Window, pooled
 
 PERIOD_NS = 5_000_000
 

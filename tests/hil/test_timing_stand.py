@@ -18,11 +18,11 @@ from controller.config import load as settings_of
 from controller.guard.__main__ import build, profile_path
 from controller.record import record
 from controller.step import Controller, Inputs, step
-from hil.exits import Exit
-from hil.experiments import soak
-from hil.timing.planner import BEHIND_NS, Planner, Swing
-from hil.timing.reference import missing_tools
-from hil.timing.witness import Witness
+from experiments.timing import soak
+from experiments.timing.bus_observer import Witness
+from experiments.timing.planner import BEHIND_NS, Planner, Swing
+from experiments.timing.reference import missing_tools
+from host.exits import Exit
 from machine.joints import JOINTS
 from machine.load import load_profile
 from machine.modes import Mode

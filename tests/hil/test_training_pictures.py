@@ -14,15 +14,15 @@ from autonomy.perception.finder import LogFinder
 from autonomy.perception.network import unet
 from autonomy.perception.plane import height_over_plane
 from autonomy.perception.regions import judges as judges_in
-from autonomy.training.labels import ANGLE, CENTRE_U, CENTRE_V, ID, IGNORED
-from hil.training import frames, judges, piles, produce, samples
-from hil.training.frames import MOST_LOGS, draw, labelled
-from hil.training.piles import HELD_OUT, chunk, profile_of, settle
-from hil.training.props import Steel
-from hil.training.samples import pictures, shard
 from machine.optics import pinhole
 from sim.camera.geometry import look_at
 from sim.camera.scene import LogPose
+from training.detection import evaluators, frames, piles, produce, samples
+from training.detection.frames import MOST_LOGS, draw, labelled
+from training.detection.labels import ANGLE, CENTRE_U, CENTRE_V, ID, IGNORED
+from training.detection.piles import HELD_OUT, chunk, profile_of, settle
+from training.detection.props import Steel
+from training.detection.samples import pictures, shard
 
 
 @pytest.fixture(scope="module")
@@ -195,9 +195,9 @@ def test_small_and_large_pictures_come_in_turn(few):
 @pytest.mark.slow
 @pytest.mark.computed
 def test_judges_come_with_their_cards(few, monkeypatch):
-    monkeypatch.setattr(judges, "STEPS", 40)
-    monkeypatch.setattr(judges, "SIZE_PX", 304)
-    card = judges.produce(4, 1, few, few / "judges", None, Console(quiet=True))
+    monkeypatch.setattr(evaluators, "STEPS", 40)
+    monkeypatch.setattr(evaluators, "SIZE_PX", 304)
+    card = evaluators.produce(4, 1, few, few / "judges", None, Console(quiet=True))
     assert "timberhand train judges --pictures 4 --seed 1" in card.read_text()
     told = judges_in(few / "judges").joins.chance(np.zeros((3, 19), np.float32))
     assert told.shape == (3,) and (told > 0.0).all() and (told < 1.0).all()

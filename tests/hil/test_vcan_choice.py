@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from hil.vcan_lab import guest, lab_kernel, shim
-from hil.vcan_lab.choose import Machine, choose
-from hil.vcan_lab.spec import LabError
+from host.vcan_lab import guest, lab_kernel, shim
+from host.vcan_lab.choose import Machine, choose
+from host.vcan_lab.spec import LabError
 
 BARE = Machine(
     can_fault="Address family not supported by protocol",

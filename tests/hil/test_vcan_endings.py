@@ -103,7 +103,7 @@ def test_a_command_that_ends_before_it_is_looked_at_is_heard_of() -> None:
     """The starting call returns when the command is over: its status must still come to the supervisor."""
     script = (
         "import json, os, socket, subprocess\n"
-        "from hil.vcan_lab.guest import Host, Supervisor\n"
+        "from host.vcan_lab.guest import Host, Supervisor\n"
         "class Slow(subprocess.Popen):\n"
         "    def __init__(self, *a, **k):\n"
         "        super().__init__(*a, **k)\n"
@@ -123,8 +123,8 @@ def test_a_command_that_ends_before_it_is_looked_at_is_heard_of() -> None:
 def test_what_the_command_leaves_behind_is_ended_natively_too(tmp_path: Path) -> None:
     """A process that left the command's group and session is still below the lab."""
     script = (
-        "import os, sys; from hil.vcan_lab.choose import Way; from hil.vcan_lab.host import run\n"
-        "from hil.vcan_lab.spec import Request\n"
+        "import os, sys; from host.vcan_lab.choose import Way; from host.vcan_lab.host import run\n"
+        "from host.vcan_lab.spec import Request\n"
         "argv = ('sh', '-c', 'setsid sleep 300 & echo $! > left; sleep 0.5')\n"
         "request = Request(argv=argv, cwd=sys.argv[1], env=dict(os.environ), uid=os.getuid(), gid=os.getgid(),\n"
         "                  groups=tuple(os.getgroups()), umask=0o22)\n"

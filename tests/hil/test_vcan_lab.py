@@ -12,8 +12,8 @@ from tempfile import TemporaryDirectory
 import pytest
 from lab_runs import LAB, PATIENCE_S, REQUEST, ROOT, Run, environment, require_lab
 
-from hil.vcan_lab import lab_kernel, shim
-from hil.vcan_lab.choose import survey
+from host.vcan_lab import lab_kernel, shim
+from host.vcan_lab.choose import survey
 
 
 @pytest.mark.slow
@@ -82,8 +82,8 @@ def test_the_shim_does_no_harm_where_it_is_not_needed(lab: Run, tmp_path: Path) 
     if require_lab() != "uml" or not any(Path(folder, "cc").exists() for folder in os.get_exec_path()):
         pytest.skip("needs user-mode Linux and a C compiler")
     wrapper = (
-        "import sys; from hil.vcan_lab import shim; shim.needed = lambda text: True; "
-        "import typer; from hil.vcan_lab.__main__ import CONTEXT, vcan; "
+        "import sys; from host.vcan_lab import shim; shim.needed = lambda text: True; "
+        "import typer; from host.vcan_lab.__main__ import CONTEXT, vcan; "
         "app = typer.Typer(); app.command(context_settings=CONTEXT)(vcan); app()"
     )
     cache = tmp_path / "a cache: odd"

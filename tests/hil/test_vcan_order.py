@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from lab_runs import REQUEST
 
-from hil.vcan_lab.spec import LabError, Request, kernel_arguments, link_fault, order
+from host.vcan_lab.spec import LabError, Request, kernel_arguments, link_fault, order
 
 
 def test_the_order_carries_the_caller_and_the_lab() -> None:

@@ -8,7 +8,7 @@ import pytest
 from crane_driver import Driver
 
 from machine.load import load_profile
-from sim.judge import Judge
+from sim.evaluator import Judge
 from sim.scene import random_scene
 from sim.truth import load_truth
 from sim.world import World

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from machine.load import load_profile
-from sim.judge import Judge, Verdict
+from sim.evaluator import Judge, Verdict
 from sim.log_shape import LogSpec
 from sim.scene import arrangement
 from sim.truth import load_truth

@@ -12,7 +12,7 @@ import pytest
 def test_a_kernel_with_can_needs_no_second_one(link: str, way: str) -> None:
     command = ["sh", "-c", f'echo "$TIMBERHAND_LAB" $(cat); ip link show {link} >&2 && kill -HUP $$']
     done = subprocess.run(
-        [sys.executable, "-m", "hil.vcan_lab", "-v", "--link", link, "--", *command], capture_output=True, check=False
+        [sys.executable, "-m", "host.vcan_lab", "-v", "--link", link, "--", *command], capture_output=True, check=False
     )
     complaints = done.stderr.decode()
     assert (done.returncode, done.stdout) == (128 + 1, b"native\n"), complaints

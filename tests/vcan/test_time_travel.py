@@ -23,9 +23,9 @@ from can_dbc.logread import read
 from can_dbc.lost_link import GONE_NS, RETRY_NS
 from controller.config import load as load_settings
 from controller.guard.__main__ import PERIOD_NS as GUARD_PERIOD_NS
-from hil.service_lab.pilot import LEASE_NS
-from hil.vcan_lab import lab_kernel, shim
-from hil.vcan_lab.spec import VIRTUAL_START_NS
+from host.service_lab.pilot import LEASE_NS
+from host.vcan_lab import lab_kernel, shim
+from host.vcan_lab.spec import VIRTUAL_START_NS
 from machine.modes import Mode
 from machine.reasons import Reason
 from sim.nodes.valve import CYCLE_NS, GUARD_NS, PILOT_NS, RAMP_NS, SYNC_NS, ValveState
@@ -112,7 +112,7 @@ def travel() -> Callable[..., subprocess.CompletedProcess[str]]:
         lab = [
             sys.executable,
             "-m",
-            "hil.vcan_lab",
+            "host.vcan_lab",
             "--time-travel",
             "--root",
             "--timeout",

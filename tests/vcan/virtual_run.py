@@ -17,7 +17,7 @@ from pathlib import Path
 
 from can_dbc.bus import open_bus
 from can_dbc.setpoint import OperatorAction
-from hil.service_lab.pilot import PERIOD_NS, Pilot
+from host.service_lab.pilot import PERIOD_NS, Pilot
 from machine.load import load_profile
 from machine.modes import Mode
 

@@ -23,9 +23,9 @@ def bus(
     """
     import json
 
-    from hil.bus_bench import LIMIT_US, measure
-    from hil.exits import Exit
-    from hil.experiments.result import environment
+    from experiments.benches.bus import LIMIT_US, measure
+    from experiments.common.result import environment
+    from host.exits import Exit
 
     result = {"environment": environment()} | measure(frames, rounds)
     metrics, lab = result["metrics"], result["lab"]

@@ -23,7 +23,7 @@ def codec(
     """
     import json
 
-    from hil.exits import Exit
+    from host.exits import Exit
 
     result = measure(repetitions)
     if as_json:

@@ -38,9 +38,9 @@ def loop_design(
     from rich.console import Console
     from rich.table import Table
 
-    from hil.exits import Exit, Stopped
-    from hil.loop_design import carrier
-    from hil.loop_design.study import GAIN_DB, PHASE_DEG, study, work_of
+    from experiments.loop_design import carrier
+    from experiments.loop_design.study import GAIN_DB, PHASE_DEG, study, work_of
+    from host.exits import Exit, Stopped
     from machine.load import ProfileError, load_profile
 
     screen = Console(stderr=as_json, highlight=False, soft_wrap=True)
@@ -70,12 +70,12 @@ def loop_design(
         machines.append((machine, studies, work))
         documents[machine.name] = {joint.name: joint.document() for joint in studies}
         if out is not None:
-            from hil.loop_design.pictures import draw
+            from experiments.loop_design.pictures import draw
 
             for file in draw(machine.name, studies, out):
                 screen.print(f"[dim]{file}[/dim]")
     if docs is not None:
-        from hil.loop_design.page import write
+        from experiments.loop_design.page import write
 
         with screen.status("every law"):
             holds = write(machines, docs) and holds

@@ -25,8 +25,8 @@ def motion(
     from rich.console import Console
     from rich.progress import Progress
 
-    from hil.exits import Exit, Stopped
-    from hil.motion_bench import GOAL_MS, run
+    from experiments.benches.motion import GOAL_MS, run
+    from host.exits import Exit, Stopped
     from machine.load import ProfileError, load_profile
 
     error = Console(stderr=True)

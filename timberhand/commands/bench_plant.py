@@ -22,9 +22,9 @@ def plant(
     from rich.console import Console
     from rich.table import Table
 
-    from hil.exits import Exit
-    from hil.experiments.plant.bench import FIGURES, LOG_COUNTS, measure
-    from hil.experiments.result import environment, judge
+    from experiments.common.result import environment, judge
+    from experiments.plant.bench import FIGURES, LOG_COUNTS, measure
+    from host.exits import Exit
 
     screen = Console(stderr=as_json, highlight=False, soft_wrap=True)
     metrics, noisy, _ = measure(profile, truth, quick, screen)

@@ -37,7 +37,7 @@ def console(
     timberhand console --report-port 8472 --controller 127.0.0.1:8470
     """
     from console.__main__ import Refused, serve
-    from hil.exits import Exit, Stopped
+    from host.exits import Exit, Stopped
 
     try:
         serve(

@@ -32,7 +32,7 @@ def check(
     from dataclasses import asdict
 
     from can_dbc.check import check as check_file
-    from hil.exits import Exit
+    from host.exits import Exit
 
     reports = [check_file(file, frames, seed) for file in files]
     if as_json:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 from timberhand.commands.runs import Backend, enter_lab, new_directory
 
 

@@ -32,10 +32,10 @@ def doctor(
 
     from rich.console import Console
 
-    from hil.doctor import facts, installation, timing
-    from hil.doctor.finding import Severity
-    from hil.doctor.show import show, verdict
-    from hil.exits import Exit
+    from host.doctor import facts, installation, timing
+    from host.doctor.finding import Severity
+    from host.doctor.show import show, verdict
+    from host.exits import Exit
 
     groups = {"installation": installation.examine()}
     if rt:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from hil.experiments.registry import EXPERIMENTS
+from experiments.common.registry import EXPERIMENTS
 
 Name = StrEnum("Name", {name.upper().replace("-", "_"): name for name in EXPERIMENTS})
 
@@ -66,12 +66,12 @@ def experiment(
     """
     from rich.console import Console
 
-    from hil.exits import Exit, Stopped
-    from hil.experiments.registry import Options, load
+    from experiments.common.registry import Options, load
+    from host.exits import Exit, Stopped
     from machine.load import ProfileError, load_profile
 
     if bus is Bus.VCAN and "TIMBERHAND_LAB" not in os.environ:
-        from hil.vcan_lab.__main__ import vcan
+        from host.vcan_lab.__main__ import vcan
 
         vcan([sys.executable, "-m", "timberhand", *sys.argv[1:]])
     try:

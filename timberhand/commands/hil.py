@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from hil.vcan_lab.__main__ import CONTEXT, vcan
+from host.vcan_lab.__main__ import CONTEXT, vcan
 
 app = typer.Typer(no_args_is_help=True, help="Hardware in the loop: real CAN interfaces for any command.")
 app.command("vcan", context_settings=CONTEXT)(vcan)

@@ -37,7 +37,7 @@ def decode(
     from can_dbc.codec import SHIPPED, DbcError
     from can_dbc.decoding import Decoder
     from can_dbc.logread import read
-    from hil.exits import Exit, Stopped
+    from host.exits import Exit, Stopped
 
     try:
         decoder = Decoder(dbc or list(SHIPPED))

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 from timberhand.commands.runs import Backend, enter_lab, new_directory
 
 app = typer.Typer(no_args_is_help=True, help="Run a forwarding mission, and show what the forwarder does next.")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 
 if TYPE_CHECKING:
     from autonomy.missions.features import Draft

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 
 
 def learn(
@@ -34,7 +34,7 @@ def learn(
 
     from autonomy.motion.dmp import DemonstrationRefused
     from autonomy.motion.primitives import encode, learn_primitives
-    from hil.learning import draw, motions_in
+    from training.movement_primitives import draw, motions_in
 
     machine, motions = motions_in(log, profile)
     try:

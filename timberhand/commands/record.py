@@ -29,7 +29,7 @@ def record(
     timberhand record --out runs/field-1 --bus crane0=socketcan:can0
     """
     from can_dbc.bus import BusError, default_address
-    from hil.exits import Exit, Stopped
+    from host.exits import Exit, Stopped
     from machine.load import ProfileError, load_profile
     from recorder.__main__ import main
 

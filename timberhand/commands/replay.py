@@ -29,9 +29,9 @@ def replay(
     """
     import json
 
-    from hil.exits import Exit, Stopped
     from hil.replay import contents as list_contents
     from hil.replay import files_of, manifest_of
+    from host.exits import Exit, Stopped
 
     files = files_of(log)
     if contents:

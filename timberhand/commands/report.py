@@ -22,8 +22,8 @@ def report(
 
       timberhand report --docs /srv/timberhand/docs
     """
-    from hil.exits import Exit, Stopped
-    from hil.experiments import overview
+    from experiments.common import overview
+    from host.exits import Exit, Stopped
 
     try:
         found = overview.results_in(docs)

@@ -20,7 +20,7 @@ class Backend(StrEnum):
 def enter_lab(bus: Backend) -> None:
     """Where vcan is wanted, run this command again inside the lab and end with its exit code; else return."""
     if bus is Backend.VCAN and "TIMBERHAND_LAB" not in os.environ:
-        from hil.vcan_lab.__main__ import vcan
+        from host.vcan_lab.__main__ import vcan
 
         vcan([sys.executable, "-m", "timberhand", *_without_page(sys.argv[1:])])
 

@@ -67,7 +67,7 @@ def status(
     """
     import json
 
-    from hil.exits import Exit, Stopped
+    from host.exits import Exit, Stopped
     from timberhand.services import look
 
     if watch:
@@ -89,7 +89,7 @@ def status(
 def _watch(page: Path | None, as_json: bool) -> None:
     import json
 
-    from hil.exits import Exit
+    from host.exits import Exit
     from timberhand.services import look
 
     before = None

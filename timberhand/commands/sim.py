@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 
 app = typer.Typer(no_args_is_help=True, help="The simulated plant: look at it alive, or take its picture.")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 
 if TYPE_CHECKING:
     from machine.profile import Camera

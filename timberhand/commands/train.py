@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hil.exits import Exit, Stopped
+from host.exits import Exit, Stopped
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -72,18 +72,18 @@ def grasp(
 
 
 def _grasp_physical(weights: Path, seed: int, epochs: int | None) -> None:
-    from hil.training import grasp_physical
+    from training.grasp import physical
 
-    passes = epochs or grasp_physical.EPOCHS
-    _made(weights, None, lambda _, screen: grasp_physical.produce(seed, weights, screen, epochs=passes)[1])
+    passes = epochs or physical.EPOCHS
+    _made(weights, None, lambda _, screen: physical.produce(seed, weights, screen, epochs=passes)[1])
 
 
 def _grasp_cornell(data: Path, out: Path, seed: int, epochs: int | None) -> None:
     from rich.console import Console
 
-    from autonomy.training import grasp as training
-    from autonomy.training.cornell import DataRefused, load
-    from autonomy.training.grasp_weights import produce
+    from training.grasp import train as training
+    from training.grasp.cornell import DataRefused, load
+    from training.grasp.weights import produce
 
     screen = Console(stderr=True)
     try:
@@ -126,7 +126,7 @@ def segmentation(
     """
     torch_on_one_thread()
     from autonomy.perception.network import CHANNELS
-    from hil.training.produce import Plan, produce
+    from training.detection.produce import Plan, produce
 
     if variant not in CHANNELS:
         raise Stopped(Exit.USAGE, f"variant {variant!r} is unknown; use one of {', '.join(CHANNELS)}")
@@ -158,7 +158,7 @@ def detector(
       timberhand train detector --pictures 256 --steps 50     a look at it in a few minutes
     """
     torch_on_one_thread()
-    from hil.training.produce import Plan, produce_boxes
+    from training.detection.produce import Plan, produce_boxes
 
     plan = Plan(pictures, steps, seed, learning_rate, start, large)
     _made(out, folder, lambda kept, screen: produce_boxes(plan, kept, out, screen))
@@ -185,7 +185,7 @@ def judges(
       timberhand train judges --pictures 64     a look at it in a minute
     """
     torch_on_one_thread()
-    from hil.training.judges import produce
+    from training.detection.evaluators import produce
 
     _made(out, folder, lambda kept, screen: produce(pictures, seed, kept, out, weights, screen))
 
@@ -194,7 +194,7 @@ def _made(weights: Path, folder: Path | None, make: Callable[[Path, Console], Pa
     """Make weights of drawn pictures and say where they are."""
     from rich.console import Console
 
-    from hil.training.piles import cache_folder
+    from training.detection.piles import cache_folder
 
     screen = Console(stderr=True)
     try:

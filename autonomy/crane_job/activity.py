@@ -1,0 +1,387 @@
+"""The first mission as a state machine: one log, or what one grasp holds, from the ground into the bunk.
+
+``Activity.step`` is pure: monotonic time, the controller's newest report and the detector's newest log list
+go in, a setpoint datagram comes out, every 50 ms while the controller obeys (ARMED, ACTIVE) and something is
+left to do.  What is gripped and which way it goes is in `autonomy.crane_job.cycle`; here is when, and what follows.  A controller
+that stops, faults or falls silent pauses the activity; when it is armed again the interrupted phase is planned anew
+from the measured pose.  Every phase has a time limit and a sentence for it; ``failure`` holds the one that ended the
+mission, after a smooth stop along the path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isfinite
+from typing import Final
+
+from autonomy.crane_job.cycle import Cycle
+from autonomy.crane_job.grapple import Tongs
+from autonomy.crane_job.inbox import Heard
+from autonomy.crane_job.phase_conditions import at_goal, pace
+from autonomy.crane_job.phases import BEGIN_AGAIN, RULES, Phase, grapple
+from autonomy.crane_job.rotator import Rotator, hanging, is_counted, planned
+from autonomy.crane_job.trajectory_tracker import BRAKE_S, Pursuit
+from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, choose
+from autonomy.grasp.proposal import BunkFull, NoGrasp
+from autonomy.missions.crane_job import Mission
+from autonomy.motion.arm import Pose
+from autonomy.motion.planners import Motions, Swiftest
+from autonomy.motion.setpoint_stream import SetpointStream
+from autonomy.motion.trajectory import Trajectory, hold, turned
+from autonomy.perception.logs import LogObservation
+from can_dbc.setpoint import GrappleCommand, StateReport
+from machine.joints import JOINTS, Joint
+from machine.kinematics import Unreachable
+from machine.modes import Mode
+from machine.profile import Profile
+
+SETTLED_NS: Final = 300_000_000
+"""A crane that has come to rest over logs looks at them so much later, ..."""
+PATIENCE_NS: Final = 1_500_000_000
+"""... and without that look it goes on after so long."""
+_SLOWEST: Final = 2.0
+_LAST_HOLD_S: Final = 0.1
+_LONGEST_TICK_S: Final = 0.1
+
+
+class Activity:
+    """Picks the mission's log and lays it down; see the module's contract.
+
+    ``phase``, ``paused`` (why it waits, or None) and ``failure`` (why it ended, or None) are for the operator;
+    ``idle`` says that nothing more will be sent.  ``rests`` is where an earlier job left the joints: one without an
+    encoder is taken to stand there.  ``motions``: whose motions it makes.  ``onward`` says of a log whether the next
+    job would fetch it; where there is such a log the crane stays between the stakes, with open tongs, to go on from
+    there, and otherwise rises above them.  With ``stows`` no log is fetched: the crane goes over the bunk, holding
+    what it may hold, for the machine to drive; where it rests there already nothing moves.  ``rotator``: what earlier
+    jobs found out about one without an encoder; afterwards what is known now.
+    """
+
+    def __init__(
+        self,
+        profile: Profile,
+        profile_hash: int,
+        mission: Mission | None = None,
+        lease_ns: int = 200_000_000,
+        key: bytes | None = None,
+        chooser: Chooser = choose,
+        rests: tuple[float, ...] = (0.0,) * len(JOINTS),
+        motions: Motions | None = None,
+        onward: Callable[[LogObservation], bool] | None = None,
+        stows: bool = False,
+        rotator: Rotator | None = None,
+    ) -> None:
+        self.phase = Phase.WAIT
+        self.paused: str | None = "the controller has not reported"
+        self.failure: str | None = None
+        self.idle = False
+        self.halted = False
+        """A person lets it stand: it stops smoothly on its way; a grip that has begun is ended first."""
+        self.no_room = False
+        """What was gripped has no room in the bunk."""
+        self.rotator = self._count = rotator or Rotator()
+        self._profile = planned(profile, self._count)
+        self._first = Phase.STOW if stows else Phase.LOOK
+        self._onward = onward
+        motions = motions or Swiftest()
+        self._direct = motions.direct
+        self._stream = SetpointStream(profile_hash, lease_ns, key)
+        self._heard = Heard(self._profile)
+        self._cycle = Cycle(self._profile, mission or Mission(), motions, chooser, self._heard)
+        self._tongs = Tongs(self._profile, self._heard)
+        self._pursuit = Pursuit(profile, rests)
+        self._elapsed_s = 0.0
+        self._arrived_ns: int | None = None
+        self._ready_ns: int | None = None
+        self._anew: Phase | None = None
+        self._sorry = ""
+        """Why what was gripped is put back."""
+        self._last_ns: int | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether the log lies in the bunk and the crane is clear of it."""
+        return self.phase is Phase.DONE
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the motion of the present phase is done; it may still wait for something."""
+        return self._arrived_ns is not None
+
+    @property
+    def grasp(self) -> Grasp | None:
+        """What is gripped, once that is chosen."""
+        return self._cycle.grasp
+
+    @property
+    def place(self) -> Pose | None:
+        """Where it goes, once that is chosen."""
+        return self._cycle.place
+
+    @property
+    def missed(self) -> int:
+        """Grasps that came up empty."""
+        return self._cycle.missed
+
+    @property
+    def lifted_kg(self) -> float:
+        """What hung in the grapple; 0 when nobody weighs it."""
+        return self._cycle.lifted_kg
+
+    @property
+    def rests(self) -> tuple[float, ...]:
+        """Where the joints were last sent, rad (EXT m), as far as is known now."""
+        return self.rotator.believed(self._count.counted(self._pursuit.sent))
+
+    @property
+    def motion(self) -> Trajectory:
+        """What the crane drives in the present phase."""
+        return self._pursuit.motion
+
+    @property
+    def _held(self) -> bool:
+        return self.halted and self.phase not in (Phase.CLOSE, Phase.DONE, Phase.FAILED)
+
+    def abort(self, reason: str) -> None:
+        """Ends the mission: the crane stops smoothly on its path within ``BRAKE_S``."""
+        if self.phase not in (Phase.DONE, Phase.FAILED):
+            self._fail(reason)
+
+    # ------------------------------------------------------------------ one turn
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+        """One turn at ``now_ns``: the datagram to send now, or None.
+
+        ``report`` and ``logs`` are the newest since the last call; None and () when nothing new came.  To be
+        called at 20 Hz or faster.
+        """
+        dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _LONGEST_TICK_S)
+        self._last_ns = now_ns
+        self._heard.take(now_ns, report, logs)
+        if self.idle:
+            return None
+        obstacle = self._heard.obstacle(now_ns, self._pursuit.sent)
+        if obstacle is not None:
+            self.paused = obstacle
+            self.idle = self.phase in (Phase.DONE, Phase.FAILED)
+            return None
+        if self.paused is not None:
+            self._resume()
+        else:
+            self._advance(dt_s)
+        self._proceed(now_ns)
+        self._tell_tongs(dt_s)
+        if self.idle or not self._stream.due(now_ns):
+            return None
+        way = self._pursuit
+        return self._stream.datagram(now_ns, self._count.motion(way.motion), way.clock_s, self._tongs.command, way.rate)
+
+    def _position(self) -> tuple[float, ...]:
+        return self._heard.position(self._pursuit.sent)
+
+    def _resume(self) -> None:
+        """Goes on from the measured pose, in the interrupted phase or at the way to it."""
+        self.paused = None
+        measured = self._position()
+        follows = self._heard.report.mode == Mode.ACTIVE and all(map(isfinite, self._heard.report.reference))
+        start = self._count.believed(self._heard.report.reference) if follows else measured
+        phase = self._first if self.phase is Phase.WAIT else self.phase
+        if phase in BEGIN_AGAIN and self._cycle.is_aside(phase, measured):
+            phase = BEGIN_AGAIN[phase]
+        self._enter(phase, start)
+        self._pursuit.rate = 0.0
+
+    def _enter(self, phase: Phase, start: tuple[float, ...]) -> None:
+        """Plans a phase from a joint position and begins it."""
+        self.phase = phase
+        self._elapsed_s = 0.0
+        self._arrived_ns = self._ready_ns = self._anew = None
+        closing_s = self._tongs.follow() if phase is Phase.CLOSE else 0.0
+        try:
+            self._pursuit.begin(self._cycle.plan(phase, start, closing_s))
+        except (Unreachable, NoGrasp) as error:
+            self._pursuit.begin(hold(start))
+            self.no_room = isinstance(error, BunkFull)
+            if phase in (Phase.LIFT, Phase.CARRY) and self._cycle.is_over_the_grasp(start):
+                self._sorry = str(error)
+                self._cycle.put_back()
+                self._enter(Phase.LOWER, start)
+            elif phase is Phase.ABOVE and self._cycle.take_former():
+                self._enter(Phase.DESCEND, start)
+            else:
+                self._fail(str(error))
+
+    def _fail(self, reason: str) -> None:
+        self.failure = reason
+        self.phase = Phase.FAILED
+        self._elapsed_s = 0.0
+
+    def _advance(self, dt_s: float) -> None:
+        """Moves on along the motion, or smoothly slower to wait for the tongs or to stop for good."""
+        way = self._pursuit
+        self._elapsed_s += 0.0 if self._held else dt_s
+        stops = self._held or self.phase is Phase.FAILED or self._anew is not None
+        wanted = 0.0 if stops else pace(self.phase, self._elapsed_s, way, self._tongs, self.grasp)
+        way.advance(dt_s, wanted, self._position())
+        if self.phase is Phase.FAILED and way.stands:
+            way.stand()
+
+    def _tell_tongs(self, dt_s: float) -> None:
+        command = grapple(self.phase, self._cycle.gathered, stows=self._first is Phase.STOW)
+        if command is GrappleCommand.OPEN and self.phase is not Phase.OPEN:
+            command = GrappleCommand.NEUTRAL if self._cycle.is_among_stakes(self._position()) else command
+        if self.phase is Phase.OPEN:
+            self._tongs.let_go(dt_s)
+        else:
+            self._tongs.tell(command, dt_s)
+
+    # ------------------------------------------------------------------ what follows
+    def _proceed(self, now_ns: int) -> None:
+        """Ends the phase when its work is done, or the mission when its time is over."""
+        if self.phase is Phase.FAILED:
+            self.idle = self._elapsed_s > BRAKE_S + _LAST_HOLD_S
+            return
+        if self.phase is Phase.DONE:
+            self.idle = self._elapsed_s > _LAST_HOLD_S
+            return
+        if self._held:
+            return
+        if self._anew is not None:
+            if self._pursuit.stands:
+                self._enter(self._anew, self._pursuit.sent)
+            return
+        rule = RULES[self.phase]
+        if self._arrived_ns is None and at_goal(
+            self.phase, self._elapsed_s, self._pursuit, self._tongs, self.grasp, self._position()
+        ):
+            self._arrived_ns = now_ns
+        gathers = self.phase is Phase.LIFT and self._cycle.gathered
+        if gathers and self._cycle.slid_off(self._tongs, self._position()):
+            self._anew = Phase.ABOVE
+            return
+        if self.phase in (Phase.LIFT, Phase.CARRY) and self._direct and not gathers:
+            self._watch(now_ns)
+            if self._anew is not None or self.phase is Phase.FAILED:
+                return  # the list is judged, and not to be judged again
+        following = self._next(now_ns) if self._arrived_ns is not None else None
+        if following is not None and self.halted:
+            return
+        if following is Phase.OPEN and self._heard.fresh(now_ns):
+            self._see_rotator()
+        if following is not None:
+            self._enter(following, self._pursuit.sent)
+        elif self._elapsed_s > _SLOWEST * self.motion.duration_s + rule.settle_s + rule.slack_s:
+            off = self._pursuit.worst_joint(self._position())
+            self._fail(f"{rule.trouble} within {self._elapsed_s:.0f} s{off}")
+
+    def _next(self, now_ns: int) -> Phase | None:
+        """The phase after this one, whose motion is done; None while it still waits for something."""
+        seen = self._arrived_ns is not None and self._heard.logs_ns >= self._arrived_ns
+        match self.phase:
+            case Phase.LOOK:
+                return self._after_look(now_ns) if seen else None
+            case Phase.ABOVE:
+                return self._after_above(now_ns) if self._tongs.open else None
+            case Phase.CLOSE:
+                return self._cycle.after_closing(self._tongs)
+            case Phase.LIFT | Phase.CARRY:
+                if self.phase is Phase.CARRY and self._carried(now_ns):
+                    return Phase.LOWER
+                return self._after_lift() if seen else None
+            case Phase.OPEN:
+                return self._after_open(now_ns)
+            case Phase.RETREAT:
+                return self._after_retreat() if seen else None
+            case Phase.STOW:
+                return Phase.DONE
+        return Phase(self.phase + 1)
+
+    def _after_look(self, now_ns: int) -> Phase | None:
+        """Over a grasp.  What a camera measures is looked at for a while before there is said to be none."""
+        first_ns = self._ready_ns
+        if first_ns is not None and self._heard.logs_ns < now_ns <= first_ns + PATIENCE_NS:
+            return None  # nothing new is known
+        try:
+            self._cycle.choose(self.motion.goal)
+        except NoGrasp as error:
+            self._ready_ns = first_ns or now_ns
+            if now_ns > self._ready_ns + PATIENCE_NS or not self._heard.measured:
+                self._fail(str(error))
+            return None
+        return Phase.ABOVE
+
+    def _after_above(self, now_ns: int) -> Phase | None:
+        """Down, or first over a better grasp: from above, logs that a camera measured from aside are known better."""
+        assert self._arrived_ns is not None
+        if not self._cycle.unsure:
+            return Phase.DESCEND
+        if self._heard.logs_ns < self._arrived_ns + SETTLED_NS:
+            return None if now_ns < self._arrived_ns + PATIENCE_NS else Phase.DESCEND
+        return Phase.ABOVE if self._cycle.choose_better(self.motion.goal) else Phase.DESCEND
+
+    def _after_lift(self) -> Phase | None:
+        if self._cycle.came_up((self._position(), self._pursuit.sent)):
+            if self.phase is Phase.LIFT:
+                self._see_rotator()
+            return Phase(self.phase + 1)
+        if reason := self._cycle.came_up_empty():
+            self._fail(reason)
+            return None
+        return Phase.LOOK
+
+    def _after_open(self, now_ns: int) -> Phase | None:
+        """Up and away, or done here with the next log in view."""
+        assert self.grasp is not None
+        if not self._tongs.released(self.grasp, self._elapsed_s):
+            return None
+        if self._sorry:
+            self._fail(self._sorry)
+            return None
+        if self._onward is None or not self._direct:
+            return Phase.RETREAT
+        self._ready_ns = self._ready_ns or now_ns
+        if self._heard.logs_ns < self._ready_ns:
+            return None
+        return self._after_retreat() if any(map(self._onward, self._cycle.others())) else Phase.RETREAT
+
+    def _after_retreat(self) -> Phase | None:
+        if reason := self._cycle.astray():
+            self._fail(reason)
+            return None
+        return Phase.DONE
+
+    # ------------------------------------------------------------------ what hangs in the grapple
+    def _watch(self, now_ns: int) -> None:
+        """Judges on the way what hangs in the grapple; where it is not what the way was planned for, a stop and
+        another.
+        """
+        if self._ready_ns is None:
+            risen_m = self._cycle.risen_m(self._position())
+            if self.phase is Phase.CARRY or risen_m > LIFT_M or self._arrived_ns is not None:
+                self._ready_ns = now_ns
+            return
+        if self._heard.logs_ns <= self._ready_ns:
+            return
+        self._ready_ns = self._heard.logs_ns
+        before = self.grasp
+        following = self._after_lift()
+        if following is Phase.LOOK:
+            self._anew = Phase.LOOK
+        elif following is Phase.CARRY:
+            turn = self._cycle.turn_on_the_way(self._position()) if self.grasp is before else None
+            if turn is None:
+                self._anew = Phase.CARRY
+                return
+            self.phase = Phase.CARRY
+            if turn:
+                self._pursuit.motion = turned(self.motion, self._pursuit.clock_s, turn)
+
+    def _carried(self, now_ns: int) -> bool:
+        """Whether the log was seen in the grapple a moment ago."""
+        return self._direct and self._ready_ns == self._heard.logs_ns and self._heard.fresh(now_ns)
+
+    def _see_rotator(self) -> None:
+        """What hangs in the tongs tells how the rotator stands: the next job is to know."""
+        seen = self._cycle.first()
+        if seen is not None and is_counted(self._profile):
+            q = self._position()
+            stands = hanging(self._profile, seen, q[Joint.SLEW])
+            self.rotator = self.rotator.seen(self._count.sent(q[Joint.ROT]), stands)

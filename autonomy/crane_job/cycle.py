@@ -1,0 +1,273 @@
+"""One crane cycle: what is gripped, where it goes, the motion of each phase, and whether the newest list bears it out.
+
+A `Cycle` is asked by the activity, which alone knows when a phase begins and ends.  Joints are in ``Joint`` order, rad
+(EXT m).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import dist
+from typing import Final
+
+import msgspec
+
+from autonomy.crane_job.grapple import Tongs, among_stakes, lifts_nothing
+from autonomy.crane_job.grasp_recovery import Regrip, measured
+from autonomy.crane_job.grasp_verification import ASIDE_M, came_up, laid, picked, place_as_seen
+from autonomy.crane_job.inbox import Heard
+from autonomy.crane_job.phase_motions import above, aimed, carrying, closing, dragging, gathering, stowing
+from autonomy.crane_job.phases import Phase
+from autonomy.crane_job.rotator import is_counted
+from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, lies_in, plan_place, retreat_height
+from autonomy.grasp.proposal import NoGrasp
+from autonomy.missions.crane_job import Mission
+from autonomy.motion.arm import Arm, Pose
+from autonomy.motion.planners import Motions
+from autonomy.motion.setpoint_stream import Axes
+from autonomy.motion.trajectory import Trajectory, brisk, hold, straight
+from autonomy.perception.logs import LogObservation
+from machine.grapple import grapple_yaw
+from machine.joints import Joint
+from machine.profile import Profile
+from machine.sag import sane_load_kg
+
+ATTEMPTS: Final = 3
+LOOKS: Final = 2
+"""So often a grasp is chosen again from over it."""
+WEIGHS_M: Final = 0.2
+"""What is gripped weighs in tongs that have risen so far, half of it at least."""
+WEDGE_M: Final = 0.1
+"""Open tongs that draw a log are pressed in beside it so much lower than others begin to close: those sweep down from
+0.15 m over the ground or more, and would slide over the log before they are beside its middle."""
+_SAME_M, _SAME_RAD = 0.02, 0.03
+"""Grasps that differ by less are gone down to from the same place."""
+_LOOSE_M: Final = 0.2
+"""So far over where it was gripped a bundle is let go again: pressed onto others, it would stop the crane."""
+
+_THERE_M, _THERE_RAD = 0.03, 0.03
+"""A crane so near to where it lets a log go need not go nearer."""
+
+
+class Cycle:
+    """``grasp`` is what is gripped and ``place`` where it goes, each once it is chosen; ``lifted_kg`` hung in the
+    grapple, 0 when nobody weighs it; ``missed`` grasps came up empty.  ``profile`` is the machine as motions are
+    planned for it.
+    """
+
+    def __init__(self, profile: Profile, mission: Mission, motions: Motions, chooser: Chooser, heard: Heard) -> None:
+        self.grasp: Grasp | None = None
+        self.place: Pose | None = None
+        self.lifted_kg = 0.0
+        self.missed = 0
+        self._profile, self._mission, self._motions, self._choose = profile, mission, motions, chooser
+        self._target = mission.to(profile.bunk)
+        self._brisk = is_counted(profile) and motions.direct
+        self._heard = heard
+        self._arm = Arm(profile, stretches=motions.stretches)
+        """With what hangs in the grapple in the present phase."""
+        self._begun_z_m = 0.0
+        self._looks, self._regrip = 0, Regrip()
+        self._before: Grasp | None = None
+
+    @property
+    def gathered(self) -> bool:
+        """Whether a bundle is gripped: its logs settle when it is lifted, and the tongs follow."""
+        return self.grasp is not None and self.grasp.gathered
+
+    def choose(self, q: Axes) -> None:
+        """A grasp among the logs of the newest list, from where the crane stands; raises ``NoGrasp``."""
+        self._regrip = Regrip()
+        self._choose_now(q)
+
+    def _choose_now(self, q: Axes) -> None:
+        self._looks = 0
+        self._before = None
+        mission = msgspec.structs.replace(self._mission, leave=self._mission.leave + self._regrip.stubborn)
+        self.grasp = self._choose(self._arm, mission, self._heard.logs, q[Joint.SLEW], q[Joint.ROT])
+
+    @property
+    def unsure(self) -> bool:
+        """Whether the grasp is worth another look from above: of logs among others that a camera has measured."""
+        return self.grasp is not None and self.gathered and measured(self.grasp) and self._looks < LOOKS
+
+    def choose_better(self, q: Axes) -> bool:
+        """Choose again by what is seen from over the grasp; whether the crane has to go over another place for it."""
+        before = self.grasp
+        assert before is not None
+        looks = self._looks + 1
+        try:
+            self._choose_now(q)
+        except NoGrasp:
+            return False
+        finally:
+            self._looks = looks
+        assert self.grasp is not None
+        self._before, after = before, self.grasp.pose
+        apart_m = dist((*self._arm.xy(before.pose), before.pose.z_m), (*self._arm.xy(after), after.z_m))
+        return apart_m > _SAME_M or abs(before.pose.rot_rad - after.rot_rad) > _SAME_RAD
+
+    def take_former(self) -> bool:
+        """Go back to the grasp before the last look, over which the crane stands; whether there is one."""
+        if self._before is None:
+            return False
+        self.grasp, self._before, self._looks = self._before, None, LOOKS
+        return True
+
+    def after_closing(self, tongs: Tongs) -> Phase | None:
+        """The phase that follows, None while the tongs still move."""
+        assert self.grasp is not None
+        following, self.grasp = self._regrip.after_closing(self.grasp, tongs)
+        if following is Phase.ABOVE:
+            self._look_again()
+        return following
+
+    def slid_off(self, tongs: Tongs, q: Axes) -> bool:
+        """Whether tongs that begin to rise are seen to hold nothing: the grasp is to be begun anew, from above."""
+        assert self.grasp is not None
+        anew = self._regrip.after_rising(self.grasp, tongs) if WEIGHS_M < self.risen_m(q) < LIFT_M else None
+        if anew is None:
+            return False
+        self.grasp = anew
+        self._look_again()
+        return True
+
+    def _look_again(self) -> None:
+        self._looks = min(self._looks, LOOKS - 1)  # the tongs have stirred the logs
+
+    def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
+        """The motion of a phase that begins at ``q``, with the grasp and the place as they are now seen to be best.
+        ``closing_s``: how long tongs that close have been closing.
+
+        Raises:
+            Unreachable, NoGrasp: there is no way, in one sentence.
+        """
+        self._begun_z_m = self._arm.pose(q).z_m
+        self._arm = self._arm.loaded(self._hanging_kg(phase))
+        motion = self._planned(phase, q, closing_s)
+        return brisk(self._arm, motion) if self._brisk else motion
+
+    def _planned(self, phase: Phase, q: Axes, closing_s: float) -> Trajectory:
+        arm = self._arm
+        grasp, start, logs = self.grasp, arm.pose(q), self._heard.logs
+        if phase is Phase.STOW:
+            return stowing(arm, self._motions, start, logs)
+        if phase in (Phase.LOOK, Phase.OPEN, Phase.DONE, Phase.FAILED) or grasp is None:
+            return hold(q)
+        match phase:
+            case Phase.ABOVE:
+                return above(arm, self._motions, start, grasp, logs)
+            case Phase.DESCEND:
+                self.grasp = grasp = aimed(arm, grasp, logs)
+                deeper_m = WEDGE_M if grasp.drawn else 0.0
+                return straight(arm, start, grasp.pose.at_height(grasp.pose.z_m - deeper_m))
+            case Phase.CLOSE:
+                return dragging(arm, start, grasp) if grasp.drags else closing(arm, start, grasp, closing_s)
+            case Phase.LIFT:
+                if grasp.gathered:
+                    return gathering(arm, start, grasp)
+                if not self._motions.direct:
+                    return straight(arm, start, grasp.pose.at_height(grasp.pose.z_m + LIFT_M))
+                self.place = plan_place(arm, self._mission, grasp, logs)
+                return carrying(arm, self._motions, start, self.place, grasp, logs, hangs=False)
+            case Phase.CARRY:
+                self.lifted_kg = arm.load_kg
+                self.place = plan_place(arm, self._mission, grasp, logs, grapple_yaw(self._profile, q))
+                return carrying(arm, self._motions, start, self.place, grasp, logs, hangs=True)
+        assert self.place is not None
+        if phase is Phase.LOWER:
+            return hold(q) if self._is_there(start, self.place) else straight(arm, start, self.place)
+        return straight(arm, start, start.at_height(max(start.z_m, retreat_height(self._profile))))
+
+    def _hanging_kg(self, phase: Phase) -> float:
+        """What the crane carries in a phase: a log that it has lifted bends it, and nothing else does."""
+        return sane_load_kg(self._heard.report.load_kg) if Phase.LIFT < phase < Phase.RETREAT else 0.0
+
+    # ------------------------------------------------------------------ where the crane is
+    def is_aside(self, phase: Phase, q: Axes) -> bool:
+        """Whether it stands aside of the column in which it grips or lays down in a phase."""
+        assert self.grasp is not None
+        column = self.grasp.pose if phase < Phase.CARRY else self.place
+        assert column is not None
+        return self._off_m(q, column) > ASIDE_M
+
+    def is_over_the_grasp(self, q: Axes) -> bool:
+        """Whether what hangs in the grapple would come down where it was gripped."""
+        assert self.grasp is not None
+        return self._off_m(q, self.grasp.pose) < ASIDE_M
+
+    def _is_there(self, start: Pose, place: Pose) -> bool:
+        """Whether a log that is let go here is as well laid as at its place."""
+        apart_m = dist((*self._arm.xy(start), start.z_m), (*self._arm.xy(place), place.z_m))
+        return apart_m < _THERE_M and abs(start.rot_rad - place.rot_rad) < _THERE_RAD
+
+    def _off_m(self, q: Axes, column: Pose) -> float:
+        return dist(self._arm.xy(self._arm.pose(q)), self._arm.xy(column))
+
+    def risen_m(self, q: Axes) -> float:
+        """How much higher it stands than where the phase began."""
+        return self._arm.pose(q).z_m - self._begun_z_m
+
+    def is_among_stakes(self, q: Axes) -> bool:
+        """Whether tongs that open farther would stir what lies where the logs go."""
+        return among_stakes(self._arm, self._target, q)
+
+    # ------------------------------------------------------------------ what the newest list says
+    def first(self) -> LogObservation | None:
+        """The log that the grasp is of, as it is now seen; None when it is hidden."""
+        assert self.grasp is not None
+        return next((log for log in self._picked() if log.id == self.grasp.log.id), None)
+
+    def others(self) -> list[LogObservation]:
+        """The logs that are not of the grasp."""
+        taken = {log.id for log in self._picked()}
+        return [log for log in self._heard.logs if log.id not in taken]
+
+    def came_up(self, positions: Iterable[Axes]) -> bool:
+        """Whether what was gripped hangs under the crane, measured or sent, or is hidden in tongs that did not shut on
+        nothing or in which something weighs; the grasp is of that now."""
+        assert self.grasp is not None
+        seen = self._picked()
+        held = came_up(self._arm, self.grasp, seen, [self._arm.pose(q) for q in positions])
+        self.grasp = held or self.grasp
+        return held is not None or (not seen and not lifts_nothing(self._heard.report))
+
+    def came_up_empty(self) -> str:
+        """Count a grasp that did; why there is to be no other, or empty."""
+        assert self.grasp is not None
+        seen = self._picked()
+        lost = next((log for log in seen if lies_in(self._target, log)), None)
+        if lost is not None:
+            return f"log {lost.id} fell from the grapple into the bunk"
+        self.missed += 1
+        return "" if self.missed < ATTEMPTS else f"log {(seen or self.grasp.logs)[0].id} was missed {ATTEMPTS} times"
+
+    def turn_on_the_way(self, q: Axes) -> float | None:
+        """How much farther the rotator is to turn [rad] on a way that is driven already, for what is now seen to hang;
+        None when it asks for another way.
+        """
+        assert self.grasp is not None and self.place is not None
+        place = place_as_seen(self._arm, self._mission, self.grasp, self.place, self._heard.logs, q)
+        if place is None:
+            return None
+        turn = place.rot_rad - self.place.rot_rad
+        self.place, self.lifted_kg = place, self._hanging_kg(Phase.CARRY)
+        return turn
+
+    def put_back(self) -> None:
+        """There is no way on with what is gripped: its place is where it lay."""
+        assert self.grasp is not None
+        above_m = _LOOSE_M if self.grasp.gathered else 0.0  # what lay under a bundle has settled, and hangs lower now
+        self.place = self.grasp.pose.at_height(self.grasp.pose.z_m + above_m)
+
+    def astray(self) -> str:
+        """Why what was let go does not lie where it was to be; empty when it does."""
+        log = next((log for log in self._picked() if not laid(self._mission, self._target, log)), None)
+        if log is None:
+            return ""
+        x, y, z = log.center_m
+        return f"log {log.id} was released but lies at ({x:.2f}, {y:.2f}, {z:.2f}) m, not in the bunk"
+
+    def _picked(self) -> list[LogObservation]:
+        assert self.grasp is not None
+        return picked(self.grasp, self._heard.logs)

@@ -1,0 +1,217 @@
+"""The tongs: what they are told, and what the controller's report says of them, open, closed, clear of the logs.
+
+Without a sensor they are timed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+from typing import Final
+
+from autonomy.crane_job.inbox import Heard
+from autonomy.grasp.direct import Grasp, opened_angle
+from autonomy.grasp.heap import is_over
+from autonomy.motion.arm import Arm
+from can_dbc.setpoint import GrappleCommand, StateReport
+from machine.grapple import (
+    half_gap_m,
+    opening_pct_from_tong_angle,
+    tip_below_pin_m,
+    tong_angle_from_opening_pct,
+)
+from machine.profile import Bunk, Profile
+
+_SHUT, _HOLDING = 4, 5
+"""Of GrappleStat.State: at the end of its way with nothing in it, and stopped by what it holds."""
+_OPEN_PCT: Final = 92.0
+_GRIPPED_RAD: Final = 1.5
+"""Tongs without a sensor are taken to have been closed as far when they let go of a log: past tips that meet."""
+_WIDE_PCT, _CLIMB_PCT, _WIDER_M = 70.0, 3.0, 0.15
+"""Tongs that stop closing so wide open, or so much wider than the wood they are to hold lies side by side, clasp a
+heap's sides: their tips are not under it."""
+_HELD_M: Final = 0.2
+"""Thinner logs are held in tongs that have shut."""
+_NOTHING_KG: Final = 8.0
+"""Less than the thinnest log weighs, half of it lying on others."""
+_HUNG_KG: Final = 12.0
+"""Less than the thinnest log weighs that hangs, more than a crane at rest reads for nothing.  The controller says that
+tongs hold something from 30 kg on: thin logs weigh less and vanish in tongs that have shut."""
+_EMPTY_KG: Final = 30.0
+"""What hangs in the tongs when they have let go, at most."""
+_PUSH_KG, _PUSH = 250.0, 1.5
+"""Tongs that bear more after that, and so many times what hung in them, push against logs or stakes and lift the crane;
+what only rebounds bears less."""
+_UNDER: Final = 0.85
+"""The tips are under a log when they are nearer to each other than so much of its diameter."""
+_STILL_PCT, _STILL_S = 0.5, 0.8
+"""Tongs stand that move by less in this time; logs that give way are pressed together slowly."""
+_LEAST_S: Final = 0.5
+"""Of closing, before the report can be of it."""
+_VALVE_S: Final = 0.4
+_SLOW_TONGS: Final = 1.3
+"""Before they move, and how much slower they may be than the profile says."""
+_CLOSE_GAIN_1_S: Final = 2.0
+_CLOSE_FASTEST: Final = 1.3
+
+
+def pace(ahead_s: float) -> float:
+    """How fast the pin follows the sweep of closing tongs that are so far ahead of it; NaN: at its own pace."""
+    return min(max(1.0 + _CLOSE_GAIN_1_S * ahead_s, 0.0), _CLOSE_FASTEST) if isfinite(ahead_s) else 1.0
+
+
+def gripped(report: StateReport, closing_s: float) -> bool:
+    """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""
+    return closing_s > _LEAST_S and report.grapple_state in (_SHUT, _HOLDING)
+
+
+def is_empty(report: StateReport) -> bool:
+    """Whether they shut on nothing, and nothing weighs in them."""
+    return report.grapple_state == _SHUT
+
+
+def lifts_nothing(report: StateReport) -> bool:
+    """Whether they shut and came up with nothing that is known to weigh."""
+    return is_empty(report) and not report.load_kg >= _HUNG_KG
+
+
+def opened(profile: Profile, report: StateReport, opening_s: float) -> bool:
+    """Whether they stand open."""
+    if isfinite(report.opening_pct):
+        return report.opening_pct >= _OPEN_PCT
+    return opening_s > profile.grapple.open_time_s
+
+
+def released(profile: Profile, report: StateReport, grasp: Grasp, opening_s: float) -> bool:
+    """Whether they have left the logs that they held."""
+    grapple = profile.grapple
+    angle = opened_angle(profile, max(log.diameter_m for log in grasp.logs))
+    if grasp.others:
+        angle = 0.0  # logs beside each other reach farther out
+    if isfinite(report.opening_pct):
+        return report.opening_pct >= min(opening_pct_from_tong_angle(grapple.tongs, angle), _OPEN_PCT)
+    turned = max(_GRIPPED_RAD - angle, 0.0) / grapple.tongs.angle_rad[-1]
+    return opening_s > _VALVE_S + _SLOW_TONGS * turned * grapple.open_time_s
+
+
+def among_stakes(arm: Arm, bunk: Bunk, q: Sequence[float]) -> bool:
+    """Whether tongs that have let a log go stand so low over a bunk that to open further would stir the heap."""
+    pose, top_m = arm.pose(q), bunk.floor_z_m + bunk.stake_height_m
+    return is_over(bunk, *arm.xy(pose)) and pose.z_m < top_m + tip_below_pin_m(arm.profile.grapple.tongs, 0.0)
+
+
+def closed_for_s(profile: Profile, report: StateReport) -> float:
+    """How long tongs of the nominal speed have been closing to be where they are measured; NaN if unknown."""
+    opening = report.opening_pct
+    if not isfinite(opening):
+        return opening
+    tongs = profile.grapple.tongs
+    return tong_angle_from_opening_pct(tongs, opening) / tongs.angle_rad[-1] * profile.grapple.close_time_s
+
+
+class Tongs:
+    """Those of one job.  ``command`` is what they are told now."""
+
+    def __init__(self, profile: Profile, heard: Heard) -> None:
+        self.command = GrappleCommand.HOLD
+        self._profile, self._heard = profile, heard
+        self._opening_s = self._close_from_s = self._still_s = self._calm_s = 0.0
+        self._stood_pct = self._held_kg = 0.0
+        self._let_go = self.pushed = False
+        """``pushed``: while opening they came to push against something; a load cell tells."""
+
+    def let_go(self, dt_s: float) -> None:
+        """Open, from now on for so long; once they push, back as far as they do so, and hold still."""
+        gives_way = self.pushed and self._pushes
+        back = GrappleCommand.CLOSE if gives_way else GrappleCommand.NEUTRAL
+        self.tell(back if self.pushed else GrappleCommand.OPEN, dt_s, gives_way)
+
+    def tell(self, command: GrappleCommand, dt_s: float, gives_way: bool = False) -> None:
+        """A command, from now on for so long; ``gives_way``: not to close, but to push no longer."""
+        self.command = command
+        opening = self._heard.report.opening_pct if self._heard.report is not None else 0.0
+        self._still_s += dt_s
+        if abs(opening - self._stood_pct) > _STILL_PCT:
+            self._stood_pct, self._still_s = opening, 0.0
+        if gives_way or command in (GrappleCommand.OPEN, GrappleCommand.NEUTRAL):
+            self._feel(dt_s)
+        else:
+            self._held_kg, self._let_go, self.pushed = self._load_kg, False, False
+        if command is GrappleCommand.OPEN:
+            self._opening_s += dt_s
+        elif command is not GrappleCommand.NEUTRAL:
+            self._opening_s = 0.0
+
+    def _feel(self, dt_s: float) -> None:
+        self._let_go |= self._load_kg < _EMPTY_KG
+        self.pushed |= self._let_go and self._pushes
+        self._calm_s = 0.0 if self._pushes else self._calm_s + dt_s
+
+    @property
+    def _load_kg(self) -> float:
+        return self._heard.report.load_kg if self._heard.report is not None else 0.0
+
+    @property
+    def _pushes(self) -> bool:
+        return self._load_kg > max(_PUSH_KG, _PUSH * self._held_kg)
+
+    @property
+    def open(self) -> bool:
+        """Whether they stand open."""
+        return opened(self._profile, self._heard.report, self._opening_s)
+
+    def are_wide(self, grasp: Grasp, climbs: int) -> bool:
+        """Whether they are seen to stand too wide open to lift what they hold, gripped higher so often already, where
+        there is less; without a sensor nobody knows.
+        """
+        wood_m = sum(log.diameter_m for log in grasp.logs)
+        too_open = self._heard.report.opening_pct > _WIDE_PCT - _CLIMB_PCT * climbs
+        return too_open or self._gap_m() > wood_m + _WIDER_M
+
+    def have_missed(self, grasp: Grasp) -> bool:
+        """Whether they are seen to have shut on nothing where thick logs were, or to pinch the upper half of a log that
+        they were to be under; without a sensor nobody knows.
+        """
+        if is_empty(self._heard.report):
+            return grasp.thinnest_m > _HELD_M
+        return grasp.drawn and self._gap_m() > _UNDER * grasp.thinnest_m
+
+    @property
+    def hold_nothing(self) -> bool:
+        """Whether they are seen to have shut, and nothing weighs in them; without a load cell nobody knows."""
+        return is_empty(self._heard.report) and self._heard.report.load_kg < _NOTHING_KG
+
+    def _gap_m(self) -> float:
+        """Between the tips; 0 when no sensor tells."""
+        opening, tongs = self._heard.report.opening_pct, self._profile.grapple.tongs
+        return 2.0 * half_gap_m(tongs, tong_angle_from_opening_pct(tongs, opening)) if isfinite(opening) else 0.0
+
+    @property
+    def empty(self) -> bool:
+        """Whether they have shut on nothing that is seen."""
+        return is_empty(self._heard.report)
+
+    @property
+    def still(self) -> bool:
+        """Whether they have not moved for a while."""
+        return self._still_s > _STILL_S
+
+    def gripped(self, closing_s: float) -> bool:
+        """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""
+        return gripped(self._heard.report, closing_s)
+
+    def released(self, grasp: Grasp, opening_s: float) -> bool:
+        """Whether they have left the logs of a grasp, ``opening_s`` after they were told to open there, or opened until
+        they pushed against something, gave way, and the crane has swung out.
+        """
+        return self._calm_s > _STILL_S if self.pushed else released(self._profile, self._heard.report, grasp, opening_s)
+
+    def follow(self) -> float:
+        """The pin is to follow them from now on: how long they have been closing, s; 0 where no sensor tells."""
+        measured_s = closed_for_s(self._profile, self._heard.report)
+        self._close_from_s = measured_s if isfinite(measured_s) else 0.0
+        return self._close_from_s
+
+    def pace(self, clock_s: float) -> float:
+        """How fast the pin is to go that has followed them for so much of its motion."""
+        return pace(closed_for_s(self._profile, self._heard.report) - self._close_from_s - clock_s)

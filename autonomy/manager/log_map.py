@@ -1,0 +1,220 @@
+"""The logs of a mission in the local plane: where they lie, as seen from a machine that drives past.
+
+Every log list is in the crane's base frame; with the base's pose it becomes places in the plane (x east, y north, z up,
+metres) that stay when the machine moves on.  A log's place is the running average of where it was seen (paper B 3.2.6),
+weighed by how well it was known where that is said; an average begun anew keeps the log's number.  What lies in the
+bunk is no log of the field.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from autonomy.grasp.direct import lies_in
+from autonomy.localization.plane import Plane
+from autonomy.missions.local import yaw_from_bearing
+from autonomy.missions.model import KnownLog
+from autonomy.perception.estimate import ACROSS_1, ACROSS_2, END, START, TILT_1, unpacked
+from autonomy.perception.frame import Pose
+from autonomy.perception.logs import LogObservation
+from machine.profile import Bunk
+
+SAME_M: Final = 0.8
+"""Sightings of one log are nearer to each other than this along its axis, ..."""
+SIDE_M: Final = 0.35
+"""... and than this across it."""
+ALIKE_RAD: Final = math.radians(40.0)
+"""Axes of one log differ by less, and by what they are not known to."""
+PLAIN_SIGMA_M: Final = 0.10
+"""Of a sighting that does not say how well it is known (paper B's own figure)."""
+LEAST_SIGMA_M: Final = 0.01
+"""Poses and mounts err for good: neither a sighting nor an average is known better than this."""
+TOLD_SIGMA_M: Final = 0.3
+"""Of a log that a mission lists without saying how well it is known."""
+USUAL_M: Final = (3.0, 0.2)
+"""Length and diameter of one whose size it does not say."""
+CONFIRMED: Final = 2
+_BAR: Final = 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class FieldLog:
+    """A log in the plane: centre and unit axis (3,), length, diameter [m], 1-sigma of the centre [m]; in how many lists
+    it was, and when last; grasps that came up empty.
+    """
+
+    number: int
+    center_m: np.ndarray
+    axis: np.ndarray
+    length_m: float
+    diameter_m: float
+    sigma_m: float
+    hits: int
+    seen_ns: int
+    misses: int = 0
+    assortment: str = ""
+    turn_rad: float = 0.0
+    """1-sigma of the axis on the ground."""
+
+    def observation(self, base: Pose) -> LogObservation:
+        """As it lies in the crane's base frame now."""
+        x, y, z = base.to_optical(self.center_m).tolist()
+        ax, ay, az = (self.axis @ base.rotation).tolist()
+        return LogObservation(self.number, (x, y, z), (ax, ay, az), self.length_m, self.diameter_m)
+
+
+class Field:
+    """All logs that were seen and are not collected yet."""
+
+    def __init__(self, bunk: Bunk) -> None:
+        self._bunk = bunk
+        self._logs: dict[int, FieldLog] = {}
+        self._next = 1
+
+    @property
+    def logs(self) -> tuple[FieldLog, ...]:
+        """Those that were seen often enough to be believed, by number."""
+        return tuple(log for log in self._logs.values() if log.hits >= CONFIRMED)
+
+    @property
+    def missed_ones(self) -> tuple[FieldLog, ...]:
+        """Those that grasps came back from empty, given up or not."""
+        return tuple(log for log in self._logs.values() if log.misses)
+
+    @property
+    def free(self) -> int:
+        """The next number."""
+        return self._next
+
+    def known(self, log: FieldLog) -> None:
+        """A log that is known before it is seen, as from a harvester; it gets a number of its own."""
+        self._logs[self._next] = replace(log, number=self._next, hits=max(log.hits, CONFIRMED))
+        self._next += 1
+
+    def restore(self, log: FieldLog) -> None:
+        """A log as it was known before, with its number."""
+        self._logs[log.number] = log
+
+    def number_from(self, free: int) -> None:
+        """Numbers below this one are those of logs that were known before."""
+        self._next = max(self._next, free)
+
+    def get(self, number: int) -> FieldLog | None:
+        """The log of this number, if it still lies there."""
+        return self._logs.get(number)
+
+    def see(self, seen: Iterable[LogObservation], base: Pose, now_ns: int) -> dict[int, int]:
+        """Take in a list; which number of the list is which log of the field."""
+        fresh = [_sighting(o, base, now_ns) for o in seen if not lies_in(self._bunk, o)]
+        names = [o.id for o in seen if not lies_in(self._bunk, o)]
+        known = list(self._logs.values())
+        costs = np.full((len(known), len(fresh)), _BAR)
+        for i, log in enumerate(known):
+            for j, sighting in enumerate(fresh):
+                costs[i, j] = _apart(log, sighting)
+        pairs = {int(j): int(i) for i, j in zip(*linear_sum_assignment(costs), strict=True) if costs[i, j] < _BAR}
+        numbers = {}
+        for j, sighting in enumerate(fresh):
+            if j in pairs:
+                before = known[pairs[j]]
+                self._logs[before.number] = _averaged(before, sighting)
+                numbers[names[j]] = before.number
+            else:
+                self._logs[self._next] = replace(sighting, number=self._next)
+                numbers[names[j]] = self._next
+                self._next += 1
+        return numbers
+
+    def anew(self, number: int) -> None:
+        """The average of a log begins anew with what is seen next (paper B: at standstill)."""
+        self._logs[number] = replace(self._logs[number], hits=0)
+
+    def missed(self, number: int) -> int:
+        """A grasp of it came up empty; how often that has been."""
+        log = self._logs[number] = replace(self._logs[number], misses=self._logs[number].misses + 1, hits=0)
+        return log.misses
+
+    def remove(self, number: int) -> None:
+        """It is collected, or given up."""
+        self._logs.pop(number, None)
+
+    def forget(self, older_ns: int) -> None:
+        """Drop what was seen once and not again since a moment."""
+        stale = [n for n, log in self._logs.items() if log.hits < CONFIRMED and log.seen_ns < older_ns]
+        for number in stale:
+            del self._logs[number]
+
+
+def nearest(logs: Sequence[FieldLog], point_m: np.ndarray) -> FieldLog | None:
+    """The log whose centre is nearest to a point (2,) of the plane."""
+    return min(logs, key=lambda log: math.dist(log.center_m[:2], point_m), default=None)
+
+
+def told(log: KnownLog, plane: Plane, ground_m: float) -> FieldLog:
+    """A log that somebody knows of, on ground of a height in the plane [m]."""
+    d = log.diameter_m or USUAL_M[1]
+    x, y, _ = plane.local(log.position.latitude_deg, log.position.longitude_deg)
+    yaw = 0.0 if log.bearing_deg is None else yaw_from_bearing(log.bearing_deg)
+    return FieldLog(
+        0, np.array([x, y, ground_m + 0.5 * d]), np.array([math.cos(yaw), math.sin(yaw), 0.0]),
+        log.length_m or USUAL_M[0], d, log.sigma_m or TOLD_SIGMA_M, CONFIRMED, 0, assortment=log.assortment,
+        turn_rad=math.pi if log.bearing_deg is None else 0.0,
+    )  # fmt: skip
+
+
+def _sighting(o: LogObservation, base: Pose, now_ns: int) -> FieldLog:
+    center = base.to_base(np.asarray(o.center_m))
+    axis, turn_rad = base.rotation @ np.asarray(o.axis), 0.0
+    if o.covariance is not None:
+        turn_rad = math.sqrt(unpacked(o.covariance)[TILT_1, TILT_1])
+    return FieldLog(0, center, axis, o.length_m, o.diameter_m, _sigma_m(o), 1, now_ns, turn_rad=turn_rad)
+
+
+def _sigma_m(o: LogObservation) -> float:
+    """Of the centre on the ground: the worse of across and along."""
+    if o.covariance is None:
+        return PLAIN_SIGMA_M
+    c = unpacked(o.covariance)
+    along = 0.25 * (c[START, START] + c[END, END] + 2.0 * c[START, END])
+    return max(LEAST_SIGMA_M, math.sqrt(max(c[ACROSS_1, ACROSS_1], c[ACROSS_2, ACROSS_2], along)))
+
+
+def _apart(log: FieldLog, sighting: FieldLog) -> float:
+    """Distance of two sightings [m]; `_BAR` when they cannot be of one log."""
+    off = sighting.center_m - log.center_m
+    along = float(off @ log.axis)
+    across = float(np.linalg.norm(off - along * log.axis))
+    loose = 3.0 * (log.sigma_m + sighting.sigma_m)
+    askew = math.acos(min(1.0, abs(float(log.axis @ sighting.axis))))
+    if askew > ALIKE_RAD + 3.0 * max(log.turn_rad, sighting.turn_rad):
+        return _BAR
+    if abs(along) > SAME_M + loose or across > SIDE_M + loose:
+        return _BAR
+    return math.hypot(along, across)
+
+
+def _averaged(log: FieldLog, sighting: FieldLog) -> FieldLog:
+    """The running average, each sighting weighed by its variance; begun anew at no hits."""
+    if not log.hits:
+        return replace(sighting, number=log.number, misses=log.misses, assortment=log.assortment)
+    before, now = 1.0 / log.sigma_m**2, 1.0 / sighting.sigma_m**2
+    share = now / (before + now)
+    sense = 1.0 if float(log.axis @ sighting.axis) >= 0.0 else -1.0
+    axis = log.axis + share * (sense * sighting.axis - log.axis)
+    return replace(
+        log,
+        center_m=log.center_m + share * (sighting.center_m - log.center_m),
+        axis=axis / np.linalg.norm(axis),
+        length_m=log.length_m + share * (sighting.length_m - log.length_m),
+        diameter_m=log.diameter_m + share * (sighting.diameter_m - log.diameter_m),
+        sigma_m=max(LEAST_SIGMA_M, 1.0 / math.sqrt(before + now)),
+        turn_rad=min(log.turn_rad, sighting.turn_rad),
+        hits=log.hits + 1,
+        seen_ns=sighting.seen_ns,
+    )

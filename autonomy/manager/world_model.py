@@ -1,0 +1,333 @@
+"""What the manager knows of machine and surroundings, and what follows for the logs: near, in the circle, in reach.
+
+`Outlook.take` is given everything that comes in; the questions are answered from the newest of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from autonomy.crane_job.activity import Activity
+from autonomy.grasp.direct import lies_in
+from autonomy.localization.estimate import Location
+from autonomy.localization.frames import Frames
+from autonomy.localization.localizer import Localizer
+from autonomy.localization.plane import Plane
+from autonomy.manager.log_map import CONFIRMED, Field, FieldLog, nearest, told
+from autonomy.manager.memory import Memory
+from autonomy.manager.progress import Known, Missed
+from autonomy.manager.sorting import Sorting
+from autonomy.manager.stops import BaseAt, Reach, Stop, best_stop
+from autonomy.missions.area import Area
+from autonomy.missions.local import bearing_from_yaw
+from autonomy.missions.model import ForwardingMission, KnownLog, Point
+from autonomy.motion.arm import Arm
+from autonomy.navigation.curves import Point2
+from autonomy.perception.frame import Pose
+from autonomy.perception.logs import LogObservation
+from can_dbc.setpoint import StateReport, VehicleReport
+from machine.modes import Mode
+from machine.profile import Bunk, Profile
+
+SILENT_NS: Final = 300_000_000
+NEAR_M: Final = 4.0
+"""The machine stops to look when a log lies so far ahead of the front axle, or less (paper B: 4 m before the log)."""
+CIRCLE_M: Final = 5.3
+"""Radius of the circle round the log that the crane foot enters and leaves: about 5 m (paper B)."""
+HORIZON_M: Final = 16.0
+"""Logs that lie farther away along the way are no matter yet."""
+AHEAD_M: Final = 0.5
+BRAKING_M: Final = 0.5
+"""The machine comes to rest in this way from its usual speed."""
+SPINE: Final = 15
+"""Points along a log where it is asked whether a wheel meets it."""
+ATTEMPTS: Final = 3
+STANDS_M_S: Final = 0.02
+POSES: Final = 40
+FARTHEST: Final = 4.0
+"""The base is foretold no further than by so many reports."""
+PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M = 3.0, 2.6, 1.5
+"""Of a pile on the landing: shorter logs than this, side by side, and no higher."""
+
+
+class Outlook:
+    """One machine's view.  ``field`` are the logs that lie about, of which ``sorting`` says what is wanted;
+    ``location`` is the newest, None before the first.  ``known`` is what was known of logs when the mission was left.
+    """
+
+    def __init__(
+        self, profile: Profile, mission: ForwardingMission, plane: Plane | None = None, known: Known | None = None
+    ) -> None:
+        assert profile.carrier is not None
+        self.field, self.sorting = Field(profile.bunk), Sorting(mission)
+        self.location: Location | None = None
+        self.report: StateReport | None = None
+        self.vehicle: VehicleReport | None = None
+        self.list_ns = 0
+        """When the newest list of logs was seen."""
+        self.in_bunk, self.counted_ns = 0, 0
+        self.strayed_m = 0.0
+        """How far the front axle or the crane's foot is from where the fences let the machine drive; 0 inside."""
+        self._carrier, self._bunk, self._ground_z_m = profile.carrier, profile.bunk, profile.workspace.ground_z_m
+        self._localizer = Localizer(profile.carrier, plane)
+        self._reach = Reach(Arm(profile), profile.carrier)
+        self._report_ns = self._vehicle_ns = 0
+        self._bases: deque[tuple[int, Pose]] = deque(maxlen=POSES)
+        self._numbers: dict[int, int] = {}
+        self.landings: list[Point2] = []
+        """In the plane, once that is known."""
+        self._places = tuple(landing.position for landing in mission.landings)
+        self._listed = mission.logs if mission.options.logs == "listed" else ()
+        self._known = known or Known()
+        self._fences, self._area = mission.fences, Area()
+
+    @property
+    def plane(self) -> Plane:
+        """The local plane; known once the machine is located."""
+        assert self._localizer.plane is not None
+        return self._localizer.plane
+
+    @property
+    def located(self) -> bool:
+        """Whether the crane's base is known."""
+        return bool(self._bases)
+
+    @property
+    def base(self) -> Pose:
+        """The crane's base now."""
+        return self._bases[-1][1]
+
+    def base_at(self, at_ns: int) -> Pose:
+        """The crane's base at a moment: the nearest that is known, or as it moves on after the last."""
+        stamp, last = self._bases[-1]
+        if at_ns <= stamp or len(self._bases) < 2:
+            return min(self._bases, key=lambda known: abs(known[0] - at_ns))[1]
+        before, first = self._bases[-2]
+        if stamp <= before:
+            return last
+        share = min((at_ns - stamp) / (stamp - before), FARTHEST)
+        turn = Rotation.from_matrix(last.rotation @ first.rotation.T).as_rotvec()
+        return Pose(
+            last.position_m + share * (last.position_m - first.position_m),
+            Rotation.from_rotvec(share * turn).as_matrix() @ last.rotation,
+        )
+
+    def take(self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None) -> None:
+        """The newest reports."""
+        if report is not None:
+            self.report, self._report_ns = report, now_ns
+        if vehicle is not None:
+            self.vehicle, self._vehicle_ns = vehicle, now_ns
+            self.location = self._localizer.step(vehicle)
+            if self.location.usable:
+                self._bases.append((self.location.stamp_ns, Frames(self._carrier, self.location).base()))
+                if len(self._bases) == 1:
+                    self._look_up()
+                places = np.array([(self.location.x_m, self.location.y_m), self.base.position_m[:2]])
+                self.strayed_m = float(self._area.outside_m(places).max())
+
+    def _look_up(self) -> None:
+        """What the mission says of places, in the plane that is now known: landings, fences, and logs that need not be
+        found.
+        """
+        plane = self.plane
+        self.landings = [plane.local(p.latitude_deg, p.longitude_deg)[:2] for p in self._places]
+        rings = [
+            (np.array([plane.local(c.latitude_deg, c.longitude_deg)[:2] for c in fence.corners]), fence.keep_out)
+            for fence in self._fences
+        ]
+        self._area = Area(tuple(r for r, out in rings if not out), tuple(r for r, out in rings if out))
+        ground_m = float(self.base.position_m[2]) + self._ground_z_m
+        for log in self._listed:
+            self.field.known(told(log, plane, ground_m))
+        for number in self._known.gone:
+            self.field.remove(number)
+        for missed in self._known.missed:
+            lay = told(missed.log, plane, ground_m)
+            self.field.restore(replace(lay, number=missed.number, misses=missed.misses, hits=0))
+        self.field.number_from(self._known.free)
+
+    def known(self) -> Known:
+        """What is to be remembered of the logs when the mission is left now."""
+        if not self._bases:
+            return self._known
+        gone = tuple(n for n in range(1, len(self._listed) + 1) if self.field.get(n) is None)
+        return Known(gone, tuple(self._as_missed(log) for log in self.field.missed_ones), self.field.free)
+
+    def _as_missed(self, log: FieldLog) -> Missed:
+        x, y, _ = log.center_m.tolist()
+        place = Point(*self.plane.geodetic(x, y)[:2])
+        bearing = bearing_from_yaw(math.atan2(log.axis[1], log.axis[0]))
+        kept = KnownLog(place, "", bearing, log.length_m, log.diameter_m, "", log.assortment, None, log.sigma_m)
+        return Missed(log.number, kept, log.misses)
+
+    def in_the_way(self) -> FieldLog | None:
+        """The first log that a front wheel would run into next."""
+        assert self.location is not None
+        here, c = self.location, self._carrier
+        cos, sin = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
+        turn = np.array([[cos, -sin], [sin, cos]])
+        for log in self.field.logs:
+            spine = log.center_m + np.linspace(-0.5, 0.5, SPINE)[:, None] * log.length_m * log.axis
+            ahead, aside = ((spine[:, :2] - (here.x_m, here.y_m)) @ turn).T
+            near = (ahead > 0.0) & (ahead < c.wheel_radius_m + 0.5 * log.diameter_m + BRAKING_M)
+            if np.any(near & (np.abs(np.abs(aside) - 0.5 * c.track_width_m) < 0.5 * c.wheel_width_m)):
+                return log
+        return None
+
+    def see(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
+        """A list of logs in the base frame as it was at a moment; none counts before the machine is located."""
+        if logs and self._bases:
+            self.aboard(logs, seen_ns)
+            self._numbers = self.learn(logs, seen_ns)
+            self.list_ns = seen_ns
+
+    def learn(self, logs: Sequence[LogObservation], seen_ns: int) -> dict[int, int]:
+        """Take a list into the field alone; which of its numbers is which log of the field."""
+        if not logs or not self._bases:
+            return {}
+        return self.field.see(logs, self.base_at(seen_ns), seen_ns)
+
+    def remember(self, memory: Memory, job: Activity | None, now_ns: int) -> tuple[LogObservation, ...]:
+        """A list of what is remembered takes the place of what is seen; empty while there is no new one."""
+        if not self._bases:
+            return ()
+        logs = memory.list(now_ns, self.field, self.base, self.report, job)
+        if logs is None:
+            return ()
+        self._numbers = {log.id: log.id for log in logs}
+        self.list_ns = self.counted_ns = now_ns
+        self.in_bunk = memory.aboard
+        return logs
+
+    def aboard(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
+        """Count the logs of a list that lie in the bunk."""
+        if logs:
+            self.in_bunk, self.counted_ns = sum(lies_in(self._bunk, log) for log in logs), seen_ns
+
+    def landing_ahead(self, point: Point2, base_at: BaseAt, end_m: float) -> float | None:
+        """From where along a way the crane reaches a landing best; None: from nowhere."""
+        pile = FieldLog(0, np.array([*point, 0.0]), np.array([1.0, 0.0, 0.0]), 2.0, 0.3, 0.1, CONFIRMED, 0)
+        stop = best_stop([pile], self._reach, base_at, 0.0, end_m)
+        return None if stop is None else stop.along_m
+
+    def pile_at(self, point: Point2, lie_rad: float | None = None) -> Bunk:
+        """A landing as the crane lays logs there: a bunk on the ground beside the machine, along it or along a
+        direction in the plane.
+        """
+        x, y, _ = self.base.to_optical(np.array([*point, self.base.position_m[2]])).tolist()
+        looks = math.atan2(self.base.rotation[1, 0], self.base.rotation[0, 0])
+        yaw = 0.0 if lie_rad is None else math.remainder(lie_rad - looks, math.pi)
+        return Bunk((x, y), yaw, PILE_LENGTH_M, PILE_WIDTH_M, self._ground_z_m, PILE_HEIGHT_M)
+
+    def obstacle(self, now_ns: int) -> str:
+        """Why nothing that is asked for would be obeyed now; empty when it would."""
+        if self.report is None or self.vehicle is None:
+            return "the controller has not reported"
+        if now_ns - min(self._report_ns, self._vehicle_ns) > SILENT_NS:
+            return "the controller is silent"
+        if self.report.mode not in (Mode.ARMED, Mode.ACTIVE):
+            return f"the controller is in {Mode(self.report.mode).name}"
+        if self.location is None or not self.location.usable:
+            return f"not located: {self.location.reason if self.location else 'no report'}"
+        return ""
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the controller has stopped the machine."""
+        return self.report is not None and self.report.mode in (Mode.STOP, Mode.FAULT)
+
+    def at_height(self, wanted_m: float) -> bool:
+        """Whether all four arms are there."""
+        assert self.vehicle is not None
+        near = 1.5 * self._carrier.arm_in_band_m
+        return all(abs(h - wanted_m) <= near for h in self.vehicle.heights_m)
+
+    def stands(self) -> bool:
+        """Whether the machine does."""
+        return self.vehicle is not None and abs(self.vehicle.speed_m_s) < STANDS_M_S
+
+    # ------------------------------------------------------------------ logs
+    def number_of(self, listed: int) -> int | None:
+        """The field's number of a log of the newest list."""
+        return self._numbers.get(listed)
+
+    def listed_as(self, number: int | None) -> int | None:
+        """The newest list's number of a log of the field."""
+        return next((k for k, n in self._numbers.items() if n == number), None)
+
+    def missed(self, number: int, for_good: bool = False) -> bool:
+        """A grasp of a log came up empty; whether it is given up: then it is known, but nobody stops for it."""
+        if self.field.get(number) is None:
+            return False
+        while (misses := self.field.missed(number)) < ATTEMPTS and for_good:
+            pass
+        return misses >= ATTEMPTS
+
+    def given_up(self, listed: int) -> bool:
+        """Whether a log of the newest list is one that is given up."""
+        number = self._numbers.get(listed)
+        log = None if number is None else self.field.get(number)
+        return log is not None and log.misses >= ATTEMPTS
+
+    def near(self) -> FieldLog | None:
+        """Paper B: of the logs that are near enough to stop for, the one that is nearest to the crane.
+
+        Near are those a little ahead, and those beside or behind the front half whose circle the crane foot has not
+        left: while the machine went on to one log it may have come past the next.
+        """
+        assert self.location is not None
+        here = self.location
+        ahead = np.array([math.cos(here.yaw_rad), math.sin(here.yaw_rad)])
+        near = [
+            g for g in self._matter()
+            if self.in_circle(g) or 0.0 < float((g.center_m[:2] - (here.x_m, here.y_m)) @ ahead) <= NEAR_M
+        ]  # fmt: skip
+        return nearest(near, self.base.position_m[:2])
+
+    def stop_ahead(self, base_at: BaseAt, along_m: float, end_m: float) -> Stop | None:
+        """Ours: the best next place to stop on the way ahead."""
+        begin = along_m + AHEAD_M
+        return best_stop(self._matter(), self._reach, base_at, begin, min(begin + HORIZON_M, end_m))
+
+    def in_circle(self, log: FieldLog | None) -> bool:
+        """Whether the crane foot is in the circle round a log."""
+        return log is not None and math.dist(log.center_m[:2], self.base.position_m[:2]) < CIRCLE_M
+
+    def past(self, log: FieldLog | None) -> bool:
+        """Whether the crane foot has left the circle on the far side: at its near edge noise must not count."""
+        if log is None:
+            return True
+        behind_m = float(self.base.to_optical(log.center_m)[0])  # the base looks backwards
+        return behind_m > 0.0 and not self.in_circle(log)
+
+    def takable(self, only: int | None = None) -> list[FieldLog]:
+        """The logs of the newest list that the crane can take from here, best first; or one of them."""
+        seen = set(self._numbers.values()) if only is None else {only}
+        logs = [g for g in self._wanted() if g.number in seen]
+        work = sorted((self._reach.work_s(g.observation(self.base)), g.number, g) for g in logs)
+        return [g for seconds, _, g in work if math.isfinite(seconds)]
+
+    def lying(self) -> list[FieldLog]:
+        """The logs that can be collected: not given up, and not on a landing."""
+        return [g for g in self.field.logs if g.misses < ATTEMPTS and not self.on_landing(g)]
+
+    def on_landing(self, log: FieldLog) -> bool:
+        """Whether a log has come to a landing."""
+        return any(math.dist(log.center_m[:2], at) <= PILE_LENGTH_M for at in self.landings)
+
+    def _wanted(self) -> list[FieldLog]:
+        """Those of them that are to come into the load on board."""
+        return [g for g in self.lying() if self.sorting.wants(g.assortment)]
+
+    def _matter(self) -> list[FieldLog]:
+        """Those of them for which it may be worth to stop soon."""
+        foot = self.base.position_m[:2]
+        return [g for g in self._wanted() if math.dist(g.center_m[:2], foot) < HORIZON_M]

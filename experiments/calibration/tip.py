@@ -1,0 +1,98 @@
+"""Where the hanger pin truly is, against where a calibrated profile says it is, at poses that no survey has seen.
+
+The plant stands at the poses with its oil locked, empty and with a load on its hook; what the encoders would show goes
+through the shipped profile's kinematics and through the calibrated one's.  The load is known there, as a load cell
+would tell it; what the lift's pressures alone say of it is compared beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+from experiments.common.pool import Job
+from experiments.common.worlds import hang, opened
+from machine.joints import Joint
+from machine.kinematics import Unreachable, pin_position
+from machine.lift import hanging_kg, lift_moment_nm
+from machine.profile import Profile, joint
+from machine.sag import aim_free, true_pin
+from sim.world import STEP_S, World
+
+LOAD_KG: Final = 200.0
+GOALS: Final = (
+    (4.27, 1.86, 1.0), (4.27, -1.86, 1.0), (6.0, 1.86, 1.0), (6.0, -1.86, 1.0),
+    (3.0, 0.8, 1.6), (4.4, -2.4, 2.8), (5.2, 0.0, 1.8), (6.3, -1.0, 2.4),
+)  # fmt: skip
+"""Ahead of and beside the crane at slew 0 [m]: the four of paper B, and others; some are beyond the smaller crane."""
+NUDGE_SPOOL, NUDGE_S = 0.22, 0.4
+HANG_S, REST_S, LOOK_S = 1.0, 4.0, 2.0
+
+
+def tip_errors(job: Job, shipped: Profile, calibrated: Profile) -> dict[str, Any]:
+    """Distances of the true pin [mm] and errors of the load [kg] at every goal that the crane reaches, by name."""
+    found: dict[str, list[float]] = {"before": [], "empty": [], "loaded": [], "loaded_before": [], "load_kg": []}
+    turn = calibrated.kinematics.theta1_offset_rad
+    for i, (ahead, aside, z) in enumerate(GOALS):
+        x, y = ahead * math.cos(turn) - aside * math.sin(turn), ahead * math.sin(turn) + aside * math.cos(turn)
+        try:
+            q = aim_free(calibrated, x, y, z)
+        except Unreachable:
+            continue
+        home = dict(zip(("slew", "lift", "tilt", "ext"), q, strict=True))
+        with opened(job.options["profile"], job.options["truth"], job.seed, home=home) as world:
+            # A cylinder's friction depends on where it came from: every second pose is reached from above.
+            _run(world, NUDGE_S, NUDGE_SPOOL if i % 2 else -NUDGE_SPOOL)
+            for kg, before, after in ((0.0, "before", "empty"), (LOAD_KG, "loaded_before", "loaded")):
+                if kg:
+                    _hang_slowly(world, kg)
+                    _run(world, REST_S)
+                shown, true, moment_nm = _look(world, shipped)
+                corrected = _read_by(shown, shipped, calibrated)
+                found[before].append(1e3 * math.dist(pin_position(shipped.kinematics, shown), true))
+                pin = true_pin(calibrated.sag, calibrated.kinematics, corrected, kg)
+                found[after].append(1e3 * math.dist(pin, true))
+                found["load_kg"].append(hanging_kg(calibrated.sag, calibrated.kinematics, corrected, moment_nm) - kg)
+    return found
+
+
+def _run(world: World, seconds: float, lift_spool: float = 0.0) -> None:
+    commands = [0.0] * len(world.functions)
+    commands[world.functions.index("lift")] = lift_spool
+    for _ in range(round(seconds / STEP_S)):
+        world.step(commands)
+
+
+def _hang_slowly(world: World, kg: float) -> None:
+    """Onto the hook without a shock."""
+    parts = 20
+    for i in range(parts):
+        hang(world, kg * (i + 1) / parts)
+        _run(world, HANG_S / parts)
+
+
+def _look(world: World, profile: Profile) -> tuple[list[float], Sequence[float], float]:
+    """Means over a while: what the encoders show through a profile, the true pin, and the moment by the pressures."""
+    names = [j.name.lower() for j in Joint]
+    steps = round(LOOK_S / STEP_S)
+    q, tip, bar = [0.0] * len(names), [0.0] * 3, [0.0] * 2
+    for _ in range(steps):
+        _run(world, STEP_S)
+        q = [a + world.q[n] / steps for a, n in zip(q, names, strict=True)]
+        tip = [a + v / steps for a, v in zip(tip, world.tip(), strict=True)]
+        bar = [a + p / steps / 1e5 for a, p in zip(bar, world.hydraulics.pressures_pa["lift"], strict=True)]
+    for j, name in enumerate(names[:4]):
+        e = world.truth.encoders[name]
+        q[j] += e.offset + e.eccentricity * math.sin(q[j] + e.phase_rad)
+    return q, tip, lift_moment_nm(profile, q[Joint.LIFT], *bar)
+
+
+def _read_by(shown: Sequence[float], shipped: Profile, calibrated: Profile) -> list[float]:
+    """The same counts through the calibrated profile's zeros."""
+    out = list(shown)
+    for j in Joint:
+        a, b = joint(shipped, j).encoder, joint(calibrated, j).encoder
+        if a is not None and b is not None:
+            out[j] -= b.direction * (b.zero_counts - a.zero_counts) * b.unit_per_count
+    return out

@@ -1,0 +1,189 @@
+"""Paper A's grasping attempts and more of them: three sources of poses by three planners, the whole chain on the bus.
+
+The paper made 5 attempts with each of its 12 configurations.  Here ``--trials`` is how many attempts each configuration
+gets with our perception and our search (default 100: 1,200 attempts); the first 5 of each are the paper's 60, on the
+nominal machine, and the rest is made by that one and by calibrated individuals in turn.  The other pairs of the
+ablation get a twentieth, at least 5, on the nominal machine.  ``--quick`` leaves them out; the page then keeps those
+that are published, and says of which commit they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from statistics import fmean, median
+from types import MappingProxyType
+from typing import Any, Final
+
+from rich.console import Console
+
+from experiments.common import overview, pool
+from experiments.common.individuals import calibrated
+from experiments.common.pool import Job
+from experiments.common.registry import Options
+from experiments.common.report import tell
+from experiments.common.result import Result, judged, rate
+from experiments.common.trials import checkpoint, individuals
+from experiments.grasp_configs.figures import FIGURES, INTRODUCTION, sections
+from experiments.grasp_configs.outcome import ALL_LOGS, PILES
+from experiments.grasp_configs.pictures import draw_chain, draw_table
+from experiments.grasp_configs.poses import POSES
+from experiments.grasp_configs.trial import NETWORKS, attempt, weights_of
+from sim.scene import CONFIGURATIONS
+
+PAPER: Final = {"paper60_success": 59 / 60, "optimal": 48 / 59}
+"""Paper A, section IV-C: the simulated trials."""
+ATTEMPTS, PAPER_ATTEMPTS, SHARE = 100, 5, 20
+MACHINES: Final = 5
+"""Individuals that make attempts in turn with the nominal machine."""
+FIRST_MACHINE: Final = 70_000
+FIRST_SEED: Final = 20_000
+"""Judged on scenes that nobody looked at while the planner was made (those had seeds from 7000 on)."""
+PLANNERS: Final = ("search", *NETWORKS)
+BEST: Final = ("ours", "search")
+RAW: Final = "results/grasp-configs/trials.jsonl.xz"
+"""What became of every attempt, in the docs."""
+SOURCES: Final = ("autonomy", "controller", "hil/lockstep.py")
+
+
+def machines_of(options: Options, attempts: int) -> list[Job]:
+    """The calibrations of the individuals that are needed."""
+    what, first = {"profile": options.profile, "truth": individuals(options.truth)}, FIRST_MACHINE + options.seed
+    count = min(MACHINES, max(0, attempts - PAPER_ATTEMPTS - 1))
+    return [Job(f"machine/{i}", "calibration", first + i, what) for i in range(count)]
+
+
+def jobs_of(
+    options: Options,
+    pairs: Sequence[tuple[str, str]],
+    attempts: int,
+    machines: Mapping[str, Any] = MappingProxyType({}),
+) -> list[Job]:
+    """All attempts; the first pair gets ``attempts`` of each configuration, the others a twentieth.  ``machines`` are
+    the calibrated individuals by the names of their jobs; without any, the nominal one makes all.
+    """
+    found = []
+    for pair in pairs:
+        count = attempts if pair == pairs[0] else max(min(PAPER_ATTEMPTS, attempts), attempts // SHARE)
+        for number in CONFIGURATIONS:
+            for k in range(count):
+                plain = {"profile": options.profile, "truth": options.truth, "configuration": number}
+                plain |= {"poses": pair[0], "planner": pair[1]}
+                seed = FIRST_SEED + 1000 * options.seed + k
+                turn = (k - PAPER_ATTEMPTS) % (MACHINES + 1) if k >= PAPER_ATTEMPTS and pair == pairs[0] else 0
+                machine = machines.get(f"machine/{turn - 1}")
+                if machine is not None and machine["profile"] is not None:
+                    plain |= {"truth": individuals(options.truth), "text": machine["profile"], "scene": seed}
+                    seed = FIRST_MACHINE + options.seed + turn - 1
+                found.append(Job(f"{'.'.join(pair)}/{number}/{k}", "grasp", seed, plain))
+    return found
+
+
+def pairs_of() -> list[tuple[str, str]]:
+    """The ablation's pairs whose weights are there, the one that is judged first."""
+    pairs = [(poses, planner) for poses in POSES for planner in PLANNERS]
+    ready = [p for p in pairs if weights_of(*p)]
+    first = BEST if BEST in ready else ("true", "search")
+    return [first, *(p for p in ready if p != first)]
+
+
+def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[str, float]:
+    """The metrics: of the judged pair by the issue's names, of every pair with its name before them."""
+    by_pair: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+    for name, o in outcomes.items():
+        if name.startswith("machine/"):
+            continue
+        pair, _, k = name.split("/")
+        by_pair.setdefault(pair, []).append((int(k), o))
+    metrics: dict[str, float] = {}
+    for pair, trials in by_pair.items():
+        own = of_trials([o for _, o in trials], f"{pair}.")
+        metrics |= own
+        if pair == ".".join(first):
+            metrics |= of_trials([o for _, o in trials], "")
+            sixty = [o["lifted"] > 0 for k, o in trials if k < PAPER_ATTEMPTS]
+            metrics |= rate("paper60_success", sum(sixty), len(sixty))
+            metrics["success_wilson_low"] = metrics["success_low"]
+            for kind, sampled in (("nominal", False), ("individuals", True)):
+                its = [o["lifted"] > 0 for _, o in trials if o["individual"] is sampled]
+                metrics |= rate(f"{kind}.success", sum(its), len(its)) if its else {}
+            metrics["first_closing"] = _mean([float(o["lifted"] > 0 and o["closings"] == 1) for _, o in trials])
+            for number in CONFIGURATIONS:
+                its = [o for _, o in trials if o["configuration"] == number]
+                metrics |= rate(f"config{number}.success", sum(o["lifted"] > 0 for o in its), len(its))
+                metrics[f"config{number}.optimal"] = _share(its, "optimal")
+                metrics[f"config{number}.logs"] = _mean([o["lifted"] for o in its])
+    return metrics
+
+
+def of_trials(trials: Sequence[dict[str, Any]], prefix: str) -> dict[str, float]:
+    """Success, optimal among the successful, logs a grasp, times."""
+    up = [o for o in trials if o["lifted"] > 0]
+    piles = [o["lifted"] for o in trials if o["configuration"] in PILES]
+    all_of = [o["lifted"] == o["logs"] for o in trials if o["configuration"] in ALL_LOGS]
+    planned = [o for o in trials if math.isfinite(o["plan_ms"])]
+    return {
+        **rate(f"{prefix}success", len(up), len(trials)),
+        **rate(f"{prefix}optimal", sum(o["category"] == "optimal" for o in up), len(up)),
+        **{f"{prefix}{c.lower()}": float(sum(o["category"] == c for o in up)) for c in ("NI", "SE", "MA")},
+        f"{prefix}logs_per_grasp_10_12": _mean(piles),
+        f"{prefix}all_logs": _mean([float(a) for a in all_of]),
+        f"{prefix}plan_ms": _median([o["see_ms"] + o["plan_ms"] for o in planned]),
+        f"{prefix}perceive_ms": _median([o["see_ms"] for o in trials]),
+        f"{prefix}choose_ms": _median([o["plan_ms"] for o in planned]),
+    }
+
+
+def published_ablation(docs: Path | None, judged_pair: tuple[str, str]) -> tuple[dict[str, float], str]:
+    """The metrics of the other pairs that a folder of docs holds, and of which commit they are; ({}, "") for none."""
+    saved = None if docs is None else overview.results_in(docs).get("grasp-configs")
+    if saved is None:
+        return {}, ""
+    pairs = {".".join(pair) for pair in product(POSES, PLANNERS)} - {".".join(judged_pair)}
+    kept = {name: value for name, value in saved.metrics.items() if name.rpartition(".")[0] in pairs}
+    return kept, saved.environment.get("ablation", saved.commit) if kept else ""
+
+
+def _share(trials: Sequence[dict[str, Any]], category: str) -> float:
+    up = [o for o in trials if o["lifted"] > 0]
+    return _mean([float(o["category"] == category) for o in up])
+
+
+def _median(values: Sequence[float]) -> float:
+    return median(values) if values else math.nan
+
+
+def _mean(values: Sequence[float]) -> float:
+    return fmean(values) if values else math.nan
+
+
+def run(options: Options, console: Console) -> Result:
+    """All attempts; writes ``options.out`` and, when asked, the docs."""
+    pairs = pairs_of()
+    attempts = options.trials or (1 if options.quick else ATTEMPTS)
+    calibrations = machines_of(options, attempts)
+    asked = (options.seed, pairs)  # more attempts go on from fewer
+    with checkpoint(options, asked, [options.profile], options.truth, SOURCES, RAW) as kept:
+        machines = pool.run(calibrated, calibrations, kept, options.workers, "calibrations", console)
+        jobs = jobs_of(options, pairs[:1] if options.quick else pairs, attempts, machines)
+        outcomes = machines | pool.run(attempt, jobs, kept, options.workers, "grasping attempts", console)
+        kept_metrics, since = published_ablation(options.docs, pairs[0]) if options.quick else ({}, "")
+        more = {"truth": options.truth, "judged": " poses, ".join(pairs[0])} | ({"ablation": since} if since else {})
+        result = judged(
+            "grasp-configs", FIGURES, kept_metrics | gather(outcomes, pairs[0]), profile=options.profile,
+            seed=options.seed, trials=len(jobs), more=more, paper=PAPER,
+        )  # fmt: skip
+        draw_chain(options.out / "chain.png", options.profile, options.truth, FIRST_SEED)
+        draw_table(options.out / "configurations.png", outcomes, ".".join(pairs[0]))
+        _tell_failures(outcomes, ".".join(pairs[0]), console)
+        tell(result, "Grasping logs in twelve configurations", INTRODUCTION, sections(since), options, console)
+        kept.publish()
+    return result
+
+
+def _tell_failures(outcomes: dict[str, dict[str, Any]], pair: str, console: Console) -> None:
+    for name, o in outcomes.items():
+        if name.startswith(f"{pair}/") and o["category"] == "failed":
+            console.print(f"{name}: {o['failure'] or o['reason']}", highlight=False, soft_wrap=True)

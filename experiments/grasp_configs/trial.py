@@ -1,0 +1,212 @@
+"""One grasping attempt of paper A IV-A: a fresh arrangement, see, plan, crane on the bus, lift, hold; physics judges.
+
+Controller, guard, CAN bytes and plant as in every lockstep run.  The logs are seen by the camera on the stick from
+where the crane rests, at the start and where the activity looks again, or as the plant knows them (poses ``true``).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+from autonomy.crane_job.activity import SETTLED_NS, Activity
+from autonomy.crane_job.phases import Phase
+from autonomy.grasp.cnn_planner import CnnPlanner
+from autonomy.grasp.direct import Planned
+from autonomy.grasp.network import WEIGHTS, GraspNet
+from autonomy.grasp.proposal import GraspProposal, Planner
+from autonomy.grasp.search import Search
+from autonomy.motion.arm import Arm
+from autonomy.motion.planners import Swiftest
+from autonomy.perception.logs import LogObservation
+from can_dbc.setpoint import StateReport
+from controller.config import Settings
+from controller.guard.__main__ import build as build_guard
+from experiments.common.individuals import believed
+from experiments.common.pool import Job
+from experiments.common.worlds import profile_named, wood_of
+from experiments.grasp_configs.outcome import Grip, category, lifted
+from experiments.grasp_configs.poses import LOOK_NS, POSES, Seen, Sight, misled
+from hil.lockstep import START_NS, Lockstep, Observer
+from hil.operator import Operator
+from machine.load import load_profile, profile_hash
+from sim.plant import Plant
+from sim.scene import LogSpec, configuration
+
+LIMIT_NS: Final = 60_000_000_000
+HELD_NS: Final = 2_000_000_000
+SEEDS_PER_ATTEMPT: Final = 16
+SEGMENTATION: Final = "logs_rgbd.safetensors"
+NETWORKS: Final = {"cnn": "grasp_cornell", "cnn_physical": "grasp_physical"}
+
+
+@dataclass(slots=True)
+class Attempt:
+    """The planner's seat in a lockstep run: autonomy's activity, shown what is seen from where it rests; notes what it
+    does.
+    """
+
+    activity: Activity
+    sight: Sight
+    seen: Seen = field(default_factory=Seen)
+    """The last look, ..."""
+    looks: int = 0
+    """... and how many there were."""
+    _q: tuple[float, ...] = ()
+    """Where the joints were last measured."""
+    _up_ns: int = 0
+    """Since when the lift is done."""
+    _looked_ns: int = 0
+    _rested_ns: int = 0
+    """Since when the crane rests above the logs."""
+
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+        """One turn (contract of ``hil.lockstep.Planner``): looks at the start until a grasp is chosen, and one at each
+        rest above it."""
+        activity = self.activity
+        self._q = self._q if report is None else report.position
+        data = activity.step(now_ns, report, self._looked(now_ns) if logs and self._q else ())
+        if self._up_ns == 0 and activity.phase is Phase.LIFT and activity.arrived:
+            self._up_ns = now_ns
+        return data
+
+    def _looked(self, now_ns: int) -> tuple[LogObservation, ...]:
+        phase = self.activity.phase
+        if phase <= Phase.LOOK:
+            wants = phase is Phase.LOOK or not self.seen.logs
+            if wants and now_ns >= self._looked_ns + LOOK_NS:
+                self._look(now_ns)
+            return self.seen.logs
+        rests = phase is Phase.ABOVE and self.activity.arrived
+        self._rested_ns = (self._rested_ns or now_ns) if rests else 0
+        if not rests or now_ns < self._rested_ns + SETTLED_NS:
+            return ()
+        self._rested_ns = now_ns + SETTLED_NS
+        self._look(now_ns)
+        return self.seen.logs
+
+    def _look(self, now_ns: int) -> None:
+        self.seen = self.sight.look(now_ns, self._q)
+        self.looks, self._looked_ns = self.looks + 1, now_ns
+
+    def over(self, now_ns: int) -> bool:
+        """Whether the grapple is up and has been held still for two seconds."""
+        return self._up_ns > 0 and now_ns - self._up_ns > HELD_NS
+
+
+@dataclass(slots=True)
+class Timed:
+    """A planner that notes its proposal and what it took."""
+
+    planner: Planner
+    proposal: GraspProposal | None = None
+    seconds: float = math.nan
+
+    def __call__(
+        self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float, stay: Collection[int] = ()
+    ) -> GraspProposal:
+        """See ``autonomy.grasp.proposal``."""
+        begun = time.process_time()
+        try:
+            self.proposal = self.planner(arm, logs, slew_rad, rot_rad, stay)
+        finally:
+            self.seconds = time.process_time() - begun
+        return self.proposal
+
+
+@cache
+def _network(name: str) -> GraspNet:
+    return GraspNet.shipped(WEIGHTS.with_name(f"{name}.safetensors"))
+
+
+def weights_of(poses: str, planner: str) -> bool:
+    """Whether the weights are there that a pair of the ablation needs."""
+    needed = [f"{NETWORKS[planner]}.safetensors"] if planner in NETWORKS else []
+    needed += [SEGMENTATION] if poses in ("ours", "faithful") else []
+    return all(WEIGHTS.with_name(name).exists() for name in needed)
+
+
+def planner_named(name: str) -> Planner:
+    """The planner of an ablation.
+
+    Raises:
+        WeightsRefused: the network's weights are missing or damaged.
+    """
+    if name == "search":
+        return Search()
+    return CnnPlanner(_network(NETWORKS[name]), by_rule=name == "cnn_physical")
+
+
+def attempt(job: Job) -> dict[str, Any]:
+    """Options: profile, truth, configuration, poses (of ``poses.POSES``), planner (search, cnn or cnn_physical), scene
+    (its seed, for the job's is that of the machine), text (of the calibrated profile; None: as shipped).
+    """
+    with believed(job.options["profile"], job.options.get("text")) as name:
+        return _attempt(job, name, job.options.get("scene", job.seed))
+
+
+def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
+    o = job.options
+    profile, number = load_profile(name), o["configuration"]
+    digest = profile_hash(profile)
+    scene = arranged(o["profile"], o["truth"], number, field)
+    plant = Plant(profile_named(o["profile"]), job.seed, o["truth"], scene=scene)
+    try:
+        before = plant.logs()
+        timed = Timed(planner_named(o["planner"]))
+        activity = Activity(profile, digest, chooser=Planned(timed), motions=Swiftest(direct=False))
+        seat = Attempt(activity, POSES[o["poses"]](plant, profile, field))
+        operator = Operator(digest, lambda *_: None)
+        settings = Settings(profile, digest, profile.rate_hz)
+        guard = build_guard(Path(name))
+        system = Lockstep(settings, guard, plant, seat, operator, Observer(None, []))
+        grip, closings = Grip(0.0, 0.0, 0.0), 0
+        phase = activity.phase
+        while not activity.failure and not operator.gave_up and not seat.over(system.now_ns):
+            system.advance()
+            if activity.phase is not phase:
+                phase = activity.phase
+                closings += phase is Phase.CLOSE
+                if phase is Phase.LIFT:
+                    grip = _grip(plant)
+            if system.now_ns > START_NS + LIMIT_NS:
+                break
+        ground = profile.workspace.ground_z_m
+        up = lifted(before, plant.logs(), ground) if seat.over(system.now_ns) else []
+        verdict = plant.judge()
+        up = [i for i in up if verdict.logs[i].left_ground or not verdict.logs[i].max_grip_n]
+        p, seen = timed.proposal, seat.seen
+        wrong = misled(before, seen.logs)
+        rise = [now.position_m[2] - was.position_m[2] for was, now in zip(before, plant.logs(), strict=True)]
+        return {
+            "configuration": number, "individual": o["truth"] == "sampled",
+            "category": category(number, before, up, grip, wrong), "lifted": len(up),
+            "misled": wrong, "looks": seat.looks, "closings": closings, "seen": len(seen.logs),
+            "see_ms": 1e3 * seen.seconds, "logs": len(before), "up": up,
+            "failure": activity.failure, "stops": operator.stops, "expected": list(p.logs) if p else [],
+            "probability": p.probability if p else math.nan, "reason": p.reason if p else "",
+            "plan_ms": 1e3 * timed.seconds, "grip": [grip.x_m, grip.y_m, grip.yaw_rad], "rise_m": rise,
+            "tong_rad": plant.tong_angle(), "asked": [p.x_m, p.y_m, p.yaw_rad] if p else [],
+            "seconds": (system.now_ns - START_NS) * 1e-9,
+        }  # fmt: skip
+    finally:
+        plant.close()
+
+
+def _grip(plant: Plant) -> Grip:
+    """Where the tongs closed."""
+    x, y, _ = plant.tip()
+    (_, turn) = plant.link_poses()["rotator"]
+    m = plant.world.client.getMatrixFromQuaternion(turn)
+    return Grip(x, y, math.atan2(m[3], m[0]))
+
+
+def arranged(profile: str, truth: str, number: int, seed: int) -> tuple[LogSpec, ...]:
+    """The logs of an attempt: random place, direction and sizes, and who lies where."""
+    wood = wood_of(profile, truth)
+    return configuration(number, profile_named(profile), wood, seed * SEEDS_PER_ATTEMPT + number)

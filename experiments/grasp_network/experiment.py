@@ -1,0 +1,152 @@
+"""The grasp-network experiment: count, cross-validate where the data are at hand, time, draw, write."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from rich.console import Console
+
+from autonomy.grasp.network import PAPER as NETWORK
+from autonomy.grasp.network import WEIGHTS, GraspNet, prepare
+from autonomy.networks.graph import parameter_count
+from autonomy.networks.weights import WeightsRefused, load
+from experiments.common import pool
+from experiments.common.pool import Job
+from experiments.common.registry import Options
+from experiments.common.report import tell
+from experiments.common.result import ROOT, Result, judged, rate
+from experiments.grasp_network import folds, latency
+from experiments.grasp_network.figures import FIGURES, PAPER, SECTIONS
+from experiments.grasp_network.pictures import draw
+from host.exits import Exit, Stopped
+
+ROUNDS: Final = 80
+QUICK_ROUNDS: Final = 15
+CORNELL: Final = "cornell_rgbd_01"
+
+
+def run(options: Options, console: Console) -> Result:
+    """Measure everything; writes ``options.out`` and, when asked, the docs.
+
+    With ``options.data`` the shipped weights are judged on that folder instead of a cross-validation.
+
+    Raises:
+        Stopped: no torch, no usable weights, or a folder without samples.
+    """
+    try:
+        import torch
+    except ImportError:
+        raise Stopped(
+            Exit.CONFIGURATION, "the experiment compares with torch: pip install 'timberhand[train]'"
+        ) from None
+    from training.grasp.cornell import DataRefused
+
+    metrics = {"parameters": float(parameter_count(NETWORK))}
+    try:
+        arrays, facts = load(WEIGHTS, NETWORK)
+        skipped, pictures = _cornell(options, facts, arrays, metrics, console)
+    except (WeightsRefused, DataRefused) as error:
+        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    scenes = [picture for _, picture in latency.log_scenes(options.seed)]
+    with console.status("timing"):
+        paths = latency.ways(arrays)
+        times = latency.times_ms(paths, scenes, QUICK_ROUNDS if options.quick else ROUNDS)
+        metrics |= latency.metrics(times, latency.agreement(paths, [*scenes, *pictures]))
+    metrics["prepare_ms"] = _prepare_ms(options.seed)
+    result = judged(
+        "grasp-network", FIGURES, metrics, profile="", seed=options.seed, trials=len(pictures),
+        more={"torch": torch.__version__, "skipped": skipped}, paper=PAPER,
+    )  # fmt: skip
+    options.out.mkdir(parents=True, exist_ok=True)
+    draw(metrics, times, GraspNet(arrays), options.seed, options.out)
+    tell(result, "The grasp network, measured", INTRODUCTION, SECTIONS, options, console, _setting(result))
+    (options.out / "folds.jsonl").unlink(missing_ok=True)
+    if skipped:
+        console.print(f"[yellow]skipped:[/yellow] {skipped}", highlight=False)
+    return result
+
+
+def _cornell(
+    options: Options, facts: dict[str, str], arrays: dict[str, Any], metrics: dict[str, float], console: Console
+) -> tuple[str, list[np.ndarray]]:
+    """What was skipped and why, and the pictures at hand as the network sees them; adds to ``metrics``."""
+    from training.grasp.cornell import load as load_samples
+    from training.grasp.views import centre, cut
+    from training.grasp.weights import on_samples
+
+    folder = options.data or data_root() / CORNELL
+    if options.data is None and not folder.is_dir():
+        return f"both cross-validations (no Cornell samples under {CORNELL} in TIMBERHAND_DATA)", []
+    samples = load_samples(folder)
+    pictures = [prepare(cut(s.depth_m, centre(s.depth_m)))[None, None] for s in samples[:: 8 if options.quick else 1]]
+    if options.data is not None:
+        found = on_samples(GraspNet(arrays), samples, facts)
+        metrics |= rate("data_right", sum(f["right"] for f in found), len(found))
+        metrics |= rate("data_own_size", sum(f["own_size"] for f in found), len(found))
+        metrics["data_trained_on"] = float(sum(f["trained_on"] for f in found))
+        return "both cross-validations (--data judges the shipped weights)", pictures
+    if options.quick:
+        return "both cross-validations (--quick)", pictures
+    metrics |= cross_validated(options, folder, samples, console)
+    return "", pictures
+
+
+def cross_validated(options: Options, folder: Path, samples: Any, console: Console) -> dict[str, float]:
+    """Both cross-validations; finished folds are kept until the whole run is done."""
+    from training.grasp.train import EPOCHS
+
+    plain = {"data": str(folder), "epochs": EPOCHS}
+    jobs = [Job(f"{kind}-{i}", kind, options.seed, {**plain, "fold": i}) for kind in folds.KINDS
+            for i in range(folds.FOLDS)]  # fmt: skip
+    checkpoint = pool.Checkpoint(options.out / "folds.jsonl", folds.identity(samples, options.seed, EPOCHS))
+    with closing(checkpoint):
+        return gather(pool.run(folds.perform, jobs, checkpoint, options.workers, "folds", console))
+
+
+def gather(outcomes: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
+    """The rates of both cross-validations."""
+    metrics: dict[str, float] = {}
+    for kind, name in zip(folds.KINDS, ("cornell_grouped", "cornell_paper_split"), strict=True):
+        trials = [t for job, found in outcomes.items() if job.startswith(f"{kind}-") for t in found]
+        metrics |= rate(name, sum(t["right"] for t in trials), len(trials))
+        metrics |= rate(f"{name}_own_size", sum(t["own_size"] for t in trials), len(trials))
+    return metrics
+
+
+def data_root() -> Path:
+    """Where the third-party data lie: TIMBERHAND_DATA, else beside the checkout."""
+    return Path(os.environ.get("TIMBERHAND_DATA", ROOT.parent / "shared" / "data"))
+
+
+def _prepare_ms(seed: int) -> float:
+    found = []
+    for depth, _ in latency.log_scenes(seed):
+        start_ns = time.process_time_ns()
+        prepare(depth)
+        found.append((time.process_time_ns() - start_ns) / 1e6)
+    return float(np.median(found))
+
+
+def _setting(result: Result) -> str:
+    from training.grasp.train import BATCH, COPIES, EPOCHS, LEARNING_RATE
+
+    e = result.environment
+    return (
+        f"Seed {result.seed}, commit `{result.commit}`. Training of every fold: {EPOCHS} epochs of {COPIES} views a "
+        f"sample, batches of {BATCH}, AdamW with {LEARNING_RATE} and a cosine; one schedule, set before the folds were "
+        "judged; preprocessing and views were chosen by earlier looks at some of these samples, so both rates may "
+        f"be a little too good. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python {e['python']}, "
+        f"torch {e['torch']}."
+    )
+
+
+INTRODUCTION: Final = (
+    "Paper A plans its grasps with a small network. This page says whether ours is that network, what it has learnt "
+    "from the 80 Cornell samples at hand, and how fast it runs. `timberhand experiment grasp-network --docs docs` "
+    "measures everything and writes the page; no number is typed."
+)

@@ -1,0 +1,156 @@
+"""The joint-tracking experiment: which trials, run on all cores, judged, drawn and written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import product
+from typing import Any, Final
+
+from rich.console import Console
+
+from experiments.common import pool
+from experiments.common.pool import Job
+from experiments.common.registry import Options
+from experiments.common.report import Section, tell
+from experiments.common.result import Figure, Result, judged
+from experiments.common.trials import check_truth, checkpoint, individuals
+from experiments.common.worlds import profile_named
+from experiments.joint_tracking.figures import INTRODUCTION, LAWS, MACHINES, sections
+from experiments.joint_tracking.individuals import CORNERS
+from experiments.joint_tracking.pictures import draw
+from experiments.joint_tracking.trial import perform
+
+TRIALS: Final = 6
+QUICK_TRIALS: Final = 1
+FIRST_SEED: Final = 1000
+"""Judged on machines that nobody looked at while the laws were tuned."""
+SEEDS_PER_RUN: Final = 1000
+STATES: Final = {"calibrated": True, "shipped": False}
+CALIBRATED: Final = ("cycle", "steps", "ramps", "pick_up", "pump", "dip", "wide", "corner")
+SHIPPED: Final = ("cycle", "wide", "corner")
+QUICK_CORNERS: Final = (7,)
+TRACED: Final = "aoro"
+COUNTED: Final = ("diverged", "alarms")
+WORST: Final = ("rest_m", "settle_s", "wobble_m", "tip_peak_m")
+
+
+def machines(options: Options) -> dict[str, str]:
+    """Profiles by short name; a profile of one's own takes the place of its kind."""
+    kind = "palms" if profile_named(options.profile).carrier is None else "aoro"
+    return {**MACHINES, kind: options.profile}
+
+
+def plan(options: Options, trials: int) -> list[Job]:
+    """Every job of the run."""
+    first = FIRST_SEED + options.seed * SEEDS_PER_RUN
+    corners = QUICK_CORNERS if options.quick else range(len(CORNERS))
+    jobs = []
+    for short, profile in machines(options).items():
+        # Without a truth of one's own every trial is an individual: one machine alone says little about a law.
+        same = profile == options.profile and options.truth not in ("nominal", "sampled")
+        what = {"profile": profile, "truth": options.truth if same else "sampled"}
+        for (state, calibrated), law in product(STATES.items(), LAWS):
+            kinds = CALIBRATED if calibrated else SHIPPED
+            if options.quick and law != own_law(profile):
+                kinds = ("cycle",) if calibrated else ()
+            for kind in kinds:
+                for i in corners if kind == "corner" else range(trials):
+                    more: dict[str, Any] = {"corner": i} if kind == "corner" else {}
+                    if short == TRACED and kind == "cycle" and calibrated and i == 0:
+                        more["trace"] = True
+                    more |= {**what, "law": law, "calibrated": calibrated}
+                    jobs.append(Job(f"{short}/{law}/{state}/{kind}/{i}", kind, first + i, more))
+        for i in range(trials):
+            more = {"trace": True} if short == TRACED and i == 0 else {}
+            more |= {**what, "law": own_law(profile), "calibrated": True}
+            jobs.append(Job(f"{short}/stop/{i}", "stop", first + i, more))
+    return jobs
+
+
+def own_law(profile: str) -> str:
+    """The law of a profile's slew, which stands for all."""
+    return profile_named(profile).joints["slew"].law.kind
+
+
+def run(options: Options, console: Console) -> Result:
+    """Measure everything; writes ``options.out`` and, when asked, the docs.
+
+    Raises:
+        Stopped: the truth file cannot be used.
+    """
+    check_truth(options.profile, options.truth)
+    trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
+    jobs = plan(options, trials)
+    profiles = machines(options)
+    with checkpoint(options, jobs, profiles.values(), options.truth, ["controller"]) as kept:
+        outcomes = pool.run(perform, jobs, kept, options.workers, "joint-tracking trials", console)
+        metrics = gather(outcomes)
+        shown = sections_of(profiles, metrics)
+        result = judged(
+            "joint-tracking", [f for section in shown for f in section.figures], metrics,
+            profile=", ".join(profiles.values()), seed=options.seed, trials=trials,
+            more={"truth": individuals(options.truth)},
+        )  # fmt: skip
+        draw(metrics, outcomes, profiles, options.out)
+        tell(result, "Joint laws, compared", INTRODUCTION, shown, options, console)
+    return result
+
+
+def sections_of(profiles: Mapping[str, str], metrics: Mapping[str, float]) -> tuple[Section, ...]:
+    """The page's sections for profiles by short name."""
+    return sections({short: own_law(profile) for short, profile in profiles.items()}, metrics)
+
+
+def figures(metrics: Mapping[str, float]) -> list[Figure]:
+    """Those of the shipped machines."""
+    return [f for section in sections_of(MACHINES, metrics) for f in section.figures]
+
+
+def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
+    """Means over the trials of each kind: machine, law, state and scenario are in the name.
+
+    The worst is kept beside the mean where it matters.  Over all trials of a law: its valves shut and the motions that
+    did not settle in each state, how many machines of twice the spread it had, and how many of them diverged.
+    """
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for name, outcome in outcomes.items():
+        groups.setdefault("_".join(name.split("/")[:-1]), []).append(outcome)
+    metrics: dict[str, float] = {}
+    for group, trials in groups.items():
+        for key in trials[0]:
+            if key == "trace":
+                continue
+            values = [v for t in trials for v in (t[key] if isinstance(t[key], list) else [t[key]])]
+            metrics[f"{group}_{key}"] = float(sum(values)) if key in COUNTED else sum(values) / len(values)
+            if key in WORST:
+                metrics[f"{group}_{key}_max"] = float(max(values))
+    return {k: v for k, v in (metrics | _over_all(outcomes)).items() if not math.isnan(v)}
+
+
+def _over_all(outcomes: Mapping[str, Any]) -> dict[str, float]:
+    shares: dict[str, list[float]] = {}
+    found: dict[str, float] = {}
+    for name, outcome in outcomes.items():
+        short, law, *rest = name.split("/")
+        for key in ("shut_share", "unsettled_share"):
+            if key in outcome:
+                known = shares.setdefault(f"{short}_{law}_{rest[0]}_{key}", [])
+                known += [] if math.isnan(outcome[key]) else [outcome[key]]
+        if rest[1:2] in (["wide"], ["corner"]):
+            for key, value in (("machines", 1.0), ("diverged", float(outcome["diverged"]))):
+                found[f"{short}_{law}_twice_{key}"] = found.get(f"{short}_{law}_twice_{key}", 0.0) + value
+    for name, outcome in outcomes.items():
+        short, kind, *_ = name.split("/")
+        if kind == "stop":
+            for key in outcome:
+                if key.endswith("_damped_ring_m"):
+                    plain = outcome[key.replace("damped", "plain")]
+                    for how, values in (("damped", outcome[key]), ("plain", plain)):
+                        ring = f"{short}_stop_{how}"
+                        found[ring] = found.get(ring, 0.0) + sum(values)
+    for short in {name.split("/")[0] for name in outcomes}:
+        if plain := found.pop(f"{short}_stop_plain", 0.0):
+            found[f"{short}_stop_damped_over_plain"] = found.pop(f"{short}_stop_damped") / plain
+    # Where nothing settles at all, no valve is shut after settling: that must not pass for lack of a figure.
+    return found | {name: sum(values) / len(values) if values else 0.0 for name, values in shares.items()}

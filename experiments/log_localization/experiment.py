@@ -1,0 +1,69 @@
+"""The log-localization experiment: paper B's approaches and single frames over angle and range; judged, drawn, told."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rich.console import Console
+
+from autonomy.networks.weights import SHIPPED
+from experiments.common import pool
+from experiments.common.pool import Job
+from experiments.common.registry import Options
+from experiments.common.report import tell
+from experiments.common.result import Result, judged
+from experiments.common.trials import check_truth, checkpoint, individuals
+from experiments.common.worlds import carrier_profile, profile_named
+from experiments.log_localization.figures import DEGREES, FIGURES, INTRODUCTION, PAPER, gather, sections
+from experiments.log_localization.pictures import draw, overlay
+from experiments.log_localization.trial import SEGMENTERS, perform
+from host.exits import Exit, Stopped
+
+TRIALS: Final = 12
+QUICK_TRIALS: Final = 1
+FIRST_SEED: Final = 30_000
+"""Judged on sites that nobody looked at while perception was made."""
+SEEDS_PER_RUN: Final = 1000
+ANGLES: Final = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)
+QUICK_ANGLES: Final = (0.0, 90.0)
+CURVE_SHARE: Final = 2  # of so many trials one is a curve too
+
+
+def run(options: Options, console: Console) -> Result:
+    """Measure everything; writes ``options.out`` and, when asked, the docs.
+
+    Raises:
+        Stopped: the truth file cannot be used, or the machine has no front camera.
+    """
+    name, truth = carrier_profile(options.profile), individuals(options.truth)
+    profile = profile_named(name)
+    if "front" not in profile.cameras:
+        raise Stopped(Exit.CONFIGURATION, f"{name} has no camera named front; add [cameras.front] to the profile")
+    check_truth(name, truth)
+    masks = "network" if (SHIPPED / "logs_rgbd.safetensors").exists() else "true"
+    trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
+    jobs = plan(options, name, truth, trials, masks)
+    with checkpoint(options, jobs, [name], truth, ["autonomy"]) as kept:
+        outcomes = pool.run(perform, jobs, kept, options.workers, "log-localization trials", console)
+        result = judged(
+            "log-localization", FIGURES, gather(outcomes), profile=name, seed=options.seed, trials=trials,
+            more={"truth": truth, "masks": masks}, paper=PAPER,
+        )  # fmt: skip
+        draw(outcomes, options.out)
+        overlay(profile, truth, jobs[0].seed, SEGMENTERS[masks], options.out / "overlay.png")
+        tell(result, "Where is the log?", INTRODUCTION, sections(masks), options, console)
+    return result
+
+
+def plan(options: Options, profile: str, truth: str, trials: int, masks: str) -> list[Job]:
+    """Every job of the run."""
+    first = FIRST_SEED + options.seed * SEEDS_PER_RUN
+    what = {"profile": profile, "truth": truth, "masks": masks}
+    jobs = [
+        Job(f"approach/{d}/{i}", "approach", first + i, what | {"degrees": float(d)})
+        for i in range(trials)
+        for d in DEGREES
+    ]
+    curves = range(max(1, trials // CURVE_SHARE))
+    angles = QUICK_ANGLES if options.quick else ANGLES
+    return jobs + [Job(f"curve/{a:g}/{i}", "curve", first + i, what | {"degrees": a}) for i in curves for a in angles]

@@ -1,0 +1,82 @@
+"""The navigation experiment: two ways, three grounds, six starts, two laps; judged, drawn, told."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from rich.console import Console
+
+from experiments.common import pool
+from experiments.common.pool import Job
+from experiments.common.registry import Options
+from experiments.common.report import tell
+from experiments.common.result import Result, judged
+from experiments.common.trials import check_truth, checkpoint, individuals
+from experiments.common.worlds import carrier_profile, profile_named
+from experiments.navigation.figures import FIGURES, GROUNDS, INTRODUCTION, LAP, PAPER, SECTIONS, gather
+from experiments.navigation.pictures import draw
+from experiments.navigation.trial import Pose, perform
+
+TRIALS: Final = 1
+"""Individual machines; each makes 36 drives of five minutes."""
+LAPS: Final = 2
+CORNERS: Final = ((15.0, -10.0), (15.0, 10.0), (-15.0, 10.0), (-15.0, -10.0))
+"""Waypoints in the field [m east, north]: 5 m from its edges, in the order in which they are driven at."""
+STARTS: Final = (
+    (-12.0, -10.0, 0.0),
+    (-4.0, -14.0, 20.0),
+    (-17.0, -1.0, -70.0),
+    (0.0, 1.0, -20.0),
+    (-13.0, -7.0, 95.0),
+    (-11.0, -3.0, 180.0),
+)
+"""Front axle [m east, north] and direction [deg from east, + left]."""
+QUICK_START: Final = (4.0, -10.0, 0.0)
+WAYS: Final = ("faithful", "ours")
+FIRST_SEED: Final = 7000
+SEEDS_PER_RUN: Final = 100
+
+
+def run(options: Options, console: Console) -> Result:
+    """Measure everything; writes ``options.out`` and, when asked, the docs.
+
+    Raises:
+        Stopped: the truth file cannot be used.
+    """
+    name, truth = carrier_profile(options.profile), individuals(options.truth)
+    carrier = profile_named(name).carrier
+    assert carrier is not None
+    check_truth(name, truth)
+    trials = 1 if options.quick else options.trials or TRIALS
+    points = list(CORNERS[:2]) if options.quick else list(CORNERS) * LAPS
+    jobs = plan(options, name, truth, trials, points)
+    with checkpoint(options, jobs, [name], truth, ["autonomy", "controller"]) as kept:
+        outcomes = pool.run(perform, jobs, kept, options.workers, "navigation drives", console)
+        result = judged(
+            "navigation", FIGURES, gather(outcomes, points, carrier, LAP), profile=name, seed=options.seed,
+            trials=trials, more={"truth": truth}, paper=PAPER,
+        )  # fmt: skip
+        draw(outcomes, points, carrier, options.out)
+        tell(result, "Navigation", INTRODUCTION, SECTIONS, options, console)
+    return result
+
+
+def plan(options: Options, profile: str, truth: str, trials: int, points: list[tuple[float, float]]) -> list[Job]:
+    """Every drive, named way/ground/trial/start.  Both ways and all grounds get the same individuals."""
+    first = FIRST_SEED + options.seed * SEEDS_PER_RUN
+    grounds = ("mud",) if options.quick else tuple(GROUNDS)
+    starts = (QUICK_START,) if options.quick else STARTS
+    what = {"profile": profile, "truth": truth, "points": [list(p) for p in points]}
+    return [
+        Job(f"{way}/{ground}/{trial}/{k}", way, first + trial,
+            what | {"way": way, "terrain": ground, "pose": list(_pose(start))})
+        for trial in range(trials)
+        for ground in grounds
+        for k, start in enumerate(starts)
+        for way in WAYS
+    ]  # fmt: skip
+
+
+def _pose(start: tuple[float, float, float]) -> Pose:
+    return start[0], start[1], math.radians(start[2])

@@ -1,0 +1,155 @@
+"""One drive of the machine on the bus, in lockstep: from a start, along the waypoints, by one of the two ways.
+
+The planner is autonomy's own: localizer, navigator and the way under it, fed with the controller's reports.  What is
+kept is the truth of the plant beside what the machine knew, ten times a second.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+from autonomy.localization.estimate import Location, Status
+from autonomy.localization.localizer import Localizer
+from autonomy.localization.plane import Plane
+from autonomy.navigation.along import Along
+from autonomy.navigation.join import joined
+from autonomy.navigation.navigator import Navigator, Phase
+from autonomy.navigation.waypoints import PaperB, Waypoint
+from autonomy.perception.logs import LogObservation
+from can_dbc.setpoint import StateReport, VehicleReport, encode
+from controller.config import Settings
+from controller.guard.__main__ import build as build_guard
+from controller.guard.__main__ import profile_path
+from experiments.common.pool import Job
+from experiments.common.worlds import profile_named
+from hil.lockstep import START_NS, Lockstep, Observer
+from hil.operator import Operator
+from machine.load import profile_hash
+from machine.modes import Mode
+from machine.profile import Profile
+from sim.carrier import PARKED
+from sim.plant import Plant
+
+Pose = tuple[float, float, float]
+LIMIT_NS: Final = 1_200_000_000_000
+SETTLE_STEPS: Final = 800
+REST_NS: Final = 1_000_000_000
+KEEP: Final = 2
+"""Every second report is kept."""
+COLUMNS: Final = (
+    "t_s", "x_m", "y_m", "yaw_rad", "bend_rad", "speed_m_s", "seen_x_m", "seen_y_m", "seen_yaw_rad", "sigma_m", "s_m",
+    "off_m", "goal", "wanted_rad", "roll_rad",
+)  # fmt: skip
+
+
+class Planner:
+    """Waits until the machine is armed and located, drives, and keeps what happens."""
+
+    def __init__(self, profile: Profile, plane: Plane, points: Sequence[tuple[float, float]], way: str) -> None:
+        assert profile.carrier is not None
+        self.rows: list[list[float]] = []
+        self.navigator = Navigator(profile.carrier, profile_hash(profile))
+        self.localizer = Localizer(profile.carrier, plane)
+        self.way: Along | PaperB | None = None
+        self.location: Location | None = None
+        self._carrier, self._plane, self._points, self._kind = profile.carrier, plane, points, way
+        self.begin: Pose = (math.nan,) * 3
+        self._fresh: VehicleReport | None = None
+        self._armed = False
+        self._count = 0
+        self.truth: Any = None
+        """The plant's carrier, for the record alone."""
+
+    def heard(self, report: VehicleReport) -> None:
+        """A report of the vehicle."""
+        self._fresh = report
+
+    def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
+        """The setpoint to send now."""
+        vehicle, self._fresh = self._fresh, None
+        if report is not None:
+            self._armed = report.mode in (Mode.ARMED, Mode.ACTIVE)
+        if vehicle is None:
+            return None
+        self.location = location = self.localizer.step(vehicle)
+        if self.way is None and location.status is Status.TRACKING and self._armed:
+            self.way = self._begin(location)
+            self.navigator.drive(self.way)
+        setpoint = self.navigator.step(now_ns, vehicle, location)
+        self._keep(now_ns, location)
+        return None if setpoint is None else encode(setpoint)
+
+    @property
+    def over(self) -> bool:
+        """Whether the drive has ended one way or another."""
+        return self.navigator.phase in (Phase.ARRIVED, Phase.STOPPED)
+
+    def _begin(self, location: Location) -> Along | PaperB:
+        here = (location.x_m, location.y_m)
+        self.begin = (*here, location.yaw_rad)
+        if self._kind == "faithful":
+            places = [self._plane.geodetic(*point)[:2] for point in self._points]
+            return PaperB(self._carrier, [Waypoint(*place) for place in places])
+        return Along(self._carrier, joined(here, location.yaw_rad, self._points, self._carrier))
+
+    def _keep(self, now_ns: int, location: Location) -> None:
+        self._count += 1
+        if self.way is None or self._count % KEEP:
+            return
+        c = self.truth
+        x, y, _ = c.front_axle()
+        steer = self.way.steer if isinstance(self.way, Along) else None
+        goal = self.way.number if isinstance(self.way, PaperB) else -1
+        own = (steer.s_m, steer.off_m) if steer else (math.nan, math.nan)
+        wanted = steer.articulation_rad if steer else math.nan
+        self.rows.append([
+            (now_ns - START_NS) * 1e-9, x, y, c.heading_rad, c.articulation_rad, c.speed_m_s, location.x_m,
+            location.y_m, location.yaw_rad, location.sigma_m if location.usable else math.nan, *own, goal, wanted,
+            c.roll_rad,
+        ])  # fmt: skip
+
+
+def perform(job: Job) -> dict[str, Any]:
+    """One drive; ``options``: profile, truth, terrain, way, pose (x, y, yaw of the front axle), points."""
+    o = job.options
+    profile = profile_named(o["profile"])
+    carrier = profile.carrier
+    assert carrier is not None
+    settings = Settings(profile, profile_hash(profile), profile.rate_hz)
+    plant = Plant(profile, job.seed, o["truth"], scene=(), terrain=o["terrain"])
+    try:
+        stand(plant, o["pose"])
+        plane = Plane(carrier.site_lat_deg, carrier.site_lon_deg, o.get("altitude_m", 0.0))
+        planner = Planner(profile, plane, [(x, y) for x, y in o["points"]], o["way"])
+        planner.truth = plant.world.carrier
+        operator = Operator(profile_hash(profile), lambda *_: None)
+        observer = Observer(None, [], [planner.heard])
+        system = Lockstep(settings, build_guard(profile_path(o["profile"])), plant, planner, operator, observer)
+        while not planner.over and not operator.gave_up and system.now_ns < START_NS + LIMIT_NS:
+            system.advance()
+        ended_ns, phase = system.now_ns, planner.navigator.phase
+        while system.now_ns < ended_ns + REST_NS:
+            system.advance()
+        at = plant.world.carrier.front_axle()
+        return {
+            "rows": [[round(v, 5) if math.isfinite(v) else None for v in row] for row in planner.rows],
+            "arrived": phase is Phase.ARRIVED, "reason": planner.navigator.reason, "stops": operator.stops,
+            "begin": list(planner.begin), "rest_m": [at[0], at[1]], "rejected": planner.localizer.rejected,
+            "seconds": (ended_ns - START_NS) * 1e-9,
+        }  # fmt: skip
+    finally:
+        plant.close()
+
+
+def stand(plant: Plant, pose: Pose) -> None:
+    """The machine at rest with its front axle at a pose of the world."""
+    world, carrier = plant.world, plant.profile.carrier
+    assert world.carrier is not None and carrier is not None
+    x, y, yaw = pose
+    lf = carrier.front_axle_m
+    world.carrier.place(x - lf * math.cos(yaw), y - lf * math.sin(yaw), yaw, carrier.arm_transport_m)
+    neutral = [0.0] * len(world.functions)
+    for _ in range(SETTLE_STEPS):
+        world.step(neutral, PARKED)

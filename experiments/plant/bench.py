@@ -1,0 +1,240 @@
+"""How fast the plant is: real-time factors, cost over the number of logs, milliseconds of a camera picture.
+
+Every stretch of simulated time is timed by the wall and by the process's own processor time, with a fixed piece of
+Python work timed before it.  The figure is the median over the stretches; ``*_per_reference`` is its cost as a ratio
+to that work.  The host is called noisy when it took the processor away or the fixed work itself took unequal time.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import time
+from dataclasses import dataclass, field
+from itertools import islice, product
+from statistics import median
+from typing import Any, Final
+
+from rich.console import Console
+
+from experiments.common.result import Figure
+from experiments.common.worlds import carrier_profile, opened, profile_named
+from experiments.plant.busworld import BusWorld
+from experiments.plant.driver import Driver
+from experiments.plant.trial import over_stakes_m, take, unload
+from machine.kinematics import Unreachable
+from sim.carrier import Drive
+from sim.plant import Plant
+from sim.scene import LogSpec
+from sim.world import STEP_S
+
+LOG_COUNTS: Final = (1, 12, 50, 200)
+PICTURE_LOGS: Final = 12
+PER_SECOND: Final = round(1.0 / STEP_S)
+STOLEN: Final = 0.05  # share of the wall time that the process did not run
+UNEQUAL: Final = 0.20  # spread of the fixed work, (p90 - median) / median
+FIGURES: Final = (
+    Figure("rtf_crane12", "Real-time factor, crane at work among 12 logs, no camera", "x",
+           "Physics, hydraulics and judge-free yard of the fixed crane while it drives its functions among 12 logs.",
+           least=5.0, clocked=True),
+    Figure("rtf_mission", "Real-time factor, forwarder: driving, then crane work, all CAN nodes", "x",
+           "The whole plant behind both buses: 20 s of driving past a row of logs, then a grasp into the bunk.",
+           least=3.0, clocked=True),
+    Figure("camera608_ms", "Camera picture 608 x 608 with depth, 12 logs in the yard", "ms",
+           "One frame of the emulated stereo camera: colour, depth and its errors.", most=12.0, clocked=True),
+)  # fmt: skip
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Collects timed stretches of one workload, and the fixed work beside them."""
+
+    wall_s: list[float] = field(default_factory=list)
+    processor_s: list[float] = field(default_factory=list)
+    reference_s: list[float] = field(default_factory=list)
+    _wall: float = 0.0
+    _processor: float = 0.0
+
+    def begin(self) -> None:
+        """Do the fixed work, then start a stretch."""
+        self.reference_s.append(_fixed_work_s())
+        self._wall, self._processor = time.perf_counter(), time.process_time()
+
+    def end(self) -> None:
+        """End the stretch."""
+        self.wall_s.append(time.perf_counter() - self._wall)
+        self.processor_s.append(time.process_time() - self._processor)
+
+    @property
+    def stolen(self) -> float:
+        """Share of the wall time in which the process did not run."""
+        return max(0.0, 1.0 - sum(self.processor_s) / sum(self.wall_s))
+
+    @property
+    def unequal(self) -> float:
+        """Spread of the fixed work."""
+        ordered = sorted(self.reference_s)
+        return ordered[9 * (len(ordered) - 1) // 10] / median(ordered) - 1.0
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the host was too busy for a verdict."""
+        return self.stolen > STOLEN or self.unequal > UNEQUAL
+
+
+def _fixed_work_s() -> float:
+    start = time.perf_counter()
+    total = 0.0
+    for i in range(1, 60_001):
+        total += math.sqrt(i) / i
+    return time.perf_counter() - start + 0.0 * total
+
+
+def measure(profile: str, truth: str, quick: bool, console: Console) -> tuple[dict[str, float], bool, dict[str, Any]]:
+    """Metrics, whether the host was noisy, and traces for the plots."""
+    watches: dict[str, Stopwatch] = {}
+    metrics: dict[str, float] = {}
+    cost: dict[str, float] = {}
+    gc.collect()
+    stretches = 4 if quick else 24
+    with console.status("timing the plant") as status:
+        status.update("timing: crane among 12 logs")
+        watches["rtf_crane12"] = _crane(profile, truth, stretches)
+        status.update("timing: forwarder, driving and loading, all nodes")
+        watches["rtf_mission"] = _mission(carrier_profile(profile), truth, quick)
+        for count in LOG_COUNTS:
+            status.update(f"timing: {count} logs")
+            watch = _growth(profile, truth, count, 2 if quick else 6)
+            cost[str(count)] = 1e3 * median(watch.wall_s) / (PER_SECOND // 2)
+            metrics[f"step_ms_{count}_logs"] = cost[str(count)]
+        status.update("timing: camera")
+        camera = watches["camera608_ms"] = _camera(profile, truth, 6 if quick else 30)
+    for name, watch in watches.items():
+        reference = median(watch.reference_s)
+        if watch is camera:
+            metrics[name] = 1e3 * median(watch.wall_s)
+            metrics["camera608_processor_ms"] = 1e3 * median(watch.processor_s)
+            metrics["camera608_per_reference"] = median(watch.wall_s) / reference
+            continue
+        metrics[name] = 1.0 / median(watch.wall_s)
+        metrics[f"{name}_processor"] = 1.0 / median(watch.processor_s)
+        metrics[f"{name}_per_reference"] = median(watch.wall_s) / reference
+    metrics["host_stolen"] = max(w.stolen for w in watches.values())
+    metrics["host_unequal"] = max(w.unequal for w in watches.values())
+    return metrics, any(w.noisy for w in watches.values()), {"step_ms": cost}
+
+
+def rows_of_logs(count: int, x_m: float, y_m: float) -> tuple[LogSpec, ...]:
+    """Logs side by side on the ground from a corner away from the machine, ten in a row."""
+    places = ((x_m - 3.0 * column, y_m - 0.5 * row) for row, column in product(range(count), range(10)))
+    return tuple(LogSpec(x, y, 0.0, 2.6, 0.2, 600.0) for x, y in islice(places, count))
+
+
+def heap(count: int, x_m: float, y_m: float) -> tuple[LogSpec, ...]:
+    """Logs let go in layers of four, one above the other: a heap with many contacts."""
+    return tuple(
+        LogSpec(x_m + 0.30 * (i % 4 - 1.5), y_m, math.pi / 2, 2.6, 0.2, 600.0, z_m=0.26 * (i // 4))
+        for i in range(count)
+    )
+
+
+def _crane(profile: str, truth: str, stretches: int) -> Stopwatch:
+    """Stretches of one second of the crane moving all its functions, 12 logs in a heap."""
+    p = profile_named(profile)
+    with opened(profile, truth, 1, heap(12, *p.workspace.pick_center_m)) as world:
+        driver, watch = Driver(world), Stopwatch()
+        start = dict(driver.reference)
+        _second(driver, start, 0)
+        for i in range(1, stretches + 1):
+            watch.begin()
+            _second(driver, start, i)
+            watch.end()
+    return watch
+
+
+def _second(driver: Driver, start: dict[str, float], number: int) -> None:
+    """A second of slow sines on every function."""
+    spans = {"slew": 0.30, "lift": 0.08, "tilt": 0.15, "ext": 0.15, "rot": 0.8}
+    n = PER_SECOND
+    driver.grapple = 0.5 if number % 6 < 3 else -0.5
+    for i in range(n):
+        phase = 2.0 * math.pi * (number + i / n) / 6.0
+        driver.reference.update({name: start[name] + span * math.sin(phase) for name, span in spans.items()})
+        driver.tick({name: span * math.cos(phase) * 2.0 * math.pi / 6.0 for name, span in spans.items()})
+
+
+def _mission(profile: str, truth: str, quick: bool) -> Stopwatch:
+    """Drive along a row of 12 logs with gentle bends, stop, load the nearest log into the bunk."""
+    plant = Plant(profile_named(profile), seed=1, truth=truth, logs=PICTURE_LOGS, scene="row")
+    try:
+        bus, watch = BusWorld(plant), Stopwatch()
+        spec = plant.profile.carrier
+        assert spec is not None
+        neutral = [0.0] * len(bus.functions)
+        steps = 0
+
+        def lap() -> None:
+            nonlocal steps
+            steps += 1
+            if steps % PER_SECOND == 0:
+                watch.end()
+                watch.begin()
+
+        watch.begin()
+        for i in range((3 if quick else 20) * PER_SECOND):
+            rate = 0.05 * math.cos(2.0 * math.pi * i / PER_SECOND / 8.0)
+            bus.step(neutral, Drive(spec.cruise_speed_m_s), rate)
+            lap()
+        _load_one(bus, Driver(bus, lap), quick)
+        return watch
+    finally:
+        plant.close()
+
+
+def _load_one(bus: BusWorld, driver: Driver, quick: bool) -> None:
+    """Grasp the nearest log that the crane reaches and lay it into the bunk."""
+    driver.wait(1.0)
+    centre, logs = bus.base_pose()[0], bus.yard.states()
+    for i in sorted(range(len(logs)), key=lambda i: math.dist(logs[i].position_m, centre)):
+        try:
+            take(bus, driver, lift_to_m=None if quick else over_stakes_m(bus), logs=[logs[i]])
+        except Unreachable:
+            continue
+        if not quick:
+            unload(bus, driver, [bus.yard.states()[i]])
+        return
+    raise RuntimeError("the crane reaches no log of the row after the drive; the bench needs another route")
+
+
+def _growth(profile: str, truth: str, count: int, stretches: int) -> Stopwatch:
+    """Half-second stretches of the standing crane with so many logs on the ground."""
+    with opened(profile, truth, 1, rows_of_logs(count, 12.0, -6.0)) as world:
+        watch = Stopwatch()
+        neutral = [0.0] * len(world.functions)
+        for i in range(stretches + 1):
+            if i == 1:
+                watch = Stopwatch()  # the first one warms up
+            watch.begin()
+            for _ in range(PER_SECOND // 2):
+                world.step(neutral)
+            watch.end()
+    return watch
+
+
+def _camera(profile: str, truth: str, pictures: int) -> Stopwatch:
+    """One picture per stretch while the crane moves."""
+    from sim.camera.rig import CameraRig
+
+    p = profile_named(profile)
+    with opened(profile, truth, 1, heap(PICTURE_LOGS, *p.workspace.pick_center_m)) as world:
+        rig = CameraRig(world, p, world.truth, 1, 608)
+        name = next(iter(p.cameras))
+        rig.frame(name, 0)
+        watch = Stopwatch()
+        neutral = [0.0] * len(world.functions)
+        for i in range(pictures):
+            world.step(neutral)
+            watch.begin()
+            rig.frame(name, (i + 1) * 33_000_000)
+            watch.end()
+    return watch

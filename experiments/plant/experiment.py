@@ -1,0 +1,158 @@
+"""The plant experiment: which trials, run on all cores, judged together, drawn and written."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from typing import Any, Final
+
+from rich.console import Console
+
+from experiments.common import pool
+from experiments.common.pool import Job
+from experiments.common.registry import Options
+from experiments.common.report import tell
+from experiments.common.result import Result, judged, mean, rate
+from experiments.common.trials import check_truth, checkpoint
+from experiments.common.worlds import carrier_profile, profile_named
+from experiments.plant import bench, endurance, energy, physics, rolling, trial
+from experiments.plant.figures import FIGURES, PAPER, SECTIONS
+from experiments.plant.pictures import draw
+
+TRIALS: Final = 200
+QUICK_TRIALS: Final = 2
+SHIFT_S: Final = 3600.0
+QUICK_SHIFT_S: Final = 30.0
+SEEDS_PER_RUN: Final = 100_000
+
+GRASPS: Final = {
+    "single": {"scene": "single", "logs": 1, "across_m": 0.0, "turned_rad": 0.0, "unload": True},
+    "pile3": {"scene": "pile", "logs": 3, "across_m": 0.0, "turned_rad": 0.0, "unload": False},
+    "yaw90": {"scene": "single", "logs": 1, "across_m": 0.0, "turned_rad": math.pi / 2, "unload": False},
+    "off1m": {"scene": "single", "logs": 1, "across_m": 1.0, "turned_rad": 0.0, "unload": False},
+}
+RESTS: Final = {"rest_pile": {"scene": "pile", "logs": 6}, "rest_bunk": {"scene": "bunk", "logs": 8}}
+CRANE: Final = {
+    "sag": physics.sag,
+    "boom_stop": physics.boom_stop,
+    "pendulum": physics.pendulum,
+    "slew_stop": physics.slew_stop,
+    "sharing": physics.sharing,
+    "cylinder": physics.cylinder_spring,
+    "left_alone": energy.left_alone,
+    "falling": energy.falling,
+    "lifting": energy.lifting,
+}
+CARRIER: Final = {"turning": rolling.turning, "braking": rolling.braking}
+FUNCTIONS: Final = {
+    "shift": endurance.shift,
+    **dict.fromkeys(GRASPS, trial.grasp),
+    **dict.fromkeys(RESTS, energy.resting),
+    **CRANE,
+    **CARRIER,
+}
+
+
+def perform(job: Job) -> Any:
+    """Run one job in whatever process this is."""
+    return FUNCTIONS[job.kind](job)
+
+
+def plan(options: Options, trials: int) -> list[Job]:
+    """Every job of the run, the long ones first."""
+    seed = options.seed * SEEDS_PER_RUN
+    common = {"profile": options.profile, "truth": options.truth, "quick": options.quick}
+    shift_s = QUICK_SHIFT_S if options.quick else SHIFT_S
+    jobs = [Job("shift", "shift", seed, {**common, "seconds": shift_s})]
+    jobs += [Job(kind, kind, seed, {**common, **scene}) for kind, scene in RESTS.items()]
+    jobs += [Job(kind, kind, seed, common) for kind in CRANE]
+    # A truth file is of one machine; the carrier has the shipped one beside a fixed crane's.
+    other = carrier_profile(options.profile)
+    same = other == options.profile or options.truth in ("nominal", "sampled")
+    under = {**common, "profile": other, "truth": options.truth if same else "nominal"}
+    jobs += [Job(kind, kind, seed, under) for kind in CARRIER]
+    jobs += [
+        Job(f"{kind}/{i}", kind, seed + i, {**common, **what}) for i in range(trials) for kind, what in GRASPS.items()
+    ]
+    return jobs
+
+
+def run(options: Options, console: Console) -> Result:
+    """Measure everything; writes ``options.out`` and, when asked, the docs.
+
+    Raises:
+        Stopped: the truth file or a scene cannot be used.
+    """
+    check_truth(options.profile, options.truth)
+    trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
+    jobs = plan(options, trials)
+    with checkpoint(options, jobs, [options.profile], options.truth) as kept:
+        outcomes = pool.run(perform, jobs, kept, options.workers, "plant trials", console)
+        metrics, traces = gather(outcomes)
+        metrics["repeat_equal"] = float(_repeats(options))
+        speed, noisy, costs = bench.measure(options.profile, options.truth, options.quick, console)
+        metrics |= speed
+        traces |= costs
+        result = judged(
+            "plant", FIGURES, metrics, profile=profile_named(options.profile).name, seed=options.seed, trials=trials,
+            more={"truth": options.truth}, paper=PAPER, noisy=noisy,
+        )  # fmt: skip
+        draw(metrics, traces, options.out)
+        tell(result, "The plant, measured", INTRODUCTION, SECTIONS, options, console)
+    return result
+
+
+INTRODUCTION: Final = (
+    "The plant stands where the machine stands: crane, hydraulics, carrier, logs and CAN nodes. This page says how "
+    "much of a machine it is. `timberhand experiment plant --docs docs` measures everything and writes the page; no "
+    "number is typed."
+)
+
+
+def _repeats(options: Options) -> bool:
+    """Whether two fresh processes agree on every byte of a grasp."""
+    o = {"profile": options.profile, "truth": options.truth, "scene": "pile", "logs": 3}
+    job = Job("repeat", "repeat", options.seed * SEEDS_PER_RUN, o)
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as processes:
+        first, second = processes.map(partial(endurance.fingerprint), [job, job])
+    return first == second
+
+
+def gather(outcomes: dict[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
+    """Metrics and traces of all jobs together."""
+    by_kind: dict[str, list[Any]] = {}
+    for name, outcome in outcomes.items():
+        by_kind.setdefault(name.split("/")[0], []).append(outcome)
+    metrics: dict[str, float] = {}
+    traces: dict[str, Any] = {}
+    for kind in ("shift", *CRANE, *CARRIER):
+        metrics |= by_kind[kind][0]["metrics"]
+        traces |= by_kind[kind][0].get("traces", {})
+    rests = [by_kind[kind][0]["metrics"] for kind in RESTS]
+    metrics["rest_speed_max_m_s"] = max(r["fastest_m_s"] for r in rests)
+    metrics["rest_awake_speed_m_s"] = max(r["awake_fastest_m_s"] for r in rests)
+    metrics["rest_awake_moved_m"] = max(r["awake_moved_m"] for r in rests)
+    single, pile, yaw90, off1m = (by_kind[kind] for kind in GRASPS)
+    lifted = [t for t in single if t["held"] == 1]
+    metrics |= rate("single_success", len(lifted), len(single))
+    metrics |= rate("pile3_success", sum(t["held"] == 3 for t in pile), len(pile))
+    metrics |= rate("pile3_any", sum(t["held"] > 0 for t in pile), len(pile))
+    metrics |= rate("unload_success", sum(t["in_bunk"] for t in lifted), len(lifted))
+    metrics |= rate("yaw90_lifted", sum(t["raised"] > 0 for t in yaw90), len(yaw90))
+    metrics |= rate("off1m_lifted", sum(t["raised"] > 0 for t in off1m), len(off1m))
+    good = [t for t in (*single, *pile) if t["held"]]
+    wrong = [*yaw90, *off1m]
+    metrics |= {
+        "penetration_max_m": max((t["penetration_m"] for t in good), default=math.nan),
+        "penetration_wrong_max_m": max(t["penetration_m"] for t in wrong),
+        "log_speed_max_m_s": max((t["log_speed_m_s"] for t in good), default=math.nan),
+        "log_speed_bound_max_m_s": max((t["log_speed_bound_m_s"] for t in good), default=math.nan),
+        "peak_bar_max": max(t["peak_bar"] for t in (*single, *pile)),
+        "load_cell_error": mean([abs(t["load_kg"] / t["true_load_kg"] - 1.0) for t in good]),
+        "grasp_energy_j": mean([t["energy_j"] for t in lifted]),
+        "grasp_time_s": mean([t["time_s"] for t in lifted]),
+    }
+    traces["good"] = [[t["penetration_m"], t["log_speed_m_s"], t["true_load_kg"], t["load_kg"]] for t in good]
+    return metrics, traces

@@ -1,0 +1,175 @@
+"""One grasp trial: fresh logs, an aim with noise, pick, perhaps unload into the bunk; judged by the plant's truth."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from typing import Any, Final
+
+from experiments.common.pool import Job
+from experiments.common.worlds import opened, to_base, yaw_in_base
+from experiments.plant.driver import Driver
+from machine.grapple import lowest_tip_below_pin_m
+from machine.kinematics import Unreachable
+from sim.bunk import from_bunk
+from sim.evaluator import LIFTED_M, Judge
+from sim.logs import LogState
+from sim.world import STEP_S, World
+
+AIM_M: Final = 0.04
+AIM_RAD: Final = math.radians(4.0)
+HOVER_M: Final = 0.5  # tips over the ground before the descent
+SHOWN_M: Final = 1.0  # tips over the ground after it: higher than a log must hang to count as lifted
+WEIGH_S: Final = 0.5
+UNLOADED_S: Final = 20  # a crooked log may rock that long before it lies still
+OVER_STAKES_M: Final = 0.15
+OVER_FLOOR_M: Final = 0.05
+
+
+def grasp(job: Job) -> dict[str, Any]:
+    """Options: profile, truth, scene, logs, across_m, turned_rad, unload.
+
+    ``held``: logs half a metre and more off the ground a second after the lift; ``raised``: logs that ever were;
+    ``in_bunk``: logs at rest in the bunk after unloading.
+    """
+    o = job.options
+    with opened(o["profile"], o["truth"], job.seed, o["scene"], o["logs"]) as world:
+        judge, fastest = Judge(world), Fastest(world)
+
+        def watch() -> None:
+            judge.watch()
+            fastest.watch()
+
+        driver = Driver(world, watch)
+        rng = random.Random(f"aim {job.seed}")
+        high = over_stakes_m(world) if o["unload"] else None
+        take(world, driver, rng, o["across_m"], o["turned_rad"], high)
+        weighed = []
+        for _ in range(round(WEIGH_S / STEP_S)):
+            driver.tick({})
+            weighed.append(world.load_kg())
+        after = judge.verdict()
+        # Also the top log of a pile, which the grapple itself does not touch.
+        held = [log.position_m[2] - world.terrain.height(*log.position_m[:2]) > LIFTED_M for log in world.yard.states()]
+        outcome: dict[str, Any] = {
+            "held": sum(held),
+            "raised": sum(v.lifted or h for v, h in zip(after.logs, held, strict=True)),
+            "load_kg": sum(weighed) / len(weighed),
+            "true_load_kg": sum(m for m, h in zip(world.yard.masses, held, strict=True) if h),
+        }
+        if o["unload"] and any(held):
+            hanging = [log for log, h in zip(world.yard.states(), held, strict=True) if h]
+            unload(world, driver, hanging)
+            for _ in range(UNLOADED_S):
+                driver.wait(1.0)
+                verdict = judge.verdict()
+                if all(v.at_rest for v in verdict.logs):
+                    break
+            outcome["in_bunk"] = sum(v.done for v, h in zip(verdict.logs, held, strict=True) if h)
+        last = judge.verdict()
+        outcome |= {
+            "penetration_m": last.max_penetration_m,
+            "log_speed_m_s": fastest.m_s,
+            "log_speed_bound_m_s": last.max_log_speed_m_s,
+            "peak_bar": last.peak_pressure_bar,
+            "energy_j": last.energy_j,
+            "time_s": last.time_s,
+        }
+        return outcome
+
+
+class Fastest:
+    """The greatest speed of a log's middle or ends so far [m/s]; the judge's own is a bound that adds the spin."""
+
+    def __init__(self, world: World) -> None:
+        self._world, self._steps, self.m_s = world, 0, 0.0
+
+    def watch(self) -> None:
+        """Once per physics step; looks at every fourth."""
+        self._steps += 1
+        if self._steps % 4:
+            return
+        p, yard = self._world.client, self._world.yard
+        for body, spec in zip(yard.logs, yard.scene, strict=True):
+            v, w = p.getBaseVelocity(body)
+            if v == w == (0.0, 0.0, 0.0):
+                continue
+            m = p.getMatrixFromQuaternion(p.getBasePositionAndOrientation(body)[1])
+            half = [spec.length_m / 2.0 * a for a in (m[2], m[5], m[8])]
+            turn = (w[1] * half[2] - w[2] * half[1], w[2] * half[0] - w[0] * half[2], w[0] * half[1] - w[1] * half[0])
+            for side in (-1.0, 0.0, 1.0):
+                self.m_s = max(self.m_s, math.hypot(*(a + side * b for a, b in zip(v, turn, strict=True))))
+
+
+def take(
+    world: World,
+    driver: Driver,
+    rng: random.Random | None = None,
+    across_m: float = 0.0,
+    turned_rad: float = 0.0,
+    lift_to_m: float | None = None,
+    logs: Sequence[LogState] | None = None,
+) -> None:
+    """Grasp at the middle of the logs (default: all) and lift; ``Unreachable`` when nothing serves.
+
+    The aim is off by ``across_m``, ``turned_rad`` and the noise of ``rng`` (None: no noise).
+    """
+    tips = lowest_tip_below_pin_m(world.profile.grapple.tongs)
+    x, y, yaw, ground = _aim(world, driver, rng, across_m, logs or world.yard.states())
+    top = ground + SHOWN_M + tips if lift_to_m is None else lift_to_m
+    driver.pick(x, y, yaw + turned_rad, ground + HOVER_M + tips, ground, top)
+
+
+def over_stakes_m(world: World) -> float:
+    """Height of the pin [m] at which the load passes over the stakes."""
+    bunk = world.profile.bunk
+    return bunk.floor_z_m + bunk.stake_height_m + OVER_STAKES_M + lowest_tip_below_pin_m(world.profile.grapple.tongs)
+
+
+def unload(world: World, driver: Driver, logs: Sequence[LogState]) -> None:
+    """Lay the logs that hang in the grapple into the middle of the bunk, along it.
+
+    As an operator does, it looks once how they hang: a thin log may lie askew in the closed tongs.
+    """
+    bunk = world.profile.bunk
+    x, y, yaw = _middle(world, logs)
+    pin = world.rigid_tip()
+    turn = bunk.yaw_rad - yaw
+    turn -= math.pi * round(turn / math.pi)
+    c, s = math.cos(turn), math.sin(turn)
+    off_x, off_y = c * (x - pin[0]) - s * (y - pin[1]), s * (x - pin[0]) + c * (y - pin[1])
+    over_x, over_y, _ = from_bunk(bunk, (0.0, 0.0, 0.0))
+    floor = bunk.floor_z_m + OVER_FLOOR_M
+    driver.place(over_x - off_x, over_y - off_y, driver.log_yaw() + turn, floor, over_stakes_m(world))
+
+
+def _middle(world: World, logs: Sequence[LogState]) -> tuple[float, float, float]:
+    """Middle (x, y) [m] and direction [rad] of logs in the base frame."""
+    centre = [sum(log.position_m[i] for log in logs) / len(logs) for i in range(3)]
+    x, y, _ = to_base(world, centre)
+    # An axis counts modulo pi: average the doubled angles.
+    doubled = [2.0 * yaw_in_base(world, log.axis) for log in logs]
+    return x, y, math.atan2(sum(map(math.sin, doubled)), sum(map(math.cos, doubled))) / 2.0
+
+
+def _aim(
+    world: World, driver: Driver, rng: random.Random | None, across_m: float, logs: Sequence[LogState]
+) -> tuple[float, float, float, float]:
+    """Where to grasp in the base frame: x, y, yaw across which to close, height of the ground; noise included."""
+    x, y, yaw = _middle(world, logs)
+    spot = [sum(log.position_m[i] for log in logs) / len(logs) for i in range(2)]
+    ground = to_base(world, (*spot, world.terrain.height(*spot)))[2]
+    noise, side = (0.0, 0.0, 0.0), across_m
+    if rng is not None:
+        noise = (rng.gauss(0.0, AIM_M), rng.gauss(0.0, AIM_M), rng.gauss(0.0, AIM_RAD))
+        side *= rng.choice((-1.0, 1.0))
+    tips = lowest_tip_below_pin_m(world.profile.grapple.tongs)
+    for offset in (side, -side):
+        at = (x - offset * math.sin(yaw) + noise[0], y + offset * math.cos(yaw) + noise[1])
+        try:
+            driver.extension_for(*at, ground + tips, ground + SHOWN_M + tips)
+        except Unreachable:
+            continue
+        return (*at, yaw + noise[2], ground)
+    raise Unreachable(f"the aim ({x:.2f}, {y:.2f}) m is out of reach; narrow the profile's pick area")

@@ -1,0 +1,126 @@
+"""Takes the controller's tick records and says whether anything is missing: ``python -m experiments.timing.bus_observer``.
+
+Checks what the controller received and sent, frame by frame, with the means of `experiments.timing.continuity`, and that no
+record is missing but for missed periods.  Says its totals once a second, one JSON object a line.  Exit codes: 0 stopped
+by SIGTERM or SIGINT, 2 usage, 3 profile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import json
+import signal
+import socket
+import sys
+import time
+from typing import Final
+
+from can_dbc.canopen import SYNC_ID
+from can_dbc.tick_record import RecordRefused, TickRecord, decode
+from experiments.timing.continuity import Continuity, databases
+from machine.load import ProfileError, load_profile
+from machine.profile import Profile
+
+TELL_NS: Final = 1_000_000_000
+BUFFER_BYTES: Final = 4 << 20
+SO_RCVBUFFORCE: Final = 33
+"""socket(7); as root it goes beyond the system's limit."""
+
+
+class Witness:
+    """Records in, totals out; pure."""
+
+    def __init__(self, profile: Profile, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._last: TickRecord | None = None
+        known = databases(profile)
+        self.received, self.sent = Continuity(known), Continuity(known)
+        specs = [s.encoder for s in profile.joints.values() if s.encoder]
+        specs += [profile.carrier.articulation_encoder] if profile.carrier else []
+        self._encoders = [known[0].message(spec.message).key for spec in specs]
+        self._first: dict[int, int] = {}
+        self.records = self.lost = self.unreadable = 0
+
+    def take(self, data: bytes) -> None:
+        """One datagram."""
+        try:
+            record = decode(data)
+        except RecordRefused:
+            self.unreadable += 1
+            return
+        last, self._last = self._last, record
+        self.records += 1
+        if last is not None:
+            passed = (record.now_ns - last.now_ns) // self._period_ns
+            self.lost += max(0, passed - 1 - (record.missed_ticks - last.missed_ticks))
+        for frame in (*record.frames_in, *record.machine_frames_in):
+            self.received.take(frame.key, frame.data)
+        for key, payload in (*record.frames_out, *record.machine_frames_out):
+            self.sent.take(key, payload)
+        if not self._first and all(self.received.frames[key] for key in self._encoders):
+            self._first = {key: self.received.frames[key] for key in self._encoders}
+            self._first[SYNC_ID] = self.sent.frames[SYNC_ID]
+
+    def unanswered(self) -> int:
+        """SYNCs since all encoders run that at least one of them left without an answer; one may be on its way."""
+        if not self._first:
+            return 0
+        syncs = self.sent.frames[SYNC_ID] - self._first[SYNC_ID]
+        answers = min(self.received.frames[key] - self._first[key] for key in self._encoders)
+        return max(0, syncs - answers - 1)
+
+    def totals(self) -> dict[str, int]:
+        """Everything so far."""
+        return {
+            "records": self.records,
+            "records_lost": self.lost,
+            "records_unreadable": self.unreadable,
+            "received": self.received.frames.total(),
+            "sent": self.sent.frames.total(),
+            "gaps": self.received.gaps + self.sent.gaps,
+            "damaged": self.received.damaged + self.sent.damaged,
+            "unanswered": self.unanswered(),
+        }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.timing.bus_observer", description="Watches the tick records."
+    )
+    parser.add_argument("--profile", required=True)
+    parser.add_argument("--rate", required=True, type=int, metavar="HZ")
+    parser.add_argument("--port", required=True, type=int, help="UDP port of the tick records")
+    options = parser.parse_args(arguments)
+    try:
+        witness = Witness(load_profile(options.profile), 1_000_000_000 // options.rate)
+    except ProfileError as error:
+        sys.stderr.write(f"witness: {error}\n")
+        return 3
+    ended: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda which, _frame: ended.append(which))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        with contextlib.suppress(OSError):
+            link.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
+        link.bind(("127.0.0.1", options.port))
+        link.settimeout(0.1)
+        gc.collect()
+        gc.freeze()
+        print("ready", flush=True)
+        tell_ns = 0
+        while not ended:
+            with contextlib.suppress(TimeoutError):
+                witness.take(link.recv(65_536))
+            now_ns = time.monotonic_ns()
+            if now_ns >= tell_ns:
+                tell_ns = now_ns + TELL_NS
+                print(json.dumps(witness.totals()), flush=True)
+    print(json.dumps(witness.totals()), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

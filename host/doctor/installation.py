@@ -1,0 +1,195 @@
+"""Is this installation sane: Python, packages, profiles, buses, the lab, places to write, ports?
+
+Looks at the running system.  Only what prevents every run is a FAULT: a missing package, a profile that does not
+load.  Packages and versions come from the distribution's own metadata.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import socket
+import sys
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Final
+
+from packaging.requirements import Requirement
+
+from can_dbc.bus import kernel_has_can
+from host.doctor.finding import Finding, Severity, fine
+from host.vcan_lab import lab_kernel, shim
+from host.vcan_lab.choose import choose, survey
+from host.vcan_lab.spec import LabError, Request
+from machine.load import ProfileError, load_profile, shipped_profiles
+
+EXTRAS: Final = {
+    "sim": "the simulated plant: `make demo`", "autonomy": "the planner", "console": "the operator's page",
+    "tools": "plots and pictures",
+}  # fmt: skip
+"""What each optional group of packages is for."""
+CONF: Final = Path("/etc/timberhand/timberhand.conf")
+DATA: Final = Path("/var/lib/timberhand")
+NEEDED_MB: Final = 1000
+"""Some hours of recording."""
+
+
+def examine() -> tuple[Finding, ...]:
+    """Everything, in the order in which a technician would mend it."""
+    return (python(), *packages(), *profiles(), *buses(), lab(), kernel_of_lab(), *places(), ports())
+
+
+def python() -> Finding:
+    """The interpreter; pip has refused one that is too old, and the plant has no wheels for the newest."""
+    version = sys.version.split()[0]
+    if sys.version_info >= (3, 12):
+        return Finding(
+            "python", Severity.ADVICE, f"Python {version}, for which there is no pybullet", "the simulated plant",
+            ("make setup PYTHON=python3.11",),
+        )  # fmt: skip
+    return fine("python", f"Python {version} in {sys.prefix}")
+
+
+def packages() -> Iterator[Finding]:
+    """Whether what the distribution asks for is there, in the versions that it asks for."""
+    try:
+        wanted = [Requirement(text) for text in metadata.requires("timberhand") or ()]
+    except metadata.PackageNotFoundError:
+        yield Finding("packages", Severity.FAULT, "timberhand itself is not installed", "it runs", ("make setup",))
+        return
+    base = [need for need in wanted if need.marker is None or need.marker.evaluate({"extra": ""})]
+    lacking = [fault for need in base if (fault := _lacking(need))]
+    if lacking:
+        yield Finding("packages", Severity.FAULT, f"missing: {', '.join(lacking)}", "it runs", ("make setup",))
+    else:
+        yield fine("packages", f"timberhand {metadata.version('timberhand')}; all {len(base)} that it needs are there")
+    for extra, purpose in EXTRAS.items():
+        needs = [n for n in wanted if n.marker and n.marker.evaluate({"extra": extra}) and n not in base]
+        if faults := [fault for need in needs if (fault := _lacking(need))]:
+            command = f"{sys.executable} -m pip install 'timberhand[{extra}]'"
+            yield Finding(f"packages, {extra}", Severity.ADVICE, f"missing: {', '.join(faults)}", purpose, (command,))
+
+
+def _lacking(need: Requirement) -> str:
+    try:
+        there = metadata.version(need.name)
+    except metadata.PackageNotFoundError:
+        return need.name
+    return "" if need.specifier.contains(there, prereleases=True) else f"{need.name} {need.specifier} (is {there})"
+
+
+def profiles() -> Iterator[Finding]:
+    """The shipped profiles, and the one in the settings."""
+    names = [*shipped_profiles()]
+    if (chosen := _settings().get("PROFILE")) and chosen not in names:
+        names.append(chosen)
+    for name in names:
+        try:
+            load_profile(name)
+        except ProfileError as error:
+            command = "git status machine" if name in shipped_profiles() else f"sudo nano {CONF}  # PROFILE"
+            yield Finding("profile", Severity.FAULT, str(error), "the controller starts", (command,))
+        else:
+            yield fine("profile", f"{name} loads" + (", chosen in the settings" if name == chosen else ""))
+
+
+def buses() -> Iterator[Finding]:
+    """What a controller could be started on."""
+    if not kernel_has_can():
+        yield Finding(
+            "buses", Severity.ADVICE, "this kernel has no SocketCAN; the wire (a CAN bus in user space) works",
+            "a real machine", ("sudo modprobe can_raw  # else: a kernel with CONFIG_CAN_RAW",),
+        )  # fmt: skip
+    else:
+        names = [n for _, n in socket.if_nameindex() if _type_of(n) == "280"]  # ARPHRD_CAN, linux/if_arp.h
+        there = ", ".join(names) if names else "no interface yet"
+        yield fine("buses", f"SocketCAN: {there}; the wire")
+    settings = _settings()
+    for setting in ("CRANE_BUS", "MACHINE_BUS"):
+        address = settings.get(setting, "")
+        name = address.removeprefix("socketcan:")
+        if name != address and name not in {n for _, n in socket.if_nameindex()}:
+            yield Finding(
+                "buses", Severity.CHANGE, f"{setting}={address} in {CONF}, and there is no interface {name}",
+                "the controller service finds its bus", (f"sudo nano {CONF}", "ip -brief link show type can"),
+            )  # fmt: skip
+
+
+def lab() -> Finding:
+    """Whether tests and trials can have SocketCAN."""
+    here = Request((), "/", {}, os.getuid(), os.getgid(), (), 0o22)
+    try:
+        way = choose(survey(here))
+    except LabError as reason:
+        packages = "sh deploy/debian_packages.sh"
+        return Finding("vcan lab", Severity.ADVICE, str(reason), "SocketCAN for tests and trials", (packages,))
+    return fine("vcan lab", f"works ({way.kind})")
+
+
+def kernel_of_lab() -> Finding:
+    """The optional kernel with simulated time."""
+    if built := lab_kernel.find(shim.user_cache()):
+        return fine("lab kernel", built)
+    gain = "tests in simulated time: hil vcan --time-travel"
+    return Finding("lab kernel", Severity.ADVICE, "not built", gain, ("make lab-kernel",))
+
+
+def places() -> Iterator[Finding]:
+    """Where recordings and shared pages are written."""
+    for place, purpose in ((DATA, "the service's recordings"), (Path("runs"), "recordings of runs started here")):
+        if place is DATA and not place.exists():
+            continue  # not installed as a service
+        near = next(p for p in (place.absolute(), *place.absolute().parents) if p.exists())
+        free_mb = shutil.disk_usage(near).free >> 20
+        if place is not DATA and not os.access(near, os.W_OK):
+            yield Finding("disk", Severity.CHANGE, f"{near} cannot be written", purpose, (f"ls -ld {near}",))
+        elif free_mb < NEEDED_MB:
+            yield Finding("disk", Severity.CHANGE, f"{near} has {free_mb} MB free", purpose, (f"du -h -d 1 {near}",))
+        else:
+            yield fine("disk", f"{near}: {free_mb >> 10} GB free for {purpose}")
+    if not os.access("/dev/shm", os.W_OK):
+        yield Finding(
+            "disk", Severity.CHANGE, "/dev/shm cannot be written", "the controller's timing page", ("mount | grep shm",)
+        )  # fmt: skip
+
+
+def ports() -> Finding:
+    """The UDP ports of the settings, and the page's."""
+    wanted = {name: int(value) for name, value in _settings().items() if name.endswith("_PORT") and value.isdigit()}
+    wanted = wanted or {"CONSOLE_PORT": 8471}
+    taken = {name: port for name, port in wanted.items() if not _free(port, name == "CONSOLE_PORT")}
+    if taken:
+        which = ", ".join(f"{name} {port}" for name, port in taken.items())
+        return Finding(
+            "ports", Severity.ADVICE, f"in use: {which}; that is right while the services run",
+            "the processes find their ports", (f"ss -lunpt | grep -E '{'|'.join(map(str, taken.values()))}'",),
+        )  # fmt: skip
+    return fine("ports", f"free: {', '.join(map(str, wanted.values()))}")
+
+
+def _free(port: int, stream: bool) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM if stream else socket.SOCK_DGRAM) as trial:
+        if stream:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
+
+
+def _settings() -> dict[str, str]:
+    try:
+        text = CONF.read_text()
+    except OSError:
+        return {}
+    return dict(re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE))
+
+
+def _type_of(interface: str) -> str:
+    try:
+        return Path(f"/sys/class/net/{interface}/type").read_text().strip()
+    except OSError:
+        return ""
