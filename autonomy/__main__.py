@@ -3,7 +3,7 @@
 ``python -m autonomy --profile palms_471 --controller 127.0.0.1:47001 --report-port 47002 --scene 127.0.0.1:47003``
 lays one log into the bunk; with ``--mission FILE`` and a machine that drives, the whole mission is done.
 ``--tell HOST:PORT`` is told twice a second how the mission stands, and ``--order-port`` takes a person's orders
-(`can_dbc.mission_datagrams` has both), from this machine only.
+(`can_dbc.messages.mission` has both), from this machine only.
 ``--progress FILE`` keeps how far the mission has come; where there is such a file already the mission goes on from
 there, once a person has ordered Auto.
 
@@ -32,20 +32,20 @@ from typing import Final
 import msgspec
 
 from autonomy.crane_job.activity import Activity
-from autonomy.grasp.direct import Planned
-from autonomy.grasp.press import Press
-from autonomy.grasp.search import Search
-from autonomy.manager.logbook import Logbook, MissionFinished, read
-from autonomy.manager.manager import Manager
-from autonomy.manager.table import WAYS
+from autonomy.grasp.selection import Planned
+from autonomy.grasp.pile_planner import Press
+from autonomy.grasp.sampling_planner import Search
+from autonomy.manager.checkpoint_file import Logbook, MissionFinished, read
+from autonomy.manager.activity_manager import Manager
+from autonomy.manager.transition_table import WAYS
 from autonomy.missions.crane_job import Mission
-from autonomy.missions.files import load_mission
+from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import MissionError
-from autonomy.perception.logs import LogObservation, LogsRefused, parse_logs, question
+from autonomy.perception.log_list.observation import LogObservation, LogsRefused, parse_logs, question
 from autonomy.process.jobs import Forwarding, Job, OneLog
 from autonomy.process.operator_commands import OrderRefused, Orders
-from can_dbc.mission_datagrams import encode_mission
-from can_dbc.setpoint import DatagramRefused, StateReport, VehicleReport, decode, udp_address
+from can_dbc.messages.mission import encode_mission
+from can_dbc.messages.crane import DatagramRefused, StateReport, VehicleReport, decode, udp_address
 from machine.load import ProfileError, load_profile, profile_hash
 from machine.modes import Mode
 from machine.profile import Profile

@@ -2,7 +2,7 @@
 
 A foreign ``Host`` is DNS rebinding; a foreign ``Origin`` on the websocket or on a command is another site's page that
 uses this browser.  Both are refused with a sentence.  Every answer carries a policy that lets the page load nothing
-from anywhere but here (safety_faults.md section 3).
+from anywhere but here (docs/reference/safety.md section 3).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What the page shows of a mission and of the vehicle that does it; pure, as `console.state` is.
 
-Everything for the map is in metres east and north of one origin (`console.ground`), angles in radians counter-clockwise
+Everything for the map is in metres east and north of one origin (`console.map_projection`), angles in radians counter-clockwise
 from east.  A mission report is taken when it is for this machine and newer than the last; then it stays, and its age is
 told with it.
 """
@@ -11,10 +11,10 @@ import math
 from collections import deque
 from typing import Any, Final
 
-from can_dbc.mission_datagrams import LatLon, Lying, MissionReport, decode_mission
-from can_dbc.setpoint import DatagramRefused, Driving, VehicleReport
-from can_dbc.vehicle_datagrams import VEHICLE_INPUTS
-from console.ground import Ground, Metres
+from can_dbc.messages.mission import LatLon, Lying, MissionReport, decode_mission
+from can_dbc.messages.crane import DatagramRefused, Driving, VehicleReport
+from can_dbc.messages.vehicle import VEHICLE_INPUTS
+from console.map_projection import Ground, Metres
 from machine.profile import Profile
 
 TOLD_NS: Final = 2_000_000_000

@@ -32,10 +32,10 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from autonomy.perception.logs import LogsRefused, parse_logs, question
-from can_dbc.mission_datagrams import MissionOrder, Order, encode_order
-from can_dbc.setpoint import OperatorAction, OperatorCommand, encode
-from can_dbc.timing_page import TimingRefused, read_timing
+from autonomy.perception.log_list.observation import LogsRefused, parse_logs, question
+from can_dbc.messages.mission import MissionOrder, Order, encode_order
+from can_dbc.messages.crane import OperatorAction, OperatorCommand, encode
+from can_dbc.timing.page import TimingRefused, read_timing
 from console.guards import LOOPBACK_NAMES, Guards, content_security_policy, is_loopback
 from console.state import Watch, describe_machine
 from machine.profile import Profile

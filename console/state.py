@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import DatagramRefused, StateReport, VehicleReport, decode
-from can_dbc.timing_page import Timing
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import DatagramRefused, StateReport, VehicleReport, decode
+from can_dbc.timing.page import Timing
 from console.mission_state import MissionWatch, describe_carrier
 from machine import faults, grapple, kinematics
 from machine.joints import ARTICULATION, JOINTS, Joint

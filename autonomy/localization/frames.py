@@ -1,7 +1,7 @@
 """Points of the machine in the plane: rear frame, crane base and whatever stands in it, with how sure they are.
 
 The chain is rigid: middle of the front axle, articulation axis, rear frame, crane base (``machine.carrier``).  A
-camera's optical frame in the base is ``autonomy.perception.mount.optical_pose``'s; both halves share roll and pitch
+camera's optical frame in the base is ``autonomy.perception.camera.mount.optical_pose``'s; both halves share roll and pitch
 about the articulation axis.
 """
 
@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.localization.estimate import Location
-from autonomy.localization.motion import Noise, axle_m, tilt
-from autonomy.perception.frame import Pose
+from autonomy.localization.location import Location
+from autonomy.localization.motion_model import Noise, axle_m, tilt
+from autonomy.perception.camera.frame import Pose
 from machine.carrier import rear_from_base, rear_from_front
 from machine.profile import Carrier
 

@@ -15,15 +15,15 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.localization.estimate import Location, Status
-from autonomy.localization.filter import Filter
-from autonomy.localization.motion import Noise, Odometry, State, antenna_reach, drift_rad, front_attitude
-from autonomy.localization.plane import Plane, wrapped, yaw_from_heading
-from can_dbc.setpoint import VehicleReport
+from autonomy.localization.location import Location, Status
+from autonomy.localization.vehicle_filter import Filter
+from autonomy.localization.motion_model import Noise, Odometry, State, antenna_reach, drift_rad, front_attitude
+from autonomy.localization.local_plane import Plane, wrapped, yaw_from_heading
+from can_dbc.messages.crane import VehicleReport
 from machine.profile import Carrier
 
 LATENCY_NS: Final = 75_000_000
-"""From a measurement of the receiver to its reception: 50 to 100 ms (machines.md 8, assumed)."""
+"""From a measurement of the receiver to its reception: 50 to 100 ms (docs/reference/machines.md section 8, assumed)."""
 TURN_OVER_NS: Final = 50_000_000
 """The receiver's rate of turn is a mean over this time (assumed)."""
 FRESH_NS: Final = 500_000_000

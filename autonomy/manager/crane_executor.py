@@ -13,15 +13,15 @@ from typing import Final
 from msgspec.structs import replace
 
 from autonomy.crane_job.activity import Activity
-from autonomy.crane_job.rotator import Rotator
-from autonomy.grasp.direct import Chooser, Grasp, lies_in
-from autonomy.manager.cargo import Cargo
+from autonomy.crane_job.rotator_estimate import Rotator
+from autonomy.grasp.selection import Chooser, Grasp, lies_in
+from autonomy.manager.load_bookkeeping import Cargo
 from autonomy.manager.world_model import Outlook
 from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm
-from autonomy.motion.planners import Motions
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import StateReport
+from autonomy.motion.motion_planner import Motions
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import StateReport
 from machine.joints import N_JOINTS
 from machine.profile import Profile
 

@@ -16,13 +16,13 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from autonomy.grasp.direct import lies_in
-from autonomy.localization.plane import Plane
-from autonomy.missions.local import yaw_from_bearing
+from autonomy.grasp.selection import lies_in
+from autonomy.localization.local_plane import Plane
+from autonomy.missions.local_frame import yaw_from_bearing
 from autonomy.missions.model import KnownLog
-from autonomy.perception.estimate import ACROSS_1, ACROSS_2, END, START, TILT_1, unpacked
-from autonomy.perception.frame import Pose
-from autonomy.perception.logs import LogObservation
+from autonomy.perception.log_list.estimate import ACROSS_1, ACROSS_2, END, START, TILT_1, unpacked
+from autonomy.perception.camera.frame import Pose
+from autonomy.perception.log_list.observation import LogObservation
 from machine.profile import Bunk
 
 SAME_M: Final = 0.8

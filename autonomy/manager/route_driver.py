@@ -10,17 +10,17 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from typing import Final
 
-from autonomy.localization.estimate import Location
-from autonomy.localization.plane import Plane
-from autonomy.manager.progress import Left
-from autonomy.manager.stops import base_on_way
-from autonomy.manager.turning import turns
+from autonomy.localization.location import Location
+from autonomy.localization.local_plane import Plane
+from autonomy.manager.checkpoint import Left
+from autonomy.manager.loading_stops import base_on_way
+from autonomy.navigation.dubins import turns
 from autonomy.missions.model import ForwardingMission, Point
-from autonomy.navigation.along import Along
-from autonomy.navigation.curves import Path, PathRefused, Point2, drivable
+from autonomy.navigation.path_drive import Along
+from autonomy.navigation.clothoid_path import Path, PathRefused, Point2, drivable
 from autonomy.navigation.navigator import Navigator, Phase
-from autonomy.navigation.waypoints import PaperB, Waypoint
-from autonomy.perception.frame import Pose
+from autonomy.navigation.waypoint_drive import PaperB, Waypoint
+from autonomy.perception.camera.frame import Pose
 from machine.carrier import turning_radius_m
 from machine.profile import Carrier
 

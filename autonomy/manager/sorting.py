@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable
 
 from autonomy.missions.model import ForwardingMission
-from autonomy.navigation.curves import Point2
+from autonomy.navigation.clothoid_path import Point2
 
 
 class Sorting:

@@ -15,24 +15,24 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from autonomy.crane_job.activity import Activity
-from autonomy.grasp.direct import lies_in
-from autonomy.localization.estimate import Location
+from autonomy.grasp.selection import lies_in
+from autonomy.localization.location import Location
 from autonomy.localization.frames import Frames
 from autonomy.localization.localizer import Localizer
-from autonomy.localization.plane import Plane
+from autonomy.localization.local_plane import Plane
 from autonomy.manager.log_map import CONFIRMED, Field, FieldLog, nearest, told
-from autonomy.manager.memory import Memory
-from autonomy.manager.progress import Known, Missed
+from autonomy.manager.log_memory import Memory
+from autonomy.manager.checkpoint import Known, Missed
 from autonomy.manager.sorting import Sorting
-from autonomy.manager.stops import BaseAt, Reach, Stop, best_stop
+from autonomy.manager.loading_stops import BaseAt, Reach, Stop, best_stop
 from autonomy.missions.area import Area
-from autonomy.missions.local import bearing_from_yaw
+from autonomy.missions.local_frame import bearing_from_yaw
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
 from autonomy.motion.arm import Arm
-from autonomy.navigation.curves import Point2
-from autonomy.perception.frame import Pose
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import StateReport, VehicleReport
+from autonomy.navigation.clothoid_path import Point2
+from autonomy.perception.camera.frame import Pose
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import StateReport, VehicleReport
 from machine.modes import Mode
 from machine.profile import Bunk, Profile
 

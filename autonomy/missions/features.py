@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from autonomy.missions.area import signed_area_m2
-from autonomy.missions.local import LocalFrame
+from autonomy.missions.local_frame import LocalFrame
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Landing, MissionError, Options, Point
 from autonomy.missions.source import Place, Source
 
@@ -59,7 +59,7 @@ class Draft:
 def assemble(
     shapes: Sequence[Shape], source: Source, kind: str, name: str = "", options: Options | None = None
 ) -> Draft:
-    """The mission that shapes make; coordinates are not yet judged (``autonomy.missions.check``).
+    """The mission that shapes make; coordinates are not yet judged (``autonomy.missions.validation``).
 
     Raises:
         MissionError: a role that is none or does not fit its shape, a property of the wrong type, or two routes.

@@ -1,8 +1,8 @@
 """The mission of a forwarder: a route, its fence, logs that are known beforehand, landings and options.
 
 Places are WGS84: degrees, and metres above the ellipsoid where a height is known.  Bearings are degrees clockwise from
-true north, as maps and the bus have them; what drives turns both into local metres with ``autonomy.missions.local``.
-A mission is only data: ``autonomy.missions.check`` says what makes it one, ``autonomy.missions.files`` reads and writes
+true north, as maps and the bus have them; what drives turns both into local metres with ``autonomy.missions.local_frame``.
+A mission is only data: ``autonomy.missions.validation`` says what makes it one, ``autonomy.missions.mission_file`` reads and writes
 it.  (``autonomy.missions.crane_job`` is the record of a single grasp, which the console sends.)
 """
 

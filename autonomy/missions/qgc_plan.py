@@ -11,7 +11,7 @@ from collections import Counter
 from typing import Any, Final
 
 from autonomy.missions.features import Draft, Position, Shape, assemble
-from autonomy.missions.local import LocalFrame
+from autonomy.missions.local_frame import LocalFrame
 from autonomy.missions.model import MAX_WAYPOINTS, Options
 from autonomy.missions.source import Source
 

@@ -10,17 +10,17 @@ from typing import Final
 import numpy as np
 
 from autonomy.missions.area import path_distance_m
-from autonomy.missions.check import SITE_M, area_of, legs
-from autonomy.missions.local import LocalFrame, site_frame
+from autonomy.missions.validation import SITE_M, area_of, legs
+from autonomy.missions.local_frame import LocalFrame, site_frame
 from autonomy.missions.model import ForwardingMission
 from machine.carrier import turning_radius_m
 from machine.kinematics import max_reach_m
 from machine.profile import Carrier, Profile
 
 SWITCH_LEAST_M: Final = 3.0
-"""Nearest a waypoint is passed before the next one is steered to (machines.md 7.2: 3 to 4 m, else R tan(turn / 2))."""
+"""Nearest a waypoint is passed before the next one is steered to (docs/reference/machines.md section 7.2: 3 to 4 m, else R tan(turn / 2))."""
 LOG_S: Final = 25.0
-"""Seconds for one log from the ground into the bunk, as an expert needs (machines.md 10)."""
+"""Seconds for one log from the ground into the bunk, as an expert needs (docs/reference/machines.md section 10)."""
 SHARPEST_RAD: Final = math.radians(150.0)
 SHOWN: Final = 5
 

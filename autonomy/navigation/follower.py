@@ -21,9 +21,9 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from autonomy.localization.estimate import Location
-from autonomy.localization.plane import wrapped
-from autonomy.navigation.curves import Path
+from autonomy.localization.location import Location
+from autonomy.localization.local_plane import wrapped
+from autonomy.navigation.clothoid_path import Path
 from machine.profile import Carrier
 
 LAMBDA_1_M: Final = 0.55

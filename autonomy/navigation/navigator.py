@@ -11,11 +11,11 @@ import math
 from enum import IntEnum
 from typing import Final
 
-from autonomy.localization.estimate import Location
-from autonomy.navigation.along import Along
-from autonomy.navigation.order import Order
-from autonomy.navigation.waypoints import PaperB
-from can_dbc.setpoint import DriveSetpoint, Driving, VehicleReport
+from autonomy.localization.location import Location
+from autonomy.navigation.path_drive import Along
+from autonomy.navigation.drive_request import Order
+from autonomy.navigation.waypoint_drive import PaperB
+from can_dbc.messages.crane import DriveSetpoint, Driving, VehicleReport
 from machine.profile import Carrier
 
 LEASE_NS: Final = 250_000_000

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
-from autonomy.localization.estimate import Location
-from autonomy.navigation.curves import Path
+from autonomy.localization.location import Location
+from autonomy.navigation.clothoid_path import Path
 from machine.carrier import ARMS, hub_m, pivot_height_m, rear_from_front
 from machine.profile import Carrier
 

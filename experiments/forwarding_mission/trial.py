@@ -8,20 +8,15 @@ from pathlib import Path
 from typing import Any, Final
 
 import msgspec
-from rich.console import Console
 
-from autonomy.localization.plane import Plane
-from autonomy.missions.files import load_mission
+from autonomy.localization.local_plane import Plane
+from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
-from experiments.common.individuals import believed, calibrated
+from experiments.common.individuals import calibrated
+from experiments.common.mission_trial import run_mission
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
-from experiments.forwarding_mission.ground_truth_observer import Witness
-from hil.display import Display
-from hil.mission import MissionRun, MissionSummary
-from hil.mission_site import site_of
-from machine.load import load_profile
-from sim.site_file import Site
+from hil.missions.site import site_of
 
 ALONG_M: Final = 0.5
 """In other missions than the first each log lies so far off its place along the route, at most, ..."""
@@ -30,8 +25,6 @@ ACROSS_M: Final = 0.25
 TURN_DEG: Final = 15.0
 """... and turned by so much."""
 SHORT_M: Final = 17.0
-PILE_M: Final = 3.0
-"""A log that lies so near to the middle of a landing was brought there."""
 
 
 def perform(job: Job) -> dict[str, Any]:
@@ -54,51 +47,7 @@ def driven(job: Job) -> dict[str, Any]:
         mission = shuffled(mission, o["field"])
     shipped = profile_named(o["profile"])
     site = site_of(mission, shipped, o.get("field", job.seed), o["truth"])
-    return judged(job, mission, site)
-
-
-def judged(job: Job, mission: ForwardingMission, site: Site) -> dict[str, Any]:
-    """What became of a mission on a site."""
-    o = job.options
-    with believed(o["profile"], o.get("text")) as name:
-        profile = load_profile(name)
-        plant = site.plant(profile_named(o["profile"]), o["truth"], job.seed)
-        try:
-            with Display(Console(quiet=True), job.name) as display:
-                run = MissionRun(mission, name, profile, plant, None, display, o["way"], site, o["eyes"], job.seed)
-                witness = Witness(run, profile, Plane(site.latitude_deg, site.longitude_deg))
-                summary = run.run(o["limit_s"], "", witness.step)
-            verdict, lying = plant.judge(), plant.logs()
-            plane = Plane(site.latitude_deg, site.longitude_deg)
-            landings = [plane.local(x.position.latitude_deg, x.position.longitude_deg)[:2] for x in mission.landings]
-            return {
-                **summary_of(summary),
-                "logs": [
-                    {"place_m": [s.x_m, s.y_m, s.yaw_rad], "size_m": [s.length_m, s.diameter_m],
-                     "detected": i in witness.known, "in_bunk": verdict.logs[i].in_bunk,
-                     "lies_m": [[round(v, 3) for v in at] for at in (lying[i].position_m, *lying[i].ends_m)],
-                     "landed": not verdict.logs[i].in_bunk
-                     and any(math.dist(lying[i].position_m[:2], at) < PILE_M for at in landings)}
-                    for i, s in enumerate(site.logs)
-                ],
-                "base": plant.base_pose(),
-                "places": site.places,
-                "grasps": witness.grasps,
-                "path": witness.path,
-                "stands": witness.stands,
-            }  # fmt: skip
-        finally:
-            plant.close()
-
-
-def summary_of(summary: MissionSummary) -> dict[str, Any]:
-    """What the run itself says."""
-    return {
-        "finished": summary.finished, "failure": summary.failure, "loaded": summary.loaded,
-        "given_up": {str(k): v for k, v in summary.given_up.items()}, "seconds": summary.seconds,
-        "driven_m": round(summary.driven_m, 2), "stops": summary.stops, "refused": summary.refused,
-        "states": [list(s) for s in summary.states],
-    }  # fmt: skip
+    return run_mission(job, mission, site)
 
 
 def shuffled(mission: ForwardingMission, seed: int) -> ForwardingMission:

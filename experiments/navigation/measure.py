@@ -13,8 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from autonomy.navigation.curves import Path, Point2
-from autonomy.navigation.join import joined
+from autonomy.navigation.clothoid_path import Path, Point2
+from autonomy.navigation.joining_path import joined
 from experiments.navigation.trial import COLUMNS
 from machine.profile import Carrier
 

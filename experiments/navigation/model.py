@@ -12,9 +12,9 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from autonomy.localization.motion import antenna_reach, front_attitude
-from autonomy.localization.plane import Plane, heading_from_yaw
-from can_dbc.setpoint import DriveSetpoint, Driving, Steering, VehicleReport
+from autonomy.localization.local_plane import Plane, heading_from_yaw
+from autonomy.localization.motion_model import antenna_reach, front_attitude
+from can_dbc.messages.crane import DriveSetpoint, Driving, Steering, VehicleReport
 from controller.laws.drive import DriveLaw
 from controller.laws.heading import AngleLaw, SteeringLimits, WaypointLaw, east_north_m
 from machine.carrier import turning_radius_m
@@ -66,7 +66,7 @@ class Individual:
 
 
 def individual(seed: int) -> Individual:
-    """A machine as the plant draws them (machines.md 14)."""
+    """A machine as the plant draws them (docs/reference/machines.md section 14)."""
     rng = random.Random(f"vehicle {seed}")
 
     def within(bound: float) -> float:

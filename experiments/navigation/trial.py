@@ -10,26 +10,26 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-from autonomy.localization.estimate import Location, Status
+from autonomy.localization.local_plane import Plane
 from autonomy.localization.localizer import Localizer
-from autonomy.localization.plane import Plane
-from autonomy.navigation.along import Along
-from autonomy.navigation.join import joined
+from autonomy.localization.location import Location, Status
+from autonomy.navigation.joining_path import joined
 from autonomy.navigation.navigator import Navigator, Phase
-from autonomy.navigation.waypoints import PaperB, Waypoint
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import StateReport, VehicleReport, encode
+from autonomy.navigation.path_drive import Along
+from autonomy.navigation.waypoint_drive import PaperB, Waypoint
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import StateReport, VehicleReport, encode
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
-from hil.lockstep import START_NS, Lockstep, Observer
-from hil.operator import Operator
+from hil.harness.lockstep import START_NS, Lockstep, Observer
+from hil.harness.operator import Operator
 from machine.load import profile_hash
 from machine.modes import Mode
 from machine.profile import Profile
-from sim.carrier import PARKED
+from sim.mechanics.carrier import PARKED
 from sim.plant import Plant
 
 Pose = tuple[float, float, float]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from autonomy.localization.estimate import Location, Status
+from autonomy.localization.location import Location, Status
 from machine.load import load_profile
 
 CARRIER = load_profile("aoro_fc8").carrier

@@ -10,13 +10,13 @@ from collections import deque
 import numpy as np
 
 from autonomy.localization.localizer import LATENCY_NS
-from autonomy.localization.plane import Plane, heading_from_yaw
+from autonomy.localization.local_plane import Plane, heading_from_yaw
 from autonomy.manager.log_map import FieldLog
-from autonomy.manager.manager import Manager
-from autonomy.manager.stops import base_on_way
-from autonomy.perception.frame import Pose
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import CraneSetpoint, DriveSetpoint, Driving, Steering, VehicleReport, decode
+from autonomy.manager.activity_manager import Manager
+from autonomy.manager.loading_stops import base_on_way
+from autonomy.perception.camera.frame import Pose
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import CraneSetpoint, DriveSetpoint, Driving, Steering, VehicleReport, decode
 from machine.carrier import heading_rate_rad_s
 from machine.load import profile_hash
 from machine.modes import Mode

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from autonomy.missions.local import LocalFrame
+from autonomy.missions.local_frame import LocalFrame
 from autonomy.missions.model import Point
 
 SITE = LocalFrame(63.657853, 19.895562)

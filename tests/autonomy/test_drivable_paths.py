@@ -10,7 +10,7 @@ from driven_carrier import CARRIER, SQUARE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.navigation.curves import HARDEST, SPACING_M, PathRefused, drivable, limits_of
+from autonomy.navigation.clothoid_path import HARDEST, SPACING_M, PathRefused, drivable, limits_of
 from machine.carrier import turning_radius_m
 
 POINT = st.tuples(st.floats(-60.0, 60.0), st.floats(-60.0, 60.0))

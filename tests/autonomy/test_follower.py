@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.navigation import speed
-from autonomy.navigation.along import Along
-from autonomy.navigation.curves import Path, drivable
+from autonomy.navigation.path_drive import Along
+from autonomy.navigation.clothoid_path import Path, drivable
 from autonomy.navigation.follower import Following, follow
 
 # -- follower

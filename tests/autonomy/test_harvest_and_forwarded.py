@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from mission_texts import SITE, at
 
-from autonomy.missions.files import load_mission, read, verify
-from autonomy.missions.forwarded import ForwardedLoad, ForwardedLog, Forwarder, write_fpr
-from autonomy.missions.harvest import MACHINE_SIGMA_M, TIP_SIGMA_M
+from autonomy.missions.mission_file import load_mission, read, verify
+from autonomy.missions.fpr import ForwardedLoad, ForwardedLog, Forwarder, write_fpr
+from autonomy.missions.hpr import MACHINE_SIGMA_M, TIP_SIGMA_M
 from autonomy.missions.model import Landing, MissionError, Point
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "harvest.hpr"

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from autonomy.manager.manager import Manager
-from autonomy.manager.table import OURS, State
+from autonomy.manager.activity_manager import Manager
+from autonomy.manager.transition_table import OURS, State
 from autonomy.missions.model import ForwardingMission, Point
 from autonomy.process.jobs import COME_TO_REST_NS, Forwarding
-from can_dbc.mission_datagrams import MissionOrder, Order
-from can_dbc.setpoint import DriveSetpoint, decode
+from can_dbc.messages.mission import MissionOrder, Order
+from can_dbc.messages.crane import DriveSetpoint, decode
 from machine.load import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.test_manager import LOGS, PLANE, PROFILE

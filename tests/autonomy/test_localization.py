@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.localization.estimate import Location, Status
+from autonomy.localization.location import Location, Status
 from autonomy.localization.frames import Frames
 from autonomy.localization.localizer import AGREEING, Localizer
-from autonomy.localization.motion import SIZE, Noise, Odometry, State, advance, antenna, antenna_reach, front_attitude
-from autonomy.localization.plane import Plane, heading_from_yaw, wrapped, yaw_from_heading
-from can_dbc.setpoint import DriveSetpoint, Steering, VehicleReport
+from autonomy.localization.motion_model import SIZE, Noise, Odometry, State, advance, antenna, antenna_reach, front_attitude
+from autonomy.localization.local_plane import Plane, heading_from_yaw, wrapped, yaw_from_heading
+from can_dbc.messages.crane import DriveSetpoint, Steering, VehicleReport
 from experiments.navigation.model import FIRM, MUD, SLOPE, Ground, Individual, Vehicle, individual
 from machine.load import load_profile
-from sim.geodesy import Site
+from sim.geometry.geodesy import Site
 
 PROFILE = load_profile("aoro_fc8")
 CARRIER = PROFILE.carrier

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autonomy.grasp.direct import lies_in, plan_place
-from autonomy.grasp.proposal import BunkFull
-from autonomy.localization.plane import Plane
-from autonomy.manager.manager import Manager
-from autonomy.manager.table import ENDS, OURS, PAPER_B, RULES, State
+from autonomy.grasp.selection import lies_in, plan_place
+from autonomy.grasp.planner import BunkFull
+from autonomy.localization.local_plane import Plane
+from autonomy.manager.activity_manager import Manager
+from autonomy.manager.transition_table import ENDS, OURS, PAPER_B, RULES, State
 from autonomy.manager.tally import Tally
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Landing, Options, Point
-from autonomy.navigation.curves import PathRefused
-from autonomy.perception.logs import LogObservation
+from autonomy.navigation.clothoid_path import PathRefused
+from autonomy.perception.log_list.observation import LogObservation
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode
 from tests.autonomy.forwarder_stand_in import Forwarder

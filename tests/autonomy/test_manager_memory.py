@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.direct import is_held, lies_in, plan_grasp
+from autonomy.grasp.selection import is_held, lies_in, plan_grasp
 from autonomy.manager.log_map import Field
-from autonomy.manager.memory import EVERY_NS, Memory
-from autonomy.manager.scale import FEELING_NS
+from autonomy.manager.log_memory import EVERY_NS, Memory
+from autonomy.manager.load_detector import FEELING_NS
 from autonomy.motion.arm import Arm
 from machine.load import load_profile
 from tests.autonomy.test_manager_field import base, lying, seen

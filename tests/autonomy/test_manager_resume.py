@@ -14,18 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.__main__ import CONFIGURATION, FINE, main
-from autonomy.crane_job.rotator import Rotator
-from autonomy.manager.logbook import EVERY_NS, Logbook, MissionFinished, read
-from autonomy.manager.manager import Manager
-from autonomy.manager.progress import Known, Left, Missed, Progress, copied, digest
-from autonomy.manager.table import OURS, PAPER_B, State
+from autonomy.crane_job.rotator_estimate import Rotator
+from autonomy.manager.checkpoint_file import EVERY_NS, Logbook, MissionFinished, read
+from autonomy.manager.activity_manager import Manager
+from autonomy.manager.checkpoint import Known, Left, Missed, Progress, copied, digest
+from autonomy.manager.transition_table import OURS, PAPER_B, State
 from autonomy.manager.tally import Load, Taken, Tally
-from autonomy.manager.turning import turns
-from autonomy.missions.files import load_mission
+from autonomy.navigation.dubins import turns
+from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, MissionError, Options, Point
-from autonomy.navigation.curves import PathRefused, drivable
+from autonomy.navigation.clothoid_path import PathRefused, drivable
 from autonomy.process.jobs import Forwarding
-from can_dbc.mission_datagrams import MissionOrder, Order
+from can_dbc.messages.mission import MissionOrder, Order
 from machine.load import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.test_manager import PLANE, PROFILE, at, ended, place, states, whole

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.grasp.direct import Planned
-from autonomy.grasp.search import Search
-from autonomy.manager.manager import Manager
+from autonomy.grasp.selection import Planned
+from autonomy.grasp.sampling_planner import Search
+from autonomy.manager.activity_manager import Manager
 from autonomy.manager.sorting import Sorting
-from autonomy.manager.table import State
+from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
 from machine.load import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder

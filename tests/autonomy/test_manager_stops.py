@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from autonomy.manager.stops import STEP_M, Reach, Stop, base_on_way, best_stop
+from autonomy.manager.loading_stops import STEP_M, Reach, Stop, base_on_way, best_stop
 from autonomy.motion.arm import Arm
 from machine.carrier import rear_from_front
 from machine.load import load_profile

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from autonomy.manager.table import ENDS, EVENTS, OURS, PAPER_B, RULES, Event, Height, State, awaited, following
+from autonomy.manager.transition_table import ENDS, EVENTS, OURS, PAPER_B, RULES, Event, Height, State, awaited, following
 
 TABLES = {"paper_b": PAPER_B, "ours": OURS}
 PAIRS = list(itertools.product(TABLES, State, Event))

@@ -22,8 +22,8 @@ from mission_texts import (
 )
 from told_missions import assert_route, good, told
 
-from autonomy.missions import maps
-from autonomy.missions.files import load_mission
+from autonomy.missions import gpx_kml
+from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import MissionError, Point
 
 NEWLINE = b"\n"
@@ -58,7 +58,7 @@ def test_huge_numbers() -> None:
 @pytest.mark.parametrize("form", ["geojson", "gpx", "kml", "plan"])
 def test_a_million_points_are_refused_in_bounded_memory(form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     count = 1_000_000
-    monkeypatch.setattr(maps, "MAX_KML_POSITIONS", 5_000)  # 100 000 would take seconds while memory is traced
+    monkeypatch.setattr(gpx_kml, "MAX_KML_POSITIONS", 5_000)  # 100 000 would take seconds while memory is traced
     data = {
         "geojson": lambda: b'{"type":"LineString","coordinates":[' + b"[1,2]," * count + b"[1,2]]}",
         "gpx": lambda: b"<gpx><rte>" + b'<rtept lat="1" lon="2"/>' * count + b"</rte></gpx>",

@@ -25,7 +25,7 @@ from mission_texts import (
 )
 from told_missions import EXAMPLES, assert_route, good, told
 
-from autonomy.missions.files import load_mission, save_mission
+from autonomy.missions.mission_file import load_mission, save_mission
 from autonomy.missions.model import MissionError, Options
 
 

@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.missions import geojson
-from autonomy.missions.files import read, verify
-from autonomy.missions.forwarded import ForwardedLoad, ForwardedLog, Forwarder, write_fpr
-from autonomy.missions.local import LocalFrame
+from autonomy.missions.mission_file import read, verify
+from autonomy.missions.fpr import ForwardedLoad, ForwardedLog, Forwarder, write_fpr
+from autonomy.missions.local_frame import LocalFrame
 from autonomy.missions.model import (
     Fence,
     ForwardingMission,

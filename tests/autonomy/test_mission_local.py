@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.missions.area import Area, crossing, edge_distance_m, inside, path_distance_m, signed_area_m2
-from autonomy.missions.local import LocalFrame, bearing_from_yaw, site_frame, yaw_from_bearing
+from autonomy.missions.local_frame import LocalFrame, bearing_from_yaw, site_frame, yaw_from_bearing
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, MissionError, Point
 
 LATITUDES = st.floats(-89.99, 89.99)

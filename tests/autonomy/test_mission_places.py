@@ -46,7 +46,7 @@ def test_one_swapped_waypoint() -> None:
 
 def test_swapped_near_the_diagonal_shows_at_the_fence() -> None:
     """Where latitude and longitude are nearly equal, swapping moves a place by metres only."""
-    from autonomy.missions.local import LocalFrame
+    from autonomy.missions.local_frame import LocalFrame
 
     near = LocalFrame(45.001, 45.0)
     corners = [near.point(*c) for c in ((-40, -40), (40, -40), (40, 40), (-40, 40))]
@@ -142,7 +142,7 @@ def test_latitude_and_longitude_out_of_range() -> None:
 @pytest.mark.parametrize("longitude", [180.0, -180.0, 179.9999, -179.9999])
 def test_antimeridian(longitude: float) -> None:
     """A site on the 180th meridian is a site like any other."""
-    from autonomy.missions.local import LocalFrame
+    from autonomy.missions.local_frame import LocalFrame
 
     site = LocalFrame(65.0, longitude)
     ring = [site.point(*c) for c in ((-40, -40), (40, -40), (40, 40), (-40, 40))]
@@ -154,7 +154,7 @@ def test_antimeridian(longitude: float) -> None:
 
 @pytest.mark.parametrize("latitude", [90.0, -90.0, 89.9999])
 def test_poles(latitude: float) -> None:
-    from autonomy.missions.local import LocalFrame
+    from autonomy.missions.local_frame import LocalFrame
 
     site = LocalFrame(latitude, 0.0)
     ring = [site.point(*c) for c in ((-40, -40), (40, -40), (40, 40), (-40, 40))]

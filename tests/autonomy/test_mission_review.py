@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from mission_texts import FENCE, at
 
-from autonomy.missions.files import load_mission
+from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Options, Point
 from autonomy.missions.review import LOG_S, SWITCH_LEAST_M, Review, review
 from machine.carrier import turning_radius_m

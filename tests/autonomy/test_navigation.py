@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from driven_carrier import CARRIER, at
 
-from autonomy.localization.estimate import Location, Status
+from autonomy.localization.location import Location, Status
 from autonomy.localization.localizer import Localizer
-from autonomy.localization.plane import Plane
-from autonomy.navigation.along import Along
-from autonomy.navigation.curves import drivable
+from autonomy.localization.local_plane import Plane
+from autonomy.navigation.path_drive import Along
+from autonomy.navigation.clothoid_path import drivable
 from autonomy.navigation.navigator import LEASE_NS, MOVES_NS, OBEYS_NS, Navigator, Phase
-from autonomy.navigation.waypoints import LEAST_M, PaperB, Waypoint
-from can_dbc.setpoint import DriveSetpoint, Driving, Steering, VehicleReport, decode, encode
+from autonomy.navigation.waypoint_drive import LEAST_M, PaperB, Waypoint
+from can_dbc.messages.crane import DriveSetpoint, Driving, Steering, VehicleReport, decode, encode
 from experiments.navigation.model import FIRM, MUD, Ground, Individual, Vehicle, individual
 from machine.carrier import turning_radius_m
 

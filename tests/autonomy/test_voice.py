@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autonomy.manager.manager import Manager
-from autonomy.manager.table import EVENTS, OURS, Event, State
+from autonomy.manager.activity_manager import Manager
+from autonomy.manager.transition_table import EVENTS, OURS, Event, State
 from autonomy.manager.world_model import ATTEMPTS
 from autonomy.missions.model import Fence, ForwardingMission, Landing, Options, Point
 from autonomy.process.jobs import ABORTED, Forwarding, OneLog
-from can_dbc.mission_datagrams import (
+from can_dbc.messages.mission import (
     MAX_CORNERS,
     MAX_LOGS,
     MAX_ROUTE,

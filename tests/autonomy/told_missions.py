@@ -8,7 +8,7 @@ import pytest
 from mission_texts import ROUTE
 
 from autonomy.missions.features import Draft
-from autonomy.missions.files import read, verify
+from autonomy.missions.mission_file import read, verify
 from autonomy.missions.model import ForwardingMission, MissionError
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"

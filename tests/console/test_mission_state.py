@@ -11,10 +11,10 @@ import pymap3d
 import pytest
 from starlette.testclient import TestClient
 
-from can_dbc.mission_datagrams import MissionOrder, Order, decode_order, encode_mission
-from can_dbc.setpoint import Driving, VehicleReport, encode
-from can_dbc.vehicle_datagrams import VEHICLE_INPUTS
-from console.ground import Ground
+from can_dbc.messages.mission import MissionOrder, Order, decode_order, encode_mission
+from can_dbc.messages.crane import Driving, VehicleReport, encode
+from can_dbc.messages.vehicle import VEHICLE_INPUTS
+from console.map_projection import Ground
 from console.mission_state import INPUT_NAMES, TOLD_NS, TRAIL_M, VEHICLE_NS
 from console.server import Console, create_app
 from console.state import Watch, describe_machine

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from autonomy.localization.plane import Plane
-from autonomy.missions.check import problems_of
-from autonomy.missions.files import load_mission
+from autonomy.localization.local_plane import Plane
+from autonomy.missions.validation import problems_of
+from autonomy.missions.mission_file import load_mission
 from experiments.forwarding_mission.experiment import FILE, MACHINES, NOMINAL, calibrations, missions, trial
-from experiments.forwarding_mission.figures import FIGURES, PAPER_TABLE_MM, by_log, gather, table
-from experiments.forwarding_mission.pictures import PAPER_MM, draw
+from experiments.forwarding_mission.metrics import FIGURES, PAPER_TABLE_MM, by_log, gather, table
+from experiments.forwarding_mission.plots import PAPER_MM, draw
 from experiments.forwarding_mission.trial import ACROSS_M, ALONG_M, TURN_DEG, perform, short, shuffled
 
 OPTIONS = SimpleNamespace(seed=3, quick=False)

@@ -22,9 +22,9 @@ FROZEN = """
 import os, signal, sys, time
 from pathlib import Path
 from rich.console import Console
-import hil.live_mission as live
-from autonomy.missions.files import load_mission
-from hil.live import LiveOptions
+import hil.missions.live as live
+from autonomy.missions.mission_file import load_mission
+from hil.harness.live import LiveOptions
 from machine.load import load_profile
 
 class Frozen(live.LiveMission):

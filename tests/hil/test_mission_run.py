@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from autonomy.localization.plane import Plane
-from autonomy.manager.chart import diagram, page
-from autonomy.manager.table import OURS, PAPER_B
-from autonomy.missions.files import save_mission
+from autonomy.localization.local_plane import Plane
+from autonomy.manager.state_chart import diagram, page
+from autonomy.manager.transition_table import OURS, PAPER_B
+from autonomy.missions.mission_file import save_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
-from host.exits import Exit
+from host.exit_codes import Exit
 from timberhand.cli import app
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -9,16 +9,16 @@ import pytest
 from rich.console import Console
 from test_mission_run import PLANE, point
 
-from autonomy.grasp.direct import Planned
-from autonomy.grasp.press import Press
-from autonomy.grasp.search import Search
-from autonomy.manager.logbook import Logbook, read
-from autonomy.manager.manager import Manager
-from autonomy.manager.table import State
+from autonomy.grasp.selection import Planned
+from autonomy.grasp.pile_planner import Press
+from autonomy.grasp.sampling_planner import Search
+from autonomy.manager.checkpoint_file import Logbook, read
+from autonomy.manager.activity_manager import Manager
+from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options
-from hil.display import Display
-from hil.mission import MissionRun
-from hil.mission_site import site_of
+from hil.harness.display import Display
+from hil.missions.lockstep import MissionRun
+from hil.missions.site import site_of
 from machine.load import load_profile, profile_hash
 
 LIE = (("saw logs", 8.0, 4.2), ("pulpwood", 16.0, -4.2))

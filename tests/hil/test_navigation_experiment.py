@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from autonomy.navigation.curves import drivable
-from autonomy.navigation.join import joined
+from autonomy.navigation.clothoid_path import drivable
+from autonomy.navigation.joining_path import joined
 from experiments.navigation import measure
 from experiments.navigation.experiment import CORNERS, LAPS, QUICK_START, STARTS, plan
-from experiments.navigation.figures import FIGURES, GROUNDS, LAP, gather
+from experiments.navigation.metrics import FIGURES, GROUNDS, LAP, gather
 from experiments.navigation.measure import Drive
-from experiments.navigation.pictures import draw
+from experiments.navigation.plots import draw
 from experiments.navigation.trial import COLUMNS, perform
 from machine.load import load_profile
 

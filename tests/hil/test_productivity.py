@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from autonomy.missions.check import problems_of
+from autonomy.missions.validation import problems_of
 from experiments.productivity.experiment import AMOUNTS, QUICK, plan
-from experiments.productivity.figures import FIGURES, cycles, gather
-from experiments.productivity.pictures import draw
-from experiments.productivity.work import KINDS, work
+from experiments.productivity.metrics import FIGURES, cycles, gather
+from experiments.productivity.plots import draw
+from experiments.productivity.tasks import KINDS, work
 from machine.load import load_profile
 
 PROFILE = load_profile("aoro_fc8")

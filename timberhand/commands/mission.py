@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from host.exits import Exit, Stopped
+from host.exit_codes import Exit, Stopped
 from timberhand.commands.runs import Backend, enter_lab, new_directory
 
 app = typer.Typer(no_args_is_help=True, help="Run a forwarding mission, and show what the forwarder does next.")
@@ -71,7 +71,7 @@ def run(
 
     from rich.console import Console
 
-    from autonomy.missions.files import load_mission
+    from autonomy.missions.mission_file import load_mission
     from autonomy.missions.model import MissionError
     from machine.load import ProfileError, load_profile
 
@@ -87,12 +87,12 @@ def run(
     directory = out or new_directory(f"mission-{file.stem}-{way.value}-seed{seed}")
     screen = Console(stderr=as_json)
     if lockstep:
-        from hil.mission import run_mission
+        from hil.missions.lockstep import run_mission
 
         summary = run_mission(mission, profile, seed, truth, way.value, logs, directory, limit_s, screen, eyes.value)
     else:
-        from hil.live import LiveOptions
-        from hil.live_mission import run_live_mission
+        from hil.harness.live import LiveOptions
+        from hil.missions.live import run_live_mission
 
         page = console_port if console else 0
         options = LiveOptions(profile, machine, seed, truth, bus.value, directory, page, limit_s, patience)
@@ -114,7 +114,7 @@ def states(
 
       timberhand mission states --docs docs
     """
-    from autonomy.manager.chart import page
+    from autonomy.manager.state_chart import page
 
     if docs is None:
         print(page())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from host.exits import Exit, Stopped
+from host.exit_codes import Exit, Stopped
 
 if TYPE_CHECKING:
     from autonomy.missions.features import Draft
@@ -77,7 +77,7 @@ def convert(
     """
     import json
 
-    from autonomy.missions.files import load_mission, save_mission
+    from autonomy.missions.mission_file import load_mission, save_mission
     from autonomy.missions.model import MissionError
 
     if out.suffix.lower() not in (".geojson", ".json"):
@@ -125,7 +125,7 @@ def show(
     if png.suffix.lower() != ".png":
         raise Stopped(Exit.USAGE, f"{png}: the map is a PNG; name it {png.with_suffix('.png')}")
     try:
-        from timberhand.plan_map import draw
+        from timberhand.mission_map import draw
     except ImportError:
         raise Stopped(Exit.CONFIGURATION, "drawing needs matplotlib: pip install 'timberhand[tools]'") from None
     try:
@@ -150,7 +150,7 @@ def _machine(name: str) -> Profile:
 
 def _read(file: Path, logs: Path | None, machine: Profile) -> tuple[Draft, Review | None]:
     """The checked mission, and what the machine will make of it if it has a route."""
-    from autonomy.missions.files import load_mission
+    from autonomy.missions.mission_file import load_mission
     from autonomy.missions.review import review
 
     carrier = machine.carrier

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 import pymap3d
 
-from autonomy.localization.plane import Plane
+from autonomy.localization.local_plane import Plane
 from autonomy.missions.model import ForwardingMission, MissionError, Point, all_points
 
 

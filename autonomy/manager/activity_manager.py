@@ -1,7 +1,7 @@
 """The activity manager: reports and log lists in; crane and drive setpoints out.
 
-``Manager.step`` is pure but for its state and holds no clock.  What follows what is in `autonomy.manager.table`, and
-when an event has come about in `autonomy.manager.events`; here is how each state begins, and what is sent meanwhile.  A
+``Manager.step`` is pure but for its state and holds no clock.  What follows what is in `autonomy.manager.transition_table`, and
+when an event has come about in `autonomy.manager.event_conditions`; here is how each state begins, and what is sent meanwhile.  A
 controller that stops, faults or falls silent pauses the mission; when it is armed again the state begins anew.  Every
 wait has its patience, and ``failure`` says why a mission ended.
 """
@@ -15,26 +15,26 @@ from functools import partial
 from typing import Final
 
 from autonomy.crane_job.activity import Activity
-from autonomy.crane_job.rotator import Rotator
-from autonomy.grasp.direct import Chooser, choose
-from autonomy.localization.plane import Plane
-from autonomy.manager.cargo import Cargo
+from autonomy.crane_job.rotator_estimate import Rotator
+from autonomy.grasp.selection import Chooser, choose
+from autonomy.localization.local_plane import Plane
+from autonomy.manager.load_bookkeeping import Cargo
 from autonomy.manager.crane_executor import Hand
-from autonomy.manager.events import Events
-from autonomy.manager.memory import Memory
-from autonomy.manager.progress import Progress, copied, digest
+from autonomy.manager.event_conditions import Events
+from autonomy.manager.log_memory import Memory
+from autonomy.manager.checkpoint import Progress, copied, digest
 from autonomy.manager.route_driver import Ride
-from autonomy.manager.table import ENDS, OURS, PAPER_B, RULES, Event, Height, State, Table, awaited, following
+from autonomy.manager.transition_table import ENDS, OURS, PAPER_B, RULES, Event, Height, State, Table, awaited, following
 from autonomy.manager.tally import Tally
-from autonomy.manager.target import Target
+from autonomy.manager.target_log import Target
 from autonomy.manager.world_model import Outlook
 from autonomy.missions.model import ForwardingMission
-from autonomy.motion.planners import AsShown, Motions, Swiftest
-from autonomy.motion.primitives import load
-from autonomy.navigation.curves import PathRefused
+from autonomy.motion.motion_planner import AsShown, Motions, Swiftest
+from autonomy.motion.movement_primitives import load
+from autonomy.navigation.clothoid_path import PathRefused
 from autonomy.navigation.navigator import LEASE_NS, Navigator, Phase
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import StateReport, VehicleReport, encode
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import StateReport, VehicleReport, encode
 from machine.profile import Profile
 
 STRAYED_M: Final = 0.5

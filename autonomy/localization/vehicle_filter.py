@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from autonomy.localization.motion import SIZE, Array, Noise, Odometry, State, advance, antenna
-from autonomy.localization.plane import wrapped
+from autonomy.localization.motion_model import SIZE, Array, Noise, Odometry, State, advance, antenna
+from autonomy.localization.local_plane import wrapped
 from machine.profile import Carrier
 
 GATES: Final = (0.0, 10.828, 13.816)

@@ -12,7 +12,7 @@ from typing import Final
 
 import msgspec
 
-from autonomy.manager.progress import Progress, copied, digest, fits
+from autonomy.manager.checkpoint import Progress, copied, digest, fits
 from autonomy.missions.model import ForwardingMission, MissionError
 
 EVERY_NS: Final = 1_000_000_000

@@ -11,8 +11,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from autonomy.localization.plane import wrapped
-from autonomy.navigation.curves import Path, PathRefused, Point2, drivable
+from autonomy.localization.local_plane import wrapped
+from autonomy.navigation.clothoid_path import Path, PathRefused, Point2, drivable
 from machine.profile import Carrier
 
 AHEAD_M: Final = (7.0, 10.0, 14.0)

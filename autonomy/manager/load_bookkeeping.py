@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from autonomy.crane_job.activity import Activity
-from autonomy.manager.progress import Progress, copied
+from autonomy.manager.checkpoint import Progress, copied
 from autonomy.manager.tally import Taken, Tally, volume_m3
 from autonomy.manager.world_model import Outlook
-from autonomy.missions.local import yaw_from_bearing
+from autonomy.missions.local_frame import yaw_from_bearing
 from autonomy.missions.model import ForwardingMission, Point
-from autonomy.navigation.curves import Point2
-from autonomy.perception.logs import LogObservation
+from autonomy.navigation.clothoid_path import Point2
+from autonomy.perception.log_list.observation import LogObservation
 from machine.profile import Profile
 
 

@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 from typing import Final
 
-from autonomy.localization.estimate import Location, Status
-from autonomy.navigation.curves import Path
+from autonomy.localization.location import Location, Status
+from autonomy.navigation.clothoid_path import Path
 from autonomy.navigation.follower import Following, Steer, follow
-from autonomy.navigation.order import Order
+from autonomy.navigation.drive_request import Order
 from autonomy.navigation.speed import (
     Rocking,
     bend_speed_m_s,
@@ -17,7 +17,7 @@ from autonomy.navigation.speed import (
     terrain_share,
     tip_margin_m,
 )
-from can_dbc.setpoint import Steering
+from can_dbc.messages.crane import Steering
 from machine.profile import Carrier
 
 SIGMA_M: Final = 0.25

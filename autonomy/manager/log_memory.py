@@ -16,14 +16,14 @@ import numpy as np
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.direct import lies_in
-from autonomy.grasp.heap import fallen
+from autonomy.grasp.selection import lies_in
+from autonomy.grasp.bunk_load import fallen
 from autonomy.manager.log_map import Field
-from autonomy.manager.scale import Scale
+from autonomy.manager.load_detector import Scale
 from autonomy.motion.arm import Arm
-from autonomy.perception.frame import Pose
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import StateReport
+from autonomy.perception.camera.frame import Pose
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import StateReport
 from machine.grapple import grapple_yaw
 from machine.joints import JOINTS
 from machine.profile import Profile, joint

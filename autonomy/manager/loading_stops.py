@@ -15,11 +15,11 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.direct import NoGrasp, plan_grasp
+from autonomy.grasp.selection import NoGrasp, plan_grasp
 from autonomy.manager.log_map import FieldLog
 from autonomy.motion.arm import Arm
-from autonomy.perception.frame import Pose
-from autonomy.perception.logs import LogObservation
+from autonomy.perception.camera.frame import Pose
+from autonomy.perception.log_list.observation import LogObservation
 from machine.carrier import pivot_height_m, rear_from_base
 from machine.profile import Carrier
 

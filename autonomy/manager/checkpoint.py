@@ -1,7 +1,7 @@
 """How far a mission has come, so that a planner that is started again goes on where the one before it ended.
 
 A `Progress` is plain data, the same on every machine: places are WGS84, lengths metres, times ns by the clock of the
-process that took it down.  The manager gives it and can begin with it; `autonomy.manager.logbook` keeps it in a file.
+process that took it down.  The manager gives it and can begin with it; `autonomy.manager.checkpoint_file` keeps it in a file.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Annotated, Final, Literal
 
 import msgspec
 
-from autonomy.crane_job.rotator import Rotator
+from autonomy.crane_job.rotator_estimate import Rotator
 from autonomy.manager.tally import Taken, Tally
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
 

@@ -13,7 +13,7 @@ from statistics import fmean
 from typing import Final
 
 from autonomy.manager.tally import volume_m3
-from autonomy.perception.logs import LogObservation
+from autonomy.perception.log_list.observation import LogObservation
 
 FEELING_NS: Final = 2_000_000_000
 """As long as a lift takes from its start to its stop (measured on the plant: at the longest arm one second of either
@@ -24,7 +24,7 @@ FELT_KG: Final = 30.0
 FELT_SHARE: Final = 0.3
 """Of light logs only so much of their weight, ..."""
 GREEN_KG_M3: Final = 900.0
-"""... fresh from the stump (birch 850 to 950, `machines.md`)."""
+"""... fresh from the stump (birch 850 to 950, `docs/reference/machines.md`)."""
 
 
 class Scale:

@@ -14,11 +14,11 @@ import numpy as np
 
 from autonomy.missions.area import Area, crossing, signed_area_m2
 from autonomy.missions.features import Key
-from autonomy.missions.local import LocalFrame, site_frame
+from autonomy.missions.local_frame import LocalFrame, site_frame
 from autonomy.missions.model import MAX_CORNERS, MAX_LOGS, MAX_WAYPOINTS, ForwardingMission, Options, Point
 
 EXTENT_M: Final = 20_000.0
-"""Farthest that two places of a mission lie apart; forwarders drive some hundred metres (machines.md 10)."""
+"""Farthest that two places of a mission lie apart; forwarders drive some hundred metres (docs/reference/machines.md section 10)."""
 SITE_M: Final = 100_000.0
 SAME_M: Final = 0.1
 """Waypoints nearer than this to the one before are the same place."""

@@ -4,7 +4,7 @@ State (``State``): middle of the front axle [m] and yaw of the front half [rad] 
 curvature of its path [1/m] and to its direction [rad]; share by which the ground passes faster than the wheels say;
 error of the receiver's heading [rad]; the receiver's slowly wandering position error [m]; where the main antenna stands
 beside its place, ahead and to the left [m]; how far its direction turns downhill for each radian that it leans.
-Without slip (machines.md 7.1)
+Without slip (docs/reference/machines.md section 7.1)
 
     x' = v cos psi,  y' = v sin psi,  psi' = (v sin g + lr g') / (lf cos g + lr)
 

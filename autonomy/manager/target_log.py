@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from autonomy.manager.cargo import Cargo
+from autonomy.manager.load_bookkeeping import Cargo
 from autonomy.manager.log_map import FieldLog
 from autonomy.manager.route_driver import Ride
 from autonomy.manager.world_model import Outlook

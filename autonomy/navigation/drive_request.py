@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from can_dbc.setpoint import Steering
+from can_dbc.messages.crane import Steering
 
 
 @dataclass(frozen=True, slots=True)

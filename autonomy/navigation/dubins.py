@@ -1,6 +1,6 @@
 """How a machine that looks elsewhere turns onto a way: two arcs and a straight piece between them (Dubins 1957).
 
-The ways are given by the corners of polygons round the arcs; `autonomy.navigation.curves.drivable` rounds them with
+The ways are given by the corners of polygons round the arcs; `autonomy.navigation.clothoid_path.drivable` rounds them with
 bends of its own.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from autonomy.navigation.curves import Point2
+from autonomy.navigation.clothoid_path import Point2
 
 Heading = tuple[float, float, float]
 """A place [m] and a direction there [rad]."""

@@ -2,7 +2,7 @@
 
 The law itself is closed in the controller; here the waypoints are switched.  The front axle is where the receiver says
 it is, without a filter, as in the paper.  The distance is R tan(turn / 2), with the radius R at full articulation and
-the turn at the waypoint: what a circle needs (machines.md 7.2).
+the turn at the waypoint: what a circle needs (docs/reference/machines.md section 7.2).
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from autonomy.localization.plane import Plane, wrapped, yaw_from_heading
-from autonomy.navigation.order import Order
-from can_dbc.setpoint import Steering, VehicleReport
+from autonomy.localization.local_plane import Plane, wrapped, yaw_from_heading
+from autonomy.navigation.drive_request import Order
+from can_dbc.messages.crane import Steering, VehicleReport
 from machine.carrier import turning_radius_m
 from machine.profile import Carrier
 

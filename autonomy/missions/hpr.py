@@ -14,7 +14,7 @@ import math
 from typing import Final
 
 from autonomy.missions.features import Draft, Key
-from autonomy.missions.maps import decimal
+from autonomy.missions.gpx_kml import decimal
 from autonomy.missions.model import MAX_LOGS, ForwardingMission, KnownLog, Point
 from autonomy.missions.source import Place, Source
 from autonomy.missions.xml_tree import ANY, Element, tree

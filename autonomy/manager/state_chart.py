@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Final
 
-from autonomy.manager.table import ENDS, EVENTS, OURS, PAPER_B, RULES, Height, State, Table
+from autonomy.manager.transition_table import ENDS, EVENTS, OURS, PAPER_B, RULES, Height, State, Table
 
 TITLES: Final = {"Paper B's way (its Fig. 8)": PAPER_B, "Our way": OURS}
 INTRODUCTION: Final = (
-    "What the forwarder does next is written in tables (`autonomy/manager/table.py`); this page is made from them by "
+    "What the forwarder does next is written in tables (`autonomy/manager/transition_table.py`); this page is made from them by "
     "`timberhand mission states --docs docs`. What is not in a table cannot happen. A state that takes longer than its "
     "patience ends the mission with its sentence, unless the table knows a way on. A controller that stops, faults or "
     "falls silent pauses every state; when it is armed again the state begins anew."

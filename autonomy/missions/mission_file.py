@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from autonomy.missions import geojson, qgc_plan
-from autonomy.missions.check import problems_of
+from autonomy.missions.validation import problems_of
 from autonomy.missions.features import Draft, merged
-from autonomy.missions.harvest import HPR, read_hpr
-from autonomy.missions.maps import read_gpx, read_kml
+from autonomy.missions.hpr import HPR, read_hpr
+from autonomy.missions.gpx_kml import read_gpx, read_kml
 from autonomy.missions.model import ForwardingMission, MissionError
 from autonomy.missions.source import json_document, read_bytes
 from autonomy.missions.xml_tree import root_name, tree
@@ -31,7 +31,7 @@ def load_mission(
     """The checked mission of a file, and what was left out of it.
 
     ``logs``: a second file whose logs are added, for example a harvester's hpr.  ``route_wanted``: None asks for one
-    unless the file is a harvester's.  ``site``: see ``autonomy.missions.check.problems_of``.
+    unless the file is a harvester's.  ``site``: see ``autonomy.missions.validation.problems_of``.
 
     Raises:
         MissionError: every problem is one sentence with the file, the line where there is one, and a hint.

@@ -16,7 +16,7 @@ from datetime import datetime
 from typing import Final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from autonomy.missions.harvest import NAMESPACE
+from autonomy.missions.hpr import NAMESPACE
 from autonomy.missions.model import Landing, MissionError, Point
 
 VERSION: Final = "3.6"

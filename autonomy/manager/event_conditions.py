@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import Final
 
-from autonomy.manager.cargo import Cargo
+from autonomy.manager.load_bookkeeping import Cargo
 from autonomy.manager.crane_executor import Hand
 from autonomy.manager.route_driver import Ride
-from autonomy.manager.table import Event, Rule
-from autonomy.manager.target import Target
+from autonomy.manager.transition_table import Event, Rule
+from autonomy.manager.target_log import Target
 from autonomy.manager.world_model import Outlook
 
 SECOND: Final = 1_000_000_000

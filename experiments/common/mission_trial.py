@@ -1,0 +1,71 @@
+"""One forwarding mission in lockstep with a ground-truth observer: a job in, plain data out.
+
+Shared by the experiments that drive whole missions.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+from rich.console import Console
+
+from autonomy.localization.local_plane import Plane
+from autonomy.missions.model import ForwardingMission
+from experiments.common.ground_truth_observer import GroundTruthObserver
+from experiments.common.individuals import believed
+from experiments.common.pool import Job
+from experiments.common.worlds import profile_named
+from hil.harness.display import Display
+from hil.missions.lockstep import MissionRun, MissionSummary
+from machine.load import load_profile
+from sim.site_file import Site
+
+LANDED_M: Final = 3.0
+"""A log this near to the middle of a landing counts as delivered."""
+MISSION_SOURCES: Final = ("autonomy", "controller", "hil/harness/lockstep.py", "hil/missions/lockstep.py", "hil/missions/site.py",
+                  "hil/harness/operator.py", "hil/calibration/crane.py", "docs/examples/paper_b.geojson")  # fmt: skip
+"""What the outcome of a mission depends on, beside the sources of every trial."""
+
+def run_mission(job: Job, mission: ForwardingMission, site: Site) -> dict[str, Any]:
+    """What became of a mission on a site."""
+    o = job.options
+    with believed(o["profile"], o.get("text")) as name:
+        profile = load_profile(name)
+        plant = site.plant(profile_named(o["profile"]), o["truth"], job.seed)
+        try:
+            with Display(Console(quiet=True), job.name) as display:
+                run = MissionRun(mission, name, profile, plant, None, display, o["way"], site, o["eyes"], job.seed)
+                observer = GroundTruthObserver(run, profile, Plane(site.latitude_deg, site.longitude_deg))
+                summary = run.run(o["limit_s"], "", observer.step)
+            verdict, lying = plant.judge(), plant.logs()
+            plane = Plane(site.latitude_deg, site.longitude_deg)
+            landings = [plane.local(x.position.latitude_deg, x.position.longitude_deg)[:2] for x in mission.landings]
+            return {
+                **summary_of(summary),
+                "logs": [
+                    {"place_m": [s.x_m, s.y_m, s.yaw_rad], "size_m": [s.length_m, s.diameter_m],
+                     "detected": i in observer.known, "in_bunk": verdict.logs[i].in_bunk,
+                     "lies_m": [[round(v, 3) for v in at] for at in (lying[i].position_m, *lying[i].ends_m)],
+                     "landed": not verdict.logs[i].in_bunk
+                     and any(math.dist(lying[i].position_m[:2], at) < LANDED_M for at in landings)}
+                    for i, s in enumerate(site.logs)
+                ],
+                "base": plant.base_pose(),
+                "places": site.places,
+                "grasps": observer.grasps,
+                "path": observer.path,
+                "stands": observer.stands,
+            }  # fmt: skip
+        finally:
+            plant.close()
+
+
+def summary_of(summary: MissionSummary) -> dict[str, Any]:
+    """What the run itself says."""
+    return {
+        "finished": summary.finished, "failure": summary.failure, "loaded": summary.loaded,
+        "given_up": {str(k): v for k, v in summary.given_up.items()}, "seconds": summary.seconds,
+        "driven_m": round(summary.driven_m, 2), "stops": summary.stops, "refused": summary.refused,
+        "states": [list(s) for s in summary.states],
+    }  # fmt: skip
