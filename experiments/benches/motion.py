@@ -17,19 +17,22 @@ from typing import Final
 import numpy as np
 
 from autonomy.crane_job.phase_motions import above, carrying
-from autonomy.grasp.direct import approach_length, hover_height, plan_grasp, plan_place, travel_height
-from autonomy.grasp.proposal import NoGrasp
+from autonomy.grasp.grapple_heights import approach_length, hover_height, travel_height
+from autonomy.grasp.placement import plan_place
+from autonomy.grasp.planner import NoGrasp
+from autonomy.grasp.selection import plan_grasp
 from autonomy.missions.crane_job import Mission
-from autonomy.motion.arm import Arm, Pose
+from autonomy.motion.arm import Arm
 from autonomy.motion.clearance import spare
+from autonomy.motion.motion_planner import Swiftest
 from autonomy.motion.obstacles import Held, Surroundings, held_log, surroundings
-from autonomy.motion.planners import Swiftest
+from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, travel
-from autonomy.perception.logs import LogObservation
+from autonomy.perception.log_list.observation import LogObservation
 from experiments.common.worlds import wood_of
 from machine.kinematics import Unreachable
 from machine.profile import Profile
-from sim.scene import LogSpec, arrangement
+from sim.scenes.arrangements import LogSpec, arrangement
 from sim.world import home_of
 
 SCENES: Final = (("separate", 2), ("parallel", 3), ("crossed", 3), ("pile", 5))

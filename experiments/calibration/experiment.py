@@ -10,11 +10,11 @@ from rich.console import Console
 
 from experiments.calibration.trial import calibrated
 from experiments.common import pool
-from experiments.common.plots import MOSS, OIL, STEEL, limit_band, sheet
+from experiments.common.plot_style import MOSS, OIL, STEEL, limit_band, sheet
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import Section, tell
 from experiments.common.result import Figure, Result, judged, rate
+from experiments.common.result_page import Section, tell
 from experiments.common.trials import checkpoint, individuals
 from experiments.common.worlds import profile_named
 from machine.joints import Joint
@@ -30,7 +30,7 @@ TIP_EMPTY_MM, TIP_LOADED_MM = 6.0, 20.0
 """Small beside the centimetres that the crane may be off by all told."""
 DEADBAND_PCT, GAIN, DELAY_MS, SECONDS = 1.0, 0.05, 10.0, 240.0
 ROT_DEADBAND_PCT, ROT_QUARTER = 2.5, 0.03
-SOURCES: Final = ("autonomy", "controller", "hil/lockstep.py", "hil/calibration.py")
+SOURCES: Final = ("autonomy", "controller", "hil/harness/lockstep.py", "hil/calibration/crane.py")
 
 
 def _figures(short: str) -> tuple[Figure, ...]:

@@ -13,14 +13,14 @@ from typing import Final
 from autonomy.motion.arm import Arm
 from autonomy.motion.setpoint_stream import SetpointStream
 from autonomy.motion.trajectory import Trajectory, across, hold
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import GrappleCommand, OperatorAction, StateReport
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import GrappleCommand, OperatorAction, StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
-from hil.lockstep import START_NS, Lockstep, Observer
-from hil.operator import Operator
+from hil.harness.lockstep import START_NS, Lockstep, Observer
+from hil.harness.operator import Operator
 from machine.joints import JOINTS, Joint
 from machine.load import load_profile, profile_hash
 from machine.modes import Mode

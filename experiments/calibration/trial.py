@@ -17,7 +17,7 @@ from experiments.calibration.rotator import turn_errors
 from experiments.calibration.tip import tip_errors
 from experiments.common.pool import Job
 from experiments.common.worlds import opened, profile_named
-from hil.calibration import run_lockstep
+from hil.calibration.crane import run_lockstep
 from machine.joints import Joint
 from machine.load import load_profile
 from machine.profile import Profile

@@ -13,7 +13,7 @@ from autonomy.calibration.result import identify
 from controller.guard.__main__ import profile_path
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
-from hil.calibration import run_lockstep
+from hil.calibration.crane import run_lockstep
 
 DATE: Final = "2000-01-01"
 """Stands in the calibrated profile; a run's outcome must not depend on the day."""

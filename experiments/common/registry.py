@@ -65,7 +65,7 @@ EXPERIMENTS: Final = {
     ),
     "plc": Entry(
         "Does a PLC between crane0 and the valves do the job as well? Both roles beside CAN: logs, accuracy, latency.",
-        "experiments.plc",
+        "experiments.plc.experiment",
     ),
     "grasp-network": Entry(
         "Is it paper A's network, what has it learnt, what does a picture cost? Parameters, Cornell folds, latency.",

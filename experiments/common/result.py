@@ -1,4 +1,4 @@
-"""What an experiment leaves behind: figures with their limits, and result.json (design section 8).
+"""What an experiment leaves behind: figures with their limits, and result.json (docs/architecture.md, "Experiments").
 
 ``metrics`` is a flat map from name to number; a rate has its Wilson 95 % interval beside it as ``NAME_low`` and
 ``NAME_high``.  ``limits`` holds [least, most] (null: open) and ``missed`` the names outside theirs.  A clocked figure

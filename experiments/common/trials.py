@@ -13,7 +13,7 @@ from experiments.common.pool import Checkpoint
 from experiments.common.registry import Options
 from experiments.common.result import ROOT
 from experiments.common.worlds import opened, profile_named
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 from machine.load import profile_hash
 
 SOURCES: Final = ("machine", "sim", "can_dbc", "hil/experiments")
@@ -28,13 +28,13 @@ def check_truth(profile: str, truth: str) -> None:
     """Open a world of it once, before any trial does.
 
     Raises:
-        Stopped: the truth file cannot be used.
+        CommandFailed: the truth file cannot be used.
     """
     try:
         with opened(profile, truth, 0):
             pass
     except ValueError as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed(ExitCode.CONFIGURATION, str(error)) from None
 
 
 def checkpoint(

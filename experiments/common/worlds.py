@@ -11,7 +11,7 @@ from typing import Any, Final
 from machine.kinematics import Point, inverse, solve
 from machine.load import load_profile
 from machine.profile import Profile, joint_limits
-from sim.scene import LogSpec, arrangement
+from sim.scenes.arrangements import LogSpec, arrangement
 from sim.world import World, open_world
 
 CARRIER_PROFILE: Final = "aoro_fc8"
@@ -40,7 +40,7 @@ def opened(
 ) -> Iterator[World]:
     """A world of one trial, closed at the end; the same arguments give the same world.
 
-    A scene by name is an arrangement of ``sim.scene`` with so many logs.
+    A scene by name is an arrangement of ``sim.scenes.arrangements`` with so many logs.
     """
     p = profile_named(profile)
     specs = arrangement(scene, p, wood_of(profile, truth), seed, logs) if isinstance(scene, str) else scene

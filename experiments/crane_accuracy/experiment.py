@@ -10,12 +10,11 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import tell
 from experiments.common.result import Result, judged
+from experiments.common.result_page import tell
 from experiments.common.trials import check_truth, checkpoint, individuals, tell_failures
 from experiments.common.worlds import carrier_profile, profile_named
-from experiments.crane_accuracy.figures import FIGURES, INTRODUCTION, PAPER, SECTIONS, gather
-from experiments.crane_accuracy.pictures import draw
+from experiments.crane_accuracy.metrics import FIGURES, INTRODUCTION, PAPER, SECTIONS, gather
 from experiments.crane_accuracy.plan import (
     GOALS_M,
     OWN,
@@ -28,6 +27,7 @@ from experiments.crane_accuracy.plan import (
     variants,
     visits,
 )
+from experiments.crane_accuracy.plots import draw
 from experiments.crane_accuracy.trial import perform
 
 MACHINES: Final = 20
@@ -39,7 +39,7 @@ FIRST_SEED: Final = 20_000
 SEEDS_PER_RUN: Final = 1000
 TRACED_GOAL: Final = 2
 TRACED: Final = (OWN, UNSHAPED, UNCOMPENSATED)
-SOURCES: Final = ("autonomy", "controller", "hil/lockstep.py", "hil/calibration.py", "hil/operator.py")
+SOURCES: Final = ("autonomy", "controller", "hil/harness/lockstep.py", "hil/calibration/crane.py", "hil/harness/operator.py")
 
 
 def run(options: Options, console: Console) -> Result:

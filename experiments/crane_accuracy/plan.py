@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from autonomy.motion.arm import Arm, Pose
+from autonomy.motion.arm import Arm
+from autonomy.motion.pose import Pose
 from machine.kinematics import Point
 from machine.profile import Profile
 

@@ -16,8 +16,8 @@ from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from experiments.crane_accuracy import measure
 from experiments.crane_accuracy.plan import LAWS, UNCOMPENSATED, UNSHAPED, Visit
-from experiments.crane_accuracy.rounds import Run
-from experiments.crane_accuracy.stand import Seen, Stand
+from experiments.crane_accuracy.reach_cycles import Run
+from experiments.crane_accuracy.testbed import Seen, Stand
 from machine.joints import JOINTS, Joint
 from machine.load import load_profile
 from machine.profile import Profile

@@ -9,20 +9,20 @@ import numpy as np
 from rich.console import Console
 
 from autonomy.networks.weights import WeightsRefused
-from autonomy.perception.finder import LogFinder
+from autonomy.perception.segmentation.log_segmenter import LogFinder
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import Section, tell
 from experiments.common.result import Figure, Result, judged
+from experiments.common.result_page import Section, tell
 from experiments.common.trials import checkpoint
 from experiments.detector import photos
-from experiments.detector.pictures import PAPER, contact_sheet, gallery, overlaid, precision_recall
+from experiments.detector.plots import PAPER, contact_sheet, gallery, overlaid, precision_recall
 from experiments.detector.trial import FAITHFUL, PARTED, box_finder, finder, look, matches, perform, shipped
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 from machine.optics import pinhole
-from training.average_precision import average_precision, curve, taken
-from training.detection.piles import MACHINES
+from training.common.average_precision import average_precision, curve, taken
+from training.pictures.piles import MACHINES
 
 TRIALS: Final = 120  # pictures of each machine
 QUICK_TRIALS: Final = 8
@@ -112,12 +112,12 @@ def run(options: Options, console: Console) -> Result:
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     networks = shipped()
     if "rgbd" not in networks:
-        raise Stopped(Exit.CONFIGURATION, "there are no weights logs_rgbd; make them: timberhand train segmentation")
+        raise CommandFailed(ExitCode.CONFIGURATION, "there are no weights logs_rgbd; make them: timberhand train segmentation")
     try:
         nets = {name: box_finder() if name == FAITHFUL else finder(name) for name in networks}
         facts = {name: net.facts.get("digest", "") for name, net in nets.items()}
     except WeightsRefused as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed(ExitCode.CONFIGURATION, str(error)) from None
     jobs = [
         Job(f"{machine}-{i}", machine, options.seed, {"number": i, "truth": options.truth, "networks": list(networks)})
         for machine in MACHINES

@@ -8,13 +8,13 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.networks.weights import SHIPPED
-from autonomy.perception.detector import BoxFinder
-from autonomy.perception.finder import LogFinder
-from autonomy.perception.instances import Instance
+from autonomy.perception.papers.box_detector import BoxFinder
+from autonomy.perception.segmentation.instances import Instance
+from autonomy.perception.segmentation.log_segmenter import LogFinder
 from experiments.common.pool import Job
 from experiments.detector.worlds import SIZE_PX, TestPicture, picture
-from training.average_precision import Matches, box_overlaps, mask_overlaps
-from training.detection.produce import box_of
+from training.common.average_precision import Matches, box_overlaps, mask_overlaps
+from training.detection.detector_weights import box_of
 
 SIZES: Final = {
     "rgbd": SIZE_PX, "double": 2 * SIZE_PX, "whole": SIZE_PX, "half": SIZE_PX // 2, "depth": SIZE_PX,

@@ -14,13 +14,13 @@ from typing import Final
 import numpy as np
 
 from machine.optics import Intrinsics, intrinsics
-from sim.camera.clutter import Clutter, Density
 from sim.camera.geometry import View, look_at
+from sim.camera.ground_cover import Clutter, Density
+from sim.camera.mesh_renderer import TinyRenderer
 from sim.camera.scene import Boxes, SceneBuilder
-from sim.camera.tiny import TinyRenderer
-from sim.studio import stereo
-from training.detection.piles import HELD_OUT, Pile, chunk, ground_of, profile_of
-from training.detection.props import Steel
+from sim.scenes.settled_logs import stereo
+from training.pictures.piles import HELD_OUT, Pile, chunk, ground_of, profile_of
+from training.pictures.props import Steel
 
 SIZE_PX: Final = 608
 LEAST_PX: Final = 100  # of a log: of one that shows less nobody knows that it is there, it does not count

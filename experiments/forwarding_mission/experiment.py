@@ -8,14 +8,15 @@ from typing import Any, Final
 from rich.console import Console
 
 from experiments.common import pool
+from experiments.common.mission_trial import MISSION_SOURCES
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import tell
 from experiments.common.result import ROOT, Result, judged
+from experiments.common.result_page import tell
 from experiments.common.trials import check_truth, checkpoint, individuals, tell_failures
 from experiments.common.worlds import carrier_profile
-from experiments.forwarding_mission.figures import CM, FIGURES, INTRODUCTION, PAPER, SEEN_BY, gather, sections
-from experiments.forwarding_mission.pictures import draw
+from experiments.forwarding_mission.metrics import CM, FIGURES, INTRODUCTION, PAPER, SEEN_BY, gather, sections
+from experiments.forwarding_mission.plots import draw
 from experiments.forwarding_mission.trial import ACROSS_M, ALONG_M, TURN_DEG, perform
 
 TRIALS: Final = 20
@@ -31,8 +32,6 @@ LIMIT_S: Final = 5400.0
 FILE: Final = ROOT / "docs" / "examples" / "paper_b.geojson"
 RAW: Final = "results/forwarding-mission/trials.jsonl.xz"
 """What became of every log, way and grasp of all missions, in the docs."""
-SOURCES: Final = ("autonomy", "controller", "hil/lockstep.py", "hil/mission.py", "hil/mission_site.py",
-                  "hil/operator.py", "hil/calibration.py", "docs/examples/paper_b.geojson")  # fmt: skip
 
 
 def run(options: Options, console: Console) -> Result:
@@ -45,7 +44,7 @@ def run(options: Options, console: Console) -> Result:
     check_truth(name, truth)
     trials = 0 if options.quick else options.trials or TRIALS
     machines = calibrations(options, name, truth, MACHINES if trials else 0)
-    with checkpoint(options, machines, [name], truth, SOURCES, RAW) as kept:  # more missions go on from fewer
+    with checkpoint(options, machines, [name], truth, MISSION_SOURCES, RAW) as kept:  # more missions go on from fewer
         outcomes = pool.run(perform, machines, kept, options.workers, "calibrations", console)
         jobs = [*trial(options, name, outcomes), *missions(options, name, truth, trials, outcomes)]
         outcomes |= pool.run(perform, jobs, kept, options.workers, "missions", console)

@@ -23,15 +23,15 @@ from experiments.common import overview, pool
 from experiments.common.individuals import calibrated
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import tell
 from experiments.common.result import Result, judged, rate
+from experiments.common.result_page import tell
 from experiments.common.trials import checkpoint, individuals
-from experiments.grasp_configs.figures import FIGURES, INTRODUCTION, sections
-from experiments.grasp_configs.outcome import ALL_LOGS, PILES
-from experiments.grasp_configs.pictures import draw_chain, draw_table
-from experiments.grasp_configs.poses import POSES
+from experiments.grasp_configs.grasp_categories import ALL_LOGS, PILES
+from experiments.grasp_configs.metrics import FIGURES, INTRODUCTION, sections
+from experiments.grasp_configs.plots import draw_chain, draw_table
+from experiments.grasp_configs.pose_sources import POSES
 from experiments.grasp_configs.trial import NETWORKS, attempt, weights_of
-from sim.scene import CONFIGURATIONS
+from sim.scenes.arrangements import CONFIGURATIONS
 
 PAPER: Final = {"paper60_success": 59 / 60, "optimal": 48 / 59}
 """Paper A, section IV-C: the simulated trials."""
@@ -45,7 +45,7 @@ PLANNERS: Final = ("search", *NETWORKS)
 BEST: Final = ("ours", "search")
 RAW: Final = "results/grasp-configs/trials.jsonl.xz"
 """What became of every attempt, in the docs."""
-SOURCES: Final = ("autonomy", "controller", "hil/lockstep.py")
+SOURCES: Final = ("autonomy", "controller", "hil/harness/lockstep.py")
 
 
 def machines_of(options: Options, attempts: int) -> list[Job]:

@@ -17,26 +17,26 @@ from typing import Any, Final
 from autonomy.crane_job.activity import SETTLED_NS, Activity
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.cnn_planner import CnnPlanner
-from autonomy.grasp.direct import Planned
 from autonomy.grasp.network import WEIGHTS, GraspNet
-from autonomy.grasp.proposal import GraspProposal, Planner
-from autonomy.grasp.search import Search
+from autonomy.grasp.planner import GraspProposal, Planner
+from autonomy.grasp.sampling_planner import Search
+from autonomy.grasp.selection import Planned
 from autonomy.motion.arm import Arm
-from autonomy.motion.planners import Swiftest
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import StateReport
+from autonomy.motion.motion_planner import Swiftest
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from experiments.common.individuals import believed
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named, wood_of
-from experiments.grasp_configs.outcome import Grip, category, lifted
-from experiments.grasp_configs.poses import LOOK_NS, POSES, Seen, Sight, misled
-from hil.lockstep import START_NS, Lockstep, Observer
-from hil.operator import Operator
+from experiments.grasp_configs.grasp_categories import Grip, category, lifted
+from experiments.grasp_configs.pose_sources import LOOK_NS, POSES, Seen, Sight, misled
+from hil.harness.lockstep import START_NS, Lockstep, Observer
+from hil.harness.operator import Operator
 from machine.load import load_profile, profile_hash
 from sim.plant import Plant
-from sim.scene import LogSpec, configuration
+from sim.scenes.arrangements import LogSpec, configuration
 
 LIMIT_NS: Final = 60_000_000_000
 HELD_NS: Final = 2_000_000_000
@@ -66,7 +66,7 @@ class Attempt:
     """Since when the crane rests above the logs."""
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """One turn (contract of ``hil.lockstep.Planner``): looks at the start until a grasp is chosen, and one at each
+        """One turn (contract of ``hil.harness.lockstep.Planner``): looks at the start until a grasp is chosen, and one at each
         rest above it."""
         activity = self.activity
         self._q = self._q if report is None else report.position
@@ -110,7 +110,7 @@ class Timed:
     def __call__(
         self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float, stay: Collection[int] = ()
     ) -> GraspProposal:
-        """See ``autonomy.grasp.proposal``."""
+        """See ``autonomy.grasp.planner``."""
         begun = time.process_time()
         try:
             self.proposal = self.planner(arm, logs, slew_rad, rot_rad, stay)

@@ -18,12 +18,12 @@ from autonomy.networks.weights import WeightsRefused, load
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import tell
 from experiments.common.result import ROOT, Result, judged, rate
+from experiments.common.result_page import tell
 from experiments.grasp_network import folds, latency
-from experiments.grasp_network.figures import FIGURES, PAPER, SECTIONS
-from experiments.grasp_network.pictures import draw
-from host.exits import Exit, Stopped
+from experiments.grasp_network.metrics import FIGURES, PAPER, SECTIONS
+from experiments.grasp_network.plots import draw
+from host.exit_codes import CommandFailed, ExitCode
 
 ROUNDS: Final = 80
 QUICK_ROUNDS: Final = 15
@@ -36,13 +36,13 @@ def run(options: Options, console: Console) -> Result:
     With ``options.data`` the shipped weights are judged on that folder instead of a cross-validation.
 
     Raises:
-        Stopped: no torch, no usable weights, or a folder without samples.
+        CommandFailed: no torch, no usable weights, or a folder without samples.
     """
     try:
         import torch
     except ImportError:
-        raise Stopped(
-            Exit.CONFIGURATION, "the experiment compares with torch: pip install 'timberhand[train]'"
+        raise CommandFailed(
+            ExitCode.CONFIGURATION, "the experiment compares with torch: pip install 'timberhand[train]'"
         ) from None
     from training.grasp.cornell import DataRefused
 
@@ -51,7 +51,7 @@ def run(options: Options, console: Console) -> Result:
         arrays, facts = load(WEIGHTS, NETWORK)
         skipped, pictures = _cornell(options, facts, arrays, metrics, console)
     except (WeightsRefused, DataRefused) as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed(ExitCode.CONFIGURATION, str(error)) from None
     scenes = [picture for _, picture in latency.log_scenes(options.seed)]
     with console.status("timing"):
         paths = latency.ways(arrays)
@@ -76,8 +76,8 @@ def _cornell(
 ) -> tuple[str, list[np.ndarray]]:
     """What was skipped and why, and the pictures at hand as the network sees them; adds to ``metrics``."""
     from training.grasp.cornell import load as load_samples
+    from training.grasp.cornell_weights import on_samples
     from training.grasp.views import centre, cut
-    from training.grasp.weights import on_samples
 
     folder = options.data or data_root() / CORNELL
     if options.data is None and not folder.is_dir():
@@ -98,7 +98,7 @@ def _cornell(
 
 def cross_validated(options: Options, folder: Path, samples: Any, console: Console) -> dict[str, float]:
     """Both cross-validations; finished folds are kept until the whole run is done."""
-    from training.grasp.train import EPOCHS
+    from training.grasp.network_training import EPOCHS
 
     plain = {"data": str(folder), "epochs": EPOCHS}
     jobs = [Job(f"{kind}-{i}", kind, options.seed, {**plain, "fold": i}) for kind in folds.KINDS
@@ -133,7 +133,7 @@ def _prepare_ms(seed: int) -> float:
 
 
 def _setting(result: Result) -> str:
-    from training.grasp.train import BATCH, COPIES, EPOCHS, LEARNING_RATE
+    from training.grasp.network_training import BATCH, COPIES, EPOCHS, LEARNING_RATE
 
     e = result.environment
     return (

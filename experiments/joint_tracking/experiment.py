@@ -12,13 +12,13 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import Section, tell
 from experiments.common.result import Figure, Result, judged
+from experiments.common.result_page import Section, tell
 from experiments.common.trials import check_truth, checkpoint, individuals
 from experiments.common.worlds import profile_named
-from experiments.joint_tracking.figures import INTRODUCTION, LAWS, MACHINES, sections
 from experiments.joint_tracking.individuals import CORNERS
-from experiments.joint_tracking.pictures import draw
+from experiments.joint_tracking.metrics import INTRODUCTION, LAWS, MACHINES, sections
+from experiments.joint_tracking.plots import draw
 from experiments.joint_tracking.trial import perform
 
 TRIALS: Final = 6

@@ -12,7 +12,7 @@ import msgspec
 
 from experiments.common.pool import Job
 from experiments.common.worlds import home_at, opened, profile_named
-from experiments.joint_tracking.rig import Calibration, Rig, believed
+from experiments.joint_tracking.testbed import Calibration, Rig, believed
 from machine.kinematics import max_reach_m
 from machine.load import load_profile
 from sim.world import World

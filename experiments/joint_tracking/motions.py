@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from experiments.joint_tracking.rig import NAMES, Reference
+from experiments.joint_tracking.testbed import NAMES, Reference
 from machine.profile import Profile
 
 START_S: Final = 0.3
 """Every motion begins after this time at rest."""
 PEAK: Final = 2.1875
-"""Greatest speed of the profile over its mean (machines.md 1.6)."""
+"""Greatest speed of the profile over its mean (docs/reference/machines.md section 1.6)."""
 STEP_S: Final = 0.08
 """A step goes as far as the joint does in this time at its speed limit: the gate refuses more."""
 RAMP_SHARE: Final = 0.5

@@ -10,14 +10,14 @@ from autonomy.networks.weights import SHIPPED
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import tell
 from experiments.common.result import Result, judged
+from experiments.common.result_page import tell
 from experiments.common.trials import check_truth, checkpoint, individuals
 from experiments.common.worlds import carrier_profile, profile_named
-from experiments.log_localization.figures import DEGREES, FIGURES, INTRODUCTION, PAPER, gather, sections
-from experiments.log_localization.pictures import draw, overlay
+from experiments.log_localization.metrics import DEGREES, FIGURES, INTRODUCTION, PAPER, gather, sections
+from experiments.log_localization.plots import draw, overlay
 from experiments.log_localization.trial import SEGMENTERS, perform
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 
 TRIALS: Final = 12
 QUICK_TRIALS: Final = 1
@@ -33,12 +33,12 @@ def run(options: Options, console: Console) -> Result:
     """Measure everything; writes ``options.out`` and, when asked, the docs.
 
     Raises:
-        Stopped: the truth file cannot be used, or the machine has no front camera.
+        CommandFailed: the truth file cannot be used, or the machine has no front camera.
     """
     name, truth = carrier_profile(options.profile), individuals(options.truth)
     profile = profile_named(name)
     if "front" not in profile.cameras:
-        raise Stopped(Exit.CONFIGURATION, f"{name} has no camera named front; add [cameras.front] to the profile")
+        raise CommandFailed(ExitCode.CONFIGURATION, f"{name} has no camera named front; add [cameras.front] to the profile")
     check_truth(name, truth)
     masks = "network" if (SHIPPED / "logs_rgbd.safetensors").exists() else "true"
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)

@@ -15,17 +15,17 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from autonomy.perception.frame import Frame, Pose, rescaled
-from hil.camera_survey import survey
+from autonomy.perception.camera.frame import Frame, Pose, rescaled
+from hil.calibration.camera_survey import survey
 from machine.optics import intrinsics, rpy_matrix
 from machine.profile import Camera, Profile
-from sim.camera.clutter import CLEARING, Clutter
 from sim.camera.geometry import View, look_at, mount_view
+from sim.camera.ground_cover import CLEARING, Clutter
+from sim.camera.mesh_renderer import TinyRenderer
 from sim.camera.noise import StereoNoise
 from sim.camera.render import Picture
 from sim.camera.scene import Ground, LogPose, Scene, SceneBuilder
-from sim.camera.tiny import TinyRenderer
-from sim.terrain import Terrain
+from sim.ground.terrain import Terrain
 from sim.world import open_world
 
 CAMERA: Final = "front"

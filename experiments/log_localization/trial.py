@@ -9,14 +9,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from autonomy.perception import paper_a
-from autonomy.perception.frame import Frame, Pose
-from autonomy.perception.paper_b import DETECTOR_PX, Box, RunningAverage, in_picture, position_of
+from autonomy.perception.camera.frame import Frame, Pose
+from autonomy.perception.papers import paper_a
+from autonomy.perception.papers.paper_b import DETECTOR_PX, Box, RunningAverage, in_picture, position_of
 from autonomy.perception.pipeline import Masked, Perception
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from experiments.log_localization.site import APART_M, STOP_M, Shape, Shot, Site
-from hil.camera_survey import SURVEYED_BY_GNSS
+from hil.calibration.camera_survey import SURVEYED_BY_GNSS
 
 FURTHEST_M: Final = 10.0  # a log further off is less than 6 px wide in the detector's picture: no pipeline is fed
 STEP_M: Final = 0.55  # of the approach between two frames
@@ -47,7 +47,7 @@ def true_masks(frame: Frame, shot: Shot) -> list[TrueMask]:
 
 def network_masks(frame: Frame, shot: Shot) -> Sequence[Masked]:
     """The masks that the shipped network finds."""
-    from autonomy.perception.finder import segment
+    from autonomy.perception.segmentation.log_segmenter import segment
 
     return segment(frame)
 

@@ -1,6 +1,6 @@
 """The carrier's loops as linear models: heading to a waypoint, angle of the articulation, height of an arm.
 
-Heading (machines.md 7.2), about straight ahead: ``psi = (lr s + v) / (L s^2)`` times the articulation rate, and the
+Heading (docs/reference/machines.md section 7.2), about straight ahead: ``psi = (lr s + v) / (L s^2)`` times the articulation rate, and the
 bearing to a waypoint ``d`` metres ahead turns by ``v / (d s)`` times the heading, so that the loop has three
 integrators near it; without valve and receiver it is L s^2 + Kp lr s + Kp v = 0.  The receiver's heading is
 ``latency`` old; what the machine turned since a sample came is known from odometry, so only the age at reception is

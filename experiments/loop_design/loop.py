@@ -1,6 +1,6 @@
 """The loop of one joint as a frequency response: valve, mechanics, sensors, estimator and law, cut at the command.
 
-The controller is taken as it runs, sampled, with the gains that its own code computes (`controller.estimator`,
+The controller is taken as it runs, sampled, with the gains that its own code computes (`controller.estimation.joint_estimator`,
 `controller.laws`); `tests/hil/test_loop_design.py` drives that code with sines and compares.  Laws are linear inside
 their boundary layer; where super-twisting is not, its gain over the amplitude is a range (``amplitude``).
 """
@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from controller.estimator import acceleration_density, measurement_variance, steady_gains
+from controller.estimation.joint_estimator import acceleration_density, measurement_variance, steady_gains
 from controller.laws.feedback import INTEGRAL_SHARE, PID_SHARE, REACHING_SHARE
 from controller.laws.joint import PRESSURE_MEAN_S, PRESSURE_SMOOTH_S
 from experiments.loop_design.mechanics import Mechanics

@@ -15,9 +15,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from sim.crane import crane_links
 from sim.hydraulics.kernel import STEADY_S
 from sim.hydraulics.layout import OUT_OVER_IN, SOFT_PA
+from sim.mechanics.crane import crane_links
 from sim.world import GRAVITY_M_S2, World
 
 DRIVEN: Final = {

@@ -12,7 +12,7 @@ import msgspec
 from controller.laws.feedback import LAWS
 from experiments.common.result import commit, environment
 from experiments.loop_design.carrier import natural
-from experiments.loop_design.pictures import draw
+from experiments.loop_design.plots import draw
 from experiments.loop_design.study import GAIN_DB, PHASE_DEG, JointStudy, Work, study
 from machine.profile import Carrier, Profile
 
@@ -34,7 +34,7 @@ INTRODUCTION: Final = (
     "bench loop-design --docs docs` computes everything and writes this page; no number is typed."
 )
 CARRIER: Final = (
-    "The carrier's loops (machines.md 7.2, 7.3). *heading* is paper B's law: bearing to the waypoint less heading, to "
+    "The carrier's loops (docs/reference/machines.md sections 7.2 and 7.3). *heading* is paper B's law: bearing to the waypoint less heading, to "
     "the rate of the articulation, judged slow and at cruising speed, far from the waypoint and near, with the "
     "receiver's latency and the odometry between its samples. *articulation* closes a wanted angle on the encoder, "
     "*swing arm* a height. Without valve and receiver the heading is L s^2 + Kp lr s + Kp v = 0:"

@@ -10,12 +10,12 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import tell
 from experiments.common.result import Result, judged
+from experiments.common.result_page import tell
 from experiments.common.trials import check_truth, checkpoint, individuals
 from experiments.common.worlds import carrier_profile, profile_named
-from experiments.navigation.figures import FIGURES, GROUNDS, INTRODUCTION, LAP, PAPER, SECTIONS, gather
-from experiments.navigation.pictures import draw
+from experiments.navigation.metrics import FIGURES, GROUNDS, INTRODUCTION, LAP, PAPER, SECTIONS, gather
+from experiments.navigation.plots import draw
 from experiments.navigation.trial import Pose, perform
 
 TRIALS: Final = 1

@@ -23,9 +23,9 @@ from experiments.plant.busworld import BusWorld
 from experiments.plant.driver import Driver
 from experiments.plant.trial import over_stakes_m, take, unload
 from machine.kinematics import Unreachable
-from sim.carrier import Drive
+from sim.mechanics.carrier import Drive
 from sim.plant import Plant
-from sim.scene import LogSpec
+from sim.scenes.arrangements import LogSpec
 from sim.world import STEP_S
 
 LOG_COUNTS: Final = (1, 12, 50, 200)

@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from can_dbc.canopen import NmtCommand, nmt_frame, sync_frame
-from can_dbc.codec import load
+from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
-from sim.carrier import PARKED, Drive
-from sim.nodes.traffic import ARM_KEY, ProtectedMessage
+from can_dbc.protocols.canopen import NmtCommand, nmt_frame, sync_frame
+from sim.mechanics.carrier import PARKED, Drive
+from sim.nodes.messages import ARM_KEY, ProtectedMessage
 from sim.nodes.valve import MODE_SPOOL
 from sim.plant import Plant
 from sim.world import STEP_NS

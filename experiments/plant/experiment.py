@@ -13,13 +13,13 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import tell
 from experiments.common.result import Result, judged, mean, rate
+from experiments.common.result_page import tell
 from experiments.common.trials import check_truth, checkpoint
 from experiments.common.worlds import carrier_profile, profile_named
 from experiments.plant import bench, endurance, energy, physics, rolling, trial
-from experiments.plant.figures import FIGURES, PAPER, SECTIONS
-from experiments.plant.pictures import draw
+from experiments.plant.metrics import FIGURES, PAPER, SECTIONS
+from experiments.plant.plots import draw
 
 TRIALS: Final = 200
 QUICK_TRIALS: Final = 2

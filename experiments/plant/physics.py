@@ -18,7 +18,7 @@ from experiments.plant.driver import Driver
 from experiments.plant.signals import Ringing, ringing
 from experiments.plant.trial import take
 from sim.hydraulics import Hydraulics
-from sim.scene import LogSpec
+from sim.scenes.arrangements import LogSpec
 from sim.world import GRAVITY_M_S2, STEP_S, World
 
 SAG_REACH_M: Final = 6.0

@@ -14,7 +14,7 @@ import numpy as np
 from experiments.common.pool import Job
 from experiments.common.worlds import opened
 from machine.carrier import turning_radius_m
-from sim.carrier import PARKED, Drive
+from sim.mechanics.carrier import PARKED, Drive
 from sim.world import GRAVITY_M_S2, STEP_S, World
 
 EVERY: Final = 20
@@ -39,7 +39,7 @@ def _steer(world: World, target_rad: float) -> list[float]:
 def turning(job: Job) -> dict[str, Any]:
     """Drive at the cruising speed with the articulation held; fit a circle to the path of the front axle's middle.
 
-    Closed form (machines.md 7.1): R = (lf cos g + lr) / sin g, heading per metre 1 / R.
+    Closed form (docs/reference/machines.md section 7.1): R = (lf cos g + lr) / sin g, heading per metre 1 / R.
     """
     o = job.options
     metrics: dict[str, float] = {}

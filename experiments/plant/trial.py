@@ -12,9 +12,9 @@ from experiments.common.worlds import opened, to_base, yaw_in_base
 from experiments.plant.driver import Driver
 from machine.grapple import lowest_tip_below_pin_m
 from machine.kinematics import Unreachable
-from sim.bunk import from_bunk
 from sim.evaluator import LIFTED_M, Judge
-from sim.logs import LogState
+from sim.wood.bunk import from_bunk
+from sim.wood.logs import LogState
 from sim.world import STEP_S, World
 
 AIM_M: Final = 0.04

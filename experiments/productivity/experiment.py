@@ -7,15 +7,15 @@ from typing import Any, Final
 from rich.console import Console
 
 from experiments.common import pool
+from experiments.common.mission_trial import MISSION_SOURCES
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.report import tell
 from experiments.common.result import Result, judged
+from experiments.common.result_page import tell
 from experiments.common.trials import check_truth, checkpoint, tell_failures
 from experiments.common.worlds import carrier_profile, profile_named
-from experiments.forwarding_mission.experiment import SOURCES
-from experiments.productivity.figures import FIGURES, INTRODUCTION, gather, sections
-from experiments.productivity.pictures import draw
+from experiments.productivity.metrics import FIGURES, INTRODUCTION, gather, sections
+from experiments.productivity.plots import draw
 from experiments.productivity.trial import perform
 
 TRIALS: Final = 1
@@ -40,7 +40,7 @@ def run(options: Options, console: Console) -> Result:
     tongs_s = grapple.close_time_s + grapple.open_time_s
     trials = 1 if options.quick else options.trials or TRIALS
     jobs = plan(options, name, trials)
-    with checkpoint(options, jobs, [name], options.truth, SOURCES) as kept:
+    with checkpoint(options, jobs, [name], options.truth, MISSION_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "runs", console)
         result = judged(
             "productivity", FIGURES, gather(outcomes, tongs_s), profile=name, seed=options.seed, trials=trials,

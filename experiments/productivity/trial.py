@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from experiments.common.mission_trial import run_mission
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
-from experiments.forwarding_mission.trial import judged
-from experiments.productivity.work import work
+from experiments.productivity.tasks import work
 
 
 def perform(job: Job) -> dict[str, Any]:
     """``options``: profile, truth, amount, way, limit_s; the kind of the job is that of the work."""
     o = job.options
     mission, site = work(job.kind, profile_named(o["profile"]), o["truth"], job.seed, o["amount"])
-    return judged(job, mission, site)
+    return run_mission(job, mission, site)

@@ -17,8 +17,8 @@ import sys
 import time
 from typing import Final
 
-from can_dbc.canopen import SYNC_ID
-from can_dbc.tick_record import RecordRefused, TickRecord, decode
+from can_dbc.messages.tick_record import RecordRefused, TickRecord, decode
+from can_dbc.protocols.canopen import SYNC_ID
 from experiments.timing.continuity import Continuity, databases
 from machine.load import ProfileError, load_profile
 from machine.profile import Profile

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-from can_dbc.codec import Database, load
-from can_dbc.e2e import frame_crc
+from can_dbc.dbc.codec import Database, load
+from can_dbc.protocols.e2e import frame_crc
 from machine.profile import Profile
 
 

@@ -11,13 +11,13 @@ from typing import Final
 from rich.console import Console
 
 from experiments.common.registry import Options
-from experiments.common.report import tell
 from experiments.common.result import Result, commit, environment
-from experiments.timing import host, pictures, reference, verdict
-from experiments.timing.figures import FIGURES, SECTIONS
-from experiments.timing.stand import Setting, Stand
-from experiments.timing.windows import Window, load, measure, pooled, system_calls
-from host.exits import Exit, Stopped
+from experiments.common.result_page import tell
+from experiments.timing import evaluation, host_activity, plots, reference_loops
+from experiments.timing.measurement import Window, load, measure, pooled, system_calls
+from experiments.timing.metrics import FIGURES, SECTIONS
+from experiments.timing.testbed import Setting, Stand
+from host.exit_codes import CommandFailed, ExitCode
 from machine.load import load_profile
 
 FORWARDER: Final = "aoro_fc8"
@@ -73,7 +73,7 @@ def run(options: Options, console: Console) -> Result:
     Raises:
         Stopped: a tool is missing or a process does not run.
     """
-    if missing := reference.missing_tools():
+    if missing := reference_loops.missing_tools():
         tools, packages = ", ".join(missing), " ".join(missing.values())
         raise Stopped(Exit.CONFIGURATION, f"timing needs {tools}: apt-get install {packages}")
     plan = QUICK if options.quick else FULL
@@ -84,8 +84,8 @@ def run(options: Options, console: Console) -> Result:
     fast = on_stand(fast_setting, plan, options.out / "fast", console)
     metrics, judged = gather(slow, fast)
     metrics |= frame_costs(options.quick, console)
-    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
-    surroundings = host.describe()
+    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
+    surroundings = host_activity.describe()
     result = Result(
         experiment="timing",
         commit=commit(),
@@ -108,7 +108,7 @@ def run(options: Options, console: Console) -> Result:
     options.out.mkdir(parents=True, exist_ok=True)
     durations = {name: pooled([w.durations[name] for w in judged]) for name in judged[0].durations}
     inputs = judged[-1].end.inputs
-    pictures.draw(verdict.loops(judged), verdict.loops(slow.loaded), durations, inputs, options.out)
+    plots.draw(evaluation.loops(judged), evaluation.loops(slow.loaded), durations, inputs, options.out)
     tell(result, "Timing, measured", INTRODUCTION, SECTIONS, options, console, setting(result, plan))
     for name, why in found.inconclusive.items():
         console.print(f"[yellow]inconclusive[/yellow] {name}: {why}", highlight=False, soft_wrap=True)
@@ -178,25 +178,25 @@ def _last(done: Sequence[Window]) -> str:
 
 def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[Window]]:
     """All metrics of the stands, and the quiet windows that were judged."""
-    judged, enough = verdict.chosen(slow.quiet)
-    metrics = verdict.per_tick(slow.quiet) | verdict.of_host(slow.quiet, enough)
+    judged, enough = evaluation.chosen(slow.quiet)
+    metrics = evaluation.per_tick(slow.quiet) | evaluation.of_host(slow.quiet, enough)
     metrics["period_us"] = slow.quiet[0].end.period_ns / 1e3
     for stage in ("cpu", "tick"):
         name = "tick_cpu" if stage == "cpu" else "tick"
-        metrics |= verdict.spread_us(name, pooled([w.durations[stage] for w in judged]))
-    metrics |= verdict.spread_us("sample_to_command", pooled([w.durations["sample_to_command"] for w in judged]))
-    metrics |= verdict.wakeups("", judged)
+        metrics |= evaluation.spread_us(name, pooled([w.durations[stage] for w in judged]))
+    metrics |= evaluation.spread_us("sample_to_command", pooled([w.durations["sample_to_command"] for w in judged]))
+    metrics |= evaluation.wakeups("", judged)
     ours, theirs = [w.durations["wake"] for w in judged], [w.cyclictest for w in judged]
     for name, share in (("p50", 0.5), ("p99", 0.99), ("p999", 0.999)):
-        metrics |= verdict.ratio(f"wakeup_{name}_ratio", ours, theirs, share)
+        metrics |= evaluation.ratio(f"wakeup_{name}_ratio", ours, theirs, share)
     metrics["judged_cycles"] = float(sum(w.ticks + w.missed for w in judged))
     metrics["missed"] = float(sum(w.missed for w in judged))
     metrics["missed_everywhere"] = float(sum(w.missed for w in slow.quiet))
-    metrics |= _renamed(verdict.wakeups("", slow.loaded), "_", "_loaded_", 1) | loaded("", slow.loaded)
+    metrics |= _renamed(evaluation.wakeups("", slow.loaded), "_", "_loaded_", 1) | loaded("", slow.loaded)
     metrics["stops"] = float(slow.stops + fast.stops)
     metrics |= system_call_metrics(slow.calls)
-    metrics |= verdict.spread_us("tick1k_cpu", pooled([w.durations["cpu"] for w in fast.quiet]))
-    metrics |= _renamed(verdict.wakeups("", fast.quiet), "_", "1k_", 1) | loaded("_1k", fast.loaded)
+    metrics |= evaluation.spread_us("tick1k_cpu", pooled([w.durations["cpu"] for w in fast.quiet]))
+    metrics |= _renamed(evaluation.wakeups("", fast.quiet), "_", "1k_", 1) | loaded("_1k", fast.loaded)
     metrics["ticks_1k"] = float(sum(w.ticks for w in fast.quiet))
     metrics["missed_1k"] = float(sum(w.missed for w in fast.quiet))
     return metrics, judged
@@ -231,9 +231,9 @@ def system_call_metrics(calls: tuple[dict[str, int], float] | None) -> dict[str,
 
 def frame_costs(quick: bool, console: Console) -> dict[str, float]:
     """Cost of one frame, raw and through python-can, on this host."""
-    from experiments.benches import bus
+    from experiments.timing import receive_cost
 
     frames, rounds = (1_000, 3) if quick else (10_000, 9)
     with console.status("timing: cost of a frame"):
-        found: dict[str, float] = bus.measure(frames, rounds)["metrics"]
+        found: dict[str, float] = receive_cost.measure(frames, rounds)["metrics"]
     return found

@@ -11,16 +11,16 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from can_dbc.timing_page import Facts
-from experiments.common.plots import OIL, STEEL, TIMBER, sheet
+from can_dbc.timing.page import Facts
+from experiments.common.plot_style import OIL, STEEL, TIMBER, sheet
 from experiments.common.registry import Options
-from experiments.common.report import Section, tell
 from experiments.common.result import Figure, Result, commit, environment
-from experiments.timing import host, verdict
-from experiments.timing.pictures import exceeded
-from experiments.timing.stand import Setting, Stand
-from experiments.timing.verdict import STEADY_TICKS
-from experiments.timing.windows import between
+from experiments.common.result_page import Section, tell
+from experiments.timing import evaluation, host_activity
+from experiments.timing.evaluation import STEADY_TICKS
+from experiments.timing.measurement import between
+from experiments.timing.plots import exceeded
+from experiments.timing.testbed import Setting, Stand
 from machine.load import load_profile
 from machine.reasons import Reason
 
@@ -120,7 +120,7 @@ def run(options: Options, console: Console) -> Result:
     profile = load_profile(options.profile)
     setting = Setting(options.profile, profile.rate_hz, options.bus)
     console.print(f"soak: {minutes:.3g} minutes, {profile.name} at {profile.rate_hz} Hz on {options.bus}")
-    first = host.sample()
+    first = host_activity.sample()
     with console.status("soak: starting") as status, Stand(setting, options.out / "stand") as stand:
         stand.wait(WARM_S)
         begin = stand.fresh_timing()
@@ -140,13 +140,13 @@ def run(options: Options, console: Console) -> Result:
         "missed": float(end.facts.missed - begin.facts.missed),
         "stops": float(stops),
         "active_share": sum(r.mode == "ACTIVE" for r in readings) / len(readings),
-        "steal_ms": host.between(first, host.sample()).steal_ms,
+        "steal_ms": host_activity.between(first, host_activity.sample()).steal_ms,
         **memory(readings),
         **frames(before, after, begin.facts, end.facts),
-        **verdict.spread_us("wakeup", durations["wake"]),
-        **verdict.spread_us("tick_cpu", durations["cpu"]),
+        **evaluation.spread_us("wakeup", durations["wake"]),
+        **evaluation.spread_us("tick_cpu", durations["cpu"]),
     }
-    found = verdict.judge(FIGURES, metrics, untold(metrics, halts))
+    found = evaluation.judge(FIGURES, metrics, untold(metrics, halts))
     result = Result(
         experiment="soak",
         commit=commit(),
@@ -155,7 +155,7 @@ def run(options: Options, console: Console) -> Result:
         trials=1,
         metrics=metrics,
         paper={},
-        environment={**environment(), **host.describe(), "bus": options.bus, "lab": lab(), "modes": "; ".join(modes)},
+        environment={**environment(), **host_activity.describe(), "bus": options.bus, "lab": lab(), "modes": "; ".join(modes)},
         limits={f.name: (f.least, f.most) for f in FIGURES if f.limit_text()},
         missed=found.missed,
         inconclusive=tuple(found.inconclusive),

@@ -16,7 +16,7 @@ from autonomy.localization.localizer import AGREEING, Localizer
 from autonomy.localization.motion_model import SIZE, Noise, Odometry, State, advance, antenna, antenna_reach, front_attitude
 from autonomy.localization.local_plane import Plane, heading_from_yaw, wrapped, yaw_from_heading
 from can_dbc.messages.crane import DriveSetpoint, Steering, VehicleReport
-from experiments.navigation.model import FIRM, MUD, SLOPE, Ground, Individual, Vehicle, individual
+from tests.autonomy.carrier_model import FIRM, MUD, SLOPE, Ground, Individual, Vehicle, individual
 from machine.load import load_profile
 from sim.geometry.geodesy import Site
 

@@ -17,7 +17,7 @@ from autonomy.navigation.clothoid_path import drivable
 from autonomy.navigation.navigator import LEASE_NS, MOVES_NS, OBEYS_NS, Navigator, Phase
 from autonomy.navigation.waypoint_drive import LEAST_M, PaperB, Waypoint
 from can_dbc.messages.crane import DriveSetpoint, Driving, Steering, VehicleReport, decode, encode
-from experiments.navigation.model import FIRM, MUD, Ground, Individual, Vehicle, individual
+from tests.autonomy.carrier_model import FIRM, MUD, Ground, Individual, Vehicle, individual
 from machine.carrier import turning_radius_m
 
 # -- drives on the model

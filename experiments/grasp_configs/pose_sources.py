@@ -1,0 +1,185 @@
+"""Where a grasp planner's logs come from: the plant itself, or the camera on the stick and a perception.
+
+``true``: as a detector without errors.  ``ours``: this project's perception with its own segmentation; ``masked``: the
+same with true masks.  ``faithful``: paper A's steps on our masks (bounding extents of each mask's points).  The camera
+was surveyed; it sees the logs from where the crane stands at the start, and again from above where the activity waits
+for that.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, Protocol
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from autonomy.perception.camera.frame import Frame, Pose, rescaled
+from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.papers import paper_a
+from autonomy.perception.pipeline import Masked, Perception
+from hil.calibration.camera_survey import SURVEYED, surveyed_profile
+from machine.profile import Profile
+from sim.camera.rig import CameraRig
+from sim.plant import Plant
+from sim.wood.logs import LogState
+
+CAMERA: Final = "stick"
+PICTURES: Final = 3
+LEAST_PX: Final = 60
+RATE_NS: Final = 66_666_667
+LOOK_NS: Final = PICTURES * RATE_NS
+MISSED_M, MISSED_RAD, MISSED_WIDTH_M = 0.15, math.radians(8.0), 0.06
+"""A log that is seen further off than this, or more turned, or so much thicker or thinner, misleads a planner."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """The logs, and what seeing took."""
+
+    logs: tuple[LogObservation, ...] = ()
+    seconds: float = 0.0
+
+
+def true_poses(plant: Plant) -> tuple[LogObservation, ...]:
+    """What lies where, as the plant knows it."""
+    return tuple(
+        LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m) for i, log in enumerate(plant.logs())
+    )
+
+
+class Known:
+    """The poses that the plant knows."""
+
+    def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
+        self._plant = plant
+
+    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
+        """What lies where now."""
+        return Seen(true_poses(self._plant))
+
+
+class Ours:
+    """Three pictures of the standing camera at a look, through the whole perception; each look adds to the ones before.
+
+    ``masked``: with a perfect segmentation, the renderer's masks.
+    """
+
+    def __init__(self, plant: Plant, profile: Profile, seed: int, masked: bool = False) -> None:
+        self._masked = masked
+        self._camera = _Surveyed(plant, profile, seed)
+        self._perception = Perception(profile, SURVEYED)
+
+    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
+        """The logs as they are known after the pictures."""
+        from autonomy.perception.segmentation.log_segmenter import segment
+
+        seen = self._camera.look(stamp_ns, q)
+        begun = time.process_time()
+        for frame in seen.frames:
+            masks: Sequence[Masked] = seen.masks if self._masked else segment(frame)
+            tracks = self._perception.step(frame, seen.pose, masks)
+        seconds = (time.process_time() - begun) / len(seen.frames)
+        return Seen(tuple(t.estimate.observation(t.id) for t in tracks if t.hits > 1), seconds)
+
+
+class Faithful:
+    """Paper A's way with one picture: points under each mask, their middle, main direction and extents.
+
+    What it sees is as good as known to it: nothing is looked at twice.
+    """
+
+    def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
+        self._camera = _Surveyed(plant, profile, seed)
+
+    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
+        """The logs of a picture."""
+        from autonomy.perception.segmentation.log_segmenter import segment
+
+        seen, begun = self._camera.look(stamp_ns, q), time.process_time()
+        frame, pose = seen.frames[0], seen.pose
+        found = [paper_a.log_of(frame, one.mask) for one in segment(frame)]
+        logs = []
+        for log in found:
+            if log is not None and log.diameter_m > 0.0 and log.length_m > 0.0:
+                at, axis = pose.to_base(log.center_m), pose.rotation @ log.axis
+                logs.append(
+                    LogObservation(len(logs), _triple(at), _triple(axis), float(log.length_m), float(log.diameter_m))
+                )
+        return Seen(tuple(logs), time.process_time() - begun)
+
+
+class Sight(Protocol):
+    """Sees the logs from where the crane stands."""
+
+    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
+        """The logs, now that the joints are measured at ``q`` [rad, EXT m]."""
+
+
+POSES: Final[dict[str, Callable[[Plant, Profile, int], Sight]]] = {
+    "true": Known,
+    "ours": Ours,
+    "masked": partial(Ours, masked=True),
+    "faithful": Faithful,
+}
+
+
+def misled(truth: Sequence[LogState], seen: Sequence[LogObservation]) -> bool:
+    """Whether perception missed a log, made one up, or has one far from where it is (paper A's SE)."""
+    if len(seen) != len(truth):
+        return True
+    apart = [[math.dist(o.center_m, log.position_m) for o in seen] for log in truth]
+    for i, j in zip(*linear_sum_assignment(np.reshape(apart, (len(truth), len(seen)))), strict=True):
+        log, near = truth[i], seen[j]
+        away = np.asarray(near.center_m) - log.position_m
+        across = float(np.linalg.norm(away - (away @ np.asarray(log.axis)) * np.asarray(log.axis)))
+        turned = math.acos(min(1.0, abs(float(np.dot(near.axis, log.axis)))))
+        wide = abs(near.diameter_m - log.diameter_m)
+        if across > MISSED_M or turned > MISSED_RAD or wide > MISSED_WIDTH_M:
+            return True
+    return False
+
+
+@dataclass(frozen=True, slots=True)
+class Mask:
+    """A log's pixels (H, W) bool."""
+
+    mask: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Pictures of the standing camera, where the profile says it stands, and the true masks in them."""
+
+    frames: tuple[Frame, ...]
+    pose: Pose
+    masks: tuple[Mask, ...]
+
+
+class _Surveyed:
+    """The camera on the stick of a machine known as ``profile``, as a survey of its mount and depth left it."""
+
+    def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
+        self._plant = plant
+        self._rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
+        self._profile = surveyed_profile(profile, plant.world.truth, CAMERA, seed)
+
+    def look(self, stamp_ns: int, q: Sequence[float]) -> Look:
+        """``PICTURES`` of what lies there now."""
+        camera, ids = self._profile.cameras[CAMERA], self._rig.picture(CAMERA)[2].mask
+        pose = optical_pose(self._profile, camera, q)
+        numbers = range(1, len(self._plant.logs()) + 1)
+        masks = [Mask(ids == i) for i in numbers if np.count_nonzero(ids == i) >= LEAST_PX]
+        taken = [self._rig.frame(CAMERA, stamp_ns + i * RATE_NS) for i in range(PICTURES)]
+        frames = [Frame(f.name, f.stamp_ns, f.rgb, f.depth_m, f.intrinsics) for f in taken]
+        return Look(tuple(rescaled(f, camera.depth_scale) for f in frames), pose, tuple(masks))
+
+
+def _triple(v: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(a) for a in v)
+    return x, y, z

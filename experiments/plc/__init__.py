@@ -1,0 +1,1 @@
+"""The PLC path compared with the CAN path: same jobs, seeds and machines."""

@@ -1,0 +1,222 @@
+"""From windows to figures and verdicts; pure.
+
+What depends on the host's clock is compared with cyclictest in the same windows, and only in those in which cyclictest
+says that the host was quiet: it wakes once in each of our periods, so a stall of the host that is long enough to make
+us miss a deadline shows there too.  Where too few windows are quiet, or a run is too short to tell, the verdict is
+"inconclusive", whether the number would pass or not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from can_dbc.timing.durations import BINS, Durations, edge_ns
+from experiments.common.result import Figure
+from experiments.timing.measurement import Window, pooled
+
+QUIET_LONGEST: Final = 0.2
+"""Of a period: cyclictest's longest lateness in a quiet window."""
+QUIET_P99: Final = 0.05
+"""Of a period: cyclictest's p99 in a quiet window."""
+QUIET_STEAL: Final = 0.005
+"""Share of the time of one processor that the hypervisor may take in a quiet window."""
+QUIET_SHARE: Final = 0.5
+"""Of the windows, for the host to be called quiet enough."""
+RATIO_CYCLES: Final = 10_000
+MISS_CYCLES: Final = 100_000
+STEADY_TICKS: Final = 10_000
+CPU_TICKS: Final = 1_000
+RESAMPLES: Final = 400
+EDGES_NS: Final = np.array([0, *(edge_ns(i) for i in range(BINS))], float)
+
+
+def quiet(window: Window) -> bool:
+    """Whether cyclictest and the steal counter say that the host left us alone."""
+    period_ns = window.end.period_ns
+    return (
+        window.cyclictest.longest_ns <= QUIET_LONGEST * period_ns
+        and window.cyclictest.quantile_ns(0.99) <= QUIET_P99 * period_ns
+        and window.host.steal_ms <= QUIET_STEAL * 1e3 * window.host.seconds
+    )
+
+
+def chosen(windows: Sequence[Window]) -> tuple[list[Window], bool]:
+    """The quiet windows and True; all of them and False where too few are quiet."""
+    good = [w for w in windows if quiet(w)]
+    enough = len(good) >= QUIET_SHARE * len(windows)
+    return (good, True) if enough and good else (list(windows), False)
+
+
+def quantile_us(bins: np.ndarray, share: float, longest_ns: float) -> float:
+    """A quantile by linear interpolation inside its bin [us]; NaN when empty."""
+    total = bins.sum()
+    if not total:
+        return math.nan
+    cumulated = np.cumsum(bins)
+    i = int(np.searchsorted(cumulated, share * total))
+    low, high = EDGES_NS[i], min(EDGES_NS[i + 1], max(longest_ns, EDGES_NS[i])) if i < BINS - 1 else longest_ns
+    inside = (share * total - (cumulated[i] - bins[i])) / bins[i]
+    return float(low + inside * (high - low)) / 1e3
+
+
+def spread_us(name: str, histogram: Durations) -> dict[str, float]:
+    """``NAME_p50_us``, p99, p99.9 and the longest."""
+    bins, longest = np.array(histogram.bins), histogram.longest_ns
+    shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
+    found = {f"{name}_{k}_us": quantile_us(bins, share, longest) for k, share in shares.items()}
+    return found | {f"{name}_max_us": longest / 1e3 if histogram.count else math.nan}
+
+
+def ratio(name: str, ours: Sequence[Durations], theirs: Sequence[Durations], share: float) -> dict[str, float]:
+    """Ratio of a quantile over all windows, with a 95 % bootstrap interval over the windows."""
+    a, b = (np.array([h.bins for h in side], float) for side in (ours, theirs))
+    tops = [max((h.longest_ns for h in side), default=0) for side in (ours, theirs)]
+
+    def of(picked: np.ndarray) -> float:
+        up, down = (quantile_us(side[picked].sum(0), share, top) for side, top in zip((a, b), tops, strict=True))
+        return up / down if down else math.nan
+
+    n = len(ours)
+    if n == 0:
+        return {name: math.nan}
+    every = np.arange(n)
+    rng = np.random.default_rng(1)
+    drawn = [of(rng.integers(0, n, n)) for _ in range(RESAMPLES)] if n > 1 else [of(every)]
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return {name: of(every), f"{name}_low": float(low), f"{name}_high": float(high), f"{name}_n": float(n)}
+
+
+def per_tick(windows: Sequence[Window]) -> dict[str, float]:
+    """What the process did in all windows: totals, or per tick where the name says so."""
+    ticks = max(1, sum(w.ticks for w in windows))
+    first, last = windows[0].begin.process, windows[-1].end.process
+    span = max(1, windows[-1].end.ticks - windows[0].begin.ticks)
+    frames = sum(b.received + b.sent for b in windows[-1].end.buses)
+    frames -= sum(b.received + b.sent for b in windows[0].begin.buses)
+    lost = sum(b.dropped + b.refused for b in windows[-1].end.buses)
+    lost -= sum(b.dropped + b.refused for b in windows[0].begin.buses)
+    return {
+        "ticks": float(ticks),
+        "page_faults": float(last.minor_faults + last.major_faults - first.minor_faults - first.major_faults),
+        "gc_runs": float(last.gc_runs - first.gc_runs),
+        "allocated_blocks_growth": float(block_growth(windows)),
+        "resident_growth_kb": float(last.resident_kb - first.resident_kb),
+        "voluntary_switches_per_tick": (last.voluntary_switches - first.voluntary_switches) / span,
+        "involuntary_switches_per_tick": (last.involuntary_switches - first.involuntary_switches) / span,
+        "cpu_share": (last.cpu_ns - first.cpu_ns) / (windows[-1].end.written_ns - windows[0].begin.written_ns),
+        "frames_per_s": frames / ((windows[-1].end.written_ns - windows[0].begin.written_ns) * 1e-9),
+        "frames_lost": float(lost),
+    }
+
+
+def block_growth(windows: Sequence[Window]) -> int:
+    """Blocks that the interpreter holds at the end beyond those at the beginning; what breathes from reading to
+    reading is taken out by comparing the least of each half.
+    """
+    readings = [w.begin.process.allocated_blocks for w in windows] + [windows[-1].end.process.allocated_blocks]
+    half = max(1, len(readings) // 2)
+    return min(readings[half:]) - min(readings[:half])
+
+
+def of_host(windows: Sequence[Window], enough: bool) -> dict[str, float]:
+    """Verdict on the host, and what it did."""
+    seconds = sum(w.host.seconds for w in windows)
+    pressures = [w.host.pressure for w in windows if w.host.pressure is not None]
+    return {
+        "host_verdict": float(enough),
+        "windows": float(len(windows)),
+        "quiet_windows": float(sum(map(quiet, windows))),
+        "steal_ms": sum(w.host.steal_ms for w in windows),
+        "measured_s": seconds,
+        "pressure": sum(pressures) / len(pressures) if pressures else math.nan,
+        "load_average": max(w.host.load for w in windows),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Names of the figures that are missed, and of those that stay open, each with the reason."""
+
+    missed: tuple[str, ...]
+    inconclusive: dict[str, str]
+
+
+def judge(figures: Iterable[Figure], metrics: Mapping[str, float], enough: Mapping[str, str]) -> Verdict:
+    """Every figure with a limit; ``enough`` names those that this run cannot tell, with the reason.
+
+    A figure that this run cannot tell is inconclusive, even when its number lies within the limit; one that has no
+    number is inconclusive too.
+    """
+    missed, open_ = [], {}
+    for figure in figures:
+        if figure.least is None and figure.most is None:
+            continue
+        value = metrics.get(figure.name, math.nan)
+        if figure.name in enough:
+            open_[figure.name] = enough[figure.name]
+        elif math.isnan(value):
+            open_[figure.name] = "it could not be measured here"
+        elif not figure.holds(value):
+            missed.append(figure.name)
+    return Verdict(tuple(missed), open_)
+
+
+def untold(metrics: Mapping[str, float]) -> dict[str, str]:
+    """The figures that a run with these metrics cannot tell, with the reason."""
+    found: dict[str, str] = {}
+    noisy = "cyclictest itself was late: the host is too noisy to tell"
+    ticks = metrics["ticks"]
+    for name in ("wakeup_p50_ratio", "wakeup_p99_ratio"):
+        if not metrics["host_verdict"]:
+            found[name] = noisy
+        elif metrics["judged_cycles"] < RATIO_CYCLES:
+            found[name] = f"{metrics['judged_cycles']:.0f} cycles are too few; it takes {RATIO_CYCLES}"
+    if not metrics["host_verdict"] and metrics["missed"]:
+        found["missed"] = noisy
+    elif metrics["judged_cycles"] < MISS_CYCLES and not metrics["missed"]:
+        found["missed"] = f"{metrics['judged_cycles']:.0f} cycles are too few; it takes {MISS_CYCLES}"
+    for name in ("page_faults", "gc_runs", "allocated_blocks_growth"):
+        if ticks < STEADY_TICKS and metrics[name] <= 0.0:
+            found[name] = f"{ticks:.0f} ticks are too few; it takes {STEADY_TICKS}"
+    for name, count in (("tick_cpu_p99_us", ticks), ("tick1k_cpu_p99_us", metrics.get("ticks_1k", 0.0))):
+        if count < CPU_TICKS:
+            found[name] = f"{count:.0f} ticks are too few; it takes {CPU_TICKS}"
+    if not metrics["host_verdict"] and metrics.get("sample_to_command_p99_us", 0.0) > metrics["period_us"]:
+        found["sample_to_command_p99_us"] = noisy
+    for end in ("", "_1k"):
+        if reason := _loaded_open(metrics, end):
+            found[f"missed_loaded{end}_share"] = reason
+    return found
+
+
+def _loaded_open(metrics: Mapping[str, float], end: str) -> str:
+    """Why the comparison under load tells nothing, if so."""
+    ours, plain = metrics.get(f"missed_loaded{end}", 0.0), metrics.get(f"missed_loaded_plain{end}", 0.0)
+    if ours and metrics.get(f"missed_loaded_cyclictest{end}", 0.0) >= ours:
+        return "cyclictest missed as many: the host took the processor away"
+    if plain < 100.0 and ours * 100.0 <= plain:
+        return f"the plain loop missed only {plain:.0f}, too few to tell a hundredth"
+    return ""
+
+
+def wakeups(kind: str, windows: Sequence[Window]) -> dict[str, float]:
+    """Lateness of ours, cyclictest's and the plain loop's wake-ups, as metrics that begin with ``kind``."""
+    found: dict[str, float] = {}
+    ours, theirs, plain = loops(windows)
+    for name, histogram in (("wakeup", ours), ("cyclictest", theirs), ("plain", plain)):
+        found |= spread_us(f"{kind}{name}", histogram)
+    return found
+
+
+def loops(windows: Sequence[Window]) -> tuple[Durations, Durations, Durations]:
+    """Ours, cyclictest's and the plain loop's histograms over all windows."""
+    return (
+        pooled([w.durations["wake"] for w in windows]),
+        pooled([w.cyclictest for w in windows]),
+        pooled([w.plain.lateness for w in windows]),
+    )

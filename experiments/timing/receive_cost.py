@@ -1,0 +1,312 @@
+"""What receiving a frame costs, along every path, in one run and in turns.
+
+Every path gets a drain's worth of crane0 traffic outside the clock, then takes it in and decodes it as the controller
+does (E2E check, `MessageCodec.receive`), on the clock of the process's own CPU time.  Where the kernel has CAN the
+frames go over an interface.  Where it has none, an AF_UNIX datagram pair carries the same struct can_frame with the
+same time stamps, and the code on top is the same: ours (`can_dbc.bus.frame_socket`) as python-can's (its `SocketcanBus`
+with that socket in place of its own).  Figures are medians over rounds, in microseconds per frame.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import random
+import socket
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any, Final
+
+import can
+from can.interfaces.socketcan import SocketcanBus
+
+from can_dbc.bus.base import DRAIN_LIMIT, BusStats, kernel_has_can, open_bus
+from can_dbc.bus.frame_socket import CAN_FRAME, FrameSocket
+from can_dbc.bus.wire_client import WireClient
+from can_dbc.dbc.codec import Database, MessageCodec, load
+from can_dbc.frame import Frame
+from can_dbc.protocols.e2e import Checker, Sender
+from hil.wire.server import Server
+from host.exit_codes import CommandFailed, ExitCode
+
+DRAIN_FRAMES: Final = 14
+"""Frames per drain: what a tick at 200 Hz brings on crane0."""
+TICK_NS: Final = 5_000_000
+LIMIT_US: Final = 5.0
+"""Receive, check and decode may cost this much per frame on an ordinary host."""
+QUIET_S: Final = 0.1
+"""A kernel interface is measured on when nothing was heard on it for so long."""
+_SO_TIMESTAMPNS: Final = 35
+
+Wire = tuple[int, bytes]
+
+
+class Traffic:
+    """What the controller hears on crane0, by cycle time, with values in range and running E2E counters."""
+
+    def __init__(self, database: Database) -> None:
+        rng = random.Random(1)
+        heard = [c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders]
+        self._messages = [(c, _payload(c, rng), Sender(c.data_ids) if c.data_ids else None) for c in heard]
+        self._frames = self._endless()
+
+    def take(self, count: int) -> list[Wire]:
+        """The next frames on the bus."""
+        return [next(self._frames) for _ in range(count)]
+
+    def _endless(self) -> Iterator[Wire]:
+        now_ns = 0
+        while True:
+            for codec, payload, sender in self._messages:
+                if now_ns % codec.cycle_time_ns == 0:
+                    yield codec.key, sender.protect(payload) if sender else payload
+            now_ns += TICK_NS
+
+
+class Reader:
+    """E2E check and decoding by key, as `controller.crane.inputs` does it; ``believed`` counts the good frames."""
+
+    def __init__(self, database: Database) -> None:
+        self._slots = {
+            key: (Checker(codec.data_ids) if codec.data_ids else None, codec.receive)
+            for key, codec in database.by_key.items()
+        }
+        self.believed = 0
+
+    def read(self, frames: Sequence[Frame]) -> None:
+        for _, key, data in frames:
+            checker, receive = self._slots[key]
+            if checker is None or checker.check(data).usable:
+                receive(data)
+                self.believed += 1
+
+    def read_messages(self, messages: Sequence[can.Message]) -> None:
+        """The same for python-can's messages."""
+        for message in messages:
+            checker, receive = self._slots[message.arbitration_id]
+            data = bytes(message.data)
+            if checker is None or checker.check(data).usable:
+                receive(data)
+                self.believed += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """One path: ``send`` makes frames wait (not timed), ``drain`` takes all of them into a list."""
+
+    name: str
+    label: str
+    send: Callable[[list[Wire]], None]
+    drain: Callable[[list[Any]], object]
+    messages: bool = False
+
+
+def measure(frames: int, rounds: int) -> dict[str, Any]:
+    """Figures of every path there is: rounds of ``frames`` frames each, the paths in turns.
+
+    ``metrics``: ``rx_us`` and ``rx_decode_us`` of the fast path, the same with the name of each other path, and
+    ``rx_decode_ratio``, python-can's cost by ours.  ``lab``: measured inside user-mode Linux, where a system call costs
+    a hundred times as much, so that nothing but the ratio means anything.  Raises `CommandFailed` when the bus is in use.
+    """
+    database = load("crane")
+    clock, clock_name = _clock()
+    samples: dict[str, list[float]] = {}
+    with contextlib.ExitStack() as stack:
+        lanes = _lanes(stack)
+        time.sleep(QUIET_S)
+        for lane in lanes:
+            if _discard(lane):
+                raise CommandFailed(ExitCode.BUS, f"{lane.label}: the bus is in use; stop what runs on it, then measure.")
+        traffic = {lane.name: Traffic(database) for lane in lanes}
+        readers = {lane.name: Reader(database) for lane in lanes}
+        gc.collect()
+        gc.disable()
+        stack.callback(gc.enable)
+        for _ in range(rounds):
+            for lane in lanes:
+                rx_ns, decode_ns = _round(lane, traffic[lane.name], readers[lane.name], frames, clock)
+                samples.setdefault(f"rx_{lane.name}_us", []).append(rx_ns / frames / 1000)
+                samples.setdefault(f"rx_decode_{lane.name}_us", []).append((rx_ns + decode_ns) / frames / 1000)
+    for name, reader in readers.items():
+        if reader.believed < rounds * frames - 200:  # the first frame of each stream only qualifies it
+            raise AssertionError(f"path {name} believed {reader.believed} of {rounds * frames} frames")
+    metrics = {name.replace("_ours", ""): median(values) for name, values in samples.items()}
+    metrics["rx_decode_ratio"] = metrics["rx_decode_pythoncan_us"] / metrics["rx_decode_us"]
+    return {
+        "frames": frames, "rounds": rounds, "clock": clock_name, "lab": os.environ.get("TIMBERHAND_LAB") == "uml",
+        "paths": {lane.name: lane.label for lane in lanes}, "limit_us": LIMIT_US, "metrics": metrics,
+    }  # fmt: skip
+
+
+def _round(lane: Lane, traffic: Traffic, reader: Reader, frames: int, clock: Callable[[], int]) -> tuple[int, int]:
+    """Time [ns] of receiving, and of checking and decoding, for one round."""
+    _discard(lane)  # on an interface everybody heard the other paths' frames
+    read = reader.read_messages if lane.messages else reader.read
+    rx_ns = decode_ns = 0
+    for start in range(0, frames, DRAIN_FRAMES):
+        wanted = min(DRAIN_FRAMES, frames - start)
+        lane.send(traffic.take(wanted))
+        received: list[Any] = []
+        begin_ns = clock()
+        lane.drain(received)
+        middle_ns = clock()
+        read(received)
+        decode_ns += clock() - middle_ns
+        rx_ns += middle_ns - begin_ns
+        if len(received) != wanted:
+            raise CommandFailed(ExitCode.BUS, f"{lane.label} gave {len(received)} of {wanted} frames; is anybody else sending?")
+    return rx_ns, decode_ns
+
+
+def _discard(lane: Lane) -> int:
+    """Takes in and throws away all that waits; returns how much it was."""
+    count = 0
+    while True:
+        scrap: list[Any] = []
+        lane.drain(scrap)
+        if not scrap:
+            return count
+        count += len(scrap)
+
+
+def _lanes(stack: contextlib.ExitStack) -> list[Lane]:
+    """Every path of this machine: ours, python-can's, the wire's."""
+    interface = _interface()
+    if interface is None:
+        fast, slow = _ours_on_a_pair(stack), _python_can_on_a_pair(stack)
+    else:
+        fast, slow = _ours_on(interface, stack), _python_can_on(interface, stack)
+    return [fast, slow, _wire(stack)]
+
+
+def _interface() -> str | None:
+    """A kernel CAN interface that nobody depends on; None where there is none."""
+    present = {name for _, name in socket.if_nameindex()}
+    return next((name for name in ("vcan0", "vcan1") if name in present), None) if kernel_has_can() else None
+
+
+def _ours_on(interface: str, stack: contextlib.ExitStack) -> Lane:
+    sender, receiver = (stack.enter_context(open_bus(f"socketcan:{interface}")) for _ in range(2))
+    return Lane("ours", f"ours on {interface}", _all_of(sender.send_all), receiver.drain)
+
+
+def _python_can_on(interface: str, stack: contextlib.ExitStack) -> Lane:
+    sender = stack.enter_context(open_bus(f"socketcan:{interface}", filters=[]))
+    receiver = stack.enter_context(can.Bus(interface="socketcan", channel=interface))
+    return Lane("pythoncan", f"python-can on {interface}", _all_of(sender.send_all), _recv_all(receiver), True)
+
+
+def _ours_on_a_pair(stack: contextlib.ExitStack) -> Lane:
+    near, far = _pair(stack)
+    link, stats = FrameSocket(near), BusStats()
+    return Lane(
+        "ours", "ours on an AF_UNIX pair", _through(far),
+        lambda frames: link.receive(frames, DRAIN_LIMIT, stats.note_error),
+    )  # fmt: skip
+
+
+def _python_can_on_a_pair(stack: contextlib.ExitStack) -> Lane:
+    near, far = _pair(stack)
+    near.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+    return Lane("pythoncan", "python-can on an AF_UNIX pair", _through(far), _recv_all(_OnPair(near)), True)
+
+
+class _OnPair(SocketcanBus):
+    """python-can's own receive path on a socket that is given."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.socket, self.channel = sock, "pair"
+        self._is_filtered = self._is_shutdown = True
+
+
+def _wire(stack: contextlib.ExitStack) -> Lane:
+    """A client of a wire bus whose daemon is this process too, so that its bus time takes none of ours."""
+    directory = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    server = Server("bench", 1_000_000, directory)
+    stack.callback(server.close)
+    greeting = threading.Thread(target=_greet, args=(server,))
+    greeting.start()
+    former = os.environ.get("TIMBERHAND_WIRE_DIR")
+    os.environ["TIMBERHAND_WIRE_DIR"] = str(directory)
+    try:
+        client = stack.enter_context(WireClient("bench"))
+    finally:
+        os.environ.pop("TIMBERHAND_WIRE_DIR")
+        if former is not None:
+            os.environ["TIMBERHAND_WIRE_DIR"] = former
+    greeting.join()
+    (member,) = server.members.values()
+    sender = server.core.attach("sender", queue_limit=DRAIN_FRAMES)
+
+    def send(frames: list[Wire]) -> None:
+        for key, data in frames:
+            server.core.submit(sender, key, data)
+        server.core.advance(server.core.now_ns + DRAIN_FRAMES * TICK_NS)
+        member.write()
+
+    return Lane("wire", "client of the wire", send, client.drain)
+
+
+def _greet(server: Server) -> None:
+    server.accept()
+    (member,) = server.members.values()
+    while not server.core.nodes:
+        member.read()
+
+
+def _pair(stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket]:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    return stack.enter_context(near), stack.enter_context(far)
+
+
+def _through(sock: socket.socket) -> Callable[[list[Wire]], None]:
+    def send(frames: list[Wire]) -> None:
+        for key, data in frames:
+            sock.send(CAN_FRAME.pack(key, len(data), data))
+
+    return send
+
+
+def _all_of(send_all: Callable[[list[Wire]], int]) -> Callable[[list[Wire]], None]:
+    def send(frames: list[Wire]) -> None:
+        if send_all(frames) != len(frames):
+            raise CommandFailed(ExitCode.BUS, "The interface takes no frames; see `ip link`.")
+
+    return send
+
+
+def _recv_all(bus: can.BusABC) -> Callable[[list[Any]], object]:
+    def drain(messages: list[Any]) -> None:
+        while (message := bus.recv(timeout=0)) is not None:
+            messages.append(message)
+
+    return drain
+
+
+def _payload(codec: MessageCodec, rng: random.Random) -> bytes:
+    """Bytes of the message with every value in range and available."""
+    while True:
+        values = []
+        for s in codec.signals:
+            low, high = s.physical(s.raw_low), s.physical(s.raw_high)
+            values.append(low + (high - low) * rng.random())
+        payload = codec.encode(*values)
+        if None not in codec.receive(payload):
+            return payload
+
+
+def _clock() -> tuple[Callable[[], int], str]:
+    """CPU time of this thread; wall time where the kernel counts CPU time in ticks, as user-mode Linux does."""
+    begin_ns = time.thread_time_ns()
+    deadline_ns = time.perf_counter_ns() + 1_000_000
+    while time.perf_counter_ns() < deadline_ns:
+        pass
+    if 500_000 < time.thread_time_ns() - begin_ns < 2_000_000:
+        return time.thread_time_ns, "CPU time"
+    return time.perf_counter_ns, "wall time"
