@@ -1,7 +1,7 @@
 """The loop of one joint as a frequency response: valve, mechanics, sensors, estimator and law, cut at the command.
 
 The controller is taken as it runs, sampled, with the gains that its own code computes (`controller.estimation.joint_estimator`,
-`controller.laws`); `tests/hil/test_loop_design.py` drives that code with sines and compares.  Laws are linear inside
+`controller.laws`); `tests/experiments/test_loop_design.py` drives that code with sines and compares.  Laws are linear inside
 their boundary layer; where super-twisting is not, its gain over the amplitude is a range (``amplitude``).
 """
 

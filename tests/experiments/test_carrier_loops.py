@@ -1,4 +1,4 @@
-"""The carrier's loops: the closed form of machines.md 7.2, the running law against its response, margins over all
+"""The carrier's loops: the closed form of docs/reference/machines.md section 7.2, the running law against its response, margins over all
 machines.
 """
 
@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from controller.estimator import JointEstimator
+from controller.estimation.joint_estimator import JointEstimator
 from controller.laws.heading import AngleLaw, WaypointLaw
 from experiments.loop_design import carrier as loops
 from experiments.loop_design.carrier import CarrierCase, angle_spec, arm_loop, heading_loop, natural
@@ -56,7 +56,7 @@ def test_a_quick_valve_and_receiver_leave_the_closed_form():
 
 
 def test_without_the_rear_axle_the_loop_is_not_damped():
-    """Only lr g' damps it: trap 3 of machines.md 13."""
+    """Only lr g' damps it: docs/reference/machines.md section 13, trap 3."""
     bare = msgspec.structs.replace(CARRIER, rear_axle_m=1e-6)
     case = CarrierCase(0.075, 1.0, 0.639, math.inf, 0.1)
     assert margins(FREQUENCY_RAD_S, heading_loop(bare, VALVE, case), 2).phase_deg < 0.0

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from experiments.benches.motion import Bench, observed
 from experiments.common.worlds import wood_of
 from machine.load import load_profile
-from sim.scene import arrangement
+from sim.scenes.arrangements import arrangement
 from timberhand.cli import app
 
 

@@ -18,7 +18,7 @@ from autonomy.grasp.network import PAPER, WEIGHTS, GraspNet, best, prepare
 from autonomy.networks.weights import load
 from experiments.common.registry import Options
 from experiments.grasp_network import experiment, folds, latency
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands import train
 from training.grasp.cornell import load as load_samples
 
@@ -85,9 +85,9 @@ def test_any_folder_in_the_layout_is_judged(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_samples_is_a_sentence(tmp_path: Path) -> None:
-    with pytest.raises(Stopped, match="no Cornell samples") as stopped:
+    with pytest.raises(CommandFailed, match="no Cornell samples") as stopped:
         experiment.run(options(tmp_path, data=tmp_path / "none"), QUIET)
-    assert stopped.value.code == Exit.CONFIGURATION
+    assert stopped.value.exit_code == ExitCode.CONFIGURATION
 
 
 def test_a_checkpoint_belongs_to_its_seed_schedule_and_data(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_scenes_are_drawn_alike() -> None:
 
 def test_train_needs_data() -> None:
     done = CliRunner().invoke(train.app, ["grasp", "--data", "/nowhere"])
-    assert isinstance(done.exception, Stopped) and done.exception.code == Exit.CONFIGURATION
+    assert isinstance(done.exception, CommandFailed) and done.exception.exit_code == ExitCode.CONFIGURATION
     assert "/nowhere: no Cornell samples" in str(done.exception)
 
 

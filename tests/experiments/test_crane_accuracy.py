@@ -14,13 +14,14 @@ from rich.console import Console
 
 from autonomy.motion.arm import Arm
 from autonomy.motion.trajectory import straight
-from can_dbc.setpoint import CraneSetpoint, StateReport, decode
+from can_dbc.messages.crane import CraneSetpoint, StateReport
+from can_dbc.messages.datagrams import decode
 from experiments.common.minimum_time import Limits, full_limits, minimum_time_s
 from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.crane_accuracy import experiment, measure
-from experiments.crane_accuracy.figures import FIGURES, gather
 from experiments.crane_accuracy.measure import Trace
+from experiments.crane_accuracy.metrics import FIGURES, gather
 from experiments.crane_accuracy.plan import (
     GOALS_M,
     LAWS,
@@ -35,7 +36,7 @@ from experiments.crane_accuracy.plan import (
     variants,
     visits,
 )
-from experiments.crane_accuracy.rounds import Part, Rounds
+from experiments.crane_accuracy.reach_cycles import Part, Rounds
 from experiments.crane_accuracy.trial import varied
 from machine.kinematics import pin_position
 from machine.load import load_profile, profile_hash

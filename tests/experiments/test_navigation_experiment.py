@@ -14,8 +14,8 @@ from autonomy.navigation.clothoid_path import drivable
 from autonomy.navigation.joining_path import joined
 from experiments.navigation import measure
 from experiments.navigation.experiment import CORNERS, LAPS, QUICK_START, STARTS, plan
-from experiments.navigation.metrics import FIGURES, GROUNDS, LAP, gather
 from experiments.navigation.measure import Drive
+from experiments.navigation.metrics import FIGURES, GROUNDS, LAP, gather
 from experiments.navigation.plots import draw
 from experiments.navigation.trial import COLUMNS, perform
 from machine.load import load_profile

@@ -14,16 +14,16 @@ import pytest
 from typer.testing import CliRunner
 
 import machine
-from controller.estimator import JointEstimator
+from controller.estimation.joint_estimator import JointEstimator
 from controller.laws.feedback import LAWS
 from controller.laws.joint import JointLaw
-from controller.valve import ValveMap
+from controller.laws.valve_map import ValveMap
 from experiments.common.worlds import home_at, opened
 from experiments.loop_design.loop import FREQUENCY_RAD_S, LawResponse, Spool, margins, open_loop
 from experiments.loop_design.mechanics import mechanics
 from experiments.loop_design.page import with_law, write
 from experiments.loop_design.study import GAIN_DB, PHASE_DEG, study, work_of
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 from machine.load import load_profile
 from timberhand.cli import app
 
@@ -215,6 +215,6 @@ def test_the_command_prints_draws_and_fails(tmp_path):
     text = (Path(machine.__file__).parent / "palms_471.toml").read_text()
     eager.write_text(text.replace("kp_1_s = 2.0 ", "kp_1_s = 5.0 "))
     failed = CliRunner().invoke(app, ["bench", "loop-design", "--profile", str(eager)])
-    assert failed.exit_code == Exit.FIGURE, failed.output
+    assert failed.exit_code == ExitCode.FIGURE_MISSED, failed.output
     refused = CliRunner().invoke(app, ["bench", "loop-design", "--profile", "nothing"])
-    assert isinstance(refused.exception, Stopped) and refused.exception.code is Exit.CONFIGURATION
+    assert isinstance(refused.exception, CommandFailed) and refused.exception.exit_code is ExitCode.CONFIGURATION

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from autonomy.localization.local_plane import Plane
-from autonomy.missions.validation import problems_of
 from autonomy.missions.mission_file import load_mission
+from autonomy.missions.validation import problems_of
 from experiments.forwarding_mission.experiment import FILE, MACHINES, NOMINAL, calibrations, missions, trial
 from experiments.forwarding_mission.metrics import FIGURES, PAPER_TABLE_MM, by_log, gather, table
 from experiments.forwarding_mission.plots import PAPER_MM, draw

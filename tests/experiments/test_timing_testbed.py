@@ -12,24 +12,25 @@ from msgspec import structs
 from typer.testing import CliRunner
 
 from can_dbc.frame import Frame
-from can_dbc.setpoint import CraneSetpoint, StateReport, decode
-from can_dbc.timing_page import Facts, ProcessCounters
+from can_dbc.messages.crane import CraneSetpoint, StateReport
+from can_dbc.messages.datagrams import decode
+from can_dbc.timing.page import Facts, ProcessCounters
 from controller.config import load as settings_of
 from controller.guard.__main__ import build, profile_path
-from controller.record import record
+from controller.process.tick_recording import record
 from controller.step import Controller, Inputs, step
 from experiments.timing import soak
 from experiments.timing.bus_observer import Witness
-from experiments.timing.planner import BEHIND_NS, Planner, Swing
-from experiments.timing.reference import missing_tools
-from host.exits import Exit
+from experiments.timing.reference_loops import missing_tools
+from experiments.timing.setpoint_source import BEHIND_NS, Planner, Swing
+from host.exit_codes import ExitCode
 from machine.joints import JOINTS
 from machine.load import load_profile
 from machine.modes import Mode
 from machine.reasons import Reason
-from sim.kinematic import KinematicMachine, KinematicWorld
+from sim.kinematic.machine import KinematicMachine, KinematicWorld
 from sim.nodes.valve import FUNCTIONS
-from sim.truth import load_truth
+from sim.truth.load import load_truth
 from timberhand.cli import app
 
 START_NS = 1_000_000_000
@@ -224,7 +225,7 @@ def test_a_quick_measurement_writes_everything_and_passes_nothing_it_cannot_tell
         pytest.skip("cyclictest gets SCHED_FIFO as root only")
     command = ["experiment", "timing", "--quick", "--out", str(tmp_path / "out"), "--docs", str(tmp_path / "docs")]
     result = CliRunner().invoke(app, command)
-    assert getattr(result.exception, "code", 0) in (Exit.FINE, Exit.FIGURE), result.output[-2000:]
+    assert getattr(result.exception, "exit_code", 0) in (ExitCode.OK, ExitCode.FIGURE_MISSED), result.output[-2000:]
     document = json.loads((tmp_path / "out" / "result.json").read_text())
     open_ = {"wakeup_p50_ratio", "wakeup_p99_ratio", "missed", "page_faults", "gc_runs"}
     assert open_ <= {*document["inconclusive"], *document["missed"]}

@@ -5,15 +5,15 @@ import pytest
 from rich.console import Console
 
 from experiments.common.registry import Options
-from experiments.common.report import page
 from experiments.common.result import judged
+from experiments.common.result_page import page
 from experiments.detector import experiment, photos, trial, worlds
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 
 
 @pytest.fixture
 def few_piles(monkeypatch, tmp_path):
-    monkeypatch.setattr("training.detection.piles.CHUNK", 1)
+    monkeypatch.setattr("training.pictures.piles.CHUNK", 1)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
@@ -69,9 +69,9 @@ def test_wood_that_is_parted_right_is_as_good_as_the_wood():
 def test_without_weights_it_says_what_to_do(monkeypatch, tmp_path):
     monkeypatch.setattr(trial, "SHIPPED", tmp_path)
     options = Options(seed=1, truth="nominal", profile="palms_471", out=tmp_path)
-    with pytest.raises(Stopped, match="timberhand train segmentation") as stop:
+    with pytest.raises(CommandFailed, match="timberhand train segmentation") as stop:
         experiment.run(options, Console(quiet=True))
-    assert stop.value.code == Exit.CONFIGURATION
+    assert stop.value.exit_code == ExitCode.CONFIGURATION
 
 
 def test_photographs_are_cut_at_white_gutters():

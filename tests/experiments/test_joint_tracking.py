@@ -11,9 +11,9 @@ from rich.console import Console
 from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.joint_tracking import experiment, individuals, motions
-from experiments.joint_tracking.figures import LAWS, sections, table, verdict
 from experiments.joint_tracking.individuals import CORNERS
-from experiments.joint_tracking.rig import NAMES, Calibration
+from experiments.joint_tracking.metrics import LAWS, sections, table, verdict
+from experiments.joint_tracking.testbed import NAMES, Calibration
 from experiments.joint_tracking.trial import _slow, perform
 from machine.load import load_profile
 

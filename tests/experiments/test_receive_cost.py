@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from can_dbc.codec import load
-from can_dbc.e2e import Checker, Status
-from experiments.benches import bus
-from experiments.benches.bus import LIMIT_US, Traffic, measure
-from host.exits import Exit, Stopped
+from can_dbc.dbc.codec import load
+from can_dbc.protocols.e2e import Checker, Status
+from experiments.timing import receive_cost
+from experiments.timing.receive_cost import LIMIT_US, Traffic, measure
+from host.exit_codes import CommandFailed, ExitCode
 from timberhand.commands.bench import app
 
 TICKS = 40
@@ -51,25 +51,25 @@ def test_every_path_takes_every_frame(result: dict[str, Any]) -> None:
 def test_a_path_that_loses_a_frame_is_no_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
     take = Traffic.take
     monkeypatch.setattr(Traffic, "take", lambda self, count: take(self, count)[:-1])
-    with pytest.raises(Stopped, match="13 of 14 frames"):
+    with pytest.raises(CommandFailed, match="13 of 14 frames"):
         measure(frames=30, rounds=3)
 
 
 @pytest.mark.parametrize(
     ("cost_us", "lab", "code"),
-    [(LIMIT_US, False, Exit.FINE), (LIMIT_US + 0.1, False, Exit.FIGURE), (LIMIT_US + 0.1, True, Exit.FINE)],
+    [(LIMIT_US, False, ExitCode.OK), (LIMIT_US + 0.1, False, ExitCode.FIGURE_MISSED), (LIMIT_US + 0.1, True, ExitCode.OK)],
 )
 @pytest.mark.parametrize("form", [[], ["--json"]])
 def test_the_verdict(
     cost_us: float,
     lab: bool,
-    code: Exit,
+    code: ExitCode,
     form: list[str],
     result: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     measured = result | {"lab": lab, "metrics": result["metrics"] | {"rx_decode_us": cost_us}}
-    monkeypatch.setattr(bus, "measure", lambda frames, rounds: measured)
+    monkeypatch.setattr(receive_cost, "measure", lambda frames, rounds: measured)
     done = CliRunner().invoke(app, ["bus", *form])
     assert done.exit_code == code
     if form:

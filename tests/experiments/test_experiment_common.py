@@ -14,11 +14,11 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
-from experiments.common.report import page
 from experiments.common.result import Figure, Result, judge, rate, wilson
+from experiments.common.result_page import page
 from experiments.common.trials import check_truth, checkpoint
 from experiments.plant.signals import ringing
-from host.exits import Stopped
+from host.exit_codes import CommandFailed
 
 QUIET = Console(quiet=True)
 SPEED = Figure("speed", "How fast", "m/s", "With a watch.", least=2.0, clocked=True)
@@ -141,7 +141,7 @@ def test_a_run_with_another_truth_begins_anew(tmp_path):
 
 
 def test_a_truth_that_is_none_stops_before_any_trial(tmp_path):
-    with pytest.raises(Stopped, match=r"none\.toml"):
+    with pytest.raises(CommandFailed, match=r"none\.toml"):
         check_truth("palms_471", str(tmp_path / "none.toml"))
 
 

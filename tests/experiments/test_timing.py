@@ -7,16 +7,16 @@ from collections.abc import Sequence
 
 import pytest
 
-from can_dbc.codec import load
-from can_dbc.durations import Durations
-from can_dbc.e2e import Sender
-from can_dbc.timing_page import STAGES, BusCounters, Facts, ProcessCounters
-from experiments.timing import experiment, host, reference, verdict
+from can_dbc.dbc.codec import load
+from can_dbc.protocols.e2e import Sender
+from can_dbc.timing.durations import Durations
+from can_dbc.timing.page import STAGES, BusCounters, Facts, ProcessCounters
+from experiments.timing import evaluation, experiment, host_activity, reference_loops
 from experiments.timing.continuity import Continuity
-from experiments.timing.figures import FIGURES, SECTIONS
-from experiments.timing.host import Meanwhile
-from experiments.timing.reference import Plain
-from experiments.timing.windows import Window, pooled
+from experiments.timing.host_activity import Meanwhile
+from experiments.timing.measurement import Window, pooled
+from experiments.timing.metrics import FIGURES, SECTIONS
+from experiments.timing.reference_loops import Plain
 
 PERIOD_NS = 5_000_000
 
@@ -67,11 +67,11 @@ def metrics_of(quiet: list[Window], loaded: list[Window]) -> dict[str, float]:
 
 def test_a_pressure_file_gives_the_time_somebody_waited():
     text = "some avg10=31.01 avg60=14.01 avg300=7.94 total=5137622117\nfull avg10=0.00 total=7\n"
-    assert host.pressure_us(text) == 5137622117
-    assert host.pressure_us("") is None
-    between = host.between(host.Sample(0, 10.0, 1_000_000, 0.0), host.Sample(2_000_000_000, 40.0, 1_500_000, 3.0))
+    assert host_activity.pressure_us(text) == 5137622117
+    assert host_activity.pressure_us("") is None
+    between = host_activity.between(host_activity.Sample(0, 10.0, 1_000_000, 0.0), host_activity.Sample(2_000_000_000, 40.0, 1_500_000, 3.0))
     assert (between.seconds, between.steal_ms, between.pressure, between.load) == (2.0, 30.0, 0.25, 3.0)
-    assert host.between(host.Sample(0, 0, None, 0), host.Sample(1, 0, 5, 0)).pressure is None
+    assert host_activity.between(host_activity.Sample(0, 0, None, 0), host_activity.Sample(1, 0, 5, 0)).pressure is None
 
 
 @pytest.mark.parametrize(
@@ -84,27 +84,27 @@ def test_a_pressure_file_gives_the_time_somebody_waited():
     ],
 )
 def test_the_preemption_model_is_read_from_the_kernel(version, dynamic, model):
-    assert host.preemption(version, dynamic) == model
+    assert host_activity.preemption(version, dynamic) == model
 
 
 @pytest.mark.parametrize(("stamp_ns", "period_ns"), [(7_001_234_567, 5_000_000), (12_000_999_999, 1_000_000)])
 def test_cyclictest_wakes_at_a_fixed_distance_from_our_ticks(stamp_ns, period_ns):
-    offset_ns = 1000 * reference.offset_us(stamp_ns, period_ns)
+    offset_ns = 1000 * reference_loops.offset_us(stamp_ns, period_ns)
     assert 0 <= offset_ns < period_ns
     distance = (offset_ns - stamp_ns) % period_ns
-    assert distance == pytest.approx(reference.QUIET_PHASE * period_ns, abs=1000)
+    assert distance == pytest.approx(reference_loops.QUIET_PHASE * period_ns, abs=1000)
 
 
 def test_cyclictests_report_becomes_a_histogram():
     thread = {"cycles": 10, "min": 12, "max": 200_001, "avg": 20.0, "histogram": {"12": 6, "1500": 3}}
-    found = reference.read_cyclictest(json.dumps({"thread": {"0": thread}}))
+    found = reference_loops.read_cyclictest(json.dumps({"thread": {"0": thread}}))
     assert found.count == 10 and found.longest_ns == 200_001_000
     assert found.over(100_000_000 - 1) == 1 and found.over(PERIOD_NS) == 1
     assert found.quantile_ns(0.5) == 13_000
 
 
 def test_the_plain_loops_words_become_a_histogram():
-    plain = reference.read_plain({"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4})
+    plain = reference_loops.read_plain({"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4})
     assert plain.lateness.count == 3 and plain.missed == 4
 
 
@@ -117,7 +117,7 @@ def test_system_calls_are_counted_from_the_tables_rows():
         "------ ----------- ----------- --------- --------- ----------------\n"
         "100.00    0.000500           0      1200       300 total\n"
     )
-    assert reference.count_calls(table) == {"clock_nanosleep": 300, "recvmsg": 900}
+    assert reference_loops.count_calls(table) == {"clock_nanosleep": 300, "recvmsg": 900}
 
 
 def test_histograms_add_up():
@@ -127,7 +127,7 @@ def test_histograms_add_up():
 
 
 def test_a_quantile_lies_inside_its_bin():
-    found = verdict.spread_us("x", histogram(*(10.0 + 0.01 * i for i in range(100))))
+    found = evaluation.spread_us("x", histogram(*(10.0 + 0.01 * i for i in range(100))))
     assert 10.0 < found["x_p50_us"] < found["x_p99_us"] <= 11.0
     assert found["x_max_us"] == pytest.approx(10.99)
 
@@ -143,18 +143,18 @@ def test_a_quantile_lies_inside_its_bin():
     ],
 )
 def test_cyclictest_says_whether_a_window_was_quiet(made, is_quiet):
-    assert verdict.quiet(made) is is_quiet
+    assert evaluation.quiet(made) is is_quiet
 
 
 def test_only_quiet_windows_are_judged_where_they_are_at_least_half():
     noisy = window(theirs=[2000.0], at=2000)
     good = window()
-    assert verdict.chosen([good, noisy]) == ([good], True)
-    assert verdict.chosen([good, noisy, noisy]) == ([good, noisy, noisy], False)
+    assert evaluation.chosen([good, noisy]) == ([good], True)
+    assert evaluation.chosen([good, noisy, noisy]) == ([good, noisy, noisy], False)
 
 
 def test_a_ratio_compares_quantiles_and_has_an_interval():
-    found = verdict.ratio("r", [histogram(30.0, times=50)] * 4, [histogram(20.0, times=50)] * 4, 0.5)
+    found = evaluation.ratio("r", [histogram(30.0, times=50)] * 4, [histogram(20.0, times=50)] * 4, 0.5)
     assert found["r"] == pytest.approx(1.5, abs=0.05) and found["r_n"] == 4
     assert found["r_low"] <= found["r"] <= found["r_high"]
 
@@ -164,7 +164,7 @@ def test_a_long_quiet_run_is_judged_and_a_slow_loop_misses():
     loaded = [window(plain=Plain(histogram(9000.0), 500))]
     metrics = metrics_of(quiet, loaded)
     assert metrics["host_verdict"] == 1.0 and metrics["judged_cycles"] == 120_000
-    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
     assert found.missed == ("wakeup_p50_ratio", "wakeup_p99_ratio")
     assert not {"missed", "page_faults", "missed_loaded_share"} & found.inconclusive.keys()
 
@@ -172,27 +172,27 @@ def test_a_long_quiet_run_is_judged_and_a_slow_loop_misses():
 def test_a_noisy_host_never_passes_what_hangs_on_its_clock():
     metrics = metrics_of([window(theirs=[3000.0], late=[3000.0], ticks=6000) for _ in range(20)], [window()])
     assert metrics["host_verdict"] == 0.0 and metrics["wakeup_p50_ratio"] == pytest.approx(1.0, abs=0.01)
-    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
     assert {"wakeup_p50_ratio", "wakeup_p99_ratio"} <= found.inconclusive.keys()
     assert found.missed == ()
 
 
 def test_a_short_run_cannot_tell():
     metrics = metrics_of([window(ticks=600)], [window()])
-    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
     open_ = {"wakeup_p50_ratio", "missed", "page_faults", "gc_runs", "tick_cpu_p99_us", "missed_loaded_share"}
     assert open_ <= found.inconclusive.keys() and not found.missed
 
 
 def test_what_does_not_hang_on_the_clock_is_missed_on_any_host():
     metrics = metrics_of([window(theirs=[3000.0], ticks=600, faults=2)], [window()])
-    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
     assert "page_faults" in found.missed
 
 
 def test_a_deadline_missed_in_a_quiet_window_is_ours():
     metrics = metrics_of([window(missed=1)], [window()])
-    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
     assert "missed" in found.missed
 
 
@@ -210,7 +210,7 @@ def test_a_deadline_missed_in_a_quiet_window_is_ours():
 def test_missed_deadlines_under_load_are_compared_with_the_plain_loop(ours, plain, theirs, outcome):
     pressed = window(theirs=[theirs], plain=Plain(histogram(9000.0), plain), missed=ours)
     metrics = metrics_of([window()], [pressed])
-    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
     name = "missed_loaded_share"
     assert outcome == (
         "missed" if name in found.missed else "inconclusive" if name in found.inconclusive else "reached"
@@ -219,7 +219,7 @@ def test_missed_deadlines_under_load_are_compared_with_the_plain_loop(ours, plai
 
 def test_a_figure_without_a_number_is_inconclusive():
     metrics = metrics_of([window()], [window()]) | experiment.system_call_metrics(None)
-    found = verdict.judge(FIGURES, metrics, verdict.untold(metrics))
+    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
     assert "syscalls_per_tick" in found.inconclusive and "syscalls_per_tick" not in found.missed
 
 
@@ -238,7 +238,7 @@ def test_the_names_others_rely_on_are_there():
 
 def test_blocks_that_breathe_do_not_grow():
     made = [window(at=2000 * i) for i in range(6)]
-    assert verdict.block_growth(made) == 0
+    assert evaluation.block_growth(made) == 0
 
 
 def test_a_lost_frame_is_a_gap_in_the_counter():

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from experiments.common.pool import Job
 from experiments.common.registry import EXPERIMENTS, Options, load
 from experiments.plant import endurance, experiment, physics, rolling, trial
-from experiments.plant.figures import FIGURES, SECTIONS
+from experiments.plant.metrics import FIGURES, SECTIONS
 from timberhand.cli import app
 
 pytestmark = pytest.mark.computed
@@ -85,7 +85,7 @@ def test_a_truth_that_is_none_is_one_sentence(tmp_path):
     done = CliRunner().invoke(
         app, ["experiment", "plant", "--truth", str(tmp_path / "no.toml"), "--out", str(tmp_path)]
     )
-    assert "no.toml" in str(done.exception) and done.exception.code == 3
+    assert "no.toml" in str(done.exception) and done.exception.exit_code == 3
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from autonomy.perception.logs import LogObservation
+from autonomy.perception.log_list.observation import LogObservation
 from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.common.result import judged
@@ -21,12 +21,12 @@ from experiments.grasp_configs.experiment import (
     machines_of,
     published_ablation,
 )
-from experiments.grasp_configs.figures import FIGURES, SECTIONS, sections
-from experiments.grasp_configs.outcome import Grip, category, lies_on, lifted
-from experiments.grasp_configs.poses import misled
+from experiments.grasp_configs.grasp_categories import Grip, category, lies_on, lifted
+from experiments.grasp_configs.metrics import FIGURES, SECTIONS, sections
+from experiments.grasp_configs.pose_sources import misled
 from experiments.grasp_configs.trial import attempt
-from sim.logs import LogState
-from sim.scene import CONFIGURATIONS
+from sim.scenes.arrangements import CONFIGURATIONS
+from sim.wood.logs import LogState
 
 GROUND = -1.39
 OPTIONS = Options(0, "nominal", "palms_471", Path("unused"))
