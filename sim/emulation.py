@@ -13,10 +13,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from can_dbc.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
-from can_dbc.codec import load
+from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
-from machine.carrier import ARMS, height_from_arm_angle
+from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
+from machine.geometry.carrier import ARMS, height_from_arm_angle
 from machine.profile import Encoder, Profile
 from sim.nodes import Outbox
 from sim.nodes.arms import ArmNode
@@ -25,10 +25,10 @@ from sim.nodes.encoder import EncoderBus, EncoderNode, VirtualNetwork
 from sim.nodes.engine import EngineNode
 from sim.nodes.gnss import GnssNode
 from sim.nodes.imu import ImuNode
-from sim.nodes.traffic import MS
+from sim.nodes.messages import MS
 from sim.nodes.valve import CYCLE_NS, FUNCTIONS, Measured, ValveNode
 from sim.nodes.vehicle import VehicleNode
-from sim.truth import Truth
+from sim.truth.load import Truth
 
 SENSE_NS = 10 * MS
 """How often the carrier's own sensors are read."""

@@ -9,9 +9,9 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from sim.bunk import to_bunk
-from sim.logs import LogState
-from sim.shape import UNIT, Vector
+from sim.geometry.shape import UNIT, Vector
+from sim.wood.bunk import to_bunk
+from sim.wood.logs import LogState
 from sim.world import STEP_S, World
 
 LIFTED_M: Final = 0.5

@@ -9,24 +9,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from machine.carrier import ARMS
+from machine.geometry.carrier import ARMS
 from machine.joints import JOINTS
 from machine.profile import Profile
-from sim.bunk import bunk_shapes
-from sim.carrier import PARKED, Drive, carrier_links
-from sim.crane import crane_shapes
 from sim.emulation import EmulatedMachine
 from sim.evaluator import Judge, Verdict
-from sim.levers import DRIVE, HandLevers
-from sim.logs import LogState
+from sim.geometry.shape import Quaternion, Shape, Vector
+from sim.mechanics.carrier import PARKED, Drive, carrier_links
+from sim.mechanics.crane import crane_shapes
+from sim.mechanics.hand_levers import DRIVE, HandLevers
 from sim.nodes.arms import ArmState
 from sim.nodes.valve import FUNCTIONS, ValveState
-from sim.scene import LogSpec, arrangement, random_scene
-from sim.shape import Quaternion, Shape, Vector
-from sim.truth import Truth, load_truth
+from sim.scenes.arrangements import arrangement, random_scene
+from sim.truth.load import Truth, load_truth
+from sim.wood.bunk import bunk_shapes
+from sim.wood.log_shape import LogSpec
+from sim.wood.logs import LogState
 from sim.world import STEP_NS, World
-
-__all__ = ["LogState", "Plant", "Shape", "VehicleState", "Verdict"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,20 +12,20 @@ from dataclasses import replace
 from typing import Final
 
 from machine.profile import Profile
-from sim.body import Body, Pose, fixed_boxes, magnitude
-from sim.bunk import bunk_shapes
-from sim.carrier import PARKED, Carrier, Drive, carrier_links
-from sim.column import Column
-from sim.crane import CRANE_LINKS, FLEX, PASSIVE, crane_links, rigid_pin
-from sim.hydraulics import Hydraulics
-from sim.logs import Yard
-from sim.physics import new_client
-from sim.scene import LogSpec
-from sim.shape import UNIT, Vector
-from sim.stowage import Stowage
-from sim.terrain import Terrain
-from sim.truth import Truth, load_truth
-from sim.urdf import JointDef
+from sim.bullet.body import Body, Pose, fixed_boxes, magnitude
+from sim.bullet.client import new_client
+from sim.bullet.urdf import JointDef
+from sim.geometry.shape import UNIT, Vector
+from sim.ground.terrain import Terrain
+from sim.hydraulics.circuit import Hydraulics
+from sim.mechanics.carrier import PARKED, Carrier, Drive, carrier_links
+from sim.mechanics.column import Column
+from sim.mechanics.crane import CRANE_LINKS, FLEX, PASSIVE, crane_links, rigid_pin
+from sim.truth.load import Truth, load_truth
+from sim.wood.bunk import bunk_shapes
+from sim.wood.log_shape import LogSpec
+from sim.wood.logs import Yard
+from sim.wood.stowage import Stowage
 
 STEP_NS: Final = 2_500_000
 STEP_S: Final = STEP_NS * 1e-9

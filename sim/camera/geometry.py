@@ -1,4 +1,4 @@
-"""Where cameras stand in the world; what their pixels look at is in ``machine.optics``."""
+"""Where cameras stand in the world; what their pixels look at is in ``machine.geometry.optics``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from machine.optics import BODY_FROM_OPTICAL, Intrinsics, rpy_matrix
+from machine.geometry.optics import BODY_FROM_OPTICAL, Intrinsics, rpy_matrix
 
 
 @dataclass(frozen=True, slots=True)

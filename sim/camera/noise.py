@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numba import njit
 
-from machine.optics import Intrinsics
+from machine.geometry.optics import Intrinsics
 from machine.profile import Camera
 from sim.camera.render import Picture
 from sim.truth.sensors import CameraTruth

@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from machine.optics import Intrinsics, intrinsics
+from machine.geometry.optics import Intrinsics, intrinsics
 from machine.profile import Profile
-from sim.camera.clutter import CLEARING, YARD, Clutter, Density
 from sim.camera.geometry import View, mount_view
+from sim.camera.ground_cover import CLEARING, YARD, Clutter, Density
 from sim.camera.noise import StereoNoise
 from sim.camera.render import Look, Picture, render
 from sim.camera.scene import Scene, WorldScenes
-from sim.shape import Vector
-from sim.truth import Truth
+from sim.geometry.shape import Vector
+from sim.truth.load import Truth
 from sim.world import World
 
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from sim.bunk import bunk_shapes
 from sim.camera.geometry import quaternion_matrix
-from sim.carrier import CARRIER_LINKS, carrier_links
-from sim.crane import crane_shapes
-from sim.log_shape import STRAIGHT_M
-from sim.terrain import surface_height
+from sim.ground.terrain import surface_height
+from sim.mechanics.carrier import CARRIER_LINKS, carrier_links
+from sim.mechanics.crane import crane_shapes
+from sim.wood.bunk import bunk_shapes
+from sim.wood.log_shape import STRAIGHT_M
 
 if TYPE_CHECKING:
     from sim.world import World
@@ -30,7 +30,7 @@ Vector = Sequence[float]
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """A grid of heights as ``sim.terrain.Terrain`` has it: ``heights_m[i, j]`` at (x0 + i cell, y0 + j cell); a cell is
+    """A grid of heights as ``sim.ground.terrain.Terrain`` has it: ``heights_m[i, j]`` at (x0 + i cell, y0 + j cell); a cell is
     two triangles that meet on the diagonal from (i + 1, j) to (i, j + 1)."""
 
     x0_m: float
@@ -99,7 +99,7 @@ class Boxes:
 
 @dataclass(frozen=True, slots=True)
 class LogPose:
-    """One log in the log frame of ``sim.scene``: origin at the pith at half length, z along the chord towards the thin
+    """One log in the log frame of ``sim.scenes.arrangements``: origin at the pith at half length, z along the chord towards the thin
     end, x towards the side it bows to; mid diameter, diameter lost per metre, sagitta of the bow."""
 
     instance: int

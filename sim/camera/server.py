@@ -1,4 +1,4 @@
-"""The plant's cameras on a local socket (``can_dbc.rgbd``): pictures are drawn only when somebody asks.
+"""The plant's cameras on a local socket (``can_dbc.messages.rgbd``): pictures are drawn only when somebody asks.
 
 The plant's loop gives away what there is to see, which takes no longer than a few steps; drawing and sending are done
 by a thread of each client, so that no client delays the machine's time.
@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from can_dbc.rgbd import MM_M, QUESTION, RgbdError, RgbdFrame, encode, encode_refusal, question_bytes
+from can_dbc.messages.rgbd import MM_M, QUESTION, RgbdError, RgbdMessage, encode, encode_refusal, question_bytes
 from sim.camera.rig import Frame
 from sim.camera.scene import Scene
 
@@ -104,12 +104,12 @@ class CameraServer:
         return encode(on_the_wire(frame))
 
 
-def on_the_wire(frame: Frame) -> RgbdFrame:
+def on_the_wire(frame: Frame) -> RgbdMessage:
     """A frame as it is sent: depth in whole millimetres, no true pose."""
     pin, depth = frame.intrinsics, np.nan_to_num(frame.depth_m * np.float32(MM_M), nan=0.0)
     millimetres = np.clip(np.rint(depth), 0, 65535).astype("<u2")
     size = (pin.width_px, pin.height_px, pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px)
-    return RgbdFrame(frame.name, frame.stamp_ns, *size, frame.rgb.tobytes(), millimetres.tobytes())
+    return RgbdMessage(frame.name, frame.stamp_ns, *size, frame.rgb.tobytes(), millimetres.tobytes())
 
 
 def _read(client: socket.socket, count: int) -> bytes:

@@ -1,6 +1,6 @@
 """The hot loop of the hydraulics: one physics step of all functions in substeps, compiled.
 
-Per substep (plant.md 2, machines.md 3): spool, load-sensing pump, sharing of its flow, friction and predicted joint
+Per substep (docs/reference/plant-model.md section 2, docs/reference/machines.md section 3): spool, load-sensing pump, sharing of its flow, friction and predicted joint
 speed, chamber pressures (implicit in their own edges).  Bullet holds the returned torque for a whole step, so inside
 it the joint's motion is predicted with an inertia below the real one (above it, friction would chatter), and before
 the next step the pressures are corrected by the difference between predicted and real travel: oil is never gained or
@@ -34,7 +34,7 @@ def orifice(drop):
 
 @njit(cache=True)
 def friction(c, speed):
-    """Stribeck friction of a piston [N] (machines.md 3, form of PATU) and a stable slope over speed [N s/m]."""
+    """Stribeck friction of a piston [N] (docs/reference/machines.md section 3, form of PATU) and a stable slope over speed [N s/m]."""
     a = abs(speed) / c.stribeck_speed
     t = math.tanh(4.0 * a)
     bump = a * a / 4.0 + 0.75

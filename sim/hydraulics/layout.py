@@ -9,7 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from sim.truth import Function, Supply, Truth
+from sim.truth.hydraulics import Function, Supply
+from sim.truth.load import Truth
 
 SOFT_PA: Final = 0.2e6
 UNIT_PA: Final = 1.0e6

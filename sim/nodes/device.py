@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from can_dbc.canopen import (
+from can_dbc.dbc.codec import Database
+from can_dbc.protocols.canopen import (
     HEARTBEAT_BASE,
     SDO_TO_CLIENT,
     Emergency,
@@ -21,9 +22,8 @@ from can_dbc.canopen import (
     parse_request,
     upload_response,
 )
-from can_dbc.codec import Database
 from sim.nodes import Outbox
-from sim.nodes.traffic import MS, Every, ProtectedMessage
+from sim.nodes.messages import MS, Every, ProtectedMessage
 
 HEARTBEAT_NS = 100 * MS
 PA_PER_BAR = 1e5

@@ -16,11 +16,11 @@ import canopen
 from canopen.objectdictionary import ODVariable
 
 import can_dbc
-from can_dbc.canopen import NMT_ID, SDO_TO_SERVER
-from machine.encoder import counts_from_position, position_from_counts
+from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER
+from machine.sensing.encoder import counts_from_position, position_from_counts
 from machine.profile import Encoder
 from sim.nodes import Outbox
-from sim.truth import EncoderTruth
+from sim.truth.encoders import EncoderTruth
 
 EDS_FOLDER = Path(can_dbc.__file__).parent
 PDO_NOT_VALID = 0x8000_0000

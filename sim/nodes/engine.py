@@ -5,11 +5,11 @@ It runs at one working speed and droops under the hydraulic load.  ``set_trouble
 
 from __future__ import annotations
 
-from can_dbc.codec import Database
-from can_dbc.nmea2000 import encode, frames
+from can_dbc.dbc.codec import Database
+from can_dbc.protocols.nmea2000 import encode, frames
 from sim.nodes import Outbox
 from sim.nodes.j1939 import J1939Node
-from sim.nodes.traffic import MS, Every
+from sim.nodes.messages import MS, Every
 
 ADDRESS = 0x00
 WORKING_RPM = 1500.0

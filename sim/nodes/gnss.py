@@ -14,14 +14,14 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, Final
 
-from can_dbc.codec import Database
-from can_dbc.nmea2000 import encode, frames
+from can_dbc.dbc.codec import Database
+from can_dbc.protocols.nmea2000 import encode, frames
 from machine.profile import Carrier
-from sim.geodesy import Site
+from sim.geometry.geodesy import Site
+from sim.geometry.shape import Quaternion, Vector, quaternion_rpy
 from sim.nodes import Outbox
 from sim.nodes.j1939 import MARINE, J1939Node
-from sim.nodes.traffic import MS, Every
-from sim.shape import Quaternion, Vector, quaternion_rpy
+from sim.nodes.messages import MS, Every
 from sim.truth.sensors import GnssTruth
 
 ADDRESS: Final = 0x1C

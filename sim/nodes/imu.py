@@ -11,11 +11,11 @@ import random
 from collections import deque
 from typing import Final
 
-from can_dbc.codec import Database
+from can_dbc.dbc.codec import Database
 from machine.profile import Imu
 from sim.nodes import Outbox
 from sim.nodes.device import Device
-from sim.nodes.traffic import MS, Every, ProtectedMessage
+from sim.nodes.messages import MS, Every, ProtectedMessage
 
 PERIOD_NS: Final = 10 * MS
 LATENCY_NS: Final = 20 * MS

@@ -7,8 +7,8 @@ Addresses below 128 need no waiting time after the claim (J1939-81, 4.4.3.3).
 
 from __future__ import annotations
 
-from can_dbc.codec import Database
-from can_dbc.nmea2000 import BROADCAST, encode, frames, split_id
+from can_dbc.dbc.codec import Database
+from can_dbc.protocols.nmea2000 import BROADCAST, encode, frames, split_id
 from sim.nodes import Outbox
 
 CLAIM_PGN, REQUEST_PGN = 60928, 59904

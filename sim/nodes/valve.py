@@ -12,10 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
-from can_dbc.codec import Database
+from can_dbc.dbc.codec import Database
 from sim.nodes import Outbox
 from sim.nodes.device import Device
-from sim.nodes.traffic import ARM_KEY, MS, Every, ProtectedInput, ProtectedMessage
+from sim.nodes.messages import ARM_KEY, MS, Every, ProtectedInput, ProtectedMessage
 
 COMMAND_NS = GUARD_NS = 50 * MS
 SYNC_NS = 15 * MS

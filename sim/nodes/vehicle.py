@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import IntEnum
 
-from can_dbc.codec import Database
+from can_dbc.dbc.codec import Database
 from machine.profile import Carrier, CarrierValve
 from sim.nodes import Outbox
 from sim.nodes.j1939 import J1939Node
-from sim.nodes.traffic import ARM_KEY, MS, Every, ProtectedInput, ProtectedMessage
+from sim.nodes.messages import ARM_KEY, MS, Every, ProtectedInput, ProtectedMessage
 
 ADDRESS = 0x03
 DRIVE_FUNCTION = 23  # J1939 NAME function of a propulsion controller

@@ -17,13 +17,13 @@ from dataclasses import asdict
 
 import msgspec
 
+from can_dbc.messages.udp_address import udp_address
 from can_dbc.plc.map import Role, WordOrder
 from can_dbc.plc.modbus import LinkError, ModbusServer, is_loopback
-from can_dbc.setpoint import udp_address
-from machine.load import ProfileError, load_profile
-from sim.__main__ import LivePlant
+from machine.loading.profile_file import ProfileError, load_profile
 from sim.plc.plant import PlcPlant
 from sim.plc.server import Address, Datagrams, listen, serve
+from sim.process.live_plant import LivePlant
 
 
 class LivePlc(LivePlant):

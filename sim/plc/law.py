@@ -1,4 +1,4 @@
-"""The PLC program's joint law: paper A's PD at 50 Hz on feedback of 0.1 degree and 0.1 mm (machines.md 1.6 and 4)::
+"""The PLC program's joint law: paper A's PD at 50 Hz on feedback of 0.1 degree and 0.1 mm (docs/reference/machines.md sections 1.6 and 4)::
 
     v = qd_ref + Kp (q_ref - q) + Kd (qd_ref - qd),   u = DBinv(v / full speed)
 

@@ -10,7 +10,7 @@ from machine.joints import JOINTS
 from machine.profile import Profile
 from sim.plant import Plant
 from sim.plc.program import Inputs, Program
-from sim.scene import LogSpec
+from sim.wood.log_shape import LogSpec
 
 PA_PER_BAR = 1e5
 

@@ -14,7 +14,7 @@ from can_dbc.plc import map as plc
 from can_dbc.plc.map import N_JOINTS, Bounds, Estop, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
 from machine.joints import JOINTS
 from machine.profile import Profile, joint
-from sim.plc.gate import MS, Gate
+from sim.plc.command_arbiter import MS, Gate
 from sim.plc.law import Pd
 
 CYCLE_NS = 10 * MS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from sim.truth.spread import Draw
+from sim.truth.variation import Draw
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -25,7 +25,7 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Damping of the two passive joints above the rotator, the column's give, and the rod that couples the tongs.
 
     The column bends on two hinges at its foot: 250 kg more at 6 m move the tip of the small crane by about 0.1 m,
-    unseen by the encoders (paper A; plant.md 2).  ``flex_damping_s``: damper over spring.
+    unseen by the encoders (paper A; docs/reference/plant-model.md section 2).  ``flex_damping_s``: damper over spring.
     """
 
     hanger_damping_nm_s_rad: float

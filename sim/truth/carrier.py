@@ -1,6 +1,6 @@
 """Truth of one carrier: masses of its halves, arms and wheels, tyres, wheel motors and brakes.
 
-Every nominal figure is an engineering estimate (machines.md 7: total mass 10 t with the crane, tyres 600/50-22.5).
+Every nominal figure is an engineering estimate (docs/reference/machines.md section 7: total mass 10 t with the crane, tyres 600/50-22.5).
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from typing import Final
 
 import msgspec
 
-from sim.truth.spread import Draw
+from sim.truth.variation import Draw
 
 TYRE_SPREAD: Final = 0.2
 COM_M: Final = 0.05
@@ -31,7 +31,7 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CarrierTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything about the carrier that is not in the profile; ``sim.tyre`` says what the tyre's figures mean.
+    """Everything about the carrier that is not in the profile; ``sim.ground.tyre`` says what the tyre's figures mean.
 
     ``rear`` has the crane's foot and the bunk, ``front`` the engine; ``arm_mass_kg`` is one swing arm, uniform from
     pivot to hub, ``wheel_mass_kg`` tyre, rim and hub motor.  The tyre's free radius is the profile's (loaded) one

@@ -6,7 +6,7 @@ import math
 
 import msgspec
 
-from sim.truth.spread import Draw
+from sim.truth.variation import Draw
 
 
 class EncoderTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,4 +1,4 @@
-"""Pump, oil, cylinders and valves of one machine (plant.md 2, machines.md 3)."""
+"""Pump, oil, cylinders and valves of one machine (docs/reference/plant-model.md section 2, docs/reference/machines.md section 3)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from sim.truth.spread import Draw
+from sim.truth.variation import Draw
 
 
 class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,7 +43,7 @@ class Cylinder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     displacement [m^3/rad] with arm 1). ``arm``: dx/dq [m/rad, m/m] over the joint positions ``arm_at``, from hard
     stop to hard stop (the drive's own cushions give a little before them); it is negative where a positive command
     moves the joint towards smaller q (the grapple: + opens). ``arm_nominal``: the arm at which the valve's full speed
-    holds. Friction at the piston [N, m/s, N s/m] in the form of machines.md 3. ``relaxation_1_s``: how fast load
+    holds. Friction at the piston [N, m/s, N s/m] in the form of docs/reference/machines.md section 3. ``relaxation_1_s``: how fast load
     oscillations pass the damping orifices. ``least_inertia`` [kg m^2, kg]: half the smallest inertia that the joint
     shows its drive in any pose while the other drives push too; the solver leans on it.
     """

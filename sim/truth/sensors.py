@@ -6,13 +6,13 @@ import math
 
 import msgspec
 
-from sim.truth.spread import Draw
+from sim.truth.variation import Draw
 
 Vector = tuple[float, float, float]
 
 
 class CameraTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One stereo camera: how it is really mounted and how its depth errs (perception.md 5, machines.md 8).
+    """One stereo camera: how it is really mounted and how its depth errs (docs/reference/perception.md section 5, docs/reference/machines.md section 8).
 
     ``mount_position_m`` and ``mount_rpy_rad`` are the true body frame less the profile's, in the profile's body frame;
     an individual is off by at most ``mount_bound_m`` and ``mount_bound_rad``.  Depth errs by ``disparity_sigma_px`` of
@@ -63,7 +63,7 @@ class FixTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GnssTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A dual-antenna RTK receiver (machines.md 8).
+    """A dual-antenna RTK receiver (docs/reference/machines.md section 8).
 
     ``fixes`` are the qualities by name (rtk_fixed, rtk_float, dgnss, single).  ``wander_s`` is the correlation time of
     the wander; heights err ``height_factor`` times as much.  ``phase_noise_m`` per antenna makes the heading noise:

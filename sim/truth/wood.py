@@ -7,7 +7,7 @@ import msgspec
 
 class Wood(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Length and mid diameter [m], diameter lost per metre (least, greatest); greatest sagitta of the bow over the
-    length; density [kg/m^3] and its relative spread (one sigma).  Each log is drawn by ``sim.scene``.
+    length; density [kg/m^3] and its relative spread (one sigma).  Each log is drawn by ``sim.scenes.arrangements``.
     """
 
     length_m: tuple[float, float]

@@ -3,7 +3,7 @@
 import math
 import random
 
-from machine.optics import pinhole
+from machine.geometry.optics import pinhole
 from sim.camera.geometry import look_at
 from sim.camera.scene import BUNK, CRANE, Ground, LogPose, Scene, SceneBuilder
 

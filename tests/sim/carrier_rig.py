@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import msgspec
 
 import sim.truth
-from machine import carrier as geometry
-from machine.load import load_profile
-from sim.carrier import CARRIER_JOINTS, PARKED, Carrier, Drive, carrier_links
-from sim.physics import new_client
-from sim.terrain import Terrain
+from machine.geometry import carrier as geometry
+from machine.loading.profile_file import load_profile
+from sim.bullet.client import new_client
+from sim.bullet.urdf import JointDef, LinkDef, urdf_text
+from sim.ground.terrain import Terrain
+from sim.mechanics.carrier import CARRIER_JOINTS, PARKED, Carrier, Drive, carrier_links
 from sim.truth.carrier import CarrierTruth
-from sim.urdf import JointDef, LinkDef, urdf_text
 
 STEP_S = 0.0025
 GRAVITY = 9.81

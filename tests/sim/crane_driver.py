@@ -10,9 +10,9 @@ import math
 from collections.abc import Callable
 from itertools import pairwise
 
-from machine.kinematics import Unreachable, inverse, solve
+from machine.geometry.kinematics import Unreachable, inverse, solve
 from machine.profile import joint_limits
-from sim.bunk import from_bunk
+from sim.wood.bunk import from_bunk
 from sim.world import STEP_S, World
 
 ACTIVE = ("slew", "lift", "tilt", "ext")

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import msgspec
 
-from sim.hydraulics import Hydraulics
-from sim.truth import Cylinder, Function, Truth, load_truth
+from sim.hydraulics.circuit import Hydraulics
+from sim.truth.hydraulics import Cylinder, Function
+from sim.truth.load import Truth, load_truth
 
 STEP_S = 0.0025
 PALMS = load_truth("nominal", 0, "palms_471")

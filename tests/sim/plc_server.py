@@ -9,7 +9,7 @@ from collections.abc import Coroutine
 from typing import Any, Self
 
 from can_dbc.plc.map import Command, Mode, Role, State, WordOrder, command_registers
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from sim.plc.program import MAY_MOVE, Inputs, Program
 from sim.plc.server import Datagrams, listen, serve
 

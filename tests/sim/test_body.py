@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from machine.kinematics import pin_position, solve
-from machine.load import load_profile
-from sim.truth import load_truth
+from machine.geometry.kinematics import pin_position, solve
+from machine.loading.profile_file import load_profile
+from sim.truth.load import load_truth
 from sim.world import HOME, World
 
 MACHINES = ("palms_471", "aoro_fc8")
@@ -142,7 +142,7 @@ def test_equal_inputs_give_bit_identical_motion(world):
 def test_nobody_outside_sim_reads_the_truth_and_sim_knows_no_machine_kinematics():
     outside = ("can_dbc", "machine", "controller", "autonomy", "recorder", "hil", "console", "timberhand")
     forbidden = dict.fromkeys(outside, ("sim.truth", "load_truth"))
-    forbidden["sim"] = ("machine.kinematics", "machine.grapple")
+    forbidden["sim"] = ("machine.geometry.kinematics", "machine.geometry.grapple")
     sinners = []
     for folder, words in forbidden.items():
         for path in (ROOT / folder).rglob("*.py"):

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from machine.load import load_profile
-from machine.optics import Intrinsics, intrinsics, pinhole, rpy_matrix
+from machine.loading.profile_file import load_profile
+from machine.geometry.optics import Intrinsics, intrinsics, pinhole, rpy_matrix
 from sim.camera.geometry import look_at, mount_view, orbit, quaternion_matrix
-from sim.shape import rpy_quaternion
+from sim.geometry.shape import rpy_quaternion
 
 angles = st.floats(-1.5, 1.5)
 

@@ -5,12 +5,12 @@ import pytest
 from camera_scenes import ABOVE, log, site
 from msgspec.structs import replace
 
-from machine.load import load_profile
-from machine.optics import Intrinsics
+from machine.loading.profile_file import load_profile
+from machine.geometry.optics import Intrinsics
 from sim.camera.noise import StereoNoise
 from sim.camera.render import Picture, render
 from sim.camera.scene import Ground, SceneBuilder
-from sim.truth import load_truth
+from sim.truth.load import load_truth
 
 CAMERA = load_profile("palms_471").cameras["stick"]
 TRUTH = load_truth("nominal", 0, "palms_471").cameras["stick"]

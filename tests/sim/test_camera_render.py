@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from camera_scenes import ABOVE, LENS, log, lying, site
 
-from sim.camera.clutter import CLEARING, Clutter
 from sim.camera.geometry import View, look_at
+from sim.camera.ground_cover import CLEARING, Clutter
 from sim.camera.labels import labels
+from sim.camera.mesh_renderer import TinyRenderer
 from sim.camera.render import Look, render
 from sim.camera.scene import CLUTTER, CRANE, GROUND, SKY, Ground, LogPose, Scene, SceneBuilder
-from sim.camera.tiny import TinyRenderer
-from sim.terrain import Terrain
+from sim.ground.terrain import Terrain
 
 DOWN = View(LENS, np.array([0.0, 0.0, 3.0]), np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]))
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from machine.load import load_profile
-from machine.optics import intrinsics
+from machine.loading.profile_file import load_profile
+from machine.geometry.optics import intrinsics
 from sim.camera.geometry import mount_view
+from sim.camera.mesh_renderer import TinyRenderer
 from sim.camera.rig import CameraRig
 from sim.camera.scene import BUNK, CRANE, WorldScenes
-from sim.camera.tiny import TinyRenderer
-from sim.log_shape import LogSpec
+from sim.wood.log_shape import LogSpec
 from sim.world import World, open_world
 
 PALMS = load_profile("palms_471")

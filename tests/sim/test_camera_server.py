@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from can_dbc.rgbd import START_BYTES, RgbdError, RgbdFrame, decode, encode_question, start
-from machine.optics import Intrinsics
+from can_dbc.messages.rgbd import START_BYTES, RgbdError, RgbdMessage, decode, encode_question, start
+from machine.geometry.optics import Intrinsics
 from sim.camera.rig import Frame, Mount
 from sim.camera.server import CameraServer, on_the_wire
 
@@ -39,7 +39,7 @@ def asked(server: CameraServer, camera: str) -> socket.socket:
     return client
 
 
-def answer(client: socket.socket) -> RgbdFrame:
+def answer(client: socket.socket) -> RgbdMessage:
     data = b""
     while len(data) < START_BYTES or len(data) < START_BYTES + start(data[:START_BYTES]).rest:
         chunk = client.recv(4096)

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from machine.load import load_profile
-from sim.truth import load_truth
+from machine.loading.profile_file import load_profile
+from sim.truth.load import load_truth
 from sim.world import HOME, STEP_S, World
 
 PROFILE = load_profile("palms_471")

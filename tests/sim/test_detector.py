@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from machine.load import load_profile
-from sim.detector import detect
+from machine.loading.profile_file import load_profile
+from sim.instruments.ideal_detector import detect
 from sim.plant import Plant
 
 

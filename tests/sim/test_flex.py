@@ -9,10 +9,10 @@ import msgspec
 import pytest
 from crane_driver import Driver
 
-from machine.kinematics import solve
-from machine.load import load_profile
-from sim.scene import random_scene
-from sim.truth import load_truth
+from machine.geometry.kinematics import solve
+from machine.loading.profile_file import load_profile
+from sim.scenes.arrangements import random_scene
+from sim.truth.load import load_truth
 from sim.world import GRAVITY_M_S2, STEP_S, World
 
 PROFILE = load_profile("palms_471")

@@ -7,10 +7,10 @@ import math
 import pytest
 from crane_driver import Driver
 
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from sim.evaluator import Judge
-from sim.scene import random_scene
-from sim.truth import load_truth
+from sim.scenes.arrangements import random_scene
+from sim.truth.load import load_truth
 from sim.world import World
 
 PROFILE = load_profile("palms_471")

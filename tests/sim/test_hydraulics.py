@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from oil_rig import AORO, FRICTIONLESS, PALMS, STEP_S, Rig
 
-from sim.hydraulics import REST_PA, Hydraulics, layout
+from sim.hydraulics import layout
+from sim.hydraulics.circuit import REST_PA, Hydraulics
 from sim.hydraulics.kernel import friction, move_spool
 
 HEAVY = {"slew": 5000.0, "lift": 8000.0, "tilt": 1500.0, "ext": 200.0, "rot": 6.0, "grapple": 7.2}

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from sim.evaluator import Judge, Verdict
-from sim.log_shape import LogSpec
-from sim.scene import arrangement
-from sim.truth import load_truth
+from sim.scenes.arrangements import arrangement
+from sim.truth.load import load_truth
+from sim.wood.log_shape import LogSpec
 from sim.world import World
 
 

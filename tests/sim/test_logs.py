@@ -7,15 +7,15 @@ from collections.abc import Iterator
 
 import pytest
 
-from machine.load import load_profile
-from sim.bunk import bunk_link, bunk_shapes, from_bunk, to_bunk
-from sim.log_shape import LogSpec, mass_of
-from sim.logs import Yard
-from sim.physics import BulletClient, new_client
-from sim.scene import arrangement
-from sim.shape import UNIT
-from sim.terrain import Terrain
-from sim.truth import load_truth
+from machine.loading.profile_file import load_profile
+from sim.bullet.client import BulletClient, new_client
+from sim.geometry.shape import UNIT
+from sim.ground.terrain import Terrain
+from sim.scenes.arrangements import arrangement
+from sim.truth.load import load_truth
+from sim.wood.bunk import bunk_link, bunk_shapes, from_bunk, to_bunk
+from sim.wood.log_shape import LogSpec, mass_of
+from sim.wood.logs import Yard
 
 pytestmark = pytest.mark.computed
 

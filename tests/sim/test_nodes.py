@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.canopen import (
+from can_dbc.dbc.codec import load
+from can_dbc.frame import Frame
+from can_dbc.protocols.canopen import (
     NmtCommand,
     download_request,
     nmt_frame,
@@ -18,11 +20,9 @@ from can_dbc.canopen import (
     sync_frame,
     upload_request,
 )
-from can_dbc.codec import load
-from can_dbc.e2e import Checker, Sender, Status
-from can_dbc.frame import Frame
-from machine.encoder import position_from_counts
-from machine.load import load_profile
+from can_dbc.protocols.e2e import Checker, Sender, Status
+from machine.sensing.encoder import position_from_counts
+from machine.loading.profile_file import load_profile
 from sim.nodes.valve import Exit, ValveState
 from sim.plant import Plant
 

@@ -9,19 +9,19 @@ import math
 import msgspec
 import pytest
 
-from can_dbc.canopen import NmtCommand, nmt_frame, sync_frame
-from can_dbc.codec import load
-from can_dbc.e2e import Sender
+from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
-from can_dbc.nmea2000 import Receiver, split_id
+from can_dbc.protocols.canopen import NmtCommand, nmt_frame, sync_frame
+from can_dbc.protocols.e2e import Sender
+from can_dbc.protocols.nmea2000 import Receiver, split_id
 from hil.wire.stuffing import frame_bits
-from machine.encoder import position_from_counts
-from machine.load import load_profile
+from machine.sensing.encoder import position_from_counts
+from machine.loading.profile_file import load_profile
 from sim.nodes.valve import ValveState
 from sim.plant import Plant
-from sim.scene import random_scene
-from sim.truth import load_truth
-from sim.view import scene_of, view_of
+from sim.process.scene_view import scene_of, view_of
+from sim.scenes.arrangements import random_scene
+from sim.truth.load import load_truth
 
 PROFILE = load_profile("aoro_fc8")
 CARRIER = PROFILE.carrier

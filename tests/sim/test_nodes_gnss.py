@@ -15,14 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nmea2000.decoder import NMEA2000Decoder
 
-from can_dbc.codec import load
+from can_dbc.dbc.codec import load
 from can_dbc.frame import identifier
-from can_dbc.nmea2000 import Receiver, split_id
-from machine.load import load_profile
-from sim.geodesy import Site
+from can_dbc.protocols.nmea2000 import Receiver, split_id
+from machine.loading.profile_file import load_profile
+from sim.geometry.geodesy import Site
+from sim.geometry.shape import rpy_quaternion
 from sim.nodes.gnss import Fix, GnssNode
-from sim.shape import rpy_quaternion
-from sim.truth import load_truth
+from sim.truth.load import load_truth
 
 CARRIER = load_profile("aoro_fc8").carrier
 TRUTH = load_truth("nominal", 0, "aoro_fc8").gnss

@@ -7,10 +7,10 @@ import math
 import msgspec
 import pytest
 
-from can_dbc.canopen import NmtCommand, nmt_frame, sync_frame
-from can_dbc.codec import load
+from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
-from machine.load import load_profile
+from can_dbc.protocols.canopen import NmtCommand, nmt_frame, sync_frame
+from machine.loading.profile_file import load_profile
 from machine.profile import Imu
 from sim.nodes import Outbox
 from sim.nodes.imu import LATENCY_NS, LEAN_NOISE_RAD, MOUNTING_RAD, RATE_NOISE_RAD_S, ImuNode

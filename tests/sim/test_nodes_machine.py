@@ -9,11 +9,11 @@ import cantools
 import pytest
 
 import can_dbc
-from can_dbc.codec import load
-from can_dbc.e2e import Checker, Sender, Status
+from can_dbc.dbc.codec import load
 from can_dbc.frame import EXTENDED, identifier
-from can_dbc.nmea2000 import frames, join_id, split_id
-from machine.load import load_profile
+from can_dbc.protocols.e2e import Checker, Sender, Status
+from can_dbc.protocols.nmea2000 import frames, join_id, split_id
+from machine.loading.profile_file import load_profile
 from sim.nodes.arms import ArmNode, ArmState
 from sim.nodes.engine import EngineNode
 from sim.nodes.j1939 import CLAIM_PGN, NULL_ADDRESS, REQUEST_PGN

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sim.physics import new_client
+from sim.bullet.client import new_client
 
 pytestmark = pytest.mark.computed
 

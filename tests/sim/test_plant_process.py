@@ -12,13 +12,14 @@ from math import pi, remainder
 
 import pytest
 
-from can_dbc.bus import open_bus
-from can_dbc.canopen import NmtCommand, nmt_frame, sync_frame
-from can_dbc.codec import load
-from machine.grapple import grapple_yaw
-from machine.load import load_profile
-from sim.__main__ import LivePlant, main
+from can_dbc.bus.factory import open_bus
+from can_dbc.dbc.codec import load
+from can_dbc.protocols.canopen import NmtCommand, nmt_frame, sync_frame
+from machine.geometry.grapple import grapple_yaw
+from machine.loading.profile_file import load_profile
+from sim.__main__ import main
 from sim.plant import Plant
+from sim.process.live_plant import LivePlant
 
 PROFILE = load_profile("palms_471")
 _channels = itertools.count()

@@ -20,7 +20,7 @@ from can_dbc.plc import modbus
 from can_dbc.plc.datagram import Header, decode_reply, encode_command
 from can_dbc.plc.map import Fault, State
 from can_dbc.plc.modbus import MAX_CONNECTIONS, LinkError, ModbusClient, RegisterRefused
-from sim.plc.gate import DRAFTS
+from sim.plc.command_arbiter import DRAFTS
 
 ROUNDS = 60
 READ = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 0, 48)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from can_dbc.plc.datagram import Header, encode_command
 from can_dbc.plc.map import Bounds, Command, Fault, Grapple, Mode, WordOrder, command_registers
 from can_dbc.plc.modbus import RegisterRefused
-from sim.plc.gate import DRAFTS, MS, Gate
+from sim.plc.command_arbiter import DRAFTS, MS, Gate
 
 ORDER = WordOrder.HIGH_FIRST
 MOVE = Command(Mode.VALVES, True, (0.5, -0.25, 0, 0, 0, 0, 0), grapple=Grapple.HOLD, grapple_pct=20)

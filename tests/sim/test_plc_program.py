@@ -9,9 +9,9 @@ import pytest
 
 from can_dbc.plc.map import Command, Estop, Fault, Grapple, Mode, Role, State, WordOrder, command_registers
 from machine.joints import JOINTS, Joint
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from machine.profile import joint
-from sim.plc.gate import MS
+from sim.plc.command_arbiter import MS
 from sim.plc.law import QUANTUM_M, QUANTUM_RAD, stop_band
 from sim.plc.plant import PlcPlant
 from sim.plc.program import CYCLE_NS, MAY_MOVE, Inputs, Program

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from machine.load import load_profile
-from sim.log_shape import LogSpec, log_segments, mass_of, quaternion_of
-from sim.scene import CONFIGURATIONS, KINDS, arrangement, configuration, random_scene
-from sim.stacking import clearance, seen_from_above
-from sim.truth import load_truth
+from machine.loading.profile_file import load_profile
+from sim.scenes.arrangements import CONFIGURATIONS, KINDS, arrangement, configuration, random_scene
+from sim.truth.load import load_truth
+from sim.wood.log_shape import LogSpec, log_segments, mass_of, quaternion_of
+from sim.wood.stacking import clearance, seen_from_above
 
 MACHINES = ("palms_471", "aoro_fc8")
 PROFILES = {name: load_profile(name) for name in MACHINES}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from itertools import combinations
 
-from machine.load import load_profile
-from sim.site import Lying, lay_out
-from sim.terrain import EXTENT_M
+from machine.loading.profile_file import load_profile
+from sim.ground.terrain import EXTENT_M
+from sim.site.log_supply import Lying, lay_out
 
 PROFILE = load_profile("aoro_fc8")
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from sim.__main__ import main
-from sim.log_shape import LogSpec
-from sim.site_file import Site, load_site
+from sim.site.site_file import Site, load_site
+from sim.wood.log_shape import LogSpec
 
 SITE = Site(63.5, 19.5, (LogSpec(8.0, 3.0, 0.3, 2.0, 0.25, 900.0), LogSpec(-35.0, 0.0, 0.0, 2.5, 0.2, 850.0)), 1, 2)
 

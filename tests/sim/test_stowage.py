@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import pytest
 
-from machine.kinematics import solve
-from machine.load import load_profile
-from sim.carrier import PARKED, Drive
-from sim.scene import arrangement
-from sim.stowage import NEAR_M, TILT_RAD, Weight
-from sim.truth import load_truth
+from machine.geometry.kinematics import solve
+from machine.loading.profile_file import load_profile
+from sim.mechanics.carrier import PARKED, Drive
+from sim.scenes.arrangements import arrangement
+from sim.truth.load import load_truth
+from sim.wood.stowage import NEAR_M, TILT_RAD, Weight
 from sim.world import World
 
 PROFILE = load_profile("aoro_fc8")

@@ -8,8 +8,8 @@ import random
 import numpy as np
 import pytest
 
-from sim.physics import new_client
-from sim.terrain import KINDS, LAYERS, Terrain
+from sim.bullet.client import new_client
+from sim.ground.terrain import KINDS, LAYERS, Terrain
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sim.truth
-from machine.load import load_profile
-from sim.truth import load_truth
+from machine.loading.profile_file import load_profile
+from sim.truth.load import load_truth
 
 MACHINES = ("palms_471", "aoro_fc8")
 SEEDS = st.integers(0, 2**31)
@@ -81,7 +81,7 @@ def test_the_same_seed_makes_the_same_individual(machine, seed):
 
 
 def test_another_process_draws_the_same_individual():
-    code = "from sim.truth import load_truth; print(load_truth('sampled', 7, 'aoro_fc8'))"
+    code = "from sim.truth.load import load_truth; print(load_truth('sampled', 7, 'aoro_fc8'))"
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert other.stdout.strip() == str(load_truth("sampled", 7, "aoro_fc8")), other.stderr
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sim.terrain import Terrain
-from sim.tyre import Tyre, wheel_step
+from sim.ground.terrain import Terrain
+from sim.ground.tyre import Tyre, wheel_step
 
 STEP_S = 0.0025
 TYRE = Tyre(0.68, 0.6, 75.0, 4e5, 2e4, 5e5, 1.5e4, 0.30, 0.65, 0.03, 0.3)

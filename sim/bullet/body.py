@@ -1,0 +1,142 @@
+"""A multibody in the physics client: joints and links by name, torques in, positions and poses out.
+
+One body is the whole machine.  Positions are rad (m for prismatic joints), forces Nm (N).  Joint limits come from the
+URDF; passive damping, friction and everything else that is dynamic is set here and nowhere else.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from sim.bullet.client import BulletClient
+from sim.bullet.urdf import JointDef, LinkDef, urdf_text
+from sim.geometry.shape import Quaternion, Shape, Vector
+
+Pose = tuple[Vector, Quaternion]
+
+
+class Body:
+    """``index``: joint name -> pybullet joint; ``link``: link name -> pybullet link, the root is -1."""
+
+    def __init__(
+        self,
+        client: BulletClient,
+        links: Sequence[LinkDef],
+        joints: Sequence[JointDef],
+        *,
+        fixed: bool,
+        collides_with_itself: bool = False,
+    ) -> None:
+        self._p = p = client
+        p.setPhysicsEngineParameter(enableFileCaching=0)
+        flags = p.URDF_USE_INERTIA_FROM_FILE | p.URDF_MAINTAIN_LINK_ORDER
+        if collides_with_itself:
+            flags |= p.URDF_USE_SELF_COLLISION
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "machine.urdf"
+            path.write_text(urdf_text("machine", links, joints))
+            self.body: int = p.loadURDF(str(path), useFixedBase=fixed, flags=flags)
+        self.root = links[0].name
+        self.index: dict[str, int] = {}
+        self.link: dict[str, int] = {self.root: -1}
+        for i in range(p.getNumJoints(self.body)):
+            info = p.getJointInfo(self.body, i)
+            self.index[info[1].decode()] = self.link[info[12].decode()] = i
+        self.names = tuple(j.name for j in joints if j.kind != "fixed")
+        self._moving = [self.index[n] for n in self.names]
+        self._mass = {link.name: link.mass_kg for link in links}
+        self._inward = _inverse(p, p.getDynamicsInfo(self.body, -1)[3:5])
+        p.changeDynamics(self.body, -1, linearDamping=0.0, angularDamping=0.0)
+        for i in self._moving:
+            p.changeDynamics(self.body, i, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0)
+            p.setJointMotorControl2(self.body, i, p.VELOCITY_CONTROL, force=0.0)
+
+    def damp(self, joint: str, damping: float) -> None:
+        """Passive damping of a joint [Nm s/rad]."""
+        self._p.changeDynamics(self.body, self.index[joint], jointDamping=damping)
+
+    def rub(self, links: Iterable[str], friction: float) -> None:
+        """Friction factor of links."""
+        for name in links:
+            self._p.changeDynamics(self.body, self.link[name], lateralFriction=friction)
+
+    def collide_only(self, one: Iterable[str], other: Sequence[str]) -> None:
+        """Inside the body, only links of ``one`` against links of ``other`` collide."""
+        wanted = {(a, b) for a in one for b in other}
+        names = list(self.link)
+        for i, a in enumerate(names):
+            for b in names[i + 1 :]:
+                on = (a, b) in wanted or (b, a) in wanted
+                self._p.setCollisionFilterPair(self.body, self.body, self.link[a], self.link[b], int(on))
+
+    def place(self, positions: Mapping[str, float]) -> None:
+        """Set these joints at rest; the others stay."""
+        for joint, value in positions.items():
+            self._p.resetJointState(self.body, self.index[joint], value, 0.0)
+
+    def states(self) -> list[tuple[float, float, Vector, float]]:
+        """Position, velocity, reaction (force and torque where a sensor is), motor torque; in ``names`` order."""
+        return self._p.getJointStates(self.body, self._moving)
+
+    def apply(self, indices: list[int], torques: list[float]) -> None:
+        """Torques on joints for the next physics step."""
+        self._p.setJointMotorControlArray(self.body, indices, self._p.TORQUE_CONTROL, forces=torques)
+
+    def hold(self, joints: Iterable[str], force: float) -> None:
+        """Keep joints still by motors of this strength; 0 releases them."""
+        for joint in joints:
+            self._p.setJointMotorControl2(
+                self.body, self.index[joint], self._p.VELOCITY_CONTROL, targetVelocity=0.0, force=force
+            )
+
+    def sense(self, joint: str) -> None:
+        """Put a force sensor at a joint; ``states`` shows it."""
+        self._p.enableJointForceTorqueSensor(self.body, self.index[joint], True)
+
+    def pose(self, link: str) -> Pose:
+        """URDF frame of a link in the world."""
+        i = self.link[link]
+        if i < 0:
+            return self._p.multiplyTransforms(*self._p.getBasePositionAndOrientation(self.body), *self._inward)
+        state = self._p.getLinkState(self.body, i, computeForwardKinematics=1)
+        return state[4], state[5]
+
+    def poses(self) -> dict[str, Pose]:
+        """URDF frames of all links in the world."""
+        names = [n for n in self.link if n != self.root]
+        states = self._p.getLinkStates(self.body, [self.link[n] for n in names], computeForwardKinematics=1)
+        return {self.root: self.pose(self.root)} | {n: (s[4], s[5]) for n, s in zip(names, states, strict=True)}
+
+    def gravity_moment(self, joint: str, axis: Vector, outboard: Sequence[str], gravity: float) -> float:
+        """Moment of the weight of ``outboard`` links about ``axis`` (in the child link's frame) of a joint [Nm]."""
+        p = self._p
+        at = p.getLinkState(self.body, self.index[joint], computeForwardKinematics=1)
+        m = p.getMatrixFromQuaternion(at[5])
+        a = [sum(m[3 * r + c] * axis[c] for c in range(3)) for r in range(3)]
+        states = p.getLinkStates(self.body, [self.link[n] for n in outboard], computeForwardKinematics=1)
+        total = 0.0
+        for name, s in zip(outboard, states, strict=True):
+            x, y = s[0][0] - at[4][0], s[0][1] - at[4][1]
+            weight = self._mass[name] * gravity
+            total += a[0] * -y * weight + a[1] * x * weight  # axis . (r x (0, 0, -weight))
+        return total
+
+
+def fixed_boxes(client: BulletClient, shapes: Sequence[Shape], friction: float) -> int:
+    """Boxes that never move, as one body in the world."""
+    links = [LinkDef("boxes", 1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), tuple(shapes))]
+    body = Body(client, links, (), fixed=True)
+    body.rub(["boxes"], friction)
+    return body.body
+
+
+def _inverse(p: BulletClient, pose: Pose) -> Pose:
+    return p.invertTransform(*pose)
+
+
+def magnitude(v: Sequence[float]) -> float:
+    """Length of a vector's first three components."""
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])

@@ -1,0 +1,1 @@
+"""The ground: its surface, and the tyres that roll on it."""

@@ -1,0 +1,166 @@
+"""The ground: one grid of heights that tyres, cameras and Bullet's contacts all share.
+
+``heights[i, j]`` is the height [m] at (``origin_m[0]`` + i cell, ``origin_m[1]`` + j cell), world frame.  A cell is
+two flat triangles that meet on the diagonal from (i + 1, j) to (i, j + 1), exactly as Bullet's heightfield cuts it, so
+what a tyre feels is what a log lies on.  Outside the grid the ground goes on at the height of its edge; Bullet's body
+ends there.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import Final, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sim.bullet.client import BulletClient
+from sim.geometry.shape import Vector
+
+
+class Soil(NamedTuple):
+    """What the ground makes of the truth's tyres: factors of their friction and slip stiffness, and what it adds to
+    their rolling resistance.
+    """
+
+    friction: float = 1.0
+    stiffness: float = 1.0
+    rolling: float = 0.0
+
+
+KINDS: Final = ("flat", "rough", "slope", "hill", "mud")
+SIDE_SLOPE: Final = 0.10  # rise per metre towards +y of kind "slope"
+HILL_SLOPE: Final = math.tan(math.radians(10.0))  # of kind "hill"
+MUD: Final = Soil(0.5, 0.3, 0.10)  # assumed: a wheel pulls with a third of its load and sinks in
+EXTENT_M: Final = 120.0  # edge of all but rough
+ROUGH_CELLS: Final = 400
+ROUGH_CELL_M: Final = 0.2
+# Roughness: standard deviation and smoothing length [m] of each layer; correlation falls to 1/e at twice the length.
+LAYERS: Final = ((0.06, 0.75), (0.20, 6.0))
+THICKNESS_M: Final = 1.0  # of the box under flat and slope
+
+
+@njit(cache=True)
+def surface_height(x: float, y: float, x0: float, y0: float, cell: float, heights: NDArray[np.float64]) -> float:
+    """Height [m] of the surface at one point."""
+    u = min(max((x - x0) / cell, 0.0), heights.shape[0] - 1.0)
+    v = min(max((y - y0) / cell, 0.0), heights.shape[1] - 1.0)
+    i, j = min(int(u), heights.shape[0] - 2), min(int(v), heights.shape[1] - 2)
+    u, v = u - i, v - j
+    along, across = heights[i + 1, j], heights[i, j + 1]
+    if u + v <= 1.0:
+        corner = heights[i, j]
+        return corner + u * (along - corner) + v * (across - corner)
+    corner = heights[i + 1, j + 1]
+    return corner + (1.0 - u) * (across - corner) + (1.0 - v) * (along - corner)
+
+
+@njit(cache=True)
+def _surface_heights(
+    xs: NDArray[np.float64],
+    ys: NDArray[np.float64],
+    x0: float,
+    y0: float,
+    cell: float,
+    heights: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    for k in range(xs.size):
+        out[k] = surface_height(xs[k], ys[k], x0, y0, cell, heights)
+
+
+def _smooth(noise: NDArray[np.float64], length_cells: float) -> NDArray[np.float64]:
+    """Gaussian-filtered noise of unit standard deviation, wrapped at the edges."""
+    f = np.fft.fftfreq(noise.shape[0])
+    window = np.exp(-2.0 * (math.pi * length_cells) ** 2 * (f[:, None] ** 2 + f[None, : noise.shape[1] // 2 + 1] ** 2))
+    smooth = np.fft.irfft2(np.fft.rfft2(noise) * window, noise.shape)
+    return (smooth - smooth.mean()) / smooth.std()
+
+
+def _rough(seed: int) -> NDArray[np.float64]:
+    """Undulation of LAYERS, with the origin in the middle of the grid at height 0; exact in single precision."""
+    rng = np.random.default_rng(random.Random(f"terrain {seed}").getrandbits(64))
+    shape = (ROUGH_CELLS, ROUGH_CELLS)
+    heights = sum(s * _smooth(rng.standard_normal(shape), length / ROUGH_CELL_M) for s, length in LAYERS)
+    heights = np.vstack([heights, heights[:1]])
+    heights = np.hstack([heights, heights[:, :1]])
+    heights -= heights[ROUGH_CELLS // 2, ROUGH_CELLS // 2]
+    return heights.astype(np.float32).astype(np.float64)
+
+
+class Terrain:
+    """Ground of a kind: ``flat`` at ``datum_m``, ``slope`` and the steeper ``hill`` rising to +y, ``mud`` flat and
+    slippery, ``rough`` undulating, drawn from ``seed``.
+
+    Raises:
+        ValueError: the kind is not one of KINDS.
+    """
+
+    def __init__(self, kind: str = "flat", seed: int = 0, datum_m: float = 0.0) -> None:
+        if kind not in KINDS:
+            raise ValueError(f"terrain {kind!r} is unknown; use one of {', '.join(KINDS)}")
+        self.kind = kind
+        self.colour: Vector = (0.55, 0.60, 0.45)
+        self.soil = MUD if kind == "mud" else Soil()
+        if kind == "rough":
+            self.cell_m, heights = ROUGH_CELL_M, _rough(seed)
+        else:
+            rise = {"slope": SIDE_SLOPE, "hill": HILL_SLOPE}.get(kind, 0.0)
+            self.cell_m, edge = EXTENT_M, rise * EXTENT_M / 2
+            heights = np.array([[-edge, edge], [-edge, edge]])
+        self.heights: NDArray[np.float64] = np.ascontiguousarray(heights + datum_m)
+        half = (self.heights.shape[0] - 1) * self.cell_m / 2
+        self.origin_m: tuple[float, float] = (-half, -half)
+        self.grid = (*self.origin_m, self.cell_m, self.heights)
+        self.body = -1
+
+    def height(self, x: float, y: float) -> float:
+        """Height of the surface [m]."""
+        return surface_height(x, y, *self.grid)
+
+    def heights_at(self, xs: NDArray[np.float64], ys: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Heights [m] at points of any shape."""
+        xs, ys = np.broadcast_arrays(np.asarray(xs, dtype=np.float64), np.asarray(ys, dtype=np.float64))
+        out = np.empty(xs.size)
+        _surface_heights(xs.ravel(), ys.ravel(), *self.grid, out)
+        return out.reshape(xs.shape)
+
+    def normal(self, x: float, y: float) -> Vector:
+        """Unit normal, upward, of the triangle at a point."""
+        x0, y0 = self.origin_m
+        last = self.heights.shape[0] - 2
+        i, j = (max(0, min(int((at - low) / self.cell_m), last)) for at, low in ((x, x0), (y, y0)))
+        h, near = self.heights, (x - x0) + (y - y0) <= (i + j + 1) * self.cell_m
+        sx = (h[i + 1, j] - h[i, j] if near else h[i + 1, j + 1] - h[i, j + 1]) / self.cell_m
+        sy = (h[i, j + 1] - h[i, j] if near else h[i + 1, j + 1] - h[i + 1, j]) / self.cell_m
+        length = math.sqrt(sx * sx + sy * sy + 1.0)
+        return (float(-sx / length), float(-sy / length), 1.0 / length)
+
+    def add_to(self, client: BulletClient, friction: float) -> int:
+        """Create the fixed body in a client that carries the logs; keeps and returns its id."""
+        if self.kind == "rough":
+            low, high = float(self.heights.min()), float(self.heights.max())
+            rows, columns = self.heights.shape
+            shape = client.createCollisionShape(
+                client.GEOM_HEIGHTFIELD,
+                meshScale=[self.cell_m, self.cell_m, 1.0],
+                heightfieldData=self.heights.ravel(order="F").tolist(),  # x runs fastest
+                numHeightfieldRows=rows,
+                numHeightfieldColumns=columns,
+            )
+            # Bullet puts the field's own origin halfway between its lowest and highest point.
+            at, turn = [0.0, 0.0, (low + high) / 2], [0.0, 0.0, 0.0, 1.0]
+        else:
+            normal, middle = self.normal(0.0, 0.0), self.height(0.0, 0.0)
+            half = [EXTENT_M / 2, EXTENT_M / 2, THICKNESS_M / 2]
+            shape = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
+            at = [-THICKNESS_M / 2 * normal[0], -THICKNESS_M / 2 * normal[1], middle - THICKNESS_M / 2 * normal[2]]
+            turn = client.getQuaternionFromEuler([math.atan2(-normal[1], normal[2]), 0.0, 0.0])
+        self.body: int = client.createMultiBody(0.0, shape, basePosition=at, baseOrientation=turn)
+        client.changeDynamics(self.body, -1, lateralFriction=friction)
+        # Bullet works out the contacts of two bodies unless both sleep: ground that sleeps makes logs at rest free.
+        for state in (client.ACTIVATION_STATE_ENABLE_SLEEPING, client.ACTIVATION_STATE_SLEEP):
+            client.changeDynamics(self.body, -1, activationState=state)
+        return self.body

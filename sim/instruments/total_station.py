@@ -1,0 +1,40 @@
+"""A surveying instrument of the bench, with honest noise: it reads the hanger pin and the grapple's direction, both in
+the crane's base frame.
+"""
+
+from __future__ import annotations
+
+import random
+from math import pi, radians
+from typing import Final
+
+from sim.geometry.shape import Vector, quaternion_rpy
+from sim.plant import Plant
+
+NOISE_M: Final = 0.002
+"""One sigma per axis: a total station on a prism that hangs from a swinging boom."""
+NOISE_YAW_RAD: Final = radians(1.0)
+"""One sigma: two points of a grapple that hangs and still moves a little."""
+
+
+class TotalStation:
+    """Reads positions; the noise is its own, drawn from a seed."""
+
+    def __init__(self, seed: int) -> None:
+        self._rng = random.Random(f"total station {seed}")
+        self._yaw_rng = random.Random(f"total station, direction {seed}")
+
+    def read(self, pin_m: Vector) -> Vector:
+        """What it shows for a pin that is at ``pin_m``."""
+        x, y, z = (axis + self._rng.gauss(0.0, NOISE_M) for axis in pin_m)
+        return (x, y, z)
+
+    def read_yaw(self, yaw_rad: float) -> float:
+        """What it shows for a grapple that opens along ``yaw_rad``: in 0..pi, for its two sides look alike."""
+        return (yaw_rad + self._yaw_rng.gauss(0.0, NOISE_YAW_RAD)) % pi
+
+
+def grapple_yaw(plant: Plant) -> float:
+    """True direction along which the grapple opens, about the plumb, in the crane's base frame [rad]."""
+    grapple, base = plant.link_poses()["rotator"][1], plant.base_pose()[1]
+    return quaternion_rpy(grapple)[2] - quaternion_rpy(base)[2]

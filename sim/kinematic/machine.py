@@ -1,0 +1,131 @@
+"""A world without physics: every function moves exactly as its valve's map in the profile says, and the carrier rolls.
+
+What a calibration rig is to a machine: the same nodes on the same buses, for the cost of a few multiplications a step.
+The oil shows fixed pressures.  The tongs open and close with their times.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+from machine.geometry.carrier import ARMS, arm_angle_from_height, height_from_arm_angle
+from machine.joints import JOINTS
+from machine.profile import CarrierValve, Profile, Valve
+from sim.emulation import EmulatedMachine
+from sim.kinematic.carrier import RollingCarrier
+from sim.nodes.valve import CYCLE_NS, FUNCTIONS
+from sim.truth.load import Truth, load_truth
+
+REST_PA = 1.0e6
+PUMP_PA = 18.0e6
+MIDDLE = 0.5
+"""Share of its range at which every joint stands at the start; the boom is raised and bent there."""
+
+
+class _Oil:
+    """Fixed pressures; ``spools`` by function, -1..1."""
+
+    supply_pa = PUMP_PA
+    energy_j = 0.0
+    flow_limited = False
+
+    def __init__(self) -> None:
+        self.spools = dict.fromkeys(FUNCTIONS, 0.0)
+        self.pressures_pa = dict.fromkeys(FUNCTIONS, (REST_PA, REST_PA))
+
+
+class _Function:
+    """Dead time, dead-band and gain of one valve."""
+
+    def __init__(self, valve: Valve | CarrierValve, sign: int, step_ns: int) -> None:
+        self._dead = (valve.deadband_minus_pct / 100.0, valve.deadband_plus_pct / 100.0)
+        self._full = (-valve.full_speed_minus, valve.full_speed_plus)
+        self._sign = sign
+        self._line = deque([0.0] * max(1, round(valve.delay_s * 1e9 / step_ns)))
+
+    def speed(self, command: float) -> float:
+        """Of the joint in this step; ``command`` is -1..1 of the spool."""
+        self._line.append(command * self._sign)
+        spool = self._line.popleft()
+        dead = self._dead[spool > 0.0]
+        return self._full[spool > 0.0] * max(0.0, abs(spool) - dead) / (1.0 - dead)
+
+
+class KinematicWorld:
+    """Joints that integrate their valves (`sim.emulation.Surroundings`)."""
+
+    def __init__(self, profile: Profile, truth: Truth, step_ns: int) -> None:
+        self.profile, self.truth = profile, truth
+        self.hydraulics = _Oil()
+        self.carrier: RollingCarrier | None = None
+        self.opening = 1.0
+        self._step_s = step_ns * 1e-9
+        joints = {j.name.lower(): profile.joints[j.name.lower()] for j in JOINTS}
+        self._functions = {name: _Function(spec.valve, spec.valve.sign, step_ns) for name, spec in joints.items()}
+        self._range = {name: (spec.lower, spec.upper) for name, spec in joints.items()}
+        self.q = {name: low + MIDDLE * (high - low) for name, (low, high) in self._range.items()}
+        if profile.carrier is not None:
+            c = profile.carrier
+            self._functions["articulation"] = _Function(c.steer_valve, 1, step_ns)
+            self._range["articulation"] = (-c.articulation_limit_rad, c.articulation_limit_rad)
+            self.q["articulation"] = 0.0
+            self._arms = [_Function(c.arm_valve, 1, step_ns) for _ in ARMS]
+            self.q |= dict.fromkeys(ARMS, arm_angle_from_height(c, c.arm_transport_m))
+        self.qd = dict.fromkeys(self.q, 0.0)
+        if profile.carrier is not None:
+            self.carrier = RollingCarrier(profile.carrier, self.q, self.qd)
+
+    def load_kg(self) -> float:
+        return 0.0
+
+    def lean_rad(self) -> tuple[float, float]:
+        return 0.0, 0.0
+
+    def step(self, commands: Sequence[float], speed_m_s: float = 0.0, brake: bool = True) -> None:
+        """One step; ``commands`` -1..1: `FUNCTIONS`, then on a carrier steering and `ARMS`; its wanted speed."""
+        by_name = dict(zip(FUNCTIONS, commands, strict=False))
+        self.hydraulics.spools = by_name
+        if self.carrier is not None:
+            by_name = by_name | {"articulation": commands[len(FUNCTIONS)]}
+            self._raise(commands[len(FUNCTIONS) + 1 :])
+        for name, function in self._functions.items():
+            self._turn(name, function.speed(by_name[name]))
+        if self.carrier is not None:
+            self.carrier.step(speed_m_s, brake, self._step_s)
+        times = (self.profile.grapple.close_time_s, self.profile.grapple.open_time_s)
+        grapple = by_name["grapple"]
+        self.opening = min(1.0, max(0.0, self.opening + grapple * self._step_s / times[grapple > 0.0]))
+
+    def _turn(self, name: str, speed: float) -> None:
+        low, high = self._range[name]
+        after = min(high, max(low, self.q[name] + speed * self._step_s))
+        self.qd[name], self.q[name] = speed if low < after < high else 0.0, after
+
+    def _raise(self, commands: Sequence[float]) -> None:
+        c = self.profile.carrier
+        assert c is not None
+        for arm, function, command in zip(ARMS, self._arms, commands, strict=True):
+            height_m = height_from_arm_angle(c, self.q[arm]) + function.speed(command) * self._step_s
+            after = arm_angle_from_height(c, min(c.arm_travel_m, max(0.0, height_m)))
+            self.qd[arm], self.q[arm] = (after - self.q[arm]) / self._step_s, after
+
+
+class KinematicMachine(EmulatedMachine):
+    """Every node of a machine around a `KinematicWorld`."""
+
+    def __init__(
+        self, profile: Profile, seed: int, truth: str = "nominal", *, step_ns: int, cycle_ns: int = CYCLE_NS
+    ) -> None:
+        facts = load_truth(truth, seed, profile.name)
+        self.world = KinematicWorld(profile, facts, step_ns)
+        super().__init__(profile, facts, seed, self.world, step_ns, cycle_ns)
+
+    def _move(self, now_ns: int) -> None:
+        spools, vehicle = self._spools(now_ns), self.vehicle_node
+        drive = () if vehicle is None else (vehicle.drive_m_s, vehicle.brake)
+        self.world.step(spools, *drive)
+
+    def joint_positions(self) -> tuple[float, ...]:
+        """In ``Joint`` order [rad, m]; rot is kept within a turn by nobody."""
+        return tuple(self.world.q[j.name.lower()] for j in JOINTS)

@@ -1,0 +1,1 @@
+"""The machine's mechanics: crane, grapple, column, carrier and the hand levers."""

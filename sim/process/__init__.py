@@ -1,0 +1,1 @@
+"""The live plant as a process: real-time loop, requests and views."""

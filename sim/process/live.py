@@ -1,0 +1,90 @@
+"""An emulated machine on the monotonic clock and on real buses: what ``python -m sim`` and the timing rig share.
+
+Absolute deadlines; the machine wakes when its next step is due and when a frame has come, so that a SYNC is answered at
+once.  A host too slow for real time makes the machine's time stand still for a moment (no burst); how often is counted.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Mapping
+
+from can_dbc.bus.base import Bus, BusState
+from can_dbc.bus.reconnector import LostLink
+from can_dbc.frame import Frame
+from sim.emulation import EmulatedMachine
+
+TX_QUEUE = 256  # this process plays a dozen nodes
+LAG_NS = 25_000_000
+
+
+class LiveMachine:
+    """A machine and its buses, by name.  ``stop`` ends ``run``."""
+
+    def __init__(self, machine: EmulatedMachine, buses: Mapping[str, Bus]) -> None:
+        self._machine, self._buses = machine, dict(buses)
+        self._running = True
+        self._skipped_ns = self._started_ns = self._stalls = 0
+        self._links = [LostLink(bus) for bus in self._buses.values()]
+
+    def stop(self, *_: object) -> None:
+        """End after the present step; usable as a signal handler."""
+        self._running = False
+
+    def run(self) -> None:
+        """Until stopped."""
+        machine, frames = self._machine, list[Frame]()
+        self._started_ns = time.monotonic_ns()
+        while self._running:
+            now_ns = time.monotonic_ns() - self._skipped_ns
+            behind_ns = now_ns - machine.next_ns if machine.next_ns else 0
+            if behind_ns > LAG_NS:
+                self._skipped_ns += behind_ns
+                self._stalls += 1
+                now_ns -= behind_ns
+            received = []
+            for name, bus in self._buses.items():
+                frames.clear()
+                bus.drain(frames)
+                self._heard(frames)
+                received += [(name, f._replace(stamp_ns=f.stamp_ns - self._skipped_ns)) for f in frames]
+            sent: dict[str, list[tuple[int, bytes]]] = {}
+            for name, key, data in machine.step(now_ns, received):
+                sent.setdefault(name, []).append((key, data))
+            for name, out in sent.items():
+                self._buses[name].send_all(out)
+            for link in self._links:
+                link.watch(now_ns)
+            self._stepped(now_ns)
+            pause_ns = machine.next_ns - (time.monotonic_ns() - self._skipped_ns)
+            if pause_ns > 0:
+                self._wait(pause_ns * 1e-9)
+
+    def _heard(self, frames: list[Frame]) -> None:
+        """Called with what a bus brought."""
+
+    def _stepped(self, now_ns: int) -> None:
+        """Called after every step."""
+
+    def _wait(self, pause_s: float) -> None:
+        """Until the next step is due or a frame has come; a bus that is gone is always readable, so it is left out."""
+        listening = [b for b in self._buses.values() if b.fileno() >= 0 and b.stats.state is not BusState.DOWN]
+        if listening:
+            select.select(listening, (), (), pause_s)
+        else:
+            time.sleep(pause_s)
+
+    def report(self) -> dict[str, float]:
+        """How well real time was kept, in totals: share of time that was lost, and how often; frames by the bus."""
+        elapsed_ns = max(1, time.monotonic_ns() - self._started_ns)
+        stats = [bus.stats for bus in self._buses.values()]
+        return {
+            "time_s": elapsed_ns * 1e-9,
+            "lost_share": self._skipped_ns / elapsed_ns,
+            "stalls": self._stalls,
+            "sent_frames": sum(s.sent for s in stats),
+            "received_frames": sum(s.received for s in stats),
+            "refused_frames": sum(s.refused for s in stats),
+            "dropped_frames": sum(s.dropped for s in stats),
+        }

@@ -1,0 +1,125 @@
+"""The plant in real time on its buses, with a UDP port for JSON requests and a TCP port for camera pictures.
+
+Requests and answers are listed in ``sim/__main__.py``.  Both ports are bound on the loopback interface only.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from can_dbc.bus.base import Bus
+from sim.instruments.ideal_detector import detect, detect_near
+from sim.instruments.total_station import TotalStation, grapple_yaw
+from sim.plant import Plant
+from sim.process.live import LiveMachine
+from sim.process.scene_view import scene_of, view_of
+from sim.site.log_supply import Layer
+from sim.site.site_file import Site
+
+if TYPE_CHECKING:
+    from sim.camera.server import CameraServer
+
+REQUEST_POLL_NS: Final = 20_000_000
+LOG_SUPPLY_PERIOD_NS: Final = 1_000_000_000
+
+
+class LivePlant(LiveMachine):
+    """A plant that also answers requests on a UDP port."""
+
+    def __init__(
+        self,
+        plant: Plant,
+        buses: Mapping[str, Bus],
+        port: int | None,
+        seed: int = 0,
+        cameras: int | None = None,
+        site: Site | None = None,
+    ) -> None:
+        super().__init__(plant, buses)
+        self._plant = plant
+        self._station = TotalStation(seed)
+        self._answer_ns = self._lay_ns = 0
+        self._layer = None if site is None else Layer(plant, site.places, site.rounds)
+        self._requests: socket.socket | None = None
+        if port is not None:
+            self._requests = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._requests.setblocking(False)
+            self._requests.bind(("127.0.0.1", port))
+        self.cameras: CameraServer | None = None
+        if cameras is not None:
+            from sim.camera.rig import CameraRig
+            from sim.camera.server import CameraServer
+
+            self.cameras = CameraServer(CameraRig(plant.world, plant.profile, plant.world.truth, seed), cameras)
+
+    def _stepped(self, now_ns: int) -> None:
+        if self.cameras is not None:
+            self.cameras.serve(now_ns)
+        if self._requests is not None and now_ns >= self._answer_ns:
+            self._answer(self._requests)
+            self._answer_ns = now_ns + REQUEST_POLL_NS
+        if self._layer is not None and now_ns >= self._lay_ns:
+            self._layer.step()
+            self._lay_ns = now_ns + LOG_SUPPLY_PERIOD_NS
+
+    def _answer(self, requests: socket.socket) -> None:
+        while True:
+            try:
+                datagram, sender = requests.recvfrom(4096)
+            except BlockingIOError:
+                return
+            try:
+                request = msgspec.json.decode(datagram, type=dict[str, str])
+                reply = self._reply(request)
+            except msgspec.DecodeError as error:
+                reply = {"error": f"not a JSON object of strings: {error}"}
+            except ValueError as error:
+                reply = {"error": str(error)}
+            requests.sendto(msgspec.json.encode(reply), sender)
+
+    def _reply(self, request: dict[str, str]) -> Any:
+        plant = self._plant
+        match request.get("op", ""):
+            case "state":
+                return {
+                    "joints": plant.joint_positions(),
+                    "tong_rad": plant.tong_angle(),
+                    "tip_m": plant.tip(),
+                    "poses": plant.link_poses(),
+                    "logs": plant.logs(),
+                    "vehicle": plant.vehicle(),
+                    "verdict": plant.judge(),
+                    "host": self.report(),
+                }
+            case "logs":
+                return detect(plant) if self._layer is None else detect_near(plant)
+            case "verdict":
+                return plant.judge()
+            case "poses":
+                return plant.link_poses()
+            case "shapes":
+                return plant.shapes()
+            case "vehicle":
+                return plant.vehicle()
+            case "survey":
+                station = self._station
+                return {"pin_m": station.read(plant.tip()), "yaw_rad": station.read_yaw(grapple_yaw(plant))}
+            case "scene":
+                return scene_of(plant)
+            case "view":
+                return view_of(plant)
+            case "lever":
+                plant.lever(request.get("name", ""), float(request.get("value", "")))
+                return {"ok": True}
+            case "press" | "release" | "reset":
+                getattr(plant.estop, request["op"])()
+                return {"ok": True}
+            case "quit":
+                self.stop()
+                return {"ok": True}
+            case op:
+                return {"error": f"unknown op {op!r}"}

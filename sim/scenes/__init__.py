@@ -1,0 +1,1 @@
+"""Scenes: which logs there are, and how they come to rest."""

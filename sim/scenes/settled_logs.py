@@ -1,0 +1,68 @@
+"""What pictures for training and judging take from the plant without its machine: logs at rest, and stereo's errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Final
+
+import msgspec
+
+from machine.profile import Profile
+from sim.bullet.client import new_client
+from sim.camera.noise import StereoNoise
+from sim.camera.scene import LogPose
+from sim.geometry.shape import UNIT
+from sim.ground.terrain import Terrain
+from sim.scenes.arrangements import arrangement
+from sim.truth.load import Truth, load_truth
+from sim.wood.logs import Yard
+
+BASE: Final = ((0.0, 0.0, 0.0), UNIT)
+
+
+@lru_cache(maxsize=8)
+def _truth(name: str, seed: int, machine: str) -> Truth:
+    return load_truth(name, seed, machine)
+
+
+def settled(
+    profile: Profile, kind: str, seed: int, logs: int, terrain: Terrain, route: Sequence[tuple[float, float]]
+) -> tuple[LogPose, ...]:
+    """An arrangement of ``sim.scenes.arrangements`` at rest on ``terrain``, by the nominal truth; instances 1, 2, ...
+
+    Raises ValueError when there is no room, or no rest.
+    """
+    truth, client = _truth("nominal", 0, profile.name), new_client()
+    try:
+        scene = arrangement(kind, profile, truth.wood, seed, logs, route=route)
+        states = Yard(client, profile, truth, scene, terrain, BASE).states()
+    finally:
+        client.disconnect()
+    return tuple(
+        LogPose(i + 1, s.position_m, s.quaternion, s.length_m, s.diameter_m, s.taper_m_m, s.sweep_m)
+        for i, s in enumerate(states)
+    )
+
+
+def stereo(profile: Profile, camera: str, seed: int | str, truth: str = "nominal", truth_seed: int = 0) -> StereoNoise:
+    """Depth errors of a machine's camera as a truth has them."""
+    return StereoNoise(profile.cameras[camera], _truth(truth, truth_seed, profile.name).cameras[camera], seed)
+
+
+def varied_stereo(
+    profile: Profile, camera: str, seed: int, *, sigma: float, edges: tuple[float, float], holes: float,
+    plain_holes: float, correlation_px: float,
+) -> StereoNoise:  # fmt: skip
+    """A better or worse camera than the nominal one: factors of its disparity error, of both its edge widths and of its
+    holes; share of holes where there is no texture; how far errors are alike."""
+    own = _truth("nominal", 0, profile.name).cameras[camera]
+    changed = msgspec.structs.replace(
+        own,
+        disparity_sigma_px=own.disparity_sigma_px * sigma,
+        edge_px=(own.edge_px[0] * edges[0], own.edge_px[1] * edges[1]),
+        hole_share=min(0.3, own.hole_share * holes),
+        plain_hole_share=plain_holes,
+        correlation_px=correlation_px,
+    )
+    return StereoNoise(profile.cameras[camera], changed, seed)

@@ -1,0 +1,90 @@
+"""The site of a mission: logs where a plan says that they lie, and a helper who lays new ones for the next lap.
+
+Paper B replaced the logs as soon as the machine had collected them (section 5.2): here every place has a log for each
+lap, and those of later laps wait far away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+from machine.profile import Profile
+from sim.plant import Plant
+from sim.scenes.arrangements import arrangement
+from sim.truth.load import load_truth
+from sim.wood.log_shape import LogSpec
+
+FAR_M: Final = 35.0
+APART_M: Final = 4.0
+AWAY_M: Final = 14.0
+"""The machine is so far away when a new log is laid."""
+GONE_M: Final = 1.5
+"""A log that lies farther from its place was taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lying:
+    """Where a log is to lie in the world [m, rad]; what is None is drawn from the truth's wood."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float | None = None
+    length_m: float | None = None
+    diameter_m: float | None = None
+
+
+def lay_out(profile: Profile, truth: str, seed: int, places: Sequence[Lying], rounds: int = 1) -> tuple[LogSpec, ...]:
+    """Logs at the places, then as many for every further round, far away; raises ValueError for an unknown truth."""
+    if not places:
+        return ()
+    wood = load_truth(truth, seed, profile.name).wood
+    count = len(places) * rounds
+    drawn = arrangement("row", profile, wood, seed, count, route=((0.0, 0.0), (10.0 * count + 20.0, 0.0)))
+    found = []
+    for i, spec in enumerate(drawn):
+        place = places[i % len(places)]
+        x_m, y_m = (place.x_m, place.y_m) if i < len(places) else (-FAR_M, APART_M * (i - len(drawn) / 2))
+        found.append(
+            replace(
+                spec, x_m=x_m, y_m=y_m,
+                yaw_rad=spec.yaw_rad if place.yaw_rad is None else place.yaw_rad,
+                length_m=place.length_m or spec.length_m, diameter_m=place.diameter_m or spec.diameter_m,
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+def along_route(
+    profile: Profile, truth: str, seed: int, logs: int, route: Sequence[tuple[float, float]]
+) -> tuple[LogSpec, ...]:
+    """So many logs beside a route [m], drawn from the truth's wood; raises ValueError when there is no room."""
+    return arrangement("row", profile, load_truth(truth, seed, profile.name).wood, seed, logs, route=route)
+
+
+class Layer:
+    """The person who lays a new log where one was taken, once the machine is away."""
+
+    def __init__(self, plant: Plant, places: int, rounds: int) -> None:
+        self._plant = plant
+        self._at = [(spec.x_m, spec.y_m) for spec in plant.world.yard.scene[:places]]
+        self._lying = list(range(places))
+        self._waiting = [[i + k * places for k in range(1, rounds)] for i in range(places)]
+
+    def step(self) -> int:
+        """Look after all places; how many logs were laid."""
+        laid, yard = 0, self._plant.world.yard
+        if not any(self._waiting):
+            return laid
+        states, machine = yard.states(), self._plant.base_pose()[0]
+        for i, at in enumerate(self._at):
+            taken = math.dist(states[self._lying[i]].position_m[:2], at) > GONE_M
+            if self._waiting[i] and taken and math.dist(machine[:2], at) > AWAY_M:
+                fresh = self._lying[i] = self._waiting[i].pop(0)
+                x, y, _ = states[fresh].position_m
+                yard.wake()
+                yard.carry(fresh, at[0] - x, at[1] - y)
+                laid += 1
+        return laid

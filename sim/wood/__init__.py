@@ -1,0 +1,1 @@
+"""Logs: their shape, their rigid bodies, how they are stacked, and the bunk that carries them."""

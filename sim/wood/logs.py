@@ -1,0 +1,301 @@
+"""Logs as bodies of the physics client, and their state for display and judging.
+
+A log is one rigid body of 3 or 5 coaxial cylinders along its bow (docs/reference/plant-model.md section 1: cylinders roll, hulls have flats), with
+the mass, centre of mass and inertia of the tapered, bowed wood.  The scene comes to rest in a physics client of its
+own before the logs appear in the machine's, so nothing disturbs the crane.  A log at rest sleeps: it costs nothing
+and stands still until something touches it, where Bullet's friction alone would let a wedged one creep 1 mm/s.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from machine.profile import Profile
+from sim.bullet.client import BulletClient, new_client
+from sim.geometry.shape import Quaternion, Vector, rpy_quaternion
+from sim.ground.terrain import Terrain
+from sim.truth.body import Contact
+from sim.truth.load import Truth
+from sim.wood.bunk import bunk_boxes, from_bunk
+from sim.wood.log_shape import LogSpec, Mass, log_segments, mass_of, quaternion_of
+from sim.wood.stacking import seen_from_above
+
+Pose = tuple[Vector, Quaternion]
+
+SLEEP: Final = 0.02  # [m/s, rad/s]
+SETTLE_STEP_S: Final = 0.0025
+SETTLE_S: Final = 20.0  # longest time to come to rest
+LOOK_STEPS: Final = 20
+STILL_LOOKS: Final = 8  # 0.4 s
+REST_M_S: Final = 0.004
+REST_RAD_S: Final = 0.02
+# While a scene comes to rest, air as thick as this [1/s, of Bullet's form] takes the energy out of rolling logs.
+SETTLE_DAMPING: Final = (0.3, 0.9)
+INSIDE_M: Final = 0.003  # deepest contact at the start that is not "inside"
+NUDGE_RAD_S: Final = 0.1
+NEIGHBOUR_M: Final = 0.05
+BARK: Final = (0.55, 0.35, 0.18, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class LogState:
+    """One log now, world frame: log frame (position of the pith at half length, orientation x, y, z, w), unit vector
+    along it towards the thin end, sizes, speed of its fastest point, both ends of the pith.
+    """
+
+    position_m: Vector
+    quaternion: Quaternion
+    axis: Vector
+    length_m: float
+    diameter_m: float
+    mass_kg: float
+    speed_m_s: float
+    taper_m_m: float
+    sweep_m: float
+    ends_m: tuple[Vector, Vector]
+
+
+class Yard:
+    """The logs.  ``logs`` are body ids in scene order, ``masses`` in kg.
+
+    ``terrain`` is used in the private client alone; ``base`` is the crane's base frame in the world, for the bunk.
+    Raises ValueError when logs start in each other or in the machine, or do not come to rest.
+    """
+
+    def __init__(
+        self,
+        client: BulletClient,
+        profile: Profile,
+        truth: Truth,
+        scene: Sequence[LogSpec],
+        terrain: Terrain,
+        base: Pose,
+    ) -> None:
+        self._p, self.scene = client, tuple(scene)
+        wood = [mass_of(spec) for spec in self.scene]
+        self.masses = [m.mass_kg for m in wood]
+        poses = _settled(profile, truth.contact, self.scene, terrain, base) if self.scene else []
+        self.logs = tuple(
+            _body(client, spec, m, pose, truth.contact) for spec, m, pose in zip(self.scene, wood, poses, strict=True)
+        )
+        _check_apart(client, self.logs, "at rest")
+        for state in (client.ACTIVATION_STATE_ENABLE_SLEEPING, client.ACTIVATION_STATE_SLEEP):
+            for body in self.logs:
+                client.changeDynamics(body, -1, activationState=state, sleepThreshold=SLEEP)
+        # Body axes -> log frame: the turn about y, and the log's origin seen from the centre of mass.
+        self._turn = np.array([m.turn_rad for m in wood])
+        self._com = np.array([m.com_m for m in wood]).reshape(-1, 3)
+        self.stowed: tuple[int, ...] = ()
+        self._seen: list[Any] = [None] * len(self.logs)
+        self._last: list[Any] = [None] * len(self.logs)
+        self._size = np.array([(s.length_m, s.diameter_m, s.sweep_m) for s in self.scene]).reshape(-1, 3)
+
+    def wake(self) -> None:
+        """Wake all logs that are not stowed; needed before a pose, a speed or a force is put on one from outside."""
+        for i, body in enumerate(self.logs):
+            if i not in self.stowed:
+                self._p.changeDynamics(body, -1, activationState=self._p.ACTIVATION_STATE_WAKE_UP)
+
+    def carry(self, which: int, east_m: float, north_m: float) -> None:
+        """Someone takes a log, as it lies, to another place on level ground, by so much in the world."""
+        (x, y, z), turn = self._p.getBasePositionAndOrientation(self.logs[which])
+        self._p.resetBasePositionAndOrientation(self.logs[which], (x + east_m, y + north_m, z), turn)
+        self._p.resetBaseVelocity(self.logs[which], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+    def states(self) -> list[LogState]:
+        """The logs now, in scene order.  Only those that moved since the last call are worked out."""
+        p = self._p
+        now = [(p.getBasePositionAndOrientation(body), p.getBaseVelocity(body)) for body in self.logs]
+        moved = [i for i, seen in enumerate(now) if seen != self._seen[i]]
+        if moved:
+            for i, state in zip(moved, self._states(moved, [now[i] for i in moved]), strict=True):
+                self._seen[i], self._last[i] = now[i], state
+        return list(self._last)
+
+    def _states(self, which: list[int], now: Sequence[tuple[Pose, tuple[Vector, Vector]]]) -> list[LogState]:
+        turned = _times(np.array([q for (_, q), _ in now]), -self._turn[which])
+        x, _, z = _axes(turned)
+        com, (length, diameter, sweep) = self._com[which], self._size[which].T
+        position = np.array([at for (at, _), _ in now]) - com[:, :1] * x - com[:, 2:] * z
+        half, back = length[:, None] / 2 * z, position - sweep[:, None] * x
+        linear, angular = np.array([velocity for _, velocity in now]).transpose(1, 0, 2)
+        roll = np.abs(np.sum(angular * z, axis=1))
+        across = np.sqrt(np.maximum(np.sum(angular * angular, axis=1) - roll * roll, 0.0))
+        # No point of the log is faster than this.
+        speed = (
+            np.linalg.norm(linear, axis=1) + (length / 2 + np.abs(com[:, 2])) * across + (diameter / 2 + sweep) * roll
+        )
+        columns = zip(which, *(c.tolist() for c in (position, turned, z, back - half, back + half, speed)), strict=True)
+        return [
+            LogState(
+                tuple(at), tuple(turn), tuple(axis), self.scene[i].length_m, self.scene[i].diameter_m, self.masses[i],
+                v, self.scene[i].taper_m_m, self.scene[i].sweep_m, (tuple(butt), tuple(top)),
+            )
+            for i, at, turn, axis, butt, top, v in columns
+        ]  # fmt: skip
+
+
+def _times(q: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternions [n, 4] followed by turns [n] about their own y."""
+    s, c = np.sin(angle / 2), np.cos(angle / 2)
+    x, y, z, w = q.T
+    return np.stack([c * x - s * z, c * y + s * w, c * z + s * x, c * w - s * y], axis=1)
+
+
+def _axes(q: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """The three axes [n, 3] of quaternions [n, 4]."""
+    x, y, z, w = q.T
+    return (
+        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1),
+        np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1),
+        np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1),
+    )
+
+
+def _body(p: BulletClient, spec: LogSpec, mass: Mass, pose: Pose, contact: Contact) -> int:
+    """A log in a client; ``pose`` is of the body's own frame: centre of mass, principal axes."""
+    half, (cx, _, cz) = -mass.turn_rad / 2, mass.com_m
+    c, s = math.cos(2 * half), math.sin(2 * half)
+    radii, lengths, middles, turns = [], [], [], []
+    for a, b, ra, rb in log_segments(spec):
+        radii.append((ra + rb) / 2)
+        lengths.append(math.dist(a, b))
+        x, z = (a[0] + b[0]) / 2 - cx, (a[2] + b[2]) / 2 - cz
+        middles.append([c * x + s * z, 0.0, c * z - s * x])
+        tilt = math.atan2(b[0] - a[0], b[2] - a[2]) / 2 + half
+        turns.append([0.0, math.sin(tilt), 0.0, math.cos(tilt)])
+    shape = p.createCollisionShapeArray(
+        shapeTypes=[p.GEOM_CYLINDER] * len(radii),
+        radii=radii,
+        lengths=lengths,
+        collisionFramePositions=middles,
+        collisionFrameOrientations=turns,
+    )
+    body: int = p.createMultiBody(
+        mass.mass_kg, shape, basePosition=pose[0], baseOrientation=pose[1], useMaximalCoordinates=1
+    )
+    p.changeDynamics(
+        body,
+        -1,
+        mass=mass.mass_kg,  # without it Bullet takes the inertia of a massless body
+        localInertiaDiagonal=mass.inertia_kg_m2,
+        lateralFriction=contact.log_friction,
+        rollingFriction=contact.log_rolling_m,
+        spinningFriction=contact.log_rolling_m,
+        linearDamping=0.0,
+        angularDamping=0.0,
+    )
+    return body
+
+
+def _lifts(scene: Sequence[LogSpec], terrain: Terrain) -> list[float]:
+    """Height of the ground under each log's lowest line; logs that are near each other share the highest."""
+    lifts = []
+    for s in scene:
+        points = s.spine()
+        radii = [s.radius(i / (len(points) - 1) - 0.5) for i in range(len(points))]
+        low = [pt[2] - r for pt, r in zip(points, radii, strict=True)]
+        least, d = min(low), s.diameter_m / 2
+        lifts.append(
+            max(
+                terrain.height(s.x_m + pt[0] + dx, s.y_m + pt[1] + dy) - (z - least)
+                for pt, z in zip(points, low, strict=True)
+                for dx, dy in ((0.0, 0.0), (d, 0.0), (-d, 0.0), (0.0, d), (0.0, -d))
+            )
+        )
+    near = [
+        (i, j)
+        for i, a in enumerate(scene)
+        for j in range(i)
+        if math.hypot(a.x_m - scene[j].x_m, a.y_m - scene[j].y_m) < 4.0 and seen_from_above(a, scene[j]) < NEIGHBOUR_M
+    ]
+    for _ in scene:
+        for i, j in near:
+            lifts[i] = lifts[j] = max(lifts[i], lifts[j])
+    return lifts
+
+
+def _settled(profile: Profile, contact: Contact, scene: Sequence[LogSpec], terrain: Terrain, base: Pose) -> list[Pose]:
+    """Poses of the bodies after the scene has come to rest on the terrain and in the bunk."""
+    p = new_client()
+    try:
+        p.setGravity(0.0, 0.0, -9.81)
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=SETTLE_STEP_S, numSolverIterations=40, numSubSteps=0, deterministicOverlappingPairs=1
+        )
+        terrain.add_to(p, contact.ground_friction)
+        b = profile.bunk
+        along = rpy_quaternion(0.0, 0.0, b.yaw_rad)
+        for size, middle in bunk_boxes(profile):
+            shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[x / 2 for x in size])
+            at, turn = p.multiplyTransforms(*base, from_bunk(b, middle), along)
+            box = p.createMultiBody(0.0, shape, basePosition=at, baseOrientation=turn)
+            p.changeDynamics(box, -1, lateralFriction=contact.bunk_friction)
+        free = [s for s in scene if not s.in_bunk]
+        lifts = iter(_lifts(free, terrain))
+        bodies = []
+        for s in scene:
+            m, turn = mass_of(s), quaternion_of(s)
+            n = s.pieces * 4
+            low = min(pt[2] - s.radius(i / n - 0.5) for i, pt in enumerate(s.spine(n + 1)))
+            at = (s.x_m, s.y_m, s.z_m - low)
+            if s.in_bunk:
+                at = from_bunk(b, (at[0], at[1], at[2] + b.floor_z_m))
+                at, turn = p.multiplyTransforms(*base, at, p.multiplyTransforms((0, 0, 0), along, (0, 0, 0), turn)[1])
+            else:
+                at = (at[0], at[1], at[2] + next(lifts))
+            own = (0.0, math.sin(m.turn_rad / 2), 0.0, math.cos(m.turn_rad / 2))
+            bodies.append(_body(p, s, m, p.multiplyTransforms(at, turn, m.com_m, own), contact))
+        _check_apart(p, bodies, "where they are let go")
+        _rest(p, bodies)
+        return [p.getBasePositionAndOrientation(body) for body in bodies]
+    finally:
+        p.disconnect()
+
+
+def _rest(p: BulletClient, bodies: Sequence[int]) -> None:
+    """Step until every log stands still: in thick air, then without, nudged so that none stays on a knife edge.
+
+    A log that has come through both sleeps while others still roll.
+    """
+    still, free = dict.fromkeys(bodies, 0), dict.fromkeys(bodies, False)
+    for body in bodies:
+        p.changeDynamics(body, -1, activationState=p.ACTIVATION_STATE_ENABLE_SLEEPING, sleepThreshold=SLEEP)
+        p.changeDynamics(body, -1, linearDamping=SETTLE_DAMPING[0], angularDamping=SETTLE_DAMPING[1])
+    for _ in range(round(SETTLE_S / SETTLE_STEP_S / LOOK_STEPS)):
+        for _ in range(LOOK_STEPS):
+            p.stepSimulation()
+        for i, body in enumerate(bodies):
+            v, w = p.getBaseVelocity(body)
+            still[body] = still[body] + 1 if math.hypot(*v) < REST_M_S and math.hypot(*w) < REST_RAD_S else 0
+            if still[body] >= STILL_LOOKS and free[body]:
+                p.changeDynamics(body, -1, activationState=p.ACTIVATION_STATE_SLEEP)
+            elif still[body] >= STILL_LOOKS:
+                free[body], still[body] = True, 0
+                p.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
+                along = p.getMatrixFromQuaternion(p.getBasePositionAndOrientation(body)[1])[2::3]
+                p.resetBaseVelocity(body, angularVelocity=[NUDGE_RAD_S * (-1) ** i * x for x in along])
+        if all(free.values()) and min(still.values()) >= STILL_LOOKS:
+            return
+    worst = min(range(len(bodies)), key=lambda i: (free[bodies[i]], still[bodies[i]]))
+    raise ValueError(
+        f"log {worst} still moves {SETTLE_S:.0f} s after it was let go; lay the logs on flatter ground or use fewer"
+    )
+
+
+def _check_apart(p: BulletClient, bodies: Sequence[int], when: str) -> None:
+    """Raise ValueError when a log is inside another body."""
+    p.performCollisionDetection()
+    number = {body: i for i, body in enumerate(bodies)}
+    for i, body in enumerate(bodies):
+        for contact in p.getContactPoints(body):
+            if contact[8] < -INSIDE_M:
+                j = number.get(contact[2])
+                other = "the machine, the bunk or the ground" if j is None else f"log {j}"
+                raise ValueError(f"log {i} is {-contact[8]:.3f} m inside {other} {when}; move it away")

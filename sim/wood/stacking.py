@@ -1,0 +1,66 @@
+"""Whether logs touch where they are let go, and how they are set beside and upon each other.  Pure geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.wood.log_shape import LogSpec
+
+GAP_M: Final = 0.004  # between logs, and to the ground, when they are let go
+STEP_M: Final = 0.002  # least step of the search for a free place
+SPINE: Final = 11
+
+Array = NDArray[np.float64]
+
+
+def spine(s: LogSpec) -> tuple[Array, Array]:
+    """Points [SPINE, 3] of the pith where the log is let go, z over level ground, and the radii there [SPINE]."""
+    points = np.array(s.spine(SPINE))
+    radii = np.array([s.radius(i / (SPINE - 1) - 0.5) for i in range(SPINE)])
+    points += (s.x_m, s.y_m, s.z_m - float(np.min(points[:, 2] - radii)))
+    return points, radii
+
+
+def distances(p: Array, q: Array) -> Array:
+    """Distances [n-1, m-1] of every straight piece of one polyline [n, 3] from every piece of another [m, 3]."""
+    u, v = np.diff(p, axis=0)[:, None, :], np.diff(q, axis=0)[None, :, :]
+    w = q[None, :-1, :] - p[:-1, None, :]
+    uu, vv, uv, uw, vw = (np.sum(a * b, axis=2) for a, b in ((u, u), (v, v), (u, v), (u, w), (v, w)))
+    den = uu * vv - uv * uv
+    s = np.clip(np.where(den > 1e-12, (uw * vv - vw * uv) / np.maximum(den, 1e-12), 0.0), 0.0, 1.0)
+    t = np.clip((uv * s - vw) / vv, 0.0, 1.0)
+    s = np.clip((uv * t + uw) / uu, 0.0, 1.0)
+    return np.linalg.norm(w + t[..., None] * v - s[..., None] * u, axis=2)
+
+
+def clearance(a: LogSpec, b: LogSpec) -> float:
+    """Gap [m] between two logs where they are let go; below 0 they are in each other."""
+    (p, rp), (q, rq) = spine(a), spine(b)
+    radii = np.maximum(rp[:-1], rp[1:])[:, None] + np.maximum(rq[:-1], rq[1:])[None, :]
+    return float(np.min(distances(p, q) - radii))
+
+
+def seen_from_above(a: LogSpec, b: LogSpec) -> float:
+    """Gap [m] between two logs' footprints."""
+    (p, _), (q, _) = spine(a), spine(b)
+    flat = np.array([1.0, 1.0, 0.0])
+    return float(np.min(distances(p * flat, q * flat))) - (a.diameter_m + b.diameter_m) / 2
+
+
+def beside(s: LogSpec, others: Sequence[LogSpec]) -> LogSpec:
+    """The log shifted to +y until it touches none."""
+    while (gap := min((clearance(s, o) for o in others), default=GAP_M)) < GAP_M:
+        s = replace(s, y_m=s.y_m + max(STEP_M, GAP_M - gap))
+    return s
+
+
+def upon(s: LogSpec, others: Sequence[LogSpec]) -> LogSpec:
+    """The log raised until it touches none."""
+    while (gap := min((clearance(s, o) for o in others), default=GAP_M)) < GAP_M:
+        s = replace(s, z_m=s.z_m + max(STEP_M, GAP_M - gap))
+    return s

@@ -1,0 +1,234 @@
+"""The load that lies still in a carrier's bunk, as one rigid body of the carrier: sleep for logs on what moves.
+
+Bullet lets logs at rest on the ground sleep, never those on a machine that lives, and solves their contacts anew 400
+times a second: with a full bunk, nine tenths of a step.  Logs of which none has moved against the bunk for a while are
+therefore *stowed*: their contacts rest, and a body with their mass, centre and inertia is fixed to the rear frame, so
+that tyres, arms and frame carry what they carried.  They wake where they lie, as fast as the bunk, before anything
+comes near them, and when their weight no longer points where it did as they came to rest (a start, a stop, a slope,
+a bump): then friction has to hold them anew.  Nothing in the tongs, or near them, is ever stowed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from machine.profile import Profile
+from sim.bullet.body import Body, Pose
+from sim.bullet.client import BulletClient
+from sim.geometry.shape import Quaternion, Vector, rpy_quaternion
+from sim.wood.bunk import to_bunk
+from sim.wood.logs import Yard
+
+STILL_M_S: Final = 0.01
+STILL_RAD_S: Final = 0.03
+"""A log that is slower than these against the bunk lies still, ..."""
+STILL_S: Final = 0.5
+"""... and all are stowed when all have done so for this long."""
+NEAR_M: Final = 0.15
+"""What comes so near wakes them: several times what the fastest log of a grasp moves between two looks."""
+TILT_RAD: Final = 0.05
+"""So far their weight may turn against the bunk: less than what sets a log rolling on a flat floor (0.08), ..."""
+WEIGHT_SHARE: Final = 0.1
+"""... and so much may it change."""
+FELT_S: Final = 0.1
+"""Time over which the bunk's acceleration is felt: steel rings faster, and moves no log."""
+FOLLOW_M: Final = 0.0005
+FOLLOW_RAD: Final = 0.0002
+"""Stowed logs are put where the bunk has taken them once it has moved by more."""
+FIXED_N: Final = 1e9
+EVERYTHING, SOLID, NOTHING = -1, 1, 0
+"""Bullet's masks and groups of collision."""
+
+Box = tuple[Vector, Vector]
+
+
+class Stowage:
+    """``watch`` after every ``look_s`` of physics.  ``machine`` is the carrier's body, its root the rear frame with the
+    bunk; ``hands`` are the links that may touch a load.
+    """
+
+    def __init__(
+        self, client: BulletClient, machine: Body, profile: Profile, hands: Iterable[str], yard: Yard, look_s: float
+    ) -> None:
+        self._p, self._machine, self._bunk, self._yard, self._look_s = client, machine, profile.bunk, yard, look_s
+        self._hands = {machine.link[name] for name in hands}
+        self._log_of = {body: i for i, body in enumerate(yard.logs)}
+        self._weight = Weight(look_s)
+        self._rested: Vector = (0.0, 0.0, 0.0)
+        self._still_s = 0.0
+        self._at: Pose = client.getBasePositionAndOrientation(machine.body)
+        self._kept: list[Pose] = []
+        self._around: Box = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self._tied: tuple[int, int] | None = None
+
+    def watch(self) -> None:
+        """Stow what lies still, wake what is about to be touched or shaken."""
+        p = self._p
+        at, moving = p.getBasePositionAndOrientation(self._machine.body), p.getBaseVelocity(self._machine.body)
+        self._weight.feel(moving[0], p.getMatrixFromQuaternion(at[1]))
+        stowed = self._yard.stowed
+        if not stowed:
+            self._rest(at, moving)
+        elif self._weight.differs(self._rested) or self._approached(self._around, stowed):
+            self._wake(at, moving)
+        elif _moved(at, self._at):
+            self._follow(at)
+
+    def _rest(self, at: Pose, moving: tuple[Vector, Vector]) -> None:
+        """Count how long what is in the bunk has lain still; stow it when that is long enough."""
+        aboard = self._aboard()
+        if not aboard or not all(self._lies_still(self._yard.logs[i], at[0], *moving) for i in aboard):
+            self._still_s = 0.0
+            return
+        self._still_s += self._look_s
+        if self._still_s >= STILL_S and not self._approached(self._box(aboard), aboard):
+            self._stow(aboard, at, moving)
+
+    def _aboard(self) -> tuple[int, ...]:
+        """Logs with their middle between the stakes, above the floor."""
+        p, b = self._p, self._bunk
+        inward = p.invertTransform(*self._machine.pose("base"))
+        found = []
+        for i, log in enumerate(self._yard.logs):
+            x, y, z = to_bunk(b, p.multiplyTransforms(*inward, *p.getBasePositionAndOrientation(log))[0])
+            if abs(x) < b.length_m / 2 and abs(y) < b.width_m / 2 and z > b.floor_z_m:
+                found.append(i)
+        return tuple(found)
+
+    def _lies_still(self, log: int, origin: Vector, linear: Vector, angular: Vector) -> bool:
+        place, (v, w) = self._p.getBasePositionAndOrientation(log)[0], self._p.getBaseVelocity(log)
+        with_bunk = _carried(linear, angular, origin, place)
+        return math.dist(w, angular) < STILL_RAD_S and math.dist(v, with_bunk) < STILL_M_S
+
+    def _approached(self, box: Box, load: Sequence[int]) -> bool:
+        """Whether a hand, or a log that is not of the load, reaches into the box."""
+        for body, link in self._p.getOverlappingObjects(*box) or ():
+            if (link in self._hands) if body == self._machine.body else self._log_of.get(body, load[0]) not in load:
+                return True
+        return False
+
+    def _box(self, load: Sequence[int]) -> Box:
+        """What lies around the load, ``NEAR_M`` wide."""
+        lows, highs = zip(*(self._p.getAABB(self._yard.logs[i]) for i in load), strict=True)
+        low, high = ([f(c) for c in zip(*side, strict=True)] for f, side in ((min, lows), (max, highs)))
+        return (low[0] - NEAR_M, low[1] - NEAR_M, low[2] - NEAR_M), (
+            high[0] + NEAR_M,
+            high[1] + NEAR_M,
+            high[2] + NEAR_M,
+        )
+
+    def _stow(self, aboard: tuple[int, ...], at: Pose, moving: tuple[Vector, Vector]) -> None:
+        p, yard = self._p, self._yard
+        inward = p.invertTransform(*at)
+        self._kept = [p.multiplyTransforms(*inward, *p.getBasePositionAndOrientation(yard.logs[i])) for i in aboard]
+        self._at, self._rested, self._around = at, self._weight.now, self._box(aboard)
+        self._tied = self._fix(aboard, at, moving)
+        for i in aboard:
+            p.setCollisionFilterGroupMask(yard.logs[i], -1, NOTHING, NOTHING)
+            p.resetBaseVelocity(yard.logs[i], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            p.changeDynamics(yard.logs[i], -1, activationState=p.ACTIVATION_STATE_SLEEP)
+        yard.stowed = aboard
+
+    def _fix(self, aboard: Sequence[int], at: Pose, moving: tuple[Vector, Vector]) -> tuple[int, int]:
+        """A body without a shape that weighs as the load does, and what ties it to the rear frame."""
+        p = self._p
+        mass, own, inertia = self._mass(aboard)
+        place, turn = p.multiplyTransforms(*at, *own)
+        body: int = p.createMultiBody(mass, -1, basePosition=place, baseOrientation=turn, useMaximalCoordinates=1)
+        p.changeDynamics(body, -1, mass=mass, localInertiaDiagonal=inertia, linearDamping=0.0, angularDamping=0.0)
+        p.resetBaseVelocity(body, _carried(*moving, at[0], place), moving[1])
+        zero = (0.0, 0.0, 0.0)
+        tie: int = p.createConstraint(self._machine.body, -1, body, -1, p.JOINT_FIXED, zero, own[0], zero, own[1])
+        p.changeConstraint(tie, maxForce=FIXED_N)
+        return body, tie
+
+    def _mass(self, aboard: Sequence[int]) -> tuple[float, Pose, list[float]]:
+        """Mass, centre and principal axes, and principal inertia [kg m^2] of the load, in the root's axes."""
+        p, yard = self._p, self._yard
+        masses, places = [yard.masses[i] for i in aboard], np.array([at for at, _ in self._kept])
+        middle = np.average(places, axis=0, weights=masses)
+        inertia = np.zeros((3, 3))
+        for i, m, off, (_, turn) in zip(aboard, masses, places - middle, self._kept, strict=True):
+            axes = np.array(p.getMatrixFromQuaternion(turn)).reshape(3, 3)
+            own = np.diag(p.getDynamicsInfo(yard.logs[i], -1)[2])
+            inertia += axes @ own @ axes.T + m * (off @ off * np.eye(3) - np.outer(off, off))
+        principal, axes = np.linalg.eigh(inertia)
+        axes[:, 0] *= np.linalg.det(axes)  # right-handed
+        return sum(masses), (tuple(middle.tolist()), _turn_of(axes)), principal.tolist()
+
+    def _follow(self, at: Pose) -> None:
+        """Put the stowed logs where the bunk has taken them."""
+        p, yard = self._p, self._yard
+        for i, kept in zip(yard.stowed, self._kept, strict=True):
+            p.resetBasePositionAndOrientation(yard.logs[i], *p.multiplyTransforms(*at, *kept))
+        self._at, self._around = at, self._box(yard.stowed)
+
+    def _wake(self, at: Pose, moving: tuple[Vector, Vector]) -> None:
+        """Give the stowed logs back to the physics."""
+        p, yard = self._p, self._yard
+        self._follow(at)
+        for i in yard.stowed:
+            log = yard.logs[i]
+            p.setCollisionFilterGroupMask(log, -1, SOLID, EVERYTHING)
+            p.changeDynamics(log, -1, activationState=p.ACTIVATION_STATE_WAKE_UP)
+            place = p.getBasePositionAndOrientation(log)[0]
+            p.resetBaseVelocity(log, _carried(*moving, at[0], place), moving[1])
+        if self._tied is not None:
+            body, tie = self._tied
+            p.removeConstraint(tie)  # Bullet does not do so with the body
+            p.removeBody(body)
+        yard.stowed, self._kept, self._tied, self._still_s = (), [], None, 0.0
+
+
+class Weight:
+    """What a kilogram weighs in a frame that moves: gravity less acceleration [m/s^2], ``now``, in the frame's axes,
+    smoothed over ``FELT_S``; ``look_s`` lie between two calls of ``feel``.
+    """
+
+    def __init__(self, look_s: float, gravity_m_s2: float = 9.81) -> None:
+        self._look_s, self._gravity = look_s, gravity_m_s2
+        self._velocity: Vector | None = None
+        self.now: Vector = (0.0, 0.0, -gravity_m_s2)
+
+    def feel(self, velocity: Vector, axes: Sequence[float]) -> None:
+        """Velocity of the frame [m/s] and its rotation matrix, row by row."""
+        last = self._velocity or velocity
+        a, b, c = ((last[i] - velocity[i]) / self._look_s for i in range(3))
+        c -= self._gravity
+        share, now = self._look_s / FELT_S, self.now
+        x, y, z = (now[i] + share * (axes[i] * a + axes[3 + i] * b + axes[6 + i] * c - now[i]) for i in range(3))
+        self._velocity, self.now = velocity, (x, y, z)
+
+    def differs(self, other: Vector) -> bool:
+        """Whether it has turned or changed, against another, by more than a load at rest may bear unseen."""
+        x, y, z = other
+        u, v, w = self.now
+        size, was = math.hypot(u, v, w), math.hypot(x, y, z)
+        if abs(size - was) > WEIGHT_SHARE * was:
+            return True
+        return math.hypot(y * w - z * v, z * u - x * w, x * v - y * u) > math.sin(TILT_RAD) * size * was
+
+
+def _carried(linear: Vector, angular: Vector, origin: Vector, place: Vector) -> Vector:
+    """Velocity of a place of a body that moves as its origin does and turns about it."""
+    x, y, z = (p - o for p, o in zip(place, origin, strict=True))
+    (u, v, w), (a, b, c) = linear, angular
+    return u + b * z - c * y, v + c * x - a * z, w + a * y - b * x
+
+
+def _moved(a: Pose, b: Pose) -> bool:
+    """Whether two poses differ by more than stowed logs may lag behind."""
+    cosine = sum(x * y for x, y in zip(a[1], b[1], strict=True))  # of half the angle between them
+    return math.dist(a[0], b[0]) > FOLLOW_M or 1.0 - cosine * cosine > (FOLLOW_RAD / 2) ** 2
+
+
+def _turn_of(axes: NDArray[np.float64]) -> Quaternion:
+    """Quaternion of a rotation matrix [3, 3]."""
+    m = axes.tolist()
+    pitch = -math.asin(max(-1.0, min(1.0, m[2][0])))
+    return rpy_quaternion(math.atan2(m[2][1], m[2][2]), pitch, math.atan2(m[1][0], m[0][0]))
