@@ -1,0 +1,1 @@
+"""What the machine is: its profile, geometry, sensors, modes and reasons."""

@@ -78,7 +78,7 @@ class Valve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A joint's law (machines.md 4).
+    """A joint's law (docs/reference/machines.md section 4).
 
     ``kp_1_s`` [1/s] is what every ``kind`` may spend on small errors, ``kd`` [-] the gain of the PD's and PID's error
     rate, ``layer`` [unit] the boundary layer of the sliding laws.  ``damping_per_bar`` [unit/s per bar] gives way to
@@ -102,7 +102,7 @@ class Hydraulics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Sag(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the column leans under the weight, as a survey found it; `machine.sag` says what it does to the pin.
+    """How the column leans under the weight, as a survey found it; `machine.geometry.sag` says what it does to the pin.
 
     Lean of the empty crane [rad] = ``head_rad_m`` * r_head + ``pin_rad_m`` * r_pin - ``rest_rad``, and
     ``load_rad_nm`` per Nm that a load adds.  Moment of the empty crane at the lift joint [Nm] = ``head_nm_m`` *
@@ -153,7 +153,7 @@ class JointSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TongTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Tong geometry over the tong angle (0 = fully open), machines.md 1.5."""
+    """Tong geometry over the tong angle (0 = fully open), docs/reference/machines.md section 1.5."""
 
     angle_rad: tuple[float, ...]
     half_gap_m: tuple[float, ...]
@@ -190,7 +190,7 @@ class Workspace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A stereo camera as mounted and calibrated (machines.md 8): pinhole optics and depth range.
+    """A stereo camera as mounted and calibrated (docs/reference/machines.md section 8): pinhole optics and depth range.
 
     ``position_m`` and ``rpy_rad`` (about the fixed axes x, then y, then z) place its body frame, x forward, y left,
     z up, in the frame of ``link``; a positive pitch looks down.  Its optical frame is x right, y down, z forward.
@@ -228,7 +228,7 @@ class CarrierValve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Carrier(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An articulated four-wheel carrier on swing arms (machines.md 7); ``machine.carrier`` has its geometry.
+    """An articulated four-wheel carrier on swing arms (docs/reference/machines.md section 7); ``machine.geometry.carrier`` has its geometry.
 
     Frames ``rear`` and ``front`` share the articulation axis: origin on it, x forward, y left, z up, z = 0 at the
     pivots of the swing arms.  ``front_axle_m`` and ``rear_axle_m`` are their distances from the axis at the
@@ -270,7 +270,7 @@ class Carrier(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Plc(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A machine PLC on Ethernet in place of the nodes on crane0 (can_bus.md 10).  ``role``: it closes the joint loops
+    """A machine PLC on Ethernet in place of the nodes on crane0 (docs/reference/can-bus.md section 10).  ``role``: it closes the joint loops
     on the controller's references, or passes the controller's valve commands on.
     """
 

@@ -1,0 +1,1 @@
+"""Writes recordings: MCAP files of frames, reports and messages, with a manifest."""

@@ -23,12 +23,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from can_dbc.batch import widen
-from can_dbc.bus import Bus, BusError, BusState, open_bus
+from can_dbc.bus.base import Bus, BusError, BusState
+from can_dbc.bus.batch import widen
+from can_dbc.bus.factory import open_bus
+from can_dbc.bus.reconnector import LostLink
 from can_dbc.frame import Frame
-from can_dbc.lost_link import LostLink
-from can_dbc.timing_page import Timing, TimingRefused, read_timing
-from machine.load import ProfileError, load_profile
+from can_dbc.timing.page import Timing, TimingRefused, read_timing
+from machine.loading.profile_file import ProfileError, load_profile
 from recorder.manifest import describe
 from recorder.recorder import Recorder, RecordingRefused
 

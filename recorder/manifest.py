@@ -16,8 +16,8 @@ from pathlib import Path
 
 import msgspec
 
-from can_dbc.codec import resolve
-from machine.load import profile_hash
+from can_dbc.dbc.codec import resolve
+from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
 
 NAME = "manifest.json"

@@ -6,7 +6,7 @@ stamp; the recorder has no clock.  Outputs, in one directory:
 * ``<bus>.log``: ``candump -L`` text, for can-utils, SavvyCAN and python-can.
 * ``run.mcap`` (then ``run-0002.mcap`` and so on, one for each 512 MiB or after a full disk): ``/<bus>/raw`` (the
   16 bytes of the kernel's ``struct can_frame``, then the sender's name where it is known), ``/<bus>/<message>``
-  (decoded signals, JSON), ``/controller/tick`` (raw, see ``can_dbc.tick_record``), ``/controller/report``,
+  (decoded signals, JSON), ``/controller/tick`` (raw, see ``can_dbc.messages.tick_record``), ``/controller/report``,
   ``/timing`` (the controller's timing page) and ``/manifest`` (JSON).
   Publish time is monotonic, log time is UTC where the manifest has it (live), else monotonic too.
 * ``manifest.json``: see ``recorder.manifest``.
@@ -24,9 +24,13 @@ from typing import Final
 
 import msgspec
 
-from can_dbc import codec, setpoint, tick_record
+from can_dbc.dbc import codec
 from can_dbc.frame import ERROR, REMOTE, Frame, describe
-from can_dbc.timing_page import Timing
+from can_dbc.messages import datagrams, tick_record
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.vehicle import VehicleReport
+from can_dbc.timing.page import Timing
 from machine.profile import Profile
 from recorder import manifest as manifests
 from recorder.files import CommitFile
@@ -116,12 +120,12 @@ class Recorder:
     def on_report(self, datagram: bytes) -> None:
         """The controller's state report or vehicle report, as it came."""
         try:
-            report = setpoint.decode(datagram, self._key)
-        except setpoint.DatagramRefused:
+            report = datagrams.decode(datagram, self._key)
+        except DatagramRefused:
             report = None
-        if isinstance(report, setpoint.VehicleReport) and self._drives:
+        if isinstance(report, VehicleReport) and self._drives:
             topic = VEHICLE
-        elif isinstance(report, setpoint.StateReport):
+        elif isinstance(report, StateReport):
             topic = REPORT
         else:
             self.refused += 1

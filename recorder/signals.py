@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from can_dbc.codec import Database, MessageCodec
+from can_dbc.dbc.codec import Database, MessageCodec
 
 
 class BusSignals:

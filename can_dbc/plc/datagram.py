@@ -1,4 +1,4 @@
-"""The cyclic UDP datagrams between bridge and PLC, 100 Hz each way (can_bus.md section 10), packed little-endian.
+"""The cyclic UDP datagrams between bridge and PLC, 100 Hz each way (docs/reference/can-bus.md section 10), packed little-endian.
 
     header 28: magic 'CRN1' u32 | version u16 | type u16 | seq u32 | time u64 us | echo_seq u32 | mode u16 | arm u16
     command, 96: header | 7 x (reference i32, rate i32; 1e-6) | grapple, grapple %, speed %, reset: 4 x u16 | CRC-32

@@ -1,4 +1,4 @@
-"""The register map between bridge and PLC (can_bus.md section 10): values in SI units to 16-bit registers and back.
+"""The register map between bridge and PLC (docs/reference/can-bus.md section 10): values in SI units to 16-bit registers and back.
 
 Pure.  Two roles: in REFERENCES (A) the PLC closes the joint loops and a command carries positions and rates; in VALVES
 (B) it passes valve openings on, as shares of full opening.  A register holds 16 bits; a 32-bit number takes two, the
@@ -60,7 +60,7 @@ class Mode(IntEnum):
 
 
 class State(IntEnum):
-    """State of the PLC; 3 is the end of a trajectory that a PLC stores (machines.md 1.6), which this map has not."""
+    """State of the PLC; 3 is the end of a trajectory that a PLC stores (docs/reference/machines.md section 1.6), which this map has not."""
 
     INIT = 0
     HOLD = 1

@@ -9,8 +9,9 @@ from collections.abc import Callable
 
 import pytest
 
-from can_dbc.batch import Batch
-from can_dbc.bus import Bus, kernel_has_can, open_bus
+from can_dbc.bus.base import Bus
+from can_dbc.bus.batch import Batch
+from can_dbc.bus.factory import kernel_has_can, open_bus
 from can_dbc.frame import Frame
 from hil.wire.core import WireCore
 from hil.wire.inprocess import InProcessBus

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from can_dbc.mission_datagrams import Area, GivenUp, Lying, MissionReport, Pile, Whereabouts
+from can_dbc.messages.mission import Area, GivenUp, Lying, MissionReport, Pile, Whereabouts
 
 HERE = (63.657853, 19.895562)
 TOLD = MissionReport(

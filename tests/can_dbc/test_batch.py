@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from can_dbc.batch import Batch, widen
+from can_dbc.bus.batch import Batch, widen
 
 Pair = tuple[socket.socket, socket.socket]
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from can_dbc import bus as bus_module
-from can_dbc.bus import (
+from can_dbc.bus import factory as bus_module
+from can_dbc.bus.base import (
     CRTL_ACTIVE,
     CRTL_PASSIVE,
     CRTL_RX_OVERFLOW,
@@ -26,11 +26,10 @@ from can_dbc.bus import (
     BusError,
     BusState,
     BusStats,
-    default_address,
-    open_bus,
 )
+from can_dbc.bus.factory import default_address, open_bus
+from can_dbc.bus.socketcan import SocketCanBus
 from can_dbc.frame import ERROR, Frame
-from can_dbc.socketcan import SocketCanBus
 
 
 @pytest.mark.parametrize("address", ["", "crane0", "wire:", ":crane0"])
@@ -153,7 +152,7 @@ def test_a_kernel_queue_without_room_refuses(number: int, state: BusState) -> No
 
 def test_the_guard_can_open_wire_and_socketcan_with_the_standard_library_alone() -> None:
     code = (
-        "import sys; import can_dbc.bus, can_dbc.socketcan, can_dbc.wire_client;"
+        "import sys; import can_dbc.bus.base, can_dbc.bus.socketcan, can_dbc.bus.wire_client;"
         "own = {'can_dbc'}; names = {name.partition('.')[0] for name in sys.modules};"
         "print(sorted(n for n in names - own - sys.stdlib_module_names if n in ('can', 'msgspec', 'numpy')))"
     )

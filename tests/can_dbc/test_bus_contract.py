@@ -9,7 +9,7 @@ import time
 
 from bus_backends import Backend
 
-from can_dbc.bus import BusState
+from can_dbc.bus.base import BusState
 from can_dbc.frame import EXTENDED, REMOTE, Frame
 
 

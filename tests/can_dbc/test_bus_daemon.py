@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 from bus_backends import BITRATE, PATIENCE_S, Backend, counted_receives
 
-from can_dbc import wire_client
-from can_dbc.bus import Bus, BusState, open_bus
+from can_dbc.bus import wire_client
+from can_dbc.bus.base import Bus, BusState
+from can_dbc.bus.factory import open_bus
+from can_dbc.bus.wire_client import control
 from can_dbc.frame import Frame
-from can_dbc.wire_client import control
 from hil.wire.core import WireCore
 from hil.wire.faults import Fault, Kind
 from hil.wire.launch import wire_daemon

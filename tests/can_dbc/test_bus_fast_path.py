@@ -11,12 +11,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from can_dbc.batch import Batch
-from can_dbc.bus import ERR_BUSOFF, ERR_RESTARTED, BusStats
-from can_dbc.filters import Filter
+from can_dbc.bus.base import ERR_BUSOFF, ERR_RESTARTED, BusStats
+from can_dbc.bus.batch import Batch
+from can_dbc.bus.filters import Filter
+from can_dbc.bus.frame_socket import CAN_FRAME, FrameSocket
+from can_dbc.bus.hardware_clock import DRIFT_PPM, HardwareClock
 from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
-from can_dbc.frame_socket import CAN_FRAME, FrameSocket
-from can_dbc.stamps import DRIFT_PPM, HardwareClock
 
 LIMIT = 1024
 SO_TIMESTAMPNS, SO_TIMESTAMPING, SO_RXQ_OVFL = 35, 37, 40

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc import canopen as co
-from can_dbc import codec
+from can_dbc.dbc import codec
+from can_dbc.protocols import canopen as co
 
 MS = 1_000_000
 
@@ -166,7 +166,7 @@ def test_against_the_library_server() -> None:
     network = library.Network()
     sent: list[tuple[int, bytes]] = []
     network.send_message = lambda key, data, remote=False: sent.append((key, bytes(data)))  # type: ignore[method-assign]
-    node = network.create_node(5, str(Path(codec.__file__).with_name("encoder_rotary.eds")))
+    node = network.create_node(5, str(Path(codec.__file__).parents[1] / "encoder_rotary.eds"))
 
     def ask(request: tuple[int, bytes]) -> co.Sdo | None:
         sent.clear()

@@ -8,7 +8,7 @@ from pathlib import Path
 import canopen
 import pytest
 
-from can_dbc import check, codec
+from can_dbc.dbc import check, codec
 from can_dbc.frame import EXTENDED
 
 CRANE, MACHINE, GNSS = (codec.load(name) for name in codec.SHIPPED)
@@ -223,7 +223,7 @@ OBJECTS = [
 def test_encoder_eds_over_sdo(
     file: str, device_type: int, mapping: list[tuple[int, int, int]], signed: bool, speed_bits: int
 ) -> None:
-    path = str(Path(codec.__file__).with_name(file))
+    path = str(Path(codec.__file__).parents[1] / file)
     device, master = canopen.Network(), canopen.Network()
     device.connect(interface="virtual", channel=file)
     master.connect(interface="virtual", channel=file)

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc import check, codec
+from can_dbc.dbc import check, codec
+from can_dbc.dbc.signals import EncodeRefused, FrameRefused, Refusal
 from can_dbc.frame import EXTENDED
-from can_dbc.signals import EncodeRefused, FrameRefused, Refusal
 
 DATA = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can"
 FOREIGN = sorted([*DATA.glob("*/dbc/*.dbc"), *DATA.glob("opendbc/*.dbc"), *DATA.glob("*/kcd/*.kcd")])

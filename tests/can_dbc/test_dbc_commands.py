@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from can_dbc import codec
-from can_dbc.e2e import protect
-from host.exits import Exit, Stopped
-from timberhand.commands import bench_codec, dbc, log
+from can_dbc.dbc import codec
+from can_dbc.protocols.e2e import protect
+from host.exit_codes import CommandFailed, ExitCode
+from timberhand.commands import bench_codec, dbc, recording
 
 OVERLAP = (
     'VERSION ""\nNS_ :\nBS_:\nBU_: A\nBO_ 1 M: 8 A\n'
@@ -24,8 +24,8 @@ SOUND = OVERLAP.replace("7|8", "8|8")
 
 def run(app: object, *arguments: object) -> tuple[int, str]:
     result = CliRunner().invoke(app, [str(a) for a in arguments])  # type: ignore[arg-type]
-    if isinstance(result.exception, Stopped):
-        return result.exception.code, str(result.exception)
+    if isinstance(result.exception, CommandFailed):
+        return result.exception.exit_code, str(result.exception)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.exit_code, result.output
@@ -33,11 +33,11 @@ def run(app: object, *arguments: object) -> tuple[int, str]:
 
 CHECKS = [
     # text of the file, options, exit code, words in the output
-    (SOUND, [], Exit.FINE, ["no GenMsgCycleTime"]),
-    (SOUND, ["--strict"], Exit.CONFIGURATION, ["no GenMsgCycleTime"]),
-    (OVERLAP, [], Exit.CONFIGURATION, ["f.dbc:5:", "overlapping", "shares 1 bits with X"]),
-    ("rubbish", [], Exit.CONFIGURATION, ["f.dbc:1:"]),
-    (None, [], Exit.CONFIGURATION, ["no such file"]),
+    (SOUND, [], ExitCode.OK, ["no GenMsgCycleTime"]),
+    (SOUND, ["--strict"], ExitCode.CONFIGURATION, ["no GenMsgCycleTime"]),
+    (OVERLAP, [], ExitCode.CONFIGURATION, ["f.dbc:5:", "overlapping", "shares 1 bits with X"]),
+    ("rubbish", [], ExitCode.CONFIGURATION, ["f.dbc:1:"]),
+    (None, [], ExitCode.CONFIGURATION, ["no such file"]),
 ]
 
 
@@ -61,9 +61,9 @@ def test_check_shipped_files_as_json() -> None:
 
 
 def test_check_reports_a_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("can_dbc.check.compare_decode", lambda *_: ["M decode 00: ours 1, cantools 2"])
+    monkeypatch.setattr("can_dbc.dbc.check.compare_decode", lambda *_: ["M decode 00: ours 1, cantools 2"])
     code, output = run(dbc.app, "check", "gnss", "--frames", 1)
-    assert code == Exit.FIGURE
+    assert code == ExitCode.FIGURE_MISSED
     assert "ours 1, cantools 2" in output
 
 
@@ -78,7 +78,7 @@ def recorded(tmp_path: Path) -> Path:
 
 
 def test_log_decode(recorded: Path) -> None:
-    code, output = run(log.app, "decode", recorded, "--dbc", "crane")
+    code, output = run(recording.app, "decode", recorded, "--dbc", "crane")
     assert code == 0
     assert "PressA" in output and "LiftB=2 bar" in output
     assert "2 frames, 1 messages decoded, 1 frames unknown" in output and "1 broken lines" in output
@@ -86,7 +86,7 @@ def test_log_decode(recorded: Path) -> None:
 
 @pytest.mark.parametrize(("options", "entries"), [([], 1), (["--quiet"], 0), (["--dbc", "machine"], 0)])
 def test_log_decode_as_json(recorded: Path, options: list[str], entries: int) -> None:
-    code, output = run(log.app, "decode", recorded, "--json", *options)
+    code, output = run(recording.app, "decode", recorded, "--json", *options)
     document = json.loads(output)
     assert (code, len(document["frames"])) == (0, entries)
     assert document["summary"]["frames"] == 2
@@ -98,8 +98,8 @@ def test_log_decode_as_json(recorded: Path, options: list[str], entries: int) ->
 
 @pytest.mark.parametrize(("log_name", "dbc_name"), [("nowhere.log", "crane"), ("x.log", "nowhere.dbc"), (".", "crane")])
 def test_log_decode_refuses(recorded: Path, log_name: str, dbc_name: str) -> None:
-    code, sentence = run(log.app, "decode", recorded.parent / log_name, "--dbc", dbc_name)
-    assert code == Exit.CONFIGURATION
+    code, sentence = run(recording.app, "decode", recorded.parent / log_name, "--dbc", dbc_name)
+    assert code == ExitCode.CONFIGURATION
     assert "\n" not in sentence.strip()
 
 
@@ -116,11 +116,11 @@ def test_bench_codec_measures_every_message() -> None:
 def test_codecs_do_not_import_cantools_after_start() -> None:
     """The E2E, CANopen and NMEA 2000 modules and the codec import cantools only inside ``load``."""
     program = (
-        "import sys, can_dbc.codec, can_dbc.e2e, can_dbc.canopen, can_dbc.nmea2000, can_dbc.logread\n"
+        "import sys, can_dbc.dbc.codec, can_dbc.protocols.e2e, can_dbc.protocols.canopen, can_dbc.protocols.nmea2000, can_dbc.trace.candump\n"
         "print([m for m in ('cantools', 'can', 'canopen', 'numpy') if m in sys.modules])"
     )
     shown = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True,
-        cwd=Path(codec.__file__).parents[1],
+        cwd=Path(codec.__file__).parents[2],
     )  # fmt: skip
     assert shown.stdout.strip() == "[]"

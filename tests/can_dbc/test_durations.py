@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc.durations import BINS, Durations, bin_of, edge_ns
+from can_dbc.timing.durations import BINS, Durations, bin_of, edge_ns
 
 US, MS = 1_000, 1_000_000
 ANY = st.one_of(st.integers(-1000, 2 * MS), st.integers(0, 200 * MS))

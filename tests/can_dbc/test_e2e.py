@@ -7,7 +7,7 @@ from e2e import p02
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.e2e import Checker, Sender, Status, crc8, frame_crc, protect
+from can_dbc.protocols.e2e import Checker, Sender, Status, crc8, frame_crc, protect
 
 IDS = bytes(range(0x30, 0x40))
 PAYLOAD = bytes.fromhex("00a0123456789abc")

@@ -12,7 +12,8 @@ from collections.abc import Iterator
 import pytest
 from bus_backends import Backend, counted_receives, kernel_interface
 
-from can_dbc.bus import DRAIN_LIMIT, ERR_BUSOFF, ERR_RESTARTED, BusError, BusState, open_bus
+from can_dbc.bus.base import DRAIN_LIMIT, ERR_BUSOFF, ERR_RESTARTED, BusError, BusState
+from can_dbc.bus.factory import open_bus
 from can_dbc.frame import ERROR, Frame
 
 

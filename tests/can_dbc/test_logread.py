@@ -8,9 +8,9 @@ from pathlib import Path
 import can
 import pytest
 
-from can_dbc.decoding import Decoder
 from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame
-from can_dbc.logread import Broken, parse_line, read
+from can_dbc.trace.candump import Broken, parse_line, read
+from can_dbc.trace.decoder import Decoder
 
 CANBOAT = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can" / "canboat"
 N2K = 0x09F8027F | EXTENDED
@@ -117,8 +117,8 @@ def test_asc_damage_costs_its_line_alone(tmp_path: Path) -> None:
 
 
 def test_decoder_counts_everything() -> None:
-    from can_dbc import codec
-    from can_dbc.e2e import protect
+    from can_dbc.dbc import codec
+    from can_dbc.protocols.e2e import protect
 
     press = codec.load("crane").messages["PressA"]
     assert press.data_ids

@@ -9,7 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc.mission_datagrams import (
+from can_dbc.messages.crane import OperatorAction, OperatorCommand
+from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.envelope import DatagramFault, DatagramRefused
+from can_dbc.messages.mission import (
     MAX_BYTES,
     MissionOrder,
     MissionReport,
@@ -19,7 +22,6 @@ from can_dbc.mission_datagrams import (
     encode_mission,
     encode_order,
 )
-from can_dbc.setpoint import DatagramFault, DatagramRefused, OperatorAction, OperatorCommand, decode, encode
 from tests.can_dbc.mission_told import TOLD
 
 KEY = b"secret"

@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nmea2000.decoder import NMEA2000Decoder
 
-from can_dbc import codec
-from can_dbc import nmea2000 as n2k
+from can_dbc.dbc import codec
+from can_dbc.dbc.signals import EncodeRefused, FrameRefused
 from can_dbc.frame import ERROR, EXTENDED, Frame
-from can_dbc.logread import read
-from can_dbc.signals import EncodeRefused, FrameRefused
+from can_dbc.protocols import nmea2000 as n2k
+from can_dbc.trace.candump import read
 
 CANBOAT = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can" / "canboat"
 PGNS = sorted(CANBOAT.glob("pgns/*.yaml"))

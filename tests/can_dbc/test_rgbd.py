@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc.rgbd import (
+from can_dbc.messages.rgbd import (
     QUESTION,
     START_BYTES,
     RgbdError,
-    RgbdFrame,
+    RgbdMessage,
     decode,
     encode,
     encode_question,
@@ -20,10 +20,10 @@ from can_dbc.rgbd import (
 )
 
 
-def frame(width: int = 5, height: int = 3, seed: int = 0) -> RgbdFrame:
+def frame(width: int = 5, height: int = 3, seed: int = 0) -> RgbdMessage:
     rng = random.Random(seed)
     pixels = width * height
-    return RgbdFrame(
+    return RgbdMessage(
         "front", 123, width, height, 40.0, 41.0, 2.0, 1.0, rng.randbytes(3 * pixels), rng.randbytes(2 * pixels)
     )
 
@@ -73,10 +73,10 @@ def test_what_is_asked_is_the_cameras_name() -> None:
 @pytest.mark.parametrize(
     ("broken", "words"),
     [
-        (lambda f: RgbdFrame(**{**_fields(f), "rgb": b""}), "no 5 x 3 px"),
-        (lambda f: RgbdFrame(**{**_fields(f), "width_px": 0}), "cannot be sent"),
-        (lambda f: RgbdFrame(**{**_fields(f), "fx_px": float("nan")}), "not finite"),
-        (lambda f: RgbdFrame(**{**_fields(f), "camera": ""}), "name has 1 to"),
+        (lambda f: RgbdMessage(**{**_fields(f), "rgb": b""}), "no 5 x 3 px"),
+        (lambda f: RgbdMessage(**{**_fields(f), "width_px": 0}), "cannot be sent"),
+        (lambda f: RgbdMessage(**{**_fields(f), "fx_px": float("nan")}), "not finite"),
+        (lambda f: RgbdMessage(**{**_fields(f), "camera": ""}), "name has 1 to"),
     ],
 )
 def test_what_does_not_agree_is_not_sent(broken, words: str) -> None:
@@ -84,5 +84,5 @@ def test_what_does_not_agree_is_not_sent(broken, words: str) -> None:
         encode(broken(frame()))
 
 
-def _fields(f: RgbdFrame) -> dict:
-    return {name: getattr(f, name) for name in RgbdFrame.__slots__}
+def _fields(f: RgbdMessage) -> dict:
+    return {name: getattr(f, name) for name in RgbdMessage.__slots__}

@@ -11,14 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc.setpoint import (
+from can_dbc.messages.crane import (
     MAX_KNOTS,
     N_AXES,
     CraneSetpoint,
-    Datagram,
-    DatagramFault,
-    DatagramRefused,
-    DriveSetpoint,
     GrappleCommand,
     Knot,
     OperatorAction,
@@ -26,12 +22,11 @@ from can_dbc.setpoint import (
     SpoolKnot,
     SpoolTest,
     StateReport,
-    Steering,
-    VehicleReport,
-    decode,
-    encode,
-    udp_address,
 )
+from can_dbc.messages.datagrams import Datagram, decode, encode
+from can_dbc.messages.envelope import DatagramFault, DatagramRefused
+from can_dbc.messages.udp_address import udp_address
+from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
 
 KEY = b"a key of the two sides"
 BODY_AT = 24  # bytes of the header

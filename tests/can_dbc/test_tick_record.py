@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.bus import BusState, BusStats
+from can_dbc.bus.base import BusState, BusStats
 from can_dbc.frame import Frame
-from can_dbc.tick_record import BusReading, RecordRefused, TickRecord, decode, encode
+from can_dbc.messages.tick_record import BusReading, RecordRefused, TickRecord, decode, encode
 
 u64 = st.integers(0, 2**64 - 1)
 payload = st.binary(max_size=8)

@@ -7,8 +7,8 @@ import threading
 
 import pytest
 
-from can_dbc.durations import Durations
-from can_dbc.timing_page import (
+from can_dbc.timing.durations import Durations
+from can_dbc.timing.page import (
     STAGES,
     BusCounters,
     Facts,

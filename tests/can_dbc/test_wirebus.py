@@ -15,8 +15,8 @@ from pathlib import Path
 import can
 import pytest
 
-from can_dbc.wire_client import control
-from can_dbc.wirebus import WireBus
+from can_dbc.bus.wire_client import control
+from can_dbc.bus.wirebus import WireBus
 from hil.wire.faults import Fault, Kind
 from hil.wire.launch import wire_daemon
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import machine
-from machine.load import ProfileError, load_profile
+from machine.loading.profile_file import ProfileError, load_profile
 
 FOLDER = Path(machine.__file__).parent
 SHIPPED = FOLDER / "palms_471.toml"

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from machine.geometry.kinematics import Unreachable, inverse, jacobian, max_reach_m, pin_position, solve
 from machine.joints import Joint
-from machine.kinematics import Unreachable, inverse, jacobian, max_reach_m, pin_position, solve
-from machine.load import load_profile, shipped_profiles
+from machine.loading.profile_file import load_profile, shipped_profiles
 from machine.profile import Profile, joint_limits
 
 PROFILES = {name: load_profile(name) for name in shipped_profiles()}

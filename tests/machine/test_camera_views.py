@@ -7,8 +7,8 @@ from math import cos, sin
 import numpy as np
 import pytest
 
-from machine.carrier import pivot_height_m
-from machine.load import load_profile
+from machine.geometry.carrier import pivot_height_m
+from machine.loading.profile_file import load_profile
 from machine.profile import Camera
 
 PALMS, AORO = load_profile("palms_471"), load_profile("aoro_fc8")
@@ -43,7 +43,7 @@ def is_seen(camera: Camera, seen: tuple[float, float, float], margin_px: float =
 
 
 def stick_frame(q: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """(origin, rotation) of the stick of palms_471 in the base frame: joint table of machines.md 1.1."""
+    """(origin, rotation) of the stick of palms_471 in the base frame: joint table of docs/reference/machines.md section 1.1."""
     mast, boom = about("z", q[0]), about("z", q[0]) @ about("x", q[1])
     origin = mast @ np.array([0.0, -0.0601374, 0.26881 + 1.09553]) + boom @ np.array([0.0, 3.04904, -0.00649])
     return origin, boom @ about("x", q[2])

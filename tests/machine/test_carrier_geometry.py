@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from machine.carrier import (
+from machine.geometry.carrier import (
     ARMS,
     arm_angle_from_height,
     arm_pivot_m,
@@ -24,7 +24,7 @@ from machine.carrier import (
     turning_radius_m,
     wheel_gap_m,
 )
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 
 AORO = load_profile("aoro_fc8")
 CARRIER = AORO.carrier

@@ -13,9 +13,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-import machine.kinematics as kinematics
-from machine.joints import Joint
-from machine.kinematics import (
+import machine.geometry.kinematics as kinematics
+from machine.geometry.kinematics import (
     MARGIN,
     MIN_BEND_RAD,
     Unreachable,
@@ -27,7 +26,8 @@ from machine.kinematics import (
     reachable_extensions,
     solve,
 )
-from machine.load import load_profile
+from machine.joints import Joint
+from machine.loading.profile_file import load_profile
 from machine.profile import joint_limits
 
 PALMS = load_profile("palms_471")

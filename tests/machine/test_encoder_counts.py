@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from machine.encoder import counts_from_position, position_from_counts
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from machine.profile import Encoder
+from machine.sensing.encoder import counts_from_position, position_from_counts
 
 PALMS = load_profile("palms_471")
 SLEW = PALMS.joints["slew"].encoder

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from machine.grapple import (
+from machine.geometry.grapple import (
     grapple_yaw,
     half_gap_m,
     lowest_tip_below_pin_m,
@@ -20,8 +20,8 @@ from machine.grapple import (
     tip_below_pin_m,
     tong_angle_from_opening_pct,
 )
-from machine.kinematics import Unreachable, pin_position
-from machine.load import load_profile
+from machine.geometry.kinematics import Unreachable, pin_position
+from machine.loading.profile_file import load_profile
 
 PALMS = load_profile("palms_471")
 TONGS = PALMS.grapple.tongs

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from can_dbc import codec
-from machine.check import IMU_MESSAGE
-from machine.load import load_profile, shipped_profiles
+from can_dbc.dbc import codec
+from machine.loading.checks import IMU_MESSAGE
+from machine.loading.profile_file import load_profile, shipped_profiles
 
 
 @pytest.mark.parametrize("name", shipped_profiles())

@@ -10,7 +10,7 @@ import pytest
 from changed_profiles import AORO, DELETE, FOLDER, IMU, RAW, SAG, SHIPPED, problems, write
 
 from machine.joints import JOINTS, Joint
-from machine.load import ProfileError, load_profile, profile_hash, shipped_profiles
+from machine.loading.profile_file import ProfileError, load_profile, profile_hash, shipped_profiles
 from machine.profile import Imu, Profile, Sag, joint, joint_limits
 
 

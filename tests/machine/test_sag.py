@@ -9,12 +9,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from machine.geometry.kinematics import Unreachable, inverse, pin_position, solve
+from machine.geometry.sag import FOOT_SHARE, GRAVITY_M_S2, MOST_KG, aim, aim_free, lean_rad, sane_load_kg, true_pin
 from machine.joints import Joint
-from machine.kinematics import Unreachable, inverse, pin_position, solve
-from machine.lift import empty_moment_nm, hanging_kg, lift_moment_nm
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from machine.profile import Sag, joint_limits
-from machine.sag import FOOT_SHARE, GRAVITY_M_S2, MOST_KG, aim, aim_free, lean_rad, sane_load_kg, true_pin
+from machine.sensing.weighing import empty_moment_nm, hanging_kg, lift_moment_nm
 
 PALMS, AORO = load_profile("palms_471"), load_profile("aoro_fc8")
 LIMITS = joint_limits(PALMS)

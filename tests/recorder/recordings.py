@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from can_dbc import setpoint, tick_record
-from can_dbc.codec import load
+from can_dbc.dbc.codec import load
 from can_dbc.frame import EXTENDED, REMOTE, Frame
-from machine.load import load_profile
+from can_dbc.messages import datagrams, tick_record
+from can_dbc.messages.crane import StateReport
+from machine.loading.profile_file import load_profile
 from recorder.manifest import Manifest, describe
 from recorder.recorder import Recorder
 
@@ -42,8 +43,8 @@ def tick(k: int) -> bytes:
 
 def report(k: int) -> bytes:
     nan = (float("nan"),) * 5
-    return setpoint.encode(
-        setpoint.StateReport(k, 1, START_NS + k * T_NS, 3, 0, 0, 0, 0, 0, 0, nan, nan, nan, 50.0, 1.0, 2.0, 3, 4, 5, k)
+    return datagrams.encode(
+        StateReport(k, 1, START_NS + k * T_NS, 3, 0, 0, 0, 0, 0, 0, nan, nan, nan, 50.0, 1.0, 2.0, 3, 4, 5, k)
     )
 
 

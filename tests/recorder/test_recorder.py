@@ -13,8 +13,9 @@ from mcap.reader import make_reader
 from recordings import CRANE, PROFILE, START_NS, T_NS, feed, frames, manifest, record, report, tick
 
 from can_dbc.frame import Frame
-from can_dbc.logread import read as read_log
-from can_dbc.setpoint import VehicleReport, encode
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.vehicle import VehicleReport
+from can_dbc.trace.candump import read as read_log
 from recorder import files
 from recorder import manifest as manifests
 from recorder import recorder as recorder_module

@@ -19,9 +19,9 @@ import pytest
 from mcap.reader import make_reader
 from recordings import PROFILE, T_NS, feed, manifest, record, tick
 
-from can_dbc import tick_record
-from can_dbc.bus import open_bus
-from can_dbc.timing_page import TimingWriter
+from can_dbc.bus.factory import open_bus
+from can_dbc.messages import tick_record
+from can_dbc.timing.page import TimingWriter
 from recorder import manifest as manifests
 from recorder.__main__ import FLUSH_S, Shell, udp_socket, write_all
 from recorder.mcap_scan import NotMcap, Stored, is_complete, scan

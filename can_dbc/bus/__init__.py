@@ -1,0 +1,1 @@
+"""CAN buses behind one small interface: the wire, SocketCAN and every python-can adapter."""

@@ -1,0 +1,77 @@
+"""Opens a CAN bus by its address; `can_dbc.bus.base` has the contract of every `Bus`.
+
+Address: ``wire:crane0`` (the user-space bus of ``hil.wire``), ``socketcan:vcan0`` (a kernel interface) or
+``<python-can interface>:<channel>``.  `default_address` chooses one for a logical name.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Iterable
+from typing import Final
+
+from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.filters import Wanted, filter_of
+
+VCAN_NAMES: Final = {"crane0": "vcan0", "mach0": "vcan1"}
+
+
+def open_bus(
+    address: str,
+    *,
+    filters: Iterable[Wanted] | None = None,
+    receive_own: bool = False,
+    tx_queue: int = 10,
+    participant: str | None = None,
+) -> Bus:
+    """Opens the bus at `address`; raises `BusError`.
+
+    `filters` are the exact keys and the (key, mask) pairs to receive (`can_dbc.bus.filters`; None: all; error frames always
+    arrive); the kernel takes at most 512 and does a few dozen at no cost.  `receive_own` also gives back own frames
+    once they were on the bus.  `tx_queue` bounds the own frames that wait on the
+    wire, like ``txqueuelen`` does in the kernel; a process that plays many nodes needs more than 10.
+    `participant` is the name by which faults on the wire find this process (default: the program's name).
+    """
+    backend, _, channel = address.partition(":")
+    wanted = filter_of(filters)
+    if not backend or not channel:
+        raise BusError(
+            f"'{address}' is not a bus address; write wire:crane0, socketcan:can0 or another python-can "
+            "interface and its channel, as in virtual:test."
+        )
+    # Backends load on demand: the guard must not pull in python-can.
+    if backend == "wire":
+        from can_dbc.bus.wire_client import WireClient
+
+        return WireClient(channel, wanted, receive_own, tx_queue, participant)
+    if backend == "socketcan":
+        from can_dbc.bus.socketcan import SocketCanBus
+
+        return SocketCanBus(channel, wanted, receive_own)
+    from can_dbc.bus.python_can_bus import PythonCanBus
+
+    return PythonCanBus(backend, channel, wanted, receive_own)
+
+
+def default_address(logical_name: str, explicit: str | None = None) -> str:
+    """The address for ``crane0`` or ``mach0``: an explicit one, ``TIMBERHAND_<NAME>`` from the environment,
+    a SocketCAN interface of that name or its vcan stand-in where the kernel has one, else the wire."""
+    chosen = explicit or os.environ.get(f"TIMBERHAND_{logical_name.upper()}")
+    if chosen:
+        return chosen
+    if kernel_has_can():
+        present = {name for _, name in socket.if_nameindex()}
+        for interface in (logical_name, VCAN_NAMES.get(logical_name)):
+            if interface in present:
+                return f"socketcan:{interface}"
+    return f"wire:{logical_name}"
+
+
+def kernel_has_can() -> bool:
+    """True when this kernel offers raw CAN sockets."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,136 @@
+"""Frames in and out of any datagram socket that carries struct can_frame, many in one system call.
+
+`can_dbc.bus.socketcan` uses it on raw CAN sockets, `timberhand bench bus` on an AF_UNIX pair where the kernel has no CAN:
+the same buffers, the same control data, the same loop.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Final
+
+from can_dbc.bus.batch import Batch, Outbox, widen
+from can_dbc.bus.hardware_clock import HardwareClock
+from can_dbc.frame import ERROR, Frame
+
+CAN_FRAME: Final = struct.Struct("=IB3x8s")
+"""struct can_frame of linux/can.h: key, length, data."""
+RECEIVE_BUFFER_BYTES: Final = 4 << 20
+
+# Control data of one frame, each a struct cmsghdr of 16 bytes and its content: the timespec of SO_TIMESTAMPNS; three
+# timespecs of SO_TIMESTAMPING where the adapter stamps, the last one its own; the counter of SO_RXQ_OVFL once frames
+# were lost.
+_CONTROL_BYTES: Final = 32 + 64 + 24
+_SOFTWARE: Final = struct.Struct("@16xqq88x")
+_HARDWARE: Final = struct.Struct("@16xqq12xi32xqq24x")
+"""Software stamp, kind of the second message, hardware stamp."""
+_KIND: Final = struct.Struct("@12xi")
+_COUNT: Final = struct.Struct("@16xI")
+# Options that Python does not name everywhere: asm-generic/socket.h, linux/net_tstamp.h.
+_SO_TIMESTAMPNS: Final = 35
+_SO_TIMESTAMPING: Final = 37
+_SO_RXQ_OVFL: Final = 40
+_HARDWARE_STAMPS: Final = 1 << 2 | 1 << 6  # make them, and give them as they are
+_SECOND_NS: Final = 1_000_000_000
+
+
+class FrameSocket:
+    """The fast path of one non-blocking socket, which it owns.
+
+    Stamps are the kernel's own (taken in the receive interrupt), turned from CLOCK_REALTIME into CLOCK_MONOTONIC with
+    the offset at each call; they never lie in the future.  An adapter that stamps by itself is believed
+    (`can_dbc.bus.hardware_clock`).  `dropped` counts the frames that the socket's receive buffer had no room for.
+    """
+
+    __slots__ = ("_batch", "_clock", "_counted", "_outbox", "dropped", "sock")
+
+    def __init__(self, sock: socket.socket, buffer_bytes: int = RECEIVE_BUFFER_BYTES) -> None:
+        sock.setblocking(False)
+        widen(sock, buffer_bytes)
+        for option, value in ((_SO_TIMESTAMPNS, 1), (_SO_TIMESTAMPING, _HARDWARE_STAMPS), (_SO_RXQ_OVFL, 1)):
+            sock.setsockopt(socket.SOL_SOCKET, option, value)
+        self.sock = sock
+        self.dropped = 0
+        self._counted = 0
+        self._batch = Batch(CAN_FRAME.size, _CONTROL_BYTES)
+        self._outbox = Outbox(CAN_FRAME.size)
+        self._clock = HardwareClock()
+
+    def receive(self, frames: list[Frame], limit: int, note_error: Callable[[int, bytes], bool]) -> None:
+        """Appends what waits, at most `limit` frames; one system call unless more than a full batch waits.
+
+        Error frames go to `note_error`; where it says that the node has recovered, what came before is taken back.
+        Raises OSError when the link is lost.
+        """
+        batch, first = self._batch, len(frames)
+        new, append = tuple.__new__, frames.append  # Frame(...) costs half as much again
+        for _ in range(max(1, limit // batch.count)):
+            waiting = batch.receive(self.sock.fileno())
+            if not waiting:
+                return
+            now_ns = time.monotonic_ns()
+            offset_ns = now_ns - time.time_ns()
+            datagrams = CAN_FRAME.iter_unpack(batch.data[: waiting * CAN_FRAME.size])
+            for (seconds, nanoseconds), (key, length, data) in zip(self._stamps(waiting), datagrams, strict=True):
+                if key & ERROR:
+                    if note_error(key, data):
+                        del frames[first:]
+                    continue
+                stamp_ns = seconds * _SECOND_NS + nanoseconds + offset_ns
+                if stamp_ns > now_ns:  # a clock set back since its arrival must not make a frame look fresher
+                    stamp_ns = now_ns
+                append(new(Frame, (stamp_ns, key, data if length == 8 else data[:length])))
+            self._count_dropped(waiting)
+            if waiting < batch.count:
+                return
+
+    def send(self, frames: Sequence[tuple[int, bytes]]) -> int:
+        """Sends frames in order without blocking, up to the first that is none (more than 8 bytes) or finds no room.
+
+        Returns how many the kernel took.  Raises OSError with the reason when it took none of a batch.
+        """
+        outbox, sent = self._outbox, 0
+        while sent < len(frames):
+            count = 0
+            for key, data in frames[sent : sent + outbox.count]:
+                if len(data) > 8:
+                    break
+                CAN_FRAME.pack_into(outbox.data, count * CAN_FRAME.size, key, len(data), data)
+                count += 1
+            taken = outbox.send(self.sock.fileno(), count) if count else 0
+            sent += taken
+            if taken < outbox.count:
+                break
+        return sent
+
+    def close(self) -> None:
+        self.sock.close()
+
+    def _stamps(self, waiting: int) -> Iterable[tuple[int, int]]:
+        """Seconds and nanoseconds of each frame."""
+        control = self._batch.control[: waiting * _CONTROL_BYTES]
+        if _KIND.unpack_from(control, 32)[0] == _SO_TIMESTAMPING:
+            return self._hardware_stamps(control)
+        return _SOFTWARE.iter_unpack(control)
+
+    def _hardware_stamps(self, control: memoryview) -> Iterator[tuple[int, int]]:
+        for seconds, nanoseconds, kind, own_seconds, own_nanoseconds in _HARDWARE.iter_unpack(control):
+            if kind != _SO_TIMESTAMPING or not own_seconds + own_nanoseconds:
+                yield seconds, nanoseconds
+            else:
+                own_ns = own_seconds * _SECOND_NS + own_nanoseconds
+                yield 0, self._clock.stamp_ns(own_ns, seconds * _SECOND_NS + nanoseconds)
+
+    def _count_dropped(self, waiting: int) -> None:
+        """The counter with the last frame tells all that was lost before it; it is 32 bits wide and wraps."""
+        at = (waiting - 1) * _CONTROL_BYTES + 32
+        control = self._batch.control
+        if _KIND.unpack_from(control, at)[0] == _SO_TIMESTAMPING:
+            at += 64
+        if _KIND.unpack_from(control, at)[0] == _SO_RXQ_OVFL:
+            (counted,) = _COUNT.unpack_from(control, at)
+            self.dropped += (counted - self._counted) & 0xFFFF_FFFF
+            self._counted = counted

@@ -1,0 +1,125 @@
+"""Any python-can interface behind our `Bus`: for adapters that have no SocketCAN driver, and for tests.
+
+python-can stamps in wall-clock seconds or in the adapter's own time; a stamp more than a second away from
+now is of the second sort and is replaced by the time of the drain.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from typing import Final
+
+import can
+
+from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusError, BusState
+from can_dbc.bus.filters import Filter
+from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame, identifier
+
+_PLAUSIBLE_AGE_NS: Final = 1_000_000_000
+_FAILURES: Final = (can.CanError, OSError, ValueError, ImportError)
+
+
+class PythonCanBus(BaseBus):
+    """One python-can bus (contract: `can_dbc.bus.base.Bus`).  `reopen` takes as long as the adapter's driver takes."""
+
+    def __init__(self, interface: str, channel: str, wanted: Filter | None = None, receive_own: bool = False) -> None:
+        super().__init__(channel)
+        self._interface, self._wanted, self._receive_own = interface, wanted, receive_own
+        try:
+            self._can = self._open()
+        except _FAILURES as error:
+            raise BusError(
+                f"python-can cannot open {interface}:{channel} ({error}); check the interface name, the "
+                "channel and that the adapter's driver is installed."
+            ) from error
+
+    def fileno(self) -> int:
+        try:
+            return self._can.fileno()
+        except NotImplementedError:
+            return -1
+
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
+        stats, sent = self.stats, 0
+        if stats.state < BusState.OFF:
+            with contextlib.suppress(can.CanError, OSError):  # no room: this one and the rest are refused
+                for key, data in frames:
+                    if len(data) > 8:
+                        break
+                    self._can.send(message_of(key, data), timeout=0)
+                    sent += 1
+        stats.sent += sent
+        stats.refused += len(frames) - sent
+        return sent
+
+    def flush(self) -> None:
+        with contextlib.suppress(can.CanError, OSError, NotImplementedError):  # not every adapter can
+            self._can.flush_tx_buffer()
+        super().flush()
+
+    def _take(self, frames: list[Frame]) -> None:
+        stats, wanted, first = self.stats, self._wanted, len(frames)
+        offset_ns = time.monotonic_ns() - time.time_ns()
+        for _ in range(DRAIN_LIMIT):
+            try:
+                message = self._can.recv(timeout=0)
+            except (can.CanError, OSError):
+                stats.enter(BusState.DOWN)
+                return
+            if message is None:
+                return
+            if message.is_error_frame:
+                if stats.note_error(message.arbitration_id, bytes(message.data).ljust(8, b"\0")):
+                    del frames[first:]
+                continue
+            key = key_of(message)
+            if wanted is None or key in wanted:
+                now_ns = time.monotonic_ns()
+                stamp_ns = min(int(message.timestamp * 1e9) + offset_ns, now_ns)
+                if now_ns - stamp_ns > _PLAUSIBLE_AGE_NS:
+                    stamp_ns = now_ns
+                frames.append(Frame(stamp_ns, key, payload_of(message)))
+
+    def _open(self) -> can.BusABC:
+        return can.Bus(interface=self._interface, channel=self.name, receive_own_messages=self._receive_own)
+
+    def _open_again(self) -> bool:
+        self._leave()
+        try:
+            self._can = self._open()
+        except _FAILURES:
+            return False
+        return True
+
+    def _leave(self) -> None:
+        with contextlib.suppress(can.CanError, OSError):
+            self._can.shutdown()
+
+
+def message_of(key: int, data: bytes, timestamp_s: float = 0.0) -> can.Message:
+    """The python-can message of a key and payload."""
+    return can.Message(
+        timestamp=timestamp_s,
+        arbitration_id=key & 0x1FFF_FFFF if key & ERROR else identifier(key),
+        is_extended_id=bool(key & EXTENDED),
+        is_remote_frame=bool(key & REMOTE),
+        is_error_frame=bool(key & ERROR),
+        dlc=len(data),
+        data=data,
+    )
+
+
+def key_of(message: can.Message) -> int:
+    """The key of a python-can data or remote message."""
+    return (
+        message.arbitration_id
+        | (EXTENDED if message.is_extended_id else 0)
+        | (REMOTE if message.is_remote_frame else 0)
+    )
+
+
+def payload_of(message: can.Message) -> bytes:
+    """The payload of a message; that of a remote frame is as many zeros as it asks for bytes."""
+    return bytes(message.dlc) if message.is_remote_frame else bytes(message.data)

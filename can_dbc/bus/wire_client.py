@@ -1,0 +1,271 @@
+"""Client of the wire, our user-space CAN bus: a `Bus` over a Unix socket, standard library only.
+
+Protocol (SOCK_SEQPACKET, one socket file per bus in `wire_directory`): a packet is up to `BATCH` `RECORD`s, or one with
+flag `CONTROL` followed by a JSON object.  A participant opens with the control packet ``{"hello": {...}}``.  Every
+record to a client carries how many of its frames have left the queue (modulo 2**16) and how many received ones were
+lost, so the client knows without a round trip when its transmit queue is full, as a SocketCAN sender does from ENOBUFS.
+A record with flag `DISCARD` empties the transmit queue of the client that sends it.  Frames in the queue of a client
+that closes still go out, as long as somebody acknowledges.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import struct
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusError, BusState
+from can_dbc.bus.batch import Batch
+from can_dbc.bus.filters import Filter
+from can_dbc.frame import ERROR, Frame
+
+RECORD: Final = struct.Struct("=IB3x8sQHHI")
+"""key, length, data: struct can_frame; end-of-frame time [ns, CLOCK_MONOTONIC]; flags; done; dropped."""
+_RECEIVED: Final = struct.Struct("=IB3x8sQH6x")
+"""A record without the counters; the last ones of a packet tell all."""
+_COUNTERS: Final = struct.Struct("=26xHI")
+CONTROL: Final = 1
+STATUS: Final = 2
+"""Flag of a record that carries no frame, only the counters."""
+DISCARD: Final = 4
+BATCH: Final = 64
+"""Most records in one packet."""
+CONTROL_BYTES: Final = 1 << 16
+"""Most bytes of a control packet."""
+_PACKETS: Final = 16
+"""Most packets taken by one system call."""
+_OPEN_TIMEOUT_S: Final = 2.0
+_REOPEN_TIMEOUT_S: Final = 0.002
+_BACKLOG: Final = 4096
+
+
+def wire_directory() -> Path:
+    """Where the socket files lie: ``TIMBERHAND_WIRE_DIR``, else the user's runtime directory, else a
+    directory in the temporary one that belongs to this user."""
+    if explicit := os.environ.get("TIMBERHAND_WIRE_DIR"):
+        return Path(explicit)
+    if runtime := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(runtime) / "timberhand"
+    return Path(tempfile.gettempdir()) / f"timberhand-{os.getuid()}"
+
+
+class WireClient(BaseBus):
+    """One participant on a wire bus (contract: `can_dbc.bus.base.Bus`).
+
+    With `error_frames` they come out of `drain` too, and what came before a recovery stays: that is how python-can's
+    programs want it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        wanted: Filter | None = None,
+        receive_own: bool = False,
+        tx_queue: int = 10,
+        participant: str | None = None,
+        error_frames: bool = False,
+    ) -> None:
+        super().__init__(name)
+        hello = {
+            "name": participant or _program(),
+            "filters": None if wanted is None else wanted.pairs,
+            "receive_own": receive_own,
+            "tx_queue": tx_queue,
+        }
+        self._hello = {"hello": hello}
+        self._tx_queue = tx_queue
+        self._error_frames = error_frames
+        self._batch = Batch(RECORD.size * BATCH, count=_PACKETS)
+        self._backlog: list[Frame] = []  # read while looking for room in the transmit queue
+        self._asked: socket.socket | None = None  # a new connection whose greeting is not answered yet
+        self._accepted = self._done = self._dropped = 0
+        self._sock, reply = _connect(name, self._hello)
+        self._sock.setblocking(False)
+        self.bitrate: int = reply["bitrate"]
+
+    def fileno(self) -> int:
+        return self._sock.fileno()
+
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
+        stats, sent = self.stats, 0
+        while sent < len(frames):
+            if self.pending + len(frames) - sent > self._tx_queue and stats.state is not BusState.DOWN:
+                self._read(self._backlog, 0)
+                self._bound_backlog()
+            room = self._tx_queue - self.pending if stats.state < BusState.OFF else 0
+            records = []
+            for key, data in frames[sent : sent + min(room, BATCH)]:
+                if len(data) > 8:
+                    break
+                records.append(RECORD.pack(key, len(data), data, 0, 0, 0, 0))
+            if not records or not self._post(b"".join(records)):
+                break
+            self._accepted += len(records)
+            sent += len(records)
+        stats.sent += sent
+        stats.refused += len(frames) - sent
+        return sent
+
+    def flush(self) -> None:
+        self.discard()
+        super().flush()
+
+    def discard(self) -> None:
+        """Takes back the own frames that have not begun on the bus."""
+        if self.stats.state is not BusState.DOWN:
+            self._post(RECORD.pack(0, 0, b"", 0, DISCARD, 0, 0))
+
+    @property
+    def pending(self) -> int:
+        """Own frames taken but not yet known to have been on the bus."""
+        return (self._accepted - self._done) & 0xFFFF
+
+    def _take(self, frames: list[Frame]) -> None:
+        first = len(frames)
+        if self._backlog:
+            frames.extend(self._backlog)
+            self._backlog.clear()
+        self._read(frames, first)
+
+    def _read(self, frames: list[Frame], first: int) -> None:
+        """Appends what waits in the socket; at a recovery takes back all from `first` on."""
+        stats, batch = self.stats, self._batch
+        new, append = tuple.__new__, frames.append
+        for _ in range(DRAIN_LIMIT // batch.count):
+            try:
+                waiting = batch.receive(self._sock.fileno())
+            except OSError:
+                stats.enter(BusState.DOWN)
+                return
+            at = 0
+            for size in batch.lengths():
+                if not size:  # the daemon has gone
+                    stats.enter(BusState.DOWN)
+                    return
+                for key, length, data, stamp_ns, flags in _RECEIVED.iter_unpack(batch.data[at : at + size]):
+                    if flags & STATUS:
+                        continue
+                    if key & ERROR:
+                        recovered = stats.note_error(key, data)
+                        if not self._error_frames:
+                            if recovered:
+                                del frames[first:]
+                            continue
+                    append(new(Frame, (stamp_ns, key, data if length == 8 else data[:length])))
+                self._done, dropped = _COUNTERS.unpack_from(batch.data, at + size - RECORD.size)
+                stats.dropped += (dropped - self._dropped) & 0xFFFF_FFFF
+                self._dropped = dropped
+                at += batch.size
+            if waiting < batch.count or len(frames) - first >= DRAIN_LIMIT:
+                return
+
+    def _bound_backlog(self) -> None:
+        """Somebody who only sends must not grow without bound."""
+        surplus = len(self._backlog) - _BACKLOG
+        if surplus > 0:
+            self.stats.dropped += surplus
+            del self._backlog[:surplus]
+
+    def _post(self, packet: bytes) -> bool:
+        try:
+            self._sock.send(packet)
+        except BlockingIOError:  # the daemon is behind
+            return False
+        except OSError:
+            self.stats.enter(BusState.DOWN)
+            return False
+        return True
+
+    def _open_again(self) -> bool:
+        """A daemon that is slow to answer is asked once; later calls only look for its answer."""
+        patience_s = 0.0
+        try:
+            if self._asked is None:
+                patience_s = _REOPEN_TIMEOUT_S
+                self._asked = _dial(self.name, self._hello, 0.0)
+            if not select.select([self._asked], [], [], patience_s)[0]:
+                return False
+            reply = _answer(self._asked)
+        except (OSError, ValueError):
+            self._forget()
+            return False
+        self._sock.close()
+        self._sock, self._asked = self._asked, None
+        self._backlog.clear()
+        self._accepted = self._done = self._dropped = 0
+        self.bitrate = reply["bitrate"]
+        return True
+
+    def _forget(self) -> None:
+        if self._asked is not None:
+            self._asked.close()
+            self._asked = None
+
+    def _leave(self) -> None:
+        self._forget()
+        self._sock.close()
+
+
+def control(name: str, message: dict[str, Any]) -> dict[str, Any]:
+    """Asks the daemon of bus `name` (requests: `hil.wire.daemon`) without taking part in the bus.
+
+    Raises `BusError` when there is no daemon, when it does not answer, or with the reason of its refusal.
+    """
+    sock, reply = _connect(name, message)
+    sock.close()
+    return reply
+
+
+class _RefusedError(ValueError):
+    """The daemon's own reason why it does not do what it was asked."""
+
+
+def _connect(name: str, message: dict[str, Any]) -> tuple[socket.socket, dict[str, Any]]:
+    """A connection to the daemon and its answer to the first message; raises `BusError`."""
+    sock = None
+    try:
+        sock = _dial(name, message, _OPEN_TIMEOUT_S)
+        return sock, _answer(sock)
+    except (OSError, ValueError) as error:
+        if sock is not None:
+            sock.close()
+        if isinstance(error, _RefusedError):
+            raise BusError(f"The wire daemon of {name} refuses: {error}.") from error
+        raise BusError(
+            f"No wire bus {name} answers at {wire_directory() / name} ({getattr(error, 'strerror', None) or error}); "
+            f"start one with `python -m hil.wire.daemon --bus {name}:1000000`."
+        ) from error
+
+
+def _dial(name: str, message: dict[str, Any], timeout_s: float) -> socket.socket:
+    """A connection to the daemon that has been sent its first message, a control packet; raises OSError."""
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        sock.settimeout(timeout_s)
+        sock.connect(str(wire_directory() / name))
+        sock.send(RECORD.pack(0, 0, b"", 0, CONTROL, 0, 0) + json.dumps(message).encode())
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def _answer(sock: socket.socket) -> dict[str, Any]:
+    """The daemon's answer to a control packet; raises OSError when none comes, ValueError for a refusal."""
+    reply: dict[str, Any] = json.loads(sock.recv(CONTROL_BYTES)[RECORD.size :])
+    if "error" in reply:
+        raise _RefusedError(reply["error"])
+    return reply
+
+
+def _program() -> str:
+    """The running program's name; that of the package under ``python -m package``."""
+    path = Path(sys.argv[0])
+    return path.parent.name if path.stem == "__main__" else path.stem or "python"

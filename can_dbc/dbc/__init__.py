@@ -1,0 +1,1 @@
+"""DBC files: from signals to compiled codecs, and the check of a file."""

@@ -1,0 +1,269 @@
+"""Checks a DBC or KCD file: does it load, do the compiled codecs equal cantools, and is the file well made.
+
+``check(path, frames, seed)`` returns a ``Report``; it never raises for a bad file.  The comparison drives
+both codecs with the same random payloads and values; where cantools refuses a value, ours has to refuse it
+too.  Lint looks at what a loader does not tell: overlapping bits, ranges that the bits cannot hold, missing
+units and cycle times, identifiers used twice.  Times and counts only; no clock, the randomness comes from
+the seed.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from can_dbc.dbc.codec import DbcError, FrameRefused, MessageCodec, Policy, SignalInfo, compile_one, parse, resolve
+from can_dbc.dbc.signals import ERROR, NOT_AVAILABLE, EncodeRefused
+from can_dbc.frame import describe
+
+SHOWN: Final = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One lint warning: ``where`` is message or message.signal, ``rule`` a short name, ``text`` a
+    sentence."""
+
+    where: str
+    rule: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """The result for one file.  ``error`` is the reason it cannot be loaded, else empty; ``differences``
+    are the first few cases where the codec and cantools disagree, ``different`` counts them all."""
+
+    path: str
+    error: str
+    messages: int
+    signals: int
+    decoded: int
+    encoded: int
+    different: int
+    differences: tuple[str, ...]
+    warnings: tuple[Finding, ...]
+
+
+def check(name_or_path: str, frames: int, seed: int) -> Report:
+    """Loads, lints and compares one file over ``frames`` random payloads and value sets per message."""
+    try:
+        path = resolve(name_or_path)
+    except DbcError as error:
+        return Report(str(name_or_path), str(error), 0, 0, 0, 0, 0, (), ())
+    try:
+        database = parse(path)
+        pairs = [(message, compile_one(message, path)) for message in database.messages]
+    except DbcError as error:
+        try:
+            found = lint(parse(path, strict=False))
+        except DbcError:
+            found = ()
+        return Report(str(path), str(error), 0, 0, 0, 0, 0, (), found)
+    rng = random.Random(seed)
+    differences: list[str] = []
+    decoded = encoded = 0
+    for message, codec in pairs:
+        for _ in range(frames):
+            payload = random_payload(rng, codec)
+            values = random_values(rng, codec, payload)
+            decoded += 1
+            differences += compare_decode(message, codec, payload)
+            if values is not None:
+                encoded += 1
+                differences += compare_encode(message, codec, values)
+    return Report(
+        str(path),
+        "",
+        len(pairs),
+        sum(len(codec.signals) for _, codec in pairs),
+        decoded,
+        encoded,
+        len(differences),
+        tuple(differences[:SHOWN]),
+        lint(database),
+    )
+
+
+# -- comparison ------------------------------------------------------------------------------------------------
+
+
+def _refusals() -> tuple[type[Exception], ...]:
+    """What cantools raises for data it does not take."""
+    import bitstruct  # type: ignore[import-untyped]
+    from cantools.database.errors import Error
+
+    return (Error, bitstruct.Error, ValueError, OverflowError, KeyError, TypeError)
+
+
+def random_payload(rng: random.Random, codec: MessageCodec) -> bytes:
+    """Random bytes; three times in four with known values in the multiplexers."""
+    payload = rng.randbytes(codec.length)
+    if rng.random() < 0.25 or not any(s.is_multiplexer for s in codec.signals):
+        return payload
+    for i, s in enumerate(codec.signals):
+        ids = sorted({mux for other in codec.signals if other.parent == i for mux in other.parent_ids})
+        if s.is_multiplexer and ids:
+            order = "big" if s.big_endian else "little"
+            mask = (1 << s.bits) - 1
+            word = int.from_bytes(payload, order) & ~(mask << s.shift)  # type: ignore[arg-type]
+            word |= (rng.choice(ids) & mask) << s.shift
+            payload = word.to_bytes(codec.length, order)  # type: ignore[arg-type]
+    return payload
+
+
+def random_values(rng: random.Random, codec: MessageCodec, payload: bytes) -> list[Any] | None:
+    """Values around those of a payload: as they are, off the grid, at and beyond the limits; None if
+    unreadable."""
+    try:
+        values = list(codec.decode(payload))
+    except FrameRefused:
+        return None
+    for i, s in enumerate(codec.signals):
+        if values[i] is not None and not s.is_multiplexer:
+            values[i] = _near(rng, s, values[i])
+    return values
+
+
+def _near(rng: random.Random, s: SignalInfo, value: float) -> float:
+    low = s.physical(s.raw_min) if s.minimum is None else s.minimum
+    high = s.physical(s.raw_max) if s.maximum is None else s.maximum
+    if s.is_float and (s.minimum is None or s.maximum is None):
+        low, high = -1e3, 1e3
+    kind = rng.random()
+    if kind < 0.1:
+        return rng.choice((low, high)) + rng.choice((-1.0, -1e-7, 0.0, 1e-7, 1.0)) * abs(s.scale)
+    if kind < 0.3 and math.isfinite(value):
+        return value
+    if kind < 0.4:
+        return low + round((high - low) / abs(s.scale) * rng.random() * 2) / 2 * abs(s.scale)
+    return low + (high - low) * rng.random()
+
+
+def compare_decode(message: Any, codec: MessageCodec, payload: bytes) -> list[str]:
+    """Differences (none or one) between cantools and the codec for one payload."""
+    try:
+        want = message.decode(payload, decode_choices=False)
+    except _refusals():
+        want = None
+    try:
+        got = codec.named(codec.decode(payload))
+    except FrameRefused:
+        got = None
+    if got == want or (got and want and got.keys() == want.keys() and all(map(_same, got.values(), want.values()))):
+        return []
+    return [f"{codec.name} decode {payload.hex()}: ours {got}, cantools {want}"]
+
+
+def _same(a: float, b: float) -> bool:
+    return a == b or (a != a and b != b)
+
+
+def compare_encode(message: Any, codec: MessageCodec, values: Sequence[Any]) -> list[str]:
+    """Differences (none or one) between cantools and the codec for one set of values.
+
+    Ours may refuse more: not finite, and out of range although the value table labels it as no measurement.
+    """
+    given: dict[str, Any] = {}
+    stricter = False
+    for s, value in zip(codec.signals, values, strict=True):
+        if value is None:
+            continue
+        if s.policy is Policy.SATURATE and math.isfinite(value):
+            value = min(max(value, s.physical(s.raw_low)), s.physical(s.raw_high)) if not s.inside(value) else value
+        elif not math.isfinite(value) or (not s.inside(value) and s.convert(value) in s.sentinels):
+            stricter = True
+        given[s.name] = value
+    try:
+        want = message.encode(given, strict=True)
+    except _refusals():
+        want = None
+    try:
+        got = codec.encode(*values)
+    except EncodeRefused:
+        got = None
+    if got == want or (got is None and stricter):
+        return []
+    return [f"{codec.name} encode {given}: ours {got.hex() if got else got}, cantools {want.hex() if want else want}"]
+
+
+# -- lint ------------------------------------------------------------------------------------------------------
+
+
+def lint(database: Any) -> tuple[Finding, ...]:
+    """What is wrong with a cantools database although it can be read (loaded with ``strict=False`` if need
+    be)."""
+    findings: list[Finding] = []
+    ids = Counter((m.frame_id, m.is_extended_frame) for m in database.messages)
+    for message in database.messages:
+        name = message.name
+        if ids[message.frame_id, message.is_extended_frame] > 1:
+            key = message.frame_id | (0x8000_0000 if message.is_extended_frame else 0)
+            findings.append(Finding(name, "identifier", f"another message has the identifier {describe(key)} too"))
+        if "GenMsgCycleTime" not in (message.dbc.attributes if message.dbc else {}) and not message.cycle_time:
+            findings.append(Finding(name, "cycle-time", "no GenMsgCycleTime"))
+        findings += _overlaps(message)
+        for s in message.signals:
+            findings += _signal_findings(f"{name}.{s.name}", s)
+    return tuple(findings)
+
+
+def _signal_findings(where: str, s: Any) -> list[Finding]:
+    findings = []
+    scale, offset = s.conversion.scale, s.conversion.offset
+    labels = {str(label) for label in (s.choices or {}).values()} - {ERROR, NOT_AVAILABLE}
+    if not s.unit and not labels and (scale != 1 or offset or s.conversion.is_float):
+        findings.append(Finding(where, "unit", "a scaled value without a unit"))
+    if s.conversion.is_float:
+        return findings
+    ends = [-(1 << s.length - 1), (1 << s.length - 1) - 1] if s.is_signed else [0, (1 << s.length) - 1]
+    low, high = sorted(raw * scale + offset for raw in ends)
+    slack = abs(scale) / 2 + 1e-12 * max(abs(low), abs(high))
+    for limit, text in ((s.minimum, "minimum"), (s.maximum, "maximum")):
+        if limit is not None and not low - slack <= limit <= high + slack:
+            reach = f"{low:.12g} to {high:.12g}"
+            findings.append(Finding(where, "range", f"{text} {limit} is beyond what the bits hold, {reach}"))
+    if s.minimum is not None and s.maximum is not None and s.minimum > s.maximum:
+        findings.append(Finding(where, "range", f"minimum {s.minimum} is above maximum {s.maximum}"))
+    return findings
+
+
+def _bits(s: Any) -> set[int]:
+    """The payload bits of a signal, numbered 8 * byte + significance."""
+    if s.byte_order == "little_endian":
+        return set(range(s.start, s.start + s.length))
+    first = 8 * (s.start // 8) + 7 - s.start % 8
+    return {8 * (n // 8) + 7 - n % 8 for n in range(first, first + s.length)}
+
+
+def _together(a: Any, b: Any, parents: dict[str, Any]) -> bool:
+    """Whether two signals can be present in the same frame: no common multiplexer tells them apart."""
+
+    def selections(s: Any) -> dict[str, set[int]]:
+        found: dict[str, set[int]] = {}
+        while s is not None and s.multiplexer_signal is not None:
+            found[s.multiplexer_signal] = set(s.multiplexer_ids or ())
+            s = parents.get(s.multiplexer_signal)
+        return found
+
+    ours, theirs = selections(a), selections(b)
+    return all(ours[mux] & theirs[mux] for mux in ours.keys() & theirs.keys())
+
+
+def _overlaps(message: Any) -> list[Finding]:
+    findings = []
+    parents = {s.name: s for s in message.signals if s.is_multiplexer}
+    placed = [(s, _bits(s)) for s in message.signals]
+    for i, (s, bits) in enumerate(placed):
+        if max(bits) >= 8 * message.length:
+            text = f"reaches beyond the {message.length} bytes of the message"
+            findings.append(Finding(f"{message.name}.{s.name}", "length", text))
+        for other, other_bits in placed[:i]:
+            if bits & other_bits and _together(s, other, parents):
+                text = f"shares {len(bits & other_bits)} bits with {other.name}"
+                findings.append(Finding(f"{message.name}.{s.name}", "overlap", text))
+    return findings

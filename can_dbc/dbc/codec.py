@@ -1,0 +1,226 @@
+"""DBC files in, flat codecs out: the contract between bytes on the bus and numbers in the program.
+
+``load("crane")`` (or ``"machine"``, ``"gnss"``, or a path to any DBC or KCD) reads the file with cantools
+once, at start-up, and returns a ``Database`` of ``MessageCodec``.  A codec is plain data with three
+compiled functions:
+
+* ``decode(data)``: physical values in signal order, equal to cantools' ``decode(decode_choices=False)``;
+  checks the length only.  Signals that a multiplexer leaves out are None.
+* ``receive(data)``: the same for a live system.  The frame is refused whole (``FrameRefused``) when a value
+  is out of range; a raw value labelled NotAvailable or Error becomes None.
+* ``encode(*values)``: bytes from physical values in signal order.  Never wraps: ``EncodeRefused``, or the
+  nearest valid value where the DBC says saturate.  None writes NotAvailable.  Values round half to even.
+
+A file that cannot be used raises ``DbcError`` with file, line where known, and reason.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from can_dbc.dbc.codegen import Decoder, Encoder, Values, compile_message
+from can_dbc.dbc.signals import EncodeRefused, FrameRefused, Policy, Refusal, SignalInfo
+from can_dbc.frame import EXTENDED, describe
+
+__all__ = [
+    "SHIPPED", "Database", "DbcError", "EncodeRefused", "FrameRefused", "MessageCodec", "Policy", "Refusal",
+    "SignalInfo", "compile_one", "load", "pgn_key", "resolve",
+]  # fmt: skip
+SHIPPED: Final = ("crane", "machine", "gnss")
+PDU2_MASK: Final = EXTENDED | 0x03FF_FF00
+PDU1_MASK: Final = EXTENDED | 0x03FF_0000
+
+
+class DbcError(Exception):
+    """A DBC file that cannot be used; the text is ``file[:line]: reason``."""
+
+
+@dataclass(frozen=True, slots=True)
+class MessageCodec:
+    """One message: identity, timing, E2E Data IDs (None without E2E) and the three compiled functions.
+
+    ``key`` follows ``can_dbc.frame``; times are in ns, 0 where the DBC gives none.  ``index`` maps a signal
+    name to its place in a value tuple.  ``by_pgn``: matched whatever priority and source address (J1939,
+    NMEA 2000).
+    """
+
+    name: str
+    key: int
+    length: int
+    cycle_time_ns: int
+    timeout_ns: int
+    signals: tuple[SignalInfo, ...] = field(repr=False)
+    senders: tuple[str, ...]
+    comment: str = field(repr=False)
+    data_ids: bytes | None
+    by_pgn: bool
+    decode: Decoder = field(repr=False, compare=False)
+    receive: Decoder = field(repr=False, compare=False)
+    encode: Encoder = field(repr=False, compare=False)
+    index: Mapping[str, int] = field(repr=False, compare=False)
+    source: str = field(repr=False, compare=False)
+
+    def named(self, values: Values) -> dict[str, Any]:
+        """A value tuple as a dictionary without the absent signals."""
+        return {s.name: v for s, v in zip(self.signals, values, strict=True) if v is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class Database:
+    """All messages of one file, by name and by key, and the PGN-matched ones by ``pgn_key``."""
+
+    path: Path
+    messages: Mapping[str, MessageCodec]
+    by_key: Mapping[int, MessageCodec]
+    by_pgn: Mapping[int, MessageCodec]
+
+    def message(self, name: str) -> MessageCodec:
+        """The codec of a message; DbcError when the file has no such message."""
+        codec = self.messages.get(name)
+        if codec is None:
+            raise DbcError(f"{self.path}: no message is called {name}")
+        return codec
+
+    def find(self, key: int) -> MessageCodec | None:
+        """The codec for a received key: an exact match first, then by PGN; None for a foreign frame."""
+        return self.by_key.get(key) or (self.by_pgn.get(pgn_key(key)) if key & EXTENDED else None)
+
+
+def pgn_key(key: int) -> int:
+    """An extended key without priority, source address and (for PDU1 formats) destination address."""
+    return key & (PDU2_MASK if key >> 16 & 0xFF >= 240 else PDU1_MASK)
+
+
+def resolve(name_or_path: str | Path) -> Path:
+    """The path of a shipped database (a name without suffix) or of a file; DbcError when there is none."""
+    path = Path(name_or_path)
+    if str(name_or_path) in SHIPPED:
+        return Path(__file__).parents[1] / f"{name_or_path}.dbc"
+    if not path.is_file():
+        raise DbcError(f"{path}: no such file; shipped databases are {', '.join(SHIPPED)}")
+    return path
+
+
+def load(name_or_path: str | Path) -> Database:
+    """Reads and compiles a database: one of ``SHIPPED`` or a path to a DBC or KCD file; raises DbcError."""
+    path = resolve(name_or_path)
+    messages = [compile_one(message, path) for message in parse(path).messages]
+    for what, counts in (
+        ("name", Counter(m.name for m in messages)),
+        ("identifier", Counter(describe(m.key) for m in messages)),
+    ):
+        twice = [value for value, n in counts.items() if n > 1]
+        if twice:
+            raise DbcError(f"{path}: two messages share the {what} {twice[0]}")
+    pgns = Counter(pgn_key(m.key) for m in messages if m.by_pgn)
+    return Database(
+        path,
+        MappingProxyType({m.name: m for m in messages}),
+        MappingProxyType({m.key: m for m in messages}),
+        # two layouts for one PGN differ by source address, so only the exact identifier can tell them apart
+        MappingProxyType({k: m for m in messages if m.by_pgn and pgns[k := pgn_key(m.key)] == 1}),
+    )
+
+
+def parse(path: Path, *, strict: bool = True) -> Any:
+    """The cantools database of a file; DbcError with the line where it can be told."""
+    import cantools
+    from cantools.database.errors import Error
+
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in ("dbc", "kcd"):
+        raise DbcError(f"{path}: not a .dbc or .kcd file")
+    try:
+        text = path.read_text(encoding="cp1252" if kind == "dbc" else "utf-8")
+        return cantools.database.load_string(text, database_format=kind, strict=strict)
+    except (OSError, UnicodeError) as error:
+        raise DbcError(f"{path}: cannot be read: {error}") from error
+    except (Error, ValueError, KeyError, IndexError, TypeError, SyntaxError) as error:
+        reason = re.sub(r"^(DBC|KCD): ", "", str(error)).strip('"') or type(error).__name__
+        raise DbcError(f"{path}{_line_of(reason, text)}: {reason}") from error
+
+
+def _line_of(reason: str, text: str) -> str:
+    """``:line`` of a cantools complaint: the line it gives, or that of the message it names."""
+    given = re.search(r"line (\d+)", reason)
+    if given:
+        return f":{given[1]}"
+    named = re.search(r"in message (\w+)", reason)
+    if named:
+        for number, line in enumerate(text.splitlines(), 1):
+            if re.search(rf"(BO_ \d+ |name=\"){named[1]}\b", line):
+                return f":{number}"
+    return ""
+
+
+def compile_one(message: Any, path: Path) -> MessageCodec:
+    """The codec of one cantools message; ``path`` is named in errors."""
+    signals = _signals(message)
+    decode, receive, encode, source = compile_message(message.name, message.length, signals)
+    attributes = {k: a.value for k, a in message.dbc.attributes.items()} if message.dbc else {}
+    return MessageCodec(
+        name=message.name,
+        key=message.frame_id | (EXTENDED if message.is_extended_frame else 0),
+        length=message.length,
+        cycle_time_ns=int(message.cycle_time or 0) * 1_000_000,
+        timeout_ns=int(attributes.get("TimeoutMs", 0)) * 1_000_000,
+        signals=signals,
+        senders=tuple(message.senders),
+        comment=message.comment or "",
+        data_ids=_data_ids(message.name, attributes, path),
+        by_pgn=message.protocol == "j1939",
+        decode=decode,
+        receive=receive,
+        encode=encode,
+        index=MappingProxyType({s.name: i for i, s in enumerate(signals)}),
+        source=source,
+    )
+
+
+def _data_ids(name: str, attributes: Mapping[str, Any], path: Path) -> bytes | None:
+    if not attributes.get("E2EProfile"):
+        return None
+    try:
+        ids = bytes.fromhex(str(attributes.get("E2EDataIds", "")))
+    except ValueError:
+        ids = b""
+    if len(ids) != 16:
+        raise DbcError(f"{path}: {name} needs 16 hexadecimal Data IDs in E2EDataIds")
+    return ids
+
+
+def _signals(message: Any) -> tuple[SignalInfo, ...]:
+    """The signals in cantools' order (by start bit), with multiplexers as indices into the result."""
+    positions = {s.name: i for i, s in enumerate(message.signals) if s.is_multiplexer}
+    result = []
+    for s in message.signals:
+        network = 8 * (s.start // 8) + 7 - s.start % 8
+        attributes = {k: a.value for k, a in s.dbc.attributes.items()} if s.dbc else {}
+        result.append(
+            SignalInfo(
+                name=s.name,
+                unit=s.unit or "",
+                minimum=s.minimum,
+                maximum=s.maximum,
+                scale=s.conversion.scale,
+                offset=s.conversion.offset,
+                policy=Policy.SATURATE if attributes.get("OutOfRange") in (1, "saturate") else Policy.REFUSE,
+                choices=MappingProxyType({int(k): str(v) for k, v in (s.choices or {}).items()}),
+                comment=s.comment or "",
+                bits=s.length,
+                shift=8 * message.length - network - s.length if s.byte_order == "big_endian" else s.start,
+                big_endian=s.byte_order == "big_endian",
+                signed=s.is_signed,
+                is_float=s.conversion.is_float,
+                is_multiplexer=s.is_multiplexer,
+                parent=None if s.multiplexer_signal is None else positions[s.multiplexer_signal],
+                parent_ids=frozenset(s.multiplexer_ids or ()),
+            )
+        )
+    return tuple(result)

@@ -1,0 +1,203 @@
+"""The crane's datagrams: setpoint, spool test, operator command and state report, with their bodies.
+
+They travel in the envelope of `can_dbc.messages.envelope`; `can_dbc.messages.datagrams` encodes and decodes them.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Final
+
+from can_dbc.messages.envelope import Common, DatagramFault, DatagramRefused, finite
+
+N_AXES: Final = 5
+MAX_KNOTS: Final = 16
+FULL_PCT: Final = 100.0
+
+_CRANE: Final = struct.Struct("<IBBBB")
+_KNOT: Final = struct.Struct(f"<I{2 * N_AXES}d")
+_OPERATOR: Final = struct.Struct("<I")
+_SPOOL: Final = struct.Struct("<IBB")
+_SPOOL_KNOT: Final = struct.Struct("<Id")
+_REPORT: Final = struct.Struct(f"<BBHIHHH{3 * N_AXES + 3}d4I")
+
+
+class GrappleCommand(IntEnum):
+    """Open-loop grapple command (paper A III-A); the numbers are ``ValveCmdB.GrappleMode``."""
+
+    NEUTRAL = 0
+    OPEN = 1
+    CLOSE = 2
+    HOLD = 3
+
+
+class OperatorAction(IntEnum):
+    """What a human may ask of the controller; every one is an edge, never a level."""
+
+    ARM = 1
+    DISARM = 2
+    STOP = 3
+    RESET = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Knot:
+    """Joint positions and velocities (rad, m; per second; ``Joint`` order) at ``after_ns`` past the stamp."""
+
+    after_ns: int
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CraneSetpoint:
+    """A short joint trajectory with a lease: obeyed until ``stamp_ns + lease_ns`` and not a moment longer.
+
+    ``final`` says that the last knot is the end of the motion: once reached, the lease may run out in peace.
+    """
+
+    sequence: int
+    profile_hash: int
+    stamp_ns: int
+    lease_ns: int
+    grapple: GrappleCommand
+    final: bool
+    knots: tuple[Knot, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SpoolKnot:
+    """Command of one valve function [%, + moves the joint in its positive direction] at ``after_ns`` past the stamp."""
+
+    after_ns: int
+    percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class SpoolTest:
+    """A spool command for one function (a ``Joint`` number), to find out what its valve does; all others stay neutral.
+
+    Straight lines between the knots, neutral past the last one.  Obeyed until ``stamp_ns + lease_ns``.
+    """
+
+    sequence: int
+    profile_hash: int
+    stamp_ns: int
+    lease_ns: int
+    function: int
+    knots: tuple[SpoolKnot, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorCommand:
+    """One action of a human operator."""
+
+    sequence: int
+    profile_hash: int
+    stamp_ns: int
+    action: OperatorAction
+
+
+@dataclass(frozen=True, slots=True)
+class StateReport:
+    """What the controller says of itself, 50 times a second.
+
+    ``position``, ``velocity`` and ``reference`` are in ``Joint`` order; an unknown value is NaN.  ``mode`` is
+    a ``machine.status.modes.Mode``, ``reason`` the supervisor's number; ``refused`` counts setpoints refused since
+    start, ``refusal`` is the last reason.  ``tick_ns`` is the longest tick, ``late_ns`` the worst lateness
+    since the last report.
+    """
+
+    sequence: int
+    profile_hash: int
+    stamp_ns: int
+    mode: int
+    grapple_state: int
+    reason: int
+    setpoint_sequence: int
+    refusal: int
+    refused: int
+    stale_mask: int
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+    reference: tuple[float, ...]
+    opening_pct: float
+    clamp_bar: float
+    load_kg: float
+    tick_ns: int
+    late_ns: int
+    missed_ticks: int
+    frames_received: int
+
+
+def crane_body(m: CraneSetpoint) -> bytes:
+    """The body of a crane setpoint; times finer than 1 us are cut."""
+    head = _CRANE.pack(m.lease_ns // 1000, m.grapple, int(m.final), len(m.knots), N_AXES)
+    return head + b"".join(_KNOT.pack(k.after_ns // 1000, *k.position, *k.velocity) for k in m.knots)
+
+
+def spool_body(m: SpoolTest) -> bytes:
+    """The body of a spool test; times finer than 1 us are cut."""
+    head = _SPOOL.pack(m.lease_ns // 1000, m.function, len(m.knots))
+    return head + b"".join(_SPOOL_KNOT.pack(k.after_ns // 1000, k.percent) for k in m.knots)
+
+
+def operator_body(m: OperatorCommand) -> bytes:
+    """The body of an operator command."""
+    return _OPERATOR.pack(m.action)
+
+
+def report_body(m: StateReport) -> bytes:
+    """The body of a state report; counters wrap at their width."""
+    return _REPORT.pack(
+        m.mode, m.grapple_state, m.reason, m.setpoint_sequence, m.refusal, m.refused & 0xFFFF, m.stale_mask,
+        *m.position, *m.velocity, *m.reference, m.opening_pct, m.clamp_bar, m.load_kg,
+        m.tick_ns & 0xFFFFFFFF, m.late_ns & 0xFFFFFFFF, m.missed_ticks & 0xFFFFFFFF, m.frames_received & 0xFFFFFFFF,
+    )  # fmt: skip
+
+
+def crane_from(common: Common, body: bytes) -> CraneSetpoint:
+    lease_us, grapple, final, n_knots, axes = _CRANE.unpack_from(body)
+    if len(body) != _CRANE.size + n_knots * _KNOT.size or axes != N_AXES:
+        raise DatagramRefused(DatagramFault.LENGTH)
+    if not 1 <= n_knots <= MAX_KNOTS or final > 1:
+        raise DatagramRefused(DatagramFault.VALUE)
+    knots = []
+    for i in range(n_knots):
+        after_us, *values = _KNOT.unpack_from(body, _CRANE.size + i * _KNOT.size)
+        numbers = finite(tuple(values))
+        knots.append(Knot(after_us * 1000, numbers[:N_AXES], numbers[N_AXES:]))
+        if i and knots[i].after_ns <= knots[i - 1].after_ns:
+            raise DatagramRefused(DatagramFault.VALUE)
+    return CraneSetpoint(*common, lease_us * 1000, GrappleCommand(grapple), bool(final), tuple(knots))
+
+
+def spool_from(common: Common, body: bytes) -> SpoolTest:
+    lease_us, function, n_knots = _SPOOL.unpack_from(body)
+    if len(body) != _SPOOL.size + n_knots * _SPOOL_KNOT.size:
+        raise DatagramRefused(DatagramFault.LENGTH)
+    if not 1 <= n_knots <= MAX_KNOTS or function >= N_AXES:
+        raise DatagramRefused(DatagramFault.VALUE)
+    knots: list[SpoolKnot] = []
+    for i in range(n_knots):
+        after_us, percent = _SPOOL_KNOT.unpack_from(body, _SPOOL.size + i * _SPOOL_KNOT.size)
+        finite((percent,))
+        if abs(percent) > FULL_PCT or (knots and after_us * 1000 <= knots[-1].after_ns):
+            raise DatagramRefused(DatagramFault.VALUE)
+        knots.append(SpoolKnot(after_us * 1000, percent))
+    return SpoolTest(*common, lease_us * 1000, function, tuple(knots))
+
+
+def operator_from(common: Common, body: bytes) -> OperatorCommand:
+    """The operator command in a body; raises struct.error for a wrong length and ValueError for an unknown action."""
+    return OperatorCommand(*common, OperatorAction(*_OPERATOR.unpack(body)))
+
+
+def report_from(common: Common, body: bytes) -> StateReport:
+    values = _REPORT.unpack(body)
+    joints = values[7 : 7 + 3 * N_AXES]
+    fields: list[Any] = [*common, *values[:7]]
+    fields += [joints[:N_AXES], joints[N_AXES : 2 * N_AXES], joints[2 * N_AXES :]]
+    return StateReport(*fields, *values[7 + 3 * N_AXES :])

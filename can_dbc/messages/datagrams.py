@@ -1,0 +1,88 @@
+"""Encodes and decodes the UDP datagrams of crane and vehicle; those of a mission are in `can_dbc.messages.mission`.
+
+`decode` refuses a datagram as a whole, with a reason: length, magic, version, checksum, authentication, or a value that
+is not finite.  Whether a value suits this machine (limits, age, order) is for the supervisor to decide, not for the
+codec.
+"""
+
+from __future__ import annotations
+
+import struct
+
+from can_dbc.messages.crane import (
+    CraneSetpoint,
+    OperatorCommand,
+    SpoolTest,
+    StateReport,
+    crane_body,
+    crane_from,
+    operator_body,
+    operator_from,
+    report_body,
+    report_from,
+    spool_body,
+    spool_from,
+)
+from can_dbc.messages.envelope import DatagramFault, DatagramRefused, Kind, sealed, unsealed
+from can_dbc.messages.vehicle import (
+    DriveSetpoint,
+    VehicleReport,
+    drive_body,
+    drive_from,
+    vehicle_body,
+    vehicle_from,
+)
+
+Datagram = CraneSetpoint | SpoolTest | DriveSetpoint | OperatorCommand | StateReport | VehicleReport
+
+
+def encode(message: Datagram, key: bytes | None = None) -> bytes:
+    """The bytes of a datagram; times finer than 1 us are cut.  With ``key`` it is authenticated."""
+    kind, body = _body(message)
+    return sealed(kind, (message.sequence, message.profile_hash, message.stamp_ns), body, key)
+
+
+def decode(data: bytes, key: bytes | None = None) -> Datagram:
+    """The message in a datagram.
+
+    Raises:
+        DatagramRefused: with the reason; nothing of a refused datagram is used.
+    """
+    kind, common, body = unsealed(data, key)
+    try:
+        match kind:
+            case Kind.CRANE:
+                return crane_from(common, body)
+            case Kind.SPOOL:
+                return spool_from(common, body)
+            case Kind.DRIVE:
+                return drive_from(common, body)
+            case Kind.OPERATOR:
+                return operator_from(common, body)
+            case Kind.REPORT:
+                return report_from(common, body)
+            case Kind.VEHICLE:
+                return vehicle_from(common, body)
+    except struct.error:
+        raise DatagramRefused(DatagramFault.LENGTH) from None
+    except DatagramRefused:
+        raise
+    except ValueError:
+        raise DatagramRefused(DatagramFault.VALUE) from None
+    raise DatagramRefused(DatagramFault.KIND)
+
+
+def _body(message: Datagram) -> tuple[Kind, bytes]:
+    match message:
+        case CraneSetpoint():
+            return Kind.CRANE, crane_body(message)
+        case SpoolTest():
+            return Kind.SPOOL, spool_body(message)
+        case DriveSetpoint():
+            return Kind.DRIVE, drive_body(message)
+        case VehicleReport():
+            return Kind.VEHICLE, vehicle_body(message)
+        case OperatorCommand():
+            return Kind.OPERATOR, operator_body(message)
+        case StateReport():
+            return Kind.REPORT, report_body(message)

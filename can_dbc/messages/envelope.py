@@ -1,0 +1,101 @@
+"""The envelope of every UDP datagram between planner, operator and controller (design section 5).
+
+All kinds share one header and one trailer, little-endian::
+
+    magic u32 | version u16 | kind u16 | sequence u32 | profile hash u32 | stamp u64 ns
+    | body | [HMAC 16] | CRC-32
+
+The CRC-32 (``zlib``) covers everything before it; the optional HMAC-SHA-256, cut to 16 bytes, covers header
+and body and is present exactly when both sides are configured with a key.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import math
+import struct
+import zlib
+from enum import IntEnum
+from typing import Final
+
+MAGIC: Final = 0x44524854  # "THRD"
+VERSION: Final = 1
+MAC_BYTES: Final = 16
+
+_HEADER: Final = struct.Struct("<IHHIIQ")
+_CRC: Final = struct.Struct("<I")
+
+Common = tuple[int, int, int]
+"""Sequence, profile hash, stamp [ns]."""
+
+
+class Kind(IntEnum):
+    """What a datagram says."""
+
+    CRANE = 1
+    DRIVE = 2
+    OPERATOR = 3
+    REPORT = 4
+    SPOOL = 5
+    VEHICLE = 6
+    ORDER = 7
+    MISSION = 8
+
+
+class DatagramFault(IntEnum):
+    """Why a datagram was refused before anyone looked at its meaning."""
+
+    LENGTH = 1
+    MAGIC = 2
+    VERSION = 3
+    KIND = 4
+    CRC = 5
+    AUTHENTICATION = 6
+    NOT_FINITE = 7
+    VALUE = 8
+
+
+class DatagramRefused(ValueError):
+    """A datagram that was refused whole; ``fault`` says why."""
+
+    def __init__(self, fault: DatagramFault) -> None:
+        super().__init__(f"datagram refused: {fault.name.lower().replace('_', ' ')}")
+        self.fault = fault
+
+
+def sealed(kind: Kind, common: Common, body: bytes, key: bytes | None) -> bytes:
+    """A body in its envelope."""
+    data = _HEADER.pack(MAGIC, VERSION, kind, *common) + body
+    if key is not None:
+        data += _mac(data, key)
+    return data + _CRC.pack(zlib.crc32(data))
+
+
+def unsealed(data: bytes, key: bytes | None) -> tuple[int, Common, bytes]:
+    """Kind, common fields and body of a datagram; raises DatagramRefused."""
+    trailer = _CRC.size + (MAC_BYTES if key is not None else 0)
+    if len(data) < _HEADER.size + trailer:
+        raise DatagramRefused(DatagramFault.LENGTH)
+    magic, version, kind, sequence, profile_hash, stamp_ns = _HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise DatagramRefused(DatagramFault.MAGIC)
+    if version != VERSION:
+        raise DatagramRefused(DatagramFault.VERSION)
+    if zlib.crc32(data[: -_CRC.size]) != _CRC.unpack_from(data, len(data) - _CRC.size)[0]:
+        raise DatagramRefused(DatagramFault.CRC)
+    signed = data[: len(data) - trailer]
+    if key is not None and not hmac.compare_digest(_mac(signed, key), data[len(signed) : len(signed) + MAC_BYTES]):
+        raise DatagramRefused(DatagramFault.AUTHENTICATION)
+    return kind, (sequence, profile_hash, stamp_ns), signed[_HEADER.size :]
+
+
+def _mac(data: bytes, key: bytes) -> bytes:
+    return hmac.digest(key, data, hashlib.sha256)[:MAC_BYTES]
+
+
+def finite(values: tuple[float, ...]) -> tuple[float, ...]:
+    """`values` when all of them are finite, else DatagramRefused."""
+    if not all(map(math.isfinite, values)):
+        raise DatagramRefused(DatagramFault.NOT_FINITE)
+    return values

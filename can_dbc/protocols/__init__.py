@@ -1,0 +1,1 @@
+"""Protocols on top of CAN frames: CANopen, NMEA 2000 and end-to-end protection."""

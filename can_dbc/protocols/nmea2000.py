@@ -1,0 +1,192 @@
+"""NMEA 2000 on top of 29-bit frames: identifier fields, fast packets, and the PGNs of ``gnss.dbc``.
+
+Layouts stand in ``gnss.dbc`` alone; a message there that is longer than 8 bytes travels as a fast packet.
+``Receiver.receive`` takes every frame of a bus and returns a ``Reading`` when one is complete; what it does
+not know it ignores, what it must not use it refuses (``FrameRefused``).  ``encode`` and ``frames`` go the
+other way; a field not given is sent as "not available".  Time is ``now_ns``, monotonic.  Source: NMEA 2000
+as documented by canboat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from can_dbc.dbc.codec import Database, DbcError, EncodeRefused, MessageCodec, load
+from can_dbc.dbc.codegen import Values
+from can_dbc.dbc.signals import FrameRefused, Refusal
+from can_dbc.frame import ERROR, EXTENDED, REMOTE
+
+BROADCAST: Final = 255
+FAST_PACKET_AGE_NS: Final = 750_000_000
+MAX_OPEN: Final = 64
+FIRST_DATA: Final = 6
+NEXT_DATA: Final = 7
+MAX_FAST_PACKET: Final = FIRST_DATA + 31 * NEXT_DATA
+
+
+class Identifier(NamedTuple):
+    """The parts of a 29-bit identifier: priority 0 to 7, PGN, source and destination address (255 for
+    all)."""
+
+    priority: int
+    pgn: int
+    source: int
+    destination: int
+
+
+def split_id(key: int) -> Identifier:
+    """The parts of a key or bare identifier."""
+    pgn = key >> 8 & 0x3FFFF
+    destination = BROADCAST
+    if pgn >> 8 & 0xFF < 240:
+        destination, pgn = pgn & 0xFF, pgn & 0x3FF00
+    return Identifier(key >> 26 & 7, pgn, key & 0xFF, destination)
+
+
+def join_id(priority: int, pgn: int, source: int, destination: int = BROADCAST) -> int:
+    """The extended key of a PGN; ValueError for a destination or low byte that the PGN's format cannot
+    carry."""
+    if pgn >> 8 & 0xFF < 240:
+        if pgn & 0xFF:
+            raise ValueError(f"PGN {pgn} is addressed, its low byte must be 0")
+        pgn |= destination
+    elif destination != BROADCAST:
+        raise ValueError(f"PGN {pgn} is broadcast only, it cannot go to address {destination}")
+    return EXTENDED | priority << 26 | pgn << 8 | source
+
+
+class _Assembly:
+    __slots__ = ("length", "parts", "started_ns")
+
+    def __init__(self, started_ns: int) -> None:
+        self.started_ns = started_ns
+        self.length: int | None = None
+        self.parts: dict[int, bytes] = {}
+
+    def payload(self) -> bytes | None:
+        """The payload once every frame is there."""
+        if self.length is None:
+            return None
+        needed = 1 + max(0, -(-(self.length - FIRST_DATA) // NEXT_DATA))
+        if any(index not in self.parts for index in range(needed)):
+            return None
+        return b"".join(self.parts[i] for i in range(needed))[: self.length]
+
+
+class Reassembler:
+    """Puts fast packets together, per source, PGN and sequence number, frames in any order.
+
+    A frame whose index is already there starts the packet anew.  A packet not complete after 750 ms is
+    dropped, and at most 64 are open; ``lost`` counts the dropped ones.
+    """
+
+    def __init__(self) -> None:
+        self._open: dict[tuple[int, int], _Assembly] = {}
+        self.lost = 0
+
+    def add(self, key: int, data: bytes, now_ns: int) -> bytes | None:
+        """Takes one frame; the payload when it completes a packet.  FrameRefused for an impossible frame."""
+        if len(data) < 2:
+            raise FrameRefused(Refusal.LENGTH, f"fast packet frame of PGN {split_id(key).pgn}")
+        index, slot = data[0] & 0x1F, (key & 0x03FF_FFFF, data[0] >> 5)
+        assembly = self._open.get(slot)
+        if assembly is not None and (index in assembly.parts or now_ns - assembly.started_ns > FAST_PACKET_AGE_NS):
+            del self._open[slot]
+            self.lost += 1
+            assembly = None
+        if assembly is None:
+            if len(self._open) >= MAX_OPEN:
+                self._drop_oldest()
+            assembly = self._open[slot] = _Assembly(now_ns)
+        if index == 0:
+            if data[1] > MAX_FAST_PACKET:
+                del self._open[slot]
+                raise FrameRefused(Refusal.LENGTH, f"fast packet of PGN {split_id(key).pgn}")
+            assembly.length = data[1]
+        assembly.parts[index] = data[2:8] if index == 0 else data[1:8]
+        payload = assembly.payload()
+        if payload is None:
+            return None
+        del self._open[slot]
+        if len(payload) != assembly.length:
+            raise FrameRefused(Refusal.LENGTH, f"fast packet of PGN {split_id(key).pgn}")
+        return payload
+
+    def _drop_oldest(self) -> None:
+        del self._open[min(self._open, key=lambda slot: self._open[slot].started_ns)]
+        self.lost += 1
+
+
+def fast_packet(payload: bytes, sequence: int) -> Iterator[bytes]:
+    """The frames of a fast packet, filled up with ones; ``sequence`` 0 to 7 tells packets of one PGN
+    apart."""
+    if len(payload) > MAX_FAST_PACKET:
+        raise ValueError(f"a fast packet carries at most {MAX_FAST_PACKET} bytes, not {len(payload)}")
+    head = (sequence & 7) << 5
+    yield (bytes((head, len(payload))) + payload[:FIRST_DATA]).ljust(8, b"\xff")
+    for index, start in enumerate(range(FIRST_DATA, len(payload), NEXT_DATA), 1):
+        yield (bytes((head | index,)) + payload[start : start + NEXT_DATA]).ljust(8, b"\xff")
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One decoded PGN: where it came from, its codec, and the values in signal order (None: not
+    available)."""
+
+    identifier: Identifier
+    codec: MessageCodec
+    values: Values
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The available values by name."""
+        return self.codec.named(self.values)
+
+
+class Receiver:
+    """Decodes the PGNs of a database from the frames of a bus, fast packets included."""
+
+    def __init__(self, database: Database | None = None) -> None:
+        self.database = database or load("gnss")
+        self.reassembler = Reassembler()
+
+    def receive(self, key: int, data: bytes, now_ns: int) -> Reading | None:
+        """A reading when this frame is or completes one, else None; FrameRefused when it must not be used."""
+        if not key & EXTENDED or key & (ERROR | REMOTE):
+            return None
+        codec = self.database.find(key)
+        if codec is None:
+            return None
+        payload: bytes | None = data
+        if codec.length > 8:
+            payload = self.reassembler.add(key, data, now_ns)
+            if payload is None:
+                return None
+        return Reading(split_id(key), codec, decode(codec, payload or b""))
+
+
+def decode(codec: MessageCodec, payload: bytes) -> Values:
+    """Checked values of a PGN; a fast packet may go on behind the described part (repeated groups, later
+    fields)."""
+    return codec.receive(payload[: codec.length] if codec.length > 8 else payload)
+
+
+def encode(codec: MessageCodec, **fields: Any) -> bytes:
+    """The payload of a PGN; fields not given are "not available".  EncodeRefused for a bad value."""
+    unknown = fields.keys() - codec.index.keys()
+    if unknown:
+        raise EncodeRefused(f"{codec.name} has no field {', '.join(sorted(unknown))}")
+    return codec.encode(*(fields.get(s.name) for s in codec.signals))
+
+
+def frames(codec: MessageCodec, payload: bytes, source: int, sequence: int = 0) -> list[tuple[int, bytes]]:
+    """The frames that carry a payload: one, or those of a fast packet; the priority is that of the
+    database."""
+    if not codec.by_pgn:
+        raise DbcError(f"{codec.name} is not matched by PGN; it has no source address to choose")
+    key = codec.key & ~0xFF | source
+    if codec.length <= 8:
+        return [(key, payload)]
+    return [(key, data) for data in fast_packet(payload, sequence)]

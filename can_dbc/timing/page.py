@@ -1,0 +1,202 @@
+"""The controller's timing in shared memory: written once a second, read by console, recorder and tools at any time.
+
+A file in a memory file system, mapped by the writer: ``magic u32 | version u32 | sequence u64 | bytes of facts u64``,
+then the facts as JSON (`Facts`), then one block of bins per name in `STAGES`.  The sequence is odd while the writer
+writes; a reader copies the page and takes the copy only when the sequence was even and is still the same.  Nothing
+here blocks the writer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+import struct
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from can_dbc.timing.durations import BINS, Durations
+
+STAGES: Final = (
+    "wake", "sync", "tick", "cpu", "read", "decode", "estimate", "supervise", "law", "encode", "send", "tell",
+    "sample_to_command",
+)  # fmt: skip
+"""Lateness of the tick and of SYNC; the tick by the clock and by its own CPU time; its stages in their order ("tell" is
+all that nobody waits for: reports, record, this page); from the encoders' sample to the valve command that uses it."""
+_MAGIC: Final = 0x504D4854  # "THMP"
+_VERSION: Final = 1
+_HEAD: Final = struct.Struct("<IIQQ")
+_SEQUENCE: Final = struct.Struct("<Q")
+_SEQUENCE_AT: Final = 8
+_FACTS_BYTES: Final = 16 << 10
+_BLOCK: Final = 8 * BINS
+_SIZE: Final = _HEAD.size + _FACTS_BYTES + _BLOCK * len(STAGES)
+_TRIES: Final = 50
+
+
+class TimingRefused(Exception):
+    """There is no page, or not one that can be read; one sentence with what to do."""
+
+
+class BusCounters(msgspec.Struct, frozen=True):
+    """One bus of the controller: state as `can_dbc.bus.base.BusState` names it, counts since it was opened."""
+
+    name: str
+    state: str
+    received: int
+    sent: int
+    refused: int
+    dropped: int
+    error_frames: int
+    recoveries: int
+
+
+class ProcessCounters(msgspec.Struct, frozen=True):
+    """What the system counts of the process (getrusage(2)), and its memory."""
+
+    cpu_ns: int
+    minor_faults: int
+    major_faults: int
+    voluntary_switches: int
+    involuntary_switches: int
+    gc_runs: int
+    allocated_blocks: int
+    resident_kb: int
+
+
+class InputAge(msgspec.Struct):
+    """How old an input was when a tick used it: the last time, and at worst; ``count`` times in all."""
+
+    newest_ns: int = 0
+    longest_ns: int = 0
+    count: int = 0
+
+
+class Facts(msgspec.Struct, frozen=True):
+    """Everything but the histograms; times on CLOCK_MONOTONIC.  ``missed`` are skipped periods, ``late`` are ticks
+    that began more than two periods late.
+    """
+
+    pid: int
+    started_ns: int
+    written_ns: int
+    period_ns: int
+    ticks: int
+    missed: int
+    late: int
+    mode: str
+    words: str
+    buses: tuple[BusCounters, ...]
+    process: ProcessCounters
+    inputs: Mapping[str, InputAge]
+    longest_ns: tuple[int, ...]
+    total_ns: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """A copy of the page: ``facts``, and the histograms by the names in `STAGES`."""
+
+    facts: Facts
+    durations: Mapping[str, Durations]
+
+    @property
+    def age_ns(self) -> int:
+        """How long ago it was written."""
+        return time.monotonic_ns() - self.facts.written_ns
+
+    def named(self) -> dict[str, Any]:
+        """The whole page as plain values for JSON: the facts, and of each histogram the summary."""
+        facts: dict[str, Any] = msgspec.to_builtins(self.facts)
+        for name in ("longest_ns", "total_ns"):  # they belong to the bins
+            del facts[name]
+        return facts | {"durations": {name: found.summary() for name, found in self.durations.items()}}
+
+
+def default_path() -> Path:
+    """Where the page lies: in ``RUNTIME_DIRECTORY`` (set by systemd), else in this user's directory in /dev/shm."""
+    runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    return Path(runtime or f"/dev/shm/timberhand-{os.getuid()}") / "controller.timing"
+
+
+class TimingWriter:
+    """Owns the page at ``path``; raises OSError when it cannot be made.  Readable by everyone: it holds no secret."""
+
+    __slots__ = ("_inode", "_map", "_path", "_sequence")
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+        # A new file each time: a reader of a former life's page keeps what it has mapped.
+        with contextlib.suppress(FileNotFoundError):
+            path.unlink()
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        try:
+            os.fchmod(descriptor, 0o644)  # whatever the umask
+            os.posix_fallocate(descriptor, 0, _SIZE)  # no fault, and no full file system, at the first write
+            self._map = mmap.mmap(descriptor, _SIZE)
+            self._inode = os.fstat(descriptor).st_ino
+        finally:
+            os.close(descriptor)
+        self._path = path
+        self._sequence = 0
+        _HEAD.pack_into(self._map, 0, _MAGIC, _VERSION, 0, 0)
+
+    def publish(self, facts: Facts, durations: Mapping[str, Durations]) -> None:
+        """Writes one state of everything."""
+        text = msgspec.json.encode(facts)
+        page, size = self._map, len(text)
+        if size > _FACTS_BYTES:
+            return  # a page that says less than before is worse than an old one
+        _SEQUENCE.pack_into(page, _SEQUENCE_AT, self._sequence + 1)
+        _HEAD.pack_into(page, 0, _MAGIC, _VERSION, self._sequence + 1, size)
+        page[_HEAD.size : _HEAD.size + size] = text
+        at = _HEAD.size + _FACTS_BYTES
+        for name in STAGES:
+            page[at : at + _BLOCK] = memoryview(durations[name].bins).cast("B")
+            at += _BLOCK
+        self._sequence += 2
+        _SEQUENCE.pack_into(page, _SEQUENCE_AT, self._sequence)
+
+    def close(self) -> None:
+        """Takes the page away, unless it is another's by now; closing twice is fine."""
+        with contextlib.suppress(OSError):
+            if self._path.stat().st_ino == self._inode:
+                self._path.unlink()
+        self._map.close()
+
+
+def read_timing(path: Path | None = None) -> Timing:
+    """A copy of the page at ``path`` (default: `default_path`); raises TimingRefused."""
+    path = path or default_path()
+    try:
+        with path.open("rb", buffering=0) as file:
+            for _ in range(_TRIES):
+                data = os.pread(file.fileno(), _SIZE, 0)
+                again = os.pread(file.fileno(), _SEQUENCE.size, _SEQUENCE_AT)
+                if len(data) == _SIZE and again == data[_SEQUENCE_AT : _SEQUENCE_AT + _SEQUENCE.size]:
+                    magic, version, sequence, size = _HEAD.unpack_from(data)
+                    if (magic, version) != (_MAGIC, _VERSION):
+                        raise TimingRefused(f"{path} is no timing page of this release; look with the same release.")
+                    if sequence and not sequence & 1:
+                        return _timing(data, size)
+                time.sleep(0.002)
+    except (OSError, msgspec.MsgspecError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise TimingRefused(f"No controller tells its timing at {path} ({reason}); start it, or name its page.") from (
+            error
+        )
+    raise TimingRefused(f"The controller has not written its timing to {path} yet; look again in a second.")
+
+
+def _timing(data: bytes, size: int) -> Timing:
+    facts = msgspec.json.decode(data[_HEAD.size : _HEAD.size + size], type=Facts)
+    durations, at = {}, _HEAD.size + _FACTS_BYTES
+    for name, longest_ns, total_ns in zip(STAGES, facts.longest_ns, facts.total_ns, strict=True):
+        durations[name] = Durations(data[at : at + _BLOCK], longest_ns, total_ns)
+        at += _BLOCK
+    return Timing(facts, durations)

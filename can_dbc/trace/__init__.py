@@ -1,0 +1,1 @@
+"""CAN traces for people: text traces in, decoded frames out."""

@@ -1,0 +1,150 @@
+"""From recorded frames to named values: the core of ``timberhand log decode``.
+
+Every record of ``logread`` goes in; an ``Entry`` comes out for each message that a database knows.  Nothing
+raises for what a log contains: a frame of wrong length, out of range or with a bad CRC is an entry with
+``fault`` set.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from can_dbc.dbc.codec import Database, FrameRefused, MessageCodec, load
+from can_dbc.frame import ERROR, REMOTE, Frame, describe
+from can_dbc.protocols.e2e import frame_crc
+from can_dbc.protocols.nmea2000 import Reassembler
+from can_dbc.trace.candump import Broken
+
+SHOWN: Final = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One decoded message: stamp of its last frame [ns], identifier as candump writes it, values by name."""
+
+    stamp_ns: int
+    identifier: str
+    name: str
+    values: dict[str, Any]
+    labels: dict[str, str]
+    units: dict[str, str]
+    fault: str
+
+    def text(self) -> str:
+        """The values in one line: ``Name=value unit``, labels where the database has them."""
+        parts = []
+        for name, value in self.values.items():
+            shown = self.labels.get(name) or (f"{value:.10g}" if isinstance(value, float) else str(value))
+            unit = "" if name in self.labels else self.units.get(name, "")
+            parts.append(f"{name}={shown} {unit}".rstrip())
+        return "  ".join(parts)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON; a float that is not finite becomes null."""
+        finite = {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in self.values.items()
+        }
+        entry = {
+            "time_ns": self.stamp_ns,
+            "id": self.identifier,
+            "name": self.name,
+            "values": finite,
+            "labels": self.labels,
+        }
+        return entry | {"fault": self.fault} if self.fault else entry
+
+
+class Decoder:
+    """Decodes frames with the first of the databases that knows them; raises DbcError for an unusable
+    file."""
+
+    def __init__(self, files: Sequence[str]) -> None:
+        self.databases: list[Database] = [load(file) for file in files]
+        self.reassembler = Reassembler()
+        self.counts: Counter[str] = Counter()
+        self.messages: Counter[str] = Counter()
+        self.broken_examples: list[str] = []
+
+    def run(self, records: Iterable[Frame | Broken]) -> Iterator[Entry]:
+        """The entries of a log, counting as it goes; ``summary`` is complete at the end."""
+        for record in records:
+            if isinstance(record, Broken):
+                self.counts["broken"] += 1
+                if len(self.broken_examples) < SHOWN:
+                    self.broken_examples.append(f"line {record.line}: {record.text[:80]}")
+                continue
+            self.counts["frames"] += 1
+            entry = self._frame(record)
+            if entry is not None:
+                self.counts["decoded"] += 1
+                self.messages[entry.name] += 1
+                yield entry
+
+    def summary(self) -> dict[str, Any]:
+        """Counts of what was read, by kind and by message."""
+        names = ("frames", "decoded", "unknown", "refused", "bad_crc", "error_frames", "broken")
+        return {name: self.counts[name] for name in names} | {
+            "lost_fast_packets": self.reassembler.lost,
+            "messages": dict(sorted(self.messages.items())),
+            "broken_examples": self.broken_examples,
+        }
+
+    def _frame(self, frame: Frame) -> Entry | None:
+        if frame.key & (ERROR | REMOTE):
+            self.counts["error_frames" if frame.key & ERROR else "unknown"] += 1
+            return None
+        codec = next((c for d in self.databases if (c := d.find(frame.key)) is not None), None)
+        if codec is None:
+            self.counts["unknown"] += 1
+            return None
+        try:
+            data = self._payload(frame, codec)
+        except FrameRefused as refusal:
+            self.counts["refused"] += 1
+            return _entry(frame, codec, {}, str(refusal))
+        if data is None:
+            return None
+        fault = ""
+        try:
+            values = codec.named(codec.receive(data))
+        except FrameRefused as refusal:
+            self.counts["refused"] += 1
+            values, fault = self._anyway(codec, data), str(refusal)
+        if not fault and codec.data_ids and frame_crc(data, codec.data_ids) != data[0]:
+            self.counts["bad_crc"] += 1
+            fault = "bad CRC"
+        return _entry(frame, codec, values, fault)
+
+    def _payload(self, frame: Frame, codec: MessageCodec) -> bytes | None:
+        """The bytes to decode; None while a fast packet is incomplete."""
+        if not codec.by_pgn or codec.length <= 8:
+            return frame.data
+        data = self.reassembler.add(frame.key, frame.data, frame.stamp_ns)
+        return None if data is None else data[: codec.length]
+
+    @staticmethod
+    def _anyway(codec: MessageCodec, data: bytes) -> dict[str, Any]:
+        """What a refused frame says, as far as it can be read."""
+        try:
+            return codec.named(codec.decode(data))
+        except FrameRefused:
+            return {}
+
+
+def _entry(frame: Frame, codec: MessageCodec, values: dict[str, Any], fault: str) -> Entry:
+    labels, units = {}, {}
+    values = {name: value for name, value in values.items() if not name.startswith("Reserved")}
+    for s in codec.signals:
+        value = values.get(s.name)
+        if value is not None and math.isfinite(value):
+            label = s.choices.get(int(s.convert(value)))
+            if label is not None:
+                labels[s.name] = label
+        if s.unit not in ("", "1"):
+            units[s.name] = s.unit
+    return Entry(frame.stamp_ns, describe(frame.key), codec.name, values, labels, units, fault)

@@ -1,0 +1,1 @@
+"""Geometry of crane, column, grapple, carrier and cameras."""

@@ -1,0 +1,88 @@
+"""Geometry of the hanging grapple: yaw, rotator and tongs.
+
+Angles in the base frame, rad, counter-clockwise seen from above.  The grapple hangs straight down; with the
+rotator at 0 its tongs open across the reach: along base x on ``palms_471``, whose reach is +y at slew 0, so a log
+held then lies along y.  The carrier's x axis is that opening axis and turns with ``slew + rot``.  The **grapple yaw**
+is the direction of the opening axis; a log whose axis points to ``psi`` is gripped with yaw ``psi + pi/2``.  Log and
+grapple are symmetric, so a yaw counts modulo pi.  Tong angle 0 is fully open, the last value of the profile's table
+is closed without a load.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from math import ceil, degrees, floor, pi
+
+from machine.geometry.kinematics import Unreachable
+from machine.joints import Joint
+from machine.profile import Kinematics, Profile, TongTable, joint
+
+
+def grapple_yaw(profile: Profile, q: Sequence[float]) -> float:
+    """Direction of the opening axis, rad, not wrapped; ``q`` is indexed by ``Joint``."""
+    return q[Joint.SLEW] + q[Joint.ROT] + _across(profile.kinematics)
+
+
+def rotator_for_yaw(profile: Profile, slew: float, yaw: float, near: float = 0.0) -> float:
+    """Rotator angle within its limits that gives ``yaw`` modulo pi at this slew, the one nearest to ``near``.
+
+    Raises ``Unreachable`` when the rotator turns less than pi and none fits.
+    """
+    spec = joint(profile, Joint.ROT)
+    turn = yaw - slew - _across(profile.kinematics)
+    first, last = ceil((spec.lower - turn) / pi), floor((spec.upper - turn) / pi)
+    fitting = [turn + k * pi for k in range(first, last + 1)]
+    if not fitting:
+        raise Unreachable(
+            f"grapple yaw {degrees(yaw):.1f} deg at slew {degrees(slew):.1f} deg is out of reach: "
+            f"the rotator turns only {degrees(spec.lower):.1f}..{degrees(spec.upper):.1f} deg"
+        )
+    return min(fitting, key=lambda angle: abs(angle - near))
+
+
+def _across(kin: Kinematics) -> float:
+    """Direction across the reach at slew 0, rad."""
+    return kin.theta1_offset_rad - pi / 2
+
+
+def pin_to_tong_pivot_m(kin: Kinematics) -> float:
+    """Height of the hanger pin above the tong pivots of the hanging grapple, m."""
+    return kin.hanger_to_fork_m + kin.fork_to_rotator_m + kin.rotator_to_tong_pivot_m
+
+
+def tip_below_pin_m(tongs: TongTable, tong_rad: float) -> float:
+    """Depth of the tong tips below the hanger pin, m; linear between table rows, held beyond them."""
+    return _interpolate(tongs.angle_rad, tongs.tip_below_pin_m, tong_rad)
+
+
+def half_gap_m(tongs: TongTable, tong_rad: float) -> float:
+    """Half the distance between the tips, m; negative when the tongs interleave."""
+    return _interpolate(tongs.angle_rad, tongs.half_gap_m, tong_rad)
+
+
+def lowest_tip_below_pin_m(tongs: TongTable) -> float:
+    """The greatest depth the tips sweep through while closing, m: the clearance a closing grapple needs."""
+    return max(tongs.tip_below_pin_m)
+
+
+def tong_angle_from_opening_pct(tongs: TongTable, opening_pct: float) -> float:
+    """Tong angle, rad, for the opening reported on the bus (100 = fully open, 0 = closed); out of range is
+    clipped.
+    """
+    return (1.0 - min(max(opening_pct, 0.0), 100.0) / 100.0) * tongs.angle_rad[-1]
+
+
+def opening_pct_from_tong_angle(tongs: TongTable, tong_rad: float) -> float:
+    """The inverse of ``tong_angle_from_opening_pct``."""
+    return 100.0 * (1.0 - min(max(tong_rad / tongs.angle_rad[-1], 0.0), 1.0))
+
+
+def _interpolate(xs: Sequence[float], ys: Sequence[float], x: float) -> float:
+    i = bisect_right(xs, x)
+    if i == 0:
+        return ys[0]
+    if i == len(xs):
+        return ys[-1]
+    share = (x - xs[i - 1]) / (xs[i] - xs[i - 1])
+    return ys[i - 1] + share * (ys[i] - ys[i - 1])

@@ -1,0 +1,1 @@
+"""From sensor values to physical quantities: encoder counts and the load on the lift cylinder."""

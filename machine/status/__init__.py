@@ -1,0 +1,1 @@
+"""Modes, reasons and faults: the vocabulary in which the controller reports its state."""

@@ -1,0 +1,56 @@
+"""One house style for every plot, drawn without a display; the same data give the same PNG bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib
+
+matplotlib.use("Agg")
+from matplotlib import pyplot
+
+TIMBER, OIL, STEEL, MOSS, RUST = "#9a6a38", "#1f5f8b", "#5b6670", "#4d7c4a", "#b5452c"
+STYLE: Final = {
+    "figure.dpi": 110,
+    "figure.facecolor": "white",
+    "figure.constrained_layout.use": True,
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e3e6e8",
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.3,
+    "legend.frameon": False,
+    "axes.prop_cycle": matplotlib.cycler(ls=["-", "--"]) * matplotlib.cycler(color=[OIL, TIMBER, MOSS, RUST, STEEL]),
+}
+
+
+@contextmanager
+def sheet(path: Path, columns: int = 1, width: float = 8.0, height: float = 3.2) -> Iterator[Any]:
+    """A row of axes (one Axes for a single column) that is saved to ``path`` at the end; inches."""
+    with pyplot.rc_context(STYLE):
+        figure, axes = pyplot.subplots(1, columns, figsize=(width, height))
+        try:
+            yield axes
+            path.parent.mkdir(parents=True, exist_ok=True)
+            figure.savefig(path, metadata={"Software": None})
+        finally:
+            pyplot.close(figure)
+
+
+def limit_band(axis: Any, least: float | None, most: float | None) -> None:
+    """Shade what a figure must not be, on the y axis."""
+    low, high = axis.get_ylim()
+    if least is not None:
+        axis.axhspan(min(low, least), least, color=RUST, alpha=0.08, lw=0)
+        axis.axhline(least, color=RUST, lw=0.8, ls="--")
+    if most is not None:
+        axis.axhspan(most, max(high, most), color=RUST, alpha=0.08, lw=0)
+        axis.axhline(most, color=RUST, lw=0.8, ls="--")
