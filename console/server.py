@@ -32,9 +32,10 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from autonomy.perception.log_list.observation import LogsRefused, parse_logs, question
+from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
 from can_dbc.messages.mission import MissionOrder, Order, encode_order
-from can_dbc.messages.crane import OperatorAction, OperatorCommand, encode
+from can_dbc.messages.crane import OperatorAction, OperatorCommand
+from can_dbc.messages.datagrams import encode
 from can_dbc.timing.page import TimingRefused, read_timing
 from console.guards import LOOPBACK_NAMES, Guards, content_security_policy, is_loopback
 from console.state import Watch, describe_machine
@@ -120,13 +121,13 @@ class _Logs(asyncio.DatagramProtocol):
         self._console = console
 
     def datagram_received(self, data: bytes, addr: Address) -> None:
-        with contextlib.suppress(LogsRefused):
-            self._console.watch.logs = parse_logs(data)
+        with contextlib.suppress(LogListError):
+            self._console.watch.logs = decode_logs(data)
 
 
 async def _ask_logs(transport: asyncio.DatagramTransport) -> None:
     while True:
-        transport.sendto(question(()))  # what is known already will do
+        transport.sendto(encode_request(()))  # what is known already will do
         await asyncio.sleep(ASK_LOGS_S)
 
 

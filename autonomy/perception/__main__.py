@@ -2,10 +2,10 @@
 
 ``python -m autonomy.perception --profile palms_471 --camera stick --frames 127.0.0.1:47004 --port 47003``
 
-Answers the planner's questions (``autonomy.perception.logs``) over UDP on the loopback interface: each is a look through the
+Answers the planner's questions (``autonomy.perception.log_list.observation``) over UDP on the loopback interface: each is a look through the
 camera, and as long as that has nothing new to say there is no answer.  A question without joints, as of a page that
 only shows what is known, gets the last list.  ``--frames`` is where the camera's pictures are served
-(``can_dbc.rgbd``), ``zed`` a Stereolabs camera on this computer, or the folder of a recording.
+(``can_dbc.messages.rgbd``), ``zed`` a Stereolabs camera on this computer, or the folder of a recording.
 
 JSON lines on stdout: ``ready`` with the port, ``trouble`` with its reason.  SIGTERM and SIGINT end it.
 Exit codes: 0 ended, 2 usage, 3 profile, camera or weights, 4 port.
@@ -25,14 +25,14 @@ from typing import Final
 
 import msgspec
 
-from autonomy.memory import keep_memory
 from autonomy.networks.weights import WeightsRefused
-from autonomy.perception.finder import LogFinder
-from autonomy.perception.log_detector import Eyes
-from autonomy.perception.logs import LogsRefused, answer, answer_trouble, parse_question
-from autonomy.perception.sources import CameraSource, SourceError
-from machine.load import ProfileError, load_profile
+from autonomy.perception.log_detector import LogDetector
+from autonomy.perception.log_list.datagrams import LogListError, decode_request, encode_error, encode_logs
+from autonomy.perception.segmentation.log_segmenter import LogSegmenter
+from autonomy.perception.sources.camera_source import CameraSource, SourceError
+from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile
+from runtime.allocator import keep_memory
 
 FINE, CONFIGURATION, BUSY = 0, 3, 4
 PATIENCE_S: Final = 0.5
@@ -46,7 +46,7 @@ def opened(where: str, camera: str, profile: Profile) -> CameraSource:
 
         return ZedCamera(camera)
     if os.path.isdir(where):
-        from autonomy.perception.sources.recording import Recording
+        from autonomy.perception.sources.frame_folder import Recording
 
         return Recording(Path(where))
     from autonomy.perception.sources.stream import StreamCamera
@@ -54,7 +54,7 @@ def opened(where: str, camera: str, profile: Profile) -> CameraSource:
     return StreamCamera(where, camera, PATIENCE_S)
 
 
-def serve(eyes: Eyes, link: socket.socket, ended: list[int]) -> None:
+def serve(eyes: LogDetector, link: socket.socket, ended: list[int]) -> None:
     """Answer until a signal comes."""
     told = ""
     while not ended:
@@ -62,13 +62,13 @@ def serve(eyes: Eyes, link: socket.socket, ended: list[int]) -> None:
             continue
         data, sender = link.recvfrom(2048)
         try:
-            q = parse_question(data)
-        except LogsRefused as error:
-            link.sendto(answer_trouble(str(error)), sender)
+            q = decode_request(data)
+        except LogListError as error:
+            link.sendto(encode_error(str(error)), sender)
             continue
-        logs = eyes.look(q, time.monotonic_ns()) if any(value == value for value in q) else eyes.logs
+        logs = eyes.detect(q, time.monotonic_ns()) if any(value == value for value in q) else eyes.logs
         if logs is not None:
-            link.sendto(answer(logs), sender)
+            link.sendto(encode_logs(logs), sender)
         if eyes.trouble and eyes.trouble != told:
             say(event="trouble", reason=eyes.trouble)
         told = eyes.trouble
@@ -96,7 +96,7 @@ def main(argv: list[str] | None = None) -> int:
         if options.camera not in profile.cameras:
             known = ", ".join(profile.cameras) or "none"
             return _complain(f"{profile.name} has no camera {options.camera!r}; it has: {known}")
-        finder = LogFinder(options.variant, options.weights)
+        finder = LogSegmenter(options.variant, options.weights)
         source = opened(options.frames, options.camera, profile)
     except (ProfileError, WeightsRefused, SourceError) as error:
         return _complain(str(error))
@@ -110,7 +110,7 @@ def main(argv: list[str] | None = None) -> int:
             return _complain(f"UDP port {options.port} cannot be opened ({error}); choose another one", BUSY)
         say(ready=link.getsockname()[1], camera=options.camera)
         try:
-            serve(Eyes(profile, options.camera, source, finder.segment), link, ended)
+            serve(LogDetector(profile, options.camera, source, finder.segment), link, ended)
         finally:
             source.close()
     return FINE

@@ -1,8 +1,8 @@
 """Logs on the way, by a camera of a machine that drives: they lie still in the plane while it moves.
 
 The camera's place is that of the crane's base in the plane, by the receiver, and the kinematic chain from there: the
-half that carries it, the articulation.  `Ours` fits cylinders to the network's masks and joins them over pictures;
-`PaperB` takes the depth at the middle of each mask's box (its 3.2.3), a point and no more.
+half that carries it, the articulation.  `CylinderLocalizer` fits cylinders to the network's masks and joins them over pictures;
+`PaperBLocalizer` takes the depth at the middle of each mask's box (its 3.2.3), a point and no more.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from autonomy.perception.frame import Frame, FrameRefused, Pose, rescaled
-from autonomy.perception.log_filter import NOMINAL, Errors
-from autonomy.perception.logs import LogObservation
-from autonomy.perception.mount import MountRefused, optical_pose
-from autonomy.perception.paper_a import log_of
-from autonomy.perception.paper_b import position_of
+from autonomy.perception.camera.frame import Pose, RgbdFrame, RgbdFrameError, rescaled
+from autonomy.perception.camera.mount import CameraMountError, optical_pose
+from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.papers.paper_a import log_of
+from autonomy.perception.papers.paper_b import position_of
 from autonomy.perception.pipeline import Masked, Perception
-from autonomy.perception.sources import CameraSource, SourceError
+from autonomy.perception.sources.camera_source import CameraSource, SourceError
+from autonomy.perception.tracking.log_filter import NOMINAL_ERRORS, CameraErrors
 from machine.profile import Profile
 
 FARTHEST_M: Final = 10.0
@@ -36,43 +36,43 @@ SURE: Final = 0.25
 """What the finder believes in less is no log: one within ``FARTHEST_M`` has 0.5 and more, a gap in a shadow 0.2."""
 
 
-class Found(Masked, Protocol):
+class ScoredMask(Masked, Protocol):
     """A mask, and how much it is believed in, 0..1."""
 
     @property
     def score(self) -> float: ...
 
 
-Find = Callable[[Frame], Sequence[Found]]
+Find = Callable[[RgbdFrame], Sequence[ScoredMask]]
 
 
-class Sighted(Protocol):
+class LogLocalizer(Protocol):
     """A pipeline: logs in the frame in which ``pose`` is given."""
 
-    def see(self, frame: Frame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
+    def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
         """Of one picture."""
 
 
-class Ours:
+class CylinderLocalizer:
     """`autonomy.perception.pipeline`: cylinder fits and tracks."""
 
-    def __init__(self, profile: Profile, errors: Errors = NOMINAL) -> None:
+    def __init__(self, profile: Profile, errors: CameraErrors = NOMINAL_ERRORS) -> None:
         self._perception = Perception(profile, errors)
 
-    def see(self, frame: Frame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
+    def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
         """The tracks that this picture shows; a piece at its edge is not yet a log."""
         tracks = self._perception.step(frame, pose, masks)
         fresh = [t for t in tracks if t.last_seen_ns == frame.stamp_ns]
         return [t.estimate.observation(t.id) for t in fresh if all(t.estimate.ends_seen) or t.hits >= PATIENCE]
 
 
-class PaperB:
-    """`autonomy.perception.paper_b`, with half a diameter added along the line of sight, for the grapple needs the
+class PaperBLocalizer:
+    """`autonomy.perception.papers.paper_b`, with half a diameter added along the line of sight, for the grapple needs the
     log's middle and the paper does not say how it came from the surface; nor does it say how the grapple was turned:
     the axis is that of the mask's points, as in paper A.
     """
 
-    def see(self, frame: Frame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
+    def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
         """A log for every box whose middle has a depth."""
         found = []
         for number, one in enumerate(masks):
@@ -99,18 +99,18 @@ _SIGMAS: Final = (0.10, 0.10, 0.6, 0.6, 0.2, 0.2, 0.05)
 _PLAIN: Final = tuple(np.diag(np.square(_SIGMAS))[np.triu_indices(len(_SIGMAS))].tolist())
 
 
-class FrontEyes:
+class DrivingLogDetector:
     """One camera of a machine that drives.  ``trouble`` says why the last look saw nothing, empty when it did.
 
     ``find`` gives the masks of the logs in a frame.  Raises KeyError when the machine has no such camera.
     """
 
-    def __init__(self, profile: Profile, camera: str, source: CameraSource, find: Find, sight: Sighted) -> None:
+    def __init__(self, profile: Profile, camera: str, source: CameraSource, find: Find, sight: LogLocalizer) -> None:
         self.trouble = ""
         self._profile, self._camera = profile, profile.cameras[camera]
         self._source, self._find, self._sight = source, find, sight
 
-    def look(self, base: Pose, q: Sequence[float], articulation_rad: float) -> tuple[LogObservation, ...] | None:
+    def detect(self, base: Pose, q: Sequence[float], articulation_rad: float) -> tuple[LogObservation, ...] | None:
         """The logs of a new picture in the crane's base frame; None when there is none.
 
         ``base`` is that frame in the plane, ``q`` the joints in ``Joint`` order [rad, m], both when the picture is
@@ -125,8 +125,8 @@ class FrontEyes:
                 return None
             frame = rescaled(frame, self._camera.depth_scale)
             pose = Pose(base.to_base(mount.position_m), base.rotation @ mount.rotation)
-            seen = self._sight.see(frame, pose, [one for one in self._find(frame) if one.score >= SURE])
-        except (SourceError, FrameRefused, MountRefused) as error:
+            seen = self._sight.localize(frame, pose, [one for one in self._find(frame) if one.score >= SURE])
+        except (SourceError, RgbdFrameError, CameraMountError) as error:
             self.trouble = str(error)
             return None
         near = [o for o in seen if np.linalg.norm(np.asarray(o.center_m) - pose.position_m) < FARTHEST_M]

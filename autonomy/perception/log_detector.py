@@ -1,6 +1,6 @@
 """What lies there, by a camera of the machine: asked with the joints, answered with the logs.
 
-``Eyes.look`` takes a picture and measures it, but only while the crane rests: a picture from a moving stick is of no
+``LogDetector.detect`` takes a picture and measures it, but only while the crane rests: a picture from a moving stick is of no
 known pose.  Whoever asks gets nothing new meanwhile, and asks again.
 """
 
@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.perception.frame import Frame, FrameRefused, rescaled
-from autonomy.perception.logs import LogObservation
-from autonomy.perception.mount import MountRefused, optical_pose
+from autonomy.perception.camera.frame import RgbdFrame, RgbdFrameError, rescaled
+from autonomy.perception.camera.mount import CameraMountError, optical_pose
+from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.pipeline import Masked, Perception
-from autonomy.perception.sources import CameraSource, SourceError
+from autonomy.perception.sources.camera_source import CameraSource, SourceError
 from machine.joints import N_JOINTS
 from machine.profile import Profile
 
@@ -25,14 +25,14 @@ FAMILIAR_NS: Final = 1_000_000_000
 """After a longer silence nobody knows whether the crane has moved meanwhile."""
 
 
-class Eyes:
+class LogDetector:
     """One camera of a machine.  ``trouble`` says why the last look saw nothing, empty when it did.
 
     ``find`` gives the masks of the logs in a frame.  Raises KeyError when the machine has no such camera.
     """
 
     def __init__(
-        self, profile: Profile, camera: str, source: CameraSource, find: Callable[[Frame], Sequence[Masked]]
+        self, profile: Profile, camera: str, source: CameraSource, find: Callable[[RgbdFrame], Sequence[Masked]]
     ) -> None:
         self.trouble = ""
         self.logs: tuple[LogObservation, ...] = ()
@@ -43,7 +43,7 @@ class Eyes:
         self._before = np.full(N_JOINTS, np.nan)
         self._asked_ns = 0
 
-    def look(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
+    def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
         """The logs in the base frame, by a picture that is newer than the question; None when there is nothing new.
 
         ``q`` are the joints in ``Joint`` order [rad, m] at ``now_ns``, NaN where there is no encoder.
@@ -66,7 +66,7 @@ class Eyes:
                 return None
             frame = rescaled(frame, self._camera.depth_scale)
             tracks = self._perception.step(frame, pose, self._find(frame))
-        except (SourceError, FrameRefused, MountRefused) as error:
+        except (SourceError, RgbdFrameError, CameraMountError) as error:
             self.trouble = str(error)
             return None
         self.trouble = ""

@@ -10,15 +10,15 @@ from typing import Final, Protocol
 import numpy as np
 from scipy.ndimage import label
 
-from autonomy.perception.contour import Outline, Sensor, own_outline
-from autonomy.perception.cylinder import Cylinder, guess
-from autonomy.perception.cylinder_fit import Fit, refine
-from autonomy.perception.frame import Frame, FrameRefused, Pose, check, inside_bars
-from autonomy.perception.log_filter import NOMINAL, Errors, Track
-from autonomy.perception.merge import LONGEST_M, groups, joined, refused
-from autonomy.perception.moved import has_moved
-from autonomy.perception.tracks import Tracks
-from machine.optics import Intrinsics
+from autonomy.perception.camera.frame import Pose, RgbdFrame, RgbdFrameError, check, content_window
+from autonomy.perception.fitting.contour import Contour, StereoSensor, log_contour
+from autonomy.perception.fitting.cylinder import Cylinder, initial_cylinder
+from autonomy.perception.fitting.cylinder_fit import CylinderFit, fit_cylinder
+from autonomy.perception.fitting.log_fragments import LONGEST_M, groups, joined, refused
+from autonomy.perception.tracking.displacement import is_displaced
+from autonomy.perception.tracking.log_filter import NOMINAL_ERRORS, CameraErrors, Track
+from autonomy.perception.tracking.log_tracker import LogTracker
+from machine.geometry.optics import Intrinsics
 from machine.profile import Profile
 
 MARGIN_PX: Final = 8  # of the window that is cut out around a mask
@@ -46,35 +46,35 @@ class Refusal:
 class Perception:
     """Logs from the frames of a machine's cameras."""
 
-    def __init__(self, profile: Profile, errors: Errors = NOMINAL) -> None:
+    def __init__(self, profile: Profile, errors: CameraErrors = NOMINAL_ERRORS) -> None:
         self._sensors = {
-            name: Sensor(camera.fx_px * camera.baseline_m, SIGMA_D_PX) for name, camera in profile.cameras.items()
+            name: StereoSensor(camera.fx_px * camera.baseline_m, SIGMA_D_PX) for name, camera in profile.cameras.items()
         }
-        self._tracks = Tracks(errors)
+        self._tracks = LogTracker(errors)
         self.refusals: tuple[Refusal, ...] = ()
         """Of the last step."""
 
-    def step(self, frame: Frame, pose: Pose, instances: Sequence[Masked]) -> tuple[Track, ...]:
+    def step(self, frame: RgbdFrame, pose: Pose, instances: Sequence[Masked]) -> tuple[Track, ...]:
         """The logs believed in after ``frame``, taken at ``pose``: in the frame in which the poses are given.
 
         Raises:
             FrameRefused: the frame is none, or from a camera that the profile does not know.
         """
         fits = [fit for fit in self.fits(frame, instances) if abs(fit.body.axis @ pose.rotation[2]) < STEEPEST]
-        return self._tracks.step(fits, pose, frame.stamp_ns, partial(has_moved, frame, pose))
+        return self._tracks.step(fits, pose, frame.stamp_ns, partial(is_displaced, frame, pose))
 
-    def fits(self, frame: Frame, instances: Sequence[Masked]) -> list[Fit]:
+    def fits(self, frame: RgbdFrame, instances: Sequence[Masked]) -> list[CylinderFit]:
         """The logs of one frame alone, in its optical frame; what was refused is in ``refusals``."""
         check(frame)
         if frame.camera not in self._sensors:
             known = ", ".join(self._sensors) or "none"
-            raise FrameRefused(f"frame of camera {frame.camera!r}, which the machine does not have; it has: {known}")
+            raise RgbdFrameError(f"frame of camera {frame.camera!r}, which the machine does not have; it has: {known}")
         found, why = measure(frame, [i.mask for i in instances], self._sensors[frame.camera])
         self.refusals = tuple(why)
         return found
 
 
-def measure(frame: Frame, masks: Sequence[np.ndarray], sensor: Sensor) -> tuple[list[Fit], list[Refusal]]:
+def measure(frame: RgbdFrame, masks: Sequence[np.ndarray], sensor: StereoSensor) -> tuple[list[CylinderFit], list[Refusal]]:
     """Fits of all masks, pieces of one log joined, and what was refused."""
     scene = _Scene.of(frame, masks, sensor)
     firsts = {i: scene.first(i) for i in range(len(masks))}
@@ -84,7 +84,7 @@ def measure(frame: Frame, masks: Sequence[np.ndarray], sensor: Sensor) -> tuple[
         firsts |= {i: scene.first(i) for i in stray}
     known = {i: body for i, body in firsts.items() if body is not None}
     borders = {i: scene.border([i], body, known) for i, body in known.items()}
-    fits: list[Fit | None] = [None] * len(masks)
+    fits: list[CylinderFit | None] = [None] * len(masks)
     # What shows most first: it hides others, and is hidden least.
     for i in sorted(known, key=lambda i: -scene.areas[i]):
         fits[i] = scene.fit([i], known[i], borders[i], fits)
@@ -115,20 +115,20 @@ def _main_part(mask: np.ndarray) -> np.ndarray:
 class _Scene:
     """A frame with numbered masks and the window in which it shows anything."""
 
-    frame: Frame
+    frame: RgbdFrame
     labels: np.ndarray
     areas: tuple[int, ...]
     boxes: tuple[tuple[int, int, int, int], ...]
     window: tuple[int, int, int, int]
-    sensor: Sensor
+    sensor: StereoSensor
 
     @classmethod
-    def of(cls, frame: Frame, masks: Sequence[np.ndarray], sensor: Sensor) -> _Scene:
+    def of(cls, frame: RgbdFrame, masks: Sequence[np.ndarray], sensor: StereoSensor) -> _Scene:
         labels, areas, boxes = np.zeros(frame.depth_m.shape, np.int16), [], []
-        top, bottom, left, right = inside_bars(frame.rgb)
+        top, bottom, left, right = content_window(frame.rgb)
         for i, mask in enumerate(masks):
             if mask.shape != labels.shape or mask.dtype != bool:
-                raise FrameRefused(
+                raise RgbdFrameError(
                     f"mask {i} is {mask.dtype} of shape {mask.shape}, not bool of the frame's {labels.shape}"
                 )
             rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
@@ -157,21 +157,21 @@ class _Scene:
     def first(self, i: int) -> Cylinder | None:
         """The first guess of mask ``i``."""
         mask, depth_m, _, pin, _ = self._part([i])
-        return guess(mask, depth_m, pin, 3.0 * self.sensor.sigma_d_px / self.sensor.fb_px_m)
+        return initial_cylinder(mask, depth_m, pin, 3.0 * self.sensor.sigma_d_px / self.sensor.fb_px_m)
 
-    def border(self, group: list[int], first: Cylinder, known: dict[int, Cylinder]) -> Outline:
+    def border(self, group: list[int], first: Cylinder, known: dict[int, Cylinder]) -> Contour:
         """The border of one or several masks as one log, by guesses."""
         mask, depth_m, labels, pin, (left, top) = self._part(group)
         seen = self.window
         window = (seen[0] - left, seen[1] - top, seen[2] - left, seen[3] - top)
         others = {i + 1: body for i, body in known.items() if i not in group}
-        return own_outline(mask, depth_m, pin, first, self.sensor, window, labels, others)
+        return log_contour(mask, depth_m, pin, first, self.sensor, window, labels, others)
 
-    def fit(self, group: list[int], first: Cylinder, border: Outline, fits: list[Fit | None]) -> Fit | None:
+    def fit(self, group: list[int], first: Cylinder, border: Contour, fits: list[CylinderFit | None]) -> CylinderFit | None:
         """The fit of one or several masks as one log; ``fits`` are those of all masks so far."""
         mask, depth_m, _, pin, _ = self._part(group)
         fitted = {i + 1: fit.body for i, fit in enumerate(fits) if fit is not None and i not in group}
-        return refine(mask, depth_m, pin, first, border.without(fitted, pin), self.sensor)
+        return fit_cylinder(mask, depth_m, pin, first, border.without(fitted, pin), self.sensor)
 
     def _part(self, group: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, Intrinsics, tuple[int, int]]:
         """Mask, depth, numbers of all masks, pinhole and corner of a group's part of the picture."""

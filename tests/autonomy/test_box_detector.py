@@ -9,10 +9,10 @@ from rich.console import Console
 from autonomy.networks.graph import parameter_count
 from autonomy.networks.torch_net import random_net
 from autonomy.networks.weights import WeightsRefused, save
-from autonomy.perception.detector import SIZE_PX, BoxFinder, box_net, decoded
+from autonomy.perception.papers.box_detector import SIZE_PX, BoxDetector, box_net, decoded
 from training.detection import boxes
 from training.detection.boxes import run, targets
-from training.loop import Schedule
+from training.common.loop import Schedule
 
 LOGS = (((60.0, 70.0), 0.4, 80, 14), ((140.0, 120.0), 1.2, 100, 16))
 
@@ -53,13 +53,13 @@ def test_nothing_is_found_in_nothing():
 def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
     path = tmp_path / "boxes.safetensors"
     save(path, box_net(), random_net(box_net(), 1).arrays(), {})
-    finder = BoxFinder(path)
+    finder = BoxDetector(path)
     with pytest.raises(ValueError, match="608 x 608"):
-        finder.boxes(np.zeros((304, 304, 3), np.uint8))
-    found, _ = finder.boxes(np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8))
+        finder.detect(np.zeros((304, 304, 3), np.uint8))
+    found, _ = finder.detect(np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8))
     assert found.shape[1] == 4
     with pytest.raises(WeightsRefused):
-        BoxFinder(tmp_path / "none.safetensors")
+        BoxDetector(tmp_path / "none.safetensors")
     assert parameter_count(box_net()) < 500_000
 
 

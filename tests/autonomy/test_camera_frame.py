@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.perception.estimate import END, START, LogEstimate, across
-from autonomy.perception.frame import Frame, FrameRefused, Pose, check, rescaled
-from machine.optics import Intrinsics, rpy_matrix
+from autonomy.perception.log_list.estimate import END, START, LogEstimate, across
+from autonomy.perception.camera.frame import RgbdFrame, RgbdFrameError, Pose, check, rescaled
+from machine.geometry.optics import Intrinsics, rpy_matrix
 
 PIN = Intrinsics(64, 48, 40.0, 40.0, 31.5, 23.5)
-GOOD = Frame("front", 1, np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 3.0, np.float32), PIN)
+GOOD = RgbdFrame("front", 1, np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 3.0, np.float32), PIN)
 
 
 def test_a_good_frame_passes_and_its_depth_can_be_rescaled() -> None:
@@ -38,7 +38,7 @@ def test_a_good_frame_passes_and_its_depth_can_be_rescaled() -> None:
     ],
 )
 def test_what_cannot_be_a_frame_is_refused_with_a_sentence(change: dict, words: str) -> None:
-    with pytest.raises(FrameRefused, match=words):
+    with pytest.raises(RgbdFrameError, match=words):
         check(replace(GOOD, **change))
 
 

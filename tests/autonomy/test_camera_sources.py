@@ -11,22 +11,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from autonomy.perception.frame import Frame
-from autonomy.perception.sources import SourceError
-from autonomy.perception.sources.recording import INDEX, Recorder, Recording
+from autonomy.perception.camera.frame import RgbdFrame
+from autonomy.perception.sources.camera_source import SourceError
+from autonomy.perception.sources.frame_folder import INDEX, Recorder, Recording
 from autonomy.perception.sources.stream import StreamCamera
 from autonomy.perception.sources.zed import ZedCamera
-from can_dbc.rgbd import QUESTION, RgbdFrame, encode, encode_refusal, question_bytes
-from machine.optics import Intrinsics
+from can_dbc.messages.rgbd import QUESTION, RgbdMessage, encode, encode_refusal, question_bytes
+from machine.geometry.optics import Intrinsics
 
 PIN = Intrinsics(8, 6, 10.0, 10.0, 3.5, 2.5)
 
 
-def picture(stamp_ns: int) -> Frame:
+def picture(stamp_ns: int) -> RgbdFrame:
     rng = np.random.default_rng(stamp_ns)
     depth_m = rng.uniform(0.5, 20.0, (6, 8)).astype(np.float32)
     depth_m[0, :3] = np.nan
-    return Frame("front", stamp_ns, rng.integers(0, 256, (6, 8, 3), np.uint8), depth_m, PIN)
+    return RgbdFrame("front", stamp_ns, rng.integers(0, 256, (6, 8, 3), np.uint8), depth_m, PIN)
 
 
 @pytest.mark.parametrize(("depth", "error_m"), [("png", 5.1e-4), ("npy", 0.0)])
@@ -182,7 +182,7 @@ class Server:
 
 def wire(stamp_ns: int) -> bytes:
     depth = np.array([[0, 1500], [65535, 2]], "<u2")
-    return encode(RgbdFrame("front", stamp_ns, 2, 2, 3.0, 3.0, 0.5, 0.5, bytes(range(12)), depth.tobytes()))
+    return encode(RgbdMessage("front", stamp_ns, 2, 2, 3.0, 3.0, 0.5, 0.5, bytes(range(12)), depth.tobytes()))
 
 
 def test_the_newest_frame_is_asked_for_and_unknown_depth_is_nan() -> None:

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from autonomy.perception.frame import Frame
-from autonomy.perception.log_detector import FAMILIAR_NS, Eyes
-from autonomy.perception.sources import SourceError
-from machine.load import load_profile
-from machine.optics import intrinsics
+from autonomy.perception.camera.frame import RgbdFrame
+from autonomy.perception.log_detector import FAMILIAR_NS, LogDetector
+from autonomy.perception.sources.camera_source import SourceError
+from machine.loading.profile_file import load_profile
+from machine.geometry.optics import intrinsics
 
 PROFILE = load_profile("palms_471")
 CAMERA = "stick"
@@ -31,7 +31,7 @@ class Source:
     problem: str = ""
     count: int = field(default=0)
 
-    def frame(self) -> Frame | None:
+    def frame(self) -> RgbdFrame | None:
         if self.trouble:
             raise SourceError(self.trouble)
         if self.problem:
@@ -39,49 +39,49 @@ class Source:
         self.count += 1
         pin = intrinsics(PROFILE.cameras[CAMERA])
         shape = (pin.height_px, pin.width_px)
-        return Frame(CAMERA, self.count, np.full((*shape, 3), 90, np.uint8), np.full(shape, 4.0, np.float32), pin)
+        return RgbdFrame(CAMERA, self.count, np.full((*shape, 3), 90, np.uint8), np.full(shape, 4.0, np.float32), pin)
 
     def close(self) -> None: ...
 
 
-def eyes(source: Source) -> Eyes:
-    return Eyes(PROFILE, CAMERA, source, lambda frame: ())
+def eyes(source: Source) -> LogDetector:
+    return LogDetector(PROFILE, CAMERA, source, lambda frame: ())
 
 
 def test_the_first_question_only_shows_where_the_crane_is_and_the_second_gets_a_look() -> None:
     source = Source()
     one = eyes(source)
-    assert one.look(Q, STEP_NS) is None and source.count == 0
-    assert one.look(Q, 2 * STEP_NS) == () and source.count == 1
+    assert one.detect(Q, STEP_NS) is None and source.count == 0
+    assert one.detect(Q, 2 * STEP_NS) == () and source.count == 1
     assert not one.trouble
 
 
 def test_nothing_is_looked_at_while_the_crane_moves_or_after_a_long_silence() -> None:
     source = Source()
     one = eyes(source)
-    one.look(Q, STEP_NS)
+    one.detect(Q, STEP_NS)
     moved = (Q[0] + 0.02, *Q[1:])
-    assert one.look(moved, 2 * STEP_NS) is None
-    assert one.look(moved, 2 * STEP_NS + FAMILIAR_NS) is None
-    assert one.look(moved, 3 * STEP_NS + FAMILIAR_NS) == ()
+    assert one.detect(moved, 2 * STEP_NS) is None
+    assert one.detect(moved, 2 * STEP_NS + FAMILIAR_NS) is None
+    assert one.detect(moved, 3 * STEP_NS + FAMILIAR_NS) == ()
     assert source.count == 1
 
 
 def test_a_joint_that_nobody_measures_does_not_keep_it_from_looking_unless_the_camera_hangs_on_it() -> None:
     blind = eyes(Source())
     for k in (1, 2):
-        seen = blind.look((*Q[:4], math.nan), k * STEP_NS)
+        seen = blind.detect((*Q[:4], math.nan), k * STEP_NS)
     assert seen == ()
     for k in (3, 4):
-        seen = blind.look((Q[0], math.nan, *Q[2:]), k * STEP_NS)
+        seen = blind.detect((Q[0], math.nan, *Q[2:]), k * STEP_NS)
     assert seen is None and "unknown" in blind.trouble
 
 
 @pytest.mark.parametrize("source", [Source(trouble="unplugged"), Source(problem="unplugged")])
 def test_a_camera_that_gives_nothing_is_told_and_makes_up_no_log(source: Source) -> None:
     one = eyes(source)
-    one.look(Q, STEP_NS)
-    assert one.look(Q, 2 * STEP_NS) is None
+    one.detect(Q, STEP_NS)
+    assert one.detect(Q, 2 * STEP_NS) is None
     assert one.trouble == "unplugged"
 
 

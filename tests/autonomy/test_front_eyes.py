@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from autonomy.perception.driving_log_detector import FARTHEST_M, PATIENCE, FrontEyes, Ours, PaperB
-from autonomy.perception.frame import Frame, Pose
-from autonomy.perception.logs import LogObservation
-from autonomy.perception.mount import optical_pose
-from autonomy.perception.sources import SourceError
-from machine.load import load_profile
-from machine.optics import intrinsics
+from autonomy.perception.driving_log_detector import FARTHEST_M, PATIENCE, DrivingLogDetector, CylinderLocalizer, PaperBLocalizer
+from autonomy.perception.camera.frame import RgbdFrame, Pose
+from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception.sources.camera_source import SourceError
+from machine.loading.profile_file import load_profile
+from machine.geometry.optics import intrinsics
 from tests.autonomy.test_manager_field import base
 
 PROFILE = load_profile("aoro_fc8")
@@ -45,7 +45,7 @@ class Field:
         mount = optical_pose(PROFILE, PROFILE.cameras["front"], Q, articulation_rad)
         self.pose = Pose(at.to_base(mount.position_m), at.rotation @ mount.rotation)
 
-    def frame(self) -> Frame | None:
+    def frame(self) -> RgbdFrame | None:
         if self.trouble:
             raise SourceError(self.trouble)
         assert self.pose is not None
@@ -64,19 +64,19 @@ class Field:
         along = (eye + near[..., None] * rays - self.center) @ self.axis
         self.mask = (root > 0.0) & (near > 0.0) & (np.abs(along) < 0.5 * LENGTH_M)
         depth = np.where(self.mask, near, np.where(depth < 20.0, depth, np.nan)).astype(np.float32)
-        return Frame("front", self.count, np.full((*depth.shape, 3), 90, np.uint8), depth, PIN)
+        return RgbdFrame("front", self.count, np.full((*depth.shape, 3), 90, np.uint8), depth, PIN)
 
     def close(self) -> None: ...
 
-    def found(self, frame: Frame) -> list[Mask]:
+    def found(self, frame: RgbdFrame) -> list[Mask]:
         return [Mask(self.mask, self.score)]
 
 
-def look(field: Field, at: Pose, articulation_rad: float, sight, times: int = 3) -> tuple[LogObservation, ...]:
-    eyes = FrontEyes(PROFILE, "front", field, field.found, sight)
+def detect(field: Field, at: Pose, articulation_rad: float, sight, times: int = 3) -> tuple[LogObservation, ...]:
+    eyes = DrivingLogDetector(PROFILE, "front", field, field.found, sight)
     field.stand(at, articulation_rad)
     for _ in range(times):
-        logs = eyes.look(at, Q, articulation_rad)
+        logs = eyes.detect(at, Q, articulation_rad)
     assert logs is not None and not eyes.trouble
     return logs
 
@@ -93,7 +93,7 @@ def test_ours_finds_the_log_to_centimetres_from_a_machine_that_looks_anywhere(
     at = base(10.0, -5.0, yaw_rad + math.pi)  # the base looks backwards
     ahead = yaw_rad + articulation_rad
     field = Field(10.0 + 9.0 * math.cos(ahead), -5.0 + 9.0 * math.sin(ahead), ahead + 1.3)
-    (log,) = look(field, at, articulation_rad, Ours(PROFILE))
+    (log,) = detect(field, at, articulation_rad, CylinderLocalizer(PROFILE))
     assert plane_error_m(log, at, field) < 0.04
     assert abs(np.dot(at.rotation @ np.array(log.axis), field.axis)) > math.cos(math.radians(3.0))
     assert log.diameter_m == pytest.approx(0.25, abs=0.03) and log.covariance is not None
@@ -102,7 +102,7 @@ def test_ours_finds_the_log_to_centimetres_from_a_machine_that_looks_anywhere(
 def test_paper_b_is_a_point_with_the_size_of_its_mean_log() -> None:
     at = base(0.0, 0.0, math.pi)
     field = Field(8.0, 0.5, 1.5)
-    (log,) = look(field, at, 0.0, PaperB())
+    (log,) = detect(field, at, 0.0, PaperBLocalizer())
     assert plane_error_m(log, at, field) < 0.15
     assert (log.length_m, log.diameter_m) == (2.0, 0.25) and log.axis[2] == pytest.approx(0.0)
     assert abs(np.dot(at.rotation @ np.array(log.axis), field.axis)) > math.cos(math.radians(10.0))
@@ -111,36 +111,36 @@ def test_paper_b_is_a_point_with_the_size_of_its_mean_log() -> None:
 def test_paper_b_is_short_of_a_log_seen_end_on_as_the_paper_says() -> None:
     at = base(0.0, 0.0, math.pi)
     across, along = Field(7.5, 0.0, math.pi / 2), Field(7.5, 0.0, 0.0)
-    errors = [plane_error_m(look(f, at, 0.0, PaperB())[0], at, f) for f in (across, along)]
+    errors = [plane_error_m(detect(f, at, 0.0, PaperBLocalizer())[0], at, f) for f in (across, along)]
     assert errors[0] < 0.1 < errors[1] < 0.5
 
 
-@pytest.mark.parametrize("sight", [PaperB(), Ours(PROFILE)], ids=["paper_b", "ours"])
+@pytest.mark.parametrize("sight", [PaperBLocalizer(), CylinderLocalizer(PROFILE)], ids=["paper_b", "ours"])
 def test_what_the_finder_hardly_believes_in_is_no_log(sight) -> None:
     """The sun between boom and stick, in the machine's own shadow, was found with 0.03 to 0.19, twelve times."""
     at, field = base(0.0, 0.0, math.pi), Field(8.0, 0.5, 1.5)
     field.score = 0.19
-    assert look(field, at, 0.0, sight, 2 * PATIENCE) == ()
+    assert detect(field, at, 0.0, sight, 2 * PATIENCE) == ()
 
 
-@pytest.mark.parametrize("sight", [PaperB(), Ours(PROFILE)], ids=["paper_b", "ours"])
+@pytest.mark.parametrize("sight", [PaperBLocalizer(), CylinderLocalizer(PROFILE)], ids=["paper_b", "ours"])
 def test_a_log_far_off_is_not_measured(sight) -> None:
     at = base(0.0, 0.0, math.pi)
-    assert look(Field(FARTHEST_M + 8.0, 0.0, 1.5), at, 0.0, sight) == ()
+    assert detect(Field(FARTHEST_M + 8.0, 0.0, 1.5), at, 0.0, sight) == ()
 
 
 def test_a_piece_at_the_edge_of_the_picture_is_no_log_before_it_was_seen_often() -> None:
     at = base(0.0, 0.0, math.pi)
     beside = Field(4.9, 2.6, 0.0)
-    assert look(beside, at, 0.0, Ours(PROFILE), PATIENCE - 1) == ()
+    assert detect(beside, at, 0.0, CylinderLocalizer(PROFILE), PATIENCE - 1) == ()
     assert beside.mask.any() and beside.mask[:, 0].any(), "it is cut by the picture's edge"
-    assert len(look(Field(7.5, 0.5, 1.5), at, 0.0, Ours(PROFILE), PATIENCE - 1)) == 1
+    assert len(detect(Field(7.5, 0.5, 1.5), at, 0.0, CylinderLocalizer(PROFILE), PATIENCE - 1)) == 1
 
 
 def test_a_camera_in_trouble_is_told_in_words_and_gives_nothing() -> None:
     field = Field(9.0, 0.0, 1.5)
     field.trouble = "the camera fell off"
-    eyes = FrontEyes(PROFILE, "front", field, field.found, PaperB())
-    assert eyes.look(base(0.0, 0.0, 0.0), Q, 0.0) is None and eyes.trouble == "the camera fell off"
+    eyes = DrivingLogDetector(PROFILE, "front", field, field.found, PaperBLocalizer())
+    assert eyes.detect(base(0.0, 0.0, 0.0), Q, 0.0) is None and eyes.trouble == "the camera fell off"
     with pytest.raises(KeyError):
-        FrontEyes(PROFILE, "rear view", field, field.found, PaperB())
+        DrivingLogDetector(PROFILE, "rear view", field, field.found, PaperBLocalizer())

@@ -7,8 +7,8 @@ from drawn_logs import ground_depth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.perception.plane import height_over_plane
-from machine.optics import Intrinsics
+from autonomy.perception.segmentation.ground_plane import height_over_plane
+from machine.geometry.optics import Intrinsics
 
 PIN = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
 

@@ -1,4 +1,4 @@
-"""The detector's answer is a log list, or it is refused whole."""
+"""A detector's reply is a log list, or it is refused as a whole."""
 
 from __future__ import annotations
 
@@ -11,9 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.perception import logs
-from autonomy.perception.estimate import LogEstimate, unpacked
-from autonomy.perception.logs import LogObservation, LogsRefused, parse_logs, parse_question, question
+from autonomy.perception.log_list.datagrams import (
+    LogListError,
+    decode_logs,
+    decode_request,
+    encode_error,
+    encode_logs,
+    encode_request,
+)
+from autonomy.perception.log_list.estimate import LogEstimate, unpacked
+from autonomy.perception.log_list.observation import LogObservation
+from tests.codes import coded
 
 LOG: dict[str, Any] = {
     "position_m": [-1.8, 4.4, -1.3],
@@ -24,73 +32,73 @@ LOG: dict[str, Any] = {
 }
 
 
-def answer(**changes: object) -> bytes:
+def reply(**changes: object) -> bytes:
     return json.dumps([LOG, LOG | changes]).encode()
 
 
-def test_logs_are_numbered_by_their_place_and_their_axes_have_length_one() -> None:
-    first, second = parse_logs(answer(diameter_m=0.3))
+def test_logs_without_ids_are_numbered_by_index_and_axes_are_normalised() -> None:
+    first, second = decode_logs(reply(diameter_m=0.3))
     assert (first.id, second.id) == (0, 1)
     assert first.axis == pytest.approx((0.6, 0.8, 0.0)) and second.diameter_m == 0.3
 
 
-def test_numbers_that_a_detector_gives_are_kept_and_must_differ() -> None:
+def test_ids_of_a_detector_are_kept_and_must_differ() -> None:
     seen = [LogObservation(n, (1.0, 2.0, -1.0), (0.0, 1.0, 0.0), 3.0, 0.2) for n in (7, 3)]
-    assert parse_logs(logs.answer(seen)) == tuple(seen)
-    with pytest.raises(LogsRefused, match="same number"):
-        parse_logs(logs.answer([seen[0], seen[0]]))
+    assert decode_logs(encode_logs(seen)) == tuple(seen)
+    with pytest.raises(LogListError, check=coded("log-list.duplicate-id")):
+        decode_logs(encode_logs([seen[0], seen[0]]))
 
 
-def test_whether_the_newest_look_shows_a_log_goes_with_it() -> None:
-    told = [LogObservation(n, (1.0, 2.0, -1.0), (0.0, 1.0, 0.0), 3.0, 0.2, seen=n == 7) for n in (7, 3)]
-    assert [log.seen for log in parse_logs(logs.answer(told))] == [True, False]
-    assert all(log.seen for log in parse_logs(answer())), "who does not say so has seen it"
+def test_a_reply_says_which_logs_the_newest_picture_shows() -> None:
+    logs = [LogObservation(n, (1.0, 2.0, -1.0), (0.0, 1.0, 0.0), 3.0, 0.2, seen=n == 7) for n in (7, 3)]
+    assert [log.seen for log in decode_logs(encode_logs(logs))] == [True, False]
+    assert all(log.seen for log in decode_logs(reply())), "seen is the default"
 
 
-def test_how_well_a_log_is_known_goes_with_it() -> None:
+def test_a_reply_carries_the_covariance() -> None:
     root = np.random.default_rng(1).normal(0.0, 0.02, (7, 7))
     estimate = LogEstimate(np.array([1.0, 2.0, -1.0]), np.array([0.0, 1.0, 0.0]), 3.0, 0.2, root @ root.T)
-    (told,) = parse_logs(logs.answer([estimate.observation(4)]))
-    assert told.covariance is not None and unpacked(told.covariance) == pytest.approx(root @ root.T, rel=1e-3)
+    (log,) = decode_logs(encode_logs([estimate.observation(4)]))
+    assert log.covariance is not None and unpacked(log.covariance) == pytest.approx(root @ root.T, rel=1e-3)
 
 
-def test_a_detector_that_cannot_look_says_why() -> None:
-    with pytest.raises(LogsRefused, match="the camera is dark"):
-        parse_logs(logs.answer_trouble("the camera is dark"))
+def test_an_error_reply_is_raised() -> None:
+    with pytest.raises(LogListError, check=coded("log-list.detector-error")):
+        decode_logs(encode_error("the camera is dark"))
 
 
-def test_a_question_carries_the_joints_and_without_any_they_are_unknown() -> None:
-    assert parse_question(question((0.5, -1.0, 2.25, 0.125, math.nan)))[:4] == (0.5, -1.0, 2.25, 0.125)
-    assert all(math.isnan(value) for value in parse_question(question(())))
+def test_a_request_carries_the_joints_which_are_nan_when_missing() -> None:
+    assert decode_request(encode_request((0.5, -1.0, 2.25, 0.125, math.nan)))[:4] == (0.5, -1.0, 2.25, 0.125)
+    assert all(math.isnan(value) for value in decode_request(encode_request(())))
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b'{"op":"state"}', b'{"op":"logs","q":"1 2"}', b'{"op":"logs","q":"a"}'])
-def test_what_is_no_question_for_logs_is_refused(data: bytes) -> None:
-    with pytest.raises(LogsRefused, match="no question"):
-        parse_question(data)
+def test_a_datagram_that_is_not_a_request_is_refused(data: bytes) -> None:
+    with pytest.raises(LogListError, check=coded("log-list.not-a-request")):
+        decode_request(data)
 
 
-def test_no_logs_is_a_list_too() -> None:
-    assert parse_logs(b"[]") == ()
+def test_an_empty_list_is_valid() -> None:
+    assert decode_logs(b"[]") == ()
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "code"),
     [
-        ({"diameter_m": 2.7}, "log 1 is 2.6 m long and 2.7 m wide"),
-        ({"diameter_m": 0.0}, "which is no log"),
-        ({"axis": [0.0, 0.0, 0.0]}, "log 1 has .* an axis without a direction"),
-        ({"axis": [1.7e308, 1.7e308, 0.0]}, "not finite"),
-        ({"length_m": None}, "not a log list"),
-        ({"position_m": [1.0, 2.0]}, "not a log list"),
-        ({"covariance": [1e-4] * 27}, "log 1 has a covariance that is none"),
-        ({"covariance": [1e-4] * 27 + [-1e-4]}, "no variance below 0"),
-        ({"covariance": [1e-4] * 27 + [math.inf]}, "not a log list"),
+        ({"diameter_m": 2.7}, "bad-size"),
+        ({"diameter_m": 0.0}, "bad-size"),
+        ({"axis": [0.0, 0.0, 0.0]}, "bad-value"),
+        ({"axis": [1.7e308, 1.7e308, 0.0]}, "bad-value"),
+        ({"length_m": None}, "not-a-list"),
+        ({"position_m": [1.0, 2.0]}, "not-a-list"),
+        ({"covariance": [1e-4] * 27}, "bad-covariance"),
+        ({"covariance": [1e-4] * 27 + [-1e-4]}, "bad-covariance"),
+        ({"covariance": [1e-4] * 27 + [math.inf]}, "not-a-list"),
     ],
 )
-def test_an_impossible_log_refuses_the_list(changes: dict[str, object], says: str) -> None:
-    with pytest.raises(LogsRefused, match=says):
-        parse_logs(answer(**changes))
+def test_an_impossible_log_refuses_the_whole_list(changes: dict[str, object], code: str) -> None:
+    with pytest.raises(LogListError, check=coded(f"log-list.{code}")):
+        decode_logs(reply(**changes))
 
 
 @given(st.one_of(st.binary(max_size=300), st.recursive(
@@ -98,9 +106,9 @@ def test_an_impossible_log_refuses_the_list(changes: dict[str, object], says: st
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from([*LOG]), inner, max_size=5),
     max_leaves=12,
 ).map(lambda value: json.dumps(value).encode())))  # fmt: skip
-def test_anything_else_is_refused_and_nothing_else_is_raised(data: bytes) -> None:
+def test_any_other_data_raises_only_log_list_error(data: bytes) -> None:
     try:
-        logs = parse_logs(data)
-    except LogsRefused:
+        logs = decode_logs(data)
+    except LogListError:
         return
     assert all(math.isfinite(v) for log in logs for v in (*log.center_m, *log.axis))

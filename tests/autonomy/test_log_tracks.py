@@ -8,15 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.perception.cylinder import Cylinder, across_view
-from autonomy.perception.cylinder_fit import Fit
-from autonomy.perception.frame import Pose
-from autonomy.perception.log_filter import Errors
-from autonomy.perception.merge import groups, joined, of_one_log
-from autonomy.perception.tracks import LOST, Tracks
-from machine.optics import BODY_FROM_OPTICAL, rpy_matrix
+from autonomy.perception.fitting.cylinder import Cylinder, across_view
+from autonomy.perception.fitting.cylinder_fit import CylinderFit
+from autonomy.perception.camera.frame import Pose
+from autonomy.perception.tracking.log_filter import CameraErrors
+from autonomy.perception.fitting.log_fragments import groups, joined, same_log
+from autonomy.perception.tracking.log_tracker import LOST, LogTracker
+from machine.geometry.optics import BODY_FROM_OPTICAL, rpy_matrix
 
-QUIET = Errors(scale=1e-5, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6)
+QUIET = CameraErrors(scale=1e-5, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6)
 SIGMA = np.array([0.01, 0.03, 0.01, 0.02, 0.03, 0.03, 0.005])
 
 
@@ -25,7 +25,7 @@ def pose_at(x: float = 0.0, yaw: float = 0.0) -> Pose:
     return Pose(np.array([x, 0.0, 2.4]), rpy_matrix((0.0, 0.5, yaw)) @ BODY_FROM_OPTICAL)
 
 
-def fit_of(pose: Pose, center, yaw: float = 1.5, length: float = 2.0, scale: float = 1.0, noise=None) -> Fit:
+def fit_of(pose: Pose, center, yaw: float = 1.5, length: float = 2.0, scale: float = 1.0, noise=None) -> CylinderFit:
     """What a camera would make of a level log; ``noise`` (7,) in standard deviations."""
     axis = pose.rotation.T @ np.array([math.cos(yaw), math.sin(yaw), 0.0])
     at = pose.to_optical(np.asarray(center, float)) * scale
@@ -37,11 +37,11 @@ def fit_of(pose: Pose, center, yaw: float = 1.5, length: float = 2.0, scale: flo
     half = 0.5 * length * scale
     start, end = -half + n[4], half + n[5]
     body = Cylinder(at, axis, start, end, 0.125 * scale + n[6]).centered()
-    return Fit(body, np.diag(SIGMA**2), (True, True), 1.0, 0.5, np.full(7, 1e-4))
+    return CylinderFit(body, np.diag(SIGMA**2), (True, True), 1.0, 0.5, np.full(7, 1e-4))
 
 
 def test_a_log_is_believed_from_its_second_picture_and_keeps_its_number() -> None:
-    tracks, pose = Tracks(QUIET), pose_at()
+    tracks, pose = LogTracker(QUIET), pose_at()
     places = [(5.0, -1.0, 0.12), (6.0, 1.0, 0.12)]
     assert tracks.step([fit_of(pose, p) for p in places], pose, 0) == ()
     for k in range(1, 6):
@@ -52,7 +52,7 @@ def test_a_log_is_believed_from_its_second_picture_and_keeps_its_number() -> Non
 
 
 def test_a_log_turned_round_by_a_fit_is_the_same_log() -> None:
-    tracks, pose = Tracks(QUIET), pose_at()
+    tracks, pose = LogTracker(QUIET), pose_at()
     fit = fit_of(pose, (5.0, 0.0, 0.12))
     turned = replace(fit, body=replace(fit.body, axis=-fit.body.axis), ends_seen=(False, True))
     fit = replace(fit, ends_seen=(True, False))
@@ -66,7 +66,7 @@ def test_a_log_turned_round_by_a_fit_is_the_same_log() -> None:
 def test_noise_averages_and_the_claim_is_honest() -> None:
     rng, squares = np.random.default_rng(1), []
     for _ in range(25):
-        tracks, pose = Tracks(QUIET), pose_at()
+        tracks, pose = LogTracker(QUIET), pose_at()
         for k in range(12):
             found = tracks.step([fit_of(pose, (5.0, 0.3, 0.12), noise=rng.normal(size=7))], pose, k)
         estimate = found[0].estimate
@@ -78,10 +78,10 @@ def test_noise_averages_and_the_claim_is_honest() -> None:
 
 
 def test_a_scale_error_stays_while_the_camera_stands_and_shows_when_it_drives() -> None:
-    center, errors = (8.0, 0.2, 0.12), Errors(scale=0.01, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6)
+    center, errors = (8.0, 0.2, 0.12), CameraErrors(scale=0.01, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6)
     claims, misses = [], []
     for drive in (0.0, 4.0):
-        tracks = Tracks(errors)
+        tracks = LogTracker(errors)
         for k in range(120):
             pose = pose_at(drive * k / 119)
             found = tracks.step([fit_of(pose, center, scale=1.01)], pose, k)
@@ -94,8 +94,8 @@ def test_a_scale_error_stays_while_the_camera_stands_and_shows_when_it_drives() 
 
 def test_pictures_alike_do_not_make_sure_of_what_they_share() -> None:
     shared = np.array([0.01, 0.02, 0.01, 0.02, 0.05, 0.05, 0.004])
-    tracks, pose = Tracks(QUIET), pose_at()
-    fit = replace(fit_of(pose, (5.0, 0.0, 0.12)), lasting=shared, covariance=np.diag(SIGMA**2 + shared**2))
+    tracks, pose = LogTracker(QUIET), pose_at()
+    fit = replace(fit_of(pose, (5.0, 0.0, 0.12)), systematic=shared, covariance=np.diag(SIGMA**2 + shared**2))
     for k in range(200):
         found = tracks.step([fit], pose, k)
     assert found[0].estimate.length_sigma_m() > 0.06
@@ -103,24 +103,24 @@ def test_pictures_alike_do_not_make_sure_of_what_they_share() -> None:
 
 def test_many_pictures_from_one_place_do_not_outvote_few_from_others() -> None:
     shared = np.array([0.01, 0.02, 0.01, 0.02, 0.1, 0.1, 0.004])
-    tracks = Tracks(QUIET)
+    tracks = LogTracker(QUIET)
     places = [(0.0, 2.2)] * 60 + [(x, 2.0) for x in (1.0, 2.0, 2.8, 3.5)]
     for k, (x, length) in enumerate(places):
         pose = pose_at(x)
         fit = fit_of(pose, (8.0, 0.0, 0.12), length=length)
-        fit = replace(fit, lasting=shared, covariance=np.diag(SIGMA**2 + shared**2))
+        fit = replace(fit, systematic=shared, covariance=np.diag(SIGMA**2 + shared**2))
         found = tracks.step([fit], pose, k)
     assert found[0].estimate.length_m < 2.1
 
 
 def test_an_outlier_changes_nothing_but_a_wrong_beginning_is_given_up() -> None:
     pose, truth = pose_at(), (5.0, 0.0, 0.12)
-    tracks = Tracks(QUIET)
+    tracks = LogTracker(QUIET)
     for k in range(6):
         tracks.step([fit_of(pose, truth)], pose, k)
     found = tracks.step([fit_of(pose, truth, length=3.5)], pose, 6)
     assert found[0].estimate.length_m == pytest.approx(2.0, abs=1e-3) and len(found) == 1
-    tracks = Tracks(QUIET)
+    tracks = LogTracker(QUIET)
     for k in range(2):
         tracks.step([fit_of(pose, truth, length=3.5)], pose, k)
     for k in range(2, 9):
@@ -130,7 +130,7 @@ def test_an_outlier_changes_nothing_but_a_wrong_beginning_is_given_up() -> None:
 
 def test_a_log_that_its_first_picture_shows_wrongly_is_believed_all_the_same() -> None:
     pose, truth = pose_at(), (5.0, 0.0, 0.12)
-    tracks = Tracks(QUIET)
+    tracks = LogTracker(QUIET)
     tracks.step([fit_of(pose, truth, length=3.5)], pose, 0)
     assert tracks.step([fit_of(pose, truth)], pose, 1) == (), "two pictures that do not agree tell of no log"
     found = tracks.step([fit_of(pose, truth)], pose, 2)
@@ -138,7 +138,7 @@ def test_a_log_that_its_first_picture_shows_wrongly_is_believed_all_the_same() -
 
 
 def test_a_log_that_is_gone_is_given_up_and_a_new_one_gets_a_new_number() -> None:
-    tracks, pose = Tracks(QUIET), pose_at()
+    tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
         tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
     for k in range(LOST - 1):
@@ -150,7 +150,7 @@ def test_a_log_that_is_gone_is_given_up_and_a_new_one_gets_a_new_number() -> Non
 
 
 def test_a_log_that_is_seen_to_have_moved_keeps_its_number_wherever_it_is() -> None:
-    tracks, pose = Tracks(QUIET), pose_at()
+    tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
         tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
     for k, up in enumerate((0.5, 0.9, 1.3)):
@@ -161,7 +161,7 @@ def test_a_log_that_is_seen_to_have_moved_keeps_its_number_wherever_it_is() -> N
 
 def test_two_numbers_for_one_log_become_the_older_one() -> None:
     """A wrong fit took a log's number, a new number began where it is, and then the picture is clear again."""
-    tracks, pose = Tracks(QUIET), pose_at()
+    tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
         tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
     tracks.step([fit_of(pose, (5.0, 0.0, 0.12), length=2.1), fit_of(pose, (5.0, 0.0, 0.2))], pose, 3)
@@ -171,7 +171,7 @@ def test_two_numbers_for_one_log_become_the_older_one() -> None:
 
 
 def test_a_piece_of_a_log_is_no_reason_to_forget_the_whole() -> None:
-    tracks, pose = Tracks(QUIET), pose_at()
+    tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
         tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
     pieces = [fit_of(pose, (5.0, y, 0.12), length=0.7) for y in (0.3, -0.3)]
@@ -191,7 +191,7 @@ def test_a_piece_of_a_log_is_no_reason_to_forget_the_whole() -> None:
     ],
 )
 def test_a_piece_of_a_log_that_is_seen_beside_the_whole_is_no_log(center, length: float, count: int) -> None:
-    tracks, pose = Tracks(QUIET), pose_at()
+    tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
         found = tracks.step([fit_of(pose, (5.0, 0.0, 0.12)), fit_of(pose, center, length=length)], pose, k)
     assert [t.id for t in found] == [1, 2][:count]
@@ -200,22 +200,22 @@ def test_a_piece_of_a_log_that_is_seen_beside_the_whole_is_no_log(center, length
 @settings(max_examples=40)
 @given(st.floats(-0.4, 0.4), st.floats(-3.1, 3.1), st.floats(0.0, 2.0))
 def test_where_the_camera_stands_does_not_matter_to_an_exact_fit(yaw: float, log_yaw: float, moved: float) -> None:
-    tracks, center = Tracks(QUIET), (6.0, 0.4, 0.12)
+    tracks, center = LogTracker(QUIET), (6.0, 0.4, 0.12)
     for k in range(3):
         pose = pose_at(moved * k / 2, yaw)
         found = tracks.step([fit_of(pose, center, yaw=log_yaw)], pose, k)
     assert len(found) == 1 and np.allclose(found[0].estimate.center_m, center, atol=1e-5)
 
 
-def piece(start: float, end: float, seen: tuple[bool, bool], radius: float = 0.12, y: float = 0.0) -> Fit:
+def piece(start: float, end: float, seen: tuple[bool, bool], radius: float = 0.12, y: float = 0.0) -> CylinderFit:
     """A piece of a log along x, 5 m away."""
     body = Cylinder(np.array([0.0, y, 5.0]), np.array([1.0, 0.0, 0.0]), start, end, radius).centered()
-    return Fit(body, np.diag(np.full(7, 1e-4)), seen, 1.0, 0.5, np.zeros(7))
+    return CylinderFit(body, np.diag(np.full(7, 1e-4)), seen, 1.0, 0.5, np.zeros(7))
 
 
 def test_pieces_that_miss_the_ends_facing_each_other_are_one_log() -> None:
     a, b = piece(-1.0, -0.2, (True, False)), piece(0.3, 1.0, (False, True))
-    assert of_one_log(a, b) and of_one_log(b, a) and groups([a, None, b]) == [[0, 2]]
+    assert same_log(a, b) and same_log(b, a) and groups([a, None, b]) == [[0, 2]]
     whole = joined(a.body, b.body)
     assert whole.length_m == pytest.approx(2.0) and np.allclose(whole.center_m, (0.0, 0.0, 5.0))
 
@@ -230,6 +230,6 @@ def test_pieces_that_miss_the_ends_facing_each_other_are_one_log() -> None:
     ],
     ids=["its own end", "another width", "beside", "far away"],
 )
-def test_what_is_no_piece_of_it_stays_apart(other: Fit) -> None:
+def test_what_is_no_piece_of_it_stays_apart(other: CylinderFit) -> None:
     a = piece(-1.0, -0.2, (True, False))
-    assert not of_one_log(a, other) and groups([a, other]) == [[0], [1]]
+    assert not same_log(a, other) and groups([a, other]) == [[0], [1]]

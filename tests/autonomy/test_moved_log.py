@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autonomy.perception.cylinder import Cylinder
-from autonomy.perception.cylinder_fit import Fit
-from autonomy.perception.estimate import LogEstimate
-from autonomy.perception.frame import Frame, Pose
-from autonomy.perception.moved import has_moved
-from machine.optics import Intrinsics
+from autonomy.perception.fitting.cylinder import Cylinder
+from autonomy.perception.fitting.cylinder_fit import CylinderFit
+from autonomy.perception.log_list.estimate import LogEstimate
+from autonomy.perception.camera.frame import RgbdFrame, Pose
+from autonomy.perception.tracking.displacement import is_displaced
+from machine.geometry.optics import Intrinsics
 
 HEIGHT_M = 4.0
 LENGTH_M, RADIUS_M = 2.0, 0.1
@@ -22,7 +22,7 @@ Place = tuple[float, float]
 """Across its axis, and up, of a log along x."""
 
 
-def picture(*logs: Place, tongs: slice | None = None, length_m: float = LENGTH_M) -> Frame:
+def picture(*logs: Place, tongs: slice | None = None, length_m: float = LENGTH_M) -> RgbdFrame:
     """Depth of logs over the ground, and of tongs close to the camera in some of the picture's columns."""
     v, u = np.mgrid[: PIN.height_px, : PIN.width_px]
     depth = np.full(u.shape, HEIGHT_M)
@@ -35,17 +35,17 @@ def picture(*logs: Place, tongs: slice | None = None, length_m: float = LENGTH_M
     if tongs is not None:
         depth[:, tongs] = 2.0
     rgb = np.full((*depth.shape, 3), 90, np.uint8)
-    return Frame("stick", 1, rgb, depth.astype(np.float32), PIN)
+    return RgbdFrame("stick", 1, rgb, depth.astype(np.float32), PIN)
 
 
 def log_at(place: Place, x_m: float = 0.0) -> LogEstimate:
     return LogEstimate(np.array([x_m, *place]), np.array([1.0, 0.0, 0.0]), LENGTH_M, 2.0 * RADIUS_M, np.eye(7) * 1e-4)
 
 
-def fit_at(place: Place, length_m: float = LENGTH_M, radius_m: float = RADIUS_M, x_m: float = 0.0) -> Fit:
+def fit_at(place: Place, length_m: float = LENGTH_M, radius_m: float = RADIUS_M, x_m: float = 0.0) -> CylinderFit:
     middle, half = DOWN.to_optical(np.array([x_m, *place])), length_m / 2
     body = Cylinder(middle, np.array([1.0, 0.0, 0.0]), -half, half, radius_m)
-    return Fit(body, np.eye(7) * 1e-4, (True, True), 1.0, 0.5, np.zeros(7))
+    return CylinderFit(body, np.eye(7) * 1e-4, (True, True), 1.0, 0.5, np.zeros(7))
 
 
 LAY = (0.0, RADIUS_M)
@@ -53,22 +53,22 @@ LAY = (0.0, RADIUS_M)
 
 @pytest.mark.parametrize("now", [(0.0, 0.6), (0.3, 0.5), (0.6, RADIUS_M)], ids=["lifted", "carried", "rolled away"])
 def test_a_log_that_is_seen_elsewhere_and_not_there_has_moved(now: Place) -> None:
-    assert has_moved(picture(now), DOWN, log_at(LAY), fit_at(now))
+    assert is_displaced(picture(now), DOWN, log_at(LAY), fit_at(now))
 
 
 def test_tongs_over_its_middle_do_not_hide_that_it_is_gone() -> None:
     now = (0.0, 0.6)
-    assert has_moved(picture(now, tongs=slice(140, 180)), DOWN, log_at(LAY), fit_at(now))
+    assert is_displaced(picture(now, tongs=slice(140, 180)), DOWN, log_at(LAY), fit_at(now))
 
 
 def test_a_log_that_still_lies_there_is_not_the_like_one_beside_it() -> None:
     beside = (0.5, RADIUS_M)
-    assert not has_moved(picture(LAY, beside), DOWN, log_at(LAY), fit_at(beside))
+    assert not is_displaced(picture(LAY, beside), DOWN, log_at(LAY), fit_at(beside))
 
 
 def test_what_is_hidden_may_lie_there_still() -> None:
     now = (0.5, 0.6)
-    assert not has_moved(picture(now, tongs=slice(0, 320)), DOWN, log_at(LAY), fit_at(now))
+    assert not is_displaced(picture(now, tongs=slice(0, 320)), DOWN, log_at(LAY), fit_at(now))
 
 
 @pytest.mark.parametrize(
@@ -76,26 +76,26 @@ def test_what_is_hidden_may_lie_there_still() -> None:
     [fit_at((0.0, 0.6), length_m=1.2), fit_at((0.0, 0.6), radius_m=0.2), fit_at((0.0, 1.8))],
     ids=["a shorter log", "a thicker log", "far away"],
 )
-def test_another_log_is_not_it(other: Fit) -> None:
-    assert not has_moved(picture(), DOWN, log_at(LAY), other)
+def test_another_log_is_not_it(other: CylinderFit) -> None:
+    assert not is_displaced(picture(), DOWN, log_at(LAY), other)
 
 
 def test_a_log_half_of_which_is_still_seen_there_has_not_moved() -> None:
     frame = picture(LAY, length_m=0.4 * LENGTH_M)
-    assert not has_moved(frame, DOWN, log_at(LAY), fit_at((0.6, RADIUS_M)))
+    assert not is_displaced(frame, DOWN, log_at(LAY), fit_at((0.6, RADIUS_M)))
 
 
 def test_a_log_out_of_the_picture_is_not_missed_in_it() -> None:
     outside = log_at((4.0, RADIUS_M))
-    assert not has_moved(picture((3.0, 0.6)), DOWN, outside, fit_at((3.0, 0.6)))
+    assert not is_displaced(picture((3.0, 0.6)), DOWN, outside, fit_at((3.0, 0.6)))
 
 
 def test_half_a_log_in_the_picture_tells_of_the_whole() -> None:
     half_outside = log_at(LAY, x_m=2.4)
-    assert has_moved(picture(), DOWN, half_outside, fit_at((0.6, 0.6), x_m=1.6)), "what is in view is the ground"
+    assert is_displaced(picture(), DOWN, half_outside, fit_at((0.6, 0.6), x_m=1.6)), "what is in view is the ground"
 
 
 def test_nothing_is_known_where_no_depth_is() -> None:
     frame = picture((0.0, 0.6))
     frame.depth_m[:] = np.nan
-    assert not has_moved(frame, DOWN, log_at(LAY), fit_at((0.0, 0.6)))
+    assert not is_displaced(frame, DOWN, log_at(LAY), fit_at((0.0, 0.6)))

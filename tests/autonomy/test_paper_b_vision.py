@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.perception.frame import Frame, Pose
-from autonomy.perception.paper_b import RunningAverage, end_on_miss_m, in_picture, position_of
-from machine.optics import BODY_FROM_OPTICAL, Intrinsics
+from autonomy.perception.camera.frame import RgbdFrame, Pose
+from autonomy.perception.papers.paper_b import RunningAverage, end_on_error_m, in_picture, position_of
+from machine.geometry.optics import BODY_FROM_OPTICAL, Intrinsics
 
 PIN = Intrinsics(1280, 720, 530.0, 530.0, 640.0, 360.0)
-FRAME = Frame("front", 0, np.zeros((720, 1280, 3), np.uint8), np.full((720, 1280), 5.0, np.float32), PIN)
+FRAME = RgbdFrame("front", 0, np.zeros((720, 1280, 3), np.uint8), np.full((720, 1280), 5.0, np.float32), PIN)
 STILL = Pose(np.array([1.0, 2.0, 3.0]), BODY_FROM_OPTICAL)
 
 
@@ -75,13 +75,13 @@ def test_the_closed_form_is_what_a_ray_through_the_boxs_middle_hits(
     if ahead < near:
         ahead = near
     up = height - ahead * fall / way
-    back, high = end_on_miss_m(near, far, height, diameter, pitch)
+    back, high = end_on_error_m(near, far, height, diameter, pitch)
     assert back == pytest.approx(0.5 * (near + far) - ahead, abs=1e-9)
     assert high == pytest.approx(up - 0.5 * diameter, abs=1e-9)
 
 
 def test_a_log_of_two_metres_end_on_is_missed_by_decimetres() -> None:
-    back, high = end_on_miss_m(4.2, 6.2, 2.4, 0.25)
+    back, high = end_on_error_m(4.2, 6.2, 2.4, 0.25)
     harmonic = 0.5 * (4.2 + 6.2) - 2.0 / (1.0 / 4.2 + 1.0 / 6.2)
     assert harmonic == pytest.approx(0.19, abs=0.005)
     assert back > harmonic and 0.3 < math.hypot(back, high) < 0.6

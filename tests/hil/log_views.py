@@ -5,10 +5,10 @@ from functools import cache
 
 import numpy as np
 
-from autonomy.perception.frame import Frame, Pose
+from autonomy.perception.camera.frame import RgbdFrame, Pose
 from experiments.common.worlds import opened, profile_named
 from experiments.log_localization.trial import TrueMask
-from machine.optics import Intrinsics, intrinsics
+from machine.geometry.optics import Intrinsics, intrinsics
 from sim.camera.geometry import View, look_at
 from sim.camera.noise import StereoNoise
 from sim.camera.render import Look, Picture, render
@@ -52,13 +52,13 @@ def seen(scene: Scene, view: View) -> Picture:
     return render(scene, view, Look())
 
 
-def frame_of(picture: Picture, view: View, number: int = 0, exact: bool = False) -> Frame:
+def frame_of(picture: Picture, view: View, number: int = 0, exact: bool = False) -> RgbdFrame:
     """A frame with stereo's noise but without its scale error, or with exact depth."""
     depth_m = picture.depth_m
     if not exact:
         noise = StereoNoise(CAMERA, camera_truth(), 1)
         depth_m = noise.apply(picture, view.intrinsics, number) / np.float32(noise.scale)
-    return Frame("front", 66_000_000 * (number + 1), picture.rgb, depth_m, view.intrinsics)
+    return RgbdFrame("front", 66_000_000 * (number + 1), picture.rgb, depth_m, view.intrinsics)
 
 
 def masks_of(picture: Picture) -> list[TrueMask]:

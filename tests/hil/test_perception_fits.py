@@ -5,18 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from log_views import CAMERA, PIN, PROFILE, frame_of, lying, masks_of, scene_of, seen, view_from
 from scipy.ndimage import binary_erosion
 
-from autonomy.perception import paper_a
-from autonomy.perception.contour import Sensor, own_outline
-from autonomy.perception.cylinder import Bodies, Cylinder, across_view, depth, guess, outline, rays_of
-from autonomy.perception.cylinder_fit import refine
-from autonomy.perception.frame import FrameRefused, Pose
-from autonomy.perception.merge import refused
+from autonomy.perception.camera.frame import RgbdFrameError, Pose
+from autonomy.perception.fitting.contour import StereoSensor, log_contour
+from autonomy.perception.fitting.cylinder import CylinderBatch, Cylinder, across_view, depth, initial_cylinder, outline, pixel_rays
+from autonomy.perception.fitting.cylinder_fit import fit_cylinder
+from autonomy.perception.fitting.log_fragments import refused
+from autonomy.perception.papers import paper_a
 from autonomy.perception.pipeline import Perception
 from experiments.log_localization.trial import TrueMask
 from sim.camera.scene import BUNK, SceneBuilder
+from tests.hil.log_views import CAMERA, PIN, PROFILE, frame_of, lying, masks_of, scene_of, seen, view_from
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
@@ -36,12 +36,12 @@ def test_outline_and_depth_are_the_renderers(degrees: float) -> None:
     picture = seen(scene_of(log), view)
     v, u = np.mgrid[200:420:3, 400:900:3]
     body = Cylinder(view.to_optical(np.array([log.position_m]))[0], view.rotation.T @ log.axis, -1.0, 1.0, 0.125)
-    rays = rays_of(PIN, u.ravel(), v.ravel())
-    inside = outline(Bodies.of(body), rays)[0] < 0.0
+    rays = pixel_rays(PIN, u.ravel(), v.ravel())
+    inside = outline(CylinderBatch.of(body), rays)[0] < 0.0
     truly = (picture.mask[v, u] == 1).ravel()
     assert np.mean(inside != truly) < 0.004
     both = inside & truly
-    apart = np.abs(depth(Bodies.of(body), rays[both])[0] - picture.depth_m[v, u].ravel()[both])
+    apart = np.abs(depth(CylinderBatch.of(body), rays[both])[0] - picture.depth_m[v, u].ravel()[both])
     assert np.quantile(apart, 0.98) < 0.01 and np.median(apart) < 1e-3
 
 
@@ -95,14 +95,14 @@ def test_an_end_behind_another_log_is_no_end() -> None:
 
 def test_a_border_that_is_anothers_tells_of_no_width() -> None:
     """The same log, once with its lower side said to be behind something: it may go on there."""
-    view, sensor = view_from(), Sensor(CAMERA.fx_px * CAMERA.baseline_m)
+    view, sensor = view_from(), StereoSensor(CAMERA.fx_px * CAMERA.baseline_m)
     picture = seen(scene_of(lying(1, 4.6, 0.0, 90.0)), view)
     mask, depth_m = picture.mask == 1, frame_of(picture, view).depth_m
-    first = guess(mask, depth_m, PIN, 3.0 * 0.2 / sensor.fb_px_m)
+    first = initial_cylinder(mask, depth_m, PIN, 3.0 * 0.2 / sensor.fb_px_m)
     assert first is not None
-    whole = own_outline(mask, depth_m, PIN, first, sensor, (0, 0, PIN.width_px, PIN.height_px))
+    whole = log_contour(mask, depth_m, PIN, first, sensor, (0, 0, PIN.width_px, PIN.height_px))
     half = replace(whole, own=whole.own & (whole.v_px < np.median(whole.v_px)))
-    sure, unsure = (refine(mask, depth_m, PIN, first, edge, sensor) for edge in (whole, half))
+    sure, unsure = (fit_cylinder(mask, depth_m, PIN, first, edge, sensor) for edge in (whole, half))
     assert sure is not None and unsure is not None
     assert sure.covariance[6, 6] < 0.006**2 and unsure.covariance[6, 6] > 0.02**2
     assert unsure.covariance[1, 1] > 3.0 * sure.covariance[1, 1], "depth beside it may be that of what hides it"
@@ -204,13 +204,13 @@ def test_no_log_no_depth_and_a_wrong_frame_make_no_log() -> None:
     blind = replace(frame, depth_m=np.where(picture.mask == 1, np.nan, frame.depth_m))
     assert perception.fits(blind, masks_of(picture)) == []
     assert "depth" in perception.refusals[0].why
-    with pytest.raises(FrameRefused, match="no depth anywhere"):
+    with pytest.raises(RgbdFrameError, match="no depth anywhere"):
         perception.fits(replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), [])
-    with pytest.raises(FrameRefused, match="'rear', which the machine does not have; it has: front"):
+    with pytest.raises(RgbdFrameError, match="'rear', which the machine does not have; it has: front"):
         perception.fits(replace(frame, camera="rear"), [])
-    with pytest.raises(FrameRefused, match="mask 0 is"):
+    with pytest.raises(RgbdFrameError, match="mask 0 is"):
         perception.fits(frame, [TrueMask(np.zeros((3, 3), bool))])
-    with pytest.raises(FrameRefused, match="intrinsics are for"):
+    with pytest.raises(RgbdFrameError, match="intrinsics are for"):
         perception.fits(replace(frame, intrinsics=PIN.scaled(0.5)), [])
 
 
@@ -235,13 +235,13 @@ def test_the_first_guess_needs_depth_and_ignores_outliers() -> None:
     picture = seen(scene_of(lying(1, 4.6, 0.2, 90.0)), view)
     mask, depth_m = picture.mask == 1, picture.depth_m.copy()
     slack = 3.0 * 0.2 / (CAMERA.fx_px * CAMERA.baseline_m)
-    clean = guess(mask, depth_m, PIN, slack)
+    clean = initial_cylinder(mask, depth_m, PIN, slack)
     rng = np.random.default_rng(1)
     depth_m[mask & (rng.random(mask.shape) < 0.3)] = 1.5
-    dirty = guess(mask, depth_m, PIN, slack)
+    dirty = initial_cylinder(mask, depth_m, PIN, slack)
     assert clean is not None and dirty is not None
     assert np.linalg.norm(clean.center_m - dirty.center_m) < 0.05
-    assert guess(mask, np.full_like(depth_m, np.nan), PIN, slack) is None
+    assert initial_cylinder(mask, np.full_like(depth_m, np.nan), PIN, slack) is None
 
 
 def test_paper_a_takes_the_surface_for_the_log() -> None:

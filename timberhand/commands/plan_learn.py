@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 
 
 def learn(
@@ -33,19 +33,19 @@ def learn(
     import json
 
     from autonomy.motion.dmp import DemonstrationRefused
-    from autonomy.motion.primitives import encode, learn_primitives
-    from training.movement_primitives import draw, motions_in
+    from autonomy.motion.movement_primitives import encode, learn_primitives
+    from training.motion.demonstration_recordings import draw, motions_in
 
     machine, motions = motions_in(log, profile)
     try:
         primitives = learn_primitives(machine, motions)
     except DemonstrationRefused as error:
-        raise Stopped(Exit.CONFIGURATION, f"{log}: {error}") from None
+        raise CommandFailed("plan.demonstrations", f"{log}: {error}", ExitCode.CONFIGURATION) from None
     _write(out, encode(primitives))
     if csv is not None:
-        from autonomy.motion.demonstration import to_text
+        from autonomy.motion.demonstration import format_demonstrations
 
-        _write(csv, to_text(machine.name, motions).encode())
+        _write(csv, format_demonstrations(machine.name, motions).encode())
     if plot is not None:
         draw(plot, machine, motions, primitives)
     found = {
@@ -86,10 +86,10 @@ def demonstrate(
     from rich.console import Console
     from rich.progress import Progress
 
-    from autonomy.motion.demonstration import cut, to_text, track
-    from can_dbc.codec import load
-    from hil.hand_demonstration import show
-    from machine.load import ProfileError, load_profile
+    from autonomy.motion.demonstration import segment_motions, format_demonstrations, joint_track
+    from can_dbc.dbc.codec import load
+    from hil.demonstrations.hand_levers import show
+    from machine.loading.profile_file import ProfileError, load_profile
     from recorder.manifest import describe
     from recorder.recorder import Recorder, RecordingRefused
 
@@ -111,9 +111,9 @@ def demonstrate(
         if recorder is not None:
             recorder.close()
     except (ProfileError, ValueError, RecordingRefused) as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
-    motions = cut(machine, track(machine, load("crane"), frames))
-    _write(out, to_text(machine.name, motions).encode())
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    motions = segment_motions(machine, joint_track(machine, load("crane"), frames))
+    _write(out, format_demonstrations(machine.name, motions).encode())
     typer.echo(f"{out}: {len(motions)} motions of {machine.name}")
 
 
@@ -122,4 +122,8 @@ def _write(path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
     except OSError as error:
-        raise Stopped(Exit.CONFIGURATION, f"{path} cannot be written ({error.strerror}); give another file") from None
+        raise CommandFailed(
+            "plan.output-not-written",
+            f"{path} cannot be written ({error.strerror}); give another file",
+            ExitCode.CONFIGURATION,
+        ) from None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -63,37 +63,46 @@ def grasp(
     weights = out or Path(f"grasp_{labels.value}.safetensors")
     if labels is Labels.PHYSICAL:
         if data is not None:
-            raise Stopped(Exit.USAGE, "--data goes with --labels cornell; physical labels need none")
+            raise CommandFailed(
+                "train.data-not-wanted", "--data goes with --labels cornell; physical labels need none", ExitCode.USAGE
+            )
         _grasp_physical(weights, seed, epochs)
     elif data is None:
-        raise Stopped(Exit.USAGE, "--data is missing: the folder of Cornell samples, or --labels physical without any")
+        raise CommandFailed(
+            "train.data-missing",
+            "--data is missing: the folder of Cornell samples, or --labels physical without any",
+            ExitCode.USAGE,
+        )
     else:
         _grasp_cornell(data, weights, seed, epochs)
 
 
 def _grasp_physical(weights: Path, seed: int, epochs: int | None) -> None:
-    from training.grasp import physical
+    from training.grasp import physical_weights
 
-    passes = epochs or physical.EPOCHS
-    _made(weights, None, lambda _, screen: physical.produce(seed, weights, screen, epochs=passes)[1])
+    passes = epochs or physical_weights.EPOCHS
+    _made(weights, None, lambda _, screen: physical_weights.produce(seed, weights, screen, epochs=passes)[1])
 
 
 def _grasp_cornell(data: Path, out: Path, seed: int, epochs: int | None) -> None:
     from rich.console import Console
 
-    from training.grasp import train as training
-    from training.grasp.cornell import DataRefused, load
-    from training.grasp.weights import produce
+    from training.grasp import network_training as training
+    from training.common.dataset_error import DatasetError
+    from training.grasp.cornell import load
+    from training.grasp.cornell_weights import produce
 
     screen = Console(stderr=True)
     try:
         samples = load(data)
-    except DataRefused as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    except DatasetError as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     try:
         weights, card = produce(samples, seed, epochs or training.EPOCHS, out, screen)
     except KeyboardInterrupt:
-        raise Stopped(Exit.INTERRUPTED, "interrupted; the same command goes on from the last checkpoint") from None
+        raise CommandFailed(
+            "train.interrupted", "interrupted; the same command goes on from the last checkpoint", ExitCode.INTERRUPTED
+        ) from None
     screen.print(f"{weights}, {card}", highlight=False)
 
 
@@ -125,11 +134,13 @@ def segmentation(
       timberhand train segmentation --pictures 256 --steps 50     a look at it in a few minutes
     """
     torch_on_one_thread()
-    from autonomy.perception.network import CHANNELS
-    from training.detection.produce import Plan, produce
+    from autonomy.perception.segmentation.network import CHANNELS
+    from training.detection.detector_weights import Plan, produce
 
     if variant not in CHANNELS:
-        raise Stopped(Exit.USAGE, f"variant {variant!r} is unknown; use one of {', '.join(CHANNELS)}")
+        raise CommandFailed(
+            "train.unknown-variant", f"variant {variant!r} is unknown; use one of {', '.join(CHANNELS)}", ExitCode.USAGE
+        )
     weights = out or Path(f"logs_{variant}.safetensors")
     plan = Plan(pictures, steps, seed, learning_rate, start, large)
     _made(weights, folder, lambda kept, screen: produce(variant, plan, kept, weights, screen))
@@ -158,7 +169,7 @@ def detector(
       timberhand train detector --pictures 256 --steps 50     a look at it in a few minutes
     """
     torch_on_one_thread()
-    from training.detection.produce import Plan, produce_boxes
+    from training.detection.detector_weights import Plan, produce_boxes
 
     plan = Plan(pictures, steps, seed, learning_rate, start, large)
     _made(out, folder, lambda kept, screen: produce_boxes(plan, kept, out, screen))
@@ -185,7 +196,7 @@ def judges(
       timberhand train judges --pictures 64     a look at it in a minute
     """
     torch_on_one_thread()
-    from training.detection.evaluators import produce
+    from training.detection.scorer_weights import produce
 
     _made(out, folder, lambda kept, screen: produce(pictures, seed, kept, out, weights, screen))
 
@@ -194,15 +205,17 @@ def _made(weights: Path, folder: Path | None, make: Callable[[Path, Console], Pa
     """Make weights of drawn pictures and say where they are."""
     from rich.console import Console
 
-    from training.detection.piles import cache_folder
+    from training.pictures.piles import cache_folder
 
     screen = Console(stderr=True)
     try:
         card = make(folder or cache_folder().parent / "pictures", screen)
     except KeyboardInterrupt:
-        raise Stopped(Exit.INTERRUPTED, "interrupted; the same command goes on from the last checkpoint") from None
+        raise CommandFailed(
+            "train.interrupted", "interrupted; the same command goes on from the last checkpoint", ExitCode.INTERRUPTED
+        ) from None
     except ValueError as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     screen.print(f"{weights}, {card}", highlight=False)
 
 
@@ -210,10 +223,12 @@ def torch_on_one_thread() -> None:
     """Ready torch for training here.
 
     Raises:
-        Stopped: torch is not installed.
+        CommandFailed: torch is not installed.
     """
     try:
         import torch
     except ImportError:
-        raise Stopped(Exit.CONFIGURATION, "training needs torch: pip install 'timberhand[train]'") from None
+        raise CommandFailed(
+            "train.no-torch", "training needs torch: pip install 'timberhand[train]'", ExitCode.CONFIGURATION
+        ) from None
     torch.set_num_threads(1)

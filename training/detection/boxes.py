@@ -12,10 +12,10 @@ from rich.console import Console
 from torch.nn import functional as F
 
 from autonomy.networks.torch_net import TorchNet
-from autonomy.perception.detector import STRIDE, box_net, colour
-from training.detection.labels import ID, IGNORED, Labelled
+from autonomy.perception.papers.box_detector import STRIDE, box_net, colour
+from training.common.loop import Schedule, begun, stacked, train
 from training.detection.segmentation import Picture, changed
-from training.loop import Schedule, begun, stacked, train
+from training.pictures.labels import ID, IGNORED, Labelled
 
 CROPS: Final = ((256, 1.0), (512, 0.25))
 """Sizes of the windows of small and of large pictures [px] and their share of a batch's pictures: a log that is longer

@@ -17,8 +17,9 @@ from scipy import ndimage
 from torch.nn import functional as F
 
 from autonomy.networks.torch_net import TorchNet
-from autonomy.perception.network import MAPS, MASK, OFFSET_PX, STRIDE, channels, unet
-from training.detection.labels import (
+from autonomy.perception.segmentation.network import MAPS, MASK, OFFSET_PX, STRIDE, channels, unet
+from training.common.loop import Schedule, begun, stacked, train
+from training.pictures.labels import (
     ANGLE,
     CENTRE_U,
     CENTRE_V,
@@ -36,7 +37,6 @@ from training.detection.labels import (
     enlarged,
     mirrored,
 )
-from training.loop import Schedule, begun, stacked, train
 
 SPOT_PX: Final = 1.5  # sigma of the spots at centres and ends, in pixels of the maps
 SPOT_WEIGHT: Final = 20.0

@@ -1,0 +1,1 @@
+"""Training of paper A's grasp network: Cornell rectangles and physical labels."""

@@ -21,7 +21,7 @@ GUARD: Final = 4
 """Numbers beside a test run that are not trained on. An object has 3 to 5 pictures in a row, by looking at them."""
 
 
-class DataRefused(ValueError):
+class DatasetError(ValueError):
     """A folder or file that is not in the layout; the message says what is wrong and where."""
 
 
@@ -39,12 +39,12 @@ def load(folder: Path) -> tuple[Sample, ...]:
     """All samples in the order of their numbers.
 
     Raises:
-        DataRefused: no sample, or a file that cannot be read.
+        DatasetError: no sample, or a file that cannot be read.
     """
     files = sorted(folder.rglob("pcd*d.tiff")) if folder.is_dir() else []
     found = [s for path in files if (s := _sample(path)) is not None]
     if not found:
-        raise DataRefused(f"{folder}: no Cornell samples; it must hold pcdNNNNd.tiff beside pcdNNNNcpos.txt")
+        raise DatasetError(f"{folder}: no Cornell samples; it must hold pcdNNNNd.tiff beside pcdNNNNcpos.txt")
     return tuple(sorted(found, key=lambda s: s.number))
 
 
@@ -67,9 +67,9 @@ def depth(path: Path) -> np.ndarray:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             found = np.asarray(image, np.float32)
     except (OSError, UnidentifiedImageError, ValueError) as error:
-        raise DataRefused(f"{path}: cannot be read as a TIFF of float32 metres ({error})") from None
+        raise DatasetError(f"{path}: cannot be read as a TIFF of float32 metres ({error})") from None
     if found.ndim != 2:
-        raise DataRefused(f"{path}: is no depth picture but has the shape {found.shape}")
+        raise DatasetError(f"{path}: is no depth picture but has the shape {found.shape}")
     return np.where(np.isfinite(found) & (found > 0.0), found, np.float32(np.nan))
 
 
@@ -77,13 +77,13 @@ def rectangles(path: Path) -> tuple[Rectangle, ...]:
     """The rectangles of a label file; those with a corner that is no number are left out.
 
     Raises:
-        DataRefused: lines that are not two numbers, or no multiple of four of them.
+        DatasetError: lines that are not two numbers, or no multiple of four of them.
     """
     try:
         lines = [[float(x) for x in line.split()] for line in path.read_text().splitlines() if line.strip()]
         corners = np.array(lines, float).reshape(-1, 4, 2)
     except (ValueError, OSError) as error:
-        raise DataRefused(f"{path}: must hold four lines 'x y' for every rectangle ({error})") from None
+        raise DatasetError(f"{path}: must hold four lines 'x y' for every rectangle ({error})") from None
     made = (from_corners(c) for c in corners if np.isfinite(c).all())
     return tuple(r for r in made if r.opening_px > 0.0 and r.jaw_px > 0.0)
 

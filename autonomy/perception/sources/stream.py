@@ -1,4 +1,4 @@
-"""Frames over a local stream socket (``can_dbc.rgbd``): what a plant or a camera process on this host serves.
+"""Frames over a local stream socket (``can_dbc.messages.rgbd``): what a plant or a camera process on this host serves.
 
 Pull-style: the newest frame is asked for.  A call never takes longer than its timeout; what has come by then is kept
 for the next one.  A connection that breaks, or on which anything broken comes, is opened anew.
@@ -12,9 +12,9 @@ import time
 
 import numpy as np
 
-from autonomy.perception.frame import Frame
-from can_dbc.rgbd import MM_M, START_BYTES, RgbdError, RgbdFrame, decode, encode_question, start
-from machine.optics import Intrinsics
+from autonomy.perception.camera.frame import RgbdFrame
+from can_dbc.messages.rgbd import MM_M, START_BYTES, RgbdError, RgbdMessage, decode, encode_question, start
+from machine.geometry.optics import Intrinsics
 
 CHUNK: int = 1 << 20
 
@@ -31,7 +31,7 @@ class StreamCamera:
         self._asked, self._data = False, bytearray()
         self.problem = ""
 
-    def frame(self) -> Frame | None:
+    def frame(self) -> RgbdFrame | None:
         """The newest frame, or None with ``problem`` set."""
         end_s = time.monotonic() + self._timeout_s
         try:
@@ -51,7 +51,7 @@ class StreamCamera:
         self._socket, self._asked = None, False
         self._data.clear()
 
-    def _answer(self, end_s: float) -> Frame | None:
+    def _answer(self, end_s: float) -> RgbdFrame | None:
         sock = self._socket or self._connected(end_s)
         if not self._asked:
             sock.settimeout(_left(end_s))
@@ -77,7 +77,7 @@ class StreamCamera:
         data = bytes(self._data)
         self._data.clear()
         self._asked = False
-        return received(decode(data))
+        return frame_from_message(decode(data))
 
     def _connected(self, end_s: float) -> socket.socket:
         if self._address.startswith("unix:"):
@@ -101,11 +101,11 @@ def _left(end_s: float) -> float:
     return max(1e-3, end_s - time.monotonic())
 
 
-def received(sent: RgbdFrame) -> Frame:
+def frame_from_message(sent: RgbdMessage) -> RgbdFrame:
     """A frame as it came over the wire: depth in m, NaN where it is unknown."""
     shape = (sent.height_px, sent.width_px)
     depth_m = np.frombuffer(sent.depth_mm, "<u2").reshape(shape).astype(np.float32) / np.float32(MM_M)
     depth_m[depth_m == 0.0] = np.nan
     pin = Intrinsics(sent.width_px, sent.height_px, sent.fx_px, sent.fy_px, sent.cx_px, sent.cy_px)
     rgb = np.frombuffer(sent.rgb, np.uint8).reshape(*shape, 3)
-    return Frame(sent.camera, sent.stamp_ns, rgb, depth_m, pin)
+    return RgbdFrame(sent.camera, sent.stamp_ns, rgb, depth_m, pin)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from autonomy.perception.frame import Frame
-from autonomy.perception.sources import SourceError
-from machine.optics import Intrinsics
+from autonomy.perception.camera.frame import RgbdFrame
+from autonomy.perception.sources.camera_source import SourceError
+from machine.geometry.optics import Intrinsics
 
 
 class ZedCamera:
@@ -42,7 +42,7 @@ class ZedCamera:
         self._pin = pin
         self._picture, self._depth = sl.Mat(), sl.Mat()
 
-    def frame(self) -> Frame | None:
+    def frame(self) -> RgbdFrame | None:
         """The next frame; None when the camera had none in time.
 
         Raises:
@@ -61,7 +61,7 @@ class ZedCamera:
         depth[~np.isfinite(depth) | (depth <= 0.0)] = np.nan
         rgb = np.ascontiguousarray(bgra[..., 2::-1])
         stamp_ns = int(camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds())
-        return Frame(self._name, stamp_ns, rgb, depth, self._pin)
+        return RgbdFrame(self._name, stamp_ns, rgb, depth, self._pin)
 
     def close(self) -> None:
         """Release the camera."""

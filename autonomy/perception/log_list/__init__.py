@@ -1,0 +1,1 @@
+"""What perception reports: log observations, their covariance, their datagrams."""

@@ -1,0 +1,125 @@
+"""The log list's datagrams: a request for logs and the reply of a detector.
+
+The request is ``{"op":"logs","q":"..."}``.  ``q`` holds the joint positions [rad, m] in the order of ``Joint``, "nan"
+where a joint is not measured: a detector whose camera rides on the crane needs them.  The reply is
+``[{"position_m","axis","length_m","diameter_m","id","covariance","seen"}, ...]`` in the crane's base frame, or
+``{"error": SENTENCE}``.  ``id`` is the log's number (default: its index in the list), ``covariance`` may be missing, and
+``seen`` is false when the log is remembered from an earlier picture.
+
+A list is accepted or refused as a whole.  It is refused for a number that is not finite, an axis without length, a log
+that is wider than long (the cause of paper A's only real failures), a negative variance, or a number used twice.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import msgspec
+
+from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
+from machine.joints import N_JOINTS
+from runtime.errors import CodedError
+
+_ROWS: Final = 7
+_DIAGONAL: Final = tuple(TRIANGLE - k * (k + 1) // 2 for k in range(_ROWS, 0, -1))
+_MIN_AXIS_NORM: Final = 1e-6
+
+
+class LogListError(CodedError, ValueError):
+    """A request or a log list that was refused as a whole."""
+
+
+class _Log(msgspec.Struct):
+    position_m: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    length_m: float
+    diameter_m: float
+    id: int | None = None
+    covariance: tuple[float, ...] | None = None
+    seen: bool = True
+
+
+class _Error(msgspec.Struct, forbid_unknown_fields=True):
+    error: str
+
+
+class _Request(msgspec.Struct):
+    op: str
+    q: str = ""
+
+
+_REPLIES: Final = msgspec.json.Decoder(list[_Log] | _Error)
+_REQUESTS: Final = msgspec.json.Decoder(_Request)
+
+
+def encode_request(q: Sequence[float]) -> bytes:
+    """A request for logs; ``q`` are the joint positions, empty when none are known."""
+    return msgspec.json.encode(_Request("logs", " ".join(f"{value:.6g}" for value in q)))
+
+
+def decode_request(data: bytes) -> tuple[float, ...]:
+    """The ``N_JOINTS`` joint positions of a request; all NaN when it holds none.
+
+    Raises:
+        LogListError: the datagram is not a request for logs.
+    """
+    try:
+        request = _REQUESTS.decode(data)
+        q = tuple(float(word) for word in request.q.split()) or (math.nan,) * N_JOINTS
+    except (msgspec.DecodeError, ValueError) as error:
+        raise LogListError("log-list.not-a-request", f"the datagram is not a request for logs: {error}") from None
+    if request.op != "logs" or len(q) != N_JOINTS:
+        raise LogListError(
+            "log-list.not-a-request",
+            f"the datagram is not a request for logs: op {request.op!r} with {len(q)} joints instead of {N_JOINTS}",
+        )
+    return q
+
+
+def encode_logs(logs: Iterable[LogObservation]) -> bytes:
+    """A reply with a log list."""
+    rows = [_Log(o.center_m, o.axis, o.length_m, o.diameter_m, o.id, o.covariance, o.seen) for o in logs]
+    return msgspec.json.encode(rows)
+
+
+def encode_error(sentence: str) -> bytes:
+    """A reply without a log list: ``sentence`` says why there is none."""
+    return msgspec.json.encode(_Error(sentence))
+
+
+def decode_logs(data: bytes) -> tuple[LogObservation, ...]:
+    """The log list of a reply, axes normalised.
+
+    Raises:
+        LogListError: the reply is not a log list, a log in it is impossible, or the reply is an error.
+    """
+    try:
+        reply = _REPLIES.decode(data)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise LogListError("log-list.not-a-list", f"the detector's reply is not a log list: {error}") from None
+    if isinstance(reply, _Error):
+        raise LogListError("log-list.detector-error", reply.error)
+    logs = tuple(_checked(index if log.id is None else log.id, log) for index, log in enumerate(reply))
+    if len({log.id for log in logs}) < len(logs):
+        raise LogListError("log-list.duplicate-id", "two logs of the detector's reply have the same number")
+    return logs
+
+
+def _checked(number: int, log: _Log) -> LogObservation:
+    norm = math.hypot(*log.axis)
+    if not all(map(math.isfinite, (*log.position_m, norm, log.length_m, log.diameter_m))) or norm < _MIN_AXIS_NORM:
+        raise LogListError("log-list.bad-value", f"log {number} has a value that is not finite or an axis of length 0")
+    if not 0.0 < log.diameter_m < log.length_m:
+        raise LogListError(
+            "log-list.bad-size", f"log {number} is {log.length_m:g} m long and {log.diameter_m:g} m wide: not a log"
+        )
+    c = log.covariance
+    if c is not None and (len(c) != TRIANGLE or not all(map(math.isfinite, c)) or min(c[i] for i in _DIAGONAL) < 0.0):
+        raise LogListError(
+            "log-list.bad-covariance",
+            f"log {number} has an invalid covariance; it must be {TRIANGLE} finite numbers without a negative variance",
+        )
+    axis = (log.axis[0] / norm, log.axis[1] / norm, log.axis[2] / norm)
+    return LogObservation(number, log.position_m, axis, log.length_m, log.diameter_m, c, log.seen)

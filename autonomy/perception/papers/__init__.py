@@ -1,0 +1,1 @@
+"""The perception of papers A and B, implemented faithfully for comparison."""

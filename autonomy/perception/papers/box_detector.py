@@ -1,0 +1,106 @@
+"""Paper B's detector in its role (3.2.2): a letterboxed colour picture of 608 x 608 px in, boxes of logs out.
+
+The paper uses YOLOv3 (62 million parameters).  This is a small network of our own that answers the same question: at
+every eighth pixel whether the middle of a log's box is there, and how far the box's sides are.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy import ndimage
+
+from autonomy.networks.graph import Add, BatchNorm, Conv, Layer, Network, Relu, Resize
+from autonomy.networks.openvino_net import OpenVinoNet
+from autonomy.networks.weights import SHIPPED, load
+
+SIZE_PX: Final = 608
+STRIDE: Final = 8
+LEAST_SCORE: Final = 0.05
+MOST_OVERLAP: Final = 0.75  # of two boxes that are two logs: those of slanting neighbours overlap a lot
+SIDES: Final = 4  # left, top, right, bottom: logarithms of distances in STRIDE
+
+
+def box_net() -> Network:
+    """The network: colour (3, H, W) about -1..1 in; ``boxes`` (5, H / 8, W / 8) out, a logit and four sides."""
+    layers: list[Layer] = []
+
+    def conv(name: str, out: int, stride: int = 1, dilation: int = 1) -> str:
+        layers.append(Conv(name, out, 3, stride, dilation, bias=False))
+        layers.extend((BatchNorm(f"{name}_norm"), Relu(f"{name}_relu")))
+        return f"{name}_relu"
+
+    conv("in2", 16, stride=2)
+    conv("in4", 32, stride=2)
+    conv("at4", 32)
+    conv("in8", 64, stride=2)
+    at8 = conv("at8", 64)
+    conv("in16", 96, stride=2)
+    conv("at16", 96)
+    conv("wide16", 96, dilation=2)
+    conv("wider16", 96, dilation=4)
+    layers.append(Conv("to8", 64, 1))
+    layers.append(Resize("to8_up", 2))
+    layers.append(Add("sum8", ("to8_up", at8)))
+    conv("out8", 64)
+    conv("more8", 64)
+    layers.append(Conv("boxes", 1 + SIDES, 1))
+    return Network("log_boxes", 3, tuple(layers), ("boxes",))
+
+
+class BoxDetector:
+    """The detector with its weights (None: the shipped ones), on one thread.
+
+    Raises:
+        WeightsRefused: the weights are missing, damaged or of another network.
+    """
+
+    def __init__(self, weights: Path | None = None, precision: str = "f32") -> None:
+        network = box_net()
+        arrays, self.facts = load(weights or SHIPPED / "log_boxes.safetensors", network)
+        self._net = OpenVinoNet(network, arrays, (1, 3, SIZE_PX, SIZE_PX), precision)
+
+    def detect(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Boxes (N, 4) left, top, right, bottom [px] in a picture (608, 608, 3) uint8 and their scores (N,), the surest
+        first.
+
+        Raises:
+            ValueError: a picture of another size or kind.
+        """
+        if rgb.shape != (SIZE_PX, SIZE_PX, 3) or rgb.dtype != np.uint8:
+            raise ValueError(
+                f"the detector takes letterboxed pictures of {SIZE_PX} x {SIZE_PX} px, uint8, not {rgb.dtype} of shape "
+                f"{rgb.shape}"
+            )
+        return decoded(self._net(colour(rgb)[None])["boxes"][0])
+
+
+def colour(rgb: np.ndarray) -> np.ndarray:
+    """Input (3, H, W) float32 of a picture (H, W, 3) uint8."""
+    return np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32) * np.float32(1.0 / 127.5) - np.float32(1.0)
+
+
+def decoded(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (N, 4) [px] and scores (N,) of maps (5, h, w): local maxima, without those that another one covers."""
+    score = 1.0 / (1.0 + np.exp(-maps[0]))
+    peak = (score >= LEAST_SCORE) & (score == ndimage.maximum_filter(score, 3, mode="constant"))
+    y, x = np.nonzero(peak)
+    order = np.argsort(-score[y, x], kind="stable")
+    y, x = y[order], x[order]
+    middle = np.stack([x, y], axis=1) * STRIDE + 0.5 * STRIDE
+    sides = np.exp(np.clip(maps[1:, y, x].T, -4.0, 5.0)) * STRIDE
+    boxes = np.concatenate([middle - sides[:, :2], middle + sides[:, 2:]], axis=1)
+    boxes = np.clip(boxes, 0.0, (maps.shape[2] * STRIDE, maps.shape[1] * STRIDE) * 2)
+    kept: list[int] = []
+    for i in range(len(boxes)):
+        if not kept or _overlaps(boxes[i], boxes[kept]).max() < MOST_OVERLAP:
+            kept.append(i)
+    return boxes[kept], score[y[kept], x[kept]]
+
+
+def _overlaps(box: np.ndarray, others: np.ndarray) -> np.ndarray:
+    shared = np.prod(np.maximum(np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2]), 0.0), axis=1)
+    areas = np.prod(others[:, 2:] - others[:, :2], axis=1) + np.prod(box[2:] - box[:2])
+    return np.divide(shared, areas - shared, out=np.zeros_like(shared), where=areas > shared)

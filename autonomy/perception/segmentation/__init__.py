@@ -1,0 +1,1 @@
+"""Instance segmentation of logs: a network's maps, segments, merged segments, masks."""

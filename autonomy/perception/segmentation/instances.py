@@ -1,0 +1,140 @@
+"""The logs of a picture: the network's maps, the regions they are parted into, and of each mask, box, axis and ends.
+
+A mask's outline runs through the picture's pixels: the map's probabilities are interpolated and cut at a half.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy import ndimage
+
+from autonomy.perception.segmentation.network import ENDS, MASK, STRIDE
+from autonomy.perception.segmentation.resize import bilinear
+from autonomy.perception.segmentation.segment_merging import LogSegment, SegmentScorers, parted
+from autonomy.perception.segmentation.segments import Foreground, scene
+from autonomy.perception.segmentation.watershed import sigmoid
+
+LEAST_MASK: Final = 0.5
+LEAST_END: Final = 0.3
+LEAST_DEPTH_M: Final = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Instance:
+    """One log in one picture.
+
+    mask (H, W) bool; ``box_px`` left, top, right, bottom of the mask, the last two exclusive; score 0..1; ``axis_px``
+    angle of the log's axis in the picture [rad, -pi/2..pi/2); ``ends_px`` both ends of the axis (u, v) [px] in its
+    direction; ``ends_seen`` which of them are the log's own, not where something hides it.
+    """
+
+    mask: np.ndarray
+    box_px: tuple[int, int, int, int]
+    score: float
+    axis_px: float
+    ends_px: tuple[tuple[float, float], tuple[float, float]]
+    ends_seen: tuple[bool, bool]
+
+
+def instances(maps: np.ndarray, scale: int, depth_m: np.ndarray, judges: SegmentScorers) -> tuple[Instance, ...]:
+    """The logs of maps (8, h, w), one pixel of which is ``scale`` pixels wide in a picture with depth (H, W) [m]."""
+    seen = foreground_of(maps, scale, depth_m)
+    regions = parted(seen, judges)
+    if not regions:
+        return ()
+    sure, x, y, shape = sigmoid(maps[MASK]), seen.x, seen.y, depth_m.shape
+    labels = np.zeros(sure.shape, np.int32)
+    for number, region in enumerate(regions, 1):
+        labels[y[region.own], x[region.own]] = number
+    sure = np.where((sure > LEAST_MASK) & (labels == 0), 0.0, sure)
+    # Beside a log its half sure pixels belong to it too, for the outline runs through them.
+    nearest = ndimage.distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
+    labels = labels[tuple(nearest)]
+    ends = sigmoid(maps[ENDS])
+    found = []
+    for number, region in enumerate(regions, 1):
+        if instance := _instance(region, number, x, y, labels, sure, ends, scale, shape):
+            found.append(instance)
+    return tuple(sorted(found, key=lambda i: -i.score))
+
+
+def foreground_of(maps: np.ndarray, scale: int, depth_m: np.ndarray) -> Foreground:
+    """What the regions are parted from: maps (8, h, w) and the depth in the middle of each of their pixels."""
+    sure = sigmoid(maps[MASK])
+    inverse = np.full(sure.shape, np.nan, np.float32)
+    middle = depth_m[scale // 2 :: scale, scale // 2 :: scale][: sure.shape[0], : sure.shape[1]]
+    inverse[: middle.shape[0], : middle.shape[1]] = 1.0 / np.maximum(middle, LEAST_DEPTH_M)
+    return scene(maps, sure, sure > LEAST_MASK, inverse, max(1, STRIDE // scale) ** 2)
+
+
+def _instance(
+    region: LogSegment,
+    number: int,
+    x: np.ndarray,
+    y: np.ndarray,
+    labels: np.ndarray,
+    sure: np.ndarray,
+    ends: np.ndarray,
+    scale: int,
+    shape: tuple[int, int],
+) -> Instance | None:
+    """The region at the resolution of the picture, ``scale`` pixels for each of a map's."""
+    px, py = x[region.own], y[region.own]
+    x0, x1 = max(0, int(px.min()) - 2), min(sure.shape[1], int(px.max()) + 3)
+    y0, y1 = max(0, int(py.min()) - 2), min(sure.shape[0], int(py.max()) + 3)
+    window = sure[y0:y1, x0:x1] * (labels[y0:y1, x0:x1] == number)
+    fine = bilinear(y1 - y0, scale) @ window @ bilinear(x1 - x0, scale).T
+    top, left = y0 * scale, x0 * scale
+    inside = fine[: shape[0] - top, : shape[1] - left] > LEAST_MASK
+    v, u = np.nonzero(inside)
+    if not len(u):
+        return None
+    v, u = v + top, u + left
+    mask = np.zeros(shape, bool)
+    mask[top : top + inside.shape[0], left : left + inside.shape[1]] = inside
+    axis = region.axis if region.axis[0] >= 0.0 else -region.axis
+    across = np.array([-axis[1], axis[0]])
+    along, side = u * axis[0] + v * axis[1], float(np.median(u * across[0] + v * across[1]))
+    low, high = np.percentile(along, (0.5, 99.5))
+    half = float(np.percentile(np.abs(u * across[0] + v * across[1] - side), 90))
+    points, seen = [], []
+    for reach in (low, high):
+        point, own = _end(reach * axis + side * across, ends, scale, max(2.0 * scale, 1.2 * half))
+        points.append(point)
+        seen.append(own)
+    box = (int(u.min()), int(v.min()), int(u.max()) + 1, int(v.max()) + 1)
+    return Instance(
+        mask, box, region.score, math.atan2(float(axis[1]), float(axis[0])), (points[0], points[1]), (seen[0], seen[1])
+    )
+
+
+def _end(point: np.ndarray, ends: np.ndarray, scale: int, reach_px: float) -> tuple[tuple[float, float], bool]:
+    """The end near ``point`` where the map of ends has one, else the point itself; and whether it has."""
+    at, reach = (point + 0.5) / scale - 0.5, reach_px / scale
+    x0, y0 = (max(0, math.floor(c - reach)) for c in at)
+    patch = ends[y0 : math.ceil(at[1] + reach) + 1, x0 : math.ceil(at[0] + reach) + 1]
+    if not patch.size or patch.max() < LEAST_END:
+        return (float(point[0]), float(point[1])), False
+    row, column = np.unravel_index(int(np.argmax(patch)), patch.shape)
+    weight = patch * (patch > 0.5 * patch.max())
+    rows, columns = np.ogrid[: patch.shape[0], : patch.shape[1]]
+    weight = weight * ((rows - row) ** 2 + (columns - column) ** 2 <= 9)
+    total = weight.sum()
+    u = (x0 + float((weight * columns).sum() / total) + 0.5) * scale - 0.5
+    v = (y0 + float((weight * rows).sum() / total) + 0.5) * scale - 0.5
+    return (u, v), True
+
+
+def placed(found: Instance, left: int, top: int, shape: tuple[int, int]) -> Instance:
+    """An instance of a window at (left, top) in the whole picture."""
+    mask = np.zeros(shape, bool)
+    mask[top : top + found.mask.shape[0], left : left + found.mask.shape[1]] = found.mask
+    x0, y0, x1, y1 = found.box_px
+    (a, b), (c, d) = found.ends_px
+    ends = ((a + left, b + top), (c + left, d + top))
+    box = (x0 + left, y0 + top, x1 + left, y1 + top)
+    return Instance(mask, box, found.score, found.axis_px, ends, found.ends_seen)

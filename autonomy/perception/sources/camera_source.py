@@ -1,0 +1,28 @@
+"""The protocol of a source of camera frames: a frame folder, a stereo camera or a socket."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from autonomy.perception.camera.frame import RgbdFrame
+from runtime.errors import CodedError
+
+
+class SourceError(CodedError, ValueError):
+    """A source that cannot be opened or read."""
+
+
+class CameraSource(Protocol):
+    """A camera that delivers frames on request."""
+
+    def frame(self) -> RgbdFrame | None:
+        """The newest frame; None when there is none yet, none in time, or none left.
+
+        Raises:
+            SourceError: the source cannot deliver frames.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release the source."""
+        ...

@@ -1,0 +1,130 @@
+"""A folder of RGB-D pictures: ``camera.json`` and, for each frame, ``NNNNNN.png`` and its depth.
+
+``camera.json`` holds the camera's name, the intrinsics, how depth is stored and the frames' stamps.  Depth is
+``NNNNNN.depth.png``, 16-bit whole millimetres, 0 = unknown, or ``NNNNNN.npy``, floating metres, NaN = unknown.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+from PIL import Image
+
+from autonomy.perception.camera.frame import RgbdFrame
+from autonomy.perception.sources.camera_source import SourceError
+from machine.geometry.optics import Intrinsics
+
+INDEX: Final = "camera.json"
+MM_M: Final = 1000.0
+
+
+class Index(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What ``camera.json`` holds; one stamp [ns] a frame."""
+
+    camera: str
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    depth: Literal["png", "npy"]
+    stamps_ns: tuple[int, ...]
+
+
+class Recording:
+    """A recorded folder as a source: every call gives the next frame, None after the last.
+
+    Raises:
+        SourceError: it is no recording.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._next = Path(folder), 0
+        path = self._folder / INDEX
+        try:
+            self.index = msgspec.json.decode(path.read_bytes(), type=Index)
+        except OSError as error:
+            raise SourceError(f"{folder} is no recording: {error.strerror or error} ({INDEX})") from None
+        except msgspec.DecodeError as error:
+            raise SourceError(f"{path}: {error}; record the folder again or correct the file") from None
+
+    def __len__(self) -> int:
+        return len(self.index.stamps_ns)
+
+    def frame(self) -> RgbdFrame | None:
+        """The next frame; SourceError when its pictures are missing or of another size."""
+        if self._next == len(self):
+            return None
+        frame = self.at(self._next)
+        self._next += 1
+        return frame
+
+    def at(self, number: int) -> RgbdFrame:
+        """Frame ``number``, from 0."""
+        i, stem = self.index, f"{number:06d}"
+        try:
+            with Image.open(self._folder / f"{stem}.png") as picture:
+                rgb = np.asarray(picture.convert("RGB"))
+            depth_m = self._depth(stem)
+        except (OSError, ValueError) as error:
+            raise SourceError(f"frame {number} of {self._folder} cannot be read: {error}") from None
+        if rgb.shape[:2] != (i.height_px, i.width_px) or depth_m.shape != rgb.shape[:2]:
+            raise SourceError(
+                f"frame {number} of {self._folder} is {rgb.shape[1]} x {rgb.shape[0]} px with depth of shape "
+                f"{depth_m.shape}, but {INDEX} says {i.width_px} x {i.height_px} px"
+            )
+        pin = Intrinsics(i.width_px, i.height_px, i.fx_px, i.fy_px, i.cx_px, i.cy_px)
+        return RgbdFrame(i.camera, i.stamps_ns[number], rgb, depth_m, pin)
+
+    def _depth(self, stem: str) -> np.ndarray:
+        if self.index.depth == "npy":
+            return np.load(self._folder / f"{stem}.npy", allow_pickle=False).astype(np.float32)
+        with Image.open(self._folder / f"{stem}.depth.png") as picture:
+            depth_m = np.asarray(picture).astype(np.float32) / np.float32(MM_M)
+        depth_m[depth_m == 0.0] = np.nan
+        return depth_m
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+class Recorder:
+    """Writes a recording, frame by frame; ``close`` writes its index.
+
+    Raises:
+        SourceError: the folder already holds a recording, or a frame is not like the first.
+    """
+
+    def __init__(self, folder: Path, depth: Literal["png", "npy"] = "png") -> None:
+        self._folder, self._depth = Path(folder), depth
+        if (self._folder / INDEX).exists():
+            raise SourceError(f"{folder} already holds a recording; choose another folder")
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._first: RgbdFrame | None = None
+        self._stamps_ns: list[int] = []
+
+    def add(self, frame: RgbdFrame) -> None:
+        """Write one frame."""
+        first = self._first or frame
+        if (frame.camera, frame.intrinsics) != (first.camera, first.intrinsics):
+            raise SourceError(f"a frame of camera {frame.camera!r} does not belong in a recording of {first.camera!r}")
+        self._first, stem = first, f"{len(self._stamps_ns):06d}"
+        Image.fromarray(frame.rgb).save(self._folder / f"{stem}.png")
+        if self._depth == "npy":
+            np.save(self._folder / f"{stem}.npy", frame.depth_m)
+        else:
+            millimetres = np.clip(np.rint(np.nan_to_num(frame.depth_m, nan=0.0) * MM_M), 0, 65535).astype(np.uint16)
+            Image.fromarray(millimetres).save(self._folder / f"{stem}.depth.png")
+        self._stamps_ns.append(frame.stamp_ns)
+
+    def close(self) -> None:
+        """Write the index; without a frame there is nothing to write."""
+        if self._first is not None:
+            p = self._first.intrinsics
+            numbers = (p.width_px, p.height_px, p.fx_px, p.fy_px, p.cx_px, p.cy_px)
+            index = Index(self._first.camera, *numbers, self._depth, tuple(self._stamps_ns))
+            (self._folder / INDEX).write_bytes(msgspec.json.format(msgspec.json.encode(index)))

@@ -1,0 +1,1 @@
+"""Logs over time: data association and one filter for each log."""

@@ -1,0 +1,1 @@
+"""Demonstrated motions in recordings, from which movement primitives are learned."""

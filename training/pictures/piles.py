@@ -1,0 +1,177 @@
+"""Settled piles to learn from: each is brought to rest once by the plant's physics and kept on disk.
+
+A chunk of CHUNK piles depends on the machine and the chunk's number alone, so a split by chunk is a split by pile.
+Chunks of HELD_OUT and above are never trained on: they are the experiments'.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from machine.loading.profile_file import load_profile
+from machine.profile import Profile
+from sim.camera.scene import Ground, LogPose
+from sim.geometry.shape import Vector
+from sim.ground.terrain import Terrain
+from sim.scenes.arrangements import KINDS
+from sim.scenes.settled_logs import settled
+
+EDITION: Final = 1  # raised when the same seed would give other piles
+CHUNK: Final = 64
+HELD_OUT: Final = 1_000_000
+TERRAINS: Final = 12  # grounds are dear to make: so many are shared by all piles of a kind
+MACHINES: Final = ("palms_471", "aoro_fc8")
+SHARES: Final = {
+    "palms_471": {
+        "single": 1.0, "separate": 2.0, "parallel": 1.5, "skewed": 1.0, "crossed": 2.0, "pile": 4.0, "bunk": 1.0,
+    },
+    "aoro_fc8": {
+        "single": 1.5, "separate": 2.0, "parallel": 1.0, "skewed": 1.0, "crossed": 1.5, "pile": 2.0, "row": 2.0,
+    },
+}  # fmt: skip
+"""How often a kind of ``sim.scenes.arrangements`` is drawn for a machine."""
+MOST: Final = {"separate": 5, "row": 10, "bunk": 12}
+ROUTE_M: Final = 3.2  # of a row, for each log
+COLUMNS: Final = 11
+
+
+@dataclass(frozen=True, slots=True)
+class Pile:
+    """Logs at rest, world frame, instances 1, 2, ...; ``kind`` as in ``sim.scenes.arrangements``; ``number`` within the machine;
+    the ground is ``terrain`` of ``terrain_seed`` with its datum at ``datum_m``."""
+
+    machine: str
+    number: int
+    kind: str
+    terrain: str
+    terrain_seed: int
+    datum_m: float
+    logs: tuple[LogPose, ...]
+
+    @property
+    def middle_m(self) -> Vector:
+        """Mean of the logs' middles."""
+        x, y, z = np.mean([log.position_m for log in self.logs], axis=0)
+        return (float(x), float(y), float(z))
+
+
+@cache
+def profile_of(machine: str) -> Profile:
+    """The shipped profile of a machine, read once."""
+    return load_profile(machine)
+
+
+@lru_cache(maxsize=2 * TERRAINS + 4)
+def terrain_of(kind: str, seed: int, datum_m: float) -> Terrain:
+    """The ground of a pile; rough ones are remembered."""
+    return Terrain(kind, seed, datum_m)
+
+
+def ground_of(pile: Pile) -> Ground:
+    """The ground of a pile as the renderer wants it."""
+    return Ground(*terrain_of(pile.terrain, pile.terrain_seed, pile.datum_m).grid)
+
+
+def cache_folder() -> Path:
+    """Where piles are kept unless a folder is given: below XDG_CACHE_HOME or ~/.cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "timberhand" / "piles"
+
+
+def settle(machine: str, number: int) -> Pile:
+    """One pile by its number.  A draw that finds no room or no rest is drawn again.
+
+    Raises ValueError when fifty draws in a row fail.
+    """
+    profile = profile_of(machine)
+    rng = random.Random(f"pile {machine} {number}")
+    mobile = profile.carrier is not None
+    datum = 0.0 if mobile else profile.workspace.ground_z_m
+    last: ValueError | None = None
+    for _ in range(50):
+        kind = rng.choices(list(SHARES[machine]), list(SHARES[machine].values()))[0]
+        low, high = KINDS[kind]
+        logs = rng.randint(max(low, 3 if kind in ("row", "bunk") else low), min(high, MOST.get(kind, high)))
+        # A fixed machine stands on a yard, a carrier on whatever there is.
+        ground = rng.choices(("flat", "slope", "rough"), (2.0, 1.0, 3.0) if mobile else (8.0, 1.0, 1.0))[0]
+        terrain_seed = rng.randrange(TERRAINS) + (TERRAINS if number >= HELD_OUT * CHUNK else 0)
+        route = ((0.0, 0.0), (6.0 + ROUTE_M * logs, 0.0))
+        terrain = terrain_of(ground, terrain_seed if ground == "rough" else 0, datum)
+        try:
+            poses = settled(profile, kind, rng.getrandbits(31), logs, terrain, route)
+        except ValueError as error:
+            last = error
+            continue
+        return Pile(machine, number, kind, ground, terrain_seed if ground == "rough" else 0, datum, poses)
+    raise ValueError(f"pile {number} of {machine} found no rest in 50 draws; the last reason: {last}")
+
+
+def chunk(machine: str, index: int, folder: Path | None = None, tick: Callable[[], None] = lambda: None) -> list[Pile]:
+    """CHUNK piles, read from ``folder`` (default ``cache_folder()``) or settled and kept there; ``tick`` after each.
+
+    Raises ValueError for a file that does not hold such piles.
+    """
+    path = (folder or cache_folder()) / f"{machine}-{index:07d}-e{EDITION}.npz"
+    if path.exists():
+        return _read(path, machine, index)
+    piles = []
+    for number in range(index * CHUNK, (index + 1) * CHUNK):
+        piles.append(settle(machine, number))
+        tick()
+    _write(path, piles)
+    return piles
+
+
+def piles(machine: str, first_chunk: int, chunks: int, folder: Path | None = None) -> Iterator[Pile]:
+    """The piles of several chunks, in order."""
+    for index in range(first_chunk, first_chunk + chunks):
+        yield from chunk(machine, index, folder)
+
+
+def _write(path: Path, baked: list[Pile]) -> None:
+    rows = [
+        (*log.position_m, *log.quaternion, log.length_m, log.diameter_m, log.taper_m_m, log.sweep_m)
+        for pile in baked
+        for log in pile.logs
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(f".{os.getpid()}.part.npz")
+    np.savez_compressed(
+        part,
+        logs=np.array(rows),
+        counts=np.array([len(p.logs) for p in baked]),
+        kinds=np.array([p.kind for p in baked]),
+        terrains=np.array([p.terrain for p in baked]),
+        terrain_seeds=np.array([p.terrain_seed for p in baked]),
+        datum_m=np.array([p.datum_m for p in baked]),
+    )
+    part.replace(path)  # whole or not at all, whoever else bakes
+
+
+def _read(path: Path, machine: str, index: int) -> list[Pile]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: file[name] for name in file.files}
+        counts, rows = data["counts"].tolist(), data["logs"]
+        if len(counts) != CHUNK or rows.shape != (sum(counts), COLUMNS) or not np.isfinite(rows).all():
+            raise ValueError("wrong shape")
+        out, at = [], 0
+        for i, n in enumerate(counts):
+            logs = tuple(
+                LogPose(k + 1, tuple(r[:3]), tuple(r[3:7]), *r[7:]) for k, r in enumerate(rows[at : at + n].tolist())
+            )
+            at += n
+            ground = (str(data["terrains"][i]), int(data["terrain_seeds"][i]), float(data["datum_m"][i]))
+            out.append(Pile(machine, index * CHUNK + i, str(data["kinds"][i]), *ground, logs))
+        return out
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} does not hold settled piles ({error}); delete it and they are settled anew") from None
