@@ -1,1 +1,1 @@
-"""Where the machine is and which way it faces, from what the controller reports of a machine that drives."""
+"""Position and attitude of the machine from the controller's vehicle reports."""

@@ -1,8 +1,9 @@
-"""Points of the machine in the plane: rear frame, crane base and whatever stands in it, with how sure they are.
+"""Transforms of the machine in the plane: rear frame and crane base, with their uncertainty.
 
-The chain is rigid: middle of the front axle, articulation axis, rear frame, crane base (``machine.carrier``).  A
-camera's optical frame in the base is ``autonomy.perception.camera.mount.optical_pose``'s; both halves share roll and pitch
-about the articulation axis.
+
+The chain is rigid: centre of the front axle, articulation axis, rear frame, crane base (``machine.geometry.carrier``).
+The optical frame of a camera in the base is ``autonomy.perception.camera.mount.optical_pose``; both halves share roll
+and pitch about the articulation axis.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from autonomy.localization.location import Location
 from autonomy.localization.motion_model import Noise, axle_m, tilt
 from autonomy.perception.camera.frame import Pose
-from machine.carrier import rear_from_base, rear_from_front
+from machine.geometry.carrier import rear_from_base, rear_from_front
 from machine.profile import Carrier
 
 STEP: Final = 1e-6
@@ -31,7 +32,7 @@ class Placed:
 
 
 class Frames:
-    """The machine's frames at one location; a z that is not known is that of level ground at the plane's origin."""
+    """The machine's frames at one location; an unknown z is that of level ground at the plane's origin."""
 
     def __init__(self, carrier: Carrier, location: Location, noise: Noise | None = None) -> None:
         self._carrier = carrier
@@ -50,7 +51,7 @@ class Frames:
         self._spread[[2, 4, 5, 6], [2, 4, 5, 6]] = np.square(own)
 
     def rear(self) -> Pose:
-        """The rear frame: origin on the articulation axis."""
+        """The rear frame; its origin is on the articulation axis."""
         return self._rear(self._values)
 
     def base(self) -> Pose:
@@ -100,7 +101,7 @@ class Frames:
     def _rear(self, values: np.ndarray) -> Pose:
         x, y, z, yaw, bend, roll, pitch = values
         lean = tilt(roll, pitch)
-        ahead = lean @ (np.cos(bend), np.sin(bend), 0.0)  # where the front half points, the rear's yaw left out
+        ahead = lean @ (np.cos(bend), np.sin(bend), 0.0)  # direction of the front half without the rear's yaw
         rear = yaw - np.arctan2(ahead[1], ahead[0])
         c, s = np.cos(rear), np.sin(rear)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ lean

@@ -1,7 +1,7 @@
-"""The local plane in which the machine is located and drives: x east, y north, z up [m] about an origin on WGS-84.
+"""The local plane for localization and driving: x east, y north, z up [m] about a WGS84 origin (ENU, ROS REP 103).
 
-Angles in the plane count counter-clockwise from east; headings and bearings clockwise from true north stay at the bus
-and in the controller's reports.
+Angles in the plane are counter-clockwise from east; headings and bearings, clockwise from true north, are only used on
+the bus and in the controller's reports.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import pymap3d
 
-from machine.carrier import Point
+from machine.geometry.carrier import Point
 
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """East, north and up about a point given in degrees and metres above the ellipsoid."""
+    """East-north-up frame about an origin in degrees and metres above the ellipsoid."""
 
     latitude_deg: float
     longitude_deg: float
@@ -26,12 +26,12 @@ class Plane:
         good = abs(self.latitude_deg) <= 90.0 and abs(self.longitude_deg) <= 180.0 and math.isfinite(self.altitude_m)
         if not good:
             raise ValueError(
-                f"no origin of a plane: latitude {self.latitude_deg} deg, longitude {self.longitude_deg} deg, "
-                f"altitude {self.altitude_m} m"
+                f"invalid origin of the local plane: latitude {self.latitude_deg} deg, longitude "
+                f"{self.longitude_deg} deg, altitude {self.altitude_m} m"
             )
 
     def local(self, latitude_deg: float, longitude_deg: float, altitude_m: float | None = None) -> Point:
-        """East, north and up [m]; a point without an altitude lies at that of the origin."""
+        """East, north and up [m]; a point without an altitude is at that of the origin."""
         altitude = self.altitude_m if altitude_m is None else altitude_m
         e, n, u = pymap3d.geodetic2enu(
             latitude_deg, longitude_deg, altitude, self.latitude_deg, self.longitude_deg, self.altitude_m
@@ -47,15 +47,15 @@ class Plane:
 
 
 def wrapped(angle_rad: float) -> float:
-    """The same direction as an angle between -pi and pi."""
+    """The same direction between -pi and pi."""
     return math.remainder(angle_rad, 2.0 * math.pi)
 
 
 def yaw_from_heading(heading_rad: float) -> float:
-    """Counter-clockwise from east, from clockwise from north."""
+    """Yaw, counter-clockwise from east, of a heading, clockwise from north."""
     return wrapped(0.5 * math.pi - heading_rad)
 
 
 def heading_from_yaw(yaw_rad: float) -> float:
-    """Clockwise from north 0..2 pi, from counter-clockwise from east."""
+    """Heading, clockwise from north 0..2 pi, of a yaw, counter-clockwise from east."""
     return (0.5 * math.pi - yaw_rad) % (2.0 * math.pi)

@@ -1,10 +1,10 @@
-"""From the controller's reports of the vehicle to its location: dead reckoning, gates, loss and return.
+"""Location from the controller's vehicle reports: dead reckoning, gates, loss and recovery.
 
-``Localizer.step(report)`` takes every ``VehicleReport`` and gives a ``Location`` at its stamp.  It holds no clock.
-Positions and headings count from when they were true, not from when they came (``LATENCY_NS``).  Without a position
-and a heading that fit, the machine is located by its wheels for ``RECKONING_NS`` and then is lost, with a reason; it
-is located again once ``AGREEING`` positions in a row fit, or agree with each other about another place; so
-with headings, where the machine stands.
+``Localizer.step(report)`` accepts every ``VehicleReport`` and returns a ``Location`` at its stamp.  It holds no clock.
+Positions and headings are used at their time of validity (``LATENCY_NS`` before their reception).  Without a matching
+position and heading, the machine is located by its wheels for ``RECKONING_NS``; then it is lost, with a reason.  It
+recovers after ``AGREEING`` consecutive positions that match, or that agree with each other on another place; headings
+likewise, at standstill only.
 """
 
 from __future__ import annotations
@@ -19,37 +19,35 @@ from autonomy.localization.location import Location, Status
 from autonomy.localization.vehicle_filter import Filter
 from autonomy.localization.motion_model import Noise, Odometry, State, antenna_reach, drift_rad, front_attitude
 from autonomy.localization.local_plane import Plane, wrapped, yaw_from_heading
-from can_dbc.messages.crane import VehicleReport
+from can_dbc.messages.vehicle import VehicleReport
 from machine.profile import Carrier
 
 LATENCY_NS: Final = 75_000_000
 """From a measurement of the receiver to its reception: 50 to 100 ms (docs/reference/machines.md section 8, assumed)."""
 TURN_OVER_NS: Final = 50_000_000
-"""The receiver's rate of turn is a mean over this time (assumed)."""
+"""Averaging time of the receiver's rate of turn (assumed)."""
 FRESH_NS: Final = 500_000_000
-"""Older, a position is missing: five of its periods."""
+"""Greatest age of a position: five of its periods."""
 RECKONING_NS: Final = 2_000_000_000
 MOTION_NS: Final = 300_000_000
-"""Without speed and articulation for so long there is nothing to reckon with; before, the last ones hold."""
+"""Greatest age of speed and articulation; until then the last values hold."""
 CREEP: Final = 0.8
-"""A braked wheel turns with its swing arm and takes the machine along, unseen by the drive: metres per metre of height
+"""A braked wheel turns with its swing arm and moves the machine without being measured: metres per metre of height
 (measured on the plant: 0.14 m for 0.35 m).
 """
 AGREEING: Final = 5
 AGREE_SIGMAS: Final = 4.0
 MOST_TURN_RAD: Final = 0.5
-"""What turns the machine otherwise than its wheels say, as a log it ran into, turns it less; a heading that is farther
-off is a fault.
-"""
+"""Greatest turn caused by an external force, such as running into a log; a heading that is farther off is a fault."""
 STANDS_M_S: Final = 0.05
 FORGOTTEN_NS: Final = 1_000_000_000
-"""After a longer gap between reports nobody knows what the machine did meanwhile."""
+"""After a longer gap between reports the motion meanwhile is unknown."""
 BEGIN_M: Final = 3.0
 SECOND: Final = 1e9
 
 
 class Localizer:
-    """One machine.  ``plane`` None: its origin becomes the first position.
+    """Locates one machine.  ``plane`` None: the first position becomes its origin.
 
     ``rejected`` counts measurements outside their gates.
     """
@@ -65,12 +63,12 @@ class Localizer:
         self._fitting = 0
         self._strays: list[np.ndarray] = []
         self._turned: list[float] = []
-        """By how much the last headings did not fit."""
+        """Innovations of the last headings outside the gate."""
         self._jumps = 0
         self._z = (math.nan, math.inf)
 
     def step(self, report: VehicleReport) -> Location:
-        """Where the machine is at ``report.stamp_ns``."""
+        """The location at ``report.stamp_ns``."""
         last = self._last
         if last is not None and report.stamp_ns <= last.stamp_ns:
             return self._location(last)
@@ -93,7 +91,7 @@ class Localizer:
         return self._location(report)
 
     def _go(self, report: VehicleReport, last: VehicleReport | None, gap: int) -> None:
-        """On by what wheels and articulation did since the last report."""
+        """Predict with wheels and articulation since the last report."""
         assert last is not None
         roll, pitch = self._lean(report)
         wheels = 0.5 * (report.speed_m_s + last.speed_m_s) * gap / SECOND
@@ -116,7 +114,7 @@ class Localizer:
                 self._filter.turn(report.yaw_rate_rad_s, report.speed_m_s, TURN_OVER_NS, then)
 
     def _see(self, report: VehicleReport) -> None:
-        """A new position."""
+        """Update with a new position."""
         if self.plane is None:
             altitude = report.altitude_m if math.isfinite(report.altitude_m) else 0.0
             self.plane = Plane(report.latitude_deg, report.longitude_deg, altitude)
@@ -147,7 +145,7 @@ class Localizer:
             self._return(report)
 
     def _return(self, report: VehicleReport) -> None:
-        """Take the position anew where the last ones agree about another place."""
+        """Re-initialize the position when the last ones agree on another place."""
         del self._strays[:-AGREEING]
         sigma = self._noise.fixes[report.fix][0]
         middle = np.mean(self._strays, axis=0)
@@ -161,7 +159,7 @@ class Localizer:
         self._strays.clear()
 
     def _turn(self, report: VehicleReport, then: int) -> None:
-        """Take the heading anew where the last ones of a machine that stands agree about another one."""
+        """Re-initialize the heading of a standing machine when the last ones agree on another one."""
         if self._status is not Status.LOST or abs(report.speed_m_s) > STANDS_M_S:
             self._turned.clear()
             return
@@ -179,7 +177,7 @@ class Localizer:
             self._turned.clear()
 
     def _height(self, report: VehicleReport, reach_m: float) -> None:
-        """The axle's height: the receiver's altitudes, smoothed by how they scatter."""
+        """Height of the axle: the receiver's altitudes, smoothed by their scatter."""
         assert self.plane is not None
         if not math.isfinite(report.altitude_m):
             return
@@ -192,7 +190,7 @@ class Localizer:
         )
 
     def _judge(self, report: VehicleReport, moving: bool) -> None:
-        """Status from the ages of what fitted last."""
+        """Status from the ages of the last accepted measurements."""
         if self._status is Status.STARTING or not moving:
             self._status = Status.TRACKING if moving and self._fitting >= AGREEING else Status.STARTING
             if not moving:
@@ -223,8 +221,8 @@ class Localizer:
             if what == "position" and report.fix not in self._noise.fixes:
                 return "the receiver has no fix"
             if self._status is not Status.STARTING and stamp - fitted > FRESH_NS:
-                return f"the {what} from the receiver does not fit what the wheels do"
-        return "not enough positions that fit yet"
+                return f"the receiver's {what} does not match the wheels"
+        return "not enough matching positions yet"
 
     def _location(self, report: VehicleReport) -> Location:
         reason = self._reason(report)
@@ -242,7 +240,7 @@ class Localizer:
         )  # fmt: skip
 
     def _lean(self, report: VehicleReport) -> tuple[float, float]:
-        """Roll and pitch of the front half; level where they are not known."""
+        """Roll and pitch of the front half; level while unknown."""
         if not _finite(report.roll_rad, report.pitch_rad):
             return 0.0, 0.0
         return front_attitude(report.roll_rad, report.pitch_rad, report.articulation_rad)

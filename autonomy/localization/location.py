@@ -1,4 +1,4 @@
-"""What localization says: where the machine is, how sure of it, and why not when it cannot say."""
+"""The result of localization: position, its uncertainty, and the reason when there is none."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ import numpy as np
 
 
 class Status(IntEnum):
-    """How much a location is worth."""
+    """Quality of a location."""
 
     STARTING = 0
     """Not located yet."""
     TRACKING = 1
     DEAD_RECKONING = 2
-    """By wheels and articulation alone, for at most ``localizer.RECKONING_NS``."""
+    """By wheels and articulation only, for at most ``localizer.RECKONING_NS``."""
     LOST = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Location:
-    """The machine at ``stamp_ns``; ``reason`` says why it is not tracked, empty while it is.
+    """The machine at ``stamp_ns``; ``reason`` says why it is not tracked, empty otherwise.
 
-    ``x_m``, ``y_m`` are the middle of the front axle and ``yaw_rad`` the front half's direction, in the plane;
-    ``z_m`` the height of that middle, NaN while no altitude is known.  ``covariance`` (3, 3) is of x, y and yaw.
-    ``course_rad`` is where the front axle really goes, ``speed_m_s`` how fast, ``slip_curve_1_m`` the curvature that
-    slip adds to what the articulation makes.  Roll (+ right side down) and pitch (+ nose up) are of the rear half.
-    ``jumps`` counts how often position or heading were taken anew after they had been lost.
+    ``x_m``, ``y_m`` are the centre of the front axle and ``yaw_rad`` the direction of the front half, in the plane;
+    ``z_m`` is the height of that centre, NaN without an altitude.  ``covariance`` (3, 3) is of x, y and yaw.
+    ``course_rad`` is the direction in which the front axle moves, ``speed_m_s`` its speed, ``slip_curve_1_m`` the
+    curvature that slip adds to that of the articulation.  Roll (+ right side down) and pitch (+ nose up) are those of
+    the rear half.  ``jumps`` counts re-initializations of position or heading after a loss.
     """
 
     stamp_ns: int
@@ -51,7 +51,7 @@ class Location:
 
     @property
     def usable(self) -> bool:
-        """Whether one may drive by it."""
+        """Whether the location is good enough for driving."""
         return self.status in (Status.TRACKING, Status.DEAD_RECKONING)
 
     @property

@@ -1,15 +1,15 @@
-"""The filter's model: how the state of an articulated machine goes on, and what its antennas then show.
+"""The filter's model: state transition of an articulated machine, and the measurements of its antennas.
 
-State (``State``): middle of the front axle [m] and yaw of the front half [rad] in the plane; what slip adds to the
-curvature of its path [1/m] and to its direction [rad]; share by which the ground passes faster than the wheels say;
-error of the receiver's heading [rad]; the receiver's slowly wandering position error [m]; where the main antenna stands
-beside its place, ahead and to the left [m]; how far its direction turns downhill for each radian that it leans.
-Without slip (docs/reference/machines.md section 7.1)
+
+State (``State``): centre of the front axle [m] and yaw of the front half [rad] in the plane; curvature [1/m] and
+direction [rad] added by slip; scale error of the wheel speed; error of the receiver's heading [rad]; slowly varying
+position error of the receiver [m]; offset of the main antenna, ahead and to the left [m]; downhill drift of the
+direction per radian of lean.  Without slip (docs/reference/machines.md section 7.1)
 
     x' = v cos psi,  y' = v sin psi,  psi' = (v sin g + lr g') / (lf cos g + lr)
 
-with the speed v of the front axle and the articulation g.  Slip comes with the way that is driven: a machine that
-stands does not grow uncertain.
+with the speed v of the front axle and the articulation g.  Slip noise grows with the distance driven, so a standing
+machine does not become uncertain.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from typing import Final
 
 import numpy as np
 
-from machine.carrier import Point
+from machine.geometry.carrier import Point
 from machine.profile import Carrier
 
 Array = np.ndarray
 
 
 class State(IntEnum):
-    """Places in the state vector."""
+    """Indices of the state vector."""
 
     X = 0
     Y = 1
@@ -49,21 +49,21 @@ SIZE: Final = len(State)
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """A quantity that wanders about zero: standard deviation, and the way [m] or time [s] over which it forgets."""
+    """A first-order Gauss-Markov process: standard deviation, and correlation length [m] or time [s]."""
 
     sigma: float
     over: float
 
     def step(self, by: float) -> tuple[float, float]:
-        """What is kept of it, and the variance that comes in, after ``by`` m or s."""
+        """Decay factor and added variance after ``by`` m or s."""
         keep = math.exp(-by / self.over)
         return keep, self.sigma**2 * (1.0 - keep * keep)
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """What the filter expects; all of it assumed.  ``fixes`` by number of the method in PGN 129029: white and wandering
-    horizontal error of a position, root mean square [m].
+    """Noise of the filter; all of it assumed.  ``fixes`` by method of PGN 129029: white and slowly varying horizontal
+    error of a position, root mean square [m].
     """
 
     curve: Drift = Drift(0.02, 4.0)
@@ -71,20 +71,20 @@ class Noise:
     slide: Drift = Drift(0.25, 200.0)
     scale: Drift = Drift(0.12, 30.0)
     way_m: float = 0.01
-    """Of the position, per square root of a metre driven."""
+    """Position noise per square root of a metre driven."""
     way_rad: float = 0.003
-    """Of the yaw, per square root of a metre driven."""
+    """Yaw noise per square root of a metre driven."""
     rest_m: float = 0.002
-    """Of the position, per square root of a second: the machine rocks while its crane works."""
+    """Position noise per square root of a second: the machine rocks while its crane works."""
     heading_start_rad: float = 0.015
     heading_rad: float = 2e-5
-    """Of the heading's error, per square root of a second."""
+    """Noise of the heading error per square root of a second."""
     antenna_m: float = 0.02
     attitude_rad: float = 0.004
     articulation_rad: float = 0.004
-    """Of the articulation encoder, its zero in it."""
+    """Of the articulation encoder, including its zero."""
     phase_m: float = 0.003
-    """Per antenna, to measure a heading by."""
+    """Per antenna, for a dual-antenna heading."""
     turn_rad_s: float = 0.006
     wander_s: float = 60.0
     fixes: dict[int, tuple[float, float]] = field(
@@ -94,8 +94,8 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class Odometry:
-    """What the machine did since the last step: time [s], way of the wheels over ground seen from above [m],
-    articulation before and now [rad], roll of the front half, + right side down [rad].
+    """Motion since the last step: time [s], horizontal distance of the wheels [m], articulation before and now [rad],
+    roll of the front half, + right side down [rad].
     """
 
     seconds: float
@@ -106,7 +106,7 @@ class Odometry:
 
 
 def turned_without_slip(carrier: Carrier, odometry: Odometry, way_m: float) -> float:
-    """By how much the front half turns on a way of ``way_m`` of its axle [rad]."""
+    """Turn of the front half over a distance ``way_m`` of its axle, without slip [rad]."""
     bend = 0.5 * (odometry.bend_before_rad + odometry.bend_rad)
     swing = odometry.bend_rad - odometry.bend_before_rad
     lf, lr = carrier.front_axle_m, carrier.rear_axle_m
@@ -114,7 +114,7 @@ def turned_without_slip(carrier: Carrier, odometry: Odometry, way_m: float) -> f
 
 
 def advance(carrier: Carrier, noise: Noise, x: Array, odometry: Odometry) -> tuple[Array, Array, Array]:
-    """State (12,), its Jacobian (12, 12) and the covariance (12, 12) that comes in, one step later."""
+    """State (12,), Jacobian (12, 12) and process noise (12, 12) one step later."""
     s, d = State, odometry
     way = d.way_m * (1.0 + x[s.SCALE])
     turned = turned_without_slip(carrier, d, way) + x[s.CURVE] * way
@@ -148,30 +148,30 @@ def advance(carrier: Carrier, noise: Noise, x: Array, odometry: Odometry) -> tup
 
 
 def drift_rad(x: Array, lean_rad: float) -> float:
-    """By how much the front axle goes to the left of where the front half points [rad]."""
+    """Direction of the front axle's motion relative to the front half, + left [rad]."""
     return float(x[State.SIDE] - x[State.SLIDE] * lean_rad)
 
 
 def tilt(roll_rad: float, pitch_rad: float) -> Array:
-    """Rotation (3, 3) of a half that leans, its yaw left out: roll + right side down, pitch + nose up."""
+    """Rotation (3, 3) of a half without its yaw: roll + right side down, pitch + nose up."""
     cr, sr, cp, sp = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
     roll = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
     return np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]]) @ roll
 
 
 def axle_m(carrier: Carrier, height_m: float) -> Point:
-    """The middle of the front axle, between the hubs, in the front frame."""
+    """Centre of the front axle, between the hubs, in the front frame."""
     return carrier.front_axle_m, 0.0, -(carrier.arm_drop_low_m + height_m)
 
 
 def antenna_reach(carrier: Carrier, roll_rad: float, pitch_rad: float, height_m: float) -> Array:
-    """From the middle of the front axle to the main antenna (3,), along the front's yaw, to its left and up [m]."""
+    """From the centre of the front axle to the main antenna (3,): along the front's yaw, to its left, and up [m]."""
     lever = np.subtract(carrier.antenna_main_m, axle_m(carrier, height_m))
     return tilt(roll_rad, pitch_rad) @ lever
 
 
 def antenna(x: Array, reach: Array) -> tuple[Array, Array]:
-    """Where the receiver would show the main antenna (2,), and the Jacobian (2, 12)."""
+    """Predicted position of the main antenna (2,) and its Jacobian (2, 12)."""
     s = State
     c, si = math.cos(x[s.YAW]), math.sin(x[s.YAW])
     ahead, left = reach[0] + x[s.ANTENNA_X], reach[1] + x[s.ANTENNA_Y]
@@ -187,7 +187,7 @@ def antenna(x: Array, reach: Array) -> tuple[Array, Array]:
 
 
 def front_attitude(roll_rad: float, pitch_rad: float, bend_rad: float) -> tuple[float, float]:
-    """Roll and pitch of the front half from those of the rear: the axis between them leans with both."""
+    """Roll and pitch of the front half from those of the rear, for a rigid articulation axis."""
     down = tilt(roll_rad, pitch_rad)[2]
     c, s = math.cos(bend_rad), math.sin(bend_rad)
     ahead, left, up = c * down[0] + s * down[1], -s * down[0] + c * down[1], down[2]

@@ -1,7 +1,7 @@
-"""The extended Kalman filter: one state for odometry and antennas, late measurements, gates.
+"""Extended Kalman filter of the vehicle: one state for odometry and antennas, delayed measurements, gates.
 
-A receiver's solution is late, so it is compared with where the machine was then: the way since comes from the
-odometry, which is good to a millimetre over a tenth of a second.  A measurement outside its gate changes nothing.
+A receiver's solution is delayed, so it is compared with the state at its time of validity: the motion since then comes
+from the odometry, which is accurate to a millimetre over 0.1 s.  A measurement outside its gate is not used.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from autonomy.localization.local_plane import wrapped
 from machine.profile import Carrier
 
 GATES: Final = (0.0, 10.828, 13.816)
-"""Chi square of 0.1 % for one and two degrees of freedom."""
+"""Chi-square quantiles of 99.9 % for one and two degrees of freedom, by the number of components."""
 CONSIDERED: Final = [State.ANTENNA_X, State.ANTENNA_Y]
-"""Reckoned with and never learned: only what slip does in bends would teach it, and wrongly (Schmidt's filter)."""
+"""Considered but not estimated (Schmidt filter): only slip in bends would be attributed to them, which is wrong."""
 KEPT: Final = 24
-"""Steps back in time, 1.2 s at 20 Hz."""
+"""Stored steps, 1.2 s at 20 Hz."""
 
 
 class Filter(ExtendedKalmanFilter):
-    """Located once ``begin`` was called.  ``x`` (12,), ``P`` (12, 12) as in ``motion.State``."""
+    """Located once ``begin`` was called.  ``x`` (12,), ``P`` (12, 12) are ordered as ``motion_model.State``."""
 
     def __init__(self, carrier: Carrier, noise: Noise) -> None:
         super().__init__(SIZE, 2)
@@ -38,7 +38,7 @@ class Filter(ExtendedKalmanFilter):
         self._fix = 0
 
     def begin(self, x_m: float, y_m: float, yaw_rad: float, fix: int, sigma_m: float, stamp_ns: int) -> None:
-        """Located anew: the front axle is about here, good to ``sigma_m`` in each axis."""
+        """Initialize: the front axle is at this position, with a standard deviation ``sigma_m`` in each axis."""
         n, s = self._noise, State
         self.x = np.zeros(SIZE)
         self.x[[s.X, s.Y, s.YAW]] = x_m, y_m, yaw_rad
@@ -56,14 +56,14 @@ class Filter(ExtendedKalmanFilter):
         self._remember(stamp_ns)
 
     def begin_place(self, x_m: float, y_m: float, sigma_m: float) -> None:
-        """The position anew, all else as it was."""
+        """Re-initialize the position; the rest of the state stays."""
         places = [State.X, State.Y]
         self.x[places] = x_m, y_m
         self.P[places, :] = self.P[:, places] = 0.0
         self.P[places, places] = sigma_m**2
 
     def begin_yaw(self, turn_rad: float, reach_m: float) -> None:
-        """The yaw anew, so much more than it was, all else as it was; the antenna is ``reach_m`` from the axle."""
+        """Re-initialize the yaw by a correction; the antenna is ``reach_m`` from the axle.  The rest stays."""
         places = [State.X, State.Y]
         self.x[State.YAW] = wrapped(self.x[State.YAW] + turn_rad)
         self.P[State.YAW, :] = self.P[:, State.YAW] = 0.0
@@ -72,17 +72,17 @@ class Filter(ExtendedKalmanFilter):
 
     @property
     def heading_sigma_rad(self) -> float:
-        """Of one heading by both antennas."""
+        """Standard deviation of one dual-antenna heading."""
         base = math.dist(self._carrier.antenna_main_m[:2], self._carrier.antenna_aux_m[:2])
         return math.sqrt(2.0) * self._noise.phase_m / base
 
     def heading_off(self, yaw_rad: float, stamp_ns: int) -> float:
-        """How much more a yaw by both antennas is than it ought to have been then [rad]."""
+        """Innovation of a dual-antenna yaw at a time [rad]."""
         then = self._then(self._since(stamp_ns))
         return wrapped(yaw_rad - then[State.YAW] - then[State.HEADING])
 
     def go(self, odometry: Odometry, stamp_ns: int) -> None:
-        """On by what the machine did, to ``stamp_ns``."""
+        """Predict to ``stamp_ns`` with the odometry since the last step."""
         before = self.x
         after, self.F, self.Q = advance(self._carrier, self._noise, before, odometry)
         keep = math.exp(-odometry.seconds / self._noise.wander_s)
@@ -97,18 +97,17 @@ class Filter(ExtendedKalmanFilter):
         self._remember(stamp_ns)
 
     def creep(self, sigma_m: float) -> None:
-        """The machine may have moved a little, in any direction, without its wheels' knowledge."""
+        """Add position uncertainty for motion that the wheels do not measure."""
         self.P[[State.X, State.Y], [State.X, State.Y]] += sigma_m**2
 
     def predict_x(self, u: float = 0) -> None:
-        """The state that ``go`` found: the model is not linear."""
+        """Use the state from ``go``: the model is not linear."""
         self.x = self._next
 
     def position(self, east_m: float, north_m: float, reach: Array, fix: int, stated_m: float, stamp_ns: int) -> bool:
-        """A position of the main antenna that held at ``stamp_ns``; False: outside the gate.
+        """Update with a position of the main antenna that was valid at ``stamp_ns``; False outside the gate.
 
-        ``reach`` as ``motion.antenna_reach``; ``stated_m`` is the receiver's own standard deviation, NaN if it says
-        none.
+        ``reach`` is ``motion_model.antenna_reach``; ``stated_m`` is the receiver's own standard deviation, NaN without.
         """
         self._quality(fix)
         since = self._since(stamp_ns)
@@ -120,14 +119,14 @@ class Filter(ExtendedKalmanFilter):
         return self._take(np.array([east_m, north_m]) - shown, h, np.eye(2) * spread)
 
     def heading(self, yaw_rad: float, stamp_ns: int) -> bool:
-        """A yaw of the front half by both antennas; False: outside the gate."""
+        """Update with a dual-antenna yaw of the front half; False outside the gate."""
         h = np.zeros((1, SIZE))
         h[0, [State.YAW, State.HEADING]] = 1.0
         off = self.heading_off(yaw_rad, stamp_ns)
         return self._take(np.array([off]), h, np.array([[self.heading_sigma_rad**2]]))
 
     def turn(self, rate_rad_s: float, speed_m_s: float, over_ns: int, stamp_ns: int) -> bool:
-        """A yaw rate, mean of the ``over_ns`` before ``stamp_ns``; False: outside the gate."""
+        """Update with a yaw rate, averaged over the ``over_ns`` before ``stamp_ns``; False outside the gate."""
         h = np.zeros((1, SIZE))
         h[0, State.CURVE] = speed_m_s * (1.0 + self.x[State.SCALE])
         turned = self._since(stamp_ns - over_ns)[2] - self._since(stamp_ns)[2]
@@ -135,7 +134,7 @@ class Filter(ExtendedKalmanFilter):
         return self._take(np.array([off]), h, np.array([[self._noise.turn_rad_s**2]]))
 
     def shown(self, reach: Array, stamp_ns: int) -> Array:
-        """Where the receiver ought to have shown the antenna at ``stamp_ns`` (2,)."""
+        """Predicted position of the antenna at ``stamp_ns`` (2,)."""
         return antenna(self._then(self._since(stamp_ns)), reach)[0]
 
     def _take(self, off: Array, h: Array, r: Array) -> bool:
@@ -151,7 +150,7 @@ class Filter(ExtendedKalmanFilter):
         return True
 
     def _quality(self, fix: int) -> None:
-        """The wandering error of another kind of fix is another one."""
+        """Another kind of fix has another slowly varying error: reset it."""
         if fix == self._fix:
             return
         self._fix = fix
@@ -165,13 +164,13 @@ class Filter(ExtendedKalmanFilter):
         self._ways.append(self._way)
 
     def _then(self, since: Array) -> Array:
-        """The state as it would have been before the way ``since``."""
+        """The state before the motion ``since``."""
         x = self.x.copy()
         x[[State.X, State.Y, State.YAW]] -= since
         return x
 
     def _since(self, stamp_ns: int) -> Array:
-        """Way and turn (3,) since ``stamp_ns`` by the odometry; at most as far back as is remembered."""
+        """Odometry displacement and turn (3,) since ``stamp_ns``, limited to the stored steps."""
         stamps = self._stamps
         i = bisect_left(stamps, stamp_ns)
         if i == 0 or i == len(stamps):

@@ -1,9 +1,9 @@
-"""The activity manager: reports and log lists in; crane and drive setpoints out.
+"""The activity manager: reports and log lists in; crane and drive setpoints out, at 20 Hz or faster.
 
-``Manager.step`` is pure but for its state and holds no clock.  What follows what is in `autonomy.manager.transition_table`, and
-when an event has come about in `autonomy.manager.event_conditions`; here is how each state begins, and what is sent meanwhile.  A
-controller that stops, faults or falls silent pauses the mission; when it is armed again the state begins anew.  Every
-wait has its patience, and ``failure`` says why a mission ended.
+`ActivityManager.step` holds no clock and does no I/O.  Transitions are in `autonomy.manager.transition_table`, the
+conditions of events in `autonomy.manager.event_conditions`; this module enters states and sends setpoints.  When the
+controller stops, faults or falls silent, the mission pauses; once it is armed again, the state is entered again.  Every
+state has a timeout, and ``failure`` is the reason why a mission failed.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from functools import partial
 from typing import Final
 
 from autonomy.crane_job.activity import Activity
-from autonomy.crane_job.rotator_estimate import Rotator
-from autonomy.grasp.selection import Chooser, choose
+from autonomy.crane_job.rotator_estimate import RotatorEstimate
+from autonomy.grasp.selection import select_direct
+from autonomy.grasp.planner import Chooser
 from autonomy.localization.local_plane import Plane
 from autonomy.manager.load_bookkeeping import Cargo
 from autonomy.manager.crane_executor import Hand
@@ -24,27 +25,41 @@ from autonomy.manager.event_conditions import Events
 from autonomy.manager.log_memory import Memory
 from autonomy.manager.checkpoint import Progress, copied, digest
 from autonomy.manager.route_driver import Ride
-from autonomy.manager.transition_table import ENDS, OURS, PAPER_B, RULES, Event, Height, State, Table, awaited, following
+from autonomy.manager.transition_table import (
+    ENDS,
+    OURS,
+    PAPER_B,
+    RULES,
+    Event,
+    Height,
+    State,
+    Table,
+    awaited,
+    following,
+)
 from autonomy.manager.tally import Tally
 from autonomy.manager.target_log import Target
 from autonomy.manager.world_model import Outlook
 from autonomy.missions.model import ForwardingMission
-from autonomy.motion.motion_planner import AsShown, Motions, Swiftest
+from autonomy.motion.motion_planner import MovementPrimitivePlanner, MotionPlanner, TimeOptimalPlanner
 from autonomy.motion.movement_primitives import load
 from autonomy.navigation.clothoid_path import PathRefused
 from autonomy.navigation.navigator import LEASE_NS, Navigator, Phase
 from autonomy.perception.log_list.observation import LogObservation
-from can_dbc.messages.crane import StateReport, VehicleReport, encode
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.vehicle import VehicleReport
 from machine.profile import Profile
 
 STRAYED_M: Final = 0.5
-"""So far beyond a fence neither a receiver errs nor a good follower strays: the mission ends there."""
+"""Farther outside a fence than any error of receiver or path follower: the mission fails."""
 HISTORY: Final = 64
+"""Transitions kept for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of state: when, what came about, and what is done now."""
+    """A transition: time, event and new state."""
 
     at_ns: int
     event: Event
@@ -52,13 +67,12 @@ class Change:
 
 
 class Manager:
-    """One mission.  ``state``, ``paused``, ``failure``, ``tally`` and ``changes`` are for the operator.
+    """Runs one mission.  ``state``, ``paused``, ``failure``, ``tally`` and ``changes`` are for the operator.
 
-    ``table`` is whose way it is done: `OURS` or `PAPER_B`.  ``chooser`` picks the grasps,
-    ``emptier`` those from the bunk at a landing; ``motions`` are the crane's:
-    by default ours, or in paper B's way those that ship as shown to the machine.
-    ``remembers``: logs are seen on the way alone, and the crane works from memory.  ``progress``: it goes on where a
-    planner before it ended; what lay in the bunk then is seen, not remembered.
+    ``table`` is `OURS` or `PAPER_B`.  ``chooser`` picks grasps on the ground, ``emptier`` those from the bunk.
+    ``motions`` plans crane motions; the default is ours, or the shipped demonstrations for paper B.  ``remembers``: the
+    camera only sees logs while driving, and the crane works from memory.  ``progress`` resumes from a checkpoint; the
+    logs in the bunk are then detected, not remembered.
     """
 
     def __init__(
@@ -67,11 +81,11 @@ class Manager:
         profile_hash: int,
         mission: ForwardingMission,
         table: Table = OURS,
-        chooser: Chooser = choose,
+        chooser: Chooser = select_direct,
         plane: Plane | None = None,
         key: bytes | None = None,
         lease_ns: int = LEASE_NS,
-        motions: Motions | None = None,
+        motions: MotionPlanner | None = None,
         remembers: bool = False,
         emptier: Chooser | None = None,
         progress: Progress | None = None,
@@ -81,19 +95,19 @@ class Manager:
         self.state, self.paused, self.failure = State.IDLE, "the controller has not reported", ""
         self.changes: deque[Change] = deque(maxlen=HISTORY)
         self.single_step = False
-        """Every change waits for `step_on`."""
+        """Every transition waits for `step_on`."""
         self.outlook = Outlook(profile, mission, plane, progress and progress.known)
         self.cargo = Cargo(profile, mission, self.outlook, progress)
         self._digest = digest(mission)
         self.memory = Memory(profile) if remembers else None
         self._auto = self._may_step = False
         self.waiting: Event | None = None
-        """In single step: what has come about and waits for `step_on`."""
+        """In single-step mode: the event that waits for `step_on`."""
         self._table, self._key = table, key
-        motions = motions or (AsShown(load(profile)) if table is PAPER_B else Swiftest())
+        motions = motions or (MovementPrimitivePlanner(load(profile)) if table is PAPER_B else TimeOptimalPlanner())
         self._hand = Hand(
             profile, profile_hash, self.outlook, self.cargo, chooser, emptier or chooser, motions, lease_ns, key,
-            progress.rotator if progress else Rotator(), table is PAPER_B,
+            progress.rotator if progress else RotatorEstimate(), table is PAPER_B,
         )  # fmt: skip
         options, carrier = mission.options, profile.carrier
         transport, loading = options.transport_height_m, options.loading_height_m
@@ -111,31 +125,31 @@ class Manager:
 
     @property
     def activity(self) -> Activity | None:
-        """The crane's job, while it has one."""
+        """The active crane job, None without one."""
         return self._hand.job
 
     @property
     def target(self) -> int | None:
-        """The field's number of the log that the machine is about."""
+        """Map number of the target log, None without one."""
         return self._target.number
 
     @property
     def tally(self) -> Tally:
-        """What is on board, and what was done."""
+        """Counts of logs and loads."""
         return self.cargo.tally
 
     @property
     def words(self) -> str:
-        """What the machine is about, where there are several landings or rounds with which one it is."""
+        """What the machine is doing, with landing or round where there are several."""
         words, rounds = RULES[self.state].words, self.outlook.sorting.rounds
         if self.state in (State.HAUL, State.SETTLE, State.UNLOAD) and (name := self.cargo.bound_for):
             return f"{words} ({name})"
         if self.state is State.IDLE and self.resumed:
-            return f"{words}, to go on where it was left"
+            return f"{words}, to resume the mission"
         return f"{words} (round {rounds + 1})" if self.state is State.SEARCH and rounds else words
 
     def progress(self) -> Progress:
-        """How far the mission has come."""
+        """A checkpoint of the mission."""
         outlook, sorting = self.outlook, self.outlook.sorting
         return Progress(
             mission=self._digest,
@@ -150,25 +164,25 @@ class Manager:
             finished=self.state is State.DONE,
         )
 
-    # ------------------------------------------------------------------ the operator
+    # ------------------------------------------------------------------ operator commands
     def auto(self) -> None:
-        """The switch to Auto."""
+        """Set the mode switch to Auto."""
         self._auto = True
 
     def idle(self) -> None:
-        """The switch back: everything stops smoothly, and the mission goes on with the next Auto."""
+        """Set the mode switch to Idle: everything stops smoothly; the next Auto resumes the mission."""
         self._auto = False
 
     def step_on(self) -> None:
-        """In single step: the next change may happen."""
+        """In single-step mode: release the next transition."""
         self._may_step = True
 
     def abort(self, reason: str) -> None:
-        """The mission ends here; crane and machine stop smoothly."""
+        """Fail the mission; crane and machine stop smoothly."""
         if self.state not in ENDS:
             self._fail(reason)
 
-    # ------------------------------------------------------------------ one turn
+    # ------------------------------------------------------------------ one step
     def step(
         self,
         now_ns: int,
@@ -177,8 +191,9 @@ class Manager:
         logs: Sequence[LogObservation] = (),
         seen_ns: int | None = None,
     ) -> list[bytes]:
-        """The datagrams to send now.  Reports and log list are the newest since the last turn; the list was seen at
-        ``seen_ns`` (None: now).  To be called at 20 Hz or faster.
+        """The datagrams to send now.
+
+        Reports and log list are the newest since the last step; the list was observed at ``seen_ns`` (None: now).
         """
         outlook = self.outlook
         outlook.take(now_ns, report, vehicle)
@@ -188,7 +203,7 @@ class Manager:
         if self.memory is not None:
             outlook.learn(logs, seen_ns)
             logs = outlook.remember(self.memory, self.activity, now_ns)
-        elif RULES[self.state].crane:  # what hangs in the grapple does not lie in the field
+        elif RULES[self.state].crane:  # a log in the grapple does not lie on the ground
             outlook.aboard(logs, seen_ns)
         else:
             outlook.see(logs, seen_ns)
@@ -209,18 +224,18 @@ class Manager:
         return self._send(now_ns, report, vehicle, logs)
 
     def _off(self) -> str:
-        return "the switch is at Idle" if not self._auto and self.state not in ENDS | {State.IDLE} else ""
+        return "the mode switch is at Idle" if not self._auto and self.state not in ENDS | {State.IDLE} else ""
 
     def _danger(self) -> str:
-        """Why a machine that drives must not drive on; empty while it may."""
+        """Why a driving machine must stop; empty while it may drive."""
         if (strayed_m := self.outlook.strayed_m) > STRAYED_M:
-            return f"the machine has left its fence by {strayed_m:.1f} m; drive it back by hand, and see its route"
+            return f"the machine is {strayed_m:.1f} m outside its fence; drive it back by hand and check the route"
         if not self.ride.faithful and (log := self.outlook.in_the_way()) is not None:
-            return f"log {log.number} lies in the way of the wheels; clear it away, or lead the route round it"
+            return f"log {log.number} lies in front of a wheel; remove it or route the machine round it"
         return ""
 
     def _proceed(self, now_ns: int) -> None:
-        """Change the state when something has come about."""
+        """Fail, time out, or take the transition of the first event that has occurred."""
         if self._navigator.phase is Phase.STOPPED and RULES[self.state].drives:
             self._fail(self._navigator.reason)
             return
@@ -238,7 +253,7 @@ class Manager:
         if event is None:
             return
         if self.single_step and not self._may_step:
-            self.waiting = event  # it has come about once, and stands until the operator goes on
+            self.waiting = event  # the event is kept until the operator releases the transition
             if RULES[self.state].drives:
                 self.ride.halt()
             return
@@ -266,9 +281,9 @@ class Manager:
                 return self._auto
         return self._events.has(event, now_ns)
 
-    # ------------------------------------------------------------------ how a state begins
+    # ------------------------------------------------------------------ entering a state
     def _enter(self, state: State, now_ns: int) -> None:
-        """Begin a state, or begin it anew after a pause."""
+        """Enter a state, or enter it again after a pause."""
         self.state, rule = state, RULES[state]
         if rule.height is not Height.KEEP:
             self._height_m = self._heights[rule.height]
@@ -303,7 +318,7 @@ class Manager:
             self._fail(f"the route cannot be driven: {error}")
             return
         self._unloaded = False
-        if self.ride.ended:  # from the landing there is nothing to come back to
+        if self.ride.ended:  # there is no route left to return to
             return
         if state is State.SEARCH:
             self._target.search()
@@ -314,7 +329,7 @@ class Manager:
         self.ride.halt()
         self._hand.abort(reason)
 
-    # ------------------------------------------------------------------ what is sent
+    # ------------------------------------------------------------------ sending
     def _send(
         self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None, logs: Sequence[LogObservation]
     ) -> list[bytes]:

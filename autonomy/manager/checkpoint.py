@@ -1,7 +1,8 @@
-"""How far a mission has come, so that a planner that is started again goes on where the one before it ended.
+"""Checkpoint of a mission, so that a restarted planner resumes where the previous one ended.
 
-A `Progress` is plain data, the same on every machine: places are WGS84, lengths metres, times ns by the clock of the
-process that took it down.  The manager gives it and can begin with it; `autonomy.manager.checkpoint_file` keeps it in a file.
+A `Checkpoint` is plain data, independent of the machine: positions in WGS84, lengths in metres, times in ns of the
+clock of the process that made it.  The manager creates it and can start from it; `autonomy.manager.checkpoint_file`
+stores it.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Annotated, Final, Literal
 
 import msgspec
 
-from autonomy.crane_job.rotator_estimate import Rotator
+from autonomy.crane_job.rotator_estimate import RotatorEstimate
 from autonomy.manager.tally import Taken, Tally
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
 
@@ -21,8 +22,8 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 
 
 class Left(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the route was left: a place a bit before and the place itself (``at``), places to drive by from there, and
-    how many of the waypoints of all laps are still to come; ``ended``: none, the end of the route was reached.
+    """Where the route was left: a point shortly before and the point itself (``at``), extra places to drive by from
+    there (``by``), and the number of waypoints of all laps still to come; ``ended``: the end was reached.
     """
 
     to_come: Count
@@ -32,7 +33,7 @@ class Left(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Missed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A log that grasps came back from empty, by its number."""
+    """A log with failed grasps, by its number."""
 
     number: Count
     log: KnownLog
@@ -40,8 +41,8 @@ class Missed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Known(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is known of the logs that lie about: which of the mission's no longer lie where it lists them (``gone``, by
-    their numbers, which begin with 1), which were missed, and the next number that is free.
+    """Knowledge of the logs on the ground: listed logs that are gone (numbers from 1), logs with failed grasps, and the
+    next unused number.
     """
 
     gone: tuple[Count, ...] = ()
@@ -50,10 +51,11 @@ class Known(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Of the mission whose digest is ``mission``.  The load on board goes to ``landing``, and ``served`` and ``rounds``
-    are as in `autonomy.manager.sorting`; ``left`` is None before the route was begun; ``rotator`` is what was found out
-    about one without an encoder.  ``clock_ns`` and ``unix_ns`` are the same moment, by the process's clock and as Unix
-    time: with them times outlast the computer's start.
+    """Checkpoint of the mission with the digest ``mission``.
+
+    ``landing``, ``served`` and ``rounds`` are as in `autonomy.manager.sorting`; ``left`` is None before the route was
+    begun; ``rotator`` is the state of one without an encoder.  ``clock_ns`` and ``unix_ns`` are the same moment by the
+    process's clock and as Unix time, so that times survive a restart of the computer.
     """
 
     mission: str
@@ -64,7 +66,7 @@ class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     served: tuple[Count, ...] = ()
     rounds: Count = 0
     driven_m: float = 0.0
-    rotator: Rotator = Rotator()
+    rotator: RotatorEstimate = RotatorEstimate()
     finished: bool = False
     clock_ns: int = 0
     unix_ns: int = 0
@@ -72,12 +74,12 @@ class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def digest(mission: ForwardingMission) -> str:
-    """The same for the same mission, whatever file it comes from."""
+    """Digest of a mission's content, independent of its file format."""
     return hashlib.sha256(msgspec.json.encode(mission)).hexdigest()
 
 
 def copied(tally: Tally, later_ns: int = 0) -> Tally:
-    """A tally of its own, with all its times so much later."""
+    """A deep copy of a tally with all times shifted."""
 
     def moved(logs: tuple[Taken, ...] | list[Taken]) -> list[Taken]:
         return [msgspec.structs.replace(log, at_ns=log.at_ns + later_ns) for log in logs]
@@ -89,10 +91,10 @@ def copied(tally: Tally, later_ns: int = 0) -> Tally:
 
 
 def fits(progress: Progress, mission: ForwardingMission) -> bool:
-    """Whether what is said of landings and waypoints can be said of this mission."""
+    """Whether landings and waypoints of a checkpoint exist in this mission."""
     landings = {*progress.served, *(load.landing for load in progress.tally.loads)}
     landings |= set() if progress.landing is None else {progress.landing}
     to_come = 0 if progress.left is None else progress.left.to_come
     places = mission.options.laps * len(mission.waypoints)
-    # Without any landing every load went to the first one that there could be.
+    # Without landings every load counts for landing 0.
     return all(0 <= at < max(1, len(mission.landings)) for at in landings) and to_come <= places

@@ -1,7 +1,7 @@
-"""The file that keeps a mission's progress: written at once or not at all, and read when the planner starts.
+"""The checkpoint file of a mission: replaced atomically, read when a planner starts.
 
-A process that dies loses what changed in its last second.  A computer that loses its power may lose what its file
-system had not written yet; then the file is the one before, or is told to be damaged.
+If the process dies, the last second is lost.  If the computer loses power, data that the file system had not written is
+lost; the file is then the previous one, or it is reported as damaged.
 """
 
 from __future__ import annotations
@@ -16,20 +16,22 @@ from autonomy.manager.checkpoint import Progress, copied, digest, fits
 from autonomy.missions.model import ForwardingMission, MissionError
 
 EVERY_NS: Final = 1_000_000_000
-_MOVE: Final = "move the file away to begin anew"
+_MOVE: Final = "move the file away to start over"
 
 
 class MissionFinished(Exception):
-    """There is nothing left to do of a mission; the text is one sentence."""
+    """The mission of a checkpoint is finished; nothing is left to do."""
 
 
 def read(path: Path, mission: ForwardingMission, now_ns: int, unix_ns: int) -> Progress | None:
-    """The progress of a mission by the clock of this process, which says ``now_ns`` when it is ``unix_ns``; None where
-    there is no file.
+    """Read the checkpoint of a mission; None without a file.
+
+    ``now_ns`` (clock of this process) and ``unix_ns`` are the same moment; the checkpoint's times are converted to the
+    clock of this process.
 
     Raises:
-        MissionError: it cannot be read, is damaged or of another mission.
-        MissionFinished: the mission was done to its end.
+        MissionError: the file cannot be read, is damaged or belongs to another mission.
+        MissionFinished: the mission is finished.
     """
     try:
         data = path.read_bytes()
@@ -52,7 +54,7 @@ def read(path: Path, mission: ForwardingMission, now_ns: int, unix_ns: int) -> P
 
 
 class Logbook:
-    """Writes to one file."""
+    """Writes checkpoints to one file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -60,11 +62,15 @@ class Logbook:
         self._last: Progress | None = None
 
     def due(self, now_ns: int) -> bool:
-        """Whether it is time to keep the progress again."""
+        """Whether the next checkpoint is due."""
         return now_ns >= self._due_ns
 
     def keep(self, progress: Progress, now_ns: int, unix_ns: int) -> None:
-        """Write the progress, if it has changed; raises OSError."""
+        """Write the checkpoint if it has changed.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
         self._due_ns = now_ns + EVERY_NS
         if progress == self._last:
             return

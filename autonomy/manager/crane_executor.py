@@ -1,7 +1,7 @@
-"""The crane's jobs of a mission, one after the other: each begins with what the one before it found out.
+"""Runs the crane jobs of a mission one after the other; each starts with the state that the previous one found.
 
-A job goes over the bunk, takes logs of the field into the bunk, or those of the bunk to a landing.  When it chooses its
-grasp it is told which logs are to stay lying, by the list that it chooses from.  What it came to goes to the cargo.
+A job stows the crane, loads mapped logs into the bunk, or unloads the bunk to a landing.  The logs that must not be
+picked are given with the list from which a grasp is chosen.  Results are passed to the load bookkeeping.
 """
 
 from __future__ import annotations
@@ -13,29 +13,32 @@ from typing import Final
 from msgspec.structs import replace
 
 from autonomy.crane_job.activity import Activity
-from autonomy.crane_job.rotator_estimate import Rotator
-from autonomy.grasp.selection import Chooser, Grasp, lies_in
+from autonomy.crane_job.rotator_estimate import RotatorEstimate
+from autonomy.grasp.planner import Chooser
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.grasp import Grasp
 from autonomy.manager.load_bookkeeping import Cargo
 from autonomy.manager.world_model import Outlook
 from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm
-from autonomy.motion.motion_planner import Motions
+from autonomy.motion.motion_planner import MotionPlanner
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.joints import N_JOINTS
 from machine.profile import Profile
 
 STOPS: Final = 3
-"""So often the controller may stop the crane before a grasp is given up."""
+"""A grasp is given up after the controller has stopped the crane this many times."""
 FAILURES: Final = 3
-"""So many grasps from the bunk may fail one after the other."""
+"""Unloading fails after this many failed grasps from the bunk in a row."""
 
 
 class Hand:
-    """Begins jobs and ends them; ``job`` is the one in hand, None between two.  ``chooser`` picks the grasps,
-    ``emptier`` those from the bunk at a landing; ``rotator`` is what was known at first of one without an encoder.
-    ``faithful``, as in paper B: a grasp takes its target alone, which is given up where it comes back empty, and ends
-    over the bunk.
+    """Starts and ends crane jobs; ``job`` is the active one, None between two.
+
+    ``chooser`` picks grasps on the ground, ``emptier`` those from the bunk.  ``rotator`` is the known state of a
+    rotator without an encoder.  ``faithful`` works as paper B does: a grasp takes only its target, gives it up after
+    one failure, and ends over the bunk.
     """
 
     def __init__(
@@ -46,15 +49,15 @@ class Hand:
         cargo: Cargo,
         chooser: Chooser,
         emptier: Chooser,
-        motions: Motions,
+        motions: MotionPlanner,
         lease_ns: int,
         key: bytes | None,
-        rotator: Rotator,
+        rotator: RotatorEstimate,
         faithful: bool,
     ) -> None:
         self.job: Activity | None = None
         self.trouble = ""
-        """Why the mission cannot go on, once that is so."""
+        """Why the mission cannot continue; empty while it can."""
         self._profile, self._hash = profile, profile_hash
         self._outlook, self._cargo = outlook, cargo
         self._chooser, self._emptier, self._motions = chooser, emptier, motions
@@ -64,26 +67,26 @@ class Hand:
         self._stops = self._failures = 0
 
     @property
-    def rotator(self) -> Rotator:
-        """What is known now of one without an encoder."""
+    def rotator(self) -> RotatorEstimate:
+        """Known state of a rotator without an encoder."""
         return self._rotator if self.job is None else self.job.rotator
 
-    # ------------------------------------------------------------------ how a job begins
+    # ------------------------------------------------------------------ starting a job
     def fetch(self, target: int | None) -> None:
-        """Take a log of the field into the bunk, by its number, and others with it."""
+        """Load the target log into the bunk, and other logs that one grasp holds."""
         self._begin(Mission(log_id=self._outlook.listed_as(target) if self._faithful else None), target)
 
     def unload(self) -> None:
-        """Bring logs from the bunk to the landing of the load."""
+        """Move logs from the bunk to the landing of the load."""
         pile = self._outlook.pile_at(*self._cargo.landing())
         self._begin(Mission(source=self._profile.bunk, target=pile), None)
 
     def stow(self) -> None:
-        """Go over the bunk."""
+        """Move the crane over the bunk."""
         self._begin(None, None)
 
     def _begin(self, mission: Mission | None, target: int | None) -> None:
-        if self._rests is None:  # another planner may have turned a rotator of which nothing but its count is known
+        if self._rests is None:  # without an encoder only the reference of a previous planner is known
             told = self._outlook.report.reference if self._outlook.report is not None else ()
             told = tuple(r if isfinite(r) else 0.0 for r in told) or (0.0,) * N_JOINTS
             self._rests = self.rotator.believed(told)
@@ -100,19 +103,19 @@ class Hand:
         )  # fmt: skip
 
     def _unloads_next(self, log: LogObservation) -> bool:
-        """Whether the next grasp from the bunk would be of such a log."""
-        return lies_in(self._profile.bunk, log)
+        """Whether the next grasp from the bunk could be of such a log."""
+        return lies_in_bunk(self._profile.bunk, log)
 
     def _fetches_next(self, log: LogObservation) -> bool:
-        """Whether the next grasp of the field would."""
+        """Whether the next grasp on the ground could be of such a log."""
         number = self._outlook.number_of(log.id)
         return number is not None and not self._cargo.full and number in {g.number for g in self._outlook.takable()}
 
-    # ------------------------------------------------------------------ while it lasts
+    # ------------------------------------------------------------------ running a job
     def step(
         self, now_ns: int, report: StateReport | None, logs: Sequence[LogObservation], halted: bool
     ) -> bytes | None:
-        """One turn of the job: the datagram to send now, or None.  ``halted``: a person lets the crane stand."""
+        """One step of the job: the datagram to send now, or None.  ``halted``: the operator has paused the crane."""
         if self.job is None:
             return None
         self.job.halted = halted
@@ -120,22 +123,22 @@ class Hand:
         return self.job.step(now_ns, report, offered)
 
     def abort(self, reason: str) -> None:
-        """The crane stops smoothly."""
+        """End the job; the crane stops smoothly."""
         if self.job is not None:
             self.job.abort(reason)
 
     def interrupted(self) -> None:
-        """What was asked for is no longer obeyed; it counts where the controller has stopped the machine."""
+        """Setpoints are no longer executed; this is counted when the controller has stopped the machine."""
         self._stops += self.job is not None and self._outlook.stopped
 
     def resumed(self) -> None:
-        """It is obeyed again; a job that was stopped too often is given up."""
+        """Setpoints are executed again; a job that was stopped too often is aborted."""
         if self._stops >= STOPS:
             self.abort(f"the controller stopped the crane {self._stops} times")
 
-    # ------------------------------------------------------------------ how it ends
+    # ------------------------------------------------------------------ ending a job
     def collected(self, now_ns: int) -> bool:
-        """Whether a grasp lies in the bunk; then the job has ended, and the cargo knows."""
+        """Whether a grasp was placed in the bunk; ends the job and books the logs."""
         job = self.job
         if job is None or not job.idle or not job.done or job.grasp is None:
             return False
@@ -144,7 +147,7 @@ class Hand:
         return True
 
     def missed(self, target: int | None) -> bool:
-        """Whether the crane came back empty; a log that was missed too often is given up."""
+        """Whether a grasp failed; ends the job and gives the log up after too many failures."""
         job = self.job
         if job is None or not job.idle or job.failure is None:
             return False
@@ -153,7 +156,7 @@ class Hand:
         return True
 
     def unloaded(self) -> bool:
-        """Whether a grasp from the bunk is over, with or without logs."""
+        """Whether a grasp from the bunk is over, with or without logs; ends the job."""
         job = self.job
         if job is None or not job.idle:
             return False
@@ -164,7 +167,7 @@ class Hand:
         return True
 
     def stowed(self) -> bool:
-        """Whether the crane is out of the way for driving."""
+        """Whether the crane is stowed for driving; ends the job."""
         job = self.job
         if job is None or not job.idle:
             return False

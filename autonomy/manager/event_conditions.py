@@ -1,7 +1,7 @@
-"""Whether what a state waits for has come about, or it takes too long.
+"""Conditions of the manager's events, and the timeouts of its states.
 
-The table says which events a state reacts to; here is what tells each of them.  To ask for one that ends a job of the
-crane takes that job's outcome into account, so an event is asked for once a turn.
+The transition table says which events a state reacts to.  Testing an event that ends a crane job books the result of
+that job, so each event is tested once per step.
 """
 
 from __future__ import annotations
@@ -15,16 +15,17 @@ from autonomy.manager.transition_table import Event, Rule
 from autonomy.manager.target_log import Target
 from autonomy.manager.world_model import Outlook
 
-SECOND: Final = 1_000_000_000
+SECOND_NS: Final = 1_000_000_000
 SETTLED_NS: Final = 400_000_000
-"""What stands or is at its height has been so for this long."""
-HOLD_NS: Final = 3 * SECOND
-"""Paper B's hold time: so long the log is watched at standstill."""
+"""Standstill and heights must hold for this long."""
+HOLD_NS: Final = 3 * SECOND_NS
+"""Paper B's hold time: the log is observed at standstill for this long."""
 PROGRESS_M: Final = 0.2
+"""Distance that counts as progress of a driving state."""
 
 
 class Events:
-    """Those of the machine and of the logs, in the state that began last; the operator's are the manager's."""
+    """Conditions of machine and logs in the current state; operator events belong to the manager."""
 
     def __init__(self, outlook: Outlook, ride: Ride, cargo: Cargo, target: Target, hand: Hand) -> None:
         self._outlook, self._ride, self._cargo, self._target, self._hand = outlook, ride, cargo, target, hand
@@ -32,12 +33,12 @@ class Events:
         self._since_ns = self._settled_ns = self._progress_ns = 0
 
     def begin(self, now_ns: int, height_m: float) -> None:
-        """A state begins, or begins anew; the swing arms are to be at this height."""
+        """Enter a state, or enter it again; ``height_m`` is the requested height of the swing arms."""
         self._since_ns, self._settled_ns, self._progress_ns = now_ns, 0, now_ns
         self._height_m, self._progress_m = height_m, self._ride.driven_m
 
     def has(self, event: Event, now_ns: int) -> bool:
-        """Whether an event has come about."""
+        """Whether an event has occurred."""
         match event:
             case Event.AT_HEIGHT:
                 return self._settled(self._outlook.at_height(self._height_m), now_ns)
@@ -75,19 +76,19 @@ class Events:
         return False
 
     def late(self, rule: Rule, now_ns: int) -> bool:
-        """Whether a state takes too long: driving counts from the last progress."""
+        """Whether a state has timed out; for driving states the time counts from the last progress."""
         if self._ride.driven_m > self._progress_m + PROGRESS_M:
             self._progress_m, self._progress_ns = self._ride.driven_m, now_ns
         begun = max(self._since_ns, self._progress_ns) if rule.drives else self._since_ns
-        return now_ns - begun > rule.patience_s * SECOND
+        return now_ns - begun > rule.patience_s * SECOND_NS
 
     def _settled(self, so: bool, now_ns: int) -> bool:
-        """Whether something has been so for ``SETTLED_NS``."""
+        """Whether a condition has held for ``SETTLED_NS``."""
         self._settled_ns = (self._settled_ns or now_ns) if so else 0
         return so and now_ns - self._settled_ns >= SETTLED_NS
 
     def _emptied(self, now_ns: int) -> bool:
-        """Whether nothing is left in the bunk; while there is, the next grasp begins."""
+        """Whether the bunk is empty; starts the next grasp while it is not."""
         if self._hand.unloaded():
             self._since_ns = now_ns
         if self._hand.trouble or self._hand.job is not None or self._outlook.counted_ns <= self._since_ns:

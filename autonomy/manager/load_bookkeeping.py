@@ -1,4 +1,4 @@
-"""The load: what is on board, whether more is wanted, what comes up together, and what each grasp is to the tally."""
+"""The load: what is on board, whether more is wanted, which logs may share a grasp, and the booking of each grasp."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from machine.profile import Profile
 
 
 class Cargo:
-    """Of one mission; logs of a list are known by the outlook's numbers.  ``progress``: where it goes on."""
+    """Load of one mission; logs of a list are identified by the world model's numbers."""
 
     def __init__(
         self, profile: Profile, mission: ForwardingMission, outlook: Outlook, progress: Progress | None = None
@@ -34,43 +34,43 @@ class Cargo:
 
     @property
     def enough(self) -> bool:
-        """Whether as many logs were taken as the mission wants."""
+        """Whether as many logs were loaded as the mission wants."""
         return self._wanted is not None and self.tally.loaded >= self._wanted
 
     @property
     def full(self) -> bool:
-        """Whether no more log is wanted: there are enough, or the bunk is full, to the brim, or as full as it need be
-        where there is a landing to bring it to.
+        """Whether no more logs are wanted: there are enough, the bunk has no room, or, if there is a landing, the bunk
+        holds its planned volume.
         """
         full = self.tally.brimful or (self._lands and self.tally.full(self._bunk))
         return full or self.enough
 
     @property
     def loaded(self) -> bool:
-        """Whether there is something to bring to a landing: taken in this mission, or seen on board."""
+        """Whether there is a load for a landing: loaded in this mission, or seen on board."""
         tally = self.tally
         return self._lands and (tally.on_board > 0 or bool(tally.board) or self._outlook.in_bunk > 0)
 
     @property
     def another_round(self) -> bool:
-        """Whether the route is to be driven anew for logs of other landings."""
+        """Whether the route must be driven again for logs of other landings."""
         return not self.enough and self.sorting.anew(log.assortment for log in self._outlook.lying())
 
     @property
     def bound_for(self) -> str:
-        """The landing that the load goes to, as people call it; empty where there is one alone, or none is decided."""
+        """Name of the landing of the load; empty with a single landing or while it is undecided."""
         return self.sorting.called(self.sorting.landing)
 
     def landing(self) -> tuple[Point2, float | None]:
-        """The landing that the load is brought to now: its middle in the plane, and the direction in which its logs are
-        to lie [rad], None where any will do."""
+        """The landing of the load: its centre in the plane and the direction of its logs [rad], None for any direction.
+        """
         here, places = self._outlook.location, self._outlook.landings
         assert here is not None
         which = self.sorting.sets_out(places, (here.x_m, here.y_m))
         return places[which], self._lie_rad[which] if self._lie_rad else None
 
     def leave(self, logs: Sequence[LogObservation], target: int | None) -> tuple[int, ...]:
-        """The numbers of a list's logs that are to stay when one grasp takes the target and others with it."""
+        """List numbers of the logs that a grasp of the target must leave."""
         field, outlook = self._outlook.field, self._outlook
         first = None if target is None else field.get(target)
         found = []
@@ -83,14 +83,14 @@ class Cargo:
         return tuple(found)
 
     def took(self, job: Activity, now_ns: int) -> None:
-        """A grasp lies in the bunk."""
+        """Book a grasp that was placed in the bunk."""
         assert job.grasp is not None
         taken = [self._taken(log, now_ns) for log in job.grasp.logs]
         self.tally.took(taken, job.lifted_kg)
         self.sorting.took(log.assortment for log in taken)
 
     def _taken(self, log: LogObservation, now_ns: int) -> Taken:
-        """A log of the grasp no longer lies in the field; in the tally it does with where it had lain."""
+        """Remove a grasped log from the map and return it with the place where it had lain."""
         outlook = self._outlook
         number = outlook.number_of(log.id)
         lay = None if number is None else outlook.field.get(number)
@@ -102,7 +102,7 @@ class Cargo:
         return Taken(Point(lat, lon), now_ns, wood, "" if lay is None else lay.assortment)
 
     def missed(self, job: Activity, target: int | None, for_good: bool) -> None:
-        """The crane came back empty; a log that was missed too often (``for_good``: now) is given up."""
+        """Book a failed grasp; the log is given up after too many failures (``for_good``: at once)."""
         assert job.failure is not None
         tally = self.tally
         tally.missed += 1
@@ -115,7 +115,7 @@ class Cargo:
             tally.given_up[number] = job.failure
 
     def unloaded(self, job: Activity) -> bool:
-        """A grasp from the bunk is over; whether it was none."""
+        """Book a finished grasp from the bunk; returns whether it failed."""
         failed = job.failure is not None
         self.tally.missed += failed
         if job.done and job.grasp is not None:
@@ -123,6 +123,6 @@ class Cargo:
         return failed
 
     def emptied(self, now_ns: int, driven_m: float) -> None:
-        """Nothing is left in the bunk."""
+        """Book an empty bunk."""
         self.tally.emptied(now_ns, driven_m, self.sorting.landing or 0)
         self.sorting.unloaded()

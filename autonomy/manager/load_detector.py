@@ -1,7 +1,7 @@
-"""Whether something hangs in the grapple, by what the crane's scale feels.
+"""Detects from the crane scale whether logs hang in the grapple.
 
-A crane that slows its lift down makes what hangs there light, and one that speeds up makes an empty grapple heavy, for
-the grapple itself weighs more than a log: only an average over both says anything.
+Acceleration falsifies the reading: a lift that slows down reads too little, and an empty grapple that speeds up reads
+too much, because it weighs more than a log.  Only an average over the whole lift is reliable.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from autonomy.manager.tally import volume_m3
 from autonomy.perception.log_list.observation import LogObservation
 
 FEELING_NS: Final = 2_000_000_000
-"""As long as a lift takes from its start to its stop (measured on the plant: at the longest arm one second of either
-alone reads 110 or 20 kg for 90).
+"""Duration of a lift from start to stop (measured on the plant: at full reach, one second of either half alone reads
+110 or 20 kg for 90).
 """
 FELT_KG: Final = 30.0
-"""What logs weigh at least on the average; friction of the lift looks like half."""
+"""Least mean reading of a loaded grapple; friction of the lift reads about half."""
 FELT_SHARE: Final = 0.3
-"""Of light logs only so much of their weight, ..."""
+"""Of light logs this share of their weight is enough, ..."""
 GREEN_KG_M3: Final = 900.0
-"""... fresh from the stump (birch 850 to 950, `docs/reference/machines.md`)."""
+"""... with the density of green wood (birch 850 to 950, `docs/reference/machines.md`)."""
 
 
 class Scale:
-    """One grasp, from when it closed; ``feel`` is told every report."""
+    """The load of one grasp from the time it closed; ``feel`` accepts every report."""
 
     def __init__(self, logs: Sequence[LogObservation]) -> None:
         weight_kg = GREEN_KG_M3 * sum(volume_m3(log.length_m, log.diameter_m) for log in logs)
@@ -36,7 +36,7 @@ class Scale:
         self._felt: deque[tuple[int, float]] = deque()
 
     def feel(self, stamp_ns: int, load_kg: float) -> None:
-        """Take in a load [kg], NaN where nobody weighs."""
+        """Accept a load reading [kg]; NaN without a scale."""
         felt = self._felt
         if math.isfinite(load_kg) and not (felt and felt[-1][0] >= stamp_ns):
             felt.append((stamp_ns, load_kg))
@@ -45,7 +45,7 @@ class Scale:
 
     @property
     def light(self) -> bool:
-        """Whether too little was felt for such logs, for long enough to say so."""
+        """Whether the mean reading is too small for the logs, over a long enough time."""
         felt = self._felt
         long_enough = len(felt) > 1 and 1.1 * (felt[-1][0] - felt[0][0]) >= FEELING_NS
         return long_enough and fmean(kg for _, kg in felt) < self._least_kg

@@ -1,8 +1,7 @@
-"""Where along its way the machine stops to load: at the place from which the crane reaches most logs, and best.
+"""Where the machine stops to load: the place along its path from which the crane reaches the most logs with least work.
 
-A log that the machine passes is lost, so the search goes no further than the last place from which every log that can
-be reached at all still is.  Of the places before it, the one with most logs in reach wins; of these, the one with the
-shortest crane work.
+A passed log is lost, so the search ends at the last place from which every reachable log can still be reached.  Among
+the places before it, the one with the most logs in reach wins, then the one with the shortest crane work.
 """
 
 from __future__ import annotations
@@ -15,33 +14,33 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.selection import NoGrasp, plan_grasp
+from autonomy.grasp.selection import NoGrasp, plan_single_log_grasp
 from autonomy.manager.log_map import FieldLog
 from autonomy.motion.arm import Arm
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.log_list.observation import LogObservation
-from machine.carrier import pivot_height_m, rear_from_base
+from machine.geometry.carrier import pivot_height_m, rear_from_base
 from machine.profile import Carrier
 
 STEP_M: Final = 0.25
 ASIDE_M: Final = 0.35
-"""A log's middle lies at least so far outside the machine's sides, beyond its own half width."""
+"""A log's centre lies at least this far outside the machine's sides, beyond its own half width."""
 
 SPARE_M: Final = 0.15
-"""The telescope keeps so much for what is not where it was seen."""
+"""Telescope stroke kept in reserve for position errors."""
 
 BESIDE_M: Final = 0.5
-"""No log is taken whose middle is farther than this beyond the straight arm: it may be gripped beside it, and the
-column leans.
+"""No log is grasped whose centre is farther than this beyond the straight arm: it may be gripped off its centre, and
+the column leans.
 """
 
 BaseAt = Callable[[float], Pose]
-"""The crane's base in the plane when the machine stands at a distance [m] along its way."""
+"""The crane's base in the plane when the machine stands at a distance [m] along its path."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A place along the way [m], the logs to take there, best first, and the crane's work for them [s]."""
+    """A place along the path [m], the logs to grasp there, best first, and the crane's work for them [s]."""
 
     along_m: float
     numbers: tuple[int, ...]
@@ -49,7 +48,7 @@ class Stop:
 
 
 class Reach:
-    """Which logs the crane can take where, with the frame at loading height."""
+    """Which logs the crane can grasp, with the frame at loading height."""
 
     def __init__(self, arm: Arm, carrier: Carrier) -> None:
         self._arm, self.ground_z_m = arm, arm.profile.workspace.ground_z_m
@@ -64,12 +63,12 @@ class Reach:
         self.farthest_m = kin.a1_m + kin.a2_m + math.hypot(kin.a3_m, kin.d4_m + self._longest_m) + BESIDE_M
 
     def work_s(self, log: LogObservation) -> float:
-        """How long the crane's way to a log and back is, roughly [s]; infinite when it cannot take it."""
+        """Rough duration of the crane's motion to a log and back [s]; infinite if it cannot be grasped."""
         x, y, _ = log.center_m
         if abs(y) < self._aside_m + 0.5 * log.diameter_m and x < self._rear_end_m + 0.5 * log.length_m:
             return math.inf  # under the machine, or its bunk
         try:
-            pose = plan_grasp(self._arm, log, 0.0).pose
+            pose = plan_single_log_grasp(self._arm, log, 0.0).pose
         except NoGrasp:
             return math.inf
         if pose.ext_m > self._longest_m:
@@ -80,7 +79,7 @@ class Reach:
 
 
 def best_stop(logs: Sequence[FieldLog], reach: Reach, base_at: BaseAt, begin_m: float, end_m: float) -> Stop | None:
-    """The next stop between two distances along the way [m]; None when no log can be taken from there."""
+    """The best stop between two distances along the path [m]; None when no log can be grasped from there."""
     places = np.arange(begin_m, end_m + 1e-9, STEP_M)
     bases = [base_at(along_m) for along_m in places.tolist()]
 
@@ -91,7 +90,7 @@ def best_stop(logs: Sequence[FieldLog], reach: Reach, base_at: BaseAt, begin_m: 
             return math.inf
         return reach.work_s(_level(log.observation(base), reach.ground_z_m))
 
-    # From the far end, for of the work at a place beyond the last nothing but whether it can be done matters.
+    # From the far end: beyond the last place only whether the work is finite matters.
     lasts = (
         next((i for i in reversed(range(len(places))) if math.isfinite(work_s(i, j))), None) for j in range(len(logs))
     )
@@ -107,7 +106,7 @@ def best_stop(logs: Sequence[FieldLog], reach: Reach, base_at: BaseAt, begin_m: 
 
 
 def _level(log: LogObservation, ground_z_m: float) -> LogObservation:
-    """The log on the ground on which the machine will stand: how high that is where it will, nobody knows yet."""
+    """The log at the ground height of the machine; the real height at the stop is not known yet."""
     x, y, _ = log.center_m
     return replace(log, center_m=(x, y, ground_z_m + 0.5 * log.diameter_m))
 
@@ -115,7 +114,7 @@ def _level(log: LogObservation, ground_z_m: float) -> LogObservation:
 def base_on_way(
     carrier: Carrier, front: tuple[float, float, float], rear_m: tuple[float, float], height_m: float
 ) -> Pose:
-    """The crane's base when the middle of the front axle stands at ``front`` (x, y [m], direction [rad]) and that of
+    """The crane's base when the centre of the front axle stands at ``front`` (x, y [m], direction [rad]) and that of
     the rear axle at ``rear_m`` (x, y [m]), on level ground z = 0 with the frame at a height [m].
     """
     x, y, yaw = front
@@ -130,7 +129,7 @@ def base_on_way(
 
 @lru_cache(maxsize=8)
 def _base_in_rear(carrier: Carrier) -> tuple[np.ndarray, np.ndarray]:
-    """The crane's base in the rear frame: where (3,) and turned how (3, 3)."""
+    """The crane's base in the rear frame: position (3,) and rotation (3, 3)."""
     foot, *ends = (
         np.array(rear_from_base(carrier, (float(p[0]), float(p[1]), float(p[2])))) for p in (np.zeros(3), *np.eye(3))
     )

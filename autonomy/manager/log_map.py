@@ -1,9 +1,8 @@
-"""The logs of a mission in the local plane: where they lie, as seen from a machine that drives past.
+"""The logs of a mission in the local plane, merged from log lists that are observed while the machine drives.
 
-Every log list is in the crane's base frame; with the base's pose it becomes places in the plane (x east, y north, z up,
-metres) that stay when the machine moves on.  A log's place is the running average of where it was seen (paper B 3.2.6),
-weighed by how well it was known where that is said; an average begun anew keeps the log's number.  What lies in the
-bunk is no log of the field.
+Each list is in the crane's base frame; with the base pose it is transformed to the plane (x east, y north, z up, m).  A
+log's position is the running average of its observations (paper B 3.2.6), weighted by their variance where that is
+known.  A restarted average keeps the log's number.  Logs in the bunk are not mapped.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from autonomy.grasp.selection import lies_in
+from autonomy.grasp.placement import lies_in_bunk
 from autonomy.localization.local_plane import Plane
 from autonomy.missions.local_frame import yaw_from_bearing
 from autonomy.missions.model import KnownLog
@@ -26,27 +25,27 @@ from autonomy.perception.log_list.observation import LogObservation
 from machine.profile import Bunk
 
 SAME_M: Final = 0.8
-"""Sightings of one log are nearer to each other than this along its axis, ..."""
+"""Two observations of one log are closer than this along its axis, ..."""
 SIDE_M: Final = 0.35
-"""... and than this across it."""
+"""... and closer than this across it."""
 ALIKE_RAD: Final = math.radians(40.0)
-"""Axes of one log differ by less, and by what they are not known to."""
+"""Axes of two observations of one log differ by less than this plus their uncertainty."""
 PLAIN_SIGMA_M: Final = 0.10
-"""Of a sighting that does not say how well it is known (paper B's own figure)."""
+"""Assumed for an observation without a covariance (paper B's own value)."""
 LEAST_SIGMA_M: Final = 0.01
-"""Poses and mounts err for good: neither a sighting nor an average is known better than this."""
+"""Lower bound of every sigma: errors of poses and mounts do not average out."""
 TOLD_SIGMA_M: Final = 0.3
-"""Of a log that a mission lists without saying how well it is known."""
+"""Assumed for a log that a mission lists without a sigma."""
 USUAL_M: Final = (3.0, 0.2)
-"""Length and diameter of one whose size it does not say."""
+"""Assumed length and diameter of a listed log without a size."""
 CONFIRMED: Final = 2
+"""Observations that confirm a log."""
 _BAR: Final = 1e9
-
-
+"""Cost of a pair that cannot be the same log."""
 @dataclass(frozen=True, slots=True)
 class FieldLog:
-    """A log in the plane: centre and unit axis (3,), length, diameter [m], 1-sigma of the centre [m]; in how many lists
-    it was, and when last; grasps that came up empty.
+    """A log in the plane: centre and unit axis (3,), length and diameter [m], 1-sigma of the centre [m], number of
+    observations, time of the last one, number of failed grasps.
     """
 
     number: int
@@ -60,17 +59,17 @@ class FieldLog:
     misses: int = 0
     assortment: str = ""
     turn_rad: float = 0.0
-    """1-sigma of the axis on the ground."""
+    """1-sigma of the axis direction on the ground."""
 
     def observation(self, base: Pose) -> LogObservation:
-        """As it lies in the crane's base frame now."""
+        """The log in the crane's base frame."""
         x, y, z = base.to_optical(self.center_m).tolist()
         ax, ay, az = (self.axis @ base.rotation).tolist()
         return LogObservation(self.number, (x, y, z), (ax, ay, az), self.length_m, self.diameter_m)
 
 
 class Field:
-    """All logs that were seen and are not collected yet."""
+    """All logs that were observed or listed and are not collected yet."""
 
     def __init__(self, bunk: Bunk) -> None:
         self._bunk = bunk
@@ -79,40 +78,40 @@ class Field:
 
     @property
     def logs(self) -> tuple[FieldLog, ...]:
-        """Those that were seen often enough to be believed, by number."""
+        """Confirmed logs in the order of their numbers."""
         return tuple(log for log in self._logs.values() if log.hits >= CONFIRMED)
 
     @property
     def missed_ones(self) -> tuple[FieldLog, ...]:
-        """Those that grasps came back from empty, given up or not."""
+        """Logs with at least one failed grasp, given up or not."""
         return tuple(log for log in self._logs.values() if log.misses)
 
     @property
     def free(self) -> int:
-        """The next number."""
+        """The next unused number."""
         return self._next
 
     def known(self, log: FieldLog) -> None:
-        """A log that is known before it is seen, as from a harvester; it gets a number of its own."""
+        """Add a log known before it is observed, for example from a harvester; it gets the next number."""
         self._logs[self._next] = replace(log, number=self._next, hits=max(log.hits, CONFIRMED))
         self._next += 1
 
     def restore(self, log: FieldLog) -> None:
-        """A log as it was known before, with its number."""
+        """Restore a log with its number."""
         self._logs[log.number] = log
 
     def number_from(self, free: int) -> None:
-        """Numbers below this one are those of logs that were known before."""
+        """Start new numbers at ``free`` or above."""
         self._next = max(self._next, free)
 
     def get(self, number: int) -> FieldLog | None:
-        """The log of this number, if it still lies there."""
+        """The log with this number, None if it is not mapped."""
         return self._logs.get(number)
 
     def see(self, seen: Iterable[LogObservation], base: Pose, now_ns: int) -> dict[int, int]:
-        """Take in a list; which number of the list is which log of the field."""
-        fresh = [_sighting(o, base, now_ns) for o in seen if not lies_in(self._bunk, o)]
-        names = [o.id for o in seen if not lies_in(self._bunk, o)]
+        """Merge a list of observations; returns the map number of each list number."""
+        fresh = [_sighting(o, base, now_ns) for o in seen if not lies_in_bunk(self._bunk, o)]
+        names = [o.id for o in seen if not lies_in_bunk(self._bunk, o)]
         known = list(self._logs.values())
         costs = np.full((len(known), len(fresh)), _BAR)
         for i, log in enumerate(known):
@@ -132,20 +131,20 @@ class Field:
         return numbers
 
     def anew(self, number: int) -> None:
-        """The average of a log begins anew with what is seen next (paper B: at standstill)."""
+        """Restart the average of a log with its next observation (paper B: at standstill)."""
         self._logs[number] = replace(self._logs[number], hits=0)
 
     def missed(self, number: int) -> int:
-        """A grasp of it came up empty; how often that has been."""
+        """Record a failed grasp; returns how many there were."""
         log = self._logs[number] = replace(self._logs[number], misses=self._logs[number].misses + 1, hits=0)
         return log.misses
 
     def remove(self, number: int) -> None:
-        """It is collected, or given up."""
+        """Remove a log that is collected."""
         self._logs.pop(number, None)
 
     def forget(self, older_ns: int) -> None:
-        """Drop what was seen once and not again since a moment."""
+        """Drop unconfirmed logs that were last observed before a time."""
         stale = [n for n, log in self._logs.items() if log.hits < CONFIRMED and log.seen_ns < older_ns]
         for number in stale:
             del self._logs[number]
@@ -157,7 +156,7 @@ def nearest(logs: Sequence[FieldLog], point_m: np.ndarray) -> FieldLog | None:
 
 
 def told(log: KnownLog, plane: Plane, ground_m: float) -> FieldLog:
-    """A log that somebody knows of, on ground of a height in the plane [m]."""
+    """A listed log in the plane, on ground at a height [m]."""
     d = log.diameter_m or USUAL_M[1]
     x, y, _ = plane.local(log.position.latitude_deg, log.position.longitude_deg)
     yaw = 0.0 if log.bearing_deg is None else yaw_from_bearing(log.bearing_deg)
@@ -177,7 +176,7 @@ def _sighting(o: LogObservation, base: Pose, now_ns: int) -> FieldLog:
 
 
 def _sigma_m(o: LogObservation) -> float:
-    """Of the centre on the ground: the worse of across and along."""
+    """1-sigma of the centre on the ground: the larger of across and along."""
     if o.covariance is None:
         return PLAIN_SIGMA_M
     c = unpacked(o.covariance)
@@ -186,7 +185,7 @@ def _sigma_m(o: LogObservation) -> float:
 
 
 def _apart(log: FieldLog, sighting: FieldLog) -> float:
-    """Distance of two sightings [m]; `_BAR` when they cannot be of one log."""
+    """Distance between two observations [m]; `_BAR` when they cannot be of one log."""
     off = sighting.center_m - log.center_m
     along = float(off @ log.axis)
     across = float(np.linalg.norm(off - along * log.axis))
@@ -200,7 +199,7 @@ def _apart(log: FieldLog, sighting: FieldLog) -> float:
 
 
 def _averaged(log: FieldLog, sighting: FieldLog) -> FieldLog:
-    """The running average, each sighting weighed by its variance; begun anew at no hits."""
+    """The running average, weighted by variance; restarted when the log has no hits."""
     if not log.hits:
         return replace(sighting, number=log.number, misses=log.misses, assortment=log.assortment)
     before, now = 1.0 / log.sigma_m**2, 1.0 / sighting.sigma_m**2

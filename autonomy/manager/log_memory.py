@@ -1,9 +1,9 @@
-"""Logs that no camera sees now, as they are remembered: for a machine whose only camera looks ahead.
+"""Virtual log lists from the log map, for a machine whose only camera looks ahead.
 
-Paper B's crane works from what the front camera saw on the way: the places of the logs in the plane (3.2.6), the
-kinematic chain and the receiver say where they are from the crane's foot now.  A log in the grapple goes with it while
-the scale feels one; what was laid into the bunk lies where it fell to on what is there already.  Four times a second
-this is a list like a detector's, with the field's numbers.
+Paper B's crane works from what the front camera saw while driving: log positions in the plane (3.2.6) are transformed
+into the crane's base frame by the receiver and the kinematic chain.  Logs in the grapple move with it while the crane
+scale measures a load; logs in the bunk lie where they fell.  Four times a second this yields a list like a detector's,
+with the map's numbers.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ import numpy as np
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.selection import lies_in
-from autonomy.grasp.bunk_load import fallen
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.bunk_load import settled_in_bunk
 from autonomy.manager.log_map import Field
 from autonomy.manager.load_detector import Scale
 from autonomy.motion.arm import Arm
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
-from machine.grapple import grapple_yaw
+from machine.geometry.grapple import grapple_yaw
 from machine.joints import JOINTS
 from machine.profile import Profile, joint
 
 EVERY_NS: Final = 250_000_000
 AROUND_M: Final = 12.0
 LIFTED_M: Final = 0.5
-"""Above this the scale is asked: before, the log may still lie."""
+"""The scale is used above this height only: below it, the log may still rest on the ground."""
 
 
 class Memory:
-    """``list`` is called every turn; see the module's contract."""
+    """Call ``list`` once per step; see the module's contract."""
 
     def __init__(self, profile: Profile) -> None:
         self._profile, self._arm = profile, Arm(profile)
@@ -43,7 +43,7 @@ class Memory:
         self._aboard: list[LogObservation] = []
         self._job: Activity | None = None
         self._held: dict[int, LogObservation] = {}
-        """Logs of the grasp relative to pin and yaw of the grapple, from when it closed."""
+        """Logs of the grasp relative to hanger pin and grapple yaw, from the time it closed."""
         self._low_m = 0.0
         self._laid: list[LogObservation] = []
         self._scale: Scale | None = None
@@ -51,13 +51,13 @@ class Memory:
 
     @property
     def aboard(self) -> int:
-        """Logs that were laid into the bunk."""
+        """Number of logs that were placed in the bunk."""
         return len(self._aboard)
 
     def list(
         self, now_ns: int, field: Field, base: Pose, report: StateReport | None, job: Activity | None
     ) -> tuple[LogObservation, ...] | None:
-        """What is remembered, in the base frame; None when it is not yet time for a new list."""
+        """The remembered logs in the base frame; None when no new list is due."""
         if job is not self._job:
             self._end()
             self._job = job
@@ -75,14 +75,14 @@ class Memory:
         return (*near, *hanging, *self._laid, *(log for log in self._aboard if log.id not in gone))
 
     def _end(self) -> None:
-        """The job is over: what it laid into the bunk is on board, and what it took from there is not."""
+        """The job is over: logs placed in the bunk are on board, logs taken from it are not."""
         moved = {log.id for log in self._laid}
         self._aboard = [log for log in self._aboard if log.id not in moved]
-        self._aboard += [log for log in self._laid if lies_in(self._profile.bunk, log)]
+        self._aboard += [log for log in self._laid if lies_in_bunk(self._profile.bunk, log)]
         self._laid, self._held, self._scale, self._slipped = [], {}, None, False
 
     def _follow(self, job: Activity, report: StateReport) -> None:
-        """Note what the grapple closes on, what it loses and where it opens."""
+        """Track what the grapple closes on, loses and releases."""
         grasp = job.grasp
         if grasp is None:
             return
@@ -100,7 +100,7 @@ class Memory:
             under = [log for log in self._aboard if log.id not in self._held]
             laid: list[LogObservation] = []
             for log in self._hanging(report):
-                laid.append(fallen(self._profile.bunk, log, under + laid))
+                laid.append(settled_in_bunk(self._profile.bunk, log, under + laid))
             self._laid, self._held, self._scale = laid, {}, None
 
     def _hanging(self, report: StateReport | None) -> list[LogObservation]:
@@ -110,7 +110,7 @@ class Memory:
         return [_absolute(log, pin, yaw) for log in self._held.values()]
 
     def _pin(self, report: StateReport) -> tuple[np.ndarray, float]:
-        """The hanger pin in the base frame and the yaw of the grapple; without an encoder, where it was sent."""
+        """Hanger pin in the base frame and grapple yaw; joints without an encoder use their reference."""
         assert self._job is not None
         sent = self._job.rests
         q = tuple(
@@ -123,7 +123,7 @@ class Memory:
 
 
 def _relative(log: LogObservation, pin: np.ndarray, yaw: float) -> LogObservation:
-    """A log as it hangs: closing tongs draw it between them, along its axis it stays where it was gripped."""
+    """A log relative to the grapple: closing jaws centre it between them; along its axis it stays where it was."""
     axis = np.asarray(log.axis)
     off = np.asarray(log.center_m) - pin
     level = axis * (1.0, 1.0, 0.0)

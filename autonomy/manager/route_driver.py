@@ -1,6 +1,6 @@
-"""The ways a mission drives: its route by paper B's law or along a path of ours, and the way to a landing and back.
+"""Driving of a mission: the route by paper B's law or along a planned path, the drive to a landing and back.
 
-A `Ride` wraps the navigator and the way under it, so that the manager only says go, halt, and where to stop.
+`RouteDriver` wraps the navigator and the active drive, so that the manager only starts, halts and sets stops.
 """
 
 from __future__ import annotations
@@ -21,38 +21,37 @@ from autonomy.navigation.clothoid_path import Path, PathRefused, Point2, drivabl
 from autonomy.navigation.navigator import Navigator, Phase
 from autonomy.navigation.waypoint_drive import PaperB, Waypoint
 from autonomy.perception.camera.frame import Pose
-from machine.carrier import turning_radius_m
+from machine.geometry.carrier import turning_radius_m
 from machine.profile import Carrier
 
 AHEAD_M: Final = 3.0
-"""A path begins so far straight ahead, where there is room for a bend after it."""
+"""A path starts this far straight ahead, so that there is room for a bend after it."""
 AT_M: Final = 1.0
-"""A first waypoint that is no farther away is where the machine stands."""
+"""A first waypoint within this distance counts as reached."""
 BESIDE_M: Final = 4.2
-"""The machine passes a landing at this distance: there the crane lays down best."""
+"""Distance at which the machine passes a landing: the crane places best there."""
 BEFORE_M, BEYOND_M = 10.0, 10.0
-"""The way past a landing is straight from so far before it to so far beyond."""
+"""The path past a landing is straight from this far before it to this far beyond."""
 ROOMY: Final = 1.5
-"""The machine turns round in circles that are so much wider than its smallest: the bends begin and end gently."""
+"""Turning circles are this many times larger than the smallest one, because bends begin and end gently."""
 ASTRAY_RAD: Final = 1.4
-"""Onto a first leg that begins so far off its direction the machine does not turn well."""
+"""The machine does not turn well onto a first leg whose direction differs by more than this."""
 NEAR_M: Final = 10.0
-"""A corner that is so near may be cut: the machine was in its bend when it was left there."""
+"""A corner this near may be cut: the machine was in its bend when it left the route."""
 DIRECTIONS: Final = 12
 ALONG_RAD: Final = 0.2
-"""A machine that stands so along the logs of a landing lays them well."""
+"""A machine within this angle of a landing's log direction places logs well."""
 AGAIN_M: Final = 6.0
-"""After a landing the machine comes back to its route so far before the place where it left it."""
+"""After a landing the machine returns to the route this far before the place where it left it."""
 
 StopOn = Callable[[Callable[[float], Pose], float], float | None]
-"""Where along a way to stop: the crane's base by distance [m], and the way's length [m]; None: nowhere."""
-
+"""Where to stop along a path: from the crane's base by distance [m] and the path's length [m]; None: nowhere."""
 
 class Ride:
-    """The mission's route.  ``faithful`` drives it by paper B's law.
+    """Drives the mission's route.
 
-    ``along_m`` is the way driven on it, ``length_m`` all of it; ``driven_m`` is all that was driven.  ``left``: it goes
-    on where it was left, after so much way.
+    ``faithful`` selects paper B's law.  ``along_m`` is the distance driven on the route, ``length_m`` its length,
+    ``driven_m`` the total distance driven.  ``left`` is the rest of the route from a checkpoint.
     """
 
     def __init__(
@@ -75,7 +74,7 @@ class Ride:
         self._haul: Along | None = None
         self._left, self._to_come, self._new = left, 0, True
         self._begun: Left | None = None
-        """Where the route was begun that is driven now, if it was left before."""
+        """The checkpoint's rest of the route while that is being driven."""
         self._plane: Plane | None = None
         self._over = left is not None and left.ended
         self._last: Point2 | None = None
@@ -89,12 +88,14 @@ class Ride:
 
     @property
     def arrived(self) -> bool:
-        """Whether the machine has come to a halt where it was told to."""
+        """Whether the machine stands at the requested stop."""
         return self._navigator.phase is Phase.ARRIVED and self._navigator.stands
 
     def begin(self, location: Location, plane: Plane) -> None:
-        """Plan the route from where the machine stands, all of it or what is left of it; raises PathRefused when it
-        cannot be driven.
+        """Plan the route, or what is left of it, from the machine's location.
+
+        Raises:
+            PathRefused: it cannot be driven.
         """
         left, self._left, self._plane = self._left, None, plane
         self._begun = left
@@ -116,12 +117,12 @@ class Ride:
             self._over = True
 
     def renew(self) -> None:
-        """The route is to begin once more."""
+        """Restart the route from its first waypoint."""
         self._way, self._path, self._left, self._new = None, None, None, False
         self.along_m, self.length_m, self._over = 0.0, math.inf, False
 
     def left(self, plane: Plane | None) -> Left | None:
-        """Where the route is left now, for one that goes on with it later; None before it was begun."""
+        """The rest of the route for a checkpoint; None before the route was begun."""
         if isinstance(self._way, PaperB):
             return Left(self._to_come - self._way.number, ended=self.ended)
         if self._path is None:
@@ -134,7 +135,7 @@ class Ride:
         return Left(len(rest), (before, at), tuple(_place(plane, p) for p in by), bool(self.ended))
 
     def go(self, stop_m: float | None = None) -> None:
-        """Drive on, and stop at a distance along the route [m], or (None) at its end."""
+        """Drive on; stop at a distance along the route [m], or at its end (None)."""
         assert self._way is not None
         self._haul = None
         if isinstance(self._way, Along):
@@ -142,20 +143,24 @@ class Ride:
         self._drive(self._way)
 
     def halt(self) -> None:
-        """Stand as soon as is smooth."""
+        """Stop smoothly."""
         self._navigator.pause()
 
     def haul(self, location: Location, landing: Point2, lie_rad: float | None, stop_on: StopOn) -> None:
-        """Drive to a landing by the shortest way that passes it with room for the crane, along its logs (``lie_rad``,
-        None: anyhow) where there is such a way; PathRefused when none does.
+        """Drive to a landing along the shortest path that passes it with room for the crane.
+
+        ``lie_rad`` is the log direction there; a path along it is preferred (None: any direction).
+
+        Raises:
+            PathRefused: no path passes the landing.
         """
         if self._haul is None:
             ways = list[tuple[float, Path]]()
             if lie_rad is not None:
                 ways = self._passing(location, landing, (lie_rad, lie_rad + math.pi), [], stop_on)
-                # A way round about may pass the landing before its last leg, and otherwise.
+                # A detour may pass the landing before its last leg, in another direction.
                 ways = [w for w in ways if abs(math.remainder(w[1].at(w[0])[2] - lie_rad, math.pi)) < ALONG_RAD]
-            # Beside it or too near to it for a plain way: a little ahead, or round about.
+            # Beside the landing or too near for a plain path: drive a little ahead, or make a detour.
             ways = ways or self._passing(location, landing, _ALL_ROUND, [[]], stop_on)
             if not ways:
                 raise PathRefused("no way leads past the landing with room to turn; move it or give it more room")
@@ -171,17 +176,15 @@ class Ride:
         else_: list[list[Point2]],
         stop_on: StopOn,
     ) -> list[tuple[float, Path]]:
-        """Ways past a landing in one of these directions; where there are none, those by ``else_``; where there are
-        none either, ways round about.
-        """
+        """Paths past a landing in these directions; else the paths by ``else_``; else paths with a turn first."""
         ways = self._reaching(location, _past(landing, directions), stop_on)
         ways = ways or self._reaching(location, else_, stop_on)
         turned = ([*turn, *p] for p in _past(landing, directions) for turn in self._turned(location, p))
         return ways or self._reaching(location, turned, stop_on)
 
     def _reaching(self, location: Location, ways: Iterable[list[Point2]], stop_on: StopOn) -> list[tuple[float, Path]]:
-        """Of the ways by these points those that can be driven and stopped on, each with where to stop [m].  The
-        machine is on them from the first: it does not stop well on one that it has yet to come to.
+        """The drivable paths by these points from which the landing is reached, each with its stop [m].  Every path
+        starts at the machine: stopping is inaccurate before the machine is on its path.
         """
         found = []
         for points in ways:
@@ -195,7 +198,7 @@ class Ride:
         return found
 
     def rejoin(self, location: Location) -> None:
-        """Plan the rest of the route anew, from the landing to where it was left."""
+        """Plan the rest of the route from the landing back to where the route was left."""
         self._haul = None
         if self._over or self._path is None:
             return
@@ -211,9 +214,10 @@ class Ride:
     def _again(
         self, location: Location, back: Sequence[Point2], by: Sequence[Point2], rest: Sequence[Point2], turn: bool
     ) -> None:
-        """The route from where it was left by other places and the rest; where there is no room to come back, as for a
-        machine that is there still, by what is ahead of it or past a place that is too near to turn at, and where there
-        is none for that either, with a turn before it.
+        """Plan the route back to where it was left, by extra places and the remaining waypoints.
+
+        Without room to return, skip the place where it was left, then a place too near to turn at; without room for
+        that, try all of them with a turn first.
         """
         here = (location.x_m, location.y_m)
         ways = [[*back, *by, *rest]] if back else []
@@ -239,7 +243,7 @@ class Ride:
         raise refused
 
     def _turned(self, location: Location, points: Sequence[Point2]) -> Iterator[list[Point2]]:
-        """Places to drive by so that the machine comes to the first of these points along their first leg."""
+        """Corner points that lead the machine to the first of these points in the direction of their first leg."""
         if not points:
             return
         here, yaw = (location.x_m, location.y_m), location.yaw_rad
@@ -250,18 +254,18 @@ class Ride:
         yield from turns((*ahead, yaw), (*points[0], leg), radius_m)
 
     def _back(self) -> tuple[Point2, Point2]:
-        """Where the route is left, and a bit before."""
+        """A point shortly before the place where the route is left, and that place."""
         assert self._path is not None
         return self._path.at(self.along_m - AGAIN_M)[:2], self._path.at(self.along_m)[:2]
 
     def _ahead(self) -> tuple[list[Point2], list[Point2]]:
-        """The places that the route still leads to: those that are no waypoints, and then the waypoints."""
+        """The points still ahead: extra places first, then waypoints."""
         ahead = [point for mark, point in self._marks if mark > self.along_m + AT_M]
         others = len(ahead) - min(len(ahead), self._to_come)
         return ahead[:others], ahead[others:]
 
     def moved(self, location: Location) -> None:
-        """Keep account of the way that was driven."""
+        """Update the driven distance."""
         here = (location.x_m, location.y_m)
         way_m = 0.0 if self._last is None else math.dist(here, self._last)
         self._last, self.driven_m = here, self.driven_m + way_m
@@ -271,39 +275,39 @@ class Ride:
             self.along_m = self._way.steer.s_m
 
     def base_at(self, along_m: float) -> Pose:
-        """The crane's base at a distance along the route of ours, the frame at its lowest."""
+        """The crane's base at a distance along the route, with the frame at its lowest."""
         assert self._path is not None
         return self._base(self._path, along_m)
 
     def _route(self, location: Location, points: Sequence[Point2], begins: Callable[..., Path]) -> None:
-        """The route by these points is what is driven now; ``begins`` makes its path."""
+        """Make the path by these points the active route; ``begins`` plans it."""
         points = list(points)
         if len(points) > 1 and math.dist((location.x_m, location.y_m), points[0]) < AT_M:
             del points[0]
         self._path = path = begins(location, points)
         self._way, self.length_m, self.along_m = Along(self._carrier, path, None, self._speed), path.length_m, 0.0
         self._marks, low, before = [], 0.0, (location.x_m, location.y_m)
-        for point in points:  # bends are shorter than their corners; beyond that it may be the place of another lap
+        for point in points:  # bends are shorter than their corners; farther on it may be the same place of another lap
             low, before = path.nearest(*point, low, low + math.dist(before, point) + 2.0 * AHEAD_M), point
             self._marks.append((low, point))
 
     def _as_it_stands(self, location: Location, points: Sequence[Point2]) -> Path:
-        """A path by these points that the machine is on from where it stands."""
+        """A path by these points that starts in the machine's own direction."""
         here, yaw = (location.x_m, location.y_m), location.yaw_rad
         ahead = (here[0] + AHEAD_M * math.cos(yaw), here[1] + AHEAD_M * math.sin(yaw))
         return drivable([here, ahead, *points], self._carrier)
 
     def _nearly(self, location: Location, points: Sequence[Point2]) -> Path:
-        """A path by these points whose first leg begins about as the machine stands."""
+        """A path by these points whose first leg roughly has the machine's direction."""
         path = self._onto(location, points)
         if abs(math.remainder(path.at(0.0)[2] - location.yaw_rad, math.tau)) > ASTRAY_RAD:
             raise PathRefused(
-                "the way begins far off the direction in which the machine stands; drive it there by hand"
+                "the path starts too far off the direction in which the machine stands; drive it there by hand"
             )
         return path
 
     def _onto(self, location: Location, points: Sequence[Point2]) -> Path:
-        """A path by these points; the follower turns onto its first leg, beside it at first."""
+        """A path by these points; the follower steers onto its first leg."""
         return drivable([(location.x_m, location.y_m), *points], self._carrier)
 
     def _base(self, path: Path, along_m: float) -> Pose:
@@ -311,7 +315,7 @@ class Ride:
         return base_on_way(self._carrier, path.at(along_m)[:3], path.at(along_m - wheelbase)[:2], 0.0)
 
     def _drive(self, way: Along | PaperB) -> None:
-        """Drive on this way, or begin it."""
+        """Start this drive, or resume it."""
         if self._navigator.phase in (Phase.PAUSED, Phase.STOPPED) and self._navigator.way is way:
             self._navigator.resume()
         else:
@@ -330,7 +334,7 @@ _ALL_ROUND: Final = [2.0 * math.pi * k / DIRECTIONS for k in range(DIRECTIONS)]
 
 
 def _past(landing: Point2, directions: Iterable[float]) -> Iterator[list[Point2]]:
-    """Straight ways past a landing, in these directions and on both of its sides."""
+    """Straight lines past a landing in these directions, on both of its sides."""
     for angle in directions:
         c, s = math.cos(angle), math.sin(angle)
         for side in (BESIDE_M, -BESIDE_M):

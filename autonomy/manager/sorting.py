@@ -1,9 +1,9 @@
-"""Which logs a mission wants, and to which of its landings a load of them goes.
+"""Which logs a mission wants, and which landing a load goes to.
 
-What is not of the mission's assortments stays lying.  Without sorting a load goes to the landing that is nearest when
-the machine sets out.  With sorting a load holds what one landing takes: the first log aboard decides which, and until
-it is unloaded there logs of the others stay lying; then the route is driven anew for them.  A round in which nothing
-was loaded is the last.  Landings are known by their places in the mission, from 0.
+Logs of other assortments than the mission's are left.  Without sorting, a load goes to the landing nearest to where the
+machine sets out.  With sorting, a load only holds what one landing accepts: the first log on board decides, and logs of
+other landings are left until the load is unloaded; then the route is driven again for them.  A round in which nothing
+was loaded is the last.  Landings are identified by their index in the mission, from 0.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from autonomy.navigation.clothoid_path import Point2
 
 
 class Sorting:
-    """Of one mission.  ``landing`` is where the load on board goes, None while that is open; ``served`` are the
-    landings for which something was loaded in this round of the route, ``rounds`` those that are over.
+    """Sorting of one mission.
+
+    ``landing`` is the landing of the load on board, None while undecided; ``served`` are the landings for which logs
+    were loaded in this round of the route; ``rounds`` counts finished rounds.
     """
 
     def __init__(self, mission: ForwardingMission) -> None:
@@ -30,19 +32,19 @@ class Sorting:
 
     @property
     def chooses(self) -> bool:
-        """Whether there may be logs that stay lying."""
+        """Whether some logs may have to be left."""
         return self._sorts or bool(self._only)
 
     def taker(self, assortment: str) -> int | None:
-        """The landing that an assortment goes to when it is sorted: the first that names it, else the first that names
-        none; None where no landing takes it.
+        """The landing of an assortment when sorting: the first that names it, else the first that names none, else
+        None.
         """
         named = (i for i, at in enumerate(self._landings) if assortment in at.assortments)
         takes_all = (i for i, at in enumerate(self._landings) if not at.assortments)
         return next(named, next(takes_all, None))
 
     def wants(self, assortment: str, landing: int | None = None) -> bool:
-        """Whether such a log is to come into the load on board; ``landing``: where that would go if it is open."""
+        """Whether such a log belongs to the load on board; ``landing`` is where the load goes while undecided."""
         if self._only and assortment not in self._only:
             return False
         if not self._sorts:
@@ -52,11 +54,11 @@ class Sorting:
         return goes_to is not None and bound in (None, goes_to)
 
     def together(self, assortment: str, first: str) -> bool:
-        """Whether such a log may come up in one grasp with a first one."""
+        """Whether such a log may share a grasp with ``first``."""
         return self.wants(assortment, self.taker(first) if self._sorts else None)
 
     def took(self, assortments: Iterable[str]) -> None:
-        """Logs that have come aboard, the first one first."""
+        """Book assortments that came on board, in order."""
         if not self._sorts:
             return
         if self.landing is None:
@@ -65,23 +67,23 @@ class Sorting:
             self.served.add(self.landing)
 
     def goes_on(self, landing: int | None, served: Iterable[int], rounds: int) -> None:
-        """As it was when the mission was left."""
+        """Restore the state of a checkpoint."""
         self.landing, self.served, self.rounds = landing, set(served), rounds
 
     def sets_out(self, landings: list[Point2], here: Point2) -> int:
-        """The landing that the load is brought to from here: as it was decided, else the nearest."""
+        """Decide the landing of the load: as decided before, else the nearest."""
         if self.landing is None:
             self.landing = min(range(len(landings)), key=lambda i: math.dist(landings[i], here))
         return self.landing
 
     def unloaded(self) -> None:
-        """Nothing is on board any more; the next load is open."""
+        """The bunk is empty; the landing of the next load is undecided."""
         self.landing = None
 
     def anew(self, lying: Iterable[str]) -> bool:
-        """Whether the route is to be driven once more, for logs of these assortments that lie about.
+        """Whether the route is driven again for logs of these assortments that are left.
 
-        A log that would have fitted the only load of the round lies where this route does not lead to it.
+        A log that fits the only load of the round cannot be reached from this route.
         """
         if not self._sorts:
             return False
@@ -89,11 +91,11 @@ class Sorting:
         return bool(self.served) and bool(passed if len(self.served) > 1 else passed - self.served)
 
     def begins_anew(self) -> None:
-        """The route is driven once more."""
+        """Start the next round of the route."""
         self.served, self.rounds = set(), self.rounds + 1
 
     def called(self, landing: int | None) -> str:
-        """A landing as people call it; empty where there is one alone."""
+        """Name of a landing; empty with a single landing."""
         if landing is None or len(self._landings) < 2:
             return ""
         return self._landings[landing].name or f"landing {landing + 1}"

@@ -1,4 +1,4 @@
-"""The tables as pictures and words for the documentation: a page whose charts are Mermaid state diagrams."""
+"""The transition tables as a documentation page: Mermaid state diagrams and tables of states and events."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from typing import Final
 
 from autonomy.manager.transition_table import ENDS, EVENTS, OURS, PAPER_B, RULES, Height, State, Table
 
-TITLES: Final = {"Paper B's way (its Fig. 8)": PAPER_B, "Our way": OURS}
+TITLES: Final = {"Paper B (its Fig. 8)": PAPER_B, "Ours": OURS}
 INTRODUCTION: Final = (
-    "What the forwarder does next is written in tables (`autonomy/manager/transition_table.py`); this page is made from them by "
-    "`timberhand mission states --docs docs`. What is not in a table cannot happen. A state that takes longer than its "
-    "patience ends the mission with its sentence, unless the table knows a way on. A controller that stops, faults or "
-    "falls silent pauses every state; when it is armed again the state begins anew."
+    "The tables in `autonomy/manager/transition_table.py` define what the forwarder does next. `timberhand mission "
+    "states --docs docs` generates this page from them. A transition that is not in a table cannot happen. A state "
+    "that exceeds its timeout fails the mission with its reason, unless the table has a transition for the timeout. "
+    "When the controller stops, faults or falls silent, every state pauses; once it is armed again, the state is "
+    "entered again."
 )
 
 
 def page() -> str:
-    """The whole page, Markdown."""
+    """The whole page as Markdown."""
     parts = ["# The activity manager", "", INTRODUCTION, ""]
     for title, table in TITLES.items():
         parts += [f"## {title}", "", "```mermaid", diagram(table), "```", ""]
@@ -26,7 +27,7 @@ def page() -> str:
 
 
 def diagram(table: Table) -> str:
-    """A state diagram; events that lead from one state to another stand together."""
+    """A Mermaid state diagram; events between the same two states share an arrow."""
     arrows: dict[tuple[State, State], list[str]] = defaultdict(list)
     for (begin, event), end in sorted(table.items()):
         arrows[begin, end].append(event.name.lower().replace("_", " "))
@@ -37,8 +38,8 @@ def diagram(table: Table) -> str:
 
 
 def states() -> list[str]:
-    """A table of all states."""
-    rows = ["| state | the machine | frame | patience | when it is over |", "|---|---|---|---|---|"]
+    """The table of states."""
+    rows = ["| state | the machine | frame | timeout | reason after the timeout |", "|---|---|---|---|---|"]
     heights = {Height.KEEP: "as it is", Height.TRANSPORT: "transport", Height.LOADING: "loading"}
     for state, rule in RULES.items():
         waits = rule.patience_s == float("inf")
@@ -48,5 +49,5 @@ def states() -> list[str]:
 
 
 def events() -> list[str]:
-    """A table of all events."""
+    """The table of events."""
     return ["| event | meaning |", "|---|---|", *(f"| {e.name} | {words} |" for e, words in EVENTS.items())]

@@ -1,4 +1,4 @@
-"""What is on board and what was done: loads, volumes, and every log that was given up, with its reason."""
+"""Counts of a mission: logs on board, loads brought to landings, volumes, and logs given up with the reason."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from autonomy.missions.model import Point
 from machine.profile import Bunk
 
 PACKING: Final = 0.60
-"""Share of a bunk's volume that is wood when logs lie in it as a crane lays them (assumed; 0.55 to 0.65)."""
+"""Solid share of a bunk's volume when a crane loads it (assumed; 0.55 to 0.65)."""
 
 
 def volume_m3(length_m: float, diameter_m: float) -> float:
-    """Of a cylinder."""
+    """Volume of a cylinder."""
     return 0.25 * math.pi * diameter_m**2 * length_m
 
 
 class Taken(msgspec.Struct, frozen=True):
-    """A log that was brought into the bunk: where it had lain, when, and its solid volume."""
+    """A log that was loaded into the bunk: where it had lain, when it was loaded, its solid volume."""
 
     position: Point
     at_ns: int
@@ -31,7 +31,7 @@ class Taken(msgspec.Struct, frozen=True):
 
 
 class Load(msgspec.Struct, frozen=True):
-    """What was brought at once to a landing, by its place in the mission; ``driven_m`` since the load before."""
+    """Logs unloaded together at one landing, by the landing's index; ``driven_m`` since the load before."""
 
     logs: tuple[Taken, ...]
     at_ns: int
@@ -41,8 +41,10 @@ class Load(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class Tally:
-    """Counts and sums of a mission; ``on_board`` logs are in the bunk now, ``board`` are those of them that the mission
-    took, ``loads`` went to landings, the last one after ``counted_m`` of the mission's way.
+    """Counts and sums of a mission.
+
+    ``on_board`` counts logs in the bunk, ``board`` lists those that this mission loaded, ``loads`` went to landings.
+    ``counted_m`` is the driven distance at the last unloading.
     """
 
     loaded: int = 0
@@ -53,14 +55,14 @@ class Tally:
     board_m3: float = 0.0
     board_kg: float = 0.0
     brimful: bool = False
-    """A log was gripped for which the bunk had no room."""
+    """The bunk had no room for a grasp."""
     given_up: dict[int, str] = field(default_factory=dict)
     loads: list[Load] = field(default_factory=list)
     board: list[Taken] = field(default_factory=list)
     counted_m: float = 0.0
 
     def took(self, logs: Sequence[Taken], load_kg: float) -> None:
-        """A grasp that went into the bunk."""
+        """Book a grasp that was placed in the bunk."""
         self.grasps += 1
         self.loaded += len(logs)
         self.on_board += len(logs)
@@ -69,19 +71,19 @@ class Tally:
         self.board_kg += load_kg if math.isfinite(load_kg) else 0.0
 
     def full(self, bunk: Bunk, next_m3: float = 0.0) -> bool:
-        """Whether the bunk has no room for so much more wood [m3]."""
+        """Whether the bunk has no room for ``next_m3`` more wood [m3]."""
         room = PACKING * bunk.length_m * bunk.width_m * bunk.stake_height_m
         return self.board_m3 + next_m3 > room
 
     def laid_down(self, logs: int) -> None:
-        """A grasp that went from the bunk to a landing; it may have held logs that were on board before the mission."""
+        """Book a grasp from the bunk to a landing; it may include logs that were on board before the mission."""
         self.grasps += 1
         self.unloaded += logs
         self.on_board = max(0, self.on_board - logs)
 
     def emptied(self, now_ns: int, driven_m: float, landing: int = 0) -> None:
-        """Nothing is left in the bunk, after so much way of the whole mission [m]."""
-        if self.board:  # and not only what was on board before
+        """Book an empty bunk after a driven distance of the whole mission [m]."""
+        if self.board:  # else only logs from before the mission were unloaded
             self.loads.append(Load(tuple(self.board), now_ns, driven_m - self.counted_m, landing))
         self.board, self.counted_m = [], driven_m
         self.on_board, self.board_m3, self.board_kg, self.brimful = 0, 0.0, 0.0, False

@@ -1,4 +1,4 @@
-"""The log that the machine is about: what it stops for and where, whether the crane's foot comes by, what it takes."""
+"""The log that the machine drives to: where to stop for it, and whether the crane's base has passed it."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from autonomy.manager.route_driver import Ride
 from autonomy.manager.world_model import Outlook
 
 COMMIT_M: Final = 2.5
-"""A stop that is no further ahead is driven to."""
+"""A stop no farther ahead than this is final."""
 WEIGH_NS: Final = 200_000_000
-"""The next stop is thought over so often."""
+"""Period at which the next stop is planned."""
 HITS: Final = 2
-"""So often a log is seen before its place counts as averaged."""
+"""Observations after which a log's position counts as averaged."""
 
 
 class Target:
-    """``number`` is the field's, None while there is no target; ``stop_m``: where to stop for it, along the route."""
+    """``number`` is the map's, None without a target; ``stop_m`` is where to stop for it along the route."""
 
     def __init__(self, outlook: Outlook, ride: Ride, cargo: Cargo) -> None:
         self.number: int | None = None
@@ -29,25 +29,27 @@ class Target:
 
     @property
     def log(self) -> FieldLog | None:
-        """As it is known now; None when it is not, or no longer."""
+        """The mapped target; None without one, or when it is no longer mapped."""
         return None if self.number is None else self._outlook.field.get(self.number)
 
     def search(self) -> None:
-        """For another."""
+        """Drop the target and search for another one."""
         self.number, self._was_inside = None, False
 
     @property
     def lies_ahead(self) -> bool:
-        """Whether it may be looked at: one beside the machine is out of the front camera's sight."""
+        """Whether the front camera can see the target; it cannot see beside the machine."""
         return self.number is not None and not self._outlook.in_circle(self.log)
 
     def look_again(self) -> None:
-        """Know its place by what is seen from now on alone."""
+        """Restart the average of the target's position."""
         assert self.number is not None
         self._outlook.field.anew(self.number)
 
     def is_near(self, now_ns: int) -> bool:
-        """Paper B stops for the nearest log; we, where the best place to stop is just ahead; full, for none."""
+        """Whether to stop for a log: paper B stops for the nearest one, ours when the best stop is close.  With a full
+        bunk the machine does not stop.
+        """
         if self._cargo.full:
             return False
         if self._ride.faithful:
@@ -66,27 +68,27 @@ class Target:
 
     @property
     def averaged(self) -> bool:
-        """Whether it was seen often enough for a place."""
+        """Whether the target was observed often enough."""
         log = self.log
         return log is not None and log.hits >= HITS
 
     def came_inside(self) -> bool:
-        """Whether the crane's foot is in the circle round it, or was."""
+        """Whether the crane's base is, or was, in the circle round the target."""
         self._was_inside = self._was_inside or self._outlook.in_circle(self.log)
         return self._was_inside
 
     def is_past(self) -> bool:
-        """Whether the crane's foot has left the circle."""
+        """Whether the crane's base has left the circle on the far side."""
         return self._outlook.past(self.log)
 
     def is_takable(self) -> bool:
-        """Whether a log can be taken from here: paper B checks its target, we all that are seen."""
+        """Whether a log can be grasped from here: for paper B only the target, for ours any log in the list."""
         found = [] if self._cargo.full else self._outlook.takable(self.number if self._ride.faithful else None)
         if found:
             self.number = found[0].number
         return bool(found)
 
     def not_takable(self) -> None:
-        """It looked better from afar: not again and again."""
+        """Count a failure for a log that proves out of reach, so that the machine does not stop for it forever."""
         if self.number is not None and not self._cargo.full:
             self._outlook.missed(self.number)

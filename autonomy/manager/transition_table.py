@@ -1,9 +1,9 @@
-"""The activity manager as tables: states, events, what follows, how long each state may take and what is wrong then.
+"""The transition tables of the activity manager: states, events, transitions, timeouts and their reasons.
 
-``PAPER_B`` is Fig. 8 of paper B (section 3.2.6): one log at a time, a first stop to look, a second one when the crane
-foot has entered and left a circle round the log.  ``OURS`` drives to the best place for all logs in reach, takes them
-one after the other with a new look before each, and brings the load to the landing.  Both share states and events, and
-nothing but a table says what follows; what is not in it cannot happen.
+``PAPER_B`` is Fig. 8 of paper B (section 3.2.6): one log at a time, a first stop to observe it, a second one when the
+crane's base has entered and left a circle round it.  ``OURS`` drives to the best place for all logs in reach, loads
+them one after the other with a new detection before each, and brings the load to the landing.  Both share states and
+events.  Only a table decides what follows; a transition that is not in it cannot happen.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final
 
 
 class State(IntEnum):
-    """What the forwarder is about."""
+    """Current task of the forwarder."""
 
     IDLE = 0
     RAISE = 1
@@ -37,7 +37,7 @@ class State(IntEnum):
 
 
 class Event(IntEnum):
-    """What has come about; the order is the order in which they are asked for."""
+    """Reason for a transition; events are tested in this order."""
 
     RESUMED = 0
     AUTO = 1
@@ -62,31 +62,31 @@ class Event(IntEnum):
 
 
 EVENTS: Final[Mapping[Event, str]] = {
-    Event.RESUMED: "the switch is at Auto, and the mission was begun before the planner was started again",
-    Event.AUTO: "the switch is at Auto",
-    Event.AT_HEIGHT: "all four arms are at the wanted height",
+    Event.RESUMED: "the mode switch is at Auto, and the mission was begun before the planner restarted",
+    Event.AUTO: "the mode switch is at Auto",
+    Event.AT_HEIGHT: "all four swing arms are at the requested height",
     Event.LOG_NEAR: "a log is near enough to stop for",
-    Event.STANDING: "the machine stands",
-    Event.AVERAGED: "the log has been watched for the hold time",
-    Event.GONE: "the log is not seen again",
-    Event.INSIDE: "the crane foot has entered the circle round the log",
-    Event.OUTSIDE: "the crane foot has left the circle",
-    Event.ARRIVED: "the machine stands at the wanted place",
-    Event.VALID: "a log lies where the crane can take it",
-    Event.INVALID: "no log lies where the crane can take it",
+    Event.STANDING: "the machine is at standstill",
+    Event.AVERAGED: "the log has been observed for the hold time",
+    Event.GONE: "the log is no longer detected",
+    Event.INSIDE: "the crane's base has entered the circle round the log",
+    Event.OUTSIDE: "the crane's base has left the circle",
+    Event.ARRIVED: "the machine stands at the requested place",
+    Event.VALID: "the crane can grasp a log from here",
+    Event.INVALID: "the crane can grasp no log from here",
     Event.COLLECTED: "the log lies in the bunk",
-    Event.MISSED: "the grasp came up empty or was given up",
-    Event.LOADED: "the bunk is full or holds all that is wanted, or the route has ended with logs on board",
-    Event.EMPTY: "nothing is left in the bunk",
-    Event.STOWED: "the crane rests over the bunk",
-    Event.ROUND_END: "the last waypoint is reached, and logs that other landings take still lie along the route",
-    Event.ROUTE_END: "the last waypoint is reached, or all logs that are wanted are taken",
-    Event.TIME_OUT: "it takes too long",
+    Event.MISSED: "the grasp failed or was given up",
+    Event.LOADED: "the bunk is full or holds all wanted logs, or the route has ended with logs on board",
+    Event.EMPTY: "the bunk is empty",
+    Event.STOWED: "the crane is stowed over the bunk",
+    Event.ROUND_END: "the last waypoint is reached, and logs of other landings still lie along the route",
+    Event.ROUTE_END: "the last waypoint is reached, or all wanted logs are loaded",
+    Event.TIME_OUT: "the state has timed out",
 }
 
 
 class Height(IntEnum):
-    """Where the swing arms are to be."""
+    """Requested height of the swing arms."""
 
     KEEP = 0
     TRANSPORT = 1
@@ -95,9 +95,8 @@ class Height(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A state: what it is in words, whether the carrier drives, where the frame is to be, whether the crane works, how
-    long it may take [s], and what is wrong after that.  Driving time counts against the way, so a state that drives
-    has the time that may pass without progress.
+    """Properties of a state: description, timeout [s] and its reason, whether the carrier drives, frame height, whether
+    the crane works.  The timeout of a driving state counts from the last progress.
     """
 
     words: str
@@ -109,30 +108,30 @@ class Rule:
 
 
 RULES: Final[Mapping[State, Rule]] = {
-    State.IDLE: Rule("waits for the switch to go to Auto", float("inf"), ""),
-    State.RAISE: Rule("brings the frame to transport height", 30.0, "the swing arms did not reach the transport height",
+    State.IDLE: Rule("waits for the mode switch to be set to Auto", float("inf"), ""),
+    State.RAISE: Rule("moves the frame to transport height", 30.0, "the swing arms did not reach the transport height",
                       height=Height.TRANSPORT),
-    State.SEARCH: Rule("follows the waypoints and looks for logs", 20.0, "the machine does not get on along its way",
+    State.SEARCH: Rule("follows the waypoints and looks for logs", 20.0, "the machine makes no progress on the route",
                        drives=True),
     State.HALT: Rule("stops before the log", 10.0, "the machine did not come to a stop"),
-    State.LOOK: Rule("watches the log at standstill", 15.0, "the log was not seen well enough"),
-    State.APPROACH: Rule("drives up to the log", 20.0, "the machine does not get on towards the log", drives=True),
-    State.PASS: Rule("drives past the log", 20.0, "the machine does not get on past the log", drives=True),
+    State.LOOK: Rule("observes the log at standstill", 15.0, "the log was not observed often enough"),
+    State.APPROACH: Rule("drives up to the log", 20.0, "the machine makes no progress towards the log", drives=True),
+    State.PASS: Rule("drives past the log", 20.0, "the machine makes no progress past the log", drives=True),
     State.STOP: Rule("stops beside the log", 10.0, "the machine did not come to a stop"),
-    State.CHECK: Rule("judges whether a log can be taken", 15.0, "no list of logs came"),
-    State.LOWER: Rule("brings the frame to loading height", 30.0, "the swing arms did not reach the loading height",
+    State.CHECK: Rule("checks whether a log can be grasped", 15.0, "no log list was received"),
+    State.LOWER: Rule("moves the frame to loading height", 30.0, "the swing arms did not reach the loading height",
                       height=Height.LOADING),
-    State.COLLECT: Rule("takes a log into the bunk", 180.0, "the crane did not bring the log into the bunk",
+    State.COLLECT: Rule("loads a log into the bunk", 180.0, "the crane did not bring the log into the bunk",
                         crane=True),
-    State.HAUL: Rule("drives the load to the landing", 20.0, "the machine does not get on towards the landing",
+    State.HAUL: Rule("drives the load to the landing", 20.0, "the machine makes no progress towards the landing",
                      drives=True),
-    State.SETTLE: Rule("brings the frame to loading height at the landing", 30.0,
+    State.SETTLE: Rule("moves the frame to loading height at the landing", 30.0,
                        "the swing arms did not reach the loading height", height=Height.LOADING),
     State.UNLOAD: Rule("unloads the bunk", 240.0, "the crane did not bring a log to the landing", crane=True),
-    State.STOW: Rule("brings the crane over the bunk", 60.0, "the crane did not come to rest over the bunk",
+    State.STOW: Rule("moves the crane over the bunk", 60.0, "the crane did not reach its stow position over the bunk",
                      crane=True),
     State.DONE: Rule("has finished", float("inf"), ""),
-    State.FAILED: Rule("has given up", float("inf"), ""),
+    State.FAILED: Rule("has failed", float("inf"), ""),
 }  # fmt: skip
 
 Table = Mapping[tuple[State, Event], State]
@@ -182,21 +181,21 @@ OURS: Final[Table] = {
 }
 
 WAYS: Final[Mapping[str, Table]] = {"ours": OURS, "paper-b": PAPER_B}
-"""By the names that a person gives them."""
+"""By their names on the command line."""
 ENDS: Final = frozenset({State.DONE, State.FAILED})
-"""Nothing follows, but that an operator begins anew."""
+"""Final states."""
 
 
 def awaited(table: Table, state: State) -> tuple[Event, ...]:
-    """The events that a state reacts to, in the order in which they are asked for."""
+    """The events that a state reacts to, in the order in which they are tested."""
     return tuple(sorted(event for known, event in table if known is state))
 
 
 def following(table: Table, state: State, event: Event) -> State:
-    """What follows; a state that runs out of time without a way on has failed.
+    """The next state; a timeout without a transition leads to FAILED.
 
     Raises:
-        KeyError: this event does not concern this state.
+        KeyError: the state does not react to this event.
     """
     if event is Event.TIME_OUT:
         return table.get((state, event), State.FAILED)

@@ -1,6 +1,6 @@
-"""What the manager knows of machine and surroundings, and what follows for the logs: near, in the circle, in reach.
+"""World model of the activity manager: machine state, logs, landings and fences, and the questions asked about them.
 
-`Outlook.take` is given everything that comes in; the questions are answered from the newest of it.
+`WorldModel.update` accepts every report; `observe` accepts log lists.  All questions are answered from the newest data.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from autonomy.crane_job.activity import Activity
-from autonomy.grasp.selection import lies_in
+from autonomy.grasp.placement import lies_in_bunk
 from autonomy.localization.location import Location
 from autonomy.localization.frames import Frames
 from autonomy.localization.localizer import Localizer
@@ -32,34 +32,37 @@ from autonomy.motion.arm import Arm
 from autonomy.navigation.clothoid_path import Point2
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.log_list.observation import LogObservation
-from can_dbc.messages.crane import StateReport, VehicleReport
-from machine.modes import Mode
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.vehicle import VehicleReport
+from machine.status.modes import Mode
 from machine.profile import Bunk, Profile
 
 SILENT_NS: Final = 300_000_000
 NEAR_M: Final = 4.0
-"""The machine stops to look when a log lies so far ahead of the front axle, or less (paper B: 4 m before the log)."""
+"""The machine stops to observe a log that lies no farther ahead of the front axle (paper B: 4 m before the log)."""
 CIRCLE_M: Final = 5.3
-"""Radius of the circle round the log that the crane foot enters and leaves: about 5 m (paper B)."""
+"""Radius of the circle round the log that the crane's base enters and leaves: about 5 m (paper B)."""
 HORIZON_M: Final = 16.0
-"""Logs that lie farther away along the way are no matter yet."""
+"""Logs farther away along the route are not considered yet."""
 AHEAD_M: Final = 0.5
 BRAKING_M: Final = 0.5
-"""The machine comes to rest in this way from its usual speed."""
+"""Stopping distance from the usual speed."""
 SPINE: Final = 15
-"""Points along a log where it is asked whether a wheel meets it."""
+"""Points along a log that are tested against the wheel tracks."""
 ATTEMPTS: Final = 3
 STANDS_M_S: Final = 0.02
 POSES: Final = 40
 FARTHEST: Final = 4.0
-"""The base is foretold no further than by so many reports."""
+"""The base pose is extrapolated by at most this many report intervals."""
 PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M = 3.0, 2.6, 1.5
-"""Of a pile on the landing: shorter logs than this, side by side, and no higher."""
+"""Size of a pile on a landing: longer than the logs, which lie side by side, and no higher."""
 
 
 class Outlook:
-    """One machine's view.  ``field`` are the logs that lie about, of which ``sorting`` says what is wanted;
-    ``location`` is the newest, None before the first.  ``known`` is what was known of logs when the mission was left.
+    """One machine's view of its surroundings.
+
+    ``field`` maps the logs on the ground; ``sorting`` decides which of them are wanted.  ``location`` is the newest
+    one, None before the first.  ``known`` restores the log knowledge of a checkpoint.
     """
 
     def __init__(
@@ -71,10 +74,10 @@ class Outlook:
         self.report: StateReport | None = None
         self.vehicle: VehicleReport | None = None
         self.list_ns = 0
-        """When the newest list of logs was seen."""
+        """When the newest log list was observed."""
         self.in_bunk, self.counted_ns = 0, 0
         self.strayed_m = 0.0
-        """How far the front axle or the crane's foot is from where the fences let the machine drive; 0 inside."""
+        """Distance of the front axle or the crane's base outside the fences; 0 inside."""
         self._carrier, self._bunk, self._ground_z_m = profile.carrier, profile.bunk, profile.workspace.ground_z_m
         self._localizer = Localizer(profile.carrier, plane)
         self._reach = Reach(Arm(profile), profile.carrier)
@@ -82,7 +85,7 @@ class Outlook:
         self._bases: deque[tuple[int, Pose]] = deque(maxlen=POSES)
         self._numbers: dict[int, int] = {}
         self.landings: list[Point2] = []
-        """In the plane, once that is known."""
+        """Landing positions in the plane; empty before the first location."""
         self._places = tuple(landing.position for landing in mission.landings)
         self._listed = mission.logs if mission.options.logs == "listed" else ()
         self._known = known or Known()
@@ -90,7 +93,7 @@ class Outlook:
 
     @property
     def plane(self) -> Plane:
-        """The local plane; known once the machine is located."""
+        """The local plane; only valid once the machine is located."""
         assert self._localizer.plane is not None
         return self._localizer.plane
 
@@ -105,7 +108,7 @@ class Outlook:
         return self._bases[-1][1]
 
     def base_at(self, at_ns: int) -> Pose:
-        """The crane's base at a moment: the nearest that is known, or as it moves on after the last."""
+        """The crane's base at a time: the nearest stored pose, extrapolated after the last one."""
         stamp, last = self._bases[-1]
         if at_ns <= stamp or len(self._bases) < 2:
             return min(self._bases, key=lambda known: abs(known[0] - at_ns))[1]
@@ -120,7 +123,7 @@ class Outlook:
         )
 
     def take(self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None) -> None:
-        """The newest reports."""
+        """Accept the newest reports and update the location."""
         if report is not None:
             self.report, self._report_ns = report, now_ns
         if vehicle is not None:
@@ -134,9 +137,7 @@ class Outlook:
                 self.strayed_m = float(self._area.outside_m(places).max())
 
     def _look_up(self) -> None:
-        """What the mission says of places, in the plane that is now known: landings, fences, and logs that need not be
-        found.
-        """
+        """Convert landings, fences and listed logs of the mission into the plane, and restore the known logs."""
         plane = self.plane
         self.landings = [plane.local(p.latitude_deg, p.longitude_deg)[:2] for p in self._places]
         rings = [
@@ -155,7 +156,7 @@ class Outlook:
         self.field.number_from(self._known.free)
 
     def known(self) -> Known:
-        """What is to be remembered of the logs when the mission is left now."""
+        """Log knowledge to store in a checkpoint."""
         if not self._bases:
             return self._known
         gone = tuple(n for n in range(1, len(self._listed) + 1) if self.field.get(n) is None)
@@ -169,7 +170,7 @@ class Outlook:
         return Missed(log.number, kept, log.misses)
 
     def in_the_way(self) -> FieldLog | None:
-        """The first log that a front wheel would run into next."""
+        """The first log that a front wheel would hit next; None without one."""
         assert self.location is not None
         here, c = self.location, self._carrier
         cos, sin = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
@@ -183,20 +184,20 @@ class Outlook:
         return None
 
     def see(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
-        """A list of logs in the base frame as it was at a moment; none counts before the machine is located."""
+        """Accept a log list in the base frame of a time; ignored before the machine is located."""
         if logs and self._bases:
             self.aboard(logs, seen_ns)
             self._numbers = self.learn(logs, seen_ns)
             self.list_ns = seen_ns
 
     def learn(self, logs: Sequence[LogObservation], seen_ns: int) -> dict[int, int]:
-        """Take a list into the field alone; which of its numbers is which log of the field."""
+        """Merge a list into the log map only; returns the map number of each list number."""
         if not logs or not self._bases:
             return {}
         return self.field.see(logs, self.base_at(seen_ns), seen_ns)
 
     def remember(self, memory: Memory, job: Activity | None, now_ns: int) -> tuple[LogObservation, ...]:
-        """A list of what is remembered takes the place of what is seen; empty while there is no new one."""
+        """Replace the detector's list by one from memory; empty while there is no new one."""
         if not self._bases:
             return ()
         logs = memory.list(now_ns, self.field, self.base, self.report, job)
@@ -210,17 +211,17 @@ class Outlook:
     def aboard(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
         """Count the logs of a list that lie in the bunk."""
         if logs:
-            self.in_bunk, self.counted_ns = sum(lies_in(self._bunk, log) for log in logs), seen_ns
+            self.in_bunk, self.counted_ns = sum(lies_in_bunk(self._bunk, log) for log in logs), seen_ns
 
     def landing_ahead(self, point: Point2, base_at: BaseAt, end_m: float) -> float | None:
-        """From where along a way the crane reaches a landing best; None: from nowhere."""
+        """Distance along a path from which the crane reaches a landing best; None if there is none."""
         pile = FieldLog(0, np.array([*point, 0.0]), np.array([1.0, 0.0, 0.0]), 2.0, 0.3, 0.1, CONFIRMED, 0)
         stop = best_stop([pile], self._reach, base_at, 0.0, end_m)
         return None if stop is None else stop.along_m
 
     def pile_at(self, point: Point2, lie_rad: float | None = None) -> Bunk:
-        """A landing as the crane lays logs there: a bunk on the ground beside the machine, along it or along a
-        direction in the plane.
+        """The landing as a bunk on the ground for the crane: beside the machine, parallel to it or to ``lie_rad`` [rad]
+        in the plane.
         """
         x, y, _ = self.base.to_optical(np.array([*point, self.base.position_m[2]])).tolist()
         looks = math.atan2(self.base.rotation[1, 0], self.base.rotation[0, 0])
@@ -228,7 +229,7 @@ class Outlook:
         return Bunk((x, y), yaw, PILE_LENGTH_M, PILE_WIDTH_M, self._ground_z_m, PILE_HEIGHT_M)
 
     def obstacle(self, now_ns: int) -> str:
-        """Why nothing that is asked for would be obeyed now; empty when it would."""
+        """Why the machine cannot act on setpoints now; empty when it can."""
         if self.report is None or self.vehicle is None:
             return "the controller has not reported"
         if now_ns - min(self._report_ns, self._vehicle_ns) > SILENT_NS:
@@ -241,30 +242,30 @@ class Outlook:
 
     @property
     def stopped(self) -> bool:
-        """Whether the controller has stopped the machine."""
+        """Whether the controller is in STOP or FAULT."""
         return self.report is not None and self.report.mode in (Mode.STOP, Mode.FAULT)
 
     def at_height(self, wanted_m: float) -> bool:
-        """Whether all four arms are there."""
+        """Whether all four swing arms are at a height."""
         assert self.vehicle is not None
         near = 1.5 * self._carrier.arm_in_band_m
         return all(abs(h - wanted_m) <= near for h in self.vehicle.heights_m)
 
     def stands(self) -> bool:
-        """Whether the machine does."""
+        """Whether the machine is at standstill."""
         return self.vehicle is not None and abs(self.vehicle.speed_m_s) < STANDS_M_S
 
     # ------------------------------------------------------------------ logs
     def number_of(self, listed: int) -> int | None:
-        """The field's number of a log of the newest list."""
+        """The map number of a log of the newest list."""
         return self._numbers.get(listed)
 
     def listed_as(self, number: int | None) -> int | None:
-        """The newest list's number of a log of the field."""
+        """The newest list's number of a mapped log."""
         return next((k for k, n in self._numbers.items() if n == number), None)
 
     def missed(self, number: int, for_good: bool = False) -> bool:
-        """A grasp of a log came up empty; whether it is given up: then it is known, but nobody stops for it."""
+        """Record a failed grasp; returns whether the log is given up: it stays mapped but is no longer collected."""
         if self.field.get(number) is None:
             return False
         while (misses := self.field.missed(number)) < ATTEMPTS and for_good:
@@ -272,16 +273,16 @@ class Outlook:
         return misses >= ATTEMPTS
 
     def given_up(self, listed: int) -> bool:
-        """Whether a log of the newest list is one that is given up."""
+        """Whether a log of the newest list is given up."""
         number = self._numbers.get(listed)
         log = None if number is None else self.field.get(number)
         return log is not None and log.misses >= ATTEMPTS
 
     def near(self) -> FieldLog | None:
-        """Paper B: of the logs that are near enough to stop for, the one that is nearest to the crane.
+        """Paper B: the log nearest to the crane among those near enough to stop for.
 
-        Near are those a little ahead, and those beside or behind the front half whose circle the crane foot has not
-        left: while the machine went on to one log it may have come past the next.
+        These are logs a little ahead, and logs whose circle the crane's base is still inside: the machine may have
+        passed a second log while it approached the first.
         """
         assert self.location is not None
         here = self.location
@@ -293,41 +294,41 @@ class Outlook:
         return nearest(near, self.base.position_m[:2])
 
     def stop_ahead(self, base_at: BaseAt, along_m: float, end_m: float) -> Stop | None:
-        """Ours: the best next place to stop on the way ahead."""
+        """The best next place to stop along the path; None without one."""
         begin = along_m + AHEAD_M
         return best_stop(self._matter(), self._reach, base_at, begin, min(begin + HORIZON_M, end_m))
 
     def in_circle(self, log: FieldLog | None) -> bool:
-        """Whether the crane foot is in the circle round a log."""
+        """Whether the crane's base is in the circle round a log."""
         return log is not None and math.dist(log.center_m[:2], self.base.position_m[:2]) < CIRCLE_M
 
     def past(self, log: FieldLog | None) -> bool:
-        """Whether the crane foot has left the circle on the far side: at its near edge noise must not count."""
+        """Whether the crane's base has left the circle on the far side; noise at the near edge does not count."""
         if log is None:
             return True
         behind_m = float(self.base.to_optical(log.center_m)[0])  # the base looks backwards
         return behind_m > 0.0 and not self.in_circle(log)
 
     def takable(self, only: int | None = None) -> list[FieldLog]:
-        """The logs of the newest list that the crane can take from here, best first; or one of them."""
+        """Logs of the newest list that the crane can grasp from here, best first; or only the log ``only``."""
         seen = set(self._numbers.values()) if only is None else {only}
         logs = [g for g in self._wanted() if g.number in seen]
         work = sorted((self._reach.work_s(g.observation(self.base)), g.number, g) for g in logs)
         return [g for seconds, _, g in work if math.isfinite(seconds)]
 
     def lying(self) -> list[FieldLog]:
-        """The logs that can be collected: not given up, and not on a landing."""
+        """Logs that can be collected: not given up and not on a landing."""
         return [g for g in self.field.logs if g.misses < ATTEMPTS and not self.on_landing(g)]
 
     def on_landing(self, log: FieldLog) -> bool:
-        """Whether a log has come to a landing."""
+        """Whether a log lies on a landing."""
         return any(math.dist(log.center_m[:2], at) <= PILE_LENGTH_M for at in self.landings)
 
     def _wanted(self) -> list[FieldLog]:
-        """Those of them that are to come into the load on board."""
+        """Collectable logs that belong to the current load."""
         return [g for g in self.lying() if self.sorting.wants(g.assortment)]
 
     def _matter(self) -> list[FieldLog]:
-        """Those of them for which it may be worth to stop soon."""
+        """Wanted logs close enough to affect the next stop."""
         foot = self.base.position_m[:2]
         return [g for g in self._wanted() if math.dist(g.center_m[:2], foot) < HORIZON_M]

@@ -1,8 +1,8 @@
-"""A polyline as a path the machine can drive: straight legs, corners rounded by clothoid, arc, clothoid.
+"""Drivable paths from polylines: straight legs, and corners rounded by clothoid, arc, clothoid.
 
-``drivable(points, limits)`` first drops points that the line does not need, then rounds every corner with at most the
-curvature and the change of curvature in ``Limits``; a corner whose legs are too short for that gets the sharpest bend
-the machine can drive, and is refused when that is not enough.
+``drivable(points, carrier)`` drops points that the line does not need, then rounds every corner within the curvature
+and curvature rate of `Limits`.  A corner whose legs are too short gets the sharpest bend that the machine can drive,
+and is refused when that is not enough.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from typing import Final
 
 import numpy as np
 
-from machine.carrier import turning_radius_m
+from machine.geometry.carrier import turning_radius_m
 from machine.profile import Carrier
 
 SPACING_M: Final = 0.05
 TOLERANCE_M: Final = 0.05
-"""Points this near to the line between their neighbours are dropped."""
+"""Points this near to the line between their neighbours are dropped (Douglas and Peucker)."""
 COMFORT: Final = 0.80
-"""Share of the sharpest bend that a corner uses, so that something is left for correction."""
+"""Share of the maximum curvature used in a corner; the rest is left for correction."""
 RATE_SHARE: Final = 0.70
-"""Share of the articulation's rate that a corner uses at cruising speed."""
+"""Share of the articulation rate used in a corner at cruising speed."""
 HARDEST: Final = 0.95
-"""Of both, where the legs are short."""
+"""Share of both where the legs are short."""
 Point2 = tuple[float, float]
 
 
 class PathRefused(ValueError):
-    """A polyline that cannot be driven; the message says where and why."""
+    """A polyline cannot be driven; the message says where and why."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Curvature [1/m] and its change along the path [1/m^2]."""
+    """Curvature [1/m] and curvature rate along the path [1/m^2]."""
 
     curve_1_m: float
     change_1_m2: float
@@ -45,8 +45,8 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Samples ``SPACING_M`` apart, or a little less: way ``s_m`` (n,), ``xy_m`` (n, 2), ``heading_rad`` (n,) that goes
-    on without jumps, ``curve_1_m`` (n,).  ``corners_m``: where along it the middle of each corner is.
+    """Samples at most ``SPACING_M`` apart: distance ``s_m`` (n,), ``xy_m`` (n, 2), ``heading_rad`` (n,) without jumps,
+    ``curve_1_m`` (n,).  ``corners_m`` are the distances of the corners' centres.
     """
 
     s_m: np.ndarray
@@ -57,14 +57,14 @@ class Path:
 
     @property
     def length_m(self) -> float:
-        """The whole way."""
+        """Length of the path."""
         return float(self.s_m[-1])
 
     def at(self, s_m: float) -> tuple[float, float, float, float]:
-        """x, y [m], heading [rad] and curvature [1/m] at ``s_m``; past either end the path goes on straight."""
+        """x, y [m], heading [rad] and curvature [1/m] at ``s_m``; the path continues straight past either end."""
         s = min(max(s_m, 0.0), self.length_m)
         beyond = s_m - s
-        i = min(bisect_right(self.s_m, s) - 1, len(self.s_m) - 2)  # a planner asks thousands of times: no numpy call
+        i = min(bisect_right(self.s_m, s) - 1, len(self.s_m) - 2)  # called thousands of times: numpy would be slower
         from_m, to_m = self.s_m[i : i + 2].tolist()
         (x, y), (to_x, to_y) = self.xy_m[i : i + 2].tolist()
         heading, to_heading = self.heading_rad[i : i + 2].tolist()
@@ -76,8 +76,8 @@ class Path:
         return x, y, heading, 0.0 if beyond else curve + part * (to_curve - curve)
 
     def nearest(self, x_m: float, y_m: float, low_m: float = -math.inf, high_m: float = math.inf) -> float:
-        """The way of the point nearest to (x, y) among those between ``low_m`` and ``high_m``; before the start and
-        past the end of the path it counts on along its first or last direction.
+        """Distance along the path of the point nearest to (x, y) between ``low_m`` and ``high_m``; the path is extended
+        straight before its start and past its end.
         """
         first, last = np.searchsorted(self.s_m, (low_m, high_m))
         first, last = int(min(first, len(self.s_m) - 1)), int(max(first + 1, last))
@@ -92,7 +92,7 @@ class Path:
 
 
 def limits_of(carrier: Carrier, share: float = COMFORT, rate_share: float = RATE_SHARE) -> Limits:
-    """What the machine can drive at its cruising speed."""
+    """Limits of the machine at its cruising speed."""
     sharpest = 1.0 / turning_radius_m(carrier, carrier.articulation_limit_rad)
     swing_1_m = rate_share * carrier.articulation_rate_limit_rad_s / carrier.cruise_speed_m_s
     return Limits(share * sharpest, swing_1_m / (carrier.front_axle_m + carrier.rear_axle_m))
@@ -102,15 +102,15 @@ def drivable(points: Sequence[Point2], carrier: Carrier) -> Path:
     """The path along ``points`` [m] in the plane.
 
     Raises:
-        PathRefused: fewer than two different points, a point that is no number, or corners too sharp for their legs.
+        PathRefused: fewer than two different points, a non-finite point, or corners too sharp for their legs.
     """
     xy = np.asarray(points, float).reshape(-1, 2)
     if not np.all(np.isfinite(xy)):
         i = int(np.argmin(np.all(np.isfinite(xy), axis=1)))
-        raise PathRefused(f"point {i + 1} of the path is no place in the plane: {tuple(xy[i])}")
+        raise PathRefused(f"point {i + 1} of the path is not finite: {tuple(xy[i])}")
     xy = _needed(xy) if len(xy) else xy
     if len(xy) < 2:
-        raise PathRefused("a path needs two different points at least")
+        raise PathRefused("a path needs at least two different points")
     hard = limits_of(carrier, HARDEST, HARDEST)
     bends = _bends(xy, limits_of(carrier), hard)
     return _sampled(xy, bends)
@@ -118,7 +118,7 @@ def drivable(points: Sequence[Point2], carrier: Carrier) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class _Bend:
-    """One corner: by how much it turns [rad], its limits, and its reach along each leg [m]."""
+    """One corner: its turn [rad], its limits, and the length it needs on each leg [m]."""
 
     turn_rad: float
     limits: Limits
@@ -126,7 +126,7 @@ class _Bend:
 
 
 def _needed(xy: np.ndarray) -> np.ndarray:
-    """The points without repetitions and without those that lie on the line (Douglas and Peucker)."""
+    """The points without repetitions and without those close to the line."""
     apart = np.hypot(*np.diff(xy, axis=0).T) if len(xy) > 1 else np.empty(0)
     xy = xy[np.concatenate([[True], apart > 1e-3])]
     keep = np.zeros(len(xy), bool)
@@ -156,7 +156,7 @@ def _bends(xy: np.ndarray, soft: Limits, hard: Limits) -> list[_Bend]:
     bends = []
     for i, turn in enumerate(turns):
         if abs(turn) > math.radians(170.0):
-            raise PathRefused(f"the path turns back on itself at {_place(xy[i + 1])}; put a point beside it")
+            raise PathRefused(f"the path reverses at {_place(xy[i + 1])}; add a point beside it")
         bends.append(_Bend(turn, soft, _reach(turn, soft)))
     for i, length in enumerate(lengths):
         ends = [k for k in (i - 1, i) if 0 <= k < len(bends)]
@@ -168,7 +168,7 @@ def _bends(xy: np.ndarray, soft: Limits, hard: Limits) -> list[_Bend]:
         if needed > length:
             raise PathRefused(
                 f"the leg from {_place(xy[i])} to {_place(xy[i + 1])} is {length:.1f} m long, but the bends at its "
-                f"ends need {needed:.1f} m; move the points apart or make the corners flatter"
+                f"ends need {needed:.1f} m; move the points apart or make the corners less sharp"
             )
     return bends
 
@@ -187,7 +187,7 @@ def _profile(turn_rad: float, limits: Limits) -> tuple[float, float]:
 
 
 def _corner(turn_rad: float, limits: Limits) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Way, points, heading and curvature of a corner that starts at the origin along x."""
+    """Distance, points, heading and curvature of a corner that starts at the origin along x."""
     ramp, arc = _profile(turn_rad, limits)
     length = 2.0 * ramp + arc
     n = max(2, math.ceil(length / SPACING_M)) + 1
@@ -205,14 +205,14 @@ def _corner(turn_rad: float, limits: Limits) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _reach(turn_rad: float, limits: Limits) -> float:
-    """How far before the corner point a bend begins [m]; it ends as far behind it."""
+    """Distance from the start of a bend to the corner point [m]; it ends as far behind it."""
     if abs(turn_rad) < 1e-6:
         return 0.0
     return float(_corner(turn_rad, limits)[1][-1, 0]) / (1.0 + math.cos(turn_rad))
 
 
 def _sampled(xy: np.ndarray, bends: Sequence[_Bend]) -> Path:
-    """All legs and corners, one behind the other."""
+    """The samples of all legs and corners in order."""
     s: list[np.ndarray] = []
     points: list[np.ndarray] = []
     headings: list[np.ndarray] = []

@@ -1,16 +1,16 @@
-"""What a way of driving asks of the machine at one moment."""
+"""The request of a drive to the machine at one moment."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from can_dbc.messages.crane import Steering
+from can_dbc.messages.vehicle import Steering
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Steering as in ``DriveSetpoint`` and a speed [m/s]; ``arrived``: nothing is left to drive; ``trouble`` says why
-    the machine must stand, empty when it need not.
+    """Steering as in ``DriveSetpoint`` and a speed [m/s].  ``arrived``: the drive is complete.  ``trouble``: why the
+    machine must stop, empty otherwise.
     """
 
     steering: Steering = Steering.ARTICULATION

@@ -1,7 +1,6 @@
-"""How a machine that looks elsewhere turns onto a way: two arcs and a straight piece between them (Dubins 1957).
+"""Turning manoeuvres between two headings: two arcs and a straight line (Dubins 1957).
 
-The ways are given by the corners of polygons round the arcs; `autonomy.navigation.clothoid_path.drivable` rounds them with
-bends of its own.
+Each is given by the corners of polygons round its arcs; `autonomy.navigation.clothoid_path.drivable` rounds them.
 """
 
 from __future__ import annotations
@@ -12,11 +11,11 @@ from collections.abc import Iterator
 from autonomy.navigation.clothoid_path import Point2
 
 Heading = tuple[float, float, float]
-"""A place [m] and a direction there [rad]."""
+"""A position [m] and a direction [rad]."""
 
 
 def turns(start: Heading, goal: Heading, radius_m: float) -> Iterator[list[Point2]]:
-    """The corners of all ways from one heading to another with two arcs of a radius, the shortest way first."""
+    """Corner points of all manoeuvres from one heading to another with two arcs of a radius, the shortest first."""
     ways = []
     for first in (1.0, -1.0):
         for last in (1.0, -1.0):
@@ -25,7 +24,7 @@ def turns(start: Heading, goal: Heading, radius_m: float) -> Iterator[list[Point
             straight = math.atan2(end[1] - begin[1], end[0] - begin[0])
             if first != last:
                 if apart < 2.0 * radius_m:
-                    continue  # the circles overlap: no straight way leads from one side to the other
+                    continue  # the circles overlap: no straight line leads from one side to the other
                 straight += first * math.asin(2.0 * radius_m / apart)
             out, back = _angle(first * (straight - start[2])), _angle(last * (goal[2] - straight))
             along = apart if first == last else math.sqrt(apart**2 - 4.0 * radius_m**2)
@@ -36,19 +35,19 @@ def turns(start: Heading, goal: Heading, radius_m: float) -> Iterator[list[Point
 
 
 def _middle(at: Heading, side: float, radius_m: float) -> Point2:
-    """The middle of the circle to the left (1) or right (-1)."""
+    """Centre of the turning circle to the left (1) or right (-1)."""
     x, y, yaw = at
     return x - side * radius_m * math.sin(yaw), y + side * radius_m * math.cos(yaw)
 
 
 def _angle(turn_rad: float) -> float:
-    """Of an arc that turns by this, 0 to 2 pi; rounding makes no circle of none."""
+    """Angle of an arc, 0 to 2 pi; a rounding error does not become a full circle."""
     angle = turn_rad % (2.0 * math.pi)
     return 0.0 if angle > 2.0 * math.pi - 1e-6 else angle
 
 
 def _corners(at: Heading, side: float, angle_rad: float, radius_m: float) -> list[Point2]:
-    """Of a polygon round an arc from a heading to the left (1) or right (-1); none turns by more than a right angle."""
+    """Corners round an arc from a heading to the left (1) or right (-1); none turns by more than a right angle."""
     x, y, yaw = at
     count = math.ceil(angle_rad / (0.5 * math.pi) - 1e-9)
     found = []

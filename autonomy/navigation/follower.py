@@ -1,18 +1,18 @@
-"""Path following by articulation: feed-forward from the path's curvature, feedback on lateral and course error.
+"""Path following by articulation: feed-forward of the path's curvature, feedback of lateral and course error.
 
-The front axle's middle follows the path.  Without slip its path bends by kappa = (sin g + lr g_s) / (lf cos g + lr),
-with g_s the articulation's change per metre, so a wanted curvature is driven by
+The centre of the front axle follows the path.  Without slip, its curvature is kappa = (sin g + lr g_s) / (lf cos g +
+lr), where g_s is the articulation's change per metre.  A wanted curvature therefore needs
 
     g_s = (kappa (lf cos g + lr) - sin g) / lr,
 
-which is stable forwards and needs no look-ahead.  With the lateral error e (+ left of the path) and the course error c,
+which is stable forwards without look-ahead.  With the lateral error e (+ left of the path) and the course error c,
 
-    c_wanted = -atan(LAMBDA e),   kappa = path's + d c_wanted / ds - GAMMA (c - c_wanted) - what slip adds,
+    c_wanted = -atan(LAMBDA e),   kappa = path's + d c_wanted / ds - GAMMA (c - c_wanted) - slip's curvature,
 
-so that far from the path the machine comes back at an angle that is bounded, and near it the error decays as
-exp(-LAMBDA s) for every way s.  Course and slip are the filter's: on a side slope the front points uphill and goes
-straight.  What they leave is integrated, slowly and only near the path, and added to e.  All errors are taken where the
-machine will be when the valve acts.
+so that far from the path the machine returns at a bounded angle, and near it the error decays as exp(-LAMBDA s) over
+the distance s.  Course and slip come from the localization filter: on a side slope the front points uphill while the
+machine drives straight.  The remaining error is integrated, slowly and only near the path, and added to e.  All errors
+are predicted to the time at which the valve acts.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from machine.profile import Carrier
 LAMBDA_1_M: Final = 0.55
 GAMMA_1_M: Final = 1.1
 INTEGRAL_M: Final = 6.0
-"""A lateral error that stays for so long a way counts twice."""
+"""A lateral error that persists over this distance counts twice."""
 INTEGRAL_LIMIT_M: Final = 0.10
 NEAR_M: Final = 0.25
 NEAR_RAD: Final = 0.15
-"""Only nearer than this to the path and its direction anything is integrated."""
+"""The error is integrated only closer than this to the path and its direction."""
 REACTION_S: Final = 0.10
-"""Report to setpoint to valve and oil, beyond what the controller's own loop makes up for (assumed)."""
+"""Delay from report to oil flow that the controller's own loop does not compensate (assumed)."""
 BACK_M: Final = 1.0
 FORTH_M: Final = 2.0
-"""The nearest point of the path is looked for so far around the last one: a path may cross itself."""
+"""Search range around the last nearest point, because a path may cross itself."""
 RATE_SHARE: Final = 0.95
 ANGLE_SPARE_RAD: Final = 0.005
 APART_RAD: Final = 0.12
-"""The wanted angle runs no further ahead of the measured one."""
+"""Maximum lead of the wanted angle over the measured one."""
 LONGEST_S: Final = 0.2
-"""A wanted angle moves on no longer than this by itself."""
+"""Maximum extrapolation time of a wanted angle."""
 STEEPEST_RAD: Final = 1.1
-"""Greatest angle between course and path on the way back to it."""
+"""Greatest angle between course and path while returning to it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Steer:
-    """What the follower wants now: articulation [rad] and its rate [rad/s], + bends left; and how it stands to the
+    """The follower's output: articulation [rad] and its rate [rad/s], + bends left; and the machine's position on the
     path: nearest point ``s_m``, lateral error ``off_m`` (+ left of it), course error ``off_rad``.
     """
 
@@ -64,7 +64,7 @@ class Steer:
 
 @dataclass(frozen=True, slots=True)
 class Following:
-    """The follower's state: where it is along the path, and the last wanted articulation; None at the beginning."""
+    """The follower's state: position along the path and last wanted articulation; None at the beginning."""
 
     s_m: float | None = None
     articulation_rad: float | None = None
@@ -76,7 +76,7 @@ class Following:
 def follow(
     carrier: Carrier, path: Path, state: Following, location: Location, speed_m_s: float
 ) -> tuple[Following, Steer]:
-    """One step, at the location's stamp; ``speed_m_s`` is the speed that is about to be driven."""
+    """One step at the location's stamp; ``speed_m_s`` is the speed about to be requested."""
     bend, speed = location.articulation_rad, location.speed_m_s
     turn_1_m = math.sin(bend) / (carrier.front_axle_m * math.cos(bend) + carrier.rear_axle_m) + location.slip_curve_1_m
     way = speed * REACTION_S
@@ -104,7 +104,7 @@ def follow(
 def _articulation(
     carrier: Carrier, state: Following, location: Location, kappa: float, speed_m_s: float
 ) -> tuple[float, float]:
-    """The wanted articulation at the location's stamp, and its rate from there, within what the machine can do."""
+    """The wanted articulation at the location's stamp and its rate, within the machine's limits."""
     angle = measured = location.articulation_rad
     if state.articulation_rad is not None:
         seconds = min(LONGEST_S, (location.stamp_ns - state.stamp_ns) * 1e-9)

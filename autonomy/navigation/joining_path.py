@@ -1,8 +1,7 @@
-"""From where the machine stands onto the way along its waypoints, whichever way it looks.
+"""A path from the machine's pose onto a route, whatever the machine's heading.
 
-A first corner may be too sharp for its legs, or the machine may look elsewhere.  Points straight ahead and points about
-the first waypoint are tried before it, and the shortest path that can be driven is taken; what the machine looks past
-the beginning of its path costs as if it had to be driven.
+The first corner may be too sharp for its legs.  Points straight ahead and points round the first waypoint are tried
+before it, and the shortest drivable path wins; a heading error at the start of the path is charged as extra length.
 """
 
 from __future__ import annotations
@@ -18,18 +17,18 @@ from machine.profile import Carrier
 AHEAD_M: Final = (7.0, 10.0, 14.0)
 ABOUT_M: Final = (10.0, 15.0)
 ABOUT: Final = 8
-"""Points on each circle about the first waypoint."""
+"""Points on each circle round the first waypoint."""
 LEGS: Final = 3
-"""Waypoints that a trial path has: what comes later does not depend on how it begins."""
+"""Waypoints of a trial path: later ones do not depend on how it begins."""
 TURN_M_RAD: Final = 8.0
-"""A metre of way for each of so many metres of turning circle: what a radian the machine looks past its path costs."""
+"""Extra length per radian of heading error at the start of the path."""
 
 
 def joined(here: Point2, yaw_rad: float, points: Sequence[Point2], carrier: Carrier) -> Path:
-    """A path that begins ``here`` [m], where the front axle's middle is, and goes along ``points``.
+    """A path from ``here`` [m], the centre of the front axle, along ``points``.
 
     Raises:
-        PathRefused: with the reason for the straight way, when none can be driven.
+        PathRefused: no path is drivable; the reason is that of the direct path.
     """
     first = points[:LEGS]
     best: tuple[float, list[Point2]] | None = None
@@ -46,7 +45,7 @@ def joined(here: Point2, yaw_rad: float, points: Sequence[Point2], carrier: Carr
 
 
 def _ways(here: Point2, yaw_rad: float, points: Sequence[Point2]) -> Iterator[list[Point2]]:
-    """Points to go through before the first one."""
+    """Candidate points to drive through before the first one."""
     yield []
     if not points:
         return

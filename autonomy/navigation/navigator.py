@@ -1,8 +1,8 @@
-"""Drives the machine by one of the two ways, with a lease on every setpoint; pause, resume, stop, reasons.
+"""Executes a drive, path or waypoints, with a lease on every setpoint; pause, resume, stop with a reason.
 
-``Navigator.step`` takes a report of the vehicle and its location and gives the setpoint to send, or None when nothing
-is to be sent.  What stops the machine keeps it stopped until ``resume`` or another ``drive``; a setpoint that asks
-for no speed goes out until the machine stands, and then the lease runs out in peace.
+``Navigator.step`` accepts a vehicle report and its location and returns the setpoint to send, or None.  A stopped drive
+stays stopped until ``resume`` or another ``drive``.  Setpoints with zero speed are sent until the machine stands; then
+the lease is allowed to expire.
 """
 
 from __future__ import annotations
@@ -15,35 +15,35 @@ from autonomy.localization.location import Location
 from autonomy.navigation.path_drive import Along
 from autonomy.navigation.drive_request import Order
 from autonomy.navigation.waypoint_drive import PaperB
-from can_dbc.messages.crane import DriveSetpoint, Driving, VehicleReport
+from can_dbc.messages.vehicle import DriveSetpoint, Driving, VehicleReport
 from machine.profile import Carrier
 
 LEASE_NS: Final = 250_000_000
-"""Five reports."""
+"""Five report periods."""
 STANDS_M_S: Final = 0.02
 REST_NS: Final = 500_000_000
-"""The brake is on by then: on a slope the drive pushes back until it is."""
+"""The brake is on after this time: on a slope the drive holds the machine until then."""
 OBEYS_NS: Final = 2_000_000_000
-"""A controller that does not drive for so long does not want to."""
+"""The drive stops when the controller does not execute its setpoints for this long."""
 MOVES_NS: Final = 5_000_000_000
-"""Wheels that do not turn for so long are stuck."""
+"""The drive stops when the wheels do not turn for this long."""
 STUCK_M_S: Final = 0.02
 Heights = tuple[float, float, float, float]
 
 
 class Phase(IntEnum):
-    """What the navigator does."""
+    """State of the navigator."""
 
     IDLE = 0
     DRIVING = 1
     PAUSED = 2
     STOPPED = 3
-    """Something was wrong; ``reason`` says what."""
+    """A problem ended the drive; ``reason`` says which."""
     ARRIVED = 4
 
 
 class Navigator:
-    """One machine.  ``phase`` and ``reason`` say how things stand."""
+    """Drives one machine; ``phase`` and ``reason`` are its state."""
 
     def __init__(
         self,
@@ -56,40 +56,40 @@ class Navigator:
         self.phase = Phase.IDLE
         self.reason = ""
         self.stands = True
-        """Whether it was told to stand, and its wheels have stood since for ``REST_NS``."""
+        """Whether standstill was requested and has held for ``REST_NS``."""
         self.heights_m = heights_m or (carrier.arm_transport_m,) * 4
         self.level = level
         self.holds = False
-        """Setpoints go out while the machine stands, too: its heights are being set."""
+        """Send setpoints at standstill, too, to set the heights."""
         self._profile_hash, self._limit_rad = profile_hash, carrier.articulation_limit_rad
         self._lease_ns = lease_ns
         self.way: Along | PaperB | None = None
-        """What is driven, or was."""
+        """The current or last drive."""
         self._sequence = 0
         self._asked_ns = self._obeyed_ns = self._moved_ns = self._rolled_ns = 0
 
     def drive(self, way: Along | PaperB) -> None:
-        """Begin this drive; another one under way is over."""
+        """Start this drive; it replaces an active one."""
         self.way = way
         self._begin()
 
     def pause(self) -> None:
-        """Stand until ``resume``."""
+        """Stop until ``resume``."""
         if self.phase is Phase.DRIVING:
             self.phase, self.reason = Phase.PAUSED, "paused"
 
     def resume(self) -> None:
-        """Drive on from a pause or from what stopped the machine."""
+        """Resume after a pause or a stop."""
         if self.phase in (Phase.PAUSED, Phase.STOPPED) and self.way is not None:
             self._begin()
 
     def stop(self, reason: str) -> None:
-        """Stand, with a reason, until ``resume`` or another drive."""
+        """Stop with a reason until ``resume`` or another drive."""
         if self.phase is Phase.DRIVING or self.phase is Phase.PAUSED:
             self.phase, self.reason = Phase.STOPPED, reason
 
     def step(self, now_ns: int, report: VehicleReport, location: Location) -> DriveSetpoint | None:
-        """The setpoint to send now."""
+        """The setpoint to send now, or None."""
         still = abs(report.speed_m_s) < STANDS_M_S and report.driving != Driving.BRAKING
         self.stands = still and now_ns - self._rolled_ns >= REST_NS
         order = Order()
@@ -107,9 +107,9 @@ class Navigator:
             self._rolled_ns = now_ns
         limit = self._limit_rad
         bend = min(max(order.articulation_rad, -limit), limit)
-        # As a beam axle: paper B opens it just before the machine moves, and closes it for the crane to stand firm.
+        # As a beam axle: paper B opens it just before the machine moves and closes it while the crane works.
         floats = self.phase is Phase.DRIVING
-        # From the clock at the start: a planner that is started again is never taken for a replay.
+        # Starts from the clock, so that the setpoints of a restarted planner are not taken for a replay.
         self._sequence = self._sequence + 1 if self._sequence else now_ns // 1_000_000 & 0xFFFF_FFFF
         return DriveSetpoint(
             self._sequence, self._profile_hash, now_ns, self._lease_ns, order.steering, order.latitude_deg,
@@ -122,7 +122,7 @@ class Navigator:
         self._asked_ns = self._obeyed_ns = self._moved_ns = 0
 
     def _look(self, now_ns: int, report: VehicleReport, order: Order) -> None:
-        """End the drive when it is over, or when something is wrong with it."""
+        """End the drive on arrival or on a problem."""
         if not self._asked_ns:
             self._asked_ns = self._obeyed_ns = self._moved_ns = now_ns
         if report.driving == Driving.DRIVING:
@@ -135,6 +135,6 @@ class Navigator:
             if self.stands:
                 self.phase = Phase.ARRIVED
         elif now_ns - self._obeyed_ns > OBEYS_NS:
-            self.stop(f"the controller does not drive, last refusal {report.refusal}")
+            self.stop(f"the controller does not execute drive setpoints; its last refusal is {report.refusal}")
         elif now_ns - self._moved_ns > MOVES_NS:
             self.stop("the wheels do not turn")

@@ -1,4 +1,4 @@
-"""Our way: along a path by the follower, with the speed that bends, ground and the place to stop at allow."""
+"""A drive along a planned path (ours): path following, with the speed limited by bends, ground and the next stop."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from autonomy.navigation.speed import (
     terrain_share,
     tip_margin_m,
 )
-from can_dbc.messages.crane import Steering
+from can_dbc.messages.vehicle import Steering
 from machine.profile import Carrier
 
 SIGMA_M: Final = 0.25
-"""A position that is worse than this is none to drive by."""
+"""A worse position is not used for driving."""
 ASTRAY_M: Final = 1.5
-"""A machine that was on the path and is so far beside it is somewhere else."""
+"""A machine that was on the path and is this far beside it is reported as off the path."""
 ON_M: Final = 0.5
 ON_RAD: Final = 0.3
-"""Nearer than this to the path and its direction it is on it."""
+"""Closer than this to the path and its direction, the machine is on it."""
 RECKONING_SHARE: Final = 0.5
+"""Share of the speed while dead reckoning."""
 STOP_M: Final = 0.015
-"""From the order to stand to standing, at the creep (assumed)."""
+"""Stopping distance from creep speed (assumed)."""
 SPEED_GAIN_1_S: Final = 0.5
 SPEED_SPARE_M_S: Final = 0.15
 SPEED_NEAR_M_S: Final = 0.2
-"""Only so near to the wanted speed the rest of the error is learned: not while it starts."""
+"""The integral of the speed error runs only this close to the wanted speed, not while starting."""
 HALTED_M_S: Final = 0.03
 HALT_NS: Final = 2_000_000_000
 """A machine that does not come to rest in this time is braked."""
@@ -42,7 +43,7 @@ HALT_NS: Final = 2_000_000_000
 class Along:
     """One drive along ``path``; ``stop_m`` is where along it to stop, None for its end.
 
-    ``steer`` is what the follower wanted last.
+    ``steer`` is the follower's last output.
     """
 
     def __init__(
@@ -60,16 +61,16 @@ class Along:
         self.stop_at(path.length_m if stop_m is None else stop_m)
 
     def stop_at(self, s_m: float) -> None:
-        """Stop there along the path instead; a place already passed is stopped at as soon as it can be."""
+        """Stop at this distance along the path instead; if it is passed already, stop as soon as possible."""
         self._stop_m = min(max(s_m, 0.0), self.path.length_m)
 
     @property
     def left_m(self) -> float:
-        """The way left to the place to stop at."""
+        """Distance left to the stop."""
         return self._stop_m - (self.steer.s_m if self.steer else 0.0)
 
     def step(self, location: Location) -> Order:
-        """The order by one location."""
+        """The drive request for one location."""
         if trouble := self._trouble(location):
             self._following = replace(self._following, articulation_rad=None, stamp_ns=0)
             self._correction = 0.0
@@ -79,7 +80,7 @@ class Along:
         self.steer = steer
         self._on = self._on or (abs(steer.off_m) < ON_M and abs(steer.off_rad) < ON_RAD)
         if self._on and abs(steer.off_m) > ASTRAY_M:
-            return Order(trouble=f"{abs(steer.off_m):.1f} m beside the path; plan the drive anew")
+            return Order(trouble=f"the machine is {abs(steer.off_m):.1f} m beside its path; plan the drive again")
         if self.left_m <= STOP_M:
             return self._halt(location)
         self._halting_ns = 0
@@ -89,13 +90,13 @@ class Along:
         )
 
     def rest(self, location: Location) -> None:
-        """The machine stands for a while: what was learned about its speed does not hold for the start."""
+        """Reset the speed correction while the machine stands; it is not valid for the next start."""
         self._following = replace(self._following, articulation_rad=None, stamp_ns=0)
         self._correction = 0.0
         self._stamp_ns = location.stamp_ns
 
     def _halt(self, location: Location) -> Order:
-        """Come to rest; on a slope the drive must push back to stand, and the brake comes on once it does."""
+        """Come to rest: on a slope the drive must hold the machine until the brake is on."""
         self._halting_ns = self._halting_ns or location.stamp_ns
         rests = abs(location.speed_m_s) < HALTED_M_S or location.stamp_ns - self._halting_ns > HALT_NS
         speed = 0.0 if rests else self._corrected(0.0, location)
@@ -105,10 +106,10 @@ class Along:
         if not location.usable:
             return f"not located: {location.reason}"
         if location.sigma_m > SIGMA_M:
-            return f"the position is only good to {location.sigma_m:.2f} m"
+            return f"the position is only accurate to {location.sigma_m:.2f} m"
         margin = self._margin(location)
         if terrain_share(margin, self._rocking.step(location)) == 0.0:
-            return f"the machine stands too near to tipping over: {margin:.2f} m left"
+            return f"the machine is too close to tipping over: {margin:.2f} m margin left"
         return ""
 
     def _margin(self, location: Location) -> float:
@@ -119,7 +120,7 @@ class Along:
         )
 
     def _wanted(self, location: Location) -> float:
-        """The speed for bends and ground."""
+        """The speed allowed by bends and ground."""
         share = terrain_share(self._margin(location), self._rocking.rate_rad_s)
         if location.status is Status.DEAD_RECKONING:
             share *= RECKONING_SHARE
@@ -129,7 +130,7 @@ class Along:
         return wanted if self.steer is None else min(wanted, stopping_speed_m_s(self.left_m - STOP_M))
 
     def _corrected(self, wanted_m_s: float, location: Location) -> float:
-        """The speed to ask for: wheels that slip and a drive that droops are made up for."""
+        """The speed to request: compensates for wheel slip and drive droop."""
         seconds = min(0.2, (location.stamp_ns - self._stamp_ns) * 1e-9) if self._stamp_ns else 0.0
         self._stamp_ns = location.stamp_ns
         error = wanted_m_s - location.speed_m_s

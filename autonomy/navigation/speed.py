@@ -1,4 +1,4 @@
-"""How fast the machine may drive here: bends, tip-over margin, rough ground, the way left to where it is to stop."""
+"""Speed limits: bends, tip-over margin, rough ground, distance to the stop."""
 
 from __future__ import annotations
 
@@ -9,37 +9,38 @@ from typing import Final
 
 from autonomy.localization.location import Location
 from autonomy.navigation.clothoid_path import Path
-from machine.carrier import ARMS, hub_m, pivot_height_m, rear_from_front
+from machine.geometry.carrier import ARMS, hub_m, pivot_height_m, rear_from_front
 from machine.profile import Carrier
 
 MASS_HEIGHT_M: Final = 0.55
-"""Height of the centre of mass above the pivots, crane in its transport pose, bunk full (assumed)."""
+"""Height of the centre of mass above the pivots, crane in transport pose, bunk full (assumed)."""
 MASS_REACH: Final = 0.9
-"""Each half is as heavy as the other, and its weight acts so far out towards its axle (assumed)."""
+"""Both halves have the same mass, which acts at this share of the distance to the axle (assumed)."""
 FULL_MARGIN_M: Final = 0.55
-"""With this margin to the edge of the wheels' polygon, full speed; ..."""
+"""Full speed with this margin to the edge of the support polygon; ..."""
 LEAST_MARGIN_M: Final = 0.20
-"""... with this one the machine does not drive."""
+"""... no driving below this one."""
 SLOWEST: Final = 0.3
-"""Share of the wanted speed with little more than the least margin, or on the roughest ground."""
+"""Share of the wanted speed just above the least margin, or on the roughest ground."""
 CALM_RAD_S: Final = 0.06
 ROUGH_RAD_S: Final = 0.30
-"""Rate at which the machine rocks: full speed, slowest."""
+"""Rate of rocking at full speed and at the slowest speed."""
 ROCKING_S: Final = 2.0
 RATE_SHARE: Final = 0.85
-"""Share of the articulation's rate limit that a bend may ask for."""
+"""Share of the articulation rate limit that a bend may use."""
 BRAKING_M_S2: Final = 0.15
 CREEP_M_S: Final = 0.10
 GRAVITY_M_S2: Final = 9.81
 LOOK_M: Final = 1.5
-"""So far ahead bends are looked at."""
+"""Look-ahead distance for bends."""
 LOOK_STEP_M: Final = 0.25
 
 
 def tip_margin_m(carrier: Carrier, location: Location, acceleration_m_s2: float = 0.0) -> float:
-    """How far the weight acts inside the wheels' polygon [m], by roll, pitch and articulation; 0 or less: it tips.
+    """Distance of the weight's line of action inside the support polygon [m], from roll, pitch and articulation; 0 or
+    less means tipping.
 
-    ``acceleration_m_s2`` is towards the left, as in a bend to the left.  The masses are assumed: the profile has none.
+    ``acceleration_m_s2`` is positive to the left.  The masses are assumed, because the profile has none.
     """
     height = pivot_height_m(carrier, location.front_height_m) + MASS_HEIGHT_M
     side = math.atan2(acceleration_m_s2, GRAVITY_M_S2)
@@ -59,13 +60,13 @@ def tip_margin_m(carrier: Carrier, location: Location, acceleration_m_s2: float 
 
 @dataclass(slots=True)
 class Rocking:
-    """How fast roll and pitch change, smoothed over ``ROCKING_S``."""
+    """Rate of change of roll and pitch, smoothed over ``ROCKING_S``."""
 
     rate_rad_s: float = 0.0
     _last: tuple[int, float, float] | None = None
 
     def step(self, location: Location) -> float:
-        """One location later; rad/s."""
+        """Update with a location; returns the rate [rad/s]."""
         now = location.stamp_ns, location.roll_rad, location.pitch_rad
         if self._last is not None and now[0] > self._last[0]:
             seconds = (now[0] - self._last[0]) * 1e-9
@@ -76,7 +77,7 @@ class Rocking:
 
 
 def terrain_share(margin_m: float, rocking_rad_s: float) -> float:
-    """Share of the wanted speed that ground and slope allow, 0 to stand."""
+    """Share of the wanted speed that ground and slope allow; 0 means stop."""
     if margin_m < LEAST_MARGIN_M:
         return 0.0
     steady = min(1.0, (margin_m - LEAST_MARGIN_M) / (FULL_MARGIN_M - LEAST_MARGIN_M))
@@ -85,7 +86,7 @@ def terrain_share(margin_m: float, rocking_rad_s: float) -> float:
 
 
 def bend_speed_m_s(carrier: Carrier, path: Path, s_m: float) -> float:
-    """The greatest speed at which the articulation keeps up with the path ahead of ``s_m``."""
+    """Greatest speed at which the articulation can follow the path ahead of ``s_m``."""
     fastest = math.inf
     lf, lr = carrier.front_axle_m, carrier.rear_axle_m
     limit = RATE_SHARE * carrier.articulation_rate_limit_rad_s
@@ -98,5 +99,5 @@ def bend_speed_m_s(carrier: Carrier, path: Path, s_m: float) -> float:
 
 
 def stopping_speed_m_s(left_m: float) -> float:
-    """The speed with ``left_m`` to go: a steady slowing down that ends in a creep."""
+    """Speed with ``left_m`` to go: constant deceleration that ends in a creep."""
     return max(CREEP_M_S, math.sqrt(2.0 * BRAKING_M_S2 * max(0.0, left_m)))

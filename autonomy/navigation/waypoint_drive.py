@@ -1,8 +1,8 @@
-"""Paper B's way (3.2.1): drive at the waypoint, and turn to the next one within a distance of the steering radius.
+"""Paper B's drive (3.2.1): head for a waypoint, and switch to the next one within a distance of the steering radius.
 
-The law itself is closed in the controller; here the waypoints are switched.  The front axle is where the receiver says
-it is, without a filter, as in the paper.  The distance is R tan(turn / 2), with the radius R at full articulation and
-the turn at the waypoint: what a circle needs (docs/reference/machines.md section 7.2).
+The steering loop is closed in the controller; this module switches the waypoints.  The position of the front axle is
+the receiver's, unfiltered as in the paper.  The switching distance is R tan(turn / 2), with the radius R at full
+articulation and the turn at the waypoint: what a circle needs (docs/reference/machines.md section 7.2).
 """
 
 from __future__ import annotations
@@ -14,33 +14,33 @@ from typing import Final
 
 from autonomy.localization.local_plane import Plane, wrapped, yaw_from_heading
 from autonomy.navigation.drive_request import Order
-from can_dbc.messages.crane import Steering, VehicleReport
-from machine.carrier import turning_radius_m
+from can_dbc.messages.vehicle import Steering, VehicleReport
+from machine.geometry.carrier import turning_radius_m
 from machine.profile import Carrier
 
 LEAST_M: Final = 1.0
-"""No waypoint is switched nearer than this, or a machine that misses it would circle round it."""
+"""Least switching distance; with less, a machine that misses a waypoint would circle round it."""
 MOST_M: Final = 12.0
 FRESH_NS: Final = 500_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """A place on WGS-84 [deg]."""
+    """A position in WGS84 [deg]."""
 
     latitude_deg: float
     longitude_deg: float
 
 
 class PaperB:
-    """One drive along ``waypoints``; ``number`` is the one that it drives at.
+    """One drive along ``waypoints``; ``number`` is the index of the current one.
 
-    The last one is reached within ``LEAST_M`` of it, or once it lies behind.
+    The last one is reached within ``LEAST_M``, or once it lies behind the machine.
     """
 
     def __init__(self, carrier: Carrier, waypoints: Sequence[Waypoint], speed_m_s: float | None = None) -> None:
         if not waypoints:
-            raise ValueError("a drive needs one waypoint at least")
+            raise ValueError("a drive needs at least one waypoint")
         self.number = 0
         self._plane = Plane(waypoints[0].latitude_deg, waypoints[0].longitude_deg)
         self._waypoints = tuple(waypoints)
@@ -51,7 +51,7 @@ class PaperB:
         self._from: tuple[float, float] | None = None
 
     def switch_m(self, number: int) -> float:
-        """At this distance from a waypoint the next one becomes the goal [m]."""
+        """Distance from a waypoint at which the next one becomes the goal [m]."""
         if self._from is None or number + 1 >= len(self._points):
             return LEAST_M
         before = self._points[number - 1] if number else self._from
@@ -60,7 +60,7 @@ class PaperB:
         return min(MOST_M, max(LEAST_M, self._radius_m * math.tan(min(abs(turn), 3.0) / 2.0)))
 
     def step(self, report: VehicleReport) -> Order:
-        """The order by one report."""
+        """The drive request for one report."""
         seen = report.position_ns and report.stamp_ns - report.position_ns <= FRESH_NS
         if not seen or not math.isfinite(report.latitude_deg + report.longitude_deg):
             return Order(Steering.WAYPOINT, trouble="no position from the receiver")
@@ -81,7 +81,7 @@ class PaperB:
         return self._order(self._speed)
 
     def _behind(self, at: tuple[float, float]) -> bool:
-        """Whether the machine has passed the waypoint, seen along the leg that leads to it."""
+        """Whether the machine has passed the current waypoint in the direction of its leg."""
         assert self._from is not None
         before = self._points[self.number - 1] if self.number else self._from
         here = self._points[self.number]
