@@ -1,0 +1,18 @@
+"""The documentation site: `make docs` builds it with broken links and references as errors."""
+
+project = "timberhand"
+author = "the timberhand developers"
+copyright = "the timberhand developers, Apache-2.0"  # noqa: A001 (Sphinx's name)
+
+extensions = ["myst_parser", "sphinx_copybutton", "sphinxcontrib.mermaid"]
+source_suffix = {".md": "markdown"}
+exclude_patterns = ["_build"]
+myst_enable_extensions = ["colon_fence", "deflist"]
+myst_heading_anchors = 4
+myst_fence_as_directive = ["mermaid"]  # plain fences, so that forges draw them too
+myst_links_external_new_tab = False
+
+html_theme = "furo"
+html_title = "timberhand"
+html_show_sphinx = False
+nitpicky = True

@@ -1,0 +1,31 @@
+"""The generated pages of docs/reference say what the code says, and the codes of errors keep their form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from runtime.errors import CodedError
+from timberhand.reference import errors_page
+from timberhand.reference.__main__ import REPOSITORY, stale
+
+
+def test_no_generated_page_is_stale() -> None:
+    assert [path.name for path in stale()] == []
+
+
+def test_a_changed_page_is_noticed(tmp_path: Path) -> None:
+    assert {path.stem for path in stale(tmp_path)} == {"cli", "errors", "faults", "frames", "transitions"}
+
+
+def test_a_code_belongs_to_one_area_of_the_program() -> None:
+    """Codes begin with their area; one area is one package, or the program's own commands about it."""
+    for code, places in errors_page.codes(REPOSITORY).items():
+        assert errors_page.CODE.fullmatch(code), code
+        assert len({taker for taker, _, _ in places}) <= 2, f"{code} is raised as {places}"
+
+
+def test_an_error_keeps_its_code_across_processes() -> None:
+    import pickle
+
+    error = pickle.loads(pickle.dumps(CodedError("test.code", "A sentence.")))
+    assert (error.code, str(error)) == ("test.code", "A sentence.")
