@@ -32,22 +32,27 @@ from typing import Final
 import msgspec
 
 from autonomy.crane_job.activity import Activity
-from autonomy.grasp.selection import Planned
-from autonomy.grasp.pile_planner import Press
-from autonomy.grasp.sampling_planner import Search
+from autonomy.grasp.selection import PlannerSelection
+from autonomy.grasp.pile_planner import PilePlanner
+from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.manager.checkpoint_file import Logbook, MissionFinished, read
 from autonomy.manager.activity_manager import Manager
 from autonomy.manager.transition_table import WAYS
 from autonomy.missions.crane_job import Mission
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import MissionError
-from autonomy.perception.log_list.observation import LogObservation, LogsRefused, parse_logs, question
+from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
+from autonomy.perception.log_list.observation import LogObservation
 from autonomy.process.jobs import Forwarding, Job, OneLog
 from autonomy.process.operator_commands import OrderRefused, Orders
 from can_dbc.messages.mission import encode_mission
-from can_dbc.messages.crane import DatagramRefused, StateReport, VehicleReport, decode, udp_address
-from machine.load import ProfileError, load_profile, profile_hash
-from machine.modes import Mode
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.udp_address import udp_address
+from can_dbc.messages.datagrams import decode
+from can_dbc.messages.vehicle import VehicleReport
+from can_dbc.messages.envelope import DatagramRefused
+from machine.loading.profile_file import ProfileError, load_profile, profile_hash
+from machine.status.modes import Mode
 from machine.profile import Profile
 
 FINE, CONFIGURATION, BUSY, SAFETY, FAILED, INTERRUPTED = 0, 3, 4, 5, 6, 130
@@ -139,7 +144,7 @@ class Process:
         """One turn: ask, take what came, step, send, tell."""
         if now_ns >= self._look_ns:
             self._look_ns = now_ns + LOOK_NS
-            self._send(self._scene.send, question(self._joints))
+            self._send(self._scene.send, encode_request(self._joints))
         self._obey(now_ns)
         (report, vehicle), logs = self._newest_reports(), self._newest_logs()
         for data in self._job.step(now_ns, report, vehicle, logs):
@@ -209,8 +214,8 @@ class Process:
         logs: tuple[LogObservation, ...] = ()
         for data in _received(self._scene):
             try:
-                logs = parse_logs(data)
-            except LogsRefused as error:
+                logs = decode_logs(data)
+            except LogListError as error:
                 if self._changed("detector", str(error)):
                     say("detector", reason=str(error))
         return logs
@@ -303,7 +308,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: bytes | None) -> Job:
     """What the command line asks for; raises MissionError, MissionFinished."""
-    code, chooser = profile_hash(profile), Planned(Search())
+    code, chooser = profile_hash(profile), PlannerSelection(SamplingPlanner())
     if options.mission is None:
         return OneLog(Activity(profile, code, Mission(log_id=options.log), lease_ns, key, chooser))
     if profile.carrier is None:
@@ -313,7 +318,7 @@ def _job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: byte
     progress = options.progress and read(options.progress, mission, time.monotonic_ns(), time.time_ns())
     manager = Manager(
         profile, code, mission, WAYS[options.way], chooser, key=key, lease_ns=lease_ns,
-        emptier=Planned(Press(Search())), progress=progress,
+        emptier=PlannerSelection(PilePlanner(SamplingPlanner())), progress=progress,
     )  # fmt: skip
     if progress:
         tally = manager.tally

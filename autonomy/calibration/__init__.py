@@ -1,1 +1,1 @@
-"""Commissioning: what a machine's valves, sensors and steel really do, found through the bus (design section 6)."""
+"""Commissioning: what a machine's valves, sensors and steel really do, found through the bus (docs/architecture.md, "Machine and truth")."""

@@ -1,6 +1,6 @@
 """Dead time and lag of one valve's spool, from the commands on the bus and the spools that the valve node reports.
 
-    spool'' = w^2 (command(t - dead time) - spool) - 2 z w spool'          (machines.md 3)
+    spool'' = w^2 (command(t - dead time) - spool) - 2 z w spool'          (docs/reference/machines.md section 3)
 
 ``delay_s`` is the pure dead time from the command's frame to the spool's first motion; ``lag_s`` = 2 z / w is how far
 a moving spool stays behind after it.  Joints show neither cleanly: pump and oil stand between.  How long the joint
@@ -17,12 +17,12 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from autonomy.calibration.trace import FINE, GRID_S, Record
+from autonomy.calibration.trace import FINE_FACTOR, GRID_S, SpoolTestRecord
 
-LONGEST_S: Final = 0.3
-QUANTUM: Final = 0.0005
+MAX_DELAY_S: Final = 0.3
+SPOOL_RESOLUTION: Final = 0.0005
 """Spools are reported in 0.05 %."""
-_STARTS_S: Final = (0.04, 0.08, 0.12, 0.16)
+_DELAY_GUESSES_S: Final = (0.04, 0.08, 0.12, 0.16)
 MOVED_SHARE: Final = 0.2
 
 
@@ -36,7 +36,7 @@ class DelayFit:
     residual: float
 
 
-def fit_delay(tests: Sequence[Record]) -> DelayFit | None:
+def fit_delay(tests: Sequence[SpoolTestRecord]) -> DelayFit | None:
     """From the staircases of both sides; None where the valve node reports no spools."""
     usable = [t for t in tests if t.spool is not None and float(np.ptp(t.spool)) > 0.02]
     if not usable:
@@ -46,9 +46,9 @@ def fit_delay(tests: Sequence[Record]) -> DelayFit | None:
     return DelayFit(both[0], both[1], (sides[0], sides[-1]), both[2])
 
 
-def _fit(tests: Sequence[Record]) -> tuple[float, float, float]:
+def _fit(tests: Sequence[SpoolTestRecord]) -> tuple[float, float, float]:
     """Dead time, lag, residual."""
-    step_s = GRID_S / FINE
+    step_s = GRID_S / FINE_FACTOR
 
     def residuals(p: np.ndarray) -> np.ndarray:
         out = []
@@ -57,25 +57,25 @@ def _fit(tests: Sequence[Record]) -> tuple[float, float, float]:
             command = t.fine_command
             time = np.arange(len(command)) * step_s
             delayed = np.interp(time - p[0], time, command, left=command[0])
-            out.append((t.spool - lfilter(*_spool(p[1], p[2], step_s), delayed)[FINE - 1 :: FINE]) / QUANTUM)
+            out.append((t.spool - lfilter(*_spool_filter(p[1], p[2], step_s), delayed)[FINE_FACTOR - 1 :: FINE_FACTOR]) / SPOOL_RESOLUTION)
         return np.concatenate(out)
 
     best = min(
         (
             least_squares(
-                residuals, (start, 40.0, 0.8), bounds=((0.0, 10.0, 0.3), (LONGEST_S, 150.0, 1.5)),
+                residuals, (start, 40.0, 0.8), bounds=((0.0, 10.0, 0.3), (MAX_DELAY_S, 150.0, 1.5)),
                 x_scale=(0.01, 10.0, 0.2), loss="soft_l1", diff_step=1e-3, max_nfev=40,
             )
-            for start in _STARTS_S
+            for start in _DELAY_GUESSES_S
         ),
         key=lambda found: float(found.cost),
     )  # fmt: skip
     delay, omega, zeta = best.x
-    misfit = residuals(best.x) * QUANTUM
+    misfit = residuals(best.x) * SPOOL_RESOLUTION
     return float(delay), float(2.0 * zeta / omega), float(np.sqrt(np.mean(misfit**2)))
 
 
-def _spool(omega: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
+def _spool_filter(omega: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
     """The spool as a digital filter."""
     k = 2.0 / step_s
     first = k * k + 2.0 * zeta * omega * k + omega * omega
@@ -84,7 +84,7 @@ def _spool(omega: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.nda
     return b, a
 
 
-def response_s(test: Record, deadband: float) -> float:
+def response_s(test: SpoolTestRecord, deadband: float) -> float:
     """From the command that leaves the dead-band to the joint's first motion in a staircase [s]; NaN if it never moves.
 
     Motion is seen when the joint has gone `MOVED_SHARE` of what it goes in the first 0.3 s of steady motion.

@@ -17,17 +17,19 @@ from typing import Final, Protocol
 import msgspec
 
 from autonomy.calibration.procedure import Calibration
-from can_dbc.bus import Bus
+from can_dbc.bus.base import Bus
 from can_dbc.frame import Frame
-from can_dbc.setpoint import DatagramRefused, StateReport, decode
-from machine.kinematics import Point
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import decode
+from can_dbc.messages.envelope import DatagramRefused
+from machine.geometry.kinematics import Point
 
-TURN_S: Final = 0.005
-QUESTION: Final = b'{"op":"survey"}'
+POLL_S: Final = 0.005
+SURVEY_REQUEST: Final = b'{"op":"survey"}'
 Address = tuple[str, int]
 
 
-class Surveyed(msgspec.Struct):
+class SurveyAnswer(msgspec.Struct):
     """A surveying instrument's answer, in the crane's base frame: the hanger pin [m], and the direction along which the
     grapple opens [rad], where the instrument can tell it.
     """
@@ -36,7 +38,7 @@ class Surveyed(msgspec.Struct):
     yaw_rad: float | None = None
 
 
-class Instrument:
+class SurveyInstrument:
     """Asks a surveying instrument over UDP: one question under way at a time."""
 
     def __init__(self, address: Address) -> None:
@@ -55,7 +57,7 @@ class Instrument:
         found = self._newest(now_ns)
         return None if found is None else nan if found.yaw_rad is None else found.yaw_rad
 
-    def _newest(self, now_ns: int) -> Surveyed | None:
+    def _newest(self, now_ns: int) -> SurveyAnswer | None:
         found = None
         while True:
             try:
@@ -63,11 +65,11 @@ class Instrument:
             except (BlockingIOError, ConnectionRefusedError):
                 break
             with suppress(msgspec.DecodeError):
-                found = msgspec.json.decode(data, type=Surveyed)
+                found = msgspec.json.decode(data, type=SurveyAnswer)
         if now_ns - self._asked_ns >= 100_000_000:
             self._asked_ns = now_ns
             with suppress(OSError):
-                self._link.sendto(QUESTION, self._address)
+                self._link.sendto(SURVEY_REQUEST, self._address)
         return found
 
     def close(self) -> None:
@@ -76,7 +78,7 @@ class Instrument:
 
 
 class Surveyor(Protocol):
-    """Whoever reads the hanger pin and the grapple's direction, as `Instrument` does; None: nothing yet."""
+    """Whoever reads the hanger pin and the grapple's direction, as `SurveyInstrument` does; None: nothing yet."""
 
     def read(self, now_ns: int) -> Point | None:
         """The pin, base frame, m."""
@@ -85,7 +87,7 @@ class Surveyor(Protocol):
         """The direction along which the grapple opens, base frame, rad modulo pi; NaN where it cannot be read."""
 
 
-class Link:
+class ControllerLink:
     """Reports in, datagrams out; ``foreign`` when the controller means another profile."""
 
     def __init__(self, controller: Address, report_port: int, profile_hash: int, key: bytes | None) -> None:
@@ -125,11 +127,11 @@ class Link:
         self._socket.close()
 
 
-def first_report(link: Link, within_s: float, ready: tuple[int, ...]) -> StateReport | None:
+def first_report(link: ControllerLink, within_s: float, ready: tuple[int, ...]) -> StateReport | None:
     """The first report of a controller that could be armed; None when none comes in time."""
     end_ns = time.monotonic_ns() + int(within_s * 1e9)
     while time.monotonic_ns() < end_ns and not link.foreign:
-        link.wait(TURN_S)
+        link.wait(POLL_S)
         report = link.newest()
         if report is not None and report.mode in ready:
             return report
@@ -138,7 +140,7 @@ def first_report(link: Link, within_s: float, ready: tuple[int, ...]) -> StateRe
 
 def run(
     calibration: Calibration,
-    link: Link,
+    link: ControllerLink,
     bus: Bus,
     surveyor: Surveyor | None,
     turn: Callable[[Calibration], None],
@@ -146,7 +148,7 @@ def run(
     """Turns until the procedure is over; ``turn`` is called each time and may abort it."""
     frames: list[Frame] = []
     while not (calibration.idle or calibration.done):
-        link.wait(TURN_S)
+        link.wait(POLL_S)
         # A person may take minutes to read an instrument: the time of the turn is the time after it.
         reading = yaw_rad = None
         if surveyor is not None and calibration.wants_reading:

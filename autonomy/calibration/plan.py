@@ -1,7 +1,7 @@
 """Where a machine is calibrated: which joint is tested from which pose, how far it goes, and what it stays clear of.
 
 Every pose of every test keeps the open grapple above ground, bunk and logs, and every joint away from its stops; a
-machine on which that cannot be done is refused with a sentence (`NoRoom`) before anything moves.
+machine on which that cannot be done is refused with a sentence (`CalibrationImpossible`) before anything moves.
 """
 
 from __future__ import annotations
@@ -14,35 +14,35 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.calibration.program import PULSES, staircase, sweep, travel_of
-from autonomy.calibration.survey import telling_poses
+from autonomy.calibration.spool_program import PULSES, staircase, sweep, predicted_travel
+from autonomy.calibration.survey import most_informative_poses
 from machine.joints import JOINTS, Joint
-from machine.kinematics import pin_position
+from machine.geometry.kinematics import pin_position
 from machine.profile import JointSpec, Profile, joint
 
-MORE: Final = 1.35
+RANGE_MARGIN: Final = 1.35
 """A joint may go this much farther than its profile says: gains differ by a fifth, levers by a tenth."""
 BEGIN_SHARE: Final = 0.13
 """Where in its stretch a joint's tests begin: what comes back may come further back than it went."""
-STOP_SHARE, STOP_LEAST = 0.03, 0.05
+STOP_MARGIN_SHARE, MIN_STOP_MARGIN = 0.03, 0.05
 """What a test leaves free at either end of a range: a share of it, and at least so much [rad, m]."""
-ABOVE_M: Final = 0.35
+TIP_CLEARANCE_M: Final = 0.35
 """Free height under the tips of the open grapple."""
-NEAREST_M: Final = 2.0
-SURVEY_POSES: Final = 6
+MIN_REACH_M: Final = 2.0
+SURVEY_POSE_COUNT: Final = 6
 SURVEY_SLEW: Final = (-0.35, 0.0, 0.35)
 SURVEY_REACH: Final = (0.15, 0.85)
 """Survey poses use this part of the free ranges: what lies further out takes long to reach and tells little more."""
-HIGHEST_M: Final = 5.0
+MAX_HEIGHT_ABOVE_CLEAR_M: Final = 5.0
 """A pose is at most so much above the clear height: a boom that stands upright tells little and frightens people."""
-OWN_WEIGHT: Final = 6.0
-LOW_WEIGHT: Final = 0.3
-NEAR_WEIGHT_1_S: Final = 0.03
-_GRID: Final = 9
-_BOOM: Final = (Joint.LIFT, Joint.TILT, Joint.EXT)
+TESTED_JOINT_WEIGHT: Final = 6.0
+HEIGHT_WEIGHT: Final = 0.3
+TRAVEL_WEIGHT_1_S: Final = 0.03
+_GRID_COUNT: Final = 9
+_BOOM_JOINTS: Final = (Joint.LIFT, Joint.TILT, Joint.EXT)
 
 
-class NoRoom(ValueError):
+class CalibrationImpossible(ValueError):
     """The machine cannot be calibrated here; the text says which joint has no room and what to do."""
 
 
@@ -59,7 +59,7 @@ class JointPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class CalibrationPlan:
     """All tests in their order; ``skipped`` are the joints without an encoder, ``turned`` is the one of them that is
     tested by the surveyor's readings.
     """
@@ -73,23 +73,23 @@ class Plan:
 
 def free_range(spec: JointSpec) -> tuple[float, float]:
     """What tests may use of a joint's range."""
-    margin = max(STOP_SHARE * (spec.upper - spec.lower), STOP_LEAST)
+    margin = max(STOP_MARGIN_SHARE * (spec.upper - spec.lower), MIN_STOP_MARGIN)
     return spec.lower + margin, spec.upper - margin
 
 
 def clear_height_m(profile: Profile) -> float:
     """Lowest hanger pin at which the open grapple passes over everything."""
     top = max(profile.workspace.ground_z_m, profile.bunk.floor_z_m + profile.bunk.stake_height_m)
-    return top + max(profile.grapple.tongs.tip_below_pin_m) + ABOVE_M
+    return top + max(profile.grapple.tongs.tip_below_pin_m) + TIP_CLEARANCE_M
 
 
-def way_m(spec: JointSpec) -> float:
+def test_range(spec: JointSpec) -> float:
     """How far the tests of one side go at most [rad, m]."""
-    ways = [abs(travel_of(program(spec, side), spec, side)) for program in (sweep, staircase) for side in (1, -1)]
-    return MORE * (max(ways[:2]) + max(ways[2:]))
+    ways = [abs(predicted_travel(program(spec, side), spec, side)) for program in (sweep, staircase) for side in (1, -1)]
+    return RANGE_MARGIN * (max(ways[:2]) + max(ways[2:]))
 
 
-def make_plan(profile: Profile, position: Sequence[float], surveyed: bool) -> Plan:
+def make_plan(profile: Profile, position: Sequence[float], surveyed: bool) -> CalibrationPlan:
     """The plan from where the crane stands (``Joint`` order, NaN without an encoder); raises NoRoom."""
     here = [0.0 if np.isnan(p) else float(p) for p in position]
     clear = clear_height_m(profile)
@@ -100,25 +100,25 @@ def make_plan(profile: Profile, position: Sequence[float], surveyed: bool) -> Pl
     survey = _survey_poses(profile, here, clear) if surveyed else ()
     blind = tuple(j for j in JOINTS if j not in sensed)
     turned = Joint.ROT if surveyed and Joint.ROT in blind else None
-    return Plan(tuple(plans), survey, blind, clear, turned)
+    return CalibrationPlan(tuple(plans), survey, blind, clear, turned)
 
 
 def _grids(profile: Profile) -> list[list[float]]:
-    return [np.linspace(*free_range(joint(profile, j)), _GRID).tolist() for j in _BOOM]
+    return [np.linspace(*free_range(joint(profile, j)), _GRID_COUNT).tolist() for j in _BOOM_JOINTS]
 
 
 def _is_clear(profile: Profile, q: Sequence[float], clear_m: float) -> bool:
     x, y, z = pin_position(profile.kinematics, q)
-    return clear_m <= z <= clear_m + HIGHEST_M and hypot(x, y) >= NEAREST_M
+    return clear_m <= z <= clear_m + MAX_HEIGHT_ABOVE_CLEAR_M and hypot(x, y) >= MIN_REACH_M
 
 
 def _joint_plan(profile: Profile, which: Joint, before: Sequence[float], slew: float, clear_m: float) -> JointPlan:
     spec = joint(profile, which)
     low, high = free_range(spec)
-    way = way_m(spec)
+    way = test_range(spec)
     name = which.name.lower()
     if way > high - low:
-        raise NoRoom(
+        raise CalibrationImpossible(
             f"the {name} has {high - low:.2f} of free range, its tests may need {way:.2f}; lower its speed_limit or "
             "correct full_speed in the profile"
         )
@@ -129,12 +129,12 @@ def _joint_plan(profile: Profile, which: Joint, before: Sequence[float], slew: f
         start = min(max(middle - 0.5 * way, low), high - way)
         stretch = [_with(q, which, start + share * way) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
         if all(_is_clear(profile, s, clear_m) for s in stretch):
-            cost = _cost(profile, which, stretch[2]) + NEAR_WEIGHT_1_S * _way_s(profile, before, stretch[0])
+            cost = _cost(profile, which, stretch[2]) + TRAVEL_WEIGHT_1_S * _travel_time_s(profile, before, stretch[0])
             if best is None or cost < best[0]:
                 best = (cost, tuple(_with(q, which, start + BEGIN_SHARE * way)), start)
     if best is None:
-        raise NoRoom(
-            f"no pose leaves the {name} {way:.2f} of free way with the grapple {ABOVE_M} m clear of ground and bunk; "
+        raise CalibrationImpossible(
+            f"no pose leaves the {name} {way:.2f} of free way with the grapple {TIP_CLEARANCE_M} m clear of ground and bunk; "
             "check [workspace], [bunk] and the joint limits in the profile"
         )
     return JointPlan(which, best[1], best[2], best[2] + way, 0.8 * spec.speed_limit)
@@ -145,17 +145,17 @@ def _cost(profile: Profile, which: Joint, q: Sequence[float]) -> float:
     its range, where a cylinder's lever changes least, and the others near the middle of theirs.
     """
     off = 0.0
-    for j in _BOOM:
+    for j in _BOOM_JOINTS:
         spec = joint(profile, j)
         share = (q[j] - 0.5 * (spec.lower + spec.upper)) / (spec.upper - spec.lower)
-        off += (OWN_WEIGHT if j is which else 1.0) * share**2
+        off += (TESTED_JOINT_WEIGHT if j is which else 1.0) * share**2
     if which is Joint.SLEW:
         x, y, z = pin_position(profile.kinematics, q)
-        return hypot(x, y) + LOW_WEIGHT * z + 0.1 * off
+        return hypot(x, y) + HEIGHT_WEIGHT * z + 0.1 * off
     return off
 
 
-def _way_s(profile: Profile, start: Sequence[float], goal: Sequence[float]) -> float:
+def _travel_time_s(profile: Profile, start: Sequence[float], goal: Sequence[float]) -> float:
     """How long the slowest joint needs from pose to pose."""
     return max(abs(goal[j] - start[j]) / joint(profile, j).speed_limit for j in JOINTS)
 
@@ -171,24 +171,24 @@ def _survey_poses(profile: Profile, here: Sequence[float], clear_m: float) -> tu
     slew_low, slew_high = free_range(joint(profile, Joint.SLEW))
     slews = sorted({min(max(here[Joint.SLEW] + d, slew_low), slew_high) for d in SURVEY_SLEW})
     grids = []
-    for j in _BOOM:
+    for j in _BOOM_JOINTS:
         low, high = free_range(joint(profile, j))
         grids.append(np.linspace(*(low + share * (high - low) for share in SURVEY_REACH), 5).tolist())
     candidates = [q for s, *boom in product(slews, *grids) if _is_clear(profile, q := [s, *boom, 0.0], clear_m)]
-    chosen = [candidates[i] for i in telling_poses(profile.kinematics, candidates, SURVEY_POSES)]
-    return tuple(_shortest_way(profile, chosen))
+    chosen = [candidates[i] for i in most_informative_poses(profile.kinematics, candidates, SURVEY_POSE_COUNT)]
+    return tuple(_shortest_order(profile, chosen))
 
 
-def _shortest_way(profile: Profile, poses: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
+def _shortest_order(profile: Profile, poses: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
     """The poses in the order that takes least time, counted by the slowest joint of every leg."""
 
     def time_s(order: Sequence[Sequence[float]]) -> float:
-        return sum(_way_s(profile, p, q) for p, q in pairwise(order))
+        return sum(_travel_time_s(profile, p, q) for p, q in pairwise(order))
 
     return [tuple(q) for q in min(permutations(sorted(poses)), key=time_s)]
 
 
-def sentences(profile: Profile, plan: Plan) -> list[str]:
+def plan_summary(profile: Profile, plan: CalibrationPlan) -> list[str]:
     """What will move and how far, a line per test, for the person who says yes."""
     lines = []
     for p in plan.joints:

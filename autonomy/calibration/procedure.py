@@ -16,42 +16,42 @@ from collections.abc import Sequence
 from math import isfinite, isnan
 from typing import Final
 
-from autonomy.calibration.plan import BEGIN_SHARE, Plan
-from autonomy.calibration.spool_attempt import LEAD_S, TAIL_S, BlindAttempt, SpoolAttempt, programmed
-from autonomy.calibration.survey import Reading
-from autonomy.calibration.tasks import Bearing, Findings, Grip, Look, Pulse, Spool, Task, Travel, tasks_of
+from autonomy.calibration.plan import BEGIN_SHARE, CalibrationPlan
+from autonomy.calibration.spool_run import LEAD_S, TAIL_S, SpoolRun, MonitoredSpoolRun, program_for
+from autonomy.calibration.survey import SurveyReading
+from autonomy.calibration.tasks import YawReadingTask, Findings, GrappleTask, PinReadingTask, PulseTask, SpoolTask, Task, MoveTask, build_tasks
 from autonomy.calibration.trace import BusTrace
-from autonomy.calibration.turning import Turning
+from autonomy.calibration.rotator_turns import RotatorTurns
 from autonomy.motion.arm import Arm
 from autonomy.motion.setpoint_stream import SetpointStream
-from autonomy.motion.trajectory import Trajectory, across, hold
-from can_dbc.codec import Database
+from autonomy.motion.trajectory import Trajectory, joint_motion, hold
+from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame
-from can_dbc.setpoint import GrappleCommand, StateReport
-from machine.faults import describe
+from can_dbc.messages.crane import GrappleCommand, StateReport
+from machine.status.faults import describe
 from machine.joints import JOINTS, Joint
-from machine.kinematics import Point
-from machine.modes import Mode
+from machine.geometry.kinematics import Point
+from machine.status.modes import Mode
 from machine.profile import JointSpec, Profile, joint
 
 SETTLE_S: Final = 0.4
 SURVEY_SETTLE_S: Final = 1.5
-BEARING_SETTLE_S: Final = 0.4
+YAW_SETTLE_S: Final = 0.4
 """The grapple rests soon after a turn: nothing but its rotator has moved."""
-READINGS: Final = 8
-READING_NS: Final = 100_000_000
-SILENT_NS: Final = 300_000_000
-GRAPPLE_S: Final = 12.0
-GRIP_LEAST_S, BLIND_S = 0.5, 1.0
-ARRIVED: Final = (0.02, 0.02, 0.03, 0.03, 0.08)
-PULSE_S: Final = 2.0
+READING_COUNT: Final = 8
+READING_PERIOD_NS: Final = 100_000_000
+REPORT_TIMEOUT_NS: Final = 300_000_000
+GRAPPLE_TIMEOUT_S: Final = 12.0
+MIN_GRAPPLE_S, UNSENSED_EXTRA_S = 0.5, 1.0
+ARRIVAL_TOLERANCE: Final = (0.02, 0.02, 0.03, 0.03, 0.08)
+EXPECTED_PULSE_S: Final = 2.0
 """About how long a pulse takes."""
-_LATE: Final = 2.0
-_INCHING_S: Final = 20.0
+_TIMEOUT_FACTOR: Final = 2.0
+_TIMEOUT_EXTRA_S: Final = 20.0
 """A joint whose dead-band is not known yet may have to be inched to where it is sent."""
 _BRAKE_S: Final = 0.8
-_OPEN, _CLOSED, _HOLDING = 1, 4, 5  # GrappleStat.State
-_LONGEST_TURN_S: Final = 0.1
+_STATE_OPEN, _STATE_CLOSED_EMPTY, _STATE_HOLDING = 1, 4, 5  # GrappleStat.State
+_MAX_TICK_S: Final = 0.1
 
 
 class Calibration:
@@ -64,11 +64,11 @@ class Calibration:
         self,
         profile: Profile,
         profile_hash: int,
-        plan: Plan,
+        plan: CalibrationPlan,
         database: Database,
         lease_ns: int = 200_000_000,
         key: bytes | None = None,
-        asked_readings: int = READINGS,
+        asked_readings: int = READING_COUNT,
     ) -> None:
         self.trace = BusTrace(profile, database)
         self.found = Findings()
@@ -80,7 +80,7 @@ class Calibration:
         self.elapsed_s = 0.0
         self._profile, self._plan = profile, plan
         self._plans = {p.joint: p for p in plan.joints}
-        self._tasks = tasks_of(plan)
+        self._tasks = build_tasks(plan)
         self._at = 0
         self._arm = Arm(profile)
         self._stream = SetpointStream(profile_hash, lease_ns, key)
@@ -94,8 +94,8 @@ class Calibration:
         self._motion: Trajectory = hold((0.0,) * len(JOINTS))
         self._clock_s = 0.0
         self._rate = 1.0
-        self._spool: BlindAttempt | None = None
-        self._turning = Turning(joint(profile, Joint.ROT), self.found.turns)
+        self._spool: SpoolRun | None = None
+        self._turning = RotatorTurns(joint(profile, Joint.ROT), self.found.turns)
         self._points: list[Point] = []
         self._point_ns = 0
         self._poses: list[tuple[float, ...]] = []
@@ -139,7 +139,7 @@ class Calibration:
         read, and the rotator is not tested.
         """
         self.trace.take(frames)
-        dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _LONGEST_TURN_S)
+        dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _MAX_TICK_S)
         self._last_ns = now_ns
         if report is not None:
             self._report, self._report_ns = report, now_ns
@@ -167,7 +167,7 @@ class Calibration:
         report = self._report
         if report is None:
             return "the controller has not reported"
-        if now_ns - self._report_ns > SILENT_NS:
+        if now_ns - self._report_ns > REPORT_TIMEOUT_NS:
             return "the controller is silent"
         if report.mode not in (Mode.ARMED, Mode.ACTIVE):
             name = next((mode.name for mode in Mode if mode == report.mode), str(report.mode))
@@ -199,18 +199,18 @@ class Calibration:
 
     def _expected_s(self, task: Task) -> float:
         match task:
-            case Spool():
-                whole = LEAD_S + programmed(self._spec(task.joint), task).duration_s + TAIL_S
+            case SpoolTask():
+                whole = LEAD_S + program_for(self._spec(task.joint), task).duration_s + TAIL_S
                 return 0.75 * whole if task.kind != "staircase" else whole
-            case Travel():
+            case MoveTask():
                 return 4.0
-            case Grip():
+            case GrappleTask():
                 return 1.2 * self._profile.grapple.close_time_s
-            case Pulse():
-                return LEAD_S + PULSE_S + TAIL_S
-            case Bearing():
-                return BEARING_SETTLE_S + self._readings * READING_NS * 1e-9
-        return SURVEY_SETTLE_S + self._readings * READING_NS * 1e-9
+            case PulseTask():
+                return LEAD_S + EXPECTED_PULSE_S + TAIL_S
+            case YawReadingTask():
+                return YAW_SETTLE_S + self._readings * READING_PERIOD_NS * 1e-9
+        return SURVEY_SETTLE_S + self._readings * READING_PERIOD_NS * 1e-9
 
     def _enter(self, now_ns: int) -> None:
         """Begins the task."""
@@ -221,18 +221,18 @@ class Calibration:
         follows = self._report.mode == Mode.ACTIVE and all(map(isfinite, self._report.reference[:4]))
         start = tuple(r if isfinite(r) else 0.0 for r in self._report.reference) if follows else self._position()
         match task:
-            case Travel():
-                self._motion = across(self._arm, start, task.pose)
-            case Spool():
-                self._spool = SpoolAttempt(self._spec(task.joint), task, self._position()[task.joint])
+            case MoveTask():
+                self._motion = joint_motion(self._arm, start, task.pose)
+            case SpoolTask():
+                self._spool = MonitoredSpoolRun(self._spec(task.joint), task, self._position()[task.joint])
                 self._check_room(task, self._spool.end)
-            case Pulse():
-                self._spool = BlindAttempt(self._turning.program(task))
+            case PulseTask():
+                self._spool = SpoolRun(self._turning.program(task))
             case _:
                 self._motion = hold(start)
                 self._points, self._poses, self._point_ns = [], [], 0
 
-    def _check_room(self, task: Spool, end: float) -> None:
+    def _check_room(self, task: SpoolTask, end: float) -> None:
         """A test that might come to the end of the joint's range begins from farther away, or is not tried."""
         spec, plan = self._spec(task.joint), self._plans[task.joint]
         if task.kind == "wiggle" or spec.lower < end < spec.upper:
@@ -242,10 +242,10 @@ class Calibration:
         stands = start[task.joint]
         start[task.joint] = plan.low + aside if task.side > 0 else plan.high - aside
         name = task.joint.name.lower()
-        if abs(start[task.joint] - stands) < 3.0 * ARRIVED[task.joint]:
+        if abs(start[task.joint] - stands) < 3.0 * ARRIVAL_TOLERANCE[task.joint]:
             self.abort(f"the {name} has no room for its {task.kind}: it would end at {end:.2f}, past its stop")
             return
-        self._tasks.insert(self._at, Travel(tuple(start), f"back for more room of the {name}"))
+        self._tasks.insert(self._at, MoveTask(tuple(start), f"back for more room of the {name}"))
         self._enter(self._task_ns)
 
     def _next(self) -> None:
@@ -257,22 +257,22 @@ class Calibration:
         task = self._tasks[self._at]
         time_s = (now_ns - self._task_ns) * 1e-9
         match task:
-            case Spool() | Pulse():
+            case SpoolTask() | PulseTask():
                 return self._run_spool(task, time_s, now_ns)
-            case Travel():
+            case MoveTask():
                 self._clock_s += dt_s
                 if self._clock_s >= self._motion.duration_s + SETTLE_S and self._arrived():
                     self._next()
-                elif self._clock_s > _LATE * self._motion.duration_s + _INCHING_S:
+                elif self._clock_s > _TIMEOUT_FACTOR * self._motion.duration_s + _TIMEOUT_EXTRA_S:
                     self.abort(f"the crane did not come {task.why}")
                 return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
-            case Grip():
+            case GrappleTask():
                 self._run_grip(task, time_s)
                 return self._motion_datagram(now_ns, task.command)
-            case Look():
+            case PinReadingTask():
                 self._run_look(task, time_s, now_ns, survey)
                 return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
-            case Bearing():
+            case YawReadingTask():
                 self._run_bearing(time_s, now_ns, yaw_rad)
                 return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
         return None
@@ -280,7 +280,7 @@ class Calibration:
     def _arrived(self) -> bool:
         return all(
             abs(p - g) <= near
-            for j, p, g, near in zip(JOINTS, self._position(), self._motion.goal, ARRIVED, strict=True)
+            for j, p, g, near in zip(JOINTS, self._position(), self._motion.goal, ARRIVAL_TOLERANCE, strict=True)
             if self._spec(j).encoder is not None
         )
 
@@ -289,7 +289,7 @@ class Calibration:
             return None
         return self._stream.datagram(now_ns, self._motion, self._clock_s, grapple, self._rate)
 
-    def _run_spool(self, task: Spool | Pulse, time_s: float, now_ns: int) -> bytes | None:
+    def _run_spool(self, task: SpoolTask | PulseTask, time_s: float, now_ns: int) -> bytes | None:
         assert self._spool is not None and self._report is not None
         run, position = self._spool, self._position()[task.joint]
         run_s = time_s - LEAD_S
@@ -307,11 +307,11 @@ class Calibration:
             return None
         return self._stream.spool(now_ns, task.joint, run.window(run_s))
 
-    def _finish_spool(self, task: Spool | Pulse, wrong: str | None, now_ns: int) -> None:
+    def _finish_spool(self, task: SpoolTask | PulseTask, wrong: str | None, now_ns: int) -> None:
         if wrong:
             self.abort(wrong)
             return
-        if isinstance(task, Pulse):
+        if isinstance(task, PulseTask):
             self._turning.ran(self.trace.test(task.joint, task.side, "pulse", self._task_ns, now_ns))
             self._next()
             return
@@ -319,7 +319,7 @@ class Calibration:
         (self.found.wiggles if task.kind == "wiggle" else self.found.tests).append(test)
         self._next()
 
-    def _run_grip(self, task: Grip, time_s: float) -> None:
+    def _run_grip(self, task: GrappleTask, time_s: float) -> None:
         """Until the valve node says that the grapple is at its end; only a time from end to end counts.
 
         A grapple without an opening sensor is opened for the profile's time and may fall short of its end: then its
@@ -327,42 +327,42 @@ class Calibration:
         """
         state = self.trace.grapple_state.values[-1] if self.trace.grapple_state.values else 0.0
         opens, grapple = task.command is GrappleCommand.OPEN, self._profile.grapple
-        if time_s > GRIP_LEAST_S and state in ((_OPEN,) if opens else (_CLOSED, _HOLDING)):
+        if time_s > MIN_GRAPPLE_S and state in ((_STATE_OPEN,) if opens else (_STATE_CLOSED_EMPTY, _STATE_HOLDING)):
             if self._at_end:
                 self.found.grapple_s[task.command] = time_s
             self._at_end = True
             self._next()
-        elif opens and not grapple.opening_sensor and time_s > grapple.open_time_s + BLIND_S:
+        elif opens and not grapple.opening_sensor and time_s > grapple.open_time_s + UNSENSED_EXTRA_S:
             self._at_end = False
             self._next()
-        elif time_s > GRAPPLE_S:
-            self.abort(f"the grapple did not {task.command.name.lower()} within {GRAPPLE_S:.0f} s")
+        elif time_s > GRAPPLE_TIMEOUT_S:
+            self.abort(f"the grapple did not {task.command.name.lower()} within {GRAPPLE_TIMEOUT_S:.0f} s")
 
-    def _run_look(self, task: Look, time_s: float, now_ns: int, survey: Point | None) -> None:
+    def _run_look(self, task: PinReadingTask, time_s: float, now_ns: int, survey: Point | None) -> None:
         self.wants_reading = time_s >= SURVEY_SETTLE_S and now_ns >= self._point_ns
         if survey is None or time_s < SURVEY_SETTLE_S:
             return
         self._points.append(survey)
         self._poses.append(self._position())
-        self._point_ns = now_ns + READING_NS
+        self._point_ns = now_ns + READING_PERIOD_NS
         if len(self._points) >= self._readings:
             count = len(self._points)
             x, y, z = (sum(p[i] for p in self._points) / count for i in range(3))
             position = tuple(sum(q[j] for q in self._poses) / count for j in JOINTS)
             since_ns = self._task_ns + round(SURVEY_SETTLE_S * 1e9)
             moment_nm = self.trace.lift_moment_nm(position[Joint.LIFT], since_ns, now_ns)
-            self.found.readings.append(Reading(position, (x, y, z), moment_nm))
+            self.found.readings.append(SurveyReading(position, (x, y, z), moment_nm))
             self._next()
 
     def _run_bearing(self, time_s: float, now_ns: int, yaw_rad: float | None) -> None:
-        self.wants_yaw = time_s >= BEARING_SETTLE_S and now_ns >= self._point_ns
-        if yaw_rad is None or time_s < BEARING_SETTLE_S:
+        self.wants_yaw = time_s >= YAW_SETTLE_S and now_ns >= self._point_ns
+        if yaw_rad is None or time_s < YAW_SETTLE_S:
             return
         if isnan(yaw_rad):
             del self._tasks[self._at :]  # nothing but the rotator's turns is left
             self.wants_yaw = False
             return
-        self._point_ns = now_ns + READING_NS
+        self._point_ns = now_ns + READING_PERIOD_NS
         if self._turning.see(yaw_rad, self._position()[Joint.SLEW]) >= self._readings:
             if wrong := self._turning.rest():
                 self.abort(wrong)
@@ -372,7 +372,7 @@ class Calibration:
     def _brake(self, now_ns: int, dt_s: float) -> bytes | None:
         """The end of a run that failed: valve closed, or the motion slowed to a stand on its path."""
         task = self._tasks[self._at] if self._at < len(self._tasks) else None
-        if isinstance(task, Spool | Pulse) and self._entered:
+        if isinstance(task, SpoolTask | PulseTask) and self._entered:
             run_s = (now_ns - self._task_ns) * 1e-9 - LEAD_S
             assert self._spool is not None
             if self._rate != 0.0:

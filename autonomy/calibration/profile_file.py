@@ -14,29 +14,29 @@ from typing import Any, Final
 import tomlkit
 from tomlkit.items import Item
 
-from autonomy.calibration.result import JointResult, Result
+from autonomy.calibration.result import JointResult, CalibrationResult
 from autonomy.calibration.survey import OFFSETS, SurveyFit
 from autonomy.calibration.turn_fit import TurnFit
-from can_dbc.setpoint import GrappleCommand
+from can_dbc.messages.crane import GrappleCommand
 from machine.joints import Joint
-from machine.lift import lever_share
-from machine.load import ProfileError, load_profile
+from machine.sensing.weighing import lever_share
+from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import JointSpec, Profile, joint
 
-SPEED_SHARE: Final = 0.9
+SPEED_LIMIT_SHARE: Final = 0.9
 """A joint that cannot reach its speed limit gets one at this share of what it can."""
-SAG_DIGITS: Final = 5
+SIGNIFICANT_SAG_DIGITS: Final = 5
 """Significant digits of a sag value."""
-COMMENT_AT: Final = 40
+COMMENT_COLUMN: Final = 40
 """Column of the comments, as in the shipped profiles."""
 Change = tuple[tuple[str, ...], Any, str]
 
 
-class NotWritten(ValueError):
+class ProfileNotWritten(ValueError):
     """No profile was written; the text says why and what to do."""
 
 
-def changes(profile: Profile, result: Result) -> list[Change]:
+def profile_changes(profile: Profile, result: CalibrationResult) -> list[Change]:
     """What a calibration changes in its profile: key path, value, remark."""
     found: list[Change] = []
     for j, r in result.joints.items():
@@ -70,7 +70,7 @@ def _survey_changes(profile: Profile, survey: SurveyFit) -> list[Change]:
         "pin_nm_m": "and per metre of the hanger pin's reach",
     }
     for name, remark in remarks.items():
-        value = float(f"{getattr(survey.sag, name):.{SAG_DIGITS}g}")
+        value = float(f"{getattr(survey.sag, name):.{SIGNIFICANT_SAG_DIGITS}g}")
         found.append((("sag", name), value, remark))
     return found
 
@@ -118,7 +118,7 @@ def _limit_changes(path: tuple[str, ...], spec: JointSpec, fulls: Sequence[float
     slowest = min(fulls)
     if slowest >= spec.speed_limit:
         return []
-    limit = round(SPEED_SHARE * slowest, 4)
+    limit = round(SPEED_LIMIT_SHARE * slowest, 4)
     return [((*path, "speed_limit"), limit, f"{unit}/s, the valve gives no more than {slowest:.3f}")]
 
 
@@ -135,7 +135,7 @@ def write_profile(source: Path, out: Path, changed: list[Change], date: str) -> 
             if key not in table:
                 table.append(key, tomlkit.table())
             table = table[key]
-        _put(table, path[-1], value, f"# [cal] {date} {remark}")
+        _set_value(table, path[-1], value, f"# [cal] {date} {remark}")
     text = f"# Calibrated on {date}; [cal] marks what was measured on this machine.\n" + tomlkit.dumps(document)
     scratch = out.with_name(f".{out.stem}.part.toml")
     try:
@@ -144,18 +144,18 @@ def write_profile(source: Path, out: Path, changed: list[Change], date: str) -> 
         load_profile(scratch)
         os.link(scratch, out)  # never over an existing file, whole or not at all
     except ProfileError as error:
-        raise NotWritten(f"the calibrated profile would be refused: {error}") from None
+        raise ProfileNotWritten(f"the calibrated profile would be refused: {error}") from None
     except FileExistsError:
-        raise NotWritten(f"{out} exists and is not overwritten; choose another --out") from None
+        raise ProfileNotWritten(f"{out} exists and is not overwritten; choose another --out") from None
     except OSError as error:
-        raise NotWritten(f"{out}: the profile cannot be written: {error.strerror}; choose another --out") from None
+        raise ProfileNotWritten(f"{out}: the profile cannot be written: {error.strerror}; choose another --out") from None
     finally:
         scratch.unlink(missing_ok=True)
 
 
-def _put(table: Any, key: str, value: Any, comment: str) -> None:
+def _set_value(table: Any, key: str, value: Any, comment: str) -> None:
     item: Item = tomlkit.item(value)
-    room = COMMENT_AT - len(f"{key} = {item.as_string()}") - 1
+    room = COMMENT_COLUMN - len(f"{key} = {item.as_string()}") - 1
     table[key] = item
     table[key].trivia.comment_ws = " " * max(1, room)
     table[key].trivia.comment = comment

@@ -1,6 +1,6 @@
 """The report of a calibration: result.json and a page of pictures per joint, for the person who decides.
 
-Everything comes from the `Result`; the same result gives the same files.
+Everything comes from the `CalibrationResult`; the same result gives the same files.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.calibration.profile_file import Change
-from autonomy.calibration.result import JointResult, Result
+from autonomy.calibration.result import JointResult, CalibrationResult
 from autonomy.calibration.survey import OFFSETS
 from autonomy.calibration.turn_fit import TurnFit
 from machine.joints import Joint
 
-ROUND: Final = 6
-SMALL, ROUND_SMALL = 1e-3, 12
+DECIMALS: Final = 6
+SMALL_BELOW, SMALL_DECIMALS = 1e-3, 12
 
 
-def document(result: Result, facts: dict[str, Any], changed: list[Change]) -> dict[str, Any]:
+def result_document(result: CalibrationResult, facts: dict[str, Any], changed: list[Change]) -> dict[str, Any]:
     """Everything that was found, as plain data."""
     joints = {j.name.lower(): _joint(r) for j, r in result.joints.items()}
     survey = None
@@ -90,14 +90,14 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, float):
         if not isfinite(value):
             return None
-        return round(value, ROUND if abs(value) >= SMALL else ROUND_SMALL)
+        return round(value, DECIMALS if abs(value) >= SMALL_BELOW else SMALL_DECIMALS)
     return value
 
 
-def write_report(folder: Path, result: Result, facts: dict[str, Any], changed: list[Change]) -> None:
+def write_report(folder: Path, result: CalibrationResult, facts: dict[str, Any], changed: list[Change]) -> None:
     """``result.json``, ``JOINT.png`` for every joint and ``survey.png``."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "result.json").write_text(json.dumps(document(result, facts, changed), indent=2) + "\n")
+    (folder / "result.json").write_text(json.dumps(result_document(result, facts, changed), indent=2) + "\n")
     for j, r in result.joints.items():
         _draw_joint(folder / f"{j.name.lower()}.png", r)
     if result.survey is not None:
@@ -155,7 +155,7 @@ def _draw_joint(path: Path, r: JointResult) -> None:
     _save(figure, path)
 
 
-def _draw_survey(path: Path, result: Result) -> None:
+def _draw_survey(path: Path, result: CalibrationResult) -> None:
     """What encoders and survey disagree about at every pose, before and after."""
     s = result.survey
     assert s is not None

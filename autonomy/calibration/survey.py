@@ -24,32 +24,32 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from machine.joints import N_JOINTS, Joint
-from machine.kinematics import Point
-from machine.lift import empty_moment_nm
+from machine.geometry.kinematics import Point
+from machine.sensing.weighing import empty_moment_nm
 from machine.profile import Kinematics, Sag
-from machine.sag import true_pin
+from machine.geometry.sag import true_pin
 
 OFFSETS: Final = (Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT)
-NOISE_M: Final = 0.002
+PIN_SIGMA_M: Final = 0.002
 """Of one surveyed position; several readings at one pose are averaged by the caller."""
-OFFSET_SPREAD: Final = (0.07, 0.02, 0.02, 0.02)
-"""How far off an encoder's zero is on a machine that nobody has surveyed [rad, m] (machines.md 1.6, 14)."""
-GIVE_SPREAD: Final = 0.01
+OFFSET_SIGMA: Final = (0.07, 0.02, 0.02, 0.02)
+"""How far off an encoder's zero is on a machine that nobody has surveyed [rad, m] (docs/reference/machines.md sections 1.6 and 14)."""
+LEAN_SIGMA: Final = 0.01
 """Of each of the two lean terms [rad/m]: 0.1 m of sag at full reach."""
-REST_SPREAD: Final = 0.05
-MOMENT_NOISE_NM: Final = 600.0
+REST_SIGMA: Final = 0.05
+MOMENT_SIGMA_NM: Final = 600.0
 """Of one moment by pressures: a cylinder at rest holds up to its friction either way."""
-WEIGHT_SPREAD_N: Final = 2e4
+WEIGHT_SIGMA_N: Final = 2e4
 """Of each of the two terms of the moment: two tons at either pin."""
-GIVE_RAD_NM: Final = 1e-6
+USUAL_COMPLIANCE_RAD_NM: Final = 1e-6
 """A usual column's give, and how far others are from it."""
-USUAL: Final = (1.0, 0.01, 6e3, 8e3)
+USUAL_PARAMETERS: Final = (1.0, 0.01, 6e3, 8e3)
 """Give, rest, head and pin of a usual crane, where the poses of a survey are chosen."""
-LEAST_POSES: Final = 5
+MIN_POSES: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class SurveyReading:
     """One pose: what the encoders say (``Joint`` order, rad and m), where the pin is (base frame, m), and the moment
     that the lift cylinder's pressures show [Nm], NaN without pressure sensors.
     """
@@ -79,12 +79,12 @@ class SurveyFit:
 def _sag(p: Sequence[float]) -> Sag:
     """The sag of the parameters after the offsets.
 
-    Three are the lean by itself: head, pin, rest.  Four tie it to the moment: give [`GIVE_RAD_NM`], rest, head and pin
+    Three are the lean by itself: head, pin, rest.  Four tie it to the moment: give [`USUAL_COMPLIANCE_RAD_NM`], rest, head and pin
     of the moment.
     """
     if len(p) == 3:
         return Sag(p[0], p[1], p[2])
-    give = p[0] * GIVE_RAD_NM
+    give = p[0] * USUAL_COMPLIANCE_RAD_NM
     return Sag(give * p[2], give * p[3], p[1], give, p[2], p[3])
 
 
@@ -95,13 +95,13 @@ def _corrected(position: Sequence[float], offsets: Sequence[float]) -> list[floa
     return q
 
 
-def _spread(weighed: bool) -> np.ndarray:
+def _prior_sigma(weighed: bool) -> np.ndarray:
     """How far the parameters may be from 0 on a machine that nobody has surveyed."""
-    lean = (1.0, REST_SPREAD, WEIGHT_SPREAD_N, WEIGHT_SPREAD_N) if weighed else (GIVE_SPREAD, GIVE_SPREAD, REST_SPREAD)
-    return np.array([*OFFSET_SPREAD, *lean])
+    lean = (1.0, REST_SIGMA, WEIGHT_SIGMA_N, WEIGHT_SIGMA_N) if weighed else (LEAN_SIGMA, LEAN_SIGMA, REST_SIGMA)
+    return np.array([*OFFSET_SIGMA, *lean])
 
 
-def _misfit(kin: Kinematics, readings: Sequence[Reading], p: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+def _misfit(kin: Kinematics, readings: Sequence[SurveyReading], p: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """What the parameters leave of pins (n, 3) [m] and moments [Nm]."""
     sag, shown = _sag(p[4:]), [_corrected(r.position, p[:4]) for r in readings]
     pins = np.array([r.pin_m for r in readings]) - np.array([true_pin(sag, kin, q) for q in shown])
@@ -109,23 +109,23 @@ def _misfit(kin: Kinematics, readings: Sequence[Reading], p: Sequence[float]) ->
     return pins, np.array(moments)
 
 
-def fit_survey(kin: Kinematics, readings: Sequence[Reading], known: Sag | None = None) -> SurveyFit:
-    """Offsets and sag from at least `LEAST_POSES` readings; ValueError with fewer.
+def fit_survey(kin: Kinematics, readings: Sequence[SurveyReading], known: Sag | None = None) -> SurveyFit:
+    """Offsets and sag from at least `MIN_POSES` readings; ValueError with fewer.
 
     ``known``: the sag that the profile has so far; only ``before_m`` depends on it.
     """
-    if len(readings) < LEAST_POSES:
-        raise ValueError(f"{len(readings)} surveyed poses are too few; survey {LEAST_POSES} or more, far apart")
+    if len(readings) < MIN_POSES:
+        raise ValueError(f"{len(readings)} surveyed poses are too few; survey {MIN_POSES} or more, far apart")
     weighed = all(isfinite(r.moment_nm) for r in readings)
-    spread = _spread(weighed)
+    spread = _prior_sigma(weighed)
     start = np.zeros(len(spread))
     if weighed:
-        start[4], start[6:] = 1.0, 0.2 * WEIGHT_SPREAD_N
+        start[4], start[6:] = 1.0, 0.2 * WEIGHT_SIGMA_N
 
     def residuals(p: np.ndarray) -> np.ndarray:
         pins, moments = _misfit(kin, readings, p.tolist())
-        parts = [pins.ravel() / NOISE_M, (p - start) / spread]
-        return np.concatenate([*parts, moments / MOMENT_NOISE_NM] if weighed else parts)
+        parts = [pins.ravel() / PIN_SIGMA_M, (p - start) / spread]
+        return np.concatenate([*parts, moments / MOMENT_SIGMA_NM] if weighed else parts)
 
     found = least_squares(residuals, start, x_scale=spread)
     errors = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
@@ -142,20 +142,20 @@ def fit_survey(kin: Kinematics, readings: Sequence[Reading], known: Sag | None =
     )
 
 
-def telling_poses(kin: Kinematics, candidates: Sequence[Sequence[float]], count: int) -> list[int]:
+def most_informative_poses(kin: Kinematics, candidates: Sequence[Sequence[float]], count: int) -> list[int]:
     """Which of the candidate poses, surveyed together, leave the pin best known at all of them (greedy)."""
-    usual = [*[0.0] * 4, *USUAL]
-    spread = _spread(True)
+    usual = [*[0.0] * 4, *USUAL_PARAMETERS]
+    spread = _prior_sigma(True)
     rows = []
     for q in candidates:
-        reading = [Reading(tuple(q), (0.0, 0.0, 0.0), 0.0)]
+        reading = [SurveyReading(tuple(q), (0.0, 0.0, 0.0), 0.0)]
         columns = []
         for i, step in enumerate(1e-3 * spread):
             moved = [p + (step if i == n else 0.0) for n, p in enumerate(usual)]
             pins, moments = (
                 b - a for a, b in zip(_misfit(kin, reading, usual), _misfit(kin, reading, moved), strict=True)
             )
-            columns.append(np.array([*pins[0] / NOISE_M, moments[0] / MOMENT_NOISE_NM]) / step)
+            columns.append(np.array([*pins[0] / PIN_SIGMA_M, moments[0] / MOMENT_SIGMA_NM]) / step)
         rows.append(np.array(columns).T)
     all_rows = np.array(rows)
     wanted = np.einsum("nki,nkj->ij", all_rows[:, :3], all_rows[:, :3])

@@ -11,15 +11,15 @@ from typing import Final
 import numpy as np
 
 COLUMNS: Final = ("u_px", "v_px", "x_m", "y_m", "z_m")
-DEPTH: Final = "depth_m"
+DEPTH_COLUMN: Final = "depth_m"
 
 
-class TargetsRefused(ValueError):
+class TargetsFileError(ValueError):
     """The file is no list of targets; the message names the line and what is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
-class Targets:
+class SurveyTargets:
     """Pixels (N, 2), depths (N,) [m], NaN where none is known, and places in the crane's base frame (N, 3) [m]."""
 
     pixels_px: np.ndarray
@@ -27,8 +27,8 @@ class Targets:
     places_m: np.ndarray
 
 
-def load_targets(path: Path) -> Targets:
-    """The targets of a file with the columns ``COLUMNS`` and, where the camera measures it, ``DEPTH``.
+def load_targets(path: Path) -> SurveyTargets:
+    """The targets of a file with the columns ``COLUMNS`` and, where the camera measures it, ``DEPTH_COLUMN``.
 
     Raises:
         TargetsRefused: it cannot be read, a column is missing or a value is no finite number.
@@ -36,23 +36,23 @@ def load_targets(path: Path) -> Targets:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise TargetsRefused(f"{path}: cannot be read as text: {error}") from None
+        raise TargetsFileError(f"{path}: cannot be read as text: {error}") from None
     rows = csv.DictReader(text.splitlines(), skipinitialspace=True)
     names = [(name or "").strip() for name in rows.fieldnames or ()]
     missing = [name for name in COLUMNS if name not in names]
     if missing:
-        raise TargetsRefused(
-            f"{path}:1: column {missing[0]} is missing; the first line is {','.join((*COLUMNS, DEPTH))}"
+        raise TargetsFileError(
+            f"{path}:1: column {missing[0]} is missing; the first line is {','.join((*COLUMNS, DEPTH_COLUMN))}"
         )
     rows.fieldnames = names
     values, depths = [], []
     for row in rows:
         where = f"{path}:{rows.line_num}"
         values.append([_number(row[name], name, where) for name in COLUMNS])
-        depth = (row.get(DEPTH) or "").strip()
-        depths.append(_number(depth, DEPTH, where) if depth else math.nan)
+        depth = (row.get(DEPTH_COLUMN) or "").strip()
+        depths.append(_number(depth, DEPTH_COLUMN, where) if depth else math.nan)
     table = np.array(values, float).reshape(-1, len(COLUMNS))
-    return Targets(table[:, :2], np.array(depths), table[:, 2:])
+    return SurveyTargets(table[:, :2], np.array(depths), table[:, 2:])
 
 
 def _number(text: str | None, name: str, where: str) -> float:
@@ -61,5 +61,5 @@ def _number(text: str | None, name: str, where: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise TargetsRefused(f"{where}: {name} is {text!r}, which is no number; decimals have a point")
+        raise TargetsFileError(f"{where}: {name} is {text!r}, which is no number; decimals have a point")
     return value

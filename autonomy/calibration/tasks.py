@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from autonomy.calibration.plan import Plan
-from autonomy.calibration.program import PULSES
-from autonomy.calibration.survey import Reading
-from autonomy.calibration.trace import Record
+from autonomy.calibration.plan import CalibrationPlan
+from autonomy.calibration.spool_program import PULSES
+from autonomy.calibration.survey import SurveyReading
+from autonomy.calibration.trace import SpoolTestRecord
 from autonomy.calibration.turn_fit import Turn
-from can_dbc.setpoint import GrappleCommand
+from can_dbc.messages.crane import GrappleCommand
 from machine.joints import Joint
 
 
 @dataclass(frozen=True, slots=True)
-class Travel:
+class MoveTask:
     """An ordinary motion to a pose."""
 
     pose: tuple[float, ...]
@@ -22,7 +22,7 @@ class Travel:
 
 
 @dataclass(frozen=True, slots=True)
-class Spool:
+class SpoolTask:
     """One spool program: ``kind`` is wiggle, sweep or staircase."""
 
     joint: Joint
@@ -31,21 +31,21 @@ class Spool:
 
 
 @dataclass(frozen=True, slots=True)
-class Grip:
+class GrappleTask:
     """The grapple opens or closes, the crane stands."""
 
     command: GrappleCommand
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class PinReadingTask:
     """Stand still until the surveyor has read the pin's position."""
 
     number: int
 
 
 @dataclass(frozen=True, slots=True)
-class Pulse:
+class PulseTask:
     """A joint without an encoder turns by its spool alone, by the profile at a ``share`` of its speed limit, to an
     angle counted from where it stood before its first pulse [rad].
     """
@@ -57,41 +57,41 @@ class Pulse:
 
 
 @dataclass(frozen=True, slots=True)
-class Bearing:
+class YawReadingTask:
     """Stand still until the surveyor has read the grapple's direction."""
 
     number: int
 
 
-Task = Travel | Spool | Grip | Look | Pulse | Bearing
+Task = MoveTask | SpoolTask | GrappleTask | PinReadingTask | PulseTask | YawReadingTask
 
 
 @dataclass(slots=True)
 class Findings:
     """What a run has brought home."""
 
-    wiggles: list[Record] = field(default_factory=list)
-    tests: list[Record] = field(default_factory=list)
+    wiggles: list[SpoolTestRecord] = field(default_factory=list)
+    tests: list[SpoolTestRecord] = field(default_factory=list)
     grapple_s: dict[GrappleCommand, float] = field(default_factory=dict)
-    readings: list[Reading] = field(default_factory=list)
+    readings: list[SurveyReading] = field(default_factory=list)
     turns: list[Turn] = field(default_factory=list)
 
 
-def tasks_of(plan: Plan) -> list[Task]:
+def build_tasks(plan: CalibrationPlan) -> list[Task]:
     """Everything in order: first every joint's wiggle where the crane stands, inward first."""
     tasks: list[Task] = []
     for p in plan.joints:
-        tasks += [Spool(p.joint, +1, "wiggle"), Spool(p.joint, -1, "wiggle")]
+        tasks += [SpoolTask(p.joint, +1, "wiggle"), SpoolTask(p.joint, -1, "wiggle")]
     for p in plan.joints:
-        tasks.append(Travel(p.pose, f"to the start of the {p.joint.name.lower()}'s tests"))
+        tasks.append(MoveTask(p.pose, f"to the start of the {p.joint.name.lower()}'s tests"))
         for side in (+1, -1):
-            tasks += [Spool(p.joint, side, "sweep"), Spool(p.joint, side, "staircase")]
-    tasks += [Grip(GrappleCommand.OPEN), Grip(GrappleCommand.CLOSE), Grip(GrappleCommand.OPEN)]
+            tasks += [SpoolTask(p.joint, side, "sweep"), SpoolTask(p.joint, side, "staircase")]
+    tasks += [GrappleTask(GrappleCommand.OPEN), GrappleTask(GrappleCommand.CLOSE), GrappleTask(GrappleCommand.OPEN)]
     for number, pose in enumerate(plan.survey):
-        tasks += [Travel(pose, f"to survey pose {number + 1}"), Look(number)]
+        tasks += [MoveTask(pose, f"to survey pose {number + 1}"), PinReadingTask(number)]
     if plan.turned is not None:
-        tasks.append(Bearing(0))
-        pulses = [Pulse(plan.turned, s, share, to) for share, far in PULSES for s, to in ((+1, far), (-1, 0.0))]
+        tasks.append(YawReadingTask(0))
+        pulses = [PulseTask(plan.turned, s, share, to) for share, far in PULSES for s, to in ((+1, far), (-1, 0.0))]
         for number, pulse in enumerate(pulses):
-            tasks += [pulse, Bearing(number + 1)]
+            tasks += [pulse, YawReadingTask(number + 1)]
     return tasks

@@ -15,19 +15,19 @@ from typing import Final
 
 import numpy as np
 
-from can_dbc.codec import Database
+from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame
-from machine.encoder import position_from_counts
+from machine.sensing.encoder import position_from_counts
 from machine.joints import JOINTS, Joint
-from machine.lift import lift_moment_nm
+from machine.sensing.weighing import lift_moment_nm
 from machine.profile import Profile, joint
 
 GRID_S: Final = 0.005
-FINE: Final = 4
+FINE_FACTOR: Final = 4
 _NS: Final = 1e-9
 
 
-class Column:
+class SignalColumn:
     """Times [ns] and values of one signal."""
 
     __slots__ = ("times_ns", "values")
@@ -50,10 +50,10 @@ class Column:
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class SpoolTestRecord:
     """One program as it was run: which joint and side, what for, and the bus's columns on a grid of `GRID_S`.
 
-    ``command`` and ``spool`` in shares of full (1 = 100 %), ``position`` in rad or m.  ``fine_command`` has `FINE`
+    ``command`` and ``spool`` in shares of full (1 = 100 %), ``position`` in rad or m.  ``fine_command`` has `FINE_FACTOR`
     values per grid step, for a dead time is looked for between them.  ``spool`` is None where the valve node reports
     none.
     """
@@ -73,11 +73,11 @@ class BusTrace:
 
     def __init__(self, profile: Profile, database: Database) -> None:
         self._profile = profile
-        self.commands = [Column() for _ in JOINTS]
-        self.spools = [Column() for _ in JOINTS]
-        self.positions = [Column() for _ in JOINTS]
-        self.grapple_state, self.opening, self.grapple_spool = Column(), Column(), Column()
-        self.lift_bar = (Column(), Column())
+        self.commands = [SignalColumn() for _ in JOINTS]
+        self.spools = [SignalColumn() for _ in JOINTS]
+        self.positions = [SignalColumn() for _ in JOINTS]
+        self.grapple_state, self.opening, self.grapple_spool = SignalColumn(), SignalColumn(), SignalColumn()
+        self.lift_bar = (SignalColumn(), SignalColumn())
         """Pressures of the lift cylinder: the side that pushes upward, the other."""
         self._readers = {}
         for message, columns in (("ValveCmdA", self.commands), ("ValveCmdB", self.commands)):
@@ -99,7 +99,7 @@ class BusTrace:
                 codec = database.message(encoder.message)
                 self._encoders[codec.key] = (codec, codec.index["Position"], encoder, self.positions[j])
 
-    def _read_valves(self, database: Database, message: str, prefix: str, columns: list[Column]) -> None:
+    def _read_valves(self, database: Database, message: str, prefix: str, columns: list[SignalColumn]) -> None:
         codec = database.message(message)
         wanted = []
         for j in JOINTS:
@@ -133,16 +133,16 @@ class BusTrace:
             return nan
         return lift_moment_nm(self._profile, position, float(np.mean(a)), float(np.mean(b)))
 
-    def test(self, which: Joint, side: int, kind: str, from_ns: int, to_ns: int) -> Record:
+    def test(self, which: Joint, side: int, kind: str, from_ns: int, to_ns: int) -> SpoolTestRecord:
         """The columns of one joint between two times."""
         grid = np.arange(0.0, (to_ns - from_ns) * _NS, GRID_S)
         times, commands = self.commands[which].between(from_ns, to_ns)
         # A command holds until the next one; a spool and a joint move between their samples.
-        fine = (np.arange(len(grid) * FINE) - FINE + 1) * (GRID_S / FINE)
+        fine = (np.arange(len(grid) * FINE_FACTOR) - FINE_FACTOR + 1) * (GRID_S / FINE_FACTOR)
         index = np.clip(np.searchsorted(times, fine, side="right") - 1, 0, None)
         held = commands[index] if len(commands) else np.zeros_like(fine)
         times, spools = self.spools[which].between(from_ns, to_ns)
         spool = np.interp(grid, times, spools) if len(spools) > 1 else None
         times, positions = self.positions[which].between(from_ns, to_ns)
         position = np.interp(grid, times, positions) if len(positions) else np.full_like(grid, np.nan)
-        return Record(which, side, kind, grid, held[FINE - 1 :: FINE], held, spool, position)
+        return SpoolTestRecord(which, side, kind, grid, held[FINE_FACTOR - 1 :: FINE_FACTOR], held, spool, position)

@@ -1,6 +1,6 @@
 """Dead-band and full speed of a rotator without an encoder, from how far known spool programs turned it.
 
-    turn = full * integral of ((play(spool) - dead-band) / (1 - half of the play - dead-band))^n      (machines.md 3)
+    turn = full * integral of ((play(spool) - dead-band) / (1 - half of the play - dead-band))^n      (docs/reference/machines.md section 3)
 
 A surveyor reads the grapple's direction at rest before and after every program.  Dead time and lag of the spool come at
 its opening and at its closing alike: they shift a turn and do not change it.  Play and exponent are the profile's, so
@@ -18,16 +18,16 @@ from typing import Final
 import numpy as np
 from scipy.optimize import least_squares
 
-from autonomy.calibration.program import SpoolProgram, deadband_pct, pulse
-from autonomy.calibration.trace import GRID_S, Record
-from autonomy.calibration.valve_fit import played
+from autonomy.calibration.spool_program import SpoolProgram, deadband_pct, pulse
+from autonomy.calibration.trace import GRID_S, SpoolTestRecord
+from autonomy.calibration.valve_fit import apply_backlash
 from machine.profile import JointSpec
 
-NOISE_RAD: Final = radians(1.0)
+YAW_SIGMA_RAD: Final = radians(1.0)
 """Of one reading of the direction, 1 sigma; several readings at one rest are averaged by the caller."""
-DEADBAND_SPREAD, FULL_SPREAD = 0.04, 0.4
+DEADBAND_SIGMA, FULL_SPEED_SIGMA = 0.04, 0.4
 """How far a valve is from its profile, share of the stroke and of the full speed: it leads where turns are few."""
-HOLD_S: Final = (0.2, 3.0)
+HOLD_BOUNDS_S: Final = (0.2, 3.0)
 """Bounds of how long a pulse holds: the controller ends a test of a joint without encoder after five seconds."""
 SIDES: Final = (1, -1)
 
@@ -38,7 +38,7 @@ class Turn:
     the slew; either is the mean of so many ``readings``.
     """
 
-    record: Record
+    record: SpoolTestRecord
     before_rad: float
     after_rad: float
     readings: int
@@ -88,41 +88,41 @@ def pulse_to(spec: JointSpec, fit: TurnFit, side: int, share: float, to_rad: flo
         program = pulse(spec, side, share, hold_s)
         times = np.arange(0.0, program.duration_s, GRID_S)
         spool = np.array([side * program.at(t) / 100.0 for t in times])
-        return known.full_speed * _seconds(played(spool, _half(spec)), spec, known.deadband)
+        return known.full_speed * _full_speed_seconds(apply_backlash(spool, _half_backlash(spec)), spec, known.deadband)
 
     shut, held = turn_rad(0.0), turn_rad(1.0)
     wanted = side * (to_rad - fit.stands_rad)
-    least, most = HOLD_S
+    least, most = HOLD_BOUNDS_S
     hold_s = (wanted - shut) / (held - shut) if held > shut else most
     return pulse(spec, side, share, min(max(hold_s, least), most))
 
 
-def _half(spec: JointSpec) -> float:
+def _half_backlash(spec: JointSpec) -> float:
     return spec.valve.hysteresis_pct / 200.0
 
 
-def _seconds(spool: np.ndarray, spec: JointSpec, deadband: float) -> float:
+def _full_speed_seconds(spool: np.ndarray, spec: JointSpec, deadband: float) -> float:
     """How long the full speed would take for the turn that a spool behind its play makes, on the grid of a record."""
-    opening = np.clip((spool - deadband) / (1.0 - _half(spec) - deadband), 0.0, 1.0)
+    opening = np.clip((spool - deadband) / (1.0 - _half_backlash(spec) - deadband), 0.0, 1.0)
     return float(np.sum(opening**spec.valve.exponent)) * GRID_S
 
 
 def _fit_side(turns: Sequence[Turn], spec: JointSpec, side: int) -> SideFit:
     deadband = deadband_pct(spec, side) / 100.0
     full = spec.valve.full_speed_plus if side > 0 else spec.valve.full_speed_minus
-    fit = SideFit(deadband, full, (DEADBAND_SPREAD, FULL_SPREAD * full))
+    fit = SideFit(deadband, full, (DEADBAND_SIGMA, FULL_SPEED_SIGMA * full))
     records = [t.record for t in turns]
-    spools = [played(side * (r.command if r.spool is None else r.spool), _half(spec)) for r in records]
-    noises = np.array([NOISE_RAD * sqrt(2.0 / t.readings) for t in turns])
+    spools = [apply_backlash(side * (r.command if r.spool is None else r.spool), _half_backlash(spec)) for r in records]
+    noises = np.array([YAW_SIGMA_RAD * sqrt(2.0 / t.readings) for t in turns])
     seen: list[float] = []
     for turn, spool in zip(turns, spools, strict=True):
-        expected = fit.full_speed * _seconds(spool, spec, fit.deadband)
+        expected = fit.full_speed * _full_speed_seconds(spool, spec, fit.deadband)
         seen.append(expected + remainder(side * (turn.after_rad - turn.before_rad) - expected, pi))
-        fit = _least_squares(spools[: len(seen)], seen, noises[: len(seen)], spec, (deadband, full))
+        fit = _solve_side(spools[: len(seen)], seen, noises[: len(seen)], spec, (deadband, full))
     return fit
 
 
-def _least_squares(
+def _solve_side(
     spools: Sequence[np.ndarray],
     seen: Sequence[float],
     noises: np.ndarray,
@@ -132,10 +132,10 @@ def _least_squares(
     deadband, full = known
 
     def left(p: np.ndarray) -> np.ndarray:
-        return np.array(seen) - [p[1] * full * _seconds(s, spec, p[0]) for s in spools]
+        return np.array(seen) - [p[1] * full * _full_speed_seconds(s, spec, p[0]) for s in spools]
 
     def residuals(p: np.ndarray) -> np.ndarray:
-        before = [(p[0] - deadband) / DEADBAND_SPREAD, (p[1] - 1.0) / FULL_SPREAD]
+        before = [(p[0] - deadband) / DEADBAND_SIGMA, (p[1] - 1.0) / FULL_SPEED_SIGMA]
         return np.concatenate([left(p) / noises, before])
 
     found = least_squares(residuals, (deadband, 1.0), bounds=((0.0, 0.1), (0.6, 5.0)), x_scale=(0.01, 0.1))

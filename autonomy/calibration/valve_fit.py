@@ -1,6 +1,6 @@
 """Dead-band, hysteresis, gain and metering curve of one valve function, from its sweeps and staircases.
 
-The model is the spool section as it is built (machines.md 3): the measured spool passes a play of the hysteresis'
+The model is the spool section as it is built (docs/reference/machines.md section 3): the measured spool passes a play of the hysteresis'
 width, a dead-band and a metering curve ``speed = full * opening^n``; a cylinder's lever makes the joint faster or
 slower along its way, and the oil between valve and joint is a spring that rings.  All tests of both sides are fitted
 together, on positions, so that no noisy derivative is ever taken.  Least squares with a soft loss; no randomness.
@@ -16,24 +16,24 @@ import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.signal import lfilter
 
-from autonomy.calibration.trace import GRID_S, Record
+from autonomy.calibration.trace import GRID_S, SpoolTestRecord
 from machine.joints import Joint
 from machine.profile import JointSpec
 
-EXPONENT, EXPONENT_SPREAD = 1.05, 0.05
+EXPONENT, EXPONENT_SIGMA = 1.05, 0.05
 """Metering edges of compensated spools are nearly straight; the data decide within this."""
-HYSTERESIS, HYSTERESIS_SPREAD = 0.02, 0.02
-LEVER_SPREAD: Final = 0.7
+HYSTERESIS, HYSTERESIS_SIGMA = 0.02, 0.02
+LEVER_SIGMA: Final = 0.7
 """Relative change of a joint's speed per rad along a cylinder's lever; a gear and a telescope have none."""
-RESOLUTION: Final = 0.004
+RESIDUAL_SCALE_S: Final = 0.004
 """Of the speed limit times one second: residuals far above it are down-weighted."""
-THINNED: Final = 2
+DECIMATION: Final = 2
 """The fit looks at every second sample."""
-_LEVERS: Final = (Joint.LIFT, Joint.TILT)
-_EVALUATIONS: Final = 60
-WEIGHT: Final = 10.0
+_LEVER_JOINTS: Final = (Joint.LIFT, Joint.TILT)
+_MAX_EVALUATIONS: Final = 60
+PRIOR_WEIGHT: Final = 10.0
 """Of what is known beforehand against the data: neighbouring residuals are alike, a hundred of them count as one."""
-_NAMES: Final = (
+_PARAMETER_NAMES: Final = (
     "deadband_plus", "deadband_minus", "hysteresis", "exponent", "full_plus", "full_minus", "lever", "ring_rad_s",
     "ring_zeta", "lag_plus_s", "lag_minus_s",
 )  # fmt: skip
@@ -62,7 +62,7 @@ class ValveFit:
     errors: dict[str, float]
 
 
-def played(spool: np.ndarray, half: float) -> np.ndarray:
+def apply_backlash(spool: np.ndarray, half: float) -> np.ndarray:
     """A spool that was neutral before, behind a play of twice ``half``."""
     out, at = [], 0.0
     for x in spool.tolist():
@@ -74,15 +74,15 @@ def played(spool: np.ndarray, half: float) -> np.ndarray:
     return np.array(out)
 
 
-class _Stretch:
+class _TestModel:
     """One test, ready for the model."""
 
-    def __init__(self, test: Record, reference: float) -> None:
+    def __init__(self, test: SpoolTestRecord, reference: float) -> None:
         self.side = test.side
         spool = test.command if test.spool is None else test.spool
-        self.spool = test.side * spool[::THINNED]
-        self.step_s = GRID_S * THINNED
-        self.position = test.position[::THINNED]
+        self.spool = test.side * spool[::DECIMATION]
+        self.step_s = GRID_S * DECIMATION
+        self.position = test.position[::DECIMATION]
         self.along = self.position - reference
         self.start = float(np.mean(self.position[:10]))
         self._played: dict[float, np.ndarray] = {}
@@ -92,11 +92,11 @@ class _Stretch:
         if half not in self._played:
             if len(self._played) > 3:
                 self._played.clear()
-            self._played[half] = played(self.spool, half)
+            self._played[half] = apply_backlash(self.spool, half)
         return self._played[half]
 
     def model(self, p: np.ndarray) -> np.ndarray:
-        """Positions for the parameters `_NAMES`."""
+        """Positions for the parameters `_PARAMETER_NAMES`."""
         first = 0 if self.side > 0 else 1
         deadband, full, lag_s = p[first], p[4 + first], p[9 + first]
         half = 0.5 * p[2]
@@ -104,11 +104,11 @@ class _Stretch:
         speed = self.side * full * (1.0 + p[6] * self.along) * opening ** p[3]
         way = np.cumsum(speed) * self.step_s
         time = np.arange(len(way)) * self.step_s
-        b, a = _ringing(p[7], p[8], self.step_s)
+        b, a = _second_order_lag(p[7], p[8], self.step_s)
         return self.start + lfilter(b, a, np.interp(time - lag_s, time, way))
 
 
-def _ringing(rad_s: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
+def _second_order_lag(rad_s: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
     """A second-order lag as a digital filter (bilinear)."""
     k = 2.0 / step_s
     first = k * k + 2.0 * zeta * rad_s * k + rad_s * rad_s
@@ -117,11 +117,11 @@ def _ringing(rad_s: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.n
     return b, a
 
 
-def fit_valve(tests: Sequence[Record], spec: JointSpec) -> ValveFit:
+def fit_valve(tests: Sequence[SpoolTestRecord], spec: JointSpec) -> ValveFit:
     """The valve of one joint from its tests (both sides, sweep and staircase each)."""
     joint = tests[0].joint
     at = float(np.mean([np.mean(t.position) for t in tests]))
-    stretches = [_Stretch(t, at) for t in tests]
+    stretches = [_TestModel(t, at) for t in tests]
     valve = spec.valve
     start = np.array(
         [
@@ -133,19 +133,19 @@ def fit_valve(tests: Sequence[Record], spec: JointSpec) -> ValveFit:
     low = np.array([0.005, 0.005, 0.0, 0.9, *(0.3 * full), -2.0, 2.0, 0.02, 0.0, 0.0])
     high = np.array([0.45, 0.45, 0.1, 1.6, *(3.0 * full), 2.0, 80.0, 3.0, 0.3, 0.3])
     scale = np.array([0.01, 0.01, 0.01, 0.1, *(0.1 * full), 0.3, 3.0, 0.2, 0.02, 0.02])
-    noise = RESOLUTION * spec.speed_limit
-    lever = LEVER_SPREAD if joint in _LEVERS else 1e-4
+    noise = RESIDUAL_SCALE_S * spec.speed_limit
+    lever = LEVER_SIGMA if joint in _LEVER_JOINTS else 1e-4
 
     def residuals(p: np.ndarray) -> np.ndarray:
         prior = [
-            (p[2] - HYSTERESIS) / HYSTERESIS_SPREAD, (p[3] - EXPONENT) / EXPONENT_SPREAD, p[6] / lever,
+            (p[2] - HYSTERESIS) / HYSTERESIS_SIGMA, (p[3] - EXPONENT) / EXPONENT_SIGMA, p[6] / lever,
         ]  # fmt: skip
-        return np.concatenate([*((s.position - s.model(p)) / noise for s in stretches), np.array(prior) * WEIGHT])
+        return np.concatenate([*((s.position - s.model(p)) / noise for s in stretches), np.array(prior) * PRIOR_WEIGHT])
 
-    found = least_squares(residuals, start, bounds=(low, high), x_scale=scale, loss="soft_l1", max_nfev=_EVALUATIONS)
+    found = least_squares(residuals, start, bounds=(low, high), x_scale=scale, loss="soft_l1", max_nfev=_MAX_EVALUATIONS)
     p = found.x
     modelled = tuple(
-        np.interp(t.time_s, t.time_s[::THINNED], s.model(p)) for t, s in zip(tests, stretches, strict=True)
+        np.interp(t.time_s, t.time_s[::DECIMATION], s.model(p)) for t, s in zip(tests, stretches, strict=True)
     )
     errors = np.concatenate([t.position - m for t, m in zip(tests, modelled, strict=True)])
     return ValveFit(
@@ -168,18 +168,18 @@ def _standard_errors(found: Any) -> dict[str, float]:
     try:
         covariance = np.linalg.inv(found.jac.T @ found.jac)
     except np.linalg.LinAlgError:
-        return dict.fromkeys(_NAMES, float("inf"))
-    scale = 2.0 * found.cost / len(found.fun) * WEIGHT**2
+        return dict.fromkeys(_PARAMETER_NAMES, float("inf"))
+    scale = 2.0 * found.cost / len(found.fun) * PRIOR_WEIGHT**2
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0) * scale)
-    return dict(zip(_NAMES, errors.tolist(), strict=True))
+    return dict(zip(_PARAMETER_NAMES, errors.tolist(), strict=True))
 
 
-def repeated(fit: ValveFit, test: Record) -> float:
+def deadband_difference(fit: ValveFit, test: SpoolTestRecord) -> float:
     """By how much the dead-band of another test of that side differs from the fit's [share of full]; NaN if unclear.
 
     The test is not one of those that were fitted.  Everything but the dead-band is taken from the fit.
     """
-    stretch = _Stretch(test, fit.at)
+    stretch = _TestModel(test, fit.at)
     first = 0 if test.side > 0 else 1
     p = np.array([*fit.deadbands, fit.hysteresis, fit.exponent, *fit.full_speeds, fit.lever, *fit.ringing, *fit.lags_s])
 

@@ -15,33 +15,35 @@ from math import isfinite
 from typing import Final
 
 from autonomy.crane_job.cycle import Cycle
-from autonomy.crane_job.grapple import Tongs
-from autonomy.crane_job.inbox import Heard
-from autonomy.crane_job.phase_conditions import at_goal, pace
-from autonomy.crane_job.phases import BEGIN_AGAIN, RULES, Phase, grapple
-from autonomy.crane_job.rotator import Rotator, hanging, is_counted, planned
-from autonomy.crane_job.trajectory_tracker import BRAKE_S, Pursuit
-from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, choose
-from autonomy.grasp.proposal import BunkFull, NoGrasp
+from autonomy.crane_job.grapple import GrappleSequence
+from autonomy.crane_job.inbox import Inbox
+from autonomy.crane_job.phase_conditions import is_motion_done, motion_rate
+from autonomy.crane_job.phases import RESUME_PHASE, PHASE_RULES, Phase, grapple_command
+from autonomy.crane_job.rotator_estimate import RotatorEstimate, rotator_angle_of_hanging_log, has_no_encoder, planning_profile
+from autonomy.crane_job.trajectory_tracker import BRAKE_S, TrajectoryTracker
+from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
+from autonomy.grasp.grasp import Grasp
+from autonomy.grasp.planner import BunkFull, GraspSelector, NoGrasp
+from autonomy.grasp.selection import select_direct
 from autonomy.missions.crane_job import Mission
-from autonomy.motion.arm import Pose
-from autonomy.motion.planners import Motions, Swiftest
+from autonomy.motion.motion_planner import MotionPlanner, TimeOptimalPlanner
+from autonomy.motion.pose import Pose
 from autonomy.motion.setpoint_stream import SetpointStream
-from autonomy.motion.trajectory import Trajectory, hold, turned
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import GrappleCommand, StateReport
+from autonomy.motion.trajectory import Trajectory, hold, with_rotation
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.joints import JOINTS, Joint
-from machine.kinematics import Unreachable
-from machine.modes import Mode
+from machine.geometry.kinematics import Unreachable
+from machine.status.modes import Mode
 from machine.profile import Profile
 
-SETTLED_NS: Final = 300_000_000
+SETTLE_AFTER_ARRIVAL_NS: Final = 300_000_000
 """A crane that has come to rest over logs looks at them so much later, ..."""
-PATIENCE_NS: Final = 1_500_000_000
+DETECTION_TIMEOUT_NS: Final = 1_500_000_000
 """... and without that look it goes on after so long."""
-_SLOWEST: Final = 2.0
-_LAST_HOLD_S: Final = 0.1
-_LONGEST_TICK_S: Final = 0.1
+_TIMEOUT_FACTOR: Final = 2.0
+_FINAL_HOLD_S: Final = 0.1
+_MAX_TICK_S: Final = 0.1
 
 
 class Activity:
@@ -63,12 +65,12 @@ class Activity:
         mission: Mission | None = None,
         lease_ns: int = 200_000_000,
         key: bytes | None = None,
-        chooser: Chooser = choose,
+        chooser: GraspSelector = select_direct,
         rests: tuple[float, ...] = (0.0,) * len(JOINTS),
-        motions: Motions | None = None,
+        motions: MotionPlanner | None = None,
         onward: Callable[[LogObservation], bool] | None = None,
         stows: bool = False,
-        rotator: Rotator | None = None,
+        rotator: RotatorEstimate | None = None,
     ) -> None:
         self.phase = Phase.WAIT
         self.paused: str | None = "the controller has not reported"
@@ -78,17 +80,17 @@ class Activity:
         """A person lets it stand: it stops smoothly on its way; a grip that has begun is ended first."""
         self.no_room = False
         """What was gripped has no room in the bunk."""
-        self.rotator = self._count = rotator or Rotator()
-        self._profile = planned(profile, self._count)
+        self.rotator = self._count = rotator or RotatorEstimate()
+        self._profile = planning_profile(profile, self._count)
         self._first = Phase.STOW if stows else Phase.LOOK
         self._onward = onward
-        motions = motions or Swiftest()
+        motions = motions or TimeOptimalPlanner()
         self._direct = motions.direct
         self._stream = SetpointStream(profile_hash, lease_ns, key)
-        self._heard = Heard(self._profile)
+        self._heard = Inbox(self._profile)
         self._cycle = Cycle(self._profile, mission or Mission(), motions, chooser, self._heard)
-        self._tongs = Tongs(self._profile, self._heard)
-        self._pursuit = Pursuit(profile, rests)
+        self._tongs = GrappleSequence(self._profile, self._heard)
+        self._pursuit = TrajectoryTracker(profile, rests)
         self._elapsed_s = 0.0
         self._arrived_ns: int | None = None
         self._ready_ns: int | None = None
@@ -153,7 +155,7 @@ class Activity:
         ``report`` and ``logs`` are the newest since the last call; None and () when nothing new came.  To be
         called at 20 Hz or faster.
         """
-        dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _LONGEST_TICK_S)
+        dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _MAX_TICK_S)
         self._last_ns = now_ns
         self._heard.take(now_ns, report, logs)
         if self.idle:
@@ -184,8 +186,8 @@ class Activity:
         follows = self._heard.report.mode == Mode.ACTIVE and all(map(isfinite, self._heard.report.reference))
         start = self._count.believed(self._heard.report.reference) if follows else measured
         phase = self._first if self.phase is Phase.WAIT else self.phase
-        if phase in BEGIN_AGAIN and self._cycle.is_aside(phase, measured):
-            phase = BEGIN_AGAIN[phase]
+        if phase in RESUME_PHASE and self._cycle.is_aside(phase, measured):
+            phase = RESUME_PHASE[phase]
         self._enter(phase, start)
         self._pursuit.rate = 0.0
 
@@ -219,13 +221,13 @@ class Activity:
         way = self._pursuit
         self._elapsed_s += 0.0 if self._held else dt_s
         stops = self._held or self.phase is Phase.FAILED or self._anew is not None
-        wanted = 0.0 if stops else pace(self.phase, self._elapsed_s, way, self._tongs, self.grasp)
+        wanted = 0.0 if stops else motion_rate(self.phase, self._elapsed_s, way, self._tongs, self.grasp)
         way.advance(dt_s, wanted, self._position())
         if self.phase is Phase.FAILED and way.stands:
             way.stand()
 
     def _tell_tongs(self, dt_s: float) -> None:
-        command = grapple(self.phase, self._cycle.gathered, stows=self._first is Phase.STOW)
+        command = grapple_command(self.phase, self._cycle.gathered, stows=self._first is Phase.STOW)
         if command is GrappleCommand.OPEN and self.phase is not Phase.OPEN:
             command = GrappleCommand.NEUTRAL if self._cycle.is_among_stakes(self._position()) else command
         if self.phase is Phase.OPEN:
@@ -237,10 +239,10 @@ class Activity:
     def _proceed(self, now_ns: int) -> None:
         """Ends the phase when its work is done, or the mission when its time is over."""
         if self.phase is Phase.FAILED:
-            self.idle = self._elapsed_s > BRAKE_S + _LAST_HOLD_S
+            self.idle = self._elapsed_s > BRAKE_S + _FINAL_HOLD_S
             return
         if self.phase is Phase.DONE:
-            self.idle = self._elapsed_s > _LAST_HOLD_S
+            self.idle = self._elapsed_s > _FINAL_HOLD_S
             return
         if self._held:
             return
@@ -248,8 +250,8 @@ class Activity:
             if self._pursuit.stands:
                 self._enter(self._anew, self._pursuit.sent)
             return
-        rule = RULES[self.phase]
-        if self._arrived_ns is None and at_goal(
+        rule = PHASE_RULES[self.phase]
+        if self._arrived_ns is None and is_motion_done(
             self.phase, self._elapsed_s, self._pursuit, self._tongs, self.grasp, self._position()
         ):
             self._arrived_ns = now_ns
@@ -268,7 +270,7 @@ class Activity:
             self._see_rotator()
         if following is not None:
             self._enter(following, self._pursuit.sent)
-        elif self._elapsed_s > _SLOWEST * self.motion.duration_s + rule.settle_s + rule.slack_s:
+        elif self._elapsed_s > _TIMEOUT_FACTOR * self.motion.duration_s + rule.settle_s + rule.slack_s:
             off = self._pursuit.worst_joint(self._position())
             self._fail(f"{rule.trouble} within {self._elapsed_s:.0f} s{off}")
 
@@ -297,13 +299,13 @@ class Activity:
     def _after_look(self, now_ns: int) -> Phase | None:
         """Over a grasp.  What a camera measures is looked at for a while before there is said to be none."""
         first_ns = self._ready_ns
-        if first_ns is not None and self._heard.logs_ns < now_ns <= first_ns + PATIENCE_NS:
+        if first_ns is not None and self._heard.logs_ns < now_ns <= first_ns + DETECTION_TIMEOUT_NS:
             return None  # nothing new is known
         try:
             self._cycle.choose(self.motion.goal)
         except NoGrasp as error:
             self._ready_ns = first_ns or now_ns
-            if now_ns > self._ready_ns + PATIENCE_NS or not self._heard.measured:
+            if now_ns > self._ready_ns + DETECTION_TIMEOUT_NS or not self._heard.measured:
                 self._fail(str(error))
             return None
         return Phase.ABOVE
@@ -313,8 +315,8 @@ class Activity:
         assert self._arrived_ns is not None
         if not self._cycle.unsure:
             return Phase.DESCEND
-        if self._heard.logs_ns < self._arrived_ns + SETTLED_NS:
-            return None if now_ns < self._arrived_ns + PATIENCE_NS else Phase.DESCEND
+        if self._heard.logs_ns < self._arrived_ns + SETTLE_AFTER_ARRIVAL_NS:
+            return None if now_ns < self._arrived_ns + DETECTION_TIMEOUT_NS else Phase.DESCEND
         return Phase.ABOVE if self._cycle.choose_better(self.motion.goal) else Phase.DESCEND
 
     def _after_lift(self) -> Phase | None:
@@ -355,7 +357,7 @@ class Activity:
         """
         if self._ready_ns is None:
             risen_m = self._cycle.risen_m(self._position())
-            if self.phase is Phase.CARRY or risen_m > LIFT_M or self._arrived_ns is not None:
+            if self.phase is Phase.CARRY or risen_m > VERIFY_LIFT_M or self._arrived_ns is not None:
                 self._ready_ns = now_ns
             return
         if self._heard.logs_ns <= self._ready_ns:
@@ -372,7 +374,7 @@ class Activity:
                 return
             self.phase = Phase.CARRY
             if turn:
-                self._pursuit.motion = turned(self.motion, self._pursuit.clock_s, turn)
+                self._pursuit.motion = with_rotation(self.motion, self._pursuit.clock_s, turn)
 
     def _carried(self, now_ns: int) -> bool:
         """Whether the log was seen in the grapple a moment ago."""
@@ -381,7 +383,7 @@ class Activity:
     def _see_rotator(self) -> None:
         """What hangs in the tongs tells how the rotator stands: the next job is to know."""
         seen = self._cycle.first()
-        if seen is not None and is_counted(self._profile):
+        if seen is not None and has_no_encoder(self._profile):
             q = self._position()
-            stands = hanging(self._profile, seen, q[Joint.SLEW])
+            stands = rotator_angle_of_hanging_log(self._profile, seen, q[Joint.SLEW])
             self.rotator = self.rotator.seen(self._count.sent(q[Joint.ROT]), stands)

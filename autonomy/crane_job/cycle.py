@@ -12,40 +12,43 @@ from typing import Final
 
 import msgspec
 
-from autonomy.crane_job.grapple import Tongs, among_stakes, lifts_nothing
-from autonomy.crane_job.grasp_recovery import Regrip, measured
-from autonomy.crane_job.grasp_verification import ASIDE_M, came_up, laid, picked, place_as_seen
-from autonomy.crane_job.inbox import Heard
-from autonomy.crane_job.phase_motions import above, aimed, carrying, closing, dragging, gathering, stowing
+from autonomy.crane_job.grapple import GrappleSequence, is_between_stakes, lifts_nothing
+from autonomy.crane_job.grasp_recovery import GraspRecovery, is_camera_measured
+from autonomy.crane_job.grasp_verification import COLUMN_RADIUS_M, lifted_part, is_at_target, visible_grasped_logs, corrected_place
+from autonomy.crane_job.inbox import Inbox
+from autonomy.crane_job.phase_motions import approach_motion, corrected_grasp, carry_motion, closing_motion, extraction_motion, bundle_lift_motion, stow_motion
 from autonomy.crane_job.phases import Phase
-from autonomy.crane_job.rotator import is_counted
-from autonomy.grasp.direct import LIFT_M, Chooser, Grasp, lies_in, plan_place, retreat_height
-from autonomy.grasp.proposal import NoGrasp
+from autonomy.crane_job.rotator_estimate import has_no_encoder
+from autonomy.grasp.grapple_heights import VERIFY_LIFT_M, retreat_height_m
+from autonomy.grasp.grasp import Grasp
+from autonomy.grasp.placement import lies_in_bunk, plan_place
+from autonomy.grasp.planner import GraspSelector, NoGrasp
 from autonomy.missions.crane_job import Mission
-from autonomy.motion.arm import Arm, Pose
-from autonomy.motion.planners import Motions
+from autonomy.motion.arm import Arm
+from autonomy.motion.motion_planner import MotionPlanner
+from autonomy.motion.pose import Pose
 from autonomy.motion.setpoint_stream import Axes
-from autonomy.motion.trajectory import Trajectory, brisk, hold, straight
-from autonomy.perception.logs import LogObservation
-from machine.grapple import grapple_yaw
+from autonomy.motion.trajectory import Trajectory, with_quick_rotation, hold, straight_line
+from autonomy.perception.log_list.observation import LogObservation
+from machine.geometry.grapple import grapple_yaw
 from machine.joints import Joint
 from machine.profile import Profile
-from machine.sag import sane_load_kg
+from machine.geometry.sag import sane_load_kg
 
-ATTEMPTS: Final = 3
-LOOKS: Final = 2
+MAX_ATTEMPTS: Final = 3
+MAX_RESELECTIONS: Final = 2
 """So often a grasp is chosen again from over it."""
-WEIGHS_M: Final = 0.2
+WEIGHABLE_RISE_M: Final = 0.2
 """What is gripped weighs in tongs that have risen so far, half of it at least."""
-WEDGE_M: Final = 0.1
+EXTRACTION_DEPTH_M: Final = 0.1
 """Open tongs that draw a log are pressed in beside it so much lower than others begin to close: those sweep down from
 0.15 m over the ground or more, and would slide over the log before they are beside its middle."""
-_SAME_M, _SAME_RAD = 0.02, 0.03
+_SAME_GRASP_M, _SAME_GRASP_RAD = 0.02, 0.03
 """Grasps that differ by less are gone down to from the same place."""
-_LOOSE_M: Final = 0.2
+_BUNDLE_RELEASE_HEIGHT_M: Final = 0.2
 """So far over where it was gripped a bundle is let go again: pressed onto others, it would stop the crane."""
 
-_THERE_M, _THERE_RAD = 0.03, 0.03
+_AT_PLACE_M, _AT_PLACE_RAD = 0.03, 0.03
 """A crane so near to where it lets a log go need not go nearer."""
 
 
@@ -55,19 +58,19 @@ class Cycle:
     planned for it.
     """
 
-    def __init__(self, profile: Profile, mission: Mission, motions: Motions, chooser: Chooser, heard: Heard) -> None:
+    def __init__(self, profile: Profile, mission: Mission, motions: MotionPlanner, chooser: GraspSelector, heard: Inbox) -> None:
         self.grasp: Grasp | None = None
         self.place: Pose | None = None
         self.lifted_kg = 0.0
         self.missed = 0
         self._profile, self._mission, self._motions, self._choose = profile, mission, motions, chooser
         self._target = mission.to(profile.bunk)
-        self._brisk = is_counted(profile) and motions.direct
+        self._brisk = has_no_encoder(profile) and motions.direct
         self._heard = heard
         self._arm = Arm(profile, stretches=motions.stretches)
         """With what hangs in the grapple in the present phase."""
         self._begun_z_m = 0.0
-        self._looks, self._regrip = 0, Regrip()
+        self._looks, self._regrip = 0, GraspRecovery()
         self._before: Grasp | None = None
 
     @property
@@ -77,7 +80,7 @@ class Cycle:
 
     def choose(self, q: Axes) -> None:
         """A grasp among the logs of the newest list, from where the crane stands; raises ``NoGrasp``."""
-        self._regrip = Regrip()
+        self._regrip = GraspRecovery()
         self._choose_now(q)
 
     def _choose_now(self, q: Axes) -> None:
@@ -89,7 +92,7 @@ class Cycle:
     @property
     def unsure(self) -> bool:
         """Whether the grasp is worth another look from above: of logs among others that a camera has measured."""
-        return self.grasp is not None and self.gathered and measured(self.grasp) and self._looks < LOOKS
+        return self.grasp is not None and self.gathered and is_camera_measured(self.grasp) and self._looks < MAX_RESELECTIONS
 
     def choose_better(self, q: Axes) -> bool:
         """Choose again by what is seen from over the grasp; whether the crane has to go over another place for it."""
@@ -105,16 +108,16 @@ class Cycle:
         assert self.grasp is not None
         self._before, after = before, self.grasp.pose
         apart_m = dist((*self._arm.xy(before.pose), before.pose.z_m), (*self._arm.xy(after), after.z_m))
-        return apart_m > _SAME_M or abs(before.pose.rot_rad - after.rot_rad) > _SAME_RAD
+        return apart_m > _SAME_GRASP_M or abs(before.pose.rot_rad - after.rot_rad) > _SAME_GRASP_RAD
 
     def take_former(self) -> bool:
         """Go back to the grasp before the last look, over which the crane stands; whether there is one."""
         if self._before is None:
             return False
-        self.grasp, self._before, self._looks = self._before, None, LOOKS
+        self.grasp, self._before, self._looks = self._before, None, MAX_RESELECTIONS
         return True
 
-    def after_closing(self, tongs: Tongs) -> Phase | None:
+    def after_closing(self, tongs: GrappleSequence) -> Phase | None:
         """The phase that follows, None while the tongs still move."""
         assert self.grasp is not None
         following, self.grasp = self._regrip.after_closing(self.grasp, tongs)
@@ -122,10 +125,10 @@ class Cycle:
             self._look_again()
         return following
 
-    def slid_off(self, tongs: Tongs, q: Axes) -> bool:
+    def slid_off(self, tongs: GrappleSequence, q: Axes) -> bool:
         """Whether tongs that begin to rise are seen to hold nothing: the grasp is to be begun anew, from above."""
         assert self.grasp is not None
-        anew = self._regrip.after_rising(self.grasp, tongs) if WEIGHS_M < self.risen_m(q) < LIFT_M else None
+        anew = self._regrip.after_rising(self.grasp, tongs) if WEIGHABLE_RISE_M < self.risen_m(q) < VERIFY_LIFT_M else None
         if anew is None:
             return False
         self.grasp = anew
@@ -133,7 +136,7 @@ class Cycle:
         return True
 
     def _look_again(self) -> None:
-        self._looks = min(self._looks, LOOKS - 1)  # the tongs have stirred the logs
+        self._looks = min(self._looks, MAX_RESELECTIONS - 1)  # the tongs have stirred the logs
 
     def plan(self, phase: Phase, q: Axes, closing_s: float = 0.0) -> Trajectory:
         """The motion of a phase that begins at ``q``, with the grasp and the place as they are now seen to be best.
@@ -145,39 +148,39 @@ class Cycle:
         self._begun_z_m = self._arm.pose(q).z_m
         self._arm = self._arm.loaded(self._hanging_kg(phase))
         motion = self._planned(phase, q, closing_s)
-        return brisk(self._arm, motion) if self._brisk else motion
+        return with_quick_rotation(self._arm, motion) if self._brisk else motion
 
     def _planned(self, phase: Phase, q: Axes, closing_s: float) -> Trajectory:
         arm = self._arm
         grasp, start, logs = self.grasp, arm.pose(q), self._heard.logs
         if phase is Phase.STOW:
-            return stowing(arm, self._motions, start, logs)
+            return stow_motion(arm, self._motions, start, logs)
         if phase in (Phase.LOOK, Phase.OPEN, Phase.DONE, Phase.FAILED) or grasp is None:
             return hold(q)
         match phase:
             case Phase.ABOVE:
-                return above(arm, self._motions, start, grasp, logs)
+                return approach_motion(arm, self._motions, start, grasp, logs)
             case Phase.DESCEND:
-                self.grasp = grasp = aimed(arm, grasp, logs)
-                deeper_m = WEDGE_M if grasp.drawn else 0.0
-                return straight(arm, start, grasp.pose.at_height(grasp.pose.z_m - deeper_m))
+                self.grasp = grasp = corrected_grasp(arm, grasp, logs)
+                deeper_m = EXTRACTION_DEPTH_M if grasp.drawn else 0.0
+                return straight_line(arm, start, grasp.pose.at_height(grasp.pose.z_m - deeper_m))
             case Phase.CLOSE:
-                return dragging(arm, start, grasp) if grasp.drags else closing(arm, start, grasp, closing_s)
+                return extraction_motion(arm, start, grasp) if grasp.drags else closing_motion(arm, start, grasp, closing_s)
             case Phase.LIFT:
                 if grasp.gathered:
-                    return gathering(arm, start, grasp)
+                    return bundle_lift_motion(arm, start, grasp)
                 if not self._motions.direct:
-                    return straight(arm, start, grasp.pose.at_height(grasp.pose.z_m + LIFT_M))
+                    return straight_line(arm, start, grasp.pose.at_height(grasp.pose.z_m + VERIFY_LIFT_M))
                 self.place = plan_place(arm, self._mission, grasp, logs)
-                return carrying(arm, self._motions, start, self.place, grasp, logs, hangs=False)
+                return carry_motion(arm, self._motions, start, self.place, grasp, logs, hangs=False)
             case Phase.CARRY:
                 self.lifted_kg = arm.load_kg
                 self.place = plan_place(arm, self._mission, grasp, logs, grapple_yaw(self._profile, q))
-                return carrying(arm, self._motions, start, self.place, grasp, logs, hangs=True)
+                return carry_motion(arm, self._motions, start, self.place, grasp, logs, hangs=True)
         assert self.place is not None
         if phase is Phase.LOWER:
-            return hold(q) if self._is_there(start, self.place) else straight(arm, start, self.place)
-        return straight(arm, start, start.at_height(max(start.z_m, retreat_height(self._profile))))
+            return hold(q) if self._is_there(start, self.place) else straight_line(arm, start, self.place)
+        return straight_line(arm, start, start.at_height(max(start.z_m, retreat_height_m(self._profile))))
 
     def _hanging_kg(self, phase: Phase) -> float:
         """What the crane carries in a phase: a log that it has lifted bends it, and nothing else does."""
@@ -189,17 +192,17 @@ class Cycle:
         assert self.grasp is not None
         column = self.grasp.pose if phase < Phase.CARRY else self.place
         assert column is not None
-        return self._off_m(q, column) > ASIDE_M
+        return self._off_m(q, column) > COLUMN_RADIUS_M
 
     def is_over_the_grasp(self, q: Axes) -> bool:
         """Whether what hangs in the grapple would come down where it was gripped."""
         assert self.grasp is not None
-        return self._off_m(q, self.grasp.pose) < ASIDE_M
+        return self._off_m(q, self.grasp.pose) < COLUMN_RADIUS_M
 
     def _is_there(self, start: Pose, place: Pose) -> bool:
         """Whether a log that is let go here is as well laid as at its place."""
         apart_m = dist((*self._arm.xy(start), start.z_m), (*self._arm.xy(place), place.z_m))
-        return apart_m < _THERE_M and abs(start.rot_rad - place.rot_rad) < _THERE_RAD
+        return apart_m < _AT_PLACE_M and abs(start.rot_rad - place.rot_rad) < _AT_PLACE_RAD
 
     def _off_m(self, q: Axes, column: Pose) -> float:
         return dist(self._arm.xy(self._arm.pose(q)), self._arm.xy(column))
@@ -210,7 +213,7 @@ class Cycle:
 
     def is_among_stakes(self, q: Axes) -> bool:
         """Whether tongs that open farther would stir what lies where the logs go."""
-        return among_stakes(self._arm, self._target, q)
+        return is_between_stakes(self._arm, self._target, q)
 
     # ------------------------------------------------------------------ what the newest list says
     def first(self) -> LogObservation | None:
@@ -228,7 +231,7 @@ class Cycle:
         nothing or in which something weighs; the grasp is of that now."""
         assert self.grasp is not None
         seen = self._picked()
-        held = came_up(self._arm, self.grasp, seen, [self._arm.pose(q) for q in positions])
+        held = lifted_part(self._arm, self.grasp, seen, [self._arm.pose(q) for q in positions])
         self.grasp = held or self.grasp
         return held is not None or (not seen and not lifts_nothing(self._heard.report))
 
@@ -236,18 +239,18 @@ class Cycle:
         """Count a grasp that did; why there is to be no other, or empty."""
         assert self.grasp is not None
         seen = self._picked()
-        lost = next((log for log in seen if lies_in(self._target, log)), None)
+        lost = next((log for log in seen if lies_in_bunk(self._target, log)), None)
         if lost is not None:
             return f"log {lost.id} fell from the grapple into the bunk"
         self.missed += 1
-        return "" if self.missed < ATTEMPTS else f"log {(seen or self.grasp.logs)[0].id} was missed {ATTEMPTS} times"
+        return "" if self.missed < MAX_ATTEMPTS else f"log {(seen or self.grasp.logs)[0].id} was missed {MAX_ATTEMPTS} times"
 
     def turn_on_the_way(self, q: Axes) -> float | None:
         """How much farther the rotator is to turn [rad] on a way that is driven already, for what is now seen to hang;
         None when it asks for another way.
         """
         assert self.grasp is not None and self.place is not None
-        place = place_as_seen(self._arm, self._mission, self.grasp, self.place, self._heard.logs, q)
+        place = corrected_place(self._arm, self._mission, self.grasp, self.place, self._heard.logs, q)
         if place is None:
             return None
         turn = place.rot_rad - self.place.rot_rad
@@ -257,12 +260,12 @@ class Cycle:
     def put_back(self) -> None:
         """There is no way on with what is gripped: its place is where it lay."""
         assert self.grasp is not None
-        above_m = _LOOSE_M if self.grasp.gathered else 0.0  # what lay under a bundle has settled, and hangs lower now
+        above_m = _BUNDLE_RELEASE_HEIGHT_M if self.grasp.gathered else 0.0  # what lay under a bundle has settled, and hangs lower now
         self.place = self.grasp.pose.at_height(self.grasp.pose.z_m + above_m)
 
     def astray(self) -> str:
         """Why what was let go does not lie where it was to be; empty when it does."""
-        log = next((log for log in self._picked() if not laid(self._mission, self._target, log)), None)
+        log = next((log for log in self._picked() if not is_at_target(self._mission, self._target, log)), None)
         if log is None:
             return ""
         x, y, z = log.center_m
@@ -270,4 +273,4 @@ class Cycle:
 
     def _picked(self) -> list[LogObservation]:
         assert self.grasp is not None
-        return picked(self.grasp, self._heard.logs)
+        return visible_grasped_logs(self.grasp, self._heard.logs)

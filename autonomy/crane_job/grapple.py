@@ -9,12 +9,13 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Final
 
-from autonomy.crane_job.inbox import Heard
-from autonomy.grasp.direct import Grasp, opened_angle
-from autonomy.grasp.heap import is_over
+from autonomy.crane_job.inbox import Inbox
+from autonomy.grasp.bunk_load import is_over_bunk
+from autonomy.grasp.grapple_heights import release_angle_rad
+from autonomy.grasp.grasp import Grasp
 from autonomy.motion.arm import Arm
-from can_dbc.setpoint import GrappleCommand, StateReport
-from machine.grapple import (
+from can_dbc.messages.crane import GrappleCommand, StateReport
+from machine.geometry.grapple import (
     half_gap_m,
     opening_pct_from_tong_angle,
     tip_below_pin_m,
@@ -22,85 +23,85 @@ from machine.grapple import (
 )
 from machine.profile import Bunk, Profile
 
-_SHUT, _HOLDING = 4, 5
+_STATE_CLOSED_EMPTY, _STATE_HOLDING = 4, 5
 """Of GrappleStat.State: at the end of its way with nothing in it, and stopped by what it holds."""
-_OPEN_PCT: Final = 92.0
-_GRIPPED_RAD: Final = 1.5
+_OPEN_FROM_PCT: Final = 92.0
+_ASSUMED_GRIP_RAD: Final = 1.5
 """Tongs without a sensor are taken to have been closed as far when they let go of a log: past tips that meet."""
-_WIDE_PCT, _CLIMB_PCT, _WIDER_M = 70.0, 3.0, 0.15
+_STALLED_WIDE_PCT, _STALLED_WIDE_STEP_PCT, _STALLED_EXCESS_M = 70.0, 3.0, 0.15
 """Tongs that stop closing so wide open, or so much wider than the wood they are to hold lies side by side, clasp a
 heap's sides: their tips are not under it."""
-_HELD_M: Final = 0.2
+_THICK_LOG_M: Final = 0.2
 """Thinner logs are held in tongs that have shut."""
-_NOTHING_KG: Final = 8.0
+_EMPTY_ON_GROUND_KG: Final = 8.0
 """Less than the thinnest log weighs, half of it lying on others."""
-_HUNG_KG: Final = 12.0
+_EMPTY_LIFTED_KG: Final = 12.0
 """Less than the thinnest log weighs that hangs, more than a crane at rest reads for nothing.  The controller says that
 tongs hold something from 30 kg on: thin logs weigh less and vanish in tongs that have shut."""
-_EMPTY_KG: Final = 30.0
+_RELEASED_KG: Final = 30.0
 """What hangs in the tongs when they have let go, at most."""
-_PUSH_KG, _PUSH = 250.0, 1.5
+_PUSH_LOAD_KG, _PUSH_FACTOR = 250.0, 1.5
 """Tongs that bear more after that, and so many times what hung in them, push against logs or stakes and lift the crane;
 what only rebounds bears less."""
-_UNDER: Final = 0.85
+_UNDER_LOG_SHARE: Final = 0.85
 """The tips are under a log when they are nearer to each other than so much of its diameter."""
-_STILL_PCT, _STILL_S = 0.5, 0.8
+_STILL_BAND_PCT, _STILL_S = 0.5, 0.8
 """Tongs stand that move by less in this time; logs that give way are pressed together slowly."""
-_LEAST_S: Final = 0.5
+_MIN_CLOSING_S: Final = 0.5
 """Of closing, before the report can be of it."""
-_VALVE_S: Final = 0.4
-_SLOW_TONGS: Final = 1.3
+_VALVE_DELAY_S: Final = 0.4
+_SLOW_OPENING_FACTOR: Final = 1.3
 """Before they move, and how much slower they may be than the profile says."""
 _CLOSE_GAIN_1_S: Final = 2.0
-_CLOSE_FASTEST: Final = 1.3
+_MAX_CLOSE_RATE: Final = 1.3
 
 
-def pace(ahead_s: float) -> float:
+def following_rate(ahead_s: float) -> float:
     """How fast the pin follows the sweep of closing tongs that are so far ahead of it; NaN: at its own pace."""
-    return min(max(1.0 + _CLOSE_GAIN_1_S * ahead_s, 0.0), _CLOSE_FASTEST) if isfinite(ahead_s) else 1.0
+    return min(max(1.0 + _CLOSE_GAIN_1_S * ahead_s, 0.0), _MAX_CLOSE_RATE) if isfinite(ahead_s) else 1.0
 
 
-def gripped(report: StateReport, closing_s: float) -> bool:
+def has_closed(report: StateReport, closing_s: float) -> bool:
     """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""
-    return closing_s > _LEAST_S and report.grapple_state in (_SHUT, _HOLDING)
+    return closing_s > _MIN_CLOSING_S and report.grapple_state in (_STATE_CLOSED_EMPTY, _STATE_HOLDING)
 
 
-def is_empty(report: StateReport) -> bool:
+def is_closed_empty(report: StateReport) -> bool:
     """Whether they shut on nothing, and nothing weighs in them."""
-    return report.grapple_state == _SHUT
+    return report.grapple_state == _STATE_CLOSED_EMPTY
 
 
 def lifts_nothing(report: StateReport) -> bool:
     """Whether they shut and came up with nothing that is known to weigh."""
-    return is_empty(report) and not report.load_kg >= _HUNG_KG
+    return is_closed_empty(report) and not report.load_kg >= _EMPTY_LIFTED_KG
 
 
-def opened(profile: Profile, report: StateReport, opening_s: float) -> bool:
+def is_open(profile: Profile, report: StateReport, opening_s: float) -> bool:
     """Whether they stand open."""
     if isfinite(report.opening_pct):
-        return report.opening_pct >= _OPEN_PCT
+        return report.opening_pct >= _OPEN_FROM_PCT
     return opening_s > profile.grapple.open_time_s
 
 
-def released(profile: Profile, report: StateReport, grasp: Grasp, opening_s: float) -> bool:
+def has_released(profile: Profile, report: StateReport, grasp: Grasp, opening_s: float) -> bool:
     """Whether they have left the logs that they held."""
     grapple = profile.grapple
-    angle = opened_angle(profile, max(log.diameter_m for log in grasp.logs))
+    angle = release_angle_rad(profile, max(log.diameter_m for log in grasp.logs))
     if grasp.others:
         angle = 0.0  # logs beside each other reach farther out
     if isfinite(report.opening_pct):
-        return report.opening_pct >= min(opening_pct_from_tong_angle(grapple.tongs, angle), _OPEN_PCT)
-    turned = max(_GRIPPED_RAD - angle, 0.0) / grapple.tongs.angle_rad[-1]
-    return opening_s > _VALVE_S + _SLOW_TONGS * turned * grapple.open_time_s
+        return report.opening_pct >= min(opening_pct_from_tong_angle(grapple.tongs, angle), _OPEN_FROM_PCT)
+    turned = max(_ASSUMED_GRIP_RAD - angle, 0.0) / grapple.tongs.angle_rad[-1]
+    return opening_s > _VALVE_DELAY_S + _SLOW_OPENING_FACTOR * turned * grapple.open_time_s
 
 
-def among_stakes(arm: Arm, bunk: Bunk, q: Sequence[float]) -> bool:
+def is_between_stakes(arm: Arm, bunk: Bunk, q: Sequence[float]) -> bool:
     """Whether tongs that have let a log go stand so low over a bunk that to open further would stir the heap."""
     pose, top_m = arm.pose(q), bunk.floor_z_m + bunk.stake_height_m
-    return is_over(bunk, *arm.xy(pose)) and pose.z_m < top_m + tip_below_pin_m(arm.profile.grapple.tongs, 0.0)
+    return is_over_bunk(bunk, *arm.xy(pose)) and pose.z_m < top_m + tip_below_pin_m(arm.profile.grapple.tongs, 0.0)
 
 
-def closed_for_s(profile: Profile, report: StateReport) -> float:
+def equivalent_closing_s(profile: Profile, report: StateReport) -> float:
     """How long tongs of the nominal speed have been closing to be where they are measured; NaN if unknown."""
     opening = report.opening_pct
     if not isfinite(opening):
@@ -109,10 +110,10 @@ def closed_for_s(profile: Profile, report: StateReport) -> float:
     return tong_angle_from_opening_pct(tongs, opening) / tongs.angle_rad[-1] * profile.grapple.close_time_s
 
 
-class Tongs:
+class GrappleSequence:
     """Those of one job.  ``command`` is what they are told now."""
 
-    def __init__(self, profile: Profile, heard: Heard) -> None:
+    def __init__(self, profile: Profile, heard: Inbox) -> None:
         self.command = GrappleCommand.HOLD
         self._profile, self._heard = profile, heard
         self._opening_s = self._close_from_s = self._still_s = self._calm_s = 0.0
@@ -131,7 +132,7 @@ class Tongs:
         self.command = command
         opening = self._heard.report.opening_pct if self._heard.report is not None else 0.0
         self._still_s += dt_s
-        if abs(opening - self._stood_pct) > _STILL_PCT:
+        if abs(opening - self._stood_pct) > _STILL_BAND_PCT:
             self._stood_pct, self._still_s = opening, 0.0
         if gives_way or command in (GrappleCommand.OPEN, GrappleCommand.NEUTRAL):
             self._feel(dt_s)
@@ -143,7 +144,7 @@ class Tongs:
             self._opening_s = 0.0
 
     def _feel(self, dt_s: float) -> None:
-        self._let_go |= self._load_kg < _EMPTY_KG
+        self._let_go |= self._load_kg < _RELEASED_KG
         self.pushed |= self._let_go and self._pushes
         self._calm_s = 0.0 if self._pushes else self._calm_s + dt_s
 
@@ -153,33 +154,33 @@ class Tongs:
 
     @property
     def _pushes(self) -> bool:
-        return self._load_kg > max(_PUSH_KG, _PUSH * self._held_kg)
+        return self._load_kg > max(_PUSH_LOAD_KG, _PUSH_FACTOR * self._held_kg)
 
     @property
     def open(self) -> bool:
         """Whether they stand open."""
-        return opened(self._profile, self._heard.report, self._opening_s)
+        return is_open(self._profile, self._heard.report, self._opening_s)
 
     def are_wide(self, grasp: Grasp, climbs: int) -> bool:
         """Whether they are seen to stand too wide open to lift what they hold, gripped higher so often already, where
         there is less; without a sensor nobody knows.
         """
         wood_m = sum(log.diameter_m for log in grasp.logs)
-        too_open = self._heard.report.opening_pct > _WIDE_PCT - _CLIMB_PCT * climbs
-        return too_open or self._gap_m() > wood_m + _WIDER_M
+        too_open = self._heard.report.opening_pct > _STALLED_WIDE_PCT - _STALLED_WIDE_STEP_PCT * climbs
+        return too_open or self._gap_m() > wood_m + _STALLED_EXCESS_M
 
     def have_missed(self, grasp: Grasp) -> bool:
         """Whether they are seen to have shut on nothing where thick logs were, or to pinch the upper half of a log that
         they were to be under; without a sensor nobody knows.
         """
-        if is_empty(self._heard.report):
-            return grasp.thinnest_m > _HELD_M
-        return grasp.drawn and self._gap_m() > _UNDER * grasp.thinnest_m
+        if is_closed_empty(self._heard.report):
+            return grasp.thinnest_m > _THICK_LOG_M
+        return grasp.drawn and self._gap_m() > _UNDER_LOG_SHARE * grasp.thinnest_m
 
     @property
     def hold_nothing(self) -> bool:
         """Whether they are seen to have shut, and nothing weighs in them; without a load cell nobody knows."""
-        return is_empty(self._heard.report) and self._heard.report.load_kg < _NOTHING_KG
+        return is_closed_empty(self._heard.report) and self._heard.report.load_kg < _EMPTY_ON_GROUND_KG
 
     def _gap_m(self) -> float:
         """Between the tips; 0 when no sensor tells."""
@@ -189,7 +190,7 @@ class Tongs:
     @property
     def empty(self) -> bool:
         """Whether they have shut on nothing that is seen."""
-        return is_empty(self._heard.report)
+        return is_closed_empty(self._heard.report)
 
     @property
     def still(self) -> bool:
@@ -198,20 +199,20 @@ class Tongs:
 
     def gripped(self, closing_s: float) -> bool:
         """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""
-        return gripped(self._heard.report, closing_s)
+        return has_closed(self._heard.report, closing_s)
 
     def released(self, grasp: Grasp, opening_s: float) -> bool:
         """Whether they have left the logs of a grasp, ``opening_s`` after they were told to open there, or opened until
         they pushed against something, gave way, and the crane has swung out.
         """
-        return self._calm_s > _STILL_S if self.pushed else released(self._profile, self._heard.report, grasp, opening_s)
+        return self._calm_s > _STILL_S if self.pushed else has_released(self._profile, self._heard.report, grasp, opening_s)
 
     def follow(self) -> float:
         """The pin is to follow them from now on: how long they have been closing, s; 0 where no sensor tells."""
-        measured_s = closed_for_s(self._profile, self._heard.report)
+        measured_s = equivalent_closing_s(self._profile, self._heard.report)
         self._close_from_s = measured_s if isfinite(measured_s) else 0.0
         return self._close_from_s
 
     def pace(self, clock_s: float) -> float:
         """How fast the pin is to go that has followed them for so much of its motion."""
-        return pace(closed_for_s(self._profile, self._heard.report) - self._close_from_s - clock_s)
+        return following_rate(equivalent_closing_s(self._profile, self._heard.report) - self._close_from_s - clock_s)

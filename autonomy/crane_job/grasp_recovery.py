@@ -13,18 +13,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-from autonomy.crane_job.grapple import Tongs
+from autonomy.crane_job.grapple import GrappleSequence
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.direct import Grasp
+from autonomy.grasp.grasp import Grasp
 
-CLIMBS, CLIMB_M = 3, 0.1
+MAX_REGRIPS_HIGHER, REGRIP_STEP_M = 3, 0.1
 """A heap too wide for the tongs is gripped so much higher, so often."""
-ANEW: Final = 2
+MAX_RESTARTS: Final = 2
 """So often are missed logs gripped again before the crane goes up empty."""
 
 
 @dataclass(slots=True)
-class Regrip:
+class GraspRecovery:
     """How often one grasp was taken higher up since its logs were last looked at, and begun anew; ``stubborn`` are the
     numbers of logs that it is better chosen without: drawn in vain, or inside of a row that was closed round in vain.
     """
@@ -33,46 +33,46 @@ class Regrip:
     begun: int = 0
     stubborn: tuple[int, ...] = ()
 
-    def after_closing(self, grasp: Grasp, tongs: Tongs) -> tuple[Phase | None, Grasp]:
+    def after_closing(self, grasp: Grasp, tongs: GrappleSequence) -> tuple[Phase | None, Grasp]:
         """The phase that follows, None while the tongs still move, and the grasp as it is then tried."""
-        if not measured(grasp):
+        if not is_camera_measured(grasp):
             return Phase.LIFT, grasp
-        wide = self.climbs < CLIMBS and tongs.are_wide(grasp, self.climbs)
+        wide = self.climbs < MAX_REGRIPS_HIGHER and tongs.are_wide(grasp, self.climbs)
         # Higher up there may be a thin log that nobody saw, which shut tongs hold: its weight tells.
         vain = tongs.hold_nothing if self.climbs else tongs.have_missed(grasp)
         if self.climbs and tongs.empty and not tongs.still:
             return None, grasp  # the crane still swings, and its load with it
-        missed = vain and self.begun < ANEW
+        missed = vain and self.begun < MAX_RESTARTS
         if not wide and not missed:
             return Phase.LIFT, grasp
         if not tongs.still:
             return None, grasp
         if wide:
             self.climbs += 1
-            pose = grasp.pose.at_height(grasp.pose.z_m + CLIMB_M)
-            return Phase.DESCEND, replace(grasp, pose=pose, support_z_m=grasp.support_z_m + CLIMB_M)
+            pose = grasp.pose.at_height(grasp.pose.z_m + REGRIP_STEP_M)
+            return Phase.DESCEND, replace(grasp, pose=pose, support_z_m=grasp.support_z_m + REGRIP_STEP_M)
         if grasp.drawn and not grasp.drags and not tongs.empty:
             return Phase.CLOSE, replace(grasp, drags=True)
         return Phase.ABOVE, self._anew(grasp)
 
-    def after_rising(self, grasp: Grasp, tongs: Tongs) -> Grasp | None:
+    def after_rising(self, grasp: Grasp, tongs: GrappleSequence) -> Grasp | None:
         """The grasp, to be begun anew, where the tongs hold nothing that would weigh by now; None where they may."""
-        empty = measured(grasp) and tongs.still and tongs.hold_nothing
-        return self._anew(grasp) if empty and self.begun < ANEW else None
+        empty = is_camera_measured(grasp) and tongs.still and tongs.hold_nothing
+        return self._anew(grasp) if empty and self.begun < MAX_RESTARTS else None
 
     def _anew(self, grasp: Grasp) -> Grasp:
-        self.stubborn += _inside(grasp) if self.climbs else (grasp.log.id,) if grasp.drawn else ()
+        self.stubborn += _inner_logs(grasp) if self.climbs else (grasp.log.id,) if grasp.drawn else ()
         self.begun, self.climbs = self.begun + 1, 0
         return replace(grasp, drags=False)
 
 
-def _inside(grasp: Grasp) -> tuple[int, ...]:
+def _inner_logs(grasp: Grasp) -> tuple[int, ...]:
     """The logs of a grasp with others of it on both sides."""
     ax, ay, _ = grasp.log.axis
     across = sorted(grasp.logs, key=lambda log: log.center_m[1] * ax - log.center_m[0] * ay)
     return tuple(log.id for log in across[1:-1])
 
 
-def measured(grasp: Grasp) -> bool:
+def is_camera_measured(grasp: Grasp) -> bool:
     """Whether it is of logs that a camera has measured."""
     return any(log.covariance is not None for log in grasp.logs)

@@ -6,18 +6,18 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Final
 
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import StateReport
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import StateReport
 from machine.joints import JOINTS
-from machine.modes import Mode
+from machine.status.modes import Mode
 from machine.profile import Profile, joint
 
-SILENT_NS: Final = 300_000_000
-FRESH_NS: Final = 600_000_000
+REPORT_TIMEOUT_NS: Final = 300_000_000
+LOG_LIST_FRESH_NS: Final = 600_000_000
 """A log list that is no older says what hangs in the grapple now."""
 
 
-class Heard:
+class Inbox:
     """``logs`` with their time ``logs_ns``, -1 before the first list; what is older than the newest is forgotten."""
 
     __slots__ = ("_profile", "_report", "_report_ns", "logs", "logs_ns")
@@ -58,7 +58,7 @@ class Heard:
         """Why no setpoint would be obeyed now."""
         if self._report is None:
             return "the controller has not reported"
-        if now_ns - self._report_ns > SILENT_NS:
+        if now_ns - self._report_ns > REPORT_TIMEOUT_NS:
             return "the controller is silent"
         if self._report.mode not in (Mode.ARMED, Mode.ACTIVE):
             name = next((mode.name for mode in Mode if mode == self._report.mode), str(self._report.mode))
@@ -69,4 +69,4 @@ class Heard:
 
     def fresh(self, now_ns: int) -> bool:
         """Whether the log list is of this moment."""
-        return now_ns - self.logs_ns < FRESH_NS
+        return now_ns - self.logs_ns < LOG_LIST_FRESH_NS

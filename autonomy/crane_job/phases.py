@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
-from can_dbc.setpoint import GrappleCommand
+from can_dbc.messages.crane import GrappleCommand
 
 
 class Phase(IntEnum):
@@ -28,7 +28,7 @@ class Phase(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class PhaseRule:
     """A phase: what the grapple does, rest after the motion [s], time beyond it [s], what is wrong after
     that.
     """
@@ -40,19 +40,19 @@ class Rule:
 
 
 _OPEN, _CLOSE, _HOLD = GrappleCommand.OPEN, GrappleCommand.CLOSE, GrappleCommand.HOLD
-RULES: Final = {
-    Phase.LOOK: Rule(_OPEN, 0.0, 5.0, "the detector sent no log list"),
-    Phase.ABOVE: Rule(_OPEN, 0.0, 6.0, "the crane did not get above the log with an open grapple"),
-    Phase.DESCEND: Rule(_OPEN, 0.1, 5.0, "the crane did not get down to the log"),
-    Phase.CLOSE: Rule(_CLOSE, 0.0, 6.0, "the grapple did not close"),
-    Phase.LIFT: Rule(_HOLD, 0.0, 5.0, "the crane did not lift the log, or no log list came"),
-    Phase.CARRY: Rule(_HOLD, 0.0, 6.0, "the crane did not get over the bunk, or no log list came"),
-    Phase.LOWER: Rule(_HOLD, 0.1, 5.0, "the crane did not get down into the bunk"),
-    Phase.OPEN: Rule(_OPEN, 0.0, 5.0, "the grapple did not open"),
-    Phase.RETREAT: Rule(_OPEN, 0.1, 6.0, "the crane did not leave the bunk, or no log list came"),
-    Phase.STOW: Rule(_HOLD, 0.1, 6.0, "the crane did not get over the bunk"),
+PHASE_RULES: Final = {
+    Phase.LOOK: PhaseRule(_OPEN, 0.0, 5.0, "the detector sent no log list"),
+    Phase.ABOVE: PhaseRule(_OPEN, 0.0, 6.0, "the crane did not get above the log with an open grapple"),
+    Phase.DESCEND: PhaseRule(_OPEN, 0.1, 5.0, "the crane did not get down to the log"),
+    Phase.CLOSE: PhaseRule(_CLOSE, 0.0, 6.0, "the grapple did not close"),
+    Phase.LIFT: PhaseRule(_HOLD, 0.0, 5.0, "the crane did not lift the log, or no log list came"),
+    Phase.CARRY: PhaseRule(_HOLD, 0.0, 6.0, "the crane did not get over the bunk, or no log list came"),
+    Phase.LOWER: PhaseRule(_HOLD, 0.1, 5.0, "the crane did not get down into the bunk"),
+    Phase.OPEN: PhaseRule(_OPEN, 0.0, 5.0, "the grapple did not open"),
+    Phase.RETREAT: PhaseRule(_OPEN, 0.1, 6.0, "the crane did not leave the bunk, or no log list came"),
+    Phase.STOW: PhaseRule(_HOLD, 0.1, 6.0, "the crane did not get over the bunk"),
 }
-BEGIN_AGAIN: Final = {
+RESUME_PHASE: Final = {
     Phase.DESCEND: Phase.ABOVE,
     Phase.CLOSE: Phase.ABOVE,
     Phase.LOWER: Phase.CARRY,
@@ -61,12 +61,12 @@ BEGIN_AGAIN: Final = {
 """Where an interrupted vertical phase begins again when the crane stands aside of its column."""
 
 
-def grapple(phase: Phase, gathered: bool, stows: bool) -> GrappleCommand:
+def grapple_command(phase: Phase, gathered: bool, stows: bool) -> GrappleCommand:
     """What the grapple does in a phase: with a bundle (``gathered``) it closes on, for the logs settle and the tongs
     follow; at the end of a job that only ``stows`` the crane it does not open.
     """
     if gathered and Phase.LIFT <= phase <= Phase.LOWER:
         return _CLOSE
-    if phase in RULES:
-        return RULES[phase].grapple
+    if phase in PHASE_RULES:
+        return PHASE_RULES[phase].grapple
     return _OPEN if phase is Phase.DONE and not stows else _HOLD

@@ -9,16 +9,16 @@ from autonomy.motion.trajectory import Trajectory, hold
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
 
-ARRIVED: Final = (0.015, 0.015, 0.02, 0.02, 0.06)
+ARRIVAL_TOLERANCE: Final = (0.015, 0.015, 0.02, 0.02, 0.06)
 """How near each joint comes to its goal before the next phase, rad (EXT m): a few cm at the pin."""
 BRAKE_S: Final = 0.8
 """From full speed to a stop on the way."""
-_LAG_S: Final = 0.4
+_MAX_LAG_S: Final = 0.4
 
 Axes = tuple[float, ...]
 
 
-class Pursuit:
+class TrajectoryTracker:
     """Where on its ``motion`` a crane is sent: at ``clock_s`` of it, ``rate`` of its seconds in a second."""
 
     def __init__(self, profile: Profile, rests: Axes) -> None:
@@ -58,21 +58,21 @@ class Pursuit:
         self.rate += min(max(wanted - self.rate, -most), most)
 
     def _pace(self, measured: Sequence[float]) -> float:
-        """1 while the joints follow, less when one falls behind by more than ``_LAG_S``, 0 at twice that."""
+        """1 while the joints follow, less when one falls behind by more than ``_MAX_LAG_S``, 0 at twice that."""
         lags = [
             abs(q - p) / joint(self._profile, j).speed_limit
             for j, q, p in zip(JOINTS, self.sent, measured, strict=True)
         ]
-        return min(max(2.0 - max(lags) / _LAG_S, 0.0), 1.0)
+        return min(max(2.0 - max(lags) / _MAX_LAG_S, 0.0), 1.0)
 
     def arrived(self, measured: Sequence[float], share: float) -> bool:
-        """Whether every joint is near its goal; ``share`` of ``ARRIVED`` is near."""
-        return all(abs(p - g) <= share * near for p, g, near in zip(measured, self.motion.goal, ARRIVED, strict=True))
+        """Whether every joint is near its goal; ``share`` of ``ARRIVAL_TOLERANCE`` is near."""
+        return all(abs(p - g) <= share * near for p, g, near in zip(measured, self.motion.goal, ARRIVAL_TOLERANCE, strict=True))
 
     def worst_joint(self, measured: Sequence[float]) -> str:
         """The end of a sentence: which joint is farthest off; empty when all are near."""
         errors = [
-            (abs(p - w) / near, j, p - w) for j, p, w, near in zip(JOINTS, measured, self.sent, ARRIVED, strict=True)
+            (abs(p - w) / near, j, p - w) for j, p, w, near in zip(JOINTS, measured, self.sent, ARRIVAL_TOLERANCE, strict=True)
         ]
         share, axis, error = max(errors)
         unit = "m" if axis is Joint.EXT else "rad"

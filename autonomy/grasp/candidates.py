@@ -11,30 +11,30 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.cylinders import LEAST_RADIUS_M, Cylinders
-from autonomy.grasp.direct import clearance, closing_height, travel_height
-from autonomy.grasp.proposal import NoGrasp
-from autonomy.grasp.quality import Scores, Sections
+from autonomy.grasp.cylinders import MIN_RADIUS_M, Cylinders
+from autonomy.grasp.grapple_heights import tip_clearance_m, closing_height_curve, travel_height_m
+from autonomy.grasp.planner import NoGrasp
+from autonomy.grasp.quality import GraspScores, BladeSections
 from autonomy.motion.arm import Arm
-from autonomy.perception.logs import LogObservation
-from machine.kinematics import Unreachable
+from autonomy.perception.log_list.observation import LogObservation
+from machine.geometry.kinematics import Unreachable
 
-ALONG: Final = np.linspace(-0.21, 0.21, 7)
+ALONG_SHARES: Final = np.linspace(-0.21, 0.21, 7)
 """Stations, in lengths of the log from its middle; nearer to its ends an operator would not grip it."""
-SIDEWAYS_M: Final = np.linspace(-0.48, 0.48, 9)
-TURNED_RAD: Final = np.radians([-14.0, -7.0, 0.0, 7.0, 14.0])
-ABOUT: Final = 8
+SIDEWAYS_OFFSETS_M: Final = np.linspace(-0.48, 0.48, 9)
+YAW_OFFSETS_RAD: Final = np.radians([-14.0, -7.0, 0.0, 7.0, 14.0])
+ANCHOR_LOG_COUNT: Final = 8
 """So many logs, the topmost in reach, have candidates about them."""
-MIDDLE_M: Final = 0.15
+CENTRING_SCALE_M: Final = 0.15
 """Off the middle by this much a grasp is worth a third of one in it."""
-SQUARE: Final = 0.04
+SQUARENESS_SCALE: Final = 0.04
 """Mean squared sine of the logs' angles at which it is worth a third: 11 deg."""
-FINALISTS: Final = 40
+FINALIST_COUNT: Final = 40
 SEED: Final = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Candidates:
+class CandidateArrays:
     """Arrays of one length: place [m], opening axis [rad], height that logs are taken above [m]."""
 
     x: np.ndarray
@@ -43,47 +43,47 @@ class Candidates:
     level: np.ndarray
 
 
-def in_reach(arm: Arm, logs: Sequence[LogObservation], stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def reachable_stations(arm: Arm, logs: Sequence[LogObservation], stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The topmost logs (k,) that may be taken and that the crane reaches somewhere, and at which of the stations
-    ``ALONG`` (k, stations).
+    ``ALONG_SHARES`` (k, stations).
 
     Raises ``NoGrasp`` when it reaches none.
     """
-    high = travel_height(arm.profile)
-    over_support = closing_height(arm.profile, 0.0, 2.0 * LEAST_RADIUS_M)(0.0) - clearance(2.0 * LEAST_RADIUS_M)
+    high = travel_height_m(arm.profile)
+    over_support = closing_height_curve(arm.profile, 0.0, 2.0 * MIN_RADIUS_M)(0.0) - tip_clearance_m(2.0 * MIN_RADIUS_M)
     top, reached, trouble = list[int](), list[list[bool]](), ""
 
     def served(log: LogObservation, along: float) -> bool:
         nonlocal trouble
         x, y, z = (c + along * log.length_m * a for c, a in zip(log.center_m, log.axis, strict=True))
         try:
-            arm.over(x, y, z - log.diameter_m / 2 + clearance(log.diameter_m) + over_support, high)
+            arm.over(x, y, z - log.diameter_m / 2 + tip_clearance_m(log.diameter_m) + over_support, high)
         except Unreachable as error:
             trouble = trouble or f"log {log.id}: {error}"
             return False
         return True
 
     for i in sorted(np.flatnonzero(~stays).tolist(), key=lambda i: -logs[i].center_m[2]):
-        whole = all(served(logs[i], along) for along in (0.0, ALONG[0], ALONG[-1]))
-        stations = [whole or served(logs[i], along) for along in ALONG]
+        whole = all(served(logs[i], along) for along in (0.0, ALONG_SHARES[0], ALONG_SHARES[-1]))
+        stations = [whole or served(logs[i], along) for along in ALONG_SHARES]
         if any(stations):
             top.append(i)
             reached.append(stations)
-        if len(top) == ABOUT:
+        if len(top) == ANCHOR_LOG_COUNT:
             break
     if not top:
         raise NoGrasp(f"no log is in reach; {trouble or 'all that are in view are to stay'}")
     return np.array(top), np.array(reached)
 
 
-def candidates(world: Cylinders, top: np.ndarray, reached: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def candidate_grid(world: Cylinders, top: np.ndarray, reached: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """All that are looked at, about the logs ``top`` (k,) where these are ``reached`` (k, stations): x, y [m] and
     opening axis [rad].
     """
     center, axis, length = world.center[top], world.axis[top], world.length[top]
     flat = np.arctan2(axis[:, 1], axis[:, 0])[:, None, None, None]
-    along = ALONG[:, None, None] * length[:, None, None, None]
-    side, turned = SIDEWAYS_M[:, None], TURNED_RAD
+    along = ALONG_SHARES[:, None, None] * length[:, None, None, None]
+    side, turned = SIDEWAYS_OFFSETS_M[:, None], YAW_OFFSETS_RAD
     cx, cy, ax, ay = (v[:, k, None, None, None] for v in (center, axis) for k in (0, 1))
     x = cx + along * ax - side * np.sin(flat)
     y = cy + along * ay + side * np.cos(flat)
@@ -92,32 +92,32 @@ def candidates(world: Cylinders, top: np.ndarray, reached: np.ndarray) -> tuple[
 
 
 def finalists(
-    at: tuple[np.ndarray, np.ndarray, np.ndarray], levels: np.ndarray, seen: Sections, found: Scores
-) -> tuple[Candidates, Scores]:
+    at: tuple[np.ndarray, np.ndarray, np.ndarray], levels: np.ndarray, seen: BladeSections, found: GraspScores
+) -> tuple[CandidateArrays, GraspScores]:
     """The best of every set of logs that can be taken, best first."""
     where = np.nonzero(found.safe)
-    safe = Scores(*(getattr(found, f.name)[where] for f in fields(Scores)))
-    near = Sections(*(getattr(seen, f.name)[where[0]] for f in fields(Sections)))
-    order = _varied(safe.lever * (1.0 + 0.3 * safe.count) * middling(near, safe.captured), safe.captured)
+    safe = GraspScores(*(getattr(found, f.name)[where] for f in fields(GraspScores)))
+    near = BladeSections(*(getattr(seen, f.name)[where[0]] for f in fields(BladeSections)))
+    order = _diverse_best(safe.lever * (1.0 + 0.3 * safe.count) * centring(near, safe.captured), safe.captured)
     x, y, yaw = (c[where[0]][order] for c in at)
-    chosen = Scores(*(getattr(safe, f.name)[order] for f in fields(Scores)))
-    return Candidates(x, y, yaw, levels[where][order]), chosen
+    chosen = GraspScores(*(getattr(safe, f.name)[order] for f in fields(GraspScores)))
+    return CandidateArrays(x, y, yaw, levels[where][order]), chosen
 
 
-def middling(at: Sections, captured: np.ndarray) -> np.ndarray:
+def centring(at: BladeSections, captured: np.ndarray) -> np.ndarray:
     """How well the captured logs stand in the middle between the tongs and square to them, 0..1."""
     low = np.min(np.where(captured, at.low_u, np.inf), axis=-1)
     high = np.max(np.where(captured, at.high_u, -np.inf), axis=-1)
     askew = np.sum(np.where(captured, at.askew, 0.0), axis=-1) / np.sum(captured, axis=-1)
-    return np.exp(-(((low + high) / 2 / MIDDLE_M) ** 2) - askew / SQUARE)
+    return np.exp(-(((low + high) / 2 / CENTRING_SCALE_M) ** 2) - askew / SQUARENESS_SCALE)
 
 
-def _varied(rough: np.ndarray, captured: np.ndarray) -> np.ndarray:
+def _diverse_best(rough: np.ndarray, captured: np.ndarray) -> np.ndarray:
     """Indices of the finalists: the best of every set of captured logs first, so that no set crowds the others out."""
     code = captured @ np.random.default_rng(SEED).random(captured.shape[1])
     order = np.argsort(-rough, kind="stable")
     sets, first = np.unique(code[order], return_index=True)
-    each = max(2, FINALISTS // len(sets))
-    keep = [order[code[order] == s][:each] for s in sets[np.argsort(first)][: FINALISTS // 2]]
+    each = max(2, FINALIST_COUNT // len(sets))
+    keep = [order[code[order] == s][:each] for s in sets[np.argsort(first)][: FINALIST_COUNT // 2]]
     chosen: np.ndarray = np.concatenate(keep)
     return chosen[np.argsort(-rough[chosen], kind="stable")]

@@ -1,7 +1,7 @@
 """Paper A's grasp planner (section II): virtual world, depth picture, network, argmax, and back to the crane's base.
 
 The network says where and how turned, not how deep: the tips go 0.25 m under the surface that the camera sees there, as
-on the test-bed (machines.md 1.5), and never into the ground.  What comes up is not its business; the logs between the
+on the test-bed (docs/reference/machines.md section 1.5), and never into the ground.  What comes up is not its business; the logs between the
 tongs are named for the closing of the tongs.  Inputs: log list, a network.  Failure: ``NoGrasp``.
 """
 
@@ -14,39 +14,39 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from autonomy.grasp.cylinders import Cylinders, cylinders, lowest_m
-from autonomy.grasp.direct import known_ground_m
+from autonomy.grasp.cylinders import Cylinders, as_cylinders, lowest_m
+from autonomy.grasp.grapple_heights import known_ground_m
 from autonomy.grasp.jaws import Jaws, jaws_of
-from autonomy.grasp.network import Best, GraspMaps, best
-from autonomy.grasp.proposal import GraspProposal, NoGrasp
-from autonomy.grasp.quality import lies_upon, rate, sections
-from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, cuboid, render, trimmed
+from autonomy.grasp.network import PixelGrasp, GraspMaps, best_pixel
+from autonomy.grasp.planner import GraspCandidate, NoGrasp
+from autonomy.grasp.quality import rests_upon, score_grasps, blade_sections
+from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
 from autonomy.motion.arm import Arm
-from autonomy.perception.logs import LogObservation
+from autonomy.perception.log_list.observation import LogObservation
 
-DEPTH_M: Final = 0.25
+TIP_DEPTH_M: Final = 0.25
 """How far under the surface of the pile the tips close."""
 
 
 class Network(Protocol):
     """``autonomy.grasp.network.GraspNet``: a 300 x 300 depth picture [m] in, the grasp of eq. 4 or whole maps out."""
 
-    def best(self, depth_m: np.ndarray) -> Best: ...
+    def best(self, depth_m: np.ndarray) -> PixelGrasp: ...
 
     def maps(self, depth_m: np.ndarray) -> GraspMaps: ...
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class NetworkView:
     """What a plan was made from, for pictures: camera, depth (300, 300) [m] and the grasp found in it."""
 
     camera: Camera
     depth_m: np.ndarray
-    best: Best
+    best: PixelGrasp
 
 
 class CnnPlanner:
-    """A planner (``autonomy.grasp.proposal``).  Like the paper's, it knows nothing of logs that are to stay lying: it
+    """A planner (``autonomy.grasp.planner``).  Like the paper's, it knows nothing of logs that are to stay lying: it
     plans from the list without them, and may take one along.
 
     ``by_rule`` takes the height from the rule that physical labels are made by, where that holds.
@@ -57,21 +57,21 @@ class CnnPlanner:
     def __init__(self, network: Network, by_rule: bool = False, cameras: int = 1, reach_m: float = 0.3) -> None:
         self._network, self._by_rule, self._cameras, self._reach_m = network, by_rule, cameras, reach_m
 
-    def look(self, world: Cylinders, jaws: Jaws, ground_z_m: float) -> Seen:
+    def look(self, world: Cylinders, jaws: Jaws, ground_z_m: float) -> NetworkView:
         """The virtual camera's picture of a world and the grasp in it.
 
         Raises ValueError when there is nothing to see.
         """
-        recreated = trimmed(world, jaws.blade_m)
-        box = cuboid(recreated)
+        recreated = shortened_logs(world, jaws.blade_m)
+        box = operational_area(recreated)
         if self._cameras <= 1:
             camera = camera_above(box)
             depth = render(recreated, camera, ground_z_m)
-            return Seen(camera, depth, self._network.best(depth))
+            return NetworkView(camera, depth, self._network.best(depth))
         views = cameras_along(box, self._reach_m, self._cameras)
         pictures = [render(recreated, camera, ground_z_m) for camera in views]
-        mean = averaged([self._network.maps(depth) for depth in pictures], views, float(box.centroid_m[2]))
-        return Seen(views[0], pictures[0], best(mean))
+        mean = mean_maps([self._network.maps(depth) for depth in pictures], views, float(box.centroid_m[2]))
+        return NetworkView(views[0], pictures[0], best_pixel(mean))
 
     def __call__(
         self,
@@ -80,13 +80,13 @@ class CnnPlanner:
         slew_rad: float,
         rot_rad: float,
         stay: Collection[int] = (),
-    ) -> GraspProposal:
+    ) -> GraspCandidate:
         """The grasp of eq. 4; raises ``NoGrasp`` without a log."""
         places = [i for i in range(len(logs)) if i not in stay]
         logs = [logs[i] for i in places]
         if not logs:
             raise NoGrasp("no log is in view")
-        world, jaws = cylinders(logs), jaws_of(arm.profile)
+        world, jaws = as_cylinders(logs), jaws_of(arm.profile)
         ground = known_ground_m(arm.profile)
         ground = ground if math.isfinite(ground) else lowest_m(world)
         try:
@@ -97,18 +97,18 @@ class CnnPlanner:
         depth = float(seen.depth_m[round(found.v_px), round(found.u_px)])
         x, y, surface = seen.camera.to_base(found.u_px, found.v_px, depth).tolist()
         # Seen from above the picture's y runs against the base's.
-        yaw, level = -found.theta_rad, max(ground, surface - DEPTH_M)
+        yaw, level = -found.theta_rad, max(ground, surface - TIP_DEPTH_M)
         if self._by_rule:
-            level = safe_level(jaws, world, x, y, yaw, ground, level)
-        taken = tuple(places[i] for i in between(jaws, world, x, y, yaw, level))
+            level = rule_level_m(jaws, world, x, y, yaw, ground, level)
+        taken = tuple(places[i] for i in logs_between_jaws(jaws, world, x, y, yaw, level))
         quality = min(max(found.q, 0.0), 1.0)
         reason = f"the network's best pixel ({found.u_px:.0f}, {found.v_px:.0f}) has quality {found.q:.2f}"
-        return GraspProposal(x, y, yaw, level, taken, quality, reason)
+        return GraspCandidate(x, y, yaw, level, taken, quality, reason)
 
 
-def between(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, level: float) -> tuple[int, ...]:
+def logs_between_jaws(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, level: float) -> tuple[int, ...]:
     """The logs between the tongs of a grasp and above its tips; without any, the nearest one."""
-    at = sections(jaws, world, np.array(x), np.array(y), np.array(yaw))
+    at = blade_sections(jaws, world, np.array(x), np.array(y), np.array(yaw))
     middle = np.abs(at.low_u + at.high_u) / 2
     inside = at.inside & (middle < jaws.half_gap_m) & (at.middle > level)
     if not inside.any():
@@ -117,16 +117,16 @@ def between(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, level:
     return tuple(int(i) for i in np.flatnonzero(inside))
 
 
-def safe_level(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, ground: float, level: float) -> float:
+def rule_level_m(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, ground: float, level: float) -> float:
     """The height at which the rule takes most wood at a place; ``level`` where it takes none."""
     heights = np.append(world.center[:, 2] + world.radius, ground)
-    at = sections(jaws, world, *(np.full(len(heights), v) for v in (x, y, yaw)))
-    found = rate(jaws, world, lies_upon(world), at, heights)
+    at = blade_sections(jaws, world, *(np.full(len(heights), v) for v in (x, y, yaw)))
+    found = score_grasps(jaws, world, rests_upon(world), at, heights)
     mass = np.where(found.safe, found.mass_kg, 0.0)
     return float(heights[np.argmax(mass)]) if mass.any() else level
 
 
-def averaged(maps: Sequence[GraspMaps], cameras: Sequence[Camera], height_m: float) -> GraspMaps:
+def mean_maps(maps: Sequence[GraspMaps], cameras: Sequence[Camera], height_m: float) -> GraspMaps:
     """Mean of the predictions of cameras that look straight down, shifted onto the first one's picture at a height.
 
     Pixels that a camera does not see count for it as worthless.

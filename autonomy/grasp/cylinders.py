@@ -12,11 +12,11 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.perception.estimate import ACROSS_1, ACROSS_2, END, RADIUS, SIZE, START, TILT_1, TILT_2, unpacked
-from autonomy.perception.logs import LogObservation
+from autonomy.perception.log_list.estimate import ACROSS_1, ACROSS_2, END, RADIUS, SIZE, START, TILT_1, TILT_2, unpacked
+from autonomy.perception.log_list.observation import LogObservation
 
-LEAST_RADIUS_M: Final = 0.02
-POINTS: Final = 15
+MIN_RADIUS_M: Final = 0.02
+POINT_COUNT: Final = 15
 """Of an axis, where its distance to others is asked."""
 
 
@@ -41,7 +41,7 @@ class Cylinders:
 
     def points(self) -> np.ndarray:
         """Points of every axis from end to end (..., n, POINTS, 3)."""
-        part = self.length[..., None] * np.linspace(-0.5, 0.5, POINTS)
+        part = self.length[..., None] * np.linspace(-0.5, 0.5, POINT_COUNT)
         points: np.ndarray = self.center[..., None, :] + part[..., None] * self.axis[..., None, :]
         return points
 
@@ -51,7 +51,7 @@ class Cylinders:
         return Cylinders(self.center, self.axis, np.minimum(length, self.length), self.radius)
 
 
-def cylinders(logs: Sequence[LogObservation]) -> Cylinders:
+def as_cylinders(logs: Sequence[LogObservation]) -> Cylinders:
     """The logs of a list, no draws."""
     return Cylinders(
         np.array([log.center_m for log in logs], float).reshape(-1, 3),
@@ -67,7 +67,7 @@ def lowest_m(world: Cylinders) -> float:
     return float(np.min(np.min(world.ends()[..., 2], axis=-1) - thick))
 
 
-def between_axes(world: Cylinders) -> np.ndarray:
+def axis_offsets(world: Cylinders) -> np.ndarray:
     """(n, n, POINTS, 3): from the nearest point of the axis of log i (first) to points of that of log j, no draws."""
     away = world.points()[None] - world.center[:, None, None]
     half = world.length[:, None, None] / 2
@@ -76,7 +76,7 @@ def between_axes(world: Cylinders) -> np.ndarray:
     return off
 
 
-def covariance_of(log: LogObservation) -> np.ndarray:
+def log_covariance(log: LogObservation) -> np.ndarray:
     """(7, 7) of ``LogEstimate`` as perception has it, or for a log of which only the pose is told."""
     return default_covariance(log) if log.covariance is None else unpacked(log.covariance)
 
@@ -89,7 +89,7 @@ def default_covariance(log: LogObservation) -> np.ndarray:
     return np.diag(sigma**2)
 
 
-def draws_of(world: Cylinders, covariances: np.ndarray, count: int, seed: int) -> Cylinders:
+def sample_cylinders(world: Cylinders, covariances: np.ndarray, count: int, seed: int) -> Cylinders:
     """``count`` draws of a world (n logs) from covariances (n, 7, 7); the same seed draws the same.
 
     Raises ValueError when a covariance is none.
@@ -99,10 +99,10 @@ def draws_of(world: Cylinders, covariances: np.ndarray, count: int, seed: int) -
     value, vector = np.linalg.eigh(covariances)
     root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
     normal = np.random.default_rng(seed).standard_normal((count, world.count, SIZE))
-    return changed(world, np.einsum("nij,dnj->dni", root, normal))
+    return perturbed(world, np.einsum("nij,dnj->dni", root, normal))
 
 
-def across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def transverse_axes(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors (n, 3) across unit axes (n, 3), along which errors count: the first level, the second upward."""
     level = np.stack([-axis[:, 1], axis[:, 0], np.zeros(len(axis))], axis=1)
     steep = np.hypot(level[:, 0], level[:, 1]) < 0.05
@@ -111,13 +111,13 @@ def across(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return level, np.cross(axis, level)
 
 
-def changed(world: Cylinders, e: np.ndarray) -> Cylinders:
+def perturbed(world: Cylinders, e: np.ndarray) -> Cylinders:
     """The logs (n) with errors (..., n, 7), in the order of ``LogEstimate``'s covariance, added to them."""
-    level, up = across(world.axis)
+    level, up = transverse_axes(world.axis)
     axis = world.axis + e[..., TILT_1, None] * level + e[..., TILT_2, None] * up
     axis /= np.linalg.norm(axis, axis=-1)[..., None]
     along = 0.5 * (e[..., START] + e[..., END])
     center = world.center + e[..., ACROSS_1, None] * level + e[..., ACROSS_2, None] * up + along[..., None] * axis
-    radius = np.maximum(world.radius + e[..., RADIUS], LEAST_RADIUS_M)
+    radius = np.maximum(world.radius + e[..., RADIUS], MIN_RADIUS_M)
     length = np.maximum(world.length + e[..., END] - e[..., START], 2.0 * radius)
     return Cylinders(center, axis, length, radius)

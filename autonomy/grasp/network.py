@@ -25,18 +25,18 @@ POOL: Final = 3
 """The network works at a third of the picture's side."""
 SHAPE: Final = (1, 1, SIDE_PX, SIDE_PX)
 HEADS: Final = ("q", "cos2", "sin2")
-CANDIDATES: Final = 32
+CANDIDATE_COUNT: Final = 32
 NOT_FINITE: Final = "the quality map is not finite: no grasp can be chosen from it"
 PRECISIONS: Final = ("f32", "mixed")
 WEIGHTS: Final = SHIPPED / "grasp_cornell.safetensors"
-FAINT: Final = 0.005
+RELIEF_SCALE: Final = 0.005
 """What stands out by this share of the ground's distance is plain to see; twice as much is not twice as plain."""
-MOST: Final = 0.5
+MAX_RELIEF: Final = 0.5
 """Nothing is told to stand out more than this."""
-STEP_PX: Final = 6
-SCALES: Final = (0.2, 0.1, 0.05, 0.03, 0.02, 0.015, 0.01, 0.01, 0.01, 0.01)
-FARTHER: Final = 3.0
-RIDGE: Final = np.diag([0.0, 1e-6, 1e-6])
+GROUND_STEP_PX: Final = 6
+ROBUST_SCALES: Final = (0.2, 0.1, 0.05, 0.03, 0.02, 0.015, 0.01, 0.01, 0.01, 0.01)
+FARTHER_FACTOR: Final = 3.0
+RIDGE_TERM: Final = np.diag([0.0, 1e-6, 1e-6])
 
 PAPER: Final = Network(
     "grasp",
@@ -85,7 +85,7 @@ class GraspMaps:
 
 
 @dataclass(frozen=True, slots=True)
-class Best:
+class PixelGrasp:
     """Eq. 4: the pixel of the greatest quality, the closing direction in [-pi/2, pi/2] and the quality there."""
 
     u_px: float
@@ -98,7 +98,7 @@ class NoDepth(ValueError):
     """A depth picture without one known pixel."""
 
 
-def best(maps: GraspMaps) -> Best:
+def best_pixel(maps: GraspMaps) -> PixelGrasp:
     """The grasp of eq. 4.
 
     Maps at a third of the side give the same grasp as the full ones: bilinear interpolation by an odd factor keeps
@@ -112,14 +112,14 @@ def best(maps: GraspMaps) -> Best:
     return _at(maps, int(np.argmax(maps.q)))
 
 
-def _at(maps: GraspMaps, place: int) -> Best:
+def _at(maps: GraspMaps, place: int) -> PixelGrasp:
     v, u = divmod(place, maps.q.shape[1])
     middle = (maps.scale_px - 1) / 2
     theta = 0.5 * math.atan2(float(maps.sin2[v, u]), float(maps.cos2[v, u]))
-    return Best(u * maps.scale_px + middle, v * maps.scale_px + middle, theta, float(maps.q[v, u]))
+    return PixelGrasp(u * maps.scale_px + middle, v * maps.scale_px + middle, theta, float(maps.q[v, u]))
 
 
-def prepare(depth_m: np.ndarray) -> np.ndarray:
+def normalized_relief(depth_m: np.ndarray) -> np.ndarray:
     """The network's input (H, W) float32 from depth [m], NaN where unknown: how far things stand out of the ground.
 
     The ground is the plane that most of the picture lies on or before; what stands out is told as a share of its
@@ -134,7 +134,7 @@ def prepare(depth_m: np.ndarray) -> np.ndarray:
     if not known.any():
         raise NoDepth("the depth picture holds no known pixel; check the camera and what it looks at")
     out = 1.0 - np.where(known, depth_m, 1.0).astype(np.float32) * _ground(depth_m, known)
-    return np.where(known, np.arcsinh(np.clip(out, -MOST, MOST) / np.float32(FAINT)), np.float32(0.0))
+    return np.where(known, np.arcsinh(np.clip(out, -MAX_RELIEF, MAX_RELIEF) / np.float32(RELIEF_SCALE)), np.float32(0.0))
 
 
 def _ground(depth_m: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -145,20 +145,20 @@ def _ground(depth_m: np.ndarray, known: np.ndarray) -> np.ndarray:
     """
     height, width = depth_m.shape
     u, v = (np.arange(n) / max(height, width) - 0.5 for n in (width, height))
-    step = STEP_PX if known[::STEP_PX, ::STEP_PX].any() else 1
+    step = GROUND_STEP_PX if known[::GROUND_STEP_PX, ::GROUND_STEP_PX].any() else 1
     rows, columns = np.nonzero(known[::step, ::step])
     inverse = 1.0 / depth_m[::step, ::step][rows, columns].astype(np.float64)
     terms = np.stack([np.ones(len(inverse)), u[::step][columns], v[::step][rows]])
     weight = np.ones(len(inverse))
-    for scale in SCALES:
+    for scale in ROBUST_SCALES:
         weighted = terms * weight
-        plane = np.linalg.solve(weighted @ terms.T + weight.sum() * RIDGE, weighted @ inverse)
+        plane = np.linalg.solve(weighted @ terms.T + weight.sum() * RIDGE_TERM, weighted @ inverse)
         ground = plane @ terms
         if ground.min() <= 0.0:  # it passes the camera, so it is none: take a level one
             plane = np.array([np.median(inverse), 0.0, 0.0])
             ground = plane @ terms
         miss = inverse / ground - 1.0
-        weight = 1.0 / (1.0 + (miss / np.where(miss > 0.0, scale, FARTHER * scale)) ** 2)
+        weight = 1.0 / (1.0 + (miss / np.where(miss > 0.0, scale, FARTHER_FACTOR * scale)) ** 2)
     found = (plane[0] + plane[1] * u)[None, :] + (plane[2] * v)[:, None]
     return np.maximum(found, 1e-3 * inverse.min()).astype(np.float32)
 
@@ -174,7 +174,7 @@ def heads_first(network: Network, arrays: Arrays) -> Form:
 
 
 def low_resolution(network: Network, arrays: Arrays) -> Form:
-    """Maps at a third of the side, for ``best``; after ``heads_first``."""
+    """Maps at a third of the side, for ``best_pixel``; after ``heads_first``."""
     return replace(network, layers=network.layers[:-1], outputs=("heads",)), dict(arrays)
 
 
@@ -191,7 +191,7 @@ class GraspNet:
             raise ValueError(f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
         self._form = heads_first(PAPER, arrays)
         self._full: OpenVinoNet | None = None
-        self._choose = chooser(arrays, precision)
+        self._choose = pixel_grasp_inference(arrays, precision)
 
     @classmethod
     def shipped(cls, path: Path = WEIGHTS, precision: str = "f32") -> GraspNet:
@@ -209,9 +209,9 @@ class GraspNet:
             ValueError: another size, or no depth at all (``NoDepth``).
         """
         self._full = self._full or OpenVinoNet(*self._form, SHAPE)
-        return stack(self._full(_picture(depth_m)))
+        return stack_maps(self._full(_picture(depth_m)))
 
-    def best(self, depth_m: np.ndarray) -> Best:
+    def best(self, depth_m: np.ndarray) -> PixelGrasp:
         """The grasp of eq. 4 in a 300 x 300 depth picture [m].
 
         Raises:
@@ -220,7 +220,7 @@ class GraspNet:
         return self._choose(_picture(depth_m))
 
 
-def chooser(arrays: Arrays, precision: str = "f32") -> Callable[[np.ndarray], Best]:
+def pixel_grasp_inference(arrays: Arrays, precision: str = "f32") -> Callable[[np.ndarray], PixelGrasp]:
     """From a prepared picture (1, 1, 300, 300) to its grasp, by maps at a third of the side; as of ``GraspNet``.
 
     "mixed" runs all in bf16, where neighbours become equal on flat quality and the grasp would wander; so the last
@@ -229,17 +229,17 @@ def chooser(arrays: Arrays, precision: str = "f32") -> Callable[[np.ndarray], Be
     network, kept = low_resolution(*heads_first(PAPER, arrays))
     if precision == "f32":
         net = OpenVinoNet(network, kept, SHAPE)
-        return lambda picture: best(stack(net(picture)))
+        return lambda picture: best_pixel(stack_maps(net(picture)))
     front = OpenVinoNet(replace(network, outputs=("norm6", "heads")), kept, SHAPE, "bf16")
     weight = kept["conv7.weight"].reshape(len(kept["conv7.bias"]), -1).T
     heads = kept["heads.weight"][:, :, 0, 0].T
 
-    def choose(picture: np.ndarray) -> Best:
+    def choose(picture: np.ndarray) -> PixelGrasp:
         found = front(picture)
         quality = found["heads"][0, 0]
         if not np.isfinite(quality).all():
             raise ValueError(NOT_FINITE)
-        v, u = np.divmod(np.argpartition(quality, -CANDIDATES, axis=None)[-CANDIDATES:], quality.shape[1])
+        v, u = np.divmod(np.argpartition(quality, -CANDIDATE_COUNT, axis=None)[-CANDIDATE_COUNT:], quality.shape[1])
         hidden = np.maximum(_patches(found["norm6"][0], v, u) @ weight + kept["conv7.bias"], 0.0)
         again = hidden @ heads + kept["heads.bias"]
         maps = np.full((len(HEADS), *quality.shape), -np.inf, np.float32)
@@ -266,7 +266,7 @@ def _patches(features: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
     return seen.transpose(1, 0, 2, 3).reshape(len(v), -1)
 
 
-def stack(found: Mapping[str, np.ndarray]) -> GraspMaps:
+def stack_maps(found: Mapping[str, np.ndarray]) -> GraspMaps:
     """The maps of the first picture in any form's outputs."""
     q, cos2, sin2 = np.concatenate([v[0] for v in found.values()])
     return GraspMaps(q, cos2, sin2, SIDE_PX // len(q))
@@ -275,4 +275,4 @@ def stack(found: Mapping[str, np.ndarray]) -> GraspMaps:
 def _picture(depth_m: np.ndarray) -> np.ndarray:
     if depth_m.shape != (SIDE_PX, SIDE_PX):
         raise ValueError(f"the grasp network takes {SIDE_PX} x {SIDE_PX} depth pictures, not {depth_m.shape}")
-    return prepare(depth_m)[None, None]
+    return normalized_relief(depth_m)[None, None]

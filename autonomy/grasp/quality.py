@@ -8,7 +8,7 @@ height while they sweep together.  The rule (a) to (f):
 reaches over its tip; (c) nothing that is left behind lies on what is captured; (d) every captured log lies across the
 tongs, within the angle of friction; (e) its weight is held near its middle; (f) more wood is better.
 
-The rule plans and labels.  It never judges: that does the plant's physics (perception.md 6).
+The rule plans and labels.  It never judges: that does the plant's physics (docs/reference/perception.md section 6).
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.cylinders import Cylinders, between_axes
-from autonomy.grasp.direct import CLEARANCE_M, TONG_HALF_PLATE_M, UNDER
+from autonomy.grasp.cylinders import Cylinders, axis_offsets
+from autonomy.grasp.grapple_heights import TIP_CLEARANCE_M, HALF_PLATE_M, SCOOP_SHARE
 from autonomy.grasp.jaws import Jaws
 
-FRICTION: Final = 0.45
-ACROSS: Final = sin(atan(FRICTION))
+FRICTION_COEFFICIENT: Final = 0.45
+MAX_AXIS_OBLIQUITY: Final = sin(atan(FRICTION_COEFFICIENT))
 """Greatest component of a captured log's level axis along the opening axis."""
-LEVER_M: Final = 0.35
-ALONE_M: Final = 0.7
+LEVER_SCALE_M: Final = 0.35
+OFF_CENTRE_SCALE_M: Final = 0.7
 """Off its own middle by this much one log among others is held a third as well: it may turn in the tongs."""
 DENSITY_KG_M3: Final = 550.0
 GRAVITY_M_S2: Final = 9.81
-TIP_M: Final = 0.03
+TIP_HEIGHT_M: Final = 0.03
 """Height of the tips over what they sweep along, where that has to be low enough to pass over."""
-ROW_M: Final = 0.08
+LOWEST_ROW_M: Final = 0.08
 """Captured logs whose undersides are less than this over what the tips sweep along are of the lowest row."""
-TOUCH_M: Final = 0.06
+CONTACT_M: Final = 0.06
 """A log this near to another and over it lies on it."""
-RISES: Final = 0.3
+SUPPORT_RISE_SHARE: Final = 0.3
 """A log so much higher than another, over the sum of their radii, lies on it, ..."""
-LIFTED_M: Final = 0.05
+SUPPORT_RISE_M: Final = 0.05
 """... and its underside so much higher: a thick log beside a thin one on the ground does not."""
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class CaptureRule:
     """How strict: tips under a share of a log's diameter above its underside scoop it, for a log on the ground at most
-    ``GROUND_SCOOP``; how far apart the outer logs of
+    ``GROUND_SCOOP_SHARE``; how far apart the outer logs of
     a row may be, over what the tongs get under; how much wood there may be, over what they hold; tips pass over a log
     up to this share of its radius over its axis; heights may be off by ``slack_m``.
     """
@@ -58,18 +58,18 @@ class Rule:
     slack_m: float
 
 
-GROUND_SCOOP: Final = 0.35
-PASSED_M: Final = 0.02
+GROUND_SCOOP_SHARE: Final = 0.35
+PASS_OVER_M: Final = 0.02
 """Tips that ride up over a log come down on nothing whose axis is lower than its top by more than this."""
-STRICT: Final = Rule(GROUND_SCOOP, 1.0, 1.0, 1.0, 0.01)
-LAYER: Final = Rule(0.5, 1.0, 1.0, 0.2, 0.02)
+STRICT_RULE: Final = CaptureRule(GROUND_SCOOP_SHARE, 1.0, 1.0, 1.0, 0.01)
+LAYER_RULE: Final = CaptureRule(0.5, 1.0, 1.0, 0.2, 0.02)
 """Also takes logs that lie deep between others below them: the tips brush these and roll up what they pinch."""
-WIDE: Final = Rule(0.35, 1.35, 1.35, 1.0, 0.01)
+WIDE_RULE: Final = CaptureRule(0.35, 1.35, 1.35, 1.0, 0.01)
 """Also squeezes a row that the tongs may not get under, or more than they hold: some of it comes up, often."""
 
 
 @dataclass(frozen=True, slots=True)
-class Scores:
+class GraspScores:
     """For candidates: ``captured`` (..., n) bool, ``safe`` and ``lever`` (...), ``mass_kg`` and ``count`` of what comes
     up.  ``safe``: (a) to (d) and the moment of (e) hold; ``lever``: 0..1.  All but ``captured`` are 0 where a tong
     comes down on a log, nothing is captured or it does not fit.
@@ -82,18 +82,18 @@ class Scores:
     count: np.ndarray
 
 
-def lies_upon(world: Cylinders) -> np.ndarray:
+def rests_upon(world: Cylinders) -> np.ndarray:
     """(n, n) bool: log j (last) lies on log i, by where any of some points of its axis are over the other's."""
-    off = between_axes(world)
+    off = axis_offsets(world)
     radii = (world.radius[:, None] + world.radius[None, :])[..., None]
     thicker = (world.radius[None, :] - world.radius[:, None])[..., None]
-    near = np.linalg.norm(off, axis=-1) < radii + TOUCH_M
-    upon: np.ndarray = np.any(near & (off[..., 2] > np.maximum(RISES * radii, thicker + LIFTED_M)), axis=-1)
+    near = np.linalg.norm(off, axis=-1) < radii + CONTACT_M
+    upon: np.ndarray = np.any(near & (off[..., 2] > np.maximum(SUPPORT_RISE_SHARE * radii, thicker + SUPPORT_RISE_M)), axis=-1)
     return upon
 
 
 @dataclass(frozen=True, slots=True)
-class Sections:
+class BladeSections:
     """Every log where it passes between the blades of a candidate (..., n): from where to where along the opening axis,
     its underside, top and axis there; what of it is inside; how it lies.
     """
@@ -112,7 +112,7 @@ class Sections:
     """Squared sine of its level direction's angle to the blades."""
 
 
-def sections(jaws: Jaws, world: Cylinders, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> Sections:
+def blade_sections(jaws: Jaws, world: Cylinders, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> BladeSections:
     """Candidates of one shape (...) against logs whose leading axes broadcast to it."""
     cu, su = np.cos(yaw)[..., None], np.sin(yaw)[..., None]
     dx, dy = world.center[..., 0] - x[..., None], world.center[..., 1] - y[..., None]
@@ -132,29 +132,29 @@ def sections(jaws: Jaws, world: Cylinders, x: np.ndarray, y: np.ndarray, yaw: np
     middle = world.center[..., 2] + 0.5 * (s0 + s1) * az
     high = part * np.abs(az) + r
     level_axis = np.maximum(np.sqrt(1.0 - az * az), 1e-6)
-    good = (part > 0.9 * np.minimum(reach_s, half)) & (np.abs(au) < ACROSS * level_axis)
+    good = (part > 0.9 * np.minimum(reach_s, half)) & (np.abs(au) < MAX_AXIS_OBLIQUITY * level_axis)
     askew = (au / level_axis) ** 2
-    return Sections(center_u - wide, center_u + wide, middle - high, middle + high, middle, inside, good, dv, askew)
+    return BladeSections(center_u - wide, center_u + wide, middle - high, middle + high, middle, inside, good, dv, askew)
 
 
-def rate(
-    jaws: Jaws, world: Cylinders, upon: np.ndarray, at: Sections, level: np.ndarray, rule: Rule = STRICT
-) -> Scores:
+def score_grasps(
+    jaws: Jaws, world: Cylinders, upon: np.ndarray, at: BladeSections, level: np.ndarray, rule: CaptureRule = STRICT_RULE
+) -> GraspScores:
     """Candidates whose sections (..., n) are known, at heights ``level`` (...), which broadcast; ``upon`` is
-    ``lies_upon``.
+    ``rests_upon``.
     """
-    r, tip, gap = world.radius, level[..., None] + TIP_M, jaws.half_gap_m
+    r, tip, gap = world.radius, level[..., None] + TIP_HEIGHT_M, jaws.half_gap_m
     over = at.inside & (at.middle + rule.passed * (at.top - at.middle) > tip - jaws.plate_m / 2)
     farthest, nearest = np.maximum(-at.low_u, at.high_u), np.maximum(at.low_u, -at.high_u)
-    scoop = np.where(upon.any(axis=0), rule.scoop, min(rule.scoop, GROUND_SCOOP))
-    taken = at.bottom + 2.0 * scoop * r >= level[..., None] + _clearance(2.0 * r) - rule.slack_m
+    scoop = np.where(upon.any(axis=0), rule.scoop, min(rule.scoop, GROUND_SCOOP_SHARE))
+    taken = at.bottom + 2.0 * scoop * r >= level[..., None] + _tip_clearance_m(2.0 * r) - rule.slack_m
     captured = over & taken & (farthest < gap)
     swept = np.max(np.where(at.inside & ~captured & (nearest < gap), at.top, -np.inf), axis=-1)
-    captured &= at.middle > swept[..., None] - PASSED_M
+    captured &= at.middle > swept[..., None] - PASS_OVER_M
     clear = ~over | captured | (nearest > gap + jaws.plate_m)
     fits = (farthest < jaws.half_width_at(at.middle - tip)) & (at.top - tip < jaws.room_m) & at.good
     safe = np.all(clear & (fits | ~captured), axis=-1) & np.any(captured, axis=-1)
-    found = Scores(captured, safe, *(np.zeros(safe.shape) for _ in range(3)))
+    found = GraspScores(captured, safe, *(np.zeros(safe.shape) for _ in range(3)))
     where = np.nonzero(safe)  # most are out by now
     parts = (at.bottom, at.along, world.length, r, level[..., None])
     bottom, along, length, r, level = (np.broadcast_to(p, captured.shape)[where] for p in parts)
@@ -165,19 +165,19 @@ def rate(
     total = np.sum(wood, axis=-1)
     tilt = np.abs(np.sum(wood * along, axis=-1))
     # The outer logs of the lowest row, pushed together, must be so near that the tips get under them.
-    row = captured & (bottom < level + ROW_M)
+    row = captured & (bottom < level + LOWEST_ROW_M)
     in_row = np.maximum(np.sum(row, axis=-1), 1)
     apart = np.sum(np.where(row, 2.0 * r, 0.0), axis=-1) * (in_row - 1) / in_row
     holds = (np.sum(share * pi * r * r, axis=-1) < rule.wood * jaws.holds_m2) & (apart < rule.row * jaws.scoops_m)
-    holds &= GRAVITY_M_S2 * tilt < FRICTION * jaws.grip_n * jaws.blade_m
+    holds &= GRAVITY_M_S2 * tilt < FRICTION_COEFFICIENT * jaws.grip_n * jaws.blade_m
     farthest_m = np.max(share * np.abs(along), axis=-1)
     safe[where] = (below == 0.0) & holds
-    found.lever[where] = np.exp(-((tilt / np.maximum(total, 1e-6) / LEVER_M) ** 2) - (farthest_m / ALONE_M) ** 2)
+    found.lever[where] = np.exp(-((tilt / np.maximum(total, 1e-6) / LEVER_SCALE_M) ** 2) - (farthest_m / OFF_CENTRE_SCALE_M) ** 2)
     found.mass_kg[where], found.count[where] = total, np.sum(captured, axis=-1)
     return found
 
 
-def _clearance(diameter_m: np.ndarray) -> np.ndarray:
+def _tip_clearance_m(diameter_m: np.ndarray) -> np.ndarray:
     """As ``direct.clearance``: how high over the support the tips are for a log."""
-    low, high = CLEARANCE_M
-    return np.clip((TONG_HALF_PLATE_M + UNDER * diameter_m) / 2.0, low, high)
+    low, high = TIP_CLEARANCE_M
+    return np.clip((HALF_PLATE_M + SCOOP_SHARE * diameter_m) / 2.0, low, high)

@@ -14,20 +14,20 @@ from typing import Final
 import numpy as np
 
 from autonomy.grasp.cylinders import Cylinders
-from machine.optics import Intrinsics
+from machine.geometry.optics import Intrinsics
 
 SIDE_PX: Final = 300
 """Side of the picture the network takes, cut from the middle of the camera's."""
 D435: Final = Intrinsics(640, 480, 385.0, 385.0, 320.0, 240.0).crop(170, 90, SIDE_PX, SIDE_PX)
-ABOVE_M: Final = 3.0
-TRIM: Final = 0.10
-DOWNWARD: Final = np.diag([1.0, -1.0, -1.0])
+CAMERA_HEIGHT_M: Final = 3.0
+TRIM_SHARE: Final = 0.10
+DOWNWARD_AXES: Final = np.diag([1.0, -1.0, -1.0])
 """Columns: the optical axes of a camera that looks straight down."""
-NEAREST_M: Final = 0.05
+MIN_DEPTH_M: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Cuboid:
+class OperationalArea:
     """The box that holds the ends of all logs: least and greatest corner (3,) [m]."""
 
     low_m: np.ndarray
@@ -48,16 +48,16 @@ class Camera:
 
     def to_base(self, u_px: float, v_px: float, depth_m: float) -> np.ndarray:
         """Base-frame point (3,) of a pixel at a depth [m]."""
-        seen: np.ndarray = DOWNWARD @ self.intrinsics.deproject(u_px, v_px, depth_m)
+        seen: np.ndarray = DOWNWARD_AXES @ self.intrinsics.deproject(u_px, v_px, depth_m)
         return self.position_m + seen
 
 
-def trimmed(world: Cylinders, grapple_m: float) -> Cylinders:
+def shortened_logs(world: Cylinders, grapple_m: float) -> Cylinders:
     """The logs as they are recreated: shorter by the grapple's width, then by 10 %."""
-    return world.shortened(grapple_m, TRIM)
+    return world.shortened(grapple_m, TRIM_SHARE)
 
 
-def cuboid(world: Cylinders) -> Cuboid:
+def operational_area(world: Cylinders) -> OperationalArea:
     """The operational area, from the ends of the axes (eq. 1).
 
     Raises ValueError without a log, or when one is nowhere.
@@ -65,15 +65,15 @@ def cuboid(world: Cylinders) -> Cuboid:
     ends = world.ends().reshape(-1, 3)
     if not len(ends) or not np.all(np.isfinite(ends)):
         raise ValueError("the virtual world holds no log, or one whose pose is not finite")
-    return Cuboid(ends.min(axis=0), ends.max(axis=0))
+    return OperationalArea(ends.min(axis=0), ends.max(axis=0))
 
 
-def camera_above(box: Cuboid, intrinsics: Intrinsics = D435) -> Camera:
+def camera_above(box: OperationalArea, intrinsics: Intrinsics = D435) -> Camera:
     """The paper's camera: 3 m above the centroid."""
-    return Camera(box.centroid_m + np.array([0.0, 0.0, ABOVE_M]), intrinsics)
+    return Camera(box.centroid_m + np.array([0.0, 0.0, CAMERA_HEIGHT_M]), intrinsics)
 
 
-def cameras_along(box: Cuboid, reach_m: float, count: int, intrinsics: Intrinsics = D435) -> tuple[Camera, ...]:
+def cameras_along(box: OperationalArea, reach_m: float, count: int, intrinsics: Intrinsics = D435) -> tuple[Camera, ...]:
     """A moving camera: ``count`` places on a circle of ``reach_m`` about the paper's, which comes first."""
     first = camera_above(box, intrinsics)
     turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[: max(0, count - 1)]
@@ -88,12 +88,12 @@ def render(world: Cylinders, camera: Camera, ground_z_m: float) -> np.ndarray:
     """
     pin = camera.intrinsics
     below = float(camera.position_m[2]) - ground_z_m
-    if not below > NEAREST_M:
+    if not below > MIN_DEPTH_M:
         raise ValueError(f"the virtual camera is {below:.2f} m above the ground; it has to look down on it")
     inverse = np.full((pin.height_px, pin.width_px), 1.0 / below, np.float32)
     u = ((np.arange(pin.width_px) - pin.cx_px) / pin.fx_px).astype(np.float32)
     v = ((np.arange(pin.height_px) - pin.cy_px) / pin.fy_px).astype(np.float32)
-    centers, axes = (world.center - camera.position_m) @ DOWNWARD, world.axis @ DOWNWARD
+    centers, axes = (world.center - camera.position_m) @ DOWNWARD_AXES, world.axis @ DOWNWARD_AXES
     for p, w, length, radius in zip(centers, axes, world.length.tolist(), world.radius.tolist(), strict=True):
         _draw(inverse, u, v, pin, p, w, length / 2.0, radius)
     return 1.0 / inverse
@@ -115,7 +115,7 @@ def _draw(
     across = np.stack([side, np.cross(w, side)]) * r
     corners = [p + a * half * w + b * across[0] + c * across[1] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]
     corners_m = np.array(corners)
-    if corners_m[:, 2].min() < NEAREST_M:
+    if corners_m[:, 2].min() < MIN_DEPTH_M:
         raise ValueError("the virtual camera is inside a log or beside one; raise it")
     px = pin.project(corners_m)
     left, top = np.maximum(np.floor(px.min(axis=0)).astype(int), 0)

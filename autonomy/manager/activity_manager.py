@@ -17,7 +17,7 @@ from typing import Final
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.rotator_estimate import RotatorEstimate
 from autonomy.grasp.selection import select_direct
-from autonomy.grasp.planner import Chooser
+from autonomy.grasp.planner import GraspSelector
 from autonomy.localization.local_plane import Plane
 from autonomy.manager.load_bookkeeping import Cargo
 from autonomy.manager.crane_executor import Hand
@@ -81,13 +81,13 @@ class Manager:
         profile_hash: int,
         mission: ForwardingMission,
         table: Table = OURS,
-        chooser: Chooser = select_direct,
+        chooser: GraspSelector = select_direct,
         plane: Plane | None = None,
         key: bytes | None = None,
         lease_ns: int = LEASE_NS,
         motions: MotionPlanner | None = None,
         remembers: bool = False,
-        emptier: Chooser | None = None,
+        emptier: GraspSelector | None = None,
         progress: Progress | None = None,
     ) -> None:
         assert profile.carrier is not None and not (remembers and progress)

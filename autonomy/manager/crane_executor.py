@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.rotator_estimate import RotatorEstimate
-from autonomy.grasp.planner import Chooser
+from autonomy.grasp.planner import GraspSelector
 from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.grasp import Grasp
 from autonomy.manager.load_bookkeeping import Cargo
@@ -47,8 +47,8 @@ class Hand:
         profile_hash: int,
         outlook: Outlook,
         cargo: Cargo,
-        chooser: Chooser,
-        emptier: Chooser,
+        chooser: GraspSelector,
+        emptier: GraspSelector,
         motions: MotionPlanner,
         lease_ns: int,
         key: bytes | None,

@@ -16,42 +16,42 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.distances import apart, between
-from autonomy.motion.obstacles import Held, Surroundings, swept
-from autonomy.motion.timing import PENDULUM_S
+from autonomy.motion.distances import obstacle_distances, motion_between_samples
+from autonomy.motion.obstacles import HeldLog, CollisionScene, swept_capsules
+from autonomy.motion.time_law import PENDULUM_S
 from autonomy.motion.trajectory import Trajectory
 
 MARGIN_M: Final = 0.10
 """Least clearance on the way, beyond the swing that is foreseen; near its ends a part may be as near to a thing as it
 is there."""
-SWAY_RAD: Final = 0.06
+ASSUMED_SWING_RAD: Final = 0.06
 """Lean of the hanging grapple that a way has room for before its law is known."""
-LEAVE_M: Final = 1.2
+DEPARTURE_ZONE_M: Final = 1.2
 """How far from its ends a way may still be near what is near there."""
-TOUCH_M: Final = 0.02
+CONTACT_ALLOWANCE_M: Final = 0.02
 """What is that near at an end may also come a little nearer: it is gripped or lies there."""
-SAMPLES: Final = 49
-FAR_M: Final = 0.8
+SAMPLE_COUNT: Final = 49
+BROAD_PHASE_M: Final = 0.8
 """Beyond this from all that moves a thing is not looked at; more than radii, margin and sway together."""
-_DAMPING: Final = 0.03
+_DAMPING_RATIO: Final = 0.03
 
 
-def spare(arm: Arm, motion: Trajectory, around: Surroundings, held: Held | None = None) -> tuple[float, str]:
+def clearance_reserve(arm: Arm, motion: Trajectory, around: CollisionScene, held: HeldLog | None = None) -> tuple[float, str]:
     """By how much any motion is clearer than asked for [m], negative where it is too near, and of what from what."""
-    time_s = np.linspace(0.0, motion.duration_s, SAMPLES)
+    time_s = np.linspace(0.0, motion.duration_s, SAMPLE_COUNT)
     q = np.array([motion.at(t)[0] for t in time_s])
-    pin = pins(arm, np.array([arm.pose(row) for row in q.tolist()]))
-    found, why, _ = judged(arm, q, pin, around, held, time_s[1])
+    pin = pin_positions(arm, np.array([arm.pose(row) for row in q.tolist()]))
+    found, why, _ = evaluate_clearance(arm, q, pin, around, held, time_s[1])
     return found, why
 
 
-def pins(arm: Arm, poses: np.ndarray) -> np.ndarray:
+def pin_positions(arm: Arm, poses: np.ndarray) -> np.ndarray:
     """True pin positions (n, 3) of poses (n, 5)."""
     theta = poses[:, 0] + arm.profile.kinematics.theta1_offset_rad
     return np.column_stack([poses[:, 1] * np.cos(theta), poses[:, 1] * np.sin(theta), poses[:, 2]])
 
 
-def _swung(pin: np.ndarray, step_s: float) -> np.ndarray:
+def _predicted_swing(pin: np.ndarray, step_s: float) -> np.ndarray:
     """Lean of the hanging grapple [rad] under a pin (n, 3) that moves in steps of time, (pendulums, n, 2)."""
     fine = np.linspace(0.0, len(pin) - 1.0, (len(pin) - 1) * 4 + 1)
     curve = CubicSpline(np.arange(len(pin)), pin[:, :2], bc_type="clamped")
@@ -60,51 +60,51 @@ def _swung(pin: np.ndarray, step_s: float) -> np.ndarray:
     for period in (PENDULUM_S[0], PENDULUM_S[-1]):
         w = 2.0 * pi / period * step_s / 4
         # Semi-implicit steps of lean'' = -w^2 (lean + push) - 2 z w lean'.
-        damp = 1.0 - 2.0 * _DAMPING * w
+        damp = 1.0 - 2.0 * _DAMPING_RATIO * w
         leans.append(lfilter([0.0, -(w**2)], [1.0, -(1.0 + damp - w**2), damp], push, axis=0)[::4])
     return np.stack(leans)
 
 
-def judged(
-    arm: Arm, q: np.ndarray, pin: np.ndarray, around: Surroundings, held: Held | None, step_s: float | None
+def evaluate_clearance(
+    arm: Arm, q: np.ndarray, pin: np.ndarray, around: CollisionScene, held: HeldLog | None, step_s: float | None
 ) -> tuple[float, str, int]:
     """By how much the least clearance is over (negative: under) what is asked for, of what from what, and where.
 
     ``step_s``: time between samples; None where no time is known yet, with room for some swing.  Beyond what is asked
     for, what is given may be less than it is.
     """
-    body = swept(arm.profile, q, pin, held)
+    body = swept_capsules(arm.profile, q, pin, held)
     deep = body.depth(body.b)
     depth, n = float(np.max(deep)), len(pin)
     away = [np.linalg.norm(pin - pin[i], axis=1) for i in (0, -1)]
-    left = np.clip(2.0 * (np.minimum(*away) / LEAVE_M - 1.0), 0.0, 1.0)
-    room = between(body)
+    left = np.clip(2.0 * (np.minimum(*away) / DEPARTURE_ZONE_M - 1.0), 0.0, 1.0)
+    room = motion_between_samples(body)
     if step_s is None:
-        room = room + np.where(body.hangs, SWAY_RAD * np.max(deep[..., 0], axis=0), 0.0)
+        room = room + np.where(body.hangs, ASSUMED_SWING_RAD * np.max(deep[..., 0], axis=0), 0.0)
     room = room * left[:, None]
     low, high = np.min(np.minimum(body.a, body.b), axis=(0, 1)), np.max(np.maximum(body.a, body.b), axis=(0, 1))
-    things = around.standing.near(low - FAR_M, high + FAR_M)
+    things = around.standing.near(low - BROAD_PHASE_M, high + BROAD_PHASE_M)
     # All samples with every lean, and both ends once more as they stand, at once.
-    leans = [] if step_s is None else [body.shifted(lean * depth, depth) for lean in _swung(pin, step_s)]
+    leans = [] if step_s is None else [body.shifted(lean * depth, depth) for lean in _predicted_swing(pin, step_s)]
     bodies = [*(leans or [body]), body.rows([0, -1])]
     whole = replace(body, a=np.concatenate([b.a for b in bodies]), b=np.concatenate([b.b for b in bodies]))
     times = len(bodies) - 1
-    near = np.concatenate([np.tile(room, (times, 1)), np.zeros((2, room.shape[1]))]) + MARGIN_M + TOUCH_M
-    found = apart(things, whole, near[:, :, None])
-    spare_m = found[:-2].reshape(times, n, *found.shape[1:]) - _needed(found[-2:], away, room)
+    near = np.concatenate([np.tile(room, (times, 1)), np.zeros((2, room.shape[1]))]) + MARGIN_M + CONTACT_ALLOWANCE_M
+    found = obstacle_distances(things, whole, near[:, :, None])
+    spare_m = found[:-2].reshape(times, n, *found.shape[1:]) - _required_clearance(found[-2:], away, room)
     _, i, m, k = np.unravel_index(int(np.argmin(spare_m)), spare_m.shape)
     x, y, z = pin[i]
     why = f"the {body.names[m]} would come too near to {things.names[k]} at ({x:.2f}, {y:.2f}, {z:.2f}) m"
     return float(spare_m.min()), why, int(i)
 
 
-def _needed(ends: np.ndarray, away: list[np.ndarray], room: np.ndarray) -> np.ndarray:
+def _required_clearance(ends: np.ndarray, away: list[np.ndarray], room: np.ndarray) -> np.ndarray:
     """The clearance asked for (n, m, k), given what it is at both ends (2, m, k) and how far samples are from each.
 
     It is the margin, or near an end what there is at that end: a part may leave a thing at which it stands.
     """
     need = np.full((len(room), *ends.shape[1:]), MARGIN_M)
-    for here, far in zip(ends - TOUCH_M, away, strict=True):
-        close = far < LEAVE_M
+    for here, far in zip(ends - CONTACT_ALLOWANCE_M, away, strict=True):
+        close = far < DEPARTURE_ZONE_M
         need[close] = np.minimum(need[close], here)
     return need + room[:, :, None]

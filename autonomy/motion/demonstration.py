@@ -15,25 +15,25 @@ from typing import Final
 
 import numpy as np
 
-from can_dbc.codec import Database
+from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame
-from machine.encoder import position_from_counts
+from machine.sensing.encoder import position_from_counts
 from machine.joints import JOINTS, Joint
-from machine.kinematics import pin_position
+from machine.geometry.kinematics import pin_position
 from machine.profile import Profile, joint
 
 AXES: Final = (Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT)
 """The joints of a demonstration (paper B: q1 to q4)."""
 GRID_S: Final = 0.05
-SMOOTH_S: Final = 0.15
+SMOOTHING_SIGMA_S: Final = 0.15
 """Standard deviation of the smoothing: shorter than a hand's motion, longer than its tremor."""
-MOVING: Final = 0.03
+MOVING_SHARE: Final = 0.03
 """Share of a joint's greatest speed from which it moves."""
 PAUSE_S: Final = 0.7
 """A rest at least this long ends a motion; shorter ones are hesitation within it."""
-LEAST_WAY_M: Final = 1.0
-LEAST_S: Final = 1.5
-_HEAD: Final = ("motion", "time_s", "slew_rad", "lift_rad", "tilt_rad", "ext_m")
+MIN_PIN_TRAVEL_M: Final = 1.0
+MIN_DURATION_S: Final = 1.5
+_CSV_HEADER: Final = ("motion", "time_s", "slew_rad", "lift_rad", "tilt_rad", "ext_m")
 
 
 class RecordingRefused(ValueError):
@@ -41,14 +41,14 @@ class RecordingRefused(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class JointTrack:
     """Positions (n, 4) of `AXES` [rad, m] at times (n,) [s], on an even grid."""
 
     time_s: np.ndarray
     position: np.ndarray
 
 
-def track(profile: Profile, database: Database, frames: Iterable[Frame]) -> Track:
+def joint_track(profile: Profile, database: Database, frames: Iterable[Frame]) -> JointTrack:
     """The joints over time from the encoder frames of a crane bus, raw, every `GRID_S` from the first to the last.
 
     Raises:
@@ -74,14 +74,14 @@ def track(profile: Profile, database: Database, frames: Iterable[Frame]) -> Trac
         if len(stamps) < 2:
             raise RecordingRefused(f"the recording holds no frames {e.message} of the {j.name.lower()} encoder")
     begin, end = max(h[0][0] for h in heard), min(h[0][-1] for h in heard)
-    if end - begin < LEAST_S * 1e9:
+    if end - begin < MIN_DURATION_S * 1e9:
         raise RecordingRefused(f"the recording holds {max(0, end - begin) * 1e-9:.1f} s of all encoders together")
     time_s = np.arange(int((end - begin) * 1e-9 / GRID_S) + 1) * GRID_S
     columns = [
         np.interp(time_s, (np.array(t) - begin) * 1e-9, _unwrapped(e, v))
         for e, (t, v) in zip(encoders, heard, strict=True)
     ]
-    return Track(time_s, np.column_stack(columns))
+    return JointTrack(time_s, np.column_stack(columns))
 
 
 def _unwrapped(encoder, positions: list[float]) -> np.ndarray:  # type: ignore[no-untyped-def]
@@ -91,7 +91,7 @@ def _unwrapped(encoder, positions: list[float]) -> np.ndarray:  # type: ignore[n
     return np.unwrap(positions, period=encoder.total_counts * encoder.unit_per_count)
 
 
-def smooth(positions: np.ndarray, sigma_s: float = SMOOTH_S) -> np.ndarray:
+def smoothed(positions: np.ndarray, sigma_s: float = SMOOTHING_SIGMA_S) -> np.ndarray:
     """Positions (n, m) every `GRID_S` without tremor and noise and without delay; the ends stay."""
     half = int(np.ceil(4.0 * sigma_s / GRID_S))
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * GRID_S / sigma_s) ** 2)
@@ -100,31 +100,31 @@ def smooth(positions: np.ndarray, sigma_s: float = SMOOTH_S) -> np.ndarray:
     return np.column_stack([np.convolve(column, kernel, mode="valid") for column in padded.T])
 
 
-def cut(profile: Profile, whole: Track) -> tuple[Track, ...]:
+def segment_motions(profile: Profile, whole: JointTrack) -> tuple[JointTrack, ...]:
     """The point-to-point motions of a track, smoothed, each from rest to rest and from time 0."""
-    if len(whole.time_s) < LEAST_S / GRID_S:
+    if len(whole.time_s) < MIN_DURATION_S / GRID_S:
         return ()
-    y = smooth(whole.position)
+    y = smoothed(whole.position)
     limits = np.array([joint(profile, j).speed_limit for j in AXES])
-    moves = np.max(np.abs(np.gradient(y, GRID_S, axis=0)) / limits, axis=1) > MOVING
+    moves = np.max(np.abs(np.gradient(y, GRID_S, axis=0)) / limits, axis=1) > MOVING_SHARE
     at = np.flatnonzero(moves)
     if not at.size:
         return ()
     pieces = np.split(at, np.flatnonzero(np.diff(at) > PAUSE_S / GRID_S) + 1)
-    spare = int(2.0 * SMOOTH_S / GRID_S)
+    spare = int(2.0 * SMOOTHING_SIGMA_S / GRID_S)
     found = []
     for piece in pieces:
         first, last = max(0, piece[0] - spare), min(len(y) - 1, piece[-1] + spare)
         motion = y[first : last + 1]
         ends = [np.array(pin_position(profile.kinematics, q)) for q in (motion[0], motion[-1])]
-        if float(np.linalg.norm(ends[1] - ends[0])) >= LEAST_WAY_M:
-            found.append(Track(np.arange(len(motion)) * GRID_S, motion))
+        if float(np.linalg.norm(ends[1] - ends[0])) >= MIN_PIN_TRAVEL_M:
+            found.append(JointTrack(np.arange(len(motion)) * GRID_S, motion))
     return tuple(found)
 
 
-def to_text(profile_name: str, motions: Sequence[Track], every: int = 2) -> str:
+def format_demonstrations(profile_name: str, motions: Sequence[JointTrack], every: int = 2) -> str:
     """Demonstrations as a file: names in a comment and a head, then every ``every``-th sample."""
-    lines = [f"# demonstrations of {profile_name}; joint positions as recorded, smoothed", ",".join(_HEAD)]
+    lines = [f"# demonstrations of {profile_name}; joint positions as recorded, smoothed", ",".join(_CSV_HEADER)]
     for number, motion in enumerate(motions, 1):
         keep = sorted({*range(0, len(motion.time_s), every), len(motion.time_s) - 1})
         for t, q in zip(motion.time_s[keep], motion.position[keep], strict=True):
@@ -132,29 +132,29 @@ def to_text(profile_name: str, motions: Sequence[Track], every: int = 2) -> str:
     return "\n".join(lines) + "\n"
 
 
-def from_text(path: Path) -> tuple[str, tuple[Track, ...]]:
+def read_demonstrations(path: Path) -> tuple[str, tuple[JointTrack, ...]]:
     """Name of the machine and the motions of a file; raises RecordingRefused."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise RecordingRefused(f"{path} cannot be read ({error})") from None
-    if len(lines) < 3 or not lines[0].startswith("# demonstrations of ") or lines[1] != ",".join(_HEAD):
+    if len(lines) < 3 or not lines[0].startswith("# demonstrations of ") or lines[1] != ",".join(_CSV_HEADER):
         raise RecordingRefused(f"{path} is no file of demonstrations; give a recording or a file that `learn` reads")
     name = lines[0].removeprefix("# demonstrations of ").split(";")[0].strip()
     try:
         table = np.array([[float(x) for x in line.split(",")] for line in lines[2:] if line])
-        assert table.shape[1] == len(_HEAD) and np.all(np.isfinite(table))
+        assert table.shape[1] == len(_CSV_HEADER) and np.all(np.isfinite(table))
     except (ValueError, AssertionError, IndexError):
-        raise RecordingRefused(f"{path} holds a line that is not {len(_HEAD)} numbers") from None
+        raise RecordingRefused(f"{path} holds a line that is not {len(_CSV_HEADER)} numbers") from None
     motions = []
     for number in np.unique(table[:, 0]):
         rows = table[table[:, 0] == number]
         time_s = np.arange(int(np.ceil(rows[-1, 1] / GRID_S - 1e-6)) + 1) * GRID_S
         curve = [np.interp(time_s, rows[:, 1], column) for column in rows[:, 2:].T]
-        motions.append(Track(time_s, smooth(np.column_stack(curve), GRID_S)))
+        motions.append(JointTrack(time_s, smoothed(np.column_stack(curve), GRID_S)))
     return name, tuple(motions)
 
 
-def joints_of(motion: Track) -> np.ndarray:
+def joint_vectors(motion: JointTrack) -> np.ndarray:
     """Joint vectors (n, 5) of a motion; the rotator, which nobody measures, at 0."""
     return np.column_stack([motion.position, np.zeros((len(motion.position), len(JOINTS) - len(AXES)))])

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.motion.obstacles import Ground, Standing, Surroundings, Swept
+from autonomy.motion.obstacles import Ground, ObstacleArrays, CollisionScene, SweptCapsules
 
 _SMALL: Final = 1e-12
 
@@ -59,19 +59,19 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("...i,...i->...", a, b)
 
 
-def clearances(around: Surroundings, body: Swept, near_m: float = np.inf) -> np.ndarray:
-    """Distances (n, m, k) of m parts at n samples from the ground, the boxes and the rods (`Surroundings.names`).
+def clearances(around: CollisionScene, body: SweptCapsules, near_m: float = np.inf) -> np.ndarray:
+    """Distances (n, m, k) of m parts at n samples from the ground, the boxes and the rods (`CollisionScene.names`).
 
     Beyond ``near_m`` what is given may be less than the distance, but not less than ``near_m``.
     """
-    return apart(around.standing, body, np.array(near_m))
+    return obstacle_distances(around.standing, body, np.array(near_m))
 
 
-def apart(things: Standing, body: Swept, near_m: np.ndarray) -> np.ndarray:
+def obstacle_distances(things: ObstacleArrays, body: SweptCapsules, near_m: np.ndarray) -> np.ndarray:
     """The same from things as arrays; ``near_m`` broadcasts to (n, m, 1)."""
     limit = near_m + body.radius[:, None]
     middle, way = (body.a + body.b) / 2, (body.b - body.a) / 2
-    columns = [_over_ground(things.ground, body.a, body.b)]
+    columns = [_height_above_ground(things.ground, body.a, body.b)]
     # Axis by axis a part and a thing are at least as far from each other as what encloses them.
     x, y, z = (middle[..., i, None] - things.center[:, i] for i in range(3))
     cos_, sin_ = things.turn.T
@@ -79,12 +79,12 @@ def apart(things: Standing, body: Swept, near_m: np.ndarray) -> np.ndarray:
     wx, wy, wz = (way[..., i, None] for i in range(3))
     wx, wy = cos_ * wx + sin_ * wy, cos_ * wy - sin_ * wx
     hx, hy, hz = things.half.T
-    far = _beyond(np.abs(x) - np.abs(wx) - hx, np.abs(y) - np.abs(wy) - hy, np.abs(z) - np.abs(wz) - hz)
+    far = _gap_length(np.abs(x) - np.abs(wx) - hx, np.abs(y) - np.abs(wy) - hy, np.abs(z) - np.abs(wz) - hz)
     i, m, k = np.nonzero(far < limit)
     at, to = np.stack([x[i, m, k], y[i, m, k], z[i, m, k]], -1), np.stack([wx[i, m, k], wy[i, m, k], wz[i, m, 0]], -1)
     far[i, m, k] = segment_box(at - to, at + to, things.half[k])
     columns.append(far)
-    far = _beyond(
+    far = _gap_length(
         *(
             np.abs(middle[..., i, None] - things.middle[:, i]) - np.abs(way[..., i, None]) - np.abs(things.along[:, i])
             for i in range(3)
@@ -98,13 +98,13 @@ def apart(things: Standing, body: Swept, near_m: np.ndarray) -> np.ndarray:
     return np.concatenate(columns, axis=2) - body.radius[:, None]
 
 
-def _beyond(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _gap_length(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Length of a gap (n, m, k) given by what it is along each axis; negative is none."""
     x, y, z = np.maximum(x, 0.0), np.maximum(y, 0.0), np.maximum(z, 0.0)
     return np.sqrt(x * x + y * y + z * z)
 
 
-def _over_ground(ground: Ground, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _height_above_ground(ground: Ground, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Height of both ends and the middle over the ground, the least of them, (n, m, 1)."""
     heights = []
     for share in (0.0, 0.5, 1.0):
@@ -113,14 +113,14 @@ def _over_ground(ground: Ground, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.min(np.stack(heights, axis=-1), axis=-1)[..., None]
 
 
-def between(body: Swept) -> np.ndarray:
+def motion_between_samples(body: SweptCapsules) -> np.ndarray:
     """By how much a part may be nearer between two samples than at either, (n, m): half of its movement."""
     move = np.maximum(np.linalg.norm(np.diff(body.a, axis=0), axis=2), np.linalg.norm(np.diff(body.b, axis=0), axis=2))
     nothing = np.zeros((1, move.shape[1]))
     return 0.5 * np.maximum(np.concatenate([nothing, move]), np.concatenate([move, nothing]))
 
 
-def least(around: Surroundings, body: Swept) -> tuple[float, str, str, int]:
+def least_clearance(around: CollisionScene, body: SweptCapsules) -> tuple[float, str, str, int]:
     """The least clearance [m], of which part from what, and at which sample."""
     apart = clearances(around, body)
     i, m, k = np.unravel_index(int(np.argmin(apart)), apart.shape)

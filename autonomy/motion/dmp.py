@@ -1,6 +1,6 @@
 """Dynamic movement primitives: a point-to-point motion learned from demonstrations, replayed to any goal.
 
-Ijspeert 2013 with the goal term of Pastor 2009 (machines.md 6; paper B 3.2.5), per coordinate y and share of time:
+Ijspeert 2013 with the goal term of Pastor 2009 (docs/reference/machines.md section 6; paper B 3.2.5), per coordinate y and share of time:
 
     tau z' = alpha (beta (g - y) - z) + alpha beta (F(x) - (g - y0) x),   tau y' = z,   tau x' = -alpha_x x
     F(x) = x sum psi_i w_i / sum psi_i,   psi_i = exp(-h_i (x - c_i)^2)
@@ -26,14 +26,14 @@ ALPHA: Final = 25.0
 BETA: Final = ALPHA / 4.0
 ALPHA_X: Final = -float(np.log(0.01))
 """The phase x falls to 0.01 over the duration."""
-BASES: Final = 40
-OVERLAP: Final = 0.2
+BASIS_COUNT: Final = 40
+BASIS_OVERLAP: Final = 0.2
 """A basis function at the centre of the next."""
-LANDING: Final = 0.4
+CORRECTION_SHARE: Final = 0.4
 """Last share of the duration in which what the phase leaves at its end is made up for: some percent of what is new in
 the goal."""
-_STEPS: Final = 400
-_FEWEST: Final = 8
+_STEP_COUNT: Final = 400
+_MIN_SAMPLES: Final = 8
 
 
 class DemonstrationRefused(ValueError):
@@ -60,11 +60,11 @@ class Dmp:
         if not (np.all(np.isfinite(start)) and np.all(np.isfinite(goal))):
             raise ValueError("start and goal of a primitive must be finite numbers")
         way = goal - start
-        share = np.arange(_STEPS + 1) / _STEPS
+        share = np.arange(_STEP_COUNT + 1) / _STEP_COUNT
         x = np.exp(-ALPHA_X * share)
         force = _design(x, self.weights.shape[1]) @ self.weights.T * np.where(self.scaled, way, 1.0)
-        y = start + _driven(way - way * x[:, None] + force)
-        return Rollout(share * self.duration_s, _landed(y, goal))
+        y = start + _filtered(way - way * x[:, None] + force)
+        return Rollout(share * self.duration_s, _ending_at_goal(y, goal))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class Rollout:
 def learn(
     demonstrations: Sequence[tuple[np.ndarray, np.ndarray]],
     scaled: Sequence[bool] | None = None,
-    bases: int = BASES,
+    bases: int = BASIS_COUNT,
     least_way: float = 0.2,
 ) -> Dmp:
     """A primitive from demonstrations (times (n,) [s], positions (n, D)), each from rest to rest.
@@ -115,7 +115,7 @@ def learn(
     flags = tuple(scaled) if scaled is not None else (False,) * count
     above, below, spans = np.zeros((count, bases)), np.zeros((count, bases)), []
     for number, (time_s, position) in enumerate(demonstrations, 1):
-        share, y, span = _checked(number, time_s, position, count)
+        share, y, span = _normalized(number, time_s, position, count)
         spans.append(span)
         x = np.exp(-ALPHA_X * share)
         velocity = np.gradient(y, share, axis=0)
@@ -135,9 +135,9 @@ def learn(
     return Dmp(float(np.mean(spans)), above / below, flags)
 
 
-def _landed(y: np.ndarray, goal: np.ndarray) -> np.ndarray:
+def _ending_at_goal(y: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """The same motion (n, D) at rest at the goal at its end, by a polynomial over its last part."""
-    last = int(LANDING * _STEPS)
+    last = int(CORRECTION_SHARE * _STEP_COUNT)
     h = 1.0 / last
     tail = y[-3:]
     speed, bend = (tail[2] - tail[1]) / h, (tail[2] - 2.0 * tail[1] + tail[0]) / h**2
@@ -150,12 +150,12 @@ def _landed(y: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return out
 
 
-def _checked(number: int, time_s: np.ndarray, position: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, float]:
+def _normalized(number: int, time_s: np.ndarray, position: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, float]:
     t, y = np.asarray(time_s, dtype=float), np.asarray(position, dtype=float)
     if y.ndim != 2 or t.shape != y.shape[:1] or y.shape[1] != count:
         raise DemonstrationRefused(f"demonstration {number} has {t.shape} times and {y.shape} positions")
-    if len(t) < _FEWEST:
-        raise DemonstrationRefused(f"demonstration {number} has {len(t)} samples; at least {_FEWEST} are needed")
+    if len(t) < _MIN_SAMPLES:
+        raise DemonstrationRefused(f"demonstration {number} has {len(t)} samples; at least {_MIN_SAMPLES} are needed")
     if not (np.all(np.isfinite(t)) and np.all(np.isfinite(y))):
         raise DemonstrationRefused(f"demonstration {number} holds a number that is not finite")
     if np.any(np.diff(t) <= 0.0):
@@ -165,10 +165,10 @@ def _checked(number: int, time_s: np.ndarray, position: np.ndarray, count: int) 
 
 
 def _centres(bases: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres in the phase, evenly in time, and widths that overlap by `OVERLAP`."""
+    """Centres in the phase, evenly in time, and widths that overlap by `BASIS_OVERLAP`."""
     centres = np.exp(-ALPHA_X * np.linspace(0.0, 1.0, bases))
     gaps = np.diff(centres)
-    return centres, -np.log(OVERLAP) / np.append(gaps, gaps[-1]) ** 2
+    return centres, -np.log(BASIS_OVERLAP) / np.append(gaps, gaps[-1]) ** 2
 
 
 def _activations(x: np.ndarray, bases: int) -> np.ndarray:
@@ -183,11 +183,11 @@ def _design(x: np.ndarray, bases: int) -> np.ndarray:
     return x[:, None] * _activations(x, bases)
 
 
-def _driven(pull: np.ndarray) -> np.ndarray:
-    """y'' + alpha y' + alpha beta y = alpha beta pull from rest at 0, for pull (n, D) every 1 / `_STEPS`, straight
+def _filtered(pull: np.ndarray) -> np.ndarray:
+    """y'' + alpha y' + alpha beta y = alpha beta pull from rest at 0, for pull (n, D) every 1 / `_STEP_COUNT`, straight
     between: exact, as alpha = 4 beta makes the double pole p = -alpha / 2.
     """
-    h, p = 1.0 / _STEPS, -ALPHA / 2.0
+    h, p = 1.0 / _STEP_COUNT, -ALPHA / 2.0
     e = np.exp(p * h)
     free = e * np.array([[1.0 - p * h, h], [-p * p * h, 1.0 + p * h]])
     # With y - pull as the state, a straight pull is a particular solution: pull - slope * alpha / (alpha beta).

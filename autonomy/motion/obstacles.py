@@ -15,24 +15,25 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.motion.arm import Arm, Pose
-from autonomy.perception.logs import LogObservation
-from machine.grapple import grapple_yaw, lowest_tip_below_pin_m, pin_to_tong_pivot_m
+from autonomy.motion.arm import Arm
+from autonomy.motion.pose import Pose
+from autonomy.perception.log_list.observation import LogObservation
+from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m, pin_to_tong_pivot_m
 from machine.joints import Joint
 from machine.profile import Bunk, Profile
 
-STAKE_M: Final = 0.08
-FLOOR_M: Final = 0.12
-FRAME_HALF_M: Final = 0.45
+STAKE_THICKNESS_M: Final = 0.08
+FLOOR_THICKNESS_M: Final = 0.12
+FRAME_HALF_WIDTH_M: Final = 0.45
 HOOD_M: Final = (0.6, 0.65, 0.6)
 """Where the hood begins ahead of the articulation, half its width, half its height."""
-AHEAD_M: Final = 0.85
-BEHIND_M: Final = 2.0
+FRONT_OVERHANG_M: Final = 0.85
+REAR_OVERHANG_M: Final = 2.0
 """The frames beyond their axles."""
-BOOM_M: Final = 0.17
-STICK_M: Final = 0.14
-GRAPPLE_M: Final = 0.20
-TONG_M: Final = 0.10
+BOOM_RADIUS_M: Final = 0.17
+STICK_RADIUS_M: Final = 0.14
+GRAPPLE_RADIUS_M: Final = 0.20
+JAW_RADIUS_M: Final = 0.10
 
 Ground = float | Callable[[np.ndarray, np.ndarray], np.ndarray]
 """A height, or heights at x and y."""
@@ -49,7 +50,7 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
-class Rod:
+class Capsule:
     """A capsule between two points."""
 
     name: str
@@ -59,7 +60,7 @@ class Rod:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class ObstacleArrays:
     """What stands still as arrays: k boxes (middles, half edges, cos and sin of their turn) and j rods (middles, half
     ways from end to end, radii); names of the ground and of them all.
     """
@@ -73,7 +74,7 @@ class Standing:
     along: np.ndarray
     radius: np.ndarray
 
-    def near(self, low: np.ndarray, high: np.ndarray) -> Standing:
+    def near(self, low: np.ndarray, high: np.ndarray) -> ObstacleArrays:
         """Without what is wholly outside of a range (3,) to (3,)."""
         wide = np.hypot(self.half[:, 0], self.half[:, 1])
         box = np.column_stack([wide, wide, self.half[:, 2]])
@@ -81,7 +82,7 @@ class Standing:
         boxes = np.all((self.center - box < high) & (self.center + box > low), axis=1)
         rods = np.all((self.middle - rod < high) & (self.middle + rod > low), axis=1)
         names = tuple(n for n, kept in zip(self.names, [True, *boxes, *rods], strict=True) if kept)
-        return Standing(
+        return ObstacleArrays(
             self.ground,
             names,
             self.center[boxes],
@@ -94,12 +95,12 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class CollisionScene:
     """What stands still about the crane."""
 
     ground: Ground
     boxes: tuple[Box, ...] = ()
-    rods: tuple[Rod, ...] = ()
+    rods: tuple[Capsule, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -107,11 +108,11 @@ class Surroundings:
         return ("the ground", *(b.name for b in self.boxes), *(r.name for r in self.rods))
 
     @cached_property
-    def standing(self) -> Standing:
+    def standing(self) -> ObstacleArrays:
         """The same as arrays."""
         yaw = np.array([b.yaw_rad for b in self.boxes])
         begin, end = (np.array([getattr(r, f) for r in self.rods]).reshape(-1, 3) for f in ("a_m", "b_m"))
-        return Standing(
+        return ObstacleArrays(
             self.ground,
             self.names,
             np.array([b.center_m for b in self.boxes]).reshape(-1, 3),
@@ -124,7 +125,7 @@ class Surroundings:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class HeldLog:
     """A log in the grapple: the point gripped is ``along_m`` from its middle, its axis ``skew_rad`` off the tongs' and
     ``tilt_rad`` off the level.
     """
@@ -136,7 +137,7 @@ class Held:
     tilt_rad: float = 0.0
 
 
-def held_log(arm: Arm, pose: Pose, log: LogObservation) -> Held:
+def held_log(arm: Arm, pose: Pose, log: LogObservation) -> HeldLog:
     """A log as it is held by a grapple at a pose: seen hanging in it, or lying where it will be gripped."""
     yaw = grapple_yaw(arm.profile, (pose.slew_rad, 0.0, 0.0, 0.0, pose.rot_rad)) - pi / 2
     skew = remainder(atan2(log.axis[1], log.axis[0]) - yaw, pi)
@@ -144,11 +145,11 @@ def held_log(arm: Arm, pose: Pose, log: LogObservation) -> Held:
     ahead = cos(yaw + skew), sin(yaw + skew)
     along = (x - log.center_m[0]) * ahead[0] + (y - log.center_m[1]) * ahead[1]
     up = log.axis[2] if log.axis[0] * ahead[0] + log.axis[1] * ahead[1] > 0.0 else -log.axis[2]
-    return Held(log.length_m, log.diameter_m, along, skew, asin(min(max(up, -1.0), 1.0)))
+    return HeldLog(log.length_m, log.diameter_m, along, skew, asin(min(max(up, -1.0), 1.0)))
 
 
 @dataclass(frozen=True, slots=True)
-class Swept:
+class SweptCapsules:
     """Moving rods: ends (n, m, 3) of m parts at n samples, radii (m,), names, and which of them hang (m,)."""
 
     a: np.ndarray
@@ -157,11 +158,11 @@ class Swept:
     names: tuple[str, ...]
     hangs: np.ndarray = field(repr=False)
 
-    def rows(self, at: list[int]) -> Swept:
+    def rows(self, at: list[int]) -> SweptCapsules:
         """Some samples alone."""
-        return Swept(self.a[at], self.b[at], self.radius, self.names, self.hangs)
+        return SweptCapsules(self.a[at], self.b[at], self.radius, self.names, self.hangs)
 
-    def shifted(self, offset: np.ndarray, depth_m: float) -> Swept:
+    def shifted(self, offset: np.ndarray, depth_m: float) -> SweptCapsules:
         """With the hanging parts swung: ``offset`` (n, 2) is how far a point ``depth_m`` below the pin is aside."""
         move = np.zeros((len(offset), 1, 3))
         move[:, 0, :2] = offset
@@ -169,7 +170,7 @@ class Swept:
         # Parts that begin at the pin stay there at their upper end; the log moves as a whole.
         top = self.a + move * hanging * (self.depth(self.a) / depth_m)
         low = self.b + move * hanging * (self.depth(self.b) / depth_m)
-        return Swept(top, low, self.radius, self.names, self.hangs)
+        return SweptCapsules(top, low, self.radius, self.names, self.hangs)
 
     def depth(self, points: np.ndarray) -> np.ndarray:
         """How far points (n, m, 3) are below the pin, (n, m, 1)."""
@@ -181,19 +182,19 @@ def bunk_boxes(bunk: Bunk) -> tuple[Box, ...]:
     """The floor, and each row of stakes as a wall: a log is to pass over it wherever they stand."""
     c, s = cos(bunk.yaw_rad), sin(bunk.yaw_rad)
     x, y = bunk.center_m
-    side = bunk.width_m / 2 + STAKE_M / 2
+    side = bunk.width_m / 2 + STAKE_THICKNESS_M / 2
     middle_z = bunk.floor_z_m + bunk.stake_height_m / 2
     walls = tuple(
         Box(
             f"the {name} stakes",
             (x - k * side * s, y + k * side * c, middle_z),
-            (bunk.length_m / 2, STAKE_M / 2, bunk.stake_height_m / 2),
+            (bunk.length_m / 2, STAKE_THICKNESS_M / 2, bunk.stake_height_m / 2),
             bunk.yaw_rad,
         )
         for name, k in (("left", 1.0), ("right", -1.0))
     )
-    floor = (bunk.length_m / 2, bunk.width_m / 2, FLOOR_M / 2)
-    return (Box("the bunk's floor", (x, y, bunk.floor_z_m - FLOOR_M / 2), floor, bunk.yaw_rad), *walls)
+    floor = (bunk.length_m / 2, bunk.width_m / 2, FLOOR_THICKNESS_M / 2)
+    return (Box("the bunk's floor", (x, y, bunk.floor_z_m - FLOOR_THICKNESS_M / 2), floor, bunk.yaw_rad), *walls)
 
 
 def carrier_boxes(profile: Profile) -> tuple[Box, ...]:
@@ -208,10 +209,10 @@ def carrier_boxes(profile: Profile) -> tuple[Box, ...]:
         x, y = at[0] - x0, at[1] - y0
         return Box(name, (turn * x + s * y, turn * y - s * x, at[2] - z0), half, -c.crane_yaw_rad)
 
-    front, rear = c.front_axle_m + AHEAD_M, c.rear_axle_m + BEHIND_M
+    front, rear = c.front_axle_m + FRONT_OVERHANG_M, c.rear_axle_m + REAR_OVERHANG_M
     wheel = (c.wheel_radius_m, c.wheel_width_m / 2, c.wheel_radius_m)
     return (
-        box("the rear frame", (-rear / 2, 0.0, 0.1), (rear / 2, FRAME_HALF_M, 0.2)),
+        box("the rear frame", (-rear / 2, 0.0, 0.1), (rear / 2, FRAME_HALF_WIDTH_M, 0.2)),
         box("the front half", ((front + HOOD_M[0]) / 2, 0.0, HOOD_M[2] / 2), ((front - HOOD_M[0]) / 2, *HOOD_M[1:])),
         *(
             box("a wheel", (axle, side * c.track_width_m / 2, -c.arm_drop_low_m), wheel)
@@ -221,37 +222,37 @@ def carrier_boxes(profile: Profile) -> tuple[Box, ...]:
     )
 
 
-def log_rods(logs: Iterable[LogObservation]) -> tuple[Rod, ...]:
+def log_capsules(logs: Iterable[LogObservation]) -> tuple[Capsule, ...]:
     """Logs as rods; their round ends stay inside of them."""
     rods = []
     for log in logs:
         half = max(log.length_m - log.diameter_m, 0.0) / 2
         ends = ((c - half * a, c + half * a) for c, a in zip(log.center_m, log.axis, strict=True))
         a, b = zip(*ends, strict=True)
-        rods.append(Rod(f"log {log.id}", a, b, log.diameter_m / 2))
+        rods.append(Capsule(f"log {log.id}", a, b, log.diameter_m / 2))
     return tuple(rods)
 
 
-def tree(x_m: float, y_m: float, radius_m: float, foot_z_m: float, height_m: float = 15.0, number: int = 1) -> Rod:
+def tree_capsule(x_m: float, y_m: float, radius_m: float, foot_z_m: float, height_m: float = 15.0, number: int = 1) -> Capsule:
     """A standing tree."""
-    return Rod(f"tree {number}", (x_m, y_m, foot_z_m), (x_m, y_m, foot_z_m + height_m), radius_m)
+    return Capsule(f"tree {number}", (x_m, y_m, foot_z_m), (x_m, y_m, foot_z_m + height_m), radius_m)
 
 
-def surroundings(
+def collision_scene(
     profile: Profile,
     logs: Iterable[LogObservation] = (),
-    trees: Iterable[Rod] = (),
+    trees: Iterable[Capsule] = (),
     ground: Ground | None = None,
     without: Iterable[int] = (),
-) -> Surroundings:
+) -> CollisionScene:
     """The machine's own obstacles, the logs but for those ``without`` (the one to grasp), the trees and the ground."""
     left_out = set(without)
-    rods = (*log_rods(log for log in logs if log.id not in left_out), *trees)
+    rods = (*log_capsules(log for log in logs if log.id not in left_out), *trees)
     level = profile.workspace.ground_z_m if ground is None else ground
-    return Surroundings(level, (*carrier_boxes(profile), *bunk_boxes(profile.bunk)), rods)
+    return CollisionScene(level, (*carrier_boxes(profile), *bunk_boxes(profile.bunk)), rods)
 
 
-def swept(profile: Profile, q: np.ndarray, pin: np.ndarray, held: Held | None, opened: bool = True) -> Swept:
+def swept_capsules(profile: Profile, q: np.ndarray, pin: np.ndarray, held: HeldLog | None, opened: bool = True) -> SweptCapsules:
     """The crane at joints (n, 5) whose pin truly is at (n, 3), with what it holds; ``opened``: its tongs."""
     kin, n = profile.kinematics, len(q)
     theta = q[:, Joint.SLEW] + kin.theta1_offset_rad
@@ -269,15 +270,15 @@ def swept(profile: Profile, q: np.ndarray, pin: np.ndarray, held: Held | None, o
     tongs = profile.grapple.tongs
     pivot = pin - np.array([0.0, 0.0, pin_to_tong_pivot_m(kin)])
     parts: list[tuple[str, np.ndarray, np.ndarray, float, bool]] = [
-        ("boom", foot, elbow, BOOM_M, False),
-        ("stick", elbow, pin, STICK_M, False),
-        ("grapple", pin, pivot, GRAPPLE_M, True),
+        ("boom", foot, elbow, BOOM_RADIUS_M, False),
+        ("stick", elbow, pin, STICK_RADIUS_M, False),
+        ("grapple", pin, pivot, GRAPPLE_RADIUS_M, True),
     ]
     half_gap = tongs.half_gap_m[0] if opened and held is None else 0.25
     deep = tongs.tip_below_pin_m[0] if opened and held is None else lowest_tip_below_pin_m(tongs)
     for side in (-1.0, 1.0):
-        tip = pin + side * half_gap * opening - np.array([0.0, 0.0, deep - TONG_M])
-        parts.append(("tong", pivot, tip, TONG_M, True))
+        tip = pin + side * half_gap * opening - np.array([0.0, 0.0, deep - JAW_RADIUS_M])
+        parts.append(("tong", pivot, tip, JAW_RADIUS_M, True))
     if held is not None:
         turn = yaw - pi / 2 + held.skew_rad
         level, up = cos(held.tilt_rad), sin(held.tilt_rad)
@@ -287,4 +288,4 @@ def swept(profile: Profile, q: np.ndarray, pin: np.ndarray, held: Held | None, o
         half = max(held.length_m - held.diameter_m, 0.0) / 2
         parts.append(("log", middle - half * axis, middle + half * axis, held.diameter_m / 2, True))
     names, a, b, radius, hangs = zip(*parts, strict=True)
-    return Swept(np.stack(a, 1), np.stack(b, 1), np.array(radius), names, np.array(hangs))
+    return SweptCapsules(np.stack(a, 1), np.stack(b, 1), np.array(radius), names, np.array(hangs))

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from typing import Final, Protocol
 
-from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, SpoolKnot, SpoolTest, encode
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, SpoolKnot, SpoolTest
+from can_dbc.messages.datagrams import encode
 
 PERIOD_NS: Final = 50_000_000
-HORIZON_KNOTS: Final = 8
+HORIZON_KNOT_COUNT: Final = 8
 
 Axes = tuple[float, ...]
 
@@ -56,11 +57,11 @@ class SetpointStream:
         second.
         """
         knots = []
-        for index in range(HORIZON_KNOTS + 1):
+        for index in range(HORIZON_KNOT_COUNT + 1):
             after_ns = index * PERIOD_NS
             position, velocity = motion.at(time_s + rate * after_ns * 1e-9)
             knots.append(Knot(after_ns, position, tuple(rate * v for v in velocity)))
-        end_s = time_s + rate * HORIZON_KNOTS * PERIOD_NS * 1e-9
+        end_s = time_s + rate * HORIZON_KNOT_COUNT * PERIOD_NS * 1e-9
         setpoint = CraneSetpoint(
             self._next(now_ns),
             self._profile_hash,

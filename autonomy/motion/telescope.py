@@ -8,52 +8,51 @@ and the pump, has least to do.  Speeds only, no laws; no clock, no randomness.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
+from autonomy.motion.arm_kinematics import ArmKinematics
+from autonomy.motion.pose import Pose
 from machine.joints import Joint
 from machine.profile import joint_limits
 
-if TYPE_CHECKING:
-    from autonomy.motion.arm import Arm, Pose
-
-COUNT: Final = 13
+EXTENSION_COUNT: Final = 13
 """Extensions that are compared."""
 _SAMPLES: Final = 7
-_ALL: Final = 0.15
+_TOTAL_WORK_WEIGHT: Final = 0.15
 """Weight of all joints' work beside that of the one that has most to do."""
-AT_REST_M: Final = 0.2
+OUTER_RESERVE_M: Final = 0.2
 """What it keeps free at its outer end where the crane goes down: for what is not where it was seen."""
-SPARE_M: Final = 0.03
+END_RESERVE_M: Final = 0.03
 """What a telescope keeps free at its ends."""
 
 
-def extensions(arm: Arm) -> np.ndarray:
+def candidate_extensions(arm: ArmKinematics) -> np.ndarray:
     """Extensions to compare, m."""
     low, high = joint_limits(arm.profile)[Joint.EXT]
-    return np.linspace(low + SPARE_M, high - SPARE_M, COUNT)
+    return np.linspace(low + END_RESERVE_M, high - END_RESERVE_M, EXTENSION_COUNT)
 
 
-def easiest(arm: Arm, low: Pose, high: Pose, home: Pose) -> float | None:
+def fastest_extension(arm: ArmKinematics, low: Pose, high: Pose, home: Pose) -> float | None:
     """The extension of a pose from which the crane gets up and over home fastest; None where none serves at both
-    heights alike, with `AT_REST_M` to spare.
+    heights alike, with `OUTER_RESERVE_M` to spare.
     """
     least, most = joint_limits(arm.profile)[Joint.EXT]
-    free = np.linspace(least + SPARE_M, most - AT_REST_M, COUNT)
+    free = np.linspace(least + END_RESERVE_M, most - OUTER_RESERVE_M, EXTENSION_COUNT)
     heights = np.array([low, low.at_height(0.5 * (low.z_m + high.z_m)), high])
     poses = np.repeat(heights[None], len(free), axis=0)
     poses[:, :, 3] = free[:, None]
     _, outside = arm.joints_or_outside(poses.reshape(-1, 5))
-    any_way = extensions(arm)
-    home_s = np.min(work_s(arm, high, home, any_way, any_way), axis=1)
-    seconds = np.min(work_s(arm, low, high, free, any_way) + home_s, axis=1)
+    any_way = candidate_extensions(arm)
+    home_s = np.min(full_speed_times(arm, high, home, any_way, any_way), axis=1)
+    seconds = np.min(full_speed_times(arm, low, high, free, any_way) + home_s, axis=1)
     seconds = np.where(outside.reshape(len(free), 3).any(axis=1), np.inf, seconds)
     best = int(np.argmin(seconds))
     return float(free[best]) if np.isfinite(seconds[best]) else None
 
 
-def work_s(arm: Arm, start: Pose, goal: Pose, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def full_speed_times(arm: ArmKinematics, start: Pose, goal: Pose, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """How long a straight way takes at full speed, with every extension ``before`` (n,) and ``after`` it (m,), (n, m).
 
     Infinite where it leaves the crane's reach.
@@ -68,19 +67,19 @@ def work_s(arm: Arm, start: Pose, goal: Pose, before: np.ndarray, after: np.ndar
     middle = q.reshape(n, m, _SAMPLES, 5)[:, :, :-1] + 0.5 * step
     turned = np.sum(np.abs(step), axis=2) / arm.speed
     oil = arm.pump_load(middle.reshape(-1, 5), step.reshape(-1, 5)).reshape(n, m, -1).sum(axis=2)
-    seconds = np.maximum(np.max(turned, axis=2), oil) + _ALL * np.sum(turned, axis=2)
+    seconds = np.maximum(np.max(turned, axis=2), oil) + _TOTAL_WORK_WEIGHT * np.sum(turned, axis=2)
     return np.where(outside.reshape(n, m, _SAMPLES).any(axis=2), np.inf, seconds)
 
 
-def eased(arm: Arm, via: Sequence[Pose]) -> tuple[Pose, ...]:
+def with_fastest_extensions(arm: ArmKinematics, via: Sequence[Pose]) -> tuple[Pose, ...]:
     """The way with the extensions between its ends that leave least to do; as it came where none is in reach."""
     if len(via) < 3:
         return tuple(via)
-    free = extensions(arm)
+    free = candidate_extensions(arm)
     choices = [np.array([via[0].ext_m]), *[np.append(free, p.ext_m) for p in via[1:-1]], np.array([via[-1].ext_m])]
     best, came = np.zeros(1), []
     for k in range(len(via) - 1):
-        total = best[:, None] + work_s(arm, via[k], via[k + 1], choices[k], choices[k + 1])
+        total = best[:, None] + full_speed_times(arm, via[k], via[k + 1], choices[k], choices[k + 1])
         came.append(np.argmin(total, axis=0))
         best = np.min(total, axis=0)
     if not np.isfinite(best[0]):

@@ -1,6 +1,6 @@
 """A fast planner's time law: along a given way as fast as the limits allow, shaped so that the grapple hangs still.
 
-`autonomy.motion.timing` finds a law by linear programs in a few tenths of a second; this one takes some milliseconds.
+`autonomy.motion.time_law` finds a law by linear programs in a few tenths of a second; this one takes some milliseconds.
 It goes through the phase plane of progress and speed once backward and once forward (Bobrow 1985, Pham 2018), which is
 the fastest law under speeds, pump and accelerations, and then averages the progress over a window in time.  Averaging
 keeps the way, bounds the jerk by twice the acceleration over the window's first part, and takes out the swing whose
@@ -21,46 +21,46 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import nnls
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.timing import _GRAVITY_M_S2, _OMEGA, _POLES, SWING_RAD, Way
+from autonomy.motion.time_law import GRAVITY_M_S2, PENDULUM_RAD_S, PENDULUM_POLES, SWING_RAD, PathGeometry
 from autonomy.motion.trajectory import STEP_S
 from machine.joints import N_JOINTS
 
-GRID: Final = 128
+GRID_COUNT: Final = 128
 """Pieces of the way on which the phase plane is walked through."""
-FINE: Final = 4
+SAMPLES_PER_PIECE: Final = 4
 """Samples of the way's joints per piece."""
-JERK_S: Final = 0.24
+JERK_WINDOW_S: Final = 0.24
 """Least window: accelerations rise within it."""
 TAP_S: Final = 0.04
 """Impulses of a window stand so far apart, ..."""
-TAPS: Final = (0, 12, 18, 22, 26, 30, 34, 38, 43, 48, 53)
+TAP_COUNTS: Final = (0, 12, 18, 22, 26, 30, 34, 38, 43, 48, 53)
 """... and there are one of these numbers of them more than one: at most, a period of the slowest pendulum."""
-SEARCHES: Final = 3
+REFINEMENT_COUNT: Final = 3
 """How often the swing of a window is made straight about it: a way is bent, so two impulses do not just add up."""
-ROUNDS: Final = 2
-_LONGEST_S: Final = 60.0
+ROUND_COUNT: Final = 2
+_MAX_DURATION_S: Final = 60.0
 _TINY: Final = 1e-9
-_EVERY: Final = round(TAP_S / STEP_S)
-_LATE: Final = np.exp(-np.outer(_POLES, np.arange(int(_LONGEST_S / TAP_S)) * TAP_S))
+_TAP_STEPS: Final = round(TAP_S / STEP_S)
+_DECAY: Final = np.exp(-np.outer(PENDULUM_POLES, np.arange(int(_MAX_DURATION_S / TAP_S)) * TAP_S))
 """What is left of a pendulum's swing some taps later."""
-_GAIN: Final = (_OMEGA**2 / _GRAVITY_M_S2)[:, None]
-_WELL: Final = 0.6
+_GAIN: Final = (PENDULUM_RAD_S**2 / GRAVITY_M_S2)[:, None]
+_GOOD_SHARE: Final = 0.6
 """A window is good enough at this share of the bound."""
-_SUM: Final = 3.0
+_SUM_WEIGHT: Final = 3.0
 """Weight of the wish that a window's impulses sum to 1, in bounds of the swing."""
 
 
-def _box() -> np.ndarray:
-    n = round(JERK_S / STEP_S / 2)
+def _jerk_kernel() -> np.ndarray:
+    n = round(JERK_WINDOW_S / STEP_S / 2)
     kernel = np.convolve(np.ones(n), np.ones(n))
     return kernel / kernel.sum()
 
 
-_BOX: Final = _box()
+_JERK_KERNEL: Final = _jerk_kernel()
 
 
 @dataclass(frozen=True)
-class Swift:
+class SampledTimeLaw:
     """A law: progress (n,) every `STEP_S` from 0 to 1, and the swing [rad] it leaves."""
 
     done: np.ndarray
@@ -81,16 +81,16 @@ class Swift:
         return np.clip(at, 0.0, 1.0)
 
 
-class Limits:
+class PathLimits:
     """A way's limits on its grid: slope and bend of the moving joints, greatest speed by speeds and pump."""
 
-    def __init__(self, arm: Arm, way: Way) -> None:
-        self.s = np.linspace(0.0, 1.0, GRID + 1)
+    def __init__(self, arm: Arm, way: PathGeometry) -> None:
+        self.s = np.linspace(0.0, 1.0, GRID_COUNT + 1)
         self.slope = way.curve(self.s, 1)[:, way.moving]
         self.bend = way.curve(self.s, 2)[:, way.moving]
         self.most = way.acceleration
         self.speed = 1.0 / np.maximum(way.cost(self.s)[0], _TINY)
-        fine = np.linspace(0.0, 1.0, FINE * GRID + 1)
+        fine = np.linspace(0.0, 1.0, SAMPLES_PER_PIECE * GRID_COUNT + 1)
         self.fine, self.table = fine, way.curve(fine)
         self.pin = self.table[:, N_JOINTS:]
         self._pin_slope = np.gradient(self.pin, fine, axis=0)
@@ -106,7 +106,7 @@ class Limits:
 
     def fastest(self, brake: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Times and speeds of the fastest law on the grid; ``brake`` (n,) lowers the speed there."""
-        step = 1.0 / GRID
+        step = 1.0 / GRID_COUNT
         most = self.most
         slope = np.where(np.abs(self.slope) < 1e-6, 1e-6, self.slope)
         # |slope a + bend b| <= most, with b the squared speed: two lines a over b for every joint.
@@ -120,16 +120,16 @@ class Limits:
         low, top = (-size).tolist(), ceiling.tolist()
         lean, high = tilt.tolist(), size.tolist()
         two = 2.0 * step
-        reach = [0.0] * (GRID + 1)
-        for k in range(GRID - 1, -1, -1):
+        reach = [0.0] * (GRID_COUNT + 1)
+        for k in range(GRID_COUNT - 1, -1, -1):
             best, beyond = top[k], reach[k + 1] / two
             for a0, m in zip(low[k], lean[k], strict=True):
                 rise = m + 1.0 / two
                 if rise > 0.0:
                     best = min(best, (beyond - a0) / rise)
             reach[k] = max(best, 0.0)
-        b, squared = 0.0, [0.0] * (GRID + 1)
-        for k in range(GRID):
+        b, squared = 0.0, [0.0] * (GRID_COUNT + 1)
+        for k in range(GRID_COUNT):
             push = min(a1 + m * b for a1, m in zip(high[k], lean[k], strict=True))
             b = min(reach[k + 1], max(b + two * push, 0.0))
             squared[k + 1] = b
@@ -142,10 +142,10 @@ def _sampled(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
     """Progress every `STEP_S` of a law given on the grid."""
     end = max(int(np.ceil(time[-1] / STEP_S)), 2)
     at = np.linspace(0.0, time[-1], end + 1)
-    i = np.minimum(np.searchsorted(time, at, side="right") - 1, GRID - 1)
+    i = np.minimum(np.searchsorted(time, at, side="right") - 1, GRID_COUNT - 1)
     span = np.maximum(time[i + 1] - time[i], _TINY)
     part = at - time[i]
-    done = i / GRID + speed[i] * part + 0.5 * (speed[i + 1] - speed[i]) / span * part**2
+    done = i / GRID_COUNT + speed[i] * part + 0.5 * (speed[i + 1] - speed[i]) / span * part**2
     return np.clip(done, 0.0, 1.0)
 
 
@@ -154,13 +154,13 @@ def _weights(length: int) -> np.ndarray:
     """What a way of so many places, one every `TAP_S`, from rest to rest, leaves of swing [rad]: real and imaginary
     parts for every pendulum, (2 n, length).
     """
-    late = _GAIN * _LATE[:, : length - 1][:, ::-1]
+    late = _GAIN * _DECAY[:, : length - 1][:, ::-1]
     none = np.zeros((len(late), 1))
     weights = np.hstack([none, late]) - np.hstack([late, none])
     return np.vstack([weights.real, weights.imag])
 
 
-def _left(pin: np.ndarray) -> np.ndarray:
+def _residual_swing(pin: np.ndarray) -> np.ndarray:
     """Swing [rad] that ways (t, m), every `TAP_S` from rest to rest, leave: of every pendulum, real and imaginary, (2
     n, m).
     """
@@ -168,86 +168,86 @@ def _left(pin: np.ndarray) -> np.ndarray:
     return found
 
 
-def _greatest(left: np.ndarray) -> float:
+def _max_swing_rad(left: np.ndarray) -> float:
     size = np.sum(left**2, axis=1)
     return float(np.sqrt(np.max(size[: len(size) // 2] + size[len(size) // 2 :])))
 
 
-def swift_law(arm: Arm, way: Way, shaped: bool = True) -> Swift:
+def time_optimal_law(arm: Arm, way: PathGeometry, shaped: bool = True) -> SampledTimeLaw:
     """The fastest law of a way that keeps the limits and, if ``shaped``, leaves at most `SWING_RAD` of swing."""
-    limits = Limits(arm, way)
-    brake = np.ones(GRID + 1)
+    limits = PathLimits(arm, way)
+    brake = np.ones(GRID_COUNT + 1)
     taps = None if shaped and limits.sideways else 0
-    for turn in range(ROUNDS + 1):
-        raw = np.convolve(np.pad(_sampled(*limits.fastest(brake)), len(_BOX) - 1, mode="edge"), _BOX, mode="valid")
-        taps, law = _shaped(limits, raw, taps)
+    for turn in range(ROUND_COUNT + 1):
+        raw = np.convolve(np.pad(_sampled(*limits.fastest(brake)), len(_JERK_KERNEL) - 1, mode="edge"), _JERK_KERNEL, mode="valid")
+        taps, law = _shortest_window(limits, raw, taps)
         load = _load(arm, limits, law.done)
         over = float(np.max(load))
-        if over <= 1.0 or turn == ROUNDS:
+        if over <= 1.0 or turn == ROUND_COUNT:
             break
-        brake = _braked(brake, load, law.done)
+        brake = _reduced_speeds(brake, load, law.done)
     return law if over <= 1.0 else _slowed(limits, law, over)
 
 
-def _shaped(limits: Limits, raw: np.ndarray, taps: int | None) -> tuple[int, Swift]:
+def _shortest_window(limits: PathLimits, raw: np.ndarray, taps: int | None) -> tuple[int, SampledTimeLaw]:
     """The law through a window of so many taps, None: through the shortest that leaves little swing."""
     if taps is not None:
-        return taps, _through(limits, raw, taps)
-    low, high = 0, len(TAPS) - 1
-    law = _through(limits, raw, TAPS[high])
+        return taps, _with_window(limits, raw, taps)
+    low, high = 0, len(TAP_COUNTS) - 1
+    law = _with_window(limits, raw, TAP_COUNTS[high])
     while low < high:
         middle = (low + high) // 2
-        tried = _through(limits, raw, TAPS[middle])
+        tried = _with_window(limits, raw, TAP_COUNTS[middle])
         if tried.swing_rad <= SWING_RAD:
             high, law = middle, tried
         else:
             low = middle + 1
-    return TAPS[high], law
+    return TAP_COUNTS[high], law
 
 
-def _through(limits: Limits, raw: np.ndarray, taps: int) -> Swift:
+def _with_window(limits: PathLimits, raw: np.ndarray, taps: int) -> SampledTimeLaw:
     """A law averaged over the window of so many taps that leaves least swing."""
-    whole = len(raw) + taps * _EVERY
-    whole += (whole + 1) % _EVERY
+    whole = len(raw) + taps * _TAP_STEPS
+    whole += (whole + 1) % _TAP_STEPS
     impulses = np.full(taps + 1, 1.0 / (taps + 1))
     if not limits.sideways:
-        return Swift(_averaged(raw, impulses, whole), 0.0)
+        return SampledTimeLaw(_convolved(raw, impulses, whole), 0.0)
     # The raw law every `TAP_S` up to the common end, once later with every impulse.
-    at = np.arange((whole - 1) % _EVERY - taps * _EVERY, whole, _EVERY)
+    at = np.arange((whole - 1) % _TAP_STEPS - taps * _TAP_STEPS, whole, _TAP_STEPS)
     places = np.where(at < 0, 0.0, raw[np.clip(at, 0, len(raw) - 1)])
     delayed = np.lib.stride_tricks.sliding_window_view(places, taps + 1)[:, ::-1]
-    left = _left(limits.pin_at(delayed @ impulses))
-    for _ in range(SEARCHES if taps else 0):
-        if _greatest(left) <= _WELL * SWING_RAD:
+    left = _residual_swing(limits.pin_at(delayed @ impulses))
+    for _ in range(REFINEMENT_COUNT if taps else 0):
+        if _max_swing_rad(left) <= _GOOD_SHARE * SWING_RAD:
             break
-        wish = _better(limits, delayed, left, impulses)
+        wish = _improved_impulses(limits, delayed, left, impulses)
         for share in (1.0, 0.5, 0.25):  # a way is bent: half a step may be better than a whole one
             tried = impulses + share * (wish - impulses)
-            then = _left(limits.pin_at(delayed @ tried))
-            if _greatest(then) < _greatest(left):
+            then = _residual_swing(limits.pin_at(delayed @ tried))
+            if _max_swing_rad(then) < _max_swing_rad(left):
                 impulses, left = tried, then
                 break
         else:
             break
-    return Swift(_averaged(raw, impulses, whole), _greatest(left))
+    return SampledTimeLaw(_convolved(raw, impulses, whole), _max_swing_rad(left))
 
 
-def _averaged(raw: np.ndarray, impulses: np.ndarray, length: int) -> np.ndarray:
+def _convolved(raw: np.ndarray, impulses: np.ndarray, length: int) -> np.ndarray:
     """The raw law once later with every impulse, ``length`` samples."""
-    kernel = np.zeros((len(impulses) - 1) * _EVERY + 1)
-    kernel[::_EVERY] = impulses
+    kernel = np.zeros((len(impulses) - 1) * _TAP_STEPS + 1)
+    kernel[::_TAP_STEPS] = impulses
     late = length - len(raw)
     begun = np.concatenate([np.zeros(len(kernel) - 1), raw, np.full(late, raw[-1])])
     return np.convolve(begun, kernel, mode="valid")
 
 
-def _better(limits: Limits, delayed: np.ndarray, left: np.ndarray, impulses: np.ndarray) -> np.ndarray:
+def _improved_impulses(limits: PathLimits, delayed: np.ndarray, left: np.ndarray, impulses: np.ndarray) -> np.ndarray:
     """Impulses whose swing, linearised about the present ones, is least."""
     slope = limits.pin_slope_at(delayed @ impulses) / SWING_RAD
     weights = _weights(len(delayed))
     rows = np.vstack([weights * column for column in slope.T]) @ delayed
     wish = rows @ impulses - left.T.ravel() / SWING_RAD
-    size = _SUM * max(1.0, float(np.max(np.abs(rows))))
+    size = _SUM_WEIGHT * max(1.0, float(np.max(np.abs(rows))))
     system = np.vstack([rows, np.full((1, len(impulses)), size)])
     try:
         found, _ = nnls(system, np.append(wish, size))
@@ -257,7 +257,7 @@ def _better(limits: Limits, delayed: np.ndarray, left: np.ndarray, impulses: np.
     return found / total if total > 0.0 else impulses
 
 
-def _load(arm: Arm, limits: Limits, progress: np.ndarray) -> np.ndarray:
+def _load(arm: Arm, limits: PathLimits, progress: np.ndarray) -> np.ndarray:
     """Shares of the limits at the samples, as a factor of time (1 = just)."""
     q = np.column_stack([np.interp(progress, limits.fine, column) for column in limits.table[:, :N_JOINTS].T])
     v = np.gradient(q, STEP_S, axis=0)
@@ -266,18 +266,18 @@ def _load(arm: Arm, limits: Limits, progress: np.ndarray) -> np.ndarray:
     return np.maximum(fast, np.sqrt(np.max(np.abs(a) / arm.acceleration, axis=1)))
 
 
-def _braked(brake: np.ndarray, load: np.ndarray, where: np.ndarray) -> np.ndarray:
+def _reduced_speeds(brake: np.ndarray, load: np.ndarray, where: np.ndarray) -> np.ndarray:
     """Lower speeds on the grid about where a limit was broken."""
-    worst = np.ones(GRID + 1)
-    at = np.clip(np.rint(where * GRID).astype(int), 0, GRID)
+    worst = np.ones(GRID_COUNT + 1)
+    at = np.clip(np.rint(where * GRID_COUNT).astype(int), 0, GRID_COUNT)
     np.maximum.at(worst, at, load)
     wide = np.max(np.stack([np.roll(worst, k) for k in range(-3, 4)]), axis=0)
     return brake / np.clip(wide, 1.0, 1.6)
 
 
-def _slowed(limits: Limits, law: Swift, factor: float) -> Swift:
+def _slowed(limits: PathLimits, law: SampledTimeLaw, factor: float) -> SampledTimeLaw:
     """The same, evenly slowed."""
     n = max(int(np.ceil((len(law.done) - 1) * factor)), 2)
-    n += n % _EVERY
+    n += n % _TAP_STEPS
     done = law.progress(np.linspace(0.0, law.duration_s, n + 1))
-    return Swift(done, _greatest(_left(limits.pin_at(done[::_EVERY]))) if limits.sideways else 0.0)
+    return SampledTimeLaw(done, _max_swing_rad(_residual_swing(limits.pin_at(done[::_TAP_STEPS]))) if limits.sideways else 0.0)

@@ -1,8 +1,8 @@
 """Smooth, synchronised joint motions between poses that leave the grapple hanging still.
 
-A leg is a straight line in poses, driven by a time law of `autonomy.motion.timing`.  Legs over different coordinates
+A leg is a straight line in poses, driven by a time law of `autonomy.motion.time_law`.  Legs over different coordinates
 may overlap; a motion has at most one leg that moves the pin sideways, so that leg's law decides about the swing.
-Failure: ``machine.kinematics.Unreachable``.  No clock: a plan is a function of its own time.
+Failure: ``machine.geometry.kinematics.Unreachable``.  No clock: a plan is a function of its own time.
 """
 
 from __future__ import annotations
@@ -14,27 +14,28 @@ from typing import Final, Protocol
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from autonomy.motion.arm import Arm, Pose
-from autonomy.motion.timing import SHORTEST_S, Way, time_law
+from autonomy.motion.arm import Arm
+from autonomy.motion.pose import Pose
+from autonomy.motion.time_law import MIN_DURATION_S, PathGeometry, swing_free_law
 from machine.joints import Joint
 
 STEP_S: Final = 0.02
-_GENTLE: Final = 0.5
+_GENTLE_SHARE: Final = 0.5
 """Share of the acceleration limits that a motion without regard to the arm's reach uses."""
-_GRID: Final = np.linspace(0.0, 1.0, 81)
+_PROGRESS_GRID: Final = np.linspace(0.0, 1.0, 81)
 _RISE_LEFT_M: Final = 0.12
 """How far under its height a rising grapple may still be when it starts to move sideways."""
-_WAY_LEFT_M: Final = 0.35
+_APPROACH_LEFT_M: Final = 0.35
 """How far from the point under it a grapple may be when it starts to go down."""
-_SAME: Final = 1e-6
-_STEEPEST, _STRONGEST = 2.1875, 7.5132
-"""Greatest slope and greatest curvature of `progress`."""
+_TOLERANCE: Final = 1e-6
+_MAX_SLOPE, _MAX_CURVATURE = 2.1875, 7.5132
+"""Greatest slope and greatest curvature of `smooth_progress`."""
 
 Axes = tuple[float, ...]
 
 
-def progress(tau: np.ndarray) -> np.ndarray:
-    """Progress 0..1 over ``tau`` = time / duration (clipped), at rest up to the jerk at both ends (machines.md 1.6)."""
+def smooth_progress(tau: np.ndarray) -> np.ndarray:
+    """Progress 0..1 over ``tau`` = time / duration (clipped), at rest up to the jerk at both ends (docs/reference/machines.md section 1.6)."""
     t = np.clip(tau, 0.0, 1.0)
     way: np.ndarray = t**4 * (35.0 + t * (-84.0 + t * (70.0 - 20.0 * t)))
     return way
@@ -77,24 +78,24 @@ def _curve(position: np.ndarray) -> CubicSpline:
     return CubicSpline(np.arange(len(position)) * STEP_S, position, bc_type="clamped")
 
 
-def _table(position: np.ndarray) -> Trajectory:
+def _sampled_trajectory(position: np.ndarray) -> Trajectory:
     curve = _curve(position)
     return Trajectory([tuple(q) for q in position.tolist()], [tuple(v) for v in curve(curve.x, 1).tolist()])
 
 
-def turned(motion: Trajectory, from_s: float, by_rad: float) -> Trajectory:
+def with_rotation(motion: Trajectory, from_s: float, by_rad: float) -> Trajectory:
     """The motion with the rotator turned by so much more from a time on, until its end."""
     position, velocity = np.array(motion.position), np.array(motion.velocity)
     span_s = motion.duration_s - from_s
     time = (np.arange(len(position)) * STEP_S - from_s) / span_s
-    done = progress(time)
+    done = smooth_progress(time)
     position[:, Joint.ROT] += by_rad * done
     t = np.clip(time, 0.0, 1.0)
     velocity[:, Joint.ROT] += by_rad * 140.0 * t**3 * (1.0 - t) ** 3 / span_s
     return Trajectory([tuple(q) for q in position.tolist()], [tuple(v) for v in velocity.tolist()])
 
 
-def brisk(arm: Arm, motion: Trajectory) -> Trajectory:
+def with_quick_rotation(arm: Arm, motion: Trajectory) -> Trajectory:
     """The motion with its turn of the rotator made at one go, when half of it was to be done.
 
     For a rotator that is counted and not measured: what its valve gives is known to a few per mille of its stroke, a
@@ -104,24 +105,24 @@ def brisk(arm: Arm, motion: Trajectory) -> Trajectory:
     angle = position[:, Joint.ROT]
     turn = float(angle[-1] - angle[0])
     speed, push = arm.speed[Joint.ROT], arm.acceleration[Joint.ROT]
-    span_s = max(_STEEPEST * abs(turn) / speed, float(np.sqrt(_STRONGEST * abs(turn) / push)), SHORTEST_S)
-    quicker = span_s < motion.duration_s and _STEEPEST * abs(turn) / span_s > np.max(np.abs(velocity[:, Joint.ROT]))
-    if not quicker or np.ptp(angle) > abs(turn) + _SAME:
+    span_s = max(_MAX_SLOPE * abs(turn) / speed, float(np.sqrt(_MAX_CURVATURE * abs(turn) / push)), MIN_DURATION_S)
+    quicker = span_s < motion.duration_s and _MAX_SLOPE * abs(turn) / span_s > np.max(np.abs(velocity[:, Joint.ROT]))
+    if not quicker or np.ptp(angle) > abs(turn) + _TOLERANCE:
         return motion
     half_s = float(np.argmin(np.abs(angle - angle[0] - 0.5 * turn))) * STEP_S
     begin_s = min(max(half_s - 0.5 * span_s, 0.0), motion.duration_s - span_s)
     t = np.clip((np.arange(len(position)) * STEP_S - begin_s) / span_s, 0.0, 1.0)
-    position[:, Joint.ROT] = angle[0] + turn * progress(t)
+    position[:, Joint.ROT] = angle[0] + turn * smooth_progress(t)
     velocity[:, Joint.ROT] = turn * 140.0 * t**3 * (1.0 - t) ** 3 / span_s
     return Trajectory([tuple(q) for q in position.tolist()], [tuple(v) for v in velocity.tolist()])
 
 
 def hold(q: Sequence[float]) -> Trajectory:
     """Standing still at a joint position."""
-    return _table(np.array([q, q], dtype=float))
+    return _sampled_trajectory(np.array([q, q], dtype=float))
 
 
-class Law(Protocol):
+class TimeLaw(Protocol):
     """How far a way is done over time."""
 
     @property
@@ -138,7 +139,7 @@ class Leg:
 
     start: np.ndarray
     way: np.ndarray
-    law: Law | None
+    law: TimeLaw | None
 
     @property
     def duration_s(self) -> float:
@@ -151,23 +152,23 @@ class Leg:
 
     def times_left(self, *left: float) -> list[float]:
         """The times from which the progress that is left is at most so much (shares)."""
-        done = self.progress_at(_GRID * self.duration_s)
-        return [float(_GRID[np.argmax(done >= 1.0 - share)]) * self.duration_s for share in left]
+        done = self.progress_at(_PROGRESS_GRID * self.duration_s)
+        return [float(_PROGRESS_GRID[np.argmax(done >= 1.0 - share)]) * self.duration_s for share in left]
 
 
-def leg(arm: Arm, start: Pose, goal: Pose, law: Callable[[Way], Law] = time_law) -> Leg:
-    """The straight way from start to goal, driven by a law of `autonomy.motion.timing` or of another maker."""
+def make_leg(arm: Arm, start: Pose, goal: Pose, law: Callable[[PathGeometry], TimeLaw] = swing_free_law) -> Leg:
+    """The straight way from start to goal, driven by a law of `autonomy.motion.time_law` or of another maker."""
     first, way = np.array(start), np.array(goal) - np.array(start)
-    if np.max(np.abs(way)) < _SAME:
+    if np.max(np.abs(way)) < _TOLERANCE:
         return Leg(first, way, None)
-    return Leg(first, way, law(_way(arm, first, way)))
+    return Leg(first, way, law(_path_geometry(arm, first, way)))
 
 
-def _way(arm: Arm, first: np.ndarray, way: np.ndarray) -> Way:
-    return Way(arm, first + _GRID[:, None] * way)
+def _path_geometry(arm: Arm, first: np.ndarray, way: np.ndarray) -> PathGeometry:
+    return PathGeometry(arm, first + _PROGRESS_GRID[:, None] * way)
 
 
-def summed(arm: Arm, legs: Sequence[tuple[float, Leg]]) -> Trajectory:
+def superposed(arm: Arm, legs: Sequence[tuple[float, Leg]]) -> Trajectory:
     """The sum of legs, each from its starting time, slowed down as a whole if their overlap asks for it."""
     end_s = max(at + leg.duration_s for at, leg in legs)
 
@@ -176,10 +177,10 @@ def summed(arm: Arm, legs: Sequence[tuple[float, Leg]]) -> Trajectory:
         time = np.linspace(0.0, end_s, steps + 1)
         return arm.joints(legs[0][1].start + sum(leg.progress_at(time - at)[:, None] * leg.way for at, leg in legs))
 
-    return paced(arm, sampled, end_s, arm.sampled_acceleration if len(legs) == 1 else arm.acceleration)
+    return within_limits(arm, sampled, end_s, arm.sampled_acceleration if len(legs) == 1 else arm.acceleration)
 
 
-def paced(
+def within_limits(
     arm: Arm, sampled: Callable[[float], np.ndarray], end_s: float, accelerations: np.ndarray | None = None
 ) -> Trajectory:
     """A motion of ``end_s``, or as much longer as the arm's limits (or these ``accelerations``) ask for.
@@ -187,11 +188,11 @@ def paced(
     ``sampled(duration_s)`` gives its joint vectors (n, 5) every ``STEP_S``, from rest to rest.
     """
     q = sampled(end_s)
-    load = _load(arm, q, arm.acceleration if accelerations is None else accelerations)
-    return _table(q if load <= 1.0 else sampled(load * end_s))
+    load = _time_stretch(arm, q, arm.acceleration if accelerations is None else accelerations)
+    return _sampled_trajectory(q if load <= 1.0 else sampled(load * end_s))
 
 
-def _load(arm: Arm, position: np.ndarray, accelerations: np.ndarray) -> float:
+def _time_stretch(arm: Arm, position: np.ndarray, accelerations: np.ndarray) -> float:
     """By how much a motion sampled every ``STEP_S`` is to be stretched in time to keep the arm's limits and these
     ``accelerations`` (1 = just).
     """
@@ -201,68 +202,68 @@ def _load(arm: Arm, position: np.ndarray, accelerations: np.ndarray) -> float:
     return float(max(speed, np.sqrt(np.max(np.abs(acceleration) / accelerations))))
 
 
-def straight(arm: Arm, start: Pose, goal: Pose, shaped: bool = True) -> Trajectory:
+def straight_line(arm: Arm, start: Pose, goal: Pose, shaped: bool = True) -> Trajectory:
     """A straight line in poses; vertical when only the height differs.
 
     ``shaped=False``, for comparison, takes as long without regard to swing: it is the fastest law, evenly slowed.
     """
-    line = leg(arm, start, goal)
-    motion = summed(arm, [(0.0, line)])
+    line = make_leg(arm, start, goal)
+    motion = superposed(arm, [(0.0, line)])
     if shaped or line.law is None:
         return motion
-    plain = time_law(_way(arm, line.start, line.way), shaped=False).slowed(motion.duration_s)
-    return summed(arm, [(0.0, Leg(line.start, line.way, plain))])
+    plain = swing_free_law(_path_geometry(arm, line.start, line.way), shaped=False).slowed(motion.duration_s)
+    return superposed(arm, [(0.0, Leg(line.start, line.way, plain))])
 
 
-def travel(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: float = 0.0) -> Trajectory:
+def travel_over(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: float = 0.0) -> Trajectory:
     """To ``height_m``, over, and down to the goal, with rounded corners.
 
     With ``free_m`` the pin may rise on the way, as long as it is up ``free_m`` before the goal; without, it goes
     sideways only when it is almost up.
     """
-    up = leg(arm, start, start.at_height(height_m))
-    over = leg(arm, start.at_height(height_m), goal.at_height(height_m))
-    down = leg(arm, goal.at_height(height_m), goal)
+    up = make_leg(arm, start, start.at_height(height_m))
+    over = make_leg(arm, start.at_height(height_m), goal.at_height(height_m))
+    down = make_leg(arm, goal.at_height(height_m), goal)
     rise, drop = abs(up.way[2]), abs(down.way[2])
     way_m = float(np.hypot(over.way[0] * max(start.r_m, goal.r_m), over.way[1]))
     over_at = up.times_left(_RISE_LEFT_M / rise)[0] if rise > _RISE_LEFT_M else 0.0
     if 0.0 < free_m < way_m:
         over_at = max(0.0, up.duration_s - over.times_left(free_m / way_m)[0])
-    down_at = over_at + (over.times_left(_WAY_LEFT_M / way_m)[0] if way_m > _WAY_LEFT_M else 0.0)
+    down_at = over_at + (over.times_left(_APPROACH_LEFT_M / way_m)[0] if way_m > _APPROACH_LEFT_M else 0.0)
     down_at = max(down_at, up.duration_s if drop else 0.0)
-    return summed(arm, [(0.0, up), (over_at, over), (down_at, down)])
+    return superposed(arm, [(0.0, up), (over_at, over), (down_at, down)])
 
 
-def across(arm: Arm, start: Sequence[float], goal: Sequence[float]) -> Trajectory:
+def joint_motion(arm: Arm, start: Sequence[float], goal: Sequence[float]) -> Trajectory:
     """Every joint straight from start to goal, together, within the limits but gently, whatever the arm's reach."""
     first, way = np.array(start, dtype=float), np.array(goal, dtype=float) - np.array(start, dtype=float)
     tau = np.linspace(0.0, 1.0, 121)
-    done = progress(tau)
+    done = smooth_progress(tau)
     speed = np.gradient(done, tau[1])
     steepest = float(np.max(np.abs(np.gradient(speed, tau[1]))))
     fastest = float(np.max(np.abs(way) / arm.speed)) * float(np.max(speed))
-    pushed = float(np.sqrt(np.max(np.abs(way) / (_GENTLE * arm.acceleration)) * steepest))
-    duration = max(SHORTEST_S, fastest, pushed)
+    pushed = float(np.sqrt(np.max(np.abs(way) / (_GENTLE_SHARE * arm.acceleration)) * steepest))
+    duration = max(MIN_DURATION_S, fastest, pushed)
     time = np.arange(int(np.ceil(duration / STEP_S)) + 2) * STEP_S
-    return _table(first + progress(time / duration)[:, None] * way)
+    return _sampled_trajectory(first + smooth_progress(time / duration)[:, None] * way)
 
 
-def slowly(arm: Arm, start: Pose, goal: Pose, least_s: float) -> Trajectory:
+def slow_line(arm: Arm, start: Pose, goal: Pose, least_s: float) -> Trajectory:
     """A straight line in poses in ``least_s``, or as much longer as the arm's limits ask for."""
     first, way = np.array(start), np.array(goal) - np.array(start)
 
     def sampled(duration_s: float) -> np.ndarray:
         time = np.arange(int(np.ceil(duration_s / STEP_S)) + 1) * STEP_S
-        return arm.joints(first + progress(time / duration_s)[:, None] * way)
+        return arm.joints(first + smooth_progress(time / duration_s)[:, None] * way)
 
-    return paced(arm, sampled, least_s)
+    return within_limits(arm, sampled, least_s)
 
 
-def follow(arm: Arm, start: Pose, path: Callable[[float], Pose], end_s: float, blend_s: float) -> Trajectory:
+def follow_path(arm: Arm, start: Pose, path: Callable[[float], Pose], end_s: float, blend_s: float) -> Trajectory:
     """A motion along given poses over time; what ``start`` is off the path at time 0 fades out within
     ``blend_s``.
     """
     time = np.arange(int(np.ceil(end_s / STEP_S)) + 1) * STEP_S
     nominal = np.array([path(t) for t in time])
-    fade = 1.0 - progress(time / blend_s)
-    return _table(arm.joints(nominal + fade[:, None] * (np.array(start) - nominal[0])))
+    fade = 1.0 - smooth_progress(time / blend_s)
+    return _sampled_trajectory(arm.joints(nominal + fade[:, None] * (np.array(start) - nominal[0])))

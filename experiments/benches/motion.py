@@ -2,7 +2,7 @@
 
 For every scene one cycle is planned, as the activity does: from where the crane stands to a log, with the log to the
 bunk, and back to the next.  Planning is measured in CPU time of this process, once as it comes and again as the best of
-a few, which is what a quiet machine would take.  Motions are compared with `autonomy.motion.trajectory.travel`.
+a few, which is what a quiet machine would take.  Motions are compared with `autonomy.motion.trajectory.travel_over`.
 """
 
 from __future__ import annotations
@@ -16,24 +16,25 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.crane_job.phase_motions import above, carrying
-from autonomy.grasp.grapple_heights import approach_length, hover_height, travel_height
+from autonomy.crane_job.phase_motions import approach_motion, carry_motion
+from autonomy.grasp.grapple_heights import approach_length_m, hover_height_m, travel_height_m
 from autonomy.grasp.placement import plan_place
 from autonomy.grasp.planner import NoGrasp
-from autonomy.grasp.selection import plan_grasp
+from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm
-from autonomy.motion.clearance import spare
-from autonomy.motion.motion_planner import Swiftest
-from autonomy.motion.obstacles import Held, Surroundings, held_log, surroundings
+from autonomy.motion.clearance import clearance_reserve
+from autonomy.motion.motion_planner import TimeOptimalPlanner
+from autonomy.motion.obstacles import HeldLog, CollisionScene, held_log, collision_scene
 from autonomy.motion.pose import Pose
-from autonomy.motion.trajectory import Trajectory, travel
+from autonomy.motion.trajectory import Trajectory, travel_over
 from autonomy.perception.log_list.observation import LogObservation
 from experiments.common.worlds import wood_of
-from machine.kinematics import Unreachable
+from machine.geometry.kinematics import Unreachable
 from machine.profile import Profile
-from sim.scenes.arrangements import LogSpec, arrangement
-from sim.world import home_of
+from sim.scenes.arrangements import arrangement
+from sim.wood.log_shape import LogSpec
+from sim.world import home_pose
 
 SCENES: Final = (("separate", 2), ("parallel", 3), ("crossed", 3), ("pile", 5))
 AGAIN: Final = 3
@@ -75,7 +76,7 @@ def _at(values: list[float], percent: float) -> float:
 def run(profile: Profile, seeds: int, progress: Callable[[int, int], None] = lambda done, total: None) -> Bench:
     """Plans a cycle in every scene of every seed."""
     bench, arm, wood = Bench(), Arm(profile), wood_of(profile.name, "nominal")
-    home = arm.pose(tuple(home_of(profile)[n] for n in ("slew", "lift", "tilt", "ext", "rot")))
+    home = arm.pose(tuple(home_pose(profile)[n] for n in ("slew", "lift", "tilt", "ext", "rot")))
     cases = [(kind, count, seed) for seed in range(seeds) for kind, count in SCENES]
     for i, (kind, count, seed) in enumerate(cases):
         logs = [observed(profile, k, s) for k, s in enumerate(arrangement(kind, profile, wood, seed, count))]
@@ -96,33 +97,33 @@ def observed(profile: Profile, number: int, spec: LogSpec) -> LogObservation:
 
 
 def _cycle(bench: Bench, arm: Arm, home: Pose, logs: list[LogObservation]) -> None:
-    profile, top = arm.profile, travel_height(arm.profile)
+    profile, top = arm.profile, travel_height_m(arm.profile)
     log = max(logs, key=lambda o: o.center_m[2])
     rest = [o for o in logs if o is not log]
     try:
-        grasp = plan_grasp(arm, log, home.rot_rad)
+        grasp = plan_single_log_grasp(arm, log, home.rot_rad)
         place = plan_place(arm, Mission(), grasp, logs)
     except NoGrasp:
         bench.no_grasp += 1
         return
-    motions, free_m = Swiftest(), approach_length(profile, log)
-    around, held = surroundings(profile, rest), held_log(arm, grasp.pose, log)
-    over = grasp.pose.at_height(hover_height(profile, grasp))
-    clear = Task(surroundings(profile, logs), None, top, 0.0)
+    motions, free_m = TimeOptimalPlanner(), approach_length_m(profile, log)
+    around, held = collision_scene(profile, rest), held_log(arm, grasp.pose, log)
+    over = grasp.pose.at_height(hover_height_m(profile, grasp))
+    clear = Task(collision_scene(profile, logs), None, top, 0.0)
     laden = Task(around, held, top, free_m)
-    _measure(bench, arm, home, over, clear, partial(above, arm, motions, home, grasp, logs))
+    _measure(bench, arm, home, over, clear, partial(approach_motion, arm, motions, home, grasp, logs))
     _measure(
-        bench, arm, grasp.pose, place, laden, partial(carrying, arm, motions, grasp.pose, place, grasp, logs, False)
+        bench, arm, grasp.pose, place, laden, partial(carry_motion, arm, motions, grasp.pose, place, grasp, logs, False)
     )
-    _measure(bench, arm, place, over, Task(around, None, top, 0.0), partial(above, arm, motions, place, grasp, rest))
+    _measure(bench, arm, place, over, Task(around, None, top, 0.0), partial(approach_motion, arm, motions, place, grasp, rest))
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What stands around, what is held, and where `travel` passes: its height and how far before the goal [m]."""
+    """What stands around, what is held, and where `travel_over` passes: its height and how far before the goal [m]."""
 
-    around: Surroundings
-    held: Held | None
+    around: CollisionScene
+    held: HeldLog | None
     high_m: float
     free_m: float
 
@@ -140,9 +141,9 @@ def _measure(bench: Bench, arm: Arm, start: Pose, goal: Pose, task: Task, make: 
     bench.cpu_ms.append(times[0])
     bench.best_ms.append(min(times))
     try:
-        always = travel(arm, start, goal, task.high_m, task.free_m)
+        always = travel_over(arm, start, goal, task.high_m, task.free_m)
     except Unreachable:
         return
     bench.ours_s.append(motion.duration_s)
     bench.travel_s.append(always.duration_s)
-    bench.travel_spare_m.append(spare(arm, always, task.around, task.held)[0])
+    bench.travel_spare_m.append(clearance_reserve(arm, always, task.around, task.held)[0])

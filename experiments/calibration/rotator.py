@@ -12,7 +12,7 @@ from typing import Final
 
 from autonomy.motion.arm import Arm
 from autonomy.motion.setpoint_stream import SetpointStream
-from autonomy.motion.trajectory import Trajectory, across, hold
+from autonomy.motion.trajectory import Trajectory, joint_motion, hold
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import GrappleCommand, OperatorAction, StateReport
 from controller.config import Settings
@@ -22,9 +22,9 @@ from experiments.common.worlds import profile_named
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from machine.joints import JOINTS, Joint
-from machine.load import load_profile, profile_hash
-from machine.modes import Mode
+from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Profile
+from machine.status.modes import Mode
 from sim.plant import Plant
 
 QUARTER_RAD: Final = pi / 2
@@ -67,7 +67,7 @@ class _Turner:
                 return
         start = self._motion.goal if self._begun_ns is not None else (*report.position[: Joint.ROT], 0.0)
         goal = (*start[: Joint.ROT], TURNS_RAD[len(self.turned_rad)])
-        self._motion, self._begun_ns, self._from_rad = across(self._arm, start, goal), now_ns, angle_rad
+        self._motion, self._begun_ns, self._from_rad = joint_motion(self._arm, start, goal), now_ns, angle_rad
 
 
 def turn_errors(job: Job, path: Path) -> list[float]:
@@ -82,7 +82,7 @@ def turn_errors(job: Job, path: Path) -> list[float]:
         turner, digest = _Turner(profile, plant), profile_hash(profile)
         system = Lockstep(
             Settings(profile, digest, profile.rate_hz), build_guard(path), plant, turner,
-            Operator(digest, _pressed, patience=0), Observer(None, []),
+            Operator(digest, _pressed, max_stops=0), Observer(None, []),
         )  # fmt: skip
         while not turner.done and system.now_ns < START_NS + int(LONGEST_S * 1e9):
             system.advance()

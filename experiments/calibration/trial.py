@@ -7,19 +7,19 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-from autonomy.calibration.plan import Plan
-from autonomy.calibration.profile_file import changes, write_profile
-from autonomy.calibration.result import JointResult, Result, identify
+from autonomy.calibration.plan import CalibrationPlan
+from autonomy.calibration.profile_file import profile_changes, write_profile
+from autonomy.calibration.result import JointResult, CalibrationResult, identify
 from autonomy.calibration.survey import OFFSETS
 from autonomy.calibration.turn_fit import TurnFit
 from controller.guard.__main__ import profile_path
 from experiments.calibration.rotator import turn_errors
 from experiments.calibration.tip import tip_errors
 from experiments.common.pool import Job
-from experiments.common.worlds import opened, profile_named
+from experiments.common.worlds import profile_named, trial_world
 from hil.calibration.crane import run_lockstep
 from machine.joints import Joint
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from machine.profile import Profile
 from sim.world import STEP_S
 
@@ -37,7 +37,7 @@ def calibrated(job: Job) -> dict[str, Any]:
     if outcome.failure is not None or outcome.calibration is None or outcome.plan is None:
         return facts
     result = identify(profile, outcome.calibration.found)
-    with opened(name, truth_name, job.seed) as world:
+    with trial_world(name, truth_name, job.seed) as world:
         truth = world.truth
     joints = {}
     for j, r in result.joints.items():
@@ -52,7 +52,7 @@ def calibrated(job: Job) -> dict[str, Any]:
         return found
     with TemporaryDirectory() as folder:
         out = Path(folder) / "calibrated.toml"
-        write_profile(profile_path(name), out, changes(profile, result), "today")
+        write_profile(profile_path(name), out, profile_changes(profile, result), "today")
         if result.turns is not None:
             found["rotator"] = _rotator_errors(job, profile, truth, result.turns, out)
         return {**found, "tip": tip_errors(job, profile, load_profile(out))}
@@ -76,7 +76,7 @@ def _rotator_errors(job: Job, profile: Profile, truth: Any, turns: TurnFit, cali
     }
 
 
-def _joint_errors(job: Job, profile: Profile, plan: Plan, truth: Any, which: Joint, r: JointResult) -> dict[str, Any]:
+def _joint_errors(job: Job, profile: Profile, plan: CalibrationPlan, truth: Any, which: Joint, r: JointResult) -> dict[str, Any]:
     valve = truth.functions[which.name.lower()].valve
     real = [real_full_speed(job, profile, plan, valve, which, side, r.valve.at) for side in (+1, -1)]
     return {
@@ -107,7 +107,7 @@ def _profile_errors(profile: Profile, valve: Any, which: Joint, real: list[float
     }
 
 
-def real_full_speed(job: Job, profile: Profile, plan: Plan, valve: Any, which: Joint, side: int, at: float) -> float:
+def real_full_speed(job: Job, profile: Profile, plan: CalibrationPlan, valve: Any, which: Joint, side: int, at: float) -> float:
     """Full speed of the plant at the place where the calibration states it: no bus, no controller, no sensor.
 
     The plant is driven past the place with a steady spool and timed; the metering curve of its truth leads from that
@@ -123,7 +123,7 @@ def real_full_speed(job: Job, profile: Profile, plan: Plan, valve: Any, which: J
     home = {j.name.lower(): float(q) for j, q in zip(Joint, pose, strict=True)}
     begin = at - side * guess * (RUN_S + TIMED_S / 2.0 - valve.delay_s)
     home[name] = min(max(begin, spec.lower), spec.upper)
-    with opened(job.options["profile"], job.options["truth"], job.seed, home=home) as world:
+    with trial_world(job.options["profile"], job.options["truth"], job.seed, home=home) as world:
         place = world.functions.index(name)
 
         def run(seconds: float, spool: float) -> None:
@@ -139,7 +139,7 @@ def real_full_speed(job: Job, profile: Profile, plan: Plan, valve: Any, which: J
         return abs(world.q[name] - first) / TIMED_S / share
 
 
-def _survey_errors(truth: Any, result: Result) -> dict[str, Any]:
+def _survey_errors(truth: Any, result: CalibrationResult) -> dict[str, Any]:
     if result.survey is None:
         return {}
     names = [j.name.lower() for j in OFFSETS]

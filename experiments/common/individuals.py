@@ -1,4 +1,4 @@
-"""One individual machine calibrated before an experiment lets it work: the profile that it then has, as a file."""
+"""Individual machines: calibration before a trial, and the calibrated profile as a file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from autonomy.calibration.profile_file import NotWritten, changes, write_profile
+from autonomy.calibration.profile_file import ProfileNotWritten, profile_changes, write_profile
 from autonomy.calibration.result import identify
 from controller.guard.__main__ import profile_path
 from experiments.common.pool import Job
@@ -16,12 +16,14 @@ from experiments.common.worlds import profile_named
 from hil.calibration.crane import run_lockstep
 
 DATE: Final = "2000-01-01"
-"""Stands in the calibrated profile; a run's outcome must not depend on the day."""
+"""Date written into the calibrated profile; the outcome of a run must not depend on the day."""
 
 
 def calibrated(job: Job) -> dict[str, Any]:
-    """Options: profile, truth.  The text of the profile that `timberhand calibrate` would write for this individual,
-    None with the reason in ``failure`` when it would write none.
+    """Calibrate one individual machine; options: profile, truth.
+
+    ``profile`` in the outcome is the text that `timberhand calibrate` would write, or None with the reason in
+    ``failure``.
     """
     name = job.options["profile"]
     outcome = run_lockstep(name, job.options["truth"], job.seed, surveyed=True)
@@ -34,15 +36,15 @@ def calibrated(job: Job) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "calibrated.toml"
         try:
-            write_profile(profile_path(name), path, changes(known, result), DATE)
-        except NotWritten as error:
+            write_profile(profile_path(name), path, profile_changes(known, result), DATE)
+        except ProfileNotWritten as error:
             return {"profile": None, "failure": str(error)}
         return {"profile": path.read_text(encoding="utf-8"), "failure": None}
 
 
 @contextmanager
-def believed(name: str, text: str | None) -> Iterator[str]:
-    """The profile that controller, guard and planner read: the shipped one, or a calibrated text in a file."""
+def controller_profile(name: str, text: str | None) -> Iterator[str]:
+    """Path of the profile for controller, guard and planner: the shipped one, or a file with the calibrated ``text``."""
     if text is None:
         yield str(profile_path(name))
         return

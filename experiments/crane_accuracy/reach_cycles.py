@@ -17,16 +17,16 @@ from typing import Final
 
 from autonomy.motion.arm import Arm
 from autonomy.motion.setpoint_stream import PERIOD_NS, SetpointStream
-from autonomy.motion.trajectory import Trajectory, hold, straight
+from autonomy.motion.trajectory import Trajectory, hold, straight_line
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from experiments.crane_accuracy.measure import NEAR_M
 from experiments.crane_accuracy.plan import GOALS_M, Visit, pose_at, start_pose
+from machine.geometry.kinematics import Point, pin_position
+from machine.geometry.sag import sane_load_kg
 from machine.joints import JOINTS
-from machine.kinematics import Point, pin_position
-from machine.modes import Mode
 from machine.profile import Profile, joint
-from machine.sag import sane_load_kg
+from machine.status.modes import Mode
 
 LEASE_NS: Final = 200_000_000
 REST_NS: Final = 3_500_000_000
@@ -143,7 +143,7 @@ class Rounds:
         )
 
     def _way_back(self, q: Sequence[float]) -> Trajectory:
-        return straight(self._arm, self._arm.pose(q), start_pose(self._arm))
+        return straight_line(self._arm, self._arm.pose(q), start_pose(self._arm))
 
     def _begin(self, part: Part, motion: Trajectory, now_ns: int) -> None:
         self.part, self._motion, self._begun_ns, self._stands_ns = part, motion, now_ns, 0
@@ -188,7 +188,7 @@ class Rounds:
         self._next += 1
         goal_m = GOALS_M[visit.goal]
         start = self._arm.pose(self._motion.goal)
-        motion = straight(self._arm, start, pose_at(self._arm, goal_m), shaped=self.shaped)
+        motion = straight_line(self._arm, start, pose_at(self._arm, goal_m), shaped=self.shaped)
         commanded_m = pin_position(self.profile.kinematics, motion.goal)
         self.runs.append(Run(visit, goal_m, motion, commanded_m, self._arm.load_kg, now_ns))
         self._begin(Part.OUT, motion, now_ns)

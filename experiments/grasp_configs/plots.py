@@ -10,19 +10,19 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.grasp.cnn_planner import CnnPlanner
-from autonomy.grasp.cylinders import cylinders
+from autonomy.grasp.cylinders import as_cylinders
 from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.network import GraspNet
-from autonomy.grasp.sampling_planner import Search
+from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.virtual_scene import Camera
 from autonomy.motion.arm import Arm
-from experiments.common.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 from experiments.common.worlds import profile_named
 from experiments.grasp_configs.pose_sources import true_poses
 from experiments.grasp_configs.trial import arranged
-from machine.optics import pinhole
+from machine.geometry.optics import pinhole
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 from sim.camera.geometry import orbit
-from sim.camera.render import Look, render
+from sim.camera.render import ImagingConditions, render
 from sim.camera.scene import scene_from_world
 from sim.plant import Plant
 
@@ -38,13 +38,13 @@ def draw_chain(path: Path, name: str, truth: str, seed: int) -> None:
         logs = true_poses(plant)
         x, y, z = (float(v) for v in np.mean([log.center_m for log in logs], axis=0))
         view = orbit((x, y, z), 4.5, math.radians(-60.0), math.radians(35.0), pinhole(480, 480, 0.75))
-        picture = render(scene_from_world(plant.world), view, Look()).rgb
+        picture = render(scene_from_world(plant.world), view, ImagingConditions()).rgb
     finally:
         plant.close()
     jaws, net = jaws_of(profile), GraspNet.shipped()
-    seen = CnnPlanner(net).look(cylinders(logs), jaws, profile.workspace.ground_z_m)
+    seen = CnnPlanner(net).look(as_cylinders(logs), jaws, profile.workspace.ground_z_m)
     quality = net.maps(seen.depth_m).q
-    chosen = Search()(Arm(profile), logs, 0.0, 0.0)
+    chosen = SamplingPlanner()(Arm(profile), logs, 0.0, 0.0)
     with sheet(path, 3, 10.0, 3.6) as (scene, depth, q):
         scene.imshow(picture)
         scene.set(title="the pile")

@@ -14,29 +14,30 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from autonomy.crane_job.activity import SETTLED_NS, Activity
+from autonomy.crane_job.activity import SETTLE_AFTER_ARRIVAL_NS, Activity
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.cnn_planner import CnnPlanner
 from autonomy.grasp.network import WEIGHTS, GraspNet
-from autonomy.grasp.planner import GraspProposal, Planner
-from autonomy.grasp.sampling_planner import Search
-from autonomy.grasp.selection import Planned
+from autonomy.grasp.planner import GraspCandidate, GraspPlanner
+from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.selection import PlannerSelection
 from autonomy.motion.arm import Arm
-from autonomy.motion.motion_planner import Swiftest
+from autonomy.motion.motion_planner import TimeOptimalPlanner
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
-from experiments.common.individuals import believed
+from experiments.common.individuals import controller_profile
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named, wood_of
 from experiments.grasp_configs.grasp_categories import Grip, category, lifted
 from experiments.grasp_configs.pose_sources import LOOK_NS, POSES, Seen, Sight, misled
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
-from machine.load import load_profile, profile_hash
+from machine.loading.profile_file import load_profile, profile_hash
 from sim.plant import Plant
-from sim.scenes.arrangements import LogSpec, configuration
+from sim.scenes.arrangements import configuration
+from sim.wood.log_shape import LogSpec
 
 LIMIT_NS: Final = 60_000_000_000
 HELD_NS: Final = 2_000_000_000
@@ -84,9 +85,9 @@ class Attempt:
             return self.seen.logs
         rests = phase is Phase.ABOVE and self.activity.arrived
         self._rested_ns = (self._rested_ns or now_ns) if rests else 0
-        if not rests or now_ns < self._rested_ns + SETTLED_NS:
+        if not rests or now_ns < self._rested_ns + SETTLE_AFTER_ARRIVAL_NS:
             return ()
-        self._rested_ns = now_ns + SETTLED_NS
+        self._rested_ns = now_ns + SETTLE_AFTER_ARRIVAL_NS
         self._look(now_ns)
         return self.seen.logs
 
@@ -103,13 +104,13 @@ class Attempt:
 class Timed:
     """A planner that notes its proposal and what it took."""
 
-    planner: Planner
-    proposal: GraspProposal | None = None
+    planner: GraspPlanner
+    proposal: GraspCandidate | None = None
     seconds: float = math.nan
 
     def __call__(
         self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float, stay: Collection[int] = ()
-    ) -> GraspProposal:
+    ) -> GraspCandidate:
         """See ``autonomy.grasp.planner``."""
         begun = time.process_time()
         try:
@@ -131,14 +132,14 @@ def weights_of(poses: str, planner: str) -> bool:
     return all(WEIGHTS.with_name(name).exists() for name in needed)
 
 
-def planner_named(name: str) -> Planner:
+def planner_named(name: str) -> GraspPlanner:
     """The planner of an ablation.
 
     Raises:
         WeightsRefused: the network's weights are missing or damaged.
     """
     if name == "search":
-        return Search()
+        return SamplingPlanner()
     return CnnPlanner(_network(NETWORKS[name]), by_rule=name == "cnn_physical")
 
 
@@ -146,7 +147,7 @@ def attempt(job: Job) -> dict[str, Any]:
     """Options: profile, truth, configuration, poses (of ``poses.POSES``), planner (search, cnn or cnn_physical), scene
     (its seed, for the job's is that of the machine), text (of the calibrated profile; None: as shipped).
     """
-    with believed(job.options["profile"], job.options.get("text")) as name:
+    with controller_profile(job.options["profile"], job.options.get("text")) as name:
         return _attempt(job, name, job.options.get("scene", job.seed))
 
 
@@ -159,7 +160,7 @@ def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
     try:
         before = plant.logs()
         timed = Timed(planner_named(o["planner"]))
-        activity = Activity(profile, digest, chooser=Planned(timed), motions=Swiftest(direct=False))
+        activity = Activity(profile, digest, chooser=PlannerSelection(timed), motions=TimeOptimalPlanner(direct=False))
         seat = Attempt(activity, POSES[o["poses"]](plant, profile, field))
         operator = Operator(digest, lambda *_: None)
         settings = Settings(profile, digest, profile.rate_hz)
@@ -178,7 +179,7 @@ def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
                 break
         ground = profile.workspace.ground_z_m
         up = lifted(before, plant.logs(), ground) if seat.over(system.now_ns) else []
-        verdict = plant.judge()
+        verdict = plant.evaluate()
         up = [i for i in up if verdict.logs[i].left_ground or not verdict.logs[i].max_grip_n]
         p, seen = timed.proposal, seat.seen
         wrong = misled(before, seen.logs)
@@ -191,7 +192,7 @@ def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
             "failure": activity.failure, "stops": operator.stops, "expected": list(p.logs) if p else [],
             "probability": p.probability if p else math.nan, "reason": p.reason if p else "",
             "plan_ms": 1e3 * timed.seconds, "grip": [grip.x_m, grip.y_m, grip.yaw_rad], "rise_m": rise,
-            "tong_rad": plant.tong_angle(), "asked": [p.x_m, p.y_m, p.yaw_rad] if p else [],
+            "tong_rad": plant.jaw_angle_rad(), "asked": [p.x_m, p.y_m, p.yaw_rad] if p else [],
             "seconds": (system.now_ns - START_NS) * 1e-9,
         }  # fmt: skip
     finally:

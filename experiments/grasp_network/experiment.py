@@ -12,16 +12,16 @@ import numpy as np
 from rich.console import Console
 
 from autonomy.grasp.network import PAPER as NETWORK
-from autonomy.grasp.network import WEIGHTS, GraspNet, prepare
+from autonomy.grasp.network import WEIGHTS, GraspNet, normalized_relief
 from autonomy.networks.graph import parameter_count
 from autonomy.networks.weights import WeightsRefused, load
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import ROOT, Result, judged, rate
+from experiments.common.result import ROOT, Result, make_result, rate
 from experiments.common.result_page import tell
 from experiments.grasp_network import folds, latency
-from experiments.grasp_network.metrics import FIGURES, PAPER, SECTIONS
+from experiments.grasp_network.metrics import METRICS, PAPER, SECTIONS
 from experiments.grasp_network.plots import draw
 from host.exit_codes import CommandFailed, ExitCode
 
@@ -42,24 +42,26 @@ def run(options: Options, console: Console) -> Result:
         import torch
     except ImportError:
         raise CommandFailed(
-            ExitCode.CONFIGURATION, "the experiment compares with torch: pip install 'timberhand[train]'"
+            "grasp-network.no-torch",
+            "the experiment compares with torch: pip install 'timberhand[train]'",
+            ExitCode.CONFIGURATION,
         ) from None
-    from training.grasp.cornell import DataRefused
+    from training.common.dataset_error import DatasetError
 
     metrics = {"parameters": float(parameter_count(NETWORK))}
     try:
         arrays, facts = load(WEIGHTS, NETWORK)
         skipped, pictures = _cornell(options, facts, arrays, metrics, console)
-    except (WeightsRefused, DataRefused) as error:
-        raise CommandFailed(ExitCode.CONFIGURATION, str(error)) from None
+    except (WeightsRefused, DatasetError) as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     scenes = [picture for _, picture in latency.log_scenes(options.seed)]
     with console.status("timing"):
         paths = latency.ways(arrays)
         times = latency.times_ms(paths, scenes, QUICK_ROUNDS if options.quick else ROUNDS)
         metrics |= latency.metrics(times, latency.agreement(paths, [*scenes, *pictures]))
     metrics["prepare_ms"] = _prepare_ms(options.seed)
-    result = judged(
-        "grasp-network", FIGURES, metrics, profile="", seed=options.seed, trials=len(pictures),
+    result = make_result(
+        "grasp-network", METRICS, metrics, profile="", seed=options.seed, trials=len(pictures),
         more={"torch": torch.__version__, "skipped": skipped}, paper=PAPER,
     )  # fmt: skip
     options.out.mkdir(parents=True, exist_ok=True)
@@ -83,7 +85,7 @@ def _cornell(
     if options.data is None and not folder.is_dir():
         return f"both cross-validations (no Cornell samples under {CORNELL} in TIMBERHAND_DATA)", []
     samples = load_samples(folder)
-    pictures = [prepare(cut(s.depth_m, centre(s.depth_m)))[None, None] for s in samples[:: 8 if options.quick else 1]]
+    pictures = [normalized_relief(cut(s.depth_m, centre(s.depth_m)))[None, None] for s in samples[:: 8 if options.quick else 1]]
     if options.data is not None:
         found = on_samples(GraspNet(arrays), samples, facts)
         metrics |= rate("data_right", sum(f["right"] for f in found), len(found))
@@ -127,7 +129,7 @@ def _prepare_ms(seed: int) -> float:
     found = []
     for depth, _ in latency.log_scenes(seed):
         start_ns = time.process_time_ns()
-        prepare(depth)
+        normalized_relief(depth)
         found.append((time.process_time_ns() - start_ns) / 1e6)
     return float(np.median(found))
 

@@ -10,8 +10,17 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.grasp.cylinders import Cylinders
-from autonomy.grasp.network import PAPER, SHAPE, Best, best, chooser, heads_first, prepare, stack
-from autonomy.grasp.virtual_scene import camera_above, cuboid, render
+from autonomy.grasp.network import (
+    PAPER,
+    SHAPE,
+    PixelGrasp,
+    best_pixel,
+    heads_first,
+    normalized_relief,
+    pixel_grasp_inference,
+    stack_maps,
+)
+from autonomy.grasp.virtual_scene import camera_above, operational_area, render
 from autonomy.networks.openvino_net import OpenVinoNet
 
 EAGER: Final = "torch eager, unchanged"
@@ -26,7 +35,7 @@ MOST_PX: Final = 3.0
 MOST_DEG: Final = 3.0
 SCENES: Final = 12
 
-Way = Callable[[np.ndarray], Best]
+Way = Callable[[np.ndarray], PixelGrasp]
 
 
 def ways(arrays: Mapping[str, np.ndarray]) -> dict[str, Way]:
@@ -39,22 +48,22 @@ def ways(arrays: Mapping[str, np.ndarray]) -> dict[str, Way]:
     net = random_net(PAPER, 0).eval()
     net.load(arrays)
 
-    def eager(picture: np.ndarray) -> Best:
+    def eager(picture: np.ndarray) -> PixelGrasp:
         with torch.inference_mode():
             found = net(torch.from_numpy(picture))
-        return best(stack({name: v.numpy() for name, v in found.items()}))
+        return best_pixel(stack_maps({name: v.numpy() for name, v in found.items()}))
 
     return {
         "torch": eager,
         "f32": _through(OpenVinoNet(PAPER, arrays, SHAPE)),
         "heads": _through(OpenVinoNet(*heads_first(PAPER, arrays), SHAPE)),
-        "low": chooser(arrays),
-        "mixed": chooser(arrays, "mixed"),
+        "low": pixel_grasp_inference(arrays),
+        "mixed": pixel_grasp_inference(arrays, "mixed"),
     }
 
 
 def _through(net: Callable[[np.ndarray], dict[str, np.ndarray]]) -> Way:
-    return lambda picture: best(stack(net(picture)))
+    return lambda picture: best_pixel(stack_maps(net(picture)))
 
 
 def times_ms(paths: Mapping[str, Way], pictures: Sequence[np.ndarray], rounds: int) -> dict[str, list[float]]:
@@ -118,6 +127,6 @@ def log_scenes(seed: int, count: int = SCENES) -> list[tuple[np.ndarray, np.ndar
         place = np.stack([rng.uniform(-0.5, 0.5, logs), 4.0 + rng.uniform(-0.5, 0.5, logs), height], axis=1)
         axis = np.stack([np.cos(turned), np.sin(turned), np.zeros(logs)], axis=1)
         world = Cylinders(place, axis, rng.uniform(1.2, 2.0, logs), radius)
-        depth = render(world, camera_above(cuboid(world)), 0.0)
-        found.append((depth, prepare(depth)[None, None]))
+        depth = render(world, camera_above(operational_area(world)), 0.0)
+        found.append((depth, normalized_relief(depth)[None, None]))
     return found

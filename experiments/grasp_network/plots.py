@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from autonomy.grasp.network import GraspNet, best, prepare
-from experiments.common.plot_style import OIL, RUST, STEEL, TIMBER, sheet
+from autonomy.grasp.network import GraspNet, best_pixel, normalized_relief
 from experiments.grasp_network.latency import PATHS, log_scenes
 from experiments.grasp_network.metrics import PAPER, RATIO
+from runtime.plot_style import OIL, RUST, STEEL, TIMBER, sheet
 
 BARS = {
     "cornell_paper_split": "copies at random\n(paper's way)",
@@ -72,9 +72,9 @@ def _logs(net: GraspNet, seed: int, path: Path) -> None:
         for column, i in enumerate(SHOWN):
             depth, _ = scenes[i]
             maps = net.maps(depth)
-            g = best(maps)
+            g = best_pixel(maps)
             top, bottom = grid[:, column]
-            top.imshow(prepare(depth), cmap="gray", vmin=-1.0)
+            top.imshow(normalized_relief(depth), cmap="gray", vmin=-1.0)
             quality = bottom.imshow(maps.q, cmap="inferno", vmin=0.0, vmax=1.0)
             for axis in (top, bottom):
                 along = 26.0 * np.array([math.cos(g.theta_rad), math.sin(g.theta_rad)])

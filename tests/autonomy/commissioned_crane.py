@@ -11,19 +11,20 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 from math import nan, pi
 
-from autonomy.calibration.plan import Plan, make_plan
+from autonomy.calibration.plan import CalibrationPlan, make_plan
 from autonomy.calibration.procedure import Calibration
-from can_dbc.codec import load
+from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
-from can_dbc.setpoint import CraneSetpoint, GrappleCommand, SpoolTest, StateReport, decode
-from machine.encoder import counts_from_position
-from machine.grapple import grapple_yaw
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, SpoolTest, StateReport
+from can_dbc.messages.datagrams import decode
+from machine.sensing.encoder import counts_from_position
+from machine.geometry.grapple import grapple_yaw
 from machine.joints import JOINTS, Joint
-from machine.lift import empty_moment_nm, lever_share
-from machine.load import load_profile, profile_hash
-from machine.modes import Mode
+from machine.sensing.weighing import empty_moment_nm, lever_share
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.status.modes import Mode
 from machine.profile import Profile, Sag, joint
-from machine.sag import true_pin
+from machine.geometry.sag import true_pin
 
 DATABASE = load("crane")
 STEP_S = 0.01
@@ -56,7 +57,7 @@ class Crane:
         self.opening = 100.0
         self.lines = [deque([0.0] * round(joint(self.profile, j).valve.delay_s / STEP_S)) for j in JOINTS]
         self.ticks = 0
-        self.plan: Plan = make_plan(self.profile, HOME[self.name], self.surveyed)
+        self.plan: CalibrationPlan = make_plan(self.profile, HOME[self.name], self.surveyed)
         if self.only_turns:
             self.plan = replace(self.plan, joints=(), survey=())
         self.calibration = Calibration(self.profile, profile_hash(self.profile), self.plan, DATABASE)

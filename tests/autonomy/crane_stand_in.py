@@ -13,14 +13,15 @@ import numpy as np
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, StateReport, decode
-from machine.grapple import grapple_yaw, half_gap_m, opening_pct_from_tong_angle, tip_below_pin_m
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
+from can_dbc.messages.datagrams import decode
+from machine.geometry.grapple import grapple_yaw, half_gap_m, opening_pct_from_tong_angle, tip_below_pin_m
 from machine.joints import JOINTS
-from machine.load import profile_hash
-from machine.modes import Mode
+from machine.loading.profile_file import profile_hash
+from machine.status.modes import Mode
 from machine.profile import Profile, joint
-from machine.sag import true_pin
+from machine.geometry.sag import true_pin
 
 GROUND_LOG = LogObservation(0, (-1.8, 4.4, -1.29), (0.6, 0.8, 0.0), 2.6, 0.2)
 HOME = (0.0, 0.75, -1.6, 0.30, 0.0)

@@ -6,8 +6,8 @@ from dataclasses import replace
 from math import cos, sin, sqrt
 
 from autonomy.motion.arm import Arm
-from autonomy.perception.logs import TRIANGLE, LogObservation
-from machine.load import load_profile
+from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
+from machine.loading.profile_file import load_profile
 
 PROFILE = load_profile("palms_471")
 ARM = Arm(PROFILE)

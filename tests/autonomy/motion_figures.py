@@ -9,10 +9,10 @@ from math import hypot, pi
 
 import numpy as np
 
-from autonomy.motion.obstacles import Held, Surroundings, swept
+from autonomy.motion.obstacles import HeldLog, CollisionScene, swept_capsules
 from autonomy.motion.trajectory import Trajectory
 from machine.joints import JOINTS
-from machine.kinematics import pin_position
+from machine.geometry.kinematics import pin_position
 from machine.profile import Profile, joint
 
 STEP_S = 0.005
@@ -37,7 +37,7 @@ class Figures:
     lost_m: float
 
 
-def figures(profile: Profile, motion: Trajectory, around: Surroundings, held: Held | None) -> Figures:
+def figures(profile: Profile, motion: Trajectory, around: CollisionScene, held: HeldLog | None) -> Figures:
     """All of them, looked at every 5 ms, clearances every 20 ms."""
     time_s = np.arange(0.0, motion.duration_s + STEP_S / 2, STEP_S)
     both = [motion.at(min(t, motion.duration_s - 1e-9)) for t in time_s]
@@ -81,10 +81,10 @@ def _swing(pin: np.ndarray, period_s: float) -> float:
 
 
 def _apart(
-    profile: Profile, q: np.ndarray, pin: np.ndarray, around: Surroundings, held: Held | None
+    profile: Profile, q: np.ndarray, pin: np.ndarray, around: CollisionScene, held: HeldLog | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distance of every part from every thing (n, m, k), by points, and of the pin from the motion's ends (n,)."""
-    body = swept(profile, q, pin, held)
+    body = swept_capsules(profile, q, pin, held)
     share = np.linspace(0.0, 1.0, POINTS)[:, None, None, None]
     points = body.a + share * (body.b - body.a)
     ground = around.ground(points[..., 0], points[..., 1]) if callable(around.ground) else around.ground

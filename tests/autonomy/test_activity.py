@@ -12,25 +12,28 @@ import pytest
 from crane_stand_in import GROUND_LOG, TICK_NS, StandIn, clearances
 
 from autonomy.crane_job.activity import Activity, Phase
-from autonomy.crane_job.phase_motions import aimed
-from autonomy.grasp.direct import LIFT_M, lies_in, plan_grasp
+from autonomy.crane_job.phase_motions import corrected_grasp
+from autonomy.grasp.selection import plan_single_log_grasp
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
 from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm
-from autonomy.motion.planners import Swiftest
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import CraneSetpoint, GrappleCommand, StateReport, decode
+from autonomy.motion.motion_planner import TimeOptimalPlanner
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, StateReport
+from can_dbc.messages.datagrams import decode
 from machine.joints import JOINTS, Joint
-from machine.load import load_profile, profile_hash
-from machine.modes import Mode
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.status.modes import Mode
 from machine.profile import Sag, joint
-from machine.sag import true_pin
+from machine.geometry.sag import true_pin
 
 PROFILE = load_profile("palms_471")
 CYCLE = ["LOOK", "ABOVE", "DESCEND", "CLOSE", "LIFT", "CARRY", "LOWER", "OPEN", "RETREAT", "DONE"]
 
 
 def activity(mission: Mission | None = None, direct: bool = True) -> Activity:
-    return Activity(PROFILE, profile_hash(PROFILE), mission, motions=Swiftest(direct))
+    return Activity(PROFILE, profile_hash(PROFILE), mission, motions=TimeOptimalPlanner(direct))
 
 
 def random_log(seed: int) -> LogObservation:
@@ -67,7 +70,7 @@ def test_a_column_that_leans_under_the_log_is_known_where_the_log_is_laid_down()
     planner = Activity(profile, profile_hash(profile))
     crane.run(planner)
     assert planner.done and planner.failure is None and planner.missed == 0
-    assert lies_in(profile.bunk, crane.logs[0])
+    assert lies_in_bunk(profile.bunk, crane.logs[0])
     last = {m.phase: m for m in crane.trace}
     assert planner.grasp is not None and planner.place is not None
     assert last["DESCEND"].pin[2] == pytest.approx(planner.grasp.pose.z_m, abs=1e-3)
@@ -92,7 +95,7 @@ def test_a_random_log_goes_from_the_ground_into_the_bunk(seed: int) -> None:
     seconds = crane.run(planner)
     assert planner.done and planner.failure is None and planner.missed == 0
     assert phases(crane) == CYCLE and 15.0 < seconds < 30.0
-    assert lies_in(PROFILE.bunk, crane.logs[0])
+    assert lies_in_bunk(PROFILE.bunk, crane.logs[0])
     least = clearances(PROFILE, crane.trace[::2])
     assert least["tip"] > 0.005 and least["log"] > 0.0
     assert least["tips_in_stakes"] > 0.15 and least["stakes"] > 0.08 and least["base"] > 1.5
@@ -108,9 +111,9 @@ def test_a_random_log_goes_from_the_ground_into_the_bunk(seed: int) -> None:
 def test_motions_that_are_made_one_by_one_lead_there_too(seed: int) -> None:
     crane, planner = StandIn(PROFILE, [random_log(seed)]), activity(direct=False)
     crane.run(planner)
-    assert planner.done and phases(crane) == CYCLE and lies_in(PROFILE.bunk, crane.logs[0])
+    assert planner.done and phases(crane) == CYCLE and lies_in_bunk(PROFILE.bunk, crane.logs[0])
     heights = {m.phase: m.pin[2] for m in crane.trace}
-    assert heights["LIFT"] == pytest.approx(heights["CLOSE"] + LIFT_M, abs=0.08), "it stands there to be judged"
+    assert heights["LIFT"] == pytest.approx(heights["CLOSE"] + VERIFY_LIFT_M, abs=0.08), "it stands there to be judged"
     least = clearances(PROFILE, crane.trace[::2])
     assert least["tip"] > 0.005 and least["stakes"] > 0.08
 
@@ -122,7 +125,7 @@ def test_with_another_log_in_view_the_crane_stays_in_the_bunk_and_goes_on_from_t
 
     def onward(log: LogObservation) -> bool:
         wanted.append(log.id)
-        return not lies_in(PROFILE.bunk, log)
+        return not lies_in_bunk(PROFILE.bunk, log)
 
     def job() -> Activity:
         return Activity(PROFILE, profile_hash(PROFILE), onward=onward)
@@ -135,7 +138,7 @@ def test_with_another_log_in_view_the_crane_stays_in_the_bunk_and_goes_on_from_t
     begin = len(crane.trace)
     crane.run(second)
     assert second.done and phases(crane)[-2:] == ["RETREAT", "DONE"] and first_s < 30.0
-    assert all(lies_in(PROFILE.bunk, log) for log in crane.logs)
+    assert all(lies_in_bunk(PROFILE.bunk, log) for log in crane.logs)
     least = clearances(PROFILE, crane.trace[begin::2])
     assert least["tip"] > 0.005 and least["stakes"] > 0.08
 
@@ -207,17 +210,17 @@ def test_what_turns_out_to_lie_a_little_elsewhere_is_gripped_there() -> None:
 )
 def test_other_news_of_a_log_change_no_aim(moved_m: tuple[float, float, float], why: str) -> None:
     arm = Arm(PROFILE)
-    grasp = plan_grasp(arm, GROUND_LOG, 0.0)
+    grasp = plan_single_log_grasp(arm, GROUND_LOG, 0.0)
     seen = replace(GROUND_LOG, center_m=tuple(c + d for c, d in zip(GROUND_LOG.center_m, moved_m, strict=True)))
-    assert aimed(arm, grasp, [seen]) is grasp, why
-    assert aimed(arm, grasp, []) is grasp
+    assert corrected_grasp(arm, grasp, [seen]) is grasp, why
+    assert corrected_grasp(arm, grasp, []) is grasp
 
 
 def test_nothing_is_aimed_at_below_the_ground() -> None:
     arm = Arm(PROFILE)
-    grasp = plan_grasp(arm, GROUND_LOG, 0.0)
+    grasp = plan_single_log_grasp(arm, GROUND_LOG, 0.0)
     x, y, z = GROUND_LOG.center_m
-    lower = aimed(arm, grasp, [replace(GROUND_LOG, center_m=(x, y, z - 0.2))])
+    lower = corrected_grasp(arm, grasp, [replace(GROUND_LOG, center_m=(x, y, z - 0.2))])
     assert lower.support_z_m == pytest.approx(PROFILE.workspace.ground_z_m)
     assert lower.pose.z_m == pytest.approx(grasp.pose.z_m + lower.support_z_m - grasp.support_z_m)
 
@@ -225,7 +228,7 @@ def test_nothing_is_aimed_at_below_the_ground() -> None:
 def test_a_log_that_has_come_to_its_place_is_let_go_at_once() -> None:
     profile = msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 2.0e-6))
     crane = StandIn(profile, [GROUND_LOG], log_kg=90.0)
-    planner = Activity(profile, profile_hash(profile), motions=Swiftest())
+    planner = Activity(profile, profile_hash(profile), motions=TimeOptimalPlanner())
     run_until(crane, planner, Phase.CARRY, more_s=1.0)
     crane.log_kg = 70.0  # it swings, and weighs less for the moment in which the scale is asked
     crane.run(planner)

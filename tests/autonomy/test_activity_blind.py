@@ -10,11 +10,11 @@ import pytest
 from crane_stand_in import StandIn
 
 from autonomy.crane_job.activity import Activity
-from autonomy.grasp.direct import lies_in
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import StateReport
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import StateReport
 from machine.joints import Joint
-from machine.load import load_profile, profile_hash
+from machine.loading.profile_file import load_profile, profile_hash
 
 FORWARDER = load_profile("aoro_fc8")
 HOME = (0.0, 1.25, -2.39, 0.10, 0.0)
@@ -41,7 +41,7 @@ def test_a_log_beside_the_forwarder_goes_into_its_bunk(seed: int) -> None:
     planner = Activity(FORWARDER, profile_hash(FORWARDER))
     crane.run(planner)
     assert planner.failure is None and planner.done and planner.missed == 0
-    assert lies_in(FORWARDER.bunk, crane.logs[0])
+    assert lies_in_bunk(FORWARDER.bunk, crane.logs[0])
 
 
 def test_a_lost_encoder_still_pauses_it() -> None:

@@ -10,14 +10,17 @@ from crane_stand_in import StandIn
 from grasp_scenes import PROFILE, cross, pair
 
 from autonomy.crane_job.activity import Activity
-from autonomy.crane_job.phase_motions import GATHER_S
+from autonomy.crane_job.phase_motions import BUNDLE_LIFT_S
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.direct import Planned, lies_in, travel_height
-from autonomy.grasp.search import Search
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import CraneSetpoint, GrappleCommand, decode
-from machine.kinematics import Unreachable
-from machine.load import profile_hash
+from autonomy.grasp.selection import PlannerSelection
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.grapple_heights import travel_height_m
+from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
+from can_dbc.messages.datagrams import decode
+from machine.geometry.kinematics import Unreachable
+from machine.loading.profile_file import profile_hash
 
 
 class Bundle(StandIn):
@@ -41,7 +44,7 @@ class Bundle(StandIn):
 def made(logs: list[LogObservation], slips: tuple[int, ...] = ()) -> tuple[Bundle, Activity]:
     crane = Bundle(PROFILE, logs)
     crane.slips = slips
-    return crane, Activity(PROFILE, profile_hash(PROFILE), chooser=Planned(Search()))
+    return crane, Activity(PROFILE, profile_hash(PROFILE), chooser=PlannerSelection(SamplingPlanner()))
 
 
 def until(crane: Bundle, planner: Activity, phase: Phase) -> list[GrappleCommand]:
@@ -65,8 +68,8 @@ def test_a_bundle_is_lifted_slowly_with_the_tongs_closing_on() -> None:
     begun_ns = crane.now_ns
     asked = until(crane, planner, Phase.CARRY)
     assert set(asked) == {GrappleCommand.CLOSE}
-    assert crane.pin()[2] == pytest.approx(travel_height(PROFILE), abs=0.02)
-    assert (crane.now_ns - begun_ns) * 1e-9 > GATHER_S
+    assert crane.pin()[2] == pytest.approx(travel_height_m(PROFILE), abs=0.02)
+    assert (crane.now_ns - begun_ns) * 1e-9 > BUNDLE_LIFT_S
 
 
 def test_the_pin_waits_while_the_tongs_close_again() -> None:
@@ -107,14 +110,14 @@ def test_a_single_log_of_many_is_taken_from_the_top_and_laid_down() -> None:
     crane, planner = made(logs, slips=(0, 1))
     until(crane, planner, Phase.CARRY)
     assert planner.grasp is not None and planner.grasp.log.id == 2
-    assert not any(lies_in(PROFILE.bunk, log) for log in crane.logs)
+    assert not any(lies_in_bunk(PROFILE.bunk, log) for log in crane.logs)
 
 
 def test_a_bundle_without_a_way_on_is_let_go_a_little_over_where_it_lay(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise Unreachable("no way is clear")
 
-    monkeypatch.setattr("autonomy.crane_job.cycle.carrying", refuse)
+    monkeypatch.setattr("autonomy.crane_job.cycle.carry_motion", refuse)
     crane, planner = made(pair())
     until(crane, planner, Phase.OPEN)
     assert planner.grasp is not None

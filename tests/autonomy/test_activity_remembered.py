@@ -10,9 +10,9 @@ from crane_stand_in import GROUND_LOG, StandIn
 from grasp_scenes import PROFILE
 
 from autonomy.crane_job.activity import Activity
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import StateReport
-from machine.load import profile_hash
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import StateReport
+from machine.loading.profile_file import profile_hash
 
 _SHUT = 4
 

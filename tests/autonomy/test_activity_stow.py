@@ -8,12 +8,13 @@ from crane_stand_in import GROUND_LOG, StandIn
 from test_activity import PROFILE, activity, phases, run_until
 
 from autonomy.crane_job.activity import Activity, Phase
-from autonomy.grasp.direct import retreat_height
-from autonomy.grasp.proposal import NoGrasp
+from autonomy.grasp.grapple_heights import retreat_height_m
+from autonomy.grasp.planner import NoGrasp
 from autonomy.motion.arm import Arm
-from can_dbc.setpoint import GrappleCommand, decode
-from machine.kinematics import Unreachable
-from machine.load import profile_hash
+from can_dbc.messages.crane import GrappleCommand
+from can_dbc.messages.datagrams import decode
+from machine.geometry.kinematics import Unreachable
+from machine.loading.profile_file import profile_hash
 
 ARM = Arm(PROFILE)
 BUNK = PROFILE.bunk
@@ -33,7 +34,7 @@ def over_the_bunk(q: tuple[float, ...]) -> bool:
     pin = ARM.pose(q)
     x, y = ARM.xy(pin)
     near = abs(x - BUNK.center_m[0]) < BUNK.width_m and abs(y - BUNK.center_m[1]) < BUNK.width_m
-    return near and pin.z_m > retreat_height(PROFILE) - 0.02
+    return near and pin.z_m > retreat_height_m(PROFILE) - 0.02
 
 
 def test_from_beside_a_log_it_goes_over_the_bunk_and_keeps_its_tongs_as_they_are() -> None:
@@ -49,7 +50,7 @@ def test_from_beside_a_log_it_goes_over_the_bunk_and_keeps_its_tongs_as_they_are
 
 def test_where_it_rests_there_already_nothing_moves() -> None:
     crane = StandIn(PROFILE, [])
-    over = ARM.over(*BUNK.center_m, retreat_height(PROFILE) + 0.2, retreat_height(PROFILE) + 0.2)
+    over = ARM.over(*BUNK.center_m, retreat_height_m(PROFILE) + 0.2, retreat_height_m(PROFILE) + 0.2)
     crane.q = tuple(ARM.joints(np.array([over]))[0].tolist())
     before = crane.q
     stow(crane)
@@ -63,7 +64,7 @@ def test_a_log_for_which_there_is_no_way_on_is_let_go_where_it_lay(
     def refuse(*_: object, **__: object) -> None:
         raise trouble
 
-    monkeypatch.setattr("autonomy.crane_job.cycle.carrying", refuse)
+    monkeypatch.setattr("autonomy.crane_job.cycle.carry_motion", refuse)
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     crane.run(planner)
     assert planner.failure == str(trouble) and planner.idle

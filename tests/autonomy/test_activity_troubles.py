@@ -12,14 +12,15 @@ from crane_stand_in import GROUND_LOG, HOME, TICK_NS, StandIn, clearances
 from test_activity import CYCLE, PROFILE, activity, phases, report, run_until
 
 from autonomy.crane_job.activity import Phase
-from autonomy.crane_job.grasp_verification import is_between_tongs
+from autonomy.crane_job.grasp_verification import is_between_jaws
 from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import CraneSetpoint, GrappleCommand, decode
-from machine.grapple import lowest_tip_below_pin_m
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
+from can_dbc.messages.datagrams import decode
+from machine.geometry.grapple import lowest_tip_below_pin_m
 from machine.joints import JOINTS, Joint
-from machine.modes import Mode
+from machine.status.modes import Mode
 from machine.profile import joint
 
 
@@ -93,17 +94,17 @@ def test_only_what_lies_in_closed_tongs_is_between_them() -> None:
     arm = Arm(PROFILE)
     x, y, z = GROUND_LOG.center_m
     pin = arm.over(x, y, z + lowest_tip_below_pin_m(PROFILE.grapple.tongs) - 0.1, 2.0)
-    assert is_between_tongs(arm, GROUND_LOG, pin)
-    assert not is_between_tongs(arm, GROUND_LOG, pin.at_height(pin.z_m + 0.15)), "it lies under them"
+    assert is_between_jaws(arm, GROUND_LOG, pin)
+    assert not is_between_jaws(arm, GROUND_LOG, pin.at_height(pin.z_m + 0.15)), "it lies under them"
     upright = replace(GROUND_LOG, axis=(0.0, 0.0, 1.0))
-    assert is_between_tongs(arm, upright, pin)
+    assert is_between_jaws(arm, upright, pin)
     ax, ay, _ = GROUND_LOG.axis
     aside_m = 0.6 * GROUND_LOG.diameter_m
     beside = replace(GROUND_LOG, center_m=(x - aside_m * ay, y + aside_m * ax, z))
-    assert not is_between_tongs(arm, beside, pin), "another one, beside it"
+    assert not is_between_jaws(arm, beside, pin), "another one, beside it"
     half_m = 0.5 * GROUND_LOG.length_m
     ends = replace(GROUND_LOG, center_m=(x + (half_m + 0.2) * ax, y + (half_m + 0.2) * ay, z))
-    assert not is_between_tongs(arm, ends, pin), "it ends before them"
+    assert not is_between_jaws(arm, ends, pin), "it ends before them"
 
 
 def test_a_missed_log_is_looked_for_again() -> None:

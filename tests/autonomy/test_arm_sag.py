@@ -6,12 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from autonomy.motion.arm import Arm, Pose
-from autonomy.motion.trajectory import straight
-from machine.kinematics import pin_position
-from machine.load import load_profile
+from autonomy.motion.arm import Arm
+from autonomy.motion.pose import Pose
+from autonomy.motion.trajectory import straight_line
+from machine.geometry.kinematics import pin_position
+from machine.loading.profile_file import load_profile
 from machine.profile import Sag
-from machine.sag import true_pin
+from machine.geometry.sag import true_pin
 
 PROFILE = load_profile("palms_471")
 LEANING = Arm(msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 1.2e-6, 4500.0, 3000.0)))
@@ -22,7 +23,7 @@ def test_with_sag_known_the_true_pin_goes_straight(load_kg: float) -> None:
     arm = LEANING.loaded(load_kg)
     assert arm.load_kg == load_kg and (arm is LEANING) == (load_kg == 0.0)
     start, goal = Pose(0.8, 3.6, 0.6, 0.9, 0.0), Pose(0.8, 5.2, 0.6, 0.9, 0.0)
-    motion = straight(arm, start, goal)
+    motion = straight_line(arm, start, goal)
     q = np.array(motion.position)
     true = np.array([true_pin(arm.profile.sag, PROFILE.kinematics, row, load_kg) for row in q])
     assert np.max(np.abs(true[:, 2] - 0.6)) < 1e-4, "as level as the column really holds it"

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from autonomy.motion.setpoint_stream import HORIZON_KNOTS, PERIOD_NS, SetpointStream
+from autonomy.motion.setpoint_stream import HORIZON_KNOT_COUNT, PERIOD_NS, SetpointStream
 from autonomy.motion.trajectory import hold
-from can_dbc.setpoint import CraneSetpoint, DatagramFault, DatagramRefused, GrappleCommand, decode
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
+from can_dbc.messages.datagrams import decode
+from can_dbc.messages.envelope import DatagramFault, DatagramRefused
 
 
 class Ramp:
@@ -28,7 +30,7 @@ def window(time_s: float, rate: float = 1.0, now_ns: int = 7_000_000_000) -> Cra
 
 def test_the_window_shows_the_next_400_ms() -> None:
     setpoint = window(0.5)
-    assert [k.after_ns for k in setpoint.knots] == [n * PERIOD_NS for n in range(HORIZON_KNOTS + 1)]
+    assert [k.after_ns for k in setpoint.knots] == [n * PERIOD_NS for n in range(HORIZON_KNOT_COUNT + 1)]
     assert [k.position[0] for k in setpoint.knots] == pytest.approx([0.05 + 0.005 * n for n in range(9)])
     assert all(k.velocity == pytest.approx((0.1,) * 5) for k in setpoint.knots)
     assert (setpoint.profile_hash, setpoint.lease_ns, setpoint.stamp_ns) == (0xABCD, 150_000_000, 7_000_000_000)

@@ -10,17 +10,17 @@ import pytest
 from valve_stand_in import StandIn
 
 from autonomy.calibration.delay_fit import fit_delay, response_s
-from autonomy.calibration.program import staircase, sweep, turned, wiggle
+from autonomy.calibration.spool_program import staircase, sweep, reversed_sweep, wiggle
 from autonomy.calibration.result import identify
-from autonomy.calibration.survey import Reading, fit_survey, telling_poses
+from autonomy.calibration.survey import SurveyReading, fit_survey, most_informative_poses
 from autonomy.calibration.tasks import Findings
-from autonomy.calibration.trace import Record
-from autonomy.calibration.valve_fit import fit_valve, repeated
+from autonomy.calibration.trace import SpoolTestRecord
+from autonomy.calibration.valve_fit import fit_valve, deadband_difference
 from machine.joints import Joint
-from machine.lift import empty_moment_nm
-from machine.load import load_profile
+from machine.sensing.weighing import empty_moment_nm
+from machine.loading.profile_file import load_profile
 from machine.profile import Sag
-from machine.sag import true_pin
+from machine.geometry.sag import true_pin
 
 PALMS = load_profile("palms_471")
 SLEW = PALMS.joints["slew"]
@@ -31,12 +31,12 @@ MACHINES = [StandIn(), pytest.param(OTHER, marks=pytest.mark.slow)]
 
 
 @cache
-def measured(machine: StandIn) -> tuple[Record, ...]:
+def measured(machine: StandIn) -> tuple[SpoolTestRecord, ...]:
     """Sweeps and staircases of both sides of a slew."""
     tests = []
     start = -0.3
     for side in (1, -1):
-        for kind, program in (("sweep", turned(sweep(SLEW, side), 2.0)), ("staircase", staircase(SLEW, side))):
+        for kind, program in (("sweep", reversed_sweep(sweep(SLEW, side), 2.0)), ("staircase", staircase(SLEW, side))):
             tests.append(machine.run(Joint.SLEW, side, kind, program, start, seed=len(tests)))
             start = float(tests[-1].position[-1])
     return tuple(tests)
@@ -77,15 +77,15 @@ def test_a_repetition_agrees_and_another_valve_does_not() -> None:
     program = wiggle(SLEW, 1)
     again = StandIn().run(Joint.SLEW, 1, "wiggle", program, 0.0, seed=9)
     moved = StandIn(deadbands=(0.17, 0.11)).run(Joint.SLEW, 1, "wiggle", program, 0.0, seed=9)
-    assert abs(repeated(fit, again)) < 0.005
-    assert repeated(fit, moved) == pytest.approx(0.04, abs=0.008)
+    assert abs(deadband_difference(fit, again)) < 0.005
+    assert deadband_difference(fit, moved) == pytest.approx(0.04, abs=0.008)
 
 
 SAG = Sag(0.0054, 0.0036, 0.028, 1.2e-6, 4500.0, 3000.0)
 OFFSETS = (0.002, -0.0025, 0.0015, 0.002)
 
 
-def surveyed(noise_m: float, friction_nm: float = 0.0, weighed: bool = True) -> list[Reading]:
+def surveyed(noise_m: float, friction_nm: float = 0.0, weighed: bool = True) -> list[SurveyReading]:
     rng = np.random.default_rng(3)
     candidates = [
         (slew, lift, tilt, ext, 0.0)
@@ -94,14 +94,14 @@ def surveyed(noise_m: float, friction_nm: float = 0.0, weighed: bool = True) -> 
         for tilt in (-2.0, -1.2, -0.4)
         for ext in (0.3, 1.0, 1.6)
     ]
-    chosen = telling_poses(PALMS.kinematics, candidates, 7)
+    chosen = most_informative_poses(PALMS.kinematics, candidates, 7)
     assert len(set(chosen)) == 7
     readings = []
     for i in chosen:
         pin = np.array(true_pin(SAG, PALMS.kinematics, candidates[i])) + rng.normal(0.0, noise_m, 3)
         moment_nm = empty_moment_nm(SAG, PALMS.kinematics, candidates[i]) + friction_nm * rng.uniform(-1.0, 1.0)
         shown = tuple(q + o for q, o in zip(candidates[i], (*OFFSETS, 0.0), strict=True))
-        readings.append(Reading(shown, tuple(pin), moment_nm if weighed else np.nan))
+        readings.append(SurveyReading(shown, tuple(pin), moment_nm if weighed else np.nan))
     return readings
 
 
@@ -150,7 +150,7 @@ def test_too_few_surveyed_poses_are_refused() -> None:
         fit_survey(PALMS.kinematics, surveyed(0.0)[:4])
 
 
-def found(tests: tuple[Record, ...]) -> Findings:
+def found(tests: tuple[SpoolTestRecord, ...]) -> Findings:
     wiggles = [StandIn().run(Joint.SLEW, side, "wiggle", wiggle(SLEW, side), 0.0) for side in (1, -1)]
     return Findings(wiggles=wiggles, tests=list(tests))
 

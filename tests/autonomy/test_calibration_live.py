@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from autonomy.calibration.live import QUESTION, Instrument, Link, first_report
-from can_dbc.setpoint import StateReport, encode
-from machine.modes import Mode
+from autonomy.calibration.live import SURVEY_REQUEST, SurveyInstrument, ControllerLink, first_report
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import encode
+from machine.status.modes import Mode
 
 NAN5 = (0.0,) * 5
 
@@ -44,10 +45,10 @@ def waited_for(read: Callable[[int], Any]) -> Any:
 
 
 def test_an_instrument_is_asked_and_its_answer_is_read(far: socket.socket) -> None:
-    instrument = Instrument(far.getsockname())
+    instrument = SurveyInstrument(far.getsockname())
     assert instrument.read(10**9) is None
     question, asker = far.recvfrom(100)
-    assert question == QUESTION
+    assert question == SURVEY_REQUEST
     for answer in (b'{"error":"no prism"}', b"nonsense", b'{"pin_m":[1.0,2.0,3.0]}'):
         far.sendto(answer, asker)
     assert waited_for(instrument.read) == (1.0, 2.0, 3.0)
@@ -55,7 +56,7 @@ def test_an_instrument_is_asked_and_its_answer_is_read(far: socket.socket) -> No
 
 
 def test_an_instrument_tells_the_grapples_direction_or_that_it_cannot(far: socket.socket) -> None:
-    instrument = Instrument(far.getsockname())
+    instrument = SurveyInstrument(far.getsockname())
     assert instrument.read_yaw(10**9) is None
     _, asker = far.recvfrom(100)
     far.sendto(b'{"pin_m":[1.0,2.0,3.0],"yaw_rad":0.7}', asker)
@@ -68,7 +69,7 @@ def test_an_instrument_tells_the_grapples_direction_or_that_it_cannot(far: socke
 
 def test_the_newest_report_counts_and_a_foreign_controller_is_noticed(far: socket.socket) -> None:
     port = free_port()
-    link = Link(far.getsockname(), port, 7, None)
+    link = ControllerLink(far.getsockname(), port, 7, None)
     for data in (report(Mode.BOOT), b"noise", report(Mode.STANDBY)):
         far.sendto(data, ("127.0.0.1", port))
     first = first_report(link, 5.0, (Mode.STANDBY,))

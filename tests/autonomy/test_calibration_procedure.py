@@ -8,19 +8,19 @@ import msgspec
 import pytest
 from commissioned_crane import HOME, SAG, Crane
 
-from autonomy.calibration.plan import NoRoom, make_plan, sentences
-from autonomy.calibration.profile_file import changes
-from autonomy.calibration.program import STEP_SHARES, command_for, staircase, sweep, turned, wiggle
-from autonomy.calibration.report import document
-from autonomy.calibration.result import Result, identify
+from autonomy.calibration.plan import CalibrationImpossible, make_plan, plan_summary
+from autonomy.calibration.profile_file import profile_changes
+from autonomy.calibration.spool_program import STAIRCASE_SPEED_SHARES, command_for, staircase, sweep, reversed_sweep, wiggle
+from autonomy.calibration.report import result_document
+from autonomy.calibration.result import CalibrationResult, identify
 from autonomy.calibration.survey import fit_survey
-from autonomy.calibration.tasks import Spool, Travel
+from autonomy.calibration.tasks import SpoolTask, MoveTask
 from autonomy.calibration.turn_fit import fit_turns
-from can_dbc.setpoint import CraneSetpoint, SpoolTest
+from can_dbc.messages.crane import CraneSetpoint, SpoolTest
 from machine.joints import JOINTS, Joint
-from machine.kinematics import pin_position
-from machine.load import load_profile
-from machine.modes import Mode
+from machine.geometry.kinematics import pin_position
+from machine.loading.profile_file import load_profile
+from machine.status.modes import Mode
 
 PALMS = load_profile("palms_471")
 
@@ -84,13 +84,13 @@ def test_without_a_readable_direction_the_rotator_stays_as_it_was() -> None:
     assert not any(isinstance(m, SpoolTest) for m in crane.heard)
     result = identify(crane.profile, run.found)
     assert result.turns is None and len(result.kept) == 1 and "no encoder" in result.kept[0]
-    assert document(result, {}, [])["kept"] == list(result.kept)
-    assert not changes(crane.profile, Result({}, {}, None, kept=result.kept))
+    assert result_document(result, {}, [])["kept"] == list(result.kept)
+    assert not profile_changes(crane.profile, CalibrationResult({}, {}, None, kept=result.kept))
 
 
 def test_every_joint_is_wiggled_before_anything_travels() -> None:
     crane = Crane()
-    run = crane.run(done=lambda c: isinstance(c.calibration.task, Travel))
+    run = crane.run(done=lambda c: isinstance(c.calibration.task, MoveTask))
     assert run.failure is None
     assert [(w.joint, w.side) for w in run.found.wiggles] == [(j, s) for j in JOINTS for s in (1, -1)]
     assert all(isinstance(m, SpoolTest) for m in crane.heard)
@@ -129,7 +129,7 @@ def test_an_abort_shuts_the_valve_within_a_tenth_of_a_second(after_s: float) -> 
 
 def test_an_abort_while_travelling_ends_at_rest() -> None:
     crane = Crane()
-    crane.run(done=lambda c: isinstance(c.calibration.task, Travel))
+    crane.run(done=lambda c: isinstance(c.calibration.task, MoveTask))
     crane.run(1.5)
     crane.calibration.abort("interrupted")
     run = crane.run(5.0)
@@ -183,14 +183,14 @@ def test_a_plan_stays_clear_of_ground_bunk_and_stops(name: str) -> None:
             assert pin_position(profile.kinematics, q)[2] >= plan.clear_z_m - 1e-9
     for q in plan.survey:
         assert pin_position(profile.kinematics, q)[2] >= plan.clear_z_m - 1e-9
-    lines = sentences(profile, plan)
+    lines = plan_summary(profile, plan)
     assert len(lines) == len(JOINTS) + 2
     assert list(plan.skipped) == ([Joint.ROT] if name == "aoro_fc8" else [])
 
 
 def test_a_machine_without_room_is_refused_before_anything_moves() -> None:
     bunk = msgspec.structs.replace(PALMS.bunk, stake_height_m=9.0)
-    with pytest.raises(NoRoom, match="clear of ground and bunk"):
+    with pytest.raises(CalibrationImpossible, match="clear of ground and bunk"):
         make_plan(msgspec.structs.replace(PALMS, bunk=bunk), (0.0, 0.7, -1.5, 0.3, nan), surveyed=False)
 
 
@@ -198,12 +198,12 @@ def test_programs_begin_and_end_neutral_and_reach_their_speeds() -> None:
     for name, spec in PALMS.joints.items():
         for side in (1, -1):
             stairs = staircase(spec, side)
-            for program in (wiggle(spec, side), sweep(spec, side), stairs, turned(sweep(spec, side), 1.7)):
+            for program in (wiggle(spec, side), sweep(spec, side), stairs, reversed_sweep(sweep(spec, side), 1.7)):
                 assert program.at(0.0) == program.at(program.duration_s) == 0.0, name
                 assert program.window(program.duration_s - 0.1, 0.4)[-1].percent == 0.0
                 assert all(side * p >= 0.0 for _, p in program.points)
             top = max(side * p for _, p in stairs.points)
-            assert top == pytest.approx(command_for(spec, side, STEP_SHARES[-1] * spec.speed_limit))
+            assert top == pytest.approx(command_for(spec, side, STAIRCASE_SPEED_SHARES[-1] * spec.speed_limit))
 
 
 def test_a_program_begins_at_its_beginning_however_late_the_turn_is() -> None:
@@ -219,7 +219,7 @@ def test_a_program_begins_at_its_beginning_however_late_the_turn_is() -> None:
 def test_a_task_tells_what_it_is() -> None:
     crane = Crane()
     crane.run(1.0)
-    assert crane.calibration.task == Spool(Joint.SLEW, 1, "wiggle")
+    assert crane.calibration.task == SpoolTask(Joint.SLEW, 1, "wiggle")
     at, count = crane.calibration.progress
     assert at == 0 and count > 40 and 150.0 < crane.calibration.remaining_s() < 260.0
 
@@ -231,8 +231,8 @@ def test_a_changed_program_is_told_at_once_and_its_end_however_late() -> None:
     last = crane.heard[-1]
     assert isinstance(last, SpoolTest) and last.stamp_ns == crane.now_ns and last.knots[-1].percent == 0.0
     other = Crane()
-    other.run(done=lambda c: isinstance(c.calibration.task, Travel))
-    other.run(done=lambda c: isinstance(c.calibration.task, Spool) and any(c._spools()))
+    other.run(done=lambda c: isinstance(c.calibration.task, MoveTask))
+    other.run(done=lambda c: isinstance(c.calibration.task, SpoolTask) and any(c._spools()))
     heard = len(other.heard)
     spool = other.calibration._spool
     assert spool is not None

@@ -8,34 +8,35 @@ import msgspec
 import numpy as np
 import pytest
 
-from autonomy.motion import primitives
-from autonomy.motion.arm import Arm, Pose
+from autonomy.motion import movement_primitives
+from autonomy.motion.arm import Arm
+from autonomy.motion.pose import Pose
 from autonomy.motion.demonstration import (
     AXES,
     GRID_S,
     RecordingRefused,
-    Track,
-    cut,
-    from_text,
-    smooth,
-    to_text,
-    track,
+    JointTrack,
+    segment_motions,
+    read_demonstrations,
+    smoothed,
+    format_demonstrations,
+    joint_track,
 )
 from autonomy.motion.dmp import DemonstrationRefused
-from autonomy.motion.primitives import PrimitivesRefused, Shown, algorithm_1, learn_primitives
-from can_dbc.codec import load as load_database
+from autonomy.motion.movement_primitives import PrimitivesRefused, PrimitiveMotions, algorithm_1, learn_primitives
+from can_dbc.dbc.codec import load as load_database
 from can_dbc.frame import Frame
-from can_dbc.setpoint import GrappleCommand
-from machine.encoder import counts_from_position
+from can_dbc.messages.crane import GrappleCommand
+from machine.sensing.encoder import counts_from_position
 from machine.joints import Joint
-from machine.kinematics import Unreachable
-from machine.load import load_profile
+from machine.geometry.kinematics import Unreachable
+from machine.loading.profile_file import load_profile
 from machine.profile import joint
 
 PROFILE = load_profile("aoro_fc8")
 ARM = Arm(PROFILE)
 CRANE = load_database("crane")
-SHIPPED = primitives.SHIPPED / "aoro_fc8.csv"
+SHIPPED = movement_primitives.SHIPPED_FOLDER / "aoro_fc8.csv"
 REST = np.array([0.0, 1.2, -2.3, 0.1])
 OVER_BUNK = ARM.reach(*PROFILE.bunk.center_m, 1.95, 3.0)
 
@@ -45,17 +46,17 @@ def rise(time_s: np.ndarray, begin_s: float, end_s: float) -> np.ndarray:
     return tau**3 * (10.0 - 15.0 * tau + 6.0 * tau**2)
 
 
-def shown() -> Track:
+def shown() -> JointTrack:
     """Out for 4 s, a rest with a small correction, back for 4 s, rest."""
     time_s = np.arange(0.0, 16.0, GRID_S)
     way = rise(time_s, 1.0, 5.0) - rise(time_s, 10.0, 14.0)
     little = 0.01 * (rise(time_s, 6.5, 7.0) - rise(time_s, 8.0, 8.5))
-    return Track(
+    return JointTrack(
         time_s, REST + way[:, None] * np.array([0.8, -0.9, 1.0, 0.3]) + little[:, None] * np.array([1, 0, 0, 0])
     )
 
 
-def frames(positions: Track, without: Joint | None = None) -> list[Frame]:
+def frames(positions: JointTrack, without: Joint | None = None) -> list[Frame]:
     """What the encoders would have sent, 100 times a second each, among frames of others."""
     out = []
     for t in np.arange(0.0, positions.time_s[-1], 0.01):
@@ -73,7 +74,7 @@ def frames(positions: Track, without: Joint | None = None) -> list[Frame]:
 
 
 def test_encoder_frames_become_joint_positions_over_time() -> None:
-    found = track(PROFILE, CRANE, frames(shown()))
+    found = joint_track(PROFILE, CRANE, frames(shown()))
     assert found.time_s[0] == 0.0 and np.diff(found.time_s) == pytest.approx(GRID_S)
     expected = np.column_stack([np.interp(found.time_s, shown().time_s, c) for c in shown().position.T])
     assert np.max(np.abs(found.position - expected)) < 1e-3
@@ -81,11 +82,11 @@ def test_encoder_frames_become_joint_positions_over_time() -> None:
 
 def test_an_encoder_that_is_not_heard_is_named() -> None:
     with pytest.raises(RecordingRefused, match="EncTilt of the tilt"):
-        track(PROFILE, CRANE, frames(shown(), without=Joint.TILT))
+        joint_track(PROFILE, CRANE, frames(shown(), without=Joint.TILT))
 
 
 def test_motions_are_cut_from_rest_to_rest_and_small_corrections_are_left_out() -> None:
-    out, back = cut(PROFILE, shown())
+    out, back = segment_motions(PROFILE, shown())
     assert out.time_s[0] == back.time_s[0] == 0.0
     assert out.time_s[-1] == pytest.approx(4.0, abs=0.7)
     assert out.position[0] == pytest.approx(REST, abs=0.01) == back.position[-1]
@@ -95,32 +96,32 @@ def test_motions_are_cut_from_rest_to_rest_and_small_corrections_are_left_out() 
 def test_what_brings_the_pin_nowhere_is_no_motion() -> None:
     time_s = np.arange(0.0, 10.0, GRID_S)
     turned = REST + (0.2 * rise(time_s, 3.0, 6.0))[:, None] * np.array([1.0, 0.0, 0.0, 0.0])
-    assert cut(PROFILE, Track(time_s, turned)) == ()
+    assert segment_motions(PROFILE, JointTrack(time_s, turned)) == ()
     enough = REST + (0.9 * rise(time_s, 3.0, 6.0))[:, None] * np.array([1.0, 0.0, 0.0, 0.0])
-    assert len(cut(PROFILE, Track(time_s, enough))) == 1
+    assert len(segment_motions(PROFILE, JointTrack(time_s, enough))) == 1
 
 
 def test_a_still_machine_shows_nothing() -> None:
-    still = Track(np.arange(200) * GRID_S, np.tile(REST, (200, 1)))
-    assert cut(PROFILE, still) == ()
+    still = JointTrack(np.arange(200) * GRID_S, np.tile(REST, (200, 1)))
+    assert segment_motions(PROFILE, still) == ()
 
 
 def test_smoothing_takes_tremor_out_without_delay() -> None:
     time_s = np.arange(0.0, 6.0, GRID_S)
     clean = rise(time_s, 1.0, 5.0)[:, None]
     trembling = clean + 0.01 * np.sin(2.0 * np.pi * 5.0 * time_s + 0.3)[:, None]
-    left = smooth(trembling)
+    left = smoothed(trembling)
     assert np.max(np.abs(left - clean)[10:-10]) < 0.008
-    quiet, loud = (np.abs(np.diff(y, axis=0))[10:-10].max() for y in (left - smooth(clean), trembling - clean))
+    quiet, loud = (np.abs(np.diff(y, axis=0))[10:-10].max() for y in (left - smoothed(clean), trembling - clean))
     assert quiet < 0.05 * loud
     lag = np.argmax(np.correlate(left[:, 0] - left.mean(), clean[:, 0] - clean.mean(), "full")) - len(time_s) + 1
     assert lag == 0
 
 
 def test_a_file_of_demonstrations_reads_back(tmp_path: Path) -> None:
-    motions = cut(PROFILE, shown())
-    (tmp_path / "shown.csv").write_text(to_text("aoro_fc8", motions))
-    name, again = from_text(tmp_path / "shown.csv")
+    motions = segment_motions(PROFILE, shown())
+    (tmp_path / "shown.csv").write_text(format_demonstrations("aoro_fc8", motions))
+    name, again = read_demonstrations(tmp_path / "shown.csv")
     assert name == "aoro_fc8" and len(again) == 2
     for a, b in zip(motions, again, strict=True):
         assert len(b.position) == pytest.approx(len(a.position), abs=1)
@@ -139,14 +140,14 @@ def test_a_file_of_demonstrations_reads_back(tmp_path: Path) -> None:
 def test_another_file_is_refused_in_words(tmp_path: Path, text: str) -> None:
     (tmp_path / "other.csv").write_text(text)
     with pytest.raises(RecordingRefused, match=r"other\.csv"):
-        from_text(tmp_path / "other.csv")
+        read_demonstrations(tmp_path / "other.csv")
     with pytest.raises(RecordingRefused, match="cannot be read"):
-        from_text(tmp_path / "missing.csv")
+        read_demonstrations(tmp_path / "missing.csv")
 
 
 def test_the_shipped_primitives_are_what_the_shipped_demonstrations_teach() -> None:
-    _, motions = from_text(SHIPPED)
-    learned, shipped = learn_primitives(PROFILE, motions), primitives.load(PROFILE)
+    _, motions = read_demonstrations(SHIPPED)
+    learned, shipped = learn_primitives(PROFILE, motions), movement_primitives.load(PROFILE)
     assert (learned.out.demonstrations, learned.back.demonstrations) == (6, 6)
     for a, b in ((learned.out, shipped.out), (learned.back, shipped.back)):
         assert np.array(a.weights) == pytest.approx(np.array(b.weights), rel=1e-3, abs=1e-3)
@@ -157,7 +158,7 @@ def test_the_shipped_primitives_are_what_the_shipped_demonstrations_teach() -> N
 @pytest.mark.parametrize("x", [3.2, 4.6])
 @pytest.mark.parametrize("y", [-4.2, -2.6, 2.6, 4.2])
 def test_what_was_learned_leads_over_the_stakes_to_any_log_and_back(x: float, y: float) -> None:
-    move, log = Shown(primitives.load(PROFILE)), ARM.reach(x, y, 0.1, 3.0)._replace(rot_rad=0.4)
+    move, log = PrimitiveMotions(movement_primitives.load(PROFILE)), ARM.reach(x, y, 0.1, 3.0)._replace(rot_rad=0.4)
     for start, goal in ((OVER_BUNK, log), (log, OVER_BUNK)):
         motion = move(ARM, start, goal)
         q = np.array(motion.position)
@@ -172,7 +173,7 @@ def test_what_was_learned_leads_over_the_stakes_to_any_log_and_back(x: float, y:
 
 
 def test_the_other_side_is_the_mirror_image() -> None:
-    move = Shown(primitives.load(PROFILE))
+    move = PrimitiveMotions(movement_primitives.load(PROFILE))
     log = ARM.reach(4.0, 3.2, 0.1, 3.0)
     left = np.array(move(ARM, OVER_BUNK._replace(slew_rad=0.0), log).position)
     right = np.array(move(ARM, OVER_BUNK._replace(slew_rad=0.0), log._replace(slew_rad=-log.slew_rad)).position)
@@ -182,7 +183,7 @@ def test_the_other_side_is_the_mirror_image() -> None:
 
 def test_algorithm_1_opens_on_the_way_closes_there_and_opens_over_the_bunk() -> None:
     log = ARM.reach(4.0, 3.2, 0.1, 3.0)._replace(rot_rad=0.5)
-    out, back = algorithm_1(ARM, primitives.load(PROFILE), OVER_BUNK, log, OVER_BUNK)
+    out, back = algorithm_1(ARM, movement_primitives.load(PROFILE), OVER_BUNK, log, OVER_BUNK)
     assert (out.meanwhile, out.then) == (GrappleCommand.OPEN, GrappleCommand.CLOSE)
     assert (back.meanwhile, back.then) == (GrappleCommand.HOLD, GrappleCommand.OPEN)
     assert ARM.pose(out.motion.goal) == pytest.approx(log, abs=1e-6)
@@ -193,40 +194,40 @@ def test_algorithm_1_opens_on_the_way_closes_there_and_opens_over_the_bunk() -> 
 def test_a_log_out_of_reach_is_refused_in_words() -> None:
     far = Pose(0.7, 12.0, 0.1, 2.5, 0.0)
     with pytest.raises(Unreachable, match="out of reach"):
-        Shown(primitives.load(PROFILE))(ARM, OVER_BUNK, far)
+        PrimitiveMotions(movement_primitives.load(PROFILE))(ARM, OVER_BUNK, far)
 
 
 def test_one_way_alone_teaches_the_other_in_reverse() -> None:
-    _, motions = from_text(SHIPPED)
-    out, _ = primitives.sorted_motions(ARM, motions)
+    _, motions = read_demonstrations(SHIPPED)
+    out, _ = movement_primitives.split_by_direction(ARM, motions)
     learned = learn_primitives(PROFILE, out)
     assert (learned.out.demonstrations, learned.back.demonstrations) == (6, 0)
-    ends = primitives.pose_track(ARM, out[2])[[-1, 0]]
+    ends = movement_primitives.pose_track(ARM, out[2])[[-1, 0]]
     back = learned.back.dmp().rollout(ends[0], ends[1])
     assert back.position[:, 2].max() > 2.8
 
 
 def test_motions_beside_the_bunk_teach_nothing() -> None:
     beside = shown()
-    beside = Track(beside.time_s, beside.position + np.array([1.2, 0.0, 0.0, 0.0]))
+    beside = JointTrack(beside.time_s, beside.position + np.array([1.2, 0.0, 0.0, 0.0]))
     with pytest.raises(DemonstrationRefused, match="from the bunk to a log"):
-        learn_primitives(PROFILE, cut(PROFILE, beside))
+        learn_primitives(PROFILE, segment_motions(PROFILE, beside))
 
 
 def test_a_file_of_primitives_is_taken_whole_or_refused_in_words(tmp_path: Path) -> None:
     file = tmp_path / "some.json"
-    good = primitives.load(PROFILE)
-    file.write_bytes(primitives.encode(good))
-    assert primitives.load(PROFILE, file) == good
+    good = movement_primitives.load(PROFILE)
+    file.write_bytes(movement_primitives.encode(good))
+    assert movement_primitives.load(PROFILE, file) == good
     nan = msgspec.structs.replace(good.out, duration_s=-1.0)
     cases = {
         "no file of primitives": b"{",
-        "not of aoro_fc8": primitives.encode(msgspec.structs.replace(good, profile="palms_471")),
-        "makes no sense": primitives.encode(msgspec.structs.replace(good, out=nan)),
+        "not of aoro_fc8": movement_primitives.encode(msgspec.structs.replace(good, profile="palms_471")),
+        "makes no sense": movement_primitives.encode(msgspec.structs.replace(good, out=nan)),
     }
     for words, data in cases.items():
         file.write_bytes(data)
         with pytest.raises(PrimitivesRefused, match=words):
-            primitives.load(PROFILE, file)
+            movement_primitives.load(PROFILE, file)
     with pytest.raises(PrimitivesRefused, match="plan learn"):
-        primitives.load(load_profile("palms_471"))
+        movement_primitives.load(load_profile("palms_471"))

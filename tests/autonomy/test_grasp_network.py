@@ -11,19 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.grasp.network import (
-    FAINT,
+    RELIEF_SCALE,
     PAPER,
-    Best,
+    PixelGrasp,
     GraspMaps,
     GraspNet,
     NoDepth,
     _patches,
-    best,
-    chooser,
+    best_pixel,
+    pixel_grasp_inference,
     heads_first,
     low_resolution,
-    prepare,
-    stack,
+    normalized_relief,
+    stack_maps,
 )
 from autonomy.networks.graph import parameter_count, parameter_shapes
 from autonomy.networks.openvino_net import OpenVinoNet
@@ -47,7 +47,7 @@ def picture() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def unchanged(arrays, picture) -> GraspMaps:
-    return stack(OpenVinoNet(PAPER, arrays, SHAPE)(picture))
+    return stack_maps(OpenVinoNet(PAPER, arrays, SHAPE)(picture))
 
 
 def largest(a: GraspMaps, b: GraspMaps) -> float:
@@ -67,14 +67,14 @@ def test_the_paper_s_parameters_layer_by_layer() -> None:
 def test_torch_says_the_same(arrays, picture, unchanged: GraspMaps) -> None:
     net = random_net(PAPER, 3).eval()
     with torch.inference_mode():
-        wanted = stack({name: v.numpy() for name, v in net(torch.from_numpy(picture)).items()})
+        wanted = stack_maps({name: v.numpy() for name, v in net(torch.from_numpy(picture)).items()})
     assert unchanged.q.shape == (300, 300) and unchanged.scale_px == 1
     assert largest(unchanged, wanted) <= 1e-4
 
 
 def test_heads_before_the_upsampling_change_nothing(arrays, picture, unchanged: GraspMaps) -> None:
     form = heads_first(PAPER, arrays)
-    assert largest(stack(OpenVinoNet(*form, SHAPE)(picture)), unchanged) <= 1e-6
+    assert largest(stack_maps(OpenVinoNet(*form, SHAPE)(picture)), unchanged) <= 1e-6
     assert parameter_count(form[0]) == 78_803
 
 
@@ -82,7 +82,7 @@ def test_heads_before_the_upsampling_change_nothing(arrays, picture, unchanged: 
 def test_the_mixed_net_chooses_like_the_exact_one(arrays, seed: int) -> None:
     coarse = torch.randn(1, 1, 12, 12, generator=torch.Generator().manual_seed(seed))
     picture = 3.0 * torch.nn.functional.interpolate(coarse, scale_factor=25, mode="bicubic").numpy()
-    exact, mixed = chooser(arrays)(picture), chooser(arrays, "mixed")(picture)
+    exact, mixed = pixel_grasp_inference(arrays)(picture), pixel_grasp_inference(arrays, "mixed")(picture)
     assert math.hypot(exact.u_px - mixed.u_px, exact.v_px - mixed.v_px) <= 3.0
     assert abs(exact.theta_rad - mixed.theta_rad) <= math.radians(3.0)
     assert math.isclose(exact.q, mixed.q, rel_tol=0.01)
@@ -102,14 +102,14 @@ def test_what_the_last_convolution_sees(arrays) -> None:
 def test_a_third_of_the_side_gives_the_same_grasp(seed: int) -> None:
     low = np.random.default_rng(seed).normal(size=(3, 20, 20)).astype(np.float32)
     full = torch.nn.functional.interpolate(torch.from_numpy(low)[None], scale_factor=3, mode="bilinear")[0].numpy()
-    a, b = best(GraspMaps(*low, scale_px=3)), best(GraspMaps(*full))
+    a, b = best_pixel(GraspMaps(*low, scale_px=3)), best_pixel(GraspMaps(*full))
     assert abs(a.u_px - b.u_px) <= 1 and abs(a.v_px - b.v_px) <= 1  # the border repeats: a tie there
     assert math.isclose(a.q, b.q, rel_tol=1e-5) and math.isclose(a.theta_rad, b.theta_rad, abs_tol=1e-4)
 
 
 def test_the_low_form_is_the_full_one_seen_at_every_third_pixel(arrays, picture) -> None:
     form = heads_first(PAPER, arrays)
-    low, full = (stack(OpenVinoNet(*f, SHAPE)(picture)) for f in (low_resolution(*form), form))
+    low, full = (stack_maps(OpenVinoNet(*f, SHAPE)(picture)) for f in (low_resolution(*form), form))
     assert low.scale_px == 3
     assert np.abs(low.q - full.q[1::3, 1::3]).max() <= 1e-6
 
@@ -119,7 +119,7 @@ def test_the_grasp_is_where_quality_is_greatest() -> None:
     q[40, 250] = 0.9
     angle = math.radians(-70.0)
     maps = GraspMaps(q, np.full_like(q, 0.5 * math.cos(2 * angle)), np.full_like(q, 0.5 * math.sin(2 * angle)))
-    found = best(maps)
+    found = best_pixel(maps)
     assert (found.u_px, found.v_px) == (250, 40)
     assert math.isclose(found.theta_rad, angle, abs_tol=1e-6)
 
@@ -127,7 +127,7 @@ def test_the_grasp_is_where_quality_is_greatest() -> None:
 def test_a_map_that_is_no_number_gives_no_grasp() -> None:
     q = np.zeros((10, 10), np.float32)
     with pytest.raises(ValueError, match="not finite"):
-        best(GraspMaps(np.where(np.arange(10) == 3, np.nan, q), q, q))
+        best_pixel(GraspMaps(np.where(np.arange(10) == 3, np.nan, q), q, q))
 
 
 def plane(slope_u: float = 0.0, slope_v: float = 0.0, far_m: float = 3.0) -> np.ndarray:
@@ -138,8 +138,8 @@ def plane(slope_u: float = 0.0, slope_v: float = 0.0, far_m: float = 3.0) -> np.
 def test_an_object_stands_out_of_a_slanted_ground() -> None:
     depth = plane(0.4, -0.3)
     depth[100:140, 50:200] *= 0.95
-    seen = prepare(depth)
-    assert np.allclose(seen[100:140, 50:200], math.asinh(0.05 / FAINT), atol=0.1)
+    seen = normalized_relief(depth)
+    assert np.allclose(seen[100:140, 50:200], math.asinh(0.05 / RELIEF_SCALE), atol=0.1)
     seen[100:140, 50:200] = 0.0
     assert np.abs(seen).max() < 0.1
 
@@ -147,20 +147,20 @@ def test_an_object_stands_out_of_a_slanted_ground() -> None:
 def test_scale_does_not_count() -> None:
     depth = plane(0.2)
     depth[10:90, 20:60] *= 0.9
-    assert np.allclose(prepare(depth), prepare(4.0 * depth), atol=1e-3)
+    assert np.allclose(normalized_relief(depth), normalized_relief(4.0 * depth), atol=1e-3)
 
 
 def test_unknown_depth_is_ground() -> None:
     depth = plane(0.1, 0.1)
     depth[200:220, 200:240] = np.nan
     depth[::6, ::6] = 0.0
-    assert np.abs(prepare(depth)).max() < 0.05
+    assert np.abs(normalized_relief(depth)).max() < 0.05
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, -1.0, np.inf])
 def test_a_picture_without_depth_is_refused(value: float, arrays) -> None:
     with pytest.raises(NoDepth, match="no known pixel"):
-        prepare(np.full((300, 300), value, np.float32))
+        normalized_relief(np.full((300, 300), value, np.float32))
 
 
 def test_strange_pictures_give_finite_inputs() -> None:
@@ -168,14 +168,14 @@ def test_strange_pictures_give_finite_inputs() -> None:
     single = np.full((300, 300), np.nan, np.float32)
     single[7, 9] = 2.0
     for depth in (single, plane()[:1], rng.exponential(1.0, (300, 300)) ** 4 + 1e-3, plane(1.9, -1.9) ** 3):
-        assert np.isfinite(prepare(depth)).all()
+        assert np.isfinite(normalized_relief(depth)).all()
 
 
 def test_maps_and_grasp_of_the_running_net_agree(arrays) -> None:
     net, depth = GraspNet(arrays), plane(0.2)
     depth[120:180, 140:160] *= 0.9
-    full, fast = best(net.maps(depth)), net.best(depth)
-    assert isinstance(fast, Best)
+    full, fast = best_pixel(net.maps(depth)), net.best(depth)
+    assert isinstance(fast, PixelGrasp)
     assert math.hypot(full.u_px - fast.u_px, full.v_px - fast.v_px) <= 3.0
 
 

@@ -18,8 +18,9 @@ from rich.console import Console
 from autonomy.grasp.network import PAPER, GraspMaps, heads_first
 from autonomy.networks.graph import parameter_shapes
 from autonomy.networks.torch_net import random_net
-from training.grasp import train
-from training.grasp.cornell import DataRefused, Sample, grouped_folds, load, paper_folds, rectangles
+from training.grasp import network_training
+from training.common.dataset_error import DatasetError
+from training.grasp.cornell import Sample, grouped_folds, load, paper_folds, rectangles
 from training.grasp.rectangles import Rectangle, angle_between, from_corners, iou, right, wrapped
 from training.grasp.views import View, centre, cut, drawn, label_maps, seen
 
@@ -107,17 +108,17 @@ def test_a_folder_in_the_layout_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("labels", ["1 2\n3 4\n5 6\n", "one two\n" * 4, "1 2 3\n" * 4])
 def test_labels_in_no_layout_are_refused(tmp_path: Path, labels: str) -> None:
     written(tmp_path, 1, labels)
-    with pytest.raises(DataRefused, match=r"pcd0001cpos\.txt.*four lines"):
+    with pytest.raises(DatasetError, match=r"pcd0001cpos\.txt.*four lines"):
         rectangles(tmp_path / "pcd0001cpos.txt")
 
 
 def test_a_folder_without_samples_and_a_broken_tiff_are_refused(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(DataRefused, match="no Cornell samples"):
+        with pytest.raises(DatasetError, match="no Cornell samples"):
             load(folder)
     written(tmp_path, 1, SQUARE)
     (tmp_path / "pcd0001d.tiff").write_bytes(b"II*\0 no picture")
-    with pytest.raises(DataRefused, match=r"pcd0001d\.tiff"):
+    with pytest.raises(DatasetError, match=r"pcd0001d\.tiff"):
         load(tmp_path)
 
 
@@ -134,17 +135,17 @@ def test_no_object_is_on_both_sides_of_a_grouped_fold() -> None:
     kind = {n: max(o for o in OBJECTS if o <= n) for n in numbers}
     folds = grouped_folds(numbers, 10)
     assert sorted(i for _, test in folds for i in test) == list(range(80))
-    for train, test in folds:
+    for network_training, test in folds:
         assert not {kind[numbers[i]] for i in train} & {kind[numbers[i]] for i in test}
-        assert len(train) >= 64
+        assert len(network_training) >= 64
 
 
 def test_the_paper_s_folds_deal_every_copy_once() -> None:
     folds = paper_folds(800, 10, 1)
     assert sorted(i for _, test in folds for i in test) == list(range(800))
-    assert all(len(train) == 720 and not set(train) & set(test) for train, test in folds)
+    assert all(len(network_training) == 720 and not set(network_training) & set(test) for network_training, test in folds)
     # What the paper's protocol leaks: nearly every test copy has a brother in the training set.
-    train, test = folds[0]
+    network_training, test = folds[0]
     assert sum(i // 10 in {j // 10 for j in train} for i in test) == 80
 
 
@@ -195,24 +196,24 @@ def test_equation_5_at_a_third_of_the_side() -> None:
     maps = torch.from_numpy(near.astype(np.float32))
     full = torch.nn.functional.interpolate(maps, scale_factor=3, mode="bilinear").numpy()
     wanted = np.square(full - labels).sum() / (2 * 300 * 300)
-    up = train.upsampling()
+    up = network_training.upsampling()
     pulled = torch.from_numpy(up.T @ labels @ up)
     square = torch.from_numpy(np.square(labels).sum((1, 2, 3)))
-    got = train.equation_5(maps, pulled, square, torch.from_numpy(up.T @ up)).item()
+    got = network_training.equation_5(maps, pulled, square, torch.from_numpy(up.T @ up)).item()
     assert math.isclose(got, wanted, rel_tol=1e-4)
 
 
 def test_what_is_trained_is_the_paper_s_network() -> None:
-    assert parameter_shapes(train.BODY) == parameter_shapes(PAPER)
+    assert parameter_shapes(network_training.BODY) == parameter_shapes(PAPER)
     arrays = random_net(PAPER, 1).arrays()
-    full, body = random_net(PAPER, 0).eval(), random_net(train.BODY, 0).eval()
+    full, body = random_net(PAPER, 0).eval(), random_net(network_training.BODY, 0).eval()
     full.load(arrays)
     body.load(arrays)
     picture = torch.randn(1, 1, 300, 300, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         wanted = full(picture)
         low = body(torch.nn.functional.avg_pool2d(picture, 3))
-        for head in train.HEADS:
+        for head in network_training.HEADS:
             got = torch.nn.functional.interpolate(low[head], scale_factor=3, mode="bilinear")
             assert (got - wanted[head]).abs().max() <= 1e-5
     assert heads_first(PAPER, arrays)[1]["heads.weight"].shape == (3, 16, 1, 1)
@@ -232,12 +233,12 @@ def bar(number: int, theta: float) -> Sample:
 def test_a_few_bars_are_learnt() -> None:
     torch.set_num_threads(1)
     samples = [bar(i, a) for i, a in enumerate((0.0, 0.8, -0.8, 1.5))]
-    examples = train.copies(samples, 1, 8)
-    net, losses = train.fit(examples, 1, "bars", Console(file=io.StringIO()), epochs=12)
+    examples = network_training.copies(samples, 1, 8)
+    net, losses = network_training.fit(examples, 1, "bars", Console(file=io.StringIO()), epochs=12)
     assert np.mean(losses[-8:]) < 0.6 * np.mean(losses[:8])
-    asked = train.copies(samples, 2, 4)
-    size = train.usual_size(asked)
-    hits = [train.judge(m, e.grasps, size)["right"] for m, e in zip(train.predict(net, asked), asked, strict=True)]
+    asked = network_training.copies(samples, 2, 4)
+    size = network_training.usual_size(asked)
+    hits = [network_training.judge(m, e.grasps, size)["right"] for m, e in zip(network_training.predict(net, asked), asked, strict=True)]
     assert sum(hits) >= 12
 
 
@@ -245,6 +246,6 @@ def test_a_grasp_is_judged_by_its_place_and_direction() -> None:
     q = np.zeros((100, 100), np.float32)
     q[50, 40] = 1.0
     maps = GraspMaps(q, np.ones_like(q), np.zeros_like(q), 3)
-    found = train.judge(maps, [Rectangle(121, 151, 0.1, 90, 80)], (30.0, 20.0))
+    found = network_training.judge(maps, [Rectangle(121, 151, 0.1, 90, 80)], (30.0, 20.0))
     assert (found["u_px"], found["v_px"]) == (121, 151)
     assert not found["right"] and found["own_size"]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autonomy.grasp.selection import lies_in, plan_place
+from autonomy.grasp.placement import lies_in_bunk, plan_place
 from autonomy.grasp.planner import BunkFull
 from autonomy.localization.local_plane import Plane
 from autonomy.manager.activity_manager import Manager
@@ -17,8 +17,8 @@ from autonomy.manager.tally import Tally
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Landing, Options, Point
 from autonomy.navigation.clothoid_path import PathRefused
 from autonomy.perception.log_list.observation import LogObservation
-from machine.load import load_profile, profile_hash
-from machine.modes import Mode
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.status.modes import Mode
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.test_manager_field import lying
 
@@ -326,7 +326,7 @@ def test_a_full_bunk_is_brought_to_the_landing_and_the_rest_of_the_route_is_sear
 @pytest.mark.parametrize("table", [OURS, PAPER_B])
 def test_a_bunk_that_is_full_to_the_brim_ends_the_collecting(table, monkeypatch) -> None:
     def place(arm, mission, grasp, logs, *held):
-        if any(lies_in(PROFILE.bunk, log) for log in logs):
+        if any(lies_in_bunk(PROFILE.bunk, log) for log in logs):
             raise BunkFull("the bunk is full")
         return plan_place(arm, mission, grasp, logs, *held)
 

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.selection import is_held, lies_in, plan_grasp
+from autonomy.grasp.selection import plan_single_log_grasp
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.grasp import hangs_below
 from autonomy.manager.log_map import Field
 from autonomy.manager.log_memory import EVERY_NS, Memory
 from autonomy.manager.load_detector import FEELING_NS
 from autonomy.motion.arm import Arm
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from tests.autonomy.test_manager_field import base, lying, seen
 
 PROFILE = load_profile("aoro_fc8")
@@ -42,7 +44,7 @@ class Hands:
 
     def begin(self) -> None:
         log = self.field.logs[0].observation(HERE)
-        grasp = plan_grasp(ARM, log, 0.0)
+        grasp = plan_single_log_grasp(ARM, log, 0.0)
         self.job = SimpleNamespace(grasp=grasp, phase=Phase.LOOK, rests=(0.0,) * 5)
         self.to(grasp.pose)
 
@@ -81,12 +83,12 @@ def test_a_log_goes_with_the_grapple_and_stays_in_the_bunk() -> None:
     high = grasp.pose.at_height(grasp.pose.z_m + 1.0)
     hands.to(high)
     (log,) = hands.step(Phase.CARRY)
-    assert log.center_m[2] == pytest.approx(grasp.log.center_m[2] + 1.0, abs=0.02) and is_held(ARM, log, high)
+    assert log.center_m[2] == pytest.approx(grasp.log.center_m[2] + 1.0, abs=0.02) and hangs_below(ARM, log, high)
     x, y = PROFILE.bunk.center_m
     place = ARM.over(x, y, 1.7, 2.0)
     hands.to(place)
     (log,) = hands.step(Phase.OPEN)
-    assert lies_in(PROFILE.bunk, log)
+    assert lies_in_bunk(PROFILE.bunk, log)
     assert log.center_m[2] == pytest.approx(PROFILE.bunk.floor_z_m + log.diameter_m / 2), "it fell to the floor"
     hands.to(place.at_height(1.9))
     hands.step(Phase.DONE)

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.__main__ import CONFIGURATION, FINE, main
-from autonomy.crane_job.rotator_estimate import Rotator
+from autonomy.crane_job.rotator_estimate import RotatorEstimate
 from autonomy.manager.checkpoint_file import EVERY_NS, Logbook, MissionFinished, read
 from autonomy.manager.activity_manager import Manager
 from autonomy.manager.checkpoint import Known, Left, Missed, Progress, copied, digest
@@ -26,7 +26,7 @@ from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Missio
 from autonomy.navigation.clothoid_path import PathRefused, drivable
 from autonomy.process.jobs import Forwarding
 from can_dbc.messages.mission import MissionOrder, Order
-from machine.load import profile_hash
+from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.test_manager import PLANE, PROFILE, at, ended, place, states, whole
 from tests.autonomy.test_manager_field import lying
@@ -378,7 +378,7 @@ def test_what_is_kept_is_read_again(tmp_path_factory, tally, known, left, landin
     told = mission((58.0, 14.0))
     progress = Progress(
         mission=digest(told), tally=tally, known=known, left=left, landing=landing, served=served, rounds=rounds,
-        driven_m=driven_m, rotator=Rotator(driven_m, -driven_m, (0.8, 1.1)),
+        driven_m=driven_m, rotator=RotatorEstimate(driven_m, -driven_m, (0.8, 1.1)),
     )  # fmt: skip
     path = kept(tmp_path_factory.getbasetemp() / "p", progress, 7, 11)
     assert read(path, told, 7, 11) == progress

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.grasp.selection import Planned
-from autonomy.grasp.sampling_planner import Search
+from autonomy.grasp.selection import PlannerSelection
+from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.manager.activity_manager import Manager
 from autonomy.manager.sorting import Sorting
 from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
-from machine.load import profile_hash
+from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.test_manager import PLANE, PROFILE, at, ended, place, states, whole
 from tests.autonomy.test_manager_field import lying
@@ -151,7 +151,7 @@ def test_unwanted_logs_stay_lying_and_nobody_stops_for_them() -> None:
 @pytest.mark.parametrize(("only", "grasp"), [(SAW, (2,)), ((), (1, 2))])
 def test_a_log_that_nobody_wants_is_not_scooped_up_with_its_neighbour(only, grasp) -> None:
     lie = (("pulpwood", 18.0, 4.4), ("saw logs", 18.0, 4.9))
-    machine, manager = forwarder(lie), managed(mission(lie, assortments=only), chooser=Planned(Search()))
+    machine, manager = forwarder(lie), managed(mission(lie, assortments=only), chooser=PlannerSelection(SamplingPlanner()))
     machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
     assert manager.activity is not None and manager.activity.grasp is not None
     assert sorted(log.id for log in manager.activity.grasp.logs) == list(grasp)
@@ -161,7 +161,7 @@ def test_a_log_that_nobody_wants_is_not_scooped_up_with_its_neighbour(only, gras
 def test_the_first_grasp_of_a_sorted_load_is_of_one_landing() -> None:
     lie = (("pulpwood", 18.0, 4.4), ("saw logs", 18.0, 4.9))
     told = mission(lie, ((34.0, 14.0, SAW), (34.0, -14.0, PULP)), sort_by_assortment=True)
-    machine, manager = forwarder(lie), managed(told, chooser=Planned(Search()))
+    machine, manager = forwarder(lie), managed(told, chooser=PlannerSelection(SamplingPlanner()))
     machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
     assert manager.activity is not None and manager.activity.grasp is not None
     assert len(manager.activity.grasp.logs) == 1

@@ -10,8 +10,8 @@ import pytest
 
 from autonomy.manager.loading_stops import STEP_M, Reach, Stop, base_on_way, best_stop
 from autonomy.motion.arm import Arm
-from machine.carrier import rear_from_front
-from machine.load import load_profile
+from machine.geometry.carrier import rear_from_front
+from machine.loading.profile_file import load_profile
 from tests.autonomy.test_manager_field import lying
 
 PROFILE = load_profile("aoro_fc8")

@@ -10,24 +10,24 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import minimize_scalar
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.distances import between, clearances, least, segment_box, segment_segment
+from autonomy.motion.distances import motion_between_samples, clearances, least_clearance, segment_box, segment_segment
 from autonomy.motion.obstacles import (
     Box,
-    Held,
-    Rod,
-    Surroundings,
-    Swept,
+    HeldLog,
+    Capsule,
+    CollisionScene,
+    SweptCapsules,
     bunk_boxes,
     carrier_boxes,
     held_log,
-    surroundings,
-    swept,
-    tree,
+    collision_scene,
+    swept_capsules,
+    tree_capsule,
 )
-from autonomy.perception.logs import LogObservation
-from machine.load import load_profile
-from sim.bunk import bunk_boxes as plant_boxes
-from sim.bunk import to_bunk
+from autonomy.perception.log_list.observation import LogObservation
+from machine.loading.profile_file import load_profile
+from sim.wood.bunk import bunk_boxes as plant_boxes
+from sim.wood.bunk import to_bunk
 
 PALMS, AORO = load_profile("palms_471"), load_profile("aoro_fc8")
 points = arrays(float, 3, elements=st.floats(-3.0, 3.0).map(lambda x: round(x, 3)))
@@ -61,27 +61,27 @@ def test_the_distance_of_a_segment_and_a_box_is_the_least_of_its_points(
     assert found <= brute + 1e-9 and found > brute - 1e-3 * (1.0 + np.linalg.norm(b - a))
 
 
-def one(a: tuple[float, ...], b: tuple[float, ...], radius: float) -> Swept:
-    return Swept(np.array([[a]]), np.array([[b]]), np.array([radius]), ("thing",), np.array([True]))
+def one(a: tuple[float, ...], b: tuple[float, ...], radius: float) -> SweptCapsules:
+    return SweptCapsules(np.array([[a]]), np.array([[b]]), np.array([radius]), ("thing",), np.array([True]))
 
 
 def test_ground_box_and_rod_are_measured_to_the_skin() -> None:
-    around = Surroundings(
+    around = CollisionScene(
         -1.0,
         (Box("crate", (2.0, 0.0, 0.0), (0.5, 0.1, 0.5), np.pi / 2),),
-        (Rod("pole", (0.0, 3.0, -1.0), (0.0, 3.0, 5.0), 0.2),),
+        (Capsule("pole", (0.0, 3.0, -1.0), (0.0, 3.0, 5.0), 0.2),),
     )
     apart = clearances(around, one((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.1))[0, 0]
     assert apart == pytest.approx([0.9, 2.0 - 0.1 - 1.0 - 0.1, 3.0 - 0.2 - 0.1])
     assert around.names == ("the ground", "crate", "pole")
-    assert least(around, one((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.1))[1:3] == ("thing", "crate")
+    assert least_clearance(around, one((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.1))[1:3] == ("thing", "crate")
 
 
 def test_a_bound_never_claims_more_than_the_distance() -> None:
     rng = np.random.default_rng(3)
-    body = Swept(*rng.normal(size=(2, 20, 3, 3)) * 3.0, rng.uniform(0.05, 0.3, 3), ("a", "b", "c"), np.ones(3, bool))
+    body = SweptCapsules(*rng.normal(size=(2, 20, 3, 3)) * 3.0, rng.uniform(0.05, 0.3, 3), ("a", "b", "c"), np.ones(3, bool))
     logs = [LogObservation(i, tuple(rng.normal(size=3) * 3), (1.0, 0.0, 0.0), 2.0, 0.2) for i in range(5)]
-    around = surroundings(AORO, logs)
+    around = collision_scene(AORO, logs)
     exact, quick = clearances(around, body), clearances(around, body, 0.5)
     assert np.all(quick <= exact + 1e-9)
     near = exact < 0.5
@@ -93,7 +93,7 @@ def test_a_ground_may_have_a_shape() -> None:
     def slope(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return 0.5 * x
 
-    apart = clearances(Surroundings(slope), one((0.0, 0.0, 1.0), (2.0, 0.0, 1.0), 0.1))
+    apart = clearances(CollisionScene(slope), one((0.0, 0.0, 1.0), (2.0, 0.0, 1.0), 0.1))
     assert apart[0, 0, 0] == pytest.approx(-0.1)
 
 
@@ -128,7 +128,7 @@ def test_a_held_log_hangs_under_the_pin_across_the_tongs() -> None:
     pose = arm.over(4.0, 3.0, 1.0, 3.0)
     q = arm.joints(np.array([pose]))
     pin = np.array([[4.0, 3.0, 1.0]])
-    body = swept(AORO, q, pin, Held(2.0, 0.25, along_m=0.3))
+    body = swept_capsules(AORO, q, pin, HeldLog(2.0, 0.25, along_m=0.3))
     log = body.names.index("log")
     a, b = body.a[0, log], body.b[0, log]
     assert np.linalg.norm(b - a) == pytest.approx(1.75) and a[2] == b[2] < 0.0
@@ -148,7 +148,7 @@ def test_a_log_is_held_where_it_lay_whichever_way_it_is_taken(turned: float, sen
     log = LogObservation(0, (4.0, 3.0, -1.0), axis, 2.0, 0.25)
     pose = arm.over(4.0 + 0.2 * np.cos(0.4), 3.0 + 0.2 * np.sin(0.4), 0.3, 3.0)
     pose = pose._replace(rot_rad=0.45 - pose.slew_rad + np.pi / 2 + np.pi / 2 + turned)  # 0.05 rad askew
-    body = swept(AORO, arm.joints(np.array([pose])), np.array([[*arm.xy(pose), pose.z_m]]), held_log(arm, pose, log))
+    body = swept_capsules(AORO, arm.joints(np.array([pose])), np.array([[*arm.xy(pose), pose.z_m]]), held_log(arm, pose, log))
     ends = np.array([body.a[0, -1, :2], body.b[0, -1, :2]])
     expected = np.array(log.center_m[:2]) + np.array([[-1.0], [1.0]]) * 0.875 * np.array([np.cos(0.4), np.sin(0.4)])
     assert sorted(map(tuple, ends.round(6))) == sorted(map(tuple, expected.round(6)))
@@ -156,7 +156,7 @@ def test_a_log_is_held_where_it_lay_whichever_way_it_is_taken(turned: float, sen
 
 def test_what_moves_far_between_samples_may_be_nearer_there() -> None:
     a = np.array([[[0.0, 0.0, 1.0]], [[1.0, 0.0, 1.0]]])
-    moving = Swept(a, a + np.array([0.0, 1.0, 0.0]), np.array([0.1]), ("thing",), np.array([True]))
-    assert between(moving) == pytest.approx(np.array([[0.5], [0.5]]))
-    pole = Surroundings(-1.0, (), (tree(0.5, 0.5, 0.05, -1.0),))
-    assert np.min(clearances(pole, moving) - between(moving)[:, :, None]) < 0.0
+    moving = SweptCapsules(a, a + np.array([0.0, 1.0, 0.0]), np.array([0.1]), ("thing",), np.array([True]))
+    assert motion_between_samples(moving) == pytest.approx(np.array([[0.5], [0.5]]))
+    pole = CollisionScene(-1.0, (), (tree_capsule(0.5, 0.5, 0.05, -1.0),))
+    assert np.min(clearances(pole, moving) - motion_between_samples(moving)[:, :, None]) < 0.0

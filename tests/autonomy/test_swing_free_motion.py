@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.motion.arm import Arm, Pose
-from autonomy.motion.timing import SWING_RAD, Way, time_law
-from autonomy.motion.trajectory import STEP_S, Trajectory, straight
+from autonomy.motion.arm import Arm
+from autonomy.motion.pose import Pose
+from autonomy.motion.time_law import SWING_RAD, PathGeometry, swing_free_law
+from autonomy.motion.trajectory import STEP_S, Trajectory, straight_line
 from machine.joints import JOINTS
-from machine.kinematics import pin_position
-from machine.load import load_profile
+from machine.geometry.kinematics import pin_position
+from machine.loading.profile_file import load_profile
 from machine.profile import Profile, joint
 
 GRAVITY_M_S2 = 9.81
@@ -74,7 +75,7 @@ def assert_within_limits(profile: Profile, motion: Trajectory) -> None:
 @pytest.mark.parametrize("goal", GOALS)
 def test_the_trial_motions_leave_little_swing_for_every_period_of_the_range(goal: tuple[float, float]) -> None:
     start, end = trial(goal)
-    shaped, plain = (straight(FORWARDER.arm, start, end, shaped) for shaped in (True, False))
+    shaped, plain = (straight_line(FORWARDER.arm, start, end, shaped) for shaped in (True, False))
     assert shaped.duration_s == plain.duration_s and shaped.goal == pytest.approx(plain.goal)
     periods = (1.5, 1.57, 1.72, 1.88, 2.03, 2.1)
     left, left_plain = ([swing_left_rad(FORWARDER.profile, m, p) for p in periods] for m in (shaped, plain))
@@ -87,7 +88,7 @@ def test_the_trial_motions_leave_little_swing_for_every_period_of_the_range(goal
 @pytest.mark.parametrize("damping", [0.05, 0.1, 0.15])
 @pytest.mark.parametrize("goal", GOALS)
 def test_links_with_friction_swing_as_little(goal: tuple[float, float], damping: float) -> None:
-    motion = straight(FORWARDER.arm, *trial(goal))
+    motion = straight_line(FORWARDER.arm, *trial(goal))
     left = [swing_left_rad(FORWARDER.profile, motion, p, damping) for p in (1.5, 1.57, 1.72, 1.88, 2.03, 2.1)]
     assert max(left) < 1.1 * SWING_RAD
 
@@ -95,15 +96,15 @@ def test_links_with_friction_swing_as_little(goal: tuple[float, float], damping:
 @pytest.mark.parametrize("goal", GOALS)
 def test_a_motion_takes_as_long_as_its_law_says(goal: tuple[float, float]) -> None:
     start, end = (np.array(pose) for pose in trial(goal))
-    law = time_law(Way(FORWARDER.arm, start + np.linspace(0.0, 1.0, 81)[:, None] * (end - start)))
-    assert straight(FORWARDER.arm, *trial(goal)).duration_s < law.duration_s + STEP_S
+    law = swing_free_law(PathGeometry(FORWARDER.arm, start + np.linspace(0.0, 1.0, 81)[:, None] * (end - start)))
+    assert straight_line(FORWARDER.arm, *trial(goal)).duration_s < law.duration_s + STEP_S
 
 
 @pytest.mark.parametrize("goal", GOALS)
 def test_the_law_without_swing_takes_little_longer_than_the_fastest(goal: tuple[float, float]) -> None:
     start, end = (np.array(pose) for pose in trial(goal))
-    way = Way(FORWARDER.arm, start + np.linspace(0.0, 1.0, 81)[:, None] * (end - start))
-    fastest, shaped = time_law(way, shaped=False), time_law(way)
+    way = PathGeometry(FORWARDER.arm, start + np.linspace(0.0, 1.0, 81)[:, None] * (end - start))
+    fastest, shaped = swing_free_law(way, shaped=False), swing_free_law(way)
     assert fastest.duration_s < shaped.duration_s < 1.13 * fastest.duration_s
 
 
@@ -117,7 +118,7 @@ def test_any_straight_motion_keeps_limits_and_swing(name: str, slew: float, near
     turn = crane.profile.kinematics.theta1_offset_rad
     start = crane.arm.over(near * np.cos(turn), near * np.sin(turn), 1.2, 1.2)
     goal = crane.arm.over(far * np.cos(turn + slew), far * np.sin(turn + slew), z, z)
-    motion = straight(crane.arm, start, goal)
+    motion = straight_line(crane.arm, start, goal)
     assert_within_limits(crane.profile, motion)
     assert crane.arm.pose(motion.goal) == pytest.approx(goal, abs=1e-6)
     assert max(swing_left_rad(crane.profile, motion, p) for p in (1.53, 1.75, 2.05)) < 1.2 * SWING_RAD
@@ -125,7 +126,7 @@ def test_any_straight_motion_keeps_limits_and_swing(name: str, slew: float, near
 
 def test_an_equal_way_has_an_equal_law_and_a_point_has_none() -> None:
     start, end = trial(GOALS[0])
-    first, again = (straight(Arm(FORWARDER.profile), start, end) for _ in range(2))
+    first, again = (straight_line(Arm(FORWARDER.profile), start, end) for _ in range(2))
     assert first.position == again.position and first.velocity == again.velocity
-    still = straight(FORWARDER.arm, start, start)
+    still = straight_line(FORWARDER.arm, start, start)
     assert still.duration_s == STEP_S and still.velocity == [(0.0,) * len(JOINTS)] * 2

@@ -8,13 +8,15 @@ from math import hypot
 import numpy as np
 import pytest
 
-from autonomy.grasp.direct import travel_height
-from autonomy.motion.arm import STOP_MARGIN, Arm, Pose
-from autonomy.motion.telescope import AT_REST_M, eased, easiest, work_s
-from autonomy.motion.trajectory import Trajectory, hold, turned
+from autonomy.grasp.grapple_heights import travel_height_m
+from autonomy.motion.arm import Arm
+from autonomy.motion.arm_kinematics import STOP_MARGIN
+from autonomy.motion.pose import Pose
+from autonomy.motion.telescope import OUTER_RESERVE_M, with_fastest_extensions, fastest_extension, full_speed_times
+from autonomy.motion.trajectory import Trajectory, hold, with_rotation
 from machine.joints import Joint
-from machine.kinematics import Unreachable
-from machine.load import load_profile
+from machine.geometry.kinematics import Unreachable
+from machine.loading.profile_file import load_profile
 from machine.profile import joint_limits
 
 AORO = Arm(load_profile("aoro_fc8"))
@@ -26,13 +28,13 @@ def way(height_m: float) -> tuple[Pose, ...]:
 
 
 def worked_s(via: tuple[Pose, ...]) -> float:
-    return sum(work_s(AORO, a, b, np.array([a.ext_m]), np.array([b.ext_m]))[0, 0] for a, b in pairwise(via))
+    return sum(full_speed_times(AORO, a, b, np.array([a.ext_m]), np.array([b.ext_m]))[0, 0] for a, b in pairwise(via))
 
 
 @pytest.mark.parametrize("height_m", [2.6, 3.0])
 def test_an_eased_way_leaves_less_to_do_and_only_its_corners_change(height_m: float) -> None:
     plain = way(height_m)
-    easy = eased(AORO, plain)
+    easy = with_fastest_extensions(AORO, plain)
     assert worked_s(easy) < 0.9 * worked_s(plain)
     assert easy[0] == START and easy[-1] == GOAL
     assert [p._replace(ext_m=0.0) for p in easy] == [p._replace(ext_m=0.0) for p in plain]
@@ -41,24 +43,24 @@ def test_an_eased_way_leaves_less_to_do_and_only_its_corners_change(height_m: fl
 
 
 def test_a_way_without_corners_or_out_of_reach_stays_as_it_is() -> None:
-    assert eased(AORO, (START, GOAL)) == (START, GOAL)
-    assert eased(AORO, way(9.0)) == way(9.0)
+    assert with_fastest_extensions(AORO, (START, GOAL)) == (START, GOAL)
+    assert with_fastest_extensions(AORO, way(9.0)) == way(9.0)
 
 
 def test_over_a_log_the_telescope_is_out_for_a_fast_way_home() -> None:
-    high_m, home_m = travel_height(AORO.profile), hypot(*AORO.profile.bunk.center_m)
+    high_m, home_m = travel_height_m(AORO.profile), hypot(*AORO.profile.bunk.center_m)
     pose = AORO.over(3.3, 3.0, 0.2, high_m)
     short = pose._replace(ext_m=0.05)
     over = pose.at_height(high_m)
     home = over._replace(r_m=home_m)
     best, worst = (
-        float(np.min(work_s(AORO, p, p.at_height(high_m), np.array([p.ext_m]), np.linspace(0.1, 2.0, 9))))
+        float(np.min(full_speed_times(AORO, p, p.at_height(high_m), np.array([p.ext_m]), np.linspace(0.1, 2.0, 9))))
         for p in (pose, short)
     )
     assert pose.ext_m > 0.8 and best < 0.8 * worst
-    assert easiest(AORO, pose, over, home) == pytest.approx(pose.ext_m, abs=0.25)
+    assert fastest_extension(AORO, pose, over, home) == pytest.approx(pose.ext_m, abs=0.25)
     high = joint_limits(AORO.profile)[Joint.EXT][1]
-    assert pose.ext_m <= high - AT_REST_M + 1e-9
+    assert pose.ext_m <= high - OUTER_RESERVE_M + 1e-9
 
 
 def test_a_goal_at_a_stop_is_refused_but_a_start_there_is_not() -> None:
@@ -74,7 +76,7 @@ def test_a_goal_at_a_stop_is_refused_but_a_start_there_is_not() -> None:
 def test_a_turn_is_added_to_the_rotator_alone_and_smoothly() -> None:
     still = hold((0.1, 0.2, -1.0, 0.5, 0.3))
     motion = Trajectory([still.position[0]] * 151, [still.velocity[0]] * 151)
-    more = turned(motion, 1.0, 0.2)
+    more = with_rotation(motion, 1.0, 0.2)
     q, v = np.array(more.position), np.array(more.velocity)
     assert np.array_equal(q[:, : Joint.ROT], np.array(motion.position)[:, : Joint.ROT])
     assert np.all(q[:51, Joint.ROT] == 0.3) and q[-1, Joint.ROT] == pytest.approx(0.5)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from valve_stand_in import StandIn
 
-from autonomy.calibration.program import PULSES
+from autonomy.calibration.spool_program import PULSES
 from autonomy.calibration.result import identify
 from autonomy.calibration.tasks import Findings
-from autonomy.calibration.turn_fit import NOISE_RAD, Turn, TurnFit, fit_turns, pulse_to
+from autonomy.calibration.turn_fit import YAW_SIGMA_RAD, Turn, TurnFit, fit_turns, pulse_to
 from machine.joints import Joint
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 
 AORO = load_profile("aoro_fc8")
 ROT = AORO.joints["rot"]
@@ -29,7 +29,7 @@ def surveyed(machine: StandIn, seed: int = 3, readings: int = READINGS) -> tuple
     rng = np.random.default_rng(seed)
 
     def read() -> float:
-        return (0.3 + angle + rng.normal(0.0, NOISE_RAD / readings**0.5)) % pi
+        return (0.3 + angle + rng.normal(0.0, YAW_SIGMA_RAD / readings**0.5)) % pi
 
     angle, turns, stood = 0.0, [], []
     before = read()

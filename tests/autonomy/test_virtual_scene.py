@@ -10,15 +10,15 @@ from grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pil
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autonomy.grasp.cnn_planner import CnnPlanner, averaged
-from autonomy.grasp.cylinders import cylinders
+from autonomy.grasp.cnn_planner import CnnPlanner, mean_maps
+from autonomy.grasp.cylinders import as_cylinders
 from autonomy.grasp.jaws import jaws_of
-from autonomy.grasp.network import WEIGHTS, Best, GraspMaps, GraspNet
-from autonomy.grasp.proposal import NoGrasp
-from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, cuboid, render, trimmed
+from autonomy.grasp.network import WEIGHTS, PixelGrasp, GraspMaps, GraspNet
+from autonomy.grasp.planner import NoGrasp
+from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
 from autonomy.motion.arm import Arm
-from autonomy.perception.logs import LogObservation
-from machine.load import load_profile
+from autonomy.perception.log_list.observation import LogObservation
+from machine.loading.profile_file import load_profile
 
 JAWS = jaws_of(PROFILE)
 
@@ -27,9 +27,9 @@ class Chosen:
     """A network that always finds the same pixel."""
 
     def __init__(self, u_px: float, v_px: float, theta: float) -> None:
-        self.found, self.seen = Best(u_px, v_px, theta, 0.9), None
+        self.found, self.seen = PixelGrasp(u_px, v_px, theta, 0.9), None
 
-    def best(self, depth_m: np.ndarray) -> Best:
+    def best(self, depth_m: np.ndarray) -> PixelGrasp:
         self.seen = depth_m
         return self.found
 
@@ -39,21 +39,21 @@ class Chosen:
 
 
 def test_logs_are_shortened_by_the_grapple_and_a_tenth_but_never_to_discs() -> None:
-    world = cylinders(pair())
-    assert trimmed(world, 0.36).length == pytest.approx([(2.6 - 0.36) * 0.9] * 2)
-    assert trimmed(world, 2.5).length == pytest.approx([0.2, 0.2])
-    assert np.array_equal(trimmed(world, 0.36).center, world.center)
+    world = as_cylinders(pair())
+    assert shortened_logs(world, 0.36).length == pytest.approx([(2.6 - 0.36) * 0.9] * 2)
+    assert shortened_logs(world, 2.5).length == pytest.approx([0.2, 0.2])
+    assert np.array_equal(shortened_logs(world, 0.36).center, world.center)
 
 
 def test_the_cuboid_holds_the_ends_and_the_camera_hangs_three_metres_over_its_middle() -> None:
     turned = log(0, yaw=0.5)
-    box = cuboid(cylinders([turned]))
+    box = operational_area(as_cylinders([turned]))
     half = np.array([1.3 * cos(0.5), 1.3 * sin(0.5), 0.0])
     assert box.low_m == pytest.approx(np.array(turned.center_m) - half)
     assert box.high_m == pytest.approx(np.array(turned.center_m) + half)
     assert camera_above(box).position_m == pytest.approx((*turned.center_m[:2], turned.center_m[2] + 3.0))
     with pytest.raises(ValueError, match="no log"):
-        cuboid(cylinders([]))
+        operational_area(as_cylinders([]))
 
 
 @settings(max_examples=40, deadline=None)
@@ -61,7 +61,7 @@ def test_the_cuboid_holds_the_ends_and_the_camera_hangs_three_metres_over_its_mi
 def test_depth_is_that_of_the_surface(dx: float, dy: float, yaw: float, diameter: float, slope: float) -> None:
     """Every pixel's point lies on the cylinder's side or caps, or on the ground."""
     one = log(0, dy, 0.2, yaw, diameter, dx)
-    world = cylinders([one])
+    world = as_cylinders([one])
     world.axis[0, 2] = slope
     world.axis[0] /= np.linalg.norm(world.axis[0])
     camera = Camera(np.array([X, Y, GROUND + 3.0]))
@@ -85,7 +85,7 @@ def test_depth_is_that_of_the_surface(dx: float, dy: float, yaw: float, diameter
 
 def test_a_log_fills_the_pixels_it_should() -> None:
     camera = Camera(np.array([X, Y, GROUND + 3.0]))
-    depth = render(cylinders([log(0, diameter=0.2)]), camera, GROUND)
+    depth = render(as_cylinders([log(0, diameter=0.2)]), camera, GROUND)
     assert depth.min() == pytest.approx(2.8, abs=1e-3)
     rows, columns = np.nonzero(depth < 2.95)
     assert columns.min() == 0 and columns.max() == 299, "longer than the picture is wide"
@@ -94,9 +94,9 @@ def test_a_log_fills_the_pixels_it_should() -> None:
 
 def test_a_camera_that_cannot_see_is_refused() -> None:
     with pytest.raises(ValueError, match="look down"):
-        render(cylinders(pair()), Camera(np.array([X, Y, GROUND])), GROUND)
+        render(as_cylinders(pair()), Camera(np.array([X, Y, GROUND])), GROUND)
     with pytest.raises(ValueError, match="inside a log"):
-        render(cylinders(pair()), Camera(np.array([X, Y, GROUND + 0.2])), GROUND)
+        render(as_cylinders(pair()), Camera(np.array([X, Y, GROUND + 0.2])), GROUND)
 
 
 @pytest.mark.parametrize("theta", [0.3, -1.2])
@@ -105,7 +105,7 @@ def test_a_pixel_becomes_a_grasp_in_the_base(theta: float) -> None:
     planner = CnnPlanner(Chosen(180.0, 90.0, theta))
     one = log(0, 0.0)
     p = planner(ARM, [one], 0.0, 0.0)
-    seen = planner.look(cylinders([one]), JAWS, GROUND)
+    seen = planner.look(as_cylinders([one]), JAWS, GROUND)
     z = float(seen.depth_m[90, 180])
     assert (p.x_m, p.y_m) == pytest.approx((X + 30 / 385 * z, Y + 60 / 385 * z))
     assert remainder(p.yaw_rad + theta, pi) == pytest.approx(0.0)
@@ -151,7 +151,7 @@ def test_nothing_to_see_is_no_grasp() -> None:
 
 def test_a_moving_camera_agrees_with_one_that_stands() -> None:
     planner = CnnPlanner(Chosen(0.0, 0.0, 0.0), cameras=5)
-    seen = planner.look(cylinders(cross()), JAWS, GROUND)
+    seen = planner.look(as_cylinders(cross()), JAWS, GROUND)
     point = seen.camera.to_base(seen.best.u_px, seen.best.v_px, 2.6)
     assert abs(remainder(seen.best.theta_rad - pi / 2, pi)) < 1e-6
     upper = cross()[2]
@@ -160,7 +160,7 @@ def test_a_moving_camera_agrees_with_one_that_stands() -> None:
 
 
 def test_predictions_are_averaged_where_they_belong() -> None:
-    box = cuboid(cylinders(pair()))
+    box = operational_area(as_cylinders(pair()))
     cameras = cameras_along(box, 0.3, 4)
     maps = []
     for camera in cameras:
@@ -172,7 +172,7 @@ def test_predictions_are_averaged_where_they_belong() -> None:
         )
         q[v, u] = 1.0
         maps.append(GraspMaps(q, q, q))
-    mean = averaged(maps, cameras, float(box.centroid_m[2]))
+    mean = mean_maps(maps, cameras, float(box.centroid_m[2]))
     assert mean.q[149:152, 149:152].sum() == pytest.approx(1.0) and mean.q[150, 150] >= 0.25
 
 

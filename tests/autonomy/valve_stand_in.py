@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autonomy.calibration.program import SpoolProgram
-from autonomy.calibration.trace import FINE, GRID_S, Record
+from autonomy.calibration.spool_program import SpoolProgram
+from autonomy.calibration.trace import FINE_FACTOR, GRID_S, SpoolTestRecord
 from machine.joints import Joint
 
 LEAD_S, TAIL_S = 0.2, 0.6
@@ -29,9 +29,9 @@ class StandIn:
     noise: float = 2e-4
     count: float = 3.8e-4
 
-    def run(self, joint: Joint, side: int, kind: str, program: SpoolProgram, start: float, seed: int = 0) -> Record:
+    def run(self, joint: Joint, side: int, kind: str, program: SpoolProgram, start: float, seed: int = 0) -> SpoolTestRecord:
         """What the bus would have said while the program ran."""
-        h = GRID_S / FINE
+        h = GRID_S / FINE_FACTOR
         steps = int((LEAD_S + program.duration_s + TAIL_S) / h)
         delay = round(self.delay_s / h)
         tick = round(GRID_S / h)
@@ -58,11 +58,11 @@ class StandIn:
         grid = slice(None, None, tick)
         rng = np.random.default_rng(seed)
         position = positions[grid] + rng.normal(0.0, self.noise, len(positions[grid]))
-        fine = command[:: tick // FINE]
+        fine = command[:: tick // FINE_FACTOR]
         count = len(position)
         # The last of every grid step's fine commands is the one at the grid's time.
-        shifted = np.concatenate([np.zeros(FINE - 1), fine])[: count * FINE]
-        return Record(
+        shifted = np.concatenate([np.zeros(FINE_FACTOR - 1), fine])[: count * FINE_FACTOR]
+        return SpoolTestRecord(
             joint, side, kind, times[grid], command[grid], shifted,
             np.round(spools[grid] / 0.0005) * 0.0005, np.round(position / self.count) * self.count,
         )  # fmt: skip

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.trajectory import straight
+from autonomy.motion.trajectory import straight_line
 from can_dbc.messages.crane import CraneSetpoint, StateReport
 from can_dbc.messages.datagrams import decode
 from experiments.common.minimum_time import Limits, full_limits, minimum_time_s
@@ -21,7 +21,7 @@ from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.crane_accuracy import experiment, measure
 from experiments.crane_accuracy.measure import Trace
-from experiments.crane_accuracy.metrics import FIGURES, gather
+from experiments.crane_accuracy.metrics import METRICS, gather
 from experiments.crane_accuracy.plan import (
     GOALS_M,
     LAWS,
@@ -38,10 +38,10 @@ from experiments.crane_accuracy.plan import (
 )
 from experiments.crane_accuracy.reach_cycles import Part, Rounds
 from experiments.crane_accuracy.trial import varied
-from machine.kinematics import pin_position
-from machine.load import load_profile, profile_hash
-from machine.modes import Mode
+from machine.geometry.kinematics import pin_position
+from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Sag
+from machine.status.modes import Mode
 
 AORO = load_profile("aoro_fc8")
 TICK_NS = 20_000_000
@@ -91,7 +91,7 @@ def test_the_timing_of_the_samples_does_not_count_and_no_plan_is_faster():
     )
     shortest = minimum_time_s(even, full)
     assert minimum_time_s(slow, full) == pytest.approx(shortest, rel=5e-3)
-    planned = straight(arm, start_pose(arm), pose_at(arm, GOALS_M[2]))
+    planned = straight_line(arm, start_pose(arm), pose_at(arm, GOALS_M[2]))
     assert minimum_time_s(np.array(planned.position), full) < planned.duration_s
 
 
@@ -291,6 +291,6 @@ def test_the_experiment_calibrates_moves_and_writes_its_page(tmp_path, monkeypat
     assert m["encoder_error_mean_m"] < 0.02 and m["tip_error_mean_m"] < 0.03 < m["tip_error_uncorrected_mean_m"]
     assert set(result.missed) <= {"time_ratio", "limit_cycle_share", "encoder_error_mean_m", "encoder_error_xy_mean_m"}
     page = (tmp_path / "docs" / "crane-accuracy.md").read_text()
-    assert all(f.title in page for f in FIGURES if f.name in m) and "(paper: 80 mm)" in page
+    assert all(f.title in page for f in METRICS if f.name in m) and "(paper: 80 mm)" in page
     for name in ("histogram", "points", "true_points", "motion"):
         assert (tmp_path / "docs" / "results" / "crane-accuracy" / f"{name}.png").stat().st_size > 5000

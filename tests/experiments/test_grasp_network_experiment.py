@@ -14,7 +14,7 @@ from rich.console import Console
 from scipy.ndimage import binary_dilation
 from typer.testing import CliRunner
 
-from autonomy.grasp.network import PAPER, WEIGHTS, GraspNet, best, prepare
+from autonomy.grasp.network import PAPER, WEIGHTS, GraspNet, best_pixel, normalized_relief
 from autonomy.networks.weights import load
 from experiments.common.registry import Options
 from experiments.grasp_network import experiment, folds, latency
@@ -103,11 +103,11 @@ def test_the_shipped_weights_close_across_a_log() -> None:
     """They never saw one; what they learnt holds because depth is told relative to the ground."""
     net = GraspNet.shipped()
     for depth, _ in latency.log_scenes(3, 9)[::4]:  # one log each
-        logs = binary_dilation(prepare(depth) > 1.0, iterations=5)
+        logs = binary_dilation(normalized_relief(depth) > 1.0, iterations=5)
         v, u = np.nonzero(logs)
         spread = np.cov(np.stack([u, v]))
         axis = np.linalg.eigh(spread)[1][:, 1]
-        for grasp in (net.best(depth), best(net.maps(depth))):
+        for grasp in (net.best(depth), best_pixel(net.maps(depth))):
             across = abs(axis[0] * math.cos(grasp.theta_rad) + axis[1] * math.sin(grasp.theta_rad))
             assert across < math.sin(math.radians(20.0))
             assert logs[round(grasp.v_px), round(grasp.u_px)]

@@ -12,16 +12,16 @@ import numpy as np
 import machine
 from autonomy.motion.arm import Arm
 from autonomy.motion.setpoint_stream import PERIOD_NS, SetpointStream
-from autonomy.motion.trajectory import Trajectory, hold, straight
-from autonomy.perception.logs import LogObservation
-from can_dbc.setpoint import GrappleCommand, StateReport
+from autonomy.motion.trajectory import Trajectory, hold, straight_line
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import GrappleCommand, StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
-from hil.lockstep import Lockstep, Observer
-from hil.operator import Operator
-from machine.kinematics import pin_position
-from machine.load import load_profile, profile_hash
-from machine.modes import Mode
+from hil.harness.lockstep import Lockstep, Observer
+from hil.harness.operator import Operator
+from machine.geometry.kinematics import pin_position
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.status.modes import Mode
 from machine.profile import Profile
 from sim.plant import Plant
 
@@ -70,7 +70,7 @@ class Stop:
             elif self.motion.duration_s < 0.5 and now_ns - self.begun_ns > WAIT_NS:
                 x, y, z = self.goal_m
                 start = self.arm.pose(self.motion.goal)
-                self.motion = straight(self.arm, start, self.arm.reach(x, y, z, z), shaped=self.shaped)
+                self.motion = straight_line(self.arm, start, self.arm.reach(x, y, z, z), shaped=self.shaped)
                 self.begun_ns = now_ns
             elif self.motion.duration_s > 0.5 and not self.stands_ns:
                 self.stands_ns = now_ns * np.allclose(report.reference, self.motion.goal, atol=1e-6)

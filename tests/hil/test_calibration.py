@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 
 import machine
 from autonomy.calibration.procedure import Calibration
-from autonomy.calibration.tasks import Spool
+from autonomy.calibration.tasks import SpoolTask
 from experiments.calibration.trial import calibrated
 from experiments.common.pool import Job
-from hil.calibration import run_lockstep
-from hil.replay import files_of, replay
-from machine.load import load_profile
+from hil.calibration.crane import run_lockstep
+from hil.replay.replay import files_of, replay
+from machine.loading.profile_file import load_profile
 from recorder.manifest import describe
 from recorder.recorder import Recorder
 from timberhand.cli import app
@@ -91,7 +91,7 @@ def test_an_abort_leaves_the_valves_neutral_and_the_run_replays(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_the_command_records_every_bus_of_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hil.calibration.LONGEST_S", 3.0)
+    monkeypatch.setattr("hil.calibration.crane.MAX_DURATION_S", 3.0)
     asked = ["calibrate", "--profile", "aoro_fc8", "--lockstep", "--out", str(tmp_path / "mine.toml")]
     done = CliRunner().invoke(app, asked)
     assert "not done within 3 s" in str(done.exception)
@@ -100,4 +100,4 @@ def test_the_command_records_every_bus_of_the_machine(tmp_path: Path, monkeypatc
 
 
 def _opened(calibration: Calibration) -> bool:
-    return isinstance(calibration.task, Spool) and bool(calibration.trace.commands[0].values[-1:].tolist() != [0.0])
+    return isinstance(calibration.task, SpoolTask) and bool(calibration.trace.commands[0].values[-1:].tolist() != [0.0])

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from test_mission_run import PLANE, point
 
-from autonomy.grasp.selection import Planned
-from autonomy.grasp.pile_planner import Press
-from autonomy.grasp.sampling_planner import Search
-from autonomy.manager.checkpoint_file import Logbook, read
+from autonomy.grasp.pile_planner import PilePlanner
+from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.selection import PlannerSelection
 from autonomy.manager.activity_manager import Manager
+from autonomy.manager.checkpoint_file import Logbook, read
 from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options
 from hil.harness.display import Display
 from hil.missions.lockstep import MissionRun
 from hil.missions.site import site_of
-from machine.load import load_profile, profile_hash
+from machine.loading.profile_file import load_profile, profile_hash
+from tests.hil.short_missions import PLANE, point
 
 LIE = (("saw logs", 8.0, 4.2), ("pulpwood", 16.0, -4.2))
 LANDINGS = (("saw logs", 34.0, 14.0), ("pulpwood", 34.0, -14.0))
@@ -58,7 +58,7 @@ def test_each_assortment_comes_to_its_landing_although_the_planner_starts_anew(t
         assert plant.world.carrier.speed_m_s == pytest.approx(0.0, abs=0.01), "nobody drives"
         progress = read(book, told, system.now_ns, 10**18 + int(DEAD_S * 1e9))
         run.manager = Manager(
-            profile, profile_hash(profile), told, chooser=Planned(Search()), emptier=Planned(Press(Search())),
+            profile, profile_hash(profile), told, chooser=PlannerSelection(SamplingPlanner()), emptier=PlannerSelection(PilePlanner(SamplingPlanner())),
             progress=progress,
         )  # fmt: skip
         run.manager.auto()
@@ -66,6 +66,6 @@ def test_each_assortment_comes_to_its_landing_although_the_planner_starts_anew(t
     assert summary.finished, summary.failure
     assert summary.loaded == 2 and not summary.given_up and summary.in_bunk == 0
     east, north, _ = PLANE.local(site.latitude_deg, site.longitude_deg)
-    for state, (_, x, y) in zip(plant.world.yard.states(), LANDINGS, strict=True):
+    for state, (_, x, y) in zip(plant.world.log_bodies.states(), LANDINGS, strict=True):
         there = (state.position_m[0] + east, state.position_m[1] + north)
         assert math.dist(there, (x, y)) < 1.6, "on the pile of its assortment"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from autonomy.calibration.live import Surveyor
-    from autonomy.calibration.plan import Plan
+    from autonomy.calibration.plan import CalibrationPlan
     from autonomy.calibration.procedure import Calibration
     from machine.profile import Profile
 
@@ -55,17 +55,19 @@ def calibrate(
     """
     from rich.console import Console
 
-    from autonomy.calibration.profile_file import NotWritten, changes, write_profile
-    from autonomy.calibration.report import document, write_report
+    from autonomy.calibration.profile_file import ProfileNotWritten, profile_changes, write_profile
+    from autonomy.calibration.report import result_document, write_report
     from autonomy.calibration.result import identify
-    from machine.load import ProfileError, load_profile
+    from machine.loading.profile_file import ProfileError, load_profile
 
     try:
         known = load_profile(profile)
     except ProfileError as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if out.exists():
-        raise Stopped(Exit.USAGE, f"{out} exists and is not overwritten; choose another --out")
+        raise CommandFailed(
+            "calibrate.output-exists", f"{out} exists and is not overwritten; choose another --out", ExitCode.USAGE
+        )
     folder = report or out.with_suffix("")
     screen = Console(stderr=True)
     if lockstep:
@@ -80,22 +82,24 @@ def calibrate(
         )
     with screen.status("fitting"):
         result = identify(known, calibration.found)
-    changed = changes(known, result)
+    changed = profile_changes(known, result)
     facts: dict[str, Any] = {"profile": known.name, "date": _today(), "seconds": calibration.elapsed_s}
     facts |= {"lockstep": {"truth": truth, "seed": seed}} if lockstep else {}
     write_report(folder, result, facts, changed)
     if as_json:
-        print(json.dumps(document(result, facts, changed), indent=2))
+        print(json.dumps(result_document(result, facts, changed), indent=2))
     _show(result, screen)
     if result.implausible:
         screen.print("\n".join(f"[red]✘[/red] {sentence}" for sentence in result.implausible), highlight=False)
-        raise Stopped(
-            Exit.FIGURE, f"no profile is written: {len(result.implausible)} values are implausible; see {folder}"
+        raise CommandFailed(
+            "calibrate.implausible",
+            f"no profile is written: {len(result.implausible)} values are implausible; see {folder}",
+            ExitCode.FIGURE_MISSED,
         )
     try:
         write_profile(_source(profile), out, changed, facts["date"])
-    except NotWritten as error:
-        raise Stopped(Exit.FIGURE, str(error)) from None
+    except ProfileNotWritten as error:
+        raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
     screen.print(f"[green]✔[/green] {out} written, {len(changed)} values; report in {folder}", highlight=False)
     if result.survey is None:
         screen.print("zeros and sag stay as they were: nothing was surveyed (--survey)", highlight=False)
@@ -115,22 +119,22 @@ def _source(profile: str) -> Path:
     return Path(profile_path(profile))
 
 
-def _agree(profile: Profile, plan: Plan, yes: bool) -> None:
+def _agree(profile: Profile, plan: CalibrationPlan, yes: bool) -> None:
     """Says what will move and waits for a yes; anything else ends the command."""
-    from autonomy.calibration.plan import sentences
+    from autonomy.calibration.plan import plan_summary
 
     print(f"{profile.title}: these will move, one at a time:", file=sys.stderr)
-    for line in sentences(profile, plan):
+    for line in plan_summary(profile, plan):
         print(f"  {line}", file=sys.stderr)
     print("Clear the zone: nobody and no log within reach, the grapple empty, the machine at rest.", file=sys.stderr)
     if not yes and not typer.confirm("Move now?", err=True):
-        raise Stopped(Exit.INTERRUPTED, "nothing was moved")
+        raise CommandFailed("calibrate.not-confirmed", "nothing was moved", ExitCode.INTERRUPTED)
 
 
 def _lockstep(
     name: str, profile: Profile, truth: str, seed: int, surveyed: bool, folder: Path, screen: Console
 ) -> Calibration:
-    from hil.calibration import run_lockstep
+    from hil.calibration.crane import run_lockstep
     from recorder.manifest import describe
     from recorder.recorder import Recorder, RecordingRefused
 
@@ -146,15 +150,19 @@ def _lockstep(
                 show=lambda plan: _agree(profile, plan, yes=True), watch=progress.show, aborted=lambda: bool(pressed),
             )  # fmt: skip
     except (ValueError, RecordingRefused) as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     finally:
         signal.signal(signal.SIGINT, before)
         if recorder is not None:
             recorder.close()
     if pressed:
-        raise Stopped(Exit.INTERRUPTED, "interrupted; the valves are neutral and nothing is written")
+        raise CommandFailed(
+            "calibrate.interrupted", "interrupted; the valves are neutral and nothing is written", ExitCode.INTERRUPTED
+        )
     if outcome.failure is not None or outcome.calibration is None:
-        raise Stopped(Exit.SAFETY, f"calibration ended: {outcome.failure}; nothing is written")
+        raise CommandFailed(
+            "calibrate.ended-early", f"calibration ended: {outcome.failure}; nothing is written", ExitCode.SAFETY_STOP
+        )
     return outcome.calibration
 
 
@@ -162,40 +170,55 @@ def _live(
     profile: Profile,
     link_options: tuple[str, int, str, Path | None, int],
     survey: str | None,
-    agree: Callable[[Plan], None],
+    agree: Callable[[CalibrationPlan], None],
     screen: Console,
 ) -> Calibration:
     from autonomy.calibration import live
-    from autonomy.calibration.plan import NoRoom, make_plan
-    from autonomy.calibration.procedure import READINGS, Calibration
-    from can_dbc.bus import BusError, open_bus
-    from can_dbc.codec import load
-    from can_dbc.setpoint import udp_address
-    from machine.load import profile_hash
-    from machine.modes import Mode
+    from autonomy.calibration.plan import CalibrationImpossible, make_plan
+    from autonomy.calibration.procedure import READING_COUNT, Calibration
+    from can_dbc.bus.base import BusError
+    from can_dbc.bus.factory import open_bus
+    from can_dbc.dbc.codec import load
+    from can_dbc.messages.udp_address import udp_address
+    from machine.loading.profile_file import profile_hash
+    from machine.status.modes import Mode
 
     controller, report_port, address, key_file, lease_ms = link_options
     if not 0 < lease_ms <= profile.timeouts.lease_max_ms:
-        raise Stopped(Exit.USAGE, f"--lease-ms {lease_ms}: {profile.name} allows 1..{profile.timeouts.lease_max_ms}")
+        raise CommandFailed(
+            "calibrate.lease",
+            f"--lease-ms {lease_ms}: {profile.name} allows 1..{profile.timeouts.lease_max_ms}",
+            ExitCode.USAGE,
+        )
     pressed: list[int] = []
     try:
         where = udp_address(controller)
         reader = _surveyor(survey, screen)
         key = key_file.read_bytes().strip() if key_file else None
-        link = live.Link(where, report_port, profile_hash(profile), key)
+        link = live.ControllerLink(where, report_port, profile_hash(profile), key)
     except ValueError as error:
-        raise Stopped(Exit.USAGE, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.USAGE) from None
     except OSError as error:
-        raise Stopped(Exit.BUS, f"UDP port {report_port} or the key file: {error}; choose another one") from None
+        raise CommandFailed(
+            "calibrate.port", f"UDP port {report_port} or the key file: {error}; choose another one", ExitCode.BUS
+        ) from None
     try:
         report = live.first_report(link, 10.0, (Mode.STANDBY, Mode.ARMED, Mode.STOP))
         if link.foreign:
-            raise Stopped(Exit.CONFIGURATION, "the controller runs another profile: start both with the same one")
+            raise CommandFailed(
+                "calibrate.other-profile",
+                "the controller runs another profile: start both with the same one",
+                ExitCode.CONFIGURATION,
+            )
         if report is None:
-            raise Stopped(Exit.BUS, f"no controller in STANDBY reports on port {report_port} within 10 s; start it")
+            raise CommandFailed(
+                "calibrate.no-controller",
+                f"no controller in STANDBY reports on port {report_port} within 10 s; start it",
+                ExitCode.BUS,
+            )
         plan = make_plan(profile, report.position, survey is not None)
         agree(plan)
-        readings = 1 if survey == "ask" else READINGS
+        readings = 1 if survey == "ask" else READING_COUNT
         run = Calibration(profile, profile_hash(profile), plan, load("crane"), lease_ms * 1_000_000, key, readings)
         before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
         try:
@@ -213,27 +236,31 @@ def _live(
                 live.run(run, link, heard, reader, turn)
         finally:
             signal.signal(signal.SIGINT, before)
-    except NoRoom as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    except CalibrationImpossible as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     except BusError as error:
-        raise Stopped(Exit.BUS, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.BUS) from None
     finally:
         link.close()
     if pressed:
-        raise Stopped(Exit.INTERRUPTED, "interrupted; the valves are neutral and nothing is written")
+        raise CommandFailed(
+            "calibrate.interrupted", "interrupted; the valves are neutral and nothing is written", ExitCode.INTERRUPTED
+        )
     if not run.done:
-        raise Stopped(Exit.SAFETY, f"calibration ended: {run.failure}; nothing is written")
+        raise CommandFailed(
+            "calibrate.ended-early", f"calibration ended: {run.failure}; nothing is written", ExitCode.SAFETY_STOP
+        )
     return run
 
 
 def _surveyor(survey: str | None, screen: Console) -> Surveyor | None:
     """How a reading is got: never, typed in, or from an instrument."""
-    from autonomy.calibration.live import Instrument
-    from can_dbc.setpoint import udp_address
+    from autonomy.calibration.live import SurveyInstrument
+    from can_dbc.messages.udp_address import udp_address
 
     if survey is None:
         return None
-    return _Typed(screen) if survey == "ask" else Instrument(udp_address(survey))
+    return _Typed(screen) if survey == "ask" else SurveyInstrument(udp_address(survey))
 
 
 class _Typed:
@@ -295,20 +322,20 @@ class _Progress:
 
 
 def _says(calibration: Calibration) -> str:
-    from autonomy.calibration.tasks import Bearing, Grip, Look, Pulse, Spool, Travel
+    from autonomy.calibration.tasks import YawReadingTask, GrappleTask, PinReadingTask, PulseTask, SpoolTask, MoveTask
 
     match calibration.task:
-        case Spool(joint=j, side=side, kind=kind):
+        case SpoolTask(joint=j, side=side, kind=kind):
             return f"{j.name.lower()} {'+' if side > 0 else '-'} {kind}"
-        case Travel(why=why):
+        case MoveTask(why=why):
             return f"travels {why}"
-        case Grip(command=command):
+        case GrappleTask(command=command):
             return f"grapple: {command.name.lower()}"
-        case Look(number=number):
+        case PinReadingTask(number=number):
             return f"survey pose {number + 1}"
-        case Pulse(joint=j, side=side):
+        case PulseTask(joint=j, side=side):
             return f"{j.name.lower()} {'+' if side > 0 else '-'} turn"
-        case Bearing(number=number):
+        case YawReadingTask(number=number):
             return f"direction of the grapple {number + 1}"
     return "waiting"
 

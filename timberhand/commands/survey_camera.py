@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 
 if TYPE_CHECKING:
     from machine.profile import Camera
@@ -42,28 +42,32 @@ def survey_camera(
 
     from rich.console import Console
 
-    from autonomy.calibration.profile_file import NotWritten, write_profile
-    from autonomy.calibration.targets_file import TargetsRefused, load_targets
-    from autonomy.perception.camera_survey import surveyed
-    from autonomy.perception.mount import MountRefused, link_pose
+    from autonomy.calibration.profile_file import ProfileNotWritten, write_profile
+    from autonomy.calibration.targets_file import TargetsFileError, load_targets
+    from autonomy.perception.camera.mount import CameraMountError, link_pose
+    from autonomy.perception.camera.survey import surveyed
     from controller.guard.__main__ import profile_path
-    from machine.load import ProfileError, load_profile
+    from machine.loading.profile_file import ProfileError, load_profile
 
     try:
         known = load_profile(profile)
         seen = load_targets(targets)
-    except (ProfileError, TargetsRefused) as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+    except (ProfileError, TargetsFileError) as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if camera not in known.cameras:
         names = ", ".join(known.cameras) or "none"
-        raise Stopped(Exit.USAGE, f"{known.name} has no camera {camera!r}; it has: {names}")
+        raise CommandFailed(
+            "survey-camera.no-camera", f"{known.name} has no camera {camera!r}; it has: {names}", ExitCode.USAGE
+        )
     before = known.cameras[camera]
     q = _joints(joints, before)
     try:
         link = link_pose(known, before.link, q, math.radians(articulation_deg))
         found = surveyed(before, link, seen.pixels_px, seen.depths_m, seen.places_m)
-    except MountRefused as error:
-        raise Stopped(Exit.FIGURE, f"no profile is written: {error}") from None
+    except CameraMountError as error:
+        raise CommandFailed(
+            "survey-camera.no-solution", f"no profile is written: {error}", ExitCode.FIGURE_MISSED
+        ) from None
     remark = f"by {len(seen.places_m)} surveyed targets"
     values = {
         "position_m": [round(v, 4) for v in found.position_m],
@@ -73,8 +77,8 @@ def survey_camera(
     changed = [(("cameras", camera, name), value, remark) for name, value in values.items()]
     try:
         write_profile(Path(profile_path(profile)), out, changed, datetime.date.today().isoformat())
-    except NotWritten as error:
-        raise Stopped(Exit.FIGURE, str(error)) from None
+    except ProfileNotWritten as error:
+        raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
     if as_json:
         print(json.dumps({"camera": camera, "targets": len(seen.places_m), **values}, indent=2))
     moved_mm = 1000.0 * math.dist(before.position_m, found.position_m)
@@ -91,12 +95,18 @@ def _joints(text: str | None, camera: Camera) -> list[float]:
     """Joint positions [rad, m] in ``Joint`` order."""
     if text is None:
         if camera.link in ("boom", "stick"):
-            raise Stopped(Exit.USAGE, f"the camera is on the {camera.link}; say where the crane stands with --joints")
+            raise CommandFailed(
+                "survey-camera.joints-missing",
+                f"the camera is on the {camera.link}; say where the crane stands with --joints",
+                ExitCode.USAGE,
+            )
         return [0.0] * 5
     try:
         slew, lift, tilt, ext = (float(word) for word in text.replace(",", " ").split())
     except ValueError:
-        raise Stopped(
-            Exit.USAGE, f'--joints "{text}": four numbers are wanted, slew, lift and tilt in deg and telescope in m'
+        raise CommandFailed(
+            "survey-camera.joints-malformed",
+            f'--joints "{text}": four numbers are wanted, slew, lift and tilt in deg and telescope in m',
+            ExitCode.USAGE,
         ) from None
     return [*map(math.radians, (slew, lift, tilt)), ext, 0.0]

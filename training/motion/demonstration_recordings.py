@@ -10,7 +10,13 @@ from typing import Final
 import numpy as np
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.demonstration import RecordingRefused, JointTrack, segment_motions, read_demonstrations, joint_track
+from autonomy.motion.demonstration import (
+    JointTrack,
+    RecordingRefused,
+    joint_track,
+    read_demonstrations,
+    segment_motions,
+)
 from autonomy.motion.movement_primitives import Primitives, pose_track, split_by_direction
 from autonomy.motion.pose import Pose
 from can_dbc.dbc.codec import load as load_database

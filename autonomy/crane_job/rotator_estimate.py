@@ -14,21 +14,21 @@ from typing import Final
 from msgspec.structs import replace
 
 from autonomy.motion.setpoint_stream import Axes, Motion
-from autonomy.perception.logs import LogObservation
-from machine.grapple import grapple_yaw
+from autonomy.perception.log_list.observation import LogObservation
+from machine.geometry.grapple import grapple_yaw
 from machine.joints import Joint
 from machine.profile import Profile, joint
 
-GAIN: Final = 0.8
+ANGLE_GAIN: Final = 0.8
 """Share of what is seen that is believed: a log may hang a little askew."""
-PACE_GAIN: Final = 0.5
-FAR_RAD: Final = 0.5
+SCALE_GAIN: Final = 0.5
+MIN_SCALE_TURN_RAD: Final = 0.5
 """A turn that is long enough to tell how much of it was made."""
-PACES: Final = (0.6, 1.5)
+SCALE_BOUNDS: Final = (0.6, 1.5)
 
 
 @dataclass(frozen=True, slots=True)
-class Rotator:
+class RotatorEstimate:
     """At the count ``sent_rad`` it stood at ``angle_rad``; from there a turn by 1 on the count is one by ``paces``, to
     the negative and to the positive side.
     """
@@ -47,18 +47,18 @@ class Rotator:
         turn = angle_rad - self.angle_rad
         return self.sent_rad + turn / self.paces[turn > 0.0]
 
-    def seen(self, sent_rad: float, angle_rad: float) -> Rotator:
+    def seen(self, sent_rad: float, angle_rad: float) -> RotatorEstimate:
         """At this count it is seen to stand at an angle, modulo pi."""
         turn, off = sent_rad - self.sent_rad, remainder(angle_rad - self.angle(sent_rad), pi)
         paces = list(self.paces)
-        if abs(turn) > FAR_RAD:
-            paces[turn > 0.0] += PACE_GAIN * off / turn
-        least, most = PACES
-        angle = self.angle(sent_rad) + GAIN * off
+        if abs(turn) > MIN_SCALE_TURN_RAD:
+            paces[turn > 0.0] += SCALE_GAIN * off / turn
+        least, most = SCALE_BOUNDS
+        angle = self.angle(sent_rad) + ANGLE_GAIN * off
         # A grapple turned by half a turn is the same: the count stays near the angle and within its range.
         near = sent_rad + remainder(angle - sent_rad, pi)
         minus, plus = (min(max(pace, least), most) for pace in paces)
-        return Rotator(sent_rad, near, (minus, plus))
+        return RotatorEstimate(sent_rad, near, (minus, plus))
 
     def counted(self, q: Axes) -> Axes:
         """Joints with the count in place of the rotator's angle."""
@@ -70,11 +70,11 @@ class Rotator:
 
     def motion(self, motion: Motion) -> Motion:
         """A motion of the angle as one of the count."""
-        return _Counted(motion, self)
+        return _CountMotion(motion, self)
 
 
-class _Counted:
-    def __init__(self, motion: Motion, rotator: Rotator) -> None:
+class _CountMotion:
+    def __init__(self, motion: Motion, rotator: RotatorEstimate) -> None:
         self._motion, self._rotator = motion, rotator
 
     @property
@@ -87,16 +87,16 @@ class _Counted:
         return (*q, rotator.sent(angle)), (*v, speed / rotator.paces[angle > rotator.angle_rad])
 
 
-def is_counted(profile: Profile) -> bool:
+def has_no_encoder(profile: Profile) -> bool:
     """Whether the machine's rotator has no encoder."""
     return joint(profile, Joint.ROT).encoder is None
 
 
-def planned(profile: Profile, rotator: Rotator) -> Profile:
+def planning_profile(profile: Profile, rotator: RotatorEstimate) -> Profile:
     """The machine as motions are planned for it: a counted rotator is sent no faster than it may be, and uses half of
     its range, for the count may be off by as much as a quarter turn and goes farther than the angle.
     """
-    if not is_counted(profile):
+    if not has_no_encoder(profile):
         return profile
     spec, slower = joint(profile, Joint.ROT), min(*rotator.paces, 1.0)
     limited = replace(
@@ -106,7 +106,7 @@ def planned(profile: Profile, rotator: Rotator) -> Profile:
     return replace(profile, joints={**profile.joints, "rot": limited})
 
 
-def hanging(profile: Profile, log: LogObservation, slew_rad: float) -> float:
+def rotator_angle_of_hanging_log(profile: Profile, log: LogObservation, slew_rad: float) -> float:
     """The rotator's angle that a log tells which is seen to hang in closed tongs, rad, modulo pi."""
     straight = grapple_yaw(profile, (slew_rad, 0.0, 0.0, 0.0, 0.0))
     return atan2(log.axis[1], log.axis[0]) + pi / 2 - straight

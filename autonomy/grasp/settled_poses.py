@@ -12,63 +12,63 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.cylinders import Cylinders, across, between_axes, changed
-from autonomy.perception.estimate import ACROSS_1, ACROSS_2, RADIUS, SIZE, TILT_1, TILT_2
+from autonomy.grasp.cylinders import Cylinders, transverse_axes, axis_offsets, perturbed
+from autonomy.perception.log_list.estimate import ACROSS_1, ACROSS_2, RADIUS, SIZE, TILT_1, TILT_2
 
-LEVEL_M: Final = 0.015
+GROUND_SIGMA_M: Final = 0.015
 """Standard deviation of the ground's height under an end of a log, with its bow and taper."""
-LIKELY: Final = 9.0
+MAX_MAHALANOBIS_SQ: Final = 9.0
 """Squared standard deviations, of two numbers, up to which a log may lie on the ground: 99 %."""
-SUNK_M: Final = 0.12
+MAX_HEIGHT_ON_GROUND_M: Final = 0.12
 """A log whose middle is seen further over the ground than this lies on something."""
-CROOKED_M: Final = 0.015
+CONTACT_OVERLAP_M: Final = 0.015
 """Logs that touch reach so far into each other as cylinders."""
-INTO_M: Final = 0.04
+MAX_OVERLAP_M: Final = 0.04
 """A log that would reach further into another if it lay on the ground does not lie there."""
-OWN_SHARE: Final = 0.4
+OWN_HEIGHT_SHARE: Final = 0.4
 """Of the standard deviation of the height of a log on others, the part that is its own and not the camera's."""
-ROUNDS: Final = 3
+ROUND_COUNT: Final = 3
 
 
-def settled(world: Cylinders, covariances: np.ndarray, ground_z_m: float) -> tuple[Cylinders, np.ndarray]:
+def settled_poses(world: Cylinders, covariances: np.ndarray, ground_z_m: float) -> tuple[Cylinders, np.ndarray]:
     """The logs (n) and their covariances (n, 7, 7), with level ground at ``ground_z_m``."""
-    sigma, before = covariances.copy(), apart(world)
+    sigma, before = covariances.copy(), surface_gaps(world)
     common = float(np.min(sigma[:, ACROSS_2, ACROSS_2], initial=np.inf))  # no log is known better than the camera
     lying, off, sure = np.zeros(world.count, bool), np.zeros(world.count), np.zeros(world.count)
     for i in np.argsort(sigma[:, ACROSS_2, ACROSS_2], kind="stable").tolist():
         height, slope = _undersides(world, i, ground_z_m)
         off[i] = height.mean()
-        spread = slope @ sigma[i] @ slope.T + LEVEL_M**2 * np.eye(2)
-        if off[i] > SUNK_M or (off[i] > 0.0 and height @ np.linalg.solve(spread, height) > LIKELY):
+        spread = slope @ sigma[i] @ slope.T + GROUND_SIGMA_M**2 * np.eye(2)
+        if off[i] > MAX_HEIGHT_ON_GROUND_M or (off[i] > 0.0 and height @ np.linalg.solve(spread, height) > MAX_MAHALANOBIS_SQ):
             continue
-        laid = _moved(world, sigma, i, height, slope, LEVEL_M)
-        if off[i] > 0.0 and np.any(apart(laid)[i] < np.minimum(before[i], 0.0) - INTO_M):
+        laid = _updated_pose(world, sigma, i, height, slope, GROUND_SIGMA_M)
+        if off[i] > 0.0 and np.any(surface_gaps(laid)[i] < np.minimum(before[i], 0.0) - MAX_OVERLAP_M):
             continue
         world, lying[i] = laid, True
-        sure[i] = 1.0 / max(float(spread.mean()) - common, LEVEL_M**2)
-        sigma[i] = _known(sigma[i], slope, LEVEL_M)
+        sure[i] = 1.0 / max(float(spread.mean()) - common, GROUND_SIGMA_M**2)
+        sigma[i] = _updated_covariance(sigma[i], slope, GROUND_SIGMA_M)
     if lying.any():
         shift = np.where(lying, 0.0, sure @ off / (1.0 / common + sure.sum()))
         center = world.center - shift[:, None] * (0.0, 0.0, 1.0)
         world = Cylinders(center, world.axis, world.length, world.radius)
         scale = np.ones((world.count, SIZE))
-        scale[~lying, ACROSS_2] = OWN_SHARE
+        scale[~lying, ACROSS_2] = OWN_HEIGHT_SHARE
         sigma *= scale[:, :, None] * scale[:, None, :]
-    for _ in range(ROUNDS):
-        pairs = np.argwhere(np.triu(apart(world) < -CROOKED_M)).tolist()
+    for _ in range(ROUND_COUNT):
+        pairs = np.argwhere(np.triu(surface_gaps(world) < -CONTACT_OVERLAP_M)).tolist()
         if not pairs:
             break
         for i, j in pairs:
-            world = _parted(world, sigma, i, j)
+            world = _separated(world, sigma, i, j)
         for i in np.flatnonzero(lying).tolist():
-            world = _moved(world, sigma, i, *_undersides(world, i, ground_z_m), LEVEL_M)
+            world = _updated_pose(world, sigma, i, *_undersides(world, i, ground_z_m), GROUND_SIGMA_M)
     return world, sigma
 
 
-def apart(world: Cylinders) -> np.ndarray:
+def surface_gaps(world: Cylinders) -> np.ndarray:
     """(n, n) [m]: the least distance between the surfaces of every two logs by points of the one's axis, negative where
     they reach into each other; infinite between a log and itself."""
-    off = np.linalg.norm(between_axes(world), axis=-1).min(axis=-1)
+    off = np.linalg.norm(axis_offsets(world), axis=-1).min(axis=-1)
     gap: np.ndarray = np.minimum(off, off.T) - world.radius[:, None] - world.radius[None, :]
     np.fill_diagonal(gap, np.inf)
     return gap
@@ -86,30 +86,30 @@ def _undersides(world: Cylinders, i: int, ground_z_m: float) -> tuple[np.ndarray
     return np.array([middle - rise, middle + rise]), slope
 
 
-def _known(covariance: np.ndarray, slope: np.ndarray, noise_m: float) -> np.ndarray:
+def _updated_covariance(covariance: np.ndarray, slope: np.ndarray, noise_m: float) -> np.ndarray:
     """A covariance (7, 7) after a measurement with derivatives (k, 7)."""
     spread = slope @ covariance @ slope.T + noise_m**2 * np.eye(len(slope))
     known: np.ndarray = covariance - covariance @ slope.T @ np.linalg.solve(spread, slope @ covariance)
     return 0.5 * (known + known.T)
 
 
-def _moved(
+def _updated_pose(
     world: Cylinders, sigma: np.ndarray, i: int, over_m: np.ndarray, slope: np.ndarray, noise_m: float
 ) -> Cylinders:
     """The logs with ``i`` changed so that what is ``over_m`` (k,) over its place is as near to it as both are known."""
     spread = slope @ sigma[i] @ slope.T + noise_m**2 * np.eye(len(slope))
     error = np.zeros((world.count, SIZE))
     error[i] = -sigma[i] @ slope.T @ np.linalg.solve(spread, over_m)
-    return changed(world, error)
+    return perturbed(world, error)
 
 
-def _parted(world: Cylinders, sigma: np.ndarray, i: int, j: int) -> Cylinders:
+def _separated(world: Cylinders, sigma: np.ndarray, i: int, j: int) -> Cylinders:
     """The logs with two of them moved apart until they touch, each by as much as it is unsure."""
-    level, up = across(world.axis)
-    points, away = world.points()[j], between_axes(world)[i, j]
+    level, up = transverse_axes(world.axis)
+    points, away = world.points()[j], axis_offsets(world)[i, j]
     distance = np.linalg.norm(away, axis=1)
     k = int(np.argmin(distance))
-    reach = float(distance[k] - world.radius[i] - world.radius[j]) + CROOKED_M
+    reach = float(distance[k] - world.radius[i] - world.radius[j]) + CONTACT_OVERLAP_M
     if reach >= 0.0:
         return world
     way = away[k] / max(float(distance[k]), 1e-6)
@@ -124,4 +124,4 @@ def _parted(world: Cylinders, sigma: np.ndarray, i: int, j: int) -> Cylinders:
     spread = sum(float(slope @ sigma[log] @ slope) for log, slope in slopes) + 1e-6
     for log, slope in slopes:
         error[log] = -sigma[log] @ slope * (reach / spread)
-    return changed(world, error)
+    return perturbed(world, error)

@@ -12,23 +12,23 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
-from can_dbc.setpoint import MAX_KNOTS, SpoolKnot
+from can_dbc.messages.crane import MAX_KNOTS, SpoolKnot
 from machine.profile import JointSpec
 
 OPENING_FACTOR: Final = 2.0
 """The opening grows this many times faster than the acceleration limit; the controller allows four."""
-LAST_S: Final = 0.001
+END_GUARD_S: Final = 0.001
 """So short before its end a program is over: every program ends neutral."""
 STEP_S: Final = 0.005
 """A step inside the dead-band takes one control period."""
-UNDER_PCT: Final = 4.0
+BELOW_DEADBAND_PCT: Final = 4.0
 """How far under the profile's dead-band a slow program begins: a valve may open this much earlier than assumed."""
-WIGGLE_PCT_S, WIGGLE_OVER_PCT = 14.0, 20.0
-SWEEP_PCT_S, SWEEP_OVER_PCT = 7.0, 16.0
-STEP_SHARES: Final = (0.3, 0.55, 0.8)
+WIGGLE_PCT_S, WIGGLE_ABOVE_PCT = 14.0, 20.0
+SWEEP_PCT_S, SWEEP_ABOVE_PCT = 7.0, 16.0
+STAIRCASE_SPEED_SHARES: Final = (0.3, 0.55, 0.8)
 """Steady speeds of the staircase, as shares of the speed limit by the profile's valve map."""
 HOLD_S: Final = 0.9
-PULSE_FACTOR: Final = 0.5
+PULSE_OPENING_FACTOR: Final = 0.5
 """A pulse opens and shuts as gently as the planner's motions do: one that jerks loses 0.05 s of its way to the pump."""
 PULSES: Final = ((0.12, 0.4), (0.35, 0.9), (0.7, 1.6))
 """A rotator without an encoder turns there and back at these shares of its speed limit, so far [rad]: the slow turns
@@ -59,7 +59,7 @@ class SpoolProgram:
 
     def window(self, time_s: float, horizon_s: float) -> tuple[SpoolKnot, ...]:
         """Knots of the stretch from ``time_s`` on; at its end the program has more to say or is neutral."""
-        if time_s > self.duration_s - LAST_S:
+        if time_s > self.duration_s - END_GUARD_S:
             return (SpoolKnot(0, 0.0),)
         end_s = min(time_s + horizon_s, self.duration_s)
         inside = [t for t, _ in self.points if time_s < t < end_s]
@@ -88,9 +88,9 @@ def command_for(spec: JointSpec, side: int, speed: float) -> float:
     return deadband + (100.0 - deadband) * min(1.0, speed / full)
 
 
-def _slow(spec: JointSpec, side: int, rate_pct_s: float, over_pct: float, back: bool) -> SpoolProgram:
+def _ramp(spec: JointSpec, side: int, rate_pct_s: float, over_pct: float, back: bool) -> SpoolProgram:
     """Up through the edge of the dead-band at a steady rate, to ``over_pct`` past it, and down again or shut."""
-    low = max(0.0, deadband_pct(spec, side) - UNDER_PCT)
+    low = max(0.0, deadband_pct(spec, side) - BELOW_DEADBAND_PCT)
     top = deadband_pct(spec, side) + over_pct
     up_s = (top - low) / rate_pct_s
     points = [(0.0, 0.0), (STEP_S, low), (STEP_S + up_s, top)]
@@ -102,15 +102,15 @@ def _slow(spec: JointSpec, side: int, rate_pct_s: float, over_pct: float, back: 
 
 def wiggle(spec: JointSpec, side: int) -> SpoolProgram:
     """Open until something moves; it is broken off as soon as something does."""
-    return _slow(spec, side, WIGGLE_PCT_S, WIGGLE_OVER_PCT, back=False)
+    return _ramp(spec, side, WIGGLE_PCT_S, WIGGLE_ABOVE_PCT, back=False)
 
 
 def sweep(spec: JointSpec, side: int) -> SpoolProgram:
     """Slowly out of the dead-band and back into it: both edges of the hysteresis and the foot of the metering curve."""
-    return _slow(spec, side, SWEEP_PCT_S, SWEEP_OVER_PCT, back=True)
+    return _ramp(spec, side, SWEEP_PCT_S, SWEEP_ABOVE_PCT, back=True)
 
 
-def turned(program: SpoolProgram, time_s: float) -> SpoolProgram:
+def reversed_sweep(program: SpoolProgram, time_s: float) -> SpoolProgram:
     """A sweep that turns at ``time_s`` instead of at its top."""
     (t0, p0), (t1, p1), (_, _), (_, _), _ = program.points
     top = program.at(time_s)
@@ -120,15 +120,15 @@ def turned(program: SpoolProgram, time_s: float) -> SpoolProgram:
 
 def staircase(spec: JointSpec, side: int) -> SpoolProgram:
     """Three steady speeds, each long enough for the oil to come to rest, and shut."""
-    return _steps(spec, side, STEP_SHARES, HOLD_S, OPENING_FACTOR)
+    return _staircase(spec, side, STAIRCASE_SPEED_SHARES, HOLD_S, OPENING_FACTOR)
 
 
 def pulse(spec: JointSpec, side: int, share: float, hold_s: float) -> SpoolProgram:
     """One steady speed, by the profile's valve map a ``share`` of the speed limit, for so long, and shut."""
-    return _steps(spec, side, (share,), hold_s, PULSE_FACTOR)
+    return _staircase(spec, side, (share,), hold_s, PULSE_OPENING_FACTOR)
 
 
-def _steps(spec: JointSpec, side: int, shares: Sequence[float], hold_s: float, factor: float) -> SpoolProgram:
+def _staircase(spec: JointSpec, side: int, shares: Sequence[float], hold_s: float, factor: float) -> SpoolProgram:
     rate_pct_s = 100.0 * factor * spec.acceleration_limit
     rate_pct_s /= max(spec.valve.full_speed_plus, spec.valve.full_speed_minus)
     before = max(0.0, deadband_pct(spec, side) - 0.5)
@@ -144,7 +144,7 @@ def _steps(spec: JointSpec, side: int, shares: Sequence[float], hold_s: float, f
     return SpoolProgram(tuple((t, side * p) for t, p in points))
 
 
-def travel_of(program: SpoolProgram, spec: JointSpec, side: int) -> float:
+def predicted_travel(program: SpoolProgram, spec: JointSpec, side: int) -> float:
     """How far the profile's valve map says that the joint goes [rad, m], with its sign."""
     full = spec.valve.full_speed_plus if side > 0 else spec.valve.full_speed_minus
     deadband = deadband_pct(spec, side)

@@ -14,24 +14,24 @@ from typing import Final
 import numpy as np
 
 from autonomy.grasp.cylinders import Cylinders
-from autonomy.grasp.direct import pose_over
+from autonomy.grasp.grapple_heights import grasp_pose
 from autonomy.grasp.jaws import Jaws
-from autonomy.grasp.proposal import GraspProposal
+from autonomy.grasp.planner import GraspCandidate
 from autonomy.motion.arm import Arm
-from autonomy.perception.logs import LogObservation
-from machine.kinematics import Unreachable
+from autonomy.perception.log_list.observation import LogObservation
+from machine.geometry.kinematics import Unreachable
 
-SUCCESS: Final = 0.9
+SUCCESS_PROBABILITY: Final = 0.9
 """In the plant's rows of three: 14 of 14, without another try."""
-VALLEY_M: Final = 0.02
+VALLEY_OFFSET_M: Final = 0.02
 """The tip comes down so far beyond the log's side: logs that touch part when it is pressed between them."""
-BESIDE_M: Final = 0.05
+NEIGHBOUR_OFFSET_M: Final = 0.05
 """What lies on one side of a log lies so far over there, at least."""
-ROUND_M: Final = 2.5
+ROW_RADIUS_M: Final = 2.5
 """Logs whose middles are farther away are of no row with it."""
 
 
-def drawn_out(
+def extract_end_log(
     arm: Arm,
     jaws: Jaws,
     world: Cylinders,
@@ -40,7 +40,7 @@ def drawn_out(
     stays: np.ndarray,
     lowest_m: float,
     rot_rad: float,
-) -> GraspProposal | None:
+) -> GraspCandidate | None:
     """The thickest log at an end of a row on the ground at ``lowest_m`` that is in reach with free ground beside it and
     is none of those that are to stay (n,), nor lies on others or under them (``upon`` (n, n) of `quality.lies_upon`);
     None where there is none.  ``rot_rad`` is where the rotator stands.
@@ -53,14 +53,14 @@ def drawn_out(
         for side in (1.0, -1.0):
             out = side * np.array([np.cos(yaw), np.sin(yaw)])
             away = world.center[:, :2] - world.center[i, :2]
-            beyond, near = away @ out, np.hypot(*away.T) < ROUND_M
-            if np.any(near & (beyond > BESIDE_M)) or not np.any(near & (beyond < -BESIDE_M)):
+            beyond, near = away @ out, np.hypot(*away.T) < ROW_RADIUS_M
+            if np.any(near & (beyond > NEIGHBOUR_OFFSET_M)) or not np.any(near & (beyond < -NEIGHBOUR_OFFSET_M)):
                 continue
-            x, y = world.center[i, :2] + out * (jaws.half_gap_m - world.radius[i] - VALLEY_M)
+            x, y = world.center[i, :2] + out * (jaws.half_gap_m - world.radius[i] - VALLEY_OFFSET_M)
             try:
-                pose_over(arm, float(x), float(y), yaw, lowest_m, logs[i].diameter_m, rot_rad)
+                grasp_pose(arm, float(x), float(y), yaw, lowest_m, logs[i].diameter_m, rot_rad)
             except Unreachable:
                 continue
             reason = f"log {logs[i].id} is drawn out of a row of {len(logs)} logs that is too wide for the tongs"
-            return GraspProposal(float(x), float(y), yaw, lowest_m, (i,), SUCCESS, reason, pressed=True, drawn=True)
+            return GraspCandidate(float(x), float(y), yaw, lowest_m, (i,), SUCCESS_PROBABILITY, reason, pressed=True, drawn=True)
     return None

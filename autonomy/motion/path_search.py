@@ -15,49 +15,50 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.motion.arm import Arm, Pose
-from autonomy.motion.clearance import SAMPLES, judged, pins, spare
-from autonomy.motion.obstacles import Held, Surroundings
-from autonomy.motion.telescope import eased
-from autonomy.motion.time_optimal import swift_law
-from autonomy.motion.trajectory import Leg, Trajectory, leg, summed, travel
+from autonomy.motion.arm import Arm
+from autonomy.motion.clearance import SAMPLE_COUNT, evaluate_clearance, pin_positions, clearance_reserve
+from autonomy.motion.obstacles import HeldLog, CollisionScene
+from autonomy.motion.pose import Pose
+from autonomy.motion.telescope import with_fastest_extensions
+from autonomy.motion.time_optimal import time_optimal_law
+from autonomy.motion.trajectory import Leg, Trajectory, make_leg, superposed, travel_over
 from machine.joints import Joint
-from machine.kinematics import Unreachable
+from machine.geometry.kinematics import Unreachable
 
-TRIES: Final = 8
+TRIES_PER_HEIGHT: Final = 8
 """So many overlaps at one height are checked, the fastest first, before the next shape's turn."""
-MOST: Final = 64
+MAX_TRIES: Final = 64
 """No more ways than so many are checked at all."""
-HIGHEST_M: Final = 4.0
+MAX_RISE_M: Final = 4.0
 """So far over the higher end a way is looked for, ..."""
-HIGHER_M: Final = (0.0, 0.4, 0.9)
+HEIGHT_MARGINS_M: Final = (0.0, 0.4, 0.9)
 """... and where none is clear as it swings, so much higher."""
-_STEP_UP_M: Final = 0.05
-REACHES: Final = (None, 0.6, 1.25)
+_HEIGHT_STEP_M: Final = 0.05
+REACH_FACTORS: Final = (None, 0.6, 1.25)
 """Distance from the slew axis half-way, as a share of the nearer or the farther end's: as it comes, drawn in,
 stretched out."""
-EARLY: Final = (1.0, 0.7, 0.45, 0.3, 0.2, 0.08)
+OVERLAP_SHARES: Final = (1.0, 0.7, 0.45, 0.3, 0.2, 0.08)
 """Share of a rise that may be left when the way over begins, and of the way over when the way down begins."""
-_HEIGHT_M_S: Final = 0.7
-_REACH_M_S: Final = 0.9
+_ASSUMED_LIFT_M_S: Final = 0.7
+_ASSUMED_REACH_M_S: Final = 0.9
 """Speeds of the pin by which ways are compared before their laws are known, ..."""
-_SOFT: Final = 0.3
+_RAMP_SHARE: Final = 0.3
 """... and the share of a leg in which it sets in and ends."""
-_POSES: Final = 65
-_SURE: Final = 0.7
+_POSE_COUNT: Final = 65
+_PRUNE_SHARE: Final = 0.7
 """A way that is higher by this share of what was missing may be clear."""
-_THROUGH_M: Final = 0.2
+_HOPELESS_M: Final = 0.2
 """A way that is by so much too near to a thing, with room for swing, is so however it swings: it gets no law."""
-_SAME: Final = 1e-6
-_COARSE: Final = 25
+_TOLERANCE: Final = 1e-6
+_COARSE_COUNT: Final = 25
 
 
-class Blocked(Unreachable):
+class PathBlocked(Unreachable):
     """No way is clear; the text says what is in the way of the best."""
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class ClearMotion:
     """A way that is clear: the motion, its least clearance beyond what is asked for [m], its shape in words, how many
     ways were looked at.
     """
@@ -90,55 +91,55 @@ class _Failure:
 
     def rules_out(self, other: _Candidate) -> bool:
         """Whether another is no farther away where this one was too near."""
-        if other.shape != self.way.shape or other.height_m > self.way.height_m + _SURE * self.short_m:
+        if other.shape != self.way.shape or other.height_m > self.way.height_m + _PRUNE_SHARE * self.short_m:
             return False
         if self.late:
             return other.over_left >= self.way.over_left
         return other.up_left >= self.way.up_left
 
 
-def plan(
+def plan_path(
     arm: Arm,
     start: Pose,
     goal: Pose,
-    around: Surroundings,
-    held: Held | None = None,
+    around: CollisionScene,
+    held: HeldLog | None = None,
     least_height_m: float = -np.inf,
-) -> Path:
+) -> ClearMotion:
     """The fastest clear way from rest at ``start`` to rest at ``goal``.
 
     ``held`` is what hangs in the grapple, empty tongs are open; ``least_height_m``: the way goes at least so high.
 
     Raises:
         Blocked: nothing is clear; in one sentence.
-        machine.kinematics.Unreachable: an end is out of reach.
+        machine.geometry.kinematics.Unreachable: an end is out of reach.
     """
     arm.joints(np.array([start, goal]))
-    planner = _Planner(arm, start, goal, around, held)
+    planner = _PathSearch(arm, start, goal, around, held)
     top = max(start.z_m, goal.z_m)
     line = _Candidate((start, goal), 1.0, 1.0, top, "straight")
     if least_height_m <= top and planner.may_pass(line) and (found := planner.driven(line)):
         return found
-    for reach in REACHES:
-        height = planner.least_height(max(top, least_height_m), top + HIGHEST_M, reach)
-        for more in HIGHER_M if height is not None else ():
-            if planner.tried >= MOST:
+    for reach in REACH_FACTORS:
+        height = planner.least_height(max(top, least_height_m), top + MAX_RISE_M, reach)
+        for more in HEIGHT_MARGINS_M if height is not None else ():
+            if planner.tried >= MAX_TRIES:
                 break
             if found := planner.best(height + more, reach):
                 return found
     best = max(planner.failures, key=lambda f: -f.short_m, default=None)
     reason = best.why if best else "every way leaves the crane's reach"
-    raise Blocked(f"no way is clear from ({_said(arm, start)}) to ({_said(arm, goal)}) m: {reason}")
+    raise PathBlocked(f"no way is clear from ({_coordinates(arm, start)}) to ({_coordinates(arm, goal)}) m: {reason}")
 
 
-class Clear:
-    """A source of motions with the signature of `autonomy.motion.trajectory.travel` that stays clear of a scene.
+class ClearPathPlanner:
+    """A source of motions with the signature of `autonomy.motion.trajectory.travel_over` that stays clear of a scene.
 
-    ``patient``: `travel` itself is looked at as well, which takes some tenths of a second: on a level way its slower
+    ``patient``: `travel_over` itself is looked at as well, which takes some tenths of a second: on a level way its slower
     laws are the shorter ones.
     """
 
-    def __init__(self, around: Surroundings, held: Held | None = None, patient: bool = False) -> None:
+    def __init__(self, around: CollisionScene, held: HeldLog | None = None, patient: bool = False) -> None:
         self._around, self._held, self._patient = around, held, patient
 
     def __call__(self, arm: Arm, start: Pose, goal: Pose, height_m: float = 0.0, free_m: float = 0.0) -> Trajectory:
@@ -147,28 +148,28 @@ class Clear:
         Raises:
             Blocked: nothing is clear; in one sentence.
         """
-        ours = plan(arm, start, goal, self._around, self._held).motion
+        ours = plan_path(arm, start, goal, self._around, self._held).motion
         if not self._patient:
             return ours
-        always = travel(arm, start, goal, max(height_m, start.z_m, goal.z_m), free_m)
+        always = travel_over(arm, start, goal, max(height_m, start.z_m, goal.z_m), free_m)
         shorter = always.duration_s < ours.duration_s
-        return always if shorter and spare(arm, always, self._around, self._held)[0] >= 0.0 else ours
+        return always if shorter and clearance_reserve(arm, always, self._around, self._held)[0] >= 0.0 else ours
 
 
-def _said(arm: Arm, pose: Pose) -> str:
+def _coordinates(arm: Arm, pose: Pose) -> str:
     x, y = arm.xy(pose)
     return f"{x:.2f}, {y:.2f}, {pose.z_m:.2f}"
 
 
 @dataclass(slots=True)
-class _Planner:
+class _PathSearch:
     """One question; what was tried, and failures."""
 
     arm: Arm
     start: Pose
     goal: Pose
-    around: Surroundings
-    held: Held | None
+    around: CollisionScene
+    held: HeldLog | None
     tried: int = 0
     spare_m: float = 0.0
     failures: list[_Failure] = field(default_factory=list)
@@ -178,8 +179,8 @@ class _Planner:
     def least_height(self, low_m: float, high_m: float, reach: float | None) -> float | None:
         """The least height, within a few cm, at which the way with sharp corners is clear; None where none is."""
         height = low_m
-        while height <= high_m and self.tried < MOST:
-            sharp = self._way(height, reach, EARLY[-1], EARLY[-1])
+        while height <= high_m and self.tried < MAX_TRIES:
+            sharp = self._way(height, reach, OVERLAP_SHARES[-1], OVERLAP_SHARES[-1])
             poses = self._poses(sharp)
             try:
                 spare_m = self._judged(sharp, poses, self.arm.joints_about(poses), None)
@@ -187,7 +188,7 @@ class _Planner:
                 return None
             if spare_m >= 0.0:
                 return height
-            height += _STEP_UP_M - spare_m
+            height += _HEIGHT_STEP_M - spare_m
         return None
 
     def may_pass(self, way: _Candidate) -> bool:
@@ -197,14 +198,14 @@ class _Planner:
             q = self.arm.joints_about(poses)
         except Unreachable:
             return False
-        spare_m, why, _ = judged(self.arm, q, pins(self.arm, poses), self.around, self.held, None)
-        if spare_m > -_THROUGH_M:
+        spare_m, why, _ = evaluate_clearance(self.arm, q, pin_positions(self.arm, poses), self.around, self.held, None)
+        if spare_m > -_HOPELESS_M:
             return True
         self.tried += 1
         self.failures.append(_Failure(way, -spare_m, why, False))
         return False
 
-    def driven(self, way: _Candidate) -> Path | None:
+    def driven(self, way: _Candidate) -> ClearMotion | None:
         """The motion of a way if it is clear as it swings."""
         if any(failure.rules_out(way) for failure in self.failures):
             return None
@@ -213,15 +214,15 @@ class _Planner:
             time_s, poses, q = self._sampled(legs)
             # Slowed down as a whole it will swing less than it is judged for here.
             spare_m = self._judged(way, poses, q, float(time_s[1]))
-            return Path(summed(self.arm, legs), spare_m, way.shape, self.tried) if spare_m >= 0.0 else None
+            return ClearMotion(superposed(self.arm, legs), spare_m, way.shape, self.tried) if spare_m >= 0.0 else None
         except Unreachable:
             return None
 
-    def best(self, height_m: float, reach: float | None) -> Path | None:
+    def best(self, height_m: float, reach: float | None) -> ClearMotion | None:
         """The fastest clear way of a shape, at this height."""
-        ways = [self._way(height_m, reach, u, o) for u in EARLY for o in EARLY]
+        ways = [self._way(height_m, reach, u, o) for u in OVERLAP_SHARES for o in OVERLAP_SHARES]
         seconds = self._seconds(ways)
-        tries = self.tried + TRIES
+        tries = self.tried + TRIES_PER_HEIGHT
         for i in np.argsort(seconds, kind="stable"):
             if not np.isfinite(seconds[i]) or self.tried >= tries:
                 break
@@ -240,12 +241,12 @@ class _Planner:
 
     def _eased(self, via: tuple[Pose, ...]) -> tuple[Pose, ...]:
         if via not in self.easy:
-            self.easy[via] = eased(self.arm, via)
+            self.easy[via] = with_fastest_extensions(self.arm, via)
         return self.easy[via]
 
     def _speeds(self) -> np.ndarray:
         slew, ext, rot = self.arm.speed[[Joint.SLEW, Joint.EXT, Joint.ROT]]
-        return np.array([slew, _REACH_M_S, _HEIGHT_M_S, ext, rot])
+        return np.array([slew, _ASSUMED_REACH_M_S, _ASSUMED_LIFT_M_S, ext, rot])
 
     def _spans(self, way: _Candidate) -> tuple[np.ndarray, list[tuple[float, float]]]:
         """The legs (k, 5), and from when to when each runs [s, about]."""
@@ -255,11 +256,11 @@ class _Planner:
         spans, at = [], 0.0
         for i, seconds in enumerate(long):
             spans.append((at, at + seconds))
-            left = way.up_left if i == 0 else way.over_left if i == len(long) - 2 else EARLY[-1]
+            left = way.up_left if i == 0 else way.over_left if i == len(long) - 2 else OVERLAP_SHARES[-1]
             at += seconds * (1.0 - left)
         if len(spans) > 2:
             # Down only when the way up is done.
-            begin = max(spans[-1][0], spans[0][1] if long[-1] > _SAME else 0.0)
+            begin = max(spans[-1][0], spans[0][1] if long[-1] > _TOLERANCE else 0.0)
             spans[-1] = begin, begin + float(long[-1])
         return legs, spans
 
@@ -267,8 +268,8 @@ class _Planner:
         """The legs of a way and when they begin; raises Unreachable."""
         key = way.height_m, way.shape
         if key not in self.made:
-            legs = [leg(self.arm, a, b, lambda line: swift_law(self.arm, line)) for a, b in pairwise(way.via)]
-            early = [dict(zip(EARLY, part.times_left(*EARLY), strict=True)) for part in legs]
+            legs = [make_leg(self.arm, a, b, lambda line: time_optimal_law(self.arm, line)) for a, b in pairwise(way.via)]
+            early = [dict(zip(OVERLAP_SHARES, part.times_left(*OVERLAP_SHARES), strict=True)) for part in legs]
             self.made[key] = legs, early
         legs, early = self.made[key]
         if len(legs) == 1:
@@ -285,7 +286,7 @@ class _Planner:
 
     def _sampled(self, legs: list[tuple[float, Leg]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times (n,), poses (n, 5) and joints (n, 5) of legs; raises Unreachable."""
-        time_s = np.linspace(0.0, max(max(at + part.duration_s for at, part in legs), _SAME), SAMPLES)
+        time_s = np.linspace(0.0, max(max(at + part.duration_s for at, part in legs), _TOLERANCE), SAMPLE_COUNT)
         poses = np.array(self.start) + sum(part.progress_at(time_s - at)[:, None] * part.way for at, part in legs)
         return time_s, poses, self.arm.joints_about(poses)
 
@@ -295,8 +296,8 @@ class _Planner:
         """
         try:
             timed = [self._legs(way) for way in ways]
-            end_s = np.array([max(max(at + part.duration_s for at, part in legs), _SAME) for legs in timed])
-            time_s = np.linspace(0.0, end_s, _COARSE, axis=1)
+            end_s = np.array([max(max(at + part.duration_s for at, part in legs), _TOLERANCE) for legs in timed])
+            time_s = np.linspace(0.0, end_s, _COARSE_COUNT, axis=1)
             poses = np.array(self.start) + sum(
                 part.progress_at(time_s - np.array([[legs[k][0]] for legs in timed]))[..., None] * part.way
                 for k, (_, part) in enumerate(timed[0])
@@ -304,7 +305,7 @@ class _Planner:
             q, outside = self.arm.joints_or_outside(poses.reshape(-1, 5))
         except Unreachable:
             return np.full(len(ways), np.inf)
-        q = q.reshape(len(ways), _COARSE, 5)
+        q = q.reshape(len(ways), _COARSE_COUNT, 5)
         speed = np.diff(q, axis=1) / time_s[:, 1, None, None]
         middle = 0.5 * (q[:, 1:] + q[:, :-1])
         flow = self.arm.pump_load(middle.reshape(-1, 5), speed.reshape(-1, 5)).reshape(len(ways), -1)
@@ -315,27 +316,27 @@ class _Planner:
     def _poses(self, way: _Candidate) -> np.ndarray:
         """Poses (n, 5) evenly along a way."""
         legs, spans = self._spans(way)
-        time_s = np.linspace(0.0, max(max(end for _, end in spans), _SAME), 2 * _POSES)
+        time_s = np.linspace(0.0, max(max(end for _, end in spans), _TOLERANCE), 2 * _POSE_COUNT)
         line = np.array(self.start) + np.zeros((len(time_s), 1))
         for step, (begin, end) in zip(legs, spans, strict=True):
-            if end - begin > _SAME:
+            if end - begin > _TOLERANCE:
                 line = line + _ramp((time_s - begin) / (end - begin))[:, None] * step
-        along = np.cumsum(np.append(0.0, np.linalg.norm(np.diff(line, axis=0) / self._speeds(), axis=1) + _SAME**2))
-        even = np.linspace(0.0, along[-1], _POSES)
+        along = np.cumsum(np.append(0.0, np.linalg.norm(np.diff(line, axis=0) / self._speeds(), axis=1) + _TOLERANCE**2))
+        even = np.linspace(0.0, along[-1], _POSE_COUNT)
         return np.column_stack([np.interp(even, along, column) for column in line.T])
 
     def _judged(self, way: _Candidate, poses: np.ndarray, q: np.ndarray, step_s: float | None) -> float:
         self.tried += 1
-        spare_m, why, at = judged(self.arm, q, pins(self.arm, poses), self.around, self.held, step_s)
+        spare_m, why, at = evaluate_clearance(self.arm, q, pin_positions(self.arm, poses), self.around, self.held, step_s)
         if spare_m < 0.0:
-            self.failures.append(_Failure(way, -spare_m, why, _is_late(poses, at)))
+            self.failures.append(_Failure(way, -spare_m, why, _is_on_descent(poses, at)))
         return spare_m
 
 
-def _is_late(poses: np.ndarray, at: int) -> bool:
+def _is_on_descent(poses: np.ndarray, at: int) -> bool:
     """Whether what happened at a sample is the way down's to mend: it had begun, or, on the level, is nearer."""
     top = int(np.argmax(poses[:, 2]))
-    if poses[at, 2] < poses[top, 2] - _STEP_UP_M:
+    if poses[at, 2] < poses[top, 2] - _HEIGHT_STEP_M:
         return at > top
     begun, left = (np.hypot(*(poses[at, :2] - poses[i, :2])) for i in (0, -1))
     return bool(begun > left)
@@ -344,7 +345,7 @@ def _is_late(poses: np.ndarray, at: int) -> bool:
 def _ramp(tau: np.ndarray) -> np.ndarray:
     """From 0 to 1 with an even middle and soft ends."""
     t = np.clip(tau, 0.0, 1.0)
-    full = 1.0 / (1.0 - _SOFT)
-    soft = 0.5 * full / _SOFT
-    middle = full * (t - 0.5 * _SOFT)
-    return np.where(t < _SOFT, soft * t**2, np.where(t > 1.0 - _SOFT, 1.0 - soft * (1.0 - t) ** 2, middle))
+    full = 1.0 / (1.0 - _RAMP_SHARE)
+    soft = 0.5 * full / _RAMP_SHARE
+    middle = full * (t - 0.5 * _RAMP_SHARE)
+    return np.where(t < _RAMP_SHARE, soft * t**2, np.where(t > 1.0 - _RAMP_SHARE, 1.0 - soft * (1.0 - t) ** 2, middle))

@@ -9,31 +9,31 @@ from __future__ import annotations
 from math import pi, remainder
 from typing import Final
 
-from autonomy.calibration.program import SpoolProgram
-from autonomy.calibration.tasks import Pulse
-from autonomy.calibration.trace import Record
+from autonomy.calibration.spool_program import SpoolProgram
+from autonomy.calibration.tasks import PulseTask
+from autonomy.calibration.trace import SpoolTestRecord
 from autonomy.calibration.turn_fit import Turn, fit_turns, pulse_to
 from machine.profile import JointSpec
 
-LEAST_RAD: Final = 0.1
+MIN_FIRST_TURN_RAD: Final = 0.1
 """A first turn that is shorter was none: four times the noise of two single readings."""
 
 
-class Turning:
+class RotatorTurns:
     """``turns`` are those that are complete."""
 
     def __init__(self, spec: JointSpec, turns: list[Turn]) -> None:
         self.turns = turns
         self._spec = spec
         self._seen: list[float] = []
-        self._record: Record | None = None
+        self._record: SpoolTestRecord | None = None
         self._before_rad: float | None = None
 
-    def program(self, task: Pulse) -> SpoolProgram:
+    def program(self, task: PulseTask) -> SpoolProgram:
         """The pulse of a task by all that is known so far."""
         return pulse_to(self._spec, fit_turns(self.turns, self._spec), task.side, task.share, task.to_rad)
 
-    def ran(self, record: Record) -> None:
+    def ran(self, record: SpoolTestRecord) -> None:
         """A pulse is over."""
         self._record = record
 
@@ -55,8 +55,8 @@ class Turning:
         if sum(t.record.side == record.side for t in self.turns) > 1:
             return None
         name, turned = record.joint.name.lower(), record.side * remainder(direction - before, pi)
-        if turned < -LEAST_RAD:
+        if turned < -MIN_FIRST_TURN_RAD:
             return f"the {name} moves the wrong way: check the sign of its valve in the profile"
-        if turned < LEAST_RAD:
+        if turned < MIN_FIRST_TURN_RAD:
             return f"the {name} does not move: check its valve and pump, or correct deadband in the profile"
         return None

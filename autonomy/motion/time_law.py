@@ -6,7 +6,7 @@ last solution, and the step is kept small enough, ever smaller.  Without regard 
 percent of the shortest time for the way.
 
 Swing: a pendulum of frequency w and damping ratio z below a pin of velocity v(t) keeps, after a motion from rest to
-rest of duration T, the angle |integral v(t) e^((z + i) w (t - T)) dt| w^2 / g (machines.md 5).  It is bounded in both
+rest of duration T, the angle |integral v(t) e^((z + i) w (t - T)) dt| w^2 / g (docs/reference/machines.md section 5).  It is bounded in both
 horizontal directions for all of `PENDULUM_S` and `DAMPING`, as no sensor tells the period and a load changes it.  No
 clock, no randomness: equal ways have equal laws.
 """
@@ -24,52 +24,52 @@ from autonomy.motion.arm import Arm
 from machine.joints import N_JOINTS
 
 PENDULUM_S: Final = (1.5, 1.65, 1.8, 1.95, 2.1)
-"""Periods of the empty and the loaded grapple (machines.md 5), with some spread."""
+"""Periods of the empty and the loaded grapple (docs/reference/machines.md section 5), with some spread."""
 DAMPING: Final = (0.0, 0.15)
-"""Damping ratios of free links and of links with friction or a brake (machines.md 5).  Undamped is not the worst: where
+"""Damping ratios of free links and of links with friction or a brake (docs/reference/machines.md section 5).  Undamped is not the worst: where
 an earlier swing has died away, nothing is left to cancel a later one.
 """
 SWING_RAD: Final = 0.038
 """What a motion may leave of swing."""
-SHORTEST_S: Final = 0.6
-_GRAVITY_M_S2: Final = 9.81
-_PIECES: Final = 56
+MIN_DURATION_S: Final = 0.6
+GRAVITY_M_S2: Final = 9.81
+_PIECE_COUNT: Final = 56
 """Pieces of the spline: the acceleration rises and falls within one, a few percent of the time."""
-_SAMPLES: Final = 3 * _PIECES
+_SAMPLE_COUNT: Final = 3 * _PIECE_COUNT
 """Places where the limits are looked at, but for the first."""
-_ROUNDS: Final = 14
-_TRUST: Final = 0.3
+_ROUND_COUNT: Final = 14
+_DURATION_TRUST: Final = 0.3
 """Share by which the duration may change in the first round, ..."""
 _COEFFICIENT_TRUST: Final = 0.25
 """... how much of that every coefficient may, ..."""
-_SHRINK: Final = 0.75
+_TRUST_SHRINK: Final = 0.75
 """... and what is left of it in the next round."""
-_DONE: Final = 1e-3
+_CONVERGED_SHARE: Final = 1e-3
 """Share by which the duration still changes when the search is over."""
-_PRICE: Final = 2.0
+_SWING_PENALTY: Final = 2.0
 """What swing of twice its bound would cost, in motion times."""
-_NEAR: Final = 1.05
+_SWING_TOLERANCE: Final = 1.05
 """So much of its bound the swing may be: what is linear in a round is not quite so in truth."""
-_STRETCH: Final = 1.03
-_SAME: Final = 1e-9
+_SLOWDOWN: Final = 1.03
+_TOLERANCE: Final = 1e-9
 
-_OMEGA: Final = np.tile(2.0 * np.pi / np.array(PENDULUM_S), len(DAMPING))
-_POLES: Final = _OMEGA * (1j + np.repeat(DAMPING, len(PENDULUM_S)))
-_SIDES: Final = np.exp(0.25j * np.pi * np.arange(8))
+PENDULUM_RAD_S: Final = np.tile(2.0 * np.pi / np.array(PENDULUM_S), len(DAMPING))
+PENDULUM_POLES: Final = PENDULUM_RAD_S * (1j + np.repeat(DAMPING, len(PENDULUM_S)))
+_OCTAGON: Final = np.exp(0.25j * np.pi * np.arange(8))
 _DIRECTION_RAD: Final = SWING_RAD * float(np.cos(np.pi / 8.0) * np.sqrt(0.5))
 """Bound on an octagon's side in either direction that keeps the swing of both together in a circle."""
 
-_TAU: Final = np.linspace(0.0, 1.0, _SAMPLES + 1)
-_KNOTS: Final = np.concatenate([np.zeros(3), np.linspace(0.0, 1.0, _PIECES + 1), np.ones(3)])
-_COUNT: Final = _PIECES + 3
-_FREE: Final = slice(3, _COUNT - 3)
+_TAU: Final = np.linspace(0.0, 1.0, _SAMPLE_COUNT + 1)
+_KNOTS: Final = np.concatenate([np.zeros(3), np.linspace(0.0, 1.0, _PIECE_COUNT + 1), np.ones(3)])
+_COEFFICIENT_COUNT: Final = _PIECE_COUNT + 3
+_FREE: Final = slice(3, _COEFFICIENT_COUNT - 3)
 """Three coefficients at either end are fixed: rest up to the acceleration."""
-_UNIT: Final = BSpline(_KNOTS, np.eye(_COUNT), 3)
-_B0, _B1, _B2 = (_UNIT(_TAU, nu) for nu in range(3))
-_RISE: Final = np.diff(np.eye(_COUNT), axis=0)
+_BASIS: Final = BSpline(_KNOTS, np.eye(_COEFFICIENT_COUNT), 3)
+_B0, _B1, _B2 = (_BASIS(_TAU, nu) for nu in range(3))
+_DIFFERENCE: Final = np.diff(np.eye(_COEFFICIENT_COUNT), axis=0)
 
 
-class Way:
+class PathGeometry:
     """A way in poses (n, 5), evenly sampled over its progress, as a smooth curve of joints and of the pin's place."""
 
     def __init__(self, arm: Arm, poses: np.ndarray) -> None:
@@ -77,11 +77,11 @@ class Way:
         turn = poses[:, 0] - poses[-1, 0]
         pin = poses[:, 1:2] * np.column_stack([np.cos(turn), np.sin(turn)])
         self._share = np.linspace(0.0, 1.0, len(poses))
-        self.moving = np.flatnonzero(np.ptp(q, axis=0) > _SAME)
+        self.moving = np.flatnonzero(np.ptp(q, axis=0) > _TOLERANCE)
         self.acceleration = arm.acceleration[self.moving]
         # However it is driven, a way leaves no more swing than its length over that of the shortest pendulum.
         length_m = float(np.sum(np.linalg.norm(np.diff(pin, axis=0), axis=1)))
-        self.sideways = length_m * float(np.max(_OMEGA)) ** 2 / _GRAVITY_M_S2 > SWING_RAD
+        self.sideways = length_m * float(np.max(PENDULUM_RAD_S)) ** 2 / GRAVITY_M_S2 > SWING_RAD
         self.curve = CubicSpline(self._share, np.hstack([q, pin]))
         slope = self.curve(self._share, 1)[:, :N_JOINTS]
         self._cost = np.maximum(np.max(np.abs(slope) / arm.speed, axis=1), arm.pump_load(q, slope))
@@ -94,7 +94,7 @@ class Way:
 
 
 @dataclass(frozen=True, slots=True)
-class TimeLaw:
+class SplineTimeLaw:
     """Progress along a way over time."""
 
     duration_s: float
@@ -105,15 +105,15 @@ class TimeLaw:
         share = np.clip(time_s / self.duration_s, 0.0, 1.0)
         return np.clip(BSpline(_KNOTS, self.coefficients, 3)(share), 0.0, 1.0)
 
-    def slowed(self, duration_s: float) -> TimeLaw:
+    def slowed(self, duration_s: float) -> SplineTimeLaw:
         """The same, evenly slowed."""
-        return TimeLaw(duration_s, self.coefficients)
+        return SplineTimeLaw(duration_s, self.coefficients)
 
 
-class _Linear:
+class _LinearizedLaw:
     """The limits and the swing of one law, and how they change with its coefficients c and its duration T."""
 
-    def __init__(self, way: Way, c: np.ndarray) -> None:
+    def __init__(self, way: PathGeometry, c: np.ndarray) -> None:
         s, self.v, self._a = np.clip(_B0 @ c, 0.0, 1.0), _B1 @ c, _B2 @ c
         slopes = [way.curve(s, nu) for nu in range(1, 4)]
         self._joints = [d[:, way.moving] for d in slopes]
@@ -123,14 +123,14 @@ class _Linear:
         d1, d2, _ = self._joints
         self._push = d1 * self._a[:, None] + d2 * self.v[:, None] ** 2
         self.shortest_s = max(
-            SHORTEST_S,
+            MIN_DURATION_S,
             float(np.max(self._cost * self.v)),
             float(np.sqrt(np.max(np.abs(self._push) / self._most))),
         )
 
     def limits(self, duration_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Rows and bounds (rows @ [dc, dT] <= bounds) of speeds, pump and accelerations, as shares of their limits."""
-        v, a, ones = self.v[:, None], self._a[:, None], np.ones((_SAMPLES + 1, 1))
+        v, a, ones = self.v[:, None], self._a[:, None], np.ones((_SAMPLE_COUNT + 1, 1))
         rows = [np.hstack([self._cost[:, None] * _B1 + self._cost_slope[:, None] * v * _B0, -ones]) / duration_s]
         bounds = [1.0 - self._cost * self.v / duration_s]
         for j, most in enumerate(self._most):
@@ -145,63 +145,63 @@ class _Linear:
     def swing(self, duration_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Complex swing [rad] in both directions for every pendulum (2, n), its change with c (2, n, _COUNT) and T."""
         before = _TAU - 1.0
-        wave = np.exp(duration_s * np.outer(_POLES, before)) * (_OMEGA**2 / _GRAVITY_M_S2 / _SAMPLES)[:, None]
+        wave = np.exp(duration_s * np.outer(PENDULUM_POLES, before)) * (PENDULUM_RAD_S**2 / GRAVITY_M_S2 / _SAMPLE_COUNT)[:, None]
         pin, bend = self._pin
         by_c = (wave * pin) @ _B1 + (wave * bend * self.v) @ _B0
-        return (wave * pin) @ self.v, by_c, (wave * pin * _POLES[:, None] * before) @ self.v
+        return (wave * pin) @ self.v, by_c, (wave * pin * PENDULUM_POLES[:, None] * before) @ self.v
 
 
-def time_law(way: Way, shaped: bool = True) -> TimeLaw:
+def swing_free_law(way: PathGeometry, shaped: bool = True) -> SplineTimeLaw:
     """The law that drives a way fast; ``shaped``: and leaves at most `SWING_RAD` of swing."""
     shaped = shaped and way.sideways
-    rise = np.clip((np.arange(_COUNT) - 2) / (_COUNT - 5), 0.0, 1.0)
+    rise = np.clip((np.arange(_COEFFICIENT_COUNT) - 2) / (_COEFFICIENT_COUNT - 5), 0.0, 1.0)
     c = rise**3 * (10.0 - 15.0 * rise + 6.0 * rise**2)
-    state = _Linear(way, c)
-    duration_s, trust, found = state.shortest_s, _TRUST, []
-    for _ in range(_ROUNDS):
-        step = _step(state, c, duration_s, trust, shaped)
+    state = _LinearizedLaw(way, c)
+    duration_s, trust, found = state.shortest_s, _DURATION_TRUST, []
+    for _ in range(_ROUND_COUNT):
+        step = _solve_step(state, c, duration_s, trust, shaped)
         if step is None:
             break
         c = c.copy()
         c[_FREE] += step[:-2]
-        state = _Linear(way, c)
+        state = _LinearizedLaw(way, c)
         before_s, duration_s = duration_s, max(duration_s + float(step[-2]), state.shortest_s)
-        trust *= _SHRINK
-        over = _left(state, duration_s) / SWING_RAD if shaped else 0.0
-        found.append((max(over, _NEAR), duration_s, c))
-        if over <= _NEAR and abs(duration_s - before_s) < _DONE * duration_s:
+        trust *= _TRUST_SHRINK
+        over = _residual_swing_rad(state, duration_s) / SWING_RAD if shaped else 0.0
+        found.append((max(over, _SWING_TOLERANCE), duration_s, c))
+        if over <= _SWING_TOLERANCE and abs(duration_s - before_s) < _CONVERGED_SHARE * duration_s:
             break
-    return _kept(way, found or [(np.inf, duration_s, c)], shaped)
+    return _best_law(way, found or [(np.inf, duration_s, c)], shaped)
 
 
-def _kept(way: Way, found: list[tuple[float, float, np.ndarray]], shaped: bool) -> TimeLaw:
+def _best_law(way: PathGeometry, found: list[tuple[float, float, np.ndarray]], shaped: bool) -> SplineTimeLaw:
     """The fastest law whose swing is small; where none is, the least swing, slowed until it is."""
     _, duration_s, c = min(found, key=lambda law: law[:2])
-    state = _Linear(way, c)
-    while shaped and _left(state, duration_s) > _NEAR * SWING_RAD:
-        duration_s *= _STRETCH
-    return TimeLaw(duration_s, c)
+    state = _LinearizedLaw(way, c)
+    while shaped and _residual_swing_rad(state, duration_s) > _SWING_TOLERANCE * SWING_RAD:
+        duration_s *= _SLOWDOWN
+    return SplineTimeLaw(duration_s, c)
 
 
-def _left(state: _Linear, duration_s: float) -> float:
+def _residual_swing_rad(state: _LinearizedLaw, duration_s: float) -> float:
     """Greatest swing [rad] that stays."""
     return float(np.max(np.linalg.norm(np.abs(state.swing(duration_s)[0]), axis=0)))
 
 
-def _step(state: _Linear, c: np.ndarray, duration_s: float, trust: float, shaped: bool) -> np.ndarray | None:
+def _solve_step(state: _LinearizedLaw, c: np.ndarray, duration_s: float, trust: float, shaped: bool) -> np.ndarray | None:
     """The best change of coefficients and duration, and what is left over of swing in shares of its bound."""
     rows, bounds = state.limits(duration_s)
-    parts = [np.hstack([rows, np.zeros((len(rows), 1))]), np.hstack([-_RISE, np.zeros((_COUNT - 1, 2))])]
-    most = [bounds, _RISE @ c]
+    parts = [np.hstack([rows, np.zeros((len(rows), 1))]), np.hstack([-_DIFFERENCE, np.zeros((_COEFFICIENT_COUNT - 1, 2))])]
+    most = [bounds, _DIFFERENCE @ c]
     if shaped:
         left, by_c, by_t = (x / _DIRECTION_RAD for x in state.swing(duration_s))
-        for side in _SIDES:
+        for side in _OCTAGON:
             change = np.concatenate([(by_c * side).real, (by_t * side).real[..., None]], axis=2)
-            parts.append(np.hstack([change.reshape(-1, _COUNT + 1), -np.ones((left.size, 1))]))
+            parts.append(np.hstack([change.reshape(-1, _COEFFICIENT_COUNT + 1), -np.ones((left.size, 1))]))
             most.append(1.0 - (left * side).real.ravel())
-    keep = np.r_[_FREE, _COUNT, _COUNT + 1]
+    keep = np.r_[_FREE, _COEFFICIENT_COUNT, _COEFFICIENT_COUNT + 1]
     n = len(keep) - 2
-    price = np.concatenate([np.zeros(n), [1.0, _PRICE * duration_s]])
+    price = np.concatenate([np.zeros(n), [1.0, _SWING_PENALTY * duration_s]])
     reach = [(-_COEFFICIENT_TRUST * trust, _COEFFICIENT_TRUST * trust)] * n
     reach += [(-trust * duration_s, trust * duration_s), (0.0, None)]
     solved = linprog(

@@ -1,6 +1,6 @@
 """What a grasp planner proposes: one grasp in the base frame, with what it expects to come up and why.
 
-A planner is a callable ``(arm, logs, slew_rad, rot_rad, stay=()) -> GraspProposal``; it raises ``NoGrasp``.  ``stay``
+A planner is a callable ``(arm, logs, slew_rad, rot_rad, stay=()) -> GraspCandidate``; it raises ``NoGrasp``.  ``stay``
 are places in the list: those logs are to stay lying, but they are there and in the way.
 """
 
@@ -10,8 +10,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from autonomy.grasp.grasp import Grasp
+from autonomy.missions.crane_job import Mission
 from autonomy.motion.arm import Arm
-from autonomy.perception.logs import LogObservation
+from autonomy.perception.log_list.observation import LogObservation
 
 
 class NoGrasp(ValueError):
@@ -23,7 +25,7 @@ class BunkFull(NoGrasp):
 
 
 @dataclass(frozen=True, slots=True)
-class GraspProposal:
+class GraspCandidate:
     """Where the middle between the tips comes to (base frame), how it is turned and what comes up.
 
     ``yaw_rad`` is the direction of the opening axis; ``support_z_m`` the height that the tips sweep along, just above
@@ -43,7 +45,7 @@ class GraspProposal:
     drawn: bool = False
 
 
-class Planner(Protocol):
+class GraspPlanner(Protocol):
     """See the module."""
 
     def __call__(
@@ -53,4 +55,12 @@ class Planner(Protocol):
         slew_rad: float,
         rot_rad: float,
         stay: Collection[int] = (),
-    ) -> GraspProposal: ...
+    ) -> GraspCandidate: ...
+
+
+class GraspSelector(Protocol):
+    """See the module."""
+
+    def __call__(
+        self, arm: Arm, mission: Mission, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float
+    ) -> Grasp: ...

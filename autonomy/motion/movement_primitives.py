@@ -16,20 +16,21 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from autonomy.motion.arm import Arm, Pose
-from autonomy.motion.demonstration import Track, joints_of
-from autonomy.motion.dmp import BASES, DemonstrationRefused, Dmp, learn
-from autonomy.motion.trajectory import STEP_S, Trajectory, paced, progress
-from can_dbc.setpoint import GrappleCommand
-from machine.kinematics import Unreachable, reachable_extensions
+from autonomy.motion.arm import Arm
+from autonomy.motion.demonstration import JointTrack, joint_vectors
+from autonomy.motion.dmp import BASIS_COUNT, DemonstrationRefused, Dmp, learn
+from autonomy.motion.pose import Pose
+from autonomy.motion.trajectory import STEP_S, Trajectory, within_limits, smooth_progress
+from can_dbc.messages.crane import GrappleCommand
+from machine.geometry.kinematics import Unreachable, reachable_extensions
 from machine.profile import Bunk, Profile
 
 SCHEMA: Final = 1
-OVER_BUNK_M: Final = 0.4
+BUNK_MARGIN_M: Final = 0.4
 """A motion that ends within this of the bunk's sides ends at the bunk."""
-SHIPPED: Final = Path(__file__).parent / "shown"
-_SCALED: Final = (True, False, False, False)
-_EASE_M: Final = 0.08
+SHIPPED_FOLDER: Final = Path(__file__).parent / "shown"
+_SCALED_AXES: Final = (True, False, False, False)
+_LIMIT_RESERVE_M: Final = 0.08
 """How far inside its limits a telescope is that gives way to a height or a distance."""
 
 
@@ -46,7 +47,7 @@ class Primitive(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def dmp(self) -> Dmp:
         """The same as equations."""
-        return Dmp(self.duration_s, np.array(self.weights), _SCALED)
+        return Dmp(self.duration_s, np.array(self.weights), _SCALED_AXES)
 
 
 class Primitives(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -58,38 +59,38 @@ class Primitives(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     back: Primitive
 
 
-def pose_track(arm: Arm, motion: Track) -> np.ndarray:
+def pose_track(arm: Arm, motion: JointTrack) -> np.ndarray:
     """A demonstration in the crane's plane: slew, r, z, ext (n, 4)."""
-    return np.array([arm.pose(q)[:4] for q in joints_of(motion)])
+    return np.array([arm.pose(q)[:4] for q in joint_vectors(motion)])
 
 
-def over_bunk(bunk: Bunk, xy: Sequence[float]) -> bool:
+def is_near_bunk(bunk: Bunk, xy: Sequence[float]) -> bool:
     """Whether a point is over the bunk or next to it."""
     x, y = xy[0] - bunk.center_m[0], xy[1] - bunk.center_m[1]
     c, s = np.cos(bunk.yaw_rad), np.sin(bunk.yaw_rad)
     along, across = x * c + y * s, y * c - x * s
-    return bool(abs(along) < bunk.length_m / 2 + OVER_BUNK_M and abs(across) < bunk.width_m / 2 + OVER_BUNK_M)
+    return bool(abs(along) < bunk.length_m / 2 + BUNK_MARGIN_M and abs(across) < bunk.width_m / 2 + BUNK_MARGIN_M)
 
 
-def sorted_motions(arm: Arm, motions: Sequence[Track]) -> tuple[list[Track], list[Track]]:
+def split_by_direction(arm: Arm, motions: Sequence[JointTrack]) -> tuple[list[JointTrack], list[JointTrack]]:
     """Motions out of the bunk, and into it; others, which lead nowhere near it, are left out."""
     out, back = [], []
     for motion in motions:
-        q = joints_of(motion)
-        begins, ends = (over_bunk(arm.profile.bunk, arm.xy(arm.pose(q[i]))) for i in (0, -1))
+        q = joint_vectors(motion)
+        begins, ends = (is_near_bunk(arm.profile.bunk, arm.xy(arm.pose(q[i]))) for i in (0, -1))
         if begins != ends:
             (back if ends else out).append(motion)
     return out, back
 
 
-def learn_primitives(profile: Profile, motions: Sequence[Track], bases: int = BASES) -> Primitives:
+def learn_primitives(profile: Profile, motions: Sequence[JointTrack], bases: int = BASIS_COUNT) -> Primitives:
     """Primitives from demonstrations of the machine.
 
     Raises:
         DemonstrationRefused: none of them leads between the bunk and another place.
     """
     arm = Arm(profile)
-    out, back = sorted_motions(arm, motions)
+    out, back = split_by_direction(arm, motions)
     if not out and not back:
         raise DemonstrationRefused(
             f"none of the {len(motions)} motions leads between the bunk and another place; "
@@ -100,7 +101,7 @@ def learn_primitives(profile: Profile, motions: Sequence[Track], bases: int = BA
         if not shown[mine]:
             shown[mine] = [(t, poses[::-1]) for t, poses in shown[other]]
     counts = len(out), len(back)
-    made = [learn(group, _SCALED, bases) for group in shown]
+    made = [learn(group, _SCALED_AXES, bases) for group in shown]
     packed = [Primitive(d.duration_s, n, d.weights.tolist()) for d, n in zip(made, counts, strict=True)]
     return Primitives(SCHEMA, profile.name, *packed)
 
@@ -118,7 +119,7 @@ def encode(primitives: Primitives) -> bytes:
 
 def load(profile: Profile, path: Path | None = None) -> Primitives:
     """The primitives in a file, by default those that ship for the machine; raises PrimitivesRefused."""
-    path = path or SHIPPED / f"{profile.name}.json"
+    path = path or SHIPPED_FOLDER / f"{profile.name}.json"
     hint = "learn some with `timberhand plan learn LOG --out FILE`"
     try:
         found = msgspec.json.decode(path.read_bytes(), type=Primitives)
@@ -130,14 +131,14 @@ def load(profile: Profile, path: Path | None = None) -> Primitives:
         raise PrimitivesRefused(f"{path} is of {found.profile}, schema {found.schema}, not of {profile.name}; {hint}")
     for primitive in (found.out, found.back):
         rows = primitive.weights
-        good = len(rows) == len(_SCALED) and len({len(row) for row in rows}) == 1 and len(rows[0]) >= 2
+        good = len(rows) == len(_SCALED_AXES) and len({len(row) for row in rows}) == 1 and len(rows[0]) >= 2
         if not good or not 0.5 < primitive.duration_s < 120.0 or not np.all(np.isfinite(primitive.weights)):
             raise PrimitivesRefused(f"{path} holds a primitive that makes no sense; {hint}")
     return found
 
 
-class Shown:
-    """A source of motions with the signature of `autonomy.motion.trajectory.travel`: as people move, by primitives.
+class PrimitiveMotions:
+    """A source of motions with the signature of `autonomy.motion.trajectory.travel_over`: as people move, by primitives.
 
     Heights that are asked for are not looked at: the way over the stakes is in what was shown.
     """
@@ -149,22 +150,22 @@ class Shown:
         """Back where the goal is at the bunk, else out.
 
         Raises:
-            machine.kinematics.Unreachable: the motion would leave the crane's reach.
+            machine.geometry.kinematics.Unreachable: the motion would leave the crane's reach.
         """
-        dmp = self._back if over_bunk(arm.profile.bunk, arm.xy(goal)) else self._out
-        return by_primitive(arm, dmp, start, goal)
+        dmp = self._back if is_near_bunk(arm.profile.bunk, arm.xy(goal)) else self._out
+        return primitive_motion(arm, dmp, start, goal)
 
 
-def by_primitive(arm: Arm, dmp: Dmp, start: Pose, goal: Pose) -> Trajectory:
+def primitive_motion(arm: Arm, dmp: Dmp, start: Pose, goal: Pose) -> Trajectory:
     """The motion of a primitive from rest to rest, slowed down to the arm's limits if need be; raises Unreachable."""
     way = dmp.rollout(np.array(start[:4]), np.array(goal[:4]))
 
     def sampled(duration_s: float) -> np.ndarray:
         time_s = np.linspace(0.0, duration_s, max(2, int(np.ceil(duration_s / STEP_S)) + 1))
-        turned = start.rot_rad + progress(time_s / duration_s) * (goal.rot_rad - start.rot_rad)
+        turned = start.rot_rad + smooth_progress(time_s / duration_s) * (goal.rot_rad - start.rot_rad)
         return _joints(arm, np.column_stack([way.at(time_s, duration_s), turned]))
 
-    return paced(arm, sampled, way.duration_s)
+    return within_limits(arm, sampled, way.duration_s)
 
 
 def _joints(arm: Arm, poses: np.ndarray) -> np.ndarray:
@@ -181,7 +182,7 @@ def _joints(arm: Arm, poses: np.ndarray) -> np.ndarray:
             arm.joints(poses[coarse[i] : coarse[i] + 1])  # says what is in the way
             raise Unreachable(f"the shown way leaves the crane's reach at a height of {pose.z_m:.2f} m")
         low[i], high[i] = min(spans, key=lambda s: max(s[0] - pose.ext_m, pose.ext_m - s[1], 0.0))
-    room = np.minimum(_EASE_M, (high - low) / 2)
+    room = np.minimum(_LIMIT_RESERVE_M, (high - low) / 2)
     ext = poses[coarse, 3]
     wanted = np.clip(ext, low + room, high - room) - ext
     wanted[0] = wanted[-1] = 0.0
@@ -215,8 +216,8 @@ def algorithm_1(arm: Arm, primitives: Primitives, start: Pose, target: Pose, bun
     The second stage is to begin when the first has reached its target and the grapple is closed (line 7).  Raises
     ``Unreachable``.
     """
-    move = Shown(primitives)
-    out = by_primitive(arm, primitives.out.dmp(), start, target)
+    move = PrimitiveMotions(primitives)
+    out = primitive_motion(arm, primitives.out.dmp(), start, target)
     return (
         Stage(out, GrappleCommand.OPEN, GrappleCommand.CLOSE),
         Stage(move(arm, target, bunk), GrappleCommand.HOLD, GrappleCommand.OPEN),

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from typing import Final, Protocol
 
-from autonomy.motion.arm import Arm, Pose
-from autonomy.motion.clearance import MARGIN_M, spare
-from autonomy.motion.obstacles import Held, Surroundings
-from autonomy.motion.paths import Blocked, plan
-from autonomy.motion.primitives import Primitives, Shown
-from autonomy.motion.trajectory import Trajectory, travel
-from machine.kinematics import Unreachable
+from autonomy.motion.arm import Arm
+from autonomy.motion.clearance import MARGIN_M, clearance_reserve
+from autonomy.motion.movement_primitives import Primitives, PrimitiveMotions
+from autonomy.motion.obstacles import HeldLog, CollisionScene
+from autonomy.motion.path_search import PathBlocked, plan_path
+from autonomy.motion.pose import Pose
+from autonomy.motion.trajectory import Trajectory, travel_over
+from machine.geometry.kinematics import Unreachable
 
 
-class Motions(Protocol):
+class MotionPlanner(Protocol):
     """A way from rest to rest.
 
     ``direct``: it goes down to a log, and with it up, over and down into the bunk, in one; else an activity asks for
@@ -33,16 +34,16 @@ class Motions(Protocol):
         """Whether the telescope may be anywhere."""
 
     def __call__(
-        self, arm: Arm, start: Pose, goal: Pose, around: Surroundings, held: Held | None, high_m: float, free_m: float
+        self, arm: Arm, start: Pose, goal: Pose, around: CollisionScene, held: HeldLog | None, high_m: float, free_m: float
     ) -> Trajectory:
-        """The motion.  ``high_m``: where `travel` would pass, ``free_m`` before the goal.
+        """The motion.  ``high_m``: where `travel_over` would pass, ``free_m`` before the goal.
 
         Raises:
-            machine.kinematics.Unreachable: none that is clear; in one sentence.
+            machine.geometry.kinematics.Unreachable: none that is clear; in one sentence.
         """
 
 
-class Swiftest:
+class TimeOptimalPlanner:
     """Ours: the fastest clear way; where none is found, always at full height, if that is clear."""
 
     def __init__(self, direct: bool = True) -> None:
@@ -50,19 +51,19 @@ class Swiftest:
         self.stretches: Final = True
 
     def __call__(
-        self, arm: Arm, start: Pose, goal: Pose, around: Surroundings, held: Held | None, high_m: float, free_m: float
+        self, arm: Arm, start: Pose, goal: Pose, around: CollisionScene, held: HeldLog | None, high_m: float, free_m: float
     ) -> Trajectory:
         """The fastest clear way."""
         try:
-            return plan(arm, start, goal, around, held).motion
-        except Blocked as error:
+            return plan_path(arm, start, goal, around, held).motion
+        except PathBlocked as error:
             slow = _at_full_height(arm, start, goal, high_m, free_m, error)
-            if spare(arm, slow, around, held)[0] < 0.0:
+            if clearance_reserve(arm, slow, around, held)[0] < 0.0:
                 raise
             return slow
 
 
-class AsShown:
+class MovementPrimitivePlanner:
     """Paper B's: movement primitives that a person showed.
 
     They know no obstacles; one that would touch something is not driven, but the way at full height.
@@ -72,10 +73,10 @@ class AsShown:
         self.direct: Final = False
         self.stretches: Final = False
         """People showed other postures."""
-        self._shown = Shown(primitives)
+        self._shown = PrimitiveMotions(primitives)
 
     def __call__(
-        self, arm: Arm, start: Pose, goal: Pose, around: Surroundings, held: Held | None, high_m: float, free_m: float
+        self, arm: Arm, start: Pose, goal: Pose, around: CollisionScene, held: HeldLog | None, high_m: float, free_m: float
     ) -> Trajectory:
         """The primitive from here to there."""
         found, trouble = [], Unreachable("")
@@ -86,7 +87,7 @@ class AsShown:
             except Unreachable as error:
                 trouble = error
         for motion in sorted(found, key=lambda m: m.duration_s)[:1]:
-            spare_m, why = spare(arm, motion, around, held)
+            spare_m, why = clearance_reserve(arm, motion, around, held)
             if spare_m >= -MARGIN_M:
                 return motion
             trouble = Unreachable(why)
@@ -98,6 +99,6 @@ def _at_full_height(
 ) -> Trajectory:
     """The way at full height; raises ``trouble``, what was wrong with the better one, where it is out of reach."""
     try:
-        return travel(arm, start, goal, max(high_m, start.z_m, goal.z_m), free_m)
+        return travel_over(arm, start, goal, max(high_m, start.z_m, goal.z_m), free_m)
     except Unreachable:
         raise trouble from None

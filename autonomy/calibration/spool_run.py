@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from autonomy.calibration import program
-from autonomy.calibration.program import SpoolProgram
-from autonomy.calibration.tasks import Spool
-from can_dbc.setpoint import SpoolKnot
+from autonomy.calibration import spool_program
+from autonomy.calibration.spool_program import SpoolProgram
+from autonomy.calibration.tasks import SpoolTask
+from can_dbc.messages.crane import SpoolKnot
 from machine.profile import JointSpec
 
 LEAD_S: Final = 0.15
@@ -19,24 +19,24 @@ LEAD_S: Final = 0.15
 TAIL_S: Final = 0.55
 """and ends this long after: dead time, and the oil's ringing."""
 HORIZON_S: Final = 0.4
-MOVED, MOVED_S = 0.008, 0.02
+MIN_MOVED, MIN_MOVED_S = 0.008, 0.02
 """A joint that went this far [rad, m], and so long at its speed limit, has moved: beyond noise and ringing oil."""
-BACKLASH: Final = 3.0
+REBOUND_FACTOR: Final = 3.0
 """A joint that has proved its direction may swing back so many times further: oil rings on after a staircase."""
-TURN_SHARE: Final = 0.16
+REVERSAL_SPEED_SHARE: Final = 0.16
 """A sweep turns when the joint has this share of its speed limit: enough to see the foot of the metering curve."""
 CLOSE_S: Final = 0.06
-SPREAD: Final = 1.3
+TRAVEL_UNCERTAINTY: Final = 1.3
 """A joint may go so many times as far as the profile's valve map says."""
 
 
-def programmed(spec: JointSpec, task: Spool) -> SpoolProgram:
+def program_for(spec: JointSpec, task: SpoolTask) -> SpoolProgram:
     """The program of a task, before anything has moved."""
-    build = {"wiggle": program.wiggle, "sweep": program.sweep, "staircase": program.staircase}[task.kind]
+    build = {"wiggle": spool_program.wiggle, "sweep": spool_program.sweep, "staircase": spool_program.staircase}[task.kind]
     return build(spec, task.side)
 
 
-class BlindAttempt:
+class SpoolRun:
     """``program`` is what is told from now on; ``begun``: it is on its way."""
 
     def __init__(self, first: SpoolProgram) -> None:
@@ -72,11 +72,11 @@ class BlindAttempt:
         return self.program.window(run_s, HORIZON_S)
 
 
-class SpoolAttempt(BlindAttempt):
+class MonitoredSpoolRun(SpoolRun):
     """The program of a joint with an encoder; ``closed``: it is on its way out."""
 
-    def __init__(self, spec: JointSpec, task: Spool, position: float) -> None:
-        super().__init__(programmed(spec, task))
+    def __init__(self, spec: JointSpec, task: SpoolTask, position: float) -> None:
+        super().__init__(program_for(spec, task))
         self._spec, self._task, self._from = spec, task, position
         self._name = task.joint.name.lower()
         self.closed = False
@@ -84,12 +84,12 @@ class SpoolAttempt(BlindAttempt):
     @property
     def end(self) -> float:
         """Where the joint may come to at most [rad, m]."""
-        return self._from + SPREAD * program.travel_of(self.program, self._spec, self._task.side)
+        return self._from + TRAVEL_UNCERTAINTY * spool_program.predicted_travel(self.program, self._spec, self._task.side)
 
     def follow(self, run_s: float, position: float, velocity: float) -> str | None:
         """Changes the program by what the joint does; a sentence when it moves the wrong way."""
-        moved, enough = self._moved(position), _enough(self._spec)
-        if moved < -enough * (1.0 if self._task.kind == "wiggle" else BACKLASH):
+        moved, enough = self._moved(position), _min_travel(self._spec)
+        if moved < -enough * (1.0 if self._task.kind == "wiggle" else REBOUND_FACTOR):
             why = "check sign and direction of its valve and encoder in the profile"
             return f"the {self._name} moves the wrong way: {why}"
         if self.closed:
@@ -98,7 +98,7 @@ class SpoolAttempt(BlindAttempt):
             self.close(run_s)
             self.closed = True
         elif self._task.kind == "sweep" and self._turns(run_s, velocity):
-            self.program = program.turned(self.program, run_s)
+            self.program = spool_program.reversed_sweep(self.program, run_s)
             self.closed = True
         elif run_s >= self.program.duration_s:
             self.closed = True
@@ -106,7 +106,7 @@ class SpoolAttempt(BlindAttempt):
 
     def judged(self, position: float) -> str | None:
         """At its end: a sentence when the joint has not moved."""
-        if self._moved(position) >= _enough(self._spec):
+        if self._moved(position) >= _min_travel(self._spec):
             return None
         return f"the {self._name} does not move: check its valve, pump and encoder, or correct deadband in the profile"
 
@@ -115,9 +115,9 @@ class SpoolAttempt(BlindAttempt):
 
     def _turns(self, run_s: float, velocity: float) -> bool:
         rising = self.program.points[1][0] < run_s < self.program.points[2][0]
-        return rising and self._task.side * velocity > TURN_SHARE * self._spec.speed_limit
+        return rising and self._task.side * velocity > REVERSAL_SPEED_SHARE * self._spec.speed_limit
 
 
-def _enough(spec: JointSpec) -> float:
+def _min_travel(spec: JointSpec) -> float:
     """How far a joint goes that certainly moves [rad, m]."""
-    return max(MOVED, MOVED_S * spec.speed_limit)
+    return max(MIN_MOVED, MIN_MOVED_S * spec.speed_limit)

@@ -1,0 +1,138 @@
+"""The one-log job in lockstep: one log from the ground into the bunk of the PALMS 4.71 test-bed (paper A)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+
+from autonomy.crane_job.activity import Activity
+from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.selection import PlannerSelection
+from can_dbc.messages.crane import OperatorAction, StateReport
+from controller.config import Settings
+from controller.guard.__main__ import build as build_guard
+from controller.guard.__main__ import profile_path
+from hil.demo.summary import Summary, outcome_sentence
+from hil.harness.display import Display
+from hil.harness.lockstep import START_NS, LogDetector, Lockstep, Observer
+from hil.harness.operator import Operator
+from hil.plc.bridged_plant import BridgedPlant
+from host.exit_codes import CommandFailed, ExitCode
+from machine.status.faults import describe
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.status.modes import Mode
+from machine.profile import Profile
+from recorder.manifest import describe as describe_run
+from recorder.recorder import Recorder, RecordingRefused
+from sim.plant import Plant
+
+SETTLE_NS: Final = 3_000_000_000
+
+
+def run_lockstep(
+    name: str, seed: int, truth: str, directory: Path, limit_s: float, console: Console, camera: str = ""
+) -> Summary:
+    """Run the job in one process on virtual time; the same seed leaves the same bytes in ``directory``.
+
+    With ``camera`` the planner gets the logs detected through it, without it their true poses.
+
+    Raises:
+        CommandFailed: profile, truth, camera or directory cannot be used.
+    """
+    profile = load_profile(name)
+    try:
+        plant = Plant(profile, seed, truth) if profile.plc is None else BridgedPlant(profile, seed, truth)
+        buses = tuple(name for name in (profile.crane_bus, profile.machine_bus) if name)
+        detector = _camera_detector(plant, profile, camera, seed) if camera else None
+        recorder = Recorder(directory, profile, describe_run(profile, buses, seed))
+    except (ValueError, RecordingRefused) as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    try:
+        with Display(console, f"{profile.title}: one log into the bunk, lockstep, seed {seed}") as display:
+            return _Job(name, profile, plant, recorder, display, detector).run(limit_s, str(directory))
+    finally:
+        recorder.close()
+
+
+def _camera_detector(plant: Plant, profile: Profile, camera: str, seed: int) -> LogDetector:
+    from hil.plant.camera import camera_detector  # loads a network, which a run without a camera does not need
+
+    return camera_detector(plant, profile, camera, seed)
+
+
+class _Job:
+    """Lockstep run with a display: shows every change, ends with the planner."""
+
+    def __init__(
+        self,
+        name: str,
+        profile: Profile,
+        plant: Plant,
+        recorder: Recorder | None,
+        display: Display,
+        detector: LogDetector | None,
+    ) -> None:
+        settings = Settings(profile, profile_hash(profile), profile.rate_hz)
+        self._display = display
+        self._mode: int = -1
+        self._phase = self._grasp = ""
+        self.activity = Activity(profile, profile_hash(profile), chooser=PlannerSelection(SamplingPlanner()))
+        self.system = Lockstep(
+            settings,
+            build_guard(profile_path(name)),
+            plant,
+            self.activity,
+            Operator(profile_hash(profile), self._on_press),
+            Observer(recorder, [self._on_report]),
+            detector,
+        )
+
+    def run(self, limit_s: float, directory: str) -> Summary:
+        system, activity = self.system, self.activity
+        limit_ns = START_NS + int(limit_s * 1e9)
+        while not activity.done and not activity.failure and system.now_ns < limit_ns:
+            system.advance()
+            if system.operator.gave_up:
+                break
+            if activity.grasp is not None and activity.grasp.reason != self._grasp:
+                self._grasp = activity.grasp.reason
+                self._display.event(f"grasp: {self._grasp}")
+            if activity.phase.name != self._phase:
+                self._phase = activity.phase.name
+                self._display.phase(self._phase)
+        finished_ns = system.now_ns
+        verdict = system.plant.evaluate()
+        while not verdict.success and system.now_ns < finished_ns + SETTLE_NS:
+            system.advance()
+            verdict = system.plant.evaluate()
+        report = system.report
+        return Summary(
+            in_bunk=verdict.success,
+            verdict=outcome_sentence(asdict(verdict)),
+            failure=activity.failure or ("" if activity.done else f"not done within {limit_s:.0f} s"),
+            seconds=(finished_ns - START_NS) / 1e9,
+            stops=system.operator.stops,
+            ticks=system.ticks,
+            missed_ticks=0,
+            frames=system.frames,
+            refused_setpoints=report.refused if report else 0,
+            grasp=self._grasp,
+            directory=directory,
+        )
+
+    def _on_report(self, report: StateReport) -> None:
+        if report.mode != self._mode:
+            self._mode = report.mode
+            mode = Mode(report.mode)
+            stopped = mode in (Mode.STOP, Mode.FAULT)
+            self._display.event(
+                f"{mode.name}: {describe(report.reason)}" if stopped else f"controller {mode.name}",
+                "yellow" if stopped else "",
+            )
+        self._display.report(report)
+
+    def _on_press(self, action: OperatorAction, _: StateReport) -> None:
+        self._display.event(f"operator presses {action.name}", "magenta")

@@ -1,0 +1,152 @@
+"""A grasp among logs that a camera measured from aside is chosen again from above it, where these are seen better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import hypot
+
+import pytest
+from crane_stand_in import TICK_NS, StandIn
+from grasp_scenes import PROFILE, pair
+
+from autonomy.crane_job.activity import DETECTION_TIMEOUT_NS, Activity
+from autonomy.crane_job.phases import Phase
+from autonomy.grasp.selection import PlannerSelection
+from autonomy.grasp.planner import NoGrasp
+from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
+from machine.geometry.kinematics import Unreachable
+from machine.loading.profile_file import profile_hash
+
+OFF_M = 0.09
+
+
+class Camera(StandIn):
+    """A crane whose camera sees logs beside where they lie, but from above; ``covered``: there it sees nothing."""
+
+    covered = False
+    off_m = OFF_M
+
+    def seen(self) -> tuple[LogObservation, ...]:
+        """Measured logs."""
+        x, y, _ = self.pin()
+        above = hypot(x - self.logs[0].center_m[0], y - self.logs[0].center_m[1]) < 1.0
+        if above and self.covered:
+            return ()
+        return tuple(measured(log, 0.0 if above else self.off_m) for log in self.logs)
+
+
+def measured(log: LogObservation, off_m: float) -> LogObservation:
+    x, y, z = log.center_m
+    variances = [0.0] * TRIANGLE
+    variances[0] = variances[7] = 1e-4
+    return replace(log, center_m=(x, y + off_m, z), covariance=tuple(variances))
+
+
+def made(chooser: PlannerSelection | None = None) -> tuple[Camera, Activity]:
+    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=chooser or PlannerSelection(SamplingPlanner()))
+    return Camera(PROFILE, pair()), planner
+
+
+def until(crane: StandIn, planner: Activity, phase: Phase) -> list[tuple[float, float]]:
+    """Where the grasps were that the crane went to."""
+    found: list[tuple[float, float]] = []
+    for _ in range(1200):
+        if planner.phase is phase or planner.idle:
+            break
+        crane.step(planner)
+        if planner.grasp is not None:
+            at = (planner.grasp.pose.slew_rad, planner.grasp.pose.rot_rad)
+            if not found or found[-1] != at:
+                found.append(at)
+    assert planner.phase is phase, planner.failure
+    return found
+
+
+def test_from_above_the_grasp_is_chosen_again_and_gone_over() -> None:
+    crane, planner = made()
+    assert len(until(crane, planner, Phase.CLOSE)) > 1
+    middle = sum(log.center_m[1] for log in crane.logs) / 2
+    assert crane.pin()[1] == pytest.approx(middle, abs=0.05), "and not off it by what was seen from aside"
+    phases = [m.phase for m in crane.trace]
+    assert phases.count("LOOK") and phases.index("DESCEND") > phases.index("ABOVE")
+
+
+def test_logs_that_nobody_measured_are_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Camera, "seen", StandIn.seen)
+    crane, planner = made()
+    assert len(until(crane, planner, Phase.CLOSE)) == 1
+
+
+def test_where_nothing_is_seen_from_above_the_crane_goes_on_after_a_moment() -> None:
+    crane, planner = made()
+    crane.covered = True
+    until(crane, planner, Phase.ABOVE)
+    while not planner.arrived:
+        crane.step(planner)
+    since_ns = crane.now_ns
+    assert len(until(crane, planner, Phase.DESCEND)) == 1
+    assert crane.now_ns - since_ns <= DETECTION_TIMEOUT_NS + 4 * TICK_NS
+
+
+def test_a_better_grasp_to_which_there_is_no_way_is_let_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    crane, planner = made()
+    until(crane, planner, Phase.ABOVE)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise Unreachable("no way is clear")
+
+    monkeypatch.setattr("autonomy.crane_job.cycle.approach_motion", refuse)
+    until(crane, planner, Phase.CLOSE)
+    assert planner.failure is None
+
+
+def test_a_second_look_that_finds_no_grasp_changes_none() -> None:
+    search = SamplingPlanner()
+    asked = []
+
+    def once(*args: object, **more: object) -> object:
+        asked.append(1)
+        if len(asked) > 1:
+            raise NoGrasp("nothing is safe")
+        return search(*args, **more)  # type: ignore[arg-type]
+
+    crane, planner = made(PlannerSelection(once))  # type: ignore[arg-type]
+    until(crane, planner, Phase.ABOVE)
+    first = planner.grasp
+    assert first is not None
+    until(crane, planner, Phase.CLOSE)
+    assert len(asked) > 1 and planner.grasp is not None and planner.grasp.reason == first.reason
+
+
+@pytest.mark.parametrize("better", [True, False])
+def test_where_a_camera_shows_no_grasp_it_is_asked_again_before_there_is_said_to_be_none(better: bool) -> None:
+    search = SamplingPlanner()
+    asked: list[int] = []
+
+    def at_last(*args: object, **more: object) -> object:
+        asked.append(crane.now_ns)
+        if better and len(asked) > 3:
+            return search(*args, **more)  # type: ignore[arg-type]
+        raise NoGrasp("nothing is safe")
+
+    crane, planner = made(PlannerSelection(at_last))  # type: ignore[arg-type]
+    while planner.phase <= Phase.LOOK and not planner.failure:
+        crane.step(planner)
+    if better:
+        assert planner.phase is Phase.ABOVE and len(asked) == 4
+    else:
+        assert planner.failure == "nothing is safe"
+        assert asked[-1] - asked[0] == pytest.approx(DETECTION_TIMEOUT_NS, abs=3 * TICK_NS)
+
+
+def test_where_logs_are_told_exactly_there_is_none_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Camera, "seen", StandIn.seen)
+
+    def refuse(*_: object, **__: object) -> object:
+        raise NoGrasp("nothing is safe")
+
+    crane, planner = made(PlannerSelection(refuse))  # type: ignore[arg-type]
+    while not planner.failure:
+        crane.step(planner)
+    assert len([m for m in crane.trace if m.phase == "LOOK"]) <= 6

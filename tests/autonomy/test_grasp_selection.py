@@ -1,0 +1,199 @@
+"""Grasp and place from a log's pose: where, how turned, how high; and one clear sentence when it is impossible."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from math import atan2, cos, pi, remainder, sin
+
+import numpy as np
+import pytest
+from crane_stand_in import GROUND_LOG, log_ends, over_bunk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autonomy.grasp.selection import NoGrasp, select_direct, plan_single_log_grasp
+from autonomy.grasp.placement import BELOW_STAKE_TOP_M, lies_in_bunk, plan_place
+from autonomy.grasp.grasp import hangs_below
+from autonomy.grasp.grapple_heights import closing_height_curve, hover_height_m, travel_height_m
+from autonomy.grasp.planner import BunkFull
+from autonomy.missions.crane_job import Mission
+from autonomy.motion.arm import Arm
+from autonomy.motion.pose import Pose
+from autonomy.perception.log_list.observation import LogObservation
+from machine.geometry.grapple import half_gap_m, lowest_tip_below_pin_m, tip_below_pin_m
+from machine.loading.profile_file import load_profile
+
+PROFILE = load_profile("palms_471")
+ARM = Arm(PROFILE)
+TONGS = PROFILE.grapple.tongs
+GROUND = PROFILE.workspace.ground_z_m
+BUNK = PROFILE.bunk
+
+
+def log_at(x: float, y: float, yaw: float = 0.7, number: int = 0, diameter: float = 0.2) -> LogObservation:
+    return LogObservation(number, (x, y, GROUND + diameter / 2), (cos(yaw), sin(yaw), 0.0), 2.6, diameter)
+
+
+def in_bunk(number: int, top_z_m: float) -> LogObservation:
+    axis = (cos(BUNK.yaw_rad), sin(BUNK.yaw_rad), 0.0)
+    return LogObservation(number, (*BUNK.center_m, top_z_m - 0.1), axis, 2.6, 0.2)
+
+
+def layer(top_z_m: float) -> list[LogObservation]:
+    """Logs side by side from stake to stake, so close that none rolls in between, so far over the top of the stakes."""
+    log = in_bunk(0, BUNK.floor_z_m + BUNK.stake_height_m + top_z_m)
+    places = [k * 0.05 for k in range(-20, 21) if abs(k * 0.05) <= BUNK.width_m / 2]
+    c, s = cos(BUNK.yaw_rad), sin(BUNK.yaw_rad)
+    x, y, z = log.center_m
+    return [replace(log, id=k, center_m=(x - s * a, y + c * a, z)) for k, a in enumerate(places, 1)]
+
+
+def random_logs(n: int) -> list[LogObservation]:
+    rng = random.Random("logs")
+    (cx, cy), half = PROFILE.workspace.pick_center_m, PROFILE.workspace.pick_half_size_m
+    out = []
+    for _ in range(n):
+        x, y = cx + rng.uniform(-half, half), cy + rng.uniform(-half, half)
+        log = log_at(x, y, rng.uniform(-pi, pi), 0, rng.uniform(0.1, 0.3))
+        out.append(replace(log, length_m=rng.uniform(2.5, 2.8)))
+    return out
+
+
+@pytest.mark.parametrize("log", random_logs(200), ids=range(200))
+def test_every_log_of_the_pick_area_has_a_grasp_and_a_place(log: LogObservation) -> None:
+    grasp = plan_single_log_grasp(ARM, log, 0.0)
+    assert grasp.along_m == 0.0 and grasp.support_z_m == pytest.approx(GROUND)
+    assert ARM.xy(grasp.pose) == pytest.approx(log.center_m[:2])
+    opening = grasp.pose.slew_rad + grasp.pose.rot_rad
+    assert abs(remainder(opening - atan2(log.axis[1], log.axis[0]), pi)) == pytest.approx(pi / 2)
+    place = plan_place(ARM, Mission(), grasp, [log])
+    assert ARM.xy(place) == pytest.approx(BUNK.center_m)
+    assert remainder(place.slew_rad + place.rot_rad - BUNK.yaw_rad - pi / 2, pi) == pytest.approx(0.0)
+    assert abs(place.rot_rad - grasp.pose.rot_rad) <= pi / 2 + 1e-9
+    for pose in (grasp.pose, place):
+        ARM.joints(np.array([pose, pose.at_height(travel_height_m(PROFILE))]))  # raises when out of reach
+    assert hover_height_m(PROFILE, grasp) - tip_below_pin_m(TONGS, 0.0) > GROUND + log.diameter_m + 0.1
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(0.97, 1.03), st.floats(0.1, 0.3), st.floats(0.05, 0.15))
+def test_the_tips_sweep_between_the_ground_and_the_middle_of_the_log(
+    pace: float, diameter: float, delay_s: float
+) -> None:
+    height = closing_height_curve(PROFILE, GROUND, diameter)
+    rate = TONGS.angle_rad[-1] / PROFILE.grapple.close_time_s
+    tips = []
+    for t in np.arange(0.0, 3.5, 0.01):
+        angle = min(rate * pace * t, TONGS.angle_rad[-1])
+        z = height(max(t - delay_s, 0.0)) - tip_below_pin_m(TONGS, angle) - GROUND
+        tips.append((half_gap_m(TONGS, angle), z))
+    assert tips[0][1] < 0.2
+    assert min(tip for gap, tip in tips if gap > diameter / 2) > 0.012
+    assert max(tip for gap, tip in tips if 0.3 * diameter < gap < 0.5 * diameter) < 0.45 * diameter
+
+
+def test_the_closing_height_starts_at_rest_and_is_smooth() -> None:
+    height = closing_height_curve(PROFILE, GROUND, 0.2)
+    z = np.array([height(t) for t in np.arange(0.0, 3.5, 0.02)])
+    speed = np.gradient(z, 0.02)
+    assert abs(speed[0]) < 0.02 and np.max(np.abs(speed)) < 0.2
+    assert np.max(np.abs(np.gradient(speed, 0.02))) < 1.0
+
+
+def test_a_log_on_others_is_gripped_at_its_own_height() -> None:
+    high = replace(GROUND_LOG, center_m=(-1.8, 4.4, -0.9))
+    assert plan_single_log_grasp(ARM, high, 0.0).pose.z_m - plan_single_log_grasp(ARM, GROUND_LOG, 0.0).pose.z_m == pytest.approx(0.39)
+
+
+def test_a_log_whose_centre_is_just_out_of_reach_is_gripped_off_its_centre() -> None:
+    distances = (float(r) for r in np.arange(6.2, 7.2, 0.05))
+    far = next(log for log in (log_at(0.0, r, pi / 2) for r in distances) if not centre_in_reach(log))
+    grasp = plan_single_log_grasp(ARM, far, 0.0)
+    assert grasp.along_m < 0.0 and ARM.xy(grasp.pose)[1] < far.center_m[1] - 0.05
+    place = plan_place(ARM, Mission(), grasp, [])
+    for point in log_ends(laid(grasp.log, grasp.pose, place)):
+        assert over_bunk(PROFILE, point, 0.001)
+
+
+def centre_in_reach(log: LogObservation) -> bool:
+    return plan_single_log_grasp(ARM, log, 0.0).along_m == 0.0
+
+
+def laid(log: LogObservation, grasp: Pose, place: Pose) -> LogObservation:
+    """The log after it went rigidly with the grapple from one pose to the other."""
+    (gx, gy), (px, py) = ARM.xy(grasp), ARM.xy(place)
+    turn = place.slew_rad + place.rot_rad - grasp.slew_rad - grasp.rot_rad
+    x, y = log.center_m[0] - gx, log.center_m[1] - gy
+    c, s = cos(turn), sin(turn)
+    axis = (c * log.axis[0] - s * log.axis[1], s * log.axis[0] + c * log.axis[1], 0.0)
+    return replace(log, center_m=(px + c * x - s * y, py + s * x + c * y, -0.9), axis=axis)
+
+
+@pytest.mark.parametrize(
+    ("log", "says"),
+    [
+        (log_at(-6.0, 6.0), r"log 0 cannot be picked: point .* is out of reach: .*"),
+        (log_at(0.5, -4.0), r"log 0 cannot be picked: point .* is out of reach: slew .* outside its limits .*"),
+        (replace(GROUND_LOG, axis=(0.0, 0.6, 0.8)), r"log 0 stands at 53 deg, too steep to grip"),
+    ],
+)
+def test_an_impossible_log_gives_one_clear_sentence(log: LogObservation, says: str) -> None:
+    with pytest.raises(NoGrasp, match=f"^{says}$"):
+        select_direct(ARM, Mission(), [log], 0.0, 0.0)
+
+
+def test_the_top_log_comes_first_then_the_nearest_and_never_one_in_the_bunk() -> None:
+    near, far = log_at(0.0, 4.5, number=1), log_at(-2.5, 4.5, number=2)
+    top = replace(log_at(-2.0, 4.0, number=3), center_m=(-2.0, 4.0, -0.9))
+    loaded = in_bunk(4, -0.8)
+    assert select_direct(ARM, Mission(), [far, near, loaded], 0.0, 0.0).log.id == 1
+    assert select_direct(ARM, Mission(), [near, far, top, loaded], 0.0, 0.0).log.id == 3
+    assert select_direct(ARM, Mission(log_id=2), [near, far, top], 0.0, 0.0).log.id == 2
+    with pytest.raises(NoGrasp, match="log 9 is not in view"):
+        select_direct(ARM, Mission(log_id=9), [near], 0.0, 0.0)
+    with pytest.raises(NoGrasp, match="no log lies outside the bunk"):
+        select_direct(ARM, Mission(), [loaded], 0.0, 0.0)
+    unreachable = log_at(-6.0, 6.0, number=5)
+    assert select_direct(ARM, Mission(), [unreachable, near], 0.0, 0.0).log.id == 1
+
+
+def test_a_place_is_above_what_is_in_the_bunk_until_the_bunk_is_full() -> None:
+    grasp = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
+    deepest = lowest_tip_below_pin_m(TONGS)
+    empty = plan_place(ARM, Mission(), grasp, [GROUND_LOG])
+    assert 0.04 < empty.z_m - deepest - BUNK.floor_z_m < 0.1
+    half = plan_place(ARM, Mission(), grasp, layer(-0.5))
+    assert half.z_m - empty.z_m == pytest.approx(0.5)
+    top_m, radius_m = BUNK.floor_z_m + BUNK.stake_height_m, GROUND_LOG.diameter_m / 2
+    last = plan_place(ARM, Mission(), grasp, layer(-BELOW_STAKE_TOP_M - radius_m - 0.01))
+    assert last.z_m - deepest + radius_m < top_m + 0.03, "its middle comes to lie below the top of the stakes"
+    with pytest.raises(BunkFull, match="the bunk is full"):
+        plan_place(ARM, Mission(), grasp, layer(-BELOW_STAKE_TOP_M - radius_m + 0.01))
+
+
+def test_a_mission_may_name_the_place() -> None:
+    grasp = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
+    assert ARM.xy(plan_place(ARM, Mission(place_m=(3.2, 1.0)), grasp, [])) == pytest.approx((3.2, 1.0))
+    with pytest.raises(NoGrasp, match=r"log 0 cannot be laid down: .*out of reach"):
+        plan_place(ARM, Mission(place_m=(9.0, 1.0)), grasp, [])
+
+
+def test_lying_in_the_bunk_and_hanging_from_the_grapple() -> None:
+    assert lies_in_bunk(BUNK, in_bunk(0, -0.8)) and not lies_in_bunk(BUNK, in_bunk(0, 0.4))
+    assert not lies_in_bunk(BUNK, GROUND_LOG)
+    up = plan_single_log_grasp(ARM, GROUND_LOG, 0.0).pose.at_height(travel_height_m(PROFILE))
+    assert not hangs_below(ARM, GROUND_LOG, up)
+    assert hangs_below(ARM, replace(GROUND_LOG, center_m=(-1.7, 4.5, up.z_m - 1.1)), up)
+    assert not hangs_below(ARM, replace(GROUND_LOG, center_m=(1.0, 4.5, up.z_m - 1.1)), up)
+
+
+@pytest.mark.parametrize("skew", [-0.5, 0.0, 0.4])
+def test_a_log_that_hangs_askew_is_turned_along_the_bunk(skew):
+    grasp = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
+    held_yaw = 0.9
+    hangs = held_yaw - pi / 2 + skew
+    seen = replace(GROUND_LOG, axis=(cos(hangs), sin(hangs), 0.0))
+    place = plan_place(ARM, Mission(), grasp, [seen], held_yaw)
+    laid = hangs + (place.slew_rad + place.rot_rad - held_yaw)
+    assert remainder(laid - BUNK.yaw_rad, pi) == pytest.approx(0.0, abs=1e-6)

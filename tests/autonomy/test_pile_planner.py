@@ -1,0 +1,164 @@
+"""Open tongs pressed into a heap: where, how deep, and what happens when nothing comes up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import hypot, inf, pi, remainder
+
+import numpy as np
+import pytest
+from crane_stand_in import StandIn
+from grasp_scenes import PROFILE as PALMS
+
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.grasp_verification import is_at_target
+from autonomy.crane_job.phases import Phase
+from autonomy.grasp.selection import PlannerSelection
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.jaws import jaws_of
+from autonomy.grasp.pile_planner import DEPTHS_M, FAILED_RADIUS_M, PilePlanner
+from autonomy.grasp.planner import GraspCandidate, NoGrasp
+from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.missions.crane_job import Mission
+from autonomy.motion.arm import Arm
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.messages.crane import StateReport
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.profile import Bunk
+
+AORO = load_profile("aoro_fc8")
+ARM, BUNK, JAWS = Arm(AORO), AORO.bunk, jaws_of(AORO)
+THICK = 0.25
+
+
+def row(first: int, count: int, layer: int, shift_m: float = 0.0) -> list[LogObservation]:
+    """Logs side by side along the bunk, a third of a metre apart, in a layer."""
+    z = BUNK.floor_z_m + THICK / 2 + layer * 0.2
+    across = [shift_m + 0.33 * (i - (count - 1) / 2) for i in range(count)]
+    return [
+        LogObservation(first + i, (BUNK.center_m[0], y, z), (1.0, 0.0, 0.0), 2.0, THICK) for i, y in enumerate(across)
+    ]
+
+
+def heap() -> list[LogObservation]:
+    """Two layers, one in the valleys of the other."""
+    return row(0, 6, 0) + row(6, 5, 1)
+
+
+def planner() -> PilePlanner:
+    return PilePlanner(SamplingPlanner())
+
+
+def test_a_heap_is_pressed_into_and_several_logs_are_between_the_tongs() -> None:
+    logs = heap()
+    p = planner()(ARM, logs, 0.0, 0.0)
+    assert p.pressed and len(p.logs) >= 2 and p.reason.startswith("pressed into the heap") and "\n" not in p.reason
+    assert abs(remainder(p.yaw_rad - pi / 2, pi)) < 0.15, "across the logs"
+    wood = sum(pi * (logs[i].diameter_m / 2) ** 2 for i in p.logs)
+    assert wood < 1.1 * JAWS.holds_m2
+    top = max(log.center_m[2] + log.diameter_m / 2 for log in logs)
+    assert BUNK.floor_z_m <= p.support_z_m < top - DEPTHS_M[0] + 1e-6
+
+
+def test_no_tip_comes_down_on_the_middle_of_a_log() -> None:
+    logs = heap()
+    p = planner()(ARM, logs, 0.0, 0.0)
+    for side in (-1.0, 1.0):
+        tip = p.y_m + side * (JAWS.half_gap_m + JAWS.plate_m / 2)
+        met = [log for log in logs if log.center_m[2] > p.support_z_m]
+        assert all(abs(log.center_m[1] - tip) > 0.1 * log.diameter_m for log in met)
+
+
+def test_logs_that_lie_on_no_others_are_left_to_the_other_planner() -> None:
+    p = planner()(ARM, row(0, 3, 0), 0.0, 0.0)
+    assert not p.pressed and p == SamplingPlanner()(ARM, row(0, 3, 0), 0.0, 0.0)
+
+
+def test_a_row_of_which_no_grasp_is_safe_is_pressed_into() -> None:
+    def never(*_: object) -> GraspCandidate:
+        raise NoGrasp("no grasp of the 6 logs is safe")
+
+    p = PilePlanner(never)(ARM, row(0, 6, 0), 0.0, 0.0)
+    assert p.pressed and p.logs and p.support_z_m >= BUNK.floor_z_m
+
+
+def test_nothing_in_view_is_no_grasp() -> None:
+    with pytest.raises(NoGrasp, match="no log is in view"):
+        planner()(ARM, [], 0.0, 0.0)
+
+
+def test_a_place_where_nothing_came_up_is_not_tried_again_until_something_did() -> None:
+    press, logs = planner(), heap()
+    first = press(ARM, logs, 0.0, 0.0)
+    second = press(ARM, logs, 0.0, 0.0)
+    third = press(ARM, logs, 0.0, 0.0)
+    places = [(p.x_m, p.y_m) for p in (first, second, third)]
+    for i, a in enumerate(places):
+        assert all(hypot(a[0] - b[0], a[1] - b[1]) >= FAILED_RADIUS_M - 1e-9 for b in places[:i])
+    press(ARM, [log for i, log in enumerate(logs) if i not in third.logs], 0.0, 0.0)
+    assert press(ARM, logs, 0.0, 0.0) == first, "something came up: every place is as good as before"
+
+
+def test_a_log_that_only_rolled_has_not_come_up() -> None:
+    press, logs = planner(), heap()
+    first = press(ARM, logs, 0.0, 0.0)
+    moved = [replace(log, center_m=(log.center_m[0] + 0.02, *log.center_m[1:])) for log in logs]
+    second = press(ARM, moved, 0.0, 0.0)
+    assert hypot(first.x_m - second.x_m, first.y_m - second.y_m) > FAILED_RADIUS_M / 2
+
+
+def test_the_same_heap_gives_the_same_grasp() -> None:
+    assert planner()(ARM, heap(), 0.0, 0.0) == planner()(ARM, heap(), 0.0, 0.0)
+
+
+class Resisting(StandIn):
+    """A crane that a heap does not let down farther than ``floor_z_m``."""
+
+    floor_z_m = -inf
+
+    def report(self) -> StateReport:
+        said, arm = super().report(), Arm(self.profile)
+        pose = arm.pose(said.position)
+        held_up = arm.joints(np.array([pose.at_height(max(pose.z_m, self.floor_z_m))]))[0]
+        return replace(said, position=tuple(float(v) for v in held_up))
+
+
+@pytest.mark.parametrize(("pressed", "short_m"), [(True, 0.12), (True, 0.4), (False, 0.12)])
+def test_tongs_that_rest_on_wood_close_there_where_they_were_pressed(pressed: bool, short_m: float) -> None:
+    logs = [LogObservation(0, (-1.8, 4.4, -1.29), (0.6, 0.8, 0.0), 2.6, 0.2)]
+
+    def chooser(arm, mission, seen, slew, rot):  # type: ignore[no-untyped-def]
+        return replace(PlannerSelection(SamplingPlanner())(arm, mission, seen, slew, rot), pressed=pressed)
+
+    crane = Resisting(PALMS, logs)
+    activity = Activity(PALMS, profile_hash(PALMS), chooser=chooser)
+    crane.until(activity, Phase.DESCEND)
+    assert activity.grasp is not None
+    begun_ns = crane.now_ns
+    crane.floor_z_m = activity.grasp.pose.z_m + short_m
+    for _ in range(400):
+        crane.step(activity)
+        if activity.phase is not Phase.DESCEND:
+            break
+    begun_s = (crane.now_ns - begun_ns) * 1e-9
+    assert not pressed or begun_s < 3.0, "before the controller takes the joint for stuck"
+    assert activity.phase is (Phase.CLOSE if pressed else Phase.FAILED), activity.failure
+
+
+def test_a_log_that_rolls_beside_a_landing_is_laid_down_but_not_one_that_still_hangs() -> None:
+    pile = Bunk((0.4, -2.9), 0.0, 3.0, 2.6, -1.4, 1.5)
+    unloading, loading = Mission(source=BUNK, target=pile), Mission(target=pile)
+    rolled = LogObservation(0, (0.4, -4.6, -1.3), (1.0, 0.0, 0.0), 2.0, 0.2)
+    hanging = replace(rolled, center_m=(0.4, -4.6, 0.9))
+    assert not lies_in_bunk(pile, rolled) and is_at_target(unloading, pile, rolled)
+    assert not is_at_target(unloading, pile, hanging) and not is_at_target(loading, pile, rolled)
+    assert not is_at_target(unloading, pile, replace(rolled, center_m=(*BUNK.center_m, 0.6)))
+
+
+def test_no_place_is_pressed_into_where_a_log_that_is_to_stay_is_between_the_tongs() -> None:
+    logs = heap()
+    taken = planner()(ARM, logs, 0.0, 0.0).logs
+    other = planner()(ARM, logs, 0.0, 0.0, stay=taken[:1])
+    assert other.pressed and taken[0] not in other.logs and other.logs
+    with pytest.raises(NoGrasp):
+        planner()(ARM, logs, 0.0, 0.0, stay=range(len(logs)))

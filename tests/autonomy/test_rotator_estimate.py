@@ -1,0 +1,111 @@
+"""A rotator that is only counted: what hangs in the grapple sets its count right, job after job."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from math import atan2, cos, degrees, pi, remainder, sin
+
+import pytest
+from crane_stand_in import StandIn
+from hypothesis import given
+from hypothesis import strategies as st
+from test_activity_blind import HOME, Blind, birch
+
+from autonomy.crane_job.activity import Activity
+from autonomy.crane_job.rotator_estimate import SCALE_BOUNDS, RotatorEstimate, has_no_encoder, planning_profile
+from machine.geometry.grapple import grapple_yaw
+from machine.joints import Joint
+from machine.loading.profile_file import load_profile, profile_hash
+
+FORWARDER, LOADER = load_profile("aoro_fc8"), load_profile("palms_471")
+ANGLE = st.floats(-pi, pi)
+ROTATORS = st.builds(RotatorEstimate, ANGLE, ANGLE, st.tuples(st.floats(*SCALE_BOUNDS), st.floats(*SCALE_BOUNDS)))
+
+
+class Drifting(Blind):
+    """Its rotator makes only part of every turn, and a log that it grips lies across its tongs."""
+
+    made = (0.85, 0.7)
+    """Of turns to the negative and to the positive side."""
+    true_rad = counted_rad = askew_rad = 0.0
+
+    @contextmanager
+    def _truly(self) -> Iterator[None]:
+        counted, self.q = self.q, (*self.q[: Joint.ROT], self.true_rad)
+        yield
+        self.q = counted
+
+    def _carry(self) -> None:
+        turn = self.q[Joint.ROT] - self.counted_rad
+        self.true_rad += self.made[turn > 0.0] * turn
+        self.counted_rad = self.q[Joint.ROT]
+        with self._truly():
+            super()._carry()
+
+    def _grip(self) -> None:
+        with self._truly():
+            (log,) = self.logs
+            yaw = grapple_yaw(self.profile, self.q) - pi / 2
+            self.askew_rad = remainder(atan2(log.axis[1], log.axis[0]) - yaw, pi)
+            self._move(log.id, log.center_m, (cos(yaw), sin(yaw), 0.0))
+            super()._grip()
+
+
+def askew_deg(count: int, learns: bool) -> list[float]:
+    """How far each log of a row of jobs was askew between the tongs."""
+    crane, rests, rotator, found = Drifting(FORWARDER, [], q=HOME), HOME, None, []
+    for seed in range(count):
+        crane.logs = [birch(seed)]
+        planner = Activity(FORWARDER, profile_hash(FORWARDER), rests=rests, rotator=rotator)
+        crane.run(planner)
+        assert planner.done, planner.failure
+        rests, rotator = (planner.rests, planner.rotator) if learns else (crane.q, None)
+        found.append(abs(degrees(crane.askew_rad)))
+    return found
+
+
+def test_the_count_is_set_right_by_every_log() -> None:
+    learned = askew_deg(7, learns=True)
+    assert max(learned[2:]) < 8.0
+    assert max(askew_deg(7, learns=False)) > 20.0, "without it the count drifts"
+
+
+@given(ROTATORS, ANGLE)
+def test_count_and_angle_are_inverse(rotator: RotatorEstimate, angle: float) -> None:
+    assert rotator.angle(rotator.sent(angle)) == pytest.approx(angle)
+    q = (0.1, 0.2, 0.3, 0.4, angle)
+    assert rotator.believed(rotator.counted(q)) == pytest.approx(q)
+
+
+@given(ROTATORS, ANGLE, ANGLE)
+def test_what_is_seen_leaves_the_count_within_a_quarter_turn_of_the_angle(rotator, sent, angle) -> None:
+    seen = rotator.seen(sent, angle)
+    assert abs(seen.angle(sent) - sent) <= pi / 2 + 1e-9
+    assert all(SCALE_BOUNDS[0] <= pace <= SCALE_BOUNDS[1] for pace in seen.paces)
+
+
+def test_repeated_looks_find_how_much_of_a_turn_is_made() -> None:
+    made, true, rotator, sent = (0.8, 1.1), 0.3, RotatorEstimate(), 0.0
+    for goal in 4 * (1.5, -1.0, 1.2, -0.8, 1.0, -1.4):
+        before, sent = sent, rotator.sent(goal)
+        true += made[sent > before] * (sent - before)
+        rotator = rotator.seen(sent, true)
+    assert rotator.paces == pytest.approx(made, abs=0.02)
+    assert remainder(rotator.angle(sent) - true, pi) == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_counted_rotator_is_planned_within_half_its_range_and_no_faster_than_it_may_be_sent() -> None:
+    whole, slow = FORWARDER.joints["rot"], planning_profile(FORWARDER, RotatorEstimate(paces=(0.9, 0.8))).joints["rot"]
+    assert (slow.lower, slow.upper) == (whole.lower / 2, whole.upper / 2)
+    assert slow.speed_limit == pytest.approx(0.8 * whole.speed_limit)
+    assert planning_profile(FORWARDER, RotatorEstimate(paces=(1.3, 1.1))).joints["rot"].speed_limit == whole.speed_limit
+    assert has_no_encoder(FORWARDER) and planning_profile(LOADER, RotatorEstimate(paces=(0.9, 0.8))) is LOADER
+
+
+def test_a_measured_rotator_is_left_as_it_is() -> None:
+    crane = StandIn(LOADER, [replace(birch(0), center_m=(-1.8, 4.4, -1.29), length_m=2.6, diameter_m=0.2)])
+    planner = Activity(LOADER, profile_hash(LOADER))
+    crane.run(planner)
+    assert planner.done and planner.rotator == RotatorEstimate()

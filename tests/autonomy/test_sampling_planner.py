@@ -1,0 +1,312 @@
+"""The rule and the search: what they take, what they leave, and when they say that nothing can be had."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import atan2, pi, remainder
+
+import numpy as np
+import pytest
+from grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
+
+from autonomy.grasp.cylinders import as_cylinders, default_covariance, sample_cylinders
+from autonomy.grasp.selection import PlannerSelection, select_direct
+from autonomy.grasp.grasp import restricted_to
+from autonomy.grasp.grapple_heights import hover_height_m
+from autonomy.grasp.jaws import jaws_of
+from autonomy.grasp.planner import GraspCandidate, NoGrasp
+from autonomy.grasp.quality import LAYER_RULE, STRICT_RULE, CaptureRule, rests_upon, score_grasps, blade_sections
+from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.missions.crane_job import Mission
+from autonomy.motion.arm import Arm
+from autonomy.perception.log_list.estimate import LogEstimate
+from autonomy.perception.log_list.observation import LogObservation
+from machine.geometry.grapple import tip_below_pin_m
+from machine.loading.profile_file import load_profile
+
+JAWS = jaws_of(PROFILE)
+
+
+def planned(logs: list[LogObservation]) -> GraspCandidate:
+    return SamplingPlanner()(ARM, logs, 0.0, 0.0)
+
+
+def is_safe(
+    logs: list[LogObservation], across_m: float, yaw: float = pi / 2, level: float = GROUND, rule: CaptureRule = STRICT_RULE
+) -> bool:
+    world = as_cylinders(logs)
+    at = blade_sections(JAWS, world, np.array([X]), np.array([Y + across_m]), np.array([yaw]))
+    return bool(score_grasps(JAWS, world, rests_upon(world), at, np.array([level]), rule).safe[0])
+
+
+def test_the_jaws_are_those_of_the_profile() -> None:
+    assert JAWS.half_gap_m == 0.733 and JAWS.blade_m == pytest.approx(0.36, abs=0.005)
+    assert list(JAWS.height_m) == sorted(JAWS.height_m)
+    assert list(JAWS.half_width_m) == sorted(JAWS.half_width_m, reverse=True)
+
+
+def test_logs_on_the_ground_are_not_pinched_above_a_thinner_one_between_them() -> None:
+    row = [log(0, -0.22, diameter=0.29), log(1, 0.0, diameter=0.13), log(2, 0.22, diameter=0.29)]
+    assert is_safe([row[0], row[2]], 0.0)
+    assert not is_safe(row, 0.0, level=GROUND + 0.14, rule=LAYER_RULE)
+
+
+def test_tips_that_ride_up_over_its_neighbours_do_not_come_down_on_a_log_deep_between_them() -> None:
+    beside = [log(0, -0.18, diameter=0.26), log(1, 0.16, diameter=0.24)]
+    deep, high = log(2, 0.0, 0.15, diameter=0.1), log(2, 0.0, 0.22, diameter=0.1)
+    level = GROUND + 0.19
+    assert is_safe([*beside, high], 0.0, level=level, rule=LAYER_RULE)
+    assert not is_safe([*beside, deep], 0.0, level=level, rule=LAYER_RULE)
+
+
+def test_a_thick_log_beside_a_thin_one_does_not_lie_on_it() -> None:
+    assert not rests_upon(as_cylinders([log(0, diameter=0.12), log(1, 0.21, diameter=0.3)])).any()
+    assert rests_upon(as_cylinders(small_pile())).tolist() == [[False, False, True], [False, False, True], [False] * 3]
+
+
+def test_a_single_log_is_taken_across_its_middle() -> None:
+    turned = log(7, yaw=0.6)
+    p = planned([turned])
+    assert p.logs == (0,) and p.probability > 0.9
+    assert np.hypot(p.x_m - turned.center_m[0], p.y_m - turned.center_m[1]) < 0.1
+    assert abs(remainder(p.yaw_rad - 0.6 - pi / 2, pi)) < 0.15
+    assert p.support_z_m == pytest.approx(GROUND, abs=1e-3)
+    assert p.reason.startswith("1 log (7) of 1 at once") and "\n" not in p.reason
+
+
+@pytest.mark.parametrize("logs", [pair(), small_pile()])
+def test_what_fits_comes_up_together(logs: list[LogObservation]) -> None:
+    p = planned(logs)
+    assert p.logs == tuple(range(len(logs)))
+    assert abs(p.y_m - Y) < 0.1, "in the middle of all"
+
+
+def test_the_log_on_top_is_taken_and_those_below_are_left() -> None:
+    assert planned(cross()).logs == (2,)
+
+
+@pytest.mark.parametrize(
+    ("logs", "across_m", "yaw", "safe"),
+    [
+        ([log(0)], 0.0, pi / 2, True),
+        ([log(0)], 0.0, pi / 2 + 0.6, False),  # (d) askew
+        ([log(0)], 0.72, pi / 2, False),  # (b) a tong comes down on it
+        ([log(0)], 1.2, pi / 2, False),  # nothing between the tongs
+        ([log(0, along_m=1.25)], 0.0, pi / 2, False),  # only its end
+        ([log(i, 0.31 * (i - 1.5), diameter=0.3) for i in range(4)], 0.0, pi / 2, False),  # (a) too much
+        (small_pile(), 0.0, pi / 2, True),
+    ],
+)
+def test_the_rule(logs: list[LogObservation], across_m: float, yaw: float, safe: bool) -> None:
+    assert is_safe(logs, across_m, yaw) is safe
+
+
+def test_no_log_is_drawn_from_under_another() -> None:
+    """(c): the lower log alone between the tongs, the upper one far off its middle across it."""
+    under, over = log(0), log(1, 0.0, 0.2, yaw=pi / 2, along_m=0.8)
+    assert is_safe([under], 0.0)
+    assert not is_safe([under, over], 0.0)
+    upon = rests_upon(as_cylinders([under, over]))
+    assert upon.tolist() == [[False, True], [False, False]]
+
+
+def test_from_above_a_layer_only_that_layer_is_taken() -> None:
+    pile = small_pile()
+    world = as_cylinders(pile)
+    at = blade_sections(JAWS, world, np.array([X]), np.array([Y]), np.array([pi / 2]))
+    levels = np.array([GROUND, GROUND + 0.2])
+    found = score_grasps(JAWS, world, rests_upon(world), *_both(at), levels)
+    assert found.captured[0].tolist() == [[True, True, True], [False, False, True]]
+
+
+def _both(at: object) -> tuple[object]:
+    from dataclasses import fields
+
+    return (type(at)(*(getattr(at, f.name)[:, None, :] for f in fields(at))),)  # type: ignore[arg-type]
+
+
+def test_what_perception_is_unsure_of_makes_a_grasp_less_probable() -> None:
+    wide = LogEstimate(np.zeros(3), np.ones(3), 1.0, 0.1, np.diag([0.3, 0.05, 0.2, 0.05, 0.2, 0.2, 0.02]) ** 2)
+    known = wide.observation(0).covariance
+    unsure = [replace(o, covariance=known) for o in pair()]
+    assert planned(unsure).probability < planned(pair()).probability - 0.1
+
+
+@pytest.mark.parametrize("sunk_m", [-0.1, 0.0, 0.1])
+def test_a_machine_on_wheels_takes_the_ground_from_the_logs(sunk_m: float) -> None:
+    """Its frame goes up and down: what the profile says of the ground is nothing to go by."""
+    arm = Arm(load_profile("aoro_fc8"))
+    ground = arm.profile.workspace.ground_z_m - sunk_m
+    x, y = arm.profile.workspace.pick_center_m
+    logs = [
+        LogObservation(i, (x, y + side, ground + 0.1), (1.0, 0.0, 0.0), 2.6, 0.2) for i, side in ((0, 0), (1, 0.21))
+    ]
+    upon = LogObservation(2, (x, y + 0.105, ground + 0.27), (1.0, 0.0, 0.0), 2.6, 0.2)
+    p = SamplingPlanner()(arm, [*logs, upon], 0.0, 0.0)
+    assert set(p.logs) == {0, 1, 2} and p.support_z_m == pytest.approx(ground, abs=1e-3)
+    higher = replace(logs[0], id=3, center_m=(x, y + 3.0, ground + 0.4))
+    alone = SamplingPlanner()(arm, [higher], 0.0, 0.0)
+    assert alone.support_z_m == pytest.approx(ground + 0.3, abs=1e-3), "it lies on a bank"
+
+
+def test_draws_have_the_spread_they_are_asked_for() -> None:
+    world = as_cylinders([log(0, yaw=0.8)])
+    sigma = np.sqrt(np.diag(default_covariance(log(0))))
+    drawn = sample_cylinders(world, np.diag(sigma**2)[None], 4000, 3)
+    off = drawn.center[:, 0] - world.center
+    across = off @ np.array([-np.sin(0.8), np.cos(0.8), 0.0])
+    assert np.std(across) == pytest.approx(sigma[0], rel=0.05)
+    assert np.std(off[:, 2]) == pytest.approx(sigma[1], rel=0.05)
+    assert np.std(drawn.length) == pytest.approx(np.hypot(sigma[4], sigma[5]), rel=0.05)
+    again = sample_cylinders(world, np.diag(sigma**2)[None], 4000, 3)
+    assert np.array_equal(again.center, drawn.center)
+    with pytest.raises(ValueError, match="not finite"):
+        sample_cylinders(world, np.full((1, 7, 7), np.nan), 2, 0)
+
+
+def test_logs_that_a_camera_sees_too_high_are_gripped_at_the_ground() -> None:
+    raised = [replace(o, center_m=(*o.center_m[:2], o.center_m[2] + 0.05)) for o in small_pile()]
+    assert planned(raised).support_z_m == pytest.approx(GROUND, abs=1e-3)
+
+
+def test_higher_logs_out_of_reach_hide_none_in_reach() -> None:
+    far = [log(i, along_m=-9.0, z_m=0.3 + 0.1 * i) for i in range(12)]
+    assert planned([*far, log(12)]).logs == (12,)
+
+
+def test_nothing_to_take_is_said_in_one_sentence() -> None:
+    with pytest.raises(NoGrasp, match=r"^no log is in view$"):
+        planned([])
+    standing = replace(log(0), axis=(0.0, 0.1, 0.995))
+    with pytest.raises(NoGrasp, match=r"^no grasp of the 1 log is safe: .*$"):
+        planned([standing])
+    with pytest.raises(NoGrasp, match=r"^no log is in reach; log 0: point "):
+        planned([replace(log(0), center_m=(-6.0, 7.0, GROUND + 0.1))])
+
+
+def test_a_proposal_becomes_a_grasp_of_several_logs() -> None:
+    grasp = PlannerSelection(SamplingPlanner())(ARM, Mission(), small_pile(), 0.0, 0.0)
+    assert {o.id for o in grasp.logs} == {0, 1, 2} and grasp.gathered and grasp.thinnest_m == 0.2
+    top = GROUND + small_pile()[2].center_m[2] - GROUND + 0.1
+    assert hover_height_m(PROFILE, grasp) - tip_below_pin_m(PROFILE.grapple.tongs, 0.0) > top
+    rest = restricted_to(ARM, grasp, [2])
+    assert rest.log.id == 2 and rest.others == () and abs(rest.along_m) < 0.2
+    assert restricted_to(ARM, grasp, [0, 1, 2]) is grasp
+
+
+def test_a_mission_that_names_its_log_is_served_directly() -> None:
+    grasp = PlannerSelection(SamplingPlanner())(ARM, Mission(log_id=1), pair(), 0.0, 0.0)
+    assert [o.id for o in grasp.logs] == [1] and not grasp.gathered
+    opening = grasp.pose.slew_rad + grasp.pose.rot_rad
+    assert abs(remainder(opening - atan2(0.0, 1.0), pi)) == pytest.approx(pi / 2)
+
+
+def test_what_is_to_stay_is_never_taken_and_still_in_the_way() -> None:
+    apart = [log(0, -0.3), log(1, 0.3)]
+    assert SamplingPlanner()(ARM, apart, 0.0, 0.0).logs == (0, 1)
+    p = SamplingPlanner()(ARM, apart, 0.0, 0.0, stay={0})
+    assert p.logs == (1,) and p.y_m > Y + 0.3, "the tongs come down beside it"
+    with pytest.raises(NoGrasp, match="no grasp of the 1 log is safe"):
+        SamplingPlanner()(ARM, pair(), 0.0, 0.0, stay=(0,))
+    with pytest.raises(NoGrasp, match="all that are in view are to stay"):
+        SamplingPlanner()(ARM, pair(), 0.0, 0.0, stay=(0, 1))
+
+
+def test_nothing_is_taken_from_under_a_log_that_is_to_stay() -> None:
+    logs = small_pile()
+    assert 2 not in SamplingPlanner()(ARM, [*logs[:2], log(2, 1.0)], 0.0, 0.0, stay=(2,)).logs
+    with pytest.raises(NoGrasp):
+        SamplingPlanner()(ARM, logs, 0.0, 0.0, stay=(2,))
+
+
+def test_a_mission_says_which_logs_are_left_by_their_numbers() -> None:
+    apart = [log(7, -0.3), log(8, 0.3)]
+    grasp = PlannerSelection(SamplingPlanner())(ARM, Mission(leave=(7,)), apart, 0.0, 0.0)
+    assert grasp.log.id == 8 and not grasp.others
+    assert ARM.xy(grasp.pose)[1] > Y + 0.3, "the planner knows of the one that stays"
+    assert select_direct(ARM, Mission(leave=(8,)), apart, 0.0, 0.0).log.id == 7
+    for chooser in (select_direct, PlannerSelection(SamplingPlanner())):
+        with pytest.raises(NoGrasp, match="every log that lies there is to stay"):
+            chooser(ARM, Mission(leave=(7, 8)), apart, 0.0, 0.0)
+        with pytest.raises(NoGrasp, match="no log lies outside the bunk"):
+            chooser(ARM, Mission(leave=(7, 8)), [], 0.0, 0.0)
+
+
+def measured(logs: list[LogObservation]) -> list[LogObservation]:
+    """As a good camera measures them."""
+    well = LogEstimate(np.zeros(3), np.ones(3), 1.0, 0.1, np.diag([0.01, 0.02, 0.01, 0.02, 0.1, 0.1, 0.005]) ** 2)
+    return [replace(o, covariance=well.observation(0).covariance) for o in logs]
+
+
+def test_tongs_are_pressed_into_a_heap_that_a_camera_measured_but_not_into_the_ground() -> None:
+    heap = [*(log(i, 0.21 * i) for i in range(-3, 4)), log(9, 0.105, 0.18)]
+    known, seen = planned(heap), planned(measured(heap))
+    assert known.logs == seen.logs == (7,)
+    assert not known.pressed and seen.pressed
+    assert seen.support_z_m == pytest.approx(max(known.support_z_m - 0.15, GROUND), abs=0.02)
+    whole = planned(measured(pair()))
+    assert not whole.pressed and whole.support_z_m == pytest.approx(GROUND, abs=1e-3)
+
+
+def test_tongs_are_not_pressed_in_over_a_log_that_lies_across() -> None:
+    """They would take it, too, and hang askew."""
+    row = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
+    on_top = log(9, 0.0, 0.22)
+    across = LogObservation(8, on_top.center_m, (0.0, 1.0, 0.0), 2.0, 0.2)
+    beneath = measured([*row, replace(on_top, center_m=(X, Y, on_top.center_m[2] + 0.2)), across])
+    p = planned(beneath)
+    assert p.logs == (7,) and not p.pressed
+    assert planned(measured([*row, on_top])).pressed
+
+
+def test_what_floats_in_the_air_is_not_gripped_and_in_nobody_s_way() -> None:
+    """A glimpse of the crane's own tongs, as a camera that looked past them once measured it."""
+    ghost = LogObservation(9, (X, Y, GROUND + 1.6), (-0.8, 0.38, -0.46), 1.92, 0.09)
+    logs = measured(pair())
+    alone, haunted = planned(logs), planned([ghost, *logs])
+    assert haunted.logs == tuple(i + 1 for i in alone.logs) and (haunted.x_m, haunted.y_m) == (alone.x_m, alone.y_m)
+    assert SamplingPlanner()(ARM, [log(0, -0.4), ghost, log(1, 0.4)], 0.0, 0.0, stay=(0,)).logs == (2,)
+    with pytest.raises(NoGrasp, match="lies on anything"):
+        planned([ghost])
+
+
+WALL = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
+
+
+def test_a_log_is_drawn_out_of_a_row_that_is_too_wide() -> None:
+    with pytest.raises(NoGrasp, match="is safe"):
+        planned(WALL)
+    p = planned(measured(WALL))
+    assert p.pressed and p.logs in {(0,), (6,)} and "drawn out of a row of 7 logs" in p.reason
+    end = WALL[p.logs[0]].center_m[1]
+    inner, outer = sorted((p.y_m - JAWS.half_gap_m, p.y_m + JAWS.half_gap_m), key=lambda y: abs(y - Y))
+    assert abs(inner - end) == pytest.approx(0.14, abs=0.001) and abs(inner - Y) < abs(end - Y), (
+        "in the valley beside it"
+    )
+    assert abs(outer - Y) > abs(end - Y) + 1.0, "and on free ground"
+    assert p.logs == (0,)
+    beside = SamplingPlanner()(ARM, measured([*WALL, log(9, -1.6)]), 0.0, 0.0, stay=(7,))
+    assert beside.logs == (6,), "where another lies there is no room"
+    laden = SamplingPlanner()(ARM, measured([*WALL, on_top(WALL[0], WALL[1])]), 0.0, 0.0, stay=(7,))
+    assert laden.logs == (6,), "none that another lies on, where the others are free"
+
+
+def on_top(a: LogObservation, b: LogObservation) -> LogObservation:
+    """A log in the valley between two."""
+    (x, ya, z), yb = a.center_m, b.center_m[1]
+    return replace(a, id=8, center_m=(x, 0.5 * (ya + yb), z + 0.21))
+
+
+def test_where_no_grasp_is_safe_a_camera_s_logs_are_gripped_at_the_top_all_the_same() -> None:
+    p = SamplingPlanner()(ARM, measured(WALL), 0.0, 0.0, stay=(0, 6))
+    assert p.probability == 0.3 and len(p.logs) == 1 and "sure" in p.reason and "\n" not in p.reason
+    one = WALL[p.logs[0]]
+    assert np.hypot(p.x_m - one.center_m[0], p.y_m - one.center_m[1]) < 0.01
+
+
+def test_on_wheels_nothing_is_pressed_lower_than_the_lowest_log() -> None:
+    arm = Arm(load_profile("aoro_fc8"))
+    x, y = arm.profile.workspace.pick_center_m
+    logs = measured([LogObservation(i, (x, y + 0.25 * i, -1.0), (1.0, 0.0, 0.0), 2.6, 0.2) for i in range(-4, 5)])
+    p = SamplingPlanner()(arm, logs, 0.0, 0.0)
+    assert p.support_z_m >= -1.1 - 1e-6
