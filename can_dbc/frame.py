@@ -24,6 +24,10 @@ class Frame(NamedTuple):
     data: bytes
 
 
+RawFrame = tuple[int, bytes]
+"""A frame to send, without a time: key and 0 to 8 payload bytes."""
+
+
 def identifier(key: int) -> int:
     """The identifier of a key without its kind bits."""
     return key & (EXTENDED_MASK if key & EXTENDED else STANDARD_MASK)

@@ -13,14 +13,18 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from autonomy.perception.log_list.observation import LogObservation
-from can_dbc.messages.crane import DatagramRefused, StateReport, VehicleReport, decode
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import decode
+from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.timing.page import Timing
 from console.mission_state import MissionWatch, describe_carrier
-from machine import faults, grapple, kinematics
-from machine.joints import ARTICULATION, JOINTS, Joint
-from machine.modes import Mode
+from machine.geometry import grapple, kinematics
+from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
-from machine.reasons import ENCODER_BIT
+from machine.status import faults
+from machine.status.modes import Mode
+from machine.status.stale_inputs import STALE_INPUT_NAMES
 
 ALIVE_NS: Final = 300_000_000
 """A controller that has said nothing for this long is shown as lost."""
@@ -30,12 +34,6 @@ TIMING_OLD_NS: Final = 3_000_000_000
 
 PARTS: Final = ("column", "boom", "stick", "telescope", "grapple")
 _NAMES: Final = tuple((j.name.lower(), PARTS[j]) for j in JOINTS)
-STALE_NAMES: Final = {
-    0: "emergency stop", 1: "guard", 8: "valves A", 9: "valves B", 10: "PLC",
-    11: "pressures A", 12: "pressures B", 13: "pressures C", 14: "grapple", 15: "carrier",
-    ENCODER_BIT + ARTICULATION: "articulation encoder",
-} | {ENCODER_BIT + j: f"{j.name.lower()} encoder" for j in JOINTS}  # fmt: skip
-"""Bits of ``StateReport.stale_mask``."""
 
 
 def describe_machine(profile: Profile) -> dict[str, Any]:
@@ -123,7 +121,7 @@ class Watch:
             "frames_per_s": _rate(window),
             "refused": r.refused,
             "refusal": _sentence(r.refusal) if r.refusal else "",
-            "stale": [STALE_NAMES.get(b, f"bit {b}") for b in range(16) if r.stale_mask >> b & 1],
+            "stale": [STALE_INPUT_NAMES.get(b, f"bit {b}") for b in range(16) if r.stale_mask >> b & 1],
             **self._drawing(r),
         }
 

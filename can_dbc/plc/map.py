@@ -103,8 +103,6 @@ class Grapple(IntEnum):
 NO_AXIS: Final = 15
 RANGE_MARGIN: Final = 0.05
 """How far past a joint's range [rad, m] a reference may lie: a machine found there must be able to hold still."""
-HEADROOM: Final = 1.25
-"""Greatest rate over the joint's speed limit, so that a stop from a correction can fade out."""
 
 
 class MapError(ValueError):
@@ -160,12 +158,12 @@ class Bounds:
 
     @classmethod
     def references(cls, joints: Sequence[tuple[float, float, float]]) -> Bounds:
-        """Those of role REFERENCES, from (lower, upper, speed limit) of every joint."""
+        """Those of role REFERENCES, from (lower, upper, greatest rate) of every joint."""
         spare = N_AXES - N_JOINTS
         return cls(
             Role.REFERENCES,
             tuple((lower - RANGE_MARGIN, upper + RANGE_MARGIN) for lower, upper, _ in joints) + ((0.0, 0.0),) * spare,
-            tuple(HEADROOM * speed for _, _, speed in joints) + (0.0,) * spare,
+            tuple(rate for _, _, rate in joints) + (0.0,) * spare,
         )
 
     @classmethod

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple
 
+from can_dbc.frame import RawFrame
+
 NMT_ID: Final = 0x000
 SYNC_ID: Final = 0x080
 EMCY_BASE: Final = 0x080
@@ -21,8 +23,6 @@ SDO_TO_CLIENT: Final = 0x580
 SDO_TO_SERVER: Final = 0x600
 HEARTBEAT_BASE: Final = 0x700
 MAX_NODE: Final = 127
-
-Wire = tuple[int, bytes]
 
 
 class NmtCommand(IntEnum):
@@ -44,12 +44,12 @@ class NodeState(IntEnum):
     PRE_OPERATIONAL = 0x7F
 
 
-def nmt_frame(command: NmtCommand, node: int = 0) -> Wire:
+def nmt_frame(command: NmtCommand, node: int = 0) -> RawFrame:
     """The NMT command for a node, or for all nodes with 0."""
     return NMT_ID, bytes((command, node))
 
 
-def sync_frame(counter: int) -> Wire:
+def sync_frame(counter: int) -> RawFrame:
     """SYNC with its counter, 1 to 240; see ``next_sync``."""
     return SYNC_ID, bytes((counter,))
 
@@ -59,7 +59,7 @@ def next_sync(counter: int) -> int:
     return counter % 240 + 1
 
 
-def heartbeat_frame(node: int, state: NodeState) -> Wire:
+def heartbeat_frame(node: int, state: NodeState) -> RawFrame:
     """The heartbeat of a node; BOOT_UP is the boot-up message."""
     return HEARTBEAT_BASE + node, bytes((state,))
 
@@ -109,7 +109,7 @@ def parse_emergency(key: int, data: bytes) -> Emergency | None:
     return Emergency(node, data[0] | data[1] << 8, data[2], data[3:8])
 
 
-def emergency_frame(emergency: Emergency) -> Wire:
+def emergency_frame(emergency: Emergency) -> RawFrame:
     """The frame of an emergency message; the maker's bytes are filled up with zeros."""
     data = struct.pack("<HB5s", emergency.code, emergency.register, emergency.manufacturer)
     return EMCY_BASE + emergency.node, data
@@ -271,27 +271,27 @@ def abort_text(code: int) -> str:
     return f"{ABORT_TEXTS.get(code, 'unknown abort code')} (0x{code:08X})"
 
 
-def upload_request(node: int, index: int, sub: int) -> Wire:
+def upload_request(node: int, index: int, sub: int) -> RawFrame:
     """Client: ask a node for an object."""
     return SDO_TO_SERVER + node, struct.pack("<BHB4x", 0x40, index, sub)
 
 
-def download_request(node: int, index: int, sub: int, data: bytes) -> Wire:
+def download_request(node: int, index: int, sub: int, data: bytes) -> RawFrame:
     """Client: write 1 to 4 bytes, little-endian, to an object of a node."""
     return SDO_TO_SERVER + node, _expedited(0x23, index, sub, data)
 
 
-def upload_response(node: int, index: int, sub: int, data: bytes) -> Wire:
+def upload_response(node: int, index: int, sub: int, data: bytes) -> RawFrame:
     """Server: answer an upload with 1 to 4 bytes."""
     return SDO_TO_CLIENT + node, _expedited(0x43, index, sub, data)
 
 
-def download_response(node: int, index: int, sub: int) -> Wire:
+def download_response(node: int, index: int, sub: int) -> RawFrame:
     """Server: confirm a download."""
     return SDO_TO_CLIENT + node, struct.pack("<BHB4x", 0x60, index, sub)
 
 
-def abort_frame(base: int, node: int, index: int, sub: int, code: int) -> Wire:
+def abort_frame(base: int, node: int, index: int, sub: int, code: int) -> RawFrame:
     """Either side ends a transfer; ``base`` is SDO_TO_CLIENT or SDO_TO_SERVER."""
     return base + node, struct.pack("<BHBI", 0x80, index, sub, code)
 

@@ -6,98 +6,47 @@ controller sets it up again as it would a device that had lost its supply.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from typing import Final
 
-from can_dbc.canopen import (
-    SDO_TO_CLIENT,
-    NmtCommand,
-    NodeState,
-    SdoKind,
-    Wire,
-    abort_frame,
-    download_response,
-    heartbeat_frame,
-    parse_request,
-    upload_response,
-)
-from can_dbc.codec import MessageCodec
-from controller.outputs import Every
-from machine.encoder import counts_from_position
+from can_dbc.dbc.codec import MessageCodec
+from can_dbc.frame import RawFrame
+from can_dbc.protocols.canopen import NodeState, heartbeat_frame
+from can_dbc.protocols.canopen_slave import HEARTBEAT_MS, CanopenSlave, Objects
+from controller.bus_io.messages import PeriodicTimer
 from machine.profile import Encoder
+from machine.sensing.encoder import counts_from_position
 
-HEARTBEAT_NS: Final = 100_000_000
-_NO_OBJECT, _READ_ONLY, _WRONG_LENGTH, _NO_SEGMENTS = 0x0602_0000, 0x0601_0002, 0x0607_0010, 0x0504_0001
+HEARTBEAT_NS: Final = HEARTBEAT_MS * 1_000_000
 _NOT_VALID: Final = 0x8000_0000
 _TPDO1: Final = 0x180
 _MAPPINGS: Final = {
     "rotary": (0x6004_0020, 0x2120_0010, 0x6503_0010),
     "linear": (0x6004_0020, 0x6030_0110, 0x5122_0108, 0x5122_0208),
 }
-Objects = dict[tuple[int, int], bytes]
 
 
-class PlayedNode:
+class PlayedNode(CanopenSlave):
     """A node with heartbeat and SDO server.  ``starts`` says whether it goes operational by itself."""
 
-    def __init__(self, node: int, objects: Objects, starts: bool) -> None:
-        self.node = node
-        self._initial: Objects = {
-            (0x1000, 0): bytes(4), (0x1001, 0): bytes(1), (0x1017, 0): (100).to_bytes(2, "little"),
-            (0x1018, 0): b"\x02", (0x1018, 1): bytes(4), (0x1018, 2): node.to_bytes(4, "little"),
-        } | objects  # fmt: skip
+    def __init__(
+        self, node: int, objects: Objects, starts: bool, writable: Set[tuple[int, int]] = frozenset()
+    ) -> None:
+        super().__init__(node, objects, writable)
+        self._initial = dict(self.objects)
         self._starts = starts
-        self._writable: frozenset[tuple[int, int]] = frozenset()
-        self._heartbeat = Every(HEARTBEAT_NS)
-        self.boot()
+        self._heartbeat = PeriodicTimer(HEARTBEAT_NS)
 
     def boot(self) -> None:
         """As after power-on."""
         self.state = NodeState.BOOT_UP
+        self.restart()
+
+    def restart(self) -> None:
+        """The object dictionary is as delivered again."""
         self.objects = dict(self._initial)
 
-    @property
-    def operational(self) -> bool:
-        """Whether it sends its PDOs."""
-        return self.state is NodeState.OPERATIONAL
-
-    def receive_nmt(self, data: bytes) -> None:
-        """An NMT command."""
-        if len(data) != 2 or data[1] not in (0, self.node):
-            return
-        match data[0]:
-            case NmtCommand.START:
-                self.state = NodeState.OPERATIONAL
-            case NmtCommand.STOP:
-                self.state = NodeState.STOPPED
-            case NmtCommand.ENTER_PRE_OPERATIONAL:
-                self.state = NodeState.PRE_OPERATIONAL
-            case NmtCommand.RESET_NODE | NmtCommand.RESET_COMMUNICATION:
-                self.boot()
-
-    def receive_sdo(self, key: int, data: bytes) -> Wire | None:
-        """The answer to an SDO request to this node."""
-        request = parse_request(key, data)
-        if request is None or request.node != self.node or request.kind is SdoKind.ABORT:
-            return None
-        entry = (request.index, request.sub)
-        value = self.objects.get(entry)
-        if value is None:
-            code = _NO_OBJECT
-        elif request.kind is SdoKind.UPLOAD:
-            return upload_response(self.node, *entry, value)
-        elif request.kind is SdoKind.SEGMENTED:
-            code = _NO_SEGMENTS
-        elif entry not in self._writable:
-            code = _READ_ONLY
-        elif len(request.data) != len(value):
-            code = _WRONG_LENGTH
-        else:
-            self.objects[entry] = request.data
-            return download_response(self.node, *entry)
-        return abort_frame(SDO_TO_CLIENT, self.node, *entry, code)
-
-    def tick(self, now_ns: int, out: list[Wire]) -> None:
+    def tick(self, now_ns: int, out: list[RawFrame]) -> None:
         """Boot-up message and heartbeat."""
         if self.state is NodeState.BOOT_UP:
             out.append(heartbeat_frame(self.node, NodeState.BOOT_UP))
@@ -126,12 +75,11 @@ class PlayedEncoder(PlayedNode):
                 (0x1000, 0): spec.device_type.to_bytes(4, "little"), (0x6000, 0): bytes(2), (0x6003, 0): bytes(4),
                 (0x6509, 0): bytes(4), (0x6002, 0): spec.total_counts.to_bytes(4, "little"),
             } | scale | dict(communication),
-            starts=False,
+            starts=False, writable=frozenset(communication) | {(0x1017, 0)},
         )  # fmt: skip
-        self._writable = frozenset(communication) | {(0x1017, 0)}
         self._mapping = _MAPPINGS[spec.kind]
 
-    def answer(self, position: float, velocity: float, now_ns: int) -> Wire | None:
+    def answer(self, position: float, velocity: float, now_ns: int) -> RawFrame | None:
         """TPDO1 in answer to SYNC, when it is set up for that as crane.dbc says."""
         if not self.operational or not self._mapped():
             return None

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from typing import Final
 
-from can_dbc.codec import Database
+from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame
 from can_dbc.plc import map as plc
 from can_dbc.plc.map import N_AXES, N_JOINTS, Bounds, Command, Feedback, Grapple, MapError, Mode, Role, State
-from controller.message_state import Slot, age_out
-from controller.outputs import ARM_KEY
+from controller.bus_io.message_state import MessageState, age_out
+from controller.bus_io.messages import ARM_KEY
 from machine.joints import JOINTS
-from machine.modes import Mode as ControllerMode
+from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.profile import Profile, joint
+from machine.status.modes import Mode as ControllerMode
 
 SYNC_NS: Final = 15_000_000
 RESET_NS: Final = 200_000_000
@@ -26,7 +27,7 @@ _DEGRADED: Final = 1
 _REFERENCES: Final = ("JointRefA", "JointRefB", "JointRefC")
 
 
-class Exit:
+class ExitCode:
     """ValveFbB.ExitCode (ISO 11783-7 reasons): why the node does not follow."""
 
     OK, SAFETY_STOP, GUARD_MISSING, COMMAND_TIMEOUT, OUT_OF_RANGE, NOT_ARMED, FUNCTION_FAULT = 0, 2, 4, 5, 6, 8, 9
@@ -41,11 +42,11 @@ class ValveGate:
         self._bounds = (
             Bounds.valves()
             if role is Role.VALVES
-            else Bounds.references([(s.lower, s.upper, s.speed_limit) for s in specs])
+            else Bounds.references([(s.lower, s.upper, SPEED_HEADROOM_SHARE * s.speed_limit) for s in specs])
         )
         names = ["ValveCmdA", "ValveCmdB", "GuardStat", "CtrlStatus"]
         names += _REFERENCES if role is Role.REFERENCES else ()
-        slots = [Slot(database.message(name), bit) for bit, name in enumerate(names)]
+        slots = [MessageState(database.message(name), bit) for bit, name in enumerate(names)]
         self._a, self._b, self._guard, self._status, *self._references = slots
         self._slots = tuple(slots)
         self._by_key = {slot.codec.key: slot for slot in slots}
@@ -56,12 +57,12 @@ class ValveGate:
         self._locked = 0
         self._reset_until_ns = 0
         self.refused = 0
-        self.exit = Exit.NOT_ARMED
+        self.exit = ExitCode.NOT_ARMED
 
-    def _place(self, signal: str) -> tuple[Slot, str]:
+    def _place(self, signal: str) -> tuple[MessageState, str]:
         return (self._a if signal in self._a.codec.index else self._b), signal
 
-    def _reference(self, name: str) -> tuple[Slot, str]:
+    def _reference(self, name: str) -> tuple[MessageState, str]:
         return next(slot for slot in self._references if name in slot.codec.index), name
 
     def receive(self, frame: Frame, now_ns: int) -> None:
@@ -94,7 +95,7 @@ class ValveGate:
             self._locked = missing
         asked = self._b.get("ArmKey") == ARM_KEY
         self._armed = not missing and not self._locked and asked
-        self.exit = self._locked or missing or (Exit.OK if asked else Exit.NOT_ARMED)
+        self.exit = self._locked or missing or (ExitCode.OK if asked else ExitCode.NOT_ARMED)
         if not self._armed:
             return Command(reset=self._wants_reset(now_ns, feedback))
         command = self._wanted()
@@ -102,8 +103,8 @@ class ValveGate:
             self._bounds.check(command)
         except MapError:
             self.refused += 1
-            self._armed, self._locked = False, Exit.OUT_OF_RANGE
-            self.exit = Exit.OUT_OF_RANGE
+            self._armed, self._locked = False, ExitCode.OUT_OF_RANGE
+            self.exit = ExitCode.OUT_OF_RANGE
             return Command()
         return command
 
@@ -111,11 +112,11 @@ class ValveGate:
         """What keeps us from passing a command on, as an exit code; 0 when nothing does."""
         slots = (self._a, self._b, *self._references)
         if any(slot.values is None for slot in slots) or now_ns - self._sync_ns > SYNC_NS:
-            return Exit.COMMAND_TIMEOUT
+            return ExitCode.COMMAND_TIMEOUT
         if self._guard.get("Enable") != ARM_KEY:
-            return Exit.GUARD_MISSING
+            return ExitCode.GUARD_MISSING
         if self._a.get("Mode") not in (0, _MOVES):
-            return Exit.OUT_OF_RANGE
+            return ExitCode.OUT_OF_RANGE
         return 0
 
     def _wanted(self) -> Command:

@@ -1,8 +1,9 @@
-"""Many independent trials on all cores: spawned processes, results in the order of the jobs, a checkpoint on disk.
+"""Runs independent trials on all cores in spawned processes, with a checkpoint on disk.
 
-A job is plain data; ``function(job)`` runs in a worker and returns plain (JSON) data that depends on the job alone, so
-the number of workers changes nothing.  Finished jobs are written to the checkpoint at once; after an interruption the
-same call takes them from there.  Workers never see Ctrl-C: the parent ends them.
+A job is plain data.  ``function(job)`` runs in a worker and returns plain (JSON) data that depends on the job alone, so
+the number of workers does not change a result.  Outcomes come back in the order of the jobs.  Every finished job is
+written to the checkpoint at once; after an interruption the same call continues from there.  Workers ignore Ctrl-C: the
+parent ends them.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any, Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from autonomy.memory import keep_memory
+from runtime.allocator import keep_memory
 
 WAITING_PER_WORKER: Final = 2
 ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -29,7 +30,7 @@ ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREA
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One trial: a name that is unique in the run, the kind of trial, its seed and further plain arguments."""
+    """One trial: a name unique in the run, the kind of trial, its seed and further plain arguments."""
 
     name: str
     kind: str
@@ -38,9 +39,10 @@ class Job:
 
 
 class Checkpoint:
-    """Finished jobs in a file of JSON lines; the first line says which run they belong to.
+    """Finished jobs in a file of JSON lines; the first line holds the fingerprint of the run they belong to.
 
-    Where there is none of this run, those are taken that were ``published``, the same lines as an xz file.
+    If the file holds no jobs of this run, those in ``published`` are used: the same lines in an xz file.  Jobs of
+    another fingerprint are ignored, so that the run starts anew.
     """
 
     def __init__(self, path: Path, fingerprint: str, published: Path | None = None) -> None:
@@ -53,36 +55,49 @@ class Checkpoint:
         path.write_text("\n".join(lines) + "\n")
         self._file = path.open("a")
 
-    def add(self, name: str, outcome: Any) -> Any:
-        """Keep a finished job; returns it as it will be read back."""
+    def add(self, name: str, outcome: Any) -> None:
+        """Store a finished job."""
         line = json.dumps([name, outcome])
         self._file.write(line + "\n")
         self._file.flush()
         self.done[name] = json.loads(line)[1]
 
     def publish(self) -> None:
-        """Write what is done where it is to be published, if anywhere."""
+        """Write the finished jobs to the published file, if there is one."""
         if self._published is not None:
             self._published.parent.mkdir(parents=True, exist_ok=True)
             with lzma.open(self._published, "wb") as file:
                 file.write(self._path.read_bytes())
 
     def close(self) -> None:
-        """The file stays, for the next run."""
+        """Close the file; it stays on disk for the next run."""
         self._file.close()
 
     def __enter__(self) -> Checkpoint:
         return self
 
     def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
-        """A run that is complete removes the file, one that broke off leaves it."""
+        """Remove the file after a complete run; an interrupted run leaves it."""
         self.close()
         if failure is None:
             self._path.unlink()
 
 
+def read_published(path: Path) -> dict[str, Any]:
+    """The outcomes of a published file by the names of their jobs, whichever run made them.
+
+    Raises:
+        ValueError: the file is missing or damaged.
+    """
+    try:
+        _, *lines = lzma.decompress(path.read_bytes()).decode().splitlines()
+    except (OSError, lzma.LZMAError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from None
+    return _outcomes(lines)
+
+
 def _read(path: Path, fingerprint: str) -> dict[str, Any]:
-    """The finished jobs in a file, by name; none when it is of another run or cannot be read."""
+    """The finished jobs in a file, by name; none if it belongs to another run or cannot be read."""
     try:
         data = path.read_bytes()
         head, *lines = (lzma.decompress(data) if path.suffix == ".xz" else data).decode().splitlines()
@@ -90,12 +105,16 @@ def _read(path: Path, fingerprint: str) -> dict[str, Any]:
             return {}
     except (OSError, ValueError, lzma.LZMAError):
         return {}
+    return _outcomes(lines)
+
+
+def _outcomes(lines: Sequence[str]) -> dict[str, Any]:
     done = {}
     for line in lines:
         try:
             name, outcome = json.loads(line)
         except ValueError:
-            break  # the run was cut off while it wrote this line
+            break  # the run was interrupted while it wrote this line
         done[name] = outcome
     return done
 
@@ -108,7 +127,7 @@ def run(
     title: str,
     console: Console,
 ) -> dict[str, Any]:
-    """Outcome of every job by name, in the order of ``jobs``; an exception in a trial comes out with its name."""
+    """Outcome of every job by name, in the order of ``jobs``; an exception in a trial names the trial in a note."""
     todo = [job for job in jobs if job.name not in checkpoint.done]
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as progress:
@@ -154,7 +173,7 @@ def _run_parallel(
 
 def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    keep_memory()  # as the machine's eyes do, whose time is measured
+    keep_memory()  # as the detector process of the machine does, whose time is measured
 
 
 def _named(function: Callable[[Job], Any], job: Job) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from machine.crane_nodes import NODE_NAMES
 from machine.joints import ARTICULATION, JOINTS
 from machine.status.driving_faults import DRIVING
 from machine.status.reasons import About, Fault, Reaction, Reason
@@ -248,10 +249,6 @@ FAULTS: Final[dict[Reason, Fault]] = {
     **REFUSALS,
 }
 
-_NODE_NAMES: Final = {
-    0x01: "the safety module", 0x10: "the valve node", 0x20: "pressure module A", 0x21: "pressure module B",
-    0x22: "pressure module C", 0x7D: "the guard",
-}  # fmt: skip
 _BUS_NAMES: Final = ("the crane bus", "the machine bus")
 _ARM_NAMES: Final = ("front left", "front right", "rear left", "rear right")
 
@@ -269,7 +266,7 @@ def describe(reason: int, detail: int = 0) -> str:
         if detail < len(JOINTS):
             subject = f"joint {JOINTS[detail].name.lower()}"
     elif fault.about is About.NODE:
-        subject = _NODE_NAMES.get(detail, f"node {detail}")
+        subject = NODE_NAMES.get(detail, f"node {detail}")
     elif fault.about is About.BUS:
         subject = _BUS_NAMES[detail] if detail < len(_BUS_NAMES) else f"bus {detail}"
     elif fault.about is About.ARM:

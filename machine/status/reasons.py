@@ -6,11 +6,7 @@ The numbers travel in ``CtrlStatus.Reason`` (8 bits) and, with the detail above 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Final, NamedTuple
-
-ENCODER_BIT: Final = 2
-"""In the mask of stale inputs (``StateReport.stale_mask``) the encoder of a joint has bit ``ENCODER_BIT + joint``, that
-of the articulation ``ENCODER_BIT + ARTICULATION``."""
+from typing import NamedTuple
 
 
 class Reaction(IntEnum):

@@ -10,84 +10,36 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from can_dbc.dbc.codec import Database
-from can_dbc.protocols.canopen import (
-    HEARTBEAT_BASE,
-    SDO_TO_CLIENT,
-    Emergency,
-    NmtCommand,
-    NodeState,
-    SdoKind,
-    abort_frame,
-    emergency_frame,
-    parse_request,
-    upload_response,
-)
+from can_dbc.protocols.canopen import HEARTBEAT_BASE, Emergency, NodeState, emergency_frame
+from can_dbc.protocols.canopen_slave import HEARTBEAT_MS, CanopenSlave
+from machine.crane_nodes import CraneNode
 from sim.nodes import Outbox
-from sim.nodes.messages import MS, Every, ProtectedMessage
+from sim.nodes.messages import MS, PeriodicTimer, ProtectedMessage
 
-HEARTBEAT_NS = 100 * MS
+HEARTBEAT_NS = HEARTBEAT_MS * MS
 PA_PER_BAR = 1e5
-NO_OBJECT, READ_ONLY, NO_SEGMENTS = 0x0602_0000, 0x0601_0002, 0x0504_0001
 
 
-class Device:
+class Device(CanopenSlave):
     """A node with NMT state and heartbeat."""
 
     def __init__(self, node: int, outbox: Outbox) -> None:
-        self.node, self.outbox = node, outbox
-        self.state = NodeState.BOOT_UP
-        self._heartbeat = Every(HEARTBEAT_NS, phase_ns=node * MS)
-        self._objects = {
-            (0x1000, 0): bytes(4),
-            (0x1001, 0): bytes(1),
-            (0x1017, 0): (HEARTBEAT_NS // MS).to_bytes(2, "little"),
-            (0x1018, 0): b"\x02",
-            (0x1018, 1): bytes(4),
-            (0x1018, 2): node.to_bytes(4, "little"),
-        }
+        super().__init__(node, {})
+        self.outbox = outbox
+        self._heartbeat = PeriodicTimer(HEARTBEAT_NS, phase_ns=node * MS)
         self._emergency = 0
-
-    @property
-    def operational(self) -> bool:
-        return self.state == NodeState.OPERATIONAL
-
-    def receive_nmt(self, data: bytes) -> None:
-        """An NMT command frame."""
-        if len(data) != 2 or data[1] not in (0, self.node):
-            return
-        match data[0]:
-            case NmtCommand.START:
-                self.state = NodeState.OPERATIONAL
-            case NmtCommand.STOP:
-                self.state = NodeState.STOPPED
-            case NmtCommand.ENTER_PRE_OPERATIONAL:
-                self.state = NodeState.PRE_OPERATIONAL
-            case NmtCommand.RESET_NODE | NmtCommand.RESET_COMMUNICATION:
-                self.state = NodeState.BOOT_UP
-                self.restart()
-
-    def restart(self) -> None:
-        """Forget run-time state after an NMT reset."""
 
     def receive_sdo(self, key: int, data: bytes) -> None:
         """Answer an SDO request to this node; others are ignored."""
-        request = parse_request(key, data)
-        if request is None or request.node != self.node or request.kind is SdoKind.ABORT:
-            return
-        node, index, sub = self.node, request.index, request.sub
-        value = self._objects.get((index, sub))
-        if request.kind is SdoKind.UPLOAD and value is not None:
-            self.outbox.append(upload_response(node, index, sub, value))
-            return
-        known = NO_SEGMENTS if request.kind is SdoKind.SEGMENTED else READ_ONLY
-        code = NO_OBJECT if value is None else known
-        self.outbox.append(abort_frame(SDO_TO_CLIENT, node, index, sub, code))
+        answer = self.sdo_answer(key, data)
+        if answer is not None:
+            self.outbox.append(answer)
 
     def set_emergency(self, code: int) -> None:
         """The node finds a fault of its own (CiA 301 emergency code), or with 0 that it is over; a change is sent."""
         register = bytes((int(code != 0),))
         if code != self._emergency:
-            self._emergency, self._objects[0x1001, 0] = code, register
+            self._emergency, self.objects[0x1001, 0] = code, register
             self.outbox.append(emergency_frame(Emergency(self.node, code, register[0], bytes(5))))
 
     def tick(self, now_ns: int) -> None:
@@ -114,9 +66,9 @@ class EstopBox(Device):
     PILOT_BAR = 35.0
 
     def __init__(self, database: Database, outbox: Outbox) -> None:
-        super().__init__(0x01, outbox)
+        super().__init__(CraneNode.SAFETY_MODULE, outbox)
         self._message = ProtectedMessage(database, "EstopStat")
-        self._period = Every(10 * MS)
+        self._period = PeriodicTimer(10 * MS)
         self._channels = (1, 1)
         self._source = self._events = 0
         self._reset_until_ns: int | None = None
@@ -183,7 +135,7 @@ class PressureModule(Device):
         sense: Callable[[], Sequence[float]],
     ) -> None:
         super().__init__(node, outbox)
-        self._message, self._period = ProtectedMessage(database, message), Every(period_ns)
+        self._message, self._period = ProtectedMessage(database, message), PeriodicTimer(period_ns)
         self._sense = sense
 
     def cycle(self, now_ns: int) -> None:

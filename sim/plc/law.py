@@ -9,34 +9,34 @@ from __future__ import annotations
 
 import math
 
-from can_dbc.plc.map import HEADROOM
+from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.profile import JointSpec, Valve
 
-QUANTUM_RAD = math.radians(0.1)
-QUANTUM_M = 1e-4
+RESOLUTION_RAD = math.radians(0.1)
+RESOLUTION_M = 1e-4
 KP_1_S = 3.0
-KD = 0.1
+KD_GAIN = 0.1
 REST_S = 0.01
 ACCELERATION_FACTOR = 4.0
 END_GAIN_1_S = 4.0
-LINEAR = 0.01
+LINEAR_SHARE = 0.01
 
 
-def quantum(spec: JointSpec) -> float:
+def resolution(spec: JointSpec) -> float:
     """What one count of the PLC's feedback is worth."""
-    return QUANTUM_M if spec.kind == "prismatic" else QUANTUM_RAD
+    return RESOLUTION_M if spec.kind == "prismatic" else RESOLUTION_RAD
 
 
 def stop_band(spec: JointSpec) -> float:
     """Within this of its reference a joint rests: two counts, or what it does in 10 ms at its speed limit."""
-    return max(2.0 * quantum(spec), REST_S * spec.speed_limit)
+    return max(2.0 * resolution(spec), REST_S * spec.speed_limit)
 
 
-class Pd:
+class PdLaw:
     """The law of one joint; ``position`` and ``velocity`` are the PLC's feedback, in whole quanta."""
 
     def __init__(self, spec: JointSpec) -> None:
-        self._spec, self._quantum = spec, quantum(spec)
+        self._spec, self._resolution = spec, resolution(spec)
         self.position = self.velocity = 0.0
         self._filtered = 0.0
         self._known = False
@@ -49,12 +49,12 @@ class Pd:
 
     def measure(self, position: float, elapsed_s: float) -> None:
         """A reading of the encoder, ``elapsed_s`` after the last one."""
-        counted = round(position / self._quantum) * self._quantum
+        counted = round(position / self._resolution) * self._resolution
         if self._known:
             share = -math.expm1(-elapsed_s / self._spec.law.velocity_filter_s)
             self._filtered += share * ((counted - self.position) / elapsed_s - self._filtered)
         self.position, self._known = counted, True
-        self.velocity = round(self._filtered / self._quantum) * self._quantum
+        self.velocity = round(self._filtered / self._resolution) * self._resolution
 
     def step(self, q_ref: float, v_ref: float, speed: float, elapsed_s: float) -> float:
         """The valve's opening, -1..1; ``speed`` is the share of the speed limit that may be used."""
@@ -64,21 +64,22 @@ class Pd:
             error = q_ref - self.position
             band = stop_band(spec) if self._resting else 0.5 * stop_band(spec)
             self._resting = v_ref == 0.0 and abs(error) < band
-            command = 0.0 if self._resting else v_ref + KP_1_S * error + KD * (v_ref - self._filtered)
+            command = 0.0 if self._resting else v_ref + KP_1_S * error + KD_GAIN * (v_ref - self._filtered)
             command = min(command, max(0.0, (spec.upper - self.position) * END_GAIN_1_S))
             command = max(command, min(0.0, (spec.lower - self.position) * END_GAIN_1_S))
-        limit, change = HEADROOM * spec.speed_limit * speed, ACCELERATION_FACTOR * spec.acceleration_limit * elapsed_s
+        limit = SPEED_HEADROOM_SHARE * spec.speed_limit * speed
+        change = ACCELERATION_FACTOR * spec.acceleration_limit * elapsed_s
         command = min(max(command, -limit), limit)
         self._command = min(max(command, self._command - change), self._command + change)
-        return opening(spec.valve, self._command)
+        return valve_opening(spec.valve, self._command)
 
 
-def opening(valve: Valve, velocity: float) -> float:
+def valve_opening(valve: Valve, velocity: float) -> float:
     """The inverse of the valve's dead-band, linear in the first per cent."""
     if velocity >= 0.0:
         share, deadband, sign = velocity / valve.full_speed_plus, valve.deadband_plus_pct / 100.0, valve.sign
     else:
         share, deadband, sign = -velocity / valve.full_speed_minus, valve.deadband_minus_pct / 100.0, -valve.sign
     share = min(share, 1.0)
-    edge = deadband + (1.0 - deadband) * max(share, LINEAR)
-    return sign * (edge if share > LINEAR else edge * share / LINEAR)
+    edge = deadband + (1.0 - deadband) * max(share, LINEAR_SHARE)
+    return sign * (edge if share > LINEAR_SHARE else edge * share / LINEAR_SHARE)

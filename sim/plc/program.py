@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 from can_dbc.plc import map as plc
 from can_dbc.plc.map import N_JOINTS, Bounds, Estop, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
 from machine.joints import JOINTS
+from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.profile import Profile, joint
-from sim.plc.command_arbiter import MS, Gate
-from sim.plc.law import Pd
+from sim.plc.command_arbiter import MS, CommandArbiter
+from sim.plc.law import PdLaw
 
 CYCLE_NS = 10 * MS
-LAW_CYCLES = 2  # the joint law runs at 50 Hz
+LAW_CYCLE_COUNT = 2  # the joint law runs at 50 Hz
 HOLD_NS = 50 * MS
 RAMP_NS = 40 * MS
 HOLD_SHARE = -0.2  # a held grapple keeps a little closing flow, so that its pressure stays
@@ -41,21 +42,21 @@ def bounds_of(profile: Profile, role: Role) -> Bounds:
     if role is Role.VALVES:
         return Bounds.valves()
     specs = [joint(profile, j) for j in JOINTS]
-    return Bounds.references([(s.lower, s.upper, s.speed_limit) for s in specs])
+    return Bounds.references([(s.lower, s.upper, SPEED_HEADROOM_SHARE * s.speed_limit) for s in specs])
 
 
 class Program:
-    """The PLC: ``gate`` takes commands, ``outputs`` are the valves' openings -1..1 (five joints, grapple)."""
+    """The PLC: ``arbiter`` takes commands, ``outputs`` are the valves' openings -1..1 (five joints, grapple)."""
 
     def __init__(
         self, profile: Profile, role: Role, inputs: Callable[[int], Inputs], order: WordOrder = WordOrder.HIGH_FIRST
     ) -> None:
-        self.gate = Gate(bounds_of(profile, role), order)
+        self.arbiter = CommandArbiter(bounds_of(profile, role), order)
         self.state = State.INIT
         self.outputs = [0.0] * (N_JOINTS + 1)
         self.feedback = Feedback()
         self._inputs = inputs
-        self._laws = [Pd(joint(profile, j)) for j in JOINTS]
+        self._laws = [PdLaw(joint(profile, j)) for j in JOINTS]
         self._next_ns = self._measured_ns = 0
         self._cycles = self._longest_us = 0
         self._lost_ns: int | None = None
@@ -70,8 +71,8 @@ class Program:
 
     def status(self) -> list[int]:
         """The status block as it reads now; what was accepted since the last cycle is in it."""
-        feedback = replace(self.feedback, accepted=self.gate.sequence & 0xFFFF)
-        return plc.status_registers(feedback, self.gate.watchdog_ms, self.gate.order)
+        feedback = replace(self.feedback, accepted=self.arbiter.sequence & 0xFFFF)
+        return plc.status_registers(feedback, self.arbiter.watchdog_ms, self.arbiter.order)
 
     def _cycle(self, now_ns: int) -> None:
         inputs = self._inputs(now_ns)
@@ -84,29 +85,29 @@ class Program:
                 law.measure(position, elapsed_ns * 1e-9)
         self._decide(inputs.estop, now_ns)
         if self.state is State.EXECUTE:
-            if self._cycles % LAW_CYCLES == 0 or self.gate.command.mode is not Mode.REFERENCES:
-                self.outputs = self._obey()
+            if self._cycles % LAW_CYCLE_COUNT == 0 or self.arbiter.command.mode is not Mode.REFERENCES:
+                self.outputs = self._execute()
         elif self._lost_ns is not None:
             left = 1.0 - (now_ns - self._lost_ns) / RAMP_NS
             self.outputs = [max(0.0, left) * u for u in self._from]
         else:
             self.outputs = [0.0] * len(self.outputs)
-        self.feedback = self._say(inputs)
+        self.feedback = self._make_feedback(inputs)
 
     def _decide(self, estop: int, now_ns: int) -> None:
         """The state of this cycle."""
-        gate = self.gate
+        arbiter = self.arbiter
         may_move = estop & MAY_MOVE == MAY_MOVE
-        reset = gate.reset_edge()
+        reset = arbiter.take_reset_edge()
         if not may_move:
             self._make_safe(Fault.EMERGENCY_STOP)
-        elif gate.heard() and gate.commander(now_ns) is None:
+        elif arbiter.commanded() and arbiter.commander(now_ns) is None:
             self._make_safe(Fault.WATCHDOG)
-            gate.forget()
+            arbiter.release()
         elif self.state is State.SAFE:
-            if reset and not gate.command.armed:
+            if reset and not arbiter.command.armed:
                 self.state = State.HOLD
-        elif gate.heard() and gate.command.armed and gate.age_ns(now_ns) <= HOLD_NS and gate.fault is Fault.NONE:
+        elif arbiter.commanded() and arbiter.command.armed and arbiter.age_ns(now_ns) <= HOLD_NS and arbiter.fault is Fault.NONE:
             if self.state is not State.EXECUTE:
                 for law in self._laws:
                     law.reset()
@@ -120,15 +121,15 @@ class Program:
 
     def _make_safe(self, fault: Fault) -> None:
         self.state, self._lost_ns = State.SAFE, None
-        self.gate.note(fault)
+        self.arbiter.latch_fault(fault)
 
-    def _obey(self) -> list[float]:
-        command = self.gate.command
+    def _execute(self) -> list[float]:
+        command = self.arbiter.command
         out = [0.0] * (N_JOINTS + 1)
         if command.mode is Mode.VALVES:
             out[:N_JOINTS] = command.reference[:N_JOINTS]
         elif command.mode is Mode.REFERENCES:
-            speed, cycle_s = command.max_speed_pct / 100.0, LAW_CYCLES * CYCLE_NS * 1e-9
+            speed, cycle_s = command.max_speed_pct / 100.0, LAW_CYCLE_COUNT * CYCLE_NS * 1e-9
             out[:N_JOINTS] = [
                 law.step(command.reference[i], command.rate[i], speed, cycle_s) for i, law in enumerate(self._laws)
             ]
@@ -145,15 +146,15 @@ class Program:
                 out[-1] = HOLD_SHARE
         return out
 
-    def _say(self, inputs: Inputs) -> Feedback:
-        gate, spare = self.gate, (0.0,) * (plc.N_AXES - N_JOINTS)
+    def _make_feedback(self, inputs: Inputs) -> Feedback:
+        arbiter, spare = self.arbiter, (0.0,) * (plc.N_AXES - N_JOINTS)
         return Feedback(
             heartbeat=self._cycles & 0xFFFF,
             state=self.state,
-            fault=gate.fault,
-            fault_axis=gate.fault_axis,
+            fault=arbiter.fault,
+            fault_axis=arbiter.fault_axis,
             estop=inputs.estop,
-            accepted=gate.sequence & 0xFFFF,
+            accepted=arbiter.sequence & 0xFFFF,
             longest_cycle_us=self._longest_us,
             position=tuple(law.position for law in self._laws) + spare,
             velocity=tuple(law.velocity for law in self._laws) + spare,

@@ -152,7 +152,7 @@ def test_a_command_that_means_nothing_is_refused(register: int, value: int) -> N
 
 
 def test_bounds_name_the_axis() -> None:
-    bounds = Bounds.references([(-1.0, 1.0, 0.4)] * 5)
+    bounds = Bounds.references([(-1.0, 1.0, 0.5)] * 5)
     bounds.check(Command(Mode.REFERENCES, True, (1.05, *(0.0,) * 6), (0.5, *(0.0,) * 6)))
     bounds.check(Command(Mode.NEUTRAL, True, (9.0,) * 7))
     for reference, rate, axis in [

@@ -14,17 +14,16 @@ import pytest
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from autonomy.perception.logs import parse_logs, parse_question
-from can_dbc.setpoint import OperatorAction, OperatorCommand, StateReport, decode, encode
-from can_dbc.timing_page import TimingWriter
+from autonomy.perception.log_list.datagrams import decode_logs, decode_request
+from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
+from can_dbc.messages.datagrams import decode, encode
+from can_dbc.timing.page import TimingWriter
 from console.server import STATIC, Console, create_app
-from console.state import ALIVE_NS, STALE_NAMES, TIMING_OLD_NS, Watch, describe_machine
-from controller.carrier.inputs import STALE_BIT
-from controller.inputs import BITS
-from machine.joints import ARTICULATION, JOINTS
-from machine.load import load_profile, profile_hash
-from machine.modes import Mode
-from machine.reasons import ENCODER_BIT, Reason, pack
+from console.state import ALIVE_NS, TIMING_OLD_NS, Watch, describe_machine
+from machine.joints import JOINTS
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.status.modes import Mode
+from machine.status.reasons import Reason, pack
 
 PROFILE = load_profile("palms_471")
 HERE = "http://127.0.0.1:8471"
@@ -215,10 +214,10 @@ def test_logs_of_a_detector_are_shown(controller_socket):
     console = Console(PROFILE, 1, scene=controller_socket.getsockname())
     log = {"position_m": [1, 2, -1], "axis": [0, 2, 0], "length_m": 2.4, "diameter_m": 0.2}
     answer = json.dumps([log]).encode()
-    (known,) = parse_logs(answer)
+    (known,) = decode_logs(answer)
     with client_of(console) as client:
         question, peer = controller_socket.recvfrom(100)
-        assert all(value != value for value in parse_question(question)), "it has no joints to tell"
+        assert all(value != value for value in decode_request(question)), "it has no joints to tell"
         controller_socket.sendto(b'{"nonsense": 1}', peer)
         controller_socket.sendto(answer, peer)
         with client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
@@ -323,11 +322,6 @@ def test_drawing_hangs_the_grapple_below_the_pin():
     assert base == [0, 0, 0] and pin[:2] == grapple[:2] and pin[2] > rotator[2] > grapple[2]
     assert state["reference_points"][4] != pin
     assert state["tongs"]["yaw_rad"] == pytest.approx(0.4)
-
-
-def test_stale_names_are_the_controllers_bits():
-    bits = set(BITS.values()) | {STALE_BIT} | {ENCODER_BIT + j for j in (*JOINTS, ARTICULATION)}
-    assert set(STALE_NAMES) == bits
 
 
 def test_machine_description_names_every_joint_once():
