@@ -29,7 +29,7 @@ from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile
 from sim.ground.terrain import KINDS as TERRAINS
 from sim.plant import Plant
-from sim.process.live import TX_QUEUE
+from sim.process.live import TX_QUEUE_FRAMES
 from sim.process.live_plant import LivePlant
 from sim.scenes.arrangements import KINDS
 from sim.site.site_file import Site, load_site
@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> int:
         plant = _plant(profile, site, options)
         with contextlib.ExitStack() as stack:
             buses = {
-                name: stack.enter_context(open_bus(address, tx_queue=TX_QUEUE, participant="plant"))
+                name: stack.enter_context(open_bus(address, tx_queue=TX_QUEUE_FRAMES, participant="plant"))
                 for name, address in addresses.items()
             }
             live = LivePlant(plant, buses, options.port, options.seed, options.camera, site)

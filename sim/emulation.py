@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
+from machine.crane_nodes import CraneNode
 from machine.geometry.carrier import ARMS, height_from_arm_angle
 from machine.profile import Encoder, Profile
 from sim.nodes import Outbox
@@ -26,7 +27,7 @@ from sim.nodes.engine import EngineNode
 from sim.nodes.gnss import GnssNode
 from sim.nodes.imu import ImuNode
 from sim.nodes.messages import MS
-from sim.nodes.valve import CYCLE_NS, FUNCTIONS, Measured, ValveNode
+from sim.nodes.valve import CYCLE_NS, FUNCTIONS, ValveInputs, ValveNode
 from sim.nodes.vehicle import VehicleNode
 from sim.truth.load import Truth
 
@@ -34,7 +35,7 @@ SENSE_NS = 10 * MS
 """How often the carrier's own sensors are read."""
 
 
-class Surroundings(Protocol):
+class SensedWorld(Protocol):
     """What the nodes feel of a world: joints by name, oil, and the carrier (None on a machine without one)."""
 
     truth: Truth
@@ -64,7 +65,7 @@ class EmulatedMachine(ABC):
         profile: Profile,
         facts: Truth,
         seed: int,
-        world: Surroundings,
+        world: SensedWorld,
         step_ns: int,
         cycle_ns: int = CYCLE_NS,
     ) -> None:
@@ -96,9 +97,13 @@ class EmulatedMachine(ABC):
         self._devices: tuple[Device, ...] = (
             self.estop,
             self.valve,
-            PressureModule(0x20, "PressA", cycle_ns, database, out, lambda: self._chambers("lift", "tilt")),
-            PressureModule(0x21, "PressB", cycle_ns, database, out, lambda: self._chambers("ext", "slew")),
-            PressureModule(0x22, "PressC", 20 * MS, database, out, self._grapple_pressures),
+            PressureModule(
+                CraneNode.PRESSURES_A, "PressA", cycle_ns, database, out, lambda: self._chambers("lift", "tilt")
+            ),
+            PressureModule(
+                CraneNode.PRESSURES_B, "PressB", cycle_ns, database, out, lambda: self._chambers("ext", "slew")
+            ),
+            PressureModule(CraneNode.PRESSURES_C, "PressC", 20 * MS, database, out, self._grapple_pressures),
             *([] if self.imu is None else [self.imu]),
         )
         specs: dict[str, Encoder] = {n: s.encoder for n, s in self.profile.joints.items() if s.encoder is not None}
@@ -185,11 +190,11 @@ class EmulatedMachine(ABC):
         if self._machine_nodes and self._steps % self._sense_steps == 0:
             self._measure_carrier()
 
-    def _sense_valves(self) -> Measured:
+    def _sense_valves(self) -> ValveInputs:
         """What the PLC's inputs show now."""
         w, h = self._surroundings, self._surroundings.hydraulics
         spools, (opening, closing) = h.spools, self._pressures()["grapple"]
-        return Measured(
+        return ValveInputs(
             spools=tuple(spools[name] for name in FUNCTIONS),
             flow_limited=h.flow_limited,
             opening=w.opening if self.profile.grapple.opening_sensor else None,

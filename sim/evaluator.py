@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from sim.geometry.shape import UNIT, Vector
+from sim.geometry.shape import IDENTITY, Vector
 from sim.wood.bunk import to_bunk
 from sim.wood.logs import LogState
 from sim.world import STEP_S, World
@@ -24,7 +24,7 @@ FLEX: Final = ("flex_pitch", "flex_roll")
 
 
 @dataclass(frozen=True, slots=True)
-class LogVerdict:
+class LogEvaluation:
     """One log.  ``lifted``: raised by the crane over LIFTED_M; ``left_ground``: by LEFT_GROUND_M more than it lay.
     ``in_bunk``: centre over the bunk, both ends between the stakes, on the floor or on logs; ``released``: the crane
     does not touch it.  ``max_grip_n``: largest sum of the tongs' normal forces on it.
@@ -44,7 +44,7 @@ class LogVerdict:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Evaluation:
     """The run so far.  ``success``: every log done.  Energy is hydraulic, from the pump.
 
     ``tip_m`` is where the hanger pin truly is, ``rigid_tip_m`` where it would be on a stiff column, both in the crane's
@@ -53,7 +53,7 @@ class Verdict:
     column brings into the crane's foot.
     """
 
-    logs: tuple[LogVerdict, ...]
+    logs: tuple[LogEvaluation, ...]
     success: bool
     loaded: int
     max_penetration_m: float
@@ -71,12 +71,12 @@ class Verdict:
     max_load_kg: float
 
 
-class Judge:
+class Evaluator:
     """``watch`` once per physics step; ``verdict`` at any time."""
 
     def __init__(self, world: World) -> None:
         self._w = world
-        logs = world.yard.states()
+        logs = world.log_bodies.states()
         n = len(logs)
         self._lay_m = [self._clearance(log) for log in logs]
         self._lifted, self._left, self._rest_s = [False] * n, [False] * n, [0.0] * n
@@ -93,7 +93,7 @@ class Judge:
             return
         w = self._w
         touched, grip = w.touched(), w.grip_n
-        for i, log in enumerate(w.yard.states()):
+        for i, log in enumerate(w.log_bodies.states()):
             v = log.speed_m_s
             self._speed[i], self._grip[i] = max(self._speed[i], v), max(self._grip[i], grip[i])
             self._rest_s[i] = self._rest_s[i] + EVERY_STEPS * STEP_S if v < REST_M_S else 0.0
@@ -117,15 +117,15 @@ class Judge:
         places = zip((log.position_m, *log.ends_m), (0.0, fall, -fall), strict=True)
         return min(p[2] - (log.diameter_m + d) / 2 - height(p[0], p[1]) for p, d in places)
 
-    def verdict(self) -> Verdict:
+    def evaluate(self) -> Evaluation:
         """Judgement at this moment."""
         w = self._w
         inward = w.client.invertTransform(*w.base_pose())
         logs = tuple(
-            LogVerdict(
+            LogEvaluation(
                 lifted=self._lifted[i],
                 in_bunk=self._in_bunk(
-                    log, [w.client.multiplyTransforms(*inward, p, UNIT)[0] for p in (log.position_m, *log.ends_m)]
+                    log, [w.client.multiplyTransforms(*inward, p, IDENTITY)[0] for p in (log.position_m, *log.ends_m)]
                 ),
                 released=not touched,
                 at_rest=self._rest_s[i] >= REST_S,
@@ -133,10 +133,10 @@ class Judge:
                 max_speed_m_s=self._speed[i],
                 max_grip_n=self._grip[i],
             )
-            for i, (log, touched) in enumerate(zip(w.yard.states(), w.touched(), strict=True))
+            for i, (log, touched) in enumerate(zip(w.log_bodies.states(), w.touched(), strict=True))
         )
         tip, rigid = w.tip(), w.rigid_tip()
-        return Verdict(
+        return Evaluation(
             logs=logs,
             success=all(v.done for v in logs),
             loaded=sum(v.done for v in logs),

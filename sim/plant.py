@@ -13,7 +13,7 @@ from machine.geometry.carrier import ARMS
 from machine.joints import JOINTS
 from machine.profile import Profile
 from sim.emulation import EmulatedMachine
-from sim.evaluator import Judge, Verdict
+from sim.evaluator import Evaluation, Evaluator
 from sim.geometry.shape import Quaternion, Shape, Vector
 from sim.mechanics.carrier import PARKED, Drive, carrier_links
 from sim.mechanics.crane import crane_shapes
@@ -63,7 +63,7 @@ class Plant(EmulatedMachine):
     ) -> None:
         facts = load_truth(truth, seed, profile.name)
         self.world = World(profile, facts, seed, _scene(profile, facts, seed, logs, scene), terrain)
-        self._judge = Judge(self.world)
+        self._evaluator = Evaluator(self.world)
         self._floats = (False, False)
         # Commands come node by node; the world wants them in its own order.
         self._order = (*FUNCTIONS, "steer", *ARMS)
@@ -73,7 +73,7 @@ class Plant(EmulatedMachine):
 
     def _move(self, now_ns: int) -> None:
         self.world.step(*self._decide(now_ns))
-        self._judge.watch()
+        self._evaluator.watch()
 
     def _decide(self, now_ns: int) -> tuple[list[float], Drive]:
         """What the nodes and levers do to the valves and the drive in this step."""
@@ -119,15 +119,15 @@ class Plant(EmulatedMachine):
 
     def logs(self) -> list[LogState]:
         """Every log now, in the world frame: what a perfect detector sees."""
-        return self.world.yard.states()
+        return self.world.log_bodies.states()
 
     def joint_positions(self) -> tuple[float, ...]:
         """True joint positions in ``Joint`` order [rad, m]."""
         return tuple(self.world.q[j.name.lower()] for j in JOINTS)
 
-    def tong_angle(self) -> float:
+    def jaw_angle_rad(self) -> float:
         """True mean tong angle [rad], 0 open."""
-        return self.world.tong_angle
+        return self.world.jaw_angle_rad
 
     def link_poses(self) -> dict[str, tuple[Vector, Quaternion]]:
         """Link frames in the world frame: position [m] and quaternion (x, y, z, w)."""
@@ -157,9 +157,9 @@ class Plant(EmulatedMachine):
         """True hanger pin in the crane's base frame [m]."""
         return self.world.tip()
 
-    def judge(self) -> Verdict:
+    def evaluate(self) -> Evaluation:
         """The judge's verdict now."""
-        return self._judge.verdict()
+        return self._evaluator.evaluate()
 
     def close(self) -> None:
         """Release the physics client."""

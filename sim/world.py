@@ -15,7 +15,7 @@ from machine.profile import Profile
 from sim.bullet.body import Body, Pose, fixed_boxes, magnitude
 from sim.bullet.client import new_client
 from sim.bullet.urdf import JointDef
-from sim.geometry.shape import UNIT, Vector
+from sim.geometry.shape import IDENTITY, Vector
 from sim.ground.terrain import Terrain
 from sim.hydraulics.circuit import Hydraulics
 from sim.mechanics.carrier import PARKED, Carrier, Drive, carrier_links
@@ -24,32 +24,32 @@ from sim.mechanics.crane import CRANE_LINKS, FLEX, PASSIVE, crane_links, rigid_p
 from sim.truth.load import Truth, load_truth
 from sim.wood.bunk import bunk_shapes
 from sim.wood.log_shape import LogSpec
-from sim.wood.logs import Yard
+from sim.wood.logs import LogBodies
 from sim.wood.stowage import Stowage
 
 STEP_NS: Final = 2_500_000
 STEP_S: Final = STEP_NS * 1e-9
 GRAVITY_M_S2: Final = 9.81
 SOLVER_ITERATIONS: Final = 40
-HOME: Final = {
+HOME_POSE: Final = {
     "palms_471": {"slew": 0.0, "lift": 0.75, "tilt": -1.6, "ext": 0.30, "rot": 0.0},
     "aoro_fc8": {"slew": 0.0, "lift": 1.25, "tilt": -2.39, "ext": 0.10, "rot": 0.0},
 }
-SETTLE_STEPS: Final = 240
-CARRIER_SETTLE_STEPS: Final = 960
-HAND_OVER_STEPS: Final = 80
+SETTLE_STEP_COUNT: Final = 240
+CARRIER_SETTLE_STEP_COUNT: Final = 960
+HAND_OVER_STEP_COUNT: Final = 80
 SETTLE_DAMPING_S: Final = 0.06  # of the column, until all is at rest
-HOLDING: Final = 1e7  # [Nm, N] motors that stand in for the valves until all is at rest
-LOOK_STEPS: Final = 4  # contacts are looked at every so many steps
-TONGS: Final = ("tong_left", "tong_right")
-GRAPPLE: Final = (*TONGS, "rotator", "telescope", "stick")
-MOVED_BY: Final = {"grapple": TONGS, "steer": ("articulation",)}
+HOLDING_TORQUE: Final = 1e7  # [Nm, N] motors that stand in for the valves until all is at rest
+CONTACT_UPDATE_STEPS: Final = 4  # contacts are looked at every so many steps
+JAW_LINKS: Final = ("tong_left", "tong_right")
+GRAPPLE_LINKS: Final = (*JAW_LINKS, "rotator", "telescope", "stick")
+JOINTS_OF_FUNCTION: Final = {"grapple": JAW_LINKS, "steer": ("articulation",)}
 
 
-def home_of(profile: Profile) -> dict[str, float]:
+def home_pose(profile: Profile) -> dict[str, float]:
     """Where the crane stands at the start; a machine of another name starts like the shipped one of its kind."""
     kind = "palms_471" if profile.carrier is None else "aoro_fc8"
-    return dict(HOME.get(profile.name, HOME[kind]))
+    return dict(HOME_POSE.get(profile.name, HOME_POSE[kind]))
 
 
 class World:
@@ -83,27 +83,27 @@ class World:
         self.hydraulics = Hydraulics(truth, STEP_S)
         self.functions: tuple[str, ...] = self.hydraulics.names
         self._grapple = self.functions.index("grapple")
-        driven = [j for name in self.functions for j in MOVED_BY.get(name, (name,))]
+        driven = [j for name in self.functions for j in JOINTS_OF_FUNCTION.get(name, (name,))]
         self._driven = tuple(driven)
-        self._motors = [self.crane.index[j] for j in driven if j not in TONGS]
-        self._motors += [self.crane.index[j] for j in (*TONGS, *FLEX)]
+        self._motors = [self.crane.index[j] for j in driven if j not in JAW_LINKS]
+        self._motors += [self.crane.index[j] for j in (*JAW_LINKS, *FLEX)]
         self._hanger = self.crane.names.index("hanger")
         self.column = self._level()
-        self._settle(home_of(profile) | dict(home or {}))
+        self._settle(home_pose(profile) | dict(home or {}))
         # The yard lets its logs come to rest in a client of its own, and so on ground of its own.
-        self.yard = Yard(p, profile, truth, scene, Terrain(*ground), self.base_pose())
-        self._log_of = {body: i for i, body in enumerate(self.yard.logs)}
-        self._tongs = {self.crane.link[n] for n in TONGS}
+        self.log_bodies = LogBodies(p, profile, truth, scene, Terrain(*ground), self.base_pose())
+        self._log_of = {body: i for i, body in enumerate(self.log_bodies.body_ids)}
+        self._jaw_links = {self.crane.link[n] for n in JAW_LINKS}
         self._above = {self.crane.link[n] for n in CRANE_LINKS[1:]}  # the crane without what it stands on
         self.max_penetration_m = 0.0
-        self.grip_n = [0.0] * len(self.yard.logs)
-        self._touched = [False] * len(self.yard.logs)
+        self.grip_n = [0.0] * len(self.log_bodies.body_ids)
+        self._touched = [False] * len(self.log_bodies.body_ids)
         self._steps = 0
         laden = mobile and any(log.in_bunk for log in scene)
-        self._wait(CARRIER_SETTLE_STEPS if laden else HAND_OVER_STEPS)
+        self._wait(CARRIER_SETTLE_STEP_COUNT if laden else HAND_OVER_STEP_COUNT)
         self._hand_over()
-        self.stowage = Stowage(p, self.crane, profile, GRAPPLE, self.yard, LOOK_STEPS * STEP_S) if mobile else None
-        self._look()
+        self.stowage = Stowage(p, self.crane, profile, GRAPPLE_LINKS, self.log_bodies, CONTACT_UPDATE_STEPS * STEP_S) if mobile else None
+        self._update_contacts()
 
     def _build(self) -> Body:
         profile, truth = self.profile, self.truth
@@ -125,11 +125,11 @@ class World:
                 fixed=False,
                 collides_with_itself=True,
             )
-            body.collide_only(GRAPPLE, ("rear", "front"))
+            body.collide_only(GRAPPLE_LINKS, ("rear", "front"))
             body.rub(["rear"], truth.contact.bunk_friction)
         for joint in PASSIVE:
             body.damp(joint, getattr(truth.structure, f"{joint}_damping_nm_s_rad"))
-        body.rub((*TONGS, "rotator"), truth.contact.tong_friction)
+        body.rub((*JAW_LINKS, "rotator"), truth.contact.tong_friction)
         body.sense("hanger")
         return body
 
@@ -144,13 +144,13 @@ class World:
 
     def _place(self, pose: Mapping[str, float]) -> None:
         """The crane at rest in a pose, tongs open, the grapple hanging plumb."""
-        crane = dict.fromkeys((*FLEX, *PASSIVE, *TONGS), 0.0) | pose
+        crane = dict.fromkeys((*FLEX, *PASSIVE, *JAW_LINKS), 0.0) | pose
         hang = -(crane["lift"] + crane["tilt"] + crane["flex_pitch"])
         self.crane.place(crane | {"hanger": pose.get("hanger", hang)})
 
     def _level(self) -> Column:
         """Zero the encoders: at the home pose with an empty grapple the column stands plumb."""
-        self._place(home_of(self.profile))
+        self._place(home_pose(self.profile))
         return Column(self.truth.structure, self._moments())
 
     def _settle(self, home: Mapping[str, float]) -> None:
@@ -161,8 +161,8 @@ class World:
         self._place(home)
         self._place(dict(home) | dict(zip(FLEX, self.column.balance(self._moments()), strict=True)))
         self._read()
-        self.crane.hold(self._driven, HOLDING)
-        self._wait(SETTLE_STEPS if self.carrier is None else CARRIER_SETTLE_STEPS)
+        self.crane.hold(self._driven, HOLDING_TORQUE)
+        self._wait(SETTLE_STEP_COUNT if self.carrier is None else CARRIER_SETTLE_STEP_COUNT)
 
     def _wait(self, steps: int) -> None:
         flex = [self.crane.index[j] for j in FLEX]
@@ -178,7 +178,7 @@ class World:
         crane = self.crane
         carried = dict(zip(crane.names, (s[3] for s in crane.states()), strict=True))
         crane.hold(self._driven, 0.0)
-        torques = [sum(carried[j] for j in MOVED_BY.get(name, (name,))) for name in self.functions]
+        torques = [sum(carried[j] for j in JOINTS_OF_FUNCTION.get(name, (name,))) for name in self.functions]
         self.hydraulics.hold(torques, self._positions(self.q))
 
     def _read(self) -> None:
@@ -213,14 +213,14 @@ class World:
         self.client.stepSimulation()
         self._read()
         self._steps += 1
-        if self._steps % LOOK_STEPS == 0:
-            self._look()
+        if self._steps % CONTACT_UPDATE_STEPS == 0:
+            self._update_contacts()
 
-    def _look(self) -> None:
+    def _update_contacts(self) -> None:
         """Take note of which logs the crane touches."""
         n = len(self._log_of)
         touched, grip = [False] * n, [0.0] * n
-        tongs, above = self._tongs, self._above
+        tongs, above = self._jaw_links, self._above
         for c in self.client.getContactPoints(bodyA=self.crane.body):
             log = self._log_of.get(c[2])
             if log is None:
@@ -240,14 +240,14 @@ class World:
         return self._touched
 
     @property
-    def tong_angle(self) -> float:
+    def jaw_angle_rad(self) -> float:
         """Mean tong angle [rad], 0 open."""
         return (self.q["tong_left"] + self.q["tong_right"]) / 2
 
     @property
     def opening(self) -> float:
         """Grapple opening, 1 = fully open."""
-        return max(0.0, min(1.0, 1.0 - self.tong_angle / self.profile.grapple.tongs.angle_rad[-1]))
+        return max(0.0, min(1.0, 1.0 - self.jaw_angle_rad / self.profile.grapple.tongs.angle_rad[-1]))
 
     def link_poses(self) -> dict[str, Pose]:
         """Frames of all links in the world."""
@@ -263,7 +263,7 @@ class World:
         if self.carrier is None:
             return pin
         inward = self.client.invertTransform(*self.base_pose())
-        return self.client.multiplyTransforms(*inward, pin, UNIT)[0]
+        return self.client.multiplyTransforms(*inward, pin, IDENTITY)[0]
 
     def rigid_tip(self) -> Vector:
         """The hanger pin in the crane's base frame if the column were rigid: what perfect encoders say [m]."""

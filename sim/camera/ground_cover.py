@@ -28,7 +28,7 @@ class Density:
     branches_m2: float
 
 
-BARE, YARD, CLEARING = Density(0.0, 0.0), Density(0.0, 0.04), Density(0.25, 0.10)
+BARE, LANDING, CLEARING = Density(0.0, 0.0), Density(0.0, 0.04), Density(0.25, 0.10)
 
 
 def _blade(b: SceneBuilder, rng: random.Random, x: float, y: float) -> None:
@@ -63,7 +63,7 @@ def _some(rng: random.Random, mean: float) -> int:
     return int(mean) + (rng.random() < mean % 1.0)
 
 
-class Clutter:
+class GroundCover:
     """The clutter of one site."""
 
     def __init__(self, ground: Ground, density: Density, seed: int) -> None:

@@ -50,7 +50,7 @@ def _tube(points: np.ndarray, radii: np.ndarray, bump_m: float, oval: float, rng
     return vertices, np.concatenate(faces)[:, ::-1], normals
 
 
-class TinyRenderer:
+class MeshRenderer:
     """One scene in a client of its own.  ``bump_m`` roughens the bark, ``oval`` flattens logs (fraction of the radius);
     ``seed`` draws both.  Call ``close`` when done."""
 

@@ -34,7 +34,7 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class ImagingConditions:
     """Light and lens: unit vector towards the sun, gains of sun and sky, white balance, sensor grain, surfaces."""
 
     sun: tuple[float, float, float] = (0.43, -0.35, 0.83)
@@ -45,7 +45,7 @@ class Look:
     surfaces: int = 0
 
     @classmethod
-    def random(cls, seed: int) -> Look:
+    def random(cls, seed: int) -> ImagingConditions:
         """A day drawn from ``seed``: sun 20..70 degrees high, clear to overcast, exposure and white balance off."""
         rng = random.Random(f"look {seed}")
         azimuth, height = rng.uniform(-math.pi, math.pi), math.radians(rng.uniform(20.0, 70.0))
@@ -66,7 +66,7 @@ def _grain() -> np.ndarray:
     return np.random.default_rng(7).standard_normal((GRAIN_PX, GRAIN_PX)).astype(np.float32)
 
 
-def render(scene: Scene, view: View, look: Look = Look(), frame: int = 0) -> Picture:
+def render(scene: Scene, view: View, look: ImagingConditions = ImagingConditions(), frame: int = 0) -> Picture:
     """What an ideal camera at ``view`` sees.  ``frame`` changes the sensor's grain only."""
     pin, eye, turn = view.intrinsics, view.position_m, np.ascontiguousarray(view.rotation)
     lens = (pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px)

@@ -1,6 +1,6 @@
 """The cameras of a machine: where they really are, what they deliver, and what their maker's plate says.
 
-A ``Frame`` carries both poses: the nominal mount, all that autonomy may know, and the true one, for judging.
+A ``RgbdFrame`` carries both poses: the nominal mount, all that autonomy may know, and the true one, for judging.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 from machine.geometry.optics import Intrinsics, intrinsics
 from machine.profile import Profile
 from sim.camera.geometry import View, mount_view
-from sim.camera.ground_cover import CLEARING, YARD, Clutter, Density
+from sim.camera.ground_cover import CLEARING, LANDING, Density, GroundCover
 from sim.camera.noise import StereoNoise
-from sim.camera.render import Look, Picture, render
+from sim.camera.render import ImagingConditions, Picture, render
 from sim.camera.scene import Scene, WorldScenes
 from sim.geometry.shape import Vector
 from sim.truth.load import Truth
@@ -32,7 +32,7 @@ class Mount:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class RgbdFrame:
     """One delivered picture: rgb (H, W, 3) uint8; depth_m (H, W) float32, optical z, NaN = unknown (a hole, too near,
     too far, sky, letterbox bar); ``stamp_ns`` when it was taken; ``true_position_m`` (3,) and ``true_rotation`` (3, 3)
     of the optical frame in the world are the judge's alone."""
@@ -64,13 +64,13 @@ class CameraRig:
         size_px: int | None = 608,
         density: Density | None = None,
     ) -> None:
-        self.look = Look.random(seed)
+        self.look = ImagingConditions.random(seed)
         self._profile, self._truth, self._size_px = profile, truth, size_px
         self._scenes = WorldScenes(source) if isinstance(source, World) else source
-        self._clutter: Clutter | None = None
+        self._clutter: GroundCover | None = None
         if isinstance(self._scenes, WorldScenes):
-            litter = density or (YARD if self._scenes.style == "asphalt" else CLEARING)
-            self._clutter = Clutter(self._scenes.ground, litter, seed)
+            litter = density or (LANDING if self._scenes.style == "asphalt" else CLEARING)
+            self._clutter = GroundCover(self._scenes.ground, litter, seed)
         self._noise = {
             name: StereoNoise(camera, truth.cameras[name], f"{name} {seed}") for name, camera in profile.cameras.items()
         }
@@ -96,11 +96,11 @@ class CameraRig:
         scene = self.scene(name)
         return scene, *self._picture(name, scene)
 
-    def frame(self, name: str, now_ns: int) -> Frame:
+    def frame(self, name: str, now_ns: int) -> RgbdFrame:
         """The next frame of camera ``name``; KeyError when the profile has none of that name."""
-        return self.shoot(name, self.scene(name), now_ns)
+        return self.capture(name, self.scene(name), now_ns)
 
-    def shoot(self, name: str, scene: Scene, now_ns: int) -> Frame:
+    def capture(self, name: str, scene: Scene, now_ns: int) -> RgbdFrame:
         """The next frame of camera ``name`` of a scene that was to be seen at ``now_ns``."""
         camera = self._profile.cameras[name]
         view, picture = self._picture(name, scene)
@@ -111,7 +111,7 @@ class CameraRig:
             box = intrinsics(camera).letterbox(self._size_px)
             depth, rgb, pin = box.pad(depth, np.nan), box.pad(rgb, 0), box.outer
         mount = Mount(camera.link, camera.position_m, camera.rpy_rad)
-        return Frame(name, now_ns, rgb, depth, pin, mount, view.position_m, view.rotation)
+        return RgbdFrame(name, now_ns, rgb, depth, pin, mount, view.position_m, view.rotation)
 
     def _picture(self, name: str, scene: Scene) -> tuple[View, Picture]:
         view = self.view(name, scene)

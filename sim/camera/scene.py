@@ -218,7 +218,7 @@ class WorldScenes:
         local = SceneBuilder(self.ground, self.style)
         for s, instance in shapes:
             local.box(s.size_m, s.position_m, s.quaternion, s.colour, instance)
-        for i, spec in enumerate(world.yard.scene):
+        for i, spec in enumerate(world.log_bodies.scene):
             size = (spec.length_m, spec.diameter_m, spec.taper_m_m, spec.sweep_m)
             # No two logs have quite the same bark.
             tint = 0.88 + 0.24 * ((i * 0.618) % 1.0)
@@ -233,7 +233,7 @@ class WorldScenes:
         boxes = self._local.boxes
         centres = np.einsum("bij,bj->bi", turns, boxes.centre_m) + at
         boxes = replace(boxes, centre_m=centres, axes=turns @ boxes.axes)
-        states = self._world.yard.states()
+        states = self._world.log_bodies.states()
         logs = tuple(
             LogPose(i + 1, s.position_m, s.quaternion, s.length_m, s.diameter_m, s.taper_m_m, s.sweep_m)
             for i, s in enumerate(states)

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from can_dbc.messages.rgbd import MM_M, QUESTION, RgbdError, RgbdMessage, encode, encode_refusal, question_bytes
-from sim.camera.rig import Frame
+from sim.camera.rig import RgbdFrame
 from sim.camera.scene import Scene
 
 ANSWER_S = 1.0  # a client waits so long for the plant's loop
@@ -29,7 +29,7 @@ class Rig(Protocol):
 
     def scene(self, name: str) -> Scene: ...
 
-    def shoot(self, name: str, scene: Scene, now_ns: int) -> Frame: ...
+    def capture(self, name: str, scene: Scene, now_ns: int) -> RgbdFrame: ...
 
 
 class CameraServer:
@@ -100,11 +100,11 @@ class CameraServer:
         except queue.Empty:
             return encode_refusal(name, f"the plant did not answer within {ANSWER_S:g} s; does it run?")
         with self._drawing:
-            frame = self._rig.shoot(name, scene, now_ns)
+            frame = self._rig.capture(name, scene, now_ns)
         return encode(on_the_wire(frame))
 
 
-def on_the_wire(frame: Frame) -> RgbdMessage:
+def on_the_wire(frame: RgbdFrame) -> RgbdMessage:
     """A frame as it is sent: depth in whole millimetres, no true pose."""
     pin, depth = frame.intrinsics, np.nan_to_num(frame.depth_m * np.float32(MM_M), nan=0.0)
     millimetres = np.clip(np.rint(depth), 0, 65535).astype("<u2")

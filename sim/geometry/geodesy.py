@@ -17,7 +17,7 @@ EP2: Final = E2 / (1.0 - E2)
 Geodetic = tuple[float, float, float]
 
 
-class Site:
+class LocalFrame:
     """The local frame whose origin lies at a latitude, longitude and height; x east, y north, z up."""
 
     def __init__(self, lat_deg: float, lon_deg: float, height_m: float = 0.0) -> None:

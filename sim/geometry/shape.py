@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-UNIT: Quaternion = (0.0, 0.0, 0.0, 1.0)
+IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,8 @@ from sim.camera.geometry import quaternion_matrix
 from sim.geometry.shape import Vector
 from sim.plant import Plant
 
-ROUND_M: Final = 9.0
-AHEAD_M: Final = 12.0
+AROUND_CRANE_M: Final = 9.0
+AHEAD_OF_FRONT_M: Final = 12.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +48,11 @@ def detect(plant: Plant) -> list[Detection]:
     ]
 
 
-def detect_near(plant: Plant) -> list[Detection]:
+def detect_in_view(plant: Plant) -> list[Detection]:
     """Those of them that cameras of a forwarder could see: round the crane, or before the front, a quarter wide."""
     return [log for log in detect(plant) if _in_view(*log.position_m[:2])]
 
 
 def _in_view(x_m: float, y_m: float) -> bool:
     """Whether a place in the base frame, which looks backwards, is in view."""
-    return math.hypot(x_m, y_m) < ROUND_M or (-AHEAD_M < x_m < 0.0 and abs(y_m) < -x_m)
+    return math.hypot(x_m, y_m) < AROUND_CRANE_M or (-AHEAD_OF_FRONT_M < x_m < 0.0 and abs(y_m) < -x_m)

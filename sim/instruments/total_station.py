@@ -11,9 +11,9 @@ from typing import Final
 from sim.geometry.shape import Vector, quaternion_rpy
 from sim.plant import Plant
 
-NOISE_M: Final = 0.002
+POSITION_SIGMA_M: Final = 0.002
 """One sigma per axis: a total station on a prism that hangs from a swinging boom."""
-NOISE_YAW_RAD: Final = radians(1.0)
+YAW_SIGMA_RAD: Final = radians(1.0)
 """One sigma: two points of a grapple that hangs and still moves a little."""
 
 
@@ -26,12 +26,12 @@ class TotalStation:
 
     def read(self, pin_m: Vector) -> Vector:
         """What it shows for a pin that is at ``pin_m``."""
-        x, y, z = (axis + self._rng.gauss(0.0, NOISE_M) for axis in pin_m)
+        x, y, z = (axis + self._rng.gauss(0.0, POSITION_SIGMA_M) for axis in pin_m)
         return (x, y, z)
 
     def read_yaw(self, yaw_rad: float) -> float:
         """What it shows for a grapple that opens along ``yaw_rad``: in 0..pi, for its two sides look alike."""
-        return (yaw_rad + self._yaw_rng.gauss(0.0, NOISE_YAW_RAD)) % pi
+        return (yaw_rad + self._yaw_rng.gauss(0.0, YAW_SIGMA_RAD)) % pi
 
 
 def grapple_yaw(plant: Plant) -> float:

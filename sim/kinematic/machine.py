@@ -19,11 +19,11 @@ from sim.truth.load import Truth, load_truth
 
 REST_PA = 1.0e6
 PUMP_PA = 18.0e6
-MIDDLE = 0.5
+START_SHARE = 0.5
 """Share of its range at which every joint stands at the start; the boom is raised and bent there."""
 
 
-class _Oil:
+class _FixedPressures:
     """Fixed pressures; ``spools`` by function, -1..1."""
 
     supply_pa = PUMP_PA
@@ -35,7 +35,7 @@ class _Oil:
         self.pressures_pa = dict.fromkeys(FUNCTIONS, (REST_PA, REST_PA))
 
 
-class _Function:
+class _ValveModel:
     """Dead time, dead-band and gain of one valve."""
 
     def __init__(self, valve: Valve | CarrierValve, sign: int, step_ns: int) -> None:
@@ -53,24 +53,24 @@ class _Function:
 
 
 class KinematicWorld:
-    """Joints that integrate their valves (`sim.emulation.Surroundings`)."""
+    """Joints that integrate their valves (`sim.emulation.SensedWorld`)."""
 
     def __init__(self, profile: Profile, truth: Truth, step_ns: int) -> None:
         self.profile, self.truth = profile, truth
-        self.hydraulics = _Oil()
+        self.hydraulics = _FixedPressures()
         self.carrier: RollingCarrier | None = None
         self.opening = 1.0
         self._step_s = step_ns * 1e-9
         joints = {j.name.lower(): profile.joints[j.name.lower()] for j in JOINTS}
-        self._functions = {name: _Function(spec.valve, spec.valve.sign, step_ns) for name, spec in joints.items()}
+        self._functions = {name: _ValveModel(spec.valve, spec.valve.sign, step_ns) for name, spec in joints.items()}
         self._range = {name: (spec.lower, spec.upper) for name, spec in joints.items()}
-        self.q = {name: low + MIDDLE * (high - low) for name, (low, high) in self._range.items()}
+        self.q = {name: low + START_SHARE * (high - low) for name, (low, high) in self._range.items()}
         if profile.carrier is not None:
             c = profile.carrier
-            self._functions["articulation"] = _Function(c.steer_valve, 1, step_ns)
+            self._functions["articulation"] = _ValveModel(c.steer_valve, 1, step_ns)
             self._range["articulation"] = (-c.articulation_limit_rad, c.articulation_limit_rad)
             self.q["articulation"] = 0.0
-            self._arms = [_Function(c.arm_valve, 1, step_ns) for _ in ARMS]
+            self._arms = [_ValveModel(c.arm_valve, 1, step_ns) for _ in ARMS]
             self.q |= dict.fromkeys(ARMS, arm_angle_from_height(c, c.arm_transport_m))
         self.qd = dict.fromkeys(self.q, 0.0)
         if profile.carrier is not None:

@@ -20,7 +20,7 @@ from machine.geometry import carrier as geometry
 from machine.profile import Profile
 from sim.bullet.client import BulletClient
 from sim.bullet.urdf import JointDef, LinkDef
-from sim.geometry.shape import UNIT, Quaternion, Shape, Vector, quaternion_rpy, rpy_quaternion
+from sim.geometry.shape import IDENTITY, Quaternion, Shape, Vector, quaternion_rpy, rpy_quaternion
 from sim.ground.terrain import Terrain
 from sim.ground.tyre import Tyre, wheel_step
 from sim.truth.carrier import CarrierTruth
@@ -52,16 +52,16 @@ def _shapes(profile: Profile, link: str) -> tuple[Shape, ...]:
     x, y, z = c.crane_base_m
     if link == "rear":
         return (
-            Shape(link, (3.95, 0.90, 0.33), (-2.05, 0.0, 0.115), UNIT, dark),
-            Shape(link, (0.70, 0.90, z - 0.28), (x, y, (z + 0.28) / 2), UNIT, dark),
+            Shape(link, (3.95, 0.90, 0.33), (-2.05, 0.0, 0.115), IDENTITY, dark),
+            Shape(link, (0.70, 0.90, z - 0.28), (x, y, (z + 0.28) / 2), IDENTITY, dark),
         )
     if link == "front":
         feet = ((p, 1.15 if p[0] > 0.65 else 0.28) for p in (c.antenna_main_m, c.antenna_aux_m))  # on hood or frame
         masts = ((p[0], p[1], (p[2] + foot) / 2, p[2] - foot) for p, foot in feet)
         return (
-            Shape(link, (2.75, 0.90, 0.33), (1.475, 0.0, 0.115), UNIT, dark),
-            Shape(link, (2.10, 1.30, 0.87), (1.70, 0.0, 0.715), UNIT, green),
-            *(Shape(link, (0.05, 0.05, tall), at, UNIT, dark, False) for *at, tall in masts),
+            Shape(link, (2.75, 0.90, 0.33), (1.475, 0.0, 0.115), IDENTITY, dark),
+            Shape(link, (2.10, 1.30, 0.87), (1.70, 0.0, 0.715), IDENTITY, green),
+            *(Shape(link, (0.05, 0.05, tall), at, IDENTITY, dark, False) for *at, tall in masts),
         )
     ahead, inward = (1 if link[4] == "f" else -1), (-1 if link[5] == "l" else 1)
     beam = (c.arm_length_m + 0.20, *BEAM_M)
@@ -70,7 +70,7 @@ def _shapes(profile: Profile, link: str) -> tuple[Shape, ...]:
     facet = (2 * c.wheel_radius_m * math.cos(half), c.wheel_width_m, 2 * c.wheel_radius_m * math.sin(half))
     hub = (ahead * c.arm_length_m, 0.0, 0.0)
     turns = (rpy_quaternion(0.0, 2 * half * i) for i in range(FACETS))
-    return (Shape(link, beam, at, UNIT, dark), *(Shape(link, facet, hub, turn, rubber) for turn in turns))
+    return (Shape(link, beam, at, IDENTITY, dark), *(Shape(link, facet, hub, turn, rubber) for turn in turns))
 
 
 def _arm_link(profile: Profile, t: CarrierTruth, name: str) -> LinkDef:
@@ -236,7 +236,7 @@ class Carrier:
     def _hub_at(self, arm: str) -> Vector:
         at, turn = self.pose(arm)
         hub = self._hub[geometry.ARMS.index(arm)]
-        return self._p.multiplyTransforms(at, turn, [hub, 0.0, 0.0], UNIT)[0]
+        return self._p.multiplyTransforms(at, turn, [hub, 0.0, 0.0], IDENTITY)[0]
 
     @property
     def speed_m_s(self) -> float:

@@ -15,8 +15,8 @@ from typing import Final
 
 from machine.profile import Kinematics, Profile
 from sim.bullet.urdf import JointDef, LinkDef
-from sim.geometry.shape import UNIT, Shape, Vector, rpy_quaternion
-from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, tongs_of
+from sim.geometry.shape import IDENTITY, Shape, Vector, rpy_quaternion
+from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, jaw_geometry
 from sim.truth.load import Truth
 
 ACTIVE: Final = ("slew", "lift", "tilt", "ext")
@@ -34,7 +34,7 @@ SMALL_LINKS: Final = {"base": (100.0, 5.0), "turntable": (15.0, 0.5), "flexure":
 
 
 @dataclass(frozen=True, slots=True)
-class Build:
+class SteelDimensions:
     """Steel that the profile does not tell.  ``telescope_frame_m``: its link frame at 0 in the stick's; None: where
     the telescope's axis passes the stick pin.  ``beam_m``: width and height of boom, stick and telescope.
     """
@@ -45,21 +45,21 @@ class Build:
     column_m: float
 
 
-BUILDS: Final = {
-    "palms_471": Build(
+STEEL_DIMENSIONS: Final = {
+    "palms_471": SteelDimensions(
         0.26881, (0.0, 0.1256771629, 0.21905106705), ((0.16, 0.22), (0.14, 0.16), (0.10, 0.10)), 0.28
     ),
-    "aoro_fc8": Build(0.40, None, ((0.20, 0.26), (0.18, 0.20), (0.13, 0.13)), 0.36),
+    "aoro_fc8": SteelDimensions(0.40, None, ((0.20, 0.26), (0.18, 0.20), (0.13, 0.13)), 0.36),
 }  # fmt: skip
 
 
-def _build(profile: Profile) -> Build:
-    if profile.name not in BUILDS:
-        raise ValueError(f"the plant knows no steel of machine {profile.name!r}; use a profile of {', '.join(BUILDS)}")
-    return BUILDS[profile.name]
+def _steel_dimensions(profile: Profile) -> SteelDimensions:
+    if profile.name not in STEEL_DIMENSIONS:
+        raise ValueError(f"the plant knows no steel of machine {profile.name!r}; use a profile of {', '.join(STEEL_DIMENSIONS)}")
+    return STEEL_DIMENSIONS[profile.name]
 
 
-def _telescope(k: Kinematics, build: Build) -> tuple[float, Vector, Vector, Vector]:
+def _telescope(k: Kinematics, build: SteelDimensions) -> tuple[float, Vector, Vector, Vector]:
     """The telescope in the stick frame: pitch [rad] and direction of its axis, its frame at 0, the pin at 0.
 
     Third and fourth row of the DH chain: a3 across and d4 along the telescope's own axis, which theta3's offset turns.
@@ -74,7 +74,7 @@ def _telescope(k: Kinematics, build: Build) -> tuple[float, Vector, Vector, Vect
 
 def crane_shapes(profile: Profile) -> list[Shape]:
     """All boxes of the crane; ``solid`` ones collide."""
-    k, build = profile.kinematics, _build(profile)
+    k, build = profile.kinematics, _steel_dimensions(profile)
     steel, yellow, dark = (0.45, 0.47, 0.5), (0.95, 0.72, 0.1), (0.2, 0.2, 0.22)
     pitch, along, frame, pin = _telescope(k, build)
     tilted = rpy_quaternion(pitch, 0.0)
@@ -91,9 +91,9 @@ def crane_shapes(profile: Profile) -> list[Shape]:
     wide = 1.8 * build.column_m
     pedestal = ((wide, wide, build.bearing_z_m - foot), (0.0, 0.0, (build.bearing_z_m + foot) / 2))
     return [
-        Shape("base", *pedestal, UNIT, dark, False),
-        Shape("mast", (build.column_m, build.column_m, pivot + 0.05), (0, k.a1_m / 2, pivot / 2), UNIT, steel, False),
-        Shape("boom", (boom_x, k.a2_m, boom_z), (0, k.a2_m / 2, 0), UNIT, yellow),
+        Shape("base", *pedestal, IDENTITY, dark, False),
+        Shape("mast", (build.column_m, build.column_m, pivot + 0.05), (0, k.a1_m / 2, pivot / 2), IDENTITY, steel, False),
+        Shape("boom", (boom_x, k.a2_m, boom_z), (0, k.a2_m / 2, 0), IDENTITY, yellow),
         Shape("stick", (stick[0], length, stick[1]), middle, tilted, yellow),
         Shape("telescope", (inner[0], length, inner[1]), (0, tube[1] - frame[1], tube[2] - frame[2]), tilted, steel),
         *grapple_shapes(profile),
@@ -117,9 +117,9 @@ def crane_links(profile: Profile, truth: Truth) -> tuple[list[LinkDef], list[Joi
 
 
 def _joints(profile: Profile) -> list[JointDef]:
-    k, build = profile.kinematics, _build(profile)
+    k, build = profile.kinematics, _steel_dimensions(profile)
     _, along, frame, pin = _telescope(k, build)
-    tongs = tongs_of(profile)
+    tongs = jaw_geometry(profile)
     x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     boom = (0.0, k.a2_m * math.cos(k.theta2_offset_rad), k.a2_m * math.sin(k.theta2_offset_rad))
     pivot = -tongs.pivot_z_m

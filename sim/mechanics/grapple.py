@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from machine.profile import Kinematics, Profile
-from sim.geometry.shape import UNIT, Shape, Vector, rpy_quaternion
+from sim.geometry.shape import IDENTITY, Shape, Vector, rpy_quaternion
 
 PIVOT_Y_M = -0.0193
 PALMS_CHORD_M = 0.648  # blades, widths and beam below are those of this grapple; others are scaled by their chord
@@ -22,7 +22,7 @@ PLATE_M = (0.035, 0.035, 0.035, 0.03, 0.022)  # per segment: the tips are sharp,
 
 
 @dataclass(frozen=True, slots=True)
-class Tongs:
+class JawGeometry:
     """Pivots at (-+pivot_x_m, -pivot_z_m) of the rotator frame; tips at (-+out_m, -down_m) of the open tong frames."""
 
     pivot_x_m: float
@@ -37,7 +37,7 @@ class Tongs:
         return math.hypot(self.out_m, self.down_m)
 
 
-def tongs_of(profile: Profile) -> Tongs:
+def jaw_geometry(profile: Profile) -> JawGeometry:
     """Least-squares fit of pivots and chord to the profile's table.
 
     half gap = x + out cos(a) - down sin(a), tip below pivot = out sin(a) + down cos(a).
@@ -51,7 +51,7 @@ def tongs_of(profile: Profile) -> Tongs:
     normal = [[sum(r[i] * r[j] for r, _ in rows) for j in range(3)] for i in range(3)]
     right = [sum(r[i] * y for r, y in rows) for i in range(3)]
     x, out, down = _solve3(normal, right)
-    return Tongs(x, k.rotator_to_tong_pivot_m, out, down, table.angle_rad[-1])
+    return JawGeometry(x, k.rotator_to_tong_pivot_m, out, down, table.angle_rad[-1])
 
 
 def _solve3(m: list[list[float]], y: Sequence[float]) -> tuple[float, float, float]:
@@ -69,7 +69,7 @@ def _solve3(m: list[list[float]], y: Sequence[float]) -> tuple[float, float, flo
     return (x[0], x[1], x[2])
 
 
-def tong_points(tongs: Tongs, side: int) -> list[tuple[float, float]]:
+def jaw_points(tongs: JawGeometry, side: int) -> list[tuple[float, float]]:
     """Polyline (x, z) [m] of a tong in its link frame at angle 0; side -1 left, +1 right."""
     x, z = tongs.out_m, tongs.down_m
     return [(side * (a * x + b * z), -a * z + b * x) for a, b in POLYLINE]
@@ -81,18 +81,18 @@ def grapple_shapes(profile: Profile) -> list[Shape]:
     The beam between the pivots is slim and stands above them: the claw's throat is the room a thick log needs.
     """
     k: Kinematics = profile.kinematics
-    tongs = tongs_of(profile)
+    tongs = jaw_geometry(profile)
     scale = tongs.chord_m / PALMS_CHORD_M
     dark, red = (0.2, 0.2, 0.22), (0.8, 0.2, 0.15)
     rotator, fork, z = k.rotator_to_tong_pivot_m, k.fork_to_rotator_m, -tongs.pivot_z_m
     shapes = [
-        Shape("hanger", (0.08, 0.08, k.hanger_to_fork_m), (0.0, 0.0, -k.hanger_to_fork_m / 2), UNIT, dark, False),
-        Shape("fork", (0.14, 0.14, fork), (0.0, 0.0, -fork / 2), UNIT, dark, False),
-        Shape("rotator", (0.22, 0.22, rotator / 2), (0.0, 0.0, -rotator / 4), UNIT, dark),
-        Shape("rotator", (2 * tongs.pivot_x_m + 0.06, 0.16 * scale, 0.08), (0.0, PIVOT_Y_M, z + 0.07), UNIT, dark),
+        Shape("hanger", (0.08, 0.08, k.hanger_to_fork_m), (0.0, 0.0, -k.hanger_to_fork_m / 2), IDENTITY, dark, False),
+        Shape("fork", (0.14, 0.14, fork), (0.0, 0.0, -fork / 2), IDENTITY, dark, False),
+        Shape("rotator", (0.22, 0.22, rotator / 2), (0.0, 0.0, -rotator / 4), IDENTITY, dark),
+        Shape("rotator", (2 * tongs.pivot_x_m + 0.06, 0.16 * scale, 0.08), (0.0, PIVOT_Y_M, z + 0.07), IDENTITY, dark),
     ]
     for side, link in ((-1, "tong_left"), (1, "tong_right")):
-        points = tong_points(tongs, side)
+        points = jaw_points(tongs, side)
         for (x0, z0), (x1, z1), thick in zip(points, points[1:], PLATE_M, strict=False):
             length, x, z = math.hypot(x1 - x0, z1 - z0), (x0 + x1) / 2, (z0 + z1) / 2
             turn = rpy_quaternion(0.0, -math.atan2(z1 - z0, x1 - x0))

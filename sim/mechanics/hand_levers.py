@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-HELD_NS: Final = 300_000_000
+LEVER_HOLD_NS: Final = 300_000_000
 DRIVE: Final = "drive"
 
 
@@ -27,7 +27,7 @@ class HandLevers:
             raise ValueError(f"no lever is called {name!r}; there are {', '.join(self.names)}")
         if not math.isfinite(value) or abs(value) > 1.0:
             raise ValueError(f"a lever stands between -1 and 1, not at {value}")
-        self._at[name], self._until_ns[name] = value, now_ns + HELD_NS
+        self._at[name], self._until_ns[name] = value, now_ns + LEVER_HOLD_NS
 
     def held(self, now_ns: int) -> dict[str, float]:
         """The levers that are out of neutral now."""

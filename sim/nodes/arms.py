@@ -14,7 +14,7 @@ from enum import IntEnum
 from can_dbc.dbc.codec import Database
 from sim.nodes import Outbox
 from sim.nodes.j1939 import J1939Node
-from sim.nodes.messages import ARM_KEY, MS, Every, ProtectedInput, ProtectedMessage
+from sim.nodes.messages import ARM_KEY, MS, PeriodicTimer, ProtectedInput, ProtectedMessage
 
 ADDRESS = 0x30
 SUSPENSION_FUNCTION = 21  # J1939 NAME function of a suspension system controller
@@ -45,7 +45,7 @@ class ArmNode(J1939Node):
             ProtectedMessage(machine, "ArmHeightA"),
             ProtectedMessage(machine, "ArmHeightB"),
         )
-        self._period = Every(CYCLE_NS, phase_ns=5 * MS)
+        self._period = PeriodicTimer(CYCLE_NS, phase_ns=5 * MS)
         self.heights_mm = (0.0,) * ARMS
         self.roll_deg = self.pitch_deg = 0.0
         self.state = ArmState.HOLD
@@ -59,7 +59,7 @@ class ArmNode(J1939Node):
         source = self._inputs.get(key)
         if source is None:
             super().receive(key, data, now_ns)
-        elif source.take(data, now_ns) and source.get("ArmKey") != ARM_KEY:
+        elif source.accept(data, now_ns) and source.get("ArmKey") != ARM_KEY:
             self.state = ArmState.HOLD
 
     def decide(self, now_ns: int) -> None:

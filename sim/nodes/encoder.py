@@ -17,8 +17,8 @@ from canopen.objectdictionary import ODVariable
 
 import can_dbc
 from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER
-from machine.sensing.encoder import counts_from_position, position_from_counts
 from machine.profile import Encoder
+from machine.sensing.encoder import counts_from_position, position_from_counts
 from sim.nodes import Outbox
 from sim.truth.encoders import EncoderTruth
 

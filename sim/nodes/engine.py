@@ -9,7 +9,7 @@ from can_dbc.dbc.codec import Database
 from can_dbc.protocols.nmea2000 import encode, frames
 from sim.nodes import Outbox
 from sim.nodes.j1939 import J1939Node
-from sim.nodes.messages import MS, Every
+from sim.nodes.messages import MS, PeriodicTimer
 
 ADDRESS = 0x00
 WORKING_RPM = 1500.0
@@ -27,7 +27,7 @@ class EngineNode(J1939Node):
     def __init__(self, machine: Database, outbox: Outbox) -> None:
         super().__init__(ADDRESS, 0, machine, outbox)
         self._eec1, self._ccvs, self._dm1 = (machine.message(n) for n in ("EEC1", "CCVS", "DM1"))
-        self._fast, self._medium, self._slow = Every(CYCLE_NS), Every(100 * MS, 10 * MS), Every(1000 * MS, 30 * MS)
+        self._fast, self._medium, self._slow = PeriodicTimer(CYCLE_NS), PeriodicTimer(100 * MS, 10 * MS), PeriodicTimer(1000 * MS, 30 * MS)
         self.energy_j = self.speed_m_s = 0.0
         self.brake = True
         self._last_j = self._load = 0.0

@@ -17,11 +17,11 @@ from typing import Any, Final
 from can_dbc.dbc.codec import Database
 from can_dbc.protocols.nmea2000 import encode, frames
 from machine.profile import Carrier
-from sim.geometry.geodesy import Site
+from sim.geometry.geodesy import LocalFrame
 from sim.geometry.shape import Quaternion, Vector, quaternion_rpy
 from sim.nodes import Outbox
 from sim.nodes.j1939 import MARINE, J1939Node
-from sim.nodes.messages import MS, Every
+from sim.nodes.messages import MS, PeriodicTimer
 from sim.truth.sensors import GnssTruth
 
 ADDRESS: Final = 0x1C
@@ -67,13 +67,13 @@ class GnssNode(J1939Node):
         self._truth, self._front_pose = truth, front_pose
         self._rng = random.Random(f"gnss {seed}")
         self._messages = gnss
-        self._site = Site(carrier.site_lat_deg, carrier.site_lon_deg, truth.datum_m)
+        self._local_frame = LocalFrame(carrier.site_lat_deg, carrier.site_lon_deg, truth.datum_m)
         self._main = _sum(carrier.antenna_main_m, truth.main_offset_m)
         self._aux = _sum(carrier.antenna_aux_m, truth.aux_offset_m)
         nominal = _difference(carrier.antenna_aux_m, carrier.antenna_main_m)
         self._baseline_rad = math.atan2(nominal[1], nominal[0])
         self._heading_noise_rad = math.sqrt(2.0) * truth.phase_noise_m / math.hypot(*nominal)
-        self._cycle = Every(CYCLE_NS)
+        self._cycle = PeriodicTimer(CYCLE_NS)
         self._epochs = 0
         self._sequence = 0
         self._pending: deque[tuple[int, list[tuple[int, bytes]]]] = deque()
@@ -148,7 +148,7 @@ class GnssNode(J1939Node):
         axis = math.sqrt(0.5)  # a horizontal error has two axes
         error = [axis * (quality.noise_m * n + quality.wander_m * w) for n, w in zip(noise, self._wander, strict=True)]
         east, north, up = antenna
-        return self._site.geodetic(
+        return self._local_frame.geodetic(
             east + error[0] + self.jump_m[0],
             north + error[1] + self.jump_m[1],
             up + error[2] / axis * self._truth.height_factor,

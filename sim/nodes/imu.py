@@ -15,7 +15,7 @@ from can_dbc.dbc.codec import Database
 from machine.profile import Imu
 from sim.nodes import Outbox
 from sim.nodes.device import Device
-from sim.nodes.messages import MS, Every, ProtectedMessage
+from sim.nodes.messages import MS, PeriodicTimer, ProtectedMessage
 
 PERIOD_NS: Final = 10 * MS
 LATENCY_NS: Final = 20 * MS
@@ -31,7 +31,7 @@ class ImuNode(Device):
 
     def __init__(self, spec: Imu, database: Database, outbox: Outbox, step_ns: int, seed: int) -> None:
         super().__init__(spec.node, outbox)
-        self._message, self._period = ProtectedMessage(database, spec.message), Every(PERIOD_NS)
+        self._message, self._period = ProtectedMessage(database, spec.message), PeriodicTimer(PERIOD_NS)
         self._rng = random.Random(f"imu {seed}")
         self._step_s = step_ns * 1e-9
         self._history: deque[Pair] = deque(maxlen=2 + max(0, round(LATENCY_NS / step_ns)))

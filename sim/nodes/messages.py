@@ -11,7 +11,7 @@ MS = 1_000_000
 ARM_KEY = 0xA
 
 
-class Every:
+class PeriodicTimer:
     """A period on virtual time."""
 
     def __init__(self, period_ns: int, phase_ns: int = 0) -> None:
@@ -56,7 +56,7 @@ class ProtectedInput:
         self.values: tuple[Any, ...] | None = None
         self.stamp_ns = self.counter = 0
 
-    def take(self, data: bytes, now_ns: int) -> bool:
+    def accept(self, data: bytes, now_ns: int) -> bool:
         """Whether the frame was accepted."""
         if not self._checker.check(data).usable:
             return False

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from can_dbc.dbc.codec import Database
+from machine.crane_nodes import CraneNode
 from sim.nodes import Outbox
 from sim.nodes.device import Device
-from sim.nodes.messages import ARM_KEY, MS, Every, ProtectedInput, ProtectedMessage
+from sim.nodes.messages import ARM_KEY, MS, PeriodicTimer, ProtectedInput, ProtectedMessage
 
 COMMAND_NS = GUARD_NS = 50 * MS
 SYNC_NS = 15 * MS
@@ -41,7 +42,7 @@ class ValveState(IntEnum):
     FAULT = 4
 
 
-class Exit(IntEnum):
+class ExitCode(IntEnum):
     """ValveFbB.ExitCode (ISO 11783-7 reasons)."""
 
     OK = 0
@@ -64,7 +65,7 @@ class GrappleState(IntEnum):
 
 
 @dataclass(slots=True)
-class Measured:
+class ValveInputs:
     """What the node's own inputs show: spools -1..1 in FUNCTIONS order and the grapple's sensors, None without one."""
 
     spools: tuple[float, ...] = (0.0,) * 6
@@ -84,17 +85,17 @@ class ValveNode(Device):
         database: Database,
         outbox: Outbox,
         pilot_on: Callable[[], bool],
-        sense: Callable[[], Measured],
+        sense: Callable[[], ValveInputs],
         cycle_ns: int = CYCLE_NS,
     ) -> None:
-        super().__init__(0x10, outbox)
+        super().__init__(CraneNode.VALVES, outbox)
         self._pilot_on, self._sense = pilot_on, sense
         self._a, self._b, self._guard = (ProtectedInput(database, n) for n in ("ValveCmdA", "ValveCmdB", "GuardStat"))
         self._inputs = {i.key: i for i in (self._a, self._b, self._guard)}
         self._fb_a, self._fb_b, self._grapple_stat, self._plc = (
             ProtectedMessage(database, n) for n in ("ValveFbA", "ValveFbB", "GrappleStat", "PlcStatus")
         )
-        self._fast, self._slow = Every(cycle_ns), Every(SLOW_NS, phase_ns=MS)
+        self._fast, self._slow = PeriodicTimer(cycle_ns), PeriodicTimer(SLOW_NS, phase_ns=MS)
         self._watchdog = 0
         self._grapple = GrappleState.UNKNOWN
         self.restart()
@@ -102,17 +103,17 @@ class ValveNode(Device):
     def restart(self) -> None:
         for i in self._inputs.values():
             i.reset()
-        self.valve_state, self.exit = ValveState.NEUTRAL, Exit.NOT_ARMED
+        self.valve_state, self.exit = ValveState.NEUTRAL, ExitCode.NOT_ARMED
         self.outputs_pct = [0.0] * len(FUNCTIONS)
         self._ramp_from = list(self.outputs_pct)
         self._lost_ns: int | None = None
         self._sync_ns: int | None = None
-        self._locked: Exit | None = None
+        self._locked: ExitCode | None = None
 
     def receive(self, key: int, data: bytes, now_ns: int) -> None:
         """A command or guard frame; others and bad ones are ignored."""
         source = self._inputs.get(key)
-        if source is None or not source.take(data, now_ns):
+        if source is None or not source.accept(data, now_ns):
             return
         if source is self._b and self._b.get("ArmKey") != ARM_KEY:
             self._locked = None
@@ -123,13 +124,13 @@ class ValveNode(Device):
 
     def decide(self, now_ns: int) -> None:
         """Set ``outputs_pct``, ``valve_state`` and ``exit`` for this physics step."""
-        missing = self._missing(now_ns)
+        missing = self._missing_condition(now_ns)
         if missing is not None and self.valve_state is ValveState.ACTIVE:
             self._locked, self._lost_ns, self._ramp_from = missing, now_ns, list(self.outputs_pct)
             self._ramp_from[-1] = 0.0  # the grapple's valve shuts at once and holds
         wanted = [0.0] * len(FUNCTIONS)
         armed = self._b.get("ArmKey") == ARM_KEY
-        if missing is Exit.SAFETY_STOP or (missing is not None and not self._heard(now_ns, PILOT_NS)):
+        if missing is ExitCode.SAFETY_STOP or (missing is not None and not self._commands_fresh(now_ns, PILOT_NS)):
             self.valve_state, self.exit = ValveState.PILOT_OFF, missing
         elif self._locked is not None:
             self.exit = self._locked
@@ -137,24 +138,24 @@ class ValveNode(Device):
             self.valve_state = ValveState.RAMP if left > 0.0 else ValveState.FAULT
             wanted = [max(0.0, left) * u for u in self._ramp_from]
         elif missing is not None or not armed:
-            self.valve_state, self.exit = ValveState.NEUTRAL, missing or Exit.NOT_ARMED
+            self.valve_state, self.exit = ValveState.NEUTRAL, missing or ExitCode.NOT_ARMED
         else:
-            self.valve_state, self.exit = ValveState.ACTIVE, Exit.OK
+            self.valve_state, self.exit = ValveState.ACTIVE, ExitCode.OK
             wanted = self._commands()
         self.outputs_pct = wanted
 
-    def _heard(self, now_ns: int, limit_ns: int) -> bool:
+    def _commands_fresh(self, now_ns: int, limit_ns: int) -> bool:
         return self._a.fresh(now_ns, limit_ns) and self._b.fresh(now_ns, limit_ns)
 
-    def _missing(self, now_ns: int) -> Exit | None:
+    def _missing_condition(self, now_ns: int) -> ExitCode | None:
         """What keeps the node from following, if anything."""
         if not self._pilot_on():
-            return Exit.SAFETY_STOP
+            return ExitCode.SAFETY_STOP
         synchronous = self._sync_ns is not None and now_ns - self._sync_ns <= SYNC_NS
-        if not self._heard(now_ns, COMMAND_NS) or not synchronous:
-            return Exit.COMMAND_TIMEOUT
+        if not self._commands_fresh(now_ns, COMMAND_NS) or not synchronous:
+            return ExitCode.COMMAND_TIMEOUT
         if not self._guard.fresh(now_ns, GUARD_NS) or self._guard.get("Enable") != ARM_KEY:
-            return Exit.GUARD_MISSING
+            return ExitCode.GUARD_MISSING
         return None
 
     def _commands(self) -> list[float]:
@@ -164,7 +165,7 @@ class ValveNode(Device):
         if mode == MODE_SPOOL:
             out[:5] = [a.get("Slew"), a.get("Lift"), a.get("Tilt"), a.get("Ext"), b.get("Rot")]
         elif mode != 0:
-            self.exit = Exit.OUT_OF_RANGE  # this node closes no velocity loop
+            self.exit = ExitCode.OUT_OF_RANGE  # this node closes no velocity loop
         flow = abs(b.get("Grapple"))
         match b.get("GrappleMode"):
             case 1:
@@ -193,7 +194,7 @@ class ValveNode(Device):
             run = 2 if self.valve_state is ValveState.ACTIVE else 1
             self.outbox.append(self._plc.frame(run, self._watchdog, CYCLE_US, 0))
 
-    def _grapple_state(self, m: Measured) -> GrappleState:
+    def _grapple_state(self, m: ValveInputs) -> GrappleState:
         """By the opening where it is measured, else by the pressures at the ends."""
         command = self.outputs_pct[5]
         if m.opening is None:

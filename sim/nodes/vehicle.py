@@ -14,14 +14,14 @@ from can_dbc.dbc.codec import Database
 from machine.profile import Carrier, CarrierValve
 from sim.nodes import Outbox
 from sim.nodes.j1939 import J1939Node
-from sim.nodes.messages import ARM_KEY, MS, Every, ProtectedInput, ProtectedMessage
+from sim.nodes.messages import ARM_KEY, MS, PeriodicTimer, ProtectedInput, ProtectedMessage
 
 ADDRESS = 0x03
 DRIVE_FUNCTION = 23  # J1939 NAME function of a propulsion controller
 COMMAND_NS = 100 * MS
 CYCLE_NS = 20 * MS
-STILL_M_S = 0.02
-LEAST_RATE_RAD_S = 5e-4
+STANDSTILL_M_S = 0.02
+MIN_RATE_RAD_S = 5e-4
 
 
 class VehicleFault(IntEnum):
@@ -61,7 +61,7 @@ class VehicleNode(J1939Node):
         self._carrier, self._pilot_on = carrier, pilot_on
         self._command = ProtectedInput(machine, "VehCmd")
         self._stat = ProtectedMessage(machine, "VehStat")
-        self._period = Every(CYCLE_NS)
+        self._period = PeriodicTimer(CYCLE_NS)
         self.speed_m_s = self.articulation_rad = 0.0
         self.fault = VehicleFault.NONE
         self.active = False
@@ -73,7 +73,7 @@ class VehicleNode(J1939Node):
     def receive(self, key: int, data: bytes, now_ns: int) -> None:
         if key != self._command.key:
             super().receive(key, data, now_ns)
-        elif self._command.take(data, now_ns) and self._command.get("ArmKey") != ARM_KEY:
+        elif self._command.accept(data, now_ns) and self._command.get("ArmKey") != ARM_KEY:
             self.fault = VehicleFault.NONE
 
     def decide(self, now_ns: int) -> None:
@@ -102,11 +102,11 @@ class VehicleNode(J1939Node):
         self.drive_m_s = 0.0 if self.brake else _clamped(speed, c.speed_limit_m_s)
         rate = _clamped(rate, c.articulation_rate_limit_rad_s)
         outward = rate * self.articulation_rad > 0.0 and abs(self.articulation_rad) >= c.articulation_limit_rad
-        self.steer = 0.0 if outward else spool_for(c.steer_valve, rate, LEAST_RATE_RAD_S)
+        self.steer = 0.0 if outward else spool_for(c.steer_valve, rate, MIN_RATE_RAD_S)
 
     def cycle(self, now_ns: int) -> None:
         if self._period.due(now_ns):
-            parked = self.brake and abs(self.speed_m_s) < STILL_M_S
+            parked = self.brake and abs(self.speed_m_s) < STANDSTILL_M_S
             gear = Gear.PARK if parked else Gear.NEUTRAL
             if self.drive_m_s:
                 gear = Gear.FORWARD if self.drive_m_s > 0.0 else Gear.REVERSE

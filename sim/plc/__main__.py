@@ -52,20 +52,20 @@ class LivePlc(LivePlant):
             ports["udp"] = self.datagrams.port
         return ports
 
-    def _stepped(self, now_ns: int) -> None:
+    def _on_step(self, now_ns: int) -> None:
         self._now_ns = now_ns
         if self.datagrams is not None:
             self.datagrams.cycle()
         self._loop.run_until_complete(asyncio.sleep(0))
-        super()._stepped(now_ns)
+        super()._on_step(now_ns)
 
     def _wait(self, pause_s: float) -> None:
         self._loop.run_until_complete(asyncio.sleep(pause_s))
 
     def report(self) -> dict[str, float]:
         """Also what came over the network."""
-        gate = self._program.gate
-        counts = {"accepted": gate.accepted, "refused": gate.refused, "dropped": gate.dropped}
+        arbiter = self._program.arbiter
+        counts = {"accepted": arbiter.accepted, "refused": arbiter.refused, "dropped": arbiter.dropped}
         return super().report() | counts | (asdict(self.modbus.counts) if self.modbus else {})
 
     def close(self) -> None:

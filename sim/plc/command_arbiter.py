@@ -16,10 +16,10 @@ from can_dbc.plc.map import Bounds, Command, Fault, MapError, WordOrder
 from can_dbc.plc.modbus import RegisterRefused
 
 MS = 1_000_000
-DRAFTS = 16  # clients whose unfinished writes are remembered
+MAX_DRAFT_COUNT = 16  # clients whose unfinished writes are remembered
 
 
-class Gate:
+class CommandArbiter:
     """The commanding side as the PLC sees it.  ``command`` is the newest accepted one; times are in ns."""
 
     def __init__(self, bounds: Bounds, order: WordOrder) -> None:
@@ -34,19 +34,19 @@ class Gate:
         self._drafts: dict[Hashable, list[int]] = {}
         self._commander: Hashable = None
         self._accepted_ns = self._alive_ns = 0
-        self._reset_seen = self._left = False
+        self._reset_seen = self._commander_disconnected = False
 
     def commander(self, now_ns: int) -> Hashable:
         """Who commands now; None when nobody does."""
         alive = self._commander is not None and now_ns - self._alive_ns <= self.watchdog_ms * MS
         return self._commander if alive else None
 
-    def left(self, client: Hashable) -> None:
+    def disconnected(self, client: Hashable) -> None:
         """The client's connection has ended.  Its command stands as long as any other, but anybody may take over."""
         self._drafts.pop(client, None)
-        self._left = self._left or (client is not None and client == self._commander)
+        self._commander_disconnected = self._commander_disconnected or (client is not None and client == self._commander)
 
-    def heard(self) -> bool:
+    def commanded(self) -> bool:
         """Whether anybody has commanded since the last `forget`."""
         return self._commander is not None
 
@@ -54,17 +54,17 @@ class Gate:
         """Age of the newest accepted command."""
         return now_ns - self._accepted_ns
 
-    def forget(self) -> None:
+    def release(self) -> None:
         """Nobody commands; the next command may come from anybody and with any number."""
         self._commander = None
         self.command = Command()
 
-    def note(self, fault: Fault, axis: int = plc.NO_AXIS) -> None:
+    def latch_fault(self, fault: Fault, axis: int = plc.NO_AXIS) -> None:
         """Keeps the first fault until `reset`."""
         if self.fault is Fault.NONE:
             self.fault, self.fault_axis = fault, axis
 
-    def reset_edge(self) -> bool:
+    def take_reset_edge(self) -> bool:
         """Whether the newest command began to ask for a reset; faults are then forgotten."""
         before, self._reset_seen = self._reset_seen, self.command.reset
         edge = self._reset_seen and not before
@@ -76,14 +76,14 @@ class Gate:
         """A Modbus write; raises RegisterRefused and then has changed nothing."""
         last = address + len(values)
         if address == plc.WATCHDOG_AT and len(values) == 1:
-            self._only(client, now_ns)
+            self._require_command_right(client, now_ns)
             if not plc.WATCHDOG_MS[0] <= values[0] <= plc.WATCHDOG_MS[1]:
-                self._illegal(MapError("watchdog"))
+                self._refuse_value(MapError("watchdog"))
             self.watchdog_ms = values[0]
             return
         if not (address >= plc.COMMAND_AT and last <= plc.COMMAND_AT + plc.COMMAND_COUNT):
             raise RegisterRefused(RegisterRefused.ADDRESS)
-        self._only(client, now_ns)
+        self._require_command_right(client, now_ns)
         draft = list(self._drafts.get(client, self._neutral))
         draft[address - plc.COMMAND_AT : last - plc.COMMAND_AT] = values
         try:
@@ -92,7 +92,7 @@ class Gate:
             if address <= plc.SEQUENCE_AT < last:
                 self._commit(client, draft, now_ns)
         except MapError as error:
-            self._illegal(error)
+            self._refuse_value(error)
         if address <= plc.HEARTBEAT_AT < last and client == self._commander:
             if draft[0] != self._block[0]:
                 self._alive_ns = now_ns
@@ -101,54 +101,54 @@ class Gate:
 
     def _commit(self, client: Hashable, draft: list[int], now_ns: int) -> None:
         sequence = draft[plc.SEQUENCE_AT - plc.COMMAND_AT]
-        if self._take(client, sequence, plc.read_command(draft, self.order), now_ns, 16):
+        if self._accept(client, sequence, plc.read_command(draft, self.order), now_ns, 16):
             self._block = list(draft)
 
     def datagram(self, client: Hashable, data: bytes, now_ns: int) -> Header | None:
         """A UDP command; its header when it was taken.  A damaged, old or strange one is dropped and counted."""
         try:
             header, command = decode_command(data)
-            if self._may(client, now_ns) and self._take(client, header.sequence, command, now_ns, 32):
+            if self._may_command(client, now_ns) and self._accept(client, header.sequence, command, now_ns, 32):
                 return header
         except DatagramRefused:
             pass
         except MapError as error:
-            if self._may(client, now_ns):
-                self.note(Fault.ILLEGAL_VALUE, error.axis)
+            if self._may_command(client, now_ns):
+                self.latch_fault(Fault.ILLEGAL_VALUE, error.axis)
             self.refused += 1
             return None
         self.dropped += 1
         return None
 
-    def _take(self, client: Hashable, sequence: int, command: Command, now_ns: int, bits: int) -> bool:
+    def _accept(self, client: Hashable, sequence: int, command: Command, now_ns: int, bits: int) -> bool:
         if client == self.commander(now_ns) and not plc.advances(sequence, self.sequence, bits):
             return False
         self._bounds.check(command)
         self.command, self.sequence, self._commander = command, sequence, client
         self._accepted_ns = self._alive_ns = now_ns
-        self._left = False
+        self._commander_disconnected = False
         self.accepted += 1
         return True
 
-    def _may(self, client: Hashable, now_ns: int) -> bool:
+    def _may_command(self, client: Hashable, now_ns: int) -> bool:
         """Whether this client may command."""
-        return self._left or self.commander(now_ns) in (None, client)
+        return self._commander_disconnected or self.commander(now_ns) in (None, client)
 
-    def _only(self, client: Hashable, now_ns: int) -> None:
-        if not self._may(client, now_ns):
+    def _require_command_right(self, client: Hashable, now_ns: int) -> None:
+        if not self._may_command(client, now_ns):
             raise RegisterRefused(RegisterRefused.BUSY)
 
-    def _illegal(self, error: MapError) -> None:
+    def _refuse_value(self, error: MapError) -> None:
         self.refused += 1
-        self.note(Fault.ILLEGAL_VALUE, error.axis)
+        self.latch_fault(Fault.ILLEGAL_VALUE, error.axis)
         raise RegisterRefused(RegisterRefused.VALUE) from error
 
     def _remember(self, client: Hashable, draft: list[int]) -> None:
         self._drafts.pop(client, None)
         self._drafts[client] = draft
-        while len(self._drafts) > DRAFTS:
+        while len(self._drafts) > MAX_DRAFT_COUNT:
             self._drafts.pop(next(iter(self._drafts)))
 
-    def block(self) -> list[int]:
+    def command_block(self) -> list[int]:
         """The accepted command block, as it can be read back."""
         return list(self._block)

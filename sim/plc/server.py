@@ -29,21 +29,21 @@ class PlcRegisters:
         """Status block or command block, or a part of one; both read alike as holding and as input registers."""
         for begin, length in ((plc.STATUS_AT, plc.STATUS_COUNT), (plc.COMMAND_AT, plc.COMMAND_COUNT)):
             if begin <= address and address + count <= begin + length:
-                block = self._program.status() if begin == plc.STATUS_AT else self._program.gate.block()
+                block = self._program.status() if begin == plc.STATUS_AT else self._program.arbiter.command_block()
                 return block[address - begin : address - begin + count]
         raise RegisterRefused(RegisterRefused.ADDRESS)
 
     def write(self, client: int, address: int, values: Sequence[int]) -> None:
         """A write by this connection."""
-        self._program.gate.write(client, address, values, self._clock_ns())
+        self._program.arbiter.write(client, address, values, self._clock_ns())
 
     def commands(self, client: int) -> bool:
         """Whether this connection commands."""
-        return self._program.gate.commander(self._clock_ns()) == client
+        return self._program.arbiter.commander(self._clock_ns()) == client
 
     def closed(self, client: int) -> None:
         """Who commanded may come back on a new connection."""
-        self._program.gate.left(client)
+        self._program.arbiter.disconnected(client)
 
 
 class Datagrams(asyncio.DatagramProtocol):
@@ -61,7 +61,7 @@ class Datagrams(asyncio.DatagramProtocol):
         self.port = transport.get_extra_info("sockname")[1]
 
     def datagram_received(self, data: bytes, addr: Address) -> None:
-        if self._program.gate.datagram(addr, data, self._clock_ns()) is not None:
+        if self._program.arbiter.datagram(addr, data, self._clock_ns()) is not None:
             self._peer = addr
 
     def cycle(self) -> None:
@@ -71,7 +71,7 @@ class Datagrams(asyncio.DatagramProtocol):
             return
         self._beat = feedback.heartbeat
         self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
-        header = Header(self._sequence, self._clock_ns() // 1000, self._program.gate.sequence)
+        header = Header(self._sequence, self._clock_ns() // 1000, self._program.arbiter.sequence)
         with contextlib.suppress(OSError):
             self._transport.sendto(encode_reply(header, feedback), self._peer)
 

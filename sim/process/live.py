@@ -15,8 +15,8 @@ from can_dbc.bus.reconnector import LostLink
 from can_dbc.frame import Frame
 from sim.emulation import EmulatedMachine
 
-TX_QUEUE = 256  # this process plays a dozen nodes
-LAG_NS = 25_000_000
+TX_QUEUE_FRAMES = 256  # this process plays a dozen nodes
+MAX_LAG_NS = 25_000_000
 
 
 class LiveMachine:
@@ -39,7 +39,7 @@ class LiveMachine:
         while self._running:
             now_ns = time.monotonic_ns() - self._skipped_ns
             behind_ns = now_ns - machine.next_ns if machine.next_ns else 0
-            if behind_ns > LAG_NS:
+            if behind_ns > MAX_LAG_NS:
                 self._skipped_ns += behind_ns
                 self._stalls += 1
                 now_ns -= behind_ns
@@ -47,7 +47,7 @@ class LiveMachine:
             for name, bus in self._buses.items():
                 frames.clear()
                 bus.drain(frames)
-                self._heard(frames)
+                self._on_received(frames)
                 received += [(name, f._replace(stamp_ns=f.stamp_ns - self._skipped_ns)) for f in frames]
             sent: dict[str, list[tuple[int, bytes]]] = {}
             for name, key, data in machine.step(now_ns, received):
@@ -56,15 +56,15 @@ class LiveMachine:
                 self._buses[name].send_all(out)
             for link in self._links:
                 link.watch(now_ns)
-            self._stepped(now_ns)
+            self._on_step(now_ns)
             pause_ns = machine.next_ns - (time.monotonic_ns() - self._skipped_ns)
             if pause_ns > 0:
                 self._wait(pause_ns * 1e-9)
 
-    def _heard(self, frames: list[Frame]) -> None:
+    def _on_received(self, frames: list[Frame]) -> None:
         """Called with what a bus brought."""
 
-    def _stepped(self, now_ns: int) -> None:
+    def _on_step(self, now_ns: int) -> None:
         """Called after every step."""
 
     def _wait(self, pause_s: float) -> None:

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from can_dbc.bus.base import Bus
-from sim.instruments.ideal_detector import detect, detect_near
+from sim.instruments.ideal_detector import detect, detect_in_view
 from sim.instruments.total_station import TotalStation, grapple_yaw
 from sim.plant import Plant
 from sim.process.live import LiveMachine
 from sim.process.scene_view import scene_of, view_of
-from sim.site.log_supply import Layer
+from sim.site.log_supply import LogSupplier
 from sim.site.site_file import Site
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class LivePlant(LiveMachine):
         self._plant = plant
         self._station = TotalStation(seed)
         self._answer_ns = self._lay_ns = 0
-        self._layer = None if site is None else Layer(plant, site.places, site.rounds)
+        self._layer = None if site is None else LogSupplier(plant, site.places, site.rounds)
         self._requests: socket.socket | None = None
         if port is not None:
             self._requests = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -56,7 +56,7 @@ class LivePlant(LiveMachine):
 
             self.cameras = CameraServer(CameraRig(plant.world, plant.profile, plant.world.truth, seed), cameras)
 
-    def _stepped(self, now_ns: int) -> None:
+    def _on_step(self, now_ns: int) -> None:
         if self.cameras is not None:
             self.cameras.serve(now_ns)
         if self._requests is not None and now_ns >= self._answer_ns:
@@ -87,18 +87,18 @@ class LivePlant(LiveMachine):
             case "state":
                 return {
                     "joints": plant.joint_positions(),
-                    "tong_rad": plant.tong_angle(),
+                    "tong_rad": plant.jaw_angle_rad(),
                     "tip_m": plant.tip(),
                     "poses": plant.link_poses(),
                     "logs": plant.logs(),
                     "vehicle": plant.vehicle(),
-                    "verdict": plant.judge(),
+                    "verdict": plant.evaluate(),
                     "host": self.report(),
                 }
             case "logs":
-                return detect(plant) if self._layer is None else detect_near(plant)
+                return detect(plant) if self._layer is None else detect_in_view(plant)
             case "verdict":
-                return plant.judge()
+                return plant.evaluate()
             case "poses":
                 return plant.link_poses()
             case "shapes":

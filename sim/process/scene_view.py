@@ -30,7 +30,7 @@ LEVER_WORDS: Final = {
 
 def scene_of(plant: Plant) -> dict[str, Any]:
     """What never changes: shapes on links, wheels, logs, ground, levers, and where to look from."""
-    carrier, yard = plant.profile.carrier, plant.world.yard
+    carrier, log_bodies = plant.profile.carrier, plant.world.log_bodies
     wheel = None if carrier is None else {"radius_m": carrier.wheel_radius_m, "width_m": carrier.wheel_width_m}
     middle, _ = plant.base_pose()
     return {
@@ -44,7 +44,7 @@ def scene_of(plant: Plant) -> dict[str, Any]:
                 "taper_m_m": log.taper_m_m,
                 "sweep_m": log.sweep_m,
             }
-            for log in yard.states()
+            for log in log_bodies.states()
         ],
         "ground": _ground(plant.world.terrain),
         "levers": [dict(zip(("name", "minus", "plus"), (n, *_words(n)), strict=True)) for n in plant.levers()],
@@ -87,7 +87,7 @@ def _wheels(plant: Plant) -> list[list[float]]:
 
 
 def _facts(plant: Plant) -> dict[str, str]:
-    world, verdict = plant.world, plant.judge()
+    world, verdict = plant.world, plant.evaluate()
     tip, rigid = world.tip(), world.rigid_tip()
     facts = {
         "tip": " ".join(_fixed(v, 2) for v in tip) + " m",

@@ -1,7 +1,7 @@
 """Scenes: which logs there are and where they are let go.  Same profile, seed and count, same scene.
 
 Positions are world positions (palms: the crane's base frame; a carrier starts at the origin, heading +x).  A scene is
-let go a finger's breadth above where it comes to lie; ``sim.wood.logs.Yard`` lets it come to rest before time 0.
+let go a finger's breadth above where it comes to lie; ``sim.wood.logs.LogBodies`` lets it come to rest before time 0.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ its sentences: 1 single and 2 parallel; the top log of 3 and 9 is the one to tak
 than one of 10, 11, 12 come up together; mini-piles of up to six logs."""
 
 
-class Lumber:
+class LogSampler:
     """Draws logs.  Places and sizes come from one stream, shapes from another: a new property moves no log."""
 
     def __init__(self, wood: Wood, seed: int) -> None:
@@ -91,7 +91,7 @@ def random_scene(profile: Profile, wood: Wood, seed: int, logs: int) -> tuple[Lo
 
     Raises ValueError when so many logs find no free place.
     """
-    lumber, (cx, cy), half = Lumber(wood, seed), _pick_center(profile), profile.workspace.pick_half_size_m
+    lumber, (cx, cy), half = LogSampler(wood, seed), _pick_center(profile), profile.workspace.pick_half_size_m
     found: list[LogSpec] = []
     failed = 0
     while len(found) < logs and failed < TRIES:
@@ -135,7 +135,7 @@ def arrangement(
         raise ValueError(f"scene {kind!r} is made of {low} to {high} logs, not of {logs}; ask for another number")
     if kind == "separate":
         return random_scene(profile, wood, seed, logs)
-    lumber = Lumber(wood, seed)
+    lumber = LogSampler(wood, seed)
     if kind in ("row", "bunk"):
         return _row(lumber, logs, route) if kind == "row" else _bunk(lumber, logs, profile)
     yaw = lumber.rng.uniform(-math.pi / 2, math.pi / 2) if yaw_rad is None else yaw_rad
@@ -174,7 +174,7 @@ def _moved(s: LogSpec, x: float, y: float, yaw: float) -> LogSpec:
     return replace(s, x_m=x + c * s.x_m - k * s.y_m, y_m=y + k * s.x_m + c * s.y_m, yaw_rad=s.yaw_rad + yaw)
 
 
-def _drawn(lumber: Lumber, logs: int, yaws: Callable[[], float]) -> list[LogSpec]:
+def _drawn(lumber: LogSampler, logs: int, yaws: Callable[[], float]) -> list[LogSpec]:
     return [lumber.log(lumber.rng.uniform(-0.2, 0.2), 0.0, yaws()) for _ in range(logs)]
 
 
@@ -193,22 +193,22 @@ def _rows(counts: Sequence[int], logs: Sequence[LogSpec]) -> list[LogSpec]:
     return out
 
 
-def _parallel(lumber: Lumber, logs: int) -> list[LogSpec]:
+def _parallel(lumber: LogSampler, logs: int) -> list[LogSpec]:
     return _rows((logs,), _drawn(lumber, logs, lambda: lumber.rng.uniform(-0.03, 0.03)))
 
 
-def _pile(lumber: Lumber, logs: int) -> list[LogSpec]:
+def _pile(lumber: LogSampler, logs: int) -> list[LogSpec]:
     """The thickest below: a thick log on thin ones rolls off, and what is left is no pile."""
     drawn = _drawn(lumber, logs, lambda: lumber.rng.uniform(-0.08, 0.08))
     return _rows(PILE_ROWS[logs], sorted(drawn, key=lambda log: -log.diameter_m))
 
 
-def _skewed(lumber: Lumber, logs: int) -> list[LogSpec]:
+def _skewed(lumber: LogSampler, logs: int) -> list[LogSpec]:
     turns = iter([0.0, math.radians(lumber.rng.uniform(15.0, 30.0))])
     return _rows((logs,), _drawn(lumber, logs, lambda: next(turns)))
 
 
-def _crossed(lumber: Lumber, logs: int) -> list[LogSpec]:
+def _crossed(lumber: LogSampler, logs: int) -> list[LogSpec]:
     """Parallel logs half a metre apart and one across them, 40 to 90 deg turned."""
     rng, lower = lumber.rng, []
     for i in range(logs - 1):
@@ -217,7 +217,7 @@ def _crossed(lumber: Lumber, logs: int) -> list[LogSpec]:
     return [*lower, upon(lumber.log(rng.uniform(-0.2, 0.2), 0.0, turn), lower)]
 
 
-def _row(lumber: Lumber, logs: int, route: Sequence[tuple[float, float]]) -> tuple[LogSpec, ...]:
+def _row(lumber: LogSampler, logs: int, route: Sequence[tuple[float, float]]) -> tuple[LogSpec, ...]:
     rng = lumber.rng
     legs = list(pairwise(route))
     total = sum(math.dist(a, b) for a, b in legs)
@@ -268,7 +268,7 @@ def _driven(route: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return [*out, route[-1]]
 
 
-def _bunk(lumber: Lumber, logs: int, profile: Profile) -> tuple[LogSpec, ...]:
+def _bunk(lumber: LogSampler, logs: int, profile: Profile) -> tuple[LogSpec, ...]:
     """Logs along the bunk, from stake to stake and row upon row."""
     rng, stake = lumber.rng, profile.bunk.width_m / 2 - 0.01
     out: list[LogSpec] = []

@@ -12,13 +12,13 @@ from machine.profile import Profile
 from sim.bullet.client import new_client
 from sim.camera.noise import StereoNoise
 from sim.camera.scene import LogPose
-from sim.geometry.shape import UNIT
+from sim.geometry.shape import IDENTITY
 from sim.ground.terrain import Terrain
 from sim.scenes.arrangements import arrangement
 from sim.truth.load import Truth, load_truth
-from sim.wood.logs import Yard
+from sim.wood.logs import LogBodies
 
-BASE: Final = ((0.0, 0.0, 0.0), UNIT)
+BASE: Final = ((0.0, 0.0, 0.0), IDENTITY)
 
 
 @lru_cache(maxsize=8)
@@ -26,7 +26,7 @@ def _truth(name: str, seed: int, machine: str) -> Truth:
     return load_truth(name, seed, machine)
 
 
-def settled(
+def settle_logs(
     profile: Profile, kind: str, seed: int, logs: int, terrain: Terrain, route: Sequence[tuple[float, float]]
 ) -> tuple[LogPose, ...]:
     """An arrangement of ``sim.scenes.arrangements`` at rest on ``terrain``, by the nominal truth; instances 1, 2, ...
@@ -36,7 +36,7 @@ def settled(
     truth, client = _truth("nominal", 0, profile.name), new_client()
     try:
         scene = arrangement(kind, profile, truth.wood, seed, logs, route=route)
-        states = Yard(client, profile, truth, scene, terrain, BASE).states()
+        states = LogBodies(client, profile, truth, scene, terrain, BASE).states()
     finally:
         client.disconnect()
     return tuple(
@@ -45,12 +45,12 @@ def settled(
     )
 
 
-def stereo(profile: Profile, camera: str, seed: int | str, truth: str = "nominal", truth_seed: int = 0) -> StereoNoise:
+def stereo_noise(profile: Profile, camera: str, seed: int | str, truth: str = "nominal", truth_seed: int = 0) -> StereoNoise:
     """Depth errors of a machine's camera as a truth has them."""
     return StereoNoise(profile.cameras[camera], _truth(truth, truth_seed, profile.name).cameras[camera], seed)
 
 
-def varied_stereo(
+def varied_stereo_noise(
     profile: Profile, camera: str, seed: int, *, sigma: float, edges: tuple[float, float], holes: float,
     plain_holes: float, correlation_px: float,
 ) -> StereoNoise:  # fmt: skip

@@ -17,16 +17,16 @@ from sim.scenes.arrangements import arrangement
 from sim.truth.load import load_truth
 from sim.wood.log_shape import LogSpec
 
-FAR_M: Final = 35.0
-APART_M: Final = 4.0
-AWAY_M: Final = 14.0
+SUPPLY_DISTANCE_M: Final = 35.0
+SUPPLY_SPACING_M: Final = 4.0
+MACHINE_DISTANCE_M: Final = 14.0
 """The machine is so far away when a new log is laid."""
-GONE_M: Final = 1.5
+COLLECTED_M: Final = 1.5
 """A log that lies farther from its place was taken."""
 
 
 @dataclass(frozen=True, slots=True)
-class Lying:
+class LogPlace:
     """Where a log is to lie in the world [m, rad]; what is None is drawn from the truth's wood."""
 
     x_m: float
@@ -36,7 +36,7 @@ class Lying:
     diameter_m: float | None = None
 
 
-def lay_out(profile: Profile, truth: str, seed: int, places: Sequence[Lying], rounds: int = 1) -> tuple[LogSpec, ...]:
+def place_logs(profile: Profile, truth: str, seed: int, places: Sequence[LogPlace], rounds: int = 1) -> tuple[LogSpec, ...]:
     """Logs at the places, then as many for every further round, far away; raises ValueError for an unknown truth."""
     if not places:
         return ()
@@ -46,7 +46,7 @@ def lay_out(profile: Profile, truth: str, seed: int, places: Sequence[Lying], ro
     found = []
     for i, spec in enumerate(drawn):
         place = places[i % len(places)]
-        x_m, y_m = (place.x_m, place.y_m) if i < len(places) else (-FAR_M, APART_M * (i - len(drawn) / 2))
+        x_m, y_m = (place.x_m, place.y_m) if i < len(places) else (-SUPPLY_DISTANCE_M, SUPPLY_SPACING_M * (i - len(drawn) / 2))
         found.append(
             replace(
                 spec, x_m=x_m, y_m=y_m,
@@ -64,27 +64,27 @@ def along_route(
     return arrangement("row", profile, load_truth(truth, seed, profile.name).wood, seed, logs, route=route)
 
 
-class Layer:
+class LogSupplier:
     """The person who lays a new log where one was taken, once the machine is away."""
 
     def __init__(self, plant: Plant, places: int, rounds: int) -> None:
         self._plant = plant
-        self._at = [(spec.x_m, spec.y_m) for spec in plant.world.yard.scene[:places]]
+        self._at = [(spec.x_m, spec.y_m) for spec in plant.world.log_bodies.scene[:places]]
         self._lying = list(range(places))
         self._waiting = [[i + k * places for k in range(1, rounds)] for i in range(places)]
 
     def step(self) -> int:
         """Look after all places; how many logs were laid."""
-        laid, yard = 0, self._plant.world.yard
+        laid, log_bodies = 0, self._plant.world.log_bodies
         if not any(self._waiting):
             return laid
-        states, machine = yard.states(), self._plant.base_pose()[0]
+        states, machine = log_bodies.states(), self._plant.base_pose()[0]
         for i, at in enumerate(self._at):
-            taken = math.dist(states[self._lying[i]].position_m[:2], at) > GONE_M
-            if self._waiting[i] and taken and math.dist(machine[:2], at) > AWAY_M:
+            taken = math.dist(states[self._lying[i]].position_m[:2], at) > COLLECTED_M
+            if self._waiting[i] and taken and math.dist(machine[:2], at) > MACHINE_DISTANCE_M:
                 fresh = self._lying[i] = self._waiting[i].pop(0)
                 x, y, _ = states[fresh].position_m
-                yard.wake()
-                yard.carry(fresh, at[0] - x, at[1] - y)
+                log_bodies.wake()
+                log_bodies.carry(fresh, at[0] - x, at[1] - y)
                 laid += 1
         return laid

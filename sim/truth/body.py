@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from sim.truth.variation import Draw
+from sim.truth.variation import VariationSampler
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -14,7 +14,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     com_m: tuple[float, float, float]
     inertia_kg_m2: tuple[float, float, float]
 
-    def sampled(self, draw: Draw) -> Link:
+    def sampled(self, draw: VariationSampler) -> Link:
         """The link of an individual: mass and inertia scaled together."""
         scale = draw.factor(draw.spread.mass)
         x, y, z = (scale * i for i in self.inertia_kg_m2)
@@ -36,7 +36,7 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tong_sync_nm_rad: float
     tong_sync_nm_s_rad: float
 
-    def sampled(self, draw: Draw) -> Structure:
+    def sampled(self, draw: VariationSampler) -> Structure:
         """The structure of an individual."""
         s = draw.spread
         hanging = draw.factor(s.friction)

@@ -9,7 +9,7 @@ from typing import Final
 
 import msgspec
 
-from sim.truth.variation import Draw
+from sim.truth.variation import VariationSampler
 
 TYRE_SPREAD: Final = 0.2
 COM_M: Final = 0.05
@@ -22,7 +22,7 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     com_m: tuple[float, float, float]
     inertia_kg_m2: tuple[float, float, float]
 
-    def sampled(self, draw: Draw) -> Frame:
+    def sampled(self, draw: VariationSampler) -> Frame:
         """The half of an individual."""
         k = draw.factor(draw.spread.mass)
         x, y, z = (c + draw.within(COM_M) for c in self.com_m)
@@ -60,7 +60,7 @@ class CarrierTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     brake_torque_nm: float
     brake_lag_s: float
 
-    def sampled(self, draw: Draw) -> CarrierTruth:
+    def sampled(self, draw: VariationSampler) -> CarrierTruth:
         """The carrier of an individual: masses and friction by the spread, centres of mass within 5 cm."""
         mass, friction = draw.spread.mass, draw.spread.friction
         wheel = draw.factor(mass)

@@ -6,7 +6,7 @@ import math
 
 import msgspec
 
-from sim.truth.variation import Draw
+from sim.truth.variation import VariationSampler
 
 
 class EncoderTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -18,7 +18,7 @@ class EncoderTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     noise: float
     latency_s: float
 
-    def sampled(self, draw: Draw) -> EncoderTruth:
+    def sampled(self, draw: VariationSampler) -> EncoderTruth:
         """The encoder of an individual: mounted with its own zero error and run-out."""
         return msgspec.structs.replace(
             self,

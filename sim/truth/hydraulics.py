@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from sim.truth.variation import Draw
+from sim.truth.variation import VariationSampler
 
 
 class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -27,7 +27,7 @@ class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bulk_modulus_pa: float
     leakage_m3_s_pa: float
 
-    def sampled(self, draw: Draw) -> Supply:
+    def sampled(self, draw: VariationSampler) -> Supply:
         """The supply of an individual."""
         return msgspec.structs.replace(
             self,
@@ -61,7 +61,7 @@ class Cylinder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     relaxation_1_s: float
     least_inertia: float
 
-    def sampled(self, draw: Draw) -> Cylinder:
+    def sampled(self, draw: VariationSampler) -> Cylinder:
         """The cylinder of an individual: its seals rub more or less, its load is lighter or heavier."""
         dry = draw.factor(draw.spread.friction)
         return msgspec.structs.replace(
@@ -95,7 +95,7 @@ class ValveTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     limit_minus_pa: float
     check_ratio: float = 0.0
 
-    def sampled(self, draw: Draw) -> ValveTruth:
+    def sampled(self, draw: VariationSampler) -> ValveTruth:
         """The valve of an individual."""
         s = draw.spread
         return msgspec.structs.replace(
@@ -115,6 +115,6 @@ class Function(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cylinder: Cylinder
     valve: ValveTruth
 
-    def sampled(self, draw: Draw) -> Function:
+    def sampled(self, draw: VariationSampler) -> Function:
         """The function of an individual."""
         return Function(self.cylinder.sampled(draw), self.valve.sampled(draw))

@@ -16,7 +16,7 @@ from sim.truth.carrier import CarrierTruth
 from sim.truth.encoders import EncoderTruth
 from sim.truth.hydraulics import Function, Supply
 from sim.truth.sensors import CameraTruth, GnssTruth
-from sim.truth.variation import Draw, Spread
+from sim.truth.variation import Variation, VariationSampler
 from sim.truth.wood import Wood
 
 FILES = {"palms_471": "nominal.toml", "aoro_fc8": "nominal_aoro_fc8.toml"}
@@ -32,7 +32,7 @@ class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     supply: Supply
     functions: dict[str, Function]
     encoders: dict[str, EncoderTruth]
-    spread: Spread
+    spread: Variation
     wood: Wood
     cameras: dict[str, CameraTruth]
     gnss: GnssTruth | None = None
@@ -63,8 +63,8 @@ def load_truth(name: str, seed: int, machine: str) -> Truth:
 def _sampled(truth: Truth, seed: int) -> Truth:
     """One individual; every part draws by its own name, so that a new part changes no other."""
 
-    def draw(part: str) -> Draw:
-        return Draw(truth.spread, part, seed)
+    def draw(part: str) -> VariationSampler:
+        return VariationSampler(truth.spread, part, seed)
 
     return msgspec.structs.replace(
         truth,

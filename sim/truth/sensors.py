@@ -6,7 +6,7 @@ import math
 
 import msgspec
 
-from sim.truth.variation import Draw
+from sim.truth.variation import VariationSampler
 
 Vector = tuple[float, float, float]
 
@@ -34,7 +34,7 @@ class CameraTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hole_share: float
     plain_hole_share: float
 
-    def sampled(self, draw: Draw) -> CameraTruth:
+    def sampled(self, draw: VariationSampler) -> CameraTruth:
         """The camera of an individual: shifted and turned some way, its matching better or worse by a third."""
 
         def off(nominal: Vector, bound: float) -> Vector:
@@ -85,7 +85,7 @@ class GnssTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     datum_m: float
     geoid_m: float
 
-    def sampled(self, draw: Draw) -> GnssTruth:
+    def sampled(self, draw: VariationSampler) -> GnssTruth:
         """The receiver of an individual: antennas mounted a little beside their places."""
         bound = draw.spread.antenna_m
         main, aux = (tuple(x + draw.within(bound) for x in at) for at in (self.main_offset_m, self.aux_offset_m))

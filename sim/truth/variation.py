@@ -11,7 +11,7 @@ SIGMA_SHARE: Final = 0.5
 """A draw is normal with this share of its bound as sigma and cut at the bound: most individuals are near the middle."""
 
 
-class Spread(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Variation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Bounds about the nominal values (docs/reference/machines.md section 14): relative ones as fractions, others with their unit.
 
     ``offset`` is the zero error of an encoder [rad, m], ``antenna_m`` how far an antenna stands beside its place;
@@ -33,10 +33,10 @@ class Spread(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     antenna_m: float
 
 
-class Draw:
+class VariationSampler:
     """Bounded random numbers for one part of the truth: each part draws from its own seed, whatever others draw."""
 
-    def __init__(self, spread: Spread, part: str, seed: int) -> None:
+    def __init__(self, spread: Variation, part: str, seed: int) -> None:
         self.spread = spread
         self.rng = random.Random(f"truth {part} {seed}")
 

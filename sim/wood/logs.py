@@ -31,8 +31,8 @@ Pose = tuple[Vector, Quaternion]
 SLEEP: Final = 0.02  # [m/s, rad/s]
 SETTLE_STEP_S: Final = 0.0025
 SETTLE_S: Final = 20.0  # longest time to come to rest
-LOOK_STEPS: Final = 20
-STILL_LOOKS: Final = 8  # 0.4 s
+CHECK_STEPS: Final = 20
+STILL_CHECK_COUNT: Final = 8  # 0.4 s
 REST_M_S: Final = 0.004
 REST_RAD_S: Final = 0.02
 # While a scene comes to rest, air as thick as this [1/s, of Bullet's form] takes the energy out of rolling logs.
@@ -61,7 +61,7 @@ class LogState:
     ends_m: tuple[Vector, Vector]
 
 
-class Yard:
+class LogBodies:
     """The logs.  ``logs`` are body ids in scene order, ``masses`` in kg.
 
     ``terrain`` is used in the private client alone; ``base`` is the crane's base frame in the world, for the bunk.
@@ -81,37 +81,37 @@ class Yard:
         wood = [mass_of(spec) for spec in self.scene]
         self.masses = [m.mass_kg for m in wood]
         poses = _settled(profile, truth.contact, self.scene, terrain, base) if self.scene else []
-        self.logs = tuple(
+        self.body_ids = tuple(
             _body(client, spec, m, pose, truth.contact) for spec, m, pose in zip(self.scene, wood, poses, strict=True)
         )
-        _check_apart(client, self.logs, "at rest")
+        _check_apart(client, self.body_ids, "at rest")
         for state in (client.ACTIVATION_STATE_ENABLE_SLEEPING, client.ACTIVATION_STATE_SLEEP):
-            for body in self.logs:
+            for body in self.body_ids:
                 client.changeDynamics(body, -1, activationState=state, sleepThreshold=SLEEP)
         # Body axes -> log frame: the turn about y, and the log's origin seen from the centre of mass.
         self._turn = np.array([m.turn_rad for m in wood])
         self._com = np.array([m.com_m for m in wood]).reshape(-1, 3)
         self.stowed: tuple[int, ...] = ()
-        self._seen: list[Any] = [None] * len(self.logs)
-        self._last: list[Any] = [None] * len(self.logs)
+        self._seen: list[Any] = [None] * len(self.body_ids)
+        self._last: list[Any] = [None] * len(self.body_ids)
         self._size = np.array([(s.length_m, s.diameter_m, s.sweep_m) for s in self.scene]).reshape(-1, 3)
 
     def wake(self) -> None:
         """Wake all logs that are not stowed; needed before a pose, a speed or a force is put on one from outside."""
-        for i, body in enumerate(self.logs):
+        for i, body in enumerate(self.body_ids):
             if i not in self.stowed:
                 self._p.changeDynamics(body, -1, activationState=self._p.ACTIVATION_STATE_WAKE_UP)
 
     def carry(self, which: int, east_m: float, north_m: float) -> None:
         """Someone takes a log, as it lies, to another place on level ground, by so much in the world."""
-        (x, y, z), turn = self._p.getBasePositionAndOrientation(self.logs[which])
-        self._p.resetBasePositionAndOrientation(self.logs[which], (x + east_m, y + north_m, z), turn)
-        self._p.resetBaseVelocity(self.logs[which], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        (x, y, z), turn = self._p.getBasePositionAndOrientation(self.body_ids[which])
+        self._p.resetBasePositionAndOrientation(self.body_ids[which], (x + east_m, y + north_m, z), turn)
+        self._p.resetBaseVelocity(self.body_ids[which], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     def states(self) -> list[LogState]:
         """The logs now, in scene order.  Only those that moved since the last call are worked out."""
         p = self._p
-        now = [(p.getBasePositionAndOrientation(body), p.getBaseVelocity(body)) for body in self.logs]
+        now = [(p.getBasePositionAndOrientation(body), p.getBaseVelocity(body)) for body in self.body_ids]
         moved = [i for i, seen in enumerate(now) if seen != self._seen[i]]
         if moved:
             for i, state in zip(moved, self._states(moved, [now[i] for i in moved]), strict=True):
@@ -268,20 +268,20 @@ def _rest(p: BulletClient, bodies: Sequence[int]) -> None:
     for body in bodies:
         p.changeDynamics(body, -1, activationState=p.ACTIVATION_STATE_ENABLE_SLEEPING, sleepThreshold=SLEEP)
         p.changeDynamics(body, -1, linearDamping=SETTLE_DAMPING[0], angularDamping=SETTLE_DAMPING[1])
-    for _ in range(round(SETTLE_S / SETTLE_STEP_S / LOOK_STEPS)):
-        for _ in range(LOOK_STEPS):
+    for _ in range(round(SETTLE_S / SETTLE_STEP_S / CHECK_STEPS)):
+        for _ in range(CHECK_STEPS):
             p.stepSimulation()
         for i, body in enumerate(bodies):
             v, w = p.getBaseVelocity(body)
             still[body] = still[body] + 1 if math.hypot(*v) < REST_M_S and math.hypot(*w) < REST_RAD_S else 0
-            if still[body] >= STILL_LOOKS and free[body]:
+            if still[body] >= STILL_CHECK_COUNT and free[body]:
                 p.changeDynamics(body, -1, activationState=p.ACTIVATION_STATE_SLEEP)
-            elif still[body] >= STILL_LOOKS:
+            elif still[body] >= STILL_CHECK_COUNT:
                 free[body], still[body] = True, 0
                 p.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
                 along = p.getMatrixFromQuaternion(p.getBasePositionAndOrientation(body)[1])[2::3]
                 p.resetBaseVelocity(body, angularVelocity=[NUDGE_RAD_S * (-1) ** i * x for x in along])
-        if all(free.values()) and min(still.values()) >= STILL_LOOKS:
+        if all(free.values()) and min(still.values()) >= STILL_CHECK_COUNT:
             return
     worst = min(range(len(bodies)), key=lambda i: (free[bodies[i]], still[bodies[i]]))
     raise ValueError(

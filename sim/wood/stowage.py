@@ -22,7 +22,7 @@ from sim.bullet.body import Body, Pose
 from sim.bullet.client import BulletClient
 from sim.geometry.shape import Quaternion, Vector, rpy_quaternion
 from sim.wood.bunk import to_bunk
-from sim.wood.logs import Yard
+from sim.wood.logs import LogBodies
 
 STILL_M_S: Final = 0.01
 STILL_RAD_S: Final = 0.03
@@ -31,50 +31,50 @@ STILL_S: Final = 0.5
 """... and all are stowed when all have done so for this long."""
 NEAR_M: Final = 0.15
 """What comes so near wakes them: several times what the fastest log of a grasp moves between two looks."""
-TILT_RAD: Final = 0.05
+WEIGHT_TILT_RAD: Final = 0.05
 """So far their weight may turn against the bunk: less than what sets a log rolling on a flat floor (0.08), ..."""
 WEIGHT_SHARE: Final = 0.1
 """... and so much may it change."""
-FELT_S: Final = 0.1
+WEIGHT_FILTER_S: Final = 0.1
 """Time over which the bunk's acceleration is felt: steel rings faster, and moves no log."""
 FOLLOW_M: Final = 0.0005
 FOLLOW_RAD: Final = 0.0002
 """Stowed logs are put where the bunk has taken them once it has moved by more."""
-FIXED_N: Final = 1e9
-EVERYTHING, SOLID, NOTHING = -1, 1, 0
+FIXED_JOINT_N: Final = 1e9
+COLLIDE_ALL, COLLISION_GROUP, COLLIDE_NONE = -1, 1, 0
 """Bullet's masks and groups of collision."""
 
 Box = tuple[Vector, Vector]
 
 
 class Stowage:
-    """``watch`` after every ``look_s`` of physics.  ``machine`` is the carrier's body, its root the rear frame with the
-    bunk; ``hands`` are the links that may touch a load.
+    """``watch`` after every ``check_period_s`` of physics.  ``machine`` is the carrier's body, its root the rear frame with the
+    bunk; ``grapple_links`` are the links that may touch a load.
     """
 
     def __init__(
-        self, client: BulletClient, machine: Body, profile: Profile, hands: Iterable[str], yard: Yard, look_s: float
+        self, client: BulletClient, machine: Body, profile: Profile, grapple_links: Iterable[str], log_bodies: LogBodies, check_period_s: float
     ) -> None:
-        self._p, self._machine, self._bunk, self._yard, self._look_s = client, machine, profile.bunk, yard, look_s
-        self._hands = {machine.link[name] for name in hands}
-        self._log_of = {body: i for i, body in enumerate(yard.logs)}
-        self._weight = Weight(look_s)
-        self._rested: Vector = (0.0, 0.0, 0.0)
+        self._p, self._machine, self._bunk, self._log_bodies, self._check_period_s = client, machine, profile.bunk, log_bodies, check_period_s
+        self._grapple_links = {machine.link[name] for name in grapple_links}
+        self._log_of = {body: i for i, body in enumerate(log_bodies.body_ids)}
+        self._weight = ApparentWeight(check_period_s)
+        self._weight_at_rest: Vector = (0.0, 0.0, 0.0)
         self._still_s = 0.0
         self._at: Pose = client.getBasePositionAndOrientation(machine.body)
-        self._kept: list[Pose] = []
+        self._relative_poses: list[Pose] = []
         self._around: Box = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        self._tied: tuple[int, int] | None = None
+        self._fixed_body: tuple[int, int] | None = None
 
     def watch(self) -> None:
         """Stow what lies still, wake what is about to be touched or shaken."""
         p = self._p
         at, moving = p.getBasePositionAndOrientation(self._machine.body), p.getBaseVelocity(self._machine.body)
-        self._weight.feel(moving[0], p.getMatrixFromQuaternion(at[1]))
-        stowed = self._yard.stowed
+        self._weight.update(moving[0], p.getMatrixFromQuaternion(at[1]))
+        stowed = self._log_bodies.stowed
         if not stowed:
             self._rest(at, moving)
-        elif self._weight.differs(self._rested) or self._approached(self._around, stowed):
+        elif self._weight.differs(self._weight_at_rest) or self._approached(self._around, stowed):
             self._wake(at, moving)
         elif _moved(at, self._at):
             self._follow(at)
@@ -82,10 +82,10 @@ class Stowage:
     def _rest(self, at: Pose, moving: tuple[Vector, Vector]) -> None:
         """Count how long what is in the bunk has lain still; stow it when that is long enough."""
         aboard = self._aboard()
-        if not aboard or not all(self._lies_still(self._yard.logs[i], at[0], *moving) for i in aboard):
+        if not aboard or not all(self._lies_still(self._log_bodies.body_ids[i], at[0], *moving) for i in aboard):
             self._still_s = 0.0
             return
-        self._still_s += self._look_s
+        self._still_s += self._check_period_s
         if self._still_s >= STILL_S and not self._approached(self._box(aboard), aboard):
             self._stow(aboard, at, moving)
 
@@ -94,7 +94,7 @@ class Stowage:
         p, b = self._p, self._bunk
         inward = p.invertTransform(*self._machine.pose("base"))
         found = []
-        for i, log in enumerate(self._yard.logs):
+        for i, log in enumerate(self._log_bodies.body_ids):
             x, y, z = to_bunk(b, p.multiplyTransforms(*inward, *p.getBasePositionAndOrientation(log))[0])
             if abs(x) < b.length_m / 2 and abs(y) < b.width_m / 2 and z > b.floor_z_m:
                 found.append(i)
@@ -108,13 +108,13 @@ class Stowage:
     def _approached(self, box: Box, load: Sequence[int]) -> bool:
         """Whether a hand, or a log that is not of the load, reaches into the box."""
         for body, link in self._p.getOverlappingObjects(*box) or ():
-            if (link in self._hands) if body == self._machine.body else self._log_of.get(body, load[0]) not in load:
+            if (link in self._grapple_links) if body == self._machine.body else self._log_of.get(body, load[0]) not in load:
                 return True
         return False
 
     def _box(self, load: Sequence[int]) -> Box:
         """What lies around the load, ``NEAR_M`` wide."""
-        lows, highs = zip(*(self._p.getAABB(self._yard.logs[i]) for i in load), strict=True)
+        lows, highs = zip(*(self._p.getAABB(self._log_bodies.body_ids[i]) for i in load), strict=True)
         low, high = ([f(c) for c in zip(*side, strict=True)] for f, side in ((min, lows), (max, highs)))
         return (low[0] - NEAR_M, low[1] - NEAR_M, low[2] - NEAR_M), (
             high[0] + NEAR_M,
@@ -123,16 +123,16 @@ class Stowage:
         )
 
     def _stow(self, aboard: tuple[int, ...], at: Pose, moving: tuple[Vector, Vector]) -> None:
-        p, yard = self._p, self._yard
+        p, log_bodies = self._p, self._log_bodies
         inward = p.invertTransform(*at)
-        self._kept = [p.multiplyTransforms(*inward, *p.getBasePositionAndOrientation(yard.logs[i])) for i in aboard]
-        self._at, self._rested, self._around = at, self._weight.now, self._box(aboard)
-        self._tied = self._fix(aboard, at, moving)
+        self._relative_poses = [p.multiplyTransforms(*inward, *p.getBasePositionAndOrientation(log_bodies.body_ids[i])) for i in aboard]
+        self._at, self._weight_at_rest, self._around = at, self._weight.now, self._box(aboard)
+        self._fixed_body = self._fix(aboard, at, moving)
         for i in aboard:
-            p.setCollisionFilterGroupMask(yard.logs[i], -1, NOTHING, NOTHING)
-            p.resetBaseVelocity(yard.logs[i], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-            p.changeDynamics(yard.logs[i], -1, activationState=p.ACTIVATION_STATE_SLEEP)
-        yard.stowed = aboard
+            p.setCollisionFilterGroupMask(log_bodies.body_ids[i], -1, COLLIDE_NONE, COLLIDE_NONE)
+            p.resetBaseVelocity(log_bodies.body_ids[i], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            p.changeDynamics(log_bodies.body_ids[i], -1, activationState=p.ACTIVATION_STATE_SLEEP)
+        log_bodies.stowed = aboard
 
     def _fix(self, aboard: Sequence[int], at: Pose, moving: tuple[Vector, Vector]) -> tuple[int, int]:
         """A body without a shape that weighs as the load does, and what ties it to the rear frame."""
@@ -144,18 +144,18 @@ class Stowage:
         p.resetBaseVelocity(body, _carried(*moving, at[0], place), moving[1])
         zero = (0.0, 0.0, 0.0)
         tie: int = p.createConstraint(self._machine.body, -1, body, -1, p.JOINT_FIXED, zero, own[0], zero, own[1])
-        p.changeConstraint(tie, maxForce=FIXED_N)
+        p.changeConstraint(tie, maxForce=FIXED_JOINT_N)
         return body, tie
 
     def _mass(self, aboard: Sequence[int]) -> tuple[float, Pose, list[float]]:
         """Mass, centre and principal axes, and principal inertia [kg m^2] of the load, in the root's axes."""
-        p, yard = self._p, self._yard
-        masses, places = [yard.masses[i] for i in aboard], np.array([at for at, _ in self._kept])
+        p, log_bodies = self._p, self._log_bodies
+        masses, places = [log_bodies.masses[i] for i in aboard], np.array([at for at, _ in self._relative_poses])
         middle = np.average(places, axis=0, weights=masses)
         inertia = np.zeros((3, 3))
-        for i, m, off, (_, turn) in zip(aboard, masses, places - middle, self._kept, strict=True):
+        for i, m, off, (_, turn) in zip(aboard, masses, places - middle, self._relative_poses, strict=True):
             axes = np.array(p.getMatrixFromQuaternion(turn)).reshape(3, 3)
-            own = np.diag(p.getDynamicsInfo(yard.logs[i], -1)[2])
+            own = np.diag(p.getDynamicsInfo(log_bodies.body_ids[i], -1)[2])
             inertia += axes @ own @ axes.T + m * (off @ off * np.eye(3) - np.outer(off, off))
         principal, axes = np.linalg.eigh(inertia)
         axes[:, 0] *= np.linalg.det(axes)  # right-handed
@@ -163,44 +163,44 @@ class Stowage:
 
     def _follow(self, at: Pose) -> None:
         """Put the stowed logs where the bunk has taken them."""
-        p, yard = self._p, self._yard
-        for i, kept in zip(yard.stowed, self._kept, strict=True):
-            p.resetBasePositionAndOrientation(yard.logs[i], *p.multiplyTransforms(*at, *kept))
-        self._at, self._around = at, self._box(yard.stowed)
+        p, log_bodies = self._p, self._log_bodies
+        for i, kept in zip(log_bodies.stowed, self._relative_poses, strict=True):
+            p.resetBasePositionAndOrientation(log_bodies.body_ids[i], *p.multiplyTransforms(*at, *kept))
+        self._at, self._around = at, self._box(log_bodies.stowed)
 
     def _wake(self, at: Pose, moving: tuple[Vector, Vector]) -> None:
         """Give the stowed logs back to the physics."""
-        p, yard = self._p, self._yard
+        p, log_bodies = self._p, self._log_bodies
         self._follow(at)
-        for i in yard.stowed:
-            log = yard.logs[i]
-            p.setCollisionFilterGroupMask(log, -1, SOLID, EVERYTHING)
+        for i in log_bodies.stowed:
+            log = log_bodies.body_ids[i]
+            p.setCollisionFilterGroupMask(log, -1, COLLISION_GROUP, COLLIDE_ALL)
             p.changeDynamics(log, -1, activationState=p.ACTIVATION_STATE_WAKE_UP)
             place = p.getBasePositionAndOrientation(log)[0]
             p.resetBaseVelocity(log, _carried(*moving, at[0], place), moving[1])
-        if self._tied is not None:
-            body, tie = self._tied
+        if self._fixed_body is not None:
+            body, tie = self._fixed_body
             p.removeConstraint(tie)  # Bullet does not do so with the body
             p.removeBody(body)
-        yard.stowed, self._kept, self._tied, self._still_s = (), [], None, 0.0
+        log_bodies.stowed, self._relative_poses, self._fixed_body, self._still_s = (), [], None, 0.0
 
 
-class Weight:
+class ApparentWeight:
     """What a kilogram weighs in a frame that moves: gravity less acceleration [m/s^2], ``now``, in the frame's axes,
-    smoothed over ``FELT_S``; ``look_s`` lie between two calls of ``feel``.
+    smoothed over ``WEIGHT_FILTER_S``; ``check_period_s`` lie between two calls of ``update``.
     """
 
-    def __init__(self, look_s: float, gravity_m_s2: float = 9.81) -> None:
-        self._look_s, self._gravity = look_s, gravity_m_s2
+    def __init__(self, check_period_s: float, gravity_m_s2: float = 9.81) -> None:
+        self._check_period_s, self._gravity = check_period_s, gravity_m_s2
         self._velocity: Vector | None = None
         self.now: Vector = (0.0, 0.0, -gravity_m_s2)
 
-    def feel(self, velocity: Vector, axes: Sequence[float]) -> None:
+    def update(self, velocity: Vector, axes: Sequence[float]) -> None:
         """Velocity of the frame [m/s] and its rotation matrix, row by row."""
         last = self._velocity or velocity
-        a, b, c = ((last[i] - velocity[i]) / self._look_s for i in range(3))
+        a, b, c = ((last[i] - velocity[i]) / self._check_period_s for i in range(3))
         c -= self._gravity
-        share, now = self._look_s / FELT_S, self.now
+        share, now = self._check_period_s / WEIGHT_FILTER_S, self.now
         x, y, z = (now[i] + share * (axes[i] * a + axes[3 + i] * b + axes[6 + i] * c - now[i]) for i in range(3))
         self._velocity, self.now = velocity, (x, y, z)
 
@@ -211,7 +211,7 @@ class Weight:
         size, was = math.hypot(u, v, w), math.hypot(x, y, z)
         if abs(size - was) > WEIGHT_SHARE * was:
             return True
-        return math.hypot(y * w - z * v, z * u - x * w, x * v - y * u) > math.sin(TILT_RAD) * size * was
+        return math.hypot(y * w - z * v, z * u - x * w, x * v - y * u) > math.sin(WEIGHT_TILT_RAD) * size * was
 
 
 def _carried(linear: Vector, angular: Vector, origin: Vector, place: Vector) -> Vector:

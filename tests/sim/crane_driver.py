@@ -115,7 +115,7 @@ class Driver:
         self.commands["grapple"] = -0.7
         z, still = low, 0
         for _ in range(round(8.0 / STEP_S)):
-            angle = self.w.tong_angle
+            angle = self.w.jaw_angle_rad
             if raising:
                 deepest = max(self.tip_below_pin(angle + a) for a in (0.0, 0.05, 0.1, 0.15))
                 wanted = ground + CLEARANCE_M + deepest
@@ -142,7 +142,7 @@ class Driver:
         self.commands["grapple"] = 1.0
         for _ in range(round(6.0 / STEP_S)):
             self.tick({})
-            if self.w.tong_angle < 0.45:
+            if self.w.jaw_angle_rad < 0.45:
                 break
         self.commands["grapple"] = 0.0
         self.wait(0.5)

@@ -13,7 +13,7 @@ import pytest
 from machine.geometry.kinematics import pin_position, solve
 from machine.loading.profile_file import load_profile
 from sim.truth.load import load_truth
-from sim.world import HOME, World
+from sim.world import HOME_POSE, World
 
 MACHINES = ("palms_471", "aoro_fc8")
 ROOT = Path(__file__).parents[2]
@@ -109,7 +109,7 @@ def test_the_grapple_hits_the_bunk_and_nothing_else_of_the_machine():
 
 def test_home_is_plumb_and_still(world):
     w = World(world.profile, world.truth, 0, ())
-    for joint, value in HOME[world.profile.name].items():
+    for joint, value in HOME_POSE[world.profile.name].items():
         assert w.q[joint] == pytest.approx(value, abs=2e-3)
     before = w.tip()
     for _ in range(400):

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from machine.loading.profile_file import load_profile
 from machine.geometry.optics import Intrinsics, intrinsics, pinhole, rpy_matrix
+from machine.loading.profile_file import load_profile
 from sim.camera.geometry import look_at, mount_view, orbit, quaternion_matrix
 from sim.geometry.shape import rpy_quaternion
 

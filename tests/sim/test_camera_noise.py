@@ -5,8 +5,8 @@ import pytest
 from camera_scenes import ABOVE, log, site
 from msgspec.structs import replace
 
-from machine.loading.profile_file import load_profile
 from machine.geometry.optics import Intrinsics
+from machine.loading.profile_file import load_profile
 from sim.camera.noise import StereoNoise
 from sim.camera.render import Picture, render
 from sim.camera.scene import Ground, SceneBuilder

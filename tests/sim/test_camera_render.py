@@ -11,10 +11,10 @@ import pytest
 from camera_scenes import ABOVE, LENS, log, lying, site
 
 from sim.camera.geometry import View, look_at
-from sim.camera.ground_cover import CLEARING, Clutter
+from sim.camera.ground_cover import CLEARING, GroundCover
 from sim.camera.labels import labels
-from sim.camera.mesh_renderer import TinyRenderer
-from sim.camera.render import Look, render
+from sim.camera.mesh_renderer import MeshRenderer
+from sim.camera.render import ImagingConditions, render
 from sim.camera.scene import CLUTTER, CRANE, GROUND, SKY, Ground, LogPose, Scene, SceneBuilder
 from sim.ground.terrain import Terrain
 
@@ -110,7 +110,7 @@ def test_pybullets_renderer_sees_the_same(kind: str) -> None:
     terrain = Terrain(kind, 4)
     scene = site(8, ground=Ground(*terrain.origin_m, terrain.cell_m, terrain.heights))
     ours = render(scene, ABOVE)
-    second = TinyRenderer(scene)
+    second = MeshRenderer(scene)
     try:
         theirs = second.render(ABOVE)
     finally:
@@ -128,7 +128,7 @@ def test_held_out_logs_differ_from_the_analytic_ones() -> None:
     scene = scene_of(log(1, 0.0, 0.0, diameter=0.3))
     pictures = []
     for bump in (0.0, 0.01):
-        second = TinyRenderer(scene, bump_m=bump, oval=0.1 if bump else 0.0)
+        second = MeshRenderer(scene, bump_m=bump, oval=0.1 if bump else 0.0)
         pictures.append(second.render(DOWN))
         second.close()
     both = (pictures[0].mask == 1) & (pictures[1].mask == 1)
@@ -188,8 +188,8 @@ def test_a_log_behind_the_camera_has_no_box() -> None:
 
 
 def test_the_sun_casts_a_shadow_and_light_changes_with_the_day() -> None:
-    sun = Look(sun=(0.0, 0.6, 0.8), sky_gain=0.4, sun_gain=0.8, grain=0.0)
-    dark = Look(sun=(0.0, 0.6, 0.8), sky_gain=0.4, sun_gain=0.0, grain=0.0)
+    sun = ImagingConditions(sun=(0.0, 0.6, 0.8), sky_gain=0.4, sun_gain=0.8, grain=0.0)
+    dark = ImagingConditions(sun=(0.0, 0.6, 0.8), sky_gain=0.4, sun_gain=0.0, grain=0.0)
     scene = scene_of(log(1, 0.0, 0.0, diameter=0.3))
     bright, overcast = render(scene, DOWN, sun), render(scene, DOWN, dark)
     ground = bright.mask == GROUND
@@ -199,12 +199,12 @@ def test_the_sun_casts_a_shadow_and_light_changes_with_the_day() -> None:
     shade = np.count_nonzero(gain < 1.1) * (3.0 / LENS.fx_px) ** 2
     # The log's axis shades a strip as wide as the cylinder under a slanting sun, less what the log itself hides.
     assert 0.1 < shade < 2.5 * 0.3
-    assert Look.random(1) != Look.random(2) and Look.random(1) == Look.random(1)
+    assert ImagingConditions.random(1) != ImagingConditions.random(2) and ImagingConditions.random(1) == ImagingConditions.random(1)
 
 
 def test_clutter_stands_still_and_hides_logs() -> None:
-    clutter = Clutter(Ground.flat(), CLEARING, 5)
-    rods, again = clutter.around(0.0, 0.0), Clutter(Ground.flat(), CLEARING, 5).around(3.0, 0.0)
+    clutter = GroundCover(Ground.flat(), CLEARING, 5)
+    rods, again = clutter.around(0.0, 0.0), GroundCover(Ground.flat(), CLEARING, 5).around(3.0, 0.0)
     here = np.abs(rods.start_m[:, :2]).max(axis=1) < 3.0
     there = np.abs(again.start_m[:, :2]).max(axis=1) < 3.0
     assert here.sum() > 50 and np.array_equal(rods.start_m[here], again.start_m[there])
@@ -219,8 +219,8 @@ DIGEST = """
 import hashlib, sys
 sys.path.insert(0, sys.argv[1])
 from camera_scenes import ABOVE, site
-from sim.camera.render import Look, render
-p = render(site(10), ABOVE, Look.random(3), 7)
+from sim.camera.render import ImagingConditions, render
+p = render(site(10), ABOVE, ImagingConditions.random(3), 7)
 print(hashlib.sha256(p.rgb.tobytes() + p.depth_m.tobytes() + p.mask.tobytes()).hexdigest())
 """
 
@@ -228,5 +228,5 @@ print(hashlib.sha256(p.rgb.tobytes() + p.depth_m.tobytes() + p.mask.tobytes()).h
 def test_two_processes_render_the_same_bytes() -> None:
     here = Path(__file__).parent
     run = subprocess.run([sys.executable, "-c", DIGEST, str(here)], capture_output=True, text=True, check=True)
-    p = render(site(10), ABOVE, Look.random(3), 7)
+    p = render(site(10), ABOVE, ImagingConditions.random(3), 7)
     assert run.stdout.strip() == hashlib.sha256(p.rgb.tobytes() + p.depth_m.tobytes() + p.mask.tobytes()).hexdigest()

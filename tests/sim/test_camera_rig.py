@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from machine.loading.profile_file import load_profile
 from machine.geometry.optics import intrinsics
+from machine.loading.profile_file import load_profile
 from sim.camera.geometry import mount_view
-from sim.camera.mesh_renderer import TinyRenderer
+from sim.camera.mesh_renderer import MeshRenderer
 from sim.camera.rig import CameraRig
 from sim.camera.scene import BUNK, CRANE, WorldScenes
 from sim.wood.log_shape import LogSpec
@@ -33,7 +33,7 @@ def world() -> Iterator[World]:
 def test_the_scene_has_the_logs_where_the_physics_has_them(world: World) -> None:
     scene = WorldScenes(world)()
     assert [log.instance for log in scene.logs] == [1, 2]
-    for log, state in zip(scene.logs, world.yard.states(), strict=True):
+    for log, state in zip(scene.logs, world.log_bodies.states(), strict=True):
         spine, _ = log.spine(4)
         assert spine[0] == pytest.approx(state.ends_m[0], abs=1e-6)
         assert spine[-1] == pytest.approx(state.ends_m[1], abs=1e-6)
@@ -82,7 +82,7 @@ def test_frames_repeat_with_the_seed_and_differ_in_noise(world: World) -> None:
 def test_the_stick_camera_sees_the_grapple_and_pybullet_agrees(world: World) -> None:
     scene, view, picture = CameraRig(world, PALMS, world.truth, 3, size_px=320).picture("stick")
     assert np.count_nonzero(picture.mask == CRANE) > 500
-    second = TinyRenderer(scene)
+    second = MeshRenderer(scene)
     try:
         theirs = second.render(view)
     finally:

@@ -10,7 +10,7 @@ import pytest
 
 from can_dbc.messages.rgbd import START_BYTES, RgbdError, RgbdMessage, decode, encode_question, start
 from machine.geometry.optics import Intrinsics
-from sim.camera.rig import Frame, Mount
+from sim.camera.rig import Mount, RgbdFrame
 from sim.camera.server import CameraServer, on_the_wire
 
 PIN = Intrinsics(4, 2, 3.0, 3.0, 1.5, 0.5)
@@ -26,11 +26,11 @@ class Rig:
         assert threading.current_thread() is threading.main_thread()  # only the loop may touch the physics
         return name.upper()
 
-    def shoot(self, name: str, scene: object, now_ns: int) -> Frame:
+    def capture(self, name: str, scene: object, now_ns: int) -> RgbdFrame:
         self.drawn.append((scene, now_ns))
         depth = np.array([[1.0, np.nan, 2.0004, 99.0], [0.3, 5.0, 6.0, 7.0]], np.float32)
         rgb = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-        return Frame(name, now_ns, rgb, depth, PIN, Mount("front", (0, 0, 0), (0, 0, 0)), np.ones(3), np.eye(3))
+        return RgbdFrame(name, now_ns, rgb, depth, PIN, Mount("front", (0, 0, 0), (0, 0, 0)), np.ones(3), np.eye(3))
 
 
 def asked(server: CameraServer, camera: str) -> socket.socket:
@@ -89,5 +89,5 @@ def test_who_talks_nonsense_is_hung_up_on() -> None:
 
 
 def test_the_true_pose_stays_in_the_plant() -> None:
-    sent = on_the_wire(Rig().shoot("front", None, 5))
+    sent = on_the_wire(Rig().capture("front", None, 5))
     assert not any("true" in name or "pose" in name for name in type(sent).__slots__)

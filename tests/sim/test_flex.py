@@ -94,7 +94,7 @@ def pendulum(w: World, log: int | None = None) -> tuple[float, float]:
         about += link.inertia_kg_m2[0] + link.mass_kg * r * r
         moment += link.mass_kg * GRAVITY_M_S2 * (pin[2] - com[2])
     if log is not None:
-        state = w.yard.states()[log]
+        state = w.log_bodies.states()[log]
         along = state.axis[1] ** 2 + state.axis[2] ** 2  # how much of the log turns about x
         r = math.dist(state.position_m[1:], pin[1:])
         about += state.mass_kg * (r * r + along * state.length_m**2 / 12)
@@ -136,7 +136,7 @@ def test_a_held_log_makes_the_pendulum_longer():
     scene = random_scene(PROFILE, NOMINAL.wood, 403, 1)
     w = World(PROFILE, NOMINAL, 403, scene)
     driver = Driver(w)
-    log = w.yard.states()[0]
+    log = w.log_bodies.states()[0]
     driver.pick(*log.position_m[:2], math.atan2(log.axis[1], log.axis[0]))
     driver.move({"slew": 0.0})
     driver.wait(4.0)

@@ -8,7 +8,7 @@ import pytest
 from crane_driver import Driver
 
 from machine.loading.profile_file import load_profile
-from sim.evaluator import Judge
+from sim.evaluator import Evaluator
 from sim.scenes.arrangements import random_scene
 from sim.truth.load import load_truth
 from sim.world import World
@@ -19,26 +19,26 @@ NOMINAL = load_truth("nominal", 0, "palms_471")
 
 def attempt(seed: int, across_m: float = 0.0, turned_rad: float = 0.0):
     w = World(PROFILE, NOMINAL, seed, random_scene(PROFILE, NOMINAL.wood, seed, 1))
-    log = w.yard.states()[0]
+    log = w.log_bodies.states()[0]
     yaw = math.atan2(log.axis[1], log.axis[0])
-    judge = Judge(w)
-    driver = Driver(w, judge.watch)
+    evaluator = Evaluator(w)
+    driver = Driver(w, evaluator.watch)
     x = log.position_m[0] - across_m * math.sin(yaw)
     y = log.position_m[1] + across_m * math.cos(yaw)
     driver.pick(x, y, yaw + turned_rad)
-    return w, judge, driver
+    return w, evaluator, driver
 
 
 @pytest.mark.computed
 @pytest.mark.slow
 def test_a_log_is_grasped_carried_and_laid_into_the_bunk():
-    w, judge, driver = attempt(403)
-    held = judge.verdict()
+    w, evaluator, driver = attempt(403)
+    held = evaluator.evaluate()
     assert held.logs[0].lifted and not held.logs[0].released and not held.success
-    assert w.load_kg() == pytest.approx(w.yard.masses[0], rel=0.2)
-    assert w.grip_n[0] > 9.81 * w.yard.masses[0]
+    assert w.load_kg() == pytest.approx(w.log_bodies.masses[0], rel=0.2)
+    assert w.grip_n[0] > 9.81 * w.log_bodies.masses[0]
     driver.place()
-    done = judge.verdict()
+    done = evaluator.evaluate()
     assert done.success and done.loaded == 1 and done.logs[0].done
     assert done.max_penetration_m < 5e-3 and done.max_log_speed_m_s < 3.0
     assert 50.0 < done.peak_pressure_bar < 240.0 and done.energy_j > 1e3
@@ -49,17 +49,17 @@ def test_a_log_is_grasped_carried_and_laid_into_the_bunk():
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "least_m", "most_m"), [(423, 0.0, 0.13), (2, 0.29, 0.31)])
 def test_thin_and_thick_logs_are_scooped_up_held_and_let_go(seed, least_m, most_m):
-    w, judge, driver = attempt(seed)
-    assert least_m < w.yard.states()[0].diameter_m < most_m
-    assert judge.verdict().logs[0].lifted and not judge.verdict().logs[0].released
+    w, evaluator, driver = attempt(seed)
+    assert least_m < w.log_bodies.states()[0].diameter_m < most_m
+    assert evaluator.evaluate().logs[0].lifted and not evaluator.evaluate().logs[0].released
     driver.place()
-    verdict = judge.verdict()
+    verdict = evaluator.evaluate()
     assert verdict.logs[0].released and verdict.max_penetration_m < 5e-3
     w.close()
 
 
 @pytest.mark.parametrize("wrong", [{"turned_rad": math.pi / 2}, {"across_m": 1.0}])
 def test_a_wrong_aim_lifts_nothing(wrong):
-    w, judge, _ = attempt(403, **wrong)
-    assert not judge.verdict().logs[0].lifted
+    w, evaluator, _ = attempt(403, **wrong)
+    assert not evaluator.evaluate().logs[0].lifted
     w.close()

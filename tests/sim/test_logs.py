@@ -9,13 +9,13 @@ import pytest
 
 from machine.loading.profile_file import load_profile
 from sim.bullet.client import BulletClient, new_client
-from sim.geometry.shape import UNIT
+from sim.geometry.shape import IDENTITY
 from sim.ground.terrain import Terrain
 from sim.scenes.arrangements import arrangement
 from sim.truth.load import load_truth
 from sim.wood.bunk import bunk_link, bunk_shapes, from_bunk, to_bunk
 from sim.wood.log_shape import LogSpec, mass_of
-from sim.wood.logs import Yard
+from sim.wood.logs import LogBodies
 
 pytestmark = pytest.mark.computed
 
@@ -31,7 +31,7 @@ class Stand:
     def __init__(self, scene: tuple[LogSpec, ...], machine: str = "palms_471", kind: str = "flat") -> None:
         profile, truth = PROFILES[machine], TRUTHS[machine]
         ground = (kind, 0, profile.workspace.ground_z_m if profile.carrier is None else 0.0)
-        self.base = ((0.0, 0.0, 0.0), UNIT) if profile.carrier is None else ((0.0, 0.0, 1.4), UNIT)
+        self.base = ((0.0, 0.0, 0.0), IDENTITY) if profile.carrier is None else ((0.0, 0.0, 1.4), IDENTITY)
         self.client: BulletClient = new_client()
         self.client.setGravity(0.0, 0.0, -9.81)
         self.client.setPhysicsEngineParameter(
@@ -41,7 +41,7 @@ class Stand:
         self.terrain.add_to(self.client, truth.contact.ground_friction)
         if profile.carrier is None:
             self._boxes(profile, truth)
-        self.yard = Yard(self.client, profile, truth, scene, Terrain(*ground), self.base)
+        self.log_bodies = LogBodies(self.client, profile, truth, scene, Terrain(*ground), self.base)
 
     def _boxes(self, profile, truth) -> None:
         p = self.client
@@ -52,7 +52,7 @@ class Stand:
 
     def awake(self) -> None:
         """Let no log sleep, whatever it does."""
-        for log in self.yard.logs:
+        for log in self.log_bodies.body_ids:
             self.client.changeDynamics(log, -1, activationState=self.client.ACTIVATION_STATE_DISABLE_SLEEPING)
 
     def fastest(self, seconds: float) -> float:
@@ -60,7 +60,7 @@ class Stand:
         for i in range(round(seconds / STEP_S)):
             self.client.stepSimulation()
             if i % 20 == 0:
-                top = max(top, max(log.speed_m_s for log in self.yard.states()))
+                top = max(top, max(log.speed_m_s for log in self.log_bodies.states()))
         return top
 
 
@@ -85,10 +85,10 @@ def test_logs_lie_still_from_the_start_and_in_nothing(stands, kind, logs, machin
         stand = Stand(of(kind, seed, logs, machine), machine)
         stands.append(stand)
         stand.client.performCollisionDetection()
-        assert all(c[8] > -0.003 for log in stand.yard.logs for c in stand.client.getContactPoints(log))
-        before = [log.position_m for log in stand.yard.states()]
+        assert all(c[8] > -0.003 for log in stand.log_bodies.body_ids for c in stand.client.getContactPoints(log))
+        before = [log.position_m for log in stand.log_bodies.states()]
         assert stand.fastest(1.0) < 5e-3
-        after = [log.position_m for log in stand.yard.states()]
+        after = [log.position_m for log in stand.log_bodies.states()]
         assert max(math.dist(a, b) for a, b in zip(before, after, strict=True)) < 2e-3
 
 
@@ -109,14 +109,14 @@ def test_logs_rest_for_a_minute(stands, kind, logs):
 
 def test_the_same_scene_comes_to_rest_in_the_same_place_to_the_bit(stands):
     stands += [Stand(of("pile", 4, 5)), Stand(of("pile", 4, 5))]
-    one, two = (stand.yard.states() for stand in stands)
+    one, two = (stand.log_bodies.states() for stand in stands)
     assert one == two
 
 
 def test_a_tapered_log_rests_with_its_axis_falling_to_the_thin_end_and_a_bowed_one_on_its_side(stands):
     stand = Stand((LogSpec(-2.0, 4.0, 0.3, 2.6, 0.2, 600.0, 0.012, 0.02, z_m=0.004, roll_rad=0.4),))
     stands.append(stand)
-    (log,) = stand.yard.states()
+    (log,) = stand.log_bodies.states()
     assert log.axis[2] == pytest.approx(-0.006, rel=0.25)
     p = stand.client
     turn = p.getMatrixFromQuaternion(log.quaternion)
@@ -132,23 +132,23 @@ def test_bullet_moves_the_real_wood(stands):
     stand = Stand((spec,))
     stands.append(stand)
     p, wood = stand.client, mass_of(spec)
-    mass, _, inertia, *_ = p.getDynamicsInfo(stand.yard.logs[0], -1)
-    assert mass == wood.mass_kg == stand.yard.masses[0] and inertia == pytest.approx(wood.inertia_kg_m2)
-    (log,) = stand.yard.states()
-    com = p.multiplyTransforms(log.position_m, log.quaternion, wood.com_m, UNIT)[0]
-    assert com == pytest.approx(p.getBasePositionAndOrientation(stand.yard.logs[0])[0], abs=1e-6)
+    mass, _, inertia, *_ = p.getDynamicsInfo(stand.log_bodies.body_ids[0], -1)
+    assert mass == wood.mass_kg == stand.log_bodies.masses[0] and inertia == pytest.approx(wood.inertia_kg_m2)
+    (log,) = stand.log_bodies.states()
+    com = p.multiplyTransforms(log.position_m, log.quaternion, wood.com_m, IDENTITY)[0]
+    assert com == pytest.approx(p.getBasePositionAndOrientation(stand.log_bodies.body_ids[0])[0], abs=1e-6)
 
 
 @pytest.mark.parametrize("diameter", [0.1, 0.3])
 def test_a_rolling_log_comes_to_a_stop(stands, diameter):
     stand = Stand((LogSpec(-2.0, 4.0, 0.0, 2.6, diameter, 600.0, z_m=0.004),))
     stands.append(stand)
-    stand.yard.wake()
+    stand.log_bodies.wake()
     v = 0.3
-    stand.client.resetBaseVelocity(stand.yard.logs[0], [0.0, v, 0.0], [-2 * v / diameter, 0.0, 0.0])
-    start = stand.yard.states()[0].position_m
+    stand.client.resetBaseVelocity(stand.log_bodies.body_ids[0], [0.0, v, 0.0], [-2 * v / diameter, 0.0, 0.0])
+    start = stand.log_bodies.states()[0].position_m
     stand.fastest(3.0)
-    log = stand.yard.states()[0]
+    log = stand.log_bodies.states()[0]
     assert log.speed_m_s < 5e-3 and 0.02 < math.dist(start, log.position_m) < 0.6
 
 
@@ -157,7 +157,7 @@ def test_a_touch_wakes_a_sleeping_log(stands):
     stands.append(stand)
     p = stand.client
     assert stand.fastest(0.1) == 0.0
-    x, y, z = stand.yard.states()[0].position_m
+    x, y, z = stand.log_bodies.states()[0].position_m
     shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.1, 0.1, 0.1])
     p.createMultiBody(80.0, shape, basePosition=[x, y + 0.05, z + 0.6])
     assert stand.fastest(0.6) > 0.05
@@ -174,11 +174,11 @@ def test_ground_that_sleeps_carries_logs_as_ground_awake_does(stands):
             state = p.ACTIVATION_STATE_DISABLE_SLEEPING | p.ACTIVATION_STATE_WAKE_UP
             p.changeDynamics(stand.terrain.body, -1, activationState=state)
         assert stand.fastest(0.1) == 0.0
-        x, y, z = stand.yard.states()[0].position_m
+        x, y, z = stand.log_bodies.states()[0].position_m
         shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.1, 0.1, 0.1])
         p.createMultiBody(80.0, shape, basePosition=[x, y + 0.05, z + 0.6])
         assert stand.fastest(0.6) > 0.05
-        ways.append([p.getBasePositionAndOrientation(log) for log in stand.yard.logs])
+        ways.append([p.getBasePositionAndOrientation(log) for log in stand.log_bodies.body_ids])
     assert ways[0] == ways[1]
 
 
@@ -190,8 +190,8 @@ def test_a_full_bunk_holds_its_logs(stands, machine):
     b = PROFILES[machine].bunk
     p = stand.client
     inward = p.invertTransform(*stand.base)
-    for log in stand.yard.states():
-        x, y, z = to_bunk(b, p.multiplyTransforms(*inward, log.position_m, UNIT)[0])
+    for log in stand.log_bodies.states():
+        x, y, z = to_bunk(b, p.multiplyTransforms(*inward, log.position_m, IDENTITY)[0])
         assert abs(x) < b.length_m / 2 and abs(y) < b.width_m / 2
         assert b.floor_z_m + log.diameter_m / 2 - 0.02 < z < b.floor_z_m + b.stake_height_m
 
@@ -201,7 +201,7 @@ def test_a_full_bunk_holds_its_logs(stands, machine):
 def test_logs_lie_on_uneven_ground(stands, kind):
     stand = Stand(of("row", 0, 3, "aoro_fc8"), "aoro_fc8", kind)
     stands.append(stand)
-    for log in stand.yard.states():
+    for log in stand.log_bodies.states():
         air = [x[2] - log.diameter_m / 2 - stand.terrain.height(x[0], x[1]) for x in (log.position_m, *log.ends_m)]
         assert min(air) < 0.03 and max(air) < 0.3 and min(air) > -0.05
     assert stand.fastest(0.5) < 5e-3

@@ -21,9 +21,9 @@ from can_dbc.protocols.canopen import (
     upload_request,
 )
 from can_dbc.protocols.e2e import Checker, Sender, Status
-from machine.sensing.encoder import position_from_counts
 from machine.loading.profile_file import load_profile
-from sim.nodes.valve import Exit, ValveState
+from machine.sensing.encoder import position_from_counts
+from sim.nodes.valve import ExitCode, ValveState
 from sim.plant import Plant
 
 PROFILE = load_profile("palms_471")
@@ -212,10 +212,10 @@ def test_the_valve_follows_fresh_armed_commands_and_echoes_them(bench):
 @pytest.mark.parametrize(
     ("loss", "exit_code"),
     [
-        ({"commands": False}, Exit.COMMAND_TIMEOUT),
-        ({"guard": None}, Exit.GUARD_MISSING),
-        ({"guard": 0}, Exit.GUARD_MISSING),
-        ({"sync": False}, Exit.COMMAND_TIMEOUT),
+        ({"commands": False}, ExitCode.COMMAND_TIMEOUT),
+        ({"guard": None}, ExitCode.GUARD_MISSING),
+        ({"guard": 0}, ExitCode.GUARD_MISSING),
+        ({"sync": False}, ExitCode.COMMAND_TIMEOUT),
     ],
 )
 def test_the_valve_goes_neutral_by_absence_and_needs_a_new_arming(bench, loss, exit_code):

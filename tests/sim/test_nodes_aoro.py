@@ -15,8 +15,8 @@ from can_dbc.protocols.canopen import NmtCommand, nmt_frame, sync_frame
 from can_dbc.protocols.e2e import Sender
 from can_dbc.protocols.nmea2000 import Receiver, split_id
 from hil.wire.stuffing import frame_bits
-from machine.sensing.encoder import position_from_counts
 from machine.loading.profile_file import load_profile
+from machine.sensing.encoder import position_from_counts
 from sim.nodes.valve import ValveState
 from sim.plant import Plant
 from sim.process.scene_view import scene_of, view_of

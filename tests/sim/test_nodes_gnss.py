@@ -19,7 +19,7 @@ from can_dbc.dbc.codec import load
 from can_dbc.frame import identifier
 from can_dbc.protocols.nmea2000 import Receiver, split_id
 from machine.loading.profile_file import load_profile
-from sim.geometry.geodesy import Site
+from sim.geometry.geodesy import LocalFrame
 from sim.geometry.shape import rpy_quaternion
 from sim.nodes.gnss import Fix, GnssNode
 from sim.truth.load import load_truth
@@ -49,7 +49,7 @@ QUIET = msgspec.structs.replace(
     st.floats(-1000.0, 1000.0), st.floats(-1000.0, 1000.0), st.floats(-20.0, 20.0),
 )  # fmt: skip
 def test_local_metres_become_the_same_place_as_pymap3d_says(lat, lon, height, east, north, up):
-    mine = Site(lat, lon, height).geodetic(east, north, up)
+    mine = LocalFrame(lat, lon, height).geodetic(east, north, up)
     back = pymap3d.geodetic2enu(*mine, lat, lon, height)
     assert back == pytest.approx((east, north, up), abs=1e-3)
     theirs = pymap3d.enu2geodetic(east, north, up, lat, lon, height)

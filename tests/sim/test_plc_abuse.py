@@ -20,7 +20,7 @@ from can_dbc.plc import modbus
 from can_dbc.plc.datagram import Header, decode_reply, encode_command
 from can_dbc.plc.map import Fault, State
 from can_dbc.plc.modbus import MAX_CONNECTIONS, LinkError, ModbusClient, RegisterRefused
-from sim.plc.command_arbiter import DRAFTS
+from sim.plc.command_arbiter import MAX_DRAFT_COUNT
 
 ROUNDS = 60
 READ = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 0, 48)
@@ -85,10 +85,10 @@ def rightful(plc: ServedPlc, between: Callable[[int], None]) -> int:
 def served(plc: ServedPlc, nasty: Callable[[int], None]) -> None:
     """The claim of this file."""
     assert rightful(plc, nasty) == ROUNDS
-    assert plc.program.gate.accepted == ROUNDS
-    assert plc.program.gate.fault is Fault.NONE
+    assert plc.program.arbiter.accepted == ROUNDS
+    assert plc.program.arbiter.fault is Fault.NONE
     assert plc.connections <= MAX_CONNECTIONS
-    assert len(plc.program.gate._drafts) <= DRAFTS
+    assert len(plc.program.arbiter._drafts) <= MAX_DRAFT_COUNT
 
 
 def test_a_cable_cut_in_the_middle_of_a_request(plc: ServedPlc, abuser: Abuser) -> None:
@@ -199,7 +199,7 @@ def test_strangers_may_read_while_one_commands_and_not_write(plc: ServedPlc) -> 
         theirs.close()
 
     asyncio.run(run())
-    assert plc.program.gate.accepted == ROUNDS and plc.program.gate.fault is Fault.NONE
+    assert plc.program.arbiter.accepted == ROUNDS and plc.program.arbiter.fault is Fault.NONE
 
 
 class Cable:
@@ -253,7 +253,7 @@ def test_a_half_open_connection_is_noticed_left_and_never_speaks_again(plc: Serv
         client.close()
 
     asyncio.run(run())
-    assert plc.program.gate.accepted == 2
+    assert plc.program.arbiter.accepted == 2
 
 
 def test_closing_discards_what_the_kernel_still_holds(plc: ServedPlc) -> None:
@@ -283,4 +283,4 @@ def test_datagrams_from_everywhere_do_not_disturb_the_commander(plc: ServedPlc) 
             theirs.send(encode_command(Header(n + 6000, 0, 0), MOVE)[:-1])
             while decode_reply(ours.recv(200))[0].echo != n:
                 pass
-    assert plc.program.gate.accepted == ROUNDS and plc.program.gate.fault is Fault.NONE
+    assert plc.program.arbiter.accepted == ROUNDS and plc.program.arbiter.fault is Fault.NONE

@@ -52,7 +52,7 @@ def test_pymodbus_with_every_function_code(plc: ServedPlc) -> None:
         assert client.read_coils(0, count=1, device_id=1).exception_code == 1
         assert client.read_holding_registers(0, count=4, device_id=9).exception_code == 11
         assert client.read_holding_registers(100, count=32, device_id=1).registers == block(2)
-    assert plc.program.gate.command == MOVE
+    assert plc.program.arbiter.command == MOVE
 
 
 def test_pymodbustcp_splits_the_block_and_commits(plc: ServedPlc) -> None:
@@ -60,11 +60,11 @@ def test_pymodbustcp_splits_the_block_and_commits(plc: ServedPlc) -> None:
     assert client.read_holding_registers(0, 4) == IDENTITY
     assert client.write_multiple_registers(102, words[2:])
     assert client.write_single_register(100, 77)
-    assert plc.program.gate.accepted == 0
+    assert plc.program.arbiter.accepted == 0
     assert client.write_single_register(101, 5)
-    assert (plc.program.gate.accepted, plc.program.gate.command) == (1, MOVE)
+    assert (plc.program.arbiter.accepted, plc.program.arbiter.command) == (1, MOVE)
     assert not client.write_single_register(102, 9) and client.last_except == 3
-    assert plc.program.gate.accepted == 1 and client.read_holding_registers(6, 1) is not None
+    assert plc.program.arbiter.accepted == 1 and client.read_holding_registers(6, 1) is not None
     assert client.write_read_multiple_registers(100, block(6), 0, 48)[9] == 6  # type: ignore[index]
     client.close()
 
@@ -84,7 +84,7 @@ def test_mbpoll_reads_and_writes(plc: ServedPlc) -> None:
     assert [registers[i] for i in range(4)] == IDENTITY and len(registers) == 48
     assert "17234" in mbpoll(plc, "-r", "0", "-c", "1", "-t", "3", LOOPBACK)
     assert "Written 32" in mbpoll(plc, "-r", "100", "-t", "4", LOOPBACK, *map(str, block(1)))
-    assert plc.program.gate.command == MOVE
+    assert plc.program.arbiter.command == MOVE
     assert "Illegal data value" in mbpoll(plc, "-r", "102", "-t", "4", LOOPBACK, "9")
 
 
@@ -116,7 +116,7 @@ def test_libmodbus_exchanges_in_one_request(plc: ServedPlc) -> None:
     finally:
         library.modbus_close(context)
         library.modbus_free(context)
-    assert plc.program.gate.accepted == 20
+    assert plc.program.arbiter.accepted == 20
 
 
 def test_low_word_first_is_a_setting() -> None:
@@ -125,7 +125,7 @@ def test_low_word_first_is_a_setting() -> None:
         assert registers[2:4] == [0x0304, 0x0102]
         assert read_status(registers, WordOrder.LOW_FIRST)[0].position[2] == pytest.approx(-1.6, abs=1e-3)
         client.write_registers(100, block(1, MOVE, WordOrder.LOW_FIRST), device_id=1)
-        assert plc.program.gate.command == MOVE
+        assert plc.program.arbiter.command == MOVE
 
 
 STATUS = status_registers(Feedback(heartbeat=9, state=State.HOLD, accepted=4), 300, WordOrder.HIGH_FIRST)

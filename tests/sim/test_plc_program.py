@@ -12,7 +12,7 @@ from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import joint
 from sim.plc.command_arbiter import MS
-from sim.plc.law import QUANTUM_M, QUANTUM_RAD, stop_band
+from sim.plc.law import RESOLUTION_M, RESOLUTION_RAD, stop_band
 from sim.plc.plant import PlcPlant
 from sim.plc.program import CYCLE_NS, MAY_MOVE, Inputs, Program
 
@@ -36,7 +36,7 @@ class Rig:
             if command is not None and self.now_ns % (10 * MS) == 0:
                 self.sequence += 1
                 block = command_registers(command, self.sequence, self.sequence & 0xFFFF, WordOrder.HIGH_FIRST)
-                self.program.gate.write(1, 100, block, self.now_ns)
+                self.program.arbiter.write(1, 100, block, self.now_ns)
             self.program.scan(self.now_ns)
             self.now_ns += 2_500_000
 
@@ -111,7 +111,7 @@ def test_an_open_emergency_stop_is_neutral_at_once(open_contact: Estop) -> None:
 def test_an_illegal_value_stops_it_until_a_reset() -> None:
     rig = Rig(Role.VALVES)
     rig.run(100, SPOOLS)
-    rig.program.gate.note(Fault.ILLEGAL_VALUE, 3)
+    rig.program.arbiter.latch_fault(Fault.ILLEGAL_VALUE, 3)
     rig.run(20, SPOOLS)
     assert rig.state is State.HOLD
     rig.run(50, SPOOLS)
@@ -129,9 +129,9 @@ def test_feedback_is_in_tenths_of_degrees_and_millimetres() -> None:
     rig.inputs.positions = (0.12345, 0.7, -1.61803, 0.300049, math.pi / 2)
     rig.run(50)
     for j, got in zip(JOINTS, rig.program.feedback.position, strict=False):
-        quantum = QUANTUM_M if j is Joint.EXT else QUANTUM_RAD
-        assert got / quantum == pytest.approx(round(got / quantum), abs=1e-9)
-        assert abs(got - rig.inputs.positions[j]) <= 0.5 * quantum + 1e-12
+        resolution = RESOLUTION_M if j is Joint.EXT else RESOLUTION_RAD
+        assert got / resolution == pytest.approx(round(got / resolution), abs=1e-9)
+        assert abs(got - rig.inputs.positions[j]) <= 0.5 * resolution + 1e-12
 
 
 def test_the_law_brings_every_joint_to_its_reference_and_rests() -> None:
@@ -153,7 +153,7 @@ def test_the_law_brings_every_joint_to_its_reference_and_rests() -> None:
             q[i] += math.copysign(opened * full, u) * 0.0025
         rig.inputs.positions = tuple(q)
     for spec, at, to in zip(specs, q, target, strict=True):
-        assert abs(at - to) < stop_band(spec) + QUANTUM_RAD
+        assert abs(at - to) < stop_band(spec) + RESOLUTION_RAD
     assert not any(rig.program.outputs[:5]), "at rest"
 
 

@@ -7,14 +7,14 @@ from itertools import combinations
 
 from machine.loading.profile_file import load_profile
 from sim.ground.terrain import EXTENT_M
-from sim.site.log_supply import Lying, lay_out
+from sim.site.log_supply import LogPlace, place_logs
 
 PROFILE = load_profile("aoro_fc8")
 
 
 def test_logs_lie_where_they_are_said_to_and_the_later_ones_wait_apart_on_the_ground() -> None:
-    places = [Lying(4.0 * i, 3.0, 0.1 * i, 2.0, 0.25) for i in range(12)]
-    scene = lay_out(PROFILE, "nominal", 1, places, rounds=2)
+    places = [LogPlace(4.0 * i, 3.0, 0.1 * i, 2.0, 0.25) for i in range(12)]
+    scene = place_logs(PROFILE, "nominal", 1, places, rounds=2)
     assert len(scene) == 24
     for spec, place in zip(scene, places, strict=False):
         assert (spec.x_m, spec.y_m, spec.yaw_rad) == (place.x_m, place.y_m, place.yaw_rad)

@@ -13,7 +13,7 @@ from machine.loading.profile_file import load_profile
 from sim.mechanics.carrier import PARKED, Drive
 from sim.scenes.arrangements import arrangement
 from sim.truth.load import load_truth
-from sim.wood.stowage import NEAR_M, TILT_RAD, Weight
+from sim.wood.stowage import NEAR_M, WEIGHT_TILT_RAD, ApparentWeight
 from sim.world import World
 
 PROFILE = load_profile("aoro_fc8")
@@ -39,7 +39,7 @@ def go(world: World, seconds: float, drive: Drive = PARKED) -> None:
 
 def in_base(world: World, log: int) -> tuple[float, float, float]:
     p = world.client
-    place = p.getBasePositionAndOrientation(world.yard.logs[log])
+    place = p.getBasePositionAndOrientation(world.log_bodies.body_ids[log])
     return p.multiplyTransforms(*p.invertTransform(*world.base_pose()), *place)[0]
 
 
@@ -51,9 +51,9 @@ def world() -> Iterator[World]:
 
 
 def test_what_has_lain_still_is_stowed_and_what_lies_on_the_ground_is_not(world):
-    assert world.yard.stowed == ()
+    assert world.log_bodies.stowed == ()
     go(world, 1.0)
-    assert world.yard.stowed == tuple(range(LOGS))
+    assert world.log_bodies.stowed == tuple(range(LOGS))
 
 
 def test_the_machine_carries_a_stowed_load_as_it_carries_one_that_is_awake(world):
@@ -65,7 +65,7 @@ def test_the_machine_carries_a_stowed_load_as_it_carries_one_that_is_awake(world
         assert a.wheel_loads_n == pytest.approx(b.wheel_loads_n, rel=0.01)
         assert (a.roll_rad, a.pitch_rad) == pytest.approx((b.roll_rad, b.pitch_rad), abs=3e-4)
         assert a.front_axle() == pytest.approx(b.front_axle(), abs=0.01)
-    assert other.yard.stowed == () != world.yard.stowed
+    assert other.log_bodies.stowed == () != world.log_bodies.stowed
     for log in range(LOGS):
         assert math.dist(in_base(world, log), in_base(other, log)) < 0.02
     other.close()
@@ -78,31 +78,31 @@ def test_a_start_and_a_stop_wake_the_load_and_leave_it_where_it_lay(world):
     for drive in (AHEAD, PARKED):
         for _ in range(8):
             go(world, 0.1, drive)
-            woken += not world.yard.stowed
+            woken += not world.log_bodies.stowed
         go(world, 4.0, drive)
-        assert world.yard.stowed == tuple(range(LOGS))
+        assert world.log_bodies.stowed == tuple(range(LOGS))
         assert max(math.dist(in_base(world, i), at) for i, at in enumerate(before)) < 0.01
     assert woken >= 2
 
 
 def test_a_log_that_is_let_fall_onto_the_load_wakes_it_first_and_is_stowed_with_it(world):
     go(world, 1.0)
-    p, falling = world.client, world.yard.logs[LOGS]
-    top = max(p.getAABB(world.yard.logs[i])[1][2] for i in range(LOGS))
-    at, turn = p.getBasePositionAndOrientation(world.yard.logs[0])
-    world.yard.wake()
-    assert world.yard.stowed  # not by this: it would fall through the bunk
+    p, falling = world.client, world.log_bodies.body_ids[LOGS]
+    top = max(p.getAABB(world.log_bodies.body_ids[i])[1][2] for i in range(LOGS))
+    at, turn = p.getBasePositionAndOrientation(world.log_bodies.body_ids[0])
+    world.log_bodies.wake()
+    assert world.log_bodies.stowed  # not by this: it would fall through the bunk
     p.resetBasePositionAndOrientation(falling, (at[0], world.base_pose()[0][1], top + 0.6), turn)
     lowest = top
     for _ in range(100):
-        if not world.yard.stowed:
+        if not world.log_bodies.stowed:
             break
         go(world, 0.01)
         lowest = p.getAABB(falling)[0][2]
     assert top + NEAR_M / 2 < lowest < top + 0.6
     go(world, 5.0)
-    assert world.yard.stowed == tuple(range(LOGS + 1))
-    assert not any(c[8] < -0.005 for i in world.yard.logs for c in p.getContactPoints(i))
+    assert world.log_bodies.stowed == tuple(range(LOGS + 1))
+    assert not any(c[8] < -0.005 for i in world.log_bodies.body_ids for c in p.getContactPoints(i))
 
 
 @pytest.mark.parametrize(("above_m", "stowed"), [(0.1, False), (0.6, True)])
@@ -112,7 +112,7 @@ def test_a_load_with_open_tongs_close_above_it_stays_awake(above_m, stowed):
     slew, lift, tilt, ext = solve(PROFILE, x, y, PROFILE.bunk.floor_z_m + 0.35 + above_m + hanging)
     world = laden(home={"slew": slew, "lift": lift, "tilt": tilt, "ext": ext})
     go(world, 1.5)
-    assert bool(world.yard.stowed) is stowed
+    assert bool(world.log_bodies.stowed) is stowed
     world.close()
 
 
@@ -122,26 +122,26 @@ def test_equal_worlds_stow_and_wake_alike(world):
         go(w, 1.0)
         go(w, 2.0, AHEAD)
         go(w, 2.0)
-    poses = [[w.client.getBasePositionAndOrientation(log) for log in w.yard.logs] for w in (world, other)]
-    assert poses[0] == poses[1] and world.yard.stowed == other.yard.stowed
+    poses = [[w.client.getBasePositionAndOrientation(log) for log in w.log_bodies.body_ids] for w in (world, other)]
+    assert poses[0] == poses[1] and world.log_bodies.stowed == other.log_bodies.stowed
     other.close()
 
 
 def test_the_weight_in_a_frame_turns_with_its_axes_and_its_acceleration():
     level, look_s = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), 0.01
-    weight = Weight(look_s)
+    weight = ApparentWeight(look_s)
     rest = weight.now
     for i in range(100):
-        weight.feel((0.8 * i * look_s, 0.0, 0.0), level)
+        weight.update((0.8 * i * look_s, 0.0, 0.0), level)
     assert weight.now == pytest.approx((-0.8, 0.0, -9.81), abs=1e-3) and weight.differs(rest)
-    tilted = Weight(look_s)
-    for angle, differs in ((0.9 * TILT_RAD, False), (1.1 * TILT_RAD, True)):
+    tilted = ApparentWeight(look_s)
+    for angle, differs in ((0.9 * WEIGHT_TILT_RAD, False), (1.1 * WEIGHT_TILT_RAD, True)):
         c, s = math.cos(angle), math.sin(angle)
         for _ in range(100):
-            tilted.feel((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0, c, -s, 0.0, s, c))
+            tilted.update((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0, c, -s, 0.0, s, c))
         assert tilted.now == pytest.approx((0.0, -9.81 * s, -9.81 * c), abs=1e-3)
         assert tilted.differs(rest) is differs
-    falling = Weight(look_s)
+    falling = ApparentWeight(look_s)
     for i in range(100):
-        falling.feel((0.0, 0.0, -2.0 * i * look_s), level)
+        falling.update((0.0, 0.0, -2.0 * i * look_s), level)
     assert falling.differs(rest)

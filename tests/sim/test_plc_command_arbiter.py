@@ -11,26 +11,26 @@ from hypothesis import strategies as st
 from can_dbc.plc.datagram import Header, encode_command
 from can_dbc.plc.map import Bounds, Command, Fault, Grapple, Mode, WordOrder, command_registers
 from can_dbc.plc.modbus import RegisterRefused
-from sim.plc.command_arbiter import DRAFTS, MS, Gate
+from sim.plc.command_arbiter import MAX_DRAFT_COUNT, MS, CommandArbiter
 
 ORDER = WordOrder.HIGH_FIRST
 MOVE = Command(Mode.VALVES, True, (0.5, -0.25, 0, 0, 0, 0, 0), grapple=Grapple.HOLD, grapple_pct=20)
 US, THEM = 1, 2
 
 
-def gate() -> Gate:
-    return Gate(Bounds.valves(), ORDER)
+def arbiter() -> CommandArbiter:
+    return CommandArbiter(Bounds.valves(), ORDER)
 
 
 def block(sequence: int, command: Command = MOVE, heartbeat: int | None = None) -> list[int]:
     return command_registers(command, sequence if heartbeat is None else heartbeat, sequence, ORDER)
 
 
-def state(g: Gate) -> tuple[object, ...]:
-    return g.command, g.sequence, g.accepted, g.block(), g.watchdog_ms
+def state(g: CommandArbiter) -> tuple[object, ...]:
+    return g.command, g.sequence, g.accepted, g.command_block(), g.watchdog_ms
 
 
-def refused(g: Gate, client: int, address: int, values: list[int], now_ns: int = 0) -> int:
+def refused(g: CommandArbiter, client: int, address: int, values: list[int], now_ns: int = 0) -> int:
     before = state(g)
     with pytest.raises(RegisterRefused) as refusal:
         g.write(client, address, values, now_ns)
@@ -39,7 +39,7 @@ def refused(g: Gate, client: int, address: int, values: list[int], now_ns: int =
 
 
 def test_a_whole_block_counts_once_per_sequence_number() -> None:
-    g = gate()
+    g = arbiter()
     g.write(US, 100, block(7), 0)
     assert (g.command, g.sequence, g.accepted) == (MOVE, 7, 1)
     g.write(US, 100, block(7, Command()), 1)
@@ -50,7 +50,7 @@ def test_a_whole_block_counts_once_per_sequence_number() -> None:
 
 
 def test_the_sequence_goes_round() -> None:
-    g = gate()
+    g = arbiter()
     g.write(US, 100, block(0xFFFF), 0)
     g.write(US, 100, block(0, Command()), 1)
     assert g.command == Command()
@@ -60,7 +60,7 @@ def test_the_sequence_goes_round() -> None:
 @given(st.lists(st.integers(1, 31), unique=True).map(sorted), st.booleans())
 def test_a_split_write_counts_when_its_number_is_written(cuts: list[int], one_by_one: bool) -> None:
     """However a client cuts the block, nothing counts before register 101, and then everything."""
-    g, words = gate(), block(3)
+    g, words = arbiter(), block(3)
     edges = list(range(33)) if one_by_one else [0, *cuts, 32]
     pieces = [(a, words[a:b]) for a, b in pairwise(edges)]
     later = [(a, w) for a, w in pieces if not a <= 1 < a + len(w)]
@@ -73,7 +73,7 @@ def test_a_split_write_counts_when_its_number_is_written(cuts: list[int], one_by
 
 
 def test_two_clients_do_not_finish_each_others_writes() -> None:
-    g, words = gate(), block(3)
+    g, words = arbiter(), block(3)
     g.write(US, 102, words[2:], 0)
     g.write(THEM, 101, [9], 0)
     assert g.command == Command(), "a bare sequence number of a stranger commits the stranger's own neutral block"
@@ -83,7 +83,7 @@ def test_two_clients_do_not_finish_each_others_writes() -> None:
     ("register", "value"), [(102, 9), (102, 1), (103, 1), (125, 4), (126, 101), (127, 999), (128, 7), (130, 1)]
 )
 def test_an_illegal_value_is_exception_3_and_changes_nothing(register: int, value: int) -> None:
-    g = gate()
+    g = arbiter()
     g.write(US, 100, block(1), 0)
     words = block(2)
     words[register - 100] = value
@@ -93,12 +93,12 @@ def test_an_illegal_value_is_exception_3_and_changes_nothing(register: int, valu
     assert g.accepted == 2, "the number of a refused command is not used up"
     assert g.fault is Fault.ILLEGAL_VALUE, "the fault stays until a reset"
     g.write(US, 100, block(3, Command(reset=True)), 0)
-    assert g.reset_edge() and not g.reset_edge()
+    assert g.take_reset_edge() and not g.take_reset_edge()
     assert g.fault is Fault.NONE
 
 
 def test_an_illegal_reference_names_its_axis_and_is_judged_at_the_commit() -> None:
-    g = gate()
+    g = arbiter()
     g.write(US, 100, block(1), 0)
     too_far = block(2, Command(Mode.VALVES, True, (0.0, 0.0, 1.000_001 + 1e-6, 0, 0, 0, 0)))
     g.write(US, 102, too_far[2:], 0)  # unfinished: no harm yet
@@ -110,13 +110,13 @@ def test_an_illegal_reference_names_its_axis_and_is_judged_at_the_commit() -> No
     ("address", "count"), [(0, 1), (10, 1), (12, 4), (48, 1), (99, 2), (99, 32), (131, 2), (132, 1), (11, 2)]
 )
 def test_a_write_elsewhere_is_exception_2(address: int, count: int) -> None:
-    g = gate()
+    g = arbiter()
     assert refused(g, US, address, [0] * count) == 2
     assert g.fault is Fault.NONE
 
 
 def test_who_commands_keeps_the_command_until_the_watchdog() -> None:
-    g = gate()
+    g = arbiter()
     g.write(US, 100, block(500), 0)
     assert refused(g, THEM, 100, block(501), 100 * MS) == 6
     assert refused(g, THEM, 125, [1], 100 * MS) == 6
@@ -128,11 +128,11 @@ def test_who_commands_keeps_the_command_until_the_watchdog() -> None:
 
 
 def test_who_has_left_may_be_followed_at_once() -> None:
-    g = gate()
+    g = arbiter()
     g.write(US, 100, block(500), 0)
-    g.left(THEM)
+    g.disconnected(THEM)
     assert refused(g, THEM, 100, block(3), 10 * MS) == 6
-    g.left(US)
+    g.disconnected(US)
     assert (g.commander(10 * MS), g.command) == (US, MOVE), "what was commanded stands until the watchdog"
     g.write(THEM, 100, block(3, Command()), 10 * MS)
     assert (g.commander(10 * MS), g.command) == (THEM, Command())
@@ -140,7 +140,7 @@ def test_who_has_left_may_be_followed_at_once() -> None:
 
 
 def test_a_moving_heartbeat_is_a_sign_of_life_and_a_frozen_one_is_none() -> None:
-    g = gate()
+    g = arbiter()
     g.write(US, 100, block(1, heartbeat=10), 0)
     g.write(US, 100, [11], 250 * MS)
     assert g.commander(500 * MS) == US
@@ -151,7 +151,7 @@ def test_a_moving_heartbeat_is_a_sign_of_life_and_a_frozen_one_is_none() -> None
 
 @pytest.mark.parametrize(("value", "code"), [(49, 3), (2001, 3), (0, 3)])
 def test_the_watchdog_register_is_bounded(value: int, code: int) -> None:
-    g = gate()
+    g = arbiter()
     assert refused(g, US, 11, [value]) == code
     g.write(US, 11, [50], 0)
     g.write(US, 100, block(1), 0)
@@ -159,10 +159,10 @@ def test_the_watchdog_register_is_bounded(value: int, code: int) -> None:
 
 
 def test_unfinished_writes_of_many_clients_take_bounded_memory() -> None:
-    g = gate()
+    g = arbiter()
     for client in range(1000):
         g.write(client, 127, [50], 0)
-    assert len(g._drafts) == DRAFTS
+    assert len(g._drafts) == MAX_DRAFT_COUNT
 
 
 def datagram(sequence: int, command: Command = MOVE) -> bytes:
@@ -170,7 +170,7 @@ def datagram(sequence: int, command: Command = MOVE) -> bytes:
 
 
 def test_datagrams_old_damaged_or_strange_are_dropped_and_illegal_ones_are_a_fault() -> None:
-    g, us, them = gate(), ("127.0.0.1", 5), ("127.0.0.1", 6)
+    g, us, them = arbiter(), ("127.0.0.1", 5), ("127.0.0.1", 6)
     assert g.datagram(us, datagram(9), 0) == Header(9, 0, 0)
     assert g.datagram(us, datagram(9, Command()), 1) is None
     assert g.datagram(us, datagram(8, Command()), 2) is None

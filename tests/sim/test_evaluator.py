@@ -5,24 +5,24 @@ from __future__ import annotations
 import pytest
 
 from machine.loading.profile_file import load_profile
-from sim.evaluator import Judge, Verdict
+from sim.evaluator import Evaluation, Evaluator
 from sim.scenes.arrangements import arrangement
 from sim.truth.load import load_truth
 from sim.wood.log_shape import LogSpec
 from sim.world import World
 
 
-def watched(machine: str, scene, steps: int, before=None) -> tuple[World, Verdict]:
+def watched(machine: str, scene, steps: int, before=None) -> tuple[World, Evaluation]:
     profile, truth = load_profile(machine), load_truth("nominal", 0, machine)
     world = World(profile, truth, 0, scene(profile, truth.wood))
-    judge = Judge(world)
+    evaluator = Evaluator(world)
     if before:
         before(world)
     still = [0.0] * len(world.functions)
     for _ in range(steps):
         world.step(still)
-        judge.watch()
-    return world, judge.verdict()
+        evaluator.watch()
+    return world, evaluator.evaluate()
 
 
 def test_logs_in_the_bunk_are_done_once_at_rest_and_one_beside_it_is_not():
@@ -43,10 +43,10 @@ def test_logs_in_the_bunk_are_done_once_at_rest_and_one_beside_it_is_not():
 def test_a_log_leaning_out_of_the_bunk_is_not_in_it():
     def across(world):
         b = world.profile.bunk
-        world.yard.wake()
+        world.log_bodies.wake()
         turn = world.client.getQuaternionFromEuler([0.0, 1.5708, b.yaw_rad + 1.5708])
         at = (*b.center_m, b.floor_z_m + b.stake_height_m - 0.2)
-        world.client.resetBasePositionAndOrientation(world.yard.logs[0], at, turn)
+        world.client.resetBasePositionAndOrientation(world.log_bodies.body_ids[0], at, turn)
 
     world, verdict = watched("palms_471", lambda p, w: arrangement("bunk", p, w, 0, 1), 1, across)
     assert not verdict.logs[0].in_bunk
