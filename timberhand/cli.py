@@ -1,7 +1,7 @@
 """The ``timberhand`` command.
 
 Every command group lives in a module of ``timberhand.commands`` that imports nothing heavy until it runs, so
-``timberhand --help`` answers at once.  Exit codes are the same everywhere (``timberhand.exits``).
+``timberhand --help`` answers at once.  Exit codes are the same everywhere (`host.exit_codes`).
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from typing import Annotated
 
 import typer
 
-from host.exits import Stopped
+from host.exit_codes import CommandFailed, ExitCode
+from runtime.errors import CodedError
 from timberhand.commands import (
     bench,
     calibrate,
@@ -22,11 +24,11 @@ from timberhand.commands import (
     doctor,
     experiment,
     hil,
-    log,
     mission,
     plan,
     plan_learn,
     record,
+    recording,
     replay,
     report,
     service,
@@ -34,17 +36,37 @@ from timberhand.commands import (
     survey_camera,
     train,
 )
+from timberhand.deprecated import current_spelling
 
-SENTENCE = "Drives a log-loading forestry machine by itself: crane control over CAN, planning, and a physics plant."
+SENTENCE = "Autonomous control of a log-loading forestry machine: crane control over CAN, planning, physics plant."
 app = typer.Typer(
     name="timberhand",
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     help=SENTENCE,
-    epilog="Exit codes: 0 fine, 2 usage, 3 configuration, 4 bus, 5 stopped by safety, 6 figure not reached, "
-    "130 interrupted.",
+    epilog="Exit codes: 0 success, 2 usage, 3 configuration, 4 bus, 5 safety stop, 6 figure missed, 130 interrupted.",
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"timberhand {version('timberhand')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=_print_version),
+    ] = False,
+) -> None:
+    """Options of the whole command."""
+
+
 app.command("demo")(demo.demo)
 app.command("calibrate")(calibrate.calibrate)
 app.command("survey-camera")(survey_camera.survey_camera)
@@ -55,7 +77,7 @@ app.command("record")(record.record)
 app.command("console")(console.console)
 app.command("doctor")(doctor.doctor)
 app.add_typer(dbc.app, name="dbc")
-app.add_typer(log.app, name="log")
+app.add_typer(recording.app, name="recording")
 app.add_typer(plan.app, name="plan")
 plan.app.command("learn")(plan_learn.learn)
 plan.app.command("demonstrate")(plan_learn.demonstrate)
@@ -68,17 +90,28 @@ app.add_typer(train.app, name="train")
 
 
 def main() -> None:
-    """Run the command line; an error of ours is one sentence on stderr and its documented exit code."""
-    # Small products of matrices in many threads wait for each other; on two processors that takes three times as long.
+    """Run the command line.
+
+    An error that reaches a person is one line on stderr, ``timberhand: <sentence> [code]``, and the documented exit
+    code.
+    """
+    # Small matrix products in many threads wait for each other: three times as slow on two processors.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # A reader that goes away (`timberhand ... | head`) ends us quietly instead of with a traceback.
+    # When the reader of a pipe ends (`timberhand ... | head`), end quietly instead of with a traceback.
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # asked to end is the same as Ctrl-C: exit code 130
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # like Ctrl-C: exit code 130
+    arguments, notes = current_spelling(sys.argv[1:])
+    for note in notes:
+        print(f"timberhand: {note}", file=sys.stderr)
+    sys.argv[1:] = arguments
     try:
         app()
-    except Stopped as stop:
-        print(f"timberhand: {stop}", file=sys.stderr)
-        sys.exit(stop.code)
+    except CommandFailed as failure:
+        print(f"timberhand: {failure}{f' [{failure.code}]' if failure.code else ''}", file=sys.stderr)
+        sys.exit(failure.exit_code)
+    except CodedError as error:
+        print(f"timberhand: {error} [{error.code}]", file=sys.stderr)
+        sys.exit(ExitCode.CONFIGURATION)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_rgba
 
-from autonomy.missions.validation import legs
 from autonomy.missions.local_frame import site_frame, yaw_from_bearing
 from autonomy.missions.model import ForwardingMission, KnownLog
 from autonomy.missions.review import Review
-from experiments.common.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
+from autonomy.missions.validation import legs
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 
 LOG_LENGTH_M = 3.0
 """Drawn where a log's length is not known."""

@@ -33,7 +33,7 @@ OURS = ("can_dbc", "machine", "controller", "sim", "hil")
 ENTRIES = (
     "controller.__main__",
     "controller.guard.__main__",
-    "experiments.timing.rig",
+    "experiments.timing.emulated_machine",
     "host.vcan_lab.links",
     "ctypes",
 )
@@ -41,7 +41,7 @@ LEFT_OUT = ("test", "idlelib", "tkinter", "ensurepip", "lib2to3", "turtledemo", 
 LOOK = """
 import importlib, json, sys, sysconfig
 for name in sys.argv[1:]: importlib.import_module(name)
-importlib.import_module("can_dbc.codec").load("crane")  # imports what only reading a DBC needs
+importlib.import_module("can_dbc.dbc.codec").load("crane")  # imports what only reading a DBC needs
 files = [f for m in list(sys.modules.values()) if (f := getattr(m, "__file__", None))]
 maps = {line.split(None, 5)[5].strip() for line in open("/proc/self/maps") if line.count("/")}
 print(json.dumps({"files": files, "maps": sorted(maps), "stdlib": sysconfig.get_path("stdlib"),

@@ -78,8 +78,8 @@ def run(python: str, checkout: Path) -> dict[str, Any]:
     reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     reports.bind(("127.0.0.1", REPORTS))
     began_s = time.monotonic()
-    nodes, _ = start(python, checkout, "experiments.timing.rig", *bus)
-    if not await_word(nodes, RUNTIME / "experiments.timing.rig.out", "ready"):
+    nodes, _ = start(python, checkout, "experiments.timing.emulated_machine", *bus)
+    if not await_word(nodes, RUNTIME / "experiments.timing.emulated_machine.out", "ready"):
         raise TimeoutError("the emulated nodes do not start")
     guard, guard_ready = start(python, checkout, "controller.guard", *bus)
     controller, controller_ready = start(
@@ -144,8 +144,9 @@ def await_word(process: subprocess.Popen[bytes], out: Path, word: str) -> bool:
 
 def await_mode(reports: socket.socket, wanted: str) -> bool:
     """Whether the controller reaches a mode: STANDBY needs every encoder's answers."""
-    from can_dbc.setpoint import StateReport, decode
-    from machine.modes import Mode
+    from can_dbc.messages.crane import StateReport
+    from can_dbc.messages.datagrams import decode
+    from machine.status.modes import Mode
 
     limit_s = time.monotonic() + PATIENCE_S
     while (left_s := limit_s - time.monotonic()) > 0 and select.select([reports], [], [], left_s)[0]:

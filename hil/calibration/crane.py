@@ -24,8 +24,8 @@ from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from hil.wire.inprocess import InProcessBus
 from machine.loading.profile_file import load_profile, profile_hash
-from machine.status.modes import Mode
 from machine.profile import Profile
+from machine.status.modes import Mode
 from recorder.recorder import Recorder
 from sim.instruments.total_station import TotalStation, grapple_yaw
 from sim.plant import Plant
@@ -50,7 +50,9 @@ class Outcome:
 class _Calibrator:
     """The procedure as the planner of the lockstep; it plans with the first report of a machine that is ready."""
 
-    def __init__(self, profile: Profile, plant: Plant, seed: int, surveyed: bool, show: Callable[[CalibrationPlan], None]) -> None:
+    def __init__(
+        self, profile: Profile, plant: Plant, seed: int, surveyed: bool, show: Callable[[CalibrationPlan], None]
+    ) -> None:
         self.calibration: Calibration | None = None
         self.plan: CalibrationPlan | None = None
         self.refused: str | None = None

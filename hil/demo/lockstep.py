@@ -17,14 +17,14 @@ from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from hil.demo.summary import Summary, outcome_sentence
 from hil.harness.display import Display
-from hil.harness.lockstep import START_NS, LogDetector, Lockstep, Observer
+from hil.harness.lockstep import START_NS, Lockstep, LogDetector, Observer
 from hil.harness.operator import Operator
 from hil.plc.bridged_plant import BridgedPlant
 from host.exit_codes import CommandFailed, ExitCode
-from machine.status.faults import describe
 from machine.loading.profile_file import load_profile, profile_hash
-from machine.status.modes import Mode
 from machine.profile import Profile
+from machine.status.faults import describe
+from machine.status.modes import Mode
 from recorder.manifest import describe as describe_run
 from recorder.recorder import Recorder, RecordingRefused
 from sim.plant import Plant

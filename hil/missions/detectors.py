@@ -1,8 +1,8 @@
-"""What sees the logs on a mission in lockstep: a detector without mistakes, or the front camera of the plant.
+"""Log detectors of a mission in lockstep: a perfect one, or the front camera of the plant.
 
-``perfect`` is told where logs truly lie, round the crane and before the machine.  ``faithful`` and ``ours`` are given
-pictures of the front camera, whose mount was surveyed, while the crane rests; they find the logs in them with the
-shipped network and measure them as paper B did or as we do, and the crane works from what is remembered.
+``perfect`` reports the true poses of the logs around the crane and in front of the machine.  ``faithful`` and ``ours``
+take pictures with the surveyed front camera while the crane rests, segment the logs with the shipped network and
+localize them as paper B does (``faithful``) or with our own method (``ours``); the crane works from the map of logs.
 """
 
 from __future__ import annotations
@@ -12,60 +12,64 @@ from typing import Final
 
 from autonomy.manager.activity_manager import Manager
 from autonomy.manager.transition_table import ENDS, RULES
-from autonomy.perception.driving_log_detector import FrontEyes, Ours, PaperB
-from autonomy.perception.segmentation.log_segmenter import LogFinder
+from autonomy.perception.driving_log_detector import CylinderLocalizer, DrivingLogDetector, PaperBLocalizer
 from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from hil.calibration.camera_survey import SURVEYED_BY_GNSS, surveyed_profile
-from hil.harness.lockstep import Eyes
+from hil.harness.errors import SetupError
+from hil.harness.lockstep import LogDetector
 from hil.plant.camera import RigCamera
 from machine.profile import Profile
 from sim.camera.rig import CameraRig
-from sim.instruments.ideal_detector import detect_near
+from sim.instruments.ideal_detector import detect_in_view
 from sim.plant import Plant
 
 CAMERA: Final = "front"
 
 
-class NearEyes:
-    """Every log that a camera could see, where it truly lies."""
+class PerfectDetector:
+    """Every log that a camera could see, at its true pose."""
 
     def __init__(self, plant: Plant) -> None:
         self._plant = plant
 
-    def look(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...]:
-        """The logs in the crane's base frame, which looks backwards."""
+    def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...]:
+        """The logs in the base frame of the crane, whose x axis points backwards."""
         return tuple(
             LogObservation(log.id, log.position_m, log.axis, log.length_m, log.diameter_m)
-            for log in detect_near(self._plant)
+            for log in detect_in_view(self._plant)
         )
 
 
-class RouteEyes:
-    """The front camera, asked while the crane rests."""
+class FrontCameraDetector:
+    """The front camera; it takes pictures only while the crane rests."""
 
-    def __init__(self, front: FrontEyes, manager: Manager) -> None:
+    def __init__(self, front: DrivingLogDetector, manager: Manager) -> None:
         self._front, self._manager = front, manager
 
-    def look(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
-        """The logs of a picture taken now."""
+    def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
+        """The logs in a picture taken now; None while the crane works or the machine is not localized."""
         manager = self._manager
         outlook = manager.outlook
         if RULES[manager.state].crane or manager.state in ENDS or not outlook.located or outlook.vehicle is None:
             return None
-        return self._front.look(outlook.base_at(now_ns), q, outlook.vehicle.articulation_rad)
+        return self._front.detect(outlook.base_at(now_ns), q, outlook.vehicle.articulation_rad)
 
 
-def eyes_of(kind: str, plant: Plant, profile: Profile, manager: Manager, seed: int) -> Eyes:
-    """Eyes of a kind.
+def make_detector(kind: str, plant: Plant, profile: Profile, manager: Manager, seed: int) -> LogDetector:
+    """The detector ``kind`` of the module docstring.
 
     Raises:
-        ValueError: the machine has no front camera, or the network's weights are missing.
+        SetupError: the machine has no front camera.
+        ValueError: the network's weights are missing.
     """
     if kind == "perfect":
-        return NearEyes(plant)
+        return PerfectDetector(plant)
     if CAMERA not in profile.cameras:
-        raise ValueError(f"{profile.name} has no camera {CAMERA!r}; add [cameras.{CAMERA}] to the profile")
-    seeing = surveyed_profile(profile, plant.world.truth, CAMERA, seed)
+        raise SetupError(
+            "mission.no-front-camera", f"{profile.name} has no camera {CAMERA!r}; add [cameras.{CAMERA}] to the profile"
+        )
+    surveyed = surveyed_profile(profile, plant.world.truth, CAMERA, seed)
     source = RigCamera(CameraRig(plant.world, profile, plant.world.truth, seed), CAMERA)
-    sight = Ours(seeing, SURVEYED_BY_GNSS) if kind == "ours" else PaperB()
-    return RouteEyes(FrontEyes(seeing, CAMERA, source, LogFinder().segment, sight), manager)
+    localizer = CylinderLocalizer(surveyed, SURVEYED_BY_GNSS) if kind == "ours" else PaperBLocalizer()
+    return FrontCameraDetector(DrivingLogDetector(surveyed, CAMERA, source, LogSegmenter().segment, localizer), manager)

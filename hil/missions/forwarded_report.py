@@ -1,4 +1,4 @@
-"""The report of a run to the forest company: what went to landings, as StanForD 2010 ``fpr`` beside the run's logs."""
+"""The report of a run to the forest company: the forwarded loads as StanForD 2010 ``fpr``, beside the recording."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ NAME: Final = "forwarded.fpr"
 def report_loads(
     directory: Path, loads: Sequence[Load], mission: ForwardingMission, profile: Profile, epoch: datetime, epoch_ns: int
 ) -> Path | None:
-    """Write it and say where; None where nothing was forwarded.  ``epoch``, with its zone, is ``epoch_ns`` by the clock
-    of the loads.
+    """Write the report and return its path; None when nothing was forwarded.
+
+    ``epoch`` (with time zone) is the date at ``epoch_ns`` on the clock of the loads.
     """
     if not loads:
         return None

@@ -32,10 +32,10 @@ from hil.missions.forwarded_report import report_loads
 from hil.missions.site import site_of
 from hil.missions.summary import MissionSummary
 from host.exit_codes import CommandFailed, ExitCode
-from machine.status.faults import describe
 from machine.loading.profile_file import load_profile, profile_hash
-from machine.status.modes import Mode
 from machine.profile import Profile
+from machine.status.faults import describe
+from machine.status.modes import Mode
 from recorder.manifest import describe as describe_run
 from recorder.recorder import Recorder, RecordingRefused
 from sim.plant import Plant

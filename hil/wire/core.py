@@ -1,17 +1,17 @@
 """One CAN bus in time, without a clock or a socket: arbitration, bit times, error counters, bus-off.
 
-Time is an integer number of ns that only `WireCore.advance` moves.  A frame starts at the first moment at
-which the bus is idle and a frame is pending; of all that are pending then, the arbitration field decides.
-Frames submitted at the present moment all take part in the arbitration at that moment, whatever the order
-of the calls.  Receivers get a frame at its last bit.
+Time is an integer number of ns that only `WireCore.advance` moves.  A frame starts as soon as the bus is idle and a
+frame is pending; the arbitration field decides between the pending frames.  Frames submitted at the present time all
+take part in the arbitration at that time, in whatever order they were submitted.  Receivers get a frame at its last
+bit.
 
-Model (ISO 11898-1): each participant sends its queue in order, as a SocketCAN queue does.  A frame that
-nobody acknowledges or whose CRC fails is destroyed by an error frame and sent again; the transmit error
-counter rises by 8, the receive counter by 1, and each good frame takes 1 off.  96 warns, 128 is error
-passive (8 bits of pause after an own frame; a missing acknowledge no longer counts), above 255 the node is
-off the bus, loses its queue, and comes back `restart_ns` later (0: never).  Error frames reach the receive
-queue of the node concerned as SocketCAN reports them.  Simplified: error frames take their least length (14
-bits); two equal arbitration fields at the same moment go out one after the other instead of colliding.
+Model (ISO 11898-1): each participant sends its queue in order, like a SocketCAN queue.  A frame without an
+acknowledgement or with a failed CRC is destroyed by an error frame and sent again; the transmit error counter rises by
+8, the receive counter by 1, and each good frame lowers them by 1.  96 is the warning limit, 128 is error passive (8
+bits of pause after an own frame; a missing acknowledgement no longer counts).  Above 255 the node is bus-off, loses its
+queue, and restarts `restart_ns` later (0: never).  Error frames reach the receive queue of the node concerned in
+SocketCAN's format.  Simplifications: error frames have their minimum length (14 bits); frames with equal arbitration
+fields go out one after the other instead of colliding.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from heapq import heapify, heappop, heappush
 from itertools import count
 from typing import Final
 
-from can_dbc.bus import ERR_ACK, ERR_BUSERROR, ERR_PROT, ERR_RESTARTED, BusState
-from can_dbc.filters import Wanted, filter_of
+from can_dbc.bus.base import ERR_ACK, ERR_BUSERROR, ERR_PROT, ERR_RESTARTED, BusState
+from can_dbc.bus.filters import Wanted, filter_of
 from can_dbc.frame import ERROR, Frame
+from hil.wire.errors import WireError
 from hil.wire.faults import Damage, Fault, Kind
 from hil.wire.node import Flight, Node, Pending, Segment
 from hil.wire.stuffing import frame_bits, priority
@@ -41,15 +42,17 @@ class WireCore:
 
     def __init__(self, bitrate: int, name: str = "wire", restart_ns: int = 100_000_000) -> None:
         if bitrate <= 0 or 1_000_000_000 % bitrate:
-            raise ValueError(f"A bit of wire {name} at {bitrate} bit/s is not a whole number of ns long.")
+            raise WireError(
+                "wire.bitrate", f"A bit of wire {name} at {bitrate} bit/s is not a whole number of ns long."
+            )
         self.name = name
         self.bitrate = bitrate
         self.bit_ns = 1_000_000_000 // bitrate
         self.restart_ns = restart_ns
         self.now_ns = 0
         self.busy_ns = 0
-        """Bus time used by frames, error frames and the space after each; the bus load over a span is the
-        growth of this by the growth of `now_ns`."""
+        """Bus time used by frames, error frames and interframe space; the bus load of an interval is the
+        growth of this divided by the growth of `now_ns`."""
         self.errors = 0
         """Frames destroyed by an error frame."""
         self.nodes: list[Node] = []
@@ -72,28 +75,28 @@ class WireCore:
         queue_limit: int = 10,
         rx_limit: int = 1024,
     ) -> Node:
-        """Adds a participant at the present moment; `filters` as in `can_dbc.bus.open_bus`."""
+        """Add a participant at the present time; `filters` as in `can_dbc.bus.factory.open_bus`."""
         node = Node(name, filter_of(filters), receive_own, queue_limit, rx_limit)
         self.nodes.append(node)
         self._place(node)
         return node
 
     def detach(self, node: Node) -> None:
-        """Removes a participant; its pending frames and a frame it is sending are lost."""
+        """Remove a participant; its pending frames and the frame it is sending are lost."""
         self.nodes.remove(node)
         node.queue.clear()
         self._leave(node)
 
     def retire(self, node: Node) -> None:
-        """Removes a participant that wants to hear no more, once its pending frames are out; at once when
-        nobody acknowledges them."""
+        """Remove a participant once its pending frames are sent, or at once when nobody acknowledges them; it
+        receives nothing more."""
         node.wanted, node.rx_limit, node.retiring = (), 0, True
         if not node.queue or node.tec > 127:
             self.detach(node)
 
     def submit(self, node: Node, key: int, data: bytes) -> bool:
-        """Queues a frame at the present moment; False when the queue is full, the node is bus-off, or it is
-        no frame (more than 8 bytes, an error key)."""
+        """Queue a frame at the present time; False when the queue is full, the node is bus-off, or the frame is
+        invalid (more than 8 bytes, an error key)."""
         if len(node.queue) >= node.queue_limit or node.state is BusState.OFF or key & ERROR or len(data) > 8:
             node.refused += 1
             return False
@@ -101,7 +104,7 @@ class WireCore:
         return True
 
     def restart(self, node: Node) -> None:
-        """Brings a node that is bus-off back, as ``ip link set can0 type can restart`` does."""
+        """Restart a node that is bus-off, as ``ip link set can0 type can restart`` does."""
         if node.state is BusState.OFF and node in self.nodes:
             node.tec = node.rec = 0
             node.state = BusState.ACTIVE
@@ -110,34 +113,39 @@ class WireCore:
             self._report(node, self.now_ns, ERR_RESTARTED)
 
     def inject(self, fault: Fault) -> None:
-        """Puts a fault on the wire; it acts within its window, from now on at the earliest."""
+        """Inject a fault; it acts within its time window, from now on at the earliest."""
         if fault.kind is Kind.CUT:
             self._at(fault.start_ns, lambda: self._cut(fault), of_fault=True)
-            self._at(fault.end_ns, lambda: self._mend(fault), of_fault=True)
+            self._at(fault.end_ns, lambda: self._repair(fault), of_fault=True)
         elif fault.kind is Kind.BABBLE:
             self._at(fault.start_ns, lambda: self._babble(fault), of_fault=True)
         else:
             self._damage.add(fault)
 
     def heal(self) -> None:
-        """Takes every fault off the wire, those to come included."""
+        """Remove every fault, future ones included."""
         self._damage.clear()
         self._events = [event for event in self._events if not event[3]]
         heapify(self._events)
         for fault in self._cuts[:]:
-            self._mend(fault)
+            self._repair(fault)
         for node in [node for node in self.nodes if node.refill_ns is not None]:
             self.detach(node)
 
     # -- time
 
     def advance(self, to_ns: int) -> list[tuple[Node, Frame]]:
-        """Moves time on; returns (sender, frame) of every frame that ended, in order.
+        """Advance to `to_ns`; return (sender, frame) of every completed frame, in order.
 
-        Frames may start before `to_ns`, not at it.  Raises ValueError when time would run back.
+        Frames may start before `to_ns`, not at it.
+
+        Raises:
+            WireError: `to_ns` lies in the past.
         """
         if to_ns < self.now_ns:
-            raise ValueError(f"Wire {self.name} is at {self.now_ns} ns and cannot go back to {to_ns} ns.")
+            raise WireError(
+                "wire.time-reversed", f"Wire {self.name} is at {self.now_ns} ns and cannot go back to {to_ns} ns."
+            )
         while True:
             for segment in self._segments[:]:
                 self._run(segment, to_ns)
@@ -151,12 +159,12 @@ class WireCore:
         return finished
 
     def next_ns(self) -> int | None:
-        """When something happens next if nobody submits anything; None: never."""
+        """Time of the next event if nobody submits anything; None for never."""
         times = [event[0] for event in self._events[:1]]
         for segment in self._segments:
             if segment.flight:
                 times.append(segment.flight.end_ns)
-            elif len(segment.nodes) != 1 or segment.nodes[0].tec < 128:  # else it tries in vain for ever
+            elif len(segment.nodes) != 1 or segment.nodes[0].tec < 128:  # else it retries for ever
                 times.extend(node.ready_ns(segment) + 1 for node in segment.nodes if node.queue)
         return min(times, default=None)
 
@@ -166,7 +174,7 @@ class WireCore:
     # -- the bus
 
     def _run(self, segment: Segment, to_ns: int) -> None:
-        """Runs one segment up to `to_ns` or to the next event, which it may itself have scheduled."""
+        """Run one segment up to `to_ns` or to the next event, which it may have scheduled itself."""
         events = self._events
         while True:
             limit_ns = events[0][0] if events and events[0][0] < to_ns else to_ns
@@ -193,29 +201,29 @@ class WireCore:
     def _start(self, segment: Segment, sender: Node, start_ns: int, limit_ns: int) -> None:
         frame = sender.queue[0]
         alone = len(segment.nodes) == 1
-        verdict = None
+        fate = None
         if self._damage:
-            verdict = self._damage.judge(start_ns, sender.name, frame.key, frame.data)
-        destroyed = alone or (verdict is not None and verdict.error)
+            fate = self._damage.fate(start_ns, sender.name, frame.key, frame.data)
+        destroyed = alone or (fate is not None and fate.error)
         bits = frame_bits(frame.key, frame.data) + (ERROR_BITS if destroyed else END_BITS)
         if alone and sender.tec > 127:
-            # Nothing changes from try to try: take all that fit in one step.
+            # Every retry is the same: compute all that fit in one step.
             period_ns = (bits + SPACE_BITS + SUSPEND_BITS) * self.bit_ns
-            tries = max(1, (limit_ns - start_ns) // period_ns)
-            self.errors += tries
-            sender.hold_ns = start_ns + tries * period_ns
+            retries = max(1, (limit_ns - start_ns) // period_ns)
+            self.errors += retries
+            sender.hold_ns = start_ns + retries * period_ns
             if segment is self._main:
-                self.busy_ns += tries * (bits + SPACE_BITS) * self.bit_ns
+                self.busy_ns += retries * (bits + SPACE_BITS) * self.bit_ns
             return
         end_ns = start_ns + bits * self.bit_ns
         segment.free_ns = end_ns + SPACE_BITS * self.bit_ns
         if segment is self._main:
             self.busy_ns += segment.free_ns - start_ns
-        segment.flight = Flight(end_ns, sender, frame, alone, verdict)
+        segment.flight = Flight(end_ns, sender, frame, alone, fate)
 
     def _finish(self, segment: Segment, flight: Flight) -> None:
-        end_ns, sender, frame, alone, verdict = flight
-        if alone or (verdict is not None and verdict.error):
+        end_ns, sender, frame, alone, fate = flight
+        if alone or (fate is not None and fate.error):
             self._destroy(segment, flight)
         else:
             sender.queue.popleft()
@@ -230,11 +238,11 @@ class WireCore:
                 elif node.rec:
                     node.rec = min(node.rec - 1, 127)
                     self._report(node, end_ns)
-            if verdict is None:
+            if fate is None:
                 self._deliver(segment, sender, Frame(end_ns, frame.key, frame.data))
             else:
-                for offset_ns in verdict.offsets_ns:
-                    late = Frame(end_ns + offset_ns, frame.key, verdict.data)
+                for offset_ns in fate.offsets_ns:
+                    late = Frame(end_ns + offset_ns, frame.key, fate.data)
                     self._at(late.stamp_ns, partial(self._deliver, segment, sender, late))
         if sender.tec > 127:
             sender.hold_ns = segment.free_ns + SUSPEND_BITS * self.bit_ns
@@ -252,7 +260,7 @@ class WireCore:
     # -- errors
 
     def _destroy(self, segment: Segment, flight: Flight) -> None:
-        """Everyone on the segment sees the error; the frame stays at the head of its queue."""
+        """Every node of the segment detects the error; the frame stays at the head of its queue."""
         self.errors += 1
         for node in tuple(segment.nodes):
             if node is flight.sender:
@@ -264,7 +272,7 @@ class WireCore:
                 self._report(node, flight.end_ns, ERR_PROT | ERR_BUSERROR)
 
     def _report(self, node: Node, at_ns: int, classes: int = 0, transmitter: bool = False) -> None:
-        """Settles the state by the counters and tells the node of the error and of a change of state."""
+        """Update the state from the counters, and report the error and a change of state to the node."""
         state = node.confinement()
         changed = state is not node.state
         node.state = state
@@ -283,21 +291,21 @@ class WireCore:
     # -- cable
 
     def _place(self, node: Node) -> None:
-        """Puts a node on the piece of cable it belongs to now."""
+        """Connect a node to the segment that it belongs to now."""
         if node.state is BusState.OFF:
             return
         cut = any(fault.node in (None, node.name) for fault in self._cuts)
         here = node.segment
         if here is None or cut is (here is self._main):
             self._leave(node)
-            node.hold_ns = max(node.hold_ns, self.now_ns)  # frames that waited start now, not in the past
+            node.hold_ns = max(node.hold_ns, self.now_ns)  # waiting frames start now, not in the past
             node.segment = Segment() if cut else self._main
             node.segment.nodes.append(node)
             if cut:
                 self._segments.append(node.segment)
 
     def _leave(self, node: Node) -> None:
-        """Takes a node off its cable; a frame it is sending breaks off."""
+        """Disconnect a node from its segment; a frame that it is sending is aborted."""
         segment, node.segment = node.segment, None
         if segment is None:
             return
@@ -312,7 +320,7 @@ class WireCore:
         for node in self.nodes:
             self._place(node)
 
-    def _mend(self, fault: Fault) -> None:
+    def _repair(self, fault: Fault) -> None:
         if fault in self._cuts:
             self._cuts.remove(fault)
             for node in self.nodes:

@@ -1,12 +1,12 @@
-"""The wire as a process: real-time CAN buses that any program of this user can join.
+"""The wire as a process: real-time CAN buses in user space that any program of this user can join.
 
     python -m hil.wire.daemon --bus crane0:1000000 --bus mach0:250000
 
-Each bus is a Unix socket in `wire_directory` (protocol: `can_dbc.wire_client`).  ``--join crane0=can0`` makes
-a SocketCAN interface a participant: with two of them the wire is a cable between the two, which faults can
-damage.
+Each bus is a Unix socket in `wire_directory` (protocol: `can_dbc.bus.wire_client`).  ``--join crane0=can0`` makes
+a SocketCAN interface a participant: with two of them the wire is a cable between the two, on which faults can be
+injected.
 
-Control requests (`can_dbc.wire_client.control`): ``{"inject": Fault.to_json()}``, ``{"heal": true}``,
+Control requests (`can_dbc.bus.wire_client.control`): ``{"inject": Fault.to_json()}``, ``{"heal": true}``,
 ``{"restart": "participant"}``, ``{"stats": true}``.  Prints ``ready`` when every bus accepts clients.
 Exit codes: 0 stopped by SIGINT or SIGTERM, 2 usage, 4 bus busy or not available.
 """
@@ -20,8 +20,8 @@ import socket
 import sys
 from pathlib import Path
 
-from can_dbc.bus import BusError
-from can_dbc.wire_client import wire_directory
+from can_dbc.bus.base import BusError
+from can_dbc.bus.wire_client import wire_directory
 from hil.wire.server import Server, serve
 
 
@@ -65,27 +65,27 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _prepare(directory: Path) -> None:
-    """Makes the directory for this user only; one that somebody else made is not to be trusted."""
+    """Make the directory for this user only; a directory of another user is not trusted."""
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         owner = directory.stat().st_uid
     except OSError as error:
-        raise BusError(f"The wire directory {directory} cannot be made ({error.strerror}).") from error
+        raise BusError(f"The wire directory {directory} cannot be created ({error.strerror}).") from error
     if owner not in (os.getuid(), 0):
-        raise BusError(f"The wire directory {directory} belongs to somebody else; choose another with --dir.")
+        raise BusError(f"The wire directory {directory} belongs to another user; choose another with --dir.")
 
 
 def _bus(text: str) -> tuple[str, int]:
     name, _, bitrate = text.partition(":")
     if not name or "/" in name or not bitrate.isdigit() or not int(bitrate) or 1_000_000_000 % int(bitrate):
-        raise argparse.ArgumentTypeError(f"'{text}': write NAME:BITRATE, as in crane0:1000000")
+        raise argparse.ArgumentTypeError(f"'{text}' is not NAME:BITRATE, as in crane0:1000000")
     return name, int(bitrate)
 
 
 def _join(text: str) -> tuple[str, str]:
     name, _, interface = text.partition("=")
     if not name or not interface:
-        raise argparse.ArgumentTypeError(f"'{text}': write NAME=INTERFACE, as in crane0=can0")
+        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=INTERFACE, as in crane0=can0")
     return name, interface
 
 

@@ -1,14 +1,14 @@
-"""Damage done to a wire on purpose: what, to which frames, from when to when.
+"""Fault injection: which faults act on which frames of a wire, and when.
 
-A `Fault` is plain data and travels as JSON.  `Damage` judges each frame as it starts; the core carries the
-verdict out.  With the same seed and the same frames the damage is the same.
+A `Fault` is plain data and travels as JSON.  `Damage` decides on the fate of each frame when it starts; the core carries
+it out.  The same seed and the same frames give the same damage.
 
 | kind | effect |
 |---|---|
 | drop | the sender succeeds, nobody receives |
 | delay | received `shift_ns` later |
 | repeat | received again `count` times, `shift_ns` apart |
-| corrupt | `count` payload bits flip and the bus does not notice |
+| corrupt | `count` payload bits flip, undetected by the bus |
 | error | the CRC fails: error frame, error counters rise, the sender tries again |
 | babble | a new node `node` sends `key` with `data` every `shift_ns`, back to back when that is 0 |
 | cut | the cable to participant `node` (None: to everyone) is open |
@@ -21,6 +21,8 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from random import Random
 from typing import Any, NamedTuple, Self
+
+from hil.wire.errors import WireError
 
 FOREVER_NS = 1 << 62
 
@@ -41,9 +43,8 @@ class Kind(StrEnum):
 class Fault:
     """One fault, active from `start_ns` up to `end_ns` on frames whose key equals `key` under `mask`.
 
-    Times are those of the core: virtual in lockstep, CLOCK_MONOTONIC under the daemon.
-    Mask 0 takes every frame.  `node` narrows it to frames sent by participants of that name.  Each frame
-    is hit with `probability`.
+    Times are those of the core: virtual in lockstep, CLOCK_MONOTONIC in the daemon.  Mask 0 selects every frame; `node`
+    restricts the fault to frames sent by participants of that name.  Each frame is hit with `probability`.
     """
 
     kind: Kind
@@ -60,14 +61,15 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.end_ns <= self.start_ns or self.shift_ns < 0 or self.count < 1 or len(self.data) > 8:
-            raise ValueError(
+            raise WireError(
+                "wire.fault-fields",
                 f"The wire fault {self.kind} needs end_ns after start_ns, shift_ns of 0 or more, count of 1 "
-                "or more and at most 8 data bytes."
+                "or more and at most 8 data bytes.",
             )
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> Self:
-        """Raises ValueError or TypeError for an unknown kind, field or value."""
+        """A fault from its JSON fields; raises ValueError or TypeError for an unknown kind, field or value."""
         converted = dict(fields, kind=Kind(fields.get("kind", "")))
         if "data" in fields:
             converted["data"] = bytes.fromhex(fields["data"])
@@ -77,8 +79,8 @@ class Fault:
         return {**asdict(self), "data": self.data.hex()}
 
 
-class Verdict(NamedTuple):
-    """What becomes of one frame: destroyed by an error frame, or `data` received at each offset."""
+class Fate(NamedTuple):
+    """The fate of one frame: destroyed by an error frame, or `data` received at each offset."""
 
     error: bool
     offsets_ns: tuple[int, ...]
@@ -100,8 +102,8 @@ class Damage:
     def clear(self) -> None:
         self._faults.clear()
 
-    def judge(self, at_ns: int, sender: str, key: int, data: bytes) -> Verdict:
-        """The verdict on a frame that starts at `at_ns`; faults apply in the order they were added."""
+    def fate(self, at_ns: int, sender: str, key: int, data: bytes) -> Fate:
+        """The fate of a frame that starts at `at_ns`; faults apply in the order in which they were added."""
         error = False
         offsets: tuple[int, ...] = (0,)
         self._faults = [entry for entry in self._faults if at_ns < entry[0].end_ns]
@@ -124,7 +126,7 @@ class Damage:
                     data = _flip(data, fault.count, random)
                 case Kind.ERROR:
                     error = True
-        return Verdict(error, offsets, data)
+        return Fate(error, offsets, data)
 
 
 def _flip(data: bytes, count: int, random: Random) -> bytes:

@@ -1,21 +1,21 @@
 """A participant on a `WireCore` in the same process: the bus of lockstep runs, on the core's own time.
 
-The harness moves time with `WireCore.advance`; `send` queues at that time, `drain` gives what has arrived
-by it.
+The harness advances time with `WireCore.advance`; `send` queues at that time, `drain` returns the frames that have
+arrived by then.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from can_dbc.bus import BaseBus, BusState
-from can_dbc.filters import Wanted
+from can_dbc.bus.base import BaseBus, BusState
+from can_dbc.bus.filters import Wanted
 from can_dbc.frame import ERROR, Frame
 from hil.wire.core import WireCore
 
 
 class InProcessBus(BaseBus):
-    """One participant (contract: `can_dbc.bus.Bus`); `participant` names it for faults and reports."""
+    """One participant (contract: `can_dbc.bus.base.Bus`); `participant` names it for faults and reports."""
 
     def __init__(
         self,

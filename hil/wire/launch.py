@@ -1,4 +1,4 @@
-"""Starts a wire daemon as a child process and stops it again: for live runs and tests."""
+"""Runs a wire daemon as a child process, for tests and benches."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from can_dbc.bus import BusError
+from can_dbc.bus.base import BusError
 
 _START_TIMEOUT_S: Final = 20.0
 _STOP_TIMEOUT_S: Final = 5.0
@@ -21,10 +21,12 @@ _STOP_TIMEOUT_S: Final = 5.0
 def wire_daemon(
     buses: Mapping[str, int], directory: Path | None = None, joined: Mapping[str, str] | None = None
 ) -> Iterator[subprocess.Popen[str]]:
-    """A daemon that serves `buses` (name to bit/s), ready to take clients; ends with the block.
+    """A daemon that serves `buses` (name to bit/s), ready for clients; ends with the block.
 
-    `joined` maps SocketCAN interfaces to the bus they take part in.  Raises `BusError` with the daemon's own
-    sentence when it does not start.
+    `joined` maps SocketCAN interfaces to the bus that they join.
+
+    Raises:
+        BusError: the daemon does not start; the sentence is the daemon's own.
     """
     ready, child_end = os.pipe()
     command = [sys.executable, "-m", "hil.wire.daemon", "--ready-fd", str(child_end)]

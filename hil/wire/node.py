@@ -1,4 +1,4 @@
-"""The state of one participant of the wire, and the pieces of cable that participants sit on."""
+"""The state of one participant of the wire, and the cable segments that connect participants."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Container
 from typing import Final, NamedTuple
 
-from can_dbc.bus import (
+from can_dbc.bus.base import (
     CRTL_ACTIVE,
     CRTL_PASSIVE,
     CRTL_WARNING,
@@ -18,7 +18,7 @@ from can_dbc.bus import (
     BusState,
 )
 from can_dbc.frame import ERROR, Frame
-from hil.wire.faults import Verdict
+from hil.wire.faults import Fate
 
 # Bytes 1 to 3 of an error frame (linux/can/error.h).
 _CRTL_RECEIVER: Final = 0x14
@@ -44,11 +44,11 @@ class Flight(NamedTuple):
     sender: Node
     frame: Pending
     alone: bool
-    verdict: Verdict | None
+    fate: Fate | None
 
 
 class Node:
-    """One participant: its queues, counters and error state.  Read it freely; only the core writes it."""
+    """One participant: its queues, counters and error state; only the core changes it."""
 
     __slots__ = (
         "done", "dropped", "hold_ns", "name", "queue", "queue_limit", "rec", "receive_own",
@@ -65,8 +65,8 @@ class Node:
         self.queue_limit = queue_limit
         self.rx: list[Frame] = []
         self.rx_limit = rx_limit
-        self.hold_ns = 0  # not before this time may it start a frame
-        self.refill_ns: int | None = None  # a babbling node: pause until the same frame again
+        self.hold_ns = 0  # no frame starts before this time
+        self.refill_ns: int | None = None  # of a babbling node: pause before it sends the same frame again
         self.retiring = False
         self.tec = self.rec = 0
         self.state = BusState.ACTIVE
@@ -74,12 +74,12 @@ class Node:
         self.done = self.dropped = self.refused = 0
 
     def take(self) -> list[Frame]:
-        """Empties the receive queue."""
+        """Empty the receive queue."""
         taken, self.rx = self.rx, []
         return taken
 
     def discard(self) -> None:
-        """Empties the transmit queue but for the frame on the bus."""
+        """Empty the transmit queue, except for the frame on the bus."""
         flight = self.segment.flight if self.segment else None
         kept = 1 if flight is not None and flight.sender is self else 0
         self.done += len(self.queue) - kept
@@ -87,25 +87,25 @@ class Node:
             self.queue.pop()
 
     def receive(self, frame: Frame) -> None:
-        """Puts a frame into the receive queue, or counts it as dropped."""
+        """Put a frame into the receive queue, or count it as dropped."""
         if len(self.rx) < self.rx_limit:
             self.rx.append(frame)
         else:
             self.dropped += 1
 
     def ready_ns(self, segment: Segment) -> int:
-        """The first moment at which the head of the transmit queue may start."""
+        """The earliest time at which the head of the transmit queue may start."""
         return max(self.queue[0].ready_ns, self.hold_ns, segment.free_ns)
 
     def confinement(self) -> BusState:
-        """The state that the error counters ask for."""
+        """The fault confinement state for the present error counters (ISO 11898-1)."""
         if self.tec > 255:
             return BusState.OFF
         worst = max(self.tec, self.rec)
         return BusState.PASSIVE if worst > 127 else BusState.WARNING if worst > 95 else BusState.ACTIVE
 
     def error_frame(self, at_ns: int, classes: int, changed: bool, transmitter: bool) -> Frame:
-        """What SocketCAN tells of an error of these classes and of a state that has `changed`."""
+        """SocketCAN's error frame for an error of these classes and, if `changed`, for the new state."""
         flags = 0
         if changed and self.state is BusState.OFF:
             classes |= ERR_BUSOFF
@@ -122,7 +122,7 @@ class Node:
 
 
 class Segment:
-    """A piece of cable and the nodes on it: the whole bus, or one node behind an open cable."""
+    """A cable segment and its nodes: the whole bus, or one node behind an open cable."""
 
     __slots__ = ("flight", "free_ns", "nodes")
 

@@ -1,9 +1,8 @@
 """The participants of a real-time wire bus and the loop that serves them (commands: `hil.wire.daemon`).
 
-A bus is a listening Unix socket and a `WireCore` on CLOCK_MONOTONIC.  Deliveries are batched `GRAIN_NS`
-apart; the stamps keep the exact end of each frame.  A slow client loses frames of its own receive queue,
-counted, and never holds up the others.  A SocketCAN interface that goes down is unplugged and tried again until it is
-back.
+A bus is a listening Unix socket and a `WireCore` on CLOCK_MONOTONIC.  Deliveries are batched `GRAIN_NS` apart; the
+stamps keep the exact end of each frame.  A slow client loses frames of its own receive queue, counted, and never delays
+the others.  A SocketCAN interface that goes down is unplugged and tried again until it is back.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-from can_dbc.bus import BusError, BusState
+from can_dbc.bus.base import BusError, BusState
+from can_dbc.bus.socketcan import SocketCanBus
+from can_dbc.bus.wire_client import BATCH, CONTROL, CONTROL_BYTES, DISCARD, RECORD, STATUS
 from can_dbc.frame import Frame
-from can_dbc.socketcan import SocketCanBus
-from can_dbc.wire_client import BATCH, CONTROL, CONTROL_BYTES, DISCARD, RECORD, STATUS
 from hil.wire.core import WireCore
 from hil.wire.faults import Fault
 from hil.wire.node import Node
@@ -29,13 +28,13 @@ GRAIN_NS: Final = 250_000
 _SEND_BUFFER_BYTES: Final = 1 << 16
 _RX_LIMIT: Final = 4096
 _RETRY_NS: Final = 100_000_000
-"""An interface that was lost is tried again this often."""
+"""Interval at which a lost interface is tried again."""
 _SOCKET_PATH_BYTES: Final = 107
-"""The kernel's sun_path (unix(7)) less its end."""
+"""Length of sun_path (unix(7)) without the terminating zero."""
 
 
 class Client:
-    """One connection: a node of the core once it has said hello."""
+    """One connection; it becomes a node of the core with its hello request."""
 
     def __init__(self, sock: socket.socket, core: WireCore) -> None:
         sock.setblocking(False)
@@ -43,19 +42,19 @@ class Client:
         self.sock = sock
         self._core = core
         self._node: Node | None = None
-        self._told = 0
+        self._reported_done = 0
         self.blocked = False
-        """Its socket is full; frames wait in the node's receive queue."""
+        """The socket is full; frames wait in the node's receive queue."""
 
     def read(self) -> bool:
-        """Takes everything the client has sent; False when it has gone or breaks the protocol."""
+        """Read everything that the client has sent; False when it is gone or violates the protocol."""
         while True:
             try:
                 packet = self.sock.recv(CONTROL_BYTES)
             except BlockingIOError:
                 return True
             except ConnectionResetError:
-                continue  # it closed without reading all we sent; what it sent before is still there
+                continue  # it closed with unread data; what it sent before can still be read
             except OSError:
                 return False
             if len(packet) < RECORD.size:
@@ -65,20 +64,19 @@ class Client:
             elif self._node is None or len(packet) % RECORD.size:
                 return False
             else:
-                self._take(self._node, packet)
+                self._queue(self._node, packet)
 
-    def _take(self, node: Node, packet: bytes) -> None:
+    def _queue(self, node: Node, packet: bytes) -> None:
         for key, length, data, _, flags, _, _ in RECORD.iter_unpack(packet):
             if flags & DISCARD:
                 node.discard()
             elif not self._core.submit(node, key, data[:length]):
-                node.done += 1  # it has left the client's queue, though not for the bus
+                node.done += 1  # it has left the client's queue, but never reaches the bus
 
     def write(self) -> None:
-        """Sends what the node has received; that a client has gone is for `read` to find, after its last
-        frames."""
+        """Send what the node has received.  `read` detects that a client is gone, after its last frames."""
         node = self._node
-        while node is not None and (node.rx or node.done != self._told):
+        while node is not None and (node.rx or node.done != self._reported_done):
             done, dropped = node.done & 0xFFFF, node.dropped & 0xFFFF_FFFF
             batch = node.rx[:BATCH]
             packet = b"".join(
@@ -90,7 +88,7 @@ class Client:
                 self.blocked = error.errno == errno.EAGAIN
                 return
             del node.rx[:BATCH]
-            self._told = node.done
+            self._reported_done = node.done
         self.blocked = False
 
     def close(self) -> None:
@@ -100,15 +98,15 @@ class Client:
 
     def _answer(self, body: bytes) -> None:
         try:
-            reply = self._obey(json.loads(body))
+            reply = self._execute(json.loads(body))
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             reply = {"error": str(error)}
         try:
             self.sock.send(RECORD.pack(0, 0, b"", 0, CONTROL, 0, 0) + json.dumps(reply).encode())
         except OSError:
-            return  # the next read or write finds out
+            return  # the next read or write detects it
 
-    def _obey(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _execute(self, request: dict[str, Any]) -> dict[str, Any]:
         match request:
             case {"hello": hello} if self._node is None:
                 self._node = self._core.attach(
@@ -131,7 +129,7 @@ class Client:
                         self._core.restart(node)
                 return {}
             case {"stats": True}:
-                return _figures(self._core)
+                return _statistics(self._core)
         raise ValueError("unknown request; known are inject, heal, restart and stats")
 
 
@@ -148,7 +146,7 @@ class Joined:
         self._frames: list[Frame] = []
 
     def read(self) -> bool:
-        """Takes everything the interface has heard; False when it is lost."""
+        """Read every frame that the interface has received; False when it is lost."""
         self._bus.drain(self._frames)
         for _, key, data in self._frames:
             self._core.submit(self._node, key, data)
@@ -174,7 +172,7 @@ class Server:
         self.sock = _listen(self.path)
         self.members: dict[int, Client | Joined] = {}
         self.unplugged: dict[str, int] = {}
-        """Interfaces that were lost, and when to try them again [ns]."""
+        """Lost interfaces, and when to try them again [ns]."""
 
     def accept(self) -> None:
         client = Client(self.sock.accept()[0], self.core)
@@ -191,7 +189,7 @@ class Server:
             self.unplugged[member.interface] = 0
 
     def plug_in(self, now_ns: int) -> None:
-        """Tries to join the interfaces that were lost."""
+        """Try to join the lost interfaces again."""
         for interface, due_ns in list(self.unplugged.items()):
             if now_ns < due_ns:
                 continue
@@ -210,7 +208,7 @@ class Server:
 
 
 def serve(servers: list[Server], stop: socket.socket) -> None:
-    """Runs the buses until `stop` becomes readable."""
+    """Run the buses until `stop` becomes readable."""
     last_ns = 0
     while True:
         listening = {server.sock.fileno(): server for server in servers}
@@ -240,11 +238,11 @@ def serve(servers: list[Server], stop: socket.socket) -> None:
 
 
 def _listen(path: Path) -> socket.socket:
-    """A listening socket at `path`; a file left by a dead daemon is replaced, a living one is an error."""
+    """A listening socket at `path`; the file of a dead daemon is replaced, a running daemon is an error."""
     if (length := len(os.fsencode(path))) > _SOCKET_PATH_BYTES:
         raise BusError(
-            f"The wire bus {path.name} cannot listen at {path}: a socket's path has {_SOCKET_PATH_BYTES} bytes at "
-            f"most, this one {length}; choose a shorter directory with --dir or TIMBERHAND_WIRE_DIR."
+            f"The wire bus {path.name} cannot listen at {path}: a socket path has at most {_SOCKET_PATH_BYTES} "
+            f"bytes, this one has {length}; choose a shorter directory with --dir or TIMBERHAND_WIRE_DIR."
         )
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
@@ -275,7 +273,7 @@ def _answers(path: Path) -> bool:
     return True
 
 
-def _figures(core: WireCore) -> dict[str, Any]:
+def _statistics(core: WireCore) -> dict[str, Any]:
     return {
         "bus": core.name,
         "bitrate": core.bitrate,

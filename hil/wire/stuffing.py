@@ -2,7 +2,7 @@
 
 The bits from start of frame to the last CRC bit are stuffed: after five equal bits a complementary one is
 inserted, which itself counts towards the next five.  Both the CRC-15 and the stuffing are run eight bits at a
-time from tables; the header of a key and length is done once and remembered.
+time from tables; the header of a key and length is computed once and cached.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def _crc_table() -> list[int]:
 
 
 def _stuff(state: int, bits: int, count: int) -> tuple[int, int]:
-    """Runs `count` bits of `bits`, most significant first; gives (state, stuff bits inserted)."""
+    """Process `count` bits of `bits`, most significant first; return (state, stuff bits inserted)."""
     inserted = 0
     for shift in range(count - 1, -1, -1):
         level = 5 * (bits >> shift & 1)

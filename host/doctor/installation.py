@@ -18,12 +18,12 @@ from typing import Final
 
 from packaging.requirements import Requirement
 
-from can_dbc.bus import kernel_has_can
+from can_dbc.bus.factory import kernel_has_can
 from host.doctor.finding import Finding, Severity, fine
 from host.vcan_lab import lab_kernel, shim
 from host.vcan_lab.choose import choose, survey
 from host.vcan_lab.spec import LabError, Request
-from machine.load import ProfileError, load_profile, shipped_profiles
+from machine.loading.profile_file import ProfileError, load_profile, shipped_profiles
 
 EXTRAS: Final = {
     "sim": "the simulated plant: `make demo`", "autonomy": "the planner", "console": "the operator's page",

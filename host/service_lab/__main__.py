@@ -10,7 +10,7 @@ import json
 import sys
 from pathlib import Path
 
-from host.exits import Exit
+from host.exit_codes import ExitCode
 from host.service_lab.host import run
 from host.vcan_lab.spec import LabError
 
@@ -36,9 +36,9 @@ def main() -> int:
         )
     except LabError as reason:
         print(f"service lab: {reason}", file=sys.stderr)
-        return Exit.BUS
+        return ExitCode.BUS
     print(json.dumps(result, indent=2))
-    return Exit.FIGURE if result["failed"] else Exit.FINE
+    return ExitCode.FIGURE_MISSED if result["failed"] else ExitCode.OK
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ LEFT_OUT: Final = shutil.ignore_patterns(".*", "runs", "build", "dist", "__pycac
 
 WARM_UP: Final = """\
 import host.service_lab.guest
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from sim.plant import Plant
 plant = Plant(load_profile("palms_471"))
 for now_ms in range(1000, 1100, 5):

@@ -12,24 +12,16 @@ import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from can_dbc import codec
-from can_dbc.bus import open_bus
+from can_dbc.bus.factory import open_bus
+from can_dbc.bus.reconnector import LostLink
+from can_dbc.dbc import codec
 from can_dbc.frame import Frame
-from can_dbc.lost_link import LostLink
-from can_dbc.setpoint import (
-    CraneSetpoint,
-    DatagramRefused,
-    GrappleCommand,
-    Knot,
-    OperatorAction,
-    OperatorCommand,
-    StateReport,
-    decode,
-    encode,
-)
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, OperatorCommand, StateReport
+from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.envelope import DatagramRefused
 from machine.joints import JOINTS
-from machine.load import load_profile, profile_hash
-from machine.modes import Mode
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.status.modes import Mode
 from machine.profile import joint
 
 LOOK_S: Final = 0.002

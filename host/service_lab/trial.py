@@ -11,10 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from can_dbc.setpoint import OperatorAction
+from can_dbc.messages.crane import OperatorAction
 from host.service_lab.pilot import Pilot, Valve
 from host.systemd import show
-from machine.modes import Mode
+from machine.status.modes import Mode
 
 CONTROLLER: Final = "timberhand-controller.service"
 GUARD: Final = "timberhand-guard.service"

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from host.exits import Exit
+from host.exit_codes import ExitCode
 from host.vcan_lab.spec import DEFAULT_BOOT_TIMEOUT_S, DEFAULT_LINKS, DEFAULT_MEM_MB, LabError, Request, link_fault
 
 CONTEXT = {"allow_interspersed_args": False}
@@ -106,7 +106,7 @@ def vcan(
             typer.echo(json.dumps({"way": None, "why": str(reason), "kernel": None, "links": request.links}))
         else:
             typer.echo(f"vcan lab: {reason}", err=True)
-        status = Exit.BUS
+        status = ExitCode.BUS
     raise typer.Exit(status)
 
 

@@ -12,16 +12,16 @@ from pathlib import Path
 
 import pytest
 
-from can_dbc.bus import BusState
+from can_dbc.bus.base import BusState
 from controller.config import load
 from controller.guard.__main__ import build, profile_path
 from controller.guard.__main__ import run as run_guard
-from controller.loop import Loop
-from controller.realtime import Notifier
+from controller.process.loop import Loop
+from controller.process.realtime import Notifier
+from controller.process.timing import LoopTiming
+from controller.process.warm_up import NullBus, warm_up
 from controller.step import Controller
-from controller.timing import LoopTiming
-from controller.warm_up import NowhereBus, rehearse
-from machine.modes import Mode
+from machine.status.modes import Mode
 
 MS = 1_000_000
 T = 5 * MS
@@ -56,7 +56,7 @@ def systemd(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.
     made.socket.close()
 
 
-class SilentBus(NowhereBus):
+class SilentBus(NullBus):
     """Keeps what it is given and brings nothing."""
 
     def __init__(self) -> None:
@@ -174,7 +174,7 @@ def test_a_controller_without_a_bus_is_alive_and_says_so(systemd: Systemd, loop:
 def test_a_rehearsal_is_nobodys_business(systemd: Systemd) -> None:
     """Systemd would take its farewell for the end of the service."""
     settings = load("palms_471")
-    rehearse(settings, Controller(settings))
+    warm_up(settings, Controller(settings))
     assert systemd.heard() == []
     assert Notifier(lambda: "well")._socket is not None, "and the controller itself still speaks"
 

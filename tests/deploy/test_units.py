@@ -14,7 +14,7 @@ import pytest
 from autonomy.__main__ import arguments as autonomy_arguments
 from controller.__main__ import parser as controller_parser
 from controller.plc.__main__ import parser as plc_parser
-from timberhand.services import SERVICE_PAGE
+from timberhand.service_status.status import SERVICE_PAGE
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 UNITS = sorted((DEPLOY / "units").glob("*.service"))

@@ -5,13 +5,13 @@ from functools import cache
 
 import numpy as np
 
-from autonomy.perception.camera.frame import RgbdFrame, Pose
+from autonomy.perception.camera.frame import Pose, RgbdFrame
 from experiments.common.worlds import opened, profile_named
 from experiments.log_localization.trial import TrueMask
 from machine.geometry.optics import Intrinsics, intrinsics
 from sim.camera.geometry import View, look_at
 from sim.camera.noise import StereoNoise
-from sim.camera.render import Look, Picture, render
+from sim.camera.render import ImagingConditions, Picture, render
 from sim.camera.scene import Ground, LogPose, Scene, SceneBuilder
 
 PROFILE = profile_named("aoro_fc8")
@@ -49,7 +49,7 @@ def pose_of(view: View) -> Pose:
 
 
 def seen(scene: Scene, view: View) -> Picture:
-    return render(scene, view, Look())
+    return render(scene, view, ImagingConditions())
 
 
 def frame_of(picture: Picture, view: View, number: int = 0, exact: bool = False) -> RgbdFrame:

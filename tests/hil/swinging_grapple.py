@@ -21,8 +21,8 @@ from hil.harness.lockstep import Lockstep, Observer
 from hil.harness.operator import Operator
 from machine.geometry.kinematics import pin_position
 from machine.loading.profile_file import load_profile, profile_hash
-from machine.status.modes import Mode
 from machine.profile import Profile
+from machine.status.modes import Mode
 from sim.plant import Plant
 
 SHIPPED = Path(machine.__file__).parent / "aoro_fc8.toml"

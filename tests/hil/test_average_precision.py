@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from training.average_precision import (
+from training.common.average_precision import (
     Matches,
     average_precision,
     box_overlaps,

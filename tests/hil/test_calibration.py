@@ -15,7 +15,8 @@ from autonomy.calibration.tasks import SpoolTask
 from experiments.calibration.trial import calibrated
 from experiments.common.pool import Job
 from hil.calibration.crane import run_lockstep
-from hil.replay.replay import files_of, replay
+from hil.replay.recording import files_of
+from hil.replay.replay import replay
 from machine.loading.profile_file import load_profile
 from recorder.manifest import describe
 from recorder.recorder import Recorder

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from autonomy.perception.camera_survey import surveyed
-from autonomy.perception.frame import Pose
-from autonomy.perception.mount import MountRefused, optical_pose
+from autonomy.perception.camera.frame import Pose
+from autonomy.perception.camera.mount import CameraMountError, optical_pose
+from autonomy.perception.camera.survey import surveyed
 from experiments.common.worlds import opened, profile_named
-from machine.optics import BODY_FROM_OPTICAL, intrinsics, rpy_matrix
+from machine.geometry.optics import BODY_FROM_OPTICAL, intrinsics, rpy_matrix
 from sim.camera.geometry import mount_view, quaternion_matrix
 
 
@@ -48,7 +48,7 @@ def test_a_bent_carrier_turns_its_front_camera() -> None:
 
 def test_a_camera_on_a_part_that_swings_is_refused() -> None:
     profile = profile_named("palms_471")
-    with pytest.raises(MountRefused, match="on link 'rotator'"):
+    with pytest.raises(CameraMountError, match="on link 'rotator'"):
         optical_pose(profile, replace(profile.cameras["stick"], link="rotator"), [0.0, 0.5, -1.0, 0.0])
 
 
@@ -80,9 +80,9 @@ def test_a_survey_finds_mount_and_scale() -> None:
 def test_a_survey_that_cannot_be_is_refused() -> None:
     link = Pose(np.zeros(3), np.eye(3))
     camera, pixels, depths, places, _, _ = targets(2)
-    with pytest.raises(MountRefused, match="survey at least 6"):
+    with pytest.raises(CameraMountError, match="survey at least 6"):
         surveyed(camera, link, pixels[:5], depths[:5], places[:5])
-    with pytest.raises(MountRefused, match="which target is which"):
+    with pytest.raises(CameraMountError, match="which target is which"):
         surveyed(camera, link, pixels[::-1], depths, places)
-    with pytest.raises(MountRefused, match="baseline"):
+    with pytest.raises(CameraMountError, match="baseline"):
         surveyed(camera, link, pixels, 1.3 * depths, places)

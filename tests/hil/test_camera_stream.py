@@ -6,12 +6,12 @@ import time
 import numpy as np
 import pytest
 
-from autonomy.perception.frame import check
+from autonomy.perception.camera.frame import check
 from autonomy.perception.sources.stream import StreamCamera
-from can_dbc.bus import open_bus
+from can_dbc.bus.factory import open_bus
 from experiments.common.worlds import profile_named
-from sim.__main__ import LivePlant
 from sim.plant import Plant
+from sim.process.live_plant import LivePlant
 
 
 @pytest.mark.slow

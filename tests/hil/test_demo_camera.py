@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from hil.demo import run_lockstep
-from host.exits import Exit
+from hil.demo.lockstep import run_lockstep
+from host.exit_codes import ExitCode
 
 pytestmark = [pytest.mark.slow, pytest.mark.computed]
 
@@ -18,4 +18,4 @@ pytestmark = [pytest.mark.slow, pytest.mark.computed]
 def test_a_log_that_only_a_camera_sees_gets_into_the_bunk(seed: int, tmp_path: Path) -> None:
     summary = run_lockstep("palms_471", seed, "nominal", tmp_path, 120.0, Console(file=io.StringIO()), "stick")
     assert summary.in_bunk, f"{summary.verdict} {summary.failure}"
-    assert summary.exit is Exit.FINE
+    assert summary.exit_code is ExitCode.OK

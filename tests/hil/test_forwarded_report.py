@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 
 from autonomy.manager.tally import Load, Taken
 from autonomy.missions.model import ForwardingMission, Landing, Point
-from hil.forwarded_report import report_loads
-from machine.load import load_profile
+from hil.missions.forwarded_report import report_loads
+from machine.loading.profile_file import load_profile
 
 PROFILE = load_profile("aoro_fc8")
 MISSION = ForwardingMission("Kiruna 7", (), landings=(Landing(Point(63.6, 19.9), "road"),))

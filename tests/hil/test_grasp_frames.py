@@ -13,17 +13,17 @@ from typer.testing import CliRunner
 from autonomy.grasp.cylinders import Cylinders
 from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.network import GraspNet
-from autonomy.grasp.quality import lies_upon, rate, sections
-from autonomy.grasp.virtual_scene import DOWNWARD, Camera, render
-from host.exits import Exit, Stopped
-from machine.load import load_profile
+from autonomy.grasp.quality import blade_sections, rests_upon, score_grasps
+from autonomy.grasp.virtual_scene import DOWNWARD_AXES, Camera, render
+from host.exit_codes import CommandFailed, ExitCode
+from machine.loading.profile_file import load_profile
 from sim.camera.geometry import View
 from sim.camera.render import render as sim_render
 from sim.camera.scene import Ground, LogPose, SceneBuilder
 from timberhand.commands import train
-from training.detection.piles import Pile
-from training.grasp.frames import LOW_PX, frames
-from training.grasp.kernel import draw, facts_of, judge
+from training.grasp.label_kernel import draw, facts_of, judge
+from training.grasp.physical_frames import LOW_PX, frames
+from training.pictures.piles import Pile
 
 GROUND = -1.39
 JAWS = jaws_of(load_profile("palms_471"))
@@ -62,7 +62,7 @@ def test_the_virtual_camera_sees_what_the_simulations_renderer_sees() -> None:
     scene = SceneBuilder(Ground.flat(GROUND))
     for log in poses(w):
         scene.log(log)
-    theirs = sim_render(scene.build(), View(camera.intrinsics, camera.position_m, DOWNWARD)).depth_m
+    theirs = sim_render(scene.build(), View(camera.intrinsics, camera.position_m, DOWNWARD_AXES)).depth_m
     ours = render(w, camera, GROUND)
     assert np.quantile(np.abs(ours - theirs), 0.999) < 1e-3
     assert np.mean(np.abs(ours - theirs) > 0.01) < 1e-3
@@ -84,11 +84,11 @@ def test_the_compiled_rule_is_the_planners() -> None:
     safe = 0
     for seed in range(30):
         w = world(seed, 1 + seed % 5)
-        upon = lies_upon(w)
+        upon = rests_upon(w)
         x, y = rng.normal(0, 0.3, 40), rng.normal(0, 0.3, 40)
         yaw = rng.normal(0.3, 0.2, 40) + math.pi / 2
         level = rng.choice([GROUND, *(w.center[:, 2] + w.radius)], 40)
-        ours = rate(JAWS, w, upon, sections(JAWS, w, x, y, yaw), level)
+        ours = score_grasps(JAWS, w, upon, blade_sections(JAWS, w, x, y, yaw), level)
         for k in range(40):
             at, captured = np.empty((w.count, 2)), np.empty(w.count, np.bool_)
             lever, mass = judge(*facts, packed(w), upon, x[k], y[k], yaw[k], level[k], at, captured)
@@ -121,8 +121,8 @@ def test_a_frame_is_a_picture_with_quality_on_the_wood_and_equal_seeds_are_equal
 def test_frames_become_examples_of_equation_5() -> None:
     """Against the sums over all 90 000 pixels."""
     torch = pytest.importorskip("torch")
-    from training.grasp.physical import examples
-    from training.grasp.train import equation_5, upsampling
+    from training.grasp.network_training import equation_5, upsampling
+    from training.grasp.physical_weights import examples
 
     single = [LogPose(1, (0.3, 0.2, GROUND + 0.1), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)), 2.6, 0.2)]
     found = list(frames(single, GROUND, JAWS, 3, 2))
@@ -141,7 +141,7 @@ def test_frames_become_examples_of_equation_5() -> None:
 @pytest.mark.computed
 def test_weights_from_physical_labels_come_with_their_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch")
-    from training.grasp import physical
+    from training.grasp import physical_weights
 
     def lain(machine: str, first: int, count: int, folder: Path | None) -> list[Pile]:
         z = GROUND + 0.1
@@ -151,10 +151,10 @@ def test_weights_from_physical_labels_come_with_their_card(tmp_path: Path, monke
         )
         return [Pile(machine, first, "parallel", "flat", 0, GROUND, logs)]
 
-    monkeypatch.setattr(physical, "piles", lain)
-    monkeypatch.setattr(physical, "HELD_BACK", 4)
+    monkeypatch.setattr(physical_weights, "piles", lain)
+    monkeypatch.setattr(physical_weights, "HELD_BACK", 4)
     out = tmp_path / "grasp_physical.safetensors"
-    made, card = physical.produce(3, out, Console(quiet=True), count=8, epochs=1)
+    made, card = physical_weights.produce(3, out, Console(quiet=True), count=8, epochs=1)
     assert made == out and GraspNet.shipped(out).maps(np.full((300, 300), 3.0, np.float32)).q.shape[0] > 0
     told = card.read_text()
     assert "8 frames of settled piles" in told and "no real data" in told
@@ -168,5 +168,5 @@ def test_weights_from_physical_labels_come_with_their_card(tmp_path: Path, monke
 def test_which_labels_need_data(arguments: list[str], says: str) -> None:
     pytest.importorskip("torch")
     done = CliRunner().invoke(train.app, arguments)
-    assert isinstance(done.exception, Stopped) and done.exception.code == Exit.USAGE
+    assert isinstance(done.exception, CommandFailed) and done.exception.exit_code == ExitCode.USAGE
     assert says in str(done.exception)

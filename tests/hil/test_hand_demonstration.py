@@ -10,21 +10,21 @@ import pytest
 from typer.testing import CliRunner
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.demonstration import cut, track
-from autonomy.motion.primitives import SHIPPED, learn_primitives, over_bunk
-from can_dbc.codec import load as load_database
-from hil.hand_demonstration import AXES, script, show
-from host.exits import Exit, Stopped
-from machine.load import load_profile
+from autonomy.motion.demonstration import joint_track, segment_motions
+from autonomy.motion.movement_primitives import SHIPPED_FOLDER, is_near_bunk, learn_primitives
+from can_dbc.dbc.codec import load as load_database
+from hil.demonstrations.hand_levers import AXES, demonstrate, script
+from host.exit_codes import CommandFailed, ExitCode
+from machine.loading.profile_file import load_profile
 from recorder.manifest import describe
 from recorder.recorder import Recorder
-from sim.world import home_of
+from sim.world import home_pose
 from timberhand.cli import app
-from training.movement_primitives import motions_in
+from training.motion.demonstration_recordings import motions_in
 
 PROFILE = load_profile("aoro_fc8")
-HOME = tuple(home_of(PROFILE)[name] for name in ("slew", "lift", "tilt", "ext", "rot"))
-SHOWN = SHIPPED / "aoro_fc8.csv"
+HOME = tuple(home_pose(PROFILE)[name] for name in ("slew", "lift", "tilt", "ext", "rot"))
+SHOWN = SHIPPED_FOLDER / "aoro_fc8.csv"
 
 
 def test_the_script_goes_out_and_back_on_both_sides_over_the_stakes() -> None:
@@ -35,7 +35,7 @@ def test_the_script_goes_out_and_back_on_both_sides_over_the_stakes() -> None:
     for out, back in zip(shown[::2], shown[1::2], strict=True):
         log = arm.pose((*out.joints[-1], 0.0))
         assert back.joints[0] == pytest.approx(out.joints[-1])
-        assert over_bunk(PROFILE.bunk, arm.xy(arm.pose((*back.joints[-1], 0.0)))) and not over_bunk(
+        assert is_near_bunk(PROFILE.bunk, arm.xy(arm.pose((*back.joints[-1], 0.0)))) and not is_near_bunk(
             PROFILE.bunk, arm.xy(log)
         )
         sides.add(np.sign(log.slew_rad))
@@ -53,7 +53,7 @@ def test_learn_reads_the_shipped_demonstrations(tmp_path: Path) -> None:
         "profile": "aoro_fc8", "motions": 12, "out": 6, "back": 6, "out_s": 0, "back_s": 0,
     }  # fmt: skip
     assert picture.stat().st_size > 10_000
-    learned, shipped = (json.loads(path.read_bytes()) for path in (out, SHIPPED / "aoro_fc8.json"))
+    learned, shipped = (json.loads(path.read_bytes()) for path in (out, SHIPPED_FOLDER / "aoro_fc8.json"))
     assert np.array(learned["out"]["weights"]) == pytest.approx(np.array(shipped["out"]["weights"]), rel=1e-3, abs=1e-3)
 
 
@@ -69,10 +69,10 @@ def test_learn_reads_the_shipped_demonstrations(tmp_path: Path) -> None:
 def test_what_holds_no_motion_is_refused_in_a_sentence(tmp_path: Path, name: str, text: str | None, words: str) -> None:
     if text is not None:
         (tmp_path / name).write_text(text)
-    with pytest.raises(Stopped, match=words) as stopped:
+    with pytest.raises(CommandFailed, match=words) as stopped:
         motions_in(tmp_path / name)
-    assert stopped.value.code == Exit.CONFIGURATION
-    with pytest.raises(Stopped, match="not of palms_471"):
+    assert stopped.value.exit_code == ExitCode.CONFIGURATION
+    with pytest.raises(CommandFailed, match="not of palms_471"):
         motions_in(SHOWN, "palms_471")
 
 
@@ -80,9 +80,9 @@ def test_what_holds_no_motion_is_refused_in_a_sentence(tmp_path: Path, name: str
 @pytest.mark.computed
 def test_a_recording_of_hands_on_the_levers_is_learned_from(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run", PROFILE, describe(PROFILE, ("crane0", "mach0"), 2))
-    frames = show("aoro_fc8", seed=2, targets=1, recorder=recorder)
+    frames = demonstrate("aoro_fc8", seed=2, targets=1, recorder=recorder)
     recorder.close()
-    heard = cut(PROFILE, track(PROFILE, load_database("crane"), frames))
+    heard = segment_motions(PROFILE, joint_track(PROFILE, load_database("crane"), frames))
     for log in (tmp_path / "run", tmp_path / "run" / "crane0.log"):
         _, motions = motions_in(log)
         assert len(motions) == len(heard) == 2

@@ -19,13 +19,13 @@ from pathlib import Path
 import can
 import pytest
 
-from can_dbc import codec
-from host.exits import Exit
+from can_dbc.dbc import codec
+from host.exit_codes import ExitCode
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(700)]
 
 
-PATIENT = "--patience 120 --limit-s 600"
+PATIENT = "--max-stops 120 --limit-s 600"
 """A host that is short of processor time stops the machine, rightly; the stand-in operator arms it again each time."""
 Demo = Callable[..., subprocess.Popen[str]]
 
@@ -100,7 +100,7 @@ def assert_neutral_and_readable(directory: Path) -> None:
 def test_the_job_on_the_wire(tmp_path: Path, demo: Demo) -> None:
     process = demo("--bus", "wire", "--seed", "103", *PATIENT.split())
     out, err = process.communicate(timeout=660)
-    assert process.returncode == Exit.FINE, out + err
+    assert process.returncode == ExitCode.OK, out + err
     assert "The log lies in the bunk" in out
     assert_neutral_and_readable(tmp_path / "run")
 
@@ -116,7 +116,7 @@ def test_the_job_on_vcan_where_candump_sees_it(tmp_path: Path) -> None:
     job = f"{sys.executable} -m timberhand demo --bus vcan --no-console --seed 103 --out {run} {PATIENT}"
     script = f"candump -n 100 vcan0,210:7FF,182:7FF > {seen} & {job}"
     result = subprocess.run([*lab, "--", "sh", "-c", script], capture_output=True, text=True, timeout=660)
-    assert result.returncode == Exit.FINE, f"{way}: {result.stdout}{result.stderr}"
+    assert result.returncode == ExitCode.OK, f"{way}: {result.stdout}{result.stderr}"
     assert "The log lies in the bunk" in result.stdout
     assert_neutral_and_readable(run)
     identifiers = {line.split()[1] for line in seen.read_text().splitlines()}
@@ -129,7 +129,7 @@ def test_ctrl_c_leaves_the_valves_neutral_and_the_logs_readable(tmp_path: Path, 
     time.sleep(1.5)  # into the motion
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == Exit.INTERRUPTED, err
+    assert process.returncode == ExitCode.INTERRUPTED, err
     assert_neutral_and_readable(tmp_path / "run")
 
 
@@ -140,7 +140,7 @@ def test_a_killed_process_ends_the_run_with_one_sentence(tmp_path: Path, demo: D
     time.sleep(1.0)
     os.kill(pid_of(process.pid, victim), signal.SIGKILL)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == Exit.SAFETY, err
+    assert process.returncode == ExitCode.SAFETY_STOP, err
     assert "Traceback" not in err
     assert "ended in the middle of the run" in err
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["complete"]

@@ -13,9 +13,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_mission_run import mission_file
 
 from host.vcan_lab import lab_kernel, shim
+from tests.hil.short_missions import mission_file
 
 ROOT = Path(__file__).parents[2]
 FROZEN = """
@@ -25,14 +25,14 @@ from rich.console import Console
 import hil.missions.live as live
 from autonomy.missions.mission_file import load_mission
 from hil.harness.live import LiveOptions
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 
 class Frozen(live.LiveMission):
     at_s = None
 
-    def _listen(self, port):
-        super()._listen(port)
-        now, planner = time.monotonic(), self._family.children.get("autonomy")
+    def _receive(self, port):
+        super()._receive(port)
+        now, planner = time.monotonic(), self._processes.children.get("autonomy")
         if self._states and self._states[-1][1] == "SEARCH" and self.at_s is None and self._seconds > 4.0:
             self.at_s = now
             planner.process.send_signal(signal.SIGSTOP)
@@ -48,7 +48,7 @@ options = LiveOptions("aoro_fc8", load_profile("aoro_fc8"), 1, "nominal", "vcan"
 mission = load_mission(file, route_wanted=True).mission
 summary = live.run_live_mission(file, mission, options, "ours", 0, Console())
 summary.save(out / "summary.json")
-sys.exit(summary.exit)
+sys.exit(summary.exit_code)
 """
 
 

@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from hil.demo import run_lockstep
-from hil.replay import files_of, replay
-from hil.summary import Summary
-from host.exits import Exit
+from hil.demo.lockstep import run_lockstep
+from hil.demo.summary import Summary
+from hil.replay.recording import files_of
+from hil.replay.replay import replay
+from host.exit_codes import ExitCode
 
 pytestmark = [pytest.mark.slow, pytest.mark.computed]
 
@@ -28,7 +29,7 @@ def digest(directory: Path) -> dict[str, str]:
 def test_the_log_gets_into_the_bunk_and_the_record_replays(tmp_path: Path) -> None:
     summary = job(101, tmp_path / "run")
     assert summary.in_bunk, summary.verdict
-    assert summary.exit is Exit.FINE
+    assert summary.exit_code is ExitCode.OK
     assert summary.stops == 0
     assert summary.grasp.startswith("1 log (0) of 1 at once, ")
     assert (tmp_path / "run" / "crane0.log").read_text().count("\n") > 50_000
@@ -40,7 +41,7 @@ def test_the_log_gets_into_the_bunk_and_the_record_replays(tmp_path: Path) -> No
 def test_the_machine_on_wheels_loads_its_log_at_the_height_it_drives_at(tmp_path: Path) -> None:
     summary = job(104, tmp_path / "run", machine="aoro_fc8")
     assert summary.in_bunk, summary.verdict
-    assert (summary.exit, summary.stops) == (Exit.FINE, 0)
+    assert (summary.exit_code, summary.stops) == (ExitCode.OK, 0)
 
 
 def test_one_seed_leaves_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
@@ -54,6 +55,6 @@ def test_one_seed_leaves_the_same_bytes_and_another_does_not(tmp_path: Path) -> 
 def test_a_job_that_is_not_done_is_not_called_done(tmp_path: Path) -> None:
     summary = job(5, tmp_path / "short", 4.0)
     assert not summary.in_bunk
-    assert summary.exit is Exit.FIGURE
+    assert summary.exit_code is ExitCode.FIGURE_MISSED
     assert "not done within 4 s" in summary.failure
     assert "never lifted" in summary.verdict

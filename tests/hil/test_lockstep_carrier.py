@@ -9,16 +9,18 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from can_dbc import tick_record
-from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, OperatorAction, StateReport, encode
+from can_dbc.messages import tick_record
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, StateReport
+from can_dbc.messages.datagrams import encode
 from controller.config import load as load_settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
-from hil.lockstep import Lockstep, Observer
-from hil.operator import Operator
-from hil.replay import files_of, replay
+from hil.harness.lockstep import Lockstep, Observer
+from hil.harness.operator import Operator
+from hil.replay.recording import files_of
+from hil.replay.replay import replay
 from machine.joints import N_JOINTS, Joint
-from machine.modes import Mode
+from machine.status.modes import Mode
 from recorder.manifest import describe
 from recorder.recorder import Recorder
 from sim.plant import Plant

@@ -10,21 +10,24 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from can_dbc.setpoint import DriveSetpoint, Driving, StateReport, Steering, VehicleReport, encode
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
 from controller.config import load as load_settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
 from controller.laws.heading import east_north_m
-from hil.lockstep import Lockstep, Observer
-from hil.operator import Operator
-from hil.replay import files_of, replay
-from machine.modes import Mode
+from hil.harness.lockstep import Lockstep, Observer
+from hil.harness.operator import Operator
+from hil.replay.recording import files_of
+from hil.replay.replay import replay
 from machine.profile import Carrier
-from machine.reasons import Reason
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
 from recorder.manifest import describe
 from recorder.recorder import Recorder
-from sim.geodesy import Site
-from sim.kinematic import KinematicMachine
+from sim.geometry.geodesy import LocalFrame
+from sim.kinematic.machine import KinematicMachine
 from sim.plant import Plant
 
 pytestmark = [pytest.mark.slow, pytest.mark.computed]
@@ -33,7 +36,7 @@ SETTINGS = load_settings("aoro_fc8")
 PROFILE = SETTINGS.profile
 CARRIER = PROFILE.carrier
 assert isinstance(CARRIER, Carrier)
-SITE = Site(CARRIER.site_lat_deg, CARRIER.site_lon_deg, 0.0)
+SITE = LocalFrame(CARRIER.site_lat_deg, CARRIER.site_lon_deg, 0.0)
 HIGH = CARRIER.arm_transport_m
 
 
@@ -70,7 +73,7 @@ class Drives:
 class Blind:
     """Eyes that see no logs."""
 
-    def look(self, q, now_ns):
+    def detect(self, q, now_ns):
         return None
 
 

@@ -8,27 +8,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from autonomy.localization.local_plane import Plane
 from autonomy.manager.state_chart import diagram, page
 from autonomy.manager.transition_table import OURS, PAPER_B
-from autonomy.missions.mission_file import save_mission
-from autonomy.missions.model import ForwardingMission, KnownLog, Point
-from host.exit_codes import Exit
+from host.exit_codes import ExitCode
+from tests.hil.short_missions import mission_file
 from timberhand.cli import app
 
 DOCS = Path(__file__).parents[2] / "docs"
-PLANE = Plane(63.657853, 19.895562)
-
-
-def point(east_m: float, north_m: float) -> Point:
-    return Point(*PLANE.geodetic(east_m, north_m)[:2])
-
-
-def mission_file(path: Path, *logs: tuple[float, float, float]) -> Path:
-    """A route of 18 m to the east, and logs beside it (east, north [m], bearing [deg])."""
-    known = tuple(KnownLog(point(e, n), bearing_deg=b, length_m=2.0, diameter_m=0.25) for e, n, b in logs)
-    save_mission(path, ForwardingMission("short", (point(0.0, 0.0), point(18.0, 0.0)), logs=known))
-    return path
 
 
 def test_the_page_of_the_activity_manager_is_as_the_code_has_it() -> None:
@@ -47,7 +33,7 @@ def test_a_mission_that_is_none_is_refused_in_a_sentence(tmp_path: Path) -> None
     path = tmp_path / "mission.geojson"
     path.write_text("{}")
     result = CliRunner().invoke(app, ["mission", "run", str(path), "--lockstep", "--out", str(tmp_path / "run")])
-    assert getattr(result.exception, "code", None) == Exit.CONFIGURATION and str(path) in str(result.exception)
+    assert getattr(result.exception, "exit_code", None) == ExitCode.CONFIGURATION and str(path) in str(result.exception)
 
 
 def test_a_machine_that_stands_still_drives_no_mission(tmp_path: Path) -> None:

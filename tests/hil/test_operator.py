@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
-from can_dbc.setpoint import OperatorAction, OperatorCommand, StateReport, decode
-from hil.operator import LOOK_NS, PATIENCE, REPEAT_NS, Operator
-from machine.modes import Mode
+from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
+from can_dbc.messages.datagrams import decode
+from hil.harness.operator import MAX_STOPS, REACTION_NS, REPEAT_NS, Operator
+from machine.status.modes import Mode
 
 UNKNOWN = (math.nan,) * 5
 
@@ -28,31 +29,31 @@ def pressed(operator: Operator, mode: Mode, stamp_ns: int) -> OperatorAction | N
 def test_looks_before_arming_and_does_not_hammer() -> None:
     seen: list[OperatorAction] = []
     operator = Operator(7, lambda action, _: seen.append(action))
-    assert pressed(operator, Mode.STANDBY, 10 * LOOK_NS) is None
-    assert pressed(operator, Mode.STANDBY, 11 * LOOK_NS) is OperatorAction.ARM
-    assert pressed(operator, Mode.STANDBY, 11 * LOOK_NS + REPEAT_NS - 1) is None
-    assert pressed(operator, Mode.STANDBY, 11 * LOOK_NS + REPEAT_NS) is OperatorAction.ARM
+    assert pressed(operator, Mode.STANDBY, 10 * REACTION_NS) is None
+    assert pressed(operator, Mode.STANDBY, 11 * REACTION_NS) is OperatorAction.ARM
+    assert pressed(operator, Mode.STANDBY, 11 * REACTION_NS + REPEAT_NS - 1) is None
+    assert pressed(operator, Mode.STANDBY, 11 * REACTION_NS + REPEAT_NS) is OperatorAction.ARM
     assert seen == [OperatorAction.ARM, OperatorAction.ARM]
 
 
 def test_leaves_a_working_machine_alone() -> None:
     operator = Operator(7, lambda *_: None)
     for mode in (Mode.BOOT, Mode.ARMED, Mode.ACTIVE):
-        assert pressed(operator, mode, 10 * LOOK_NS) is None
-        assert pressed(operator, mode, 20 * LOOK_NS) is None
+        assert pressed(operator, mode, 10 * REACTION_NS) is None
+        assert pressed(operator, mode, 20 * REACTION_NS) is None
 
 
 def test_resets_a_fault_and_rearms_a_stop_until_patience_ends() -> None:
     operator = Operator(7, lambda *_: None)
     now_ns = 0
-    for number in range(1, PATIENCE + 2):
+    for number in range(1, MAX_STOPS + 2):
         now_ns += 10 * REPEAT_NS
         pressed(operator, Mode.FAULT if number % 2 else Mode.STOP, now_ns)
-        action = pressed(operator, Mode.FAULT if number % 2 else Mode.STOP, now_ns + LOOK_NS)
+        action = pressed(operator, Mode.FAULT if number % 2 else Mode.STOP, now_ns + REACTION_NS)
         assert operator.stops == number
-        if number > PATIENCE:
+        if number > MAX_STOPS:
             assert operator.gave_up
             assert action is None
         else:
             assert action is (OperatorAction.RESET if number % 2 else OperatorAction.ARM)
-        pressed(operator, Mode.ACTIVE, now_ns + 2 * LOOK_NS)
+        pressed(operator, Mode.ACTIVE, now_ns + 2 * REACTION_NS)

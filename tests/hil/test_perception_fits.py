@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from autonomy.perception.camera.frame import RgbdFrameError, Pose
+from autonomy.perception.camera.frame import Pose, RgbdFrameError
 from autonomy.perception.fitting.contour import StereoSensor, log_contour
-from autonomy.perception.fitting.cylinder import CylinderBatch, Cylinder, across_view, depth, initial_cylinder, outline, pixel_rays
+from autonomy.perception.fitting.cylinder import (
+    Cylinder,
+    CylinderBatch,
+    across_view,
+    depth,
+    initial_cylinder,
+    outline,
+    pixel_rays,
+)
 from autonomy.perception.fitting.cylinder_fit import fit_cylinder
 from autonomy.perception.fitting.log_fragments import refused
 from autonomy.perception.papers import paper_a

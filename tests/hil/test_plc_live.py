@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.plc_profile import write_plc_profile
+from hil.plc.profile import write_plc_profile
 from hil.wire.launch import wire_daemon
 
 pytestmark = pytest.mark.slow
@@ -33,7 +33,7 @@ def run(*arguments: str, timeout: float = 60.0, **environment: str) -> subproces
 @pytest.mark.timeout(400)
 def test_a_log_goes_into_the_bunk_through_modbus(tmp_path: Path) -> None:
     """What is asserted is the outcome; a host that is short of processor time stops the machine, rightly."""
-    arguments = ["demo", "--plc", "--bus", "wire", "--no-console", "--json", "--patience", "60", "--limit-s", "300"]
+    arguments = ["demo", "--plc", "--bus", "wire", "--no-console", "--json", "--max-stops", "60", "--limit-s", "300"]
     done = run("timberhand", *arguments, "--out", str(tmp_path / "run"), timeout=380, TIMBERHAND_WIRE_DIR=str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["in_bunk"]

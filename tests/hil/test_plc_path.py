@@ -11,12 +11,12 @@ from autonomy.crane_job.activity import Activity
 from can_dbc.plc.map import Fault, State
 from controller.config import load
 from controller.guard.__main__ import build as build_guard
-from hil.lockstep import START_NS, Lockstep, Observer
-from hil.operator import Operator
-from hil.plc_path import BridgedPlant, Transport
-from hil.plc_profile import write_plc_profile
-from machine.modes import Mode
-from machine.reasons import Reason
+from hil.harness.lockstep import START_NS, Lockstep, Observer
+from hil.harness.operator import Operator
+from hil.plc.bridged_plant import BridgedPlant, Transport
+from hil.plc.profile import write_plc_profile
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
 
 pytestmark = pytest.mark.computed
 
@@ -64,11 +64,11 @@ def test_a_log_goes_into_the_bunk(role: RoleName, transport: Transport, tmp_path
     while not run.activity.done and not run.activity.failure and run.system.now_ns < START_NS + 120 * S:
         run.system.advance()
     limit_ns = run.system.now_ns + 3 * S
-    while not run.plant.judge().success and run.system.now_ns < limit_ns:
+    while not run.plant.evaluate().success and run.system.now_ns < limit_ns:
         run.system.advance()
-    assert run.activity.done and run.plant.judge().success, run.activity.failure
+    assert run.activity.done and run.plant.evaluate().success, run.activity.failure
     assert run.system.operator.stops == 0
-    shake, gate = run.plant.bridge.handshake, run.plant.plc.gate
+    shake, gate = run.plant.bridge.handshake, run.plant.plc.arbiter
     assert (shake.refused, shake.dropped, run.plant.bridge.gate.refused) == (0, 0, 0)
     assert (gate.refused, gate.dropped, gate.fault) == (0, 0, Fault.NONE)
     assert gate.accepted >= shake.sent - 2, "every command was a new one and was taken"
@@ -131,7 +131,7 @@ def test_a_fault_of_the_plc_stops_the_controller(tmp_path: Path) -> None:
     run.until(Mode.ACTIVE)
     while not run.moving():
         run.system.advance()
-    run.plant.plc.gate.note(Fault.ILLEGAL_VALUE, 1)
+    run.plant.plc.arbiter.note(Fault.ILLEGAL_VALUE, 1)
     run.until(Mode.STOP)
     assert run.system.report is not None and run.system.report.reason & 0xFF == Reason.PLC_FAULT
     run.wait(50)

@@ -11,15 +11,17 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from can_dbc import setpoint, tick_record
-from can_dbc.codec import load
+from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
+from can_dbc.messages import datagrams, tick_record
+from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from controller.config import load as load_settings
-from controller.record import record
+from controller.process.tick_recording import record
 from controller.step import Controller, Inputs, step
-from hil.replay import contents, files_of, manifest_of, replay
-from host.exits import Exit, Stopped
-from machine.load import load_profile
+from hil.replay.recording import contents, files_of, manifest_of
+from hil.replay.replay import replay
+from host.exit_codes import CommandFailed, ExitCode
+from machine.loading.profile_file import load_profile
 from recorder import recorder as recorder_module
 from recorder.manifest import describe
 from recorder.recorder import Recorder
@@ -42,8 +44,8 @@ def inputs_of(k: int, inputs: Inputs) -> int:
         data = message.encode(*(values[s.name] for s in message.signals))
         inputs.frames.append(Frame(now_ns - 1_000_000, message.key, data))
     inputs.frames.append(Frame(now_ns - 900_000, CRANE.message("GuardStat").key, bytes([k & 255] * 8)))
-    stop = setpoint.OperatorCommand(k, SETTINGS.profile_hash, now_ns, setpoint.OperatorAction.STOP)
-    inputs.datagrams[:] = [setpoint.encode(stop)] if k % 10 == 3 else []
+    stop = OperatorCommand(k, SETTINGS.profile_hash, now_ns, OperatorAction.STOP)
+    inputs.datagrams[:] = [datagrams.encode(stop)] if k % 10 == 3 else []
     inputs.missed_ticks = 0
     inputs.late_ns = 1000 * k
     return now_ns
@@ -84,8 +86,8 @@ def run(*arguments: object):
     app = typer.Typer()
     app.command()(command)
     result = CliRunner().invoke(app, [str(a) for a in arguments])
-    if isinstance(result.exception, Stopped):
-        return result.exception.code, str(result.exception)
+    if isinstance(result.exception, CommandFailed):
+        return result.exception.exit_code, str(result.exception)
     return result.exit_code, result.stdout
 
 
@@ -95,7 +97,7 @@ def test_recorded_run_agrees_byte_for_byte(tmp_path):
     assert result.agrees and result.ticks == TICKS and result.rate_hz == SETTINGS.rate_hz
     assert seen[-1] == (TICKS, TICKS)
     # The inputs matter: the stream holds reports, refused datagrams and received frames.
-    reports = [setpoint.decode(t.report) for t in map(tick_record.decode, RECORDS) if t.report]
+    reports = [datagrams.decode(t.report) for t in map(tick_record.decode, RECORDS) if t.report]
     assert len(reports) > TICKS / 5 and reports[-1].frames_received > 0
     code, text = run(tmp_path)
     assert code == 0 and f"{TICKS} ticks agree byte for byte" in text
@@ -112,7 +114,7 @@ def test_tampered_output_is_found_and_shown_decoded(tmp_path):
     (recorded,), (replayed,) = result.difference["recorded"], result.difference["replayed"]
     assert recorded != replayed and recorded.split()[1] == replayed.split()[1] == "ValveCmdA"
     code, text = run(tmp_path)
-    assert code == Exit.FIGURE and "tick 50 (0.250 s) differs" in text and "ValveCmdA" in text
+    assert code == ExitCode.FIGURE_MISSED and "tick 50 (0.250 s) differs" in text and "ValveCmdA" in text
 
 
 def test_what_was_said_on_mach0_counts_too(tmp_path):
@@ -157,7 +159,7 @@ def test_a_recording_of_an_older_release_is_refused_in_one_sentence(tmp_path, mo
     old = keep(tmp_path, [again(data) for data in map(_as_version_1, RECORDS[:5])])
     monkeypatch.undo()
     code, text = run(old)
-    assert code == Exit.CONFIGURATION
+    assert code == ExitCode.CONFIGURATION
     assert "a tick record of version 1, this release reads version 2; replay it with the release" in text
 
 
@@ -169,7 +171,7 @@ def _as_version_1(data: bytes) -> bytes:
 def test_gap_is_said_and_not_followed(tmp_path):
     code, text = run(keep(tmp_path, RECORDS[:70] + RECORDS[73:]), "--json")
     result = json.loads(text)
-    assert code == Exit.FIGURE and not result["agrees"] and result["ticks"] == 70
+    assert code == ExitCode.FIGURE_MISSED and not result["agrees"] and result["ticks"] == 70
     assert result["missing"].startswith("3 ticks are missing after tick 69 (0.345 s)")
     assert "cannot follow the state over a gap" in result["missing"]
 
@@ -202,18 +204,18 @@ def test_missing_beginning_is_said(tmp_path):
 
 def test_other_profile_is_refused_with_both_hashes(tmp_path):
     code, text = run(keep(tmp_path, RECORDS, profile_hash="deadbeef"))
-    assert code == Exit.CONFIGURATION
+    assert code == ExitCode.CONFIGURATION
     assert "deadbeef" in text and f"{SETTINGS.profile_hash:08x}" in text
 
 
 def test_other_dbc_is_refused_with_both_hashes(tmp_path):
     code, text = run(keep(tmp_path, RECORDS, dbc_hash={"crane": "0123456789abcdef"}))
-    assert code == Exit.CONFIGURATION and "0123456789ab" in text and "crane.dbc" in text
+    assert code == ExitCode.CONFIGURATION and "0123456789ab" in text and "crane.dbc" in text
 
 
 def test_unknown_profile_name_asks_for_the_file(tmp_path):
     code, text = run(keep(tmp_path, RECORDS, profile="field_crane"))
-    assert code == Exit.CONFIGURATION and "--profile" in text
+    assert code == ExitCode.CONFIGURATION and "--profile" in text
     shipped = Path(recorder_module.__file__).parents[1] / "machine" / "palms_471.toml"
     assert run(tmp_path, "--profile", shipped)[0] == 0
 
@@ -231,7 +233,7 @@ def test_truncated_recording_is_mended_and_agrees_as_far_as_it_goes(tmp_path):
 def test_what_is_no_recording_is_refused(tmp_path, make):
     (tmp_path / "text.mcap").write_text("hello, this is text")
     code, text = run(make(tmp_path))
-    assert code == Exit.CONFIGURATION and str(tmp_path) in text
+    assert code == ExitCode.CONFIGURATION and str(tmp_path) in text
 
 
 def test_contents_are_listed(tmp_path):

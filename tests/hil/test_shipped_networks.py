@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from autonomy.networks.weights import SHIPPED
-from autonomy.perception.detector import SIZE_PX, BoxFinder
-from autonomy.perception.finder import LogFinder
-from training.average_precision import box_overlaps
-from training.detection.frames import draw
-from training.detection.labels import ID
-from training.detection.piles import settle
-from training.detection.produce import box_of
+from autonomy.perception.papers.box_detector import SIZE_PX, BoxDetector
+from autonomy.perception.segmentation.log_segmenter import LogSegmenter
+from training.common.average_precision import box_overlaps
+from training.detection.detector_weights import box_of
+from training.pictures.drawing import draw
+from training.pictures.labels import ID
+from training.pictures.piles import settle
 
 WELL_SHOWN_PX = 600
 
@@ -43,25 +43,25 @@ def test_the_card_is_of_these_weights(weights):
 
 @pytest.mark.parametrize(("variant", "least"), [("rgbd", 0.7), ("depth", 0.55)])
 def test_logs_that_show_well_are_found(variant, least, seen):
-    finder = LogFinder(variant)
-    share = found(lambda s: [i.box_px for i in finder.find(s.rgb, s.depth_m, s.intrinsics)], seen)
+    finder = LogSegmenter(variant)
+    share = found(lambda s: [i.box_px for i in finder.segment_picture(s.rgb, s.depth_m, s.intrinsics)], seen)
     assert share >= least, share
 
 
 def test_the_variant_for_depth_alone_needs_no_colour(seen):
-    finder = LogFinder("depth")
+    finder = LogSegmenter("depth")
     sample = next(s for s, truth in seen if len(truth) > 2)
-    plain = finder.find(sample.rgb, sample.depth_m, sample.intrinsics)
-    dark = finder.find(np.full_like(sample.rgb, 7), sample.depth_m, sample.intrinsics)
+    plain = finder.segment_picture(sample.rgb, sample.depth_m, sample.intrinsics)
+    dark = finder.segment_picture(np.full_like(sample.rgb, 7), sample.depth_m, sample.intrinsics)
     assert plain and [i.box_px for i in plain] == [i.box_px for i in dark]
 
 
 def test_boxes_from_colour_lie_on_logs(seen):
-    finder = BoxFinder()
+    finder = BoxDetector()
 
     def boxes_of(sample):
         square = np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8)
         square[: sample.rgb.shape[0], : sample.rgb.shape[1]] = sample.rgb
-        return finder.boxes(square)[0]
+        return finder.detect(square)[0]
 
     assert found(boxes_of, seen) >= 0.5

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from swinging_grapple import SHIPPED, sensing_profile, stop_at
 
-from machine.modes import Mode
+from machine.status.modes import Mode
 from sim.plant import Plant
+from tests.hil.swinging_grapple import SHIPPED, sensing_profile, stop_at
 
 pytestmark = [pytest.mark.slow, pytest.mark.computed]
 

@@ -9,20 +9,21 @@ from rich.console import Console
 
 from autonomy.networks.torch_net import random_net
 from autonomy.networks.weights import WeightsRefused, load, save
-from autonomy.perception.detector import BoxFinder
-from autonomy.perception.finder import LogFinder
-from autonomy.perception.network import unet
-from autonomy.perception.plane import height_over_plane
-from autonomy.perception.regions import judges as judges_in
-from machine.optics import pinhole
+from autonomy.perception.papers.box_detector import BoxDetector
+from autonomy.perception.segmentation.ground_plane import height_over_plane
+from autonomy.perception.segmentation.log_segmenter import LogSegmenter
+from autonomy.perception.segmentation.network import unet
+from autonomy.perception.segmentation.segment_merging import judges as judges_in
+from machine.geometry.optics import pinhole
 from sim.camera.geometry import look_at
 from sim.camera.scene import LogPose
-from training.detection import evaluators, frames, piles, produce, samples
-from training.detection.frames import MOST_LOGS, draw, labelled
-from training.detection.labels import ANGLE, CENTRE_U, CENTRE_V, ID, IGNORED
-from training.detection.piles import HELD_OUT, chunk, profile_of, settle
-from training.detection.props import Steel
-from training.detection.samples import pictures, shard
+from training.detection import detector_weights, scorer_weights
+from training.pictures import drawing, piles, shards
+from training.pictures.drawing import MOST_LOGS, draw, labelled
+from training.pictures.labels import ANGLE, CENTRE_U, CENTRE_V, ID, IGNORED
+from training.pictures.piles import HELD_OUT, chunk, profile_of, settle
+from training.pictures.props import Steel
+from training.pictures.shards import pictures, shard
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +34,8 @@ def pile():
 @pytest.fixture
 def few(monkeypatch, tmp_path):
     monkeypatch.setattr(piles, "CHUNK", 2)
-    monkeypatch.setattr(samples, "SHARD", 2)
-    monkeypatch.setattr(samples, "REUSE_PILES", 1)
+    monkeypatch.setattr(shards, "SHARD", 2)
+    monkeypatch.setattr(shards, "REUSE_PILES", 1)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path
 
@@ -82,9 +83,9 @@ def test_a_held_log_is_between_the_tongs():
 
 
 def test_a_plain_sky_is_of_one_colour(pile, monkeypatch):
-    monkeypatch.setattr(frames, "PLAIN_SHARE", 1.0)
-    monkeypatch.setattr(frames, "_lens", lambda rgb, rng: rgb)
-    monkeypatch.setattr(frames, "_noisy", lambda machine, camera, picture, pin, rng: picture.depth_m)  # no holes
+    monkeypatch.setattr(drawing, "PLAIN_SHARE", 1.0)
+    monkeypatch.setattr(drawing, "_lens", lambda rgb, rng: rgb)
+    monkeypatch.setattr(drawing, "_noisy", lambda machine, camera, picture, pin, rng: picture.depth_m)  # no holes
     seen = 0
     for seed in range(12):
         sample = draw(pile, seed, 96)
@@ -121,8 +122,8 @@ def test_logs_of_which_little_shows_are_ignored():
 
 def test_shards_are_drawn_once_and_read_back(few, monkeypatch):
     drawn = []
-    real = frames.draw
-    monkeypatch.setattr(samples, "draw", lambda *a: drawn.append(a[1]) or real(*a))
+    real = drawing.draw
+    monkeypatch.setattr(shards, "draw", lambda *a: drawn.append(a[1]) or real(*a))
     own = pictures(few, 96)
     again = [own(1), own(3)]  # of shards 0 and 1
     assert drawn == [0, 1, 2, 3]
@@ -153,17 +154,17 @@ def test_a_damaged_shard_is_named(few):
 @pytest.mark.slow
 @pytest.mark.computed
 def test_weights_come_with_a_card_and_find_logs_by_themselves(few, monkeypatch):
-    monkeypatch.setattr(produce, "BATCH", 2)
-    monkeypatch.setattr(produce, "JUDGED", 2)
+    monkeypatch.setattr(detector_weights, "BATCH", 2)
+    monkeypatch.setattr(detector_weights, "JUDGED", 2)
     out = few / "logs_depth.safetensors"
-    card = produce.produce("depth", produce.Plan(2, 2, 1), few, out, Console(quiet=True))
+    card = detector_weights.produce("depth", detector_weights.Plan(2, 2, 1), few, out, Console(quiet=True))
     assert "mAP@0.5" in card.read_text() and "timberhand train segmentation --variant depth" in card.read_text()
-    assert LogFinder("depth", out).facts["seed"] == "1"
+    assert LogSegmenter("depth", out).facts["seed"] == "1"
     boxes = few / "log_boxes.safetensors"
-    produce.produce_boxes(produce.Plan(2, 2, 1, large=2), few, boxes, Console(quiet=True))
-    assert BoxFinder(boxes).facts["command"].startswith("timberhand train detector --pictures 2 --large 2")
-    on = produce.Plan(2, 1, 1, 1e-6, out)
-    text = produce.produce("depth", on, few, few / "on.safetensors", Console(quiet=True)).read_text()
+    detector_weights.produce_boxes(detector_weights.Plan(2, 2, 1, large=2), few, boxes, Console(quiet=True))
+    assert BoxDetector(boxes).facts["command"].startswith("timberhand train detector --pictures 2 --large 2")
+    on = detector_weights.Plan(2, 1, 1, 1e-6, out)
+    text = detector_weights.produce("depth", on, few, few / "on.safetensors", Console(quiet=True)).read_text()
     assert "begun with logs_depth.safetensors" in text
     before, after = (
         load(few / f"{name}.safetensors", unet("depth"))[0]["maps.weight"] for name in ("logs_depth", "on")
@@ -176,28 +177,30 @@ def test_the_depth_variant_begins_with_what_colour_and_depth_were_looked_at_with
     both, alone = tmp_path / "logs_rgbd.safetensors", tmp_path / "logs_depth.safetensors"
     arrays = random_net(unet("rgbd"), 1).arrays()
     save(both, unet("rgbd"), arrays, {})
-    taken = produce.begun(both, "depth")
+    taken = detector_weights.begun(both, "depth")
     assert np.array_equal(taken["in2.weight"], arrays["in2.weight"][:, 3:])
     assert all(np.array_equal(taken[k], arrays[k]) for k in arrays if k != "in2.weight")
     save(alone, unet("depth"), taken, {})
-    assert np.array_equal(produce.begun(alone, "depth")["in2.weight"], taken["in2.weight"])
+    assert np.array_equal(detector_weights.begun(alone, "depth")["in2.weight"], taken["in2.weight"])
     with pytest.raises(WeightsRefused, match="logs_rgbd"):
-        produce.begun(alone, "rgbd")
+        detector_weights.begun(alone, "rgbd")
 
 
 def test_small_and_large_pictures_come_in_turn(few):
-    source = produce.mixed(pictures(few), produce.Plan(2, 1, 1, large=2), few, Console(quiet=True))
+    source = detector_weights.mixed(pictures(few), detector_weights.Plan(2, 1, 1, large=2), few, Console(quiet=True))
     assert [source(i).ids.shape[0] for i in range(4)] == [304, 608, 304, 608]
     assert np.array_equal(source(1).ids, source(5).ids) and not np.array_equal(source(1).ids, source(3).ids)
-    assert "--pictures 2 --large 2 --steps 1" in produce.Plan(2, 1, 1, large=2).command("segmentation", few / "x")
+    assert "--pictures 2 --large 2 --steps 1" in detector_weights.Plan(2, 1, 1, large=2).command(
+        "segmentation", few / "x"
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.computed
 def test_judges_come_with_their_cards(few, monkeypatch):
-    monkeypatch.setattr(evaluators, "STEPS", 40)
-    monkeypatch.setattr(evaluators, "SIZE_PX", 304)
-    card = evaluators.produce(4, 1, few, few / "judges", None, Console(quiet=True))
+    monkeypatch.setattr(scorer_weights, "STEPS", 40)
+    monkeypatch.setattr(scorer_weights, "SIZE_PX", 304)
+    card = scorer_weights.produce(4, 1, few, few / "judges", None, Console(quiet=True))
     assert "timberhand train judges --pictures 4 --seed 1" in card.read_text()
     told = judges_in(few / "judges").joins.chance(np.zeros((3, 19), np.float32))
     assert told.shape == (3,) and (told > 0.0).all() and (told < 1.0).all()

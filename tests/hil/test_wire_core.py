@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.bus import ERR_ACK, ERR_BUSOFF, ERR_CRTL, ERR_RESTARTED, BusState
+from can_dbc.bus.base import ERR_ACK, ERR_BUSOFF, ERR_CRTL, ERR_RESTARTED, BusState
 from can_dbc.frame import ERROR, EXTENDED, Frame
 from hil.wire.core import Node, WireCore
 from hil.wire.faults import Fault, Kind

@@ -16,9 +16,10 @@ from pathlib import Path
 
 import pytest
 
-from can_dbc.bus import BusError, BusState, kernel_has_can, open_bus
+from can_dbc.bus.base import BusError, BusState
+from can_dbc.bus.factory import kernel_has_can, open_bus
+from can_dbc.bus.wire_client import CONTROL, RECORD, control, wire_directory
 from can_dbc.frame import ERROR, EXTENDED, Frame
-from can_dbc.wire_client import CONTROL, RECORD, control, wire_directory
 from hil.wire.faults import Fault, Kind
 from hil.wire.launch import wire_daemon
 from hil.wire.stuffing import frame_bits
@@ -208,7 +209,7 @@ def test_room_comes_back_for_a_frame_that_the_bus_refuses(daemon: subprocess.Pop
 def test_a_client_that_only_sends_keeps_a_bounded_backlog(
     daemon: subprocess.Popen[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("can_dbc.wire_client._BACKLOG", 8)
+    monkeypatch.setattr("can_dbc.bus.wire_client._BACKLOG", 8)
     with open_bus("wire:crane0", tx_queue=1) as a, open_bus("wire:crane0", tx_queue=40) as b:
         assert all(b.send(i, b"") for i in range(30))
         assert a.send(0x100, b"")

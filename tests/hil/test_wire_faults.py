@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from can_dbc.bus import BusState
+from can_dbc.bus.base import BusState
 from can_dbc.frame import ERROR, Frame
 from hil.wire.core import Node, WireCore
 from hil.wire.faults import Fault, Kind

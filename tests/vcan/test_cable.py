@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from can_dbc.bus import Bus, open_bus
+from can_dbc.bus.base import Bus
+from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
 from hil.wire.launch import wire_daemon
 

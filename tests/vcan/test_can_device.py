@@ -19,7 +19,8 @@ from pathlib import Path
 
 import pytest
 
-from can_dbc.bus import Bus, BusState, open_bus
+from can_dbc.bus.base import Bus, BusState
+from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
 
 SYS_FINIT_MODULE = 313  # x86-64

@@ -14,7 +14,8 @@ from pathlib import Path
 import can
 import pytest
 
-from can_dbc.bus import Bus, default_address, open_bus
+from can_dbc.bus.base import Bus
+from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.frame import EXTENDED, Frame
 
 RAW = struct.Struct("=IB3x8s")
@@ -88,7 +89,7 @@ def test_an_ordinary_user_gets_fifo_and_locked_memory() -> None:
 
 ANSWERER = """
 import sys
-from can_dbc.bus import open_bus
+from can_dbc.bus.base import open_bus
 import select
 with open_bus("socketcan:vcan0", filters=[0x80, 0x7FF]) as bus:
     print("ready", flush=True)

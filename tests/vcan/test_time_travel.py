@@ -17,17 +17,17 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from can_dbc import codec
+from can_dbc.dbc import codec
 from can_dbc.frame import Frame
-from can_dbc.logread import read
-from can_dbc.lost_link import GONE_NS, RETRY_NS
+from can_dbc.trace.candump import read
+from can_dbc.bus.reconnector import GONE_NS, RETRY_NS
 from controller.config import load as load_settings
 from controller.guard.__main__ import PERIOD_NS as GUARD_PERIOD_NS
 from host.service_lab.pilot import LEASE_NS
 from host.vcan_lab import lab_kernel, shim
 from host.vcan_lab.spec import VIRTUAL_START_NS
-from machine.modes import Mode
-from machine.reasons import Reason
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
 from sim.nodes.valve import CYCLE_NS, GUARD_NS, PILOT_NS, RAMP_NS, SYNC_NS, ValveState
 
 pytestmark = [

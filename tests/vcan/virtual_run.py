@@ -15,11 +15,11 @@ import sys
 import time
 from pathlib import Path
 
-from can_dbc.bus import open_bus
-from can_dbc.setpoint import OperatorAction
+from can_dbc.bus.factory import open_bus
+from can_dbc.messages.crane import OperatorAction
 from host.service_lab.pilot import PERIOD_NS, Pilot
-from machine.load import load_profile
-from machine.modes import Mode
+from machine.loading.profile_file import load_profile
+from machine.status.modes import Mode
 
 PROFILE = "palms_471"
 BUS = "socketcan:vcan0"
@@ -29,11 +29,11 @@ PATIENCE_S = 30.0
 
 def nodes() -> None:
     """The machine's nodes, until SIGTERM."""
-    from sim.kinematic import KinematicMachine
-    from sim.live import TX_QUEUE, LiveMachine
+    from sim.kinematic.machine import KinematicMachine
+    from sim.process.live import TX_QUEUE_FRAMES, LiveMachine
 
     machine = KinematicMachine(load_profile(PROFILE), seed=1, step_ns=2_500_000)
-    with open_bus(BUS, tx_queue=TX_QUEUE) as bus:
+    with open_bus(BUS, tx_queue=TX_QUEUE_FRAMES) as bus:
         live = LiveMachine(machine, {"crane0": bus})
         signal.signal(signal.SIGUSR1, lambda *_: machine.estop.press())
         signal.signal(signal.SIGUSR2, lambda *_: (machine.estop.release(), machine.estop.reset()))

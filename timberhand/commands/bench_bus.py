@@ -23,9 +23,9 @@ def bus(
     """
     import json
 
-    from experiments.benches.bus import LIMIT_US, measure
     from experiments.common.result import environment
-    from host.exits import Exit
+    from experiments.timing.receive_cost import LIMIT_US, measure
+    from host.exit_codes import ExitCode
 
     result = {"environment": environment()} | measure(frames, rounds)
     metrics, lab = result["metrics"], result["lab"]
@@ -35,7 +35,7 @@ def bus(
     else:
         _show(result, reached)
     if not reached and not lab:
-        raise typer.Exit(Exit.FIGURE)
+        raise typer.Exit(ExitCode.FIGURE_MISSED)
 
 
 def _show(result: dict, reached: bool) -> None:

@@ -23,7 +23,7 @@ def codec(
     """
     import json
 
-    from host.exits import Exit
+    from host.exit_codes import ExitCode
 
     result = measure(repetitions)
     if as_json:
@@ -31,7 +31,7 @@ def codec(
     else:
         _show(result)
     if not result["reached"]:
-        raise typer.Exit(Exit.FIGURE)
+        raise typer.Exit(ExitCode.FIGURE_MISSED)
 
 
 def measure(repetitions: int) -> dict[str, Any]:
@@ -42,8 +42,8 @@ def measure(repetitions: int) -> dict[str, Any]:
     import random
     from importlib.metadata import version
 
-    from can_dbc.check import random_values
-    from can_dbc.codec import EncodeRefused, FrameRefused, load, parse
+    from can_dbc.dbc.check import random_values
+    from can_dbc.dbc.codec import EncodeRefused, FrameRefused, load, parse
 
     database = load("crane")
     reference = {m.name: m for m in parse(database.path).messages}

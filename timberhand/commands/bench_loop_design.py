@@ -40,8 +40,8 @@ def loop_design(
 
     from experiments.loop_design import carrier
     from experiments.loop_design.study import GAIN_DB, PHASE_DEG, study, work_of
-    from host.exits import Exit, Stopped
-    from machine.load import ProfileError, load_profile
+    from host.exit_codes import CommandFailed, ExitCode
+    from machine.loading.profile_file import ProfileError, load_profile
 
     screen = Console(stderr=as_json, highlight=False, soft_wrap=True)
     documents: dict[str, Any] = {}
@@ -54,7 +54,7 @@ def loop_design(
                 work = work_of(source, truth)
                 studies = study(machine, work) + carrier.studies(machine, work)
         except (ProfileError, ValueError) as error:
-            raise Stopped(Exit.CONFIGURATION, str(error)) from None
+            raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
         table = Table(box=None, header_style="bold", pad_edge=False, title=machine.title, title_justify="left")
         for column in ("joint", "law", "kp 1/s", "phase deg", "gain dB", "bandwidth Hz", "worst machine"):
             table.add_column(column, justify="left" if column in ("joint", "law", "worst machine") else "right")
@@ -70,7 +70,7 @@ def loop_design(
         machines.append((machine, studies, work))
         documents[machine.name] = {joint.name: joint.document() for joint in studies}
         if out is not None:
-            from experiments.loop_design.pictures import draw
+            from experiments.loop_design.plots import draw
 
             for file in draw(machine.name, studies, out):
                 screen.print(f"[dim]{file}[/dim]")
@@ -86,4 +86,4 @@ def loop_design(
     else:
         screen.print(f"needed everywhere: {PHASE_DEG:.0f} deg and {GAIN_DB:.0f} dB")
     if not holds:
-        raise typer.Exit(Exit.FIGURE)
+        raise typer.Exit(ExitCode.FIGURE_MISSED)

@@ -26,8 +26,8 @@ def motion(
     from rich.progress import Progress
 
     from experiments.benches.motion import GOAL_MS, run
-    from host.exits import Exit, Stopped
-    from machine.load import ProfileError, load_profile
+    from host.exit_codes import CommandFailed, ExitCode
+    from machine.loading.profile_file import ProfileError, load_profile
 
     error = Console(stderr=True)
     found = {}
@@ -38,7 +38,7 @@ def motion(
                 task = bar.add_task(name, total=None)
                 bench = run(machine, seeds, lambda done, total, t=task: bar.update(t, completed=done, total=total))
         except (ProfileError, ValueError) as trouble:
-            raise Stopped(Exit.CONFIGURATION, str(trouble)) from None
+            raise CommandFailed.from_error(trouble, ExitCode.CONFIGURATION) from None
         found[name] = bench.metrics()
         if not as_json:
             m = bench.metrics()

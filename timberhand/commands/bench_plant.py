@@ -23,18 +23,18 @@ def plant(
     from rich.table import Table
 
     from experiments.common.result import environment, judge
-    from experiments.plant.bench import FIGURES, LOG_COUNTS, measure
-    from host.exits import Exit
+    from experiments.plant.bench import LOG_COUNTS, METRICS, measure
+    from host.exit_codes import ExitCode
 
     screen = Console(stderr=as_json, highlight=False, soft_wrap=True)
     metrics, noisy, _ = measure(profile, truth, quick, screen)
-    missed, inconclusive = judge(FIGURES, metrics, noisy)
+    missed, inconclusive = judge(METRICS, metrics, noisy)
     if as_json:
         verdict = {"missed": missed, "inconclusive": inconclusive, "noisy": noisy}
         typer.echo(json.dumps({"environment": environment(), "metrics": metrics, **verdict}, indent=2))
     else:
         screen.print("  ".join(f"[dim]{name}[/dim] {value}" for name, value in environment().items()))
-        for f in FIGURES:
+        for f in METRICS:
             word = "inconclusive" if f.name in inconclusive else "missed" if f.name in missed else "reached"
             ratio = metrics[f.name.replace("_ms", "") + "_per_reference"]
             screen.print(f"{f.title}: [bold]{f.text(metrics[f.name])}[/bold] ({f.limit_text()}: {word})")
@@ -50,4 +50,4 @@ def plant(
             f"{100 * metrics['host_unequal']:.0f} %{': noisy' if noisy else ''}[/dim]"
         )
     if missed:
-        raise typer.Exit(Exit.FIGURE)
+        raise typer.Exit(ExitCode.FIGURE_MISSED)

@@ -322,7 +322,7 @@ class _Progress:
 
 
 def _says(calibration: Calibration) -> str:
-    from autonomy.calibration.tasks import YawReadingTask, GrappleTask, PinReadingTask, PulseTask, SpoolTask, MoveTask
+    from autonomy.calibration.tasks import GrappleTask, MoveTask, PinReadingTask, PulseTask, SpoolTask, YawReadingTask
 
     match calibration.task:
         case SpoolTask(joint=j, side=side, kind=kind):

@@ -37,7 +37,7 @@ def console(
     timberhand console --report-port 8472 --controller 127.0.0.1:8470
     """
     from console.__main__ import Refused, serve
-    from host.exits import Exit, Stopped
+    from host.exit_codes import CommandFailed, ExitCode
 
     try:
         serve(
@@ -53,4 +53,4 @@ def console(
             timing=timing,
         )
     except Refused as refused:
-        raise Stopped(Exit(refused.code), str(refused)) from refused
+        raise CommandFailed.from_error(refused, ExitCode(refused.code)) from refused

@@ -31,8 +31,8 @@ def check(
     import json
     from dataclasses import asdict
 
-    from can_dbc.check import check as check_file
-    from host.exits import Exit
+    from can_dbc.dbc.check import check as check_file
+    from host.exit_codes import ExitCode
 
     reports = [check_file(file, frames, seed) for file in files]
     if as_json:
@@ -40,9 +40,9 @@ def check(
     else:
         _show(reports)
     if any(r.error for r in reports) or (strict and any(r.warnings for r in reports)):
-        raise typer.Exit(Exit.CONFIGURATION)
+        raise typer.Exit(ExitCode.CONFIGURATION)
     if any(r.different for r in reports):
-        raise typer.Exit(Exit.FIGURE)
+        raise typer.Exit(ExitCode.FIGURE_MISSED)
 
 
 def _show(reports: list) -> None:  # type: ignore[type-arg]

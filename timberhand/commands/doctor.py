@@ -35,7 +35,7 @@ def doctor(
     from host.doctor import facts, installation, timing
     from host.doctor.finding import Severity
     from host.doctor.show import show, verdict
-    from host.exits import Exit
+    from host.exit_codes import ExitCode
 
     groups = {"installation": installation.examine()}
     if rt:
@@ -52,4 +52,4 @@ def doctor(
         for name, group in groups.items():
             show(console, f"timberhand {name}", group)
         console.print(verdict(every))
-    raise typer.Exit(Exit.CONFIGURATION if any(f.severity is Severity.FAULT for f in every) else Exit.FINE)
+    raise typer.Exit(ExitCode.CONFIGURATION if any(f.severity is Severity.FAULT for f in every) else ExitCode.OK)

@@ -67,8 +67,8 @@ def experiment(
     from rich.console import Console
 
     from experiments.common.registry import Options, load
-    from host.exits import Exit, Stopped
-    from machine.load import ProfileError, load_profile
+    from host.exit_codes import CommandFailed, ExitCode
+    from machine.loading.profile_file import ProfileError, load_profile
 
     if bus is Bus.VCAN and "TIMBERHAND_LAB" not in os.environ:
         from host.vcan_lab.__main__ import vcan
@@ -77,7 +77,7 @@ def experiment(
     try:
         load_profile(profile)
     except ProfileError as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     options = Options(
         seed=seed,
         truth=truth,
@@ -96,12 +96,16 @@ def experiment(
     try:
         result = load(name.value)(options, screen)
     except KeyboardInterrupt:
-        raise Stopped(
-            Exit.INTERRUPTED, f"interrupted; finished trials are kept in {options.out}, the same command goes on"
+        raise CommandFailed(
+            "experiment.interrupted",
+            f"interrupted; finished trials are kept in {options.out}, the same command goes on",
+            ExitCode.INTERRUPTED,
         ) from None
     if as_json:
         print(result.json())
     if result.missed:
-        raise Stopped(
-            Exit.FIGURE, f"figures not reached: {', '.join(result.missed)}; see {options.out / 'result.json'}"
+        raise CommandFailed(
+            "experiment.figure-missed",
+            f"figures not reached: {', '.join(result.missed)}; see {options.out / 'result.json'}",
+            ExitCode.FIGURE_MISSED,
         )

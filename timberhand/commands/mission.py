@@ -1,63 +1,81 @@
-"""``timberhand mission``: the forwarder does a whole mission, and what it does next, as a chart."""
+"""``timberhand mission``: run a whole forwarding mission, and document the activity manager."""
 
 from __future__ import annotations
 
 import json
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
-from host.exit_codes import Exit, Stopped
-from timberhand.commands.runs import Backend, enter_lab, new_directory
+from host.exit_codes import CommandFailed, ExitCode
+from timberhand.commands.options import (
+    MaxStopsOption,
+    PageOption,
+    PagePortOption,
+    ProfileOption,
+    SummaryOption,
+    TruthOption,
+)
+from timberhand.commands.runs import Backend, BusOption, enter_lab, new_directory
 
-app = typer.Typer(no_args_is_help=True, help="Run a forwarding mission, and show what the forwarder does next.")
+app = typer.Typer(no_args_is_help=True, help="Run a forwarding mission; document the activity manager.")
 
 
-class Way(StrEnum):
-    """Whose way the mission is done."""
+class ManagerKind(StrEnum):
+    """The activity manager, with its steering law."""
 
-    OURS = "ours"
+    OWN = "own"
     PAPER_B = "paper-b"
 
 
-class Sight(StrEnum):
-    """What sees the logs."""
+class DetectorKind(StrEnum):
+    """The detector that finds the logs."""
 
     PERFECT = "perfect"
-    FAITHFUL = "faithful"
-    OURS = "ours"
+    PAPER_B = "paper-b"
+    OWN = "own"
+
+
+TABLES: Final = {ManagerKind.OWN: "ours", ManagerKind.PAPER_B: "paper-b"}
+"""Names of the transition tables (`autonomy.manager.transition_table`)."""
+DETECTORS: Final = {DetectorKind.PERFECT: "perfect", DetectorKind.PAPER_B: "faithful", DetectorKind.OWN: "ours"}
+"""Names of the detectors (`hil.missions.detectors`)."""
 
 
 @app.command()
 def run(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The mission, in any format of `timberhand plan`.")],
-    lockstep: Annotated[bool, typer.Option(help="Virtual time in one process, bit-identical for a seed.")] = False,
-    seed: Annotated[int, typer.Option(help="Chooses the plant's wood and noise.")] = 1,
-    way: Annotated[Way, typer.Option(help="Our way, or paper B's activity manager and steering law.")] = Way.OURS,
-    eyes: Annotated[
-        Sight,
-        typer.Option(
-            help="A detector without mistakes, or the front camera with paper B's pipeline or ours (lockstep)."
-        ),
-    ] = Sight.PERFECT,
-    logs: Annotated[int, typer.Option(min=0, help="So many logs along the route instead of those in the mission.")] = 0,
-    profile: Annotated[str, typer.Option(help="A shipped profile or a TOML file.")] = "aoro_fc8",
-    truth: Annotated[str, typer.Option(help="The plant's hidden truth: nominal, sampled, or a TOML file.")] = "nominal",
-    out: Annotated[Path | None, typer.Option(help="Directory of the run's logs (default: under runs/).")] = None,
-    bus: Annotated[
-        Backend, typer.Option(help="vcan (in user-mode Linux if need be), the wire, or what is there (live).")
-    ] = Backend.AUTO,
-    console: Annotated[bool, typer.Option(help="Serve the page that shows the machine (live).")] = True,
-    console_port: Annotated[int, typer.Option(help="Port of the page on localhost.")] = 8471,
-    patience: Annotated[int, typer.Option(help="How many stops the stand-in operator arms again after (live).")] = 20,
-    limit_s: Annotated[float, typer.Option(help="Give up after so many seconds of the machine's time.")] = 7200.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")] = False,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Mission file, in any format of `timberhand plan`.")],
+    lockstep: Annotated[
+        bool, typer.Option(help="Run in virtual time in one process; a seed gives the same bytes every time.")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Chooses the logs' properties and the noise of the plant.")] = 1,
+    manager: Annotated[
+        ManagerKind, typer.Option(help="Activity manager and steering law: our own, or those of paper B.")
+    ] = ManagerKind.OWN,
+    detector: Annotated[
+        DetectorKind,
+        typer.Option(help="Log detector: perfect, or the front camera with paper B's or our own pipeline (lockstep)."),
+    ] = DetectorKind.PERFECT,
+    logs: Annotated[
+        int, typer.Option(min=0, help="Lay this many logs along the route instead of those of the mission.")
+    ] = 0,
+    profile: ProfileOption = "aoro_fc8",
+    truth: TruthOption = "nominal",
+    out: Annotated[
+        Path | None, typer.Option(help="Directory of the recording (default: a new one below runs/).")
+    ] = None,
+    bus: BusOption = Backend.AUTO,
+    console: PageOption = True,
+    console_port: PagePortOption = 8471,
+    max_stops: MaxStopsOption = 20,
+    limit_s: Annotated[float, typer.Option(help="Time limit of the mission in seconds of machine time.")] = 7200.0,
+    as_json: SummaryOption = False,
 ) -> None:
-    """The forwarder follows its route, collects the logs and brings them to the end of the route.
+    """Drive the route of a mission, collect the logs and bring them to the end of the route.
 
-    Exit code 0: the mission came to its end, and all that was loaded lies in the bunk by the plant's physics.
+    Exit code 0 when the mission is finished and all loaded logs lie in the bunk according to the plant's physics.
 
     [bold]Examples[/bold]
 
@@ -65,7 +83,7 @@ def run(
 
       timberhand mission run docs/examples/paper_b.geojson --bus vcan
 
-      timberhand mission run docs/examples/paper_b.geojson --way paper-b --seed 3
+      timberhand mission run docs/examples/paper_b.geojson --manager paper-b --seed 3
     """
     from dataclasses import asdict
 
@@ -73,7 +91,7 @@ def run(
 
     from autonomy.missions.mission_file import load_mission
     from autonomy.missions.model import MissionError
-    from machine.load import ProfileError, load_profile
+    from machine.loading.profile_file import ProfileError, load_profile
 
     if not lockstep:
         enter_lab(bus)
@@ -83,32 +101,34 @@ def run(
         site = None if carrier is None else (carrier.site_lat_deg, carrier.site_lon_deg)
         mission = load_mission(file, route_wanted=True, site=site).mission
     except (MissionError, ProfileError) as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
-    directory = out or new_directory(f"mission-{file.stem}-{way.value}-seed{seed}")
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+    directory = out or new_directory(f"mission-{file.stem}-{manager.value}-seed{seed}")
     screen = Console(stderr=as_json)
     if lockstep:
         from hil.missions.lockstep import run_mission
 
-        summary = run_mission(mission, profile, seed, truth, way.value, logs, directory, limit_s, screen, eyes.value)
+        summary = run_mission(
+            mission, profile, seed, truth, TABLES[manager], logs, directory, limit_s, screen, DETECTORS[detector]
+        )
     else:
         from hil.harness.live import LiveOptions
         from hil.missions.live import run_live_mission
 
         page = console_port if console else 0
-        options = LiveOptions(profile, machine, seed, truth, bus.value, directory, page, limit_s, patience)
-        summary = run_live_mission(file, mission, options, way.value, logs, screen)
+        options = LiveOptions(profile, machine, seed, truth, bus.value, directory, page, limit_s, max_stops)
+        summary = run_live_mission(file, mission, options, TABLES[manager], logs, screen)
     summary.show(screen)
     summary.save(directory / "summary.json")
     if as_json:
         print(json.dumps(asdict(summary)))
-    raise typer.Exit(summary.exit)
+    raise typer.Exit(summary.exit_code)
 
 
 @app.command()
 def states(
-    docs: Annotated[Path | None, typer.Option(help="Write the page activity.md into this folder.")] = None,
+    docs: Annotated[Path | None, typer.Option(help="Write the page activity.md into this folder instead.")] = None,
 ) -> None:
-    """The activity manager's tables as a page with charts: paper B's (Fig. 8) and ours.
+    """Print the activity manager's transition tables with state charts: paper B's (Fig. 8) and our own.
 
     [bold]Examples[/bold]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from host.exit_codes import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 
 if TYPE_CHECKING:
     from autonomy.missions.features import Draft
@@ -50,14 +50,14 @@ def check(
     except MissionError as error:
         if as_json:
             typer.echo(json.dumps({"file": str(file), "problems": list(error.problems)}, indent=2))
-            raise typer.Exit(Exit.CONFIGURATION) from None
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+            raise typer.Exit(ExitCode.CONFIGURATION) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if as_json:
         typer.echo(json.dumps(_facts(file, draft, review), indent=2))
     else:
         _show(file, draft, review)
     if strict and review is not None and review.warnings:
-        raise typer.Exit(Exit.CONFIGURATION)
+        raise typer.Exit(ExitCode.CONFIGURATION)
 
 
 @app.command()
@@ -81,12 +81,16 @@ def convert(
     from autonomy.missions.model import MissionError
 
     if out.suffix.lower() not in (".geojson", ".json"):
-        raise Stopped(Exit.USAGE, f"{out}: missions are written as GeoJSON; name it {out.with_suffix('.geojson')}")
+        raise CommandFailed(
+            "plan.output-format",
+            f"{out}: missions are written as GeoJSON; name it {out.with_suffix('.geojson')}",
+            ExitCode.USAGE,
+        )
     try:
         draft = load_mission(file, logs=logs)
         save_mission(out, draft.mission)
     except MissionError as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if as_json:
         typer.echo(json.dumps(_facts(file, draft, None) | {"out": str(out)}, indent=2))
         return
@@ -121,30 +125,40 @@ def show(
     try:
         draft, review = _read(file, logs, machine)
     except MissionError as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if png.suffix.lower() != ".png":
-        raise Stopped(Exit.USAGE, f"{png}: the map is a PNG; name it {png.with_suffix('.png')}")
+        raise CommandFailed(
+            "plan.map-format", f"{png}: the map is a PNG; name it {png.with_suffix('.png')}", ExitCode.USAGE
+        )
     try:
         from timberhand.mission_map import draw
     except ImportError:
-        raise Stopped(Exit.CONFIGURATION, "drawing needs matplotlib: pip install 'timberhand[tools]'") from None
+        raise CommandFailed(
+            "plan.no-matplotlib", "drawing needs matplotlib: pip install 'timberhand[tools]'", ExitCode.CONFIGURATION
+        ) from None
     try:
         draw(draft.mission, review, png)
     except OSError as error:
-        raise Stopped(Exit.CONFIGURATION, f"{png}: cannot be written: {error.strerror}") from None
+        raise CommandFailed(
+            "plan.map-not-written", f"{png}: cannot be written: {error.strerror}", ExitCode.CONFIGURATION
+        ) from None
     typer.echo(json.dumps(_facts(file, draft, review) | {"png": str(png)}, indent=2) if as_json else str(png))
 
 
 def _machine(name: str) -> Profile:
     """A machine that drives."""
-    from machine.load import ProfileError, load_profile
+    from machine.loading.profile_file import ProfileError, load_profile
 
     try:
         profile = load_profile(name)
     except ProfileError as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if profile.carrier is None:
-        raise Stopped(Exit.CONFIGURATION, f"{profile.name} does not drive; choose a machine with a carrier")
+        raise CommandFailed(
+            "plan.stationary-machine",
+            f"{profile.name} does not drive; choose a machine with a carrier",
+            ExitCode.CONFIGURATION,
+        )
     return profile
 
 

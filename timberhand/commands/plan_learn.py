@@ -86,9 +86,9 @@ def demonstrate(
     from rich.console import Console
     from rich.progress import Progress
 
-    from autonomy.motion.demonstration import segment_motions, format_demonstrations, joint_track
+    from autonomy.motion.demonstration import format_demonstrations, joint_track, segment_motions
     from can_dbc.dbc.codec import load
-    from hil.demonstrations.hand_levers import show
+    from hil.demonstrations.hand_levers import demonstrate as demonstrate_motions
     from machine.loading.profile_file import ProfileError, load_profile
     from recorder.manifest import describe
     from recorder.recorder import Recorder, RecordingRefused
@@ -100,7 +100,7 @@ def demonstrate(
         recorder = Recorder(record, machine, describe(machine, buses, seed)) if record is not None else None
         with Progress(console=error_console, transient=True, disable=not error_console.is_terminal) as bar:
             task = bar.add_task("motions", total=None)
-            frames = show(
+            frames = demonstrate_motions(
                 profile,
                 seed,
                 targets,

@@ -28,9 +28,10 @@ def record(
 
     timberhand record --out runs/field-1 --bus crane0=socketcan:can0
     """
-    from can_dbc.bus import BusError, default_address
-    from host.exits import Exit, Stopped
-    from machine.load import ProfileError, load_profile
+    from can_dbc.bus.base import BusError
+    from can_dbc.bus.factory import default_address
+    from host.exit_codes import CommandFailed, ExitCode
+    from machine.loading.profile_file import ProfileError, load_profile
     from recorder.__main__ import main
 
     try:
@@ -38,9 +39,9 @@ def record(
         names = [name for name in (machine.crane_bus, machine.machine_bus) if name]
         buses = bus or [f"{name}={default_address(name)}" for name in names]
     except ProfileError as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from error
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
     except BusError as error:
-        raise Stopped(Exit.BUS, str(error)) from error
+        raise CommandFailed.from_error(error, ExitCode.BUS) from error
     arguments = ["--out", str(out), "--tick-port", str(tick_port), "--report-port", str(report_port)]
     arguments += ["--timing", str(timing)] if timing else []
     code = main([*arguments, "--profile", profile, *(x for b in buses for x in ("--bus", b))])

@@ -29,9 +29,9 @@ def replay(
     """
     import json
 
-    from hil.replay import contents as list_contents
-    from hil.replay import files_of, manifest_of
-    from host.exits import Exit, Stopped
+    from hil.replay.recording import contents as list_contents
+    from hil.replay.recording import files_of, manifest_of
+    from host.exit_codes import CommandFailed, ExitCode
 
     files = files_of(log)
     if contents:
@@ -47,7 +47,9 @@ def replay(
     try:
         key = key_file.read_bytes().strip() if key_file else None
     except OSError as error:
-        raise Stopped(Exit.CONFIGURATION, f"{key_file} cannot be read ({error.strerror})") from error
+        raise CommandFailed(
+            "replay.key-unreadable", f"{key_file} cannot be read ({error.strerror})", ExitCode.CONFIGURATION
+        ) from error
     result = _run(files, profile, key)
     if as_json:
         typer.echo(json.dumps(result.as_dict()))
@@ -62,14 +64,14 @@ def replay(
     else:
         typer.echo(f"{result.ticks} ticks agree; {result.missing}")
     if not result.agrees:
-        raise typer.Exit(Exit.FIGURE)
+        raise typer.Exit(ExitCode.FIGURE_MISSED)
 
 
 def _run(files, profile, key):  # type: ignore[no-untyped-def]
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from hil.replay import replay as run
+    from hil.replay.replay import replay as run
 
     columns = (TextColumn("replay"), BarColumn(), MofNCompleteColumn(), TextColumn("ticks"), TimeRemainingColumn())
     error = Console(stderr=True)

@@ -23,12 +23,18 @@ def report(
       timberhand report --docs /srv/timberhand/docs
     """
     from experiments.common import overview
-    from host.exits import Exit, Stopped
+    from host.exit_codes import CommandFailed, ExitCode
 
     try:
         found = overview.results_in(docs)
         if not found:
-            raise Stopped(Exit.CONFIGURATION, f"{docs / 'results'} holds no result of an experiment; name it by --docs")
+            raise CommandFailed(
+                "report.no-results",
+                f"{docs / 'results'} holds no result of an experiment; name it by --docs",
+                ExitCode.CONFIGURATION,
+            )
         print(f"{overview.write(docs)}: {len(found)} experiments")
     except (OSError, ValueError) as error:
-        raise Stopped(Exit.CONFIGURATION, f"the results in {docs} cannot be used: {error}") from None
+        raise CommandFailed(
+            "report.results-unusable", f"the results in {docs} cannot be used: {error}", ExitCode.CONFIGURATION
+        ) from None

@@ -1,4 +1,4 @@
-"""What the commands that run a machine share: the bus, the lab around them, the directory of the run."""
+"""What the commands that run a machine share: the choice of bus, the vcan lab, the directory of a run."""
 
 from __future__ import annotations
 
@@ -7,18 +7,27 @@ import sys
 from enum import StrEnum
 from itertools import count
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 
 class Backend(StrEnum):
-    """Where the frames travel."""
+    """The bus that carries the frames."""
 
     AUTO = "auto"
     WIRE = "wire"
     VCAN = "vcan"
 
 
+BusOption = Annotated[
+    Backend,
+    typer.Option("--bus", help="CAN backend of a live run: vcan (in user-mode Linux if necessary), wire, or auto."),
+]
+
+
 def enter_lab(bus: Backend) -> None:
-    """Where vcan is wanted, run this command again inside the lab and end with its exit code; else return."""
+    """For vcan outside the lab: run this command again inside it, and exit with its code."""
     if bus is Backend.VCAN and "TIMBERHAND_LAB" not in os.environ:
         from host.vcan_lab.__main__ import vcan
 
@@ -26,12 +35,12 @@ def enter_lab(bus: Backend) -> None:
 
 
 def _without_page(arguments: list[str]) -> list[str]:
-    """Inside user-mode Linux nobody can reach the page, so it is not started there."""
+    """No page: a browser cannot reach one inside user-mode Linux."""
     return arguments if "--no-console" in arguments else [*arguments, "--no-console"]
 
 
 def new_directory(name: str) -> Path:
-    """``runs/<name>-<n>``, made with the first free n, and ``runs/LAST`` pointing at it, also beside other runs."""
+    """Make ``runs/<name>-<n>`` with the first free n, and point ``runs/LAST`` at it; safe for concurrent runs."""
     runs = Path("runs")
     runs.mkdir(exist_ok=True)
     for number in count(1):

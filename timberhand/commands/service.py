@@ -67,8 +67,8 @@ def status(
     """
     import json
 
-    from host.exits import Exit, Stopped
-    from timberhand.services import look
+    from host.exit_codes import CommandFailed, ExitCode
+    from timberhand.service_status.status import look
 
     if watch:
         _watch(timing, as_json)
@@ -79,18 +79,18 @@ def status(
     elif found.units or found.timing:
         from rich.console import Console
 
-        from timberhand.services_view import screen
+        from timberhand.service_status.screen import screen
 
         Console(highlight=False).print(screen(found))
     else:
-        raise Stopped(Exit.CONFIGURATION, " ".join(found.notes))
+        raise CommandFailed("service.nothing-found", " ".join(found.notes), ExitCode.CONFIGURATION)
 
 
 def _watch(page: Path | None, as_json: bool) -> None:
     import json
 
-    from host.exits import Exit
-    from timberhand.services import look
+    from host.exit_codes import ExitCode
+    from timberhand.service_status.status import look
 
     before = None
     try:
@@ -101,7 +101,7 @@ def _watch(page: Path | None, as_json: bool) -> None:
         from rich.console import Console
         from rich.live import Live
 
-        from timberhand.services_view import screen
+        from timberhand.service_status.screen import screen
 
         console = Console(highlight=False)
         with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
@@ -111,7 +111,7 @@ def _watch(page: Path | None, as_json: bool) -> None:
                 before = found.timing or before
                 time.sleep(PERIOD_S)
     except KeyboardInterrupt:
-        raise typer.Exit(Exit.INTERRUPTED) from None
+        raise typer.Exit(ExitCode.INTERRUPTED) from None
 
 
 def _script(options: list[str], dry_run: bool) -> Any:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from host.exits import Exit, Stopped
+from host.exit_codes import CommandFailed, ExitCode
 
 app = typer.Typer(no_args_is_help=True, help="The simulated plant: look at it alive, or take its picture.")
 
@@ -64,13 +64,13 @@ def view(
     """
     from rich.console import Console
 
-    from hil.plant_view import run_view
-    from machine.load import ProfileError, load_profile
+    from hil.plant.viewer import run_view
+    from machine.loading.profile_file import ProfileError, load_profile
 
     try:
         machine = load_profile(profile)
     except ProfileError as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     options = ["--seed", str(seed), "--logs", str(logs), "--scene", scene.value, "--terrain", terrain.value]
     with tempfile.TemporaryDirectory(prefix="timberhand-view-") as directory:
         run_view(machine, profile, [*options, "--truth", truth], port, Path(directory), Console())
@@ -101,8 +101,8 @@ def shot(
 
       timberhand sim shot front.png --profile aoro_fc8 --camera front --depth
     """
-    from hil.plant_shot import Shot, take
-    from machine.load import ProfileError, load_profile
+    from hil.plant.picture import Shot, take
+    from machine.loading.profile_file import ProfileError, load_profile
 
     request = Shot(
         logs=logs, scene=scene.value, seed=seed, terrain=terrain.value, truth=truth, camera=camera, depth=depth,
@@ -112,7 +112,11 @@ def shot(
         machine = load_profile(profile)
         take(machine, request, out)
     except (ProfileError, ValueError) as error:
-        raise Stopped(Exit.CONFIGURATION, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     except OSError as error:
-        raise Stopped(Exit.CONFIGURATION, f"{out} cannot be written ({error.strerror}); give another file") from None
+        raise CommandFailed(
+            "sim.picture-not-written",
+            f"{out} cannot be written ({error.strerror}); give another file",
+            ExitCode.CONFIGURATION,
+        ) from None
     print(out)

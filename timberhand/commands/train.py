@@ -87,8 +87,8 @@ def _grasp_physical(weights: Path, seed: int, epochs: int | None) -> None:
 def _grasp_cornell(data: Path, out: Path, seed: int, epochs: int | None) -> None:
     from rich.console import Console
 
-    from training.grasp import network_training as training
     from training.common.dataset_error import DatasetError
+    from training.grasp import network_training as training
     from training.grasp.cornell import load
     from training.grasp.cornell_weights import produce
 

@@ -1,0 +1,74 @@
+"""The outcome of a one-log run, in the same words live and in lockstep."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from host.exit_codes import ExitCode
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """The outcome of one run; ``in_bunk`` and ``verdict`` come from the plant's physics alone."""
+
+    in_bunk: bool
+    verdict: str
+    failure: str
+    seconds: float
+    stops: int
+    ticks: int
+    missed_ticks: int
+    frames: int
+    refused_setpoints: int
+    grasp: str
+    directory: str
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """`ExitCode.OK` only when the log lies in the bunk according to the physics."""
+        if self.in_bunk:
+            return ExitCode.OK
+        return ExitCode.SAFETY_STOP if self.stops else ExitCode.FIGURE_MISSED
+
+    def show(self, console: Console) -> None:
+        """Print it for a person."""
+        mark = "[green]✔[/green]" if self.in_bunk else "[red]✘[/red]"
+        console.print(f"{mark} {self.verdict}", highlight=False, soft_wrap=True)
+        if self.failure:
+            console.print(f"  the planner failed: {self.failure}", highlight=False, soft_wrap=True)
+        if self.grasp:
+            console.print(f"  grasp: {self.grasp}", highlight=False, soft_wrap=True)
+        console.print(
+            f"  {self.seconds:.1f} s, {self.ticks} control ticks ({self.missed_ticks} missed), "
+            f"{self.frames} frames, {self.stops} stops, {self.refused_setpoints} setpoints refused",
+            highlight=False,
+            soft_wrap=True,
+        )
+        console.print(f"  recording: {self.directory}", highlight=False, soft_wrap=True)
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON."""
+        path.write_text(json.dumps(asdict(self), indent=2) + "\n")
+
+
+def outcome_sentence(verdict: dict[str, Any]) -> str:
+    """The evaluation of the first log in words; ``verdict`` is the plant's evaluation as plain data."""
+    log = verdict["logs"][0]
+    if log["in_bunk"] and log["released"] and log["at_rest"]:
+        return "The log lies in the bunk: lifted, released and at rest, as the plant's physics sees it."
+    wrong = [
+        text
+        for text, true in (
+            ("it was never lifted", not log["lifted"]),
+            ("it is not in the bunk", not log["in_bunk"]),
+            ("the grapple still touches it", not log["released"]),
+            ("it still moves", not log["at_rest"]),
+        )
+        if true
+    ]
+    return f"The log does not lie in the bunk: {', '.join(wrong)}."

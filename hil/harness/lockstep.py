@@ -1,0 +1,188 @@
+"""The whole machine in one process on virtual time: controller, guard, planner, plant and recorder, real CAN bytes.
+
+The parts are the pure cores that the processes of a live run wrap; only the buses (`hil.wire.core`) and the clock
+differ.  Time moves in slices of 1.25 ms; a bus delivers every frame at the end of its transmission time.  SYNC leaves
+one lead before each tick, so that the encoders' answers have arrived when the tick begins.  Nothing here reads a clock
+or draws a random number, so a seed gives the same bytes every time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+from autonomy.perception.log_list.observation import LogObservation
+from can_dbc.frame import Frame, RawFrame
+from can_dbc.messages import datagrams
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.vehicle import VehicleReport
+from controller.config import Settings
+from controller.guard.guard import Guard
+from controller.process.bus_link import BusLink
+from controller.process.tick_recording import record
+from controller.step import Controller, Inputs, step
+from hil.harness.operator import Operator
+from hil.wire.bitrates import CRANE_BITRATE, MACHINE_BITRATE
+from hil.wire.core import WireCore
+from hil.wire.inprocess import InProcessBus
+from recorder.recorder import Recorder
+from sim.instruments.ideal_detector import detect
+from sim.plant import Plant
+
+SLICE_NS: Final = 1_250_000
+"""Half the SYNC lead at 200 Hz: the plant receives SYNC in one slice, and its answers cross the bus in the next."""
+START_NS: Final = 1_000_000_000
+"""Virtual time of the first slice; not zero, because a zero stamp means unknown."""
+
+
+class Planner(Protocol):
+    """The source of setpoints; `autonomy.crane_job.activity.Activity` is one."""
+
+    def step(
+        self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]
+    ) -> bytes | list[bytes] | None:
+        """The datagrams to send now; None for none."""
+
+
+class LogDetector(Protocol):
+    """The source of log observations; `autonomy.perception.log_detector.LogDetector` is one."""
+
+    def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
+        """The logs detected with the joints at ``q`` [rad, m]; None when there is nothing new."""
+
+
+@dataclass(slots=True)
+class Observer:
+    """Recorder and hooks of a run; all of them are optional."""
+
+    recorder: Recorder | None = None
+    on_report: list[Callable[[StateReport], None]] = field(default_factory=list)
+    on_vehicle: list[Callable[[VehicleReport], None]] = field(default_factory=list)
+
+
+class Lockstep:
+    """One machine, its controller, guard and planner on virtual buses: crane0, and mach0 where the profile has one.
+
+    Without ``detector`` the planner gets the true poses of the logs.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        guard: Guard,
+        plant: Plant,
+        activity: Planner,
+        operator: Operator,
+        observer: Observer,
+        detector: LogDetector | None = None,
+    ) -> None:
+        profile = settings.profile
+        self.now_ns = START_NS
+        self.ticks = 0
+        self.frames = 0
+        self.report: StateReport | None = None
+        self.vehicle_report: VehicleReport | None = None
+        self.plant, self.activity, self.operator = plant, activity, operator
+        self._detector = detector
+        self.core = WireCore(CRANE_BITRATE, profile.crane_bus)
+        self._cores = [self.core]
+        if profile.machine_bus is not None:
+            self._cores.append(WireCore(MACHINE_BITRATE, profile.machine_bus))
+        self._observer = observer
+        self._settings = settings
+        self._period_ns = 1_000_000_000 // settings.rate_hz
+        self._sync_lead_ns = settings.sync_lead_ns
+        self._controller = Controller(settings)
+        self._guard = guard
+        self._inputs = Inputs()
+        self._datagrams: list[bytes] = []
+        self._plant_buses = {core.name: InProcessBus(core, "plant", tx_queue=64) for core in self._cores}
+        self._crane, *more = (BusLink(InProcessBus(core, "controller")) for core in self._cores)
+        self._machine = more[0] if self._controller.carrier_bus and more else None
+        self._guard_bus = InProcessBus(self.core, "guard")
+        self._listeners = [InProcessBus(core, "recorder") for core in self._cores]
+        self._next_tick_ns = START_NS
+        self._sync: RawFrame | None = None
+
+    def advance(self) -> None:
+        """Advance the whole system by one slice."""
+        self.now_ns += SLICE_NS
+        for core in self._cores:
+            core.advance(self.now_ns)
+        self._record_buses()
+        received = [(name, frame) for name, bus in self._plant_buses.items() for frame in _drained(bus)]
+        for name, key, data in self.plant.step(self.now_ns, received):
+            self._plant_buses[name].send(key, data)
+        if self._sync is not None and self.now_ns >= self._next_tick_ns - self._sync_lead_ns:
+            self._crane.bus.send(*self._sync)
+            self._sync = None
+        if self.now_ns >= self._next_tick_ns:
+            self._next_tick_ns = self.now_ns + self._period_ns
+            self._tick()
+
+    def _tick(self) -> None:
+        for key, data in self._guard.step(self.now_ns, _drained(self._guard_bus)):
+            self._guard_bus.send(key, data)
+        inputs, machine = self._inputs, self._machine
+        self._crane.read(inputs.frames, inputs.bus)
+        if machine is not None:
+            machine.read(inputs.machine_frames, inputs.machine_bus)
+        inputs.datagrams[:] = self._datagrams
+        self._datagrams.clear()
+        outputs = step(self._controller, inputs, self.now_ns)
+        self.ticks += 1
+        self.frames += len(inputs.frames) + len(inputs.machine_frames)
+        self._crane.send(outputs.frames)
+        if machine is not None:
+            machine.send(outputs.machine_frames)
+        self._sync = outputs.sync
+        if self._observer.recorder:
+            self._observer.recorder.on_tick(record(inputs, outputs, self.now_ns))
+        report = None
+        if outputs.report is not None:
+            message = datagrams.decode(outputs.report, self._settings.key)
+            assert isinstance(message, StateReport)
+            report = self.report = message
+            if self._observer.recorder:
+                self._observer.recorder.on_report(outputs.report)
+            for hook in self._observer.on_report:
+                hook(report)
+            if press := self.operator.step(report):
+                self._datagrams.append(press)
+        if outputs.vehicle_report is not None:
+            vehicle = datagrams.decode(outputs.vehicle_report, self._settings.key)
+            assert isinstance(vehicle, VehicleReport)
+            self.vehicle_report = vehicle
+            if self._observer.recorder:
+                self._observer.recorder.on_report(outputs.vehicle_report)
+            for hook in self._observer.on_vehicle:
+                hook(vehicle)
+        requests = self.activity.step(self.now_ns, report, self._detect())
+        if requests:
+            self._datagrams.extend([requests] if isinstance(requests, bytes) else requests)
+
+    def _detect(self) -> tuple[LogObservation, ...]:
+        """The logs, four times per second: detected by a camera, or their true poses."""
+        if self.ticks % (self._settings.rate_hz // 4):
+            return ()
+        if self._detector is not None:
+            return self._detector.detect(self.report.position, self.now_ns) or () if self.report else ()
+        return tuple(
+            LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m)
+            for i, log in enumerate(detect(self.plant))
+        )
+
+    def _record_buses(self) -> None:
+        recorder = self._observer.recorder
+        for bus in self._listeners:
+            frames = _drained(bus)
+            if recorder:
+                for frame in frames:
+                    recorder.on_frame(bus.name, frame)
+
+
+def _drained(bus: InProcessBus) -> list[Frame]:
+    frames: list[Frame] = []
+    bus.drain(frames)
+    return frames

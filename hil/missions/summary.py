@@ -1,0 +1,53 @@
+"""The outcome of a mission, the same live and in lockstep."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from host.exit_codes import ExitCode
+
+
+@dataclass(frozen=True, slots=True)
+class MissionSummary:
+    """The outcome of a mission; ``in_bunk`` comes from the plant's physics, the rest from manager and controller."""
+
+    finished: bool
+    failure: str
+    logs: int
+    in_bunk: int
+    loaded: int
+    given_up: dict[int, str]
+    seconds: float
+    driven_m: float
+    stops: int
+    refused: int
+    states: tuple[tuple[float, str], ...]
+    directory: str
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """`ExitCode.OK` when the mission is finished and every log reported as loaded lies in the bunk."""
+        if self.finished and self.in_bunk == self.loaded:
+            return ExitCode.OK
+        return ExitCode.SAFETY_STOP if self.stops else ExitCode.FIGURE_MISSED
+
+    def show(self, console: Console) -> None:
+        """Print it for a person."""
+        mark = "[green]✔[/green]" if self.exit_code is ExitCode.OK else "[red]✘[/red]"
+        end = "The mission is finished" if self.finished else f"The mission ended early: {self.failure}"
+        console.print(f"{mark} {end}. {self.in_bunk} of {self.logs} logs lie in the bunk.", highlight=False)
+        for number, why in self.given_up.items():
+            console.print(f"  log {number} skipped: {why}", highlight=False, soft_wrap=True)
+        console.print(
+            f"  {self.seconds:.0f} s, {self.driven_m:.0f} m, {self.stops} stops, {self.refused} setpoints refused",
+            highlight=False,
+        )
+        console.print(f"  recording: {self.directory}", highlight=False, soft_wrap=True)
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON."""
+        path.write_text(json.dumps(asdict(self), indent=2) + "\n")

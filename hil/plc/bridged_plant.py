@@ -1,0 +1,79 @@
+"""The whole PLC path on virtual time with the interface of a plant: `hil.harness.lockstep` runs it as its plant.
+
+The path consists of the bridge (`controller.plc`), the wire format of either transport, and the emulated PLC
+(`sim.plc`).  Every 10 ms a command leaves as real bytes or registers; the PLC gets it one slice later, and the answer
+arrives another slice later, as on a quiet Ethernet.
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+from can_dbc.dbc.codec import load
+from can_dbc.frame import Frame
+from can_dbc.plc import map as plc
+from can_dbc.plc.datagram import Header, encode_reply
+from can_dbc.plc.modbus import RegisterRefused
+from controller.plc.bridge import EXCHANGE_NS, Bridge, role_of
+from machine.profile import Profile
+from sim.plc.plant import PlcPlant
+
+Transport = Literal["modbus", "udp"]
+_CLIENT: Final = 1
+
+
+class BridgedPlant(PlcPlant):
+    """A plant behind PLC and bridge; while ``cut`` is True, nothing passes the cable in either direction."""
+
+    def __init__(
+        self, profile: Profile, seed: int = 0, truth: str = "nominal", logs: int = 1, transport: Transport = "modbus"
+    ) -> None:
+        super().__init__(profile, seed, truth, logs, role=role_of(profile))
+        self.bridge = Bridge(profile, load("crane"))
+        self.cut = False
+        self._transport = transport
+        self._exchange_ns = 0
+        self._command: list[int] | bytes | None = None
+        self._answer: list[int] | bytes | None = None
+        self._replies = 0
+
+    def step(self, now_ns: int, received: list[tuple[str, Frame]]) -> list[tuple[str, int, bytes]]:
+        """Advance to ``now_ns`` like a plant; input and output are the bridge's frames."""
+        super().step(now_ns, [])
+        self._arrive(now_ns)
+        crane = self.profile.crane_bus
+        frames = [frame for bus, frame in received if bus == crane]
+        return [(crane, key, data) for key, data in self.bridge.step(now_ns, frames)]
+
+    def _arrive(self, now_ns: int) -> None:
+        """One slice of the cable: the answer reaches the bridge, the command reaches the PLC, a new command leaves."""
+        answer, self._answer = self._answer, None
+        command, self._command = self._command, None
+        shake = self.bridge.handshake
+        if self.cut:
+            answer = command = None
+        if isinstance(answer, list):
+            shake.take_registers(answer, now_ns)
+        elif answer is not None:
+            shake.take_datagram(answer, now_ns)
+        if command is not None:
+            self._answer = self._serve(command, now_ns)
+        if now_ns >= self._exchange_ns:
+            self._exchange_ns = now_ns + EXCHANGE_NS
+            wanted = self.bridge.command(now_ns)
+            self._command = (
+                shake.registers(wanted, now_ns) if self._transport == "modbus" else shake.datagram(wanted, now_ns)
+            )
+
+    def _serve(self, command: list[int] | bytes, now_ns: int) -> list[int] | bytes | None:
+        gate, feedback = self.plc.arbiter, self.plc.feedback
+        if isinstance(command, list):
+            try:
+                gate.write(_CLIENT, plc.COMMAND_AT, command, now_ns)
+            except RegisterRefused as refused:
+                self.bridge.handshake.refusal(refused.code)
+                return None
+            return self.plc.status()
+        gate.datagram(_CLIENT, command, now_ns)
+        self._replies += 1
+        return encode_reply(Header(self._replies, now_ns // 1000, gate.sequence), feedback)

@@ -1,0 +1,87 @@
+"""Reads a recording: its files, its manifest, the messages of a topic."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from host.exit_codes import CommandFailed, ExitCode
+from recorder.manifest import Manifest
+from recorder.mcap_scan import Channel, NotMcap, Stored, scan
+from recorder.recover import recover, run_files
+
+
+def files_of(log: Path) -> list[Path]:
+    """The MCAP files of a run's directory, or the one file; the end of a directory's recording is recovered first.
+
+    Raises:
+        CommandFailed: there is no recording.
+    """
+    if log.is_dir():
+        with contextlib.suppress(OSError):  # a directory that is not writable is read as it is
+            recover(log)
+        files = run_files(log)
+    else:
+        files = [log] if log.is_file() else []
+    if not files:
+        raise CommandFailed(
+            "recording.none",
+            f"{log} holds no recording; give a run's directory or its run.mcap",
+            ExitCode.CONFIGURATION,
+        )
+    return files
+
+
+def messages(files: list[Path], topic: str) -> Iterator[bytes]:
+    """The payloads of a topic, in recorded order.
+
+    Raises:
+        CommandFailed: not an MCAP file.
+    """
+    try:
+        for path in files:
+            for record in scan(path, {topic}):
+                if isinstance(record, Stored):
+                    yield record.data
+    except NotMcap as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
+
+
+def contents(files: list[Path]) -> dict[str, int]:
+    """Topic -> number of messages, for topics that have any.
+
+    Raises:
+        CommandFailed: not an MCAP file.
+    """
+    counts: Counter[str] = Counter()
+    try:
+        for path in files:
+            topics: dict[int, str] = {}
+            for record in scan(path):
+                if isinstance(record, Channel):
+                    topics[record.id] = record.topic
+                elif isinstance(record, Stored):
+                    counts[topics[record.channel_id]] += 1
+    except NotMcap as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
+    return dict(sorted(counts.items()))
+
+
+def manifest_of(files: list[Path]) -> Manifest:
+    """The manifest inside the recording.
+
+    Raises:
+        CommandFailed: there is none.
+    """
+    first = next(messages(files[:1], "/manifest"), None)
+    if first is None:
+        raise CommandFailed(
+            "recording.no-manifest",
+            f"{files[0]} has no manifest, so timberhand did not make this recording",
+            ExitCode.CONFIGURATION,
+        )
+    return msgspec.json.decode(first, type=Manifest)

@@ -1,0 +1,374 @@
+"""The doctor: facts from made-up /proc and /sys trees, what it makes of them, its output, and the tuning script."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from host.doctor import installation
+from host.doctor.facts import UNLIMITED, CanLink, Facts, cpu_set, read
+from host.doctor.finding import Finding, Severity, fine
+from host.doctor.show import show, verdict
+from host.doctor.timing import judge
+from machine.loading.profile_file import ProfileError
+
+ROOT = Path(__file__).parents[2]
+TUNE = ROOT / "deploy/tune.sh"
+GOOD = {
+    "proc/version": "Linux version 6.1.0-rt7 (gcc) #1 SMP PREEMPT_RT Debian",
+    "proc/sys/kernel/osrelease": "6.1.0-rt7",
+    "sys/kernel/realtime": "1",
+    "proc/cmdline": "isolcpus=managed_irq,domain,3 nohz_full=3 rcu_nocbs=3 quiet",
+    "proc/cpuinfo": "processor : 0\nflags\t\t: fpu tsc\n",
+    "proc/self/limits": "Max locked memory         8388608              unlimited            bytes\n"
+    "Max realtime priority     0                    95\n",
+    "proc/self/status": "Name:\tpython\nCapEff:\t0000000000000000\n",
+    "proc/self/timerslack_ns": "50000",
+    "proc/swaps": "Filename Type Size Used Priority\n",
+    "proc/sys/kernel/sched_rt_runtime_us": "950000",
+    "proc/sys/kernel/sched_rt_period_us": "1000000",
+    "proc/15/stat": f"15 (ksoftirqd/0) S 2 0 0 0 -1 {'0 ' * 9}-61 0 1 {'0 ' * 16}17 0 0 60 1 0 0",
+    "proc/901/stat": "901 (a (b) c) S 1 0",
+    "proc/irq/130/smp_affinity_list": "0-2",
+    "sys/devices/system/cpu/online": "0-3",
+    "sys/devices/system/cpu/isolated": "3",
+    "sys/devices/system/cpu/nohz_full": "3",
+    **{f"sys/devices/system/cpu/cpu{n}/cpufreq/scaling_governor": "performance" for n in range(4)},
+    "sys/devices/system/cpu/cpu3/topology/thread_siblings_list": "3",
+    "sys/devices/system/cpu/cpu3/cpuidle/state0/name": "POLL",
+    "sys/devices/system/cpu/cpu3/cpuidle/state0/latency": "0",
+    "sys/devices/system/cpu/cpu3/cpuidle/state1/name": "C10",
+    "sys/devices/system/cpu/cpu3/cpuidle/state1/latency": "890",
+    "sys/devices/system/cpu/cpu3/cpuidle/state1/disable": "1",
+    "sys/devices/system/clocksource/clocksource0/current_clocksource": "tsc",
+    "sys/kernel/mm/transparent_hugepage/enabled": "always [madvise] never",
+    "sys/devices/pci0/can0-device/msi_irqs/130": "",
+    "dev/cpu_dma_latency": "",
+    "etc/timberhand/timberhand.conf": "# as in CONTROLLER_OPTIONS=--cpu 7\nCONTROLLER_OPTIONS=--spin-us 120 --cpu 3\n",
+}
+LINKS: list[dict[str, Any]] = [
+    {"ifname": "lo", "link_type": "loopback"},
+    {
+        "ifname": "crane0", "flags": ["NOARP", "UP"], "link_type": "can", "txqlen": 32,
+        "linkinfo": {
+            "info_kind": "can",
+            "info_data": {"state": "ERROR-ACTIVE", "berr_counter": {"tx": 0, "rx": 0}, "restart_ms": 100,
+                          "bittiming": {"bitrate": 1000000}},
+            "info_xstats": {"restarts": 0, "bus_error": 0, "error_passive": 0, "bus_off": 0},
+        },
+    },
+]  # fmt: skip
+Tree = Callable[..., Facts]
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Tree:
+    """Facts of a good computer with some files changed (None: absent)."""
+
+    def make(links: list[dict[str, Any]] = LINKS, cpu: int | None = None, **changed: str | None) -> Facts:
+        files = {**GOOD, **{name.replace("__", "/"): text for name, text in changed.items()}}
+        for name, text in files.items():
+            path = tmp_path / name
+            path.unlink(missing_ok=True)
+            if text is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text + "\n")
+        device = tmp_path / "sys/class/net/crane0/device"
+        if not device.is_symlink():
+            device.parent.mkdir(parents=True)
+            device.symlink_to("../../../devices/pci0/can0-device")
+        return read(tmp_path, json.dumps(links), cpu)
+
+    return make
+
+
+def of(facts: Facts, what: str) -> Finding:
+    return next(finding for finding in judge(facts) if finding.what == what)
+
+
+# ------------------------------------------------------------------------------- facts
+def test_a_well_tuned_computer_is_read_and_nothing_is_found(tree: Tree) -> None:
+    facts = tree()
+    assert (facts.preemption, facts.machine, facts.control_cpu) == ("rt", "", 3)
+    assert (facts.isolated, facts.tickless, facts.rcu_offloaded) == ({3}, {3}, {3})
+    assert (facts.rtprio_limit, facts.memlock_limit) == (95, UNLIMITED)
+    assert facts.softirq_threads == {0: "FIFO 60"}
+    assert facts.links[0].interrupts == (130,)
+    assert facts.links[0].interrupt_cpus == {0, 1, 2}
+    assert [f for f in judge(facts) if f.severity is not Severity.FINE] == []
+
+
+def test_an_empty_tree_is_unknown_and_no_error(tmp_path: Path) -> None:
+    facts = read(tmp_path)
+    assert (facts.preemption, facts.rt_runtime_us, facts.links) == ("", None, ())
+    assert all(finding.sentence for finding in judge(facts))
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"), [("0-2,5", {0, 1, 2, 5}), ("managed_irq,domain,3", {3}), ("", set()), ("7\n", {7})]
+)
+def test_a_list_of_processors(text: str, numbers: set[int]) -> None:
+    assert cpu_set(text) == numbers
+
+
+@pytest.mark.parametrize(
+    ("version", "chosen", "expected"),
+    [
+        ("#1 SMP PREEMPT_DYNAMIC Debian", "none voluntary (full) lazy", "full"),
+        ("#1 SMP PREEMPT_DYNAMIC Debian", None, "dynamic"),
+        ("#1 SMP PREEMPT Debian", None, "full"),
+        ("#1 SMP Debian", None, ""),
+    ],
+)
+def test_preemption_is_read_where_the_kernel_tells_it(
+    tree: Tree, version: str, chosen: str | None, expected: str
+) -> None:
+    changes = {"proc__version": version, "sys__kernel__realtime": None, "sys__kernel__debug__sched__preempt": chosen}
+    assert tree(**changes).preemption == expected
+
+
+# ------------------------------------------------------------------------------- findings
+CASES: list[tuple[str, dict[str, str | None], Severity, str, str]] = [
+    ("priority", {"proc__self__limits": "Max realtime priority  0  0\n"}, Severity.CHANGE, "priority 0", "rtprio 90"),
+    ("memory", {"proc__self__limits": "Max locked memory  65536  65536\n"}, Severity.CHANGE, "64 kB", "memlock"),
+    ("kernel", {"proc__version": "#1 SMP PREEMPT Debian", "sys__kernel__realtime": "0"}, Severity.CHANGE,
+     "preempts 'full'", "linux-image-rt-amd64"),
+    ("machine", {"proc__cpuinfo": "flags : fpu hypervisor"}, Severity.ADVICE, "virtual machine", ""),
+    ("clock rate", {"sys__devices__system__cpu__cpu3__cpufreq__scaling_governor": "powersave"}, Severity.CHANGE,
+     "processor 3 is 'powersave'", "tune.sh --apply --cpu 3"),
+    ("processor", {"sys__devices__system__cpu__isolated": ""}, Severity.CHANGE, "so may everything else",
+     "isolcpus=managed_irq,domain,3"),
+    ("processor", {"sys__devices__system__cpu__nohz_full": "", "proc__cmdline": "rcu_nocbs=3"}, Severity.ADVICE,
+     "not by nohz_full", "nohz_full=3"),
+    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=\n"}, Severity.ADVICE, "kept free",
+     "CONTROLLER_OPTIONS=--cpu 3"),
+    ("processor", {"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=--cpu 9\n"}, Severity.CHANGE, "not there",
+     "nano"),
+    ("sibling", {"sys__devices__system__cpu__cpu3__topology__thread_siblings_list": "1,3"}, Severity.ADVICE,
+     "processor 1", "cpu1/online"),
+    ("interrupts", {"proc__irq__130__smp_affinity_list": "0-3"}, Severity.CHANGE, "interrupt 130 of crane0", "tune.sh"),
+    ("irqbalance", {"proc__901__stat": "901 (irqbalance) S 1", "sys__devices__system__cpu__isolated": ""},
+     Severity.CHANGE, "processor 3 at any time", "IRQBALANCE_BANNED_CPULIST=3"),
+    ("sleep", {"sys__devices__system__cpu__cpu3__cpuidle__state1__disable": "0"}, Severity.ADVICE, "C10 takes 890 us",
+     "--dma-latency"),
+    ("delivery", {"proc__15__stat": GOOD["proc/15/stat"].replace(" 60 1 ", " 0 0 ")}, Severity.ADVICE, "wait behind",
+     "chrt"),
+    ("throttling", {"proc__sys__kernel__sched_rt_runtime_us": "-1"}, Severity.ADVICE, "nothing stops", "950000"),
+    ("throttling", {"proc__sys__kernel__sched_rt_runtime_us": "500000"}, Severity.CHANGE, "50%", "tune.sh"),
+    ("clock", {"sys__devices__system__clocksource__clocksource0__current_clocksource": "hpet"}, Severity.CHANGE,
+     "hpet", "dmesg"),
+    ("huge pages", {"sys__kernel__mm__transparent_hugepage__enabled": "[always] madvise never"}, Severity.ADVICE,
+     "every", "tune.sh"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("what", "changes", "severity", "sentence", "command"), CASES)
+def test_what_is_wrong_is_said_with_its_command(
+    tree: Tree, what: str, changes: dict[str, str | None], severity: Severity, sentence: str, command: str
+) -> None:
+    found = of(tree(**changes), what)
+    assert found.severity is severity
+    assert sentence in found.sentence
+    assert command in "\n".join(found.commands)
+    assert found.gain
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"proc__self__status": "CapEff:\t000001ffffffffff", "proc__self__limits": ""}, "priority"),
+        ({"usr__lib__systemd__system__timberhand-controller.service": "LimitRTPRIO=80\nLimitMEMLOCK=infinity\n",
+          "proc__self__limits": ""}, "memory"),
+        ({"etc__timberhand__timberhand.conf": "CONTROLLER_OPTIONS=--dma-latency --cpu 3\n",
+          "sys__devices__system__cpu__cpu3__cpuidle__state1__disable": "0"}, "sleep"),
+        ({"proc__901__stat": "901 (irqbalance) S 1", "etc__default__irqbalance": "IRQBALANCE_BANNED_CPULIST=2-3"},
+         "irqbalance"),
+    ],
+)  # fmt: skip
+def test_what_is_granted_in_another_way_is_fine(tree: Tree, changes: dict[str, str | None], what: str) -> None:
+    assert of(tree(**changes), what).severity is Severity.FINE
+
+
+@pytest.mark.parametrize(
+    ("change", "severity", "sentence"),
+    [
+        ({"up": False}, Severity.CHANGE, "down"),
+        ({"state": "ERROR-PASSIVE"}, Severity.CHANGE, "ERROR-PASSIVE"),
+        ({"counters": {"bus_off": 2}}, Severity.CHANGE, "bus_off 2"),
+        ({"restart_ms": 0}, Severity.ADVICE, "for ever"),
+        ({"virtual": True}, Severity.FINE, "virtual"),
+    ],
+)
+def test_how_a_can_interface_is(tree: Tree, change: dict[str, Any], severity: Severity, sentence: str) -> None:
+    facts = tree()
+    link: CanLink = replace(facts.links[0], **change)
+    found = of(replace(facts, links=(link,)), "CAN crane0")
+    assert (found.severity, sentence in found.sentence) == (severity, True)
+
+
+def test_the_greatest_gain_comes_first(tree: Tree) -> None:
+    names = [finding.what for finding in judge(tree())]
+    assert names[:3] == ["priority", "memory", "kernel"]
+    assert names[-1] == "CAN crane0"
+
+
+# ------------------------------------------------------------------------------- installation
+def test_this_installation_is_sane() -> None:
+    assert [f for f in installation.examine() if f.severity is Severity.FAULT] == []
+
+
+def test_a_profile_that_does_not_load_is_in_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(name: str) -> None:
+        raise ProfileError(f"{name}: rate_hz is missing")
+
+    monkeypatch.setattr(installation, "load_profile", broken)
+    assert {f.severity for f in installation.profiles()} == {Severity.FAULT}
+
+
+def test_a_package_that_is_missing_is_in_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    needs = ["no-such-thing>=1", "typer>=999", "pybullet; extra == 'sim'", "nor-this-one; extra == 'sim'"]
+    monkeypatch.setattr(installation.metadata, "requires", lambda _: needs)
+    base, sim = installation.packages()
+    assert (base.severity, sim.severity) == (Severity.FAULT, Severity.ADVICE)
+    assert "no-such-thing" in base.sentence
+    assert "typer >=999 (is " in base.sentence
+    assert "nor-this-one" in sim.sentence
+
+
+# ------------------------------------------------------------------------------- output
+def test_the_terminal_shows_what_to_change_before_what_is_fine(capsys: pytest.CaptureFixture[str]) -> None:
+    bad = Finding("clock", Severity.CHANGE, "it is slow", "it is fast", ("sudo make it [fast]",))
+    show(Console(width=60, highlight=False), "timing", [fine("kernel", "is there"), bad])
+    said = capsys.readouterr().out
+    assert said.index("clock: it is slow") < said.index("gained: it is fast") < said.index("$ sudo make it [fast]")
+    assert said.index("$ sudo") < said.index("kernel")
+
+
+@pytest.mark.parametrize(
+    ("severities", "words"),
+    [
+        ([Severity.FINE], "All is well."),
+        ([Severity.FINE, Severity.ADVICE], "All is well; one thing could be better"),
+        ([Severity.CHANGE, Severity.CHANGE, Severity.ADVICE], "It runs; 2 things should be changed"),
+        ([Severity.FAULT, Severity.CHANGE], "one thing in the way"),
+    ],
+)
+def test_the_last_line_says_how_it_stands(severities: list[Severity], words: str) -> None:
+    assert verdict([Finding("x", severity, "y") for severity in severities]).startswith(words)
+
+
+@pytest.mark.slow
+def test_the_command_answers_in_json() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "timberhand", "doctor", "--rt", "--json"], cwd=ROOT, capture_output=True, text=True
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert set(told) == {"installation", "timing"}
+    assert {f["severity"] for group in told.values() for f in group} <= {"fine", "advice", "change"}
+    assert set(told["timing"][0]) == {"what", "severity", "sentence", "gain", "commands"}
+
+
+# ------------------------------------------------------------------------------- tune.sh
+@pytest.fixture
+def computer(tmp_path: Path) -> Path:
+    """A made-up tree that can be tuned."""
+    files = {
+        **{f"sys/devices/system/cpu/cpu{n}/cpufreq/scaling_governor": "powersave" for n in range(4)},
+        "sys/devices/system/cpu/online": "0-3",
+        "sys/devices/system/cpu/isolated": "",
+        "sys/devices/system/cpu/cpu3/cpuidle/state0/latency": "2",
+        "sys/devices/system/cpu/cpu3/cpuidle/state0/disable": "0",
+        "sys/devices/system/cpu/cpu3/cpuidle/state1/latency": "890",
+        "sys/devices/system/cpu/cpu3/cpuidle/state1/disable": "0",
+        "sys/kernel/mm/transparent_hugepage/enabled": "[always] madvise never",
+        "sys/devices/virtual/workqueue/cpumask": "0f",
+        "proc/sys/kernel/sched_rt_runtime_us": "500000",
+        "proc/irq/130/smp_affinity_list": "0-3",
+        "proc/irq/131/smp_affinity_list": "1",
+        "run/.keep": "",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text + "\n")
+    return tmp_path
+
+
+def tune(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["sh", str(TUNE), "--root", str(root), *words], capture_output=True, text=True)
+
+
+def contents(root: Path) -> dict[str, str]:
+    return {str(p.relative_to(root)): p.read_text() for p in root.rglob("*") if p.is_file()}
+
+
+@pytest.mark.slow
+def test_tuning_is_shown_done_once_and_undone(computer: Path) -> None:
+    before = contents(computer)
+    shown = tune(computer, "--cpu", "3")
+    assert shown.returncode == 0, shown.stderr
+    assert contents(computer) == before
+    assert "cpu3/cpufreq/scaling_governor: powersave -> performance" in shown.stdout
+    assert "isolcpus=managed_irq,domain,3 nohz_full=3 rcu_nocbs=3 irqaffinity=0-2" in shown.stdout
+    assert "not PREEMPT_RT" in shown.stderr
+
+    assert tune(computer, "--cpu", "3", "--apply").returncode == 0
+    after = contents(computer)
+    changed = {name: text.strip() for name, text in after.items() if before.get(name) != text}
+    del changed["run/timberhand-tune"]
+    assert changed == {
+        "sys/devices/system/cpu/cpu3/cpufreq/scaling_governor": "performance",
+        "sys/devices/system/cpu/cpu3/cpuidle/state1/disable": "1",
+        "sys/kernel/mm/transparent_hugepage/enabled": "madvise",
+        "sys/devices/virtual/workqueue/cpumask": "07",
+        "proc/sys/kernel/sched_rt_runtime_us": "950000",
+        "proc/irq/130/smp_affinity_list": "0-2",
+        "proc/irq/131/smp_affinity_list": "0-2",
+    }
+    again = tune(computer, "--cpu", "3", "--apply")
+    assert "is now" not in again.stderr
+    assert contents(computer) == after
+
+    (computer / "proc/irq/130/smp_affinity_list").write_text("1\n")  # somebody moves it: what was first is kept
+    assert tune(computer, "--cpu", "3", "--apply").returncode == 0
+    assert tune(computer, "--undo").returncode == 0
+    undone = contents(computer)
+    name = "sys/kernel/mm/transparent_hugepage/enabled"  # the kernel takes the word alone and shows it in brackets
+    assert (undone.pop(name), before.pop(name)) == ("always\n", "[always] madvise never\n")
+    assert undone == before
+    assert "nothing was changed" in tune(computer, "--undo").stderr
+
+
+@pytest.mark.slow
+def test_without_a_processor_only_what_serves_all_is_changed(computer: Path) -> None:
+    assert tune(computer, "--apply").returncode == 0
+    governors = [p.read_text() for p in sorted(computer.glob("sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"))]
+    assert governors == ["performance\n"] * 4
+    assert (computer / "proc/irq/130/smp_affinity_list").read_text() == "0-3\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [(["--cpu", "9"], "there is no processor 9"), (["--cpu", "x"], "no number"), (["--fast"], "no option --fast")],
+)
+def test_what_cannot_be_tuned_is_refused(computer: Path, words: list[str], sentence: str) -> None:
+    done = tune(computer, *words)
+    assert (done.returncode, sentence in done.stderr) == (2, True)
+
+
+@pytest.mark.slow
+def test_the_scripts_are_clean() -> None:
+    if not any(Path(folder, "shellcheck").exists() for folder in os.get_exec_path()):
+        pytest.skip("shellcheck is missing (apt-get install shellcheck)")
+    scripts = [TUNE, ROOT / "deploy/lab_kernel/build.sh"]
+    done = subprocess.run(["shellcheck", *scripts], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout

@@ -1,0 +1,95 @@
+"""``timberhand plan``: what it says of good and of bad files, its JSON, its exit codes, its pictures."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from runtime.plot_style import MOSS, OIL, RUST, TIMBER
+from host.exit_codes import CommandFailed, ExitCode
+from timberhand.cli import app
+
+EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
+PAPER_B = str(EXAMPLES / "paper_b.geojson")
+
+
+def run(*arguments: str | Path) -> Any:
+    """The result of a ``timberhand plan`` command."""
+    return CliRunner().invoke(app, ["plan", *map(str, arguments)], env={"COLUMNS": "200"})
+
+
+def stopped(*arguments: str | Path) -> CommandFailed:
+    """Why a command ended."""
+    error = run(*arguments).exception
+    assert isinstance(error, CommandFailed)
+    return error
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.iterdir()))
+def test_every_shipped_example_is_fine(name: str) -> None:
+    result = run("check", EXAMPLES / name)
+    assert result.exit_code == 0 and name in result.output
+
+
+def test_check_in_words_and_as_json() -> None:
+    said = run("check", PAPER_B).output
+    assert "4 waypoints, 1 fence, 12 logs" in said and "250.0 m in 2 laps" in said and "24 logs" in said
+    facts = json.loads(run("check", PAPER_B, "--json").output)
+    assert (facts["waypoints"], facts["laps"], facts["logs"], facts["logs_to_fetch"]) == (4, 2, 12, 24)
+    assert facts["length_m"] == pytest.approx(250.0, abs=0.05) and len(facts["corners"]) == 4
+
+
+def test_a_bad_mission_ends_with_its_line_and_exit_code_3(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.gpx"
+    bad.write_text('<gpx><rte>\n<rtept lat="19.9" lon="63.66"/>\n<rtept lat="19.901" lon="63.66"/></rte></gpx>')
+    error = stopped("check", bad)
+    assert error.exit_code == ExitCode.CONFIGURATION
+    assert str(error).startswith(f"{bad}: the mission is ") and "longitude and latitude look swapped" in str(error)
+    result = run("check", bad, "--json")
+    assert result.exit_code == ExitCode.CONFIGURATION and "look swapped" in json.loads(result.output)["problems"][0]
+
+
+def test_strict_makes_warnings_fail() -> None:
+    assert run("check", EXAMPLES / "route.gpx").exit_code == 0
+    assert run("check", EXAMPLES / "route.gpx", "--strict").exit_code == ExitCode.CONFIGURATION
+
+
+def test_a_machine_that_does_not_drive_or_is_unknown() -> None:
+    assert "does not drive" in str(stopped("check", PAPER_B, "--profile", "palms_471"))
+    assert stopped("check", PAPER_B, "--profile", "none").exit_code == ExitCode.CONFIGURATION
+
+
+def test_convert_with_a_harvest(tmp_path: Path) -> None:
+    out = tmp_path / "m.geojson"
+    said = run("convert", EXAMPLES / "site.kml", out, "--logs", EXAMPLES / "harvest.hpr").output
+    assert "3 waypoints, 2 fences, 1 landing, 7 logs" in said
+    assert json.loads(run("check", out, "--json").output)["logs"] == 7
+    assert stopped("convert", PAPER_B, tmp_path / "m.kml").exit_code == ExitCode.USAGE
+    assert "cannot be written" in str(stopped("convert", PAPER_B, tmp_path / "no" / "m.geojson"))
+
+
+def test_show_draws_everything(tmp_path: Path) -> None:
+    logs = EXAMPLES / "harvest.hpr"
+    assert run("show", EXAMPLES / "site.kml", "--logs", logs, "--png", tmp_path / "a.png").exit_code == 0
+    with Image.open(tmp_path / "a.png") as picture:
+        inks = {color for _, color in picture.convert("RGB").getcolors(1 << 20)}
+    assert {OIL, MOSS, RUST, TIMBER} <= {f"#{r:02x}{g:02x}{b:02x}" for r, g, b in inks}  # route, fence, keep-out, logs
+    assert stopped("show", PAPER_B, "--png", tmp_path / "a.jpg").exit_code == ExitCode.USAGE
+
+
+def test_show_of_logs_alone(tmp_path: Path) -> None:
+    assert run("show", EXAMPLES / "harvest.hpr", "--png", tmp_path / "logs.png").exit_code == 0
+
+
+def test_help_loads_nothing_heavy() -> None:
+    heavy = ("numpy", "pymap3d", "matplotlib", "msgspec")
+    code = f"import sys, timberhand.cli; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

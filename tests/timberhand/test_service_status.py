@@ -1,0 +1,167 @@
+"""``timberhand service status``: what systemd's properties mean, and a screen that fits."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from can_dbc.timing.page import Timing, TimingWriter
+from timberhand.cli import app
+from timberhand.service_status import status
+from timberhand.service_status.screen import duration, number, screen
+from timberhand.service_status.status import Look, Unit, look, read_unit, worst_first
+
+S = 1_000_000_000
+Timings = Callable[..., Timing]
+
+
+def unit(**found: str) -> Unit:
+    usual = {
+        "Id": "timberhand-guard.service", "Type": "notify", "LoadState": "loaded", "ActiveState": "active",
+        "SubState": "running", "Result": "success", "ExecMainStatus": "0", "NRestarts": "2", "StatusText": "Well.",
+        "StateChangeTimestampMonotonic": "40000000", "ExecMainExitTimestampMonotonic": "0",
+    }  # fmt: skip
+    return read_unit(usual | found, 100.0)
+
+
+def shown(found: Look, width: int, before: Timing | None = None) -> str:
+    console = Console(width=width, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(screen(found, before))
+    return console.export_text()
+
+
+def test_a_running_unit() -> None:
+    assert unit() == Unit("guard", "running", "", 60.0, 2, "Well.")
+
+
+@pytest.mark.parametrize(
+    ("found", "state", "why"),
+    [
+        ({"ActiveState": "activating", "SubState": "start"}, "starting", ""),
+        ({"LoadState": "not-found", "ActiveState": "inactive", "SubState": "dead"}, "not installed", ""),
+        ({"ActiveState": "inactive", "SubState": "dead"}, "stopped", ""),
+        ({"ActiveState": "inactive", "SubState": "dead", "Result": "exec-condition"}, "not configured", ""),
+        ({"ActiveState": "inactive", "SubState": "dead", "ExecMainExitTimestampMonotonic": "9"}, "stopped", ""),
+        (
+            {"ActiveState": "inactive", "SubState": "dead", "ExecMainExitTimestampMonotonic": "9", "Type": "oneshot"},
+            "done",
+            "",
+        ),
+        (
+            {"ActiveState": "failed", "SubState": "failed", "Result": "exit-code", "ExecMainStatus": "3"},
+            "failed",
+            "exit status 3, configuration",
+        ),
+        (
+            {"ActiveState": "failed", "SubState": "failed", "Result": "exit-code", "ExecMainStatus": "77"},
+            "failed",
+            "exit status 77",
+        ),
+        (
+            {"ActiveState": "activating", "SubState": "auto-restart", "Result": "watchdog", "ExecMainStatus": "9"},
+            "restarting",
+            "it hung, and the watchdog ended it",
+        ),
+        (
+            {"ActiveState": "activating", "SubState": "auto-restart", "Result": "signal", "ExecMainStatus": "11"},
+            "restarting",
+            "killed by signal 11",
+        ),
+    ],
+)
+def test_what_systemd_means(found: dict[str, str], state: str, why: str) -> None:
+    seen = unit(**found)
+    assert (seen.state, seen.why) == (state, why)
+
+
+def test_a_unit_that_failed_in_silence_says_its_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(status, "last_words", lambda name: f"{name}: no such bus")
+    failed = {"ActiveState": "failed", "Result": "exit-code", "ExecMainStatus": "4", "StatusText": ""}
+    assert unit(**failed).words == "timberhand-guard.service: no such bus"
+    assert unit(StatusText="").words == "", "not of one that runs"
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_the_screen_fits_and_cuts_nothing(timing: Timings, width: int) -> None:
+    units = (Unit("controller", "failed", "exit status 4, bus", 3 * 86400.0, 12, "A sentence " * 12), unit())
+    text = shown(Look(units, timing(missed=3), ("A note.",)), width, timing(50))
+    assert "…" not in text and max(map(len, text.splitlines())) <= width
+    for words in (
+        "failed (exit status 4, bus)",
+        "3 d 0 h",
+        "STANDBY",
+        "missed 3",
+        "sample to command",
+        "DOWN",
+        "A note.",
+    ):
+        assert words in " ".join(text.split()), words
+    assert len(text.splitlines()) <= 50
+
+
+def test_the_worst_input_comes_first_and_what_never_came_is_told(timing: Timings) -> None:
+    assert [name for name, _ in worst_first(list(timing().facts.inputs.items()))][:2] == ["Input6", "Input5"]
+    text = shown(Look((), timing(), ()), 80)
+    assert text.index("Input6") < text.index("Input5") < text.index("Input3")
+    assert "Input2" not in text and "3 better ones" in text and "never came: Never" in text
+
+
+def test_an_old_page_says_so(timing: Timings) -> None:
+    assert "hangs or has ended" not in shown(Look((), timing(), ()), 80)
+    assert "It has said nothing for 12 s: it hangs or has ended." in shown(
+        Look((), timing(written_ns=time.monotonic_ns() - 12 * S), ()), 80
+    )
+
+
+def test_the_last_second_stands_beside_all_time(timing: Timings) -> None:
+    before, now = timing(100, started_ns=5), timing(300, started_ns=5)
+    text = shown(Look((), now, ()), 100, before)
+    assert "now p99" in text and "ticks 300 (+200)" in text
+    another_life = shown(Look((), timing(300, started_ns=6), ()), 100, before)
+    assert "now p99" not in another_life
+
+
+def test_without_systemd_there_is_the_page_alone(
+    timing: Timings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(status, "SYSTEMD", tmp_path / "nothing")
+    page = tmp_path / "page"
+    writer = TimingWriter(page)
+    written = timing(10)
+    writer.publish(written.facts, written.durations)
+    seen = look(page)
+    assert (
+        seen.units == () and not seen.silent and seen.notes == ("systemd does not run here, so no service is shown.",)
+    )
+    done = CliRunner().invoke(app, ["service", "status", "--json", "--timing", str(page)])
+    said = json.loads(done.stdout)
+    assert said["timing"]["pid"] == 4711 and said["timing"]["durations"]["wake"]["p50_us"] == pytest.approx(
+        10.0, abs=1.0
+    )
+    assert said["timing"]["silent"] is False and said["units"] == []
+    assert "longest_ns" not in said["timing"]
+    writer.close()
+
+
+def test_nothing_at_all_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(status, "SYSTEMD", tmp_path / "nothing")
+    done = CliRunner().invoke(app, ["service", "status", "--timing", str(tmp_path / "page")])
+    assert done.exit_code != 0
+    assert "No controller tells its timing" in str(done.exception)
+
+
+def test_numbers_and_durations() -> None:
+    assert number(1_234_567) == "1\N{NO-BREAK SPACE}234\N{NO-BREAK SPACE}567"
+    assert [duration(s) for s in (0.44, 59.0, 61.0, 7384.0, 90000.0)] == [
+        "0.4 s",
+        "59 s",
+        "1 min 1 s",
+        "2 h 3 min",
+        "1 d 1 h",
+    ]

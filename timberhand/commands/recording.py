@@ -1,0 +1,89 @@
+"""``timberhand log``: recorded CAN traffic in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="Read recorded CAN logs.")
+
+
+@app.callback()
+def group() -> None:
+    """Keeps ``decode`` a subcommand while it is the only one."""
+
+
+@app.command(
+    epilog="Examples:  timberhand log decode drive.log --dbc gnss  ·  "
+    "timberhand log decode crane.blf --dbc crane --json"
+)
+def decode(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="candump, PCAN-View or YDWG text, .asc, .blf.")],
+    dbc: Annotated[
+        list[str] | None,
+        typer.Option("--dbc", metavar="FILE", help="DBC or KCD path, or crane, machine, gnss; may be repeated."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="The counts only.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+) -> None:
+    """Decode LOG with one or more databases (by default all shipped ones), fast packets included.
+
+    Broken lines are counted, never fatal; a frame out of range or with a bad CRC is shown and counted.
+    """
+    import json
+
+    from can_dbc.dbc.codec import SHIPPED, DbcError
+    from can_dbc.trace.candump import read
+    from can_dbc.trace.decoder import Decoder
+    from host.exit_codes import CommandFailed, ExitCode
+
+    try:
+        decoder = Decoder(dbc or list(SHIPPED))
+        records = read(log)
+    except DbcError as error:
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
+    except OSError as error:
+        raise CommandFailed(
+            "recording.unreadable", f"{log}: cannot be read: {error.strerror}", ExitCode.CONFIGURATION
+        ) from error
+    if as_json:
+        separator = '{"frames": ['
+        for entry in decoder.run(records):
+            if not quiet:
+                typer.echo(separator + json.dumps(entry.as_dict(), allow_nan=False))
+                separator = ","
+        head = separator if separator != "," else ""
+        typer.echo(f'{head}], "summary": {json.dumps(decoder.summary())}}}')
+        return
+    _print(decoder, records, quiet)
+
+
+def _print(decoder, records, quiet: bool) -> None:  # type: ignore[no-untyped-def]
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console(soft_wrap=True, highlight=False)
+    for entry in decoder.run(records):
+        if not quiet:
+            mark = f"  [red]{escape(entry.fault)}[/red]" if entry.fault else ""
+            name = escape(f"{entry.name:<20}")
+            stamp = f"{entry.stamp_ns / 1e9:17.6f}"
+            console.print(f"[dim]{stamp} {entry.identifier:>8}[/dim] [cyan]{name}[/cyan] {escape(entry.text())}{mark}")
+    summary = decoder.summary()
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    table.add_column("message")
+    table.add_column("frames", justify="right")
+    for name, count in summary["messages"].items():
+        table.add_row(escape(name), str(count))
+    console.print(table)
+    console.print(
+        f"{summary['frames']} frames, {summary['decoded']} messages decoded, {summary['unknown']} frames unknown, "
+        f"{summary['refused']} refused, {summary['bad_crc']} with a bad CRC, "
+        f"{summary['error_frames']} error frames, "
+        f"{summary['lost_fast_packets']} fast packets lost, {summary['broken']} broken lines"
+    )
+    for text in summary["broken_examples"]:
+        console.print(f"[yellow]broken[/yellow] {escape(text)}")

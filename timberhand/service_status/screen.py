@@ -1,0 +1,185 @@
+"""One screen for a technician: the services, and the controller's timing.  Fits terminals from 60 columns on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from can_dbc.timing.durations import Durations
+from can_dbc.timing.page import Facts, Timing
+from timberhand.service_status.status import Look, Unit, worst_first
+
+STATE_STYLES: Final = {"running": "green", "done": "green", "failed": "bold red", "restarting": "bold red"}
+MODE_STYLES: Final = {"FAULT": "bold red", "STOP": "bold red", "ACTIVE": "bold green", "ARMED": "bold green"}
+WHOLE: Final = {
+    "wake": "wake-up late", "sync": "SYNC late", "tick": "tick", "cpu": "tick, CPU",
+    "sample_to_command": "sample to command",
+}  # fmt: skip
+"""What gets a row of its own; the stages of the tick share a line."""
+INPUTS: Final = 4
+"""So many inputs are shown, the worst first; all of them are in the JSON."""
+
+
+def screen(now: Look, before: Timing | None = None) -> RenderableType:
+    """Everything; with a former page ``before`` also what came since."""
+    parts: list[RenderableType] = []
+    if now.units:
+        parts += [_units(now.units), Text()]
+    if now.timing is not None:
+        if before is not None and before.facts.started_ns != now.timing.facts.started_ns:
+            before = None  # a former life
+        parts += _timing(now.timing, before, now.silent)
+    parts += [Text(note, style="yellow") for note in now.notes]
+    return Group(*parts)
+
+
+def _table(*columns: str, title: str = "", words: int = 1) -> Table:
+    """A plain table; all columns but the first ``words`` hold numbers."""
+    table = Table(
+        title=title or None, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1)
+    )
+    for i, name in enumerate(columns):
+        table.add_column(name, justify="left" if i < words else "right", no_wrap=i >= words, header_style="dim")
+    return table
+
+
+def _units(units: tuple[Unit, ...]) -> Table:
+    table = _table("service", "since", "restarts")
+    table.add_column("", overflow="fold", ratio=1)
+    for unit in units:
+        state = Text(unit.state, style=STATE_STYLES.get(unit.state, "yellow"))
+        if unit.why:
+            state.append(f" ({unit.why})")
+        if unit.words:
+            state.append(f": {unit.words}", style="default")
+        since = "" if unit.since_s is None else duration(unit.since_s)
+        table.add_row(unit.name, since, str(unit.restarts or ""), state)
+    return table
+
+
+def _timing(timing: Timing, before: Timing | None, silent: bool) -> list[RenderableType]:
+    facts = timing.facts
+    old_s = timing.age_ns * 1e-9
+    head = Text.assemble(
+        "controller ", (facts.mode, MODE_STYLES.get(facts.mode, "bold")),
+        f", {1e9 / facts.period_ns:.0f} Hz for {duration((facts.written_ns - facts.started_ns) * 1e-9)}",
+        f", process {facts.pid}",
+    )  # fmt: skip
+    parts: list[RenderableType] = [head, Text(facts.words)]
+    if silent:
+        parts.append(Text(f"It has said nothing for {duration(old_s)}: it hangs or has ended.", style="bold red"))
+    parts += [Text(), _counters(facts, before.facts if before else None), Text()]
+    parts += [
+        _durations(timing, before),
+        Text(),
+        _inputs(facts),
+        Text(),
+        _buses(facts),
+        Text(),
+        _process(facts, before),
+    ]
+    return [*parts, Text()] if silent else parts
+
+
+def _counters(facts: Facts, before: Facts | None) -> Text:
+    def count(name: str, of: Callable[[Facts], int], bad: bool) -> tuple[str, str]:
+        grown = f" (+{number(of(facts) - of(before))})" if before else ""
+        wrong = bad and (of(facts) - of(before) if before else of(facts))
+        return f"{name} {number(of(facts))}{grown}", "bold yellow" if wrong else ""
+
+    return Text.assemble(
+        count("ticks", lambda f: f.ticks, False), " · ",
+        count("missed", lambda f: f.missed, True), " · ",
+        count("late", lambda f: f.late, True),
+    )  # fmt: skip
+
+
+def _durations(timing: Timing, before: Timing | None) -> RenderableType:
+    columns = ["µs", "p50", "p99", "p99.9", "max"]
+    table = _table(*columns, *(["now p99", "now max"] if before else []))
+    for name, word in WHOLE.items():
+        found = timing.durations[name]
+        if not found.count:
+            continue
+        row = [*(_us(found, share) for share in (0.5, 0.99, 0.999)), number(found.longest_ns // 1000)]
+        if before:
+            since = found - before.durations[name]
+            row += [_us(since, 0.99), number(since.longest_ns // 1000)] if since.count else ["", ""]
+        table.add_row(word, *row)
+    stages = [f"{n} {_us(found, 0.99)}" for n, found in timing.durations.items() if n not in WHOLE and found.count]
+    return Group(table, Text("stages of the tick, p99: " + ", ".join(stages))) if stages else table
+
+
+def _us(found: Durations, share: float) -> str:
+    return number(found.quantile_ns(share) // 1000)
+
+
+def _inputs(facts: Facts) -> RenderableType:
+    used = [item for item in worst_first(list(facts.inputs.items())) if item[1].count]
+    if not used:
+        return Text("No input has come yet.", style="yellow")
+    table = _table("age of inputs when used, ms", "last", "worst", "used")
+    for name, age in used[:INPUTS]:
+        table.add_row(name, f"{age.newest_ns * 1e-6:.1f}", f"{age.longest_ns * 1e-6:.1f}", number(age.count))
+    if len(used) > INPUTS:
+        table.add_row(Text(f"{len(used) - INPUTS} better ones", style="dim"))
+    silent = sorted(name for name, age in facts.inputs.items() if not age.count)
+    if not silent:
+        return table
+    return Group(table, Text(f"never came: {', '.join(silent)}", style="yellow"))
+
+
+def _buses(facts: Facts) -> Table:
+    table = _table("bus", "state", "received", "sent", "refused", "dropped", "errors", words=2)
+    for bus in facts.buses:
+        state = Text(bus.state, style="green" if bus.state == "ACTIVE" else "bold red")
+        if bus.recoveries:
+            state.append(f", back {bus.recoveries}\N{MULTIPLICATION SIGN}", style="yellow")
+        counts = (bus.refused, bus.dropped, bus.error_frames)
+        table.add_row(bus.name, state, _rough(bus.received), _rough(bus.sent), *map(number, counts))
+    return table
+
+
+def _process(facts: Facts, before: Timing | None) -> Text:
+    process = facts.process
+    since_ns, cpu_ns = facts.written_ns - facts.started_ns, process.cpu_ns
+    minor, major = process.minor_faults, process.major_faults
+    faults = f"page faults {number(minor)} minor, {number(major)} major"
+    if before:
+        then = before.facts.process
+        since_ns, cpu_ns = facts.written_ns - before.facts.written_ns, cpu_ns - then.cpu_ns
+        faults = f"page faults +{number(minor - then.minor_faults)} minor, +{number(major - then.major_faults)} major"
+    share = 100.0 * cpu_ns / since_ns if since_ns > 0 else 0.0
+    words = (
+        f"memory {process.resident_kb / 1024:.0f} MB", f"CPU {share:.1f} %", faults,
+        f"preempted {number(process.involuntary_switches)} times", f"garbage passes {number(process.gc_runs)}",
+    )  # fmt: skip
+    return Text(" · ".join(words))
+
+
+def number(value: int) -> str:
+    """Grouped by thousands: 1 234 567."""
+    return f"{value:,}".replace(",", "\N{NO-BREAK SPACE}")
+
+
+def _rough(value: int) -> str:
+    """To four digits where exactness says nothing: 12.35 M."""
+    if value < 1_000_000:
+        return number(value)
+    rough = f"{value / 1e6:.2f} M" if value < 1_000_000_000 else f"{value / 1e9:.2f} G"
+    return rough.replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def duration(seconds: float) -> str:
+    """In the two largest units: 2 h 13 min."""
+    if seconds < 10.0:
+        return f"{max(seconds, 0.0):.1f} s"
+    s = round(seconds)
+    for size, unit, small, small_unit in ((86400, "d", 3600, "h"), (3600, "h", 60, "min"), (60, "min", 1, "s")):
+        if s >= size:
+            return f"{s // size} {unit} {s % size // small} {small_unit}"
+    return f"{s} s"
