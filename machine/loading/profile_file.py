@@ -1,7 +1,7 @@
-"""Reading a profile: a shipped name or a TOML file in, a checked ``Profile`` out, or ``ProfileError``.
+"""Reads a profile: a shipped name or a TOML file in, a checked ``Profile`` out, or ``ProfileError``.
 
 Every problem is one line: the file, the key path, what is wrong, what is allowed.  All problems of one stage
-(keys and types first, then values) are reported together, so a file is mended in few rounds.
+(keys and types first, then values) are reported together, so that few rounds correct a file.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import tomllib
 import types
 import zlib
+from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final, Literal, get_args, get_origin
@@ -17,9 +18,9 @@ import msgspec
 
 from machine.joints import JOINTS
 from machine.loading.checks import problems_of
-from machine.profile import JointSpec, Profile, joint
-
-__all__ = ["ProfileError", "joint", "load_profile", "profile_hash", "shipped_profiles"]
+from machine.loading.problem import Problem
+from machine.profile import JointSpec, Profile
+from runtime.errors import CodedError
 
 _FOLDER: Final = Path(__file__).parents[1]
 _UNIT_SUFFIXES: Final = (
@@ -30,12 +31,19 @@ _NO_IMU: Final = b',"imu":null}'
 _JOINT_NAMES: Final = tuple(j.name.lower() for j in JOINTS)
 
 
-class ProfileError(ValueError):
-    """A profile cannot be used; ``problems`` holds one sentence per problem and the text is all of them."""
+class ProfileError(CodedError, ValueError):
+    """A profile cannot be used.
 
-    def __init__(self, *problems: str) -> None:
-        super().__init__("\n".join(problems))
-        self.problems = problems
+    The text has one line per problem.  ``problems`` holds them where the file could be read: with code
+    ``profile.wrong-structure`` those of keys and types, with ``profile.wrong-values`` those of values.
+    """
+
+    def __init__(self, code: str, sentence: str, problems: Sequence[Problem] = ()) -> None:
+        super().__init__(code, sentence)
+        self.problems = tuple(problems)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.code, str(self), self.problems)
 
 
 def shipped_profiles() -> tuple[str, ...]:
@@ -49,26 +57,33 @@ def load_profile(name_or_path: str | Path) -> Profile:
     try:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ProfileError(f"{path}: the profile cannot be read: {error.strerror}") from None
+        sentence = f"{path}: the profile cannot be read: {error.strerror}"
+        raise ProfileError("profile.unreadable", sentence) from None
     except UnicodeDecodeError as error:
-        raise ProfileError(f"{path}: not UTF-8 text at byte {error.start}; a profile is a TOML file") from None
+        sentence = f"{path}: not UTF-8 text at byte {error.start}; a profile is a TOML file"
+        raise ProfileError("profile.not-utf8", sentence) from None
     except tomllib.TOMLDecodeError as error:
-        raise ProfileError(f"{path}: broken TOML: {error}") from None
-    problems: list[str] = []
+        raise ProfileError("profile.broken-toml", f"{path}: broken TOML: {error}") from None
+    problems: list[Problem] = []
     built = _build(Profile, raw, "", problems)
-    if not problems:
-        problems = problems_of(built)
     if problems:
-        raise ProfileError(*(f"{path}: {problem}" for problem in problems))
+        raise ProfileError("profile.wrong-structure", _lines(path, problems), problems)
+    problems = problems_of(built)
+    if problems:
+        raise ProfileError("profile.wrong-values", _lines(path, problems), problems)
     profile: Profile = built
     return profile
 
 
-def profile_hash(profile: Profile) -> int:
-    """CRC-32 of the canonical content: datagrams carry it so that both ends prove that they mean one machine.
+def _lines(path: Path, problems: Sequence[Problem]) -> str:
+    return "\n".join(f"{path}: {problem}" for problem in problems)
 
-    Comments, order and layout of the file do not count; any value does.  An IMU that is not there does not count, so
-    that a machine without one keeps the hash that its recordings carry.
+
+def profile_hash(profile: Profile) -> int:
+    """CRC-32 of the canonical content; datagrams carry it to prove that both ends use the same profile.
+
+    Comments, order and layout of the file do not count; every value does.  A missing IMU does not count, so
+    that a machine without one keeps the hash of its recordings.
     """
     content = msgspec.json.encode(profile, order="deterministic")
     return zlib.crc32(content.removesuffix(_NO_IMU) + b"}" if profile.imu is None else content)
@@ -82,8 +97,9 @@ def _find(name_or_path: str | Path) -> Path:
     if text in shipped:
         return _FOLDER / f"{text}.toml"
     raise ProfileError(
+        "profile.unknown-name",
         f'unknown profile "{text}"{_did_you_mean(text, shipped)}; shipped profiles: {", ".join(shipped)}; '
-        "or give the path of a .toml file"
+        "or give the path of a .toml file",
     )
 
 
@@ -92,8 +108,8 @@ def _did_you_mean(word: str, known: tuple[str, ...]) -> str:
     return f'; did you mean "{close[0]}"?' if close else ""
 
 
-def _build(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
-    """``value`` converted to ``kind``; every mismatch is added to ``problems`` with its full key path."""
+def _build(kind: Any, value: Any, path: str, problems: list[Problem]) -> Any:
+    """``value`` converted to ``kind``; adds every mismatch to ``problems`` with its full key path."""
     if get_origin(kind) is types.UnionType:  # T | None, where an absent key means None
         kind = next(k for k in get_args(kind) if k is not types.NoneType)
     if get_origin(kind) is dict:
@@ -102,7 +118,7 @@ def _build(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
         # A bool equals 1 but is no sign.
         if value not in get_args(kind) or isinstance(value, bool):
             allowed = ", ".join(map(repr, get_args(kind)))
-            problems.append(f"{path}: {value!r} is not allowed; use one of {allowed}")
+            problems.append(Problem("profile.not-allowed", path, f"{value!r} is not allowed; use one of {allowed}"))
         return value
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         return _build_struct(kind, value, path, problems)
@@ -110,13 +126,14 @@ def _build(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
         text, _, inner = str(error).partition(" - at `$")
-        problems.append(f"{path}{inner.rstrip('`')}: {text[0].lower()}{text[1:]}")
+        where = f"{path}{inner.rstrip('`')}"
+        problems.append(Problem("profile.wrong-type", where, f"{text[0].lower()}{text[1:]}"))
         return None
 
 
-def _build_struct(kind: type[msgspec.Struct], value: Any, path: str, problems: list[str]) -> Any:
+def _build_struct(kind: type[msgspec.Struct], value: Any, path: str, problems: list[Problem]) -> Any:
     if not isinstance(value, dict):
-        problems.append(f"{path}: must be a table, found {value!r}")
+        problems.append(Problem("profile.not-a-table", path, f"must be a table, found {value!r}"))
         return None
     found = len(problems)
     dot = f"{path}." if path else ""
@@ -126,27 +143,33 @@ def _build_struct(kind: type[msgspec.Struct], value: Any, path: str, problems: l
     missing = [f.name for f in absent if f.required and types.NoneType not in get_args(f.type)]
     for key in value:
         if key not in names:
-            problems.append(f"{dot}{key}: {_unknown_key(key, names)}")
+            problems.append(_unknown_key(dot, key, names))
     stems = {_stem(key) for key in value if key not in names}
-    problems += [f"{dot}{name}: missing" for name in missing if _stem(name) not in stems]
+    problems += [
+        Problem("profile.missing-key", f"{dot}{name}", "missing") for name in missing if _stem(name) not in stems
+    ]
     parts = {f.name: _build(f.type, value[f.name], dot + f.name, problems) for f in fields if f.name in value}
     parts |= {f.name: None for f in absent if f.required}
     return kind(**parts) if len(problems) == found else None
 
 
-def _build_table(kind: Any, value: Any, path: str, problems: list[str]) -> dict[str, Any]:
+def _build_table(kind: Any, value: Any, path: str, problems: list[Problem]) -> dict[str, Any]:
     """A table of named things, in the order of the file; the joints are a fixed set in chain order."""
     thing = path.removesuffix("s")
     if not isinstance(value, dict):
-        problems.append(f"{path}: must be a table of {path}, found {value!r}")
+        problems.append(Problem("profile.not-a-table", path, f"must be a table of {path}, found {value!r}"))
         return {}
     names = tuple(value)
     if kind is JointSpec:
         for name in value:
             if name not in _JOINT_NAMES:
                 hint = _did_you_mean(name, _JOINT_NAMES) or f"; the joints are {', '.join(_JOINT_NAMES)}"
-                problems.append(f"{path}.{name}: unknown {thing}{hint}")
-        problems += [f"{path}.{name}: missing {thing}" for name in _JOINT_NAMES if name not in value]
+                problems.append(Problem("profile.unknown-joint", f"{path}.{name}", f"unknown {thing}{hint}"))
+        problems += [
+            Problem("profile.missing-joint", f"{path}.{name}", f"missing {thing}")
+            for name in _JOINT_NAMES
+            if name not in value
+        ]
         names = tuple(name for name in _JOINT_NAMES if name in value)
     return {name: _build(kind, value[name], f"{path}.{name}", problems) for name in names}
 
@@ -155,9 +178,10 @@ def _stem(key: str) -> str:
     return next((key.removesuffix(suffix) for suffix in _UNIT_SUFFIXES if key.endswith(suffix)), key)
 
 
-def _unknown_key(key: str, names: tuple[str, ...]) -> str:
+def _unknown_key(parent: str, key: str, names: tuple[str, ...]) -> Problem:
     same = [name for name in names if _stem(name) == _stem(key)]
     if same:
         unit = "" if _stem(same[0]) != same[0] else " in SI (rad, or m for the telescope; per second)"
-        return f'wrong unit in the name; write "{same[0]}"{unit}'
-    return f"unknown key{_did_you_mean(key, names) or '; allowed: ' + ', '.join(names)}"
+        return Problem("profile.wrong-unit", parent + key, f'wrong unit in the name; write "{same[0]}"{unit}')
+    hint = _did_you_mean(key, names) or f"; allowed: {', '.join(names)}"
+    return Problem("profile.unknown-key", parent + key, f"unknown key{hint}")

@@ -1,7 +1,7 @@
-"""The range of every number in a profile, and the sentence for one that is outside.
+"""The range of every number in a profile, and the problem of a number outside its range.
 
-The ranges are generous physical bounds of road-going loader and forwarder cranes, so that they catch a wrong unit or
-a slipped digit and never a real machine.  NaN and infinity are outside every range.
+The ranges are generous physical bounds of loader and forwarder cranes: they catch a wrong unit or a slipped digit,
+never a real machine.  NaN and infinity are outside every range.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import msgspec
 
+from machine.loading.problem import Problem
 from machine.profile import (
     Bunk,
     Camera,
@@ -33,25 +34,26 @@ from machine.profile import (
 
 TURN_RAD: Final = 2.0 * pi
 
-Bounds = tuple[float, float, str]
-DEPTH_SCALE: Final[Bounds] = (0.9, 1.1, "")
-_LENGTH: Final[Bounds] = (0.3, 15.0, "m")
-_OFFSET: Final[Bounds] = (-2.0, 2.0, "m")
-ANGLE: Final[Bounds] = (-TURN_RAD, TURN_RAD, "rad")
-_PLACE: Final[Bounds] = (-20.0, 20.0, "m")
-_HEIGHT: Final[Bounds] = (-5.0, 5.0, "m")
+Range = tuple[float, float, str]
+"""Lowest value, highest value, unit."""
+DEPTH_SCALE_RANGE: Final[Range] = (0.9, 1.1, "")
+_LENGTH_RANGE: Final[Range] = (0.3, 15.0, "m")
+_OFFSET_RANGE: Final[Range] = (-2.0, 2.0, "m")
+ANGLE_RANGE: Final[Range] = (-TURN_RAD, TURN_RAD, "rad")
+_PLACE_RANGE: Final[Range] = (-20.0, 20.0, "m")
+_HEIGHT_RANGE: Final[Range] = (-5.0, 5.0, "m")
 
-_BOUNDS: Final[dict[type[msgspec.Struct], dict[str, Bounds]]] = {
+_RANGES: Final[dict[type[msgspec.Struct], dict[str, Range]]] = {
     Profile: {"rate_hz": (50, 1000, "Hz")},
     Kinematics: {
         "d1_m": (0.0, 10.0, "m"),
-        "a1_m": _OFFSET,
-        "theta1_offset_rad": ANGLE,
-        "a2_m": _LENGTH,
-        "theta2_offset_rad": ANGLE,
-        "a3_m": _OFFSET,
-        "theta3_offset_rad": ANGLE,
-        "d4_m": _LENGTH,
+        "a1_m": _OFFSET_RANGE,
+        "theta1_offset_rad": ANGLE_RANGE,
+        "a2_m": _LENGTH_RANGE,
+        "theta2_offset_rad": ANGLE_RANGE,
+        "a3_m": _OFFSET_RANGE,
+        "theta3_offset_rad": ANGLE_RANGE,
+        "d4_m": _LENGTH_RANGE,
         "hanger_to_fork_m": (0.0, 2.0, "m"),
         "fork_to_rotator_m": (0.0, 2.0, "m"),
         "rotator_to_tong_pivot_m": (0.0, 2.0, "m"),
@@ -102,21 +104,21 @@ _BOUNDS: Final[dict[type[msgspec.Struct], dict[str, Bounds]]] = {
     },
     TongTable: {
         "angle_rad": (0.0, TURN_RAD, "rad"),
-        "half_gap_m": _OFFSET,
+        "half_gap_m": _OFFSET_RANGE,
         "tip_below_pin_m": (0.0, 3.0, "m"),
     },
     Bunk: {
-        "center_m": _PLACE,
-        "yaw_rad": ANGLE,
+        "center_m": _PLACE_RANGE,
+        "yaw_rad": ANGLE_RANGE,
         "length_m": (0.5, 15.0, "m"),
         "width_m": (0.3, 5.0, "m"),
-        "floor_z_m": _HEIGHT,
+        "floor_z_m": _HEIGHT_RANGE,
         "stake_height_m": (0.0, 4.0, "m"),
     },
-    Workspace: {"ground_z_m": _HEIGHT, "pick_center_m": _PLACE, "pick_half_size_m": (0.1, 10.0, "m")},
+    Workspace: {"ground_z_m": _HEIGHT_RANGE, "pick_center_m": _PLACE_RANGE, "pick_half_size_m": (0.1, 10.0, "m")},
     Camera: {
-        "position_m": _PLACE,
-        "rpy_rad": ANGLE,
+        "position_m": _PLACE_RANGE,
+        "rpy_rad": ANGLE_RANGE,
         "width_px": (16, 8192, "px"),
         "height_px": (16, 8192, "px"),
         "fx_px": (10.0, 20000.0, "px"),
@@ -125,7 +127,7 @@ _BOUNDS: Final[dict[type[msgspec.Struct], dict[str, Bounds]]] = {
         "rate_hz": (0.1, 240.0, "Hz"),
         "depth_min_m": (0.01, 100.0, "m"),
         "depth_max_m": (0.01, 100.0, "m"),
-        "depth_scale": DEPTH_SCALE,
+        "depth_scale": DEPTH_SCALE_RANGE,
     },
     Carrier: {
         "front_axle_m": (0.5, 6.0, "m"),
@@ -134,7 +136,7 @@ _BOUNDS: Final[dict[type[msgspec.Struct], dict[str, Bounds]]] = {
         "wheel_radius_m": (0.2, 1.5, "m"),
         "wheel_width_m": (0.1, 1.5, "m"),
         "arm_length_m": (0.2, 3.0, "m"),
-        "arm_drop_low_m": _OFFSET,
+        "arm_drop_low_m": _OFFSET_RANGE,
         "arm_travel_m": (0.05, 2.0, "m"),
         "arm_transport_m": (0.0, 2.0, "m"),
         "arm_kp_1_s": (0.05, 20.0, "1/s"),
@@ -148,10 +150,10 @@ _BOUNDS: Final[dict[type[msgspec.Struct], dict[str, Bounds]]] = {
         "speed_limit_m_s": (0.05, 5.0, "m/s"),
         "drive_acceleration_m_s2": (0.05, 3.0, "m/s^2"),
         "tilt_limit_rad": (0.05, 0.6, "rad"),
-        "crane_base_m": _HEIGHT,
-        "crane_yaw_rad": ANGLE,
-        "antenna_main_m": _HEIGHT,
-        "antenna_aux_m": _HEIGHT,
+        "crane_base_m": _HEIGHT_RANGE,
+        "crane_yaw_rad": ANGLE_RANGE,
+        "antenna_main_m": _HEIGHT_RANGE,
+        "antenna_aux_m": _HEIGHT_RANGE,
         "site_lat_deg": (-85.0, 85.0, "deg"),
         "site_lon_deg": (-180.0, 180.0, "deg"),
     },
@@ -172,11 +174,12 @@ _SLIPS: Final = {
     "bar": (1e-5, "Pa"),
     "Hz": (1e9, "s per tick in ns"),
 }
+"""By unit: the factor from a unit that is often written by mistake, and its name."""
 
 
-def out_of_range(struct: msgspec.Struct, path: str) -> Iterator[str]:
-    """The sentence of every number of a profile, or of a part at the key path ``path``, that its table refuses."""
-    bounds = _BOUNDS.get(type(struct), {})
+def out_of_range(struct: msgspec.Struct, path: str) -> Iterator[Problem]:
+    """The problem of every number that its table refuses, of a profile or of a part at the key path ``path``."""
+    ranges = _RANGES.get(type(struct), {})
     for name in struct.__struct_fields__:
         value: Any = getattr(struct, name)
         where = f"{path}{name}"
@@ -185,24 +188,25 @@ def out_of_range(struct: msgspec.Struct, path: str) -> Iterator[str]:
         elif isinstance(value, dict):
             for key, item in value.items():
                 yield from out_of_range(item, f"{where}.{key}.")
-        elif name in bounds:
-            yield from _bounded_all(where, value, bounds[name])
+        elif name in ranges:
+            yield from _check_all(where, value, ranges[name])
 
 
-def _bounded_all(path: str, value: Any, bounds: Bounds) -> Iterator[str]:
+def _check_all(path: str, value: Any, allowed: Range) -> Iterator[Problem]:
     if isinstance(value, tuple):
         for i, item in enumerate(value):
-            yield from bounded(f"{path}[{i}]", item, bounds)
+            yield from check_range(f"{path}[{i}]", item, allowed)
     else:
-        yield from bounded(path, value, bounds)
+        yield from check_range(path, value, allowed)
 
 
-def bounded(path: str, value: float, bounds: Bounds) -> Iterator[str]:
-    """The sentence for a number outside (lowest, highest, unit); it guesses the unit that was meant."""
-    low, high, unit = bounds
+def check_range(path: str, value: float, allowed: Range) -> Iterator[Problem]:
+    """The problem of a number outside ``allowed``; the sentence suggests the unit that may have been meant."""
+    low, high, unit = allowed
     if low <= value <= high:
         return
     factor, slip = _SLIPS.get(unit, (0.0, ""))
     hint = f"; was it given in {slip}?" if factor and low <= value * factor <= high else ""
     unit = f" {unit}" if unit else ""
-    yield f"{path}: {value:.6g}{unit} is outside {low:.6g}..{high:.6g}{unit}{hint}"
+    text = f"{value:.6g}{unit} is outside {low:.6g}..{high:.6g}{unit}{hint}"
+    yield Problem("profile.out-of-range", path, text)

@@ -228,7 +228,7 @@ def test_this_installation_is_sane() -> None:
 
 def test_a_profile_that_does_not_load_is_in_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(name: str) -> None:
-        raise ProfileError(f"{name}: rate_hz is missing")
+        raise ProfileError("profile.wrong-structure", f"{name}: rate_hz: missing")
 
     monkeypatch.setattr(installation, "load_profile", broken)
     assert {f.severity for f in installation.profiles()} == {Severity.FAULT}

@@ -1,4 +1,4 @@
-"""Copies of the shipped profiles with some values changed, and what is said of them."""
+"""Copies of the shipped profiles with some values changed, and the problems found in them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import machine
+from machine.loading.problem import Problem
 from machine.loading.profile_file import ProfileError, load_profile
 
 FOLDER = Path(machine.__file__).parent
@@ -45,14 +46,22 @@ def write(folder: Path, changes: dict[str, object], of: dict[str, object] = RAW)
     return file
 
 
-def problems(folder: Path, changes: dict[str, object], of: dict[str, object] = RAW) -> list[str]:
+def problems(folder: Path, changes: dict[str, object], of: dict[str, object] = RAW) -> tuple[Problem, ...]:
+    """The problems of a changed copy; its error has one line for each, with the file's name."""
     file = write(folder, changes, of)
     with pytest.raises(ProfileError) as caught:
         load_profile(file)
-    prefix = f"{file}: "
-    assert all(line.startswith(prefix) for line in caught.value.problems)
-    assert str(caught.value) == "\n".join(caught.value.problems)
-    return [line.removeprefix(prefix) for line in caught.value.problems]
+    assert caught.value.code in ("profile.wrong-structure", "profile.wrong-values")
+    assert str(caught.value) == "\n".join(f"{file}: {problem}" for problem in caught.value.problems)
+    return caught.value.problems
+
+
+def the_problem(
+    folder: Path, changes: dict[str, object], of: dict[str, object] = RAW
+) -> tuple[tuple[str, str], str]:
+    """Code and key path, and the sentence, of the only problem of a changed copy."""
+    (problem,) = problems(folder, changes, of)
+    return (problem.code, problem.path), problem.sentence
 
 
 SAG = {"head_rad_m": 0.005, "pin_rad_m": 0.003, "rest_rad": 0.02}

@@ -1,4 +1,4 @@
-"""A camera's mount and scale of depth by targets whose places were surveyed and that it sees."""
+"""Estimation of a camera's mount and depth scale from surveyed targets that the camera sees."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from scipy.optimize import least_squares
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.camera.mount import CameraMountError
 from machine.geometry.optics import BODY_FROM_OPTICAL, Intrinsics, intrinsics, rpy_matrix
-from machine.loading.ranges import DEPTH_SCALE
+from machine.loading.ranges import DEPTH_SCALE_RANGE
 from machine.profile import Camera
 
-LEAST_TARGETS: Final = 6
-MOUNT_SPREAD: Final = (0.03, 0.03, 0.03, 0.035, 0.035, 0.035)
-"""How far off a mount is that nobody has surveyed [m, rad] (docs/reference/machines.md section 8)."""
+MIN_TARGETS: Final = 6
+MOUNT_PRIOR_SIGMA: Final = (0.03, 0.03, 0.03, 0.035, 0.035, 0.035)
+"""Standard deviations of a mount that was not surveyed: x, y, z [m] and roll, pitch, yaw [rad] (machines.md 8)."""
+MAX_RESIDUAL_SIGMAS: Final = 5.0
+"""Largest root mean square residual of the pixels, in their standard deviation."""
+MIN_DEPTH_M: Final = 0.05
 
 
 def surveyed(
@@ -28,64 +31,73 @@ def surveyed(
     targets_m: np.ndarray,
     pixel_sigma_px: float = 0.3,
 ) -> Camera:
-    """The camera with the mount and the scale of depth that ``LEAST_TARGETS`` or more surveyed targets show.
+    """The camera with the mount and the depth scale that fit ``MIN_TARGETS`` or more surveyed targets.
 
-    ``pixels_px`` (N, 2) is where the camera sees the targets ``targets_m`` (N, 3), ``depths_m`` (N,) their depth, NaN
-    where it has none; ``link`` is the pose of its link (not of its optics) in the frame of the targets.  The profile's
-    mount is the prior.
+    Args:
+        camera: as the profile has it; its mount is the prior.
+        link: pose of the camera's link (not of its optical frame) in the frame of the targets.
+        pixels_px: (N, 2), where the camera sees the targets.
+        depths_m: (N,), depth of the targets, NaN where it is unknown.
+        targets_m: (N, 3), surveyed positions of the targets.
+        pixel_sigma_px: standard deviation of ``pixels_px``.
 
     Raises:
-        MountRefused: too few targets, or ones that it cannot see where the survey says they are.
+        CameraMountError: too few targets, or no mount near the profile's explains the pixels or depths.
     """
-    if len(targets_m) < LEAST_TARGETS:
-        raise CameraMountError(f"{len(targets_m)} targets do not fix a mount; survey at least {LEAST_TARGETS}")
+    if len(targets_m) < MIN_TARGETS:
+        raise CameraMountError(
+            "camera-mount.too-few-targets",
+            f"{len(targets_m)} targets do not determine a mount; survey at least {MIN_TARGETS}",
+        )
     pin = intrinsics(camera)
     nominal_m, nominal = np.asarray(camera.position_m, float), rpy_matrix(camera.rpy_rad)
     local = link.to_optical(targets_m)  # in the link's frame
 
     def body(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return nominal_m + nominal @ x[:3], nominal @ rpy_matrix(x[3:])
+        return nominal_m + nominal @ x[:3], nominal @ rpy_matrix((x[3], x[4], x[5]))
 
     def optical(x: np.ndarray) -> np.ndarray:
         at, turn = body(x)
-        return (local - at) @ (turn @ BODY_FROM_OPTICAL)
+        return np.asarray((local - at) @ (turn @ BODY_FROM_OPTICAL))
 
-    def misses(x: np.ndarray) -> np.ndarray:
+    def residuals(x: np.ndarray) -> np.ndarray:
         return np.concatenate(
-            [((_seen(pin, optical(x)) - pixels_px) / pixel_sigma_px).ravel(), x / np.array(MOUNT_SPREAD)]
+            [((_projected(pin, optical(x)) - pixels_px) / pixel_sigma_px).ravel(), x / np.array(MOUNT_PRIOR_SIGMA)]
         )
 
-    found = least_squares(misses, np.zeros(6), x_scale=MOUNT_SPREAD)
-    rest = found.fun[: 2 * len(targets_m)]
+    solution = least_squares(residuals, np.zeros(6), x_scale=MOUNT_PRIOR_SIGMA)
+    rest = solution.fun[: 2 * len(targets_m)]
     off_px = math.sqrt(float(np.mean(rest * rest))) * pixel_sigma_px
-    if not off_px < 5.0 * pixel_sigma_px:
+    if not off_px < MAX_RESIDUAL_SIGMAS * pixel_sigma_px:
         raise CameraMountError(
+            "camera-mount.bad-targets",
             f"the targets are {off_px:.1f} px from where any mount near the profile's puts them; "
-            "check which target is which, and their places"
+            "check the order of the targets and their surveyed positions",
         )
-    at, turn = body(found.x)
+    at, turn = body(solution.x)
     pitch = math.asin(max(-1.0, min(1.0, -turn[2, 0])))
     rpy = (math.atan2(turn[2, 1], turn[2, 2]), pitch, math.atan2(turn[1, 0], turn[0, 0]))
-    scale = _scale(optical(found.x)[:, 2], depths_m)
+    scale = _depth_scale(optical(solution.x)[:, 2], depths_m)
     return replace(camera, position_m=tuple(float(v) for v in at), rpy_rad=rpy, depth_scale=scale)
 
 
-def _scale(true_m: np.ndarray, depths_m: np.ndarray) -> float:
-    """Measured over true depths (N,); 1 where none is known."""
+def _depth_scale(true_m: np.ndarray, depths_m: np.ndarray) -> float:
+    """Ratio of measured to true depths (N,); 1 where no depth is known."""
     known = np.isfinite(depths_m)
     if not known.any():
         return 1.0
-    # The error of depth grows with its square: of the ratio it grows with depth.
+    # The error of depth grows with its square, so the error of the ratio grows with depth.
     weights = 1.0 / true_m[known] ** 2
     scale = float(np.sum(weights * depths_m[known] / true_m[known]) / np.sum(weights))
-    low, high, _ = DEPTH_SCALE
+    low, high, _ = DEPTH_SCALE_RANGE
     if not low < scale < high:
         raise CameraMountError(
-            f"depth is {scale:.2f} of what the survey says; the camera's baseline or focal length is wrong"
+            "camera-mount.bad-depth-scale",
+            f"measured depth is {scale:.2f} times the surveyed depth; correct the camera's baseline or focal length",
         )
     return scale
 
 
-def _seen(pin: Intrinsics, optical: np.ndarray) -> np.ndarray:
-    ahead = np.where(optical[:, 2:] > 0.05, optical[:, 2:], 0.05)
+def _projected(pin: Intrinsics, optical: np.ndarray) -> np.ndarray:
+    ahead = np.where(optical[:, 2:] > MIN_DEPTH_M, optical[:, 2:], MIN_DEPTH_M)
     return pin.project(np.concatenate([optical[:, :2], ahead], axis=1))
