@@ -36,7 +36,7 @@ def journal(unit: str) -> list[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.splitlines()
 
 
-def last_words(unit: str) -> str:
+def last_journal_line(unit: str) -> str:
     """The last line that a process of the unit has said; empty where this user may not read it."""
     command = ["journalctl", "--no-pager", "--quiet", "--output", "cat", "--lines", "1", f"_SYSTEMD_UNIT={unit}"]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

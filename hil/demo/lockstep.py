@@ -79,7 +79,7 @@ class _Job:
         self._display = display
         self._mode: int = -1
         self._phase = self._grasp = ""
-        self.activity = Activity(profile, profile_hash(profile), chooser=PlannerSelection(SamplingPlanner()))
+        self.activity = Activity(profile, profile_hash(profile), grasp_selector=PlannerSelection(SamplingPlanner()))
         self.system = Lockstep(
             settings,
             build_guard(profile_path(name)),

@@ -57,7 +57,7 @@ class ProcessGroup:
     environment: dict[str, str] = field(default_factory=dict)
     """Environment variables of the children in addition to the harness's own."""
     own_sessions: bool = True
-    """Each child gets its own session; else they stay in the harness's, where the scheduler gives them one weight."""
+    """Each child gets its own session; else all share that of the harness, with one scheduling weight."""
 
     def start(self, name: str, module: str, *arguments: object) -> Child:
         """Start ``python -m module arguments...`` under ``name``."""

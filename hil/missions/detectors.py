@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from autonomy.manager.activity_manager import Manager
-from autonomy.manager.transition_table import ENDS, RULES
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.transition_table import FINAL_STATES, RULES
 from autonomy.perception.driving_log_detector import CylinderLocalizer, DrivingLogDetector, PaperBLocalizer
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
@@ -44,19 +44,19 @@ class PerfectDetector:
 class FrontCameraDetector:
     """The front camera; it takes pictures only while the crane rests."""
 
-    def __init__(self, front: DrivingLogDetector, manager: Manager) -> None:
+    def __init__(self, front: DrivingLogDetector, manager: ActivityManager) -> None:
         self._front, self._manager = front, manager
 
     def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
         """The logs in a picture taken now; None while the crane works or the machine is not localized."""
         manager = self._manager
-        outlook = manager.outlook
-        if RULES[manager.state].crane or manager.state in ENDS or not outlook.located or outlook.vehicle is None:
+        world = manager.world
+        if RULES[manager.state].crane or manager.state in FINAL_STATES or not world.located or world.vehicle is None:
             return None
-        return self._front.detect(outlook.base_at(now_ns), q, outlook.vehicle.articulation_rad)
+        return self._front.detect(world.base_at(now_ns), q, world.vehicle.articulation_rad)
 
 
-def make_detector(kind: str, plant: Plant, profile: Profile, manager: Manager, seed: int) -> LogDetector:
+def make_detector(kind: str, plant: Plant, profile: Profile, manager: ActivityManager, seed: int) -> LogDetector:
     """The detector ``kind`` of the module docstring.
 
     Raises:

@@ -15,8 +15,8 @@ from rich.console import Console
 from autonomy.grasp.pile_planner import PilePlanner
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
-from autonomy.manager.activity_manager import Manager
-from autonomy.manager.transition_table import ENDS, WAYS, State
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.transition_table import FINAL_STATES, TABLES, State
 from autonomy.missions.model import ForwardingMission
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import OperatorAction, StateReport
@@ -107,8 +107,8 @@ class MissionRun:
         self.states: list[tuple[float, str]] = []
         code = profile_hash(profile)
         remembers = detector != "perfect"
-        self.manager = Manager(
-            profile, code, mission, WAYS[manager], chooser=PlannerSelection(SamplingPlanner()), remembers=remembers,
+        self.manager = ActivityManager(
+            profile, code, mission, TABLES[manager], chooser=PlannerSelection(SamplingPlanner()), remembers=remembers,
             emptier=PlannerSelection(PilePlanner(SamplingPlanner())),
         )  # fmt: skip
         self.manager.auto()
@@ -135,7 +135,7 @@ class MissionRun:
         """Run until the manager ends, and `SETTLE_S` longer; ``watch`` is called after every slice."""
         system, manager = self.system, self.manager
         limit_ns = START_NS + int(limit_s * 1e9)
-        while manager.state not in ENDS and system.now_ns < limit_ns and not system.operator.gave_up:
+        while manager.state not in FINAL_STATES and system.now_ns < limit_ns and not system.operator.gave_up:
             system.advance()
             if system.ticks % SUPPLY_TICKS == 0 and (laid := self._layer.step()):
                 self._display.event(f"{laid} new logs laid")
@@ -155,7 +155,7 @@ class MissionRun:
             loaded=manager.tally.loaded,
             given_up=manager.tally.given_up,
             seconds=(ended_ns - START_NS) / 1e9,
-            driven_m=manager.ride.driven_m,
+            driven_m=manager.route.driven_m,
             stops=system.operator.stops,
             refused=(report.refused if report else 0) + (vehicle.refused if vehicle else 0),
             states=tuple(self.states),
@@ -175,7 +175,7 @@ class MissionRun:
             seconds = (self.system.now_ns - START_NS) / 1e9
             self.states.append((round(seconds, 2), manager.state.name))
             self._display.phase(manager.state.name)
-            self._display.event(f"  {manager.words}; {manager.tally.loaded} logs on board")
+            self._display.event(f"  {manager.description}; {manager.tally.loaded} logs on board")
         if manager.paused != before[1]:
             self._display.event(f"paused: {manager.paused}" if manager.paused else "resumed", "yellow")
         if failure and failure != before[3]:

@@ -5,7 +5,7 @@ The machine starts with its front axle at the first waypoint, heading east.
 
 from __future__ import annotations
 
-from autonomy.localization.local_plane import Plane
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.local_frame import yaw_from_bearing
 from autonomy.missions.model import ForwardingMission
 from hil.harness.errors import SetupError
@@ -30,8 +30,8 @@ def site_of(mission: ForwardingMission, profile: Profile, seed: int, truth: str,
         raise SetupError("mission.no-route", "the mission has no route; add waypoints")
     first = mission.waypoints[0]
     # The front axle starts at the first waypoint, so the origin of the rear frame lies behind it.
-    lat, lon, _ = Plane(first.latitude_deg, first.longitude_deg).geodetic(-carrier.front_axle_m, 0.0)
-    origin = Plane(lat, lon)
+    lat, lon, _ = LocalPlane(first.latitude_deg, first.longitude_deg).geodetic(-carrier.front_axle_m, 0.0)
+    origin = LocalPlane(lat, lon)
     if logs:
         route = [origin.local(p.latitude_deg, p.longitude_deg)[:2] for p in mission.waypoints]
         return Site(lat, lon, along_route(profile, truth, seed, logs, route))

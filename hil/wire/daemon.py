@@ -70,9 +70,11 @@ def _prepare(directory: Path) -> None:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         owner = directory.stat().st_uid
     except OSError as error:
-        raise BusError(f"The wire directory {directory} cannot be created ({error.strerror}).") from error
+        sentence = f"The wire directory {directory} cannot be created ({error.strerror})."
+        raise BusError("wire.directory", sentence) from error
     if owner not in (os.getuid(), 0):
-        raise BusError(f"The wire directory {directory} belongs to another user; choose another with --dir.")
+        sentence = f"The wire directory {directory} belongs to another user; choose another with --dir."
+        raise BusError("wire.directory-owner", sentence)
 
 
 def _bus(text: str) -> tuple[str, int]:

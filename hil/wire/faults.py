@@ -1,6 +1,6 @@
 """Fault injection: which faults act on which frames of a wire, and when.
 
-A `Fault` is plain data and travels as JSON.  `Damage` decides on the fate of each frame when it starts; the core carries
+A `Fault` is plain data and travels as JSON.  `Damage` decides the fate of each frame when it starts; the core carries
 it out.  The same seed and the same frames give the same damage.
 
 | kind | effect |

@@ -43,7 +43,8 @@ def wire_daemon(
     try:
         if not select.select([ready], [], [], _START_TIMEOUT_S)[0] or not os.read(ready, 16):
             process.kill()
-            raise BusError(process.communicate()[1].strip() or "The wire daemon did not start.")
+            sentence = process.communicate()[1].strip() or "The wire daemon did not start."
+            raise BusError("wire.not-started", sentence)
         yield process
     finally:
         os.close(ready)

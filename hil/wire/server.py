@@ -241,8 +241,9 @@ def _listen(path: Path) -> socket.socket:
     """A listening socket at `path`; the file of a dead daemon is replaced, a running daemon is an error."""
     if (length := len(os.fsencode(path))) > _SOCKET_PATH_BYTES:
         raise BusError(
+            "wire.path-too-long",
             f"The wire bus {path.name} cannot listen at {path}: a socket path has at most {_SOCKET_PATH_BYTES} "
-            f"bytes, this one has {length}; choose a shorter directory with --dir or TIMBERHAND_WIRE_DIR."
+            f"bytes, this one has {length}; choose a shorter directory with --dir or TIMBERHAND_WIRE_DIR.",
         )
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
@@ -258,8 +259,9 @@ def _listen(path: Path) -> socket.socket:
     except OSError as error:
         sock.close()
         raise BusError(
+            "wire.cannot-listen",
             f"The wire bus {path.name} cannot listen at {path} ({error.strerror or error}); is another wire "
-            "daemon running? Stop it, or choose another directory with --dir."
+            "daemon running? Stop it, or choose another directory with --dir.",
         ) from error
     return sock
 

@@ -53,8 +53,9 @@ def vcan(
 ) -> None:
     """Run a command with real SocketCAN interfaces vcan0 and vcan1, on any Linux kernel.
 
-    Natively where the kernel has CAN, else in user-mode Linux on this machine's own files: no root, a second to
-    boot, nothing left behind.  Standard input is empty; the network is the loopback alone.
+    Natively where the kernel has CAN, else in user-mode Linux on this machine's
+    own files: no root, a second to boot, nothing left behind. Standard input is
+    empty; the network is the loopback alone.
 
     Examples:
 

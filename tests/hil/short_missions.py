@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from autonomy.localization.local_plane import Plane
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.mission_file import save_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
 
-PLANE = Plane(63.657853, 19.895562)
+PLANE = LocalPlane(63.657853, 19.895562)
 
 
 def point(east_m: float, north_m: float) -> Point:

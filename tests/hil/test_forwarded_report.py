@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree import ElementTree
 
-from autonomy.manager.tally import Load, Taken
+from autonomy.manager.tally import Load, LoadedLog
 from autonomy.missions.model import ForwardingMission, Landing, Point
 from hil.missions.forwarded_report import report_loads
 from machine.loading.profile_file import load_profile
@@ -16,8 +16,8 @@ MISSION = ForwardingMission("Kiruna 7", (), landings=(Landing(Point(63.6, 19.9),
 BEGUN = datetime(2026, 5, 4, 12, 0, tzinfo=UTC)
 
 
-def taken(at_s: int, volume_m3: float = 0.1, assortment: str = "") -> Taken:
-    return Taken(Point(63.65, 19.89), at_s * 1_000_000_000, volume_m3, assortment)
+def taken(at_s: int, volume_m3: float = 0.1, assortment: str = "") -> LoadedLog:
+    return LoadedLog(Point(63.65, 19.89), at_s * 1_000_000_000, volume_m3, assortment)
 
 
 def test_a_run_leaves_a_report_of_its_loads(tmp_path: Path) -> None:

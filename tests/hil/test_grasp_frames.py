@@ -96,7 +96,7 @@ def test_the_compiled_rule_is_the_planners() -> None:
             if ours.safe[k]:
                 safe += 1
                 assert captured.tolist() == ours.captured[k].tolist()
-                assert mass == pytest.approx(ours.mass_kg[k]) and lever <= ours.lever[k] + 1e-9
+                assert mass == pytest.approx(ours.mass_kg[k]) and lever <= ours.balance[k] + 1e-9
     assert safe > 50
 
 

@@ -11,8 +11,8 @@ from rich.console import Console
 from autonomy.grasp.pile_planner import PilePlanner
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
-from autonomy.manager.activity_manager import Manager
-from autonomy.manager.checkpoint_file import Logbook, read
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.checkpoint_file import CheckpointFile, read_checkpoint
 from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options
 from hil.harness.display import Display
@@ -50,14 +50,14 @@ def test_each_assortment_comes_to_its_landing_although_the_planner_starts_anew(t
         while first.state is not State.HAUL and system.now_ns < 400e9:
             system.advance()
         assert first.state is State.HAUL and first.tally.loaded == 1, (first.state, first.failure)
-        Logbook(book).keep(first.progress(), system.now_ns, 10**18)
+        CheckpointFile(book).keep(first.progress(), system.now_ns, 10**18)
         run.manager = Silent()  # type: ignore[assignment]
         dead_ns = system.now_ns
         while system.now_ns < dead_ns + int(DEAD_S * 1e9):
             system.advance()
         assert plant.world.carrier.speed_m_s == pytest.approx(0.0, abs=0.01), "nobody drives"
-        progress = read(book, told, system.now_ns, 10**18 + int(DEAD_S * 1e9))
-        run.manager = Manager(
+        progress = read_checkpoint(book, told, system.now_ns, 10**18 + int(DEAD_S * 1e9))
+        run.manager = ActivityManager(
             profile, profile_hash(profile), told, chooser=PlannerSelection(SamplingPlanner()), emptier=PlannerSelection(PilePlanner(SamplingPlanner())),
             progress=progress,
         )  # fmt: skip

@@ -13,17 +13,18 @@ from autonomy.perception.fitting.cylinder import (
     Cylinder,
     CylinderBatch,
     across_view,
-    depth,
-    initial_cylinder,
-    outline,
+    outline_distance,
     pixel_rays,
+    surface_depth,
 )
 from autonomy.perception.fitting.cylinder_fit import fit_cylinder
-from autonomy.perception.fitting.log_fragments import refused
+from autonomy.perception.fitting.initial_cylinder import initial_cylinder
+from autonomy.perception.fitting.log_fragments import implausibility
 from autonomy.perception.papers import paper_a
 from autonomy.perception.pipeline import Perception
 from experiments.log_localization.trial import TrueMask
 from sim.camera.scene import BUNK, SceneBuilder
+from tests.codes import coded
 from tests.hil.log_views import CAMERA, PIN, PROFILE, frame_of, lying, masks_of, scene_of, seen, view_from
 
 
@@ -45,11 +46,11 @@ def test_outline_and_depth_are_the_renderers(degrees: float) -> None:
     v, u = np.mgrid[200:420:3, 400:900:3]
     body = Cylinder(view.to_optical(np.array([log.position_m]))[0], view.rotation.T @ log.axis, -1.0, 1.0, 0.125)
     rays = pixel_rays(PIN, u.ravel(), v.ravel())
-    inside = outline(CylinderBatch.of(body), rays)[0] < 0.0
+    inside = outline_distance(CylinderBatch.of(body), rays)[0] < 0.0
     truly = (picture.mask[v, u] == 1).ravel()
     assert np.mean(inside != truly) < 0.004
     both = inside & truly
-    apart = np.abs(depth(CylinderBatch.of(body), rays[both])[0] - picture.depth_m[v, u].ravel()[both])
+    apart = np.abs(surface_depth(CylinderBatch.of(body), rays[both])[0] - picture.depth_m[v, u].ravel()[both])
     assert np.quantile(apart, 0.98) < 0.01 and np.median(apart) < 1e-3
 
 
@@ -193,14 +194,14 @@ def test_where_the_picture_cuts_a_log_its_end_is_not_known(degrees: float, short
 
 def test_what_is_no_log_is_refused_with_a_reason() -> None:
     (fit,), _, _ = fits_of(lying(1, 4.6, 0.0, 90.0))
-    assert refused(fit) == ""
+    assert implausibility(fit) is None
     short = replace(fit.body, start_m=-0.1, end_m=0.1, radius_m=0.11)
-    assert "0.22 m wide and 0.20 m long, which is no log" in refused(replace(fit, body=short))
-    assert "which no log here is" in refused(replace(fit, body=replace(fit.body, radius_m=0.6)))
-    assert "30 % of its outline" in refused(replace(fit, explained=0.3))
+    assert implausibility(replace(fit, body=short)).code == "too-wide"
+    assert implausibility(replace(fit, body=replace(fit.body, radius_m=0.6))).code == "bad-width"
+    assert implausibility(replace(fit, explained=0.3)).code == "bad-contour"
     vague = fit.covariance.copy()
     vague[3, 3] = 0.5
-    assert "direction is not determined" in refused(replace(fit, covariance=vague))
+    assert implausibility(replace(fit, covariance=vague)).code == "unknown-direction"
 
 
 def test_no_log_no_depth_and_a_wrong_frame_make_no_log() -> None:
@@ -211,14 +212,14 @@ def test_no_log_no_depth_and_a_wrong_frame_make_no_log() -> None:
     assert perception.fits(frame, [TrueMask(np.zeros_like(picture.mask, bool))]) == []
     blind = replace(frame, depth_m=np.where(picture.mask == 1, np.nan, frame.depth_m))
     assert perception.fits(blind, masks_of(picture)) == []
-    assert "depth" in perception.refusals[0].why
-    with pytest.raises(RgbdFrameError, match="no depth anywhere"):
+    assert perception.rejections[0].code == "too-little-depth"
+    with pytest.raises(RgbdFrameError, check=coded("frame.depth-unknown")):
         perception.fits(replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), [])
-    with pytest.raises(RgbdFrameError, match="'rear', which the machine does not have; it has: front"):
+    with pytest.raises(RgbdFrameError, check=coded("frame.unknown-camera")):
         perception.fits(replace(frame, camera="rear"), [])
-    with pytest.raises(RgbdFrameError, match="mask 0 is"):
+    with pytest.raises(RgbdFrameError, check=coded("frame.bad-mask")):
         perception.fits(frame, [TrueMask(np.zeros((3, 3), bool))])
-    with pytest.raises(RgbdFrameError, match="intrinsics are for"):
+    with pytest.raises(RgbdFrameError, check=coded("frame.bad-size")):
         perception.fits(replace(frame, intrinsics=PIN.scaled(0.5)), [])
 
 
@@ -234,7 +235,7 @@ def test_noise_of_any_shape_in_a_mask_is_a_log_or_a_refusal_but_no_crash() -> No
         mask &= rng.random(mask.shape) < rng.choice([0.2, 0.9, 1.0])
         wild = replace(frame, depth_m=rng.uniform(0.3, 20.0, mask.shape).astype(np.float32))
         fits = perception.fits(wild, [TrueMask(mask)])
-        assert len(fits) + len(perception.refusals) == 1
+        assert len(fits) + len(perception.rejections) == 1
         assert all(np.isfinite(f.covariance).all() for f in fits)
 
 
@@ -256,13 +257,13 @@ def test_paper_a_takes_the_surface_for_the_log() -> None:
     log, view = lying(1, 4.6, 0.2, 90.0), view_from()
     picture = seen(scene_of(log), view)
     frame = frame_of(picture, view, exact=True)
-    found = paper_a.log_of(frame, picture.mask == 1)
+    found = paper_a.log_from_mask(frame, picture.mask == 1)
     assert found is not None
     assert found.length_m == pytest.approx(2.0, abs=0.05) and found.diameter_m == pytest.approx(0.25, abs=0.06)
     assert angle_deg(view.rotation @ found.axis, log.axis) < 1.0
     off = view.to_world(found.center_m[None])[0] - log.position_m
     assert 0.06 < np.linalg.norm(off) < 0.13  # towards the camera
-    assert paper_a.log_of(frame, np.zeros_like(picture.mask, bool)) is None
+    assert paper_a.log_from_mask(frame, np.zeros_like(picture.mask, bool)) is None
 
 
 @pytest.mark.parametrize(("lean_deg", "believed"), [(20.0, 1), (40.0, 0)])
@@ -285,4 +286,4 @@ def test_a_log_whose_depth_is_known_at_its_border_alone_is_refused() -> None:
     inner = binary_erosion(picture.mask == 1, iterations=3)
     perception = Perception(PROFILE)
     assert perception.fits(replace(frame, depth_m=np.where(inner, np.nan, frame.depth_m)), masks_of(picture)) == []
-    assert [r.why for r in perception.refusals] == ["too little of its depth is known"]
+    assert [r.code for r in perception.rejections] == ["too-little-depth"]

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from autonomy.networks.torch_net import random_net
-from autonomy.networks.weights import WeightsRefused, load, save
+from autonomy.networks.weights import WeightsError, load, save
 from autonomy.perception.papers.box_detector import BoxDetector
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
@@ -182,7 +182,7 @@ def test_the_depth_variant_begins_with_what_colour_and_depth_were_looked_at_with
     assert all(np.array_equal(taken[k], arrays[k]) for k in arrays if k != "in2.weight")
     save(alone, unet("depth"), taken, {})
     assert np.array_equal(detector_weights.begun(alone, "depth")["in2.weight"], taken["in2.weight"])
-    with pytest.raises(WeightsRefused, match="logs_rgbd"):
+    with pytest.raises(WeightsError, match="logs_rgbd"):
         detector_weights.begun(alone, "rgbd")
 
 

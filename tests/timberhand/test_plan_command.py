@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from runtime.plot_style import MOSS, OIL, RUST, TIMBER
 from host.exit_codes import CommandFailed, ExitCode
+from runtime.plot_style import MOSS, OIL, RUST, TIMBER
 from timberhand.cli import app
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"

@@ -12,10 +12,11 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from can_dbc.timing.page import Timing, TimingWriter
+from host.exit_codes import CommandFailed
 from timberhand.cli import app
 from timberhand.service_status import status
 from timberhand.service_status.screen import duration, number, screen
-from timberhand.service_status.status import Look, Unit, look, read_unit, worst_first
+from timberhand.service_status.status import Status, Unit, oldest_first, read_status, read_unit
 
 S = 1_000_000_000
 Timings = Callable[..., Timing]
@@ -30,7 +31,7 @@ def unit(**found: str) -> Unit:
     return read_unit(usual | found, 100.0)
 
 
-def shown(found: Look, width: int, before: Timing | None = None) -> str:
+def shown(found: Status, width: int, before: Timing | None = None) -> str:
     console = Console(width=width, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(screen(found, before))
     return console.export_text()
@@ -66,7 +67,7 @@ def test_a_running_unit() -> None:
         (
             {"ActiveState": "activating", "SubState": "auto-restart", "Result": "watchdog", "ExecMainStatus": "9"},
             "restarting",
-            "it hung, and the watchdog ended it",
+            "hung, ended by the watchdog",
         ),
         (
             {"ActiveState": "activating", "SubState": "auto-restart", "Result": "signal", "ExecMainStatus": "11"},
@@ -80,8 +81,8 @@ def test_what_systemd_means(found: dict[str, str], state: str, why: str) -> None
     assert (seen.state, seen.why) == (state, why)
 
 
-def test_a_unit_that_failed_in_silence_says_its_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(status, "last_words", lambda name: f"{name}: no such bus")
+def test_a_unit_that_failed_without_a_status_text_shows_its_last_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(status, "last_journal_line", lambda name: f"{name}: no such bus")
     failed = {"ActiveState": "failed", "Result": "exit-code", "ExecMainStatus": "4", "StatusText": ""}
     assert unit(**failed).words == "timberhand-guard.service: no such bus"
     assert unit(StatusText="").words == "", "not of one that runs"
@@ -90,7 +91,7 @@ def test_a_unit_that_failed_in_silence_says_its_last_line(monkeypatch: pytest.Mo
 @pytest.mark.parametrize("width", [60, 80, 120])
 def test_the_screen_fits_and_cuts_nothing(timing: Timings, width: int) -> None:
     units = (Unit("controller", "failed", "exit status 4, bus", 3 * 86400.0, 12, "A sentence " * 12), unit())
-    text = shown(Look(units, timing(missed=3), ("A note.",)), width, timing(50))
+    text = shown(Status(units, timing(missed=3), ("A note.",)), width, timing(50))
     assert "…" not in text and max(map(len, text.splitlines())) <= width
     for words in (
         "failed (exit status 4, bus)",
@@ -105,25 +106,23 @@ def test_the_screen_fits_and_cuts_nothing(timing: Timings, width: int) -> None:
     assert len(text.splitlines()) <= 50
 
 
-def test_the_worst_input_comes_first_and_what_never_came_is_told(timing: Timings) -> None:
-    assert [name for name, _ in worst_first(list(timing().facts.inputs.items()))][:2] == ["Input6", "Input5"]
-    text = shown(Look((), timing(), ()), 80)
+def test_the_oldest_input_comes_first_and_one_never_received_is_named(timing: Timings) -> None:
+    assert [name for name, _ in oldest_first(list(timing().facts.inputs.items()))][:2] == ["Input6", "Input5"]
+    text = shown(Status((), timing(), ()), 80)
     assert text.index("Input6") < text.index("Input5") < text.index("Input3")
-    assert "Input2" not in text and "3 better ones" in text and "never came: Never" in text
+    assert "Input2" not in text and "3 younger ones" in text and "never received: Never" in text
 
 
 def test_an_old_page_says_so(timing: Timings) -> None:
-    assert "hangs or has ended" not in shown(Look((), timing(), ()), 80)
-    assert "It has said nothing for 12 s: it hangs or has ended." in shown(
-        Look((), timing(written_ns=time.monotonic_ns() - 12 * S), ()), 80
-    )
+    assert "hangs or has ended" not in shown(Status((), timing(), ()), 80)
+    assert "no update for 12 s" in shown(Status((), timing(written_ns=time.monotonic_ns() - 12 * S), ()), 80)
 
 
 def test_the_last_second_stands_beside_all_time(timing: Timings) -> None:
     before, now = timing(100, started_ns=5), timing(300, started_ns=5)
-    text = shown(Look((), now, ()), 100, before)
+    text = shown(Status((), now, ()), 100, before)
     assert "now p99" in text and "ticks 300 (+200)" in text
-    another_life = shown(Look((), timing(300, started_ns=6), ()), 100, before)
+    another_life = shown(Status((), timing(300, started_ns=6), ()), 100, before)
     assert "now p99" not in another_life
 
 
@@ -135,25 +134,25 @@ def test_without_systemd_there_is_the_page_alone(
     writer = TimingWriter(page)
     written = timing(10)
     writer.publish(written.facts, written.durations)
-    seen = look(page)
-    assert (
-        seen.units == () and not seen.silent and seen.notes == ("systemd does not run here, so no service is shown.",)
-    )
+    seen = read_status(page)
+    assert seen.units == () and not seen.silent and len(seen.notes) == 1
     done = CliRunner().invoke(app, ["service", "status", "--json", "--timing", str(page)])
-    said = json.loads(done.stdout)
-    assert said["timing"]["pid"] == 4711 and said["timing"]["durations"]["wake"]["p50_us"] == pytest.approx(
+    document = json.loads(done.stdout)
+    assert document["timing"]["pid"] == 4711 and document["timing"]["durations"]["wake"]["p50_us"] == pytest.approx(
         10.0, abs=1.0
     )
-    assert said["timing"]["silent"] is False and said["units"] == []
-    assert "longest_ns" not in said["timing"]
+    assert document["timing"]["silent"] is False and document["units"] == []
+    assert "longest_ns" not in document["timing"]
     writer.close()
 
 
-def test_nothing_at_all_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_services_and_timing_the_command_fails_with_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(status, "SYSTEMD", tmp_path / "nothing")
     done = CliRunner().invoke(app, ["service", "status", "--timing", str(tmp_path / "page")])
     assert done.exit_code != 0
-    assert "No controller tells its timing" in str(done.exception)
+    assert isinstance(done.exception, CommandFailed) and done.exception.code == "service.nothing-found"
 
 
 def test_numbers_and_durations() -> None:

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from autonomy.perception.camera.mount import optical_pose
 from host.exit_codes import CommandFailed, ExitCode
-from machine.loading.profile_file import load_profile, profile_hash
 from machine.geometry.optics import intrinsics
+from machine.loading.profile_file import load_profile, profile_hash
 from timberhand.cli import app
 
 PALMS = load_profile("palms_471")

@@ -1,4 +1,4 @@
-"""``timberhand bench``: measurements, each a command that prints its environment and its figures."""
+"""``timberhand bench``: benchmarks that print their environment and their figures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import typer
 
 from timberhand.commands import bench_bus, bench_codec, bench_loop_design, bench_motion, bench_plant
 
-app = typer.Typer(no_args_is_help=True, help="Measure: every claimed figure has the command that makes it.")
+app = typer.Typer(no_args_is_help=True, help="Benchmarks: measure the documented figures again.")
 app.command("bus")(bench_bus.bus)
 app.command("codec")(bench_codec.codec)
 app.command("loop-design")(bench_loop_design.loop_design)

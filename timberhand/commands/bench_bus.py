@@ -1,4 +1,4 @@
-"""``timberhand bench bus``: what receiving a frame costs, ours beside python-can, in one run."""
+"""``timberhand bench bus``: the cost of receiving a frame, compared with python-can in one run."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ from typing import Annotated
 
 import typer
 
+from timberhand.commands.options import JsonOption
+
 
 def bus(
-    frames: Annotated[int, typer.Option(min=10, help="Frames per round and path.")] = 1000,
-    rounds: Annotated[int, typer.Option(min=3, help="Rounds in which the paths take turns; the median counts.")] = 31,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+    frames: Annotated[int, typer.Option(min=10, help="Frames per round and receive path.")] = 1000,
+    rounds: Annotated[int, typer.Option(min=3, help="Rounds with all paths in turn; the median counts.")] = 31,
+    as_json: JsonOption = False,
 ) -> None:
-    """Time the way from the socket to checked and decoded values, per frame of crane0, along every path.
+    """Measure the time from the socket to checked and decoded values, per frame of crane0, for every receive path.
 
-    Over vcan where the kernel has it, else over a stand-in with the same code on top.  Exit code 6 when the fast path
-    needs more than 5 us per frame; inside user-mode Linux there is no such verdict.
+    Uses vcan where the kernel has it, else a socket pair with the same code on
+    top. Exit code 6 when the fast path needs more than 5 us per frame; not
+    evaluated inside user-mode Linux.
+
+    [bold]Examples[/bold]
 
       timberhand bench bus
 
@@ -54,9 +59,7 @@ def _show(result: dict, reached: bool) -> None:
         table.add_row(label, f"{metrics[f'rx{suffix}_us']:.2f}", f"{metrics[f'rx_decode{suffix}_us']:.2f}")
     screen.print(table)
     if "pair" in result["paths"]["ours"]:
-        screen.print(
-            "[dim]This kernel has no CAN: a pair of datagram sockets carries the frames, same code on top.[/dim]"
-        )
+        screen.print("[dim]This kernel has no CAN: a pair of datagram sockets carries the frames instead.[/dim]")
     screen.print(f"python-can costs {metrics['rx_decode_ratio']:.1f} times as much")
     if result["lab"]:
         screen.print("[yellow]lab: user-mode Linux, where a system call costs a hundred times as much[/yellow]")

@@ -1,5 +1,4 @@
-"""``timberhand bench codec``: the compiled codec beside cantools, in one run, over the messages of
-crane.dbc."""
+"""``timberhand bench codec``: the compiled codecs compared with cantools, in one run, on the messages of crane.dbc."""
 
 from __future__ import annotations
 
@@ -7,19 +6,21 @@ from typing import Annotated, Any, Final
 
 import typer
 
-ENCODE_NEEDED: Final = 5.0
-DECODE_NEEDED: Final = 2.0
-LOOPS: Final = 100
+from timberhand.commands.options import JsonOption
+
+MIN_ENCODE_RATIO: Final = 5.0
+MIN_DECODE_RATIO: Final = 2.0
+CALLS_PER_SAMPLE: Final = 100
 
 
 def codec(
     repetitions: Annotated[int, typer.Option(min=3, help="Interleaved repetitions; the median counts.")] = 31,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Time encode and decode of every message of crane.dbc, ours and cantools in turn.
+    """Measure encode and decode of every message of crane.dbc, with the compiled codec and cantools in turn.
 
-    Both sides check ranges when they encode.  Exit code 6 when encoding is not 5 times or decoding not 2
-    times as fast as cantools.
+    Both check ranges when they encode. Exit code 6 unless encoding is 5 times and
+    decoding 2 times as fast as cantools.
     """
     import json
 
@@ -84,9 +85,9 @@ def measure(repetitions: int) -> dict[str, Any]:
             "bitstruct": version("bitstruct"),
         },
         "repetitions": repetitions,
-        "needed": {"encode": ENCODE_NEEDED, "decode": DECODE_NEEDED},
+        "needed": {"encode": MIN_ENCODE_RATIO, "decode": MIN_DECODE_RATIO},
         "ratios": ratios,
-        "reached": ratios["encode"] >= ENCODE_NEEDED and ratios["decode"] >= DECODE_NEEDED,
+        "reached": ratios["encode"] >= MIN_ENCODE_RATIO and ratios["decode"] >= MIN_DECODE_RATIO,
         "messages": rows,
     }
 
@@ -109,9 +110,9 @@ def _timed(
     for _ in range(repetitions):
         for name, call in cases.items():
             start = perf_counter_ns()
-            for _ in range(LOOPS):
+            for _ in range(CALLS_PER_SAMPLE):
                 call()
-            samples[name].append((perf_counter_ns() - start) / LOOPS)
+            samples[name].append((perf_counter_ns() - start) / CALLS_PER_SAMPLE)
     return {name: median(times) for name, times in samples.items()}
 
 

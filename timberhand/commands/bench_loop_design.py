@@ -1,4 +1,4 @@
-"""``timberhand bench loop-design``: margins of every loop over all machines that the truth's spread allows."""
+"""``timberhand bench loop-design``: stability margins of every loop over the whole spread of machines."""
 
 from __future__ import annotations
 
@@ -7,31 +7,37 @@ from typing import Annotated, Any
 
 import typer
 
+from timberhand.commands.options import JsonOption
+
 
 def loop_design(
     profile: Annotated[
-        list[str] | None, typer.Option(help="A shipped profile or a TOML file; may be given again (default: both).")
+        list[str] | None, typer.Option(help="Machine profile; may be repeated (default: both shipped ones).")
     ] = None,
-    truth: Annotated[str, typer.Option(help="The plant's truth and its spread: nominal or a TOML file.")] = "nominal",
-    out: Annotated[Path | None, typer.Option(help="Where the pictures go (default: none are drawn).")] = None,
+    truth: Annotated[
+        str, typer.Option(help="Ground truth of the plant and its spread: nominal or a TOML file.")
+    ] = "nominal",
+    out: Annotated[Path | None, typer.Option(help="Folder for plots (default: none).")] = None,
     docs: Annotated[
-        Path | None, typer.Option(help="Folder whose loop-design.md is written anew, with every law and pictures.")
+        Path | None, typer.Option(help="Folder of the page loop-design.md, written again with plots.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Linear model of every joint, and of the carrier, with its law; phase and gain margins, bandwidth, worst machine.
+    """Compute phase margin, gain margin and bandwidth of every control loop, for the worst machine.
 
-    Near, working and far reach, empty and loaded, dead times and gains over the whole spread of the truth; for the
-    heading slow and fast, near a waypoint and far from it. Exit code 6
-    when a phase margin is below 40 deg or a gain margin below 6 dB anywhere.
+    Linear models of every joint and of the carrier with their control laws, over
+    near, working and far reach, empty and loaded, and the whole spread of dead
+    times and gains; of the heading loop slow and fast, near a waypoint and far
+    from it. Exit code 6 when a phase margin is below 40 deg or a gain margin
+    below 6 dB.
 
     [bold]Examples[/bold]
 
-      timberhand bench loop-design                              both shipped machines
+      timberhand bench loop-design
 
-      timberhand bench loop-design --profile my.toml --out runs/loops   gains of your own, with pictures
+      timberhand bench loop-design --profile my.toml --out runs/loops
 
-      timberhand bench loop-design --docs docs                  every law, and the page that shows them
+      timberhand bench loop-design --docs docs
     """
     import json
 

@@ -1,4 +1,4 @@
-"""``timberhand bench motion``: clear ways, how long they take to plan and to drive."""
+"""``timberhand bench motion``: planning time and duration of collision-free crane motions."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ from typing import Annotated
 
 import typer
 
+from timberhand.commands.options import JsonOption
+
 
 def motion(
-    seeds: Annotated[int, typer.Option(min=1, help="So many scenes of every kind.")] = 6,
-    profile: Annotated[list[str] | None, typer.Option(help="A profile; may be repeated. Default: both.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+    seeds: Annotated[int, typer.Option(min=1, help="Scenes of each kind.")] = 6,
+    profile: Annotated[
+        list[str] | None, typer.Option(help="Machine profile; may be repeated (default: both shipped ones).")
+    ] = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Plan the motions of a cycle in the simulator's scenes: CPU time, duration beside always going at full height.
+    """Plan the motions of a crane cycle in simulated scenes; compare them with motions at full travel height.
 
     [bold]Examples[/bold]
 
@@ -45,9 +49,9 @@ def motion(
             typer.echo(
                 f"{name}: {m['motions']} motions, {m['blocked']} blocked, {m['no_grasp']} scenes without a grasp\n"
                 f"  planned in {m['cpu_p50_ms']:.0f} ms of CPU (median), {m['cpu_p95_ms']:.0f} ms (95 %); "
-                f"best of 4: {m['cpu_best_p50_ms']:.0f} and {m['cpu_best_p95_ms']:.0f} ms (goal: {GOAL_MS:.0f})\n"
-                f"  driven in {m['ours_mean_s']:.2f} s (mean), always at full height in {m['travel_mean_s']:.2f} s, "
-                f"which comes too near {m['travel_too_near']} times"
+                f"best of 4: {m['cpu_best_p50_ms']:.0f} and {m['cpu_best_p95_ms']:.0f} ms (goal: {GOAL_MS:.0f} ms)\n"
+                f"  duration {m['ours_mean_s']:.2f} s (mean); at full travel height {m['travel_mean_s']:.2f} s, "
+                f"with {m['travel_too_near']} clearance violations"
             )
             for sentence in bench.blocked[:5]:
                 typer.echo(f"  {sentence}")

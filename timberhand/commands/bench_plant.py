@@ -1,4 +1,4 @@
-"""``timberhand bench plant``: how fast the plant runs, with the host it ran on."""
+"""``timberhand bench plant``: real-time factor of the plant on this host."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ from typing import Annotated
 
 import typer
 
+from timberhand.commands.options import JsonOption, ProfileOption, TruthOption
+
 
 def plant(
-    profile: Annotated[str, typer.Option(help="A shipped profile or a TOML file.")] = "palms_471",
-    truth: Annotated[str, typer.Option(help="The plant's hidden truth: nominal, sampled, or a TOML file.")] = "nominal",
-    quick: Annotated[bool, typer.Option(help="A few stretches only.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+    profile: ProfileOption = "palms_471",
+    truth: TruthOption = "nominal",
+    quick: Annotated[bool, typer.Option(help="Fewer repetitions.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Real-time factors of the crane with 12 logs and of a whole forwarder mission, camera time, cost per log.
+    """Measure the real-time factors of a crane with 12 logs and of a whole mission, camera time and cost per log.
 
-    Exit code 6 when a factor is not reached on a quiet host; on a noisy one the figure is called inconclusive.
+    Exit code 6 when a factor is missed on a quiet host; on a noisy host the
+    figure is reported as inconclusive.
     """
     import json
 

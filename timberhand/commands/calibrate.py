@@ -1,4 +1,4 @@
-"""``timberhand calibrate``: find out what a new machine really does, and write its profile."""
+"""``timberhand calibrate``: identify the properties of a machine, and write its profile."""
 
 from __future__ import annotations
 
@@ -25,33 +25,36 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    profile: Annotated[str, typer.Option(help="The machine as it is known: a shipped profile or a TOML file.")],
-    out: Annotated[Path, typer.Option(help="The calibrated profile, a new TOML file.")] = Path("calibrated.toml"),
+    profile: Annotated[str, typer.Option(help="Present machine profile: a shipped name or a TOML file.")],
+    out: Annotated[Path, typer.Option(help="New TOML file: the calibrated profile.")] = Path("calibrated.toml"),
     report: Annotated[Path | None, typer.Option(help="Folder of the report (default: beside --out).")] = None,
     survey: Annotated[
-        str | None, typer.Option(help="HOST:PORT of a surveying instrument, or 'ask' to type its readings in.")
+        str | None, typer.Option(help="HOST:PORT of a total station, or 'ask' to type its readings.")
     ] = None,
-    controller: Annotated[str, typer.Option(help="HOST:PORT that takes setpoints.")] = "127.0.0.1:47001",
-    report_port: Annotated[int, typer.Option(help="Local UDP port of the state reports.")] = 47002,
-    bus: Annotated[str, typer.Option(help="The crane's bus, as in socketcan:can0; only listened to.")] = "wire:crane0",
-    key_file: Annotated[Path | None, typer.Option(help="Key that authenticates datagrams.")] = None,
-    lease_ms: Annotated[int, typer.Option(help="How long a setpoint is obeyed.")] = 200,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the machine moves.")] = False,
-    lockstep: Annotated[bool, typer.Option(help="A virtual machine in virtual time instead of a real one.")] = False,
-    truth: Annotated[str, typer.Option(help="With --lockstep: nominal, sampled or a truth file.")] = "sampled",
-    seed: Annotated[int, typer.Option(help="With --lockstep: which individual machine.")] = 1,
+    controller: Annotated[str, typer.Option(help="HOST:PORT of the controller's setpoint port.")] = "127.0.0.1:47001",
+    report_port: Annotated[int, typer.Option(help="Local UDP port for the state reports.")] = 47002,
+    bus: Annotated[str, typer.Option(help="Bus of the crane, as in socketcan:can0; read only.")] = "wire:crane0",
+    key_file: Annotated[Path | None, typer.Option(help="File with the key that authenticates datagrams.")] = None,
+    lease_ms: Annotated[int, typer.Option(help="Lease of a setpoint in ms.")] = 200,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation before the machine moves.")] = False,
+    lockstep: Annotated[bool, typer.Option(help="Calibrate a virtual machine in virtual time.")] = False,
+    truth: Annotated[
+        str, typer.Option(help="With --lockstep: ground truth: nominal, sampled, or a TOML file.")
+    ] = "sampled",
+    seed: Annotated[int, typer.Option(help="With --lockstep: chooses the virtual machine.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report's result.json on stdout.")] = False,
 ) -> None:
-    """Find dead-bands, gains, delays, zeros and sag of a machine through its bus, and write them into a new profile.
+    """Identify dead-bands, gains, delays, zeros and sag of a machine over its bus, and write a new profile.
 
-    The crane moves by itself for about four minutes, one function at a time. Ctrl-C stops it at any time. A profile is
-    written only when every value can be believed; else the exit code is 6 and the report says why.
+    The crane moves for about four minutes, one function at a time. Ctrl-C stops
+    it at any time. A profile is written only when every value is plausible;
+    otherwise the exit code is 6 and the report tells why.
 
     [bold]Examples[/bold]
 
-      timberhand calibrate --profile palms_471 --bus socketcan:can0 --survey ask --out my_crane.toml
+      timberhand calibrate --profile palms_471 --bus socketcan:can0 --survey ask
 
-      timberhand calibrate --profile palms_471 --lockstep --seed 7 --survey sim --out my_crane.toml
+      timberhand calibrate --profile palms_471 --lockstep --survey sim
     """
     from rich.console import Console
 
@@ -77,7 +80,7 @@ def calibrate(
             known,
             (controller, report_port, bus, key_file, lease_ms),
             survey,
-            lambda plan: _agree(known, plan, yes),
+            lambda plan: _confirm(known, plan, yes),
             screen,
         )
     with screen.status("fitting"):
@@ -93,7 +96,7 @@ def calibrate(
         screen.print("\n".join(f"[red]✘[/red] {sentence}" for sentence in result.implausible), highlight=False)
         raise CommandFailed(
             "calibrate.implausible",
-            f"no profile is written: {len(result.implausible)} values are implausible; see {folder}",
+            f"no profile is written: {len(result.implausible)} values are implausible, see {folder}",
             ExitCode.FIGURE_MISSED,
         )
     try:
@@ -102,7 +105,7 @@ def calibrate(
         raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
     screen.print(f"[green]✔[/green] {out} written, {len(changed)} values; report in {folder}", highlight=False)
     if result.survey is None:
-        screen.print("zeros and sag stay as they were: nothing was surveyed (--survey)", highlight=False)
+        screen.print("zeros and sag are unchanged, because nothing was surveyed (--survey)", highlight=False)
     for sentence in result.kept:
         screen.print(sentence, highlight=False)
 
@@ -119,14 +122,14 @@ def _source(profile: str) -> Path:
     return Path(profile_path(profile))
 
 
-def _agree(profile: Profile, plan: CalibrationPlan, yes: bool) -> None:
-    """Says what will move and waits for a yes; anything else ends the command."""
+def _confirm(profile: Profile, plan: CalibrationPlan, yes: bool) -> None:
+    """Show the motions and ask for confirmation; raises CommandFailed without one."""
     from autonomy.calibration.plan import plan_summary
 
-    print(f"{profile.title}: these will move, one at a time:", file=sys.stderr)
+    print(f"{profile.title}: these functions will move, one at a time:", file=sys.stderr)
     for line in plan_summary(profile, plan):
         print(f"  {line}", file=sys.stderr)
-    print("Clear the zone: nobody and no log within reach, the grapple empty, the machine at rest.", file=sys.stderr)
+    print("Clear the zone: no person and no log within reach, the grapple empty, the machine at rest.", file=sys.stderr)
     if not yes and not typer.confirm("Move now?", err=True):
         raise CommandFailed("calibrate.not-confirmed", "nothing was moved", ExitCode.INTERRUPTED)
 
@@ -147,7 +150,7 @@ def _lockstep(
         with _Progress(screen) as progress:
             outcome = run_lockstep(
                 name, truth, seed, surveyed=surveyed, recorder=recorder,
-                show=lambda plan: _agree(profile, plan, yes=True), watch=progress.show, aborted=lambda: bool(pressed),
+                show=lambda plan: _confirm(profile, plan, yes=True), watch=progress.show, aborted=lambda: bool(pressed),
             )  # fmt: skip
     except (ValueError, RecordingRefused) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
@@ -157,11 +160,13 @@ def _lockstep(
             recorder.close()
     if pressed:
         raise CommandFailed(
-            "calibrate.interrupted", "interrupted; the valves are neutral and nothing is written", ExitCode.INTERRUPTED
+            "calibrate.interrupted", "interrupted; the valves are neutral, no profile is written", ExitCode.INTERRUPTED
         )
     if outcome.failure is not None or outcome.calibration is None:
         raise CommandFailed(
-            "calibrate.ended-early", f"calibration ended: {outcome.failure}; nothing is written", ExitCode.SAFETY_STOP
+            "calibrate.ended-early",
+            f"calibration ended: {outcome.failure}; no profile is written",
+            ExitCode.SAFETY_STOP,
         )
     return outcome.calibration
 
@@ -170,7 +175,7 @@ def _live(
     profile: Profile,
     link_options: tuple[str, int, str, Path | None, int],
     survey: str | None,
-    agree: Callable[[CalibrationPlan], None],
+    confirm: Callable[[CalibrationPlan], None],
     screen: Console,
 ) -> Calibration:
     from autonomy.calibration import live
@@ -217,7 +222,7 @@ def _live(
                 ExitCode.BUS,
             )
         plan = make_plan(profile, report.position, survey is not None)
-        agree(plan)
+        confirm(plan)
         readings = 1 if survey == "ask" else READING_COUNT
         run = Calibration(profile, profile_hash(profile), plan, load("crane"), lease_ms * 1_000_000, key, readings)
         before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
@@ -244,17 +249,17 @@ def _live(
         link.close()
     if pressed:
         raise CommandFailed(
-            "calibrate.interrupted", "interrupted; the valves are neutral and nothing is written", ExitCode.INTERRUPTED
+            "calibrate.interrupted", "interrupted; the valves are neutral, no profile is written", ExitCode.INTERRUPTED
         )
     if not run.done:
         raise CommandFailed(
-            "calibrate.ended-early", f"calibration ended: {run.failure}; nothing is written", ExitCode.SAFETY_STOP
+            "calibrate.ended-early", f"calibration ended: {run.failure}; no profile is written", ExitCode.SAFETY_STOP
         )
     return run
 
 
 def _surveyor(survey: str | None, screen: Console) -> Surveyor | None:
-    """How a reading is got: never, typed in, or from an instrument."""
+    """The source of survey readings: none, typed, or an instrument."""
     from autonomy.calibration.live import SurveyInstrument
     from can_dbc.messages.udp_address import udp_address
 
@@ -264,36 +269,36 @@ def _surveyor(survey: str | None, screen: Console) -> Surveyor | None:
 
 
 class _Typed:
-    """A person reads an instrument and types.
+    """Survey readings that a person types.
 
-    The crane stands, its last setpoint was final: the lease may run out meanwhile.
+    The crane stands still and its last setpoint was final, so the lease may expire meanwhile.
     """
 
     def __init__(self, screen: Console) -> None:
         self._screen = screen
 
     def read(self, now_ns: int) -> tuple[float, float, float] | None:
-        """The hanger pin."""
+        """Position of the hanger pin [m]; None after invalid input."""
         text = typer.prompt("hanger pin x y z [m, crane base frame]", err=True)
         try:
             x, y, z = map(float, text.replace(",", " ").split())
         except ValueError:
-            self._screen.print("three numbers, as in 0.12 5.43 2.10")
+            self._screen.print("enter three numbers, as in 0.12 5.43 2.10")
             return None
         return x, y, z
 
     def read_yaw(self, now_ns: int) -> float | None:
-        """The grapple's direction."""
+        """Direction of the grapple [rad]; NaN when nobody can read it, None after invalid input."""
         text = typer.prompt("direction along which the grapple opens [deg from x towards y, - for none]", err=True)
         try:
             return math.nan if text.strip() == "-" else math.radians(float(text))
         except ValueError:
-            self._screen.print("degrees, as in 92.5; or - when nobody can read it: then the rotator is not tested")
+            self._screen.print("enter degrees, as in 92.5, or - if it cannot be read; then the rotator is not tested")
             return None
 
 
 class _Progress:
-    """A bar with the remaining time, and what is being done."""
+    """A progress bar with the remaining time and the present task."""
 
     def __init__(self, screen: Console) -> None:
         from rich.progress import BarColumn, Progress, TextColumn
@@ -312,16 +317,18 @@ class _Progress:
         self._bar.stop()
 
     def show(self, calibration: Calibration) -> None:
-        """The state of the run now."""
+        """Show the present state of the run."""
         left = calibration.remaining_s()
         if calibration.waiting and calibration.begun_ns is None and calibration.waiting != self._waiting:
             self._waiting = calibration.waiting
             self._screen.print(f"waiting for ARM: {self._waiting}", highlight=False)
         whole = max(calibration.elapsed_s + left, 1.0)
-        self._bar.update(self._task, completed=calibration.elapsed_s / whole, description=_says(calibration), left=left)
+        self._bar.update(
+            self._task, completed=calibration.elapsed_s / whole, description=_task_name(calibration), left=left
+        )
 
 
-def _says(calibration: Calibration) -> str:
+def _task_name(calibration: Calibration) -> str:
     from autonomy.calibration.tasks import GrappleTask, MoveTask, PinReadingTask, PulseTask, SpoolTask, YawReadingTask
 
     match calibration.task:
@@ -341,7 +348,7 @@ def _says(calibration: Calibration) -> str:
 
 
 def _show(result: Any, screen: Console) -> None:
-    """The values as a table."""
+    """Print the values as a table."""
     from rich.table import Table
 
     table = Table("joint", "dead-band + / - [%]", "full speed + / -", "dead time [ms]", "lag [ms]", "response [ms]")
@@ -361,4 +368,4 @@ def _show(result: Any, screen: Console) -> None:
     screen.print(table)
     if result.survey is not None:
         before, after = (1e3 * max(d) for d in (result.survey.before_m, result.survey.after_m))
-        screen.print(f"survey: pin off by up to {before:.0f} mm as shipped, {after:.0f} mm with zeros and sag")
+        screen.print(f"survey: largest pin error {before:.0f} mm as shipped, {after:.0f} mm with zeros and sag")

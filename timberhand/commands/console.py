@@ -1,4 +1,4 @@
-"""``timberhand console``: the operator's web page."""
+"""``timberhand console``: serve the operator's web page."""
 
 from __future__ import annotations
 
@@ -7,34 +7,39 @@ from typing import Annotated
 
 import typer
 
+from timberhand.commands.options import ProfileOption
+
 
 def console(
     port: Annotated[int, typer.Option(help="Port of the page.")] = 8471,
-    report_port: Annotated[int, typer.Option(help="UDP port on which the controller's reports arrive.")] = 8472,
-    profile: Annotated[str, typer.Option(help="A shipped profile or a TOML file.")] = "palms_471",
+    report_port: Annotated[int, typer.Option(help="UDP port that receives the controller's state reports.")] = 8472,
+    profile: ProfileOption = "palms_471",
     controller: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Where commands go; without it the page only watches.")
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Setpoint port of the controller; without it the page is read-only."),
     ] = None,
     planner: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Where the orders to a mission go: its --order-port.")
+        str | None, typer.Option(metavar="HOST:PORT", help="Operator command port of the planner (its --order-port).")
     ] = None,
     scene: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="A detector to ask for the logs that lie there.")
+        str | None, typer.Option(metavar="HOST:PORT", help="Log detector that lists the logs for the drawing.")
     ] = None,
-    bind: Annotated[str, typer.Option(help="Address to serve on; the default is this machine only.")] = "127.0.0.1",
+    bind: Annotated[str, typer.Option(help="Address to serve on; by default this computer only.")] = "127.0.0.1",
     allow_host: Annotated[
-        list[str] | None, typer.Option(help="A host name to serve besides this machine's own; may be repeated.")
+        list[str] | None, typer.Option(help="Further host name to accept in requests; may be repeated.")
     ] = None,
-    key_file: Annotated[Path | None, typer.Option(help="File with the key of authenticated datagrams.")] = None,
+    key_file: Annotated[Path | None, typer.Option(help="File with the key that authenticates datagrams.")] = None,
     timing: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The controller's timing page, to be shown too.")
+        Path | None, typer.Option(metavar="FILE", help="Timing page of the controller, to be shown.")
     ] = None,
 ) -> None:
-    """Serve the page that shows the crane and stops it; STOP is also on Space and Escape.
+    """Serve the operator's page: it shows the machine and stops it.
+
+    Space and Escape press STOP.
 
     [bold]Examples[/bold]
 
-    timberhand console --report-port 8472 --controller 127.0.0.1:8470
+      timberhand console --report-port 8472 --controller 127.0.0.1:8470
     """
     from console.__main__ import Refused, serve
     from host.exit_codes import CommandFailed, ExitCode

@@ -1,4 +1,4 @@
-"""``timberhand dbc``: what the DBC files say and whether the compiled codecs keep to it."""
+"""``timberhand dbc``: check DBC files and the codecs compiled from them."""
 
 from __future__ import annotations
 
@@ -6,27 +6,34 @@ from typing import Annotated
 
 import typer
 
+from timberhand.commands.options import JsonOption
+
 app = typer.Typer(no_args_is_help=True, help="Check DBC and KCD files.")
 
 
 @app.callback()
 def group() -> None:
-    """Keeps ``check`` a subcommand while it is the only one."""
+    """Keep ``check`` a subcommand although it is the only one."""
 
 
 @app.command(
     epilog="Examples:  timberhand dbc check crane machine gnss  ·  timberhand dbc check my.dbc --frames 2000 --strict"
 )
 def check(
-    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Paths, or crane, machine, gnss.")],
-    frames: Annotated[int, typer.Option(min=1, help="Random frames per message to compare with cantools.")] = 200,
+    files: Annotated[
+        list[str], typer.Argument(metavar="FILE...", help="DBC or KCD paths, or shipped: crane, machine, gnss.")
+    ],
+    frames: Annotated[
+        int, typer.Option(min=1, help="Random frames per message for the comparison with cantools.")
+    ] = 200,
     seed: Annotated[int, typer.Option(help="Seed of the random frames.")] = 1,
-    strict: Annotated[bool, typer.Option("--strict", help="Lint warnings fail, exit code 3.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Treat lint warnings as errors (exit code 3).")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Compile each FILE, compare the codecs with cantools over random frames, and lint it.
+    """Compile each FILE, compare its codecs with cantools on random frames, and lint it.
 
-    Exit code 3: a file cannot be loaded.  6: a compiled codec differs from cantools.
+    Exit code 3 when a file cannot be loaded, 6 when a compiled codec differs from
+    cantools.
     """
     import json
     from dataclasses import asdict

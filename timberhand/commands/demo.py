@@ -64,7 +64,8 @@ def demo(
 ) -> None:
     """Lay one log from the ground into the bunk, over CAN.
 
-    Exit code 0 only when the log lies in the bunk according to the plant's physics.
+    Exit code 0 only when the log lies in the bunk according to the plant's
+    physics.
 
     [bold]Examples[/bold]
 
@@ -74,9 +75,9 @@ def demo(
 
       timberhand demo --lockstep --seed 3    the same job in virtual time
 
-      timberhand demo --plc                  a PLC closes the joint loops, over Modbus/TCP
+      timberhand demo --plc                  a PLC closes the joint loops
 
-      timberhand demo --camera stick         the camera on the stick detects the log
+      timberhand demo --camera stick         a camera detects the log
     """
     from rich.console import Console
 

@@ -1,4 +1,4 @@
-"""``timberhand doctor``: is this installation sane, and is this computer ready for a hard-timed loop?"""
+"""``timberhand doctor``: check this installation and the real-time readiness of this computer."""
 
 from __future__ import annotations
 
@@ -8,18 +8,23 @@ from typing import Annotated
 
 import typer
 
+from timberhand.commands.options import JsonOption
+
 
 def doctor(
-    rt: Annotated[bool, typer.Option("--rt", help="Look at the computer's timing too, and say what to tune.")] = False,
+    rt: Annotated[
+        bool, typer.Option("--rt", help="Also check the computer's real-time settings and suggest changes.")
+    ] = False,
     cpu: Annotated[
         int | None,
-        typer.Option(min=0, metavar="N", help="Judge processor N as the controller's (default: from the settings)."),
+        typer.Option(min=0, metavar="N", help="Processor of the controller (default: from the settings)."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="JSON instead of words.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Examine this installation and, with --rt, this computer's timing; say what to change, the greatest gain first.
+    """Check this installation and, with --rt, this computer's real-time settings.
 
-    Changes nothing.  Exit status 3 only when something prevents every run.
+    Suggests changes, the most useful first. Exit code 3 only when something
+    prevents every run.
 
     [bold]Examples[/bold]
 
@@ -41,8 +46,8 @@ def doctor(
     if rt:
         links = "[]"
         if ip := shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin"):
-            told = subprocess.run([ip, "-details", "-statistics", "-json", "link"], capture_output=True, text=True)
-            links = told.stdout or links
+            answer = subprocess.run([ip, "-details", "-statistics", "-json", "link"], capture_output=True, text=True)
+            links = answer.stdout or links
         groups["timing"] = timing.judge(facts.read(Path("/"), links, cpu))
     every = [finding for group in groups.values() for finding in group]
     if as_json:

@@ -1,4 +1,4 @@
-"""``timberhand experiment NAME``: measures, writes result.json and plots, and fails when a figure is missed."""
+"""``timberhand experiment NAME``: measure, write result.json and plots, fail when a figure is missed."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from typing import Annotated
 import typer
 
 from experiments.common.registry import EXPERIMENTS
+from timberhand.commands.options import ProfileOption, TruthOption
 
 Name = StrEnum("Name", {name.upper().replace("-", "_"): name for name in EXPERIMENTS})
 
 
 class Bus(StrEnum):
-    """Where the frames of a live experiment travel."""
+    """The bus of a live experiment."""
 
     WIRE = "wire"
     VCAN = "vcan"
@@ -27,42 +28,44 @@ def experiment(
         Name, typer.Argument(metavar="NAME", help="; ".join(f"{n}: {e.sentence}" for n, e in EXPERIMENTS.items()))
     ],
     trials: Annotated[
-        int | None, typer.Option(min=1, help="Trials of each kind (default: the experiment's own).")
+        int | None, typer.Option(min=1, help="Trials of each kind (default: as in the experiment).")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same figures (but for timings).")] = 1,
-    truth: Annotated[str, typer.Option(help="The plant's hidden truth: nominal, sampled, or a TOML file.")] = "nominal",
-    profile: Annotated[str, typer.Option(help="A shipped profile or a TOML file.")] = "palms_471",
-    out: Annotated[Path | None, typer.Option(help="Where the results go (default: runs/NAME).")] = None,
-    quick: Annotated[bool, typer.Option(help="A few trials of everything, in under a minute.")] = False,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes (default: one per core).")] = None,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same figures, except timings.")] = 1,
+    truth: TruthOption = "nominal",
+    profile: ProfileOption = "palms_471",
+    out: Annotated[Path | None, typer.Option(help="Directory of the results (default: runs/NAME).")] = None,
+    quick: Annotated[bool, typer.Option(help="A few trials of each kind, in less than a minute.")] = False,
+    workers: Annotated[int | None, typer.Option(min=1, help="Worker processes (default: one per core).")] = None,
     docs: Annotated[
-        Path | None, typer.Option(help="Also refresh the page, the pictures and results/NAME.json in this folder.")
+        Path | None, typer.Option(help="Folder in which to update the page, its plots and results/NAME.json.")
     ] = None,
-    minutes: Annotated[float | None, typer.Option(min=0.1, help="soak: how long (default: 30).")] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="soak: duration in minutes (default: 30).")] = None,
     repetitions: Annotated[
-        int | None, typer.Option(min=1, help="crane-accuracy: motions to every goal of a machine (default: 20).")
+        int | None, typer.Option(min=1, help="crane-accuracy: motions to every goal (default: 20).")
     ] = None,
-    bus: Annotated[Bus, typer.Option(help="soak: vcan (in user-mode Linux if need be) or the wire.")] = Bus.WIRE,
+    bus: Annotated[Bus, typer.Option(help="soak: vcan (in user-mode Linux if necessary) or wire.")] = Bus.WIRE,
     data: Annotated[
-        Path | None, typer.Option(help="grasp-network: judge the shipped weights on this folder in the Cornell layout.")
+        Path | None,
+        typer.Option(help="grasp-network: folder of Cornell samples on which to evaluate the shipped weights."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")] = False,
 ) -> None:
-    """Run an experiment, judge its figures and write DIR/result.json with its plots.
+    """Run an experiment, evaluate its figures, and write result.json and plots.
 
-    Exit code 6 when a figure is not reached. Ctrl-C keeps the finished trials; the same command goes on from there.
+    Exit code 6 when a figure is missed. Ctrl-C keeps the finished trials; the
+    same command continues from there.
 
     [bold]Examples[/bold]
 
-      timberhand experiment plant --quick                   a look, in a minute
+      timberhand experiment plant --quick
 
-      timberhand experiment plant --docs docs               the committed figures and docs/plant.md
+      timberhand experiment plant --docs docs
 
-      timberhand experiment plant --truth sampled --seed 7  every trial on another individual machine
+      timberhand experiment plant --truth sampled --seed 7
 
-      timberhand experiment timing --docs docs              a quarter of an hour on a quiet machine, as root for FIFO
+      sudo timberhand experiment timing       on a quiet computer, 15 minutes
 
-      timberhand experiment soak --bus vcan --minutes 30    half an hour on SocketCAN
+      timberhand experiment soak --bus vcan --minutes 30
     """
     from rich.console import Console
 
@@ -98,7 +101,7 @@ def experiment(
     except KeyboardInterrupt:
         raise CommandFailed(
             "experiment.interrupted",
-            f"interrupted; finished trials are kept in {options.out}, the same command goes on",
+            f"interrupted; finished trials are kept in {options.out}, the same command continues",
             ExitCode.INTERRUPTED,
         ) from None
     if as_json:
@@ -106,6 +109,6 @@ def experiment(
     if result.missed:
         raise CommandFailed(
             "experiment.figure-missed",
-            f"figures not reached: {', '.join(result.missed)}; see {options.out / 'result.json'}",
+            f"figures missed: {', '.join(result.missed)}; see {options.out / 'result.json'}",
             ExitCode.FIGURE_MISSED,
         )

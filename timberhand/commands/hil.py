@@ -1,4 +1,4 @@
-"""``timberhand hil``: hardware-in-the-loop helpers."""
+"""``timberhand hil``: real CAN interfaces for any command."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import typer
 
 from host.vcan_lab.__main__ import CONTEXT, vcan
 
-app = typer.Typer(no_args_is_help=True, help="Hardware in the loop: real CAN interfaces for any command.")
+app = typer.Typer(no_args_is_help=True, help="Hardware in the loop: run any command with SocketCAN interfaces.")
 app.command("vcan", context_settings=CONTEXT)(vcan)
 
 
 @app.callback()
 def group() -> None:
-    """Keeps ``vcan`` a subcommand while it is the only one."""
+    """Keep ``vcan`` a subcommand although it is the only one."""

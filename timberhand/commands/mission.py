@@ -75,7 +75,8 @@ def run(
 ) -> None:
     """Drive the route of a mission, collect the logs and bring them to the end of the route.
 
-    Exit code 0 when the mission is finished and all loaded logs lie in the bunk according to the plant's physics.
+    Exit code 0 when the mission is finished and all loaded logs lie in the bunk
+    according to the plant's physics.
 
     [bold]Examples[/bold]
 
@@ -83,7 +84,7 @@ def run(
 
       timberhand mission run docs/examples/paper_b.geojson --bus vcan
 
-      timberhand mission run docs/examples/paper_b.geojson --manager paper-b --seed 3
+      timberhand mission run docs/examples/paper_b.geojson --manager paper-b
     """
     from dataclasses import asdict
 

@@ -1,4 +1,4 @@
-"""``timberhand plan``: missions from the formats people plan with, checked, converted and drawn."""
+"""``timberhand plan``: check, convert and draw missions in the common planning formats."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
+from timberhand.commands.options import JsonOption
 
 if TYPE_CHECKING:
     from autonomy.missions.features import Draft
     from autonomy.missions.review import Review
     from machine.profile import Profile
 
-app = typer.Typer(no_args_is_help=True, help="Plan missions: check, convert and draw GeoJSON, .plan, GPX, KML and hpr.")
+app = typer.Typer(no_args_is_help=True, help="Check, convert and draw missions: GeoJSON, .plan, GPX, KML and hpr.")
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="GeoJSON, QGroundControl .plan, GPX, KML or StanForD hpr.")]
-Logs = Annotated[Path | None, typer.Option(metavar="FILE", help="Add the logs of this file, for example an hpr.")]
-Machine = Annotated[str, typer.Option(help="The machine that is to drive: a shipped profile or a TOML file.")]
-Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")]
+Logs = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Add the logs of this file, for example of an hpr file.")
+]
+Machine = Annotated[str, typer.Option(help="Profile of the machine: a shipped name or a TOML file.")]
 
 
 @app.command()
@@ -27,12 +29,12 @@ def check(
     file: File,
     logs: Logs = None,
     profile: Machine = "aoro_fc8",
-    strict: Annotated[bool, typer.Option("--strict", help="Warnings fail, exit code 3.")] = False,
-    as_json: Json = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Treat warnings as errors (exit code 3).")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Say what FILE holds, how long it takes, and what is wrong or hard with it.
+    """Check a mission: contents, duration, errors and warnings.
 
-    Exit code 3: the mission cannot be driven; every reason is a sentence with its line.
+    Exit code 3 when the mission cannot be driven; each error names its line.
 
     [bold]Examples[/bold]
 
@@ -63,11 +65,11 @@ def check(
 @app.command()
 def convert(
     file: File,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The GeoJSON to write.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="GeoJSON file to write.")],
     logs: Logs = None,
-    as_json: Json = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Write the mission in FILE as GeoJSON, the mission's own format, in which it can be completed.
+    """Convert a mission to GeoJSON, the native format, which can hold every property of a mission.
 
     [bold]Examples[/bold]
 
@@ -106,12 +108,12 @@ def convert(
 @app.command()
 def show(
     file: File,
-    png: Annotated[Path, typer.Option(metavar="OUT", help="The picture to write.")],
+    png: Annotated[Path, typer.Option(metavar="OUT", help="PNG file to write.")],
     logs: Logs = None,
     profile: Machine = "aoro_fc8",
-    as_json: Json = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Draw FILE as a map in metres: route, fence, logs, landings, and where the machine turns in.
+    """Draw a mission as a map in metres: route, fences, logs, landings, and where turns begin.
 
     [bold]Examples[/bold]
 
@@ -146,7 +148,7 @@ def show(
 
 
 def _machine(name: str) -> Profile:
-    """A machine that drives."""
+    """The profile of a machine that drives."""
     from machine.loading.profile_file import ProfileError, load_profile
 
     try:
@@ -156,14 +158,14 @@ def _machine(name: str) -> Profile:
     if profile.carrier is None:
         raise CommandFailed(
             "plan.stationary-machine",
-            f"{profile.name} does not drive; choose a machine with a carrier",
+            f"{profile.name} does not drive; choose a machine with a carrier, such as aoro_fc8",
             ExitCode.CONFIGURATION,
         )
     return profile
 
 
 def _read(file: Path, logs: Path | None, machine: Profile) -> tuple[Draft, Review | None]:
-    """The checked mission, and what the machine will make of it if it has a route."""
+    """The checked mission, and its review for the machine; None without a route."""
     from autonomy.missions.mission_file import load_mission
     from autonomy.missions.review import review
 
@@ -174,7 +176,7 @@ def _read(file: Path, logs: Path | None, machine: Profile) -> tuple[Draft, Revie
 
 
 def _facts(file: Path, draft: Draft, review: Review | None) -> dict[str, Any]:
-    """Everything as plain data."""
+    """The JSON document of a mission."""
     from math import degrees, isfinite
 
     mission = draft.mission
@@ -201,7 +203,7 @@ def _facts(file: Path, draft: Draft, review: Review | None) -> dict[str, Any]:
 
 
 def _contents(draft: Draft) -> str:
-    """What a mission consists of, in words."""
+    """The contents of a mission in words."""
     mission = draft.mission
     parts = (("waypoint", mission.waypoints), ("fence", mission.fences), ("landing", mission.landings))
     counted = [f"{len(p)} {word}{'' if len(p) == 1 else 's'}" for word, p in (*parts, ("log", mission.logs)) if p]
@@ -234,4 +236,4 @@ def _show(file: Path, draft: Draft, review: Review | None) -> None:
     for warning in review.warnings if review is not None else ():
         console.print(f"[yellow]warning[/yellow] {escape(warning)}")
     if review is not None and not review.warnings:
-        console.print("[green]✔[/green] nothing in it is hard for this machine")
+        console.print("[green]✔[/green] no warnings for this machine")

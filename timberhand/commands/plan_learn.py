@@ -1,4 +1,4 @@
-"""``timberhand plan learn`` and ``demonstrate``: motions of the crane as people show them (paper B 3.2.5)."""
+"""``timberhand plan learn`` and ``demonstrate``: crane motions learned from demonstrations (paper B 3.2.5)."""
 
 from __future__ import annotations
 
@@ -8,21 +8,28 @@ from typing import Annotated
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
+from timberhand.commands.options import ProfileOption, TruthOption
 
 
 def learn(
-    log: Annotated[
-        Path, typer.Argument(metavar="LOG", help="A run's directory, run.mcap, a CAN log, or demonstrations (.csv).")
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RECORDING", help="Directory of a run, run.mcap, CAN recording, or demonstrations (.csv)."
+        ),
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The primitives to write (JSON).")],
-    profile: Annotated[str | None, typer.Option(help="The machine; by default the recorded one.")] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="PNG", help="A picture of demonstrated and learned.")] = None,
-    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the demonstrations found, too.")] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Movement primitives to write (JSON).")],
+    profile: Annotated[str | None, typer.Option(help="Machine profile (default: the recorded one).")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Plot of the demonstrated and learned motions.")
+    ] = None,
+    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Also write the demonstrations (CSV).")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
 ) -> None:
-    """Learn the motions between bunk and log from a recording of somebody moving the crane.
+    """Learn the motions between bunk and log from a recording of manual operation.
 
-    The encoders on the bus are enough.  Show several motions, each from rest to rest, out to logs and back.
+    The encoder frames on the bus suffice. Record several motions, each from rest
+    to rest, out to logs and back.
 
     [bold]Examples[/bold]
 
@@ -36,11 +43,11 @@ def learn(
     from autonomy.motion.movement_primitives import encode, learn_primitives
     from training.motion.demonstration_recordings import draw, motions_in
 
-    machine, motions = motions_in(log, profile)
+    machine, motions = motions_in(recording, profile)
     try:
         primitives = learn_primitives(machine, motions)
     except DemonstrationRefused as error:
-        raise CommandFailed("plan.demonstrations", f"{log}: {error}", ExitCode.CONFIGURATION) from None
+        raise CommandFailed("plan.demonstrations", f"{recording}: {error}", ExitCode.CONFIGURATION) from None
     _write(out, encode(primitives))
     if csv is not None:
         from autonomy.motion.demonstration import format_demonstrations
@@ -66,16 +73,16 @@ def learn(
 
 
 def demonstrate(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The demonstrations to write (.csv).")],
-    profile: Annotated[str, typer.Option(help="A shipped profile or a TOML file.")] = "aoro_fc8",
-    seed: Annotated[int, typer.Option(help="Chooses the places and the hand's tremor.")] = 1,
-    targets: Annotated[int, typer.Option(min=1, max=40, help="So many places are shown, out and back.")] = 6,
-    truth: Annotated[str, typer.Option(help="The plant's truth: nominal, sampled, or a TOML file.")] = "nominal",
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Demonstrations to write (.csv).")],
+    profile: ProfileOption = "aoro_fc8",
+    seed: Annotated[int, typer.Option(help="Chooses the targets and the tremor of the hand.")] = 1,
+    targets: Annotated[int, typer.Option(min=1, max=40, help="Number of targets, each out and back.")] = 6,
+    truth: TruthOption = "nominal",
     record: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Keep the whole recording, too: `plan learn DIR` reads it.")
+        Path | None, typer.Option(metavar="DIR", help="Also record the run into DIR, for `plan learn DIR`.")
     ] = None,
 ) -> None:
-    """Let a scripted operator move the plant's crane by its hand levers, and keep the motions.
+    """Let an emulated operator move the plant's crane with its hand levers, and write the motions.
 
     [bold]Examples[/bold]
 
@@ -124,6 +131,6 @@ def _write(path: Path, data: bytes) -> None:
     except OSError as error:
         raise CommandFailed(
             "plan.output-not-written",
-            f"{path} cannot be written ({error.strerror}); give another file",
+            f"{path} cannot be written ({error.strerror}); choose another file",
             ExitCode.CONFIGURATION,
         ) from None

@@ -1,4 +1,4 @@
-"""``timberhand record``: the recorder in the foreground."""
+"""``timberhand record``: run the recorder in the foreground."""
 
 from __future__ import annotations
 
@@ -7,26 +7,29 @@ from typing import Annotated
 
 import typer
 
+from timberhand.commands.options import ProfileOption
+
 
 def record(
-    out: Annotated[Path, typer.Option(help="Directory of the recording; it must hold none yet.")],
+    out: Annotated[Path, typer.Option(help="Directory of the recording; it must not hold one already.")],
     bus: Annotated[
-        list[str] | None, typer.Option(help="NAME=ADDRESS, may be repeated (default: the profile's buses).")
+        list[str] | None,
+        typer.Option(help="NAME=ADDRESS of a bus; may be repeated (default: the buses of the profile)."),
     ] = None,
     tick_port: Annotated[int, typer.Option(help="UDP port of the controller's tick records.")] = 8473,
     report_port: Annotated[int, typer.Option(help="UDP port of the controller's state reports.")] = 8474,
-    profile: Annotated[str, typer.Option(help="A shipped profile or a TOML file.")] = "palms_471",
+    profile: ProfileOption = "palms_471",
     timing: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The controller's timing page, recorded once a second.")
+        Path | None, typer.Option(metavar="FILE", help="Timing page of the controller, recorded once per second.")
     ] = None,
 ) -> None:
     """Record the buses, the controller's ticks and its reports until Ctrl-C.
 
     [bold]Examples[/bold]
 
-    timberhand record --out runs/field-1
+      timberhand record --out runs/field-1
 
-    timberhand record --out runs/field-1 --bus crane0=socketcan:can0
+      timberhand record --out runs/field-1 --bus crane0=socketcan:can0
     """
     from can_dbc.bus.base import BusError
     from can_dbc.bus.factory import default_address

@@ -1,4 +1,4 @@
-"""``timberhand log``: recorded CAN traffic in words."""
+"""``timberhand recording``: recorded CAN traffic in words."""
 
 from __future__ import annotations
 
@@ -7,30 +7,35 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Read recorded CAN logs.")
+from timberhand.commands.options import JsonOption
+
+app = typer.Typer(no_args_is_help=True, help="Read CAN recordings.")
 
 
 @app.callback()
 def group() -> None:
-    """Keeps ``decode`` a subcommand while it is the only one."""
+    """Keep ``decode`` a subcommand although it is the only one."""
 
 
 @app.command(
-    epilog="Examples:  timberhand log decode drive.log --dbc gnss  ·  "
-    "timberhand log decode crane.blf --dbc crane --json"
+    epilog="Examples:  timberhand recording decode drive.log --dbc gnss  ·  "
+    "timberhand recording decode crane.blf --dbc crane --json"
 )
 def decode(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="candump, PCAN-View or YDWG text, .asc, .blf.")],
+    recording: Annotated[Path, typer.Argument(metavar="FILE", help="candump, PCAN-View or YDWG text, .asc, .blf.")],
     dbc: Annotated[
         list[str] | None,
-        typer.Option("--dbc", metavar="FILE", help="DBC or KCD path, or crane, machine, gnss; may be repeated."),
+        typer.Option(
+            "--dbc", metavar="FILE", help="DBC or KCD path, or shipped: crane, machine, gnss; may be repeated."
+        ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="The counts only.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print the counts only.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Decode LOG with one or more databases (by default all shipped ones), fast packets included.
+    """Decode a CAN recording with one or more databases (default: all shipped ones), fast packets included.
 
-    Broken lines are counted, never fatal; a frame out of range or with a bad CRC is shown and counted.
+    Malformed lines are counted and never fatal; a frame out of range or with a
+    bad CRC is shown and counted.
     """
     import json
 
@@ -41,12 +46,12 @@ def decode(
 
     try:
         decoder = Decoder(dbc or list(SHIPPED))
-        records = read(log)
+        records = read(recording)
     except DbcError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
     except OSError as error:
         raise CommandFailed(
-            "recording.unreadable", f"{log}: cannot be read: {error.strerror}", ExitCode.CONFIGURATION
+            "recording.unreadable", f"{recording}: cannot be read: {error.strerror}", ExitCode.CONFIGURATION
         ) from error
     if as_json:
         separator = '{"frames": ['
@@ -83,7 +88,7 @@ def _print(decoder, records, quiet: bool) -> None:  # type: ignore[no-untyped-de
         f"{summary['frames']} frames, {summary['decoded']} messages decoded, {summary['unknown']} frames unknown, "
         f"{summary['refused']} refused, {summary['bad_crc']} with a bad CRC, "
         f"{summary['error_frames']} error frames, "
-        f"{summary['lost_fast_packets']} fast packets lost, {summary['broken']} broken lines"
+        f"{summary['lost_fast_packets']} fast packets lost, {summary['broken']} malformed lines"
     )
     for text in summary["broken_examples"]:
-        console.print(f"[yellow]broken[/yellow] {escape(text)}")
+        console.print(f"[yellow]malformed[/yellow] {escape(text)}")

@@ -1,31 +1,37 @@
-"""``timberhand replay``: a recorded run through today's controller, byte for byte."""
+"""``timberhand replay``: feed a recorded run to today's controller and compare byte for byte."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from timberhand.commands.options import JsonOption
+
+if TYPE_CHECKING:
+    from hil.replay.replay import Result
+
 
 def replay(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="A run's directory, or its run.mcap.")],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Directory of a run, or its run.mcap.")],
     profile: Annotated[
-        str | None, typer.Option(help="The profile of that run (default: the shipped one it names).")
+        str | None, typer.Option(help="Profile of that run (default: the shipped profile named in it).")
     ] = None,
-    key_file: Annotated[Path | None, typer.Option(help="Key of a run with authenticated datagrams.")] = None,
-    contents: Annotated[bool, typer.Option("--contents", help="Only list what the recording holds.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout.")] = False,
+    key_file: Annotated[Path | None, typer.Option(help="Key file of a run with authenticated datagrams.")] = None,
+    contents: Annotated[bool, typer.Option("--contents", help="Only list the topics of the recording.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Feed the recorded inputs of every tick to the controller and compare its outputs with the recorded ones.
+    """Replay the recorded inputs of every tick and compare the controller's outputs with the recorded ones.
 
-    Exit code 0 only when all ticks agree; 6 at the first difference or gap; 3 for another profile or DBC.
+    Exit code 0 only when all ticks agree, 6 at the first difference or gap, 3
+    when profile or DBC have changed.
 
     [bold]Examples[/bold]
 
-    timberhand replay runs/demo-1
+      timberhand replay runs/demo-1
 
-    timberhand replay runs/demo-1/run.mcap --contents
+      timberhand replay runs/demo-1/run.mcap --contents
     """
     import json
 
@@ -33,13 +39,13 @@ def replay(
     from hil.replay.recording import files_of, manifest_of
     from host.exit_codes import CommandFailed, ExitCode
 
-    files = files_of(log)
+    files = files_of(recording)
     if contents:
         manifest, counts = manifest_of(files), list_contents(files)
         if as_json:
             typer.echo(json.dumps({"profile": manifest.profile, "topics": counts}))
             return
-        typer.echo(f"{log}: profile {manifest.profile}, seed {manifest.seed}, {manifest.start_utc or 'lockstep'}")
+        typer.echo(f"{recording}: profile {manifest.profile}, seed {manifest.seed}, {manifest.start_utc or 'lockstep'}")
         for topic, count in counts.items():
             typer.echo(f"{count:10d}  {topic}")
         return
@@ -67,7 +73,7 @@ def replay(
         raise typer.Exit(ExitCode.FIGURE_MISSED)
 
 
-def _run(files, profile, key):  # type: ignore[no-untyped-def]
+def _run(files: list[Path], profile: str | None, key: bytes | None) -> Result:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -1,4 +1,4 @@
-"""``timberhand report``: the page of all experiments at a glance, from their saved results."""
+"""``timberhand report``: the overview page of all experiments, from their saved results."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import typer
 
 
 def report(
-    docs: Annotated[Path, typer.Option(help="The folder with results/, where figures.md is written.")] = Path("docs"),
+    docs: Annotated[Path, typer.Option(help="Folder that holds results/ and gets figures.md.")] = Path("docs"),
 ) -> None:
-    """Write figures.md: what every experiment asks, what it reached and missed, beside the papers' figures.
+    """Write figures.md: the results of every experiment beside the limits and the papers' figures.
 
-    An experiment that is run with --docs does so by itself; this is for results that came from elsewhere.  Measures
-    nothing.
+    An experiment with --docs does this itself; use this command for results from
+    elsewhere. Measures nothing.
 
     [bold]Examples[/bold]
 
@@ -30,7 +30,7 @@ def report(
         if not found:
             raise CommandFailed(
                 "report.no-results",
-                f"{docs / 'results'} holds no result of an experiment; name it by --docs",
+                f"{docs / 'results'} holds no results of experiments; name the folder with --docs",
                 ExitCode.CONFIGURATION,
             )
         print(f"{overview.write(docs)}: {len(found)} experiments")

@@ -1,4 +1,4 @@
-"""``timberhand service``: the processes as services of this computer."""
+"""``timberhand service``: install and inspect the systemd services."""
 
 from __future__ import annotations
 
@@ -8,33 +8,34 @@ from typing import Annotated, Any
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="The processes as services of this computer: install, look, remove.")
+app = typer.Typer(no_args_is_help=True, help="Install, inspect and remove the systemd services.")
 PERIOD_S = 1.0
 
-Root = Annotated[Path | None, typer.Option(help="Lay everything out in the tree DIR instead.", metavar="DIR")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would be done, and do nothing.")]
+Root = Annotated[Path | None, typer.Option(help="Install into the directory tree DIR instead of /.", metavar="DIR")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the steps without executing them.")]
 
 
 @app.command(epilog="Examples:  sudo timberhand service install --wheel timberhand-0.1.0-py3-none-any.whl  ·  "
              "timberhand service install --dry-run")  # fmt: skip
 def install(
     wheel: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="What is installed; default: built from this checkout.")
+        Path | None, typer.Option(metavar="FILE", help="Wheel to install (default: built from this checkout).")
     ] = None,
     find_links: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Take every package from there, without a network.")
+        Path | None, typer.Option(metavar="DIR", help="Take all packages from DIR, without a network.")
     ] = None,
     from_environment: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Use the packages of this virtual environment.")
     ] = None,
-    python: Annotated[str | None, typer.Option(metavar="PROGRAM", help="Python to run with, 3.11 or newer.")] = None,
+    python: Annotated[str | None, typer.Option(metavar="PROGRAM", help="Python interpreter, 3.11 or newer.")] = None,
     root: Root = None,
     dry_run: DryRun = False,
 ) -> None:
-    """Install program, units, users and settings; run it again to mend or update.  Nothing is started or armed.
+    """Install program, units, users and settings; run it again to repair or update.  Starts and arms nothing.
 
-    Started by the installed program itself, it mends everything around it.  With nothing but the wheel:
-    sudo python3.11 timberhand-VERSION.whl/deploy
+    When the installed program runs this command, it repairs the installation
+    around itself. From the wheel alone: sudo python3.11 timberhand-
+    VERSION.whl/deploy
     """
     options = {
         "--wheel": wheel, "--find-links": find_links, "--from-environment": from_environment, "--python": python,
@@ -45,35 +46,36 @@ def install(
 
 @app.command()
 def uninstall(root: Root = None, dry_run: DryRun = False) -> None:
-    """Remove what was installed; recordings, users and changed settings stay."""
+    """Remove the installation; recordings, users and changed settings remain."""
     _script(["--uninstall", *(["--root", str(root)] if root else [])], dry_run)
 
 
 @app.command(epilog="Examples:  timberhand service status  ·  timberhand service status --watch  ·  "
              "timberhand service status --json | jq .timing.durations.wake")  # fmt: skip
 def status(
-    watch: Annotated[bool, typer.Option("--watch", help="Once a second, until Ctrl-C.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Refresh once per second, until Ctrl-C.")] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON document on stdout (with --watch one a line).")
+        bool, typer.Option("--json", help="Print JSON on stdout; with --watch one document per line.")
     ] = False,
     timing: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The controller's timing page; default: the service's.")
+        Path | None, typer.Option(metavar="FILE", help="Timing page of the controller (default: that of the service).")
     ] = None,
 ) -> None:
-    """How every service is, and how punctual the controller: ticks, wake-ups, ages of inputs, buses, memory.
+    """Show the state of every service and the timing of the controller: ticks, wake-ups, input ages, buses, memory.
 
-    p50, p99 and p99.9 are quantiles since the controller's start; with --watch also those of the last second.  Works
-    without systemd too, for a controller that was started by hand.
+    p50, p99 and p99.9 are quantiles since the start of the controller; with
+    --watch also those of the last second. Also works without systemd, for a
+    controller started by hand.
     """
     import json
 
     from host.exit_codes import CommandFailed, ExitCode
-    from timberhand.service_status.status import look
+    from timberhand.service_status.status import read_status
 
     if watch:
         _watch(timing, as_json)
         return
-    found = look(timing)
+    found = read_status(timing)
     if as_json:
         print(json.dumps(found.named()))
     elif found.units or found.timing:
@@ -90,13 +92,13 @@ def _watch(page: Path | None, as_json: bool) -> None:
     import json
 
     from host.exit_codes import ExitCode
-    from timberhand.service_status.status import look
+    from timberhand.service_status.status import read_status
 
     before = None
     try:
         if as_json:
             while True:
-                print(json.dumps(look(page).named()), flush=True)
+                print(json.dumps(read_status(page).named()), flush=True)
                 time.sleep(PERIOD_S)
         from rich.console import Console
         from rich.live import Live
@@ -106,7 +108,7 @@ def _watch(page: Path | None, as_json: bool) -> None:
         console = Console(highlight=False)
         with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
             while True:
-                found = look(page)
+                found = read_status(page)
                 live.update(screen(found, before), refresh=True)
                 before = found.timing or before
                 time.sleep(PERIOD_S)

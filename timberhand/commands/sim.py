@@ -1,4 +1,4 @@
-"""``timberhand sim``: look at the simulated plant."""
+"""``timberhand sim``: view the simulated plant."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from typing import Annotated
 import typer
 
 from host.exit_codes import CommandFailed, ExitCode
+from timberhand.commands.options import ProfileOption, TruthOption
 
-app = typer.Typer(no_args_is_help=True, help="The simulated plant: look at it alive, or take its picture.")
+app = typer.Typer(no_args_is_help=True, help="View the simulated plant live, or write a picture of it.")
 
 
-class Ground(StrEnum):
-    """What the machine stands on."""
+class Terrain(StrEnum):
+    """The terrain."""
 
     FLAT = "flat"
     ROUGH = "rough"
@@ -25,7 +26,7 @@ class Ground(StrEnum):
 
 
 class Scene(StrEnum):
-    """How the logs lie."""
+    """The arrangement of the logs."""
 
     RANDOM = "random"
     SINGLE = "single"
@@ -36,31 +37,29 @@ class Scene(StrEnum):
     BUNK = "bunk"
 
 
-PROFILE = Annotated[str, typer.Option(help="A shipped profile or a TOML file.")]
-SEED = Annotated[int, typer.Option(help="Chooses the logs and where they lie.")]
-TRUTH = Annotated[str, typer.Option(help="The plant's truth: nominal, sampled, or a TOML file.")]
-LOGS = Annotated[int, typer.Option(min=0, max=200, help="How many logs.")]
-GROUND = Annotated[Ground, typer.Option(help="What the machine stands on.")]
-SCENE = Annotated[Scene, typer.Option(help="How the logs lie.")]
+SeedOption = Annotated[int, typer.Option("--seed", help="Chooses the logs and their poses.")]
+LogsOption = Annotated[int, typer.Option("--logs", min=0, max=200, help="Number of logs.")]
+TerrainOption = Annotated[Terrain, typer.Option("--terrain", help="Terrain.")]
+SceneOption = Annotated[Scene, typer.Option("--scene", help="Arrangement of the logs.")]
 
 
 @app.command()
 def view(
-    profile: PROFILE = "palms_471",
-    seed: SEED = 1,
-    logs: LOGS = 3,
-    scene: SCENE = Scene.RANDOM,
-    terrain: GROUND = Ground.FLAT,
-    truth: TRUTH = "nominal",
+    profile: ProfileOption = "palms_471",
+    seed: SeedOption = 1,
+    logs: LogsOption = 3,
+    scene: SceneOption = Scene.RANDOM,
+    terrain: TerrainOption = Terrain.FLAT,
+    truth: TruthOption = "nominal",
     port: Annotated[int, typer.Option(help="Port of the page on localhost.")] = 8471,
 ) -> None:
-    """Open a live three-dimensional view of the plant, with its pressures and hand levers, in the browser.
+    """Serve a live three-dimensional view of the plant with its pressures and hand levers, for the browser.
 
     [bold]Examples[/bold]
 
       timberhand sim view
 
-      timberhand sim view --profile aoro_fc8 --terrain rough --scene row --logs 8
+      timberhand sim view --profile aoro_fc8 --terrain rough --scene row
     """
     from rich.console import Console
 
@@ -77,40 +76,40 @@ def view(
 
 
 @app.command()
-def shot(
-    out: Annotated[Path, typer.Argument(help="The PNG to write.")] = Path("plant.png"),
-    profile: PROFILE = "palms_471",
-    seed: SEED = 1,
-    logs: LOGS = 3,
-    scene: SCENE = Scene.RANDOM,
-    terrain: GROUND = Ground.FLAT,
-    truth: TRUTH = "nominal",
-    camera: Annotated[
-        str | None, typer.Option(help="A camera of the profile; without it the picture is taken from outside.")
-    ] = None,
-    azimuth_deg: Annotated[float, typer.Option(help="Where the outside camera stands, seen from above.")] = -50.0,
-    elevation_deg: Annotated[float, typer.Option(min=5.0, max=89.0, help="How high it looks down from.")] = 22.0,
-    distance_m: Annotated[float, typer.Option(min=1.0, help="How far away it stands.")] = 13.0,
-    depth: Annotated[bool, typer.Option(help="Depth in colours instead of the photograph (profile cameras).")] = False,
+def picture(
+    out: Annotated[Path, typer.Argument(help="PNG file to write.")] = Path("plant.png"),
+    profile: ProfileOption = "palms_471",
+    seed: SeedOption = 1,
+    logs: LogsOption = 3,
+    scene: SceneOption = Scene.RANDOM,
+    terrain: TerrainOption = Terrain.FLAT,
+    truth: TruthOption = "nominal",
+    camera: Annotated[str | None, typer.Option(help="Camera of the profile (default: an outside camera).")] = None,
+    azimuth_deg: Annotated[float, typer.Option(help="Azimuth of the outside camera.")] = -50.0,
+    elevation_deg: Annotated[float, typer.Option(min=5.0, max=89.0, help="Elevation of the outside camera.")] = 22.0,
+    distance_m: Annotated[float, typer.Option(min=1.0, help="Distance of the outside camera.")] = 13.0,
+    depth: Annotated[
+        bool, typer.Option(help="Show depth as colors instead of the image (cameras of the profile).")
+    ] = False,
 ) -> None:
-    """Write a picture of the plant as it stands at the start.
+    """Write a picture of the plant in its initial state.
 
     [bold]Examples[/bold]
 
-      timberhand sim shot plant.png --scene pile --logs 5
+      timberhand sim picture plant.png --scene pile --logs 5
 
-      timberhand sim shot front.png --profile aoro_fc8 --camera front --depth
+      timberhand sim picture front.png --profile aoro_fc8 --camera front --depth
     """
-    from hil.plant.picture import Shot, take
+    from hil.plant.picture import PictureRequest, take_picture
     from machine.loading.profile_file import ProfileError, load_profile
 
-    request = Shot(
+    request = PictureRequest(
         logs=logs, scene=scene.value, seed=seed, terrain=terrain.value, truth=truth, camera=camera, depth=depth,
         azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, distance_m=distance_m,
     )  # fmt: skip
     try:
         machine = load_profile(profile)
-        take(machine, request, out)
+        take_picture(machine, request, out)
     except (ProfileError, ValueError) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     except OSError as error:

@@ -1,4 +1,4 @@
-"""``timberhand survey-camera``: where a camera truly sits and what its depth is worth, into a new profile."""
+"""``timberhand survey-camera``: a camera's mount and depth scale from surveyed targets, into a new profile."""
 
 from __future__ import annotations
 
@@ -16,27 +16,31 @@ if TYPE_CHECKING:
 
 
 def survey_camera(
-    camera: Annotated[str, typer.Argument(help="Its name in the profile.")],
-    targets: Annotated[Path, typer.Argument(help="CSV with u_px,v_px,x_m,y_m,z_m,depth_m, a target a line.")],
-    profile: Annotated[str, typer.Option(help="The machine as it is known: a shipped profile or a TOML file.")],
-    out: Annotated[Path, typer.Option(help="The profile with the surveyed camera, a new TOML file.")] = Path(
+    camera: Annotated[str, typer.Argument(help="Name of the camera in the profile.")],
+    targets: Annotated[Path, typer.Argument(help="CSV with u_px,v_px,x_m,y_m,z_m,depth_m, one target per line.")],
+    profile: Annotated[str, typer.Option(help="Present machine profile: a shipped name or a TOML file.")],
+    out: Annotated[Path, typer.Option(help="New TOML file: the profile with the surveyed camera.")] = Path(
         "surveyed.toml"
     ),
     joints: Annotated[
         str | None,
-        typer.Option(help="Slew, lift and tilt in degrees and telescope in m, for a camera on the crane."),
+        typer.Option(help="Slew, lift, tilt in deg and telescope in m, for a camera on the crane."),
     ] = None,
-    articulation_deg: Annotated[float, typer.Option(help="Bend of the carrier, for a camera on its front.")] = 0.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what was found on stdout.")] = False,
+    articulation_deg: Annotated[
+        float, typer.Option(help="Articulation of the carrier, for a camera on its front frame.")
+    ] = 0.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")] = False,
 ) -> None:
-    """Find a camera's mount and scale of depth from targets that were surveyed, and write them into a new profile.
+    """Compute a camera's mount and depth scale from surveyed targets, and write them into a new profile.
 
-    Set up six targets or more in the picture, near and far, left and right. Survey each in the crane's base frame,
-    and note at which pixel the camera sees it and how deep. The crane stands still meanwhile.
+    Place six targets or more in the field of view, near and far, left and right.
+    Survey each in the base frame of the crane, and record the pixel and the depth
+    at which the camera sees it. The crane must not move meanwhile.
 
     [bold]Example[/bold]
 
-      timberhand survey-camera stick targets.csv --profile my_crane.toml --joints "0 43 -92 0.3" --out seeing.toml
+      timberhand survey-camera stick targets.csv --profile my_crane.toml
+        --joints "0 43 -92 0.3" --out surveyed.toml
     """
     import datetime
 
@@ -65,9 +69,7 @@ def survey_camera(
         link = link_pose(known, before.link, q, math.radians(articulation_deg))
         found = surveyed(before, link, seen.pixels_px, seen.depths_m, seen.places_m)
     except CameraMountError as error:
-        raise CommandFailed(
-            "survey-camera.no-solution", f"no profile is written: {error}", ExitCode.FIGURE_MISSED
-        ) from None
+        raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
     remark = f"by {len(seen.places_m)} surveyed targets"
     values = {
         "position_m": [round(v, 4) for v in found.position_m],
@@ -85,8 +87,8 @@ def survey_camera(
     turns = (math.remainder(b - a, math.tau) for a, b in zip(before.rpy_rad, found.rpy_rad, strict=True))
     turned = math.degrees(max(map(abs, turns)))
     Console(stderr=True).print(
-        f"[green]✔[/green] {out} written: {camera} sits {moved_mm:.0f} mm and {turned:.1f} deg off what the profile "
-        f"said, its depth is {100.0 * (found.depth_scale - 1.0):+.2f} % off",
+        f"[green]✔[/green] {out} written: the mount of {camera} differs from the old profile by {moved_mm:.0f} mm and "
+        f"{turned:.1f} deg, the depth scale by {100.0 * (found.depth_scale - 1.0):+.2f} %",
         highlight=False,
     )
 
@@ -97,7 +99,7 @@ def _joints(text: str | None, camera: Camera) -> list[float]:
         if camera.link in ("boom", "stick"):
             raise CommandFailed(
                 "survey-camera.joints-missing",
-                f"the camera is on the {camera.link}; say where the crane stands with --joints",
+                f"the camera is on the {camera.link}; give the position of the crane with --joints",
                 ExitCode.USAGE,
             )
         return [0.0] * 5
@@ -106,7 +108,7 @@ def _joints(text: str | None, camera: Camera) -> list[float]:
     except ValueError:
         raise CommandFailed(
             "survey-camera.joints-malformed",
-            f'--joints "{text}": four numbers are wanted, slew, lift and tilt in deg and telescope in m',
+            f'--joints "{text}": expected four numbers: slew, lift, tilt in deg and telescope in m',
             ExitCode.USAGE,
         ) from None
     return [*map(math.radians, (slew, lift, tilt)), ext, 0.0]

@@ -1,4 +1,4 @@
-"""``timberhand train``: the networks' weights from data, with a card that says how they were made."""
+"""``timberhand train``: train the networks and write their weights with a model card."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True, help="Train a network and write its weights with a model card.")
 
-Out = Annotated[Path, typer.Option(help="The weights; the card goes beside them as .md.")]
-Seed = Annotated[int, typer.Option(help="Same seed and computer, same weights.")]
-Pictures = Annotated[int, typer.Option(min=1, help="How many pictures are drawn; 0.6 MB each.")]
-Rate = Annotated[float, typer.Option(min=1e-6, max=0.1, help="Greatest learning rate.")]
-Large = Annotated[int, typer.Option(min=0, help="Pictures of twice the size, for half of what is learnt; 2.5 MB each.")]
-Folder = Annotated[Path | None, typer.Option(help="Where they are kept (default: ~/.cache/timberhand/pictures).")]
+OUT_HELP = "Weights to write; the model card is written beside them as .md."
+Out = Annotated[Path, typer.Option(help=OUT_HELP)]
+OptionalOut = Annotated[Path | None, typer.Option(help=OUT_HELP)]
+Seed = Annotated[int, typer.Option(help="The same seed gives the same weights on the same computer.")]
+Pictures = Annotated[int, typer.Option(min=1, help="Number of rendered pictures; 0.6 MB each.")]
+Rate = Annotated[float, typer.Option(min=1e-6, max=0.1, help="Peak learning rate.")]
+Large = Annotated[int, typer.Option(min=0, help="Pictures of twice the size, for half of the training; 2.5 MB each.")]
+Folder = Annotated[Path | None, typer.Option(help="Folder of the pictures (default: ~/.cache/timberhand/pictures).")]
 
 
 class Labels(StrEnum):
-    """What the grasp network learns from."""
+    """The training labels of the grasp network."""
 
     CORNELL = "cornell"
     PHYSICAL = "physical"
@@ -34,43 +36,45 @@ class Labels(StrEnum):
 @app.command()
 def grasp(
     data: Annotated[
-        Path | None, typer.Option(help="Folder of Cornell samples: pcdNNNNd.tiff beside pcdNNNNcpos.txt.")
+        Path | None, typer.Option(help="Folder of Cornell samples: pcdNNNNd.tiff and pcdNNNNcpos.txt.")
     ] = None,
     labels: Annotated[
-        Labels, typer.Option(help="Rectangles of Cornell samples, or a physical rule on settled piles of logs.")
+        Labels, typer.Option(help="Rectangles of Cornell samples, or a physical rule on simulated piles of logs.")
     ] = Labels.CORNELL,
-    out: Annotated[Path | None, typer.Option(help="The weights; the card goes beside them as .md.")] = None,
+    out: OptionalOut = None,
     seed: Seed = 1,
     epochs: Annotated[
-        int | None, typer.Option(min=1, help="Passes over all views (default: the shipped ones).")
+        int | None, typer.Option(min=1, help="Training epochs (default: as for the shipped weights).")
     ] = None,
 ) -> None:
-    """Train paper A's grasp network on Cornell samples or on drawn piles of logs, on one core.
+    """Train paper A's grasp network on Cornell samples or on rendered piles of logs, on one core.
 
-    Ctrl-C keeps what was learnt; the same command goes on from there.
+    Ctrl-C keeps the last checkpoint; the same command continues from there.
 
     [bold]Examples[/bold]
 
       timberhand train grasp --data ~/cornell
 
-      timberhand train grasp --data ~/cornell --epochs 30 --out better.safetensors
+      timberhand train grasp --data ~/cornell --epochs 30 --out my.safetensors
 
-      timberhand train grasp --labels physical     no data needed: piles are settled and labelled first
+      timberhand train grasp --labels physical     needs no data
 
-      timberhand experiment grasp-network --data ~/other_cornell     how good the shipped weights are there
+      timberhand experiment grasp-network --data ~/other_cornell
     """
-    torch_on_one_thread()
+    prepare_torch()
     weights = out or Path(f"grasp_{labels.value}.safetensors")
     if labels is Labels.PHYSICAL:
         if data is not None:
             raise CommandFailed(
-                "train.data-not-wanted", "--data goes with --labels cornell; physical labels need none", ExitCode.USAGE
+                "train.data-not-wanted",
+                "--data belongs to --labels cornell; physical labels need no data",
+                ExitCode.USAGE,
             )
         _grasp_physical(weights, seed, epochs)
     elif data is None:
         raise CommandFailed(
             "train.data-missing",
-            "--data is missing: the folder of Cornell samples, or --labels physical without any",
+            "--data is missing: give the folder of Cornell samples, or use --labels physical",
             ExitCode.USAGE,
         )
     else:
@@ -81,7 +85,9 @@ def _grasp_physical(weights: Path, seed: int, epochs: int | None) -> None:
     from training.grasp import physical_weights
 
     passes = epochs or physical_weights.EPOCHS
-    _made(weights, None, lambda _, screen: physical_weights.produce(seed, weights, screen, epochs=passes)[1])
+    _train_on_pictures(
+        weights, None, lambda _, screen: physical_weights.produce(seed, weights, screen, epochs=passes)[1]
+    )
 
 
 def _grasp_cornell(data: Path, out: Path, seed: int, epochs: int | None) -> None:
@@ -101,39 +107,41 @@ def _grasp_cornell(data: Path, out: Path, seed: int, epochs: int | None) -> None
         weights, card = produce(samples, seed, epochs or training.EPOCHS, out, screen)
     except KeyboardInterrupt:
         raise CommandFailed(
-            "train.interrupted", "interrupted; the same command goes on from the last checkpoint", ExitCode.INTERRUPTED
+            "train.interrupted",
+            "interrupted; the same command continues from the last checkpoint",
+            ExitCode.INTERRUPTED,
         ) from None
     screen.print(f"{weights}, {card}", highlight=False)
 
 
 @app.command()
 def segmentation(
-    variant: Annotated[str, typer.Option(help="What the network sees: rgbd or depth.")] = "rgbd",
-    out: Annotated[Path | None, typer.Option(help="The weights; the card goes beside them as .md.")] = None,
+    variant: Annotated[str, typer.Option(help="Input channels of the network: rgbd or depth.")] = "rgbd",
+    out: OptionalOut = None,
     seed: Seed = 1,
-    steps: Annotated[int, typer.Option(min=1, help="Batches to learn from.")] = 6000,
+    steps: Annotated[int, typer.Option(min=1, help="Training batches.")] = 6000,
     pictures: Pictures = 25_088,
     folder: Folder = None,
     learning_rate: Rate = 3e-3,
     start: Annotated[
-        Path | None, typer.Option(help="Weights to go on from, for depth also those of rgbd (default: from scratch).")
+        Path | None, typer.Option(help="Initial weights; for depth those of rgbd are possible, too (default: random).")
     ] = None,
     large: Large = 0,
 ) -> None:
-    """Train the network that finds logs, on pictures drawn for it, on one core.
+    """Train the network that segments logs, on rendered pictures, on one core.
 
-    Piles are settled and pictures drawn first, and kept for the next time.  Ctrl-C keeps what was learnt; the same
-    command goes on from there.
+    The pictures are rendered first and kept for the next training. Ctrl-C keeps
+    the last checkpoint; the same command continues from there.
 
     [bold]Examples[/bold]
 
       timberhand train segmentation
 
-      timberhand train segmentation --variant depth --steps 12000 --out logs_depth.safetensors
+      timberhand train segmentation --variant depth --steps 12000
 
-      timberhand train segmentation --pictures 256 --steps 50     a look at it in a few minutes
+      timberhand train segmentation --pictures 256 --steps 50     a short trial
     """
-    torch_on_one_thread()
+    prepare_torch()
     from autonomy.perception.segmentation.network import CHANNELS
     from training.detection.detector_weights import Plan, produce
 
@@ -143,66 +151,67 @@ def segmentation(
         )
     weights = out or Path(f"logs_{variant}.safetensors")
     plan = Plan(pictures, steps, seed, learning_rate, start, large)
-    _made(weights, folder, lambda kept, screen: produce(variant, plan, kept, weights, screen))
+    _train_on_pictures(weights, folder, lambda kept, screen: produce(variant, plan, kept, weights, screen))
 
 
 @app.command()
 def detector(
     out: Out = Path("log_boxes.safetensors"),
     seed: Seed = 1,
-    steps: Annotated[int, typer.Option(min=1, help="Batches to learn from.")] = 4000,
+    steps: Annotated[int, typer.Option(min=1, help="Training batches.")] = 4000,
     pictures: Pictures = 25_088,
     folder: Folder = None,
     learning_rate: Rate = 3e-3,
     large: Large = 0,
-    start: Annotated[Path | None, typer.Option(help="Weights to go on from (default: from scratch).")] = None,
+    start: Annotated[Path | None, typer.Option(help="Initial weights (default: random).")] = None,
 ) -> None:
-    """Train paper B's detector in its role, boxes of logs from colour, on pictures drawn for it, on one core.
+    """Train a detector in the role of paper B's, boxes of logs from color, on rendered pictures, on one core.
 
-    The pictures are those of [bold]train segmentation[/bold].  Ctrl-C keeps what was learnt; the same command goes on
-    from there.
+    The pictures are those of [bold]train segmentation[/bold]. Ctrl-C keeps the
+    last checkpoint; the same command continues from there.
 
     [bold]Examples[/bold]
 
       timberhand train detector
 
-      timberhand train detector --pictures 256 --steps 50     a look at it in a few minutes
+      timberhand train detector --pictures 256 --steps 50     a short trial
     """
-    torch_on_one_thread()
+    prepare_torch()
     from training.detection.detector_weights import Plan, produce_boxes
 
     plan = Plan(pictures, steps, seed, learning_rate, start, large)
-    _made(out, folder, lambda kept, screen: produce_boxes(plan, kept, out, screen))
+    _train_on_pictures(out, folder, lambda kept, screen: produce_boxes(plan, kept, out, screen))
 
 
 @app.command()
-def judges(
-    out: Annotated[Path, typer.Option(help="Folder for joins and worth, .safetensors and .md.")] = Path(),
+def scorers(
+    out: Annotated[Path, typer.Option(help="Folder for the joins and worth weights, .safetensors and .md.")] = Path(),
     seed: Seed = 1,
-    pictures: Annotated[int, typer.Option(min=2, help="How many pictures are drawn; 2.5 MB each.")] = 1024,
+    pictures: Annotated[int, typer.Option(min=2, help="Number of rendered pictures; 2.5 MB each.")] = 1024,
     folder: Folder = None,
     weights: Annotated[
-        Path | None, typer.Option(help="Of the network that looks at them (default: the shipped one).")
+        Path | None, typer.Option(help="Weights of the segmentation network (default: the shipped ones).")
     ] = None,
 ) -> None:
-    """Train the judges that say which pieces of a picture are one log, and how well a region fits one.
+    """Train the scorers that decide which segments belong to one log, and how well a region fits one.
 
-    They learn from what the network of [bold]train segmentation[/bold] sees: train them again after it.
+    They learn from the output of the network of [bold]train segmentation[/bold]:
+    train them again after it.
 
     [bold]Examples[/bold]
 
-      timberhand train judges
+      timberhand train scorers
 
-      timberhand train judges --pictures 64     a look at it in a minute
+      timberhand train scorers --pictures 64     a trial in a minute
     """
-    torch_on_one_thread()
+    prepare_torch()
     from training.detection.scorer_weights import produce
 
-    _made(out, folder, lambda kept, screen: produce(pictures, seed, kept, out, weights, screen))
+    _train_on_pictures(out, folder, lambda kept, screen: produce(pictures, seed, kept, out, weights, screen))
 
 
-def _made(weights: Path, folder: Path | None, make: Callable[[Path, Console], Path]) -> None:
-    """Make weights of drawn pictures and say where they are."""
+def _train_on_pictures(weights: Path, folder: Path | None, make: Callable[[Path, Console], Path]) -> None:
+    """Train weights on rendered pictures and print their path."""
     from rich.console import Console
 
     from training.pictures.piles import cache_folder
@@ -212,15 +221,17 @@ def _made(weights: Path, folder: Path | None, make: Callable[[Path, Console], Pa
         card = make(folder or cache_folder().parent / "pictures", screen)
     except KeyboardInterrupt:
         raise CommandFailed(
-            "train.interrupted", "interrupted; the same command goes on from the last checkpoint", ExitCode.INTERRUPTED
+            "train.interrupted",
+            "interrupted; the same command continues from the last checkpoint",
+            ExitCode.INTERRUPTED,
         ) from None
     except ValueError as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     screen.print(f"{weights}, {card}", highlight=False)
 
 
-def torch_on_one_thread() -> None:
-    """Ready torch for training here.
+def prepare_torch() -> None:
+    """Prepare torch for training on one core.
 
     Raises:
         CommandFailed: torch is not installed.

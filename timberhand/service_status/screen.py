@@ -1,4 +1,4 @@
-"""One screen for a technician: the services, and the controller's timing.  Fits terminals from 60 columns on."""
+"""The status of services and controller timing as one screen, for terminals of 60 columns or more."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from rich.text import Text
 
 from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import Facts, Timing
-from timberhand.service_status.status import Look, Unit, worst_first
+from timberhand.service_status.status import Status, Unit, oldest_first
 
 STATE_STYLES: Final = {"running": "green", "done": "green", "failed": "bold red", "restarting": "bold red"}
 MODE_STYLES: Final = {"FAULT": "bold red", "STOP": "bold red", "ACTIVE": "bold green", "ARMED": "bold green"}
-WHOLE: Final = {
+TABLE_ROWS: Final = {
     "wake": "wake-up late", "sync": "SYNC late", "tick": "tick", "cpu": "tick, CPU",
     "sample_to_command": "sample to command",
 }  # fmt: skip
-"""What gets a row of its own; the stages of the tick share a line."""
-INPUTS: Final = 4
-"""So many inputs are shown, the worst first; all of them are in the JSON."""
+"""Durations with a row of their own; the stages of the tick share a line."""
+INPUT_COUNT: Final = 4
+"""Number of inputs shown, the oldest first; the JSON has all of them."""
 
 
-def screen(now: Look, before: Timing | None = None) -> RenderableType:
-    """Everything; with a former page ``before`` also what came since."""
+def screen(now: Status, before: Timing | None = None) -> RenderableType:
+    """The whole screen; with an earlier page ``before`` also the changes since."""
     parts: list[RenderableType] = []
     if now.units:
         parts += [_units(now.units), Text()]
     if now.timing is not None:
         if before is not None and before.facts.started_ns != now.timing.facts.started_ns:
-            before = None  # a former life
+            before = None  # of an earlier process
         parts += _timing(now.timing, before, now.silent)
     parts += [Text(note, style="yellow") for note in now.notes]
     return Group(*parts)
@@ -71,7 +71,7 @@ def _timing(timing: Timing, before: Timing | None, silent: bool) -> list[Rendera
     )  # fmt: skip
     parts: list[RenderableType] = [head, Text(facts.words)]
     if silent:
-        parts.append(Text(f"It has said nothing for {duration(old_s)}: it hangs or has ended.", style="bold red"))
+        parts.append(Text(f"no update for {duration(old_s)}: the controller hangs or has ended", style="bold red"))
     parts += [Text(), _counters(facts, before.facts if before else None), Text()]
     parts += [
         _durations(timing, before),
@@ -101,7 +101,7 @@ def _counters(facts: Facts, before: Facts | None) -> Text:
 def _durations(timing: Timing, before: Timing | None) -> RenderableType:
     columns = ["µs", "p50", "p99", "p99.9", "max"]
     table = _table(*columns, *(["now p99", "now max"] if before else []))
-    for name, word in WHOLE.items():
+    for name, word in TABLE_ROWS.items():
         found = timing.durations[name]
         if not found.count:
             continue
@@ -110,7 +110,7 @@ def _durations(timing: Timing, before: Timing | None) -> RenderableType:
             since = found - before.durations[name]
             row += [_us(since, 0.99), number(since.longest_ns // 1000)] if since.count else ["", ""]
         table.add_row(word, *row)
-    stages = [f"{n} {_us(found, 0.99)}" for n, found in timing.durations.items() if n not in WHOLE and found.count]
+    stages = [f"{n} {_us(found, 0.99)}" for n, found in timing.durations.items() if n not in TABLE_ROWS and found.count]
     return Group(table, Text("stages of the tick, p99: " + ", ".join(stages))) if stages else table
 
 
@@ -119,18 +119,18 @@ def _us(found: Durations, share: float) -> str:
 
 
 def _inputs(facts: Facts) -> RenderableType:
-    used = [item for item in worst_first(list(facts.inputs.items())) if item[1].count]
+    used = [item for item in oldest_first(list(facts.inputs.items())) if item[1].count]
     if not used:
-        return Text("No input has come yet.", style="yellow")
+        return Text("no input received yet", style="yellow")
     table = _table("age of inputs when used, ms", "last", "worst", "used")
-    for name, age in used[:INPUTS]:
+    for name, age in used[:INPUT_COUNT]:
         table.add_row(name, f"{age.newest_ns * 1e-6:.1f}", f"{age.longest_ns * 1e-6:.1f}", number(age.count))
-    if len(used) > INPUTS:
-        table.add_row(Text(f"{len(used) - INPUTS} better ones", style="dim"))
+    if len(used) > INPUT_COUNT:
+        table.add_row(Text(f"{len(used) - INPUT_COUNT} younger ones", style="dim"))
     silent = sorted(name for name, age in facts.inputs.items() if not age.count)
     if not silent:
         return table
-    return Group(table, Text(f"never came: {', '.join(silent)}", style="yellow"))
+    return Group(table, Text(f"never received: {', '.join(silent)}", style="yellow"))
 
 
 def _buses(facts: Facts) -> Table:
@@ -140,7 +140,7 @@ def _buses(facts: Facts) -> Table:
         if bus.recoveries:
             state.append(f", back {bus.recoveries}\N{MULTIPLICATION SIGN}", style="yellow")
         counts = (bus.refused, bus.dropped, bus.error_frames)
-        table.add_row(bus.name, state, _rough(bus.received), _rough(bus.sent), *map(number, counts))
+        table.add_row(bus.name, state, _rounded(bus.received), _rounded(bus.sent), *map(number, counts))
     return table
 
 
@@ -166,16 +166,16 @@ def number(value: int) -> str:
     return f"{value:,}".replace(",", "\N{NO-BREAK SPACE}")
 
 
-def _rough(value: int) -> str:
-    """To four digits where exactness says nothing: 12.35 M."""
+def _rounded(value: int) -> str:
+    """Rounded to four digits from a million on: 12.35 M."""
     if value < 1_000_000:
         return number(value)
-    rough = f"{value / 1e6:.2f} M" if value < 1_000_000_000 else f"{value / 1e9:.2f} G"
-    return rough.replace(" ", "\N{NO-BREAK SPACE}")
+    text = f"{value / 1e6:.2f} M" if value < 1_000_000_000 else f"{value / 1e9:.2f} G"
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def duration(seconds: float) -> str:
-    """In the two largest units: 2 h 13 min."""
+    """A duration in its two largest units: 2 h 13 min."""
     if seconds < 10.0:
         return f"{max(seconds, 0.0):.1f} s"
     s = round(seconds)

@@ -1,6 +1,6 @@
-"""How the installed services and their controller are: what systemd says of each unit, and the controller's own page.
+"""The status of the installed services: systemd's state of each unit, and the controller's timing page.
 
-Reads only, and as any user.  `look` gives everything; ``named`` of its answer is the JSON of ``service status``.
+Read-only, for any user.  `read_status` returns everything; its ``named`` is the JSON of ``service status``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from can_dbc.timing.page import InputAge, Timing, TimingRefused, default_path, read_timing
 from host.exit_codes import ExitCode
-from host.systemd import last_words, show_all
+from host.systemd import last_journal_line, show_all
 
 NAMES: Final = ("controller", "guard", "autonomy", "recorder", "console", "plc", "can@crane0", "can@mach0")
 PROPERTIES: Final = (
@@ -22,15 +22,16 @@ PROPERTIES: Final = (
 )  # fmt: skip
 SYSTEMD: Final = Path("/run/systemd/system")
 SERVICE_PAGE: Final = Path("/run/timberhand/controller.timing")
-OLD_NS: Final = 3_000_000_000
-"""The page is written once a second; one this old says that the controller hangs or has gone."""
+STALE_NS: Final = 3_000_000_000
+"""The page is written once per second; at this age the controller hangs or has ended."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """One service.  ``state`` is one of running, starting, ending, done (it ran and ended well), stopped, failed,
-    restarting, not configured, not installed; ``why`` says how it ended where that was not well; ``since_s`` ago it
-    came to that.
+    """One service.
+
+    ``state`` is one of running, starting, ending, done (a one-shot that succeeded), stopped, failed, restarting, not
+    configured, not installed.  ``why`` tells how it ended if it failed; ``since_s`` is the time in this state.
     """
 
     name: str
@@ -42,8 +43,8 @@ class Unit:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """Everything that could be found out; ``notes`` are sentences on what could not."""
+class Status:
+    """Units and timing; ``notes`` are sentences about what is unavailable."""
 
     units: tuple[Unit, ...]
     timing: Timing | None
@@ -51,8 +52,8 @@ class Look:
 
     @property
     def silent(self) -> bool:
-        """Whether the controller writes no page, or no longer does."""
-        return self.timing is None or self.timing.age_ns > OLD_NS
+        """Whether the controller writes no timing page, or has stopped writing it."""
+        return self.timing is None or self.timing.age_ns > STALE_NS
 
     def named(self) -> dict[str, Any]:
         """As plain values for JSON."""
@@ -62,12 +63,12 @@ class Look:
         return {"units": [asdict(unit) for unit in self.units], "timing": timing, "notes": list(self.notes)}
 
 
-def look(page: Path | None = None) -> Look:
-    """One look; ``page`` is the controller's timing page (default: the service's, else this user's)."""
+def read_status(page: Path | None = None) -> Status:
+    """The status now; ``page`` is the controller's timing page (default: that of the service, else of this user)."""
     notes = []
     units: tuple[Unit, ...] = ()
     if SYSTEMD.is_dir():
-        units = tuple(read_unit(found, time.monotonic()) for found in _ask())
+        units = tuple(read_unit(found, time.monotonic()) for found in _systemd_properties())
     else:
         notes.append("systemd does not run here, so no service is shown.")
     timing = None
@@ -75,22 +76,22 @@ def look(page: Path | None = None) -> Look:
         timing = read_timing(page or (SERVICE_PAGE if SERVICE_PAGE.exists() else default_path()))
     except TimingRefused as refused:
         notes.append(str(refused))
-    return Look(units, timing, tuple(notes))
+    return Status(units, timing, tuple(notes))
 
 
-def _ask() -> list[dict[str, str]]:
+def _systemd_properties() -> list[dict[str, str]]:
     return show_all([f"timberhand-{name}.service" for name in NAMES], *PROPERTIES)
 
 
 def read_unit(found: dict[str, str], now_s: float) -> Unit:
-    """A unit from the properties that systemd gives of it; ``now_s`` is the monotonic clock."""
+    """A unit from its systemd properties; ``now_s`` is the monotonic clock."""
     name = found["Id"].removeprefix("timberhand-").removesuffix(".service")
     state = _state(found)
     changed_s = int(found.get("StateChangeTimestampMonotonic") or 0) * 1e-6
     why = _why(found) if state in ("failed", "restarting", "stopped") else ""
     words = found.get("StatusText", "")
     if state in ("failed", "restarting") and not words:
-        words = last_words(found["Id"])
+        words = last_journal_line(found["Id"])
     since_s = now_s - changed_s if changed_s else None
     return Unit(name, state, why, since_s, int(found.get("NRestarts") or 0), words)
 
@@ -119,13 +120,13 @@ def _why(found: dict[str, str]) -> str:
         case "signal":
             return f"killed by signal {status}"
         case "watchdog":
-            return "it hung, and the watchdog ended it"
+            return "hung, ended by the watchdog"
         case "timeout":
-            return "it took too long"
+            return "timeout of starting or stopping"
         case _:
             return result
 
 
-def worst_first(inputs: Sequence[tuple[str, InputAge]]) -> list[tuple[str, InputAge]]:
-    """Inputs by the longest age at which they were used."""
+def oldest_first(inputs: Sequence[tuple[str, InputAge]]) -> list[tuple[str, InputAge]]:
+    """Inputs sorted by the longest age at which they were used."""
     return sorted(inputs, key=lambda item: -item[1].longest_ns)
