@@ -1,8 +1,11 @@
 """A convolutional network as plain data: layers by name, in the order in which they run.
 
-A layer reads the layer before it unless it names its ``source`` (``INPUT`` is the network's input).  Tensors are NCHW
+A layer reads the layer before it unless it names a ``source`` (``INPUT`` is the network's input).  Tensors are NCHW
 float32.  Every convolution pads with zeros so that its output has the input's size divided by the stride ("same").
-``torch_net`` and ``openvino_net`` both run such a description and agree; ``weights`` ties a file to it.
+``torch_net`` and ``openvino_net`` run such a description with the same result; ``weights`` ties a file to it.
+
+The fingerprint of a network depends on the names of layers, layer classes and their fields: renaming one of them
+invalidates all weight files.
 """
 
 from __future__ import annotations
@@ -12,10 +15,16 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
+from runtime.errors import CodedError
+
 INPUT: Final = "input"
 STATISTICS: Final = ("running_mean", "running_var")
 EPSILON: Final = 1e-5
-"""Added to the variance by every batch norm."""
+"""Added to the variance in every batch normalisation."""
+
+
+class NetworkError(CodedError, ValueError):
+    """An invalid network description, or input that does not fit a network."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +48,7 @@ class Conv:
 
 @dataclass(frozen=True, slots=True)
 class BatchNorm:
-    """Batch normalisation; in use it is one scale and one shift a channel."""
+    """Batch normalisation; at inference one scale and one shift per channel."""
 
     name: str
     source: str = ""
@@ -63,7 +72,7 @@ class Sigmoid:
 
 @dataclass(frozen=True, slots=True)
 class MaxPool:
-    """The greatest of every ``factor`` x ``factor`` block; a rest at the far border is left out."""
+    """Maximum of every ``factor`` x ``factor`` block; an incomplete block at the far border is dropped."""
 
     name: str
     factor: int
@@ -72,7 +81,7 @@ class MaxPool:
 
 @dataclass(frozen=True, slots=True)
 class AveragePool:
-    """The mean of every ``factor`` x ``factor`` block; a rest at the far border is left out."""
+    """Mean of every ``factor`` x ``factor`` block; an incomplete block at the far border is dropped."""
 
     name: str
     factor: int
@@ -81,7 +90,7 @@ class AveragePool:
 
 @dataclass(frozen=True, slots=True)
 class Resize:
-    """Bilinear upsampling by a whole ``factor``; pixel areas correspond (corners not aligned), borders repeat."""
+    """Bilinear upsampling by an integer ``factor``; pixel areas correspond (corners not aligned), borders repeat."""
 
     name: str
     factor: int
@@ -90,7 +99,7 @@ class Resize:
 
 @dataclass(frozen=True, slots=True)
 class Concat:
-    """The channels of all sources, one after the other."""
+    """Concatenation of the channels of all sources."""
 
     name: str
     sources: tuple[str, ...]
@@ -109,11 +118,11 @@ Layer = Conv | BatchNorm | Relu | Sigmoid | MaxPool | AveragePool | Resize | Con
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """A named network: input channels, layers, and the names of the layers whose results come out.
+    """A named network: input channels, layers, and the names of the layers that are outputs.
 
     Raises:
-        ValueError: two layers of one name, a source that does not come before its reader, an even kernel, channels
-            that do not fit, or an output that is no layer.
+        NetworkError: two layers have one name, a source does not come before its reader, a kernel is even, channels do
+            not fit, or an output is not a layer.
     """
 
     name: str
@@ -125,11 +134,11 @@ class Network:
         widths = channels(self)
         for name in self.outputs:
             if name not in widths:
-                raise ValueError(f"network {self.name}: output {name!r} is no layer")
+                raise NetworkError("network.unknown-output", f"network {self.name}: output {name!r} is not a layer")
 
 
 def wired(network: Network) -> list[tuple[Layer, tuple[str, ...]]]:
-    """Every layer with the names of what it reads."""
+    """Every layer with the names of its sources."""
     found: list[tuple[Layer, tuple[str, ...]]] = []
     before = INPUT
     for layer in network.layers:
@@ -139,29 +148,32 @@ def wired(network: Network) -> list[tuple[Layer, tuple[str, ...]]]:
 
 
 def channels(network: Network) -> dict[str, int]:
-    """Channels of the input and of every layer's result.
+    """Channels of the input and of every layer's output.
 
     Raises:
-        ValueError: as of ``Network``.
+        NetworkError: as ``Network``.
     """
     widths = {INPUT: network.channels}
     for layer, sources in wired(network):
         where = f"network {network.name}, layer {layer.name!r}"
         if layer.name in widths or "." in layer.name or not layer.name:
-            raise ValueError(f"{where}: a name must be new, not empty and without a dot")
+            raise NetworkError("network.bad-name", f"{where}: its name must be unique, not empty and without a dot")
         if unknown := [s for s in sources if s not in widths]:
-            raise ValueError(f"{where}: {unknown[0]!r} does not come before it")
+            raise NetworkError("network.unknown-source", f"{where}: source {unknown[0]!r} does not come before it")
         width = [widths[s] for s in sources]
         if isinstance(layer, Conv):
             if layer.kernel % 2 == 0:
-                raise ValueError(f"{where}: kernel {layer.kernel} is even, only odd ones keep the size")
+                raise NetworkError("network.even-kernel", f"{where}: kernel {layer.kernel} is even; use an odd kernel")
             if width[0] % layer.groups or layer.out % layer.groups:
-                raise ValueError(f"{where}: {layer.groups} groups do not divide {width[0]} and {layer.out} channels")
+                raise NetworkError(
+                    "network.bad-groups",
+                    f"{where}: {layer.groups} groups do not divide {width[0]} and {layer.out} channels",
+                )
             widths[layer.name] = layer.out
         elif isinstance(layer, Concat):
             widths[layer.name] = sum(width)
         elif isinstance(layer, Add) and len(set(width)) != 1:
-            raise ValueError(f"{where}: cannot add {width} channels")
+            raise NetworkError("network.bad-sum", f"{where}: cannot add sources with {width} channels")
         else:
             widths[layer.name] = width[0]
     return widths
@@ -188,11 +200,11 @@ def parameter_shapes(network: Network) -> dict[str, tuple[int, ...]]:
 
 
 def parameter_count(network: Network) -> int:
-    """Trained numbers (a batch norm's statistics are not trained)."""
+    """Number of trained parameters (without the statistics of batch normalisation)."""
     trained = (s for name, s in parameter_shapes(network).items() if not name.endswith(STATISTICS))
     return sum(math.prod(shape) for shape in trained)
 
 
 def fingerprint(network: Network) -> str:
-    """Of everything that decides what the weights mean; the name does not count."""
+    """A hash of everything that determines the meaning of the weights; the name is not included."""
     return hashlib.sha256(repr((network.channels, network.layers, network.outputs)).encode()).hexdigest()[:16]

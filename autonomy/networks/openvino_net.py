@@ -1,8 +1,8 @@
-"""A network description compiled by OpenVINO for one thread of the processor: how networks run in use.
+"""A network description compiled by OpenVINO for one CPU thread: the back end for inference.
 
-The model is built op by op from the description and numpy arrays; no converter, no file, no network access.  One thread
-only, because control shares the computer.  Precision is always stated: left alone, OpenVINO takes bf16 by itself where
-the processor has matrix tiles.
+The model is built operation by operation from the description and numpy arrays, without converter, file or network
+access.  It uses one thread, because control shares the computer.  The precision is always set explicitly: by default,
+OpenVINO selects bf16 where the processor has matrix tiles.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from autonomy.networks.graph import (
     Conv,
     MaxPool,
     Network,
+    NetworkError,
     Relu,
     Resize,
     Sigmoid,
@@ -39,20 +40,22 @@ class OpenVinoNet:
     Args:
         network: the description.
         arrays: its weights, as ``weights.load`` gives them.
-        shape: of the images it will be called with, (N, C, H, W).
-        precision: "f32", or "bf16" (about three digits; faster where the processor has it).
+        shape: of the input images, (N, C, H, W).
+        precision: "f32", or "bf16" (about three digits; faster where the processor supports it).
 
     Raises:
-        ValueError: the shape does not fit the network, or the precision is unknown.
+        NetworkError: the shape does not fit the network, or the precision is unknown.
     """
 
     def __init__(
         self, network: Network, arrays: Arrays, shape: tuple[int, int, int, int], precision: str = "f32"
     ) -> None:
         if len(shape) != 4 or shape[1] != network.channels or min(shape) < 1:
-            raise ValueError(f"network {network.name} takes (N, {network.channels}, H, W) images, not {shape}")
+            raise NetworkError(
+                "network.bad-shape", f"network {network.name} needs images (N, {network.channels}, H, W), not {shape}"
+            )
         if precision not in PRECISIONS:
-            raise ValueError(f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
+            raise NetworkError("network.bad-precision", f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
         self.network = network
         self.shape = shape
         core = _openvino().Core()
@@ -65,19 +68,22 @@ class OpenVinoNet:
         self._request = core.compile_model(_model(network, arrays, shape), "CPU", settings).create_infer_request()
 
     def __call__(self, images: np.ndarray) -> dict[str, np.ndarray]:
-        """Every output by name, (N, C, H, W) float32; the arrays are the caller's to keep.
+        """Every output by name, (N, C, H, W) float32; the caller owns the arrays.
 
         Raises:
-            ValueError: images of another shape than the compiled one.
+            NetworkError: the images have another shape than the compiled one.
         """
         if images.shape != self.shape:
-            raise ValueError(f"network {self.network.name} was compiled for images {self.shape}, not {images.shape}")
+            raise NetworkError(
+                "network.bad-images",
+                f"network {self.network.name} was compiled for images {self.shape}, not {images.shape}",
+            )
         found = self._request.infer([np.ascontiguousarray(images, np.float32)])
         return {name: found[i] for i, name in enumerate(self.network.outputs)}
 
 
 def _openvino() -> Any:
-    """The package without its telemetry: its tools take a stub of their own when that module cannot be imported."""
+    """The package without its telemetry: its tools use their own stub when that module cannot be imported."""
     sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]
     import openvino
 

@@ -1,6 +1,6 @@
-"""A network description as a torch module, for training and as the reference of the other back end.
+"""A network description as a torch module: the back end for training and the reference of the other one.
 
-Only what trains imports this module: torch is not needed to run.
+Only training imports this module; torch is not needed for inference.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from autonomy.networks.graph import (
 
 
 class TorchNet(nn.Module):
-    """Runs a ``Network``; its parameters bear the layers' names, as in ``parameter_shapes``."""
+    """Runs a ``Network``; its parameters have the names of ``parameter_shapes``."""
 
     def __init__(self, network: Network) -> None:
         super().__init__()
@@ -81,14 +81,14 @@ class TorchNet(nn.Module):
         return {name: state[name].detach().float().cpu().numpy().copy() for name in parameter_shapes(self.network)}
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Take the arrays of ``weights.load`` or ``arrays``."""
+        """Load the arrays of ``weights.load`` or ``arrays``."""
         own = self.state_dict()
         for name in parameter_shapes(self.network):
             own[name].copy_(torch.from_numpy(np.ascontiguousarray(arrays[name])))
 
 
 def random_net(network: Network, seed: int) -> TorchNet:
-    """A freshly drawn net; the same seed gives the same numbers and leaves torch's own generator alone."""
+    """A net with random parameters from a seed; torch's global generator is not affected."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return TorchNet(network)

@@ -1,8 +1,7 @@
-"""Weight files: safetensors, tied to the network they belong to and to every bit they held when written.
+"""Weight files in safetensors format, tied to one network.
 
-The header holds the network's name and fingerprint, a digest of the numbers, and what the trainer has to say (data,
-seed, metrics) as text.  A file that is cut off, changed, of another network or with numbers that are none is refused
-with a sentence.
+The header holds the network's name and fingerprint, a digest of the arrays, and facts of the training (data, seed,
+metrics) as text.  A file that is truncated, changed, of another network, or with values that are not finite is refused.
 """
 
 from __future__ import annotations
@@ -17,25 +16,28 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as serialised
 
-from autonomy.networks.graph import Network, fingerprint, parameter_shapes
+from autonomy.networks.graph import Network, NetworkError, fingerprint, parameter_shapes
+from runtime.errors import CodedError
 
 SHIPPED: Final = Path(__file__).parents[1] / "weights"
-"""Where the weights lie that come with the package, NAME.safetensors beside its card NAME.md."""
+"""Folder of the weights that are shipped with the package, NAME.safetensors beside its card NAME.md."""
 
 
-class WeightsRefused(ValueError):
-    """A weight file that cannot be used; the message says why and what to do."""
+class WeightsError(CodedError, ValueError):
+    """A weight file that cannot be used."""
 
 
 def save(path: Path, network: Network, arrays: Mapping[str, np.ndarray], facts: Mapping[str, str]) -> None:
-    """Write the file at once or not at all.
+    """Write a weight file atomically.
 
     Raises:
-        ValueError: arrays that are not the network's.
+        NetworkError: the arrays are not the network's.
     """
     shapes = parameter_shapes(network)
     if {name: a.shape for name, a in arrays.items()} != shapes:
-        raise ValueError(f"these arrays are not those of network {network.name}")
+        raise NetworkError(
+            "network.bad-arrays", f"names or shapes of the arrays are not those of network {network.name}"
+        )
     whole = {name: np.ascontiguousarray(arrays[name], np.float32) for name in shapes}
     own = {"network": network.name, "fingerprint": fingerprint(network), "digest": _digest(whole)}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,27 +50,32 @@ def load(path: Path, network: Network) -> tuple[dict[str, np.ndarray], dict[str,
     """The network's arrays and the header's facts.
 
     Raises:
-        WeightsRefused: no such file, a file that is cut off or changed, or one of another network.
+        WeightsError: the file is missing, truncated, changed, or of another network.
     """
     try:
         with safe_open(path, "numpy") as file:
             facts = dict(file.metadata() or {})
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
-        raise WeightsRefused(f"{path}: there is no such weight file; `timberhand train` makes one") from None
+        raise WeightsError(
+            "weights.missing", f"{path}: no such weight file; `timberhand train` makes one"
+        ) from None
     except (SafetensorError, OSError, ValueError, TypeError) as error:
-        raise WeightsRefused(f"{path}: is damaged or no safetensors file ({error}); fetch or train it again") from None
+        raise WeightsError(
+            "weights.damaged", f"{path}: damaged or not a safetensors file ({error}); fetch or train it again"
+        ) from None
     if facts.get("fingerprint") != fingerprint(network):
-        raise WeightsRefused(
-            f"{path}: holds weights of {facts.get('network', 'an unknown network')!r} that do not fit this version of "
-            f"{network.name!r}; train it again"
+        raise WeightsError(
+            "weights.other-network",
+            f"{path}: weights of {facts.get('network', 'an unknown network')!r} do not fit this version of "
+            f"{network.name!r}; train it again",
         )
     if {name: a.shape for name, a in arrays.items()} != parameter_shapes(network) or facts.get("digest") != _digest(
         arrays
     ):
-        raise WeightsRefused(f"{path}: its numbers are not those that were written; fetch or train it again")
+        raise WeightsError("weights.changed", f"{path}: its arrays were changed; fetch or train it again")
     if not all(np.isfinite(a).all() for a in arrays.values()):
-        raise WeightsRefused(f"{path}: holds numbers that are not finite; train it again")
+        raise WeightsError("weights.not-finite", f"{path}: some values are not finite; train it again")
     return arrays, facts
 
 

@@ -1,8 +1,9 @@
-"""Logs on the way, by a camera of a machine that drives: they lie still in the plane while it moves.
+"""Logs along the route, from a camera of a machine that drives; the logs lie still in the plane.
 
-The camera's place is that of the crane's base in the plane, by the receiver, and the kinematic chain from there: the
-half that carries it, the articulation.  `CylinderLocalizer` fits cylinders to the network's masks and joins them over pictures;
-`PaperBLocalizer` takes the depth at the middle of each mask's box (its 3.2.3), a point and no more.
+The pose of the camera is that of the crane's base in the plane (from the GNSS receiver) with the kinematic chain from
+there to the camera: the half of the carrier that holds it and the articulation.  ``CylinderLocalizer`` fits cylinders to
+the network's masks and merges them over pictures.  ``PaperBLocalizer`` takes the depth at the middle of each mask's box
+(paper B 3.2.3), which gives a point only.
 """
 
 from __future__ import annotations
@@ -15,61 +16,66 @@ import numpy as np
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame, RgbdFrameError, rescaled
 from autonomy.perception.camera.mount import CameraMountError, optical_pose
+from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_list.observation import LogObservation
-from autonomy.perception.papers.paper_a import log_of
-from autonomy.perception.papers.paper_b import position_of
-from autonomy.perception.pipeline import Masked, Perception
+from autonomy.perception.papers.paper_a import log_from_mask
+from autonomy.perception.papers.paper_b import position_in_box
+from autonomy.perception.pipeline import Perception
 from autonomy.perception.sources.camera_source import CameraSource, SourceError
 from autonomy.perception.tracking.log_filter import NOMINAL_ERRORS, CameraErrors
 from machine.profile import Profile
 
-FARTHEST_M: Final = 10.0
-"""A log that is farther away is a few pixels wide: nobody measures it."""
-LENGTH_M, DIAMETER_M = 2.0, 0.25
-"""Paper B's boxes tell no size: the mean of its logs is taken."""
-PATIENCE: Final = 6
-"""A log whose ends are not both seen is believed in after so many pictures: another may hide one for good."""
-FLAT: Final = 0.3
-"""An axis whose level part is shorter says nothing of a log on the ground."""
-
-SURE: Final = 0.25
-"""What the finder believes in less is no log: one within ``FARTHEST_M`` has 0.5 and more, a gap in a shadow 0.2."""
+MAX_RANGE_M: Final = 10.0
+"""A log that is farther away is only a few pixels wide and cannot be measured."""
+PAPER_B_LENGTH_M, PAPER_B_DIAMETER_M = 2.0, 0.25
+"""Mean size of paper B's logs, because its boxes give no size."""
+MIN_HITS_WITH_HIDDEN_END: Final = 6
+"""A log with a hidden end is reported after so many pictures: another log may hide the end in all of them."""
+MIN_LEVEL_PART: Final = 0.3
+"""An axis with a smaller horizontal component is not that of a log on the ground."""
+MIN_SCORE: Final = 0.25
+"""Masks with a lower score are not logs: logs within ``MAX_RANGE_M`` score 0.5 and more, gaps in a shadow 0.2."""
 
 
 class ScoredMask(Masked, Protocol):
-    """A mask, and how much it is believed in, 0..1."""
+    """A mask with its score, 0..1."""
 
     @property
     def score(self) -> float: ...
 
 
-Find = Callable[[RgbdFrame], Sequence[ScoredMask]]
+Segmentation = Callable[[RgbdFrame], Sequence[ScoredMask]]
 
 
 class LogLocalizer(Protocol):
-    """A pipeline: logs in the frame in which ``pose`` is given."""
+    """A method that turns masks into logs in the frame in which ``pose`` is given."""
 
     def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
-        """Of one picture."""
+        """The logs of one picture."""
 
 
 class CylinderLocalizer:
-    """`autonomy.perception.pipeline`: cylinder fits and tracks."""
+    """``autonomy.perception.pipeline``: cylinder fits and tracks."""
 
     def __init__(self, profile: Profile, errors: CameraErrors = NOMINAL_ERRORS) -> None:
         self._perception = Perception(profile, errors)
 
     def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
-        """The tracks that this picture shows; a piece at its edge is not yet a log."""
+        """The tracks that this picture shows, without those that may be cut off at the edge of the picture."""
         tracks = self._perception.step(frame, pose, masks)
         fresh = [t for t in tracks if t.last_seen_ns == frame.stamp_ns]
-        return [t.estimate.observation(t.id) for t in fresh if all(t.estimate.ends_seen) or t.hits >= PATIENCE]
+        return [
+            t.estimate.observation(t.id)
+            for t in fresh
+            if all(t.estimate.ends_seen) or t.hits >= MIN_HITS_WITH_HIDDEN_END
+        ]
 
 
 class PaperBLocalizer:
-    """`autonomy.perception.papers.paper_b`, with half a diameter added along the line of sight, for the grapple needs the
-    log's middle and the paper does not say how it came from the surface; nor does it say how the grapple was turned:
-    the axis is that of the mask's points, as in paper A.
+    """``autonomy.perception.papers.paper_b``, extended where the paper is silent.
+
+    Half a diameter is added along the line of sight, because the grapple needs the log's middle and the camera sees its
+    surface.  The axis is that of the mask's points, as in paper A, because paper B does not say how the grapple turns.
     """
 
     def localize(self, frame: RgbdFrame, pose: Pose, masks: Sequence[Masked]) -> list[LogObservation]:
@@ -80,61 +86,72 @@ class PaperBLocalizer:
             if not len(rows):
                 continue
             box = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
-            point, plain = position_of(frame, box), log_of(frame, one.mask)
-            if point is None or plain is None:
+            point, log = position_in_box(frame, box), log_from_mask(frame, one.mask)
+            if point is None or log is None:
                 continue
             range_m = float(np.linalg.norm(point))
-            level = (pose.rotation @ plain.axis)[:2]
+            level = (pose.rotation @ log.axis)[:2]
             length = float(np.linalg.norm(level))
-            if range_m > FARTHEST_M or length < FLAT:
+            if range_m > MAX_RANGE_M or length < MIN_LEVEL_PART:
                 continue
-            x, y, z = pose.to_base(point * (1.0 + 0.5 * DIAMETER_M / range_m)).tolist()
+            x, y, z = pose.to_base(point * (1.0 + 0.5 * PAPER_B_DIAMETER_M / range_m)).tolist()
             axis = (float(level[0]) / length, float(level[1]) / length, 0.0)
-            found.append(LogObservation(number, (x, y, z), axis, LENGTH_M, DIAMETER_M, _PLAIN))
+            found.append(
+                LogObservation(number, (x, y, z), axis, PAPER_B_LENGTH_M, PAPER_B_DIAMETER_M, _PAPER_B_COVARIANCE)
+            )
         return found
 
 
-_SIGMAS: Final = (0.10, 0.10, 0.6, 0.6, 0.2, 0.2, 0.05)
-"""Of a box (m, rad): its place by the paper's own errors; an axis seen end-on may be any."""
-_PLAIN: Final = tuple(np.diag(np.square(_SIGMAS))[np.triu_indices(len(_SIGMAS))].tolist())
+_PAPER_B_SIGMAS: Final = (0.10, 0.10, 0.6, 0.6, 0.2, 0.2, 0.05)
+"""Of a box [m, rad]: the position as in the paper's own errors; the axis of a log seen end-on is arbitrary."""
+_PAPER_B_COVARIANCE: Final = tuple(
+    np.diag(np.square(_PAPER_B_SIGMAS))[np.triu_indices(len(_PAPER_B_SIGMAS))].tolist()
+)
 
 
 class DrivingLogDetector:
-    """One camera of a machine that drives.  ``trouble`` says why the last look saw nothing, empty when it did.
+    """One camera of a machine that drives.
 
-    ``find`` gives the masks of the logs in a frame.  Raises KeyError when the machine has no such camera.
+    ``segment`` returns the masks of the logs in a frame.  ``problem`` says why the last call of ``detect`` returned no
+    logs; it is empty when the call succeeded.
+
+    Raises:
+        KeyError: the machine has no such camera.
     """
 
-    def __init__(self, profile: Profile, camera: str, source: CameraSource, find: Find, sight: LogLocalizer) -> None:
-        self.trouble = ""
+    def __init__(
+        self, profile: Profile, camera: str, source: CameraSource, segment: Segmentation, localizer: LogLocalizer
+    ) -> None:
+        self.problem = ""
         self._profile, self._camera = profile, profile.cameras[camera]
-        self._source, self._find, self._sight = source, find, sight
+        self._source, self._segment, self._localizer = source, segment, localizer
 
     def detect(self, base: Pose, q: Sequence[float], articulation_rad: float) -> tuple[LogObservation, ...] | None:
-        """The logs of a new picture in the crane's base frame; None when there is none.
+        """The logs of a new picture in the crane's base frame; None when there is no usable picture.
 
-        ``base`` is that frame in the plane, ``q`` the joints in ``Joint`` order [rad, m], both when the picture is
-        taken.
+        ``base`` is that frame in the plane, ``q`` the joints in ``Joint`` order [rad, m], both at the time of the
+        picture.
         """
-        self.trouble = ""
+        self.problem = ""
         try:
             mount = optical_pose(self._profile, self._camera, q, articulation_rad)
             frame = self._source.frame()
             if frame is None:
-                self.trouble = getattr(self._source, "problem", "") or "the camera gives no picture"
+                self.problem = getattr(self._source, "problem", "") or "the camera delivers no picture"
                 return None
             frame = rescaled(frame, self._camera.depth_scale)
             pose = Pose(base.to_base(mount.position_m), base.rotation @ mount.rotation)
-            seen = self._sight.localize(frame, pose, [one for one in self._find(frame) if one.score >= SURE])
+            masks = [one for one in self._segment(frame) if one.score >= MIN_SCORE]
+            logs = self._localizer.localize(frame, pose, masks)
         except (SourceError, RgbdFrameError, CameraMountError) as error:
-            self.trouble = str(error)
+            self.problem = str(error)
             return None
-        near = [o for o in seen if np.linalg.norm(np.asarray(o.center_m) - pose.position_m) < FARTHEST_M]
+        near = [o for o in logs if np.linalg.norm(np.asarray(o.center_m) - pose.position_m) < MAX_RANGE_M]
         return tuple(_in_base(o, base) for o in near)
 
 
 def _in_base(o: LogObservation, base: Pose) -> LogObservation:
-    """From the plane into the base frame; how well it is known turns with it."""
+    """From the plane into the base frame; the covariance refers to the axis and turns with it."""
     x, y, z = base.to_optical(np.asarray(o.center_m)).tolist()
     ax, ay, az = (np.asarray(o.axis) @ base.rotation).tolist()
     return replace(o, center_m=(x, y, z), axis=(ax, ay, az))

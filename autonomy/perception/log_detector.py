@@ -1,7 +1,7 @@
-"""What lies there, by a camera of the machine: asked with the joints, answered with the logs.
+"""The log detector: one camera of the machine in, the list of logs in the crane's base frame out.
 
-``LogDetector.detect`` takes a picture and measures it, but only while the crane rests: a picture from a moving stick is of no
-known pose.  Whoever asks gets nothing new meanwhile, and asks again.
+``LogDetector.detect`` takes a picture only while the crane is at rest, because the pose of a camera on a moving stick is
+not known well enough.  Otherwise it returns None, and the caller requests again.
 """
 
 from __future__ import annotations
@@ -13,62 +13,69 @@ import numpy as np
 
 from autonomy.perception.camera.frame import RgbdFrame, RgbdFrameError, rescaled
 from autonomy.perception.camera.mount import CameraMountError, optical_pose
+from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_list.observation import LogObservation
-from autonomy.perception.pipeline import Masked, Perception
+from autonomy.perception.pipeline import Perception
 from autonomy.perception.sources.camera_source import CameraSource, SourceError
 from machine.joints import N_JOINTS
 from machine.profile import Profile
 
-RESTS: Final = 0.004
-"""Joints that went less than this between two questions, rad or m, are at rest: 2 cm at the longest arm."""
-FAMILIAR_NS: Final = 1_000_000_000
-"""After a longer silence nobody knows whether the crane has moved meanwhile."""
+REST_TOLERANCE: Final = 0.004
+"""The crane is at rest when no joint moves by more than this between two requests [rad, m]: 2 cm at full reach."""
+MAX_REQUEST_GAP_NS: Final = 1_000_000_000
+"""After a longer gap between requests it is unknown whether the crane moved."""
 
 
 class LogDetector:
-    """One camera of a machine.  ``trouble`` says why the last look saw nothing, empty when it did.
+    """One camera of a machine.
 
-    ``find`` gives the masks of the logs in a frame.  Raises KeyError when the machine has no such camera.
+    ``segment`` returns the masks of the logs in a frame.  ``problem`` says why the last call of ``detect`` returned no
+    logs; it is empty when the call succeeded or the crane was moving.
+
+    Raises:
+        KeyError: the machine has no such camera.
     """
 
     def __init__(
-        self, profile: Profile, camera: str, source: CameraSource, find: Callable[[RgbdFrame], Sequence[Masked]]
+        self, profile: Profile, camera: str, source: CameraSource, segment: Callable[[RgbdFrame], Sequence[Masked]]
     ) -> None:
-        self.trouble = ""
+        self.problem = ""
         self.logs: tuple[LogObservation, ...] = ()
-        """As of the last look."""
+        """Result of the last successful detection."""
         self._profile, self._camera = profile, profile.cameras[camera]
-        self._source, self._find = source, find
+        self._source, self._segment = source, segment
         self._perception = Perception(profile)
-        self._before = np.full(N_JOINTS, np.nan)
-        self._asked_ns = 0
+        self._last_q = np.full(N_JOINTS, np.nan)
+        self._last_request_ns = 0
 
     def detect(self, q: Sequence[float], now_ns: int) -> tuple[LogObservation, ...] | None:
-        """The logs in the base frame, by a picture that is newer than the question; None when there is nothing new.
+        """The logs in the base frame from a picture that is newer than the request; None when there is none.
 
         ``q`` are the joints in ``Joint`` order [rad, m] at ``now_ns``, NaN where there is no encoder.
         """
         at = np.array(q, float)
-        moved = np.abs(at - self._before)
-        rests = now_ns - self._asked_ns < FAMILIAR_NS and bool(np.all(moved[np.isfinite(at)] < RESTS))
-        self._before, self._asked_ns = at, now_ns
-        if not rests:
-            self.trouble = ""
+        moved = np.abs(at - self._last_q)
+        at_rest = now_ns - self._last_request_ns < MAX_REQUEST_GAP_NS and bool(
+            np.all(moved[np.isfinite(at)] < REST_TOLERANCE)
+        )
+        self._last_q, self._last_request_ns = at, now_ns
+        if not at_rest:
+            self.problem = ""
             return None
         try:
             pose = optical_pose(self._profile, self._camera, q)
             if not np.all(np.isfinite(pose.rotation)):
-                self.trouble = f"camera {self._camera.model} hangs on a joint whose position is unknown"
+                self.problem = f"the pose of camera {self._camera.model} depends on a joint whose position is unknown"
                 return None
             frame = self._source.frame()
             if frame is None:
-                self.trouble = getattr(self._source, "problem", "") or "the camera gives no picture"
+                self.problem = getattr(self._source, "problem", "") or "the camera delivers no picture"
                 return None
             frame = rescaled(frame, self._camera.depth_scale)
-            tracks = self._perception.step(frame, pose, self._find(frame))
+            tracks = self._perception.step(frame, pose, self._segment(frame))
         except (SourceError, RgbdFrameError, CameraMountError) as error:
-            self.trouble = str(error)
+            self.problem = str(error)
             return None
-        self.trouble = ""
+        self.problem = ""
         self.logs = tuple(t.estimate.observation(t.id, t.last_seen_ns == frame.stamp_ns) for t in tracks)
         return self.logs

@@ -19,7 +19,7 @@ from autonomy.perception.log_list.datagrams import (
     encode_logs,
     encode_request,
 )
-from autonomy.perception.log_list.estimate import LogEstimate, unpacked
+from autonomy.perception.log_list.estimate import LogEstimate, unpack_covariance
 from autonomy.perception.log_list.observation import LogObservation
 from tests.codes import coded
 
@@ -59,7 +59,7 @@ def test_a_reply_carries_the_covariance() -> None:
     root = np.random.default_rng(1).normal(0.0, 0.02, (7, 7))
     estimate = LogEstimate(np.array([1.0, 2.0, -1.0]), np.array([0.0, 1.0, 0.0]), 3.0, 0.2, root @ root.T)
     (log,) = decode_logs(encode_logs([estimate.observation(4)]))
-    assert log.covariance is not None and unpacked(log.covariance) == pytest.approx(root @ root.T, rel=1e-3)
+    assert log.covariance is not None and unpack_covariance(log.covariance) == pytest.approx(root @ root.T, rel=1e-3)
 
 
 def test_an_error_reply_is_raised() -> None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.perception.camera.frame import RgbdFrame, Pose
-from autonomy.perception.papers.paper_b import RunningAverage, end_on_error_m, in_picture, position_of
+from autonomy.perception.papers.paper_b import RunningAverage, end_on_error_m, box_in_picture, position_in_box
 from machine.geometry.optics import BODY_FROM_OPTICAL, Intrinsics
 
 PIN = Intrinsics(1280, 720, 530.0, 530.0, 640.0, 360.0)
@@ -18,14 +18,14 @@ STILL = Pose(np.array([1.0, 2.0, 3.0]), BODY_FROM_OPTICAL)
 
 
 def test_the_letterboxs_corners_are_the_pictures() -> None:
-    assert in_picture((0, 133, 608, 475), PIN) == pytest.approx((0.0, 0.0, 1280.0, 720.0))
-    assert in_picture((304, 304, 304, 304), PIN) == pytest.approx((640.0, 360.0, 640.0, 360.0))
+    assert box_in_picture((0, 133, 608, 475), PIN) == pytest.approx((0.0, 0.0, 1280.0, 720.0))
+    assert box_in_picture((304, 304, 304, 304), PIN) == pytest.approx((640.0, 360.0, 640.0, 360.0))
 
 
 def test_depth_is_the_mean_of_eight_by_eight_pixels_at_the_boxs_middle() -> None:
     depth_m = np.full((720, 1280), 9.0, np.float32)
     depth_m[296:304, 496:504] = np.square(np.arange(64, dtype=np.float32)).reshape(8, 8) / 4096.0 + 4.0
-    point = position_of(replace(FRAME, depth_m=depth_m), (450.0, 280.0, 550.0, 320.0))
+    point = position_in_box(replace(FRAME, depth_m=depth_m), (450.0, 280.0, 550.0, 320.0))
     assert point is not None and point[2] == pytest.approx(4.0 + np.mean(np.arange(64) ** 2) / 4096.0)
     assert point[:2] == pytest.approx(((499.5 - 640.0) / 530.0 * point[2], (299.5 - 360.0) / 530.0 * point[2]))
 
@@ -33,11 +33,11 @@ def test_depth_is_the_mean_of_eight_by_eight_pixels_at_the_boxs_middle() -> None
 def test_unknown_pixels_are_left_out_and_without_any_there_is_no_position() -> None:
     depth_m = np.full((720, 1280), np.nan, np.float32)
     box = (450.0, 280.0, 550.0, 320.0)
-    assert position_of(replace(FRAME, depth_m=depth_m), box) is None
+    assert position_in_box(replace(FRAME, depth_m=depth_m), box) is None
     depth_m[300, 500] = 4.0
-    point = position_of(replace(FRAME, depth_m=depth_m), box)
+    point = position_in_box(replace(FRAME, depth_m=depth_m), box)
     assert point is not None and point[2] == 4.0
-    assert position_of(FRAME, (1400.0, 280.0, 1500.0, 320.0)) is None
+    assert position_in_box(FRAME, (1400.0, 280.0, 1500.0, 320.0)) is None
 
 
 def test_estimates_of_a_log_are_averaged_in_the_machines_frame() -> None:

@@ -1,4 +1,7 @@
-"""A mask's border, and which of it outlines the log: not where something nearer cuts it, nor the rim of the picture."""
+"""The contour of a mask, and which of its points are the log's own outline.
+
+Contour points where something nearer cuts the mask, or at the edge of the picture, are not the log's own outline.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +10,27 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.perception.fitting.cylinder import Cylinder, CylinderBatch, depth, outline, pixel_rays
+from autonomy.perception.fitting.cylinder import (
+    Cylinder,
+    CylinderBatch,
+    outline_distance,
+    pixel_rays,
+    surface_depth,
+)
 from machine.geometry.optics import Intrinsics
 
-OUTLINE_POINTS: Final = 80
-PROBE_PX: Final = 3  # this far outside the mask it is asked what is nearer
+MAX_CONTOUR_POINTS: Final = 80
+PROBE_PX: Final = 3  # distance outside the mask at which the depth of the neighbour is read
 PROBE_MARGIN_M: Final = 0.08
-RIM_PX: Final = 8  # a mask ends so near to the picture's rim without reaching it: that is no end of the log
-SHARED_PX: Final = 1.5  # so near to another log's outline a border is not surely a log's own
+EDGE_PX: Final = 8  # masks end this close to the edge of the picture without reaching it; this is no end of the log
+SHARED_PX: Final = 1.5  # contour points this close to the outline of another log may belong to that log
+NEIGHBOUR_MARGIN_M: Final = 0.02  # by which a neighbouring log must be farther away to be behind this one
 
 
 @dataclass(frozen=True, slots=True)
 class StereoSensor:
-    """What is known of a stereo camera's depth: focal length times baseline [px m] of its own picture, and the
-    standard deviation of its disparity [px]."""
+    """Depth accuracy of a stereo camera: focal length times baseline [px m] in its own picture, and the standard
+    deviation of its disparity [px]."""
 
     fb_px_m: float
     sigma_d_px: float = 0.2
@@ -28,8 +38,8 @@ class StereoSensor:
 
 @dataclass(frozen=True, slots=True)
 class Contour:
-    """Border points (N,) of a mask [px], whether each is the log's own outline, and the number of the mask that it
-    touches there, 0 for none."""
+    """Contour points (N,) of a mask [px]; ``own``: whether each is on the log's own outline; ``beside``: the number of
+    the mask that it touches there, 0 for none."""
 
     u_px: np.ndarray
     v_px: np.ndarray
@@ -37,24 +47,24 @@ class Contour:
     beside: np.ndarray
 
     def without(self, fitted: dict[int, Cylinder], pin: Intrinsics) -> Contour:
-        """The points that are on the outline of a log beside it, by the fits so far, are that log's and not its own.
+        """The contour without the points on the outlines of neighbouring logs ``fitted`` (by mask number).
 
-        What lies before it is mostly seen whole and told well; the guess of what is half hidden is not, and would take
-        the other's outline for its own.
+        A log in front is mostly seen whole and fitted well.  The initial cylinder of a half hidden log is not, and would
+        take the neighbour's outline for its own.
         """
         own = self.own.copy()
         for number, body in fitted.items():
             touch = np.flatnonzero(own & (self.beside == number))
             if len(touch):
                 rays = pixel_rays(pin, self.u_px[touch], self.v_px[touch])
-                own[touch] = outline(CylinderBatch.of(body), rays)[0] < -SHARED_PX * body.center_m[2] / pin.fx_px
+                own[touch] = outline_distance(CylinderBatch.of(body), rays)[0] < -SHARED_PX * body.center_m[2] / pin.fx_px
         return Contour(self.u_px, self.v_px, own, self.beside)
 
 
-def border(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Between every mask pixel and a neighbour outside it: the point between (u, v) (N,) [px] and the way out (N,).
+def mask_border(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Points u, v (N,) [px] half-way between mask pixels and their neighbours outside, and the outward direction (N,).
 
-    Half-way points err by less than half a pixel and without bias.  The picture's own rim is no border.
+    Half-way points err by less than half a pixel and without bias.  The edge of the picture is not part of the border.
     """
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     top, left = max(0, int(rows[0]) - 1), max(0, int(columns[0]) - 1)
@@ -80,24 +90,31 @@ def log_contour(
     labels: np.ndarray | None = None,
     others: dict[int, Cylinder] | None = None,
 ) -> Contour:
-    """The mask's border, thinned to ``OUTLINE_POINTS``, and which of it is the log's own.
+    """The contour of a mask (H, W) bool, thinned to ``MAX_CONTOUR_POINTS``, with the log's own outline marked.
 
-    ``window`` (left, top, right, bottom) is where the picture shows anything; ``labels`` (H, W) numbers the masks and
-    ``others`` are the first guesses of the logs by their number.
+    Args:
+        mask: (H, W) bool.
+        depth_m: (H, W) [m].
+        pin: intrinsics of this part of the picture.
+        body: the log's initial cylinder.
+        sensor: accuracy of the depth.
+        window: left, top, right, bottom of the picture without black bars.
+        labels: (H, W), the numbers of all masks.
+        others: the initial cylinders of other logs by the number of their mask.
     """
-    u, v, du, dv = border(mask)
-    if len(u) > OUTLINE_POINTS:
-        pick = np.linspace(0, len(u) - 1, OUTLINE_POINTS).astype(int)
+    u, v, du, dv = mask_border(mask)
+    if len(u) > MAX_CONTOUR_POINTS:
+        pick = np.linspace(0, len(u) - 1, MAX_CONTOUR_POINTS).astype(int)
         order = np.argsort(np.arctan2(v - v.mean(), u - u.mean()), kind="stable")[pick]
         u, v, du, dv = u[order], v[order], du[order], dv[order]
     left, top, right, bottom = window
     pu = np.rint(u + (PROBE_PX - 0.5) * du).astype(int)
     pv = np.rint(v + (PROBE_PX - 0.5) * dv).astype(int)
-    inside = (u >= left + RIM_PX) & (u < right - RIM_PX) & (v >= top + RIM_PX) & (v < bottom - RIM_PX)
+    inside = (u >= left + EDGE_PX) & (u < right - EDGE_PX) & (v >= top + EDGE_PX) & (v < bottom - EDGE_PX)
     pu, pv = np.clip(pu, 0, mask.shape[1] - 1), np.clip(pv, 0, mask.shape[0] - 1)
     rays = pixel_rays(pin, u, v)
     bodies = CylinderBatch.of(body)
-    own_m, there_m = depth(bodies, rays)[0], depth_m[pv, pu]
+    own_m, there_m = surface_depth(bodies, rays)[0], depth_m[pv, pu]
     margin = PROBE_MARGIN_M + 3.0 * own_m * own_m * sensor.sigma_d_px / sensor.fb_px_m
     own = inside & ~(there_m < own_m - margin)
     beside = np.zeros(len(u), int) if labels is None else labels[pv, pu]
@@ -105,6 +122,6 @@ def log_contour(
         for number, other in others.items():
             touch = beside == number
             if touch.any():
-                theirs = depth(CylinderBatch.of(other), rays[touch])[0]
-                own[touch] = inside[touch] & (theirs > own_m[touch] + 0.02)
+                theirs = surface_depth(CylinderBatch.of(other), rays[touch])[0]
+                own[touch] = inside[touch] & (theirs > own_m[touch] + NEIGHBOUR_MARGIN_M)
     return Contour(u, v, own, beside)

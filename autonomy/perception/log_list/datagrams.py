@@ -3,8 +3,8 @@
 The request is ``{"op":"logs","q":"..."}``.  ``q`` holds the joint positions [rad, m] in the order of ``Joint``, "nan"
 where a joint is not measured: a detector whose camera rides on the crane needs them.  The reply is
 ``[{"position_m","axis","length_m","diameter_m","id","covariance","seen"}, ...]`` in the crane's base frame, or
-``{"error": SENTENCE}``.  ``id`` is the log's number (default: its index in the list), ``covariance`` may be missing, and
-``seen`` is false when the log is remembered from an earlier picture.
+``{"error": SENTENCE}``.  ``id`` is the log's number (default: its index in the list), ``covariance`` may be missing,
+and ``seen`` is false when the log is remembered from an earlier picture.
 
 A list is accepted or refused as a whole.  It is refused for a number that is not finite, an axis without length, a log
 that is wider than long (the cause of paper A's only real failures), a negative variance, or a number used twice.

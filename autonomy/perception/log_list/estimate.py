@@ -1,8 +1,7 @@
-"""What perception knows of one log, and how well: seven numbers and their covariance."""
+"""The estimate of one log: seven numbers and their covariance."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,10 +17,10 @@ SIZE: Final = 7
 class LogEstimate:
     """One log: centre (3,) [m] and unit axis (3,) in the crane's base frame, length and diameter [m].
 
-    ``covariance`` (7, 7) is that of errors in the order ACROSS_1, ACROSS_2 [m] (the axis at the centre, along the two
-    directions of ``frame``), TILT_1, TILT_2 [rad] (the axis towards these), START, END [m] (of the ends at -length/2
-    and +length/2, along the axis), RADIUS [m].  ``ends_seen`` says which ends are the log's own, not where the picture
-    or something in front of it cut it; the length is a lower bound unless both are.  ``score`` is in 0..1.
+    ``covariance`` (7, 7) is that of errors in the order ACROSS_1, ACROSS_2 [m] (of the axis at the centre, along the two
+    directions of ``frame``), TILT_1, TILT_2 [rad] (of the axis towards these), START, END [m] (of the ends at -length/2
+    and +length/2, along the axis), RADIUS [m].  ``ends_seen`` says which ends are visible, not cut off by the edge of the
+    picture or by something in front; the length is a lower bound unless both are.  ``score`` is in 0..1.
     """
 
     center_m: np.ndarray
@@ -33,14 +32,8 @@ class LogEstimate:
     score: float = 1.0
 
     def frame(self) -> tuple[np.ndarray, np.ndarray]:
-        """The two unit vectors (3,) across the axis that the covariance counts along: level, and up."""
+        """The two unit vectors (3,) across the axis to which the covariance refers: level, and up."""
         return across(self.axis)
-
-    @property
-    def ends_m(self) -> np.ndarray:
-        """Both ends of the axis (2, 3) [m]: start, end."""
-        half = 0.5 * self.length_m * self.axis
-        return np.stack([self.center_m - half, self.center_m + half])
 
     def position_sigma_m(self) -> np.ndarray:
         """Standard deviation (3,) [m] of the centre: along ``frame``'s two directions and along the axis."""
@@ -48,34 +41,17 @@ class LogEstimate:
         along = 0.25 * (c[START, START] + c[END, END] + 2.0 * c[START, END])
         return np.sqrt(np.maximum([c[ACROSS_1, ACROSS_1], c[ACROSS_2, ACROSS_2], along], 0.0))
 
-    def length_sigma_m(self) -> float:
-        """Standard deviation [m] of the length."""
-        c = self.covariance
-        return math.sqrt(max(0.0, float(c[START, START] + c[END, END] - 2.0 * c[START, END])))
-
-    def reversed(self) -> LogEstimate:
-        """The same log with its axis turned round."""
-        swap = np.zeros((SIZE, SIZE))
-        # With the axis, both directions' product turns: level turns round, up stays.
-        swap[ACROSS_1, ACROSS_1], swap[ACROSS_2, ACROSS_2] = -1.0, 1.0
-        swap[TILT_1, TILT_1], swap[TILT_2, TILT_2] = 1.0, -1.0
-        swap[START, END] = swap[END, START] = -1.0
-        swap[RADIUS, RADIUS] = 1.0
-        turned = swap @ self.covariance @ swap.T
-        ends = (self.ends_seen[1], self.ends_seen[0])
-        return LogEstimate(self.center_m, -self.axis, self.length_m, self.diameter_m, turned, ends, self.score)
-
     def observation(self, number: int, seen: bool = True) -> LogObservation:
-        """What a grasp is planned for; ``seen``: the newest picture shows it."""
+        """The observation with this number; ``seen``: the newest picture shows the log."""
         x, y, z = (float(v) for v in self.center_m)
         ax, ay, az = (float(v) for v in self.axis)
-        # Four digits do, and an answer about a hundred logs goes into one datagram.
+        # Four digits suffice, and a reply about a hundred logs must fit into one datagram.
         known = tuple(float(f"{v:.4g}") for v in self.covariance[np.triu_indices(SIZE)])
         length_m, diameter_m = float(self.length_m), float(self.diameter_m)
         return LogObservation(number, (x, y, z), (ax, ay, az), length_m, diameter_m, known, seen)
 
 
-def unpacked(triangle: tuple[float, ...]) -> np.ndarray:
+def unpack_covariance(triangle: tuple[float, ...]) -> np.ndarray:
     """The covariance (7, 7) of a ``LogObservation``."""
     upper = np.zeros((SIZE, SIZE))
     upper[np.triu_indices(SIZE)] = triangle

@@ -1,7 +1,7 @@
-"""Paper B's detector in its role (3.2.2): a letterboxed colour picture of 608 x 608 px in, boxes of logs out.
+"""A box detector in the role of paper B's (3.2.2): a letterboxed picture of 608 x 608 px in, boxes of logs out.
 
-The paper uses YOLOv3 (62 million parameters).  This is a small network of our own that answers the same question: at
-every eighth pixel whether the middle of a log's box is there, and how far the box's sides are.
+The paper uses YOLOv3 (62 million parameters).  This is a small network for the same task: at every eighth pixel it
+predicts whether the middle of a log's box is there, and the distances of the box's sides.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from autonomy.networks.weights import SHIPPED, load
 
 SIZE_PX: Final = 608
 STRIDE: Final = 8
-LEAST_SCORE: Final = 0.05
-MOST_OVERLAP: Final = 0.75  # of two boxes that are two logs: those of slanting neighbours overlap a lot
-SIDES: Final = 4  # left, top, right, bottom: logarithms of distances in STRIDE
+MIN_SCORE: Final = 0.05
+MAX_OVERLAP: Final = 0.75  # intersection over union of two logs' boxes: those of slanting neighbours overlap a lot
+SIDE_COUNT: Final = 4  # left, top, right, bottom: logarithms of distances in STRIDE
 
 
 def box_net() -> Network:
-    """The network: colour (3, H, W) about -1..1 in; ``boxes`` (5, H / 8, W / 8) out, a logit and four sides."""
+    """The network: colour (3, H, W), about -1..1, in; ``boxes`` (5, H / 8, W / 8) out: a logit and four sides."""
     layers: list[Layer] = []
 
     def conv(name: str, out: int, stride: int = 1, dilation: int = 1) -> str:
@@ -46,15 +46,15 @@ def box_net() -> Network:
     layers.append(Add("sum8", ("to8_up", at8)))
     conv("out8", 64)
     conv("more8", 64)
-    layers.append(Conv("boxes", 1 + SIDES, 1))
+    layers.append(Conv("boxes", 1 + SIDE_COUNT, 1))
     return Network("log_boxes", 3, tuple(layers), ("boxes",))
 
 
 class BoxDetector:
-    """The detector with its weights (None: the shipped ones), on one thread.
+    """The detector with its weights (default: the shipped ones), on one thread.
 
     Raises:
-        WeightsRefused: the weights are missing, damaged or of another network.
+        WeightsError: the weights are missing, damaged or of another network.
     """
 
     def __init__(self, weights: Path | None = None, precision: str = "f32") -> None:
@@ -63,29 +63,28 @@ class BoxDetector:
         self._net = OpenVinoNet(network, arrays, (1, 3, SIZE_PX, SIZE_PX), precision)
 
     def detect(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes (N, 4) left, top, right, bottom [px] in a picture (608, 608, 3) uint8 and their scores (N,), the surest
-        first.
+        """Boxes (N, 4) left, top, right, bottom [px] in a picture (608, 608, 3) uint8 and their scores (N,), descending.
 
         Raises:
-            ValueError: a picture of another size or kind.
+            ValueError: a picture of another size or type.
         """
         if rgb.shape != (SIZE_PX, SIZE_PX, 3) or rgb.dtype != np.uint8:
             raise ValueError(
                 f"the detector takes letterboxed pictures of {SIZE_PX} x {SIZE_PX} px, uint8, not {rgb.dtype} of shape "
                 f"{rgb.shape}"
             )
-        return decoded(self._net(colour(rgb)[None])["boxes"][0])
+        return decode_boxes(self._net(network_input(rgb)[None])["boxes"][0])
 
 
-def colour(rgb: np.ndarray) -> np.ndarray:
-    """Input (3, H, W) float32 of a picture (H, W, 3) uint8."""
+def network_input(rgb: np.ndarray) -> np.ndarray:
+    """The network's input (3, H, W) float32 from a picture (H, W, 3) uint8."""
     return np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32) * np.float32(1.0 / 127.5) - np.float32(1.0)
 
 
-def decoded(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes (N, 4) [px] and scores (N,) of maps (5, h, w): local maxima, without those that another one covers."""
+def decode_boxes(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (N, 4) [px] and scores (N,) of maps (5, h, w): local maxima after non-maximum suppression."""
     score = 1.0 / (1.0 + np.exp(-maps[0]))
-    peak = (score >= LEAST_SCORE) & (score == ndimage.maximum_filter(score, 3, mode="constant"))
+    peak = (score >= MIN_SCORE) & (score == ndimage.maximum_filter(score, 3, mode="constant"))
     y, x = np.nonzero(peak)
     order = np.argsort(-score[y, x], kind="stable")
     y, x = y[order], x[order]
@@ -95,7 +94,7 @@ def decoded(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     boxes = np.clip(boxes, 0.0, (maps.shape[2] * STRIDE, maps.shape[1] * STRIDE) * 2)
     kept: list[int] = []
     for i in range(len(boxes)):
-        if not kept or _overlaps(boxes[i], boxes[kept]).max() < MOST_OVERLAP:
+        if not kept or _overlaps(boxes[i], boxes[kept]).max() < MAX_OVERLAP:
             kept.append(i)
     return boxes[kept], score[y[kept], x[kept]]
 

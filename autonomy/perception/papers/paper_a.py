@@ -1,10 +1,11 @@
-"""Paper A's perception (II-B), faithfully: a mask and a point cloud give a log's pose, length and diameter.
+"""Paper A's perception (II-B), implemented faithfully: pose, length and diameter from a mask and a point cloud.
 
 The paper names the steps (masks of a segmentation network "coupled with a point-cloud obtained from a depth camera are
-then combined to infer the length and diameter of the logs, and localize them") and no formulas.  Taken here as plainly
-as they can be: the cloud's centroid is the place, its first principal axis the axis, its extents along the first and
-the second are length and diameter.  It takes the visible surface for the log, fattened edges and all; where the
-diameter comes out greater than the length the axis is 90 degrees off, which are the paper's two failures (IV).
+then combined to infer the length and diameter of the logs, and localize them") but gives no formulas.  This is their
+plainest reading: the centroid of the cloud is the centre, its first principal axis the axis, its extents along the first
+and second principal axes are length and diameter.  The method takes the visible surface, with its fattened edges, for
+the log.  When the diameter comes out greater than the length, the axis is 90 degrees off; these are the paper's two
+failures (IV).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from autonomy.perception.camera.frame import RgbdFrame
 
-LEAST_POINTS: Final = 16
+MIN_POINTS: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,10 +30,10 @@ class LogCylinder:
     diameter_m: float
 
 
-def log_of(frame: RgbdFrame, mask: np.ndarray) -> LogCylinder | None:
-    """The log of a mask (H, W) bool; None with fewer than ``LEAST_POINTS`` points of known depth."""
+def log_from_mask(frame: RgbdFrame, mask: np.ndarray) -> LogCylinder | None:
+    """The log of a mask (H, W) bool; None with fewer than ``MIN_POINTS`` points of known depth."""
     v, u = np.nonzero(mask & np.isfinite(frame.depth_m))
-    if len(u) < LEAST_POINTS:
+    if len(u) < MIN_POINTS:
         return None
     pin, z = frame.intrinsics, frame.depth_m[v, u].astype(float)
     cloud = np.stack([(u - pin.cx_px) / pin.fx_px * z, (v - pin.cy_px) / pin.fy_px * z, z], axis=1)

@@ -14,7 +14,7 @@ import numpy as np
 
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.weights import SHIPPED, load
-from autonomy.perception.camera.frame import RgbdFrame, check, content_window
+from autonomy.perception.camera.frame import RgbdFrame, check_frame, content_window
 from autonomy.perception.segmentation.instances import Instance, instances, placed
 from autonomy.perception.segmentation.network import (
     COS2,
@@ -64,7 +64,7 @@ class LogSegmenter:
         nearer: whether a window about the wood is looked at from nearer.
 
     Raises:
-        WeightsRefused: the weights are missing, damaged or of another network.
+        WeightsError: the weights are missing, damaged or of another network.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class LogSegmenter:
         Raises:
             FrameRefused: the frame cannot be a picture of its camera.
         """
-        check(frame)
+        check_frame(frame)
         return self.segment_picture(frame.rgb, frame.depth_m, frame.intrinsics)
 
     def segment_picture(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[Instance, ...]:

@@ -66,7 +66,7 @@ def judges(folder: Path = SHIPPED) -> SegmentScorers:
     """From ``joins.safetensors`` and ``worth.safetensors`` of a folder.
 
     Raises:
-        WeightsRefused: they are missing, damaged or of other networks.
+        WeightsError: they are missing, damaged or of other networks.
     """
     heads = (ScoringNetwork.of(load(folder / f"{network.name}.safetensors", network)[0]) for network in (MERGE_NETWORK, QUALITY_NETWORK))
     return SegmentScorers(*heads)

@@ -1,6 +1,6 @@
-"""A folder of RGB-D pictures: ``camera.json`` and, for each frame, ``NNNNNN.png`` and its depth.
+"""A folder of RGB-D frames: ``camera.json`` and, for each frame, ``NNNNNN.png`` with its depth.
 
-``camera.json`` holds the camera's name, the intrinsics, how depth is stored and the frames' stamps.  Depth is
+``camera.json`` holds the camera's name, the intrinsics, the storage of depth and the stamps of the frames.  Depth is
 ``NNNNNN.depth.png``, 16-bit whole millimetres, 0 = unknown, or ``NNNNNN.npy``, floating metres, NaN = unknown.
 """
 
@@ -22,7 +22,7 @@ MM_M: Final = 1000.0
 
 
 class Index(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What ``camera.json`` holds; one stamp [ns] a frame."""
+    """Contents of ``camera.json``; one stamp [ns] for each frame."""
 
     camera: str
     width_px: int
@@ -35,11 +35,11 @@ class Index(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stamps_ns: tuple[int, ...]
 
 
-class Recording:
-    """A recorded folder as a source: every call gives the next frame, None after the last.
+class FrameFolder:
+    """A folder of frames as a source: every call returns the next frame, None after the last.
 
     Raises:
-        SourceError: it is no recording.
+        SourceError: the folder has no valid index.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -48,15 +48,24 @@ class Recording:
         try:
             self.index = msgspec.json.decode(path.read_bytes(), type=Index)
         except OSError as error:
-            raise SourceError(f"{folder} is no recording: {error.strerror or error} ({INDEX})") from None
+            raise SourceError(
+                "camera-source.no-frame-folder",
+                f"{folder} is not a folder of frames: {INDEX} cannot be read ({error.strerror or error})",
+            ) from None
         except msgspec.DecodeError as error:
-            raise SourceError(f"{path}: {error}; record the folder again or correct the file") from None
+            raise SourceError(
+                "camera-source.bad-index", f"{path}: {error}; correct the file or write the folder again"
+            ) from None
 
     def __len__(self) -> int:
         return len(self.index.stamps_ns)
 
     def frame(self) -> RgbdFrame | None:
-        """The next frame; SourceError when its pictures are missing or of another size."""
+        """The next frame.
+
+        Raises:
+            SourceError: its pictures are missing, unreadable or of another size.
+        """
         if self._next == len(self):
             return None
         frame = self.at(self._next)
@@ -64,45 +73,48 @@ class Recording:
         return frame
 
     def at(self, number: int) -> RgbdFrame:
-        """Frame ``number``, from 0."""
+        """Frame ``number``, counted from 0; raises as ``frame``."""
         i, stem = self.index, f"{number:06d}"
         try:
             with Image.open(self._folder / f"{stem}.png") as picture:
                 rgb = np.asarray(picture.convert("RGB"))
             depth_m = self._depth(stem)
         except (OSError, ValueError) as error:
-            raise SourceError(f"frame {number} of {self._folder} cannot be read: {error}") from None
+            raise SourceError(
+                "camera-source.bad-frame", f"frame {number} of {self._folder} cannot be read: {error}"
+            ) from None
         if rgb.shape[:2] != (i.height_px, i.width_px) or depth_m.shape != rgb.shape[:2]:
             raise SourceError(
+                "camera-source.bad-frame-size",
                 f"frame {number} of {self._folder} is {rgb.shape[1]} x {rgb.shape[0]} px with depth of shape "
-                f"{depth_m.shape}, but {INDEX} says {i.width_px} x {i.height_px} px"
+                f"{depth_m.shape}, but {INDEX} states {i.width_px} x {i.height_px} px",
             )
         pin = Intrinsics(i.width_px, i.height_px, i.fx_px, i.fy_px, i.cx_px, i.cy_px)
         return RgbdFrame(i.camera, i.stamps_ns[number], rgb, depth_m, pin)
 
     def _depth(self, stem: str) -> np.ndarray:
         if self.index.depth == "npy":
-            return np.load(self._folder / f"{stem}.npy", allow_pickle=False).astype(np.float32)
+            return np.asarray(np.load(self._folder / f"{stem}.npy", allow_pickle=False).astype(np.float32))
         with Image.open(self._folder / f"{stem}.depth.png") as picture:
             depth_m = np.asarray(picture).astype(np.float32) / np.float32(MM_M)
         depth_m[depth_m == 0.0] = np.nan
         return depth_m
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: no file is kept open."""
 
 
-class Recorder:
-    """Writes a recording, frame by frame; ``close`` writes its index.
+class FrameFolderWriter:
+    """Writes a folder of frames; ``close`` writes its index.
 
     Raises:
-        SourceError: the folder already holds a recording, or a frame is not like the first.
+        SourceError: the folder already holds frames, or a frame is of another camera than the first.
     """
 
     def __init__(self, folder: Path, depth: Literal["png", "npy"] = "png") -> None:
         self._folder, self._depth = Path(folder), depth
         if (self._folder / INDEX).exists():
-            raise SourceError(f"{folder} already holds a recording; choose another folder")
+            raise SourceError("camera-source.folder-in-use", f"{folder} already holds frames; choose another folder")
         self._folder.mkdir(parents=True, exist_ok=True)
         self._first: RgbdFrame | None = None
         self._stamps_ns: list[int] = []
@@ -111,7 +123,11 @@ class Recorder:
         """Write one frame."""
         first = self._first or frame
         if (frame.camera, frame.intrinsics) != (first.camera, first.intrinsics):
-            raise SourceError(f"a frame of camera {frame.camera!r} does not belong in a recording of {first.camera!r}")
+            raise SourceError(
+                "camera-source.other-camera",
+                f"a frame of camera {frame.camera!r} does not belong in a folder of camera {first.camera!r} or has "
+                "other intrinsics; write it to another folder",
+            )
         self._first, stem = first, f"{len(self._stamps_ns):06d}"
         Image.fromarray(frame.rgb).save(self._folder / f"{stem}.png")
         if self._depth == "npy":
@@ -122,7 +138,7 @@ class Recorder:
         self._stamps_ns.append(frame.stamp_ns)
 
     def close(self) -> None:
-        """Write the index; without a frame there is nothing to write."""
+        """Write the index, unless no frame was added."""
         if self._first is not None:
             p = self._first.intrinsics
             numbers = (p.width_px, p.height_px, p.fx_px, p.fy_px, p.cx_px, p.cy_px)

@@ -1,7 +1,7 @@
-"""Frames over a local stream socket (``can_dbc.messages.rgbd``): what a plant or a camera process on this host serves.
+"""Frames over a local stream socket (``can_dbc.messages.rgbd``) from the plant or a camera process on this host.
 
-Pull-style: the newest frame is asked for.  A call never takes longer than its timeout; what has come by then is kept
-for the next one.  A connection that breaks, or on which anything broken comes, is opened anew.
+The client requests the newest frame.  A call never takes longer than its timeout; bytes received by then are kept for
+the next call.  The connection is opened again after it breaks or delivers invalid data.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
+from typing import Final
 
 import numpy as np
 
@@ -16,26 +17,26 @@ from autonomy.perception.camera.frame import RgbdFrame
 from can_dbc.messages.rgbd import MM_M, START_BYTES, RgbdError, RgbdMessage, decode, encode_question, start
 from machine.geometry.optics import Intrinsics
 
-CHUNK: int = 1 << 20
+MAX_RECEIVE_BYTES: Final = 1 << 20
 
 
 class StreamCamera:
     """One camera of a server at ``address``: ``HOST:PORT``, or ``unix:PATH``.
 
-    ``problem`` says why the last call gave no frame, empty when it did.
+    ``problem`` says why the last call returned no frame; it is empty when the call returned one.
     """
 
     def __init__(self, address: str, camera: str, timeout_s: float = 0.1) -> None:
         self._address, self._camera, self._timeout_s = address, camera, timeout_s
         self._socket: socket.socket | None = None
-        self._asked, self._data = False, bytearray()
+        self._requested, self._data = False, bytearray()
         self.problem = ""
 
     def frame(self) -> RgbdFrame | None:
         """The newest frame, or None with ``problem`` set."""
         end_s = time.monotonic() + self._timeout_s
         try:
-            frame = self._answer(end_s)
+            frame = self._receive(end_s)
         except (OSError, RgbdError) as error:
             self.close()
             self.problem = f"no frame of camera {self._camera} from {self._address}: {error or type(error).__name__}"
@@ -44,19 +45,19 @@ class StreamCamera:
         return frame
 
     def close(self) -> None:
-        """Hang up; the next call connects again."""
+        """Close the connection; the next call connects again."""
         if self._socket is not None:
             with contextlib.suppress(OSError):
                 self._socket.close()
-        self._socket, self._asked = None, False
+        self._socket, self._requested = None, False
         self._data.clear()
 
-    def _answer(self, end_s: float) -> RgbdFrame | None:
-        sock = self._socket or self._connected(end_s)
-        if not self._asked:
+    def _receive(self, end_s: float) -> RgbdFrame | None:
+        sock = self._socket or self._connect(end_s)
+        if not self._requested:
             sock.settimeout(_left(end_s))
             sock.sendall(encode_question(self._camera))
-            self._asked = True
+            self._requested = True
         wanted = START_BYTES
         while True:
             if len(self._data) >= START_BYTES:
@@ -68,24 +69,25 @@ class StreamCamera:
                 return None
             sock.settimeout(left_s)
             try:
-                chunk = sock.recv(min(CHUNK, wanted - len(self._data)))
+                chunk = sock.recv(min(MAX_RECEIVE_BYTES, wanted - len(self._data)))
             except TimeoutError:
                 return None
             if not chunk:
-                raise ConnectionError("the server hung up")
+                raise ConnectionError("the server closed the connection")
             self._data += chunk
         data = bytes(self._data)
         self._data.clear()
-        self._asked = False
+        self._requested = False
         return frame_from_message(decode(data))
 
-    def _connected(self, end_s: float) -> socket.socket:
+    def _connect(self, end_s: float) -> socket.socket:
         if self._address.startswith("unix:"):
-            sock, target = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM), self._address[5:]
+            sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            target: str | tuple[str, int] = self._address[5:]
         else:
             host, _, port = self._address.rpartition(":")
             if not host or not port.isdigit():
-                raise RgbdError(f"'{self._address}' is neither HOST:PORT nor unix:PATH")
+                raise RgbdError("rgbd.address", f"'{self._address}' is neither HOST:PORT nor unix:PATH")
             sock, target = socket.socket(socket.AF_INET, socket.SOCK_STREAM), (host, int(port))
         sock.settimeout(_left(end_s))
         try:
@@ -102,7 +104,7 @@ def _left(end_s: float) -> float:
 
 
 def frame_from_message(sent: RgbdMessage) -> RgbdFrame:
-    """A frame as it came over the wire: depth in m, NaN where it is unknown."""
+    """The frame of a message: depth in m, NaN where it is unknown."""
     shape = (sent.height_px, sent.width_px)
     depth_m = np.frombuffer(sent.depth_mm, "<u2").reshape(shape).astype(np.float32) / np.float32(MM_M)
     depth_m[depth_m == 0.0] = np.nan

@@ -1,6 +1,6 @@
-"""Logs over time: which fit of a picture is of which log, and which number it keeps.
+"""Logs over frames: association of fits with logs, and the number that each log keeps.
 
-A log lies still until a picture shows it elsewhere; what is known of each is its ``LogFilter``'s.
+A log is assumed to lie still until a picture shows it elsewhere.  Each log has its own ``LogFilter``.
 """
 
 from __future__ import annotations
@@ -16,123 +16,136 @@ from autonomy.perception.fitting.cylinder_fit import CylinderFit
 from autonomy.perception.log_list.estimate import LogEstimate
 from autonomy.perception.tracking.log_filter import NOMINAL_ERRORS, CameraErrors, LogFilter, Track
 
-GATE: Final = 24.3  # chi squared of seven numbers, 99.9 %
-CONFIRMED: Final = 2  # pictures after which a log is believed
-ODD: Final = 4  # fits in a row beyond the gate after which a log is begun anew
-LOST: Final = 8  # pictures in a row without it after which it is given up
-INSIDE, PARALLEL, AS_LONG_M = 0.7, 0.94, 0.25
-"""Two logs of a length, their axes nearer than this share of their radii's sum, 20 degrees askew at most, are one."""
-PIECE: Final = 0.5
-"""A shorter log whose axis is nearer to that of a longer one than this share of their radii's sum is a piece of it."""
-BAR: Final = 1e9  # a gap in the table of costs
+GATE_CHI2: Final = 24.3  # chi squared of seven numbers, 99.9 %
+CONFIRMED_HITS: Final = 2  # pictures after which a log is reported
+MAX_OUTLIERS: Final = 4  # fits in a row outside the gate after which a log is initialised anew
+LOST_MISSES: Final = 8  # pictures in a row without it after which a log is deleted
+DUPLICATE_DISTANCE_SHARE, MIN_PARALLEL_COSINE, MAX_LENGTH_DIFFERENCE_M = 0.7, 0.94, 0.25
+"""Two logs are duplicates when their lengths differ by less, their axes are at most 20 degrees apart, and the distance
+of their axes is below this share of the sum of their radii."""
+FRAGMENT_DISTANCE_SHARE: Final = 0.5
+"""A shorter log is a fragment of a longer one when the distance of their axes is below this share of the sum of radii."""
+NO_PAIR_COST: Final = 1e9  # in the assignment matrix
 
 
-def _lies_still(log: LogEstimate, fit: CylinderFit) -> bool:
-    """What is known of a log's ways without its picture: none."""
+def _never_displaced(log: LogEstimate, fit: CylinderFit) -> bool:
+    """Without a picture, no log is known to have moved."""
     return False
 
 
-def _are_one(log: LogEstimate, other: LogEstimate) -> bool:
-    """Whether they would lie in each other, as two logs cannot."""
-    as_long = abs(log.length_m - other.length_m) < AS_LONG_M  # a piece of a log is no reason to forget the whole
-    return as_long and _lies_in(log, other, INSIDE)
+def _are_duplicates(log: LogEstimate, other: LogEstimate) -> bool:
+    """Whether two logs would occupy the same space, which two real logs cannot."""
+    # A fragment of a log is no reason to delete the whole log: compare lengths.
+    same_length = abs(log.length_m - other.length_m) < MAX_LENGTH_DIFFERENCE_M
+    return same_length and _lies_in(log, other, DUPLICATE_DISTANCE_SHARE)
 
 
 def _lies_in(log: LogEstimate, other: LogEstimate, share: float) -> bool:
-    """Whether a log's middle lies in another of its direction, its axis within a share of their radii's sum."""
+    """Whether a log's middle lies in a parallel log, the distance of their axes below a share of the sum of radii."""
     off = log.center_m - other.center_m
     along = float(off @ other.axis)
     apart_m = float(np.linalg.norm(off - along * other.axis))
     inside = apart_m < share * 0.5 * (log.diameter_m + other.diameter_m) and abs(along) < 0.5 * other.length_m
-    return inside and abs(float(log.axis @ other.axis)) > PARALLEL
+    return inside and abs(float(log.axis @ other.axis)) > MIN_PARALLEL_COSINE
 
 
-def _whole(tracks: Sequence[Track]) -> tuple[Track, ...]:
-    """Those that are no piece of a longer one: a mask that fell apart shows one log twice, picture after picture."""
+def _without_fragments(tracks: Sequence[Track]) -> tuple[Track, ...]:
+    """The tracks that are not fragments of a longer one: a mask that splits shows one log as two in every picture."""
 
-    def is_piece(log: Track) -> bool:
+    def is_fragment(log: Track) -> bool:
         one = log.estimate
-        return any(o.estimate.length_m > one.length_m and _lies_in(one, o.estimate, PIECE) for o in tracks)
+        return any(
+            o.estimate.length_m > one.length_m and _lies_in(one, o.estimate, FRAGMENT_DISTANCE_SHARE) for o in tracks
+        )
 
-    return tuple(log for log in tracks if not is_piece(log))
+    return tuple(log for log in tracks if not is_fragment(log))
 
 
 class LogTracker:
     """All logs of a scene."""
 
     def __init__(self, errors: CameraErrors = NOMINAL_ERRORS) -> None:
-        self._errors, self._next = errors, 1
+        self._errors, self._next_id = errors, 1
         self._logs: list[LogFilter] = []
 
     def step(
-        self, fits: Sequence[CylinderFit], pose: Pose, stamp_ns: int, moved: Callable[[LogEstimate, CylinderFit], bool] = _lies_still
+        self,
+        fits: Sequence[CylinderFit],
+        pose: Pose,
+        stamp_ns: int,
+        displaced: Callable[[LogEstimate, CylinderFit], bool] = _never_displaced,
     ) -> tuple[Track, ...]:
-        """Take one picture's fits in; the logs believed in, by number.
+        """Update the logs with the fits of one picture; returns the confirmed logs in the order of their numbers.
 
-        ``moved`` says whether the picture shows a log that is not where it was as another fit: it keeps its number.
+        ``displaced`` says whether a fit shows a log that is no longer where it was; such a log keeps its number.
         """
-        pairs, found = self._paired(fits, pose)
-        for i, j in self._elsewhere({i: pairs[i] for i in found}, fits, moved):
-            self._logs[i] = self._anew(self._logs[i], fits[j], pose)
+        pairs, matched = self._associated(fits, pose)
+        for i, j in self._displaced({i: pairs[i] for i in matched}, fits, displaced):
+            self._logs[i] = self._restarted(self._logs[i], fits[j], pose)
             pairs[i] = j
-            found.add(i)
+            matched.add(i)
         for i, j in pairs.items():
-            # A fit of this log that errs beyond the gate changes nothing, and is no other log either; but when
-            # several in a row do, it is the log that was wrong from the start.  One that was in a single picture
-            # is not believed by two that do not agree: it begins with the second.
+            # A single fit outside the gate changes nothing, and does not start another log either.  Several in a row
+            # mean that the log was wrong from the start.  A log from a single picture that the next one contradicts is
+            # not confirmed: it starts again with the second picture.
             log = self._logs[i]
-            log.odd = 0 if i in found else log.odd + 1
-            if log.odd >= (ODD if log.hits >= CONFIRMED else 1):
-                self._logs[i] = log = self._anew(log, fits[j], pose)
-            if log.odd == 0:
+            log.outliers = 0 if i in matched else log.outliers + 1
+            if log.outliers >= (MAX_OUTLIERS if log.hits >= CONFIRMED_HITS else 1):
+                self._logs[i] = log = self._restarted(log, fits[j], pose)
+            if log.outliers == 0:
                 log.update(fits[j], pose, stamp_ns)
-                found.add(i)
-        self._forget(found)
+                matched.add(i)
+        self._delete_lost(matched)
         for j in sorted(set(range(len(fits))) - set(pairs.values())):
-            log = LogFilter(self._next, fits[j], pose, self._errors)
+            log = LogFilter(self._next_id, fits[j], pose, self._errors)
             log.update(fits[j], pose, stamp_ns)
             self._logs.append(log)
-            self._next += 1
-        return _whole([log.track() for log in self._logs if log.hits >= CONFIRMED])
+            self._next_id += 1
+        return _without_fragments([log.track() for log in self._logs if log.hits >= CONFIRMED_HITS])
 
-    def _paired(self, fits: Sequence[CylinderFit], pose: Pose) -> tuple[dict[int, int], set[int]]:
-        """Which fit is nearest to which log, and which logs theirs agrees with."""
-        costs = np.full((len(self._logs), len(fits)), BAR)
+    def _associated(self, fits: Sequence[CylinderFit], pose: Pose) -> tuple[dict[int, int], set[int]]:
+        """The nearest fit of each log, and the logs that agree with theirs."""
+        costs = np.full((len(self._logs), len(fits)), NO_PAIR_COST)
         for i, log in enumerate(self._logs):
             for j, fit in enumerate(fits):
-                costs[i, j] = min(BAR, log.distance2(fit, pose))
-        pairs = {i: j for i, j in zip(*linear_sum_assignment(costs), strict=True) if costs[i, j] < BAR}
-        return pairs, {i for i, j in pairs.items() if costs[i, j] < GATE}
+                costs[i, j] = min(NO_PAIR_COST, log.distance2(fit, pose))
+        pairs = {i: j for i, j in zip(*linear_sum_assignment(costs), strict=True) if costs[i, j] < NO_PAIR_COST}
+        return pairs, {i for i, j in pairs.items() if costs[i, j] < GATE_CHI2}
 
-    def _elsewhere(
-        self, found: dict[int, int], fits: Sequence[CylinderFit], moved: Callable[[LogEstimate, CylinderFit], bool]
+    def _displaced(
+        self,
+        matched: dict[int, int],
+        fits: Sequence[CylinderFit],
+        displaced: Callable[[LogEstimate, CylinderFit], bool],
     ) -> list[tuple[int, int]]:
-        """Logs that are believed in and not found where they were, each with the fit that shows it elsewhere."""
-        shown, free = [], [j for j in range(len(fits)) if j not in found.values()]
+        """Confirmed logs that no longer lie where they were, each with the fit that shows it elsewhere."""
+        moves, free = [], [j for j in range(len(fits)) if j not in matched.values()]
         for i, log in enumerate(self._logs):
-            if i in found or log.hits < CONFIRMED:
+            if i in matched or log.hits < CONFIRMED_HITS:
                 continue
             estimate = log.track().estimate
-            at = [j for j in free if moved(estimate, fits[j])]
-            if at:
-                best = min(at, key=lambda j: abs(fits[j].body.length_m - estimate.length_m))
+            candidates = [j for j in free if displaced(estimate, fits[j])]
+            if candidates:
+                best = min(candidates, key=lambda j: abs(fits[j].body.length_m - estimate.length_m))
                 free.remove(best)
-                shown.append((i, best))
-        return shown
+                moves.append((i, best))
+        return moves
 
-    def _anew(self, log: LogFilter, fit: CylinderFit, pose: Pose) -> LogFilter:
-        """The log begun again where a fit shows it, with its number."""
-        return LogFilter(log.id, fit, pose, self._errors, log.hits if log.hits >= CONFIRMED else 0)
+    def _restarted(self, log: LogFilter, fit: CylinderFit, pose: Pose) -> LogFilter:
+        """The log with its number, initialised anew where a fit shows it."""
+        return LogFilter(log.id, fit, pose, self._errors, log.hits if log.hits >= CONFIRMED_HITS else 0)
 
-    def _forget(self, found: set[int]) -> None:
-        """Give up the logs that were long not found, and at once those in whose place another is found."""
-        shown = [(self._logs[i], self._logs[i].track().estimate) for i in found]
+    def _delete_lost(self, matched: set[int]) -> None:
+        """Delete logs that were missed for long, and at once those in whose place another log is found."""
+        present = [(self._logs[i], self._logs[i].track().estimate) for i in matched]
         for i, log in enumerate(self._logs):
-            if i in found:
+            if i in matched:
                 continue
-            log.missed += 1
+            log.misses += 1
             estimate = log.track().estimate
-            twin = next((other for other, at in shown if _are_one(estimate, at)), None)
-            if twin is not None:  # it keeps the older number
-                twin.id, log.id, log.missed = min(twin.id, log.id), max(twin.id, log.id), LOST
-        self._logs = [log for log in self._logs if log.missed < (LOST if log.hits >= CONFIRMED else CONFIRMED)]
+            duplicate = next((other for other, at in present if _are_duplicates(estimate, at)), None)
+            if duplicate is not None:  # it keeps the older number
+                duplicate.id, log.id, log.misses = min(duplicate.id, log.id), max(duplicate.id, log.id), LOST_MISSES
+        self._logs = [
+            log for log in self._logs if log.misses < (LOST_MISSES if log.hits >= CONFIRMED_HITS else CONFIRMED_HITS)
+        ]

@@ -1,4 +1,4 @@
-"""Cylinder fits against the renderer's truth, in one frame: exact depth, stereo, occlusion, borders, bad input."""
+"""Cylinder fits against the renderer's ground truth in one frame: exact depth, stereo, occlusion, invalid input."""
 
 import math
 from dataclasses import replace
@@ -22,10 +22,20 @@ from autonomy.perception.fitting.initial_cylinder import initial_cylinder
 from autonomy.perception.fitting.log_fragments import implausibility
 from autonomy.perception.papers import paper_a
 from autonomy.perception.pipeline import Perception
-from experiments.log_localization.trial import TrueMask
 from sim.camera.scene import BUNK, SceneBuilder
+from tests.autonomy.log_views import (
+    CAMERA,
+    PIN,
+    PROFILE,
+    TrueMask,
+    frame_of,
+    lying,
+    masks_of,
+    scene_of,
+    seen,
+    view_from,
+)
 from tests.codes import coded
-from tests.hil.log_views import CAMERA, PIN, PROFILE, frame_of, lying, masks_of, scene_of, seen, view_from
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
@@ -40,7 +50,7 @@ def fits_of(*logs, exact: bool = True, **options):
 
 
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 55.0, 90.0])
-def test_outline_and_depth_are_the_renderers(degrees: float) -> None:
+def test_outline_and_depth_agree_with_the_renderer(degrees: float) -> None:
     log, view = lying(1, 4.6, 0.2, degrees), view_from()
     picture = seen(scene_of(log), view)
     v, u = np.mgrid[200:420:3, 400:900:3]
@@ -55,7 +65,7 @@ def test_outline_and_depth_are_the_renderers(degrees: float) -> None:
 
 
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 60.0, 90.0])
-def test_with_exact_depth_a_log_is_found_to_a_centimetre(degrees: float) -> None:
+def test_with_exact_depth_the_fit_is_accurate_to_two_centimetres(degrees: float) -> None:
     log = lying(1, 4.6, 0.2, degrees)
     (fit,), view, _ = fits_of(log)
     assert np.linalg.norm(view.to_world(fit.body.center_m[None])[0] - log.position_m) < 0.02
@@ -65,7 +75,7 @@ def test_with_exact_depth_a_log_is_found_to_a_centimetre(degrees: float) -> None
 
 
 @pytest.mark.parametrize("sweep_m", [0.02, 0.04, 0.06])
-def test_the_middle_of_a_log_that_sags_is_found_though_a_straight_one_would_end_further_off(sweep_m: float) -> None:
+def test_the_middle_of_a_bowed_log_is_fitted(sweep_m: float) -> None:
     log = replace(lying(1, 4.6, 0.2, 0.0), sweep_m=sweep_m)  # a straight one was found 6 and 10 cm off
     truth = log.spine(40)[0].mean(axis=0)
     (fit,), view, _ = fits_of(log)
@@ -74,7 +84,7 @@ def test_the_middle_of_a_log_that_sags_is_found_though_a_straight_one_would_end_
 
 
 @pytest.mark.parametrize("degrees", [0.0, 45.0, 90.0])
-def test_claimed_uncertainty_covers_stereos_errors(degrees: float) -> None:
+def test_the_covariance_covers_stereo_errors(degrees: float) -> None:
     log, view = lying(1, 4.6, 0.2, degrees), view_from()
     picture = seen(scene_of(log), view)
     perception, squares = Perception(PROFILE), []
@@ -89,7 +99,7 @@ def test_claimed_uncertainty_covers_stereos_errors(degrees: float) -> None:
     assert np.mean(squares) < 3.0
 
 
-def test_an_end_behind_another_log_is_no_end() -> None:
+def test_an_end_hidden_by_another_log_is_not_an_end() -> None:
     back, front = lying(1, 5.2, 0.0, 90.0), lying(2, 4.3, 0.8, 10.0, length=1.6, diameter=0.5)
     fits, view, _ = fits_of(back, front)
     fit = min(fits, key=lambda f: abs(f.body.radius_m - 0.125))
@@ -102,8 +112,8 @@ def test_an_end_behind_another_log_is_no_end() -> None:
     assert ends[left] == pytest.approx([5.2, -1.0, 0.125], abs=0.04)
 
 
-def test_a_border_that_is_anothers_tells_of_no_width() -> None:
-    """The same log, once with its lower side said to be behind something: it may go on there."""
+def test_contour_that_is_not_its_own_says_nothing_of_the_width() -> None:
+    """The same log, once with its lower side marked as hidden: it may be wider there."""
     view, sensor = view_from(), StereoSensor(CAMERA.fx_px * CAMERA.baseline_m)
     picture = seen(scene_of(lying(1, 4.6, 0.0, 90.0)), view)
     mask, depth_m = picture.mask == 1, frame_of(picture, view).depth_m
@@ -118,7 +128,7 @@ def test_a_border_that_is_anothers_tells_of_no_width() -> None:
 
 
 @pytest.mark.parametrize(("away_m", "diameter"), [(4.75, 0.25), (4.72, 0.28)])
-def test_a_log_half_hidden_by_the_one_before_it_is_not_taken_for_a_thin_one(away_m: float, diameter: float) -> None:
+def test_a_half_hidden_log_is_not_fitted_as_a_thin_one(away_m: float, diameter: float) -> None:
     back, front = lying(1, 5.0, 0.0, 90.0), lying(2, away_m, 0.1, 92.0, length=2.6, diameter=diameter)
     view = view_from()
     picture = seen(scene_of(back, front), view)
@@ -134,7 +144,7 @@ def test_a_log_half_hidden_by_the_one_before_it_is_not_taken_for_a_thin_one(away
         assert math.sqrt(other.covariance[6, 6]) < 0.006, "the one before it is seen whole"
 
 
-def test_pieces_on_either_side_of_an_occluder_are_one_log() -> None:
+def test_fragments_on_both_sides_of_an_occluder_are_one_log() -> None:
     log = lying(1, 5.2, 0.0, 90.0, length=2.6)
     b = SceneBuilder(scene_of().ground, "forest")
     b.log(log)
@@ -155,7 +165,7 @@ def test_two_logs_in_line_stay_two() -> None:
     assert sorted(round(f.body.length_m, 1) for f in fits) == [2.0, 2.0]
 
 
-def test_what_a_mask_has_in_line_with_a_log_is_left_out_where_the_whole_is_too_long_for_one() -> None:
+def test_only_the_largest_part_of_a_mask_that_is_too_long_is_fitted() -> None:
     log = lying(1, 4.6, 0.0, 0.0)
     picture, view = seen(scene_of(log), view_from()), view_from()
     frame = frame_of(picture, view, exact=True)
@@ -179,8 +189,8 @@ def test_a_log_half_outside_the_picture_has_one_end() -> None:
 
 @pytest.mark.parametrize("short_px", [0, 2, 5])
 @pytest.mark.parametrize("degrees", [0.0, 75.0, 90.0])
-def test_where_the_picture_cuts_a_log_its_end_is_not_known(degrees: float, short_px: int) -> None:
-    """A network's mask may stop a few pixels before the rim: that is no end of the log either."""
+def test_an_end_at_the_edge_of_the_picture_is_unknown(degrees: float, short_px: int) -> None:
+    """A network's mask may stop a few pixels before the edge of the picture: that is not an end of the log either."""
     view = view_from()
     picture = seen(scene_of(lying(1, 2.6, 3.3, degrees, length=3.0)), view)
     mask = picture.mask == 1
@@ -192,7 +202,7 @@ def test_where_the_picture_cuts_a_log_its_end_is_not_known(degrees: float, short
     assert sigmas_m[unseen] > 0.5 and sigmas_m[1 - unseen] < 0.1
 
 
-def test_what_is_no_log_is_refused_with_a_reason() -> None:
+def test_an_implausible_fit_is_rejected_with_a_reason() -> None:
     (fit,), _, _ = fits_of(lying(1, 4.6, 0.0, 90.0))
     assert implausibility(fit) is None
     short = replace(fit.body, start_m=-0.1, end_m=0.1, radius_m=0.11)
@@ -204,7 +214,7 @@ def test_what_is_no_log_is_refused_with_a_reason() -> None:
     assert implausibility(replace(fit, covariance=vague)).code == "unknown-direction"
 
 
-def test_no_log_no_depth_and_a_wrong_frame_make_no_log() -> None:
+def test_no_mask_no_depth_and_an_invalid_frame_give_no_log() -> None:
     scene, view = scene_of(lying(1, 4.6, 0.2, 90.0)), view_from()
     picture = seen(scene, view)
     frame, perception = frame_of(picture, view, exact=True), Perception(PROFILE)
@@ -223,7 +233,7 @@ def test_no_log_no_depth_and_a_wrong_frame_make_no_log() -> None:
         perception.fits(replace(frame, intrinsics=PIN.scaled(0.5)), [])
 
 
-def test_noise_of_any_shape_in_a_mask_is_a_log_or_a_refusal_but_no_crash() -> None:
+def test_noise_in_a_mask_gives_a_log_or_a_rejection() -> None:
     rng, view = np.random.default_rng(3), view_from()
     picture = seen(scene_of(), view)
     frame = frame_of(picture, view, exact=True)
@@ -239,7 +249,7 @@ def test_noise_of_any_shape_in_a_mask_is_a_log_or_a_refusal_but_no_crash() -> No
         assert all(np.isfinite(f.covariance).all() for f in fits)
 
 
-def test_the_first_guess_needs_depth_and_ignores_outliers() -> None:
+def test_the_initial_cylinder_needs_depth_and_ignores_outliers() -> None:
     view = view_from()
     picture = seen(scene_of(lying(1, 4.6, 0.2, 90.0)), view)
     mask, depth_m = picture.mask == 1, picture.depth_m.copy()
@@ -266,8 +276,8 @@ def test_paper_a_takes_the_surface_for_the_log() -> None:
     assert paper_a.log_from_mask(frame, np.zeros_like(picture.mask, bool)) is None
 
 
-@pytest.mark.parametrize(("lean_deg", "believed"), [(20.0, 1), (40.0, 0)])
-def test_what_stands_too_steep_for_a_log_is_none(lean_deg: float, believed: int) -> None:
+@pytest.mark.parametrize(("lean_deg", "confirmed"), [(20.0, 1), (40.0, 0)])
+def test_a_steep_cylinder_is_not_a_log(lean_deg: float, confirmed: int) -> None:
     view = view_from()
     picture = seen(scene_of(lying(1, 4.6, 0.0, 90.0)), view)
     c, s = math.cos(math.radians(lean_deg)), math.sin(math.radians(lean_deg))
@@ -276,10 +286,10 @@ def test_what_stands_too_steep_for_a_log_is_none(lean_deg: float, believed: int)
     for i in range(3):
         frame = frame_of(picture, view, i)
         tracks = perception.step(frame, Pose(view.position_m, leaning), masks_of(picture))
-    assert len(tracks) == believed
+    assert len(tracks) == confirmed
 
 
-def test_a_log_whose_depth_is_known_at_its_border_alone_is_refused() -> None:
+def test_a_log_with_depth_only_at_its_border_is_rejected() -> None:
     view = view_from()
     picture = seen(scene_of(lying(1, 4.6, 0.0, 90.0)), view)
     frame = frame_of(picture, view, exact=True)

@@ -1,4 +1,4 @@
-"""The eyes look while the crane rests, and say why when they see nothing."""
+"""The log detector takes pictures while the crane is at rest, and reports problems."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from autonomy.perception.camera.frame import RgbdFrame
-from autonomy.perception.log_detector import FAMILIAR_NS, LogDetector
+from autonomy.perception.log_detector import MAX_REQUEST_GAP_NS, LogDetector
 from autonomy.perception.sources.camera_source import SourceError
-from machine.loading.profile_file import load_profile
 from machine.geometry.optics import intrinsics
+from machine.loading.profile_file import load_profile
 
 PROFILE = load_profile("palms_471")
 CAMERA = "stick"
@@ -25,15 +25,15 @@ STEP_NS = 250_000_000
 
 @dataclass
 class Source:
-    """Gives pictures of an empty, level world, or trouble."""
+    """Delivers pictures of an empty, level world, or fails."""
 
-    trouble: str = ""
+    failure: str = ""
     problem: str = ""
     count: int = field(default=0)
 
     def frame(self) -> RgbdFrame | None:
-        if self.trouble:
-            raise SourceError(self.trouble)
+        if self.failure:
+            raise SourceError("camera-source.disconnected", self.failure)
         if self.problem:
             return None
         self.count += 1
@@ -44,45 +44,45 @@ class Source:
     def close(self) -> None: ...
 
 
-def eyes(source: Source) -> LogDetector:
+def detector_of(source: Source) -> LogDetector:
     return LogDetector(PROFILE, CAMERA, source, lambda frame: ())
 
 
-def test_the_first_question_only_shows_where_the_crane_is_and_the_second_gets_a_look() -> None:
+def test_the_first_request_only_gives_the_joints_and_the_second_gets_a_detection() -> None:
     source = Source()
-    one = eyes(source)
-    assert one.detect(Q, STEP_NS) is None and source.count == 0
-    assert one.detect(Q, 2 * STEP_NS) == () and source.count == 1
-    assert not one.trouble
+    detector = detector_of(source)
+    assert detector.detect(Q, STEP_NS) is None and source.count == 0
+    assert detector.detect(Q, 2 * STEP_NS) == () and source.count == 1
+    assert not detector.problem
 
 
-def test_nothing_is_looked_at_while_the_crane_moves_or_after_a_long_silence() -> None:
+def test_there_is_no_detection_while_the_crane_moves_or_after_a_long_gap() -> None:
     source = Source()
-    one = eyes(source)
-    one.detect(Q, STEP_NS)
+    detector = detector_of(source)
+    detector.detect(Q, STEP_NS)
     moved = (Q[0] + 0.02, *Q[1:])
-    assert one.detect(moved, 2 * STEP_NS) is None
-    assert one.detect(moved, 2 * STEP_NS + FAMILIAR_NS) is None
-    assert one.detect(moved, 3 * STEP_NS + FAMILIAR_NS) == ()
+    assert detector.detect(moved, 2 * STEP_NS) is None
+    assert detector.detect(moved, 2 * STEP_NS + MAX_REQUEST_GAP_NS) is None
+    assert detector.detect(moved, 3 * STEP_NS + MAX_REQUEST_GAP_NS) == ()
     assert source.count == 1
 
 
-def test_a_joint_that_nobody_measures_does_not_keep_it_from_looking_unless_the_camera_hangs_on_it() -> None:
-    blind = eyes(Source())
+def test_an_unmeasured_joint_prevents_detection_only_when_the_camera_pose_depends_on_it() -> None:
+    blind = detector_of(Source())
     for k in (1, 2):
         seen = blind.detect((*Q[:4], math.nan), k * STEP_NS)
     assert seen == ()
     for k in (3, 4):
         seen = blind.detect((Q[0], math.nan, *Q[2:]), k * STEP_NS)
-    assert seen is None and "unknown" in blind.trouble
+    assert seen is None and "unknown" in blind.problem
 
 
-@pytest.mark.parametrize("source", [Source(trouble="unplugged"), Source(problem="unplugged")])
-def test_a_camera_that_gives_nothing_is_told_and_makes_up_no_log(source: Source) -> None:
-    one = eyes(source)
-    one.detect(Q, STEP_NS)
-    assert one.detect(Q, 2 * STEP_NS) is None
-    assert one.trouble == "unplugged"
+@pytest.mark.parametrize("source", [Source(failure="unplugged"), Source(problem="unplugged")])
+def test_a_camera_without_pictures_is_reported_and_gives_no_log(source: Source) -> None:
+    detector = detector_of(source)
+    detector.detect(Q, STEP_NS)
+    assert detector.detect(Q, 2 * STEP_NS) is None
+    assert detector.problem == "unplugged"
 
 
 def test_the_process_refuses_a_camera_that_the_machine_does_not_have() -> None:
@@ -91,7 +91,7 @@ def test_the_process_refuses_a_camera_that_the_machine_does_not_have() -> None:
     assert "no camera 'moon'; it has: stick" in done.stderr
 
 
-def test_the_process_refuses_weights_that_are_none(tmp_path: Path) -> None:
+def test_the_process_refuses_damaged_weights(tmp_path: Path) -> None:
     bad = tmp_path / "bad.safetensors"
     bad.write_bytes(b"nothing")
     done = run("--camera", CAMERA, "--frames", "127.0.0.1:1", "--weights", bad)

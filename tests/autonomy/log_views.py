@@ -1,27 +1,36 @@
-"""Logs seen by the analytic renderer and its stereo noise, for the tests of perception."""
+"""Pictures of logs from the analytic renderer with stereo noise, for tests of perception."""
 
 import math
+from contextlib import closing
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame
-from experiments.common.worlds import opened, profile_named
-from experiments.log_localization.trial import TrueMask
 from machine.geometry.optics import Intrinsics, intrinsics
+from machine.loading.profile_file import load_profile
 from sim.camera.geometry import View, look_at
 from sim.camera.noise import StereoNoise
 from sim.camera.render import ImagingConditions, Picture, render
 from sim.camera.scene import Ground, LogPose, Scene, SceneBuilder
+from sim.world import open_world
 
-PROFILE = profile_named("aoro_fc8")
+PROFILE = load_profile("aoro_fc8")
 CAMERA = PROFILE.cameras["front"]
 PIN = intrinsics(CAMERA)
 
 
+@dataclass(frozen=True, slots=True)
+class TrueMask:
+    """A mask that the renderer knows."""
+
+    mask: np.ndarray
+
+
 @cache
 def camera_truth():
-    with opened("aoro_fc8", "nominal", 0) as world:
+    with closing(open_world(PROFILE, truth="nominal", seed=0, scene=())) as world:
         return world.truth.cameras["front"]
 
 
@@ -53,7 +62,7 @@ def seen(scene: Scene, view: View) -> Picture:
 
 
 def frame_of(picture: Picture, view: View, number: int = 0, exact: bool = False) -> RgbdFrame:
-    """A frame with stereo's noise but without its scale error, or with exact depth."""
+    """A frame with stereo noise but without scale error, or with exact depth."""
     depth_m = picture.depth_m
     if not exact:
         noise = StereoNoise(CAMERA, camera_truth(), 1)

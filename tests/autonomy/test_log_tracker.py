@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from autonomy.perception.camera.frame import Pose
 from autonomy.perception.fitting.cylinder import Cylinder, across_view
 from autonomy.perception.fitting.cylinder_fit import CylinderFit
-from autonomy.perception.camera.frame import Pose
+from autonomy.perception.fitting.log_fragments import fragment_groups, joined_cylinder, same_log
+from autonomy.perception.log_list.estimate import END, START, LogEstimate
 from autonomy.perception.tracking.log_filter import CameraErrors
-from autonomy.perception.fitting.log_fragments import groups, joined, same_log
-from autonomy.perception.tracking.log_tracker import LOST, LogTracker
+from autonomy.perception.tracking.log_tracker import LOST_MISSES, LogTracker
 from machine.geometry.optics import BODY_FROM_OPTICAL, rpy_matrix
 
 QUIET = CameraErrors(scale=1e-5, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6)
@@ -40,7 +41,12 @@ def fit_of(pose: Pose, center, yaw: float = 1.5, length: float = 2.0, scale: flo
     return CylinderFit(body, np.diag(SIGMA**2), (True, True), 1.0, 0.5, np.full(7, 1e-4))
 
 
-def test_a_log_is_believed_from_its_second_picture_and_keeps_its_number() -> None:
+def length_sigma_m(estimate: LogEstimate) -> float:
+    c = estimate.covariance
+    return math.sqrt(c[START, START] + c[END, END] - 2.0 * c[START, END])
+
+
+def test_a_log_is_confirmed_by_its_second_picture_and_keeps_its_number() -> None:
     tracks, pose = LogTracker(QUIET), pose_at()
     places = [(5.0, -1.0, 0.12), (6.0, 1.0, 0.12)]
     assert tracks.step([fit_of(pose, p) for p in places], pose, 0) == ()
@@ -51,7 +57,7 @@ def test_a_log_is_believed_from_its_second_picture_and_keeps_its_number() -> Non
         assert np.allclose([t.estimate.center_m for t in found], places, atol=1e-6)
 
 
-def test_a_log_turned_round_by_a_fit_is_the_same_log() -> None:
+def test_a_fit_with_a_reversed_axis_is_of_the_same_log() -> None:
     tracks, pose = LogTracker(QUIET), pose_at()
     fit = fit_of(pose, (5.0, 0.0, 0.12))
     turned = replace(fit, body=replace(fit.body, axis=-fit.body.axis), ends_seen=(False, True))
@@ -63,7 +69,7 @@ def test_a_log_turned_round_by_a_fit_is_the_same_log() -> None:
     assert np.allclose(found[0].estimate.center_m, (5.0, 0.0, 0.12), atol=1e-6)
 
 
-def test_noise_averages_and_the_claim_is_honest() -> None:
+def test_noise_averages_and_the_covariance_is_consistent() -> None:
     rng, squares = np.random.default_rng(1), []
     for _ in range(25):
         tracks, pose = LogTracker(QUIET), pose_at()
@@ -77,7 +83,7 @@ def test_noise_averages_and_the_claim_is_honest() -> None:
     assert 0.5 < np.mean(squares) < 1.8
 
 
-def test_a_scale_error_stays_while_the_camera_stands_and_shows_when_it_drives() -> None:
+def test_a_scale_error_remains_while_the_camera_stands_and_shrinks_when_it_drives() -> None:
     center, errors = (8.0, 0.2, 0.12), CameraErrors(scale=0.01, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6)
     claims, misses = [], []
     for drive in (0.0, 4.0):
@@ -92,16 +98,16 @@ def test_a_scale_error_stays_while_the_camera_stands_and_shows_when_it_drives() 
     assert misses[0] > 0.06 and misses[1] < 0.4 * misses[0]
 
 
-def test_pictures_alike_do_not_make_sure_of_what_they_share() -> None:
+def test_similar_pictures_do_not_reduce_their_common_errors() -> None:
     shared = np.array([0.01, 0.02, 0.01, 0.02, 0.05, 0.05, 0.004])
     tracks, pose = LogTracker(QUIET), pose_at()
     fit = replace(fit_of(pose, (5.0, 0.0, 0.12)), systematic=shared, covariance=np.diag(SIGMA**2 + shared**2))
     for k in range(200):
         found = tracks.step([fit], pose, k)
-    assert found[0].estimate.length_sigma_m() > 0.06
+    assert length_sigma_m(found[0].estimate) > 0.06
 
 
-def test_many_pictures_from_one_place_do_not_outvote_few_from_others() -> None:
+def test_many_pictures_from_one_place_do_not_outweigh_few_from_others() -> None:
     shared = np.array([0.01, 0.02, 0.01, 0.02, 0.1, 0.1, 0.004])
     tracks = LogTracker(QUIET)
     places = [(0.0, 2.2)] * 60 + [(x, 2.0) for x in (1.0, 2.0, 2.8, 3.5)]
@@ -113,7 +119,7 @@ def test_many_pictures_from_one_place_do_not_outvote_few_from_others() -> None:
     assert found[0].estimate.length_m < 2.1
 
 
-def test_an_outlier_changes_nothing_but_a_wrong_beginning_is_given_up() -> None:
+def test_an_outlier_changes_nothing_but_a_wrong_start_is_corrected() -> None:
     pose, truth = pose_at(), (5.0, 0.0, 0.12)
     tracks = LogTracker(QUIET)
     for k in range(6):
@@ -128,7 +134,7 @@ def test_an_outlier_changes_nothing_but_a_wrong_beginning_is_given_up() -> None:
     assert [t.id for t in found] == [1] and found[0].estimate.length_m == pytest.approx(2.0, abs=0.01)
 
 
-def test_a_log_that_its_first_picture_shows_wrongly_is_believed_all_the_same() -> None:
+def test_a_log_with_a_wrong_first_fit_is_confirmed_nevertheless() -> None:
     pose, truth = pose_at(), (5.0, 0.0, 0.12)
     tracks = LogTracker(QUIET)
     tracks.step([fit_of(pose, truth, length=3.5)], pose, 0)
@@ -137,11 +143,11 @@ def test_a_log_that_its_first_picture_shows_wrongly_is_believed_all_the_same() -
     assert [t.id for t in found] == [1] and found[0].estimate.length_m == pytest.approx(2.0, abs=0.01)
 
 
-def test_a_log_that_is_gone_is_given_up_and_a_new_one_gets_a_new_number() -> None:
+def test_a_log_that_is_gone_is_deleted_and_a_new_one_gets_a_new_number() -> None:
     tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
         tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
-    for k in range(LOST - 1):
+    for k in range(LOST_MISSES - 1):
         assert len(tracks.step([], pose, 3 + k)) == 1
     assert tracks.step([], pose, 20) == ()
     for k in range(2):
@@ -149,17 +155,17 @@ def test_a_log_that_is_gone_is_given_up_and_a_new_one_gets_a_new_number() -> Non
     assert [t.id for t in found] == [2]
 
 
-def test_a_log_that_is_seen_to_have_moved_keeps_its_number_wherever_it_is() -> None:
+def test_a_displaced_log_keeps_its_number() -> None:
     tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
         tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
     for k, up in enumerate((0.5, 0.9, 1.3)):
-        found = tracks.step([fit_of(pose, (5.0, 0.0, 0.12 + up))], pose, 3 + k, moved=lambda log, fit: True)
+        found = tracks.step([fit_of(pose, (5.0, 0.0, 0.12 + up))], pose, 3 + k, displaced=lambda log, fit: True)
         assert [t.id for t in found] == [1]
         assert found[0].estimate.center_m[2] == pytest.approx(0.12 + up, abs=1e-3)
 
 
-def test_two_numbers_for_one_log_become_the_older_one() -> None:
+def test_two_numbers_for_one_log_merge_into_the_older_one() -> None:
     """A wrong fit took a log's number, a new number began where it is, and then the picture is clear again."""
     tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
@@ -170,7 +176,7 @@ def test_two_numbers_for_one_log_become_the_older_one() -> None:
     assert [t.id for t in found] == [1] and found[0].estimate.center_m[2] == pytest.approx(0.2, abs=0.01)
 
 
-def test_a_piece_of_a_log_is_no_reason_to_forget_the_whole() -> None:
+def test_a_fragment_of_a_log_does_not_delete_the_whole_log() -> None:
     tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
         tracks.step([fit_of(pose, (5.0, 0.0, 0.12))], pose, k)
@@ -190,7 +196,7 @@ def test_a_piece_of_a_log_is_no_reason_to_forget_the_whole() -> None:
         ((5.0, 1.8, 0.12), 1.4, 2),  # before its end
     ],
 )
-def test_a_piece_of_a_log_that_is_seen_beside_the_whole_is_no_log(center, length: float, count: int) -> None:
+def test_a_fragment_beside_the_whole_log_is_not_reported(center, length: float, count: int) -> None:
     tracks, pose = LogTracker(QUIET), pose_at()
     for k in range(3):
         found = tracks.step([fit_of(pose, (5.0, 0.0, 0.12)), fit_of(pose, center, length=length)], pose, k)
@@ -199,7 +205,7 @@ def test_a_piece_of_a_log_that_is_seen_beside_the_whole_is_no_log(center, length
 
 @settings(max_examples=40)
 @given(st.floats(-0.4, 0.4), st.floats(-3.1, 3.1), st.floats(0.0, 2.0))
-def test_where_the_camera_stands_does_not_matter_to_an_exact_fit(yaw: float, log_yaw: float, moved: float) -> None:
+def test_an_exact_fit_does_not_depend_on_the_camera_pose(yaw: float, log_yaw: float, moved: float) -> None:
     tracks, center = LogTracker(QUIET), (6.0, 0.4, 0.12)
     for k in range(3):
         pose = pose_at(moved * k / 2, yaw)
@@ -207,29 +213,29 @@ def test_where_the_camera_stands_does_not_matter_to_an_exact_fit(yaw: float, log
     assert len(found) == 1 and np.allclose(found[0].estimate.center_m, center, atol=1e-5)
 
 
-def piece(start: float, end: float, seen: tuple[bool, bool], radius: float = 0.12, y: float = 0.0) -> CylinderFit:
+def fragment(start: float, end: float, seen: tuple[bool, bool], radius: float = 0.12, y: float = 0.0) -> CylinderFit:
     """A piece of a log along x, 5 m away."""
     body = Cylinder(np.array([0.0, y, 5.0]), np.array([1.0, 0.0, 0.0]), start, end, radius).centered()
     return CylinderFit(body, np.diag(np.full(7, 1e-4)), seen, 1.0, 0.5, np.zeros(7))
 
 
-def test_pieces_that_miss_the_ends_facing_each_other_are_one_log() -> None:
-    a, b = piece(-1.0, -0.2, (True, False)), piece(0.3, 1.0, (False, True))
-    assert same_log(a, b) and same_log(b, a) and groups([a, None, b]) == [[0, 2]]
-    whole = joined(a.body, b.body)
+def test_fragments_that_miss_the_ends_facing_each_other_are_one_log() -> None:
+    a, b = fragment(-1.0, -0.2, (True, False)), fragment(0.3, 1.0, (False, True))
+    assert same_log(a, b) and same_log(b, a) and fragment_groups({0: a, 2: b}) == [[0, 2]]
+    whole = joined_cylinder(a.body, b.body)
     assert whole.length_m == pytest.approx(2.0) and np.allclose(whole.center_m, (0.0, 0.0, 5.0))
 
 
 @pytest.mark.parametrize(
     "other",
     [
-        piece(0.3, 1.0, (True, True)),
-        piece(0.3, 1.0, (False, True), radius=0.2),
-        piece(0.3, 1.0, (False, True), y=0.4),
-        piece(2.0, 3.0, (False, True)),
+        fragment(0.3, 1.0, (True, True)),
+        fragment(0.3, 1.0, (False, True), radius=0.2),
+        fragment(0.3, 1.0, (False, True), y=0.4),
+        fragment(2.0, 3.0, (False, True)),
     ],
     ids=["its own end", "another width", "beside", "far away"],
 )
-def test_what_is_no_piece_of_it_stays_apart(other: CylinderFit) -> None:
-    a = piece(-1.0, -0.2, (True, False))
-    assert not same_log(a, other) and groups([a, other]) == [[0], [1]]
+def test_other_fits_are_not_merged(other: CylinderFit) -> None:
+    a = fragment(-1.0, -0.2, (True, False))
+    assert not same_log(a, other) and fragment_groups({0: a, 1: other}) == [[0], [1]]

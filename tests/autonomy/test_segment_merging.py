@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from drawn_logs import perfect_maps, picture
 
-from autonomy.networks.weights import WeightsRefused
-from autonomy.perception.segmentation.watershed import watershed, wall
+from autonomy.networks.weights import WeightsError
 from autonomy.perception.segmentation.instances import foreground_of
 from autonomy.perception.segmentation.network import STRIDE
-from autonomy.perception.segmentation.segments import SEGMENT_FEATURES, piece
 from autonomy.perception.segmentation.segment_merging import SegmentMerger, cut, judges, parted, shipped_scorers
 from autonomy.perception.segmentation.segment_pairs import PAIR_FEATURES, SegmentTable, relations
+from autonomy.perception.segmentation.segments import SEGMENT_FEATURES, piece
+from autonomy.perception.segmentation.watershed import wall, watershed
 from training.detection import segment_scorers
 from training.detection.segment_scorers import worths
 from training.detection.segmentation import targets
@@ -152,5 +152,5 @@ def test_a_picture_without_logs_has_no_regions():
 
 
 def test_missing_judges_are_named(tmp_path):
-    with pytest.raises(WeightsRefused, match="no such weight file"):
+    with pytest.raises(WeightsError, match="no such weight file"):
         judges(tmp_path)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from autonomy.perception.camera.frame import Pose, RgbdFrame
 from autonomy.perception.fitting.cylinder import Cylinder
 from autonomy.perception.fitting.cylinder_fit import CylinderFit
 from autonomy.perception.log_list.estimate import LogEstimate
-from autonomy.perception.camera.frame import RgbdFrame, Pose
 from autonomy.perception.tracking.displacement import is_displaced
 from machine.geometry.optics import Intrinsics
 

@@ -1,4 +1,4 @@
-"""The front camera of a machine that drives: a drawn log comes out where it lies, bent machine or straight."""
+"""The front camera of a driving machine: a drawn log is detected in its place, with a bent machine or a straight one."""
 
 from __future__ import annotations
 
@@ -8,19 +8,30 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from autonomy.perception.driving_log_detector import FARTHEST_M, PATIENCE, DrivingLogDetector, CylinderLocalizer, PaperBLocalizer
-from autonomy.perception.camera.frame import RgbdFrame, Pose
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.perception.camera.frame import Pose, RgbdFrame
 from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception.driving_log_detector import (
+    MAX_RANGE_M,
+    MIN_HITS_WITH_HIDDEN_END,
+    CylinderLocalizer,
+    DrivingLogDetector,
+    PaperBLocalizer,
+)
+from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.sources.camera_source import SourceError
-from machine.loading.profile_file import load_profile
 from machine.geometry.optics import intrinsics
-from tests.autonomy.test_manager_field import base
+from machine.loading.profile_file import load_profile
 
 PROFILE = load_profile("aoro_fc8")
 PIN = intrinsics(PROFILE.cameras["front"]).scaled(0.5)
 Q = (0.0, 1.2, -2.4, 0.1, 0.0)
 RADIUS_M, LENGTH_M = 0.125, 2.0
+
+
+def base(x_m: float, y_m: float, yaw_rad: float) -> Pose:
+    """The crane's base in the plane."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return Pose(np.array([x_m, y_m, 1.5]), np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
 @dataclass
@@ -29,15 +40,15 @@ class Mask:
     score: float
 
 
-class Field:
-    """One log on level ground at z = 0 of the plane; a camera and a detector of it."""
+class Scene:
+    """One log on level ground at z = 0 of the plane, with a camera and a segmentation of it."""
 
     def __init__(self, x_m: float, y_m: float, yaw_rad: float) -> None:
         self.center = np.array([x_m, y_m, RADIUS_M])
         self.axis = np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
         self.pose: Pose | None = None
         self.mask = np.zeros((PIN.height_px, PIN.width_px), bool)
-        self.trouble = ""
+        self.failure = ""
         self.count = 0
         self.score = 0.9
 
@@ -46,8 +57,8 @@ class Field:
         self.pose = Pose(at.to_base(mount.position_m), at.rotation @ mount.rotation)
 
     def frame(self) -> RgbdFrame | None:
-        if self.trouble:
-            raise SourceError(self.trouble)
+        if self.failure:
+            raise SourceError("camera-source.disconnected", self.failure)
         assert self.pose is not None
         self.count += 1
         u, v = np.meshgrid(np.arange(PIN.width_px), np.arange(PIN.height_px))
@@ -68,79 +79,79 @@ class Field:
 
     def close(self) -> None: ...
 
-    def found(self, frame: RgbdFrame) -> list[Mask]:
+    def segment(self, frame: RgbdFrame) -> list[Mask]:
         return [Mask(self.mask, self.score)]
 
 
-def detect(field: Field, at: Pose, articulation_rad: float, sight, times: int = 3) -> tuple[LogObservation, ...]:
-    eyes = DrivingLogDetector(PROFILE, "front", field, field.found, sight)
+def detect(field: Scene, at: Pose, articulation_rad: float, localizer, times: int = 3) -> tuple[LogObservation, ...]:
+    detector = DrivingLogDetector(PROFILE, "front", field, field.segment, localizer)
     field.stand(at, articulation_rad)
     for _ in range(times):
-        logs = eyes.detect(at, Q, articulation_rad)
-    assert logs is not None and not eyes.trouble
+        logs = detector.detect(at, Q, articulation_rad)
+    assert logs is not None and not detector.problem
     return logs
 
 
-def plane_error_m(log: LogObservation, at: Pose, field: Field) -> float:
+def plane_error_m(log: LogObservation, at: Pose, field: Scene) -> float:
     return float(np.linalg.norm(at.to_base(np.array(log.center_m)) - field.center))
 
 
 @pytest.mark.parametrize("articulation_rad", [0.0, 0.4])
 @pytest.mark.parametrize("yaw_rad", [0.0, 1.2])
-def test_ours_finds_the_log_to_centimetres_from_a_machine_that_looks_anywhere(
+def test_the_cylinder_localizer_is_accurate_to_centimetres_in_any_direction(
     articulation_rad: float, yaw_rad: float
 ) -> None:
     at = base(10.0, -5.0, yaw_rad + math.pi)  # the base looks backwards
     ahead = yaw_rad + articulation_rad
-    field = Field(10.0 + 9.0 * math.cos(ahead), -5.0 + 9.0 * math.sin(ahead), ahead + 1.3)
+    field = Scene(10.0 + 9.0 * math.cos(ahead), -5.0 + 9.0 * math.sin(ahead), ahead + 1.3)
     (log,) = detect(field, at, articulation_rad, CylinderLocalizer(PROFILE))
     assert plane_error_m(log, at, field) < 0.04
     assert abs(np.dot(at.rotation @ np.array(log.axis), field.axis)) > math.cos(math.radians(3.0))
     assert log.diameter_m == pytest.approx(0.25, abs=0.03) and log.covariance is not None
 
 
-def test_paper_b_is_a_point_with_the_size_of_its_mean_log() -> None:
+def test_the_paper_b_localizer_gives_a_point_with_the_size_of_a_mean_log() -> None:
     at = base(0.0, 0.0, math.pi)
-    field = Field(8.0, 0.5, 1.5)
+    field = Scene(8.0, 0.5, 1.5)
     (log,) = detect(field, at, 0.0, PaperBLocalizer())
     assert plane_error_m(log, at, field) < 0.15
     assert (log.length_m, log.diameter_m) == (2.0, 0.25) and log.axis[2] == pytest.approx(0.0)
     assert abs(np.dot(at.rotation @ np.array(log.axis), field.axis)) > math.cos(math.radians(10.0))
 
 
-def test_paper_b_is_short_of_a_log_seen_end_on_as_the_paper_says() -> None:
+def test_the_paper_b_localizer_falls_short_of_a_log_seen_end_on_as_in_the_paper() -> None:
     at = base(0.0, 0.0, math.pi)
-    across, along = Field(7.5, 0.0, math.pi / 2), Field(7.5, 0.0, 0.0)
+    across, along = Scene(7.5, 0.0, math.pi / 2), Scene(7.5, 0.0, 0.0)
     errors = [plane_error_m(detect(f, at, 0.0, PaperBLocalizer())[0], at, f) for f in (across, along)]
     assert errors[0] < 0.1 < errors[1] < 0.5
 
 
-@pytest.mark.parametrize("sight", [PaperBLocalizer(), CylinderLocalizer(PROFILE)], ids=["paper_b", "ours"])
-def test_what_the_finder_hardly_believes_in_is_no_log(sight) -> None:
-    """The sun between boom and stick, in the machine's own shadow, was found with 0.03 to 0.19, twelve times."""
-    at, field = base(0.0, 0.0, math.pi), Field(8.0, 0.5, 1.5)
+@pytest.mark.parametrize("localizer", [PaperBLocalizer(), CylinderLocalizer(PROFILE)], ids=["paper_b", "ours"])
+def test_masks_with_a_low_score_are_not_logs(localizer) -> None:
+    """Sunlight between boom and stick in the machine's own shadow was segmented with scores of 0.03 to 0.19, 12 times."""
+    at, field = base(0.0, 0.0, math.pi), Scene(8.0, 0.5, 1.5)
     field.score = 0.19
-    assert detect(field, at, 0.0, sight, 2 * PATIENCE) == ()
+    assert detect(field, at, 0.0, localizer, 2 * MIN_HITS_WITH_HIDDEN_END) == ()
 
 
-@pytest.mark.parametrize("sight", [PaperBLocalizer(), CylinderLocalizer(PROFILE)], ids=["paper_b", "ours"])
-def test_a_log_far_off_is_not_measured(sight) -> None:
+@pytest.mark.parametrize("localizer", [PaperBLocalizer(), CylinderLocalizer(PROFILE)], ids=["paper_b", "ours"])
+def test_a_log_beyond_the_maximum_range_is_not_reported(localizer) -> None:
     at = base(0.0, 0.0, math.pi)
-    assert detect(Field(FARTHEST_M + 8.0, 0.0, 1.5), at, 0.0, sight) == ()
+    assert detect(Scene(MAX_RANGE_M + 8.0, 0.0, 1.5), at, 0.0, localizer) == ()
 
 
-def test_a_piece_at_the_edge_of_the_picture_is_no_log_before_it_was_seen_often() -> None:
+def test_a_log_cut_off_by_the_edge_of_the_picture_is_reported_only_after_many_pictures() -> None:
     at = base(0.0, 0.0, math.pi)
-    beside = Field(4.9, 2.6, 0.0)
-    assert detect(beside, at, 0.0, CylinderLocalizer(PROFILE), PATIENCE - 1) == ()
-    assert beside.mask.any() and beside.mask[:, 0].any(), "it is cut by the picture's edge"
-    assert len(detect(Field(7.5, 0.5, 1.5), at, 0.0, CylinderLocalizer(PROFILE), PATIENCE - 1)) == 1
+    beside = Scene(4.9, 2.6, 0.0)
+    assert detect(beside, at, 0.0, CylinderLocalizer(PROFILE), MIN_HITS_WITH_HIDDEN_END - 1) == ()
+    assert beside.mask.any() and beside.mask[:, 0].any(), "the edge of the picture cuts it"
+    assert len(detect(Scene(7.5, 0.5, 1.5), at, 0.0, CylinderLocalizer(PROFILE), MIN_HITS_WITH_HIDDEN_END - 1)) == 1
 
 
-def test_a_camera_in_trouble_is_told_in_words_and_gives_nothing() -> None:
-    field = Field(9.0, 0.0, 1.5)
-    field.trouble = "the camera fell off"
-    eyes = DrivingLogDetector(PROFILE, "front", field, field.found, PaperBLocalizer())
-    assert eyes.detect(base(0.0, 0.0, 0.0), Q, 0.0) is None and eyes.trouble == "the camera fell off"
+def test_a_failed_camera_is_reported_and_gives_no_logs() -> None:
+    field = Scene(9.0, 0.0, 1.5)
+    field.failure = "the camera fell off"
+    detector = DrivingLogDetector(PROFILE, "front", field, field.segment, PaperBLocalizer())
+    assert detector.detect(base(0.0, 0.0, 0.0), Q, 0.0) is None and detector.problem == "the camera fell off"
     with pytest.raises(KeyError):
-        DrivingLogDetector(PROFILE, "rear view", field, field.found, PaperBLocalizer())
+        DrivingLogDetector(PROFILE, "rear view", field, field.segment, PaperBLocalizer())
