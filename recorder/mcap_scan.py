@@ -21,13 +21,15 @@ from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
+from runtime.errors import CodedError
+
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _FOOTER_BYTES = _RECORD.size + 20
 
 
-class NotMcap(ValueError):
-    """The file is something else; the message is a sentence that names it."""
+class NotMcap(CodedError, ValueError):
+    """The file is not an MCAP file; the sentence names it."""
 
 
 class Stored(NamedTuple):
@@ -58,7 +60,7 @@ def scan(path: Path, topics: Collection[str] | None = None) -> Iterator[Schema |
     with path.open("rb") as file:
         magic = file.read(len(MCAP0_MAGIC))
         if not MCAP0_MAGIC.startswith(magic):
-            raise NotMcap(f"{path} is not an MCAP file; give a run.mcap of the recorder")
+            raise NotMcap("recording.not-mcap", f"{path} is not an MCAP file; give a run.mcap of the recorder")
         skipped: set[int] = set()
         while True:
             head = file.read(_RECORD.size)

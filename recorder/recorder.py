@@ -38,6 +38,7 @@ from recorder.manifest import Manifest
 from recorder.mcap_file import McapFile
 from recorder.recover import RUN_NAME, recover, run_files
 from recorder.signals import BusSignals, json_schema
+from runtime.errors import CodedError
 
 CHUNK_NS: Final = 200_000_000
 SEGMENT_BYTES: Final = 512 * 2**20
@@ -51,8 +52,8 @@ _JSON: Final = msgspec.json.Encoder()
 _OBJECT: Final = b'{"type":"object"}'
 
 
-class RecordingRefused(Exception):
-    """The recording cannot start; the message is one sentence that says what to do."""
+class RecordingRefused(CodedError):
+    """The recording cannot start; the sentence says what to do."""
 
 
 class Recorder:
@@ -86,13 +87,16 @@ class Recorder:
             directory.mkdir(parents=True, exist_ok=True)
             if run_files(directory):
                 recover(directory)
-                raise RecordingRefused(f"{directory} already holds a recording; name another directory")
+                raise RecordingRefused(
+                    "recording.exists", f"{directory} already holds a recording; name another directory"
+                )
             manifests.write(directory, manifest)
             self._text = {bus: CommitFile(directory / f"{bus}.log", self._durable) for bus in manifest.buses}
             self._open_segment()
         except OSError as error:
             raise RecordingRefused(
-                f"cannot record in {directory} ({error.strerror}); make room or name another directory"
+                "recording.cannot-write",
+                f"cannot record in {directory} ({error.strerror}); make room or name another directory",
             ) from error
 
     def on_frame(self, bus: str, frame: Frame, sent_by: str = "") -> None:

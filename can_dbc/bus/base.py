@@ -22,6 +22,7 @@ from enum import IntEnum
 from typing import Final, Protocol, Self
 
 from can_dbc.frame import Frame
+from runtime.errors import CodedError
 
 DRAIN_LIMIT: Final = 1024
 """Most frames one `Bus.drain` takes (a few more where they arrive in packets): a flooded bus cannot hold the tick."""
@@ -44,8 +45,8 @@ CRTL_PASSIVE: Final = 0x30  # receive 10, transmit 20
 CRTL_ACTIVE: Final = 0x40
 
 
-class BusError(Exception):
-    """A bus cannot be opened; the message says what is wrong, where, and what to do."""
+class BusError(CodedError):
+    """A bus cannot be opened; the sentence says what is wrong, where, and what to do."""
 
 
 class BusState(IntEnum):

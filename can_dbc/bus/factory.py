@@ -37,8 +37,9 @@ def open_bus(
     wanted = filter_of(filters)
     if not backend or not channel:
         raise BusError(
+            "bus.address",
             f"'{address}' is not a bus address; write wire:crane0, socketcan:can0 or another python-can "
-            "interface and its channel, as in virtual:test."
+            "interface and its channel, as in virtual:test.",
         )
     # Backends load on demand: the guard must not pull in python-can.
     if backend == "wire":

@@ -31,8 +31,9 @@ class PythonCanBus(BaseBus):
             self._can = self._open()
         except _FAILURES as error:
             raise BusError(
+                "bus.adapter",
                 f"python-can cannot open {interface}:{channel} ({error}); check the interface name, the "
-                "channel and that the adapter's driver is installed."
+                "channel and that the adapter's driver is installed.",
             ) from error
 
     def fileno(self) -> int:

@@ -39,8 +39,9 @@ class SocketCanBus(BaseBus):
         super().__init__(interface)
         if wanted is not None and len(wanted.pairs) > _MOST_FILTERS:
             raise BusError(
+                "bus.too-many-filters",
                 f"{len(wanted.pairs)} filters are more than the {_MOST_FILTERS} that the kernel takes for "
-                f"{interface}; give pairs of key and mask."
+                f"{interface}; give pairs of key and mask.",
             )
         self._wanted, self._receive_own = wanted, receive_own
         try:
@@ -48,12 +49,14 @@ class SocketCanBus(BaseBus):
         except OSError as error:
             if error.errno in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
                 raise BusError(
+                    "bus.no-can",
                     f"This kernel has no raw CAN sockets ({error.strerror}), so socketcan:{interface} cannot be "
-                    "opened; load the modules can and can_raw, or use the wire: wire:crane0."
+                    "opened; load the modules can and can_raw, or use the wire: wire:crane0.",
                 ) from error
             raise BusError(
+                "bus.interface",
                 f"CAN interface {interface} cannot be opened ({error.strerror}); see `ip link`, and bring it "
-                f"up with `ip link set {interface} up`."
+                f"up with `ip link set {interface} up`.",
             ) from error
 
     def fileno(self) -> int:

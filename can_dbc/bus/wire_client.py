@@ -237,10 +237,11 @@ def _connect(name: str, message: dict[str, Any]) -> tuple[socket.socket, dict[st
         if sock is not None:
             sock.close()
         if isinstance(error, _RefusedError):
-            raise BusError(f"The wire daemon of {name} refuses: {error}.") from error
+            raise BusError("wire.refused", f"The wire daemon of {name} refuses: {error}.") from error
         raise BusError(
+            "wire.no-daemon",
             f"No wire bus {name} answers at {wire_directory() / name} ({getattr(error, 'strerror', None) or error}); "
-            f"start one with `python -m hil.wire.daemon --bus {name}:1000000`."
+            f"start one with `python -m hil.wire.daemon --bus {name}:1000000`.",
         ) from error
 
 

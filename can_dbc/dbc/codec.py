@@ -27,6 +27,7 @@ from typing import Any, Final
 from can_dbc.dbc.codegen import Decoder, Encoder, Values, compile_message
 from can_dbc.dbc.signals import EncodeRefused, FrameRefused, Policy, Refusal, SignalInfo
 from can_dbc.frame import EXTENDED, describe
+from runtime.errors import CodedError
 
 __all__ = [
     "SHIPPED", "Database", "DbcError", "EncodeRefused", "FrameRefused", "MessageCodec", "Policy", "Refusal",
@@ -37,7 +38,7 @@ PDU2_MASK: Final = EXTENDED | 0x03FF_FF00
 PDU1_MASK: Final = EXTENDED | 0x03FF_0000
 
 
-class DbcError(Exception):
+class DbcError(CodedError):
     """A DBC file that cannot be used; the text is ``file[:line]: reason``."""
 
 
@@ -84,7 +85,7 @@ class Database:
         """The codec of a message; DbcError when the file has no such message."""
         codec = self.messages.get(name)
         if codec is None:
-            raise DbcError(f"{self.path}: no message is called {name}")
+            raise DbcError("dbc.unknown-message", f"{self.path}: no message is called {name}")
         return codec
 
     def find(self, key: int) -> MessageCodec | None:
@@ -103,7 +104,7 @@ def resolve(name_or_path: str | Path) -> Path:
     if str(name_or_path) in SHIPPED:
         return Path(__file__).parents[1] / f"{name_or_path}.dbc"
     if not path.is_file():
-        raise DbcError(f"{path}: no such file; shipped databases are {', '.join(SHIPPED)}")
+        raise DbcError("dbc.no-file", f"{path}: no such file; shipped databases are {', '.join(SHIPPED)}")
     return path
 
 
@@ -117,7 +118,7 @@ def load(name_or_path: str | Path) -> Database:
     ):
         twice = [value for value, n in counts.items() if n > 1]
         if twice:
-            raise DbcError(f"{path}: two messages share the {what} {twice[0]}")
+            raise DbcError("dbc.duplicate", f"{path}: two messages share the {what} {twice[0]}")
     pgns = Counter(pgn_key(m.key) for m in messages if m.by_pgn)
     return Database(
         path,
@@ -135,15 +136,15 @@ def parse(path: Path, *, strict: bool = True) -> Any:
 
     kind = path.suffix.lower().removeprefix(".")
     if kind not in ("dbc", "kcd"):
-        raise DbcError(f"{path}: not a .dbc or .kcd file")
+        raise DbcError("dbc.wrong-suffix", f"{path}: not a .dbc or .kcd file")
     try:
         text = path.read_text(encoding="cp1252" if kind == "dbc" else "utf-8")
         return cantools.database.load_string(text, database_format=kind, strict=strict)
     except (OSError, UnicodeError) as error:
-        raise DbcError(f"{path}: cannot be read: {error}") from error
+        raise DbcError("dbc.unreadable", f"{path}: cannot be read: {error}") from error
     except (Error, ValueError, KeyError, IndexError, TypeError, SyntaxError) as error:
         reason = re.sub(r"^(DBC|KCD): ", "", str(error)).strip('"') or type(error).__name__
-        raise DbcError(f"{path}{_line_of(reason, text)}: {reason}") from error
+        raise DbcError("dbc.invalid", f"{path}{_line_of(reason, text)}: {reason}") from error
 
 
 def _line_of(reason: str, text: str) -> str:
@@ -191,7 +192,7 @@ def _data_ids(name: str, attributes: Mapping[str, Any], path: Path) -> bytes | N
     except ValueError:
         ids = b""
     if len(ids) != 16:
-        raise DbcError(f"{path}: {name} needs 16 hexadecimal Data IDs in E2EDataIds")
+        raise DbcError("dbc.data-ids", f"{path}: {name} needs 16 hexadecimal Data IDs in E2EDataIds")
     return ids
 
 

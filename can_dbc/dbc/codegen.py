@@ -271,7 +271,7 @@ def _assemble(
         try:
             bits = s.encode(values[i])
         except EncodeRefused as error:
-            raise EncodeRefused(f"{name}.{error}") from None
+            raise EncodeRefused(error.code, f"{name}.{error}") from None
         if s.big_endian:
             big |= bits << s.shift
         else:
@@ -332,9 +332,11 @@ def _multiplexed_encoder(name: str, length: int, signals: tuple[SignalInfo, ...]
             if signals[i].is_multiplexer:
                 value = values[i]
                 if not isinstance(value, (int, float)) or not math.isfinite(value):
-                    raise EncodeRefused(f"{name}.{signals[i].name} = {value!r} selects nothing")
+                    raise EncodeRefused("codec.multiplexer", f"{name}.{signals[i].name} = {value!r} selects nothing")
                 if int(value) not in _mux_ids(signals, i):
-                    raise EncodeRefused(f"{name}.{signals[i].name} = {value} is not a known multiplexer value")
+                    raise EncodeRefused(
+                        "codec.multiplexer", f"{name}.{signals[i].name} = {value} is not a known multiplexer value"
+                    )
                 found = found + active(values, i, int(value))
         return found
 
@@ -344,7 +346,9 @@ def _multiplexed_encoder(name: str, length: int, signals: tuple[SignalInfo, ...]
         used = active(values, None, None)
         surplus = [s.name for i, s in enumerate(signals) if values[i] is not None and i not in used]
         if surplus:
-            raise EncodeRefused(f"{name}: {', '.join(surplus)} is absent for this multiplexer value; give None")
+            raise EncodeRefused(
+                "codec.absent-signal", f"{name}: {', '.join(surplus)} is absent for this multiplexer value; give None"
+            )
         return _assemble(name, length, signals, values, used)
 
     return encode

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 from typing import Final
 
+from runtime.errors import CodedError
+
 Value = int | float | None
 FLOAT_FORMATS: Final = {16: "<e", 32: "<f", 64: "<d"}
 FLOAT_MAX: Final = {16: 65504.0, 32: 3.4028234663852886e38, 64: 1.7976931348623157e308}
@@ -40,8 +42,8 @@ class FrameRefused(ValueError):
         self.where = where
 
 
-class EncodeRefused(ValueError):
-    """A value that cannot be put on the bus; the text names signal, value and limits."""
+class EncodeRefused(CodedError, ValueError):
+    """A value cannot be sent; the sentence names signal, value and limits."""
 
 
 class Policy(StrEnum):
@@ -150,23 +152,25 @@ class SignalInfo:
         if value is None:
             raw: int | float | None = self.not_available
             if raw is None:
-                raise EncodeRefused(f"{self.name} has no raw value for 'not available'")
+                raise EncodeRefused("codec.no-not-available", f"{self.name} has no raw value for 'not available'")
             return self._pack(raw)
         if not isinstance(value, (int, float)) or (isinstance(value, float) and not math.isfinite(value)):
-            raise EncodeRefused(f"{self.name} = {value!r} is not a finite number")
+            raise EncodeRefused("codec.not-finite", f"{self.name} = {value!r} is not a finite number")
         try:
             raw = self.convert(value)
             if not self.inside(value) and (raw not in self.choices or raw in self.sentinels):
                 if self.policy is Policy.REFUSE:
-                    raise EncodeRefused(f"{self.name} = {value} is outside {self._limits()}")
+                    raise EncodeRefused("codec.out-of-range", f"{self.name} = {value} is outside {self._limits()}")
                 raw = self.convert(self._clamped(value))
             if not self.is_float and not self.raw_min <= raw <= self.raw_max:
                 if self.policy is Policy.REFUSE:
-                    raise EncodeRefused(f"{self.name} = {value} does not fit in {self.bits} bits")
+                    raise EncodeRefused("codec.does-not-fit", f"{self.name} = {value} does not fit in {self.bits} bits")
                 raw = min(max(raw, self.raw_min), self.raw_max)
             return self._pack(raw)
         except OverflowError:
-            raise EncodeRefused(f"{self.name} = {value} does not fit in {self.bits} bits") from None
+            raise EncodeRefused(
+                "codec.does-not-fit", f"{self.name} = {value} does not fit in {self.bits} bits"
+            ) from None
 
     def extract(self, little: int, big: int) -> int | float:
         """The raw value out of the payload read as a little-endian and as a big-endian number."""

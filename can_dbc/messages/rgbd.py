@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
+from runtime.errors import CodedError
+
 MAGIC: Final = 0x54485244  # "THRD"
 VERSION: Final = 1
 PICTURE, REFUSAL = 1, 2
@@ -28,7 +30,7 @@ PIXEL_BYTES: Final = 5
 MM_M: Final = 1000.0
 
 
-class RgbdError(ValueError):
+class RgbdError(CodedError, ValueError):
     """Bytes that are no frame, or a frame that cannot be sent; the message says what is wrong."""
 
 
@@ -72,7 +74,9 @@ def question_bytes(start: bytes) -> int:
     """How many bytes of name follow ``QUESTION.size`` bytes; raises RgbdError when they begin no question."""
     magic, version, length = QUESTION.unpack(start)
     if magic != MAGIC or version != VERSION or not 0 < length <= MOST_NAME:
-        raise RgbdError("these bytes ask for no frame; is the other side a camera client of this version?")
+        raise RgbdError(
+            "rgbd.no-request", "these bytes ask for no frame; is the other side a camera client of this version?"
+        )
     return int(length)
 
 
@@ -80,15 +84,18 @@ def encode(frame: RgbdMessage) -> bytes:
     """The bytes of a frame; raises RgbdError when its sizes do not agree."""
     pixels = frame.width_px * frame.height_px
     if not (0 < frame.width_px <= MOST_PX and 0 < frame.height_px <= MOST_PX):
-        raise RgbdError(f"a picture of {frame.width_px} x {frame.height_px} px cannot be sent; at most {MOST_PX} px")
+        raise RgbdError(
+            "rgbd.size", f"a picture of {frame.width_px} x {frame.height_px} px cannot be sent; at most {MOST_PX} px"
+        )
     if len(frame.rgb) != 3 * pixels or len(frame.depth_mm) != 2 * pixels:
         raise RgbdError(
+            "rgbd.incomplete",
             f"{len(frame.rgb)} bytes of colour and {len(frame.depth_mm)} of depth are no "
-            f"{frame.width_px} x {frame.height_px} px"
+            f"{frame.width_px} x {frame.height_px} px",
         )
     pinhole = (frame.fx_px, frame.fy_px, frame.cx_px, frame.cy_px)
     if not all(map(isfinite, pinhole)):
-        raise RgbdError("intrinsics that are not finite cannot be sent")
+        raise RgbdError("rgbd.not-finite", "intrinsics that are not finite cannot be sent")
     name = _name(frame.camera)
     return _packed(PICTURE, name, frame.stamp_ns, frame.width_px, frame.height_px, pinhole, frame.rgb + frame.depth_mm)
 
@@ -103,13 +110,15 @@ def start(data: bytes) -> Start:
     its word."""
     magic, version, kind, name, stamp_ns, width, height, fx, fy, cx, cy, body = HEADER.unpack_from(data)
     if magic != MAGIC:
-        raise RgbdError("these bytes begin no frame; is the other side a camera server?")
+        raise RgbdError("rgbd.magic", "these bytes begin no frame; is the other side a camera server?")
     if version != VERSION:
-        raise RgbdError(f"a frame of version {version}, but this side knows {VERSION}; use the same release on both")
+        raise RgbdError(
+            "rgbd.version", f"a frame of version {version}, but this side knows {VERSION}; use the same release on both"
+        )
     if kind not in (PICTURE, REFUSAL) or name > MOST_NAME or width > MOST_PX or height > MOST_PX:
-        raise RgbdError(f"a frame of kind {kind} and {width} x {height} px, which none is")
+        raise RgbdError("rgbd.kind", f"a frame of kind {kind} and {width} x {height} px, which none is")
     if body != (width * height * PIXEL_BYTES if kind == PICTURE else min(body, 1000)):
-        raise RgbdError(f"a frame of {width} x {height} px with {body} bytes, which do not fit")
+        raise RgbdError("rgbd.length", f"a frame of {width} x {height} px with {body} bytes, which do not fit")
     (crc,) = CRC.unpack_from(data, HEADER.size)
     return Start(kind, name, stamp_ns, width, height, (fx, fy, cx, cy), name + body, crc)
 
@@ -117,21 +126,23 @@ def start(data: bytes) -> Start:
 def decode(data: bytes) -> RgbdMessage:
     """The frame of a whole answer; raises RgbdError for a refusal, with its sentence, and for anything broken."""
     if len(data) < START_BYTES:
-        raise RgbdError(f"{len(data)} bytes are no frame")
+        raise RgbdError("rgbd.length", f"{len(data)} bytes are no frame")
     head = start(data)
     if len(data) != START_BYTES + head.rest:
-        raise RgbdError(f"{len(data)} bytes where a frame of {START_BYTES + head.rest} was announced")
+        raise RgbdError("rgbd.length", f"{len(data)} bytes where a frame of {START_BYTES + head.rest} was announced")
     if zlib.crc32(memoryview(data)[START_BYTES:], zlib.crc32(data[: HEADER.size])) != head.crc:
-        raise RgbdError("a frame whose checksum is wrong")
+        raise RgbdError("rgbd.checksum", "a frame whose checksum is wrong")
     body = START_BYTES + head.name_bytes
     try:
         camera = data[START_BYTES:body].decode()
     except UnicodeDecodeError:
-        raise RgbdError("a frame whose camera has no name") from None
+        raise RgbdError("rgbd.camera-name", "a frame whose camera has no name") from None
     if head.kind == REFUSAL:
-        raise RgbdError(data[body:].decode(errors="replace"))
+        raise RgbdError("rgbd.refused", data[body:].decode(errors="replace"))
     if not head.width_px or not head.height_px or not all(map(isfinite, head.pinhole_px)):
-        raise RgbdError(f"a frame of {head.width_px} x {head.height_px} px with intrinsics {head.pinhole_px}")
+        raise RgbdError(
+            "rgbd.intrinsics", f"a frame of {head.width_px} x {head.height_px} px with intrinsics {head.pinhole_px}"
+        )
     split = body + 3 * head.width_px * head.height_px
     return RgbdMessage(
         camera, head.stamp_ns, head.width_px, head.height_px, *head.pinhole_px, data[body:split], data[split:]
@@ -154,5 +165,5 @@ def _packed(
 def _name(camera: str) -> bytes:
     name = camera.encode()
     if not 0 < len(name) <= MOST_NAME:
-        raise RgbdError(f"a camera's name has 1 to {MOST_NAME} bytes, not {len(name)}")
+        raise RgbdError("rgbd.camera-name", f"a camera's name has 1 to {MOST_NAME} bytes, not {len(name)}")
     return name

@@ -21,6 +21,7 @@ from typing import Final
 
 from can_dbc.bus.base import BusStats
 from can_dbc.frame import Frame
+from runtime.errors import CodedError
 
 MAGIC: Final = 0x52544854  # "THTR"
 VERSION: Final = 2
@@ -35,7 +36,7 @@ _LENGTH: Final = struct.Struct("<H")
 _CRC: Final = struct.Struct("<I")
 
 
-class RecordRefused(ValueError):
+class RecordRefused(CodedError, ValueError):
     """A tick record that is damaged or of another version; the text says which."""
 
 
@@ -109,14 +110,16 @@ def encode(tick: TickRecord) -> bytes:
 def decode(data: bytes) -> TickRecord:
     """The tick in a record; raises RecordRefused."""
     if len(data) < _VERSION.size + _CRC.size:
-        raise RecordRefused(f"a tick record of {len(data)} bytes is too short")
+        raise RecordRefused("tick-record.length", f"a tick record of {len(data)} bytes is too short")
     if zlib.crc32(data[: -_CRC.size]) != _CRC.unpack_from(data, len(data) - _CRC.size)[0]:
-        raise RecordRefused("a tick record with a wrong checksum")
+        raise RecordRefused("tick-record.checksum", "a tick record with a wrong checksum")
     magic, version = _VERSION.unpack_from(data)
     if magic != MAGIC:
-        raise RecordRefused("not a tick record")
+        raise RecordRefused("tick-record.magic", "not a tick record")
     if version != VERSION:
-        raise RecordRefused(f"a tick record of version {version}, this release reads version {VERSION}")
+        raise RecordRefused(
+            "tick-record.version", f"a tick record of version {version}, this release reads version {VERSION}"
+        )
     end = len(data) - _CRC.size
     frames_in: tuple[list[Frame], list[Frame]] = ([], [])
     frames_out: tuple[list[tuple[int, bytes]], list[tuple[int, bytes]]] = ([], [])
@@ -137,9 +140,9 @@ def decode(data: bytes) -> TickRecord:
             frames_out[bus].append((key, payload[:length]))
             at += _OUT.size
     except (struct.error, IndexError):
-        raise RecordRefused("a tick record whose contents do not fit its counts") from None
+        raise RecordRefused("tick-record.contents", "a tick record whose contents do not fit its counts") from None
     if at + n_report > end:
-        raise RecordRefused("a tick record whose contents do not fit its counts")
+        raise RecordRefused("tick-record.contents", "a tick record whose contents do not fit its counts")
     return TickRecord(
         now_ns, late_ns, tick_ns, missed, BusReading(*counters[:5]), BusReading(*counters[5:]),
         tuple(frames_in[0]), tuple(frames_in[1]), tuple(datagrams), tuple(frames_out[0]), tuple(frames_out[1]),

@@ -19,6 +19,7 @@ from typing import Final
 
 from can_dbc.plc import map as plc
 from can_dbc.plc.map import ARM_KEY, N_AXES, N_PRESSURES, Command, Feedback, Grapple, MapError, Mode, State
+from runtime.errors import CodedError
 
 MAGIC: Final = 0x314E5243  # "CRN1"
 VERSION: Final = 1
@@ -30,8 +31,8 @@ _CRC: Final = struct.Struct("<I")
 _MICRO: Final = 1e6
 
 
-class DatagramRefused(ValueError):
-    """A datagram that was refused whole; the text says why."""
+class DatagramRefused(CodedError, ValueError):
+    """A datagram is refused as a whole; the sentence says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +59,9 @@ def decode_command(data: bytes) -> tuple[Header, Command]:
     header, mode, arm, values = _opened(data, _COMMAND, COMMAND_TYPE)
     *body, grapple, grapple_pct, speed_pct, reset = values
     if mode not in set(Mode) or arm not in (0, ARM_KEY) or grapple not in set(Grapple):
-        raise MapError("mode, arm key or grapple command means nothing")
+        raise MapError("plc.illegal-value", "mode, arm key or grapple command means nothing")
     if grapple_pct > 100 or speed_pct > 100 or reset > 1:
-        raise MapError("grapple share, speed or reset is out of range")
+        raise MapError("plc.illegal-value", "grapple share, speed or reset is out of range")
     reference, rate = _halves(body)
     return header, Command(
         Mode(mode), arm == ARM_KEY, reference, rate, Grapple(grapple), grapple_pct, speed_pct, bool(reset)
@@ -87,7 +88,7 @@ def decode_reply(data: bytes) -> tuple[Header, Feedback]:
     pressures = values[2 * N_AXES : 2 * N_AXES + N_PRESSURES]
     estop, fault, axis, longest, opening, load = values[2 * N_AXES + N_PRESSURES :]
     if state not in set(State):
-        raise DatagramRefused(f"the PLC's state is {state}, which means nothing")
+        raise DatagramRefused("plc-datagram.state", f"the PLC's state is {state}, which means nothing")
     return header, Feedback(
         heartbeat=header.sequence & 0xFFFF,
         state=State(state),
@@ -106,7 +107,7 @@ def decode_reply(data: bytes) -> tuple[Header, Feedback]:
 
 def _micros(values: tuple[float, ...], what: str) -> list[int]:
     if len(values) != N_AXES:
-        raise MapError(f"{what} has {len(values)} axes, not {N_AXES}")
+        raise MapError("plc.axis-count", f"{what} has {len(values)} axes, not {N_AXES}")
     return [plc.micro(value, f"{what} of axis {i}") for i, value in enumerate(values)]
 
 
@@ -124,10 +125,12 @@ def _closed(data: bytes) -> bytes:
 
 def _opened(data: bytes, layout: struct.Struct, kind: int) -> tuple[Header, int, int, tuple[int, ...]]:
     if len(data) != layout.size + _CRC.size:
-        raise DatagramRefused(f"{len(data)} bytes, not {layout.size + _CRC.size}")
+        raise DatagramRefused("plc-datagram.length", f"{len(data)} bytes, not {layout.size + _CRC.size}")
     if zlib.crc32(data[: -_CRC.size]) != _CRC.unpack_from(data, layout.size)[0]:
-        raise DatagramRefused("wrong checksum")
+        raise DatagramRefused("plc-datagram.checksum", "wrong checksum")
     magic, version, got, sequence, time_us, echo, mode, arm, *values = layout.unpack_from(data)
     if (magic, version, got) != (MAGIC, VERSION, kind):
-        raise DatagramRefused(f"magic 0x{magic:08X}, version {version}, type {got}: not a datagram for us")
+        raise DatagramRefused(
+            "plc-datagram.header", f"magic 0x{magic:08X}, version {version}, type {got}: not a datagram for us"
+        )
     return Header(sequence, time_us, echo), mode, arm, tuple(values)

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 
+from runtime.errors import CodedError
+
 N_AXES: Final = 7
 """Slew, lift, tilt, extension, rotator, grapple, auxiliary.  The last two have no joint: their values are 0."""
 N_JOINTS: Final = 5
@@ -105,11 +107,11 @@ RANGE_MARGIN: Final = 0.05
 """How far past a joint's range [rad, m] a reference may lie: a machine found there must be able to hold still."""
 
 
-class MapError(ValueError):
-    """A value that the map cannot carry, or registers that mean nothing; ``axis`` is `NO_AXIS` where none is meant."""
+class MapError(CodedError, ValueError):
+    """A value that the map cannot carry, or registers without a meaning; ``axis`` is `NO_AXIS` where none is concerned."""
 
-    def __init__(self, text: str, axis: int = NO_AXIS) -> None:
-        super().__init__(text)
+    def __init__(self, code: str, sentence: str, axis: int = NO_AXIS) -> None:
+        super().__init__(code, sentence)
         self.axis = axis
 
 
@@ -174,26 +176,30 @@ class Bounds:
     def check(self, command: Command) -> None:
         """Raises MapError for a command that this machine cannot obey."""
         if command.mode not in (Mode.NEUTRAL, int(self.role)):
-            raise MapError(f"mode {command.mode} is not of role {self.role.name}")
+            raise MapError("plc.role", f"mode {command.mode} is not of role {self.role.name}")
         if command.mode is Mode.NEUTRAL:
             return
         for axis, (value, rate) in enumerate(zip(command.reference, command.rate, strict=True)):
             lower, upper = self.reference[axis]
             # Half a unit of the map: a limit that is no whole number of units is rounded on the way.
             if not lower - 0.5e-6 <= value <= upper + 0.5e-6:
-                raise MapError(f"reference of axis {axis} is {value:.6f}, allowed {lower:g} to {upper:g}", axis)
+                raise MapError(
+                    "plc.reference", f"reference of axis {axis} is {value:.6f}, allowed {lower:g} to {upper:g}", axis
+                )
             if abs(rate) > self.rate[axis] + 0.5e-3:
-                raise MapError(f"rate of axis {axis} is {rate:.6f}, allowed {self.rate[axis]:g}", axis)
+                raise MapError("plc.rate", f"rate of axis {axis} is {rate:.6f}, allowed {self.rate[axis]:g}", axis)
 
 
 def whole(value: float, scale: float, lowest: int, highest: int, what: str) -> int:
     """``value * scale`` as a whole number in lowest..highest; raises MapError."""
     scaled = value * scale
     if not math.isfinite(scaled):
-        raise MapError(f"{what} is not a finite number")
+        raise MapError("plc.not-finite", f"{what} is not a finite number")
     number = round(scaled)
     if not lowest <= number <= highest:
-        raise MapError(f"{what} is {value:g}, the map carries {lowest / scale:g} to {highest / scale:g}")
+        raise MapError(
+            "plc.out-of-range", f"{what} is {value:g}, the map carries {lowest / scale:g} to {highest / scale:g}"
+        )
     return number
 
 
@@ -225,7 +231,7 @@ def _short(register: int) -> int:
 def command_registers(command: Command, heartbeat: int, sequence: int, order: WordOrder) -> list[int]:
     """The command block, registers 100 to 131; raises MapError."""
     if len(command.reference) != N_AXES or len(command.rate) != N_AXES:
-        raise MapError(f"a command has {N_AXES} axes")
+        raise MapError("plc.axis-count", f"a command has {N_AXES} axes")
     words = [heartbeat & _U16, sequence & _U16, command.mode, ARM_KEY if command.armed else 0]
     for axis, value in enumerate(command.reference):
         words += _pair(micro(value, f"reference of axis {axis}"), order)
@@ -252,13 +258,13 @@ def check_single(address: int, value: int) -> None:
     """Raises MapError for a register of the command block whose value means nothing by itself."""
     allowed = _CHOICES.get(address)
     if allowed is not None and value not in allowed:
-        raise MapError(f"register {address} is {value}, which means nothing")
+        raise MapError("plc.illegal-value", f"register {address} is {value}, which means nothing")
 
 
 def read_command(registers: Sequence[int], order: WordOrder) -> Command:
     """The command in the 32 registers from `COMMAND_AT`; raises MapError."""
     if len(registers) != COMMAND_COUNT:
-        raise MapError(f"a command block has {COMMAND_COUNT} registers, not {len(registers)}")
+        raise MapError("plc.block-size", f"a command block has {COMMAND_COUNT} registers, not {len(registers)}")
     for offset, value in enumerate(registers):
         check_single(COMMAND_AT + offset, value)
     _, _, mode, arm = registers[:4]
@@ -291,16 +297,28 @@ def status_registers(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> 
 def check_identity(registers: Sequence[int], order: WordOrder) -> None:
     """Raises MapError, with what to do, unless the block is of this map, this version and this word order."""
     if len(registers) != STATUS_COUNT:
-        raise MapError(f"a status block has {STATUS_COUNT} registers, not {len(registers)}")
+        raise MapError("plc.block-size", f"a status block has {STATUS_COUNT} registers, not {len(registers)}")
     if registers[0] != MAGIC:
-        raise MapError(f"register 0 is 0x{registers[0]:04X}, not 0x{MAGIC:04X}; check the PLC's program and byte order")
+        raise MapError(
+            "plc.magic",
+            f"register 0 is 0x{registers[0]:04X}, not 0x{MAGIC:04X}; check the PLC's program and byte order",
+        )
     if registers[1] != MAP_VERSION:
-        raise MapError(f"the PLC has map version {registers[1]}, we have {MAP_VERSION}; load the matching PLC program")
+        raise MapError(
+            "plc.version",
+            f"the PLC has map version {registers[1]}, we have {MAP_VERSION}; load the matching PLC program",
+        )
     if _long(registers, 2, order) != WORD_TEST:
         other = WordOrder(1 - order)
         if _long(registers, 2, other) == WORD_TEST:
-            raise MapError(f"the PLC's word order is {other.name}, ours {order.name}; change our setting or the PLC's")
-        raise MapError(f"the word-order test reads 0x{registers[2]:04X}{registers[3]:04X}; check the PLC's byte order")
+            raise MapError(
+                "plc.word-order",
+                f"the PLC's word order is {other.name}, ours {order.name}; change our setting or the PLC's",
+            )
+        raise MapError(
+            "plc.byte-order",
+            f"the word-order test reads 0x{registers[2]:04X}{registers[3]:04X}; check the PLC's byte order",
+        )
 
 
 def read_status(registers: Sequence[int], order: WordOrder) -> tuple[Feedback, int]:
@@ -309,7 +327,7 @@ def read_status(registers: Sequence[int], order: WordOrder) -> tuple[Feedback, i
     try:
         state = State(registers[5])
     except ValueError:
-        raise MapError(f"the PLC's state is {registers[5]}, which means nothing") from None
+        raise MapError("plc.state", f"the PLC's state is {registers[5]}, which means nothing") from None
     feedback = Feedback(
         heartbeat=registers[4],
         state=state,

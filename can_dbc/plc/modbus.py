@@ -24,6 +24,7 @@ from pymodbus.framer import FramerSocket
 from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 
 from can_dbc.plc.map import COMMAND_AT, STATUS_AT, STATUS_COUNT
+from runtime.errors import CodedError
 
 UNIT: Final = 1
 MAX_CONNECTIONS: Final = 8
@@ -42,7 +43,7 @@ _REFUSED: Final = (ModbusException, ValueError, OSError, TimeoutError)
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 
-class LinkError(Exception):
+class LinkError(CodedError):
     """The PLC cannot be reached or does not answer as it should; the text says what happened."""
 
 
@@ -96,9 +97,11 @@ class ModbusClient:
         try:
             connected = await client.connect()
         except _REFUSED as error:
-            raise LinkError(f"{self._host}:{self._port}: {error}") from error
+            raise LinkError("plc-link.connect", f"{self._host}:{self._port}: {error}") from error
         if not connected:
-            raise LinkError(f"no PLC answers at {self._host}:{self._port}; check its address, port and cable")
+            raise LinkError(
+                "plc-link.no-answer", f"no PLC answers at {self._host}:{self._port}; check its address, port and cable"
+            )
         sock = client.ctx.transport.get_extra_info("socket")
         # Closing discards what the kernel still holds: no old command arrives when a cut cable is whole again.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_ON_CLOSE)
@@ -125,17 +128,19 @@ class ModbusClient:
     async def _ask(self, request: Any) -> list[int]:
         client = self._client
         if client is None or not client.connected:
-            raise LinkError("not connected")
+            raise LinkError("plc-link.not-connected", "not connected")
         try:
             response = await request(client)
         except _REFUSED as error:
             self.close()
-            raise LinkError(str(error) or type(error).__name__) from error
+            raise LinkError("plc-link.request", str(error) or type(error).__name__) from error
         if isinstance(response, ExceptionResponse):
             raise RegisterRefused(response.exception_code)
         if len(response.registers) != STATUS_COUNT:
             self.close()
-            raise LinkError(f"the PLC answered {len(response.registers)} registers, not {STATUS_COUNT}")
+            raise LinkError(
+                "plc-link.answer", f"the PLC answered {len(response.registers)} registers, not {STATUS_COUNT}"
+            )
         return list(response.registers)
 
     def close(self) -> None:
@@ -235,7 +240,9 @@ class ModbusServer:
                 self._serve, self._host, self.port, limit=2 * _MAX_PDU, backlog=MAX_CONNECTIONS
             )
         except OSError as error:
-            raise LinkError(f"cannot listen on {self._host}:{self.port}: {error.strerror}") from error
+            raise LinkError(
+                "plc-link.listen", f"cannot listen on {self._host}:{self.port}: {error.strerror}"
+            ) from error
         self.port = self._server.sockets[0].getsockname()[1]
 
     def close(self) -> None:

@@ -177,7 +177,7 @@ def encode(codec: MessageCodec, **fields: Any) -> bytes:
     """The payload of a PGN; fields not given are "not available".  EncodeRefused for a bad value."""
     unknown = fields.keys() - codec.index.keys()
     if unknown:
-        raise EncodeRefused(f"{codec.name} has no field {', '.join(sorted(unknown))}")
+        raise EncodeRefused("codec.unknown-field", f"{codec.name} has no field {', '.join(sorted(unknown))}")
     return codec.encode(*(fields.get(s.name) for s in codec.signals))
 
 
@@ -185,7 +185,7 @@ def frames(codec: MessageCodec, payload: bytes, source: int, sequence: int = 0) 
     """The frames that carry a payload: one, or those of a fast packet; the priority is that of the
     database."""
     if not codec.by_pgn:
-        raise DbcError(f"{codec.name} is not matched by PGN; it has no source address to choose")
+        raise DbcError("dbc.not-by-pgn", f"{codec.name} is not matched by PGN; it has no source address to choose")
     key = codec.key & ~0xFF | source
     if codec.length <= 8:
         return [(key, payload)]

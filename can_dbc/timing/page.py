@@ -21,13 +21,20 @@ from typing import Any, Final
 import msgspec
 
 from can_dbc.timing.durations import BINS, Durations
+from runtime.errors import CodedError
 
 STAGES: Final = (
-    "wake", "sync", "tick", "cpu", "read", "decode", "estimate", "supervise", "law", "encode", "send", "tell",
+    "wake", "sync", "tick", "cpu", "receive", "decode", "estimate", "supervise", "control", "encode", "send", "record",
     "sample_to_command",
 )  # fmt: skip
-"""Lateness of the tick and of SYNC; the tick by the clock and by its own CPU time; its stages in their order ("tell" is
-all that nobody waits for: reports, record, this page); from the encoders' sample to the valve command that uses it."""
+"""What is measured: lateness of the tick and of SYNC; the tick by the clock and by CPU time; its stages in order; and the
+time from the encoders' sample to the valve command that uses it.
+
+"estimate" includes the reference, "supervise" includes the acceptance of requests, and "record" is everything after the
+frames are sent: reports, tick record and this page.
+"""
+METRIC_KEYS: Final = {name: name for name in STAGES} | {"receive": "read", "control": "law", "record": "tell"}
+"""Names in JSON (recordings, command output), which older recordings share."""
 _MAGIC: Final = 0x504D4854  # "THMP"
 _VERSION: Final = 1
 _HEAD: Final = struct.Struct("<IIQQ")
@@ -39,8 +46,8 @@ _SIZE: Final = _HEAD.size + _FACTS_BYTES + _BLOCK * len(STAGES)
 _TRIES: Final = 50
 
 
-class TimingRefused(Exception):
-    """There is no page, or not one that can be read; one sentence with what to do."""
+class TimingRefused(CodedError):
+    """There is no timing page, or it cannot be read; the sentence says what to do."""
 
 
 class BusCounters(msgspec.Struct, frozen=True):
@@ -115,7 +122,7 @@ class Timing:
         facts: dict[str, Any] = msgspec.to_builtins(self.facts)
         for name in ("longest_ns", "total_ns"):  # they belong to the bins
             del facts[name]
-        return facts | {"durations": {name: found.summary() for name, found in self.durations.items()}}
+        return facts | {"durations": {METRIC_KEYS[name]: found.summary() for name, found in self.durations.items()}}
 
 
 def default_path() -> Path:
@@ -181,16 +188,21 @@ def read_timing(path: Path | None = None) -> Timing:
                 if len(data) == _SIZE and again == data[_SEQUENCE_AT : _SEQUENCE_AT + _SEQUENCE.size]:
                     magic, version, sequence, size = _HEAD.unpack_from(data)
                     if (magic, version) != (_MAGIC, _VERSION):
-                        raise TimingRefused(f"{path} is no timing page of this release; look with the same release.")
+                        raise TimingRefused(
+                            "timing.other-release",
+                            f"{path} is no timing page of this release; look with the same release.",
+                        )
                     if sequence and not sequence & 1:
                         return _timing(data, size)
                 time.sleep(0.002)
     except (OSError, msgspec.MsgspecError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise TimingRefused(f"No controller tells its timing at {path} ({reason}); start it, or name its page.") from (
-            error
-        )
-    raise TimingRefused(f"The controller has not written its timing to {path} yet; look again in a second.")
+        raise TimingRefused(
+            "timing.no-page", f"No controller tells its timing at {path} ({reason}); start it, or name its page."
+        ) from (error)
+    raise TimingRefused(
+        "timing.not-written", f"The controller has not written its timing to {path} yet; look again in a second."
+    )
 
 
 def _timing(data: bytes, size: int) -> Timing:

@@ -36,7 +36,8 @@ def rotator_for_yaw(profile: Profile, slew: float, yaw: float, near: float = 0.0
     if not fitting:
         raise Unreachable(
             f"grapple yaw {degrees(yaw):.1f} deg at slew {degrees(slew):.1f} deg is out of reach: "
-            f"the rotator turns only {degrees(spec.lower):.1f}..{degrees(spec.upper):.1f} deg"
+            f"the rotator turns only {degrees(spec.lower):.1f}..{degrees(spec.upper):.1f} deg",
+            "reach.rotator",
         )
     return min(fitting, key=lambda angle: abs(angle - near))
 

@@ -4,12 +4,11 @@ Input is a joint vector ``q`` indexed by ``Joint`` (slew, lift, tilt in rad, ext
 the rotator, is ignored) and the profile's ``Kinematics``.  Output is in the base frame: origin above the
 ground, z up, x = r cos(theta), y = r sin(theta) with theta = slew + theta1 offset, so slew 0 reaches +y on
 ``palms_471`` and +x on ``aoro_fc8``; boom and stick angles are positive upward, the stick angle is relative to the
-boom.  The chain is the standard Denavit-Hartenberg one (RRRP) with twists +pi/2, 0, +pi/2, 0.  Encoder kinematics:
-structural sag is not in it.
+boom.  The chain is the standard Denavit-Hartenberg chain (RRRP) with twists +pi/2, 0, +pi/2, 0.  These are encoder
+kinematics: they do not include structural sag (`machine.geometry.sag`).
 
-The crane always works in one vertical plane through the slew axis, so everything is done in (r, z) of that
-plane. Plain floats only: this runs in the control tick and in planning.  Failure: ``Unreachable``, which says
-why in words.
+The crane works in one vertical plane through the slew axis, so all computation is in (r, z) of that plane.  Plain
+floats only: this runs in the control tick and in planning.  Failure: ``Unreachable`` with the reason.
 """
 
 from __future__ import annotations
@@ -17,32 +16,41 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from math import atan2, cos, degrees, hypot, pi, remainder, sin, sqrt
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from machine.joints import Joint
 from machine.profile import Kinematics, Profile, joint, joint_limits
+from runtime.errors import CodedError
 
 Point = tuple[float, float, float]
 Limits = Sequence[tuple[float, float]]
 
-MARGIN: Final = 0.02
-"""Share of a joint's range that ``solve`` keeps free at either stop when it can."""
+STOP_MARGIN_SHARE: Final = 0.02
+"""Share of a joint's range that ``solve`` keeps free at either stop if possible."""
 MIN_BEND_RAD: Final = 0.10
-"""Least bend of the elbow that ``solve`` keeps when it can: the straight arm is singular."""
+"""Smallest bend of the elbow that ``solve`` keeps if possible: the straight arm is singular."""
 _LIMIT_SLACK: Final = 1e-9
 _CLOSE_SLACK_M: Final = 1e-12
 _BOOM_LINKS: Final = (Joint.LIFT, Joint.TILT, Joint.EXT)
 _GOLDEN: Final = (sqrt(5.0) - 1.0) / 2.0
 
 
-class Unreachable(ValueError):
-    """No joint position inside the limits reaches the point; the text says what is in the way and by how
-    much.
-    """
+class Unreachable(CodedError, ValueError):
+    """No joint position inside the limits reaches the point; the sentence says which limit and by how much."""
+
+    def __init__(self, sentence: str, code: str = "reach.unreachable") -> None:
+        super().__init__(code, sentence)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self), self.code)
+
+
+Obstacle = tuple[str, str]
+"""Code and sentence of what keeps the pin from a point."""
 
 
 class ChainPoints(NamedTuple):
-    """Points for drawing, base frame, m; the grapple hangs straight down from the hanger pin."""
+    """Points for drawing, in the base frame [m]; the grapple hangs straight down from the hanger pin."""
 
     base: Point
     boom_pin: Point
@@ -84,7 +92,7 @@ def pin_position(kin: Kinematics, q: Sequence[float]) -> Point:
 def chain_points(kin: Kinematics, q: Sequence[float]) -> ChainPoints:
     """Points of the crane for drawing.
 
-    ``telescope_front`` is where the pin stands at extension 0, i.e. the moving part shows its full extension.
+    ``telescope_front`` is where the pin is at extension 0, so the moving part shows its full extension.
     """
     slew, phi = q[Joint.SLEW], _phi3(kin, q)
     boom_r, boom_z = _boom_vector(kin, q[Joint.LIFT])
@@ -104,7 +112,7 @@ def chain_points(kin: Kinematics, q: Sequence[float]) -> ChainPoints:
 
 
 def jacobian(kin: Kinematics, q: Sequence[float]) -> tuple[tuple[float, float, float, float], ...]:
-    """Derivative of the pin by (slew, lift, tilt, ext): three rows x, y, z; m per rad, m per m."""
+    """Derivative of the pin with respect to (slew, lift, tilt, ext): three rows x, y, z [m/rad, m/m]."""
     theta, phi = q[Joint.SLEW] + kin.theta1_offset_rad, _phi3(kin, q)
     ct, st = cos(theta), sin(theta)
     boom_r, boom_z = _boom_vector(kin, q[Joint.LIFT])
@@ -119,7 +127,7 @@ def jacobian(kin: Kinematics, q: Sequence[float]) -> tuple[tuple[float, float, f
 
 
 def max_reach_m(profile: Profile) -> float:
-    """Greatest distance of the pin from the slew axis with the arm straight and level, m."""
+    """Greatest distance of the pin from the slew axis, with the arm straight and level [m]."""
     kin = profile.kinematics
     return kin.a1_m + kin.a2_m + hypot(kin.a3_m, kin.d4_m + joint_limits(profile)[Joint.EXT][1])
 
@@ -139,14 +147,14 @@ def _target(kin: Kinematics, x: float, y: float, z: float) -> _Target:
 
 
 def _closes(kin: Kinematics, target: _Target, ext_m: float) -> bool:
-    """Whether boom and stick of this extension span the distance at all."""
+    """Whether boom and stick span the distance with this extension."""
     stick = hypot(kin.a3_m, kin.d4_m + ext_m)
     d = target.distance_m
     return d > 0.0 and abs(kin.a2_m - stick) - _CLOSE_SLACK_M <= d <= kin.a2_m + stick + _CLOSE_SLACK_M
 
 
 def _boom_and_stick(kin: Kinematics, target: _Target, ext_m: float) -> tuple[float, float]:
-    """Lift and tilt (elbow up) for an extension whose triangle closes; joint limits are not looked at."""
+    """Lift and tilt (elbow up) for an extension whose triangle closes; joint limits are not checked."""
     d, boom, length = target.distance_m, kin.a2_m, kin.d4_m + ext_m
     stick = hypot(kin.a3_m, length)
     # Both angles from one area (Heron), so that they agree to rounding even where the arm is straight.
@@ -160,50 +168,56 @@ def _boom_and_stick(kin: Kinematics, target: _Target, ext_m: float) -> tuple[flo
     return lift, tilt
 
 
-def _stop_sentence(name: str, value: float, low: float, high: float, low_stop: str, high_stop: str) -> str | None:
-    if value < low - _LIMIT_SLACK:
-        return f"the {name} would be {degrees(low - value):.1f} deg below its {low_stop}"
-    if value > high + _LIMIT_SLACK:
-        return f"the {name} would be {degrees(value - high):.1f} deg above its {high_stop}"
-    return None
-
-
-def _slew_obstacle(slew: float, limits: Limits) -> str | None:
+def _slew_obstacle(slew: float, limits: Limits) -> Obstacle | None:
     low, high = limits[Joint.SLEW]
     if low - _LIMIT_SLACK <= slew <= high + _LIMIT_SLACK:
         return None
-    return f"slew {degrees(slew):.1f} deg is outside its limits {degrees(low):.1f}..{degrees(high):.1f} deg"
+    text = f"slew {degrees(slew):.1f} deg is outside its limits {degrees(low):.1f}..{degrees(high):.1f} deg"
+    return "reach.slew", text
 
 
-def _boom_obstacle(lift: float, tilt: float, limits: Limits) -> str | None:
-    return _stop_sentence("boom", lift, *limits[Joint.LIFT], "lower stop", "upper stop") or _stop_sentence(
-        "stick", tilt, *limits[Joint.TILT], "folded stop", "straight stop"
-    )
+def _boom_obstacle(lift: float, tilt: float, limits: Limits) -> Obstacle | None:
+    low, high = limits[Joint.LIFT]
+    if lift < low - _LIMIT_SLACK:
+        return "reach.boom-lower-stop", f"the boom would be {degrees(low - lift):.1f} deg below its lower stop"
+    if lift > high + _LIMIT_SLACK:
+        return "reach.boom-upper-stop", f"the boom would be {degrees(lift - high):.1f} deg above its upper stop"
+    low, high = limits[Joint.TILT]
+    if tilt < low - _LIMIT_SLACK:
+        return "reach.stick-folded-stop", f"the stick would be {degrees(low - tilt):.1f} deg below its folded stop"
+    if tilt > high + _LIMIT_SLACK:
+        return "reach.stick-straight-stop", f"the stick would be {degrees(tilt - high):.1f} deg above its straight stop"
+    return None
 
 
-def _distance_obstacle(kin: Kinematics, target: _Target, shortest: float, longest: float) -> str:
-    """Why no extension between the two closes the triangle; distances along the line boom pin to point."""
+def _distance_obstacle(kin: Kinematics, target: _Target, shortest: float, longest: float) -> Obstacle:
+    """Why no extension in between closes the triangle; distances along the line from boom pin to point."""
     far = kin.a2_m + hypot(kin.a3_m, kin.d4_m + longest)
     if target.distance_m > far:
-        return f"too far by {target.distance_m - far:.2f} m"
+        return "reach.too-far", f"too far by {target.distance_m - far:.2f} m"
     stick_short, stick_long = (hypot(kin.a3_m, kin.d4_m + e) for e in (shortest, longest))
     near = max(0.0, stick_short - kin.a2_m, kin.a2_m - stick_long)
-    return f"too close to the boom pin by {near - target.distance_m:.2f} m"
+    return "reach.too-close", f"too close to the boom pin by {near - target.distance_m:.2f} m"
 
 
-def _unreachable(x: float, y: float, z: float, why: str) -> Unreachable:
-    return Unreachable(f"point ({x:.2f}, {y:.2f}, {z:.2f}) m is out of reach: {why}")
+def _unreachable(x: float, y: float, z: float, obstacle: Obstacle) -> Unreachable:
+    code, text = obstacle
+    return Unreachable(f"point ({x:.2f}, {y:.2f}, {z:.2f}) m is out of reach: {text}", code)
 
 
 def inverse(kin: Kinematics, limits: Limits, x: float, y: float, z: float, ext_m: float) -> tuple[float, float, float]:
     """Slew, lift and tilt in rad, elbow up, that bring the pin to a point with the given extension.
 
-    ``limits`` is indexed by ``Joint`` (``machine.profile.joint_limits``).  Raises ``Unreachable``.  The point
-    lies on the side the slew looks at; poses folded back behind the mast are not produced.
+    ``limits`` is indexed by ``Joint`` (``machine.profile.joint_limits``).  The arm points toward the point; poses
+    folded back behind the mast are not produced.
+
+    Raises:
+        Unreachable: no such joint position is inside the limits.
     """
     low, high = limits[Joint.EXT]
     if not low - _LIMIT_SLACK <= ext_m <= high + _LIMIT_SLACK:
-        raise _unreachable(x, y, z, f"extension {ext_m:.2f} m is outside its limits {low:.2f}..{high:.2f} m")
+        text = f"extension {ext_m:.2f} m is outside its limits {low:.2f}..{high:.2f} m"
+        raise _unreachable(x, y, z, ("reach.extension", text))
     target = _target(kin, x, y, z)
     obstacle = _slew_obstacle(target.slew, limits)
     if not obstacle and not _closes(kin, target, ext_m):
@@ -217,7 +231,7 @@ def inverse(kin: Kinematics, limits: Limits, x: float, y: float, z: float, ext_m
 
 
 def _breakpoints(kin: Kinematics, limits: Limits, target: _Target) -> list[float]:
-    """Every extension at which a limit can begin or cease to hold, sorted, inside the telescope's range.
+    """Every extension inside the telescope's range at which a limit can begin or cease to hold, sorted.
 
     Between two neighbours nothing changes, so one test in the middle decides the whole interval.
     """
@@ -250,12 +264,12 @@ def _intervals(kin: Kinematics, limits: Limits, target: _Target) -> list[tuple[f
             if found and found[-1][1] == low:
                 low = found.pop()[0]
             found.append((low, high))
-    # A point on the very edge of the work space is reached by one extension only.
+    # A point on the edge of the work space is reached by one extension only.
     return found or [(e, e) for e in points if _fits(kin, limits, target, e)]
 
 
 def reachable_extensions(profile: Profile, x: float, y: float, z: float) -> tuple[tuple[float, float], ...]:
-    """Intervals of the extension, m, for which the point is reached inside all limits; maybe none."""
+    """Intervals of the extension [m] with which the point is reached inside all limits; may be empty."""
     limits = joint_limits(profile)
     target = _target(profile.kinematics, x, y, z)
     if _slew_obstacle(target.slew, limits):
@@ -264,8 +278,8 @@ def reachable_extensions(profile: Profile, x: float, y: float, z: float) -> tupl
 
 
 def _comfortable(kin: Kinematics, limits: Limits) -> list[tuple[float, float]]:
-    """The limits less ``MARGIN``, and the stick at least ``MIN_BEND_RAD`` off the straight arm."""
-    inner = [(low + MARGIN * (high - low), high - MARGIN * (high - low)) for low, high in limits]
+    """The limits less ``STOP_MARGIN_SHARE``, and the stick at least ``MIN_BEND_RAD`` off the straight arm."""
+    inner = [(low + STOP_MARGIN_SHARE * (high - low), high - STOP_MARGIN_SHARE * (high - low)) for low, high in limits]
     straight = atan2(kin.d4_m + limits[Joint.EXT][0], kin.a3_m) - kin.theta3_offset_rad
     folded, stretched = inner[Joint.TILT]
     inner[Joint.TILT] = (folded, max(folded, min(stretched, straight - MIN_BEND_RAD)))
@@ -273,7 +287,7 @@ def _comfortable(kin: Kinematics, limits: Limits) -> list[tuple[float, float]]:
 
 
 def _least(cost: Callable[[float], float], low: float, high: float, n: int = 24) -> tuple[float, float]:
-    """(cost, argument) of the least cost on an interval: golden section around each low point of a grid."""
+    """(cost, argument) of the minimum on an interval: golden section around each low point of a grid."""
     step = (high - low) / n
     costs = [cost(low + i * step) for i in range(n + 1)]
     found = []
@@ -295,13 +309,14 @@ def _least(cost: Callable[[float], float], low: float, high: float, n: int = 24)
 def solve(
     profile: Profile, x: float, y: float, z: float, preference: float | Sequence[float] | None = None
 ) -> tuple[float, float, float, float]:
-    """Slew, lift, tilt in rad and extension in m that bring the pin to a point; the redundancy goes by
-    preference.
+    """Slew, lift, tilt [rad] and extension [m] that bring the pin to a point; ``preference`` resolves the redundancy.
 
-    ``preference``: a number is a wished extension (the nearest feasible one is taken); a joint vector is the
-    present pose (least travel time at the profile's speed limits); None keeps the joints farthest from their
-    stops.  Poses near a stop or near the straight arm are used only when there is no other.  Raises
-    ``Unreachable``.
+    A number is a preferred extension (the nearest feasible one is used); a joint vector is the present pose (shortest
+    travel time at the profile's speed limits); None keeps the joints farthest from their stops.  Poses near a stop or
+    near the straight arm are used only if there is no other.
+
+    Raises:
+        Unreachable: no joint position inside the limits reaches the point.
     """
     kin, limits = profile.kinematics, joint_limits(profile)
     target = _target(kin, x, y, z)
@@ -310,7 +325,7 @@ def solve(
         raise _unreachable(x, y, z, obstacle)
     intervals = _intervals(kin, _comfortable(kin, limits), target) or _intervals(kin, limits, target)
     if not intervals:
-        raise _unreachable(x, y, z, _why_not(kin, limits, target))
+        raise _unreachable(x, y, z, _nearest_obstacle(kin, limits, target))
 
     def pose(ext: float) -> tuple[float, float, float]:
         return *_boom_and_stick(kin, target, ext), ext
@@ -334,10 +349,10 @@ def solve(
     return target.slew, *pose(ext)
 
 
-def _why_not(kin: Kinematics, limits: Limits, target: _Target) -> str:
-    """The obstacle at the extension that comes nearest to success."""
+def _nearest_obstacle(kin: Kinematics, limits: Limits, target: _Target) -> Obstacle:
+    """The obstacle at the extension that violates the limits least."""
     low, high = limits[Joint.EXT]
-    reasons: list[tuple[float, str]] = []
+    reasons: list[tuple[float, Obstacle]] = []
     for i in range(21):
         ext = low + (high - low) * i / 20
         if not _closes(kin, target, ext):
@@ -345,5 +360,5 @@ def _why_not(kin: Kinematics, limits: Limits, target: _Target) -> str:
         angles = _boom_and_stick(kin, target, ext)
         spans = zip(angles, (limits[Joint.LIFT], limits[Joint.TILT]), strict=True)
         over = sum(max(lower - v, v - upper, 0.0) for v, (lower, upper) in spans)
-        reasons.append((over, _boom_obstacle(*angles, limits) or "only by rounding"))
+        reasons.append((over, _boom_obstacle(*angles, limits) or ("reach.rounding", "by rounding only")))
     return min(reasons)[1] if reasons else _distance_obstacle(kin, target, low, high)

@@ -137,9 +137,7 @@ def _valve_problems(path: str, spec: JointSpec, speed: Range) -> Iterator[Proble
     yield from _gain_problems(f"{path}.law.kp_1_s", law.kp_1_s, valve.delay_s)
 
 
-def _side_problems(
-    path: str, valve: Valve | CarrierValve, key: str, limit: float, speed: Range
-) -> Iterator[Problem]:
+def _side_problems(path: str, valve: Valve | CarrierValve, key: str, limit: float, speed: Range) -> Iterator[Problem]:
     """Checks dead band and full speed of both sides of a valve whose function must reach ``limit`` (its ``key``)."""
     for side in ("plus", "minus"):
         deadband = getattr(valve, f"deadband_{side}_pct")
@@ -182,9 +180,7 @@ def _encoder_problems(
         text = f'"{encoder.kind}" on a {joint_kind} joint; the joint needs a {kind} encoder'
         yield Problem("profile.encoder-kind", f"{path}.kind", text)
     if encoder.device_type & 0xFFFF != 0x0196:
-        text = (
-            f"{encoder.device_type:#010x} is not a CiA 406 encoder; the low half of object 1000h must be 0x0196"
-        )
+        text = f"{encoder.device_type:#010x} is not a CiA 406 encoder; the low half of object 1000h must be 0x0196"
         yield Problem("profile.encoder-device-type", f"{path}.device_type", text)
     yield from check_range(f"{path}.noise", encoder.noise, (0.0, 0.05, unit))
     if encoder.kind == "rotary":

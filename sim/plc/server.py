@@ -1,6 +1,6 @@
-"""The emulated PLC on its two ports: Modbus/TCP registers and the cyclic datagram.  Nothing is decided here.
+"""The emulated PLC on its two ports: Modbus/TCP registers and the cyclic datagram.  Decides nothing.
 
-Both live in the asyncio loop of the process; who speaks is told apart by connection, and by address for datagrams.
+Both run in the asyncio loop of the process; clients are told apart by connection, and by address for datagrams.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ Address = tuple[str, int]
 
 
 class PlcRegisters:
-    """The registers of a PLC as a Modbus server asks for them; ``clock_ns`` is the PLC's time."""
+    """The registers of a PLC for a Modbus server; ``clock_ns`` is the PLC's time."""
 
     def __init__(self, program: Program, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._program, self._clock_ns = program, clock_ns
 
     def read(self, address: int, count: int) -> list[int]:
-        """Status block or command block, or a part of one; both read alike as holding and as input registers."""
+        """A part of the status block or of the command block; both read alike as holding and as input registers."""
         for begin, length in ((plc.STATUS_AT, plc.STATUS_COUNT), (plc.COMMAND_AT, plc.COMMAND_COUNT)):
             if begin <= address and address + count <= begin + length:
                 block = self._program.status() if begin == plc.STATUS_AT else self._program.arbiter.command_block()
@@ -42,12 +42,12 @@ class PlcRegisters:
         return self._program.arbiter.commander(self._clock_ns()) == client
 
     def closed(self, client: int) -> None:
-        """Who commanded may come back on a new connection."""
+        """The connection has ended; the commander may return on a new one."""
         self._program.arbiter.disconnected(client)
 
 
 class Datagrams(asyncio.DatagramProtocol):
-    """The UDP side: commands in; a reply per PLC cycle goes to whoever commands, or last asked well-formed."""
+    """The UDP side: commands in; one reply per PLC cycle to the commander, or to the last valid sender."""
 
     def __init__(self, program: Program, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._program, self._clock_ns = program, clock_ns
@@ -65,7 +65,7 @@ class Datagrams(asyncio.DatagramProtocol):
             self._peer = addr
 
     def cycle(self) -> None:
-        """Sends the reply of a PLC cycle that has not been sent yet."""
+        """Send the reply of a PLC cycle that has not been sent yet."""
         feedback = self._program.feedback
         if self._transport is None or self._peer is None or feedback.heartbeat == self._beat:
             return
@@ -81,17 +81,25 @@ class Datagrams(asyncio.DatagramProtocol):
 
 
 async def listen(program: Program, address: Address, clock_ns: Callable[[], int]) -> Datagrams:
-    """The UDP side on an address; raises LinkError."""
+    """Open the UDP side on an address.
+
+    Raises:
+        LinkError: the address cannot be used.
+    """
     protocol = Datagrams(program, clock_ns)
     try:
         await asyncio.get_running_loop().create_datagram_endpoint(lambda: protocol, local_addr=address)
     except OSError as error:
-        raise LinkError(f"cannot listen on {address[0]}:{address[1]}: {error.strerror}") from error
+        raise LinkError("plc-link.listen", f"cannot listen on {address[0]}:{address[1]}: {error.strerror}") from error
     return protocol
 
 
 async def serve(program: Program, address: Address, clock_ns: Callable[[], int]) -> ModbusServer:
-    """The Modbus side on an address; raises LinkError."""
+    """Open the Modbus side on an address.
+
+    Raises:
+        LinkError: the address cannot be used.
+    """
     server = ModbusServer(PlcRegisters(program, clock_ns), *address)
     await server.start()
     return server

@@ -29,6 +29,7 @@ from can_dbc.plc.map import (
     read_status,
     status_registers,
 )
+from tests.codes import coded
 
 U16 = st.integers(0, 0xFFFF)
 MICROS = st.integers(-(1 << 31), (1 << 31) - 1).map(lambda n: n / 1e6)
@@ -102,18 +103,21 @@ def test_the_addresses_are_those_of_the_map() -> None:
 
 
 @pytest.mark.parametrize(
-    ("order", "registers", "says"),
+    ("order", "registers", "code", "named"),
     [
-        (WordOrder.HIGH_FIRST, (0x0304, 0x0102), "LOW_FIRST"),
-        (WordOrder.LOW_FIRST, (0x0102, 0x0304), "HIGH_FIRST"),
-        (WordOrder.HIGH_FIRST, (0x0201, 0x0403), "byte order"),
+        (WordOrder.HIGH_FIRST, (0x0304, 0x0102), "plc.word-order", "LOW_FIRST"),
+        (WordOrder.LOW_FIRST, (0x0102, 0x0304), "plc.word-order", "HIGH_FIRST"),
+        (WordOrder.HIGH_FIRST, (0x0201, 0x0403), "plc.byte-order", "0x02010403"),
     ],
 )
-def test_the_word_order_test_tells_what_is_wrong(order: WordOrder, registers: tuple[int, int], says: str) -> None:
+def test_the_word_order_test_tells_what_is_wrong(
+    order: WordOrder, registers: tuple[int, int], code: str, named: str
+) -> None:
     status = status_registers(Feedback(), 300, order)
     status[2:4] = registers
-    with pytest.raises(MapError, match=says):
+    with pytest.raises(MapError, check=coded(code)) as refused:
         read_status(status, order)
+    assert named in str(refused.value)
 
 
 @pytest.mark.parametrize(("register", "value"), [(0, 0x5243), (1, 2), (5, 3), (5, 9)])
@@ -147,8 +151,9 @@ def test_what_does_not_fit_is_refused_and_never_clamped(command: Command) -> Non
 def test_a_command_that_means_nothing_is_refused(register: int, value: int) -> None:
     block = command_registers(Command(), 0, 1, WordOrder.HIGH_FIRST)
     block[register - plc.COMMAND_AT] = value
-    with pytest.raises(MapError, match=str(register)):
+    with pytest.raises(MapError, check=coded("plc.illegal-value")) as refused:
         read_command(block, WordOrder.HIGH_FIRST)
+    assert str(register) in str(refused.value)
 
 
 def test_bounds_name_the_axis() -> None:
@@ -163,7 +168,7 @@ def test_bounds_name_the_axis() -> None:
         with pytest.raises(MapError) as refused:
             bounds.check(Command(Mode.REFERENCES, True, reference, rate))
         assert refused.value.axis == axis
-    with pytest.raises(MapError, match="REFERENCES"):
+    with pytest.raises(MapError, check=coded("plc.role")):
         bounds.check(Command(Mode.VALVES, True))
     with pytest.raises(MapError):
         Bounds.valves().check(Command(Mode.VALVES, True, (1.01, *(0.0,) * 6)))

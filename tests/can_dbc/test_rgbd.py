@@ -18,6 +18,7 @@ from can_dbc.messages.rgbd import (
     question_bytes,
     start,
 )
+from tests.codes import coded
 
 
 def frame(width: int = 5, height: int = 3, seed: int = 0) -> RgbdMessage:
@@ -59,28 +60,28 @@ def test_noise_is_no_frame(noise: bytes) -> None:
 
 
 def test_a_refusal_says_why() -> None:
-    with pytest.raises(RgbdError, match="the lens is covered"):
+    with pytest.raises(RgbdError, match=r"^the lens is covered$", check=coded("rgbd.refused")):
         decode(encode_refusal("front", "the lens is covered"))
 
 
 def test_what_is_asked_is_the_cameras_name() -> None:
     asked = encode_question("front")
     assert asked[QUESTION.size :] == b"front" and question_bytes(asked[: QUESTION.size]) == 5
-    with pytest.raises(RgbdError, match="ask for no frame"):
+    with pytest.raises(RgbdError, check=coded("rgbd.no-request")):
         question_bytes(bytes(QUESTION.size))
 
 
 @pytest.mark.parametrize(
-    ("broken", "words"),
+    ("broken", "code"),
     [
-        (lambda f: RgbdMessage(**{**_fields(f), "rgb": b""}), "no 5 x 3 px"),
-        (lambda f: RgbdMessage(**{**_fields(f), "width_px": 0}), "cannot be sent"),
-        (lambda f: RgbdMessage(**{**_fields(f), "fx_px": float("nan")}), "not finite"),
-        (lambda f: RgbdMessage(**{**_fields(f), "camera": ""}), "name has 1 to"),
+        (lambda f: RgbdMessage(**{**_fields(f), "rgb": b""}), "rgbd.incomplete"),
+        (lambda f: RgbdMessage(**{**_fields(f), "width_px": 0}), "rgbd.size"),
+        (lambda f: RgbdMessage(**{**_fields(f), "fx_px": float("nan")}), "rgbd.not-finite"),
+        (lambda f: RgbdMessage(**{**_fields(f), "camera": ""}), "rgbd.camera-name"),
     ],
 )
-def test_what_does_not_agree_is_not_sent(broken, words: str) -> None:
-    with pytest.raises(RgbdError, match=words):
+def test_what_does_not_agree_is_not_sent(broken, code: str) -> None:
+    with pytest.raises(RgbdError, check=coded(code)):
         encode(broken(frame()))
 
 

@@ -19,6 +19,7 @@ from can_dbc.timing.page import (
     default_path,
     read_timing,
 )
+from tests.codes import coded
 
 
 def facts(ticks: int = 3, words: str = "STANDBY. All is well.") -> Facts:
@@ -41,7 +42,7 @@ def histograms(duration_ns: int = 1000, count: int = 1) -> dict[str, Durations]:
 def test_what_is_written_is_read(tmp_path):
     path = tmp_path / "sub" / "controller.timing"
     writer = TimingWriter(path)
-    with pytest.raises(TimingRefused, match="not written its timing"):
+    with pytest.raises(TimingRefused, check=coded("timing.not-written")):
         read_timing(path)
     writer.publish(facts(), histograms())
     found = read_timing(path)
@@ -50,7 +51,7 @@ def test_what_is_written_is_read(tmp_path):
     assert found.durations["sync"].bins == histograms()["sync"].bins
     writer.close()
     writer.close()
-    with pytest.raises(TimingRefused, match="No controller tells its timing"):
+    with pytest.raises(TimingRefused, check=coded("timing.no-page")):
         read_timing(path)
 
 
@@ -71,11 +72,11 @@ def test_a_page_in_the_middle_of_a_change_or_of_another_release_is_refused(tmp_p
     with path.open("r+b") as file:
         file.seek(8)
         file.write(struct.pack("<Q", 3))
-    with pytest.raises(TimingRefused, match="not written"):
+    with pytest.raises(TimingRefused, check=coded("timing.not-written")):
         read_timing(path)
     with path.open("r+b") as file:
         file.write(struct.pack("<II", 0x504D4854, 99))
-    with pytest.raises(TimingRefused, match="same release"):
+    with pytest.raises(TimingRefused, check=coded("timing.other-release")):
         read_timing(path)
     path.write_bytes(b"short")
     with pytest.raises(TimingRefused):

@@ -151,7 +151,7 @@ def test_the_live_bus_tests_pass_in_the_lab(lab: Run) -> None:
         done = lab(
             "--timeout", "80", "--root", "--",
             sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--basetemp={short}/inside",
-            "tests/vcan", "tests/can_dbc/test_bus_contract.py", "tests/can_dbc/test_kernel_bus.py",
+            "tests/vcan", "tests/hil/test_bus_contract.py", "tests/hil/test_kernel_bus.py",
             "-k", "vcan or socketcan or kernel or link",
         )  # fmt: skip
     report = done.stdout.decode()

@@ -43,7 +43,7 @@ def is_seen(camera: Camera, seen: tuple[float, float, float], margin_px: float =
 
 
 def stick_frame(q: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """(origin, rotation) of the stick of palms_471 in the base frame: joint table of docs/reference/machines.md section 1.1."""
+    """(origin, rotation) of the stick of palms_471 in the base frame (docs/reference/machines.md section 1.1)."""
     mast, boom = about("z", q[0]), about("z", q[0]) @ about("x", q[1])
     origin = mast @ np.array([0.0, -0.0601374, 0.26881 + 1.09553]) + boom @ np.array([0.0, 3.04904, -0.00649])
     return origin, boom @ about("x", q[2])

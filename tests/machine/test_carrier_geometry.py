@@ -57,7 +57,7 @@ def test_at_transport_height_the_axles_are_where_the_profile_says():
 
 
 def test_an_arm_too_short_says_so():
-    with pytest.raises(ValueError, match=r"height 1\.200 m is out of reach of a swing arm of 1\.00 m"):
+    with pytest.raises(ValueError, match=r"1\.200 m.*1\.00 m"):
         arm_angle_from_height(CARRIER, 1.2)
 
 

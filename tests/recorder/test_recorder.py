@@ -10,7 +10,6 @@ import struct
 import can
 import pytest
 from mcap.reader import make_reader
-from recordings import CRANE, PROFILE, START_NS, T_NS, feed, frames, manifest, record, report, tick
 
 from can_dbc.frame import Frame
 from can_dbc.messages.datagrams import encode
@@ -22,6 +21,8 @@ from recorder import recorder as recorder_module
 from recorder.mcap_scan import Channel, Stored, is_complete, scan
 from recorder.recorder import CHUNK_NS, Recorder, RecordingRefused
 from recorder.recover import run_files
+from tests.codes import coded
+from tests.recorder.recordings import CRANE, PROFILE, START_NS, T_NS, feed, frames, manifest, record, report, tick
 
 TICKS = 200
 
@@ -190,14 +191,14 @@ def test_damaged_datagrams_are_counted(tmp_path):
 
 def test_directory_with_a_recording_is_refused_and_kept(run):
     before = (run / "run.mcap").read_bytes()
-    with pytest.raises(RecordingRefused, match="already holds a recording"):
+    with pytest.raises(RecordingRefused, check=coded("recording.exists")):
         Recorder(run, PROFILE, manifest())
     assert (run / "run.mcap").read_bytes() == before
 
 
 def test_directory_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordingRefused, match="make room or name another directory"):
+    with pytest.raises(RecordingRefused, check=coded("recording.cannot-write")):
         Recorder(tmp_path / "file", PROFILE, manifest())
 
 
@@ -229,7 +230,7 @@ class FullDisk:
 
 def test_full_disk_at_start_is_refused(tmp_path, monkeypatch):
     FullDisk(monkeypatch).full = True
-    with pytest.raises(RecordingRefused, match="No space left on device"):
+    with pytest.raises(RecordingRefused, match="No space left on device", check=coded("recording.cannot-write")):
         Recorder(tmp_path, PROFILE, manifest())
 
 

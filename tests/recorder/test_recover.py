@@ -17,7 +17,6 @@ import time
 import can
 import pytest
 from mcap.reader import make_reader
-from recordings import PROFILE, T_NS, feed, manifest, record, tick
 
 from can_dbc.bus.factory import open_bus
 from can_dbc.messages import tick_record
@@ -27,6 +26,8 @@ from recorder.__main__ import FLUSH_S, Shell, udp_socket, write_all
 from recorder.mcap_scan import NotMcap, Stored, is_complete, scan
 from recorder.recorder import CHUNK_NS, TICK, Recorder
 from recorder.recover import recover
+from tests.codes import coded
+from tests.recorder.recordings import PROFILE, T_NS, feed, manifest, record, tick
 
 TICKS = 400
 
@@ -103,7 +104,7 @@ def test_unfinished_line_of_the_text_log_is_cut(whole, tmp_path):
 
 def test_another_file_is_refused_by_name(tmp_path):
     (tmp_path / "run.mcap").write_text("this is no recording")
-    with pytest.raises(NotMcap, match="is not an MCAP file"):
+    with pytest.raises(NotMcap, check=coded("recording.not-mcap")):
         list(scan(tmp_path / "run.mcap"))
 
 

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from bus_backends import BITRATE, Backend, kernel_interface
 
 from hil.wire.core import WireCore
 from hil.wire.launch import wire_daemon
+from tests.hil.bus_backends import BITRATE, Backend, kernel_interface
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import time
 
-from bus_backends import Backend
-
 from can_dbc.bus.base import BusState
 from can_dbc.frame import EXTENDED, REMOTE, Frame
+from tests.hil.bus_backends import Backend
 
 
 def test_frames_arrive_in_order_with_payload_and_stamp(backend: Backend) -> None:

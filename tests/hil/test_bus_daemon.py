@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 
 import pytest
-from bus_backends import BITRATE, PATIENCE_S, Backend, counted_receives
 
 from can_dbc.bus import wire_client
 from can_dbc.bus.base import Bus, BusState
@@ -18,6 +17,7 @@ from can_dbc.frame import Frame
 from hil.wire.core import WireCore
 from hil.wire.faults import Fault, Kind
 from hil.wire.launch import wire_daemon
+from tests.hil.bus_backends import BITRATE, PATIENCE_S, Backend, counted_receives
 
 
 @pytest.mark.parametrize("address", ["in-process", "wire:lone", "timberhand:lone"])
