@@ -1,1 +1,1 @@
-"""Commissioning: what a machine's valves, sensors and steel really do, found through the bus (docs/architecture.md, "Machine and truth")."""
+"""Commissioning: identifies a machine's valves, sensors and steel through its bus (design section 6)."""

@@ -138,22 +138,22 @@ class Calibration:
         ``survey`` and ``yaw_rad`` are the surveyor's answers, base frame, m and rad modulo pi; NaN: no direction can be
         read, and the rotator is not tested.
         """
-        self.trace.take(frames)
+        self.trace.accept(frames)
         dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _MAX_TICK_S)
         self._last_ns = now_ns
         if report is not None:
             self._report, self._report_ns = report, now_ns
         if self.idle:
             return None
-        obstacle = self._obstacle(now_ns)
+        obstacle = self._blocked_reason(now_ns)
         if obstacle is not None:
-            self._stand_back(obstacle)
+            self._interrupt(obstacle)
             return None
         self.waiting = None
         if self.begun_ns is None:
             self.begun_ns = now_ns
         self.elapsed_s = (now_ns - self.begun_ns) * 1e-9
-        self._watch_refusals()
+        self._check_refusals()
         if self.failure is not None:
             return self._brake(now_ns, dt_s)
         if self.done:
@@ -161,9 +161,9 @@ class Calibration:
             return None
         if not self._entered:
             self._enter(now_ns)
-        return self._proceed(now_ns, dt_s, survey, yaw_rad)
+        return self._run_task(now_ns, dt_s, survey, yaw_rad)
 
-    def _obstacle(self, now_ns: int) -> str | None:
+    def _blocked_reason(self, now_ns: int) -> str | None:
         report = self._report
         if report is None:
             return "the controller has not reported"
@@ -176,14 +176,14 @@ class Calibration:
         sensed = (p for j, p in zip(JOINTS, report.position, strict=True) if joint(self._profile, j).encoder)
         return None if all(map(isfinite, sensed)) else "a joint position is unknown"
 
-    def _stand_back(self, obstacle: str) -> None:
+    def _interrupt(self, obstacle: str) -> None:
         """Before the start it waits; a run that was interrupted is over, for nobody knows what moved meanwhile."""
         self.waiting = obstacle
         if self.begun_ns is not None:
             self.failure = self.failure or obstacle
             self.idle = True
 
-    def _watch_refusals(self) -> None:
+    def _check_refusals(self) -> None:
         assert self._report is not None
         before, self._refused = self._refused, self._report.refused
         if before is not None and self._report.refused != before:
@@ -248,12 +248,12 @@ class Calibration:
         self._tasks.insert(self._at, MoveTask(tuple(start), f"back for more room of the {name}"))
         self._enter(self._task_ns)
 
-    def _next(self) -> None:
+    def _next_task(self) -> None:
         self._at += 1
         self._entered = False
         self.wants_reading = self.wants_yaw = False
 
-    def _proceed(self, now_ns: int, dt_s: float, survey: Point | None, yaw_rad: float | None) -> bytes | None:
+    def _run_task(self, now_ns: int, dt_s: float, survey: Point | None, yaw_rad: float | None) -> bytes | None:
         task = self._tasks[self._at]
         time_s = (now_ns - self._task_ns) * 1e-9
         match task:
@@ -262,18 +262,18 @@ class Calibration:
             case MoveTask():
                 self._clock_s += dt_s
                 if self._clock_s >= self._motion.duration_s + SETTLE_S and self._arrived():
-                    self._next()
+                    self._next_task()
                 elif self._clock_s > _TIMEOUT_FACTOR * self._motion.duration_s + _TIMEOUT_EXTRA_S:
                     self.abort(f"the crane did not come {task.why}")
                 return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
             case GrappleTask():
-                self._run_grip(task, time_s)
+                self._run_grapple(task, time_s)
                 return self._motion_datagram(now_ns, task.command)
             case PinReadingTask():
-                self._run_look(task, time_s, now_ns, survey)
+                self._run_pin_reading(task, time_s, now_ns, survey)
                 return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
             case YawReadingTask():
-                self._run_bearing(time_s, now_ns, yaw_rad)
+                self._run_yaw_reading(time_s, now_ns, yaw_rad)
                 return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
         return None
 
@@ -300,10 +300,10 @@ class Calibration:
             self.abort(wrong)
             return None
         if run_s >= run.program.duration_s + TAIL_S:
-            self._finish_spool(task, run.judged(position), now_ns)
+            self._finish_spool(task, run.final_check(position), now_ns)
             return None
         # A program that has just been changed is told at once, and its end always, however late this turn is.
-        if run.silent(run_s) or not (self._stream.due(now_ns) or run.changed):
+        if run.is_silent(run_s) or not (self._stream.due(now_ns) or run.changed):
             return None
         return self._stream.spool(now_ns, task.joint, run.window(run_s))
 
@@ -312,14 +312,14 @@ class Calibration:
             self.abort(wrong)
             return
         if isinstance(task, PulseTask):
-            self._turning.ran(self.trace.test(task.joint, task.side, "pulse", self._task_ns, now_ns))
-            self._next()
+            self._turning.pulse_finished(self.trace.test(task.joint, task.side, "pulse", self._task_ns, now_ns))
+            self._next_task()
             return
         test = self.trace.test(task.joint, task.side, task.kind, self._task_ns, now_ns)
         (self.found.wiggles if task.kind == "wiggle" else self.found.tests).append(test)
-        self._next()
+        self._next_task()
 
-    def _run_grip(self, task: GrappleTask, time_s: float) -> None:
+    def _run_grapple(self, task: GrappleTask, time_s: float) -> None:
         """Until the valve node says that the grapple is at its end; only a time from end to end counts.
 
         A grapple without an opening sensor is opened for the profile's time and may fall short of its end: then its
@@ -331,14 +331,14 @@ class Calibration:
             if self._at_end:
                 self.found.grapple_s[task.command] = time_s
             self._at_end = True
-            self._next()
+            self._next_task()
         elif opens and not grapple.opening_sensor and time_s > grapple.open_time_s + UNSENSED_EXTRA_S:
             self._at_end = False
-            self._next()
+            self._next_task()
         elif time_s > GRAPPLE_TIMEOUT_S:
             self.abort(f"the grapple did not {task.command.name.lower()} within {GRAPPLE_TIMEOUT_S:.0f} s")
 
-    def _run_look(self, task: PinReadingTask, time_s: float, now_ns: int, survey: Point | None) -> None:
+    def _run_pin_reading(self, task: PinReadingTask, time_s: float, now_ns: int, survey: Point | None) -> None:
         self.wants_reading = time_s >= SURVEY_SETTLE_S and now_ns >= self._point_ns
         if survey is None or time_s < SURVEY_SETTLE_S:
             return
@@ -352,9 +352,9 @@ class Calibration:
             since_ns = self._task_ns + round(SURVEY_SETTLE_S * 1e9)
             moment_nm = self.trace.lift_moment_nm(position[Joint.LIFT], since_ns, now_ns)
             self.found.readings.append(SurveyReading(position, (x, y, z), moment_nm))
-            self._next()
+            self._next_task()
 
-    def _run_bearing(self, time_s: float, now_ns: int, yaw_rad: float | None) -> None:
+    def _run_yaw_reading(self, time_s: float, now_ns: int, yaw_rad: float | None) -> None:
         self.wants_yaw = time_s >= YAW_SETTLE_S and now_ns >= self._point_ns
         if yaw_rad is None or time_s < YAW_SETTLE_S:
             return
@@ -363,11 +363,11 @@ class Calibration:
             self.wants_yaw = False
             return
         self._point_ns = now_ns + READING_PERIOD_NS
-        if self._turning.see(yaw_rad, self._position()[Joint.SLEW]) >= self._readings:
-            if wrong := self._turning.rest():
+        if self._turning.add_reading(yaw_rad, self._position()[Joint.SLEW]) >= self._readings:
+            if wrong := self._turning.finish_rest():
                 self.abort(wrong)
                 return
-            self._next()
+            self._next_task()
 
     def _brake(self, now_ns: int, dt_s: float) -> bytes | None:
         """The end of a run that failed: valve closed, or the motion slowed to a stand on its path."""

@@ -33,18 +33,18 @@ class RotatorTurns:
         """The pulse of a task by all that is known so far."""
         return pulse_to(self._spec, fit_turns(self.turns, self._spec), task.side, task.share, task.to_rad)
 
-    def ran(self, record: SpoolTestRecord) -> None:
+    def pulse_finished(self, record: SpoolTestRecord) -> None:
         """A pulse is over."""
         self._record = record
 
-    def see(self, yaw_rad: float, slew_rad: float) -> int:
+    def add_reading(self, yaw_rad: float, slew_rad: float) -> int:
         """One reading of the direction at rest; returns how many there are here."""
         direction = yaw_rad - slew_rad
         first = self._seen[0] if self._seen else direction
         self._seen.append(first + remainder(direction - first, pi))
         return len(self._seen)
 
-    def rest(self) -> str | None:
+    def finish_rest(self) -> str | None:
         """Enough was read here: completes the turn before; a sentence when it was none."""
         readings, direction = len(self._seen), sum(self._seen) / len(self._seen)
         record, before, self._before_rad = self._record, self._before_rad, direction

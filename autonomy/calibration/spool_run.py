@@ -48,7 +48,7 @@ class SpoolRun:
         """Nobody sees what the joint does."""
         return None
 
-    def judged(self, position: float) -> str | None:
+    def final_check(self, position: float) -> str | None:
         """Nor what it has done."""
         return None
 
@@ -56,7 +56,7 @@ class SpoolRun:
         """The valve shuts from now on."""
         self.program = self.program.closing(run_s, CLOSE_S)
 
-    def silent(self, run_s: float) -> bool:
+    def is_silent(self, run_s: float) -> bool:
         """Whether there is nothing to tell now: before its begin, and once its end is told."""
         return run_s < 0.0 or (run_s > self.program.duration_s and self._told_end)
 

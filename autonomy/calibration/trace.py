@@ -1,6 +1,6 @@
 """What the bus said while a function was tested: commands, spools, joint positions, lift pressures, with their times.
 
-Frames go in as they come (`BusTrace.take`, any number at a time), columns over a stretch of time come out.  Nothing
+Frames go in as they come (`BusTrace.accept`, any number at a time), columns over a stretch of time come out.  Nothing
 here sends.  Positions are the encoder's counts through the profile, not the controller's estimate; commands and spools
 carry the profile's sign, so that + is positive joint motion everywhere.
 """
@@ -113,7 +113,7 @@ class BusTrace:
         """The frames it wants."""
         return (*self._readers, *self._encoders)
 
-    def take(self, frames: Iterable[Frame]) -> None:
+    def accept(self, frames: Iterable[Frame]) -> None:
         """Frames as they came; what cannot be read is left out."""
         for stamp_ns, key, data in frames:
             if (encoder := self._encoders.get(key)) is not None:

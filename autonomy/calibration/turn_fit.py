@@ -65,7 +65,7 @@ class TurnFit:
     minus: SideFit
 
     @property
-    def stands_rad(self) -> float:
+    def angle_rad(self) -> float:
         """Where it stands now, counted from where it stood before its first turn."""
         return sum(self.plus.turns_rad) - sum(self.minus.turns_rad)
 
@@ -81,7 +81,7 @@ def fit_turns(turns: Sequence[Turn], spec: JointSpec) -> TurnFit:
 
 
 def pulse_to(spec: JointSpec, fit: TurnFit, side: int, share: float, to_rad: float) -> SpoolProgram:
-    """A pulse that should end at an angle, counted as ``stands_rad``."""
+    """A pulse that should end at an angle, counted as ``angle_rad``."""
     known = fit.side(side)
 
     def turn_rad(hold_s: float) -> float:
@@ -91,7 +91,7 @@ def pulse_to(spec: JointSpec, fit: TurnFit, side: int, share: float, to_rad: flo
         return known.full_speed * _full_speed_seconds(apply_backlash(spool, _half_backlash(spec)), spec, known.deadband)
 
     shut, held = turn_rad(0.0), turn_rad(1.0)
-    wanted = side * (to_rad - fit.stands_rad)
+    wanted = side * (to_rad - fit.angle_rad)
     least, most = HOLD_BOUNDS_S
     hold_s = (wanted - shut) / (held - shut) if held > shut else most
     return pulse(spec, side, share, min(max(hold_s, least), most))

@@ -87,7 +87,7 @@ class _TestModel:
         self.start = float(np.mean(self.position[:10]))
         self._played: dict[float, np.ndarray] = {}
 
-    def play(self, half: float) -> np.ndarray:
+    def after_backlash(self, half: float) -> np.ndarray:
         """The spool behind its play; kept, because most evaluations of a gradient share it."""
         if half not in self._played:
             if len(self._played) > 3:
@@ -100,7 +100,7 @@ class _TestModel:
         first = 0 if self.side > 0 else 1
         deadband, full, lag_s = p[first], p[4 + first], p[9 + first]
         half = 0.5 * p[2]
-        opening = np.clip((self.play(half) - deadband) / (1.0 - half - deadband), 0.0, 1.0)
+        opening = np.clip((self.after_backlash(half) - deadband) / (1.0 - half - deadband), 0.0, 1.0)
         speed = self.side * full * (1.0 + p[6] * self.along) * opening ** p[3]
         way = np.cumsum(speed) * self.step_s
         time = np.arange(len(way)) * self.step_s

@@ -25,7 +25,7 @@ from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
 from autonomy.grasp.grasp import Grasp
 from autonomy.grasp.planner import BunkFull, GraspSelector, NoGrasp
 from autonomy.grasp.selection import select_direct
-from autonomy.missions.crane_job import Mission
+from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.motion_planner import MotionPlanner, TimeOptimalPlanner
 from autonomy.motion.pose import Pose
 from autonomy.motion.setpoint_stream import SetpointStream
@@ -50,10 +50,10 @@ class Activity:
     """Picks the mission's log and lays it down; see the module's contract.
 
     ``phase``, ``paused`` (why it waits, or None) and ``failure`` (why it ended, or None) are for the operator;
-    ``idle`` says that nothing more will be sent.  ``rests`` is where an earlier job left the joints: one without an
-    encoder is taken to stand there.  ``motions``: whose motions it makes.  ``onward`` says of a log whether the next
+    ``idle`` says that nothing more will be sent.  ``last_setpoint`` is where an earlier job left the joints: one without an
+    encoder is taken to stand there.  ``motion_planner``: whose motions it makes.  ``fetches_next`` says of a log whether the next
     job would fetch it; where there is such a log the crane stays between the stakes, with open tongs, to go on from
-    there, and otherwise rises above them.  With ``stows`` no log is fetched: the crane goes over the bunk, holding
+    there, and otherwise rises above them.  With ``stow_only`` no log is fetched: the crane goes over the bunk, holding
     what it may hold, for the machine to drive; where it rests there already nothing moves.  ``rotator``: what earlier
     jobs found out about one without an encoder; afterwards what is known now.
     """
@@ -62,14 +62,14 @@ class Activity:
         self,
         profile: Profile,
         profile_hash: int,
-        mission: Mission | None = None,
+        mission: CraneJob | None = None,
         lease_ns: int = 200_000_000,
         key: bytes | None = None,
-        chooser: GraspSelector = select_direct,
-        rests: tuple[float, ...] = (0.0,) * len(JOINTS),
-        motions: MotionPlanner | None = None,
-        onward: Callable[[LogObservation], bool] | None = None,
-        stows: bool = False,
+        grasp_selector: GraspSelector = select_direct,
+        last_setpoint: tuple[float, ...] = (0.0,) * len(JOINTS),
+        motion_planner: MotionPlanner | None = None,
+        fetches_next: Callable[[LogObservation], bool] | None = None,
+        stow_only: bool = False,
         rotator: RotatorEstimate | None = None,
     ) -> None:
         self.phase = Phase.WAIT
@@ -78,24 +78,24 @@ class Activity:
         self.idle = False
         self.halted = False
         """A person lets it stand: it stops smoothly on its way; a grip that has begun is ended first."""
-        self.no_room = False
+        self.bunk_full = False
         """What was gripped has no room in the bunk."""
         self.rotator = self._count = rotator or RotatorEstimate()
         self._profile = planning_profile(profile, self._count)
-        self._first = Phase.STOW if stows else Phase.LOOK
-        self._onward = onward
-        motions = motions or TimeOptimalPlanner()
-        self._direct = motions.direct
+        self._first = Phase.STOW if stow_only else Phase.LOOK
+        self._fetches_next = fetches_next
+        motion_planner = motion_planner or TimeOptimalPlanner()
+        self._direct = motion_planner.direct
         self._stream = SetpointStream(profile_hash, lease_ns, key)
-        self._heard = Inbox(self._profile)
-        self._cycle = Cycle(self._profile, mission or Mission(), motions, chooser, self._heard)
-        self._tongs = GrappleSequence(self._profile, self._heard)
-        self._pursuit = TrajectoryTracker(profile, rests)
+        self._inbox = Inbox(self._profile)
+        self._cycle = Cycle(self._profile, mission or CraneJob(), motion_planner, grasp_selector, self._inbox)
+        self._grapple = GrappleSequence(self._profile, self._inbox)
+        self._tracker = TrajectoryTracker(profile, last_setpoint)
         self._elapsed_s = 0.0
         self._arrived_ns: int | None = None
         self._ready_ns: int | None = None
-        self._anew: Phase | None = None
-        self._sorry = ""
+        self._restart_phase: Phase | None = None
+        self._put_back_reason = ""
         """Why what was gripped is put back."""
         self._last_ns: int | None = None
 
@@ -130,17 +130,17 @@ class Activity:
         return self._cycle.lifted_kg
 
     @property
-    def rests(self) -> tuple[float, ...]:
+    def last_setpoint(self) -> tuple[float, ...]:
         """Where the joints were last sent, rad (EXT m), as far as is known now."""
-        return self.rotator.believed(self._count.counted(self._pursuit.sent))
+        return self.rotator.believed(self._count.counted(self._tracker.sent))
 
     @property
     def motion(self) -> Trajectory:
         """What the crane drives in the present phase."""
-        return self._pursuit.motion
+        return self._tracker.motion
 
     @property
-    def _held(self) -> bool:
+    def _is_halting(self) -> bool:
         return self.halted and self.phase not in (Phase.CLOSE, Phase.DONE, Phase.FAILED)
 
     def abort(self, reason: str) -> None:
@@ -157,10 +157,10 @@ class Activity:
         """
         dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _MAX_TICK_S)
         self._last_ns = now_ns
-        self._heard.take(now_ns, report, logs)
+        self._inbox.accept(now_ns, report, logs)
         if self.idle:
             return None
-        obstacle = self._heard.obstacle(now_ns, self._pursuit.sent)
+        obstacle = self._inbox.blocked_reason(now_ns, self._tracker.sent)
         if obstacle is not None:
             self.paused = obstacle
             self.idle = self.phase in (Phase.DONE, Phase.FAILED)
@@ -169,44 +169,44 @@ class Activity:
             self._resume()
         else:
             self._advance(dt_s)
-        self._proceed(now_ns)
-        self._tell_tongs(dt_s)
+        self._check_transition(now_ns)
+        self._command_grapple(dt_s)
         if self.idle or not self._stream.due(now_ns):
             return None
-        way = self._pursuit
-        return self._stream.datagram(now_ns, self._count.motion(way.motion), way.clock_s, self._tongs.command, way.rate)
+        way = self._tracker
+        return self._stream.datagram(now_ns, self._count.motion(way.motion), way.clock_s, self._grapple.command, way.rate)
 
     def _position(self) -> tuple[float, ...]:
-        return self._heard.position(self._pursuit.sent)
+        return self._inbox.position(self._tracker.sent)
 
     def _resume(self) -> None:
         """Goes on from the measured pose, in the interrupted phase or at the way to it."""
         self.paused = None
         measured = self._position()
-        follows = self._heard.report.mode == Mode.ACTIVE and all(map(isfinite, self._heard.report.reference))
-        start = self._count.believed(self._heard.report.reference) if follows else measured
+        follows = self._inbox.report.mode == Mode.ACTIVE and all(map(isfinite, self._inbox.report.reference))
+        start = self._count.believed(self._inbox.report.reference) if follows else measured
         phase = self._first if self.phase is Phase.WAIT else self.phase
-        if phase in RESUME_PHASE and self._cycle.is_aside(phase, measured):
+        if phase in RESUME_PHASE and self._cycle.is_off_column(phase, measured):
             phase = RESUME_PHASE[phase]
         self._enter(phase, start)
-        self._pursuit.rate = 0.0
+        self._tracker.rate = 0.0
 
     def _enter(self, phase: Phase, start: tuple[float, ...]) -> None:
         """Plans a phase from a joint position and begins it."""
         self.phase = phase
         self._elapsed_s = 0.0
-        self._arrived_ns = self._ready_ns = self._anew = None
-        closing_s = self._tongs.follow() if phase is Phase.CLOSE else 0.0
+        self._arrived_ns = self._ready_ns = self._restart_phase = None
+        closing_s = self._grapple.follow() if phase is Phase.CLOSE else 0.0
         try:
-            self._pursuit.begin(self._cycle.plan(phase, start, closing_s))
+            self._tracker.begin(self._cycle.plan(phase, start, closing_s))
         except (Unreachable, NoGrasp) as error:
-            self._pursuit.begin(hold(start))
-            self.no_room = isinstance(error, BunkFull)
-            if phase in (Phase.LIFT, Phase.CARRY) and self._cycle.is_over_the_grasp(start):
-                self._sorry = str(error)
-                self._cycle.put_back()
+            self._tracker.begin(hold(start))
+            self.bunk_full = isinstance(error, BunkFull)
+            if phase in (Phase.LIFT, Phase.CARRY) and self._cycle.is_over_grasp(start):
+                self._put_back_reason = str(error)
+                self._cycle.plan_return()
                 self._enter(Phase.LOWER, start)
-            elif phase is Phase.ABOVE and self._cycle.take_former():
+            elif phase is Phase.ABOVE and self._cycle.restore_previous_grasp():
                 self._enter(Phase.DESCEND, start)
             else:
                 self._fail(str(error))
@@ -218,25 +218,25 @@ class Activity:
 
     def _advance(self, dt_s: float) -> None:
         """Moves on along the motion, or smoothly slower to wait for the tongs or to stop for good."""
-        way = self._pursuit
-        self._elapsed_s += 0.0 if self._held else dt_s
-        stops = self._held or self.phase is Phase.FAILED or self._anew is not None
-        wanted = 0.0 if stops else motion_rate(self.phase, self._elapsed_s, way, self._tongs, self.grasp)
+        way = self._tracker
+        self._elapsed_s += 0.0 if self._is_halting else dt_s
+        stops = self._is_halting or self.phase is Phase.FAILED or self._restart_phase is not None
+        wanted = 0.0 if stops else motion_rate(self.phase, self._elapsed_s, way, self._grapple, self.grasp)
         way.advance(dt_s, wanted, self._position())
-        if self.phase is Phase.FAILED and way.stands:
-            way.stand()
+        if self.phase is Phase.FAILED and way.is_stopped:
+            way.hold_here()
 
-    def _tell_tongs(self, dt_s: float) -> None:
-        command = grapple_command(self.phase, self._cycle.gathered, stows=self._first is Phase.STOW)
+    def _command_grapple(self, dt_s: float) -> None:
+        command = grapple_command(self.phase, self._cycle.is_bundle, stow_only=self._first is Phase.STOW)
         if command is GrappleCommand.OPEN and self.phase is not Phase.OPEN:
-            command = GrappleCommand.NEUTRAL if self._cycle.is_among_stakes(self._position()) else command
+            command = GrappleCommand.NEUTRAL if self._cycle.is_between_stakes(self._position()) else command
         if self.phase is Phase.OPEN:
-            self._tongs.let_go(dt_s)
+            self._grapple.release(dt_s)
         else:
-            self._tongs.tell(command, dt_s)
+            self._grapple.apply(command, dt_s)
 
     # ------------------------------------------------------------------ what follows
-    def _proceed(self, now_ns: int) -> None:
+    def _check_transition(self, now_ns: int) -> None:
         """Ends the phase when its work is done, or the mission when its time is over."""
         if self.phase is Phase.FAILED:
             self.idle = self._elapsed_s > BRAKE_S + _FINAL_HOLD_S
@@ -244,48 +244,48 @@ class Activity:
         if self.phase is Phase.DONE:
             self.idle = self._elapsed_s > _FINAL_HOLD_S
             return
-        if self._held:
+        if self._is_halting:
             return
-        if self._anew is not None:
-            if self._pursuit.stands:
-                self._enter(self._anew, self._pursuit.sent)
+        if self._restart_phase is not None:
+            if self._tracker.is_stopped:
+                self._enter(self._restart_phase, self._tracker.sent)
             return
         rule = PHASE_RULES[self.phase]
         if self._arrived_ns is None and is_motion_done(
-            self.phase, self._elapsed_s, self._pursuit, self._tongs, self.grasp, self._position()
+            self.phase, self._elapsed_s, self._tracker, self._grapple, self.grasp, self._position()
         ):
             self._arrived_ns = now_ns
-        gathers = self.phase is Phase.LIFT and self._cycle.gathered
-        if gathers and self._cycle.slid_off(self._tongs, self._position()):
-            self._anew = Phase.ABOVE
+        gathers = self.phase is Phase.LIFT and self._cycle.is_bundle
+        if gathers and self._cycle.has_slipped_off(self._grapple, self._position()):
+            self._restart_phase = Phase.ABOVE
             return
         if self.phase in (Phase.LIFT, Phase.CARRY) and self._direct and not gathers:
-            self._watch(now_ns)
-            if self._anew is not None or self.phase is Phase.FAILED:
+            self._verify_load(now_ns)
+            if self._restart_phase is not None or self.phase is Phase.FAILED:
                 return  # the list is judged, and not to be judged again
         following = self._next(now_ns) if self._arrived_ns is not None else None
         if following is not None and self.halted:
             return
-        if following is Phase.OPEN and self._heard.fresh(now_ns):
-            self._see_rotator()
+        if following is Phase.OPEN and self._inbox.is_fresh(now_ns):
+            self._update_rotator()
         if following is not None:
-            self._enter(following, self._pursuit.sent)
+            self._enter(following, self._tracker.sent)
         elif self._elapsed_s > _TIMEOUT_FACTOR * self.motion.duration_s + rule.settle_s + rule.slack_s:
-            off = self._pursuit.worst_joint(self._position())
-            self._fail(f"{rule.trouble} within {self._elapsed_s:.0f} s{off}")
+            off = self._tracker.worst_joint(self._position())
+            self._fail(f"{rule.timeout_message} within {self._elapsed_s:.0f} s{off}")
 
     def _next(self, now_ns: int) -> Phase | None:
         """The phase after this one, whose motion is done; None while it still waits for something."""
-        seen = self._arrived_ns is not None and self._heard.logs_ns >= self._arrived_ns
+        seen = self._arrived_ns is not None and self._inbox.logs_ns >= self._arrived_ns
         match self.phase:
             case Phase.LOOK:
                 return self._after_look(now_ns) if seen else None
             case Phase.ABOVE:
-                return self._after_above(now_ns) if self._tongs.open else None
+                return self._after_above(now_ns) if self._grapple.open else None
             case Phase.CLOSE:
-                return self._cycle.after_closing(self._tongs)
+                return self._cycle.after_closing(self._grapple)
             case Phase.LIFT | Phase.CARRY:
-                if self.phase is Phase.CARRY and self._carried(now_ns):
+                if self.phase is Phase.CARRY and self._is_seen_in_grapple(now_ns):
                     return Phase.LOWER
                 return self._after_lift() if seen else None
             case Phase.OPEN:
@@ -299,13 +299,13 @@ class Activity:
     def _after_look(self, now_ns: int) -> Phase | None:
         """Over a grasp.  What a camera measures is looked at for a while before there is said to be none."""
         first_ns = self._ready_ns
-        if first_ns is not None and self._heard.logs_ns < now_ns <= first_ns + DETECTION_TIMEOUT_NS:
+        if first_ns is not None and self._inbox.logs_ns < now_ns <= first_ns + DETECTION_TIMEOUT_NS:
             return None  # nothing new is known
         try:
-            self._cycle.choose(self.motion.goal)
+            self._cycle.select_grasp(self.motion.goal)
         except NoGrasp as error:
             self._ready_ns = first_ns or now_ns
-            if now_ns > self._ready_ns + DETECTION_TIMEOUT_NS or not self._heard.measured:
+            if now_ns > self._ready_ns + DETECTION_TIMEOUT_NS or not self._inbox.has_camera_measurements:
                 self._fail(str(error))
             return None
         return Phase.ABOVE
@@ -313,18 +313,18 @@ class Activity:
     def _after_above(self, now_ns: int) -> Phase | None:
         """Down, or first over a better grasp: from above, logs that a camera measured from aside are known better."""
         assert self._arrived_ns is not None
-        if not self._cycle.unsure:
+        if not self._cycle.needs_reselection:
             return Phase.DESCEND
-        if self._heard.logs_ns < self._arrived_ns + SETTLE_AFTER_ARRIVAL_NS:
+        if self._inbox.logs_ns < self._arrived_ns + SETTLE_AFTER_ARRIVAL_NS:
             return None if now_ns < self._arrived_ns + DETECTION_TIMEOUT_NS else Phase.DESCEND
-        return Phase.ABOVE if self._cycle.choose_better(self.motion.goal) else Phase.DESCEND
+        return Phase.ABOVE if self._cycle.reselect_grasp(self.motion.goal) else Phase.DESCEND
 
     def _after_lift(self) -> Phase | None:
-        if self._cycle.came_up((self._position(), self._pursuit.sent)):
+        if self._cycle.confirm_lift((self._position(), self._tracker.sent)):
             if self.phase is Phase.LIFT:
-                self._see_rotator()
+                self._update_rotator()
             return Phase(self.phase + 1)
-        if reason := self._cycle.came_up_empty():
+        if reason := self._cycle.count_miss():
             self._fail(reason)
             return None
         return Phase.LOOK
@@ -332,26 +332,26 @@ class Activity:
     def _after_open(self, now_ns: int) -> Phase | None:
         """Up and away, or done here with the next log in view."""
         assert self.grasp is not None
-        if not self._tongs.released(self.grasp, self._elapsed_s):
+        if not self._grapple.has_released(self.grasp, self._elapsed_s):
             return None
-        if self._sorry:
-            self._fail(self._sorry)
+        if self._put_back_reason:
+            self._fail(self._put_back_reason)
             return None
-        if self._onward is None or not self._direct:
+        if self._fetches_next is None or not self._direct:
             return Phase.RETREAT
         self._ready_ns = self._ready_ns or now_ns
-        if self._heard.logs_ns < self._ready_ns:
+        if self._inbox.logs_ns < self._ready_ns:
             return None
-        return self._after_retreat() if any(map(self._onward, self._cycle.others())) else Phase.RETREAT
+        return self._after_retreat() if any(map(self._fetches_next, self._cycle.others())) else Phase.RETREAT
 
     def _after_retreat(self) -> Phase | None:
-        if reason := self._cycle.astray():
+        if reason := self._cycle.misplaced_log():
             self._fail(reason)
             return None
         return Phase.DONE
 
     # ------------------------------------------------------------------ what hangs in the grapple
-    def _watch(self, now_ns: int) -> None:
+    def _verify_load(self, now_ns: int) -> None:
         """Judges on the way what hangs in the grapple; where it is not what the way was planned for, a stop and
         another.
         """
@@ -360,27 +360,27 @@ class Activity:
             if self.phase is Phase.CARRY or risen_m > VERIFY_LIFT_M or self._arrived_ns is not None:
                 self._ready_ns = now_ns
             return
-        if self._heard.logs_ns <= self._ready_ns:
+        if self._inbox.logs_ns <= self._ready_ns:
             return
-        self._ready_ns = self._heard.logs_ns
+        self._ready_ns = self._inbox.logs_ns
         before = self.grasp
         following = self._after_lift()
         if following is Phase.LOOK:
-            self._anew = Phase.LOOK
+            self._restart_phase = Phase.LOOK
         elif following is Phase.CARRY:
-            turn = self._cycle.turn_on_the_way(self._position()) if self.grasp is before else None
+            turn = self._cycle.rotator_correction(self._position()) if self.grasp is before else None
             if turn is None:
-                self._anew = Phase.CARRY
+                self._restart_phase = Phase.CARRY
                 return
             self.phase = Phase.CARRY
             if turn:
-                self._pursuit.motion = with_rotation(self.motion, self._pursuit.clock_s, turn)
+                self._tracker.motion = with_rotation(self.motion, self._tracker.clock_s, turn)
 
-    def _carried(self, now_ns: int) -> bool:
+    def _is_seen_in_grapple(self, now_ns: int) -> bool:
         """Whether the log was seen in the grapple a moment ago."""
-        return self._direct and self._ready_ns == self._heard.logs_ns and self._heard.fresh(now_ns)
+        return self._direct and self._ready_ns == self._inbox.logs_ns and self._inbox.is_fresh(now_ns)
 
-    def _see_rotator(self) -> None:
+    def _update_rotator(self) -> None:
         """What hangs in the tongs tells how the rotator stands: the next job is to know."""
         seen = self._cycle.first()
         if seen is not None and has_no_encoder(self._profile):

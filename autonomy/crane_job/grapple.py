@@ -115,104 +115,104 @@ class GrappleSequence:
 
     def __init__(self, profile: Profile, heard: Inbox) -> None:
         self.command = GrappleCommand.HOLD
-        self._profile, self._heard = profile, heard
-        self._opening_s = self._close_from_s = self._still_s = self._calm_s = 0.0
-        self._stood_pct = self._held_kg = 0.0
-        self._let_go = self.pushed = False
-        """``pushed``: while opening they came to push against something; a load cell tells."""
+        self._profile, self._inbox = profile, heard
+        self._opening_s = self._close_from_s = self._still_s = self._since_push_s = 0.0
+        self._reference_pct = self._held_kg = 0.0
+        self._has_let_go = self.is_obstructed = False
+        """``is_obstructed``: while opening they came to push against something; a load cell tells."""
 
-    def let_go(self, dt_s: float) -> None:
+    def release(self, dt_s: float) -> None:
         """Open, from now on for so long; once they push, back as far as they do so, and hold still."""
-        gives_way = self.pushed and self._pushes
+        gives_way = self.is_obstructed and self._is_pushing
         back = GrappleCommand.CLOSE if gives_way else GrappleCommand.NEUTRAL
-        self.tell(back if self.pushed else GrappleCommand.OPEN, dt_s, gives_way)
+        self.apply(back if self.is_obstructed else GrappleCommand.OPEN, dt_s, gives_way)
 
-    def tell(self, command: GrappleCommand, dt_s: float, gives_way: bool = False) -> None:
+    def apply(self, command: GrappleCommand, dt_s: float, gives_way: bool = False) -> None:
         """A command, from now on for so long; ``gives_way``: not to close, but to push no longer."""
         self.command = command
-        opening = self._heard.report.opening_pct if self._heard.report is not None else 0.0
+        opening = self._inbox.report.opening_pct if self._inbox.report is not None else 0.0
         self._still_s += dt_s
-        if abs(opening - self._stood_pct) > _STILL_BAND_PCT:
-            self._stood_pct, self._still_s = opening, 0.0
+        if abs(opening - self._reference_pct) > _STILL_BAND_PCT:
+            self._reference_pct, self._still_s = opening, 0.0
         if gives_way or command in (GrappleCommand.OPEN, GrappleCommand.NEUTRAL):
-            self._feel(dt_s)
+            self._sense_load(dt_s)
         else:
-            self._held_kg, self._let_go, self.pushed = self._load_kg, False, False
+            self._held_kg, self._has_let_go, self.is_obstructed = self._load_kg, False, False
         if command is GrappleCommand.OPEN:
             self._opening_s += dt_s
         elif command is not GrappleCommand.NEUTRAL:
             self._opening_s = 0.0
 
-    def _feel(self, dt_s: float) -> None:
-        self._let_go |= self._load_kg < _RELEASED_KG
-        self.pushed |= self._let_go and self._pushes
-        self._calm_s = 0.0 if self._pushes else self._calm_s + dt_s
+    def _sense_load(self, dt_s: float) -> None:
+        self._has_let_go |= self._load_kg < _RELEASED_KG
+        self.is_obstructed |= self._has_let_go and self._is_pushing
+        self._since_push_s = 0.0 if self._is_pushing else self._since_push_s + dt_s
 
     @property
     def _load_kg(self) -> float:
-        return self._heard.report.load_kg if self._heard.report is not None else 0.0
+        return self._inbox.report.load_kg if self._inbox.report is not None else 0.0
 
     @property
-    def _pushes(self) -> bool:
+    def _is_pushing(self) -> bool:
         return self._load_kg > max(_PUSH_LOAD_KG, _PUSH_FACTOR * self._held_kg)
 
     @property
     def open(self) -> bool:
         """Whether they stand open."""
-        return is_open(self._profile, self._heard.report, self._opening_s)
+        return is_open(self._profile, self._inbox.report, self._opening_s)
 
-    def are_wide(self, grasp: Grasp, climbs: int) -> bool:
+    def is_stalled_wide(self, grasp: Grasp, climbs: int) -> bool:
         """Whether they are seen to stand too wide open to lift what they hold, gripped higher so often already, where
         there is less; without a sensor nobody knows.
         """
         wood_m = sum(log.diameter_m for log in grasp.logs)
-        too_open = self._heard.report.opening_pct > _STALLED_WIDE_PCT - _STALLED_WIDE_STEP_PCT * climbs
+        too_open = self._inbox.report.opening_pct > _STALLED_WIDE_PCT - _STALLED_WIDE_STEP_PCT * climbs
         return too_open or self._gap_m() > wood_m + _STALLED_EXCESS_M
 
-    def have_missed(self, grasp: Grasp) -> bool:
+    def has_missed(self, grasp: Grasp) -> bool:
         """Whether they are seen to have shut on nothing where thick logs were, or to pinch the upper half of a log that
         they were to be under; without a sensor nobody knows.
         """
-        if is_closed_empty(self._heard.report):
+        if is_closed_empty(self._inbox.report):
             return grasp.thinnest_m > _THICK_LOG_M
-        return grasp.drawn and self._gap_m() > _UNDER_LOG_SHARE * grasp.thinnest_m
+        return grasp.extracts and self._gap_m() > _UNDER_LOG_SHARE * grasp.thinnest_m
 
     @property
-    def hold_nothing(self) -> bool:
+    def holds_nothing(self) -> bool:
         """Whether they are seen to have shut, and nothing weighs in them; without a load cell nobody knows."""
-        return is_closed_empty(self._heard.report) and self._heard.report.load_kg < _EMPTY_ON_GROUND_KG
+        return is_closed_empty(self._inbox.report) and self._inbox.report.load_kg < _EMPTY_ON_GROUND_KG
 
     def _gap_m(self) -> float:
         """Between the tips; 0 when no sensor tells."""
-        opening, tongs = self._heard.report.opening_pct, self._profile.grapple.tongs
+        opening, tongs = self._inbox.report.opening_pct, self._profile.grapple.tongs
         return 2.0 * half_gap_m(tongs, tong_angle_from_opening_pct(tongs, opening)) if isfinite(opening) else 0.0
 
     @property
     def empty(self) -> bool:
         """Whether they have shut on nothing that is seen."""
-        return is_closed_empty(self._heard.report)
+        return is_closed_empty(self._inbox.report)
 
     @property
-    def still(self) -> bool:
+    def is_still(self) -> bool:
         """Whether they have not moved for a while."""
         return self._still_s > _STILL_S
 
-    def gripped(self, closing_s: float) -> bool:
+    def has_closed(self, closing_s: float) -> bool:
         """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""
-        return has_closed(self._heard.report, closing_s)
+        return has_closed(self._inbox.report, closing_s)
 
-    def released(self, grasp: Grasp, opening_s: float) -> bool:
+    def has_released(self, grasp: Grasp, opening_s: float) -> bool:
         """Whether they have left the logs of a grasp, ``opening_s`` after they were told to open there, or opened until
         they pushed against something, gave way, and the crane has swung out.
         """
-        return self._calm_s > _STILL_S if self.pushed else has_released(self._profile, self._heard.report, grasp, opening_s)
+        return self._since_push_s > _STILL_S if self.is_obstructed else has_released(self._profile, self._inbox.report, grasp, opening_s)
 
     def follow(self) -> float:
         """The pin is to follow them from now on: how long they have been closing, s; 0 where no sensor tells."""
-        measured_s = equivalent_closing_s(self._profile, self._heard.report)
+        measured_s = equivalent_closing_s(self._profile, self._inbox.report)
         self._close_from_s = measured_s if isfinite(measured_s) else 0.0
         return self._close_from_s
 
     def pace(self, clock_s: float) -> float:
         """How fast the pin is to go that has followed them for so much of its motion."""
-        return following_rate(equivalent_closing_s(self._profile, self._heard.report) - self._close_from_s - clock_s)
+        return following_rate(equivalent_closing_s(self._profile, self._inbox.report) - self._close_from_s - clock_s)

@@ -25,45 +25,45 @@ MAX_RESTARTS: Final = 2
 
 @dataclass(slots=True)
 class GraspRecovery:
-    """How often one grasp was taken higher up since its logs were last looked at, and begun anew; ``stubborn`` are the
+    """How often one grasp was taken higher up since its logs were last looked at, and begun anew; ``excluded_logs`` are the
     numbers of logs that it is better chosen without: drawn in vain, or inside of a row that was closed round in vain.
     """
 
-    climbs: int = 0
-    begun: int = 0
-    stubborn: tuple[int, ...] = ()
+    raised_count: int = 0
+    restart_count: int = 0
+    excluded_logs: tuple[int, ...] = ()
 
     def after_closing(self, grasp: Grasp, tongs: GrappleSequence) -> tuple[Phase | None, Grasp]:
         """The phase that follows, None while the tongs still move, and the grasp as it is then tried."""
         if not is_camera_measured(grasp):
             return Phase.LIFT, grasp
-        wide = self.climbs < MAX_REGRIPS_HIGHER and tongs.are_wide(grasp, self.climbs)
+        wide = self.raised_count < MAX_REGRIPS_HIGHER and tongs.is_stalled_wide(grasp, self.raised_count)
         # Higher up there may be a thin log that nobody saw, which shut tongs hold: its weight tells.
-        vain = tongs.hold_nothing if self.climbs else tongs.have_missed(grasp)
-        if self.climbs and tongs.empty and not tongs.still:
+        vain = tongs.holds_nothing if self.raised_count else tongs.has_missed(grasp)
+        if self.raised_count and tongs.empty and not tongs.is_still:
             return None, grasp  # the crane still swings, and its load with it
-        missed = vain and self.begun < MAX_RESTARTS
+        missed = vain and self.restart_count < MAX_RESTARTS
         if not wide and not missed:
             return Phase.LIFT, grasp
-        if not tongs.still:
+        if not tongs.is_still:
             return None, grasp
         if wide:
-            self.climbs += 1
+            self.raised_count += 1
             pose = grasp.pose.at_height(grasp.pose.z_m + REGRIP_STEP_M)
             return Phase.DESCEND, replace(grasp, pose=pose, support_z_m=grasp.support_z_m + REGRIP_STEP_M)
-        if grasp.drawn and not grasp.drags and not tongs.empty:
-            return Phase.CLOSE, replace(grasp, drags=True)
-        return Phase.ABOVE, self._anew(grasp)
+        if grasp.extracts and not grasp.dragging and not tongs.empty:
+            return Phase.CLOSE, replace(grasp, dragging=True)
+        return Phase.ABOVE, self._restarted(grasp)
 
     def after_rising(self, grasp: Grasp, tongs: GrappleSequence) -> Grasp | None:
         """The grasp, to be begun anew, where the tongs hold nothing that would weigh by now; None where they may."""
-        empty = is_camera_measured(grasp) and tongs.still and tongs.hold_nothing
-        return self._anew(grasp) if empty and self.begun < MAX_RESTARTS else None
+        empty = is_camera_measured(grasp) and tongs.is_still and tongs.holds_nothing
+        return self._restarted(grasp) if empty and self.restart_count < MAX_RESTARTS else None
 
-    def _anew(self, grasp: Grasp) -> Grasp:
-        self.stubborn += _inner_logs(grasp) if self.climbs else (grasp.log.id,) if grasp.drawn else ()
-        self.begun, self.climbs = self.begun + 1, 0
-        return replace(grasp, drags=False)
+    def _restarted(self, grasp: Grasp) -> Grasp:
+        self.excluded_logs += _inner_logs(grasp) if self.raised_count else (grasp.log.id,) if grasp.extracts else ()
+        self.restart_count, self.raised_count = self.restart_count + 1, 0
+        return replace(grasp, dragging=False)
 
 
 def _inner_logs(grasp: Grasp) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from autonomy.grasp.bunk_load import is_over_bunk
 from autonomy.grasp.grasp import Grasp, hangs_below, restricted_to
 from autonomy.grasp.placement import lies_in_bunk, plan_place
 from autonomy.grasp.planner import NoGrasp
-from autonomy.missions.crane_job import Mission
+from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.perception.log_list.observation import LogObservation
@@ -58,7 +58,7 @@ def is_between_jaws(arm: Arm, log: LogObservation, pin: Pose) -> bool:
     return aside_m < 0.5 * log.diameter_m and 0.0 < below_m < lowest_tip_below_pin_m(arm.profile.grapple.tongs)
 
 
-def is_at_target(mission: Mission, target: Bunk, log: LogObservation) -> bool:
+def is_at_target(mission: CraneJob, target: Bunk, log: LogObservation) -> bool:
     """Whether a log that was let go lies where it was to be: in the target, or, where logs only have to get out of
     their source, low beside it, for it may roll.
     """
@@ -68,7 +68,7 @@ def is_at_target(mission: Mission, target: Bunk, log: LogObservation) -> bool:
 
 
 def corrected_place(
-    arm: Arm, mission: Mission, grasp: Grasp, place: Pose, logs: Sequence[LogObservation], position: Sequence[float]
+    arm: Arm, mission: CraneJob, grasp: Grasp, place: Pose, logs: Sequence[LogObservation], position: Sequence[float]
 ) -> Pose | None:
     """The place with the rotator turned for the log as it is now seen to hang; None when another way is asked for.
 

@@ -29,7 +29,7 @@ class Inbox:
         self.logs: tuple[LogObservation, ...] = ()
         self.logs_ns = -1
 
-    def take(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> None:
+    def accept(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> None:
         """What came since the last call; None and () when nothing did."""
         if report is not None:
             self._report, self._report_ns = report, now_ns
@@ -37,7 +37,7 @@ class Inbox:
             self.logs, self.logs_ns = logs, now_ns
 
     @property
-    def measured(self) -> bool:
+    def has_camera_measurements(self) -> bool:
         """Whether a camera measured one of the logs: what it sees next may be better."""
         return any(log.covariance is not None for log in self.logs)
 
@@ -54,7 +54,7 @@ class Inbox:
             for j, p, q in zip(JOINTS, self.report.position, sent, strict=True)
         )
 
-    def obstacle(self, now_ns: int, sent: Sequence[float]) -> str | None:
+    def blocked_reason(self, now_ns: int, sent: Sequence[float]) -> str | None:
         """Why no setpoint would be obeyed now."""
         if self._report is None:
             return "the controller has not reported"
@@ -67,6 +67,6 @@ class Inbox:
             return "a joint position is unknown"
         return None
 
-    def fresh(self, now_ns: int) -> bool:
+    def is_fresh(self, now_ns: int) -> bool:
         """Whether the log list is of this moment."""
         return now_ns - self.logs_ns < LOG_LIST_FRESH_NS

@@ -24,11 +24,11 @@ _SINKING_S: Final = 0.6
 def motion_rate(phase: Phase, elapsed_s: float, way: TrajectoryTracker, tongs: GrappleSequence, grasp: Grasp | None) -> float:
     """Seconds of the motion in a second that are wanted; 0 where it is to come to a stop and wait."""
     match phase:
-        case Phase.CLOSE if grasp is None or not grasp.drags:
-            return 0.0 if tongs.gripped(elapsed_s) else tongs.pace(way.clock_s)
+        case Phase.CLOSE if grasp is None or not grasp.dragging:
+            return 0.0 if tongs.has_closed(elapsed_s) else tongs.pace(way.clock_s)
         case Phase.ABOVE if way.left_s < OPENING_GATE_S and not tongs.open:
             return 0.0
-        case Phase.LIFT if grasp is not None and grasp.gathered and not tongs.gripped(elapsed_s):
+        case Phase.LIFT if grasp is not None and grasp.is_bundle and not tongs.has_closed(elapsed_s):
             return 0.0  # the logs have settled: up again when the tongs have followed
     return 1.0
 
@@ -38,9 +38,9 @@ def is_motion_done(
 ) -> bool:
     """Whether the motion is done and at rest with the joints measured at ``position``, rad (EXT m)."""
     if phase is Phase.CLOSE:
-        held = way.stands and not (grasp is not None and grasp.drags)
-        return tongs.gripped(elapsed_s) and (held or way.left_s <= 0.0)
-    if phase is Phase.DESCEND and grasp is not None and grasp.pressed and _stopped_by_wood(elapsed_s, way):
+        held = way.is_stopped and not (grasp is not None and grasp.dragging)
+        return tongs.has_closed(elapsed_s) and (held or way.left_s <= 0.0)
+    if phase is Phase.DESCEND and grasp is not None and grasp.penetrates and _stopped_by_wood(elapsed_s, way):
         return True
     share = _LAYING_TOLERANCE_FACTOR if phase in (Phase.CARRY, Phase.LOWER) else 1.0
     return way.clock_s >= way.motion.duration_s + PHASE_RULES[phase].settle_s and way.arrived(position, share)
@@ -49,4 +49,4 @@ def is_motion_done(
 def _stopped_by_wood(elapsed_s: float, way: TrajectoryTracker) -> bool:
     """Whether open tongs that are pressed into a heap get no deeper; they sink as they close."""
     late = elapsed_s > way.motion.duration_s + _SINKING_S
-    return late or (way.stands and elapsed_s > _SINKING_S)
+    return late or (way.is_stopped and elapsed_s > _SINKING_S)

@@ -46,22 +46,22 @@ PILE_LIFT_S: Final = 4.0
 """The same out of a heap, which is nearer to that height."""
 
 
-def approach_motion(arm: Arm, motions: MotionPlanner, start: Pose, grasp: Grasp, logs: Sequence[LogObservation]) -> Trajectory:
+def approach_motion(arm: Arm, motion_planner: MotionPlanner, start: Pose, grasp: Grasp, logs: Sequence[LogObservation]) -> Trajectory:
     """With open tongs to where they close, or above it: among other logs, and on tyres, only the last, straight way
     down is safe.
     """
     # Open tongs come from above rather than from aside, for the log may lie a little elsewhere, and so may they.
     broad = [replace(o, diameter_m=o.diameter_m + 2.0 * APPROACH_CLEARANCE_M) if o.id == grasp.log.id else o for o in logs]
     around, high_m = collision_scene(arm.profile, broad), travel_height_m(arm.profile)
-    if motions.direct and not grasp.gathered:
+    if motion_planner.direct and not grasp.is_bundle:
         stands = arm.profile.carrier is None
         goal = grasp.pose if stands else grasp.pose.at_height(grasp.pose.z_m + MACHINE_LEAN_M)
         try:
-            return motions(arm, start, goal, around, None, high_m, 0.0)
+            return motion_planner(arm, start, goal, around, None, high_m, 0.0)
         except Unreachable:  # a stump or a log beside it: from above, then
             pass
     over = grasp.pose.at_height(hover_height_m(arm.profile, grasp))
-    return motions(arm, start, over, around, None, high_m, 0.0)
+    return motion_planner(arm, start, over, around, None, high_m, 0.0)
 
 
 def corrected_grasp(arm: Arm, grasp: Grasp, logs: Sequence[LogObservation]) -> Grasp:
@@ -77,7 +77,7 @@ def corrected_grasp(arm: Arm, grasp: Grasp, logs: Sequence[LogObservation]) -> G
     support = max(grasp.support_z_m + dz, known_ground_m(arm.profile))
     (x, y), z = arm.xy(grasp.pose), grasp.pose.z_m + support - grasp.support_z_m
     try:
-        pose = arm.over(x + dx, y + dy, z, travel_height_m(arm.profile))._replace(rot_rad=grasp.pose.rot_rad)
+        pose = arm.pose_above(x + dx, y + dy, z, travel_height_m(arm.profile))._replace(rot_rad=grasp.pose.rot_rad)
     except Unreachable:
         return grasp
     others = tuple(next((log for log in logs if log.id == o.id), o) for o in grasp.others)
@@ -86,7 +86,7 @@ def corrected_grasp(arm: Arm, grasp: Grasp, logs: Sequence[LogObservation]) -> G
 
 def carry_motion(
     arm: Arm,
-    motions: MotionPlanner,
+    motion_planner: MotionPlanner,
     start: Pose,
     place: Pose,
     grasp: Grasp,
@@ -101,11 +101,11 @@ def carry_motion(
     held = replace(held, diameter_m=hypot(*(log.diameter_m for log in grasp.logs)))  # a bundle is as thick as all
     high_m, free_m = travel_height_m(arm.profile), approach_length_m(arm.profile, grasp.log)
     try:
-        return motions(arm, start, place, around, held, high_m, free_m)
+        return motion_planner(arm, start, place, around, held, high_m, free_m)
     except Unreachable:  # close to the stakes: over it first, and from there straight down
         if place.z_m >= high_m:
             raise
-        return motions(arm, start, place.at_height(high_m), around, held, high_m, free_m)
+        return motion_planner(arm, start, place.at_height(high_m), around, held, high_m, free_m)
 
 
 def closing_motion(arm: Arm, start: Pose, grasp: Grasp, begin_s: float) -> Trajectory:
@@ -126,7 +126,7 @@ def extraction_motion(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
     out = way[0] - along * log.axis[0], way[1] - along * log.axis[1]
     far = EXTRACTION_DISTANCE_M / max(hypot(*out), 1e-3)
     try:
-        aside = arm.over(x + far * out[0], y + far * out[1], start.z_m, travel_height_m(arm.profile))
+        aside = arm.pose_above(x + far * out[0], y + far * out[1], start.z_m, travel_height_m(arm.profile))
     except Unreachable:
         return straight_line(arm, start, start)
     turned = start.rot_rad - (aside.slew_rad - start.slew_rad)
@@ -135,15 +135,15 @@ def extraction_motion(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
 
 def bundle_lift_motion(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
     """A bundle up, slowly: its logs settle, and the tongs follow them under it."""
-    column = start if grasp.drags else grasp.pose
+    column = start if grasp.dragging else grasp.pose
     goal = column.at_height(travel_height_m(arm.profile))
-    return slow_line(arm, start, goal, PILE_LIFT_S if grasp.pressed and not grasp.drags else BUNDLE_LIFT_S)
+    return slow_line(arm, start, goal, PILE_LIFT_S if grasp.penetrates and not grasp.dragging else BUNDLE_LIFT_S)
 
 
-def stow_motion(arm: Arm, motions: MotionPlanner, start: Pose, logs: Sequence[LogObservation]) -> Trajectory:
+def stow_motion(arm: Arm, motion_planner: MotionPlanner, start: Pose, logs: Sequence[LogObservation]) -> Trajectory:
     """Over the bunk, high enough for what hangs open to be clear of the stakes; no motion where it is there."""
     bunk, high_m = arm.profile.bunk, retreat_height_m(arm.profile)
     if is_over_bunk(bunk, *arm.xy(start)):
         return straight_line(arm, start, start.at_height(max(start.z_m, high_m)))
-    over = arm.over(*bunk.center_m, high_m, high_m)._replace(rot_rad=start.rot_rad)
-    return motions(arm, start, over, collision_scene(arm.profile, logs), None, travel_height_m(arm.profile), 0.0)
+    over = arm.pose_above(*bunk.center_m, high_m, high_m)._replace(rot_rad=start.rot_rad)
+    return motion_planner(arm, start, over, collision_scene(arm.profile, logs), None, travel_height_m(arm.profile), 0.0)

@@ -36,7 +36,7 @@ class PhaseRule:
     grapple: GrappleCommand
     settle_s: float
     slack_s: float
-    trouble: str
+    timeout_message: str
 
 
 _OPEN, _CLOSE, _HOLD = GrappleCommand.OPEN, GrappleCommand.CLOSE, GrappleCommand.HOLD
@@ -61,12 +61,12 @@ RESUME_PHASE: Final = {
 """Where an interrupted vertical phase begins again when the crane stands aside of its column."""
 
 
-def grapple_command(phase: Phase, gathered: bool, stows: bool) -> GrappleCommand:
+def grapple_command(phase: Phase, gathered: bool, stow_only: bool) -> GrappleCommand:
     """What the grapple does in a phase: with a bundle (``gathered``) it closes on, for the logs settle and the tongs
-    follow; at the end of a job that only ``stows`` the crane it does not open.
+    follow; at the end of a job that only ``stow_only`` the crane it does not open.
     """
     if gathered and Phase.LIFT <= phase <= Phase.LOWER:
         return _CLOSE
     if phase in PHASE_RULES:
         return PHASE_RULES[phase].grapple
-    return _OPEN if phase is Phase.DONE and not stows else _HOLD
+    return _OPEN if phase is Phase.DONE and not stow_only else _HOLD

@@ -21,8 +21,8 @@ Axes = tuple[float, ...]
 class TrajectoryTracker:
     """Where on its ``motion`` a crane is sent: at ``clock_s`` of it, ``rate`` of its seconds in a second."""
 
-    def __init__(self, profile: Profile, rests: Axes) -> None:
-        self.motion: Trajectory = hold(rests)
+    def __init__(self, profile: Profile, last_setpoint: Axes) -> None:
+        self.motion: Trajectory = hold(last_setpoint)
         self.clock_s = 0.0
         self.rate = 1.0
         self._profile = profile
@@ -42,22 +42,22 @@ class TrajectoryTracker:
         return self.motion.duration_s - self.clock_s
 
     @property
-    def stands(self) -> bool:
+    def is_stopped(self) -> bool:
         """Whether it has come to a stop."""
         return self.rate == 0.0
 
-    def stand(self) -> None:
+    def hold_here(self) -> None:
         """Stay here: there is no way on."""
         self.motion = hold(self.sent)
 
     def advance(self, dt_s: float, wanted: float, measured: Sequence[float]) -> None:
         """``wanted`` rate from now on, less when a joint falls behind."""
-        wanted = min(wanted, self._pace(measured))
+        wanted = min(wanted, self._following_rate(measured))
         self.clock_s += self.rate * dt_s  # as the last window foretold
         most = dt_s / BRAKE_S
         self.rate += min(max(wanted - self.rate, -most), most)
 
-    def _pace(self, measured: Sequence[float]) -> float:
+    def _following_rate(self, measured: Sequence[float]) -> float:
         """1 while the joints follow, less when one falls behind by more than ``_MAX_LAG_S``, 0 at twice that."""
         lags = [
             abs(q - p) / joint(self._profile, j).speed_limit

@@ -1,7 +1,7 @@
-"""Where a log that is let go over a bunk comes to lie: the heap seen along the bunk, logs as circles between stakes.
+"""Where a log released over a bunk comes to rest: a cross-section of the load, logs as circles between stakes.
 
-A log drops onto what is below it and rolls down to the nearest hollow; logs that lie askew count where they are at
-both ends and in the middle of the new one.  Nothing is pushed aside: real heaps settle a little lower.  Inputs: the
+A log drops onto what is below it and rolls down to the nearest hollow.  Logs that lie askew count where they are at
+both ends and in the middle of the new one.  Nothing is pushed aside: real loads settle a little lower.  Inputs: the
 bunk, the logs that may lie in it, the new log.  No clock, no randomness.
 """
 
@@ -19,26 +19,26 @@ from machine.profile import Bunk
 
 GRID_M: Final = 0.01
 RELEASE_ERROR_M: Final = 0.05
-"""A log that is let go is so far beside where it was to be: tracking error, sway, a bent log."""
+"""Lateral error of a released log: tracking error, sway, a bent log."""
 OPENING_CLEARANCE_M: Final = 0.17
-"""What the tongs need beside a log while they open: its tips' way, and their thickness."""
+"""Space that the jaws need beside a log while they open: the travel of the tips, and their thickness."""
 _DROP_COST: Final = 0.6
-"""A fall of a metre is worth so much height: what drops far may roll on or push others."""
+"""Cost of a drop per metre, as height: a log that drops far may roll on or push others."""
 _SPREAD_COST: Final = 2.0
-"""A spread of a metre of where it comes to lie (a standard deviation) is worth so much height: what is let go on top
-of another log rolls to either side, or stays there, and the last ones lie over the stakes."""
+"""Cost of the spread of the resting place per metre (standard deviation), as height: a log released on top of another
+rolls to either side or stays there, and the last ones lie over the stakes."""
 _COST_GRAIN_M: Final = 0.03
-"""Places that differ by less are as good as each other."""
+"""Places whose cost differs by less are equal."""
 _ROLL_GRAIN_M: Final = 0.1
-"""A log that rolls less far comes to lie where it was let go."""
+"""A log that rolls less far rests where it was released."""
 _SECTION_SHARE: Final = 0.35
-"""Sections through the new log, in its lengths from the middle."""
+"""Positions of the cross-sections through the new log, as shares of its length from the middle."""
 
 
 @dataclass(frozen=True, slots=True)
 class RestingPlace:
-    """A place across the bunk [m, from its middle] with the height of what is under the log and the tongs there, and
-    the height at which the log's own middle comes to rest at the worst, m.
+    """A place across the bunk [m, from its middle], the height of what is under log and jaws there, and the greatest
+    height at which the log's axis may come to rest, m.
     """
 
     across_m: float
@@ -47,7 +47,7 @@ class RestingPlace:
 
 
 class BunkLoad:
-    """What lies in a bunk, for one log of the given diameter and length [m] that is laid along its middle line."""
+    """The load of a bunk, as a new log of the given diameter and length [m] meets it."""
 
     def __init__(self, bunk: Bunk, logs: Sequence[LogObservation], diameter_m: float, length_m: float) -> None:
         self._radius_m = radius = diameter_m / 2
@@ -66,57 +66,59 @@ class BunkLoad:
         self._hollow = _hollows(self._bed)
         self._rest = self._bed[self._hollow]
 
-    def at(self, across_m: float) -> RestingPlace:
-        """What a log that is let go there comes to; beyond the stakes it counts as beside them."""
-        return self._found(int(np.argmin(np.abs(self._across - across_m))))
+    def place_at(self, across_m: float) -> RestingPlace:
+        """The resting place of a log released there; beyond the stakes it counts as beside them."""
+        return self._place(int(np.argmin(np.abs(self._across - across_m))))
 
-    def falls(self, across_m: float) -> tuple[float, float]:
-        """Where the middle of a log that is let go there comes to lie: across the bunk and its height, m."""
+    def resting_point(self, across_m: float) -> tuple[float, float]:
+        """Where the axis of a log released there comes to rest: across the bunk and height, m."""
         i = int(self._hollow[np.argmin(np.abs(self._across - across_m))])
         return float(self._across[i]), float(self._bed[i])
 
-    def lowest(self, reach_m: float) -> RestingPlace:
-        """Where, at most ``reach_m`` from the middle, it comes to lie lowest.
+    def lowest_place(self, reach_m: float) -> RestingPlace:
+        """The place at most ``reach_m`` from the middle where the log rests lowest.
 
-        Of places as good as each other those where it rolls least, of these the middle of an empty bunk, then those by
-        the stakes: what lies there cannot roll, and the middle fills by itself.
+        Among equal places it prefers the one where the log rolls least, then the middle of an empty bunk or else the
+        place nearest to the stakes: a log there cannot roll, and the middle fills by itself.
         """
-        places = np.flatnonzero(np.abs(self._across) <= reach_m + 0.5 * GRID_M)
-        found = [(i, self._found(int(i))) for i in places] or [(0, self.at(0.0))]
+        places = np.flatnonzero(np.abs(self._across) <= reach_m + 0.5 * GRID_M).tolist()
+        found = [(i, self._place(i)) for i in places] or [(0, self.place_at(0.0))]
         sign = 1.0 if self._empty else -1.0
 
-        def worth(item: tuple[int, RestingPlace]) -> tuple[int, int, float]:
+        def cost(item: tuple[int, RestingPlace]) -> tuple[int, int, float]:
             i, rest = item
             low = self._mean(i)
             cost = low + _DROP_COST * (rest.support_z_m + self._radius_m - low) + _SPREAD_COST * self._spread(i)
             rolls = abs(float(self._across[self._hollow[i]]) - rest.across_m)
             return round(cost / _COST_GRAIN_M), round(rolls / _ROLL_GRAIN_M), sign * abs(rest.across_m)
 
-        return min(found, key=worth)[1]
+        return min(found, key=cost)[1]
 
-    def _around(self, i: int, off_m: float = RELEASE_ERROR_M) -> slice:
+    def _release_window(self, i: int, off_m: float = RELEASE_ERROR_M) -> slice:
         few = round(off_m / GRID_M)
         return slice(max(i - few, 0), i + few + 1)
 
     def _mean(self, i: int) -> float:
-        return float(np.mean(self._rest[self._around(i)]))
+        return float(np.mean(self._rest[self._release_window(i)]))
 
     def _spread(self, i: int) -> float:
-        """How much more what it comes to varies than the places it may be let go at."""
-        around = self._around(i, 2.0 * RELEASE_ERROR_M)
+        """How much more the resting places vary than the release places."""
+        around = self._release_window(i, 2.0 * RELEASE_ERROR_M)
         return max(float(np.std(self._across[self._hollow[around]]) - np.std(self._across[around])), 0.0)
 
-    def _found(self, i: int) -> RestingPlace:
-        return RestingPlace(float(self._across[i]), float(self._under[i]), float(np.max(self._rest[self._around(i)])))
+    def _place(self, i: int) -> RestingPlace:
+        return RestingPlace(
+            float(self._across[i]), float(self._under[i]), float(np.max(self._rest[self._release_window(i)]))
+        )
 
 
 def log_in_bunk(bunk: Bunk, log: LogObservation) -> tuple[float, float]:
-    """How far along and across a bunk from its middle a log's centre is, m."""
+    """Position of a log's centre along and across a bunk, from its middle, m."""
     return point_in_bunk(bunk, log.center_m[0], log.center_m[1])
 
 
 def point_in_bunk(bunk: Bunk, x_m: float, y_m: float) -> tuple[float, float]:
-    """How far along and across a bunk from its middle a point is, m."""
+    """Position of a point along and across a bunk, from its middle, m."""
     return _rotated(bunk, x_m - bunk.center_m[0], y_m - bunk.center_m[1])
 
 
@@ -127,11 +129,11 @@ def is_over_bunk(bunk: Bunk, x_m: float, y_m: float) -> bool:
 
 
 def settled_in_bunk(bunk: Bunk, log: LogObservation, logs: Sequence[LogObservation]) -> LogObservation:
-    """A log that was let go over a bunk in which others lie, as it then lies; one beside the bunk stays as it is."""
+    """A log released over a bunk that holds others, as it then lies; a log beside the bunk stays as it is."""
     if not is_over_bunk(bunk, *log.center_m[:2]):
         return log
     across = log_in_bunk(bunk, log)[1]
-    at, z = BunkLoad(bunk, logs, log.diameter_m, log.length_m).falls(across)
+    at, z = BunkLoad(bunk, logs, log.diameter_m, log.length_m).resting_point(across)
     c, s, aside = cos(bunk.yaw_rad), sin(bunk.yaw_rad), at - across
     level = hypot(*log.axis[:2])
     axis = (log.axis[0] / level, log.axis[1] / level, 0.0) if level > 0.0 else log.axis
@@ -144,15 +146,15 @@ def _rotated(bunk: Bunk, x: float, y: float) -> tuple[float, float]:
     return x * c + y * s, -x * s + y * c
 
 
-def _sections(bunk: Bunk, logs: Sequence[LogObservation], along: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places across and heights of the logs' axes, and their radii, in sections through the bunk, for all that reach
-    them.
-    """
+def _sections(
+    bunk: Bunk, logs: Sequence[LogObservation], along: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lateral places and heights of the logs' axes, and their radii, in cross-sections through the bunk."""
     cuts = []
     for log in logs:
         middle = log_in_bunk(bunk, log)
         ahead, aside = _rotated(bunk, log.axis[0], log.axis[1])
-        if abs(ahead) < _SECTION_SHARE:  # it lies across: as if it were everywhere between its ends
+        if abs(ahead) < _SECTION_SHARE:  # it lies across the bunk: it counts everywhere between its ends
             ahead = _SECTION_SHARE if ahead >= 0.0 else -_SECTION_SHARE
         for at in along - middle[0]:
             share = at / ahead
@@ -164,10 +166,10 @@ def _sections(bunk: Bunk, logs: Sequence[LogObservation], along: np.ndarray) -> 
 
 
 def _hollows(bed: np.ndarray) -> np.ndarray:
-    """For every place the index of the hollow that a log rolls down to from there; level ground keeps it."""
+    """For every place the index of the hollow that a log rolls down to from there; level ground keeps the log."""
     last = len(bed) - 1
     to = np.full(len(bed), -1)
-    for begin in np.argsort(bed, kind="stable"):  # the lowest first: what rolls comes to a place that is known
+    for begin in np.argsort(bed, kind="stable"):  # from the lowest, so that the hollow next to each place is known
         i = int(begin)
         sides = [k for k in (i - 1, i + 1) if 0 <= k <= last and bed[k] < bed[i] - 1e-9]
         to[i] = to[min(sides, key=lambda k: float(bed[k]))] if sides else i

@@ -1,5 +1,6 @@
-"""Where tongs may come down among logs: stations along the topmost in reach, shifted sideways and turned; and which of
-those that a rule calls safe are worth a closer look.
+"""Grasp candidates: stations along the topmost logs in reach, shifted sideways and turned, and the best of them.
+
+`candidate_grid` lists all of them; `finalists` keeps the best safe ones of every set of captured logs.
 """
 
 from __future__ import annotations
@@ -12,30 +13,30 @@ from typing import Final
 import numpy as np
 
 from autonomy.grasp.cylinders import MIN_RADIUS_M, Cylinders
-from autonomy.grasp.grapple_heights import tip_clearance_m, closing_height_curve, travel_height_m
+from autonomy.grasp.grapple_heights import closing_height_curve, tip_clearance_m, travel_height_m
 from autonomy.grasp.planner import NoGrasp
-from autonomy.grasp.quality import GraspScores, BladeSections
+from autonomy.grasp.quality import BladeSections, GraspScores
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.kinematics import Unreachable
 
 ALONG_SHARES: Final = np.linspace(-0.21, 0.21, 7)
-"""Stations, in lengths of the log from its middle; nearer to its ends an operator would not grip it."""
+"""Stations along a log, as shares of its length from the middle; operators do not grip nearer to the ends."""
 SIDEWAYS_OFFSETS_M: Final = np.linspace(-0.48, 0.48, 9)
 YAW_OFFSETS_RAD: Final = np.radians([-14.0, -7.0, 0.0, 7.0, 14.0])
 ANCHOR_LOG_COUNT: Final = 8
-"""So many logs, the topmost in reach, have candidates about them."""
+"""Number of logs, the topmost in reach, that have candidates."""
 CENTRING_SCALE_M: Final = 0.15
-"""Off the middle by this much a grasp is worth a third of one in it."""
+"""This distance off the middle of the jaws reduces the score of a grasp to a third."""
 SQUARENESS_SCALE: Final = 0.04
-"""Mean squared sine of the logs' angles at which it is worth a third: 11 deg."""
+"""Mean squared sine of the logs' obliquity that reduces the score to a third: 11 deg."""
 FINALIST_COUNT: Final = 40
 SEED: Final = 1
 
 
 @dataclass(frozen=True, slots=True)
 class CandidateArrays:
-    """Arrays of one length: place [m], opening axis [rad], height that logs are taken above [m]."""
+    """Arrays of one length: place [m], opening axis [rad], height above which logs are taken [m]."""
 
     x: np.ndarray
     y: np.ndarray
@@ -44,10 +45,12 @@ class CandidateArrays:
 
 
 def reachable_stations(arm: Arm, logs: Sequence[LogObservation], stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The topmost logs (k,) that may be taken and that the crane reaches somewhere, and at which of the stations
-    ``ALONG_SHARES`` (k, stations).
+    """The indices of the topmost reachable logs (k,), and which of the stations ``ALONG_SHARES`` are in reach (k, s).
 
-    Raises ``NoGrasp`` when it reaches none.
+    ``stays`` (n,) marks logs that must not be gripped.
+
+    Raises:
+        NoGrasp: no log is in reach.
     """
     high = travel_height_m(arm.profile)
     over_support = closing_height_curve(arm.profile, 0.0, 2.0 * MIN_RADIUS_M)(0.0) - tip_clearance_m(2.0 * MIN_RADIUS_M)
@@ -57,7 +60,7 @@ def reachable_stations(arm: Arm, logs: Sequence[LogObservation], stays: np.ndarr
         nonlocal trouble
         x, y, z = (c + along * log.length_m * a for c, a in zip(log.center_m, log.axis, strict=True))
         try:
-            arm.over(x, y, z - log.diameter_m / 2 + tip_clearance_m(log.diameter_m) + over_support, high)
+            arm.pose_above(x, y, z - log.diameter_m / 2 + tip_clearance_m(log.diameter_m) + over_support, high)
         except Unreachable as error:
             trouble = trouble or f"log {log.id}: {error}"
             return False
@@ -72,14 +75,13 @@ def reachable_stations(arm: Arm, logs: Sequence[LogObservation], stays: np.ndarr
         if len(top) == ANCHOR_LOG_COUNT:
             break
     if not top:
-        raise NoGrasp(f"no log is in reach; {trouble or 'all that are in view are to stay'}")
+        raise NoGrasp("grasp.no-log-in-reach", f"no log is in reach; {trouble or 'all logs in view must stay'}")
     return np.array(top), np.array(reached)
 
 
 def candidate_grid(world: Cylinders, top: np.ndarray, reached: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All that are looked at, about the logs ``top`` (k,) where these are ``reached`` (k, stations): x, y [m] and
-    opening axis [rad].
-    """
+    """All candidates about the logs ``top`` (k,) at the stations ``reached`` (k, s): x, y [m] and opening axis
+    [rad]."""
     center, axis, length = world.center[top], world.axis[top], world.length[top]
     flat = np.arctan2(axis[:, 1], axis[:, 0])[:, None, None, None]
     along = ALONG_SHARES[:, None, None] * length[:, None, None, None]
@@ -94,26 +96,27 @@ def candidate_grid(world: Cylinders, top: np.ndarray, reached: np.ndarray) -> tu
 def finalists(
     at: tuple[np.ndarray, np.ndarray, np.ndarray], levels: np.ndarray, seen: BladeSections, found: GraspScores
 ) -> tuple[CandidateArrays, GraspScores]:
-    """The best of every set of logs that can be taken, best first."""
+    """The best candidates of every set of logs that can be captured, best first, with their scores."""
     where = np.nonzero(found.safe)
     safe = GraspScores(*(getattr(found, f.name)[where] for f in fields(GraspScores)))
     near = BladeSections(*(getattr(seen, f.name)[where[0]] for f in fields(BladeSections)))
-    order = _diverse_best(safe.lever * (1.0 + 0.3 * safe.count) * centring(near, safe.captured), safe.captured)
+    order = _diverse_best(safe.balance * (1.0 + 0.3 * safe.count) * centring(near, safe.captured), safe.captured)
     x, y, yaw = (c[where[0]][order] for c in at)
     chosen = GraspScores(*(getattr(safe, f.name)[order] for f in fields(GraspScores)))
     return CandidateArrays(x, y, yaw, levels[where][order]), chosen
 
 
 def centring(at: BladeSections, captured: np.ndarray) -> np.ndarray:
-    """How well the captured logs stand in the middle between the tongs and square to them, 0..1."""
+    """How well centred between the jaws and how square to them the captured logs are, 0 to 1."""
     low = np.min(np.where(captured, at.low_u, np.inf), axis=-1)
     high = np.max(np.where(captured, at.high_u, -np.inf), axis=-1)
-    askew = np.sum(np.where(captured, at.askew, 0.0), axis=-1) / np.sum(captured, axis=-1)
-    return np.exp(-(((low + high) / 2 / CENTRING_SCALE_M) ** 2) - askew / SQUARENESS_SCALE)
+    askew = np.sum(np.where(captured, at.obliquity_sq, 0.0), axis=-1) / np.sum(captured, axis=-1)
+    score: np.ndarray = np.exp(-(((low + high) / 2 / CENTRING_SCALE_M) ** 2) - askew / SQUARENESS_SCALE)
+    return score
 
 
 def _diverse_best(rough: np.ndarray, captured: np.ndarray) -> np.ndarray:
-    """Indices of the finalists: the best of every set of captured logs first, so that no set crowds the others out."""
+    """Indices of the best candidates of every set of captured logs, so that no set crowds the others out."""
     code = captured @ np.random.default_rng(SEED).random(captured.shape[1])
     order = np.argsort(-rough, kind="stable")
     sets, first = np.unique(code[order], return_index=True)

@@ -1,14 +1,15 @@
-"""Paper A's grasp planner (section II): virtual world, depth picture, network, argmax, and back to the crane's base.
+"""Paper A's grasp planner (section II): virtual scene, depth image, network, argmax, and back to the base frame.
 
-The network says where and how turned, not how deep: the tips go 0.25 m under the surface that the camera sees there, as
-on the test-bed (docs/reference/machines.md section 1.5), and never into the ground.  What comes up is not its business; the logs between the
-tongs are named for the closing of the tongs.  Inputs: log list, a network.  Failure: ``NoGrasp``.
+The network says where to grip and how the grapple is turned, not how deep: the tips go 0.25 m under the surface that
+the camera sees there, as on the test-bed (docs/reference/machines.md section 1.5), and never into the ground.  The
+logs between the jaws are named for the closing motion; the network does not predict what comes up.  Inputs: log list,
+a network. Failure: ``NoGrasp``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -17,19 +18,25 @@ import numpy as np
 from autonomy.grasp.cylinders import Cylinders, as_cylinders, lowest_m
 from autonomy.grasp.grapple_heights import known_ground_m
 from autonomy.grasp.jaws import Jaws, jaws_of
-from autonomy.grasp.network import PixelGrasp, GraspMaps, best_pixel
-from autonomy.grasp.planner import GraspCandidate, NoGrasp
-from autonomy.grasp.quality import rests_upon, score_grasps, blade_sections
-from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
-from autonomy.motion.arm import Arm
-from autonomy.perception.log_list.observation import LogObservation
+from autonomy.grasp.network import GraspMaps, NetworkInputError, PixelGrasp, best_pixel
+from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
+from autonomy.grasp.quality import blade_sections, rests_upon, score_grasps
+from autonomy.grasp.virtual_scene import (
+    Camera,
+    SceneError,
+    camera_above,
+    cameras_along,
+    operational_area,
+    render,
+    shortened_logs,
+)
 
 TIP_DEPTH_M: Final = 0.25
-"""How far under the surface of the pile the tips close."""
+"""Depth of the tips below the surface of the pile."""
 
 
 class Network(Protocol):
-    """``autonomy.grasp.network.GraspNet``: a 300 x 300 depth picture [m] in, the grasp of eq. 4 or whole maps out."""
+    """Paper A's network, as ``GraspNet``: a 300 x 300 depth image [m] in, the grasp of eq. 4 or whole maps out."""
 
     def best(self, depth_m: np.ndarray) -> PixelGrasp: ...
 
@@ -38,7 +45,7 @@ class Network(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class NetworkView:
-    """What a plan was made from, for pictures: camera, depth (300, 300) [m] and the grasp found in it."""
+    """What a grasp was planned from, for plots: camera, depth (300, 300) [m] and the grasp found in it."""
 
     camera: Camera
     depth_m: np.ndarray
@@ -46,21 +53,22 @@ class NetworkView:
 
 
 class CnnPlanner:
-    """A planner (``autonomy.grasp.planner``).  Like the paper's, it knows nothing of logs that are to stay lying: it
-    plans from the list without them, and may take one along.
+    """A ``GraspPlanner``.  Like the paper's, it does not know logs that must stay: it plans from the list without them
+    and may take one along.
 
-    ``by_rule`` takes the height from the rule that physical labels are made by, where that holds.
+    ``by_rule`` takes the height from the capture rule that also makes the physical labels, where that rule holds.
     ``cameras`` over 1 moves the virtual camera on a circle of ``reach_m`` and averages the predictions (II-C); the
-    paper's results are with one that stands still.
+    paper's results use one camera that stands still.
     """
 
     def __init__(self, network: Network, by_rule: bool = False, cameras: int = 1, reach_m: float = 0.3) -> None:
         self._network, self._by_rule, self._cameras, self._reach_m = network, by_rule, cameras, reach_m
 
-    def look(self, world: Cylinders, jaws: Jaws, ground_z_m: float) -> NetworkView:
-        """The virtual camera's picture of a world and the grasp in it.
+    def view(self, world: Cylinders, jaws: Jaws, ground_z_m: float) -> NetworkView:
+        """The virtual camera's image of a scene and the grasp in it.
 
-        Raises ValueError when there is nothing to see.
+        Raises:
+            SceneError: there is no log to see, or the camera is not above the ground.
         """
         recreated = shortened_logs(world, jaws.blade_m)
         box = operational_area(recreated)
@@ -73,30 +81,24 @@ class CnnPlanner:
         mean = mean_maps([self._network.maps(depth) for depth in pictures], views, float(box.centroid_m[2]))
         return NetworkView(views[0], pictures[0], best_pixel(mean))
 
-    def __call__(
-        self,
-        arm: Arm,
-        logs: Sequence[LogObservation],
-        slew_rad: float,
-        rot_rad: float,
-        stay: Collection[int] = (),
-    ) -> GraspCandidate:
+    def __call__(self, request: GraspRequest) -> GraspCandidate:
         """The grasp of eq. 4; raises ``NoGrasp`` without a log."""
-        places = [i for i in range(len(logs)) if i not in stay]
-        logs = [logs[i] for i in places]
+        arm = request.arm
+        places = [i for i in range(len(request.logs)) if i not in request.stay]
+        logs = [request.logs[i] for i in places]
         if not logs:
-            raise NoGrasp("no log is in view")
+            raise NoGrasp("grasp.no-log-in-view", "no log is in view")
         world, jaws = as_cylinders(logs), jaws_of(arm.profile)
         ground = known_ground_m(arm.profile)
         ground = ground if math.isfinite(ground) else lowest_m(world)
         try:
-            seen = self.look(world, jaws, ground)
-        except ValueError as error:
-            raise NoGrasp(f"the network has nothing to plan from: {error}") from None
+            seen = self.view(world, jaws, ground)
+        except (SceneError, NetworkInputError) as error:
+            raise NoGrasp("grasp.no-network-input", f"the network has nothing to plan from: {error}") from None
         found = seen.best
         depth = float(seen.depth_m[round(found.v_px), round(found.u_px)])
         x, y, surface = seen.camera.to_base(found.u_px, found.v_px, depth).tolist()
-        # Seen from above the picture's y runs against the base's.
+        # Seen from above, the image's y axis points against the base's.
         yaw, level = -found.theta_rad, max(ground, surface - TIP_DEPTH_M)
         if self._by_rule:
             level = rule_level_m(jaws, world, x, y, yaw, ground, level)
@@ -107,7 +109,7 @@ class CnnPlanner:
 
 
 def logs_between_jaws(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, level: float) -> tuple[int, ...]:
-    """The logs between the tongs of a grasp and above its tips; without any, the nearest one."""
+    """Indices of the logs between the jaws of a grasp and above its tips; without any, of the nearest one."""
     at = blade_sections(jaws, world, np.array(x), np.array(y), np.array(yaw))
     middle = np.abs(at.low_u + at.high_u) / 2
     inside = at.inside & (middle < jaws.half_gap_m) & (at.middle > level)
@@ -118,7 +120,7 @@ def logs_between_jaws(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: flo
 
 
 def rule_level_m(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, ground: float, level: float) -> float:
-    """The height at which the rule takes most wood at a place; ``level`` where it takes none."""
+    """The height at which the capture rule takes most wood at a place; ``level`` where it takes none."""
     heights = np.append(world.center[:, 2] + world.radius, ground)
     at = blade_sections(jaws, world, *(np.full(len(heights), v) for v in (x, y, yaw)))
     found = score_grasps(jaws, world, rests_upon(world), at, heights)
@@ -127,9 +129,9 @@ def rule_level_m(jaws: Jaws, world: Cylinders, x: float, y: float, yaw: float, g
 
 
 def mean_maps(maps: Sequence[GraspMaps], cameras: Sequence[Camera], height_m: float) -> GraspMaps:
-    """Mean of the predictions of cameras that look straight down, shifted onto the first one's picture at a height.
+    """Mean of the predictions of cameras that look straight down, shifted onto the first camera's image at a height.
 
-    Pixels that a camera does not see count for it as worthless.
+    Pixels that a camera does not see count as zero for it.
     """
     first = cameras[0]
     sums = np.zeros((3, *maps[0].q.shape))
@@ -140,11 +142,11 @@ def mean_maps(maps: Sequence[GraspMaps], cameras: Sequence[Camera], height_m: fl
         for total, layer in zip(sums, (found.q, found.cos2, found.sin2), strict=True):
             total += _shifted(layer, down, right)
     sums /= len(maps)
-    return GraspMaps(*sums, maps[0].scale_px)
+    return GraspMaps(sums[0], sums[1], sums[2], maps[0].scale_px)
 
 
 def _shifted(layer: np.ndarray, down: int, right: int) -> np.ndarray:
-    """A map moved by whole entries, zeros where nothing comes from."""
+    """A map moved by whole entries, filled with zeros."""
     out = np.zeros_like(layer)
     height, width = layer.shape
     rows, columns = math.fabs(down), math.fabs(right)

@@ -1,7 +1,7 @@
-"""Logs as perfect cylinders in arrays, and random draws of them from what perception is unsure of.
+"""Logs as perfect cylinders in arrays, and Monte Carlo samples of them from their covariances.
 
-Base frame, m.  Every array has the logs on its last axis but the coordinates': ``center`` and ``axis`` (..., n, 3),
-``length`` and ``radius`` (..., n); leading axes are draws.
+Base frame, m.  The logs are on the last axis of every array, before the coordinates: ``center`` and ``axis``
+(..., n, 3), ``length`` and ``radius`` (..., n); leading axes are samples.
 """
 
 from __future__ import annotations
@@ -12,17 +12,32 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.perception.log_list.estimate import ACROSS_1, ACROSS_2, END, RADIUS, SIZE, START, TILT_1, TILT_2, unpacked
+from autonomy.perception.log_list.estimate import (
+    ACROSS_1,
+    ACROSS_2,
+    END,
+    RADIUS,
+    SIZE,
+    START,
+    TILT_1,
+    TILT_2,
+    unpack_covariance,
+)
 from autonomy.perception.log_list.observation import LogObservation
+from runtime.errors import CodedError
 
 MIN_RADIUS_M: Final = 0.02
 POINT_COUNT: Final = 15
-"""Of an axis, where its distance to others is asked."""
+"""Points of an axis at which its distance to other logs is computed."""
+
+
+class CovarianceError(CodedError, ValueError):
+    """A log's covariance cannot be sampled."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cylinders:
-    """See the module."""
+    """Arrays of logs; see the module for their shapes."""
 
     center: np.ndarray
     axis: np.ndarray
@@ -31,28 +46,29 @@ class Cylinders:
 
     @property
     def count(self) -> int:
-        """How many logs."""
+        """The number of logs."""
         return int(self.length.shape[-1])
 
     def ends(self) -> np.ndarray:
         """Both ends of every axis (..., n, 2, 3): paper A, eq. (1)."""
         half = (self.axis * self.length[..., None] / 2)[..., None, :]
-        return self.center[..., None, :] + np.concatenate([-half, half], axis=-2)
+        ends: np.ndarray = self.center[..., None, :] + np.concatenate([-half, half], axis=-2)
+        return ends
 
     def points(self) -> np.ndarray:
-        """Points of every axis from end to end (..., n, POINTS, 3)."""
+        """Points of every axis from end to end (..., n, POINT_COUNT, 3)."""
         part = self.length[..., None] * np.linspace(-0.5, 0.5, POINT_COUNT)
         points: np.ndarray = self.center[..., None, :] + part[..., None] * self.axis[..., None, :]
         return points
 
     def shortened(self, by_m: float, share: float) -> Cylinders:
-        """Every log shorter by ``by_m`` and then by a ``share`` of what is left, never shorter than it is wide."""
+        """Every log shorter by ``by_m`` and then by a ``share`` of the rest, never shorter than it is thick."""
         length = np.maximum((self.length - by_m) * (1.0 - share), 2.0 * self.radius)
         return Cylinders(self.center, self.axis, np.minimum(length, self.length), self.radius)
 
 
 def as_cylinders(logs: Sequence[LogObservation]) -> Cylinders:
-    """The logs of a list, no draws."""
+    """The logs of a list, without samples."""
     return Cylinders(
         np.array([log.center_m for log in logs], float).reshape(-1, 3),
         np.array([log.axis for log in logs], float).reshape(-1, 3),
@@ -68,7 +84,7 @@ def lowest_m(world: Cylinders) -> float:
 
 
 def axis_offsets(world: Cylinders) -> np.ndarray:
-    """(n, n, POINTS, 3): from the nearest point of the axis of log i (first) to points of that of log j, no draws."""
+    """From the nearest point of the axis of log i (first) to points of the axis of log j (n, n, POINT_COUNT, 3)."""
     away = world.points()[None] - world.center[:, None, None]
     half = world.length[:, None, None] / 2
     along = np.clip(np.einsum("ijkc,ic->ijk", away, world.axis), -half, half)
@@ -77,12 +93,12 @@ def axis_offsets(world: Cylinders) -> np.ndarray:
 
 
 def log_covariance(log: LogObservation) -> np.ndarray:
-    """(7, 7) of ``LogEstimate`` as perception has it, or for a log of which only the pose is told."""
-    return default_covariance(log) if log.covariance is None else unpacked(log.covariance)
+    """The covariance (7, 7) of ``LogEstimate``, or the default for a log that comes without one."""
+    return default_covariance(log) if log.covariance is None else unpack_covariance(log.covariance)
 
 
 def default_covariance(log: LogObservation) -> np.ndarray:
-    """(7, 7) for a pose that is known well: 1.5 cm across, 1 deg, 5 cm at the ends."""
+    """The covariance (7, 7) of a well-known pose: 1.5 cm across, 1 deg, 5 cm at the ends."""
     sigma = np.zeros(SIZE)
     sigma[[ACROSS_1, ACROSS_2]], sigma[[TILT_1, TILT_2]] = 0.015, 0.017
     sigma[[START, END]], sigma[RADIUS] = 0.05, 0.05 * log.diameter_m
@@ -90,12 +106,15 @@ def default_covariance(log: LogObservation) -> np.ndarray:
 
 
 def sample_cylinders(world: Cylinders, covariances: np.ndarray, count: int, seed: int) -> Cylinders:
-    """``count`` draws of a world (n logs) from covariances (n, 7, 7); the same seed draws the same.
+    """``count`` samples of the logs (n) from covariances (n, 7, 7); the same seed gives the same samples.
 
-    Raises ValueError when a covariance is none.
+    Raises:
+        CovarianceError: a covariance is not finite.
     """
     if not np.all(np.isfinite(covariances)):
-        raise ValueError("the covariance of a log has an entry that is not finite; leave that log out")
+        raise CovarianceError(
+            "grasp.covariance-not-finite", "the covariance of a log has an entry that is not finite; leave that log out"
+        )
     value, vector = np.linalg.eigh(covariances)
     root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
     normal = np.random.default_rng(seed).standard_normal((count, world.count, SIZE))
@@ -103,7 +122,7 @@ def sample_cylinders(world: Cylinders, covariances: np.ndarray, count: int, seed
 
 
 def transverse_axes(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (n, 3) across unit axes (n, 3), along which errors count: the first level, the second upward."""
+    """Unit vectors (n, 3) across unit axes (n, 3), the axes of the error states: the first level, the second upward."""
     level = np.stack([-axis[:, 1], axis[:, 0], np.zeros(len(axis))], axis=1)
     steep = np.hypot(level[:, 0], level[:, 1]) < 0.05
     level[steep] = (0.0, 1.0, 0.0)
@@ -112,7 +131,7 @@ def transverse_axes(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def perturbed(world: Cylinders, e: np.ndarray) -> Cylinders:
-    """The logs (n) with errors (..., n, 7), in the order of ``LogEstimate``'s covariance, added to them."""
+    """The logs (n) with errors (..., n, 7) added, in the order of ``LogEstimate``'s covariance."""
     level, up = transverse_axes(world.axis)
     axis = world.axis + e[..., TILT_1, None] * level + e[..., TILT_2, None] * up
     axis /= np.linalg.norm(axis, axis=-1)[..., None]

@@ -1,4 +1,7 @@
-"""Heights of the hanger pin for every part of a grasp: travel, hover, closing and release clearances."""
+"""Heights of the hanger pin during a grasp: travel, hover, closing and release.
+
+While the jaws close, the pin follows their sweep, so that the tips stay just above what the log lies on.
+"""
 
 from __future__ import annotations
 
@@ -17,27 +20,27 @@ from machine.geometry.grapple import lowest_tip_below_pin_m, rotator_for_yaw, ti
 from machine.profile import Profile, TongTable
 
 TIP_CLEARANCE_M: Final = (0.025, 0.05)
-"""Least and greatest height of the tips over the support while closing: 3 to 5 cm lift 19 of 20, 1.5 cm 13 of
+"""Least and greatest height of the tips over the support while closing: 3 to 5 cm lift 19 of 20 logs, 1.5 cm 13 of
 20 (docs/reference/plant-model.md section 1)."""
 HALF_PLATE_M: Final = 0.018
 SCOOP_SHARE: Final = 0.35
-"""Tips under this share of a log's diameter scoop it, higher ones pinch it and lose it."""
+"""Tips below this share of a log's diameter scoop it; higher ones pinch it and lose it."""
 _CONTACT_SHARE: Final = 0.45
 """The tips touch a log when their half gap is this share of its diameter."""
 HOVER_CLEARANCE_M: Final = 0.5
-"""Open tips above the support before the vertical descent; more than a log's diameter."""
+"""Height of the open tips above the support before the vertical descent; more than a log's diameter."""
 PASS_CLEARANCE_M: Final = 0.15
-"""Open tips above the logs that they come in over."""
+"""Height of the open tips above the logs that they pass over."""
 TRAVEL_CLEARANCE_M: Final = 0.40
-"""Tips of a closed grapple above the stakes: a tilted log, its sway and the tracking error fit in between."""
+"""Height of the closed tips above the stakes: leaves room for a tilted log, its sway and the tracking error."""
 RETREAT_CLEARANCE_M: Final = 0.20
 VERIFY_LIFT_M: Final = 0.7
-"""How far a log is lifted before the grasp is judged."""
+"""How far a log is lifted before the grasp is verified."""
 RELEASE_SIDE_CLEARANCE_M: Final = 0.15
-"""Tips that are so far beside a log when they leave it do not take it along."""
+"""Tips this far beside a log do not take it along when they leave it."""
 _RISE_LEAD_S: Final = 0.3
 _FALL_LEAD_S: Final = 0.1
-"""How far ahead of the tongs the pin rises and sinks: valve delay, and tips that would touch the ground."""
+"""How far ahead of the jaws the pin rises and sinks: covers the valve delay and keeps the tips off the ground."""
 _SMOOTH_S: Final = 0.4
 _STEP_S: Final = 0.02
 
@@ -57,12 +60,12 @@ def retreat_height_m(profile: Profile) -> float:
 
 
 def approach_length_m(profile: Profile, log: LogObservation) -> float:
-    """How far before the place a carried log must be at its travel height, m."""
+    """Distance before the place at which a carried log must be at its travel height, m."""
     return (log.length_m + profile.bunk.length_m) / 2 + HOVER_CLEARANCE_M
 
 
 def hover_height_m(profile: Profile, grasp: Grasp) -> float:
-    """Height of the pin from which the open grapple goes straight down, m."""
+    """Height of the pin from which the open grapple descends vertically, m."""
     over = grasp.support_z_m + HOVER_CLEARANCE_M
     if grasp.top_z_m is not None:
         over = max(over, grasp.top_z_m + PASS_CLEARANCE_M)
@@ -70,18 +73,18 @@ def hover_height_m(profile: Profile, grasp: Grasp) -> float:
 
 
 def known_ground_m(profile: Profile) -> float:
-    """Height below which nothing lies, m: a machine on wheels knows none, for its frame goes up and down."""
+    """Height below which nothing lies, m; -inf on a machine on wheels, whose frame moves up and down."""
     return profile.workspace.ground_z_m if profile.carrier is None else -inf
 
 
 def release_angle_rad(profile: Profile, thickest_m: float) -> float:
-    """The tong angle [rad] at which the tips are clear of a log that lies between them."""
+    """Jaw angle [rad] at which the tips are clear of a log that lies between them."""
     tongs = profile.grapple.tongs
     return float(np.interp(thickest_m / 2 + RELEASE_SIDE_CLEARANCE_M, tongs.half_gap_m[::-1], tongs.angle_rad[::-1]))
 
 
 def tip_clearance_m(diameter_m: float) -> float:
-    """Height of the tips over the support, m: in the middle between scraping and pinching the log."""
+    """Height of the tips over the support, m: midway between scraping the ground and pinching the log."""
     low, high = TIP_CLEARANCE_M
     return min(max((HALF_PLATE_M + SCOOP_SHARE * diameter_m) / 2, low), high)
 
@@ -89,8 +92,8 @@ def tip_clearance_m(diameter_m: float) -> float:
 def closing_height_curve(profile: Profile, support_z_m: float, diameter_m: float) -> Callable[[float], float]:
     """Height of the pin [m] over the closing time [s], smooth and at rest before 0.
 
-    The tips, which sweep deeper and then rise while the tongs turn, stay ``tip_clearance_m`` above the support until
-    they touch the log; from then on the pin stands still.
+    The tips first sweep deeper and then rise while the jaws turn.  The pin keeps them ``tip_clearance_m`` above the
+    support until they touch the log; from then on it stands still.
     """
     times, sweep = _sweep(profile.grapple.tongs, profile.grapple.close_time_s, diameter_m)
     height = support_z_m + tip_clearance_m(diameter_m) + sweep
@@ -99,7 +102,7 @@ def closing_height_curve(profile: Profile, support_z_m: float, diameter_m: float
 
 @lru_cache(maxsize=64)
 def _sweep(tongs: TongTable, close_time_s: float, diameter_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times [s] and how deep below the pin closing tongs reach then [m]; a log is asked about again and again."""
+    """Times [s] and the depth of closing tips below the pin then [m]; cached, as logs repeat."""
     rate = tongs.angle_rad[-1] / close_time_s
     meet = float(np.interp(_CONTACT_SHARE * diameter_m, tongs.half_gap_m[::-1], tongs.angle_rad[::-1]))
     half = _SMOOTH_S / 2
@@ -121,9 +124,14 @@ def _sweep(tongs: TongTable, close_time_s: float, diameter_m: float) -> tuple[np
 def grasp_pose(
     arm: Arm, x_m: float, y_m: float, yaw_rad: float, support_z_m: float, thinnest_m: float, rot_rad: float
 ) -> Pose:
-    """The pose in which tongs that open along ``yaw_rad`` begin to close over a support round logs of which the
-    thinnest is ``thinnest_m``, the rotator turned from ``rot_rad``; raises ``Unreachable``.
+    """The pose in which the grapple begins to close on logs over a support.
+
+    The jaws open along ``yaw_rad``; ``thinnest_m`` is the least diameter of the logs; the rotator turns from
+    ``rot_rad``.
+
+    Raises:
+        Unreachable: the pose is out of reach.
     """
     low = closing_height_curve(arm.profile, support_z_m, thinnest_m)(0.0)
-    pose = arm.over(x_m, y_m, low, travel_height_m(arm.profile))
+    pose = arm.pose_above(x_m, y_m, low, travel_height_m(arm.profile))
     return pose._replace(rot_rad=rotator_for_yaw(arm.profile, pose.slew_rad, yaw_rad, rot_rad))

@@ -1,4 +1,4 @@
-"""A grasp as the crane executes it."""
+"""A grasp as the crane executes it, and which of its logs came up."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from machine.geometry.grapple import lowest_tip_below_pin_m
 
 @dataclass(frozen=True, slots=True)
 class Grasp:
-    """Where closing begins: the pose of the pin, the height of the support, the point along the axis of ``log``.
+    """The pose of the pin where the jaws begin to close, the height of the support, and the logs.
 
-    ``others`` come up with it; ``top_z_m`` is the highest point of a log under the way down, or None; ``reason`` is a
-    sentence for the operator, ``probability`` that of success where a planner reckons with one; ``pressed``: the tongs
-    go down among other logs, as far as these let them; ``drawn``: to draw the log out of a row; ``drags``: pinched by
-    its upper half it is dragged out, to be gripped there.
+    The grapple grips ``log`` at ``along_m`` from its centre along its axis; ``others`` come up with it.  ``top_z_m`` is
+    the highest point of the logs under the descent, or None where the log lies alone.  ``reason`` is a sentence for the
+    operator, ``probability`` the planner's estimate of success.  ``penetrates``: the open jaws go down among other logs
+    until these stop them.  ``extracts``: the grasp draws the log out of a row.  ``dragging``: the jaws pinch the log by
+    its upper half and drag it out; they close on it again there.
     """
 
     log: LogObservation
@@ -30,33 +31,33 @@ class Grasp:
     top_z_m: float | None = None
     reason: str = ""
     probability: float | None = None
-    pressed: bool = False
-    drawn: bool = False
-    drags: bool = False
+    penetrates: bool = False
+    extracts: bool = False
+    dragging: bool = False
 
     @property
     def logs(self) -> tuple[LogObservation, ...]:
-        """All logs that are to come up."""
+        """All logs of the grasp."""
         return (self.log, *self.others)
 
     @property
-    def gathered(self) -> bool:
-        """Whether it is lifted slowly while the tongs go on closing: what a planner chose may settle in them."""
+    def is_bundle(self) -> bool:
+        """Whether the crane lifts slowly while the jaws keep closing: the logs of a bundle settle in them."""
         return self.top_z_m is not None
 
     @property
     def thinnest_m(self) -> float:
-        """Least diameter of these."""
+        """The least diameter of its logs."""
         return min(log.diameter_m for log in self.logs)
 
 
 def offset_along(point: tuple[float, float], log: LogObservation) -> float:
-    """How far along a log's axis a point is from its centre, m."""
+    """Distance of a point from a log's centre along the log's axis, m."""
     return (point[0] - log.center_m[0]) * log.axis[0] + (point[1] - log.center_m[1]) * log.axis[1]
 
 
 def restricted_to(arm: Arm, grasp: Grasp, held: Sequence[int]) -> Grasp:
-    """The grasp with those of its logs that truly came up, by their numbers."""
+    """The grasp with only those of its logs whose numbers are in ``held``."""
     if all(log.id in held for log in grasp.logs):
         return grasp
     first, *others = (log for log in grasp.logs if log.id in held)
@@ -64,7 +65,7 @@ def restricted_to(arm: Arm, grasp: Grasp, held: Sequence[int]) -> Grasp:
 
 
 def hangs_below(arm: Arm, log: LogObservation, pin: Pose) -> bool:
-    """Whether the log hangs under a pin: near it sideways, and as high as tongs can hold it."""
+    """Whether the log hangs below a pin: horizontally near it, and as high as the jaws can hold it."""
     x, y = arm.xy(pin)
     reach = lowest_tip_below_pin_m(arm.profile.grapple.tongs) + 0.3
     near = hypot(log.center_m[0] - x, log.center_m[1] - y) < log.length_m / 2

@@ -1,8 +1,8 @@
-"""Paper A's grasp network (section II-D, Table I): a depth picture in, grasp quality and closing direction out.
+"""Paper A's grasp network (section II-D, Table I): a depth image in, grasp quality and closing direction out.
 
 78 803 parameters.  Table I prints 12 832 for the second 32-channel layer; its sum holds only with 25 632.  The faster
-forms below compute the same function.  (Both first convolutions as one of 17 x 17 would not: the zero padding between
-them is lost, and what stands at the border of a picture then draws the grasp.)
+forms below compute the same function.  (Merging the first two convolutions into one of 17 x 17 would not: the zero
+padding between them is lost, and objects at the border of an image then attract the grasp.)
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ import numpy as np
 from autonomy.networks.graph import AveragePool, BatchNorm, Conv, MaxPool, Network, Relu, Resize
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.weights import SHIPPED, load
+from runtime.errors import CodedError
 
 SIDE_PX: Final = 300
-"""Side of the depth picture and of the full maps."""
+"""Side of the depth image and of the full maps."""
 POOL: Final = 3
-"""The network works at a third of the picture's side."""
+"""The network works at a third of the image's side."""
 SHAPE: Final = (1, 1, SIDE_PX, SIDE_PX)
 HEADS: Final = ("q", "cos2", "sin2")
 CANDIDATE_COUNT: Final = 32
@@ -30,9 +31,9 @@ NOT_FINITE: Final = "the quality map is not finite: no grasp can be chosen from 
 PRECISIONS: Final = ("f32", "mixed")
 WEIGHTS: Final = SHIPPED / "grasp_cornell.safetensors"
 RELIEF_SCALE: Final = 0.005
-"""What stands out by this share of the ground's distance is plain to see; twice as much is not twice as plain."""
+"""Relief, as a share of the ground's distance, at which the arsinh bends: twice as much is not twice as salient."""
 MAX_RELIEF: Final = 0.5
-"""Nothing is told to stand out more than this."""
+"""Relief is clipped here."""
 GROUND_STEP_PX: Final = 6
 ROBUST_SCALES: Final = (0.2, 0.1, 0.05, 0.03, 0.02, 0.015, 0.01, 0.01, 0.01, 0.01)
 FARTHER_FACTOR: Final = 3.0
@@ -73,9 +74,9 @@ Form = tuple[Network, dict[str, np.ndarray]]
 @dataclass(frozen=True, slots=True)
 class GraspMaps:
     """Quality and direction at every pixel: ``q``, ``cos2``, ``sin2`` (H, W), one entry every ``scale_px`` pixels of
-    the 300 x 300 picture.
+    the 300 x 300 image.
 
-    The tongs close along (cos theta, sin theta) in pixels, x right and y down, theta = atan2(sin2, cos2) / 2.
+    The jaws close along (cos theta, sin theta) in pixels, x right and y down, theta = atan2(sin2, cos2) / 2.
     """
 
     q: np.ndarray
@@ -94,8 +95,12 @@ class PixelGrasp:
     q: float
 
 
-class NoDepth(ValueError):
-    """A depth picture without one known pixel."""
+class NetworkInputError(CodedError, ValueError):
+    """An image or a map that gives no grasp, or an unknown precision."""
+
+
+class NoDepth(NetworkInputError):
+    """The depth image has no known pixel."""
 
 
 def best_pixel(maps: GraspMaps) -> PixelGrasp:
@@ -105,10 +110,10 @@ def best_pixel(maps: GraspMaps) -> PixelGrasp:
     every sample and never exceeds it.
 
     Raises:
-        ValueError: the quality is not finite everywhere.
+        NetworkInputError: the quality is not finite everywhere.
     """
     if not (np.isfinite(maps.q).all() and maps.q.size):
-        raise ValueError(NOT_FINITE)
+        raise NetworkInputError("grasp.quality-not-finite", NOT_FINITE)
     return _at(maps, int(np.argmax(maps.q)))
 
 
@@ -120,28 +125,30 @@ def _at(maps: GraspMaps, place: int) -> PixelGrasp:
 
 
 def normalized_relief(depth_m: np.ndarray) -> np.ndarray:
-    """The network's input (H, W) float32 from depth [m], NaN where unknown: how far things stand out of the ground.
+    """The network's input (H, W) float32 from depth [m], NaN where unknown: the relief of things above the ground.
 
-    The ground is the plane that most of the picture lies on or before; what stands out is told as a share of its
-    distance, so that a scene and its copy at another scale and slant give the same picture: what was learned from
-    objects of a hand's size on a table holds for logs. An arsinh lets a pen and a crate both be seen. Unknown pixels
-    count as ground; a picture without ground behind its objects has to be given one.
+    The ground is the plane that most of the image lies on or before.  Relief is a share of the ground's distance, so
+    that a scene and its copy at another scale and slant give the same image: what the network learned from hand-sized
+    objects on a table holds for logs.  An arsinh keeps both a pen and a crate visible.  Unknown pixels count as ground;
+    an image without ground behind its objects must be given one.
 
     Raises:
         NoDepth: no pixel is known.
     """
     known = np.isfinite(depth_m) & (depth_m > 0.0)
     if not known.any():
-        raise NoDepth("the depth picture holds no known pixel; check the camera and what it looks at")
+        raise NoDepth("grasp.no-depth", "the depth image holds no known pixel; check the camera and its view")
     out = 1.0 - np.where(known, depth_m, 1.0).astype(np.float32) * _ground(depth_m, known)
-    return np.where(known, np.arcsinh(np.clip(out, -MAX_RELIEF, MAX_RELIEF) / np.float32(RELIEF_SCALE)), np.float32(0.0))
+    return np.where(
+        known, np.arcsinh(np.clip(out, -MAX_RELIEF, MAX_RELIEF) / np.float32(RELIEF_SCALE)), np.float32(0.0)
+    )
 
 
 def _ground(depth_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Inverse depth (H, W) float32 [1/m] of the ground: a plane is linear in the picture there.
+    """Inverse depth (H, W) float32 [1/m] of the ground: a plane is linear there.
 
-    Reweighted least squares over every sixth pixel, the scale shrinking; nearer pixels lose weight sooner than farther
-    ones, for things lie on the ground.
+    Reweighted least squares over every sixth pixel with a shrinking scale; nearer pixels lose weight sooner than
+    farther ones, because things lie on the ground.
     """
     height, width = depth_m.shape
     u, v = (np.arange(n) / max(height, width) - 0.5 for n in (width, height))
@@ -154,17 +161,19 @@ def _ground(depth_m: np.ndarray, known: np.ndarray) -> np.ndarray:
         weighted = terms * weight
         plane = np.linalg.solve(weighted @ terms.T + weight.sum() * RIDGE_TERM, weighted @ inverse)
         ground = plane @ terms
-        if ground.min() <= 0.0:  # it passes the camera, so it is none: take a level one
+        if ground.min() <= 0.0:  # the plane passes the camera, so it is not the ground: assume level ground
             plane = np.array([np.median(inverse), 0.0, 0.0])
             ground = plane @ terms
         miss = inverse / ground - 1.0
         weight = 1.0 / (1.0 + (miss / np.where(miss > 0.0, scale, FARTHER_FACTOR * scale)) ** 2)
     found = (plane[0] + plane[1] * u)[None, :] + (plane[2] * v)[:, None]
-    return np.maximum(found, 1e-3 * inverse.min()).astype(np.float32)
+    ground_inverse: np.ndarray = np.maximum(found, 1e-3 * inverse.min()).astype(np.float32)
+    return ground_inverse
 
 
 def heads_first(network: Network, arrays: Arrays) -> Form:
-    """The three heads as one, and before the upsampling: a 1 x 1 convolution commutes with bilinear interpolation."""
+    """The three heads merged and moved before the upsampling: a 1 x 1 convolution commutes with bilinear
+    interpolation."""
     body = tuple(layer for layer in network.layers if layer.name not in (*HEADS, "up3"))
     joint = Conv("heads", len(HEADS), 1, source=body[-1].name)
     kept = {name: a for name, a in arrays.items() if name.split(".")[0] not in HEADS}
@@ -174,28 +183,32 @@ def heads_first(network: Network, arrays: Arrays) -> Form:
 
 
 def low_resolution(network: Network, arrays: Arrays) -> Form:
-    """Maps at a third of the side, for ``best_pixel``; after ``heads_first``."""
+    """The network without the upsampling, with maps at a third of the side, for ``best_pixel``; after
+    ``heads_first``."""
     return replace(network, layers=network.layers[:-1], outputs=("heads",)), dict(arrays)
 
 
 class GraspNet:
-    """The network as it runs on the machine: all maps to look at, and the grasp alone from maps at a third of the side.
+    """The network as it runs on the machine: full maps for display, and the grasp alone from maps at a third of the
+    side.
 
     Args:
         arrays: weights of ``PAPER``.
-        precision: "f32", or "mixed": bf16 where the processor has it, and f32 where the grasp is decided.
+        precision: "f32", or "mixed": bf16 where the processor has it, and f32 for the decision.
     """
 
     def __init__(self, arrays: Arrays, precision: str = "f32") -> None:
         if precision not in PRECISIONS:
-            raise ValueError(f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
+            raise NetworkInputError(
+                "grasp.unknown-precision", f"precision {precision!r} is none of {', '.join(PRECISIONS)}"
+            )
         self._form = heads_first(PAPER, arrays)
         self._full: OpenVinoNet | None = None
-        self._choose = pixel_grasp_inference(arrays, precision)
+        self._infer = pixel_grasp_inference(arrays, precision)
 
     @classmethod
     def shipped(cls, path: Path = WEIGHTS, precision: str = "f32") -> GraspNet:
-        """The net with the weights of a file.
+        """The network with the weights of a file.
 
         Raises:
             WeightsRefused: damaged or foreign weights.
@@ -203,28 +216,28 @@ class GraspNet:
         return cls(load(path, PAPER)[0], precision)
 
     def maps(self, depth_m: np.ndarray) -> GraspMaps:
-        """Maps of all pixels of a 300 x 300 depth picture [m], f32.
+        """Maps of all pixels of a 300 x 300 depth image [m], f32.
 
         Raises:
-            ValueError: another size, or no depth at all (``NoDepth``).
+            NetworkInputError: another size, or no depth at all (``NoDepth``).
         """
         self._full = self._full or OpenVinoNet(*self._form, SHAPE)
         return stack_maps(self._full(_picture(depth_m)))
 
     def best(self, depth_m: np.ndarray) -> PixelGrasp:
-        """The grasp of eq. 4 in a 300 x 300 depth picture [m].
+        """The grasp of eq. 4 in a 300 x 300 depth image [m].
 
         Raises:
-            ValueError: another size, or no depth at all (``NoDepth``).
+            NetworkInputError: another size, or no depth at all (``NoDepth``).
         """
-        return self._choose(_picture(depth_m))
+        return self._infer(_picture(depth_m))
 
 
 def pixel_grasp_inference(arrays: Arrays, precision: str = "f32") -> Callable[[np.ndarray], PixelGrasp]:
-    """From a prepared picture (1, 1, 300, 300) to its grasp, by maps at a third of the side; as of ``GraspNet``.
+    """A function from a prepared image (1, 1, 300, 300) to its grasp, by maps at a third of the side.
 
-    "mixed" runs all in bf16, where neighbours become equal on flat quality and the grasp would wander; so the last
-    convolution and the heads are taken again in f32 at the best pixels, and these decide.
+    "mixed" runs everything in bf16, in which neighbouring pixels of a flat quality become equal and the grasp would
+    wander; the last convolution and the heads are therefore repeated in f32 at the best pixels, and these decide.
     """
     network, kept = low_resolution(*heads_first(PAPER, arrays))
     if precision == "f32":
@@ -234,23 +247,23 @@ def pixel_grasp_inference(arrays: Arrays, precision: str = "f32") -> Callable[[n
     weight = kept["conv7.weight"].reshape(len(kept["conv7.bias"]), -1).T
     heads = kept["heads.weight"][:, :, 0, 0].T
 
-    def choose(picture: np.ndarray) -> PixelGrasp:
+    def infer(picture: np.ndarray) -> PixelGrasp:
         found = front(picture)
         quality = found["heads"][0, 0]
         if not np.isfinite(quality).all():
-            raise ValueError(NOT_FINITE)
+            raise NetworkInputError("grasp.quality-not-finite", NOT_FINITE)
         v, u = np.divmod(np.argpartition(quality, -CANDIDATE_COUNT, axis=None)[-CANDIDATE_COUNT:], quality.shape[1])
         hidden = np.maximum(_patches(found["norm6"][0], v, u) @ weight + kept["conv7.bias"], 0.0)
         again = hidden @ heads + kept["heads.bias"]
         maps = np.full((len(HEADS), *quality.shape), -np.inf, np.float32)
         maps[:, v, u] = again.T
-        return _at(GraspMaps(*maps, POOL), int(np.argmax(maps[0])))
+        return _at(GraspMaps(maps[0], maps[1], maps[2], POOL), int(np.argmax(maps[0])))
 
-    return choose
+    return infer
 
 
 def _patches(features: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """What the last 5 x 5 convolution sees at places of the doubled features (C, H, W): (places, C * 25)."""
+    """Inputs of the last 5 x 5 convolution at places of the doubled features (C, H, W): (places, C * 25)."""
     sides = []
     for at, size in ((v, features.shape[1]), (u, features.shape[2])):
         places = at[:, None] + np.arange(-2, 3)
@@ -263,16 +276,19 @@ def _patches(features: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
     rows = [(v0[:, :, None], a0[:, :, None]), (v1[:, :, None], a1[:, :, None])]
     columns = [(u0[:, None, :], b0[:, None, :]), (u1[:, None, :], b1[:, None, :])]
     seen = sum(features[:, y, x] * (a * b) for y, a in rows for x, b in columns)
-    return seen.transpose(1, 0, 2, 3).reshape(len(v), -1)
+    patches: np.ndarray = seen.transpose(1, 0, 2, 3).reshape(len(v), -1)
+    return patches
 
 
 def stack_maps(found: Mapping[str, np.ndarray]) -> GraspMaps:
-    """The maps of the first picture in any form's outputs."""
+    """The maps of the first image, from the outputs of any form."""
     q, cos2, sin2 = np.concatenate([v[0] for v in found.values()])
     return GraspMaps(q, cos2, sin2, SIDE_PX // len(q))
 
 
 def _picture(depth_m: np.ndarray) -> np.ndarray:
     if depth_m.shape != (SIDE_PX, SIDE_PX):
-        raise ValueError(f"the grasp network takes {SIDE_PX} x {SIDE_PX} depth pictures, not {depth_m.shape}")
+        raise NetworkInputError(
+            "grasp.image-size", f"the grasp network takes {SIDE_PX} x {SIDE_PX} depth images, not {depth_m.shape}"
+        )
     return normalized_relief(depth_m)[None, None]

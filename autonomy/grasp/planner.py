@@ -1,7 +1,8 @@
-"""What a grasp planner proposes: one grasp in the base frame, with what it expects to come up and why.
+"""The two contracts of grasp planning, and what passes between them.
 
-A planner is a callable ``(arm, logs, slew_rad, rot_rad, stay=()) -> GraspCandidate``; it raises ``NoGrasp``.  ``stay``
-are places in the list: those logs are to stay lying, but they are there and in the way.
+A grasp planner looks at a log list and proposes one grasp candidate in the base frame.  A grasp selector turns a crane
+job into the grasp that the crane executes; `autonomy.grasp.selection.PlannerSelection` wraps a planner as a selector.
+Failure of both: ``NoGrasp``.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from autonomy.grasp.grasp import Grasp
-from autonomy.missions.crane_job import Mission
+from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.observation import LogObservation
+from runtime.errors import CodedError
 
 
-class NoGrasp(ValueError):
-    """No log can be picked or placed; the message says which and why."""
+class NoGrasp(CodedError, ValueError):
+    """No log can be picked or placed; the sentence says which and why."""
 
 
 class BunkFull(NoGrasp):
@@ -25,13 +27,26 @@ class BunkFull(NoGrasp):
 
 
 @dataclass(frozen=True, slots=True)
-class GraspCandidate:
-    """Where the middle between the tips comes to (base frame), how it is turned and what comes up.
+class GraspRequest:
+    """What a grasp planner plans from: machine and load, the log list, and the present rotator angle [rad].
 
-    ``yaw_rad`` is the direction of the opening axis; ``support_z_m`` the height that the tips sweep along, just above
-    it.  ``logs`` are places in the list that was planned from.
-    ``probability`` is that of success as the planner sees it, ``reason`` one sentence.  ``pressed``: the tongs go down
-    among logs, and close where they meet too much; ``drawn``: one of them between two that touch, to draw one out.
+    ``stay`` holds indices into ``logs``: these logs must not be gripped, but they are obstacles.
+    """
+
+    arm: Arm
+    logs: Sequence[LogObservation]
+    rot_rad: float
+    stay: Collection[int] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class GraspCandidate:
+    """One proposed grasp: the point midway between the tips (base frame), the opening axis, and the logs it lifts.
+
+    ``yaw_rad`` is the direction of the opening axis.  The tips sweep just above ``support_z_m``.  ``logs`` holds
+    indices into the request's log list.  ``probability`` is the planner's estimate of success, ``reason`` one
+    sentence for the operator.  ``penetrates``: the open jaws go down among logs and close where these stop them.
+    ``extracts``: one jaw goes down between two logs that touch, to draw one of them out of a row.
     """
 
     x_m: float
@@ -41,26 +56,29 @@ class GraspCandidate:
     logs: tuple[int, ...]
     probability: float
     reason: str
-    pressed: bool = False
-    drawn: bool = False
+    penetrates: bool = False
+    extracts: bool = False
 
 
 class GraspPlanner(Protocol):
-    """See the module."""
+    """Proposes the best grasp of a log list."""
 
-    def __call__(
-        self,
-        arm: Arm,
-        logs: Sequence[LogObservation],
-        slew_rad: float,
-        rot_rad: float,
-        stay: Collection[int] = (),
-    ) -> GraspCandidate: ...
+    def __call__(self, request: GraspRequest) -> GraspCandidate:
+        """The best candidate.
+
+        Raises:
+            NoGrasp: there is none.
+        """
 
 
 class GraspSelector(Protocol):
-    """See the module."""
+    """Chooses the grasp of a crane job."""
 
     def __call__(
-        self, arm: Arm, mission: Mission, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float
-    ) -> Grasp: ...
+        self, arm: Arm, job: CraneJob, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float
+    ) -> Grasp:
+        """The grasp of the job from the present slew and rotator angles [rad].
+
+        Raises:
+            NoGrasp: there is none.
+        """

@@ -1,8 +1,8 @@
-"""A log at the end of a row that is too wide for the tongs is drawn out of it.
+"""Extraction grasp: draws a log off the end of a row that is too wide for the grapple.
 
-One open tong is pressed into the valley between it and its neighbour until its tip is beside them rather than on them,
-the other comes down on free ground beyond; closing, they roll the log away from the row until both are under it.  Tongs
-round the whole row, instead, stall at its sides, pull, and slip off over it.
+One open jaw penetrates the valley between the log and its neighbour until its tip is beside them rather than on them;
+the other comes down on free ground beyond.  Closing, they roll the log away from the row until both are under it.  Jaws
+around the whole row would instead stall at its sides, pull, and slip off over it.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.kinematics import Unreachable
 
 SUCCESS_PROBABILITY: Final = 0.9
-"""In the plant's rows of three: 14 of 14, without another try."""
+"""In the plant's rows of three: 14 of 14 at the first try."""
 VALLEY_OFFSET_M: Final = 0.02
-"""The tip comes down so far beyond the log's side: logs that touch part when it is pressed between them."""
+"""Distance of the tip beyond the log's side: logs that touch part when the tip is pressed between them."""
 NEIGHBOUR_OFFSET_M: Final = 0.05
-"""What lies on one side of a log lies so far over there, at least."""
+"""A neighbour's centre is at least this far to the side of the log."""
 ROW_RADIUS_M: Final = 2.5
-"""Logs whose middles are farther away are of no row with it."""
+"""Logs whose centres are farther apart belong to different rows."""
 
 
 def extract_end_log(
@@ -41,9 +41,10 @@ def extract_end_log(
     lowest_m: float,
     rot_rad: float,
 ) -> GraspCandidate | None:
-    """The thickest log at an end of a row on the ground at ``lowest_m`` that is in reach with free ground beside it and
-    is none of those that are to stay (n,), nor lies on others or under them (``upon`` (n, n) of `quality.lies_upon`);
-    None where there is none.  ``rot_rad`` is where the rotator stands.
+    """The extraction of the thickest log at the end of a row on the ground, or None where there is none.
+
+    The log is in reach, has free ground beside it at ``lowest_m``, is not marked in ``stays`` (n,), and neither lies on
+    others nor carries any (``upon`` (n, n) of `quality.rests_upon`).  ``rot_rad`` is the present rotator angle.
     """
     barred = stays | upon.any(axis=0) | upon.any(axis=1)
     for i in np.argsort(-world.radius, kind="stable").tolist():
@@ -61,6 +62,8 @@ def extract_end_log(
                 grasp_pose(arm, float(x), float(y), yaw, lowest_m, logs[i].diameter_m, rot_rad)
             except Unreachable:
                 continue
-            reason = f"log {logs[i].id} is drawn out of a row of {len(logs)} logs that is too wide for the tongs"
-            return GraspCandidate(float(x), float(y), yaw, lowest_m, (i,), SUCCESS_PROBABILITY, reason, pressed=True, drawn=True)
+            reason = f"draws log {logs[i].id} out of a row of {len(logs)} logs that is too wide for the grapple"
+            return GraspCandidate(
+                float(x), float(y), yaw, lowest_m, (i,), SUCCESS_PROBABILITY, reason, penetrates=True, extracts=True
+            )
     return None

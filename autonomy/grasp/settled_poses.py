@@ -1,9 +1,9 @@
-"""Logs as they can lie: on the ground or on others, not in the ground and not in each other.
+"""Settled pose estimates: log poses corrected so that logs lie on the ground or on each other, and never inside.
 
-A camera sees a strip of a log that others hide, and tells its height and width badly, which its covariance says.  What
-is known of heavy things does the rest, as measurements of a Kalman filter: a log that may lie on the ground lies on it
-with both ends, and two logs that reach into each other touch; each is moved by as much as it is unsure.  What raises or
-sinks all logs alike, a camera's mount or scale of depth, is taken from those on others, too.
+A camera sees only a strip of a log that others hide; it measures height and width badly, which the covariance says.
+Gravity and contact add what is missing, as measurements of a Kalman filter: a log that may lie on the ground lies on
+it with both ends, and two logs that overlap touch.  Each log moves in proportion to its own uncertainty.  An error
+common to all logs, from the camera's mount or depth scale, is removed from the logs on others, too.
 """
 
 from __future__ import annotations
@@ -12,34 +12,36 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.cylinders import Cylinders, transverse_axes, axis_offsets, perturbed
+from autonomy.grasp.cylinders import Cylinders, axis_offsets, perturbed, transverse_axes
 from autonomy.perception.log_list.estimate import ACROSS_1, ACROSS_2, RADIUS, SIZE, TILT_1, TILT_2
 
 GROUND_SIGMA_M: Final = 0.015
-"""Standard deviation of the ground's height under an end of a log, with its bow and taper."""
+"""Standard deviation of the ground's height under a log's end, including bow and taper."""
 MAX_MAHALANOBIS_SQ: Final = 9.0
-"""Squared standard deviations, of two numbers, up to which a log may lie on the ground: 99 %."""
+"""Squared Mahalanobis distance, two degrees of freedom, up to which a log may lie on the ground: 99 %."""
 MAX_HEIGHT_ON_GROUND_M: Final = 0.12
-"""A log whose middle is seen further over the ground than this lies on something."""
+"""A log whose middle is seen higher above the ground than this lies on something."""
 CONTACT_OVERLAP_M: Final = 0.015
-"""Logs that touch reach so far into each other as cylinders."""
+"""Logs in contact overlap this much as cylinders."""
 MAX_OVERLAP_M: Final = 0.04
-"""A log that would reach further into another if it lay on the ground does not lie there."""
+"""A log that would overlap another by more if it lay on the ground does not lie there."""
 OWN_HEIGHT_SHARE: Final = 0.4
-"""Of the standard deviation of the height of a log on others, the part that is its own and not the camera's."""
+"""Share of the height's standard deviation of a log on others that is its own and not the camera's."""
 ROUND_COUNT: Final = 3
 
 
 def settled_poses(world: Cylinders, covariances: np.ndarray, ground_z_m: float) -> tuple[Cylinders, np.ndarray]:
-    """The logs (n) and their covariances (n, 7, 7), with level ground at ``ground_z_m``."""
+    """The corrected logs (n) and their covariances (n, 7, 7), on level ground at ``ground_z_m``."""
     sigma, before = covariances.copy(), surface_gaps(world)
-    common = float(np.min(sigma[:, ACROSS_2, ACROSS_2], initial=np.inf))  # no log is known better than the camera
+    common = float(np.min(sigma[:, ACROSS_2, ACROSS_2], initial=np.inf))  # the camera's own share of the variance
     lying, off, sure = np.zeros(world.count, bool), np.zeros(world.count), np.zeros(world.count)
     for i in np.argsort(sigma[:, ACROSS_2, ACROSS_2], kind="stable").tolist():
         height, slope = _undersides(world, i, ground_z_m)
         off[i] = height.mean()
         spread = slope @ sigma[i] @ slope.T + GROUND_SIGMA_M**2 * np.eye(2)
-        if off[i] > MAX_HEIGHT_ON_GROUND_M or (off[i] > 0.0 and height @ np.linalg.solve(spread, height) > MAX_MAHALANOBIS_SQ):
+        if off[i] > MAX_HEIGHT_ON_GROUND_M or (
+            off[i] > 0.0 and height @ np.linalg.solve(spread, height) > MAX_MAHALANOBIS_SQ
+        ):
             continue
         laid = _updated_pose(world, sigma, i, height, slope, GROUND_SIGMA_M)
         if off[i] > 0.0 and np.any(surface_gaps(laid)[i] < np.minimum(before[i], 0.0) - MAX_OVERLAP_M):
@@ -66,8 +68,8 @@ def settled_poses(world: Cylinders, covariances: np.ndarray, ground_z_m: float) 
 
 
 def surface_gaps(world: Cylinders) -> np.ndarray:
-    """(n, n) [m]: the least distance between the surfaces of every two logs by points of the one's axis, negative where
-    they reach into each other; infinite between a log and itself."""
+    """Least distance between the surfaces of every two logs (n, n) [m], by points along one axis; negative where they
+    overlap, infinite between a log and itself."""
     off = np.linalg.norm(axis_offsets(world), axis=-1).min(axis=-1)
     gap: np.ndarray = np.minimum(off, off.T) - world.radius[:, None] - world.radius[None, :]
     np.fill_diagonal(gap, np.inf)
@@ -75,7 +77,7 @@ def surface_gaps(world: Cylinders) -> np.ndarray:
 
 
 def _undersides(world: Cylinders, i: int, ground_z_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (2,) of the undersides of both ends of log ``i`` over the ground, and their derivatives (2, 7)."""
+    """Heights (2,) of the undersides of both ends of log ``i`` over the ground, and their Jacobian (2, 7)."""
     half = 0.5 * float(world.length[i])
     level = float(np.sqrt(max(1.0 - world.axis[i, 2] ** 2, 0.0)))
     middle = world.center[i, 2] - world.radius[i] * level - ground_z_m
@@ -87,16 +89,17 @@ def _undersides(world: Cylinders, i: int, ground_z_m: float) -> tuple[np.ndarray
 
 
 def _updated_covariance(covariance: np.ndarray, slope: np.ndarray, noise_m: float) -> np.ndarray:
-    """A covariance (7, 7) after a measurement with derivatives (k, 7)."""
+    """A covariance (7, 7) after a measurement with Jacobian (k, 7)."""
     spread = slope @ covariance @ slope.T + noise_m**2 * np.eye(len(slope))
-    known: np.ndarray = covariance - covariance @ slope.T @ np.linalg.solve(spread, slope @ covariance)
-    return 0.5 * (known + known.T)
+    known = covariance - covariance @ slope.T @ np.linalg.solve(spread, slope @ covariance)
+    symmetric: np.ndarray = 0.5 * (known + known.T)
+    return symmetric
 
 
 def _updated_pose(
     world: Cylinders, sigma: np.ndarray, i: int, over_m: np.ndarray, slope: np.ndarray, noise_m: float
 ) -> Cylinders:
-    """The logs with ``i`` changed so that what is ``over_m`` (k,) over its place is as near to it as both are known."""
+    """The logs with log ``i`` moved to reduce the residual ``over_m`` (k,), weighted by its covariance."""
     spread = slope @ sigma[i] @ slope.T + noise_m**2 * np.eye(len(slope))
     error = np.zeros((world.count, SIZE))
     error[i] = -sigma[i] @ slope.T @ np.linalg.solve(spread, over_m)
@@ -104,7 +107,7 @@ def _updated_pose(
 
 
 def _separated(world: Cylinders, sigma: np.ndarray, i: int, j: int) -> Cylinders:
-    """The logs with two of them moved apart until they touch, each by as much as it is unsure."""
+    """The logs with logs ``i`` and ``j`` moved apart until they touch, each in proportion to its variance."""
     level, up = transverse_axes(world.axis)
     points, away = world.points()[j], axis_offsets(world)[i, j]
     distance = np.linalg.norm(away, axis=1)

@@ -1,9 +1,9 @@
-"""Paper A's virtual world (II-C): the logs again as perfect cylinders, and a depth camera that hangs above them.
+"""Paper A's virtual scene (II-C): the logs recreated as perfect cylinders, and a depth camera above them.
 
-Logs are shortened by the grapple's width and a further 10 %, so that no grasp is planned at their edges; the cuboid of
-their ends (eq. 1) says where they are; a D435 looks down from 3 m above its centroid.  The paper's world is blank; here
-the ground is in it, which a network needs to see what stands out.  Exact, no noise.  Base frame, metres; picture: x
-right is base +x, y down is base -y.
+Logs are shortened by the grapple's width and a further 10 %, so that no grasp is planned at their edges.  The cuboid of
+their ends (eq. 1) bounds them; a D435 looks down from 3 m above its centroid.  The paper's scene is blank; here it
+contains the ground, which a network needs to see relief.  Exact, no noise.  Base frame, metres; image: x right is
+base +x, y down is base -y.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import numpy as np
 
 from autonomy.grasp.cylinders import Cylinders
 from machine.geometry.optics import Intrinsics
+from runtime.errors import CodedError
 
 SIDE_PX: Final = 300
-"""Side of the picture the network takes, cut from the middle of the camera's."""
+"""Side of the image the network takes, cut from the middle of the camera's."""
 D435: Final = Intrinsics(640, 480, 385.0, 385.0, 320.0, 240.0).crop(170, 90, SIDE_PX, SIDE_PX)
 CAMERA_HEIGHT_M: Final = 3.0
 TRIM_SHARE: Final = 0.10
@@ -26,9 +27,13 @@ DOWNWARD_AXES: Final = np.diag([1.0, -1.0, -1.0])
 MIN_DEPTH_M: Final = 0.05
 
 
+class SceneError(CodedError, ValueError):
+    """The virtual scene cannot be built or seen."""
+
+
 @dataclass(frozen=True, slots=True)
 class OperationalArea:
-    """The box that holds the ends of all logs: least and greatest corner (3,) [m]."""
+    """The cuboid that holds the ends of all logs: least and greatest corner (3,) [m]."""
 
     low_m: np.ndarray
     high_m: np.ndarray
@@ -36,7 +41,8 @@ class OperationalArea:
     @property
     def centroid_m(self) -> np.ndarray:
         """Its middle (3,)."""
-        return (self.low_m + self.high_m) / 2.0
+        middle: np.ndarray = (self.low_m + self.high_m) / 2.0
+        return middle
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,23 +54,25 @@ class Camera:
 
     def to_base(self, u_px: float, v_px: float, depth_m: float) -> np.ndarray:
         """Base-frame point (3,) of a pixel at a depth [m]."""
-        seen: np.ndarray = DOWNWARD_AXES @ self.intrinsics.deproject(u_px, v_px, depth_m)
-        return self.position_m + seen
+        seen = DOWNWARD_AXES @ self.intrinsics.deproject(u_px, v_px, depth_m)
+        point: np.ndarray = self.position_m + seen
+        return point
 
 
 def shortened_logs(world: Cylinders, grapple_m: float) -> Cylinders:
-    """The logs as they are recreated: shorter by the grapple's width, then by 10 %."""
+    """The recreated logs: shorter by the grapple's width, then by 10 %."""
     return world.shortened(grapple_m, TRIM_SHARE)
 
 
 def operational_area(world: Cylinders) -> OperationalArea:
     """The operational area, from the ends of the axes (eq. 1).
 
-    Raises ValueError without a log, or when one is nowhere.
+    Raises:
+        SceneError: there is no log, or a pose is not finite.
     """
     ends = world.ends().reshape(-1, 3)
     if not len(ends) or not np.all(np.isfinite(ends)):
-        raise ValueError("the virtual world holds no log, or one whose pose is not finite")
+        raise SceneError("grasp.scene-empty", "the virtual scene holds no log, or one whose pose is not finite")
     return OperationalArea(ends.min(axis=0), ends.max(axis=0))
 
 
@@ -73,8 +81,10 @@ def camera_above(box: OperationalArea, intrinsics: Intrinsics = D435) -> Camera:
     return Camera(box.centroid_m + np.array([0.0, 0.0, CAMERA_HEIGHT_M]), intrinsics)
 
 
-def cameras_along(box: OperationalArea, reach_m: float, count: int, intrinsics: Intrinsics = D435) -> tuple[Camera, ...]:
-    """A moving camera: ``count`` places on a circle of ``reach_m`` about the paper's, which comes first."""
+def cameras_along(
+    box: OperationalArea, reach_m: float, count: int, intrinsics: Intrinsics = D435
+) -> tuple[Camera, ...]:
+    """A moving camera: ``count`` places on a circle of ``reach_m`` about the paper's place, which comes first."""
     first = camera_above(box, intrinsics)
     turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[: max(0, count - 1)]
     circle = reach_m * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
@@ -84,12 +94,15 @@ def cameras_along(box: OperationalArea, reach_m: float, count: int, intrinsics: 
 def render(world: Cylinders, camera: Camera, ground_z_m: float) -> np.ndarray:
     """Depth (H, W) float32 [m], optical z, of cylinders and level ground.
 
-    Raises ValueError when the camera is not above the ground, or is inside a log.
+    Raises:
+        SceneError: the camera is not above the ground, or is inside a log.
     """
     pin = camera.intrinsics
     below = float(camera.position_m[2]) - ground_z_m
     if not below > MIN_DEPTH_M:
-        raise ValueError(f"the virtual camera is {below:.2f} m above the ground; it has to look down on it")
+        raise SceneError(
+            "grasp.camera-below-ground", f"the virtual camera is {below:.2f} m above the ground; place it higher"
+        )
     inverse = np.full((pin.height_px, pin.width_px), 1.0 / below, np.float32)
     u = ((np.arange(pin.width_px) - pin.cx_px) / pin.fx_px).astype(np.float32)
     v = ((np.arange(pin.height_px) - pin.cy_px) / pin.fy_px).astype(np.float32)
@@ -109,14 +122,14 @@ def _draw(
     half: float,
     r: float,
 ) -> None:
-    """One cylinder into a picture of inverse depths; only its box in the picture is looked at."""
+    """Draws one cylinder into an image of inverse depths, within its bounding box."""
     side = np.cross(w, (0.0, 0.0, 1.0) if abs(w[2]) < 0.9 else (1.0, 0.0, 0.0))
     side /= np.linalg.norm(side)
     across = np.stack([side, np.cross(w, side)]) * r
     corners = [p + a * half * w + b * across[0] + c * across[1] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]
     corners_m = np.array(corners)
     if corners_m[:, 2].min() < MIN_DEPTH_M:
-        raise ValueError("the virtual camera is inside a log or beside one; raise it")
+        raise SceneError("grasp.camera-in-log", "the virtual camera is inside a log or beside one; raise it")
     px = pin.project(corners_m)
     left, top = np.maximum(np.floor(px.min(axis=0)).astype(int), 0)
     right, bottom = np.ceil(px.max(axis=0)).astype(int) + 1

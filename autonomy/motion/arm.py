@@ -27,29 +27,29 @@ directions.
 class Arm(ArmKinematics):
     """x"""
 
-    def __init__(self, profile: Profile, load_kg: float = 0.0, stretches: bool = True) -> None:
+    def __init__(self, profile: Profile, load_kg: float = 0.0, free_telescope: bool = True) -> None:
         super().__init__(profile, load_kg)
-        self._stretches = stretches
-        self._easy: dict[tuple[int, int, int], float | None] = {}
+        self._free_telescope = free_telescope
+        self._extension_cache: dict[tuple[int, int, int], float | None] = {}
 
     def loaded(self, load_kg: float) -> Arm:
         """The same machine with another load."""
-        return self if load_kg == self.load_kg else Arm(self.profile, load_kg, self._stretches)
+        return self if load_kg == self.load_kg else Arm(self.profile, load_kg, self._free_telescope)
 
-    def over(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
+    def pose_above(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
         """The pose above a point at ``low_z_m`` whose telescope also serves at ``high_z_m``; rotator at 0.
 
         Raises:
             Unreachable: with the reason.
         """
-        if not self._stretches:
-            return self.reach(x, y, low_z_m, high_z_m)
+        if not self._free_telescope:
+            return self.compact_pose_above(x, y, low_z_m, high_z_m)
         try:
-            return self._over(x, y, low_z_m, high_z_m, self._easy_extension(hypot(x, y), low_z_m, high_z_m))
+            return self._pose_with_extension(x, y, low_z_m, high_z_m, self._fastest_extension(hypot(x, y), low_z_m, high_z_m))
         except Unreachable:
-            return self.reach(x, y, low_z_m, high_z_m)
+            return self.compact_pose_above(x, y, low_z_m, high_z_m)
 
-    def reach(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
+    def compact_pose_above(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
         """The same with the telescope out only as far as leaves the arm speed in all directions there.
 
         Raises:
@@ -57,9 +57,9 @@ class Arm(ArmKinematics):
         """
         r = hypot(x, y) - self._kin.a1_m
         stretch = max(hypot(r, z - self._kin.d1_m) for z in (low_z_m, high_z_m)) / DEXTEROUS_STRETCH
-        return self._over(x, y, low_z_m, high_z_m, stretch - self._kin.a2_m - self._kin.d4_m)
+        return self._pose_with_extension(x, y, low_z_m, high_z_m, stretch - self._kin.a2_m - self._kin.d4_m)
 
-    def _over(self, x: float, y: float, low_z_m: float, high_z_m: float, wish_m: float) -> Pose:
+    def _pose_with_extension(self, x: float, y: float, low_z_m: float, high_z_m: float, wish_m: float) -> Pose:
         least, most = self._limits[Joint.EXT]
         wish_m = min(max(wish_m, least + 2.0 * STOP_MARGIN), most - 2.0 * STOP_MARGIN)
         slew, _, _, ext = aim_free(self.profile, x, y, low_z_m, wish_m, self.load_kg)
@@ -71,13 +71,13 @@ class Arm(ArmKinematics):
         self.joints(np.array([pose.at_height(z) for z in heights]))
         return pose
 
-    def _easy_extension(self, r_m: float, low_z_m: float, high_z_m: float) -> float:
+    def _fastest_extension(self, r_m: float, low_z_m: float, high_z_m: float) -> float:
         """The telescope's best extension at a distance, m, about: for the way up and over the bunk."""
         key = round(r_m / _EXTENSION_CACHE_GRID_M), round(low_z_m / _EXTENSION_CACHE_GRID_M), round(high_z_m / _EXTENSION_CACHE_GRID_M)
-        if key not in self._easy:
+        if key not in self._extension_cache:
             r, low, high = (k * _EXTENSION_CACHE_GRID_M for k in key)
             down, up = (Pose(0.0, r, z, 0.0, 0.0) for z in (low, high))
-            self._easy[key] = fastest_extension(self, down, up, up._replace(r_m=hypot(*self.profile.bunk.center_m)))
-        if (found := self._easy[key]) is None:
+            self._extension_cache[key] = fastest_extension(self, down, up, up._replace(r_m=hypot(*self.profile.bunk.center_m)))
+        if (found := self._extension_cache[key]) is None:
             raise Unreachable("no extension serves at both heights")
         return found

@@ -72,12 +72,12 @@ class ArmKinematics:
         Raises:
             Unreachable: a pose is outside the joint limits.
         """
-        q, outside = self._settled(poses)
-        return self._one_by_one(poses) if np.any(outside) else q
+        q, outside = self._sag_compensated(poses)
+        return self._joints_or_reason(poses) if np.any(outside) else q
 
-    def _settled(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _sag_compensated(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """All at once, and which are out of reach: `machine.geometry.sag.aim` for arrays."""
-        q, outside = self.joints_or_outside(poses)
+        q, outside = self.straight_column_joints(poses)
         if (sag := self.profile.sag) is None:
             return q, outside
         kin, at = self._kin, poses
@@ -92,10 +92,10 @@ class ArmKinematics:
                 break
             at = at.copy()
             at[:, 1:3] += off
-            q, outside = self.joints_or_outside(at)
+            q, outside = self.straight_column_joints(at)
         return q, outside
 
-    def _one_by_one(self, poses: np.ndarray) -> np.ndarray:
+    def _joints_or_reason(self, poses: np.ndarray) -> np.ndarray:
         """The same, to say what is in the way."""
         sag, out, limits = self.profile.sag, np.empty_like(poses), self._limits
         for i, (slew, r, z, ext, rot) in enumerate(poses.tolist()):
@@ -103,26 +103,26 @@ class ArmKinematics:
             angles = aim(sag, self._kin, limits, r * cos(theta), r * sin(theta), z, ext, self.load_kg)
             out[i] = (slew, angles[1], angles[2], ext, rot)
             if i == 0:
-                low, high = self._room(out[0])
+                low, high = self._joint_bounds(out[0])
                 limits = tuple(zip(low.tolist(), high.tolist(), strict=True))
         return out
 
-    def _room(self, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _joint_bounds(self, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Least and greatest joints of a motion that begins at joints (5,)."""
         low, high = np.array(self._limits).T
         inner, outer = low + STOP_MARGIN, high - STOP_MARGIN
         at = np.where(np.isfinite(first), np.clip(first, low, high), inner)
         return np.minimum(inner, at), np.maximum(outer, at)
 
-    def joints_about(self, poses: np.ndarray) -> np.ndarray:
+    def approximate_joints(self, poses: np.ndarray) -> np.ndarray:
         """The same all at once, as if the column stood straight: to look at many ways, not to drive one."""
-        q, outside = self.joints_or_outside(poses)
+        q, outside = self.straight_column_joints(poses)
         if np.any(outside):
             self.joints(poses[np.argmax(outside)][None])  # says what is in the way
             raise Unreachable("a pose of the way is at the edge of the crane's reach")
         return q
 
-    def joints_or_outside(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def straight_column_joints(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Joint vectors (n, 5) of poses (n, 5), the column straight, and which of them are out of reach (n,)."""
         kin, (slew, r, z, ext, rot) = self._kin, poses.T
         boom, length = kin.a2_m, kin.d4_m + ext
@@ -134,5 +134,5 @@ class ArmKinematics:
         elbow = np.arctan2(area4, d**2 - boom**2 - stick**2)
         tilt = np.arctan2(length, kin.a3_m) - elbow - kin.theta3_offset_rad
         q = np.column_stack([slew, lift, tilt, ext, rot])
-        low, high = self._room(q[0])
+        low, high = self._joint_bounds(q[0])
         return q, ~np.all((q >= low - STOP_ROUNDING) & (q <= high + STOP_ROUNDING), axis=1) | (heron < 0.0)

@@ -83,7 +83,7 @@ def evaluate_clearance(
         room = room + np.where(body.hangs, ASSUMED_SWING_RAD * np.max(deep[..., 0], axis=0), 0.0)
     room = room * left[:, None]
     low, high = np.min(np.minimum(body.a, body.b), axis=(0, 1)), np.max(np.maximum(body.a, body.b), axis=(0, 1))
-    things = around.standing.near(low - BROAD_PHASE_M, high + BROAD_PHASE_M)
+    things = around.arrays.near(low - BROAD_PHASE_M, high + BROAD_PHASE_M)
     # All samples with every lean, and both ends once more as they stand, at once.
     leans = [] if step_s is None else [body.shifted(lean * depth, depth) for lean in _predicted_swing(pin, step_s)]
     bodies = [*(leans or [body]), body.rows([0, -1])]

@@ -64,7 +64,7 @@ def clearances(around: CollisionScene, body: SweptCapsules, near_m: float = np.i
 
     Beyond ``near_m`` what is given may be less than the distance, but not less than ``near_m``.
     """
-    return obstacle_distances(around.standing, body, np.array(near_m))
+    return obstacle_distances(around.arrays, body, np.array(near_m))
 
 
 def obstacle_distances(things: ObstacleArrays, body: SweptCapsules, near_m: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ class MotionPlanner(Protocol):
     """A way from rest to rest.
 
     ``direct``: it goes down to a log, and with it up, over and down into the bunk, in one; else an activity asks for
-    each of these alone.  ``stretches``: it is quickest with the telescope far out at a log (`Arm`).
+    each of these alone.  ``free_telescope``: it is quickest with the telescope far out at a log (`Arm`).
     """
 
     @property
@@ -30,7 +30,7 @@ class MotionPlanner(Protocol):
         """Whether a way may begin and end beside a log or between the stakes."""
 
     @property
-    def stretches(self) -> bool:
+    def free_telescope(self) -> bool:
         """Whether the telescope may be anywhere."""
 
     def __call__(
@@ -48,7 +48,7 @@ class TimeOptimalPlanner:
 
     def __init__(self, direct: bool = True) -> None:
         self.direct: Final = direct
-        self.stretches: Final = True
+        self.free_telescope: Final = True
 
     def __call__(
         self, arm: Arm, start: Pose, goal: Pose, around: CollisionScene, held: HeldLog | None, high_m: float, free_m: float
@@ -71,7 +71,7 @@ class MovementPrimitivePlanner:
 
     def __init__(self, primitives: Primitives) -> None:
         self.direct: Final = False
-        self.stretches: Final = False
+        self.free_telescope: Final = False
         """People showed other postures."""
         self._shown = PrimitiveMotions(primitives)
 

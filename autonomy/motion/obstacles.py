@@ -100,18 +100,18 @@ class CollisionScene:
 
     ground: Ground
     boxes: tuple[Box, ...] = ()
-    rods: tuple[Capsule, ...] = ()
+    capsules: tuple[Capsule, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
         """The ground, the boxes, the rods: the columns of `clearances`."""
-        return ("the ground", *(b.name for b in self.boxes), *(r.name for r in self.rods))
+        return ("the ground", *(b.name for b in self.boxes), *(r.name for r in self.capsules))
 
     @cached_property
-    def standing(self) -> ObstacleArrays:
+    def arrays(self) -> ObstacleArrays:
         """The same as arrays."""
         yaw = np.array([b.yaw_rad for b in self.boxes])
-        begin, end = (np.array([getattr(r, f) for r in self.rods]).reshape(-1, 3) for f in ("a_m", "b_m"))
+        begin, end = (np.array([getattr(r, f) for r in self.capsules]).reshape(-1, 3) for f in ("a_m", "b_m"))
         return ObstacleArrays(
             self.ground,
             self.names,
@@ -120,7 +120,7 @@ class CollisionScene:
             np.column_stack([np.cos(yaw), np.sin(yaw)]),
             (begin + end) / 2,
             (end - begin) / 2,
-            np.array([r.radius_m for r in self.rods]),
+            np.array([r.radius_m for r in self.capsules]),
         )
 
 

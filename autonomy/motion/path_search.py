@@ -64,7 +64,7 @@ class ClearMotion:
     """
 
     motion: Trajectory
-    spare_m: float
+    reserve_m: float
     name: str
     tried: int
 
@@ -84,18 +84,18 @@ class _Candidate:
 class _Failure:
     """What one way taught: by how much it was too near, where from what, and in which half."""
 
-    way: _Candidate
+    candidate: _Candidate
     short_m: float
     why: str
     late: bool
 
     def rules_out(self, other: _Candidate) -> bool:
         """Whether another is no farther away where this one was too near."""
-        if other.shape != self.way.shape or other.height_m > self.way.height_m + _PRUNE_SHARE * self.short_m:
+        if other.shape != self.candidate.shape or other.height_m > self.candidate.height_m + _PRUNE_SHARE * self.short_m:
             return False
         if self.late:
-            return other.over_left >= self.way.over_left
-        return other.up_left >= self.way.up_left
+            return other.over_left >= self.candidate.over_left
+        return other.up_left >= self.candidate.up_left
 
 
 def plan_path(
@@ -118,7 +118,7 @@ def plan_path(
     planner = _PathSearch(arm, start, goal, around, held)
     top = max(start.z_m, goal.z_m)
     line = _Candidate((start, goal), 1.0, 1.0, top, "straight")
-    if least_height_m <= top and planner.may_pass(line) and (found := planner.driven(line)):
+    if least_height_m <= top and planner.may_be_clear(line) and (found := planner.clear_motion(line)):
         return found
     for reach in REACH_FACTORS:
         height = planner.least_height(max(top, least_height_m), top + MAX_RISE_M, reach)
@@ -171,19 +171,19 @@ class _PathSearch:
     around: CollisionScene
     held: HeldLog | None
     tried: int = 0
-    spare_m: float = 0.0
+    reserve_m: float = 0.0
     failures: list[_Failure] = field(default_factory=list)
-    made: dict[tuple[float, str], tuple[list[Leg], list[dict[float, float]]]] = field(default_factory=dict)
-    easy: dict[tuple[Pose, ...], tuple[Pose, ...]] = field(default_factory=dict)
+    leg_cache: dict[tuple[float, str], tuple[list[Leg], list[dict[float, float]]]] = field(default_factory=dict)
+    extension_cache: dict[tuple[Pose, ...], tuple[Pose, ...]] = field(default_factory=dict)
 
     def least_height(self, low_m: float, high_m: float, reach: float | None) -> float | None:
         """The least height, within a few cm, at which the way with sharp corners is clear; None where none is."""
         height = low_m
         while height <= high_m and self.tried < MAX_TRIES:
-            sharp = self._way(height, reach, OVERLAP_SHARES[-1], OVERLAP_SHARES[-1])
+            sharp = self._candidate(height, reach, OVERLAP_SHARES[-1], OVERLAP_SHARES[-1])
             poses = self._poses(sharp)
             try:
-                spare_m = self._judged(sharp, poses, self.arm.joints_about(poses), None)
+                spare_m = self._evaluate(sharp, poses, self.arm.approximate_joints(poses), None)
             except Unreachable:
                 return None
             if spare_m >= 0.0:
@@ -191,11 +191,11 @@ class _PathSearch:
             height += _HEIGHT_STEP_M - spare_m
         return None
 
-    def may_pass(self, way: _Candidate) -> bool:
+    def may_be_clear(self, way: _Candidate) -> bool:
         """Whether a law may make a way clear."""
         poses = self._poses(way)
         try:
-            q = self.arm.joints_about(poses)
+            q = self.arm.approximate_joints(poses)
         except Unreachable:
             return False
         spare_m, why, _ = evaluate_clearance(self.arm, q, pin_positions(self.arm, poses), self.around, self.held, None)
@@ -205,7 +205,7 @@ class _PathSearch:
         self.failures.append(_Failure(way, -spare_m, why, False))
         return False
 
-    def driven(self, way: _Candidate) -> ClearMotion | None:
+    def clear_motion(self, way: _Candidate) -> ClearMotion | None:
         """The motion of a way if it is clear as it swings."""
         if any(failure.rules_out(way) for failure in self.failures):
             return None
@@ -213,36 +213,36 @@ class _PathSearch:
             legs = self._legs(way)
             time_s, poses, q = self._sampled(legs)
             # Slowed down as a whole it will swing less than it is judged for here.
-            spare_m = self._judged(way, poses, q, float(time_s[1]))
+            spare_m = self._evaluate(way, poses, q, float(time_s[1]))
             return ClearMotion(superposed(self.arm, legs), spare_m, way.shape, self.tried) if spare_m >= 0.0 else None
         except Unreachable:
             return None
 
     def best(self, height_m: float, reach: float | None) -> ClearMotion | None:
         """The fastest clear way of a shape, at this height."""
-        ways = [self._way(height_m, reach, u, o) for u in OVERLAP_SHARES for o in OVERLAP_SHARES]
-        seconds = self._seconds(ways)
+        ways = [self._candidate(height_m, reach, u, o) for u in OVERLAP_SHARES for o in OVERLAP_SHARES]
+        seconds = self._estimated_durations(ways)
         tries = self.tried + TRIES_PER_HEIGHT
         for i in np.argsort(seconds, kind="stable"):
             if not np.isfinite(seconds[i]) or self.tried >= tries:
                 break
-            if found := self.driven(ways[i]):
+            if found := self.clear_motion(ways[i]):
                 return found
-        return self.driven(ways[-1])
+        return self.clear_motion(ways[-1])
 
-    def _way(self, height: float, reach: float | None, up_left: float, over_left: float) -> _Candidate:
+    def _candidate(self, height: float, reach: float | None, up_left: float, over_left: float) -> _Candidate:
         start, goal = self.start, self.goal
         up, down = start.at_height(height), goal.at_height(height)
         if reach is None:
-            return _Candidate(self._eased((start, up, down, goal)), up_left, over_left, height, "over")
+            return _Candidate(self._with_extensions((start, up, down, goal)), up_left, over_left, height, "over")
         r = reach * (min(start.r_m, goal.r_m) if reach < 1.0 else max(start.r_m, goal.r_m))
-        via = self._eased((start, up, up._replace(r_m=r), down._replace(r_m=r), down, goal))
+        via = self._with_extensions((start, up, up._replace(r_m=r), down._replace(r_m=r), down, goal))
         return _Candidate(via, up_left, over_left, height, "drawn in" if reach < 1.0 else "stretched out")
 
-    def _eased(self, via: tuple[Pose, ...]) -> tuple[Pose, ...]:
-        if via not in self.easy:
-            self.easy[via] = with_fastest_extensions(self.arm, via)
-        return self.easy[via]
+    def _with_extensions(self, via: tuple[Pose, ...]) -> tuple[Pose, ...]:
+        if via not in self.extension_cache:
+            self.extension_cache[via] = with_fastest_extensions(self.arm, via)
+        return self.extension_cache[via]
 
     def _speeds(self) -> np.ndarray:
         slew, ext, rot = self.arm.speed[[Joint.SLEW, Joint.EXT, Joint.ROT]]
@@ -267,11 +267,11 @@ class _PathSearch:
     def _legs(self, way: _Candidate) -> list[tuple[float, Leg]]:
         """The legs of a way and when they begin; raises Unreachable."""
         key = way.height_m, way.shape
-        if key not in self.made:
+        if key not in self.leg_cache:
             legs = [make_leg(self.arm, a, b, lambda line: time_optimal_law(self.arm, line)) for a, b in pairwise(way.via)]
             early = [dict(zip(OVERLAP_SHARES, part.times_left(*OVERLAP_SHARES), strict=True)) for part in legs]
-            self.made[key] = legs, early
-        legs, early = self.made[key]
+            self.leg_cache[key] = legs, early
+        legs, early = self.leg_cache[key]
         if len(legs) == 1:
             return [(0.0, legs[0])]
         up, *middle, down = legs
@@ -287,10 +287,10 @@ class _PathSearch:
     def _sampled(self, legs: list[tuple[float, Leg]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times (n,), poses (n, 5) and joints (n, 5) of legs; raises Unreachable."""
         time_s = np.linspace(0.0, max(max(at + part.duration_s for at, part in legs), _TOLERANCE), SAMPLE_COUNT)
-        poses = np.array(self.start) + sum(part.progress_at(time_s - at)[:, None] * part.way for at, part in legs)
-        return time_s, poses, self.arm.joints_about(poses)
+        poses = np.array(self.start) + sum(part.progress_at(time_s - at)[:, None] * part.delta for at, part in legs)
+        return time_s, poses, self.arm.approximate_joints(poses)
 
-    def _seconds(self, ways: list[_Candidate]) -> np.ndarray:
+    def _estimated_durations(self, ways: list[_Candidate]) -> np.ndarray:
         """How long ways of the same legs take, slower where the legs together ask for too much, about (n,); infinite
         where they are out of reach.
         """
@@ -299,10 +299,10 @@ class _PathSearch:
             end_s = np.array([max(max(at + part.duration_s for at, part in legs), _TOLERANCE) for legs in timed])
             time_s = np.linspace(0.0, end_s, _COARSE_COUNT, axis=1)
             poses = np.array(self.start) + sum(
-                part.progress_at(time_s - np.array([[legs[k][0]] for legs in timed]))[..., None] * part.way
+                part.progress_at(time_s - np.array([[legs[k][0]] for legs in timed]))[..., None] * part.delta
                 for k, (_, part) in enumerate(timed[0])
             )
-            q, outside = self.arm.joints_or_outside(poses.reshape(-1, 5))
+            q, outside = self.arm.straight_column_joints(poses.reshape(-1, 5))
         except Unreachable:
             return np.full(len(ways), np.inf)
         q = q.reshape(len(ways), _COARSE_COUNT, 5)
@@ -325,7 +325,7 @@ class _PathSearch:
         even = np.linspace(0.0, along[-1], _POSE_COUNT)
         return np.column_stack([np.interp(even, along, column) for column in line.T])
 
-    def _judged(self, way: _Candidate, poses: np.ndarray, q: np.ndarray, step_s: float | None) -> float:
+    def _evaluate(self, way: _Candidate, poses: np.ndarray, q: np.ndarray, step_s: float | None) -> float:
         self.tried += 1
         spare_m, why, at = evaluate_clearance(self.arm, q, pin_positions(self.arm, poses), self.around, self.held, step_s)
         if spare_m < 0.0:

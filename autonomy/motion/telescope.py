@@ -43,7 +43,7 @@ def fastest_extension(arm: ArmKinematics, low: Pose, high: Pose, home: Pose) -> 
     heights = np.array([low, low.at_height(0.5 * (low.z_m + high.z_m)), high])
     poses = np.repeat(heights[None], len(free), axis=0)
     poses[:, :, 3] = free[:, None]
-    _, outside = arm.joints_or_outside(poses.reshape(-1, 5))
+    _, outside = arm.straight_column_joints(poses.reshape(-1, 5))
     any_way = candidate_extensions(arm)
     home_s = np.min(full_speed_times(arm, high, home, any_way, any_way), axis=1)
     seconds = np.min(full_speed_times(arm, low, high, free, any_way) + home_s, axis=1)
@@ -62,7 +62,7 @@ def full_speed_times(arm: ArmKinematics, start: Pose, goal: Pose, before: np.nda
     n, m = len(before), len(after)
     poses = np.broadcast_to(line, (n, m, *line.shape)).copy()
     poses[..., Joint.EXT] = before[:, None, None] + share * (after[None, :, None] - before[:, None, None])
-    q, outside = arm.joints_or_outside(poses.reshape(-1, 5))
+    q, outside = arm.straight_column_joints(poses.reshape(-1, 5))
     step = np.diff(q.reshape(n, m, _SAMPLES, 5), axis=2)
     middle = q.reshape(n, m, _SAMPLES, 5)[:, :, :-1] + 0.5 * step
     turned = np.sum(np.abs(step), axis=2) / arm.speed

@@ -138,7 +138,7 @@ class Leg:
     """A straight way in poses with its time law; None where there is nowhere to go."""
 
     start: np.ndarray
-    way: np.ndarray
+    delta: np.ndarray
     law: TimeLaw | None
 
     @property
@@ -175,7 +175,7 @@ def superposed(arm: Arm, legs: Sequence[tuple[float, Leg]]) -> Trajectory:
     def sampled(duration_s: float) -> np.ndarray:
         steps = max(1, int(np.ceil(duration_s / STEP_S)))
         time = np.linspace(0.0, end_s, steps + 1)
-        return arm.joints(legs[0][1].start + sum(leg.progress_at(time - at)[:, None] * leg.way for at, leg in legs))
+        return arm.joints(legs[0][1].start + sum(leg.progress_at(time - at)[:, None] * leg.delta for at, leg in legs))
 
     return within_limits(arm, sampled, end_s, arm.sampled_acceleration if len(legs) == 1 else arm.acceleration)
 
@@ -211,8 +211,8 @@ def straight_line(arm: Arm, start: Pose, goal: Pose, shaped: bool = True) -> Tra
     motion = superposed(arm, [(0.0, line)])
     if shaped or line.law is None:
         return motion
-    plain = swing_free_law(_path_geometry(arm, line.start, line.way), shaped=False).slowed(motion.duration_s)
-    return superposed(arm, [(0.0, Leg(line.start, line.way, plain))])
+    plain = swing_free_law(_path_geometry(arm, line.start, line.delta), shaped=False).slowed(motion.duration_s)
+    return superposed(arm, [(0.0, Leg(line.start, line.delta, plain))])
 
 
 def travel_over(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: float = 0.0) -> Trajectory:
@@ -224,8 +224,8 @@ def travel_over(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: floa
     up = make_leg(arm, start, start.at_height(height_m))
     over = make_leg(arm, start.at_height(height_m), goal.at_height(height_m))
     down = make_leg(arm, goal.at_height(height_m), goal)
-    rise, drop = abs(up.way[2]), abs(down.way[2])
-    way_m = float(np.hypot(over.way[0] * max(start.r_m, goal.r_m), over.way[1]))
+    rise, drop = abs(up.delta[2]), abs(down.delta[2])
+    way_m = float(np.hypot(over.delta[0] * max(start.r_m, goal.r_m), over.delta[1]))
     over_at = up.times_left(_RISE_LEFT_M / rise)[0] if rise > _RISE_LEFT_M else 0.0
     if 0.0 < free_m < way_m:
         over_at = max(0.0, up.duration_s - over.times_left(free_m / way_m)[0])

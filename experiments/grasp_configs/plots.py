@@ -13,6 +13,7 @@ from autonomy.grasp.cnn_planner import CnnPlanner
 from autonomy.grasp.cylinders import as_cylinders
 from autonomy.grasp.jaws import Jaws, jaws_of
 from autonomy.grasp.network import GraspNet
+from autonomy.grasp.planner import GraspRequest
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.virtual_scene import Camera
 from autonomy.motion.arm import Arm
@@ -42,9 +43,9 @@ def draw_chain(path: Path, name: str, truth: str, seed: int) -> None:
     finally:
         plant.close()
     jaws, net = jaws_of(profile), GraspNet.shipped()
-    seen = CnnPlanner(net).look(as_cylinders(logs), jaws, profile.workspace.ground_z_m)
+    seen = CnnPlanner(net).view(as_cylinders(logs), jaws, profile.workspace.ground_z_m)
     quality = net.maps(seen.depth_m).q
-    chosen = SamplingPlanner()(Arm(profile), logs, 0.0, 0.0)
+    chosen = SamplingPlanner()(GraspRequest(Arm(profile), logs, 0.0))
     with sheet(path, 3, 10.0, 3.6) as (scene, depth, q):
         scene.imshow(picture)
         scene.set(title="the pile")

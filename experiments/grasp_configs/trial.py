@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -18,10 +17,9 @@ from autonomy.crane_job.activity import SETTLE_AFTER_ARRIVAL_NS, Activity
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.cnn_planner import CnnPlanner
 from autonomy.grasp.network import WEIGHTS, GraspNet
-from autonomy.grasp.planner import GraspCandidate, GraspPlanner
+from autonomy.grasp.planner import GraspCandidate, GraspPlanner, GraspRequest
 from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
-from autonomy.motion.arm import Arm
 from autonomy.motion.motion_planner import TimeOptimalPlanner
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
@@ -67,8 +65,8 @@ class Attempt:
     """Since when the crane rests above the logs."""
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """One turn (contract of ``hil.harness.lockstep.Planner``): looks at the start until a grasp is chosen, and one at each
-        rest above it."""
+        """One turn (contract of ``hil.harness.lockstep.Planner``): looks at the start until a grasp is chosen, and one
+        at each rest above it."""
         activity = self.activity
         self._q = self._q if report is None else report.position
         data = activity.step(now_ns, report, self._looked(now_ns) if logs and self._q else ())
@@ -108,13 +106,11 @@ class Timed:
     proposal: GraspCandidate | None = None
     seconds: float = math.nan
 
-    def __call__(
-        self, arm: Arm, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float, stay: Collection[int] = ()
-    ) -> GraspCandidate:
+    def __call__(self, request: GraspRequest) -> GraspCandidate:
         """See ``autonomy.grasp.planner``."""
         begun = time.process_time()
         try:
-            self.proposal = self.planner(arm, logs, slew_rad, rot_rad, stay)
+            self.proposal = self.planner(request)
         finally:
             self.seconds = time.process_time() - begun
         return self.proposal
@@ -136,7 +132,7 @@ def planner_named(name: str) -> GraspPlanner:
     """The planner of an ablation.
 
     Raises:
-        WeightsRefused: the network's weights are missing or damaged.
+        WeightsError: the network's weights are missing or damaged.
     """
     if name == "search":
         return SamplingPlanner()
@@ -160,7 +156,9 @@ def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
     try:
         before = plant.logs()
         timed = Timed(planner_named(o["planner"]))
-        activity = Activity(profile, digest, chooser=PlannerSelection(timed), motions=TimeOptimalPlanner(direct=False))
+        activity = Activity(
+            profile, digest, grasp_selector=PlannerSelection(timed), motion_planner=TimeOptimalPlanner(direct=False)
+        )
         seat = Attempt(activity, POSES[o["poses"]](plant, profile, field))
         operator = Operator(digest, lambda *_: None)
         settings = Settings(profile, digest, profile.rate_hz)

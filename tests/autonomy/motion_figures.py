@@ -94,7 +94,7 @@ def _apart(
         c, s = np.cos(box.yaw_rad), np.sin(box.yaw_rad)
         local = np.stack([c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0], d[..., 2]], -1)
         columns.append(np.linalg.norm(np.maximum(np.abs(local) - box.half_m, 0.0), axis=-1))
-    for rod in around.rods:
+    for rod in around.capsules:
         a, b = np.array(rod.a_m), np.array(rod.b_m)
         along = np.clip((points - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-12), 0.0, 1.0)
         columns.append(np.linalg.norm(points - a - along[..., None] * (b - a), axis=-1) - rod.radius_m)

@@ -13,27 +13,27 @@ from crane_stand_in import GROUND_LOG, TICK_NS, StandIn, clearances
 
 from autonomy.crane_job.activity import Activity, Phase
 from autonomy.crane_job.phase_motions import corrected_grasp
-from autonomy.grasp.selection import plan_single_log_grasp
-from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
-from autonomy.missions.crane_job import Mission
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.selection import plan_single_log_grasp
+from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
 from autonomy.motion.motion_planner import TimeOptimalPlanner
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, StateReport
 from can_dbc.messages.datagrams import decode
+from machine.geometry.sag import true_pin
 from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
-from machine.status.modes import Mode
 from machine.profile import Sag, joint
-from machine.geometry.sag import true_pin
+from machine.status.modes import Mode
 
 PROFILE = load_profile("palms_471")
 CYCLE = ["LOOK", "ABOVE", "DESCEND", "CLOSE", "LIFT", "CARRY", "LOWER", "OPEN", "RETREAT", "DONE"]
 
 
-def activity(mission: Mission | None = None, direct: bool = True) -> Activity:
-    return Activity(PROFILE, profile_hash(PROFILE), mission, motions=TimeOptimalPlanner(direct))
+def activity(mission: CraneJob | None = None, direct: bool = True) -> Activity:
+    return Activity(PROFILE, profile_hash(PROFILE), mission, motion_planner=TimeOptimalPlanner(direct))
 
 
 def random_log(seed: int) -> LogObservation:
@@ -128,7 +128,7 @@ def test_with_another_log_in_view_the_crane_stays_in_the_bunk_and_goes_on_from_t
         return not lies_in_bunk(PROFILE.bunk, log)
 
     def job() -> Activity:
-        return Activity(PROFILE, profile_hash(PROFILE), onward=onward)
+        return Activity(PROFILE, profile_hash(PROFILE), fetches_next=onward)
 
     first, second = job(), job()
     first_s = crane.run(first)
@@ -228,7 +228,7 @@ def test_nothing_is_aimed_at_below_the_ground() -> None:
 def test_a_log_that_has_come_to_its_place_is_let_go_at_once() -> None:
     profile = msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 2.0e-6))
     crane = StandIn(profile, [GROUND_LOG], log_kg=90.0)
-    planner = Activity(profile, profile_hash(profile), motions=TimeOptimalPlanner())
+    planner = Activity(profile, profile_hash(profile), motion_planner=TimeOptimalPlanner())
     run_until(crane, planner, Phase.CARRY, more_s=1.0)
     crane.log_kg = 70.0  # it swings, and weighs less for the moment in which the scale is asked
     crane.run(planner)

@@ -12,10 +12,10 @@ from grasp_scenes import PROFILE, cross, pair
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phase_motions import BUNDLE_LIFT_S
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.selection import PlannerSelection
-from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.grapple_heights import travel_height_m
+from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.selection import PlannerSelection
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
 from can_dbc.messages.datagrams import decode
@@ -44,7 +44,7 @@ class Bundle(StandIn):
 def made(logs: list[LogObservation], slips: tuple[int, ...] = ()) -> tuple[Bundle, Activity]:
     crane = Bundle(PROFILE, logs)
     crane.slips = slips
-    return crane, Activity(PROFILE, profile_hash(PROFILE), chooser=PlannerSelection(SamplingPlanner()))
+    return crane, Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner()))
 
 
 def until(crane: Bundle, planner: Activity, phase: Phase) -> list[GrappleCommand]:

@@ -21,7 +21,7 @@ BUNK = PROFILE.bunk
 
 
 def stow(crane: StandIn) -> Activity:
-    planner = Activity(PROFILE, profile_hash(PROFILE), stows=True)
+    planner = Activity(PROFILE, profile_hash(PROFILE), stow_only=True)
     while not planner.idle:
         data = crane.step(planner)
         assert data is None or decode(data).grapple is GrappleCommand.HOLD  # type: ignore[union-attr]
@@ -50,14 +50,14 @@ def test_from_beside_a_log_it_goes_over_the_bunk_and_keeps_its_tongs_as_they_are
 
 def test_where_it_rests_there_already_nothing_moves() -> None:
     crane = StandIn(PROFILE, [])
-    over = ARM.over(*BUNK.center_m, retreat_height_m(PROFILE) + 0.2, retreat_height_m(PROFILE) + 0.2)
+    over = ARM.pose_above(*BUNK.center_m, retreat_height_m(PROFILE) + 0.2, retreat_height_m(PROFILE) + 0.2)
     crane.q = tuple(ARM.joints(np.array([over]))[0].tolist())
     before = crane.q
     stow(crane)
     assert crane.q == pytest.approx(before, abs=1e-6)
 
 
-@pytest.mark.parametrize("trouble", [Unreachable("no way is clear"), NoGrasp("the bunk is full")])
+@pytest.mark.parametrize("trouble", [Unreachable("no way is clear"), NoGrasp("grasp.bunk-full", "the bunk is full")])
 def test_a_log_for_which_there_is_no_way_on_is_let_go_where_it_lay(
     trouble: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -86,4 +86,4 @@ def test_a_log_in_the_air_without_a_way_on_goes_down_again(monkeypatch: pytest.M
 
 
 def refuse_room(*_: object, **__: object) -> None:
-    raise NoGrasp("no room")
+    raise NoGrasp("grasp.bunk-full", "no room")

@@ -13,15 +13,15 @@ from test_activity import CYCLE, PROFILE, activity, phases, report, run_until
 
 from autonomy.crane_job.activity import Phase
 from autonomy.crane_job.grasp_verification import is_between_jaws
-from autonomy.missions.crane_job import Mission
+from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
 from can_dbc.messages.datagrams import decode
 from machine.geometry.grapple import lowest_tip_below_pin_m
 from machine.joints import JOINTS, Joint
-from machine.status.modes import Mode
 from machine.profile import joint
+from machine.status.modes import Mode
 
 
 def test_nothing_is_sent_before_the_controller_is_armed() -> None:
@@ -93,7 +93,7 @@ def test_a_log_in_the_tongs_that_is_listed_twice_stands_in_no_way() -> None:
 def test_only_what_lies_in_closed_tongs_is_between_them() -> None:
     arm = Arm(PROFILE)
     x, y, z = GROUND_LOG.center_m
-    pin = arm.over(x, y, z + lowest_tip_below_pin_m(PROFILE.grapple.tongs) - 0.1, 2.0)
+    pin = arm.pose_above(x, y, z + lowest_tip_below_pin_m(PROFILE.grapple.tongs) - 0.1, 2.0)
     assert is_between_jaws(arm, GROUND_LOG, pin)
     assert not is_between_jaws(arm, GROUND_LOG, pin.at_height(pin.z_m + 0.15)), "it lies under them"
     upright = replace(GROUND_LOG, axis=(0.0, 0.0, 1.0))
@@ -166,13 +166,13 @@ def test_no_log_list_ends_the_mission() -> None:
 @pytest.mark.parametrize(
     ("mission", "log", "says"),
     [
-        (Mission(log_id=4), GROUND_LOG, "log 4 is not in view"),
-        (Mission(), replace(GROUND_LOG, center_m=(-7.0, 7.0, -1.29)), "log 0 cannot be picked: "),
-        (Mission(place_m=(-9.0, 0.0)), GROUND_LOG, "log 0 cannot be laid down: "),
+        (CraneJob(log_id=4), GROUND_LOG, "log 4 is not in view"),
+        (CraneJob(), replace(GROUND_LOG, center_m=(-7.0, 7.0, -1.29)), "log 0 cannot be picked: "),
+        (CraneJob(place_m=(-9.0, 0.0)), GROUND_LOG, "log 0 cannot be laid down: "),
     ],
 )
 def test_what_cannot_be_done_ends_the_mission_with_one_sentence(
-    mission: Mission, log: LogObservation, says: str
+    mission: CraneJob, log: LogObservation, says: str
 ) -> None:
     crane, planner = StandIn(PROFILE, [log]), activity(mission)
     crane.run(planner)

@@ -35,12 +35,12 @@ def heap(*logs: LogObservation, diameter_m: float = D_M) -> BunkLoad:
 
 
 def test_in_an_empty_bunk_it_lies_on_the_floor_in_the_middle() -> None:
-    rest = heap().lowest(REACH_M)
+    rest = heap().lowest_place(REACH_M)
     assert (rest.across_m, rest.support_z_m, rest.rest_z_m) == (0.0, FLOOR_M, FLOOR_M + R_M)
 
 
 def test_the_second_lies_by_the_stakes_clear_of_the_first() -> None:
-    rest = heap(lying(0.0, FLOOR_M + R_M)).lowest(REACH_M)
+    rest = heap(lying(0.0, FLOOR_M + R_M)).lowest_place(REACH_M)
     assert abs(rest.across_m) == pytest.approx(REACH_M, abs=GRID_M)
     assert (rest.support_z_m, rest.rest_z_m) == (FLOOR_M, FLOOR_M + R_M)
 
@@ -50,19 +50,19 @@ def test_a_log_rolls_into_the_hollow_between_two() -> None:
     pair = heap(lying(-0.13, z), lying(0.13, z))
     hollow = z + sqrt(D_M**2 - 0.13**2)
     for at in (-0.05, 0.0, 0.05):
-        assert pair.at(at).rest_z_m == pytest.approx(hollow, abs=2e-3)
-    assert pair.at(0.0).support_z_m == pytest.approx(z + R_M), "the tongs meet the tops of both"
+        assert pair.place_at(at).rest_z_m == pytest.approx(hollow, abs=2e-3)
+    assert pair.place_at(0.0).support_z_m == pytest.approx(z + R_M), "the tongs meet the tops of both"
 
 
 def test_on_the_back_of_a_log_the_worse_side_counts() -> None:
     z = FLOOR_M + R_M
     wall = heap(lying(0.2, z), lying(-0.1, z), lying(0.2, z + D_M))
-    assert wall.at(-0.1).rest_z_m > z + R_M, "it may roll into the high hollow as well as down to the floor"
+    assert wall.place_at(-0.1).rest_z_m > z + R_M, "it may roll into the high hollow as well as down to the floor"
 
 
 def test_a_place_is_chosen_where_what_falls_does_not_roll_to_either_side() -> None:
     z = FLOOR_M + R_M
-    rest = heap(*(lying(y, z) for y in (-0.6, 0.0, 0.6))).lowest(REACH_M)
+    rest = heap(*(lying(y, z) for y in (-0.6, 0.0, 0.6))).lowest_place(REACH_M)
     assert 0.2 < abs(rest.across_m) < 0.4, "into the gap, and not on the back of the log beside the stakes"
     assert rest.rest_z_m == pytest.approx(z, abs=1e-3)
 
@@ -70,14 +70,14 @@ def test_a_place_is_chosen_where_what_falls_does_not_roll_to_either_side() -> No
 def test_logs_that_lie_askew_count_at_their_ends() -> None:
     z = FLOOR_M + R_M
     straight, askew = heap(lying(0.4, z)), heap(lying(0.4, z, skew_rad=0.3))
-    assert straight.at(-0.05).support_z_m == FLOOR_M
-    assert askew.at(-0.05).support_z_m == pytest.approx(z + R_M), "its end is 21 cm nearer to the middle"
+    assert straight.place_at(-0.05).support_z_m == FLOOR_M
+    assert askew.place_at(-0.05).support_z_m == pytest.approx(z + R_M), "its end is 21 cm nearer to the middle"
 
 
 def test_what_lies_across_counts_everywhere_between_its_ends() -> None:
     z = FLOOR_M + R_M
     across = heap(lying(0.0, z, skew_rad=pi / 2))
-    assert all(across.at(a).support_z_m == pytest.approx(z + R_M) for a in (0.0, 0.4))
+    assert all(across.place_at(a).support_z_m == pytest.approx(z + R_M) for a in (0.0, 0.4))
 
 
 def test_a_log_that_was_let_go_lies_where_it_fell_to() -> None:
@@ -91,7 +91,7 @@ def test_a_log_that_was_let_go_lies_where_it_fell_to() -> None:
 
 
 def test_logs_on_the_ground_do_not_matter() -> None:
-    assert heap(lying(HALF_M + 0.6, -1.0), lying(0.0, -1.0)).lowest(REACH_M) == heap().lowest(REACH_M)
+    assert heap(lying(HALF_M + 0.6, -1.0), lying(0.0, -1.0)).lowest_place(REACH_M) == heap().lowest_place(REACH_M)
 
 
 @given(
@@ -103,7 +103,7 @@ def test_logs_on_the_ground_do_not_matter() -> None:
 def test_a_rest_is_on_something_and_no_higher_than_a_drop_from_there(told, diameter_m) -> None:
     logs = [lying(a, z, skew_rad=k, diameter_m=d) for a, z, k, d in told]
     found = heap(*logs, diameter_m=diameter_m)
-    rest = found.lowest(REACH_M)
+    rest = found.lowest_place(REACH_M)
     assert abs(rest.across_m) <= REACH_M + GRID_M and rest.support_z_m >= FLOOR_M
     assert rest.rest_z_m >= FLOOR_M + diameter_m / 2 - 1e-9
     highest = max([FLOOR_M, *(z + d / 2 for _, z, _, d in told)])
@@ -116,7 +116,7 @@ def test_paper_bs_logs_find_room(seed: int) -> None:
     rng, logs = random.Random(seed), []
     for _ in range(24):
         found = heap(*logs)
-        at = found.at(found.lowest(REACH_M).across_m + rng.gauss(0.0, 0.03))
+        at = found.place_at(found.lowest_place(REACH_M).across_m + rng.gauss(0.0, 0.03))
         # Judged by its own fall: it rolls while another place beside it is lower.
         across, z = rolled(logs, at.across_m)
         logs.append(lying(across, z))

@@ -55,7 +55,7 @@ def test_a_rotator_without_encoder_turns_there_and_back_and_its_valve_is_found()
         # This crane's spool has no play; the profile's has: 1 % of the stroke.
         assert 100.0 * side.deadband == pytest.approx(deadband, abs=1.5)
         assert side.full_speed == pytest.approx(full, rel=0.03)
-    assert abs(crane.q[Joint.ROT]) < 0.1 and abs(fit.stands_rad - crane.q[Joint.ROT]) < 0.01
+    assert abs(crane.q[Joint.ROT]) < 0.1 and abs(fit.angle_rad - crane.q[Joint.ROT]) < 0.01
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ ARM = Arm(PROFILE)
 CRANE = load_database("crane")
 SHIPPED = movement_primitives.SHIPPED_FOLDER / "aoro_fc8.csv"
 REST = np.array([0.0, 1.2, -2.3, 0.1])
-OVER_BUNK = ARM.reach(*PROFILE.bunk.center_m, 1.95, 3.0)
+OVER_BUNK = ARM.compact_pose_above(*PROFILE.bunk.center_m, 1.95, 3.0)
 
 
 def rise(time_s: np.ndarray, begin_s: float, end_s: float) -> np.ndarray:
@@ -158,7 +158,7 @@ def test_the_shipped_primitives_are_what_the_shipped_demonstrations_teach() -> N
 @pytest.mark.parametrize("x", [3.2, 4.6])
 @pytest.mark.parametrize("y", [-4.2, -2.6, 2.6, 4.2])
 def test_what_was_learned_leads_over_the_stakes_to_any_log_and_back(x: float, y: float) -> None:
-    move, log = PrimitiveMotions(movement_primitives.load(PROFILE)), ARM.reach(x, y, 0.1, 3.0)._replace(rot_rad=0.4)
+    move, log = PrimitiveMotions(movement_primitives.load(PROFILE)), ARM.compact_pose_above(x, y, 0.1, 3.0)._replace(rot_rad=0.4)
     for start, goal in ((OVER_BUNK, log), (log, OVER_BUNK)):
         motion = move(ARM, start, goal)
         q = np.array(motion.position)
@@ -174,7 +174,7 @@ def test_what_was_learned_leads_over_the_stakes_to_any_log_and_back(x: float, y:
 
 def test_the_other_side_is_the_mirror_image() -> None:
     move = PrimitiveMotions(movement_primitives.load(PROFILE))
-    log = ARM.reach(4.0, 3.2, 0.1, 3.0)
+    log = ARM.compact_pose_above(4.0, 3.2, 0.1, 3.0)
     left = np.array(move(ARM, OVER_BUNK._replace(slew_rad=0.0), log).position)
     right = np.array(move(ARM, OVER_BUNK._replace(slew_rad=0.0), log._replace(slew_rad=-log.slew_rad)).position)
     assert right[:, 0] == pytest.approx(-left[:, 0], abs=1e-9)
@@ -182,7 +182,7 @@ def test_the_other_side_is_the_mirror_image() -> None:
 
 
 def test_algorithm_1_opens_on_the_way_closes_there_and_opens_over_the_bunk() -> None:
-    log = ARM.reach(4.0, 3.2, 0.1, 3.0)._replace(rot_rad=0.5)
+    log = ARM.compact_pose_above(4.0, 3.2, 0.1, 3.0)._replace(rot_rad=0.5)
     out, back = algorithm_1(ARM, movement_primitives.load(PROFILE), OVER_BUNK, log, OVER_BUNK)
     assert (out.meanwhile, out.then) == (GrappleCommand.OPEN, GrappleCommand.CLOSE)
     assert (back.meanwhile, back.then) == (GrappleCommand.HOLD, GrappleCommand.OPEN)

@@ -29,12 +29,12 @@ def test_they_are_among_it_until_open_tips_are_over_its_top(bunk: Bunk) -> None:
     top = bunk.floor_z_m + bunk.stake_height_m + tip_below_pin_m(AORO.grapple.tongs, 0.0)
     high = travel_height_m(AORO)
     for above_m, among in ((-0.3, True), (-0.05, True), (0.05, False), (0.3, False)):
-        q = ARM.joints(np.array([ARM.over(*bunk.center_m, top + above_m, high)]))[0].tolist()
+        q = ARM.joints(np.array([ARM.pose_above(*bunk.center_m, top + above_m, high)]))[0].tolist()
         assert is_between_stakes(ARM, bunk, tuple(q)) is among
 
 
 def test_beside_it_they_may_open_at_any_height() -> None:
-    q = ARM.joints(np.array([ARM.over(*PILE.center_m, 0.0, travel_height_m(AORO))]))[0].tolist()
+    q = ARM.joints(np.array([ARM.pose_above(*PILE.center_m, 0.0, travel_height_m(AORO))]))[0].tolist()
     assert is_between_stakes(ARM, PILE, tuple(q)) and not is_between_stakes(ARM, AORO.bunk, tuple(q))
 
 
@@ -55,7 +55,7 @@ def test_tongs_are_wide_by_what_they_are_to_hold(
 ) -> None:
     logs = [LogObservation(i, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, d) for i, d in enumerate(diameters_m)]
     grasp = Grasp(logs[0], Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, tuple(logs[1:]))
-    assert tongs_at(opening_pct).are_wide(grasp, climbs) is wide
+    assert tongs_at(opening_pct).is_stalled_wide(grasp, climbs) is wide
 
 
 @pytest.mark.parametrize(
@@ -73,15 +73,15 @@ def test_tongs_tell_that_they_have_missed(
     opening_pct: float, state: int, diameter_m: float, drawn: bool, missed: bool
 ) -> None:
     log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, diameter_m)
-    grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, drawn=drawn)
-    assert tongs_at(opening_pct, state).have_missed(grasp) is missed
+    grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, extracts=drawn)
+    assert tongs_at(opening_pct, state).has_missed(grasp) is missed
 
 
 @pytest.mark.parametrize(
     ("state", "load_kg", "nothing"), [(4, 2.0, True), (4, 15.0, False), (5, 2.0, False), (4, nan, False)]
 )
 def test_shut_tongs_that_weigh_nothing_hold_nothing(state: int, load_kg: float, nothing: bool) -> None:
-    assert tongs_at(0.0, state, load_kg).hold_nothing is nothing
+    assert tongs_at(0.0, state, load_kg).holds_nothing is nothing
 
 
 @pytest.mark.parametrize(
@@ -99,21 +99,21 @@ def test_opening_tongs_that_come_to_bear_push(loads_kg: tuple[float, ...], pushe
     log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, 0.25)
     grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0)
     for load_kg, command in zip(loads_kg, ["HOLD", *["OPEN"] * 4], strict=False):
-        tongs._heard.report.load_kg = load_kg
-        tongs.tell(GrappleCommand[command], 0.05)
-    assert tongs.pushed is pushed
+        tongs._inbox.report.load_kg = load_kg
+        tongs.apply(GrappleCommand[command], 0.05)
+    assert tongs.is_obstructed is pushed
     if pushed:
-        tongs.let_go(0.05)
-        assert tongs.command is GrappleCommand.CLOSE and tongs.pushed and not tongs.released(grasp, 10.0)
-        tongs._heard.report.load_kg = 90.0
+        tongs.release(0.05)
+        assert tongs.command is GrappleCommand.CLOSE and tongs.is_obstructed and not tongs.has_released(grasp, 10.0)
+        tongs._inbox.report.load_kg = 90.0
         for _ in range(10):
-            tongs.let_go(0.05)
-        assert tongs.command is GrappleCommand.NEUTRAL and not tongs.released(grasp, 10.0), "the crane still swings"
+            tongs.release(0.05)
+        assert tongs.command is GrappleCommand.NEUTRAL and not tongs.has_released(grasp, 10.0), "the crane still swings"
         for _ in range(10):
-            tongs.let_go(0.05)
-        assert tongs.released(grasp, 0.3)
-    tongs.tell(GrappleCommand.CLOSE, 0.05)
-    assert not tongs.pushed
+            tongs.release(0.05)
+        assert tongs.has_released(grasp, 0.3)
+    tongs.apply(GrappleCommand.CLOSE, 0.05)
+    assert not tongs.is_obstructed
 
 
 def tongs_at(opening_pct: float, state: int = 5, load_kg: float = nan) -> GrappleSequence:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from grasp_scenes import MEASURED
 
-from autonomy.crane_job.grasp_recovery import MAX_RESTARTS, REGRIP_STEP_M, MAX_REGRIPS_HIGHER, GraspRecovery
+from autonomy.crane_job.grasp_recovery import MAX_REGRIPS_HIGHER, MAX_RESTARTS, REGRIP_STEP_M, GraspRecovery
 from autonomy.crane_job.phases import Phase
 from autonomy.grasp.grasp import Grasp
 from autonomy.motion.pose import Pose
@@ -18,18 +18,18 @@ from autonomy.perception.log_list.observation import LogObservation
 class Told(SimpleNamespace):
     """Tongs of which everything is told."""
 
-    still, empty, wide, missed, hold_nothing = True, False, False, False, False
+    is_still, empty, wide, missed, holds_nothing = True, False, False, False, False
 
-    def are_wide(self, grasp: Grasp, climbs: int) -> bool:
+    def is_stalled_wide(self, grasp: Grasp, raised_count: int) -> bool:
         return self.wide
 
-    def have_missed(self, grasp: Grasp) -> bool:
+    def has_missed(self, grasp: Grasp) -> bool:
         return self.missed
 
 
-def grasp(drawn: bool = False, measured: bool = True) -> Grasp:
+def grasp(extracts: bool = False, measured: bool = True) -> Grasp:
     log = LogObservation(1, (0.0, 4.0, -1.2), (1.0, 0.0, 0.0), 2.6, 0.28, MEASURED if measured else None)
-    return Grasp(log, Pose(0.0, 4.0, -0.4, 0.3, 0.1), -1.3, 0.0, drawn=drawn)
+    return Grasp(log, Pose(0.0, 4.0, -0.4, 0.3, 0.1), -1.3, 0.0, extracts=extracts)
 
 
 def test_what_is_held_is_lifted() -> None:
@@ -39,7 +39,7 @@ def test_what_is_held_is_lifted() -> None:
 
 @pytest.mark.parametrize("trouble", ["wide", "missed"])
 def test_they_are_waited_for_while_they_move(trouble: str) -> None:
-    assert GraspRecovery().after_closing(grasp(), Told(still=False, **{trouble: True}))[0] is None
+    assert GraspRecovery().after_closing(grasp(), Told(is_still=False, **{trouble: True}))[0] is None
 
 
 def test_too_wide_is_closed_higher_up_some_times() -> None:
@@ -59,11 +59,11 @@ def test_a_miss_is_begun_anew_from_above_some_times() -> None:
 
 def test_what_is_pinched_in_a_row_is_dragged_once_before_it_is_begun_anew() -> None:
     regrip = GraspRecovery()
-    phase, now = regrip.after_closing(grasp(drawn=True), Told(missed=True))
-    assert phase is Phase.CLOSE and now.drags
+    phase, now = regrip.after_closing(grasp(extracts=True), Told(missed=True))
+    assert phase is Phase.CLOSE and now.dragging
     phase, now = regrip.after_closing(now, Told(missed=True))
-    assert phase is Phase.ABOVE and not now.drags
-    assert regrip.after_closing(grasp(drawn=True), Told(missed=True, empty=True))[0] is Phase.ABOVE, "nothing to drag"
+    assert phase is Phase.ABOVE and not now.dragging
+    assert regrip.after_closing(grasp(extracts=True), Told(missed=True, empty=True))[0] is Phase.ABOVE, "nothing to drag"
 
 
 def test_shut_tongs_higher_up_may_hold_a_thin_log_that_nobody_saw() -> None:
@@ -75,14 +75,14 @@ def test_shut_tongs_higher_up_may_hold_a_thin_log_that_nobody_saw() -> None:
 def test_shut_tongs_higher_up_are_weighed_once_the_crane_swings_no_more() -> None:
     regrip = GraspRecovery()
     _, now = regrip.after_closing(grasp(), Told(wide=True))
-    assert regrip.after_closing(now, Told(empty=True, still=False))[0] is None, "its load swings, too"
-    assert regrip.after_closing(now, Told(empty=True, hold_nothing=True))[0] is Phase.ABOVE
+    assert regrip.after_closing(now, Told(empty=True, is_still=False))[0] is None, "its load swings, too"
+    assert regrip.after_closing(now, Told(empty=True, holds_nothing=True))[0] is Phase.ABOVE
 
 
 def test_what_weighs_nothing_as_it_rises_is_begun_anew_as_often_as_what_shut_on_nothing() -> None:
-    regrip, empty = GraspRecovery(), Told(empty=True, hold_nothing=True)
+    regrip, empty = GraspRecovery(), Told(empty=True, holds_nothing=True)
     assert regrip.after_rising(grasp(), Told()) is None
-    assert regrip.after_rising(grasp(), Told(hold_nothing=True, still=False)) is None, "they may close on it yet"
+    assert regrip.after_rising(grasp(), Told(holds_nothing=True, is_still=False)) is None, "they may close on it yet"
     assert regrip.after_rising(grasp(measured=False), empty) is None
     assert [regrip.after_rising(grasp(), empty) is not None for _ in range(MAX_RESTARTS + 1)] == [True] * MAX_RESTARTS + [False]
 
@@ -95,19 +95,19 @@ def row(*across_m: float) -> Grasp:
 def test_a_row_that_was_closed_round_in_vain_is_looked_at_without_what_is_inside_of_it() -> None:
     regrip, wide = GraspRecovery(), row(0.3, -0.3, 0.0)
     _, now = regrip.after_closing(wide, Told(wide=True))
-    assert regrip.after_closing(now, Told(empty=True, hold_nothing=True))[0] is Phase.ABOVE
-    assert regrip.stubborn == (3,) and regrip.climbs == 0, "one at its end is taken, from the ground"
-    drawn = replace(row(0.3), drawn=True)
+    assert regrip.after_closing(now, Told(empty=True, holds_nothing=True))[0] is Phase.ABOVE
+    assert regrip.excluded_logs == (3,) and regrip.raised_count == 0, "one at its end is taken, from the ground"
+    drawn = replace(row(0.3), extracts=True)
     regrip.after_closing(drawn, Told(missed=True, empty=True))
-    assert regrip.stubborn == (3, 1)
+    assert regrip.excluded_logs == (3, 1)
     _, now = regrip.after_closing(row(0.3), Told(wide=True))
-    assert regrip.after_closing(now, Told(empty=True, hold_nothing=True))[0] is Phase.LIFT, "twice, and no more"
+    assert regrip.after_closing(now, Told(empty=True, holds_nothing=True))[0] is Phase.LIFT, "twice, and no more"
 
 
 def test_a_grasp_of_two_has_nothing_inside() -> None:
     regrip = GraspRecovery()
     _, now = regrip.after_closing(row(0.0, 0.3), Told(wide=True))
-    assert regrip.after_closing(now, Told(hold_nothing=True))[0] is Phase.ABOVE and regrip.stubborn == ()
+    assert regrip.after_closing(now, Told(holds_nothing=True))[0] is Phase.ABOVE and regrip.excluded_logs == ()
 
 
 def test_what_is_told_exactly_is_lifted_as_it_is() -> None:

@@ -11,9 +11,9 @@ from grasp_scenes import PROFILE, pair
 
 from autonomy.crane_job.activity import DETECTION_TIMEOUT_NS, Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.selection import PlannerSelection
-from autonomy.grasp.planner import NoGrasp
+from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.selection import PlannerSelection
 from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
 from machine.geometry.kinematics import Unreachable
 from machine.loading.profile_file import profile_hash
@@ -44,7 +44,7 @@ def measured(log: LogObservation, off_m: float) -> LogObservation:
 
 
 def made(chooser: PlannerSelection | None = None) -> tuple[Camera, Activity]:
-    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=chooser or PlannerSelection(SamplingPlanner()))
+    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=chooser or PlannerSelection(SamplingPlanner()))
     return Camera(PROFILE, pair()), planner
 
 
@@ -102,16 +102,16 @@ def test_a_better_grasp_to_which_there_is_no_way_is_let_be(monkeypatch: pytest.M
 
 
 def test_a_second_look_that_finds_no_grasp_changes_none() -> None:
-    search = SamplingPlanner()
+    sampling = SamplingPlanner()
     asked = []
 
-    def once(*args: object, **more: object) -> object:
+    def once(request: GraspRequest) -> GraspCandidate:
         asked.append(1)
         if len(asked) > 1:
-            raise NoGrasp("nothing is safe")
-        return search(*args, **more)  # type: ignore[arg-type]
+            raise NoGrasp("grasp.none-safe", "nothing is safe")
+        return sampling(request)
 
-    crane, planner = made(PlannerSelection(once))  # type: ignore[arg-type]
+    crane, planner = made(PlannerSelection(once))
     until(crane, planner, Phase.ABOVE)
     first = planner.grasp
     assert first is not None
@@ -121,16 +121,16 @@ def test_a_second_look_that_finds_no_grasp_changes_none() -> None:
 
 @pytest.mark.parametrize("better", [True, False])
 def test_where_a_camera_shows_no_grasp_it_is_asked_again_before_there_is_said_to_be_none(better: bool) -> None:
-    search = SamplingPlanner()
+    sampling = SamplingPlanner()
     asked: list[int] = []
 
-    def at_last(*args: object, **more: object) -> object:
+    def at_last(request: GraspRequest) -> GraspCandidate:
         asked.append(crane.now_ns)
         if better and len(asked) > 3:
-            return search(*args, **more)  # type: ignore[arg-type]
-        raise NoGrasp("nothing is safe")
+            return sampling(request)
+        raise NoGrasp("grasp.none-safe", "nothing is safe")
 
-    crane, planner = made(PlannerSelection(at_last))  # type: ignore[arg-type]
+    crane, planner = made(PlannerSelection(at_last))
     while planner.phase <= Phase.LOOK and not planner.failure:
         crane.step(planner)
     if better:
@@ -143,10 +143,10 @@ def test_where_a_camera_shows_no_grasp_it_is_asked_again_before_there_is_said_to
 def test_where_logs_are_told_exactly_there_is_none_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Camera, "seen", StandIn.seen)
 
-    def refuse(*_: object, **__: object) -> object:
-        raise NoGrasp("nothing is safe")
+    def refuse(request: GraspRequest) -> GraspCandidate:
+        raise NoGrasp("grasp.none-safe", "nothing is safe")
 
-    crane, planner = made(PlannerSelection(refuse))  # type: ignore[arg-type]
+    crane, planner = made(PlannerSelection(refuse))
     while not planner.failure:
         crane.step(planner)
     assert len([m for m in crane.trace if m.phase == "LOOK"]) <= 6

@@ -10,9 +10,9 @@ import pytest
 
 from autonomy.grasp.placement import lies_in_bunk, plan_place
 from autonomy.grasp.planner import BunkFull
-from autonomy.localization.local_plane import Plane
-from autonomy.manager.activity_manager import Manager
-from autonomy.manager.transition_table import ENDS, OURS, PAPER_B, RULES, State
+from autonomy.localization.local_plane import LocalPlane
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.transition_table import FINAL_STATES, OURS, PAPER_B, RULES, State
 from autonomy.manager.tally import Tally
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Landing, Options, Point
 from autonomy.navigation.clothoid_path import PathRefused
@@ -25,7 +25,7 @@ from tests.autonomy.test_manager_field import lying
 PROFILE = load_profile("aoro_fc8")
 CARRIER = PROFILE.carrier
 assert CARRIER is not None
-PLANE = Plane(63.657853, 19.895562, 100.0)
+PLANE = LocalPlane(63.657853, 19.895562, 100.0)
 LOGS = ((1, 15.0, 4.2, 0.0), (2, 18.0, -4.4, 0.5))
 
 
@@ -35,12 +35,12 @@ def place(x_m: float, y_m: float) -> Point:
 
 def begin(
     lie=LOGS, table=OURS, end_m: float = 26.0, landing=None, bearing_deg=None, known=(), fences=(), **options
-) -> tuple[Forwarder, Manager]:
+) -> tuple[Forwarder, ActivityManager]:
     """A machine that looks east, logs along its way, and a manager with the switch at Auto."""
     way = (place(10.0, 0.0), place(end_m, 0.0))
     landings = () if landing is None else (Landing(place(*landing), bearing_deg=bearing_deg),)
     mission = ForwardingMission("test", way, fences, landings, known, Options(**options))
-    manager = Manager(PROFILE, profile_hash(PROFILE), mission, table, plane=PLANE)
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, table, plane=PLANE)
     manager.auto()
     return Forwarder(PROFILE, PLANE, [lying(*log) for log in lie], (0.0, 0.1, 0.05)), manager
 
@@ -50,15 +50,15 @@ def whole(test):
     return pytest.mark.slow(pytest.mark.computed(test))
 
 
-def ended(manager: Manager) -> bool:
-    return manager.state in ENDS
+def ended(manager: ActivityManager) -> bool:
+    return manager.state in FINAL_STATES
 
 
 def at(state: State):
     return lambda manager: manager.state is state
 
 
-def states(manager: Manager) -> list[State]:
+def states(manager: ActivityManager) -> list[State]:
     return [change.state for change in manager.changes]
 
 
@@ -85,10 +85,10 @@ def test_the_machine_stops_at_a_log_that_its_mission_lists_before_anybody_has_se
     listed = KnownLog(place(15.0, 4.2), bearing_deg=80.0, length_m=2.4)
     forwarder, manager = begin((), known=(listed,), logs="listed")
     forwarder.run(manager, at(State.CHECK))
-    (log,) = manager.outlook.field.logs
+    (log,) = manager.world.log_map.logs
     assert log.center_m[:2] == pytest.approx([15.0, 4.2], abs=0.01) and log.length_m == 2.4
     assert math.atan2(log.axis[1], log.axis[0]) == pytest.approx(math.radians(10.0))
-    assert abs(float(manager.outlook.base.to_optical(log.center_m)[2]) - PROFILE.workspace.ground_z_m) < 0.3
+    assert abs(float(manager.world.base.to_optical(log.center_m)[2]) - PROFILE.workspace.ground_z_m) < 0.3
     forwarder, manager = begin((), known=(listed,))
     forwarder.run(manager, ended)
     assert State.CHECK not in states(manager), "searched for, it does not exist before it is seen"
@@ -138,11 +138,11 @@ def test_paper_b_comes_back_to_a_log_that_it_came_past_while_it_went_on_to_anoth
 def test_the_circle_is_left_on_its_far_side_alone() -> None:
     forwarder, manager = begin((), PAPER_B)
     forwarder.run(manager, at(State.SEARCH))
-    outlook = manager.outlook
+    world = manager.world
     for away_m, inside, past in ((5.4, False, False), (5.2, True, False), (-5.2, True, False), (-5.4, False, True)):
-        log = replace(lying(1, 0.0, 0.0), center_m=outlook.base.to_base(np.array([-away_m, 0.0, 0.0])))
-        assert (outlook.in_circle(log), outlook.past(log)) == (inside, past), away_m
-    assert outlook.past(None), "a log that is gone keeps nobody waiting"
+        log = replace(lying(1, 0.0, 0.0), center_m=world.base.to_base(np.array([-away_m, 0.0, 0.0])))
+        assert (world.is_in_circle(log), world.has_passed(log)) == (inside, past), away_m
+    assert world.has_passed(None), "a log that is gone keeps nobody waiting"
 
 
 def test_without_logs_the_machine_drives_to_the_end_and_no_further() -> None:
@@ -201,7 +201,7 @@ def test_in_single_step_every_change_waits_for_the_operator() -> None:
         forwarder.step(manager)
     assert manager.state is State.IDLE
     for wanted in (State.RAISE, State.SEARCH):
-        manager.step_on()
+        manager.next_step()
         forwarder.run(manager, at(wanted), 30.0)
         for _ in range(20):
             forwarder.step(manager)
@@ -215,7 +215,7 @@ def test_in_single_step_nothing_that_comes_about_is_lost_while_the_operator_thin
     while not ended(manager):
         for _ in range(1200):
             forwarder.step(manager)
-        manager.step_on()
+        manager.next_step()
         forwarder.step(manager)
         assert forwarder.crane.now_ns < 1500e9, (manager.state, manager.failure)
     assert manager.state is State.DONE, manager.failure
@@ -241,7 +241,7 @@ def test_arms_that_do_not_move_end_the_mission_with_their_sentence() -> None:
     while not ended(manager):
         forwarder.step(manager)
         forwarder.heights_m = [0.1] * 4
-    assert manager.failure == RULES[State.RAISE].trouble
+    assert manager.failure == RULES[State.RAISE].timeout_reason
     assert forwarder.crane.now_ns - 5_000_000_000 < 40e9
 
 
@@ -277,7 +277,7 @@ def test_at_the_end_of_the_route_the_load_goes_to_the_landing() -> None:
     (load,) = manager.tally.loads
     lay = sorted(PLANE.local(t.position.latitude_deg, t.position.longitude_deg)[:2] for t in load.logs)
     assert lay == [pytest.approx(log[1:3], abs=0.1) for log in LOGS], "where they had lain, not where they are"
-    assert load.driven_m == pytest.approx(manager.ride.driven_m) and load.logs[0].at_ns < load.at_ns
+    assert load.driven_m == pytest.approx(manager.route.driven_m) and load.logs[0].at_ns < load.at_ns
     assert all(t.volume_m3 == pytest.approx(math.pi * 0.125**2 * 2.0, rel=0.5) for t in load.logs)
 
 
@@ -314,7 +314,7 @@ def test_a_full_bunk_is_brought_to_the_landing_and_the_rest_of_the_route_is_sear
     logs = ((1, 15.0, 4.2, 0.0), (2, 36.0, 4.2, 0.0))
     forwarder, manager = begin(logs, end_m=50.0, landing=(20.0, -20.0))
     forwarder.run(manager, lambda m: len(m.tally.loads) == 2 or ended(m), 1800.0)
-    driven_m = manager.ride.driven_m
+    driven_m = manager.route.driven_m
     forwarder.run(manager, ended, 1800.0)
     assert manager.state is State.DONE, manager.failure
     assert manager.tally.unloaded == 2 and [s.name for s in states(manager)].count("HAUL") == 2
@@ -342,7 +342,7 @@ def test_a_bunk_that_is_full_to_the_brim_ends_the_collecting(table, monkeypatch)
 def test_a_landing_without_room_is_refused_in_words() -> None:
     forwarder, manager = begin((), landing=(12.0, 0.0))
     manager.tally.on_board = 1
-    manager.ride.haul = refuse  # type: ignore[method-assign]
+    manager.route.drive_to_landing = refuse  # type: ignore[method-assign]
     forwarder.run(manager, ended)
     assert manager.failure == "the route cannot be driven: no room"
 
@@ -391,7 +391,7 @@ def test_the_same_inputs_give_the_same_bytes() -> None:
 def test_a_route_that_cannot_be_driven_is_refused_in_words() -> None:
     points = ((10.0, 0.0), (10.5, 0.0), (10.5, 1.0), (9.0, 1.0))
     way = tuple(Point(*PLANE.geodetic(*p)[:2]) for p in points)
-    manager = Manager(PROFILE, profile_hash(PROFILE), ForwardingMission("test", way), plane=PLANE)
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), ForwardingMission("test", way), plane=PLANE)
     manager.auto()
     forwarder = Forwarder(PROFILE, PLANE, [], (0.0, 0.0, 0.0))
     forwarder.run(manager, ended)

@@ -13,9 +13,9 @@ from autonomy.crane_job.phases import Phase
 from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.grasp import hangs_below
-from autonomy.manager.log_map import Field
-from autonomy.manager.log_memory import EVERY_NS, Memory
-from autonomy.manager.load_detector import FEELING_NS
+from autonomy.manager.log_map import LogMap
+from autonomy.manager.log_memory import PERIOD_NS, LogMemory
+from autonomy.manager.load_detector import WINDOW_NS
 from autonomy.motion.arm import Arm
 from machine.loading.profile_file import load_profile
 from tests.autonomy.test_manager_field import base, lying, seen
@@ -25,9 +25,9 @@ ARM = Arm(PROFILE)
 HERE = base(0.0, 0.0, math.pi)
 
 
-def field_of(*places: tuple[float, float]) -> Field:
+def field_of(*places: tuple[float, float]) -> LogMap:
     """A field with logs that were seen twice, 0.15 m over the ground under a base that is 1.5 m up."""
-    field = Field(PROFILE.bunk)
+    field = LogMap(PROFILE.bunk)
     logs = [lying(i, x, y, 0.3) for i, (x, y) in enumerate(places)]
     for k in range(2):
         field.see(seen(logs, HERE), HERE, k)
@@ -37,25 +37,25 @@ def field_of(*places: tuple[float, float]) -> Field:
 class Hands:
     """A job whose crane is where a test says; `step` makes one turn of memory."""
 
-    def __init__(self, field: Field) -> None:
-        self.memory, self.field, self.now_ns = Memory(PROFILE), field, 0
+    def __init__(self, field: LogMap) -> None:
+        self.memory, self.field, self.now_ns = LogMemory(PROFILE), field, 0
         self.job: Any = None
         self.load_kg, self.q = math.nan, (0.0,) * 5
 
     def begin(self) -> None:
         log = self.field.logs[0].observation(HERE)
         grasp = plan_single_log_grasp(ARM, log, 0.0)
-        self.job = SimpleNamespace(grasp=grasp, phase=Phase.LOOK, rests=(0.0,) * 5)
+        self.job = SimpleNamespace(grasp=grasp, phase=Phase.LOOK, last_setpoint=(0.0,) * 5)
         self.to(grasp.pose)
 
     def to(self, pose: Any) -> None:
         self.q = tuple(ARM.joints(np.array([pose]))[0].tolist())
-        self.job.rests = self.q
+        self.job.last_setpoint = self.q
 
     def step(self, phase: Phase | None = None) -> tuple:
         if phase is not None:
             self.job.phase = phase
-        self.now_ns += EVERY_NS
+        self.now_ns += PERIOD_NS
         report = SimpleNamespace(stamp_ns=self.now_ns, position=self.q, load_kg=self.load_kg)
         logs = self.memory.list(self.now_ns, self.field, HERE, report, self.job)
         assert logs is not None
@@ -63,11 +63,11 @@ class Hands:
 
 
 def test_what_lies_on_the_ground_stays_in_the_plane_while_the_machine_moves() -> None:
-    field, memory = field_of((-4.0, 3.0), (-4.0, -30.0)), Memory(PROFILE)
-    (first,) = memory.list(EVERY_NS, field, HERE, None, None) or ()
-    assert memory.list(EVERY_NS + 1, field, HERE, None, None) is None, "four times a second"
+    field, memory = field_of((-4.0, 3.0), (-4.0, -30.0)), LogMemory(PROFILE)
+    (first,) = memory.list(PERIOD_NS, field, HERE, None, None) or ()
+    assert memory.list(PERIOD_NS + 1, field, HERE, None, None) is None, "four times a second"
     there = base(2.0, 1.0, math.pi)
-    (after,) = memory.list(2 * EVERY_NS, field, there, None, None) or ()
+    (after,) = memory.list(2 * PERIOD_NS, field, there, None, None) or ()
     assert first.id == after.id == field.logs[0].number
     assert there.to_base(np.array(after.center_m)) == pytest.approx(HERE.to_base(np.array(first.center_m)))
 
@@ -85,7 +85,7 @@ def test_a_log_goes_with_the_grapple_and_stays_in_the_bunk() -> None:
     (log,) = hands.step(Phase.CARRY)
     assert log.center_m[2] == pytest.approx(grasp.log.center_m[2] + 1.0, abs=0.02) and hangs_below(ARM, log, high)
     x, y = PROFILE.bunk.center_m
-    place = ARM.over(x, y, 1.7, 2.0)
+    place = ARM.pose_above(x, y, 1.7, 2.0)
     hands.to(place)
     (log,) = hands.step(Phase.OPEN)
     assert lies_in_bunk(PROFILE.bunk, log)
@@ -105,7 +105,7 @@ def test_a_log_that_the_scale_does_not_feel_lies_where_it_was() -> None:
     for phase in (Phase.CLOSE, Phase.LIFT):
         hands.step(phase)
     hands.to(grasp.pose.at_height(grasp.pose.z_m + 1.0))
-    for _ in range(FEELING_NS // EVERY_NS + 2):
+    for _ in range(WINDOW_NS // PERIOD_NS + 2):
         (log,) = hands.step()
     assert log.center_m == pytest.approx(grasp.log.center_m, abs=1e-6)
     assert hands.memory.aboard == 0

@@ -15,16 +15,16 @@ from hypothesis import strategies as st
 
 from autonomy.__main__ import CONFIGURATION, FINE, main
 from autonomy.crane_job.rotator_estimate import RotatorEstimate
-from autonomy.manager.checkpoint_file import EVERY_NS, Logbook, MissionFinished, read
-from autonomy.manager.activity_manager import Manager
-from autonomy.manager.checkpoint import Known, Left, Missed, Progress, copied, digest
+from autonomy.manager.checkpoint_file import PERIOD_NS, CheckpointFile, MissionFinished, read_checkpoint
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.checkpoint import LogKnowledge, RouteRemainder, MissedLog, Checkpoint, copied_tally, mission_digest
 from autonomy.manager.transition_table import OURS, PAPER_B, State
-from autonomy.manager.tally import Load, Taken, Tally
-from autonomy.navigation.dubins import turns
+from autonomy.manager.tally import Load, LoadedLog, Tally
+from autonomy.navigation.dubins import dubins_corners
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, MissionError, Options, Point
-from autonomy.navigation.clothoid_path import PathRefused, drivable
-from autonomy.process.jobs import Forwarding
+from autonomy.navigation.clothoid_path import PathRefused, drivable_path
+from autonomy.process.jobs import ForwardingJob
 from can_dbc.messages.mission import MissionOrder, Order
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
@@ -42,29 +42,29 @@ def mission(landing=None, lie=LIE, end_m: float = 50.0, **options) -> Forwarding
     return ForwardingMission("test", way, (), landings, known, Options(logs="listed", **options))
 
 
-def begun(told: ForwardingMission, lie=LIE, table=OURS) -> tuple[Forwarder, Manager]:
-    manager = Manager(PROFILE, profile_hash(PROFILE), told, table, plane=PLANE)
+def begun(told: ForwardingMission, lie=LIE, table=OURS) -> tuple[Forwarder, ActivityManager]:
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, table, plane=PLANE)
     manager.auto()
     logs = [lying(i, x, y, 0.0) for i, (x, y) in enumerate(lie, 1)]
     return Forwarder(PROFILE, PLANE, logs, (0.0, 0.1, 0.05)), manager
 
 
-def again(machine: Forwarder, manager: Manager, told: ForwardingMission, path: Path, table=OURS) -> Manager:
+def again(machine: Forwarder, manager: ActivityManager, told: ForwardingMission, path: Path, table=OURS) -> ActivityManager:
     """Another planner, with what the file says alone, some time later: the machine has come to rest."""
-    Logbook(path).keep(manager.progress(), machine.crane.now_ns, 10**18)
-    progress = read(path, told, machine.crane.now_ns, 10**18)
+    CheckpointFile(path).keep(manager.progress(), machine.crane.now_ns, 10**18)
+    progress = read_checkpoint(path, told, machine.crane.now_ns, 10**18)
     machine.drive = machine.crane.setpoint = None
     for _ in range(60):
         machine.crane.now_ns += 50_000_000
         machine._move()
-    return Manager(PROFILE, profile_hash(PROFILE), told, table, progress=progress)
+    return ActivityManager(PROFILE, profile_hash(PROFILE), told, table, progress=progress)
 
 
 def loaded(count: int, state: State):
     return lambda manager: manager.tally.loaded >= count and manager.state is state
 
 
-def unloads(manager: Manager) -> bool:
+def unloads(manager: ActivityManager) -> bool:
     return manager.state is State.UNLOAD and manager.activity is not None and manager.activity.grasp is not None
 
 
@@ -85,7 +85,7 @@ def test_a_mission_that_is_started_again_comes_to_the_same_tally(landing, left_a
     manager.auto()
     behind = []
 
-    def over(_: Manager) -> bool:
+    def over(_: ActivityManager) -> bool:
         behind.append(machine.x_m)
         return ended(manager)
 
@@ -129,7 +129,7 @@ def test_paper_b_goes_on_too(tmp_path: Path) -> None:
 
 
 @whole
-@pytest.mark.parametrize("left_at", [unloads, lambda m: m.tally.loads and m.ride.along_m > 5.0])
+@pytest.mark.parametrize("left_at", [unloads, lambda m: m.tally.loads and m.route.along_m > 5.0])
 def test_from_a_landing_the_machine_comes_back_to_where_it_left_its_route(left_at, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(Tally, "full", lambda self, _bunk, _next_m3=0.0: self.on_board >= 1)
     told = mission((20.0, -20.0))
@@ -145,7 +145,7 @@ def test_from_a_landing_the_machine_comes_back_to_where_it_left_its_route(left_a
         assert machine.driven_m - driven_m < 1.0, "it stands beside the landing already"
     nearest_m = []
 
-    def over(_: Manager) -> bool:
+    def over(_: ActivityManager) -> bool:
         nearest_m.append(math.dist((machine.x_m, machine.y_m), left_m))
         return ended(manager)
 
@@ -175,17 +175,17 @@ def test_a_mission_that_goes_on_waits_for_auto(tmp_path: Path) -> None:
     machine, manager = begun(told)
     machine.run(manager, at(State.SEARCH))
     manager = again(machine, manager, told, tmp_path / "progress.json")
-    job = Forwarding(manager, told)
+    job = ForwardingJob(manager, told)
     for _ in range(100):
         machine.step(job)  # type: ignore[arg-type]
     assert manager.state is State.IDLE and machine.drive is None and machine.crane.setpoint is None
     assert not job.report(0).auto
     assert job.report(0).words == "waits for the switch to go to Auto, to go on where it was left"
-    assert job.obey(MissionOrder(1, 0, 0, Order.AUTO)) == ""
+    assert job.execute(MissionOrder(1, 0, 0, Order.AUTO)) == ""
     machine.step(job)  # type: ignore[arg-type]
     machine.step(job)  # type: ignore[arg-type]
     assert manager.state is not State.IDLE and job.report(0).auto
-    assert Forwarding(begun(told)[1], told).report(0).auto, "one that begins does not wait"
+    assert ForwardingJob(begun(told)[1], told).report(0).auto, "one that begins does not wait"
 
 
 LAPS = ForwardingMission("test", tuple(place(*p) for p in ((10.0, 0.0), (30.0, 0.0), (30.0, 20.0), (10.0, 20.0))),
@@ -219,14 +219,14 @@ def test_what_is_left_of_the_laps_is_counted(
     machine.run(manager, ended, 900.0)
     assert manager.state is State.DONE
     assert machine.driven_m == pytest.approx(undisturbed_m, abs=4.0), "nothing is driven twice or left out"
-    assert manager.ride.driven_m == pytest.approx(machine.driven_m, abs=1.0)
+    assert manager.route.driven_m == pytest.approx(machine.driven_m, abs=1.0)
     assert manager.progress().finished
 
 
 def test_a_route_that_was_driven_to_its_end_is_not_driven_again() -> None:
     told = mission(lie=())
-    left = Left(1, ended=True)
-    manager = Manager(PROFILE, profile_hash(PROFILE), told, progress=Progress(mission="", tally=Tally(), left=left))
+    left = RouteRemainder(1, ended=True)
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, progress=Checkpoint(mission="", tally=Tally(), left=left))
     manager.auto()
     machine = Forwarder(PROFILE, PLANE, [], (49.0, 0.0, 0.0))
     machine.run(manager, ended)
@@ -235,13 +235,13 @@ def test_a_route_that_was_driven_to_its_end_is_not_driven_again() -> None:
 
 def test_a_machine_that_stands_on_its_way_back_keeps_the_places_that_it_was_to_drive_by() -> None:
     told = ForwardingMission("test", (place(10.0, 0.0), place(60.0, 0.0)))
-    left = Left(1, (place(-6.0, 0.0), place(0.0, 0.0)), (place(30.0, 6.0),))
-    manager = Manager(PROFILE, profile_hash(PROFILE), told, progress=Progress(mission="", tally=Tally(), left=left))
+    left = RouteRemainder(1, (place(-6.0, 0.0), place(0.0, 0.0)), (place(30.0, 6.0),))
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, progress=Checkpoint(mission="", tally=Tally(), left=left))
     manager.auto()
     machine = Forwarder(PROFILE, PLANE, [], (0.0, 0.0, 0.0))
     aside_m = []
 
-    def over(_: Manager) -> bool:
+    def over(_: ActivityManager) -> bool:
         aside_m.append(machine.y_m)
         return ended(manager)
 
@@ -257,7 +257,7 @@ def test_a_machine_that_looks_anywhere_can_turn_onto_its_route(start) -> None:
     """One of the ways is drivable, as the ride tries them; the shortest may have a leg too short for its bends."""
     x, y, yaw = start
     ahead = (x + 3.0 * math.cos(yaw), y + 3.0 * math.sin(yaw))
-    ways = turns((*ahead, yaw), (0.0, 0.0, 0.0), 9.5)
+    ways = dubins_corners((*ahead, yaw), (0.0, 0.0, 0.0), 9.5)
     path = next(filter(None, map(partial(driven, (x, y), ahead), ways)))
     assert abs(math.remainder(path.at(0.0)[2] - yaw, math.tau)) < 0.1
     at_m = path.nearest(0.0, 0.0, 0.0)
@@ -267,49 +267,49 @@ def test_a_machine_that_looks_anywhere_can_turn_onto_its_route(start) -> None:
 def driven(here: tuple[float, float], ahead: tuple[float, float], corners: Sequence[tuple[float, float]]):
     """The path by these corners onto the route, None where it is refused."""
     try:
-        return drivable([here, ahead, *corners, (0.0, 0.0), (30.0, 0.0)], PROFILE.carrier)
+        return drivable_path([here, ahead, *corners, (0.0, 0.0), (30.0, 0.0)], PROFILE.carrier)
     except PathRefused:
         return None
 
 
 # ---------------------------------------------------------------------- the file
-def some(told: ForwardingMission, **more) -> Progress:
-    return Progress(mission=digest(told), tally=Tally(loaded=3), **more)
+def some(told: ForwardingMission, **more) -> Checkpoint:
+    return Checkpoint(mission=mission_digest(told), tally=Tally(loaded=3), **more)
 
 
-def kept(path: Path, progress: Progress, now_ns: int = 5, unix_ns: int = 10**18) -> Path:
-    Logbook(path).keep(progress, now_ns, unix_ns)
+def kept(path: Path, progress: Checkpoint, now_ns: int = 5, unix_ns: int = 10**18) -> Path:
+    CheckpointFile(path).keep(progress, now_ns, unix_ns)
     return path
 
 
 def test_without_a_file_the_mission_begins(tmp_path: Path) -> None:
-    assert read(tmp_path / "none.json", mission(), 0, 0) is None
+    assert read_checkpoint(tmp_path / "none.json", mission(), 0, 0) is None
 
 
 def test_times_outlast_the_start_of_the_computer(tmp_path: Path) -> None:
-    taken = Taken(Point(63.0, 19.0), 80 * EVERY_NS, 0.1)
-    progress = Progress(
-        mission=digest(mission()), tally=Tally(board=[taken], loads=[Load((taken,), 90 * EVERY_NS, 5.0)])
+    taken = LoadedLog(Point(63.0, 19.0), 80 * PERIOD_NS, 0.1)
+    progress = Checkpoint(
+        mission=mission_digest(mission()), tally=Tally(board=[taken], loads=[Load((taken,), 90 * PERIOD_NS, 5.0)])
     )
-    path = kept(tmp_path / "p", progress, 100 * EVERY_NS, 10**18)
-    found = read(path, mission(), 3 * EVERY_NS, 10**18 + 60 * EVERY_NS)
+    path = kept(tmp_path / "p", progress, 100 * PERIOD_NS, 10**18)
+    found = read_checkpoint(path, mission(), 3 * PERIOD_NS, 10**18 + 60 * PERIOD_NS)
     assert found is not None
-    then_ns = 10**18 - (10**18 + 60 * EVERY_NS) + 3 * EVERY_NS  # when it was kept, by the new clock
-    assert found.tally.board[0].at_ns == then_ns - 20 * EVERY_NS
-    assert found.tally.loads[0].at_ns == then_ns - 10 * EVERY_NS
+    then_ns = 10**18 - (10**18 + 60 * PERIOD_NS) + 3 * PERIOD_NS  # when it was kept, by the new clock
+    assert found.tally.board[0].at_ns == then_ns - 20 * PERIOD_NS
+    assert found.tally.loads[0].at_ns == then_ns - 10 * PERIOD_NS
     assert found.tally.loads[0].logs == tuple(found.tally.board)
 
 
 def test_it_is_written_when_it_has_changed_and_at_most_once_a_second(tmp_path: Path) -> None:
     path, told = tmp_path / "p", mission()
-    book = Logbook(path)
+    book = CheckpointFile(path)
     assert book.due(0)
     book.keep(some(told), 0, 0)
-    assert not book.due(EVERY_NS - 1) and book.due(EVERY_NS)
+    assert not book.due(PERIOD_NS - 1) and book.due(PERIOD_NS)
     path.unlink()
-    book.keep(some(told), EVERY_NS, 0)
-    assert not path.exists() and not book.due(EVERY_NS + 1)
-    book.keep(some(told, rounds=1), 2 * EVERY_NS, 0)
+    book.keep(some(told), PERIOD_NS, 0)
+    assert not path.exists() and not book.due(PERIOD_NS + 1)
+    book.keep(some(told, rounds=1), 2 * PERIOD_NS, 0)
     assert [p.name for p in tmp_path.iterdir()] == ["p"], "nothing is left beside it"
 
 
@@ -324,40 +324,40 @@ def test_a_damaged_file_is_one_sentence(spoil, tmp_path: Path) -> None:
     with pytest.raises(
         MissionError, match=r"is damaged or no mission's progress .*; move the file away to begin anew$"
     ):
-        read(path, mission(), 0, 0)
+        read_checkpoint(path, mission(), 0, 0)
 
 
 @pytest.mark.parametrize(
-    "what", [{"landing": 1}, {"served": (2,)}, {"left": Left(3)}, {"tally": Tally(loads=[Load((), 0, 0.0, 4)])}]
+    "what", [{"landing": 1}, {"served": (2,)}, {"left": RouteRemainder(3)}, {"tally": Tally(loads=[Load((), 0, 0.0, 4)])}]
 )
 def test_a_file_that_names_what_the_mission_has_not_is_damaged(what, tmp_path: Path) -> None:
     told = mission((58.0, 14.0))
     path = kept(tmp_path / "p", msgspec.structs.replace(some(told), **what))
     with pytest.raises(MissionError, match="it names a landing or waypoints that the mission has not"):
-        read(path, told, 0, 0)
-    good = {"landing": 0, "served": (0,), "left": Left(2)}
-    assert read(kept(tmp_path / "q", msgspec.structs.replace(some(told), **good)), told, 0, 0) is not None
+        read_checkpoint(path, told, 0, 0)
+    good = {"landing": 0, "served": (0,), "left": RouteRemainder(2)}
+    assert read_checkpoint(kept(tmp_path / "q", msgspec.structs.replace(some(told), **good)), told, 0, 0) is not None
 
 
 def test_another_mission_and_a_file_that_cannot_be_read_are_one_sentence(tmp_path: Path) -> None:
     path = kept(tmp_path / "p", some(mission(logs_wanted=1)))
     with pytest.raises(MissionError, match="is the progress of another mission; start the planner with that one, or "):
-        read(path, mission(), 0, 0)
+        read_checkpoint(path, mission(), 0, 0)
     with pytest.raises(MissionError, match="the mission's progress cannot be read: Is a directory"):
-        read(tmp_path, mission(), 0, 0)
+        read_checkpoint(tmp_path, mission(), 0, 0)
 
 
 def test_a_finished_mission_says_so(tmp_path: Path) -> None:
     path = kept(tmp_path / "p", some(mission(), finished=True))
     with pytest.raises(MissionFinished, match="this mission is finished, 3 logs were loaded; move the file away"):
-        read(path, mission(), 0, 0)
+        read_checkpoint(path, mission(), 0, 0)
 
 
 TEXT = st.text(max_size=8)
 METRES = st.floats(0.0, 1e4)
 NUMBER = st.integers(0, 10**6)
 PLACE = st.builds(Point, st.floats(-90.0, 90.0), st.floats(-180.0, 180.0))
-TAKEN = st.builds(Taken, PLACE, st.integers(0, 2**62), METRES, TEXT)
+TAKEN = st.builds(LoadedLog, PLACE, st.integers(0, 2**62), METRES, TEXT)
 LOAD = st.builds(Load, st.lists(TAKEN, max_size=3).map(tuple), st.integers(0, 2**62), METRES, st.just(0))
 TALLY = st.builds(
     Tally, NUMBER, NUMBER, NUMBER, NUMBER, NUMBER, METRES, METRES, st.booleans(),
@@ -365,25 +365,25 @@ TALLY = st.builds(
 )  # fmt: skip
 LOG = st.builds(KnownLog, PLACE, st.just(""), st.floats(0.0, 360.0), METRES, METRES, TEXT, TEXT)
 KNOWN = st.builds(
-    Known, st.lists(NUMBER, max_size=3).map(tuple),
-    st.lists(st.builds(Missed, NUMBER, LOG, NUMBER), max_size=3).map(tuple), NUMBER,
+    LogKnowledge, st.lists(NUMBER, max_size=3).map(tuple),
+    st.lists(st.builds(MissedLog, NUMBER, LOG, NUMBER), max_size=3).map(tuple), NUMBER,
 )  # fmt: skip
 LEFT = st.builds(
-    Left, st.integers(0, 2), st.none() | st.tuples(PLACE, PLACE), st.lists(PLACE, max_size=3).map(tuple), st.booleans()
+    RouteRemainder, st.integers(0, 2), st.none() | st.tuples(PLACE, PLACE), st.lists(PLACE, max_size=3).map(tuple), st.booleans()
 )
 
 
 @given(TALLY, KNOWN, st.none() | LEFT, st.sampled_from([None, 0]), st.sampled_from([(), (0,)]), NUMBER, METRES)
 def test_what_is_kept_is_read_again(tmp_path_factory, tally, known, left, landing, served, rounds, driven_m) -> None:
     told = mission((58.0, 14.0))
-    progress = Progress(
-        mission=digest(told), tally=tally, known=known, left=left, landing=landing, served=served, rounds=rounds,
+    progress = Checkpoint(
+        mission=mission_digest(told), tally=tally, known=known, left=left, landing=landing, served=served, rounds=rounds,
         driven_m=driven_m, rotator=RotatorEstimate(driven_m, -driven_m, (0.8, 1.1)),
     )  # fmt: skip
     path = kept(tmp_path_factory.getbasetemp() / "p", progress, 7, 11)
-    assert read(path, told, 7, 11) == progress
-    later = read(path, told, 7 + 1000, 11)
-    assert later is not None and later.tally == copied(tally, 1000)
+    assert read_checkpoint(path, told, 7, 11) == progress
+    later = read_checkpoint(path, told, 7 + 1000, 11)
+    assert later is not None and later.tally == copied_tally(tally, 1000)
 
 
 # ---------------------------------------------------------------------- the process

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.grasp.sampling_planner import SamplingPlanner
-from autonomy.manager.activity_manager import Manager
+from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.sorting import Sorting
 from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
@@ -47,8 +47,8 @@ def forwarder(lie: Sequence[Lie]) -> Forwarder:
     return Forwarder(PROFILE, PLANE, logs, (0.0, 0.1, 0.05))
 
 
-def managed(told: ForwardingMission, **how) -> Manager:
-    manager = Manager(PROFILE, profile_hash(PROFILE), told, plane=PLANE, **how)
+def managed(told: ForwardingMission, **how) -> ActivityManager:
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, plane=PLANE, **how)
     manager.auto()
     return manager
 
@@ -174,8 +174,8 @@ def test_two_landings_get_their_own_assortments_in_two_rounds() -> None:
     machine, manager = forwarder(lie), managed(mission(lie, landings, sort_by_assortment=True))
     words = set()
 
-    def over(_: Manager) -> bool:
-        words.add(manager.words)
+    def over(_: ActivityManager) -> bool:
+        words.add(manager.description)
         return ended(manager)
 
     machine.run(manager, over, 1500.0)
@@ -187,7 +187,7 @@ def test_two_landings_get_their_own_assortments_in_two_rounds() -> None:
     for number, (x, y, _) in zip((1, 2), landings, strict=True):
         assert math.dist(machine.field[number].center_m[:2], (x, y)) < 1.6
     assert machine.field[3].center_m[:2] == pytest.approx((21.0, 4.4), abs=0.01), "no landing takes it"
-    assert manager.outlook.sorting.rounds == 1, "in the second one both were served"
+    assert manager.world.sorting.rounds == 1, "in the second one both were served"
     assert {"drives the load to the landing (Road)", "unloads the bunk (landing 2)"} <= words
     assert "follows the waypoints and looks for logs (round 2)" in words
 
@@ -202,7 +202,7 @@ def test_a_planner_that_starts_anew_with_the_load_under_way_drives_the_second_ro
     manager.auto()
     machine.run(manager, ended, 1500.0)
     assert manager.state is State.DONE, manager.failure
-    assert manager.tally.unloaded == 2 and manager.outlook.sorting.rounds == 1
+    assert manager.tally.unloaded == 2 and manager.world.sorting.rounds == 1
 
 
 @whole
@@ -213,7 +213,7 @@ def test_the_round_in_which_nothing_was_loaded_is_the_last() -> None:
     machine, manager = forwarder(lie), managed(mission(lie, landings, sort_by_assortment=True))
     machine.run(manager, ended, 1500.0)
     assert manager.state is State.DONE, manager.failure
-    assert manager.outlook.sorting.rounds == 1 and manager.tally.loaded == manager.tally.unloaded == 1
+    assert manager.world.sorting.rounds == 1 and manager.tally.loaded == manager.tally.unloaded == 1
     assert machine.field[2].center_m[:2] == pytest.approx((18.0, -9.5), abs=0.01)
 
 

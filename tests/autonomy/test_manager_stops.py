@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from autonomy.manager.loading_stops import STEP_M, Reach, Stop, base_on_way, best_stop
+from autonomy.manager.loading_stops import STEP_M, CraneReach, LoadingStop, base_on_path, best_stop
 from autonomy.motion.arm import Arm
 from machine.geometry.carrier import rear_from_front
 from machine.loading.profile_file import load_profile
@@ -16,13 +16,13 @@ from tests.autonomy.test_manager_field import lying
 
 PROFILE = load_profile("aoro_fc8")
 CARRIER = PROFILE.carrier
-REACH = Reach(Arm(PROFILE), CARRIER)
+REACH = CraneReach(Arm(PROFILE), CARRIER)
 WHEELBASE_M = CARRIER.front_axle_m + CARRIER.rear_axle_m
 
 
 def straight(along_m: float):
     """East along y = 0, at the lowest height."""
-    return base_on_way(CARRIER, (along_m, 0.0, 0.0), (along_m - WHEELBASE_M, 0.0), 0.0)
+    return base_on_path(CARRIER, (along_m, 0.0, 0.0), (along_m - WHEELBASE_M, 0.0), 0.0)
 
 
 def test_the_base_looks_back_over_the_bunk() -> None:
@@ -38,7 +38,7 @@ def test_the_base_in_a_bend_agrees_with_the_geometry_of_the_carrier() -> None:
     rear = rear_from_front(
         bend, (CARRIER.front_axle_m, 0.0, 0.0)
     )  # front axle in the rear frame, that lies in the plane
-    base = base_on_way(CARRIER, (rear[0], rear[1], bend), (-CARRIER.rear_axle_m, 0.0), 0.0)
+    base = base_on_path(CARRIER, (rear[0], rear[1], bend), (-CARRIER.rear_axle_m, 0.0), 0.0)
     assert base.position_m[:2] == pytest.approx(CARRIER.crane_base_m[:2], abs=1e-9)
 
 
@@ -81,7 +81,7 @@ def test_how_high_the_site_lies_above_the_sea_does_not_matter() -> None:
     assert best_stop([high], REACH, straight, 10.0, 40.0) == best_stop([log], REACH, straight, 10.0, 40.0)
 
 
-def looked_everywhere(logs, begin_m: float, end_m: float) -> Stop | None:
+def looked_everywhere(logs, begin_m: float, end_m: float) -> LoadingStop | None:
     """The same from the work for every log at every place, as the module's docstring has it."""
     places = np.arange(begin_m, end_m + 1e-9, STEP_M)
     level = [dataclasses.replace(g, center_m=np.array([*g.center_m[:2], 0.5 * g.diameter_m])) for g in logs]
@@ -103,7 +103,7 @@ def looked_everywhere(logs, begin_m: float, end_m: float) -> Stop | None:
     sums = np.where(taken, work, 0.0).sum(axis=1)
     best = min(range(last + 1), key=lambda i: (-taken[i].sum(), sums[i], i))
     order = sorted(np.flatnonzero(taken[best]), key=lambda j: work[best, j])
-    return Stop(float(places[best]), tuple(logs[j].number for j in order), float(sums[best]))
+    return LoadingStop(float(places[best]), tuple(logs[j].number for j in order), float(sums[best]))
 
 
 @pytest.mark.parametrize("seed", range(3))

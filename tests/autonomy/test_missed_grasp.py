@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from math import hypot, nan, pi
 
@@ -15,11 +14,10 @@ from autonomy.crane_job.cycle import EXTRACTION_DEPTH_M
 from autonomy.crane_job.grasp_recovery import MAX_RESTARTS
 from autonomy.crane_job.phase_motions import EXTRACTION_DISTANCE_M
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.selection import PlannerSelection
 from autonomy.grasp.grapple_heights import VERIFY_LIFT_M
-from autonomy.grasp.planner import GraspCandidate, NoGrasp
+from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.sampling_planner import SamplingPlanner
-from autonomy.motion.arm import Arm
+from autonomy.grasp.selection import PlannerSelection
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.grapple import tip_below_pin_m
@@ -53,7 +51,7 @@ def thick_pair() -> list[LogObservation]:
 
 
 def phases_until_lifted(crane: Slipping) -> list[Phase]:
-    phases = crane.until(Activity(PROFILE, profile_hash(PROFILE), chooser=PlannerSelection(SamplingPlanner())), Phase.LIFT)
+    phases = crane.until(Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner())), Phase.LIFT)
     return phases[phases.index(Phase.CLOSE) :]
 
 
@@ -96,7 +94,7 @@ class Weighed(Slipping):
 def test_shut_tongs_that_weigh_nothing_as_they_rise_are_sent_anew(empty_kg: float, anew: bool) -> None:
     crane = Weighed(PROFILE, [replace(log, diameter_m=0.15) for log in pair()], log_kg=40.0)
     crane.empty_kg = empty_kg
-    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=PlannerSelection(SamplingPlanner()))
+    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner()))
     crane.until(planner, Phase.LIFT)
     low = crane.pin()[2]
     while planner.phase is Phase.LIFT and crane.pin()[2] < low + VERIFY_LIFT_M:
@@ -121,7 +119,7 @@ def test_a_thin_log_that_vanished_in_shut_tongs_is_carried_on_where_it_weighs(we
     aside = replace(thin, id=thin.id + 7, center_m=(x, y - 2.0, z))
     crane = Hiding(PROFILE, [thin, aside], log_kg=weighs_kg)
     crane.empty_kg = weighs_kg
-    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=PlannerSelection(SamplingPlanner()))
+    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner()))
     crane.until(planner, Phase.LIFT)
     while planner.phase is Phase.LIFT:
         crane.step(planner)
@@ -144,16 +142,17 @@ class Pinching(Slipping):
             super()._grapple(command)
 
 
-def drawing(arm: Arm, logs: Sequence[LogObservation], *_: object) -> GraspCandidate:
-    """The end log of a row, out towards +y."""
+def extracting(request: GraspRequest) -> GraspCandidate:
+    """Extracts the end log of a row towards +y."""
+    logs = request.logs
     end = logs[-1]
     x, y, _ = end.center_m
-    return GraspCandidate(x, y + 0.5, pi / 2, GROUND, (len(logs) - 1,), 0.9, "drawn", pressed=True, drawn=True)
+    return GraspCandidate(x, y + 0.5, pi / 2, GROUND, (len(logs) - 1,), 0.9, "extracts", penetrates=True, extracts=True)
 
 
 def test_a_log_that_is_pinched_in_its_row_is_dragged_out_and_gripped_there() -> None:
     crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
-    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=PlannerSelection(drawing))
+    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(extracting))
     crane.until(planner, Phase.LIFT)
     pins = [m.pin for m in crane.trace if m.phase == "CLOSE"]
     assert pins[-1][1] - pins[0][1] == pytest.approx(EXTRACTION_DISTANCE_M, abs=0.03), "away from the others"
@@ -167,8 +166,9 @@ def test_tongs_that_draw_a_log_go_in_beside_it_before_they_close() -> None:
     pair_of = [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)]
     over = {}
     for draws in (True, False):
-        crane, chooser = Pinching(PROFILE, pair_of), lambda *args, d=draws: replace(drawing(*args), drawn=d)
-        crane.until(Activity(PROFILE, profile_hash(PROFILE), chooser=PlannerSelection(chooser)), Phase.CLOSE)
+        crane = Pinching(PROFILE, pair_of)
+        planner = lambda request, d=draws: replace(extracting(request), extracts=d)  # noqa: E731
+        crane.until(Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(planner)), Phase.CLOSE)
         tip = crane.pin()[2] - tip_below_pin_m(PROFILE.grapple.tongs, crane.tong_rad)
         over[draws] = tip - GROUND
     assert 0.02 < over[True] < 0.1, "under the middle of the log, and over the ground"
@@ -178,7 +178,7 @@ def test_tongs_that_draw_a_log_go_in_beside_it_before_they_close() -> None:
 def test_what_is_pinched_still_after_the_drag_is_looked_at_anew() -> None:
     crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
     crane.free_m = 9.0
-    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=PlannerSelection(drawing))
+    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(extracting))
     phases = crane.until(planner, Phase.LIFT)
     assert phases.count(Phase.ABOVE) == 1 + MAX_RESTARTS
 
@@ -186,15 +186,15 @@ def test_what_is_pinched_still_after_the_drag_is_looked_at_anew() -> None:
 def test_where_no_better_grasp_is_seen_after_a_drag_the_old_one_is_closed_on_before_it_drags_again() -> None:
     asked = []
 
-    def once(*args: object) -> GraspCandidate:
+    def once(request: GraspRequest) -> GraspCandidate:
         asked.append(1)
         if len(asked) > 3:
-            raise NoGrasp("nothing is safe")
-        return drawing(*args)  # type: ignore[arg-type]
+            raise NoGrasp("grasp.none-safe", "nothing is safe")
+        return extracting(request)
 
     crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
     crane.free_m = 9.0
-    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=PlannerSelection(once))
+    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(once))
     crane.until(planner, Phase.LIFT)
     assert len(asked) > 3
     phases = [m.phase for m in crane.trace]

@@ -9,7 +9,7 @@ from autonomy.crane_job.phase_motions import MACHINE_LEAN_M, approach_motion, ca
 from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.grasp.placement import plan_place
 from autonomy.grasp.grapple_heights import hover_height_m, travel_height_m
-from autonomy.missions.crane_job import Mission
+from autonomy.missions.crane_job import CraneJob
 from autonomy.motion import motion_planner
 from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
@@ -27,7 +27,7 @@ ARM, HIGH = Arm(PROFILE), travel_height_m(PROFILE)
 GROUND = PROFILE.workspace.ground_z_m
 LOG = LogObservation(0, (3.6, 3.2, GROUND + 0.12), (1.0, 0.0, 0.0), 2.0, 0.24)
 GRASP = plan_single_log_grasp(ARM, LOG, 0.0)
-PLACE = plan_place(ARM, Mission(), GRASP, [LOG])
+PLACE = plan_place(ARM, CraneJob(), GRASP, [LOG])
 OVER = GRASP.pose.at_height(hover_height_m(PROFILE, GRASP))
 
 

@@ -125,7 +125,7 @@ def test_the_carrier_stands_where_the_plant_has_it() -> None:
 
 def test_a_held_log_hangs_under_the_pin_across_the_tongs() -> None:
     arm = Arm(AORO)
-    pose = arm.over(4.0, 3.0, 1.0, 3.0)
+    pose = arm.pose_above(4.0, 3.0, 1.0, 3.0)
     q = arm.joints(np.array([pose]))
     pin = np.array([[4.0, 3.0, 1.0]])
     body = swept_capsules(AORO, q, pin, HeldLog(2.0, 0.25, along_m=0.3))
@@ -146,7 +146,7 @@ def test_a_log_is_held_where_it_lay_whichever_way_it_is_taken(turned: float, sen
     arm = Arm(AORO)
     axis = (sense * np.cos(0.4), sense * np.sin(0.4), 0.0)
     log = LogObservation(0, (4.0, 3.0, -1.0), axis, 2.0, 0.25)
-    pose = arm.over(4.0 + 0.2 * np.cos(0.4), 3.0 + 0.2 * np.sin(0.4), 0.3, 3.0)
+    pose = arm.pose_above(4.0 + 0.2 * np.cos(0.4), 3.0 + 0.2 * np.sin(0.4), 0.3, 3.0)
     pose = pose._replace(rot_rad=0.45 - pose.slew_rad + np.pi / 2 + np.pi / 2 + turned)  # 0.05 rad askew
     body = swept_capsules(AORO, arm.joints(np.array([pose])), np.array([[*arm.xy(pose), pose.z_m]]), held_log(arm, pose, log))
     ends = np.array([body.a[0, -1, :2], body.b[0, -1, :2]])

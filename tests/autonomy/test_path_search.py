@@ -34,8 +34,8 @@ def places(profile: Profile, seed: int) -> tuple[Pose, Pose]:
     rng, arm, work = random.Random(seed), ARMS[profile.name], profile.workspace
     top = travel_height_m(profile)
     x, y = (c + rng.uniform(-1.0, 1.0) * work.pick_half_size_m for c in work.pick_center_m)
-    log = arm.over(x, y, work.ground_z_m + 1.9, top)._replace(rot_rad=rng.uniform(-1.5, 1.5))
-    bunk = arm.over(*profile.bunk.center_m, profile.bunk.floor_z_m + 1.8, top)
+    log = arm.pose_above(x, y, work.ground_z_m + 1.9, top)._replace(rot_rad=rng.uniform(-1.5, 1.5))
+    bunk = arm.pose_above(*profile.bunk.center_m, profile.bunk.floor_z_m + 1.8, top)
     return log, bunk._replace(rot_rad=profile.bunk.yaw_rad - bunk.slew_rad - profile.kinematics.theta1_offset_rad)
 
 
@@ -83,7 +83,7 @@ def test_a_log_goes_over_the_stakes_and_touches_nothing(profile: Profile, seed: 
     middle = np.minimum(*(np.linalg.norm(pin - pin[i], axis=1) for i in (0, -1))) > clearance.DEPARTURE_ZONE_M
     assert middle.any() and apart[middle].min() > 0.05
     assert apart.min() > min(0.05, apart[0].min(), apart[-1].min()) - clearance.CONTACT_ALLOWANCE_M - 0.01
-    assert path.spare_m >= 0.0 and clearance_reserve(arm, path.motion, around, LOG)[0] > -0.02
+    assert path.reserve_m >= 0.0 and clearance_reserve(arm, path.motion, around, LOG)[0] > -0.02
 
 
 @pytest.mark.parametrize("profile", [PALMS, AORO], ids=lambda p: p.name)
@@ -134,7 +134,7 @@ def test_a_hanging_log_swings_little_at_the_end() -> None:
 def beside() -> tuple[Pose, Pose]:
     """Two places on one side of the machine, low over the ground."""
     arm = ARMS["aoro_fc8"]
-    return arm.over(3.0, 4.2, 0.6, 3.0), arm.over(5.4, 3.0, 0.6, 3.0)
+    return arm.pose_above(3.0, 4.2, 0.6, 3.0), arm.pose_above(5.4, 3.0, 0.6, 3.0)
 
 
 def test_a_tree_between_two_places_is_gone_around() -> None:
@@ -220,7 +220,7 @@ def test_from_a_landing_into_a_full_bunk_the_way_is_over_the_stakes_not_around_t
 
 def test_a_slow_lift_keeps_the_arms_limits_however_short_it_is_asked_to_be() -> None:
     arm = ARMS["aoro_fc8"]
-    start = arm.over(2.4, 0.3, 0.4, travel_height_m(AORO))
+    start = arm.pose_above(2.4, 0.3, 0.4, travel_height_m(AORO))
     goal = start.at_height(travel_height_m(AORO))
     hasty, slow = (slow_line(arm, start, goal, seconds) for seconds in (2.0, 20.0))
     assert_kept(AORO, hasty, start, goal)

@@ -13,18 +13,19 @@ from grasp_scenes import PROFILE as PALMS
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.grasp_verification import is_at_target
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.selection import PlannerSelection
-from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.jaws import jaws_of
 from autonomy.grasp.pile_planner import DEPTHS_M, FAILED_RADIUS_M, PilePlanner
-from autonomy.grasp.planner import GraspCandidate, NoGrasp
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
 from autonomy.grasp.sampling_planner import SamplingPlanner
-from autonomy.missions.crane_job import Mission
+from autonomy.grasp.selection import PlannerSelection
+from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Bunk
+from tests.codes import coded
 
 AORO = load_profile("aoro_fc8")
 ARM, BUNK, JAWS = Arm(AORO), AORO.bunk, jaws_of(AORO)
@@ -51,18 +52,18 @@ def planner() -> PilePlanner:
 
 def test_a_heap_is_pressed_into_and_several_logs_are_between_the_tongs() -> None:
     logs = heap()
-    p = planner()(ARM, logs, 0.0, 0.0)
-    assert p.pressed and len(p.logs) >= 2 and p.reason.startswith("pressed into the heap") and "\n" not in p.reason
+    p = planner()(GraspRequest(ARM, logs, 0.0))
+    assert p.penetrates and len(p.logs) >= 2 and "\n" not in p.reason
     assert abs(remainder(p.yaw_rad - pi / 2, pi)) < 0.15, "across the logs"
     wood = sum(pi * (logs[i].diameter_m / 2) ** 2 for i in p.logs)
-    assert wood < 1.1 * JAWS.holds_m2
+    assert wood < 1.1 * JAWS.capacity_m2
     top = max(log.center_m[2] + log.diameter_m / 2 for log in logs)
     assert BUNK.floor_z_m <= p.support_z_m < top - DEPTHS_M[0] + 1e-6
 
 
 def test_no_tip_comes_down_on_the_middle_of_a_log() -> None:
     logs = heap()
-    p = planner()(ARM, logs, 0.0, 0.0)
+    p = planner()(GraspRequest(ARM, logs, 0.0))
     for side in (-1.0, 1.0):
         tip = p.y_m + side * (JAWS.half_gap_m + JAWS.plate_m / 2)
         met = [log for log in logs if log.center_m[2] > p.support_z_m]
@@ -70,45 +71,45 @@ def test_no_tip_comes_down_on_the_middle_of_a_log() -> None:
 
 
 def test_logs_that_lie_on_no_others_are_left_to_the_other_planner() -> None:
-    p = planner()(ARM, row(0, 3, 0), 0.0, 0.0)
-    assert not p.pressed and p == SamplingPlanner()(ARM, row(0, 3, 0), 0.0, 0.0)
+    p = planner()(GraspRequest(ARM, row(0, 3, 0), 0.0))
+    assert not p.penetrates and p == SamplingPlanner()(GraspRequest(ARM, row(0, 3, 0), 0.0))
 
 
 def test_a_row_of_which_no_grasp_is_safe_is_pressed_into() -> None:
-    def never(*_: object) -> GraspCandidate:
-        raise NoGrasp("no grasp of the 6 logs is safe")
+    def never(request: GraspRequest) -> GraspCandidate:
+        raise NoGrasp("grasp.none-safe", "no grasp of the 6 logs is safe")
 
-    p = PilePlanner(never)(ARM, row(0, 6, 0), 0.0, 0.0)
-    assert p.pressed and p.logs and p.support_z_m >= BUNK.floor_z_m
+    p = PilePlanner(never)(GraspRequest(ARM, row(0, 6, 0), 0.0))
+    assert p.penetrates and p.logs and p.support_z_m >= BUNK.floor_z_m
 
 
 def test_nothing_in_view_is_no_grasp() -> None:
-    with pytest.raises(NoGrasp, match="no log is in view"):
-        planner()(ARM, [], 0.0, 0.0)
+    with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-view")):
+        planner()(GraspRequest(ARM, [], 0.0))
 
 
 def test_a_place_where_nothing_came_up_is_not_tried_again_until_something_did() -> None:
     press, logs = planner(), heap()
-    first = press(ARM, logs, 0.0, 0.0)
-    second = press(ARM, logs, 0.0, 0.0)
-    third = press(ARM, logs, 0.0, 0.0)
+    first = press(GraspRequest(ARM, logs, 0.0))
+    second = press(GraspRequest(ARM, logs, 0.0))
+    third = press(GraspRequest(ARM, logs, 0.0))
     places = [(p.x_m, p.y_m) for p in (first, second, third)]
     for i, a in enumerate(places):
         assert all(hypot(a[0] - b[0], a[1] - b[1]) >= FAILED_RADIUS_M - 1e-9 for b in places[:i])
-    press(ARM, [log for i, log in enumerate(logs) if i not in third.logs], 0.0, 0.0)
-    assert press(ARM, logs, 0.0, 0.0) == first, "something came up: every place is as good as before"
+    press(GraspRequest(ARM, [log for i, log in enumerate(logs) if i not in third.logs], 0.0))
+    assert press(GraspRequest(ARM, logs, 0.0)) == first, "something came up: every place is as good as before"
 
 
 def test_a_log_that_only_rolled_has_not_come_up() -> None:
     press, logs = planner(), heap()
-    first = press(ARM, logs, 0.0, 0.0)
+    first = press(GraspRequest(ARM, logs, 0.0))
     moved = [replace(log, center_m=(log.center_m[0] + 0.02, *log.center_m[1:])) for log in logs]
-    second = press(ARM, moved, 0.0, 0.0)
+    second = press(GraspRequest(ARM, moved, 0.0))
     assert hypot(first.x_m - second.x_m, first.y_m - second.y_m) > FAILED_RADIUS_M / 2
 
 
 def test_the_same_heap_gives_the_same_grasp() -> None:
-    assert planner()(ARM, heap(), 0.0, 0.0) == planner()(ARM, heap(), 0.0, 0.0)
+    assert planner()(GraspRequest(ARM, heap(), 0.0)) == planner()(GraspRequest(ARM, heap(), 0.0))
 
 
 class Resisting(StandIn):
@@ -128,10 +129,10 @@ def test_tongs_that_rest_on_wood_close_there_where_they_were_pressed(pressed: bo
     logs = [LogObservation(0, (-1.8, 4.4, -1.29), (0.6, 0.8, 0.0), 2.6, 0.2)]
 
     def chooser(arm, mission, seen, slew, rot):  # type: ignore[no-untyped-def]
-        return replace(PlannerSelection(SamplingPlanner())(arm, mission, seen, slew, rot), pressed=pressed)
+        return replace(PlannerSelection(SamplingPlanner())(arm, mission, seen, slew, rot), penetrates=pressed)
 
     crane = Resisting(PALMS, logs)
-    activity = Activity(PALMS, profile_hash(PALMS), chooser=chooser)
+    activity = Activity(PALMS, profile_hash(PALMS), grasp_selector=chooser)
     crane.until(activity, Phase.DESCEND)
     assert activity.grasp is not None
     begun_ns = crane.now_ns
@@ -147,7 +148,7 @@ def test_tongs_that_rest_on_wood_close_there_where_they_were_pressed(pressed: bo
 
 def test_a_log_that_rolls_beside_a_landing_is_laid_down_but_not_one_that_still_hangs() -> None:
     pile = Bunk((0.4, -2.9), 0.0, 3.0, 2.6, -1.4, 1.5)
-    unloading, loading = Mission(source=BUNK, target=pile), Mission(target=pile)
+    unloading, loading = CraneJob(source=BUNK, target=pile), CraneJob(target=pile)
     rolled = LogObservation(0, (0.4, -4.6, -1.3), (1.0, 0.0, 0.0), 2.0, 0.2)
     hanging = replace(rolled, center_m=(0.4, -4.6, 0.9))
     assert not lies_in_bunk(pile, rolled) and is_at_target(unloading, pile, rolled)
@@ -157,8 +158,8 @@ def test_a_log_that_rolls_beside_a_landing_is_laid_down_but_not_one_that_still_h
 
 def test_no_place_is_pressed_into_where_a_log_that_is_to_stay_is_between_the_tongs() -> None:
     logs = heap()
-    taken = planner()(ARM, logs, 0.0, 0.0).logs
-    other = planner()(ARM, logs, 0.0, 0.0, stay=taken[:1])
-    assert other.pressed and taken[0] not in other.logs and other.logs
+    taken = planner()(GraspRequest(ARM, logs, 0.0)).logs
+    other = planner()(GraspRequest(ARM, logs, 0.0, stay=taken[:1]))
+    assert other.penetrates and taken[0] not in other.logs and other.logs
     with pytest.raises(NoGrasp):
-        planner()(ARM, logs, 0.0, 0.0, stay=range(len(logs)))
+        planner()(GraspRequest(ARM, logs, 0.0, stay=range(len(logs))))

@@ -58,10 +58,10 @@ def askew_deg(count: int, learns: bool) -> list[float]:
     crane, rests, rotator, found = Drifting(FORWARDER, [], q=HOME), HOME, None, []
     for seed in range(count):
         crane.logs = [birch(seed)]
-        planner = Activity(FORWARDER, profile_hash(FORWARDER), rests=rests, rotator=rotator)
+        planner = Activity(FORWARDER, profile_hash(FORWARDER), last_setpoint=rests, rotator=rotator)
         crane.run(planner)
         assert planner.done, planner.failure
-        rests, rotator = (planner.rests, planner.rotator) if learns else (crane.q, None)
+        rests, rotator = (planner.last_setpoint, planner.rotator) if learns else (crane.q, None)
         found.append(abs(degrees(crane.askew_rad)))
     return found
 

@@ -9,26 +9,27 @@ import numpy as np
 import pytest
 from grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
 
-from autonomy.grasp.cylinders import as_cylinders, default_covariance, sample_cylinders
-from autonomy.grasp.selection import PlannerSelection, select_direct
-from autonomy.grasp.grasp import restricted_to
+from autonomy.grasp.cylinders import CovarianceError, as_cylinders, default_covariance, sample_cylinders
 from autonomy.grasp.grapple_heights import hover_height_m
+from autonomy.grasp.grasp import restricted_to
 from autonomy.grasp.jaws import jaws_of
-from autonomy.grasp.planner import GraspCandidate, NoGrasp
-from autonomy.grasp.quality import LAYER_RULE, STRICT_RULE, CaptureRule, rests_upon, score_grasps, blade_sections
+from autonomy.grasp.planner import GraspCandidate, GraspRequest, NoGrasp
+from autonomy.grasp.quality import LAYER_RULE, STRICT_RULE, CaptureRule, blade_sections, rests_upon, score_grasps
 from autonomy.grasp.sampling_planner import SamplingPlanner
-from autonomy.missions.crane_job import Mission
+from autonomy.grasp.selection import PlannerSelection, select_direct
+from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.estimate import LogEstimate
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import load_profile
+from tests.codes import coded
 
 JAWS = jaws_of(PROFILE)
 
 
 def planned(logs: list[LogObservation]) -> GraspCandidate:
-    return SamplingPlanner()(ARM, logs, 0.0, 0.0)
+    return SamplingPlanner()(GraspRequest(ARM, logs, 0.0))
 
 
 def is_safe(
@@ -71,7 +72,7 @@ def test_a_single_log_is_taken_across_its_middle() -> None:
     assert np.hypot(p.x_m - turned.center_m[0], p.y_m - turned.center_m[1]) < 0.1
     assert abs(remainder(p.yaw_rad - 0.6 - pi / 2, pi)) < 0.15
     assert p.support_z_m == pytest.approx(GROUND, abs=1e-3)
-    assert p.reason.startswith("1 log (7) of 1 at once") and "\n" not in p.reason
+    assert "(7)" in p.reason and "\n" not in p.reason
 
 
 @pytest.mark.parametrize("logs", [pair(), small_pile()])
@@ -142,10 +143,10 @@ def test_a_machine_on_wheels_takes_the_ground_from_the_logs(sunk_m: float) -> No
         LogObservation(i, (x, y + side, ground + 0.1), (1.0, 0.0, 0.0), 2.6, 0.2) for i, side in ((0, 0), (1, 0.21))
     ]
     upon = LogObservation(2, (x, y + 0.105, ground + 0.27), (1.0, 0.0, 0.0), 2.6, 0.2)
-    p = SamplingPlanner()(arm, [*logs, upon], 0.0, 0.0)
+    p = SamplingPlanner()(GraspRequest(arm, [*logs, upon], 0.0))
     assert set(p.logs) == {0, 1, 2} and p.support_z_m == pytest.approx(ground, abs=1e-3)
     higher = replace(logs[0], id=3, center_m=(x, y + 3.0, ground + 0.4))
-    alone = SamplingPlanner()(arm, [higher], 0.0, 0.0)
+    alone = SamplingPlanner()(GraspRequest(arm, [higher], 0.0))
     assert alone.support_z_m == pytest.approx(ground + 0.3, abs=1e-3), "it lies on a bank"
 
 
@@ -160,7 +161,7 @@ def test_draws_have_the_spread_they_are_asked_for() -> None:
     assert np.std(drawn.length) == pytest.approx(np.hypot(sigma[4], sigma[5]), rel=0.05)
     again = sample_cylinders(world, np.diag(sigma**2)[None], 4000, 3)
     assert np.array_equal(again.center, drawn.center)
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(CovarianceError, check=coded("grasp.covariance-not-finite")):
         sample_cylinders(world, np.full((1, 7, 7), np.nan), 2, 0)
 
 
@@ -175,18 +176,18 @@ def test_higher_logs_out_of_reach_hide_none_in_reach() -> None:
 
 
 def test_nothing_to_take_is_said_in_one_sentence() -> None:
-    with pytest.raises(NoGrasp, match=r"^no log is in view$"):
+    with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-view")):
         planned([])
     standing = replace(log(0), axis=(0.0, 0.1, 0.995))
-    with pytest.raises(NoGrasp, match=r"^no grasp of the 1 log is safe: .*$"):
+    with pytest.raises(NoGrasp, check=coded("grasp.none-safe")):
         planned([standing])
-    with pytest.raises(NoGrasp, match=r"^no log is in reach; log 0: point "):
+    with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-reach")):
         planned([replace(log(0), center_m=(-6.0, 7.0, GROUND + 0.1))])
 
 
 def test_a_proposal_becomes_a_grasp_of_several_logs() -> None:
-    grasp = PlannerSelection(SamplingPlanner())(ARM, Mission(), small_pile(), 0.0, 0.0)
-    assert {o.id for o in grasp.logs} == {0, 1, 2} and grasp.gathered and grasp.thinnest_m == 0.2
+    grasp = PlannerSelection(SamplingPlanner())(ARM, CraneJob(), small_pile(), 0.0, 0.0)
+    assert {o.id for o in grasp.logs} == {0, 1, 2} and grasp.is_bundle and grasp.thinnest_m == 0.2
     top = GROUND + small_pile()[2].center_m[2] - GROUND + 0.1
     assert hover_height_m(PROFILE, grasp) - tip_below_pin_m(PROFILE.grapple.tongs, 0.0) > top
     rest = restricted_to(ARM, grasp, [2])
@@ -195,41 +196,41 @@ def test_a_proposal_becomes_a_grasp_of_several_logs() -> None:
 
 
 def test_a_mission_that_names_its_log_is_served_directly() -> None:
-    grasp = PlannerSelection(SamplingPlanner())(ARM, Mission(log_id=1), pair(), 0.0, 0.0)
-    assert [o.id for o in grasp.logs] == [1] and not grasp.gathered
+    grasp = PlannerSelection(SamplingPlanner())(ARM, CraneJob(log_id=1), pair(), 0.0, 0.0)
+    assert [o.id for o in grasp.logs] == [1] and not grasp.is_bundle
     opening = grasp.pose.slew_rad + grasp.pose.rot_rad
     assert abs(remainder(opening - atan2(0.0, 1.0), pi)) == pytest.approx(pi / 2)
 
 
 def test_what_is_to_stay_is_never_taken_and_still_in_the_way() -> None:
     apart = [log(0, -0.3), log(1, 0.3)]
-    assert SamplingPlanner()(ARM, apart, 0.0, 0.0).logs == (0, 1)
-    p = SamplingPlanner()(ARM, apart, 0.0, 0.0, stay={0})
+    assert SamplingPlanner()(GraspRequest(ARM, apart, 0.0)).logs == (0, 1)
+    p = SamplingPlanner()(GraspRequest(ARM, apart, 0.0, stay={0}))
     assert p.logs == (1,) and p.y_m > Y + 0.3, "the tongs come down beside it"
-    with pytest.raises(NoGrasp, match="no grasp of the 1 log is safe"):
-        SamplingPlanner()(ARM, pair(), 0.0, 0.0, stay=(0,))
-    with pytest.raises(NoGrasp, match="all that are in view are to stay"):
-        SamplingPlanner()(ARM, pair(), 0.0, 0.0, stay=(0, 1))
+    with pytest.raises(NoGrasp, check=coded("grasp.none-safe")):
+        SamplingPlanner()(GraspRequest(ARM, pair(), 0.0, stay=(0,)))
+    with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-reach")):
+        SamplingPlanner()(GraspRequest(ARM, pair(), 0.0, stay=(0, 1)))
 
 
 def test_nothing_is_taken_from_under_a_log_that_is_to_stay() -> None:
     logs = small_pile()
-    assert 2 not in SamplingPlanner()(ARM, [*logs[:2], log(2, 1.0)], 0.0, 0.0, stay=(2,)).logs
+    assert 2 not in SamplingPlanner()(GraspRequest(ARM, [*logs[:2], log(2, 1.0)], 0.0, stay=(2,))).logs
     with pytest.raises(NoGrasp):
-        SamplingPlanner()(ARM, logs, 0.0, 0.0, stay=(2,))
+        SamplingPlanner()(GraspRequest(ARM, logs, 0.0, stay=(2,)))
 
 
 def test_a_mission_says_which_logs_are_left_by_their_numbers() -> None:
     apart = [log(7, -0.3), log(8, 0.3)]
-    grasp = PlannerSelection(SamplingPlanner())(ARM, Mission(leave=(7,)), apart, 0.0, 0.0)
+    grasp = PlannerSelection(SamplingPlanner())(ARM, CraneJob(leave=(7,)), apart, 0.0, 0.0)
     assert grasp.log.id == 8 and not grasp.others
     assert ARM.xy(grasp.pose)[1] > Y + 0.3, "the planner knows of the one that stays"
-    assert select_direct(ARM, Mission(leave=(8,)), apart, 0.0, 0.0).log.id == 7
+    assert select_direct(ARM, CraneJob(leave=(8,)), apart, 0.0, 0.0).log.id == 7
     for chooser in (select_direct, PlannerSelection(SamplingPlanner())):
-        with pytest.raises(NoGrasp, match="every log that lies there is to stay"):
-            chooser(ARM, Mission(leave=(7, 8)), apart, 0.0, 0.0)
-        with pytest.raises(NoGrasp, match="no log lies outside the bunk"):
-            chooser(ARM, Mission(leave=(7, 8)), [], 0.0, 0.0)
+        with pytest.raises(NoGrasp, check=coded("grasp.all-logs-stay")):
+            chooser(ARM, CraneJob(leave=(7, 8)), apart, 0.0, 0.0)
+        with pytest.raises(NoGrasp, check=coded("grasp.no-log-outside-bunk")):
+            chooser(ARM, CraneJob(leave=(7, 8)), [], 0.0, 0.0)
 
 
 def measured(logs: list[LogObservation]) -> list[LogObservation]:
@@ -242,10 +243,10 @@ def test_tongs_are_pressed_into_a_heap_that_a_camera_measured_but_not_into_the_g
     heap = [*(log(i, 0.21 * i) for i in range(-3, 4)), log(9, 0.105, 0.18)]
     known, seen = planned(heap), planned(measured(heap))
     assert known.logs == seen.logs == (7,)
-    assert not known.pressed and seen.pressed
+    assert not known.penetrates and seen.penetrates
     assert seen.support_z_m == pytest.approx(max(known.support_z_m - 0.15, GROUND), abs=0.02)
     whole = planned(measured(pair()))
-    assert not whole.pressed and whole.support_z_m == pytest.approx(GROUND, abs=1e-3)
+    assert not whole.penetrates and whole.support_z_m == pytest.approx(GROUND, abs=1e-3)
 
 
 def test_tongs_are_not_pressed_in_over_a_log_that_lies_across() -> None:
@@ -255,8 +256,8 @@ def test_tongs_are_not_pressed_in_over_a_log_that_lies_across() -> None:
     across = LogObservation(8, on_top.center_m, (0.0, 1.0, 0.0), 2.0, 0.2)
     beneath = measured([*row, replace(on_top, center_m=(X, Y, on_top.center_m[2] + 0.2)), across])
     p = planned(beneath)
-    assert p.logs == (7,) and not p.pressed
-    assert planned(measured([*row, on_top])).pressed
+    assert p.logs == (7,) and not p.penetrates
+    assert planned(measured([*row, on_top])).penetrates
 
 
 def test_what_floats_in_the_air_is_not_gripped_and_in_nobody_s_way() -> None:
@@ -265,8 +266,8 @@ def test_what_floats_in_the_air_is_not_gripped_and_in_nobody_s_way() -> None:
     logs = measured(pair())
     alone, haunted = planned(logs), planned([ghost, *logs])
     assert haunted.logs == tuple(i + 1 for i in alone.logs) and (haunted.x_m, haunted.y_m) == (alone.x_m, alone.y_m)
-    assert SamplingPlanner()(ARM, [log(0, -0.4), ghost, log(1, 0.4)], 0.0, 0.0, stay=(0,)).logs == (2,)
-    with pytest.raises(NoGrasp, match="lies on anything"):
+    assert SamplingPlanner()(GraspRequest(ARM, [log(0, -0.4), ghost, log(1, 0.4)], 0.0, stay=(0,))).logs == (2,)
+    with pytest.raises(NoGrasp, check=coded("grasp.no-supported-log")):
         planned([ghost])
 
 
@@ -274,10 +275,10 @@ WALL = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
 
 
 def test_a_log_is_drawn_out_of_a_row_that_is_too_wide() -> None:
-    with pytest.raises(NoGrasp, match="is safe"):
+    with pytest.raises(NoGrasp, check=coded("grasp.none-safe")):
         planned(WALL)
     p = planned(measured(WALL))
-    assert p.pressed and p.logs in {(0,), (6,)} and "drawn out of a row of 7 logs" in p.reason
+    assert p.penetrates and p.logs in {(0,), (6,)} and p.extracts
     end = WALL[p.logs[0]].center_m[1]
     inner, outer = sorted((p.y_m - JAWS.half_gap_m, p.y_m + JAWS.half_gap_m), key=lambda y: abs(y - Y))
     assert abs(inner - end) == pytest.approx(0.14, abs=0.001) and abs(inner - Y) < abs(end - Y), (
@@ -285,9 +286,9 @@ def test_a_log_is_drawn_out_of_a_row_that_is_too_wide() -> None:
     )
     assert abs(outer - Y) > abs(end - Y) + 1.0, "and on free ground"
     assert p.logs == (0,)
-    beside = SamplingPlanner()(ARM, measured([*WALL, log(9, -1.6)]), 0.0, 0.0, stay=(7,))
+    beside = SamplingPlanner()(GraspRequest(ARM, measured([*WALL, log(9, -1.6)]), 0.0, stay=(7,)))
     assert beside.logs == (6,), "where another lies there is no room"
-    laden = SamplingPlanner()(ARM, measured([*WALL, on_top(WALL[0], WALL[1])]), 0.0, 0.0, stay=(7,))
+    laden = SamplingPlanner()(GraspRequest(ARM, measured([*WALL, on_top(WALL[0], WALL[1])]), 0.0, stay=(7,)))
     assert laden.logs == (6,), "none that another lies on, where the others are free"
 
 
@@ -298,8 +299,8 @@ def on_top(a: LogObservation, b: LogObservation) -> LogObservation:
 
 
 def test_where_no_grasp_is_safe_a_camera_s_logs_are_gripped_at_the_top_all_the_same() -> None:
-    p = SamplingPlanner()(ARM, measured(WALL), 0.0, 0.0, stay=(0, 6))
-    assert p.probability == 0.3 and len(p.logs) == 1 and "sure" in p.reason and "\n" not in p.reason
+    p = SamplingPlanner()(GraspRequest(ARM, measured(WALL), 0.0, stay=(0, 6)))
+    assert p.probability == 0.3 and len(p.logs) == 1 and "\n" not in p.reason
     one = WALL[p.logs[0]]
     assert np.hypot(p.x_m - one.center_m[0], p.y_m - one.center_m[1]) < 0.01
 
@@ -308,5 +309,5 @@ def test_on_wheels_nothing_is_pressed_lower_than_the_lowest_log() -> None:
     arm = Arm(load_profile("aoro_fc8"))
     x, y = arm.profile.workspace.pick_center_m
     logs = measured([LogObservation(i, (x, y + 0.25 * i, -1.0), (1.0, 0.0, 0.0), 2.6, 0.2) for i in range(-4, 5)])
-    p = SamplingPlanner()(arm, logs, 0.0, 0.0)
+    p = SamplingPlanner()(GraspRequest(arm, logs, 0.0))
     assert p.support_z_m >= -1.1 - 1e-6

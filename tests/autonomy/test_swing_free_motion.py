@@ -36,7 +36,7 @@ FORWARDER = CRANES["aoro_fc8"]
 def trial(goal: tuple[float, float]) -> tuple[Pose, Pose]:
     """Paper B's accuracy test: from over the bunk to a point beside it."""
     arm = FORWARDER.arm
-    return arm.reach(3.0, 0.0, 3.5, 3.5), arm.reach(*goal, 1.0, 1.0)
+    return arm.compact_pose_above(3.0, 0.0, 3.5, 3.5), arm.compact_pose_above(*goal, 1.0, 1.0)
 
 
 def sampled(motion: Trajectory, step_s: float = FINE_S) -> tuple[np.ndarray, np.ndarray]:
@@ -116,8 +116,8 @@ def test_the_law_without_swing_takes_little_longer_than_the_fastest(goal: tuple[
 def test_any_straight_motion_keeps_limits_and_swing(name: str, slew: float, near: float, far: float, z: float) -> None:
     crane = CRANES[name]
     turn = crane.profile.kinematics.theta1_offset_rad
-    start = crane.arm.over(near * np.cos(turn), near * np.sin(turn), 1.2, 1.2)
-    goal = crane.arm.over(far * np.cos(turn + slew), far * np.sin(turn + slew), z, z)
+    start = crane.arm.pose_above(near * np.cos(turn), near * np.sin(turn), 1.2, 1.2)
+    goal = crane.arm.pose_above(far * np.cos(turn + slew), far * np.sin(turn + slew), z, z)
     motion = straight_line(crane.arm, start, goal)
     assert_within_limits(crane.profile, motion)
     assert crane.arm.pose(motion.goal) == pytest.approx(goal, abs=1e-6)

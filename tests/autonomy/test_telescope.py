@@ -49,7 +49,7 @@ def test_a_way_without_corners_or_out_of_reach_stays_as_it_is() -> None:
 
 def test_over_a_log_the_telescope_is_out_for_a_fast_way_home() -> None:
     high_m, home_m = travel_height_m(AORO.profile), hypot(*AORO.profile.bunk.center_m)
-    pose = AORO.over(3.3, 3.0, 0.2, high_m)
+    pose = AORO.pose_above(3.3, 3.0, 0.2, high_m)
     short = pose._replace(ext_m=0.05)
     over = pose.at_height(high_m)
     home = over._replace(r_m=home_m)
@@ -67,7 +67,7 @@ def test_a_goal_at_a_stop_is_refused_but_a_start_there_is_not() -> None:
     high = joint_limits(AORO.profile)[Joint.EXT][1]
     inside = Pose(0.0, 5.5, 1.0, high - 0.1, 0.0)
     at_stop = inside._replace(ext_m=high)
-    for joints in (AORO.joints, AORO.joints_about):
+    for joints in (AORO.joints, AORO.approximate_joints):
         assert joints(np.array([at_stop, inside]))[0, Joint.EXT] == high
         with pytest.raises(Unreachable):
             joints(np.array([inside, at_stop]))

@@ -20,7 +20,7 @@ ENDS = {
 
 def way_over(name: str) -> PathGeometry:
     arm, (a, b, z) = ARMS[name], ENDS[name]
-    first, last = (np.array(arm.over(*xy, z - 0.5, z).at_height(z)) for xy in (a, b))
+    first, last = (np.array(arm.pose_above(*xy, z - 0.5, z).at_height(z)) for xy in (a, b))
     return PathGeometry(arm, first + np.linspace(0.0, 1.0, 81)[:, None] * (last - first))
 
 
@@ -71,7 +71,7 @@ def test_a_calm_way_takes_a_second_longer_than_the_slow_law_at_most(name: str) -
 
 def test_a_vertical_way_needs_no_window() -> None:
     arm = ARMS["palms_471"]
-    low = np.array(arm.over(-1.8, 4.4, 0.0, 1.6))
+    low = np.array(arm.pose_above(-1.8, 4.4, 0.0, 1.6))
     way = PathGeometry(arm, low + np.linspace(0.0, 1.0, 81)[:, None] * np.array([0.0, 0.0, 1.2, 0.0, 0.0]))
     law = time_optimal_law(arm, way)
     assert law.swing_rad == 0.0
@@ -80,7 +80,7 @@ def test_a_vertical_way_needs_no_window() -> None:
 
 def test_a_way_too_short_to_swing_anything_is_driven_as_fast_as_one_that_goes_straight_up() -> None:
     arm = ARMS["palms_471"]
-    low = np.array(arm.over(-1.8, 4.4, 0.0, 1.6))
+    low = np.array(arm.pose_above(-1.8, 4.4, 0.0, 1.6))
     up, aside = (
         PathGeometry(arm, low + np.linspace(0.0, 1.0, 81)[:, None] * np.array([0.0, r_m, 1.2, 0.0, 0.0])) for r_m in (0.0, 0.015)
     )

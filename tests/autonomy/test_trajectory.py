@@ -24,7 +24,7 @@ FINE_S = 0.005
 
 def poses(slew: float = 1.6) -> st.SearchStrategy[Pose]:
     return st.builds(
-        lambda slew, r, z, rot: ARM.over(-r * np.sin(slew), r * np.cos(slew), z, TOP)._replace(rot_rad=rot),
+        lambda slew, r, z, rot: ARM.pose_above(-r * np.sin(slew), r * np.cos(slew), z, TOP)._replace(rot_rad=rot),
         st.floats(-slew, slew),
         st.floats(3.3, 6.2),
         st.floats(-0.2, 1.6),
@@ -106,8 +106,8 @@ def test_a_vertical_line_is_vertical(start: Pose, z: float) -> None:
 
 @pytest.mark.parametrize("period_s", [1.55, 1.6, 1.75, 1.9, 2.0])
 def test_a_hanging_log_swings_little_after_a_slew(period_s: float) -> None:
-    start = ARM.over(-1.8, 4.4, -0.1, TOP).at_height(TOP)
-    goal = ARM.over(3.47, 0.96, 0.3, TOP).at_height(TOP)
+    start = ARM.pose_above(-1.8, 4.4, -0.1, TOP).at_height(TOP)
+    goal = ARM.pose_above(3.47, 0.96, 0.3, TOP).at_height(TOP)
     pin = pins(sampled(travel_over(ARM, start, goal, TOP))[0])[:, :2]
     omega = 2 * np.pi / period_s
     swing, speed = np.zeros(2), np.zeros(2)  # a pendulum integrated step by step, undamped
@@ -122,8 +122,8 @@ def test_a_hanging_log_swings_little_after_a_slew(period_s: float) -> None:
 
 
 def test_a_slew_to_the_bunk_takes_about_ten_seconds() -> None:
-    start = ARM.over(-1.8, 4.4, -0.1, TOP).at_height(TOP)
-    goal = ARM.over(3.47, 0.96, 0.3, TOP).at_height(TOP)
+    start = ARM.pose_above(-1.8, 4.4, -0.1, TOP).at_height(TOP)
+    goal = ARM.pose_above(3.47, 0.96, 0.3, TOP).at_height(TOP)
     assert 6.0 < travel_over(ARM, start, goal, TOP).duration_s < 11.0
 
 
@@ -134,7 +134,7 @@ def test_hold_stands_still() -> None:
 
 
 def test_follow_fades_a_wrong_start_out() -> None:
-    path = ARM.over(-1.8, 4.4, -0.1, TOP)
+    path = ARM.pose_above(-1.8, 4.4, -0.1, TOP)
     start = path._replace(slew_rad=path.slew_rad + 0.01, z_m=path.z_m + 0.05)
     motion = follow_path(ARM, start, lambda t: path.at_height(path.z_m + 0.02 * t), 3.0, 1.0)
     assert ARM.pose(motion.at(0.0)[0]) == pytest.approx(start, abs=1e-6)
@@ -142,11 +142,11 @@ def test_follow_fades_a_wrong_start_out() -> None:
 
 
 def test_a_pose_outside_the_limits_is_refused_in_words() -> None:
-    near = ARM.over(-1.8, 4.4, -0.1, TOP)
+    near = ARM.pose_above(-1.8, 4.4, -0.1, TOP)
     with pytest.raises(Unreachable, match="out of reach"):
         straight_line(ARM, near, near._replace(r_m=9.0))
     with pytest.raises(Unreachable, match="slew"):
-        ARM.over(0.5, -4.0, -0.1, TOP)
+        ARM.pose_above(0.5, -4.0, -0.1, TOP)
 
 
 def test_a_brisk_turn_is_the_same_turn_in_less_time_and_within_the_limits() -> None:

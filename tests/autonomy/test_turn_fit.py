@@ -62,7 +62,7 @@ def test_the_valve_is_found_though_its_metering_is_another(machine: StandIn) -> 
     assert max(deadbands) < 0.02 and max(fulls) < 0.05
     assert max(fit.plus.errors[0], fit.minus.errors[0]) < 0.004
     assert max(map(abs, (*fit.plus.left_rad, *fit.minus.left_rad))) < 0.03
-    assert fit.stands_rad == pytest.approx(stood[-1], abs=0.03) and abs(stood[-1]) < 0.15, "it is back"
+    assert fit.angle_rad == pytest.approx(stood[-1], abs=0.03) and abs(stood[-1]) < 0.15, "it is back"
     result = identify(AORO, Findings(turns=turns))
     assert result.turns == fit and result.implausible == () and result.kept == ()
 
@@ -88,7 +88,7 @@ def test_single_readings_of_a_person_are_enough_to_be_believed() -> None:
 def test_without_turns_a_side_is_as_the_profile_has_it() -> None:
     fit = fit_turns([], ROT)
     assert (fit.plus.deadband, fit.minus.full_speed) == (0.01 * ROT.valve.deadband_plus_pct, ROT.valve.full_speed_minus)
-    assert fit.stands_rad == 0.0
+    assert fit.angle_rad == 0.0
 
 
 def test_what_cannot_be_believed_of_turns_is_said() -> None:

@@ -13,12 +13,21 @@ from hypothesis import strategies as st
 from autonomy.grasp.cnn_planner import CnnPlanner, mean_maps
 from autonomy.grasp.cylinders import as_cylinders
 from autonomy.grasp.jaws import jaws_of
-from autonomy.grasp.network import WEIGHTS, PixelGrasp, GraspMaps, GraspNet
-from autonomy.grasp.planner import NoGrasp
-from autonomy.grasp.virtual_scene import Camera, camera_above, cameras_along, operational_area, render, shortened_logs
+from autonomy.grasp.network import WEIGHTS, GraspMaps, GraspNet, PixelGrasp
+from autonomy.grasp.planner import GraspRequest, NoGrasp
+from autonomy.grasp.virtual_scene import (
+    Camera,
+    SceneError,
+    camera_above,
+    cameras_along,
+    operational_area,
+    render,
+    shortened_logs,
+)
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.observation import LogObservation
 from machine.loading.profile_file import load_profile
+from tests.codes import coded
 
 JAWS = jaws_of(PROFILE)
 
@@ -52,7 +61,7 @@ def test_the_cuboid_holds_the_ends_and_the_camera_hangs_three_metres_over_its_mi
     assert box.low_m == pytest.approx(np.array(turned.center_m) - half)
     assert box.high_m == pytest.approx(np.array(turned.center_m) + half)
     assert camera_above(box).position_m == pytest.approx((*turned.center_m[:2], turned.center_m[2] + 3.0))
-    with pytest.raises(ValueError, match="no log"):
+    with pytest.raises(SceneError, check=coded("grasp.scene-empty")):
         operational_area(as_cylinders([]))
 
 
@@ -93,9 +102,9 @@ def test_a_log_fills_the_pixels_it_should() -> None:
 
 
 def test_a_camera_that_cannot_see_is_refused() -> None:
-    with pytest.raises(ValueError, match="look down"):
+    with pytest.raises(SceneError, check=coded("grasp.camera-below-ground")):
         render(as_cylinders(pair()), Camera(np.array([X, Y, GROUND])), GROUND)
-    with pytest.raises(ValueError, match="inside a log"):
+    with pytest.raises(SceneError, check=coded("grasp.camera-in-log")):
         render(as_cylinders(pair()), Camera(np.array([X, Y, GROUND + 0.2])), GROUND)
 
 
@@ -104,8 +113,8 @@ def test_a_pixel_becomes_a_grasp_in_the_base(theta: float) -> None:
     """Right in the picture is base +x, up is base +y; the closing direction turns with it."""
     planner = CnnPlanner(Chosen(180.0, 90.0, theta))
     one = log(0, 0.0)
-    p = planner(ARM, [one], 0.0, 0.0)
-    seen = planner.look(as_cylinders([one]), JAWS, GROUND)
+    p = planner(GraspRequest(ARM, [one], 0.0))
+    seen = planner.view(as_cylinders([one]), JAWS, GROUND)
     z = float(seen.depth_m[90, 180])
     assert (p.x_m, p.y_m) == pytest.approx((X + 30 / 385 * z, Y + 60 / 385 * z))
     assert remainder(p.yaw_rad + theta, pi) == pytest.approx(0.0)
@@ -114,13 +123,13 @@ def test_a_pixel_becomes_a_grasp_in_the_base(theta: float) -> None:
 
 def test_the_tips_go_a_hand_under_the_surface_of_a_pile() -> None:
     pile = [*small_pile(), log(3, 0.0, 0.38)]
-    p = CnnPlanner(Chosen(150.0, 150.0, pi / 2))(ARM, pile, 0.0, 0.0)
+    p = CnnPlanner(Chosen(150.0, 150.0, pi / 2))(GraspRequest(ARM, pile, 0.0))
     assert p.support_z_m == pytest.approx(GROUND + 0.58 - 0.25, abs=0.01) and 3 in p.logs
 
 
 def test_with_physical_labels_the_height_is_that_of_the_rule() -> None:
     def height(logs: list, by_rule: bool) -> float:
-        return CnnPlanner(Chosen(150.0, 150.0, pi / 2), by_rule)(ARM, logs, 0.0, 0.0).support_z_m
+        return CnnPlanner(Chosen(150.0, 150.0, pi / 2), by_rule)(GraspRequest(ARM, logs, 0.0)).support_z_m
 
     assert height(small_pile(), True) == pytest.approx(GROUND)
     assert height(small_pile(), False) == pytest.approx(GROUND + 0.38 - 0.25, abs=0.01)
@@ -131,7 +140,7 @@ def test_with_physical_labels_the_height_is_that_of_the_rule() -> None:
 @pytest.mark.parametrize("yaw", [-0.8, 0.0, 0.8])
 def test_the_shipped_weights_from_physical_labels_close_across_a_log_near_its_middle(yaw: float) -> None:
     net = GraspNet.shipped(WEIGHTS.with_name("grasp_physical.safetensors"))
-    p = CnnPlanner(net, by_rule=True)(ARM, [log(0, yaw=yaw, diameter=0.24)], 0.0, 0.0)
+    p = CnnPlanner(net, by_rule=True)(GraspRequest(ARM, [log(0, yaw=yaw, diameter=0.24)], 0.0))
     assert p.logs == (0,) and hypot(p.x_m - X, p.y_m - Y) < 0.6, "on a log of 2.6 m"
     assert abs(remainder(p.yaw_rad - yaw - pi / 2, pi)) < 0.25
 
@@ -140,18 +149,18 @@ def test_on_wheels_the_lowest_log_tells_where_the_ground_is() -> None:
     arm = Arm(load_profile("aoro_fc8"))
     x, y = arm.profile.workspace.pick_center_m
     one = LogObservation(0, (x, y, arm.profile.workspace.ground_z_m + 0.2), (1.0, 0.0, 0.0), 2.6, 0.2)
-    p = CnnPlanner(Chosen(150.0, 150.0, pi / 2))(arm, [one], 0.0, 0.0)
+    p = CnnPlanner(Chosen(150.0, 150.0, pi / 2))(GraspRequest(arm, [one], 0.0))
     assert p.support_z_m == pytest.approx(one.center_m[2] - 0.1)
 
 
 def test_nothing_to_see_is_no_grasp() -> None:
-    with pytest.raises(NoGrasp, match="no log is in view"):
-        CnnPlanner(Chosen(1.0, 1.0, 0.0))(ARM, [], 0.0, 0.0)
+    with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-view")):
+        CnnPlanner(Chosen(1.0, 1.0, 0.0))(GraspRequest(ARM, [], 0.0))
 
 
 def test_a_moving_camera_agrees_with_one_that_stands() -> None:
     planner = CnnPlanner(Chosen(0.0, 0.0, 0.0), cameras=5)
-    seen = planner.look(as_cylinders(cross()), JAWS, GROUND)
+    seen = planner.view(as_cylinders(cross()), JAWS, GROUND)
     point = seen.camera.to_base(seen.best.u_px, seen.best.v_px, 2.6)
     assert abs(remainder(seen.best.theta_rad - pi / 2, pi)) < 1e-6
     upper = cross()[2]
@@ -179,8 +188,8 @@ def test_predictions_are_averaged_where_they_belong() -> None:
 def test_the_network_plans_as_if_logs_that_are_to_stay_were_not_there() -> None:
     logs = [log(0, -0.4), log(1), log(2, 0.4)]
     planner = CnnPlanner(Chosen(150.0, 150.0, pi / 2))
-    without = planner(ARM, [logs[1]], 0.0, 0.0)
-    p = planner(ARM, logs, 0.0, 0.0, stay={0, 2})
+    without = planner(GraspRequest(ARM, [logs[1]], 0.0))
+    p = planner(GraspRequest(ARM, logs, 0.0, stay={0, 2}))
     assert p.logs == (1,) and (p.x_m, p.y_m) == (without.x_m, without.y_m)
-    with pytest.raises(NoGrasp, match="no log is in view"):
-        planner(ARM, logs, 0.0, 0.0, stay=range(3))
+    with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-view")):
+        planner(GraspRequest(ARM, logs, 0.0, stay=range(3)))

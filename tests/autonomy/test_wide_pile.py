@@ -42,7 +42,7 @@ class Heap(StandIn):
 
 def driven(heap: Heap) -> tuple[list[Phase], Activity]:
     """The phases from the first descent to the lift."""
-    planner = Activity(PROFILE, profile_hash(PROFILE), chooser=PlannerSelection(SamplingPlanner()))
+    planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner()))
     phases = heap.until(planner, Phase.LIFT)
     return phases[phases.index(Phase.DESCEND) :], planner
 
