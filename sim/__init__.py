@@ -1,1 +1,1 @@
-"""The plant: a physics stand-in for the machine on the far side of the bus.  Start at ``sim.plant.Plant``."""
+"""The plant: a physics simulation of the machine on the other side of the bus.  Entry point: ``sim.plant.Plant``."""

@@ -1,12 +1,12 @@
 """The live plant: ``python -m sim --profile aoro_fc8 --bus crane0=wire:crane0 --bus mach0=wire:mach0 [--port 4710]
 [--camera 4711] [--site FILE]``.
 
-Runs the plant against the monotonic clock (`sim.process.live`).  ``--port`` answers JSON requests over UDP
-on the loopback interface: ``{"op": "state" | "shapes" | "verdict" | "logs" | "poses" | "vehicle" | "survey" | "press"
-| "release" | "reset" | "scene" | "view" | "quit"}`` and ``{"op": "lever", "name": NAME, "value": "-1".."1"}``.
-With ``--site`` the logs of a mission lie about (`sim.site.site_file`), "logs" gives those that a camera could see, and where
-one was taken a new one is laid for the next lap.  ``--camera`` serves the pictures of its cameras over TCP on that
-interface (``can_dbc.messages.rgbd``), drawn when asked for.
+Runs the plant in real time (`sim.process.live`).  ``--port`` answers JSON requests over UDP on the loopback
+interface: ``{"op": "state" | "shapes" | "verdict" | "logs" | "poses" | "vehicle" | "survey" | "press" | "release" |
+"reset" | "scene" | "view" | "quit"}`` and ``{"op": "lever", "name": NAME, "value": "-1".."1"}``.  ``--site`` places
+the logs of a mission (`sim.site.site_file`): "logs" then returns those in the cameras' view, and a collected log is
+replaced for the next lap.  ``--camera`` serves camera pictures over TCP on the loopback interface
+(``can_dbc.messages.rgbd``), rendered on request.
 
 Exit codes: 0 stopped by SIGTERM, SIGINT or quit; 2 usage; 3 profile, truth or scene; 4 bus.
 """
@@ -25,8 +25,9 @@ import msgspec
 
 from can_dbc.bus.base import BusError
 from can_dbc.bus.factory import open_bus
-from machine.loading.profile_file import ProfileError, load_profile
+from machine.loading.profile_file import load_profile
 from machine.profile import Profile
+from sim.errors import PlantError
 from sim.ground.terrain import KINDS as TERRAINS
 from sim.plant import Plant
 from sim.process.live import TX_QUEUE_FRAMES
@@ -43,18 +44,28 @@ def _address(text: str) -> tuple[str, str]:
 
 
 def _check_buses(profile: Profile, given: Mapping[str, str]) -> None:
-    """ProfileError unless exactly the machine's buses are given."""
+    """Raises:
+    PlantError: the given buses are not exactly those of the machine.
+    """
     wanted = [b for b in (profile.crane_bus, profile.machine_bus) if b]
     for name in given:
         if name not in wanted:
-            raise ProfileError(f"{profile.name} has no bus {name}, only {' and '.join(wanted)}; change --bus")
+            raise PlantError(
+                "plant.unknown-bus", f"{profile.name} has no bus {name}, only {' and '.join(wanted)}; change --bus"
+            )
     for name in wanted:
         if name not in given:
-            raise ProfileError(f"{profile.name} is on {' and '.join(wanted)}; give --bus {name}=ADDRESS too")
+            raise PlantError(
+                "plant.missing-bus", f"{profile.name} needs {' and '.join(wanted)}; add --bus {name}=ADDRESS"
+            )
 
 
 def _plant(profile: Profile, site: Site | None, options: argparse.Namespace) -> Plant:
-    """What the command line asks for; raises ValueError."""
+    """The plant that the command line describes.
+
+    Raises:
+        PlantError: the truth, scene or site cannot be used.
+    """
     seed, truth = options.seed, options.truth
     if site is not None:
         return site.plant(profile, truth, seed)
@@ -68,12 +79,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--truth", default="nominal", help="nominal, sampled or a TOML file")
     parser.add_argument("--logs", type=int, default=1)
-    parser.add_argument("--scene", default="random", help=f"how the logs lie: random, {', '.join(KINDS)}")
-    parser.add_argument("--site", type=Path, help="file of a mission's site, instead of --logs and --scene")
-    parser.add_argument("--terrain", default="flat", choices=TERRAINS, help="what the machine stands on")
+    parser.add_argument("--scene", default="random", help=f"arrangement of the logs: random, {', '.join(KINDS)}")
+    parser.add_argument("--site", type=Path, help="site file of a mission, instead of --logs and --scene")
+    parser.add_argument("--terrain", default="flat", choices=TERRAINS, help="ground under the machine")
     parser.add_argument("--bus", type=_address, action="append", required=True, metavar="NAME=ADDRESS")
     parser.add_argument("--port", type=int, help="UDP port on the loopback interface for requests")
-    parser.add_argument("--camera", type=int, help="TCP port on the loopback interface for pictures of the cameras")
+    parser.add_argument("--camera", type=int, help="TCP port on the loopback interface for camera pictures")
     options = parser.parse_args(arguments)
     addresses = dict(options.bus)
     try:
@@ -95,7 +106,7 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stdout.flush()
             live.run()
             sys.stderr.write(f"plant: {msgspec.json.encode(live.report()).decode()}\n")
-    except (ProfileError, ValueError) as error:
+    except ValueError as error:
         sys.stderr.write(f"plant: {error}\n")
         return 3
     except (BusError, OSError) as error:

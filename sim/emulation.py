@@ -1,9 +1,9 @@
-"""The emulated CAN nodes of a whole machine around any world that moves: what physics and a calibration rig share.
+"""The emulated CAN nodes of a whole machine around any world that moves: shared by the physics and the kinematic world.
 
-``EmulatedMachine.step(now_ns, received)`` advances its world on a grid of steps, which starts at the first call's
-``now_ns``, up to ``now_ns``; frames of either bus are delivered at their own stamps between the steps, so a SYNC is
-answered at once, with the state of the last step.  Returned are the frames sent meanwhile, with their buses.  No clock,
-no socket; equal inputs and seed give equal bytes.
+``EmulatedMachine.step(now_ns, received)`` advances its world on a grid of steps, from the first call's ``now_ns`` up
+to ``now_ns``.  Frames of either bus are delivered at their own time stamps between the steps, so a SYNC is answered
+at once with the state of the last step.  It returns the frames sent meanwhile, with their buses.  It uses no clock
+and no socket; equal inputs and seed give equal bytes.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
 from machine.crane_nodes import CraneNode
 from machine.geometry.carrier import ARMS, height_from_arm_angle
 from machine.profile import Encoder, Profile
+from sim.errors import PlantError
 from sim.nodes import Outbox
 from sim.nodes.arms import ArmNode
 from sim.nodes.device import Device, EstopBox, PressureModule
@@ -32,11 +33,11 @@ from sim.nodes.vehicle import VehicleNode
 from sim.truth.load import Truth
 
 SENSE_NS = 10 * MS
-"""How often the carrier's own sensors are read."""
+"""Sampling period of the carrier's own sensors."""
 
 
 class SensedWorld(Protocol):
-    """What the nodes feel of a world: joints by name, oil, and the carrier (None on a machine without one)."""
+    """What the nodes sense of a world: joints by name, hydraulics, and the carrier (None on a machine without one)."""
 
     truth: Truth
     hydraulics: Any
@@ -53,11 +54,10 @@ class SensedWorld(Protocol):
 
 
 class EmulatedMachine(ABC):
-    """All nodes of a machine.  ``estop`` is the operator's box.
+    """All nodes of a machine.  ``estop`` is the operator's emergency stop.
 
     ``vehicle_node``, ``arms``, ``engine`` and ``gnss`` are None on a machine without carrier, ``imu`` where the profile
-    has none.  ``cycle_ns`` is the
-    period of the valve node's feedback and of the fast pressures.
+    has none.  ``cycle_ns`` is the period of the valve node's feedback and of the fast pressures.
     """
 
     def __init__(
@@ -75,6 +75,7 @@ class EmulatedMachine(ABC):
         self._time_ns: int | None = None
         self._steps = 0
         self._pressures_of = -1
+        self._pressures_pa: dict[str, tuple[float, float]] = {}
         self._received = {profile.crane_bus: self._deliver_crane, profile.machine_bus: self._deliver_machine}
         self._crane_out: Outbox = []
         self._machine_out: Outbox = []
@@ -118,7 +119,9 @@ class EmulatedMachine(ABC):
     def _place_machine_nodes(self, facts: Truth, seed: int, carrier: Any) -> None:
         spec, out = self.profile.carrier, self._machine_out
         if spec is None or facts.gnss is None:
-            raise ValueError(f"the truth of {self.profile.name} needs a [gnss] table; add it to the truth file")
+            raise PlantError(
+                "truth.no-gnss", f"the truth of {self.profile.name} has no [gnss] table; add it to the truth file"
+            )
         machine = load("machine")
         self.vehicle_node = VehicleNode(machine, out, spec, self._pilot_on)
         self.arms = ArmNode(machine, out, self._pilot_on)
@@ -131,10 +134,14 @@ class EmulatedMachine(ABC):
 
     @abstractmethod
     def _move(self, now_ns: int) -> None:
-        """One step of the world, which ends at ``now_ns``."""
+        """Advance the world by one step, which ends at ``now_ns``."""
 
     def step(self, now_ns: int, received: list[tuple[str, Frame]]) -> list[tuple[str, int, bytes]]:
-        """Advance to ``now_ns``; ``received`` are (bus, frame) sent by others since, stamps up to ``now_ns``."""
+        """Advance to ``now_ns``.
+
+        ``received`` are (bus, frame) pairs sent by others since the last call, with stamps up to ``now_ns``.
+        Returns (bus, key, data) of the frames that the nodes sent.
+        """
         if self._time_ns is None:
             self._time_ns = now_ns
             self._tick(now_ns)
@@ -157,11 +164,11 @@ class EmulatedMachine(ABC):
 
     @property
     def time_s(self) -> float:
-        """Physical time that has passed [s]."""
+        """Simulated time since the start [s]."""
         return self._steps * self._step_ns * 1e-9
 
     def _advance(self, until_ns: int) -> None:
-        """Steps that end at or before ``until_ns``."""
+        """Run all steps that end at or before ``until_ns``."""
         assert self._time_ns is not None
         while self._time_ns + self._step_ns <= until_ns:
             self._time_ns += self._step_ns
@@ -171,7 +178,7 @@ class EmulatedMachine(ABC):
             self._tick(self._time_ns)
 
     def _spools(self, now_ns: int) -> list[float]:
-        """What the nodes do to the valves in this step, -1..1: `FUNCTIONS`, then steering and `ARMS`."""
+        """Commands of the nodes to the valves in this step, -1..1: `FUNCTIONS`, then steering and `ARMS`."""
         self.valve.decide(now_ns)
         commands = [u / 100.0 for u in self.valve.outputs_pct]
         if self.vehicle_node is not None and self.arms is not None:
@@ -181,7 +188,7 @@ class EmulatedMachine(ABC):
         return commands
 
     def _measure(self, now_ns: int) -> None:
-        """Let the sensors with a memory feel the present state."""
+        """Feed the present state to the sensors with a memory."""
         q, qd = self._surroundings.q, self._surroundings.qd
         for name, encoder in self.encoders.items():
             encoder.observe(now_ns, q[name], qd[name])
@@ -191,7 +198,7 @@ class EmulatedMachine(ABC):
             self._measure_carrier()
 
     def _sense_valves(self) -> ValveInputs:
-        """What the PLC's inputs show now."""
+        """Readings of the PLC's inputs."""
         w, h = self._surroundings, self._surroundings.hydraulics
         spools, (opening, closing) = h.spools, self._pressures()["grapple"]
         return ValveInputs(
@@ -209,13 +216,13 @@ class EmulatedMachine(ABC):
         return (*pressures[first], *pressures[second])
 
     def _pressures(self) -> dict[str, tuple[float, float]]:
-        """Chambers of every function [Pa]; made once a step, for three nodes ask."""
+        """Chamber pressures of every function [Pa]; computed once per step because three nodes read them."""
         if self._pressures_of != self._steps:
             self._pressures_of, self._pressures_pa = self._steps, self._surroundings.hydraulics.pressures_pa
         return self._pressures_pa
 
     def _grapple_pressures(self) -> tuple[float, ...]:
-        """Pump, tank, closing and opening side of the grapple."""
+        """Pressures of pump, tank, closing and opening side of the grapple."""
         w = self._surroundings
         opening, closing = self._pressures()["grapple"]
         return (w.hydraulics.supply_pa, w.truth.supply.tank_pa, closing, opening)

@@ -1,6 +1,7 @@
-"""The judge: watches the plant's truth and says what was done to every log and what the machine went through.
+"""The evaluator: observes the plant's ground truth and reports what happened to every log and to the machine.
 
-It reads the physics alone, never a bus or an encoder.  The bunk is judged in the crane's base frame, so it may drive.
+It reads the physics only, never a bus or an encoder.  The bunk is evaluated in the crane's base frame, because a
+carrier moves it.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ FLEX: Final = ("flex_pitch", "flex_roll")
 
 @dataclass(frozen=True, slots=True)
 class LogEvaluation:
-    """One log.  ``lifted``: raised by the crane over LIFTED_M; ``left_ground``: by LEFT_GROUND_M more than it lay.
-    ``in_bunk``: centre over the bunk, both ends between the stakes, on the floor or on logs; ``released``: the crane
-    does not touch it.  ``max_grip_n``: largest sum of the tongs' normal forces on it.
+    """One log.  ``lifted``: the crane raised it by more than LIFTED_M; ``left_ground``: its clearance grew by more than
+    LEFT_GROUND_M.  ``in_bunk``: its middle is over the bunk, both ends are between the stakes, on the floor or on logs;
+    ``released``: the crane does not touch it.  ``max_grip_n``: largest sum of the jaws' normal forces on it.
     """
 
     lifted: bool
@@ -45,12 +46,12 @@ class LogEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """The run so far.  ``success``: every log done.  Energy is hydraulic, from the pump.
+    """The run so far.  ``success``: every log is done.  Energy is hydraulic, from the pump.
 
-    ``tip_m`` is where the hanger pin truly is, ``rigid_tip_m`` where it would be on a stiff column, both in the crane's
-    base frame; ``sag_m`` their distance.  ``tip_margin_m``: least distance of a carrier's centre of pressure from the
-    edge of its wheels' contacts, None on a fixed machine.  ``max_foot_moment_nm``: largest overturning moment that the
-    column brings into the crane's foot.
+    ``tip_m`` is the true position of the hanger pin, ``rigid_tip_m`` its position on a stiff column, both in the
+    crane's base frame; ``sag_m`` is their distance.  ``tip_margin_m``: least distance of a carrier's centre of pressure
+    from the edge of its wheels' contacts, None on a fixed machine.  ``max_foot_moment_nm``: largest overturning moment
+    that the column brings into the crane's foot.
     """
 
     logs: tuple[LogEvaluation, ...]
@@ -72,7 +73,7 @@ class Evaluation:
 
 
 class Evaluator:
-    """``watch`` once per physics step; ``verdict`` at any time."""
+    """Call ``watch`` once per physics step; ``evaluate`` at any time."""
 
     def __init__(self, world: World) -> None:
         self._w = world
@@ -87,7 +88,7 @@ class Evaluator:
         self._machine()
 
     def watch(self) -> None:
-        """Take note of what happens; looks at every fourth step."""
+        """Record what happens; evaluates every fourth step."""
         self._steps += 1
         if self._steps % EVERY_STEPS:
             return
@@ -112,13 +113,13 @@ class Evaluator:
             self._margin = min(self._margin, w.carrier.tip_margin_m)
 
     def _clearance(self, log: LogState) -> float:
-        """Air under the lowest of the log's ends and middle [m]."""
+        """Air under the lowest point of the log's ends and middle [m]."""
         height, fall = self._w.terrain.height, log.taper_m_m * log.length_m / 2
         places = zip((log.position_m, *log.ends_m), (0.0, fall, -fall), strict=True)
         return min(p[2] - (log.diameter_m + d) / 2 - height(p[0], p[1]) for p, d in places)
 
     def evaluate(self) -> Evaluation:
-        """Judgement at this moment."""
+        """The evaluation up to now."""
         w = self._w
         inward = w.client.invertTransform(*w.base_pose())
         logs = tuple(

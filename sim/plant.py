@@ -1,7 +1,7 @@
-"""The plant: physics world and emulated CAN nodes behind one pure step, in place of the machine on the bus.
+"""The plant: the physics world and the emulated CAN nodes behind one pure step, in place of the machine on the bus.
 
-``Plant.step(now_ns, received)`` (of `sim.emulation.EmulatedMachine`) advances physics on a 2.5 ms grid.  No clock, no
-socket; equal inputs and seed give equal bytes.  A scene that cannot be made raises ValueError.
+``Plant.step(now_ns, received)`` (of `sim.emulation.EmulatedMachine`) advances physics on a 2.5 ms grid.  It uses no
+clock and no socket; equal inputs and seed give equal bytes.  ``PlantError``: the truth or the scene cannot be used.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from machine.geometry.carrier import ARMS
 from machine.joints import JOINTS
 from machine.profile import Profile
 from sim.emulation import EmulatedMachine
+from sim.errors import PlantError
 from sim.evaluator import Evaluation, Evaluator
 from sim.geometry.shape import Quaternion, Shape, Vector
 from sim.mechanics.carrier import PARKED, Drive, carrier_links
@@ -30,8 +31,8 @@ from sim.world import STEP_NS, World
 
 @dataclass(frozen=True, slots=True)
 class VehicleState:
-    """The carrier now, in truth.  Pose of the rear half and heading of the front half in the world, east 0, + left;
-    roll + right side down and pitch + nose up of the rear half; heights and loads fl, fr, rl, rr.
+    """Ground truth of the carrier.  Pose of the rear half and heading of the front half in the world (0 east, + left);
+    roll (+ right side down) and pitch (+ nose up) of the rear half; heights and loads in the order fl, fr, rl, rr.
     """
 
     position_m: Vector
@@ -46,7 +47,7 @@ class VehicleState:
 
 
 class Plant(EmulatedMachine):
-    """The whole machine: nodes, and in ``world`` the physics.  The public names show the truth to a harness.
+    """The whole machine: the nodes, and the physics in ``world``.  Public names give test harnesses the ground truth.
 
     ``scene`` is the name of an arrangement of ``logs`` logs, or the logs themselves; by default they lie at random.
     """
@@ -65,7 +66,7 @@ class Plant(EmulatedMachine):
         self.world = World(profile, facts, seed, _scene(profile, facts, seed, logs, scene), terrain)
         self._evaluator = Evaluator(self.world)
         self._floats = (False, False)
-        # Commands come node by node; the world wants them in its own order.
+        # Commands arrive in the order of the nodes; the world has an order of its own.
         self._order = (*FUNCTIONS, "steer", *ARMS)
         self._by_function = [self._order.index(name) for name in self.world.functions]
         self._levers = HandLevers(self.world.functions, self.world.carrier is not None)
@@ -76,7 +77,7 @@ class Plant(EmulatedMachine):
         self._evaluator.watch()
 
     def _decide(self, now_ns: int) -> tuple[list[float], Drive]:
-        """What the nodes and levers do to the valves and the drive in this step."""
+        """Commands of the nodes and hand levers to the valves and the drive in this step."""
         commands = self._spools(now_ns)
         drive = PARKED
         if self.vehicle_node is not None and self.arms is not None:
@@ -91,7 +92,7 @@ class Plant(EmulatedMachine):
         return [commands[i] for i in self._by_function], drive
 
     def _float(self, wanted: tuple[bool, bool]) -> None:
-        """Open or close the float valves of front and rear axle; never both open, not even for a moment."""
+        """Open or close the float valves of both axles; the two are never open together, not even within a step."""
         if wanted != self._floats:
             self._floats, valves = wanted, self.world.hydraulics
             valves.float_front = valves.float_rear = False
@@ -104,13 +105,16 @@ class Plant(EmulatedMachine):
         return self.valve.valve_state is ValveState.ACTIVE or carried or raised
 
     def lever(self, name: str, value: float) -> None:
-        """Pull a hand lever (``world.functions``, and ``drive``) to -1..1 for a moment.
+        """Hold a hand lever (``world.functions``, and ``drive``) at -1..1 for 0.3 s.
 
         Raises:
-            ValueError: no such lever or position, or a controller has the machine.
+            PlantError: there is no such lever or position, or a controller moves the machine.
         """
         if self._commanded():
-            raise ValueError("a controller moves the machine over the bus; disarm it before you pull a lever")
+            raise PlantError(
+                "lever.controller-active",
+                "a controller moves the machine over the bus; disarm it before you pull a lever",
+            )
         self._levers.pull(name, value, self._time_ns or 0)
 
     def levers(self) -> tuple[str, ...]:
@@ -118,7 +122,7 @@ class Plant(EmulatedMachine):
         return self._levers.names
 
     def logs(self) -> list[LogState]:
-        """Every log now, in the world frame: what a perfect detector sees."""
+        """Ground truth of all logs, in the world frame."""
         return self.world.log_bodies.states()
 
     def joint_positions(self) -> tuple[float, ...]:
@@ -126,7 +130,7 @@ class Plant(EmulatedMachine):
         return tuple(self.world.q[j.name.lower()] for j in JOINTS)
 
     def jaw_angle_rad(self) -> float:
-        """True mean tong angle [rad], 0 open."""
+        """True mean angle of the jaws [rad], 0 open."""
         return self.world.jaw_angle_rad
 
     def link_poses(self) -> dict[str, tuple[Vector, Quaternion]]:
@@ -134,7 +138,7 @@ class Plant(EmulatedMachine):
         return self.world.link_poses()
 
     def base_pose(self) -> tuple[Vector, Quaternion]:
-        """The crane's base frame in the world frame; identity for a machine that stands still."""
+        """The crane's base frame in the world frame; identity for a machine on a fixed base."""
         return self.world.base_pose()
 
     def shapes(self) -> list[Shape]:
@@ -143,7 +147,7 @@ class Plant(EmulatedMachine):
         return [*(s for link in under for s in link.shapes), *crane_shapes(self.profile), *bunk_shapes(self.profile)]
 
     def vehicle(self) -> VehicleState | None:
-        """The carrier in truth; None on a machine without one."""
+        """Ground truth of the carrier; None on a machine without one."""
         c = self.world.carrier
         if c is None:
             return None
@@ -154,11 +158,11 @@ class Plant(EmulatedMachine):
         )  # fmt: skip
 
     def tip(self) -> Vector:
-        """True hanger pin in the crane's base frame [m]."""
+        """True position of the hanger pin in the crane's base frame [m]."""
         return self.world.tip()
 
     def evaluate(self) -> Evaluation:
-        """The judge's verdict now."""
+        """The evaluation of the run up to now."""
         return self._evaluator.evaluate()
 
     def close(self) -> None:

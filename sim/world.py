@@ -1,7 +1,7 @@
-"""Machine, hydraulics, ground and logs in one physics client: spool commands in, motion out, 2.5 ms a step, no bus.
+"""Machine, hydraulics, ground and logs in one physics client: spool commands in, motion out, 2.5 ms per step, no bus.
 
-A grasp is frictional contact; no constraint is ever made between grapple and log.  Every function is driven by the
-torque of its cylinder or motor.  Bit-identical for equal inputs on one machine and build.
+A grasp is frictional contact; no constraint ever connects grapple and log.  The torque of its cylinder or motor
+drives every function.  Equal inputs give bit-identical results on one machine and build.
 """
 
 from __future__ import annotations
@@ -38,22 +38,26 @@ HOME_POSE: Final = {
 SETTLE_STEP_COUNT: Final = 240
 CARRIER_SETTLE_STEP_COUNT: Final = 960
 HAND_OVER_STEP_COUNT: Final = 80
-SETTLE_DAMPING_S: Final = 0.06  # of the column, until all is at rest
-HOLDING_TORQUE: Final = 1e7  # [Nm, N] motors that stand in for the valves until all is at rest
-CONTACT_UPDATE_STEPS: Final = 4  # contacts are looked at every so many steps
+SETTLE_DAMPING_S: Final = 0.06  # of the column, until everything is at rest
+HOLDING_TORQUE: Final = 1e7  # [Nm, N] of the motors that hold the joints until everything is at rest
+CONTACT_UPDATE_STEPS: Final = 4  # contacts are read every so many steps
 JAW_LINKS: Final = ("tong_left", "tong_right")
 GRAPPLE_LINKS: Final = (*JAW_LINKS, "rotator", "telescope", "stick")
 JOINTS_OF_FUNCTION: Final = {"grapple": JAW_LINKS, "steer": ("articulation",)}
 
 
 def home_pose(profile: Profile) -> dict[str, float]:
-    """Where the crane stands at the start; a machine of another name starts like the shipped one of its kind."""
+    """Start pose of the crane; a machine of another name starts like the shipped machine of its kind."""
     kind = "palms_471" if profile.carrier is None else "aoro_fc8"
     return dict(HOME_POSE.get(profile.name, HOME_POSE[kind]))
 
 
 class World:
-    """The machine and its surroundings.  ``q`` and ``qd`` map joint names to position and velocity."""
+    """The machine and its environment.  ``q`` and ``qd`` map joint names to position and velocity.
+
+    Raises:
+        PlantError: logs overlap or do not come to rest, or the machine has no steel dimensions.
+    """
 
     def __init__(
         self,
@@ -90,11 +94,11 @@ class World:
         self._hanger = self.crane.names.index("hanger")
         self.column = self._level()
         self._settle(home_pose(profile) | dict(home or {}))
-        # The yard lets its logs come to rest in a client of its own, and so on ground of its own.
+        # The logs come to rest in a physics client of their own, which needs its own ground.
         self.log_bodies = LogBodies(p, profile, truth, scene, Terrain(*ground), self.base_pose())
         self._log_of = {body: i for i, body in enumerate(self.log_bodies.body_ids)}
         self._jaw_links = {self.crane.link[n] for n in JAW_LINKS}
-        self._above = {self.crane.link[n] for n in CRANE_LINKS[1:]}  # the crane without what it stands on
+        self._above = {self.crane.link[n] for n in CRANE_LINKS[1:]}  # the crane above its base
         self.max_penetration_m = 0.0
         self.grip_n = [0.0] * len(self.log_bodies.body_ids)
         self._touched = [False] * len(self.log_bodies.body_ids)
@@ -102,7 +106,11 @@ class World:
         laden = mobile and any(log.in_bunk for log in scene)
         self._wait(CARRIER_SETTLE_STEP_COUNT if laden else HAND_OVER_STEP_COUNT)
         self._hand_over()
-        self.stowage = Stowage(p, self.crane, profile, GRAPPLE_LINKS, self.log_bodies, CONTACT_UPDATE_STEPS * STEP_S) if mobile else None
+        self.stowage = (
+            Stowage(p, self.crane, profile, GRAPPLE_LINKS, self.log_bodies, CONTACT_UPDATE_STEPS * STEP_S)
+            if mobile
+            else None
+        )
         self._update_contacts()
 
     def _build(self) -> Body:
@@ -143,8 +151,8 @@ class World:
         )
 
     def _place(self, pose: Mapping[str, float]) -> None:
-        """The crane at rest in a pose, tongs open, the grapple hanging plumb."""
-        crane = dict.fromkeys((*FLEX, *PASSIVE, *JAW_LINKS), 0.0) | pose
+        """Put the crane at rest in a pose, jaws open, the grapple hanging plumb."""
+        crane = {**dict.fromkeys((*FLEX, *PASSIVE, *JAW_LINKS), 0.0), **pose}
         hang = -(crane["lift"] + crane["tilt"] + crane["flex_pitch"])
         self.crane.place(crane | {"hanger": pose.get("hanger", hang)})
 
@@ -154,12 +162,12 @@ class World:
         return Column(self.truth.structure, self._moments())
 
     def _settle(self, home: Mapping[str, float]) -> None:
-        """Hold the joints by motors until the machine is at rest."""
+        """Hold the joints with motors until the machine is at rest."""
         if self.carrier is not None:
             assert self.profile.carrier is not None
             self.carrier.place(0.0, 0.0, 0.0, self.profile.carrier.arm_transport_m)
         self._place(home)
-        self._place(dict(home) | dict(zip(FLEX, self.column.balance(self._moments()), strict=True)))
+        self._place({**home, **dict(zip(FLEX, self.column.balance(self._moments()), strict=True))})
         self._read()
         self.crane.hold(self._driven, HOLDING_TORQUE)
         self._wait(SETTLE_STEP_COUNT if self.carrier is None else CARRIER_SETTLE_STEP_COUNT)
@@ -174,7 +182,7 @@ class World:
             self._read()
 
     def _hand_over(self) -> None:
-        """From the motors to the oil."""
+        """Hand the load over from the motors to the hydraulics."""
         crane = self.crane
         carried = dict(zip(crane.names, (s[3] for s in crane.states()), strict=True))
         crane.hold(self._driven, 0.0)
@@ -189,7 +197,7 @@ class World:
         self.hanging_n = magnitude(states[self._hanger][2])
 
     def _positions(self, q: Mapping[str, float]) -> list[float]:
-        """Joint positions (or velocities) in the order of ``functions``; the grapple's is the mean of its tongs."""
+        """Joint positions (or velocities) in the order of ``functions``; the grapple's is the mean of its jaws."""
         out = [q[j] for j in self._driven]
         at = self._grapple
         out[at : at + 2] = [(out[at] + out[at + 1]) / 2]
@@ -200,11 +208,14 @@ class World:
         return self.column.torques([q[j] for j in FLEX], [qd[j] for j in FLEX], extra_s)
 
     def step(self, commands: Sequence[float], drive: Drive = PARKED) -> None:
-        """Advance by STEP_NS; commands -1..1 of full spool in ``functions`` order (grapple + opens)."""
+        """Advance by STEP_NS.
+
+        ``commands`` are -1..1 of full spool in ``functions`` order (grapple: + opens); ``drive`` is the carrier's.
+        """
         q, qd, s = self.q, self.qd, self.truth.structure
         torques = self.hydraulics.step(commands, self._positions(q), self._positions(qd))
         half = torques.pop(self._grapple) / 2
-        # A rod couples the tongs; it is stiff, not rigid.
+        # A rod couples the jaws; it is stiff, not rigid.
         rod = s.tong_sync_nm_rad * (q["tong_left"] - q["tong_right"])
         rod += s.tong_sync_nm_s_rad * (qd["tong_left"] - qd["tong_right"])
         self.crane.apply(self._motors, [*torques, half - rod, half + rod, *self._column_torques()])
@@ -217,7 +228,7 @@ class World:
             self._update_contacts()
 
     def _update_contacts(self) -> None:
-        """Take note of which logs the crane touches."""
+        """Record which logs the crane touches."""
         n = len(self._log_of)
         touched, grip = [False] * n, [0.0] * n
         tongs, above = self._jaw_links, self._above
@@ -236,12 +247,12 @@ class World:
             self.stowage.watch()
 
     def touched(self) -> list[bool]:
-        """For each log, whether the crane touches it, not older than LOOK_STEPS steps."""
+        """For each log, whether the crane touches it; at most CONTACT_UPDATE_STEPS steps old."""
         return self._touched
 
     @property
     def jaw_angle_rad(self) -> float:
-        """Mean tong angle [rad], 0 open."""
+        """Mean angle of the jaws [rad], 0 open."""
         return (self.q["tong_left"] + self.q["tong_right"]) / 2
 
     @property
@@ -263,10 +274,11 @@ class World:
         if self.carrier is None:
             return pin
         inward = self.client.invertTransform(*self.base_pose())
-        return self.client.multiplyTransforms(*inward, pin, IDENTITY)[0]
+        tip: Vector = self.client.multiplyTransforms(*inward, pin, IDENTITY)[0]
+        return tip
 
     def rigid_tip(self) -> Vector:
-        """The hanger pin in the crane's base frame if the column were rigid: what perfect encoders say [m]."""
+        """The hanger pin in the crane's base frame if the column were rigid: the reading of perfect encoders [m]."""
         return rigid_pin(self._chain, self.q)
 
     def load_kg(self) -> float:

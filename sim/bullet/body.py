@@ -1,7 +1,7 @@
 """A multibody in the physics client: joints and links by name, torques in, positions and poses out.
 
 One body is the whole machine.  Positions are rad (m for prismatic joints), forces Nm (N).  Joint limits come from the
-URDF; passive damping, friction and everything else that is dynamic is set here and nowhere else.
+URDF; passive damping, friction and all other dynamics are set here only.
 """
 
 from __future__ import annotations
@@ -73,34 +73,37 @@ class Body:
                 self._p.setCollisionFilterPair(self.body, self.body, self.link[a], self.link[b], int(on))
 
     def place(self, positions: Mapping[str, float]) -> None:
-        """Set these joints at rest; the others stay."""
+        """Put these joints at rest at a position; the others stay."""
         for joint, value in positions.items():
             self._p.resetJointState(self.body, self.index[joint], value, 0.0)
 
     def states(self) -> list[tuple[float, float, Vector, float]]:
-        """Position, velocity, reaction (force and torque where a sensor is), motor torque; in ``names`` order."""
-        return self._p.getJointStates(self.body, self._moving)
+        """Position, velocity, reaction (force and torque at joints with a sensor), motor torque; in ``names`` order."""
+        states: list[tuple[float, float, Vector, float]] = self._p.getJointStates(self.body, self._moving)
+        return states
 
     def apply(self, indices: list[int], torques: list[float]) -> None:
         """Torques on joints for the next physics step."""
         self._p.setJointMotorControlArray(self.body, indices, self._p.TORQUE_CONTROL, forces=torques)
 
     def hold(self, joints: Iterable[str], force: float) -> None:
-        """Keep joints still by motors of this strength; 0 releases them."""
+        """Hold joints with motors of this strength; 0 releases them."""
         for joint in joints:
             self._p.setJointMotorControl2(
                 self.body, self.index[joint], self._p.VELOCITY_CONTROL, targetVelocity=0.0, force=force
             )
 
     def sense(self, joint: str) -> None:
-        """Put a force sensor at a joint; ``states`` shows it."""
+        """Add a force sensor at a joint; ``states`` returns its reading."""
         self._p.enableJointForceTorqueSensor(self.body, self.index[joint], True)
 
     def pose(self, link: str) -> Pose:
         """URDF frame of a link in the world."""
         i = self.link[link]
+        pose: Pose
         if i < 0:
-            return self._p.multiplyTransforms(*self._p.getBasePositionAndOrientation(self.body), *self._inward)
+            pose = self._p.multiplyTransforms(*self._p.getBasePositionAndOrientation(self.body), *self._inward)
+            return pose
         state = self._p.getLinkState(self.body, i, computeForwardKinematics=1)
         return state[4], state[5]
 
@@ -126,7 +129,7 @@ class Body:
 
 
 def fixed_boxes(client: BulletClient, shapes: Sequence[Shape], friction: float) -> int:
-    """Boxes that never move, as one body in the world."""
+    """Create boxes that never move, as one body in the world."""
     links = [LinkDef("boxes", 1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), tuple(shapes))]
     body = Body(client, links, (), fixed=True)
     body.rub(["boxes"], friction)
@@ -134,7 +137,8 @@ def fixed_boxes(client: BulletClient, shapes: Sequence[Shape], friction: float) 
 
 
 def _inverse(p: BulletClient, pose: Pose) -> Pose:
-    return p.invertTransform(*pose)
+    inverse: Pose = p.invertTransform(*pose)
+    return inverse
 
 
 def magnitude(v: Sequence[float]) -> float:

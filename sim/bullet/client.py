@@ -1,4 +1,4 @@
-"""The one door to pybullet: imports it and opens a client without the banners its C code prints on the terminal."""
+"""The only importer of pybullet: opens clients without the banners that its C code prints on the terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Discard what C code writes to descriptors 1 and 2; its buffer has to be flushed inside."""
+    """Discard what C code writes to descriptors 1 and 2; its buffer is flushed inside."""
     flush = ctypes.CDLL(None).fflush
     sys.stdout.flush()
     sys.stderr.flush()
@@ -39,11 +39,11 @@ __all__ = ["BulletClient", "new_client"]
 
 
 class BulletClient(bullet_client.BulletClient):  # type: ignore[misc]
-    """The client, which keeps the functions it has bound to itself: to bind one anew takes as long as a short call."""
+    """A client that caches the functions bound to it: binding one anew takes as long as a short call."""
 
     def __getattr__(self, name: str) -> Any:
         attribute = super().__getattr__(name)
-        if name == "disconnect":  # what is kept must not reach a later client, which may get the same number
+        if name == "disconnect":  # cached functions must not reach a later client with the same number
             self.__dict__ = {k: v for k, v in self.__dict__.items() if not isinstance(v, partial)}
         else:
             self.__dict__[name] = attribute
@@ -51,6 +51,6 @@ class BulletClient(bullet_client.BulletClient):  # type: ignore[misc]
 
 
 def new_client() -> BulletClient:
-    """A physics client of its own, without a window."""
+    """A new physics client without a window."""
     with _silent():
         return BulletClient(pybullet.DIRECT)

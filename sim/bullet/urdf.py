@@ -22,7 +22,7 @@ class LinkDef:
 
 @dataclass(frozen=True, slots=True)
 class JointDef:
-    """A joint: pose of the child frame in the parent's at 0, axis in the child frame, stops [rad, m], damping."""
+    """A joint: pose of the child frame in the parent's at 0, axis in the child frame, stops [rad, m]."""
 
     name: str
     kind: Literal["revolute", "prismatic", "fixed"]

@@ -1,4 +1,4 @@
-"""Where cameras stand in the world; what their pixels look at is in ``machine.geometry.optics``."""
+"""Poses of cameras in the world; ``machine.geometry.optics`` has their pixels."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from machine.geometry.optics import BODY_FROM_OPTICAL, Intrinsics, rpy_matrix
+from sim.errors import PlantError
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A pinhole in the world: position (3,) [m]; the columns of ``rotation`` (3, 3) are the optical axes."""
+    """A pinhole camera in the world: position (3,) [m]; the columns of ``rotation`` (3, 3) are the optical axes."""
 
     intrinsics: Intrinsics
     position_m: np.ndarray
@@ -21,11 +22,13 @@ class View:
 
     def to_optical(self, points_m: np.ndarray) -> np.ndarray:
         """World points (N, 3) in the optical frame."""
-        return (np.asarray(points_m, float) - self.position_m) @ self.rotation
+        optical: np.ndarray = (np.asarray(points_m, float) - self.position_m) @ self.rotation
+        return optical
 
     def to_world(self, points_m: np.ndarray) -> np.ndarray:
         """Optical-frame points (N, 3) in the world."""
-        return np.asarray(points_m, float) @ self.rotation.T + self.position_m
+        world: np.ndarray = np.asarray(points_m, float) @ self.rotation.T + self.position_m
+        return world
 
 
 def quaternion_matrix(q: Sequence[float]) -> np.ndarray:
@@ -48,8 +51,11 @@ def mount_view(
     error_m: Sequence[float] = (0.0, 0.0, 0.0),
     error_rpy_rad: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> View:
-    """A camera on a link: (position, quaternion) of the link in the world, body frame in the link, and how far the
-    true body frame is off the nominal one (expressed in the nominal body frame)."""
+    """The view of a camera on a link.
+
+    ``link_pose`` is (position, quaternion) of the link in the world; ``position_m`` and ``rpy_rad`` are the nominal
+    body frame in the link, ``error_m`` and ``error_rpy_rad`` the true body frame in the nominal one.
+    """
     link, body = quaternion_matrix(link_pose[1]), rpy_matrix(rpy_rad)
     origin = np.asarray(position_m, float) + body @ np.asarray(error_m, float)
     rotation = link @ body @ rpy_matrix(error_rpy_rad) @ BODY_FROM_OPTICAL
@@ -59,13 +65,17 @@ def mount_view(
 def look_at(eye_m: Sequence[float], target_m: Sequence[float], pinhole_px: Intrinsics) -> View:
     """A free camera at ``eye_m`` that looks at ``target_m`` with the horizon level.
 
-    Raises ValueError when it would look straight up or down (the horizon is then undefined): move the eye a little.
+    Raises:
+        PlantError: the camera would look straight up or down, where the horizon is undefined.
     """
     eye = np.asarray(eye_m, float)
     forward = np.asarray(target_m, float) - eye
     right = np.cross(forward, (0.0, 0.0, 1.0))
     if np.linalg.norm(right) < 1e-9 * max(1.0, float(np.linalg.norm(forward))):
-        raise ValueError("a camera that looks straight up or down has no level horizon; move its eye a little sideways")
+        raise PlantError(
+            "camera.no-horizon",
+            "a camera that looks straight up or down has no level horizon; move its position a little sideways",
+        )
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     return View(pinhole_px, eye, np.stack([right, np.cross(forward, right), forward], axis=1))
 

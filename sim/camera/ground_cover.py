@@ -1,7 +1,7 @@
-"""Grass and fallen branches, scattered by a seed: what hides logs in a forest, and what litters a yard.
+"""Grass and fallen branches, scattered by a seed: they hide logs in a forest and litter a landing.
 
-The ground is tiled in squares that each draw from their own seed, so the same tuft stands at the same place however
-one comes there.
+The ground is tiled in squares that each draw from their own seed, so a tuft stands at the same place from wherever
+the camera comes.
 """
 
 from __future__ import annotations
@@ -59,19 +59,19 @@ def _branch(b: SceneBuilder, rng: random.Random, x: float, y: float) -> None:
 
 
 def _some(rng: random.Random, mean: float) -> int:
-    """A whole number whose mean is ``mean``."""
+    """A random whole number whose mean is ``mean``."""
     return int(mean) + (rng.random() < mean % 1.0)
 
 
 class GroundCover:
-    """The clutter of one site."""
+    """The ground cover of one site."""
 
     def __init__(self, ground: Ground, density: Density, seed: int) -> None:
         self._ground, self._density, self._seed = ground, density, seed
         self._tile = lru_cache(maxsize=400)(self._made)
 
     def around(self, x_m: float, y_m: float, reach_m: float = 8.0) -> Rods:
-        """All of it on the tiles within ``reach_m`` of a place."""
+        """All rods on the tiles within ``reach_m`` of a place."""
         rods = SceneBuilder(self._ground).build().rods
         i0, i1 = math.floor((x_m - reach_m) / TILE_M), math.floor((x_m + reach_m) / TILE_M)
         j0, j1 = math.floor((y_m - reach_m) / TILE_M), math.floor((y_m + reach_m) / TILE_M)

@@ -1,4 +1,4 @@
-"""What is true in a picture: for training and for judging, never for the machine."""
+"""Ground truth of a picture: for training and evaluation, never for the machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sim.camera.scene import LogPose, Scene
 from sim.camera.visibility import NEAR_M
 
 Box = tuple[int, int, int, int]
-RING = 12  # points around a log whose projection bounds it
+RING_POINT_COUNT = 12  # points around a log whose projection bounds it
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +20,8 @@ class Label:
     """One log in one picture.
 
     ``box_visible`` bounds its visible pixels: left, top, right, bottom, the last two exclusive; None when hidden.
-    ``box_full`` bounds the whole log as if nothing hid it and the picture did not end, None when it is behind the
-    camera.  ``visible_share`` is visible pixels over the pixels it would have inside the picture alone.
+    ``box_full`` bounds the whole log without occlusion and beyond the picture's edges, None when it is behind the
+    camera.  ``visible_share`` is its visible pixels over those it would have inside the picture alone.
     """
 
     log: LogPose
@@ -60,7 +60,7 @@ def _extent(view: View, log: LogPose) -> Box | None:
     across = np.cross(along, (0.0, 0.0, 1.0) if abs(along[0, 2]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across, axis=1)[:, None]
     upward = np.cross(across, along)
-    angle = np.linspace(0.0, 2.0 * np.pi, RING, endpoint=False)[:, None, None]
+    angle = np.linspace(0.0, 2.0 * np.pi, RING_POINT_COUNT, endpoint=False)[:, None, None]
     ring = points + radii[:, None] * (np.cos(angle) * across + np.sin(angle) * upward)
     optical = view.to_optical(ring.reshape(-1, 3))
     ahead = optical[optical[:, 2] > NEAR_M]

@@ -1,12 +1,13 @@
 """A second renderer that shares no geometry code with the first: pybullet's TinyRenderer on meshes.
 
-For checking the analytic one and for pictures of held-out logs: oval ones with bumpy bark, which the analytic renderer
-cannot draw.  Slow: a tenth of a second and more a picture.  Colours are plain.
+It checks the analytic renderer, and draws pictures of held-out logs: oval ones with bumpy bark, which the analytic
+renderer cannot draw.  Slow: a tenth of a second or more per picture.  Colours are plain.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -17,11 +18,15 @@ from sim.camera.scene import GROUND, SKY, LogPose, Rods, Scene
 
 NEAR_M, FAR_M = 0.1, 60.0
 SIDES = 32
-GROUND_REACH_M = 12.0  # rough ground is drawn this far around the logs
+GROUND_REACH_M = 12.0  # radius around the logs in which rough ground is drawn
 GROUND_COLOUR, BARK_COLOUR = (0.45, 0.45, 0.43), (0.58, 0.40, 0.26)
 
 
-def _tube(points: np.ndarray, radii: np.ndarray, bump_m: float, oval: float, rng: np.random.Generator) -> tuple:
+Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Vertices (N, 3), triangles (M, 3) and normals (N, 3)."""
+
+
+def _tube(points: np.ndarray, radii: np.ndarray, bump_m: float, oval: float, rng: np.random.Generator) -> Mesh:
     """A closed tube around a spine: vertices, triangles and normals."""
     along = np.gradient(points, axis=0)
     along /= np.linalg.norm(along, axis=1)[:, None]
@@ -34,7 +39,7 @@ def _tube(points: np.ndarray, radii: np.ndarray, bump_m: float, oval: float, rng
     r = r + bump_m * rng.standard_normal(r.shape)
     side = points[:, None] + r[..., None] * out
     n = len(points)
-    # The ends have rims of their own, whose normals look along the log.
+    # The ends have rims of their own, whose normals point along the log.
     rims, ends = side[[0, -1]].reshape(-1, 3), points[[0, -1]]
     vertices = np.concatenate([side.reshape(-1, 3), rims, ends])
     looks = np.repeat(np.stack([-along[0], along[-1]]), SIDES, axis=0)
@@ -51,15 +56,19 @@ def _tube(points: np.ndarray, radii: np.ndarray, bump_m: float, oval: float, rng
 
 
 class MeshRenderer:
-    """One scene in a client of its own.  ``bump_m`` roughens the bark, ``oval`` flattens logs (fraction of the radius);
-    ``seed`` draws both.  Call ``close`` when done."""
+    """One scene in a client of its own.
+
+    ``bump_m`` roughens the bark, ``oval`` flattens logs (fraction of the radius); ``seed`` draws both.  Call ``close``
+    when done.
+    """
 
     def __init__(self, scene: Scene, bump_m: float = 0.0, oval: float = 0.0, seed: int = 0) -> None:
         self._p = new_client()
         self._of_body: dict[int, int] = {-1: SKY}
         rng = np.random.default_rng(seed)
         for log in scene.logs:
-            self._mesh(*_tube(*_fine(log), bump_m, oval, rng), BARK_COLOUR, log.instance)
+            points, radii = _fine(log)
+            self._mesh(_tube(points, radii, bump_m, oval, rng), BARK_COLOUR, log.instance)
         self._loose_rods(scene.rods, {log.instance for log in scene.logs}, rng)
         b = scene.boxes
         for i in range(len(b.instance)):
@@ -76,13 +85,14 @@ class MeshRenderer:
             if int(rods.instance[i]) not in logs:
                 points = np.stack([rods.start_m[i], rods.end_m[i]])
                 radii = np.array([rods.radius_start_m[i], rods.radius_end_m[i]])
-                self._mesh(*_tube(points, radii, 0.0, 0.0, rng), tuple(rods.tint[i] / 255.0), int(rods.instance[i]))
+                self._mesh(_tube(points, radii, 0.0, 0.0, rng), tuple(rods.tint[i] / 255.0), int(rods.instance[i]))
 
-    def _body(self, shape: int, instance: int, at: tuple, turn: tuple) -> None:
+    def _body(self, shape: int, instance: int, at: Sequence[float], turn: Sequence[float]) -> None:
         body = self._p.createMultiBody(0.0, -1, shape, basePosition=at, baseOrientation=turn)
         self._of_body[body] = instance
 
-    def _mesh(self, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, colour: tuple, instance: int) -> None:
+    def _mesh(self, mesh: Mesh, colour: Sequence[float], instance: int) -> None:
+        vertices, faces, normals = mesh
         shape = self._p.createVisualShape(
             self._p.GEOM_MESH,
             vertices=vertices.tolist(),
@@ -92,7 +102,9 @@ class MeshRenderer:
         )
         self._body(shape, instance, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
-    def _box(self, half: np.ndarray, centre: np.ndarray, axes: np.ndarray, colour: tuple, instance: int) -> None:
+    def _box(
+        self, half: np.ndarray, centre: np.ndarray, axes: np.ndarray, colour: Sequence[float], instance: int
+    ) -> None:
         p = self._p
         shape = p.createVisualShape(p.GEOM_BOX, halfExtents=half.tolist(), rgbaColor=[*colour, 1.0])
         self._body(shape, instance, tuple(centre), _quaternion(axes))
@@ -114,10 +126,11 @@ class MeshRenderer:
         a = (np.arange(i1 - i0)[:, None] * columns + np.arange(j1 - j0)).ravel()
         faces = [np.stack([a, a + columns, a + 1], 1), np.stack([a + columns, a + columns + 1, a + 1], 1)]
         flat = vertices.reshape(-1, 3)
-        self._mesh(flat, np.concatenate(faces), np.tile((0.0, 0.0, 1.0), (len(flat), 1)), GROUND_COLOUR, GROUND)
+        normals = np.tile((0.0, 0.0, 1.0), (len(flat), 1))
+        self._mesh((flat, np.concatenate(faces), normals), GROUND_COLOUR, GROUND)
 
     def render(self, view: View) -> Picture:
-        """The scene as the first renderer's ``render`` gives it."""
+        """The scene, in the form of the first renderer's ``render``."""
         pin, eye, turn = view.intrinsics, view.position_m, view.rotation
         w, h = pin.width_px, pin.height_px
         to_gl = np.eye(4)
@@ -144,7 +157,7 @@ class MeshRenderer:
 
 
 def _fine(log: LogPose) -> tuple[np.ndarray, np.ndarray]:
-    """The spine in many pieces: a smooth bow, and room for bumps."""
+    """The spine in many pieces, for a smooth bow and for bumps."""
     return log.spine(24)
 
 

@@ -1,9 +1,9 @@
-"""What stereo matching makes of exact depth.
+"""A noise model of stereo matching: exact depth in, measured depth out.
 
-Depth z errs by about z^2 sigma_d / (f B), alike over neighbouring pixels, so that averaging a small window does not
-remove it, and anew in every frame; a scale error stays for the run.  Near surfaces grow over what is behind them;
-what one eye alone sees, blots on surfaces, more of them where there is no texture, and what lies outside the
-camera's range have no depth: NaN.  Noise is looked up in a periodic tile shifted by seeded offsets.
+Depth z errs by about z^2 sigma_d / (f B).  The error is correlated over neighbouring pixels, so averaging a small
+window does not remove it, and new in every frame; a scale error lasts for the run.  Near surfaces grow over those
+behind them.  Depth is NaN where only one of the two imagers sees a surface, in blots on surfaces (more of them where
+there is no texture), and outside the camera's range.  Noise is looked up in a periodic tile shifted by seeded offsets.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from sim.truth.sensors import CameraTruth
 
 TILE_PX: Final = 1024
 _MASK = TILE_PX - 1
-BLOT_PX: Final = 12.0  # how wide a hole in a surface is
-PATCH_PX: Final = 16  # texture is judged over squares this wide
+BLOT_PX: Final = 12.0  # width of a hole in a surface
+PATCH_PX: Final = 16  # texture is measured in squares this wide
 PLAIN_STEP: Final = 5.0  # mean step of green from pixel to pixel below which a square has no texture
 
 
@@ -36,17 +36,18 @@ def _tile(length_px: float, seed: int) -> np.ndarray:
     reach = np.exp(-2.0 * (math.pi * length_px / 2.0) ** 2 * (f[:, None] ** 2 + f[None, : TILE_PX // 2 + 1] ** 2))
     white = np.random.default_rng(seed).standard_normal((TILE_PX, TILE_PX))
     tile = np.fft.irfft2(np.fft.rfft2(white) * reach, (TILE_PX, TILE_PX))
-    return ((tile - tile.mean()) / tile.std()).astype(np.float32)
+    normal: np.ndarray = ((tile - tile.mean()) / tile.std()).astype(np.float32)
+    return normal
 
 
 @njit(cache=True)
-def _plain(rgb):
+def _plain(rgb: np.ndarray) -> np.ndarray:
     """For squares of PATCH_PX, whether they lack texture."""
     rows, columns = rgb.shape[0] // PATCH_PX + 1, rgb.shape[1] // PATCH_PX + 1
     plain = np.zeros((rows, columns), np.bool_)
     for i in range(rows):
         for j in range(columns):
-            total, count = 0, 0
+            total, count = np.int64(0), 0
             for row in range(i * PATCH_PX, min((i + 1) * PATCH_PX, rgb.shape[0]), 4):
                 for x in range(j * PATCH_PX, min((j + 1) * PATCH_PX, rgb.shape[1] - 2)):
                     total += abs(np.int64(rgb[row, x + 2, 1]) - np.int64(rgb[row, x, 1]))
@@ -56,8 +57,8 @@ def _plain(rgb):
 
 
 @njit(cache=True)
-def _stamp(out, row, x, s, radius, margin):
-    """Let a near surface cover a disc of what is clearly behind it."""
+def _stamp(out: np.ndarray, row: int, x: int, s: float, radius: float, margin: float) -> None:
+    """Let a near surface cover a disc of the surface behind it."""
     height, width = out.shape
     r2 = radius * radius
     whole = int(radius)
@@ -72,8 +73,16 @@ def _stamp(out, row, x, s, radius, margin):
 
 
 @njit(cache=True)
-def _fatten(inverse, jump, lowest, highest, tile, shift_row, shift_column):
-    """Inverse depth whose near surfaces are wider at every jump of more than ``jump``."""
+def _fatten(
+    inverse: np.ndarray,
+    jump: float,
+    lowest: float,
+    highest: float,
+    tile: np.ndarray,
+    shift_row: int,
+    shift_column: int,
+) -> np.ndarray:
+    """Inverse depth whose near surfaces are widened at every jump of more than ``jump``."""
     height, width = inverse.shape
     out = inverse.copy()
     for row in range(height - 1):
@@ -96,8 +105,21 @@ def _fatten(inverse, jump, lowest, highest, tile, shift_row, shift_column):
 
 @njit(cache=True, error_model="numpy")
 def _matched(
-    inverse, fb, zoom, sigma, scale, z_min, z_max, tile, blots, cut, plain_cut, plain, shift, out
-):  # fmt: skip
+    inverse: np.ndarray,
+    fb: float,
+    zoom: float,
+    sigma: float,
+    scale: float,
+    z_min: float,
+    z_max: float,
+    tile: np.ndarray,
+    blots: np.ndarray,
+    cut: float,
+    plain_cut: float,
+    plain: np.ndarray,
+    shift: np.ndarray,
+    out: np.ndarray,
+) -> None:
     """Noisy depth of ``inverse``; ``fb`` is focal length times baseline [px m], ``zoom`` delivered per native pixel."""
     height, width = inverse.shape
     root = sigma / math.sqrt(2.0)
@@ -116,7 +138,7 @@ def _matched(
             blot = c[(x + shift[5]) & _MASK]
             known = s > 0.0 and seen and z_min <= z <= z_max and blot < cut
             if known and blot > plain_cut:
-                # The squares' borders are frayed, or one would see them.
+                # The squares' borders are frayed, so that they are not visible.
                 i = min(max(row + int(5.0 * first), 0), height - 1) // PATCH_PX
                 j = min(max(x + int(5.0 * second), 0), width - 1) // PATCH_PX
                 known = not plain[i, j]
@@ -124,7 +146,7 @@ def _matched(
 
 
 class StereoNoise:
-    """The depth errors of one camera in one run.  ``scale`` is the run's scale error (1 = none)."""
+    """The depth errors of one camera in one run.  ``scale`` is the run's scale factor (1: no error)."""
 
     def __init__(self, camera: Camera, truth: CameraTruth, seed: int | str) -> None:
         self._camera, self._truth, self._seed = camera, truth, seed
@@ -135,8 +157,10 @@ class StereoNoise:
         self._plain_cut = normal.inv_cdf(1.0 - truth.plain_hole_share)
 
     def apply(self, picture: Picture, pinhole: Intrinsics, frame: int) -> np.ndarray:
-        """Depth (H, W) float32 [m] as the camera's stereo gives it, NaN where it has none; ``pinhole`` is the picture's
-        (it may be smaller than the camera's own), ``frame`` picks this frame's errors."""
+        """Depth (H, W) float32 [m] as the camera measures it, NaN where it has none.
+
+        ``pinhole`` is the picture's (it may be smaller than the camera's own), ``frame`` selects this frame's errors.
+        """
         camera, truth = self._camera, self._truth
         rng = random.Random(f"stereo {self._seed} {frame}")
         shift = np.array([rng.randrange(TILE_PX) for _ in range(8)])

@@ -1,4 +1,4 @@
-"""The analytic renderer: a scene and a view in, colour, depth and instances out.  Exact; noise is made elsewhere.
+"""The analytic renderer: a scene and a view in, colour, depth and instances out.  Exact; `sim.camera.noise` adds noise.
 
 Equal inputs give equal bytes on one machine and build.
 """
@@ -19,8 +19,8 @@ from sim.camera.shadow import MAP_PX, shadow_map
 from sim.camera.textures import textures
 from sim.camera.visibility import SKY_CODE, draw_grid, draw_objects, draw_plane
 
-NEAREST_PLANE_M = 0.05  # closer to the plane beyond the grid than this, it is not drawn
-SHADOW_EDGE_M = 12.0  # edge of the square that has shadows
+NEAREST_PLANE_M = 0.05  # least height above the plane beyond the grid at which it is drawn
+SHADOW_EDGE_M = 12.0  # edge length of the square with shadows
 FINE_M, COARSE_STRIDE, FURTHEST_M = 21.0, 4, 60.0  # heights are drawn in full this near, every 4th point beyond
 
 
@@ -46,7 +46,7 @@ class ImagingConditions:
 
     @classmethod
     def random(cls, seed: int) -> ImagingConditions:
-        """A day drawn from ``seed``: sun 20..70 degrees high, clear to overcast, exposure and white balance off."""
+        """Conditions drawn from ``seed``: sun 20..70 degrees high, clear to overcast, exposure, white balance."""
         rng = random.Random(f"look {seed}")
         azimuth, height = rng.uniform(-math.pi, math.pi), math.radians(rng.uniform(20.0, 70.0))
         clear, exposure = rng.uniform(0.0, 1.0), rng.uniform(0.75, 1.25)
@@ -66,10 +66,10 @@ def _grain() -> np.ndarray:
     return np.random.default_rng(7).standard_normal((GRAIN_PX, GRAIN_PX)).astype(np.float32)
 
 
-def render(scene: Scene, view: View, look: ImagingConditions = ImagingConditions(), frame: int = 0) -> Picture:
-    """What an ideal camera at ``view`` sees.  ``frame`` changes the sensor's grain only."""
+def render(scene: Scene, view: View, conditions: ImagingConditions = ImagingConditions(), frame: int = 0) -> Picture:
+    """The picture of an ideal camera at ``view``.  ``frame`` changes the sensor's grain only."""
     pin, eye, turn = view.intrinsics, view.position_m, np.ascontiguousarray(view.rotation)
-    lens = (pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px)
+    lens: tuple[float, float, float, float] = (pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px)
     rods, boxes, ground = scene.rods, scene.boxes, scene.ground
     inverse, code = _blank(view)
     grid = (ground.x0_m, ground.y0_m, ground.cell_m, ground.heights_m)
@@ -85,12 +85,12 @@ def render(scene: Scene, view: View, look: ImagingConditions = ImagingConditions
     ends = np.stack([rods.start_m, rods.end_m], axis=1)
     radii = np.stack([rods.radius_start_m, rods.radius_end_m], axis=1)
 
-    kinds = textures(scene.style, look.surfaces)
-    white, sun = np.asarray(look.white_balance), np.asarray(look.sun)
+    kinds = textures(scene.style, conditions.surfaces)
+    white, sun = np.asarray(conditions.white_balance), np.asarray(conditions.sun)
     cell = SHADOW_EDGE_M / MAP_PX
-    corner = _middle(scene, view) - SHADOW_EDGE_M / 2 - ground.mean_m * sun[:2] / sun[2]
+    x0, y0 = _middle(scene, view) - SHADOW_EDGE_M / 2 - ground.mean_m * sun[:2] / sun[2]
     casts = rods.surface == BARK  # blades and twigs are thinner than a cell
-    shadows = shadow_map(ends[casts], radii[casts], boxes.centre_m, boxes.axes, boxes.half_m, sun, *corner, cell)
+    shadows = shadow_map(ends[casts], radii[casts], boxes.centre_m, boxes.axes, boxes.half_m, sun, x0, y0, cell)
     shape = inverse.shape
     picture = Picture(np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.int16))
     where = random.Random(f"grain {frame}")
@@ -100,20 +100,21 @@ def render(scene: Scene, view: View, look: ImagingConditions = ImagingConditions
         boxes.centre_m, boxes.axes, boxes.half_m, boxes.colour, boxes.instance,
         ground.heights_m, *grid[:3],
         kinds.ground, kinds.patch, kinds.bark, kinds.end, kinds.horizon,
-        _grain(), look.grain, where.getrandbits(8), where.getrandbits(8),
-        sun, look.sun_gain * white, look.sky_gain * white, *shadows, *corner, cell,
+        _grain(), conditions.grain, where.getrandbits(8), where.getrandbits(8),
+        sun, conditions.sun_gain * white, conditions.sky_gain * white, *shadows, x0, y0, cell,
         picture.rgb, picture.depth_m, picture.mask,
     )  # fmt: skip
     return picture
 
 
 def surfaces_of(scene: Scene, view: View, instance: int) -> np.ndarray:
-    """Where (H, W) bool an instance's rods would be seen if nothing else were there."""
+    """The pixels (H, W) bool of an instance's rods if nothing else were there."""
     inverse, code = _blank(view)
     own = scene.rods.instance == instance
     rods = Rods(*(getattr(scene.rods, f.name)[own] for f in fields(Rods)))
     _draw(inverse, code, view, rods, SceneBuilder(scene.ground).build().boxes)
-    return code != SKY_CODE
+    seen: np.ndarray = code != SKY_CODE
+    return seen
 
 
 def _blank(view: View) -> tuple[np.ndarray, np.ndarray]:
@@ -134,7 +135,7 @@ def _draw(inverse: np.ndarray, code: np.ndarray, view: View, rods: Rods, boxes: 
 
 
 def _middle(scene: Scene, view: View) -> np.ndarray:
-    """Middle (x, y) of the shaded square: where the camera looks, four to eight metres ahead."""
+    """Middle (x, y) of the shaded square: four to eight metres ahead in the viewing direction."""
     forward = view.rotation[:, 2]
     fall = (float(view.position_m[2]) - scene.ground.mean_m) / max(1e-3, -float(forward[2]))
     reach = min(max(fall, 0.0), 8.0) if forward[2] < 0.0 else 6.0

@@ -1,6 +1,7 @@
-"""The cameras of a machine: where they really are, what they deliver, and what their maker's plate says.
+"""The cameras of a machine: their true poses, the frames they deliver, and their nominal mounts.
 
-A ``RgbdFrame`` carries both poses: the nominal mount, all that autonomy may know, and the true one, for judging.
+An ``RgbdFrame`` carries both poses: the nominal mount, the only one that autonomy may use, and the true one, for
+evaluation.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from sim.world import World
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """What the profile says: a link, and the body frame (x forward, y left, z up) in it."""
+    """The mount in the profile: a link, and the body frame (x forward, y left, z up) in it."""
 
     link: str
     position_m: Vector
@@ -33,9 +34,12 @@ class Mount:
 
 @dataclass(frozen=True, slots=True)
 class RgbdFrame:
-    """One delivered picture: rgb (H, W, 3) uint8; depth_m (H, W) float32, optical z, NaN = unknown (a hole, too near,
-    too far, sky, letterbox bar); ``stamp_ns`` when it was taken; ``true_position_m`` (3,) and ``true_rotation`` (3, 3)
-    of the optical frame in the world are the judge's alone."""
+    """One delivered frame.
+
+    rgb (H, W, 3) uint8; depth_m (H, W) float32, optical z, NaN: unknown (a hole, too near, too far, sky, letterbox
+    bar); ``stamp_ns`` of its capture; ``true_position_m`` (3,) and ``true_rotation`` (3, 3) of the optical frame in the
+    world are for evaluation only.
+    """
 
     name: str
     stamp_ns: int
@@ -48,11 +52,11 @@ class RgbdFrame:
 
 
 class CameraRig:
-    """All cameras of ``profile``, mounted and erring as ``truth`` says; ``seed`` draws the day's light, the clutter
-    and every frame's noise.
+    """All cameras of ``profile``, with the mounts and errors of ``truth``.
 
-    ``source`` is a World or a function that gives the Scene now.  ``size_px`` letterboxes frames into a square (paper
-    B: 608), None keeps the camera's own size.  ``density`` is the clutter (of a World only).
+    ``seed`` draws the imaging conditions, the ground cover and every frame's noise.  ``source`` is a World or a
+    function that returns the present Scene.  ``size_px`` letterboxes frames into a square (paper B: 608), None keeps
+    the camera's own size.  ``density`` is that of the ground cover (of a World only).
     """
 
     def __init__(
@@ -64,7 +68,7 @@ class CameraRig:
         size_px: int | None = 608,
         density: Density | None = None,
     ) -> None:
-        self.look = ImagingConditions.random(seed)
+        self.conditions = ImagingConditions.random(seed)
         self._profile, self._truth, self._size_px = profile, truth, size_px
         self._scenes = WorldScenes(source) if isinstance(source, World) else source
         self._clutter: GroundCover | None = None
@@ -78,13 +82,13 @@ class CameraRig:
         self.names = tuple(profile.cameras)
 
     def view(self, name: str, scene: Scene) -> View:
-        """Where a camera really is; its own pinhole."""
+        """The true view of a camera, with its own pinhole."""
         camera, truth = self._profile.cameras[name], self._truth.cameras[name]
         pose, error = scene.links[camera.link], (truth.mount_position_m, truth.mount_rpy_rad)
         return mount_view(pose, intrinsics(camera), camera.position_m, camera.rpy_rad, *error)
 
     def scene(self, name: str) -> Scene:
-        """What there is to see now, with the clutter near a camera."""
+        """The present scene, with the ground cover near a camera."""
         scene = self._scenes()
         if self._clutter is not None:
             x, y, _ = scene.links[self._profile.cameras[name].link][0]
@@ -92,16 +96,20 @@ class CameraRig:
         return scene
 
     def picture(self, name: str) -> tuple[Scene, View, Picture]:
-        """What an ideal camera in the true place sees, for labels: scene, view and picture without bars or noise."""
+        """Scene, view and picture of an ideal camera at the true pose, for labels: without bars or noise."""
         scene = self.scene(name)
         return scene, *self._picture(name, scene)
 
     def frame(self, name: str, now_ns: int) -> RgbdFrame:
-        """The next frame of camera ``name``; KeyError when the profile has none of that name."""
+        """The next frame of camera ``name``.
+
+        Raises:
+            KeyError: the profile has no such camera.
+        """
         return self.capture(name, self.scene(name), now_ns)
 
     def capture(self, name: str, scene: Scene, now_ns: int) -> RgbdFrame:
-        """The next frame of camera ``name`` of a scene that was to be seen at ``now_ns``."""
+        """The next frame of camera ``name``, of a scene that was visible at ``now_ns``."""
         camera = self._profile.cameras[name]
         view, picture = self._picture(name, scene)
         rgb, pin = picture.rgb, view.intrinsics
@@ -117,4 +125,4 @@ class CameraRig:
         view = self.view(name, scene)
         if self._size_px is not None:
             view = View(view.intrinsics.letterbox(self._size_px).inner, view.position_m, view.rotation)
-        return view, render(scene, view, self.look, self._counts[name])
+        return view, render(scene, view, self.conditions, self._counts[name])

@@ -1,12 +1,12 @@
-"""What there is to see, as arrays: rods (logs, twigs, blades of grass), boxes (machine, bunk) and the ground.
+"""A visible scene as arrays: rods (logs, twigs, blades of grass), boxes (machine, bunk) and the ground.
 
-A ``SceneBuilder`` makes a scene without physics; ``scene_from_world`` reads one off a running plant.  World frame,
+A ``SceneBuilder`` makes a scene without physics; ``scene_from_world`` reads one from a running plant.  World frame,
 metres.  A log is a chain of cone frusta with mitred joints along a parabolic bow, so a swept log has no gaps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -30,8 +30,10 @@ Vector = Sequence[float]
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """A grid of heights as ``sim.ground.terrain.Terrain`` has it: ``heights_m[i, j]`` at (x0 + i cell, y0 + j cell); a cell is
-    two triangles that meet on the diagonal from (i + 1, j) to (i, j + 1)."""
+    """A grid of heights as in ``sim.ground.terrain.Terrain``: ``heights_m[i, j]`` at (x0 + i cell, y0 + j cell).
+
+    A cell is two triangles that meet on the diagonal from (i + 1, j) to (i, j + 1).
+    """
 
     x0_m: float
     y0_m: float
@@ -55,8 +57,9 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class Rods:
-    """S frusta.  ``normal_start_m`` and ``normal_end_m`` point along the rod and cut its joints; ``caps`` bit 0 is a
-    closed start, bit 1 a closed end; ``side`` is where the bark's angle is 0, ``along_m`` the bark's start."""
+    """S frusta.  ``normal_start`` and ``normal_end`` point along the rod and cut its joints; ``caps`` bit 0 is a closed
+    start, bit 1 a closed end; ``side`` is where the bark's angle is 0, ``along_m`` the bark's start.
+    """
 
     start_m: np.ndarray
     end_m: np.ndarray
@@ -75,7 +78,8 @@ class Rods:
         """Every rod turned by its ``rotation`` (S, 3, 3) and shifted to its ``position_m`` (S, 3)."""
 
         def turn(v: np.ndarray) -> np.ndarray:
-            return np.einsum("sij,sj->si", rotation, v)
+            turned: np.ndarray = np.einsum("sij,sj->si", rotation, v)
+            return turned
 
         start, end = turn(self.start_m) + position_m, turn(self.end_m) + position_m
         normals = {"normal_start": turn(self.normal_start), "normal_end": turn(self.normal_end)}
@@ -99,8 +103,11 @@ class Boxes:
 
 @dataclass(frozen=True, slots=True)
 class LogPose:
-    """One log in the log frame of ``sim.scenes.arrangements``: origin at the pith at half length, z along the chord towards the thin
-    end, x towards the side it bows to; mid diameter, diameter lost per metre, sagitta of the bow."""
+    """One log in the log frame of ``sim.wood.log_shape``.
+
+    Origin at the pith at half length, z along the chord towards the thin end, x towards the side it bows to; mid
+    diameter, diameter lost per metre, sagitta of the bow.
+    """
 
     instance: int
     position_m: Vector
@@ -113,11 +120,12 @@ class LogPose:
     @property
     def axis(self) -> np.ndarray:
         """Unit vector (3,) along the log, butt to top."""
-        return quaternion_matrix(self.quaternion)[:, 2]
+        axis: np.ndarray = quaternion_matrix(self.quaternion)[:, 2]
+        return axis
 
     @property
     def pieces(self) -> int:
-        """Of how many straight pieces the log is drawn: as many as its body has."""
+        """Number of straight pieces in which the log is drawn, as in its body."""
         return 3 if self.sweep_m <= STRAIGHT_M else 5
 
     def spine(self, pieces: int) -> tuple[np.ndarray, np.ndarray]:
@@ -130,14 +138,14 @@ class LogPose:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Everything a camera may see; ``links`` are the machine's link poses (position, quaternion) by name."""
+    """Everything that a camera may see; ``links`` are the machine's link poses (position, quaternion) by name."""
 
     rods: Rods
     boxes: Boxes
     ground: Ground
     style: Style
     logs: tuple[LogPose, ...]
-    links: dict[str, tuple[Vector, Vector]]
+    links: Mapping[str, tuple[Vector, Vector]]
 
 
 class SceneBuilder:
@@ -183,7 +191,7 @@ class SceneBuilder:
         half = np.asarray(size_m, float) / 2
         self._boxes.append((np.asarray(position_m, float), quaternion_matrix(quaternion), half, colour, instance))
 
-    def build(self, links: dict[str, tuple[Vector, Vector]] | None = None) -> Scene:
+    def build(self, links: Mapping[str, tuple[Vector, Vector]] | None = None) -> Scene:
         """The packed scene."""
         n, m = len(self._rods), len(self._boxes)
         rod = list(zip(*self._rods, strict=True)) if n else [()] * 12
@@ -202,11 +210,11 @@ class SceneBuilder:
 
 
 class WorldScenes:
-    """The scenes of a running plant: each call reads its poses off the ``World``; ``clutter`` lies still."""
+    """The scenes of a running plant: each call reads its poses from the ``World``."""
 
-    def __init__(self, world: World, clutter: Rods | None = None) -> None:
+    def __init__(self, world: World) -> None:
         profile, terrain = world.profile, world.terrain
-        self._world, self._clutter = world, clutter
+        self._world = world
         self.style: Style = "asphalt" if profile.carrier is None else "forest"
         self.ground = Ground(*terrain.origin_m, terrain.cell_m, terrain.heights)
         shapes = [(s, CRANE) for s in crane_shapes(profile)] + [(s, BUNK) for s in bunk_shapes(profile)]
@@ -243,9 +251,9 @@ class WorldScenes:
             owner = rods.instance - 1
             turns = np.stack([quaternion_matrix(log.quaternion) for log in logs])[owner]
             rods = rods.moved(turns, np.array([log.position_m for log in logs])[owner])
-        return Scene(rods + self._clutter if self._clutter else rods, boxes, self.ground, self.style, logs, links)
+        return Scene(rods, boxes, self.ground, self.style, logs, links)
 
 
-def scene_from_world(world: World, clutter: Rods | None = None) -> Scene:
-    """What there is to see in a running plant now."""
-    return WorldScenes(world, clutter)()
+def scene_from_world(world: World) -> Scene:
+    """The present scene of a running plant."""
+    return WorldScenes(world)()

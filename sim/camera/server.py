@@ -1,7 +1,7 @@
-"""The plant's cameras on a local socket (``can_dbc.messages.rgbd``): pictures are drawn only when somebody asks.
+"""The plant's cameras on a local socket (``can_dbc.messages.rgbd``): pictures are rendered on request only.
 
-The plant's loop gives away what there is to see, which takes no longer than a few steps; drawing and sending are done
-by a thread of each client, so that no client delays the machine's time.
+The plant's loop hands out the scene, which takes no longer than a few steps; a thread per client renders and sends, so
+that no client delays the machine's time.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from typing import Protocol
 
 import numpy as np
 
-from can_dbc.messages.rgbd import MM_M, QUESTION, RgbdError, RgbdMessage, encode, encode_refusal, question_bytes
+from can_dbc.messages.rgbd import MM_PER_M, REQUEST_HEADER, RgbdError, RgbdMessage, encode, encode_refusal, request_name_bytes
 from sim.camera.rig import RgbdFrame
 from sim.camera.scene import Scene
 
-ANSWER_S = 1.0  # a client waits so long for the plant's loop
+ANSWER_TIMEOUT_S = 1.0  # of the plant's loop, towards a client
 CLIENTS = 4
 
 
 class Rig(Protocol):
-    """What is needed of a ``CameraRig``."""
+    """The part of a ``CameraRig`` that the server needs."""
 
     names: tuple[str, ...]
 
@@ -38,7 +38,7 @@ class CameraServer:
     Call ``serve`` from the loop that owns the world; ``close`` at the end.
 
     Raises:
-        OSError: the port cannot be had.
+        OSError: the port cannot be used.
     """
 
     def __init__(self, rig: Rig, port: int) -> None:
@@ -51,7 +51,7 @@ class CameraServer:
         threading.Thread(target=self._listen, daemon=True, name="cameras").start()
 
     def serve(self, now_ns: int) -> None:
-        """Give what there is to see now to those who wait for it."""
+        """Hand the present scene to the clients that wait for it."""
         while True:
             try:
                 name, answer = self._waiting.get_nowait()
@@ -60,7 +60,7 @@ class CameraServer:
             answer.put((self._rig.scene(name), now_ns))
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the port and all connections."""
         for sock in (self._listener, *tuple(self._clients)):
             with contextlib.suppress(OSError):
                 sock.shutdown(socket.SHUT_RDWR)
@@ -82,10 +82,10 @@ class CameraServer:
         try:
             with client:
                 while True:
-                    name = _read(client, question_bytes(_read(client, QUESTION.size))).decode(errors="replace")
+                    name = _read(client, request_name_bytes(_read(client, REQUEST_HEADER.size))).decode(errors="replace")
                     client.sendall(self._answer(name))
         except (OSError, RgbdError):
-            return  # whoever talks nonsense is hung up on
+            return  # a malformed request ends the connection
         finally:
             self._clients.discard(client)
             self._room.release()
@@ -96,17 +96,17 @@ class CameraServer:
         answer: queue.SimpleQueue[tuple[Scene, int]] = queue.SimpleQueue()
         self._waiting.put((name, answer))
         try:
-            scene, now_ns = answer.get(timeout=ANSWER_S)
+            scene, now_ns = answer.get(timeout=ANSWER_TIMEOUT_S)
         except queue.Empty:
-            return encode_refusal(name, f"the plant did not answer within {ANSWER_S:g} s; does it run?")
+            return encode_refusal(name, f"the plant did not answer within {ANSWER_TIMEOUT_S:g} s; check that it runs")
         with self._drawing:
             frame = self._rig.capture(name, scene, now_ns)
-        return encode(on_the_wire(frame))
+        return encode(rgbd_message(frame))
 
 
-def on_the_wire(frame: RgbdFrame) -> RgbdMessage:
+def rgbd_message(frame: RgbdFrame) -> RgbdMessage:
     """A frame as it is sent: depth in whole millimetres, no true pose."""
-    pin, depth = frame.intrinsics, np.nan_to_num(frame.depth_m * np.float32(MM_M), nan=0.0)
+    pin, depth = frame.intrinsics, np.nan_to_num(frame.depth_m * np.float32(MM_PER_M), nan=0.0)
     millimetres = np.clip(np.rint(depth), 0, 65535).astype("<u2")
     size = (pin.width_px, pin.height_px, pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px)
     return RgbdMessage(frame.name, frame.stamp_ns, *size, frame.rgb.tobytes(), millimetres.tobytes())

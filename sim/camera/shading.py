@@ -24,14 +24,14 @@ from sim.camera.textures import (
 from sim.camera.visibility import FIRST_ROD, GROUND_CODE, SKY_CODE
 
 GRAIN_PX = 256
-_FAR = float(1 << 20)  # makes a texel's index positive before it is cut to a whole number
+_FAR = float(1 << 20)  # makes a texel's index positive before it is truncated
 _BARK_REPEAT = BARK_PX / BARK_LENGTH_M
 _TURN = BARK_PX / (2.0 * math.pi)
 _GROUND_MASK, _BARK_MASK, _PATCH_MASK, _GRAIN_MASK = GROUND_PX - 1, BARK_PX - 1, PATCH_PX - 1, GRAIN_PX - 1
 
 
 @njit(cache=True, fastmath=True)
-def angle_of(y, x):
+def angle_of(y: float, x: float) -> float:
     """atan2 to 0.005 rad: enough to look up a texture."""
     ax, ay = abs(x), abs(y)
     big = max(ax, ay)
@@ -47,22 +47,63 @@ def angle_of(y, x):
 
 
 @njit(cache=True, fastmath=True)
-def _byte(x):
+def _byte(x: float) -> np.uint8:
     x = x if x > 0.0 else 0.0
     return np.uint8(np.int32(x if x < 255.0 else 255.0))
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
 def shade(
-    inverse, code, eye, rotation, fx, fy, cx, cy,
-    ends, radii, side, along, surface, tint, rod_instance, centres, axes, halves, colours, box_instance,
-    heights, x0, y0, cell,
-    ground, patch, bark, end_grain, horizon, grain, grain_gain, grain_row, grain_column,
-    sun, sun_light, sky_light, shadows, shaded, shadow_x0, shadow_y0, shadow_cell,
-    rgb, depth, mask,
-):  # fmt: skip
-    """Fill rgb, depth, mask.  ``sun`` unit vector towards it; ``sun_light``, ``sky_light`` (3,) gains of the textures;
-    poses in the world; the rest as their makers describe them."""
+    inverse: np.ndarray,
+    code: np.ndarray,
+    eye: np.ndarray,
+    rotation: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    ends: np.ndarray,
+    radii: np.ndarray,
+    side: np.ndarray,
+    along: np.ndarray,
+    surface: np.ndarray,
+    tint: np.ndarray,
+    rod_instance: np.ndarray,
+    centres: np.ndarray,
+    axes: np.ndarray,
+    halves: np.ndarray,
+    colours: np.ndarray,
+    box_instance: np.ndarray,
+    heights: np.ndarray,
+    x0: float,
+    y0: float,
+    cell: float,
+    ground: np.ndarray,
+    patch: np.ndarray,
+    bark: np.ndarray,
+    end_grain: np.ndarray,
+    horizon: np.ndarray,
+    grain: np.ndarray,
+    grain_gain: float,
+    grain_row: int,
+    grain_column: int,
+    sun: np.ndarray,
+    sun_light: np.ndarray,
+    sky_light: np.ndarray,
+    shadows: np.ndarray,
+    shaded: np.ndarray,
+    shadow_x0: float,
+    shadow_y0: float,
+    shadow_cell: float,
+    rgb: np.ndarray,
+    depth: np.ndarray,
+    mask: np.ndarray,
+) -> None:
+    """Fill rgb, depth, mask.
+
+    ``sun`` is the unit vector towards the sun; ``sun_light``, ``sky_light`` (3,) are gains of the textures; poses are
+    in the world; the other arguments are described where they are made.
+    """
     height, width = inverse.shape
     rods = ends.shape[0]
     first_box = FIRST_ROD + 3 * rods
@@ -176,7 +217,7 @@ def shade(
                     int((a + 0.7 * c) * 60.0 + _FAR) & _PATCH_MASK, int((b + 0.4 * c) * 60.0 + _FAR) & _PATCH_MASK
                 ]
                 worn = 1.0 - 0.0005 * dirt
-                # A worn rim a centimetre wide tells one box from the next.
+                # A worn rim a centimetre wide separates one box from the next.
                 rim = 0
                 rim += abs(a) > halves[i, 0] - 0.012
                 rim += abs(b) > halves[i, 1] - 0.012

@@ -1,4 +1,4 @@
-"""A shadow map: for every ray of sunlight the height at which something stops it.
+"""A shadow map: for every ray of sunlight the height at which it is blocked.
 
 A point (x, y, z) lies on the ray (x - z kx, y - z ky) with k = the sun's horizontal over its vertical part.  Rods
 store the height of their axis and boxes that of their middle, so no lit surface shadows itself.
@@ -12,12 +12,12 @@ import numpy as np
 from numba import njit
 
 MAP_PX = 1024
-BLOCK_BITS = 4  # the map is kept in blocks of 16 cells; blocks without any shadow are never touched
+BLOCK_BITS = 4  # the map is stored in blocks of 16 cells; blocks without any shadow are never written
 LOWEST_M = -1e6
 
 
 @njit(cache=True)
-def _span(ax, ay, bx, by, low, high):
+def _span(ax: float, ay: float, bx: float, by: float, low: np.ndarray, high: np.ndarray) -> None:
     if ay > by:
         ax, ay, bx, by = bx, by, ax, ay
     slope = (bx - ax) / (by - ay) if by - ay > 1e-9 else 0.0
@@ -27,8 +27,8 @@ def _span(ax, ay, bx, by, low, high):
 
 
 @njit(cache=True)
-def _touch(out, used, row, first, last):
-    """Clear the blocks of a row's cells that nothing has shaded yet."""
+def _touch(out: np.ndarray, used: np.ndarray, row: int, first: int, last: int) -> None:
+    """Clear the blocks of a row's cells at their first use."""
     i = row >> BLOCK_BITS
     for j in range(first >> BLOCK_BITS, (last >> BLOCK_BITS) + 1):
         if not used[i, j]:
@@ -38,7 +38,17 @@ def _touch(out, used, row, first, last):
 
 
 @njit(cache=True)
-def shadow_map(ends, radii, centres, axes, halves, sun, x0, y0, cell):
+def shadow_map(
+    ends: np.ndarray,
+    radii: np.ndarray,
+    centres: np.ndarray,
+    axes: np.ndarray,
+    halves: np.ndarray,
+    sun: np.ndarray,
+    x0: float,
+    y0: float,
+    cell: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """Heights (MAP_PX, MAP_PX) of rods ends (S, 2, 3), radii (S, 2) and boxes, world frame; (x0, y0) is cell 0's ray.
 
     Returns the map and which of its blocks are used; in those, cells without shadow hold LOWEST_M.

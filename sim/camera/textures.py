@@ -18,28 +18,33 @@ BARK_LENGTH_M: Final = 1.0
 END_PX: Final = 128
 HORIZON_PX: Final = (128, 2048)  # elevation 0..HORIZON_RAD, azimuth
 HORIZON_RAD: Final = 0.5
-VARIANTS: Final = 6  # so many appearances are kept; a seed picks one
+VARIANTS: Final = 6  # number of appearances; a seed selects one
 
 
 def noise(
     rng: np.random.Generator, shape: tuple[int, int], wave_px: tuple[float, float], slope: float = 1.0
 ) -> np.ndarray:
-    """Periodic noise, mean 0 and unit variance, whose features are about ``wave_px`` (rows, columns) long; a larger
-    ``slope`` leaves less fine structure."""
+    """Periodic noise, mean 0 and unit variance, with features about ``wave_px`` (rows, columns) long.
+
+    A larger ``slope`` leaves less fine structure.
+    """
     fy, fx = np.fft.fftfreq(shape[0])[:, None] * wave_px[0], np.fft.rfftfreq(shape[1])[None, :] * wave_px[1]
     spectrum = np.fft.rfft2(rng.standard_normal(shape)) / (1.0 + (fy * fy + fx * fx) ** slope)
     spectrum[0, 0] = 0.0
     field = np.fft.irfft2(spectrum, shape)
-    return field / field.std()
+    normal: np.ndarray = field / field.std()
+    return normal
 
 
 def _mix(base: tuple[float, ...], other: tuple[float, ...], weight: np.ndarray) -> np.ndarray:
     w = np.clip(weight, 0.0, 1.0)[..., None]
-    return np.asarray(base) * (1.0 - w) + np.asarray(other) * w
+    mixed: np.ndarray = np.asarray(base) * (1.0 - w) + np.asarray(other) * w
+    return mixed
 
 
 def _bytes(picture: np.ndarray) -> np.ndarray:
-    return np.clip(picture, 0.0, 255.0).astype(np.uint8)
+    whole: np.ndarray = np.clip(picture, 0.0, 255.0).astype(np.uint8)
+    return whole
 
 
 def _pyramid(picture: np.ndarray) -> np.ndarray:
@@ -89,7 +94,8 @@ def _bark(rng: np.random.Generator, style: str) -> np.ndarray:
     if style == "asphalt":
         plates, furrows = noise(rng, size, (60, 18), 1.6), noise(rng, size, (46, 10), 1.6)
         bark = _mix((150, 104, 72), (196, 150, 112), 0.45 + 0.3 * plates + 0.12 * fine)
-        return _mix((0, 0, 0), (1, 1, 1), 1.0 - 0.62 * np.clip(1.0 - 2.2 * np.abs(furrows), 0.0, 1.0)) * bark
+        bark *= _mix((0, 0, 0), (1, 1, 1), 1.0 - 0.62 * np.clip(1.0 - 2.2 * np.abs(furrows), 0.0, 1.0))
+        return bark
     slits, stains = noise(rng, size, (4, 34), 2.0), noise(rng, size, (50, 30))
     bark = _mix((176, 168, 156), (226, 222, 214), 0.5 + 0.25 * stains + 0.12 * fine)
     bark = np.where((slits > 1.55)[..., None], (58.0, 52.0, 48.0), bark)

@@ -25,8 +25,8 @@ _EDGES = np.array(
 
 
 @njit(cache=True)
-def _stretch(ax, ay, bx, by, height, low, high):
-    """Widen the row spans by the segment (ax, ay)-(bx, by) in pixels, a pixel generously."""
+def _stretch(ax: float, ay: float, bx: float, by: float, height: int, low: np.ndarray, high: np.ndarray) -> None:
+    """Widen the row spans by the segment (ax, ay)-(bx, by) in pixels, with a margin of a pixel."""
     if ay > by:
         ax, ay, bx, by = bx, by, ax, ay
     first, last = max(0, math.floor(ay)), min(height - 1, math.ceil(by))
@@ -42,7 +42,17 @@ def _stretch(ax, ay, bx, by, height, low, high):
 
 
 @njit(cache=True)
-def _spans(corners, fx, fy, cx, cy, width, height, low, high):
+def _spans(
+    corners: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: int,
+    height: int,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> tuple[int, int]:
     """Row spans of the convex hull of eight corners (8, 3) in the optical frame; returns (first, last) row."""
     behind = 0
     px, py = np.empty(8), np.empty(8)
@@ -84,12 +94,12 @@ def _spans(corners, fx, fy, cx, cy, width, height, low, high):
 
 
 @njit(cache=True)
-def _columns(low, high, width):
+def _columns(low: float, high: float, width: int) -> tuple[int, int]:
     return max(0, math.floor(low)), min(width - 1, math.ceil(high))
 
 
 @njit(cache=True)
-def _box_corners(centre, axes, half, out):
+def _box_corners(centre: np.ndarray, axes: np.ndarray, half: np.ndarray, out: np.ndarray) -> None:
     for i in range(8):
         sx = half[0] if i & 1 else -half[0]
         sy = half[1] if i & 2 else -half[1]
@@ -99,7 +109,20 @@ def _box_corners(centre, axes, half, out):
 
 
 @njit(cache=True)
-def draw_box(inverse, code, first_code, centre, axes, half, fx, fy, cx, cy, low, high):
+def draw_box(
+    inverse: np.ndarray,
+    code: np.ndarray,
+    first_code: int,
+    centre: np.ndarray,
+    axes: np.ndarray,
+    half: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> None:
     """One box in the optical frame."""
     height, width = inverse.shape
     corners = np.empty((8, 3))
@@ -116,7 +139,7 @@ def draw_box(inverse, code, first_code, centre, axes, half, fx, fy, cx, cy, low,
         away = nx * centre[0] + ny * centre[1] + nz * centre[2] + half[k]
         if abs(away) < 1e-9:
             continue
-        if away > 0.0 and backs == 5:  # the camera is inside: its own housing does not blind it
+        if away > 0.0 and backs == 5:  # the camera is inside: its own housing does not hide the scene
             return
         plane = front[fronts] if away < 0.0 else back[backs]
         plane[0], plane[1], plane[2] = nx / away / fx, ny / away / fy, nz / away
@@ -154,7 +177,7 @@ def draw_box(inverse, code, first_code, centre, axes, half, fx, fy, cx, cy, low,
 
 
 @njit(cache=True)
-def _frame_of(wx, wy, wz, axes):
+def _frame_of(wx: float, wy: float, wz: float, axes: np.ndarray) -> None:
     """Axes (3, 3) whose column 2 is the unit vector w."""
     if abs(wx) < 0.7:
         ux, uy, uz = 0.0, wz, -wy
@@ -168,7 +191,22 @@ def _frame_of(wx, wy, wz, axes):
 
 
 @njit(cache=True)
-def _draw_cap(inverse, code, value, at, axes, sign, radius, corners, fx, fy, cx, cy, low, high):
+def _draw_cap(
+    inverse: np.ndarray,
+    code: np.ndarray,
+    value: int,
+    at: np.ndarray,
+    axes: np.ndarray,
+    sign: float,
+    radius: float,
+    corners: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> None:
     """A disc at ``at`` whose outward normal is sign * column 2 of ``axes``."""
     height, width = inverse.shape
     nx, ny, nz = sign * axes[0, 2], sign * axes[1, 2], sign * axes[2, 2]
@@ -191,7 +229,24 @@ def _draw_cap(inverse, code, value, at, axes, sign, radius, corners, fx, fy, cx,
 
 
 @njit(cache=True)
-def draw_rod(inverse, code, first_code, start, end, r0, r1, n0, n1, caps, fx, fy, cx, cy, low, high):
+def draw_rod(
+    inverse: np.ndarray,
+    code: np.ndarray,
+    first_code: int,
+    start: np.ndarray,
+    end: np.ndarray,
+    r0: float,
+    r1: float,
+    n0: np.ndarray,
+    n1: np.ndarray,
+    caps: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> None:
     """One frustum in the optical frame: its side between the cutting planes, and its caps."""
     height, width = inverse.shape
     wx, wy, wz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
@@ -242,7 +297,19 @@ def draw_rod(inverse, code, first_code, start, end, r0, r1, n0, n1, caps, fx, fy
 
 
 @njit(cache=True)
-def _draw_triangle(inverse, code, p, q, r, fx, fy, cx, cy, px, py):
+def _draw_triangle(
+    inverse: np.ndarray,
+    code: np.ndarray,
+    p: np.ndarray,
+    q: np.ndarray,
+    r: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    px: np.ndarray,
+    py: np.ndarray,
+) -> None:
     """A triangle of the ground in the optical frame."""
     height, width = inverse.shape
     ax, ay, az = q[0] - p[0], q[1] - p[1], q[2] - p[2]
@@ -292,7 +359,23 @@ def _draw_triangle(inverse, code, p, q, r, fx, fy, cx, cy, px, py):
 
 
 @njit(cache=True)
-def draw_grid(inverse, code, x0, y0, cell, heights, stride, nearest, furthest, eye, rotation, fx, fy, cx, cy):
+def draw_grid(
+    inverse: np.ndarray,
+    code: np.ndarray,
+    x0: float,
+    y0: float,
+    cell: float,
+    heights: np.ndarray,
+    stride: int,
+    nearest: float,
+    furthest: float,
+    eye: np.ndarray,
+    rotation: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> None:
     """Height grid at every ``stride``-th point, two triangles a cell, where a cell's middle is between ``nearest`` and
     ``furthest`` metres from the camera."""
     width = inverse.shape[1]
@@ -331,7 +414,16 @@ def draw_grid(inverse, code, x0, y0, cell, heights, stride, nearest, furthest, e
 
 
 @njit(cache=True)
-def draw_plane(inverse, code, up, below, fx, fy, cx, cy):
+def draw_plane(
+    inverse: np.ndarray,
+    code: np.ndarray,
+    up: np.ndarray,
+    below: float,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> None:
     """The level ground ``below`` metres under the camera wherever nothing is drawn; ``up`` in the optical frame."""
     height, width = inverse.shape
     su, sv = -up[0] / below / fx, -up[1] / below / fy
@@ -345,7 +437,21 @@ def draw_plane(inverse, code, up, below, fx, fy, cx, cy):
 
 
 @njit(cache=True)
-def draw_objects(inverse, code, rod_ends, rod_radii, rod_normals, caps, centres, axes, halves, fx, fy, cx, cy):
+def draw_objects(
+    inverse: np.ndarray,
+    code: np.ndarray,
+    rod_ends: np.ndarray,
+    rod_radii: np.ndarray,
+    rod_normals: np.ndarray,
+    caps: np.ndarray,
+    centres: np.ndarray,
+    axes: np.ndarray,
+    halves: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> None:
     """All rods, then all boxes, in the optical frame.  rod_ends and rod_normals (S, 2, 3), rod_radii (S, 2)."""
     low, high = np.empty(inverse.shape[0]), np.empty(inverse.shape[0])
     rods = rod_ends.shape[0]

@@ -1,4 +1,4 @@
-"""Local metres to WGS-84: a point in the east-north-up frame of a site, as latitude, longitude and height.
+"""Local metres to WGS-84: a point in an east-north-up frame as latitude, longitude and height.
 
 Exact to far below a millimetre near the surface: rotation into the Earth-centred frame, then one step of Bowring's
 formula (B. R. Bowring, Survey Review 1976).  Angles in degrees, lengths in m, heights above the ellipsoid.
@@ -18,7 +18,7 @@ Geodetic = tuple[float, float, float]
 
 
 class LocalFrame:
-    """The local frame whose origin lies at a latitude, longitude and height; x east, y north, z up."""
+    """The local frame with its origin at a latitude, longitude and height; x east, y north, z up."""
 
     def __init__(self, lat_deg: float, lon_deg: float, height_m: float = 0.0) -> None:
         lat, lon = math.radians(lat_deg), math.radians(lon_deg)

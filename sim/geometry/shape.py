@@ -1,4 +1,4 @@
-"""Boxes: what the plant's bodies are made of, for collision, drawing and the cameras."""
+"""Boxes, vectors and rotations: the plant's bodies consist of boxes, for collision, drawing and the cameras."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A box: full edge lengths [m] and pose in the frame of ``link``; ``solid`` ones collide, others are only seen."""
+    """A box: full edge lengths [m] and pose in the frame of ``link``; ``solid`` ones collide, others are only drawn."""
 
     link: str
     size_m: Vector

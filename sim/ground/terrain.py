@@ -1,8 +1,8 @@
-"""The ground: one grid of heights that tyres, cameras and Bullet's contacts all share.
+"""The ground: one grid of heights shared by tyres, cameras and Bullet's contacts.
 
 ``heights[i, j]`` is the height [m] at (``origin_m[0]`` + i cell, ``origin_m[1]`` + j cell), world frame.  A cell is
-two flat triangles that meet on the diagonal from (i + 1, j) to (i, j + 1), exactly as Bullet's heightfield cuts it, so
-what a tyre feels is what a log lies on.  Outside the grid the ground goes on at the height of its edge; Bullet's body
+two flat triangles that meet on the diagonal from (i + 1, j) to (i, j + 1), exactly as in Bullet's heightfield, so
+tyres and logs touch the same surface.  Outside the grid the ground continues at the height of its edge; Bullet's body
 ends there.
 """
 
@@ -17,13 +17,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sim.bullet.client import BulletClient
+from sim.errors import PlantError
 from sim.geometry.shape import Vector
 
 
 class Soil(NamedTuple):
-    """What the ground makes of the truth's tyres: factors of their friction and slip stiffness, and what it adds to
-    their rolling resistance.
-    """
+    """Factors of the tyres' friction and slip stiffness, and the addition to their rolling resistance."""
 
     friction: float = 1.0
     stiffness: float = 1.0
@@ -50,11 +49,14 @@ def surface_height(x: float, y: float, x0: float, y0: float, cell: float, height
     i, j = min(int(u), heights.shape[0] - 2), min(int(v), heights.shape[1] - 2)
     u, v = u - i, v - j
     along, across = heights[i + 1, j], heights[i, j + 1]
+    height: float
     if u + v <= 1.0:
         corner = heights[i, j]
-        return corner + u * (along - corner) + v * (across - corner)
-    corner = heights[i + 1, j + 1]
-    return corner + (1.0 - u) * (across - corner) + (1.0 - v) * (along - corner)
+        height = corner + u * (along - corner) + v * (across - corner)
+    else:
+        corner = heights[i + 1, j + 1]
+        height = corner + (1.0 - u) * (across - corner) + (1.0 - v) * (along - corner)
+    return height
 
 
 @njit(cache=True)
@@ -76,14 +78,17 @@ def _smooth(noise: NDArray[np.float64], length_cells: float) -> NDArray[np.float
     f = np.fft.fftfreq(noise.shape[0])
     window = np.exp(-2.0 * (math.pi * length_cells) ** 2 * (f[:, None] ** 2 + f[None, : noise.shape[1] // 2 + 1] ** 2))
     smooth = np.fft.irfft2(np.fft.rfft2(noise) * window, noise.shape)
-    return (smooth - smooth.mean()) / smooth.std()
+    normal: NDArray[np.float64] = (smooth - smooth.mean()) / smooth.std()
+    return normal
 
 
 def _rough(seed: int) -> NDArray[np.float64]:
     """Undulation of LAYERS, with the origin in the middle of the grid at height 0; exact in single precision."""
     rng = np.random.default_rng(random.Random(f"terrain {seed}").getrandbits(64))
     shape = (ROUGH_CELLS, ROUGH_CELLS)
-    heights = sum(s * _smooth(rng.standard_normal(shape), length / ROUGH_CELL_M) for s, length in LAYERS)
+    heights = np.zeros(shape)
+    for s, length in LAYERS:
+        heights = heights + s * _smooth(rng.standard_normal(shape), length / ROUGH_CELL_M)
     heights = np.vstack([heights, heights[:1]])
     heights = np.hstack([heights, heights[:, :1]])
     heights -= heights[ROUGH_CELLS // 2, ROUGH_CELLS // 2]
@@ -95,12 +100,12 @@ class Terrain:
     slippery, ``rough`` undulating, drawn from ``seed``.
 
     Raises:
-        ValueError: the kind is not one of KINDS.
+        PlantError: the kind is not one of KINDS.
     """
 
     def __init__(self, kind: str = "flat", seed: int = 0, datum_m: float = 0.0) -> None:
         if kind not in KINDS:
-            raise ValueError(f"terrain {kind!r} is unknown; use one of {', '.join(KINDS)}")
+            raise PlantError("terrain.unknown-kind", f"terrain {kind!r} is unknown; use one of {', '.join(KINDS)}")
         self.kind = kind
         self.colour: Vector = (0.55, 0.60, 0.45)
         self.soil = MUD if kind == "mud" else Soil()
@@ -139,7 +144,7 @@ class Terrain:
         return (float(-sx / length), float(-sy / length), 1.0 / length)
 
     def add_to(self, client: BulletClient, friction: float) -> int:
-        """Create the fixed body in a client that carries the logs; keeps and returns its id."""
+        """Create the fixed body in a client that holds the logs; stores and returns its id."""
         if self.kind == "rough":
             low, high = float(self.heights.min()), float(self.heights.max())
             rows, columns = self.heights.shape
@@ -158,9 +163,9 @@ class Terrain:
             shape = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
             at = [-THICKNESS_M / 2 * normal[0], -THICKNESS_M / 2 * normal[1], middle - THICKNESS_M / 2 * normal[2]]
             turn = client.getQuaternionFromEuler([math.atan2(-normal[1], normal[2]), 0.0, 0.0])
-        self.body: int = client.createMultiBody(0.0, shape, basePosition=at, baseOrientation=turn)
+        self.body = client.createMultiBody(0.0, shape, basePosition=at, baseOrientation=turn)
         client.changeDynamics(self.body, -1, lateralFriction=friction)
-        # Bullet works out the contacts of two bodies unless both sleep: ground that sleeps makes logs at rest free.
+        # Bullet computes the contacts of two bodies unless both sleep: sleeping ground makes logs at rest cost nothing.
         for state in (client.ACTIVATION_STATE_ENABLE_SLEEPING, client.ACTIVATION_STATE_SLEEP):
             client.changeDynamics(self.body, -1, activationState=state)
         return self.body

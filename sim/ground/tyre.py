@@ -1,9 +1,9 @@
 """Tyres on the ground: forces of the wheels for one physics step, compiled; no Bullet, no clock.
 
-Normal: spring and damper on a plane fitted to nine points of the ground under the tyre, as a soft carcass envelopes
-it.  Tangential: one bristle per wheel in the plane of contact (Dahl's pre-sliding spring with LuGre's damper), with
-the friction circle as its yield surface, so that a stuck tyre is a spring that never creeps.  Rolling carries
-bristles out of the contact within a relaxation length sigma:
+Normal force: spring and damper on a plane fitted to nine points of the ground under the tyre, because a soft carcass
+envelopes the ground.  Tangential force: one bristle per wheel in the plane of contact (Dahl's pre-sliding spring with
+LuGre's damper), with the friction circle as its yield surface, so that a stuck tyre is a spring that never creeps.
+Rolling carries bristles out of the contact within a relaxation length sigma:
 
     z' = s - |r w| / sigma z,    F = -(k z + c z'),    |F| <= mu N,    s = hub velocity at the ground - r w
 
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 
 class Tyre(NamedTuple):
-    """What does not change during a run, as in ``sim.truth.carrier``."""
+    """The constants of a run, as in ``sim.truth.carrier``."""
 
     radius_m: float
     width_m: float

@@ -1,9 +1,9 @@
 """Load-sensing hydraulics of all functions: compressible chambers drive the joints by torque.
 
-docs/reference/plant-model.md section 2, docs/reference/machines.md section 3: valves with dead time, second-order spool, hysteresis and dead-band; pressure-compensated
-metering in and out, so a lowered load runs at valve speed and a neutral valve holds it; one pump, whose flow is shared
-as the valve block does it; chambers never below zero; Stribeck friction; damping orifices that let only oscillating
-pressure pass; a locked grapple; float valves of the swing arms.  Units: SI.
+docs/reference/plant-model.md section 2, docs/reference/machines.md section 3: valves with dead time, second-order
+spool, hysteresis and dead-band; pressure-compensated metering in and out, so a lowered load moves at valve speed and a
+neutral valve holds it; one pump, whose flow the valve block shares; chambers never below zero; Stribeck friction;
+damping orifices that pass only oscillating pressure; a locked grapple; float valves of the swing arms.  Units: SI.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from sim.errors import PlantError
 from sim.hydraulics import layout
 from sim.hydraulics.kernel import STEADY_S, advance
 from sim.truth.load import Truth
@@ -23,7 +24,7 @@ AXLES: Final = {"front": "arm_fl", "rear": "arm_rl"}  # the right arm follows it
 
 
 class Hydraulics:
-    """Every function of a machine on its pump; ``names`` is the order of all sequences."""
+    """All functions of a machine on its pump; ``names`` is the order of all sequences."""
 
     def __init__(self, truth: Truth, step_s: float, substeps: int = SUBSTEPS) -> None:
         self.names: Final = tuple(truth.functions)
@@ -37,12 +38,12 @@ class Hydraulics:
         self._lines = np.zeros((n, int(self._constants["delay_steps"].max())))
         self._commands, self._q, self._qd, self._torques = (np.zeros(n) for _ in range(4))
         self._floating: str | None = None
-        # Without a check valve nothing ever shuts.
+        # Without a check valve the port is always open.
         self._states["poppet"] = self._constants["check_ratio"] == 0.0
         self.supply_pa = self._balance["supply"][0] = truth.supply.pressure_margin_pa
 
     def hold(self, torques: Sequence[float], q: Sequence[float]) -> None:
-        """Start at rest at ``q`` with the pressures that carry ``torques`` [Nm, N] (+ in the joint's direction)."""
+        """Start at rest at ``q`` with the pressures that balance ``torques`` [Nm, N] (+ in the joint's direction)."""
         s, c = self._states, self._constants
         at = np.asarray(q, float)
         for i, (arm, travel) in enumerate(self._tables):
@@ -78,22 +79,22 @@ class Hydraulics:
 
     @property
     def flow_limited(self) -> bool:
-        """Whether the functions ask for more than the pump gives."""
+        """Whether the functions demand more flow than the pump delivers."""
         return bool(self._balance["limited"][0])
 
     @property
     def energy_j(self) -> float:
-        """Energy from the pump (and, slight, from the tank) since the start."""
+        """Energy from the pump (and, slightly, from the tank) since the start."""
         return float(self._balance["energy_in"][0])
 
     @property
     def energy_out_j(self) -> float:
-        """Work done on the joints since the start, friction of the drives taken off; driven loads count negative."""
+        """Work done on the joints since the start, less the drives' friction; driving loads count negative."""
         return float(self._balance["energy_out"][0])
 
     @property
     def loss_j(self) -> float:
-        """Energy turned to heat at edges, valves, leaks and seals since the start; never falls."""
+        """Energy lost as heat in edges, valves, leaks and seals since the start; never decreases."""
         return float(self._balance["loss"][0])
 
     @property
@@ -109,7 +110,7 @@ class Hydraulics:
 
     @property
     def relief_pa(self) -> float:
-        """Pressure that the pump gives at most; set lower, the supply breaks down."""
+        """Relief pressure of the pump; a low value makes the supply break down."""
         return float(self._pump["relief"][0])
 
     @relief_pa.setter
@@ -123,9 +124,15 @@ class Hydraulics:
 
     def _float(self, axle: str, value: bool) -> None:
         if value and AXLES[axle] not in self.names:
-            raise ValueError(f"float valve of the {axle} axle: this machine has no swing arms; leave it shut")
+            raise PlantError(
+                "hydraulics.no-swing-arms",
+                f"float valve of the {axle} axle: this machine has no swing arms; leave the valve closed",
+            )
         if value and self._floating not in (None, axle):
-            raise ValueError(f"float valve of the {axle} axle: the {self._floating} axle floats already; shut it first")
+            raise PlantError(
+                "hydraulics.other-axle-floats",
+                f"float valve of the {axle} axle: the {self._floating} axle already floats; close its valve first",
+            )
         if value:
             self._floating = axle
         elif self._floating == axle:
@@ -133,7 +140,9 @@ class Hydraulics:
 
     @property
     def float_front(self) -> bool:
-        """Whether the front arms are cross-connected left to right; never both axles (docs/reference/machines.md section 7.3)."""
+        """Whether the front arms are cross-connected left to right; never both axles
+        (docs/reference/machines.md section 7.3).
+        """
         return self._floating == "front"
 
     @float_front.setter

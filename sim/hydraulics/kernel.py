@@ -1,10 +1,11 @@
-"""The hot loop of the hydraulics: one physics step of all functions in substeps, compiled.
+"""The compiled loop of the hydraulics: one physics step of all functions in substeps.
 
-Per substep (docs/reference/plant-model.md section 2, docs/reference/machines.md section 3): spool, load-sensing pump, sharing of its flow, friction and predicted joint
-speed, chamber pressures (implicit in their own edges).  Bullet holds the returned torque for a whole step, so inside
-it the joint's motion is predicted with an inertia below the real one (above it, friction would chatter), and before
-the next step the pressures are corrected by the difference between predicted and real travel: oil is never gained or
-lost, and the mean torque of a stiff drive on a light joint stays damped (omega times step up to about 1.4).
+Per substep (docs/reference/plant-model.md section 2, docs/reference/machines.md section 3): spool, load-sensing pump,
+flow sharing, friction and predicted joint speed, chamber pressures (implicit in their own edges).  Bullet holds the
+returned torque for a whole step, so the joint's motion within it is predicted with an inertia below the real one
+(above it, friction would chatter), and before the next step the pressures are corrected by the difference between
+predicted and real travel: oil is never gained or lost, and the mean torque of a stiff drive on a light joint stays
+damped (omega times step up to about 1.4).
 
 Records: ``sim.hydraulics.layout``.  Chamber A pushes in the direction of a positive command.
 """
@@ -16,9 +17,9 @@ import math
 import numpy as np
 from numba import njit
 
-from sim.hydraulics.layout import SOFT_PA, UNIT_PA
+from sim.hydraulics.layout import SOFT_PA, UNIT_PA, Array, Balance, FunctionConstants, FunctionState, Pump, Records
 
-STEADY_S = 0.15  # what lasts longer than this is a load, not an oscillation
+STEADY_S = 0.15  # pressure that lasts longer than this is a load, not an oscillation
 VALVE_M3_S_PA = 1.0e-8  # relief and make-up valves of a port: flow per pressure beyond their setting
 FLOAT_M3_S_PA = 2.0e-9  # float valve between the swing arms of an axle
 STOP_RAD_S = 350.0  # an end stop: frequency of the least inertia on it, half of critically damped
@@ -27,14 +28,17 @@ BISECTIONS = 24
 
 
 @njit(cache=True)
-def orifice(drop):
+def orifice(drop: float) -> float:
     """Flow factor of an edge over its pressure drop: 1 near 1 MPa, ~ square root beyond SOFT_PA."""
     return drop / math.sqrt(UNIT_PA * (abs(drop) + SOFT_PA))
 
 
 @njit(cache=True)
-def friction(c, speed):
-    """Stribeck friction of a piston [N] (docs/reference/machines.md section 3, form of PATU) and a stable slope over speed [N s/m]."""
+def friction(c: FunctionConstants, speed: float) -> tuple[float, float]:
+    """Stribeck friction of a piston [N] and a stable slope over speed [N s/m].
+
+    docs/reference/machines.md section 3, form of PATU.
+    """
     a = abs(speed) / c.stribeck_speed
     t = math.tanh(4.0 * a)
     bump = a * a / 4.0 + 0.75
@@ -45,7 +49,7 @@ def friction(c, speed):
 
 
 @njit(cache=True)
-def move_spool(c, s, command, h):
+def move_spool(c: FunctionConstants, s: FunctionState, command: float, h: float) -> None:
     """Second-order spool, play (hysteresis), dead-band and metering; sets ``opening`` in -1..1."""
     w = c.spool_rad_s
     s.spool_speed += h * (w * w * (command - s.spool) - 2.0 * c.spool_zeta * w * s.spool_speed)
@@ -62,8 +66,8 @@ def move_spool(c, s, command, h):
 
 
 @njit(cache=True)
-def demand(c, s, supply, margin):
-    """Flow [m^3/s] that a function takes at this pump pressure: its compensator keeps the drop at the margin."""
+def demand(c: FunctionConstants, s: FunctionState, supply: float, margin: float) -> float:
+    """Flow [m^3/s] that a function demands at this pump pressure: its compensator keeps the drop at the margin."""
     if s.opening > 0.0:
         drop = min(min(supply, c.limit_plus) - s.pressure_a, margin)
         return c.in_plus * s.opening * max(0.0, orifice(drop))
@@ -74,8 +78,8 @@ def demand(c, s, supply, margin):
 
 
 @njit(cache=True)
-def share_flow(constants, states, pump, balance, h):
-    """Pump pressure after the load-sensing line, and every function's inflow within what the pump gives."""
+def share_flow(constants: Records, states: Records, pump: Pump, balance: Balance, h: float) -> float:
+    """Pump pressure after the load-sensing line, and every function's inflow within the pump's flow."""
     load = 0.0
     for i in range(len(states)):
         s = states[i]
@@ -112,7 +116,7 @@ def share_flow(constants, states, pump, balance, h):
 
 
 @njit(cache=True)
-def meter_out(gain, pressure, pump):
+def meter_out(gain: float, pressure: float, pump: Pump) -> tuple[float, float]:
     """Flow out of a chamber through its compensated edge [m^3/s] and the slope over its pressure."""
     drop = pressure - pump.tank
     if drop <= 0.0:
@@ -123,7 +127,7 @@ def meter_out(gain, pressure, pump):
 
 
 @njit(cache=True)
-def port(pressure, pump):
+def port(pressure: float, pump: Pump) -> tuple[float, float]:
     """Flow into a chamber through its make-up or relief valve and the slope over its pressure."""
     if pressure < pump.tank:
         return VALVE_M3_S_PA * (pump.tank - pressure), VALVE_M3_S_PA
@@ -133,7 +137,21 @@ def port(pressure, pump):
 
 
 @njit(cache=True)
-def chamber(pressure, stiff, swept, inflow, source, out, out_slope, other, damp, hose, pump, balance, h):
+def chamber(
+    pressure: float,
+    stiff: float,
+    swept: float,
+    inflow: float,
+    source: float,
+    out: float,
+    out_slope: float,
+    other: float,
+    damp: float,
+    hose: float,
+    pump: Pump,
+    balance: Balance,
+    h: float,
+) -> float:
     """One chamber's pressure after ``h``; adds its energies to ``balance``.
 
     ``stiff``: h bulk / volume; ``swept``: flow that the piston takes; ``inflow`` comes at pressure ``source``; ``out``
@@ -160,7 +178,7 @@ def chamber(pressure, stiff, swept, inflow, source, out, out_slope, other, damp,
 
 
 @njit(cache=True)
-def end_stop(c, s):
+def end_stop(c: FunctionConstants, s: FunctionState) -> float:
     """Torque of the drive's own cushioned end stops [Nm, N]; it only pushes."""
     stiffness, damping = c.inertia * STOP_RAD_S**2, c.inertia * STOP_RAD_S
     if s.at < c.low:
@@ -171,7 +189,14 @@ def end_stop(c, s):
 
 
 @njit(cache=True)
-def advance_function(c, s, supply, pump, balance, h):
+def advance_function(
+    c: FunctionConstants,
+    s: FunctionState,
+    supply: float,
+    pump: Pump,
+    balance: Balance,
+    h: float,
+) -> tuple[float, float]:
     """One function over one substep; returns the joint torque [Nm, N] of its oil and that of its end stops."""
     a, b = s.pressure_a, s.pressure_b
     force = a * c.area_a - b * c.area_b
@@ -214,7 +239,7 @@ def advance_function(c, s, supply, pump, balance, h):
 
 
 @njit(cache=True)
-def look_up(c, table, q):
+def look_up(c: FunctionConstants, table: Array, q: float) -> tuple[float, float]:
     """(arm, travel from the lower end) of a lever at joint position ``q``; beyond its ends the arm stays."""
     at = (q - c.lever_low) / c.lever_step
     last = table.shape[1] - 2
@@ -227,8 +252,17 @@ def look_up(c, table, q):
 
 
 @njit(cache=True)
-def begin(c, s, table, q, qd, pump, balance, step_s):
-    """Take the joint's real state: correct the pressures by what the prediction missed."""
+def begin(
+    c: FunctionConstants,
+    s: FunctionState,
+    table: Array,
+    q: float,
+    qd: float,
+    pump: Pump,
+    balance: Balance,
+    step_s: float,
+) -> None:
+    """Adopt the joint's real state: correct the pressures by the error of the prediction."""
     balance.energy_out += s.driven * (q - s.q)
     s.arm, travel = look_up(c, table, q)
     missed = travel - s.travel
@@ -242,8 +276,14 @@ def begin(c, s, table, q, qd, pump, balance, step_s):
 
 
 @njit(cache=True)
-def cross_connect(left, right, constant, pump, h):
-    """Float valve of an axle: oil goes between the equal chambers of its two swing arms; returns the power lost [W]."""
+def cross_connect(
+    left: FunctionState,
+    right: FunctionState,
+    constant: FunctionConstants,
+    pump: Pump,
+    h: float,
+) -> float:
+    """Float valve of an axle: oil flows between equal chambers of its two swing arms; returns the power lost [W]."""
     stiff_a = stiff_b = 0.0
     for s in (left, right):
         stiff_a += h * pump.bulk / (constant.dead_volume + constant.area_a * s.travel)
@@ -257,7 +297,21 @@ def cross_connect(left, right, constant, pump, h):
 
 
 @njit(cache=True)
-def advance(constants, states, tables, lines, pumps, balances, floating, commands, q, qd, step_s, substeps, torques):
+def advance(
+    constants: Records,
+    states: Records,
+    tables: Array,
+    lines: Array,
+    pumps: Records,
+    balances: Records,
+    floating: int,
+    commands: Array,
+    q: Array,
+    qd: Array,
+    step_s: float,
+    substeps: int,
+    torques: Array,
+) -> float:
     """One physics step.  ``floating``: index of the left arm of the axle whose float valve is open, or -1."""
     pump, balance = pumps[0], balances[0]
     h = step_s / substeps

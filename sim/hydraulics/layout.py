@@ -1,13 +1,14 @@
-"""The arrays the kernel works on: one record of constants and one of state per function, one pair for the pump.
+"""The arrays of the kernel: one record of constants and one of state per function, one pair for the pump.
 
-Everything is float64 in SI units; the records' fields are the keys of ``sim.truth`` where they have the same meaning.
+Everything is float64 in SI units; fields have the names of the keys of ``sim.truth`` where they mean the same.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.truth.hydraulics import Function, Supply
 from sim.truth.load import Truth
@@ -15,42 +16,123 @@ from sim.truth.load import Truth
 SOFT_PA: Final = 0.2e6
 UNIT_PA: Final = 1.0e6
 LEVER_POINTS: Final = 129
-CUSHION: Final = 0.02  # the end stops give before the ends of the lever table [rad, m]
-OUT_OVER_IN: Final = 1.05  # metering out passes a little more than metering in brings, or back pressure would build up
+CUSHION: Final = 0.02  # the end stops begin before the ends of the lever table [rad, m]
+OUT_OVER_IN: Final = 1.05  # metering out passes a little more than metering in, or back pressure would build up
 
 
-def _record(names: str, *more: tuple[str, type]) -> np.dtype:
-    return np.dtype([(n, np.float64) for n in names.split()] + list(more))
+Array = NDArray[np.float64]
+Records = NDArray[np.void]
+"""Numpy records; the classes below name their fields and make their dtypes."""
 
 
-CONSTANTS: Final = _record(
-    "area_a area_b dead_volume coulomb stiction stribeck_speed viscous relaxation inertia "
-    "spool_rad_s spool_zeta half_play deadband_plus deadband_minus exponent limit_plus limit_minus check_ratio "
-    "in_plus in_minus out_plus out_minus lever_low lever_step stroke low high",
-    ("delay_steps", np.int64),
-)
-"""One function.  ``in_*`` and ``out_*``: flow [m^3/s] through the fully open edge per unit of ``kernel.orifice``."""
+class FunctionConstants(Protocol):
+    """One function.
 
-STATE: Final = _record(
-    "spool spool_speed play opening poppet pressure_a pressure_b hose_a hose_b arm travel speed outer "
-    "flow_a flow_b inflow at q qd torque driven",
-    ("line_at", np.int64),
-)
-"""One function.  ``travel``, ``at`` and ``speed`` run ahead within a step as predicted; ``q``, ``qd``, ``torque`` and
-its part ``driven`` by the oil are those of the last step; ``outer``: acceleration that the world gives the joint
-besides its drive; ``flow_*``: through the float valve; ``inflow``: from the pump.
-"""
+    ``in_*`` and ``out_*``: flow [m^3/s] through the fully open edge per unit of ``kernel.orifice``.
+    """
 
-PUMP: Final = _record("post flow margin relief shock tank build_up bulk leakage")
-"""Constants of the supply; ``post`` is 1 for a post-compensated valve block."""
+    area_a: float
+    area_b: float
+    dead_volume: float
+    coulomb: float
+    stiction: float
+    stribeck_speed: float
+    viscous: float
+    relaxation: float
+    inertia: float
+    spool_rad_s: float
+    spool_zeta: float
+    half_play: float
+    deadband_plus: float
+    deadband_minus: float
+    exponent: float
+    limit_plus: float
+    limit_minus: float
+    check_ratio: float
+    in_plus: float
+    in_minus: float
+    out_plus: float
+    out_minus: float
+    lever_low: float
+    lever_step: float
+    stroke: float
+    low: float
+    high: float
+    delay_steps: int
 
-BALANCE: Final = _record("supply limited energy_in energy_out loss peak")
-"""Pump pressure [Pa], whether flow runs short, energies [J] from pump and tank, to the joints and lost, highest chamber
-pressure [Pa].
-"""
+
+class FunctionState(Protocol):
+    """One function.
+
+    ``travel``, ``at`` and ``speed`` are predicted within a step; ``q``, ``qd``, ``torque`` and its part ``driven`` by
+    the oil are those of the last step; ``outer``: the joint's acceleration that its drive does not cause; ``flow_*``:
+    through the float valve; ``inflow``: from the pump.
+    """
+
+    spool: float
+    spool_speed: float
+    play: float
+    opening: float
+    poppet: float
+    pressure_a: float
+    pressure_b: float
+    hose_a: float
+    hose_b: float
+    arm: float
+    travel: float
+    speed: float
+    outer: float
+    flow_a: float
+    flow_b: float
+    inflow: float
+    at: float
+    q: float
+    qd: float
+    torque: float
+    driven: float
+    line_at: int
 
 
-def pump(supply: Supply) -> np.ndarray:
+class Pump(Protocol):
+    """Constants of the supply; ``post`` is 1 for a post-compensated valve block."""
+
+    post: float
+    flow: float
+    margin: float
+    relief: float
+    shock: float
+    tank: float
+    build_up: float
+    bulk: float
+    leakage: float
+
+
+class Balance(Protocol):
+    """Pump pressure [Pa], whether flow runs short, energies [J] from pump and tank, to the joints and lost, highest
+    chamber pressure [Pa].
+    """
+
+    supply: float
+    limited: float
+    energy_in: float
+    energy_out: float
+    loss: float
+    peak: float
+
+
+def _dtype(fields: type) -> np.dtype[np.void]:
+    """The dtype of a record with these fields, in their order."""
+    kinds = {"float": np.float64, "int": np.int64}
+    return np.dtype([(name, kinds[kind]) for name, kind in fields.__annotations__.items()])
+
+
+CONSTANTS: Final = _dtype(FunctionConstants)
+STATE: Final = _dtype(FunctionState)
+PUMP: Final = _dtype(Pump)
+BALANCE: Final = _dtype(Balance)
+
+
+def pump(supply: Supply) -> Records:
     """The one PUMP record."""
     s = supply
     post = float(s.sharing == "post_compensated")
@@ -58,7 +140,7 @@ def pump(supply: Supply) -> np.ndarray:
     return np.array([(*values, s.bulk_modulus_pa, s.leakage_m3_s_pa)], PUMP)
 
 
-def _lever(function: Function) -> tuple[np.ndarray, np.ndarray]:
+def _lever(function: Function) -> tuple[Array, Array]:
     """Lever arm dx/dq and piston travel from its lower end, on a uniform grid over the joint's positions."""
     c = function.cylinder
     q = np.linspace(c.arm_at[0], c.arm_at[-1], LEVER_POINTS)
@@ -67,7 +149,7 @@ def _lever(function: Function) -> tuple[np.ndarray, np.ndarray]:
     return arm, travel - travel.min()
 
 
-def functions(truth: Truth, step_s: float) -> tuple[np.ndarray, np.ndarray]:
+def functions(truth: Truth, step_s: float) -> tuple[Records, Array]:
     """CONSTANTS of every function, and their lever tables (function, arm or travel, grid)."""
     margin = truth.supply.pressure_margin_pa
     full = margin / np.sqrt(UNIT_PA * (margin + SOFT_PA))
@@ -108,6 +190,6 @@ def functions(truth: Truth, step_s: float) -> tuple[np.ndarray, np.ndarray]:
             "high": c.arm_at[-1] - CUSHION,
             "delay_steps": max(1, round(v.delay_s / step_s)),
         }
-        for key in CONSTANTS.names:
+        for key in CONSTANTS.names or ():
             r[key] = values[key]
     return records, tables

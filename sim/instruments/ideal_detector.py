@@ -1,4 +1,4 @@
-"""A detector that makes no mistakes: logs where they truly lie, in the crane's base frame."""
+"""An ideal log detector: the true poses of the logs in the crane's base frame, without error."""
 
 from __future__ import annotations
 
@@ -18,9 +18,7 @@ AHEAD_OF_FRONT_M: Final = 12.0
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """A log's number in the scene, its middle and the direction of its axis (a unit vector) in the crane's base frame,
-    and its size.
-    """
+    """Number of the log in the scene, its middle and unit axis in the crane's base frame, and its size."""
 
     id: int
     position_m: Vector
@@ -30,12 +28,12 @@ class Detection:
 
 
 def detect(plant: Plant) -> list[Detection]:
-    """Every log of the plant, in scene order.  The base frame moves and leans with a carrier."""
+    """All logs of the plant, in scene order.  The base frame moves and leans with a carrier."""
     logs = plant.logs()
     if plant.profile.carrier is None:
         return [Detection(i, log.position_m, log.axis, log.length_m, log.diameter_m) for i, log in enumerate(logs)]
     origin, turn = plant.base_pose()
-    rotation = quaternion_matrix(turn)  # of the base in the world, so that a row vector times it is in the base
+    rotation = quaternion_matrix(turn)  # base to world: a row vector times it is in the base frame
     return [
         Detection(
             i,
@@ -49,10 +47,10 @@ def detect(plant: Plant) -> list[Detection]:
 
 
 def detect_in_view(plant: Plant) -> list[Detection]:
-    """Those of them that cameras of a forwarder could see: round the crane, or before the front, a quarter wide."""
+    """The logs that the cameras of a forwarder could see: around the crane, or in a quarter ahead of the front half."""
     return [log for log in detect(plant) if _in_view(*log.position_m[:2])]
 
 
 def _in_view(x_m: float, y_m: float) -> bool:
-    """Whether a place in the base frame, which looks backwards, is in view."""
+    """Whether a place in the base frame, whose x axis points backwards, is in view."""
     return math.hypot(x_m, y_m) < AROUND_CRANE_M or (-AHEAD_OF_FRONT_M < x_m < 0.0 and abs(y_m) < -x_m)

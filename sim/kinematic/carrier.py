@@ -1,7 +1,7 @@
-"""A carrier that rolls without slip on a level plane: what the kinematic world has in place of the physical one.
+"""A carrier that rolls without slip on a level plane: the kinematic world's replacement for the physical carrier.
 
-Its speed follows the vehicle node within an acceleration, its heading the articulation; the heights of its arms raise
-it.  Frames and names as in `sim.mechanics.carrier`; SI units.
+Its speed follows the vehicle node with limited acceleration, its heading follows the articulation, and its height
+the arms.  Frames and names as in `sim.mechanics.carrier`; SI units.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ BRAKE_M_S2: Final = 3.0
 
 
 class RollingCarrier:
-    """``x_m``, ``y_m`` and ``heading_rad`` of the front axle; ``q`` holds the articulation and the arms."""
+    """``x_m``, ``y_m`` and ``heading_rad`` are of the front axle; ``q`` holds the articulation and the arms."""
 
     def __init__(self, carrier: Carrier, q: Mapping[str, float], qd: Mapping[str, float]) -> None:
         self._c, self._q, self._qd = carrier, q, qd
         self.x_m, self.y_m, self.heading_rad, self.speed_m_s = carrier.front_axle_m, 0.0, 0.0, 0.0
 
     def step(self, speed_m_s: float, brake: bool, step_s: float) -> None:
-        """One step towards a wanted speed of the front axle."""
+        """One step towards the requested speed of the front axle."""
         change = (BRAKE_M_S2 if brake else ACCELERATION_M_S2) * step_s
         wanted = 0.0 if brake else speed_m_s
         self.speed_m_s += max(-change, min(change, wanted - self.speed_m_s))
@@ -37,7 +37,7 @@ class RollingCarrier:
 
     @property
     def wheel_speeds_rad_s(self) -> tuple[float, ...]:
-        """All alike."""
+        """Equal for all wheels."""
         return (self.speed_m_s / self._c.wheel_radius_m,) * len(ARMS)
 
     @property
@@ -51,7 +51,7 @@ class RollingCarrier:
         return tuple(height_from_arm_angle(self._c, self._q[arm]) for arm in ARMS)
 
     def front_axle(self) -> Vector:
-        """Its middle, between the hubs."""
+        """Middle of the front axle, between the hubs."""
         return self.x_m, self.y_m, self._c.wheel_radius_m
 
     def attitude(self, half: str) -> Vector:
@@ -59,7 +59,7 @@ class RollingCarrier:
         return 0.0, 0.0, self.heading_rad - (self.articulation_rad if half == "rear" else 0.0)
 
     def pose(self, half: str) -> tuple[Vector, Quaternion]:
-        """Frame of ``rear`` or ``front`` in the world: both on the articulation's axis."""
+        """Frame of ``rear`` or ``front`` in the world: both lie on the articulation's axis."""
         ahead = self._c.front_axle_m
         up = pivot_height_m(self._c, sum(self.arm_heights_m) / len(ARMS))
         x, y = self.x_m - ahead * math.cos(self.heading_rad), self.y_m - ahead * math.sin(self.heading_rad)

@@ -1,7 +1,7 @@
 """A world without physics: every function moves exactly as its valve's map in the profile says, and the carrier rolls.
 
-What a calibration rig is to a machine: the same nodes on the same buses, for the cost of a few multiplications a step.
-The oil shows fixed pressures.  The tongs open and close with their times.
+It serves as a calibration rig: the same nodes on the same buses for a few multiplications per step.  The hydraulics
+show fixed pressures.  The grapple opens and closes with its times of the profile.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from sim.truth.load import Truth, load_truth
 REST_PA = 1.0e6
 PUMP_PA = 18.0e6
 START_SHARE = 0.5
-"""Share of its range at which every joint stands at the start; the boom is raised and bent there."""
+"""Share of its range at which every joint starts; the boom is raised and bent there."""
 
 
 class _FixedPressures:
-    """Fixed pressures; ``spools`` by function, -1..1."""
+    """Hydraulics with fixed pressures; ``spools`` by function, -1..1."""
 
     supply_pa = PUMP_PA
     energy_j = 0.0
@@ -45,7 +45,7 @@ class _ValveModel:
         self._line = deque([0.0] * max(1, round(valve.delay_s * 1e9 / step_ns)))
 
     def speed(self, command: float) -> float:
-        """Of the joint in this step; ``command`` is -1..1 of the spool."""
+        """Speed of the joint in this step; ``command`` is -1..1 of the spool."""
         self._line.append(command * self._sign)
         spool = self._line.popleft()
         dead = self._dead[spool > 0.0]
@@ -53,7 +53,7 @@ class _ValveModel:
 
 
 class KinematicWorld:
-    """Joints that integrate their valves (`sim.emulation.SensedWorld`)."""
+    """Joints that integrate their valves' speeds (`sim.emulation.SensedWorld`)."""
 
     def __init__(self, profile: Profile, truth: Truth, step_ns: int) -> None:
         self.profile, self.truth = profile, truth
@@ -83,7 +83,11 @@ class KinematicWorld:
         return 0.0, 0.0
 
     def step(self, commands: Sequence[float], speed_m_s: float = 0.0, brake: bool = True) -> None:
-        """One step; ``commands`` -1..1: `FUNCTIONS`, then on a carrier steering and `ARMS`; its wanted speed."""
+        """Advance by one step.
+
+        ``commands`` are -1..1: `FUNCTIONS`, then on a carrier steering and `ARMS`.  ``speed_m_s`` and ``brake`` are the
+        request to its drive.
+        """
         by_name = dict(zip(FUNCTIONS, commands, strict=False))
         self.hydraulics.spools = by_name
         if self.carrier is not None:
@@ -112,7 +116,7 @@ class KinematicWorld:
 
 
 class KinematicMachine(EmulatedMachine):
-    """Every node of a machine around a `KinematicWorld`."""
+    """All nodes of a machine around a `KinematicWorld`."""
 
     def __init__(
         self, profile: Profile, seed: int, truth: str = "nominal", *, step_ns: int, cycle_ns: int = CYCLE_NS
@@ -127,5 +131,5 @@ class KinematicMachine(EmulatedMachine):
         self.world.step(spools, *drive)
 
     def joint_positions(self) -> tuple[float, ...]:
-        """In ``Joint`` order [rad, m]; rot is kept within a turn by nobody."""
+        """In ``Joint`` order [rad, m]; the rotator's is not wrapped to one turn."""
         return tuple(self.world.q[j.name.lower()] for j in JOINTS)

@@ -1,10 +1,10 @@
 """The articulated carrier: rear half (root of the multibody, floating), front half and four swing arms with wheels.
 
-Frames: ``machine.geometry.carrier``.  The wheels' mass is on the arms; their spin and their contact with the ground are
-``sim.ground.tyre``'s, whose forces ``Carrier.apply`` puts on the arms for one physics step.  Bullet's own contact is kept
-for logs against wheels and frames, and for the frames' bellies against the ground.  Joint torques (steering, arms)
-come from the hydraulics.  The wheel motors share one pump: equal torque on all wheels, so they turn at their own
-speeds in a bend, with anti-spin for a wheel that has lost its grip.
+Frames: ``machine.geometry.carrier``.  The wheels' mass is on the arms; ``sim.ground.tyre`` computes their spin and
+their contact with the ground, and ``Carrier.apply`` puts the forces on the arms for one physics step.  Bullet's own
+contact serves logs against wheels and frames, and the frames' undersides against the ground.  Joint torques (steering,
+arms) come from the hydraulics.  The wheel motors share one pump: equal torque on all wheels, so they turn at their
+own speeds in a bend, with anti-spin for a wheel that has lost its grip.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from machine.geometry import carrier as geometry
+from machine.profile import Carrier as CarrierProfile
 from machine.profile import Profile
 from sim.bullet.client import BulletClient
 from sim.bullet.urdf import JointDef, LinkDef
@@ -37,7 +38,7 @@ POLYGON: Final = (0, 1, 3, 2)  # wheels clockwise seen from above: fl fr rr rl
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """Wanted speed of the front axle [m/s], + forwards; ``brake`` cuts the motors and locks the wheels."""
+    """Requested speed of the front axle [m/s], + forwards; ``brake`` cuts the motors and locks the wheels."""
 
     speed_m_s: float = 0.0
     brake: bool = False
@@ -46,8 +47,13 @@ class Drive:
 PARKED: Final = Drive(0.0, True)
 
 
-def _shapes(profile: Profile, link: str) -> tuple[Shape, ...]:
-    c = profile.carrier
+def _specified(profile: Profile, truth: Truth) -> tuple[CarrierProfile, CarrierTruth]:
+    """The carrier's profile and truth; only for a machine with a carrier."""
+    assert profile.carrier is not None and truth.carrier is not None
+    return profile.carrier, truth.carrier
+
+
+def _shapes(c: CarrierProfile, link: str) -> tuple[Shape, ...]:
     dark, green, rubber = (0.2, 0.2, 0.22), (0.18, 0.42, 0.22), (0.10, 0.10, 0.11)
     x, y, z = c.crane_base_m
     if link == "rear":
@@ -57,11 +63,11 @@ def _shapes(profile: Profile, link: str) -> tuple[Shape, ...]:
         )
     if link == "front":
         feet = ((p, 1.15 if p[0] > 0.65 else 0.28) for p in (c.antenna_main_m, c.antenna_aux_m))  # on hood or frame
-        masts = ((p[0], p[1], (p[2] + foot) / 2, p[2] - foot) for p, foot in feet)
+        masts = (((p[0], p[1], (p[2] + foot) / 2), p[2] - foot) for p, foot in feet)
         return (
             Shape(link, (2.75, 0.90, 0.33), (1.475, 0.0, 0.115), IDENTITY, dark),
             Shape(link, (2.10, 1.30, 0.87), (1.70, 0.0, 0.715), IDENTITY, green),
-            *(Shape(link, (0.05, 0.05, tall), at, IDENTITY, dark, False) for *at, tall in masts),
+            *(Shape(link, (0.05, 0.05, tall), at, IDENTITY, dark, False) for at, tall in masts),
         )
     ahead, inward = (1 if link[4] == "f" else -1), (-1 if link[5] == "l" else 1)
     beam = (c.arm_length_m + 0.20, *BEAM_M)
@@ -73,34 +79,36 @@ def _shapes(profile: Profile, link: str) -> tuple[Shape, ...]:
     return (Shape(link, beam, at, IDENTITY, dark), *(Shape(link, facet, hub, turn, rubber) for turn in turns))
 
 
-def _arm_link(profile: Profile, t: CarrierTruth, name: str) -> LinkDef:
-    """Arm as a beam and wheel as a disc.  The wheel's inertia about its axle is its spin's, not the arm's."""
-    length, mass = profile.carrier.arm_length_m, t.arm_mass_kg + t.wheel_mass_kg
+def _arm_link(c: CarrierProfile, t: CarrierTruth, name: str) -> LinkDef:
+    """Arm as a beam and wheel as a disc.  The wheel's inertia about its axle counts for its spin, not for the arm."""
+    length, mass = c.arm_length_m, t.arm_mass_kg + t.wheel_mass_kg
     com = (t.arm_mass_kg / 2 + t.wheel_mass_kg) / mass * length
     about = t.arm_mass_kg * (length**2 / 12 + (com - length / 2) ** 2) + t.wheel_mass_kg * (length - com) ** 2
-    across = t.wheel_spin_inertia_kg_m2 / 2 + t.wheel_mass_kg * profile.carrier.wheel_width_m**2 / 12
-    # With a beam that has no thickness the largest would be the sum of the others to the last bit, and rounding then
-    # makes a body that cannot be, which Bullet gives no inertia at all.
+    across = t.wheel_spin_inertia_kg_m2 / 2 + t.wheel_mass_kg * c.wheel_width_m**2 / 12
+    # With a beam of no thickness the largest inertia would equal the sum of the others to the last bit; rounding then
+    # makes an impossible body, to which Bullet gives no inertia at all.
     wide, high = (t.arm_mass_kg * side**2 / 12 for side in BEAM_M)
     inertia = (across + wide + high, about + high, across + about + wide)
     ahead = 1.0 if name[4] == "f" else -1.0
-    return LinkDef(name, mass, (ahead * com, 0.0, 0.0), inertia, _shapes(profile, name))
+    return LinkDef(name, mass, (ahead * com, 0.0, 0.0), inertia, _shapes(c, name))
 
 
 def carrier_links(profile: Profile, truth: Truth) -> tuple[list[LinkDef], list[JointDef]]:
     """CARRIER_LINKS (root first) and CARRIER_JOINTS of the machine's multibody; SI units."""
-    c, t = profile.carrier, truth.carrier
+    c, t = _specified(profile, truth)
     halves = zip(("rear", "front"), (t.rear, t.front), strict=True)
-    links = [LinkDef(n, f.mass_kg, f.com_m, f.inertia_kg_m2, _shapes(profile, n)) for n, f in halves]
+    links = [LinkDef(n, f.mass_kg, f.com_m, f.inertia_kg_m2, _shapes(c, n)) for n, f in halves]
     limit = c.articulation_limit_rad + STOP_MARGIN
     joints = [JointDef("articulation", "revolute", "rear", "front", lower=-limit, upper=limit)]
     low, high = (geometry.arm_angle_from_height(c, h) for h in (0.0, c.arm_travel_m))
     for name in geometry.ARMS:
-        links.append(_arm_link(profile, t, name))
+        links.append(_arm_link(c, t, name))
         parent, axis = ("front", 1.0) if name[4] == "f" else ("rear", -1.0)
         at = geometry.arm_pivot_m(c, name)
-        stops = {"lower": low - STOP_MARGIN, "upper": high + STOP_MARGIN}
-        joints.append(JointDef(name, "revolute", parent, name, origin_m=at, axis=(0.0, axis, 0.0), **stops))
+        lower, upper = low - STOP_MARGIN, high + STOP_MARGIN
+        joints.append(
+            JointDef(name, "revolute", parent, name, origin_m=at, axis=(0.0, axis, 0.0), lower=lower, upper=upper)
+        )
     return links, joints
 
 
@@ -122,7 +130,7 @@ class Carrier:
     ) -> None:
         self._p, self._body, self._terrain = client, body, terrain
         self._step_s: float = client.getPhysicsEngineParameters()["fixedTimeStep"]
-        self._c, self._t = profile.carrier, truth.carrier
+        self._c, self._t = _specified(profile, truth)
         self._index = {name: index[name] for name in CARRIER_JOINTS}
         self._arms = [index[name] for name in geometry.ARMS]
         self._com = self._t.rear.com_m
@@ -182,7 +190,7 @@ class Carrier:
         self._reference = self._torque = self._brake = 0.0
 
     def apply(self, drive: Drive) -> None:
-        """Put the tyres' forces of the next physics step on the arms and turn the wheels."""
+        """Apply the tyres' forces of the next physics step to the arms and turn the wheels."""
         p, body, h, t = self._p, self._body, self._step_s, self._t
         wanted = 0.0 if drive.brake else drive.speed_m_s
         ramp = t.drive_acceleration_m_s2 * h
@@ -236,7 +244,8 @@ class Carrier:
     def _hub_at(self, arm: str) -> Vector:
         at, turn = self.pose(arm)
         hub = self._hub[geometry.ARMS.index(arm)]
-        return self._p.multiplyTransforms(at, turn, [hub, 0.0, 0.0], IDENTITY)[0]
+        position: Vector = self._p.multiplyTransforms(at, turn, [hub, 0.0, 0.0], IDENTITY)[0]
+        return position
 
     @property
     def speed_m_s(self) -> float:
@@ -244,16 +253,18 @@ class Carrier:
         s = self._p.getLinkState(
             self._body, self._index["articulation"], computeLinkVelocity=1, computeForwardKinematics=1
         )
-        # Going from the frame's origin to the axle, along x, changes nothing.
+        # The speed along x is the same at the frame's origin and at the axle.
         axes, (dx, dy, dz) = self._p.getMatrixFromQuaternion(s[5]), (a - b for a, b in zip(s[4], s[0], strict=True))
         (wx, wy, wz), (vx, vy, vz) = s[7], s[6]
         vx, vy, vz = vx + wy * dz - wz * dy, vy + wz * dx - wx * dz, vz + wx * dy - wy * dx
-        return vx * axes[0] + vy * axes[3] + vz * axes[6]
+        speed: float = vx * axes[0] + vy * axes[3] + vz * axes[6]
+        return speed
 
     @property
     def articulation_rad(self) -> float:
         """Angle of the front against the rear, + left [rad]."""
-        return self._p.getJointState(self._body, self._index["articulation"])[0]
+        angle: float = self._p.getJointState(self._body, self._index["articulation"])[0]
+        return angle
 
     def attitude(self, link: str) -> Vector:
         """Roll (+ left side up), pitch (+ nose down) and heading (0 = east, + left) of a link [rad]."""
@@ -304,9 +315,8 @@ class Carrier:
     def tip_margin_m(self) -> float:
         """Distance [m] of the centre of pressure from the nearest edge of the polygon of the wheels' contacts.
 
-        Positive: inside, the machine stands.  0: all load is on the two wheels of one edge (or none is carried), the
-        machine is tipping over it.  Dynamics and whatever the crane carries are in it; it is the load that wheel
-        load cells would show.
+        Positive: inside, the machine stands.  0: all load is on the two wheels of one edge (or none is carried), and
+        the machine is tipping over it.  It includes dynamics and the crane's load, as wheel load cells would.
         """
         points = self._contacts.tolist()
         total = sum(point[3] for point in points)

@@ -1,7 +1,8 @@
-"""The column that gives way: two sprung hinges under the mast, which no encoder sees (docs/reference/plant-model.md section 2).
+"""The elastic column: two sprung hinges under the mast, which no encoder measures
+(docs/reference/plant-model.md section 2).
 
 The encoders are zeroed, and the crane is levelled, at the home pose with an empty grapple: there the column stands
-plumb.  So the springs' rest angles carry that pose's weight, and elsewhere the tip sags against what encoders say.
+plumb.  The springs' rest angles carry that pose's weight, and elsewhere the tip sags against the encoders' reading.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from sim.truth.body import Structure
 
 
 class Column:
-    """Spring and damper of ``flex_pitch`` and ``flex_roll``; ``home_moments``: those of the weight at home [Nm]."""
+    """Spring and damper of ``flex_pitch`` and ``flex_roll``; ``home_moments``: moments of the weight at home [Nm]."""
 
     def __init__(self, structure: Structure, home_moments: Sequence[float]) -> None:
         self._k = (structure.flex_pitch_nm_rad, structure.flex_roll_nm_rad)
@@ -20,7 +21,7 @@ class Column:
         self._rest = tuple(-moment / k for moment, k in zip(home_moments, self._k, strict=True))
 
     def torques(self, angles: Sequence[float], rates: Sequence[float], extra_s: float = 0.0) -> list[float]:
-        """Torques [Nm] on flex_pitch and flex_roll; ``extra_s`` adds to damper over spring."""
+        """Torques [Nm] on flex_pitch and flex_roll; ``extra_s`` adds to the ratio of damper to spring."""
         d = self._damping_s + extra_s
         springs = zip(angles, self._rest, rates, self._k, strict=True)
         return [-k * (x - rest + d * v) for x, rest, v, k in springs]

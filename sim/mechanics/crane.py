@@ -1,9 +1,10 @@
 """The crane as links and joints of a multibody, from the profile's geometry and the truth's masses.
 
-Joint table: docs/reference/machines.md sections 1.1 and 1.2 (palms), 2 (aoro).  From ``turntable`` upwards every link frame has y along the
-reach, x to the right, z up; pitch axes are +x, and the Denavit-Hartenberg numbers of the profile determine the joint
-origins, so the plant's rigid kinematics equal the profile's exactly.  Above the slew bearing the column gives way on
-two hinges, ``flex_pitch`` (x) and ``flex_roll`` (y), which no encoder sees (docs/reference/plant-model.md section 2).  Hanger and fork swing freely.
+Joint table: docs/reference/machines.md sections 1.1 and 1.2 (palms), 2 (aoro).  From ``turntable`` upwards every link
+frame has y along the reach, x to the right, z up; pitch axes are +x, and the Denavit-Hartenberg numbers of the profile
+determine the joint origins, so the plant's rigid kinematics equal the profile's exactly.  Above the slew bearing the
+column bends on two hinges, ``flex_pitch`` (x) and ``flex_roll`` (y), which no encoder measures
+(docs/reference/plant-model.md section 2).  Hanger and fork swing freely.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Final
 
 from machine.profile import Kinematics, Profile
 from sim.bullet.urdf import JointDef, LinkDef
+from sim.errors import PlantError
 from sim.geometry.shape import IDENTITY, Shape, Vector, rpy_quaternion
 from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, jaw_geometry
 from sim.truth.load import Truth
@@ -29,14 +31,16 @@ CRANE_LINKS: Final = (
 )
 STOP_MARGIN: Final = 0.03  # hard stops: a little outside the working range, behind the cylinders' cushions [rad, m]
 FLEX_STOP_RAD: Final = 0.15
-# Links that the tables of masses do not know: mass [kg] and principal inertia [kg m^2] of small steel parts.
+# Links without an entry in the tables of masses: mass [kg] and principal inertia [kg m^2] of small steel parts.
 SMALL_LINKS: Final = {"base": (100.0, 5.0), "turntable": (15.0, 0.5), "flexure": (5.0, 0.1)}
 
 
 @dataclass(frozen=True, slots=True)
 class SteelDimensions:
-    """Steel that the profile does not tell.  ``telescope_frame_m``: its link frame at 0 in the stick's; None: where
-    the telescope's axis passes the stick pin.  ``beam_m``: width and height of boom, stick and telescope.
+    """Dimensions of the steel that are not in the profile.
+
+    ``telescope_frame_m``: its link frame at 0 in the stick's; None: where the telescope's axis passes the stick pin.
+    ``beam_m``: width and height of boom, stick and telescope.
     """
 
     bearing_z_m: float
@@ -55,7 +59,10 @@ STEEL_DIMENSIONS: Final = {
 
 def _steel_dimensions(profile: Profile) -> SteelDimensions:
     if profile.name not in STEEL_DIMENSIONS:
-        raise ValueError(f"the plant knows no steel of machine {profile.name!r}; use a profile of {', '.join(STEEL_DIMENSIONS)}")
+        raise PlantError(
+            "plant.unknown-machine",
+            f"the plant has no steel dimensions for machine {profile.name!r}; use {', '.join(STEEL_DIMENSIONS)}",
+        )
     return STEEL_DIMENSIONS[profile.name]
 
 
@@ -92,7 +99,9 @@ def crane_shapes(profile: Profile) -> list[Shape]:
     pedestal = ((wide, wide, build.bearing_z_m - foot), (0.0, 0.0, (build.bearing_z_m + foot) / 2))
     return [
         Shape("base", *pedestal, IDENTITY, dark, False),
-        Shape("mast", (build.column_m, build.column_m, pivot + 0.05), (0, k.a1_m / 2, pivot / 2), IDENTITY, steel, False),
+        Shape(
+            "mast", (build.column_m, build.column_m, pivot + 0.05), (0, k.a1_m / 2, pivot / 2), IDENTITY, steel, False
+        ),
         Shape("boom", (boom_x, k.a2_m, boom_z), (0, k.a2_m / 2, 0), IDENTITY, yellow),
         Shape("stick", (stick[0], length, stick[1]), middle, tilted, yellow),
         Shape("telescope", (inner[0], length, inner[1]), (0, tube[1] - frame[1], tube[2] - frame[2]), tilted, steel),
@@ -156,7 +165,7 @@ def _joints(profile: Profile) -> list[JointDef]:
 
 
 def rigid_pin(joints: Sequence[JointDef], q: Mapping[str, float]) -> Vector:
-    """The hanger pin in the base frame with the column straight, by walking the joint table."""
+    """The hanger pin in the base frame with a straight column, computed along the joint table."""
     at, (rx, ry, rz) = (0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # columns of the rotation
     for joint in joints:
         x, y, z = joint.origin_m

@@ -1,8 +1,9 @@
-"""The grapple's steel: tong geometry fitted to the profile's table, boxes of tongs and rotator (docs/reference/machines.md section 1.5).
+"""The grapple's steel: jaw geometry fitted to the profile's table, boxes of jaws and rotator
+(docs/reference/machines.md section 1.5).
 
-A tong is a straight chord from pivot to tip in the plane of its motion; at angle 0 (fully open) the chord leaves the
-pivot outward and down.  The tongs interleave: two blades left, one right, all with cross plates, so that a log cannot
-wedge between the blades.  Links: tong frames at the pivots, z up, tips at -z; the rotator frame at its joint.
+A jaw is a straight chord from pivot to tip in the plane of its motion; at angle 0 (fully open) the chord points
+outward and down from the pivot.  The jaws interleave: two blades left, one right, all with cross plates, so that a log
+cannot wedge between the blades.  Links: jaw frames at the pivots, z up, tips at -z; the rotator frame at its joint.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from machine.profile import Kinematics, Profile
 from sim.geometry.shape import IDENTITY, Shape, Vector, rpy_quaternion
 
 PIVOT_Y_M = -0.0193
-PALMS_CHORD_M = 0.648  # blades, widths and beam below are those of this grapple; others are scaled by their chord
+PALMS_CHORD_M = 0.648  # blades, widths and beam below belong to this grapple; others are scaled by their chord
 # (along, across) the chord from pivot to tip, in chord lengths: a claw, bulging outward.
 POLYLINE = ((0.0, 0.0), (0.06, 0.13), (0.29, 0.205), (0.585, 0.20), (0.85, 0.12), (1.0, 0.0))
-PLATE_M = (0.035, 0.035, 0.035, 0.03, 0.022)  # per segment: the tips are sharp, so that they get under a thin log
+PLATE_M = (0.035, 0.035, 0.035, 0.03, 0.022)  # per segment: the tips are sharp to get under a thin log
 
 
 @dataclass(frozen=True, slots=True)
 class JawGeometry:
-    """Pivots at (-+pivot_x_m, -pivot_z_m) of the rotator frame; tips at (-+out_m, -down_m) of the open tong frames."""
+    """Pivots at (-+pivot_x_m, -pivot_z_m) of the rotator frame; tips at (-+out_m, -down_m) of the open jaw frames."""
 
     pivot_x_m: float
     pivot_z_m: float
@@ -70,15 +71,15 @@ def _solve3(m: list[list[float]], y: Sequence[float]) -> tuple[float, float, flo
 
 
 def jaw_points(tongs: JawGeometry, side: int) -> list[tuple[float, float]]:
-    """Polyline (x, z) [m] of a tong in its link frame at angle 0; side -1 left, +1 right."""
+    """Polyline (x, z) [m] of a jaw in its link frame at angle 0; side -1 left, +1 right."""
     x, z = tongs.out_m, tongs.down_m
     return [(side * (a * x + b * z), -a * z + b * x) for a, b in POLYLINE]
 
 
 def grapple_shapes(profile: Profile) -> list[Shape]:
-    """Boxes of fork, rotator and tongs.
+    """Boxes of fork, rotator and jaws.
 
-    The beam between the pivots is slim and stands above them: the claw's throat is the room a thick log needs.
+    The beam between the pivots is slim and lies above them, because a thick log needs the room between the jaws.
     """
     k: Kinematics = profile.kinematics
     tongs = jaw_geometry(profile)

@@ -1,6 +1,6 @@
 """The hand levers on the valve block and in the cab: they move a machine whose controller is silent.
 
-A pulled lever acts for 0.3 s and must be pulled again, as a hand that holds it would.
+A pulled lever acts for 0.3 s; holding it takes repeated pulls.
 """
 
 from __future__ import annotations
@@ -9,12 +9,14 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from sim.errors import PlantError
+
 LEVER_HOLD_NS: Final = 300_000_000
 DRIVE: Final = "drive"
 
 
 class HandLevers:
-    """Levers of the functions, and ``DRIVE`` where the machine can drive.  Positions are -1..1."""
+    """Levers of the functions, and ``DRIVE`` on a machine that drives.  Positions are -1..1."""
 
     def __init__(self, functions: Sequence[str], drives: bool) -> None:
         self.names = (*functions, DRIVE) if drives else tuple(functions)
@@ -22,11 +24,15 @@ class HandLevers:
         self._at = dict.fromkeys(self.names, 0.0)
 
     def pull(self, name: str, value: float, now_ns: int) -> None:
-        """Hold a lever at ``value`` from now on; ValueError for a lever or a position that does not exist."""
+        """Hold a lever at ``value`` for LEVER_HOLD_NS.
+
+        Raises:
+            PlantError: there is no such lever, or the position is outside -1..1.
+        """
         if name not in self._at:
-            raise ValueError(f"no lever is called {name!r}; there are {', '.join(self.names)}")
+            raise PlantError("lever.unknown", f"there is no lever {name!r}; use one of {', '.join(self.names)}")
         if not math.isfinite(value) or abs(value) > 1.0:
-            raise ValueError(f"a lever stands between -1 and 1, not at {value}")
+            raise PlantError("lever.out-of-range", f"lever position {value} is outside -1..1")
         self._at[name], self._until_ns[name] = value, now_ns + LEVER_HOLD_NS
 
     def held(self, now_ns: int) -> dict[str, float]:

@@ -1,9 +1,9 @@
 """The swing-arm controller (source address 30h): spool commands of the four arms and the two float valves.
 
-The spools follow ArmCmdA and the float valves ArmCmdB while both (E2E good, ArmKey 0xA) are at most 100 ms old and
+The spools follow ArmCmdA and the float valves ArmCmdB while both (E2E valid, ArmKey 0xA) are at most 100 ms old and
 the emergency stop is released.  Otherwise the arms hold: spools neutral, float valves closed.  A loss while active,
 and a command that opens both float valves (which would let the machine roll), are a fault until fresh frames disarm.
-It reports the heights, which the controller's own loop closes on.
+The node reports the heights on which the controller closes its loop.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ class ArmState(IntEnum):
 
 
 class ArmNode(J1939Node):
-    """``spools`` (-1..1, + raises the frame; fl fr rl rr), ``float_front`` and ``float_rear`` are its outputs now; the
-    plant fills ``heights_mm`` relative to mid travel, ``roll_deg`` (+ right side down) and ``pitch_deg`` (+ nose up).
+    """The present outputs are ``spools`` (-1..1, + raises the frame; fl fr rl rr), ``float_front`` and ``float_rear``.
+
+    The plant sets ``heights_mm`` relative to mid travel, ``roll_deg`` (+ right side down), ``pitch_deg`` (+ nose up).
     """
 
     def __init__(self, machine: Database, outbox: Outbox, pilot_on: Callable[[], bool]) -> None:

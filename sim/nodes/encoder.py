@@ -13,6 +13,7 @@ from collections import deque
 from pathlib import Path
 
 import canopen
+from canopen.network import PeriodicMessageTask
 from canopen.objectdictionary import ODVariable
 
 import can_dbc
@@ -32,8 +33,8 @@ TIMESTAMP_NS = 1_000  # the device's time stamp counts microseconds modulo 2**16
 Pdo = tuple[int, int, list[tuple[tuple[int, int], int, int]], int]
 
 
-class _Periodic:
-    """What ``Network.send_periodic`` returns: the library's heartbeat, on virtual time."""
+class _Periodic(PeriodicMessageTask):
+    """The library's periodic task (its heartbeat) on virtual time; the base's own bus task is never started."""
 
     def __init__(self, network: VirtualNetwork, can_id: int, data: bytes, period: float) -> None:
         self._network, self._id, self._data = network, can_id, bytes(data)
@@ -53,7 +54,7 @@ class _Periodic:
 
 
 class VirtualNetwork(canopen.Network):
-    """The canopen library without bus, thread and clock: sends into an outbox, is fed by ``notify``."""
+    """The canopen library without bus, thread and clock: sends into an outbox, receives by ``notify``."""
 
     def __init__(self, outbox: Outbox) -> None:
         super().__init__(None)
@@ -71,7 +72,7 @@ class VirtualNetwork(canopen.Network):
 
 
 class EncoderNode:
-    """One encoder.  ``observe`` feeds the true position every physics step; ``set_alarm`` breaks or repairs it."""
+    """One encoder.  ``observe`` feeds the true position every physics step; ``set_alarm`` sets or clears a failure."""
 
     def __init__(
         self, name: str, spec: Encoder, truth: EncoderTruth, step_ns: int, seed: int, network: VirtualNetwork
@@ -87,8 +88,8 @@ class EncoderNode:
         # The library's SDO server answers a malformed first request with the index of the request before it.
         self.node.sdo._index = self.node.sdo._subindex = 0
         self.node.sdo._buffer = bytearray()
-        self.node.add_read_callback(self._read)
-        self.node.add_write_callback(self._written)
+        self.node.add_read_callback(self._read)  # type: ignore[no-untyped-call]
+        self.node.add_write_callback(self._written)  # type: ignore[no-untyped-call]
         self._pdo: Pdo | None = None
         network.add_node(self.node)
         self._booted = False
@@ -100,7 +101,7 @@ class EncoderNode:
         self._speed = speed
 
     def measure(self, now_ns: int) -> float:
-        """The position it reads now, with all its errors [rad or m]."""
+        """Its present reading, with all its errors [rad or m]."""
         self._sample(now_ns)
         return position_from_counts(self.spec, self._values[0x6004, 0])
 
@@ -157,7 +158,7 @@ class EncoderNode:
         self._network.send_message(cob & 0x7FF, payload.to_bytes(length, "little"))
 
     def _read_pdo(self) -> Pdo:
-        """TPDO1 as configured; what does not fit into eight bytes is left out."""
+        """TPDO1 as configured; objects beyond eight bytes are left out."""
         get = self.node.get_data
         mapping, shift = [], 0
         for i in range(1, get(0x1A00, 0)[0] + 1):
@@ -204,7 +205,7 @@ class EncoderBus:
             self._network.notify(key, bytearray(data), now_ns * 1e-9)
 
     def tick(self, now_ns: int) -> None:
-        """Boots and heartbeats."""
+        """Boot-ups and heartbeats."""
         self._network.now_ns = now_ns
         for encoder in self.encoders.values():
             encoder.tick(now_ns)

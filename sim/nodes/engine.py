@@ -1,4 +1,4 @@
-"""The diesel engine (source address 00h): EEC1, CCVS and DM1 as J1939-71/73 lay them out.
+"""The diesel engine (source address 00h): EEC1, CCVS and DM1 in the layout of J1939-71/73.
 
 It runs at one working speed and droops under the hydraulic load.  ``set_trouble`` puts a code into DM1.
 """
@@ -22,19 +22,23 @@ KM_H = 3.6
 
 
 class EngineNode(J1939Node):
-    """The plant fills ``energy_j`` (hydraulic, since the start), ``speed_m_s``, ``brake``."""
+    """The plant sets ``energy_j`` (hydraulic, since the start), ``speed_m_s``, ``brake``."""
 
     def __init__(self, machine: Database, outbox: Outbox) -> None:
         super().__init__(ADDRESS, 0, machine, outbox)
         self._eec1, self._ccvs, self._dm1 = (machine.message(n) for n in ("EEC1", "CCVS", "DM1"))
-        self._fast, self._medium, self._slow = PeriodicTimer(CYCLE_NS), PeriodicTimer(100 * MS, 10 * MS), PeriodicTimer(1000 * MS, 30 * MS)
+        self._fast, self._medium, self._slow = (
+            PeriodicTimer(CYCLE_NS),
+            PeriodicTimer(100 * MS, 10 * MS),
+            PeriodicTimer(1000 * MS, 30 * MS),
+        )
         self.energy_j = self.speed_m_s = 0.0
         self.brake = True
         self._last_j = self._load = 0.0
         self._trouble = (0, 0)
 
     def set_trouble(self, spn: int, fmi: int) -> None:
-        """A suspect parameter and how it fails, with the amber lamp; (0, 0): none."""
+        """A suspect parameter number and failure mode, with the amber lamp; (0, 0): none."""
         self._trouble = (spn, fmi)
 
     def cycle(self, now_ns: int) -> None:

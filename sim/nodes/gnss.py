@@ -1,8 +1,9 @@
 """The GNSS receiver (source address 1Ch): two antennas, RTK, NMEA 2000 with fast packets.
 
-Every 50 ms it measures (its epoch); what is due then is sent 50 to 100 ms later.  Position is that of the true main
-antenna, heading the azimuth from main to auxiliary antenna less its azimuth in the profile's front frame.  Velocity
-and rate of turn are means over the last epoch.  UTC is a fixed epoch plus virtual time, so equal runs give equal bytes.
+Every 50 ms it measures (its epoch); the messages due then are sent 50 to 100 ms later.  Position is that of the true
+main antenna, heading the azimuth from main to auxiliary antenna minus its azimuth in the profile's front frame.
+Velocity and rate of turn are means over the last epoch.  UTC is a fixed epoch plus virtual time, so equal runs give
+equal bytes.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ class GnssNode(J1939Node):
         self.jump_m = (0.0, 0.0)
 
     def set_fix(self, fix: Fix) -> None:
-        """Sky and corrections are now good for this quality; NONE: no position, velocity or heading."""
+        """Set the quality that sky and corrections allow; NONE: no position, velocity or heading."""
         self.fix = fix
 
     def cycle(self, now_ns: int) -> None:
@@ -99,7 +100,7 @@ class GnssNode(J1939Node):
                 self.outbox += sent
 
     def _measure(self, now_ns: int) -> None:
-        """One epoch: feel the antennas, and queue the messages that are due."""
+        """One epoch: measure the antennas, and queue the messages that are due."""
         gauss, t = self._rng.gauss, self._truth
         place, turn = self._front_pose()
         main, aux = _sum(place, _turned(turn, self._main)), _sum(place, _turned(turn, self._aux))
@@ -140,7 +141,7 @@ class GnssNode(J1939Node):
         self._pending.append((now_ns + round(self._rng.uniform(*t.latency_s) * 1e9), out))
 
     def _position(self, antenna: Vector) -> tuple[float, float, float] | tuple[None, None, None]:
-        """Latitude, longitude and height as measured; draws the same numbers whatever the fix."""
+        """Measured latitude, longitude and height; draws the same random numbers for every fix."""
         noise = [self._rng.gauss(0.0, 1.0) for _ in range(3)]
         if not self.fix:
             return None, None, None

@@ -1,8 +1,8 @@
 """An inertial sensor on the grapple: lean against the vertical and its rate, in the crane's plane and across it.
 
-What a MEMS gyroscope and accelerometer with a filter of their own send: both angles with a fixed error of mounting and
-filter, white noise on angles and rates, all of it late.  The numbers are assumed.  Noise comes from a stream of random
-numbers of its own, so that a machine with the sensor differs from one without it by nothing else.
+It models a MEMS gyroscope and accelerometer with a built-in filter: both angles with a fixed mounting and filter
+error, white noise on angles and rates, all delayed.  The numbers are assumed.  Noise comes from a random stream of its
+own, so a machine with the sensor differs from one without it in nothing else.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ImuNode(Device):
         self._history: deque[Pair] = deque(maxlen=2 + max(0, round(LATENCY_NS / step_ns)))
         self._mounting = (self._rng.gauss(0.0, MOUNTING_RAD), self._rng.gauss(0.0, MOUNTING_RAD))
         self.silent = False
-        """Its cable is cut: it sends nothing any more."""
+        """Its cable is cut: it sends nothing."""
 
     def observe(self, lean_rad: Pair) -> None:
         """True lean at the end of a step."""

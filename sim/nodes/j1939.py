@@ -1,7 +1,7 @@
-"""What the nodes of mach0 share: a fixed source address, claimed by NAME (J1939-81), and PGN-matched frames.
+"""The base of the nodes of mach0: a fixed source address, claimed by NAME (J1939-81), and PGN-matched frames.
 
 A node claims at power-on (PGN 60928), answers requests for its claim (PGN 59904), defends its address against a NAME
-of lower priority (a greater number), and falls silent for good when it loses: it then says so from address 254.
+of lower priority (a greater number), and falls silent for good when it loses: it then reports so from address 254.
 Addresses below 128 need no waiting time after the claim (J1939-81, 4.4.3.3).
 """
 
@@ -12,14 +12,14 @@ from can_dbc.protocols.nmea2000 import BROADCAST, encode, frames, split_id
 from sim.nodes import Outbox
 
 CLAIM_PGN, REQUEST_PGN = 60928, 59904
-ADDRESS_FORMATS = (REQUEST_PGN >> 8, CLAIM_PGN >> 8)  # the byte of the identifier that tells these two
+ADDRESS_FORMATS = (REQUEST_PGN >> 8, CLAIM_PGN >> 8)  # the byte of the identifier that marks these two
 NULL_ADDRESS = 254
 NO_MANUFACTURER = 2047  # none is assigned to this project
 FORESTRY, MARINE = 2, 4  # industry groups
 
 
 class J1939Node:
-    """One node; ``address_lost`` once another node has its address."""
+    """One node; ``address_lost`` is set once another node has its address."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class J1939Node:
             self._send_claim()
 
     def tick(self, now_ns: int) -> None:
-        """Claim at power-on, then what the node sends by itself."""
+        """Claim at power-on, then the periodic frames."""
         if not self._claimed:
             self._claimed = True
             self._send_claim()

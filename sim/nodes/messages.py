@@ -1,4 +1,4 @@
-"""What every emulated node needs for its frames: periods on virtual time, and the two ends of an E2E message."""
+"""Shared by all emulated nodes: periods on virtual time, and the two ends of an E2E-protected message."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 from can_dbc.dbc.codec import Database, FrameRefused
 from can_dbc.protocols.e2e import Checker, Sender
+from sim.errors import PlantError
 
 MS = 1_000_000
 ARM_KEY = 0xA
@@ -18,7 +19,7 @@ class PeriodicTimer:
         self._period, self._next = period_ns, phase_ns
 
     def due(self, now_ns: int) -> bool:
-        """Whether the period has come round since the last call; a late caller gets one, not a burst."""
+        """Whether the period has elapsed since the last call; a late caller gets one, not a burst."""
         if now_ns < self._next:
             return False
         self._next += self._period * max(1, -(-(now_ns - self._next + 1) // self._period))
@@ -26,12 +27,16 @@ class PeriodicTimer:
 
 
 class ProtectedMessage:
-    """Encodes one E2E message of the DBC; values in signal order without Crc and Counter, None: not available."""
+    """Encodes one E2E message of the DBC; values in signal order without Crc and Counter, None: not available.
+
+    Raises:
+        PlantError: the message has no E2E Data IDs.
+    """
 
     def __init__(self, database: Database, name: str) -> None:
         codec = database.message(name)
         if codec.data_ids is None:
-            raise ValueError(f"{name} in the DBC has no E2E Data IDs")
+            raise PlantError("plant.message-without-e2e", f"{name} in the DBC has no E2E Data IDs; add them")
         self.key, self._encode, self._sender = codec.key, codec.encode, Sender(codec.data_ids)
 
     def frame(self, *values: float | None) -> tuple[int, bytes]:
@@ -40,24 +45,28 @@ class ProtectedMessage:
 
 
 class ProtectedInput:
-    """The newest good frame of one received E2E message of the DBC; ``counter`` is its counter."""
+    """The newest valid frame of one received E2E message of the DBC; ``counter`` is its counter.
+
+    Raises:
+        PlantError: the message has no E2E Data IDs.
+    """
 
     def __init__(self, database: Database, name: str) -> None:
         codec = database.message(name)
         if codec.data_ids is None:
-            raise ValueError(f"{name} in the DBC has no E2E Data IDs")
+            raise PlantError("plant.message-without-e2e", f"{name} in the DBC has no E2E Data IDs; add them")
         self.key, self._receive, self._index = codec.key, codec.receive, codec.index
         self._checker = Checker(codec.data_ids)
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, as after a restart."""
+        """Discard all state, as after a restart."""
         self._checker.reset()
         self.values: tuple[Any, ...] | None = None
         self.stamp_ns = self.counter = 0
 
     def accept(self, data: bytes, now_ns: int) -> bool:
-        """Whether the frame was accepted."""
+        """Whether the frame was valid and accepted."""
         if not self._checker.check(data).usable:
             return False
         try:
@@ -68,7 +77,7 @@ class ProtectedInput:
         return True
 
     def fresh(self, now_ns: int, limit_ns: int) -> bool:
-        """Whether the newest good frame is at most ``limit_ns`` old."""
+        """Whether the newest valid frame is at most ``limit_ns`` old."""
         return self.values is not None and now_ns - self.stamp_ns <= limit_ns
 
     def last(self, count: int) -> tuple[Any, ...]:
@@ -76,6 +85,6 @@ class ProtectedInput:
         return (None,) * count if self.values is None else self.values[-count:]
 
     def get(self, signal: str) -> float:
-        """A signal of the newest frame, 0 when it is unknown or not available."""
+        """A signal of the newest frame, 0 when unknown or not available."""
         value = None if self.values is None else self.values[self._index[signal]]
         return 0.0 if value is None else value

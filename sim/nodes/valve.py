@@ -1,6 +1,6 @@
-"""The valve node (PLC, 10h): takes ValveCmdA/B, gives spool commands; safe by absence.
+"""The valve node (PLC, 10h): receives ValveCmdA/B and sets spool commands; without valid commands it is neutral.
 
-The spools follow only while ValveCmdA, ValveCmdB (E2E good, ArmKey 0xA) and GuardStat (Enable 0xA) are at most
+The spools follow only while ValveCmdA, ValveCmdB (E2E valid, ArmKey 0xA) and GuardStat (Enable 0xA) are at most
 50 ms old, SYNC at most three cycles old and the pilot supply is on.  Lost while active: ramp to neutral in 60 ms,
 state FAULT until a fresh frame disarms; 300 ms without commands: pilot off.  The grapple never opens on a loss.  A
 disarm is neutral at once.
@@ -66,7 +66,10 @@ class GrappleState(IntEnum):
 
 @dataclass(slots=True)
 class ValveInputs:
-    """What the node's own inputs show: spools -1..1 in FUNCTIONS order and the grapple's sensors, None without one."""
+    """Readings of the node's own inputs.
+
+    ``spools`` are -1..1 in FUNCTIONS order; the grapple's sensors are None where none is fitted.
+    """
 
     spools: tuple[float, ...] = (0.0,) * 6
     flow_limited: bool = False
@@ -78,7 +81,7 @@ class ValveInputs:
 
 
 class ValveNode(Device):
-    """``outputs_pct`` are the spool commands now, in FUNCTIONS order; ``sense`` reads the node's inputs."""
+    """``outputs_pct`` are the present spool commands, in FUNCTIONS order; ``sense`` reads the node's inputs."""
 
     def __init__(
         self,
@@ -111,7 +114,7 @@ class ValveNode(Device):
         self._locked: ExitCode | None = None
 
     def receive(self, key: int, data: bytes, now_ns: int) -> None:
-        """A command or guard frame; others and bad ones are ignored."""
+        """A command or guard frame; others and invalid ones are ignored."""
         source = self._inputs.get(key)
         if source is None or not source.accept(data, now_ns):
             return
@@ -119,7 +122,7 @@ class ValveNode(Device):
             self._locked = None
 
     def sync(self, now_ns: int) -> None:
-        """SYNC seen."""
+        """A SYNC was received."""
         self._sync_ns = now_ns
 
     def decide(self, now_ns: int) -> None:
@@ -148,7 +151,7 @@ class ValveNode(Device):
         return self._a.fresh(now_ns, limit_ns) and self._b.fresh(now_ns, limit_ns)
 
     def _missing_condition(self, now_ns: int) -> ExitCode | None:
-        """What keeps the node from following, if anything."""
+        """The first condition that is not met, or None."""
         if not self._pilot_on():
             return ExitCode.SAFETY_STOP
         synchronous = self._sync_ns is not None and now_ns - self._sync_ns <= SYNC_NS
@@ -195,7 +198,7 @@ class ValveNode(Device):
             self.outbox.append(self._plc.frame(run, self._watchdog, CYCLE_US, 0))
 
     def _grapple_state(self, m: ValveInputs) -> GrappleState:
-        """By the opening where it is measured, else by the pressures at the ends."""
+        """From the opening where it is measured, else from the pressures at the ends."""
         command = self.outputs_pct[5]
         if m.opening is None:
             opened, closed = m.release_bar > END_BAR, m.clamp_bar > END_BAR
@@ -208,5 +211,5 @@ class ValveNode(Device):
         if command < 0.0:
             return GrappleState.CLOSED if closed else GrappleState.CLOSING
         if m.opening is None:
-            return self._grapple  # nothing pushes: it is where it was
+            return self._grapple  # nothing pushes: the state is unchanged
         return GrappleState.OPEN if opened else GrappleState.CLOSED if closed else GrappleState.HOLDING

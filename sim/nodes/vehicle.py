@@ -1,8 +1,8 @@
-"""The vehicle controller (source address 03h): takes VehCmd, drives, steers and brakes; safe by absence.
+"""The vehicle controller (source address 03h): receives VehCmd, drives, steers and brakes; without it the brake is on.
 
-It follows only while VehCmd (E2E good, ArmKey 0xA, every value there) is at most 100 ms old and the emergency stop is
-released.  Otherwise the brake is on and the steering spool neutral, at once; a loss while driving stays a fault until
-a fresh frame disarms.  The articulation rate becomes a spool command through the node's own dead-band map.
+It follows only while VehCmd (E2E valid, ArmKey 0xA, every value available) is at most 100 ms old and the emergency
+stop is released.  Otherwise the brake is on and the steering spool neutral, at once; a loss while driving remains a
+fault until a fresh frame disarms.  The node's own dead-band map turns the articulation rate into a spool command.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Gear(IntEnum):
 
 
 def spool_for(valve: CarrierValve, speed: float, least: float = 0.0) -> float:
-    """Spool command -1..1 that gives ``speed`` by the profile; within ``least`` of standing the spool is neutral."""
+    """Spool command -1..1 that gives ``speed`` by the profile; speeds up to ``least`` leave the spool neutral."""
     if abs(speed) <= least:
         return 0.0
     plus = speed > 0.0
@@ -52,8 +52,8 @@ def spool_for(valve: CarrierValve, speed: float, least: float = 0.0) -> float:
 
 
 class VehicleNode(J1939Node):
-    """``drive_m_s``, ``brake`` and ``steer`` (spool -1..1, + bends left) are its outputs now; the plant fills
-    ``speed_m_s`` and ``articulation_rad``, what its own sensors show.
+    """``drive_m_s``, ``brake`` and ``steer`` (spool -1..1, + bends left) are its present outputs; the plant sets
+    ``speed_m_s`` and ``articulation_rad``, the readings of its own sensors.
     """
 
     def __init__(self, machine: Database, outbox: Outbox, carrier: Carrier, pilot_on: Callable[[], bool]) -> None:

@@ -1,1 +1,1 @@
-"""The emulated machine PLC: what stands between Ethernet and the valves on a machine like paper A's (III-A)."""
+"""The emulated machine PLC: between Ethernet and the valves on a machine like paper A's (III-A)."""

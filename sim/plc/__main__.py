@@ -1,9 +1,9 @@
 """The live plant behind a PLC: ``python -m sim.plc --profile P --modbus 127.0.0.1:1502 --udp 127.0.0.1:1503``.
 
-As ``python -m sim``, without CAN: the emulated PLC reads the sensors and drives the valves, and is commanded over
-Modbus/TCP or cyclic UDP, in the role that the profile's [plc] gives it.  ``--port`` answers the same JSON requests.  On
-stdout ``ready`` with the ports in use.  Loopback only unless ``--allow-network`` is given.  Exit codes: 0 stopped, 2
-usage, 3 profile or truth, 4 an address that cannot be used.
+Like ``python -m sim``, but without CAN: the emulated PLC reads the sensors and drives the valves; clients command it
+over Modbus/TCP or cyclic UDP, in the role that the profile's [plc] defines.  ``--port`` answers the same JSON requests.
+It prints ``ready`` with the ports in use on stdout.  Loopback only unless ``--allow-network`` is given.  Exit codes: 0
+stopped, 2 usage, 3 profile or truth, 4 an address that cannot be used.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ import msgspec
 from can_dbc.messages.udp_address import udp_address
 from can_dbc.plc.map import Role, WordOrder
 from can_dbc.plc.modbus import LinkError, ModbusServer, is_loopback
-from machine.loading.profile_file import ProfileError, load_profile
+from machine.loading.profile_file import load_profile
+from sim.errors import PlantError
 from sim.plc.plant import PlcPlant
 from sim.plc.server import Address, Datagrams, listen, serve
 from sim.process.live_plant import LivePlant
 
 
 class LivePlc(LivePlant):
-    """A plant and its PLC on the monotonic clock; the network is served between the physics' steps."""
+    """A plant and its PLC in real time; the network is served between the physics' steps."""
 
     def __init__(self, plant: PlcPlant, port: int | None, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__(plant, {}, port)
@@ -42,7 +43,11 @@ class LivePlc(LivePlant):
         return self._now_ns
 
     def open(self, modbus: Address | None, udp: Address | None) -> dict[str, int]:
-        """Listens; the ports in use.  Raises LinkError."""
+        """Listen; returns the ports in use.
+
+        Raises:
+            LinkError: an address cannot be used.
+        """
         ports = {}
         if modbus is not None:
             self.modbus = self._loop.run_until_complete(serve(self._program, modbus, self.clock_ns))
@@ -63,13 +68,13 @@ class LivePlc(LivePlant):
         self._loop.run_until_complete(asyncio.sleep(pause_s))
 
     def report(self) -> dict[str, float]:
-        """Also what came over the network."""
+        """Also the counts of the network."""
         arbiter = self._program.arbiter
         counts = {"accepted": arbiter.accepted, "refused": arbiter.refused, "dropped": arbiter.dropped}
         return super().report() | counts | (asdict(self.modbus.counts) if self.modbus else {})
 
     def close(self) -> None:
-        """Ends listening."""
+        """Stop listening."""
         for server in (self.modbus, self.datagrams):
             if server is not None:
                 server.close()
@@ -110,7 +115,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         profile = load_profile(options.profile)
         if profile.plc is None:
-            raise ProfileError(f"{profile.name} has no PLC; add [plc] with a role to the profile")
+            raise PlantError(
+                "plc.not-configured", f"{profile.name} has no PLC; add a [plc] table with a role to the profile"
+            )
         role = Role.REFERENCES if profile.plc.role == "references" else Role.VALVES
         order = WordOrder.HIGH_FIRST if options.word_order == "high" else WordOrder.LOW_FIRST
         plant = PlcPlant(profile, options.seed, options.truth, options.logs, role=role, order=order)
@@ -125,7 +132,7 @@ def main(arguments: list[str] | None = None) -> int:
         live.run()
         live.close()
         sys.stderr.write(f"plc: {msgspec.json.encode(live.report()).decode()}\n")
-    except (ProfileError, ValueError) as error:
+    except ValueError as error:
         sys.stderr.write(f"plc: {error}\n")
         return 3
     except (LinkError, OSError) as error:

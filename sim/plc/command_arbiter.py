@@ -1,9 +1,9 @@
-"""How the PLC takes commands: registers and datagrams in, at most one commander, everything judged before it counts.
+"""The PLC's command arbiter: registers and datagrams in, at most one commander, every command checked as a whole.
 
-Pure.  A write lands in the writer's own copy of the command block; it counts when the sequence register is written with
-a number that advances, and then as a whole or not at all.  Who commands keeps the command until its sign of life has
-been missing for the watchdog's time, or its connection has ended; until then others read, and their writes are answered
-"busy".  A value that means nothing is refused, noted as a fault, and changes nothing; nothing is clamped.
+Pure.  A write changes the writer's own draft of the command block; writing a sequence register that advances commits
+the draft, as a whole or not at all.  The commander keeps the command until its heartbeat has been missing for the
+watchdog's time, or its connection has ended; until then others may read, and their writes are answered "busy".  A
+value out of range is refused, latched as a fault, and changes nothing; nothing is clamped.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from can_dbc.plc.map import Bounds, Command, Fault, MapError, WordOrder
 from can_dbc.plc.modbus import RegisterRefused
 
 MS = 1_000_000
-MAX_DRAFT_COUNT = 16  # clients whose unfinished writes are remembered
+MAX_DRAFT_COUNT = 16  # clients whose uncommitted drafts are stored
 
 
 class CommandArbiter:
-    """The commanding side as the PLC sees it.  ``command`` is the newest accepted one; times are in ns."""
+    """The commanding side of the PLC.  ``command`` is the newest accepted one; times are in ns."""
 
     def __init__(self, bounds: Bounds, order: WordOrder) -> None:
         self._bounds, self.order = bounds, order
@@ -37,17 +37,22 @@ class CommandArbiter:
         self._reset_seen = self._commander_disconnected = False
 
     def commander(self, now_ns: int) -> Hashable:
-        """Who commands now; None when nobody does."""
+        """The client that commands now; None without one."""
         alive = self._commander is not None and now_ns - self._alive_ns <= self.watchdog_ms * MS
         return self._commander if alive else None
 
     def disconnected(self, client: Hashable) -> None:
-        """The client's connection has ended.  Its command stands as long as any other, but anybody may take over."""
+        """The client's connection has ended.
+
+        Its command stays valid for the usual time, but any client may take over.
+        """
         self._drafts.pop(client, None)
-        self._commander_disconnected = self._commander_disconnected or (client is not None and client == self._commander)
+        self._commander_disconnected = self._commander_disconnected or (
+            client is not None and client == self._commander
+        )
 
     def commanded(self) -> bool:
-        """Whether anybody has commanded since the last `forget`."""
+        """Whether any client has commanded since the last `release`."""
         return self._commander is not None
 
     def age_ns(self, now_ns: int) -> int:
@@ -55,17 +60,17 @@ class CommandArbiter:
         return now_ns - self._accepted_ns
 
     def release(self) -> None:
-        """Nobody commands; the next command may come from anybody and with any number."""
+        """End the command; the next command may come from any client and with any number."""
         self._commander = None
         self.command = Command()
 
     def latch_fault(self, fault: Fault, axis: int = plc.NO_AXIS) -> None:
-        """Keeps the first fault until `reset`."""
+        """Keep the first fault until a reset."""
         if self.fault is Fault.NONE:
             self.fault, self.fault_axis = fault, axis
 
     def take_reset_edge(self) -> bool:
-        """Whether the newest command began to ask for a reset; faults are then forgotten."""
+        """Whether the newest command began to request a reset; faults are then cleared."""
         before, self._reset_seen = self._reset_seen, self.command.reset
         edge = self._reset_seen and not before
         if edge:
@@ -73,12 +78,16 @@ class CommandArbiter:
         return edge
 
     def write(self, client: Hashable, address: int, values: Sequence[int], now_ns: int) -> None:
-        """A Modbus write; raises RegisterRefused and then has changed nothing."""
+        """A Modbus write.
+
+        Raises:
+            RegisterRefused: wrong address, illegal value or another commander; nothing has changed.
+        """
         last = address + len(values)
         if address == plc.WATCHDOG_AT and len(values) == 1:
             self._require_command_right(client, now_ns)
             if not plc.WATCHDOG_MS[0] <= values[0] <= plc.WATCHDOG_MS[1]:
-                self._refuse_value(MapError("watchdog"))
+                self._refuse_value(MapError("plc.watchdog-out-of-range", "the watchdog time is out of range"))
             self.watchdog_ms = values[0]
             return
         if not (address >= plc.COMMAND_AT and last <= plc.COMMAND_AT + plc.COMMAND_COUNT):
@@ -105,7 +114,7 @@ class CommandArbiter:
             self._block = list(draft)
 
     def datagram(self, client: Hashable, data: bytes, now_ns: int) -> Header | None:
-        """A UDP command; its header when it was taken.  A damaged, old or strange one is dropped and counted."""
+        """A UDP command; returns its header when accepted.  A damaged, old or malformed one is dropped and counted."""
         try:
             header, command = decode_command(data)
             if self._may_command(client, now_ns) and self._accept(client, header.sequence, command, now_ns, 32):
@@ -150,5 +159,5 @@ class CommandArbiter:
             self._drafts.pop(next(iter(self._drafts)))
 
     def command_block(self) -> list[int]:
-        """The accepted command block, as it can be read back."""
+        """The accepted command block, for reading back."""
         return list(self._block)

@@ -1,4 +1,5 @@
-"""The PLC program's joint law: paper A's PD at 50 Hz on feedback of 0.1 degree and 0.1 mm (docs/reference/machines.md sections 1.6 and 4)::
+"""The PLC program's joint law: paper A's PD at 50 Hz on feedback of 0.1 degree and 0.1 mm
+(docs/reference/machines.md sections 1.6 and 4)::
 
     v = qd_ref + Kp (q_ref - q) + Kd (qd_ref - qd),   u = DBinv(v / full speed)
 
@@ -23,17 +24,17 @@ LINEAR_SHARE = 0.01
 
 
 def resolution(spec: JointSpec) -> float:
-    """What one count of the PLC's feedback is worth."""
+    """One count of the PLC's feedback [rad, m]."""
     return RESOLUTION_M if spec.kind == "prismatic" else RESOLUTION_RAD
 
 
 def stop_band(spec: JointSpec) -> float:
-    """Within this of its reference a joint rests: two counts, or what it does in 10 ms at its speed limit."""
+    """Band around the reference in which a joint rests: two counts, or its travel in 10 ms at its speed limit."""
     return max(2.0 * resolution(spec), REST_S * spec.speed_limit)
 
 
 class PdLaw:
-    """The law of one joint; ``position`` and ``velocity`` are the PLC's feedback, in whole quanta."""
+    """The law of one joint; ``position`` and ``velocity`` are the PLC's feedback, in whole counts."""
 
     def __init__(self, spec: JointSpec) -> None:
         self._spec, self._resolution = spec, resolution(spec)

@@ -8,6 +8,7 @@ from can_dbc.frame import Frame
 from can_dbc.plc.map import Estop, Role, State, WordOrder
 from machine.joints import JOINTS
 from machine.profile import Profile
+from sim.errors import PlantError
 from sim.plant import Plant
 from sim.plc.program import Inputs, Program
 from sim.wood.log_shape import LogSpec
@@ -16,7 +17,11 @@ PA_PER_BAR = 1e5
 
 
 class PlcPlant(Plant):
-    """A machine on a fixed base behind a PLC, without any CAN bus; ``plc`` is its program."""
+    """A machine on a fixed base behind a PLC, without any CAN bus; ``plc`` is its program.
+
+    Raises:
+        PlantError: the machine drives, or as `sim.plant.Plant`.
+    """
 
     def __init__(
         self,
@@ -30,12 +35,15 @@ class PlcPlant(Plant):
         scene: str | Sequence[LogSpec] | None = None,
     ) -> None:
         if profile.carrier is not None:
-            raise ValueError(f"{profile.name} drives; the emulated PLC moves a crane on a fixed base, as palms_471")
+            raise PlantError(
+                "plc.mobile-machine",
+                f"{profile.name} drives; the emulated PLC needs a crane on a fixed base, such as palms_471",
+            )
         self.plc = Program(profile, role, self._inputs, order)
         super().__init__(profile, seed, truth, logs, scene=scene)
 
     def step(self, now_ns: int, received: list[tuple[str, Frame]]) -> list[tuple[str, int, bytes]]:
-        """Advance to ``now_ns``; there is no bus, so nothing is heard and nothing said."""
+        """Advance to ``now_ns``; there is no bus, so no frame is received or sent."""
         super().step(now_ns, [])
         return []
 
@@ -49,7 +57,7 @@ class PlcPlant(Plant):
         return self.plc.state is State.EXECUTE
 
     def _inputs(self, now_ns: int) -> Inputs:
-        """What the PLC's cards read; an encoder is read as it would answer on its bus."""
+        """Readings of the PLC's cards; an encoder is read as it would answer on its bus."""
         pressures = self._pressures()
         lift, tilt, ext = (pressures[name] for name in ("lift", "tilt", "ext"))
         opening, closing = pressures["grapple"]

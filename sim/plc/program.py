@@ -1,7 +1,7 @@
-"""The PLC program: every 10 ms read inputs, judge the command, set the valves; safe by absence.
+"""The PLC program: every 10 ms it reads the inputs, checks the command and sets the valves.
 
-Pure: ``scan(now_ns)``.  HOLD is neutral; a command that is armed and at most 50 ms old makes it EXECUTE; older than
-that it ramps to neutral within 40 ms and holds.  A missing sign of life for the watchdog's time (300 ms), or an open
+Pure: ``scan(now_ns)``.  HOLD is neutral; a command that is armed and at most 50 ms old makes it EXECUTE; an older one
+ramps to neutral within 40 ms and holds.  A heartbeat that is missing for the watchdog's time (300 ms), or an open
 emergency stop, makes it SAFE at once, and only a reset edge of a command that is not armed ends that.
 """
 
@@ -28,7 +28,7 @@ MAY_MOVE = Estop.CHANNEL_A | Estop.CHANNEL_B | Estop.PILOT_ON
 
 @dataclass(slots=True)
 class Inputs:
-    """What the PLC's input cards show: joint positions (None without encoder), pressures, grapple, emergency stop."""
+    """Readings of the PLC's input cards: joint positions (None without encoder), pressures, grapple, emergency stop."""
 
     positions: tuple[float | None, ...]
     pressure_bar: tuple[float, ...]
@@ -38,7 +38,7 @@ class Inputs:
 
 
 def bounds_of(profile: Profile, role: Role) -> Bounds:
-    """What a command may hold on this machine."""
+    """The values that a command may hold on this machine."""
     if role is Role.VALVES:
         return Bounds.valves()
     specs = [joint(profile, j) for j in JOINTS]
@@ -46,7 +46,7 @@ def bounds_of(profile: Profile, role: Role) -> Bounds:
 
 
 class Program:
-    """The PLC: ``arbiter`` takes commands, ``outputs`` are the valves' openings -1..1 (five joints, grapple)."""
+    """The PLC: ``arbiter`` accepts commands, ``outputs`` are the valves' openings -1..1 (five joints, grapple)."""
 
     def __init__(
         self, profile: Profile, role: Role, inputs: Callable[[int], Inputs], order: WordOrder = WordOrder.HIGH_FIRST
@@ -70,7 +70,7 @@ class Program:
         return self.outputs
 
     def status(self) -> list[int]:
-        """The status block as it reads now; what was accepted since the last cycle is in it."""
+        """The present status block; it includes commands accepted since the last cycle."""
         feedback = replace(self.feedback, accepted=self.arbiter.sequence & 0xFFFF)
         return plc.status_registers(feedback, self.arbiter.watchdog_ms, self.arbiter.order)
 
@@ -107,7 +107,12 @@ class Program:
         elif self.state is State.SAFE:
             if reset and not arbiter.command.armed:
                 self.state = State.HOLD
-        elif arbiter.commanded() and arbiter.command.armed and arbiter.age_ns(now_ns) <= HOLD_NS and arbiter.fault is Fault.NONE:
+        elif (
+            arbiter.commanded()
+            and arbiter.command.armed
+            and arbiter.age_ns(now_ns) <= HOLD_NS
+            and arbiter.fault is Fault.NONE
+        ):
             if self.state is not State.EXECUTE:
                 for law in self._laws:
                     law.reset()

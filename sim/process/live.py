@@ -1,7 +1,7 @@
-"""An emulated machine on the monotonic clock and on real buses: what ``python -m sim`` and the timing rig share.
+"""An emulated machine in real time on real buses: shared by ``python -m sim`` and the timing test bed.
 
-Absolute deadlines; the machine wakes when its next step is due and when a frame has come, so that a SYNC is answered at
-once.  A host too slow for real time makes the machine's time stand still for a moment (no burst); how often is counted.
+Deadlines are absolute.  The machine wakes when its next step is due or a frame arrives, so a SYNC is answered at once.
+When the host is too slow for real time, the machine's time pauses for a moment (no burst); the pauses are counted.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import time
 from collections.abc import Mapping
 
 from can_dbc.bus.base import Bus, BusState
-from can_dbc.bus.reconnector import LostLink
+from can_dbc.bus.reconnector import Reconnector
 from can_dbc.frame import Frame
 from sim.emulation import EmulatedMachine
 
-TX_QUEUE_FRAMES = 256  # this process plays a dozen nodes
+TX_QUEUE_FRAMES = 256  # this process emulates a dozen nodes
 MAX_LAG_NS = 25_000_000
 
 
@@ -26,14 +26,14 @@ class LiveMachine:
         self._machine, self._buses = machine, dict(buses)
         self._running = True
         self._skipped_ns = self._started_ns = self._stalls = 0
-        self._links = [LostLink(bus) for bus in self._buses.values()]
+        self._links = [Reconnector(bus) for bus in self._buses.values()]
 
     def stop(self, *_: object) -> None:
         """End after the present step; usable as a signal handler."""
         self._running = False
 
     def run(self) -> None:
-        """Until stopped."""
+        """Run until stopped."""
         machine, frames = self._machine, list[Frame]()
         self._started_ns = time.monotonic_ns()
         while self._running:
@@ -62,13 +62,16 @@ class LiveMachine:
                 self._wait(pause_ns * 1e-9)
 
     def _on_received(self, frames: list[Frame]) -> None:
-        """Called with what a bus brought."""
+        """Called with the frames drained from a bus."""
 
     def _on_step(self, now_ns: int) -> None:
         """Called after every step."""
 
     def _wait(self, pause_s: float) -> None:
-        """Until the next step is due or a frame has come; a bus that is gone is always readable, so it is left out."""
+        """Wait until the next step is due or a frame arrives.
+
+        A bus that is down would always be readable, so it is left out.
+        """
         listening = [b for b in self._buses.values() if b.fileno() >= 0 and b.stats.state is not BusState.DOWN]
         if listening:
             select.select(listening, (), (), pause_s)
@@ -76,7 +79,7 @@ class LiveMachine:
             time.sleep(pause_s)
 
     def report(self) -> dict[str, float]:
-        """How well real time was kept, in totals: share of time that was lost, and how often; frames by the bus."""
+        """Real-time statistics in totals: share of time lost, number of pauses, frames of the buses."""
         elapsed_ns = max(1, time.monotonic_ns() - self._started_ns)
         stats = [bus.stats for bus in self._buses.values()]
         return {

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from can_dbc.bus.base import Bus
+from sim.errors import PlantError
 from sim.instruments.ideal_detector import detect, detect_in_view
 from sim.instruments.total_station import TotalStation, grapple_yaw
 from sim.plant import Plant
@@ -77,7 +78,7 @@ class LivePlant(LiveMachine):
                 reply = self._reply(request)
             except msgspec.DecodeError as error:
                 reply = {"error": f"not a JSON object of strings: {error}"}
-            except ValueError as error:
+            except PlantError as error:
                 reply = {"error": str(error)}
             requests.sendto(msgspec.json.encode(reply), sender)
 
@@ -113,7 +114,7 @@ class LivePlant(LiveMachine):
             case "view":
                 return view_of(plant)
             case "lever":
-                plant.lever(request.get("name", ""), float(request.get("value", "")))
+                plant.lever(request.get("name", ""), _lever_position(request.get("value", "")))
                 return {"ok": True}
             case "press" | "release" | "reset":
                 getattr(plant.estop, request["op"])()
@@ -123,3 +124,10 @@ class LivePlant(LiveMachine):
                 return {"ok": True}
             case op:
                 return {"error": f"unknown op {op!r}"}
+
+
+def _lever_position(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise PlantError("lever.not-a-number", f"lever position {text!r} is not a number; use -1..1") from None

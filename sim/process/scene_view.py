@@ -1,6 +1,6 @@
-"""The plant for the eye: what a page or a picture needs, as plain JSON values.  World frame: metres, z up.
+"""The plant for display: plain JSON values for a page or a picture.  World frame: metres, z up.
 
-A pose is [x, y, z, qx, qy, qz, qw].  Both answers fit into one UDP datagram.
+A pose is [x, y, z, qx, qy, qz, qw].  Each answer fits into one UDP datagram.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from sim.geometry.shape import Quaternion, Vector
 from sim.ground.terrain import Terrain
 from sim.plant import Plant
 
-GROUND_HALF_M: Final = 20.0  # half the width of the uneven ground that is drawn
+GROUND_HALF_M: Final = 20.0  # half the width of the uneven ground in the view
 GROUND_CELL_M: Final = 0.6
 LEVER_WORDS: Final = {
     "slew": ("right", "left"),
@@ -29,7 +29,7 @@ LEVER_WORDS: Final = {
 
 
 def scene_of(plant: Plant) -> dict[str, Any]:
-    """What never changes: shapes on links, wheels, logs, ground, levers, and where to look from."""
+    """The constant part: shapes on links, wheels, logs, ground, levers, and the view point."""
     carrier, log_bodies = plant.profile.carrier, plant.world.log_bodies
     wheel = None if carrier is None else {"radius_m": carrier.wheel_radius_m, "width_m": carrier.wheel_width_m}
     middle, _ = plant.base_pose()
@@ -54,7 +54,7 @@ def scene_of(plant: Plant) -> dict[str, Any]:
 
 
 def view_of(plant: Plant) -> dict[str, Any]:
-    """What moves, and the numbers beside it."""
+    """The moving part, and the numbers beside it."""
     h = plant.world.hydraulics
     return {
         "time_s": plant.time_s,

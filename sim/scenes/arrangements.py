@@ -1,7 +1,8 @@
-"""Scenes: which logs there are and where they are let go.  Same profile, seed and count, same scene.
+"""Arrangements of logs: how many there are and where they are released.
 
-Positions are world positions (palms: the crane's base frame; a carrier starts at the origin, heading +x).  A scene is
-let go a finger's breadth above where it comes to lie; ``sim.wood.logs.LogBodies`` lets it come to rest before time 0.
+Positions are world positions (palms: the crane's base frame; a carrier starts at the origin, heading +x).  Logs are
+released slightly above their final place; ``sim.wood.logs.LogBodies`` lets them come to rest before time 0.  Equal
+profile, seed and count give equal scenes.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from machine.profile import Profile
+from sim.errors import PlantError
 from sim.truth.wood import Wood
 from sim.wood.log_shape import LogSpec
 from sim.wood.stacking import GAP_M, beside, distances, seen_from_above, spine, upon
@@ -31,13 +33,13 @@ KINDS: Final = {
     "row": (1, 99),
     "bunk": (1, 99),
 }
-"""Arrangements and how many logs they may have."""
+"""Arrangements and the least and greatest number of their logs."""
 PILE_ROWS: Final = {2: (2,), 3: (2, 1), 4: (3, 1), 5: (3, 2), 6: (3, 2, 1)}
 ROUTE_BEND_M: Final = 6.5
 """Radius of the bends in which a machine rounds the corners of its route."""
-ROUTE_CLEAR_M: Final = 1.8  # half a machine and a margin: no log lies nearer to the route
+ROUTE_CLEAR_M: Final = 1.8  # half a machine and a margin: least distance of a log from the route
 ROUTE_START_M: Final = 6.0
-HEAP_M: Final = 0.5  # so far above its stakes a bunk is filled; it sinks as it comes to rest
+HEAP_M: Final = 0.5  # filling height above the bunk's stakes; the load sinks as it comes to rest
 CONFIGURATIONS: Final = {
     1: ("single", 1),
     2: ("parallel", 2),
@@ -53,12 +55,13 @@ CONFIGURATIONS: Final = {
     12: ("pile", 6),
 }
 """Paper A's twelve configurations as (kind, logs).  Its pictures are not in the text; these are a reconstruction from
-its sentences: 1 single and 2 parallel; the top log of 3 and 9 is the one to take; all logs of 2, 4, 5, 6, 7 and more
-than one of 10, 11, 12 come up together; mini-piles of up to six logs."""
+its sentences: 1 single and 2 parallel; the top log of 3 and 9 is the target; all logs of 2, 4, 5, 6, 7 and more than
+one of 10, 11, 12 are lifted together; mini-piles of up to six logs.
+"""
 
 
 class LogSampler:
-    """Draws logs.  Places and sizes come from one stream, shapes from another: a new property moves no log."""
+    """Draws logs.  Places and sizes come from one random stream, shapes from another: a new property moves no log."""
 
     def __init__(self, wood: Wood, seed: int) -> None:
         self.wood = wood
@@ -87,9 +90,12 @@ class LogSampler:
 
 
 def random_scene(profile: Profile, wood: Wood, seed: int, logs: int) -> tuple[LogSpec, ...]:
-    """``logs`` logs inside the profile's pick area, none near another (docs/reference/machines.md section 9: sizes of papers A and B).
+    """``logs`` logs inside the profile's pick area, apart from each other.
 
-    Raises ValueError when so many logs find no free place.
+    Their sizes are those of papers A and B (docs/reference/machines.md section 9).
+
+    Raises:
+        PlantError: the pick area has no room for so many logs.
     """
     lumber, (cx, cy), half = LogSampler(wood, seed), _pick_center(profile), profile.workspace.pick_half_size_m
     found: list[LogSpec] = []
@@ -104,7 +110,10 @@ def random_scene(profile: Profile, wood: Wood, seed: int, logs: int) -> tuple[Lo
         else:
             failed += 1
     if len(found) < logs:
-        raise ValueError(f"the pick area holds no {logs} separate logs; ask for fewer logs or widen pick_half_size_m")
+        raise PlantError(
+            "scene.pick-area-full",
+            f"the pick area has no room for {logs} separate logs; request fewer logs or enlarge pick_half_size_m",
+        )
     return tuple(found)
 
 
@@ -123,16 +132,18 @@ def arrangement(
 
     single: one log; separate: as ``random_scene``; parallel: side by side; skewed: side by side, 15 to 30 deg apart;
     crossed: the last across the others; pile: rows upon rows; row: single logs beside ``route`` (waypoints [m]), on
-    either side; bunk: in the bunk, as it fills.
+    either side; bunk: in the bunk, filled row by row.
 
     Raises:
-        ValueError: unknown kind, a count that the kind does not know, or no room.
+        PlantError: unknown kind, a count outside the kind's range, or no room.
     """
     if kind not in KINDS:
-        raise ValueError(f"scene {kind!r} is unknown; use one of {', '.join(KINDS)}")
+        raise PlantError("scene.unknown-kind", f"scene {kind!r} is unknown; use one of {', '.join(KINDS)}")
     low, high = KINDS[kind]
     if not low <= logs <= high:
-        raise ValueError(f"scene {kind!r} is made of {low} to {high} logs, not of {logs}; ask for another number")
+        raise PlantError(
+            "scene.log-count", f"scene {kind!r} consists of {low} to {high} logs, not {logs}; request another number"
+        )
     if kind == "separate":
         return random_scene(profile, wood, seed, logs)
     lumber = LogSampler(wood, seed)
@@ -153,15 +164,21 @@ def configuration(
     at: tuple[float, float] | None = None,
     yaw_rad: float | None = None,
 ) -> tuple[LogSpec, ...]:
-    """One of paper A's configurations, 1 to 12 (see CONFIGURATIONS), with random logs; else ValueError."""
+    """One of paper A's configurations, 1 to 12 (see CONFIGURATIONS), with random logs.
+
+    Raises:
+        PlantError: there is no configuration of this number.
+    """
     if number not in CONFIGURATIONS:
-        raise ValueError(f"paper A has no configuration {number}; use 1 to {len(CONFIGURATIONS)}")
+        raise PlantError(
+            "scene.unknown-configuration", f"paper A has no configuration {number}; use 1 to {len(CONFIGURATIONS)}"
+        )
     kind, logs = CONFIGURATIONS[number]
     return arrangement(kind, profile, wood, seed, logs, at=at, yaw_rad=yaw_rad)
 
 
 def _pick_center(profile: Profile) -> tuple[float, float]:
-    """Middle of the pick area in the world, for the machine where it starts."""
+    """Middle of the pick area in the world, for the machine at its start."""
     (x, y), c = profile.workspace.pick_center_m, profile.carrier
     if c is None:
         return x, y
@@ -198,7 +215,7 @@ def _parallel(lumber: LogSampler, logs: int) -> list[LogSpec]:
 
 
 def _pile(lumber: LogSampler, logs: int) -> list[LogSpec]:
-    """The thickest below: a thick log on thin ones rolls off, and what is left is no pile."""
+    """The thickest logs lie below: a thick log on thin ones rolls off, and the pile falls apart."""
     drawn = _drawn(lumber, logs, lambda: lumber.rng.uniform(-0.08, 0.08))
     return _rows(PILE_ROWS[logs], sorted(drawn, key=lambda log: -log.diameter_m))
 
@@ -209,7 +226,7 @@ def _skewed(lumber: LogSampler, logs: int) -> list[LogSpec]:
 
 
 def _crossed(lumber: LogSampler, logs: int) -> list[LogSpec]:
-    """Parallel logs half a metre apart and one across them, 40 to 90 deg turned."""
+    """Parallel logs half a metre apart and one across them, turned by 40 to 90 deg."""
     rng, lower = lumber.rng, []
     for i in range(logs - 1):
         lower.append(lumber.log(rng.uniform(-0.2, 0.2), 0.7 * (i - (logs - 2) / 2), rng.uniform(-0.05, 0.05)))
@@ -239,7 +256,10 @@ def _row(lumber: LogSampler, logs: int, route: Sequence[tuple[float, float]]) ->
                 found.append(spec)
                 break
         else:
-            raise ValueError(f"the route of {total:.0f} m has no room for {logs} logs; ask for fewer or lengthen it")
+            raise PlantError(
+                "scene.route-too-short",
+                f"the route of {total:.0f} m has no room for {logs} logs; request fewer logs or lengthen the route",
+            )
     return tuple(found)
 
 
@@ -282,7 +302,10 @@ def _bunk(lumber: LogSampler, logs: int, profile: Profile) -> tuple[LogSpec, ...
         out.append(upon(replace(fresh, in_bunk=True, y_m=edge + radius - min(across)), out))
         edge += width + GAP_M
         if out[-1].z_m + 2 * radius > profile.bunk.stake_height_m + HEAP_M:
-            raise ValueError(f"the bunk holds no {logs} logs; it is full with {len(out) - 1}, ask for fewer")
+            raise PlantError(
+                "scene.bunk-full",
+                f"the bunk has no room for {logs} logs; it is full with {len(out) - 1}: request fewer logs",
+            )
     return tuple(out)
 
 

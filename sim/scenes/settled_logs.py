@@ -1,4 +1,4 @@
-"""What pictures for training and judging take from the plant without its machine: logs at rest, and stereo's errors."""
+"""Logs at rest and stereo noise without a machine, for training pictures and the evaluation of detectors."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ def _truth(name: str, seed: int, machine: str) -> Truth:
 def settle_logs(
     profile: Profile, kind: str, seed: int, logs: int, terrain: Terrain, route: Sequence[tuple[float, float]]
 ) -> tuple[LogPose, ...]:
-    """An arrangement of ``sim.scenes.arrangements`` at rest on ``terrain``, by the nominal truth; instances 1, 2, ...
+    """An arrangement of ``sim.scenes.arrangements`` at rest on ``terrain``, with the nominal truth; instances 1, 2, ...
 
-    Raises ValueError when there is no room, or no rest.
+    Raises:
+        PlantError: there is no room, or the logs do not come to rest.
     """
     truth, client = _truth("nominal", 0, profile.name), new_client()
     try:
@@ -45,8 +46,10 @@ def settle_logs(
     )
 
 
-def stereo_noise(profile: Profile, camera: str, seed: int | str, truth: str = "nominal", truth_seed: int = 0) -> StereoNoise:
-    """Depth errors of a machine's camera as a truth has them."""
+def stereo_noise(
+    profile: Profile, camera: str, seed: int | str, truth: str = "nominal", truth_seed: int = 0
+) -> StereoNoise:
+    """Depth errors of a machine's camera according to a truth."""
     return StereoNoise(profile.cameras[camera], _truth(truth, truth_seed, profile.name).cameras[camera], seed)
 
 
@@ -54,8 +57,12 @@ def varied_stereo_noise(
     profile: Profile, camera: str, seed: int, *, sigma: float, edges: tuple[float, float], holes: float,
     plain_holes: float, correlation_px: float,
 ) -> StereoNoise:  # fmt: skip
-    """A better or worse camera than the nominal one: factors of its disparity error, of both its edge widths and of its
-    holes; share of holes where there is no texture; how far errors are alike."""
+    """A better or worse camera than the nominal one.
+
+    ``sigma``, ``edges`` and ``holes`` are factors of its disparity error, of both its edge widths and of its share of
+    holes; ``plain_holes`` is the share of holes on surfaces without texture, ``correlation_px`` the correlation length
+    of the errors.
+    """
     own = _truth("nominal", 0, profile.name).cameras[camera]
     changed = msgspec.structs.replace(
         own,

@@ -1,6 +1,6 @@
-"""The site of a mission: logs where a plan says that they lie, and a helper who lays new ones for the next lap.
+"""The logs of a mission's site: where they lie first, and their replacement for the next lap.
 
-Paper B replaced the logs as soon as the machine had collected them (section 5.2): here every place has a log for each
+Paper B replaced the logs as soon as the machine had collected them (section 5.2): here every place has one log per
 lap, and those of later laps wait far away.
 """
 
@@ -20,14 +20,14 @@ from sim.wood.log_shape import LogSpec
 SUPPLY_DISTANCE_M: Final = 35.0
 SUPPLY_SPACING_M: Final = 4.0
 MACHINE_DISTANCE_M: Final = 14.0
-"""The machine is so far away when a new log is laid."""
+"""A collected log is replaced when the machine is farther away than this."""
 COLLECTED_M: Final = 1.5
-"""A log that lies farther from its place was taken."""
+"""A log farther than this from its place counts as collected."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogPlace:
-    """Where a log is to lie in the world [m, rad]; what is None is drawn from the truth's wood."""
+    """Place of a log in the world [m, rad]; values that are None are drawn from the truth's wood."""
 
     x_m: float
     y_m: float
@@ -36,8 +36,14 @@ class LogPlace:
     diameter_m: float | None = None
 
 
-def place_logs(profile: Profile, truth: str, seed: int, places: Sequence[LogPlace], rounds: int = 1) -> tuple[LogSpec, ...]:
-    """Logs at the places, then as many for every further round, far away; raises ValueError for an unknown truth."""
+def place_logs(
+    profile: Profile, truth: str, seed: int, places: Sequence[LogPlace], rounds: int = 1
+) -> tuple[LogSpec, ...]:
+    """Logs at the places, then as many for every further lap, far away.
+
+    Raises:
+        PlantError: the truth is unknown.
+    """
     if not places:
         return ()
     wood = load_truth(truth, seed, profile.name).wood
@@ -46,7 +52,9 @@ def place_logs(profile: Profile, truth: str, seed: int, places: Sequence[LogPlac
     found = []
     for i, spec in enumerate(drawn):
         place = places[i % len(places)]
-        x_m, y_m = (place.x_m, place.y_m) if i < len(places) else (-SUPPLY_DISTANCE_M, SUPPLY_SPACING_M * (i - len(drawn) / 2))
+        x_m, y_m = (
+            (place.x_m, place.y_m) if i < len(places) else (-SUPPLY_DISTANCE_M, SUPPLY_SPACING_M * (i - len(drawn) / 2))
+        )
         found.append(
             replace(
                 spec, x_m=x_m, y_m=y_m,
@@ -60,12 +68,16 @@ def place_logs(profile: Profile, truth: str, seed: int, places: Sequence[LogPlac
 def along_route(
     profile: Profile, truth: str, seed: int, logs: int, route: Sequence[tuple[float, float]]
 ) -> tuple[LogSpec, ...]:
-    """So many logs beside a route [m], drawn from the truth's wood; raises ValueError when there is no room."""
+    """``logs`` logs beside a route [m], drawn from the truth's wood.
+
+    Raises:
+        PlantError: there is no room beside the route.
+    """
     return arrangement("row", profile, load_truth(truth, seed, profile.name).wood, seed, logs, route=route)
 
 
 class LogSupplier:
-    """The person who lays a new log where one was taken, once the machine is away."""
+    """Replaces collected logs once the machine is away."""
 
     def __init__(self, plant: Plant, places: int, rounds: int) -> None:
         self._plant = plant
@@ -74,7 +86,7 @@ class LogSupplier:
         self._waiting = [[i + k * places for k in range(1, rounds)] for i in range(places)]
 
     def step(self) -> int:
-        """Look after all places; how many logs were laid."""
+        """Check all places; returns how many logs were replaced."""
         laid, log_bodies = 0, self._plant.world.log_bodies
         if not any(self._waiting):
             return laid

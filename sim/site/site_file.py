@@ -1,6 +1,6 @@
-"""The site of a mission as a file: where on the Earth the machine stands first, and the logs that lie there.
+"""The site of a mission as a file: where on the Earth the machine starts, and the logs that lie there.
 
-What a plant in a process of its own is given (``python -m sim --site FILE``), as JSON.
+``python -m sim --site FILE`` reads it; it is JSON.
 """
 
 from __future__ import annotations
@@ -11,13 +11,17 @@ from pathlib import Path
 import msgspec
 
 from machine.profile import Profile
+from sim.errors import PlantError
 from sim.plant import Plant
 from sim.wood.log_shape import LogSpec
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """The first ``places`` of the logs have one at their place for each of ``rounds`` rounds (`sim.site.log_supply.Layer`)."""
+    """``logs`` in laps: the first ``places`` lie at their places, and there are ``rounds`` laps of them.
+
+    `sim.site.log_supply.LogSupplier` replaces collected logs.
+    """
 
     latitude_deg: float
     longitude_deg: float
@@ -26,23 +30,33 @@ class Site:
     rounds: int = 1
 
     def plant(self, profile: Profile, truth: str, seed: int) -> Plant:
-        """The plant with the origin of its world there; raises ValueError for a machine that stands still."""
+        """The plant whose world has its origin at this site.
+
+        Raises:
+            PlantError: the machine does not drive, or the logs cannot be placed.
+        """
         if profile.carrier is None:
-            raise ValueError(f"{profile.name} stands still; a site needs a machine that drives, such as aoro_fc8")
+            raise PlantError(
+                "site.fixed-machine", f"{profile.name} does not drive; use a machine that drives, such as aoro_fc8"
+            )
         here = {"site_lat_deg": self.latitude_deg, "site_lon_deg": self.longitude_deg}
         carrier = msgspec.structs.replace(profile.carrier, **here)
         return Plant(msgspec.structs.replace(profile, carrier=carrier), seed, truth, scene=self.logs)
 
     def save(self, path: Path) -> None:
-        """Write it."""
+        """Write the file."""
         path.write_bytes(msgspec.json.format(msgspec.json.encode(self)))
 
 
 def load_site(path: Path) -> Site:
-    """Read it; raises ValueError with a sentence."""
+    """Read the file.
+
+    Raises:
+        PlantError: the file cannot be read or is not a site.
+    """
     try:
         return msgspec.json.decode(path.read_bytes(), type=Site)
     except OSError as error:
-        raise ValueError(f"{path}: the site cannot be read: {error.strerror}") from None
+        raise PlantError("site.unreadable", f"{path}: the site file cannot be read: {error.strerror}") from None
     except msgspec.DecodeError as error:
-        raise ValueError(f"{path}: this is no site: {error}") from None
+        raise PlantError("site.malformed", f"{path}: this is not a site file: {error}") from None

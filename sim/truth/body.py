@@ -1,4 +1,4 @@
-"""Masses and flexibility of one machine: what the rigid bodies of its crane are made of."""
+"""Masses and flexibility of one machine: the rigid bodies of its crane."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Damping of the two passive joints above the rotator, the column's give, and the rod that couples the tongs.
+    """Damping of the two passive joints above the rotator, the column's flexibility, and the rod that couples the jaws.
 
     The column bends on two hinges at its foot: 250 kg more at 6 m move the tip of the small crane by about 0.1 m,
     unseen by the encoders (paper A; docs/reference/plant-model.md section 2).  ``flex_damping_s``: damper over spring.

@@ -1,6 +1,7 @@
-"""Truth of one carrier: masses of its halves, arms and wheels, tyres, wheel motors and brakes.
+"""Ground truth of one carrier: masses of its halves, arms and wheels, tyres, wheel motors and brakes.
 
-Every nominal figure is an engineering estimate (docs/reference/machines.md section 7: total mass 10 t with the crane, tyres 600/50-22.5).
+Every nominal figure is an engineering estimate (docs/reference/machines.md section 7: total mass 10 t with the crane,
+tyres 600/50-22.5).
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CarrierTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything about the carrier that is not in the profile; ``sim.ground.tyre`` says what the tyre's figures mean.
+    """The carrier's figures that are not in the profile; ``sim.ground.tyre`` defines the tyre's figures.
 
     ``rear`` has the crane's foot and the bunk, ``front`` the engine; ``arm_mass_kg`` is one swing arm, uniform from
-    pivot to hub, ``wheel_mass_kg`` tyre, rim and hub motor.  The tyre's free radius is the profile's (loaded) one
-    with ``tyre_sink_m`` more, times ``wheel_radius_scale``.  Forces and stiffnesses are of one wheel.
+    pivot to hub, ``wheel_mass_kg`` tyre, rim and hub motor.  The tyre's free radius is the profile's (loaded) radius
+    plus ``tyre_sink_m``, times ``wheel_radius_scale``.  Forces and stiffnesses are per wheel.
     """
 
     rear: Frame
@@ -61,7 +62,7 @@ class CarrierTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     brake_lag_s: float
 
     def sampled(self, draw: VariationSampler) -> CarrierTruth:
-        """The carrier of an individual: masses and friction by the spread, centres of mass within 5 cm."""
+        """The carrier of an individual: masses and friction by the variation, centres of mass within 5 cm."""
         mass, friction = draw.spread.mass, draw.spread.friction
         wheel = draw.factor(mass)
         return msgspec.structs.replace(

@@ -19,7 +19,7 @@ class EncoderTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     latency_s: float
 
     def sampled(self, draw: VariationSampler) -> EncoderTruth:
-        """The encoder of an individual: mounted with its own zero error and run-out."""
+        """The encoder of an individual: mounted with its own zero error and eccentricity."""
         return msgspec.structs.replace(
             self,
             offset=self.offset + draw.within(draw.spread.offset),

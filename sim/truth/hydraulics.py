@@ -1,4 +1,7 @@
-"""Pump, oil, cylinders and valves of one machine (docs/reference/plant-model.md section 2, docs/reference/machines.md section 3)."""
+"""Pump, oil, cylinders and valves of one machine.
+
+docs/reference/plant-model.md section 2, docs/reference/machines.md section 3.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,9 @@ from sim.truth.variation import VariationSampler
 class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Load-sensing pump, tank and oil.
 
-    ``sharing``: what happens when the functions ask for more than the pump gives.  ``pre_compensated``: the pump
-    pressure falls and the heaviest load starves first.  ``post_compensated``: all slow down by the same factor.
-    ``build_up_s``: how fast the pump pressure follows the load-sensing line.  ``shock_pa``: port relief valves.
+    ``sharing``: what happens when the functions demand more flow than the pump delivers.  ``pre_compensated``: the pump
+    pressure falls and the heaviest load stops first.  ``post_compensated``: all slow down by the same factor.
+    ``build_up_s``: time constant of the pump pressure behind the load-sensing line.  ``shock_pa``: port relief valves.
     """
 
     sharing: Literal["pre_compensated", "post_compensated"]
@@ -41,11 +44,12 @@ class Cylinder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Piston areas [m^2]: chamber A pushes in the direction of a positive command, B against it (drives of a whole turn:
     displacement [m^3/rad] with arm 1). ``arm``: dx/dq [m/rad, m/m] over the joint positions ``arm_at``, from hard
-    stop to hard stop (the drive's own cushions give a little before them); it is negative where a positive command
+    stop to hard stop (the drive's own cushions begin a little before them); it is negative where a positive command
     moves the joint towards smaller q (the grapple: + opens). ``arm_nominal``: the arm at which the valve's full speed
-    holds. Friction at the piston [N, m/s, N s/m] in the form of docs/reference/machines.md section 3. ``relaxation_1_s``: how fast load
-    oscillations pass the damping orifices. ``least_inertia`` [kg m^2, kg]: half the smallest inertia that the joint
-    shows its drive in any pose while the other drives push too; the solver leans on it.
+    holds. Friction at the piston [N, m/s, N s/m] in the form of docs/reference/machines.md section 3.
+    ``relaxation_1_s``: how fast load oscillations pass the damping orifices. ``least_inertia`` [kg m^2, kg]: half the
+    smallest inertia that the joint shows its drive in any pose while the other drives push too; the solver depends on
+    it.
     """
 
     area_a: float
@@ -62,7 +66,7 @@ class Cylinder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     least_inertia: float
 
     def sampled(self, draw: VariationSampler) -> Cylinder:
-        """The cylinder of an individual: its seals rub more or less, its load is lighter or heavier."""
+        """The cylinder of an individual: its seals have more or less friction, its load is lighter or heavier."""
         dry = draw.factor(draw.spread.friction)
         return msgspec.structs.replace(
             self,

@@ -1,8 +1,7 @@
-"""The truth about one individual machine, hidden from everything outside ``sim``.
+"""Loads the ground truth about one individual machine.
 
 ``load_truth(name, seed, machine)`` reads the machine's nominal file beside this one (or any TOML path) and, for
-``"sampled"``, draws one individual around it.  Same name, seed and machine, same truth.  A missing or unknown key
-raises ``ValueError`` that names the file and the key.
+``"sampled"``, draws one individual around it.  Equal name, seed and machine give the same truth.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 
+from sim.errors import PlantError
 from sim.truth.body import Contact, Link, Structure
 from sim.truth.carrier import CarrierTruth
 from sim.truth.encoders import EncoderTruth
@@ -23,7 +23,7 @@ FILES = {"palms_471": "nominal.toml", "aoro_fc8": "nominal_aoro_fc8.toml"}
 
 
 class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything the plant knows and the controller does not."""
+    """Everything about the machine that the plant uses and the controller does not know."""
 
     machine: str
     links: dict[str, Link]
@@ -43,25 +43,33 @@ def load_truth(name: str, seed: int, machine: str) -> Truth:
     """``"nominal"``, ``"sampled"`` (an individual drawn from ``seed``) or the path of a truth file, for ``machine``.
 
     Raises:
-        ValueError: one sentence that names the file and what is wrong.
+        PlantError: the file is missing, incomplete, has unknown keys or describes another machine.
     """
     if name in ("nominal", "sampled"):
         if machine not in FILES:
-            raise ValueError(f"no truth for machine {machine!r}; use {', '.join(FILES)} or the path of a truth file")
+            raise PlantError(
+                "truth.unknown-machine",
+                f"there is no truth for machine {machine!r}; use {', '.join(FILES)} or the path of a truth file",
+            )
         path = Path(__file__).with_name(FILES[machine])
     else:
         path = Path(name)
     try:
         truth = msgspec.toml.decode(path.read_bytes(), type=Truth)
     except (OSError, msgspec.DecodeError) as error:
-        raise ValueError(f"truth file {path}: {error}; use nominal, sampled or a complete TOML file") from None
+        raise PlantError(
+            "truth.unreadable", f"truth file {path}: {error}; use nominal, sampled or a complete TOML file"
+        ) from None
     if truth.machine != machine:
-        raise ValueError(f"truth file {path} is of machine {truth.machine!r}, not of {machine!r}; use the right file")
+        raise PlantError(
+            "truth.other-machine",
+            f"truth file {path} describes machine {truth.machine!r}, not {machine!r}; use the file of {machine!r}",
+        )
     return _sampled(truth, seed) if name == "sampled" else truth
 
 
 def _sampled(truth: Truth, seed: int) -> Truth:
-    """One individual; every part draws by its own name, so that a new part changes no other."""
+    """One individual; every part draws from its own stream, so that a new part changes no other."""
 
     def draw(part: str) -> VariationSampler:
         return VariationSampler(truth.spread, part, seed)

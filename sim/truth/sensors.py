@@ -1,4 +1,4 @@
-"""Errors of the sensors that look outwards."""
+"""Errors of the cameras and of the GNSS receiver."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ Vector = tuple[float, float, float]
 
 
 class CameraTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One stereo camera: how it is really mounted and how its depth errs (docs/reference/perception.md section 5, docs/reference/machines.md section 8).
+    """One stereo camera: its true mount and its depth errors.
 
-    ``mount_position_m`` and ``mount_rpy_rad`` are the true body frame less the profile's, in the profile's body frame;
-    an individual is off by at most ``mount_bound_m`` and ``mount_bound_rad``.  Depth errs by ``disparity_sigma_px`` of
-    disparity (of the camera's own pixels), alike over ``correlation_px`` delivered pixels (1/e), and by a scale drawn
-    between the two ``scale_bias`` for each run, of either sign.  Where disparity jumps by more than ``edge_jump_px``
-    the nearer surface grows by between the two ``edge_px`` delivered pixels.  ``hole_share`` of a textured surface
-    and ``plain_hole_share`` of one without texture has no depth.
+    docs/reference/perception.md section 5, docs/reference/machines.md section 8.
+
+    ``mount_position_m`` and ``mount_rpy_rad`` are the true body frame relative to the profile's, in the profile's body
+    frame; an individual is off by at most ``mount_bound_m`` and ``mount_bound_rad``.  Depth errs by
+    ``disparity_sigma_px`` of disparity (of the camera's own pixels), correlated over ``correlation_px`` delivered
+    pixels (1/e), and by a scale drawn between the two ``scale_bias`` for each run, of either sign.  Where disparity
+    jumps by more than ``edge_jump_px`` the nearer surface grows by between the two ``edge_px`` delivered pixels.
+    ``hole_share`` of a textured surface and ``plain_hole_share`` of one without texture has no depth.
     """
 
     mount_position_m: Vector
@@ -35,7 +37,7 @@ class CameraTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     plain_hole_share: float
 
     def sampled(self, draw: VariationSampler) -> CameraTruth:
-        """The camera of an individual: shifted and turned some way, its matching better or worse by a third."""
+        """The camera of an individual: shifted and turned at random, its matching better or worse by a third."""
 
         def off(nominal: Vector, bound: float) -> Vector:
             way = [draw.rng.gauss(0.0, 1.0) for _ in range(3)]
@@ -52,8 +54,8 @@ class CameraTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FixTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One quality of position: white and slowly wandering horizontal error [m, root mean square], and what the
-    receiver says about it: dilution of precision and satellites in use.
+    """One fix quality: white and slowly wandering horizontal error [m, root mean square], and the receiver's report:
+    dilution of precision and satellites in use.
     """
 
     noise_m: float
@@ -68,8 +70,8 @@ class GnssTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ``fixes`` are the qualities by name (rtk_fixed, rtk_float, dgnss, single).  ``wander_s`` is the correlation time of
     the wander; heights err ``height_factor`` times as much.  ``phase_noise_m`` per antenna makes the heading noise:
     sqrt(2) phase_noise / baseline.  A solution leaves the receiver between the two ``latency_s`` after its epoch.
-    ``main_offset_m`` and ``aux_offset_m`` are where the antennas really are, less where the profile has them (front
-    frame).  ``datum_m`` is the ellipsoidal height of the site's origin, ``geoid_m`` the geoid above the ellipsoid.
+    ``main_offset_m`` and ``aux_offset_m`` are the antennas' true positions relative to the profile's (front frame).
+    ``datum_m`` is the ellipsoidal height of the site's origin, ``geoid_m`` the geoid above the ellipsoid.
     """
 
     fixes: dict[str, FixTruth]
@@ -86,7 +88,7 @@ class GnssTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     geoid_m: float
 
     def sampled(self, draw: VariationSampler) -> GnssTruth:
-        """The receiver of an individual: antennas mounted a little beside their places."""
+        """The receiver of an individual: antennas mounted a little beside their nominal places."""
         bound = draw.spread.antenna_m
         main, aux = (tuple(x + draw.within(bound) for x in at) for at in (self.main_offset_m, self.aux_offset_m))
         return msgspec.structs.replace(self, main_offset_m=main, aux_offset_m=aux)

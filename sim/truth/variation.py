@@ -1,4 +1,4 @@
-"""How far one machine may lie from the nominal one, and the bounded draws that make an individual."""
+"""Variation between individual machines: how far one may differ from the nominal machine, and its bounded draws."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from typing import Final
 import msgspec
 
 SIGMA_SHARE: Final = 0.5
-"""A draw is normal with this share of its bound as sigma and cut at the bound: most individuals are near the middle."""
+"""Sigma of a draw as a share of its bound; draws beyond the bound are cut to it."""
 
 
 class Variation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Bounds about the nominal values (docs/reference/machines.md section 14): relative ones as fractions, others with their unit.
+    """Bounds about the nominal values: relative ones as fractions, others with their unit.
 
-    ``offset`` is the zero error of an encoder [rad, m], ``antenna_m`` how far an antenna stands beside its place;
-    delays are drawn anew between their two bounds, most often near the nominal one.
+    docs/reference/machines.md section 14.
+
+    ``offset`` is the zero error of an encoder [rad, m], ``antenna_m`` the distance of an antenna from its nominal
+    place; delays are drawn between their two bounds, most often near the nominal one.
     """
 
     mass: float
@@ -34,14 +36,14 @@ class Variation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class VariationSampler:
-    """Bounded random numbers for one part of the truth: each part draws from its own seed, whatever others draw."""
+    """Bounded random numbers for one part of the truth; each part draws from its own seed."""
 
     def __init__(self, spread: Variation, part: str, seed: int) -> None:
         self.spread = spread
         self.rng = random.Random(f"truth {part} {seed}")
 
     def within(self, bound: float) -> float:
-        """A number in -bound..bound, near 0 more often."""
+        """A number in -bound..bound, more often near 0."""
         return bound * max(-1.0, min(1.0, self.rng.gauss(0.0, SIGMA_SHARE)))
 
     def factor(self, bound: float) -> float:
@@ -49,6 +51,6 @@ class VariationSampler:
         return 1.0 + self.within(bound)
 
     def delay(self, nominal_s: float) -> float:
-        """A dead time [s] between the spread's two bounds; a function without dead time keeps none."""
+        """A dead time [s] between the two bounds; a function without dead time keeps none."""
         s = self.spread
         return self.rng.triangular(s.delay_min_s, s.delay_max_s, nominal_s) if nominal_s else 0.0

@@ -1,4 +1,4 @@
-"""The wood a machine meets: sizes, shapes and densities that its logs are drawn from."""
+"""The wood of a site: sizes, shapes and densities from which its logs are drawn."""
 
 from __future__ import annotations
 

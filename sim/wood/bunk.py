@@ -16,9 +16,9 @@ from sim.geometry.shape import Shape, Vector, rpy_quaternion
 
 STAKE_M: Final = 0.08
 FRAME_M: Final = 0.12  # floor beams of a bunk that stands on a carrier
-# Stakes along the bunk, in bunk lengths: the grapple opens in the wide middle gap, two stakes still carry a log.
+# Stakes along the bunk, in bunk lengths: the grapple opens in the wide gap, and two stakes still hold a log.
 STAKE_PLACES: Final = (-0.40, -0.14, 0.40)
-# Logs of 1.9 m lie in the carrier's bunk: its stakes stand nearer to the middle.
+# The carrier's bunk holds logs of 1.9 m, so its stakes stand nearer to the middle.
 CARRIER_STAKE_PLACES: Final = (-0.34, 0.34)
 COLOUR: Final = (0.35, 0.37, 0.4)
 

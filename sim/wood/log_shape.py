@@ -1,4 +1,4 @@
-"""What one log is: where it is let go, and its body of solid wood, tapered and bowed.
+"""One log: where it is released, and its body of solid wood, tapered and bowed.
 
 Log frame: origin on the pith at half length, z along the chord towards the thin end, x towards the side the log bows
 to.  ``s`` runs from -0.5 (butt) to 0.5 (thin end).  Pure geometry: no physics client is needed.
@@ -13,13 +13,13 @@ from typing import Final
 
 from sim.geometry.shape import Quaternion, Vector
 
-SLICES: Final = 60  # discs that mass, centre and inertia are summed from
-STRAIGHT_M: Final = 0.03  # a bow up to this is drawn by 3 pieces, a larger one by 5: never 4 mm beside the arc
+SLICES: Final = 60  # discs over which mass, centre and inertia are summed
+STRAIGHT_M: Final = 0.03  # up to this sagitta a log has 3 straight pieces, beyond it 5: less than 4 mm off the arc
 
 
 @dataclass(frozen=True, slots=True)
 class LogSpec:
-    """A log and where it is let go, world frame.
+    """A log and the pose of its release, world frame.
 
     ``x_m``, ``y_m``: the middle; ``yaw_rad``: of its axis from +x; ``pitch_rad``: + lifts the thin end; ``roll_rad``:
     about its own axis, at 0 it bows downward; ``z_m``: clearance of its lowest line to the ground.  ``diameter_m`` is
@@ -55,11 +55,11 @@ class LogSpec:
 
     @property
     def pieces(self) -> int:
-        """How many straight pieces the body is made of."""
+        """Number of straight pieces of the body."""
         return 3 if self.sweep_m <= STRAIGHT_M else 5
 
     def directions(self) -> tuple[Vector, Vector]:
-        """The log frame's x and z axis where it is let go: the side it bows to, and along it."""
+        """The log frame's x and z axis at release: the side it bows to, and along it."""
         cy, sy = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         cp, sp = math.cos(self.pitch_rad), math.sin(self.pitch_rad)
         cr, sr = math.cos(self.roll_rad), math.sin(self.roll_rad)
@@ -67,7 +67,7 @@ class LogSpec:
         return (cr * down[0] - sr * sy, cr * down[1] + sr * cy, cr * down[2]), (cp * cy, cp * sy, sp)
 
     def spine(self, points: int = 11) -> list[Vector]:
-        """Points of the pith where it is let go, relative to the middle [m]."""
+        """Points of the pith at release, relative to the middle [m]."""
         x, z = self.directions()
         out = []
         for i in range(points):
@@ -118,7 +118,7 @@ def log_segments(spec: LogSpec) -> list[tuple[Vector, Vector, float, float]]:
 
 
 def quaternion_of(spec: LogSpec) -> Quaternion:
-    """Orientation (x, y, z, w) of the log frame where it is let go: yaw, then pitch, then roll."""
+    """Orientation (x, y, z, w) of the log frame at release: yaw, then pitch, then roll."""
     h, p, r = spec.yaw_rad / 2, (math.pi / 2 - spec.pitch_rad) / 2, spec.roll_rad / 2
     yaw, pitch = (0.0, 0.0, math.sin(h), math.cos(h)), (0.0, math.sin(p), 0.0, math.cos(p))
     return _times(_times(yaw, pitch), (0.0, 0.0, math.sin(r), math.cos(r)))

@@ -1,9 +1,10 @@
-"""Logs as bodies of the physics client, and their state for display and judging.
+"""Logs as bodies of the physics client, and their state for display and evaluation.
 
-A log is one rigid body of 3 or 5 coaxial cylinders along its bow (docs/reference/plant-model.md section 1: cylinders roll, hulls have flats), with
-the mass, centre of mass and inertia of the tapered, bowed wood.  The scene comes to rest in a physics client of its
-own before the logs appear in the machine's, so nothing disturbs the crane.  A log at rest sleeps: it costs nothing
-and stands still until something touches it, where Bullet's friction alone would let a wedged one creep 1 mm/s.
+A log is one rigid body of 3 or 5 coaxial cylinders along its bow (docs/reference/plant-model.md section 1: cylinders
+roll, hulls have flats), with the mass, centre of mass and inertia of the tapered, bowed wood.  The scene comes to rest
+in a physics client of its own before the logs appear in the machine's, so nothing disturbs the crane.  A log at rest
+sleeps: it costs no time and stands still until something touches it; with Bullet's friction alone a wedged log would
+creep 1 mm/s.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from machine.profile import Profile
 from sim.bullet.client import BulletClient, new_client
+from sim.errors import PlantError
 from sim.geometry.shape import Quaternion, Vector, rpy_quaternion
 from sim.ground.terrain import Terrain
 from sim.truth.body import Contact
@@ -30,14 +32,14 @@ Pose = tuple[Vector, Quaternion]
 
 SLEEP: Final = 0.02  # [m/s, rad/s]
 SETTLE_STEP_S: Final = 0.0025
-SETTLE_S: Final = 20.0  # longest time to come to rest
+SETTLE_S: Final = 20.0  # time limit for coming to rest
 CHECK_STEPS: Final = 20
 STILL_CHECK_COUNT: Final = 8  # 0.4 s
 REST_M_S: Final = 0.004
 REST_RAD_S: Final = 0.02
-# While a scene comes to rest, air as thick as this [1/s, of Bullet's form] takes the energy out of rolling logs.
+# While a scene comes to rest, this damping [1/s, linear and angular, of Bullet's form] stops rolling logs.
 SETTLE_DAMPING: Final = (0.3, 0.9)
-INSIDE_M: Final = 0.003  # deepest contact at the start that is not "inside"
+INSIDE_M: Final = 0.003  # deepest contact at the start that does not count as an overlap
 NUDGE_RAD_S: Final = 0.1
 NEIGHBOUR_M: Final = 0.05
 BARK: Final = (0.55, 0.35, 0.18, 1.0)
@@ -62,10 +64,12 @@ class LogState:
 
 
 class LogBodies:
-    """The logs.  ``logs`` are body ids in scene order, ``masses`` in kg.
+    """The logs' rigid bodies.  ``body_ids`` are in scene order, ``masses`` in kg.
 
-    ``terrain`` is used in the private client alone; ``base`` is the crane's base frame in the world, for the bunk.
-    Raises ValueError when logs start in each other or in the machine, or do not come to rest.
+    ``terrain`` is used in the private client only; ``base`` is the crane's base frame in the world, for the bunk.
+
+    Raises:
+        PlantError: logs overlap each other or the machine at the start, or do not come to rest.
     """
 
     def __init__(
@@ -97,19 +101,19 @@ class LogBodies:
         self._size = np.array([(s.length_m, s.diameter_m, s.sweep_m) for s in self.scene]).reshape(-1, 3)
 
     def wake(self) -> None:
-        """Wake all logs that are not stowed; needed before a pose, a speed or a force is put on one from outside."""
+        """Wake all logs that are not stowed; needed before a pose, a speed or a force is set from outside."""
         for i, body in enumerate(self.body_ids):
             if i not in self.stowed:
                 self._p.changeDynamics(body, -1, activationState=self._p.ACTIVATION_STATE_WAKE_UP)
 
     def carry(self, which: int, east_m: float, north_m: float) -> None:
-        """Someone takes a log, as it lies, to another place on level ground, by so much in the world."""
+        """Move a log, without turning it, to another place on level ground."""
         (x, y, z), turn = self._p.getBasePositionAndOrientation(self.body_ids[which])
         self._p.resetBasePositionAndOrientation(self.body_ids[which], (x + east_m, y + north_m, z), turn)
         self._p.resetBaseVelocity(self.body_ids[which], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     def states(self) -> list[LogState]:
-        """The logs now, in scene order.  Only those that moved since the last call are worked out."""
+        """The logs now, in scene order.  Only those that moved since the last call are computed."""
         p = self._p
         now = [(p.getBasePositionAndOrientation(body), p.getBaseVelocity(body)) for body in self.body_ids]
         moved = [i for i, seen in enumerate(now) if seen != self._seen[i]]
@@ -159,7 +163,7 @@ def _axes(q: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
 
 
 def _body(p: BulletClient, spec: LogSpec, mass: Mass, pose: Pose, contact: Contact) -> int:
-    """A log in a client; ``pose`` is of the body's own frame: centre of mass, principal axes."""
+    """Create a log in a client; ``pose`` is of the body's own frame: centre of mass, principal axes."""
     half, (cx, _, cz) = -mass.turn_rad / 2, mass.com_m
     c, s = math.cos(2 * half), math.sin(2 * half)
     radii, lengths, middles, turns = [], [], [], []
@@ -183,7 +187,7 @@ def _body(p: BulletClient, spec: LogSpec, mass: Mass, pose: Pose, contact: Conta
     p.changeDynamics(
         body,
         -1,
-        mass=mass.mass_kg,  # without it Bullet takes the inertia of a massless body
+        mass=mass.mass_kg,  # without it Bullet uses the inertia of a massless body
         localInertiaDiagonal=mass.inertia_kg_m2,
         lateralFriction=contact.log_friction,
         rollingFriction=contact.log_rolling_m,
@@ -252,7 +256,7 @@ def _settled(profile: Profile, contact: Contact, scene: Sequence[LogSpec], terra
                 at = (at[0], at[1], at[2] + next(lifts))
             own = (0.0, math.sin(m.turn_rad / 2), 0.0, math.cos(m.turn_rad / 2))
             bodies.append(_body(p, s, m, p.multiplyTransforms(at, turn, m.com_m, own), contact))
-        _check_apart(p, bodies, "where they are let go")
+        _check_apart(p, bodies, "at their release")
         _rest(p, bodies)
         return [p.getBasePositionAndOrientation(body) for body in bodies]
     finally:
@@ -260,9 +264,9 @@ def _settled(profile: Profile, contact: Contact, scene: Sequence[LogSpec], terra
 
 
 def _rest(p: BulletClient, bodies: Sequence[int]) -> None:
-    """Step until every log stands still: in thick air, then without, nudged so that none stays on a knife edge.
+    """Step until every log stands still: first damped, then undamped, nudged so that none stays on an unstable edge.
 
-    A log that has come through both sleeps while others still roll.
+    A log that has passed both stages sleeps while others still roll.
     """
     still, free = dict.fromkeys(bodies, 0), dict.fromkeys(bodies, False)
     for body in bodies:
@@ -284,13 +288,16 @@ def _rest(p: BulletClient, bodies: Sequence[int]) -> None:
         if all(free.values()) and min(still.values()) >= STILL_CHECK_COUNT:
             return
     worst = min(range(len(bodies)), key=lambda i: (free[bodies[i]], still[bodies[i]]))
-    raise ValueError(
-        f"log {worst} still moves {SETTLE_S:.0f} s after it was let go; lay the logs on flatter ground or use fewer"
+    raise PlantError(
+        "logs.not-at-rest",
+        f"log {worst} still moves {SETTLE_S:.0f} s after its release; place the logs on flatter ground or use fewer",
     )
 
 
 def _check_apart(p: BulletClient, bodies: Sequence[int], when: str) -> None:
-    """Raise ValueError when a log is inside another body."""
+    """Raises:
+    PlantError: a log is inside another body.
+    """
     p.performCollisionDetection()
     number = {body: i for i, body in enumerate(bodies)}
     for i, body in enumerate(bodies):
@@ -298,4 +305,4 @@ def _check_apart(p: BulletClient, bodies: Sequence[int], when: str) -> None:
             if contact[8] < -INSIDE_M:
                 j = number.get(contact[2])
                 other = "the machine, the bunk or the ground" if j is None else f"log {j}"
-                raise ValueError(f"log {i} is {-contact[8]:.3f} m inside {other} {when}; move it away")
+                raise PlantError("logs.overlap", f"log {i} is {-contact[8]:.3f} m inside {other} {when}; move it away")

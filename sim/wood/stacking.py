@@ -1,4 +1,4 @@
-"""Whether logs touch where they are let go, and how they are set beside and upon each other.  Pure geometry."""
+"""Clearance between logs at release, and how they are placed beside and upon each other.  Pure geometry."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from sim.wood.log_shape import LogSpec
 
-GAP_M: Final = 0.004  # between logs, and to the ground, when they are let go
-STEP_M: Final = 0.002  # least step of the search for a free place
+GAP_M: Final = 0.004  # between logs, and to the ground, at release
+STEP_M: Final = 0.002  # smallest step of the search for a free place
 SPINE: Final = 11
 
 Array = NDArray[np.float64]
 
 
 def spine(s: LogSpec) -> tuple[Array, Array]:
-    """Points [SPINE, 3] of the pith where the log is let go, z over level ground, and the radii there [SPINE]."""
+    """Points [SPINE, 3] of the pith at release, z over level ground, and the radii there [SPINE]."""
     points = np.array(s.spine(SPINE))
     radii = np.array([s.radius(i / (SPINE - 1) - 0.5) for i in range(SPINE)])
     points += (s.x_m, s.y_m, s.z_m - float(np.min(points[:, 2] - radii)))
@@ -35,11 +35,12 @@ def distances(p: Array, q: Array) -> Array:
     s = np.clip(np.where(den > 1e-12, (uw * vv - vw * uv) / np.maximum(den, 1e-12), 0.0), 0.0, 1.0)
     t = np.clip((uv * s - vw) / vv, 0.0, 1.0)
     s = np.clip((uv * t + uw) / uu, 0.0, 1.0)
-    return np.linalg.norm(w + t[..., None] * v - s[..., None] * u, axis=2)
+    gaps: Array = np.linalg.norm(w + t[..., None] * v - s[..., None] * u, axis=2)
+    return gaps
 
 
 def clearance(a: LogSpec, b: LogSpec) -> float:
-    """Gap [m] between two logs where they are let go; below 0 they are in each other."""
+    """Gap [m] between two logs at release; negative when they overlap."""
     (p, rp), (q, rq) = spine(a), spine(b)
     radii = np.maximum(rp[:-1], rp[1:])[:, None] + np.maximum(rq[:-1], rq[1:])[None, :]
     return float(np.min(distances(p, q) - radii))
@@ -53,14 +54,14 @@ def seen_from_above(a: LogSpec, b: LogSpec) -> float:
 
 
 def beside(s: LogSpec, others: Sequence[LogSpec]) -> LogSpec:
-    """The log shifted to +y until it touches none."""
+    """The log shifted to +y until it touches no other."""
     while (gap := min((clearance(s, o) for o in others), default=GAP_M)) < GAP_M:
         s = replace(s, y_m=s.y_m + max(STEP_M, GAP_M - gap))
     return s
 
 
 def upon(s: LogSpec, others: Sequence[LogSpec]) -> LogSpec:
-    """The log raised until it touches none."""
+    """The log raised until it touches no other."""
     while (gap := min((clearance(s, o) for o in others), default=GAP_M)) < GAP_M:
         s = replace(s, z_m=s.z_m + max(STEP_M, GAP_M - gap))
     return s

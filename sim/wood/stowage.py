@@ -1,11 +1,11 @@
-"""The load that lies still in a carrier's bunk, as one rigid body of the carrier: sleep for logs on what moves.
+"""Stowage: the load at rest in a carrier's bunk as one rigid body of the carrier.
 
-Bullet lets logs at rest on the ground sleep, never those on a machine that lives, and solves their contacts anew 400
-times a second: with a full bunk, nine tenths of a step.  Logs of which none has moved against the bunk for a while are
-therefore *stowed*: their contacts rest, and a body with their mass, centre and inertia is fixed to the rear frame, so
-that tyres, arms and frame carry what they carried.  They wake where they lie, as fast as the bunk, before anything
-comes near them, and when their weight no longer points where it did as they came to rest (a start, a stop, a slope,
-a bump): then friction has to hold them anew.  Nothing in the tongs, or near them, is ever stowed.
+Bullet lets logs at rest on the ground sleep, but never those on a moving machine, and solves their contacts anew 400
+times a second: with a full bunk, nine tenths of a step.  When no log has moved against the bunk for a while, the logs
+are therefore *stowed*: their contacts rest, and a body with their mass, centre and inertia is fixed to the rear frame,
+so tyres, arms and frame carry the same load.  They wake where they lie, with the bunk's speed, before anything comes
+near them, and when the direction of their weight differs from that at rest (a start, a stop, a slope, a bump): then
+friction has to hold them again.  Nothing in or near the grapple is ever stowed.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from sim.wood.logs import LogBodies
 
 STILL_M_S: Final = 0.01
 STILL_RAD_S: Final = 0.03
-"""A log that is slower than these against the bunk lies still, ..."""
+"""A log slower than STILL_M_S and this, relative to the bunk, is still."""
 STILL_S: Final = 0.5
-"""... and all are stowed when all have done so for this long."""
+"""All logs are stowed when all have been still for this long."""
 NEAR_M: Final = 0.15
-"""What comes so near wakes them: several times what the fastest log of a grasp moves between two looks."""
+"""Whatever comes this near wakes them: several times what the fastest log of a grasp moves between two checks."""
 WEIGHT_TILT_RAD: Final = 0.05
-"""So far their weight may turn against the bunk: less than what sets a log rolling on a flat floor (0.08), ..."""
+"""Limit of the weight's change of direction: less than what sets a log rolling on a flat floor (0.08)."""
 WEIGHT_SHARE: Final = 0.1
-"""... and so much may it change."""
+"""Limit of the weight's relative change."""
 WEIGHT_FILTER_S: Final = 0.1
-"""Time over which the bunk's acceleration is felt: steel rings faster, and moves no log."""
+"""Time constant of the bunk's filtered acceleration: faster vibration of the steel moves no log."""
 FOLLOW_M: Final = 0.0005
 FOLLOW_RAD: Final = 0.0002
-"""Stowed logs are put where the bunk has taken them once it has moved by more."""
+"""Stowed logs follow the bunk once it has moved by more than FOLLOW_M or this."""
 FIXED_JOINT_N: Final = 1e9
 COLLIDE_ALL, COLLISION_GROUP, COLLIDE_NONE = -1, 1, 0
 """Bullet's masks and groups of collision."""
@@ -48,14 +48,28 @@ Box = tuple[Vector, Vector]
 
 
 class Stowage:
-    """``watch`` after every ``check_period_s`` of physics.  ``machine`` is the carrier's body, its root the rear frame with the
-    bunk; ``grapple_links`` are the links that may touch a load.
+    """Call ``watch`` after every ``check_period_s`` of physics.
+
+    ``machine`` is the carrier's body, its root the rear frame with the bunk; ``grapple_links`` are the links that may
+    touch a load.
     """
 
     def __init__(
-        self, client: BulletClient, machine: Body, profile: Profile, grapple_links: Iterable[str], log_bodies: LogBodies, check_period_s: float
+        self,
+        client: BulletClient,
+        machine: Body,
+        profile: Profile,
+        grapple_links: Iterable[str],
+        log_bodies: LogBodies,
+        check_period_s: float,
     ) -> None:
-        self._p, self._machine, self._bunk, self._log_bodies, self._check_period_s = client, machine, profile.bunk, log_bodies, check_period_s
+        self._p, self._machine, self._bunk, self._log_bodies, self._check_period_s = (
+            client,
+            machine,
+            profile.bunk,
+            log_bodies,
+            check_period_s,
+        )
         self._grapple_links = {machine.link[name] for name in grapple_links}
         self._log_of = {body: i for i, body in enumerate(log_bodies.body_ids)}
         self._weight = ApparentWeight(check_period_s)
@@ -67,7 +81,7 @@ class Stowage:
         self._fixed_body: tuple[int, int] | None = None
 
     def watch(self) -> None:
-        """Stow what lies still, wake what is about to be touched or shaken."""
+        """Stow logs at rest; wake them before they are touched or shaken."""
         p = self._p
         at, moving = p.getBasePositionAndOrientation(self._machine.body), p.getBaseVelocity(self._machine.body)
         self._weight.update(moving[0], p.getMatrixFromQuaternion(at[1]))
@@ -80,7 +94,7 @@ class Stowage:
             self._follow(at)
 
     def _rest(self, at: Pose, moving: tuple[Vector, Vector]) -> None:
-        """Count how long what is in the bunk has lain still; stow it when that is long enough."""
+        """Count how long the load in the bunk has been still; stow it after STILL_S."""
         aboard = self._aboard()
         if not aboard or not all(self._lies_still(self._log_bodies.body_ids[i], at[0], *moving) for i in aboard):
             self._still_s = 0.0
@@ -106,14 +120,18 @@ class Stowage:
         return math.dist(w, angular) < STILL_RAD_S and math.dist(v, with_bunk) < STILL_M_S
 
     def _approached(self, box: Box, load: Sequence[int]) -> bool:
-        """Whether a hand, or a log that is not of the load, reaches into the box."""
+        """Whether the grapple, or a log that is not part of the load, reaches into the box."""
         for body, link in self._p.getOverlappingObjects(*box) or ():
-            if (link in self._grapple_links) if body == self._machine.body else self._log_of.get(body, load[0]) not in load:
+            if (
+                (link in self._grapple_links)
+                if body == self._machine.body
+                else self._log_of.get(body, load[0]) not in load
+            ):
                 return True
         return False
 
     def _box(self, load: Sequence[int]) -> Box:
-        """What lies around the load, ``NEAR_M`` wide."""
+        """The surroundings of the load: its bounding box widened by ``NEAR_M``."""
         lows, highs = zip(*(self._p.getAABB(self._log_bodies.body_ids[i]) for i in load), strict=True)
         low, high = ([f(c) for c in zip(*side, strict=True)] for f, side in ((min, lows), (max, highs)))
         return (low[0] - NEAR_M, low[1] - NEAR_M, low[2] - NEAR_M), (
@@ -125,7 +143,9 @@ class Stowage:
     def _stow(self, aboard: tuple[int, ...], at: Pose, moving: tuple[Vector, Vector]) -> None:
         p, log_bodies = self._p, self._log_bodies
         inward = p.invertTransform(*at)
-        self._relative_poses = [p.multiplyTransforms(*inward, *p.getBasePositionAndOrientation(log_bodies.body_ids[i])) for i in aboard]
+        self._relative_poses = [
+            p.multiplyTransforms(*inward, *p.getBasePositionAndOrientation(log_bodies.body_ids[i])) for i in aboard
+        ]
         self._at, self._weight_at_rest, self._around = at, self._weight.now, self._box(aboard)
         self._fixed_body = self._fix(aboard, at, moving)
         for i in aboard:
@@ -135,7 +155,7 @@ class Stowage:
         log_bodies.stowed = aboard
 
     def _fix(self, aboard: Sequence[int], at: Pose, moving: tuple[Vector, Vector]) -> tuple[int, int]:
-        """A body without a shape that weighs as the load does, and what ties it to the rear frame."""
+        """A body without a shape but with the load's weight, and the constraint that fixes it to the rear frame."""
         p = self._p
         mass, own, inertia = self._mass(aboard)
         place, turn = p.multiplyTransforms(*at, *own)
@@ -162,14 +182,14 @@ class Stowage:
         return sum(masses), (tuple(middle.tolist()), _turn_of(axes)), principal.tolist()
 
     def _follow(self, at: Pose) -> None:
-        """Put the stowed logs where the bunk has taken them."""
+        """Move the stowed logs with the bunk."""
         p, log_bodies = self._p, self._log_bodies
         for i, kept in zip(log_bodies.stowed, self._relative_poses, strict=True):
             p.resetBasePositionAndOrientation(log_bodies.body_ids[i], *p.multiplyTransforms(*at, *kept))
         self._at, self._around = at, self._box(log_bodies.stowed)
 
     def _wake(self, at: Pose, moving: tuple[Vector, Vector]) -> None:
-        """Give the stowed logs back to the physics."""
+        """Return the stowed logs to the physics."""
         p, log_bodies = self._p, self._log_bodies
         self._follow(at)
         for i in log_bodies.stowed:
@@ -186,8 +206,10 @@ class Stowage:
 
 
 class ApparentWeight:
-    """What a kilogram weighs in a frame that moves: gravity less acceleration [m/s^2], ``now``, in the frame's axes,
-    smoothed over ``WEIGHT_FILTER_S``; ``check_period_s`` lie between two calls of ``update``.
+    """Apparent weight per kilogram in a moving frame: gravity minus acceleration [m/s^2], in the frame's axes.
+
+    ``now`` is its filtered value, ``WEIGHT_FILTER_S`` the time constant; ``check_period_s`` lie between two calls of
+    ``update``.
     """
 
     def __init__(self, check_period_s: float, gravity_m_s2: float = 9.81) -> None:
@@ -205,7 +227,7 @@ class ApparentWeight:
         self._velocity, self.now = velocity, (x, y, z)
 
     def differs(self, other: Vector) -> bool:
-        """Whether it has turned or changed, against another, by more than a load at rest may bear unseen."""
+        """Whether it differs from another in direction or size by more than a load at rest tolerates."""
         x, y, z = other
         u, v, w = self.now
         size, was = math.hypot(u, v, w), math.hypot(x, y, z)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import random
+import struct
 from collections.abc import Mapping
 
 import msgspec
@@ -14,6 +17,10 @@ STEP_S = 0.0025
 PALMS = load_truth("nominal", 0, "palms_471")
 AORO = load_truth("nominal", 0, "aoro_fc8")
 replace = msgspec.structs.replace
+AORO_HEAVY = {
+    "slew": 8000.0, "lift": 2.5e4, "tilt": 6000.0, "ext": 400.0, "rot": 15.0, "grapple": 17.0, "steer": 8000.0,
+    "arm_fl": 2500.0, "arm_fr": 2500.0, "arm_rl": 2500.0, "arm_rr": 2500.0,
+}  # fmt: skip
 FRICTIONLESS = {"coulomb": 0.0, "stiction": 0.0, "viscous": 0.0}
 
 
@@ -67,3 +74,13 @@ class Rig:
     def run(self, seconds: float, **commands: float) -> None:
         for _ in range(round(seconds / STEP_S)):
             self.step(**commands)
+
+
+def random_run_hash() -> str:
+    """A hash of every torque of a run with random commands."""
+    rig, rng, digest = Rig(AORO, AORO_HEAVY, {"lift": -20000.0}), random.Random(1), hashlib.sha256()
+    for _ in range(30):
+        commands = {n: rng.uniform(-1.0, 1.0) for n in AORO_HEAVY}
+        rig.run(0.1, **commands)
+        digest.update(struct.pack(f"{len(rig.torque)}d", *rig.torque.values()))
+    return digest.hexdigest()

@@ -12,8 +12,10 @@ import pytest
 
 from machine.geometry.kinematics import pin_position, solve
 from machine.loading.profile_file import load_profile
+from sim.errors import PlantError
 from sim.truth.load import load_truth
 from sim.world import HOME_POSE, World
+from tests.codes import coded
 
 MACHINES = ("palms_471", "aoro_fc8")
 ROOT = Path(__file__).parents[2]
@@ -122,7 +124,7 @@ def test_home_is_plumb_and_still(world):
 
 def test_a_machine_without_a_plant_is_refused_in_one_sentence(world):
     stranger = msgspec.structs.replace(world.profile, name="tractor")
-    with pytest.raises(ValueError, match="no steel of machine 'tractor'"):
+    with pytest.raises(PlantError, check=coded("plant.unknown-machine")):
         World(stranger, world.truth, 0, ())
 
 

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from machine.geometry.optics import Intrinsics, intrinsics, pinhole, rpy_matrix
 from machine.loading.profile_file import load_profile
 from sim.camera.geometry import look_at, mount_view, orbit, quaternion_matrix
+from sim.errors import PlantError
 from sim.geometry.shape import rpy_quaternion
+from tests.codes import coded
 
 angles = st.floats(-1.5, 1.5)
 
@@ -54,7 +56,7 @@ def test_a_free_camera_looks_at_its_target_with_a_level_horizon() -> None:
     assert (u, v) == pytest.approx((319.5, 239.5))
     assert view.rotation[2, 0] == pytest.approx(0.0)
     assert np.linalg.det(view.rotation) == pytest.approx(1.0)
-    with pytest.raises(ValueError, match="level horizon"):
+    with pytest.raises(PlantError, check=coded("camera.no-horizon")):
         look_at((0.0, 0.0, 5.0), (0.0, 0.0, 0.0), pinhole(640, 480, 1.0))
 
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from camera_scenes import ABOVE, log, site
 from msgspec.structs import replace
 
 from machine.geometry.optics import Intrinsics
@@ -11,6 +10,7 @@ from sim.camera.noise import StereoNoise
 from sim.camera.render import Picture, render
 from sim.camera.scene import Ground, SceneBuilder
 from sim.truth.load import load_truth
+from tests.sim.camera_scenes import ABOVE, log, site
 
 CAMERA = load_profile("palms_471").cameras["stick"]
 TRUTH = load_truth("nominal", 0, "palms_471").cameras["stick"]

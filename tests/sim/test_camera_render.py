@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_scenes import ABOVE, LENS, log, lying, site
 
 from sim.camera.geometry import View, look_at
 from sim.camera.ground_cover import CLEARING, GroundCover
@@ -17,6 +16,7 @@ from sim.camera.mesh_renderer import MeshRenderer
 from sim.camera.render import ImagingConditions, render
 from sim.camera.scene import CLUTTER, CRANE, GROUND, SKY, Ground, LogPose, Scene, SceneBuilder
 from sim.ground.terrain import Terrain
+from tests.sim.camera_scenes import ABOVE, LENS, log, lying, site
 
 DOWN = View(LENS, np.array([0.0, 0.0, 3.0]), np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]))
 
@@ -199,7 +199,9 @@ def test_the_sun_casts_a_shadow_and_light_changes_with_the_day() -> None:
     shade = np.count_nonzero(gain < 1.1) * (3.0 / LENS.fx_px) ** 2
     # The log's axis shades a strip as wide as the cylinder under a slanting sun, less what the log itself hides.
     assert 0.1 < shade < 2.5 * 0.3
-    assert ImagingConditions.random(1) != ImagingConditions.random(2) and ImagingConditions.random(1) == ImagingConditions.random(1)
+    assert ImagingConditions.random(1) != ImagingConditions.random(2) and ImagingConditions.random(
+        1
+    ) == ImagingConditions.random(1)
 
 
 def test_clutter_stands_still_and_hides_logs() -> None:
@@ -216,9 +218,8 @@ def test_clutter_stands_still_and_hides_logs() -> None:
 
 
 DIGEST = """
-import hashlib, sys
-sys.path.insert(0, sys.argv[1])
-from camera_scenes import ABOVE, site
+import hashlib
+from tests.sim.camera_scenes import ABOVE, site
 from sim.camera.render import ImagingConditions, render
 p = render(site(10), ABOVE, ImagingConditions.random(3), 7)
 print(hashlib.sha256(p.rgb.tobytes() + p.depth_m.tobytes() + p.mask.tobytes()).hexdigest())
@@ -226,7 +227,7 @@ print(hashlib.sha256(p.rgb.tobytes() + p.depth_m.tobytes() + p.mask.tobytes()).h
 
 
 def test_two_processes_render_the_same_bytes() -> None:
-    here = Path(__file__).parent
-    run = subprocess.run([sys.executable, "-c", DIGEST, str(here)], capture_output=True, text=True, check=True)
+    root = Path(__file__).parents[2]
+    run = subprocess.run([sys.executable, "-c", DIGEST], cwd=root, capture_output=True, text=True, check=True)
     p = render(site(10), ABOVE, ImagingConditions.random(3), 7)
     assert run.stdout.strip() == hashlib.sha256(p.rgb.tobytes() + p.depth_m.tobytes() + p.mask.tobytes()).hexdigest()

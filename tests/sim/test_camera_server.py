@@ -8,10 +8,11 @@ import time
 import numpy as np
 import pytest
 
-from can_dbc.messages.rgbd import START_BYTES, RgbdError, RgbdMessage, decode, encode_question, start
+from can_dbc.messages.rgbd import HEADER_BYTES, RgbdError, RgbdMessage, decode, encode_request, start
 from machine.geometry.optics import Intrinsics
 from sim.camera.rig import Mount, RgbdFrame
-from sim.camera.server import CameraServer, on_the_wire
+from sim.camera.server import CameraServer, rgbd_message
+from tests.codes import coded
 
 PIN = Intrinsics(4, 2, 3.0, 3.0, 1.5, 0.5)
 
@@ -35,13 +36,13 @@ class Rig:
 
 def asked(server: CameraServer, camera: str) -> socket.socket:
     client = socket.create_connection(("127.0.0.1", server.port), timeout=10.0)
-    client.sendall(encode_question(camera))
+    client.sendall(encode_request(camera))
     return client
 
 
 def answer(client: socket.socket) -> RgbdMessage:
     data = b""
-    while len(data) < START_BYTES or len(data) < START_BYTES + start(data[:START_BYTES]).rest:
+    while len(data) < HEADER_BYTES or len(data) < HEADER_BYTES + start(data[:HEADER_BYTES]).rest:
         chunk = client.recv(4096)
         assert chunk
         data += chunk
@@ -59,7 +60,7 @@ def test_a_picture_is_drawn_only_when_somebody_asks() -> None:
         for now_ns in range(2, 2000):
             server.serve(now_ns)
             try:
-                got = client.recv(START_BYTES)
+                got = client.recv(HEADER_BYTES)
                 break
             except TimeoutError:
                 time.sleep(0.001)
@@ -74,7 +75,7 @@ def test_a_picture_is_drawn_only_when_somebody_asks() -> None:
 
 def test_an_unknown_camera_is_refused_in_a_sentence() -> None:
     server = CameraServer(Rig(), 0)
-    with asked(server, "rear") as client, pytest.raises(RgbdError, match="no camera 'rear'; there are: front"):
+    with asked(server, "rear") as client, pytest.raises(RgbdError, check=coded("rgbd.refused")):
         answer(client)
     server.close()
 
@@ -89,5 +90,5 @@ def test_who_talks_nonsense_is_hung_up_on() -> None:
 
 
 def test_the_true_pose_stays_in_the_plant() -> None:
-    sent = on_the_wire(Rig().capture("front", None, 5))
+    sent = rgbd_message(Rig().capture("front", None, 5))
     assert not any("true" in name or "pose" in name for name in type(sent).__slots__)

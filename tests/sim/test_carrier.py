@@ -7,12 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from carrier_rig import GRAVITY, PROFILE, STEP_S, Rig, carrier_truth
 
 from machine.geometry import carrier as geometry
 from sim.ground.terrain import SIDE_SLOPE, Terrain
 from sim.mechanics.carrier import PARKED, Drive, carrier_links
 from sim.truth.load import load_truth
+from tests.sim.carrier_rig import GRAVITY, PROFILE, STEP_S, Rig, carrier_truth
 
 pytestmark = pytest.mark.computed
 

@@ -7,13 +7,13 @@ import math
 
 import msgspec
 import pytest
-from crane_driver import Driver
 
 from machine.geometry.kinematics import solve
 from machine.loading.profile_file import load_profile
 from sim.scenes.arrangements import random_scene
 from sim.truth.load import load_truth
 from sim.world import GRAVITY_M_S2, STEP_S, World
+from tests.sim.crane_driver import Driver
 
 PROFILE = load_profile("palms_471")
 NOMINAL = load_truth("nominal", 0, "palms_471")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 import pytest
-from crane_driver import Driver
 
 from machine.loading.profile_file import load_profile
 from sim.evaluator import Evaluator
 from sim.scenes.arrangements import random_scene
 from sim.truth.load import load_truth
 from sim.world import World
+from tests.sim.crane_driver import Driver
 
 PROFILE = load_profile("palms_471")
 NOMINAL = load_truth("nominal", 0, "palms_471")

@@ -9,6 +9,7 @@ import pytest
 
 from machine.loading.profile_file import load_profile
 from sim.bullet.client import BulletClient, new_client
+from sim.errors import PlantError
 from sim.geometry.shape import IDENTITY
 from sim.ground.terrain import Terrain
 from sim.scenes.arrangements import arrangement
@@ -16,6 +17,7 @@ from sim.truth.load import load_truth
 from sim.wood.bunk import bunk_link, bunk_shapes, from_bunk, to_bunk
 from sim.wood.log_shape import LogSpec, mass_of
 from sim.wood.logs import LogBodies
+from tests.codes import coded
 
 pytestmark = pytest.mark.computed
 
@@ -209,10 +211,10 @@ def test_logs_lie_on_uneven_ground(stands, kind):
 
 def test_logs_in_each_other_and_in_the_bunk_are_refused():
     a = LogSpec(-2.0, 4.0, 0.0, 2.6, 0.2, 600.0, z_m=0.004)
-    with pytest.raises(ValueError, match=r"log 0 is 0\.\d+ m inside log 1 where they are let go; move it away"):
+    with pytest.raises(PlantError, check=coded("logs.overlap")):
         Stand((a, LogSpec(-2.0, 4.1, 0.1, 2.6, 0.2, 600.0, z_m=0.004)))
     x, y = PROFILES["palms_471"].bunk.center_m
-    with pytest.raises(ValueError, match="inside the machine, the bunk or the ground where they are let go"):
+    with pytest.raises(PlantError, check=coded("logs.overlap")):
         Stand((LogSpec(x, y, 0.0, 2.6, 0.2, 600.0, z_m=0.1),))
 
 

@@ -17,11 +17,13 @@ from can_dbc.protocols.nmea2000 import Receiver, split_id
 from hil.wire.stuffing import frame_bits
 from machine.loading.profile_file import load_profile
 from machine.sensing.encoder import position_from_counts
+from sim.errors import PlantError
 from sim.nodes.valve import ValveState
 from sim.plant import Plant
 from sim.process.scene_view import scene_of, view_of
 from sim.scenes.arrangements import random_scene
 from sim.truth.load import load_truth
+from tests.codes import coded
 
 PROFILE = load_profile("aoro_fc8")
 CARRIER = PROFILE.carrier
@@ -231,11 +233,15 @@ def test_hand_levers_move_a_silent_machine_and_yield_to_the_bus(bench):
     assert bench.plant.vehicle().speed_m_s > 0.1
     bench.exchange([], 1_000_000_000)
     assert abs(bench.plant.vehicle().speed_m_s) < 0.05
-    for name, value, words in (("wings", 0.1, "wings"), ("slew", 2.0, "2.0"), ("slew", math.nan, "nan")):
-        with pytest.raises(ValueError, match=words):
+    for name, value, code in (
+        ("wings", 0.1, "lever.unknown"),
+        ("slew", 2.0, "lever.out-of-range"),
+        ("slew", math.nan, "lever.out-of-range"),
+    ):
+        with pytest.raises(PlantError, check=coded(code)):
             bench.plant.lever(name, value)
     bench.cycle(3)
-    with pytest.raises(ValueError, match="disarm"):
+    with pytest.raises(PlantError, check=coded("lever.controller-active")):
         bench.plant.lever("slew", 0.5)
 
 

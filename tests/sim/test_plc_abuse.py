@@ -14,13 +14,13 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from plc_server import LOOPBACK, MOVE, ServedPlc, block
 
 from can_dbc.plc import modbus
 from can_dbc.plc.datagram import Header, decode_reply, encode_command
 from can_dbc.plc.map import Fault, State
 from can_dbc.plc.modbus import MAX_CONNECTIONS, LinkError, ModbusClient, RegisterRefused
 from sim.plc.command_arbiter import MAX_DRAFT_COUNT
+from tests.sim.plc_server import LOOPBACK, MOVE, ServedPlc, block
 
 ROUNDS = 60
 READ = struct.pack(">HHHBBHH", 1, 0, 6, 1, 3, 0, 48)

@@ -14,7 +14,6 @@ import subprocess
 from collections.abc import Iterator
 
 import pytest
-from plc_server import LOOPBACK, MOVE, ServedPlc, block
 from pymodbus.client import ModbusTcpClient
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
@@ -23,6 +22,8 @@ from pyModbusTCP.server import ModbusServer as OtherServer
 
 from can_dbc.plc.map import Feedback, State, WordOrder, read_status, status_registers
 from can_dbc.plc.modbus import LinkError, ModbusClient, RegisterRefused
+from tests.codes import coded
+from tests.sim.plc_server import LOOPBACK, MOVE, ServedPlc, block
 
 IDENTITY = [0x4352, 1, 0x0102, 0x0304]
 
@@ -191,7 +192,7 @@ def test_our_client_tells_a_refusal_from_a_lost_link(plc: ServedPlc) -> None:
 
 def test_nobody_there_is_one_sentence() -> None:
     async def run() -> None:
-        with pytest.raises(LinkError, match="check its address"):
+        with pytest.raises(LinkError, check=coded("plc-link.no-answer")):
             await ModbusClient(LOOPBACK, 1, 0.5).connect()
 
     asyncio.run(run())

@@ -11,10 +11,12 @@ from can_dbc.plc.map import Command, Estop, Fault, Grapple, Mode, Role, State, W
 from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import joint
+from sim.errors import PlantError
 from sim.plc.command_arbiter import MS
 from sim.plc.law import RESOLUTION_M, RESOLUTION_RAD, stop_band
 from sim.plc.plant import PlcPlant
 from sim.plc.program import CYCLE_NS, MAY_MOVE, Inputs, Program
+from tests.codes import coded
 
 PROFILE = load_profile("palms_471")
 HOME = (0.0, 0.75, -1.6, 0.3, 0.0)
@@ -168,5 +170,5 @@ def test_a_speed_share_slows_the_law() -> None:
 
 def test_a_machine_that_drives_has_no_such_plc() -> None:
     profile = msgspec.structs.replace(load_profile("aoro_fc8"))
-    with pytest.raises(ValueError, match="fixed base"):
+    with pytest.raises(PlantError, check=coded("plc.mobile-machine")):
         PlcPlant(profile, role=Role.VALVES)

@@ -8,8 +8,10 @@ import pytest
 
 from machine.loading.profile_file import load_profile
 from sim.__main__ import main
+from sim.errors import PlantError
 from sim.site.site_file import Site, load_site
 from sim.wood.log_shape import LogSpec
+from tests.codes import coded
 
 SITE = Site(63.5, 19.5, (LogSpec(8.0, 3.0, 0.3, 2.0, 0.25, 900.0), LogSpec(-35.0, 0.0, 0.0, 2.5, 0.2, 850.0)), 1, 2)
 
@@ -29,7 +31,7 @@ def test_the_plant_stands_at_the_site_among_its_logs() -> None:
 
 
 def test_a_machine_that_stands_still_has_no_site() -> None:
-    with pytest.raises(ValueError, match="palms_471 stands still"):
+    with pytest.raises(PlantError, check=coded("site.fixed-machine")):
         SITE.plant(load_profile("palms_471"), "nominal", 1)
 
 
@@ -39,12 +41,17 @@ def test_a_file_that_is_none_is_one_sentence(
 ) -> None:
     path = tmp_path / "site.json"
     path.write_bytes(content)
-    said = run(path, capsys)
-    assert said.startswith(f"plant: {path}: this is no site: ") and said.count("\n") == 1
+    with pytest.raises(PlantError, check=coded("site.malformed")):
+        load_site(path)
+    message = run(path, capsys)
+    assert str(path) in message and message.count("\n") == 1
 
 
 def test_a_file_that_is_missing_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "the site cannot be read: No such file" in run(tmp_path / "none.json", capsys)
+    path = tmp_path / "none.json"
+    with pytest.raises(PlantError, check=coded("site.unreadable")):
+        load_site(path)
+    assert str(path) in run(path, capsys)
 
 
 def run(path: Path, capsys: pytest.CaptureFixture[str]) -> str:

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from sim.bullet.client import new_client
+from sim.errors import PlantError
 from sim.ground.terrain import KINDS, LAYERS, Terrain
+from tests.codes import coded
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -43,7 +45,7 @@ def test_kinds():
     slope = Terrain("slope")
     assert slope.height(5.0, 2.0) == pytest.approx(0.2)
     assert slope.normal(5.0, 2.0) == pytest.approx((0.0, -0.1 / math.sqrt(1.01), 1.0 / math.sqrt(1.01)))
-    with pytest.raises(ValueError, match="'lunar' is unknown; use one of flat, rough, slope"):
+    with pytest.raises(PlantError, check=coded("terrain.unknown-kind")):
         Terrain("lunar")
 
 

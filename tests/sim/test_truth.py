@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 
 import sim.truth
 from machine.loading.profile_file import load_profile
+from sim.errors import PlantError
 from sim.truth.load import load_truth
+from tests.codes import coded
 
 MACHINES = ("palms_471", "aoro_fc8")
 SEEDS = st.integers(0, 2**31)
@@ -107,12 +109,14 @@ def test_a_file_of_ones_own_is_read_and_a_bad_one_refused_in_a_sentence(tmp_path
     path.write_text(text.replace("relief_pa = 19.0e6", "relief_pa = 18.0e6"))
     mine = load_truth(str(path), 0, "palms_471")
     assert mine.supply.relief_pa == 18.0e6 and mine.functions == nominal.functions
-    with pytest.raises(ValueError, match="is of machine 'palms_471', not of 'aoro_fc8'"):
+    with pytest.raises(PlantError, check=coded("truth.other-machine")):
         load_truth(str(path), 0, "aoro_fc8")
     path.write_text(text.replace("relief_pa", "relieve_pa"))
-    with pytest.raises(ValueError, match=r"mine\.toml.*relie.*use nominal, sampled or a complete TOML file"):
+    with pytest.raises(PlantError, check=coded("truth.unreadable")) as refused:
         load_truth(str(path), 0, "palms_471")
-    with pytest.raises(ValueError, match="no truth for machine 'tractor'; use palms_471, aoro_fc8"):
+    assert "mine.toml" in str(refused.value) and "relie" in str(refused.value)
+    with pytest.raises(PlantError, check=coded("truth.unknown-machine")):
         load_truth("nominal", 0, "tractor")
-    with pytest.raises(ValueError, match=r"missing\.toml"):
+    with pytest.raises(PlantError, check=coded("truth.unreadable")) as refused:
         load_truth(str(tmp_path / "missing.toml"), 0, "palms_471")
+    assert "missing.toml" in str(refused.value)

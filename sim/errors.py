@@ -1,0 +1,9 @@
+"""The plant's error: what was requested of the plant cannot be built or done."""
+
+from __future__ import annotations
+
+from runtime.errors import CodedError
+
+
+class PlantError(CodedError, ValueError):
+    """A truth, scene, site or request that the plant cannot use."""
