@@ -125,9 +125,9 @@ class Lockstep:
         for key, data in self._guard.step(self.now_ns, _drained(self._guard_bus)):
             self._guard_bus.send(key, data)
         inputs, machine = self._inputs, self._machine
-        self._crane.read(inputs.frames, inputs.bus)
+        self._crane.receive(inputs.frames, inputs.bus)
         if machine is not None:
-            machine.read(inputs.machine_frames, inputs.machine_bus)
+            machine.receive(inputs.machine_frames, inputs.machine_bus)
         inputs.datagrams[:] = self._datagrams
         self._datagrams.clear()
         outputs = step(self._controller, inputs, self.now_ns)

@@ -36,7 +36,7 @@ class LiveMission(LiveRun[MissionSummary]):
         site = options.directory / SITE
         site_of(mission, options.profile, options.seed, options.truth, logs).save(site)
         self.plant_arguments = ("--site", site)
-        self.planner_arguments = ("--mission", file, "--way", manager)
+        self.planner_arguments = ("--mission", file, "--manager", manager)
         self._states: list[tuple[float, str]] = []
         self._mission = mission
 

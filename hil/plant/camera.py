@@ -10,7 +10,7 @@ from can_dbc.messages.rgbd import decode, encode
 from hil.harness.errors import SetupError
 from machine.profile import Profile
 from sim.camera.rig import CameraRig
-from sim.camera.server import on_the_wire
+from sim.camera.server import rgbd_message
 from sim.plant import Plant
 
 
@@ -24,7 +24,7 @@ class RigCamera:
     def frame(self) -> RgbdFrame:
         """The picture now; stamps count the pictures."""
         self._count += 1
-        return frame_from_message(decode(encode(on_the_wire(self._rig.frame(self._camera, self._count)))))
+        return frame_from_message(decode(encode(rgbd_message(self._rig.frame(self._camera, self._count)))))
 
     def close(self) -> None:
         """Nothing to release."""

@@ -21,7 +21,7 @@ from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.tick_record import RecordRefused, TickRecord
 from controller.config import ConfigError, Settings
 from controller.config import load as load_settings
-from controller.process.tick_recording import refill, said
+from controller.process.tick_recording import restore_inputs, transmitted
 from controller.step import Controller, Inputs, step
 from hil.replay.difference import differing_lines
 from hil.replay.recording import manifest_of, messages
@@ -118,8 +118,8 @@ def replay(
                 "cannot continue across a gap"
             )
             return result
-        refill(inputs, tick)
-        replayed = said(step(controller, inputs, tick.now_ns))
+        restore_inputs(inputs, tick)
+        replayed = transmitted(step(controller, inputs, tick.now_ns))
         if replayed != (recorded := (tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report)):
             at = {"tick": result.ticks, "at": _seconds(first[0], tick), "now_ns": tick.now_ns}
             result.difference = at | differing_lines(recorded, replayed, key)

@@ -23,7 +23,7 @@ from itertools import count
 from typing import Final
 
 from can_dbc.bus.base import ERR_ACK, ERR_BUSERROR, ERR_PROT, ERR_RESTARTED, BusState
-from can_dbc.bus.filters import Wanted, filter_of
+from can_dbc.bus.filters import FilterItem, filter_of
 from can_dbc.frame import ERROR, Frame
 from hil.wire.errors import WireError
 from hil.wire.faults import Damage, Fault, Kind
@@ -70,7 +70,7 @@ class WireCore:
         self,
         name: str,
         *,
-        filters: Iterable[Wanted] | None = None,
+        filters: Iterable[FilterItem] | None = None,
         receive_own: bool = False,
         queue_limit: int = 10,
         rx_limit: int = 1024,

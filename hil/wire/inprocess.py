@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from can_dbc.bus.base import BaseBus, BusState
-from can_dbc.bus.filters import Wanted
+from can_dbc.bus.filters import FilterItem
 from can_dbc.frame import ERROR, Frame
 from hil.wire.core import WireCore
 
@@ -22,7 +22,7 @@ class InProcessBus(BaseBus):
         core: WireCore,
         participant: str,
         *,
-        filters: Iterable[Wanted] | None = None,
+        filters: Iterable[FilterItem] | None = None,
         receive_own: bool = False,
         tx_queue: int = 10,
     ) -> None:
@@ -46,9 +46,9 @@ class InProcessBus(BaseBus):
 
     def flush(self) -> None:
         self.node.discard()
-        self._take([])
+        self._receive([])
 
-    def _take(self, frames: list[Frame]) -> None:
+    def _receive(self, frames: list[Frame]) -> None:
         stats, first = self.stats, len(frames)
         for frame in self.node.take():
             if frame.key & ERROR:
@@ -58,5 +58,5 @@ class InProcessBus(BaseBus):
                 frames.append(frame)
         stats.dropped = self.node.dropped
 
-    def _leave(self) -> None:
+    def _release(self) -> None:
         self._core.retire(self.node)

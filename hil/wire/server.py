@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from can_dbc.bus.base import BusError, BusState
 from can_dbc.bus.socketcan import SocketCanBus
-from can_dbc.bus.wire_client import BATCH, CONTROL, CONTROL_BYTES, DISCARD, RECORD, STATUS
+from can_dbc.bus.wire_client import MAX_BATCH_RECORDS, CONTROL, MAX_CONTROL_BYTES, DISCARD, RECORD, STATUS
 from can_dbc.frame import Frame
 from hil.wire.core import WireCore
 from hil.wire.faults import Fault
@@ -50,7 +50,7 @@ class Client:
         """Read everything that the client has sent; False when it is gone or violates the protocol."""
         while True:
             try:
-                packet = self.sock.recv(CONTROL_BYTES)
+                packet = self.sock.recv(MAX_CONTROL_BYTES)
             except BlockingIOError:
                 return True
             except ConnectionResetError:
@@ -78,7 +78,7 @@ class Client:
         node = self._node
         while node is not None and (node.rx or node.done != self._reported_done):
             done, dropped = node.done & 0xFFFF, node.dropped & 0xFFFF_FFFF
-            batch = node.rx[:BATCH]
+            batch = node.rx[:MAX_BATCH_RECORDS]
             packet = b"".join(
                 RECORD.pack(key, len(data), data, stamp_ns, 0, done, dropped) for stamp_ns, key, data in batch
             )
@@ -87,7 +87,7 @@ class Client:
             except OSError as error:
                 self.blocked = error.errno == errno.EAGAIN
                 return
-            del node.rx[:BATCH]
+            del node.rx[:MAX_BATCH_RECORDS]
             self._reported_done = node.done
         self.blocked = False
 

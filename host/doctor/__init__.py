@@ -1,6 +1,6 @@
-"""What a technician asks first: is this installation sane, and is this computer ready for a hard-timed loop?
+"""Checks of the installation and of this computer's real-time readiness.
 
-``installation.examine`` answers the first, ``facts.read`` and ``timing.judge`` the second.  Reading and judging are
-apart: facts come from a root directory (``/``, or a made-up tree), and judging them is pure.  Whatever is found is a
-`finding.Finding`: a sentence, and where something should change, what is gained and the exact command.
+``installation.examine`` checks the installation; ``facts.read`` and ``timing.evaluate`` check the computer.  Facts are
+read below a root directory (``/``, or a test tree); evaluating them is pure.  The result is a sequence of
+`finding.Finding`: a sentence, and for a suggested change its gain and the exact command.
 """

@@ -1,7 +1,7 @@
-"""What a Linux computer says of itself that matters to a loop with deadlines: read once, from /proc, /sys and ip(8).
+"""The facts of a Linux computer that matter to a real-time loop, read once from /proc, /sys and ip(8).
 
-``read(root, links)`` looks below any root, so a made-up tree does as well.  What is missing or may not be read is
-unknown (None, empty), never an error: an old kernel or a container has less.
+``read(root, links)`` reads below any root, for example a test tree.  A fact that is missing or unreadable is unknown
+(None, empty), never an error: old kernels and containers offer less.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 UNLIMITED: Final = -1
-"""A limit that is none."""
+"""A limit of "unlimited"."""
 _POLICIES: Final = {0: "OTHER", 1: "FIFO", 2: "RR"}
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _UNIT: Final = "timberhand-controller.service"
@@ -25,7 +25,7 @@ _CONF: Final = "etc/timberhand/timberhand.conf"
 
 @dataclass(frozen=True, slots=True)
 class IdleState:
-    """A state of a processor that has nothing to do: how long it takes to come back."""
+    """An idle state of a processor, with its exit latency."""
 
     name: str
     latency_us: int
@@ -34,9 +34,9 @@ class IdleState:
 
 @dataclass(frozen=True, slots=True)
 class CanLink:
-    """A CAN interface; a virtual one has no bit rate, no error counters and no interrupts.
+    """A CAN interface; a virtual one has no bit rate, error counters or interrupts.
 
-    ``counters``: restarts, bus_error, error_warning, error_passive, bus_off, tx and rx (the controller's own two).
+    ``counters``: restarts, bus_error, error_warning, error_passive, bus_off, tx and rx (error counters).
     """
 
     name: str
@@ -53,11 +53,11 @@ class CanLink:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Everything of one computer.
+    """The facts of one computer.
 
-    ``control_cpu``: the processor that the controller is to run on, None when it may run on any; ``siblings`` and
-    ``idle`` are that processor's, or the first one's.  ``options``: the controller's further words in the settings.
-    ``may_prioritise``, ``may_lock``: this process has the capability, whatever the limits.
+    ``control_cpu``: processor of the controller, None for any; ``siblings`` and ``idle`` belong to that processor, or
+    to the first one.  ``options``: CONTROLLER_OPTIONS of the settings.  ``may_prioritise``, ``may_lock``: this process
+    has the capability, whatever the limits.
     """
 
     release: str
@@ -93,7 +93,7 @@ class Facts:
 
 
 def read(root: Path, links: str = "[]", control_cpu: int | None = None) -> Facts:
-    """Everything below ``root``; ``links``: what ``ip -details -statistics -json link`` says."""
+    """The facts below ``root``; ``links`` is the output of ``ip -details -statistics -json link``."""
     cmdline = _text(root / "proc/cmdline")
     cpus = root / "sys/devices/system/cpu"
     unit = next((text for folder in _UNIT_FOLDERS if (text := _text(root / folder / _UNIT))), "")
@@ -139,7 +139,7 @@ def read(root: Path, links: str = "[]", control_cpu: int | None = None) -> Facts
 
 
 def cpu_set(text: str) -> frozenset[int]:
-    """``0-2,5`` as numbers; words as in ``isolcpus=managed_irq,domain,3`` are passed over."""
+    """``0-2,5`` as numbers; words as in ``isolcpus=managed_irq,domain,3`` are ignored."""
     found: set[int] = set()
     for part in text.strip().split(","):
         if match := re.fullmatch(r"(\d+)(?:-(\d+))?", part):
@@ -148,7 +148,7 @@ def cpu_set(text: str) -> frozenset[int]:
 
 
 def can_links(root: Path, links: str) -> Iterable[CanLink]:
-    """The CAN interfaces in the answer of ip(8)."""
+    """The CAN interfaces in the output of ip(8)."""
     for link in json.loads(links or "[]"):
         if link.get("link_type") != "can":
             continue
@@ -172,7 +172,7 @@ def can_links(root: Path, links: str) -> Iterable[CanLink]:
 
 
 def _interrupts(root: Path, name: str) -> tuple[int, ...]:
-    """Of the device behind an interface, or of the nearest one above it that has any: a USB adapter's host."""
+    """Interrupts of the device of an interface, or of its nearest ancestor with any (a USB adapter's host)."""
     device = (root / "sys/class/net" / name / "device").resolve()
     for place in (device, *device.parents):
         if place == root.resolve():
@@ -186,11 +186,11 @@ def _interrupts(root: Path, name: str) -> tuple[int, ...]:
 
 
 def _preemption(root: Path) -> str:
-    """rt, full, lazy, voluntary, none; empty when the kernel does not say."""
+    """rt, full, lazy, voluntary, none, dynamic; empty when unknown."""
     version = _text(root / "proc/version")
     if _text(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
         return "rt"
-    chosen = re.search(r"\((\w+)\)", _text(root / "sys/kernel/debug/sched/preempt"))  # root alone may look
+    chosen = re.search(r"\((\w+)\)", _text(root / "sys/kernel/debug/sched/preempt"))  # readable by root only
     if chosen:
         return chosen[1]
     if "PREEMPT_DYNAMIC" in version:
@@ -200,7 +200,7 @@ def _preemption(root: Path) -> str:
 
 
 def _machine(root: Path) -> str:
-    """ "" for real hardware, else what runs it."""
+    """ "" for real hardware, else what it is instead."""
     cpuinfo = _text(root / "proc/cpuinfo")
     if "User Mode Linux" in cpuinfo:
         return "user-mode Linux"
@@ -213,7 +213,7 @@ def _machine(root: Path) -> str:
 
 
 def _processes(proc: Path) -> tuple[set[str], dict[int, str]]:
-    """Names of all processes, and the scheduling of the threads that deliver deferred interrupts, by processor."""
+    """Names of all processes, and the scheduling of the ksoftirqd threads by processor."""
     names: set[str] = set()
     softirq: dict[int, str] = {}
     for stat in proc.glob("[0-9]*/stat"):
@@ -246,7 +246,7 @@ def _number(text: str) -> int | None:
 
 
 def _limit(limits: str, name: str) -> int | None:
-    """The hard limit: a process may raise its soft one up to it."""
+    """The hard limit; a process may raise its soft limit up to it."""
     found = re.search(rf"^{name}\s+\S+\s+(\S+)", limits, re.MULTILINE)
     return _number(found[1]) if found else None
 
@@ -267,6 +267,6 @@ def _word(cmdline: str, name: str) -> str:
 
 
 def _chosen(text: str) -> str:
-    """The word in brackets."""
+    """The selected word, which is in brackets."""
     found = re.search(r"\[(\w+)\]", text)
     return found[1] if found else ""

@@ -1,4 +1,4 @@
-"""One thing that was looked at, and what to do about it."""
+"""The result of one check, with the suggested change."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 class Severity(IntEnum):
-    """How much it matters.  Only FAULT prevents the machine from running."""
+    """The severity of a finding; only FAULT prevents the machine from running."""
 
     FINE = 0
     ADVICE = 1
@@ -18,7 +18,7 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """``what`` in a word or two, ``sentence``: how it is; unless it is fine, ``gain`` and ``commands`` to change it."""
+    """``what`` names the topic, ``sentence`` describes it; ``gain`` and ``commands`` belong to a suggested change."""
 
     what: str
     severity: Severity
@@ -27,7 +27,7 @@ class Finding:
     commands: tuple[str, ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """For JSON."""
+        """The finding as plain values for JSON."""
         return {
             "what": self.what, "severity": self.severity.name.lower(), "sentence": self.sentence,
             "gain": self.gain, "commands": list(self.commands),
@@ -35,5 +35,5 @@ class Finding:
 
 
 def fine(what: str, sentence: str) -> Finding:
-    """Nothing to do."""
+    """A finding without a suggested change."""
     return Finding(what, Severity.FINE, sentence)

@@ -1,7 +1,7 @@
-"""Is this installation sane: Python, packages, profiles, buses, the lab, places to write, ports?
+"""Checks the installation: Python, packages, profiles, buses, vcan lab, directories, ports.
 
-Looks at the running system.  Only what prevents every run is a FAULT: a missing package, a profile that does not
-load.  Packages and versions come from the distribution's own metadata.
+Reads the running system.  Only what prevents every run is a FAULT: a missing package, a profile that does not load.
+Packages and versions come from the metadata of the distribution.
 """
 
 from __future__ import annotations
@@ -29,50 +29,56 @@ EXTRAS: Final = {
     "sim": "the simulated plant: `make demo`", "autonomy": "the planner", "console": "the operator's page",
     "tools": "plots and pictures",
 }  # fmt: skip
-"""What each optional group of packages is for."""
+"""The purpose of each optional group of packages."""
 CONF: Final = Path("/etc/timberhand/timberhand.conf")
 DATA: Final = Path("/var/lib/timberhand")
-NEEDED_MB: Final = 1000
-"""Some hours of recording."""
+MIN_FREE_MB: Final = 1000
+"""Disk space for some hours of recording."""
 
 
 def examine() -> tuple[Finding, ...]:
-    """Everything, in the order in which a technician would mend it."""
-    return (python(), *packages(), *profiles(), *buses(), lab(), kernel_of_lab(), *places(), ports())
+    """All findings, in the order in which to correct them."""
+    return (python(), *packages(), *profiles(), *buses(), vcan_lab(), kernel_of_lab(), *places(), ports())
 
 
 def python() -> Finding:
-    """The interpreter; pip has refused one that is too old, and the plant has no wheels for the newest."""
+    """The interpreter; pip refuses versions that are too old, and pybullet has no wheels for the newest."""
     version = sys.version.split()[0]
     if sys.version_info >= (3, 12):
         return Finding(
-            "python", Severity.ADVICE, f"Python {version}, for which there is no pybullet", "the simulated plant",
+            "python", Severity.ADVICE, f"Python {version} has no pybullet", "the simulated plant",
             ("make setup PYTHON=python3.11",),
         )  # fmt: skip
     return fine("python", f"Python {version} in {sys.prefix}")
 
 
 def packages() -> Iterator[Finding]:
-    """Whether what the distribution asks for is there, in the versions that it asks for."""
+    """Whether every required package is installed in a suitable version."""
     try:
         wanted = [Requirement(text) for text in metadata.requires("timberhand") or ()]
     except metadata.PackageNotFoundError:
-        yield Finding("packages", Severity.FAULT, "timberhand itself is not installed", "it runs", ("make setup",))
+        yield Finding(
+            "packages", Severity.FAULT, "timberhand itself is not installed", "a working program", ("make setup",)
+        )
         return
     base = [need for need in wanted if need.marker is None or need.marker.evaluate({"extra": ""})]
-    lacking = [fault for need in base if (fault := _lacking(need))]
+    lacking = [fault for need in base if (fault := _missing(need))]
     if lacking:
-        yield Finding("packages", Severity.FAULT, f"missing: {', '.join(lacking)}", "it runs", ("make setup",))
+        yield Finding(
+            "packages", Severity.FAULT, f"missing: {', '.join(lacking)}", "a working program", ("make setup",)
+        )
     else:
-        yield fine("packages", f"timberhand {metadata.version('timberhand')}; all {len(base)} that it needs are there")
+        yield fine(
+            "packages", f"timberhand {metadata.version('timberhand')}; all {len(base)} required packages are installed"
+        )
     for extra, purpose in EXTRAS.items():
         needs = [n for n in wanted if n.marker and n.marker.evaluate({"extra": extra}) and n not in base]
-        if faults := [fault for need in needs if (fault := _lacking(need))]:
+        if faults := [fault for need in needs if (fault := _missing(need))]:
             command = f"{sys.executable} -m pip install 'timberhand[{extra}]'"
             yield Finding(f"packages, {extra}", Severity.ADVICE, f"missing: {', '.join(faults)}", purpose, (command,))
 
 
-def _lacking(need: Requirement) -> str:
+def _missing(need: Requirement) -> str:
     try:
         there = metadata.version(need.name)
     except metadata.PackageNotFoundError:
@@ -96,11 +102,11 @@ def profiles() -> Iterator[Finding]:
 
 
 def buses() -> Iterator[Finding]:
-    """What a controller could be started on."""
+    """The buses that a controller can use."""
     if not kernel_has_can():
         yield Finding(
             "buses", Severity.ADVICE, "this kernel has no SocketCAN; the wire (a CAN bus in user space) works",
-            "a real machine", ("sudo modprobe can_raw  # else: a kernel with CONFIG_CAN_RAW",),
+            "a real machine", ("sudo modprobe can_raw  # if that fails: a kernel with CONFIG_CAN_RAW",),
         )  # fmt: skip
     else:
         names = [n for _, n in socket.if_nameindex() if _type_of(n) == "280"]  # ARPHRD_CAN, linux/if_arp.h
@@ -112,20 +118,20 @@ def buses() -> Iterator[Finding]:
         name = address.removeprefix("socketcan:")
         if name != address and name not in {n for _, n in socket.if_nameindex()}:
             yield Finding(
-                "buses", Severity.CHANGE, f"{setting}={address} in {CONF}, and there is no interface {name}",
+                "buses", Severity.CHANGE, f"{setting}={address} in {CONF}, but there is no interface {name}",
                 "the controller service finds its bus", (f"sudo nano {CONF}", "ip -brief link show type can"),
             )  # fmt: skip
 
 
-def lab() -> Finding:
-    """Whether tests and trials can have SocketCAN."""
-    here = Request((), "/", {}, os.getuid(), os.getgid(), (), 0o22)
+def vcan_lab() -> Finding:
+    """Whether the vcan lab works here."""
+    request = Request((), "/", {}, os.getuid(), os.getgid(), (), 0o22)
     try:
-        way = choose(survey(here))
+        method = choose(survey(request))
     except LabError as reason:
         packages = "sh deploy/debian_packages.sh"
-        return Finding("vcan lab", Severity.ADVICE, str(reason), "SocketCAN for tests and trials", (packages,))
-    return fine("vcan lab", f"works ({way.kind})")
+        return Finding("vcan lab", Severity.ADVICE, str(reason), "SocketCAN for tests and demos", (packages,))
+    return fine("vcan lab", f"works ({method.kind})")
 
 
 def kernel_of_lab() -> Finding:
@@ -137,7 +143,7 @@ def kernel_of_lab() -> Finding:
 
 
 def places() -> Iterator[Finding]:
-    """Where recordings and shared pages are written."""
+    """The directories of recordings and shared pages."""
     for place, purpose in ((DATA, "the service's recordings"), (Path("runs"), "recordings of runs started here")):
         if place is DATA and not place.exists():
             continue  # not installed as a service
@@ -145,7 +151,7 @@ def places() -> Iterator[Finding]:
         free_mb = shutil.disk_usage(near).free >> 20
         if place is not DATA and not os.access(near, os.W_OK):
             yield Finding("disk", Severity.CHANGE, f"{near} cannot be written", purpose, (f"ls -ld {near}",))
-        elif free_mb < NEEDED_MB:
+        elif free_mb < MIN_FREE_MB:
             yield Finding("disk", Severity.CHANGE, f"{near} has {free_mb} MB free", purpose, (f"du -h -d 1 {near}",))
         else:
             yield fine("disk", f"{near}: {free_mb >> 10} GB free for {purpose}")
@@ -156,14 +162,14 @@ def places() -> Iterator[Finding]:
 
 
 def ports() -> Finding:
-    """The UDP ports of the settings, and the page's."""
+    """The UDP ports of the settings, and the port of the page."""
     wanted = {name: int(value) for name, value in _settings().items() if name.endswith("_PORT") and value.isdigit()}
     wanted = wanted or {"CONSOLE_PORT": 8471}
     taken = {name: port for name, port in wanted.items() if not _free(port, name == "CONSOLE_PORT")}
     if taken:
         which = ", ".join(f"{name} {port}" for name, port in taken.items())
         return Finding(
-            "ports", Severity.ADVICE, f"in use: {which}; that is right while the services run",
+            "ports", Severity.ADVICE, f"in use: {which}; expected while the services run",
             "the processes find their ports", (f"ss -lunpt | grep -E '{'|'.join(map(str, taken.values()))}'",),
         )  # fmt: skip
     return fine("ports", f"free: {', '.join(map(str, wanted.values()))}")

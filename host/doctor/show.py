@@ -1,4 +1,4 @@
-"""The findings on a terminal: what to change first, with its command ready to copy, then what is fine."""
+"""Findings on a terminal: suggested changes first, with commands to copy, then everything that is fine."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MARKS = {
 
 
 def show(console: Console, title: str, findings: Sequence[Finding]) -> None:
-    """One group of findings."""
+    """Print one group of findings."""
     console.print(Text(title, style="bold"))
     for finding in findings:
         if finding.severity is not Severity.FINE:
@@ -34,16 +34,16 @@ def show(console: Console, title: str, findings: Sequence[Finding]) -> None:
     console.print()
 
 
-def verdict(findings: Sequence[Finding]) -> str:
-    """The last line."""
+def conclusion(findings: Sequence[Finding]) -> str:
+    """The final line."""
     count = {severity: sum(f.severity is severity for f in findings) for severity in Severity}
     if count[Severity.FAULT]:
-        return f"{_things(count[Severity.FAULT])} in the way: mend the ones marked ✗ first."
+        return f"{_counted(count[Severity.FAULT], 'fault')} (✗) prevent a run: correct them first."
     if count[Severity.CHANGE]:
-        return f"It runs; {_things(count[Severity.CHANGE])} should be changed (!), from the top."
+        return f"The machine can run; {_counted(count[Severity.CHANGE], 'change')} (!) recommended, in the order shown."
     if count[Severity.ADVICE]:
-        return f"All is well; {_things(count[Severity.ADVICE])} could be better (·)."
-    return "All is well."
+        return f"No problems; {_counted(count[Severity.ADVICE], 'improvement')} (·) possible."
+    return "No problems."
 
 
 def _print(console: Console, finding: Finding) -> None:
@@ -51,10 +51,10 @@ def _print(console: Console, finding: Finding) -> None:
     head = Text.assemble((mark, style), " ", (f"{finding.what}: ", style), finding.sentence)
     console.print(head)
     if finding.gain:
-        console.print(Padding(Text(f"gained: {finding.gain}", style="dim"), (0, 0, 0, 4)))
-    for command in finding.commands:  # never folded: they are there to be copied
+        console.print(Padding(Text(f"gain: {finding.gain}", style="dim"), (0, 0, 0, 4)))
+    for command in finding.commands:  # not folded, so that they can be copied
         console.print(Text(f"    $ {command}", style="cyan"), soft_wrap=True)
 
 
-def _things(count: int) -> str:
-    return "one thing" if count == 1 else f"{count} things"
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -1,6 +1,6 @@
-"""The steps inside the guest, as a service of its systemd: install, start, look, end in many ways, remove.
+"""The steps inside the guest, as a service of its systemd: install, start, inspect, end in several ways, remove.
 
-Argument: the order as a JSON file (``host.run``).  Says JSON lines on stdout; the last one is the result.
+Argument: the order as a JSON file (``host.run``).  Prints JSON lines on stdout; the last one is the result.
 """
 
 from __future__ import annotations
@@ -30,45 +30,45 @@ SERVICES: Final = ("controller", "guard", "recorder", "autonomy", "console")
 FIFO: Final = {"controller": 80, "guard": 85}
 READY_S: Final = 2.0
 SLOW_PYTHON_S: Final = 0.3
-"""Where Python alone takes longer to start and end, the host is too busy to judge a start."""
+"""If Python alone takes longer than this to start and end, the host is too busy to evaluate a start."""
 NEUTRAL_MS: Final = 100.0
 TRIES: Final = 4
 WORK_S: Final = 60.0
 STILL_MRAD: Final = 10.0
-"""A crane whose valves are shut moves no further than this; one that swings does so within a tenth of a second."""
+"""Greatest motion of a crane with closed valves; a slewing crane exceeds it within a tenth of a second."""
 IFF_UP: Final = 1
 PILOT_PRIORITY, PLANT_PRIORITY, SYSTEMD_PRIORITY, SOFT_INTERRUPT_PRIORITY = 70, 50, 40, 95
 
 
 class Check:
-    """The findings so far.  ``failed`` and ``inconclusive`` hold sentences."""
+    """The findings; ``failed`` and ``inconclusive`` hold sentences."""
 
     def __init__(self, out: TextIO) -> None:
         self.result: dict[str, Any] = {"failed": [], "inconclusive": [], "figures": {}, "trials": []}
         self._out = out
         self._begin_s = time.monotonic()
 
-    def say(self, event: str) -> None:
-        """A step, for whoever waits."""
+    def step(self, event: str) -> None:
+        """Report a step."""
         self._line({"event": event, "at_s": time.monotonic() - self._begin_s})
 
     def expect(self, true: object, sentence: str) -> None:
-        """Note ``sentence`` as failed unless ``true``."""
+        """Record ``sentence`` as failed unless ``true``."""
         if not true:
             self.result["failed"].append(sentence)
-            self.say(f"FAILED: {sentence}")
+            self.step(f"FAILED: {sentence}")
 
     def figure(self, name: str, value: float, limit: float, disturbed: bool = False) -> None:
-        """Note a figure and compare it to its bound."""
+        """Record a figure and compare it with its limit."""
         self.result["figures"][name] = value
-        self.say(f"{name} = {value:.1f} (at most {limit:g})")
+        self.step(f"{name} = {value:.1f} (at most {limit:g})")
         if value > limit and disturbed:
-            self.result["inconclusive"].append(f"{name}: the host was too busy while it was taken")
+            self.result["inconclusive"].append(f"{name}: the host was too busy during the measurement")
         else:
             self.expect(value <= limit, f"{name} is {value:.1f}, more than {limit:g}")
 
     def end(self) -> None:
-        """Hand the result out."""
+        """Print the result."""
         self._line({"result": self.result})
 
     def _line(self, message: dict[str, Any]) -> None:
@@ -77,33 +77,33 @@ class Check:
 
 
 def carry_out(check: Check, what: str, *command: str) -> subprocess.CompletedProcess[str]:
-    """A command as a user would give it, timed."""
+    """Run a command like a user, and report its duration."""
     begin_s = time.monotonic()
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    check.say(f"{what}: {time.monotonic() - begin_s:.1f} s; {done.stderr.strip().splitlines()[-1:]}")
+    check.step(f"{what}: {time.monotonic() - begin_s:.1f} s; {done.stderr.strip().splitlines()[-1:]}")
     return done
 
 
 def install(check: Check, order: dict[str, str]) -> None:
-    """From the wheel alone, but for where the packages that it needs come from."""
+    """Install from the wheel alone, with the packages of the given environment."""
     options = ("--python", order["python"], "--from-environment", order["environment"])
     done = carry_out(check, "install", order["python"], f"{order['wheel']}/deploy", *options)
     check.expect(done.returncode == 0, f"the installation ended with {done.returncode}: {done.stderr.strip()[-500:]}")
 
 
 def uninstall(check: Check) -> None:
-    """By the installed program itself, which must not while it works."""
+    """Uninstall with the installed program, which refuses to replace a running controller."""
     done = carry_out(check, "install over it", PROGRAM, "service", "install")
     check.expect(done.returncode == 5, f"a running controller is replaced: {done.returncode} {done.stderr}")
     done = carry_out(check, "uninstall", PROGRAM, "service", "uninstall")
     check.expect(done.returncode == 0, f"the removal ended with {done.returncode}: {done.stderr.strip()[-500:]}")
 
 
-def settle(check: Check) -> dict[str, str]:
-    """Change the settings as a technician would; returns them all.
+def change_settings(check: Check) -> dict[str, str]:
+    """Change the settings like a technician; return all of them.
 
-    This kernel has no /dev/cpu_dma_latency: a device that takes every write, and that no service has by itself, stands
-    in for it, with the owner that the installed rule gives the real one.
+    This kernel has no /dev/cpu_dma_latency: a device that accepts every write replaces it, with the owner that the
+    installed udev rule gives the real one.
     """
     device = Path("/dev/cpu_dma_latency")
     if not device.exists():
@@ -115,11 +115,11 @@ def settle(check: Check) -> dict[str, str]:
     return dict(line.partition("=")[::2] for line in CONF.read_text().splitlines() if line and line[0] != "#")
 
 
-def hasten() -> None:
-    """As in the vcan lab: on one processor a frame must not wait behind an ordinary process, nor must systemd.
+def prioritize() -> None:
+    """Real-time priorities as in the vcan lab: frames and systemd must not wait for ordinary processes.
 
-    This kernel counts processor time in steps of 10 ms and charges each to whoever runs at its end, often a FIFO loop
-    that woke just then: it would take such loops for endless ones, and throttle them.
+    This kernel accounts processor time in steps of 10 ms, charged to the process that runs at their end, often a FIFO
+    loop that has just woken up.  It would take such loops for endless ones and throttle them, so throttling is off.
     """
     Path("/proc/sys/kernel/sched_rt_runtime_us").write_text("-1")
     os.sched_setscheduler(1, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(SYSTEMD_PRIORITY))
@@ -129,14 +129,17 @@ def hasten() -> None:
 
 
 def bus_without_interface(check: Check) -> None:
-    """The settings name an interface that is not there: one sentence, exit status 4."""
+    """An interface of the settings does not exist: one sentence, exit status 4."""
     systemctl("start", "timberhand-can@crane0.service")
-    said = [line for line in journal("timberhand-can@crane0.service") if line.startswith("can-up: ")]
-    check.expect(len(said) == 1 and "there is no CAN interface crane0" in said[0], f"no sentence on the bus: {said}")
+    lines = [line for line in journal("timberhand-can@crane0.service") if line.startswith("can-up: ")]
+    check.expect(
+        len(lines) == 1 and "there is no CAN interface crane0" in lines[0],
+        f"no sentence about the missing interface: {lines}",
+    )
 
 
 def plug_in(check: Check) -> None:
-    """An interface that appears is set up by nobody but the installed rule for udev."""
+    """The installed udev rule sets up a new interface."""
     subprocess.run(["ip", "link", "add", lost_bus.INTERFACE, "type", "vcan"], check=True)
     flags = Path(f"/sys/class/net/{lost_bus.INTERFACE}/flags")
     limit_s = time.monotonic() + 10.0
@@ -146,10 +149,10 @@ def plug_in(check: Check) -> None:
 
 
 def start_plant(check: Check, port: str) -> subprocess.Popen[str]:
-    """The emulated machine, in time like hardware."""
+    """Start the emulated machine with real-time priority."""
     command = [sys.executable, "-m", "sim", "--bus", "crane0=socketcan:crane0", "--port", port]
-    surroundings = os.environ | {"PYTHONPATH": ":".join(sys.path[1:])}
-    plant = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=surroundings)
+    environment = os.environ | {"PYTHONPATH": ":".join(sys.path[1:])}
+    plant = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
     assert plant.stdout
     check.expect(plant.stdout.readline() == "ready\n", "the plant does not start")
     os.sched_setscheduler(plant.pid, os.SCHED_FIFO, os.sched_param(PLANT_PRIORITY))
@@ -157,7 +160,7 @@ def start_plant(check: Check, port: str) -> subprocess.Popen[str]:
 
 
 def cold_start(check: Check) -> None:
-    """From the first start of the controller's process to READY, beside what Python alone needs."""
+    """Measure the time from the first start of the controller to READY, and that of Python alone."""
     begin_s = time.monotonic()
     subprocess.run(["/opt/timberhand/bin/python", "-P", "-c", "pass"], check=False, cwd="/")
     python_s = time.monotonic() - begin_s
@@ -168,40 +171,40 @@ def cold_start(check: Check) -> None:
 
 
 def ready_s() -> float:
-    """From the controller's process to READY, in its present life."""
+    """Time from the start of the present controller process to READY [s]."""
     times = show(trial.CONTROLLER, "ExecMainStartTimestampMonotonic", "ActiveEnterTimestampMonotonic")
     return (int(times["ActiveEnterTimestampMonotonic"]) - int(times["ExecMainStartTimestampMonotonic"])) * 1e-6
 
 
 def wait_for_work(check: Check, page: str) -> None:
-    """Start the target, and wait until those who say nothing to systemd do their work: page, recording, planner."""
+    """Start the target; wait until the services without READY notification work: page, recorder, planner."""
     started = systemctl("start", "timberhand.target")
     check.expect(started.returncode == 0, f"the target does not start: {started.stderr}")
-    works = {
-        # Both read the controller's timing as users of their own.
+    checks = {
+        # Page and recorder read the controller's timing page as different users.
         "console": lambda: json.load(urllib.request.urlopen(f"{page}api/state", timeout=5.0))["timing"],
-        "recorder": lambda: any(map(keeps_timing, Path("/var/lib/timberhand").glob("*/run.mcap"))),
+        "recorder": lambda: any(map(has_timing, Path("/var/lib/timberhand").glob("*/run.mcap"))),
         "autonomy": lambda: any('"event":"phase"' in line for line in journal("timberhand-autonomy.service")),
     }
     limit_s = time.monotonic() + WORK_S
-    while works and time.monotonic() < limit_s:
+    while checks and time.monotonic() < limit_s:
         time.sleep(1.0)
-        for name in tuple(works):
+        for name in tuple(checks):
             with contextlib.suppress(OSError):
-                if works[name]():
-                    check.say(f"{name} works")
-                    del works[name]
-    check.expect(not works, f"no sign of work from {', '.join(works)}")
+                if checks[name]():
+                    check.step(f"{name} works")
+                    del checks[name]
+    check.expect(not checks, f"no sign of work from {', '.join(checks)}")
 
 
-def keeps_timing(recording: Path) -> bool:
-    """Whether a recording that goes on holds the controller's timing, beside frames of the bus."""
+def has_timing(recording: Path) -> bool:
+    """Whether a running recording holds the controller's timing and frames of the bus."""
     frames = recording.with_name(f"{lost_bus.INTERFACE}.log").stat().st_size
     return bool(frames) and any(isinstance(found, Stored) for found in scan(recording, {TIMING}))
 
 
-def look(check: Check, page: str) -> None:
-    """The whole machine runs, with the rights and the timing that the units promise, and is not armed."""
+def inspect(check: Check, page: str) -> None:
+    """All services run with the rights and priorities of their units, and the machine is not armed."""
     wait_for_work(check, page)
     users = set()
     for name in SERVICES:
@@ -219,7 +222,7 @@ def look(check: Check, page: str) -> None:
         check.expect(bool(facts["locked_kb"]) == (name in FIFO), f"{unit} has {facts['locked_kb']} kB locked")
         check.expect(name != "controller" or facts["processors"] == [0], f"{unit} runs on {facts['processors']}")
         check.expect(facts["capabilities"] == 0 and facts["no_new_privileges"] and facts["seccomp"], f"{unit}: {facts}")
-        check.say(f"{name}: {facts}, {state['StatusText']!r}")
+        check.step(f"{name}: {facts}, {state['StatusText']!r}")
         refused = [line for line in journal(unit) if "not granted" in line]
         check.expect(not refused, f"{unit}: {refused}")
     bridge = show("timberhand-plc.service", "ActiveState", "Result")
@@ -233,35 +236,35 @@ def look(check: Check, page: str) -> None:
     check.expect(status.startswith("Valves "), f"the guard's status: {status!r}")
 
 
-def ends(check: Check, pilot: Pilot) -> None:
-    """Every way to end controller and guard, repeated while the guest stood still in the window that matters."""
-    for way in trial.WAYS:
+def end_services(check: Check, pilot: Pilot) -> None:
+    """End controller and guard in every way; repeat trials that a standstill of the guest disturbed."""
+    for ending in trial.ENDINGS:
         for _ in range(TRIES):
             try:
-                figures = trial.end(way, pilot)
+                figures = trial.run_trial(ending, pilot)
             except ProcessLookupError:
-                check.say(f"{way.name}: a busy host ended the service before we did")
+                check.step(f"{ending.name}: a busy host ended the service before we did")
                 continue
-            if way.unit == trial.CONTROLLER:
+            if ending.unit == trial.CONTROLLER:
                 figures["ready_s"] = ready_s()
             check.result["trials"].append(figures)
-            check.say(f"{way.name}: { ({name: value for name, value in figures.items() if name != 'feedback'}) }")
-            late = figures["neutral_ms"] > NEUTRAL_MS and trial.disturbed(figures)
-            if trial.moving(figures) and not late:
+            check.step(f"{ending.name}: { ({name: value for name, value in figures.items() if name != 'feedback'}) }")
+            late = figures["neutral_ms"] > NEUTRAL_MS and trial.was_disturbed(figures)
+            if trial.was_moving(figures) and not late:
                 break
-        judge_end(check, way, check.result["trials"][-1])
+        evaluate_trial(check, ending, check.result["trials"][-1])
     for unit in (trial.CONTROLLER, trial.GUARD):
         watchdog = [line for line in journal(unit) if "Watchdog timeout" in line]
         check.expect(watchdog, f"systemd says nothing of a watchdog of {unit}")
 
 
-def judge_end(check: Check, way: trial.Way, figures: dict[str, Any]) -> None:
-    """What must be true of a trial."""
-    name = way.name
-    check.figure(f"{name}_neutral_ms", figures["neutral_ms"], NEUTRAL_MS, trial.disturbed(figures))
+def evaluate_trial(check: Check, ending: trial.Ending, figures: dict[str, Any]) -> None:
+    """Check the figures of a trial."""
+    name = ending.name
+    check.figure(f"{name}_neutral_ms", figures["neutral_ms"], NEUTRAL_MS, trial.was_disturbed(figures))
     check.result["figures"] |= {f"{name}_{what}": figures[what] for what in ("no_flow_ms", "shut_ms", "ended_ms")}
-    check.expect(trial.moving(figures), f"{name}: the crane did not swing when the service was ended")
-    if not way.signal:
+    check.expect(trial.was_moving(figures), f"{name}: the crane did not move when the service ended")
+    if not ending.signal:
         check.expect(figures["frames_when_stopped"] == 0, "frames of a controller that was stopped")
         check.expect(figures["state"] == "inactive", f"a stopped service is {figures['state']}")
         return
@@ -269,18 +272,18 @@ def judge_end(check: Check, way: trial.Way, figures: dict[str, Any]) -> None:
     back = figures["restarts"] == 1 and figures["another"] and figures["state"] == "active"
     check.expect(back, f"{name}: it did not come back once")
     check.expect(figures["frames_after"] > 0, f"{name}: afterwards the controller says nothing")
-    check.expect(trial.idle(figures), f"{name}: afterwards the machine is armed: {figures['modes_after']}")
-    if way.unit == trial.GUARD:
+    check.expect(trial.is_idle(figures), f"{name}: afterwards the machine is armed: {figures['modes_after']}")
+    if ending.unit == trial.GUARD:
         check.expect(figures["same_controller"], f"{name}: the controller went down with the guard")
         check.expect("FAULT" in figures["modes_after"], f"{name}: nothing is latched: {figures['modes_after']}")
 
 
 def buses_lost(check: Check, pilot: Pilot, plant_port: int) -> None:
-    """The processes outlive their bus, say so, and need a human but no new start when it is back."""
+    """The processes survive the loss of their bus, report it, and need an operator but no restart afterwards."""
     for loss in lost_bus.LOSSES:
         figures = lost_bus.lose(loss, pilot, plant_port)
         check.result["trials"].append(figures)
-        check.say(f"bus {loss.name}: {figures}")
+        check.step(f"bus {loss.name}: {figures}")
         check.figure(f"bus_{loss.name}_moved_mrad", figures["moved_mrad"], STILL_MRAD)
         check.expect(figures["back_s"] is not None, f"the bus that was {loss.name} does not come back")
         check.result["figures"][f"bus_{loss.name}_back_s"] = figures["back_s"]
@@ -288,10 +291,10 @@ def buses_lost(check: Check, pilot: Pilot, plant_port: int) -> None:
         controller, guard = figures["status"][trial.CONTROLLER], figures["status"][trial.GUARD]
         check.expect(controller.startswith("FAULT. ") and "is DOWN." in controller, f"bus lost: {controller!r}")
         check.expect("not enabled" in guard and "is DOWN." in guard, f"bus lost: {guard!r}")
-        check.expect(trial.idle(figures), f"bus {loss.name}: it came back armed: {figures['modes_after']}")
+        check.expect(trial.is_idle(figures), f"bus {loss.name}: it came back armed: {figures['modes_after']}")
 
 
-def technician(check: Check) -> None:
+def check_status_command(check: Check) -> None:
     """`timberhand service status`."""
     found = json.loads(carry_out(check, "status", PROGRAM, "service", "status", "--json").stdout)
     running = {unit["name"] for unit in found["units"] if unit["state"] == "running"}
@@ -303,52 +306,52 @@ def technician(check: Check) -> None:
     check.result["status"] = shown
 
 
-def removed(check: Check) -> None:
-    """Nothing of it is left that could start."""
+def check_removal(check: Check) -> None:
+    """Nothing is left that could start."""
     check.expect(not Path("/opt/timberhand").exists(), "the program is still there")
     check.expect(show("timberhand.target", "LoadState")["LoadState"] == "not-found", "the target is still there")
     check.expect(not Path("/etc/timberhand/timberhand.conf").exists(), "unchanged settings are still there")
 
 
 def run(check: Check, order: dict[str, str]) -> None:
-    """All steps."""
+    """Run all steps."""
     facts = {"kernel": platform.release(), "systemd": systemctl("--version").stdout.splitlines()[0]}
     check.result["environment"] = facts | {"python": platform.python_version()}
-    hasten()
+    prioritize()
     subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     install(check, order)
     idle = systemctl("is-active", trial.CONTROLLER).stdout.strip() == "inactive"
     enabled = systemctl("is-enabled", "timberhand.target", trial.CONTROLLER).stdout.split() == ["enabled"] * 2
     check.expect(idle and enabled, "after the installation the services are not enabled, or they run")
     shipped = CONF.read_text()
-    conf = settle(check)
+    conf = change_settings(check)
     bus_without_interface(check)
     plug_in(check)
     plant_port = int(conf["SCENE"].rpartition(":")[2])
     plant = start_plant(check, str(plant_port))
     cold_start(check)
-    look(check, f"http://127.0.0.1:{conf['CONSOLE_PORT']}/")
-    technician(check)
-    systemctl("stop", "timberhand-autonomy.service")  # the pilot plans
+    inspect(check, f"http://127.0.0.1:{conf['CONSOLE_PORT']}/")
+    check_status_command(check)
+    systemctl("stop", "timberhand-autonomy.service")  # the pilot replaces the planner
     pilot = Pilot(conf["PROFILE"], int(conf["SETPOINT_PORT"]), int(conf["PLANNER_PORT"]), conf["CRANE_BUS"])
     os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PILOT_PRIORITY))
-    ends(check, pilot)
+    end_services(check, pilot)
     buses_lost(check, pilot, plant_port)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     plant.terminate()
     CONF.write_text(shipped)
     uninstall(check)
-    removed(check)
+    check_removal(check)
 
 
 def main() -> None:
-    """Whatever happens, there is a result, and the guest ends."""
-    os.environ.pop("PYTHONPATH", None)  # it is ours; what was installed must do without
+    """Run the steps; in any case print a result and power off."""
+    os.environ.pop("PYTHONPATH", None)  # for this process only; the installed program must not need it
     check = Check(sys.stdout)
     try:
         run(check, json.loads(Path(sys.argv[1]).read_text()))
-    except (OSError, ValueError, KeyError, subprocess.SubprocessError, trial.Stuck) as error:
-        check.expect(False, f"the check broke off: {type(error).__name__}: {error}")
+    except (OSError, ValueError, KeyError, subprocess.SubprocessError, trial.MachineStuck) as error:
+        check.expect(False, f"the test was aborted: {type(error).__name__}: {error}")
     check.end()
     systemctl("poweroff", "--force", "--force")
 

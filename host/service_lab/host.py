@@ -1,6 +1,6 @@
-"""Boots the guest and collects what it says.  Failure: ``LabError`` with one sentence.
+"""Boots the guest and collects its messages.  Failure: ``LabError``.
 
-The guest writes JSON lines to its first console: ``{"event": ...}`` as it goes, ``{"result": {...}}`` at the end.
+The guest writes JSON lines to its first console: ``{"event": ...}`` for every step, ``{"result": {...}}`` at the end.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from host.vcan_lab.uml import KERNEL
 ROOT: Final = Path(__file__).resolve().parents[2]
 CHECKOUT: Final = ROOT / "pyproject.toml"
 MEM_MB: Final = 1536
-"""The plant with its compiled parts, the installed program on the overlay, and systemd; the host gives what is used."""
+"""Memory for the plant, the installed program on the overlay, and systemd; the host provides only touched pages."""
 END_S: Final = 10.0
 WARM_UP_S: Final = 300.0
 LEFT_OUT: Final = shutil.ignore_patterns(".*", "runs", "build", "dist", "__pycache__", "*.egg-info")
@@ -41,11 +41,11 @@ plant = Plant(load_profile("palms_471"))
 for now_ms in range(1000, 1100, 5):
     plant.step(now_ms * 1_000_000, [])
 """
-"""Compiles what the guest runs: in the guest it would take long, and while services are timed."""
+"""Compiles the code for the guest; inside it would take long, while services are timed."""
 
 CHECK_SERVICE: Final = """\
 [Unit]
-Description=the check
+Description=timberhand service lab
 After=basic.target
 [Service]
 Type=exec
@@ -63,7 +63,7 @@ WantedBy=multi-user.target
 
 
 def missing() -> str | None:
-    """Why there is no lab on this machine, or None."""
+    """Why this computer cannot run the lab; None when it can."""
     if platform.machine() != "x86_64":
         return f"user-mode Linux runs on x86_64 only, this is {platform.machine()}"
     if shutil.which(KERNEL) is None:
@@ -73,23 +73,23 @@ def missing() -> str | None:
     if not Path("/lib/systemd/systemd-udevd").exists():
         return "udev is missing: apt-get install udev"
     if os.geteuid() != 0:
-        return "the guest's root is this machine's files: only root can be root on them"
+        return "the guest runs on this computer's files, so the lab requires root"
     python = python_for_services()
     probe = [python, "-c", "import ensurepip, venv"]
     if not Path(python).exists() or subprocess.run(probe, capture_output=True, check=False).returncode:
-        return f"{python} is missing or makes no virtual environments: apt-get install python3-venv"
+        return f"{python} is missing or cannot create virtual environments: apt-get install python3-venv"
     return None
 
 
 def python_for_services() -> str:
-    """The system's Python of this version: services see none in a home directory, nor its library."""
+    """The system's Python of this version; services cannot use one in a home directory."""
     return f"/usr/bin/python{sys.version_info.major}.{sys.version_info.minor}"
 
 
 def build_wheel(folder: Path) -> Path:
-    """A wheel of this checkout in ``folder``; the checkout stays as it is."""
+    """Build a wheel of this checkout in ``folder``; the checkout is not changed."""
     if not CHECKOUT.is_file():
-        raise LabError(f"there is no checkout around {ROOT} to build a wheel from; name one with --wheel")
+        raise LabError("service-lab.no-checkout", f"{ROOT} is not a checkout to build a wheel from; use --wheel")
     source = folder / "source"
     shutil.copytree(ROOT, source, ignore=LEFT_OUT)
     made = subprocess.run(
@@ -97,25 +97,29 @@ def build_wheel(folder: Path) -> Path:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     if made.returncode:
-        raise LabError(f"no wheel can be built: {(made.stderr.strip().splitlines() or ['no message'])[-1]}")
+        reason = (made.stderr.strip().splitlines() or ["no message"])[-1]
+        raise LabError("service-lab.wheel-build", f"the wheel cannot be built: {reason}")
     return next(folder.glob("timberhand-*.whl"))
 
 
 def _build_options() -> list[str]:
-    """Without a network where this environment has the build tool itself."""
+    """Build without a network when this environment has the build tool."""
     import setuptools
 
     return ["--no-build-isolation"] if int(setuptools.__version__.split(".")[0]) >= 77 else []
 
 
-def run(wheel: Path | None, timeout_s: float, tell: Callable[[str], None]) -> dict[str, Any]:
-    """The guest's result; ``tell`` gets a line for every step.
+def run(wheel: Path | None, timeout_s: float, show_step: Callable[[str], None]) -> dict[str, Any]:
+    """Run the guest and return its result; ``show_step`` gets a line for every step.
 
-    Whatever runs in the guest comes out of the wheel, the check itself and the emulated machine included; a checkout
-    is hidden from it.
+    Everything in the guest runs from the wheel, including the test itself and the emulated machine; the checkout is
+    hidden from it.
+
+    Raises:
+        LabError: the lab cannot run, or the guest gives no result.
     """
     if fault := missing():
-        raise LabError(f"no service lab here: {fault}")
+        raise LabError("service-lab.unavailable", f"the service lab cannot run here: {fault}")
     with tempfile.TemporaryDirectory(prefix="timberhand-service-") as name:
         folder = Path(name)
         wheel = wheel.resolve() if wheel else build_wheel(folder)
@@ -131,30 +135,30 @@ def run(wheel: Path | None, timeout_s: float, tell: Callable[[str], None]) -> di
             f"LAB={folder}", f"ENVIRONMENT={Path(sys.prefix).resolve()}", f"PYTHON={python}",
             *([f"CHECKOUT={ROOT}"] if CHECKOUT.is_file() else []),
         ]  # fmt: skip
-        init = program / "hil" / "service_lab" / "init.sh"
+        init = program / "host" / "service_lab" / "init.sh"
         init.chmod(0o755)
-        return _boot(init, settings, timeout_s, tell)
+        return _boot(init, settings, timeout_s, show_step)
 
 
 def _packages() -> Path:
-    """Where this environment keeps its packages."""
+    """The folder of this environment's packages."""
     return Path(sysconfig.get_path("purelib"))
 
 
 def _warm_up(python: str, path: str) -> None:
-    surroundings = {"PATH": os.defpath, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    environment = {"PATH": os.defpath, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     try:
         subprocess.run(
-            [python, "-c", WARM_UP], env=surroundings, cwd="/", capture_output=True, text=True, check=True,
+            [python, "-c", WARM_UP], env=environment, cwd="/", capture_output=True, text=True, check=True,
             timeout=WARM_UP_S,
         )  # fmt: skip
     except subprocess.SubprocessError as error:
-        said = getattr(error, "stderr", None) or str(error)
-        raise LabError(f"what is in the wheel does not run: {said.strip().splitlines()[-1]}") from error
+        reason = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
+        raise LabError("service-lab.wheel-broken", f"the program in the wheel does not run: {reason}") from error
 
 
-def _boot(init: Path, settings: list[str], timeout_s: float, tell: Callable[[str], None]) -> dict[str, Any]:
-    said, far = os.pipe()
+def _boot(init: Path, settings: list[str], timeout_s: float, show_step: Callable[[str], None]) -> dict[str, Any]:
+    messages, far = os.pipe()
     log = os.memfd_create("kernel log")
     arguments = [
         f"mem={MEM_MB}M", "root=none", "rootfstype=hostfs", "rootflags=/", "rw",
@@ -173,26 +177,26 @@ def _boot(init: Path, settings: list[str], timeout_s: float, tell: Callable[[str
     )  # fmt: skip
     os.close(far)
     try:
-        result = _listen(said, time.monotonic() + timeout_s, tell)
+        result = _receive(messages, time.monotonic() + timeout_s, show_step)
     finally:
         assert guest.stdin
         with contextlib.suppress(subprocess.TimeoutExpired):
             guest.wait(0 if sys.exc_info()[0] else END_S)
-        guest.stdin.close()  # the keeper's lifeline
+        guest.stdin.close()  # the keeper ends with it
         guest.wait()
-        os.close(said)
+        os.close(messages)
     if result is None:
         lines = os.pread(log, 1 << 20, 0).decode(errors="replace").strip().splitlines()[-12:]
-        raise LabError("\n  ".join(["the guest gave no result", *lines]))
+        raise LabError("service-lab.no-result", "\n  ".join(["the guest gave no result", *lines]))
     os.close(log)
     return result
 
 
-def _listen(said: int, deadline_s: float, tell: Callable[[str], None]) -> dict[str, Any] | None:
-    """Until the guest's result, its end or the deadline."""
+def _receive(messages: int, deadline_s: float, show_step: Callable[[str], None]) -> dict[str, Any] | None:
+    """The result of the guest; None when it ends or the deadline passes first."""
     rest = b""
-    while (left_s := deadline_s - time.monotonic()) > 0 and select.select([said], [], [], left_s)[0]:
-        data = os.read(said, 65536)
+    while (left_s := deadline_s - time.monotonic()) > 0 and select.select([messages], [], [], left_s)[0]:
+        data = os.read(messages, 65536)
         if not data:
             return None
         *lines, rest = (rest + data).split(b"\n")
@@ -202,10 +206,10 @@ def _listen(said: int, deadline_s: float, tell: Callable[[str], None]) -> dict[s
             with contextlib.suppress(json.JSONDecodeError):
                 message = json.loads(text)
             if not isinstance(message, dict):
-                tell(text)
+                show_step(text)
             elif "result" in message:
                 found: dict[str, Any] = message["result"]
                 return found
             else:
-                tell(f"{message['at_s']:7.1f} s  {message['event']}")
+                show_step(f"{message['at_s']:7.1f} s  {message['event']}")
     return None

@@ -1,6 +1,6 @@
-"""The crane's bus lost under the moving crane: its interface goes down, or its adapter is unplugged, and comes back.
+"""Loss of the crane's bus while the crane moves: the interface goes down, or the adapter is unplugged, and returns.
 
-Nothing on the bus can be watched meanwhile, so the emulated machine itself is asked whether it moves.
+The bus shows nothing meanwhile, so the emulated machine is asked for its motion.
 """
 
 from __future__ import annotations
@@ -13,26 +13,24 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from host.service_lab.pilot import Pilot
-from host.service_lab.trial import CONTROLLER, GUARD, go, prepared, quiet, swinging
+from host.service_lab.trial import CONTROLLER, GUARD, observe_idle, prepare, release, slew_until_fast
 from host.systemd import show
 from machine.joints import Joint
 
 INTERFACE: Final = "crane0"
 AWAY_S: Final = 2.0
 STOPPED_S: Final = 0.5
-"""The boom has come to rest this long after its valves closed."""
+"""Time for the boom to come to rest after its valves have closed."""
 BACK_S: Final = 15.0
 
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """How the interface goes and what brings it back; an adapter that is plugged in again is set up by nobody but the
-    installed rule for udev.
-    """
+    """The commands that remove and restore the interface; the installed udev rule sets up a new adapter."""
 
     name: str
     lose: tuple[str, ...]
-    give_back: tuple[str, ...]
+    restore: tuple[str, ...]
 
 
 LOSSES: Final = (
@@ -42,27 +40,31 @@ LOSSES: Final = (
 
 
 def lose(loss: Loss, pilot: Pilot, plant_port: int) -> dict[str, Any]:
-    """Figures of one trial; raises `host.service_lab.trial.Stuck` when the crane does not swing, before or after."""
+    """Run one trial and return its figures.
+
+    Raises:
+        MachineStuck: the crane does not move before or after the loss.
+    """
     processes = _processes()
-    losing = prepared(*loss.lose)
-    swinging(pilot)
+    losing = prepare(*loss.lose)
+    slew_until_fast(pilot)
     opening_pct = pilot.opening_pct()
-    go(losing)
+    release(losing)
     losing.wait()
     pilot.until(lambda: False, STOPPED_S)
     stopped_rad = _slew(plant_port)
     pilot.until(lambda: False, AWAY_S)
     status = {unit: show(unit, "StatusText")["StatusText"] for unit in (CONTROLLER, GUARD)}
     moved_rad = abs(_slew(plant_port) - stopped_rad)
-    pilot.forget()
+    pilot.clear()
     begin_s = time.monotonic()
-    subprocess.run(loss.give_back, check=True)
+    subprocess.run(loss.restore, check=True)
     back = pilot.until(lambda: pilot.valves and pilot.guarded_ns and pilot.commands, BACK_S)
     back_s = time.monotonic() - begin_s
-    figures = quiet(pilot)
+    figures = observe_idle(pilot)
     same = _processes() == processes
     if back:
-        swinging(pilot)
+        slew_until_fast(pilot)
         pilot.rest()
     return figures | {
         "way": loss.name,
@@ -79,8 +81,8 @@ def _processes() -> list[dict[str, str]]:
 
 
 def _slew(port: int) -> float:
-    """Where the column truly is [rad]."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        asking.settimeout(5.0)
-        asking.sendto(json.dumps({"op": "state"}).encode(), ("127.0.0.1", port))
-        return float(json.loads(asking.recv(65536))["joints"][Joint.SLEW])
+    """The true slew angle [rad]."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.settimeout(5.0)
+        client.sendto(json.dumps({"op": "state"}).encode(), ("127.0.0.1", port))
+        return float(json.loads(client.recv(65536))["joints"][Joint.SLEW])

@@ -1,4 +1,4 @@
-"""One way to end the controller or the guard while the crane swings, and what the valves and systemd did about it."""
+"""Ends the controller or the guard while the crane slews, and measures how valves and systemd react."""
 
 from __future__ import annotations
 
@@ -15,52 +15,57 @@ from can_dbc.messages.crane import OperatorAction
 from host.service_lab.pilot import Pilot, Valve
 from host.systemd import show
 from machine.status.modes import Mode
+from runtime.errors import CodedError
 
 CONTROLLER: Final = "timberhand-controller.service"
 GUARD: Final = "timberhand-guard.service"
 OPEN_PCT: Final = 25.0
-"""The crane swings when a spool is open so far."""
+"""The crane moves when a spool opens this far."""
 SHUT_PCT: Final = 1.0
 MOVING: Final = (1, 2)
-"""ValveFbA.State in which the valve node gives the spools a command: active, and its own ramp."""
+"""ValveFbA.State in which the valve node commands its spools: active, and its own ramp."""
 COMMAND_PRIORITY: Final = 40
 TICK_NS: Final = 5_000_000
 QUIET_S: Final = 1.5
-"""So long a machine whose service came back is watched."""
+"""Observation time after a service has returned."""
 STILL_MS: Final = 10.0
-"""A guest that stood still for longer near the end of the service proves nothing."""
+"""A longer standstill of the guest near the end of the service invalidates the trial."""
 GUARD_BACK_NS: Final = 400_000_000
-"""What the guard says later than this after its end, it says in its next life (RestartSec is longer)."""
-PATIENCE_S: Final = 120.0
-"""A busy host stops the machine now and then, and it is armed again for so long."""
+"""Messages of the guard later than this after its end come from the restarted guard (RestartSec is longer)."""
+REARM_S: Final = 120.0
+"""A busy host may stop the machine; for this time it is armed again."""
 BUTTONS: Final = {Mode.FAULT: OperatorAction.RESET, Mode.STOP: OperatorAction.ARM, Mode.STANDBY: OperatorAction.ARM}
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """How a service is ended: by a signal, or with 0 by systemd."""
+class Ending:
+    """How a service is ended: by a signal, or by systemd when ``signal`` is 0."""
 
     name: str
     unit: str
     signal: int
 
 
-WAYS: Final = (
-    Way("kill", CONTROLLER, signal.SIGKILL),
-    Way("hang", CONTROLLER, signal.SIGSTOP),
-    Way("stop", CONTROLLER, 0),
-    Way("guard_kill", GUARD, signal.SIGKILL),
-    Way("guard_hang", GUARD, signal.SIGSTOP),
+ENDINGS: Final = (
+    Ending("kill", CONTROLLER, signal.SIGKILL),
+    Ending("hang", CONTROLLER, signal.SIGSTOP),
+    Ending("stop", CONTROLLER, 0),
+    Ending("guard_kill", GUARD, signal.SIGKILL),
+    Ending("guard_hang", GUARD, signal.SIGSTOP),
 )
 
 
-class Stuck(Exception):
-    """The machine does not do what a trial needs; the message says what."""
+class MachineStuck(CodedError):
+    """The machine does not move as a trial requires."""
 
 
-def swinging(pilot: Pilot) -> None:
-    """Arm the machine and swing it, as a human and a planner would, again after every stop; raises `Stuck`."""
-    limit_s = time.monotonic() + PATIENCE_S
+def slew_until_fast(pilot: Pilot) -> None:
+    """Arm the machine and slew it, again after every stop.
+
+    Raises:
+        MachineStuck: the crane does not move.
+    """
+    limit_s = time.monotonic() + REARM_S
     while time.monotonic() < limit_s:
         mode = Mode(pilot.report.mode) if pilot.report else Mode.BOOT
         if mode in BUTTONS:
@@ -77,7 +82,7 @@ def swinging(pilot: Pilot) -> None:
                 return
         else:
             pilot.until(lambda: False, 0.6)
-    raise Stuck(f"the crane does not swing: {pilot.report}")
+    raise MachineStuck("service-lab.machine-stuck", f"the crane does not move: {pilot.report}")
 
 
 def _fast(pilot: Pilot) -> bool:
@@ -88,33 +93,33 @@ def _halted(pilot: Pilot) -> bool:
     return pilot.report is None or pilot.report.mode != Mode.ACTIVE
 
 
-def end(way: Way, pilot: Pilot) -> dict[str, Any]:
-    """Figures of one trial; times in ms from the moment the service was ended."""
-    before = show(way.unit, "NRestarts", "MainPID")  # takes its time: nothing is asked while the crane swings
+def run_trial(ending: Ending, pilot: Pilot) -> dict[str, Any]:
+    """Run one trial and return its figures; times in ms from the end of the service."""
+    before = show(ending.unit, "NRestarts", "MainPID")  # slow, so not while the crane moves
     controller = show(CONTROLLER, "MainPID")["MainPID"]
     pid = int(before["MainPID"])
     ended = os.pidfd_open(pid)
-    stop = None if way.signal else prepared("systemctl", "stop", way.unit)
-    swinging(pilot)
+    stop = None if ending.signal else prepare("systemctl", "stop", ending.unit)
+    slew_until_fast(pilot)
     opening_pct = pilot.opening_pct()
-    pilot.forget()
+    pilot.clear()
     began_ns = time.monotonic_ns()
     if stop:
-        go(stop)
+        release(stop)
     else:
-        signal.pidfd_send_signal(ended, way.signal)
+        signal.pidfd_send_signal(ended, ending.signal)
     gone = pilot.until(lambda: select.select([ended], [], [], 0)[0], 10.0)
     gone_ns = time.monotonic_ns()
     os.close(ended)
     pilot.until(lambda: False, 0.5)
     if stop:
         stop.wait()
-        # The signal came at most a tick before the last words; asking systemd to send it took longer than all the rest.
-        began_ns = pilot.farewell_ns - TICK_NS
+        # The signal came at most a tick before the last frames; systemd took longer than that to send it.
+        began_ns = pilot.disarmed_ns - TICK_NS
         opening_pct = max((v.opening_pct for v in pilot.valves if v.stamp_ns <= began_ns), default=0.0)
     figures: dict[str, Any] = {
-        "way": way.name,
-        "moving_until_then": not stop or pilot.mode_at_farewell is Mode.ACTIVE,
+        "way": ending.name,
+        "moving_until_then": not stop or pilot.mode_when_disarmed is Mode.ACTIVE,
         "opening_pct": opening_pct,
         "ended_ms": (gone_ns - began_ns) * 1e-6 if gone else None,
         "neutral_ms": _after(pilot, began_ns, lambda v: v.state in MOVING),
@@ -129,57 +134,57 @@ def end(way: Way, pilot: Pilot) -> dict[str, Any]:
     }
     if stop:
         pilot.rest()
-        figures |= {"state": show(way.unit, "ActiveState")["ActiveState"], "frames_when_stopped": _frames(pilot)}
-        subprocess.run(["systemctl", "start", way.unit], check=True)
+        figures |= {"state": show(ending.unit, "ActiveState")["ActiveState"], "frames_when_stopped": _frames(pilot)}
+        subprocess.run(["systemctl", "start", ending.unit], check=True)
         pilot.report = None
         pilot.until(lambda: pilot.report, 5.0)
         return figures
-    figures |= _second_life(way.unit, pilot, pid, int(before["NRestarts"]), began_ns)
+    figures |= _after_restart(ending.unit, pilot, pid, int(before["NRestarts"]), began_ns)
     figures["same_controller"] = show(CONTROLLER, "MainPID")["MainPID"] == controller
     pilot.rest()
     return figures
 
 
-def prepared(*command: str) -> subprocess.Popen[bytes]:
-    """A command that waits for `go`: to start it then would hold the pilot up, and it must not wait behind others."""
+def prepare(*command: str) -> subprocess.Popen[bytes]:
+    """Start a command that waits for `release`, so that its start delays neither the pilot nor itself."""
     waiting = subprocess.Popen(["sh", "-c", 'read line; exec "$@"', "sh", *command], stdin=subprocess.PIPE)
     os.sched_setscheduler(waiting.pid, os.SCHED_FIFO, os.sched_param(COMMAND_PRIORITY))
     return waiting
 
 
-def go(command: subprocess.Popen[bytes]) -> None:
-    """Let it run."""
+def release(command: subprocess.Popen[bytes]) -> None:
+    """Let a prepared command run."""
     assert command.stdin
     os.write(command.stdin.fileno(), b"\n")
 
 
-def moving(figures: dict[str, Any]) -> bool:
-    """Whether the crane swung until the end, so that the trial says something."""
+def was_moving(figures: dict[str, Any]) -> bool:
+    """Whether the crane moved until the end of the service, so that the trial is valid."""
     return bool(figures["moving_until_then"] and figures["opening_pct"] > OPEN_PCT)
 
 
-def disturbed(figures: dict[str, Any]) -> bool:
-    """Whether the guest stood still while it mattered."""
+def was_disturbed(figures: dict[str, Any]) -> bool:
+    """Whether the guest stood still in the relevant window."""
     return bool(figures["stood_still_ms"] > STILL_MS)
 
 
 def _after(pilot: Pilot, began_ns: int, moving: Callable[[Valve], bool]) -> float:
-    """From ``began_ns`` to the first feedback after which nothing moves any more."""
+    """Time from ``began_ns`` to the first feedback after the last motion [ms]."""
     last_ns = max((v.stamp_ns for v in pilot.valves if moving(v)), default=began_ns)
     return next((max(v.stamp_ns - began_ns, 0) * 1e-6 for v in pilot.valves if v.stamp_ns > last_ns), float("inf"))
 
 
 def _frames(pilot: Pilot) -> int:
-    pilot.forget()
+    pilot.clear()
     pilot.until(lambda: False, 0.3)
     return pilot.commands
 
 
-def _second_life(unit: str, pilot: Pilot, pid: int, restarts: int, began_ns: int) -> dict[str, Any]:
-    """It comes back by itself, the machine disarmed, and stays so whatever setpoints come."""
+def _after_restart(unit: str, pilot: Pilot, pid: int, restarts: int, began_ns: int) -> dict[str, Any]:
+    """The figures after the restart: the service returns, the machine stays disarmed despite setpoints."""
     pilot.report = None
     pilot.until(lambda: pilot.report and pilot.guarded_ns > began_ns + GUARD_BACK_NS, 15.0)
-    figures = quiet(pilot)
+    figures = observe_idle(pilot)
     after = show(unit, "NRestarts", "ActiveState", "StatusText", "ActiveEnterTimestampMonotonic", "MainPID")
     return figures | {
         "back_ms": int(after["ActiveEnterTimestampMonotonic"]) * 1e-3 - began_ns * 1e-6,
@@ -190,9 +195,9 @@ def _second_life(unit: str, pilot: Pilot, pid: int, restarts: int, began_ns: int
     }
 
 
-def quiet(pilot: Pilot) -> dict[str, Any]:
-    """What the machine does while nobody presses a button."""
-    pilot.forget()
+def observe_idle(pilot: Pilot) -> dict[str, Any]:
+    """Observe the machine without pressing a button."""
+    pilot.clear()
     pilot.until(lambda: False, QUIET_S)
     return {
         "modes_after": sorted(mode.name for mode in pilot.modes),
@@ -202,7 +207,7 @@ def quiet(pilot: Pilot) -> dict[str, Any]:
     }
 
 
-def idle(figures: dict[str, Any]) -> bool:
-    """Whether the machine waited for a human in `quiet`."""
+def is_idle(figures: dict[str, Any]) -> bool:
+    """Whether the machine waited for an operator during `observe_idle`."""
     armed = figures["armed_after"] or {"ARMED", "ACTIVE"} & set(figures["modes_after"])
     return not armed and figures["opening_after_pct"] <= SHUT_PCT

@@ -1,6 +1,6 @@
 """Command line of the lab: ``python -m host.vcan_lab -- COMMAND``, the same as ``timberhand hil vcan -- COMMAND``.
 
-Exit status: the command's own; 124 its time ran out; 126, 127 it cannot be started; 2 usage; 4 no lab.
+Exit status: that of the command; 124 timeout; 126, 127 the command cannot be started; 2 usage; 4 no lab available.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from host.exit_codes import ExitCode
 from host.vcan_lab.spec import DEFAULT_BOOT_TIMEOUT_S, DEFAULT_LINKS, DEFAULT_MEM_MB, LabError, Request, link_fault
 
 CONTEXT = {"allow_interspersed_args": False}
-"""The first word of the command ends the lab's own options, with or without ``--``."""
+"""The first word of the command ends the options of the lab, with or without ``--``."""
 
 
 class Kernel(StrEnum):
-    """A user-mode kernel by name."""
+    """A user-mode kernel."""
 
     DEBIAN = "debian"
     LAB = "lab"
@@ -29,29 +29,31 @@ class Kernel(StrEnum):
 def vcan(
     command: Annotated[list[str] | None, typer.Argument(metavar="COMMAND [ARG]...", show_default=False)] = None,
     link: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="A further interface beside vcan0 and vcan1; repeatable.")
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Further interface besides vcan0 and vcan1; may be repeated."),
     ] = None,
     timeout: Annotated[
-        float | None, typer.Option(metavar="S", min=0.001, help="Seconds the command may run; then exit 124.")
+        float | None,
+        typer.Option(metavar="S", min=0.001, help="Time limit of the command; exit status 124 when exceeded."),
     ] = None,
     mem: Annotated[int, typer.Option(metavar="MB", min=128, help="Memory of the user-mode kernel.")] = DEFAULT_MEM_MB,
-    root: Annotated[bool, typer.Option("--root", help="Be root inside (files stay the caller's).")] = False,
+    root: Annotated[bool, typer.Option("--root", help="Be root inside; files still belong to the caller.")] = False,
     kernel: Annotated[
-        Kernel | None, typer.Option(help="Use this user-mode kernel, whatever else there is; lab: make lab-kernel.")
+        Kernel | None, typer.Option(help="Force this user-mode kernel; lab is built by `make lab-kernel`.")
     ] = None,
     time_travel: Annotated[
-        bool, typer.Option("--time-travel", help="Simulated time, in the lab's own kernel: waiting takes no time.")
+        bool, typer.Option("--time-travel", help="Simulated time, with the lab kernel: waiting takes no time.")
     ] = False,
     boot_timeout: Annotated[
-        float, typer.Option(metavar="S", min=0.001, help="Seconds until the interfaces must be there.")
+        float, typer.Option(metavar="S", min=0.001, help="Time limit until the interfaces are ready.")
     ] = DEFAULT_BOOT_TIMEOUT_S,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print the way, boot time and memory.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print method, boot time and memory.")] = False,
     check: Annotated[
-        bool, typer.Option("--check", help="Print which way would be taken and why; run nothing.")
+        bool, typer.Option("--check", help="Print the method that would be used and why; run nothing.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="With --check: as JSON.")] = False,
 ) -> None:
-    """Run a command with real SocketCAN interfaces vcan0 and vcan1, on any Linux kernel.
+    """Run a command with SocketCAN interfaces vcan0 and vcan1, on any Linux kernel.
 
     Natively where the kernel has CAN, else in user-mode Linux on this machine's
     own files: no root, a second to boot, nothing left behind. Standard input is
@@ -71,9 +73,9 @@ def vcan(
     from host.vcan_lab.host import run
 
     if not command and not check:
-        raise typer.BadParameter("no command: give one after --", param_hint="COMMAND")
+        raise typer.BadParameter("no command given; write it after --", param_hint="COMMAND")
     if time_travel and kernel is Kernel.DEBIAN:
-        raise typer.BadParameter("Debian's kernel has no simulated time: leave --kernel away", param_hint="--kernel")
+        raise typer.BadParameter("Debian's kernel has no simulated time; omit --kernel", param_hint="--kernel")
     for name in link or ():
         if fault := link_fault(name):
             raise typer.BadParameter(fault, param_hint="--link")
@@ -94,19 +96,21 @@ def vcan(
         time_travel=time_travel,
     )
     try:
-        way = choose(survey(request), request.kernel)
+        method = choose(survey(request), request.kernel)
         if check:
-            found = {"way": way.kind, "why": way.why, "kernel": way.kernel, "links": request.links}
-            typer.echo(json.dumps(found) if as_json else f"{way.kind}: {way.why}")
+            found = {"way": method.kind, "why": method.reason, "kernel": method.kernel, "links": request.links}
+            typer.echo(json.dumps(found) if as_json else f"{method.kind}: {method.reason}")
             return
         if verbose:
-            typer.echo(f"vcan lab: {way.kind}: {way.why}", err=True)
-        status = run(request, way, verbose)
-    except LabError as reason:
+            typer.echo(f"vcan lab: {method.kind}: {method.reason}", err=True)
+        status = run(request, method, verbose)
+    except LabError as error:
         if check and as_json:
-            typer.echo(json.dumps({"way": None, "why": str(reason), "kernel": None, "links": request.links}))
+            typer.echo(
+                json.dumps({"way": None, "why": str(error), "code": error.code, "kernel": None, "links": request.links})
+            )
         else:
-            typer.echo(f"vcan lab: {reason}", err=True)
+            typer.echo(f"vcan lab: {error} [{error.code}]", err=True)
         status = ExitCode.BUS
     raise typer.Exit(status)
 

@@ -1,6 +1,6 @@
-"""Which way a lab takes on this machine, and why.
+"""Chooses the method of the lab on this computer.
 
-``survey`` looks, ``choose`` decides (pure).  Failure: ``LabError`` names every way's reason.
+``survey`` inspects the computer, ``choose`` decides (pure).  Failure: ``LabError`` with the reason against each method.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _TRY_NAMESPACE = (
 
 
 @dataclass(frozen=True, slots=True)
-class Machine:
-    """What counts for the choice; each ``*_fault`` is the reason against a way, None where it works."""
+class HostFacts:
+    """The facts for the choice; each ``*_fault`` is the reason against a method, None when it works."""
 
     can_fault: str | None
     existing_fault: str | None
@@ -37,42 +37,48 @@ class Machine:
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """The way taken, the reason, and the kernel's program for ``uml``."""
+class Method:
+    """The method, the reason for it, and the kernel program for ``uml``."""
 
     kind: Literal["existing", "namespace", "uml"]
-    why: str
+    reason: str
     kernel: str | None = None
 
 
-def choose(machine: Machine, kernel: str | None = None) -> Way:
-    """The first way that works: no kernel of its own before one, the machine's interfaces before new ones.
+def choose(facts: HostFacts, kernel: str | None = None) -> Method:
+    """The first method that works: native before user-mode Linux, existing interfaces before new ones.
 
-    ``kernel``: as in `Request`; a kernel that is asked for is the only way.
+    ``kernel``: as in `Request`; a requested kernel is the only method.
+
+    Raises:
+        LabError: no method works.
     """
     if kernel is not None:
-        natively = f"the {kernel} kernel is asked for"
-    elif machine.can_fault is None:
-        if machine.existing_fault is None:
-            return Way("existing", "the interfaces are there and up")
-        if machine.namespace_fault is None:
-            return Way("namespace", "the kernel has CAN and vcan")
-        natively = f"{machine.existing_fault}, and none can be made ({machine.namespace_fault})"
+        natively = f"the {kernel} kernel is requested"
+    elif facts.can_fault is None:
+        if facts.existing_fault is None:
+            return Method("existing", "the interfaces exist and are up")
+        if facts.namespace_fault is None:
+            return Method("namespace", "the kernel has CAN and vcan")
+        natively = f"{facts.existing_fault}, and none can be created ({facts.namespace_fault})"
     else:
-        natively = f"this kernel has no AF_CAN ({machine.can_fault})"
-    if machine.architecture != "x86_64":
-        raise LabError(f"no vcan here: {natively}; user-mode Linux runs on x86_64 only, this is {machine.architecture}")
+        natively = f"this kernel has no AF_CAN ({facts.can_fault})"
+    if facts.architecture != "x86_64":
+        raise LabError(
+            "lab.architecture",
+            f"no vcan here: {natively}; user-mode Linux runs on x86_64 only, this is {facts.architecture}",
+        )
     if kernel == "lab":
-        if machine.lab_kernel is None:
-            raise LabError(lab_kernel.MISSING)
-        return Way("uml", natively, machine.lab_kernel)
-    if machine.kernel is None:
-        raise LabError(f"no vcan here: {natively}; {KERNEL} is missing: apt-get install user-mode-linux")
-    return Way("uml", natively, machine.kernel)
+        if facts.lab_kernel is None:
+            raise LabError("lab.no-lab-kernel", lab_kernel.MISSING)
+        return Method("uml", natively, facts.lab_kernel)
+    if facts.kernel is None:
+        raise LabError("lab.no-uml", f"no vcan here: {natively}; {KERNEL} is missing: apt-get install user-mode-linux")
+    return Method("uml", natively, facts.kernel)
 
 
-def survey(request: Request) -> Machine:
-    """Look at this machine; tries a network namespace only where it would be needed."""
+def survey(request: Request) -> HostFacts:
+    """Inspect this computer; a network namespace is tried only where it would be used."""
     can_fault = existing_fault = namespace_fault = None
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
@@ -81,12 +87,12 @@ def survey(request: Request) -> Machine:
     if can_fault is None:
         faults = [f"{name}: {fault}" for name in request.links if (fault := links.state(name))]
         if request.root and request.uid != 0:
-            faults.append("--root asks for root")
+            faults.append("--root requires root")
         existing_fault = "; ".join(faults) or None
         if existing_fault:
             namespace_fault = _namespace_fault(request)
     own = lab_kernel.find(shim.user_cache())
-    return Machine(can_fault, existing_fault, namespace_fault, shutil.which(KERNEL), platform.machine(), own)
+    return HostFacts(can_fault, existing_fault, namespace_fault, shutil.which(KERNEL), platform.machine(), own)
 
 
 def _namespace_fault(request: Request) -> str | None:

@@ -1,7 +1,7 @@
-"""The lab's inner end: makes the interfaces, runs the command, reports how it ended.  Standard library alone.
+"""The inner part of the lab: creates the interfaces, runs the command, reports its end.  Standard library alone.
 
-It is the first process of the user-mode kernel, where three consoles lead to the host, or an ordinary process
-(ways ``existing`` and ``namespace``), which gets three descriptors: control, out, err.
+It is the first process of the user-mode kernel, where three consoles connect it with the host, or an ordinary process
+(methods ``existing`` and ``namespace``) with three descriptors: control, out, err.
 
 Control channel, JSON lines.  In: the order (``spec.order``), then ``{"signal": N}`` and ``{"close": "out"}``.
 Out: ``{"ready"}``, then ``{"started"}``, ``{"exit": N}`` (-N for signal N), or ``{"error"}`` when the lab fails.
@@ -33,12 +33,12 @@ MODULES = (
 )  # fmt: skip
 SETTINGS = {
     "kernel/sched_rt_runtime_us": "-1",  # a FIFO loop is never throttled
-    "vm/dirty_writeback_centisecs": "50",  # the host sees what is written after a second, not after thirty
+    "vm/dirty_writeback_centisecs": "50",  # the host sees written data after a second, not after thirty
     "vm/dirty_expire_centisecs": "50",
 }
 SOFT_INTERRUPT_PRIORITY = 95
 STRAGGLER_S = 0.5
-"""How long output may stay silent after the command's end before what still holds it is cut off."""
+"""Silence after the end of the command after which its remaining output is cut off."""
 
 _SYS_FINIT_MODULE = 313
 _POWER_OFF = 0x4321_FEDC
@@ -57,14 +57,14 @@ def main(descriptors: list[str]) -> None:
         if order["links"]:
             links.enter_namespace(order["links"], order["as_root"])
     except OSError as reason:
-        host.say(error=_sentence(reason))
+        host.send(error=_sentence(reason))
         return
     Supervisor(host, order, {"out": out, "err": err}, user=None).run()
 
 
 def _first_process() -> NoReturn:
     _mount("proc", "/proc", "proc")
-    _mount("devtmpfs", "/dev", "devtmpfs")  # mounted by the kernel already where it is built so
+    _mount("devtmpfs", "/dev", "devtmpfs")  # the kernel may have mounted it
     out, err, control = (os.open(f"/dev/tty{n}", os.O_RDWR | os.O_NOCTTY) for n in (1, 2, 3))
     for console in (control, out, err):
         tty.setraw(console)
@@ -72,10 +72,10 @@ def _first_process() -> NoReturn:
     with _held_time():
         order = host.receive_order()
     try:
-        _furnish(order)
+        _set_up(order)
         links.create(order["links"])
     except OSError as reason:
-        host.say(error=_sentence(reason))
+        host.send(error=_sentence(reason))
     else:
         Supervisor(host, order, {"out": out, "err": err}, order["user"]).run()
     termios.tcdrain(control)
@@ -86,26 +86,26 @@ def _first_process() -> NoReturn:
 
 @contextlib.contextmanager
 def _held_time() -> Iterator[None]:
-    """Keeps simulated time, where there is such, from running on while the host is waited for.
+    """Hold simulated time, if the kernel has it, while waiting for the host.
 
-    It advances when nothing can run, by thousands of seconds each second, so a process that nothing waits for runs
-    meanwhile.  What comes after begins at the same instant in every run.
+    Simulated time advances when nothing can run, by thousands of seconds per second; so an idle-priority process runs
+    meanwhile.  Everything after starts at the same time in every run.
     """
     if "time-travel=" not in Path("/proc/cmdline").read_text():
         yield
         return
-    runner = os.fork()
-    if runner == 0:
+    spinner = os.fork()
+    if spinner == 0:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         while True:
             os.sched_yield()
     yield
-    os.kill(runner, signal.SIGKILL)
-    os.waitpid(runner, 0)
+    os.kill(spinner, signal.SIGKILL)
+    os.waitpid(spinner, 0)
 
 
-def _furnish(order: dict[str, Any]) -> None:
-    """Mounts, modules and settings that a booted machine would have."""
+def _set_up(order: dict[str, Any]) -> None:
+    """Mounts, modules and settings of a booted machine."""
     os.umask(0)
     _mount("sysfs", "/sys", "sysfs")
     os.makedirs("/dev/pts", exist_ok=True)
@@ -130,23 +130,23 @@ def _furnish(order: dict[str, Any]) -> None:
         Path("/proc/sys", setting).write_text(value)
     for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):
         resource.setrlimit(limit, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    hasten_soft_interrupts(Path("/proc"))
+    prioritize_soft_interrupts(Path("/proc"))
 
 
-def hasten_soft_interrupts(proc: Path) -> None:
-    """Gives the thread that delivers deferred frames and datagrams real-time priority.
+def prioritize_soft_interrupts(proc: Path) -> None:
+    """Give ksoftirqd, which delivers deferred frames and datagrams, a real-time priority.
 
-    Every frame goes through a soft interrupt; once one is left to ksoftirqd, all wait for it, and at its ordinary
-    priority busy processes held frames back for more than 15 ms while FIFO tasks ran on time (measured).
+    Every frame passes a soft interrupt; once one is deferred to ksoftirqd, all wait for it.  At its ordinary priority,
+    busy processes delayed frames by more than 15 ms while FIFO tasks ran on time (measured).
     """
     for comm in proc.glob("[0-9]*/comm"):
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a worker of the kernel that just ended
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a kernel worker that has just ended
             if comm.read_text().startswith("ksoftirqd"):
                 os.sched_setscheduler(int(comm.parent.name), os.SCHED_FIFO, os.sched_param(SOFT_INTERRUPT_PRIORITY))
 
 
 def _end_descendants() -> None:
-    """Kills whatever the command left behind; this process is their subreaper, so they are all below it."""
+    """Kill all processes that the command left; this process is their subreaper, so all are its descendants."""
     while children := _children(os.getpid()):
         for pid in children:
             with contextlib.suppress(ProcessLookupError):
@@ -176,17 +176,17 @@ def _load_module(path: Path) -> None:
 
 
 class Host:
-    """The control channel."""
+    """The control channel to the host."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
         self._rest = b""
 
-    def say(self, **message: Any) -> None:
+    def send(self, **message: Any) -> None:
         os.write(self.fd, json.dumps(message).encode() + b"\n")
 
     def receive_order(self) -> dict[str, Any]:
-        self.say(ready=True)
+        self.send(ready=True)
         while (messages := self.receive()) is not None:
             for message in messages:
                 if "argv" in message:
@@ -194,14 +194,14 @@ class Host:
         sys.exit(1)  # the wrapper is gone
 
     def receive(self) -> list[dict[str, Any]] | None:
-        """Messages that a readable channel holds; None at its end."""
+        """The messages of a readable channel; None at its end."""
         data = os.read(self.fd, 65536)
         *lines, self._rest = (self._rest + data).split(b"\n")
         return [json.loads(line) for line in lines] if data else None
 
 
 class Supervisor:
-    """Starts the command, carries its output out and signals in, until it ends."""
+    """Starts the command; forwards its output to the host and signals to it, until it ends."""
 
     def __init__(self, host: Host, order: dict[str, Any], sinks: dict[str, int], user: list[Any] | None) -> None:
         self.host = host
@@ -219,7 +219,7 @@ class Supervisor:
         signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
         signal.signal(signal.SIGCHLD, lambda *_: None)
         _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
-        self.host.say(started=True)
+        self.host.send(started=True)
         if not self._start():
             return
         silent_until = None
@@ -233,9 +233,9 @@ class Supervisor:
                     os.read(woken, 512)
                     self._reap()
                 elif fd == self.host.fd:
-                    self._obey()
+                    self._on_control()
                 elif fd in self.sources:
-                    self._carry(fd)
+                    self._forward(fd)
             if self.status is not None:
                 silent_until = time.monotonic() + STRAGGLER_S
         if os.getpid() == 1:
@@ -243,16 +243,16 @@ class Supervisor:
                 termios.tcdrain(sink)
         else:
             _end_descendants()
-        assert self.status is not None  # only then does the wait end without news
-        self.host.say(exit=os.waitstatus_to_exitcode(self.status))
+        assert self.status is not None  # only then can the wait end without input
+        self.host.send(exit=os.waitstatus_to_exitcode(self.status))
 
     def _start(self) -> bool:
-        """Start the command; when it cannot be, say so as a shell does (126, 127)."""
+        """Start the command; if that fails, report it like a shell (126, 127)."""
         order = self.order
         uid, gid, groups = self.user or (None, None, None)
         pipes = {name: os.pipe() for name in self.sinks}
         try:
-            # Kept: an object that is let go takes the status of a command that has ended, and nobody hears of it.
+            # Keep the object: its destructor would collect the exit status of the command.
             self.command = subprocess.Popen(
                 order["argv"],
                 stdin=subprocess.DEVNULL, stdout=pipes["out"][1], stderr=pipes["err"][1],
@@ -264,7 +264,7 @@ class Supervisor:
             self.pid = self.command.pid
         except OSError as reason:
             os.write(self.sinks["err"], f"vcan lab: {reason.filename}: {reason.strerror}\n".encode())
-            self.host.say(exit=127 if isinstance(reason, FileNotFoundError) else 126)
+            self.host.send(exit=127 if isinstance(reason, FileNotFoundError) else 126)
             return False
         for name, (source, sink) in pipes.items():
             os.close(sink)
@@ -272,7 +272,7 @@ class Supervisor:
         return True
 
     def _reap(self) -> None:
-        """Collect every child that has ended: orphans of the command come to the first process."""
+        """Collect every child that has ended, including orphans of the command."""
         while self.status is None or os.getpid() == 1:
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)
@@ -283,7 +283,7 @@ class Supervisor:
             if pid == self.pid:
                 self.status = status
 
-    def _obey(self) -> None:
+    def _on_control(self) -> None:
         messages = self.host.receive()
         if messages is None:  # the wrapper is gone
             _end_descendants()
@@ -295,7 +295,7 @@ class Supervisor:
                 for fd in [fd for fd, name in self.sources.items() if name == message["close"]]:
                     self._end(fd)
 
-    def _carry(self, fd: int) -> None:
+    def _forward(self, fd: int) -> None:
         data = os.read(fd, 65536)
         if not data:
             self._end(fd)

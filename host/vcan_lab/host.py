@@ -1,8 +1,8 @@
-"""Runs a command in the lab: starts the guest, carries streams and signals, watches the clocks.
+"""Runs a command in the lab: starts the guest, forwards streams and signals, enforces the time limits.
 
-``run`` returns the command's exit status, 128+N for signal N, 124 (as timeout(1)) when its time ran out.
-Failure: ``LabError`` when the guest does not come up or goes away.  A guest that is gone before the command was
-started is booted once more, and that is said: nothing has been done yet, so nothing is done twice.
+``run`` returns the exit status of the command, 128+N for signal N, 124 (as timeout(1)) after its time limit.
+Failure: ``LabError`` when the guest does not start or dies.  A guest that dies before the command was started is booted
+once more, with a message.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from dataclasses import dataclass
 from typing import Any
 
 from host.vcan_lab import uml
-from host.vcan_lab.choose import Way
+from host.vcan_lab.choose import Method
 from host.vcan_lab.spec import PACKAGE_ROOT, RUN_GUEST, LabError, Request, order
 
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGUSR2)
 TIMED_OUT = 124
 BOOTS = 2
-"""A user-mode kernel very rarely (less than once in 400 boots) ends by itself before its first process speaks."""
+"""A user-mode kernel rarely (less than once in 400 boots) dies before its first process starts."""
 GRACE_S = 5.0
-"""From SIGTERM to SIGKILL when the time is out, from there to the end of the guest, and from exit to halt."""
+"""Time from SIGTERM to SIGKILL after the time limit, from there to the end of the guest, and from exit to halt."""
 
 _CHUNK = select.PIPE_BUF
-"""A pipe that polls as writable takes this much without blocking."""
+"""A pipe that polls as writable accepts this much without blocking."""
 _LOG_LINES = 12
 _NOISE = re.compile("umid|SELinux|mmapper_init|ubd device|^reboot:")
-"""What the kernel always complains about."""
+"""Harmless messages of the kernel."""
 
 
-def run(request: Request, way: Way, verbose: bool = False) -> int:
-    """Run the command; returns when it and the guest have ended.  Main thread only: it handles signals."""
+def run(request: Request, method: Method, verbose: bool = False) -> int:
+    """Run the command until it and the guest have ended.  Main thread only, because it handles signals."""
     for boots_left in reversed(range(BOOTS)):
-        lab = Lab(request, way)
+        lab = Lab(request, method)
         try:
             lab.serve()
             status = lab.status()
@@ -50,7 +50,7 @@ def run(request: Request, way: Way, verbose: bool = False) -> int:
         except LabError as reason:
             if not boots_left or not lab.gone_while_booting:
                 raise
-            print(f"vcan lab: {reason}\nvcan lab: the command had not begun: booting once more", file=sys.stderr)
+            print(f"vcan lab: {reason}\nvcan lab: the command was not started yet; booting once more", file=sys.stderr)
         finally:
             lab.end()
     if verbose:
@@ -60,7 +60,7 @@ def run(request: Request, way: Way, verbose: bool = False) -> int:
 
 @dataclass(slots=True)
 class Stream:
-    """One output of the command on its way to the caller's descriptor ``sink`` (None: nobody reads it)."""
+    """One output of the command and the caller's descriptor ``sink`` for it (None: closed)."""
 
     source: int
     sink: int | None
@@ -68,11 +68,11 @@ class Stream:
 
 
 class Lab:
-    """A running guest.  Stages: boot, run, term, kill (time is out), halt (the command has ended), over."""
+    """A running guest.  Stages: boot, run, term and kill (time limit), halt (the command has ended), over."""
 
-    def __init__(self, request: Request, way: Way) -> None:
+    def __init__(self, request: Request, method: Method) -> None:
         self.request = request
-        self.way = way
+        self.method = method
         self.report: dict[str, Any] = {}
         self.stage = "boot"
         self.began_s = time.monotonic()
@@ -86,14 +86,14 @@ class Lab:
         os.set_blocking(self._wake, False)
         signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False)
         self._handlers = {number: signal.signal(number, lambda *_: None) for number in FORWARDED}
-        self._handlers[signal.SIGPIPE] = signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # _write handles it
+        self._handlers[signal.SIGPIPE] = signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # `_write` handles it
         self.control, far = socket.socketpair()
         (out, out_far), (err, err_far) = os.pipe(), os.pipe()
         self.streams = {"out": Stream(out, sys.stdout.fileno()), "err": Stream(err, sys.stderr.fileno())}
         passed = (out_far, err_far, far.fileno())
         try:
-            if way.kernel:
-                self.guest = uml.start(way.kernel, request, passed, self._log)
+            if method.kernel:
+                self.guest = uml.start(method.kernel, request, passed, self._log)
             else:
                 self.guest = self._start_native(passed)
         finally:
@@ -110,28 +110,28 @@ class Lab:
         )  # fmt: skip
 
     def serve(self) -> None:
-        """Carry everything until the guest has closed all it held and all of it has been written."""
-        listening = True
-        while listening or self.streams:
+        """Forward everything until the guest has closed its channels and all output is written."""
+        connected = True
+        while connected or self.streams:
             wait = select.poll()
             wait.register(self._woken, select.POLLIN)
-            if listening:
+            if connected:
                 wait.register(self.control, select.POLLIN)
             for stream in self.streams.values():
                 if stream.pending and stream.sink is not None:
                     wait.register(stream.sink, select.POLLOUT)
                 else:
                     wait.register(stream.source, select.POLLIN)
-            ready = {fd for fd, _ in wait.poll(self._patience_ms())}
+            ready = {fd for fd, _ in wait.poll(self._timeout_ms())}
             if self.deadline_s is not None and time.monotonic() >= self.deadline_s:
                 if self.stage == "over":
                     return
-                self._out_of_time()
+                self._on_deadline()
             if self._woken in ready:
                 for number in os.read(self._woken, 64):
-                    self._interrupt(number)
+                    self._on_signal(number)
             if self.control.fileno() in ready:
-                listening = self._listen()
+                connected = self._receive()
             for name, stream in list(self.streams.items()):
                 if stream.pending and stream.sink in ready:
                     self._write(name, stream)
@@ -139,25 +139,27 @@ class Lab:
                     self._read(name, stream)
 
     def status(self) -> int:
-        """The command's status, or why there is none."""
+        """The exit status of the command; raises LabError when there is none."""
         if self.timed_out:
             return TIMED_OUT
         if self.interrupted:
             return 128 + self.interrupted
         if "exit" not in self.report:
-            raise LabError(self._obituary())
+            raise LabError("lab.guest-died", self._failure_report())
         status: int = self.report["exit"]
         if status == -signal.SIGKILL and "Out of memory" in self._kernel_log():
-            print(f"vcan lab: the guest's {self.request.mem_mb} MB were too little: --mem", file=sys.stderr)
+            print(
+                f"vcan lab: the guest's {self.request.mem_mb} MB of memory did not suffice; use --mem", file=sys.stderr
+            )
         return status if status >= 0 else 128 - status
 
     @property
     def gone_while_booting(self) -> bool:
-        """The guest ended by itself, with no reason given, before the command was started."""
+        """Whether the guest died without a reason before the command was started."""
         return not self.report.keys() & {"started", "error"}
 
     def end(self) -> None:
-        """Kill what is left, wait for it, give back descriptors and signal handlers."""
+        """Kill the guest, wait for it, release descriptors and signal handlers."""
         self._kill()
         self.guest.wait()
         signal.set_wakeup_fd(-1)
@@ -169,27 +171,27 @@ class Lab:
 
     def summary(self) -> str:
         """Times and memory of an ended lab."""
-        text = f"vcan lab: {self.way.kind}, ready after {self.booted_s - self.began_s:.2f} s"
+        text = f"vcan lab: {self.method.kind}, ready after {self.booted_s - self.began_s:.2f} s"
         text += f", ended after {time.monotonic() - self.began_s:.2f} s"
-        if self.way.kernel:
+        if self.method.kernel:
             peak_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss >> 10
-            text += f"; guest memory {self.request.mem_mb} MB, of the host's at most {peak_mb} MB"
+            text += f"; guest memory {self.request.mem_mb} MB, peak on the host {peak_mb} MB"
         return text
 
-    def _patience_ms(self) -> float | None:
+    def _timeout_ms(self) -> float | None:
         return None if self.deadline_s is None else max(0.0, self.deadline_s - time.monotonic()) * 1e3 + 1.0
 
     def _enter(self, stage: str, seconds: float | None) -> None:
         self.stage = stage
         self.deadline_s = None if seconds is None else time.monotonic() + seconds
 
-    def _out_of_time(self) -> None:
+    def _on_deadline(self) -> None:
         if self.stage == "run":
             self.timed_out = True
-            self._tell(signal=signal.SIGTERM)
+            self._send(signal=signal.SIGTERM)
             self._enter("term", GRACE_S)
         elif self.stage == "term":
-            self._tell(signal=signal.SIGKILL)
+            self._send(signal=signal.SIGKILL)
             self._enter("kill", GRACE_S)
         else:
             if self.stage == "boot":
@@ -198,24 +200,24 @@ class Lab:
 
     def _kill(self) -> None:
         if self.guest.stdin:
-            self.guest.stdin.close()  # the keeper's lifeline
+            self.guest.stdin.close()  # the keeper ends with it
         else:
             self.guest.kill()
         self._enter("over", 1.0)
 
-    def _interrupt(self, number: int) -> None:
+    def _on_signal(self, number: int) -> None:
         if self.stage == "boot":
             self.interrupted = number
             self._kill()
         else:
-            self._tell(signal=number)
+            self._send(signal=number)
 
-    def _tell(self, **message: Any) -> None:
+    def _send(self, **message: Any) -> None:
         with suppress(BrokenPipeError, ConnectionResetError):
             self.control.sendall(json.dumps(message).encode() + b"\n")
 
-    def _listen(self) -> bool:
-        """Act on the guest's messages; False when there will be no more."""
+    def _receive(self) -> bool:
+        """Handle the messages of the guest; False after the last one."""
         try:
             data = self.control.recv(65536)
         except ConnectionResetError:
@@ -225,8 +227,8 @@ class Lab:
             self.report |= message
             if "ready" in message:
                 needed = [sys.prefix, sys.base_prefix, PACKAGE_ROOT]
-                lab = "uml" if self.way.kernel else "native"
-                self._tell(**order(self.request, lab, self.way.kind != "existing", needed))
+                lab = "uml" if self.method.kernel else "native"
+                self._send(**order(self.request, lab, self.method.kind != "existing", needed))
             elif "started" in message:
                 self.booted_s = time.monotonic()
                 self._enter("run", self.request.timeout_s)
@@ -245,14 +247,16 @@ class Lab:
         assert stream.pending and stream.sink is not None
         try:
             stream.pending = stream.pending[os.write(stream.sink, stream.pending[:_CHUNK]) :]
-        except BrokenPipeError:  # as with a pipe of the command's own: its next write fails
+        except BrokenPipeError:  # as with a direct pipe: the next write of the command fails
             stream.sink = stream.pending = None
-            self._tell(close=name)
+            self._send(close=name)
 
     def _kernel_log(self) -> str:
         return os.pread(self._log, 1 << 20, 0).decode(errors="replace")
 
-    def _obituary(self) -> str:
-        reason = self.report.get("error") or ("the guest ended by itself" if self.stage == "boot" else "the guest died")
+    def _failure_report(self) -> str:
+        reason = self.report.get("error") or (
+            "the guest ended during its boot" if self.stage == "boot" else "the guest died"
+        )
         lines = [line for line in self._kernel_log().splitlines() if line and not _NOISE.search(line)][-_LOG_LINES:]
-        return "\n  ".join([f"the lab failed ({self.way.kind}): {reason}", *lines])
+        return "\n  ".join([f"the lab failed ({self.method.kind}): {reason}", *lines])

@@ -1,4 +1,4 @@
-"""vcan interfaces by rtnetlink, and network namespaces to put them in.  Standard library alone.
+"""vcan interfaces by rtnetlink, in network namespaces.  Standard library alone.
 
 Failure: ``OSError`` with the kernel's reason.  Layouts: rtnetlink(7), linux/if_link.h, linux/sched.h.
 """
@@ -23,18 +23,20 @@ _HEADER_LEN = 16
 
 
 def state(name: str) -> str | None:
-    """Why the CAN interface ``name`` cannot be used as it is; None when it is there and up."""
+    """Why the CAN interface ``name`` cannot be used; None when it exists and is up."""
     try:
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
             can.bind((name,))
-            pending = can.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # an interface that is down binds
+            pending = can.getsockopt(
+                socket.SOL_SOCKET, socket.SO_ERROR
+            )  # binding to an interface that is down succeeds
     except OSError as reason:
         pending = reason.errno or errno.EIO
     return os.strerror(pending) if pending else None
 
 
 def create(names: Iterable[str]) -> None:
-    """Make the vcan interfaces ``names`` and bring them and the loopback up."""
+    """Create the vcan interfaces ``names``; bring them and the loopback up."""
     names = tuple(names)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, 0) as netlink:
         netlink.bind((0, 0))
@@ -49,7 +51,7 @@ def create(names: Iterable[str]) -> None:
 def enter_namespace(names: Iterable[str], as_root: bool) -> None:
     """Move this process into a new network namespace with vcan interfaces ``names``.
 
-    Without root a user namespace comes with it, in which the caller keeps its id or, with ``as_root``, is root.
+    Without root this also creates a user namespace, in which the caller keeps its id or, with ``as_root``, is root.
     """
     uid, gid = os.getuid(), os.getgid()
     flags = _CLONE_NEWNET if uid == 0 else _CLONE_NEWNET | _CLONE_NEWUSER

@@ -1,6 +1,6 @@
 """The ptrace shim that user-mode Linux needs on CPUs with AMX, compiled on first use into the user's cache.
 
-Failure: ``LabError`` when there is no C compiler or no place for the result.
+Failure: ``LabError`` when there is no C compiler or the cache cannot be written.
 """
 
 from __future__ import annotations
@@ -23,13 +23,16 @@ def needed(cpuinfo: str) -> bool:
 
 
 def library(cache: Path) -> Path:
-    """The compiled shim in the folder ``cache``; compiled where it is missing or older than its source."""
+    """The compiled shim in the folder ``cache``; compiled when it is missing or older than its source."""
     built = cache / "xstate_shim.so"
     if built.exists() and built.stat().st_mtime >= SOURCE.stat().st_mtime:
         return built
     compiler = shutil.which("cc")
     if compiler is None:
-        raise LabError("this CPU has AMX and the lab's shim for it needs a C compiler: apt-get install gcc libc6-dev")
+        raise LabError(
+            "lab.no-compiler",
+            "on a CPU with AMX the lab needs a C compiler for its shim: apt-get install gcc libc6-dev",
+        )
     part = built.with_suffix(f".{os.getpid()}")
     try:
         cache.mkdir(parents=True, exist_ok=True)
@@ -38,14 +41,19 @@ def library(cache: Path) -> Path:
         )
         part.replace(built)
     except OSError as reason:
-        raise LabError(f"the compiled shim cannot be kept in {cache}: {reason.strerror}: set XDG_CACHE_HOME") from None
+        raise LabError(
+            "lab.shim-cache", f"the shim cannot be written to {cache}: {reason.strerror}; set XDG_CACHE_HOME"
+        ) from None
     except subprocess.CalledProcessError as failure:
         part.unlink(missing_ok=True)
         lines = failure.stderr.strip().splitlines() or ["no message"]
-        raise LabError(f"{compiler} does not compile {SOURCE}: {lines[0]}: apt-get install gcc libc6-dev") from None
+        raise LabError(
+            "lab.shim-compilation",
+            f"{compiler} does not compile {SOURCE}: {lines[0]}; try apt-get install gcc libc6-dev",
+        ) from None
     return built
 
 
 def user_cache() -> Path:
-    """Where this project keeps what it can make again (XDG base directories)."""
+    """The cache folder of timberhand (XDG base directories)."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "timberhand"

@@ -1,6 +1,6 @@
-"""What is asked of the lab, and the texts built from it: kernel arguments and the order to the guest.  Pure.
+"""The request to the lab, and what is derived from it: kernel arguments and the order to the guest.  Pure.
 
-Failure: ``LabError``, one sentence for the user.
+Failure: ``LabError``.
 """
 
 from __future__ import annotations
@@ -10,31 +10,33 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from runtime.errors import CodedError
+
 DEFAULT_LINKS: Final = ("vcan0", "vcan1")
 DEFAULT_MEM_MB: Final = 1024
 DEFAULT_BOOT_TIMEOUT_S: Final = 60.0
 PACKAGE_ROOT: Final = str(Path(__file__).resolve().parents[2])
-"""The folder that holds ``hil``."""
+"""The folder that holds the package ``host``."""
 GUEST_RUNTIME_DIR: Final = "/dev/runtime"
 RUN_GUEST: Final = "import sys; sys.path.append(sys.argv[1]); from host.vcan_lab.guest import main; main(sys.argv[2:])"
-"""Loads the guest without site packages: ``python -ISB -c RUN_GUEST <folder of hil> [descriptors]``."""
+"""Loads the guest without site-packages: ``python -ISB -c RUN_GUEST <PACKAGE_ROOT> [descriptors]``."""
 
 VIRTUAL_START_NS: Final = 1_767_225_600_000_000_000
-"""What the clock on the wall shows at the start of simulated time, 2026-01-01: two runs are the same to the stamp."""
+"""The wall clock at the start of simulated time, 2026-01-01, so that runs have equal time stamps."""
 
 _CON_OUT, _CON_ERR, _CON_CONTROL = 1, 2, 3
 _IFNAMSIZ = 15
 
 
-class LabError(Exception):
-    """The lab cannot be provided; the message says why and what to do."""
+class LabError(CodedError):
+    """The lab cannot be provided; the sentence tells why and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A command and the surroundings it asks for; ``uid``, ``gid``, ``groups`` are the caller's.
+    """A command and its environment; ``uid``, ``gid``, ``groups`` are those of the caller.
 
-    ``kernel``: a user-mode kernel that is asked for by name, Debian's or the lab's own; None takes the first way.
+    ``kernel``: a user-mode kernel by name, Debian's or the lab's own; None takes the first method that works.
     ``time_travel``: simulated time, which only the lab's own kernel has.
     """
 
@@ -55,21 +57,21 @@ class Request:
 
 
 def link_fault(name: str) -> str | None:
-    """Why ``name`` is no interface name (linux/if.h), or None."""
+    """Why ``name`` is not an interface name (linux/if.h); None when it is one."""
     if not 0 < len(name.encode()) <= _IFNAMSIZ:
-        return f"interface name {name!r}: 1 to {_IFNAMSIZ} bytes"
+        return f"interface name {name!r} must have 1 to {_IFNAMSIZ} bytes"
     if name in (".", "..") or "/" in name or ":" in name or any(c.isspace() for c in name):
-        return f"interface name {name!r}: no slash, colon or space"
+        return f"interface name {name!r} must not contain a slash, colon or space"
     return None
 
 
 def order(request: Request, lab: str, new_links: bool, needed: Sequence[str] = ()) -> dict[str, Any]:
-    """The first line on the control channel: all that the guest needs, ready for JSON.
+    """The first message on the control channel, ready for JSON: everything that the guest needs.
 
-    ``new_links``: the interfaces are to be made.  ``needed``: further paths that the guest must see.
+    ``new_links``: create the interfaces.  ``needed``: further paths that the guest must see.
     """
     env = {**request.env, "TIMBERHAND_LAB": lab}
-    if lab == "uml":  # a Unix socket belongs to one kernel: the host's must not be found, nor replaced
+    if lab == "uml":  # Unix sockets belong to one kernel: the guest must not find or replace those of the host
         env["XDG_RUNTIME_DIR"] = GUEST_RUNTIME_DIR
     needed = [request.cwd, *needed, *request.argv, *filter(None, (env.get("TMPDIR"), env.get("VIRTUAL_ENV")))]
     return {
@@ -89,8 +91,8 @@ def kernel_arguments(
 ) -> list[str]:
     """Arguments of ``linux.uml``: the host's root file system, three consoles on descriptors, the guest as init.
 
-    No console and no file of the kernel's own: ``uml_dir`` is a place where none can be made.  The two
-    blacklisted initcalls only time RAID algorithms and are two thirds of the boot.
+    No other console and no file of the kernel: nothing can be created in ``uml_dir``.  The two blacklisted initcalls
+    only measure RAID algorithms and take two thirds of the boot time.
     """
     travel = ["time-travel=inf-cpu", f"time-travel-start={VIRTUAL_START_NS}"] if request.time_travel else []
     return [
@@ -107,9 +109,11 @@ def kernel_arguments(
 
 
 def _quoted(text: str) -> str:
-    """``text`` as one word of a kernel command line, which knows double quotes and no escape."""
+    """``text`` as one word of a kernel command line, which has double quotes but no escapes."""
     if '"' in text or "\n" in text:
-        raise LabError(f"the kernel's command line cannot carry the path {text!r}: move it to one without quotes")
+        raise LabError(
+            "lab.path", f"the kernel's command line cannot hold the path {text!r}; use a path without quotes"
+        )
     return f'"{text}"'
 
 

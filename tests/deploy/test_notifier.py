@@ -87,9 +87,9 @@ def loop() -> Iterator[Loop]:
 
 def test_nothing_is_said_before_the_first_good_tick(systemd: Systemd) -> None:
     notifier = Notifier(lambda: "well")
-    notifier.ticked(START, False)
+    notifier.tick_done(START, False)
     assert systemd.heard() == []
-    notifier.ticked(START + T, True)
+    notifier.tick_done(START + T, True)
     assert systemd.heard() == [{"READY": "1", "WATCHDOG": "1", "STATUS": "well"}]
 
 
@@ -98,7 +98,7 @@ def test_alive_ten_times_and_status_once_a_second(systemd: Systemd) -> None:
     notifier = Notifier(lambda: asked.append("well") or asked[-1])
     heard = []
     for tick in range(401):
-        notifier.ticked(START + tick * T, True)
+        notifier.tick_done(START + tick * T, True)
         heard += systemd.heard()
     assert len(heard) == 21 and all(h["WATCHDOG"] == "1" for h in heard)
     assert [i for i, h in enumerate(heard) if "STATUS" in h] == [0, 10, 20]
@@ -108,10 +108,10 @@ def test_alive_ten_times_and_status_once_a_second(systemd: Systemd) -> None:
 
 def test_bad_ticks_starve_the_watchdog(systemd: Systemd) -> None:
     notifier = Notifier(lambda: "well")
-    notifier.ticked(START, True)
+    notifier.tick_done(START, True)
     systemd.heard()
     for tick in range(1, 200):
-        notifier.ticked(START + tick * T, False)
+        notifier.tick_done(START + tick * T, False)
     assert systemd.heard() == []
 
 
@@ -120,20 +120,20 @@ def test_ready_is_repeated_until_it_was_taken(systemd: Systemd, monkeypatch: pyt
     notifier = Notifier(lambda: "well")
     tell = Notifier._tell
     monkeypatch.setattr(Notifier, "_tell", lambda self, what: False)
-    notifier.ticked(START, True)
+    notifier.tick_done(START, True)
     monkeypatch.setattr(Notifier, "_tell", tell)
-    notifier.ticked(START + T, True)
+    notifier.tick_done(START + T, True)
     assert [h.get("READY") for h in systemd.heard()] == ["1"]
 
 
 def test_without_systemd_or_with_a_dead_one_nothing_happens(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     quiet = Notifier(lambda: pytest.fail("asked for words that nobody hears"))
-    quiet.ticked(START, True)
+    quiet.tick_done(START, True)
     quiet.stopping()
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
     dead = Notifier(lambda: "well")
-    dead.ticked(START, True)
+    dead.tick_done(START, True)
     dead.stopping()
 
 

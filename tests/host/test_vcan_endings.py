@@ -124,12 +124,12 @@ def test_a_command_that_ends_before_it_is_looked_at_is_heard_of() -> None:
 def test_what_the_command_leaves_behind_is_ended_natively_too(tmp_path: Path) -> None:
     """A process that left the command's group and session is still below the lab."""
     script = (
-        "import os, sys; from host.vcan_lab.choose import Way; from host.vcan_lab.host import run\n"
+        "import os, sys; from host.vcan_lab.choose import Method; from host.vcan_lab.host import run\n"
         "from host.vcan_lab.spec import Request\n"
         "argv = ('sh', '-c', 'setsid sleep 300 & echo $! > left; sleep 0.5')\n"
         "request = Request(argv=argv, cwd=sys.argv[1], env=dict(os.environ), uid=os.getuid(), gid=os.getgid(),\n"
         "                  groups=tuple(os.getgroups()), umask=0o22)\n"
-        "sys.exit(run(request, Way('existing', 'for this test', None)))\n"
+        "sys.exit(run(request, Method('existing', 'for this test', None)))\n"
     )
     done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], cwd=ROOT, timeout=PATIENCE_S)
     assert done.returncode == 0

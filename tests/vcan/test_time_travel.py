@@ -20,7 +20,7 @@ import pytest
 from can_dbc.dbc import codec
 from can_dbc.frame import Frame
 from can_dbc.trace.candump import read
-from can_dbc.bus.reconnector import GONE_NS, RETRY_NS
+from can_dbc.bus.reconnector import FIRST_RETRY_NS, RETRY_PERIOD_NS
 from controller.config import load as load_settings
 from controller.guard.__main__ import PERIOD_NS as GUARD_PERIOD_NS
 from host.service_lab.pilot import LEASE_NS
@@ -243,7 +243,7 @@ def test_without_the_guard_valves_and_controller_are_neutral_within_60_ms(run: R
 @pytest.mark.parametrize(("down", "up"), [("down", "up"), ("down_long", "up_long")])
 def test_an_interface_that_comes_back_is_used_again_neutral_and_disarmed(run: Recording, down: str, up: str) -> None:
     down_ns, up_ns = run.page[down], run.page[up]
-    tries = [down_ns + GONE_NS + k * RETRY_NS for k in range(10)]
+    tries = [down_ns + FIRST_RETRY_NS + k * RETRY_PERIOD_NS for k in range(10)]
     due_ns = next(at_ns for at_ns in tries if at_ns >= up_ns)
     back_ns = run.first("ValveCmdA", down_ns)
     assert not run.stamps("ValveCmdA", down_ns, due_ns)

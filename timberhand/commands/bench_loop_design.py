@@ -45,7 +45,7 @@ def loop_design(
     from rich.table import Table
 
     from experiments.loop_design import carrier
-    from experiments.loop_design.study import GAIN_DB, PHASE_DEG, study, work_of
+    from experiments.loop_design.study import MIN_GAIN_DB, MIN_PHASE_DEG, case_set, study
     from host.exit_codes import CommandFailed, ExitCode
     from machine.loading.profile_file import ProfileError, load_profile
 
@@ -57,7 +57,7 @@ def loop_design(
         try:
             machine = load_profile(source)
             with screen.status(f"{machine.name}: margins over all machines"):
-                work = work_of(source, truth)
+                work = case_set(source, truth)
                 studies = study(machine, work) + carrier.studies(machine, work)
         except (ProfileError, ValueError) as error:
             raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
@@ -86,10 +86,10 @@ def loop_design(
         with screen.status("every law"):
             holds = write(machines, docs) and holds
         screen.print(f"[dim]{docs / 'loop-design.md'}[/dim]")
-    needed = {"phase_deg": PHASE_DEG, "gain_db": GAIN_DB}
+    needed = {"phase_deg": MIN_PHASE_DEG, "gain_db": MIN_GAIN_DB}
     if as_json:
         typer.echo(json.dumps({"needed": needed, "reached": holds, "machines": documents}, indent=2))
     else:
-        screen.print(f"needed everywhere: {PHASE_DEG:.0f} deg and {GAIN_DB:.0f} dB")
+        screen.print(f"needed everywhere: {MIN_PHASE_DEG:.0f} deg and {MIN_GAIN_DB:.0f} dB")
     if not holds:
         raise typer.Exit(ExitCode.FIGURE_MISSED)

@@ -39,7 +39,7 @@ def doctor(
 
     from host.doctor import facts, installation, timing
     from host.doctor.finding import Severity
-    from host.doctor.show import show, verdict
+    from host.doctor.show import conclusion, show
     from host.exit_codes import ExitCode
 
     groups = {"installation": installation.examine()}
@@ -48,7 +48,7 @@ def doctor(
         if ip := shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin"):
             answer = subprocess.run([ip, "-details", "-statistics", "-json", "link"], capture_output=True, text=True)
             links = answer.stdout or links
-        groups["timing"] = timing.judge(facts.read(Path("/"), links, cpu))
+        groups["timing"] = timing.evaluate(facts.read(Path("/"), links, cpu))
     every = [finding for group in groups.values() for finding in group]
     if as_json:
         print(json.dumps({name: [f.document() for f in group] for name, group in groups.items()}, indent=2))
@@ -56,5 +56,5 @@ def doctor(
         console = Console(highlight=False)
         for name, group in groups.items():
             show(console, f"timberhand {name}", group)
-        console.print(verdict(every))
+        console.print(conclusion(every))
     raise typer.Exit(ExitCode.CONFIGURATION if any(f.severity is Severity.FAULT for f in every) else ExitCode.OK)
