@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from drawn_logs import ground_depth
+from tests.training.drawn_logs import ground_depth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

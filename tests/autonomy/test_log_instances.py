@@ -1,22 +1,23 @@
-"""From maps to logs, on maps that a perfect network would give."""
+"""Instances from the maps of a perfect network, and the scales at which pictures are segmented."""
 
 import math
 
 import numpy as np
 import pytest
-from drawn_logs import perfect_maps, picture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.networks.torch_net import random_net
-from autonomy.networks.weights import WeightsRefused, save
-from autonomy.perception.segmentation.log_segmenter import LogSegmenter, both
+from autonomy.networks.weights import WeightsError, save
 from autonomy.perception.camera.frame import RgbdFrame, RgbdFrameError, content_window
-from autonomy.perception.segmentation.instances import instances
+from autonomy.perception.segmentation.instances import decode_instances
+from autonomy.perception.segmentation.log_segmenter import LogSegmenter, fuse_scales
 from autonomy.perception.segmentation.network import OFFSET_PX, STRIDE, unet
-from autonomy.perception.segmentation.segment_merging import shipped_scorers
 from autonomy.perception.segmentation.resize import doubled, shrunk
+from autonomy.perception.segmentation.segment_merging import shipped_scorers
 from machine.geometry.optics import Intrinsics
+from tests.codes import coded
+from tests.training.drawn_logs import perfect_maps, picture
 from training.detection.segmentation import targets
 
 CROSSED = (((80, 80), 0.3, 100, 12), ((80, 80), 1.7, 90, 12))
@@ -26,7 +27,7 @@ PARALLEL = (((80, 60), 0.2, 100, 12), ((80, 73), 0.2, 100, 12), ((80, 86), 0.2, 
 def found(*logs, size=160):
     sample = picture(*logs, size=size)
     maps, _ = targets(sample)
-    return sample, instances(perfect_maps(maps), STRIDE, sample.depth_m, shipped_scorers())
+    return sample, decode_instances(perfect_maps(maps), STRIDE, sample.depth_m, shipped_scorers())
 
 
 def overlap(a, b):
@@ -54,13 +55,13 @@ def test_axis_box_and_ends_are_those_of_the_log(angle, length, width):
     assert log.ends_seen == (True, True)
 
 
-def test_two_looks_make_one():
+def test_two_scales_are_fused():
     logs = (((160, 120), 0.2, 200, 24), ((160, 146), 0.2, 200, 24), ((200, 140), 1.5, 180, 20))
     fine = picture(*logs, size=320)
     small = [((u / 2, v / 2), angle, length / 2, width / 2) for (u, v), angle, length, width in logs]
-    looks = [perfect_maps(targets(s)[0]) for s in (fine, picture(*small, size=160))]
-    looks[0][2:4] = 0.0  # a fine look need not know where the middle is
-    out = instances(both(*looks), STRIDE, fine.depth_m, shipped_scorers())
+    scales = [perfect_maps(targets(s)[0]) for s in (fine, picture(*small, size=160))]
+    scales[0][2:4] = 0.0  # fine maps need not know the centre
+    out = decode_instances(fuse_scales(*scales), STRIDE, fine.depth_m, shipped_scorers())
     assert len(out) == 3
     for number in (1, 2, 3):
         assert max(overlap(i.mask, fine.ids == number) for i in out) > 0.85
@@ -72,37 +73,37 @@ def test_an_end_outside_the_picture_is_not_seen():
     assert log.box_px[0] == 0
 
 
-def test_a_speck_beside_a_log_is_not_in_its_mask():
+def test_isolated_pixels_are_not_in_the_mask_of_a_log():
     sample = picture(((80.0, 80.0), 0.8, 110, 12))
     maps = perfect_maps(targets(sample)[0])
     maps[0, 30, 50] = maps[0, 5, 75] = 5.0  # in the log's box and outside it
-    (log,) = instances(maps, STRIDE, sample.depth_m, shipped_scorers())
+    (log,) = decode_instances(maps, STRIDE, sample.depth_m, shipped_scorers())
     assert not log.mask[60, 100] and not log.mask[10, 150]
     assert overlap(log.mask, sample.ids == 1) > 0.85
 
 
-def test_no_log_no_instance():
+def test_maps_without_logs_give_no_instance():
     maps = np.zeros((8, 40, 40), np.float32)
     maps[0] = -5.0
-    assert instances(maps, 4, np.full((160, 160), np.nan, np.float32), shipped_scorers()) == ()
+    assert decode_instances(maps, 4, np.full((160, 160), np.nan, np.float32), shipped_scorers()) == ()
 
 
-def test_a_coarse_map_gives_an_outline_between_its_pixels():
+def test_the_outline_of_a_coarse_map_runs_between_its_pixels():
     sample, (log,) = found(((80.0, 80.0), 0.5, 100, 14))
     depth = sample.depth_m.repeat(2, axis=0).repeat(2, axis=1)
-    double, (fine,) = sample, instances(perfect_maps(targets(sample)[0]), 4, depth, shipped_scorers())
+    double, (fine,) = sample, decode_instances(perfect_maps(targets(sample)[0]), 4, depth, shipped_scorers())
     assert abs(np.count_nonzero(fine.mask) / (4.0 * np.count_nonzero(double.ids)) - 1.0) < 0.06
     assert np.abs(np.array(fine.box_px) / 2.0 - log.box_px).max() <= 1.0
 
 
-def test_letterbox_bars_are_found_and_a_black_picture_is_kept_whole():
+def test_letterbox_bars_are_removed_and_a_black_picture_is_kept_whole():
     rgb = np.zeros((40, 40, 3), np.uint8)
     assert content_window(rgb) == (0, 40, 0, 40)
     rgb[9:31] = 5
     assert content_window(rgb) == (9, 31, 0, 40)
 
 
-def test_a_shrunk_pixel_looks_at_the_middle_of_its_block():
+def test_a_shrunk_pixel_has_the_ray_of_its_block_centre():
     pin = Intrinsics(12, 6, 10.0, 10.0, 5.5, 2.5)
     rgb = np.arange(12 * 6 * 3, dtype=np.uint8).reshape(6, 12, 3)
     small, depth, lens = shrunk(rgb, np.arange(72, dtype=np.float32).reshape(6, 12), pin, 3)
@@ -132,20 +133,20 @@ def untrained(tmp_path_factory):
     return path
 
 
-def test_any_size_of_picture_goes_through_and_masks_are_as_large(untrained):
+def test_masks_have_the_size_of_the_picture(untrained):
     for shape, size_px in (((70, 101), 96), ((192, 192), 96), ((70, 101), 200), ((340, 480), 480)):
-        finder = LogSegmenter("rgbd", untrained, size_px=size_px)
+        segmenter = LogSegmenter("rgbd", untrained, size_px=size_px)
         rgb = np.full((*shape, 3), 80, np.uint8)
         rgb[:10] = 0
         depth = np.full(shape, 3.0, np.float32)
         pin = Intrinsics(shape[1], shape[0], 90.0, 90.0, shape[1] / 2, shape[0] / 2)
-        for log in finder.segment_picture(rgb, depth, pin):
+        for log in segmenter.segment_picture(rgb, depth, pin):
             assert log.mask.shape == shape
             assert not log.mask[:9].any()
 
 
 class Recorded(LogSegmenter):
-    """A finder whose network sees wood where a picture is bright, and notes how large its pictures are."""
+    """A segmenter whose network sees wood where a picture is bright; it records the sizes of its pictures."""
 
     def maps(self, rgb, depth_m, pinhole):
         self.sizes = [*getattr(self, "sizes", []), rgb.shape[:2]]
@@ -178,27 +179,27 @@ def bright(top, left, high, wide, shape=(720, 1280)):
     ],
     ids=["in a part", "upright", "small, doubled", "across the picture"],
 )
-def test_where_all_wood_is_in_a_part_that_part_is_looked_at_from_nearer(untrained, log, largest):
-    finder = Recorded("rgbd", untrained)
-    (seen,) = finder.segment_picture(*bright(*log))
-    assert max(finder.sizes, key=math.prod) == largest
+def test_a_window_around_the_wood_is_segmented_at_a_finer_scale(untrained, log, largest):
+    segmenter = Recorded("rgbd", untrained)
+    (seen,) = segmenter.segment_picture(*bright(*log))
+    assert max(segmenter.sizes, key=math.prod) == largest
     top, left, high, wide = log
     assert np.abs(np.array(seen.box_px) - (left, top, left + wide, top + high)).max() <= 4
     assert seen.mask.shape == (720, 1280) and seen.mask[top + high // 2, left + wide // 2]
-    finder = Recorded("rgbd", untrained, nearer=False)
-    finder.segment_picture(*bright(*log))
-    assert finder.sizes == [(180, 320), (360, 640)] or finder.sizes == [(360, 640), (180, 320)]
+    segmenter = Recorded("rgbd", untrained, use_window=False)
+    segmenter.segment_picture(*bright(*log))
+    assert segmenter.sizes == [(180, 320), (360, 640)] or segmenter.sizes == [(360, 640), (180, 320)]
 
 
-def test_the_window_stays_in_the_picture_and_no_wood_is_no_log(untrained):
-    finder = Recorded("rgbd", untrained)
-    (seen,) = finder.segment_picture(*bright(0, 0, 40, 260))
+def test_the_window_stays_in_the_picture(untrained):
+    segmenter = Recorded("rgbd", untrained)
+    (seen,) = segmenter.segment_picture(*bright(0, 0, 40, 260))
     assert np.abs(np.array(seen.box_px) - (0, 0, 260, 40)).max() <= 4
-    assert finder.segment_picture(*bright(0, 0, 0, 0)) == ()
+    assert segmenter.segment_picture(*bright(0, 0, 0, 0)) == ()
 
 
-class Glancing(Recorded):
-    """One whose glance takes a patch at the right for wood, and is blind to all else."""
+class CoarselyBlind(Recorded):
+    """Its coarse view shows wood in a patch at the right only."""
 
     def maps(self, rgb, depth_m, pinhole):
         maps = super().maps(rgb, depth_m, pinhole)
@@ -207,26 +208,26 @@ class Glancing(Recorded):
         return maps
 
 
-def test_a_log_too_thin_for_the_glance_is_found_all_the_same(untrained):
-    finder = Glancing("rgbd", untrained)
-    (seen,) = finder.segment_picture(*bright(500, 100, 14, 300))
-    assert (360, 640) in finder.sizes and (352, 608) in finder.sizes, "the nearer look found nothing"
+def test_a_log_too_thin_for_the_coarse_view_is_segmented(untrained):
+    segmenter = CoarselyBlind("rgbd", untrained)
+    (seen,) = segmenter.segment_picture(*bright(500, 100, 14, 300))
+    assert (360, 640) in segmenter.sizes and (352, 608) in segmenter.sizes, "the window held no log"
     assert np.abs(np.array(seen.box_px) - (100, 500, 400, 514)).max() <= 6
-    assert finder.segment_picture(*bright(400, 20, 60, 260)) == (), "a thick log that the glance does not see is none"
+    assert segmenter.segment_picture(*bright(400, 20, 60, 260)) == (), "the coarse view is trusted for thick logs"
 
 
-def test_frames_that_are_none_are_refused(untrained):
-    finder = LogSegmenter("rgbd", untrained, size_px=96)
+def test_invalid_frames_are_refused(untrained):
+    segmenter = LogSegmenter("rgbd", untrained, size_px=96)
     pin = Intrinsics(64, 64, 60.0, 60.0, 31.5, 31.5)
     blind = RgbdFrame("stick", 0, np.zeros((64, 64, 3), np.uint8), np.full((64, 64), np.nan, np.float32), pin)
-    with pytest.raises(RgbdFrameError, match="no depth anywhere"):
-        finder.segment(blind)
+    with pytest.raises(RgbdFrameError, check=coded("frame.depth-unknown")):
+        segmenter.segment(blind)
 
 
 def test_corrupt_or_foreign_weights_are_refused(untrained, tmp_path):
     cut = tmp_path / "cut.safetensors"
     cut.write_bytes(untrained.read_bytes()[:5000])
-    with pytest.raises(WeightsRefused):
+    with pytest.raises(WeightsError):
         LogSegmenter("rgbd", cut)
-    with pytest.raises(WeightsRefused, match="do not fit"):
+    with pytest.raises(WeightsError, check=coded("weights.other-network")):
         LogSegmenter("depth", untrained)

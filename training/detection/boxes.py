@@ -12,7 +12,7 @@ from rich.console import Console
 from torch.nn import functional as F
 
 from autonomy.networks.torch_net import TorchNet
-from autonomy.perception.papers.box_detector import STRIDE, box_net, colour
+from autonomy.perception.papers.box_detector import STRIDE, box_net, network_input
 from training.common.loop import Schedule, begun, stacked, train
 from training.detection.segmentation import Picture, changed
 from training.pictures.labels import ID, IGNORED, Labelled
@@ -109,7 +109,7 @@ def batches(sources: Sequence[tuple[Picture, int]], size: int, seed: int) -> Cal
         rows = []
         for index in rng.integers(0, count, max(2, round(share * size))):
             sample = changed(picture(int(index)), rng, crop_px)
-            rows.append((colour(sample.rgb), *targets(sample)))
+            rows.append((network_input(sample.rgb), *targets(sample)))
         return stacked(rows)
 
     return batch

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from autonomy.networks.weights import WeightsRefused, load
+from autonomy.networks.weights import WeightsError, load
 from autonomy.perception.papers.box_detector import box_net
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.network import CHANNELS, unet
@@ -70,7 +70,7 @@ def produce(variant: str, plan: Plan, folder: Path, out: Path, console: Console)
     stopped goes on.  Returns the card's path.
 
     Raises:
-        WeightsRefused: the weights to start from are missing, damaged or of another network.
+        WeightsError: the weights to start from are missing, damaged or of another network.
     """
     start = begun(plan.start, variant) if plan.start else None
     source = ready(folder, plan.count, console)
@@ -86,11 +86,11 @@ def begun(weights: Path, variant: str) -> dict[str, np.ndarray]:
     at colours.
 
     Raises:
-        WeightsRefused: as ``load``.
+        WeightsError: as ``load``.
     """
     try:
         return load(weights, unet(variant))[0]
-    except WeightsRefused:
+    except WeightsError:
         if variant != "depth":
             raise
     arrays = load(weights, unet("rgbd"))[0]
@@ -102,7 +102,7 @@ def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path
     """Paper B's detector in its role, in the same way.  Returns the card's path.
 
     Raises:
-        WeightsRefused: as ``produce``.
+        WeightsError: as ``produce``.
     """
     start = load(plan.start, box_net())[0] if plan.start else None
     source = ready(folder, plan.count, console)

@@ -17,7 +17,7 @@ from scipy import ndimage
 from torch.nn import functional as F
 
 from autonomy.networks.torch_net import TorchNet
-from autonomy.perception.segmentation.network import MAPS, MASK, OFFSET_PX, STRIDE, channels, unet
+from autonomy.perception.segmentation.network import MAPS, MASK, OFFSET_PX, STRIDE, network_input, unet
 from training.common.loop import Schedule, begun, stacked, train
 from training.pictures.labels import (
     ANGLE,
@@ -224,7 +224,7 @@ def batches(
         rows = []
         for index in rng.integers(0, count, max(2, round(share * size))):
             sample = changed(picture(int(index)), rng, crop_px)
-            image = channels(sample.rgb, sample.depth_m, sample.intrinsics, variant, sample.height_m)
+            image = network_input(sample.rgb, sample.depth_m, sample.intrinsics, variant, sample.height_m)
             rows.append((image, *targets(sample)))
         return stacked(rows)
 

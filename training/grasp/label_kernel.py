@@ -19,7 +19,7 @@ from autonomy.grasp.jaws import Jaws
 
 GAP, BLADE, PLATE, HOLDS, GRIP, SCOOPS, ROOM = range(7)
 _TIP, _SLACK, _ACROSS, _LEVER = quality.TIP_HEIGHT_M, quality.STRICT_RULE.slack_m, quality.MAX_AXIS_OBLIQUITY, quality.LEVER_SCALE_M
-_SCOOP, _FRICTION, _DENSITY = quality.STRICT_RULE.scoop, quality.FRICTION_COEFFICIENT, quality.DENSITY_KG_M3
+_SCOOP, _FRICTION, _DENSITY = quality.STRICT_RULE.scoop_share, quality.FRICTION_COEFFICIENT, quality.DENSITY_KG_M3
 _GRAVITY: Final = quality.GRAVITY_M_S2
 _MIDDLE, _ALONE, _ROW = CENTRING_SCALE_M, quality.OFF_CENTRE_SCALE_M, quality.LOWEST_ROW_M
 _LOW, _HIGH = TIP_CLEARANCE_M
@@ -28,7 +28,7 @@ _HALF_PLATE, _UNDER = HALF_PLATE_M, SCOOP_SHARE
 
 def facts_of(jaws: Jaws) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of a grapple for ``judge``: facts (7,) and outline (k, 2)."""
-    facts = (jaws.half_gap_m, jaws.blade_m, jaws.plate_m, jaws.holds_m2, jaws.grip_n, jaws.scoops_m, jaws.room_m)
+    facts = (jaws.half_gap_m, jaws.blade_m, jaws.plate_m, jaws.capacity_m2, jaws.tip_force_n, jaws.scoop_span_m, jaws.room_m)
     return np.array(facts), np.array([jaws.height_m, jaws.half_width_m]).T.copy()
 
 

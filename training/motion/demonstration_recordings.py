@@ -22,7 +22,7 @@ from autonomy.motion.pose import Pose
 from can_dbc.dbc.codec import load as load_database
 from can_dbc.frame import Frame
 from can_dbc.trace.candump import read as read_log
-from hil.replay.replay import files_of, manifest_of
+from hil.replay.recording import files_of, manifest_of
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile

@@ -19,10 +19,10 @@ from PIL import Image, ImageFilter
 
 from machine.geometry.optics import Intrinsics, intrinsics
 from sim.camera.geometry import View, look_at
-from sim.camera.ground_cover import BARE, CLEARING, YARD, Clutter
-from sim.camera.render import Look, Picture, render
-from sim.camera.scene import CLUTTER, GROUND, SKY, Boxes, Ground, LogPose, Rods, Scene, SceneBuilder
-from sim.scenes.settled_logs import varied_stereo
+from sim.camera.ground_cover import BARE, CLEARING, LANDING, GroundCover
+from sim.camera.render import ImagingConditions, Picture, render
+from sim.camera.scene import COVER, GROUND, SKY, Boxes, Ground, LogPose, Rods, Scene, SceneBuilder
+from sim.scenes.settled_logs import varied_stereo_noise
 from training.pictures.labels import IGNORED, ROW, Labelled, elongation, seen_along
 from training.pictures.piles import MACHINES, Pile, ground_of, profile_of, terrain_of
 from training.pictures.props import Steel
@@ -46,7 +46,7 @@ def draw(pile: Pile, seed: int, size_px: int = 304) -> Labelled:
     view = _view(pile, keep, camera, rng, size_px, scene.ground)
     boxes = _steel(pile, keep, view, rng, held)
     scene = replace(scene, boxes=boxes, rods=scene.rods + _clutter(pile, keep, rng))
-    look = Look.random(rng.getrandbits(31))
+    look = ImagingConditions.random(rng.getrandbits(31))
     picture = render(scene, view, look, rng.getrandbits(16))
     if rng.random() < PLAIN_SHARE:
         picture = replace(picture, rgb=_plain(picture, view, look, rng))
@@ -208,8 +208,8 @@ def _steel(pile: Pile, logs: tuple[LogPose, ...], view: View, rng: random.Random
 
 
 @lru_cache(maxsize=48)
-def _litter(ground: tuple[str, int, float], kind: int, seed: int) -> Clutter:
-    return Clutter(Ground(*terrain_of(*ground).grid), (BARE, YARD, CLEARING)[kind], seed)
+def _litter(ground: tuple[str, int, float], kind: int, seed: int) -> GroundCover:
+    return GroundCover(Ground(*terrain_of(*ground).grid), (BARE, LANDING, CLEARING)[kind], seed)
 
 
 def _clutter(pile: Pile, logs: tuple[LogPose, ...], rng: random.Random) -> Rods:
@@ -226,14 +226,14 @@ def _noisy(machine: str, camera: str, picture: Picture, pin: Intrinsics, rng: ra
     edges = (rng.uniform(0.3, 1.1), rng.uniform(0.3, 1.1))
     holes, plain_holes = math.exp(rng.uniform(-1.0, 2.0)), rng.uniform(0.01, 0.25)
     reach = float(rng.choice((6, 10, 14)))
-    noise = varied_stereo(
+    noise = varied_stereo_noise(
         profile_of(machine), camera, rng.getrandbits(20),
         sigma=sigma, edges=edges, holes=holes, plain_holes=plain_holes, correlation_px=reach,
     )  # fmt: skip
     return noise.apply(picture, pin, 0)
 
 
-def _plain(picture: Picture, view: View, look: Look, rng: random.Random) -> np.ndarray:
+def _plain(picture: Picture, view: View, look: ImagingConditions, rng: random.Random) -> np.ndarray:
     """The picture with ground, logs and sky in one colour each, lit by the sun; the rest stays as it is."""
     pin, s = view.intrinsics, np.nan_to_num(1.0 / picture.depth_m, nan=0.0)
     h, w = s.shape
@@ -252,11 +252,11 @@ def _plain(picture: Picture, view: View, look: Look, rng: random.Random) -> np.n
     if rng.random() < 0.8:
         while np.linalg.norm(bark - earth) < LEAST_CONTRAST:
             bark, earth = _colour(rng), _colour(rng)
-    paint, painted = np.zeros((CLUTTER + 2, 3), np.float32), np.zeros(CLUTTER + 2, np.float32)
+    paint, painted = np.zeros((COVER + 2, 3), np.float32), np.zeros(COVER + 2, np.float32)
     for instance in range(1, MOST_LOGS + 1):
         paint[instance], painted[instance] = bark * rng.uniform(0.9, 1.1), 1.0 - keep
     paint[GROUND], painted[GROUND] = earth, 1.0 - keep
-    paint[CLUTTER], painted[CLUTTER] = _colour(rng), rng.choice((0.0, 1.0))
+    paint[COVER], painted[COVER] = _colour(rng), rng.choice((0.0, 1.0))
     cover = painted[picture.mask][..., None]
     rgb = np.clip(picture.rgb + cover * (paint[picture.mask] * light[..., None] - picture.rgb), 0.0, 255.0)
     return np.where((picture.mask == SKY)[..., None], _sky(rng), rgb.astype(np.uint8))

@@ -24,7 +24,7 @@ from sim.camera.scene import Ground, LogPose
 from sim.geometry.shape import Vector
 from sim.ground.terrain import Terrain
 from sim.scenes.arrangements import KINDS
-from sim.scenes.settled_logs import settled
+from sim.scenes.settled_logs import settle_logs
 
 EDITION: Final = 1  # raised when the same seed would give other piles
 CHUNK: Final = 64
@@ -107,7 +107,7 @@ def settle(machine: str, number: int) -> Pile:
         route = ((0.0, 0.0), (6.0 + ROUTE_M * logs, 0.0))
         terrain = terrain_of(ground, terrain_seed if ground == "rough" else 0, datum)
         try:
-            poses = settled(profile, kind, rng.getrandbits(31), logs, terrain, route)
+            poses = settle_logs(profile, kind, rng.getrandbits(31), logs, terrain, route)
         except ValueError as error:
             last = error
             continue
@@ -116,7 +116,7 @@ def settle(machine: str, number: int) -> Pile:
 
 
 def chunk(machine: str, index: int, folder: Path | None = None, tick: Callable[[], None] = lambda: None) -> list[Pile]:
-    """CHUNK piles, read from ``folder`` (default ``cache_folder()``) or settled and kept there; ``tick`` after each.
+    """CHUNK piles, read from ``folder`` (default ``cache_folder()``) or settle_logs and kept there; ``tick`` after each.
 
     Raises ValueError for a file that does not hold such piles.
     """

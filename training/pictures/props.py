@@ -14,7 +14,7 @@ from machine.profile import Profile
 from sim.camera.geometry import quaternion_matrix
 from sim.camera.scene import BUNK, CARRIER, CRANE, Boxes, LogPose
 from sim.geometry.shape import Shape
-from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, tongs_of
+from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, jaw_geometry
 from sim.wood.bunk import bunk_shapes
 from training.pictures.piles import profile_of
 
@@ -41,7 +41,7 @@ class Steel:
 
     def grapple(self, profile: Profile, at_m: np.ndarray, yaw_rad: float, opening: float) -> None:
         """A grapple whose rotator is at ``at_m``; ``opening`` 0 closed to 1 open."""
-        tongs, k = tongs_of(profile), profile.kinematics
+        tongs, k = jaw_geometry(profile), profile.kinematics
         hang = rpy_matrix((self._rng.gauss(0.0, 0.05), self._rng.gauss(0.0, 0.05), yaw_rad))
         angle = (1.0 - opening) * tongs.closed_rad
         frames = {"rotator": (np.zeros(3), np.eye(3))}
@@ -56,7 +56,7 @@ class Steel:
 
     def holding(self, profile: Profile, log: LogPose) -> None:
         """A grapple that is closed around the middle of a log."""
-        rng, tongs = self._rng, tongs_of(profile)
+        rng, tongs = self._rng, jaw_geometry(profile)
         opening, along = rng.uniform(0.12, 0.35), quaternion_matrix(log.quaternion)[:, 2]
         turn = (1.0 - opening) * tongs.closed_rad
         tip_m = tongs.pivot_z_m + tongs.out_m * math.sin(turn) + tongs.down_m * math.cos(turn)

@@ -1,6 +1,7 @@
-"""The logs of a picture: the network's maps, the regions they are parted into, and of each mask, box, axis and ends.
+"""Instances of logs in a picture: from the network's maps to masks, boxes, axes and ends.
 
-A mask's outline runs through the picture's pixels: the map's probabilities are interpolated and cut at a half.
+The outline of a mask runs between pixels of the maps: the probability is interpolated to the picture's resolution and
+thresholded.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from scipy import ndimage
 
 from autonomy.perception.segmentation.network import ENDS, MASK, STRIDE
 from autonomy.perception.segmentation.resize import bilinear
-from autonomy.perception.segmentation.segment_merging import LogSegment, SegmentScorers, parted
-from autonomy.perception.segmentation.segments import Foreground, scene
+from autonomy.perception.segmentation.segment_merging import LogSegment, SegmentScorers, segment_logs
+from autonomy.perception.segmentation.segments import Foreground, make_foreground
 from autonomy.perception.segmentation.watershed import sigmoid
 
-LEAST_MASK: Final = 0.5
-LEAST_END: Final = 0.3
-LEAST_DEPTH_M: Final = 0.1
+MIN_MASK_PROBABILITY: Final = 0.5
+MIN_END_PROBABILITY: Final = 0.3
+MIN_DEPTH_M: Final = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,7 @@ class Instance:
 
     mask (H, W) bool; ``box_px`` left, top, right, bottom of the mask, the last two exclusive; score 0..1; ``axis_px``
     angle of the log's axis in the picture [rad, -pi/2..pi/2); ``ends_px`` both ends of the axis (u, v) [px] in its
-    direction; ``ends_seen`` which of them are the log's own, not where something hides it.
+    direction; ``ends_seen`` which of them are visible, not hidden by something.
     """
 
     mask: np.ndarray
@@ -40,84 +41,91 @@ class Instance:
     ends_seen: tuple[bool, bool]
 
 
-def instances(maps: np.ndarray, scale: int, depth_m: np.ndarray, judges: SegmentScorers) -> tuple[Instance, ...]:
-    """The logs of maps (8, h, w), one pixel of which is ``scale`` pixels wide in a picture with depth (H, W) [m]."""
-    seen = foreground_of(maps, scale, depth_m)
-    regions = parted(seen, judges)
-    if not regions:
+def decode_instances(
+    maps: np.ndarray, scale: int, depth_m: np.ndarray, scorers: SegmentScorers
+) -> tuple[Instance, ...]:
+    """The logs of maps (8, h, w) in descending order of score.
+
+    A pixel of the maps is ``scale`` pixels wide in the picture, whose depth is ``depth_m`` (H, W).
+    """
+    foreground = foreground_of(maps, scale, depth_m)
+    logs = segment_logs(foreground, scorers)
+    if not logs:
         return ()
-    sure, x, y, shape = sigmoid(maps[MASK]), seen.x, seen.y, depth_m.shape
-    labels = np.zeros(sure.shape, np.int32)
-    for number, region in enumerate(regions, 1):
-        labels[y[region.own], x[region.own]] = number
-    sure = np.where((sure > LEAST_MASK) & (labels == 0), 0.0, sure)
-    # Beside a log its half sure pixels belong to it too, for the outline runs through them.
+    probability, x, y, shape = sigmoid(maps[MASK]), foreground.x, foreground.y, depth_m.shape
+    labels = np.zeros(probability.shape, np.int32)
+    for number, log in enumerate(logs, 1):
+        labels[y[log.members], x[log.members]] = number
+    probability = np.where((probability > MIN_MASK_PROBABILITY) & (labels == 0), 0.0, probability)
+    # Pixels beside a log with a lower probability belong to it, too, because its outline runs through them.
     nearest = ndimage.distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
     labels = labels[tuple(nearest)]
     ends = sigmoid(maps[ENDS])
     found = []
-    for number, region in enumerate(regions, 1):
-        if instance := _instance(region, number, x, y, labels, sure, ends, scale, shape):
+    for number, log in enumerate(logs, 1):
+        instance = _instance(log, number, x, y, labels, probability, ends, scale, (shape[0], shape[1]))
+        if instance is not None:
             found.append(instance)
     return tuple(sorted(found, key=lambda i: -i.score))
 
 
 def foreground_of(maps: np.ndarray, scale: int, depth_m: np.ndarray) -> Foreground:
-    """What the regions are parted from: maps (8, h, w) and the depth in the middle of each of their pixels."""
-    sure = sigmoid(maps[MASK])
-    inverse = np.full(sure.shape, np.nan, np.float32)
-    middle = depth_m[scale // 2 :: scale, scale // 2 :: scale][: sure.shape[0], : sure.shape[1]]
-    inverse[: middle.shape[0], : middle.shape[1]] = 1.0 / np.maximum(middle, LEAST_DEPTH_M)
-    return scene(maps, sure, sure > LEAST_MASK, inverse, max(1, STRIDE // scale) ** 2)
+    """The foreground of maps (8, h, w), with depth from the middle of each of their pixels in the picture (H, W)."""
+    probability = sigmoid(maps[MASK])
+    inverse = np.full(probability.shape, np.nan, np.float32)
+    middle = depth_m[scale // 2 :: scale, scale // 2 :: scale][: probability.shape[0], : probability.shape[1]]
+    inverse[: middle.shape[0], : middle.shape[1]] = 1.0 / np.maximum(middle, MIN_DEPTH_M)
+    grain = max(1, STRIDE // scale) ** 2
+    return make_foreground(maps, probability, probability > MIN_MASK_PROBABILITY, inverse, grain)
 
 
 def _instance(
-    region: LogSegment,
+    log: LogSegment,
     number: int,
     x: np.ndarray,
     y: np.ndarray,
     labels: np.ndarray,
-    sure: np.ndarray,
+    probability: np.ndarray,
     ends: np.ndarray,
     scale: int,
     shape: tuple[int, int],
 ) -> Instance | None:
-    """The region at the resolution of the picture, ``scale`` pixels for each of a map's."""
-    px, py = x[region.own], y[region.own]
-    x0, x1 = max(0, int(px.min()) - 2), min(sure.shape[1], int(px.max()) + 3)
-    y0, y1 = max(0, int(py.min()) - 2), min(sure.shape[0], int(py.max()) + 3)
-    window = sure[y0:y1, x0:x1] * (labels[y0:y1, x0:x1] == number)
+    """The log at the resolution of the picture, ``scale`` pixels for each of a map's; None when it has no pixel."""
+    px, py = x[log.members], y[log.members]
+    x0, x1 = max(0, int(px.min()) - 2), min(probability.shape[1], int(px.max()) + 3)
+    y0, y1 = max(0, int(py.min()) - 2), min(probability.shape[0], int(py.max()) + 3)
+    window = probability[y0:y1, x0:x1] * (labels[y0:y1, x0:x1] == number)
     fine = bilinear(y1 - y0, scale) @ window @ bilinear(x1 - x0, scale).T
     top, left = y0 * scale, x0 * scale
-    inside = fine[: shape[0] - top, : shape[1] - left] > LEAST_MASK
+    inside = fine[: shape[0] - top, : shape[1] - left] > MIN_MASK_PROBABILITY
     v, u = np.nonzero(inside)
     if not len(u):
         return None
     v, u = v + top, u + left
     mask = np.zeros(shape, bool)
     mask[top : top + inside.shape[0], left : left + inside.shape[1]] = inside
-    axis = region.axis if region.axis[0] >= 0.0 else -region.axis
+    axis = log.axis if log.axis[0] >= 0.0 else -log.axis
     across = np.array([-axis[1], axis[0]])
     along, side = u * axis[0] + v * axis[1], float(np.median(u * across[0] + v * across[1]))
     low, high = np.percentile(along, (0.5, 99.5))
-    half = float(np.percentile(np.abs(u * across[0] + v * across[1] - side), 90))
+    half_width = float(np.percentile(np.abs(u * across[0] + v * across[1] - side), 90))
     points, seen = [], []
-    for reach in (low, high):
-        point, own = _end(reach * axis + side * across, ends, scale, max(2.0 * scale, 1.2 * half))
+    for position in (low, high):
+        point, visible = _end(position * axis + side * across, ends, scale, max(2.0 * scale, 1.2 * half_width))
         points.append(point)
-        seen.append(own)
+        seen.append(visible)
     box = (int(u.min()), int(v.min()), int(u.max()) + 1, int(v.max()) + 1)
     return Instance(
-        mask, box, region.score, math.atan2(float(axis[1]), float(axis[0])), (points[0], points[1]), (seen[0], seen[1])
+        mask, box, log.score, math.atan2(float(axis[1]), float(axis[0])), (points[0], points[1]), (seen[0], seen[1])
     )
 
 
 def _end(point: np.ndarray, ends: np.ndarray, scale: int, reach_px: float) -> tuple[tuple[float, float], bool]:
-    """The end near ``point`` where the map of ends has one, else the point itself; and whether it has."""
+    """The end near ``point`` in the map of ends and True, or ``point`` and False when there is none."""
     at, reach = (point + 0.5) / scale - 0.5, reach_px / scale
     x0, y0 = (max(0, math.floor(c - reach)) for c in at)
     patch = ends[y0 : math.ceil(at[1] + reach) + 1, x0 : math.ceil(at[0] + reach) + 1]
-    if not patch.size or patch.max() < LEAST_END:
+    if not patch.size or patch.max() < MIN_END_PROBABILITY:
         return (float(point[0]), float(point[1])), False
     row, column = np.unravel_index(int(np.argmax(patch)), patch.shape)
     weight = patch * (patch > 0.5 * patch.max())
@@ -129,8 +137,8 @@ def _end(point: np.ndarray, ends: np.ndarray, scale: int, reach_px: float) -> tu
     return (u, v), True
 
 
-def placed(found: Instance, left: int, top: int, shape: tuple[int, int]) -> Instance:
-    """An instance of a window at (left, top) in the whole picture."""
+def shifted_instance(found: Instance, left: int, top: int, shape: tuple[int, int]) -> Instance:
+    """An instance of a window with its corner at (left, top), in the whole picture of ``shape`` (H, W)."""
     mask = np.zeros(shape, bool)
     mask[top : top + found.mask.shape[0], left : left + found.mask.shape[1]] = found.mask
     x0, y0, x1, y1 = found.box_px

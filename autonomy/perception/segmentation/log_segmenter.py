@@ -1,7 +1,8 @@
-"""Looking for logs in a picture: where wood may be, how near to look there, the network's maps, the logs they hold.
+"""The log segmenter: a picture with depth in, instances of logs out.
 
-A picture is looked at in several sizes: in small pictures the network sees logs as wholes, in large ones the borders
-between them.  Where all that may be wood is in a part of the picture, a window about it is looked at from nearer.
+The network sees a picture at several scales: at small ones it sees logs as wholes, at large ones the borders between
+them.  First a coarse view shows where wood may be.  When all of it is in a part of the picture, a window around it is
+segmented at a finer scale.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.weights import SHIPPED, load
 from autonomy.perception.camera.frame import RgbdFrame, check_frame, content_window
-from autonomy.perception.segmentation.instances import Instance, instances, placed
+from autonomy.perception.segmentation.instances import Instance, decode_instances, shifted_instance
 from autonomy.perception.segmentation.network import (
     COS2,
     EDGE,
@@ -26,27 +27,28 @@ from autonomy.perception.segmentation.network import (
     OFFSET_V,
     SIN2,
     STRIDE,
-    channels,
+    network_input,
     unet,
-)  # fmt: skip
+)
 from autonomy.perception.segmentation.resize import bilinear, doubled, shrunk
 from autonomy.perception.segmentation.segment_merging import SegmentScorers, shipped_scorers
 from autonomy.perception.segmentation.watershed import sigmoid
 from machine.geometry.optics import Intrinsics
 
 SIZE_PX: Final = 304
-TWICE: Final = 1.5  # pictures so many times longer than what is asked for are looked at at half the size too
-MAYBE: Final = 0.3  # what may be wood
+COARSE_VIEW_RATIO: Final = 1.5  # a picture longer than the network's by this factor gets a view at half the size, too
+MIN_WOOD_PROBABILITY: Final = 0.3
 WINDOWS: Final = ((352, 608), (464, 464), (608, 352))
-"""Height and width of a nearer look [px of the network]; few, for the network is compiled for each."""
-NEAREST: Final = 0.5  # a picture is not more than doubled
-LIKELY: Final = 0.3
-"""The best log of a nearer look is at least so good, or the whole picture is looked at."""
-EDGE_PX: Final = 16  # left about the wood [px of the network]
-THIN_PX: Final = 5  # of the finer maps: what is narrower is hardly two wide in the coarser ones
-MASK_SHARE, EDGE_SHARE = 0.4, 0.8  # of the finer look in what two looks give
+"""Height and width of a window [px of the network]; few sizes, because the network is compiled for each."""
+MIN_FACTOR: Final = 0.5  # a picture is at most doubled
+MIN_BEST_SCORE: Final = 0.3
+"""When the best log of a window scores less, the whole picture is segmented."""
+MARGIN_PX: Final = 16  # around the wood in a window [px of the network]
+THIN_PX: Final = 5  # of the finer maps: what is narrower is hardly two pixels wide in the coarser ones
+FINE_MASK_SHARE, FINE_EDGE_SHARE = 0.4, 0.8  # weight of the finer maps in the fusion of two scales
 
-Shot = tuple[np.ndarray, np.ndarray, Intrinsics]
+View = tuple[np.ndarray, np.ndarray, Intrinsics]
+"""Colour (H, W, 3) uint8, depth (H, W) [m], intrinsics."""
 Window = tuple[int, int, int, int]
 """Top, bottom, left, right; the second and fourth exclusive."""
 
@@ -56,12 +58,12 @@ class LogSegmenter:
 
     Args:
         variant: "rgbd" or "depth".
-        weights: file; None are the shipped ones of the variant.
-        size_px: about how long the network's picture is; frames are shrunk by a whole factor, or doubled when they
-            are shorter.  Of a picture longer than SIZE_PX a look at half the size is taken first, and so on.
+        weights: weight file; None selects the shipped weights of the variant.
+        size_px: approximate length of the network's picture; frames are shrunk by a whole factor, or doubled when they
+            are shorter.  Pictures longer than SIZE_PX are also seen at half the size, and so on.
         precision: of the network, see ``OpenVinoNet``.
-        judges: who says what is one log; None are the shipped ones.
-        nearer: whether a window about the wood is looked at from nearer.
+        scorers: scorers of segments; None selects the shipped ones.
+        use_window: whether a window around the wood is segmented at a finer scale.
 
     Raises:
         WeightsError: the weights are missing, damaged or of another network.
@@ -73,21 +75,21 @@ class LogSegmenter:
         weights: Path | None = None,
         size_px: int = 2 * SIZE_PX,
         precision: str = "bf16",
-        judges: SegmentScorers | None = None,
-        nearer: bool = True,
+        scorers: SegmentScorers | None = None,
+        use_window: bool = True,
     ) -> None:
-        self._looks_nearer = nearer
+        self._use_window = use_window
         self.variant, self.size_px, self._precision = variant, size_px, precision
         self._network = unet(variant)
         self._arrays, self.facts = load(weights or SHIPPED / f"logs_{variant}.safetensors", self._network)
-        self._judges = judges or shipped_scorers()
+        self._scorers = scorers or shipped_scorers()
         self._nets: dict[tuple[int, int], OpenVinoNet] = {}
 
     def segment(self, frame: RgbdFrame) -> tuple[Instance, ...]:
-        """The logs of a frame, the surest first; none is an empty tuple.
+        """The logs of a frame in descending order of score; empty when there is none.
 
         Raises:
-            FrameRefused: the frame cannot be a picture of its camera.
+            RgbdFrameError: the frame is invalid.
         """
         check_frame(frame)
         return self.segment_picture(frame.rgb, frame.depth_m, frame.intrinsics)
@@ -95,35 +97,34 @@ class LogSegmenter:
     def segment_picture(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[Instance, ...]:
         """As ``segment``; depth may be unknown everywhere (a photograph)."""
         window = content_window(rgb)
-        shot = cut((rgb, depth_m, pinhole), window)
-        factor, known = self._factor(shot), None
-        if self._looks_nearer:
-            coarse = max(1, round(max(shot[1].shape) / SIZE_PX))
-            known = coarse, self.maps(*shrunk(*shot, coarse))
-            inner, finer = self._nearer(sigmoid(known[1][MASK]), coarse * STRIDE, shot[1].shape, factor)
+        view = crop((rgb, depth_m, pinhole), window)
+        factor, known = self._finest_factor(view), None
+        if self._use_window:
+            coarse = max(1, round(max(view[1].shape) / SIZE_PX))
+            known = coarse, self.maps(*shrunk(*view, coarse))
+            inner, finer = self._finer_window(sigmoid(known[1][MASK]), coarse * STRIDE, view[1].shape, factor)
             if finer < factor:
-                found = self._found(
-                    cut(shot, inner), finer, None, (window[0] + inner[0], window[2] + inner[2]), depth_m
-                )
-                if found and found[0].score > LIKELY:
+                corner = (window[0] + inner[0], window[2] + inner[2])
+                found = self._segment_view(crop(view, inner), finer, None, corner, depth_m)
+                if found and found[0].score > MIN_BEST_SCORE:
                     return found
-        # The glance is blind to thin logs: what drew the look nearer was something else.
-        return self._found(shot, factor, known, (window[0], window[2]), depth_m)
+        # The coarse view misses thin logs: something else selected the window.
+        return self._segment_view(view, factor, known, (window[0], window[2]), depth_m)
 
-    def _found(
+    def _segment_view(
         self,
-        shot: Shot,
+        view: View,
         factor: float,
         known: tuple[int, np.ndarray] | None,
         corner: tuple[int, int],
         whole: np.ndarray,
     ) -> tuple[Instance, ...]:
-        """The logs of a part of a picture that begins at a corner (row, column) of the ``whole`` (H, W)."""
-        maps, scale = self.multi_scale_maps(*shot, factor, known)
-        found = instances(maps, scale, shot[1], self._judges)
-        if shot[1].shape == whole.shape:
+        """The logs of a part of a picture with its corner (row, column) in the ``whole`` (H, W)."""
+        maps, scale = self.multi_scale_maps(*view, factor, known)
+        found = decode_instances(maps, scale, view[1], self._scorers)
+        if view[1].shape == whole.shape:
             return found
-        return tuple(placed(i, corner[1], corner[0], whole.shape) for i in found)
+        return tuple(shifted_instance(i, corner[1], corner[0], (whole.shape[0], whole.shape[1])) for i in found)
 
     def multi_scale_maps(
         self,
@@ -133,47 +134,50 @@ class LogSegmenter:
         factor: float | None = None,
         known: tuple[int, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, int]:
-        """Maps of a picture, looked at once or more, and how many of its pixels one of theirs is wide.
+        """Fused maps (8, h, w) of a picture at one or more scales, and the width of their pixels in the picture [px].
 
-        ``factor``: by what the picture is shrunk in the finest look (a half: doubled); ``known``: a factor whose maps
-        are there already.
+        ``factor``: by what the picture is shrunk at the finest scale (0.5: doubled); ``known``: a factor whose maps
+        were computed before.
         """
-        shot = rgb, depth_m, pinhole
-        finest = self._factor(shot) if factor is None else factor
+        view = rgb, depth_m, pinhole
+        finest = self._finest_factor(view) if factor is None else factor
         rest, longest = max(1, round(finest)), max(depth_m.shape)
         factors = [rest]
-        while longest >= TWICE * rest * SIZE_PX:
+        while longest >= COARSE_VIEW_RATIO * rest * SIZE_PX:
             rest *= 2
             factors.append(rest)
-        looked = [known[1] if known and known[0] == f else self.maps(*shrunk(*shot, f)) for f in factors]
+        pyramid = [known[1] if known and known[0] == f else self.maps(*shrunk(*view, f)) for f in factors]
         if finest < 1.0:
-            looked.insert(0, self.maps(*doubled(*shot)))
-        maps = looked.pop()
-        while looked:
-            maps = both(looked.pop(), maps)
+            pyramid.insert(0, self.maps(*doubled(*view)))
+        maps = pyramid.pop()
+        while pyramid:
+            maps = fuse_scales(pyramid.pop(), maps)
         return maps, round(finest * STRIDE)
 
-    def _factor(self, shot: Shot) -> float:
-        """By what a whole picture is shrunk in its finest look."""
-        longest = max(shot[1].shape)
-        return 0.5 if self.size_px >= TWICE * longest else max(1, round(longest / self.size_px))
+    def _finest_factor(self, view: View) -> float:
+        """By what a whole picture is shrunk at its finest scale."""
+        longest = max(view[1].shape)
+        return 0.5 if self.size_px >= COARSE_VIEW_RATIO * longest else max(1, round(longest / self.size_px))
 
-    def _nearer(self, wood: np.ndarray, scale: int, shape: tuple[int, ...], factor: float) -> tuple[Window, float]:
-        """The window that holds all that may be wood (h, w: how likely, each ``scale`` pixels wide) of a picture (H, W)
-        and by what it is shrunk there: the nearest look that has room.
+    def _finer_window(
+        self, wood: np.ndarray, scale: int, shape: tuple[int, ...], factor: float
+    ) -> tuple[Window, float]:
+        """The window of a picture (H, W) that holds all wood at the finest possible scale, and its shrink factor.
+
+        ``wood`` (h, w) is the probability of wood, in pixels that are ``scale`` pixels of the picture wide.
         """
         window, at = (0, shape[0], 0, shape[1]), factor
-        rows, columns = (np.flatnonzero((wood > MAYBE).any(axis=k)) * scale for k in (1, 0))
-        while len(rows) and at > NEAREST:
+        rows, columns = (np.flatnonzero((wood > MIN_WOOD_PROBABILITY).any(axis=k)) * scale for k in (1, 0))
+        while len(rows) and at > MIN_FACTOR:
             at *= 0.5
             sizes = ((round(at * h), round(at * w)) for h, w in WINDOWS)
-            found = (_about(rows, columns, scale, round(at * EDGE_PX), size, shape) for size in sizes)
+            found = (_window_around(rows, columns, scale, round(at * MARGIN_PX), size, shape) for size in sizes)
             window, factor = next(((w, at) for w in found if w is not None), (window, factor))
         return window, factor
 
     def maps(self, rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> np.ndarray:
-        """Maps (8, h / 2, w / 2) of a picture of the network's size; padded to what the network takes."""
-        image = channels(rgb, depth_m, pinhole, self.variant)
+        """Maps (8, h / 2, w / 2) of a picture of the network's size, which is padded to a multiple of MULTIPLE."""
+        image = network_input(rgb, depth_m, pinhole, self.variant)
         h, w = image.shape[1:]
         high, wide = -(-h // MULTIPLE) * MULTIPLE, -(-w // MULTIPLE) * MULTIPLE
         padded = np.zeros((1, len(image), high, wide), np.float32)
@@ -181,7 +185,7 @@ class LogSegmenter:
         if (high, wide) not in self._nets:
             self._nets[high, wide] = OpenVinoNet(self._network, self._arrays, padded.shape, self._precision)
         maps = self._nets[high, wide](padded)["maps"][0]
-        return maps[:, : -(-h // STRIDE), : -(-w // STRIDE)]
+        return np.asarray(maps[:, : -(-h // STRIDE), : -(-w // STRIDE)])
 
 
 @cache
@@ -194,33 +198,35 @@ def segment(frame: RgbdFrame) -> tuple[Instance, ...]:
     return _shipped().segment(frame)
 
 
-def _about(
-    rows: np.ndarray, columns: np.ndarray, scale: int, edge: int, size: tuple[int, int], shape: tuple[int, ...]
+def _window_around(
+    rows: np.ndarray, columns: np.ndarray, scale: int, margin: int, size: tuple[int, int], shape: tuple[int, ...]
 ) -> Window | None:
-    """The window of a size about places at these rows and columns, each ``scale`` pixels wide, as far as it is in the
-    picture (H, W); None where it does not hold them with an ``edge`` about them.
+    """The window of ``size`` around these rows and columns, each ``scale`` pixels wide, clipped to the picture (H, W).
+
+    None when it does not hold them with ``margin`` around them.
     """
     window: list[int] = []
     for at, long, whole in zip((rows, columns), size, shape, strict=True):
         first, last = int(at[0]), int(at[-1]) + scale
-        if last - first + 2 * edge > long < whole:
+        if last - first + 2 * margin > long < whole:
             return None
         begin = min(max((first + last - long) // 2, 0), max(whole - long, 0))
         window += [begin, min(begin + long, whole)]
     return window[0], window[1], window[2], window[3]
 
 
-def cut(shot: Shot, window: Window) -> Shot:
-    """A window of colours, depth and pinhole."""
-    (rgb, depth_m, pinhole), (top, bottom, left, right) = shot, window
+def crop(view: View, window: Window) -> View:
+    """A window of colour, depth and pinhole."""
+    (rgb, depth_m, pinhole), (top, bottom, left, right) = view, window
     at = slice(top, bottom), slice(left, right)
     return rgb[at], depth_m[at], pinhole.crop(left, top, right - left, bottom - top)
 
 
-def both(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
-    """Maps (8, h, w) of a picture and of the same at half the size as one: votes from the coarse ones, which saw the
-    logs as wholes; masks, angles and edges from both, ends from the fine ones.  What is so thin that the coarse ones
-    are blind to it is as the fine ones have it.
+def fuse_scales(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
+    """Fused maps (8, h, w) of a picture and of the same picture at half the size.
+
+    Votes come from the coarse maps, which show logs as wholes; ends from the fine maps; masks, angles and edges from
+    both.  Structures too thin for the coarse maps come from the fine maps alone.
     """
     h, w = fine.shape[1:]
     y, x = (np.minimum(np.arange(n) // 2, n2 - 1) for n, n2 in ((h, coarse.shape[1]), (w, coarse.shape[2])))
@@ -232,7 +238,7 @@ def both(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
     maps[OFFSET_V] = 2.0 * south + pixel * (2.0 * y + 0.5 - np.arange(h)).astype(np.float32)[:, None]
     down, across = (bilinear(n2, 2) for n2 in coarse.shape[1:])
     rows, columns = np.minimum(np.arange(h), len(down) - 1), np.minimum(np.arange(w), len(across) - 1)
-    for i, share in ((MASK, MASK_SHARE), (EDGE, EDGE_SHARE)):
+    for i, share in ((MASK, FINE_MASK_SHARE), (EDGE, FINE_EDGE_SHARE)):
         smooth = (down[rows] @ coarse[i] @ across[columns].T).astype(np.float32)
         maps[i] = share * fine[i] + (1.0 - share) * smooth
     wood = fine[MASK] > 0.0
@@ -242,12 +248,13 @@ def both(fine: np.ndarray, coarse: np.ndarray) -> np.ndarray:
 
 
 def _opened(wood: np.ndarray, size: int) -> np.ndarray:
-    """What of ``wood`` (h, w) bool a square of ``size`` (odd) pixels inside it covers."""
+    """The morphological opening of ``wood`` (h, w) bool with a square of ``size`` (odd) pixels."""
     for grow in (False, True):
         for axis in (0, 1):
-            beyond = np.pad(wood, [(size // 2, size // 2) if a == axis else (0, 0) for a in (0, 1)])
+            pads = [(size // 2, size // 2) if a == axis else (0, 0) for a in (0, 1)]
+            padded: np.ndarray = np.pad(wood, pads)
             wood = np.full(wood.shape, not grow)
             for i in range(size):
-                part = beyond[i : i + len(wood)] if axis == 0 else beyond[:, i : i + wood.shape[1]]
+                part = padded[i : i + len(wood)] if axis == 0 else padded[:, i : i + wood.shape[1]]
                 wood = wood | part if grow else wood & part
     return wood

@@ -1,4 +1,4 @@
-"""Pictures with their depth, smaller and larger; pixel areas correspond, so that the ray of a pixel's middle stays."""
+"""Scaling of pictures with depth; pixel areas correspond, so that the ray of a pixel centre is preserved."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from machine.geometry.optics import Intrinsics
 def shrunk(
     rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics, factor: int
 ) -> tuple[np.ndarray, np.ndarray, Intrinsics]:
-    """The picture with every ``factor`` x ``factor`` block as one pixel: mean colour, depth of one pixel in it (a mean
-    would put points between near and far).  What does not fill a block at the right and lower border is left out."""
+    """The picture with every ``factor`` x ``factor`` block as one pixel: mean colour, depth of its middle pixel.
+
+    A mean of depth would create points between near and far.  Incomplete blocks at the right and lower border are
+    dropped.
+    """
     if factor == 1:
         return rgb, depth_m, pinhole
     h, w = rgb.shape[0] // factor, rgb.shape[1] // factor
@@ -26,13 +29,13 @@ def shrunk(
 
 def _means(rgb: np.ndarray, factor: int) -> np.ndarray:
     """Mean colours (H / factor, W / factor, 3) uint8 of blocks, rounded down."""
-    wide = np.uint16 if factor <= 16 else np.uint32  # 16 x 16 x 255 still fits
-    rows = rgb[::factor].astype(wide)
+    wide: type[np.uint16 | np.uint32] = np.uint16 if factor <= 16 else np.uint32  # 16 x 16 x 255 fits into 16 bits
+    rows: np.ndarray = rgb[::factor].astype(wide)
     for i in range(1, factor):
         rows += rgb[i::factor]
     means = np.empty((len(rows), rows.shape[1] // factor, 3), np.uint8)
     for colour in range(3):  # one at a time: numpy is several times faster along one stride
-        total = rows[:, ::factor, colour].copy()
+        total: np.ndarray = rows[:, ::factor, colour].copy()
         for j in range(1, factor):
             total += rows[:, j::factor, colour]
         means[:, :, colour] = total // wide(factor * factor)
@@ -40,17 +43,17 @@ def _means(rgb: np.ndarray, factor: int) -> np.ndarray:
 
 
 def doubled(rgb: np.ndarray, depth_m: np.ndarray, pinhole: Intrinsics) -> tuple[np.ndarray, np.ndarray, Intrinsics]:
-    """The picture twice as large: colour interpolated, depth repeated."""
-    return between(rgb), repeated(depth_m), pinhole.scaled(2.0)
+    """The picture at twice the size: colour interpolated, depth repeated."""
+    return interpolated(rgb), repeated(depth_m), pinhole.scaled(2.0)
 
 
 def repeated(values: np.ndarray) -> np.ndarray:
-    """(H, W) as (2 H, 2 W)."""
+    """(H, W) repeated to (2 H, 2 W)."""
     return values.repeat(2, axis=0).repeat(2, axis=1)
 
 
-def between(rgb: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 as (2 H, 2 W, 3), linear between pixel centres; the border repeats."""
+def interpolated(rgb: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 interpolated to (2 H, 2 W, 3), linear between pixel centres; the border repeats."""
     wide = rgb.astype(np.uint16)
     for axis in (0, 1):
         near = 3 * wide

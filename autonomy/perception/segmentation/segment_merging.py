@@ -1,6 +1,7 @@
-"""Regions: the foreground parted into pieces, and the pieces of one log put together again, the likeliest pair first.
+"""Merging of segments into logs: the pair with the highest probability first, until none is likely to be one log.
 
-What is one log, and how good a region is, two small networks judge that learnt it from drawn pictures.
+Two small networks score pairs of segments (are they one log?) and merged segments (how well do they overlap a log?).
+They are trained on drawn pictures.
 """
 
 from __future__ import annotations
@@ -15,28 +16,34 @@ import numpy as np
 
 from autonomy.networks.graph import Conv, Network, Relu
 from autonomy.networks.weights import SHIPPED, load
-from autonomy.perception.segmentation.segment_pairs import PAIR_FEATURES, SegmentTable, may_merge, relations
-from autonomy.perception.segmentation.segments import SEGMENT_FEATURES, Foreground, Segment, look, piece
+from autonomy.perception.segmentation.segment_pairs import PAIR_FEATURES, SegmentTable, may_merge, pair_features
+from autonomy.perception.segmentation.segments import (
+    SEGMENT_FEATURES,
+    Foreground,
+    Segment,
+    make_segment,
+    segment_features,
+)
 from autonomy.perception.segmentation.watershed import sigmoid, watershed
 
-LEAST_PX: Final = 6  # of a map: what is smaller is no log
-MOST: Final = 100  # pieces of a picture, the largest: what has more is noise
-HIDDEN: Final = 24
-LEAST_CHANCE: Final = 0.5  # that two pieces are one log
+MIN_SEGMENT_PX: Final = 6  # pixels of a map; smaller segments are dropped
+MAX_SEGMENTS: Final = 100  # of a picture; only the largest are kept, because more are noise
+HIDDEN_UNITS: Final = 24
+MIN_MERGE_PROBABILITY: Final = 0.5
 
 
-def head(name: str, inputs: int) -> Network:
-    """A judge: ``inputs`` numbers in, the logit of a chance out, as a picture's channels."""
-    return Network(name, inputs, (Conv("first", HIDDEN, 1), Relu("bent"), Conv("logit", 1, 1)), ("logit",))
+def scoring_network(name: str, inputs: int) -> Network:
+    """A network with ``inputs`` features in and the logit of a probability out, both as channels of a picture."""
+    return Network(name, inputs, (Conv("first", HIDDEN_UNITS, 1), Relu("bent"), Conv("logit", 1, 1)), ("logit",))
 
 
-MERGE_NETWORK: Final = head("joins", len(PAIR_FEATURES))
-QUALITY_NETWORK: Final = head("worth", len(SEGMENT_FEATURES))
+MERGE_NETWORK: Final = scoring_network("segment_merging", len(PAIR_FEATURES))
+QUALITY_NETWORK: Final = scoring_network("segment_quality", len(SEGMENT_FEATURES))
 
 
 @dataclass(frozen=True, slots=True)
-class ScoringNetwork:
-    """A judge's numbers: weights and biases of its two layers."""
+class Scorer:
+    """A scoring network evaluated by numpy: weights and biases of its two layers."""
 
     first: np.ndarray
     bias: np.ndarray
@@ -44,158 +51,160 @@ class ScoringNetwork:
     offset: float
 
     @classmethod
-    def of(cls, arrays: dict[str, np.ndarray]) -> ScoringNetwork:
-        """From the arrays of a ``head``."""
+    def of(cls, arrays: dict[str, np.ndarray]) -> Scorer:
+        """From the arrays of a ``scoring_network``."""
         return cls(arrays["first.weight"][:, :, 0, 0], arrays["first.bias"], arrays["logit.weight"][0, :, 0, 0],
                    float(arrays["logit.bias"][0]))  # fmt: skip
 
-    def chance(self, told: np.ndarray) -> np.ndarray:
-        """Chances (N,) from numbers (N, inputs)."""
-        return sigmoid(np.maximum(told @ self.first.T + self.bias, 0.0) @ self.second + self.offset)
+    def probability(self, features: np.ndarray) -> np.ndarray:
+        """Probabilities (N,) from features (N, inputs)."""
+        return sigmoid(np.maximum(features @ self.first.T + self.bias, 0.0) @ self.second + self.offset)
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentScorers:
-    """Who says whether two pieces are one log, and what overlap with a log a region has."""
+    """``merge``: the probability that two segments are one log; ``quality``: a segment's overlap with a log."""
 
-    joins: ScoringNetwork
-    worth: ScoringNetwork
+    merge: Scorer
+    quality: Scorer
 
 
-def judges(folder: Path = SHIPPED) -> SegmentScorers:
-    """From ``joins.safetensors`` and ``worth.safetensors`` of a folder.
+def load_scorers(folder: Path = SHIPPED) -> SegmentScorers:
+    """From ``segment_merging.safetensors`` and ``segment_quality.safetensors`` of a folder.
 
     Raises:
-        WeightsError: they are missing, damaged or of other networks.
+        WeightsError: the files are missing, damaged or of other networks.
     """
-    heads = (ScoringNetwork.of(load(folder / f"{network.name}.safetensors", network)[0]) for network in (MERGE_NETWORK, QUALITY_NETWORK))
-    return SegmentScorers(*heads)
+    networks = (MERGE_NETWORK, QUALITY_NETWORK)
+    merge, quality = (Scorer.of(load(folder / f"{network.name}.safetensors", network)[0]) for network in networks)
+    return SegmentScorers(merge, quality)
 
 
 @cache
 def shipped_scorers() -> SegmentScorers:
-    """Those that come with the package."""
-    return judges()
+    """The scorers that are shipped with the package."""
+    return load_scorers()
 
 
 @dataclass(frozen=True, slots=True)
 class LogSegment:
-    """Pixels (N,) of the maps' foreground that are one log: its axis (2,) and score."""
+    """The pixels ``members`` (N,) of the foreground that are one log, its axis (2,) and score."""
 
-    own: np.ndarray
+    members: np.ndarray
     axis: np.ndarray
     score: float
 
 
-def parted(scene: Foreground, by: SegmentScorers) -> list[LogSegment]:
-    """The foreground of a scene as logs, the largest first."""
-    pieces = cut(scene)
-    joined = SegmentMerger(scene, pieces)
-    joined.join(by.joins)
-    chances = by.worth.chance(joined.looks(by.joins)) if pieces else np.zeros(0)
-    regions = [LogSegment(p.own, p.told, float(c)) for p, c in zip(joined.pieces, chances, strict=True)]
-    return sorted(regions, key=lambda r: -len(r.own))
+def segment_logs(foreground: Foreground, scorers: SegmentScorers) -> list[LogSegment]:
+    """The logs of a foreground, in descending order of size."""
+    segments = over_segment(foreground)
+    merger = SegmentMerger(foreground, segments)
+    merger.merge_all(scorers.merge)
+    scores = scorers.quality.probability(merger.features(scorers.merge)) if segments else np.zeros(0)
+    logs = [LogSegment(s.members, s.predicted_axis, float(c)) for s, c in zip(merger.segments, scores, strict=True)]
+    return sorted(logs, key=lambda log: -len(log.members))
 
 
-def cut(scene: Foreground) -> list[Segment]:
-    """The scene's pieces, too many rather than too few, the largest first."""
-    labels = watershed(scene.wall, scene.foreground)[scene.y, scene.x]
+def over_segment(foreground: Foreground) -> list[Segment]:
+    """Segments of the foreground, rather too many than too few, in descending order of size."""
+    labels = watershed(foreground.boundary, foreground.mask)[foreground.y, foreground.x]
     order = np.argsort(labels, kind="stable")
     cuts = np.searchsorted(labels[order], np.arange(1, labels.max(initial=0) + 2))
-    parts = [order[a:b] for a, b in pairwise(cuts) if b - a >= LEAST_PX * scene.grain]
-    return [piece(scene, own) for own in sorted(parts, key=lambda own: -len(own))[:MOST]]
+    parts = [order[a:b] for a, b in pairwise(cuts) if b - a >= MIN_SEGMENT_PX * foreground.grain]
+    return [make_segment(foreground, part) for part in sorted(parts, key=lambda part: -len(part))[:MAX_SEGMENTS]]
 
 
 class SegmentMerger:
-    """Pieces of a scene, their borders with each other, and their relations, as they grow together."""
+    """Segments of a foreground with their shared borders and pair features, updated as segments merge."""
 
-    def __init__(self, scene: Foreground, pieces: list[Segment]) -> None:
-        self.scene, self.pieces = scene, list(pieces)
-        self._touch, self._wall = _borders(scene, pieces)
-        n = len(pieces)
-        self._told = np.zeros((n, n, len(PAIR_FEATURES)), np.float32)
-        self._may = np.zeros((n, n), bool)  # be one log; below the diagonal as above
-        self._row = SegmentTable.of(pieces)
-        self._relate(*np.tril_indices(n, -1))
+    def __init__(self, foreground: Foreground, segments: list[Segment]) -> None:
+        self.foreground, self.segments = foreground, list(segments)
+        self._border_px, self._boundary_sum = _borders(foreground, segments)
+        n = len(segments)
+        self._features = np.zeros((n, n, len(PAIR_FEATURES)), np.float32)
+        self._may = np.zeros((n, n), bool)  # be one log; symmetric
+        self._table = SegmentTable.of(segments)
+        self._update_pairs(*np.tril_indices(n, -1))
 
-    def _relate(self, i: np.ndarray, j: np.ndarray) -> None:
-        """Note what pieces ``i`` (n,) have to do with pieces ``j`` (n,)."""
-        first = self._row.count[i] >= self._row.count[j]
-        big, small = self._row.take(np.where(first, i, j)), self._row.take(np.where(first, j, i))
-        touch = self._touch[i, j]
-        may = may_merge(self.scene, big, small, touch)
+    def _update_pairs(self, i: np.ndarray, j: np.ndarray) -> None:
+        """Update the features of the pairs of segments ``i`` (n,) and ``j`` (n,)."""
+        first = self._table.count[i] >= self._table.count[j]
+        big, small = self._table.take(np.where(first, i, j)), self._table.take(np.where(first, j, i))
+        border_px = self._border_px[i, j]
+        may = may_merge(self.foreground, big, small, border_px)
         self._may[i, j] = self._may[j, i] = may
-        i, j, touch = i[may], j[may], touch[may]
-        between = np.divide(self._wall[i, j], touch, out=np.zeros_like(touch), where=touch > 0.0)
-        told = relations(self.scene, big.take(may), small.take(may), touch, between)
-        self._told[i, j] = self._told[j, i] = told
+        i, j, border_px = i[may], j[may], border_px[may]
+        boundary = np.divide(self._boundary_sum[i, j], border_px, out=np.zeros_like(border_px), where=border_px > 0.0)
+        features = pair_features(self.foreground, big.take(may), small.take(may), border_px, boundary)
+        self._features[i, j] = self._features[j, i] = features
 
     def pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Every pair (N, 2) that may be one log, and its RELATIONS (N, 19)."""
+        """All pairs (N, 2) that may be one log, and their PAIR_FEATURES (N, 19)."""
         pairs = np.argwhere(np.tril(self._may))
-        return pairs, self._told[pairs[:, 0], pairs[:, 1]]
+        return pairs, self._features[pairs[:, 0], pairs[:, 1]]
 
-    def join(self, judge: ScoringNetwork) -> None:
-        """Put together what is likely to be one log, the likeliest first, until nothing is."""
-        chances = self.chances(judge)
-        while chances.size and chances.max() >= LEAST_CHANCE:
-            i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(chances)), chances.shape))
-            kept = self.merge(i, j)
-            chances = chances[kept[:, None], kept]
-            chances[i] = chances[:, i] = np.where(self._may[i], judge.chance(self._told[i]), 0.0)
+    def merge_all(self, scorer: Scorer) -> None:
+        """Merge the most probable pair, again and again, until no pair reaches ``MIN_MERGE_PROBABILITY``."""
+        probabilities = self.merge_probabilities(scorer)
+        while probabilities.size and probabilities.max() >= MIN_MERGE_PROBABILITY:
+            i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(probabilities)), probabilities.shape))
+            kept = self.merge_pair(i, j)
+            probabilities = probabilities[kept[:, None], kept]
+            updated = np.where(self._may[i], scorer.probability(self._features[i]), 0.0)
+            probabilities[i] = probabilities[:, i] = updated
 
-    def chances(self, judge: ScoringNetwork) -> np.ndarray:
-        """That two pieces are one log (n, n), 0 for a piece with itself."""
-        pairs, told = self.pairs()
-        chances = np.zeros(self._may.shape)
-        chances[pairs[:, 0], pairs[:, 1]] = chances[pairs[:, 1], pairs[:, 0]] = judge.chance(told)
-        return chances
+    def merge_probabilities(self, scorer: Scorer) -> np.ndarray:
+        """The probability that two segments are one log (n, n), 0 for a segment with itself."""
+        pairs, features = self.pairs()
+        found = np.zeros(self._may.shape)
+        found[pairs[:, 0], pairs[:, 1]] = found[pairs[:, 1], pairs[:, 0]] = scorer.probability(features)
+        return found
 
-    def merge(self, i: int, j: int) -> np.ndarray:
-        """Make pieces ``i`` and ``j``, ``i`` the earlier one, one in its place; the places (n - 1,) that the pieces had
-        before."""
-        self.pieces[i] = piece(self.scene, np.concatenate([self.pieces[i].own, self.pieces[j].own]))
-        for of in (self._touch, self._wall):
+    def merge_pair(self, i: int, j: int) -> np.ndarray:
+        """Merge segment ``j`` into segment ``i``, ``i`` < ``j``; returns the former indices (n - 1,) of the segments."""
+        members = np.concatenate([self.segments[i].members, self.segments[j].members])
+        self.segments[i] = make_segment(self.foreground, members)
+        for of in (self._border_px, self._boundary_sum):
             of[i] += of[j]
             of[:, i] += of[:, j]
             of[i, i] = 0.0
-        self._row.put(i, self.pieces[i])
-        kept = np.flatnonzero(np.arange(len(self.pieces)) != j)
-        del self.pieces[j]
-        self._touch, self._wall, self._told, self._may = (
-            of[kept[:, None], kept] for of in (self._touch, self._wall, self._told, self._may)
+        self._table.put(i, self.segments[i])
+        kept = np.flatnonzero(np.arange(len(self.segments)) != j)
+        del self.segments[j]
+        self._border_px, self._boundary_sum, self._features, self._may = (
+            of[kept[:, None], kept] for of in (self._border_px, self._boundary_sum, self._features, self._may)
         )
-        self._row = self._row.take(kept)
+        self._table = self._table.take(kept)
         others = np.flatnonzero(np.arange(len(kept)) != i)
-        self._relate(np.full(len(others), i), others)
+        self._update_pairs(np.full(len(others), i), others)
         return kept
 
-    def looks(self, judge: ScoringNetwork) -> np.ndarray:
-        """LOOKS (n, 14) of the pieces as they are now."""
-        likeness = self.chances(judge).max(axis=1, initial=0.0)
-        touch, around = self._touch.sum(axis=1), self._wall.sum(axis=1)
-        around = np.divide(around, touch, out=np.ones_like(around), where=touch > 0.0)
+    def features(self, scorer: Scorer) -> np.ndarray:
+        """SEGMENT_FEATURES (n, 14) of the current segments."""
+        merge_probability = self.merge_probabilities(scorer).max(axis=1, initial=0.0)
+        border_px, around = self._border_px.sum(axis=1), self._boundary_sum.sum(axis=1)
+        around = np.divide(around, border_px, out=np.ones_like(around), where=border_px > 0.0)
         return np.array([
-            look(self.scene, p, float(touch[k]), float(around[k]), float(likeness[k]))
-            for k, p in enumerate(self.pieces)
+            segment_features(self.foreground, s, float(border_px[k]), float(around[k]), float(merge_probability[k]))
+            for k, s in enumerate(self.segments)
         ], np.float32).reshape(-1, len(SEGMENT_FEATURES))  # fmt: skip
 
 
-def _borders(scene: Foreground, pieces: list[Segment]) -> tuple[np.ndarray, np.ndarray]:
-    """How many pixels of border every two pieces (n, n) share, and the wall's sum along it."""
-    n = len(pieces)
-    labels = np.zeros(scene.foreground.shape, np.int64)
-    for number, one in enumerate(pieces, 1):
-        labels[scene.y[one.own], scene.x[one.own]] = number
-    touch, wall = np.zeros((n + 1) ** 2), np.zeros((n + 1) ** 2)
-    # A pixel or two of wall may lie between what meets there.
+def _borders(foreground: Foreground, segments: list[Segment]) -> tuple[np.ndarray, np.ndarray]:
+    """Length of the border that each pair of segments shares [px], and the sum of the boundary map along it (n, n)."""
+    n = len(segments)
+    labels = np.zeros(foreground.mask.shape, np.int64)
+    for number, one in enumerate(segments, 1):
+        labels[foreground.y[one.members], foreground.x[one.members]] = number
+    border, boundary = np.zeros((n + 1) ** 2), np.zeros((n + 1) ** 2)
+    # There may be a pixel or two of boundary between segments that meet.
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]), (np.s_[:, :-2], np.s_[:, 2:]),
                  (np.s_[:-2], np.s_[2:])):  # fmt: skip
         i, j = labels[a], labels[b]
         meet = (i != j) & (i > 0) & (j > 0)
         pair = i[meet] * (n + 1) + j[meet]
-        touch += np.bincount(pair, minlength=(n + 1) ** 2)
-        wall += np.bincount(pair, np.maximum(scene.wall[a], scene.wall[b])[meet], (n + 1) ** 2)
-    grids = (of.reshape(n + 1, n + 1)[1:, 1:] for of in (touch, wall))
-    touch, wall = ((g + g.T) / 4.0 for g in grids)  # four looks at each border
-    return touch, wall
+        border += np.bincount(pair, minlength=(n + 1) ** 2)
+        boundary += np.bincount(pair, np.maximum(foreground.boundary[a], foreground.boundary[b])[meet], (n + 1) ** 2)
+    grids = (of.reshape(n + 1, n + 1)[1:, 1:] for of in (border, boundary))
+    border, boundary = ((g + g.T) / 4.0 for g in grids)  # each border is counted four times
+    return border, boundary

@@ -1,7 +1,7 @@
-"""What pieces of the foreground have to do with each other, for many pairs at once.
+"""Features of pairs of segments, for many pairs at once, and a fast test which pairs may be one log.
 
-A log that another one crosses is several pieces: they lie on one line, in the picture and in depth, vote for one
-middle, and what lies between them lies before them.  All numbers are free of scale: a judge learns from them.
+A log that another one crosses is several segments.  They lie on one line in the picture and in depth, vote for one
+centre, and what lies between them is nearer.  All features are independent of scale, because a network learns from them.
 """
 
 from __future__ import annotations
@@ -15,150 +15,191 @@ import numpy as np
 from autonomy.perception.segmentation.segments import Foreground, Segment
 
 NEARER: Final = 1.03  # inverse depth of what hides a log, over the log's own
-GAP_PX: Final = 3.0
-GAP_LOOKS: Final = 12
-LOOK_AT: Final = np.arange(1, GAP_LOOKS + 1) / (GAP_LOOKS + 1.0)  # shares of a gap
-BESIDE, LEAN = 3.0, 0.1  # pieces further beside a line than so many half widths, and share of how far along, are apart
+MIN_GAP_PX: Final = 3.0
+GAP_SAMPLES: Final = 12
+GAP_SHARES: Final = np.arange(1, GAP_SAMPLES + 1) / (GAP_SAMPLES + 1.0)
+MAX_OFFSET_WIDTHS, MAX_OFFSET_SHARE = 3.0, 0.1
+"""Largest offset of a segment from the other's axis: half widths, plus a share of the distance along the axis."""
 UNKNOWN: Final = (np.nan, np.nan)
-LEAST_SEEN: Final = 0.6  # of a gap, that parts
-LEAST_END: Final = 0.5
-SLENDER: Final = 3.0  # a piece so many times longer than wide says itself how its depth goes on
+MIN_BACKGROUND_SHARE: Final = 0.6  # of a gap that separates two logs
+MIN_END_PROBABILITY: Final = 0.5
+MIN_ELONGATION: Final = 3.0  # from which on a segment's own slope of depth is used
 PAIR_FEATURES: Final = (
-    "touch", "wall", "touching", "turn", "turn_told", "beside", "beside_back", "votes_along", "votes_across", "gap",
-    "gap_ground", "depth_apart", "depth_known", "width_ratio", "size", "slender_big", "slender_small", "gap_widths",
-    "beside_lean",
+    "border", "boundary", "touching", "turn", "predicted_turn", "offset", "offset_back", "votes_along", "votes_across",
+    "gap", "gap_background", "depth_difference", "depth_known", "width_ratio", "size", "elongation_big",
+    "elongation_small", "gap_widths", "offset_share",
 )  # fmt: skip
-"""What ``relations`` tells of two pieces, in this order."""
-
-
-def _columns(first: int, last: int | None = None) -> property:
-    return property(lambda row: row.numbers[:, first] if last is None else row.numbers[:, first:last])
+"""The numbers of ``pair_features``, in this order."""
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentTable:
-    """Pieces as ``numbers`` (n, 15), one array because many at a time are taken from it; the columns as the fields of
-    ``Segment``, ``count`` of pixels, and the line of inverse depth as its value at the middle and its slope, NaN unknown.
+    """Segments as one array ``numbers`` (n, 15), because many at a time are selected from it.
+
+    The columns are the fields of ``Segment``, ``count`` of pixels, and the line of inverse depth as its value at the
+    middle and its slope, NaN unknown.
     """
 
     numbers: np.ndarray
 
-    count = _columns(0)
-    middle = _columns(1, 3)
-    axis = _columns(3, 5)
-    told = _columns(5, 7)
-    half = _columns(7)
-    low = _columns(8)
-    high = _columns(9)
-    slender = _columns(10)
-    vote = _columns(11, 13)
-    line_at = _columns(13)
-    line_slope = _columns(14)
+    @property
+    def count(self) -> np.ndarray:
+        return self.numbers[:, 0]
+
+    @property
+    def middle(self) -> np.ndarray:
+        return self.numbers[:, 1:3]
+
+    @property
+    def axis(self) -> np.ndarray:
+        return self.numbers[:, 3:5]
+
+    @property
+    def predicted_axis(self) -> np.ndarray:
+        return self.numbers[:, 5:7]
+
+    @property
+    def half_width(self) -> np.ndarray:
+        return self.numbers[:, 7]
+
+    @property
+    def low(self) -> np.ndarray:
+        return self.numbers[:, 8]
+
+    @property
+    def high(self) -> np.ndarray:
+        return self.numbers[:, 9]
+
+    @property
+    def elongation(self) -> np.ndarray:
+        return self.numbers[:, 10]
+
+    @property
+    def vote(self) -> np.ndarray:
+        return self.numbers[:, 11:13]
+
+    @property
+    def line_at(self) -> np.ndarray:
+        return self.numbers[:, 13]
+
+    @property
+    def line_slope(self) -> np.ndarray:
+        return self.numbers[:, 14]
 
     @classmethod
-    def of(cls, pieces: Sequence[Segment]) -> SegmentTable:
-        """Of a list."""
+    def of(cls, segments: Sequence[Segment]) -> SegmentTable:
+        """The table of a list of segments."""
         rows = [
-            (len(p.own), *p.middle, *p.axis, *p.told, p.half, p.low, p.high, p.slender, *p.vote, *(p.line or UNKNOWN))
-            for p in pieces
-        ]
+            (
+                len(s.members), *s.middle, *s.axis, *s.predicted_axis, s.half_width, s.low, s.high, s.elongation,
+                *s.vote, *(s.line or UNKNOWN),
+            )
+            for s in segments
+        ]  # fmt: skip
         return cls(np.array(rows, float).reshape(-1, 15))
 
-    def put(self, place: int, piece: Segment) -> None:
-        """Write a piece over the one at a place."""
-        self.numbers[place] = SegmentTable.of([piece]).numbers[0]
+    def put(self, row: int, segment: Segment) -> None:
+        """Replace a row by a segment."""
+        self.numbers[row] = SegmentTable.of([segment]).numbers[0]
 
     def take(self, which: np.ndarray) -> SegmentTable:
-        """Those of these places."""
+        """The table of some rows."""
         return SegmentTable(self.numbers[which])
 
 
-def relations(scene: Foreground, big: SegmentTable, small: SegmentTable, touch_px: np.ndarray, between: np.ndarray) -> np.ndarray:
-    """RELATIONS (n, 19) of n pairs of pieces that share borders of ``touch_px`` (n,) pixels of the maps, where the wall
-    has the mean ``between`` (n,).
+def pair_features(
+    foreground: Foreground, big: SegmentTable, small: SegmentTable, border_px: np.ndarray, boundary: np.ndarray
+) -> np.ndarray:
+    """PAIR_FEATURES (n, 19) of n pairs of segments.
+
+    They share borders of ``border_px`` (n,) pixels of the maps, along which the boundary map has the mean ``boundary``
+    (n,).
     """
     axis, away = big.axis, small.middle - big.middle
-    along, beside = _dot(away, axis), np.abs(_cross(axis, away))
+    along, offset = _dot(away, axis), np.abs(_cross(axis, away))
     span = np.maximum(big.high, along + small.high) - np.minimum(big.low, along + small.low)
     apart = small.vote - big.vote
     start, end = _between(big, small, along)
-    gap, thin = np.maximum(0.0, end - start), np.maximum(small.half, 1.0)
-    ground, parted = np.zeros(len(gap)), gap > GAP_PX
-    hidden, inverse, line = _gap(scene, big.take(parted), start[parted], end[parted])
-    ground[parted] = 1.0 - (hidden | (inverse > NEARER * line)).sum(axis=1) / GAP_LOOKS
+    gap, thin = np.maximum(0.0, end - start), np.maximum(small.half_width, 1.0)
+    background, wide = np.zeros(len(gap)), gap > MIN_GAP_PX
+    hidden, inverse, line = _gap(foreground, big.take(wide), start[wide], end[wide])
+    background[wide] = 1.0 - (hidden | (inverse > NEARER * line)).sum(axis=1) / GAP_SAMPLES
     return np.stack([
-        np.minimum(touch_px / (2.0 * np.minimum(small.half, big.half)), 3.0),
-        between,
-        touch_px > 0.0,
-        np.abs(_cross(small.axis, axis)) * np.minimum(small.slender, 4.0) / 4.0,
-        np.abs(_cross(small.told, big.told)),
-        np.minimum(beside / big.half, 4.0),
+        np.minimum(border_px / (2.0 * np.minimum(small.half_width, big.half_width)), 3.0),
+        boundary,
+        border_px > 0.0,
+        np.abs(_cross(small.axis, axis)) * np.minimum(small.elongation, 4.0) / 4.0,
+        np.abs(_cross(small.predicted_axis, big.predicted_axis)),
+        np.minimum(offset / big.half_width, 4.0),
         np.minimum(np.abs(_cross(small.axis, away)) / thin, 6.0),
         np.minimum(np.abs(_dot(apart, axis)) / span, 1.5),
-        np.minimum(np.abs(_cross(axis, apart)) / (big.half + small.half), 3.0),
+        np.minimum(np.abs(_cross(axis, apart)) / (big.half_width + small.half_width), 3.0),
         np.minimum(gap / span, 1.0),
-        ground,
-        np.minimum(10.0 * _depth_apart(big, small, along), 5.0),
+        background,
+        np.minimum(10.0 * _depth_difference(big, small, along), 5.0),
         ~np.isnan(big.line_at + small.line_at),
-        np.abs(np.log(small.half / big.half)),
-        0.3 * np.log(small.count / scene.grain),
-        0.2 * np.minimum(big.slender, 20.0),
-        0.2 * np.minimum(small.slender, 20.0),
-        0.2 * np.minimum(gap / (2.0 * np.maximum(big.half, 1.0)), 10.0),
-        np.minimum(beside / (big.half + 0.05 * np.abs(along)), 5.0),
+        np.abs(np.log(small.half_width / big.half_width)),
+        0.3 * np.log(small.count / foreground.grain),
+        0.2 * np.minimum(big.elongation, 20.0),
+        0.2 * np.minimum(small.elongation, 20.0),
+        0.2 * np.minimum(gap / (2.0 * np.maximum(big.half_width, 1.0)), 10.0),
+        np.minimum(offset / (big.half_width + 0.05 * np.abs(along)), 5.0),
     ], axis=1).astype(np.float32)  # fmt: skip
 
 
-def may_merge(scene: Foreground, big: SegmentTable, small: SegmentTable, touch_px: np.ndarray) -> np.ndarray:
-    """Whether (n,) a judge need be asked: two pieces touch or lie near one line, and nothing parts them there: one
-    neither looks past them at what is clearly farther nor sees an end.
+def may_merge(foreground: Foreground, big: SegmentTable, small: SegmentTable, border_px: np.ndarray) -> np.ndarray:
+    """Whether (n,) the scorer must decide about a pair.
+
+    Two segments may be one log when they touch or lie near one line, and when nothing separates them: between them there
+    is neither background that is clearly farther away nor an end of a log.
     """
     away = small.middle - big.middle
-    along, beside = _dot(away, big.axis), np.abs(_cross(big.axis, away))
-    may = (touch_px > 0.0) | (beside <= BESIDE * big.half + LEAN * np.abs(along))
+    along, offset = _dot(away, big.axis), np.abs(_cross(big.axis, away))
+    may = (border_px > 0.0) | (offset <= MAX_OFFSET_WIDTHS * big.half_width + MAX_OFFSET_SHARE * np.abs(along))
     start, end = _between(big, small, along)
-    ask = np.flatnonzero(may & (np.abs(along) > 0.5 * (big.high - big.low)) & (beside <= big.half))
+    ask = np.flatnonzero(may & (np.abs(along) > 0.5 * (big.high - big.low)) & (offset <= big.half_width))
     middles = np.rint(big.middle + 0.5 * (start + end)[:, None] * big.axis).astype(int)
     for k in ask:
-        (column, row), reach = middles[k], max(1, round(0.5 * float(small.half[k])))
-        here = scene.ends[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
-        may[k] = not (here.size and float(here.max()) > LEAST_END and end[k] - start[k] < small.half[k])
-    ask = ask[may[ask] & (end - start > GAP_PX)[ask]]
-    hidden, inverse, line = _gap(scene, big.take(ask), start[ask], end[ask])
-    may[ask] = (~hidden & (inverse < line / NEARER)).sum(axis=1) <= LEAST_SEEN * GAP_LOOKS
+        (column, row), reach = middles[k], max(1, round(0.5 * float(small.half_width[k])))
+        here = foreground.ends[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
+        has_end = here.size and float(here.max()) > MIN_END_PROBABILITY
+        may[k] = not (has_end and end[k] - start[k] < small.half_width[k])
+    ask = ask[may[ask] & (end - start > MIN_GAP_PX)[ask]]
+    hidden, inverse, line = _gap(foreground, big.take(ask), start[ask], end[ask])
+    may[ask] = (~hidden & (inverse < line / NEARER)).sum(axis=1) <= MIN_BACKGROUND_SHARE * GAP_SAMPLES
     return may
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]
+    return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def _depth_apart(big: SegmentTable, small: SegmentTable, along: np.ndarray) -> np.ndarray:
-    """By which share (n,) of its inverse depth one piece misses the other one's line, where that is straight enough; 0
-    where one has none.
-    """
+def _depth_difference(big: SegmentTable, small: SegmentTable, along: np.ndarray) -> np.ndarray:
+    """Relative difference (n,) of inverse depth between one segment and the other's line; 0 where one has no depth."""
     miss = np.abs(big.line_at + big.line_slope * along - small.line_at) / np.maximum(small.line_at, 1e-3)
     turned = np.where(_dot(big.axis, small.axis) > 0.0, 1.0, -1.0)
     back = np.abs(small.line_at - turned * small.line_slope * along - big.line_at) / np.maximum(big.line_at, 1e-3)
-    apart = np.where(small.slender > SLENDER, np.minimum(miss, back), miss)
-    return np.where(np.isnan(apart), 0.0, apart)
+    apart = np.where(small.elongation > MIN_ELONGATION, np.minimum(miss, back), miss)
+    return np.asarray(np.where(np.isnan(apart), 0.0, apart))
 
 
 def _between(big: SegmentTable, small: SegmentTable, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the gap between two pieces begins and ends on the big one's axis; they overlap where it ends first."""
+    """Start and end (n,) of the gap between two segments on the big one's axis; end before start when they overlap."""
     after = along > 0.0
     return np.where(after, big.high, along + small.high), np.where(after, along + small.low, big.low)
 
 
-def _gap(scene: Foreground, big: SegmentTable, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Along gaps (n, GAP_LOOKS): foreground, inverse depth, and that of the big piece's line, NaN unknown."""
-    at = start[:, None] + (end - start)[:, None] * LOOK_AT
+def _gap(
+    foreground: Foreground, big: SegmentTable, start: np.ndarray, end: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Along gaps (n, GAP_SAMPLES): foreground, inverse depth, and inverse depth of the big segment's line, NaN unknown."""
+    at = start[:, None] + (end - start)[:, None] * GAP_SHARES
     place = np.rint(big.middle[:, None] + at[..., None] * big.axis[:, None]).astype(int)
-    row = np.clip(place[..., 1], 0, scene.foreground.shape[0] - 1)
-    column = np.clip(place[..., 0], 0, scene.foreground.shape[1] - 1)
+    row = np.clip(place[..., 1], 0, foreground.mask.shape[0] - 1)
+    column = np.clip(place[..., 0], 0, foreground.mask.shape[1] - 1)
     line = big.line_at[:, None] + big.line_slope[:, None] * at
-    return scene.foreground[row, column], scene.inverse[row, column], line
+    return foreground.mask[row, column], foreground.inverse[row, column], line

@@ -18,7 +18,7 @@ from autonomy.perception.sources.camera_source import SourceError
 from machine.geometry.optics import Intrinsics
 
 INDEX: Final = "camera.json"
-MM_M: Final = 1000.0
+MM_PER_M: Final = 1000.0
 
 
 class Index(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -96,7 +96,7 @@ class FrameFolder:
         if self.index.depth == "npy":
             return np.asarray(np.load(self._folder / f"{stem}.npy", allow_pickle=False).astype(np.float32))
         with Image.open(self._folder / f"{stem}.depth.png") as picture:
-            depth_m = np.asarray(picture).astype(np.float32) / np.float32(MM_M)
+            depth_m = np.asarray(picture).astype(np.float32) / np.float32(MM_PER_M)
         depth_m[depth_m == 0.0] = np.nan
         return depth_m
 
@@ -133,7 +133,7 @@ class FrameFolderWriter:
         if self._depth == "npy":
             np.save(self._folder / f"{stem}.npy", frame.depth_m)
         else:
-            millimetres = np.clip(np.rint(np.nan_to_num(frame.depth_m, nan=0.0) * MM_M), 0, 65535).astype(np.uint16)
+            millimetres = np.clip(np.rint(np.nan_to_num(frame.depth_m, nan=0.0) * MM_PER_M), 0, 65535).astype(np.uint16)
             Image.fromarray(millimetres).save(self._folder / f"{stem}.depth.png")
         self._stamps_ns.append(frame.stamp_ns)
 

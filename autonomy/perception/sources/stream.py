@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from autonomy.perception.camera.frame import RgbdFrame
-from can_dbc.messages.rgbd import MM_M, START_BYTES, RgbdError, RgbdMessage, decode, encode_question, start
+from can_dbc.messages.rgbd import HEADER_BYTES, MM_PER_M, RgbdError, RgbdMessage, decode, encode_request, start
 from machine.geometry.optics import Intrinsics
 
 MAX_RECEIVE_BYTES: Final = 1 << 20
@@ -56,13 +56,13 @@ class StreamCamera:
         sock = self._socket or self._connect(end_s)
         if not self._requested:
             sock.settimeout(_left(end_s))
-            sock.sendall(encode_question(self._camera))
+            sock.sendall(encode_request(self._camera))
             self._requested = True
-        wanted = START_BYTES
+        wanted = HEADER_BYTES
         while True:
-            if len(self._data) >= START_BYTES:
-                wanted = START_BYTES + start(bytes(self._data[:START_BYTES])).rest
-            if len(self._data) >= wanted > START_BYTES:
+            if len(self._data) >= HEADER_BYTES:
+                wanted = HEADER_BYTES + start(bytes(self._data[:HEADER_BYTES])).rest
+            if len(self._data) >= wanted > HEADER_BYTES:
                 break
             left_s = end_s - time.monotonic()
             if left_s <= 0.0:
@@ -106,7 +106,7 @@ def _left(end_s: float) -> float:
 def frame_from_message(sent: RgbdMessage) -> RgbdFrame:
     """The frame of a message: depth in m, NaN where it is unknown."""
     shape = (sent.height_px, sent.width_px)
-    depth_m = np.frombuffer(sent.depth_mm, "<u2").reshape(shape).astype(np.float32) / np.float32(MM_M)
+    depth_m = np.frombuffer(sent.depth_mm, "<u2").reshape(shape).astype(np.float32) / np.float32(MM_PER_M)
     depth_m[depth_m == 0.0] = np.nan
     pin = Intrinsics(sent.width_px, sent.height_px, sent.fx_px, sent.fy_px, sent.cx_px, sent.cy_px)
     rgb = np.frombuffer(sent.rgb, np.uint8).reshape(*shape, 3)

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from machine.optics import Intrinsics
-from training.detection.labels import ROW, Labelled, elongation, seen_along
+from machine.geometry.optics import Intrinsics
+from training.pictures.labels import ROW, Labelled, elongation, seen_along
 
 
 def strip(shape, centre, angle, length, width):

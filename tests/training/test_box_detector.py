@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 import torch
-from drawn_logs import picture
 from rich.console import Console
 
 from autonomy.networks.graph import parameter_count
 from autonomy.networks.torch_net import random_net
-from autonomy.networks.weights import WeightsRefused, save
-from autonomy.perception.papers.box_detector import SIZE_PX, BoxDetector, box_net, decoded
+from autonomy.networks.weights import WeightsError, save
+from autonomy.perception.papers.box_detector import SIZE_PX, BoxDetector, box_net, decode_boxes
+from tests.training.drawn_logs import picture
+from training.common.loop import Schedule
 from training.detection import boxes
 from training.detection.boxes import run, targets
-from training.common.loop import Schedule
 
 LOGS = (((60.0, 70.0), 0.4, 80, 14), ((140.0, 120.0), 1.2, 100, 16))
 
@@ -26,7 +26,7 @@ def perfect(maps):
 
 def test_boxes_of_perfect_maps_are_those_of_the_logs():
     sample = picture(*LOGS, size=208)
-    found, scores = decoded(perfect(targets(sample)[0]))
+    found, scores = decode_boxes(perfect(targets(sample)[0]))
     assert len(found) == 2 and (scores > 0.9).all()
     for number in (1, 2):
         v, u = np.nonzero(sample.ids == number)
@@ -38,15 +38,15 @@ def test_a_second_box_upon_the_first_is_dropped_and_a_neighbour_is_kept():
     maps = np.full((5, 30, 30), -9.0, np.float32)
     for x, score in ((10, 3.0), (12, 2.0), (20, 1.0)):
         maps[:, 10, x] = (score, *np.log([6.0, 3.0, 6.0, 3.0]))
-    found, scores = decoded(maps)
+    found, scores = decode_boxes(maps)
     assert len(found) == 3  # two steps of 8 px aside: overlap 0.71
     maps[1:, 10, 12] = np.log([7.0, 3.0, 5.0, 3.0])  # now the same box
-    found, scores = decoded(maps)
+    found, scores = decode_boxes(maps)
     assert len(found) == 2 and scores[0] > scores[1]
 
 
 def test_nothing_is_found_in_nothing():
-    found, scores = decoded(np.full((5, 10, 10), -9.0, np.float32))
+    found, scores = decode_boxes(np.full((5, 10, 10), -9.0, np.float32))
     assert found.shape == (0, 4) and scores.shape == (0,)
 
 
@@ -58,7 +58,7 @@ def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
         finder.detect(np.zeros((304, 304, 3), np.uint8))
     found, _ = finder.detect(np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8))
     assert found.shape[1] == 4
-    with pytest.raises(WeightsRefused):
+    with pytest.raises(WeightsError):
         BoxDetector(tmp_path / "none.safetensors")
     assert parameter_count(box_net()) < 500_000
 

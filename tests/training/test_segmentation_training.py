@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from drawn_logs import perfect_maps, picture
 from rich.console import Console
 
 from autonomy.networks.graph import parameter_count
-from autonomy.perception.network import CHANNELS, MAPS, OFFSET_PX, STRIDE, channels, unet
+from autonomy.perception.segmentation.network import CHANNELS, MAPS, OFFSET_PX, STRIDE, channels, unet
+from tests.training.drawn_logs import perfect_maps, picture
+from training.common.loop import Schedule
 from training.detection import segmentation
-from training.detection.labels import IGNORED
 from training.detection.segmentation import batches, changed, loss, recoloured, run, targets
-from training.loop import Schedule
+from training.pictures.labels import IGNORED
 
 LOGS = (((90.0, 100.0), 0.4, 120, 14), ((140.0, 120.0), 1.2, 100, 16))
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drawn_logs import picture, strip
 
-from training.detection.labels import (
+from tests.training.drawn_logs import picture, strip
+from training.pictures.labels import (
     ANGLE,
     CENTRE_U,
     ELONGATION,

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from autonomy.networks.graph import BatchNorm, Conv, Network, Relu
 from autonomy.networks.torch_net import TorchNet, random_net
-from training.loop import Schedule, train
+from training.common.loop import Schedule, train
 
 SMALL = Network("small", 1, (Conv("a", 4, 3), BatchNorm("n"), Relu("r"), Conv("y", 1, 1)), ("y",))
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from training.detection.coco import _unpacked, labelled, load
-from training.detection.labels import IGNORED
-from training.grasp.cornell import DataRefused
+from training.common.dataset_error import DatasetError
+from training.pictures.coco import _unpacked, labelled, load
+from training.pictures.labels import IGNORED
 
 POLYGON = [[10, 10, 70, 10, 70, 20, 10, 20]]
 
@@ -81,17 +81,17 @@ def test_polygons_and_runs_become_logs(tmp_path):
 )
 def test_a_broken_annotation_is_named(tmp_path, broken):
     (picture,) = load(data_set(tmp_path, [broken]), tmp_path)
-    with pytest.raises(DataRefused, match=r"annotation 0 of a\.png"):
+    with pytest.raises(DatasetError, match=r"annotation 0 of a\.png"):
         labelled(picture, 160)
 
 
 def test_a_file_that_is_none_is_refused(tmp_path):
-    with pytest.raises(DataRefused, match="cannot be read"):
+    with pytest.raises(DatasetError, match="cannot be read"):
         load(tmp_path / "none.json", tmp_path)
     (tmp_path / "x.json").write_text('{"images": 3}')
-    with pytest.raises(DataRefused, match="no COCO file"):
+    with pytest.raises(DatasetError, match="no COCO file"):
         load(tmp_path / "x.json", tmp_path)
     path = data_set(tmp_path, [])
     (tmp_path / "a.png").unlink()
-    with pytest.raises(DataRefused, match="cannot be read as a picture"):
+    with pytest.raises(DatasetError, match="cannot be read as a picture"):
         labelled(load(path, tmp_path)[0], 160)

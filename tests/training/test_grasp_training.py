@@ -18,8 +18,8 @@ from rich.console import Console
 from autonomy.grasp.network import PAPER, GraspMaps, heads_first
 from autonomy.networks.graph import parameter_shapes
 from autonomy.networks.torch_net import random_net
-from training.grasp import network_training
 from training.common.dataset_error import DatasetError
+from training.grasp import network_training
 from training.grasp.cornell import Sample, grouped_folds, load, paper_folds, rectangles
 from training.grasp.rectangles import Rectangle, angle_between, from_corners, iou, right, wrapped
 from training.grasp.views import View, centre, cut, drawn, label_maps, seen

@@ -1,0 +1,206 @@
+"""Settled piles, the pictures drawn of them, and the shards they are kept in."""
+
+import math
+import random
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from autonomy.networks.torch_net import random_net
+from autonomy.networks.weights import WeightsError, load, save
+from autonomy.perception.papers.box_detector import BoxDetector
+from autonomy.perception.segmentation.ground_plane import height_over_plane
+from autonomy.perception.segmentation.log_segmenter import LogSegmenter
+from autonomy.perception.segmentation.network import unet
+from autonomy.perception.segmentation.segment_merging import judges as judges_in
+from machine.geometry.optics import pinhole
+from sim.camera.geometry import look_at
+from sim.camera.scene import LogPose
+from training.detection import detector_weights, scorer_weights
+from training.pictures import drawing, piles, shards
+from training.pictures.drawing import MOST_LOGS, draw, labelled
+from training.pictures.labels import ANGLE, CENTRE_U, CENTRE_V, ID, IGNORED
+from training.pictures.piles import HELD_OUT, chunk, profile_of, settle
+from training.pictures.props import Steel
+from training.pictures.shards import pictures, shard
+
+
+@pytest.fixture(scope="module")
+def pile():
+    return settle("palms_471", 5)  # crossed, four logs
+
+
+@pytest.fixture
+def few(monkeypatch, tmp_path):
+    monkeypatch.setattr(piles, "CHUNK", 2)
+    monkeypatch.setattr(shards, "SHARD", 2)
+    monkeypatch.setattr(shards, "REUSE_PILES", 1)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path
+
+
+def test_a_pile_rests_on_its_ground_and_repeats(pile):
+    assert settle("palms_471", 5) == pile
+    assert settle("palms_471", 6) != pile
+    low = min(log.spine(8)[0][:, 2].min() - log.diameter_m / 2 for log in pile.logs)
+    assert pile.datum_m - 0.03 < low < pile.datum_m + 0.1
+
+
+def test_piles_are_kept_whole(few):
+    first = chunk("palms_471", 0)
+    (file,) = (few / "timberhand" / "piles").iterdir()
+    assert chunk("palms_471", 0) == first and len(first) == 2
+    assert [p.number for p in chunk("palms_471", 3)] == [6, 7]
+    file.write_bytes(file.read_bytes()[:300])
+    with pytest.raises(ValueError, match="delete it"):
+        chunk("palms_471", 0)
+
+
+def test_a_picture_and_its_truth_agree_and_repeat(pile):
+    one = draw(pile, 3, 152)
+    two = draw(pile, 3, 152)
+    assert np.array_equal(one.rgb, two.rgb) and np.array_equal(one.depth_m, two.depth_m, equal_nan=True)
+    assert not np.array_equal(one.rgb, draw(pile, 4, 152).rgb)
+    assert set(np.unique(one.ids)) - {0, IGNORED} == set(one.logs[:, ID].astype(int))
+    assert one.logs.shape[0] > 0
+    for log in one.logs:
+        v, u = np.nonzero(one.ids == log[ID])
+        assert u.min() <= log[CENTRE_U] <= u.max() and v.min() <= log[CENTRE_V] <= v.max()
+
+
+def test_a_held_log_is_between_the_tongs():
+    log = LogPose(1, (3.0, 1.0, 1.5), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)), 2.5, 0.2)  # along +x
+    steel = Steel(random.Random(2))
+    steel.holding(profile_of("palms_471"), log)
+    boxes = steel.build()
+    corners = np.stack(np.meshgrid(*[(-1, 1)] * 3), axis=-1).reshape(-1, 3)
+    points = np.einsum("nij,nkj->nki", boxes.axes, corners * boxes.half_m[:, None]) + boxes.centre_m[:, None]
+    points = points.reshape(-1, 3)
+    assert points[:, 2].min() < 1.5 - 0.08 and points[:, 2].max() > 2.0
+    beside = points[np.abs(points[:, 2] - 1.5) < 0.15]
+    assert beside[:, 1].min() < 0.9 and beside[:, 1].max() > 1.1 and np.ptp(points[:, 0]) < 1.0
+
+
+def test_a_plain_sky_is_of_one_colour(pile, monkeypatch):
+    monkeypatch.setattr(drawing, "PLAIN_SHARE", 1.0)
+    monkeypatch.setattr(drawing, "_lens", lambda rgb, rng: rgb)
+    monkeypatch.setattr(drawing, "_noisy", lambda machine, camera, picture, pin, rng: picture.depth_m)  # no holes
+    seen = 0
+    for seed in range(12):
+        sample = draw(pile, seed, 96)
+        sky = np.isnan(sample.depth_m[0])
+        if sky.all():
+            seen += 1
+            assert len(np.unique(sample.rgb[0], axis=0)) == 1
+    assert seen
+
+
+def test_angle_centre_and_ends_are_those_of_the_projected_log():
+    view = look_at((0.0, -4.0, 3.0), (0.0, 0.0, 0.0), pinhole(200, 160, 1.2))
+    s = math.sqrt(0.5)
+    log = LogPose(1, (0.0, 0.0, 0.1), (0.0, s, 0.0, s), 2.5, 0.2)  # along +x: level in the picture
+    ends = view.intrinsics.project(view.to_optical(log.spine(1)[0]))
+    mask = np.zeros((160, 200), np.int16)
+    v, u = np.mgrid[:160, :200]
+    mask[(np.abs(v - ends[:, 1].mean()) < 5) & (u > ends[:, 0].min()) & (u < ends[:, 0].max() - 30)] = 1
+    _, (row,) = labelled(mask, view, (log,))
+    assert math.remainder(float(row[ANGLE]), math.pi) == pytest.approx(0.0, abs=0.01)
+    assert row[CENTRE_U] == pytest.approx(ends[:, 0].mean() - 15, abs=1.0)
+    assert row[3:7] == pytest.approx(ends.ravel(), abs=0.01)
+    hidden = int(np.argmax(ends[:, 0]))  # something lies over the last 30 pixels of that end
+    assert row[7 + hidden] == 0.0 and row[7 + 1 - hidden] == 1.0
+
+
+def test_logs_of_which_little_shows_are_ignored():
+    view = look_at((0.0, -4.0, 3.0), (0.0, 0.0, 0.0), pinhole(200, 160, 1.2))
+    mask = np.zeros((160, 200), np.int16)
+    mask[80, 100:105] = 1
+    ids, rows = labelled(mask, view, (LogPose(1, (0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0), 2.5, 0.2),))
+    assert (ids[mask == 1] == IGNORED).all() and len(rows) == 0
+
+
+def test_shards_are_drawn_once_and_read_back(few, monkeypatch):
+    drawn = []
+    real = drawing.draw
+    monkeypatch.setattr(shards, "draw", lambda *a: drawn.append(a[1]) or real(*a))
+    own = pictures(few, 96)
+    again = [own(1), own(3)]  # of shards 0 and 1
+    assert drawn == [0, 1, 2, 3]
+    for index, sample in ((1, again[0]), (3, again[1])):
+        assert sample.rgb.shape == (96, 96, 3) and sample.logs.shape[0] <= MOST_LOGS
+        assert np.isfinite(sample.depth_m).any() and np.isnan(sample.depth_m).any()
+        assert np.array_equal(pictures(few, 96)(index).ids, sample.ids)
+        height = height_over_plane(sample.depth_m, sample.intrinsics)
+        assert np.allclose(sample.height_m, height, atol=0.03, equal_nan=True)  # a millimetre of depth turns the plane
+    assert len(drawn) == 4
+    assert not list(few.glob("*.part*"))
+
+
+def test_pictures_kept_apart_show_piles_that_are_kept_apart(few):
+    shard(few, HELD_OUT, 96)
+    kept = {p.name.split("-")[1] for p in (few / "timberhand" / "piles").iterdir()}
+    assert kept == {f"{HELD_OUT:07d}"}
+
+
+def test_a_damaged_shard_is_named(few):
+    shard(few, 0, 96)
+    (folder,) = few.glob("logs-*")
+    (folder / "ids.npy").write_bytes(b"")
+    with pytest.raises(ValueError, match="delete it"):
+        shard(few, 0, 96)
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_weights_come_with_a_card_and_find_logs_by_themselves(few, monkeypatch):
+    monkeypatch.setattr(detector_weights, "BATCH", 2)
+    monkeypatch.setattr(detector_weights, "JUDGED", 2)
+    out = few / "logs_depth.safetensors"
+    card = detector_weights.produce("depth", detector_weights.Plan(2, 2, 1), few, out, Console(quiet=True))
+    assert "mAP@0.5" in card.read_text() and "timberhand train segmentation --variant depth" in card.read_text()
+    assert LogSegmenter("depth", out).facts["seed"] == "1"
+    boxes = few / "log_boxes.safetensors"
+    detector_weights.produce_boxes(detector_weights.Plan(2, 2, 1, large=2), few, boxes, Console(quiet=True))
+    assert BoxDetector(boxes).facts["command"].startswith("timberhand train detector --pictures 2 --large 2")
+    on = detector_weights.Plan(2, 1, 1, 1e-6, out)
+    text = detector_weights.produce("depth", on, few, few / "on.safetensors", Console(quiet=True)).read_text()
+    assert "begun with logs_depth.safetensors" in text
+    before, after = (
+        load(few / f"{name}.safetensors", unet("depth"))[0]["maps.weight"] for name in ("logs_depth", "on")
+    )
+    assert np.abs(before - after).max() < 1e-4
+
+
+def test_the_depth_variant_begins_with_what_colour_and_depth_were_looked_at_with(tmp_path):
+    """Its first layer has the depth's part of the other's; other networks than these are refused as they were."""
+    both, alone = tmp_path / "logs_rgbd.safetensors", tmp_path / "logs_depth.safetensors"
+    arrays = random_net(unet("rgbd"), 1).arrays()
+    save(both, unet("rgbd"), arrays, {})
+    taken = detector_weights.begun(both, "depth")
+    assert np.array_equal(taken["in2.weight"], arrays["in2.weight"][:, 3:])
+    assert all(np.array_equal(taken[k], arrays[k]) for k in arrays if k != "in2.weight")
+    save(alone, unet("depth"), taken, {})
+    assert np.array_equal(detector_weights.begun(alone, "depth")["in2.weight"], taken["in2.weight"])
+    with pytest.raises(WeightsError, match="logs_rgbd"):
+        detector_weights.begun(alone, "rgbd")
+
+
+def test_small_and_large_pictures_come_in_turn(few):
+    source = detector_weights.mixed(pictures(few), detector_weights.Plan(2, 1, 1, large=2), few, Console(quiet=True))
+    assert [source(i).ids.shape[0] for i in range(4)] == [304, 608, 304, 608]
+    assert np.array_equal(source(1).ids, source(5).ids) and not np.array_equal(source(1).ids, source(3).ids)
+    assert "--pictures 2 --large 2 --steps 1" in detector_weights.Plan(2, 1, 1, large=2).command(
+        "segmentation", few / "x"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.computed
+def test_judges_come_with_their_cards(few, monkeypatch):
+    monkeypatch.setattr(scorer_weights, "STEPS", 40)
+    monkeypatch.setattr(scorer_weights, "SIZE_PX", 304)
+    card = scorer_weights.produce(4, 1, few, few / "judges", None, Console(quiet=True))
+    assert "timberhand train judges --pictures 4 --seed 1" in card.read_text()
+    told = judges_in(few / "judges").joins.chance(np.zeros((3, 19), np.float32))
+    assert told.shape == (3,) and (told > 0.0).all() and (told < 1.0).all()
