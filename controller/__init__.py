@@ -1,1 +1,1 @@
-"""The hard-timed controller process: 200 Hz, one thread, pure `step`, thin `loop`."""
+"""The hard-timed controller process: a pure `controller.step.step` at 200 Hz inside a thin loop (`process`)."""

@@ -1,11 +1,11 @@
-"""Modes, events and reactions: what the machine may do now, and why not.
+"""The supervisor: modes, events and reactions.
 
-The transitions are data (`TRANSITIONS`); everything else only decides which event there is.  Inputs of a
-tick: the received values, what the tick measured of itself, accepted setpoints and operator
-actions.  Outputs: ``mode``, ``reason`` with ``detail``, and ``half_speed``.  Nothing starts by itself: ARMED
-is entered by the operator's ARM alone, a latched FAULT needs RESET and then ARM.  STOP begins with a ramp
-(``ramp_ns`` long, and as long as a carrier needs to stand) while the machine moves; in every other mode but ACTIVE
-the valves are neutral.  The supervisor never clips: it refuses, slows or stops.
+Inputs of a tick: received values, the loop's own lateness, accepted setpoints and operator actions.  Outputs:
+``mode``, ``reason`` with ``detail``, and ``half_speed``.  The transitions are data (`TRANSITIONS`); everything else
+only decides which event occurs.  Nothing starts by itself: only the operator's ARM enters ARMED, and a latched FAULT
+needs RESET and then ARM.  STOP begins with a ramp while the machine moves (``ramp_ns``, and as long as a carrier needs
+to stand); the valves are neutral in every other mode but ACTIVE.  The supervisor never clips: it refuses, slows or
+stops.
 """
 
 from __future__ import annotations
@@ -13,34 +13,34 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any, Final
 
-from controller.bus_watch import BusWatch
-from controller.carrier.bus import MachineBus
-from controller.carrier.inputs import MachineReceived
-from controller.estimator import JointEstimator
-from controller.inputs import Received
-from controller.startup import Startup
-from machine.faults import FAULTS
+from controller.bus_io.bus_monitor import BusMonitor
+from controller.carrier.bus import CarrierBus
+from controller.carrier.inputs import CarrierInputs
+from controller.crane.inputs import CraneInputs
+from controller.crane.startup import Startup
+from controller.estimation.joint_estimator import JointEstimator
 from machine.joints import JOINTS
-from machine.modes import Mode
 from machine.profile import Profile, encoders, joint
-from machine.reasons import Reaction, Reason
+from machine.status.faults import FAULTS
+from machine.status.modes import Mode
+from machine.status.reasons import Reaction, Reason
 
 
 class Event(IntEnum):
-    """What can happen to a mode."""
+    """Events that may change the mode."""
 
     BOOTED = 0
     """All encoders are set up."""
     ARM = 1
-    """The operator armed and nothing speaks against it."""
+    """The operator armed, and nothing prevents it."""
     DISARM = 2
     RESET = 3
     SETPOINT = 4
     """A setpoint was accepted."""
     DONE = 5
-    """A final setpoint was reached and its lease is over."""
+    """A final setpoint was reached, and its lease is over."""
     HOLD = 6
-    """Reaction H, and the operator's stop."""
+    """Reaction H, or the operator's stop."""
     RAMP = 7
     """Reaction R1."""
     CUT = 8
@@ -73,19 +73,20 @@ TRANSITIONS: Final[dict[tuple[Mode, Event], Mode]] = {
     (Mode.STOP, Event.LATCHED): Mode.FAULT,
     (Mode.FAULT, Event.RESET): Mode.BOOT,
 }
-"""Mode after an event; a pair that is not here changes nothing."""
+"""Mode after an event; a pair that is not listed changes nothing."""
 
 OPERATING: Final = (Mode.ARMED, Mode.ACTIVE)
-"""Modes in which the machine may be asked to move."""
+"""Modes in which setpoints are accepted."""
 _WAITING: Final = (Mode.BOOT, Mode.STANDBY)
 RAMP_NS: Final = 60_000_000
-"""Ramp of an R1: with the slowest detection before it (20 ms) neutral well within 100 ms of the loss."""
-RANGE_MARGIN: Final = 0.05
-"""How far past the profile's range [rad, m] a joint may be found before it counts as outside."""
-ECHO_TICKS: Final = 4
+"""Ramp of an R1: with the slowest detection before it (20 ms), neutral well within 100 ms of the loss."""
+RANGE_MARGIN_UNITS: Final = 0.05
+"""How far beyond the profile's range [rad, m] a joint may be before it counts as outside."""
+MAX_ECHO_TICKS: Final = 4
+"""The valve node's echo may stay the same for this many ticks."""
 DEGRADE_NS: Final = 1_000_000_000
 LATE_PERIODS: Final = 2
-LATE_CYCLES: Final = 3
+LATE_LIMIT_COUNT: Final = 3
 LATE_WINDOW_NS: Final = 1_000_000_000
 STALLED_NS: Final = 50_000_000
 _RELEASED, _PRESSED = 1, 0
@@ -96,11 +97,12 @@ _ALARM_SIGNALS: Final = {"rotary": "Alarms", "linear": "SystemReg"}
 
 
 class Supervisor:
-    """The mode and its reason; `judge` once per tick, the events as they come."""
+    """The mode and its reason; `supervise` once per tick, events as they occur."""
 
     __slots__ = (
         "_alarms",
         "_axes",
+        "_bus_monitors",
         "_degraded_until_ns",
         "_echo",
         "_echo_ticks",
@@ -109,18 +111,17 @@ class Supervisor:
         "_slow_end_ns",
         "_startup",
         "_stop_ramp_ns",
-        "_watches",
+        "carrier_inputs",
         "coast_ns",
+        "crane_inputs",
         "detail",
         "half_speed",
         "latching",
         "late",
-        "machine",
         "mode",
         "ramp_end_ns",
         "ramp_ns",
         "reason",
-        "received",
         "worst",
         "worst_detail",
     )  # fmt: skip
@@ -128,24 +129,24 @@ class Supervisor:
     def __init__(
         self,
         profile: Profile,
-        received: Received,
-        crane_watch: BusWatch,
-        machine_bus: MachineBus | None,
+        inputs: CraneInputs,
+        crane_monitor: BusMonitor,
+        carrier_bus: CarrierBus | None,
         estimators: list[JointEstimator],
         startup: Startup,
     ) -> None:
-        self.received = received
-        self.machine = machine_bus.received if machine_bus is not None else None
-        self._watches = (crane_watch,) if machine_bus is None else (crane_watch, machine_bus.watch)
+        self.crane_inputs = inputs
+        self.carrier_inputs = carrier_bus.inputs if carrier_bus is not None else None
+        self._bus_monitors = (crane_monitor,) if carrier_bus is None else (crane_monitor, carrier_bus.monitor)
         self._startup = startup
-        sensed = [*received.encoders, received.articulation]
+        sensed = [*inputs.encoders, inputs.articulation]
         self._alarms = tuple(
-            (place, slot, slot.codec.index[_ALARM_SIGNALS[spec.kind]])
+            (place, state, state.codec.index[_ALARM_SIGNALS[spec.kind]])
             for place, spec in encoders(profile).items()
-            if (slot := sensed[place]) is not None
+            if (state := sensed[place]) is not None
         )
         self._axes = tuple(
-            (int(j), estimators[j], spec.lower - RANGE_MARGIN, spec.upper + RANGE_MARGIN)
+            (int(j), estimators[j], spec.lower - RANGE_MARGIN_UNITS, spec.upper + RANGE_MARGIN_UNITS)
             for j in JOINTS
             if (spec := joint(profile, j)).encoder is not None
         )
@@ -156,13 +157,13 @@ class Supervisor:
         self.half_speed = False
         self.ramp_ns = self.ramp_end_ns = self._slow_end_ns = 0
         self.coast_ns = 0
-        """How long a carrier that drives would take to stand, if it were to stop now."""
+        """How long a driving carrier would take to stand if it stopped now."""
         self.latching = False
-        """The STOP that runs is an R1: FAULT follows its ramp."""
+        """The present STOP is an R1: FAULT follows its ramp."""
         self.worst = Reason.NONE
         self.worst_detail = 0
         self._degraded_until_ns = 0
-        self._late_stamps = [-LATE_WINDOW_NS] * LATE_CYCLES
+        self._late_stamps = [-LATE_WINDOW_NS] * LATE_LIMIT_COUNT
         self.late = 0
         """Ticks that began more than `LATE_PERIODS` late."""
         self._echo: Any = None
@@ -171,7 +172,7 @@ class Supervisor:
 
     @property
     def armed(self) -> bool:
-        """Whether needed inputs are watched: ARMED, ACTIVE and while a stop's ramp runs."""
+        """Whether needed inputs are checked: in ARMED, in ACTIVE and during a stop's ramp."""
         return self.mode in OPERATING or self.ramping
 
     @property
@@ -180,7 +181,7 @@ class Supervisor:
         return self.mode is Mode.STOP and self.ramp_ns > 0
 
     def apply(self, event: Event, reason: Reason, detail: int, now_ns: int) -> bool:
-        """Moves by the table; True when the mode changed.  ``reason`` is kept as the cause."""
+        """Change the mode by the table; True when it changed.  ``reason`` is kept as the cause."""
         before = self.mode
         after = TRANSITIONS.get((before, event), before)
         if after is before or (self.latching and event is Event.RAMP):
@@ -195,43 +196,43 @@ class Supervisor:
                 self._slow_end_ns = max(self.ramp_end_ns, now_ns + self.coast_ns)
         return True
 
-    def ask_arm(self, now_ns: int) -> tuple[Reason, int]:
-        """The operator's ARM: NONE when the machine is armed now (or was), else why not."""
+    def request_arm(self, now_ns: int) -> tuple[Reason, int]:
+        """The operator's ARM: NONE when the machine is armed now, else the reason why not."""
         if self.mode in OPERATING:
             return Reason.NONE, 0
         if self.mode is Mode.FAULT:
             return Reason.FAULT_LATCHED, 0
         if self.ramping:
             return Reason.STILL_STOPPING, 0
-        blocker = self.blocker(now_ns)
+        blocker = self.arming_blocker(now_ns)
         if blocker[0] is Reason.NONE:
             self._echo_ticks = 0
             self.apply(Event.ARM, Reason.NONE, 0, now_ns)
         return blocker
 
-    def ask_reset(self, now_ns: int) -> None:
+    def request_reset(self, now_ns: int) -> None:
         """The operator's RESET, by datagram or by the button on the safety module."""
         if not self.ramping:
             self.apply(Event.RESET, Reason.NONE, 0, now_ns)
-            self._startup.reset(lambda node: self.received.nodes.operational(node, now_ns))
-            if self.machine is not None and self.machine.address.lost:
-                self.machine.address.again()
+            self._startup.reset(lambda node: self.crane_inputs.nodes.operational(node, now_ns))
+            if self.carrier_inputs is not None and self.carrier_inputs.address.lost:
+                self.carrier_inputs.address.restart()
 
-    def ask_disarm(self, now_ns: int) -> None:
+    def request_disarm(self, now_ns: int) -> None:
         """The operator's DISARM."""
         if not self.ramping:
             self.apply(Event.DISARM, Reason.OPERATOR_DISARM, 0, now_ns)
 
-    def blocker(self, now_ns: int) -> tuple[Reason, int]:
-        """What speaks against arming now."""
-        received = self.received
+    def arming_blocker(self, now_ns: int) -> tuple[Reason, int]:
+        """What prevents arming now."""
+        received = self.crane_inputs
         if not self._startup.complete:
             return self._startup.problem()
         estop = received.estop
         if estop.values is not None and not self._estop_released():
             return Reason.ESTOP_NOT_RELEASED, 0
-        machine = self.machine
-        if any(slot.values is None for slot in received.needed) or (machine is not None and machine.stale_mask):
+        carrier = self.carrier_inputs
+        if any(state.values is None for state in received.needed) or (carrier is not None and carrier.stale_mask):
             return Reason.INPUT_MISSING, 0
         if received.guard.get("Enable") != _ENABLED:
             return Reason.GUARD_NOT_READY, 0
@@ -240,39 +241,39 @@ class Supervisor:
         absent = received.nodes.not_ready(now_ns)
         if absent:
             return Reason.NODE_NOT_OPERATIONAL, absent
-        for watch in self._watches:
-            if not watch.fit(now_ns):
-                return Reason.BUS_UNSTABLE, watch.number
+        for monitor in self._bus_monitors:
+            if not monitor.usable(now_ns):
+                return Reason.BUS_UNSTABLE, monitor.number
         self.worst, self.worst_detail = Reason.NONE, 0
-        self._judge_inputs()
-        self._find(*received.nodes.finding(now_ns))
-        if machine is not None:
-            self._judge_machine(machine)
+        self._check_values()
+        self._collect(*received.nodes.worst_finding(now_ns))
+        if carrier is not None:
+            self._check_carrier(carrier)
         reacts = FAULTS[self.worst].reaction >= Reaction.HOLD
         return (self.worst, self.worst_detail) if reacts else (Reason.NONE, 0)
 
-    def judge(self, late_ns: int, period_ns: int, now_ns: int) -> None:
-        """Looks at everything once, then applies the worst finding."""
-        machine = self.machine
+    def supervise(self, late_ns: int, period_ns: int, now_ns: int) -> None:
+        """Check everything once, then react to the worst finding."""
+        carrier = self.carrier_inputs
         self.worst, self.worst_detail = Reason.NONE, 0
-        for watch in self._watches:
-            if watch.reason:
-                self._find(watch.reason, watch.number)
-        if self.received.foreign:
-            self._find(Reason.FOREIGN_CONTROLLER, 0)
-        if machine is not None and machine.foreign:
-            self._find(Reason.FOREIGN_CONTROLLER, 1)
-        self._judge_estop()
+        for monitor in self._bus_monitors:
+            if monitor.reason:
+                self._collect(monitor.reason, monitor.number)
+        if self.crane_inputs.foreign:
+            self._collect(Reason.FOREIGN_CONTROLLER, 0)
+        if carrier is not None and carrier.foreign:
+            self._collect(Reason.FOREIGN_CONTROLLER, 1)
+        self._check_estop()
         if self.armed:
-            if self.received.stale_mask:
-                self._judge_stale()
-            self._judge_inputs()
-            self._find(*self.received.nodes.finding(now_ns))
-            self._judge_echo()
-            if machine is not None:
-                self._judge_machine(machine)
-        self._judge_loop(late_ns, period_ns, now_ns)
-        self.react(now_ns)
+            if self.crane_inputs.stale_mask:
+                self._check_stale()
+            self._check_values()
+            self._collect(*self.crane_inputs.nodes.worst_finding(now_ns))
+            self._check_echo()
+            if carrier is not None:
+                self._check_carrier(carrier)
+        self._check_lateness(late_ns, period_ns, now_ns)
+        self._react(now_ns)
         if self.mode is Mode.BOOT and self._startup.complete:
             self.apply(Event.BOOTED, Reason.NONE, 0, now_ns)
         if self.ramping and now_ns >= (self._slow_end_ns if self.coast_ns else self.ramp_end_ns):
@@ -280,14 +281,14 @@ class Supervisor:
             if self.latching:
                 self.apply(Event.LATCHED, self.reason, self.detail, now_ns)
         if self.mode in _WAITING:
-            self.reason, self.detail = self.blocker(now_ns)
+            self.reason, self.detail = self.arming_blocker(now_ns)
             if self.reason is Reason.NONE:
-                self.reason = self._note()
+                self.reason = self._advisory()
         elif self.mode in OPERATING and not self.half_speed:
-            self.reason, self.detail = self._note(), 0
+            self.reason, self.detail = self._advisory(), 0
 
-    def react(self, now_ns: int) -> None:
-        """Applies ``worst``: an event, or half speed for a while."""
+    def _react(self, now_ns: int) -> None:
+        """React to ``worst``: an event, or half speed for a while."""
         if self.worst:
             fault = FAULTS[self.worst]
             if fault.reaction >= Reaction.HOLD and (self.armed or fault.always):
@@ -299,108 +300,109 @@ class Supervisor:
                     self.reason, self.detail = self.worst, self.worst_detail
         self.half_speed = now_ns < self._degraded_until_ns
 
-    def find(self, reason: Reason, detail: int, now_ns: int) -> None:
-        """Reports a finding of the tick's later rooms (lease, refusals, motion) and reacts to it."""
+    def react_to(self, reason: Reason, detail: int, now_ns: int) -> None:
+        """React at once to a finding from outside (lease, refusals, spool test, motion, carrier)."""
         self.worst, self.worst_detail = reason, detail
-        self.react(now_ns)
+        self._react(now_ns)
 
-    def reset_edge(self) -> bool:
+    def reset_button_pressed(self) -> bool:
         """Whether the reset button of the safety module went down in this tick."""
-        pressed = self.received.estop.get("ResetReq")
+        pressed = self.crane_inputs.estop.get("ResetReq")
         if pressed is None:
             return False
         before, self._reset_pressed = self._reset_pressed, pressed == _YES
         return self._reset_pressed and not before
 
-    def _find(self, reason: Reason, detail: int = 0) -> None:
+    def _collect(self, reason: Reason, detail: int = 0) -> None:
+        """Keep a finding as ``worst`` when its reaction is harder than that of the present one."""
         if reason and FAULTS[reason].reaction > FAULTS[self.worst].reaction:
             self.worst, self.worst_detail = reason, detail
 
-    def _judge_loop(self, late_ns: int, period_ns: int, now_ns: int) -> None:
-        """A cycle beyond two periods slows the machine; three within a second, or one beyond 50 ms, stop it."""
+    def _check_lateness(self, late_ns: int, period_ns: int, now_ns: int) -> None:
+        """A tick later than two periods slows the machine; three within a second, or one beyond 50 ms, stop it."""
         if late_ns <= LATE_PERIODS * period_ns:
             return
         stamps = self._late_stamps
-        stamps[self.late % LATE_CYCLES] = now_ns
+        stamps[self.late % LATE_LIMIT_COUNT] = now_ns
         self.late += 1
         stalled = late_ns > STALLED_NS or now_ns - min(stamps) < LATE_WINDOW_NS
-        self._find(Reason.LOOP_STALLED if stalled else Reason.LOOP_LATE)
+        self._collect(Reason.LOOP_STALLED if stalled else Reason.LOOP_LATE)
 
     def _estop_released(self) -> bool:
-        estop = self.received.estop
+        estop = self.crane_inputs.estop
         return bool(estop.get("ChannelA") == _RELEASED and estop.get("ChannelB") == _RELEASED)
 
-    def _judge_estop(self) -> None:
-        estop = self.received.estop
+    def _check_estop(self) -> None:
+        estop = self.crane_inputs.estop
         if estop.values is None or self._estop_released():
             return
         channels = (estop.get("ChannelA"), estop.get("ChannelB"))
         known = all(channel in (_RELEASED, _PRESSED) for channel in channels)
-        self._find(Reason.ESTOP_PRESSED if known else Reason.ESTOP_CHANNELS)
+        self._collect(Reason.ESTOP_PRESSED if known else Reason.ESTOP_CHANNELS)
 
-    def _judge_stale(self) -> None:
-        received = self.received
+    def _check_stale(self) -> None:
+        received = self.crane_inputs
         if received.estop.values is None:
-            self._find(Reason.ESTOP_LOST)
+            self._collect(Reason.ESTOP_LOST)
         if received.guard.values is None:
-            self._find(Reason.GUARD_LOST)
+            self._collect(Reason.GUARD_LOST)
         if received.plc.values is None:
-            self._find(Reason.PLC_LOST)
+            self._collect(Reason.PLC_LOST)
         if received.valve_a.values is None or received.valve_b.values is None:
-            self._find(Reason.VALVE_FEEDBACK_LOST)
+            self._collect(Reason.VALVE_FEEDBACK_LOST)
         for place, encoder, _ in self._alarms:
             if encoder.values is None:
-                self._find(Reason.ENCODER_LOST, place)
-        if any(slot.values is None for slot in received.pressures):
-            self._find(Reason.PRESSURE_LOST)
+                self._collect(Reason.ENCODER_LOST, place)
+        if any(state.values is None for state in received.pressures):
+            self._collect(Reason.PRESSURE_LOST)
         if received.grapple.values is None:
-            self._find(Reason.GRAPPLE_STATUS_LOST)
+            self._collect(Reason.GRAPPLE_STATUS_LOST)
 
-    def _judge_inputs(self) -> None:
-        """Values that are known and bad; a stale one is not judged here."""
-        received = self.received
+    def _check_values(self) -> None:
+        """Values that are known and bad; a stale value is not checked here."""
+        received = self.crane_inputs
         if received.guard.values is not None and received.guard.get("Enable") != _ENABLED:
-            self._find(Reason.GUARD_REFUSES)
+            self._collect(Reason.GUARD_REFUSES)
         if received.estop.get("Person") == _YES:
-            self._find(Reason.PERSON_IN_ZONE)
+            self._collect(Reason.PERSON_IN_ZONE)
         state = received.valve_a.get("State")
         if state == _VALVE_FAULT or (state == _VALVE_PILOT_OFF and self.mode is Mode.ACTIVE):
-            self._find(Reason.VALVE_NODE_FAULT)
+            self._collect(Reason.VALVE_NODE_FAULT)
         if received.plc.get("FaultBits"):
-            self._find(Reason.PLC_FAULT)
+            self._collect(Reason.PLC_FAULT)
         for place, encoder, alarm in self._alarms:
             values = encoder.values
             if values is not None and values[alarm]:
-                self._find(Reason.ENCODER_ALARM, place)
+                self._collect(Reason.ENCODER_ALARM, place)
         for j, estimator, lower, upper in self._axes:
             if estimator.jumped:
-                self._find(Reason.ENCODER_JUMP, j)
+                self._collect(Reason.ENCODER_JUMP, j)
             if estimator.known and not lower <= estimator.position <= upper:
-                self._find(Reason.POSITION_OUTSIDE, j)
+                self._collect(Reason.POSITION_OUTSIDE, j)
 
-    def _judge_machine(self, machine: MachineReceived) -> None:
-        """mach0: the carrier stands and is heard, while the crane works."""
-        if machine.stale_mask:
-            if machine.vehicle.values is None:
-                self._find(Reason.CARRIER_LOST)
-            if machine.arms_a.values is None or machine.arms_b.values is None:
-                self._find(Reason.SWING_ARMS_LOST)
-        if machine.address.lost:
-            self._find(Reason.ADDRESS_LOST)
+    def _check_carrier(self, carrier: CarrierInputs) -> None:
+        """The carrier's own frames arrive, and the controller owns its address on mach0."""
+        if carrier.stale_mask:
+            if carrier.vehicle.values is None:
+                self._collect(Reason.CARRIER_LOST)
+            if carrier.arms_a.values is None or carrier.arms_b.values is None:
+                self._collect(Reason.SWING_ARMS_LOST)
+        if carrier.address.lost:
+            self._collect(Reason.ADDRESS_LOST)
 
-    def _note(self) -> Reason:
-        """What is worth saying while nothing speaks against working."""
-        machine = self.machine
-        if machine is None:
+    def _advisory(self) -> Reason:
+        """A loss to report although the machine may work."""
+        carrier = self.carrier_inputs
+        if carrier is None:
             return Reason.NONE
-        if machine.position.get("Latitude") is None or machine.heading.get("Heading") is None:
+        if carrier.position.get("Latitude") is None or carrier.heading.get("Heading") is None:
             return Reason.GNSS_LOST
-        return Reason.ENGINE_LOST if machine.engine.values is None else Reason.NONE
+        return Reason.ENGINE_LOST if carrier.engine.values is None else Reason.NONE
 
-    def _judge_echo(self) -> None:
-        """The valve node repeats the counter of the last command it took; it must move."""
-        echo = self.received.valve_b.get("EchoCounter")
+    def _check_echo(self) -> None:
+        """The valve node echoes the counter of the last accepted command; it must change."""
+        echo = self.crane_inputs.valve_b.get("EchoCounter")
         self._echo_ticks = 0 if echo != self._echo else self._echo_ticks + 1
         self._echo = echo
-        if self._echo_ticks > ECHO_TICKS:
-            self._find(Reason.VALVE_ECHO_STUCK)
+        if self._echo_ticks > MAX_ECHO_TICKS:
+            self._collect(Reason.VALVE_ECHO_STUCK)

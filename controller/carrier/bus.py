@@ -1,55 +1,58 @@
-"""mach0 of a machine with a carrier, as one part of the controller: what it brings, what is said on it, how it is.
+"""mach0 of a machine with a carrier: its inputs, its monitor and the frames that are sent on it.
 
-On a machine that stands still there is none.  The carrier stands with its brake on until `controller.carrier.vehicle` puts a
-command of its laws in the place of ``STANDING``.
+A machine on a fixed base has none.  ``command`` is `STANDING` (brake on) until `controller.carrier.vehicle` replaces it
+by a command of its laws.
 """
 
 from __future__ import annotations
 
-from can_dbc.canopen import Wire
-from can_dbc.codec import Database, DbcError, load
-from can_dbc.frame import Frame
-from can_dbc.tick_record import BusReading
-from controller.bus_watch import BusWatch
-from controller.carrier.inputs import MachineReceived
-from controller.carrier.outputs import STANDING, MachineWriter
+from can_dbc.dbc.codec import Database, DbcError, load
+from can_dbc.frame import Frame, RawFrame
+from can_dbc.messages.tick_record import BusReading
+from controller.bus_io.bus_monitor import BusMonitor
+from controller.carrier.inputs import CarrierInputs
+from controller.carrier.outputs import STANDING, CarrierWriter
 from controller.config import ConfigError
-from machine.modes import Mode
-from machine.reasons import Reason
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
 
 
-class MachineBus:
-    """``received``, ``watch`` and ``command`` of mach0; raises ConfigError."""
+class CarrierBus:
+    """``inputs``, ``monitor`` and ``command`` of mach0."""
 
-    __slots__ = ("_writer", "command", "received", "watch")
+    __slots__ = ("_writer", "command", "inputs", "monitor")
 
     def __init__(self, databases: tuple[Database, Database] | None = None) -> None:
-        """``databases``, machine and gnss, are read when they are not given."""
+        """``databases`` (machine and gnss) are loaded when they are not given.
+
+        Raises:
+            ConfigError: a database cannot be loaded.
+        """
         try:
             machine, gnss = databases or (load("machine"), load("gnss"))
         except DbcError as error:
-            raise ConfigError(str(error)) from error
-        self.received = MachineReceived(machine, gnss)
-        self.watch = BusWatch(1)
+            raise ConfigError(error.code, str(error)) from error
+        self.inputs = CarrierInputs(machine, gnss)
+        self.monitor = BusMonitor(1)
         self.command = STANDING
-        self._writer = MachineWriter(machine, self.received.address)
+        self._writer = CarrierWriter(machine, self.inputs.address)
 
-    def read(self, frames: list[Frame], reading: BusReading, sent: bool, now_ns: int) -> None:
-        """A tick's frames and reading; ``sent``: there was something to send in the tick before."""
-        self.watch.read(reading, sent, now_ns)
-        if self.watch.recovered:
-            self.received.forget()
-        self.received.read([] if self.watch.lost else frames, now_ns)
+    def decode(self, frames: list[Frame], reading: BusReading, sent: bool, now_ns: int) -> None:
+        """Decode the frames of a tick; ``sent``: the previous tick had frames to send."""
+        self.monitor.update(reading, sent, now_ns)
+        if self.monitor.recovered:
+            self.inputs.forget()
+        self.inputs.decode([] if self.monitor.frames_lost else frames, now_ns)
 
-    def write(self, mode: Mode, reason: Reason, half_speed: bool, now_ns: int, frames: list[Wire]) -> None:
-        """What is to be sent in this tick, into the emptied ``frames``."""
+    def encode(self, mode: Mode, reason: Reason, half_speed: bool, now_ns: int, frames: list[RawFrame]) -> None:
+        """Replace ``frames`` by the frames of this tick."""
         frames.clear()
-        self._writer.write(self.command, mode, reason, half_speed, now_ns, frames)
+        self._writer.encode(self.command, mode, reason, half_speed, now_ns, frames)
 
-    def farewell(self) -> list[Wire]:
-        """The last frames of a process that ends: brake on, arms held, and an alive sign that says so."""
-        frames: list[Wire] = []
-        if not self.received.address.lost:
+    def shutdown_frames(self) -> list[RawFrame]:
+        """The last frames before the process ends: brake on, arms held, and an alive sign with the reason."""
+        frames: list[RawFrame] = []
+        if not self.inputs.address.lost:
             self._writer.commands(STANDING, frames)
             frames.append(self._writer.alive(Mode.BOOT, Reason.CONTROLLER_ENDED, False))
         return frames

@@ -1,22 +1,21 @@
-"""What mach0 brings: carrier, swing arms and engine (``machine.dbc``), the GNSS receiver (``gnss.dbc``), addresses.
+"""Received values of mach0: carrier, swing arms, engine (``machine.dbc``), GNSS receiver (``gnss.dbc``), addresses.
 
-Own frames of the machine are matched by identifier and carry an E2E header; the PGNs of J1939 and NMEA 2000 are
-matched whatever priority and source address.  A position with its quality is a fast packet of 7 frames.  Without the
-carrier's own frames the machine stops; without engine or GNSS it is said.
+The machine's own frames are matched by identifier and carry an E2E header; the PGNs of J1939 and NMEA 2000 are matched
+whatever their priority and source address.  A position with its quality is a fast packet of 7 frames.  Without the
+carrier's own frames the machine stops; the loss of engine or GNSS is only reported.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-from can_dbc.codec import PDU2_MASK, Database, FrameRefused, pgn_key
+from can_dbc.dbc.codec import PDU2_MASK, Database, FrameRefused, pgn_key
 from can_dbc.frame import EXTENDED, Frame
-from can_dbc.nmea2000 import Reassembler
+from can_dbc.protocols.nmea2000 import Reassembler
+from controller.bus_io.message_state import MessageState, age_out
 from controller.carrier.address_claim import FORMATS, AddressClaim
-from controller.message_state import Slot, age_out
+from machine.status.stale_inputs import CARRIER_BIT
 
-STALE_BIT: Final = 15
-"""In the mask of stale inputs: one of the carrier's own frames."""
 _NEEDED: Final = ("VehStat", "ArmHeightA", "ArmHeightB")
 _ENGINE: Final = ("EEC1", "CCVS", "DM1")
 _GNSS: Final = (
@@ -26,77 +25,77 @@ _GNSS: Final = (
 _OWN_MESSAGES: Final = ("VehCmd", "ArmCmdA", "ArmCmdB", "CtrlAlive")
 
 
-class MachineReceived:
+class CarrierInputs:
     """All inputs from mach0, and what this tick brought."""
 
     def __init__(self, machine: Database, gnss: Database) -> None:
         self.address = AddressClaim(machine)
         self.vehicle, self.arms_a, self.arms_b = needed = tuple(
-            Slot(machine.message(name), STALE_BIT, machine=True) for name in _NEEDED
+            MessageState(machine.message(name), CARRIER_BIT, machine=True) for name in _NEEDED
         )
-        helpful = [Slot(machine.message(name), STALE_BIT, watched=False, machine=True) for name in _ENGINE]
-        helpful += [Slot(gnss.message(name), STALE_BIT, watched=False, machine=True) for name in _GNSS]
+        helpful = [MessageState(machine.message(name), CARRIER_BIT, watched=False, machine=True) for name in _ENGINE]
+        helpful += [MessageState(gnss.message(name), CARRIER_BIT, watched=False, machine=True) for name in _GNSS]
         self.engine, self.vehicle_speed, self.trouble, self.position, self.heading, *more = helpful
         self.rate_of_turn, self.attitude, self.course, self.fix, self.time = more
         self.needed = needed
         self._helpful = tuple(helpful)
-        self.slots = (*needed, *helpful)
-        self._by_key = {s.codec.key: s for s in self.slots if not s.codec.by_pgn}
-        self._by_pgn = {pgn_key(s.codec.key): s for s in self.slots if s.codec.by_pgn}
+        self.messages = (*needed, *helpful)
+        self._by_key = {s.codec.key: s for s in self.messages if not s.codec.by_pgn}
+        self._by_pgn = {pgn_key(s.codec.key): s for s in self.messages if s.codec.by_pgn}
         self._own = frozenset(machine.message(name).key for name in _OWN_MESSAGES)
         self._reassembler = Reassembler()
-        self.stale_mask = age_out(self.slots, 0)
+        self.stale_mask = age_out(self.messages, 0)
         self.foreign = False
-        """One of our own frames came from elsewhere this tick."""
+        """Another node sent one of the controller's own frames in this tick."""
         self.unknown = self.count = 0
 
-    def wanted(self) -> list[int | tuple[int, int]]:
-        """Keys of all that is looked at, for the bus to filter by, with masks where the source does not matter."""
+    def filters(self) -> list[int | tuple[int, int]]:
+        """Keys to receive, for the bus's filter, with masks where the source address does not matter."""
         by_pgn = [(key, PDU2_MASK) for key in self._by_pgn]
         addresses = [(EXTENDED | form << 16, EXTENDED | 0xFF << 16) for form in FORMATS]
         return [*self._by_key, *self._own, *by_pgn, *addresses]
 
     def forget(self) -> None:
-        """Everything is unknown again, and our address is to be claimed anew."""
-        for slot in self.slots:
-            slot.forget()
+        """All values are unknown again, and the address must be claimed anew."""
+        for state in self.messages:
+            state.forget()
         self._reassembler = Reassembler()
-        self.address.again()
+        self.address.restart()
 
-    def read(self, frames: list[Frame], now_ns: int) -> None:
-        """Takes the frames of a tick in bus order."""
+    def decode(self, frames: list[Frame], now_ns: int) -> None:
+        """Decode the frames of a tick in bus order."""
         self.foreign = False
-        for slot in self.slots:
-            slot.fresh = False
+        for state in self.messages:
+            state.fresh = False
         by_key, by_pgn = self._by_key.get, self._by_pgn.get
         for frame in frames:
             key = frame[1]
-            known = by_key(key)
-            if known is not None:
-                known.take(frame, now_ns)
+            found = by_key(key)
+            if found is not None:
+                found.receive(frame, now_ns)
                 continue
-            known = by_pgn(key & PDU2_MASK)
-            if known is not None:
-                if known.codec.length > 8:
-                    self._take_part(known, frame, now_ns)
+            found = by_pgn(key & PDU2_MASK)
+            if found is not None:
+                if found.codec.length > 8:
+                    self._receive_part(found, frame, now_ns)
                 else:
-                    known.take(frame, now_ns)
+                    found.receive(frame, now_ns)
             elif key in self._own:
                 self.foreign = True
             elif key >> 16 & 0xFF in FORMATS:
-                self.address.take(frame)
+                self.address.receive(frame)
             else:
                 self.unknown += 1
         self.count += len(frames)
         self.stale_mask = age_out(self.needed, now_ns)
         age_out(self._helpful, now_ns)
 
-    def _take_part(self, slot: Slot, frame: Frame, now_ns: int) -> None:
-        """One frame of a fast packet; the packet may go on behind the described part."""
+    def _receive_part(self, state: MessageState, frame: Frame, now_ns: int) -> None:
+        """One frame of a fast packet; the packet may continue beyond the part that the DBC describes."""
         try:
             payload = self._reassembler.add(frame.key, frame.data, frame.stamp_ns)
         except FrameRefused:
-            slot.refused += 1
+            state.refused += 1
             return
         if payload is not None:
-            slot.take(Frame(frame.stamp_ns, frame.key, payload[: slot.codec.length]), now_ns)
+            state.receive(Frame(frame.stamp_ns, frame.key, payload[: state.codec.length]), now_ns)

@@ -1,48 +1,48 @@
-"""Does the carrier do what it is told, and is what steers it to be trusted?  One reason at a time, per tick.
+"""Monitors of the carrier: does it follow its command, and can its steering inputs be trusted?  One reason per tick.
 
-Speed and articulation are watched whenever the machine is armed, for a carrier that rolls away from under the crane is
-as bad; the rest only while it drives or slows down.  Every threshold must hold for a while, because a frame of mach0
-comes every 20 ms and one of them may be odd.
+Speed and articulation are monitored whenever the machine is armed, because a carrier that rolls away under the crane is
+as dangerous; the rest only while it drives or slows down.  Every threshold must hold for a while, because frames of
+mach0 come every 20 ms and one of them may be an outlier.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-from controller.carrier.dead_reckoning import FIXES, Whereabouts
-from controller.carrier.inputs import MachineReceived
-from controller.estimator import Tracked
+from controller.carrier.dead_reckoning import RTK_METHODS, DeadReckoning
+from controller.carrier.inputs import CarrierInputs
+from controller.estimation.joint_estimator import TrackedJoint
+from controller.estimation.motion_monitor import LATE_LAG_S, MotionMonitor
 from controller.laws.suspension import N_ARMS, Suspension
-from controller.monitors import LATE_LAG_S, MotionMonitor
 from machine.joints import ARTICULATION
 from machine.profile import Carrier
-from machine.reasons import Reason
+from machine.status.reasons import Reason
 
-OWN_GAIN: Final = 1.3
-OWN_M_S: Final = 0.25
-"""The carrier may be faster than it was told by this share and this much; ..."""
+OVERSPEED_RATIO: Final = 1.3
+OVERSPEED_M_S: Final = 0.25
+"""The carrier may be faster than its command by this ratio and this much; ..."""
 RUNAWAY_NS: Final = 300_000_000
 """... longer is a runaway."""
-FORGET_M_S2: Final = 0.5
-"""What it was told it may still do for as long as it takes to slow down like this."""
-TOLD_M_S: Final = 0.2
-STUCK_M_S: Final = 0.04
+COMMAND_DECAY_M_S2: Final = 0.5
+"""A former command still counts for as long as it takes to slow down like this."""
+STUCK_COMMAND_M_S: Final = 0.2
+STUCK_SPEED_M_S: Final = 0.04
 STUCK_NS: Final = 2_500_000_000
-"""Told to go as fast as the first and slower than the second for so long, it is stuck."""
+"""It is stuck when its command is above the first and its speed below the second for this long."""
 BEND_MARGIN_RAD: Final = 0.07
-"""How far past its limit the articulation may be found: its stops, and the encoder's zero."""
+"""How far beyond its limit the articulation may be measured: its stops, and the encoder's zero."""
 DISAGREE_RAD: Final = 0.06
 DISAGREE_NS: Final = 250_000_000
 TILT_NS: Final = 60_000_000
-OUTSIDE_M: Final = 0.06
-"""An arm may be found this far outside of its travel: sag of the tyres' side, and the sensor's zero."""
+ARM_MARGIN_M: Final = 0.06
+"""An arm may be measured this far outside its travel: sag of the tyres' side, and the sensor's zero."""
 ARM_STUCK_NS: Final = 2_000_000_000
 ARM_MOVED_M: Final = 0.01
-"""An arm that is told to move does so by this in that time."""
-COMMAND_S: Final = 0.04
-"""What VehCmd's period and the vehicle node add to the steering valve's dead time at most."""
+"""An arm that is commanded to move moves by this much in that time."""
+COMMAND_DELAY_S: Final = 0.04
+"""At most this much is added to the steering valve's dead time by VehCmd's period and the vehicle node."""
 _ARMS_FAULT: Final = 3
-_STEERED: Final = {
+_STEERING_REASONS: Final = {
     Reason.NONE: Reason.NONE,
     Reason.JOINT_STUCK: Reason.STEERING_STUCK,
     Reason.JOINT_RUNAWAY: Reason.STEERING_RUNAWAY,
@@ -50,56 +50,58 @@ _STEERED: Final = {
 }
 
 
-class VehicleWatch:
-    """`step` gives (reason, detail) of what is wrong with a carrier that is armed; (NONE, 0) when nothing is."""
+class VehicleMonitor:
+    """`step` returns the (reason, detail) of an armed carrier's fault, (NONE, 0) without one."""
 
     __slots__ = (
-        "_arm_from_m", "_arm_since_ns", "_carrier", "_disagree_ns", "_machine", "_own_ns", "_steering", "_stuck_ns",
-        "_tilt_ns", "_told_m_s", "_where",
+        "_arm_from_m", "_arm_since_ns", "_carrier", "_disagree_ns", "_inputs", "_overspeed_ns", "_recent_command_m_s",
+        "_reckoning", "_steering", "_stuck_ns", "_tilt_ns",
     )  # fmt: skip
 
     def __init__(
-        self, carrier: Carrier, machine: MachineReceived, where: Whereabouts, steering: Tracked, period_s: float
+        self, carrier: Carrier, inputs: CarrierInputs, reckoning: DeadReckoning, steering: TrackedJoint, period_s: float
     ) -> None:
-        self._carrier, self._machine, self._where = carrier, machine, where
-        self._steering = MotionMonitor(steering, period_s, COMMAND_S, max(LATE_LAG_S, carrier.articulation_lag_s))
+        self._carrier, self._inputs, self._reckoning = carrier, inputs, reckoning
+        self._steering = MotionMonitor(steering, period_s, COMMAND_DELAY_S, max(LATE_LAG_S, carrier.articulation_lag_s))
         self._arm_from_m, self._arm_since_ns = [0.0] * N_ARMS, [0] * N_ARMS
         self.reset(0)
 
     def reset(self, now_ns: int) -> None:
-        """Nothing is armed."""
-        self._told_m_s = 0.0
+        """The machine is not armed."""
+        self._recent_command_m_s = 0.0
         self._steering.reset()
-        self._own_ns = self._stuck_ns = self._disagree_ns = self._tilt_ns = now_ns
+        self._overspeed_ns = self._stuck_ns = self._disagree_ns = self._tilt_ns = now_ns
         for i in range(N_ARMS):
             self._arm_since_ns[i] = now_ns
 
     def ready(self, waypoint: bool) -> Reason:
-        """What speaks against driving now, to a waypoint or by angles."""
-        machine, where = self._machine, self._where
-        if machine.vehicle.get("Fault"):
+        """The reason that prevents driving now, to a waypoint or by articulation angles, or NONE."""
+        inputs, reckoning = self._inputs, self._reckoning
+        if inputs.vehicle.get("Fault"):
             return Reason.CARRIER_FAULT
-        if machine.arms_a.get("State") == _ARMS_FAULT:
+        if inputs.arms_a.get("State") == _ARMS_FAULT:
             return Reason.ARMS_FAULT
         if self._tilted():
             return Reason.TILTED
-        return self._lost(where) if waypoint else Reason.NONE
+        return self._lost(reckoning) if waypoint else Reason.NONE
 
     def step(
         self,
-        told_m_s: float,
-        told_rad_s: float,
+        speed_command_m_s: float,
+        rate_command_rad_s: float,
         drives: bool,
         waypoint: bool,
         arms: Suspension,
         now_ns: int,
         elapsed_s: float,
     ) -> tuple[Reason, int]:
-        """One tick: speed and articulation rate it is told, whether it drives or slows down, whether a waypoint steers
-        it.
+        """One tick with the commanded speed and articulation rate.
+
+        ``drives``: the carrier drives or slows down; ``waypoint``: it steers to a waypoint.
         """
-        self._told_m_s = max(abs(told_m_s), self._told_m_s - FORGET_M_S2 * elapsed_s)
-        if self._runs_away(told_m_s, now_ns):
+        decayed_m_s = self._recent_command_m_s - COMMAND_DECAY_M_S2 * elapsed_s
+        self._recent_command_m_s = max(abs(speed_command_m_s), decayed_m_s)
+        if self._runs_away(speed_command_m_s, now_ns):
             return Reason.CARRIER_RUNAWAY, 0
         if not drives:
             self._stuck_ns = self._disagree_ns = self._tilt_ns = now_ns
@@ -107,68 +109,68 @@ class VehicleWatch:
             for i in range(N_ARMS):
                 self._arm_since_ns[i] = now_ns
             return Reason.NONE, 0
-        machine, where = self._machine, self._where
-        if where.steering.jumped:
+        inputs, reckoning = self._inputs, self._reckoning
+        if reckoning.steering.jumped:
             return Reason.ENCODER_JUMP, ARTICULATION
-        if abs(where.steering.position) > self._carrier.articulation_limit_rad + BEND_MARGIN_RAD:
+        if abs(reckoning.steering.position) > self._carrier.articulation_limit_rad + BEND_MARGIN_RAD:
             return Reason.POSITION_OUTSIDE, ARTICULATION
-        if machine.vehicle.get("Fault"):
+        if inputs.vehicle.get("Fault"):
             return Reason.CARRIER_FAULT, 0
-        if machine.arms_a.get("State") == _ARMS_FAULT:
+        if inputs.arms_a.get("State") == _ARMS_FAULT:
             return Reason.ARMS_FAULT, 0
         if self._disagrees(now_ns):
             return Reason.STEERING_DISAGREES, 0
-        steered = _STEERED[self._steering.step(told_rad_s, where.steering.velocity)]
-        if steered:
-            return steered, 0
+        steering = _STEERING_REASONS[self._steering.step(rate_command_rad_s, reckoning.steering.velocity)]
+        if steering:
+            return steering, 0
         if not self._tilted():
             self._tilt_ns = now_ns
         elif now_ns - self._tilt_ns >= TILT_NS:
             return Reason.TILTED, 0
         if waypoint:
-            reason = self._lost(where) or where.finding
+            reason = self._lost(reckoning) or reckoning.finding
             if reason:
                 return reason, 0
-        if self._stuck(told_m_s, now_ns):
+        if self._stuck(speed_command_m_s, now_ns):
             return Reason.CARRIER_STUCK, 0
-        return self._judge_arms(arms, now_ns)
+        return self._check_arms(arms, now_ns)
 
     def _tilted(self) -> bool:
-        roll, pitch = self._where.tilt_rad
+        roll, pitch = self._reckoning.tilt_rad
         return max(abs(roll), abs(pitch)) > self._carrier.tilt_limit_rad
 
-    def _lost(self, where: Whereabouts) -> Reason:
-        """What a waypoint needs and is not there."""
-        if where.yaw_rad != where.yaw_rad:
+    def _lost(self, reckoning: DeadReckoning) -> Reason:
+        """An input that driving to a waypoint needs and that is missing."""
+        if reckoning.yaw_rad != reckoning.yaw_rad:
             return Reason.HEADING_LOST
-        if where.east_m != where.east_m:
+        if reckoning.east_m != reckoning.east_m:
             return Reason.POSITION_LOST
-        return Reason.NONE if where.fix in FIXES else Reason.FIX_LOST
+        return Reason.NONE if reckoning.fix in RTK_METHODS else Reason.FIX_LOST
 
-    def _runs_away(self, told_m_s: float, now_ns: int) -> bool:
-        speed = self._where.speed_m_s
-        faster = abs(speed) > OWN_GAIN * self._told_m_s + OWN_M_S
-        against = speed * told_m_s < 0.0 and abs(speed) > OWN_M_S
-        if not (faster or against):
-            self._own_ns = now_ns
-        return now_ns - self._own_ns >= RUNAWAY_NS
+    def _runs_away(self, speed_command_m_s: float, now_ns: int) -> bool:
+        speed = self._reckoning.speed_m_s
+        too_fast = abs(speed) > OVERSPEED_RATIO * self._recent_command_m_s + OVERSPEED_M_S
+        against = speed * speed_command_m_s < 0.0 and abs(speed) > OVERSPEED_M_S
+        if not (too_fast or against):
+            self._overspeed_ns = now_ns
+        return now_ns - self._overspeed_ns >= RUNAWAY_NS
 
-    def _stuck(self, told_m_s: float, now_ns: int) -> bool:
-        if not (abs(told_m_s) > TOLD_M_S and abs(self._where.speed_m_s) < STUCK_M_S):
+    def _stuck(self, speed_command_m_s: float, now_ns: int) -> bool:
+        if not (abs(speed_command_m_s) > STUCK_COMMAND_M_S and abs(self._reckoning.speed_m_s) < STUCK_SPEED_M_S):
             self._stuck_ns = now_ns
         return now_ns - self._stuck_ns >= STUCK_NS
 
     def _disagrees(self, now_ns: int) -> bool:
-        theirs = self._machine.vehicle.get("Articulation")
-        if theirs is None or not abs(theirs - self._where.steering.position) > DISAGREE_RAD:
+        theirs = self._inputs.vehicle.get("Articulation")
+        if theirs is None or not abs(theirs - self._reckoning.steering.position) > DISAGREE_RAD:
             self._disagree_ns = now_ns
         return now_ns - self._disagree_ns >= DISAGREE_NS
 
-    def _judge_arms(self, arms: Suspension, now_ns: int) -> tuple[Reason, int]:
-        heights, travel = self._where.heights_m, self._carrier.arm_travel_m
+    def _check_arms(self, arms: Suspension, now_ns: int) -> tuple[Reason, int]:
+        heights, travel = self._reckoning.heights_m, self._carrier.arm_travel_m
         for i in range(N_ARMS):
             height = heights[i]
-            if height < -OUTSIDE_M or height > travel + OUTSIDE_M:
+            if height < -ARM_MARGIN_M or height > travel + ARM_MARGIN_M:
                 return Reason.ARM_OUTSIDE, i
             if arms.speeds_m_s[i] == 0.0 or abs(height - self._arm_from_m[i]) > ARM_MOVED_M:
                 self._arm_since_ns[i], self._arm_from_m[i] = now_ns, height

@@ -1,8 +1,8 @@
-"""What the controller says on mach0: drive and swing-arm commands every 20 ms, an alive sign every 100 ms.
+"""Frames that the controller sends on mach0: drive and swing-arm commands every 20 ms, an alive sign every 100 ms.
 
-Inputs: the carrier's command, mode and reason.  Outputs: ``(key, data)`` in send order, the address claim first.  A
-machine that does not drive gets neutral commands without the arm key, so that silence always means a dead controller;
-once another node has our address there is silence, and the carrier brakes by its own time-out.
+Inputs: the carrier's command, mode and reason.  Outputs: ``(key, data)`` in send order, the address claim first.  While
+the machine does not drive, the commands are neutral and without the arm key, so that silence always means a dead
+controller.  After another node won the address nothing is sent, and the carrier brakes by its own time-out.
 """
 
 from __future__ import annotations
@@ -10,32 +10,32 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from can_dbc.canopen import Wire
-from can_dbc.codec import Database
+from can_dbc.dbc.codec import Database
+from can_dbc.frame import RawFrame
+from controller.bus_io.messages import ARM_KEY, PeriodicTimer, ProtectedMessage, safe_state
 from controller.carrier.address_claim import AddressClaim
-from controller.outputs import ARM_KEY, Every, Message, safe_state
-from machine.modes import Mode
-from machine.reasons import Reason
+from machine.geometry.carrier import ARMS
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
 
 COMMAND_NS: Final = 20_000_000
 ALIVE_NS: Final = 100_000_000
-N_ARMS: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
 class CarrierCommand:
-    """What the carrier is to do now; the default is to stand with the brake on and to hold its height.
+    """The carrier's command; the default stands with the brake on and holds the heights.
 
-    Articulation rate + bends left; arms front left, front right, rear left, rear right, + raises the frame.  A float
-    valve connects the two arms of its axle; the arm controller refuses both at once.
+    A positive articulation rate bends left; arms are front left, front right, rear left, rear right, and + raises the
+    frame.  A float valve connects the two arms of its axle; the arm controller refuses both at once.
     """
 
     moving: bool = False
-    """Gives the arm key: without it the carrier brakes and the arms hold, whatever else is said."""
+    """Sets the arm key: without it the carrier brakes and the arms hold, whatever the other values."""
     articulation_rate_rad_s: float = 0.0
     speed_m_s: float = 0.0
     brake_pct: float = 100.0
-    arm_spools_pct: tuple[float, ...] = (0.0,) * N_ARMS
+    arm_spools_pct: tuple[float, ...] = (0.0,) * len(ARMS)
     float_front: bool = False
     float_rear: bool = False
 
@@ -43,22 +43,23 @@ class CarrierCommand:
 STANDING: Final = CarrierCommand()
 
 
-class MachineWriter:
-    """Builds the frames of a tick into a list that the caller owns."""
+class CarrierWriter:
+    """Builds the frames of a tick in a list that the caller owns."""
 
     __slots__ = ("_address", "_alive", "_alive_due", "_arms_a", "_arms_b", "_command_due", "_drive", "_moved")
 
     def __init__(self, database: Database, address: AddressClaim) -> None:
         names = ("VehCmd", "ArmCmdA", "ArmCmdB", "CtrlAlive")
-        self._drive, self._arms_a, self._arms_b, self._alive = (Message(database.message(name)) for name in names)
+        messages = (ProtectedMessage(database.message(name)) for name in names)
+        self._drive, self._arms_a, self._arms_b, self._alive = messages
         self._address = address
         self._moved = False
-        self._command_due, self._alive_due = Every(COMMAND_NS, 10_000_000), Every(ALIVE_NS, 15_000_000)
+        self._command_due, self._alive_due = PeriodicTimer(COMMAND_NS, 10_000_000), PeriodicTimer(ALIVE_NS, 15_000_000)
 
-    def write(
-        self, command: CarrierCommand, mode: Mode, reason: Reason, half_speed: bool, now_ns: int, frames: list[Wire]
+    def encode(
+        self, command: CarrierCommand, mode: Mode, reason: Reason, half_speed: bool, now_ns: int, frames: list[RawFrame]
     ) -> None:
-        """Appends what is due now; a command that ends the motion is due at once."""
+        """Append the frames that are due; a command that ends a motion is due at once."""
         claim = self._address.frame()
         if claim is not None:
             frames.append(claim)
@@ -70,14 +71,14 @@ class MachineWriter:
         if self._alive_due.due(now_ns):
             frames.append(self.alive(mode, reason, half_speed))
 
-    def commands(self, command: CarrierCommand, frames: list[Wire]) -> None:
-        """Appends VehCmd, ArmCmdA and ArmCmdB."""
+    def commands(self, command: CarrierCommand, frames: list[RawFrame]) -> None:
+        """Append VehCmd, ArmCmdA and ArmCmdB."""
         key = ARM_KEY if command.moving else 0
         motion = (command.articulation_rate_rad_s, command.speed_m_s, command.brake_pct)
-        frames.append(self._drive.carrying(key, *motion))
-        frames.append(self._arms_a.carrying(key, *command.arm_spools_pct))
-        frames.append(self._arms_b.carrying(key, command.float_front, command.float_rear))
+        frames.append(self._drive.frame_with(key, *motion))
+        frames.append(self._arms_a.frame_with(key, *command.arm_spools_pct))
+        frames.append(self._arms_b.frame_with(key, command.float_front, command.float_rear))
 
-    def alive(self, mode: Mode, reason: Reason, half_speed: bool) -> Wire:
-        """CtrlAlive."""
-        return self._alive.carrying(mode, safe_state(mode, reason, half_speed), reason)
+    def alive(self, mode: Mode, reason: Reason, half_speed: bool) -> RawFrame:
+        """Encode CtrlAlive."""
+        return self._alive.frame_with(mode, safe_state(mode, reason, half_speed), reason)

@@ -1,1 +1,1 @@
-"""The guard: a second, independent opinion on the traffic of crane0.  Standard library alone; see `judge`."""
+"""The guard: an independent check of the traffic on crane0, with its own decoding of the DBC."""

@@ -1,6 +1,6 @@
 """The guard process: ``python -m controller.guard --profile FILE --bus crane0=ADDRESS``.
 
-Every 5 ms: drain, judge, send.  A bus that is lost is tried again until it is back.  Exit codes: 0 ended by SIGTERM, 3
+Every 5 ms: receive, check, send.  A lost bus is reopened when it is back.  Exit codes: 0 ended by SIGTERM, 3
 configuration, 4 no bus at the start, 130 SIGINT.
 """
 
@@ -13,14 +13,16 @@ import time
 from pathlib import Path
 from typing import Final
 
-from can_dbc.bus import Bus, BusError, default_address, open_bus
+from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.frame import Frame
-from can_dbc.tick_record import BusReading
+from can_dbc.messages.tick_record import BusReading
 from controller.guard.envelope import read_envelope
-from controller.guard.judge import MESSAGES, Guard
+from controller.guard.guard import MESSAGES, Guard
 from controller.guard.layout import GuardConfigError, read_layouts
-from controller.link import Link
-from controller.realtime import Notifier, freeze, keep_heap, prepare, sleep_until
+from controller.process.bus_link import BusLink
+from controller.process.realtime import Notifier, prepare, sleep_until, stop_garbage_collection
+from runtime.allocator import keep_memory
 
 PERIOD_NS: Final = 5_000_000
 PRIORITY: Final = 85
@@ -28,54 +30,54 @@ ROOT: Final = Path(__file__).parents[2]
 
 
 def build(profile: Path, dbc: Path = ROOT / "can_dbc" / "crane.dbc") -> Guard:
-    """A guard for a profile file; raises GuardConfigError."""
+    """Build a guard for a profile file; raises GuardConfigError."""
     axes = read_envelope(profile)
     return Guard(axes, read_layouts(dbc, [*MESSAGES, *(axis.message for axis in axes if axis.message)]))
 
 
 def profile_path(name: str) -> Path:
-    """A profile file, or the shipped one of that name."""
+    """Path of a shipped profile by its name, else ``name`` as a path."""
     shipped = ROOT / "machine" / f"{name}.toml"
     return shipped if shipped.is_file() else Path(name)
 
 
 def run(guard: Guard, bus: Bus, ended: list[int], notifier: Notifier) -> None:
-    """Judges until a signal is in ``ended``."""
+    """Run until a signal number is in ``ended``."""
     frames: list[Frame] = []
-    link, reading = Link(bus), BusReading()
+    link, reading = BusLink(bus), BusReading()
     deadline_ns = time.monotonic_ns() + PERIOD_NS
     while not ended:
         sleep_until(deadline_ns)
         late_ns = time.monotonic_ns() - deadline_ns
         if late_ns >= PERIOD_NS:
             deadline_ns += late_ns // PERIOD_NS * PERIOD_NS
-        link.read(frames, reading)
+        link.receive(frames, reading)
         link.send(guard.step(deadline_ns, frames))
         link.watch(deadline_ns)
-        notifier.ticked(deadline_ns, late_ns < PERIOD_NS)
+        notifier.tick_done(deadline_ns, late_ns < PERIOD_NS)
         deadline_ns += PERIOD_NS
     notifier.stopping()
 
 
-def _words(guard: Guard, bus: Bus) -> str:
+def _status_text(guard: Guard, bus: Bus) -> str:
     enabled = "enabled" if guard.enabled else "not enabled"
     return f"Valves {enabled}: {guard.verdict.name}. The bus is {bus.stats.state.name}."
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Starts the guard; returns the exit code."""
+    """Run the guard; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m controller.guard",
-        description="Judges the traffic on the crane bus and enables the valves.",
+        description="Checks the traffic on the crane bus and enables the valves.",
     )
     parser.add_argument("--profile", required=True, help="shipped profile name or TOML file")
-    parser.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="where the crane bus is")
-    parser.add_argument("--no-realtime", action="store_true", help="do not ask for FIFO and locked memory")
+    parser.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="address of the crane bus")
+    parser.add_argument("--no-realtime", action="store_true", help="do not request FIFO scheduling and locked memory")
     options = parser.parse_args(arguments)
     name, _, address = options.bus.partition("=")
     if options.bus and (name != "crane0" or not address):
         parser.error(f"--bus {options.bus}: write crane0=ADDRESS, as in crane0=socketcan:can0")
-    keep_heap()
+    keep_memory()
     ended: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda which, _frame: ended.append(which))
@@ -85,8 +87,8 @@ def main(arguments: list[str] | None = None) -> int:
             if not options.no_realtime:
                 for refusal in prepare(PRIORITY):
                     sys.stderr.write(f"guard: not granted: {refusal}\n")
-            freeze()
-            run(guard, bus, ended, Notifier(lambda: _words(guard, bus)))
+            stop_garbage_collection()
+            run(guard, bus, ended, Notifier(lambda: _status_text(guard, bus)))
     except GuardConfigError as error:
         sys.stderr.write(f"guard: {error}\n")
         return 3

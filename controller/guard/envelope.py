@@ -1,4 +1,4 @@
-"""What a machine may do, as the guard reads it from the profile (TOML) by itself.
+"""Limits of a machine, read from the profile (TOML) by the guard itself.
 
 Output: one `Axis` per joint with its command signal, its encoder and its limits, in the units of the profile.
 """
@@ -13,7 +13,7 @@ from controller.guard.layout import GuardConfigError
 
 JOINT_NAMES: Final = ("slew", "lift", "tilt", "ext", "rot")
 RATE_FACTOR: Final = 6.0
-"""A command may change this many times faster than the acceleration limit; a good controller stays below."""
+"""A command may change this many times faster than the acceleration limit; the controller stays below (4)."""
 
 
 class Axis(NamedTuple):
@@ -33,15 +33,15 @@ class Axis(NamedTuple):
 
 
 def read_envelope(path: Path) -> tuple[Axis, ...]:
-    """The axes of a profile file; raises GuardConfigError."""
+    """Read the axes of a profile file; raises GuardConfigError."""
     try:
         profile = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise GuardConfigError(f"{path}: the guard cannot read this profile: {error}.") from error
+        raise GuardConfigError("guard.profile-unreadable", f"{path}: unreadable profile: {error}.") from error
     try:
         return tuple(_axis(i, profile["joints"][name]) for i, name in enumerate(JOINT_NAMES))
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise GuardConfigError(f"{path}: a joint is incomplete for the guard: {error!r}.") from error
+        raise GuardConfigError("guard.profile-incomplete", f"{path}: a joint is incomplete: {error!r}.") from error
 
 
 def _axis(number: int, joint: dict[str, Any]) -> Axis:

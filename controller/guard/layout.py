@@ -1,6 +1,6 @@
-"""The guard's own reading of ``crane.dbc``, by regular expression: it shares no fault with the codecs.
+"""The guard's own parser of ``crane.dbc``, by regular expression: it shares no fault with the codecs.
 
-Reads only what the guard needs: identifier, length, Data IDs, time-out and the bits of little-endian signals.
+It reads only what the guard needs: identifier, length, Data IDs, time-out and the bits of little-endian signals.
 Anything missing or of another form stops the start with `GuardConfigError`.
 """
 
@@ -14,11 +14,15 @@ _EXTENDED: Final = 1 << 31
 
 
 class GuardConfigError(Exception):
-    """The guard cannot start; the message says what is wrong, where, what to do."""
+    """The guard cannot start; the sentence tells what is wrong, where, and what to do; ``code`` is stable."""
+
+    def __init__(self, code: str, sentence: str) -> None:
+        super().__init__(sentence)
+        self.code = code
 
 
 class Field:
-    """One signal: where its bits lie, and raw and physical reading."""
+    """One signal: the position of its bits, its scale and its range."""
 
     __slots__ = ("_mask", "_shift", "_sign", "maximum", "minimum", "scale")
 
@@ -28,12 +32,12 @@ class Field:
         self.scale, self.minimum, self.maximum = scale, minimum, maximum
 
     def raw(self, word: int) -> int:
-        """The raw value in a payload read as a little-endian number."""
+        """The raw value in a payload that was read as a little-endian number."""
         value = word >> self._shift & self._mask
         return value - 2 * self._sign if value & self._sign else value
 
     def put(self, value: int) -> int:
-        """The bits of an unsigned raw value at their place."""
+        """The bits of an unsigned raw value at their position."""
         return (value & self._mask) << self._shift
 
     def inside(self, raw: int) -> bool:
@@ -52,26 +56,26 @@ class Layout:
 
 
 def read_layouts(path: Path, names: list[str]) -> dict[str, Layout]:
-    """The layouts of the named messages; raises GuardConfigError."""
+    """Read the layouts of the named messages; raises GuardConfigError."""
     try:
         text = path.read_text(encoding="cp1252")
     except OSError as error:
-        raise GuardConfigError(f"{path}: cannot be read: {error.strerror}.") from error
+        raise GuardConfigError("guard.dbc-unreadable", f"{path}: cannot be read: {error.strerror}.") from error
     return {name: _layout(text, name, path) for name in names}
 
 
 def _layout(text: str, name: str, path: Path) -> Layout:
     head = re.search(rf"^BO_ (\d+) {name}: (\d+) \w+\n((?: SG_ .*\n)*)", text, re.MULTILINE)
     if head is None:
-        raise GuardConfigError(f"{path}: message {name} is missing.")
+        raise GuardConfigError("guard.message-missing", f"{path}: message {name} is missing; use the shipped DBC.")
     number = int(head[1])
     if number >= _EXTENDED:
-        raise GuardConfigError(f"{path}: {name} has a 29-bit identifier; the guard watches 11-bit ones.")
+        raise GuardConfigError("guard.extended-identifier", f"{path}: {name} needs an 11-bit identifier.")
     fields = {}
     for line in head[3].splitlines():
         match = re.match(r" SG_ (\w+) : (\d+)\|(\d+)@1([+-]) \(([^,]+),([^)]+)\) \[([^|]+)\|([^\]]+)\]", line)
         if match is None or float(match[6]) != 0.0:
-            raise GuardConfigError(f"{path}: the guard cannot read this signal of {name}: {line.strip()}")
+            raise GuardConfigError("guard.signal-unreadable", f"{path}: unreadable signal of {name}: {line.strip()}")
         fields[match[1]] = Field(
             int(match[2]), int(match[3]), match[4] == "-", float(match[5]), float(match[7]), float(match[8])
         )
@@ -79,5 +83,5 @@ def _layout(text: str, name: str, path: Path) -> Layout:
     timeout = re.search(rf'^BA_ "TimeoutMs" BO_ {number} (\d+);', text, re.MULTILINE)
     data_ids = bytes.fromhex(ids[1]) if ids else b""
     if data_ids and len(data_ids) != 16:
-        raise GuardConfigError(f"{path}: {name} needs 16 Data IDs.")
+        raise GuardConfigError("guard.data-ids", f"{path}: {name} needs 16 Data IDs.")
     return Layout(number, int(head[2]), fields, data_ids, int(timeout[1]) * 1_000_000 if timeout else 0)

@@ -1,7 +1,7 @@
-"""All joints together: what they want, slowed by one factor so that the path is kept.
+"""The laws of all joints together, scaled by one factor so that the crane stays on its path.
 
-When one joint wants more than its limit, or all together more than the pump gives, every joint gets the same share: the
-crane goes on along its path, later.  The pump's flow and what a joint's speed costs come from the profile.
+When one joint exceeds its limit, or all together the pump's flow, every joint gets the same share of its desired
+velocity: the crane stays on its path and is later.  The pump's flow and the flow per joint speed come from the profile.
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from controller.estimator import JointEstimator
+from controller.estimation.joint_estimator import JointEstimator
 from controller.laws.joint import JointLaw
-from controller.laws.sway import Sway
-from controller.valve import ValveMap
+from controller.laws.sway import SwayDamping
+from controller.laws.valve_map import ValveMap
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import Profile, joint
 
 FLOW_SHARE: Final = 0.97
-"""Share of the pump's flow that the joints may ask for."""
+"""Share of the pump's flow that the joints may use."""
 LOADS: Final = (("SlewA", "SlewB"), ("LiftA", "LiftB"), ("TiltA", "TiltB"), ("ExtA", "ExtB"), None)
-"""Chamber pressures of each joint in PressA and PressB, the one that pushes in its direction first."""
+"""Chamber pressures of each joint in PressA and PressB; the chamber that pushes in the positive direction first."""
 
 
 class CraneLaw:
@@ -39,13 +39,13 @@ class CraneLaw:
         self.commands = [0.0] * N_JOINTS
 
     def reset(self) -> None:
-        """All valves are at neutral."""
+        """Reset for valves at neutral."""
         for j, law in enumerate(self.laws):
             law.reset()
             self.commands[j] = 0.0
 
-    def load_bar(self, j: int, push_bar: float | None, against_bar: float | None) -> float:
-        """Pressure [bar] in the pushing chamber that would carry the load alone; NaN where one is unknown."""
+    def load_pressure_bar(self, j: int, push_bar: float | None, against_bar: float | None) -> float:
+        """Pressure [bar] in the pushing chamber that alone would carry the load; NaN where a pressure is unknown."""
         if push_bar is None or against_bar is None:
             return math.nan
         return push_bar - against_bar * self._areas[j]
@@ -54,33 +54,34 @@ class CraneLaw:
         self,
         reference: Sequence[float],
         velocity: Sequence[float],
-        ahead: Sequence[float],
+        lead_velocity: Sequence[float],
         estimators: Sequence[JointEstimator],
         loads_bar: Sequence[float],
         cap: float,
         elapsed_s: float,
-        sway: Sway | None = None,
+        sway: SwayDamping | None = None,
     ) -> None:
-        """One tick, all sequences in ``Joint`` order: reference and its velocity now, its velocity ``lead_ns`` of each
-        law ahead, estimates, load pressures; ``cap`` scales the speed limits (1, or 0.5 when degraded);
-        ``sway`` moves the joints on top of the reference while it is active.
+        """One tick; all sequences are in ``Joint`` order.
+
+        Reference, its velocity now and ``lead_ns`` of each law ahead, estimates, and load pressures.  ``cap`` scales
+        the speed limits (1, or 0.5 when degraded); ``sway`` adds a motion to the reference while it is active.
         """
         share, flow = 1.0, 0.0
         for j, law in enumerate(self.laws):
             e, valve = estimators[j], self.valves[j]
-            valve.place(e.position)
-            moved = (0.0, 0.0) if sway is None else (sway.velocity[j], sway.displacement[j])
-            wanted = law.wanted(
-                reference[j], velocity[j], ahead[j], e.position, e.velocity, loads_bar[j], elapsed_s, *moved
+            valve.set_position(e.position)
+            added = (0.0, 0.0) if sway is None else (sway.velocity[j], sway.displacement[j])
+            v = law.desired_velocity(
+                reference[j], velocity[j], lead_velocity[j], e.position, e.velocity, loads_bar[j], elapsed_s, *added
             )
-            share = min(share, law.room(cap))
-            flow += valve.arm * (wanted * self._flow_plus[j] if wanted >= 0.0 else -wanted * self._flow_minus[j])
+            share = min(share, law.feasible_share(cap))
+            flow += valve.arm * (v * self._flow_plus[j] if v >= 0.0 else -v * self._flow_minus[j])
         if flow > self._flow:
             share = min(share, self._flow / flow)
         for j, law in enumerate(self.laws):
-            self.commands[j] = law.finish(share, elapsed_s)
+            self.commands[j] = law.command(share, elapsed_s)
 
     def fade(self, share: float) -> None:
-        """The last commands, fading while a stop's ramp runs."""
+        """Scale the last commands during a stop's ramp."""
         for j, law in enumerate(self.laws):
             self.commands[j] = law.velocity_command * share

@@ -1,7 +1,7 @@
-"""Speed and brake of the carrier: a wanted speed is approached at the profile's acceleration, a stop is a ramp as well.
+"""Speed and brake of the carrier: the speed command ramps at the profile's acceleration, and a stop is a ramp as well.
 
-The vehicle node closes the loop on the wheels; here is only what it is told.  The brake is on while nothing is to move
-and the machine stands; it never brakes a machine that still rolls, but for a stop that has lasted too long.
+The vehicle node closes the loop on the wheels; this law only computes its command.  The brake is on while the machine
+is to stand and stands; it never brakes a machine that still rolls, except when a stop lasts too long.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from typing import Final
 from machine.profile import Carrier
 
 STOP_M_S2: Final = 1.0
-"""Deceleration when the reason to drive is gone."""
-STANDS_M_S: Final = 0.04
-"""Slower than this it stands."""
+"""Deceleration of a stop."""
+STANDING_M_S: Final = 0.04
+"""Below this speed the carrier stands."""
 SETTLE_S: Final = 0.8
-"""The brake waits so long at most for a machine that was told to stand."""
+"""The brake waits at most this long for a machine that was told to stand."""
 
 
 class DriveLaw:
-    """``speed_m_s`` is what the vehicle is told, ``brake`` whether it stands with its brake on."""
+    """``speed_m_s`` is the speed command, ``brake`` whether the carrier stands with its brake on."""
 
     __slots__ = ("_acceleration", "_limit", "_standing_s", "brake", "speed_m_s")
 
@@ -29,18 +29,18 @@ class DriveLaw:
         self.reset()
 
     def reset(self) -> None:
-        """It stands with its brake on."""
+        """The carrier stands with its brake on."""
         self.speed_m_s = 0.0
         self.brake = True
         self._standing_s = 0.0
 
     @property
     def stop_s(self) -> float:
-        """How long a stop from here takes, until the brake is on."""
+        """Time of a stop from the present speed until the brake is on."""
         return 0.0 if self.brake else abs(self.speed_m_s) / STOP_M_S2 + SETTLE_S
 
     def step(self, wanted_m_s: float, measured_m_s: float, cap: float, elapsed_s: float) -> None:
-        """One tick towards a wanted speed; ``cap`` scales the limit, a measured speed of NaN is unknown."""
+        """One tick towards ``wanted_m_s``; ``cap`` scales the speed limit; an unknown measured speed is NaN."""
         limit = cap * self._limit
         self._approach(min(max(wanted_m_s, -limit), limit), self._acceleration * elapsed_s)
         self._set_brake(wanted_m_s == 0.0, measured_m_s, elapsed_s)
@@ -59,6 +59,6 @@ class DriveLaw:
             return
         if self.speed_m_s == 0.0:
             self._standing_s += elapsed_s
-        # On a slope a machine that waits with its brake for the end of the ramp rolls on.
-        if abs(measured_m_s) < STANDS_M_S or self._standing_s > SETTLE_S:
+        # On a slope a machine would roll on if the brake waited for the end of the ramp.
+        if abs(measured_m_s) < STANDING_M_S or self._standing_s > SETTLE_S:
             self.brake, self.speed_m_s = True, 0.0

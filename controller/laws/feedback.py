@@ -1,9 +1,9 @@
-"""Four ways to turn a joint's error into a velocity correction, behind one interface.
+"""Four feedback laws that turn a joint's error into a velocity correction, behind one interface.
 
-All are of the velocity type (machines.md section 4) and share one budget: ``kp_1_s`` is the small-signal gain inside
-the ``layer``, which `timberhand bench loop-design` bounds; how a law spends it stands here and nowhere else.  Sliding
-mode and super-twisting are reconstructions: paper B names the first and cites La Hera and Ortiz Morales 2015, whose
-equations were not at hand.
+All are of the velocity type (docs/reference/machines.md section 4) and share one budget: ``kp_1_s`` is the small-signal
+gain inside the ``layer``, which `timberhand bench loop-design` bounds; how a law uses it is written here and nowhere
+else.  Sliding mode and super-twisting are reconstructions: paper B names the first and cites La Hera and Ortiz Morales
+2015, whose equations were not available.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from machine.profile import Law
 REACHING_SHARE: Final = 0.5
 """Share of the budget in the switching term; the rest is the proportional term lambda e."""
 INTEGRAL_SHARE: Final = 0.05
-"""Integral gain of the three laws that have one, inside the layer, over the budget squared [-]: more would cost the
-slew, whose load swings at its crossover, its gain margin.
+"""Integral gain of the three laws that have one, inside the layer, over the budget squared [-].  More would take the
+gain margin of the slew, whose load swings at its crossover.
 """
 PID_SHARE: Final = 0.25
-"""Share of the budget that the plain PID spends: without delay compensation and pressure feedback a load that swings
-under the slew would take its margins with more.
+"""Share of the budget that the plain PID uses.  It has no delay compensation and no pressure feedback; more would take
+its margins when a load swings under the slew.
 """
 
 
 class Feedback(Protocol):
-    """A law's core."""
+    """Interface of a feedback law."""
 
     def reset(self) -> None:
-        """Forgets its integrals."""
+        """Clear the integrals."""
 
     def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
-        """Velocity correction [unit/s] for an error [unit]; ``frozen``: the command is limited, integrals stand."""
+        """Velocity correction [unit/s] for an error [unit]; ``frozen``: the command is limited, so integrals stop."""
 
 
 class Pd:
@@ -44,14 +44,14 @@ class Pd:
         self._kp, self._kd = law.kp_1_s, law.kd
 
     def reset(self) -> None:
-        """Has no memory."""
+        """A PD law has no state."""
 
     def step(self, error: float, error_rate: float, elapsed_s: float, frozen: bool) -> float:
         return self._kp * error + self._kd * error_rate
 
 
 class Pid:
-    """The baseline: PD with an integral.  Its shell gives it neither feed-forward nor delay compensation."""
+    """The baseline: PD with an integral, used without feed-forward and delay compensation."""
 
     __slots__ = ("_integral", "_kd", "_ki", "_kp")
 
@@ -70,7 +70,10 @@ class Pid:
 
 
 class SlidingMode:
-    """lambda e + Kd e' + k1 tanh(sigma / phi),  sigma = e + mu integral e, a slower surface than machines.md's."""
+    """lambda e + Kd e' + k1 tanh(sigma / phi),  sigma = e + mu integral e.
+
+    The surface is slower than that of docs/reference/machines.md section 4.
+    """
 
     __slots__ = ("_integral", "_k1", "_kd", "_lambda", "_layer", "_mu")
 
@@ -94,7 +97,7 @@ class SlidingMode:
 class SuperTwisting:
     """lambda e + Kd e' + k1 |e|^1/2 sat(e / phi) + w,  w' = k2 sat(e / phi).
 
-    The surface is the error itself: with an integral of its own beside w the loop would be stable conditionally only.
+    The surface is the error itself: with a second integral beside w the loop would be only conditionally stable.
     """
 
     __slots__ = ("_k1", "_k2", "_kd", "_lambda", "_layer", "_twist", "_twist_limit")

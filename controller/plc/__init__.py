@@ -1,1 +1,1 @@
-"""The bridge to a machine PLC on Ethernet: it plays the machine's nodes on crane0, as if they were there."""
+"""The bridge to a PLC: emulates the machine's nodes on crane0 and passes supervised commands on."""

@@ -1,9 +1,9 @@
 """The bridge process: ``python -m controller.plc --profile P --bus crane0=wire:crane0 --modbus 127.0.0.1:1502``.
 
-Plays the machine's nodes on crane0 with what a PLC says on Ethernet, and passes the supervised commands on.  One
-asyncio loop, one thread.  On stdout ``ready`` when it is on the bus, on stderr one JSON line at its end.  Nothing is
-authenticated, so it talks to loopback addresses alone unless ``--allow-network`` is given.  Exit codes: 0 ended by
-SIGTERM, 2 usage, 3 configuration, 4 no bus or address at the start, 130 SIGINT.
+Emulates the machine's nodes on crane0 from the answers of a PLC on Ethernet, and passes the supervised commands on.
+One asyncio loop, one thread.  Prints ``ready`` on stdout when it is on the bus, and one JSON line on stderr at its
+end.  Nothing is authenticated, so it connects to loopback addresses only unless ``--allow-network`` is given.  Exit
+codes: 0 ended by SIGTERM, 2 usage, 3 configuration, 4 no bus or address at the start, 130 SIGINT.
 """
 
 from __future__ import annotations
@@ -17,27 +17,29 @@ import time
 from dataclasses import asdict
 from typing import Final
 
-from can_dbc.bus import Bus, BusError, default_address, open_bus
-from can_dbc.codec import DbcError, load
+from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.factory import default_address, open_bus
+from can_dbc.bus.reconnector import Reconnector
+from can_dbc.dbc.codec import DbcError, load
 from can_dbc.frame import Frame
-from can_dbc.lost_link import LostLink
+from can_dbc.messages.udp_address import udp_address
 from can_dbc.plc.map import WordOrder
 from can_dbc.plc.modbus import is_loopback
-from can_dbc.setpoint import udp_address
 from controller.config import ConfigError
 from controller.plc.bridge import Bridge
 from controller.plc.links import ModbusLink, UdpLink
-from controller.realtime import Notifier, freeze, keep_heap, prepare
-from machine.load import ProfileError, load_profile
+from controller.process.realtime import Notifier, prepare, stop_garbage_collection
+from machine.loading.profile_file import ProfileError, load_profile
+from runtime.allocator import keep_memory
 
 STEP_S: Final = 0.005
 PRIORITY: Final = 70
 TX_QUEUE: Final = 64
-"""This process plays a dozen nodes."""
+"""Frames; this process emulates a dozen nodes."""
 
 
 def address(text: str) -> tuple[str, int]:
-    """HOST:PORT of a command line; raises ArgumentTypeError."""
+    """Parse HOST:PORT; raises ArgumentTypeError."""
     try:
         return udp_address(text)
     except ValueError as error:
@@ -53,13 +55,13 @@ def parser() -> argparse.ArgumentParser:
         "--modbus 192.168.7.2:502 --allow-network",
     )
     made.add_argument("--profile", required=True, help="shipped profile name or TOML file with a [plc] table")
-    made.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="where the crane bus is")
-    way = made.add_mutually_exclusive_group(required=True)
-    way.add_argument("--modbus", type=address, metavar="HOST:PORT", help="the PLC's Modbus/TCP server")
-    way.add_argument("--udp", type=address, metavar="HOST:PORT", help="the PLC's port for cyclic datagrams")
+    made.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="address of the crane bus")
+    link = made.add_mutually_exclusive_group(required=True)
+    link.add_argument("--modbus", type=address, metavar="HOST:PORT", help="the PLC's Modbus/TCP server")
+    link.add_argument("--udp", type=address, metavar="HOST:PORT", help="the PLC's port for cyclic datagrams")
     made.add_argument("--word-order", choices=("high", "low"), default="high", help="which half of 32 bits comes first")
     made.add_argument("--allow-network", action="store_true", help="the PLC may be on another host")
-    made.add_argument("--no-realtime", action="store_true", help="do not ask for FIFO and locked memory")
+    made.add_argument("--no-realtime", action="store_true", help="do not request FIFO scheduling and locked memory")
     return made
 
 
@@ -68,25 +70,25 @@ class Process:
 
     def __init__(self, bridge: Bridge, bus: Bus) -> None:
         self._bridge, self._bus = bridge, bus
-        self._watch = LostLink(bus).watch
-        self._notifier = Notifier(self.words)
+        self._watch = Reconnector(bus).watch
+        self._notifier = Notifier(self.status_text)
         self._frames: list[Frame] = []
 
     def step(self) -> None:
-        """Everything that waits on the bus, and what is due."""
+        """Receive all waiting frames and send what is due."""
         frames = self._frames
         frames.clear()
         self._bus.drain(frames)
         self._bus.send_all(self._bridge.step(time.monotonic_ns(), frames))
 
-    def words(self) -> str:
-        """How it is, in one line."""
+    def status_text(self) -> str:
+        """State in one line."""
         shake, bus = self._bridge.handshake, self._bus
-        said = shake.problem or f"The PLC has answered {shake.answers} times."
-        return f"{said} The bus is {bus.stats.state.name}."
+        answers = shake.problem or f"The PLC has answered {shake.answers} times."
+        return f"{answers} The bus is {bus.stats.state.name}."
 
     async def run(self, link: ModbusLink | UdpLink) -> None:
-        """Until cancelled."""
+        """Run until cancelled."""
         loop = asyncio.get_running_loop()
         listening = -1
         exchanging = asyncio.create_task(link.run())
@@ -103,7 +105,7 @@ class Process:
                 self.step()
                 now_ns = time.monotonic_ns()
                 self._watch(now_ns)
-                self._notifier.ticked(now_ns, True)
+                self._notifier.tick_done(now_ns, True)
                 due = max(due + STEP_S, loop.time())
                 await asyncio.sleep(due - loop.time())
             exchanging.result()
@@ -114,7 +116,7 @@ class Process:
 
 
 def summary(bridge: Bridge) -> str:
-    """One JSON line on how the conversation went."""
+    """Statistics of the exchange as one JSON line."""
     shake = bridge.handshake
     return json.dumps(
         {
@@ -144,7 +146,7 @@ async def _until_ended(process: Process, link: ModbusLink | UdpLink, ended: list
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Starts the bridge; returns the exit code."""
+    """Run the bridge; returns the exit code."""
     made = parser()
     options = made.parse_args(arguments)
     name, _, where = options.bus.partition("=")
@@ -154,7 +156,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not options.allow_network and not is_loopback(host):
         made.error(f"{host} is on the network, and neither Modbus nor the datagrams are authenticated; "
                    "use a network of their own and give --allow-network")  # fmt: skip
-    keep_heap()
+    keep_memory()
     ended: list[int] = []
     try:
         order = WordOrder.HIGH_FIRST if options.word_order == "high" else WordOrder.LOW_FIRST
@@ -164,7 +166,7 @@ def main(arguments: list[str] | None = None) -> int:
                 for refusal in prepare(PRIORITY):
                     sys.stderr.write(f"plc: not granted: {refusal}\n")
             link = ModbusLink(bridge, host, port) if options.modbus else UdpLink(bridge, host, port)
-            freeze()
+            stop_garbage_collection()
             asyncio.run(_until_ended(Process(bridge, bus), link, ended))
         sys.stderr.write(f"plc: {summary(bridge)}\n")
     except (ConfigError, DbcError, ProfileError) as error:

@@ -1,9 +1,9 @@
 """The bridge as one pure object: frames of crane0 and answers of the PLC in, frames and commands for the PLC out.
 
-``step(now_ns, frames)`` plays safety module, encoders, valve node and pressure modules with what the PLC last said;
-``command(now_ns)`` is what to send it next.  Every 5 ms and whenever frames have come, ``step`` is to be called.  While
-no good answer of the PLC is at most 50 ms old nothing is said on crane0 at all, and the controller stops by the same
-time-outs that watch real nodes.  What a PLC does not measure (spools, pump and slew pressures) is marked not available.
+`Bridge.step` emulates safety module, encoders, valve node and pressure modules with the PLC's last answer; call it
+every 5 ms and whenever frames arrive.  `Bridge.command` is the next command for the PLC.  Unless a good answer of the
+PLC is at most 50 ms old, nothing is sent on crane0, and the controller stops by the same time-outs that monitor real
+nodes.  Values that a PLC does not measure (spools, pump and slew pressures) are marked not available.
 """
 
 from __future__ import annotations
@@ -11,174 +11,185 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from can_dbc.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID, Wire
-from can_dbc.codec import Database
-from can_dbc.frame import Frame
+from can_dbc.dbc.codec import Database
+from can_dbc.frame import Frame, RawFrame
 from can_dbc.plc.map import Command, Estop, Feedback, Grapple, Role, State, WordOrder
+from can_dbc.protocols.canopen import NMT_ID, SDO_TO_SERVER, SYNC_ID
+from controller.bus_io.messages import PeriodicTimer, ProtectedMessage
 from controller.config import ConfigError
-from controller.outputs import Every, Message
-from controller.plc.emulated_nodes import Between, PlayedEncoder, PlayedNode
+from controller.plc.emulated_nodes import EmulatedEncoder, EmulatedNode, LinearInterpolator
 from controller.plc.handshake import FRESH_NS, Handshake
 from controller.plc.valve_gate import ValveGate, fault_bits, state_of
+from machine.crane_nodes import PRESSURE_NODES, CraneNode
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
 
 MS: Final = 1_000_000
 EXCHANGE_NS: Final = 10 * MS
-"""A command goes to the PLC this often (100 Hz)."""
-SAFE_NODE, VALVE_NODE, PRESSURE_NODES = 0x01, 0x10, (0x20, 0x21, 0x22)
-FORGOTTEN_NS: Final = 250 * MS
-"""After a silence of this long the played nodes boot: their heartbeats were missed."""
+"""Period of commands to the PLC (100 Hz)."""
+REBOOT_AFTER_NS: Final = 250 * MS
+"""After this long without frames the emulated nodes boot: their heartbeats were missed."""
 _NO_AXIS: Final = 15
-_ENDS: Final = (0.02, 0.98)
+_CLOSED_SHARE, _OPEN_SHARE = 0.02, 0.98
 _PLC_RUNS, _PLC_HOLDS = 2, 1
 
 
 def role_of(profile: Profile) -> Role:
-    """The PLC's role on this machine; raises ConfigError for what the bridge cannot serve."""
+    """The PLC's role on this machine.
+
+    Raises:
+        ConfigError: the machine has no PLC, or has a carrier.
+    """
     if profile.plc is None:
-        raise ConfigError(f'{profile.name} has no PLC; add [plc] with role = "references" or "valves" to the profile.')
+        raise ConfigError(
+            "config.no-plc",
+            f'{profile.name} has no PLC; add [plc] with role = "references" or "valves" to the profile.',
+        )
     if profile.carrier is not None:
-        raise ConfigError(f"{profile.name} has a carrier; the PLC bridge serves a crane on a fixed base.")
+        raise ConfigError(
+            "config.plc-carrier",
+            f"{profile.name} has a carrier; the PLC bridge serves a crane on a fixed base only, use another profile.",
+        )
     return Role.REFERENCES if profile.plc.role == "references" else Role.VALVES
 
 
 class Bridge:
-    """All state of the bridge; ``handshake`` talks to the PLC, ``gate`` listens to controller and guard."""
+    """All state of the bridge; ``handshake`` exchanges with the PLC, ``gate`` receives from controller and guard."""
 
     def __init__(self, profile: Profile, database: Database, order: WordOrder = WordOrder.HIGH_FIRST) -> None:
         role = role_of(profile)
         self.handshake = Handshake(order)
         self.gate = ValveGate(profile, role, database)
         specs = {j: spec for j in JOINTS if (spec := joint(profile, j).encoder) is not None}
-        self._encoders = {j: PlayedEncoder(spec, database.message(spec.message)) for j, spec in specs.items()}
-        helpers = [PlayedNode(n, {}, starts=True) for n in (SAFE_NODE, VALVE_NODE, *PRESSURE_NODES)]
-        self._nodes: list[PlayedNode] = [*helpers, *self._encoders.values()]
+        self._encoders = {j: EmulatedEncoder(spec, database.message(spec.message)) for j, spec in specs.items()}
+        numbers = (CraneNode.SAFETY_MODULE, CraneNode.VALVES, *PRESSURE_NODES)
+        helpers = [EmulatedNode(n, {}, starts=True) for n in numbers]
+        self._nodes: list[EmulatedNode] = [*helpers, *self._encoders.values()]
         self._by_number = {node.node: node for node in self._nodes}
-        self._positions = {j: Between() for j in self._encoders}
+        self._positions = {j: LinearInterpolator() for j in self._encoders}
         names = ("EstopStat", "ValveFbA", "ValveFbB", "PressA", "PressB", "PressC", "GrappleStat", "PlcStatus")
-        self._messages = {name: Message(database.message(name)) for name in names}
-        self._fast, self._estop_due, self._slow = Every(5 * MS), Every(10 * MS), Every(20 * MS)
+        self._messages = {name: ProtectedMessage(database.message(name)) for name in names}
+        self._fast, self._estop_due, self._slow = PeriodicTimer(5 * MS), PeriodicTimer(10 * MS), PeriodicTimer(20 * MS)
         self._estop_bits, self._estop_events = -1, 0
         self._counter = 0
-        self._heard: Feedback | None = None
-        self._spoke_ns = -FORGOTTEN_NS
+        self._feedback: Feedback | None = None
+        self._sent_ns = -REBOOT_AFTER_NS
         self._last = Command()
 
     def command(self, now_ns: int) -> Command:
-        """What the PLC is to be told now."""
+        """The command for the PLC now."""
         feedback = self.handshake.feedback if self.handshake.fresh(now_ns) else None
         self._last = self.gate.command(now_ns, feedback)
         return self._last
 
-    def step(self, now_ns: int, frames: list[Frame]) -> list[Wire]:
-        """Takes the frames since the last call; returns what to send."""
+    def step(self, now_ns: int, frames: list[Frame]) -> list[RawFrame]:
+        """Use the frames since the last call; returns the frames to send."""
         feedback = self.handshake.feedback
-        speaking = feedback is not None and self.handshake.fresh(now_ns)
-        if speaking and now_ns - self._spoke_ns > FORGOTTEN_NS:
-            self._wake()
-        out: list[Wire] = []
-        if feedback is not None and feedback is not self._heard:
-            self._notice(feedback, now_ns)
+        answering = feedback is not None and self.handshake.fresh(now_ns)
+        if answering and now_ns - self._sent_ns > REBOOT_AFTER_NS:
+            self._boot_nodes()
+        out: list[RawFrame] = []
+        if feedback is not None and feedback is not self._feedback:
+            self._use_feedback(feedback, now_ns)
         for frame in frames:
-            self._receive(frame, now_ns, out if speaking else None)
-        if speaking and feedback is not None:
-            self._spoke_ns = now_ns
-            self._say(feedback, now_ns, out)
+            self._receive(frame, now_ns, out if answering else None)
+        if answering and feedback is not None:
+            self._sent_ns = now_ns
+            self._send_cyclic(feedback, now_ns, out)
         return out
 
-    def _wake(self) -> None:
+    def _boot_nodes(self) -> None:
         for node in self._nodes:
             node.boot()
-        for between in self._positions.values():
-            between.forget()
+        for position in self._positions.values():
+            position.forget()
 
-    def _notice(self, feedback: Feedback, now_ns: int) -> None:
-        """A new answer; positions count only when the PLC has made a cycle since."""
-        before, self._heard = self._heard, feedback
+    def _use_feedback(self, feedback: Feedback, now_ns: int) -> None:
+        """Use a new answer; its positions count only when the PLC has completed a cycle since."""
+        before, self._feedback = self._feedback, feedback
         if before is None or before.heartbeat != feedback.heartbeat:
-            for j, between in self._positions.items():
-                between.sample(feedback.position[j], now_ns, FRESH_NS)
+            for j, position in self._positions.items():
+                position.sample(feedback.position[j], now_ns, FRESH_NS)
 
-    def _receive(self, frame: Frame, now_ns: int, out: list[Wire] | None) -> None:
-        """``out`` is None while we are silent: then only the gate listens."""
+    def _receive(self, frame: Frame, now_ns: int, out: list[RawFrame] | None) -> None:
+        """``out`` is None while nothing may be sent; then only the gate uses the frame."""
         key = frame.key
         if key == SYNC_ID:
             self.gate.sync(now_ns)
-            if out is not None and self._heard is not None:
-                self._sample(self._heard, now_ns, out)
+            if out is not None and self._feedback is not None:
+                self._sample(self._feedback, now_ns, out)
         elif key == NMT_ID and out is not None:
             for node in self._nodes:
                 node.receive_nmt(frame.data)
         elif SDO_TO_SERVER < key <= SDO_TO_SERVER + 0x7F and out is not None:
             addressed = self._by_number.get(key - SDO_TO_SERVER)
-            answer = None if addressed is None else addressed.receive_sdo(key, frame.data)
+            answer = None if addressed is None else addressed.sdo_answer(key, frame.data)
             if answer is not None:
                 out.append(answer)
         else:
             self.gate.receive(frame, now_ns)
 
-    def _sample(self, feedback: Feedback, now_ns: int, out: list[Wire]) -> None:
+    def _sample(self, feedback: Feedback, now_ns: int, out: list[RawFrame]) -> None:
         for j, encoder in self._encoders.items():
             answer = encoder.answer(self._positions[j].at(now_ns), feedback.velocity[j], now_ns)
             if answer is not None:
                 out.append(answer)
 
-    def _say(self, feedback: Feedback, now_ns: int, out: list[Wire]) -> None:
-        """What the played nodes send by themselves."""
+    def _send_cyclic(self, feedback: Feedback, now_ns: int, out: list[RawFrame]) -> None:
+        """Append the frames that the emulated nodes send by themselves."""
         for node in self._nodes:
-            node.tick(now_ns, out)
+            node.step(now_ns, out)
         running = {number: node.operational for number, node in self._by_number.items()}
         if feedback.estop != self._estop_bits:
             self._estop_events = (self._estop_events + 1) & 0xFF
         changed, self._estop_bits = feedback.estop != self._estop_bits, feedback.estop
-        if (self._estop_due.due(now_ns) or changed) and running[SAFE_NODE]:
+        if (self._estop_due.due(now_ns) or changed) and running[CraneNode.SAFETY_MODULE]:
             out.append(self._estop(feedback))
         fast, slow = self._fast.due(now_ns), self._slow.due(now_ns)
-        if running[VALVE_NODE]:
+        if running[CraneNode.VALVES]:
             if fast:
                 out += self._valves(feedback, now_ns)
             if slow:
                 out += (self._grapple(feedback), self._status(feedback))
         p, wire = feedback.pressure_bar, self._messages
         if fast and running[PRESSURE_NODES[0]]:
-            out.append(wire["PressA"].carrying(0, *p[0:4]))
+            out.append(wire["PressA"].frame_with(0, *p[0:4]))
         if fast and running[PRESSURE_NODES[1]]:
-            out.append(wire["PressB"].carrying(0, *p[4:6], None, None))
+            out.append(wire["PressB"].frame_with(0, *p[4:6], None, None))
         if slow and running[PRESSURE_NODES[2]]:
-            out.append(wire["PressC"].carrying(0, None, None, *p[6:8]))
+            out.append(wire["PressC"].frame_with(0, None, None, *p[6:8]))
 
-    def _estop(self, feedback: Feedback) -> Wire:
+    def _estop(self, feedback: Feedback) -> RawFrame:
         bits = feedback.estop
         channels = (int(bool(bits & Estop.CHANNEL_A)), int(bool(bits & Estop.CHANNEL_B)))
         reset, pilot = int(bool(bits & Estop.RESET_PRESSED)), int(bool(bits & Estop.PILOT_ON))
         person = int(bool(bits & Estop.PERSON))
-        return self._messages["EstopStat"].carrying(*channels, 0, reset, pilot, person, None, self._estop_events)
+        return self._messages["EstopStat"].frame_with(*channels, 0, reset, pilot, person, None, self._estop_events)
 
-    def _valves(self, feedback: Feedback, now_ns: int) -> tuple[Wire, Wire]:
-        """The counter of the last command is echoed only while the PLC itself takes ours."""
+    def _valves(self, feedback: Feedback, now_ns: int) -> tuple[RawFrame, RawFrame]:
+        """Echo the counter of the last command only while the PLC accepts commands."""
         if self.handshake.acknowledged(now_ns):
             self._counter = self.gate.counter
         unknown = (None,) * 4
         return (
-            self._messages["ValveFbA"].carrying(state_of(feedback, self.gate), *unknown),
-            self._messages["ValveFbB"].carrying(
+            self._messages["ValveFbA"].frame_with(state_of(feedback, self.gate), *unknown),
+            self._messages["ValveFbB"].frame_with(
                 feedback.fault_axis if feedback.fault_axis < _NO_AXIS else _NO_AXIS,
                 None, None, None, self.gate.exit, self._counter, 3,
             ),
         )  # fmt: skip
 
-    def _grapple(self, feedback: Feedback) -> Wire:
+    def _grapple(self, feedback: Feedback) -> RawFrame:
         rotator = math.degrees(math.remainder(feedback.position[Joint.ROT], math.tau))
         rot_deg = rotator if Joint.ROT in self._encoders else None
-        return self._messages["GrappleStat"].carrying(
+        return self._messages["GrappleStat"].frame_with(
             self._grapple_state(feedback.opening), 100.0 * feedback.opening, feedback.pressure_bar[6], feedback.load_kg,
             rot_deg,
         )  # fmt: skip
 
     def _grapple_state(self, opening: float) -> int:
         """0 unknown, 1 open, 2 opening, 3 closing, 4 closed, 5 holding: by the last command and the opening."""
-        closed, opened = opening < _ENDS[0], opening > _ENDS[1]
+        closed, opened = opening < _CLOSED_SHARE, opening > _OPEN_SHARE
         match self._last.grapple:
             case Grapple.OPEN:
                 return 1 if opened else 2
@@ -189,8 +200,8 @@ class Bridge:
             case _:
                 return 1 if opened else 4 if closed else 5
 
-    def _status(self, feedback: Feedback) -> Wire:
+    def _status(self, feedback: Feedback) -> RawFrame:
         run = _PLC_RUNS if feedback.state is State.EXECUTE else _PLC_HOLDS
-        return self._messages["PlcStatus"].carrying(
+        return self._messages["PlcStatus"].frame_with(
             run, feedback.heartbeat & 0xFF, feedback.longest_cycle_us, fault_bits(feedback)
         )

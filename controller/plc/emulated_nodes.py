@@ -1,7 +1,7 @@
-"""The CANopen nodes that the bridge plays on crane0: NMT, heartbeat, object dictionary, and an encoder's TPDO1.
+"""The CANopen nodes that the bridge emulates on crane0: NMT, heartbeat, object dictionary, and an encoder's TPDO1.
 
-Pure.  A node answers only while the PLC behind it lives; when it comes back after a silence it boots, so that the
-controller sets it up again as it would a device that had lost its supply.
+Pure.  A node answers only while the PLC behind it does; when the PLC answers again after a silence the node boots, so
+that the controller sets it up again like a device that had lost its supply.
 """
 
 from __future__ import annotations
@@ -14,20 +14,16 @@ from can_dbc.frame import RawFrame
 from can_dbc.protocols.canopen import NodeState, heartbeat_frame
 from can_dbc.protocols.canopen_slave import HEARTBEAT_MS, CanopenSlave, Objects
 from controller.bus_io.messages import PeriodicTimer
+from controller.crane.startup import TPDO1, TPDO1_MAPPINGS
 from machine.profile import Encoder
 from machine.sensing.encoder import counts_from_position
 
 HEARTBEAT_NS: Final = HEARTBEAT_MS * 1_000_000
 _NOT_VALID: Final = 0x8000_0000
-_TPDO1: Final = 0x180
-_MAPPINGS: Final = {
-    "rotary": (0x6004_0020, 0x2120_0010, 0x6503_0010),
-    "linear": (0x6004_0020, 0x6030_0110, 0x5122_0108, 0x5122_0208),
-}
 
 
-class PlayedNode(CanopenSlave):
-    """A node with heartbeat and SDO server.  ``starts`` says whether it goes operational by itself."""
+class EmulatedNode(CanopenSlave):
+    """A node with heartbeat and SDO server; with ``starts`` it becomes operational by itself."""
 
     def __init__(
         self, node: int, objects: Objects, starts: bool, writable: Set[tuple[int, int]] = frozenset()
@@ -43,11 +39,11 @@ class PlayedNode(CanopenSlave):
         self.restart()
 
     def restart(self) -> None:
-        """The object dictionary is as delivered again."""
+        """Reset the object dictionary to its initial values."""
         self.objects = dict(self._initial)
 
-    def tick(self, now_ns: int, out: list[RawFrame]) -> None:
-        """Boot-up message and heartbeat."""
+    def step(self, now_ns: int, out: list[RawFrame]) -> None:
+        """Append the boot-up message or the heartbeat that is due."""
         if self.state is NodeState.BOOT_UP:
             out.append(heartbeat_frame(self.node, NodeState.BOOT_UP))
             self.state = NodeState.OPERATIONAL if self._starts else NodeState.PRE_OPERATIONAL
@@ -55,12 +51,12 @@ class PlayedNode(CanopenSlave):
             out.append(heartbeat_frame(self.node, self.state))
 
 
-class PlayedEncoder(PlayedNode):
-    """A CiA 406 encoder whose position is the PLC's."""
+class EmulatedEncoder(EmulatedNode):
+    """A CiA 406 encoder with the PLC's position."""
 
     def __init__(self, spec: Encoder, codec: MessageCodec) -> None:
         self._spec, self._codec = spec, codec
-        cob = _TPDO1 + spec.node
+        cob = TPDO1 + spec.node
         scale: Objects = (
             {(0x6001, 0): spec.total_counts.to_bytes(4, "little")}
             if spec.kind == "rotary"
@@ -77,10 +73,10 @@ class PlayedEncoder(PlayedNode):
             } | scale | dict(communication),
             starts=False, writable=frozenset(communication) | {(0x1017, 0)},
         )  # fmt: skip
-        self._mapping = _MAPPINGS[spec.kind]
+        self._mapping = TPDO1_MAPPINGS[spec.kind]
 
     def answer(self, position: float, velocity: float, now_ns: int) -> RawFrame | None:
-        """TPDO1 in answer to SYNC, when it is set up for that as crane.dbc says."""
+        """TPDO1 in answer to SYNC; None unless it is configured as in crane.dbc."""
         if not self.operational or not self._mapped():
             return None
         spec = self._spec
@@ -100,8 +96,8 @@ class PlayedEncoder(PlayedNode):
         )
 
 
-class Between:
-    """A value that arrives in steps and is passed on without steps: linear from one sample to the next, one late."""
+class LinearInterpolator:
+    """Interpolates a sampled value: linear from one sample to the next, one sample late."""
 
     def __init__(self) -> None:
         self._from = self._to = 0.0
@@ -109,17 +105,17 @@ class Between:
         self._known = False
 
     def forget(self) -> None:
-        """The next sample stands alone."""
+        """The next sample is used without interpolation."""
         self._known = False
 
     def sample(self, value: float, now_ns: int, longest_ns: int) -> None:
-        """A new sample; it is reached as long after now as the last one came before, at most ``longest_ns``."""
+        """Add a sample; it is reached after the time since the previous sample, at most ``longest_ns``."""
         since_ns = now_ns - self._begin_ns
         self._from = self.at(now_ns) if self._known else value
         self._to, self._begin_ns, self._span_ns = value, now_ns, max(1, min(since_ns, longest_ns))
         self._known = True
 
     def at(self, now_ns: int) -> float:
-        """The value to pass on."""
+        """The interpolated value."""
         share = min(1.0, max(0.0, (now_ns - self._begin_ns) / self._span_ns)) if self._span_ns else 1.0
         return self._from + share * (self._to - self._from)

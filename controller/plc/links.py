@@ -1,7 +1,8 @@
-"""The two ways to the PLC, each a coroutine beside the bridge: one exchange every 10 ms, nothing queued, one at a time.
+"""The two links to the PLC, each a coroutine beside the bridge: one exchange every 10 ms, one at a time, nothing
+queued.
 
-A connection that fails is closed at once and tried again after a pause that grows to a second; the bridge notices by
-the age of the last answer, not by the connection.
+A connection that fails is closed at once and tried again after a pause that grows to a second.  The bridge detects the
+loss by the age of the last answer, not by the connection.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from can_dbc.plc.modbus import LinkError, ModbusClient, RegisterRefused
 from controller.plc.bridge import EXCHANGE_NS, Bridge
 
 TIMEOUT_S: Final = 0.1
-"""An answer later than this is no answer; the connection is closed, so that it cannot come at all."""
-PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0
+"""A later answer does not count; the connection is closed, so that it cannot arrive at all."""
+PAUSE_S, MAX_PAUSE_S = 0.05, 1.0
 _PERIOD_S: Final = EXCHANGE_NS * 1e-9
 _DATAGRAM_BYTES: Final = 2048
-_DATAGRAMS: Final = 16
+_MAX_DATAGRAMS: Final = 16
 
 
-class Pace:
-    """Absolute deadlines; whoever is late skips, and never catches up in a burst."""
+class ExchangeTimer:
+    """Absolute deadlines; a late exchange skips periods and never catches up in a burst."""
 
     def __init__(self) -> None:
         self._due = asyncio.get_running_loop().time()
@@ -44,38 +45,38 @@ class ModbusLink:
         self._bridge, self._client = bridge, ModbusClient(host, port, TIMEOUT_S)
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Run until cancelled."""
         pause = PAUSE_S
         while True:
             try:
                 await self._client.connect()
                 check_identity(await self._client.status(), self._bridge.handshake.order)
                 pause = PAUSE_S
-                await self._converse()
+                await self._exchange_cyclic()
             except LinkError as error:
-                self._bridge.handshake.lost(str(error))
+                self._bridge.handshake.exchange_failed(str(error))
             except (MapError, RegisterRefused) as error:
-                self._bridge.handshake.lost(str(error))
+                self._bridge.handshake.exchange_failed(str(error))
                 self._client.close()
             await asyncio.sleep(pause)
-            pause = min(2.0 * pause, LONGEST_PAUSE_S)
+            pause = min(2.0 * pause, MAX_PAUSE_S)
 
-    async def _converse(self) -> None:
-        """Exchanges until the connection fails (LinkError).  A refused command is counted, and the next one sent."""
-        shake, pace = self._bridge.handshake, Pace()
+    async def _exchange_cyclic(self) -> None:
+        """Exchange until the connection fails (LinkError).  A refused command is counted, and the next one is sent."""
+        shake, timer = self._bridge.handshake, ExchangeTimer()
         while True:
             now_ns = time.monotonic_ns()
             block = shake.registers(self._bridge.command(now_ns), now_ns)
             try:
                 answer = await self._client.exchange(block)
             except RegisterRefused as refused:
-                shake.refusal(refused.code)
+                shake.command_refused(refused.code)
                 answer = await self._client.status()
-            shake.take_registers(answer, time.monotonic_ns())
-            await pace.wait()
+            shake.accept_registers(answer, time.monotonic_ns())
+            await timer.wait()
 
     def close(self) -> None:
-        """Ends the connection."""
+        """Close the connection."""
         self._client.close()
 
 
@@ -89,28 +90,28 @@ class UdpLink:
         self._socket.connect((host, port))
 
     async def run(self) -> None:
-        """Until cancelled."""
-        loop, shake, pace = asyncio.get_running_loop(), self._bridge.handshake, Pace()
+        """Run until cancelled."""
+        loop, shake, timer = asyncio.get_running_loop(), self._bridge.handshake, ExchangeTimer()
         loop.add_reader(self._socket.fileno(), self._receive)
         while True:
             now_ns = time.monotonic_ns()
             data = shake.datagram(self._bridge.command(now_ns), now_ns)
             try:
                 self._socket.send(data)
-            except OSError as error:  # nobody listens, or the interface is gone: the answers' age says the rest
-                shake.lost(f"The PLC cannot be reached: {error.strerror}")
-            await pace.wait()
+            except OSError as error:  # nobody listens, or the interface is gone; the answers grow old
+                shake.exchange_failed(f"The PLC cannot be reached: {error.strerror}")
+            await timer.wait()
 
     def _receive(self) -> None:
-        for _ in range(_DATAGRAMS):
+        for _ in range(_MAX_DATAGRAMS):
             try:
                 data = self._socket.recv(_DATAGRAM_BYTES)
-            except OSError:  # nothing waits, or a former datagram met a closed port
+            except OSError:  # nothing waits, or an earlier datagram met a closed port
                 return
-            self._bridge.handshake.take_datagram(data, time.monotonic_ns())
+            self._bridge.handshake.accept_datagram(data, time.monotonic_ns())
 
     def close(self) -> None:
-        """Closes the socket."""
+        """Close the socket."""
         with contextlib.suppress(RuntimeError):
             asyncio.get_running_loop().remove_reader(self._socket.fileno())
         self._socket.close()

@@ -1,8 +1,8 @@
-"""What the controller commands and the guard allows, read from crane0 and turned into a command for the PLC.
+"""The controller's commands and the guard's enable, received from crane0 and turned into a command for the PLC.
 
-Pure, and safe by absence, like every valve node: a command that moves needs ValveCmdA and B with the arm key, the
+Pure, and safe by absence like every valve node: a command that moves needs ValveCmdA and B with the arm key, the
 guard's enable, and SYNC, all fresh; in role REFERENCES also the three reference frames.  After a loss while armed it
-stays neutral until the controller has disarmed.  What the PLC could not obey is refused here already, never clamped.
+stays neutral until the controller disarms.  A command beyond the PLC's limits is refused, never clamped.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from machine.status.modes import Mode as ControllerMode
 
 SYNC_NS: Final = 15_000_000
 RESET_NS: Final = 200_000_000
-_MOVES: Final = 2
-_DEGRADED: Final = 1
+_MODE_SPOOL: Final = 2
+_SAFE_STATE_DEGRADED: Final = 1
 _REFERENCES: Final = ("JointRefA", "JointRefB", "JointRefC")
 
 
 class ExitCode:
-    """ValveFbB.ExitCode (ISO 11783-7 reasons): why the node does not follow."""
+    """ValveFbB.ExitCode (ISO 11783-7 reasons): why the node does not follow its command."""
 
     OK, SAFETY_STOP, GUARD_MISSING, COMMAND_TIMEOUT, OUT_OF_RANGE, NOT_ARMED, FUNCTION_FAULT = 0, 2, 4, 5, 6, 8, 9
 
 
 class ValveGate:
-    """Reads crane0; ``command(now_ns, feedback)`` is what the PLC is to get next, ``exit`` why it is neutral."""
+    """Receives crane0; `command` is the next command for the PLC, ``exit`` why it is neutral."""
 
     def __init__(self, profile: Profile, role: Role, database: Database) -> None:
         self._role = role
@@ -46,10 +46,10 @@ class ValveGate:
         )
         names = ["ValveCmdA", "ValveCmdB", "GuardStat", "CtrlStatus"]
         names += _REFERENCES if role is Role.REFERENCES else ()
-        slots = [MessageState(database.message(name), bit) for bit, name in enumerate(names)]
-        self._a, self._b, self._guard, self._status, *self._references = slots
-        self._slots = tuple(slots)
-        self._by_key = {slot.codec.key: slot for slot in slots}
+        states = [MessageState(database.message(name), bit) for bit, name in enumerate(names)]
+        self._a, self._b, self._guard, self._status, *self._references = states
+        self._states = tuple(states)
+        self._by_key = {state.codec.key: state for state in states}
         self._axes = [self._place(s.valve.signal) for s in specs]
         self._places = [self._reference(j.name.capitalize()) for j in JOINTS] if self._references else []
         self._sync_ns = -SYNC_NS
@@ -63,23 +63,23 @@ class ValveGate:
         return (self._a if signal in self._a.codec.index else self._b), signal
 
     def _reference(self, name: str) -> tuple[MessageState, str]:
-        return next(slot for slot in self._references if name in slot.codec.index), name
+        return next(state for state in self._references if name in state.codec.index), name
 
     def receive(self, frame: Frame, now_ns: int) -> None:
-        """A frame from crane0; one that is not for us is ignored."""
-        slot = self._by_key.get(frame.key)
-        if slot is not None:
-            slot.take(frame, now_ns)
-            if slot is self._b and slot.fresh and slot.get("ArmKey") != ARM_KEY:
+        """Use a frame of crane0; other messages are ignored."""
+        state = self._by_key.get(frame.key)
+        if state is not None:
+            state.receive(frame, now_ns)
+            if state is self._b and state.fresh and state.get("ArmKey") != ARM_KEY:
                 self._locked = 0
 
     def sync(self, now_ns: int) -> None:
-        """SYNC seen."""
+        """Note a SYNC."""
         self._sync_ns = now_ns
 
     @property
     def locked(self) -> bool:
-        """Whether something was lost while armed, and nobody has disarmed since."""
+        """Whether an input was lost while armed, and the controller has not disarmed since."""
         return self._locked != 0
 
     @property
@@ -89,13 +89,13 @@ class ValveGate:
 
     def command(self, now_ns: int, feedback: Feedback | None) -> Command:
         """The command for the PLC now."""
-        age_out(self._slots, now_ns)
+        age_out(self._states, now_ns)
         missing = self._missing(now_ns)
         if missing and self._armed:
             self._locked = missing
-        asked = self._b.get("ArmKey") == ARM_KEY
-        self._armed = not missing and not self._locked and asked
-        self.exit = self._locked or missing or (ExitCode.OK if asked else ExitCode.NOT_ARMED)
+        armed = self._b.get("ArmKey") == ARM_KEY
+        self._armed = not missing and not self._locked and armed
+        self.exit = self._locked or missing or (ExitCode.OK if armed else ExitCode.NOT_ARMED)
         if not self._armed:
             return Command(reset=self._wants_reset(now_ns, feedback))
         command = self._wanted()
@@ -109,26 +109,26 @@ class ValveGate:
         return command
 
     def _missing(self, now_ns: int) -> int:
-        """What keeps us from passing a command on, as an exit code; 0 when nothing does."""
-        slots = (self._a, self._b, *self._references)
-        if any(slot.values is None for slot in slots) or now_ns - self._sync_ns > SYNC_NS:
+        """What prevents passing a command on, as an exit code; 0 when nothing does."""
+        needed = (self._a, self._b, *self._references)
+        if any(state.values is None for state in needed) or now_ns - self._sync_ns > SYNC_NS:
             return ExitCode.COMMAND_TIMEOUT
         if self._guard.get("Enable") != ARM_KEY:
             return ExitCode.GUARD_MISSING
-        if self._a.get("Mode") not in (0, _MOVES):
+        if self._a.get("Mode") not in (0, _MODE_SPOOL):
             return ExitCode.OUT_OF_RANGE
         return 0
 
     def _wanted(self) -> Command:
-        """What the controller asks for; a reference that is not available means that nothing is to move."""
+        """The controller's command; a reference that is not available means that nothing may move."""
         b, spare = self._b, (0.0,) * (N_AXES - N_JOINTS)
         mode, reference, rate = Mode.NEUTRAL, (0.0,) * N_AXES, (0.0,) * N_AXES
-        if self._a.get("Mode") == _MOVES and self._role is Role.VALVES:
+        if self._a.get("Mode") == _MODE_SPOOL and self._role is Role.VALVES:
             mode = Mode.VALVES
-            reference = tuple(slot.get(signal) / 100.0 for slot, signal in self._axes) + spare
-        elif self._a.get("Mode") == _MOVES:
-            positions = [slot.get(name) for slot, name in self._places]
-            rates = [slot.get(f"{name}Rate") for slot, name in self._places]
+            reference = tuple(state.get(signal) / 100.0 for state, signal in self._axes) + spare
+        elif self._a.get("Mode") == _MODE_SPOOL:
+            positions = [state.get(name) for state, name in self._places]
+            rates = [state.get(f"{name}Rate") for state, name in self._places]
             if None not in positions and None not in rates:
                 mode, reference, rate = Mode.REFERENCES, (*positions, *spare), (*rates, *spare)
         return Command(
@@ -138,13 +138,13 @@ class ValveGate:
             rate=rate,
             grapple=Grapple(b.get("GrappleMode")),
             grapple_pct=min(100, round(abs(b.get("Grapple")))),
-            max_speed_pct=50 if self._status.get("SafeState") == _DEGRADED else 100,
+            max_speed_pct=50 if self._status.get("SafeState") == _SAFE_STATE_DEGRADED else 100,
         )
 
     def _wants_reset(self, now_ns: int, feedback: Feedback | None) -> bool:
-        """A pulse while the PLC is latched and the controller is not: an operator has acknowledged what happened.
+        """A pulse while the PLC is latched and the controller is not, because an operator has reset the controller.
 
-        A reset moves nothing; the arm key still has to be given by a human through the controller.
+        A reset moves nothing; a human must still arm through the controller.
         """
         acknowledged = self._status.get("Mode") in (ControllerMode.BOOT, ControllerMode.STANDBY)
         latched = feedback is not None and (feedback.state is State.SAFE or feedback.fault != 0)

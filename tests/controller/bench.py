@@ -12,7 +12,12 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from can_dbc.canopen import (
+from can_dbc.dbc.codec import load
+from can_dbc.frame import Frame
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, OperatorCommand, StateReport
+from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.vehicle import VehicleReport
+from can_dbc.protocols.canopen import (
     SDO_TO_CLIENT,
     SdoKind,
     abort_frame,
@@ -21,28 +26,15 @@ from can_dbc.canopen import (
     parse_request,
     upload_response,
 )
-from can_dbc.codec import load
-from can_dbc.e2e import Sender
-from can_dbc.frame import Frame
-from can_dbc.nmea2000 import frames as packet
-from can_dbc.setpoint import (
-    CraneSetpoint,
-    GrappleCommand,
-    Knot,
-    OperatorAction,
-    OperatorCommand,
-    StateReport,
-    VehicleReport,
-    decode,
-    encode,
-)
+from can_dbc.protocols.e2e import Sender
+from can_dbc.protocols.nmea2000 import frames as packet
 from controller.config import load as load_settings
+from controller.laws.valve_map import ValveMap
 from controller.step import Controller, Inputs, Outputs, step
-from controller.valve import ValveMap
-from machine.encoder import counts_from_position
 from machine.joints import JOINTS, N_JOINTS
-from machine.modes import Mode
 from machine.profile import encoders, joint
+from machine.sensing.encoder import counts_from_position
+from machine.status.modes import Mode
 
 DATABASE = load("crane")
 MACHINE, GNSS = load("machine"), load("gnss")
@@ -276,7 +268,7 @@ class Bench:
             half, made = valve.hysteresis_pct / 200.0, self.valves[j]
             opening = max(self.spools[j] - half, min(self.spools[j] + half, self.openings[j]))
             self.openings[j] = opening
-            made.place(self.q[j])
+            made.set_position(self.q[j])
             deadband = (valve.deadband_plus_pct if opening > 0 else valve.deadband_minus_pct) / 100.0
             full = made.full_plus if opening > 0 else made.full_minus
             share = max(0.0, abs(opening) - deadband) / (1.0 - half - deadband)
@@ -309,12 +301,12 @@ class Bench:
 
     def hold(self, **fields) -> bytes:
         """A setpoint that stays where the reference is."""
-        reference = [r if r == r else 0.0 for r in self.controller.reference]
+        reference = [r if r == r else 0.0 for r in self.controller.reference_position]
         return self.setpoint([(0, reference, [0.0] * 5), (400, reference, [0.0] * 5)], **fields)
 
     def moving(self, j: int, speed: float, lease_ms: int = 200, **fields) -> bytes:
         """A setpoint that goes on from the reference with a constant velocity of one joint."""
-        start = list(self.controller.reference)
+        start = list(self.controller.reference_position)
         v = [0.0] * 5
         v[j] = speed
         end = list(start)

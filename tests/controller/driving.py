@@ -6,13 +6,13 @@ import math
 from collections import deque
 from typing import Any
 
-from bench import AORO, MS, Bench, T
-
-from can_dbc.setpoint import DriveSetpoint, Driving, Steering, VehicleReport, encode
-from machine.carrier import heading_rate_rad_s
-from machine.modes import Mode
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
+from machine.geometry.carrier import heading_rate_rad_s
 from machine.profile import Carrier
-from sim.geodesy import Site
+from machine.status.modes import Mode
+from sim.geometry.geodesy import LocalFrame
+from tests.controller.bench import AORO, MS, Bench, T
 
 CARRIER = AORO.profile.carrier
 assert isinstance(CARRIER, Carrier)
@@ -32,7 +32,7 @@ class DriveBench(Bench):
         self.roll_rad = self.pitch_rad = 0.0
         self.heights_m = list(TRANSPORT)
         self.lies: dict[str, dict[str, float | None]] = {}
-        self.site = Site(CARRIER.site_lat_deg, CARRIER.site_lon_deg, 260.0)
+        self.site = LocalFrame(CARRIER.site_lat_deg, CARRIER.site_lon_deg, 260.0)
         self.drive_sequence = 0
         self.slip = 1.0
         self.blocked = False
@@ -132,7 +132,7 @@ class DriveBench(Bench):
         self.armed()
         self.run(40)
         self.go(ticks, *place, **fields)
-        assert self.mode is Mode.ACTIVE and self.vehicle.driving is Driving.DRIVING, self.vehicle.order.refusal
+        assert self.mode is Mode.ACTIVE and self.vehicle.driving is Driving.DRIVING, self.vehicle.gate.refusal
         return self
 
     @property

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from math import isnan
 
-import bench
 import pytest
-from bench import Bench
 
-from can_dbc.setpoint import GrappleCommand
+from can_dbc.messages.crane import GrappleCommand
 from controller.config import load
 from controller.guard.__main__ import build, profile_path
 from controller.laws.grapple import GrappleState
 from machine.joints import JOINTS, Joint
-from machine.modes import Mode
 from machine.profile import joint
+from machine.status.modes import Mode
+from tests.controller import bench
+from tests.controller.bench import Bench
 
 SETTINGS = load("aoro_fc8")
 
@@ -42,9 +42,9 @@ def test_the_opening_on_the_bus_is_not_believed_and_time_closes_the_grapple(forw
     for k in range(700):
         forwarder.tick([forwarder.hold(grapple=GrappleCommand.OPEN)] if k % 10 == 0 else ())
         if k == 300:
-            assert forwarder.controller.grapple.state is GrappleState.OPENING, "100 % open says nothing here"
+            assert forwarder.controller.crane.grapple.state is GrappleState.OPENING, "100 % open says nothing here"
     assert isnan(forwarder.reports[-1].opening_pct)
-    assert forwarder.controller.grapple.state is GrappleState.OPEN
+    assert forwarder.controller.crane.grapple.state is GrappleState.OPEN
 
 
 def test_the_guard_reads_the_forwarder_and_lets_it_move(monkeypatch):

@@ -1,39 +1,38 @@
 """The nodes of crane0: their worst is found when something is said and when nothing is said for too long."""
 
-from bench import MS, Bench
-
-from can_dbc.canopen import Emergency, emergency_frame, heartbeat_frame
 from can_dbc.frame import Frame
-from controller.nodes import HEARTBEAT_TIMEOUT_NS, Nodes
-from machine.reasons import Reason
+from can_dbc.protocols.canopen import Emergency, emergency_frame, heartbeat_frame
+from controller.crane.nodes import HEARTBEAT_TIMEOUT_NS, NodeMonitor
+from machine.status.reasons import Reason
+from tests.controller.bench import MS, Bench
 
 
 def heard(nodes, now_ns, *frames):
-    nodes.begin()
+    nodes.begin_tick()
     for key, data in frames:
         assert nodes.receive(Frame(now_ns, key, data), now_ns)
 
 
 def test_silence_is_found_when_nobody_speaks_any_more():
-    nodes = Nodes([2])
+    nodes = NodeMonitor([2])
     heard(nodes, 10 * MS, heartbeat_frame(2, 5), heartbeat_frame(0x20, 5))
     heard(nodes, 15 * MS, heartbeat_frame(0x10, 5))
     end_ns = 10 * MS + HEARTBEAT_TIMEOUT_NS
     for now_ns in (15 * MS, 200 * MS, end_ns):
         heard(nodes, now_ns)
-        assert nodes.finding(now_ns) == (Reason.NONE, 0)
+        assert nodes.worst_finding(now_ns) == (Reason.NONE, 0)
     heard(nodes, end_ns + 1)
-    assert nodes.finding(end_ns + 1) == (Reason.ENCODER_NODE_LOST, 2), "worse than the lost pressure module"
+    assert nodes.worst_finding(end_ns + 1) == (Reason.ENCODER_NODE_LOST, 2), "worse than the lost pressure module"
     heard(nodes, end_ns + 6 * MS)
-    assert nodes.finding(end_ns + 6 * MS) == (Reason.SAFETY_NODE_LOST, 0x10)
+    assert nodes.worst_finding(end_ns + 6 * MS) == (Reason.SAFETY_NODE_LOST, 0x10)
 
 
 def test_the_hardest_finding_is_told_whoever_comes_first():
-    nodes = Nodes([2])
+    nodes = NodeMonitor([2])
     heard(nodes, 0, emergency_frame(Emergency(2, 0x4200, 1, b"")), emergency_frame(Emergency(0x22, 0x5000, 1, b"")))
-    assert nodes.finding(0) == (Reason.EMERGENCY_MESSAGE, 0x22)
+    assert nodes.worst_finding(0) == (Reason.EMERGENCY_MESSAGE, 0x22)
     heard(nodes, 1, emergency_frame(Emergency(0x22, 0, 0, b"")))
-    assert nodes.finding(1) == (Reason.EMERGENCY_WARNING, 2)
+    assert nodes.worst_finding(1) == (Reason.EMERGENCY_WARNING, 2)
 
 
 def test_a_restart_between_two_heartbeats_is_news_of_one_tick():

@@ -2,15 +2,15 @@
 
 import msgspec
 import pytest
-from bench import SETTINGS, SPECS, Bench
 from test_pace import GOALS, drive
 
 from controller.config import Settings
 from controller.laws.feedback import LAWS
-from controller.laws.joint import HEADROOM
-from controller.valve import ValveMap
-from machine.load import profile_hash
-from machine.modes import Mode
+from controller.laws.valve_map import ValveMap
+from machine.loading.profile_file import profile_hash
+from machine.motion_limits import SPEED_HEADROOM_SHARE
+from machine.status.modes import Mode
+from tests.controller.bench import SETTINGS, SPECS, Bench
 
 SLEW = SPECS[0]
 TOTAL_S = 16.0
@@ -18,7 +18,7 @@ TOTAL_S = 16.0
 
 @pytest.mark.parametrize("kind", [kind for kind in LAWS if kind != "pid"])
 def test_a_smooth_motion_of_all_joints_is_tracked(kind):
-    """Profile of the 2026 test-bed (machines.md 1.6), planner at 20 Hz, slow enough for the pump."""
+    """Profile of the 2026 test-bed (docs/reference/machines.md section 1.6), planner at 20 Hz, slow enough for the pump."""
     joints = {
         name: msgspec.structs.replace(s, law=msgspec.structs.replace(s.law, kind=kind))
         for name, s in SETTINGS.profile.joints.items()
@@ -28,9 +28,9 @@ def test_a_smooth_motion_of_all_joints_is_tracked(kind):
     worst = [0.0] * 5
     start = list(bench.q)
     for _ in drive(bench, TOTAL_S, TOTAL_S + 3.0):
-        reference = bench.controller.reference
+        reference = bench.controller.reference_position
         worst = [max(w, abs(q - r)) for w, q, r in zip(worst, bench.q, reference, strict=True)]
-        assert bench.controller.follower.behind_ns == 0
+        assert bench.controller.crane.governor.behind_ns == 0
     assert max(worst[:4]) < 0.004 and worst[4] < 0.01, worst
     for q, p, d, spec in zip(bench.q, start, GOALS, SPECS, strict=True):
         assert abs(q - p - d) <= 2.0 * spec.law.stop_band
@@ -55,9 +55,9 @@ def test_half_speed_slows_the_trajectory():
     bench.run(25)
     bench.drive(0, 0.13, 30)
     for _ in range(12):
-        planned = bench.controller.follower.planned(bench.now_ns)[1][0]
+        planned = bench.controller.crane.governor.planned(bench.now_ns)[1][0]
         bench.drive(0, min(planned + 0.03, 0.33), 10)
     assert bench.controller.supervisor.half_speed
-    limit = ValveMap(SLEW.valve).spool_pct(0.5 * HEADROOM * SLEW.speed_limit)
+    limit = ValveMap(SLEW.valve).spool_pct(0.5 * SPEED_HEADROOM_SHARE * SLEW.speed_limit)
     assert bench.commands_a["Slew"] <= limit + 0.05
-    assert bench.controller.follower.rate < 0.8
+    assert bench.controller.crane.governor.rate < 0.8

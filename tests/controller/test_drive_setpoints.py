@@ -5,27 +5,18 @@ import math
 import tracemalloc
 
 import pytest
-from bench import AORO, GNSS, MACHINE
-from driving import CARRIER, MS, TRANSPORT, DriveBench, T
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.setpoint import (
-    CraneSetpoint,
-    DriveSetpoint,
-    Driving,
-    GrappleCommand,
-    Knot,
-    OperatorAction,
-    SpoolKnot,
-    SpoolTest,
-    Steering,
-    encode,
-)
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, SpoolKnot, SpoolTest
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering
 from controller.step import Inputs, step
 from machine.joints import Joint
-from machine.modes import Mode
-from machine.reasons import Reason
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.controller.bench import AORO, GNSS, MACHINE
+from tests.controller.driving import CARRIER, MS, TRANSPORT, DriveBench, T
 
 LIMIT = CARRIER.articulation_limit_rad
 RATE = CARRIER.articulation_rate_limit_rad_s
@@ -88,9 +79,9 @@ def test_a_drive_setpoint_is_refused_with_its_reason_and_changes_nothing(name, s
     standing.run(201)  # the third refusal within a second would hold the machine
     standing.tick([standing.to(9, 0, 0.0, lease_ms=500)])
     vehicle = standing.vehicle
-    before, obeyed = vehicle.order.refused, vehicle.setpoint
+    before, obeyed = vehicle.gate.refused, vehicle.setpoint
     standing.tick([make(standing)])
-    assert (vehicle.order.refusal, vehicle.order.detail, vehicle.order.refused) == (reason, detail, before + 1)
+    assert (vehicle.gate.refusal, vehicle.gate.detail, vehicle.gate.refused) == (reason, detail, before + 1)
     assert vehicle.setpoint is obeyed and standing.mode is Mode.ACTIVE
     assert standing.controller.gate.refused == 0, "the crane's refusals are counted apart"
     standing.run(10)
@@ -102,13 +93,13 @@ def test_a_drive_setpoint_is_refused_with_its_reason_and_changes_nothing(name, s
 def test_a_drive_setpoint_at_the_edge_of_what_is_allowed_is_obeyed(name):
     bench = ready()
     bench.tick([EDGES[name](bench)])
-    assert bench.mode is Mode.ACTIVE and bench.vehicle.order.refused == 0
+    assert bench.mode is Mode.ACTIVE and bench.vehicle.gate.refused == 0
 
 
 def test_not_armed():
     bench = DriveBench().boot()
     bench.tick([bench.to(9, 0)])
-    assert bench.mode is Mode.STANDBY and bench.vehicle.order.refusal is Reason.NOT_ARMED
+    assert bench.mode is Mode.STANDBY and bench.vehicle.gate.refusal is Reason.NOT_ARMED
     assert bench.vehicle.driving is Driving.STANDING
 
 
@@ -129,7 +120,7 @@ def test_what_is_needed_and_not_there_refuses_a_drive(lie, reason):
     bench.lies = lie
     bench.run(220)
     bench.tick([bench.to(9, 0)])
-    assert bench.vehicle.order.refusal is reason and bench.mode is Mode.ARMED
+    assert bench.vehicle.gate.refusal is reason and bench.mode is Mode.ARMED
     bench.tick([bench.bend(0.0)])
     of_gnss = reason in (Reason.POSITION_LOST, Reason.HEADING_LOST, Reason.FIX_LOST)
     assert (bench.mode is Mode.ACTIVE) is of_gnss, "an angle of the articulation needs no GNSS"
@@ -213,13 +204,13 @@ def test_a_new_session_counts_anew():
     bench.run(35)
     bench.tick([bench.operator(OperatorAction.ARM)])
     bench.tick([old])
-    assert bench.mode is Mode.ARMED and bench.vehicle.order.refusal is Reason.OUT_OF_ORDER
+    assert bench.mode is Mode.ARMED and bench.vehicle.gate.refusal is Reason.OUT_OF_ORDER
     bench.tick([bench.to(50, 0, sequence=0)])
     assert bench.mode is Mode.ACTIVE
 
 
 def crane_to(bench: DriveBench, by: float) -> bytes:
-    there = [r if r == r else 0.0 for r in bench.controller.reference]
+    there = [r if r == r else 0.0 for r in bench.controller.reference_position]
     end = list(there)
     end[Joint.SLEW] += by
     still = (0.0,) * 5
@@ -252,7 +243,7 @@ def test_nothing_drives_while_the_crane_moves():
     bench.tick([bench.hold()])
     bench.drive(0, 0.08, 60)
     bench.tick([bench.to(9, 0), bench.moving(0, 0.08)])
-    assert bench.vehicle.order.refusal is Reason.CRANE_MOVES and bench.vehicle.setpoint is None
+    assert bench.vehicle.gate.refusal is Reason.CRANE_MOVES and bench.vehicle.setpoint is None
     assert bench.braked and bench.drive_command["ArmKey"] == 0
     bench.tick([bench.operator(OperatorAction.STOP)])
     bench.run(60)
@@ -306,7 +297,7 @@ def test_the_vehicle_report_says_what_is_known():
     assert report.heights_m == pytest.approx(TRANSPORT, abs=0.002)
     for stamp_ns, age_ms in ((report.position_ns, 105), (report.heading_ns, 105), (report.motion_ns, 25)):
         assert 0 < report.stamp_ns - stamp_ns <= age_ms * MS
-    assert report.drive_sequence == bench.vehicle.order.sequence > 0
+    assert report.drive_sequence == bench.vehicle.gate.sequence > 0
 
 
 def test_the_vehicle_report_says_what_is_not_known():
@@ -383,7 +374,7 @@ def test_driving_leaves_nothing_behind():
     gc.collect()
     after, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert twin.vehicle.driving is Driving.DRIVING and twin.vehicle.order.sequence == bench.vehicle.order.sequence
+    assert twin.vehicle.driving is Driving.DRIVING and twin.vehicle.gate.sequence == bench.vehicle.gate.sequence
     assert after - before < 2048, "bytes kept by 1200 ticks"
     gc.disable()
     try:

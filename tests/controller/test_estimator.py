@@ -4,21 +4,21 @@ import math
 
 import numpy as np
 import pytest
-from bench import MS, SPECS, T
 from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
-from controller.estimator import (
+from controller.estimation.joint_estimator import (
     STILL_S,
     JointEstimator,
     acceleration_density,
     measurement_variance,
     steady_gains,
 )
-from machine.encoder import counts_from_position, position_from_counts
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
+from machine.sensing.encoder import counts_from_position, position_from_counts
+from tests.controller.bench import MS, SPECS, T
 
 SLEW = SPECS[0]
 PERIOD_S = T * 1e-9
@@ -58,12 +58,12 @@ def test_estimates_are_those_of_a_kalman_filter_that_has_settled():
     predicted = solve_discrete_are(reference.F.T, reference.H.T, reference.Q, reference.R)
     reference.P = predicted - predicted @ reference.H.T @ reference.H @ predicted / (predicted[0, 0] + variance)
     ours = JointEstimator(SLEW, PERIOD_S)
-    ours.sample(0.0, 0)
+    ours.update(0.0, 0)
     reference.x = np.zeros((2, 1))
     for k in range(1, 600):
         measured = round(0.2 * math.sin(0.01 * k) / 4e-4) * 4e-4
         ours.predict(k * T)
-        ours.sample(measured, k * T)
+        ours.update(measured, k * T)
         reference.predict()
         reference.update(measured)
         assert [ours.position, ours.velocity] == pytest.approx(reference.x.ravel().tolist(), abs=1e-9)
@@ -86,10 +86,10 @@ def test_whole_counts_are_tracked_as_filterpys_steady_state_does(spec, share, hz
         ours.predict(k * T)
         reference.predict_steadystate()
         if k == 0:
-            ours.sample(measured, 0)
+            ours.update(measured, 0)
             reference.x = np.array([[measured], [0.0]])
         elif k not in lost:
-            ours.sample(measured, k * T)
+            ours.update(measured, k * T)
             reference.update_steadystate(np.array([[measured]]))
         assert abs(ours.position - reference.x[0, 0]) < 1e-7 and abs(ours.velocity - reference.x[1, 0]) < 1e-6
     assert ours.refused == 0
@@ -101,7 +101,7 @@ def follow(estimator, positions, age_ns=0, start_ns=10**9):
         now_ns = start_ns + k * T
         estimator.predict(now_ns)
         counts = counts_from_position(SLEW.encoder, position)
-        estimator.sample(position_from_counts(SLEW.encoder, counts), now_ns - age_ns)
+        estimator.update(position_from_counts(SLEW.encoder, counts), now_ns - age_ns)
 
 
 @pytest.mark.parametrize("age_ns", [0, T // 2, T])
@@ -120,7 +120,7 @@ def test_the_rate_does_not_change_what_the_filter_does():
     for estimator, dt in ((slow, 10 * MS), (fast, 5 * MS)):
         for k in range(1, int(0.1e9 / dt) + 1):
             estimator.predict(k * dt)
-            estimator.sample(0.2 * k * dt * 1e-9, k * dt)
+            estimator.update(0.2 * k * dt * 1e-9, k * dt)
     assert slow.velocity == pytest.approx(fast.velocity, rel=0.15)
 
 

@@ -1,14 +1,14 @@
 """Loss and fault of every input: the reaction, its detection bound and neutral commands in time, in virtual time."""
 
 import pytest
-from bench import MS, Bench, T, count_until
 
-from can_dbc.canopen import Emergency, emergency_frame, heartbeat_frame
-from can_dbc.setpoint import OperatorAction
-from machine.faults import FAULTS, describe
+from can_dbc.messages.crane import OperatorAction
+from can_dbc.protocols.canopen import Emergency, emergency_frame, heartbeat_frame
 from machine.joints import Joint
-from machine.modes import Mode
-from machine.reasons import Reaction, Reason, pack
+from machine.status.faults import FAULTS, describe
+from machine.status.modes import Mode
+from machine.status.reasons import Reaction, Reason, pack
+from tests.controller.bench import MS, Bench, T, count_until
 
 PROMISE_NS = 100 * MS
 
@@ -193,8 +193,8 @@ def test_emergency_messages(code, reason):
     assert bench.reason == reason and bench.controller.supervisor.detail == 4
     bench.extra.append(emergency_frame(Emergency(4, 0, 0, b"")))
     bench.tick()
-    assert not bench.controller.received.nodes.by_number[4].emergency
-    assert not bench.controller.received.nodes.by_number[4].warning
+    assert not bench.controller.crane_inputs.nodes.by_number[4].emergency
+    assert not bench.controller.crane_inputs.nodes.by_number[4].warning
 
 
 def test_three_communication_emergencies_in_ten_seconds_stop():
@@ -239,11 +239,11 @@ def test_three_refused_sends_in_a_row_stop_and_two_do_not():
 
 def test_frames_of_an_overflowed_tick_are_not_used():
     bench = Bench().active()
-    count = bench.controller.received.count
+    count = bench.controller.crane_inputs.count
     bench.tick([bench.moving(0, 0.08)], bus_dropped=3)
-    assert bench.controller.received.count == count
+    assert bench.controller.crane_inputs.count == count
     bench.tick(bus_dropped=3)
-    assert bench.controller.received.count > count and bench.mode is Mode.ACTIVE
+    assert bench.controller.crane_inputs.count > count and bench.mode is Mode.ACTIVE
 
 
 def test_late_loop_degrades_and_stalled_loop_stops():
@@ -289,7 +289,7 @@ def test_lease_lost_while_moving_slows_down_and_stops():
 
 def test_a_trajectory_that_ends_in_motion_ends_its_lease():
     bench = Bench().active()
-    start = list(bench.controller.reference)
+    start = list(bench.controller.reference_position)
     speed = [0.08, 0.0, 0.0, 0.0, 0.0]
     bench.tick([bench.setpoint([(0, start, speed), (50, [start[0] + 0.004, *start[1:]], speed)])])
     bench.run(12)
@@ -366,7 +366,7 @@ def test_descriptions_name_the_joint_and_the_node():
 
 def test_a_final_setpoint_whose_lease_ends_on_the_way_stops():
     bench = Bench().armed()
-    start = list(bench.controller.reference)
+    start = list(bench.controller.reference_position)
     end = [start[0] + 0.1, *start[1:]]
     bench.tick([bench.setpoint([(0, start, [0.0] * 5), (1500, end, [0.0] * 5)], final=True, lease_ms=300)])
     bench.run(62)

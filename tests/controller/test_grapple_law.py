@@ -3,11 +3,11 @@
 import math
 
 import pytest
-from bench import SETTINGS, Bench, T
 
-from can_dbc.setpoint import GrappleCommand
+from can_dbc.messages.crane import GrappleCommand
 from controller.laws.grapple import LOADED_KG, GrappleLaw, GrappleState
-from machine.modes import Mode
+from machine.status.modes import Mode
+from tests.controller.bench import SETTINGS, Bench, T
 
 SECOND = 10**9
 HIGH = 160.0
@@ -82,20 +82,20 @@ def test_what_weighs_something_is_held_whatever_the_tongs_say():
     law = made()
     now = run(law, GrappleCommand.CLOSE, 3.4, 40.0, 1.0)
     now = run(law, GrappleCommand.CLOSE, 0.1, HIGH, 1.0, start_ns=now)
-    law.weigh(0.5 * LOADED_KG, now)
-    law.weigh(0.5 * LOADED_KG, now + SECOND)
-    law.weigh(math.nan, now + 2 * SECOND)
+    law.observe_load(0.5 * LOADED_KG, now)
+    law.observe_load(0.5 * LOADED_KG, now + SECOND)
+    law.observe_load(math.nan, now + 2 * SECOND)
     assert law.state is GrappleState.CLOSED and not law.loaded
     now += 3 * SECOND
-    law.weigh(2.0 * LOADED_KG, now)
+    law.observe_load(2.0 * LOADED_KG, now)
     assert law.state is GrappleState.CLOSED, "a swing of the tongs"
-    law.weigh(2.0 * LOADED_KG, now + SECOND // 2)
+    law.observe_load(2.0 * LOADED_KG, now + SECOND // 2)
     assert law.state is GrappleState.HOLDING and law.loaded
-    law.weigh(0.0, now + SECOND)
+    law.observe_load(0.0, now + SECOND)
     assert law.state is GrappleState.HOLDING and not law.loaded, "on the ground it is held still"
-    law.weigh(2.0 * LOADED_KG, now + SECOND)
+    law.observe_load(2.0 * LOADED_KG, now + SECOND)
     law.step(GrappleCommand.OPEN, 0.0, 1.0, 0.0, now + SECOND)
-    law.weigh(2.0 * LOADED_KG, now + 2 * SECOND)
+    law.observe_load(2.0 * LOADED_KG, now + 2 * SECOND)
     assert law.state is GrappleState.OPENING and not law.loaded
 
 
@@ -103,11 +103,11 @@ def test_the_load_cell_tells_the_controller_that_the_grapple_is_loaded():
     bench = Bench().armed()
     for k in range(1100):
         bench.tick([bench.hold(grapple=GrappleCommand.CLOSE)] if k % 10 == 0 else ())
-    assert not bench.controller.grapple.loaded
+    assert not bench.controller.crane.grapple.loaded
     bench.changed["GrappleStat"] = {**bench.changed.get("GrappleStat", {}), "Load": 80.0}
     for k in range(200):
         bench.tick([bench.hold(grapple=GrappleCommand.CLOSE)] if k % 10 == 0 else ())
-    assert bench.controller.grapple.loaded and bench.reports[-1].load_kg == 80.0
+    assert bench.controller.crane.grapple.loaded and bench.reports[-1].load_kg == 80.0
 
 
 def held(opening):

@@ -4,19 +4,20 @@ import random
 from pathlib import Path
 
 import pytest
-from bench import DATABASE, MS, Bench, T, count_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.e2e import Sender, crc8
 from can_dbc.frame import Frame
-from can_dbc.setpoint import OperatorAction
+from can_dbc.messages.crane import OperatorAction
+from can_dbc.protocols.e2e import Sender, crc8
 from controller.guard.__main__ import build, main, profile_path
 from controller.guard.envelope import read_envelope
-from controller.guard.judge import CALM_NS, Guard, Verdict, checksum
+from controller.guard.guard import CALM_NS, Guard, Verdict, checksum
 from controller.guard.layout import GuardConfigError, read_layouts
-from machine.modes import Mode
-from machine.reasons import Reason
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.codes import coded
+from tests.controller.bench import DATABASE, MS, Bench, T, count_until
 
 PROFILE = profile_path("palms_471")
 CENTRE = 8192
@@ -305,12 +306,12 @@ def test_a_controller_that_ignores_a_lost_encoder_is_stopped_by_the_guard():
 
 
 def test_configuration_errors_say_what_to_do(tmp_path, capsys):
-    with pytest.raises(GuardConfigError, match="cannot read"):
+    with pytest.raises(GuardConfigError, check=coded("guard.profile-unreadable")):
         read_envelope(tmp_path / "none.toml")
     (tmp_path / "half.toml").write_text("[joints.slew]\nlower = 0\n")
-    with pytest.raises(GuardConfigError, match="incomplete"):
+    with pytest.raises(GuardConfigError, check=coded("guard.profile-incomplete")):
         read_envelope(tmp_path / "half.toml")
-    with pytest.raises(GuardConfigError, match="missing"):
+    with pytest.raises(GuardConfigError, check=coded("guard.message-missing")):
         read_layouts(DATABASE.path, ["NoSuchMessage"])
     assert main(["--profile", str(tmp_path / "none.toml"), "--bus", "crane0=wire:nowhere"]) == 3
     assert main(["--profile", "palms_471", "--bus", "crane0=wire:nowhere"]) == 4
@@ -323,7 +324,7 @@ def test_the_guard_imports_nothing_but_the_standard_library():
 
     code = (
         "import sys, controller.guard.__main__; bad = [m for m in sys.modules if m.split('.')[0] in "
-        "('can','cantools','canopen','msgspec','numpy','machine') or m in ('can_dbc.codec','controller.step')]; "
+        "('can','cantools','canopen','msgspec','numpy','machine') or m in ('can_dbc.dbc.codec','controller.step')]; "
         "print(bad)"
     )
     root = Path(__file__).parents[2]

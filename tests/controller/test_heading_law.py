@@ -3,25 +3,25 @@
 import math
 
 import pytest
-from driving import CARRIER, DriveBench, T
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.laws.drive import SETTLE_S, STANDS_M_S, STOP_M_S2, DriveLaw
+from controller.laws.drive import SETTLE_S, STANDING_M_S, STOP_M_S2, DriveLaw
 from controller.laws.heading import (
     ANGLE_BAND_RAD,
-    NEAR_M,
-    SLEW_S,
+    MIN_BEARING_M,
+    RATE_RISE_S,
     AngleLaw,
     SteeringLimits,
     WaypointLaw,
     east_north_m,
 )
-from controller.laws.suspension import LEVEL_M_S, Suspension, spool_pct
-from machine.carrier import heading_rate_rad_s
-from machine.modes import Mode
-from sim.geodesy import Site
+from controller.laws.suspension import MAX_LEVEL_M_S, Suspension, spool_pct
+from machine.geometry.carrier import heading_rate_rad_s
+from machine.status.modes import Mode
+from sim.geometry.geodesy import LocalFrame
 from sim.nodes.vehicle import spool_for
+from tests.controller.driving import CARRIER, DriveBench, T
 
 DT = T * 1e-9
 KP = CARRIER.heading_kp_1_s
@@ -35,7 +35,7 @@ metres = st.floats(-400.0, 400.0)
 
 @given(metres, metres, st.floats(-80.0, 80.0), st.floats(-180.0, 180.0))
 def test_metres_between_two_places_agree_with_the_ellipsoid(east, north, lat, lon):
-    latitude, longitude, _ = Site(lat, lon, 0.0).geodetic(east, north, 0.0)
+    latitude, longitude, _ = LocalFrame(lat, lon, 0.0).geodetic(east, north, 0.0)
     found = east_north_m(lat, lon, latitude, longitude)
     assert math.dist(found, (east, north)) < 0.02 + 3e-4 * math.hypot(east, north)
 
@@ -60,11 +60,11 @@ def test_the_rate_is_kp_times_the_wrapped_error(east, north, yaw):
 
 def test_near_the_waypoint_the_last_bearing_stays():
     law = WaypointLaw(CARRIER)
-    law.step(NEAR_M + 0.1, 0.0, 0.0)
-    assert law.step(0.0, NEAR_M - 0.1, 0.0) == 0.0
-    assert law.step(0.0, NEAR_M + 0.1, 0.0) == pytest.approx(KP * math.pi / 2)
+    law.step(MIN_BEARING_M + 0.1, 0.0, 0.0)
+    assert law.step(0.0, MIN_BEARING_M - 0.1, 0.0) == 0.0
+    assert law.step(0.0, MIN_BEARING_M + 0.1, 0.0) == pytest.approx(KP * math.pi / 2)
     law.reset()
-    assert law.step(0.0, NEAR_M - 0.1, 0.0) == pytest.approx(KP * math.pi / 2), "the first bearing is taken as it is"
+    assert law.step(0.0, MIN_BEARING_M - 0.1, 0.0) == pytest.approx(KP * math.pi / 2), "the first bearing is taken as it is"
 
 
 @pytest.mark.parametrize("unknown", [(math.nan, 1.0, 0.0), (1.0, math.nan, 0.0), (1.0, 1.0, math.nan)])
@@ -86,7 +86,7 @@ def test_the_rate_keeps_its_limits_whatever_is_wanted(script):
         if angle <= -LIMIT:
             assert rate >= 0.0
         faster = abs(rate) > abs(before) and rate * before >= 0.0
-        assert not faster or abs(rate - before) <= RATE / SLEW_S * DT + 1e-12
+        assert not faster or abs(rate - before) <= RATE / RATE_RISE_S * DT + 1e-12
         before = rate
 
 
@@ -135,7 +135,7 @@ def test_speed_keeps_limit_and_acceleration(wanted, cap):
         law.step(speed, before, cap, DT)
         assert abs(law.speed_m_s) <= cap * CARRIER.speed_limit_m_s
         if law.brake:  # at once, but only on a machine that stands
-            assert law.speed_m_s == 0.0 and abs(before) < STANDS_M_S
+            assert law.speed_m_s == 0.0 and abs(before) < STANDING_M_S
         else:
             assert abs(law.speed_m_s - before) <= CARRIER.drive_acceleration_m_s2 * DT + 1e-12
         before = law.speed_m_s
@@ -152,7 +152,7 @@ def test_the_brake_waits_until_it_stands_or_too_long():
     assert law.speed_m_s == pytest.approx(0.4) and not law.brake
     run(law, 0.0, 0.4, 1.1)
     assert law.speed_m_s == 0.0 and not law.brake
-    run(law, 0.0, STANDS_M_S / 2, 0.1)
+    run(law, 0.0, STANDING_M_S / 2, 0.1)
     assert law.brake
     run(law, 0.0, 0.2, 0.1)
     assert law.brake, "it is not opened for a machine that slides"
@@ -237,7 +237,7 @@ def test_levelling_raises_the_low_side_until_the_frame_is_level(roll, pitch):
             fastest = max(fastest, *(abs(a - b) for a, b in zip(heights, before, strict=True)))
             before = tuple(heights)
     assert max(map(abs, lean())) < 0.02
-    assert fastest <= 2.0 * (LEVEL_M_S + 0.002) + CARRIER.arm_in_band_m, "slowly"
+    assert fastest <= 2.0 * (MAX_LEVEL_M_S + 0.002) + CARRIER.arm_in_band_m, "slowly"
     assert sum(heights) / 4 == pytest.approx(0.3, abs=0.01), "without rising"
     for _ in range(4000):
         arms.step((0.3,) * 4, heights, False, lean(), (False, False), 1.0, DT)
@@ -275,7 +275,7 @@ def test_a_machine_that_leans_is_where_its_axle_is():
     bench.roll_rad, bench.pitch_rad = math.radians(10.0), math.radians(5.0)
     bench.under_way(300, 40.0, 0.0)
     latitude, longitude, _ = bench.site.geodetic(bench.east_m, bench.north_m, 0.0)
-    ahead, left = bench.vehicle.where.to_m(latitude, longitude)
+    ahead, left = bench.vehicle.reckoning.offset_m(latitude, longitude)
     assert abs(left) < 0.03 and abs(ahead) < 0.1, "the mast is 0.4 m aside"
 
 
@@ -284,8 +284,8 @@ def test_between_two_samples_the_heading_goes_on_with_the_odometry():
     yaw_rate = heading_rate_rad_s(CARRIER, bench.speed_m_s, bench.bend_rad, bench.bend_rate)
     steps = []
     for k in range(40):
-        before = bench.vehicle.where.yaw_rad
+        before = bench.vehicle.reckoning.yaw_rad
         bench.tick([bench.to(3.0, 30.0)] if k % 10 == 0 else ())
-        steps.append(bench.vehicle.where.yaw_rad - before)
+        steps.append(bench.vehicle.reckoning.yaw_rad - before)
     assert sum(s != 0.0 for s in steps) == 40, "every tick, not every sample"
     assert sum(steps) / (40 * DT) == pytest.approx(yaw_rate, rel=0.25)

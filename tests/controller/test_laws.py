@@ -4,17 +4,18 @@ import math
 
 import msgspec
 import pytest
-from bench import PROFILE, SPECS, T
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.estimator import JointEstimator
+from controller.estimation.joint_estimator import JointEstimator
 from controller.laws.crane import FLOW_SHARE, CraneLaw
-from controller.laws.end_positioning import INCH_SHARE, OPEN_LIMIT, Rest
+from controller.laws.end_positioning import INCH_SHARE, MAX_OPENING_SHARE, EndPositioning
 from controller.laws.feedback import INTEGRAL_SHARE, LAWS, PID_SHARE
-from controller.laws.joint import ACCELERATION_FACTOR, HEADROOM, InFlight, JointLaw, Vibration
-from controller.valve import ValveMap
+from controller.laws.joint import ACCELERATION_FACTOR, DelayCompensation, JointLaw, VibrationFilter
+from controller.laws.valve_map import ValveMap
 from machine.joints import JOINTS, Joint
+from machine.motion_limits import SPEED_HEADROOM_SHARE
+from tests.controller.bench import PROFILE, SPECS, T
 
 SLEW = SPECS[0]
 T_S = T * 1e-9
@@ -36,8 +37,8 @@ def budget(kind, law):
 
 
 def step(law, q_ref=0.0, v_ref=0.0, lead=0.0, q=0.0, v=0.0, load=math.nan, elapsed_s=T_S, cap=1.0):
-    law.wanted(q_ref, v_ref, lead, q, v, load, elapsed_s)
-    return law.finish(law.room(cap), elapsed_s)
+    law.desired_velocity(q_ref, v_ref, lead, q, v, load, elapsed_s)
+    return law.command(law.feasible_share(cap), elapsed_s)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -110,7 +111,7 @@ def test_what_is_in_flight_is_not_commanded_again():
 
 
 def test_in_flight_is_the_travel_of_the_last_delay():
-    flight = InFlight(5 * T_S, T_S)
+    flight = DelayCompensation(5 * T_S, T_S)
     for k in range(1, 9):
         flight.add(float(k))
     assert flight.travel == 4 + 5 + 6 + 7 + 8
@@ -119,7 +120,7 @@ def test_in_flight_is_the_travel_of_the_last_delay():
 
 
 def test_a_vibration_has_no_mean_and_an_unknown_pressure_is_none():
-    vibration = Vibration()
+    vibration = VibrationFilter()
     assert vibration.step(90.0, T_S) == 0.0
     for _ in range(4000):
         steady = vibration.step(120.0, T_S)
@@ -147,7 +148,7 @@ def test_a_law_never_exceeds_its_cap_and_never_drives_out_of_the_range(kind, q_r
         law = made(kind)
         for _ in range(2):
             command = step(law, q_ref, v_ref, lead, q, v, load, 10.0, cap)
-        assert abs(command) <= min(HEADROOM * SLEW.speed_limit * cap, 0.5) + 1e-12
+        assert abs(command) <= min(SPEED_HEADROOM_SHARE * SLEW.speed_limit * cap, 0.5) + 1e-12
         assert not (q > SLEW.upper and command > 0.0)
         assert not (q < SLEW.lower and command < 0.0)
 
@@ -181,7 +182,7 @@ class Oil:
 
 def settle(wrong, start, seconds=20.0, rest=None):
     """(error at the end, when the valve opened last, how often it opened) of a joint that rests ``start`` off."""
-    rest, oil = rest or Rest(SLEW), Oil(wrong)
+    rest, oil = rest or EndPositioning(SLEW), Oil(wrong)
     rest.reset()
     rest.follow()
     last_s, openings, before = 0.0, 0, 0.0
@@ -204,7 +205,7 @@ def test_a_joint_comes_to_rest_near_its_goal_whatever_its_dead_band(wrong, start
 
 
 def test_what_is_learned_makes_the_next_stop_shorter():
-    rest = Rest(SLEW)
+    rest = EndPositioning(SLEW)
     first = settle(-0.04, 0.01, rest=rest)
     second = settle(-0.04, 0.01, rest=rest)
     assert second[2] < first[2] and abs(second[0]) <= SLEW.law.stop_band
@@ -228,13 +229,13 @@ def first_inch(rest, way, oil):
 
 
 def test_a_long_inch_of_a_valve_that_gives_more_than_is_known_ends_when_enough_is_under_way():
-    _, left = first_inch(Rest(SLEW), 0.01, Oil(wrong=INCH_SHARE))
+    _, left = first_inch(EndPositioning(SLEW), 0.01, Oil(wrong=INCH_SHARE))
     assert -0.006 < left < 0.0, "by the clock alone it would go nearly as far beyond as it came from"
 
 
 def test_a_short_inch_that_a_swinging_load_may_have_moved_teaches_little():
     def next_inch_s(*earlier):
-        rest = Rest(SLEW)
+        rest = EndPositioning(SLEW)
         for way in earlier:
             first_inch(rest, way, Oil(wrong=INCH_SHARE))  # it goes twice as far
         return first_inch(rest, 0.01, Oil(wrong=-1.0))[0]
@@ -243,7 +244,7 @@ def test_a_short_inch_that_a_swinging_load_may_have_moved_teaches_little():
 
 
 def test_within_the_stop_band_nothing_happens():
-    rest = Rest(SLEW)
+    rest = EndPositioning(SLEW)
     rest.follow()
     for k in range(2000):
         error = 0.9 * SLEW.law.stop_band * math.sin(3.0 * k * T_S)
@@ -252,7 +253,7 @@ def test_within_the_stop_band_nothing_happens():
 
 
 def test_a_load_that_swings_on_the_oil_is_not_chased():
-    rest, commands = Rest(SLEW), 0
+    rest, commands = EndPositioning(SLEW), 0
     rest.follow()
     for k in range(4000):
         error = 0.0025 * math.sin(3.5 * k * T_S) * math.exp(-0.1 * k * T_S)
@@ -261,10 +262,10 @@ def test_a_load_that_swings_on_the_oil_is_not_chased():
 
 
 def test_a_stuck_valve_is_not_opened_ever_further():
-    rest = Rest(SLEW)
+    rest = EndPositioning(SLEW)
     rest.follow()
     widest = max(abs(rest.step(0.005, 0.005, 0.005, T_S)) for _ in range(20_000))
-    assert widest <= OPEN_LIMIT * SLEW.valve.full_speed_plus + 1e-12
+    assert widest <= MAX_OPENING_SHARE * SLEW.valve.full_speed_plus + 1e-12
     assert widest > INCH_SHARE * SLEW.valve.full_speed_plus
 
 
@@ -302,7 +303,7 @@ def standing(positions):
     out = [JointEstimator(spec, T_S) for spec in SPECS]
     for e, q in zip(out, positions, strict=True):
         e.predict(0)
-        e.sample(q, 0)
+        e.update(q, 0)
     return out
 
 
@@ -338,8 +339,8 @@ def test_the_joints_ask_for_no_more_flow_than_the_pump_gives():
 def test_load_pressure_counts_the_chambers_by_their_areas():
     law = crane()
     lift = SPECS[Joint.LIFT].valve
-    assert law.load_bar(Joint.LIFT, 90.0, 20.0) == pytest.approx(90.0 - 20.0 * lift.flow_minus / lift.flow_plus)
-    assert math.isnan(law.load_bar(Joint.LIFT, None, 20.0)) and math.isnan(law.load_bar(Joint.LIFT, 90.0, None))
+    assert law.load_pressure_bar(Joint.LIFT, 90.0, 20.0) == pytest.approx(90.0 - 20.0 * lift.flow_minus / lift.flow_plus)
+    assert math.isnan(law.load_pressure_bar(Joint.LIFT, None, 20.0)) and math.isnan(law.load_pressure_bar(Joint.LIFT, 90.0, None))
 
 
 def test_a_stop_lets_the_last_commands_fade_and_a_reset_forgets_them():
@@ -353,7 +354,7 @@ def test_a_stop_lets_the_last_commands_fade_and_a_reset_forgets_them():
 
 def opened_s(left: float) -> float:
     """When the valve first opens for a joint that arrived so many stop bands away and swings by one and a half."""
-    rest, band = Rest(SLEW), SLEW.law.stop_band
+    rest, band = EndPositioning(SLEW), SLEW.law.stop_band
     rest.follow()
     for k in range(600):
         error = band * (left + 1.5 * math.sin(2.0 * math.pi * k * 0.005))

@@ -5,12 +5,12 @@ import math
 
 import msgspec
 import pytest
-from bench import HOME, SETTINGS, Bench
 
-from controller.load import LoadEstimate
-from machine.lift import empty_moment_nm, lever_share
+from controller.estimation.load_estimator import LoadEstimator
+from machine.geometry.sag import GRAVITY_M_S2, distances
 from machine.profile import Sag
-from machine.sag import GRAVITY_M_S2, distances
+from machine.sensing.weighing import empty_moment_nm, lever_share
+from tests.controller.bench import HOME, SETTINGS, Bench
 
 PROFILE = msgspec.structs.replace(SETTINGS.profile, sag=Sag(0.002, 0.0015, 0.01, 1e-6, 5200.0, 2900.0))
 PERIOD_S = 0.02
@@ -25,14 +25,14 @@ def pressures(kg: float, q=HOME) -> tuple[float, float]:
     return load_bar + BACK_BAR * lift.flow_minus / lift.flow_plus, BACK_BAR
 
 
-def run(estimate: LoadEstimate, kg: float, seconds: float, velocity=lambda time_s: 0.0) -> float:
+def run(estimate: LoadEstimator, kg: float, seconds: float, velocity=lambda time_s: 0.0) -> float:
     for i in range(round(seconds / PERIOD_S)):
         found = estimate.step(HOME, velocity(i * PERIOD_S), *pressures(kg), PERIOD_S)
     return found
 
 
 def test_the_load_at_rest_is_what_the_empty_crane_does_not_weigh():
-    estimate = LoadEstimate(PROFILE)
+    estimate = LoadEstimator(PROFILE)
     assert run(estimate, 0.0, PERIOD_S) == pytest.approx(0.0, abs=1e-6)
     after = run(estimate, 200.0, 0.8)
     assert 100.0 < after < 150.0, "filtered"
@@ -40,20 +40,20 @@ def test_the_load_at_rest_is_what_the_empty_crane_does_not_weigh():
 
 
 def test_it_counts_while_the_lift_moves_steadily_and_not_while_it_changes_speed():
-    estimate = LoadEstimate(PROFILE)
+    estimate = LoadEstimator(PROFILE)
     run(estimate, 100.0, 1.0)
     assert run(estimate, 300.0, 0.4, lambda t: 0.4 * t) == pytest.approx(100.0, abs=15.0), "it speeds up: the old value"
     assert run(estimate, 300.0, 8.0, lambda t: 0.16) == pytest.approx(300.0, abs=1.0)
 
 
 def test_a_light_grapple_is_no_negative_load():
-    assert run(LoadEstimate(PROFILE), -40.0, 1.0) == 0.0
+    assert run(LoadEstimator(PROFILE), -40.0, 1.0) == 0.0
 
 
 @pytest.mark.parametrize("gone", ["pressure", "position", "sag"])
 def test_what_is_unknown_is_nan_at_once_and_begins_anew(gone):
     profile = msgspec.structs.replace(PROFILE, sag=None) if gone == "sag" else PROFILE
-    estimate = LoadEstimate(profile)
+    estimate = LoadEstimator(profile)
     run(estimate, 250.0, 2.0)
     a, b = pressures(0.0)
     q = (HOME[0], math.nan, *HOME[2:]) if gone == "position" else HOME
@@ -64,7 +64,7 @@ def test_what_is_unknown_is_nan_at_once_and_begins_anew(gone):
 
 def test_a_rotator_without_an_encoder_is_not_missed():
     a, b = pressures(150.0)
-    assert LoadEstimate(PROFILE).step((*HOME[:4], math.nan), 0.0, a, b, PERIOD_S) == pytest.approx(150.0)
+    assert LoadEstimator(PROFILE).step((*HOME[:4], math.nan), 0.0, a, b, PERIOD_S) == pytest.approx(150.0)
 
 
 def report(profile, **grapple) -> float:

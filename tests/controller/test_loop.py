@@ -4,30 +4,32 @@ import json
 import socket
 
 import pytest
-from bench import DATABASE, MS, SETTINGS, Bench, T
 
-from can_dbc import tick_record
-from can_dbc.bus import BusState
-from can_dbc.canopen import SYNC_ID
-from can_dbc.filters import Filter
+from can_dbc.bus.base import BusState
+from can_dbc.bus.filters import Filter
+from can_dbc.bus.reconnector import FIRST_RETRY_NS, RETRY_PERIOD_NS
 from can_dbc.frame import Frame
-from can_dbc.lost_link import GONE_NS, RETRY_NS
-from can_dbc.setpoint import Driving, OperatorAction, OperatorCommand, StateReport, decode, encode
-from can_dbc.timing_page import TimingWriter, read_timing
+from can_dbc.messages import tick_record
+from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
+from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.vehicle import Driving
+from can_dbc.protocols.canopen import SYNC_ID
+from can_dbc.timing.page import TimingWriter, read_timing
 from controller.__main__ import address, bus_address, listen, main, parser
 from controller.carrier.vehicle import Vehicle
 from controller.config import ConfigError, load
-from controller.loop import Loop
-from controller.realtime import sleep_until, sleeper
+from controller.process.loop import Loop
+from controller.process.realtime import make_sleep, sleep_until
+from controller.process.timing import LoopTiming
+from controller.process.warm_up import NullBus, warm_up
 from controller.step import Controller
-from controller.timing import LoopTiming
-from controller.warm_up import NowhereBus, rehearse
-from machine.reasons import Reason
+from machine.status.reasons import Reason
+from tests.controller.bench import DATABASE, MS, SETTINGS, Bench, T
 
 LEAD = SETTINGS.sync_lead_ns
 
 
-class MemoryBus(NowhereBus):
+class MemoryBus(NullBus):
     """Keeps what is sent, and counts the tries to get it back."""
 
     def __init__(self, clock=None):
@@ -200,13 +202,13 @@ def test_a_lost_link_is_tried_until_it_is_back_and_the_process_lives(udp):
             now_ns += T
             loop.tick(now_ns, 0)
 
-    ticks(GONE_NS)
+    ticks(FIRST_RETRY_NS)
     assert bus.tries == 0, "most links come back by themselves"
-    ticks(T + 3 * RETRY_NS)
+    ticks(T + 3 * RETRY_PERIOD_NS)
     assert bus.tries == 4 and not loop.stopping
-    assert "interface" in loop.words().lower() or "bus" in loop.words().lower(), loop.words()
+    assert "interface" in loop.status_text().lower() or "bus" in loop.status_text().lower(), loop.status_text()
     bus.stats.state = BusState.ACTIVE
-    ticks(2 * RETRY_NS)
+    ticks(2 * RETRY_PERIOD_NS)
     assert bus.tries == 4
 
 
@@ -230,7 +232,7 @@ def test_the_page_tells_what_the_loop_measured(udp, tmp_path):
     assert facts.ticks == 200 and facts.missed == facts.late == 0 and facts.period_ns == T
     assert facts.mode == "BOOT" and facts.words.startswith("BOOT. ")
     assert timing.durations["wake"].count == 201 and timing.durations["wake"].over(MS - 1000) == 1
-    assert timing.durations["sync"].count == timing.durations["law"].count - 1 == 200
+    assert timing.durations["sync"].count == timing.durations["control"].count - 1 == 200
     assert [bus.name for bus in facts.buses] == ["memory"]
     assert facts.process.allocated_blocks > 0 and facts.process.resident_kb > 0
     loop.close()
@@ -242,13 +244,13 @@ def test_sample_to_command_counts_from_the_sync_that_the_oldest_encoder_answered
     clock = Clock()
     bus = MemoryBus(clock)
     loop = build(udp, clock, bus)
-    encoders = [s for s in loop.controller.received.encoders if s is not None]
+    encoders = [s for s in loop.controller.crane_inputs.encoders if s is not None]
     now_ns = 10**9
     found = []
     for k in range(6):
         now_ns += T
         clock.now_ns = now_ns - LEAD
-        loop.timing.synced(0)
+        loop.timing.sync_sent(0)
         clock.now_ns = now_ns
         for i, slot in enumerate(encoders):
             slot.values = (0,) * 8
@@ -256,7 +258,7 @@ def test_sample_to_command_counts_from_the_sync_that_the_oldest_encoder_answered
             slot.stamp_ns = now_ns - T + MS if k >= 3 and i == 2 else now_ns - LEAD + MS
         before = loop.timing.sample_to_command.total_ns
         loop.timing.begin(0)
-        loop.timing.commanded()
+        loop.timing.command_sent()
         found.append(loop.timing.sample_to_command.total_ns - before)
     assert found == [LEAD] * 3 + [LEAD + T] * 3
 
@@ -274,11 +276,11 @@ def test_sleep_until_the_past_returns_and_the_future_is_reached():
     import time
 
     sleep_until(0)
-    for sleep in (sleep_until, sleeper(0), sleeper(200_000)):
+    for sleep in (sleep_until, make_sleep(0), make_sleep(200_000)):
         until_ns = time.monotonic_ns() + 3 * MS
         sleep(until_ns)
         assert time.monotonic_ns() >= until_ns
-    assert sleeper(0) is sleep_until
+    assert make_sleep(0) is sleep_until
 
 
 @pytest.mark.parametrize("profile", ["palms_471", "aoro_fc8"])
@@ -286,22 +288,22 @@ def test_the_rehearsal_walks_through_every_mode_and_leaves_nothing(profile, monk
     settings = load(profile)
     controller = Controller(settings, DATABASE)
     seen, driven, worked = set(), set(), []
-    apply = type(controller.supervisor).react
+    apply = type(controller.supervisor)._react
 
     def react(supervisor, now_ns):
         seen.add(supervisor.mode.name)
         apply(supervisor, now_ns)
 
-    monkeypatch.setattr(type(controller.supervisor), "react", react)
-    obey, law = Vehicle._command, type(controller.law).step
+    monkeypatch.setattr(type(controller.supervisor), "_react", react)
+    obey, law = Vehicle._command, type(controller.crane.law).step
     monkeypatch.setattr(Vehicle, "_command", lambda v, *floats: (driven.add(v.driving), obey(v, *floats)))
-    monkeypatch.setattr(type(controller.law), "step", lambda *a: (worked.append(1), law(*a)))
-    rehearse(settings, controller)
+    monkeypatch.setattr(type(controller.crane.law), "step", lambda *a: (worked.append(1), law(*a)))
+    warm_up(settings, controller)
     assert {"ARMED", "ACTIVE"} <= seen
     assert all(slot.stamp_ns for _, slot in controller.inputs_in_use), "every input has been decoded"
     assert controller.gate.refused > 100, "nonsense was refused"
-    assert len(worked) > 100 and (not controller.carrier.vehicle or driven == {Driving.DRIVING, Driving.BRAKING})
-    assert not controller.carrier.vehicle or controller.carrier.vehicle.order.sequence, "a drive setpoint was obeyed"
+    assert len(worked) > 100 and (not controller.vehicle or driven == {Driving.DRIVING, Driving.BRAKING})
+    assert not controller.vehicle or controller.vehicle.gate.sequence, "a drive setpoint was obeyed"
 
 
 def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):
@@ -349,13 +351,13 @@ def test_main_runs_and_ends_by_signal(capsys, monkeypatch):
     """One short life on an in-memory bus; SIGTERM after some ticks."""
     import signal
 
-    from controller import loop as loop_module
+    from controller.process import loop as loop_module
 
     ticks = []
     original = loop_module.Loop.tick
 
     def tick(self, now_ns, late_ns):
-        if isinstance(self.buses[0], NowhereBus):
+        if isinstance(self.buses[0], NullBus):
             return original(self, now_ns, late_ns)
         ticks.append(now_ns)
         if len(ticks) == 5:
@@ -383,16 +385,16 @@ def test_main_runs_and_ends_by_signal(capsys, monkeypatch):
 def test_the_bus_is_filtered_by_all_that_is_looked_at_and_nothing_more(profile):
     """Every message of the databases, from another node too where the source does not matter, and strangers."""
     controller = Controller(load(profile), DATABASE)
-    crane = Filter(controller.received.wanted())
+    crane = Filter(controller.crane_inputs.filters())
     listened = {slot.codec.key for _, slot in controller.inputs_in_use if not slot.machine}
     assert all(key in crane for key in listened)
-    for node in controller.received.nodes.by_number:
+    for node in controller.crane_inputs.nodes.by_number:
         assert {0x80 + node, 0x580 + node, 0x700 + node} <= {k for k in range(0x800) if k in crane}
     assert DATABASE.message("ValveCmdA").key in crane, "another who speaks for us is heard"
     assert 0x600 not in crane and 0x7FF not in crane
-    if controller.carrier.bus is None:
+    if controller.carrier_bus is None:
         return
-    machine = Filter(controller.carrier.bus.received.wanted())
+    machine = Filter(controller.carrier_bus.inputs.filters())
     for _, slot in controller.inputs_in_use:
         if slot.machine:
             other_source = (slot.codec.key & ~0xFF | 0x55) ^ 0x0400_0000  # and another priority

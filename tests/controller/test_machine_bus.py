@@ -4,21 +4,21 @@ from dataclasses import replace
 
 import msgspec
 import pytest
-from bench import AORO, CODECS, DATABASE, GNSS, MACHINE, MS, Bench, T
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.e2e import Checker, Status
 from can_dbc.frame import EXTENDED, REMOTE
-from can_dbc.nmea2000 import encode, frames, join_id
-from controller.carrier.bus import MachineBus
+from can_dbc.protocols.e2e import Checker, Status
+from can_dbc.protocols.nmea2000 import encode, frames, join_id
+from controller.carrier.bus import CarrierBus
 from controller.carrier.outputs import STANDING, CarrierCommand
 from controller.config import ConfigError
 from controller.step import Controller
-from machine.faults import describe
 from machine.joints import ARTICULATION
-from machine.modes import Mode
-from machine.reasons import Reason
+from machine.status.faults import describe
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.controller.bench import AORO, CODECS, DATABASE, GNSS, MACHINE, MS, Bench, T
 
 CLAIM = MACHINE.message("AddressClaim")
 CANNOT_CLAIM = CLAIM.key & ~0xFF | 254
@@ -81,7 +81,7 @@ def test_a_lost_address_is_silence_until_a_reset(theirs):
     bench.machine_extra.append((CLAIM.key, name))
     bench.run(40)
     assert [key for key, _ in bench.machine_sent] == [CANNOT_CLAIM]
-    assert bench.controller.machine_farewell() == []
+    assert bench.controller.carrier_shutdown_frames() == []
     assert bench.mode is Mode.STANDBY and bench.reason == Reason.ADDRESS_LOST
     bench.tick([bench.operator(1)])
     assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.ADDRESS_LOST
@@ -114,9 +114,9 @@ def test_the_carrier_stands_with_its_brake_on_in_every_mode(mode):
 
 
 def test_a_carrier_command_reaches_the_frames():
-    bus, sent = MachineBus((MACHINE, GNSS)), []
+    bus, sent = CarrierBus((MACHINE, GNSS)), []
     bus.command = CarrierCommand(True, -0.1, 0.639, 0.0, (10.0, -20.0, 30.0, -40.0), float_rear=True)
-    bus.write(Mode.ACTIVE, Reason.NONE, False, 10**9, sent)
+    bus.encode(Mode.ACTIVE, Reason.NONE, False, 10**9, sent)
     drive, arms_a, arms_b = (MACHINE.message(n) for n in COMMANDS)
     said = dict(sent)
     assert drive.decode(said[drive.key])[2:] == (0xA, -0.1, 0.639, 0.0)
@@ -127,7 +127,7 @@ def test_a_carrier_command_reaches_the_frames():
 
 def test_the_last_words_are_neutral_and_say_that_the_controller_ended():
     bench = Bench(AORO).armed()
-    bench.controller.outputs.machine_frames[:] = bench.controller.machine_farewell()
+    bench.controller.outputs.machine_frames[:] = bench.controller.carrier_shutdown_frames()
     bench.machine_commands.clear()
     bench._obey_machine(bench.controller.outputs)
     assert bench.machine_commands["VehCmd"]["Brake"] == 100 and bench.machine_commands["ArmCmdA"]["ArmKey"] == 0
@@ -138,8 +138,8 @@ def test_a_machine_that_stands_still_says_nothing_on_mach0():
     bench = Bench().armed()
     bench.machine_extra.append((CLAIM.key, bytes(8)))
     bench.run(40)
-    assert not bench.machine_sent and bench.controller.machine_bus is None
-    assert bench.controller.machine_farewell() == [] and bench.mode is Mode.ARMED
+    assert not bench.machine_sent and bench.controller.carrier_bus is None
+    assert bench.controller.carrier_shutdown_frames() == [] and bench.mode is Mode.ARMED
 
 
 # -- what is heard ------------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ def put(bench, name, source=0x1C, priority=None, **fields):
 
 def test_pgns_are_taken_from_any_source_with_any_priority():
     bench = Bench(AORO)
-    machine = bench.controller.machine_bus.received
+    machine = bench.controller.carrier_bus.inputs
     bench.dropped |= set(GNSS.messages)
     put(bench, "VesselHeading", source=0x55, priority=1, Heading=0.5)
     assert machine.heading.get("Heading") == 0.5 and machine.heading.get("Variation") is None
@@ -185,7 +185,7 @@ def test_pgns_are_taken_from_any_source_with_any_priority():
 
 def test_a_fast_packet_may_be_longer_and_a_short_or_broken_one_is_refused():
     bench = Bench(AORO)
-    machine = bench.controller.machine_bus.received
+    machine = bench.controller.carrier_bus.inputs
     bench.dropped |= set(GNSS.messages)
     codec = GNSS.message("GnssPositionData")
     payload = encode(codec, Latitude=1.0)

@@ -1,13 +1,13 @@
 """Losses and faults of mach0 and of both buses: reaction, bound, neutral in time; and a bus that comes back."""
 
 import pytest
-from bench import AORO, MACHINE, MS, Bench, T
 
-from can_dbc.canopen import heartbeat_frame
-from can_dbc.setpoint import OperatorAction
-from machine.faults import FAULTS, describe
-from machine.modes import Mode
-from machine.reasons import Reaction, Reason
+from can_dbc.messages.crane import OperatorAction
+from can_dbc.protocols.canopen import heartbeat_frame
+from machine.status.faults import FAULTS, describe
+from machine.status.modes import Mode
+from machine.status.reasons import Reaction, Reason
+from tests.controller.bench import AORO, MACHINE, MS, Bench, T
 
 PROMISE_NS = 100 * MS
 S = 1_000_000_000
@@ -84,7 +84,7 @@ def test_another_controller_on_mach0_is_noticed_in_every_mode():
         bench.tick()
         assert bench.mode is Mode.FAULT and bench.reason == Reason.FOREIGN_CONTROLLER and bench.neutral
         assert bench.controller.supervisor.detail == 1
-    assert describe(Reason.FOREIGN_CONTROLLER, 1).startswith("Another controller sends our frames on the machine bus.")
+    assert "the machine bus" in describe(Reason.FOREIGN_CONTROLLER, 1)
 
 
 def test_a_lost_address_stops_the_machine():
@@ -136,7 +136,7 @@ def test_three_refused_sends_in_a_row_on_mach0_stop_and_two_do_not():
 
 def test_frames_of_an_overflowed_tick_of_mach0_are_not_used():
     bench = Bench(AORO).active()
-    machine, crane = bench.controller.machine_bus.received, bench.controller.received
+    machine, crane = bench.controller.carrier_bus.inputs, bench.controller.crane_inputs
     while bench.count % 4:
         bench.drive(0, 0.08, 1)
     heard, others = machine.count, crane.count
@@ -155,13 +155,13 @@ PREPARED = {"start": lambda b: b.run(60), "standby": Bench.boot, "armed": Bench.
 def test_a_recovery_of_crane0_begins_anew(prepare):
     bench = Bench()
     prepare(bench)
-    received = bench.controller.received
+    received = bench.controller.crane_inputs
     count = received.count
     bench.encoders[3].writes.clear()
     outputs = bench.tick(bus_recoveries=1)
     assert bench.mode is Mode.FAULT and bench.reason == Reason.BUS_OFF and bench.neutral
     assert received.count == count, "what came with it is not trusted"
-    assert all(slot.values is None for slot in received.slots)
+    assert all(state.values is None for state in received.messages)
     assert not any(received.nodes.operational(n, bench.now_ns) for n in received.nodes.by_number)
     silenced = [data[1] for key, data in outputs.frames if key == 0 and data[0] == 0x80]
     assert len(silenced) == 1 and silenced[0] in bench.encoders, "an encoder is silenced, to be asked anew"
@@ -214,13 +214,13 @@ def test_a_node_that_is_silent_after_a_recovery_is_missed():
 def test_a_recovery_of_mach0_begins_anew(prepare):
     bench = Bench(AORO)
     prepare(bench)
-    machine = bench.controller.machine_bus.received
+    machine = bench.controller.carrier_bus.inputs
     count, start_up = machine.count, bench.controller.startup.complete
     bench.machine_sent.clear()
     bench.tick(machine_bus_recoveries=1)
     assert bench.mode is Mode.FAULT and bench.reason == Reason.BUS_OFF and bench.neutral
     assert bench.controller.supervisor.detail == 1
-    assert machine.count == count and all(slot.values is None for slot in machine.slots)
+    assert machine.count == count and all(state.values is None for state in machine.messages)
     assert bench.machine_sent[0][0] == MACHINE.message("AddressClaim").key
     assert bench.controller.startup.complete is start_up, "crane0 was not touched"
     bench.run(150)
@@ -243,18 +243,18 @@ def test_three_recoveries_within_a_minute_refuse_arming_for_a_minute(settings, w
     assert "the crane bus" in describe(Reason.BUS_UNSTABLE, 0)
     bench.tick([bench.operator(OperatorAction.ARM)])
     assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.BUS_UNSTABLE
-    watch = bench.controller.supervisor._watches[bus]
-    assert not watch.fit(last_ns + 60 * S - 1) and watch.fit(last_ns + 60 * S)
+    monitor = bench.controller.supervisor._bus_monitors[bus]
+    assert not monitor.usable(last_ns + 60 * S - 1) and monitor.usable(last_ns + 60 * S)
 
 
 def test_recoveries_that_are_far_apart_do_no_harm():
     bench = Bench().boot()
-    watch = bench.controller.crane_watch
+    monitor = bench.controller.crane_bus_monitor
     reading = bench.inputs.bus
     for k in range(1, 12):
         reading.recoveries = k
-        watch.read(reading, True, k * 31 * S)
-        assert watch.fit(k * 31 * S)
+        monitor.update(reading, True, k * 31 * S)
+        assert monitor.usable(k * 31 * S)
     reading.recoveries = 14  # three between two ticks
-    watch.read(reading, True, 400 * S)
-    assert not watch.fit(459 * S)
+    monitor.update(reading, True, 400 * S)
+    assert not monitor.usable(459 * S)

@@ -1,13 +1,13 @@
 """The mode table, exhaustively, and how the operator moves through it."""
 
 import pytest
-from bench import MS, VALUES, Bench
 
-from can_dbc.setpoint import OperatorAction
+from can_dbc.messages.crane import OperatorAction
 from controller.supervisor import TRANSITIONS, Event
-from machine.faults import FAULTS
-from machine.modes import Mode
-from machine.reasons import Reaction, Reason
+from machine.status.faults import FAULTS
+from machine.status.modes import Mode
+from machine.status.reasons import Reaction, Reason
+from tests.controller.bench import MS, VALUES, Bench
 
 B, S, A, X, P, F = Mode.BOOT, Mode.STANDBY, Mode.ARMED, Mode.ACTIVE, Mode.STOP, Mode.FAULT
 #                 BOOT STANDBY ARMED ACTIVE STOP FAULT

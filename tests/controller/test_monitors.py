@@ -4,12 +4,12 @@ import math
 from collections import deque
 
 import pytest
-from bench import SPECS, T
 
+from controller.estimation.motion_monitor import EARLY_DELAY_S, LATE_DELAY_S, MotionMonitor
 from controller.laws.end_positioning import INCH_SHARE
-from controller.monitors import EARLY_S, LATE_S, MotionMonitor
-from machine.faults import FAULTS
-from machine.reasons import Reason
+from machine.status.faults import FAULTS
+from machine.status.reasons import Reason
+from tests.controller.bench import SPECS, T
 
 PERIOD_S = T * 1e-9
 JOINTS = SPECS[:4]
@@ -93,7 +93,7 @@ def test_motion_against_the_command_is_found(spec):
     command = 0.4 * spec.speed_limit
     reasons = [monitor.step(command, -valve.move(command)) for _ in range(120)]
     assert Reason.JOINT_REVERSED in reasons
-    assert reasons.index(Reason.JOINT_REVERSED) * T <= (LATE_S + 0.2) * 1e9
+    assert reasons.index(Reason.JOINT_REVERSED) * T <= (LATE_DELAY_S + 0.2) * 1e9
 
 
 def test_a_reset_forgets():
@@ -102,4 +102,4 @@ def test_a_reset_forgets():
         monitor.step(0.3, -0.3)
     monitor.reset()
     assert [monitor.step(0.0, 0.0) for _ in range(100)] == [Reason.NONE] * 100
-    assert EARLY_S < LATE_S
+    assert EARLY_DELAY_S < LATE_DELAY_S

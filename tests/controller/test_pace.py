@@ -4,16 +4,16 @@ from itertools import pairwise
 
 import msgspec
 import pytest
-from bench import MS, PROFILE, SETTINGS, SPECS, Bench, T
 
-from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot
 from controller.config import Settings
-from controller.follower import Follower
-from controller.laws.pace import BEHIND_LIMIT_NS, FLOW_SHARE, RATE_CHANGE_1_S, Pace
-from controller.trajectory import HISTORY, Trajectory
-from controller.valve import ValveMap
-from machine.load import profile_hash
-from machine.modes import Mode
+from controller.crane.reference_governor import ReferenceGovernor
+from controller.crane.trajectory import HISTORY_KNOTS, Trajectory
+from controller.laws.time_scaling import FLOW_SHARE, MAX_BEHIND_NS, RATE_CHANGE_1_S, TimeScaling
+from controller.laws.valve_map import ValveMap
+from machine.loading.profile_file import profile_hash
+from machine.status.modes import Mode
+from tests.controller.bench import MS, PROFILE, SETTINGS, SPECS, Bench, T
 
 VALVES = [ValveMap(s.valve) for s in SPECS]
 ZERO = (0.0,) * 5
@@ -38,7 +38,7 @@ def line(stamp_ns, velocity, n=9):
 
 
 def test_the_rate_is_one_while_the_pump_and_the_joints_can():
-    pace = Pace(with_pump(1.0))
+    pace = TimeScaling(with_pump(1.0))
     for _ in range(100):
         pace.step([s.speed_limit for s in SPECS], VALVES, 1.0, T)
     assert (pace.rate, pace.behind_ns) == (1.0, 0)
@@ -49,7 +49,7 @@ def test_the_rate_falls_smoothly_to_what_the_pump_gives_and_the_time_behind_is_b
     flow = sum(
         (v * s.valve.flow_plus if v >= 0 else -v * s.valve.flow_minus) for v, s in zip(velocity, SPECS, strict=True)
     )
-    pace, rates = Pace(with_pump(0.5 * flow)), [1.0]
+    pace, rates = TimeScaling(with_pump(0.5 * flow)), [1.0]
     for _ in range(80):
         pace.step(velocity, VALVES, 1.0, T)
         rates.append(pace.rate)
@@ -57,20 +57,20 @@ def test_the_rate_falls_smoothly_to_what_the_pump_gives_and_the_time_behind_is_b
     assert pace.rate == pytest.approx(0.5 * FLOW_SHARE)
     for _ in range(4000):
         pace.step(velocity, VALVES, 1.0, T)
-    assert BEHIND_LIMIT_NS <= pace.behind_ns < 1.3 * BEHIND_LIMIT_NS
+    assert MAX_BEHIND_NS <= pace.behind_ns < 1.3 * MAX_BEHIND_NS
     pace.reset()
     assert (pace.rate, pace.behind_ns) == (1.0, 0)
 
 
 def test_a_lower_cap_slows_the_time_when_a_joint_is_faster():
-    pace = Pace(with_pump(1.0))
+    pace = TimeScaling(with_pump(1.0))
     for _ in range(200):
         pace.step([SPECS[0].speed_limit, 0.0, 0.0, 0.0, 0.0], VALVES, 0.5, T)
     assert 0.5 < pace.rate < 0.6
 
 
 def follower(flow_m3_s):
-    return Follower(with_pump(flow_m3_s), VALVES, [120 * MS] * 5)
+    return ReferenceGovernor(with_pump(flow_m3_s), VALVES, [120 * MS] * 5)
 
 
 def test_a_slowed_reference_stays_on_the_path():
@@ -79,10 +79,10 @@ def test_a_slowed_reference_stays_on_the_path():
         now_ns = 10**9 + k * T
         if k % 10 == 0:
             made.candidate.load(line(now_ns, velocity))
-            made.take(now_ns, True)
+            made.accept(now_ns, True)
         made.follow(now_ns, 1.0)
         own_s = (now_ns - made.behind_ns) * 1e-9
-        assert made.reference == pytest.approx([v * own_s for v in velocity], abs=1e-9)
+        assert made.position == pytest.approx([v * own_s for v in velocity], abs=1e-9)
         assert made.velocity == pytest.approx([v * made.rate for v in velocity], abs=1e-9)
     assert made.behind_ns > 300 * MS and made.rate < 0.6
     assert made.planned(now_ns)[0] == pytest.approx([v * now_ns * 1e-9 for v in velocity], abs=1e-9)
@@ -91,19 +91,19 @@ def test_a_slowed_reference_stays_on_the_path():
 def test_it_catches_up_at_rest_and_a_hold_forgets():
     made, velocity = follower(1.0e-4), [0.2, 0.1, -0.1, 0.1, 0.0]
     made.candidate.load(line(10**9, velocity))
-    made.take(10**9, True)
+    made.accept(10**9, True)
     for k in range(40):
         made.follow(10**9 + k * T, 1.0)
     behind = made.behind_ns
     assert behind > 0
     goal = [v * 1.4 for v in velocity]
     made.candidate.load(setpoint(10**9 + 400 * MS, [goal] * 9))
-    made.take(10**9 + 400 * MS, True)
+    made.accept(10**9 + 400 * MS, True)
     for k in range(40, 600):
         made.follow(10**9 + k * T, 1.0)
-    assert made.behind_ns == 0 and made.reference == pytest.approx(goal) and not any(made.velocity)
+    assert made.behind_ns == 0 and made.position == pytest.approx(goal) and not any(made.velocity)
     made.hold(0, 0.3, 10**9)
-    assert made.reference[0] == 0.3 and made.behind_ns == 0
+    assert made.position[0] == 0.3 and made.behind_ns == 0
 
 
 def test_a_trajectory_keeps_its_past_while_it_is_behind_and_no_more():
@@ -118,7 +118,7 @@ def test_a_trajectory_keeps_its_past_while_it_is_behind_and_no_more():
             old.fill(range(5), at_ns, q, v)
             assert q == pytest.approx([0.1 * at_ns * 1e-9] * 5)
     old.extend(new, 0)
-    assert old._n <= HISTORY + 9 and old.end_ns == 10**9 + 59 * 50 * MS + 400 * MS
+    assert old._n <= HISTORY_KNOTS + 9 and old.end_ns == 10**9 + 59 * 50 * MS + 400 * MS
 
 
 # -- in the controller
@@ -159,7 +159,7 @@ def test_a_motion_that_asks_for_too_much_oil_is_done_later_on_its_path():
     bench.armed()
     behind, off = 0, 0.0
     for start in drive(bench, 9.0, 13.0):
-        follower = bench.controller.follower
+        follower = bench.controller.crane.governor
         behind = max(behind, follower.behind_ns)
         shares = [(q - p) / d for q, p, d in zip(bench.q, start, GOALS, strict=True)]
         off = max(off, max(shares[:4]) - min(shares[:4]))
@@ -174,9 +174,9 @@ def test_a_setpoint_that_begins_at_the_slowed_reference_is_taken_too():
     bench.armed()
     for _ in drive(bench, 9.0, 4.0):
         pass
-    follower = bench.controller.follower
+    follower = bench.controller.crane.governor
     assert follower.behind_ns > 100 * MS
-    here = list(bench.controller.reference)
+    here = list(bench.controller.reference_position)
     speed = list(bench.controller.reference_velocity)
     end = [h + 0.2 * v for h, v in zip(here, speed, strict=True)]
     bench.tick([bench.setpoint([(0, here, speed), (400, end, [0.0] * 5)])])

@@ -8,21 +8,21 @@ from typing import Any
 import msgspec
 import pytest
 
-from can_dbc.canopen import Wire, parse_heartbeat
-from can_dbc.codec import load
-from can_dbc.e2e import Sender
-from can_dbc.frame import Frame
+from can_dbc.dbc.codec import load
+from can_dbc.frame import Frame, RawFrame
 from can_dbc.plc import map as plc
 from can_dbc.plc.datagram import Header, encode_reply
 from can_dbc.plc.map import Command, Estop, Fault, Feedback, Grapple, Mode, Role, State, WordOrder
+from can_dbc.protocols.canopen import parse_heartbeat
+from can_dbc.protocols.e2e import Sender
 from controller.config import ConfigError
+from controller.crane.startup import Startup
 from controller.plc.bridge import Bridge, role_of
-from controller.plc.emulated_nodes import Between
+from controller.plc.emulated_nodes import LinearInterpolator
 from controller.plc.handshake import Handshake
-from controller.startup import Startup
-from machine.load import load_profile
-from machine.modes import Mode as ControllerMode
+from machine.loading.profile_file import load_profile
 from machine.profile import Plc, Profile
+from machine.status.modes import Mode as ControllerMode
 
 MS = 1_000_000
 DATABASE = load("crane")
@@ -45,7 +45,7 @@ class Rig:
         self.answers = True
         self.acknowledges = True
         self.said: list[Frame] = []
-        self.sent: list[Wire] = []
+        self.sent: list[RawFrame] = []
         self.command = Command()
         self.mode = ControllerMode.ACTIVE
         self._senders: dict[str, Sender] = {}
@@ -69,7 +69,7 @@ class Rig:
             self.frame("CtrlStatus", Mode=self.mode, SafeState=values.get("SafeState", 0)),
         ]
 
-    def step(self, frames: list[Frame] | None = None) -> list[Wire]:
+    def step(self, frames: list[Frame] | None = None) -> list[RawFrame]:
         """5 ms; every second one exchanges with the PLC."""
         bridge = self.bridge
         self.now_ns += 5 * MS
@@ -82,7 +82,7 @@ class Rig:
                 beat = (self.feedback.heartbeat + 1) & 0xFFFF
                 self.feedback = replace(self.feedback, heartbeat=beat, accepted=accepted)
                 status = plc.status_registers(self.feedback, 300, WordOrder.HIGH_FIRST)
-                assert bridge.handshake.take_registers(status, self.now_ns)
+                assert bridge.handshake.accept_registers(status, self.now_ns)
         self.sent = out
         return out
 
@@ -123,7 +123,7 @@ def test_the_controllers_own_start_up_sets_up_the_played_encoders() -> None:
         out = rig.step(ours)
         for key, data in out:
             startup.receive(key, data)
-        asked: list[Wire] = []
+        asked: list[RawFrame] = []
         startup.step(rig.now_ns, asked)
         ours = [Frame(rig.now_ns, key, data) for key, data in asked]
     assert startup.complete, startup.problem()
@@ -162,7 +162,7 @@ def test_a_frozen_heartbeat_of_the_plc_is_silence() -> None:
     shake = rig.bridge.handshake
     for _ in range(20):
         rig.step(rig.control())
-        shake.take_registers(plc.status_registers(rig.feedback, 300, WordOrder.HIGH_FIRST), rig.now_ns)
+        shake.accept_registers(plc.status_registers(rig.feedback, 300, WordOrder.HIGH_FIRST), rig.now_ns)
     assert not rig.sent
 
 
@@ -309,7 +309,7 @@ def test_a_reset_is_asked_only_after_an_operator_acknowledged_and_never_armed() 
 
 
 def test_positions_arrive_without_steps() -> None:
-    between = Between()
+    between = LinearInterpolator()
     between.sample(1.0, 10 * MS, 50 * MS)
     assert between.at(10 * MS) == 1.0
     between.sample(2.0, 20 * MS, 50 * MS)
@@ -323,19 +323,19 @@ def test_the_handshake_times_the_round_trip_by_the_echo() -> None:
     for n in range(1, 11):
         shake.datagram(Command(), n * 10 * MS)
     reply = Feedback(state=State.HOLD)
-    assert shake.take_datagram(encode_reply(Header(1, 0, 4), reply), 104 * MS)
+    assert shake.accept_datagram(encode_reply(Header(1, 0, 4), reply), 104 * MS)
     assert (shake.round_trip.count, shake.round_trip.longest_ns) == (1, 64 * MS)
     assert shake.acknowledged(154 * MS) and not shake.acknowledged(155 * MS)
-    assert not shake.take_datagram(encode_reply(Header(1, 0, 5), reply), 105 * MS), "old"
-    assert not shake.take_datagram(encode_reply(Header(2, 0, 6), reply)[:-1], 106 * MS), "cut"
-    assert shake.take_datagram(encode_reply(Header(3, 0, 99), reply), 107 * MS)
+    assert not shake.accept_datagram(encode_reply(Header(1, 0, 5), reply), 105 * MS), "old"
+    assert not shake.accept_datagram(encode_reply(Header(2, 0, 6), reply)[:-1], 106 * MS), "cut"
+    assert shake.accept_datagram(encode_reply(Header(3, 0, 99), reply), 107 * MS)
     assert (shake.round_trip.count, shake.dropped) == (1, 2), "a number that we never sent proves nothing"
 
 
 def test_a_plc_of_another_word_order_is_not_believed() -> None:
     shake = Handshake(WordOrder.HIGH_FIRST)
     status = plc.status_registers(Feedback(state=State.HOLD), 300, WordOrder.LOW_FIRST)
-    assert not shake.take_registers(status, 0)
+    assert not shake.accept_registers(status, 0)
     assert shake.feedback is None and "LOW_FIRST" in shake.problem
 
 

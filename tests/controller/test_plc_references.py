@@ -8,11 +8,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from can_dbc.canopen import Wire
-from can_dbc.codec import load
+from can_dbc.dbc.codec import load
+from can_dbc.frame import RawFrame
 from controller.config import ConfigError
-from controller.outputs import Writer
-from machine.load import load_profile
+from controller.crane.outputs import CraneWriter
+from machine.loading.profile_file import load_profile
 from machine.profile import Plc, Profile
 
 DATABASE = load("crane")
@@ -24,7 +24,7 @@ def profile(role: str | None) -> Profile:
     return msgspec.structs.replace(load_profile("palms_471"), plc=Plc(role) if role else None)  # type: ignore[arg-type]
 
 
-def decoded(frames: list[Wire]) -> dict[str, Any]:
+def decoded(frames: list[RawFrame]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for (key, data), name in zip(frames, NAMES, strict=True):
         codec = DATABASE.message(name)
@@ -35,14 +35,14 @@ def decoded(frames: list[Wire]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("role", [None, "valves"])
 def test_nobody_else_is_bothered_with_them(role: str | None) -> None:
-    frames: list[Wire] = []
-    Writer(DATABASE, profile(role)).references(HERE, SPEEDS, True, frames)
+    frames: list[RawFrame] = []
+    CraneWriter(DATABASE, profile(role)).references(HERE, SPEEDS, True, frames)
     assert not frames
 
 
 def test_they_carry_position_and_the_velocity_to_command() -> None:
-    frames: list[Wire] = []
-    Writer(DATABASE, profile("references")).references(HERE, SPEEDS, True, frames)
+    frames: list[RawFrame] = []
+    CraneWriter(DATABASE, profile("references")).references(HERE, SPEEDS, True, frames)
     found = decoded(frames)
     for name, position, speed in zip(("Slew", "Lift", "Tilt", "Ext", "Rot"), HERE, SPEEDS, strict=True):
         assert found[name] == pytest.approx(position, abs=1.01e-4)
@@ -50,7 +50,7 @@ def test_they_carry_position_and_the_velocity_to_command() -> None:
 
 
 def test_at_rest_unknown_or_out_of_reach_is_not_available() -> None:
-    writer, frames = Writer(DATABASE, profile("references")), list[Wire]()
+    writer, frames = CraneWriter(DATABASE, profile("references")), list[RawFrame]()
     writer.references(HERE, SPEEDS, False, frames)
     assert decoded(frames)["Slew"] is decoded(frames)["RotRate"] is None
     frames.clear()
@@ -65,4 +65,4 @@ def test_a_machine_whose_joints_the_frames_cannot_carry_is_refused_at_the_start(
     wide = profile("references")
     slew = msgspec.structs.replace(wide.joints["slew"], upper=3.5)
     with pytest.raises(ConfigError, match="JointRefA"):
-        Writer(DATABASE, msgspec.structs.replace(wide, joints=wide.joints | {"slew": slew}))
+        CraneWriter(DATABASE, msgspec.structs.replace(wide, joints=wide.joints | {"slew": slew}))

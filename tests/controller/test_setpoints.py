@@ -5,23 +5,26 @@ import struct
 import zlib
 
 import pytest
-from bench import MS, PROFILE, SETTINGS, SPECS, Bench
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.setpoint import DatagramFault, DriveSetpoint, StateReport, Steering, encode
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.envelope import DatagramFault
+from can_dbc.messages.vehicle import DriveSetpoint, Steering
 from controller.config import load
-from controller.trajectory import extremes, hermite, peak_speed
+from controller.crane.trajectory import extremes, hermite, peak_speed
 from machine.joints import Joint
-from machine.modes import Mode
-from machine.reasons import Reason
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.controller.bench import MS, PROFILE, SETTINGS, SPECS, Bench
 
 ZERO = [0.0] * 5
 HASH = SETTINGS.profile_hash
 
 
 def at(bench, j=None, by=0.0):
-    q = list(bench.controller.reference)
+    q = list(bench.controller.reference_position)
     if j is not None:
         q[j] += by
     return q

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import pytest
-from bench import AORO, HOME, MS, Bench, T, count_until
 
-from can_dbc.setpoint import SpoolKnot, SpoolTest, encode
+from can_dbc.messages.crane import SpoolKnot, SpoolTest
+from can_dbc.messages.datagrams import encode
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
-from machine.faults import FAULTS
 from machine.joints import JOINTS, Joint
-from machine.modes import Mode
-from machine.reasons import Reason
+from machine.status.faults import FAULTS
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.controller.bench import AORO, HOME, MS, Bench, T, count_until
 
 SIGNALS = ("Slew", "Lift", "Tilt", "Ext", "Rot")
 RAMP = ((0, 0.0), (5, 12.0), (405, 30.0))
@@ -64,7 +65,7 @@ def test_one_spool_follows_its_knots_and_every_other_one_is_neutral() -> None:
         slew, *others = spools(bench)
         assert slew == pytest.approx(12.0 + 18.0 * (now_ms - 5) / 400, abs=0.06)
         assert others == [0.0] * 4 and bench.commands_b["GrappleMode"] == 0
-    assert bench.controller.reference[0] == pytest.approx(bench.q[0], abs=0.01), "the reference goes along"
+    assert bench.controller.reference_position[0] == pytest.approx(bench.q[0], abs=0.01), "the reference goes along"
 
 
 def test_a_test_that_ends_neutral_ends_in_armed() -> None:
@@ -85,7 +86,7 @@ def test_a_lost_lease_closes_the_valve_on_a_ramp_and_stops() -> None:
         bench.tick()
     fading = [p for p in opened if p > 0.0]
     assert fading == sorted(fading, reverse=True) and len(fading) > 10, "not at a stroke"
-    assert spools(bench) == [0.0] * 5 and not bench.controller.spool_run.running
+    assert spools(bench) == [0.0] * 5 and not bench.controller.crane.spool_run.running
 
 
 def test_knots_that_end_open_stop_before_the_lease_does() -> None:
@@ -104,9 +105,9 @@ def test_a_trajectory_waits_for_a_shut_valve_and_then_begins_where_the_joint_is(
     bench.tick([asked(bench, (0, spools(bench)[0]), (60, 0.0))])
     bench.run(14)
     bench.tick([bench.hold()])
-    assert bench.mode is Mode.ACTIVE and not bench.controller.spool_run.running
+    assert bench.mode is Mode.ACTIVE and not bench.controller.crane.spool_run.running
     bench.run(2)
-    assert abs(bench.controller.reference[0] - bench.q[0]) < 0.02
+    assert abs(bench.controller.reference_position[0] - bench.q[0]) < 0.02
 
 
 def test_a_moving_trajectory_is_not_broken_by_a_test() -> None:
@@ -115,7 +116,7 @@ def test_a_moving_trajectory_is_not_broken_by_a_test() -> None:
     bench.tick([asked(bench, *RAMP, joint=Joint.LIFT)])
     gate = bench.controller.gate
     assert (gate.refusal, gate.detail, gate.refused) == (Reason.TEST_BUSY, Joint.LIFT, refused + 1)
-    assert not bench.controller.spool_run.running
+    assert not bench.controller.crane.spool_run.running
 
 
 def test_not_before_a_human_armed() -> None:
@@ -128,7 +129,7 @@ def test_a_rotator_without_encoder_is_driven_and_its_commanded_way_counts() -> N
     blind = Bench(AORO).armed()
     running(blind, 40.0, 0.6, Joint.ROT)
     assert blind.mode is Mode.ACTIVE and spools(blind) == [0.0, 0.0, 0.0, 0.0, pytest.approx(40.0, abs=0.1)]
-    assert blind.controller.spool_run.way == pytest.approx(0.667 * 0.42, abs=0.05)
+    assert blind.controller.crane.spool_run.integrated_rad == pytest.approx(0.667 * 0.42, abs=0.05)
 
 
 def test_a_rotator_without_encoder_that_is_told_to_go_on_is_stopped() -> None:

@@ -4,14 +4,15 @@ from dataclasses import replace
 
 import msgspec
 import pytest
-from bench import DATABASE, MS, PROFILE, SETTINGS, Bench, T
 
-from can_dbc.canopen import SDO_TO_SERVER, Sdo, SdoKind
+from can_dbc.protocols.canopen import SDO_TO_SERVER, Sdo, SdoKind
 from controller.config import ConfigError
-from controller.startup import EncoderSetup, Phase
+from controller.crane.startup import EncoderSetup, Phase
 from controller.step import Controller
-from machine.modes import Mode
-from machine.reasons import Reason
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
+from tests.codes import coded
+from tests.controller.bench import DATABASE, MS, PROFILE, SETTINGS, Bench, T
 
 
 def test_every_encoder_is_set_up_as_the_bus_reference_says():
@@ -97,11 +98,11 @@ def test_three_tries_of_300_ms_then_over_again():
 def test_a_stray_answer_is_ignored():
     setup = EncoderSetup(Bench().settings.profile.joints["slew"].encoder)
     stray = Sdo(SdoKind.UPLOAD, 2, 0x6004, 0, b"\1\0\0\0", 0)
-    setup.answer(stray)
+    setup.receive(stray)
     setup.frame(0)
     setup.frame(T)
-    setup.answer(stray)
-    assert setup.phase is Phase.ASKING and setup.reason is Reason.NODE_ABSENT
+    setup.receive(stray)
+    assert setup.phase is Phase.CONFIGURING and setup.reason is Reason.NODE_ABSENT
 
 
 def test_an_encoder_that_left_operational_by_itself_is_set_up_again_by_a_reset():
@@ -142,5 +143,5 @@ def test_a_node_that_cannot_send_its_message_is_a_configuration_error():
     encoder = PROFILE.joints["slew"].encoder
     slew = msgspec.structs.replace(PROFILE.joints["slew"], encoder=msgspec.structs.replace(encoder, node=16))
     profile = msgspec.structs.replace(PROFILE, joints=PROFILE.joints | {"slew": slew})
-    with pytest.raises(ConfigError, match=r"node 16 does not send EncSlew \(182\); give it node 2"):
+    with pytest.raises(ConfigError, check=coded("config.encoder-node")):
         Controller(replace(SETTINGS, profile=profile), DATABASE)

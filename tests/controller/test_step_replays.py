@@ -5,18 +5,19 @@ import tracemalloc
 from itertools import pairwise
 
 import pytest
-from bench import AORO, DATABASE, GNSS, MACHINE, MS, SETTINGS, SPECS, Bench, T
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc import tick_record
 from can_dbc.frame import EXTENDED, Frame
-from can_dbc.setpoint import CraneSetpoint, GrappleCommand, Knot, encode
-from controller.laws.joint import HEADROOM
-from controller.record import record, refill, said
+from can_dbc.messages import tick_record
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot
+from can_dbc.messages.datagrams import encode
+from controller.laws.valve_map import ValveMap
+from controller.process.tick_recording import record, restore_inputs, transmitted
 from controller.step import Controller, Inputs, step
-from controller.valve import ValveMap
-from machine.modes import Mode
+from machine.motion_limits import SPEED_HEADROOM_SHARE
+from machine.status.modes import Mode
+from tests.controller.bench import AORO, DATABASE, GNSS, MACHINE, MS, SETTINGS, SPECS, Bench, T
 
 pytestmark = pytest.mark.computed
 
@@ -64,8 +65,8 @@ def inside_the_envelope(bench):
     commands = {**bench.commands_a, **bench.commands_b}
     for spec, estimator in zip(SPECS, bench.controller.estimators, strict=True):
         made = ValveMap(spec.valve)
-        made.place(estimator.position)
-        limit = HEADROOM * spec.speed_limit
+        made.set_position(estimator.position)
+        limit = SPEED_HEADROOM_SHARE * spec.speed_limit
         low, high = made.spool_pct(-limit), made.spool_pct(limit)
         assert min(low, high) - 0.05 <= commands[spec.valve.signal] <= max(low, high) + 0.05
     assert commands["Aux"] == 0.0 and commands["Mode"] in (0, 2)
@@ -90,7 +91,7 @@ def test_nothing_raises_and_outputs_stay_in_the_envelope(script, state):
 def test_any_accepted_setpoint_keeps_the_commands_in_the_envelope(plans):
     bench = Bench().armed()
     for plan in plans:
-        here = list(bench.controller.reference)
+        here = list(bench.controller.reference_position)
         knots = [(ms, [h + 0.2 * p for h, p in zip(here, q, strict=True)], v) for ms, q, v in plan]
         bench.tick([bench.setpoint(knots)])
         inside_the_envelope(bench)
@@ -134,9 +135,9 @@ def test_a_record_of_a_whole_life_replays_to_the_same_bytes(settings_):
     controller, inputs = Controller(bench.settings, DATABASE, (MACHINE, GNSS)), Inputs()
     for data in tape:
         tick = tick_record.decode(data)
-        refill(inputs, tick)
+        restore_inputs(inputs, tick)
         outputs = step(controller, inputs, tick.now_ns)
-        assert said(outputs) == (tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report)
+        assert transmitted(outputs) == (tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report)
         assert tick.frames_out[-1][0] == 0x080, "SYNC goes out last"
     spoken = [said for data in tape for said in tick_record.decode(data).machine_frames_out]
     assert bool(spoken) is (settings_ is AORO)
@@ -209,7 +210,7 @@ def test_status_and_heartbeat_on_the_bus_and_sync_apart():
 
 def test_farewell_is_neutral_and_disarmed():
     bench = Bench().active()
-    out = bench.controller.farewell()
+    out = bench.controller.shutdown_frames()
     bench.controller.outputs.frames[:] = out
     bench._obey(bench.controller.outputs)
     assert bench.neutral and bench.commands_b["ArmKey"] == 0

@@ -8,19 +8,28 @@ from dataclasses import dataclass
 
 import msgspec
 import pytest
-from bench import AORO, DATABASE, MS, SETTINGS, Bench, T, count_until
 
-from can_dbc.setpoint import OperatorAction
+from can_dbc.messages.crane import OperatorAction
 from controller.config import ConfigError, Settings
 from controller.laws.joint import JointLaw
-from controller.laws.sway import FADE_S, LONGEST_S, RETURN_1_S, SENSOR_S, START, Damper, Sway
+from controller.laws.sway import (
+    FADE_S,
+    MAX_DAMPING_S,
+    RETURN_1_S,
+    SENSOR_DELAY_S,
+    START_ZONES,
+    DirectionalDamper,
+    SwayDamping,
+)
+from controller.laws.valve_map import ValveMap
 from controller.step import Controller
-from controller.valve import ValveMap
+from machine.geometry.kinematics import pin_position
 from machine.joints import JOINTS, Joint
-from machine.kinematics import pin_position
-from machine.load import profile_hash
-from machine.modes import Mode
+from machine.loading.profile_file import profile_hash
 from machine.profile import Imu, joint
+from machine.status.modes import Mode
+from tests.codes import coded
+from tests.controller.bench import AORO, DATABASE, MS, SETTINGS, Bench, T, count_until
 
 T_S = T * 1e-9
 KEY = DATABASE.message("GrappleImu").key
@@ -55,12 +64,12 @@ class Pendulum:
 
 def damped(pendulum, seconds, imu=IMU, delay_s=0.15, age_s=0.0):
     """The damper with its way back on a pendulum behind a dead time; the swing over time."""
-    damper = Damper(imu, delay_s)
+    damper = DirectionalDamper(imu, delay_s)
     line, seen = deque([0.0] * round(delay_s / T_S)), deque()
     swings, displaced = [], 0.0
     for _ in range(round(seconds / T_S)):
         seen.append((pendulum.lean, pendulum.rate))
-        lean, rate = seen[0] if len(seen) <= round((SENSOR_S + age_s) / T_S) else seen.popleft()
+        lean, rate = seen[0] if len(seen) <= round((SENSOR_DELAY_S + age_s) / T_S) else seen.popleft()
         damper.step(lean, rate, age_s, T_S)
         velocity = damper.velocity_m_s - RETURN_1_S * displaced
         displaced += velocity * T_S
@@ -95,7 +104,7 @@ def test_a_pendulum_of_another_length_is_damped_too_and_the_pin_comes_back(lengt
     pendulum = Pendulum(length_m, 0.12)
     swings = damped(pendulum, 6.0)
     assert swings[round(3.6 / T_S)] < 0.5 * 0.12
-    assert max(swings[round(4.0 / T_S) :]) < START * IMU.dead_zone_rad, "no limit cycle"
+    assert max(swings[round(4.0 / T_S) :]) < START_ZONES * IMU.dead_zone_rad, "no limit cycle"
     assert abs(pendulum.pin_m) < 0.01
 
 
@@ -104,20 +113,20 @@ def test_an_old_swing_counts_as_what_has_become_of_it(age_s):
     w = math.sqrt(GRAVITY_M_S2 / IMU.pendulum_m)
     lean, rate, turned = 0.05, 0.12, w * age_s
     now = (lean * math.cos(turned) + rate / w * math.sin(turned), rate * math.cos(turned) - w * lean * math.sin(turned))
-    old, new = Damper(IMU, 0.15), Damper(IMU, 0.15)
+    old, new = DirectionalDamper(IMU, 0.15), DirectionalDamper(IMU, 0.15)
     old.step(lean, rate, age_s, T_S)
     new.step(*now, 0.0, T_S)
     assert old.velocity_m_s == pytest.approx(new.velocity_m_s, rel=1e-9) and old.velocity_m_s > 0.0
 
 
 def test_it_begins_above_the_dead_zone_and_ends_in_it():
-    damper = Damper(IMU, 0.15)
-    damper.step((START - 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
+    damper = DirectionalDamper(IMU, 0.15)
+    damper.step((START_ZONES - 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
     assert damper.velocity_m_s == 0.0
-    damper.step((START + 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
+    damper.step((START_ZONES + 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
     assert damper.velocity_m_s > 0.0
     for _ in range(100):
-        damper.step((START - 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
+        damper.step((START_ZONES - 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
     assert damper.velocity_m_s > 0.0
     for _ in range(round(FADE_S / T_S) + 1):
         damper.step(0.9 * IMU.dead_zone_rad, 0.0, 0.0, T_S)
@@ -125,7 +134,7 @@ def test_it_begins_above_the_dead_zone_and_ends_in_it():
 
 
 def test_the_pin_is_never_faster_than_allowed_and_nothing_jumps_when_it_starts_or_stops():
-    damper, before = Damper(IMU, 0.0), 0.0
+    damper, before = DirectionalDamper(IMU, 0.0), 0.0
     for k in range(400):
         if k < 200:
             damper.step(0.6, 0.0, 0.0, T_S)
@@ -140,7 +149,7 @@ def test_the_pin_is_never_faster_than_allowed_and_nothing_jumps_when_it_starts_o
 
 
 def sway(imu=IMU):
-    return Sway(PROFILE, imu, LEADS)
+    return SwayDamping(PROFILE, imu, LEADS)
 
 
 @pytest.mark.parametrize(("swing", "ahead"), [((0.2, 0.0, 0.0, 0.0), (1, 0)), ((0.0, 0.2, 0.0, 0.0), (0, 1))])
@@ -169,8 +178,8 @@ def test_after_its_time_it_takes_the_pin_back_and_is_exactly_over():
         law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, POSE, T_S)
         moved.append(abs(law.displacement[Joint.SLEW]))
 
-    ticks = count_until(tick, lambda: not law.active, round((LONGEST_S + 4.0) / T_S))
-    assert ticks * T_S > LONGEST_S
+    ticks = count_until(tick, lambda: not law.active, round((MAX_DAMPING_S + 4.0) / T_S))
+    assert ticks * T_S > MAX_DAMPING_S
     assert max(moved) > 0.01
     assert not any(law.velocity) and not any(law.displacement)
     for _ in range(200):
@@ -205,15 +214,15 @@ def test_joints_that_nobody_knows_are_not_moved():
 def test_a_joint_that_is_moved_on_top_of_its_reference_does_not_rest_and_rests_afterwards():
     spec = joint(PROFILE, Joint.SLEW)
     law = JointLaw(spec, ValveMap(spec.valve), T_S)
-    law.wanted(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S)
+    law.desired_velocity(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S)
     assert law.resting
-    assert law.wanted(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S, 0.01, 0.0) == pytest.approx(0.01)
+    assert law.desired_velocity(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S, 0.01, 0.0) == pytest.approx(0.01)
     assert not law.resting
     # Where it was taken to is where it is to be.
-    assert law.wanted(0.2, 0.0, 0.0, 0.203, 0.0, math.nan, T_S, 0.0, 0.003) == pytest.approx(0.0, abs=1e-4)
+    assert law.desired_velocity(0.2, 0.0, 0.0, 0.203, 0.0, math.nan, T_S, 0.0, 0.003) == pytest.approx(0.0, abs=1e-4)
     assert not law.resting
     for _ in range(400):
-        law.wanted(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S)
+        law.desired_velocity(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S)
     assert law.resting
 
 
@@ -244,14 +253,14 @@ def test_the_controller_damps_with_a_sensor_and_stops_when_it_is_silent():
         if k % 2 == 0:
             feel(bench, LeanTangential=0.15)
         bench.tick([bench.hold(lease_ms=500)] if k % 20 == 0 else [])
-    moving = bench.controller.commands[Joint.SLEW]
+    moving = bench.controller.crane.commands[Joint.SLEW]
     assert moving > 0.01
-    assert bench.controller.received.stale_mask == 0
+    assert bench.controller.crane_inputs.stale_mask == 0
     for k in range(80):
         bench.tick([bench.hold(lease_ms=500)] if k % 20 == 0 else [])
-    swung = bench.controller.sway
-    assert bench.controller.received.imu.values is None
-    assert bench.controller.received.stale_mask == 0 and bench.mode is Mode.ACTIVE
+    swung = bench.controller.crane.sway
+    assert bench.controller.crane_inputs.imu.values is None
+    assert bench.controller.crane_inputs.stale_mask == 0 and bench.mode is Mode.ACTIVE
     assert swung.velocity[Joint.SLEW] <= 0.0, "only the way back is left"
 
 
@@ -261,8 +270,8 @@ def test_a_sensor_that_says_it_is_broken_is_not_believed(values):
     for k in range(60):
         feel(bench, **{"LeanTangential": 0.15, "LeanRadial": 0.15, **values})
         bench.tick([bench.hold(lease_ms=500)] if k % 20 == 0 else [])
-    assert bench.controller.received.imu.values is not None
-    assert not bench.controller.sway.active
+    assert bench.controller.crane_inputs.imu.values is not None
+    assert not bench.controller.crane.sway.active
 
 
 def test_nothing_is_damped_in_standby_and_the_sensor_is_not_needed_to_arm():
@@ -270,19 +279,19 @@ def test_nothing_is_damped_in_standby_and_the_sensor_is_not_needed_to_arm():
     for _ in range(20):
         feel(bench, LeanTangential=0.15)
         bench.tick()
-    assert not bench.controller.sway.active
+    assert not bench.controller.crane.sway.active
     for _ in range(40):
         bench.tick()
-    assert bench.controller.received.imu.values is None
+    assert bench.controller.crane_inputs.imu.values is None
     bench.tick([bench.operator(OperatorAction.ARM)])
     assert bench.mode is Mode.ARMED
 
 
 def test_a_machine_without_one_does_not_listen_for_it():
     bench = Bench().boot()
-    received = bench.controller.received
-    assert received.imu is None and bench.controller.sway is None
-    assert KEY not in received.wanted() and KEY in Controller(sensing(), DATABASE).received.wanted()
+    received = bench.controller.crane_inputs
+    assert received.imu is None and bench.controller.crane.sway is None
+    assert KEY not in received.filters() and KEY in Controller(sensing(), DATABASE).crane_inputs.filters()
     unknown = received.unknown
     feel(bench, LeanTangential=0.15)
     bench.tick()
@@ -290,9 +299,9 @@ def test_a_machine_without_one_does_not_listen_for_it():
 
 
 def test_a_node_that_cannot_send_the_frame_is_refused():
-    with pytest.raises(ConfigError, match=r"imu.node: node 36 does not send GrappleImu \(1A3\); give it node 35"):
+    with pytest.raises(ConfigError, check=coded("config.imu-node")):
         Controller(sensing(msgspec.structs.replace(IMU, node=0x24)), DATABASE)
 
 
 def test_its_time_out_is_the_dbcs():
-    assert Controller(sensing(), DATABASE).received.imu.timeout_ns == 50 * MS
+    assert Controller(sensing(), DATABASE).crane_inputs.imu.timeout_ns == 50 * MS

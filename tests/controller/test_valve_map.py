@@ -4,11 +4,11 @@ import math
 
 import msgspec
 import pytest
-from bench import SPECS
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.valve import LINEAR, ValveMap
+from controller.laws.valve_map import LINEAR_SHARE, ValveMap
+from tests.controller.bench import SPECS
 
 PLAY, LIFT = SPECS[0].valve, SPECS[1].valve
 SLEW = msgspec.structs.replace(PLAY, hysteresis_pct=0.0)
@@ -16,7 +16,7 @@ CURVED = msgspec.structs.replace(SLEW, exponent=1.3, deadband_plus_pct=9.0, dead
 
 
 def metered(valve, u):
-    """What a valve of machines.md section 3 makes of a command: share of the full speed."""
+    """What a valve of docs/reference/machines.md section 3 makes of a command: share of the full speed."""
     deadband = (valve.deadband_plus_pct if u > 0 else valve.deadband_minus_pct) / 100.0
     half = valve.hysteresis_pct / 200.0
     return math.copysign((max(0.0, abs(u) - deadband) / (1.0 - half - deadband)) ** valve.exponent, u)
@@ -37,10 +37,10 @@ class Play:
 @given(velocity=st.floats(-0.5, 0.5))
 def test_the_map_is_the_inverse_of_the_valve(valve, velocity):
     u = ValveMap(valve).spool_pct(velocity) / 100.0
-    if abs(velocity) > LINEAR * 0.5:
+    if abs(velocity) > LINEAR_SHARE * 0.5:
         assert metered(valve, u) * 0.5 == pytest.approx(velocity, abs=1e-9)
     else:
-        edge = ValveMap(valve).spool_pct(math.copysign(1.001 * LINEAR * 0.5, velocity)) / 100.0
+        edge = ValveMap(valve).spool_pct(math.copysign(1.001 * LINEAR_SHARE * 0.5, velocity)) / 100.0
         assert abs(u) <= abs(edge)
 
 
@@ -94,20 +94,20 @@ def test_the_two_sides_differ():
 
 def test_a_short_lever_makes_the_joint_faster_and_an_unknown_place_changes_nothing():
     made = ValveMap(LIFT)
-    made.place(LIFT.lever_at[-1] + 1.0)
+    made.set_position(LIFT.lever_at[-1] + 1.0)
     assert made.arm == LIFT.lever[-1]
     assert made.full_plus == pytest.approx(LIFT.full_speed_plus / LIFT.lever[-1])
     short = made.spool_pct(0.1)
-    made.place(0.5 * (LIFT.lever_at[2] + LIFT.lever_at[3]))
+    made.set_position(0.5 * (LIFT.lever_at[2] + LIFT.lever_at[3]))
     assert made.arm == pytest.approx(0.5 * (LIFT.lever[2] + LIFT.lever[3]))
     assert made.spool_pct(0.1) > short
-    made.place(math.nan)
+    made.set_position(math.nan)
     assert made.arm == pytest.approx(0.5 * (LIFT.lever[2] + LIFT.lever[3]))
-    made.place(-9.0)
+    made.set_position(-9.0)
     assert made.arm == LIFT.lever[0]
 
 
 def test_a_joint_without_a_lever_is_the_same_everywhere():
     made = ValveMap(SLEW)
-    made.place(1.0)
+    made.set_position(1.0)
     assert (made.arm, made.full_plus) == (1.0, SLEW.full_speed_plus)

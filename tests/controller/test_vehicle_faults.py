@@ -5,16 +5,16 @@ where it does not matter.
 import math
 
 import pytest
-from driving import CARRIER, MS, DriveBench, T
 
-from can_dbc.setpoint import Driving
-from controller.carrier.dead_reckoning import JUMP_M, OFF_M
-from controller.carrier.monitors import ARM_STUCK_NS, DISAGREE_RAD, OWN_GAIN, OWN_M_S
-from controller.carrier.vehicle import UNSURE_SHARE
-from machine.faults import FAULTS, describe
+from can_dbc.messages.vehicle import Driving
+from controller.carrier.dead_reckoning import MAX_JUMP_M, MAX_REPEATED_JUMP_M
+from controller.carrier.monitors import ARM_STUCK_NS, DISAGREE_RAD, OVERSPEED_M_S, OVERSPEED_RATIO
+from controller.carrier.vehicle import RTK_FLOAT_SPEED_SHARE
 from machine.joints import ARTICULATION
-from machine.modes import Mode
-from machine.reasons import Reaction, Reason
+from machine.status.faults import FAULTS, describe
+from machine.status.modes import Mode
+from machine.status.reasons import Reaction, Reason
+from tests.controller.driving import CARRIER, MS, DriveBench, T
 
 SWAY = math.degrees(CARRIER.tilt_limit_rad)
 
@@ -89,11 +89,11 @@ def arms_fault(b):
 
 
 def run_away(b):
-    b.lies["VehStat"] = {"Speed": OWN_GAIN * 0.6 + OWN_M_S + 0.02}
+    b.lies["VehStat"] = {"Speed": OVERSPEED_RATIO * 0.6 + OVERSPEED_M_S + 0.02}
 
 
 def roll_back(b):
-    b.lies["VehStat"] = {"Speed": -OWN_M_S - 0.02}
+    b.lies["VehStat"] = {"Speed": -OVERSPEED_M_S - 0.02}
 
 
 def block(b):
@@ -202,7 +202,7 @@ def test_a_machine_that_does_not_drive_is_not_stopped(name):
 
 def test_a_carrier_that_rolls_under_the_crane_is_a_runaway():
     bench = DriveBench().armed()
-    bench.lies["VehStat"] = {"Speed": OWN_M_S + 0.02}
+    bench.lies["VehStat"] = {"Speed": OVERSPEED_M_S + 0.02}
     until(bench, Reason.CARRIER_RUNAWAY, FAULTS[Reason.CARRIER_RUNAWAY].bound_ms, speed_m_s=0.0)
     assert bench.mode is Mode.FAULT
 
@@ -230,7 +230,7 @@ def test_a_float_position_slows_the_way_to_a_waypoint_and_nothing_else():
     bench.lies["GnssPositionData"] = {"Method": 5}
     go(bench, 400)
     assert bench.mode is Mode.ACTIVE
-    assert bench.drive_command["Speed"] == pytest.approx(UNSURE_SHARE * CARRIER.speed_limit_m_s)
+    assert bench.drive_command["Speed"] == pytest.approx(RTK_FLOAT_SPEED_SHARE * CARRIER.speed_limit_m_s)
     for k in range(300):
         bench.tick([bench.bend(0.0, speed_m_s=0.6)] if k % 10 == 0 else ())
     assert bench.drive_command["Speed"] == pytest.approx(0.6)
@@ -238,12 +238,12 @@ def test_a_float_position_slows_the_way_to_a_waypoint_and_nothing_else():
 
 def test_a_step_aside_of_the_position_needs_two_samples_and_a_small_one_does_no_harm():
     bench = straight()
-    bench.north_m += OFF_M - 0.1
+    bench.north_m += MAX_REPEATED_JUMP_M - 0.1
     go(bench, 100)
     assert bench.mode is Mode.ACTIVE
-    bench.north_m += OFF_M + 0.2  # the next samples agree with it again: one is odd, not two
+    bench.north_m += MAX_REPEATED_JUMP_M + 0.2  # the next samples agree with it again: one is odd, not two
     go(bench, 100)
-    assert bench.mode is Mode.ACTIVE and OFF_M + 0.2 < JUMP_M
+    assert bench.mode is Mode.ACTIVE and MAX_REPEATED_JUMP_M + 0.2 < MAX_JUMP_M
 
 
 def test_a_position_that_wanders_off_step_by_step_is_found():
@@ -289,7 +289,7 @@ def test_a_long_drive_around_trips_nothing():
             bench.tick([bench.to(*places[0], float_rear=True)])
         else:
             bench.tick()
-    assert bench.mode is Mode.ACTIVE and bench.vehicle.order.refused == 0
+    assert bench.mode is Mode.ACTIVE and bench.vehicle.gate.refused == 0
     assert 30.0 < 12000 * T * 1e-9 * 0.6 < 40.0
 
 

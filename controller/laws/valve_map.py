@@ -1,15 +1,15 @@
-"""Joint velocity to spool command [%], by the profile's valve map.
+"""Valve compensation: joint velocity to spool command [%], by the profile's valve map.
 
-The command is the exact inverse of the rescaled dead-band and the metering curve of machines.md section 3::
+The command is the exact inverse of dead-band and metering curve of docs/reference/machines.md section 3::
 
     y = sign(w) (db + (1 - h - db) |w|^(1/n))    w: share of the full speed on that side, here in the joint's range
-    u = y + h sign(dy)                           h: half of the spool's play (hysteresis)
+    u = y + h sign(dy)                           h: half of the spool's hysteresis
 
-The spool stays behind its command by half of its play, below when it opens and above when it shuts; at 10 to 20 % of
-the stroke that is more speed than any other error of the valve.  So the command goes ahead by as much, and changes
-sides within a part of the play, not at every flicker.  A lever makes the same flow a faster joint where its arm is
-short, so the full speed depends on the position.  Within 1 % of it the inverse is linear, so that noise around zero
-does not slam the spool across the dead-band.
+The spool stays behind its command by half of its hysteresis, below when it opens and above when it shuts; at 10 to 20 %
+of the stroke this is more speed than any other error of the valve.  So the command leads by as much, and changes sides
+within a part of the hysteresis, not at every flicker.  With a short lever arm the same flow moves the joint faster, so
+the full speed depends on the position.  Within 1 % of it the inverse is linear, so that noise around zero does not slam
+the spool across the dead-band.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from typing import Final
 
 from machine.profile import Valve
 
-LINEAR: Final = 0.01
-FOLLOW: Final = 2.0
-"""Once the command has turned by a share 1 / FOLLOW of the play, it is ahead on the other side."""
+LINEAR_SHARE: Final = 0.01
+LEAD_GAIN: Final = 2.0
+"""Once the command has turned by a share 1 / LEAD_GAIN of the hysteresis, it leads on the other side."""
 
 
 class ValveMap:
-    """One valve function.  ``arm`` of its lever and the speeds at full command are those of the last `place`."""
+    """One valve function.  ``arm`` (lever arm) and the speeds at full command are those of the last `set_position`."""
 
     __slots__ = (
         "_ahead", "_at", "_deadband_minus", "_deadband_plus", "_half", "_inverse", "_last", "_lever", "_linear",
@@ -40,14 +40,14 @@ class ValveMap:
         self._range = 1.0 - self._half
         self._last = self._ahead = 0.0
         self._inverse = 1.0 / valve.exponent
-        self._linear: float = LINEAR**self._inverse / LINEAR
+        self._linear: float = LINEAR_SHARE**self._inverse / LINEAR_SHARE
         self._at, self._lever = valve.lever_at, valve.lever
         self.arm = 1.0
         self.full_plus = self._nominal_plus = valve.full_speed_plus
         self.full_minus = self._nominal_minus = valve.full_speed_minus
 
-    def place(self, position: float) -> None:
-        """Takes the lever arm at a joint position [rad, m]; NaN leaves it."""
+    def set_position(self, position: float) -> None:
+        """Set the lever arm for a joint position [rad, m]; NaN leaves it."""
         at, lever = self._at, self._lever
         if not at or position != position:
             return
@@ -72,18 +72,18 @@ class ValveMap:
         if share >= 1.0:
             self._last, self._ahead = side, side * self._half
             return 100.0 * side * self._sign
-        if share > LINEAR:
+        if share > LINEAR_SHARE:
             metered: float = share**self._inverse
-            place = side * (deadband + (self._range - deadband) * metered)
+            spool = side * (deadband + (self._range - deadband) * metered)
         else:
-            place = side * share * (deadband / LINEAR + (self._range - deadband) * self._linear)
-        half, ahead = self._half, self._ahead + FOLLOW * (place - self._last)
-        self._last, self._ahead = place, (half if ahead > half else -half if ahead < -half else ahead)
-        # Inside the dead-band nothing moves: there the play fades, so that no sign is ever turned.
+            spool = side * share * (deadband / LINEAR_SHARE + (self._range - deadband) * self._linear)
+        half, ahead = self._half, self._ahead + LEAD_GAIN * (spool - self._last)
+        self._last, self._ahead = spool, (half if ahead > half else -half if ahead < -half else ahead)
+        # Inside the dead-band nothing moves: there the lead fades, so that it never turns the sign.
         rim = max(deadband, 2.0 * half)
-        inside = abs(place) / rim if abs(place) < rim else 1.0
-        return 100.0 * self._sign * (place + self._ahead * inside)
+        inside = abs(spool) / rim if abs(spool) < rim else 1.0
+        return 100.0 * self._sign * (spool + self._ahead * inside)
 
     def limit(self, velocity: float) -> float:
-        """The velocity that the valve can give at most on that side."""
+        """Limit a velocity to what the valve can give on that side."""
         return min(velocity, self.full_plus) if velocity >= 0.0 else max(velocity, -self.full_minus)

@@ -1,8 +1,8 @@
 """The reference between the planner's knots: cubic Hermite curves, evaluated at any time without allocation.
 
-Inputs: an accepted crane setpoint; a time.  Outputs: position and velocity of every joint at that time, and
-the extremes of a piece of curve.  Before the first knot the curve goes on linearly, after the last it rests
-at the last position.  Nothing here judges.
+Inputs: an accepted crane setpoint and a time.  Outputs: position and velocity of every joint at that time, and the
+extremes of one piece.  The curve is extended linearly before the first knot and rests at the last position after the
+last.  Limits are checked elsewhere (`controller.crane.trajectory_check`).
 """
 
 from __future__ import annotations
@@ -11,28 +11,28 @@ from array import array
 from collections.abc import Sequence
 from typing import Final
 
-from can_dbc.setpoint import MAX_KNOTS, CraneSetpoint
+from can_dbc.messages.crane import MAX_KNOTS, CraneSetpoint
 from machine.joints import N_JOINTS
 
-HISTORY: Final = 20
+HISTORY_KNOTS: Final = 20
 """Knots of earlier setpoints that a trajectory keeps while its time is behind the planner's."""
-_ROOM: Final = MAX_KNOTS + HISTORY
-_NS: Final = 1e-9
+_CAPACITY_KNOTS: Final = MAX_KNOTS + HISTORY_KNOTS
+_S_PER_NS: Final = 1e-9
 
 
 class Trajectory:
-    """Knot storage of fixed size and the cubic between them."""
+    """Knots of fixed storage, and the cubics between them."""
 
     __slots__ = ("_n", "_position", "_times_ns", "_velocity")
 
     def __init__(self) -> None:
         self._n = 0
-        self._times_ns = array("q", [0] * _ROOM)
-        self._position = array("d", [0.0] * (_ROOM * N_JOINTS))
-        self._velocity = array("d", [0.0] * (_ROOM * N_JOINTS))
+        self._times_ns = array("q", [0] * _CAPACITY_KNOTS)
+        self._position = array("d", [0.0] * (_CAPACITY_KNOTS * N_JOINTS))
+        self._velocity = array("d", [0.0] * (_CAPACITY_KNOTS * N_JOINTS))
 
     def load(self, setpoint: CraneSetpoint) -> None:
-        """Takes the knots of a decoded setpoint (1 to 16, times strictly growing)."""
+        """Copy the knots of a decoded setpoint (1 to 16, times strictly growing)."""
         self._n = len(setpoint.knots)
         for i, knot in enumerate(setpoint.knots):
             self._times_ns[i] = setpoint.stamp_ns + knot.after_ns
@@ -41,12 +41,12 @@ class Trajectory:
                 self._velocity[i * N_JOINTS + joint] = knot.velocity[joint]
 
     def extend(self, newer: Trajectory, from_ns: int) -> None:
-        """Goes on as ``newer`` from its first knot; keeps what is before that and not before ``from_ns``."""
+        """Continue as ``newer`` from its first knot; keeps the knots before that and not before ``from_ns``."""
         times, first_ns = self._times_ns, newer._times_ns[0]
         end = 0
         while end < self._n and times[end] < first_ns:
             end += 1
-        start = max(0, end - HISTORY)
+        start = max(0, end - HISTORY_KNOTS)
         while start + 1 < end and times[start + 1] <= from_ns:
             start += 1
         for i in range(start, end):
@@ -73,11 +73,11 @@ class Trajectory:
         return not any(self._velocity[first : first + N_JOINTS])
 
     def fill(self, joints: Sequence[int], now_ns: int, position: list[float], velocity: list[float]) -> None:
-        """Writes where ``joints`` are to be at ``now_ns`` (rad or m) and how fast (per second) into their places."""
+        """Write position [rad, m] and velocity [per second] of ``joints`` at ``now_ns`` into their places."""
         times, n = self._times_ns, self._n
         p, v = self._position, self._velocity
         if now_ns <= times[0]:
-            ahead_s = (now_ns - times[0]) * _NS
+            ahead_s = (now_ns - times[0]) * _S_PER_NS
             for j in joints:
                 position[j], velocity[j] = p[j] + v[j] * ahead_s, v[j]
             return
@@ -89,8 +89,8 @@ class Trajectory:
         k = 1
         while times[k] < now_ns:
             k += 1
-        h = (times[k] - times[k - 1]) * _NS
-        share = (now_ns - times[k - 1]) * _NS / h
+        h = (times[k] - times[k - 1]) * _S_PER_NS
+        share = (now_ns - times[k - 1]) * _S_PER_NS / h
         for j in joints:
             b = k * N_JOINTS + j
             a = b - N_JOINTS

@@ -1,7 +1,7 @@
-"""What the loop knows of its own timing: how late, how long each stage, how old each input, what the system counts.
+"""Timing of the loop: lateness, duration of each stage, age of each input, and the system's counters.
 
-Everything is kept in arrays and objects made at start; a tick adds to them and builds nothing.  Once a second they are
-published in shared memory (`can_dbc.timing_page`).
+All storage is allocated at start; a tick only adds to it.  Once a second it is published in shared memory
+(`can_dbc.timing.page`).
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from can_dbc.bus import Bus
-from can_dbc.durations import Durations
-from can_dbc.timing_page import STAGES, BusCounters, Facts, InputAge, ProcessCounters, TimingWriter
-from controller.message_state import Slot
+from can_dbc.bus.base import Bus
+from can_dbc.timing.durations import Durations
+from can_dbc.timing.page import STAGES, BusCounters, Facts, InputAge, ProcessCounters, TimingWriter
+from controller.bus_io.message_state import MessageState
 from controller.step import Controller
 
 PUBLISH_NS: Final = 1_000_000_000
-_LAPS: Final = ("read", "decode", "estimate", "supervise", "law", "encode", "send", "tell")
+_LAPS: Final = ("receive", "decode", "estimate", "supervise", "control", "encode", "send", "record")
 _PAGE_KB: Final = os.sysconf("SC_PAGESIZE") >> 10
 
 
 class LoopTiming:
-    """The loop's stopwatch.  In a tick: `begin`, `lap` after each stage, `commanded`, `end`."""
+    """Stopwatch of the loop.  In a tick call `begin`, `lap` after each stage, `command_sent`, `end`."""
 
     __slots__ = (
         "_ages", "_at", "_begin_ns", "_clock_ns", "_cpu_begin_ns", "_cpu_ns", "_encoders", "_inputs", "_laps",
@@ -48,15 +48,17 @@ class LoopTiming:
         self._laps = [self.durations[name] for name in _LAPS]
         self._inputs = controller.inputs_in_use
         self._ages = [InputAge() for _ in self._inputs]
-        self._encoders: tuple[Slot, ...] = tuple(slot for slot in controller.received.encoders if slot is not None)
+        self._encoders: tuple[MessageState, ...] = tuple(
+            state for state in controller.crane_inputs.encoders if state is not None
+        )
         self._writer = writer
         self._clock_ns, self._cpu_ns = clock_ns, cpu_ns
         self.started_ns = clock_ns()
         self.publish_ns = self._at = self._begin_ns = self._last_ns = self._cpu_begin_ns = 0
         self._sync_ns = self._previous_sync_ns = 0
 
-    def synced(self, late_ns: int) -> None:
-        """SYNC is on its way: the encoders sample now."""
+    def sync_sent(self, late_ns: int) -> None:
+        """SYNC was sent: the encoders sample now."""
         self._previous_sync_ns, self._sync_ns = self._sync_ns, self._clock_ns()
         self.sync.add(late_ns)
 
@@ -74,14 +76,16 @@ class LoopTiming:
         self._last_ns = now_ns
         self._at += 1
 
-    def commanded(self) -> None:
-        """The valve commands are sent: how old are the samples they stand on?  As old as the oldest encoder's SYNC."""
+    def command_sent(self) -> None:
+        """The valve commands were sent: measure the age of their samples, from the SYNC of the oldest encoder
+        sample.
+        """
         oldest_ns = self._last_ns
-        for slot in self._encoders:
-            if slot.values is None:
+        for state in self._encoders:
+            if state.values is None:
                 return
-            if slot.stamp_ns < oldest_ns:
-                oldest_ns = slot.stamp_ns
+            if state.stamp_ns < oldest_ns:
+                oldest_ns = state.stamp_ns
         for sync_ns in (self._sync_ns, self._previous_sync_ns):
             if sync_ns <= oldest_ns:
                 self.sample_to_command.add(self._clock_ns() - sync_ns)
@@ -91,9 +95,9 @@ class LoopTiming:
     def end(self) -> int:
         """A tick ends; returns its duration."""
         begin_ns, ages = self._begin_ns, self._ages
-        for i, (_, slot) in enumerate(self._inputs):
-            if slot.fresh:
-                age, age_ns = ages[i], begin_ns - slot.stamp_ns
+        for i, (_, state) in enumerate(self._inputs):
+            if state.fresh:
+                age, age_ns = ages[i], begin_ns - state.stamp_ns
                 age.newest_ns = age_ns
                 age.count += 1
                 if age_ns > age.longest_ns:
@@ -105,9 +109,9 @@ class LoopTiming:
         return duration_ns
 
     def publish(
-        self, now_ns: int, period_ns: int, missed: int, late: int, mode: str, words: str, buses: Sequence[Bus]
+        self, now_ns: int, period_ns: int, missed: int, late: int, mode: str, status: str, buses: Sequence[Bus]
     ) -> None:
-        """Writes the page; call it when ``publish_ns`` is reached."""
+        """Write the page; call it when ``publish_ns`` is reached."""
         self.publish_ns = now_ns + PUBLISH_NS
         if self._writer is None:
             return
@@ -120,7 +124,7 @@ class LoopTiming:
             missed=missed,
             late=late,
             mode=mode,
-            words=words,
+            words=status,
             buses=tuple([_bus_counters(bus) for bus in buses]),
             process=_process_counters(),
             inputs={name: age for (name, _), age in zip(self._inputs, self._ages, strict=True)},
@@ -130,7 +134,7 @@ class LoopTiming:
         self._writer.publish(facts, self.durations)
 
     def close(self) -> None:
-        """Takes the page away."""
+        """Remove the page."""
         if self._writer is not None:
             self._writer.close()
 

@@ -1,9 +1,9 @@
-"""What hangs in the grapple, from the pressures of the lift cylinder, on a machine without a load cell.
+"""Load in the grapple by the pressures of the lift cylinder, on a machine without a load cell.
 
-The moment that the cylinder holds less that of the empty crane (`machine.lift`, both as calibration found them), over
-the pin's distance.  Only pressures of a lift that rests or moves steadily count; between them the last value stays.
-The cylinder's friction is in it: some 20 kg at 5 m, more nearer by.  A swinging load is averaged over `FILTER_S`.
-Called once per state report, not in every tick.
+The moment held by the cylinder less that of the empty crane (`machine.sensing.weighing`, both from calibration),
+divided by the pin's distance.  Only pressures of a lift that rests or moves steadily count; between them the last value
+is kept.  The cylinder's friction is an error of some 20 kg at 5 m, and more nearer by.  A swinging load is averaged
+over `FILTER_S`.  The estimate is updated 50 times a second, not in every tick.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from collections.abc import Sequence
 from typing import Final
 
 from machine.joints import N_JOINTS, Joint
-from machine.lift import hanging_kg, lift_moment_nm
 from machine.profile import Profile, joint
+from machine.sensing.weighing import hanging_load_kg, lift_moment_nm
 
 FILTER_S: Final = 0.8
 STEADY_S: Final = 0.3
 STEADY_SHARE: Final = 0.04
-"""A lift is steady while its speed is so near to what it was over `STEADY_S`, in shares of its speed limit."""
+"""A lift is steady while its speed differs by less than this share of its speed limit from its mean over `STEADY_S`."""
 
 
-class LoadEstimate:
-    """Filtered load [kg] of one machine; NaN while nothing is known of it."""
+class LoadEstimator:
+    """Filtered load [kg] of one machine; NaN while unknown."""
 
     __slots__ = ("_kg", "_profile", "_slow", "_steady")
 
@@ -36,9 +36,9 @@ class LoadEstimate:
     def step(
         self, position: Sequence[float], velocity: float, a_bar: float | None, b_bar: float | None, elapsed_s: float
     ) -> float:
-        """The load [kg] now, from positions, the lift's velocity [rad/s] and its pressures (None: unknown)."""
+        """Load [kg] from joint positions, the lift's velocity [rad/s] and its pressures [bar] (None: unknown)."""
         profile = self._profile
-        if profile.sag is None or a_bar is None or b_bar is None or not _all_known(position):
+        if profile.sag is None or a_bar is None or b_bar is None or not _carrying_joints_known(position):
             self._slow, self._kg = 0.0, math.nan
             return math.nan
         off = velocity - self._slow
@@ -46,13 +46,13 @@ class LoadEstimate:
         if abs(off) > self._steady:
             return self._kg
         moment_nm = lift_moment_nm(profile, position[Joint.LIFT], a_bar, b_bar)
-        kg = hanging_kg(profile.sag, profile.kinematics, position, moment_nm)
+        kg = hanging_load_kg(profile.sag, profile.kinematics, position, moment_nm)
         if kg == kg:
             before = kg if self._kg != self._kg else self._kg
             self._kg = max(0.0, before + (kg - before) * min(1.0, elapsed_s / FILTER_S))
         return self._kg
 
 
-def _all_known(position: Sequence[float]) -> bool:
+def _carrying_joints_known(position: Sequence[float]) -> bool:
     """Whether the joints that carry the load are known; the rotator does not matter."""
     return not any(math.isnan(position[j]) for j in range(N_JOINTS - 1))

@@ -1,8 +1,8 @@
-"""The newest good frame of one message: values with an age, refused whole or taken whole, stale by the DBC's time-out.
+"""The newest good frame of one message: its values with their age, stale by the DBC's time-out.
 
-Every value starts as unknown.  A frame is refused whole when its length, checksum, counter or a value is
-wrong; the old value then only grows older, until it is stale by the time-out that the DBC gives, and it must
-qualify anew (two good frames).  A rotary encoder, which has no counter, is alive while its time stamp moves.
+Every value starts as unknown.  A frame is refused whole when its length, checksum, counter or a value is wrong; the old
+values then only grow older until they are stale by the DBC's time-out, and the message must qualify again (two good
+frames).  A rotary encoder, which has no counter, is alive while its time stamp changes.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-from can_dbc.codec import FrameRefused, MessageCodec
-from can_dbc.e2e import Checker
+from can_dbc.dbc.codec import FrameRefused, MessageCodec
 from can_dbc.frame import Frame
+from can_dbc.protocols.e2e import Checker
 from controller.config import ConfigError
 
-PROMISE_NS: Final = 100_000_000
-"""Within this time after a needed input is lost every function is at neutral (design section 7)."""
-_LONGEST_TIMEOUT_NS: Final = PROMISE_NS - 10_000_000
+NEUTRAL_WITHIN_NS: Final = 100_000_000
+"""Within this time after a needed input is lost every function is at neutral (docs/reference/safety.md section 2)."""
+_MAX_TIMEOUT_NS: Final = NEUTRAL_WITHIN_NS - 10_000_000
 
 
-class Slot:
-    """One message; ``values`` is None before the first good frame and when it is stale."""
+class MessageState:
+    """One message; ``values`` is None before the first good frame and when they are stale."""
 
     __slots__ = (
         "_alive", "_checker", "_index", "_last_alive", "_receive", "bit", "codec", "fresh", "machine", "refused",
@@ -29,32 +29,34 @@ class Slot:
     )  # fmt: skip
 
     def __init__(self, codec: MessageCodec, bit: int, *, watched: bool = True, machine: bool = False) -> None:
-        """``bit`` is its place in the mask of stale inputs; the time-out of a ``watched`` one keeps the promise.
+        """``bit`` is its place in the mask of stale inputs; the time-out of a ``watched`` message is bounded by
+        `NEUTRAL_WITHIN_NS`; ``machine``: it comes on mach0, not on crane0.
 
         Raises:
-            ConfigError: the DBC has no time-out for it.
+            ConfigError: the DBC gives no time-out for it.
         """
         if not codec.timeout_ns:
-            raise ConfigError(f"The DBC gives no TimeoutMs for {codec.name}; add the attribute.")
+            raise ConfigError(
+                "config.no-timeout", f"The DBC gives no TimeoutMs for {codec.name}; add the attribute to the DBC."
+            )
         self.codec = codec
         self.machine = machine
-        """It comes on mach0, not on crane0."""
         self._receive = codec.receive
         self._index = dict(codec.index)
         self._checker = Checker(codec.data_ids) if codec.data_ids else None
         self._alive = codec.index.get("TimeStamp", -1)
         self.bit = bit
-        self.timeout_ns = min(codec.timeout_ns, _LONGEST_TIMEOUT_NS) if watched else codec.timeout_ns
+        self.timeout_ns = min(codec.timeout_ns, _MAX_TIMEOUT_NS) if watched else codec.timeout_ns
         self._last_alive: Any = None
         self.stamp_ns = 0
         self.refused = 0
         self.forget()
 
     def forget(self) -> None:
-        """Unknown again: the next frames have to qualify it."""
+        """The values are unknown again; the next frames must qualify the message."""
         self.values: tuple[Any, ...] | None = None
         self.fresh = False
-        """A good frame came this tick."""
+        """A good frame came in this tick."""
         if self._checker is not None:
             self._checker.reset()
 
@@ -62,8 +64,8 @@ class Slot:
         """A signal's value; None when the message is unknown or stale, or the signal not available."""
         return None if self.values is None else self.values[self._index[signal]]
 
-    def take(self, frame: Frame, now_ns: int) -> None:
-        """Judges a frame and takes its values when they are good."""
+    def receive(self, frame: Frame, now_ns: int) -> None:
+        """Check a frame and keep its values when they are good."""
         stamp_ns, _, data = frame
         checker = self._checker
         if checker is not None and not checker.check(data).usable:
@@ -86,18 +88,18 @@ class Slot:
         self.fresh = True
 
 
-def known(value: float | None) -> float:
+def or_nan(value: float | None) -> float:
     """A received value, NaN when there is none."""
     return math.nan if value is None else value
 
 
-def age_out(slots: tuple[Slot, ...], now_ns: int) -> int:
-    """Forgets values past their time-out; the mask of the slots in which nothing is known."""
+def age_out(states: tuple[MessageState, ...], now_ns: int) -> int:
+    """Forget values past their time-out; returns the mask of the messages without values."""
     mask = 0
-    for slot in slots:
-        if slot.values is None:
-            mask |= 1 << slot.bit
-        elif now_ns - slot.stamp_ns > slot.timeout_ns:
-            slot.forget()
-            mask |= 1 << slot.bit
+    for state in states:
+        if state.values is None:
+            mask |= 1 << state.bit
+        elif now_ns - state.stamp_ns > state.timeout_ns:
+            state.forget()
+            mask |= 1 << state.bit
     return mask

@@ -1,10 +1,9 @@
-"""The guard's judgement: pure ``step(now_ns, frames) -> frames``, no allocation that lasts.
+"""The guard's checks: pure ``step(now_ns, frames) -> frames``, no allocation that lasts.
 
-It watches the valve commands, whoever sends them, and everything they depend on, by its own rules and its own
-reading of the bytes.  GuardStat goes out every 10 ms and at once when the verdict changes; ``Enable`` is 0xA
-only while every rule holds.  After a broken rule the enable comes back when all is well and the commands are
-neutral for 200 ms. Neutral commands are always fine.  The guard never commands: silent or dead, it stops the
-machine by absence.
+It watches the valve commands, whoever sends them, and everything that they depend on, by its own rules and its own
+decoding.  GuardStat goes out every 10 ms, and at once when the verdict changes; ``Enable`` is 0xA only while no rule is
+broken.  After a broken rule the enable returns when the rules hold and the commands have been neutral for 200 ms.
+Neutral commands are always allowed.  The guard never commands: silent or dead, it stops the machine by absence.
 """
 
 from __future__ import annotations
@@ -18,14 +17,13 @@ from controller.guard.layout import Field, GuardConfigError, Layout
 
 GUARD_NODE: Final = 0x7D
 HEARTBEAT_KEY: Final = 0x700 + GUARD_NODE
-ENABLE: Final = 0xA
-ARM_KEY: Final = 0xA
+ENABLE, ARM_KEY = 0xA, 0xA
 STATUS_NS: Final = 10_000_000
 HEARTBEAT_NS: Final = 100_000_000
 CALM_NS: Final = 200_000_000
-ENCODER_NS: Final = 90_000_000
-"""The controller stops on a lost encoder within 100 ms; the guard sees to it that it does."""
-RANGE_MARGIN: Final = 0.08
+ENCODER_TIMEOUT_NS: Final = 90_000_000
+"""The controller stops on a lost encoder within 100 ms; the guard enforces it."""
+RANGE_MARGIN_UNITS: Final = 0.08
 """How far outside its range [rad, m] a joint may still be driven outward."""
 RATE_CREDIT_S: Final = 0.04
 RATE_SLACK_PCT: Final = 3.0
@@ -33,13 +31,12 @@ NO_AXIS: Final = 15
 GRAPPLE_AXIS, AUX_AXIS = 5, 6
 _NEUTRAL, _SPOOL = 0, 2
 _GRAPPLE_OPENS, _GRAPPLE_CLOSES = 1, 2
-_GOOD_NEEDED: Final = 2
-_BAD_ALLOWED: Final = 1
-_MAX_STEP: Final = 2
+_MIN_GOOD_COUNT, _MAX_BAD_COUNT, _MAX_COUNTER_STEP = 2, 1, 2
+MESSAGES: Final = ("ValveCmdA", "ValveCmdB", "EstopStat", "GuardStat")
 
 
 class Verdict(IntEnum):
-    """The rule that is broken; the number of ``GuardStat.Verdict``."""
+    """The broken rule; the number of ``GuardStat.Verdict``."""
 
     GOOD = 0
     NO_COMMAND = 1
@@ -47,21 +44,21 @@ class Verdict(IntEnum):
     CORRUPT = 2
     """A command with a wrong checksum, counter or length."""
     OTHER_GUARD = 3
-    """Somebody else sends the guard's frames."""
+    """Another node sends the guard's frames."""
     RANGE = 4
-    """A command out of its range, of an unknown mode, or for a function that is not there."""
+    """A command out of its range, of an unknown mode, or for a function that does not exist."""
     RATE = 5
     """A command that grows faster than the machine may."""
     NOT_ARMED = 6
-    """A movement is commanded without the arm key."""
+    """A motion is commanded without the arm key."""
     ESTOP = 7
-    """The emergency stop is pressed, in error, or not heard."""
+    """The emergency stop is pressed, inconsistent, or not received."""
     ENCODER = 8
-    """A joint is moved whose encoder is silent."""
+    """A motion is commanded for a joint whose encoder is silent."""
     OUTSIDE = 9
-    """A joint outside its range is moved further out."""
+    """A motion further out is commanded for a joint outside its range."""
     CALMING = 10
-    """All is well again, but not for long enough."""
+    """No rule is broken, but not for long enough."""
 
 
 def _crc_table() -> bytes:
@@ -85,55 +82,55 @@ def checksum(data: bytes, data_id: int) -> int:
     return _CRC[crc ^ data_id] ^ 0xFF
 
 
-class Taken(IntEnum):
-    """What a received frame did to its stream."""
+class FrameEffect(IntEnum):
+    """Effect of a received frame on its stream."""
 
-    NOTHING = 0
-    WORD = 1
+    NONE = 0
+    NEW_WORD = 1
     BROKEN = 2
 
 
-class Watch:
-    """One protected message: its newest good word, when it came, and whether its stream is trusted."""
+class WatchedMessage:
+    """One protected message: its newest good word, its time, and whether its stream is trusted."""
 
     __slots__ = ("_bad", "_good", "counter", "layout", "stamp_ns", "trusted", "word")
 
     def __init__(self, layout: Layout) -> None:
         if not layout.data_ids or not layout.timeout_ns:
-            raise GuardConfigError("crane.dbc: a message that the guard watches has no Data IDs or time-out.")
+            raise GuardConfigError("guard.message-unprotected", "crane.dbc: a message lacks Data IDs or a time-out.")
         self.layout = layout
         self.word = self.stamp_ns = 0
         self.counter = -1
         self.trusted = False
         self._good = self._bad = 0
 
-    def take(self, frame: Frame, now_ns: int) -> Taken:
-        """Judges a frame and takes its word when the stream is trusted."""
+    def receive(self, frame: Frame, now_ns: int) -> FrameEffect:
+        """Check a frame, and keep its word when the stream is trusted."""
         data, layout = frame.data, self.layout
         if len(data) != layout.length or checksum(data, layout.data_ids[data[1] & 0xF]) != data[0]:
             self._bad += 1
             self._good = 0
-            if self._bad > _BAD_ALLOWED:
+            if self._bad > _MAX_BAD_COUNT:
                 self.trusted = False
-                return Taken.BROKEN
-            return Taken.NOTHING
+                return FrameEffect.BROKEN
+            return FrameEffect.NONE
         counter = data[1] & 0xF
         step = (counter - self.counter) & 0xF if self.counter >= 0 else 1
         self.counter = counter
         if step == 0:  # a repeated frame only grows older
-            return Taken.NOTHING
+            return FrameEffect.NONE
         self._bad = 0
-        broken = step > _MAX_STEP and self.trusted
-        self._good = 1 if step > _MAX_STEP else self._good + 1
-        self.trusted = not broken and (self.trusted or self._good >= _GOOD_NEEDED)
+        broken = step > _MAX_COUNTER_STEP and self.trusted
+        self._good = 1 if step > _MAX_COUNTER_STEP else self._good + 1
+        self.trusted = not broken and (self.trusted or self._good >= _MIN_GOOD_COUNT)
         if not self.trusted:
-            return Taken.BROKEN if broken else Taken.NOTHING
+            return FrameEffect.BROKEN if broken else FrameEffect.NONE
         self.word = int.from_bytes(data, "little")
         self.stamp_ns = min(frame.stamp_ns, now_ns)
-        return Taken.WORD
+        return FrameEffect.NEW_WORD
 
     def old(self, now_ns: int) -> bool:
-        """Whether nothing trusted came within the time-out; then the stream must qualify again."""
+        """Whether no trusted frame came within the time-out; then the stream must qualify again."""
         if self.trusted and now_ns - self.stamp_ns <= self.layout.timeout_ns:
             return False
         if self.trusted:
@@ -145,39 +142,39 @@ class Watch:
         return self.layout.fields[name].raw(self.word)
 
 
-class Command:
+class CommandedAxis:
     """One commanded axis: its field, the last opening past the dead-band, and its rate credit."""
 
-    __slots__ = ("_credit", "_deadband", "_field", "_last", "_most", "_rate", "axis", "percent")
+    __slots__ = ("_credit", "_deadband", "_field", "_last", "_max_credit", "_rate", "axis", "percent")
 
     def __init__(self, axis: Axis, field: Field) -> None:
         self.axis = axis
         self._field = field
         self._deadband = axis.deadband_pct
         self._rate = axis.rate_pct_s
-        self._most = self._credit = axis.rate_pct_s * RATE_CREDIT_S + RATE_SLACK_PCT
+        self._max_credit = self._credit = axis.rate_pct_s * RATE_CREDIT_S + RATE_SLACK_PCT
         self._last = 0.0
         self.percent = 0.0
 
-    def take(self, word: int, elapsed_s: float) -> Verdict:
-        """Judges the value in a new command frame that came ``elapsed_s`` after the last one."""
+    def receive(self, word: int, elapsed_s: float) -> Verdict:
+        """Check the value in a new command frame that came ``elapsed_s`` after the last one."""
         raw = self._field.raw(word)
         if not self._field.inside(raw):
             return Verdict.RANGE
         self.percent = raw * self._field.scale
         size = max(0.0, abs(self.percent) - self._deadband) * 100.0 / (100.0 - self._deadband)
         opening = size if self.percent > 0.0 else -size
-        # Closing is free; what is spent is the growth on the side the command is on.
+        # Closing costs nothing; growth on the side of the command uses credit.
         growth = size if opening * self._last <= 0.0 else max(0.0, size - abs(self._last))
         self._last = opening
-        self._credit = min(self._most, self._credit + self._rate * elapsed_s) - growth
+        self._credit = min(self._max_credit, self._credit + self._rate * elapsed_s) - growth
         if self._credit < 0.0:
             self._credit = 0.0
             return Verdict.RATE
         return Verdict.GOOD
 
 
-class Joint:
+class MeasuredJoint:
     """The measured position of one joint."""
 
     __slots__ = ("_alive", "_at", "axis", "layout", "position", "stamp_ns")
@@ -185,12 +182,12 @@ class Joint:
     def __init__(self, axis: Axis, layout: Layout) -> None:
         self.axis, self.layout = axis, layout
         self.position = 0.0
-        self.stamp_ns = -ENCODER_NS
+        self.stamp_ns = -ENCODER_TIMEOUT_NS
         self._at = layout.fields.get("TimeStamp")
         self._alive = -1
 
-    def take(self, frame: Frame, now_ns: int) -> None:
-        """Takes an encoder frame; a rotary one counts only while its time stamp moves."""
+    def receive(self, frame: Frame, now_ns: int) -> None:
+        """Use an encoder frame; one of a rotary encoder counts only when its time stamp has changed."""
         if len(frame.data) != self.layout.length:
             return
         word = int.from_bytes(frame.data, "little")
@@ -206,11 +203,8 @@ class Joint:
         self.stamp_ns = min(frame.stamp_ns, now_ns)
 
 
-MESSAGES: Final = ("ValveCmdA", "ValveCmdB", "EstopStat", "GuardStat")
-
-
 class Guard:
-    """All of the guard's state; `step` is its whole behaviour."""
+    """All state of the guard; `step` is its whole behaviour."""
 
     __slots__ = (
         "_a", "_b", "_calm_ns", "_changed", "_commands", "_commands_a", "_commands_b", "_counter", "_estop",
@@ -219,16 +213,16 @@ class Guard:
     )  # fmt: skip
 
     def __init__(self, axes: tuple[Axis, ...], layouts: dict[str, Layout]) -> None:
-        self._a, self._b, self._estop = (Watch(layouts[name]) for name in MESSAGES[:3])
+        self._a, self._b, self._estop = (WatchedMessage(layouts[name]) for name in MESSAGES[:3])
         self._layout = layouts["GuardStat"]
         self._watches = {watch.layout.key: watch for watch in (self._a, self._b, self._estop)}
-        sensed = [Joint(axis, layouts[axis.message]) for axis in axes if axis.message]
+        sensed = [MeasuredJoint(axis, layouts[axis.message]) for axis in axes if axis.message]
         self._joints = {joint.layout.key: joint for joint in sensed}
         fields_a, fields_b = layouts["ValveCmdA"].fields, layouts["ValveCmdB"].fields
         missing = [axis.signal for axis in axes if axis.signal not in fields_a and axis.signal not in fields_b]
         if missing:
-            raise GuardConfigError(f"crane.dbc: no valve command is called {missing[0]}.")
-        self._commands = [Command(axis, (fields_a | fields_b)[axis.signal]) for axis in axes]
+            raise GuardConfigError("guard.no-command-signal", f"crane.dbc: no valve command is called {missing[0]}.")
+        self._commands = [CommandedAxis(axis, (fields_a | fields_b)[axis.signal]) for axis in axes]
         self._commands_a = [c for c in self._commands if c.axis.signal in fields_a]
         self._commands_b = [c for c in self._commands if c.axis.signal in fields_b]
         self._grapple_field = fields_b["Grapple"]
@@ -239,14 +233,14 @@ class Guard:
         self._calm_ns = self._status_ns = self._heartbeat_ns = 0
 
     def step(self, now_ns: int, frames: list[Frame]) -> list[tuple[int, bytes]]:
-        """Takes the frames since the last call (any period up to 10 ms); returns what to send."""
+        """Check the frames since the last call (any period up to 10 ms); returns the frames to send."""
         verdict, axis = Verdict.GOOD, NO_AXIS
         for frame in frames:
-            found, where = self._take(frame, now_ns)
+            found, where = self._receive(frame, now_ns)
             if verdict is Verdict.GOOD:
                 verdict, axis = found, where
         if verdict is Verdict.GOOD:
-            verdict, axis = self._judge(now_ns)
+            verdict, axis = self._check_state(now_ns)
         self._settle(verdict, axis, now_ns)
         out: list[tuple[int, bytes]] = []
         if self._changed or now_ns >= self._status_ns:
@@ -261,7 +255,7 @@ class Guard:
 
     @property
     def keys(self) -> tuple[int, ...]:
-        """The frames it needs to see: what it watches, and what nobody else may send."""
+        """Keys of the frames to receive: the watched ones, and the guard's own, which no other node may send."""
         return (*self._watches, *self._joints, self._layout.key, HEARTBEAT_KEY)
 
     @property
@@ -269,30 +263,30 @@ class Guard:
         """Whether the machine may move."""
         return self.verdict is Verdict.GOOD
 
-    def _take(self, frame: Frame, now_ns: int) -> tuple[Verdict, int]:
+    def _receive(self, frame: Frame, now_ns: int) -> tuple[Verdict, int]:
         watch = self._watches.get(frame.key)
         if watch is None:
             joint = self._joints.get(frame.key)
             if joint is not None:
-                joint.take(frame, now_ns)
+                joint.receive(frame, now_ns)
             elif frame.key in (self._layout.key, HEARTBEAT_KEY):
                 return Verdict.OTHER_GUARD, NO_AXIS
             return Verdict.GOOD, NO_AXIS
         before_ns = watch.stamp_ns
-        taken = watch.take(frame, now_ns)
-        if taken is Taken.BROKEN:
+        effect = watch.receive(frame, now_ns)
+        if effect is FrameEffect.BROKEN:
             return (Verdict.ESTOP if watch is self._estop else Verdict.CORRUPT), NO_AXIS
-        if watch is self._estop or taken is Taken.NOTHING:
+        if watch is self._estop or effect is FrameEffect.NONE:
             return Verdict.GOOD, NO_AXIS
         elapsed_s = (watch.stamp_ns - before_ns) * 1e-9
         for command in self._commands_a if watch is self._a else self._commands_b:
-            verdict = command.take(watch.word, elapsed_s)
+            verdict = command.receive(watch.word, elapsed_s)
             if verdict is not Verdict.GOOD:
                 return verdict, command.axis.number
         return Verdict.GOOD, NO_AXIS
 
-    def _judge(self, now_ns: int) -> tuple[Verdict, int]:
-        """The rules about the state now; only a command that moves something can break those on joints."""
+    def _check_state(self, now_ns: int) -> tuple[Verdict, int]:
+        """Check the rules on the present state; only a command that moves something can break those on joints."""
         estop_old = self._estop.old(now_ns)
         a_old, b_old = self._a.old(now_ns), self._b.old(now_ns)
         if estop_old or self._estop.raw("ChannelA") != 1 or self._estop.raw("ChannelB") != 1:
@@ -309,16 +303,16 @@ class Guard:
             return Verdict.GOOD, NO_AXIS
         if self._b.raw("ArmKey") != ARM_KEY:
             return Verdict.NOT_ARMED, NO_AXIS
-        return self._judge_joints(now_ns)
+        return self._check_joints(now_ns)
 
-    def _judge_joints(self, now_ns: int) -> tuple[Verdict, int]:
+    def _check_joints(self, now_ns: int) -> tuple[Verdict, int]:
         for joint in self._joints.values():
             number = joint.axis.number
-            if now_ns - joint.stamp_ns > ENCODER_NS:
+            if now_ns - joint.stamp_ns > ENCODER_TIMEOUT_NS:
                 return Verdict.ENCODER, number
             outward = self._commands[number].percent * joint.axis.sign
-            above = joint.position > joint.axis.upper + RANGE_MARGIN and outward > 0.0
-            below = joint.position < joint.axis.lower - RANGE_MARGIN and outward < 0.0
+            above = joint.position > joint.axis.upper + RANGE_MARGIN_UNITS and outward > 0.0
+            below = joint.position < joint.axis.lower - RANGE_MARGIN_UNITS and outward < 0.0
             if above or below:
                 return Verdict.OUTSIDE, number
         return Verdict.GOOD, NO_AXIS
@@ -329,7 +323,7 @@ class Guard:
         return self._b.raw("Grapple") == 0 and all(command.percent == 0.0 for command in self._commands)
 
     def _settle(self, verdict: Verdict, axis: int, now_ns: int) -> None:
-        """A broken rule counts at once; the way back takes a while of neutral commands."""
+        """A broken rule counts at once; the return needs a while of neutral commands."""
         if verdict is not Verdict.GOOD:
             self._calm_ns = now_ns + CALM_NS
         elif self.verdict is not Verdict.GOOD:

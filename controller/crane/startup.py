@@ -1,10 +1,9 @@
-"""Start-up of the encoders: identity, range, TPDO1 mapping, heartbeat, then NMT start; one SDO at a time per
-node.
+"""Start-up of the encoders: identity, range, TPDO1 mapping, heartbeat, then NMT start; one SDO at a time per node.
 
-A state machine that advances by at most one request per tick over all nodes, so that no tick is long and the bus
-stays free.  Every node is silenced and asked from the first tick on, 300 ms per request, 3 tries, and one that does not
-answer is asked again for ever.  A node that restarts is set up again.  Failures are a `Reason` with the node number; a
-wrong node is not asked again before a reset.
+A state machine that sends at most one request per tick over all nodes, so that no tick is long and the bus stays free.
+From the first tick on every node is silenced and configured, with 300 ms per request and 3 tries; a node that does not
+answer is tried again without end.  A node that restarts is set up again.  A failure is a `Reason` with the node number;
+a node of the wrong identity is not tried again before a reset.
 """
 
 from __future__ import annotations
@@ -13,38 +12,38 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from can_dbc.canopen import (
+from can_dbc.dbc.codec import Database
+from can_dbc.frame import RawFrame
+from can_dbc.protocols.canopen import (
     NmtCommand,
     Sdo,
     SdoKind,
-    Wire,
     download_request,
     nmt_frame,
     parse_response,
     upload_request,
 )
-from can_dbc.codec import Database
 from controller.config import ConfigError
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import Encoder, Profile, encoders
-from machine.reasons import Reason
+from machine.status.reasons import Reason
 
 TIMEOUT_NS: Final = 300_000_000
-TRIES: Final = 3
+MAX_TRIES: Final = 3
 HEARTBEAT_MS: Final = 100
 TPDO1: Final = 0x180
 _DISABLED: Final = 0x8000_0000
 _REMEMBERED: Final = (0x6000, 0x6003, 0x6509)
-"""Code sequence, preset and offset (can_bus.md section 3): a device that loses them counts from another zero."""
-# CiA 406 mappings of can_bus.md section 3: index(16) sub(8) bits(8).
-_MAPPINGS: Final = {
+"""Code sequence, preset and offset (docs/reference/can-bus.md section 3): a device that loses them has another zero."""
+# CiA 406 mappings of docs/reference/can-bus.md section 3: index(16) sub(8) bits(8).
+TPDO1_MAPPINGS: Final = {
     "rotary": (0x6004_0020, 0x2120_0010, 0x6503_0010),
     "linear": (0x6004_0020, 0x6030_0110, 0x5122_0108, 0x5122_0208),
 }
 
 
 class Request(NamedTuple):
-    """One SDO: a write of ``size`` bytes, or with size 0 a read to compare (``value`` None: to note)."""
+    """One SDO: a write of ``size`` bytes, or with size 0 a read to compare (``value`` None: to remember)."""
 
     entry: int
     sub: int
@@ -59,7 +58,7 @@ def sequence(encoder: Encoder) -> tuple[Request, ...]:
         scale = Request(0x6001, 0, encoder.total_counts)
     else:
         scale = Request(0x6005, 1, round(encoder.unit_per_count * 1e9))  # nm per step
-    mapping = _MAPPINGS[encoder.kind]
+    mapping = TPDO1_MAPPINGS[encoder.kind]
     return (
         Request(0x1000, 0, encoder.device_type),
         Request(0x1018, 1, None),
@@ -78,11 +77,11 @@ def sequence(encoder: Encoder) -> tuple[Request, ...]:
 
 
 class Phase(IntEnum):
-    """Where the set-up of one node stands."""
+    """Phase of the set-up of one node."""
 
     SILENCING = 0
-    """To be sent to pre-operational, so that its PDOs are silent."""
-    ASKING = 1
+    """The node is sent to pre-operational, so that its PDOs are silent."""
+    CONFIGURING = 1
     STARTING = 2
     READY = 3
     FAILED = 4
@@ -100,22 +99,22 @@ class EncoderSetup:
         self.restart()
 
     def restart(self) -> None:
-        """Begins again."""
+        """Begin again."""
         self.phase = Phase.SILENCING
         self.reason = Reason.NODE_ABSENT
         self._step = self._tries = self._deadline_ns = 0
 
-    def frame(self, now_ns: int) -> Wire | None:
-        """The frame this node is due, if any."""
+    def frame(self, now_ns: int) -> RawFrame | None:
+        """The next frame to this node, if one is due."""
         if self.phase is Phase.SILENCING:
-            self.phase = Phase.ASKING
+            self.phase = Phase.CONFIGURING
             return nmt_frame(NmtCommand.ENTER_PRE_OPERATIONAL, self.node)
         if self.phase is Phase.STARTING:
             self.phase, self.reason = Phase.READY, Reason.NONE
             return nmt_frame(NmtCommand.START, self.node)
-        if self.phase is not Phase.ASKING or now_ns < self._deadline_ns:
+        if self.phase is not Phase.CONFIGURING or now_ns < self._deadline_ns:
             return None
-        if self._tries == TRIES:
+        if self._tries == MAX_TRIES:
             self.restart()
             return None
         self._tries += 1
@@ -125,11 +124,11 @@ class EncoderSetup:
             return download_request(self.node, index, sub, value.to_bytes(size, "little"))
         return upload_request(self.node, index, sub)
 
-    def answer(self, response: Sdo) -> None:
-        """Takes a response; one that does not belong to the open request is ignored."""
+    def receive(self, response: Sdo) -> None:
+        """Use a response; one that does not belong to the open request is ignored."""
         index, sub, value, size = self.requests[self._step]
-        asked = self.phase is Phase.ASKING and self._tries > 0
-        if not asked or (response.index, response.sub) != (index, sub):
+        waiting = self.phase is Phase.CONFIGURING and self._tries > 0
+        if not waiting or (response.index, response.sub) != (index, sub):
             return
         if response.kind is not (SdoKind.DOWNLOAD if size else SdoKind.UPLOAD):
             self._fail(Reason.NODE_CONFIGURATION)
@@ -151,7 +150,7 @@ class EncoderSetup:
 
 
 class Startup:
-    """Set-up of all encoders; `step` gives the frames to send."""
+    """Set-up of all encoders; `step` appends the frames to send."""
 
     __slots__ = ("_by_node", "_released", "_setups", "_turn")
 
@@ -172,37 +171,37 @@ class Startup:
         return (worst.reason, worst.node) if worst is not None and worst.reason else (Reason.NONE, 0)
 
     def reset(self, operational: Callable[[int], bool]) -> None:
-        """An operator's reset: failed nodes, and those that left OPERATIONAL by themselves, are set up again."""
+        """An operator's reset: set up failed nodes, and those that left OPERATIONAL by themselves, again."""
         self._released = False
         for setup in self._setups:
             if setup.phase is Phase.FAILED or (setup.phase is Phase.READY and not operational(setup.node)):
                 setup.restart()
 
-    def again(self) -> None:
-        """Every node is set up anew: nobody knows what happened to it."""
+    def restart(self) -> None:
+        """Set up every node again, because its state is unknown."""
         self._released = False
         for setup in self._setups:
             setup.restart()
 
     def receive(self, key: int, data: bytes) -> bool:
-        """Takes a frame; True when it was an SDO answer of one of our encoders."""
+        """Use a frame; True when it was an SDO answer of one of the encoders."""
         response = parse_response(key, data)
         setup = None if response is None else self._by_node.get(response.node)
         if response is None or setup is None:
             return False
-        setup.answer(response)
+        setup.receive(response)
         return True
 
-    def booted(self, node: int) -> None:
-        """A boot-up frame: the set-up of this node is gone, and whoever it is waits for START."""
+    def node_booted(self, node: int) -> None:
+        """A boot-up frame: the node lost its set-up and waits for START."""
         self._released = False
         setup = self._by_node.get(node)
         if setup is not None:
             setup.restart()
 
-    def step(self, now_ns: int, frames: list[Wire]) -> None:
-        """Appends what this tick has to say: at most one frame."""
-        if self._released:  # everything is set up and started; whatever undoes that takes this back
+    def step(self, now_ns: int, frames: list[RawFrame]) -> None:
+        """Append the next frame, at most one per tick."""
+        if self._released:  # every node is set up and started; `restart`, `reset` and `node_booted` clear this
             return
         n = len(self._setups)
         for k in range(n):
@@ -217,20 +216,25 @@ class Startup:
 
 
 def check_nodes(database: Database, profile: Profile) -> None:
-    """Refuses a profile whose node cannot send the message it names, for start-up would write to another device; raises
-    ConfigError."""
+    """Check that every encoder's node sends the message it names; start-up would write to another device otherwise.
+
+    Raises:
+        ConfigError: a node of the profile does not fit its message.
+    """
     for place, encoder in encoders(profile).items():
         key = database.message(encoder.message).key
         if key != TPDO1 + encoder.node:
             jointed = place < N_JOINTS
             where = f"joints.{JOINTS[place].name.lower()}.encoder" if jointed else "carrier.articulation_encoder"
             raise ConfigError(
+                "config.encoder-node",
                 f"{where}.node: node {encoder.node} does not send {encoder.message} ({key:03X}); "
-                f"give it node {key - TPDO1} or another message"
+                f"use node {key - TPDO1} or another message.",
             )
     imu = profile.imu
     if imu is not None and database.message(imu.message).key != TPDO1 + imu.node:
         key = database.message(imu.message).key
         raise ConfigError(
-            f"imu.node: node {imu.node} does not send {imu.message} ({key:03X}); give it node {key - TPDO1}"
+            "config.imu-node",
+            f"imu.node: node {imu.node} does not send {imu.message} ({key:03X}); use node {key - TPDO1}.",
         )

@@ -1,11 +1,11 @@
 """Joint positions and velocities from quantised encoder counts: a steady-state Kalman filter per joint.
 
-The joint moves with a white acceleration; its encoder rounds and is noisy.  The gains are those at which the Riccati
-recursion rests, computed at start from the encoder's noise, its resolution and the joint's acceleration
-limit, so that no gain is per cycle; a tick is two scalar recurrences.  A sample belongs to the moment of SYNC, not to
-the tick: it is compared with the estimate carried back to its stamp.  A sample that no joint of this machine could
-have reached is refused and counted; three refusals within 100 ms are a fault (safety_faults.md, case 2), after which
-the filter starts anew.
+The model is a joint with white acceleration and an encoder with noise and rounding.  The gains are the fixed point of
+the Riccati recursion, computed at start from the encoder's noise and resolution and the joint's acceleration limit, so
+no gain is per cycle; a tick is two scalar recurrences.  A sample belongs to the moment of SYNC, not to the tick: it is
+compared with the estimate extrapolated back to its stamp.  A sample that the joint cannot have reached is refused and
+counted; three refusals within 100 ms are a fault (docs/reference/safety.md section 5, case 2), after which the filter
+starts again.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ ACCELERATION_SHARE: Final = 1.0 / 3.0
 ACCELERATION_S: Final = 0.1
 """... which lasts about this long: together the spectral density of the white acceleration."""
 STILL_S: Final = 0.2
-"""A joint stands still when its velocity has been within `STILL_SHARE` for this long."""
+"""A joint stands still when its speed has been below `STILL_SHARE` of its full speed for this long."""
 STILL_SHARE: Final = 0.012
 _JUMP_WINDOW_NS: Final = 100_000_000
-_JUMPS: Final = 3
+_JUMP_LIMIT_COUNT: Final = 3
 _NAN: Final = math.nan
 
 
-class Tracked(Protocol):
-    """What is known of a joint that is tracked: encoder, valve, limits [unit/s, unit/s^2]."""
+class TrackedJoint(Protocol):
+    """A joint for estimator and monitor: encoder, valve, limits [unit/s, unit/s^2]."""
 
     @property
     def encoder(self) -> Encoder | None: ...
@@ -46,26 +46,25 @@ def measurement_variance(encoder: Encoder) -> float:
     return encoder.noise**2 + encoder.unit_per_count**2 / 12.0
 
 
-def acceleration_density(spec: Tracked) -> float:
+def acceleration_density(spec: TrackedJoint) -> float:
     """Spectral density of the joint's acceleration [(rad/s^2)^2 s, (m/s^2)^2 s]."""
     return (ACCELERATION_SHARE * spec.acceleration_limit) ** 2 * ACCELERATION_S
 
 
 def steady_gains(period_s: float, density: float, variance: float) -> tuple[float, float]:
-    """Gains of position and velocity [-, 1/s] of the Kalman filter that has settled.
+    """Gains of position and velocity [-, 1/s] of the steady-state Kalman filter.
 
-    Motion over a period: position += velocity T, driven by a white acceleration of this spectral ``density``; a
-    position is measured with this ``variance`` every period.  The second differences of the measurements are a moving
-    average of order two; its factor with zeros inside the unit circle is the filter's innovation form, so the zeros
-    are the filter's poles.
+    Model: position += velocity T per period, driven by a white acceleration of spectral ``density``; a position is
+    measured with ``variance`` every period.  The second differences of the measurements are a moving average of order
+    two; its factor with zeros inside the unit circle is the filter's innovation form, so the zeros are its poles.
     """
     drive = density * period_s**3 / 6.0
     root = cmath.sqrt(drive * (drive - 24.0 * variance))
-    short = []  # one less each pole
+    complements = []  # one less each pole
     for w in ((root - drive) / (2.0 * variance), (-root - drive) / (2.0 * variance)):
         spread = cmath.sqrt(w + 0.25 * w * w)
-        short.append(max((-0.5 * w + spread, -0.5 * w - spread), key=lambda rest: -abs(1.0 - rest)))
-    a, b = short
+        complements.append(max((-0.5 * w + spread, -0.5 * w - spread), key=lambda c: -abs(1.0 - c)))
+    a, b = complements
     return (a + b - a * b).real, (a * b).real / period_s
 
 
@@ -77,7 +76,7 @@ class JointEstimator:
         "_predicted_ns", "_slack", "_slow", "jumped", "known", "position", "refused", "velocity",
     )  # fmt: skip
 
-    def __init__(self, spec: Tracked, period_s: float) -> None:
+    def __init__(self, spec: TrackedJoint, period_s: float) -> None:
         encoder, valve = spec.encoder, spec.valve
         self._alpha, self._beta = 1.0, 0.0
         self._slack = 0.0
@@ -92,25 +91,26 @@ class JointEstimator:
 
     @property
     def still(self) -> bool:
-        """Whether the joint stands."""
+        """Whether the joint stands still."""
         return self.known and self._predicted_ns - self._moved_ns >= STILL_S * 1e9
 
     def reset(self) -> None:
-        """Forgets everything: the value is unknown again."""
+        """Forget everything: the value is unknown again."""
         self.known = self.jumped = False
         self.position = self.velocity = self._measured = _NAN
         self._measured_ns = self._predicted_ns = self._moved_ns = 0
-        self._jump_stamps = [-_JUMP_WINDOW_NS] * _JUMPS
+        self._jump_stamps = [-_JUMP_WINDOW_NS] * _JUMP_LIMIT_COUNT
 
     def predict(self, now_ns: int) -> None:
-        """Moves the estimate on to ``now_ns``; once per tick, before `sample`."""
+        """Extrapolate the estimate to ``now_ns``; once per tick, before `update`."""
         if self.known:
             self.position += self.velocity * (now_ns - self._predicted_ns) * 1e-9
         self._predicted_ns = now_ns
 
-    def sample(self, measured: float, stamp_ns: int) -> None:
-        """Takes a position measured at ``stamp_ns``, not after the last `predict`; sets ``jumped`` at the third
-        refusal within 100 ms.
+    def update(self, measured: float, stamp_ns: int) -> None:
+        """Correct the estimate by a position measured at ``stamp_ns``, not after the last `predict`.
+
+        The third refusal within 100 ms sets ``jumped``.
         """
         self.jumped = False
         if not self.known:
@@ -120,7 +120,7 @@ class JointEstimator:
         if abs(measured - self._measured) > self._gate_speed * max(elapsed_s, 0.0) + self._slack:
             self.refused += 1
             stamps = self._jump_stamps
-            stamps[self.refused % _JUMPS] = stamp_ns
+            stamps[self.refused % _JUMP_LIMIT_COUNT] = stamp_ns
             if stamp_ns - min(stamps) < _JUMP_WINDOW_NS:
                 self.jumped = True
                 self._start(measured, stamp_ns)
@@ -139,5 +139,5 @@ class JointEstimator:
         self.position = self._measured = measured
         self.velocity = 0.0
         self._measured_ns, self._moved_ns = stamp_ns, self._predicted_ns
-        for i in range(_JUMPS):
+        for i in range(_JUMP_LIMIT_COUNT):
             self._jump_stamps[i] = stamp_ns - _JUMP_WINDOW_NS

@@ -1,61 +1,60 @@
-"""The state report: what the controller says of itself 50 times a second, and how it knows the load."""
+"""The state report: 50 times a second the controller's mode, refusals, estimates and timing, in one datagram.
+
+It only reads; nothing that it reports changes the state of a law.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Final
 
-from can_dbc.setpoint import StateReport, encode
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import encode
+from controller.bus_io.message_state import or_nan
+from controller.bus_io.messages import PeriodicTimer
 from controller.config import Settings
-from controller.crane import Crane
-from controller.estimator import JointEstimator
-from controller.inputs import Received
-from controller.load import LoadEstimate
-from controller.message_state import known
-from controller.outputs import Every
-from controller.requests import Gate
+from controller.crane.inputs import CraneInputs
+from controller.crane.motion import Crane
+from controller.estimation.joint_estimator import JointEstimator
+from controller.requests.setpoint_gate import SetpointGate
 from controller.supervisor import Supervisor
-from machine.joints import Joint
-from machine.reasons import pack
+from machine.status.reasons import pack
 
 REPORT_NS: Final = 20_000_000
 
 
-class Reports:
+class StateReporter:
     """Builds the reports; ``late_ns`` and ``tick_ns`` are the worst since the last one."""
 
     __slots__ = (
-        "_crane", "_due", "_estimators", "_gate", "_load", "_received", "_sequence", "_settings", "_supervisor",
-        "late_ns", "tick_ns",
+        "_crane", "_due", "_estimators", "_gate", "_inputs", "_sequence", "_settings", "_supervisor", "late_ns",
+        "tick_ns",
     )  # fmt: skip
 
     def __init__(
         self,
         settings: Settings,
         supervisor: Supervisor,
-        gate: Gate,
-        received: Received,
+        gate: SetpointGate,
+        inputs: CraneInputs,
         crane: Crane,
         estimators: Sequence[JointEstimator],
     ) -> None:
         self._settings, self._supervisor, self._gate = settings, supervisor, gate
-        self._received, self._crane, self._estimators = received, crane, estimators
-        self._load = LoadEstimate(settings.profile)
-        self._due, self._sequence = Every(REPORT_NS), 0
+        self._inputs, self._crane, self._estimators = inputs, crane, estimators
+        self._due, self._sequence = PeriodicTimer(REPORT_NS), 0
         self.late_ns = self.tick_ns = 0
 
-    def measure(self, late_ns: int, tick_ns: int) -> None:
-        """Lateness of this tick, and how long the one before took."""
+    def note_timing(self, late_ns: int, tick_ns: int) -> None:
+        """Remember the worst lateness and duration of a tick until the next report."""
         self.late_ns = max(self.late_ns, late_ns)
         self.tick_ns = max(self.tick_ns, tick_ns)
 
     def report(self, stale_mask: int, missed_ticks: int, frames: int, now_ns: int) -> bytes | None:
-        """A state report when one is due; ``frames`` is how many were received since the start."""
+        """A state report when one is due, else None; ``frames`` counts the frames received since the start."""
         if not self._due.due(now_ns):
             return None
         supervisor, gate, crane, estimators = self._supervisor, self._gate, self._crane, self._estimators
-        load_kg = self._load_kg()
-        crane.grapple.weigh(load_kg, now_ns)
         self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
         # Three by place, and tuples from lists: CPython 3.11 never takes a tuple of 20 (the names of all fields) or one
         # made from a generator from its free list again, and the heap would grow for half an hour.
@@ -72,10 +71,10 @@ class Reports:
             stale_mask=stale_mask,
             position=tuple([e.position for e in estimators]),
             velocity=tuple([e.velocity for e in estimators]),
-            reference=tuple(crane.follower.reference),
+            reference=tuple(crane.governor.position),
             opening_pct=crane.opening_pct(),
-            clamp_bar=known(self._received.grapple.get("ClampPress")),
-            load_kg=load_kg,
+            clamp_bar=or_nan(self._inputs.grapple.get("ClampPress")),
+            load_kg=crane.load_kg,
             tick_ns=self.tick_ns,
             late_ns=self.late_ns,
             missed_ticks=missed_ticks,
@@ -83,12 +82,3 @@ class Reports:
         )
         self.late_ns = self.tick_ns = 0
         return encode(report, self._settings.key)
-
-    def _load_kg(self) -> float:
-        """By the load cell where there is one, else by the lift's pressures."""
-        measured = self._received.grapple.get("Load")
-        if measured is not None:
-            return float(measured)
-        lift, slot = self._estimators[Joint.LIFT], self._received.pressures[0]
-        position = [e.position for e in self._estimators]
-        return self._load.step(position, lift.velocity, slot.get("LiftA"), slot.get("LiftB"), REPORT_NS * 1e-9)

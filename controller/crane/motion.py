@@ -1,0 +1,251 @@
+"""The crane as one part of the controller: accepted requests, their lease, the laws, and the spool commands.
+
+Inputs: accepted setpoints and spool tests, received values, joint estimates.  Outputs of a tick:  ``commands`` (joint
+velocities [rad/s, m/s]), ``spools_pct`` and the grapple's command.  A setpoint is a short trajectory or a spool test;
+it is in force until its lease ends.  The mode belongs to the supervisor; this part only acts on it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, SpoolTest
+from controller.bus_io.message_state import or_nan
+from controller.bus_io.messages import PeriodicTimer
+from controller.config import Settings
+from controller.crane.inputs import CraneInputs
+from controller.crane.reference_governor import ReferenceGovernor
+from controller.crane.spool_test_run import SpoolTestRun
+from controller.crane.trajectory_check import TrajectoryCheck
+from controller.estimation.joint_estimator import JointEstimator
+from controller.estimation.load_estimator import LoadEstimator
+from controller.laws.crane import LOADS, CraneLaw
+from controller.laws.grapple import GrappleLaw
+from controller.laws.joint import STANDING_UNIT_S
+from controller.laws.sway import STATUS_USABLE, SWING, SwayDamping
+from controller.requests.gate import RequestGate
+from controller.requests.setpoint_gate import RequestRefused
+from machine.joints import JOINTS, N_JOINTS, Joint
+from machine.status.reasons import Reason
+
+IN_PLACE_UNITS: Final = 0.005
+"""A setpoint within this of the reference [rad, m] and without velocity keeps the crane in place."""
+LOAD_PERIOD_NS: Final = 20_000_000
+"""The load is estimated this often, in step with the state report."""
+
+
+class Crane:
+    """All state of the crane's motion, built once; ``leased`` while a setpoint or a spool test is in force."""
+
+    __slots__ = (
+        "_check", "_estimators", "_final", "_gate", "_grapple_request", "_inputs", "_load", "_load_due",
+        "_load_updated", "_opening_sensed", "_pressure_pairs", "_pressures_bar", "_sensed", "commands", "governor", "grapple", "law",
+        "lease_end_ns", "leased", "load_kg", "spool_run", "spools_pct", "sway",
+    )  # fmt: skip
+
+    def __init__(
+        self, settings: Settings, inputs: CraneInputs, estimators: Sequence[JointEstimator], gate: RequestGate
+    ) -> None:
+        profile = settings.profile
+        self._inputs, self._estimators, self._gate = inputs, estimators, gate
+        self._check = TrajectoryCheck(profile)
+        self._opening_sensed = profile.grapple.opening_sensor
+        self._sensed = [profile.joints[j.name.lower()].encoder is not None for j in JOINTS]
+        self.law = CraneLaw(profile, settings.period_ns * 1e-9)
+        leads_ns = [law.lead_ns for law in self.law.laws]
+        self.governor = ReferenceGovernor(profile, self.law.valves, leads_ns)
+        self.sway = None if profile.imu is None else SwayDamping(profile, profile.imu, leads_ns)
+        """Damps the grapple's swing on a machine with an inertial sensor on the grapple."""
+        self.grapple = GrappleLaw(profile.grapple)
+        self.spool_run = SpoolTestRun(profile)
+        pressures = {name: state for state in inputs.pressures for name in state.codec.index}
+        self._pressure_pairs = tuple(pair and (pressures[pair[0]], *pair) for pair in LOADS)
+        self._pressures_bar = [math.nan] * N_JOINTS
+        self._load, self._load_due, self._load_updated = LoadEstimator(profile), PeriodicTimer(LOAD_PERIOD_NS), False
+        self.load_kg = math.nan
+        """Load in the grapple; NaN while unknown."""
+        self.commands = self.law.commands
+        """Joint velocities commanded in this tick."""
+        self.spools_pct = [0.0] * N_JOINTS
+        self.leased = False
+        self.lease_end_ns = 0
+        self._final = False
+        self._grapple_request = GrappleCommand.NEUTRAL
+
+    # -- estimate
+
+    def estimate_load(self, now_ns: int) -> None:
+        """Estimate the load when it is due: by the load cell where there is one, else by the lift's pressures."""
+        self._load_updated = self._load_due.due(now_ns)
+        if not self._load_updated:
+            return
+        measured = self._inputs.grapple.get("Load")
+        if measured is not None:
+            self.load_kg = float(measured)
+            return
+        lift, state = self._estimators[Joint.LIFT], self._inputs.pressures[0]
+        position = [e.position for e in self._estimators]
+        self.load_kg = self._load.step(
+            position, lift.velocity, state.get("LiftA"), state.get("LiftB"), LOAD_PERIOD_NS * 1e-9
+        )
+
+    # -- reference
+
+    def update_reference(self, active: bool, cap: float, now_ns: int) -> None:
+        """Compute the reference of this tick.
+
+        It follows the trajectory in force; without one, and in a spool test, it is where the joints are.
+        """
+        governor = self.governor
+        if active and self.leased and not self.spool_run.running:
+            governor.follow(now_ns, cap)
+            return
+        for j, estimator in enumerate(self._estimators):
+            measured = estimator.known or self._sensed[j]
+            governor.hold(j, estimator.position if measured else governor.position[j], now_ns)
+
+    # -- accept
+
+    def keeps_in_place(self, setpoint: CraneSetpoint) -> bool:
+        """Whether a setpoint only keeps the crane where it is."""
+        reference = self.governor.position
+        for knot in setpoint.knots:
+            for j in JOINTS:
+                if knot.velocity[j] != 0.0 or abs(knot.position[j] - reference[j]) > IN_PLACE_UNITS:
+                    return False
+        return True
+
+    def is_moving(self, now_ns: int) -> bool:
+        """Whether the reference or a spool test moves the crane."""
+        return self.leased and (self.spool_run.running or not self.governor.at_rest(now_ns))
+
+    def accept(self, setpoint: CraneSetpoint, now_ns: int) -> bool:
+        """Follow a trajectory from now on; True when this ended a spool test.
+
+        Raises:
+            RequestRefused: the trajectory leaves the limits, or a spool test holds a valve open.
+        """
+        if self.spool_run.opened(now_ns):
+            raise RequestRefused(Reason.TEST_BUSY, self.spool_run.function)
+        self.governor.accept(now_ns, self._continues_plan(setpoint, now_ns))
+        self.lease_end_ns = setpoint.stamp_ns + setpoint.lease_ns
+        self._final = setpoint.final
+        self._grapple_request = setpoint.grapple
+        ended_test = self.spool_run.running
+        self.spool_run.end()
+        return ended_test
+
+    def _continues_plan(self, setpoint: CraneSetpoint, now_ns: int) -> bool:
+        """Check a setpoint: True when it continues the plan, False when it begins at the present reference.
+
+        Plan and reference differ only while the trajectory's time is behind the planner's.
+        """
+        check, governor = self._check, self.governor
+        if governor.behind_ns:
+            try:
+                check.load_and_check(setpoint, governor.candidate, *governor.planned(now_ns), now_ns)
+            except RequestRefused as refused:
+                if refused.reason is not Reason.REFERENCE_JUMP:
+                    raise
+            else:
+                self._gate.mark_accepted(setpoint)
+                return True
+        check.load_and_check(setpoint, governor.candidate, governor.position, governor.velocity, now_ns)
+        self._gate.mark_accepted(setpoint)
+        return False
+
+    def accept_spool_test(self, test: SpoolTest, now_ns: int) -> None:
+        """Run a spool test from now on; raises RequestRefused."""
+        if self.leased and not self.spool_run.running and not self.governor.at_rest(now_ns):
+            raise RequestRefused(Reason.TEST_BUSY, test.function)
+        self.spool_run.start(test, now_ns)
+        self._gate.mark_accepted(test)
+        self.lease_end_ns = test.stamp_ns + test.lease_ns
+        self._grapple_request = GrappleCommand.NEUTRAL
+
+    def reset_laws(self) -> None:
+        """The laws begin from neutral valves."""
+        self.law.reset()
+        if self.sway is not None:
+            self.sway.reset()
+
+    # -- supervise
+
+    def lease_over(self, now_ns: int) -> bool:
+        """Whether the setpoint is no longer valid: its lease is over, or its last knot still moves."""
+        if now_ns >= self.lease_end_ns:
+            return True
+        if self.spool_run.running:
+            return self.spool_run.cut_short(now_ns)
+        return self.governor.ended_moving(now_ns)
+
+    def finished(self, now_ns: int) -> bool:
+        """Whether the requested motion is done, so that its lease may end without a fault."""
+        if self.spool_run.running:
+            return self.spool_run.ends_neutral(now_ns)
+        return self._final and self.governor.at_rest(now_ns)
+
+    # -- control
+
+    def control(self, active: bool, ramp_share: float, ramping: bool, cap: float, now_ns: int, elapsed_ns: int) -> None:
+        """Run the laws while ``active``; scale the last command by ``ramp_share`` during a stop's ramp; otherwise
+        command neutral.
+        """
+        self.leased &= active
+        if self.spool_run.running:
+            self._drive_spool_test(ramp_share if not active else 1.0, now_ns)
+            if not active and not ramping:
+                self.spool_run.end()
+        else:
+            self._run_laws(ramp_share, cap, now_ns, elapsed_ns)
+        if self._load_updated:
+            self.grapple.observe_load(self.load_kg, now_ns)
+
+    def _run_laws(self, ramp_share: float, cap: float, now_ns: int, elapsed_ns: int) -> None:
+        law, governor, inputs = self.law, self.governor, self._inputs
+        if self.leased:
+            pressures = self._pressures_bar
+            for j, source in enumerate(self._pressure_pairs):
+                if source is not None:
+                    state, push, against = source
+                    pressures[j] = law.load_pressure_bar(j, state.get(push), state.get(against))
+            elapsed_s = elapsed_ns * 1e-9
+            if self.sway is not None:
+                self._damp_sway(self.sway, now_ns, elapsed_s)
+            law.step(
+                governor.position, governor.velocity, governor.lead_velocity, self._estimators, pressures, cap,
+                elapsed_s, self.sway,
+            )  # fmt: skip
+            clamp, release = inputs.grapple.get("ClampPress"), inputs.pressures[2].get("GrappleB")
+            self.grapple.step(self._grapple_request, or_nan(clamp), self.opening_pct(), or_nan(release), now_ns)
+        else:
+            law.fade(ramp_share)
+            self.grapple.release()
+        for j, valve in enumerate(law.valves):
+            self.spools_pct[j] = valve.spool_pct(self.commands[j])
+
+    def _damp_sway(self, sway: SwayDamping, now_ns: int, elapsed_s: float) -> None:
+        """Update the sway damping; it acts once the crane's reference stands."""
+        state, governor = self._inputs.imu, self.governor
+        swing, age_s = None, 0.0
+        if state is not None and state.get("Status") in STATUS_USABLE:
+            lean = tuple(state.get(name) for name in SWING)
+            if None not in lean:
+                swing, age_s = lean, (now_ns - state.stamp_ns) * 1e-9
+        reference = (*governor.velocity[: Joint.ROT], *governor.lead_velocity[: Joint.ROT])
+        stands = all(abs(v) < STANDING_UNIT_S for v in reference)
+        sway.step(swing, age_s, stands, [e.position for e in self._estimators], elapsed_s)
+
+    def _drive_spool_test(self, share: float, now_ns: int) -> None:
+        """Drive one function by its spool command, all others neutral; during a stop's ramp with ``share`` of it."""
+        run = self.spool_run
+        for j in JOINTS:
+            self.commands[j] = self.spools_pct[j] = 0.0
+        self.spools_pct[run.function], self.commands[run.function] = run.drive(share, now_ns)
+        self.grapple.release()
+
+    def opening_pct(self) -> float:
+        """Measured opening of the grapple; NaN on a machine without the sensor, whatever the bus carries."""
+        return or_nan(self._inputs.grapple.get("Opening")) if self._opening_sensed else math.nan

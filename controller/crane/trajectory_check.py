@@ -1,0 +1,94 @@
+"""Limits of a requested trajectory: joint range, speed, and its distance to the present motion.
+
+A trajectory is refused whole with a `Reason` and the joint; nothing is corrected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from can_dbc.messages.crane import CraneSetpoint
+from controller.crane.trajectory import Trajectory, extremes, peak_speed
+from controller.requests.setpoint_gate import RequestRefused
+from machine.joints import JOINTS, N_JOINTS
+from machine.profile import Profile, joint
+from machine.status.reasons import Reason
+
+SPEED_TOLERANCE_SHARE: Final = 1.05
+"""A smooth profile cut into cubics overshoots its peak speed a little between the knots."""
+JUMP_S: Final = 0.1
+"""A new reference may differ by the distance that the joint covers in this time at its speed limit, ..."""
+VELOCITY_JUMP_S: Final = 0.25
+"""... and in velocity by the acceleration limit times this time (plus 10 % of the speed limit)."""
+
+
+class TrajectoryCheck:
+    """Checks trajectories against one profile."""
+
+    __slots__ = ("_acceleration", "_lower", "_new_position", "_new_velocity", "_speed", "_upper")
+
+    def __init__(self, profile: Profile) -> None:
+        specs = [joint(profile, j) for j in JOINTS]
+        self._lower = tuple(s.lower for s in specs)
+        self._upper = tuple(s.upper for s in specs)
+        self._speed = tuple(s.speed_limit for s in specs)
+        self._acceleration = tuple(s.acceleration_limit for s in specs)
+        self._new_position, self._new_velocity = [0.0] * N_JOINTS, [0.0] * N_JOINTS
+
+    def load_and_check(
+        self,
+        setpoint: CraneSetpoint,
+        candidate: Trajectory,
+        position: Sequence[float],
+        velocity: Sequence[float],
+        now_ns: int,
+    ) -> None:
+        """Load ``candidate`` with a setpoint and check it.
+
+        ``position`` and ``velocity`` are the motion that it must continue; a joint whose value is NaN is not compared.
+
+        Raises:
+            RequestRefused: the trajectory leaves the range, is too fast or jumps.
+        """
+        candidate.load(setpoint)
+        new_position, new_velocity = self._new_position, self._new_velocity
+        candidate.fill(JOINTS, now_ns, new_position, new_velocity)
+        for j in JOINTS:
+            self._check_path(setpoint, j)
+            far = abs(new_position[j] - position[j]) > JUMP_S * self._speed[j]
+            kick = abs(new_velocity[j] - velocity[j]) > VELOCITY_JUMP_S * self._acceleration[j] + 0.1 * self._speed[j]
+            if far or kick:
+                raise RequestRefused(Reason.REFERENCE_JUMP, j)
+
+    def _check_path(self, setpoint: CraneSetpoint, j: int) -> None:
+        knots, lower, upper = setpoint.knots, self._lower[j], self._upper[j]
+        fastest = SPEED_TOLERANCE_SHARE * self._speed[j]
+        first, last = knots[0], knots[-1]
+        if not lower <= first.position[j] <= upper:
+            raise RequestRefused(Reason.JOINT_RANGE, j)
+        if abs(first.velocity[j]) > fastest:
+            raise RequestRefused(Reason.JOINT_SPEED, j)
+        if setpoint.final and last.velocity[j] != 0.0:
+            raise RequestRefused(Reason.FINAL_MOVING, j)
+        a = first
+        for b in knots[1:]:
+            p0, v0, p1, v1 = a.position[j], a.velocity[j], b.position[j], b.velocity[j]
+            h = (b.after_ns - a.after_ns) * 1e-9
+            a = b
+            # A cubic and its velocity lie within the hulls of their Bezier points; only a piece whose hulls leave the
+            # limits is solved exactly.  The comparisons also refuse a NaN from an overflow.
+            if (
+                lower <= p1 <= upper
+                and lower <= p0 + v0 * h / 3.0 <= upper
+                and lower <= p1 - v1 * h / 3.0 <= upper
+                and -fastest <= v1 <= fastest
+                and -fastest <= 3.0 * (p1 - p0) / h - v0 - v1 <= fastest
+            ):
+                continue
+            piece = (p0, v0, p1, v1, h)
+            if not peak_speed(*piece) <= fastest:
+                raise RequestRefused(Reason.JOINT_SPEED, j)
+            low, high = extremes(*piece)
+            if not (lower <= low and high <= upper):
+                raise RequestRefused(Reason.JOINT_RANGE, j)

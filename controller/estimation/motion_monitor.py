@@ -1,0 +1,92 @@
+"""Motion monitor: does a joint follow its command?  (docs/reference/safety.md section 5, cases 1, 5, 16, 17)
+
+The valve's dead time is not known well: it lies between an early and a late bound, whatever the profile says.  So the
+commanded velocity passes two models of the valve, one at either bound, and a joint is wrong only against both.  They
+are compared with the measured velocity in leaky integrals (0.5 s), which are distances: how far the joint should have
+moved by now at the latest, how far it stayed behind that, how far it moved faster than any recent command, and how far
+against its command.  The monitor cannot see a stuck joint below a fifth of the speed limit: a wrong dead-band looks the
+same there.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from typing import Final
+
+from controller.estimation.joint_estimator import TrackedJoint
+from machine.status.reasons import Reason
+
+EARLY_DELAY_S, EARLY_LAG_S = 0.03, 0.03
+LATE_DELAY_S, LATE_LAG_S = 0.15, 0.06
+"""Bounds of the dead time, and the lags behind it: spool, and compressible oil."""
+_MEMORY_S: Final = 0.5
+_COMMAND_DECAY_S: Final = 0.2
+"""A former command at the speed limit still counts for this time, a smaller one longer."""
+_MIN_TRAVEL_S: Final = 0.08
+"""A joint can be stuck once it should have moved as far as in this time at its speed limit."""
+_STUCK_SHARE: Final = 0.7
+_AGAINST_S: Final = 0.02
+_RUNAWAY_S: Final = 0.06
+_OVERSPEED_SHARE: Final = 0.25
+"""Share of the speed limit by which a joint may be faster than its command: pendulum, ringing, ..."""
+_OVERSPEED_GAIN: Final = 0.3
+"""... and share of the command: the valve's gain."""
+_REVERSAL_SHARE: Final = 0.1
+"""From this share of the speed limit on, motion against the command is reversal and not runaway."""
+
+
+class MotionMonitor:
+    """Monitors one joint; `step` returns the fault, or `Reason.NONE`."""
+
+    __slots__ = (
+        "_against", "_at", "_behind", "_decay", "_early", "_early_at", "_early_lag", "_command_decay", "_expected",
+        "_late", "_late_lag", "_limit", "_line", "_min_travel", "_overspeed", "_period_s", "_recent_command",
+    )  # fmt: skip
+
+    def __init__(self, spec: TrackedJoint, period_s: float, later_s: float = 0.0, lag_s: float = LATE_LAG_S) -> None:
+        """``later_s``: delay that a bus and a node add to the late bound; ``lag_s``: the lag behind it."""
+        self._line = array("d", [0.0] * (round((LATE_DELAY_S + later_s) / period_s) + 1))
+        self._early_at = round(EARLY_DELAY_S / period_s)
+        self._period_s = period_s
+        self._early_lag, self._late_lag = (-math.expm1(-period_s / s) for s in (EARLY_LAG_S, lag_s))
+        self._decay = math.exp(-period_s / _MEMORY_S)
+        self._limit = spec.speed_limit
+        self._command_decay = spec.speed_limit * period_s / _COMMAND_DECAY_S
+        self._min_travel = _MIN_TRAVEL_S * spec.speed_limit
+        self.reset()
+
+    def reset(self) -> None:
+        """At rest with a neutral valve."""
+        self._at = 0
+        self._early = self._late = self._recent_command = 0.0
+        self._expected = self._behind = self._overspeed = self._against = 0.0
+        for i in range(len(self._line)):
+            self._line[i] = 0.0
+
+    def step(self, command: float, velocity: float) -> Reason:
+        """One period with the commanded and the measured velocity [rad/s or m/s]."""
+        line, at = self._line, self._at
+        line[at] = command
+        self._early = early = self._early + self._early_lag * (line[at - self._early_at] - self._early)
+        self._at = at = at + 1 if at + 1 < len(line) else 0
+        self._late = late = self._late + self._late_lag * (line[at] - self._late)
+        dt, decay, limit = self._period_s, self._decay, self._limit
+        wanted, moved = abs(late), abs(velocity)
+        self._recent_command = recent = max(abs(early), wanted, self._recent_command - self._command_decay)
+        self._expected = decay * self._expected + dt * wanted
+        self._behind = decay * self._behind + dt * (late - velocity) * math.copysign(1.0, late)
+        commanded = _REVERSAL_SHARE * limit
+        opposed = (velocity < 0.0 and min(early, late) > commanded) or (
+            velocity > 0.0 and max(early, late) < -commanded
+        )
+        self._against = decay * self._against + (dt * moved if opposed else 0.0)
+        faster = 0.0 if opposed else moved - (1.0 + _OVERSPEED_GAIN) * recent - _OVERSPEED_SHARE * limit
+        self._overspeed = max(0.0, decay * self._overspeed + dt * faster)
+        if self._against > _AGAINST_S * limit:
+            return Reason.JOINT_REVERSED
+        if self._expected > self._min_travel and self._behind > _STUCK_SHARE * self._expected:
+            return Reason.JOINT_STUCK
+        if self._overspeed > _RUNAWAY_S * limit:
+            return Reason.JOINT_RUNAWAY
+        return Reason.NONE

@@ -1,0 +1,1 @@
+"""Requests that arrive as datagrams: their checks, their order and the memory of refusals."""

@@ -1,0 +1,72 @@
+"""The gate of all requests: datagrams in, checked setpoints and operator actions out.
+
+Every datagram is a request, refused whole with a `Reason` or passed on; nothing is corrected.  Checked here: form (CRC,
+length, version, finite numbers, by the codec), profile, age, order and lease.  The motion of a crane setpoint is
+checked by `controller.crane.trajectory_check`, that of a drive setpoint by `controller.carrier.vehicle`.  An operator's
+STOP is accepted whatever profile, age or order it carries.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from can_dbc.messages.crane import CraneSetpoint, OperatorAction, OperatorCommand, SpoolTest
+from can_dbc.messages.datagrams import decode
+from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.vehicle import DriveSetpoint
+from controller.requests.setpoint_gate import RequestRefused, SetpointGate
+from machine.profile import Profile
+from machine.status.reasons import Reason
+
+OPERATOR_AGE_NS: Final = 1_000_000_000
+
+
+class RequestGate(SetpointGate):
+    """The gate of all datagrams; as a `SetpointGate` it keeps the order of crane setpoints and spool tests."""
+
+    __slots__ = ("_drives", "_key", "_operator_sequence", "_operator_stamp_ns")
+
+    def __init__(self, profile: Profile, profile_hash: int, key: bytes | None) -> None:
+        super().__init__(profile, profile_hash)
+        self._drives = profile.carrier is not None
+        self._key = key
+        self._operator_stamp_ns = self._operator_sequence = -1
+
+    def accept(
+        self, data: bytes, now_ns: int, late_ns: int
+    ) -> CraneSetpoint | SpoolTest | DriveSetpoint | OperatorAction:
+        """The setpoint or operator action in a datagram, checked for form, profile, age and order.
+
+        Order and lease of a drive setpoint are checked by the vehicle.
+
+        Raises:
+            RequestRefused: the datagram does not pass.
+        """
+        try:
+            message = decode(data, self._key)
+        except DatagramRefused as error:
+            raise RequestRefused(Reason(100 + error.fault)) from None
+        if isinstance(message, OperatorCommand):
+            if message.action is not OperatorAction.STOP:
+                self._check_operator(message, now_ns + late_ns)
+            return message.action
+        if isinstance(message, DriveSetpoint):
+            if not self._drives:
+                raise RequestRefused(Reason.CANNOT_DRIVE)
+            return message
+        if not isinstance(message, CraneSetpoint | SpoolTest):
+            raise RequestRefused(Reason.DATAGRAM_KIND)
+        self.check(message, now_ns, late_ns)
+        return message
+
+    def _check_operator(self, message: OperatorCommand, latest_ns: int) -> None:
+        if message.profile_hash != self._profile_hash:
+            raise RequestRefused(Reason.WRONG_PROFILE)
+        order = (message.stamp_ns, message.sequence)
+        if order <= (self._operator_stamp_ns, self._operator_sequence):
+            raise RequestRefused(Reason.OUT_OF_ORDER)
+        if message.stamp_ns > latest_ns:
+            raise RequestRefused(Reason.STAMP_FUTURE)
+        if latest_ns - message.stamp_ns > OPERATOR_AGE_NS:
+            raise RequestRefused(Reason.STAMP_OLD)
+        self._operator_stamp_ns, self._operator_sequence = order
