@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from machine.load import ProfileError, load_profile, profile_hash
+from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 
 
 class Refused(Exception):

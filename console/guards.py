@@ -37,7 +37,7 @@ def is_loopback(host: str | None) -> bool:
     return host is not None and (host in ("::1", "testclient") or host.startswith("127."))
 
 
-class Guards:
+class RequestGuards:
     """ASGI middleware (module docstring: contract); ``names`` are the host names served, without port."""
 
     def __init__(self, app: ASGIApp, names: Collection[str], policy: str) -> None:

@@ -15,7 +15,7 @@ _E2: Final = 0.006_694_379_990_14
 Metres = tuple[float, float]
 
 
-class Ground:
+class MapProjection:
     """The map's ground; its origin is the first place that it is asked for."""
 
     def __init__(self) -> None:

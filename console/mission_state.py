@@ -1,8 +1,7 @@
-"""What the page shows of a mission and of the vehicle that does it; pure, as `console.state` is.
+"""The page's state of a mission and its vehicle; pure, like `console.state`.
 
-Everything for the map is in metres east and north of one origin (`console.map_projection`), angles in radians counter-clockwise
-from east.  A mission report is taken when it is for this machine and newer than the last; then it stays, and its age is
-told with it.
+Map data are in metres east and north of one origin (`console.map_projection`), angles in radians counter-clockwise from
+east.  A mission report is accepted when it is for this machine and newer than the last one; it is shown with its age.
 """
 
 from __future__ import annotations
@@ -11,10 +10,10 @@ import math
 from collections import deque
 from typing import Any, Final
 
-from can_dbc.messages.mission import LatLon, Lying, MissionReport, decode_mission
-from can_dbc.messages.crane import DatagramRefused, Driving, VehicleReport
-from can_dbc.messages.vehicle import VEHICLE_INPUTS
-from console.map_projection import Ground, Metres
+from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.mission import LatLon, KnownLog, MissionReport, decode_mission
+from can_dbc.messages.vehicle import VEHICLE_INPUTS, Driving, VehicleReport
+from console.map_projection import MapProjection, Metres
 from machine.profile import Profile
 
 TOLD_NS: Final = 2_000_000_000
@@ -58,7 +57,7 @@ def describe_carrier(profile: Profile) -> dict[str, Any] | None:
     return {name: getattr(c, name) for name in names}
 
 
-class MissionWatch:
+class MissionState:
     """Takes mission and vehicle reports; gives what the page shows of them."""
 
     def __init__(self, profile: Profile, profile_hash: int, key: bytes | None = None) -> None:
@@ -68,7 +67,7 @@ class MissionWatch:
         """Where the articulation axis was."""
         self._carrier = profile.carrier
         self._hash, self._key = profile_hash, key
-        self._ground = Ground()
+        self._ground = MapProjection()
         self._mission: MissionReport | None = None
         self._stamp_ns = self._told_ns = self._heard_ns = self._placed_ns = 0
         self._vehicle: VehicleReport | None = None
@@ -127,7 +126,7 @@ class MissionWatch:
             "logs": [self._log(log) for log in m.logs],
         }
 
-    def _log(self, log: Lying) -> dict[str, Any]:
+    def _log(self, log: KnownLog) -> dict[str, Any]:
         return {
             "number": log.number,
             "at": self._metres(log.place),

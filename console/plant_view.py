@@ -23,7 +23,7 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from console.guards import LOOPBACK_NAMES, Guards, content_security_policy, is_loopback
+from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy, is_loopback
 
 PERIOD_S: Final = 0.05
 ANSWER_S: Final = 1.0
@@ -71,7 +71,7 @@ def create_plant_app(plant: Address, allow_hosts: Collection[str] = ()) -> Starl
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        _, link = await asyncio.get_running_loop().create_datagram_endpoint(PlantLink, remote_addr=plant)
+        _transport, link = await asyncio.get_running_loop().create_datagram_endpoint(PlantLink, remote_addr=plant)
         links.append(link)
         yield
         link.close()
@@ -110,6 +110,8 @@ def create_plant_app(plant: Address, allow_hosts: Collection[str] = ()) -> Starl
             WebSocketRoute("/ws/plant", ws),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
-        middleware=[Middleware(Guards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=content_security_policy(page))],
+        middleware=[
+            Middleware(RequestGuards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=content_security_policy(page))
+        ],
         lifespan=lifespan,
     )

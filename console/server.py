@@ -33,12 +33,12 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
-from can_dbc.messages.mission import MissionOrder, Order, encode_order
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
+from can_dbc.messages.mission import MissionOrder, Order, encode_order
 from can_dbc.timing.page import TimingRefused, read_timing
-from console.guards import LOOPBACK_NAMES, Guards, content_security_policy, is_loopback
-from console.state import Watch, describe_machine
+from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy, is_loopback
+from console.state import CraneState, describe_machine
 from machine.profile import Profile
 
 PERIOD_S: Final = 0.05
@@ -65,11 +65,11 @@ class Console:
     planner: Address | None = None
     timing_page: Path | None = None
     clock: Callable[[], int] = time.monotonic_ns
-    watch: Watch = field(init=False)
+    watch: CraneState = field(init=False)
     _sequence: int = 0
 
     def __post_init__(self) -> None:
-        self.watch = Watch(self.profile, self.key, self.profile_hash)
+        self.watch = CraneState(self.profile, self.key, self.profile_hash)
 
     def command(self, action: OperatorAction) -> None:
         """Send one operator command; raises OSError."""
@@ -131,7 +131,7 @@ async def _ask_logs(transport: asyncio.DatagramTransport) -> None:
         await asyncio.sleep(ASK_LOGS_S)
 
 
-async def _watch_timing(watch: Watch, page: Path) -> None:
+async def _watch_timing(watch: CraneState, page: Path) -> None:
     while True:
         with contextlib.suppress(TimingRefused):  # none, or none yet; what was read before grows old
             watch.on_timing(await asyncio.to_thread(read_timing, page))
@@ -161,10 +161,12 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
         loop = asyncio.get_running_loop()
         async with contextlib.AsyncExitStack() as stack:
             if console.reports:
-                reports, _ = await loop.create_datagram_endpoint(lambda: _Reports(console), sock=console.reports)
+                reports, _receiver = await loop.create_datagram_endpoint(
+                    lambda: _Reports(console), sock=console.reports
+                )
                 stack.callback(reports.close)
             if console.scene:
-                scene, _ = await loop.create_datagram_endpoint(lambda: _Logs(console), remote_addr=console.scene)
+                scene, _logs = await loop.create_datagram_endpoint(lambda: _Logs(console), remote_addr=console.scene)
                 asking = asyncio.create_task(_ask_logs(scene))
                 stack.callback(scene.close)
                 stack.callback(asking.cancel)
@@ -234,6 +236,8 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
             WebSocketRoute("/ws", ws),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
-        middleware=[Middleware(Guards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=content_security_policy(page))],
+        middleware=[
+            Middleware(RequestGuards, names={*LOOPBACK_NAMES, *allow_hosts}, policy=content_security_policy(page))
+        ],
         lifespan=lifespan,
     )

@@ -18,7 +18,7 @@ from can_dbc.messages.datagrams import decode
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.timing.page import Timing
-from console.mission_state import MissionWatch, describe_carrier
+from console.mission_state import MissionState, describe_carrier
 from machine.geometry import grapple, kinematics
 from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
@@ -56,12 +56,12 @@ def describe_machine(profile: Profile) -> dict[str, Any]:
     }
 
 
-class Watch:
+class CraneState:
     """Takes reports and log lists, gives the page's state; ``forwarding`` is what it knows of vehicle and mission."""
 
     def __init__(self, profile: Profile, key: bytes | None = None, profile_hash: int = 0) -> None:
         self.logs: tuple[LogObservation, ...] = ()
-        self.forwarding = MissionWatch(profile, profile_hash, key)
+        self.forwarding = MissionState(profile, profile_hash, key)
         self._profile = profile
         self._key = key
         self._report: StateReport | None = None
@@ -138,7 +138,7 @@ class Watch:
         if not all(map(math.isfinite, q)):
             return {"points": None, "reference_points": None}
         opening = r.opening_pct if math.isfinite(r.opening_pct) else 100.0
-        angle = grapple.tong_angle_from_opening_pct(tongs, opening)
+        angle = grapple.jaw_angle_from_opening_pct(tongs, opening)
         ghost = all(map(math.isfinite, r.reference))
         return {
             "points": _points(kinematics.chain_points(kin, q)),

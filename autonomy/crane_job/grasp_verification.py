@@ -1,6 +1,4 @@
-"""What hangs in the grapple, judged by the newest log list: which logs came up, whether the way planned for them
-will do.
-"""
+"""Grasp verification by the newest log list: which logs came up, and whether the path planned for them still holds."""
 
 from __future__ import annotations
 
@@ -20,23 +18,22 @@ from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m
 from machine.profile import Bunk
 
 COLUMN_RADIUS_M: Final = 0.15
-"""Farther than this from where it was meant to be, a column or a place is another one."""
+"""A column or a place farther than this from the intended one is another one."""
 MAX_EXTRA_SAG_M: Final = 0.20
-"""A log one of whose ends hangs so much lower than reckoned with is not carried on: its way is planned anew."""
+"""Where one end of a log hangs lower than assumed by more than this, the path is planned again."""
 MIN_CORRECTION_RAD: Final = 0.03
 MAX_CORRECTION_RAD: Final = 0.4
-"""The rotator corrects on the way between these how a log is seen to hang; what is more asks for a new way."""
+"""The rotator corrects the log's direction during the motion between these angles; more asks for a new path."""
 
 
 def visible_grasped_logs(grasp: Grasp, logs: Sequence[LogObservation]) -> list[LogObservation]:
-    """The logs of the grasp as they are seen now, without those that are hidden: a log that hung in the tongs hangs no
-    longer where it is remembered."""
+    """The logs of the grasp that are visible now; a hidden log is left out, as its remembered pose is out of date."""
     wanted = [log.id for log in grasp.logs]
     return [log for log in logs if log.seen and log.id in wanted]
 
 
 def lifted_part(arm: Arm, grasp: Grasp, seen: Sequence[LogObservation], pins: Iterable[Pose]) -> Grasp | None:
-    """The grasp with the logs that hang under one of the pins, and those that are hidden; None when none is seen to."""
+    """The grasp with the logs that hang below one of the pins, and the hidden ones; None when none is seen to hang."""
     poses = list(pins)
     held = [log.id for log in seen if any(hangs_below(arm, log, pin) for pin in poses)]
     if not held:
@@ -46,8 +43,8 @@ def lifted_part(arm: Arm, grasp: Grasp, seen: Sequence[LogObservation], pins: It
 
 
 def is_between_jaws(arm: Arm, log: LogObservation, pin: Pose) -> bool:
-    """Whether a log lies on the middle line of closed tongs under a pin: none can but what they hold.  A list may have
-    that twice, when it was measured amiss while it moved and begun as another log.
+    """Whether a log lies on the centre line of closed jaws under a pin: only what they hold can.  A list may contain
+    the held log twice when it was measured wrongly during the motion and tracked as another one.
     """
     (x, y), c, a = arm.xy(pin), log.center_m, log.axis
     level2 = a[0] ** 2 + a[1] ** 2
@@ -58,19 +55,21 @@ def is_between_jaws(arm: Arm, log: LogObservation, pin: Pose) -> bool:
     return aside_m < 0.5 * log.diameter_m and 0.0 < below_m < lowest_tip_below_pin_m(arm.profile.grapple.tongs)
 
 
-def is_at_target(mission: CraneJob, target: Bunk, log: LogObservation) -> bool:
-    """Whether a log that was let go lies where it was to be: in the target, or, where logs only have to get out of
-    their source, low beside it, for it may roll.
+def is_at_target(job: CraneJob, target: Bunk, log: LogObservation) -> bool:
+    """Whether a released log lies where it should: in the target, or, where a job only clears its source, low beside
+    the source, for it may roll.
     """
-    if lies_in_bunk(target, log) or mission.source is None:
+    if lies_in_bunk(target, log) or job.source is None:
         return lies_in_bunk(target, log)
-    return not is_over_bunk(mission.source, *log.center_m[:2]) and log.center_m[2] < target.floor_z_m + target.stake_height_m
+    return (
+        not is_over_bunk(job.source, *log.center_m[:2]) and log.center_m[2] < target.floor_z_m + target.stake_height_m
+    )
 
 
 def corrected_place(
-    arm: Arm, mission: CraneJob, grasp: Grasp, place: Pose, logs: Sequence[LogObservation], position: Sequence[float]
+    arm: Arm, job: CraneJob, grasp: Grasp, place: Pose, logs: Sequence[LogObservation], position: Sequence[float]
 ) -> Pose | None:
-    """The place with the rotator turned for the log as it is now seen to hang; None when another way is asked for.
+    """The place with the rotator corrected for how the log is seen to hang; None when a new path is needed.
 
     ``position``: the measured joints, rad (EXT m).
     """
@@ -80,9 +79,9 @@ def corrected_place(
     if 0.5 * seen.length_m * (abs(seen.axis[2]) - abs(grasp.log.axis[2])) > MAX_EXTRA_SAG_M:
         return None
     try:
-        wanted = plan_place(arm, mission, grasp, logs, grapple_yaw(arm.profile, position))
+        wanted = plan_place(arm, job, grasp, logs, grapple_yaw(arm.profile, position))
     except NoGrasp:
-        return None  # and why, when it is planned anew
+        return None  # planning the phase again reports why
     turn = abs(wanted.rot_rad - place.rot_rad)
     if turn > MAX_CORRECTION_RAD or dist(arm.xy(wanted), arm.xy(place)) > COLUMN_RADIUS_M:
         return None

@@ -12,10 +12,15 @@ from dataclasses import dataclass
 import pymap3d
 
 from machine.geometry.carrier import Point
+from runtime.errors import CodedError
+
+
+class PlaneError(CodedError, ValueError):
+    """A local plane cannot be made."""
 
 
 @dataclass(frozen=True, slots=True)
-class Plane:
+class LocalPlane:
     """East-north-up frame about an origin in degrees and metres above the ellipsoid."""
 
     latitude_deg: float
@@ -25,7 +30,8 @@ class Plane:
     def __post_init__(self) -> None:
         good = abs(self.latitude_deg) <= 90.0 and abs(self.longitude_deg) <= 180.0 and math.isfinite(self.altitude_m)
         if not good:
-            raise ValueError(
+            raise PlaneError(
+                "plane.origin",
                 f"invalid origin of the local plane: latitude {self.latitude_deg} deg, longitude "
                 f"{self.longitude_deg} deg, altitude {self.altitude_m} m"
             )

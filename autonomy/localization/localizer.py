@@ -3,8 +3,8 @@
 ``Localizer.step(report)`` accepts every ``VehicleReport`` and returns a ``Location`` at its stamp.  It holds no clock.
 Positions and headings are used at their time of validity (``LATENCY_NS`` before their reception).  Without a matching
 position and heading, the machine is located by its wheels for ``RECKONING_NS``; then it is lost, with a reason.  It
-recovers after ``AGREEING`` consecutive positions that match, or that agree with each other on another place; headings
-likewise, at standstill only.
+recovers after ``AGREEING_COUNT`` consecutive positions that match, or that agree with each other on another place;
+headings likewise, at standstill only.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Final
 
 import numpy as np
 
+from autonomy.localization.local_plane import LocalPlane, wrapped, yaw_from_heading
 from autonomy.localization.location import Location, Status
-from autonomy.localization.vehicle_filter import Filter
-from autonomy.localization.motion_model import Noise, Odometry, State, antenna_reach, drift_rad, front_attitude
-from autonomy.localization.local_plane import Plane, wrapped, yaw_from_heading
+from autonomy.localization.motion_model import NoiseModel, Odometry, State, antenna_reach, drift_rad, front_attitude
+from autonomy.localization.vehicle_filter import VehicleFilter
 from can_dbc.messages.vehicle import VehicleReport
 from machine.profile import Carrier
 
@@ -31,19 +31,19 @@ FRESH_NS: Final = 500_000_000
 RECKONING_NS: Final = 2_000_000_000
 MOTION_NS: Final = 300_000_000
 """Greatest age of speed and articulation; until then the last values hold."""
-CREEP: Final = 0.8
+CREEP_M_PER_M: Final = 0.8
 """A braked wheel turns with its swing arm and moves the machine without being measured: metres per metre of height
 (measured on the plant: 0.14 m for 0.35 m).
 """
-AGREEING: Final = 5
+AGREEING_COUNT: Final = 5
 AGREE_SIGMAS: Final = 4.0
-MOST_TURN_RAD: Final = 0.5
+MAX_TURN_RAD: Final = 0.5
 """Greatest turn caused by an external force, such as running into a log; a heading that is farther off is a fault."""
-STANDS_M_S: Final = 0.05
-FORGOTTEN_NS: Final = 1_000_000_000
+STANDSTILL_M_S: Final = 0.05
+MAX_GAP_NS: Final = 1_000_000_000
 """After a longer gap between reports the motion meanwhile is unknown."""
-BEGIN_M: Final = 3.0
-SECOND: Final = 1e9
+INITIAL_SIGMA_M: Final = 3.0
+SECOND_NS: Final = 1e9
 
 
 class Localizer:
@@ -52,11 +52,11 @@ class Localizer:
     ``rejected`` counts measurements outside their gates.
     """
 
-    def __init__(self, carrier: Carrier, plane: Plane | None = None, noise: Noise | None = None) -> None:
+    def __init__(self, carrier: Carrier, plane: LocalPlane | None = None, noise: NoiseModel | None = None) -> None:
         self.plane = plane
         self.rejected = 0
-        self._carrier, self._noise = carrier, noise or Noise()
-        self._filter = Filter(carrier, self._noise)
+        self._carrier, self._noise = carrier, noise or NoiseModel()
+        self._filter = VehicleFilter(carrier, self._noise)
         self._status = Status.STARTING
         self._last: VehicleReport | None = None
         self._position_ns = self._heading_ns = 0
@@ -80,26 +80,26 @@ class Localizer:
         moving = report.stamp_ns - report.motion_ns <= MOTION_NS and _finite(report.speed_m_s, report.articulation_rad)
         if self._status is not Status.STARTING:
             gap = report.stamp_ns - last.stamp_ns if last else 0
-            if not moving or gap > FORGOTTEN_NS:
+            if not moving or gap > MAX_GAP_NS:
                 self._status = Status.STARTING
             else:
-                self._go(report, last, gap)
+                self._predict(report, last, gap)
         new = last is None or report.position_ns != last.position_ns
         if moving and new and _finite(report.latitude_deg, report.longitude_deg) and report.fix in self._noise.fixes:
-            self._see(report)
-        self._judge(report, moving)
+            self._update_position(report)
+        self._update_status(report, moving)
         return self._location(report)
 
-    def _go(self, report: VehicleReport, last: VehicleReport | None, gap: int) -> None:
+    def _predict(self, report: VehicleReport, last: VehicleReport | None, gap: int) -> None:
         """Predict with wheels and articulation since the last report."""
         assert last is not None
-        roll, pitch = self._lean(report)
-        wheels = 0.5 * (report.speed_m_s + last.speed_m_s) * gap / SECOND
+        roll, pitch = self._front_roll_pitch(report)
+        wheels = 0.5 * (report.speed_m_s + last.speed_m_s) * gap / SECOND_NS
         way = wheels * math.cos(pitch)
-        odometry = Odometry(gap / SECOND, way, last.articulation_rad, report.articulation_rad, roll)
-        self._filter.go(odometry, report.stamp_ns)
+        odometry = Odometry(gap / SECOND_NS, way, last.articulation_rad, report.articulation_rad, roll)
+        self._filter.predict_motion(odometry, report.stamp_ns)
         if changed := max(abs(now - then) for now, then in zip(report.heights_m, last.heights_m, strict=True)):
-            self._filter.creep(CREEP * changed if math.isfinite(changed) else 0.0)
+            self._filter.add_position_noise(CREEP_M_PER_M * changed if math.isfinite(changed) else 0.0)
         z, spread = self._z
         self._z = z + wheels * math.sin(pitch), math.hypot(spread, 0.02 * math.sqrt(abs(wheels)))
         if report.heading_ns != last.heading_ns and math.isfinite(report.heading_rad):
@@ -109,17 +109,17 @@ class Localizer:
                 self._turned.clear()
             else:
                 self.rejected += 1
-                self._turn(report, then)
+                self._recover_heading(report, then)
             if math.isfinite(report.yaw_rate_rad_s):
                 self._filter.turn(report.yaw_rate_rad_s, report.speed_m_s, TURN_OVER_NS, then)
 
-    def _see(self, report: VehicleReport) -> None:
+    def _update_position(self, report: VehicleReport) -> None:
         """Update with a new position."""
         if self.plane is None:
             altitude = report.altitude_m if math.isfinite(report.altitude_m) else 0.0
-            self.plane = Plane(report.latitude_deg, report.longitude_deg, altitude)
+            self.plane = LocalPlane(report.latitude_deg, report.longitude_deg, altitude)
         east, north, _ = self.plane.local(report.latitude_deg, report.longitude_deg)
-        roll, pitch = self._lean(report)
+        roll, pitch = self._front_roll_pitch(report)
         reach = antenna_reach(self._carrier, roll, pitch, self._front_height(report))
         then = report.position_ns - LATENCY_NS
         if self._status is Status.STARTING and self._fitting == 0:
@@ -128,7 +128,7 @@ class Localizer:
             yaw = yaw_from_heading(report.heading_rad)
             c, s = math.cos(yaw), math.sin(yaw)
             x, y = east - c * reach[0] + s * reach[1], north - s * reach[0] - c * reach[1]
-            self._filter.begin(x, y, yaw, report.fix, BEGIN_M, report.stamp_ns)
+            self._filter.initialize(x, y, yaw, report.fix, INITIAL_SIGMA_M, report.stamp_ns)
             self._heading_ns = report.heading_ns
             self._z = math.nan, math.inf
         fits = self._filter.position(east, north, reach, report.fix, report.sigma_m, then)
@@ -141,37 +141,37 @@ class Localizer:
         self.rejected += 1
         self._fitting = 0
         if self._status is Status.LOST:
-            self._strays.append(np.array([east, north]) - self._filter.shown(reach, then))
-            self._return(report)
+            self._strays.append(np.array([east, north]) - self._filter.predicted_position(reach, then))
+            self._recover_position(report)
 
-    def _return(self, report: VehicleReport) -> None:
+    def _recover_position(self, report: VehicleReport) -> None:
         """Re-initialize the position when the last ones agree on another place."""
-        del self._strays[:-AGREEING]
+        del self._strays[:-AGREEING_COUNT]
         sigma = self._noise.fixes[report.fix][0]
         middle = np.mean(self._strays, axis=0)
         apart = max(math.dist(stray, middle) for stray in self._strays)
-        if len(self._strays) < AGREEING or apart > AGREE_SIGMAS * sigma:
+        if len(self._strays) < AGREEING_COUNT or apart > AGREE_SIGMAS * sigma:
             return
         at = self._filter.x[[State.X, State.Y]] + middle
-        self._filter.begin_place(float(at[0]), float(at[1]), sigma + self._noise.fixes[report.fix][1])
-        self._position_ns, self._fitting = report.position_ns, AGREEING
+        self._filter.reset_position(float(at[0]), float(at[1]), sigma + self._noise.fixes[report.fix][1])
+        self._position_ns, self._fitting = report.position_ns, AGREEING_COUNT
         self._jumps += 1
         self._strays.clear()
 
-    def _turn(self, report: VehicleReport, then: int) -> None:
+    def _recover_heading(self, report: VehicleReport, then: int) -> None:
         """Re-initialize the heading of a standing machine when the last ones agree on another one."""
-        if self._status is not Status.LOST or abs(report.speed_m_s) > STANDS_M_S:
+        if self._status is not Status.LOST or abs(report.speed_m_s) > STANDSTILL_M_S:
             self._turned.clear()
             return
         self._turned.append(self._filter.heading_off(yaw_from_heading(report.heading_rad), then))
-        del self._turned[:-AGREEING]
+        del self._turned[:-AGREEING_COUNT]
         turn = sum(self._turned) / len(self._turned)
         apart = max(abs(t - turn) for t in self._turned)
-        agree = len(self._turned) == AGREEING and apart <= AGREE_SIGMAS * self._filter.heading_sigma_rad
-        if agree and abs(turn) <= MOST_TURN_RAD:
-            roll, pitch = self._lean(report)
+        agree = len(self._turned) == AGREEING_COUNT and apart <= AGREE_SIGMAS * self._filter.heading_sigma_rad
+        if agree and abs(turn) <= MAX_TURN_RAD:
+            roll, pitch = self._front_roll_pitch(report)
             reach = antenna_reach(self._carrier, roll, pitch, self._front_height(report))
-            self._filter.begin_yaw(turn, math.hypot(reach[0], reach[1]))
+            self._filter.reset_yaw(turn, math.hypot(reach[0], reach[1]))
             self._heading_ns = report.heading_ns
             self._jumps += 1
             self._turned.clear()
@@ -189,16 +189,16 @@ class Localizer:
             (spread if not math.isfinite(sigma) else sigma * math.sqrt(1.0 - gain)),
         )
 
-    def _judge(self, report: VehicleReport, moving: bool) -> None:
+    def _update_status(self, report: VehicleReport, moving: bool) -> None:
         """Status from the ages of the last accepted measurements."""
         if self._status is Status.STARTING or not moving:
-            self._status = Status.TRACKING if moving and self._fitting >= AGREEING else Status.STARTING
+            self._status = Status.TRACKING if moving and self._fitting >= AGREEING_COUNT else Status.STARTING
             if not moving:
                 self._fitting = 0
             return
         age = report.stamp_ns - min(self._position_ns, self._heading_ns)
         if self._status is Status.LOST:
-            if age <= FRESH_NS and self._fitting >= AGREEING:
+            if age <= FRESH_NS and self._fitting >= AGREEING_COUNT:
                 self._status = Status.TRACKING
         elif age > RECKONING_NS:
             self._status, self._fitting = Status.LOST, 0
@@ -234,12 +234,12 @@ class Localizer:
         yaw = wrapped(float(x[State.YAW]))
         return Location(
             report.stamp_ns, self._status, reason, float(x[State.X]), float(x[State.Y]), self._z[0], yaw,
-            p[np.ix_(seen, seen)], self._z[1], wrapped(yaw + drift_rad(x, self._lean(report)[0])),
+            p[np.ix_(seen, seen)], self._z[1], wrapped(yaw + drift_rad(x, self._front_roll_pitch(report)[0])),
             report.speed_m_s * (1.0 + float(x[State.SCALE])), float(x[State.CURVE]), report.articulation_rad,
             roll, pitch, self._front_height(report), self._jumps,
         )  # fmt: skip
 
-    def _lean(self, report: VehicleReport) -> tuple[float, float]:
+    def _front_roll_pitch(self, report: VehicleReport) -> tuple[float, float]:
         """Roll and pitch of the front half; level while unknown."""
         if not _finite(report.roll_rad, report.pitch_rad):
             return 0.0, 0.0

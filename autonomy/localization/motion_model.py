@@ -48,7 +48,7 @@ SIZE: Final = len(State)
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class GaussMarkov:
     """A first-order Gauss-Markov process: standard deviation, and correlation length [m] or time [s]."""
 
     sigma: float
@@ -61,15 +61,15 @@ class Drift:
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
+class NoiseModel:
     """Noise of the filter; all of it assumed.  ``fixes`` by method of PGN 129029: white and slowly varying horizontal
     error of a position, root mean square [m].
     """
 
-    curve: Drift = Drift(0.02, 4.0)
-    side: Drift = Drift(0.02, 6.0)
-    slide: Drift = Drift(0.25, 200.0)
-    scale: Drift = Drift(0.12, 30.0)
+    curve: GaussMarkov = GaussMarkov(0.02, 4.0)
+    side: GaussMarkov = GaussMarkov(0.02, 6.0)
+    slide: GaussMarkov = GaussMarkov(0.25, 200.0)
+    scale: GaussMarkov = GaussMarkov(0.12, 30.0)
     way_m: float = 0.01
     """Position noise per square root of a metre driven."""
     way_rad: float = 0.003
@@ -113,7 +113,7 @@ def turned_without_slip(carrier: Carrier, odometry: Odometry, way_m: float) -> f
     return (way_m * math.sin(bend) + lr * swing) / (lf * math.cos(bend) + lr)
 
 
-def advance(carrier: Carrier, noise: Noise, x: Array, odometry: Odometry) -> tuple[Array, Array, Array]:
+def predicted_state(carrier: Carrier, noise: NoiseModel, x: Array, odometry: Odometry) -> tuple[Array, Array, Array]:
     """State (12,), Jacobian (12, 12) and process noise (12, 12) one step later."""
     s, d = State, odometry
     way = d.way_m * (1.0 + x[s.SCALE])
@@ -156,7 +156,8 @@ def tilt(roll_rad: float, pitch_rad: float) -> Array:
     """Rotation (3, 3) of a half without its yaw: roll + right side down, pitch + nose up."""
     cr, sr, cp, sp = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
     roll = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    return np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]]) @ roll
+    rotation: Array = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]]) @ roll
+    return rotation
 
 
 def axle_m(carrier: Carrier, height_m: float) -> Point:
@@ -170,7 +171,7 @@ def antenna_reach(carrier: Carrier, roll_rad: float, pitch_rad: float, height_m:
     return tilt(roll_rad, pitch_rad) @ lever
 
 
-def antenna(x: Array, reach: Array) -> tuple[Array, Array]:
+def predicted_antenna(x: Array, reach: Array) -> tuple[Array, Array]:
     """Predicted position of the main antenna (2,) and its Jacobian (2, 12)."""
     s = State
     c, si = math.cos(x[s.YAW]), math.sin(x[s.YAW])

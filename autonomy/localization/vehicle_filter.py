@@ -14,30 +14,38 @@ from typing import Final
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from autonomy.localization.motion_model import SIZE, Array, Noise, Odometry, State, advance, antenna
 from autonomy.localization.local_plane import wrapped
+from autonomy.localization.motion_model import (
+    SIZE,
+    Array,
+    NoiseModel,
+    Odometry,
+    State,
+    predicted_antenna,
+    predicted_state,
+)
 from machine.profile import Carrier
 
-GATES: Final = (0.0, 10.828, 13.816)
+CHI_SQUARE_GATES: Final = (0.0, 10.828, 13.816)
 """Chi-square quantiles of 99.9 % for one and two degrees of freedom, by the number of components."""
-CONSIDERED: Final = [State.ANTENNA_X, State.ANTENNA_Y]
+CONSIDERED_STATES: Final = [State.ANTENNA_X, State.ANTENNA_Y]
 """Considered but not estimated (Schmidt filter): only slip in bends would be attributed to them, which is wrong."""
-KEPT: Final = 24
+HISTORY_STEPS: Final = 24
 """Stored steps, 1.2 s at 20 Hz."""
 
 
-class Filter(ExtendedKalmanFilter):
-    """Located once ``begin`` was called.  ``x`` (12,), ``P`` (12, 12) are ordered as ``motion_model.State``."""
+class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
+    """Located once ``initialize`` was called.  ``x`` (12,), ``P`` (12, 12) are ordered as ``motion_model.State``."""
 
-    def __init__(self, carrier: Carrier, noise: Noise) -> None:
+    def __init__(self, carrier: Carrier, noise: NoiseModel) -> None:
         super().__init__(SIZE, 2)
         self._carrier, self._noise = carrier, noise
-        self._stamps: deque[int] = deque(maxlen=KEPT)
-        self._ways: deque[Array] = deque(maxlen=KEPT)
+        self._stamps: deque[int] = deque(maxlen=HISTORY_STEPS)
+        self._ways: deque[Array] = deque(maxlen=HISTORY_STEPS)
         self._way = np.zeros(3)
         self._fix = 0
 
-    def begin(self, x_m: float, y_m: float, yaw_rad: float, fix: int, sigma_m: float, stamp_ns: int) -> None:
+    def initialize(self, x_m: float, y_m: float, yaw_rad: float, fix: int, sigma_m: float, stamp_ns: int) -> None:
         """Initialize: the front axle is at this position, with a standard deviation ``sigma_m`` in each axis."""
         n, s = self._noise, State
         self.x = np.zeros(SIZE)
@@ -50,19 +58,19 @@ class Filter(ExtendedKalmanFilter):
         sigma[[s.ANTENNA_X, s.ANTENNA_Y]] = n.antenna_m
         self.P = np.diag(sigma**2)
         self._fix = 0
-        self._quality(fix)
+        self._set_fix(fix)
         self._stamps.clear()
         self._ways.clear()
-        self._remember(stamp_ns)
+        self._store(stamp_ns)
 
-    def begin_place(self, x_m: float, y_m: float, sigma_m: float) -> None:
+    def reset_position(self, x_m: float, y_m: float, sigma_m: float) -> None:
         """Re-initialize the position; the rest of the state stays."""
         places = [State.X, State.Y]
         self.x[places] = x_m, y_m
         self.P[places, :] = self.P[:, places] = 0.0
         self.P[places, places] = sigma_m**2
 
-    def begin_yaw(self, turn_rad: float, reach_m: float) -> None:
+    def reset_yaw(self, turn_rad: float, reach_m: float) -> None:
         """Re-initialize the yaw by a correction; the antenna is ``reach_m`` from the axle.  The rest stays."""
         places = [State.X, State.Y]
         self.x[State.YAW] = wrapped(self.x[State.YAW] + turn_rad)
@@ -78,13 +86,13 @@ class Filter(ExtendedKalmanFilter):
 
     def heading_off(self, yaw_rad: float, stamp_ns: int) -> float:
         """Innovation of a dual-antenna yaw at a time [rad]."""
-        then = self._then(self._since(stamp_ns))
+        then = self._state_before(self._motion_since(stamp_ns))
         return wrapped(yaw_rad - then[State.YAW] - then[State.HEADING])
 
-    def go(self, odometry: Odometry, stamp_ns: int) -> None:
+    def predict_motion(self, odometry: Odometry, stamp_ns: int) -> None:
         """Predict to ``stamp_ns`` with the odometry since the last step."""
         before = self.x
-        after, self.F, self.Q = advance(self._carrier, self._noise, before, odometry)
+        after, self.F, self.Q = predicted_state(self._carrier, self._noise, before, odometry)
         keep = math.exp(-odometry.seconds / self._noise.wander_s)
         sigma = self._noise.fixes.get(self._fix, (math.inf, 0.0))[1] * math.sqrt(0.5)
         for place in (State.WANDER_X, State.WANDER_Y):
@@ -94,14 +102,14 @@ class Filter(ExtendedKalmanFilter):
         self._next = after
         self.predict()
         self._way = self._way + (after - before)[[State.X, State.Y, State.YAW]]
-        self._remember(stamp_ns)
+        self._store(stamp_ns)
 
-    def creep(self, sigma_m: float) -> None:
+    def add_position_noise(self, sigma_m: float) -> None:
         """Add position uncertainty for motion that the wheels do not measure."""
         self.P[[State.X, State.Y], [State.X, State.Y]] += sigma_m**2
 
     def predict_x(self, u: float = 0) -> None:
-        """Use the state from ``go``: the model is not linear."""
+        """Use the state from ``predict_motion``: the model is not linear."""
         self.x = self._next
 
     def position(self, east_m: float, north_m: float, reach: Array, fix: int, stated_m: float, stamp_ns: int) -> bool:
@@ -109,47 +117,47 @@ class Filter(ExtendedKalmanFilter):
 
         ``reach`` is ``motion_model.antenna_reach``; ``stated_m`` is the receiver's own standard deviation, NaN without.
         """
-        self._quality(fix)
-        since = self._since(stamp_ns)
+        self._set_fix(fix)
+        since = self._motion_since(stamp_ns)
         sigma = self._noise.fixes[fix][0] * math.sqrt(0.5)
         if math.isfinite(stated_m):
             sigma = max(sigma, stated_m * math.sqrt(0.5))
         spread = sigma**2 + (self._noise.attitude_rad * reach[2]) ** 2
-        shown, h = antenna(self._then(since), reach)
-        return self._take(np.array([east_m, north_m]) - shown, h, np.eye(2) * spread)
+        shown, h = predicted_antenna(self._state_before(since), reach)
+        return self._update_gated(np.array([east_m, north_m]) - shown, h, np.eye(2) * spread)
 
     def heading(self, yaw_rad: float, stamp_ns: int) -> bool:
         """Update with a dual-antenna yaw of the front half; False outside the gate."""
         h = np.zeros((1, SIZE))
         h[0, [State.YAW, State.HEADING]] = 1.0
         off = self.heading_off(yaw_rad, stamp_ns)
-        return self._take(np.array([off]), h, np.array([[self.heading_sigma_rad**2]]))
+        return self._update_gated(np.array([off]), h, np.array([[self.heading_sigma_rad**2]]))
 
     def turn(self, rate_rad_s: float, speed_m_s: float, over_ns: int, stamp_ns: int) -> bool:
         """Update with a yaw rate, averaged over the ``over_ns`` before ``stamp_ns``; False outside the gate."""
         h = np.zeros((1, SIZE))
         h[0, State.CURVE] = speed_m_s * (1.0 + self.x[State.SCALE])
-        turned = self._since(stamp_ns - over_ns)[2] - self._since(stamp_ns)[2]
+        turned = self._motion_since(stamp_ns - over_ns)[2] - self._motion_since(stamp_ns)[2]
         off = rate_rad_s - turned / (over_ns * 1e-9)
-        return self._take(np.array([off]), h, np.array([[self._noise.turn_rad_s**2]]))
+        return self._update_gated(np.array([off]), h, np.array([[self._noise.turn_rad_s**2]]))
 
-    def shown(self, reach: Array, stamp_ns: int) -> Array:
+    def predicted_position(self, reach: Array, stamp_ns: int) -> Array:
         """Predicted position of the antenna at ``stamp_ns`` (2,)."""
-        return antenna(self._then(self._since(stamp_ns)), reach)[0]
+        return predicted_antenna(self._state_before(self._motion_since(stamp_ns)), reach)[0]
 
-    def _take(self, off: Array, h: Array, r: Array) -> bool:
+    def _update_gated(self, off: Array, h: Array, r: Array) -> bool:
         s = h @ self.P @ h.T + r
-        if float(off @ np.linalg.solve(s, off)) > GATES[len(off)]:
+        if float(off @ np.linalg.solve(s, off)) > CHI_SQUARE_GATES[len(off)]:
             return False
         gain = np.linalg.solve(s, h @ self.P).T
-        gain[CONSIDERED] = 0.0
+        gain[CONSIDERED_STATES] = 0.0
         self.x = self.x + gain @ off
         rest = np.eye(SIZE) - gain @ h
         spread = rest @ self.P @ rest.T + gain @ r @ gain.T
         self.P = 0.5 * (spread + spread.T)
         return True
 
-    def _quality(self, fix: int) -> None:
+    def _set_fix(self, fix: int) -> None:
         """Another kind of fix has another slowly varying error: reset it."""
         if fix == self._fix:
             return
@@ -159,21 +167,23 @@ class Filter(ExtendedKalmanFilter):
         self.P[places, :] = self.P[:, places] = 0.0
         self.P[places, places] = 0.5 * self._noise.fixes[fix][1] ** 2
 
-    def _remember(self, stamp_ns: int) -> None:
+    def _store(self, stamp_ns: int) -> None:
         self._stamps.append(stamp_ns)
         self._ways.append(self._way)
 
-    def _then(self, since: Array) -> Array:
+    def _state_before(self, since: Array) -> Array:
         """The state before the motion ``since``."""
         x = self.x.copy()
         x[[State.X, State.Y, State.YAW]] -= since
         return x
 
-    def _since(self, stamp_ns: int) -> Array:
+    def _motion_since(self, stamp_ns: int) -> Array:
         """Odometry displacement and turn (3,) since ``stamp_ns``, limited to the stored steps."""
         stamps = self._stamps
         i = bisect_left(stamps, stamp_ns)
         if i == 0 or i == len(stamps):
-            return self._way - self._ways[min(i, len(stamps) - 1)]
+            since: Array = self._way - self._ways[min(i, len(stamps) - 1)]
+            return since
         share = (stamp_ns - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
-        return self._way - (self._ways[i - 1] + share * (self._ways[i] - self._ways[i - 1]))
+        since = self._way - (self._ways[i - 1] + share * (self._ways[i] - self._ways[i - 1]))
+        return since

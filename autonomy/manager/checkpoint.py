@@ -14,14 +14,14 @@ from typing import Annotated, Final, Literal
 import msgspec
 
 from autonomy.crane_job.rotator_estimate import RotatorEstimate
-from autonomy.manager.tally import Taken, Tally
+from autonomy.manager.tally import LoadedLog, Tally
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
 
 SCHEMA: Final = 1
 Count = Annotated[int, msgspec.Meta(ge=0)]
 
 
-class Left(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RouteRemainder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where the route was left: a point shortly before and the point itself (``at``), extra places to drive by from
     there (``by``), and the number of waypoints of all laps still to come; ``ended``: the end was reached.
     """
@@ -32,7 +32,7 @@ class Left(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ended: bool = False
 
 
-class Missed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class MissedLog(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A log with failed grasps, by its number."""
 
     number: Count
@@ -40,17 +40,17 @@ class Missed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     misses: Count
 
 
-class Known(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class LogKnowledge(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Knowledge of the logs on the ground: listed logs that are gone (numbers from 1), logs with failed grasps, and the
     next unused number.
     """
 
     gone: tuple[Count, ...] = ()
-    missed: tuple[Missed, ...] = ()
+    missed: tuple[MissedLog, ...] = ()
     free: Count = 1
 
 
-class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Checkpoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Checkpoint of the mission with the digest ``mission``.
 
     ``landing``, ``served`` and ``rounds`` are as in `autonomy.manager.sorting`; ``left`` is None before the route was
@@ -60,8 +60,8 @@ class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     mission: str
     tally: Tally
-    known: Known = Known()
-    left: Left | None = None
+    known: LogKnowledge = LogKnowledge()
+    left: RouteRemainder | None = None
     landing: Count | None = None
     served: tuple[Count, ...] = ()
     rounds: Count = 0
@@ -73,15 +73,15 @@ class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     schema: Literal[1] = SCHEMA
 
 
-def digest(mission: ForwardingMission) -> str:
+def mission_digest(mission: ForwardingMission) -> str:
     """Digest of a mission's content, independent of its file format."""
     return hashlib.sha256(msgspec.json.encode(mission)).hexdigest()
 
 
-def copied(tally: Tally, later_ns: int = 0) -> Tally:
+def copied_tally(tally: Tally, later_ns: int = 0) -> Tally:
     """A deep copy of a tally with all times shifted."""
 
-    def moved(logs: tuple[Taken, ...] | list[Taken]) -> list[Taken]:
+    def moved(logs: tuple[LoadedLog, ...] | list[LoadedLog]) -> list[LoadedLog]:
         return [msgspec.structs.replace(log, at_ns=log.at_ns + later_ns) for log in logs]
 
     loads = [
@@ -90,7 +90,7 @@ def copied(tally: Tally, later_ns: int = 0) -> Tally:
     return replace(tally, given_up=dict(tally.given_up), board=moved(tally.board), loads=loads)
 
 
-def fits(progress: Progress, mission: ForwardingMission) -> bool:
+def fits_mission(progress: Checkpoint, mission: ForwardingMission) -> bool:
     """Whether landings and waypoints of a checkpoint exist in this mission."""
     landings = {*progress.served, *(load.landing for load in progress.tally.loads)}
     landings |= set() if progress.landing is None else {progress.landing}

@@ -12,18 +12,19 @@ from typing import Final
 
 import msgspec
 
-from autonomy.manager.checkpoint import Progress, copied, digest, fits
+from autonomy.manager.checkpoint import Checkpoint, copied_tally, fits_mission, mission_digest
 from autonomy.missions.model import ForwardingMission, MissionError
+from runtime.errors import CodedError
 
-EVERY_NS: Final = 1_000_000_000
+PERIOD_NS: Final = 1_000_000_000
 _MOVE: Final = "move the file away to start over"
 
 
-class MissionFinished(Exception):
+class MissionFinished(CodedError):
     """The mission of a checkpoint is finished; nothing is left to do."""
 
 
-def read(path: Path, mission: ForwardingMission, now_ns: int, unix_ns: int) -> Progress | None:
+def read_checkpoint(path: Path, mission: ForwardingMission, now_ns: int, unix_ns: int) -> Checkpoint | None:
     """Read the checkpoint of a mission; None without a file.
 
     ``now_ns`` (clock of this process) and ``unix_ns`` are the same moment; the checkpoint's times are converted to the
@@ -38,40 +39,47 @@ def read(path: Path, mission: ForwardingMission, now_ns: int, unix_ns: int) -> P
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise MissionError(f"{path}: the mission's progress cannot be read: {error.strerror}") from None
+        raise MissionError(
+            "checkpoint.unreadable", f"the checkpoint cannot be read: {error.strerror}", str(path)
+        ) from None
     try:
-        found = msgspec.json.decode(data, type=Progress)
+        found = msgspec.json.decode(data, type=Checkpoint)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise MissionError(f"{path}: is damaged or no mission's progress ({error}); {_MOVE}") from None
-    if found.mission != digest(mission):
-        raise MissionError(f"{path}: is the progress of another mission; start the planner with that one, or {_MOVE}")
-    if not fits(found, mission):
-        raise MissionError(f"{path}: is damaged, it names a landing or waypoints that the mission has not; {_MOVE}")
+        raise MissionError(
+            "checkpoint.damaged", f"is damaged or not a checkpoint ({error}); {_MOVE}", str(path)
+        ) from None
+    if found.mission != mission_digest(mission):
+        sentence = f"is the checkpoint of another mission; start the planner with that one, or {_MOVE}"
+        raise MissionError("checkpoint.other-mission", sentence, str(path))
+    if not fits_mission(found, mission):
+        sentence = f"is damaged: it has a landing or waypoints that are not in the mission; {_MOVE}"
+        raise MissionError("checkpoint.unknown-place", sentence, str(path))
     if found.finished:
-        raise MissionFinished(f"{path}: this mission is finished, {found.tally.loaded} logs were loaded; {_MOVE}")
+        sentence = f"{path}: this mission is finished, {found.tally.loaded} logs were loaded; {_MOVE}"
+        raise MissionFinished("checkpoint.finished", sentence)
     later_ns = (now_ns - unix_ns) - (found.clock_ns - found.unix_ns)
-    return msgspec.structs.replace(found, tally=copied(found.tally, later_ns), clock_ns=0, unix_ns=0)
+    return msgspec.structs.replace(found, tally=copied_tally(found.tally, later_ns), clock_ns=0, unix_ns=0)
 
 
-class Logbook:
+class CheckpointFile:
     """Writes checkpoints to one file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._due_ns = 0
-        self._last: Progress | None = None
+        self._last: Checkpoint | None = None
 
     def due(self, now_ns: int) -> bool:
         """Whether the next checkpoint is due."""
         return now_ns >= self._due_ns
 
-    def keep(self, progress: Progress, now_ns: int, unix_ns: int) -> None:
+    def keep(self, progress: Checkpoint, now_ns: int, unix_ns: int) -> None:
         """Write the checkpoint if it has changed.
 
         Raises:
             OSError: the file cannot be written.
         """
-        self._due_ns = now_ns + EVERY_NS
+        self._due_ns = now_ns + PERIOD_NS
         if progress == self._last:
             return
         stamped = msgspec.structs.replace(progress, clock_ns=now_ns, unix_ns=unix_ns)

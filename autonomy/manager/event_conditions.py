@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import Final
 
-from autonomy.manager.load_bookkeeping import Cargo
-from autonomy.manager.crane_executor import Hand
-from autonomy.manager.route_driver import Ride
+from autonomy.manager.crane_executor import CraneExecutor
+from autonomy.manager.load_bookkeeping import LoadBookkeeping
+from autonomy.manager.route_driver import RouteDriver
+from autonomy.manager.target_log import TargetLog
 from autonomy.manager.transition_table import Event, Rule
-from autonomy.manager.target_log import Target
-from autonomy.manager.world_model import Outlook
+from autonomy.manager.world_model import WorldModel
 
 SECOND_NS: Final = 1_000_000_000
 SETTLED_NS: Final = 400_000_000
@@ -24,28 +24,30 @@ PROGRESS_M: Final = 0.2
 """Distance that counts as progress of a driving state."""
 
 
-class Events:
+class EventConditions:
     """Conditions of machine and logs in the current state; operator events belong to the manager."""
 
-    def __init__(self, outlook: Outlook, ride: Ride, cargo: Cargo, target: Target, hand: Hand) -> None:
-        self._outlook, self._ride, self._cargo, self._target, self._hand = outlook, ride, cargo, target, hand
+    def __init__(
+        self, world: WorldModel, route: RouteDriver, load: LoadBookkeeping, target: TargetLog, crane: CraneExecutor
+    ) -> None:
+        self._world, self._route, self._load, self._target, self._crane = world, route, load, target, crane
         self._height_m = self._progress_m = 0.0
         self._since_ns = self._settled_ns = self._progress_ns = 0
 
     def begin(self, now_ns: int, height_m: float) -> None:
         """Enter a state, or enter it again; ``height_m`` is the requested height of the swing arms."""
         self._since_ns, self._settled_ns, self._progress_ns = now_ns, 0, now_ns
-        self._height_m, self._progress_m = height_m, self._ride.driven_m
+        self._height_m, self._progress_m = height_m, self._route.driven_m
 
     def has(self, event: Event, now_ns: int) -> bool:
         """Whether an event has occurred."""
         match event:
             case Event.AT_HEIGHT:
-                return self._settled(self._outlook.at_height(self._height_m), now_ns)
+                return self._settled(self._world.is_at_height(self._height_m), now_ns)
             case Event.STANDING:
-                return self._settled(self._outlook.stands(), now_ns)
+                return self._settled(self._world.is_standing(), now_ns)
             case Event.ARRIVED:
-                return self._settled(self._ride.arrived, now_ns)
+                return self._settled(self._route.arrived, now_ns)
             case Event.LOG_NEAR:
                 return self._target.is_near(now_ns)
             case Event.AVERAGED:
@@ -57,30 +59,30 @@ class Events:
             case Event.OUTSIDE:
                 return self._target.is_past()
             case Event.VALID | Event.INVALID:
-                looked = self._outlook.list_ns > self._since_ns
-                return looked and self._target.is_takable() == (event is Event.VALID)
+                looked = self._world.list_ns > self._since_ns
+                return looked and self._target.is_graspable() == (event is Event.VALID)
             case Event.COLLECTED:
-                return self._hand.collected(now_ns)
+                return self._crane.collected(now_ns)
             case Event.MISSED:
-                return self._hand.missed(self._target.number)
+                return self._crane.missed(self._target.number)
             case Event.LOADED:
-                return self._cargo.loaded and (self._cargo.full or self._ride.ended)
+                return self._load.loaded and (self._load.full or self._route.ended)
             case Event.EMPTY:
                 return self._emptied(now_ns)
             case Event.STOWED:
-                return self._hand.stowed()
+                return self._crane.stowed()
             case Event.ROUND_END:
-                return self._ride.ended and self._cargo.another_round
+                return self._route.ended and self._load.needs_another_round
             case Event.ROUTE_END:
-                return self._ride.ended or self._cargo.enough
+                return self._route.ended or self._load.has_enough
         return False
 
     def late(self, rule: Rule, now_ns: int) -> bool:
         """Whether a state has timed out; for driving states the time counts from the last progress."""
-        if self._ride.driven_m > self._progress_m + PROGRESS_M:
-            self._progress_m, self._progress_ns = self._ride.driven_m, now_ns
+        if self._route.driven_m > self._progress_m + PROGRESS_M:
+            self._progress_m, self._progress_ns = self._route.driven_m, now_ns
         begun = max(self._since_ns, self._progress_ns) if rule.drives else self._since_ns
-        return now_ns - begun > rule.patience_s * SECOND_NS
+        return now_ns - begun > rule.timeout_s * SECOND_NS
 
     def _settled(self, so: bool, now_ns: int) -> bool:
         """Whether a condition has held for ``SETTLED_NS``."""
@@ -89,12 +91,12 @@ class Events:
 
     def _emptied(self, now_ns: int) -> bool:
         """Whether the bunk is empty; starts the next grasp while it is not."""
-        if self._hand.unloaded():
+        if self._crane.unloaded():
             self._since_ns = now_ns
-        if self._hand.trouble or self._hand.job is not None or self._outlook.counted_ns <= self._since_ns:
+        if self._crane.failure or self._crane.job is not None or self._world.counted_ns <= self._since_ns:
             return False
-        if self._outlook.in_bunk:
-            self._hand.unload()
+        if self._world.in_bunk:
+            self._crane.unload_bunk()
             return False
-        self._cargo.emptied(now_ns, self._ride.driven_m)
+        self._load.book_empty(now_ns, self._route.driven_m)
         return True

@@ -14,8 +14,9 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.grasp.selection import NoGrasp, plan_single_log_grasp
-from autonomy.manager.log_map import FieldLog
+from autonomy.grasp.planner import NoGrasp
+from autonomy.grasp.selection import plan_single_log_grasp
+from autonomy.manager.log_map import MappedLog
 from autonomy.motion.arm import Arm
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.log_list.observation import LogObservation
@@ -23,13 +24,13 @@ from machine.geometry.carrier import pivot_height_m, rear_from_base
 from machine.profile import Carrier
 
 STEP_M: Final = 0.25
-ASIDE_M: Final = 0.35
+SIDE_CLEARANCE_M: Final = 0.35
 """A log's centre lies at least this far outside the machine's sides, beyond its own half width."""
 
-SPARE_M: Final = 0.15
+TELESCOPE_RESERVE_M: Final = 0.15
 """Telescope stroke kept in reserve for position errors."""
 
-BESIDE_M: Final = 0.5
+BEYOND_ARM_M: Final = 0.5
 """No log is grasped whose centre is farther than this beyond the straight arm: it may be gripped off its centre, and
 the column leans.
 """
@@ -39,7 +40,7 @@ BaseAt = Callable[[float], Pose]
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class LoadingStop:
     """A place along the path [m], the logs to grasp there, best first, and the crane's work for them [s]."""
 
     along_m: float
@@ -47,20 +48,20 @@ class Stop:
     work_s: float
 
 
-class Reach:
+class CraneReach:
     """Which logs the crane can grasp, with the frame at loading height."""
 
     def __init__(self, arm: Arm, carrier: Carrier) -> None:
         self._arm, self.ground_z_m = arm, arm.profile.workspace.ground_z_m
-        self._aside_m = 0.5 * (carrier.track_width_m + carrier.wheel_width_m) + ASIDE_M
+        self._aside_m = 0.5 * (carrier.track_width_m + carrier.wheel_width_m) + SIDE_CLEARANCE_M
         bunk = arm.profile.bunk
-        self._rear_end_m = bunk.center_m[0] + 0.5 * bunk.length_m + ASIDE_M
+        self._rear_end_m = bunk.center_m[0] + 0.5 * bunk.length_m + SIDE_CLEARANCE_M
         slew = arm.profile.joints["slew"]
         self._slew_rad_s = slew.speed_limit
         self._out_m_s = arm.profile.joints["ext"].speed_limit
-        self._longest_m = arm.profile.joints["ext"].upper - SPARE_M
+        self._longest_m = arm.profile.joints["ext"].upper - TELESCOPE_RESERVE_M
         kin = arm.profile.kinematics
-        self.farthest_m = kin.a1_m + kin.a2_m + math.hypot(kin.a3_m, kin.d4_m + self._longest_m) + BESIDE_M
+        self.farthest_m = kin.a1_m + kin.a2_m + math.hypot(kin.a3_m, kin.d4_m + self._longest_m) + BEYOND_ARM_M
 
     def work_s(self, log: LogObservation) -> float:
         """Rough duration of the crane's motion to a log and back [s]; infinite if it cannot be grasped."""
@@ -78,7 +79,9 @@ class Reach:
         return 2.0 * max(abs(pose.slew_rad - math.atan2(home[1], home[0])) / self._slew_rad_s, out_m / self._out_m_s)
 
 
-def best_stop(logs: Sequence[FieldLog], reach: Reach, base_at: BaseAt, begin_m: float, end_m: float) -> Stop | None:
+def best_stop(
+    logs: Sequence[MappedLog], reach: CraneReach, base_at: BaseAt, begin_m: float, end_m: float
+) -> LoadingStop | None:
     """The best stop between two distances along the path [m]; None when no log can be grasped from there."""
     places = np.arange(begin_m, end_m + 1e-9, STEP_M)
     bases = [base_at(along_m) for along_m in places.tolist()]
@@ -88,7 +91,7 @@ def best_stop(logs: Sequence[FieldLog], reach: Reach, base_at: BaseAt, begin_m: 
         log, base = logs[j], bases[i]
         if math.dist(log.center_m[:2], base.position_m[:2]) > reach.farthest_m:
             return math.inf
-        return reach.work_s(_level(log.observation(base), reach.ground_z_m))
+        return reach.work_s(_at_ground_height(log.observation(base), reach.ground_z_m))
 
     # From the far end: beyond the last place only whether the work is finite matters.
     lasts = (
@@ -102,16 +105,16 @@ def best_stop(logs: Sequence[FieldLog], reach: Reach, base_at: BaseAt, begin_m: 
     counts, sums = taken.sum(axis=1), np.where(taken, work, 0.0).sum(axis=1)
     best = min(range(last + 1), key=lambda i: (-counts[i], sums[i], places[i]))
     order = sorted(np.flatnonzero(taken[best]).tolist(), key=lambda j: work[best, j])
-    return Stop(float(places[best]), tuple(logs[j].number for j in order), float(sums[best]))
+    return LoadingStop(float(places[best]), tuple(logs[j].number for j in order), float(sums[best]))
 
 
-def _level(log: LogObservation, ground_z_m: float) -> LogObservation:
+def _at_ground_height(log: LogObservation, ground_z_m: float) -> LogObservation:
     """The log at the ground height of the machine; the real height at the stop is not known yet."""
     x, y, _ = log.center_m
     return replace(log, center_m=(x, y, ground_z_m + 0.5 * log.diameter_m))
 
 
-def base_on_way(
+def base_on_path(
     carrier: Carrier, front: tuple[float, float, float], rear_m: tuple[float, float], height_m: float
 ) -> Pose:
     """The crane's base when the centre of the front axle stands at ``front`` (x, y [m], direction [rad]) and that of

@@ -16,34 +16,36 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from autonomy.grasp.placement import lies_in_bunk
-from autonomy.localization.local_plane import Plane
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.local_frame import yaw_from_bearing
 from autonomy.missions.model import KnownLog
-from autonomy.perception.log_list.estimate import ACROSS_1, ACROSS_2, END, START, TILT_1, unpacked
 from autonomy.perception.camera.frame import Pose
+from autonomy.perception.log_list.estimate import ACROSS_1, ACROSS_2, END, START, TILT_1, unpack_covariance
 from autonomy.perception.log_list.observation import LogObservation
 from machine.profile import Bunk
 
-SAME_M: Final = 0.8
+MAX_ALONG_M: Final = 0.8
 """Two observations of one log are closer than this along its axis, ..."""
-SIDE_M: Final = 0.35
+MAX_ACROSS_M: Final = 0.35
 """... and closer than this across it."""
-ALIKE_RAD: Final = math.radians(40.0)
+MAX_ANGLE_RAD: Final = math.radians(40.0)
 """Axes of two observations of one log differ by less than this plus their uncertainty."""
-PLAIN_SIGMA_M: Final = 0.10
+DEFAULT_SIGMA_M: Final = 0.10
 """Assumed for an observation without a covariance (paper B's own value)."""
-LEAST_SIGMA_M: Final = 0.01
+MIN_SIGMA_M: Final = 0.01
 """Lower bound of every sigma: errors of poses and mounts do not average out."""
-TOLD_SIGMA_M: Final = 0.3
+LISTED_SIGMA_M: Final = 0.3
 """Assumed for a log that a mission lists without a sigma."""
-USUAL_M: Final = (3.0, 0.2)
+DEFAULT_SIZE_M: Final = (3.0, 0.2)
 """Assumed length and diameter of a listed log without a size."""
-CONFIRMED: Final = 2
+CONFIRMED_HITS: Final = 2
 """Observations that confirm a log."""
-_BAR: Final = 1e9
+_BAR_COST: Final = 1e9
 """Cost of a pair that cannot be the same log."""
+
+
 @dataclass(frozen=True, slots=True)
-class FieldLog:
+class MappedLog:
     """A log in the plane: centre and unit axis (3,), length and diameter [m], 1-sigma of the centre [m], number of
     observations, time of the last one, number of failed grasps.
     """
@@ -68,56 +70,56 @@ class FieldLog:
         return LogObservation(self.number, (x, y, z), (ax, ay, az), self.length_m, self.diameter_m)
 
 
-class Field:
+class LogMap:
     """All logs that were observed or listed and are not collected yet."""
 
     def __init__(self, bunk: Bunk) -> None:
         self._bunk = bunk
-        self._logs: dict[int, FieldLog] = {}
+        self._logs: dict[int, MappedLog] = {}
         self._next = 1
 
     @property
-    def logs(self) -> tuple[FieldLog, ...]:
+    def logs(self) -> tuple[MappedLog, ...]:
         """Confirmed logs in the order of their numbers."""
-        return tuple(log for log in self._logs.values() if log.hits >= CONFIRMED)
+        return tuple(log for log in self._logs.values() if log.hits >= CONFIRMED_HITS)
 
     @property
-    def missed_ones(self) -> tuple[FieldLog, ...]:
+    def missed_logs(self) -> tuple[MappedLog, ...]:
         """Logs with at least one failed grasp, given up or not."""
         return tuple(log for log in self._logs.values() if log.misses)
 
     @property
-    def free(self) -> int:
+    def next_number(self) -> int:
         """The next unused number."""
         return self._next
 
-    def known(self, log: FieldLog) -> None:
+    def add_known(self, log: MappedLog) -> None:
         """Add a log known before it is observed, for example from a harvester; it gets the next number."""
-        self._logs[self._next] = replace(log, number=self._next, hits=max(log.hits, CONFIRMED))
+        self._logs[self._next] = replace(log, number=self._next, hits=max(log.hits, CONFIRMED_HITS))
         self._next += 1
 
-    def restore(self, log: FieldLog) -> None:
+    def restore(self, log: MappedLog) -> None:
         """Restore a log with its number."""
         self._logs[log.number] = log
 
-    def number_from(self, free: int) -> None:
+    def reserve_numbers(self, free: int) -> None:
         """Start new numbers at ``free`` or above."""
         self._next = max(self._next, free)
 
-    def get(self, number: int) -> FieldLog | None:
+    def get(self, number: int) -> MappedLog | None:
         """The log with this number, None if it is not mapped."""
         return self._logs.get(number)
 
-    def see(self, seen: Iterable[LogObservation], base: Pose, now_ns: int) -> dict[int, int]:
+    def observe(self, seen: Iterable[LogObservation], base: Pose, now_ns: int) -> dict[int, int]:
         """Merge a list of observations; returns the map number of each list number."""
-        fresh = [_sighting(o, base, now_ns) for o in seen if not lies_in_bunk(self._bunk, o)]
+        fresh = [_observed_log(o, base, now_ns) for o in seen if not lies_in_bunk(self._bunk, o)]
         names = [o.id for o in seen if not lies_in_bunk(self._bunk, o)]
         known = list(self._logs.values())
-        costs = np.full((len(known), len(fresh)), _BAR)
+        costs = np.full((len(known), len(fresh)), _BAR_COST)
         for i, log in enumerate(known):
             for j, sighting in enumerate(fresh):
-                costs[i, j] = _apart(log, sighting)
-        pairs = {int(j): int(i) for i, j in zip(*linear_sum_assignment(costs), strict=True) if costs[i, j] < _BAR}
+                costs[i, j] = _distance_m(log, sighting)
+        pairs = {int(j): int(i) for i, j in zip(*linear_sum_assignment(costs), strict=True) if costs[i, j] < _BAR_COST}
         numbers = {}
         for j, sighting in enumerate(fresh):
             if j in pairs:
@@ -130,11 +132,11 @@ class Field:
                 self._next += 1
         return numbers
 
-    def anew(self, number: int) -> None:
+    def restart_average(self, number: int) -> None:
         """Restart the average of a log with its next observation (paper B: at standstill)."""
         self._logs[number] = replace(self._logs[number], hits=0)
 
-    def missed(self, number: int) -> int:
+    def record_miss(self, number: int) -> int:
         """Record a failed grasp; returns how many there were."""
         log = self._logs[number] = replace(self._logs[number], misses=self._logs[number].misses + 1, hits=0)
         return log.misses
@@ -143,62 +145,56 @@ class Field:
         """Remove a log that is collected."""
         self._logs.pop(number, None)
 
-    def forget(self, older_ns: int) -> None:
-        """Drop unconfirmed logs that were last observed before a time."""
-        stale = [n for n, log in self._logs.items() if log.hits < CONFIRMED and log.seen_ns < older_ns]
-        for number in stale:
-            del self._logs[number]
 
-
-def nearest(logs: Sequence[FieldLog], point_m: np.ndarray) -> FieldLog | None:
+def nearest(logs: Sequence[MappedLog], point_m: np.ndarray) -> MappedLog | None:
     """The log whose centre is nearest to a point (2,) of the plane."""
     return min(logs, key=lambda log: math.dist(log.center_m[:2], point_m), default=None)
 
 
-def told(log: KnownLog, plane: Plane, ground_m: float) -> FieldLog:
+def listed_log(log: KnownLog, plane: LocalPlane, ground_m: float) -> MappedLog:
     """A listed log in the plane, on ground at a height [m]."""
-    d = log.diameter_m or USUAL_M[1]
+    d = log.diameter_m or DEFAULT_SIZE_M[1]
     x, y, _ = plane.local(log.position.latitude_deg, log.position.longitude_deg)
     yaw = 0.0 if log.bearing_deg is None else yaw_from_bearing(log.bearing_deg)
-    return FieldLog(
+    return MappedLog(
         0, np.array([x, y, ground_m + 0.5 * d]), np.array([math.cos(yaw), math.sin(yaw), 0.0]),
-        log.length_m or USUAL_M[0], d, log.sigma_m or TOLD_SIGMA_M, CONFIRMED, 0, assortment=log.assortment,
-        turn_rad=math.pi if log.bearing_deg is None else 0.0,
+        log.length_m or DEFAULT_SIZE_M[0], d, log.sigma_m or LISTED_SIGMA_M, CONFIRMED_HITS, 0,
+        assortment=log.assortment, turn_rad=math.pi if log.bearing_deg is None else 0.0,
     )  # fmt: skip
 
 
-def _sighting(o: LogObservation, base: Pose, now_ns: int) -> FieldLog:
+def _observed_log(o: LogObservation, base: Pose, now_ns: int) -> MappedLog:
     center = base.to_base(np.asarray(o.center_m))
     axis, turn_rad = base.rotation @ np.asarray(o.axis), 0.0
     if o.covariance is not None:
-        turn_rad = math.sqrt(unpacked(o.covariance)[TILT_1, TILT_1])
-    return FieldLog(0, center, axis, o.length_m, o.diameter_m, _sigma_m(o), 1, now_ns, turn_rad=turn_rad)
+        turn_rad = math.sqrt(unpack_covariance(o.covariance)[TILT_1, TILT_1])
+    return MappedLog(0, center, axis, o.length_m, o.diameter_m, _sigma_m(o), 1, now_ns, turn_rad=turn_rad)
 
 
 def _sigma_m(o: LogObservation) -> float:
     """1-sigma of the centre on the ground: the larger of across and along."""
     if o.covariance is None:
-        return PLAIN_SIGMA_M
-    c = unpacked(o.covariance)
+        return DEFAULT_SIGMA_M
+    c = unpack_covariance(o.covariance)
     along = 0.25 * (c[START, START] + c[END, END] + 2.0 * c[START, END])
-    return max(LEAST_SIGMA_M, math.sqrt(max(c[ACROSS_1, ACROSS_1], c[ACROSS_2, ACROSS_2], along)))
+    return max(MIN_SIGMA_M, math.sqrt(max(c[ACROSS_1, ACROSS_1], c[ACROSS_2, ACROSS_2], along)))
 
 
-def _apart(log: FieldLog, sighting: FieldLog) -> float:
-    """Distance between two observations [m]; `_BAR` when they cannot be of one log."""
+def _distance_m(log: MappedLog, sighting: MappedLog) -> float:
+    """Distance between two observations [m]; `_BAR_COST` when they cannot be of one log."""
     off = sighting.center_m - log.center_m
     along = float(off @ log.axis)
     across = float(np.linalg.norm(off - along * log.axis))
     loose = 3.0 * (log.sigma_m + sighting.sigma_m)
     askew = math.acos(min(1.0, abs(float(log.axis @ sighting.axis))))
-    if askew > ALIKE_RAD + 3.0 * max(log.turn_rad, sighting.turn_rad):
-        return _BAR
-    if abs(along) > SAME_M + loose or across > SIDE_M + loose:
-        return _BAR
+    if askew > MAX_ANGLE_RAD + 3.0 * max(log.turn_rad, sighting.turn_rad):
+        return _BAR_COST
+    if abs(along) > MAX_ALONG_M + loose or across > MAX_ACROSS_M + loose:
+        return _BAR_COST
     return math.hypot(along, across)
 
 
-def _averaged(log: FieldLog, sighting: FieldLog) -> FieldLog:
+def _averaged(log: MappedLog, sighting: MappedLog) -> MappedLog:
     """The running average, weighted by variance; restarted when the log has no hits."""
     if not log.hits:
         return replace(sighting, number=log.number, misses=log.misses, assortment=log.assortment)
@@ -212,7 +208,7 @@ def _averaged(log: FieldLog, sighting: FieldLog) -> FieldLog:
         axis=axis / np.linalg.norm(axis),
         length_m=log.length_m + share * (sighting.length_m - log.length_m),
         diameter_m=log.diameter_m + share * (sighting.diameter_m - log.diameter_m),
-        sigma_m=max(LEAST_SIGMA_M, 1.0 / math.sqrt(before + now)),
+        sigma_m=max(MIN_SIGMA_M, 1.0 / math.sqrt(before + now)),
         turn_rad=min(log.turn_rad, sighting.turn_rad),
         hits=log.hits + 1,
         seen_ns=sighting.seen_ns,

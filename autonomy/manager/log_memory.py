@@ -16,10 +16,10 @@ import numpy as np
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.bunk_load import settled_in_bunk
-from autonomy.manager.log_map import Field
-from autonomy.manager.load_detector import Scale
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.manager.load_detector import LoadDetector
+from autonomy.manager.log_map import LogMap
 from autonomy.motion.arm import Arm
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.log_list.observation import LogObservation
@@ -28,34 +28,34 @@ from machine.geometry.grapple import grapple_yaw
 from machine.joints import JOINTS
 from machine.profile import Profile, joint
 
-EVERY_NS: Final = 250_000_000
-AROUND_M: Final = 12.0
+PERIOD_NS: Final = 250_000_000
+RANGE_M: Final = 12.0
 LIFTED_M: Final = 0.5
 """The scale is used above this height only: below it, the log may still rest on the ground."""
 
 
-class Memory:
+class LogMemory:
     """Call ``list`` once per step; see the module's contract."""
 
     def __init__(self, profile: Profile) -> None:
         self._profile, self._arm = profile, Arm(profile)
         self._due_ns = 0
-        self._aboard: list[LogObservation] = []
+        self._in_bunk: list[LogObservation] = []
         self._job: Activity | None = None
         self._held: dict[int, LogObservation] = {}
         """Logs of the grasp relative to hanger pin and grapple yaw, from the time it closed."""
         self._low_m = 0.0
-        self._laid: list[LogObservation] = []
-        self._scale: Scale | None = None
+        self._released: list[LogObservation] = []
+        self._load_detector: LoadDetector | None = None
         self._slipped = False
 
     @property
-    def aboard(self) -> int:
+    def in_bunk(self) -> int:
         """Number of logs that were placed in the bunk."""
-        return len(self._aboard)
+        return len(self._in_bunk)
 
-    def list(
-        self, now_ns: int, field: Field, base: Pose, report: StateReport | None, job: Activity | None
+    def log_list(
+        self, now_ns: int, log_map: LogMap, base: Pose, report: StateReport | None, job: Activity | None
     ) -> tuple[LogObservation, ...] | None:
         """The remembered logs in the base frame; None when no new list is due."""
         if job is not self._job:
@@ -65,21 +65,21 @@ class Memory:
             self._follow(job, report)
         if now_ns < self._due_ns:
             return None
-        self._due_ns = now_ns + EVERY_NS
+        self._due_ns = now_ns + PERIOD_NS
         hanging = self._hanging(report)
-        gone = {log.id for log in (*hanging, *self._laid)}
+        gone = {log.id for log in (*hanging, *self._released)}
         near = [
-            log.observation(base) for log in field.logs
-            if log.number not in gone and math.dist(log.center_m[:2], base.position_m[:2]) < AROUND_M
+            log.observation(base) for log in log_map.logs
+            if log.number not in gone and math.dist(log.center_m[:2], base.position_m[:2]) < RANGE_M
         ]  # fmt: skip
-        return (*near, *hanging, *self._laid, *(log for log in self._aboard if log.id not in gone))
+        return (*near, *hanging, *self._released, *(log for log in self._in_bunk if log.id not in gone))
 
     def _end(self) -> None:
         """The job is over: logs placed in the bunk are on board, logs taken from it are not."""
-        moved = {log.id for log in self._laid}
-        self._aboard = [log for log in self._aboard if log.id not in moved]
-        self._aboard += [log for log in self._laid if lies_in_bunk(self._profile.bunk, log)]
-        self._laid, self._held, self._scale, self._slipped = [], {}, None, False
+        moved = {log.id for log in self._released}
+        self._in_bunk = [log for log in self._in_bunk if log.id not in moved]
+        self._in_bunk += [log for log in self._released if lies_in_bunk(self._profile.bunk, log)]
+        self._released, self._held, self._load_detector, self._slipped = [], {}, None, False
 
     def _follow(self, job: Activity, report: StateReport) -> None:
         """Track what the grapple closes on, loses and releases."""
@@ -87,21 +87,24 @@ class Memory:
         if grasp is None:
             return
         if job.phase < Phase.CLOSE:
-            self._held, self._scale, self._slipped = {}, None, False
+            self._held, self._load_detector, self._slipped = {}, None, False
         elif Phase.LIFT <= job.phase < Phase.OPEN and not self._held and not self._slipped:
             pin, yaw = self._pin(report)
             self._low_m = pin[2]
-            self._held, self._scale = {log.id: _relative(log, pin, yaw) for log in grasp.logs}, Scale(grasp.logs)
-        elif Phase.LIFT <= job.phase < Phase.OPEN and self._scale is not None:
-            self._scale.feel(report.stamp_ns, report.load_kg)
-            if self._scale.light and self._pin(report)[0][2] > self._low_m + LIFTED_M:
-                self._held, self._scale, self._slipped = {}, None, True
+            self._held, self._load_detector = (
+                {log.id: _relative(log, pin, yaw) for log in grasp.logs},
+                LoadDetector(grasp.logs),
+            )
+        elif Phase.LIFT <= job.phase < Phase.OPEN and self._load_detector is not None:
+            self._load_detector.update(report.stamp_ns, report.load_kg)
+            if self._load_detector.is_empty and self._pin(report)[0][2] > self._low_m + LIFTED_M:
+                self._held, self._load_detector, self._slipped = {}, None, True
         elif Phase.OPEN <= job.phase <= Phase.DONE and self._held:
-            under = [log for log in self._aboard if log.id not in self._held]
+            under = [log for log in self._in_bunk if log.id not in self._held]
             laid: list[LogObservation] = []
             for log in self._hanging(report):
                 laid.append(settled_in_bunk(self._profile.bunk, log, under + laid))
-            self._laid, self._held, self._scale = laid, {}, None
+            self._released, self._held, self._load_detector = laid, {}, None
 
     def _hanging(self, report: StateReport | None) -> list[LogObservation]:
         if not self._held or report is None:
@@ -112,7 +115,7 @@ class Memory:
     def _pin(self, report: StateReport) -> tuple[np.ndarray, float]:
         """Hanger pin in the base frame and grapple yaw; joints without an encoder use their reference."""
         assert self._job is not None
-        sent = self._job.rests
+        sent = self._job.last_setpoint
         q = tuple(
             p if joint(self._profile, j).encoder is not None else s
             for j, p, s in zip(JOINTS, report.position, sent, strict=True)

@@ -30,12 +30,7 @@ class Sorting:
         self._landings = mission.landings
         self._sorts = mission.options.sort_by_assortment and bool(mission.landings)
 
-    @property
-    def chooses(self) -> bool:
-        """Whether some logs may have to be left."""
-        return self._sorts or bool(self._only)
-
-    def taker(self, assortment: str) -> int | None:
+    def landing_of(self, assortment: str) -> int | None:
         """The landing of an assortment when sorting: the first that names it, else the first that names none, else
         None.
         """
@@ -49,52 +44,52 @@ class Sorting:
             return False
         if not self._sorts:
             return True
-        goes_to = self.taker(assortment)
+        goes_to = self.landing_of(assortment)
         bound = landing if self.landing is None else self.landing
         return goes_to is not None and bound in (None, goes_to)
 
-    def together(self, assortment: str, first: str) -> bool:
+    def may_share_grasp(self, assortment: str, first: str) -> bool:
         """Whether such a log may share a grasp with ``first``."""
-        return self.wants(assortment, self.taker(first) if self._sorts else None)
+        return self.wants(assortment, self.landing_of(first) if self._sorts else None)
 
-    def took(self, assortments: Iterable[str]) -> None:
+    def book_loaded(self, assortments: Iterable[str]) -> None:
         """Book assortments that came on board, in order."""
         if not self._sorts:
             return
         if self.landing is None:
-            self.landing = next((at for a in assortments if (at := self.taker(a)) is not None), None)
+            self.landing = next((at for a in assortments if (at := self.landing_of(a)) is not None), None)
         if self.landing is not None:
             self.served.add(self.landing)
 
-    def goes_on(self, landing: int | None, served: Iterable[int], rounds: int) -> None:
+    def restore(self, landing: int | None, served: Iterable[int], rounds: int) -> None:
         """Restore the state of a checkpoint."""
         self.landing, self.served, self.rounds = landing, set(served), rounds
 
-    def sets_out(self, landings: list[Point2], here: Point2) -> int:
+    def choose_landing(self, landings: list[Point2], here: Point2) -> int:
         """Decide the landing of the load: as decided before, else the nearest."""
         if self.landing is None:
             self.landing = min(range(len(landings)), key=lambda i: math.dist(landings[i], here))
         return self.landing
 
-    def unloaded(self) -> None:
+    def book_unloaded(self) -> None:
         """The bunk is empty; the landing of the next load is undecided."""
         self.landing = None
 
-    def anew(self, lying: Iterable[str]) -> bool:
+    def needs_another_round(self, lying: Iterable[str]) -> bool:
         """Whether the route is driven again for logs of these assortments that are left.
 
         A log that fits the only load of the round cannot be reached from this route.
         """
         if not self._sorts:
             return False
-        passed = {self.taker(a) for a in lying if not self._only or a in self._only} - {None}
+        passed = {self.landing_of(a) for a in lying if not self._only or a in self._only} - {None}
         return bool(self.served) and bool(passed if len(self.served) > 1 else passed - self.served)
 
-    def begins_anew(self) -> None:
+    def start_round(self) -> None:
         """Start the next round of the route."""
         self.served, self.rounds = set(), self.rounds + 1
 
-    def called(self, landing: int | None) -> str:
+    def landing_name(self, landing: int | None) -> str:
         """Name of a landing; empty with a single landing."""
         if landing is None or len(self._landings) < 2:
             return ""

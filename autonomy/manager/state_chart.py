@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Final
 
-from autonomy.manager.transition_table import ENDS, EVENTS, OURS, PAPER_B, RULES, Height, State, Table
+from autonomy.manager.transition_table import (
+    EVENT_DESCRIPTIONS,
+    FINAL_STATES,
+    OURS,
+    PAPER_B,
+    RULES,
+    Height,
+    State,
+    Table,
+)
 
 TITLES: Final = {"Paper B (its Fig. 8)": PAPER_B, "Ours": OURS}
 INTRODUCTION: Final = (
@@ -33,7 +42,7 @@ def diagram(table: Table) -> str:
         arrows[begin, end].append(event.name.lower().replace("_", " "))
     lines = ["stateDiagram-v2", f"    [*] --> {State.IDLE.name}"]
     lines += [f"    {a.name} --> {b.name} : {', '.join(names)}" for (a, b), names in arrows.items()]
-    lines += [f"    {end.name} --> [*]" for end in sorted(ENDS & set(table.values()))]
+    lines += [f"    {end.name} --> [*]" for end in sorted(FINAL_STATES & set(table.values()))]
     return "\n".join(lines)
 
 
@@ -42,12 +51,13 @@ def states() -> list[str]:
     rows = ["| state | the machine | frame | timeout | reason after the timeout |", "|---|---|---|---|---|"]
     heights = {Height.KEEP: "as it is", Height.TRANSPORT: "transport", Height.LOADING: "loading"}
     for state, rule in RULES.items():
-        waits = rule.patience_s == float("inf")
-        patience = "–" if waits else f"{rule.patience_s:.0f} s" + (" without progress" if rule.drives else "")
-        rows.append(f"| {state.name} | {rule.words} | {heights[rule.height]} | {patience} | {rule.trouble or '–'} |")
+        timeout = "–" if rule.timeout_s == float("inf") else f"{rule.timeout_s:.0f} s"
+        timeout += " without progress" if rule.drives else ""
+        cells = (state.name, rule.description, heights[rule.height], timeout, rule.timeout_reason or "–")
+        rows.append(f"| {' | '.join(cells)} |")
     return rows
 
 
 def events() -> list[str]:
     """The table of events."""
-    return ["| event | meaning |", "|---|---|", *(f"| {e.name} | {words} |" for e, words in EVENTS.items())]
+    return ["| event | meaning |", "|---|---|", *(f"| {e.name} | {words} |" for e, words in EVENT_DESCRIPTIONS.items())]

@@ -12,7 +12,7 @@ import msgspec
 from autonomy.missions.model import Point
 from machine.profile import Bunk
 
-PACKING: Final = 0.60
+PACKING_SHARE: Final = 0.60
 """Solid share of a bunk's volume when a crane loads it (assumed; 0.55 to 0.65)."""
 
 
@@ -21,7 +21,7 @@ def volume_m3(length_m: float, diameter_m: float) -> float:
     return 0.25 * math.pi * diameter_m**2 * length_m
 
 
-class Taken(msgspec.Struct, frozen=True):
+class LoadedLog(msgspec.Struct, frozen=True):
     """A log that was loaded into the bunk: where it had lain, when it was loaded, its solid volume."""
 
     position: Point
@@ -33,7 +33,7 @@ class Taken(msgspec.Struct, frozen=True):
 class Load(msgspec.Struct, frozen=True):
     """Logs unloaded together at one landing, by the landing's index; ``driven_m`` since the load before."""
 
-    logs: tuple[Taken, ...]
+    logs: tuple[LoadedLog, ...]
     at_ns: int
     driven_m: float
     landing: int = 0
@@ -58,10 +58,10 @@ class Tally:
     """The bunk had no room for a grasp."""
     given_up: dict[int, str] = field(default_factory=dict)
     loads: list[Load] = field(default_factory=list)
-    board: list[Taken] = field(default_factory=list)
+    board: list[LoadedLog] = field(default_factory=list)
     counted_m: float = 0.0
 
-    def took(self, logs: Sequence[Taken], load_kg: float) -> None:
+    def book_loaded(self, logs: Sequence[LoadedLog], load_kg: float) -> None:
         """Book a grasp that was placed in the bunk."""
         self.grasps += 1
         self.loaded += len(logs)
@@ -72,16 +72,16 @@ class Tally:
 
     def full(self, bunk: Bunk, next_m3: float = 0.0) -> bool:
         """Whether the bunk has no room for ``next_m3`` more wood [m3]."""
-        room = PACKING * bunk.length_m * bunk.width_m * bunk.stake_height_m
+        room = PACKING_SHARE * bunk.length_m * bunk.width_m * bunk.stake_height_m
         return self.board_m3 + next_m3 > room
 
-    def laid_down(self, logs: int) -> None:
+    def book_unloaded(self, logs: int) -> None:
         """Book a grasp from the bunk to a landing; it may include logs that were on board before the mission."""
         self.grasps += 1
         self.unloaded += logs
         self.on_board = max(0, self.on_board - logs)
 
-    def emptied(self, now_ns: int, driven_m: float, landing: int = 0) -> None:
+    def book_empty(self, now_ns: int, driven_m: float, landing: int = 0) -> None:
         """Book an empty bunk after a driven distance of the whole mission [m]."""
         if self.board:  # else only logs from before the mission were unloaded
             self.loads.append(Load(tuple(self.board), now_ns, driven_m - self.counted_m, landing))

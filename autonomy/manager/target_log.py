@@ -4,63 +4,63 @@ from __future__ import annotations
 
 from typing import Final
 
-from autonomy.manager.load_bookkeeping import Cargo
-from autonomy.manager.log_map import FieldLog
-from autonomy.manager.route_driver import Ride
-from autonomy.manager.world_model import Outlook
+from autonomy.manager.load_bookkeeping import LoadBookkeeping
+from autonomy.manager.log_map import MappedLog
+from autonomy.manager.route_driver import RouteDriver
+from autonomy.manager.world_model import WorldModel
 
 COMMIT_M: Final = 2.5
 """A stop no farther ahead than this is final."""
-WEIGH_NS: Final = 200_000_000
+PLANNING_PERIOD_NS: Final = 200_000_000
 """Period at which the next stop is planned."""
-HITS: Final = 2
+AVERAGED_HITS: Final = 2
 """Observations after which a log's position counts as averaged."""
 
 
-class Target:
+class TargetLog:
     """``number`` is the map's, None without a target; ``stop_m`` is where to stop for it along the route."""
 
-    def __init__(self, outlook: Outlook, ride: Ride, cargo: Cargo) -> None:
+    def __init__(self, world: WorldModel, route: RouteDriver, load: LoadBookkeeping) -> None:
         self.number: int | None = None
         self.stop_m = 0.0
-        self._outlook, self._ride, self._cargo = outlook, ride, cargo
+        self._world, self._route, self._load = world, route, load
         self._was_inside = False
         self._weighed_ns = 0
 
     @property
-    def log(self) -> FieldLog | None:
+    def log(self) -> MappedLog | None:
         """The mapped target; None without one, or when it is no longer mapped."""
-        return None if self.number is None else self._outlook.field.get(self.number)
+        return None if self.number is None else self._world.log_map.get(self.number)
 
-    def search(self) -> None:
+    def clear(self) -> None:
         """Drop the target and search for another one."""
         self.number, self._was_inside = None, False
 
     @property
     def lies_ahead(self) -> bool:
         """Whether the front camera can see the target; it cannot see beside the machine."""
-        return self.number is not None and not self._outlook.in_circle(self.log)
+        return self.number is not None and not self._world.is_in_circle(self.log)
 
-    def look_again(self) -> None:
+    def restart_average(self) -> None:
         """Restart the average of the target's position."""
         assert self.number is not None
-        self._outlook.field.anew(self.number)
+        self._world.log_map.restart_average(self.number)
 
     def is_near(self, now_ns: int) -> bool:
         """Whether to stop for a log: paper B stops for the nearest one, ours when the best stop is close.  With a full
         bunk the machine does not stop.
         """
-        if self._cargo.full:
+        if self._load.full:
             return False
-        if self._ride.faithful:
-            log = self._outlook.near()
+        if self._route.as_paper_b:
+            log = self._world.nearest_candidate()
             self.number = None if log is None else log.number
             return log is not None
-        if now_ns - self._weighed_ns < WEIGH_NS:
+        if now_ns - self._weighed_ns < PLANNING_PERIOD_NS:
             return False
         self._weighed_ns = now_ns
-        along = self._ride.along_m
-        stop = self._outlook.stop_ahead(self._ride.base_at, along, self._ride.length_m)
+        along = self._route.along_m
+        stop = self._world.next_stop(self._route.base_at, along, self._route.length_m)
         if stop is None or stop.along_m > along + COMMIT_M:
             return False
         self.stop_m, self.number = stop.along_m, stop.numbers[0]
@@ -70,25 +70,25 @@ class Target:
     def averaged(self) -> bool:
         """Whether the target was observed often enough."""
         log = self.log
-        return log is not None and log.hits >= HITS
+        return log is not None and log.hits >= AVERAGED_HITS
 
     def came_inside(self) -> bool:
         """Whether the crane's base is, or was, in the circle round the target."""
-        self._was_inside = self._was_inside or self._outlook.in_circle(self.log)
+        self._was_inside = self._was_inside or self._world.is_in_circle(self.log)
         return self._was_inside
 
     def is_past(self) -> bool:
         """Whether the crane's base has left the circle on the far side."""
-        return self._outlook.past(self.log)
+        return self._world.has_passed(self.log)
 
-    def is_takable(self) -> bool:
+    def is_graspable(self) -> bool:
         """Whether a log can be grasped from here: for paper B only the target, for ours any log in the list."""
-        found = [] if self._cargo.full else self._outlook.takable(self.number if self._ride.faithful else None)
+        found = [] if self._load.full else self._world.graspable(self.number if self._route.as_paper_b else None)
         if found:
             self.number = found[0].number
         return bool(found)
 
-    def not_takable(self) -> None:
+    def record_unreachable(self) -> None:
         """Count a failure for a log that proves out of reach, so that the machine does not stop for it forever."""
-        if self.number is not None and not self._cargo.full:
-            self._outlook.missed(self.number)
+        if self.number is not None and not self._load.full:
+            self._world.record_miss(self.number)

@@ -61,7 +61,7 @@ class Event(IntEnum):
     TIME_OUT = 19
 
 
-EVENTS: Final[Mapping[Event, str]] = {
+EVENT_DESCRIPTIONS: Final[Mapping[Event, str]] = {
     Event.RESUMED: "the mode switch is at Auto, and the mission was begun before the planner restarted",
     Event.AUTO: "the mode switch is at Auto",
     Event.AT_HEIGHT: "all four swing arms are at the requested height",
@@ -99,9 +99,9 @@ class Rule:
     the crane works.  The timeout of a driving state counts from the last progress.
     """
 
-    words: str
-    patience_s: float
-    trouble: str
+    description: str
+    timeout_s: float
+    timeout_reason: str
     drives: bool = False
     height: Height = Height.KEEP
     crane: bool = False
@@ -180,18 +180,18 @@ OURS: Final[Table] = {
     (State.STOW, Event.STOWED): State.RAISE,
 }
 
-WAYS: Final[Mapping[str, Table]] = {"ours": OURS, "paper-b": PAPER_B}
+TABLES: Final[Mapping[str, Table]] = {"ours": OURS, "paper-b": PAPER_B}
 """By their names on the command line."""
-ENDS: Final = frozenset({State.DONE, State.FAILED})
+FINAL_STATES: Final = frozenset({State.DONE, State.FAILED})
 """Final states."""
 
 
-def awaited(table: Table, state: State) -> tuple[Event, ...]:
+def awaited_events(table: Table, state: State) -> tuple[Event, ...]:
     """The events that a state reacts to, in the order in which they are tested."""
     return tuple(sorted(event for known, event in table if known is state))
 
 
-def following(table: Table, state: State, event: Event) -> State:
+def next_state(table: Table, state: State, event: Event) -> State:
     """The next state; a timeout without a transition leads to FAILED.
 
     Raises:

@@ -16,15 +16,15 @@ from scipy.spatial.transform import Rotation
 
 from autonomy.crane_job.activity import Activity
 from autonomy.grasp.placement import lies_in_bunk
-from autonomy.localization.location import Location
 from autonomy.localization.frames import Frames
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.localization.localizer import Localizer
-from autonomy.localization.local_plane import Plane
-from autonomy.manager.log_map import CONFIRMED, Field, FieldLog, nearest, told
-from autonomy.manager.log_memory import Memory
-from autonomy.manager.checkpoint import Known, Missed
+from autonomy.localization.location import Location
+from autonomy.manager.checkpoint import LogKnowledge, MissedLog
+from autonomy.manager.loading_stops import BaseAt, CraneReach, LoadingStop, best_stop
+from autonomy.manager.log_map import CONFIRMED_HITS, LogMap, MappedLog, listed_log, nearest
+from autonomy.manager.log_memory import LogMemory
 from autonomy.manager.sorting import Sorting
-from autonomy.manager.loading_stops import BaseAt, Reach, Stop, best_stop
 from autonomy.missions.area import Area
 from autonomy.missions.local_frame import bearing_from_yaw
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
@@ -34,8 +34,8 @@ from autonomy.perception.camera.frame import Pose
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.vehicle import VehicleReport
-from machine.status.modes import Mode
 from machine.profile import Bunk, Profile
+from machine.status.modes import Mode
 
 SILENT_NS: Final = 300_000_000
 NEAR_M: Final = 4.0
@@ -47,52 +47,56 @@ HORIZON_M: Final = 16.0
 AHEAD_M: Final = 0.5
 BRAKING_M: Final = 0.5
 """Stopping distance from the usual speed."""
-SPINE: Final = 15
+SPINE_POINTS: Final = 15
 """Points along a log that are tested against the wheel tracks."""
-ATTEMPTS: Final = 3
-STANDS_M_S: Final = 0.02
-POSES: Final = 40
-FARTHEST: Final = 4.0
+MAX_ATTEMPTS: Final = 3
+STANDSTILL_M_S: Final = 0.02
+MAX_POSES: Final = 40
+MAX_EXTRAPOLATION_STEPS: Final = 4.0
 """The base pose is extrapolated by at most this many report intervals."""
 PILE_LENGTH_M, PILE_WIDTH_M, PILE_HEIGHT_M = 3.0, 2.6, 1.5
 """Size of a pile on a landing: longer than the logs, which lie side by side, and no higher."""
 
 
-class Outlook:
+class WorldModel:
     """One machine's view of its surroundings.
 
-    ``field`` maps the logs on the ground; ``sorting`` decides which of them are wanted.  ``location`` is the newest
+    ``log_map`` maps the logs on the ground; ``sorting`` decides which of them are wanted.  ``location`` is the newest
     one, None before the first.  ``known`` restores the log knowledge of a checkpoint.
     """
 
     def __init__(
-        self, profile: Profile, mission: ForwardingMission, plane: Plane | None = None, known: Known | None = None
+        self,
+        profile: Profile,
+        mission: ForwardingMission,
+        plane: LocalPlane | None = None,
+        known: LogKnowledge | None = None,
     ) -> None:
         assert profile.carrier is not None
-        self.field, self.sorting = Field(profile.bunk), Sorting(mission)
+        self.log_map, self.sorting = LogMap(profile.bunk), Sorting(mission)
         self.location: Location | None = None
         self.report: StateReport | None = None
         self.vehicle: VehicleReport | None = None
         self.list_ns = 0
         """When the newest log list was observed."""
         self.in_bunk, self.counted_ns = 0, 0
-        self.strayed_m = 0.0
+        self.outside_fence_m = 0.0
         """Distance of the front axle or the crane's base outside the fences; 0 inside."""
         self._carrier, self._bunk, self._ground_z_m = profile.carrier, profile.bunk, profile.workspace.ground_z_m
         self._localizer = Localizer(profile.carrier, plane)
-        self._reach = Reach(Arm(profile), profile.carrier)
+        self._reach = CraneReach(Arm(profile), profile.carrier)
         self._report_ns = self._vehicle_ns = 0
-        self._bases: deque[tuple[int, Pose]] = deque(maxlen=POSES)
+        self._bases: deque[tuple[int, Pose]] = deque(maxlen=MAX_POSES)
         self._numbers: dict[int, int] = {}
         self.landings: list[Point2] = []
         """Landing positions in the plane; empty before the first location."""
         self._places = tuple(landing.position for landing in mission.landings)
         self._listed = mission.logs if mission.options.logs == "listed" else ()
-        self._known = known or Known()
+        self._known = known or LogKnowledge()
         self._fences, self._area = mission.fences, Area()
 
     @property
-    def plane(self) -> Plane:
+    def plane(self) -> LocalPlane:
         """The local plane; only valid once the machine is located."""
         assert self._localizer.plane is not None
         return self._localizer.plane
@@ -115,14 +119,14 @@ class Outlook:
         before, first = self._bases[-2]
         if stamp <= before:
             return last
-        share = min((at_ns - stamp) / (stamp - before), FARTHEST)
+        share = min((at_ns - stamp) / (stamp - before), MAX_EXTRAPOLATION_STEPS)
         turn = Rotation.from_matrix(last.rotation @ first.rotation.T).as_rotvec()
         return Pose(
             last.position_m + share * (last.position_m - first.position_m),
             Rotation.from_rotvec(share * turn).as_matrix() @ last.rotation,
         )
 
-    def take(self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None) -> None:
+    def update(self, now_ns: int, report: StateReport | None, vehicle: VehicleReport | None) -> None:
         """Accept the newest reports and update the location."""
         if report is not None:
             self.report, self._report_ns = report, now_ns
@@ -132,11 +136,11 @@ class Outlook:
             if self.location.usable:
                 self._bases.append((self.location.stamp_ns, Frames(self._carrier, self.location).base()))
                 if len(self._bases) == 1:
-                    self._look_up()
+                    self._resolve_mission()
                 places = np.array([(self.location.x_m, self.location.y_m), self.base.position_m[:2]])
-                self.strayed_m = float(self._area.outside_m(places).max())
+                self.outside_fence_m = float(self._area.outside_m(places).max())
 
-    def _look_up(self) -> None:
+    def _resolve_mission(self) -> None:
         """Convert landings, fences and listed logs of the mission into the plane, and restore the known logs."""
         plane = self.plane
         self.landings = [plane.local(p.latitude_deg, p.longitude_deg)[:2] for p in self._places]
@@ -147,79 +151,81 @@ class Outlook:
         self._area = Area(tuple(r for r, out in rings if not out), tuple(r for r, out in rings if out))
         ground_m = float(self.base.position_m[2]) + self._ground_z_m
         for log in self._listed:
-            self.field.known(told(log, plane, ground_m))
+            self.log_map.add_known(listed_log(log, plane, ground_m))
         for number in self._known.gone:
-            self.field.remove(number)
+            self.log_map.remove(number)
         for missed in self._known.missed:
-            lay = told(missed.log, plane, ground_m)
-            self.field.restore(replace(lay, number=missed.number, misses=missed.misses, hits=0))
-        self.field.number_from(self._known.free)
+            lay = listed_log(missed.log, plane, ground_m)
+            self.log_map.restore(replace(lay, number=missed.number, misses=missed.misses, hits=0))
+        self.log_map.reserve_numbers(self._known.free)
 
-    def known(self) -> Known:
+    def known(self) -> LogKnowledge:
         """Log knowledge to store in a checkpoint."""
         if not self._bases:
             return self._known
-        gone = tuple(n for n in range(1, len(self._listed) + 1) if self.field.get(n) is None)
-        return Known(gone, tuple(self._as_missed(log) for log in self.field.missed_ones), self.field.free)
+        gone = tuple(n for n in range(1, len(self._listed) + 1) if self.log_map.get(n) is None)
+        return LogKnowledge(
+            gone, tuple(self._as_missed(log) for log in self.log_map.missed_logs), self.log_map.next_number
+        )
 
-    def _as_missed(self, log: FieldLog) -> Missed:
+    def _as_missed(self, log: MappedLog) -> MissedLog:
         x, y, _ = log.center_m.tolist()
         place = Point(*self.plane.geodetic(x, y)[:2])
         bearing = bearing_from_yaw(math.atan2(log.axis[1], log.axis[0]))
         kept = KnownLog(place, "", bearing, log.length_m, log.diameter_m, "", log.assortment, None, log.sigma_m)
-        return Missed(log.number, kept, log.misses)
+        return MissedLog(log.number, kept, log.misses)
 
-    def in_the_way(self) -> FieldLog | None:
+    def log_before_wheel(self) -> MappedLog | None:
         """The first log that a front wheel would hit next; None without one."""
         assert self.location is not None
         here, c = self.location, self._carrier
         cos, sin = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
         turn = np.array([[cos, -sin], [sin, cos]])
-        for log in self.field.logs:
-            spine = log.center_m + np.linspace(-0.5, 0.5, SPINE)[:, None] * log.length_m * log.axis
+        for log in self.log_map.logs:
+            spine = log.center_m + np.linspace(-0.5, 0.5, SPINE_POINTS)[:, None] * log.length_m * log.axis
             ahead, aside = ((spine[:, :2] - (here.x_m, here.y_m)) @ turn).T
             near = (ahead > 0.0) & (ahead < c.wheel_radius_m + 0.5 * log.diameter_m + BRAKING_M)
             if np.any(near & (np.abs(np.abs(aside) - 0.5 * c.track_width_m) < 0.5 * c.wheel_width_m)):
                 return log
         return None
 
-    def see(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
+    def observe(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
         """Accept a log list in the base frame of a time; ignored before the machine is located."""
         if logs and self._bases:
-            self.aboard(logs, seen_ns)
-            self._numbers = self.learn(logs, seen_ns)
+            self.count_bunk(logs, seen_ns)
+            self._numbers = self.update_map(logs, seen_ns)
             self.list_ns = seen_ns
 
-    def learn(self, logs: Sequence[LogObservation], seen_ns: int) -> dict[int, int]:
+    def update_map(self, logs: Sequence[LogObservation], seen_ns: int) -> dict[int, int]:
         """Merge a list into the log map only; returns the map number of each list number."""
         if not logs or not self._bases:
             return {}
-        return self.field.see(logs, self.base_at(seen_ns), seen_ns)
+        return self.log_map.observe(logs, self.base_at(seen_ns), seen_ns)
 
-    def remember(self, memory: Memory, job: Activity | None, now_ns: int) -> tuple[LogObservation, ...]:
+    def recall(self, log_memory: LogMemory, job: Activity | None, now_ns: int) -> tuple[LogObservation, ...]:
         """Replace the detector's list by one from memory; empty while there is no new one."""
         if not self._bases:
             return ()
-        logs = memory.list(now_ns, self.field, self.base, self.report, job)
+        logs = log_memory.log_list(now_ns, self.log_map, self.base, self.report, job)
         if logs is None:
             return ()
         self._numbers = {log.id: log.id for log in logs}
         self.list_ns = self.counted_ns = now_ns
-        self.in_bunk = memory.aboard
+        self.in_bunk = log_memory.in_bunk
         return logs
 
-    def aboard(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
+    def count_bunk(self, logs: Sequence[LogObservation], seen_ns: int) -> None:
         """Count the logs of a list that lie in the bunk."""
         if logs:
             self.in_bunk, self.counted_ns = sum(lies_in_bunk(self._bunk, log) for log in logs), seen_ns
 
-    def landing_ahead(self, point: Point2, base_at: BaseAt, end_m: float) -> float | None:
+    def landing_stop_m(self, point: Point2, base_at: BaseAt, end_m: float) -> float | None:
         """Distance along a path from which the crane reaches a landing best; None if there is none."""
-        pile = FieldLog(0, np.array([*point, 0.0]), np.array([1.0, 0.0, 0.0]), 2.0, 0.3, 0.1, CONFIRMED, 0)
+        pile = MappedLog(0, np.array([*point, 0.0]), np.array([1.0, 0.0, 0.0]), 2.0, 0.3, 0.1, CONFIRMED_HITS, 0)
         stop = best_stop([pile], self._reach, base_at, 0.0, end_m)
         return None if stop is None else stop.along_m
 
-    def pile_at(self, point: Point2, lie_rad: float | None = None) -> Bunk:
+    def landing_pile(self, point: Point2, lie_rad: float | None = None) -> Bunk:
         """The landing as a bunk on the ground for the crane: beside the machine, parallel to it or to ``lie_rad`` [rad]
         in the plane.
         """
@@ -228,7 +234,7 @@ class Outlook:
         yaw = 0.0 if lie_rad is None else math.remainder(lie_rad - looks, math.pi)
         return Bunk((x, y), yaw, PILE_LENGTH_M, PILE_WIDTH_M, self._ground_z_m, PILE_HEIGHT_M)
 
-    def obstacle(self, now_ns: int) -> str:
+    def blocked_reason(self, now_ns: int) -> str:
         """Why the machine cannot act on setpoints now; empty when it can."""
         if self.report is None or self.vehicle is None:
             return "the controller has not reported"
@@ -245,40 +251,40 @@ class Outlook:
         """Whether the controller is in STOP or FAULT."""
         return self.report is not None and self.report.mode in (Mode.STOP, Mode.FAULT)
 
-    def at_height(self, wanted_m: float) -> bool:
+    def is_at_height(self, wanted_m: float) -> bool:
         """Whether all four swing arms are at a height."""
         assert self.vehicle is not None
         near = 1.5 * self._carrier.arm_in_band_m
         return all(abs(h - wanted_m) <= near for h in self.vehicle.heights_m)
 
-    def stands(self) -> bool:
+    def is_standing(self) -> bool:
         """Whether the machine is at standstill."""
-        return self.vehicle is not None and abs(self.vehicle.speed_m_s) < STANDS_M_S
+        return self.vehicle is not None and abs(self.vehicle.speed_m_s) < STANDSTILL_M_S
 
     # ------------------------------------------------------------------ logs
-    def number_of(self, listed: int) -> int | None:
+    def map_number(self, listed: int) -> int | None:
         """The map number of a log of the newest list."""
         return self._numbers.get(listed)
 
-    def listed_as(self, number: int | None) -> int | None:
+    def list_number(self, number: int | None) -> int | None:
         """The newest list's number of a mapped log."""
         return next((k for k, n in self._numbers.items() if n == number), None)
 
-    def missed(self, number: int, for_good: bool = False) -> bool:
+    def record_miss(self, number: int, for_good: bool = False) -> bool:
         """Record a failed grasp; returns whether the log is given up: it stays mapped but is no longer collected."""
-        if self.field.get(number) is None:
+        if self.log_map.get(number) is None:
             return False
-        while (misses := self.field.missed(number)) < ATTEMPTS and for_good:
+        while (misses := self.log_map.record_miss(number)) < MAX_ATTEMPTS and for_good:
             pass
-        return misses >= ATTEMPTS
+        return misses >= MAX_ATTEMPTS
 
-    def given_up(self, listed: int) -> bool:
+    def is_given_up(self, listed: int) -> bool:
         """Whether a log of the newest list is given up."""
         number = self._numbers.get(listed)
-        log = None if number is None else self.field.get(number)
-        return log is not None and log.misses >= ATTEMPTS
+        log = None if number is None else self.log_map.get(number)
+        return log is not None and log.misses >= MAX_ATTEMPTS
 
-    def near(self) -> FieldLog | None:
+    def nearest_candidate(self) -> MappedLog | None:
         """Paper B: the log nearest to the crane among those near enough to stop for.
 
         These are logs a little ahead, and logs whose circle the crane's base is still inside: the machine may have
@@ -288,47 +294,47 @@ class Outlook:
         here = self.location
         ahead = np.array([math.cos(here.yaw_rad), math.sin(here.yaw_rad)])
         near = [
-            g for g in self._matter()
-            if self.in_circle(g) or 0.0 < float((g.center_m[:2] - (here.x_m, here.y_m)) @ ahead) <= NEAR_M
+            g for g in self._relevant()
+            if self.is_in_circle(g) or 0.0 < float((g.center_m[:2] - (here.x_m, here.y_m)) @ ahead) <= NEAR_M
         ]  # fmt: skip
         return nearest(near, self.base.position_m[:2])
 
-    def stop_ahead(self, base_at: BaseAt, along_m: float, end_m: float) -> Stop | None:
+    def next_stop(self, base_at: BaseAt, along_m: float, end_m: float) -> LoadingStop | None:
         """The best next place to stop along the path; None without one."""
         begin = along_m + AHEAD_M
-        return best_stop(self._matter(), self._reach, base_at, begin, min(begin + HORIZON_M, end_m))
+        return best_stop(self._relevant(), self._reach, base_at, begin, min(begin + HORIZON_M, end_m))
 
-    def in_circle(self, log: FieldLog | None) -> bool:
+    def is_in_circle(self, log: MappedLog | None) -> bool:
         """Whether the crane's base is in the circle round a log."""
         return log is not None and math.dist(log.center_m[:2], self.base.position_m[:2]) < CIRCLE_M
 
-    def past(self, log: FieldLog | None) -> bool:
+    def has_passed(self, log: MappedLog | None) -> bool:
         """Whether the crane's base has left the circle on the far side; noise at the near edge does not count."""
         if log is None:
             return True
         behind_m = float(self.base.to_optical(log.center_m)[0])  # the base looks backwards
-        return behind_m > 0.0 and not self.in_circle(log)
+        return behind_m > 0.0 and not self.is_in_circle(log)
 
-    def takable(self, only: int | None = None) -> list[FieldLog]:
+    def graspable(self, only: int | None = None) -> list[MappedLog]:
         """Logs of the newest list that the crane can grasp from here, best first; or only the log ``only``."""
         seen = set(self._numbers.values()) if only is None else {only}
         logs = [g for g in self._wanted() if g.number in seen]
         work = sorted((self._reach.work_s(g.observation(self.base)), g.number, g) for g in logs)
         return [g for seconds, _, g in work if math.isfinite(seconds)]
 
-    def lying(self) -> list[FieldLog]:
+    def collectable(self) -> list[MappedLog]:
         """Logs that can be collected: not given up and not on a landing."""
-        return [g for g in self.field.logs if g.misses < ATTEMPTS and not self.on_landing(g)]
+        return [g for g in self.log_map.logs if g.misses < MAX_ATTEMPTS and not self.is_on_landing(g)]
 
-    def on_landing(self, log: FieldLog) -> bool:
+    def is_on_landing(self, log: MappedLog) -> bool:
         """Whether a log lies on a landing."""
         return any(math.dist(log.center_m[:2], at) <= PILE_LENGTH_M for at in self.landings)
 
-    def _wanted(self) -> list[FieldLog]:
+    def _wanted(self) -> list[MappedLog]:
         """Collectable logs that belong to the current load."""
-        return [g for g in self.lying() if self.sorting.wants(g.assortment)]
+        return [g for g in self.collectable() if self.sorting.wants(g.assortment)]
 
-    def _matter(self) -> list[FieldLog]:
+    def _relevant(self) -> list[MappedLog]:
         """Wanted logs close enough to affect the next stop."""
         foot = self.base.position_m[:2]
         return [g for g in self._wanted() if math.dist(g.center_m[:2], foot) < HORIZON_M]

@@ -1,1 +1,1 @@
-"""What a forwarder is to do: missions from the formats people plan with, checked, and what was forwarded, reported."""
+"""Missions of a forwarder: reading and writing the formats people plan with, validation, and the forwarding report."""

@@ -1,6 +1,6 @@
-"""Where a machine may drive: fences as polygons in the local plane, m.
+"""The area where a machine may drive: fences as polygons in the local plane [m].
 
-Pure geometry in numpy; exact for straight edges.  A point on an edge counts as inside.
+Pure numpy geometry, exact for straight edges.  A point on an edge is inside.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ ON_EDGE_M: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Rings of corners (n, 2) that keep in (none: everywhere) and that keep out."""
+    """Rings of corners (n, 2) to stay inside of (none: everywhere) and to stay out of."""
 
     keep_in: tuple[np.ndarray, ...] = ()
     keep_out: tuple[np.ndarray, ...] = ()
 
     def outside_m(self, points: np.ndarray) -> np.ndarray:
-        """How far each point (n, 2) is from where the machine may be, m; 0 inside."""
+        """Distance of each point (n, 2) outside the area [m]; 0 inside."""
         points = np.asarray(points, dtype=float).reshape(-1, 2)
         away = np.zeros(len(points))
         if self.keep_in:
@@ -34,8 +34,8 @@ class Area:
         return np.where(away <= ON_EDGE_M, 0.0, away)
 
     def leaves_m(self, start: np.ndarray, end: np.ndarray) -> float:
-        """How far the straight way from ``start`` to ``end`` (2,) strays from where the machine may be, at least, m; 0
-        when it does not.
+        """Greatest distance outside the area along the straight line from ``start`` to ``end`` (2,) [m], at least; 0
+        when it stays inside.
         """
         cuts = [0.0, 1.0]
         for ring in (*self.keep_in, *self.keep_out):
@@ -47,7 +47,7 @@ class Area:
 
 
 def inside(ring: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether each point (n, 2) lies within a ring, by counting the edges to the right of it."""
+    """Whether each point (n, 2) lies within a ring, by counting the edges to its right."""
     x, y = points[:, 0], points[:, 1]
     found = np.zeros(len(points), dtype=bool)
     for (ax, ay), (bx, by) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
@@ -57,16 +57,17 @@ def inside(ring: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def edge_distance_m(ring: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distance of each point (n, 2) from the edge of a ring, m."""
+    """Distance of each point (n, 2) from the edge of a ring [m]."""
     closed = np.vstack([ring, ring[:1]])
     return path_distance_m(closed, points)
 
 
 def path_distance_m(path: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distance of each point (n, 2) from a polyline (m, 2), m."""
-    nearest = np.full(len(points), np.inf)
+    """Distance of each point (n, 2) from a polyline (m, 2) [m]."""
+    nearest: np.ndarray = np.full(len(points), np.inf)
     if len(path) == 1:
-        return np.linalg.norm(points - path[0], axis=1)
+        nearest = np.linalg.norm(points - path[0], axis=1)
+        return nearest
     for a, b in pairwise(path):
         along = b - a
         square = float(along @ along)
@@ -82,12 +83,12 @@ def signed_area_m2(ring: np.ndarray) -> float:
 
 
 def crossing(ring: np.ndarray) -> tuple[int, int] | None:
-    """The first two edges of a ring that cross or touch without being neighbours, by their first corner."""
+    """The first two edges of a ring, by their first corners, that cross or touch without being neighbours."""
     count = len(ring)
     start, end = ring, np.roll(ring, -1, axis=0)
     for i in range(count):
         others = np.arange(i + 1, count)
-        # Neighbours share a corner; they cross only if the second turns back over the first.
+        # Neighbours share a corner; they only cross if the second turns back over the first.
         far = others[(others != i + 1) & ((others + 1) % count != i)]
         hits = _meet(start[i], end[i], start[far], end[far])
         if hits.any():
@@ -105,11 +106,12 @@ def _meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndar
     one, two, three, four = (np.sign(np.where(np.abs(s) < 1e-9, 0.0, s)) for s in sides)
     low, high = np.minimum(a, b), np.maximum(a, b)
     near = (np.minimum(c, d) <= high).all(axis=1) & (np.maximum(c, d) >= low).all(axis=1)
-    return (one * two <= 0) & (three * four <= 0) & near
+    met: np.ndarray = (one * two <= 0) & (three * four <= 0) & near
+    return met
 
 
 def _cuts(ring: np.ndarray, start: np.ndarray, end: np.ndarray) -> list[float]:
-    """Shares of the way from ``start`` to ``end`` at which it meets the edges of a ring."""
+    """Positions, as shares of the line from ``start`` to ``end``, at which it meets the edges of a ring."""
     a, along = ring, np.roll(ring, -1, axis=0) - ring
     way = end - start
     flat = _cross(way, along)
@@ -121,4 +123,5 @@ def _cuts(ring: np.ndarray, start: np.ndarray, end: np.ndarray) -> list[float]:
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    product: np.ndarray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return product

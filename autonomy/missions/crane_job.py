@@ -1,4 +1,4 @@
-"""The record of one crane job, as an operator or the console writes it: what to pick, and where to put it."""
+"""The record of one crane job, written by an operator or the console: what to pick and where to place it."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import msgspec
 from machine.profile import Bunk
 
 
-class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Pick one log, or what one grasp holds, and lay it down.
+class CraneJob(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Pick one log, or all logs that one grasp holds, and place them.
 
-    ``log_id`` names the log (None: the one on top, then the one that is nearest by slewing); ``place_m`` is where its
-    centre goes, base frame (None: where the target has most room).  Logs come from ``source`` (None: from everywhere
-    outside the target) and go to ``target`` (None: the machine's bunk).  A pile on the ground is a `Bunk`, too: one
-    whose floor is the ground and whose stakes are as high as it may get.  ``leave`` are the numbers of logs that are to
-    stay where they are.
+    ``log_id`` selects the log (None: the topmost, then the nearest by slewing); ``place_m`` is the target position of
+    its centre in the base frame (None: where the target has most room).  Logs come from ``source`` (None: anywhere
+    outside the target) and go to ``target`` (None: the machine's bunk).  A pile on the ground is a `Bunk`, too: its
+    floor is the ground, and its stakes are as high as it may get.  ``leave`` lists logs that must not be picked.
     """
 
     log_id: int | None = None
@@ -24,5 +23,5 @@ class Mission(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     leave: tuple[int, ...] = ()
 
     def to(self, bunk: Bunk) -> Bunk:
-        """Where logs go on a machine with this bunk."""
+        """The target on a machine with this bunk."""
         return self.target or bunk

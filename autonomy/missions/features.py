@@ -1,8 +1,8 @@
-"""What every format is read into: named shapes with properties, and how they become a mission.
+"""The common model of all formats: shapes with properties, and their assembly to a mission.
 
-A shape's ``role`` says what it is: ``route``, ``waypoint``, ``fence``, ``keep-out``, ``log``, ``landing``.  Without
-one, a line is the route, a polygon a fence that keeps in, and points are waypoints in their order if there is no line.
-That is how files from programs that know nothing of logs are understood.
+A shape's ``role`` is ``route``, ``waypoint``, ``fence``, ``keep-out``, ``log`` or ``landing``.  Without a role, a line
+is the route, a polygon a fence to stay inside of, and points are waypoints in their order if there is no line; so files
+of programs that do not know logs are understood, too.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LOG_NUMBERS: Final = ("bearing_deg", "length_m", "diameter_m", "sigma_m")
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """One position of a shape, as read and not yet checked, and where it stands in its file."""
+    """One position of a shape as read, not yet validated, and its place in the file."""
 
     latitude_deg: float
     longitude_deg: float
@@ -37,7 +37,7 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A point, a line or a polygon (its outer ring, then its holes) with its properties."""
+    """A point, a line or a polygon (outer ring, then holes) with its properties."""
 
     kind: Literal["point", "line", "polygon"]
     rings: tuple[tuple[Position, ...], ...]
@@ -47,7 +47,7 @@ class Shape:
 
 @dataclass(slots=True)
 class Draft:
-    """A mission as read: what it says, where that stands, what was left out of it."""
+    """A mission as read, the places of its parts in the file, and notes on what was ignored."""
 
     mission: ForwardingMission
     source: Source
@@ -59,30 +59,36 @@ class Draft:
 def assemble(
     shapes: Sequence[Shape], source: Source, kind: str, name: str = "", options: Options | None = None
 ) -> Draft:
-    """The mission that shapes make; coordinates are not yet judged (``autonomy.missions.validation``).
+    """The mission made of shapes; coordinates are not validated yet (``autonomy.missions.validation``).
 
     Raises:
-        MissionError: a role that is none or does not fit its shape, a property of the wrong type, or two routes.
+        MissionError: an unknown or unsuitable role, a property of the wrong type, or two routes.
     """
     draft = Draft(ForwardingMission(), source, kind)
-    troubles: list[tuple[Place, str]] = []
+    troubles: list[tuple[Place, str, str]] = []
     roles = [_role(shape, troubles) for shape in shapes]
     points, lines = ([s for s, role in zip(shapes, roles, strict=True) if role == r] for r in ("waypoint", "route"))
     loose = [s for s, role in zip(shapes, roles, strict=True) if role == ""]
     if loose and not lines and not points:
         points, loose = loose, []
     if loose:
-        draft.notes.append(f"{_counted(len(loose), 'point')} without a role beside the route left out")
+        draft.notes.append(f"{_counted(len(loose), 'point')} without a role beside the route ignored")
     troubles += [
-        (line.place, 'is a second route; a mission has one, so delete one of them or give it another "role"')
+        (
+            line.place, "mission.second-route",
+            'is a second route; a mission has one, so delete one of them or give it another "role"',
+        )
         for line in lines[1:]
-    ]
+    ]  # fmt: skip
     if lines and points:
-        troubles.append((points[0].place, "a waypoint beside a route: keep the line or the points, not both"))
+        sentence = "is a waypoint beside a route; keep the line or the points, not both"
+        troubles.append((points[0].place, "mission.waypoint-beside-route", sentence))
     reader = _Reader(draft, troubles)
     route = [p for shape in (lines[:1] or points) for p in shape.rings[0]]
     waypoints = tuple(reader.point(("waypoint", i), position) for i, position in enumerate(route))
-    fences, landings, logs = [], [], []
+    fences: list[Fence] = []
+    landings: list[Landing] = []
+    logs: list[KnownLog] = []
     for shape, role in zip(shapes, roles, strict=True):
         if role in ("fence", "keep-out"):
             fences += reader.fences(shape, role == "keep-out", len(fences))
@@ -99,7 +105,7 @@ def assemble(
 
 
 def merged(route: Draft, harvest: Draft) -> Draft:
-    """The route's mission with the logs of another file added to its own."""
+    """The route's mission with the logs of another file added."""
     both = (*route.mission.logs, *harvest.mission.logs)
     fields = {name: getattr(route.mission, name) for name in ("name", "waypoints", "fences", "landings", "options")}
     return Draft(
@@ -108,26 +114,28 @@ def merged(route: Draft, harvest: Draft) -> Draft:
     )  # fmt: skip
 
 
-def _role(shape: Shape, troubles: list[tuple[Place, str]]) -> str:
-    """The role of a shape; "" for a point that has none."""
+def _role(shape: Shape, troubles: list[tuple[Place, str, str]]) -> str:
+    """The role of a shape; "" for a point without one."""
     role = shape.properties.get("role")
     if role is None:
         return {"point": "", "line": "route", "polygon": "fence"}[shape.kind]
     if role not in ROLES:
-        troubles.append((shape.place, f"role {_shown(role)} is none; use one of {', '.join(ROLES)}"))
+        sentence = f"role {_shown(role)} is unknown; use one of {', '.join(ROLES)}"
+        troubles.append((shape.place, "mission.unknown-role", sentence))
         return "none"
     fits = {"route": ("line",), "waypoint": ("point",), "fence": ("polygon",), "keep-out": ("polygon",),
             "log": ("point", "line"), "landing": ("point",)}[role]  # fmt: skip
     if shape.kind not in fits:
-        troubles.append((shape.place, f"a {shape.kind} cannot be a {role}; draw a {' or a '.join(fits)}"))
+        sentence = f"a {shape.kind} cannot be a {role}; draw a {' or a '.join(fits)}"
+        troubles.append((shape.place, "mission.role-shape", sentence))
         return "none"
     return str(role)
 
 
 class _Reader:
-    """Turns shapes into parts of a mission, remembers where they stand, and collects what is wrong."""
+    """Converts shapes to parts of a mission, and collects their places and problems."""
 
-    def __init__(self, draft: Draft, troubles: list[tuple[Place, str]]) -> None:
+    def __init__(self, draft: Draft, troubles: list[tuple[Place, str, str]]) -> None:
         self.draft, self.troubles = draft, troubles
 
     def point(self, key: Key, position: Position) -> Point:
@@ -153,18 +161,20 @@ class _Reader:
         )
 
     def log(self, shape: Shape, number: int) -> KnownLog:
-        """A log from its middle, or from its two ends."""
+        """A log from its centre or its two ends."""
         ring = shape.rings[0]
         known = {name: self.number(shape, name) for name in _LOG_NUMBERS}
         at = self.point(("log", number), ring[0])
         if shape.kind == "line":
             if len(ring) != 2:
-                self.troubles.append((shape.place, f"a log drawn as a line has its two ends, not {len(ring)} points"))
+                sentence = f"a log drawn as a line has two ends, not {len(ring)} points"
+                self.troubles.append((shape.place, "mission.log-line", sentence))
             elif not _far_from_sane(ring):
                 at, known["bearing_deg"], known["length_m"] = _from_ends(*ring)
         key = self.number(shape, "product_key")
         if key is not None and not (key.is_integer() and 0.0 < key < 2**31):
-            self.troubles.append((shape.place, f"product_key is {key:g}; StanForD numbers products from 1"))
+            sentence = f"product_key is {key:g}; StanForD product keys are integers from 1"
+            self.troubles.append((shape.place, "mission.product-key", sentence))
             key = None
         return KnownLog(
             at,
@@ -180,20 +190,23 @@ class _Reader:
         if value is None or value == "":
             return None
         if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-            self.troubles.append((shape.place, f"{name} is {_shown(value)}, which is no number"))
+            self._not_a(shape, name, value, "number")
             return None
         try:
             return float(value)
         except (ValueError, OverflowError):
-            self.troubles.append((shape.place, f"{name} is {_shown(value)}, which is no number"))
+            self._not_a(shape, name, value, "number")
             return None
+
+    def _not_a(self, shape: Shape, name: str, value: object, kind: str) -> None:
+        self.troubles.append((shape.place, "mission.property-type", f"{name} is {_shown(value)}, not a {kind}"))
 
     def text(self, shape: Shape, name: str) -> str:
         value = shape.properties.get(name)
         if value is None:
             return ""
         if isinstance(value, bool) or not isinstance(value, (str, int)):
-            self.troubles.append((shape.place, f"{name} is {_shown(value)}, which is no text"))
+            self._not_a(shape, name, value, "text")
             return ""
         return str(value)
 
@@ -205,7 +218,7 @@ class _Reader:
             return tuple(word.strip() for word in value.split(",") if word.strip())
         if isinstance(value, list) and all(isinstance(word, str) for word in value):
             return tuple(value)
-        self.troubles.append((shape.place, f"{name} is {_shown(value)}; write a list of names"))
+        self._not_a(shape, name, value, "list of names")
         return ()
 
 
@@ -219,12 +232,12 @@ def _same(a: Position, b: Position) -> bool:
 
 
 def _far_from_sane(positions: Iterable[Position]) -> bool:
-    """Whether coordinates are no place on Earth, so that nothing may be computed from them."""
+    """Whether any coordinate is outside its range, so that nothing may be computed from it."""
     return any(not (abs(p.latitude_deg) <= 90.0 and abs(p.longitude_deg) <= 180.0) for p in positions)
 
 
 def _counter_clockwise(ring: tuple[Position, ...]) -> tuple[Position, ...]:
-    """The ring, turned round if it runs clockwise; its first corner stays the first."""
+    """The ring, reversed if it runs clockwise; its first corner stays first."""
     if len(ring) < 3 or _far_from_sane(ring):
         return ring
     frame = LocalFrame(ring[0].latitude_deg, ring[0].longitude_deg)
@@ -233,7 +246,7 @@ def _counter_clockwise(ring: tuple[Position, ...]) -> tuple[Position, ...]:
 
 
 def _from_ends(a: Position, b: Position) -> tuple[Point, float, float]:
-    """Middle, bearing [deg] and length [m] of a log between two ends."""
+    """Centre, bearing [deg] and length [m] of a log between two ends."""
     frame = LocalFrame(a.latitude_deg, a.longitude_deg, a.altitude_m or 0.0)
     end = frame.points_enu([Point(b.latitude_deg, b.longitude_deg, b.altitude_m)])[0]
     middle = frame.point(*(0.5 * end))

@@ -1,9 +1,8 @@
-"""StanForD 2010 ``fpr``, forwarded production: which logs were brought to which landing, as forest companies read it.
+"""StanForD 2010 ``fpr``, forwarded production: the report of which logs were brought to which landing.
 
-Written as version 3.6 with the elements in the order of its schema.  The standard counts loads and their parts; a part
-here is one log, so that each has its own volume, its own place and its own time: ``LoadNumberOfItems`` is 1 and
-``LoadingCoordinates`` says where and when the grapple took it.  Volumes are m3 over bark, lengths m, times carry their
-zone.
+Written as version 3.6 with the elements in the order of its schema.  The standard counts loads and their parts; here a
+part is one log, so that each has its own volume, place and time: ``LoadNumberOfItems`` is 1, and ``LoadingCoordinates``
+is where and when the grapple took it.  Volumes are m3 over bark, lengths m; times have a time zone.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _MAKER: Final = "timberhand"
 
 @dataclass(frozen=True, slots=True)
 class ForwardedLog:
-    """One log that was brought: where and when it was taken, what it is, and its solid volume over bark [m3]."""
+    """One forwarded log: where and when it was loaded, its product, and its solid volume over bark [m3]."""
 
     taken_at: Point
     taken: datetime
@@ -39,7 +38,7 @@ class ForwardedLog:
 
 @dataclass(frozen=True, slots=True)
 class ForwardedLoad:
-    """What was unloaded at once at one landing; ``driven_m`` since the unloading before."""
+    """Logs unloaded together at one landing; ``driven_m`` since the previous unloading."""
 
     logs: tuple[ForwardedLog, ...]
     landing: Landing
@@ -49,7 +48,7 @@ class ForwardedLoad:
 
 @dataclass(frozen=True, slots=True)
 class Forwarder:
-    """Who forwarded: the machine's id and model, and the name of the site."""
+    """The forwarding machine: its id and model, and the name of the site."""
 
     machine_id: str
     model: str
@@ -57,10 +56,10 @@ class Forwarder:
 
 
 def write_fpr(loads: Sequence[ForwardedLoad], forwarder: Forwarder, written: datetime, application: str) -> bytes:
-    """The report of loads, UTF-8 XML; ``application`` is the program's name and version.
+    """The report of loads as UTF-8 XML; ``application`` is the program's name and version.
 
     Raises:
-        MissionError: a time without its zone, a volume that is none, or an empty load.
+        MissionError: a time without a time zone, an invalid volume, or an empty load.
     """
     _check(loads, written)
     products = _products(loads)
@@ -116,19 +115,20 @@ def write_fpr(loads: Sequence[ForwardedLoad], forwarder: Forwarder, written: dat
             part += 1
             _log(element, log, part, products[_product(log)], landings[load.landing])
     indent(root)
-    return b'<?xml version="1.0" encoding="utf-8"?>\n' + tostring(root, "utf-8") + b"\n"
+    body: bytes = tostring(root, "utf-8")
+    return b'<?xml version="1.0" encoding="utf-8"?>\n' + body + b"\n"
 
 
 def _check(loads: Sequence[ForwardedLoad], written: datetime) -> None:
     for number, load in enumerate(loads, 1):
         if not load.logs:
-            raise MissionError(f"load {number} has no logs; report only what was brought")
+            raise MissionError("fpr.empty-load", f"load {number} has no logs; only report loads with logs")
         for log in load.logs:
             if not (math.isfinite(log.volume_m3) and log.volume_m3 > 0.0):
-                raise MissionError(f"load {number} has a log of {log.volume_m3:g} m3, which is no volume")
+                raise MissionError("fpr.volume", f"load {number} has a log with a volume of {log.volume_m3:g} m3")
     times = [written, *(t for load in loads for t in (load.unloaded, *(log.taken for log in load.logs)))]
     if any(t.tzinfo is None for t in times):
-        raise MissionError("a time has no zone; give all times with one, for example in UTC")
+        raise MissionError("fpr.no-time-zone", "a time has no time zone; give all times with one, for example UTC")
 
 
 Product = tuple[str, str, int | None]
@@ -139,7 +139,7 @@ def _product(log: ForwardedLog) -> Product:
 
 
 def _products(loads: Sequence[ForwardedLoad]) -> dict[Product, int]:
-    """The number of every product: the harvester's own where it has one that is still free."""
+    """The key of every product: the harvester's own if it is still free."""
     found: dict[Product, int] = {}
     kinds = dict.fromkeys(_product(log) for load in loads for log in load.logs)
     for product in sorted(kinds, key=lambda p: (p[2] is None, p[2] or 0, p[:2])):
@@ -177,7 +177,7 @@ def _log(load: Element, log: ForwardedLog, part: int, product: int, landing: int
 
 
 def _coordinates(parent: Element, name: str, at: Point, when: datetime | None) -> None:
-    """A place; the schema wants a height, so an unknown one is written as 0."""
+    """A position; the schema requires a height, so an unknown one is written as 0."""
     element = SubElement(parent, name, coordinateReferenceSystem="WGS84")
     latitude = _add(element, "Latitude", f"{abs(at.latitude_deg):.8f}")
     latitude.set("latitudeCategory", "South" if at.latitude_deg < 0.0 else "North")
@@ -199,5 +199,5 @@ def _add(parent: Element, name: str, value: object) -> Element:
 
 
 def _legal(text: str) -> Iterator[str]:
-    """The characters that XML allows; a control character in a name would break the whole report."""
+    """The characters allowed in XML; a control character in a name would make the report invalid."""
     return (c for c in text if c in "\t\n\r" or " " <= c < "\ud800" or "\ue000" <= c < "\ufffe" or c > "\uffff")

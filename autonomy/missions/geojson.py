@@ -1,8 +1,7 @@
-"""GeoJSON (RFC 7946), the mission's own format: positions are longitude, latitude, height.
+"""GeoJSON (RFC 7946), the mission's native format: positions are longitude, latitude, height.
 
-A mission is a FeatureCollection whose member ``timberhand`` holds what no shape can say: ``schema``, ``name`` and
-``options``.  What the features are is their property ``role`` (``autonomy.missions.features``).  GeoJSON of any other
-program is read as well.
+A mission is a FeatureCollection whose member ``timberhand`` holds ``schema``, ``name`` and ``options``.  The property
+``role`` of each feature says what it is (``autonomy.missions.features``).  GeoJSON of other programs is read as well.
 """
 
 from __future__ import annotations
@@ -23,7 +22,11 @@ Path = tuple[str | int, ...]
 
 
 def read(document: dict[str, Any], source: Source) -> Draft:
-    """The mission in a GeoJSON document; raises MissionError with the line of what is wrong."""
+    """The mission in a GeoJSON document.
+
+    Raises:
+        MissionError: what is wrong, with its line.
+    """
     _check_crs(document, source)
     name, options = _header(document, source)
     reader = _Reader(source)
@@ -34,7 +37,7 @@ def read(document: dict[str, Any], source: Source) -> Draft:
 
 
 def _check_crs(document: dict[str, Any], source: Source) -> None:
-    """GeoJSON is WGS84; the member ``crs`` of 2008 may say so, and nothing else."""
+    """GeoJSON is WGS84; the ``crs`` member of GeoJSON 2008 may only confirm that."""
     crs = document.get("crs")
     if crs is None:
         return
@@ -42,20 +45,23 @@ def _check_crs(document: dict[str, Any], source: Source) -> None:
     named = str(said.get("name", said)) if isinstance(said, dict) else str(said)
     if not any(word in named.lower() for word in _WGS84):
         raise source.error(
-            ("crs",), f'coordinates are in "{named[:60]}"; a mission is in WGS84, so export it as WGS84 (EPSG:4326)'
+            "mission.datum",
+            ("crs",),
+            f'coordinates are in "{named[:60]}"; a mission is in WGS84, so export it as WGS84 (EPSG:4326)',
         )
 
 
 def _header(document: dict[str, Any], source: Source) -> tuple[str, Options]:
-    """Name and options of a mission in the member ``timberhand``, or as any program writes them."""
+    """Name and options of a mission from the member ``timberhand``, or the name of another program's file."""
     own = document.get(MEMBER)
     if own is None:
         name = document.get("name")
         return (name if isinstance(name, str) else ""), Options()
     if not isinstance(own, dict):
-        raise source.error((MEMBER,), f"{MEMBER} is no object; it holds schema, name and options")
+        raise source.error("mission.header", (MEMBER,), f"{MEMBER} is not an object; it holds schema, name and options")
     if own.get("schema") != SCHEMA:
         raise source.error(
+            "mission.schema",
             (MEMBER, "schema"),
             f"schema is {own.get('schema')!r}; this release reads schema {SCHEMA}, so convert the file with the "
             "release that wrote it",
@@ -67,11 +73,12 @@ def _header(document: dict[str, Any], source: Source) -> tuple[str, Options]:
         key = where.strip("`").removeprefix("$.") or "options"
         path = (MEMBER, "options", key) if key != "options" else (MEMBER, "options")
         known = f"; options are {', '.join(Options.__struct_fields__)}" if "unknown field" in sentence else ""
-        raise source.error(path, f"{key}: {sentence[0].lower()}{sentence[1:]}{known}") from None
+        sentence = f"{key}: {sentence[0].lower()}{sentence[1:]}{known}"
+        raise source.error("mission.option", path, sentence) from None
 
 
 class _Reader:
-    """Walks a document and collects its shapes."""
+    """Collects the shapes of a document."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -93,12 +100,13 @@ class _Reader:
 
     def feature(self, feature: Any, path: Path) -> None:
         if not isinstance(feature, dict) or feature.get("type") != "Feature":
-            raise self.source.error(path, 'this is no feature; it needs "type": "Feature"')
+            sentence = 'this is not a feature; it needs "type": "Feature"'
+            raise self.source.error("mission.geojson-feature", path, sentence)
         properties = feature.get("properties")
         if not isinstance(properties, dict | None):
-            raise self.source.error((*path, "properties"), "properties is no object")
+            raise self.source.error("mission.geojson-properties", (*path, "properties"), "properties is not an object")
         if feature.get("geometry") is None:
-            self.notes.append("a feature without a geometry left out")
+            self.notes.append("a feature without a geometry ignored")
             return
         self.geometry(feature["geometry"], properties or {}, (*path, "geometry"), path)
 
@@ -120,41 +128,46 @@ class _Reader:
                 listed = self.listed(rings, here, "a polygon")
                 self.add("polygon", tuple(self.positions(r, here, j) for j, r in enumerate(listed)), properties, owner)
         elif kind in ("MultiLineString", "GeometryCollection"):
-            raise self.source.error(path, f"a {kind} is no part of a mission; make the route one LineString")
+            sentence = f"a {kind} cannot be part of a mission; make the route one LineString"
+            raise self.source.error("mission.geojson-geometry", path, sentence)
         else:
-            raise self.source.error(path, f"type {kind!r} is no geometry of GeoJSON; a route is a LineString")
+            sentence = f"type {kind!r} is not a GeoJSON geometry; a route is a LineString"
+            raise self.source.error("mission.geojson-geometry", path, sentence)
 
     def add(self, kind: Any, rings: tuple[tuple[Position, ...], ...], properties: dict[str, Any], at: Place) -> None:
         if rings and all(rings):
             self.shapes.append(Shape(kind, rings, properties, at))
         else:
-            self.notes.append(f"an empty {kind} left out")
+            self.notes.append(f"an empty {kind} ignored")
 
     def listed(self, value: Any, path: Path, what: str) -> list[Any]:
         if not isinstance(value, list):
-            raise self.source.error(path, f"{what} is no list")
+            raise self.source.error("mission.geojson-list", path, f"{what} is not a list")
         return value
 
     def positions(self, given: Any, path: Path, step: str | int, single: bool = False) -> tuple[Position, ...]:
-        """Checked for being numbers only; how many there are is limited before any is looked at."""
+        """Positions, only checked to be numbers; their count is limited before any is read."""
         at = (*path, step)
         listed = self.listed(given, at, "coordinates")
         self.count += len(listed)
         if self.count > MAX_POSITIONS:
-            raise self.source.error(at, f"has more than {MAX_POSITIONS} positions; thin the route or fence out")
+            sentence = f"has more than {MAX_POSITIONS} positions; thin the route or fence out"
+            raise self.source.error("mission.too-many-positions", at, sentence)
         return tuple(self.position(p, at if single else (*at, i)) for i, p in enumerate(listed))
 
     def position(self, value: Any, path: Path) -> Position:
         if not isinstance(value, list) or not 2 <= len(value) <= 4:
-            raise self.source.error(path, "a position is [longitude, latitude] or [longitude, latitude, height]")
+            sentence = "a position is [longitude, latitude] or [longitude, latitude, height]"
+            raise self.source.error("mission.geojson-position", path, sentence)
         if any(isinstance(x, bool) or not isinstance(x, int | float | None) for x in value) or None in value[:2]:
-            raise self.source.error(path, "a position is made of numbers: [longitude, latitude, height]")
+            sentence = "a position is made of numbers: [longitude, latitude, height]"
+            raise self.source.error("mission.geojson-position", path, sentence)
         height = value[2] if len(value) > 2 else None
         return Position(float(value[1]), float(value[0]), None if height is None else float(height), path)
 
 
 def write(mission: ForwardingMission) -> bytes:
-    """The mission as GeoJSON, one feature a line, every digit kept."""
+    """The mission as GeoJSON, one feature per line, with all digits."""
     header = {"schema": mission.schema, "name": mission.name, "options": _without_defaults(mission.options)}
     features: list[dict[str, Any]] = []
     if len(mission.waypoints) == 1:
@@ -197,7 +210,7 @@ def _position(point: Point) -> list[float]:
 
 
 def _told(properties: dict[str, Any]) -> dict[str, Any]:
-    """The properties that say something."""
+    """The properties that have a value."""
     return {key: value for key, value in properties.items() if value not in (None, "", [])}
 
 

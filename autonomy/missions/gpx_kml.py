@@ -1,8 +1,8 @@
-"""GPX and KML, what hand-held receivers and map programs write.
+"""GPX and KML, as written by hand-held receivers and map programs.
 
-Both are WGS84.  Their heights are above the sea and not above the ellipsoid, so they are left out.  GPX has latitude
-and longitude by name; KML has longitude, latitude, height.  In KML a placemark's extended data are its properties,
-among them ``role``; in GPX a waypoint's ``type`` is its role when it is one.
+Both are WGS84.  Their heights are above sea level, not above the ellipsoid, so they are ignored.  GPX names latitude
+and longitude; KML has longitude, latitude, height.  In KML the extended data of a placemark are its properties,
+including ``role``; in GPX a waypoint's ``type`` is its role if it is one.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from autonomy.missions.features import ROLES, Draft, Position, Shape, assemble
 from autonomy.missions.model import MAX_LOGS, MAX_WAYPOINTS
 from autonomy.missions.source import Place, Source
 from autonomy.missions.xml_tree import ANY, Element, tree
+from runtime.errors import CodedError
 
 MAX_ELEMENTS: Final = 300_000
 MAX_KML_POSITIONS: Final = 100_000
@@ -37,14 +38,22 @@ _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|in
 _WORD: Final = re.compile(r"\S+")
 
 
+class NumberError(CodedError, ValueError):
+    """A text is not a number."""
+
+
 def decimal(text: str, what: str) -> float:
-    """The number in a text; raises ValueError with a sentence when there is none."""
+    """The number in a text.
+
+    Raises:
+        NumberError: it is not a number.
+    """
     word = text.strip()
     if _NUMBER.fullmatch(word):
         return float(word)
     if re.fullmatch(r"[+-]?\d+,\d+", word):
-        raise ValueError(f'{what} "{word[:40]}" has a decimal comma; write a decimal point')
-    raise ValueError(f'{what} "{word[:40]}" is no number')
+        raise NumberError("mission.decimal-comma", f'{what} "{word[:40]}" has a decimal comma; write a decimal point')
+    raise NumberError("mission.number", f'{what} "{word[:40]}" is not a number')
 
 
 def read_gpx(data: bytes, name: str) -> Draft:
@@ -58,14 +67,14 @@ def read_gpx(data: bytes, name: str) -> Draft:
     notes = []
     lines = routes or tracks
     if routes and tracks:
-        notes.append("a track beside the route left out")
+        notes.append("a track beside the route ignored")
     shapes = []
     for _, points, owner in lines:
         at = tuple(_gpx_position(point, source) for point in points)
         if at:
             shapes.append(Shape("line" if len(at) > 1 else "point", (at,), {}, owner.line))
         else:
-            notes.append("an empty route left out")
+            notes.append("an empty route ignored")
     for point in root.all("wpt"):
         kind = point.value("type").lower()
         about: dict[str, Any] = {"role": kind} if kind in ROLES else {}
@@ -81,11 +90,11 @@ def _gpx_position(point: Element, source: Source) -> Position:
     values = []
     for key in ("lat", "lon"):
         if key not in point.attributes:
-            raise source.error(point.line, f"this {point.name} has no {key}")
+            raise source.error("gpx.missing-coordinate", point.line, f"this {point.name} has no {key}")
         try:
             values.append(decimal(point.attributes[key], key))
-        except ValueError as error:
-            raise source.error(point.line, str(error)) from None
+        except NumberError as error:
+            raise source.error(error.code, point.line, str(error)) from None
     return Position(values[0], values[1], None, point.line)
 
 
@@ -149,7 +158,7 @@ class _Kml:
         if rings and all(rings):
             self.shapes.append(Shape(kind, tuple(rings), about, place))
         else:
-            self.notes.append(f"an empty {kind} left out")
+            self.notes.append(f"an empty {kind} ignored")
 
     def positions(self, owner: Element) -> tuple[Position, ...]:
         element = owner.first("coordinates")
@@ -159,17 +168,17 @@ class _Kml:
         for word in _WORD.finditer(text):
             self.count += 1
             if self.count > MAX_KML_POSITIONS:
-                raise self.source.error(line, f"has more than {MAX_KML_POSITIONS} positions; thin it out")
+                sentence = f"has more than {MAX_KML_POSITIONS} positions; thin it out"
+                raise self.source.error("mission.too-many-positions", line, sentence)
             line += text.count("\n", at, word.start())
             at = word.start()
             parts = word[0].split(",")
             if not 2 <= len(parts) <= 3 or not parts[0]:
-                raise self.source.error(
-                    line, f'"{word[0][:40]}" is no position; write longitude,latitude[,height] without spaces'
-                )
+                sentence = f'"{word[0][:40]}" is not a position; write longitude,latitude[,height] without spaces'
+                raise self.source.error("kml.position", line, sentence)
             try:
                 longitude, latitude = decimal(parts[0], "longitude"), decimal(parts[1], "latitude")
-            except ValueError as error:
-                raise self.source.error(line, str(error)) from None
+            except NumberError as error:
+                raise self.source.error(error.code, line, str(error)) from None
             found.append(Position(latitude, longitude, None, line))
         return tuple(found)

@@ -1,11 +1,11 @@
-"""StanForD 2010 ``hpr``, a harvester's production: what was felled where becomes the logs that are known beforehand.
+"""StanForD 2010 ``hpr``, a harvester's production: the felled logs become the known logs of a mission.
 
 Read from ``HarvestedProduction`` in the namespace ``urn:skogforsk:stanford2010`` (versions 2 and 3): species groups and
 products by key, and per stem its coordinates and its logs.  Lengths are cm, diameters mm, volumes m3.
 
-The file does not say where a log came to lie.  The best it has is where the crane's tip felled the tree; where it has
-only the harvester's own place, the log lies somewhere within its crane's reach.  ``sigma_m`` says which of the two, and
-logs of one stem share one place.  Nothing is known of their direction.
+The file does not say where a log came to lie.  Its best position is where the crane's tip felled the tree; if it only
+has the harvester's own position, the log lies within its crane's reach.  ``sigma_m`` tells the two apart.  Logs of one
+stem share one position, and their direction is unknown.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 from typing import Final
 
 from autonomy.missions.features import Draft, Key
-from autonomy.missions.gpx_kml import decimal
+from autonomy.missions.gpx_kml import NumberError, decimal
 from autonomy.missions.model import MAX_LOGS, ForwardingMission, KnownLog, Point
 from autonomy.missions.source import Place, Source
 from autonomy.missions.xml_tree import ANY, Element, tree
@@ -22,7 +22,7 @@ from autonomy.missions.xml_tree import ANY, Element, tree
 HPR: Final = "StanForD 2010 hpr"
 NAMESPACE: Final = "urn:skogforsk:stanford2010"
 TIP_SIGMA_M: Final = 4.0
-"""A stem is processed beside where it stood: about half its length away [est]."""
+"""A stem is processed beside its stump: about half its length away [est]."""
 MACHINE_SIGMA_M: Final = 7.0
 """A log lies within the 10 m of a harvester's crane from the machine [est]."""
 
@@ -38,17 +38,19 @@ _ENDS: Final = ("Butt ob", "Top ob")
 
 
 def read_hpr(data: bytes, name: str) -> Draft:
-    """The logs of a harvester's production; a mission without a route.
+    """The logs of a harvester's production, as a mission without a route.
 
     Raises:
-        MissionError: no such file, a coordinate system that is not WGS84, or a value that cannot be.
+        MissionError: not an hpr, a coordinate system other than WGS84, or an invalid value.
     """
     root = tree(data, name, _WANTED, _LIMITS)
     source = Source(name)
     if root.namespace != NAMESPACE:
-        raise source.error(root.line, f'the namespace "{root.namespace[:60]}" is not {NAMESPACE}, StanForD 2010')
+        sentence = f'the namespace "{root.namespace[:60]}" is not {NAMESPACE}, StanForD 2010'
+        raise source.error("hpr.namespace", root.line, sentence)
     if root.attributes.get("messageType", "hpr") != "hpr":
-        raise source.error(root.line, f"message type {root.attributes['messageType'][:20]!r}; logs come from an hpr")
+        sentence = f"message type {root.attributes['messageType'][:20]!r}; logs come from an hpr"
+        raise source.error("hpr.message-type", root.line, sentence)
     logs: list[KnownLog] = []
     places: dict[Key, Place] = {}
     lost = 0
@@ -70,7 +72,7 @@ def read_hpr(data: bytes, name: str) -> Draft:
                 logs.append(_log(log, stem, *at, species, products, source))
     draft = Draft(ForwardingMission(title, logs=tuple(logs)), source, HPR, places)
     if lost:
-        draft.notes.append(f"{lost} logs of stems without coordinates left out")
+        draft.notes.append(f"{lost} logs of stems without coordinates ignored")
     return draft
 
 
@@ -81,12 +83,13 @@ def _product_name(product: Element) -> str:
 
 
 def _position(stem: Element, source: Source) -> tuple[Point, float] | None:
-    """Where a stem was felled and how well that is known, or None."""
+    """Where a stem was felled and the position's sigma [m], or None."""
     best: tuple[Point, float] | None = None
     for given in stem.all("StemCoordinates"):
         system = given.attributes.get("coordinateReferenceSystem", "WGS84")
         if system.replace(" ", "").upper() != "WGS84":
-            raise source.error(given.line, f'coordinates are in "{system[:40]}"; a mission is in WGS84')
+            sentence = f'coordinates are in "{system[:40]}"; a mission is in WGS84'
+            raise source.error("mission.datum", given.line, sentence)
         latitude, longitude = given.first("Latitude"), given.first("Longitude")
         if latitude is None or longitude is None:
             continue
@@ -129,12 +132,12 @@ def _log(
 
 
 def _species_key(stem: Element) -> str:
-    """Trees that are processed together carry their species themselves."""
+    """Trees processed together carry their species themselves."""
     return next((child.value("SpeciesGroupKey") for child in stem.children if child.first("SpeciesGroupKey")), "")
 
 
 def _diameter_m(log: Element, length: Element | None, source: Source) -> float | None:
-    """The diameter at the middle over bark, else the mean of both ends, else that of the volume."""
+    """The diameter at the middle over bark, else the mean of both ends, else that from the volume."""
     given = {
         d.attributes.get("logDiameterCategory", ""): d
         for measurement in log.all("LogMeasurement")
@@ -158,8 +161,9 @@ def _diameter_m(log: Element, length: Element | None, source: Source) -> float |
 def _number(element: Element, source: Source) -> float:
     try:
         value = decimal(element.text, element.name)
-    except ValueError as error:
-        raise source.error(element.line, str(error)) from None
+    except NumberError as error:
+        raise source.error(error.code, element.line, str(error)) from None
     if not math.isfinite(value):
-        raise source.error(element.line, f"{element.name} is {element.text.strip()}, which is no number")
+        sentence = f"{element.name} is {element.text.strip()}, which is not finite"
+        raise source.error("mission.number", element.line, sentence)
     return value

@@ -1,7 +1,7 @@
-"""Mission files in and out: whatever the format, a checked mission or sentences that say what is wrong with the file.
+"""Mission files: reads any supported format into a validated mission, or reports every problem with its line.
 
-What a file is shows in its content, not in its name: GeoJSON, QGroundControl's ``.plan``, GPX, KML, and StanForD 2010
-``hpr`` for logs alone.
+The format is detected from the content, not from the name: GeoJSON, QGroundControl ``.plan``, GPX, KML, and StanForD
+2010 ``hpr`` for logs only.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from autonomy.missions import geojson, qgc_plan
-from autonomy.missions.validation import problems_of
 from autonomy.missions.features import Draft, merged
-from autonomy.missions.hpr import HPR, read_hpr
 from autonomy.missions.gpx_kml import read_gpx, read_kml
+from autonomy.missions.hpr import HPR, read_hpr
 from autonomy.missions.model import ForwardingMission, MissionError
 from autonomy.missions.source import json_document, read_bytes
+from autonomy.missions.validation import problems_of
 from autonomy.missions.xml_tree import root_name, tree
 
 _XML_BEGINS = (b"<", b"\xff\xfe", b"\xfe\xff")
@@ -28,13 +28,13 @@ def load_mission(
     route_wanted: bool | None = None,
     site: tuple[float, float] | None = None,
 ) -> Draft:
-    """The checked mission of a file, and what was left out of it.
+    """The validated mission of a file, and notes on what was ignored.
 
-    ``logs``: a second file whose logs are added, for example a harvester's hpr.  ``route_wanted``: None asks for one
-    unless the file is a harvester's.  ``site``: see ``autonomy.missions.validation.problems_of``.
+    ``logs`` is a second file whose logs are added, for example a harvester's hpr.  ``route_wanted`` None requires a
+    route unless the file is an hpr.  ``site``: see ``autonomy.missions.validation.problems_of``.
 
     Raises:
-        MissionError: every problem is one sentence with the file, the line where there is one, and a hint.
+        MissionError: ``problems`` has every problem with the file, its line if known, and a hint.
     """
     draft = read(read_bytes(path), str(path))
     route_wanted = draft.format != HPR if route_wanted is None else route_wanted
@@ -44,49 +44,64 @@ def load_mission(
     harvest = read(read_bytes(logs), str(logs))
     verify(harvest, route_wanted=False, site=site)
     both = merged(draft, harvest)
-    for key, sentence in problems_of(both.mission, route_wanted, site):
-        raise MissionError(f"{logs}: {sentence} (of {path} and {logs} together)" if key else f"{path}: {sentence}")
+    for key, code, sentence in problems_of(both.mission, route_wanted, site):
+        raise MissionError(code, f"{sentence} (of {path} and {logs} together)" if key else sentence,
+                           str(logs if key else path))  # fmt: skip
     return both
 
 
 def read(data: bytes, name: str) -> Draft:
-    """What the bytes of a mission file say, not yet checked; ``name`` is what to call the file in an error."""
+    """The mission in the bytes of a file, not yet validated; ``name`` is the file's name in errors."""
     start = data.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")[:4]
     if not start:
-        raise MissionError(f"{name}: is empty")
+        raise MissionError("mission.empty-file", "is empty", name)
     if start.startswith(b"PK"):
-        raise MissionError(f"{name}: is a zip file; unpack it and read the .kml inside")
+        raise MissionError("mission.zip-file", "is a zip file; unpack it and read the .kml inside", name)
     if start.startswith(_XML_BEGINS):
         return _read_xml(data, name)
     if start.startswith(b"{") and not start.startswith(b"{\0"):
         return _read_json(data, name)
-    raise MissionError(f"{name}: is neither JSON nor XML; missions are GeoJSON, QGroundControl .plan, GPX, KML or hpr")
+    raise MissionError(
+        "mission.unknown-format",
+        "is neither JSON nor XML; missions are GeoJSON, QGroundControl .plan, GPX, KML or hpr",
+        name,
+    )
 
 
 def _read_json(data: bytes, name: str) -> Draft:
     document, source = json_document(data, name)
     if not isinstance(document, dict):  # pragma: no cover - an object begins with a brace
-        raise source.error(None, "is no JSON object")
+        raise source.error("mission.no-object", None, "is not a JSON object")
     found: dict[str, Any] = document
     return qgc_plan.read(found, source) if found.get("fileType") == "Plan" else geojson.read(found, source)
 
 
 def _read_xml(data: bytes, name: str) -> Draft:
-    root = root_name(data) or tree(data, name, frozenset(), {}).name  # which says what is wrong with it
+    root = root_name(data) or tree(data, name, frozenset(), {}).name  # tree raises the precise error
     if root == "gpx":
         return read_gpx(data, name)
     if root == "kml":
         return read_kml(data, name)
     if root == "HarvestedProduction":
         return read_hpr(data, name)
-    raise MissionError(f"{name}: holds <{root[:40]}>, which is no mission; missions in XML are GPX, KML or hpr")
+    raise MissionError(
+        "mission.unknown-xml",
+        f"contains <{root[:40]}>, which is not a mission; missions in XML are GPX, KML or hpr",
+        name,
+    )
 
 
 def verify(draft: Draft, *, route_wanted: bool = True, site: tuple[float, float] | None = None) -> None:
-    """Raises MissionError with the lines of everything that keeps a draft from being driven."""
+    """Validate a draft.
+
+    Raises:
+        MissionError: every problem, with its line in the file.
+    """
     found = problems_of(draft.mission, route_wanted, site)
     if found:
-        raise draft.source.errors((None if key is None else draft.places.get(key), text) for key, text in found)
+        raise draft.source.errors(
+            (None if f.key is None else draft.places.get(f.key), f.code, f.sentence) for f in found
+        )
 
 
 def save_mission(path: str | Path, mission: ForwardingMission) -> None:
@@ -98,4 +113,5 @@ def save_mission(path: str | Path, mission: ForwardingMission) -> None:
     try:
         Path(path).write_bytes(geojson.write(mission))
     except (OSError, ValueError) as error:
-        raise MissionError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise MissionError("mission.not-written", f"cannot be written: {reason}", str(path)) from None

@@ -1,17 +1,21 @@
-"""The mission of a forwarder: a route, its fence, logs that are known beforehand, landings and options.
+"""A forwarder's mission: route, fences, known logs, landings and options.
 
-Places are WGS84: degrees, and metres above the ellipsoid where a height is known.  Bearings are degrees clockwise from
-true north, as maps and the bus have them; what drives turns both into local metres with ``autonomy.missions.local_frame``.
-A mission is only data: ``autonomy.missions.validation`` says what makes it one, ``autonomy.missions.mission_file`` reads and writes
-it.  (``autonomy.missions.crane_job`` is the record of a single grasp, which the console sends.)
+Positions are WGS84: degrees, and metres above the ellipsoid where a height is known.  Bearings are degrees clockwise
+from true north, as in maps and on the bus; ``autonomy.missions.local_frame`` converts both to local metres.  A mission
+is plain data: ``autonomy.missions.validation`` checks it, ``autonomy.missions.mission_file`` reads and writes it.
+(``autonomy.missions.crane_job`` is the record of a single grasp, which the console sends.)
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final, Literal
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Final, Literal
 
 import msgspec
+
+from runtime.errors import CodedError
 
 SCHEMA: Final = 1
 MAX_WAYPOINTS: Final = 2_000
@@ -19,16 +23,47 @@ MAX_CORNERS: Final = 2_000
 MAX_LOGS: Final = 50_000
 
 
-class MissionError(ValueError):
-    """A mission cannot be used; ``problems`` holds one sentence per problem and the text is all of them."""
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One problem of a mission: stable code, sentence with a hint, and ``file:line`` where it is known."""
 
-    def __init__(self, *problems: str) -> None:
-        super().__init__("\n".join(problems))
-        self.problems = problems
+    code: str
+    sentence: str
+    place: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.sentence}" if self.place else self.sentence
+
+
+class MissionError(CodedError, ValueError):
+    """A mission cannot be used.  ``problems`` has one record per problem; ``code`` is that of the first."""
+
+    def __init__(self, code: str, sentence: str, place: str = "") -> None:
+        problem = Problem(code, sentence, place)
+        super().__init__(code, str(problem))
+        self.problems: tuple[Problem, ...] = (problem,)
+
+    @classmethod
+    def of(cls, problems: Iterable[Problem], more: str = "") -> MissionError:
+        """The error of several problems, with a last line on those that are not listed."""
+        found = tuple(problems)
+        error = cls(found[0].code, "")
+        error.args = ("\n".join([*map(str, found), *([more] if more else [])]),)
+        error.problems = found
+        return error
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (self.code, str(self), self.problems)
+
+
+def _restored(code: str, text: str, problems: tuple[Problem, ...]) -> MissionError:
+    error = MissionError(code, text)
+    error.problems = problems
+    return error
 
 
 class Point(msgspec.Struct, frozen=True):
-    """A place: latitude and longitude [deg], height above the ellipsoid [m] or None."""
+    """A position: latitude and longitude [deg], height above the ellipsoid [m] or None."""
 
     latitude_deg: float
     longitude_deg: float
@@ -38,7 +73,7 @@ class Point(msgspec.Struct, frozen=True):
 class Fence(msgspec.Struct, frozen=True):
     """A polygon without its closing corner, counter-clockwise seen from above.
 
-    The machine stays inside of one of the fences that keep in and outside of all that keep out.
+    The machine stays inside one of the keep-in fences and outside all keep-out fences.
     """
 
     corners: tuple[Point, ...]
@@ -47,10 +82,10 @@ class Fence(msgspec.Struct, frozen=True):
 
 
 class KnownLog(msgspec.Struct, frozen=True):
-    """A log that someone knows of: where its middle lies, what is known of its direction and size.
+    """A log that is known before the mission: its centre, and its direction and size as far as known.
 
-    ``sigma_m`` is the standard deviation of the place in each horizontal direction, None when nothing is said.
-    ``product_key`` is the harvester's number of the assortment (StanForD 2010).
+    ``sigma_m`` is the standard deviation of the position in each horizontal direction, None if unknown.
+    ``product_key`` is the harvester's key of the assortment (StanForD 2010).
     """
 
     position: Point
@@ -65,15 +100,15 @@ class KnownLog(msgspec.Struct, frozen=True):
 
     @property
     def volume_m3(self) -> float | None:
-        """Of a cylinder of its length and diameter."""
+        """Volume of a cylinder of its length and diameter; None if unknown."""
         if self.length_m is None or self.diameter_m is None:
             return None
         return 0.25 * math.pi * self.diameter_m**2 * self.length_m
 
 
 class Landing(msgspec.Struct, frozen=True):
-    """Where logs are unloaded: the middle of the pile, the direction in which its logs lie, and which assortments
-    it takes (all, when none is named).
+    """Where logs are unloaded: the centre of the pile, the direction of its logs, and the assortments it accepts (all,
+    if none is named).
     """
 
     position: Point
@@ -83,12 +118,11 @@ class Landing(msgspec.Struct, frozen=True):
 
 
 class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the mission is driven; None leaves it to the machine's profile.
+    """How the mission is driven; None leaves a value to the machine's profile.
 
-    Heights are those of the swing arms, above the lowest.  ``logs`` says where logs come from: ``"search"``, the
-    machine's eyes look for them along the route (paper B), or ``"listed"``, it stops at the known ones, too.
-    ``logs_wanted`` ends the mission after so many; ``assortments`` leaves the others lying; ``laps`` counts rounds of
-    the waypoints.
+    Heights are those of the swing arms above their lowest position.  ``logs`` is the source of logs: ``"search"``, the
+    machine detects them along the route (paper B), or ``"listed"``, it also stops at the known ones.  ``logs_wanted``
+    ends the mission after that many logs; ``assortments`` leaves all others; ``laps`` counts rounds of the waypoints.
     """
 
     laps: int = 1
@@ -102,7 +136,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ForwardingMission(msgspec.Struct, frozen=True):
-    """Everything a forwarder is told before it drives."""
+    """All data that a forwarder needs before it drives."""
 
     name: str = ""
     waypoints: tuple[Point, ...] = ()
@@ -114,6 +148,7 @@ class ForwardingMission(msgspec.Struct, frozen=True):
 
 
 def all_points(mission: ForwardingMission) -> tuple[Point, ...]:
-    """Every place of a mission: waypoints, corners of fences, landings, logs."""
+    """Every position of a mission: waypoints, corners of fences, landings, logs."""
     corners = tuple(corner for fence in mission.fences for corner in fence.corners)
-    return (*mission.waypoints, *corners, *(x.position for x in (*mission.landings, *mission.logs)))
+    landings = (landing.position for landing in mission.landings)
+    return (*mission.waypoints, *corners, *landings, *(log.position for log in mission.logs))

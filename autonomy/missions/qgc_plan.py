@@ -1,7 +1,7 @@
-"""QGroundControl's ``.plan``: JSON; positions are latitude, longitude, height.
+"""QGroundControl ``.plan``: JSON; positions are latitude, longitude, height.
 
-Read: waypoints, the ground speed, fences (polygons and circles).  Heights are those of a flight and are left out, as is
-every command that a forwarder cannot follow; what was left out is said.
+Read: waypoints, the ground speed, fences (polygons and circles).  Heights are flight altitudes and are ignored, as are
+all commands that a forwarder cannot execute; notes list what was ignored.
 """
 
 from __future__ import annotations
@@ -23,21 +23,26 @@ Path = tuple[str | int, ...]
 
 
 def read(document: dict[str, Any], source: Source) -> Draft:
-    """The mission in a plan; raises MissionError with the line of what is wrong."""
+    """The mission in a plan.
+
+    Raises:
+        MissionError: what is wrong, with its line.
+    """
     reader = _Reader(source)
     mission = document.get("mission")
     if not isinstance(mission, dict) or not isinstance(mission.get("items"), list):
-        raise source.error(("mission",), "the plan has no list of mission items; draw a route and save it again")
+        sentence = "the plan has no list of mission items; draw a route and save it again"
+        raise source.error("plan.items", ("mission",), sentence)
     reader.items(mission["items"])
     fence = document.get("geoFence", {})
     if not isinstance(fence, dict):
-        raise source.error(("geoFence",), "geoFence is no object")
+        raise source.error("plan.geofence", ("geoFence",), "geoFence is not an object")
     reader.fences(fence)
     draft = assemble(reader.shapes, source, "QGroundControl plan", "", Options(speed_m_s=reader.speed_m_s))
-    draft.notes += [f"{count} × {what} left out" for what, count in reader.left_out.items()]
+    draft.notes += [f"{count} × {what} ignored" for what, count in reader.left_out.items()]
     rally = document.get("rallyPoints")
     if isinstance(rally, dict) and rally.get("points"):
-        draft.notes.append("rally points left out")
+        draft.notes.append("rally points ignored")
     return draft
 
 
@@ -53,20 +58,20 @@ class _Reader:
     def items(self, items: list[Any]) -> None:
         """The route: every waypoint item in its order."""
         if len(items) > 2 * MAX_WAYPOINTS:
-            raise self.source.error(
-                ("mission", "items"), f"has {len(items)} items; a route has at most {MAX_WAYPOINTS} waypoints"
-            )
+            sentence = f"has {len(items)} items; a route has at most {MAX_WAYPOINTS} waypoints"
+            raise self.source.error("mission.too-many-waypoints", ("mission", "items"), sentence)
         route = []
         for i, item in enumerate(items):
             path: Path = ("mission", "items", i)
             if not isinstance(item, dict):
-                raise self.source.error(path, "this is no mission item")
+                raise self.source.error("plan.item", path, "this is not a mission item")
             command, given = item.get("command"), item.get("params")
             if item.get("type") == "ComplexItem":
                 self.left_out[str(item.get("complexItemType", "complex item"))[:40]] += 1
             elif command in (NAV_WAYPOINT, NAV_SPLINE_WAYPOINT):
                 if not isinstance(given, list) or len(given) < 6:
-                    raise self.source.error(path, "a waypoint has seven params; the 5th and 6th are its place")
+                    sentence = "a waypoint has seven params; the 5th and 6th are its position"
+                    raise self.source.error("plan.params", path, sentence)
                 route.append(self.position(given[4:6], (*path, "params")))
             elif command == DO_CHANGE_SPEED and isinstance(given, list) and len(given) > 1 and _number(given[1]):
                 self.speed_m_s = float(given[1]) if self.speed_m_s is None else self.speed_m_s
@@ -83,7 +88,7 @@ class _Reader:
         for kind, inner in (("polygons", "polygon"), ("circles", "circle")):
             listed = fence.get(kind) or []
             if not isinstance(listed, list):
-                raise self.source.error(("geoFence", kind), f"{kind} is no list")
+                raise self.source.error("plan.geofence", ("geoFence", kind), f"{kind} is not a list")
             for i, entry in enumerate(listed):
                 path: Path = ("geoFence", kind, i)
                 shape = entry.get(inner) if isinstance(entry, dict) else None
@@ -92,7 +97,7 @@ class _Reader:
                 elif kind == "circles" and isinstance(shape, dict):
                     self.circle(shape, bool(entry.get("inclusion", True)), (*path, inner))
                 else:
-                    raise self.source.error(path, f"this fence has no {inner}")
+                    raise self.source.error("plan.geofence", path, f"this fence has no {inner}")
 
     def polygon(self, corners: list[Any], inclusion: bool, path: Path) -> None:
         if not corners:
@@ -101,11 +106,12 @@ class _Reader:
         self.shapes.append(Shape("polygon", (ring,), {"role": _role(inclusion)}, path))
 
     def circle(self, circle: dict[str, Any], inclusion: bool, path: Path) -> None:
-        """As a polygon that errs to the safe side: inside of a circle that keeps in, round one that keeps out."""
+        """A circle as a polygon on the safe side: inside a keep-in circle, round a keep-out circle."""
         center = self.position(circle.get("center"), (*path, "center"))
         radius = circle.get("radius")
-        if not _number(radius) or not 0.0 < radius < 1e5:
-            raise self.source.error((*path, "radius"), f"radius {radius!r} is none; it is given in metres")
+        if not isinstance(radius, int | float) or isinstance(radius, bool) or not 0.0 < radius < 1e5:
+            sentence = f"radius {radius!r} is invalid; give it in metres"
+            raise self.source.error("plan.radius", (*path, "radius"), sentence)
         if not (abs(center.latitude_deg) <= 90.0 and abs(center.longitude_deg) <= 180.0):
             self.shapes.append(Shape("polygon", ((center,) * 3,), {"role": _role(inclusion)}, path))
             return
@@ -120,7 +126,7 @@ class _Reader:
 
     def position(self, value: Any, path: Path) -> Position:
         if not isinstance(value, list) or len(value) < 2 or not all(_number(x) for x in value[:2]):
-            raise self.source.error(path, "a place is [latitude, longitude], two numbers")
+            raise self.source.error("plan.position", path, "a position is [latitude, longitude], two numbers")
         return Position(float(value[0]), float(value[1]), None, path)
 
 

@@ -1,4 +1,4 @@
-"""What a machine will make of a mission: length, time, and what will be hard for it; says so, forbids nothing."""
+"""Review of a mission for a machine: length, duration, and warnings about what will be difficult."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from typing import Final
 import numpy as np
 
 from autonomy.missions.area import path_distance_m
-from autonomy.missions.validation import SITE_M, area_of, legs
 from autonomy.missions.local_frame import LocalFrame, site_frame
-from autonomy.missions.model import ForwardingMission
-from machine.carrier import turning_radius_m
-from machine.kinematics import max_reach_m
+from autonomy.missions.model import ForwardingMission, MissionError, Problem
+from autonomy.missions.validation import MAX_SITE_DISTANCE_M, area_of, legs
+from machine.geometry.carrier import turning_radius_m
+from machine.geometry.kinematics import max_reach_m
 from machine.profile import Carrier, Profile
 
-SWITCH_LEAST_M: Final = 3.0
-"""Nearest a waypoint is passed before the next one is steered to (docs/reference/machines.md section 7.2: 3 to 4 m, else R tan(turn / 2))."""
+MIN_SWITCH_M: Final = 3.0
+"""Least distance at which the next waypoint is selected (docs/reference/machines.md section 7.2: 3 to 4 m, else
+R tan(turn / 2)).
+"""
 LOG_S: Final = 25.0
-"""Seconds for one log from the ground into the bunk, as an expert needs (docs/reference/machines.md section 10)."""
+"""Duration in which an expert loads one log from the ground into the bunk (docs/reference/machines.md section 10)."""
 SHARPEST_RAD: Final = math.radians(150.0)
-SHOWN: Final = 5
+MAX_SHOWN: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Corner:
-    """A bend of the route: its waypoint, how far it turns [rad], how far before it the machine turns in [m]."""
+    """A bend of the route: its waypoint, its turn [rad], and how far before it the machine starts to turn [m]."""
 
     waypoint: int
     turn_rad: float
@@ -43,19 +45,25 @@ class Review:
     logs: int
     crane_s: float
     corners: tuple[Corner, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[Problem, ...]
 
     @property
     def total_s(self) -> float:
-        """Driving and loading."""
+        """Duration of driving and loading."""
         return self.drive_s + self.crane_s
 
 
 def review(mission: ForwardingMission, profile: Profile) -> Review:
-    """Judge a checked mission for a machine that drives; raises ValueError for one that does not."""
+    """Review a validated mission for a machine with a carrier.
+
+    Raises:
+        MissionError: the machine has no carrier.
+    """
     carrier = profile.carrier
     if carrier is None:
-        raise ValueError(f"{profile.name} does not drive; choose a machine with a carrier")
+        raise MissionError(
+            "mission.stationary-machine", f"{profile.name} does not drive; choose a machine with a carrier"
+        )
     frame = site_frame(mission)
     at = frame.points_enu(mission.waypoints)[:, :2]
     ways = legs(mission)
@@ -79,7 +87,7 @@ def review(mission: ForwardingMission, profile: Profile) -> Review:
 
 
 def _wanted(mission: ForwardingMission) -> int:
-    """How many of the known logs are to be fetched; in paper B's way the same places are filled anew for every lap."""
+    """Number of known logs to collect; when searching as in paper B, the places are filled again for every lap."""
     wanted = mission.options.assortments
     logs = sum(1 for log in mission.logs if not wanted or log.assortment in wanted)
     if mission.options.logs == "search":
@@ -91,7 +99,7 @@ def _wanted(mission: ForwardingMission) -> int:
 
 
 def _corners(at: np.ndarray, ways: list[tuple[int, int]], radius_m: float) -> tuple[Corner, ...]:
-    """Every waypoint at which one leg follows another."""
+    """Every waypoint between two legs."""
     found = []
     follows = list(pairwise(ways))
     if len(ways) > 1 and ways[-1][1] == ways[0][0]:
@@ -100,52 +108,58 @@ def _corners(at: np.ndarray, ways: list[tuple[int, int]], radius_m: float) -> tu
         one, two = at[b] - at[a], at[c] - at[b]
         turn = abs(math.atan2(one[0] * two[1] - one[1] * two[0], float(one @ two)))
         switch = radius_m * math.tan(0.5 * turn) if turn < SHARPEST_RAD else math.inf
-        found.append(Corner(b, turn, max(switch, SWITCH_LEAST_M)))
+        found.append(Corner(b, turn, max(switch, MIN_SWITCH_M)))
     return tuple(found)
 
 
-def _site(mission: ForwardingMission, carrier: Carrier) -> list[str]:
+def _site(mission: ForwardingMission, carrier: Carrier) -> list[Problem]:
     origin = LocalFrame(carrier.site_lat_deg, carrier.site_lon_deg)
     away = float(np.linalg.norm(origin.points_enu(mission.waypoints[:1])))
-    return [f"it is {away / 1000:.0f} km from the site in the machine's profile"] if away > SITE_M else []
+    if away <= MAX_SITE_DISTANCE_M:
+        return []
+    return [Problem("mission.far-from-site", f"it is {away / 1000:.0f} km from the site in the machine's profile")]
 
 
-def _speed(mission: ForwardingMission, carrier: Carrier) -> list[str]:
+def _speed(mission: ForwardingMission, carrier: Carrier) -> list[Problem]:
     speed, height = mission.options.speed_m_s, mission.options.transport_height_m
     found = []
     if speed is not None and speed > carrier.speed_limit_m_s:
-        found.append(f"speed_m_s is {speed:g}; the machine drives at most {carrier.speed_limit_m_s:g} m/s")
+        sentence = f"speed_m_s is {speed:g}; the machine drives at most {carrier.speed_limit_m_s:g} m/s"
+        found.append(Problem("mission.speed-limit", sentence))
     if height is not None and height > carrier.arm_travel_m:
-        found.append(f"transport_height_m is {height:g}; the swing arms lift {carrier.arm_travel_m:g} m")
+        sentence = f"transport_height_m is {height:g}; the swing arms lift {carrier.arm_travel_m:g} m"
+        found.append(Problem("mission.height-limit", sentence))
     return found
 
 
 def _tight(
     corners: tuple[Corner, ...], ways: list[tuple[int, int]], lengths: list[float], radius_m: float
-) -> list[str]:
-    """Corners that the machine cannot drive as drawn: too sharp, or with legs too short to turn in and out."""
+) -> list[Problem]:
+    """Corners that the machine cannot drive as drawn: too sharp, or with legs too short for the bends."""
     found = []
     room = {corner.waypoint: corner.switch_m for corner in corners if math.isfinite(corner.switch_m)}
     for corner in corners:
         if math.isinf(corner.switch_m):
-            found.append(
+            found.append(Problem(
+                "mission.turn-on-the-spot",
                 f"waypoint {corner.waypoint + 1}: the route turns by {math.degrees(corner.turn_rad):.0f} degrees on "
-                f"the spot; the machine's smallest circle has a radius of {radius_m:.1f} m, so draw a loop"
-            )
+                f"the spot; the machine's smallest circle has a radius of {radius_m:.1f} m, so draw a loop",
+            ))  # fmt: skip
     for (i, j), length in zip(ways, lengths, strict=True):
         needed = room.get(i, 0.0) + room.get(j, 0.0)
         if length < needed:
-            found.append(
+            found.append(Problem(
+                "mission.short-leg",
                 f"leg {i + 1} to {j + 1} is {length:.1f} m long and its corners need {needed:.1f} m at a turning "
-                f"radius of {radius_m:.1f} m; the machine will cut or overshoot them"
-            )
+                f"radius of {radius_m:.1f} m; the machine will cut or overshoot them",
+            ))  # fmt: skip
     return _few(found)
 
 
-def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> list[str]:
-    """Waypoints so near the fence that a wheel would leave it."""
+def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> list[Problem]:
+    """Waypoints so close to the fence that a wheel would leave it."""
     if not mission.fences:
-        return ["there is no fence; nothing says where the machine must not drive"]
+        return [Problem("mission.no-fence", "there is no fence; add one to keep the machine inside an area")]
     area = area_of(mission, frame)
     half = 0.5 * (carrier.track_width_m + carrier.wheel_width_m)
     at = frame.points_enu(mission.waypoints)[:, :2]
@@ -153,7 +167,10 @@ def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> li
     near = np.min([path_distance_m(np.vstack([ring, ring[:1]]), at) for ring in rings], axis=0)
     return _few(
         [
-            f"waypoint {i + 1} is {near[i]:.1f} m from the fence; the machine is {2 * half:.1f} m wide"
+            Problem(
+                "mission.close-to-fence",
+                f"waypoint {i + 1} is {near[i]:.1f} m from the fence; the machine is {2 * half:.1f} m wide",
+            )
             for i in np.flatnonzero(near < half)
         ]
     )
@@ -161,8 +178,8 @@ def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> li
 
 def _logs(
     mission: ForwardingMission, frame: LocalFrame, at: np.ndarray, ways: list[tuple[int, int]], profile: Profile
-) -> list[str]:
-    """Logs that the crane cannot reach from the route, or that lie under the wheels."""
+) -> list[Problem]:
+    """Logs that the crane cannot reach from the route, or that lie on the route."""
     if not mission.logs or not len(at) or profile.carrier is None:
         return []
     path = at[[ways[0][0], *(j for _, j in ways)]] if ways else at
@@ -170,23 +187,33 @@ def _logs(
     reach = max_reach_m(profile)
     half = 0.5 * (profile.carrier.track_width_m + profile.carrier.wheel_width_m)
     far = [
-        f"log {i + 1} lies {away[i]:.1f} m from the route; the crane reaches {reach:.1f} m"
+        Problem(
+            "mission.log-out-of-reach",
+            f"log {i + 1} lies {away[i]:.1f} m from the route; the crane reaches {reach:.1f} m",
+        )
         for i in np.flatnonzero(away > reach)
     ]
     known = np.array([(log.sigma_m or 0.0) < half for log in mission.logs])
     on_route = np.flatnonzero((away < half) & known)
-    under = [f"log {i + 1} lies on the route; the wheels would roll over it" for i in on_route]
+    under = [
+        Problem("mission.log-on-route", f"log {i + 1} lies on the route; the wheels would roll over it")
+        for i in on_route
+    ]
     return [*_few(far), *_few(under)]
 
 
-def _unlisted(mission: ForwardingMission) -> list[str]:
-    """Assortments that are to be collected, and of which no log is."""
+def _unlisted(mission: ForwardingMission) -> list[Problem]:
+    """Assortments to collect that no listed log has."""
     listed = {log.assortment for log in mission.logs}
-    return _few([f'no log is "{name}", which is to be collected' for name in mission.options.assortments
-                 if name not in listed])  # fmt: skip
+    return _few([
+        Problem("mission.unlisted-assortment", f'no log is "{name}", which is to be collected')
+        for name in mission.options.assortments if name not in listed
+    ])  # fmt: skip
 
 
-def _few(sentences: list[str]) -> list[str]:
-    """The first few of many sentences of one kind."""
-    more = len(sentences) - SHOWN
-    return sentences if more <= 0 else [*sentences[:SHOWN], f"and {more} more like the last"]
+def _few(warnings: list[Problem]) -> list[Problem]:
+    """The first few of many warnings of one kind."""
+    more = len(warnings) - MAX_SHOWN
+    if more <= 0:
+        return warnings
+    return [*warnings[:MAX_SHOWN], Problem(warnings[-1].code, f"and {more} more like the last")]

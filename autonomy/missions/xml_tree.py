@@ -1,13 +1,12 @@
-"""XML without its dangers: a tree of the elements that are wanted, each with its line.
+"""Safe XML parsing: a tree of the wanted elements, each with its line.
 
-Document types, entities and references to other files are refused (defusedxml); elements that nobody asked for are
-skipped with all they hold; numbers of elements, depth and text are limited, so a hostile file costs bounded time and
-memory.
+Document types, entities and external references are refused (defusedxml).  Other elements are skipped with their
+content.  The numbers of elements, depth and text are limited, so that a hostile file costs bounded time and memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
@@ -21,7 +20,7 @@ from autonomy.missions.model import MissionError
 MAX_ELEMENTS: Final = 2_000_000
 MAX_DEPTH: Final = 100
 ANY: Final = "*"
-"""The name under which all kept elements are limited."""
+"""Key of the limit on all kept elements."""
 _CHUNK: Final = 1 << 16
 
 
@@ -59,11 +58,11 @@ class Element:
 
 
 class TooMany(Exception):
-    """A file has more elements than allowed; args: line, sentence."""
+    """A file has more elements than allowed; args: code, line, sentence."""
 
 
 class _Builder:
-    """What the parser calls: keeps wanted elements, counts all."""
+    """Parser target: keeps wanted elements, counts all."""
 
     def __init__(self, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]]) -> None:
         self.wanted, self.limits = wanted, dict(limits)
@@ -72,13 +71,13 @@ class _Builder:
         self.skipping = 0
         self.open: list[Element] = []
         self.root: Element | None = None
-        self.line = lambda: 0
+        self.line: Callable[[], int] = lambda: 0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """An element begins."""
+        """Start of an element."""
         self.elements += 1
         if self.elements > MAX_ELEMENTS:
-            raise TooMany(self.line(), f"has more than {MAX_ELEMENTS} elements")
+            raise TooMany("mission.too-many-elements", self.line(), f"has more than {MAX_ELEMENTS} elements")
         if self.skipping:
             self.skipping += 1
             return
@@ -87,13 +86,13 @@ class _Builder:
             self.skipping = 1
             return
         if len(self.open) >= MAX_DEPTH:
-            raise TooMany(self.line(), "is nested deeper than any mission")
+            raise TooMany("mission.nesting", self.line(), "is nested deeper than any mission")
         for counted in (name, ANY):
             if counted in self.limits:
                 most, what = self.limits[counted]
                 self.counts[counted] = self.counts.get(counted, 0) + 1
                 if self.counts[counted] > most:
-                    raise TooMany(self.line(), f"has more than {most} {what}")
+                    raise TooMany("mission.too-many-elements", self.line(), f"has more than {most} {what}")
         local = {key.rpartition("}")[2]: value for key, value in attributes.items()}
         element = Element(name, namespace.lstrip("{"), local, self.line())
         if self.open:
@@ -103,14 +102,14 @@ class _Builder:
         self.open.append(element)
 
     def end(self, _tag: str) -> None:
-        """An element ends."""
+        """End of an element."""
         if self.skipping:
             self.skipping -= 1
         else:
             self.open.pop()
 
     def data(self, text: str) -> None:
-        """Text of the element that is open."""
+        """Text of the open element."""
         if self.open and not self.skipping and not self.open[-1].children:
             self.open[-1].parts.append(text)
 
@@ -120,7 +119,7 @@ class _Builder:
 
 
 def root_name(data: bytes) -> str:
-    """The local name of the root element, "" when there is none to be found in the first 64 kB."""
+    """The local name of the root element, "" if there is none in the first 64 kB."""
     builder = _Builder(frozenset(), {})
     parser = DefusedXMLParser(target=builder, forbid_dtd=True)
     with suppress(ParseError, DefusedXmlException, TooMany, ValueError, LookupError):
@@ -131,10 +130,10 @@ def root_name(data: bytes) -> str:
 def tree(data: bytes, name: str, wanted: frozenset[str], limits: Mapping[str, tuple[int, str]]) -> Element:
     """The root of an XML document with the elements named ``wanted`` below it.
 
-    ``limits`` is the greatest number of elements by name (``ANY``: of all that are kept), and what to call them.
+    ``limits`` has the greatest number of elements by name (``ANY``: of all kept ones), and their name in the error.
 
     Raises:
-        MissionError: no well-formed XML, a document type or an entity, or more than the limits allow.
+        MissionError: not well-formed XML, a document type or an entity, or more than the limits allow.
     """
     builder = _Builder(wanted, limits)
     parser = DefusedXMLParser(target=builder, forbid_dtd=True)
@@ -145,19 +144,24 @@ def tree(data: bytes, name: str, wanted: frozenset[str], limits: Mapping[str, tu
         root = parser.close()
     except DefusedXmlException:
         raise MissionError(
-            f"{name}:{builder.line()}: declares a document type or entities, which no mission needs and which can do "
-            "harm; delete the <!DOCTYPE ...> part"
+            "mission.xml-doctype",
+            "declares a document type or entities, which no mission needs and which can do harm; delete the "
+            "<!DOCTYPE ...> part",
+            f"{name}:{builder.line()}",
         ) from None
     except TooMany as error:
-        line, sentence = error.args
-        raise MissionError(f"{name}:{line}: {sentence}; thin it out, or split the mission") from None
+        code, line, sentence = error.args
+        raise MissionError(code, f"{sentence}; thin it out, or split the mission", f"{name}:{line}") from None
     except ParseError as error:
         line = error.position[0]
         reason = str(error).partition(":")[0]
-        raise MissionError(f"{name}:{line}: this is no well-formed XML: {reason}; was the file cut off?") from None
+        raise MissionError(
+            "mission.not-xml", f"this is not well-formed XML: {reason}; was the file cut off?", f"{name}:{line}"
+        ) from None
     except (ValueError, LookupError) as error:
-        raise MissionError(f"{name}: its encoding cannot be read ({error}); save the file with UTF-8") from None
+        sentence = f"its encoding cannot be read ({error}); save the file with UTF-8"
+        raise MissionError("mission.encoding", sentence, name) from None
     if root is None:
-        raise MissionError(f"{name}: is empty")
+        raise MissionError("mission.empty-file", "is empty", name)
     found: Element = root
     return found

@@ -1,8 +1,8 @@
 """Drivable paths from polylines: straight legs, and corners rounded by clothoid, arc, clothoid.
 
-``drivable(points, carrier)`` drops points that the line does not need, then rounds every corner within the curvature
-and curvature rate of `Limits`.  A corner whose legs are too short gets the sharpest bend that the machine can drive,
-and is refused when that is not enough.
+``drivable_path(points, carrier)`` drops points that the line does not need, then rounds every corner within the
+curvature and curvature rate of `Limits`.  A corner whose legs are too short gets the sharpest bend that the machine can
+drive, and is refused when that is not enough.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ import numpy as np
 
 from machine.geometry.carrier import turning_radius_m
 from machine.profile import Carrier
+from runtime.errors import CodedError
 
 SPACING_M: Final = 0.05
 TOLERANCE_M: Final = 0.05
 """Points this near to the line between their neighbours are dropped (Douglas and Peucker)."""
-COMFORT: Final = 0.80
+COMFORT_SHARE: Final = 0.80
 """Share of the maximum curvature used in a corner; the rest is left for correction."""
 RATE_SHARE: Final = 0.70
 """Share of the articulation rate used in a corner at cruising speed."""
-HARDEST: Final = 0.95
+HARDEST_SHARE: Final = 0.95
 """Share of both where the legs are short."""
 Point2 = tuple[float, float]
 
 
-class PathRefused(ValueError):
+class PathRefused(CodedError, ValueError):
     """A polyline cannot be driven; the message says where and why."""
 
 
@@ -84,21 +85,21 @@ class Path:
         off = self.xy_m[first:last] - (x_m, y_m)
         i = first + int(np.argmin(np.einsum("ij,ij->i", off, off)))
         heading = float(self.heading_rad[i])
-        px, py = self.xy_m[i]
+        px, py = (float(v) for v in self.xy_m[i])
         along = (x_m - px) * math.cos(heading) + (y_m - py) * math.sin(heading)
         back = -math.inf if i == 0 else -SPACING_M
         forth = math.inf if i == len(self.s_m) - 1 else SPACING_M
         return float(self.s_m[i]) + min(max(along, back), forth)
 
 
-def limits_of(carrier: Carrier, share: float = COMFORT, rate_share: float = RATE_SHARE) -> Limits:
+def path_limits(carrier: Carrier, share: float = COMFORT_SHARE, rate_share: float = RATE_SHARE) -> Limits:
     """Limits of the machine at its cruising speed."""
     sharpest = 1.0 / turning_radius_m(carrier, carrier.articulation_limit_rad)
     swing_1_m = rate_share * carrier.articulation_rate_limit_rad_s / carrier.cruise_speed_m_s
     return Limits(share * sharpest, swing_1_m / (carrier.front_axle_m + carrier.rear_axle_m))
 
 
-def drivable(points: Sequence[Point2], carrier: Carrier) -> Path:
+def drivable_path(points: Sequence[Point2], carrier: Carrier) -> Path:
     """The path along ``points`` [m] in the plane.
 
     Raises:
@@ -107,12 +108,12 @@ def drivable(points: Sequence[Point2], carrier: Carrier) -> Path:
     xy = np.asarray(points, float).reshape(-1, 2)
     if not np.all(np.isfinite(xy)):
         i = int(np.argmin(np.all(np.isfinite(xy), axis=1)))
-        raise PathRefused(f"point {i + 1} of the path is not finite: {tuple(xy[i])}")
+        raise PathRefused("path.not-finite", f"point {i + 1} of the path is not finite: {tuple(xy[i].tolist())}")
     xy = _needed(xy) if len(xy) else xy
     if len(xy) < 2:
-        raise PathRefused("a path needs at least two different points")
-    hard = limits_of(carrier, HARDEST, HARDEST)
-    bends = _bends(xy, limits_of(carrier), hard)
+        raise PathRefused("path.too-short", "a path needs at least two different points")
+    hard = path_limits(carrier, HARDEST_SHARE, HARDEST_SHARE)
+    bends = _bends(xy, path_limits(carrier), hard)
     return _sampled(xy, bends)
 
 
@@ -156,7 +157,7 @@ def _bends(xy: np.ndarray, soft: Limits, hard: Limits) -> list[_Bend]:
     bends = []
     for i, turn in enumerate(turns):
         if abs(turn) > math.radians(170.0):
-            raise PathRefused(f"the path reverses at {_place(xy[i + 1])}; add a point beside it")
+            raise PathRefused("path.reverses", f"the path reverses at {_place(xy[i + 1])}; add a point beside it")
         bends.append(_Bend(turn, soft, _reach(turn, soft)))
     for i, length in enumerate(lengths):
         ends = [k for k in (i - 1, i) if 0 <= k < len(bends)]
@@ -167,8 +168,9 @@ def _bends(xy: np.ndarray, soft: Limits, hard: Limits) -> list[_Bend]:
         needed = sum(bends[k].reach_m for k in (i - 1, i) if 0 <= k < len(bends))
         if needed > length:
             raise PathRefused(
+                "path.short-leg",
                 f"the leg from {_place(xy[i])} to {_place(xy[i + 1])} is {length:.1f} m long, but the bends at its "
-                f"ends need {needed:.1f} m; move the points apart or make the corners less sharp"
+                f"ends need {needed:.1f} m; move the points apart or make the corners less sharp",
             )
     return bends
 

@@ -8,9 +8,9 @@ from can_dbc.messages.vehicle import Steering
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
-    """Steering as in ``DriveSetpoint`` and a speed [m/s].  ``arrived``: the drive is complete.  ``trouble``: why the
-    machine must stop, empty otherwise.
+class DriveRequest:
+    """Steering as in ``DriveSetpoint`` and a speed [m/s].  ``arrived``: the drive is complete.  ``stop_reason``: why
+    the machine must stop, empty otherwise.
     """
 
     steering: Steering = Steering.ARTICULATION
@@ -20,4 +20,4 @@ class Order:
     articulation_rate_rad_s: float = 0.0
     speed_m_s: float = 0.0
     arrived: bool = False
-    trouble: str = ""
+    stop_reason: str = ""

@@ -14,12 +14,12 @@ Heading = tuple[float, float, float]
 """A position [m] and a direction [rad]."""
 
 
-def turns(start: Heading, goal: Heading, radius_m: float) -> Iterator[list[Point2]]:
+def dubins_corners(start: Heading, goal: Heading, radius_m: float) -> Iterator[list[Point2]]:
     """Corner points of all manoeuvres from one heading to another with two arcs of a radius, the shortest first."""
     ways = []
     for first in (1.0, -1.0):
         for last in (1.0, -1.0):
-            begin, end = _middle(start, first, radius_m), _middle(goal, last, radius_m)
+            begin, end = _circle_centre(start, first, radius_m), _circle_centre(goal, last, radius_m)
             apart = math.dist(begin, end)
             straight = math.atan2(end[1] - begin[1], end[0] - begin[0])
             if first != last:
@@ -34,7 +34,7 @@ def turns(start: Heading, goal: Heading, radius_m: float) -> Iterator[list[Point
         yield [*_corners(start, first, out, radius_m), *reversed(_corners(onto, -last, back, radius_m))]
 
 
-def _middle(at: Heading, side: float, radius_m: float) -> Point2:
+def _circle_centre(at: Heading, side: float, radius_m: float) -> Point2:
     """Centre of the turning circle to the left (1) or right (-1)."""
     x, y, yaw = at
     return x - side * radius_m * math.sin(yaw), y + side * radius_m * math.cos(yaw)

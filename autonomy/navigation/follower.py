@@ -21,8 +21,8 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from autonomy.localization.location import Location
 from autonomy.localization.local_plane import wrapped
+from autonomy.localization.location import Location
 from autonomy.navigation.clothoid_path import Path
 from machine.profile import Carrier
 
@@ -41,16 +41,16 @@ FORTH_M: Final = 2.0
 """Search range around the last nearest point, because a path may cross itself."""
 RATE_SHARE: Final = 0.95
 ANGLE_SPARE_RAD: Final = 0.005
-APART_RAD: Final = 0.12
+MAX_LEAD_RAD: Final = 0.12
 """Maximum lead of the wanted angle over the measured one."""
-LONGEST_S: Final = 0.2
+MAX_EXTRAPOLATION_S: Final = 0.2
 """Maximum extrapolation time of a wanted angle."""
-STEEPEST_RAD: Final = 1.1
+MAX_RETURN_RAD: Final = 1.1
 """Greatest angle between course and path while returning to it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Steer:
+class SteeringCommand:
     """The follower's output: articulation [rad] and its rate [rad/s], + bends left; and the machine's position on the
     path: nearest point ``s_m``, lateral error ``off_m`` (+ left of it), course error ``off_rad``.
     """
@@ -63,7 +63,7 @@ class Steer:
 
 
 @dataclass(frozen=True, slots=True)
-class Following:
+class FollowerState:
     """The follower's state: position along the path and last wanted articulation; None at the beginning."""
 
     s_m: float | None = None
@@ -73,9 +73,9 @@ class Following:
     integral_m: float = 0.0
 
 
-def follow(
-    carrier: Carrier, path: Path, state: Following, location: Location, speed_m_s: float
-) -> tuple[Following, Steer]:
+def follow_path(
+    carrier: Carrier, path: Path, state: FollowerState, location: Location, speed_m_s: float
+) -> tuple[FollowerState, SteeringCommand]:
     """One step at the location's stamp; ``speed_m_s`` is the speed about to be requested."""
     bend, speed = location.articulation_rad, location.speed_m_s
     turn_1_m = math.sin(bend) / (carrier.front_axle_m * math.cos(bend) + carrier.rear_axle_m) + location.slip_curve_1_m
@@ -93,24 +93,24 @@ def follow(
         integral += max(0.0, min(FORTH_M, s - state.s_m)) * off / INTEGRAL_M
         integral = max(-INTEGRAL_LIMIT_M, min(INTEGRAL_LIMIT_M, integral))
     pull = LAMBDA_1_M * (off + integral)
-    wanted = max(-STEEPEST_RAD, min(STEEPEST_RAD, -math.atan(pull)))
+    wanted = max(-MAX_RETURN_RAD, min(MAX_RETURN_RAD, -math.atan(pull)))
     of_way = -LAMBDA_1_M / (1.0 + pull**2) * math.sin(off_course)
     own = curve * math.cos(off_course) / max(0.3, 1.0 - curve * off)
     kappa = own + of_way - GAMMA_1_M * wrapped(off_course - wanted) - location.slip_curve_1_m
     angle, rate = _articulation(carrier, state, location, kappa, speed_m_s)
-    return Following(s, angle, rate, location.stamp_ns, integral), Steer(angle, rate, s, off, off_course)
+    return FollowerState(s, angle, rate, location.stamp_ns, integral), SteeringCommand(angle, rate, s, off, off_course)
 
 
 def _articulation(
-    carrier: Carrier, state: Following, location: Location, kappa: float, speed_m_s: float
+    carrier: Carrier, state: FollowerState, location: Location, kappa: float, speed_m_s: float
 ) -> tuple[float, float]:
     """The wanted articulation at the location's stamp and its rate, within the machine's limits."""
     angle = measured = location.articulation_rad
     if state.articulation_rad is not None:
-        seconds = min(LONGEST_S, (location.stamp_ns - state.stamp_ns) * 1e-9)
+        seconds = min(MAX_EXTRAPOLATION_S, (location.stamp_ns - state.stamp_ns) * 1e-9)
         angle = state.articulation_rad + seconds * state.articulation_rate_rad_s
     limit = carrier.articulation_limit_rad - ANGLE_SPARE_RAD
-    low, high = max(-limit, measured - APART_RAD), min(limit, measured + APART_RAD)
+    low, high = max(-limit, measured - MAX_LEAD_RAD), min(limit, measured + MAX_LEAD_RAD)
     angle = max(low, min(high, angle))
     lf, lr = carrier.front_axle_m, carrier.rear_axle_m
     fastest = RATE_SHARE * carrier.articulation_rate_limit_rad_s

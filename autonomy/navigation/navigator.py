@@ -12,20 +12,20 @@ from enum import IntEnum
 from typing import Final
 
 from autonomy.localization.location import Location
-from autonomy.navigation.path_drive import Along
-from autonomy.navigation.drive_request import Order
-from autonomy.navigation.waypoint_drive import PaperB
+from autonomy.navigation.drive_request import DriveRequest
+from autonomy.navigation.path_drive import PathDrive
+from autonomy.navigation.waypoint_drive import WaypointDrive
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, VehicleReport
 from machine.profile import Carrier
 
 LEASE_NS: Final = 250_000_000
 """Five report periods."""
-STANDS_M_S: Final = 0.02
+STANDSTILL_M_S: Final = 0.02
 REST_NS: Final = 500_000_000
 """The brake is on after this time: on a slope the drive holds the machine until then."""
-OBEYS_NS: Final = 2_000_000_000
+EXECUTION_TIMEOUT_NS: Final = 2_000_000_000
 """The drive stops when the controller does not execute its setpoints for this long."""
-MOVES_NS: Final = 5_000_000_000
+MOTION_TIMEOUT_NS: Final = 5_000_000_000
 """The drive stops when the wheels do not turn for this long."""
 STUCK_M_S: Final = 0.02
 Heights = tuple[float, float, float, float]
@@ -55,22 +55,22 @@ class Navigator:
     ) -> None:
         self.phase = Phase.IDLE
         self.reason = ""
-        self.stands = True
+        self.is_standing = True
         """Whether standstill was requested and has held for ``REST_NS``."""
         self.heights_m = heights_m or (carrier.arm_transport_m,) * 4
         self.level = level
-        self.holds = False
+        self.holds_heights = False
         """Send setpoints at standstill, too, to set the heights."""
         self._profile_hash, self._limit_rad = profile_hash, carrier.articulation_limit_rad
         self._lease_ns = lease_ns
-        self.way: Along | PaperB | None = None
+        self.active: PathDrive | WaypointDrive | None = None
         """The current or last drive."""
         self._sequence = 0
         self._asked_ns = self._obeyed_ns = self._moved_ns = self._rolled_ns = 0
 
-    def drive(self, way: Along | PaperB) -> None:
+    def drive(self, way: PathDrive | WaypointDrive) -> None:
         """Start this drive; it replaces an active one."""
-        self.way = way
+        self.active = way
         self._begin()
 
     def pause(self) -> None:
@@ -80,7 +80,7 @@ class Navigator:
 
     def resume(self) -> None:
         """Resume after a pause or a stop."""
-        if self.phase in (Phase.PAUSED, Phase.STOPPED) and self.way is not None:
+        if self.phase in (Phase.PAUSED, Phase.STOPPED) and self.active is not None:
             self._begin()
 
     def stop(self, reason: str) -> None:
@@ -90,19 +90,19 @@ class Navigator:
 
     def step(self, now_ns: int, report: VehicleReport, location: Location) -> DriveSetpoint | None:
         """The setpoint to send now, or None."""
-        still = abs(report.speed_m_s) < STANDS_M_S and report.driving != Driving.BRAKING
-        self.stands = still and now_ns - self._rolled_ns >= REST_NS
-        order = Order()
+        still = abs(report.speed_m_s) < STANDSTILL_M_S and report.driving != Driving.BRAKING
+        self.is_standing = still and now_ns - self._rolled_ns >= REST_NS
+        order = DriveRequest()
         if self.phase is Phase.DRIVING:
-            order = self.way.step(report) if isinstance(self.way, PaperB) else self.way.step(location)  # type: ignore[union-attr]
-            self._look(now_ns, report, order)
+            order = self.active.step(report) if isinstance(self.active, WaypointDrive) else self.active.step(location)  # type: ignore[union-attr]
+            self._supervise(now_ns, report, order)
         if self.phase is not Phase.DRIVING:
-            if isinstance(self.way, Along):
-                self.way.rest(location)
-            idle = (self.phase is Phase.IDLE or self.stands) and not self.holds
+            if isinstance(self.active, PathDrive):
+                self.active.rest(location)
+            idle = (self.phase is Phase.IDLE or self.is_standing) and not self.holds_heights
             if idle or not math.isfinite(report.articulation_rad):
                 return None
-            order = Order(articulation_rad=report.articulation_rad)
+            order = DriveRequest(articulation_rad=report.articulation_rad)
         if not still or order.speed_m_s:
             self._rolled_ns = now_ns
         limit = self._limit_rad
@@ -121,7 +121,7 @@ class Navigator:
         self.phase, self.reason = Phase.DRIVING, ""
         self._asked_ns = self._obeyed_ns = self._moved_ns = 0
 
-    def _look(self, now_ns: int, report: VehicleReport, order: Order) -> None:
+    def _supervise(self, now_ns: int, report: VehicleReport, order: DriveRequest) -> None:
         """End the drive on arrival or on a problem."""
         if not self._asked_ns:
             self._asked_ns = self._obeyed_ns = self._moved_ns = now_ns
@@ -129,12 +129,12 @@ class Navigator:
             self._obeyed_ns = now_ns
         if abs(report.speed_m_s) > STUCK_M_S or not order.speed_m_s or report.driving != Driving.DRIVING:
             self._moved_ns = now_ns
-        if order.trouble:
-            self.stop(order.trouble)
+        if order.stop_reason:
+            self.stop(order.stop_reason)
         elif order.arrived:
-            if self.stands:
+            if self.is_standing:
                 self.phase = Phase.ARRIVED
-        elif now_ns - self._obeyed_ns > OBEYS_NS:
+        elif now_ns - self._obeyed_ns > EXECUTION_TIMEOUT_NS:
             self.stop(f"the controller does not execute drive setpoints; its last refusal is {report.refusal}")
-        elif now_ns - self._moved_ns > MOVES_NS:
+        elif now_ns - self._moved_ns > MOTION_TIMEOUT_NS:
             self.stop("the wheels do not turn")

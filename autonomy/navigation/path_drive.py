@@ -8,24 +8,24 @@ from typing import Final
 
 from autonomy.localization.location import Location, Status
 from autonomy.navigation.clothoid_path import Path
-from autonomy.navigation.follower import Following, Steer, follow
-from autonomy.navigation.drive_request import Order
+from autonomy.navigation.drive_request import DriveRequest
+from autonomy.navigation.follower import FollowerState, SteeringCommand, follow_path
 from autonomy.navigation.speed import (
     Rocking,
     bend_speed_m_s,
     stopping_speed_m_s,
-    terrain_share,
+    terrain_speed_share,
     tip_margin_m,
 )
 from can_dbc.messages.vehicle import Steering
 from machine.profile import Carrier
 
-SIGMA_M: Final = 0.25
+MAX_SIGMA_M: Final = 0.25
 """A worse position is not used for driving."""
-ASTRAY_M: Final = 1.5
+MAX_OFF_PATH_M: Final = 1.5
 """A machine that was on the path and is this far beside it is reported as off the path."""
-ON_M: Final = 0.5
-ON_RAD: Final = 0.3
+ON_PATH_M: Final = 0.5
+ON_PATH_RAD: Final = 0.3
 """Closer than this to the path and its direction, the machine is on it."""
 RECKONING_SHARE: Final = 0.5
 """Share of the speed while dead reckoning."""
@@ -40,7 +40,7 @@ HALT_NS: Final = 2_000_000_000
 """A machine that does not come to rest in this time is braked."""
 
 
-class Along:
+class PathDrive:
     """One drive along ``path``; ``stop_m`` is where along it to stop, None for its end.
 
     ``steer`` is the follower's last output.
@@ -50,10 +50,10 @@ class Along:
         self, carrier: Carrier, path: Path, stop_m: float | None = None, speed_m_s: float | None = None
     ) -> None:
         self.path = path
-        self.steer: Steer | None = None
+        self.steer: SteeringCommand | None = None
         self._carrier = carrier
         self._speed = carrier.cruise_speed_m_s if speed_m_s is None else speed_m_s
-        self._following = Following()
+        self._following = FollowerState()
         self._rocking = Rocking()
         self._on = False
         self._correction = 0.0
@@ -69,23 +69,25 @@ class Along:
         """Distance left to the stop."""
         return self._stop_m - (self.steer.s_m if self.steer else 0.0)
 
-    def step(self, location: Location) -> Order:
+    def step(self, location: Location) -> DriveRequest:
         """The drive request for one location."""
-        if trouble := self._trouble(location):
+        if stop_reason := self._stop_reason(location):
             self._following = replace(self._following, articulation_rad=None, stamp_ns=0)
             self._correction = 0.0
-            return Order(trouble=trouble)
+            return DriveRequest(stop_reason=stop_reason)
         wanted = self._wanted(location)
-        self._following, steer = follow(self._carrier, self.path, self._following, location, wanted)
+        self._following, steer = follow_path(self._carrier, self.path, self._following, location, wanted)
         self.steer = steer
-        self._on = self._on or (abs(steer.off_m) < ON_M and abs(steer.off_rad) < ON_RAD)
-        if self._on and abs(steer.off_m) > ASTRAY_M:
-            return Order(trouble=f"the machine is {abs(steer.off_m):.1f} m beside its path; plan the drive again")
+        self._on = self._on or (abs(steer.off_m) < ON_PATH_M and abs(steer.off_rad) < ON_PATH_RAD)
+        if self._on and abs(steer.off_m) > MAX_OFF_PATH_M:
+            return DriveRequest(
+                stop_reason=f"the machine is {abs(steer.off_m):.1f} m beside its path; plan the drive again"
+            )
         if self.left_m <= STOP_M:
             return self._halt(location)
         self._halting_ns = 0
         speed = self._corrected(min(wanted, stopping_speed_m_s(self.left_m - STOP_M)), location)
-        return Order(
+        return DriveRequest(
             Steering.ARTICULATION, 0.0, 0.0, steer.articulation_rad, steer.articulation_rate_rad_s, speed, False
         )
 
@@ -95,20 +97,20 @@ class Along:
         self._correction = 0.0
         self._stamp_ns = location.stamp_ns
 
-    def _halt(self, location: Location) -> Order:
+    def _halt(self, location: Location) -> DriveRequest:
         """Come to rest: on a slope the drive must hold the machine until the brake is on."""
         self._halting_ns = self._halting_ns or location.stamp_ns
         rests = abs(location.speed_m_s) < HALTED_M_S or location.stamp_ns - self._halting_ns > HALT_NS
         speed = 0.0 if rests else self._corrected(0.0, location)
-        return Order(Steering.ARTICULATION, 0.0, 0.0, location.articulation_rad, 0.0, speed, rests)
+        return DriveRequest(Steering.ARTICULATION, 0.0, 0.0, location.articulation_rad, 0.0, speed, rests)
 
-    def _trouble(self, location: Location) -> str:
+    def _stop_reason(self, location: Location) -> str:
         if not location.usable:
             return f"not located: {location.reason}"
-        if location.sigma_m > SIGMA_M:
+        if location.sigma_m > MAX_SIGMA_M:
             return f"the position is only accurate to {location.sigma_m:.2f} m"
         margin = self._margin(location)
-        if terrain_share(margin, self._rocking.step(location)) == 0.0:
+        if terrain_speed_share(margin, self._rocking.step(location)) == 0.0:
             return f"the machine is too close to tipping over: {margin:.2f} m margin left"
         return ""
 
@@ -121,7 +123,7 @@ class Along:
 
     def _wanted(self, location: Location) -> float:
         """The speed allowed by bends and ground."""
-        share = terrain_share(self._margin(location), self._rocking.rate_rad_s)
+        share = terrain_speed_share(self._margin(location), self._rocking.rate_rad_s)
         if location.status is Status.DEAD_RECKONING:
             share *= RECKONING_SHARE
         s = self._following.s_m

@@ -14,13 +14,13 @@ from machine.profile import Carrier
 
 MASS_HEIGHT_M: Final = 0.55
 """Height of the centre of mass above the pivots, crane in transport pose, bunk full (assumed)."""
-MASS_REACH: Final = 0.9
+MASS_REACH_SHARE: Final = 0.9
 """Both halves have the same mass, which acts at this share of the distance to the axle (assumed)."""
 FULL_MARGIN_M: Final = 0.55
 """Full speed with this margin to the edge of the support polygon; ..."""
-LEAST_MARGIN_M: Final = 0.20
+MIN_MARGIN_M: Final = 0.20
 """... no driving below this one."""
-SLOWEST: Final = 0.3
+MIN_SPEED_SHARE: Final = 0.3
 """Share of the wanted speed just above the least margin, or on the roughest ground."""
 CALM_RAD_S: Final = 0.06
 ROUGH_RAD_S: Final = 0.30
@@ -31,9 +31,9 @@ RATE_SHARE: Final = 0.85
 BRAKING_M_S2: Final = 0.15
 CREEP_M_S: Final = 0.10
 GRAVITY_M_S2: Final = 9.81
-LOOK_M: Final = 1.5
+LOOK_AHEAD_M: Final = 1.5
 """Look-ahead distance for bends."""
-LOOK_STEP_M: Final = 0.25
+LOOK_AHEAD_STEP_M: Final = 0.25
 
 
 def tip_margin_m(carrier: Carrier, location: Location, acceleration_m_s2: float = 0.0) -> float:
@@ -44,8 +44,8 @@ def tip_margin_m(carrier: Carrier, location: Location, acceleration_m_s2: float 
     """
     height = pivot_height_m(carrier, location.front_height_m) + MASS_HEIGHT_M
     side = math.atan2(acceleration_m_s2, GRAVITY_M_S2)
-    front = rear_from_front(location.articulation_rad, (MASS_REACH * carrier.front_axle_m, 0.0, 0.0))
-    x = 0.5 * (front[0] - MASS_REACH * carrier.rear_axle_m) - height * math.tan(location.pitch_rad)
+    front = rear_from_front(location.articulation_rad, (MASS_REACH_SHARE * carrier.front_axle_m, 0.0, 0.0))
+    x = 0.5 * (front[0] - MASS_REACH_SHARE * carrier.rear_axle_m) - height * math.tan(location.pitch_rad)
     y = 0.5 * front[1] - height * math.tan(side) - height * math.tan(location.roll_rad)
     points = []
     for arm in (ARMS[0], ARMS[2], ARMS[3], ARMS[1]):
@@ -76,13 +76,13 @@ class Rocking:
         return self.rate_rad_s
 
 
-def terrain_share(margin_m: float, rocking_rad_s: float) -> float:
+def terrain_speed_share(margin_m: float, rocking_rad_s: float) -> float:
     """Share of the wanted speed that ground and slope allow; 0 means stop."""
-    if margin_m < LEAST_MARGIN_M:
+    if margin_m < MIN_MARGIN_M:
         return 0.0
-    steady = min(1.0, (margin_m - LEAST_MARGIN_M) / (FULL_MARGIN_M - LEAST_MARGIN_M))
+    steady = min(1.0, (margin_m - MIN_MARGIN_M) / (FULL_MARGIN_M - MIN_MARGIN_M))
     calm = min(1.0, max(0.0, (ROUGH_RAD_S - rocking_rad_s) / (ROUGH_RAD_S - CALM_RAD_S)))
-    return SLOWEST + (1.0 - SLOWEST) * min(steady, calm)
+    return MIN_SPEED_SHARE + (1.0 - MIN_SPEED_SHARE) * min(steady, calm)
 
 
 def bend_speed_m_s(carrier: Carrier, path: Path, s_m: float) -> float:
@@ -90,9 +90,9 @@ def bend_speed_m_s(carrier: Carrier, path: Path, s_m: float) -> float:
     fastest = math.inf
     lf, lr = carrier.front_axle_m, carrier.rear_axle_m
     limit = RATE_SHARE * carrier.articulation_rate_limit_rad_s
-    curves = [path.at(s_m + k * LOOK_STEP_M)[3] for k in range(int(LOOK_M / LOOK_STEP_M) + 2)]
+    curves = [path.at(s_m + k * LOOK_AHEAD_STEP_M)[3] for k in range(int(LOOK_AHEAD_M / LOOK_AHEAD_STEP_M) + 2)]
     for before, after in pairwise(curves):
-        swing_1_m = abs(after - before) / LOOK_STEP_M * (lf + lr)
+        swing_1_m = abs(after - before) / LOOK_AHEAD_STEP_M * (lf + lr)
         if swing_1_m > 0.0:
             fastest = min(fastest, limit / swing_1_m)
     return fastest

@@ -12,15 +12,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from autonomy.localization.local_plane import Plane, wrapped, yaw_from_heading
-from autonomy.navigation.drive_request import Order
+from autonomy.localization.local_plane import LocalPlane, wrapped, yaw_from_heading
+from autonomy.navigation.drive_request import DriveRequest
 from can_dbc.messages.vehicle import Steering, VehicleReport
 from machine.geometry.carrier import turning_radius_m
 from machine.profile import Carrier
+from runtime.errors import CodedError
 
-LEAST_M: Final = 1.0
+MIN_SWITCH_M: Final = 1.0
 """Least switching distance; with less, a machine that misses a waypoint would circle round it."""
-MOST_M: Final = 12.0
+MAX_SWITCH_M: Final = 12.0
 FRESH_NS: Final = 500_000_000
 
 
@@ -32,17 +33,21 @@ class Waypoint:
     longitude_deg: float
 
 
-class PaperB:
+class NoWaypoints(CodedError, ValueError):
+    """A drive has no waypoints."""
+
+
+class WaypointDrive:
     """One drive along ``waypoints``; ``number`` is the index of the current one.
 
-    The last one is reached within ``LEAST_M``, or once it lies behind the machine.
+    The last one is reached within ``MIN_SWITCH_M``, or once it lies behind the machine.
     """
 
     def __init__(self, carrier: Carrier, waypoints: Sequence[Waypoint], speed_m_s: float | None = None) -> None:
         if not waypoints:
-            raise ValueError("a drive needs at least one waypoint")
+            raise NoWaypoints("path.no-waypoints", "a drive needs at least one waypoint")
         self.number = 0
-        self._plane = Plane(waypoints[0].latitude_deg, waypoints[0].longitude_deg)
+        self._plane = LocalPlane(waypoints[0].latitude_deg, waypoints[0].longitude_deg)
         self._waypoints = tuple(waypoints)
         self._points = [self._plane.local(w.latitude_deg, w.longitude_deg)[:2] for w in waypoints]
         self._ahead_m = carrier.front_axle_m - carrier.antenna_main_m[0]
@@ -53,19 +58,19 @@ class PaperB:
     def switch_m(self, number: int) -> float:
         """Distance from a waypoint at which the next one becomes the goal [m]."""
         if self._from is None or number + 1 >= len(self._points):
-            return LEAST_M
+            return MIN_SWITCH_M
         before = self._points[number - 1] if number else self._from
         here, after = self._points[number], self._points[number + 1]
         turn = wrapped(_bearing(here, after) - _bearing(before, here))
-        return min(MOST_M, max(LEAST_M, self._radius_m * math.tan(min(abs(turn), 3.0) / 2.0)))
+        return min(MAX_SWITCH_M, max(MIN_SWITCH_M, self._radius_m * math.tan(min(abs(turn), 3.0) / 2.0)))
 
-    def step(self, report: VehicleReport) -> Order:
+    def step(self, report: VehicleReport) -> DriveRequest:
         """The drive request for one report."""
         seen = report.position_ns and report.stamp_ns - report.position_ns <= FRESH_NS
         if not seen or not math.isfinite(report.latitude_deg + report.longitude_deg):
-            return Order(Steering.WAYPOINT, trouble="no position from the receiver")
+            return DriveRequest(Steering.WAYPOINT, stop_reason="no position from the receiver")
         if not math.isfinite(report.heading_rad) or report.stamp_ns - report.heading_ns > FRESH_NS:
-            return Order(Steering.WAYPOINT, trouble="no heading from the receiver")
+            return DriveRequest(Steering.WAYPOINT, stop_reason="no heading from the receiver")
         east, north, _ = self._plane.local(report.latitude_deg, report.longitude_deg)
         yaw = yaw_from_heading(report.heading_rad)
         at = east + self._ahead_m * math.cos(yaw), north + self._ahead_m * math.sin(yaw)
@@ -87,9 +92,9 @@ class PaperB:
         here = self._points[self.number]
         return (at[0] - here[0]) * (here[0] - before[0]) + (at[1] - here[1]) * (here[1] - before[1]) > 0.0
 
-    def _order(self, speed_m_s: float, arrived: bool = False) -> Order:
+    def _order(self, speed_m_s: float, arrived: bool = False) -> DriveRequest:
         goal = self._waypoints[self.number]
-        return Order(Steering.WAYPOINT, goal.latitude_deg, goal.longitude_deg, 0.0, 0.0, speed_m_s, arrived)
+        return DriveRequest(Steering.WAYPOINT, goal.latitude_deg, goal.longitude_deg, 0.0, 0.0, speed_m_s, arrived)
 
 
 def _bearing(a: tuple[float, float], b: tuple[float, float]) -> float:

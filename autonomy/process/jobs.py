@@ -13,18 +13,19 @@ from typing import Any, Final, Protocol
 import msgspec
 
 from autonomy.crane_job.activity import Activity
-from autonomy.grasp.direct import Grasp
-from autonomy.manager.manager import Manager
-from autonomy.manager.progress import Progress
-from autonomy.manager.table import ENDS, State
+from autonomy.grasp.grasp import Grasp
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.checkpoint import Checkpoint
+from autonomy.manager.transition_table import FINAL_STATES, State
 from autonomy.missions.model import ForwardingMission
-from autonomy.perception.logs import LogObservation
-from autonomy.process.mission_publisher import Voice
-from can_dbc.mission_datagrams import MissionOrder, MissionReport, Order
-from can_dbc.setpoint import StateReport, VehicleReport
+from autonomy.perception.log_list.observation import LogObservation
+from autonomy.process.mission_publisher import MissionPublisher
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.mission import MissionOrder, MissionReport, Order
+from can_dbc.messages.vehicle import VehicleReport
 
-News = tuple[str, Mapping[str, Any]]
-COME_TO_REST_NS: Final = 5_000_000_000
+JobEvent = tuple[str, Mapping[str, Any]]
+STOPPING_TIMEOUT_NS: Final = 5_000_000_000
 """After its end a mission goes on telling the machine to stand for so long, or until it does."""
 
 ABORTED: Final = "aborted by the operator"
@@ -53,23 +54,23 @@ class Job(Protocol):
     def abort(self, reason: str) -> None:
         """End it; the machine comes to a smooth stop."""
 
-    def news(self) -> Iterator[News]:
+    def events(self) -> Iterator[JobEvent]:
         """What is to be told, now."""
 
     def outcome(self) -> dict[str, Any]:
         """What it came to."""
 
-    def obey(self, order: MissionOrder) -> str:
+    def execute(self, order: MissionOrder) -> str:
         """Do what a person orders; why not, or empty."""
 
     def report(self, now_ns: int) -> MissionReport | None:
         """What those who watch it are told, if there is more to tell than the controller does."""
 
-    def progress(self) -> Progress | None:
+    def progress(self) -> Checkpoint | None:
         """What a planner that is started again must know to go on, if it can."""
 
 
-class OneLog:
+class SingleLogJob:
     """A crane's activity as a job."""
 
     def __init__(self, activity: Activity) -> None:
@@ -101,7 +102,7 @@ class OneLog:
         """The crane stops smoothly."""
         self._activity.abort(reason)
 
-    def news(self) -> Iterator[News]:
+    def events(self) -> Iterator[JobEvent]:
         """The grasp, the phase and what it waits for."""
         yield from _of_crane(self._activity.grasp, self._activity.phase.name)
         yield _waiting(self._activity.paused)
@@ -110,7 +111,7 @@ class OneLog:
         """Nothing but the end itself."""
         return {}
 
-    def obey(self, order: MissionOrder) -> str:
+    def execute(self, order: MissionOrder) -> str:
         """It can be ended, and no more."""
         if order.order is not Order.ABORT:
             return "one log is laid into the bunk; there is no mission to order about"
@@ -121,20 +122,20 @@ class OneLog:
         """Nothing."""
         return None
 
-    def progress(self) -> Progress | None:
+    def progress(self) -> Checkpoint | None:
         """Nothing: it begins anew with what is seen."""
         return None
 
 
-class Forwarding:
+class ForwardingJob:
     """An activity manager as a job, with its switch at Auto from the beginning; a mission that goes on where another
     planner ended waits at Idle, for nobody knows what was done to the machine meanwhile.
     """
 
-    def __init__(self, manager: Manager, mission: ForwardingMission) -> None:
+    def __init__(self, manager: ActivityManager, mission: ForwardingMission) -> None:
         self._manager = manager
         self._ended_ns = self._now_ns = 0
-        self._voice = Voice(manager, mission)
+        self._voice = MissionPublisher(manager, mission)
         self._auto = not manager.resumed
         self._order, self._refusal = 0, ""
         if self._auto:
@@ -144,10 +145,10 @@ class Forwarding:
     def idle(self) -> bool:
         """Whether the mission has ended and crane and machine stand."""
         manager = self._manager
-        if manager.state not in ENDS:
+        if manager.state not in FINAL_STATES:
             return False
-        rests = manager.outlook.stands() and (manager.activity is None or manager.activity.idle)
-        return rests or self._now_ns - self._ended_ns > COME_TO_REST_NS
+        rests = manager.world.is_standing() and (manager.activity is None or manager.activity.idle)
+        return rests or self._now_ns - self._ended_ns > STOPPING_TIMEOUT_NS
 
     @property
     def done(self) -> bool:
@@ -165,7 +166,7 @@ class Forwarding:
         """One turn of the manager."""
         self._now_ns = now_ns
         sent = self._manager.step(now_ns, report, vehicle, logs)
-        if self._manager.state not in ENDS:
+        if self._manager.state not in FINAL_STATES:
             self._ended_ns = now_ns
         return sent
 
@@ -173,10 +174,10 @@ class Forwarding:
         """Crane and machine stop smoothly; a mission that was never begun ends too."""
         self._manager.abort(reason)
 
-    def news(self) -> Iterator[News]:
+    def events(self) -> Iterator[JobEvent]:
         """The state, the load, the crane's grasp and phase, and what it waits for."""
         manager, activity = self._manager, self._manager.activity
-        yield "state", {"state": manager.state.name, "words": manager.words}
+        yield "state", {"state": manager.state.name, "words": manager.description}
         yield "load", {"logs": manager.tally.loaded}
         if activity is not None:
             yield from _of_crane(activity.grasp, activity.phase.name)
@@ -187,18 +188,18 @@ class Forwarding:
         tally = self._manager.tally
         given_up = [{"log": number, "reason": reason} for number, reason in tally.given_up.items()]
         return {
-            "loaded": tally.loaded, "driven_m": round(self._manager.ride.driven_m, 1), "given_up": given_up,
+            "loaded": tally.loaded, "driven_m": round(self._manager.route.driven_m, 1), "given_up": given_up,
             "loads": msgspec.to_builtins(tally.loads),
         }  # fmt: skip
 
-    def obey(self, order: MissionOrder) -> str:
+    def execute(self, order: MissionOrder) -> str:
         """Pause and go on, step by step or through, or end; an ended mission obeys nothing."""
-        self._order, self._refusal = order.sequence, self._obeyed(order.order)
+        self._order, self._refusal = order.sequence, self._executed(order.order)
         return self._refusal
 
-    def _obeyed(self, order: Order) -> str:
+    def _executed(self, order: Order) -> str:
         manager = self._manager
-        if manager.state in ENDS:
+        if manager.state in FINAL_STATES:
             return "the mission has ended"
         match order:
             case Order.AUTO:
@@ -212,9 +213,9 @@ class Forwarding:
             case Order.RUN_THROUGH:
                 manager.single_step = False
             case Order.NEXT_STEP:
-                if manager.waiting is None:
+                if manager.pending_event is None:
                     return "nothing waits for the next step"
-                manager.step_on()
+                manager.next_step()
             case Order.ABORT:
                 manager.abort(ABORTED)
         return ""
@@ -223,17 +224,17 @@ class Forwarding:
         """How the mission stands."""
         return self._voice.report(now_ns, self._auto, self._order, self._refusal)
 
-    def progress(self) -> Progress:
+    def progress(self) -> Checkpoint:
         """How far the mission has come."""
         return self._manager.progress()
 
 
-def _of_crane(grasp: Grasp | None, phase: str) -> Iterator[News]:
+def _of_crane(grasp: Grasp | None, phase: str) -> Iterator[JobEvent]:
     if grasp is not None:
         logs = [log.id for log in grasp.logs]
         yield "grasp", {"logs": logs, "probability": grasp.probability, "reason": grasp.reason}
     yield "phase", {"phase": phase}
 
 
-def _waiting(reason: str | None) -> News:
+def _waiting(reason: str | None) -> JobEvent:
     return "paused", {"reason": reason}

@@ -14,33 +14,33 @@ import numpy as np
 import pymap3d
 
 from autonomy.crane_job.phases import Phase
-from autonomy.localization.plane import Plane
-from autonomy.manager.manager import Manager
-from autonomy.manager.table import ENDS, EVENTS
-from autonomy.manager.world_model import ATTEMPTS
-from autonomy.missions.local import bearing_from_yaw
+from autonomy.localization.local_plane import LocalPlane
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.transition_table import EVENT_DESCRIPTIONS, FINAL_STATES
+from autonomy.manager.world_model import MAX_ATTEMPTS
+from autonomy.missions.local_frame import bearing_from_yaw
 from autonomy.missions.model import ForwardingMission, Point
-from can_dbc.mission_datagrams import (
+from can_dbc.messages.mission import (
     MAX_CORNERS,
     MAX_FENCES,
     MAX_GIVEN_UP,
     MAX_LANDINGS,
     MAX_LOGS,
-    MAX_ROUTE,
+    MAX_ROUTE_POINTS,
     MAX_TARGETS,
-    MAX_TEXT,
-    Area,
-    GivenUp,
+    MAX_TEXT_CHARS,
+    Fence,
+    AbandonedLog,
     LatLon,
-    Lying,
+    KnownLog,
     MissionReport,
-    Pile,
-    Whereabouts,
+    Landing,
+    MachinePose,
 )
 
 DIGITS: Final = 8
 """Of a degree: about a millimetre."""
-CRANE: Final = {
+CRANE_PHASES: Final = {
     Phase.WAIT: "",
     Phase.LOOK: "looks for the log",
     Phase.ABOVE: "moves above the log",
@@ -58,20 +58,20 @@ CRANE: Final = {
 T = TypeVar("T")
 
 
-class Voice:
+class MissionPublisher:
     """Speaks for one manager and its mission."""
 
-    def __init__(self, manager: Manager, mission: ForwardingMission) -> None:
+    def __init__(self, manager: ActivityManager, mission: ForwardingMission) -> None:
         self._manager = manager
         self._name = _text(mission.name)
-        self._route = tuple(map(_place, _thinned(mission.waypoints, MAX_ROUTE)))
+        self._route = tuple(map(_place, _thinned(mission.waypoints, MAX_ROUTE_POINTS)))
         self._closed = mission.options.laps > 1
         fences = mission.fences[:MAX_FENCES]
         share = MAX_CORNERS // max(1, len(fences))
         self._fences = tuple(
-            Area(tuple(map(_place, _thinned(f.corners, share))), f.keep_out, _text(f.name)) for f in fences
+            Fence(tuple(map(_place, _thinned(f.corners, share))), f.keep_out, _text(f.name)) for f in fences
         )
-        self._landings = tuple(Pile(_place(x.position), _text(x.name)) for x in mission.landings[:MAX_LANDINGS])
+        self._landings = tuple(Landing(_place(x.position), _text(x.name)) for x in mission.landings[:MAX_LANDINGS])
 
     def report(self, now_ns: int, auto: bool, order: int = 0, refusal: str = "") -> MissionReport:
         """How it stands now; ``auto``: where the switch is; ``order`` and ``refusal`` are those of the last order."""
@@ -82,12 +82,12 @@ class Voice:
             schema=1,
             name=self._name,
             state=manager.state.name,
-            words=_text(manager.words),
-            ended=manager.state in ENDS,
+            words=_text(manager.description),
+            ended=manager.state in FINAL_STATES,
             auto=auto,
             single_step=manager.single_step,
-            paused="" if manager.state in ENDS else _text(manager.paused),
-            waits_for="" if manager.waiting is None else EVENTS[manager.waiting],
+            paused="" if manager.state in FINAL_STATES else _text(manager.paused),
+            waits_for="" if manager.pending_event is None else EVENT_DESCRIPTIONS[manager.pending_event],
             failure=_text(manager.failure),
             order=order,
             refusal=_text(refusal),
@@ -96,10 +96,10 @@ class Voice:
             on_board_m3=round(tally.board_m3, 3),
             unloaded=tally.unloaded,
             missed=tally.missed,
-            given_up=tuple(GivenUp(number, _text(reason)) for number, reason in given_up),
-            driven_m=round(manager.ride.driven_m, 1),
+            given_up=tuple(AbandonedLog(number, _text(reason)) for number, reason in given_up),
+            driven_m=round(manager.route.driven_m, 1),
             targets=self._targets(),
-            crane="" if activity is None else CRANE[activity.phase],
+            crane="" if activity is None else CRANE_PHASES[activity.phase],
             here=self._here(),
             route=self._route,
             closed=self._closed,
@@ -113,20 +113,20 @@ class Voice:
         manager = self._manager
         if manager.activity is None or manager.activity.grasp is None:
             return () if manager.target is None else (manager.target,)
-        numbers = (manager.outlook.number_of(log.id) for log in manager.activity.grasp.logs)
+        numbers = (manager.world.map_number(log.id) for log in manager.activity.grasp.logs)
         return tuple(number for number in numbers if number is not None)[:MAX_TARGETS]
 
-    def _here(self) -> Whereabouts | None:
-        location = self._manager.outlook.location
+    def _here(self) -> MachinePose | None:
+        location = self._manager.world.location
         if location is None or not location.usable:
             return None
-        (place,) = _degrees(self._manager.outlook.plane, [(location.x_m, location.y_m)])
+        (place,) = _degrees(self._manager.world.plane, [(location.x_m, location.y_m)])
         heading = round(bearing_from_yaw(location.yaw_rad), 2)
-        return Whereabouts(place, heading, round(location.sigma_m, 3))
+        return MachinePose(place, heading, round(location.sigma_m, 3))
 
-    def _logs(self, now_ns: int) -> tuple[Lying, ...]:
-        outlook = self._manager.outlook
-        location, logs = outlook.location, list(outlook.field.logs)
+    def _logs(self, now_ns: int) -> tuple[KnownLog, ...]:
+        world = self._manager.world
+        location, logs = world.location, list(world.log_map.logs)
         if not logs:  # nor need there be a plane
             return ()
         if len(logs) > MAX_LOGS and location is not None and location.usable:
@@ -134,7 +134,7 @@ class Voice:
             logs.sort(key=lambda log: math.dist(here, log.center_m[:2]))
         logs = logs[:MAX_LOGS]
         return tuple(
-            Lying(
+            KnownLog(
                 log.number,
                 place,
                 round(bearing_from_yaw(math.atan2(log.axis[1], log.axis[0])), 1),
@@ -142,9 +142,9 @@ class Voice:
                 round(log.diameter_m, 3),
                 round(max(0, now_ns - log.seen_ns) * 1e-9, 1),
                 log.misses,
-                log.misses >= ATTEMPTS,
+                log.misses >= MAX_ATTEMPTS,
             )
-            for log, place in zip(logs, _degrees(outlook.plane, [log.center_m[:2] for log in logs]), strict=True)
+            for log, place in zip(logs, _degrees(world.plane, [log.center_m[:2] for log in logs]), strict=True)
         )
 
 
@@ -159,7 +159,7 @@ def _place(point: Point) -> LatLon:
     return round(point.latitude_deg, DIGITS), round(point.longitude_deg, DIGITS)
 
 
-def _degrees(plane: Plane, points: Sequence[Sequence[float] | np.ndarray]) -> list[LatLon]:
+def _degrees(plane: LocalPlane, points: Sequence[Sequence[float] | np.ndarray]) -> list[LatLon]:
     """Places of points of the plane; all at once, for one by one they would cost the planner tens of ms."""
     if not points:
         return []
@@ -172,6 +172,6 @@ def _degrees(plane: Plane, points: Sequence[Sequence[float] | np.ndarray]) -> li
 def _text(text: str) -> str:
     """Cut to what fits, in bytes; what cannot be printed would take many of them."""
     plain = "".join(c if c.isprintable() else " " for c in text)
-    if len(plain.encode()) <= MAX_TEXT:
+    if len(plain.encode()) <= MAX_TEXT_CHARS:
         return plain
-    return plain.encode()[: MAX_TEXT - len("…".encode())].decode(errors="ignore") + "…"
+    return plain.encode()[: MAX_TEXT_CHARS - len("…".encode())].decode(errors="ignore") + "…"

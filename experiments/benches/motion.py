@@ -1,8 +1,8 @@
-"""How long clear ways take to plan and to drive, in the scenes of the simulator, beside always going at full height.
+"""Benchmark of motion planning: planning time and duration of collision-free motions, compared with full-height travel.
 
-For every scene one cycle is planned, as the activity does: from where the crane stands to a log, with the log to the
-bunk, and back to the next.  Planning is measured in CPU time of this process, once as it comes and again as the best of
-a few, which is what a quiet machine would take.  Motions are compared with `autonomy.motion.trajectory.travel_over`.
+In every scene one cycle is planned as the activity does: from the rest position to a log, with the log to the bunk, and
+back to the next log.  Planning is measured in CPU time of this process, for the first run and for the best of a few,
+which is what a quiet host takes.  Motions are compared with `autonomy.motion.trajectory.travel`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from autonomy.grasp.grapple_heights import approach_length_m, hover_height_m, tr
 from autonomy.grasp.placement import plan_place
 from autonomy.grasp.planner import NoGrasp
 from autonomy.grasp.selection import plan_single_log_grasp
-from autonomy.missions.crane_job import Mission
+from autonomy.missions.crane_job import CraneJob
 from autonomy.motion.arm import Arm
 from autonomy.motion.clearance import clearance_reserve
 from autonomy.motion.motion_planner import TimeOptimalPlanner
-from autonomy.motion.obstacles import HeldLog, CollisionScene, held_log, collision_scene
+from autonomy.motion.obstacles import CollisionScene, HeldLog, collision_scene, held_log
 from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, travel_over
 from autonomy.perception.log_list.observation import LogObservation
@@ -37,13 +37,14 @@ from sim.wood.log_shape import LogSpec
 from sim.world import home_pose
 
 SCENES: Final = (("separate", 2), ("parallel", 3), ("crossed", 3), ("pile", 5))
-AGAIN: Final = 3
+REPEAT_COUNT: Final = 3
 GOAL_MS: Final = 50.0
 
 
 @dataclass(slots=True)
 class Bench:
-    """Figures of one machine: CPU times [ms], durations [s] of ours and of travel, how clear travel was [m]."""
+    """Measurements of one machine: CPU times [ms], durations [s] of our motions and of travel, clearance of travel
+    [m]."""
 
     cpu_ms: list[float] = field(default_factory=list)
     best_ms: list[float] = field(default_factory=list)
@@ -54,7 +55,7 @@ class Bench:
     no_grasp: int = 0
 
     def metrics(self) -> dict[str, float]:
-        """Flat figures."""
+        """Metrics by name."""
         return {
             "motions": len(self.cpu_ms),
             "blocked": len(self.blocked),
@@ -74,7 +75,7 @@ def _at(values: list[float], percent: float) -> float:
 
 
 def run(profile: Profile, seeds: int, progress: Callable[[int, int], None] = lambda done, total: None) -> Bench:
-    """Plans a cycle in every scene of every seed."""
+    """Plan one cycle in every scene of every seed."""
     bench, arm, wood = Bench(), Arm(profile), wood_of(profile.name, "nominal")
     home = arm.pose(tuple(home_pose(profile)[n] for n in ("slew", "lift", "tilt", "ext", "rot")))
     cases = [(kind, count, seed) for seed in range(seeds) for kind, count in SCENES]
@@ -86,7 +87,7 @@ def run(profile: Profile, seeds: int, progress: Callable[[int, int], None] = lam
 
 
 def observed(profile: Profile, number: int, spec: LogSpec) -> LogObservation:
-    """A log of a scene as a detector says where it lies, in the crane's base frame, the machine at its lowest."""
+    """A log of a scene as an ideal detection in the crane's base frame, with the machine at its lowest."""
     x, y, yaw, c = spec.x_m, spec.y_m, spec.yaw_rad, profile.carrier
     if c is not None:
         dx, dy, turn = x - c.crane_base_m[0], y - c.crane_base_m[1], -c.crane_yaw_rad
@@ -102,7 +103,7 @@ def _cycle(bench: Bench, arm: Arm, home: Pose, logs: list[LogObservation]) -> No
     rest = [o for o in logs if o is not log]
     try:
         grasp = plan_single_log_grasp(arm, log, home.rot_rad)
-        place = plan_place(arm, Mission(), grasp, logs)
+        place = plan_place(arm, CraneJob(), grasp, logs)
     except NoGrasp:
         bench.no_grasp += 1
         return
@@ -115,7 +116,14 @@ def _cycle(bench: Bench, arm: Arm, home: Pose, logs: list[LogObservation]) -> No
     _measure(
         bench, arm, grasp.pose, place, laden, partial(carry_motion, arm, motions, grasp.pose, place, grasp, logs, False)
     )
-    _measure(bench, arm, place, over, Task(around, None, top, 0.0), partial(approach_motion, arm, motions, place, grasp, rest))
+    _measure(
+        bench,
+        arm,
+        place,
+        over,
+        Task(around, None, top, 0.0),
+        partial(approach_motion, arm, motions, place, grasp, rest),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +138,7 @@ class Task:
 
 def _measure(bench: Bench, arm: Arm, start: Pose, goal: Pose, task: Task, make: Callable[[], Trajectory]) -> None:
     times = []
-    for _ in range(1 + AGAIN):
+    for _ in range(1 + REPEAT_COUNT):
         begin = time.process_time()
         try:
             motion = make()

@@ -10,36 +10,35 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from autonomy.localization.local_plane import Plane
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.model import ForwardingMission
 from experiments.common.ground_truth_observer import GroundTruthObserver
-from experiments.common.individuals import believed
+from experiments.common.individuals import controller_profile
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from hil.harness.display import Display
-from hil.missions.lockstep import MissionRun, MissionSummary
-from machine.load import load_profile
-from sim.site_file import Site
+from hil.missions.lockstep import MissionRun
+from hil.missions.summary import MissionSummary
+from machine.loading.profile_file import load_profile
+from sim.site.site_file import Site
 
 LANDED_M: Final = 3.0
 """A log this near to the middle of a landing counts as delivered."""
-MISSION_SOURCES: Final = ("autonomy", "controller", "hil/harness/lockstep.py", "hil/missions/lockstep.py", "hil/missions/site.py",
-                  "hil/harness/operator.py", "hil/calibration/crane.py", "docs/examples/paper_b.geojson")  # fmt: skip
-"""What the outcome of a mission depends on, beside the sources of every trial."""
+
 
 def run_mission(job: Job, mission: ForwardingMission, site: Site) -> dict[str, Any]:
-    """What became of a mission on a site."""
+    """Drive a mission on a site; options: profile, truth, text, way (method), eyes (detector), limit_s."""
     o = job.options
-    with believed(o["profile"], o.get("text")) as name:
+    with controller_profile(o["profile"], o.get("text")) as name:
         profile = load_profile(name)
         plant = site.plant(profile_named(o["profile"]), o["truth"], job.seed)
         try:
             with Display(Console(quiet=True), job.name) as display:
                 run = MissionRun(mission, name, profile, plant, None, display, o["way"], site, o["eyes"], job.seed)
-                observer = GroundTruthObserver(run, profile, Plane(site.latitude_deg, site.longitude_deg))
+                observer = GroundTruthObserver(run, profile, LocalPlane(site.latitude_deg, site.longitude_deg))
                 summary = run.run(o["limit_s"], "", observer.step)
-            verdict, lying = plant.judge(), plant.logs()
-            plane = Plane(site.latitude_deg, site.longitude_deg)
+            verdict, lying = plant.evaluate(), plant.logs()
+            plane = LocalPlane(site.latitude_deg, site.longitude_deg)
             landings = [plane.local(x.position.latitude_deg, x.position.longitude_deg)[:2] for x in mission.landings]
             return {
                 **summary_of(summary),
@@ -62,7 +61,7 @@ def run_mission(job: Job, mission: ForwardingMission, site: Site) -> dict[str, A
 
 
 def summary_of(summary: MissionSummary) -> dict[str, Any]:
-    """What the run itself says."""
+    """The summary of the run as plain data."""
     return {
         "finished": summary.finished, "failure": summary.failure, "loaded": summary.loaded,
         "given_up": {str(k): v for k, v in summary.given_up.items()}, "seconds": summary.seconds,

@@ -1,4 +1,4 @@
-"""One mission with a judge beside the machine, or the calibration of the individual that drives it: plain data."""
+"""One mission, or the calibration of the individual that drives it, as plain data."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import msgspec
 
-from autonomy.localization.local_plane import Plane
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.model import ForwardingMission, KnownLog, Point
 from experiments.common.individuals import calibrated
@@ -19,24 +19,24 @@ from experiments.common.worlds import profile_named
 from hil.missions.site import site_of
 
 ALONG_M: Final = 0.5
-"""In other missions than the first each log lies so far off its place along the route, at most, ..."""
+"""Maximum shift of a log along the route on a shuffled field."""
 ACROSS_M: Final = 0.25
-"""... so far across it, ..."""
+"""Maximum shift of a log across the route on a shuffled field."""
 TURN_DEG: Final = 15.0
-"""... and turned by so much."""
+"""Maximum turn of a log on a shuffled field."""
 SHORT_M: Final = 17.0
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """A job of either kind."""
-    return calibrated(job) if job.kind == "calibration" else driven(job)
+    """Run a job of either kind."""
+    return calibrated(job) if job.kind == "calibration" else drive(job)
 
 
-def driven(job: Job) -> dict[str, Any]:
-    """One mission.
+def drive(job: Job) -> dict[str, Any]:
+    """Drive one mission.
 
-    ``options``: profile (shipped name), truth, way, eyes, file (of the mission), shuffled (whether the logs lie
-    otherwise than in it, as the seed ``field`` says), short (whether only the first log is asked for), text (of the
+    ``options``: profile (shipped name), truth, way (method), eyes (detector), file (of the mission), shuffled (whether
+    the logs are shifted, with the seed ``field``), short (whether only the first log is loaded), text (of the
     calibrated profile; None: as shipped), limit_s.
     """
     o = job.options
@@ -51,17 +51,17 @@ def driven(job: Job) -> dict[str, Any]:
 
 
 def shuffled(mission: ForwardingMission, seed: int) -> ForwardingMission:
-    """The same mission with every log a little elsewhere; one seed, one field."""
+    """The same mission with every log shifted and turned; one seed gives one field."""
     rng = random.Random(f"field {seed}")
     first = mission.waypoints[0]
-    plane = Plane(first.latitude_deg, first.longitude_deg)
+    plane = LocalPlane(first.latitude_deg, first.longitude_deg)
     return msgspec.structs.replace(mission, logs=tuple(_elsewhere(log, plane, rng) for log in mission.logs))
 
 
 def short(mission: ForwardingMission) -> ForwardingMission:
-    """Its first steps: ``SHORT_M`` of the first leg, the first log, one lap."""
+    """A short version: ``SHORT_M`` of the first leg, the first log, one lap."""
     first, second = mission.waypoints[:2]
-    plane = Plane(first.latitude_deg, first.longitude_deg)
+    plane = LocalPlane(first.latitude_deg, first.longitude_deg)
     x, y, _ = plane.local(second.latitude_deg, second.longitude_deg)
     share = SHORT_M / math.hypot(x, y)
     lat, lon, _ = plane.geodetic(share * x, share * y)
@@ -71,7 +71,7 @@ def short(mission: ForwardingMission) -> ForwardingMission:
     )
 
 
-def _elsewhere(log: KnownLog, plane: Plane, rng: random.Random) -> KnownLog:
+def _elsewhere(log: KnownLog, plane: LocalPlane, rng: random.Random) -> KnownLog:
     x, y, _ = plane.local(log.position.latitude_deg, log.position.longitude_deg)
     x, y = x + rng.uniform(-ALONG_M, ALONG_M), y + rng.uniform(-ACROSS_M, ACROSS_M)
     turn = rng.uniform(-TURN_DEG, TURN_DEG)

@@ -1,8 +1,8 @@
-"""What a drive says: lateral errors of both ways, how fast a heading settles, how honest localization was.
+"""Measures of a drive: lateral errors of both methods, settling of the heading, consistency of the localization.
 
-Lateral errors are distances of the true middle of the front axle.  Ours is measured from the path that was planned.
-Paper B's law has no path: its machine is to come to the same path from every start, so its error is the distance from
-that path, the mean of the last laps of all starts on the same ground with the same machine.
+Lateral errors are distances of the true middle of the front axle.  Ours is measured from the planned path.  Paper B's
+law has no path: its machine should converge to the same path from every start.  Its error is the distance from that
+path, the mean of the last laps of all starts on the same ground with the same machine.
 """
 
 from __future__ import annotations
@@ -14,31 +14,31 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.navigation.clothoid_path import Path, Point2
-from autonomy.navigation.joining_path import joined
+from autonomy.navigation.joining_path import joining_path
 from experiments.navigation.trial import COLUMNS
 from machine.profile import Carrier
 
 SETTLED_RAD: Final = math.radians(5.0)
-"""A corner is over once the heading is so near to the bearing."""
+"""A corner ends when the heading is this near to the bearing."""
 TURNED: Final = (0.1, 0.9)
-"""Shares of a corner's turn between which its rate is measured."""
-LEAST_TURN_RAD: Final = 1.0
-"""Less is no corner."""
+"""Shares of the turn of a corner between which its rate is measured."""
+MIN_TURN_RAD: Final = 1.0
+"""A smaller turn is not a corner."""
 STRAIGHT_1_M: Final = 1e-6
-SAMPLES: Final = 1200
-"""Of the mean lap."""
+SAMPLE_COUNT: Final = 1200
+"""Points of the mean lap."""
 PASS_M: Final = 12.0
 Array = np.ndarray
 
 
 class Drive:
-    """The rows of one outcome as columns by name, and the way driven ``way_m``."""
+    """The rows of one outcome as columns by name, and the driven distance ``distance_m``."""
 
     def __init__(self, outcome: dict[str, Any]) -> None:
         rows = np.array([[math.nan if v is None else v for v in row] for row in outcome["rows"]], float)
         self._rows = rows.reshape(-1, len(COLUMNS))
         steps = np.hypot(np.diff(self["x_m"]), np.diff(self["y_m"]))
-        self.way_m = np.concatenate([[0.0], np.cumsum(steps)])[: len(self._rows)]
+        self.distance_m = np.concatenate([[0.0], np.cumsum(steps)])[: len(self._rows)]
         self.outcome = outcome
 
     def __getitem__(self, column: str) -> Array:
@@ -56,7 +56,7 @@ def heading_error(drive: Drive, points: Sequence[Point2]) -> Array:
 
 
 def after_first_corner(drive: Drive, points: Sequence[Point2]) -> int:
-    """Row at which a drive by paper B's law has turned to the second waypoint; the number of rows if it never has."""
+    """Row at which a drive by paper B's law has turned to the second waypoint; the number of rows if it never does."""
     error = np.abs(heading_error(drive, points))
     return int(np.argmax(np.append((drive["goal"] >= 1) & (error < SETTLED_RAD), True)))
 
@@ -68,11 +68,11 @@ def last_lap(drive: Drive, points: Sequence[Point2], lap: int) -> Array:
 
 
 def common_path(laps: Sequence[Array]) -> Array:
-    """The mean (``SAMPLES``, 2) of laps, each at equal shares of its length."""
-    out = np.zeros((SAMPLES, 2))
+    """The mean (``SAMPLE_COUNT``, 2) of laps, each at equal shares of its length."""
+    out = np.zeros((SAMPLE_COUNT, 2))
     for lap in laps:
         way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lap, axis=0).T))])
-        share = np.linspace(0.0, way[-1], SAMPLES)
+        share = np.linspace(0.0, way[-1], SAMPLE_COUNT)
         out += np.column_stack([np.interp(share, way, lap[:, k]) for k in (0, 1)]) / len(laps)
     return out
 
@@ -89,7 +89,7 @@ def distances(xy: Array, line: Array) -> Array:
     return out
 
 
-def faithful_errors(drives: Sequence[Drive], points: Sequence[Point2], lap: int) -> list[tuple[Array, Array]]:
+def convergence_errors(drives: Sequence[Drive], points: Sequence[Point2], lap: int) -> list[tuple[Array, Array]]:
     """For each start: distance from the common path after the first corner, before the last lap and on it."""
     line = common_path([last_lap(d, points, lap) for d in drives])
     out = []
@@ -102,13 +102,13 @@ def faithful_errors(drives: Sequence[Drive], points: Sequence[Point2], lap: int)
 
 
 def planned(drive: Drive, points: Sequence[Point2], carrier: Carrier) -> Path:
-    """The path that the machine planned, from where it believed to stand."""
+    """The path that the machine planned, from its estimated start."""
     x, y, yaw = drive.outcome["begin"]
-    return joined((x, y), yaw, points, carrier)
+    return joining_path((x, y), yaw, points, carrier)
 
 
 def lateral(drive: Drive, path: Path) -> tuple[Array, Array]:
-    """Way along the path and distance from it, + left [m], of every row."""
+    """Distance along the path and from it (+ left) [m] of every row."""
     ways, offs = np.empty(len(drive)), np.empty(len(drive))
     s: float | None = None
     for i, (x, y) in enumerate(zip(drive["x_m"], drive["y_m"], strict=True)):
@@ -119,7 +119,7 @@ def lateral(drive: Drive, path: Path) -> tuple[Array, Array]:
 
 
 def corner_end_m(path: Path, corner: Point2) -> float:
-    """Where the path's first bend about ``corner`` is over [m]."""
+    """End of the first bend of the path about ``corner`` [m]."""
     away = np.hypot(*(path.xy_m - corner).T)
     near = np.flatnonzero(away < PASS_M)
     gaps = np.flatnonzero(np.diff(near) > 1)
@@ -130,8 +130,9 @@ def corner_end_m(path: Path, corner: Point2) -> float:
 
 
 def turn_rates(drive: Drive) -> tuple[list[float], list[float]]:
-    """For each corner of a drive by paper B's law: how far the front turned per metre [deg/m] between ``TURNED`` of the
-    corner, and the median while the articulation was at its end.
+    """Turn of the front per metre [deg/m] in each corner of a drive by paper B's law.
+
+    First between the shares ``TURNED`` of the corner, second while the articulation was at its limit.
     """
     rates, fulls = [], []
     goal = drive["goal"].astype(int)
@@ -140,18 +141,18 @@ def turn_rates(drive: Drive) -> tuple[list[float], list[float]]:
         rows = np.flatnonzero(goal == k)
         if len(rows) < 3:
             continue
-        turned, way = np.abs(yaw[rows] - yaw[rows[0]]), drive.way_m[rows]
-        if turned[-1] < LEAST_TURN_RAD:
+        turned, way = np.abs(yaw[rows] - yaw[rows[0]]), drive.distance_m[rows]
+        if turned[-1] < MIN_TURN_RAD:
             continue
         a, b = (way[int(np.argmax(turned >= share * turned[-1]))] for share in TURNED)
         rates.append(math.degrees((TURNED[1] - TURNED[0]) * turned[-1]) / (b - a))
         full = np.flatnonzero(np.abs(drive["bend_rad"][rows]) > 0.98 * limit)
         if len(full) > 3:
             i, j = rows[full[0]], rows[full[-1]]
-            fulls.append(math.degrees(abs(yaw[j] - yaw[i])) / (drive.way_m[j] - drive.way_m[i]))
+            fulls.append(math.degrees(abs(yaw[j] - yaw[i])) / (drive.distance_m[j] - drive.distance_m[i]))
     return rates, fulls
 
 
 def located(drive: Drive) -> Array:
-    """Error of the position that the machine believed [m]."""
+    """Error of the estimated position [m]."""
     return np.hypot(drive["seen_x_m"] - drive["x_m"], drive["seen_y_m"] - drive["y_m"])

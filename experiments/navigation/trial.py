@@ -1,7 +1,7 @@
-"""One drive of the machine on the bus, in lockstep: from a start, along the waypoints, by one of the two ways.
+"""One drive of the whole machine in lockstep: from a start along the waypoints, by one of the two methods.
 
-The planner is autonomy's own: localizer, navigator and the way under it, fed with the controller's reports.  What is
-kept is the truth of the plant beside what the machine knew, ten times a second.
+The planner is the autonomy's own: localizer, navigator and path, fed with the controller's reports.  The outcome holds
+the ground truth of the plant and the machine's own estimates, ten times a second.
 """
 
 from __future__ import annotations
@@ -10,15 +10,17 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-from autonomy.localization.local_plane import Plane
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.localization.localizer import Localizer
 from autonomy.localization.location import Location, Status
-from autonomy.navigation.joining_path import joined
+from autonomy.navigation.joining_path import joining_path
 from autonomy.navigation.navigator import Navigator, Phase
-from autonomy.navigation.path_drive import Along
-from autonomy.navigation.waypoint_drive import PaperB, Waypoint
+from autonomy.navigation.path_drive import PathDrive
+from autonomy.navigation.waypoint_drive import Waypoint, WaypointDrive
 from autonomy.perception.log_list.observation import LogObservation
-from can_dbc.messages.crane import StateReport, VehicleReport, encode
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.vehicle import VehicleReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
 from controller.guard.__main__ import profile_path
@@ -26,18 +28,18 @@ from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
-from machine.load import profile_hash
-from machine.modes import Mode
+from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
+from machine.status.modes import Mode
 from sim.mechanics.carrier import PARKED
 from sim.plant import Plant
 
 Pose = tuple[float, float, float]
 LIMIT_NS: Final = 1_200_000_000_000
-SETTLE_STEPS: Final = 800
+SETTLE_STEP_COUNT: Final = 800
 REST_NS: Final = 1_000_000_000
-KEEP: Final = 2
-"""Every second report is kept."""
+KEEP_EVERY: Final = 2
+"""Every second report is stored."""
 COLUMNS: Final = (
     "t_s", "x_m", "y_m", "yaw_rad", "bend_rad", "speed_m_s", "seen_x_m", "seen_y_m", "seen_yaw_rad", "sigma_m", "s_m",
     "off_m", "goal", "wanted_rad", "roll_rad",
@@ -45,14 +47,14 @@ COLUMNS: Final = (
 
 
 class Planner:
-    """Waits until the machine is armed and located, drives, and keeps what happens."""
+    """Waits until the machine is armed and located, drives, and stores the samples."""
 
-    def __init__(self, profile: Profile, plane: Plane, points: Sequence[tuple[float, float]], way: str) -> None:
+    def __init__(self, profile: Profile, plane: LocalPlane, points: Sequence[tuple[float, float]], way: str) -> None:
         assert profile.carrier is not None
         self.rows: list[list[float]] = []
         self.navigator = Navigator(profile.carrier, profile_hash(profile))
         self.localizer = Localizer(profile.carrier, plane)
-        self.way: Along | PaperB | None = None
+        self.way: PathDrive | WaypointDrive | None = None
         self.location: Location | None = None
         self._carrier, self._plane, self._points, self._kind = profile.carrier, plane, points, way
         self.begin: Pose = (math.nan,) * 3
@@ -60,10 +62,10 @@ class Planner:
         self._armed = False
         self._count = 0
         self.truth: Any = None
-        """The plant's carrier, for the record alone."""
+        """The plant's carrier, for the samples only."""
 
-    def heard(self, report: VehicleReport) -> None:
-        """A report of the vehicle."""
+    def receive(self, report: VehicleReport) -> None:
+        """Receive a report of the vehicle."""
         self._fresh = report
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
@@ -83,25 +85,25 @@ class Planner:
 
     @property
     def over(self) -> bool:
-        """Whether the drive has ended one way or another."""
+        """Whether the drive has ended."""
         return self.navigator.phase in (Phase.ARRIVED, Phase.STOPPED)
 
-    def _begin(self, location: Location) -> Along | PaperB:
+    def _begin(self, location: Location) -> PathDrive | WaypointDrive:
         here = (location.x_m, location.y_m)
         self.begin = (*here, location.yaw_rad)
         if self._kind == "faithful":
             places = [self._plane.geodetic(*point)[:2] for point in self._points]
-            return PaperB(self._carrier, [Waypoint(*place) for place in places])
-        return Along(self._carrier, joined(here, location.yaw_rad, self._points, self._carrier))
+            return WaypointDrive(self._carrier, [Waypoint(*place) for place in places])
+        return PathDrive(self._carrier, joining_path(here, location.yaw_rad, self._points, self._carrier))
 
     def _keep(self, now_ns: int, location: Location) -> None:
         self._count += 1
-        if self.way is None or self._count % KEEP:
+        if self.way is None or self._count % KEEP_EVERY:
             return
         c = self.truth
         x, y, _ = c.front_axle()
-        steer = self.way.steer if isinstance(self.way, Along) else None
-        goal = self.way.number if isinstance(self.way, PaperB) else -1
+        steer = self.way.steer if isinstance(self.way, PathDrive) else None
+        goal = self.way.number if isinstance(self.way, WaypointDrive) else -1
         own = (steer.s_m, steer.off_m) if steer else (math.nan, math.nan)
         wanted = steer.articulation_rad if steer else math.nan
         self.rows.append([
@@ -120,12 +122,12 @@ def perform(job: Job) -> dict[str, Any]:
     settings = Settings(profile, profile_hash(profile), profile.rate_hz)
     plant = Plant(profile, job.seed, o["truth"], scene=(), terrain=o["terrain"])
     try:
-        stand(plant, o["pose"])
-        plane = Plane(carrier.site_lat_deg, carrier.site_lon_deg, o.get("altitude_m", 0.0))
+        place(plant, o["pose"])
+        plane = LocalPlane(carrier.site_lat_deg, carrier.site_lon_deg, o.get("altitude_m", 0.0))
         planner = Planner(profile, plane, [(x, y) for x, y in o["points"]], o["way"])
         planner.truth = plant.world.carrier
         operator = Operator(profile_hash(profile), lambda *_: None)
-        observer = Observer(None, [], [planner.heard])
+        observer = Observer(None, [], [planner.receive])
         system = Lockstep(settings, build_guard(profile_path(o["profile"])), plant, planner, operator, observer)
         while not planner.over and not operator.gave_up and system.now_ns < START_NS + LIMIT_NS:
             system.advance()
@@ -143,13 +145,13 @@ def perform(job: Job) -> dict[str, Any]:
         plant.close()
 
 
-def stand(plant: Plant, pose: Pose) -> None:
-    """The machine at rest with its front axle at a pose of the world."""
+def place(plant: Plant, pose: Pose) -> None:
+    """Place the machine at rest with its front axle at a pose in the world frame."""
     world, carrier = plant.world, plant.profile.carrier
     assert world.carrier is not None and carrier is not None
     x, y, yaw = pose
     lf = carrier.front_axle_m
     world.carrier.place(x - lf * math.cos(yaw), y - lf * math.sin(yaw), yaw, carrier.arm_transport_m)
     neutral = [0.0] * len(world.functions)
-    for _ in range(SETTLE_STEPS):
+    for _ in range(SETTLE_STEP_COUNT):
         world.step(neutral, PARKED)

@@ -1,4 +1,4 @@
-"""The kinds of work: a route and a landing, and what lies along it, for one machine and seed."""
+"""The tasks: route, landing and logs for one machine and seed."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from autonomy.localization.local_plane import Plane
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.model import ForwardingMission, Landing, Point
 from experiments.common.worlds import wood_of
 from machine.profile import Profile
-from sim.scenes.arrangements import Lumber, arrangement
-from sim.site_file import Site
+from sim.scenes.arrangements import LogSampler, arrangement
+from sim.site.site_file import Site
 from sim.wood.log_shape import LogSpec
 from sim.wood.stacking import upon
 
-BEGIN_M: Final = 10.0
-"""Of the route, before the first log."""
+BEFORE_M: Final = 10.0
+"""Route before the first log."""
 SINGLE_APART_M: Final = 2.5
 PILE_APART_M: Final = 6.0
 ASIDE_M: Final = (2.9, 3.9)
-"""From the route to the middle of a single log."""
+"""Distance from the route to the middle of a single log."""
 PILE_ASIDE_M: Final = 3.7
 AFTER_M: Final = 9.0
 LENGTH_M: Final = (1.9, 2.1)
 DIAMETER_M: Final = (0.20, 0.30)
-"""Paper B's birch logs: 2 m by 25 cm (assumed spread)."""
-IN_ROW: Final = 5
+"""Paper B's birch logs of 2 m by 25 cm (assumed spread)."""
+LOGS_PER_ROW: Final = 5
 STAKE_M: Final = 0.15
-"""Between the outermost logs of a row and the stakes."""
+"""Gap between the outermost logs of a row and the stakes."""
 LANDING_M: Final = (14.0, 14.0)
-"""From the end of the route of a machine that comes loaded: ahead, left."""
+"""Landing relative to the end of the route: ahead, left."""
 KINDS: Final = {
     "singles": "single logs along the route",
     "piles": "mini-piles of paper A's sizes beside the route",
@@ -41,11 +41,11 @@ KINDS: Final = {
 }
 
 
-def work(kind: str, profile: Profile, truth: str, seed: int, amount: int) -> tuple[ForwardingMission, Site]:
+def task(kind: str, profile: Profile, truth: str, seed: int, amount: int) -> tuple[ForwardingMission, Site]:
     """A mission and its site; ``amount``: single logs, piles, or logs in the bunk."""
     carrier = profile.carrier
     assert carrier is not None
-    plane = Plane(carrier.site_lat_deg, carrier.site_lon_deg)
+    plane = LocalPlane(carrier.site_lat_deg, carrier.site_lon_deg)
     front_m = carrier.front_axle_m
     rng = random.Random(f"{kind} {seed}")
     build = {"singles": _singles, "piles": _piles, "landing": _bunk}[kind]
@@ -63,34 +63,36 @@ def _singles(profile: Profile, truth: str, seed: int, rng: random.Random, amount
     """Right and left of the route in turn, up to 25 degrees askew, as on paper B's field."""
     logs = []
     for i in range(amount):
-        x = profile.carrier.front_axle_m + BEGIN_M + i * SINGLE_APART_M  # type: ignore[union-attr]
+        x = profile.carrier.front_axle_m + BEFORE_M + i * SINGLE_APART_M  # type: ignore[union-attr]
         y = (1 if i % 2 else -1) * rng.uniform(*ASIDE_M)
         logs += _at(profile, truth, seed + i, "single", 1, (x, y), math.radians(rng.uniform(-25.0, 25.0)), rng)
-    return logs, BEGIN_M + amount * SINGLE_APART_M + AFTER_M
+    return logs, BEFORE_M + amount * SINGLE_APART_M + AFTER_M
 
 
 def _piles(profile: Profile, truth: str, seed: int, rng: random.Random, amount: int) -> tuple[list[LogSpec], float]:
     """Two to six logs each, as paper A's configurations 6, 7 and 10 to 12, right and left in turn."""
     logs = []
     for i in range(amount):
-        x = profile.carrier.front_axle_m + BEGIN_M + i * PILE_APART_M  # type: ignore[union-attr]
+        x = profile.carrier.front_axle_m + BEFORE_M + i * PILE_APART_M  # type: ignore[union-attr]
         y = (1 if i % 2 else -1) * PILE_ASIDE_M
         count = 2 + (i + 1) % 5
         logs += _at(profile, truth, seed + i, "pile", count, (x, y), math.radians(rng.uniform(-10.0, 10.0)), rng)
-    return logs, BEGIN_M + amount * PILE_APART_M + AFTER_M
+    return logs, BEFORE_M + amount * PILE_APART_M + AFTER_M
 
 
 def _bunk(profile: Profile, truth: str, seed: int, rng: random.Random, amount: int) -> tuple[list[LogSpec], float]:
-    """As the crane lays them: side by side with room for the tongs, row upon row, each row in the gaps of the last."""
+    """Rows as the crane lays them: side by side with room for the grapple, each row in the gaps of the one below."""
     wood = replace(wood_of(profile.name, truth), length_m=LENGTH_M, diameter_m=DIAMETER_M)
-    lumber, half = Lumber(wood, seed), 0.5 * (profile.bunk.width_m - DIAMETER_M[1]) - STAKE_M
+    lumber, half = LogSampler(wood, seed), 0.5 * (profile.bunk.width_m - DIAMETER_M[1]) - STAKE_M
     logs: list[LogSpec] = []
     while len(logs) < amount:
-        row, inside = divmod(len(logs), IN_ROW)
-        across = half * (2.0 * inside / (IN_ROW - 1) - 1.0) + (0.0 if row % 2 else 1.0) * half / (IN_ROW - 1)
+        row, inside = divmod(len(logs), LOGS_PER_ROW)
+        across = half * (2.0 * inside / (LOGS_PER_ROW - 1) - 1.0) + (0.0 if row % 2 else 1.0) * half / (
+            LOGS_PER_ROW - 1
+        )
         log = lumber.log(rng.uniform(-0.05, 0.05), 0.0, rng.uniform(-0.05, 0.05))
         logs.append(upon(dataclasses.replace(log, in_bunk=True, y_m=min(across, half)), logs))
-    return logs, BEGIN_M
+    return logs, BEFORE_M
 
 
 def _at(

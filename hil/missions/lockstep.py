@@ -102,7 +102,8 @@ class MissionRun:
         detector: str = "perfect",
         seed: int = 0,
     ) -> None:
-        self._display, self._mode, self._vehicle = display, -1, None
+        self._display, self._mode = display, -1
+        self._vehicle: VehicleReport | None = None
         self._shown: tuple[State | None, str, str, str] = (None, "", "", "")
         self.states: list[tuple[float, str]] = []
         code = profile_hash(profile)

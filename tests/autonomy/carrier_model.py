@@ -12,12 +12,12 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from autonomy.localization.local_plane import Plane, heading_from_yaw
+from autonomy.localization.local_plane import LocalPlane, heading_from_yaw
 from autonomy.localization.motion_model import antenna_reach, front_attitude
-from can_dbc.messages.crane import DriveSetpoint, Driving, Steering, VehicleReport
+from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
 from controller.laws.drive import DriveLaw
 from controller.laws.heading import AngleLaw, SteeringLimits, WaypointLaw, east_north_m
-from machine.carrier import turning_radius_m
+from machine.geometry.carrier import turning_radius_m
 from machine.profile import Carrier
 
 TICK_NS: Final = 5_000_000
@@ -91,12 +91,12 @@ class Vehicle:
         ground: Ground = FIRM,
         own: Individual | None = None,
         seed: int = 0,
-        plane: Plane | None = None,
+        plane: LocalPlane | None = None,
     ) -> None:
         self.x, self.y, self.yaw = pose
         self.bend = self.speed = self.way_m = 0.0
         self.now_ns = START_NS
-        self.plane = plane or Plane(carrier.site_lat_deg, carrier.site_lon_deg, 260.0)
+        self.plane = plane or LocalPlane(carrier.site_lat_deg, carrier.site_lon_deg, 260.0)
         self.sky = True
         """Whether the receiver sees satellites."""
         self.jump_m = (0.0, 0.0)
@@ -150,7 +150,7 @@ class Vehicle:
         if self._drive.brake:
             wanted = 0.0
         rate = self._limits.step(wanted, measured, TICK_S)
-        self._angle.told(rate, feed, TICK_S)
+        self._angle.note_command(rate, feed, TICK_S)
         self._spools.append(rate)
 
     def _move(self) -> None:

@@ -9,18 +9,20 @@ from collections import deque
 
 import numpy as np
 
+from autonomy.localization.local_plane import LocalPlane, heading_from_yaw
 from autonomy.localization.localizer import LATENCY_NS
-from autonomy.localization.local_plane import Plane, heading_from_yaw
-from autonomy.manager.log_map import FieldLog
-from autonomy.manager.activity_manager import Manager
-from autonomy.manager.loading_stops import base_on_way
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.loading_stops import base_on_path
+from autonomy.manager.log_map import MappedLog
 from autonomy.perception.camera.frame import Pose
 from autonomy.perception.log_list.observation import LogObservation
-from can_dbc.messages.crane import CraneSetpoint, DriveSetpoint, Driving, Steering, VehicleReport, decode
-from machine.carrier import heading_rate_rad_s
-from machine.load import profile_hash
-from machine.modes import Mode
+from can_dbc.messages.crane import CraneSetpoint
+from can_dbc.messages.datagrams import decode
+from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
+from machine.geometry.carrier import heading_rate_rad_s
+from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
+from machine.status.modes import Mode
 from tests.autonomy.crane_stand_in import TICK_NS, StandIn, over_bunk
 
 TICK_S = TICK_NS * 1e-9
@@ -32,7 +34,9 @@ RATE_M_S = 0.1
 class Forwarder:
     """Machine, controller and field; ``step`` is one tick of 50 ms."""
 
-    def __init__(self, profile: Profile, plane: Plane, logs: list[FieldLog], at: tuple[float, float, float]) -> None:
+    def __init__(
+        self, profile: Profile, plane: LocalPlane, logs: list[MappedLog], at: tuple[float, float, float]
+    ) -> None:
         assert profile.carrier is not None
         self.profile, self.plane, self.carrier = profile, plane, profile.carrier
         self.crane = StandIn(profile, [], q=(0.0, 0.9, -1.6, 0.5, 0.0))
@@ -57,7 +61,7 @@ class Forwarder:
         joint = np.array([self.x_m - lf * math.cos(self.yaw_rad), self.y_m - lf * math.sin(self.yaw_rad)])
         rear = joint - lr * np.array([math.cos(yaw), math.sin(yaw)])
         height = sum(self.heights_m) / 4
-        return base_on_way(self.carrier, (self.x_m, self.y_m, self.yaw_rad), (float(rear[0]), float(rear[1])), height)
+        return base_on_path(self.carrier, (self.x_m, self.y_m, self.yaw_rad), (float(rear[0]), float(rear[1])), height)
 
     @property
     def in_bunk(self) -> int:
@@ -91,7 +95,7 @@ class Forwarder:
         near = [o for o in self.crane.logs if math.hypot(*o.center_m[:2]) < RANGE_M and o.id not in self.blind]
         return tuple(near)
 
-    def step(self, manager: Manager) -> None:
+    def step(self, manager: ActivityManager) -> None:
         """One tick."""
         crane = self.crane
         self._lie()
@@ -119,7 +123,7 @@ class Forwarder:
         crane._carry()
         self._move()
 
-    def run(self, manager: Manager, done, limit_s: float = 600.0) -> float:
+    def run(self, manager: ActivityManager, done, limit_s: float = 600.0) -> float:
         """Until ``done(manager)``; the time it took [s]."""
         begin = self.crane.now_ns
         while not done(manager):
@@ -136,7 +140,7 @@ class Forwarder:
             if o.id not in aboard and o.id in self.field:  # laid down elsewhere: where it is now in the plane
                 center = self._base.to_base(np.asarray(o.center_m))
                 was = self.field[o.id]
-                self.field[o.id] = FieldLog(
+                self.field[o.id] = MappedLog(
                     o.id, center, self._base.rotation @ np.asarray(o.axis), was.length_m, was.diameter_m, 0.1, 1, 0
                 )
         lying = [log.observation(base) for log in self.field.values() if log.number not in aboard]

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.navigation import speed
-from autonomy.navigation.path_drive import Along
-from autonomy.navigation.clothoid_path import Path, drivable
-from autonomy.navigation.follower import Following, follow
+from autonomy.navigation.clothoid_path import Path, drivable_path
+from autonomy.navigation.follower import FollowerState, follow_path
+from autonomy.navigation.path_drive import PathDrive
 
 # -- follower
 
@@ -21,10 +21,10 @@ def glide(path: Path, x: float, y: float, yaw: float, metres: float, slip: float
     """Lateral errors of a perfect machine that does what the follower wants, 50 ms a step."""
     lf, lr = CARRIER.front_axle_m, CARRIER.rear_axle_m
     bend, v, dt, stamp = 0.0, 0.6, 0.05, 10**9
-    state, errors = Following(), []
+    state, errors = FollowerState(), []
     for _ in range(round(metres / v / dt)):
         location = at(x, y, yaw, articulation_rad=bend, course_rad=yaw + slip, stamp_ns=stamp)
-        state, steer = follow(CARRIER, path, state, location, v)
+        state, steer = follow_path(CARRIER, path, state, location, v)
         errors.append(steer.off_m)
         after = steer.articulation_rad + steer.articulation_rate_rad_s * dt
         assert abs(steer.articulation_rate_rad_s) <= CARRIER.articulation_rate_limit_rad_s
@@ -38,38 +38,38 @@ def glide(path: Path, x: float, y: float, yaw: float, metres: float, slip: float
 
 
 def test_the_follower_stays_on_a_path_with_corners() -> None:
-    path = drivable(SQUARE, CARRIER)
+    path = drivable_path(SQUARE, CARRIER)
     assert max(map(abs, glide(path, 0.0, 0.0, 0.0, path.length_m - 1.0))) < 0.03
 
 
 @settings(max_examples=12, deadline=None)
 @given(st.floats(-4.0, 4.0), st.floats(-2.0, 2.0), st.floats(-0.08, 0.08))
 def test_it_comes_back_from_anywhere_and_slides_uphill_straight(off: float, yaw: float, slip: float) -> None:
-    path = drivable([(-5.0, 0.0), (80.0, 0.0)], CARRIER)
+    path = drivable_path([(-5.0, 0.0), (80.0, 0.0)], CARRIER)
     errors = glide(path, 0.0, off, yaw, 45.0, slip)
     assert max(map(abs, errors[-50:])) < 0.02
     assert max(map(abs, errors)) < abs(off) + 13.0  # no wider than its turning circle
 
 
 def test_it_keeps_to_its_lap_where_the_path_crosses_itself() -> None:
-    path = drivable([(0, 0), (40, 0), (40, 20), (20, 20), (20, -30)], CARRIER)
-    _, steer = follow(CARRIER, path, Following(s_m=20.0), at(20.0, 0.4, 0.0), 0.6)
+    path = drivable_path([(0, 0), (40, 0), (40, 20), (20, 20), (20, -30)], CARRIER)
+    _, steer = follow_path(CARRIER, path, FollowerState(s_m=20.0), at(20.0, 0.4, 0.0), 0.6)
     assert steer.s_m == pytest.approx(20.0, abs=0.2) and steer.off_m == pytest.approx(0.4, abs=0.05)
     late = path.length_m - 30.0
-    _, steer = follow(CARRIER, path, Following(s_m=late), at(20.0, 0.0, -math.pi / 2), 0.6)
+    _, steer = follow_path(CARRIER, path, FollowerState(s_m=late), at(20.0, 0.0, -math.pi / 2), 0.6)
     assert steer.s_m == pytest.approx(late, abs=0.2) and abs(steer.off_rad) < 0.01
 
 
 def test_it_steers_by_where_it_goes_and_not_by_where_it_points() -> None:
-    path = drivable([(-5.0, 0.0), (80.0, 0.0)], CARRIER)
+    path = drivable_path([(-5.0, 0.0), (80.0, 0.0)], CARRIER)
     slides = at(10.0, 0.0, 0.05, course_rad=0.0)
-    _, steer = follow(CARRIER, path, Following(s_m=10.0), slides, 0.6)
+    _, steer = follow_path(CARRIER, path, FollowerState(s_m=10.0), slides, 0.6)
     assert steer.off_rad == 0.0 and steer.articulation_rate_rad_s == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_standing_machine_is_not_steered() -> None:
-    path = drivable(SQUARE, CARRIER)
-    _, steer = follow(CARRIER, path, Following(), at(3.0, 1.0, 0.5, speed_m_s=0.0), 0.0)
+    path = drivable_path(SQUARE, CARRIER)
+    _, steer = follow_path(CARRIER, path, FollowerState(), at(3.0, 1.0, 0.5, speed_m_s=0.0), 0.0)
     assert steer.articulation_rate_rad_s == 0.0 and steer.articulation_rad == 0.0
 
 
@@ -84,8 +84,8 @@ def test_leaning_costs_margin_and_margin_costs_speed(roll: float, pitch: float, 
     if abs(roll) > 0.1 and abs(bend) < 0.1:
         assert more < leans
     assert 0.5 < level < 1.1
-    assert 0.0 <= speed.terrain_share(leans, 0.0) <= 1.0
-    assert speed.terrain_share(leans, 0.2) <= speed.terrain_share(leans, 0.0)
+    assert 0.0 <= speed.terrain_speed_share(leans, 0.0) <= 1.0
+    assert speed.terrain_speed_share(leans, 0.2) <= speed.terrain_speed_share(leans, 0.0)
 
 
 def test_the_margin_of_a_level_machine_is_half_its_track() -> None:
@@ -99,13 +99,13 @@ def test_rocking_slows_down_and_is_forgotten() -> None:
     rocking = speed.Rocking()
     for i in range(60):
         rate = rocking.step(at(0, 0, 0, roll_rad=0.02 * (i % 2), stamp_ns=10**9 + i * 50_000_000))
-    assert speed.terrain_share(1.0, rate) == pytest.approx(speed.SLOWEST)
+    assert speed.terrain_speed_share(1.0, rate) == pytest.approx(speed.MIN_SPEED_SHARE)
     for i in range(60, 400):
         rate = rocking.step(at(0, 0, 0, stamp_ns=10**9 + i * 50_000_000))
-    assert speed.terrain_share(1.0, rate) == 1.0
+    assert speed.terrain_speed_share(1.0, rate) == 1.0
 
 
 def test_too_near_to_tipping_nothing_drives() -> None:
-    way = Along(CARRIER, drivable(SQUARE, CARRIER))
+    way = PathDrive(CARRIER, drivable_path(SQUARE, CARRIER))
     order = way.step(at(0.0, 0.0, 0.0, roll_rad=0.6))
-    assert order.speed_m_s == 0.0 and "tipping" in order.trouble
+    assert order.speed_m_s == 0.0 and "tipping" in order.stop_reason

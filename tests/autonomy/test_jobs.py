@@ -2,43 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
-from autonomy.manager.activity_manager import Manager
-from autonomy.manager.transition_table import OURS, State
-from autonomy.missions.model import ForwardingMission, Point
-from autonomy.process.jobs import COME_TO_REST_NS, Forwarding
-from can_dbc.messages.mission import MissionOrder, Order
-from can_dbc.messages.crane import DriveSetpoint, decode
-from machine.load import profile_hash
-from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.test_manager import LOGS, PLANE, PROFILE
-from tests.autonomy.test_manager_field import lying
-
-
-def begin(*logs, end_m: float = 26.0, **told: Any) -> tuple[Forwarder, Forwarding, Manager]:
-    way = tuple(Point(*PLANE.geodetic(x, 0.0)[:2]) for x in (10.0, end_m))
-    mission = ForwardingMission("test", way)
-    manager = Manager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE, **told)
-    forwarder = Forwarder(PROFILE, PLANE, [lying(*log) for log in logs], (0.0, 0.1, 0.05))
-    return forwarder, Forwarding(manager, mission), manager
-
-
-def run(forwarder: Forwarder, job: Forwarding, enough, limit: int = 20_000) -> list[tuple[str, dict[str, Any]]]:
-    """What is told on the way, each time that it has changed."""
-    told: dict[str, Any] = {}
-    said = []
-    for _ in range(limit):
-        for event, what in job.news():
-            if told.get(event) != what:
-                told[event] = what
-                said.append((event, dict(what)))
-        if enough(job):
-            return said
-        forwarder.step(job)  # type: ignore[arg-type]
-    raise AssertionError(said[-5:])
+from autonomy.manager.transition_table import State
+from autonomy.process.jobs import STOPPING_TIMEOUT_NS
+from can_dbc.messages.datagrams import decode
+from can_dbc.messages.mission import Order
+from can_dbc.messages.vehicle import DriveSetpoint
+from tests.autonomy.forwarding_jobs import begin, ordered, run
+from tests.autonomy.manager_missions import LOGS
 
 
 @pytest.mark.slow
@@ -72,7 +44,7 @@ def test_a_mission_whose_machine_does_not_come_to_rest_ends_all_the_same() -> No
     ended_ns = forwarder.crane.now_ns
     forwarder._move = lambda: None  # type: ignore[method-assign]
     run(forwarder, job, lambda j: j.idle)
-    assert COME_TO_REST_NS <= forwarder.crane.now_ns - ended_ns < 2 * COME_TO_REST_NS
+    assert STOPPING_TIMEOUT_NS <= forwarder.crane.now_ns - ended_ns < 2 * STOPPING_TIMEOUT_NS
 
 
 def test_what_a_mission_asks_for_holds_as_long_as_it_is_told() -> None:
@@ -90,10 +62,6 @@ def test_an_ended_job_sends_no_speed() -> None:
     assert all(isinstance(s, DriveSetpoint) and s.speed_m_s == 0.0 for s in sent) and sent
 
 
-def ordered(number: int, order: Order) -> MissionOrder:
-    return MissionOrder(number, 0, 0, order)
-
-
 @pytest.mark.slow
 @pytest.mark.computed
 @pytest.mark.parametrize("phase", ["ABOVE", "DESCEND", "CLOSE", "CARRY", "LOWER", "OPEN"])
@@ -102,7 +70,7 @@ def test_a_pause_stops_the_crane_smoothly_and_auto_takes_the_log_on(phase: str) 
     run(forwarder, job, lambda j: manager.activity is not None and manager.activity.phase.name == phase)
     for _ in range(10):
         forwarder.step(job)  # type: ignore[arg-type]
-    assert job.obey(ordered(1, Order.PAUSE)) == "" and not job.report(0).auto
+    assert job.execute(ordered(1, Order.PAUSE)) == "" and not job.report(0).auto
     for _ in range(100):  # a grip that has begun is ended; then the crane stands
         forwarder.step(job)  # type: ignore[arg-type]
     before, stands = manager.activity, forwarder.crane.q
@@ -110,6 +78,6 @@ def test_a_pause_stops_the_crane_smoothly_and_auto_takes_the_log_on(phase: str) 
         forwarder.step(job)  # type: ignore[arg-type]
     assert forwarder.crane.q == stands and manager.state is State.COLLECT and manager.activity is before
     assert forwarder.crane.setpoint is not None, "it is held, not abandoned"
-    assert job.obey(ordered(2, Order.AUTO)) == ""
+    assert job.execute(ordered(2, Order.AUTO)) == ""
     run(forwarder, job, lambda j: j.idle)
     assert job.done and manager.tally.loaded == 1 and forwarder.in_bunk == 1

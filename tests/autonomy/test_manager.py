@@ -10,56 +10,17 @@ import pytest
 
 from autonomy.grasp.placement import lies_in_bunk, plan_place
 from autonomy.grasp.planner import BunkFull
-from autonomy.localization.local_plane import LocalPlane
-from autonomy.manager.activity_manager import ActivityManager
-from autonomy.manager.transition_table import FINAL_STATES, OURS, PAPER_B, RULES, State
+from autonomy.manager.activity_manager import MAX_OUTSIDE_M, ActivityManager
 from autonomy.manager.tally import Tally
-from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Landing, Options, Point
+from autonomy.manager.transition_table import OURS, PAPER_B, RULES, State
+from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Point
 from autonomy.navigation.clothoid_path import PathRefused
 from autonomy.perception.log_list.observation import LogObservation
-from machine.loading.profile_file import load_profile, profile_hash
+from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
 from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.test_manager_field import lying
-
-PROFILE = load_profile("aoro_fc8")
-CARRIER = PROFILE.carrier
-assert CARRIER is not None
-PLANE = LocalPlane(63.657853, 19.895562, 100.0)
-LOGS = ((1, 15.0, 4.2, 0.0), (2, 18.0, -4.4, 0.5))
-
-
-def place(x_m: float, y_m: float) -> Point:
-    return Point(*PLANE.geodetic(x_m, y_m)[:2])
-
-
-def begin(
-    lie=LOGS, table=OURS, end_m: float = 26.0, landing=None, bearing_deg=None, known=(), fences=(), **options
-) -> tuple[Forwarder, ActivityManager]:
-    """A machine that looks east, logs along its way, and a manager with the switch at Auto."""
-    way = (place(10.0, 0.0), place(end_m, 0.0))
-    landings = () if landing is None else (Landing(place(*landing), bearing_deg=bearing_deg),)
-    mission = ForwardingMission("test", way, fences, landings, known, Options(**options))
-    manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, table, plane=PLANE)
-    manager.auto()
-    return Forwarder(PROFILE, PLANE, [lying(*log) for log in lie], (0.0, 0.1, 0.05)), manager
-
-
-def whole(test):
-    """A mission with crane work: seconds of planning."""
-    return pytest.mark.slow(pytest.mark.computed(test))
-
-
-def ended(manager: ActivityManager) -> bool:
-    return manager.state in FINAL_STATES
-
-
-def at(state: State):
-    return lambda manager: manager.state is state
-
-
-def states(manager: ActivityManager) -> list[State]:
-    return [change.state for change in manager.changes]
+from tests.autonomy.manager_missions import CARRIER, LOGS, PLANE, PROFILE, at, begin, ended, place, states, whole
+from tests.autonomy.mapped_logs import lying
 
 
 @whole
@@ -100,7 +61,7 @@ def test_a_machine_that_has_left_its_fence_stands(keep_out: bool) -> None:
     corners = tuple(place(x, y) for x, y in ((reach[0], -9.0), (reach[1], -9.0), (reach[1], 9.0), (reach[0], 9.0)))
     forwarder, manager = begin((), fences=(Fence(corners, keep_out),))
     forwarder.run(manager, ended)
-    assert manager.state is State.FAILED and "the machine has left its fence by 0." in manager.failure
+    assert manager.state is State.FAILED and manager.world.outside_fence_m > MAX_OUTSIDE_M
     for _ in range(60):
         forwarder.step(manager)
     assert forwarder.speed_m_s == 0.0 and 16.4 < forwarder.x_m < 17.6
@@ -111,9 +72,9 @@ def test_a_machine_does_not_run_into_a_log(y_m: float, yaw: float, hit: bool) ->
     forwarder, manager = begin(((1, 15.0, y_m, yaw),), end_m=20.0)
     forwarder.run(manager, ended)
     if not hit:  # it passes below the machine, between the wheels
-        assert "in the way" not in manager.failure
+        assert "log 1" not in manager.failure
         return
-    assert manager.state is State.FAILED and manager.failure.startswith("log 1 lies in the way of the wheels")
+    assert manager.state is State.FAILED and manager.failure.startswith("log 1 ")
     for _ in range(60):
         forwarder.step(manager)
     assert forwarder.speed_m_s == 0.0 and forwarder.x_m + CARRIER.wheel_radius_m < 15.0
@@ -170,7 +131,7 @@ def test_a_stop_in_any_state_pauses_and_the_mission_goes_on_when_armed(state: St
     forwarder.drive = forwarder.crane.setpoint = None
     for _ in range(60):
         forwarder.step(manager)
-    assert manager.paused == "the controller is in STOP" and manager.state is state
+    assert manager.paused.endswith("STOP") and manager.state is state
     assert forwarder.speed_m_s == 0.0 and forwarder.drive is None and forwarder.crane.setpoint is None
     forwarder.crane.mode = Mode.ARMED
     forwarder.run(manager, ended)
@@ -187,7 +148,7 @@ def test_the_switch_to_idle_stops_the_machine_and_auto_goes_on() -> None:
     driven = forwarder.driven_m
     for _ in range(100):
         forwarder.step(manager)
-    assert manager.paused == "the switch is at Idle" and forwarder.speed_m_s == 0.0
+    assert manager.paused.endswith("Idle") and forwarder.speed_m_s == 0.0
     assert forwarder.driven_m - driven < 1.0
     manager.auto()
     forwarder.run(manager, ended)
@@ -344,11 +305,11 @@ def test_a_landing_without_room_is_refused_in_words() -> None:
     manager.tally.on_board = 1
     manager.route.drive_to_landing = refuse  # type: ignore[method-assign]
     forwarder.run(manager, ended)
-    assert manager.failure == "the route cannot be driven: no room"
+    assert manager.failure.endswith(": no room")
 
 
 def refuse(*_: object) -> None:
-    raise PathRefused("no room")
+    raise PathRefused("path.none", "no room")
 
 
 @whole

@@ -1,4 +1,4 @@
-"""What a machine makes of a mission: lengths, times, corners, and warnings that name what is hard."""
+"""Review of a mission for a machine: lengths, times, corners and warnings."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from mission_texts import FENCE, at
 
 from autonomy.missions.mission_file import load_mission
-from autonomy.missions.model import Fence, ForwardingMission, KnownLog, Options, Point
-from autonomy.missions.review import LOG_S, SWITCH_LEAST_M, Review, review
-from machine.carrier import turning_radius_m
-from machine.load import load_profile
+from autonomy.missions.model import Fence, ForwardingMission, KnownLog, MissionError, Options, Point
+from autonomy.missions.review import LOG_S, MIN_SWITCH_M, Review, review
+from machine.geometry.carrier import turning_radius_m
+from machine.loading.profile_file import load_profile
+from tests.autonomy.mission_texts import FENCE, at
+from tests.codes import coded
 
 AORO = load_profile("aoro_fc8")
 assert AORO.carrier is not None
@@ -57,41 +58,39 @@ def test_a_round_has_a_corner_at_every_waypoint_and_one_way_has_none_at_its_ends
 
 
 def test_gentle_corners_are_switched_at_the_least_distance() -> None:
-    assert Way([(0, 0), (20, 0), (40, 5)]).review().corners[0].switch_m == SWITCH_LEAST_M
+    assert Way([(0, 0), (20, 0), (40, 5)]).review().corners[0].switch_m == MIN_SWITCH_M
 
 
 def test_legs_too_short_for_their_corners() -> None:
-    warnings = Way([(0, 0), (30, 0), (30, 10), (0, 10)]).review().warnings
-    assert warnings == (
-        f"leg 2 to 3 is 10.0 m long and its corners need {2 * RADIUS:.1f} m at a turning radius of {RADIUS:.1f} m; "
-        "the machine will cut or overshoot them",
-    )
+    (warning,) = Way([(0, 0), (30, 0), (30, 10), (0, 10)]).review().warnings
+    assert warning.code == "mission.short-leg"
+    assert all(part in warning.sentence for part in ("leg 2 to 3", "10.0 m", f"{2 * RADIUS:.1f} m", f"{RADIUS:.1f} m"))
     assert not Way([(0, 0), (30, 0), (30, 2 * RADIUS + 0.1), (0, 2 * RADIUS + 0.1)]).review().warnings
 
 
 def test_a_turn_on_the_spot() -> None:
     (warning,) = Way([(0, 0), (30, 0), (0, 1)]).review().warnings
-    assert warning.startswith("waypoint 2: the route turns by 178 degrees on the spot")
-    assert f"radius of {RADIUS:.1f} m" in warning
+    assert warning.code == "mission.turn-on-the-spot"
+    assert all(part in warning.sentence for part in ("waypoint 2", "178 degrees", f"{RADIUS:.1f} m"))
 
 
 def test_near_the_fence_without_a_fence_and_too_fast() -> None:
     edge = Way([(-20, -24), (20, -24)]).review(fences=(Fence(tuple(FENCE)),))
-    assert edge.warnings[0] == "waypoint 1 is 1.0 m from the fence; the machine is 2.7 m wide"
-    assert "there is no fence" in Way(SQUARE).review(fences=()).warnings[0]
-    assert "drives at most 1 m/s" in Way(SQUARE).review(speed_m_s=2.0).warnings[0]
-    assert "swing arms lift 0.6 m" in Way(SQUARE).review(transport_height_m=0.9).warnings[0]
+    assert edge.warnings[0].code == "mission.close-to-fence"
+    assert "waypoint 1 is 1.0 m" in edge.warnings[0].sentence and "2.7 m" in edge.warnings[0].sentence
+    assert Way(SQUARE).review(fences=()).warnings[0].code == "mission.no-fence"
+    assert Way(SQUARE).review(speed_m_s=2.0).warnings[0].code == "mission.speed-limit"
+    assert Way(SQUARE).review(transport_height_m=0.9).warnings[0].code == "mission.height-limit"
 
 
 def test_logs_out_of_reach_and_under_the_wheels() -> None:
     far, under, vague = KnownLog(at(0, 0)), KnownLog(at(0, -14.5)), KnownLog(at(0, -14.5), sigma_m=4.0)
     warnings = Way(SQUARE).review(far, under, vague).warnings
-    assert warnings == (
-        "log 1 lies 15.0 m from the route; the crane reaches 9.0 m",
-        "log 2 lies on the route; the wheels would roll over it",
-    )
+    assert [w.code for w in warnings] == ["mission.log-out-of-reach", "mission.log-on-route"]
+    assert all(part in warnings[0].sentence for part in ("log 1", "15.0 m", "9.0 m"))
+    assert "log 2" in warnings[1].sentence
     many = Way(SQUARE).review(*[far] * 20).warnings
-    assert len(many) == 6 and many[-1] == "and 15 more like the last"
+    assert len(many) == 6 and "15 more" in many[-1].sentence
 
 
 def test_how_many_logs_are_fetched() -> None:
@@ -107,11 +106,11 @@ def test_how_many_logs_are_fetched() -> None:
 def test_an_assortment_of_which_there_is_no_log() -> None:
     log = KnownLog(at(0, -12), assortment="pulpwood")
     warnings = Way(SQUARE).review(log, assortments=("pulpwood", "pulp wood"), logs="listed").warnings
-    assert warnings == ('no log is "pulp wood", which is to be collected',)
+    assert [w.code for w in warnings] == ["mission.unlisted-assortment"] and '"pulp wood"' in warnings[0].sentence
 
 
 def test_another_country_and_a_machine_that_does_not_drive() -> None:
     chile = ForwardingMission("", (Point(-38.0, -72.0), Point(-38.0, -72.001)), (), (), ())
-    assert "km from the site in the machine's profile" in review(chile, AORO).warnings[0]
-    with pytest.raises(ValueError, match="does not drive"):
+    assert review(chile, AORO).warnings[0].code == "mission.far-from-site"
+    with pytest.raises(MissionError, check=coded("mission.stationary-machine")):
         review(chile, load_profile("palms_471"))

@@ -9,22 +9,24 @@ import numpy as np
 import pytest
 from driven_carrier import CARRIER, at
 
-from autonomy.localization.location import Location, Status
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.localization.localizer import Localizer
-from autonomy.localization.local_plane import Plane
-from autonomy.navigation.path_drive import Along
-from autonomy.navigation.clothoid_path import drivable
-from autonomy.navigation.navigator import LEASE_NS, MOVES_NS, OBEYS_NS, Navigator, Phase
-from autonomy.navigation.waypoint_drive import LEAST_M, PaperB, Waypoint
-from can_dbc.messages.crane import DriveSetpoint, Driving, Steering, VehicleReport, decode, encode
+from autonomy.localization.location import Location, Status
+from autonomy.navigation.clothoid_path import drivable_path
+from autonomy.navigation.navigator import EXECUTION_TIMEOUT_NS, LEASE_NS, MOTION_TIMEOUT_NS, Navigator, Phase
+from autonomy.navigation.path_drive import PathDrive
+from autonomy.navigation.waypoint_drive import MIN_SWITCH_M, Waypoint, WaypointDrive
+from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
+from machine.geometry.carrier import turning_radius_m
 from tests.autonomy.carrier_model import FIRM, MUD, Ground, Individual, Vehicle, individual
-from machine.carrier import turning_radius_m
+from tests.codes import coded
 
 # -- drives on the model
 
 
 def drive(
-    way: Along | PaperB, ground: Ground = FIRM, own: Individual | None = None, seconds: float = 120.0,
+    way: PathDrive | WaypointDrive, ground: Ground = FIRM, own: Individual | None = None, seconds: float = 120.0,
     pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[Vehicle, Navigator, list[Location]]:  # fmt: skip
     """A drive on the model to its end."""
@@ -47,8 +49,10 @@ def drive(
 @pytest.mark.parametrize("ground", [FIRM, MUD], ids=["firm", "mud"])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_it_stops_within_five_centimetres_of_where_it_should(ground: Ground, seed: int) -> None:
-    path = drivable([(0.0, 0.0), (12.0, 0.0), (20.0, 6.0)], CARRIER)
-    vehicle, navigator, _ = drive(Along(CARRIER, path, 9.0), ground, replace(individual(seed), main_off_m=(0.0, 0.0)))
+    path = drivable_path([(0.0, 0.0), (12.0, 0.0), (20.0, 6.0)], CARRIER)
+    vehicle, navigator, _ = drive(
+        PathDrive(CARRIER, path, 9.0), ground, replace(individual(seed), main_off_m=(0.0, 0.0))
+    )
     assert navigator.phase is Phase.ARRIVED
     assert vehicle.x == pytest.approx(9.0, abs=0.05) and abs(vehicle.y) < 0.08
 
@@ -77,7 +81,7 @@ def test_who_was_just_told_to_drive_is_told_to_stand() -> None:
 
 
 def test_the_place_to_stop_at_can_be_moved() -> None:
-    way = Along(CARRIER, drivable([(0.0, 0.0), (30.0, 0.0)], CARRIER))
+    way = PathDrive(CARRIER, drivable_path([(0.0, 0.0), (30.0, 0.0)], CARRIER))
     assert way.left_m == 30.0
     way.stop_at(4.0)
     vehicle, navigator, _ = drive(way)
@@ -87,14 +91,14 @@ def test_the_place_to_stop_at_can_be_moved() -> None:
 
 
 def test_paper_b_goes_from_waypoint_to_waypoint() -> None:
-    plane = Plane(CARRIER.site_lat_deg, CARRIER.site_lon_deg, 260.0)
+    plane = LocalPlane(CARRIER.site_lat_deg, CARRIER.site_lon_deg, 260.0)
     places = [Waypoint(*plane.geodetic(*p)[:2]) for p in ((14.0, 0.0), (14.0, 22.0))]
-    way = PaperB(CARRIER, places)
+    way = WaypointDrive(CARRIER, places)
     vehicle, navigator, _ = drive(way)
     assert navigator.phase is Phase.ARRIVED and way.number == 1
-    assert math.dist((vehicle.x, vehicle.y), (14.0, 22.0)) < LEAST_M + 0.5
+    assert math.dist((vehicle.x, vehicle.y), (14.0, 22.0)) < MIN_SWITCH_M + 0.5
     assert way.switch_m(0) == pytest.approx(turning_radius_m(CARRIER, CARRIER.articulation_limit_rad), rel=0.05)
-    assert way.switch_m(1) == LEAST_M
+    assert way.switch_m(1) == MIN_SWITCH_M
 
 
 def report(**values: float) -> VehicleReport:
@@ -118,18 +122,18 @@ def report(**values: float) -> VehicleReport:
     ],
 )
 def test_paper_b_stands_without_a_receiver(what: dict[str, float], reason: str) -> None:
-    plane = Plane(CARRIER.site_lat_deg, CARRIER.site_lon_deg)
-    way = PaperB(CARRIER, [Waypoint(*plane.geodetic(0.0, 40.0)[:2])])
+    plane = LocalPlane(CARRIER.site_lat_deg, CARRIER.site_lon_deg)
+    way = WaypointDrive(CARRIER, [Waypoint(*plane.geodetic(0.0, 40.0)[:2])])
     assert way.step(report()).speed_m_s == CARRIER.cruise_speed_m_s
     order = way.step(report(**what))
-    assert order.speed_m_s == 0.0 and reason in order.trouble
-    with pytest.raises(ValueError, match="one waypoint at least"):
-        PaperB(CARRIER, [])
+    assert order.speed_m_s == 0.0 and reason in order.stop_reason
+    with pytest.raises(ValueError, check=coded("path.no-waypoints")):
+        WaypointDrive(CARRIER, [])
 
 
 def test_a_last_waypoint_that_was_passed_is_reached() -> None:
-    plane = Plane(CARRIER.site_lat_deg, CARRIER.site_lon_deg)
-    way = PaperB(CARRIER, [Waypoint(*plane.geodetic(4.0, 10.0)[:2])])
+    plane = LocalPlane(CARRIER.site_lat_deg, CARRIER.site_lon_deg)
+    way = WaypointDrive(CARRIER, [Waypoint(*plane.geodetic(4.0, 10.0)[:2])])
     assert not way.step(report()).arrived
     lat, lon, _ = plane.geodetic(0.0, 12.0)
     assert way.step(report(latitude_deg=lat, longitude_deg=lon)).arrived
@@ -138,10 +142,10 @@ def test_a_last_waypoint_that_was_passed_is_reached() -> None:
 # -- navigator
 
 
-def begun(location: Location | None = None) -> tuple[Navigator, Along, Location]:
+def begun(location: Location | None = None) -> tuple[Navigator, PathDrive, Location]:
     """A navigator that drives along x from the origin."""
     navigator = Navigator(CARRIER, 7, (0.3, 0.3, 0.35, 0.35))
-    way = Along(CARRIER, drivable([(0.0, 0.0), (30.0, 0.0)], CARRIER))
+    way = PathDrive(CARRIER, drivable_path([(0.0, 0.0), (30.0, 0.0)], CARRIER))
     navigator.drive(way)
     return navigator, way, location or at(1.0, 0.0, 0.0)
 
@@ -164,7 +168,7 @@ def test_the_front_axle_floats_while_it_drives_and_no_longer() -> None:
     navigator.pause()
     braked = navigator.step(2 * 10**9, report(), here)
     assert braked is not None and not (braked.float_front or braked.float_rear)
-    navigator.holds = True
+    navigator.holds_heights = True
     held = navigator.step(9 * 10**9, report(speed_m_s=0.0), here)
     assert held is not None and not (held.float_front or held.float_rear), "while the crane works it stands firm"
 
@@ -177,9 +181,9 @@ def test_pause_stands_and_resume_drives_on() -> None:
     assert navigator.phase is Phase.PAUSED and asked is not None and asked.speed_m_s == 0.0
     assert asked.articulation_rad == pytest.approx(0.1)
     asked = navigator.step(2_200_000_000, report(speed_m_s=0.0), here)
-    assert asked is not None and asked.speed_m_s == 0.0 and not navigator.stands  # until the brake is on
+    assert asked is not None and asked.speed_m_s == 0.0 and not navigator.is_standing  # until the brake is on
     assert navigator.step(3 * 10**9, report(speed_m_s=0.0), here) is None  # it stands: the lease runs out
-    assert navigator.stands
+    assert navigator.is_standing
     navigator.resume()
     asked = navigator.step(4 * 10**9, report(speed_m_s=0.0), replace(here, stamp_ns=4 * 10**9))
     assert navigator.phase is Phase.DRIVING and asked is not None and asked.speed_m_s > 0.0
@@ -191,7 +195,7 @@ def test_pause_stands_and_resume_drives_on() -> None:
     [
         (Location(10**9, Status.LOST, "no position from the receiver"), "not located: no position"),
         (Location(10**9, Status.STARTING, "not enough positions that fit yet"), "not located"),
-        (at(1.0, 0.0, 0.0, covariance=np.eye(3)), "only good to 1.00 m"),
+        (at(1.0, 0.0, 0.0, covariance=np.eye(3)), "1.00 m"),
     ],
 )
 def test_who_does_not_know_where_it_is_stands_until_told(here: Location, reason: str) -> None:
@@ -218,20 +222,22 @@ def test_a_machine_that_is_carried_away_stops() -> None:
     navigator, _, here = begun()
     navigator.step(10**9, report(), here)
     navigator.step(2 * 10**9, report(), replace(here, y_m=2.2))
-    assert navigator.phase is Phase.STOPPED and "beside the path" in navigator.reason
+    assert navigator.phase is Phase.STOPPED and "beside" in navigator.reason
 
 
 def test_a_controller_that_does_not_drive_is_not_asked_for_ever() -> None:
     navigator, _, here = begun()
     for k in range(2):
-        navigator.step(10**9 + k * (OBEYS_NS + 1), report(driving=Driving.STANDING, refusal=512, speed_m_s=0.0), here)
+        navigator.step(
+            10**9 + k * (EXECUTION_TIMEOUT_NS + 1), report(driving=Driving.STANDING, refusal=512, speed_m_s=0.0), here
+        )
     assert navigator.phase is Phase.STOPPED and "512" in navigator.reason
 
 
 def test_wheels_that_do_not_turn_are_given_up() -> None:
     navigator, _, here = begun()
     for k in range(2):
-        navigator.step(10**9 + k * (MOVES_NS + 1), report(speed_m_s=0.0), here)
+        navigator.step(10**9 + k * (MOTION_TIMEOUT_NS + 1), report(speed_m_s=0.0), here)
     assert navigator.phase is Phase.STOPPED and "do not turn" in navigator.reason
 
 

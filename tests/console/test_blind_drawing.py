@@ -7,17 +7,18 @@ from math import nan
 
 import pytest
 
-from can_dbc.setpoint import StateReport, encode
-from console.state import Watch
-from machine.load import load_profile, profile_hash
-from machine.modes import Mode
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import encode
+from console.state import CraneState
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.status.modes import Mode
 
 FORWARDER, PALMS = load_profile("aoro_fc8"), load_profile("palms_471")
 MEASURED = (0.5, 0.9, -2.0, 0.5, nan)
 
 
 def drawn(profile, told: float) -> dict:
-    watch = Watch(profile)
+    watch = CraneState(profile)
     report = StateReport(
         1, profile_hash(profile), 5_000_000_000, Mode.ACTIVE, 0, 0, 1, 0, 0, 0, MEASURED,
         (0.0,) * 5, (*MEASURED[:4], told), nan, nan, nan, 0, 0, 0, 0,

@@ -19,7 +19,7 @@ from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.timing.page import TimingWriter
 from console.server import STATIC, Console, create_app
-from console.state import ALIVE_NS, TIMING_OLD_NS, Watch, describe_machine
+from console.state import ALIVE_NS, TIMING_OLD_NS, CraneState, describe_machine
 from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
@@ -232,7 +232,7 @@ def test_logs_of_a_detector_are_shown(controller_socket):
 
 
 def watched(report=REPORT, at_ns=0, seen_ns=0):
-    watch = Watch(PROFILE)
+    watch = CraneState(PROFILE)
     assert watch.on_report(encode(report), at_ns)
     return watch.state(seen_ns)
 
@@ -257,7 +257,7 @@ def test_unknown_numbers_are_none_and_the_state_is_json():
 
 
 def test_silence_is_noticed_within_a_second():
-    watch = Watch(PROFILE)
+    watch = CraneState(PROFILE)
     watch.on_report(encode(REPORT), 0)
     assert watch.state(ALIVE_NS - 1)["alive"] and not watch.state(ALIVE_NS)["alive"]
     # The page is told every 50 ms and looks every 100 ms.
@@ -265,7 +265,7 @@ def test_silence_is_noticed_within_a_second():
 
 
 def test_peaks_hold_for_a_second():
-    watch = Watch(PROFILE)
+    watch = CraneState(PROFILE)
     for k, tick_ns in enumerate((900_000, 100_000, 100_000)):
         report = replace(REPORT, tick_ns=tick_ns, stamp_ns=k * 20_000_000, frames_received=64 * k)
         watch.on_report(encode(report), k * 20_000_000)
@@ -275,7 +275,7 @@ def test_peaks_hold_for_a_second():
 
 
 def test_timing_is_shown_while_the_controller_writes_it(timing):
-    watch = Watch(PROFILE)
+    watch = CraneState(PROFILE)
     assert watch.state(0)["timing"] is None
     page = timing(100, missed=3, written_ns=10**10)
     watch.on_timing(page)
@@ -308,7 +308,7 @@ def test_the_page_file_is_read_and_its_end_is_noticed(timing, tmp_path, monkeypa
 
 
 def test_foreign_datagrams_change_nothing():
-    watch = Watch(PROFILE)
+    watch = CraneState(PROFILE)
     good = encode(REPORT)
     command = OperatorCommand(1, 2, 3, OperatorAction.STOP)
     for bad in (b"", b"x", good[:-1], good[:40] + b"\xff" + good[41:], encode(command)):

@@ -14,14 +14,15 @@ import msgspec
 import pytest
 import uvicorn
 
-from can_dbc.mission_datagrams import MissionReport, Order, decode_order, encode_mission
-from can_dbc.setpoint import StateReport, encode
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import encode
+from can_dbc.messages.mission import MissionReport, Order, decode_order, encode_mission
 from console.server import Console, create_app
-from machine.load import load_profile, profile_hash
-from machine.modes import Mode
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.status.modes import Mode
 from tests.can_dbc.mission_told import TOLD
 from tests.console.browser import MISSING, Browser, installed
-from tests.console.test_mission_state import VEHICLE
+from tests.console.vehicle_reports import VEHICLE
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(installed() is None, reason=MISSING)]
 INK = """(name => {

@@ -11,30 +11,27 @@ import pymap3d
 import pytest
 from starlette.testclient import TestClient
 
+from can_dbc.messages.datagrams import encode
 from can_dbc.messages.mission import MissionOrder, Order, decode_order, encode_mission
-from can_dbc.messages.crane import Driving, VehicleReport, encode
 from can_dbc.messages.vehicle import VEHICLE_INPUTS
-from console.map_projection import Ground
+from console.map_projection import MapProjection
 from console.mission_state import INPUT_NAMES, TOLD_NS, TRAIL_M, VEHICLE_NS
 from console.server import Console, create_app
-from console.state import Watch, describe_machine
-from machine.load import load_profile, profile_hash
+from console.state import CraneState, describe_machine
+from machine.loading.profile_file import load_profile, profile_hash
 from tests.can_dbc.mission_told import HERE, TOLD
+from tests.console.vehicle_reports import HASH, PROFILE, VEHICLE
 
-PROFILE = load_profile("aoro_fc8")
-HASH = profile_hash(PROFILE)
 BASE = "http://127.0.0.1:8471"
-VEHICLE = VehicleReport(
-    1, HASH, 10**9, 3, Driving.DRIVING, 0, 0, 10**9, *HERE, 102.0, 4, 18, 0.014, 10**9, math.pi / 2, 0.0, 10**9,
-    0.64, 0.2, 0.02, -0.03, (0.35, 0.34, 0.33, 0.32), 0,
-)  # fmt: skip
 
 
-def watch(profile=PROFILE, key=None) -> Watch:
-    return Watch(profile, key, profile_hash(profile))
+def watch(profile=PROFILE, key=None) -> CraneState:
+    return CraneState(profile, key, profile_hash(profile))
 
 
-def told(watch: Watch, report=TOLD, stamp_ns: int = 10**9, code: int = HASH, key=None, now_ns: int = 10**9) -> bool:
+def told(
+    watch: CraneState, report=TOLD, stamp_ns: int = 10**9, code: int = HASH, key=None, now_ns: int = 10**9
+) -> bool:
     return watch.on_report(encode_mission(report, 1, code, stamp_ns, key), now_ns)
 
 
@@ -120,12 +117,12 @@ def test_the_trail_grows_with_the_way() -> None:
 
 
 def test_the_ground_is_that_of_the_ellipsoid() -> None:
-    ground = Ground()
+    ground = MapProjection()
     ground.metres(*HERE)
     for lat, lon in ((63.6600, 19.8955), (63.6578, 19.9050), (63.6550, 19.8900)):
         east, north, _ = pymap3d.geodetic2enu(lat, lon, 0.0, *HERE, 0.0)
         assert ground.metres(lat, lon) == pytest.approx((east, north), abs=0.05)
-    assert Ground().metres(*HERE) == (0.0, 0.0)
+    assert MapProjection().metres(*HERE) == (0.0, 0.0)
 
 
 def test_a_machine_that_stands_still_has_no_carrier_to_draw() -> None:

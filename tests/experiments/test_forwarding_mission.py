@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from autonomy.localization.local_plane import Plane
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.missions.mission_file import load_mission
 from autonomy.missions.validation import problems_of
 from experiments.forwarding_mission.experiment import FILE, MACHINES, NOMINAL, calibrations, missions, trial
-from experiments.forwarding_mission.metrics import FIGURES, PAPER_TABLE_MM, by_log, gather, table
+from experiments.forwarding_mission.metrics import METRICS, PAPER_TABLE_MM, by_log, gather, table
 from experiments.forwarding_mission.plots import PAPER_MM, draw
 from experiments.forwarding_mission.trial import ACROSS_M, ALONG_M, TURN_DEG, perform, short, shuffled
 
@@ -65,7 +65,7 @@ def test_a_log_that_was_lost_a_stop_and_a_mission_that_failed_miss_their_limits(
     bad = outcome(finished=False, stops=2)
     bad["logs"][0] |= {"in_bunk": False, "detected": False}
     metrics = gather({"mission/0": bad, "machine/0": {"profile": None, "failure": "x"}})
-    limits = {f.name: f for f in FIGURES}
+    limits = {f.name: f for f in METRICS}
     for name, value in {
         "detected": 2 / 3,
         "loaded": 2 / 3,
@@ -129,7 +129,7 @@ def test_every_mission_has_a_field_of_its_own_and_the_individuals_take_turns() -
 
 
 def test_a_shuffled_field_can_be_driven_and_is_another_every_time() -> None:
-    plane = Plane(MISSION.waypoints[0].latitude_deg, MISSION.waypoints[0].longitude_deg)
+    plane = LocalPlane(MISSION.waypoints[0].latitude_deg, MISSION.waypoints[0].longitude_deg)
     seen = set()
     for seed in range(5):
         other = shuffled(MISSION, seed)

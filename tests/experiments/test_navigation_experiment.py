@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from autonomy.navigation.clothoid_path import drivable
-from autonomy.navigation.joining_path import joined
+from autonomy.navigation.clothoid_path import drivable_path
+from autonomy.navigation.joining_path import joining_path
 from experiments.navigation import measure
 from experiments.navigation.experiment import CORNERS, LAPS, QUICK_START, STARTS, plan
 from experiments.navigation.measure import Drive
-from experiments.navigation.metrics import FIGURES, GROUNDS, LAP, gather
+from experiments.navigation.metrics import GROUNDS, LAP, METRICS, gather
 from experiments.navigation.plots import draw
 from experiments.navigation.trial import COLUMNS, perform
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 
 CARRIER = load_profile("aoro_fc8").carrier
 assert CARRIER is not None
@@ -34,7 +34,7 @@ def row(**values: float) -> list[float | None]:
 def ours(off_m: float = 0.0, seen_off_m: float = 0.0, points: list[tuple[float, float]] = POINTS) -> dict[str, Any]:
     """A drive exactly ``off_m`` to the left of its path, that believes to be on it."""
     begin = (-12.0, -10.0, 0.0)
-    path = joined(begin[:2], begin[2], points, CARRIER)
+    path = joining_path(begin[:2], begin[2], points, CARRIER)
     rows = []
     for s in np.arange(0.0, path.length_m, SPACING_M):
         x, y, heading, _ = path.at(s)
@@ -83,7 +83,7 @@ def test_the_plan_drives_every_start_on_every_ground_both_ways() -> None:
 
 def test_every_start_has_a_path() -> None:
     for x, y, degrees in (*STARTS, QUICK_START):
-        path = joined((x, y), math.radians(degrees), POINTS, CARRIER)
+        path = joining_path((x, y), math.radians(degrees), POINTS, CARRIER)
         assert measure.corner_end_m(path, POINTS[0]) < 0.3 * path.length_m
         assert path.xy_m[-1] == pytest.approx(POINTS[-1], abs=1e-3)
 
@@ -124,7 +124,7 @@ def test_a_drive_that_did_not_arrive_is_no_path_but_counts() -> None:
     metrics = gather(outcomes, POINTS, CARRIER)
     assert metrics["faithful.coming_p95_m"] < 0.02
     assert metrics["arrived"] == pytest.approx(2 / 3) and metrics["stops"] == 2.0
-    limits = {f.name: f for f in FIGURES}
+    limits = {f.name: f for f in METRICS}
     assert not limits["arrived"].holds(metrics["arrived"]) and not limits["stops"].holds(2.0)
 
 
@@ -147,7 +147,7 @@ def test_distances_are_to_segments() -> None:
 
 
 def test_a_first_bend_ends_where_the_path_is_straight_again() -> None:
-    path = drivable([(0.0, 0.0), (30.0, 0.0), (30.0, 30.0)], CARRIER)
+    path = drivable_path([(0.0, 0.0), (30.0, 0.0), (30.0, 30.0)], CARRIER)
     end = measure.corner_end_m(path, (30.0, 0.0))
     assert path.corners_m[0] < end < path.corners_m[0] + 10.0
     assert path.at(end + 0.1)[3] == 0.0 and path.at(end - 0.3)[3] != 0.0

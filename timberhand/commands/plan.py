@@ -51,7 +51,12 @@ def check(
         draft, review = _read(file, logs, machine)
     except MissionError as error:
         if as_json:
-            typer.echo(json.dumps({"file": str(file), "problems": list(error.problems)}, indent=2))
+            found = {
+                "file": str(file),
+                "problems": [str(problem) for problem in error.problems],
+                "codes": [problem.code for problem in error.problems],
+            }
+            typer.echo(json.dumps(found, indent=2))
             raise typer.Exit(ExitCode.CONFIGURATION) from None
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     if as_json:
@@ -197,7 +202,7 @@ def _facts(file: Path, draft: Draft, review: Review | None) -> dict[str, Any]:
         facts |= {
             "length_m": round(review.length_m, 2), "drive_s": round(review.drive_s, 1), "logs_to_fetch": review.logs,
             "crane_s": round(review.crane_s, 1), "total_s": round(review.total_s, 1), "corners": corners,
-            "warnings": list(review.warnings),
+            "warnings": [warning.sentence for warning in review.warnings],
         }  # fmt: skip
     return facts
 
@@ -234,6 +239,6 @@ def _show(file: Path, draft: Draft, review: Review | None) -> None:
     for note in draft.notes:
         console.print(f"[yellow]note[/yellow] {escape(note)}")
     for warning in review.warnings if review is not None else ():
-        console.print(f"[yellow]warning[/yellow] {escape(warning)}")
+        console.print(f"[yellow]warning[/yellow] {escape(warning.sentence)}")
     if review is not None and not review.warnings:
         console.print("[green]✔[/green] no warnings for this machine")

@@ -9,40 +9,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.manager.log_map import CONFIRMED, Field, FieldLog, nearest
-from autonomy.perception.frame import Pose
-from autonomy.perception.logs import LogObservation
-from machine.load import load_profile
+from autonomy.manager.log_map import CONFIRMED_HITS, LogMap, nearest
+from autonomy.perception.log_list.observation import LogObservation
+from machine.loading.profile_file import load_profile
+from tests.autonomy.mapped_logs import base, lying, seen
 
 PROFILE = load_profile("aoro_fc8")
 
 
-def base(x_m: float, y_m: float, yaw_rad: float) -> Pose:
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    return Pose(np.array([x_m, y_m, 1.5]), np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
-
-
-def lying(number: int, x_m: float, y_m: float, yaw_rad: float = 0.0) -> FieldLog:
-    axis = np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
-    return FieldLog(number, np.array([x_m, y_m, 0.15]), axis, 2.0, 0.25, 0.1, 1, 0)
-
-
-def seen(logs: list[FieldLog], at: Pose, error_m: tuple[float, float] = (0.0, 0.0)) -> list[LogObservation]:
-    found = []
-    for log in logs:
-        o = log.observation(at)
-        x, y, z = o.center_m
-        found.append(LogObservation(o.id, (x + error_m[0], y + error_m[1], z), o.axis, o.length_m, o.diameter_m))
-    return found
-
-
 @given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-3, 3), st.floats(-3, 3)), min_size=3, max_size=8))
 def test_a_log_keeps_its_number_and_place_while_the_machine_passes(poses) -> None:
-    field, logs = Field(PROFILE.bunk), [lying(7, 12.0, 30.0), lying(9, 15.0, 30.0, 1.2)]
+    field, logs = LogMap(PROFILE.bunk), [lying(7, 12.0, 30.0), lying(9, 15.0, 30.0, 1.2)]
     numbers = set()
     for k, pose in enumerate(poses):
         at = base(*pose)
-        field.see(seen(logs, at), at, k)
+        field.observe(seen(logs, at), at, k)
         numbers |= {log.number for log in field.logs}
     assert numbers == {1, 2}
     for log, true in zip(field.logs, logs, strict=True):
@@ -51,60 +32,59 @@ def test_a_log_keeps_its_number_and_place_while_the_machine_passes(poses) -> Non
 
 
 def test_an_average_gets_better_than_its_sightings() -> None:
-    field, rng, at = Field(PROFILE.bunk), np.random.default_rng(3), base(0.0, 0.0, 0.3)
+    field, rng, at = LogMap(PROFILE.bunk), np.random.default_rng(3), base(0.0, 0.0, 0.3)
     true = lying(1, 6.0, 5.0)
     for k in range(40):
-        field.see(seen([true], at, tuple(rng.normal(0.0, 0.1, 2))), at, k)
+        field.observe(seen([true], at, tuple(rng.normal(0.0, 0.1, 2))), at, k)
     (log,) = field.logs
     assert np.linalg.norm(log.center_m - true.center_m) < 0.05
     assert log.sigma_m == pytest.approx(0.1 / math.sqrt(40), rel=1e-6)
 
 
 def test_a_sighting_that_is_known_better_weighs_more() -> None:
-    field, at = Field(PROFILE.bunk), base(0.0, 0.0, 0.0)
+    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
     true = lying(1, 6.0, 5.0)
     (o,) = seen([true], at)
-    field.see(seen([true], at, (0.2, 0.0)), at, 1)
+    field.observe(seen([true], at, (0.2, 0.0)), at, 1)
     good = np.zeros((7, 7))
     good[np.diag_indices(7)] = 1e-4
     sure = LogObservation(o.id, o.center_m, o.axis, o.length_m, o.diameter_m, tuple(good[np.triu_indices(7)]))
-    field.see([sure], at, 2)
+    field.observe([sure], at, 2)
     assert np.linalg.norm(field.logs[0].center_m - true.center_m) < 0.01
 
 
-def test_one_sighting_is_no_log_yet_and_a_stray_is_forgotten() -> None:
-    field, at = Field(PROFILE.bunk), base(0.0, 0.0, 0.0)
-    field.see(seen([lying(1, 6.0, 5.0)], at), at, 10)
-    assert CONFIRMED == 2 and not field.logs
-    field.forget(older_ns=11)
-    field.see(seen([lying(1, 6.0, 5.0)], at), at, 20)
-    assert not field.logs
+def test_one_observation_does_not_confirm_a_log() -> None:
+    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
+    field.observe(seen([lying(1, 6.0, 5.0)], at), at, 10)
+    assert CONFIRMED_HITS == 2 and not field.logs
+    field.observe(seen([lying(1, 6.0, 5.0)], at), at, 20)
+    assert len(field.logs) == 1
 
 
 def test_what_lies_in_the_bunk_is_no_log_of_the_field() -> None:
-    field, at, bunk = Field(PROFILE.bunk), base(0.0, 0.0, 0.0), PROFILE.bunk
+    field, at, bunk = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0), PROFILE.bunk
     inside = LogObservation(4, (*bunk.center_m, bunk.floor_z_m + 0.2), (1.0, 0.0, 0.0), 2.0, 0.25)
     for k in range(3):
-        assert field.see([inside], at, k) == {}
+        assert field.observe([inside], at, k) == {}
     assert not field.logs
 
 
 def test_two_logs_side_by_side_are_two() -> None:
-    field, at = Field(PROFILE.bunk), base(0.0, 0.0, 0.0)
+    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
     logs = [lying(1, 6.0, 5.0), lying(2, 6.0, 5.3)]
     for k in range(3):
-        assert field.see(seen(logs, at), at, k) == {1: 1, 2: 2}
+        assert field.observe(seen(logs, at), at, k) == {1: 1, 2: 2}
     assert len(field.logs) == 2
 
 
 def test_an_average_begun_anew_forgets_what_was_wrong_and_misses_are_counted() -> None:
-    field, at = Field(PROFILE.bunk), base(0.0, 0.0, 0.0)
+    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
     true = lying(1, 6.0, 5.0)
     for k in range(5):
-        field.see(seen([true], at, (0.25, 0.0)), at, k)
-    assert field.missed(1) == 1
+        field.observe(seen([true], at, (0.25, 0.0)), at, k)
+    assert field.record_miss(1) == 1
     for k in range(2):
-        field.see(seen([true], at), at, 10 + k)
+        field.observe(seen([true], at), at, 10 + k)
     (log,) = field.logs
     assert log.number == 1 and log.misses == 1
     assert log.center_m == pytest.approx(true.center_m, abs=1e-9)
@@ -113,17 +93,17 @@ def test_an_average_begun_anew_forgets_what_was_wrong_and_misses_are_counted() -
 
 
 def test_a_log_known_beforehand_is_there_at_once_and_is_the_one_that_is_seen() -> None:
-    field, at = Field(PROFILE.bunk), base(0.0, 0.0, 0.0)
-    field.known(lying(0, 6.1, 5.0))
+    field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
+    field.add_known(lying(0, 6.1, 5.0))
     assert nearest(field.logs, np.array([0.0, 0.0])) is field.logs[0]
-    assert field.see(seen([lying(5, 6.0, 5.0)], at), at, 1) == {5: 1}
+    assert field.observe(seen([lying(5, 6.0, 5.0)], at), at, 1) == {5: 1}
 
 
 def test_an_axis_that_is_not_known_does_not_make_two_logs_of_one() -> None:
     sure, unsure = (tuple(np.diag([0.01] * 2 + [turn**2] * 2 + [0.04] * 2 + [0.01])[np.triu_indices(7)].tolist())
                     for turn in (0.02, 0.6))  # fmt: skip
     for covariance, logs in ((unsure, 1), (sure, 2)):
-        field = Field(PROFILE.bunk)
+        field = LogMap(PROFILE.bunk)
         for k, axis in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)) * 2):
-            field.see([LogObservation(1, (-4.0, 3.0, -1.3), axis, 2.0, 0.25, covariance)], base(0.0, 0.0, 0.0), k)
+            field.observe([LogObservation(1, (-4.0, 3.0, -1.3), axis, 2.0, 0.25, covariance)], base(0.0, 0.0, 0.0), k)
         assert len(field.logs) == logs

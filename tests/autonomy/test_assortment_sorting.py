@@ -10,17 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.grasp.selection import PlannerSelection
 from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.selection import PlannerSelection
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.sorting import Sorting
 from autonomy.manager.transition_table import State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.test_manager import PLANE, PROFILE, at, ended, place, states, whole
-from tests.autonomy.test_manager_field import lying
-from tests.autonomy.test_manager_resume import again
+from tests.autonomy.manager_missions import PLANE, PROFILE, again, at, ended, place, states, whole
+from tests.autonomy.mapped_logs import lying
 
 SAW, PULP, ALL, NONE = ("saw logs",), ("pulpwood",), (), ("energy",)
 Lie = tuple[str, float, float]
@@ -56,65 +55,65 @@ def managed(told: ForwardingMission, **how) -> ActivityManager:
 # ---------------------------------------------------------------------- the rules
 def test_without_a_choice_every_log_is_wanted() -> None:
     plain = sorting(SAW, PULP, sorts=False)
-    assert not plain.chooses and plain.wants("") and plain.wants("veneer")
+    assert plain.wants("") and plain.wants("veneer")
 
 
 def test_logs_of_other_assortments_and_unknown_ones_stay_lying() -> None:
     only = sorting(sorts=False, only=SAW)
-    assert only.chooses and only.wants("saw logs") and not only.wants("pulpwood") and not only.wants("")
+    assert only.wants("saw logs") and not only.wants("pulpwood") and not only.wants("")
 
 
 def test_the_first_landing_that_names_an_assortment_takes_it_else_the_first_that_names_none() -> None:
     several = sorting(ALL, SAW, ALL, (*PULP, *SAW))
-    assert [several.taker(kind) for kind in ("saw logs", "pulpwood", "veneer", "")] == [1, 3, 0, 0]
-    assert sorting(SAW).taker("pulpwood") is None and not sorting(SAW).wants("pulpwood")
+    assert [several.landing_of(kind) for kind in ("saw logs", "pulpwood", "veneer", "")] == [1, 3, 0, 0]
+    assert sorting(SAW).landing_of("pulpwood") is None and not sorting(SAW).wants("pulpwood")
 
 
 def test_the_first_log_aboard_decides_until_the_load_is_unloaded() -> None:
     both = sorting(SAW, PULP)
     assert both.wants("saw logs") and both.wants("pulpwood")
-    both.took(["pulpwood", "saw logs"])
+    both.book_loaded(["pulpwood", "saw logs"])
     assert both.landing == 1 and both.wants("pulpwood") and not both.wants("saw logs")
-    both.took(["saw logs"])
+    both.book_loaded(["saw logs"])
     assert both.landing == 1, "one that came up by mistake changes nothing"
-    both.unloaded()
+    both.book_unloaded()
     assert both.wants("saw logs")
 
 
 def test_a_first_grasp_holds_what_one_landing_takes() -> None:
     both = sorting(SAW, PULP)
-    assert both.together("pulpwood", "pulpwood") and not both.together("saw logs", "pulpwood")
-    assert sorting(SAW, PULP, sorts=False).together("saw logs", "pulpwood")
+    assert both.may_share_grasp("pulpwood", "pulpwood") and not both.may_share_grasp("saw logs", "pulpwood")
+    assert sorting(SAW, PULP, sorts=False).may_share_grasp("saw logs", "pulpwood")
 
 
 def test_a_load_goes_to_the_nearest_landing_and_does_not_change_its_mind() -> None:
     plain = sorting(ALL, ALL, sorts=False)
-    assert plain.sets_out([(0.0, 0.0), (9.0, 0.0)], (8.0, 0.0)) == 1
-    assert plain.sets_out([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 1
-    plain.unloaded()
-    assert plain.sets_out([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 0
+    assert plain.choose_landing([(0.0, 0.0), (9.0, 0.0)], (8.0, 0.0)) == 1
+    assert plain.choose_landing([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 1
+    plain.book_unloaded()
+    assert plain.choose_landing([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 0
     sorted_ = sorting(SAW, PULP)
-    sorted_.took(PULP)
-    assert sorted_.sets_out([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 1
+    sorted_.book_loaded(PULP)
+    assert sorted_.choose_landing([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 1
 
 
 def test_another_round_is_for_what_the_load_of_this_one_had_no_place_for() -> None:
     both = sorting(SAW, PULP)
-    assert not both.anew(PULP), "nothing was loaded"
-    both.took(SAW)
-    assert both.anew(PULP) and not both.anew(SAW) and not both.anew(NONE)
-    both.unloaded()
-    both.took(PULP)
-    assert both.anew(SAW), "some of it was passed while the other was on board"
-    both.begins_anew()
-    assert both.rounds == 1 and not both.anew(SAW)
-    assert not sorting(SAW, PULP, sorts=False).anew(PULP)
+    assert not both.needs_another_round(PULP), "nothing was loaded"
+    both.book_loaded(SAW)
+    assert both.needs_another_round(PULP) and not both.needs_another_round(SAW) and not both.needs_another_round(NONE)
+    both.book_unloaded()
+    both.book_loaded(PULP)
+    assert both.needs_another_round(SAW), "some of it was passed while the other was on board"
+    both.start_round()
+    assert both.rounds == 1 and not both.needs_another_round(SAW)
+    assert not sorting(SAW, PULP, sorts=False).needs_another_round(PULP)
 
 
 def test_a_landing_is_called_by_its_name_or_number_where_there_are_several() -> None:
     several = Sorting(mission((), ((0.0, 0.0, ()), (9.0, 0.0, ()))))
-    assert [several.called(i) for i in (0, 1, None)] == ["Road", "landing 2", ""]
-    assert sorting(ALL).called(0) == ""
+    assert [several.landing_name(i) for i in (0, 1, None)] == ["Road", "landing 2", ""]
+    assert sorting(ALL).landing_name(0) == ""
 
 
 KINDS = st.sampled_from(["", "saw logs", "pulpwood", "energy"])
@@ -130,10 +129,10 @@ def test_what_is_wanted_always_goes_where_the_load_goes(takes, only, grasps) -> 
     for kinds in grasps:
         if not rules.wants(kinds[0]):
             continue  # nobody reaches out for what is to stay
-        taken = [k for k in kinds if rules.wants(k) and rules.together(k, kinds[0])]
-        rules.took(taken)
-        assert not taken or {rules.taker(k) for k in taken} == {rules.landing}
-        assert all(rules.taker(k) == rules.landing for k in taken) and (not only or set(taken) <= set(only))
+        taken = [k for k in kinds if rules.wants(k) and rules.may_share_grasp(k, kinds[0])]
+        rules.book_loaded(taken)
+        assert not taken or {rules.landing_of(k) for k in taken} == {rules.landing}
+        assert all(rules.landing_of(k) == rules.landing for k in taken) and (not only or set(taken) <= set(only))
 
 
 # ---------------------------------------------------------------------- whole missions
@@ -151,7 +150,10 @@ def test_unwanted_logs_stay_lying_and_nobody_stops_for_them() -> None:
 @pytest.mark.parametrize(("only", "grasp"), [(SAW, (2,)), ((), (1, 2))])
 def test_a_log_that_nobody_wants_is_not_scooped_up_with_its_neighbour(only, grasp) -> None:
     lie = (("pulpwood", 18.0, 4.4), ("saw logs", 18.0, 4.9))
-    machine, manager = forwarder(lie), managed(mission(lie, assortments=only), chooser=PlannerSelection(SamplingPlanner()))
+    machine, manager = (
+        forwarder(lie),
+        managed(mission(lie, assortments=only), chooser=PlannerSelection(SamplingPlanner())),
+    )
     machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
     assert manager.activity is not None and manager.activity.grasp is not None
     assert sorted(log.id for log in manager.activity.grasp.logs) == list(grasp)

@@ -8,23 +8,23 @@ from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
-from mission_texts import SITE, at
 
-from autonomy.missions.mission_file import load_mission, read, verify
 from autonomy.missions.fpr import ForwardedLoad, ForwardedLog, Forwarder, write_fpr
 from autonomy.missions.hpr import MACHINE_SIGMA_M, TIP_SIGMA_M
-from autonomy.missions.model import Landing, MissionError, Point
+from autonomy.missions.mission_file import load_mission, read
+from autonomy.missions.model import Landing, MissionError, Point, Problem
+from tests.autonomy.mission_checks import refused
+from tests.autonomy.mission_texts import SITE, at
+from tests.codes import coded
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "harvest.hpr"
 TEXT = EXAMPLE.read_text(encoding="utf-8")
 NS = {"s": "urn:skogforsk:stanford2010"}
 
 
-def told(text: str) -> str:
-    """What is said of an hpr that is refused."""
-    with pytest.raises(MissionError) as refused:
-        verify(read(text.encode(), "h"), route_wanted=False)
-    return str(refused.value)
+def problem(text: str) -> Problem:
+    """The first problem of an hpr that is refused."""
+    return refused(text.encode(), "h", route_wanted=False).problems[0]
 
 
 # -- hpr --------------------------------------------------------------------------------------------------------
@@ -69,33 +69,33 @@ def test_stems_without_coordinates_are_counted() -> None:
     start = TEXT.index("<StemCoordinates", TEXT.index("<StemKey>4004"))
     end = TEXT.index("</StemCoordinates>", start) + len("</StemCoordinates>")
     draft = read((TEXT[:start] + TEXT[end:]).encode(), "h")
-    assert len(draft.mission.logs) == 5 and draft.notes == ["2 logs of stems without coordinates left out"]
+    assert len(draft.mission.logs) == 5 and draft.notes[0].startswith("2 logs ")
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "sentence"),
+    ("old", "new", "code"),
     [
-        ("urn:skogforsk:stanford2010", "urn:else", "is not urn:skogforsk:stanford2010"),
-        ('messageType="hpr"', 'messageType="pri"', "message type 'pri'; logs come from an hpr"),
-        ('"WGS84"', '"RT90"', 'coordinates are in "RT90"; a mission is in WGS84'),
-        ("<LogLength>300", "<LogLength>3x0", 'LogLength "3x0" is no number'),
-        ("<LogLength>300", "<LogLength>inf", "LogLength is inf, which is no number"),
-        ("<LogLength>300", "<LogLength>30000", "length_m is 300; logs have 0.3 to 30 m (is it in another unit?)"),
-        ("</Machine>", "</Machin>", "no well-formed XML"),
+        ("urn:skogforsk:stanford2010", "urn:else", "hpr.namespace"),
+        ('messageType="hpr"', 'messageType="pri"', "hpr.message-type"),
+        ('"WGS84"', '"RT90"', "mission.datum"),
+        ("<LogLength>300", "<LogLength>3x0", "mission.number"),
+        ("<LogLength>300", "<LogLength>inf", "mission.number"),
+        ("<LogLength>300", "<LogLength>30000", "mission.log-size"),
+        ("</Machine>", "</Machin>", "mission.not-xml"),
     ],
 )
-def test_what_an_hpr_must_be(old: str, new: str, sentence: str) -> None:
-    said = told(TEXT.replace(old, new))
-    assert sentence in said and said.startswith("h:")
+def test_invalid_hpr_files(old: str, new: str, code: str) -> None:
+    found = problem(TEXT.replace(old, new))
+    assert found.code == code and found.place.startswith("h:")
 
 
 def test_the_line_of_a_bad_log() -> None:
     bad = TEXT.replace("<LogLength>430", "<LogLength>x", 1)
-    assert told(bad).startswith(f"h:{1 + bad[: bad.index('<LogLength>x')].count(chr(10))}: ")
+    assert problem(bad).place == f"h:{1 + bad[: bad.index('<LogLength>x')].count(chr(10))}"
 
 
 def test_an_hpr_alone_is_no_route() -> None:
-    with pytest.raises(MissionError, match="has no waypoints"):
+    with pytest.raises(MissionError, check=coded("mission.no-waypoints")):
         load_mission(EXAMPLE, route_wanted=True)
     both = load_mission(EXAMPLE.with_name("route.gpx"), logs=EXAMPLE)
     assert (len(both.mission.waypoints), len(both.mission.logs)) == (3, 7)
@@ -103,7 +103,7 @@ def test_an_hpr_alone_is_no_route() -> None:
 
 def test_logs_of_another_site_do_not_fit_the_route(tmp_path: Path) -> None:
     (tmp_path / "far.hpr").write_text(TEXT.replace(">63.", ">33."))
-    with pytest.raises(MissionError, match=r"far\.hpr: log 1 is \d+ km away from waypoint 1"):
+    with pytest.raises(MissionError, check=coded("mission.too-far-apart")):
         load_mission(EXAMPLE.with_name("route.gpx"), logs=tmp_path / "far.hpr")
 
 
@@ -206,15 +206,15 @@ def test_names_are_text_whatever_is_in_them() -> None:
 
 def test_a_report_of_nothing_that_can_be() -> None:
     assert report(()).find(".//s:Load", NS) is None
-    for load, sentence in (
-        (ForwardedLoad((), ROAD, NOON), "load 1 has no logs"),
-        (ForwardedLoad((replace(BIRCH, volume_m3=float("nan")),), ROAD, NOON), "has a log of nan m3"),
-        (ForwardedLoad((BIRCH,), ROAD, NOON.replace(tzinfo=None)), "a time has no zone"),
+    for load, code in (
+        (ForwardedLoad((), ROAD, NOON), "fpr.empty-load"),
+        (ForwardedLoad((replace(BIRCH, volume_m3=float("nan")),), ROAD, NOON), "fpr.volume"),
+        (ForwardedLoad((BIRCH,), ROAD, NOON.replace(tzinfo=None)), "fpr.no-time-zone"),
     ):
-        with pytest.raises(MissionError, match=sentence):
+        with pytest.raises(MissionError, check=coded(code)):
             write_fpr((load,), WHO, datetime(2026, 6, 1, tzinfo=UTC), "x")
 
 
 def test_an_fpr_is_no_mission() -> None:
-    with pytest.raises(MissionError, match="<ForwardedProduction>, which is no mission"):
+    with pytest.raises(MissionError, check=coded("mission.unknown-xml")):
         read(write_fpr(LOADS, WHO, NOON, "x"), "f")

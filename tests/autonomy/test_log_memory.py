@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.selection import plan_single_log_grasp
-from autonomy.grasp.placement import lies_in_bunk
 from autonomy.grasp.grasp import hangs_below
+from autonomy.grasp.placement import lies_in_bunk
+from autonomy.grasp.selection import plan_single_log_grasp
+from autonomy.manager.load_detector import WINDOW_NS
 from autonomy.manager.log_map import LogMap
 from autonomy.manager.log_memory import PERIOD_NS, LogMemory
-from autonomy.manager.load_detector import WINDOW_NS
 from autonomy.motion.arm import Arm
 from machine.loading.profile_file import load_profile
-from tests.autonomy.test_manager_field import base, lying, seen
+from tests.autonomy.mapped_logs import base, lying, seen
 
 PROFILE = load_profile("aoro_fc8")
 ARM = Arm(PROFILE)
@@ -30,7 +30,7 @@ def field_of(*places: tuple[float, float]) -> LogMap:
     field = LogMap(PROFILE.bunk)
     logs = [lying(i, x, y, 0.3) for i, (x, y) in enumerate(places)]
     for k in range(2):
-        field.see(seen(logs, HERE), HERE, k)
+        field.observe(seen(logs, HERE), HERE, k)
     return field
 
 
@@ -57,17 +57,17 @@ class Hands:
             self.job.phase = phase
         self.now_ns += PERIOD_NS
         report = SimpleNamespace(stamp_ns=self.now_ns, position=self.q, load_kg=self.load_kg)
-        logs = self.memory.list(self.now_ns, self.field, HERE, report, self.job)
+        logs = self.memory.log_list(self.now_ns, self.field, HERE, report, self.job)
         assert logs is not None
         return logs
 
 
 def test_what_lies_on_the_ground_stays_in_the_plane_while_the_machine_moves() -> None:
     field, memory = field_of((-4.0, 3.0), (-4.0, -30.0)), LogMemory(PROFILE)
-    (first,) = memory.list(PERIOD_NS, field, HERE, None, None) or ()
-    assert memory.list(PERIOD_NS + 1, field, HERE, None, None) is None, "four times a second"
+    (first,) = memory.log_list(PERIOD_NS, field, HERE, None, None) or ()
+    assert memory.log_list(PERIOD_NS + 1, field, HERE, None, None) is None, "four times a second"
     there = base(2.0, 1.0, math.pi)
-    (after,) = memory.list(2 * PERIOD_NS, field, there, None, None) or ()
+    (after,) = memory.log_list(2 * PERIOD_NS, field, there, None, None) or ()
     assert first.id == after.id == field.logs[0].number
     assert there.to_base(np.array(after.center_m)) == pytest.approx(HERE.to_base(np.array(first.center_m)))
 
@@ -95,7 +95,7 @@ def test_a_log_goes_with_the_grapple_and_stays_in_the_bunk() -> None:
     hands.field.remove(grasp.log.id)
     hands.job = None
     (aboard,) = hands.step()
-    assert aboard.center_m == pytest.approx(log.center_m) and hands.memory.aboard == 1
+    assert aboard.center_m == pytest.approx(log.center_m) and hands.memory.in_bunk == 1
 
 
 def test_a_log_that_the_scale_does_not_feel_lies_where_it_was() -> None:
@@ -108,7 +108,7 @@ def test_a_log_that_the_scale_does_not_feel_lies_where_it_was() -> None:
     for _ in range(WINDOW_NS // PERIOD_NS + 2):
         (log,) = hands.step()
     assert log.center_m == pytest.approx(grasp.log.center_m, abs=1e-6)
-    assert hands.memory.aboard == 0
+    assert hands.memory.in_bunk == 0
 
 
 def test_a_log_that_is_light_for_a_moment_still_hangs() -> None:

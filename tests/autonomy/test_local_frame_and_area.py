@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from autonomy.missions.area import Area, crossing, edge_distance_m, inside, path_distance_m, signed_area_m2
 from autonomy.missions.local_frame import LocalFrame, bearing_from_yaw, site_frame, yaw_from_bearing
 from autonomy.missions.model import Fence, ForwardingMission, KnownLog, MissionError, Point
+from tests.codes import coded
 
 LATITUDES = st.floats(-89.99, 89.99)
 LONGITUDES = st.floats(-180.0, 180.0)
@@ -68,7 +69,7 @@ def test_the_frame_of_a_mission() -> None:
     way = (Point(63.0, 19.0), Point(63.001, 19.0, 80.0))
     assert site_frame(ForwardingMission(waypoints=way)) == LocalFrame(63.0, 19.0, 80.0)
     assert site_frame(ForwardingMission(logs=(KnownLog(Point(1.0, 2.0)),))) == LocalFrame(1.0, 2.0, 0.0)
-    with pytest.raises(MissionError, match="names no place"):
+    with pytest.raises(MissionError, check=coded("mission.no-place")):
         site_frame(ForwardingMission(fences=(Fence(()),)))
 
 

@@ -7,7 +7,18 @@ import math
 
 import pytest
 
-from autonomy.manager.transition_table import ENDS, EVENTS, OURS, PAPER_B, RULES, Event, Height, State, awaited, following
+from autonomy.manager.transition_table import (
+    EVENT_DESCRIPTIONS,
+    FINAL_STATES,
+    OURS,
+    PAPER_B,
+    RULES,
+    Event,
+    Height,
+    State,
+    awaited_events,
+    next_state,
+)
 
 TABLES = {"paper_b": PAPER_B, "ours": OURS}
 PAIRS = list(itertools.product(TABLES, State, Event))
@@ -17,12 +28,12 @@ PAIRS = list(itertools.product(TABLES, State, Event))
 def test_what_is_in_the_table_follows_and_nothing_else_can(name: str, state: State, event: Event) -> None:
     table = TABLES[name]
     if (state, event) in table:
-        assert following(table, state, event) is table[state, event]
+        assert next_state(table, state, event) is table[state, event]
     elif event is Event.TIME_OUT:
-        assert following(table, state, event) is State.FAILED
+        assert next_state(table, state, event) is State.FAILED
     else:
         with pytest.raises(KeyError):
-            following(table, state, event)
+            next_state(table, state, event)
 
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
@@ -37,21 +48,21 @@ def test_every_state_is_reached_and_left(table) -> None:
                 front.append(end)
     assert reached == used
     assert State.DONE in reached
-    for state in used - ENDS:
-        assert awaited(table, state), state
+    for state in used - FINAL_STATES:
+        assert awaited_events(table, state), state
 
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
 def test_nothing_leads_out_of_the_end(table) -> None:
-    assert not any(state in ENDS for state, _ in table)
+    assert not any(state in FINAL_STATES for state, _ in table)
 
 
 def test_every_state_and_event_is_said_in_words_and_has_an_end() -> None:
-    assert set(RULES) == set(State) and set(EVENTS) == set(Event)
+    assert set(RULES) == set(State) and set(EVENT_DESCRIPTIONS) == set(Event)
     for state, rule in RULES.items():
-        assert rule.words
-        waits = state in ENDS or state is State.IDLE
-        assert math.isinf(rule.patience_s) == waits and bool(rule.trouble) != waits
+        assert rule.description
+        waits = state in FINAL_STATES or state is State.IDLE
+        assert math.isinf(rule.timeout_s) == waits and bool(rule.timeout_reason) != waits
 
 
 def test_the_machine_drives_only_after_the_crane_was_brought_over_the_bunk() -> None:

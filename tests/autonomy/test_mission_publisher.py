@@ -8,24 +8,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autonomy.manager.activity_manager import Manager
-from autonomy.manager.transition_table import EVENTS, OURS, Event, State
-from autonomy.manager.world_model import ATTEMPTS
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.transition_table import EVENT_DESCRIPTIONS, OURS, Event, State
+from autonomy.manager.world_model import MAX_ATTEMPTS
 from autonomy.missions.model import Fence, ForwardingMission, Landing, Options, Point
-from autonomy.process.jobs import ABORTED, Forwarding, OneLog
+from autonomy.process.jobs import ABORTED, ForwardingJob, SingleLogJob
 from can_dbc.messages.mission import (
     MAX_CORNERS,
     MAX_LOGS,
-    MAX_ROUTE,
+    MAX_ROUTE_POINTS,
     Order,
     decode_mission,
     encode_mission,
 )
-from machine.load import profile_hash
+from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.test_jobs import begin, ordered, run
-from tests.autonomy.test_manager import LOGS, PLANE, PROFILE
-from tests.autonomy.test_manager_field import lying
+from tests.autonomy.forwarding_jobs import begin, ordered, run
+from tests.autonomy.manager_missions import LOGS, PLANE, PROFILE
+from tests.autonomy.mapped_logs import lying
 
 
 def near(place, x_m, y_m, within_m=0.15) -> bool:
@@ -73,7 +73,7 @@ def test_orders_are_done_and_told() -> None:
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
 
     def give(number: int, order: Order) -> str:
-        refusal = job.obey(ordered(number, order))
+        refusal = job.execute(ordered(number, order))
         told = job.report(forwarder.crane.now_ns)
         assert (told.order, told.refusal) == (number, refusal)
         return refusal
@@ -84,8 +84,11 @@ def test_orders_are_done_and_told() -> None:
     assert give(2, Order.NEXT_STEP) == "nothing waits for the next step"
     assert give(3, Order.SINGLE_STEP) == "" and job.report(0).single_step
     assert give(4, Order.AUTO) == "" and job.report(0).auto
-    run(forwarder, job, lambda j: manager.waiting is not None)
-    assert job.report(forwarder.crane.now_ns).waits_for == EVENTS[Event.ROUTE_END] and manager.state is State.SEARCH
+    run(forwarder, job, lambda j: manager.pending_event is not None)
+    assert (
+        job.report(forwarder.crane.now_ns).waits_for == EVENT_DESCRIPTIONS[Event.ROUTE_END]
+        and manager.state is State.SEARCH
+    )
     assert give(5, Order.NEXT_STEP) == ""
     run(forwarder, job, lambda j: manager.state is State.DONE)
     assert give(6, Order.AUTO) == "the mission has ended" and job.report(0).ended
@@ -93,21 +96,21 @@ def test_orders_are_done_and_told() -> None:
 
 def test_it_speaks_before_the_machine_is_located() -> None:
     mission = ForwardingMission("test", (Point(*PLANE.geodetic(10.0, 0.0)[:2]),))
-    manager = Manager(PROFILE, profile_hash(PROFILE), mission, OURS)
-    forwarder, job = Forwarder(PROFILE, PLANE, [], (0.0, 0.1, 0.05)), Forwarding(manager, mission)
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, OURS)
+    forwarder, job = Forwarder(PROFILE, PLANE, [], (0.0, 0.1, 0.05)), ForwardingJob(manager, mission)
     assert job.report(0).here is None
     blind = replace(forwarder.vehicle(), fix=0, latitude_deg=math.nan, heading_rad=math.nan)
     job.step(forwarder.crane.now_ns, forwarder.crane.report(), blind, ())
     told = job.report(forwarder.crane.now_ns)
-    assert manager.outlook.location is not None and told.here is None and told.logs == ()
+    assert manager.world.location is not None and told.here is None and told.logs == ()
     assert told.paused.startswith("not located")
 
 
 def test_run_through_needs_no_more_steps() -> None:
     forwarder, job, manager = begin()
-    job.obey(ordered(1, Order.SINGLE_STEP))
-    run(forwarder, job, lambda j: manager.waiting is Event.AUTO)
-    job.obey(ordered(2, Order.RUN_THROUGH))
+    job.execute(ordered(1, Order.SINGLE_STEP))
+    run(forwarder, job, lambda j: manager.pending_event is Event.AUTO)
+    job.execute(ordered(2, Order.RUN_THROUGH))
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     assert not job.report(0).single_step
 
@@ -115,7 +118,7 @@ def test_run_through_needs_no_more_steps() -> None:
 def test_an_ordered_abort_ends_the_mission_and_says_by_whom() -> None:
     forwarder, job, _ = begin()
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
-    assert job.obey(ordered(1, Order.ABORT)) == ""
+    assert job.execute(ordered(1, Order.ABORT)) == ""
     run(forwarder, job, lambda j: j.idle)
     told = job.report(forwarder.crane.now_ns)
     assert told.ended and told.failure == job.failure == ABORTED and forwarder.speed_m_s < 0.05
@@ -128,9 +131,9 @@ def test_one_log_can_be_ended_but_has_no_mission() -> None:
         def abort(self, reason: str) -> None:
             self.failure = reason
 
-    job = OneLog(crane := Crane())  # type: ignore[arg-type]
-    assert "no mission" in job.obey(ordered(1, Order.PAUSE)) and not crane.failure
-    assert job.obey(ordered(2, Order.ABORT)) == "" and crane.failure == ABORTED
+    job = SingleLogJob(crane := Crane())  # type: ignore[arg-type]
+    assert "no mission" in job.execute(ordered(1, Order.PAUSE)) and not crane.failure
+    assert job.execute(ordered(2, Order.ABORT)) == "" and crane.failure == ABORTED
     assert job.report(0) is None
 
 
@@ -140,18 +143,18 @@ def test_the_longest_mission_fits_in_a_datagram() -> None:
         "w" * 500, corners, tuple(Fence(corners[:50], True, '"' * 300) for _ in range(200)),
         tuple(Landing(corners[0], "x" * 300) for _ in range(90)), options=Options(laps=3),
     )  # fmt: skip
-    manager = Manager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE)
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, OURS, plane=PLANE)
     forwarder = Forwarder(PROFILE, PLANE, [], (0.0, 0.1, 0.05))
-    job = Forwarding(manager, mission)
+    job = ForwardingJob(manager, mission)
     for _ in range(20):
         forwarder.step(job)  # type: ignore[arg-type]
     for k in range(500):
         far = lying(k, 100.0 - 0.2 * k, 3.0)
-        manager.outlook.field.known(replace(far, misses=ATTEMPTS))
+        manager.world.log_map.add_known(replace(far, misses=MAX_ATTEMPTS))
         manager.tally.given_up[k] = "ß\n" * 400
     told = job.report(forwarder.crane.now_ns)
     assert decode_mission(encode_mission(told, 1, 2, 3, b"key"), b"key") == (2, 3, told)
-    assert (len(told.route), len(told.logs)) == (MAX_ROUTE, MAX_LOGS) and told.closed
+    assert (len(told.route), len(told.logs)) == (MAX_ROUTE_POINTS, MAX_LOGS) and told.closed
     assert sum(len(f.corners) for f in told.fences) <= MAX_CORNERS
     assert near(told.route[0], *PLANE.local(corners[0].latitude_deg, corners[0].longitude_deg)[:2])
     assert near(told.route[-1], *PLANE.local(corners[-1].latitude_deg, corners[-1].longitude_deg)[:2])

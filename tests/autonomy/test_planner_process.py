@@ -1,4 +1,4 @@
-"""The planning process with its order port and its watchers, and a job of ours in it."""
+"""The planning process: its command port and its mission reports, with a job stand-in."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from typing import Any
 
 import pytest
 
-from autonomy.__main__ import Process, arguments
-from can_dbc.mission_datagrams import MissionOrder, MissionReport, Order, decode_mission, encode_order
+from autonomy.process.command_line import arguments
+from autonomy.process.planner_process import PlannerProcess
+from can_dbc.messages.mission import MissionOrder, MissionReport, Order, decode_mission, encode_order
 from tests.can_dbc.mission_told import TOLD
 
 HASH, KEY = 77, b"key"
 
 
 class Jobless:
-    """Refuses an order to pause and does all others."""
+    """A job that refuses Pause and executes all other commands."""
 
     idle = done = False
     failure = None
@@ -29,10 +30,10 @@ class Jobless:
     def step(self, *_: object) -> list[bytes]:
         return []
 
-    def news(self) -> Iterator[Any]:
+    def events(self) -> Iterator[Any]:
         return iter(())
 
-    def obey(self, order: MissionOrder) -> str:
+    def execute(self, order: MissionOrder) -> str:
         self.ordered.append(order.order)
         return "not now" if order.order is Order.PAUSE else ""
 
@@ -49,47 +50,47 @@ def watcher() -> Iterator[socket.socket]:
 
 
 @pytest.fixture
-def process(watcher) -> Iterator[tuple[Process, Jobless]]:
+def process(watcher) -> Iterator[tuple[PlannerProcess, Jobless]]:
     there = "127.0.0.1:9"
     told = f"127.0.0.1:{watcher.getsockname()[1]}"
     options = arguments(["--controller", there, "--scene", there, "--report-port", "0", "--order-port", "0",
                          "--tell", told, "--tell", there])  # fmt: skip
     job = Jobless()
-    made = Process(job, HASH, options, KEY)  # type: ignore[arg-type]
+    made = PlannerProcess(job, HASH, options, KEY)  # type: ignore[arg-type]
     yield made, job
     made.close()
 
 
-def give(process: Process, order: Order, key: bytes | None = KEY, late_ns: int = 0) -> None:
+def give(process: PlannerProcess, order: Order, key: bytes | None = KEY, late_ns: int = 0) -> None:
     now_ns = time.monotonic_ns()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        out.sendto(encode_order(MissionOrder(1, HASH, now_ns - late_ns, order), key), process._ordered.getsockname())
-    process.turn(time.monotonic_ns())
+        out.sendto(encode_order(MissionOrder(1, HASH, now_ns - late_ns, order), key), process._commands.getsockname())
+    process.step(time.monotonic_ns())
 
 
 def said(capsys) -> list[dict[str, Any]]:
     return [m for m in map(json.loads, capsys.readouterr().out.splitlines()) if m["event"] == "order"]
 
 
-def test_an_order_is_done_and_said(process, capsys) -> None:
+def test_a_command_is_executed_and_emitted(process, capsys) -> None:
     give(process[0], Order.ABORT)
     give(process[0], Order.PAUSE)
     assert process[1].ordered == [Order.ABORT, Order.PAUSE]
     assert [(m.get("order"), m.get("refused")) for m in said(capsys)] == [("ABORT", None), ("PAUSE", "not now")]
 
 
-def test_an_old_order_and_an_unsigned_one_are_not_done(process, capsys) -> None:
+def test_old_and_unsigned_commands_are_not_executed(process, capsys) -> None:
     give(process[0], Order.ABORT, late_ns=2_000_000_000)
     give(process[0], Order.ABORT, key=None)
     assert process[1].ordered == []
     first, second = said(capsys)
-    assert "order" not in first and "2.0 s old" in first["refused"] and "refused" in second["refused"]
+    assert "order" not in first and "2.0 s" in first["refused"] and second["refused"]
 
 
-def test_it_is_told_twice_a_second_and_at_once_after_an_order(process, watcher) -> None:
+def test_reports_are_sent_twice_a_second_and_after_a_command(process, watcher) -> None:
     begin_ns = time.monotonic_ns()
     for k in range(100):  # two seconds
-        process[0].turn(begin_ns + k * 20_000_000)
+        process[0].step(begin_ns + k * 20_000_000)
     watcher.setblocking(False)
     reports = []
     while True:
@@ -102,5 +103,5 @@ def test_it_is_told_twice_a_second_and_at_once_after_an_order(process, watcher) 
     assert watcher.recv(65536)
 
 
-def test_orders_come_from_this_machine_only(process) -> None:
-    assert process[0]._ordered.getsockname()[0] == "127.0.0.1"
+def test_the_command_port_is_bound_to_loopback(process) -> None:
+    assert process[0]._commands.getsockname()[0] == "127.0.0.1"

@@ -12,7 +12,7 @@ from autonomy.manager.loading_stops import STEP_M, CraneReach, LoadingStop, base
 from autonomy.motion.arm import Arm
 from machine.geometry.carrier import rear_from_front
 from machine.loading.profile_file import load_profile
-from tests.autonomy.test_manager_field import lying
+from tests.autonomy.mapped_logs import lying
 
 PROFILE = load_profile("aoro_fc8")
 CARRIER = PROFILE.carrier

@@ -1,0 +1,199 @@
+"""The sockets round a job: receives reports, log lists and operator commands; sends setpoints and mission reports.
+
+`PlannerProcess.run` steps the job at 100 Hz or faster until it is idle.  A detector or controller that does not listen
+is not an error; a checkpoint that cannot be written is emitted as an event and does not stop the machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import select
+import signal
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
+
+from autonomy.manager.checkpoint_file import CheckpointFile
+from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
+from autonomy.perception.log_list.observation import LogObservation
+from autonomy.process.command_line import Address
+from autonomy.process.event_output import emit
+from autonomy.process.jobs import Job
+from autonomy.process.operator_commands import CommandReceiver, CommandRefused
+from can_dbc.messages.crane import StateReport
+from can_dbc.messages.datagrams import decode
+from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.mission import encode_mission
+from can_dbc.messages.vehicle import VehicleReport
+from machine.status.modes import Mode
+
+STEP_S: Final = 0.01
+REQUEST_PERIOD_NS: Final = 250_000_000
+"""Period of the requests for log lists."""
+REPORT_PERIOD_NS: Final = 500_000_000
+"""Period of the mission reports."""
+NOT_PAUSED: Final = {"reason": None}
+
+
+class PlannerProcess:
+    """Runs one job.  ``signals`` are the signals received, ``foreign`` whether the controller has another profile."""
+
+    def __init__(self, job: Job, profile_hash: int, options: argparse.Namespace, key: bytes | None = None) -> None:
+        self._key = key
+        self.signals: list[int] = []
+        self.foreign = False
+        self._job = job
+        self._hash = profile_hash
+        self._controller: Address = options.controller
+        self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._link.bind(("127.0.0.1", options.report_port))
+        self._detector = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._detector.connect(options.scene)
+        self._receiver = CommandReceiver(profile_hash, key)
+        self._commands = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        if options.order_port is not None:
+            self._commands.bind(("127.0.0.1", options.order_port))
+        self._watchers: list[Address] = options.tell
+        self._checkpoint_file = None if options.progress is None else CheckpointFile(options.progress)
+        self._sequence = 0
+        for each in (self._link, self._detector, self._commands):
+            each.setblocking(False)
+        self._request_ns = self._report_ns = 0
+        self._mode = -1
+        self._joints: tuple[float, ...] = ()
+        self._emitted: dict[str, object] = {}
+
+    def close(self) -> None:
+        """Close the sockets."""
+        for each in (self._link, self._detector, self._commands):
+            each.close()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the controller's last report was in STOP or FAULT."""
+        return self._mode in (Mode.STOP, Mode.FAULT)
+
+    def run(self) -> None:
+        """Step the job until it is idle."""
+        while not self._job.idle and not self.foreign:
+            select.select([self._link, self._detector, self._commands], [], [], STEP_S)
+            if self.signals:
+                self._job.abort(f"ended by {signal.Signals(self.signals[0]).name}")
+            self.step(time.monotonic_ns())
+        self._report_mission(time.monotonic_ns())
+        self._keep_or_emit(time.monotonic_ns())
+
+    def step(self, now_ns: int) -> None:
+        """One step: request logs, receive, step the job, send, emit events, report."""
+        if now_ns >= self._request_ns:
+            self._request_ns = now_ns + REQUEST_PERIOD_NS
+            self._send(self._detector.send, encode_request(self._joints))
+        self._execute_commands(now_ns)
+        (report, vehicle), logs = self._newest_reports(), self._newest_logs()
+        for data in self._job.step(now_ns, report, vehicle, logs):
+            self._send(lambda d: self._link.sendto(d, self._controller), data)
+        self._emit_changes(report)
+        if now_ns >= self._report_ns:
+            self._report_ns = now_ns + REPORT_PERIOD_NS
+            self._report_mission(now_ns)
+        if self._checkpoint_file is not None and self._checkpoint_file.due(now_ns):
+            self._keep_or_emit(now_ns)
+
+    def keep(self, now_ns: int) -> None:
+        """Write the checkpoint.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        checkpoint = self._job.progress()
+        if self._checkpoint_file is not None and checkpoint is not None:
+            self._checkpoint_file.keep(checkpoint, now_ns, time.time_ns())
+
+    def _keep_or_emit(self, now_ns: int) -> None:
+        """Write the checkpoint; a full disk does not stop a machine that works."""
+        try:
+            self.keep(now_ns)
+        except OSError as error:
+            reason = f"the checkpoint cannot be written: {error.strerror}"
+            if self._changed("progress", reason):
+                emit("progress", reason=reason)
+
+    def _execute_commands(self, now_ns: int) -> None:
+        for data in _received(self._commands):
+            try:
+                command = self._receiver.accept(data, now_ns)
+            except CommandRefused as error:
+                emit("order", order=None, refused=str(error))
+                continue
+            refused = self._job.execute(command)
+            emit("order", order=command.order.name, refused=refused or None)
+            self._report_ns = 0  # the operator sees the result at once
+
+    def _report_mission(self, now_ns: int) -> None:
+        report = self._job.report(now_ns) if self._watchers else None
+        if report is None:
+            return
+        self._sequence += 1
+        data = encode_mission(report, self._sequence, self._hash, now_ns, self._key)
+        for watcher in self._watchers:
+            self._send(lambda d, to=watcher: self._link.sendto(d, to), data)  # type: ignore[misc]
+
+    def _newest_reports(self) -> tuple[StateReport | None, VehicleReport | None]:
+        newest, vehicle = None, None
+        for data in _received(self._link):
+            try:
+                message = decode(data, self._key)
+            except DatagramRefused:
+                continue
+            if not isinstance(message, StateReport | VehicleReport):
+                continue
+            if message.profile_hash != self._hash:
+                self.foreign = True
+                return None, None
+            if isinstance(message, VehicleReport):
+                vehicle = message
+            else:
+                newest, self._mode, self._joints = message, message.mode, message.position
+        return newest, vehicle
+
+    def _newest_logs(self) -> tuple[LogObservation, ...]:
+        logs: tuple[LogObservation, ...] = ()
+        for data in _received(self._detector):
+            try:
+                logs = decode_logs(data)
+            except LogListError as error:
+                if self._changed("detector", str(error)):
+                    emit("detector", reason=str(error))
+        return logs
+
+    @staticmethod
+    def _send(send: Callable[[bytes], int], data: bytes) -> None:
+        # The receiver is not listening yet, or the buffer is full: the next datagram follows in 50 ms.
+        with suppress(ConnectionRefusedError, BlockingIOError):
+            send(data)
+
+    def _emit_changes(self, report: StateReport | None) -> None:
+        """Emit the events that have changed since the last step."""
+        for event, fields in self._job.events():
+            if self._changed(event, fields):
+                emit("running" if fields == NOT_PAUSED else event, **fields)
+        if report is not None and self._changed("refused", report.refused) and report.refused:
+            emit("refused", number=report.refusal, count=report.refused)
+
+    def _changed(self, name: str, value: object) -> bool:
+        before = self._emitted.get(name)
+        self._emitted[name] = value
+        return value != before
+
+
+def _received(link: socket.socket) -> list[bytes]:
+    found = []
+    while True:
+        try:
+            found.append(link.recv(65535))
+        except BlockingIOError:
+            return found
+        except ConnectionRefusedError:
+            continue

@@ -1,0 +1,68 @@
+"""Missions of the activity manager on the forwarder stand-in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from autonomy.localization.local_plane import LocalPlane
+from autonomy.manager.activity_manager import ActivityManager
+from autonomy.manager.checkpoint_file import CheckpointFile, read_checkpoint
+from autonomy.manager.transition_table import FINAL_STATES, OURS, State
+from autonomy.missions.model import ForwardingMission, Landing, Options, Point
+from machine.loading.profile_file import load_profile, profile_hash
+from tests.autonomy.forwarder_stand_in import Forwarder
+from tests.autonomy.mapped_logs import lying
+
+PROFILE = load_profile("aoro_fc8")
+CARRIER = PROFILE.carrier
+assert CARRIER is not None
+PLANE = LocalPlane(63.657853, 19.895562, 100.0)
+LOGS = ((1, 15.0, 4.2, 0.0), (2, 18.0, -4.4, 0.5))
+
+
+def place(x_m: float, y_m: float) -> Point:
+    return Point(*PLANE.geodetic(x_m, y_m)[:2])
+
+
+def begin(
+    lie=LOGS, table=OURS, end_m: float = 26.0, landing=None, bearing_deg=None, known=(), fences=(), **options
+) -> tuple[Forwarder, ActivityManager]:
+    """A machine that looks east, logs along its way, and a manager with the switch at Auto."""
+    way = (place(10.0, 0.0), place(end_m, 0.0))
+    landings = () if landing is None else (Landing(place(*landing), bearing_deg=bearing_deg),)
+    mission = ForwardingMission("test", way, fences, landings, known, Options(**options))
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, table, plane=PLANE)
+    manager.auto()
+    return Forwarder(PROFILE, PLANE, [lying(*log) for log in lie], (0.0, 0.1, 0.05)), manager
+
+
+def whole(test):
+    """A mission with crane work: seconds of planning."""
+    return pytest.mark.slow(pytest.mark.computed(test))
+
+
+def ended(manager: ActivityManager) -> bool:
+    return manager.state in FINAL_STATES
+
+
+def at(state: State):
+    return lambda manager: manager.state is state
+
+
+def states(manager: ActivityManager) -> list[State]:
+    return [change.state for change in manager.changes]
+
+
+def again(
+    machine: Forwarder, manager: ActivityManager, told: ForwardingMission, path: Path, table=OURS
+) -> ActivityManager:
+    """Another planner, with what the file says alone, some time later: the machine has come to rest."""
+    CheckpointFile(path).keep(manager.progress(), machine.crane.now_ns, 10**18)
+    progress = read_checkpoint(path, told, machine.crane.now_ns, 10**18)
+    machine.drive = machine.crane.setpoint = None
+    for _ in range(60):
+        machine.crane.now_ns += 50_000_000
+        machine._move()
+    return ActivityManager(PROFILE, profile_hash(PROFILE), told, table, progress=progress)
