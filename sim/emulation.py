@@ -20,6 +20,7 @@ from machine.crane_nodes import CraneNode
 from machine.geometry.carrier import ARMS, height_from_arm_angle
 from machine.profile import Encoder, Profile
 from sim.errors import PlantError
+from sim.hydraulics.layout import PA_PER_BAR
 from sim.nodes import Outbox
 from sim.nodes.arms import ArmNode
 from sim.nodes.device import Device, EstopBox, PressureModule
@@ -205,8 +206,8 @@ class EmulatedMachine(ABC):
             spools=tuple(spools[name] for name in FUNCTIONS),
             flow_limited=h.flow_limited,
             opening=w.opening if self.profile.grapple.opening_sensor else None,
-            clamp_bar=closing / 1e5,
-            release_bar=opening / 1e5,
+            clamp_bar=closing / PA_PER_BAR,
+            release_bar=opening / PA_PER_BAR,
             load_kg=w.load_kg(),
             rot_deg=math.degrees(math.remainder(w.q["rot"], math.tau)) if "rot" in self.encoders else None,
         )

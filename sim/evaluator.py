@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from sim.geometry.shape import IDENTITY, Vector
+from sim.hydraulics.layout import PA_PER_BAR
+from sim.mechanics.crane import FLEX_JOINTS
 from sim.wood.bunk import to_bunk
 from sim.wood.logs import LogState
 from sim.world import STEP_S, World
@@ -21,7 +23,6 @@ REST_M_S: Final = 0.01
 REST_S: Final = 0.3
 EVERY_STEPS: Final = 4
 SIDE_TOLERANCE_M: Final = 0.02
-FLEX: Final = ("flex_pitch", "flex_roll")
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,7 @@ class Evaluator:
     def _machine(self) -> None:
         w = self._w
         self._sag = max(self._sag, math.dist(w.tip(), w.rigid_tip()))
-        self._foot = max(self._foot, math.hypot(*w.column.torques([w.q[j] for j in FLEX], (0.0, 0.0))))
+        self._foot = max(self._foot, math.hypot(*w.column.torques([w.q[j] for j in FLEX_JOINTS], (0.0, 0.0))))
         self._load = max(self._load, w.load_kg())
         if w.carrier is not None:
             self._margin = min(self._margin, w.carrier.tip_margin_m)
@@ -144,7 +145,7 @@ class Evaluator:
             max_penetration_m=w.max_penetration_m,
             max_log_speed_m_s=max(self._speed, default=0.0),
             energy_j=w.hydraulics.energy_j,
-            peak_pressure_bar=w.hydraulics.peak_pa / 1e5,
+            peak_pressure_bar=w.hydraulics.peak_pa / PA_PER_BAR,
             time_s=self._steps * STEP_S,
             tip_m=tip,
             rigid_tip_m=rigid,

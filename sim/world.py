@@ -13,14 +13,14 @@ from typing import Final
 
 from machine.profile import Profile
 from sim.bullet.body import Body, Pose, fixed_boxes, magnitude
-from sim.bullet.client import new_client
+from sim.bullet.client import GRAVITY_M_S2, new_client
 from sim.bullet.urdf import JointDef
 from sim.geometry.shape import IDENTITY, Vector
 from sim.ground.terrain import Terrain
 from sim.hydraulics.circuit import Hydraulics
 from sim.mechanics.carrier import PARKED, Carrier, Drive, carrier_links
 from sim.mechanics.column import Column
-from sim.mechanics.crane import CRANE_LINKS, FLEX, PASSIVE, crane_links, rigid_pin
+from sim.mechanics.crane import CRANE_LINKS, FLEX_JOINTS, PASSIVE_JOINTS, crane_links, rigid_pin
 from sim.truth.load import Truth, load_truth
 from sim.wood.bunk import bunk_shapes
 from sim.wood.log_shape import LogSpec
@@ -29,7 +29,6 @@ from sim.wood.stowage import Stowage
 
 STEP_NS: Final = 2_500_000
 STEP_S: Final = STEP_NS * 1e-9
-GRAVITY_M_S2: Final = 9.81
 SOLVER_ITERATIONS: Final = 40
 HOME_POSE: Final = {
     "palms_471": {"slew": 0.0, "lift": 0.75, "tilt": -1.6, "ext": 0.30, "rot": 0.0},
@@ -90,7 +89,7 @@ class World:
         driven = [j for name in self.functions for j in JOINTS_OF_FUNCTION.get(name, (name,))]
         self._driven = tuple(driven)
         self._motors = [self.crane.index[j] for j in driven if j not in JAW_LINKS]
-        self._motors += [self.crane.index[j] for j in (*JAW_LINKS, *FLEX)]
+        self._motors += [self.crane.index[j] for j in (*JAW_LINKS, *FLEX_JOINTS)]
         self._hanger = self.crane.names.index("hanger")
         self.column = self._level()
         self._settle(home_pose(profile) | dict(home or {}))
@@ -135,7 +134,7 @@ class World:
             )
             body.collide_only(GRAPPLE_LINKS, ("rear", "front"))
             body.rub(["rear"], truth.contact.bunk_friction)
-        for joint in PASSIVE:
+        for joint in PASSIVE_JOINTS:
             body.damp(joint, getattr(truth.structure, f"{joint}_damping_nm_s_rad"))
         body.rub((*JAW_LINKS, "rotator"), truth.contact.tong_friction)
         body.sense("hanger")
@@ -152,7 +151,7 @@ class World:
 
     def _place(self, pose: Mapping[str, float]) -> None:
         """Put the crane at rest in a pose, jaws open, the grapple hanging plumb."""
-        crane = {**dict.fromkeys((*FLEX, *PASSIVE, *JAW_LINKS), 0.0), **pose}
+        crane = {**dict.fromkeys((*FLEX_JOINTS, *PASSIVE_JOINTS, *JAW_LINKS), 0.0), **pose}
         hang = -(crane["lift"] + crane["tilt"] + crane["flex_pitch"])
         self.crane.place(crane | {"hanger": pose.get("hanger", hang)})
 
@@ -167,13 +166,13 @@ class World:
             assert self.profile.carrier is not None
             self.carrier.place(0.0, 0.0, 0.0, self.profile.carrier.arm_transport_m)
         self._place(home)
-        self._place({**home, **dict(zip(FLEX, self.column.balance(self._moments()), strict=True))})
+        self._place({**home, **dict(zip(FLEX_JOINTS, self.column.balance(self._moments()), strict=True))})
         self._read()
         self.crane.hold(self._driven, HOLDING_TORQUE)
         self._wait(SETTLE_STEP_COUNT if self.carrier is None else CARRIER_SETTLE_STEP_COUNT)
 
     def _wait(self, steps: int) -> None:
-        flex = [self.crane.index[j] for j in FLEX]
+        flex = [self.crane.index[j] for j in FLEX_JOINTS]
         for _ in range(steps):
             self.crane.apply(flex, self._column_torques(SETTLE_DAMPING_S))
             if self.carrier is not None:
@@ -205,7 +204,7 @@ class World:
 
     def _column_torques(self, extra_s: float = 0.0) -> list[float]:
         q, qd = self.q, self.qd
-        return self.column.torques([q[j] for j in FLEX], [qd[j] for j in FLEX], extra_s)
+        return self.column.torques([q[j] for j in FLEX_JOINTS], [qd[j] for j in FLEX_JOINTS], extra_s)
 
     def step(self, commands: Sequence[float], drive: Drive = PARKED) -> None:
         """Advance by STEP_NS.
@@ -231,14 +230,14 @@ class World:
         """Record which logs the crane touches."""
         n = len(self._log_of)
         touched, grip = [False] * n, [0.0] * n
-        tongs, above = self._jaw_links, self._above
+        jaws, above = self._jaw_links, self._above
         for c in self.client.getContactPoints(bodyA=self.crane.body):
             log = self._log_of.get(c[2])
             if log is None:
                 continue
             if c[3] in above:
                 touched[log] = True
-            if c[3] in tongs:
+            if c[3] in jaws:
                 grip[log] += c[9]
                 if -c[8] > self.max_penetration_m:
                     self.max_penetration_m = -c[8]

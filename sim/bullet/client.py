@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 
 @contextmanager
@@ -35,7 +35,7 @@ with _silent():
     import pybullet
     from pybullet_utils import bullet_client
 
-__all__ = ["BulletClient", "new_client"]
+__all__ = ["GRAVITY_M_S2", "BulletClient", "new_client"]
 
 
 class BulletClient(bullet_client.BulletClient):  # type: ignore[misc]
@@ -48,6 +48,9 @@ class BulletClient(bullet_client.BulletClient):  # type: ignore[misc]
         else:
             self.__dict__[name] = attribute
         return attribute
+
+
+GRAVITY_M_S2: Final = 9.81
 
 
 def new_client() -> BulletClient:

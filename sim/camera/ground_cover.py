@@ -17,7 +17,7 @@ import numpy as np
 from sim.camera.scene import GRASS, TWIG, Ground, Rods, SceneBuilder
 
 TILE_M: Final = 4.0
-BLADES: Final = (5, 9)  # of a tuft
+BLADE_COUNT_RANGE: Final = (5, 9)  # of a tuft
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ class GroundCover:
         area = TILE_M * TILE_M
         for _ in range(_some(rng, area * self._density.tufts_m2)):
             x, y = (i + rng.random()) * TILE_M, (j + rng.random()) * TILE_M
-            for _ in range(rng.randint(*BLADES)):
+            for _ in range(rng.randint(*BLADE_COUNT_RANGE)):
                 _blade(b, rng, x + rng.gauss(0.0, 0.05), y + rng.gauss(0.0, 0.05))
         for _ in range(_some(rng, area * self._density.branches_m2)):
             _branch(b, rng, (i + rng.random()) * TILE_M, (j + rng.random()) * TILE_M)

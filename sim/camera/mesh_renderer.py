@@ -17,7 +17,7 @@ from sim.camera.render import Picture
 from sim.camera.scene import GROUND, SKY, LogPose, Rods, Scene
 
 NEAR_M, FAR_M = 0.1, 60.0
-SIDES = 32
+TUBE_SIDE_COUNT = 32
 GROUND_REACH_M = 12.0  # radius around the logs in which rough ground is drawn
 GROUND_COLOUR, BARK_COLOUR = (0.45, 0.45, 0.43), (0.58, 0.40, 0.26)
 
@@ -33,7 +33,7 @@ def _tube(points: np.ndarray, radii: np.ndarray, bump_m: float, oval: float, rng
     across = np.cross(along, (0.0, 0.0, 1.0) if abs(along[0, 2]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across, axis=1)[:, None]
     upward = np.cross(across, along)
-    angle = np.linspace(0.0, 2.0 * math.pi, SIDES, endpoint=False)
+    angle = np.linspace(0.0, 2.0 * math.pi, TUBE_SIDE_COUNT, endpoint=False)
     out = np.cos(angle)[None, :, None] * across[:, None] + np.sin(angle)[None, :, None] * upward[:, None]
     r = radii[:, None] * (1.0 + oval * np.cos(2.0 * angle + rng.uniform(0.0, math.pi)))
     r = r + bump_m * rng.standard_normal(r.shape)
@@ -42,15 +42,15 @@ def _tube(points: np.ndarray, radii: np.ndarray, bump_m: float, oval: float, rng
     # The ends have rims of their own, whose normals point along the log.
     rims, ends = side[[0, -1]].reshape(-1, 3), points[[0, -1]]
     vertices = np.concatenate([side.reshape(-1, 3), rims, ends])
-    looks = np.repeat(np.stack([-along[0], along[-1]]), SIDES, axis=0)
+    looks = np.repeat(np.stack([-along[0], along[-1]]), TUBE_SIDE_COUNT, axis=0)
     normals = np.concatenate([out.reshape(-1, 3), looks, np.stack([-along[0], along[-1]])])
-    i, j = np.meshgrid(np.arange(n - 1), np.arange(SIDES), indexing="ij")
-    a, b = (i * SIDES + j).ravel(), (i * SIDES + (j + 1) % SIDES).ravel()
-    faces = [np.stack([a, b, a + SIDES], 1), np.stack([b, b + SIDES, a + SIDES], 1)]
-    k = np.arange(SIDES)
+    i, j = np.meshgrid(np.arange(n - 1), np.arange(TUBE_SIDE_COUNT), indexing="ij")
+    a, b = (i * TUBE_SIDE_COUNT + j).ravel(), (i * TUBE_SIDE_COUNT + (j + 1) % TUBE_SIDE_COUNT).ravel()
+    faces = [np.stack([a, b, a + TUBE_SIDE_COUNT], 1), np.stack([b, b + TUBE_SIDE_COUNT, a + TUBE_SIDE_COUNT], 1)]
+    k = np.arange(TUBE_SIDE_COUNT)
     for end in (0, 1):
-        rim, middle = (n + end) * SIDES, (n + 2) * SIDES + end
-        turn = [np.full(SIDES, middle), rim + k, rim + (k + 1) % SIDES]
+        rim, middle = (n + end) * TUBE_SIDE_COUNT, (n + 2) * TUBE_SIDE_COUNT + end
+        turn = [np.full(TUBE_SIDE_COUNT, middle), rim + k, rim + (k + 1) % TUBE_SIDE_COUNT]
         faces.append(np.stack(turn if end else [turn[0], turn[2], turn[1]], 1))
     return vertices, np.concatenate(faces)[:, ::-1], normals
 

@@ -26,7 +26,7 @@ TILE_PX: Final = 1024
 _MASK = TILE_PX - 1
 BLOT_PX: Final = 12.0  # width of a hole in a surface
 PATCH_PX: Final = 16  # texture is measured in squares this wide
-PLAIN_STEP: Final = 5.0  # mean step of green from pixel to pixel below which a square has no texture
+MIN_TEXTURE_STEP: Final = 5.0  # mean step of green from pixel to pixel below which a square has no texture
 
 
 @cache
@@ -52,7 +52,7 @@ def _plain(rgb: np.ndarray) -> np.ndarray:
                 for x in range(j * PATCH_PX, min((j + 1) * PATCH_PX, rgb.shape[1] - 2)):
                     total += abs(np.int64(rgb[row, x + 2, 1]) - np.int64(rgb[row, x, 1]))
                     count += 1
-            plain[i, j] = total < PLAIN_STEP * count
+            plain[i, j] = total < MIN_TEXTURE_STEP * count
     return plain
 
 
@@ -136,13 +136,13 @@ def _matched(
             first, second = a[(x + shift[1]) & _MASK], b[(x + shift[3]) & _MASK]
             z = scale * fb / (disparity + root * (first + second))
             blot = c[(x + shift[5]) & _MASK]
-            known = s > 0.0 and seen and z_min <= z <= z_max and blot < cut
-            if known and blot > plain_cut:
+            valid = s > 0.0 and seen and z_min <= z <= z_max and blot < cut
+            if valid and blot > plain_cut:
                 # The squares' borders are frayed, so that they are not visible.
                 i = min(max(row + int(5.0 * first), 0), height - 1) // PATCH_PX
                 j = min(max(x + int(5.0 * second), 0), width - 1) // PATCH_PX
-                known = not plain[i, j]
-            out[row, x] = z if known else np.nan
+                valid = not plain[i, j]
+            out[row, x] = z if valid else np.nan
 
 
 class StereoNoise:

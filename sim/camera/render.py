@@ -13,15 +13,20 @@ from functools import cache
 import numpy as np
 
 from sim.camera.geometry import View
+from sim.camera.ground_visibility import draw_grid, draw_plane
 from sim.camera.scene import BARK, Boxes, Rods, Scene, SceneBuilder
 from sim.camera.shading import GRAIN_PX, shade
 from sim.camera.shadow import MAP_PX, shadow_map
 from sim.camera.textures import textures
-from sim.camera.visibility import SKY_CODE, draw_grid, draw_objects, draw_plane
+from sim.camera.visibility import SKY_CODE, draw_objects
 
 NEAREST_PLANE_M = 0.05  # least height above the plane beyond the grid at which it is drawn
 SHADOW_EDGE_M = 12.0  # edge length of the square with shadows
-FINE_M, COARSE_STRIDE, FURTHEST_M = 21.0, 4, 60.0  # heights are drawn in full this near, every 4th point beyond
+FINE_GRID_REACH_M, COARSE_STRIDE, GROUND_REACH_M = (
+    21.0,
+    4,
+    60.0,
+)  # heights are drawn in full this near, every 4th point beyond
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +79,8 @@ def render(scene: Scene, view: View, conditions: ImagingConditions = ImagingCond
     inverse, code = _blank(view)
     grid = (ground.x0_m, ground.y0_m, ground.cell_m, ground.heights_m)
     if ground.heights_m.size > 4:
-        draw_grid(inverse, code, *grid, COARSE_STRIDE, FINE_M - 1.0, FURTHEST_M, eye, turn, *lens)
-        draw_grid(inverse, code, *grid, 1, 0.0, FINE_M, eye, turn, *lens)
+        draw_grid(inverse, code, *grid, COARSE_STRIDE, FINE_GRID_REACH_M - 1.0, GROUND_REACH_M, eye, turn, *lens)
+        draw_grid(inverse, code, *grid, 1, 0.0, FINE_GRID_REACH_M, eye, turn, *lens)
     else:
         draw_grid(inverse, code, *grid, 1, 0.0, 2.0 * ground.cell_m, eye, turn, *lens)
     below = float(eye[2]) - ground.mean_m

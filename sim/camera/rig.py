@@ -71,10 +71,10 @@ class CameraRig:
         self.conditions = ImagingConditions.random(seed)
         self._profile, self._truth, self._size_px = profile, truth, size_px
         self._scenes = WorldScenes(source) if isinstance(source, World) else source
-        self._clutter: GroundCover | None = None
+        self._cover: GroundCover | None = None
         if isinstance(self._scenes, WorldScenes):
             litter = density or (LANDING if self._scenes.style == "asphalt" else CLEARING)
-            self._clutter = GroundCover(self._scenes.ground, litter, seed)
+            self._cover = GroundCover(self._scenes.ground, litter, seed)
         self._noise = {
             name: StereoNoise(camera, truth.cameras[name], f"{name} {seed}") for name, camera in profile.cameras.items()
         }
@@ -90,9 +90,9 @@ class CameraRig:
     def scene(self, name: str) -> Scene:
         """The present scene, with the ground cover near a camera."""
         scene = self._scenes()
-        if self._clutter is not None:
+        if self._cover is not None:
             x, y, _ = scene.links[self._profile.cameras[name].link][0]
-            scene = replace(scene, rods=scene.rods + self._clutter.around(x, y))
+            scene = replace(scene, rods=scene.rods + self._cover.around(x, y))
         return scene
 
     def picture(self, name: str) -> tuple[Scene, View, Picture]:

@@ -22,7 +22,7 @@ from sim.wood.log_shape import STRAIGHT_M
 if TYPE_CHECKING:
     from sim.world import World
 
-SKY, GROUND, CRANE, BUNK, CARRIER, CLUTTER = -1, 0, 1001, 1002, 1003, 1004  # instance ids; logs are 1, 2, ...
+SKY, GROUND, CRANE, BUNK, CARRIER, COVER = -1, 0, 1001, 1002, 1003, 1004  # instance ids; logs are 1, 2, ...
 BARK, TWIG, GRASS = 0, 1, 2  # surfaces of a rod
 Style = Literal["asphalt", "forest"]
 Vector = Sequence[float]
@@ -164,7 +164,7 @@ class SceneBuilder:
         self._logs.append(log)
         self._chain(points, radii, quaternion_matrix(log.quaternion)[:, 1], BARK, tint, log.instance)
 
-    def rod(self, points_m: np.ndarray, radii_m: Vector, surface: int, tint: Vector, instance: int = CLUTTER) -> None:
+    def rod(self, points_m: np.ndarray, radii_m: Vector, surface: int, tint: Vector, instance: int = COVER) -> None:
         """A chain of frusta through ``points_m`` (N, 3) with the radii there: a twig, a blade of grass."""
         points = np.asarray(points_m, float)
         chord = points[-1] - points[0]

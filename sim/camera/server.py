@@ -14,12 +14,20 @@ from typing import Protocol
 
 import numpy as np
 
-from can_dbc.messages.rgbd import MM_PER_M, REQUEST_HEADER, RgbdError, RgbdMessage, encode, encode_refusal, request_name_bytes
+from can_dbc.messages.rgbd import (
+    MM_PER_M,
+    REQUEST_HEADER,
+    RgbdError,
+    RgbdMessage,
+    encode,
+    encode_refusal,
+    request_name_bytes,
+)
 from sim.camera.rig import RgbdFrame
 from sim.camera.scene import Scene
 
 ANSWER_TIMEOUT_S = 1.0  # of the plant's loop, towards a client
-CLIENTS = 4
+MAX_CLIENT_COUNT = 4
 
 
 class Rig(Protocol):
@@ -46,7 +54,7 @@ class CameraServer:
         self._waiting: queue.SimpleQueue[tuple[str, queue.SimpleQueue[tuple[Scene, int]]]] = queue.SimpleQueue()
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
-        self._room = threading.Semaphore(CLIENTS)
+        self._room = threading.Semaphore(MAX_CLIENT_COUNT)
         self._clients: set[socket.socket] = set()
         threading.Thread(target=self._listen, daemon=True, name="cameras").start()
 
@@ -82,7 +90,9 @@ class CameraServer:
         try:
             with client:
                 while True:
-                    name = _read(client, request_name_bytes(_read(client, REQUEST_HEADER.size))).decode(errors="replace")
+                    name = _read(client, request_name_bytes(_read(client, REQUEST_HEADER.size))).decode(
+                        errors="replace"
+                    )
                     client.sendall(self._answer(name))
         except (OSError, RgbdError):
             return  # a malformed request ends the connection

@@ -17,7 +17,7 @@ from sim.camera.textures import (
     GROUND_TEXEL_M,
     HORIZON_PX,
     HORIZON_RAD,
-    LEVELS,
+    MIP_LEVEL_COUNT,
     PATCH_PX,
     PATCH_TEXEL_M,
 )
@@ -146,7 +146,7 @@ def shade(
                 tx, ty = px * (1.0 / GROUND_TEXEL_M), py * (1.0 / GROUND_TEXEL_M)
                 if x & 7 == 0 or level < 0:  # neighbours share a level
                     level, foot = 0, 1.5 * z / level_gain
-                    while foot > 1.4 and level < LEVELS - 1:
+                    while foot > 1.4 and level < MIP_LEVEL_COUNT - 1:
                         foot *= 0.5
                         level += 1
                 shrink = 1.0 / (1 << level)

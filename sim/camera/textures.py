@@ -10,7 +10,7 @@ import numpy as np
 
 GROUND_PX: Final = 512
 GROUND_TEXEL_M: Final = 0.006
-LEVELS: Final = 6
+MIP_LEVEL_COUNT: Final = 6
 PATCH_PX: Final = 256
 PATCH_TEXEL_M: Final = 0.10
 BARK_PX: Final = 256  # around the log and along BARK_LENGTH_M
@@ -18,7 +18,7 @@ BARK_LENGTH_M: Final = 1.0
 END_PX: Final = 128
 HORIZON_PX: Final = (128, 2048)  # elevation 0..HORIZON_RAD, azimuth
 HORIZON_RAD: Final = 0.5
-VARIANTS: Final = 6  # number of appearances; a seed selects one
+VARIANT_COUNT: Final = 6  # number of appearances; a seed selects one
 
 
 def noise(
@@ -49,9 +49,9 @@ def _bytes(picture: np.ndarray) -> np.ndarray:
 
 def _pyramid(picture: np.ndarray) -> np.ndarray:
     """All levels (LEVELS, size, size, 3) of a square picture, each stored in its top left corner."""
-    out = np.zeros((LEVELS, *picture.shape), np.uint8)
+    out = np.zeros((MIP_LEVEL_COUNT, *picture.shape), np.uint8)
     level = picture
-    for i in range(LEVELS):
+    for i in range(MIP_LEVEL_COUNT):
         n = level.shape[0]
         out[i, :n, :n] = _bytes(level)
         level = level.reshape(n // 2, 2, n // 2, 2, 3).mean(axis=(1, 3))
@@ -158,4 +158,4 @@ def _variant(style: str, variant: int) -> Textures:
 
 def textures(style: str, seed: int) -> Textures:
     """The surfaces of a style ("asphalt" with pine, "forest" with birch) in one of VARIANTS appearances."""
-    return _variant(style, seed % VARIANTS)
+    return _variant(style, seed % VARIANT_COUNT)

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from typing import Final
 
-A: Final = 6378137.0
-F: Final = 1.0 / 298.257223563
-B: Final = A * (1.0 - F)
-E2: Final = F * (2.0 - F)
-EP2: Final = E2 / (1.0 - E2)
+SEMI_MAJOR_AXIS_M: Final = 6378137.0
+FLATTENING: Final = 1.0 / 298.257223563
+SEMI_MINOR_AXIS_M: Final = SEMI_MAJOR_AXIS_M * (1.0 - FLATTENING)
+ECCENTRICITY_SQUARED: Final = FLATTENING * (2.0 - FLATTENING)
+SECOND_ECCENTRICITY_SQUARED: Final = ECCENTRICITY_SQUARED / (1.0 - ECCENTRICITY_SQUARED)
 Geodetic = tuple[float, float, float]
 
 
@@ -28,9 +28,13 @@ class LocalFrame:
             math.sin(lon),
             math.cos(lon),
         )
-        n = A / math.sqrt(1.0 - E2 * self._sin_lat**2)
+        n = SEMI_MAJOR_AXIS_M / math.sqrt(1.0 - ECCENTRICITY_SQUARED * self._sin_lat**2)
         across = (n + height_m) * self._cos_lat
-        self._origin = (across * self._cos_lon, across * self._sin_lon, (n * (1.0 - E2) + height_m) * self._sin_lat)
+        self._origin = (
+            across * self._cos_lon,
+            across * self._sin_lon,
+            (n * (1.0 - ECCENTRICITY_SQUARED) + height_m) * self._sin_lat,
+        )
 
     def geodetic(self, east_m: float, north_m: float, up_m: float) -> Geodetic:
         """Latitude and longitude [deg] and height [m] of a local point."""
@@ -39,8 +43,11 @@ class LocalFrame:
         y = self._origin[1] + self._sin_lon * out + self._cos_lon * east_m
         z = self._origin[2] + self._sin_lat * up_m + self._cos_lat * north_m
         p = math.hypot(x, y)
-        parametric = math.atan2(z * A, p * B)
-        lat = math.atan2(z + EP2 * B * math.sin(parametric) ** 3, p - E2 * A * math.cos(parametric) ** 3)
+        parametric = math.atan2(z * SEMI_MAJOR_AXIS_M, p * SEMI_MINOR_AXIS_M)
+        lat = math.atan2(
+            z + SECOND_ECCENTRICITY_SQUARED * SEMI_MINOR_AXIS_M * math.sin(parametric) ** 3,
+            p - ECCENTRICITY_SQUARED * SEMI_MAJOR_AXIS_M * math.cos(parametric) ** 3,
+        )
         s, c = math.sin(lat), math.cos(lat)
-        height = p * c + z * s - A * math.sqrt(1.0 - E2 * s * s)
+        height = p * c + z * s - SEMI_MAJOR_AXIS_M * math.sqrt(1.0 - ECCENTRICITY_SQUARED * s * s)
         return math.degrees(lat), math.degrees(math.atan2(y, x)), height

@@ -34,10 +34,10 @@ SIDE_SLOPE: Final = 0.10  # rise per metre towards +y of kind "slope"
 HILL_SLOPE: Final = math.tan(math.radians(10.0))  # of kind "hill"
 MUD: Final = Soil(0.5, 0.3, 0.10)  # assumed: a wheel pulls with a third of its load and sinks in
 EXTENT_M: Final = 120.0  # edge of all but rough
-ROUGH_CELLS: Final = 400
+ROUGH_CELL_COUNT: Final = 400
 ROUGH_CELL_M: Final = 0.2
 # Roughness: standard deviation and smoothing length [m] of each layer; correlation falls to 1/e at twice the length.
-LAYERS: Final = ((0.06, 0.75), (0.20, 6.0))
+ROUGHNESS_LAYERS: Final = ((0.06, 0.75), (0.20, 6.0))
 THICKNESS_M: Final = 1.0  # of the box under flat and slope
 
 
@@ -85,13 +85,13 @@ def _smooth(noise: NDArray[np.float64], length_cells: float) -> NDArray[np.float
 def _rough(seed: int) -> NDArray[np.float64]:
     """Undulation of LAYERS, with the origin in the middle of the grid at height 0; exact in single precision."""
     rng = np.random.default_rng(random.Random(f"terrain {seed}").getrandbits(64))
-    shape = (ROUGH_CELLS, ROUGH_CELLS)
+    shape = (ROUGH_CELL_COUNT, ROUGH_CELL_COUNT)
     heights = np.zeros(shape)
-    for s, length in LAYERS:
+    for s, length in ROUGHNESS_LAYERS:
         heights = heights + s * _smooth(rng.standard_normal(shape), length / ROUGH_CELL_M)
     heights = np.vstack([heights, heights[:1]])
     heights = np.hstack([heights, heights[:, :1]])
-    heights -= heights[ROUGH_CELLS // 2, ROUGH_CELLS // 2]
+    heights -= heights[ROUGH_CELL_COUNT // 2, ROUGH_CELL_COUNT // 2]
     return heights.astype(np.float32).astype(np.float64)
 
 

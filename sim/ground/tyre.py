@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from sim.ground.terrain import surface_height
 
-SUBSTEPS: Final = 4
-FOOTPRINT: Final = 0.4  # half length of the contact patch that envelopes the ground, in wheel radii
+SUBSTEP_COUNT: Final = 4
+FOOTPRINT_RADII: Final = 0.4  # half length of the contact patch that envelopes the ground, in wheel radii
 Array = NDArray[np.float64]
 
 
@@ -79,7 +79,7 @@ def wheel_step(
     ``out``: a row per wheel of the force on its arm and the moment of it about the arm's centre of mass, world
     (6 numbers).  ``contact``: a row per wheel of contact point, world, and normal load [N] (4 numbers).
     """
-    h = step_s / SUBSTEPS
+    h = step_s / SUBSTEP_COUNT
     for k in range(arms.shape[0]):
         a = arms[k]
         ox, oy, oz, qx, qy, qz, qw = a[0], a[1], a[2], a[3], a[4], a[5], a[6]
@@ -91,7 +91,7 @@ def wheel_step(
         # Horizontal direction of travel, and the ground fitted in it and across it.
         length = math.sqrt(ax * ax + ay * ay)
         cx, cy = ay / length, -ax / length
-        fore, side = FOOTPRINT * tyre.radius_m, 0.35 * tyre.width_m
+        fore, side = FOOTPRINT_RADII * tyre.radius_m, 0.35 * tyre.width_m
         total, rise_fore, rise_side = 0.0, 0.0, 0.0
         for i in range(-1, 2):
             for j in range(-1, 2):
@@ -126,7 +126,7 @@ def wheel_step(
         grip, rolling = tyre.friction * load, tyre.rolling_resistance * load * reach
         w, q0, q1 = spin[k], bristle[k, 0], bristle[k, 1]
         sum_t, sum_l, sum_reaction = 0.0, 0.0, 0.0
-        for _ in range(SUBSTEPS):
+        for _ in range(SUBSTEP_COUNT):
             slip = forward - reach * w
             # Implicit in the relaxation, so that no speed makes it unstable.
             keep = 1.0 / (1.0 + h * abs(reach * w) / tyre.relaxation_m)
@@ -155,7 +155,7 @@ def wheel_step(
             sum_l += fl
             sum_reaction += drive + min(max(held, -brake), brake)
         spin[k], bristle[k, 0], bristle[k, 1] = w, q0, q1
-        ft, fl, reaction = sum_t / SUBSTEPS, sum_l / SUBSTEPS, sum_reaction / SUBSTEPS
+        ft, fl, reaction = sum_t / SUBSTEP_COUNT, sum_l / SUBSTEP_COUNT, sum_reaction / SUBSTEP_COUNT
         fx, fy, fz = ft * tx + fl * lx + load * nx, ft * ty + fl * ly + load * ny, ft * tz + fl * lz + load * nz
         # What turns the wheel about its axle reaches the arm only through motor and brake.
         about = ax * (by * fz - bz * fy) + ay * (bz * fx - bx * fz) + az * (bx * fy - by * fx) + reaction

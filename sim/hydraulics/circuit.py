@@ -18,7 +18,7 @@ from sim.hydraulics import layout
 from sim.hydraulics.kernel import STEADY_S, advance
 from sim.truth.load import Truth
 
-SUBSTEPS: Final = 4
+SUBSTEP_COUNT: Final = 4
 REST_PA: Final = 1.0e6  # in the unloaded chamber at the start
 AXLES: Final = {"front": "arm_fl", "rear": "arm_rl"}  # the right arm follows its left one
 
@@ -26,7 +26,7 @@ AXLES: Final = {"front": "arm_fl", "rear": "arm_rl"}  # the right arm follows it
 class Hydraulics:
     """All functions of a machine on its pump; ``names`` is the order of all sequences."""
 
-    def __init__(self, truth: Truth, step_s: float, substeps: int = SUBSTEPS) -> None:
+    def __init__(self, truth: Truth, step_s: float, substeps: int = SUBSTEP_COUNT) -> None:
         self.names: Final = tuple(truth.functions)
         n = len(self.names)
         self._bulk_pa = truth.supply.bulk_modulus_pa
@@ -47,7 +47,7 @@ class Hydraulics:
         s, c = self._states, self._constants
         at = np.asarray(q, float)
         for i, (arm, travel) in enumerate(self._tables):
-            grid = c["lever_low"][i] + c["lever_step"][i] * np.arange(layout.LEVER_POINTS)
+            grid = c["lever_low"][i] + c["lever_step"][i] * np.arange(layout.LEVER_POINT_COUNT)
             s["arm"][i], s["travel"][i] = np.interp(at[i], grid, arm), np.interp(at[i], grid, travel)
         force = np.asarray(torques, float) / s["arm"]
         s["pressure_a"] = REST_PA * c["area_b"] / c["area_a"] + np.maximum(0.0, force / c["area_a"])

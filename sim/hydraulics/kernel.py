@@ -24,7 +24,7 @@ VALVE_M3_S_PA = 1.0e-8  # relief and make-up valves of a port: flow per pressure
 FLOAT_M3_S_PA = 2.0e-9  # float valve between the swing arms of an axle
 STOP_RAD_S = 350.0  # an end stop: frequency of the least inertia on it, half of critically damped
 POPPET_S = 0.01  # a check valve's poppet follows its pilot
-BISECTIONS = 24
+BISECTION_COUNT = 24
 
 
 @njit(cache=True)
@@ -100,7 +100,7 @@ def share_flow(constants: Records, states: Records, pump: Pump, balance: Balance
             states[i].inflow *= pump.flow / wanted
     elif wanted > pump.flow:
         low, high = 0.0, supply
-        for _ in range(BISECTIONS):
+        for _ in range(BISECTION_COUNT):
             supply = 0.5 * (low + high)
             wanted = 0.0
             for i in range(len(states)):

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from sim.truth.hydraulics import Function, Supply
 from sim.truth.load import Truth
 
+PA_PER_BAR: Final = 1e5
 SOFT_PA: Final = 0.2e6
 UNIT_PA: Final = 1.0e6
-LEVER_POINTS: Final = 129
-CUSHION: Final = 0.02  # the end stops begin before the ends of the lever table [rad, m]
-OUT_OVER_IN: Final = 1.05  # metering out passes a little more than metering in, or back pressure would build up
+LEVER_POINT_COUNT: Final = 129
+CUSHION_LENGTH: Final = 0.02  # the end stops begin before the ends of the lever table [rad, m]
+METER_OUT_FACTOR: Final = 1.05  # metering out passes a little more than metering in, or back pressure would build up
 
 
 Array = NDArray[np.float64]
@@ -143,7 +144,7 @@ def pump(supply: Supply) -> Records:
 def _lever(function: Function) -> tuple[Array, Array]:
     """Lever arm dx/dq and piston travel from its lower end, on a uniform grid over the joint's positions."""
     c = function.cylinder
-    q = np.linspace(c.arm_at[0], c.arm_at[-1], LEVER_POINTS)
+    q = np.linspace(c.arm_at[0], c.arm_at[-1], LEVER_POINT_COUNT)
     arm = np.interp(q, c.arm_at, c.arm)
     travel = np.concatenate(([0.0], np.cumsum((arm[1:] + arm[:-1]) / 2 * (q[1] - q[0]))))
     return arm, travel - travel.min()
@@ -154,7 +155,7 @@ def functions(truth: Truth, step_s: float) -> tuple[Records, Array]:
     margin = truth.supply.pressure_margin_pa
     full = margin / np.sqrt(UNIT_PA * (margin + SOFT_PA))
     records = np.zeros(len(truth.functions), CONSTANTS)
-    tables = np.empty((len(records), 2, LEVER_POINTS))
+    tables = np.empty((len(records), 2, LEVER_POINT_COUNT))
     for r, table, function in zip(records, tables, truth.functions.values(), strict=True):
         c, v = function.cylinder, function.valve
         table[:] = _lever(function)
@@ -181,13 +182,13 @@ def functions(truth: Truth, step_s: float) -> tuple[Records, Array]:
             "check_ratio": v.check_ratio,
             "in_plus": into_a,
             "in_minus": into_b,
-            "out_plus": OUT_OVER_IN * into_a * c.area_b / c.area_a,
-            "out_minus": OUT_OVER_IN * into_b * c.area_a / c.area_b,
+            "out_plus": METER_OUT_FACTOR * into_a * c.area_b / c.area_a,
+            "out_minus": METER_OUT_FACTOR * into_b * c.area_a / c.area_b,
             "lever_low": c.arm_at[0],
-            "lever_step": (c.arm_at[-1] - c.arm_at[0]) / (LEVER_POINTS - 1),
+            "lever_step": (c.arm_at[-1] - c.arm_at[0]) / (LEVER_POINT_COUNT - 1),
             "stroke": table[1].max(),
-            "low": c.arm_at[0] + CUSHION,
-            "high": c.arm_at[-1] - CUSHION,
+            "low": c.arm_at[0] + CUSHION_LENGTH,
+            "high": c.arm_at[-1] - CUSHION_LENGTH,
             "delay_steps": max(1, round(v.delay_s / step_s)),
         }
         for key in CONSTANTS.names or ():

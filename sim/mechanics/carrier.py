@@ -19,7 +19,7 @@ import numpy as np
 from machine.geometry import carrier as geometry
 from machine.profile import Carrier as CarrierProfile
 from machine.profile import Profile
-from sim.bullet.client import BulletClient
+from sim.bullet.client import GRAVITY_M_S2, BulletClient
 from sim.bullet.urdf import JointDef, LinkDef
 from sim.geometry.shape import IDENTITY, Quaternion, Shape, Vector, quaternion_rpy, rpy_quaternion
 from sim.ground.terrain import Terrain
@@ -30,10 +30,9 @@ from sim.truth.load import Truth
 CARRIER_JOINTS: Final = ("articulation", *geometry.ARMS)
 CARRIER_LINKS: Final = ("rear", "front", *geometry.ARMS)
 STOP_MARGIN: Final = 0.03  # the hard stops stand a little outside the working range [rad]
-GRAVITY_M_S2: Final = 9.81
-FACETS: Final = 4  # boxes that make a wheel
+WHEEL_BOX_COUNT: Final = 4  # boxes that make a wheel
 BEAM_M: Final = (0.12, 0.20)  # width and height of a swing arm
-POLYGON: Final = (0, 1, 3, 2)  # wheels clockwise seen from above: fl fr rr rl
+SUPPORT_POLYGON: Final = (0, 1, 3, 2)  # wheels clockwise seen from above: fl fr rr rl
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +71,10 @@ def _shapes(c: CarrierProfile, link: str) -> tuple[Shape, ...]:
     ahead, inward = (1 if link[4] == "f" else -1), (-1 if link[5] == "l" else 1)
     beam = (c.arm_length_m + 0.20, *BEAM_M)
     at = (ahead * c.arm_length_m / 2, inward * (c.wheel_width_m / 2 + 0.08), 0.0)
-    half = math.pi / (2 * FACETS)
+    half = math.pi / (2 * WHEEL_BOX_COUNT)
     facet = (2 * c.wheel_radius_m * math.cos(half), c.wheel_width_m, 2 * c.wheel_radius_m * math.sin(half))
     hub = (ahead * c.arm_length_m, 0.0, 0.0)
-    turns = (rpy_quaternion(0.0, 2 * half * i) for i in range(FACETS))
+    turns = (rpy_quaternion(0.0, 2 * half * i) for i in range(WHEEL_BOX_COUNT))
     return (Shape(link, beam, at, IDENTITY, dark), *(Shape(link, facet, hub, turn, rubber) for turn in turns))
 
 
@@ -324,7 +323,7 @@ class Carrier:
             return 0.0
         x, y = (sum(point[k] * point[3] for point in points) / total for k in (0, 1))
         margin = math.inf
-        for a, b in zip(POLYGON, (*POLYGON[1:], POLYGON[0]), strict=True):
+        for a, b in zip(SUPPORT_POLYGON, (*SUPPORT_POLYGON[1:], SUPPORT_POLYGON[0]), strict=True):
             ex, ey = points[b][0] - points[a][0], points[b][1] - points[a][1]
             inside = ey * (x - points[a][0]) - ex * (y - points[a][1])
             margin = min(margin, inside / math.hypot(ex, ey))

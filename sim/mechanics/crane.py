@@ -21,13 +21,13 @@ from sim.geometry.shape import IDENTITY, Shape, Vector, rpy_quaternion
 from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, jaw_geometry
 from sim.truth.load import Truth
 
-ACTIVE: Final = ("slew", "lift", "tilt", "ext")
-FLEX: Final = ("flex_pitch", "flex_roll")
-PASSIVE: Final = ("hanger", "fork")
-CRANE_JOINTS: Final = ("slew", *FLEX, "lift", "tilt", "ext", *PASSIVE, "rot", "tong_left", "tong_right")
+ACTIVE_JOINTS: Final = ("slew", "lift", "tilt", "ext")
+FLEX_JOINTS: Final = ("flex_pitch", "flex_roll")
+PASSIVE_JOINTS: Final = ("hanger", "fork")
+CRANE_JOINTS: Final = ("slew", *FLEX_JOINTS, "lift", "tilt", "ext", *PASSIVE_JOINTS, "rot", "tong_left", "tong_right")
 CRANE_LINKS: Final = (
     *("base", "turntable", "flexure", "mast", "boom", "stick", "telescope"),
-    *(*PASSIVE, "rotator", "tong_left", "tong_right"),
+    *(*PASSIVE_JOINTS, "rotator", "tong_left", "tong_right"),
 )
 STOP_MARGIN: Final = 0.03  # hard stops: a little outside the working range, behind the cylinders' cushions [rad, m]
 FLEX_STOP_RAD: Final = 0.15
@@ -128,10 +128,10 @@ def crane_links(profile: Profile, truth: Truth) -> tuple[list[LinkDef], list[Joi
 def _joints(profile: Profile) -> list[JointDef]:
     k, build = profile.kinematics, _steel_dimensions(profile)
     _, along, frame, pin = _telescope(k, build)
-    tongs = jaw_geometry(profile)
+    jaws = jaw_geometry(profile)
     x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     boom = (0.0, k.a2_m * math.cos(k.theta2_offset_rad), k.a2_m * math.sin(k.theta2_offset_rad))
-    pivot = -tongs.pivot_z_m
+    pivot = -jaws.pivot_z_m
     table = {
         "slew": ("base", "turntable", (0.0, 0.0, build.bearing_z_m), z),
         "flex_pitch": ("turntable", "flexure", (0.0, 0.0, 0.0), x),
@@ -142,12 +142,14 @@ def _joints(profile: Profile) -> list[JointDef]:
         "hanger": ("telescope", "hanger", (0.0, pin[1] - frame[1], pin[2] - frame[2]), x),
         "fork": ("hanger", "fork", (0.0, 0.0, -k.hanger_to_fork_m), y),
         "rot": ("fork", "rotator", (0.0, 0.0, -k.fork_to_rotator_m), z),
-        "tong_left": ("rotator", "tong_left", (-tongs.pivot_x_m, PIVOT_Y_M, pivot), (0.0, -1.0, 0.0)),
-        "tong_right": ("rotator", "tong_right", (tongs.pivot_x_m, PIVOT_Y_M, pivot), y),
+        "tong_left": ("rotator", "tong_left", (-jaws.pivot_x_m, PIVOT_Y_M, pivot), (0.0, -1.0, 0.0)),
+        "tong_right": ("rotator", "tong_right", (jaws.pivot_x_m, PIVOT_Y_M, pivot), y),
     }
     stops = {name: (spec.lower - STOP_MARGIN, spec.upper + STOP_MARGIN) for name, spec in profile.joints.items()}
-    stops |= dict.fromkeys(FLEX, (-FLEX_STOP_RAD, FLEX_STOP_RAD)) | dict.fromkeys(PASSIVE, (-math.pi, math.pi))
-    stops |= dict.fromkeys(("tong_left", "tong_right"), (-STOP_MARGIN, tongs.closed_rad + STOP_MARGIN))
+    stops |= dict.fromkeys(FLEX_JOINTS, (-FLEX_STOP_RAD, FLEX_STOP_RAD)) | dict.fromkeys(
+        PASSIVE_JOINTS, (-math.pi, math.pi)
+    )
+    stops |= dict.fromkeys(("tong_left", "tong_right"), (-STOP_MARGIN, jaws.closed_rad + STOP_MARGIN))
     return [
         JointDef(
             name,

@@ -18,7 +18,7 @@ from sim.geometry.shape import IDENTITY, Shape, Vector, rpy_quaternion
 PIVOT_Y_M = -0.0193
 PALMS_CHORD_M = 0.648  # blades, widths and beam below belong to this grapple; others are scaled by their chord
 # (along, across) the chord from pivot to tip, in chord lengths: a claw, bulging outward.
-POLYLINE = ((0.0, 0.0), (0.06, 0.13), (0.29, 0.205), (0.585, 0.20), (0.85, 0.12), (1.0, 0.0))
+JAW_PROFILE_CHORDS = ((0.0, 0.0), (0.06, 0.13), (0.29, 0.205), (0.585, 0.20), (0.85, 0.12), (1.0, 0.0))
 PLATE_M = (0.035, 0.035, 0.035, 0.03, 0.022)  # per segment: the tips are sharp to get under a thin log
 
 
@@ -70,10 +70,10 @@ def _solve3(m: list[list[float]], y: Sequence[float]) -> tuple[float, float, flo
     return (x[0], x[1], x[2])
 
 
-def jaw_points(tongs: JawGeometry, side: int) -> list[tuple[float, float]]:
+def jaw_points(jaws: JawGeometry, side: int) -> list[tuple[float, float]]:
     """Polyline (x, z) [m] of a jaw in its link frame at angle 0; side -1 left, +1 right."""
-    x, z = tongs.out_m, tongs.down_m
-    return [(side * (a * x + b * z), -a * z + b * x) for a, b in POLYLINE]
+    x, z = jaws.out_m, jaws.down_m
+    return [(side * (a * x + b * z), -a * z + b * x) for a, b in JAW_PROFILE_CHORDS]
 
 
 def grapple_shapes(profile: Profile) -> list[Shape]:
@@ -82,18 +82,18 @@ def grapple_shapes(profile: Profile) -> list[Shape]:
     The beam between the pivots is slim and lies above them, because a thick log needs the room between the jaws.
     """
     k: Kinematics = profile.kinematics
-    tongs = jaw_geometry(profile)
-    scale = tongs.chord_m / PALMS_CHORD_M
+    jaws = jaw_geometry(profile)
+    scale = jaws.chord_m / PALMS_CHORD_M
     dark, red = (0.2, 0.2, 0.22), (0.8, 0.2, 0.15)
-    rotator, fork, z = k.rotator_to_tong_pivot_m, k.fork_to_rotator_m, -tongs.pivot_z_m
+    rotator, fork, z = k.rotator_to_tong_pivot_m, k.fork_to_rotator_m, -jaws.pivot_z_m
     shapes = [
         Shape("hanger", (0.08, 0.08, k.hanger_to_fork_m), (0.0, 0.0, -k.hanger_to_fork_m / 2), IDENTITY, dark, False),
         Shape("fork", (0.14, 0.14, fork), (0.0, 0.0, -fork / 2), IDENTITY, dark, False),
         Shape("rotator", (0.22, 0.22, rotator / 2), (0.0, 0.0, -rotator / 4), IDENTITY, dark),
-        Shape("rotator", (2 * tongs.pivot_x_m + 0.06, 0.16 * scale, 0.08), (0.0, PIVOT_Y_M, z + 0.07), IDENTITY, dark),
+        Shape("rotator", (2 * jaws.pivot_x_m + 0.06, 0.16 * scale, 0.08), (0.0, PIVOT_Y_M, z + 0.07), IDENTITY, dark),
     ]
     for side, link in ((-1, "tong_left"), (1, "tong_right")):
-        points = jaw_points(tongs, side)
+        points = jaw_points(jaws, side)
         for (x0, z0), (x1, z1), thick in zip(points, points[1:], PLATE_M, strict=False):
             length, x, z = math.hypot(x1 - x0, z1 - z0), (x0 + x1) / 2, (z0 + z1) / 2
             turn = rpy_quaternion(0.0, -math.atan2(z1 - z0, x1 - x0))

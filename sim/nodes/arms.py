@@ -20,7 +20,7 @@ ADDRESS = 0x30
 SUSPENSION_FUNCTION = 21  # J1939 NAME function of a suspension system controller
 COMMAND_NS = 100 * MS
 CYCLE_NS = 20 * MS
-ARMS = 4
+ARM_COUNT = 4
 
 
 class ArmState(IntEnum):
@@ -47,13 +47,13 @@ class ArmNode(J1939Node):
             ProtectedMessage(machine, "ArmHeightB"),
         )
         self._period = PeriodicTimer(CYCLE_NS, phase_ns=5 * MS)
-        self.heights_mm = (0.0,) * ARMS
+        self.heights_mm = (0.0,) * ARM_COUNT
         self.roll_deg = self.pitch_deg = 0.0
         self.state = ArmState.HOLD
         self._hold()
 
     def _hold(self) -> None:
-        self.spools = [0.0] * ARMS
+        self.spools = [0.0] * ARM_COUNT
         self.float_front = self.float_rear = False
 
     def receive(self, key: int, data: bytes, now_ns: int) -> None:
@@ -78,7 +78,7 @@ class ArmNode(J1939Node):
         if self.state is not ArmState.ACTIVE:
             self._hold()
             return
-        self.spools = [(percent or 0.0) / 100.0 for percent in a.last(ARMS)]
+        self.spools = [(percent or 0.0) / 100.0 for percent in a.last(ARM_COUNT)]
         self.float_front, self.float_rear = front, rear
 
     def cycle(self, now_ns: int) -> None:

@@ -13,11 +13,11 @@ from can_dbc.dbc.codec import Database
 from can_dbc.protocols.canopen import HEARTBEAT_BASE, Emergency, NodeState, emergency_frame
 from can_dbc.protocols.canopen_slave import HEARTBEAT_MS, CanopenSlave
 from machine.crane_nodes import CraneNode
+from sim.hydraulics.layout import PA_PER_BAR
 from sim.nodes import Outbox
 from sim.nodes.messages import MS, PeriodicTimer, ProtectedMessage
 
 HEARTBEAT_NS = HEARTBEAT_MS * MS
-PA_PER_BAR = 1e5
 
 
 class Device(CanopenSlave):

@@ -25,7 +25,7 @@ from sim.truth.encoders import EncoderTruth
 
 EDS_FOLDER = Path(can_dbc.__file__).parent
 PDO_NOT_VALID = 0x8000_0000
-LAST_SYNCHRONOUS = 240
+MAX_SYNCHRONOUS_TYPE = 240
 OPERATIONAL, PRE_OPERATIONAL, INITIALISING = "OPERATIONAL", "PRE-OPERATIONAL", "INITIALISING"
 EMCY_POSITION = 0x5000
 TIMESTAMP_NS = 1_000  # the device's time stamp counts microseconds modulo 2**16
@@ -144,7 +144,7 @@ class EncoderNode:
         if self._pdo is None:
             self._pdo = self._read_pdo()
         cob, every, mapping, length = self._pdo
-        if cob & PDO_NOT_VALID or not 1 <= every <= LAST_SYNCHRONOUS:
+        if cob & PDO_NOT_VALID or not 1 <= every <= MAX_SYNCHRONOUS_TYPE:
             return
         self._syncs += 1
         if self._syncs % every:

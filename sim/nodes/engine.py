@@ -13,12 +13,12 @@ from sim.nodes.messages import MS, PeriodicTimer
 
 ADDRESS = 0x00
 WORKING_RPM = 1500.0
-DROOP = 0.05  # of the speed, at full power
+DROOP_SHARE = 0.05  # of the speed, at full power
 FULL_POWER_W = 110e3
 IDLE_TORQUE_PCT = 12.0
 LAG_S = 0.25
 CYCLE_NS = 20 * MS
-KM_H = 3.6
+KM_H_PER_M_S = 3.6
 
 
 class EngineNode(J1939Node):
@@ -53,7 +53,7 @@ class EngineNode(J1939Node):
                 ActualTorqueFine=0,
                 DemandTorque=torque,
                 ActualTorque=torque,
-                EngineSpeed=WORKING_RPM * (1.0 - DROOP * self._load),
+                EngineSpeed=WORKING_RPM * (1.0 - DROOP_SHARE * self._load),
                 SourceAddress=ADDRESS,
                 StarterMode=0,
                 Reserved=0xF,
@@ -61,7 +61,7 @@ class EngineNode(J1939Node):
             )
             self.outbox += frames(self._eec1, payload, ADDRESS)
         if self._medium.due(now_ns):
-            speed = KM_H * abs(self.speed_m_s)
+            speed = KM_H_PER_M_S * abs(self.speed_m_s)
             brake = int(self.brake)
             payload = encode(
                 self._ccvs, WheelSpeed=speed, BrakeSwitch=brake, ParkingBrake=int(self.brake and speed < 0.1)

@@ -31,8 +31,8 @@ EPOCH_DAY: Final = 20_605  # 2026-06-01, days since 1970
 EPOCH_S: Final = 8 * 3600.0
 DAY_S: Final = 86_400.0
 CYCLE_NS: Final = 50 * MS
-FAST, COURSE, SLOW = 2, 5, 20  # cycles between the messages of 100 ms, 250 ms and 1 s
-TURN: Final = 2.0 * math.pi
+FAST_CYCLES, COURSE_CYCLES, SLOW_CYCLES = 2, 5, 20  # cycles between the messages of 100 ms, 250 ms and 1 s
+TURN_RAD: Final = 2.0 * math.pi
 GPS_GLONASS: Final = 2
 NO_SOLUTION_SATELLITES: Final = 2
 
@@ -110,17 +110,17 @@ class GnssNode(J1939Node):
         self._wander = [self._keep * w + driven * gauss(0.0, 1.0) for w in self._wander]
         self._epochs += 1
         due = self._epochs
-        if not (due % FAST == 0 or due % COURSE == 0):
+        if not (due % FAST_CYCLES == 0 or due % COURSE_CYCLES == 0):
             return
         heading = None
         if self.fix and not self.heading_lost:
-            heading = (math.pi / 2 - azimuth + gauss(0.0, self._heading_noise_rad) + self.heading_error_rad) % TURN
+            heading = (math.pi / 2 - azimuth + gauss(0.0, self._heading_noise_rad) + self.heading_error_rad) % TURN_RAD
             if self.heading_frozen and self._heading is not None:
                 heading = self._heading
             self._heading = heading
         out: list[tuple[int, bytes]] = []
         stamp = {"SID": due % 253}
-        if due % FAST == 0:
+        if due % FAST_CYCLES == 0:
             lat, lon, height = self._position(main)
             self._put(out, "PositionRapidUpdate", Latitude=lat, Longitude=lon)
             self._put(out, "VesselHeading", Heading=heading, Reference=0, **stamp)
@@ -131,12 +131,12 @@ class GnssNode(J1939Node):
             yaw = None if heading is None else _wrapped(heading)
             attitude = {"Yaw": yaw, "Pitch": gauss(-pitch, noise), "Roll": gauss(roll, noise)}
             self._put(out, "Attitude", **attitude, **stamp)
-            if due % SLOW == 0:
+            if due % SLOW_CYCLES == 0:
                 self._put_slow(out, now_ns, lat, lon, height, stamp)
-        if due % COURSE == 0:
+        if due % COURSE_CYCLES == 0:
             east, north = ((now - then) / (CYCLE_NS * 1e-9) for now, then in zip(main[:2], last[0][:2], strict=True))
             east, north = gauss(east, t.speed_noise_m_s), gauss(north, t.speed_noise_m_s)
-            motion: dict[str, Any] = {"Cog": math.atan2(east, north) % TURN, "Sog": math.hypot(east, north)}
+            motion: dict[str, Any] = {"Cog": math.atan2(east, north) % TURN_RAD, "Sog": math.hypot(east, north)}
             self._put(out, "CogSogRapidUpdate", CogReference=0, **stamp, **(motion if self.fix else {}))
         self._pending.append((now_ns + round(self._rng.uniform(*t.latency_s) * 1e9), out))
 
@@ -161,14 +161,14 @@ class GnssNode(J1939Node):
         days, seconds = divmod(EPOCH_S + now_ns * 1e-9, DAY_S)
         utc = {"Date": EPOCH_DAY + int(days), "Time": seconds}
         self._put(out, "SystemTime", Source=0, **utc, **stamp)
-        known: dict[str, Any] = {"NumberOfSvs": NO_SOLUTION_SATELLITES, "Integrity": 2}
+        fields: dict[str, Any] = {"NumberOfSvs": NO_SOLUTION_SATELLITES, "Integrity": 2}
         if self.fix:
             quality = self._truth.fixes[self.fix.name.lower()]
-            known = {"NumberOfSvs": quality.satellites, "Hdop": quality.hdop, "Pdop": 1.6 * quality.hdop}
-            known["Integrity"] = 1 if self.fix is Fix.RTK_FIXED else 2
+            fields = {"NumberOfSvs": quality.satellites, "Hdop": quality.hdop, "Pdop": 1.6 * quality.hdop}
+            fields["Integrity"] = 1 if self.fix is Fix.RTK_FIXED else 2
         place = {"Latitude": lat, "Longitude": lon, "Altitude": height, "GeoidalSeparation": self._truth.geoid_m}
         kind = {"GnssType": GPS_GLONASS, "Method": int(self.fix), "ReferenceStations": 0}
-        self._put(out, "GnssPositionData", **utc, **place, **kind, **known, **stamp)
+        self._put(out, "GnssPositionData", **utc, **place, **kind, **fields, **stamp)
 
     def _put(self, out: list[tuple[int, bytes]], message: str, **fields: Any) -> None:
         codec = self._messages.message(message)
@@ -185,7 +185,7 @@ def _difference(a: Vector, b: Vector) -> Vector:
 
 
 def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % TURN - math.pi
+    return (angle + math.pi) % TURN_RAD - math.pi
 
 
 def _turned(q: Quaternion, v: Vector) -> Vector:

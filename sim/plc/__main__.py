@@ -108,9 +108,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.modbus is None and options.udp is None:
         parser.error("give --modbus HOST:PORT, --udp HOST:PORT or both")
-    for asked in (options.modbus, options.udp):
-        if asked and not options.allow_network and not is_loopback(asked[0]):
-            parser.error(f"{asked[0]} can be reached by others, and nothing is authenticated; give --allow-network")
+    for address in (options.modbus, options.udp):
+        if address and not options.allow_network and not is_loopback(address[0]):
+            parser.error(f"{address[0]} can be reached by others, and nothing is authenticated; give --allow-network")
     loop = asyncio.new_event_loop()
     try:
         profile = load_profile(options.profile)

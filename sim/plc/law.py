@@ -16,9 +16,9 @@ from machine.profile import JointSpec, Valve
 RESOLUTION_RAD = math.radians(0.1)
 RESOLUTION_M = 1e-4
 KP_1_S = 3.0
-KD_GAIN = 0.1
-REST_S = 0.01
-ACCELERATION_FACTOR = 4.0
+KD = 0.1
+STOP_BAND_S = 0.01
+ACCELERATION_LIMIT_FACTOR = 4.0
 END_GAIN_1_S = 4.0
 LINEAR_SHARE = 0.01
 
@@ -30,7 +30,7 @@ def resolution(spec: JointSpec) -> float:
 
 def stop_band(spec: JointSpec) -> float:
     """Band around the reference in which a joint rests: two counts, or its travel in 10 ms at its speed limit."""
-    return max(2.0 * resolution(spec), REST_S * spec.speed_limit)
+    return max(2.0 * resolution(spec), STOP_BAND_S * spec.speed_limit)
 
 
 class PdLaw:
@@ -65,11 +65,11 @@ class PdLaw:
             error = q_ref - self.position
             band = stop_band(spec) if self._resting else 0.5 * stop_band(spec)
             self._resting = v_ref == 0.0 and abs(error) < band
-            command = 0.0 if self._resting else v_ref + KP_1_S * error + KD_GAIN * (v_ref - self._filtered)
+            command = 0.0 if self._resting else v_ref + KP_1_S * error + KD * (v_ref - self._filtered)
             command = min(command, max(0.0, (spec.upper - self.position) * END_GAIN_1_S))
             command = max(command, min(0.0, (spec.lower - self.position) * END_GAIN_1_S))
         limit = SPEED_HEADROOM_SHARE * spec.speed_limit * speed
-        change = ACCELERATION_FACTOR * spec.acceleration_limit * elapsed_s
+        change = ACCELERATION_LIMIT_FACTOR * spec.acceleration_limit * elapsed_s
         command = min(max(command, -limit), limit)
         self._command = min(max(command, self._command - change), self._command + change)
         return valve_opening(spec.valve, self._command)

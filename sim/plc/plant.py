@@ -9,11 +9,10 @@ from can_dbc.plc.map import Estop, Role, State, WordOrder
 from machine.joints import JOINTS
 from machine.profile import Profile
 from sim.errors import PlantError
+from sim.hydraulics.layout import PA_PER_BAR
 from sim.plant import Plant
 from sim.plc.program import Inputs, Program
 from sim.wood.log_shape import LogSpec
-
-PA_PER_BAR = 1e5
 
 
 class PlcPlant(Plant):

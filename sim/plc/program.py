@@ -23,7 +23,7 @@ LAW_CYCLE_COUNT = 2  # the joint law runs at 50 Hz
 HOLD_NS = 50 * MS
 RAMP_NS = 40 * MS
 HOLD_SHARE = -0.2  # a held grapple keeps a little closing flow, so that its pressure stays
-MAY_MOVE = Estop.CHANNEL_A | Estop.CHANNEL_B | Estop.PILOT_ON
+MOTION_ALLOWED = Estop.CHANNEL_A | Estop.CHANNEL_B | Estop.PILOT_ON
 
 
 @dataclass(slots=True)
@@ -97,7 +97,7 @@ class Program:
     def _decide(self, estop: int, now_ns: int) -> None:
         """The state of this cycle."""
         arbiter = self.arbiter
-        may_move = estop & MAY_MOVE == MAY_MOVE
+        may_move = estop & MOTION_ALLOWED == MOTION_ALLOWED
         reset = arbiter.take_reset_edge()
         if not may_move:
             self._make_safe(Fault.EMERGENCY_STOP)

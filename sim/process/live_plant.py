@@ -43,8 +43,8 @@ class LivePlant(LiveMachine):
         super().__init__(plant, buses)
         self._plant = plant
         self._station = TotalStation(seed)
-        self._answer_ns = self._lay_ns = 0
-        self._layer = None if site is None else LogSupplier(plant, site.places, site.rounds)
+        self._poll_ns = self._supply_ns = 0
+        self._log_supplier = None if site is None else LogSupplier(plant, site.places, site.rounds)
         self._requests: socket.socket | None = None
         if port is not None:
             self._requests = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -60,12 +60,12 @@ class LivePlant(LiveMachine):
     def _on_step(self, now_ns: int) -> None:
         if self.cameras is not None:
             self.cameras.serve(now_ns)
-        if self._requests is not None and now_ns >= self._answer_ns:
+        if self._requests is not None and now_ns >= self._poll_ns:
             self._answer(self._requests)
-            self._answer_ns = now_ns + REQUEST_POLL_NS
-        if self._layer is not None and now_ns >= self._lay_ns:
-            self._layer.step()
-            self._lay_ns = now_ns + LOG_SUPPLY_PERIOD_NS
+            self._poll_ns = now_ns + REQUEST_POLL_NS
+        if self._log_supplier is not None and now_ns >= self._supply_ns:
+            self._log_supplier.step()
+            self._supply_ns = now_ns + LOG_SUPPLY_PERIOD_NS
 
     def _answer(self, requests: socket.socket) -> None:
         while True:
@@ -97,7 +97,7 @@ class LivePlant(LiveMachine):
                     "host": self.report(),
                 }
             case "logs":
-                return detect(plant) if self._layer is None else detect_in_view(plant)
+                return detect(plant) if self._log_supplier is None else detect_in_view(plant)
             case "verdict":
                 return plant.evaluate()
             case "poses":

@@ -12,11 +12,12 @@ from typing import Any, Final
 from machine.geometry.carrier import ARMS
 from sim.geometry.shape import Quaternion, Vector
 from sim.ground.terrain import Terrain
+from sim.hydraulics.layout import PA_PER_BAR
 from sim.plant import Plant
 
 GROUND_HALF_M: Final = 20.0  # half the width of the uneven ground in the view
 GROUND_CELL_M: Final = 0.6
-LEVER_WORDS: Final = {
+LEVER_LABELS: Final = {
     "slew": ("right", "left"),
     "lift": ("lower", "lift"),
     "tilt": ("in", "out"),
@@ -47,7 +48,7 @@ def scene_of(plant: Plant) -> dict[str, Any]:
             for log in log_bodies.states()
         ],
         "ground": _ground(plant.world.terrain),
-        "levers": [dict(zip(("name", "minus", "plus"), (n, *_words(n)), strict=True)) for n in plant.levers()],
+        "levers": [dict(zip(("name", "minus", "plus"), (n, *_labels(n)), strict=True)) for n in plant.levers()],
         "centre_m": [middle[0], middle[1], middle[2] + 1.0],
         "size_m": 9.0 if carrier is None else 12.0,
     }
@@ -62,12 +63,12 @@ def view_of(plant: Plant) -> dict[str, Any]:
         "logs": [_pose(log.position_m, log.quaternion) for log in plant.logs()],
         "wheels": _wheels(plant),
         "facts": _facts(plant),
-        "pressures_bar": {n: [round(p / 1e5, 1) for p in h.pressures_pa[n]] for n in h.names},
+        "pressures_bar": {n: [round(p / PA_PER_BAR, 1) for p in h.pressures_pa[n]] for n in h.names},
     }
 
 
-def _words(lever: str) -> tuple[str, str]:
-    return LEVER_WORDS.get(lever, ("lower", "raise"))
+def _labels(lever: str) -> tuple[str, str]:
+    return LEVER_LABELS.get(lever, ("lower", "raise"))
 
 
 def _pose(position: Vector, turn: Quaternion) -> list[float]:
@@ -94,7 +95,7 @@ def _facts(plant: Plant) -> dict[str, str]:
         "sag": f"{1e3 * math.dist(tip, rigid):.0f} mm",
         "load": f"{world.load_kg():.0f} kg",
         "opening": f"{100 * world.opening:.0f} %",
-        "pump": f"{world.hydraulics.supply_pa / 1e5:.0f} bar",
+        "pump": f"{world.hydraulics.supply_pa / PA_PER_BAR:.0f} bar",
         "in the bunk": f"{verdict.loaded} of {len(verdict.logs)}",
     }
     vehicle = plant.vehicle()

@@ -22,7 +22,7 @@ from sim.truth.wood import Wood
 from sim.wood.log_shape import LogSpec
 from sim.wood.stacking import GAP_M, beside, distances, seen_from_above, spine, upon
 
-TRIES: Final = 100
+MAX_TRY_COUNT: Final = 100
 KINDS: Final = {
     "single": (1, 1),
     "separate": (1, 99),
@@ -39,7 +39,7 @@ ROUTE_BEND_M: Final = 6.5
 """Radius of the bends in which a machine rounds the corners of its route."""
 ROUTE_CLEAR_M: Final = 1.8  # half a machine and a margin: least distance of a log from the route
 ROUTE_START_M: Final = 6.0
-HEAP_M: Final = 0.5  # filling height above the bunk's stakes; the load sinks as it comes to rest
+OVERFILL_M: Final = 0.5  # filling height above the bunk's stakes; the load sinks as it comes to rest
 CONFIGURATIONS: Final = {
     1: ("single", 1),
     2: ("parallel", 2),
@@ -97,13 +97,13 @@ def random_scene(profile: Profile, wood: Wood, seed: int, logs: int) -> tuple[Lo
     Raises:
         PlantError: the pick area has no room for so many logs.
     """
-    lumber, (cx, cy), half = LogSampler(wood, seed), _pick_center(profile), profile.workspace.pick_half_size_m
+    sampler, (cx, cy), half = LogSampler(wood, seed), _pick_center(profile), profile.workspace.pick_half_size_m
     found: list[LogSpec] = []
     failed = 0
-    while len(found) < logs and failed < TRIES:
-        density, rng = lumber.density(), lumber.rng
+    while len(found) < logs and failed < MAX_TRY_COUNT:
+        density, rng = sampler.density(), sampler.rng
         x, y, yaw = cx + rng.uniform(-half, half), cy + rng.uniform(-half, half), rng.uniform(-math.pi / 2, math.pi / 2)
-        spec = lumber.log(x, y, yaw, density)
+        spec = sampler.log(x, y, yaw, density)
         if all(seen_from_above(spec, other) > 0.1 for other in found):
             found.append(spec)
             failed = 0
@@ -146,11 +146,11 @@ def arrangement(
         )
     if kind == "separate":
         return random_scene(profile, wood, seed, logs)
-    lumber = LogSampler(wood, seed)
+    sampler = LogSampler(wood, seed)
     if kind in ("row", "bunk"):
-        return _row(lumber, logs, route) if kind == "row" else _bunk(lumber, logs, profile)
-    yaw = lumber.rng.uniform(-math.pi / 2, math.pi / 2) if yaw_rad is None else yaw_rad
-    specs = BUILD[kind](lumber, logs)
+        return _row(sampler, logs, route) if kind == "row" else _bunk(sampler, logs, profile)
+    yaw = sampler.rng.uniform(-math.pi / 2, math.pi / 2) if yaw_rad is None else yaw_rad
+    specs = BUILDERS[kind](sampler, logs)
     x, y = _pick_center(profile) if at is None else at
     return tuple(_moved(spec, x, y, yaw) for spec in specs)
 
@@ -191,8 +191,8 @@ def _moved(s: LogSpec, x: float, y: float, yaw: float) -> LogSpec:
     return replace(s, x_m=x + c * s.x_m - k * s.y_m, y_m=y + k * s.x_m + c * s.y_m, yaw_rad=s.yaw_rad + yaw)
 
 
-def _drawn(lumber: LogSampler, logs: int, yaws: Callable[[], float]) -> list[LogSpec]:
-    return [lumber.log(lumber.rng.uniform(-0.2, 0.2), 0.0, yaws()) for _ in range(logs)]
+def _drawn(sampler: LogSampler, logs: int, yaws: Callable[[], float]) -> list[LogSpec]:
+    return [sampler.log(sampler.rng.uniform(-0.2, 0.2), 0.0, yaws()) for _ in range(logs)]
 
 
 def _rows(counts: Sequence[int], logs: Sequence[LogSpec]) -> list[LogSpec]:
@@ -210,38 +210,38 @@ def _rows(counts: Sequence[int], logs: Sequence[LogSpec]) -> list[LogSpec]:
     return out
 
 
-def _parallel(lumber: LogSampler, logs: int) -> list[LogSpec]:
-    return _rows((logs,), _drawn(lumber, logs, lambda: lumber.rng.uniform(-0.03, 0.03)))
+def _parallel(sampler: LogSampler, logs: int) -> list[LogSpec]:
+    return _rows((logs,), _drawn(sampler, logs, lambda: sampler.rng.uniform(-0.03, 0.03)))
 
 
-def _pile(lumber: LogSampler, logs: int) -> list[LogSpec]:
+def _pile(sampler: LogSampler, logs: int) -> list[LogSpec]:
     """The thickest logs lie below: a thick log on thin ones rolls off, and the pile falls apart."""
-    drawn = _drawn(lumber, logs, lambda: lumber.rng.uniform(-0.08, 0.08))
+    drawn = _drawn(sampler, logs, lambda: sampler.rng.uniform(-0.08, 0.08))
     return _rows(PILE_ROWS[logs], sorted(drawn, key=lambda log: -log.diameter_m))
 
 
-def _skewed(lumber: LogSampler, logs: int) -> list[LogSpec]:
-    turns = iter([0.0, math.radians(lumber.rng.uniform(15.0, 30.0))])
-    return _rows((logs,), _drawn(lumber, logs, lambda: next(turns)))
+def _skewed(sampler: LogSampler, logs: int) -> list[LogSpec]:
+    turns = iter([0.0, math.radians(sampler.rng.uniform(15.0, 30.0))])
+    return _rows((logs,), _drawn(sampler, logs, lambda: next(turns)))
 
 
-def _crossed(lumber: LogSampler, logs: int) -> list[LogSpec]:
+def _crossed(sampler: LogSampler, logs: int) -> list[LogSpec]:
     """Parallel logs half a metre apart and one across them, turned by 40 to 90 deg."""
-    rng, lower = lumber.rng, []
+    rng, lower = sampler.rng, []
     for i in range(logs - 1):
-        lower.append(lumber.log(rng.uniform(-0.2, 0.2), 0.7 * (i - (logs - 2) / 2), rng.uniform(-0.05, 0.05)))
+        lower.append(sampler.log(rng.uniform(-0.2, 0.2), 0.7 * (i - (logs - 2) / 2), rng.uniform(-0.05, 0.05)))
     turn = rng.choice((-1.0, 1.0)) * math.radians(rng.uniform(40.0, 90.0))
-    return [*lower, upon(lumber.log(rng.uniform(-0.2, 0.2), 0.0, turn), lower)]
+    return [*lower, upon(sampler.log(rng.uniform(-0.2, 0.2), 0.0, turn), lower)]
 
 
-def _row(lumber: LogSampler, logs: int, route: Sequence[tuple[float, float]]) -> tuple[LogSpec, ...]:
-    rng = lumber.rng
+def _row(sampler: LogSampler, logs: int, route: Sequence[tuple[float, float]]) -> tuple[LogSpec, ...]:
+    rng = sampler.rng
     legs = list(pairwise(route))
     total = sum(math.dist(a, b) for a, b in legs)
     spacing = (total - ROUTE_START_M) / logs
     found: list[LogSpec] = []
     for i in range(logs):
-        for _ in range(TRIES):
+        for _ in range(MAX_TRY_COUNT):
             left = ROUTE_START_M + spacing * (i + rng.uniform(0.2, 0.8))
             side, off, yaw = rng.choice((-1.0, 1.0)), rng.uniform(2.4, 4.4), rng.uniform(-math.pi / 2, math.pi / 2)
             for a, b in legs:
@@ -251,7 +251,7 @@ def _row(lumber: LogSampler, logs: int, route: Sequence[tuple[float, float]]) ->
             along = math.atan2(b[1] - a[1], b[0] - a[0])
             x = a[0] + left * math.cos(along) - side * off * math.sin(along)
             y = a[1] + left * math.sin(along) + side * off * math.cos(along)
-            spec = lumber.log(x, y, yaw + along)
+            spec = sampler.log(x, y, yaw + along)
             if _off_route(spec, route) and all(seen_from_above(spec, other) > 0.3 for other in found):
                 found.append(spec)
                 break
@@ -288,20 +288,20 @@ def _driven(route: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return [*out, route[-1]]
 
 
-def _bunk(lumber: LogSampler, logs: int, profile: Profile) -> tuple[LogSpec, ...]:
+def _bunk(sampler: LogSampler, logs: int, profile: Profile) -> tuple[LogSpec, ...]:
     """Logs along the bunk, from stake to stake and row upon row."""
-    rng, stake = lumber.rng, profile.bunk.width_m / 2 - 0.01
+    rng, stake = sampler.rng, profile.bunk.width_m / 2 - 0.01
     out: list[LogSpec] = []
     edge = -stake
     while len(out) < logs:
-        fresh = lumber.log(rng.uniform(-0.05, 0.05), 0.0, rng.uniform(-0.01, 0.01))
+        fresh = sampler.log(rng.uniform(-0.05, 0.05), 0.0, rng.uniform(-0.01, 0.01))
         across, radius = [y for _, y, _ in fresh.spine()], fresh.radius(-0.5)
         width = max(across) - min(across) + 2 * radius
         if edge + width > stake:
             edge = -stake
         out.append(upon(replace(fresh, in_bunk=True, y_m=edge + radius - min(across)), out))
         edge += width + GAP_M
-        if out[-1].z_m + 2 * radius > profile.bunk.stake_height_m + HEAP_M:
+        if out[-1].z_m + 2 * radius > profile.bunk.stake_height_m + OVERFILL_M:
             raise PlantError(
                 "scene.bunk-full",
                 f"the bunk has no room for {logs} logs; it is full with {len(out) - 1}: request fewer logs",
@@ -309,4 +309,4 @@ def _bunk(lumber: LogSampler, logs: int, profile: Profile) -> tuple[LogSpec, ...
     return tuple(out)
 
 
-BUILD: Final = {"single": _parallel, "parallel": _parallel, "skewed": _skewed, "crossed": _crossed, "pile": _pile}
+BUILDERS: Final = {"single": _parallel, "parallel": _parallel, "skewed": _skewed, "crossed": _crossed, "pile": _pile}

@@ -18,7 +18,7 @@ from sim.scenes.arrangements import arrangement
 from sim.truth.load import Truth, load_truth
 from sim.wood.logs import LogBodies
 
-BASE: Final = ((0.0, 0.0, 0.0), IDENTITY)
+BASE_POSE: Final = ((0.0, 0.0, 0.0), IDENTITY)
 
 
 @lru_cache(maxsize=8)
@@ -37,7 +37,7 @@ def settle_logs(
     truth, client = _truth("nominal", 0, profile.name), new_client()
     try:
         scene = arrangement(kind, profile, truth.wood, seed, logs, route=route)
-        states = LogBodies(client, profile, truth, scene, terrain, BASE).states()
+        states = LogBodies(client, profile, truth, scene, terrain, BASE_POSE).states()
     finally:
         client.disconnect()
     return tuple(

@@ -12,7 +12,7 @@ import msgspec
 
 from sim.truth.variation import VariationSampler
 
-TYRE_SPREAD: Final = 0.2
+TYRE_VARIATION: Final = 0.2
 COM_M: Final = 0.05
 
 
@@ -73,13 +73,13 @@ class CarrierTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             wheel_mass_kg=self.wheel_mass_kg * wheel,
             wheel_spin_inertia_kg_m2=self.wheel_spin_inertia_kg_m2 * wheel,
             wheel_radius_scale=self.wheel_radius_scale * draw.factor(0.02),
-            tyre_stiffness_n_m=self.tyre_stiffness_n_m * draw.factor(TYRE_SPREAD),
-            tyre_damping_n_s_m=self.tyre_damping_n_s_m * draw.factor(TYRE_SPREAD),
-            tread_n_m=self.tread_n_m * draw.factor(TYRE_SPREAD),
-            relaxation_m=self.relaxation_m * draw.factor(TYRE_SPREAD),
+            tyre_stiffness_n_m=self.tyre_stiffness_n_m * draw.factor(TYRE_VARIATION),
+            tyre_damping_n_s_m=self.tyre_damping_n_s_m * draw.factor(TYRE_VARIATION),
+            tread_n_m=self.tread_n_m * draw.factor(TYRE_VARIATION),
+            relaxation_m=self.relaxation_m * draw.factor(TYRE_VARIATION),
             friction=self.friction * draw.factor(friction),
             rolling_resistance=self.rolling_resistance * draw.factor(friction),
             drive_gain_nm_s_rad=self.drive_gain_nm_s_rad * draw.factor(draw.spread.gain),
-            drive_lag_s=self.drive_lag_s * draw.factor(TYRE_SPREAD),
+            drive_lag_s=self.drive_lag_s * draw.factor(TYRE_VARIATION),
             brake_torque_nm=self.brake_torque_nm * draw.factor(friction),
         )

@@ -13,7 +13,7 @@ from typing import Final
 
 from sim.geometry.shape import Quaternion, Vector
 
-SLICES: Final = 60  # discs over which mass, centre and inertia are summed
+DISC_COUNT: Final = 60  # discs over which mass, centre and inertia are summed
 STRAIGHT_M: Final = 0.03  # up to this sagitta a log has 3 straight pieces, beyond it 5: less than 4 mm off the arc
 
 
@@ -88,10 +88,10 @@ class Mass:
 
 def mass_of(spec: LogSpec) -> Mass:
     """The mass properties of the tapered, bowed log."""
-    step = spec.length_m / SLICES
+    step = spec.length_m / DISC_COUNT
     discs = []
-    for i in range(SLICES):
-        s = (i + 0.5) / SLICES - 0.5
+    for i in range(DISC_COUNT):
+        s = (i + 0.5) / DISC_COUNT - 0.5
         r = spec.radius(s)
         discs.append((spec.density_kg_m3 * math.pi * r * r * step, r, spec.axis_point(s)))
     mass = sum(m for m, _, _ in discs)

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machine.profile import Profile
-from sim.bullet.client import BulletClient, new_client
+from sim.bullet.body import Pose
+from sim.bullet.client import GRAVITY_M_S2, BulletClient, new_client
 from sim.errors import PlantError
 from sim.geometry.shape import Quaternion, Vector, rpy_quaternion
 from sim.ground.terrain import Terrain
@@ -28,9 +29,7 @@ from sim.wood.bunk import bunk_boxes, from_bunk
 from sim.wood.log_shape import LogSpec, Mass, log_segments, mass_of, quaternion_of
 from sim.wood.stacking import seen_from_above
 
-Pose = tuple[Vector, Quaternion]
-
-SLEEP: Final = 0.02  # [m/s, rad/s]
+SLEEP_SPEED: Final = 0.02  # [m/s, rad/s]
 SETTLE_STEP_S: Final = 0.0025
 SETTLE_S: Final = 20.0  # time limit for coming to rest
 CHECK_STEPS: Final = 20
@@ -91,7 +90,7 @@ class LogBodies:
         _check_apart(client, self.body_ids, "at rest")
         for state in (client.ACTIVATION_STATE_ENABLE_SLEEPING, client.ACTIVATION_STATE_SLEEP):
             for body in self.body_ids:
-                client.changeDynamics(body, -1, activationState=state, sleepThreshold=SLEEP)
+                client.changeDynamics(body, -1, activationState=state, sleepThreshold=SLEEP_SPEED)
         # Body axes -> log frame: the turn about y, and the log's origin seen from the centre of mass.
         self._turn = np.array([m.turn_rad for m in wood])
         self._com = np.array([m.com_m for m in wood]).reshape(-1, 3)
@@ -229,7 +228,7 @@ def _settled(profile: Profile, contact: Contact, scene: Sequence[LogSpec], terra
     """Poses of the bodies after the scene has come to rest on the terrain and in the bunk."""
     p = new_client()
     try:
-        p.setGravity(0.0, 0.0, -9.81)
+        p.setGravity(0.0, 0.0, -GRAVITY_M_S2)
         p.setPhysicsEngineParameter(
             fixedTimeStep=SETTLE_STEP_S, numSolverIterations=40, numSubSteps=0, deterministicOverlappingPairs=1
         )
@@ -270,7 +269,7 @@ def _rest(p: BulletClient, bodies: Sequence[int]) -> None:
     """
     still, free = dict.fromkeys(bodies, 0), dict.fromkeys(bodies, False)
     for body in bodies:
-        p.changeDynamics(body, -1, activationState=p.ACTIVATION_STATE_ENABLE_SLEEPING, sleepThreshold=SLEEP)
+        p.changeDynamics(body, -1, activationState=p.ACTIVATION_STATE_ENABLE_SLEEPING, sleepThreshold=SLEEP_SPEED)
         p.changeDynamics(body, -1, linearDamping=SETTLE_DAMPING[0], angularDamping=SETTLE_DAMPING[1])
     for _ in range(round(SETTLE_S / SETTLE_STEP_S / CHECK_STEPS)):
         for _ in range(CHECK_STEPS):

@@ -13,15 +13,15 @@ from sim.wood.log_shape import LogSpec
 
 GAP_M: Final = 0.004  # between logs, and to the ground, at release
 STEP_M: Final = 0.002  # smallest step of the search for a free place
-SPINE: Final = 11
+SPINE_POINT_COUNT: Final = 11
 
 Array = NDArray[np.float64]
 
 
 def spine(s: LogSpec) -> tuple[Array, Array]:
     """Points [SPINE, 3] of the pith at release, z over level ground, and the radii there [SPINE]."""
-    points = np.array(s.spine(SPINE))
-    radii = np.array([s.radius(i / (SPINE - 1) - 0.5) for i in range(SPINE)])
+    points = np.array(s.spine(SPINE_POINT_COUNT))
+    radii = np.array([s.radius(i / (SPINE_POINT_COUNT - 1) - 0.5) for i in range(SPINE_POINT_COUNT)])
     points += (s.x_m, s.y_m, s.z_m - float(np.min(points[:, 2] - radii)))
     return points, radii
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from machine.profile import Profile
 from sim.bullet.body import Body, Pose
-from sim.bullet.client import BulletClient
+from sim.bullet.client import GRAVITY_M_S2, BulletClient
 from sim.geometry.shape import Quaternion, Vector, rpy_quaternion
 from sim.wood.bunk import to_bunk
 from sim.wood.logs import LogBodies
@@ -212,7 +212,7 @@ class ApparentWeight:
     ``update``.
     """
 
-    def __init__(self, check_period_s: float, gravity_m_s2: float = 9.81) -> None:
+    def __init__(self, check_period_s: float, gravity_m_s2: float = GRAVITY_M_S2) -> None:
         self._check_period_s, self._gravity = check_period_s, gravity_m_s2
         self._velocity: Vector | None = None
         self.now: Vector = (0.0, 0.0, -gravity_m_s2)

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from can_dbc.plc.map import Command, Mode, Role, State, WordOrder, command_registers
 from machine.loading.profile_file import load_profile
-from sim.plc.program import MAY_MOVE, Inputs, Program
+from sim.plc.program import MOTION_ALLOWED, Inputs, Program
 from sim.plc.server import Datagrams, listen, serve
 
 HOME = (0.0, 0.75, -1.6, 0.3, 0.0)
@@ -22,7 +22,7 @@ class ServedPlc:
     """``port`` is the Modbus port, ``udp_port`` the other; the program's time is the host's."""
 
     def __init__(self, order: WordOrder = WordOrder.HIGH_FIRST) -> None:
-        self.inputs = Inputs(HOME, (10.0,) * 8, 0.5, 30.0, int(MAY_MOVE))
+        self.inputs = Inputs(HOME, (10.0,) * 8, 0.5, 30.0, int(MOTION_ALLOWED))
         self.program = Program(load_profile("palms_471"), Role.VALVES, lambda _: self.inputs, order)
         self.loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self.loop.run_forever)

@@ -14,7 +14,7 @@ from sim.camera.ground_cover import CLEARING, GroundCover
 from sim.camera.labels import labels
 from sim.camera.mesh_renderer import MeshRenderer
 from sim.camera.render import ImagingConditions, render
-from sim.camera.scene import CLUTTER, CRANE, GROUND, SKY, Ground, LogPose, Scene, SceneBuilder
+from sim.camera.scene import COVER, CRANE, GROUND, SKY, Ground, LogPose, Scene, SceneBuilder
 from sim.ground.terrain import Terrain
 from tests.sim.camera_scenes import ABOVE, LENS, log, lying, site
 
@@ -214,7 +214,7 @@ def test_clutter_stands_still_and_hides_logs() -> None:
     scene = Scene(b.rods + rods, b.boxes, b.ground, "forest", b.logs, {})
     low = look_at((-2.5, -3.0, 0.4), (0.0, 0.0, 0.1), LENS)
     bare, wild = render(b, low), render(scene, low)
-    assert np.count_nonzero((bare.mask == 1) & (wild.mask == CLUTTER)) > 20
+    assert np.count_nonzero((bare.mask == 1) & (wild.mask == COVER)) > 20
 
 
 DIGEST = """

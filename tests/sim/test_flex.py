@@ -10,9 +10,10 @@ import pytest
 
 from machine.geometry.kinematics import solve
 from machine.loading.profile_file import load_profile
+from sim.bullet.client import GRAVITY_M_S2
 from sim.scenes.arrangements import random_scene
 from sim.truth.load import load_truth
-from sim.world import GRAVITY_M_S2, STEP_S, World
+from sim.world import STEP_S, World
 from tests.sim.crane_driver import Driver
 
 PROFILE = load_profile("palms_471")

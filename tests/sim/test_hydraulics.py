@@ -121,7 +121,7 @@ def test_a_heavy_load_is_lowered_at_valve_speed_and_stops():
         assert -1.6 * full < rig.qd["lift"]
     start = rig.q["lift"]
     rig.run(1.0, lift=-1.0)
-    assert rig.q["lift"] - start == pytest.approx(-full * layout.OUT_OVER_IN, rel=0.05)
+    assert rig.q["lift"] - start == pytest.approx(-full * layout.METER_OUT_FACTOR, rel=0.05)
     rig.run(3.0)
     assert abs(rig.qd["lift"]) < 1e-3
 

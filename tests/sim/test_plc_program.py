@@ -15,7 +15,7 @@ from sim.errors import PlantError
 from sim.plc.command_arbiter import MS
 from sim.plc.law import RESOLUTION_M, RESOLUTION_RAD, stop_band
 from sim.plc.plant import PlcPlant
-from sim.plc.program import CYCLE_NS, MAY_MOVE, Inputs, Program
+from sim.plc.program import CYCLE_NS, MOTION_ALLOWED, Inputs, Program
 from tests.codes import coded
 
 PROFILE = load_profile("palms_471")
@@ -27,7 +27,7 @@ class Rig:
     """A program with inputs to turn; ``run`` scans in physics steps and can command on the way."""
 
     def __init__(self, role: Role) -> None:
-        self.inputs = Inputs(HOME, (10.0,) * 8, 1.0, 0.0, MAY_MOVE)
+        self.inputs = Inputs(HOME, (10.0,) * 8, 1.0, 0.0, MOTION_ALLOWED)
         self.program = Program(PROFILE, role, lambda _: self.inputs)
         self.now_ns = 0
         self.sequence = 0
@@ -102,7 +102,7 @@ def test_an_open_emergency_stop_is_neutral_at_once(open_contact: Estop) -> None:
     assert rig.program.feedback.fault == Fault.EMERGENCY_STOP
     rig.run(20, Command(reset=True))
     assert rig.state is State.SAFE, "no reset while it is open"
-    rig.inputs.estop = int(MAY_MOVE)
+    rig.inputs.estop = int(MOTION_ALLOWED)
     rig.run(20, SPOOLS)
     assert rig.state is State.SAFE
     rig.run(20, Command())

@@ -10,7 +10,7 @@ import pytest
 
 from sim.bullet.client import new_client
 from sim.errors import PlantError
-from sim.ground.terrain import KINDS, LAYERS, Terrain
+from sim.ground.terrain import KINDS, ROUGHNESS_LAYERS, Terrain
 from tests.codes import coded
 
 
@@ -54,7 +54,7 @@ def test_rough_is_drawn_from_the_seed_and_as_rough_as_it_says():
     assert np.array_equal(one.heights, same.heights)
     assert not np.array_equal(one.heights, other.heights)
     assert one.height(0.0, 0.0) == 0.0
-    assert one.heights.std() == pytest.approx(math.hypot(*(sigma for sigma, _ in LAYERS)), rel=0.05)
+    assert one.heights.std() == pytest.approx(math.hypot(*(sigma for sigma, _ in ROUGHNESS_LAYERS)), rel=0.05)
     steepness = np.hypot(*np.gradient(one.heights, one.cell_m))
     assert 0.03 < steepness.mean() < 0.12 and steepness.max() < 0.4
 
