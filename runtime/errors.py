@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 
 class CodedError(Exception):
@@ -19,3 +19,10 @@ class CodedError(Exception):
     def __reduce__(self) -> tuple[Any, ...]:
         # Exception would rebuild itself from the sentence alone when it crosses a process boundary.
         return type(self), (self.code, str(self))
+
+
+class Problem(NamedTuple):
+    """What is wrong, where nothing is raised: the code to compare and the sentence to read, as of a `CodedError`."""
+
+    code: str
+    sentence: str

@@ -1,6 +1,7 @@
-"""The tongs: what they are told, and what the controller's report says of them, open, closed, clear of the logs.
+"""The grapple of one crane job: its commands, and what the controller's report says about it.
 
-Without a sensor they are timed.
+`GrappleSequence` decides whether the jaws are open, closed, stalled, empty or clear of the logs.  Without an opening
+sensor it works by time; without a load cell it assumes that the grapple holds something.
 """
 
 from __future__ import annotations
@@ -17,118 +18,118 @@ from autonomy.motion.arm import Arm
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.grapple import (
     half_gap_m,
-    opening_pct_from_tong_angle,
+    jaw_angle_from_opening_pct,
+    opening_pct_from_jaw_angle,
     tip_below_pin_m,
-    tong_angle_from_opening_pct,
 )
 from machine.profile import Bunk, Profile
 
 _STATE_CLOSED_EMPTY, _STATE_HOLDING = 4, 5
-"""Of GrappleStat.State: at the end of its way with nothing in it, and stopped by what it holds."""
+"""Values of GrappleStat.State: closed to the end of the stroke with nothing in it; stopped by what it holds."""
 _OPEN_FROM_PCT: Final = 92.0
 _ASSUMED_GRIP_RAD: Final = 1.5
-"""Tongs without a sensor are taken to have been closed as far when they let go of a log: past tips that meet."""
+"""Jaw angle assumed when jaws without a sensor release a log: past the point where the tips meet."""
 _STALLED_WIDE_PCT, _STALLED_WIDE_STEP_PCT, _STALLED_EXCESS_M = 70.0, 3.0, 0.15
-"""Tongs that stop closing so wide open, or so much wider than the wood they are to hold lies side by side, clasp a
-heap's sides: their tips are not under it."""
+"""Jaws that stop closing this wide open, or with a gap this much wider than their logs side by side, clasp the sides
+of a pile: their tips are not under it."""
 _THICK_LOG_M: Final = 0.2
-"""Thinner logs are held in tongs that have shut."""
+"""Thinner logs may be held in fully closed jaws."""
 _EMPTY_ON_GROUND_KG: Final = 8.0
-"""Less than the thinnest log weighs, half of it lying on others."""
+"""Less than the thinnest log weighs with half of it lying on others."""
 _EMPTY_LIFTED_KG: Final = 12.0
-"""Less than the thinnest log weighs that hangs, more than a crane at rest reads for nothing.  The controller says that
-tongs hold something from 30 kg on: thin logs weigh less and vanish in tongs that have shut."""
+"""Less than the thinnest hanging log weighs, more than the reading of an empty crane at rest.  The controller reports a
+held load from 30 kg on: thin logs weigh less and vanish in fully closed jaws."""
 _RELEASED_KG: Final = 30.0
-"""What hangs in the tongs when they have let go, at most."""
+"""Greatest load in the jaws once they have released their logs."""
 _PUSH_LOAD_KG, _PUSH_FACTOR = 250.0, 1.5
-"""Tongs that bear more after that, and so many times what hung in them, push against logs or stakes and lift the crane;
-what only rebounds bears less."""
+"""Jaws that afterwards bear more than this, and this many times what hung in them, push against logs or stakes and lift
+the crane; a rebound bears less."""
 _UNDER_LOG_SHARE: Final = 0.85
-"""The tips are under a log when they are nearer to each other than so much of its diameter."""
+"""The tips are under a log when their gap is less than this share of its diameter."""
 _STILL_BAND_PCT, _STILL_S = 0.5, 0.8
-"""Tongs stand that move by less in this time; logs that give way are pressed together slowly."""
+"""Jaws that move less than this within this time are still; logs that give way are pressed together slowly."""
 _MIN_CLOSING_S: Final = 0.5
-"""Of closing, before the report can be of it."""
+"""Time of closing before the report can reflect it."""
 _VALVE_DELAY_S: Final = 0.4
 _SLOW_OPENING_FACTOR: Final = 1.3
-"""Before they move, and how much slower they may be than the profile says."""
+"""Delay before the jaws move, and how much slower they may be than the profile says."""
 _CLOSE_GAIN_1_S: Final = 2.0
 _MAX_CLOSE_RATE: Final = 1.3
 
 
 def following_rate(ahead_s: float) -> float:
-    """How fast the pin follows the sweep of closing tongs that are so far ahead of it; NaN: at its own pace."""
+    """Rate at which the pin follows the sweep of jaws that are ``ahead_s`` ahead of it; 1 where that is NaN."""
     return min(max(1.0 + _CLOSE_GAIN_1_S * ahead_s, 0.0), _MAX_CLOSE_RATE) if isfinite(ahead_s) else 1.0
 
 
 def has_closed(report: StateReport, closing_s: float) -> bool:
-    """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""
+    """Whether the jaws have closed, on something or nothing, ``closing_s`` after the command."""
     return closing_s > _MIN_CLOSING_S and report.grapple_state in (_STATE_CLOSED_EMPTY, _STATE_HOLDING)
 
 
 def is_closed_empty(report: StateReport) -> bool:
-    """Whether they shut on nothing, and nothing weighs in them."""
+    """Whether the jaws closed to the end of their stroke without holding anything."""
     return report.grapple_state == _STATE_CLOSED_EMPTY
 
 
 def lifts_nothing(report: StateReport) -> bool:
-    """Whether they shut and came up with nothing that is known to weigh."""
+    """Whether the jaws closed fully and came up with no known load."""
     return is_closed_empty(report) and not report.load_kg >= _EMPTY_LIFTED_KG
 
 
 def is_open(profile: Profile, report: StateReport, opening_s: float) -> bool:
-    """Whether they stand open."""
+    """Whether the jaws are open; without a sensor, by the time since the command."""
     if isfinite(report.opening_pct):
         return report.opening_pct >= _OPEN_FROM_PCT
     return opening_s > profile.grapple.open_time_s
 
 
 def has_released(profile: Profile, report: StateReport, grasp: Grasp, opening_s: float) -> bool:
-    """Whether they have left the logs that they held."""
+    """Whether the jaws have left the logs that they held."""
     grapple = profile.grapple
     angle = release_angle_rad(profile, max(log.diameter_m for log in grasp.logs))
     if grasp.others:
         angle = 0.0  # logs beside each other reach farther out
     if isfinite(report.opening_pct):
-        return report.opening_pct >= min(opening_pct_from_tong_angle(grapple.tongs, angle), _OPEN_FROM_PCT)
+        return report.opening_pct >= min(opening_pct_from_jaw_angle(grapple.tongs, angle), _OPEN_FROM_PCT)
     turned = max(_ASSUMED_GRIP_RAD - angle, 0.0) / grapple.tongs.angle_rad[-1]
     return opening_s > _VALVE_DELAY_S + _SLOW_OPENING_FACTOR * turned * grapple.open_time_s
 
 
 def is_between_stakes(arm: Arm, bunk: Bunk, q: Sequence[float]) -> bool:
-    """Whether tongs that have let a log go stand so low over a bunk that to open further would stir the heap."""
+    """Whether open jaws are so low over a bunk that opening them further would stir its load."""
     pose, top_m = arm.pose(q), bunk.floor_z_m + bunk.stake_height_m
     return is_over_bunk(bunk, *arm.xy(pose)) and pose.z_m < top_m + tip_below_pin_m(arm.profile.grapple.tongs, 0.0)
 
 
 def equivalent_closing_s(profile: Profile, report: StateReport) -> float:
-    """How long tongs of the nominal speed have been closing to be where they are measured; NaN if unknown."""
+    """How long jaws of nominal speed would have been closing to be where they are measured, s; NaN if unknown."""
     opening = report.opening_pct
     if not isfinite(opening):
         return opening
     tongs = profile.grapple.tongs
-    return tong_angle_from_opening_pct(tongs, opening) / tongs.angle_rad[-1] * profile.grapple.close_time_s
+    return jaw_angle_from_opening_pct(tongs, opening) / tongs.angle_rad[-1] * profile.grapple.close_time_s
 
 
 class GrappleSequence:
-    """Those of one job.  ``command`` is what they are told now."""
+    """Commands and state of the grapple during one job; ``command`` is the present command."""
 
-    def __init__(self, profile: Profile, heard: Inbox) -> None:
+    def __init__(self, profile: Profile, inbox: Inbox) -> None:
         self.command = GrappleCommand.HOLD
-        self._profile, self._inbox = profile, heard
+        self._profile, self._inbox = profile, inbox
         self._opening_s = self._close_from_s = self._still_s = self._since_push_s = 0.0
         self._reference_pct = self._held_kg = 0.0
         self._has_let_go = self.is_obstructed = False
-        """``is_obstructed``: while opening they came to push against something; a load cell tells."""
+        """Whether the opening jaws push against something; only a load cell tells."""
 
     def release(self, dt_s: float) -> None:
-        """Open, from now on for so long; once they push, back as far as they do so, and hold still."""
+        """Open for one tick of ``dt_s``; jaws that push close until they no longer do, and then hold still."""
         gives_way = self.is_obstructed and self._is_pushing
         back = GrappleCommand.CLOSE if gives_way else GrappleCommand.NEUTRAL
         self.apply(back if self.is_obstructed else GrappleCommand.OPEN, dt_s, gives_way)
 
     def apply(self, command: GrappleCommand, dt_s: float, gives_way: bool = False) -> None:
-        """A command, from now on for so long; ``gives_way``: not to close, but to push no longer."""
+        """Apply a command for one tick of ``dt_s``; ``gives_way``: it closes only to stop pushing."""
         self.command = command
         opening = self._inbox.report.opening_pct if self._inbox.report is not None else 0.0
         self._still_s += dt_s
@@ -157,21 +158,22 @@ class GrappleSequence:
         return self._load_kg > max(_PUSH_LOAD_KG, _PUSH_FACTOR * self._held_kg)
 
     @property
-    def open(self) -> bool:
-        """Whether they stand open."""
+    def is_open(self) -> bool:
+        """Whether the jaws are open."""
         return is_open(self._profile, self._inbox.report, self._opening_s)
 
-    def is_stalled_wide(self, grasp: Grasp, climbs: int) -> bool:
-        """Whether they are seen to stand too wide open to lift what they hold, gripped higher so often already, where
-        there is less; without a sensor nobody knows.
+    def is_stalled_wide(self, grasp: Grasp, raised_count: int) -> bool:
+        """Whether the jaws are measured too wide open to lift what they hold; False without a sensor.
+
+        ``raised_count`` counts the grasps already repeated higher up, where less lies between the jaws.
         """
         wood_m = sum(log.diameter_m for log in grasp.logs)
-        too_open = self._inbox.report.opening_pct > _STALLED_WIDE_PCT - _STALLED_WIDE_STEP_PCT * climbs
+        too_open = self._inbox.report.opening_pct > _STALLED_WIDE_PCT - _STALLED_WIDE_STEP_PCT * raised_count
         return too_open or self._gap_m() > wood_m + _STALLED_EXCESS_M
 
     def has_missed(self, grasp: Grasp) -> bool:
-        """Whether they are seen to have shut on nothing where thick logs were, or to pinch the upper half of a log that
-        they were to be under; without a sensor nobody knows.
+        """Whether the jaws are measured to have closed on nothing where thick logs were, or to pinch the upper half
+        of a log whose underside they should reach; False without a sensor.
         """
         if is_closed_empty(self._inbox.report):
             return grasp.thinnest_m > _THICK_LOG_M
@@ -179,40 +181,44 @@ class GrappleSequence:
 
     @property
     def holds_nothing(self) -> bool:
-        """Whether they are seen to have shut, and nothing weighs in them; without a load cell nobody knows."""
+        """Whether the jaws have closed fully and the load cell reads nothing; False without a load cell."""
         return is_closed_empty(self._inbox.report) and self._inbox.report.load_kg < _EMPTY_ON_GROUND_KG
 
     def _gap_m(self) -> float:
-        """Between the tips; 0 when no sensor tells."""
+        """Gap between the tips, m; 0 without a sensor."""
         opening, tongs = self._inbox.report.opening_pct, self._profile.grapple.tongs
-        return 2.0 * half_gap_m(tongs, tong_angle_from_opening_pct(tongs, opening)) if isfinite(opening) else 0.0
+        return 2.0 * half_gap_m(tongs, jaw_angle_from_opening_pct(tongs, opening)) if isfinite(opening) else 0.0
 
     @property
     def empty(self) -> bool:
-        """Whether they have shut on nothing that is seen."""
+        """Whether the jaws have closed fully without holding anything."""
         return is_closed_empty(self._inbox.report)
 
     @property
     def is_still(self) -> bool:
-        """Whether they have not moved for a while."""
+        """Whether the jaws have not moved for a while."""
         return self._still_s > _STILL_S
 
     def has_closed(self, closing_s: float) -> bool:
-        """Whether they have closed, on something or nothing, ``closing_s`` after they were told to."""
+        """Whether the jaws have closed, on something or nothing, ``closing_s`` after the command."""
         return has_closed(self._inbox.report, closing_s)
 
     def has_released(self, grasp: Grasp, opening_s: float) -> bool:
-        """Whether they have left the logs of a grasp, ``opening_s`` after they were told to open there, or opened until
-        they pushed against something, gave way, and the crane has swung out.
+        """Whether the jaws have left the logs of a grasp, ``opening_s`` after the command to open, or have opened until
+        they pushed against something, given way, and the crane has swung out.
         """
-        return self._since_push_s > _STILL_S if self.is_obstructed else has_released(self._profile, self._inbox.report, grasp, opening_s)
+        return (
+            self._since_push_s > _STILL_S
+            if self.is_obstructed
+            else has_released(self._profile, self._inbox.report, grasp, opening_s)
+        )
 
-    def follow(self) -> float:
-        """The pin is to follow them from now on: how long they have been closing, s; 0 where no sensor tells."""
+    def start_following(self) -> float:
+        """Let the pin follow the jaws from now on: returns how long they have been closing, s; 0 without a sensor."""
         measured_s = equivalent_closing_s(self._profile, self._inbox.report)
         self._close_from_s = measured_s if isfinite(measured_s) else 0.0
         return self._close_from_s
 
-    def pace(self, clock_s: float) -> float:
-        """How fast the pin is to go that has followed them for so much of its motion."""
+    def following_rate(self, clock_s: float) -> float:
+        """Rate at which the pin's motion goes on after ``clock_s`` of it."""
         return following_rate(equivalent_closing_s(self._profile, self._inbox.report) - self._close_from_s - clock_s)

@@ -1,4 +1,4 @@
-"""What an activity last heard, and when: the controller's report and the detector's log list."""
+"""The newest inputs of an activity, with their times: the controller's report and the detector's log list."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from typing import Final
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.joints import JOINTS
-from machine.status.modes import Mode
 from machine.profile import Profile, joint
+from machine.status.modes import Mode
+from runtime.errors import Problem
 
 REPORT_TIMEOUT_NS: Final = 300_000_000
 LOG_LIST_FRESH_NS: Final = 600_000_000
-"""A log list that is no older says what hangs in the grapple now."""
+"""A log list no older than this shows what hangs in the grapple now."""
 
 
 class Inbox:
-    """``logs`` with their time ``logs_ns``, -1 before the first list; what is older than the newest is forgotten."""
+    """``logs`` is the newest log list and ``logs_ns`` its time, -1 before the first list."""
 
     __slots__ = ("_profile", "_report", "_report_ns", "logs", "logs_ns")
 
@@ -30,7 +31,7 @@ class Inbox:
         self.logs_ns = -1
 
     def accept(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> None:
-        """What came since the last call; None and () when nothing did."""
+        """Store what arrived since the last call; None and () when nothing did."""
         if report is not None:
             self._report, self._report_ns = report, now_ns
         if logs:
@@ -38,35 +39,35 @@ class Inbox:
 
     @property
     def has_camera_measurements(self) -> bool:
-        """Whether a camera measured one of the logs: what it sees next may be better."""
+        """Whether a camera measured one of the logs: its next detection may be better."""
         return any(log.covariance is not None for log in self.logs)
 
     @property
     def report(self) -> StateReport:
-        """The newest report, once there is one."""
+        """The newest report; call only once there is one."""
         assert self._report is not None
         return self._report
 
-    def position(self, sent: Sequence[float]) -> tuple[float, ...]:
-        """The measured joints; one without an encoder counts as standing where it was last ``sent``."""
+    def position(self, setpoint: Sequence[float]) -> tuple[float, ...]:
+        """The measured joints; one without an encoder counts as being at its ``setpoint``."""
         return tuple(
             p if joint(self._profile, j).encoder is not None else q
-            for j, p, q in zip(JOINTS, self.report.position, sent, strict=True)
+            for j, p, q in zip(JOINTS, self.report.position, setpoint, strict=True)
         )
 
-    def blocked_reason(self, now_ns: int, sent: Sequence[float]) -> str | None:
-        """Why no setpoint would be obeyed now."""
+    def blocked_reason(self, now_ns: int, setpoint: Sequence[float]) -> Problem | None:
+        """Why the controller would execute no setpoint now."""
         if self._report is None:
-            return "the controller has not reported"
+            return Problem("activity.no-report", "the controller has not reported")
         if now_ns - self._report_ns > REPORT_TIMEOUT_NS:
-            return "the controller is silent"
+            return Problem("activity.controller-silent", "the controller is silent")
         if self._report.mode not in (Mode.ARMED, Mode.ACTIVE):
             name = next((mode.name for mode in Mode if mode == self._report.mode), str(self._report.mode))
-            return f"the controller is in {name}"
-        if not all(map(isfinite, self.position(sent))):
-            return "a joint position is unknown"
+            return Problem("activity.controller-mode", f"the controller is in {name}")
+        if not all(map(isfinite, self.position(setpoint))):
+            return Problem("activity.position-unknown", "a joint position is unknown")
         return None
 
     def is_fresh(self, now_ns: int) -> bool:
-        """Whether the log list is of this moment."""
+        """Whether the log list shows the present moment."""
         return now_ns - self.logs_ns < LOG_LIST_FRESH_NS

@@ -1,7 +1,6 @@
-"""What the crane drives in each phase of an activity: from where it stands, with what it holds, past what lies around.
+"""Motions of the phases of a crane job: from the present pose, with the present load, clear of what lies around.
 
-Pure functions of poses, log lists and the machine; ``Unreachable`` or ``NoGrasp`` where there is no way, with one
-sentence.
+Pure functions of poses, log lists and the machine.  Failure: ``Unreachable`` or ``NoGrasp`` where there is no path.
 """
 
 from __future__ import annotations
@@ -24,49 +23,56 @@ from autonomy.grasp.grapple_heights import (
 from autonomy.grasp.grasp import Grasp
 from autonomy.motion.arm import Arm
 from autonomy.motion.motion_planner import MotionPlanner
-from autonomy.motion.obstacles import held_log, collision_scene
+from autonomy.motion.obstacles import collision_scene, held_log
 from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, follow_path, slow_line, straight_line
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.kinematics import Unreachable
 
 APPROACH_CLEARANCE_M: Final = 0.25
-"""So much more than others the log that is to be gripped is kept clear of on the way to it."""
+"""Extra clearance on the approach from the log that is to be gripped."""
 MACHINE_LEAN_M: Final = 0.15
-"""A machine on tyres leans towards the crane that reaches out: what lies there rises by up to so much against it."""
+"""A machine on tyres leans towards the reaching crane: what lies there rises by up to this much relative to it."""
 MIN_AIM_CORRECTION_M: Final = 0.02
-"""What lies so near to where it was aimed at is left so: the tongs forgive it."""
+"""An aiming error below this is left: the jaws tolerate it."""
 MAX_AIM_CORRECTION_M: Final = 0.3
-"""What lies farther off may be another log."""
+"""A log farther from its expected place may be another one."""
 BUNDLE_LIFT_S: Final = 10.0
-"""Time in which what may settle is lifted to the travel height: also logs that hang askew are clear of the ground."""
+"""Duration of lifting a bundle to the travel height, while its logs settle and askew ones clear the ground."""
 EXTRACTION_DISTANCE_M, EXTRACTION_S = 0.35, 2.5
-"""How far and in what time a log is dragged out of a row."""
+"""Distance and duration of dragging a log out of a row."""
 PILE_LIFT_S: Final = 4.0
-"""The same out of a heap, which is nearer to that height."""
+"""Duration of lifting out of a pile, which is nearer to the travel height."""
 
 
-def approach_motion(arm: Arm, motion_planner: MotionPlanner, start: Pose, grasp: Grasp, logs: Sequence[LogObservation]) -> Trajectory:
-    """With open tongs to where they close, or above it: among other logs, and on tyres, only the last, straight way
-    down is safe.
+def approach_motion(
+    arm: Arm, motion_planner: MotionPlanner, start: Pose, grasp: Grasp, logs: Sequence[LogObservation]
+) -> Trajectory:
+    """With open jaws to where they close, or above it: among other logs, and on tyres, only a last vertical descent is
+    safe.
     """
-    # Open tongs come from above rather than from aside, for the log may lie a little elsewhere, and so may they.
-    broad = [replace(o, diameter_m=o.diameter_m + 2.0 * APPROACH_CLEARANCE_M) if o.id == grasp.log.id else o for o in logs]
+    # The enlarged log makes the open jaws come from above rather than from the side: both log and jaws may be off a
+    # little.
+    broad = [
+        replace(o, diameter_m=o.diameter_m + 2.0 * APPROACH_CLEARANCE_M) if o.id == grasp.log.id else o for o in logs
+    ]
     around, high_m = collision_scene(arm.profile, broad), travel_height_m(arm.profile)
     if motion_planner.direct and not grasp.is_bundle:
         stands = arm.profile.carrier is None
         goal = grasp.pose if stands else grasp.pose.at_height(grasp.pose.z_m + MACHINE_LEAN_M)
         try:
             return motion_planner(arm, start, goal, around, None, high_m, 0.0)
-        except Unreachable:  # a stump or a log beside it: from above, then
+        except Unreachable:  # a stump or a log beside it: approach from above
             pass
     over = grasp.pose.at_height(hover_height_m(arm.profile, grasp))
     return motion_planner(arm, start, over, around, None, high_m, 0.0)
 
 
 def corrected_grasp(arm: Arm, grasp: Grasp, logs: Sequence[LogObservation]) -> Grasp:
-    """The grasp of a log that is now known to lie a little elsewhere, for the machine leans, and nearer is better seen.
-    Unchanged where that is less than ``MIN_AIM_CORRECTION_M`` or more than ``MAX_AIM_CORRECTION_M``, or out of reach.
+    """The grasp moved with its log, which the list now sees elsewhere: the machine leans, and a nearer view is better.
+
+    Unchanged where the shift is less than ``MIN_AIM_CORRECTION_M`` or more than ``MAX_AIM_CORRECTION_M``, or where the
+    moved grasp is out of reach.
     """
     seen = next((log for log in logs if log.id == grasp.log.id), None)
     if seen is None:
@@ -93,23 +99,23 @@ def carry_motion(
     logs: Sequence[LogObservation],
     hangs: bool,
 ) -> Trajectory:
-    """With the log to its place; ``hangs``: it is seen in the grapple, else it lies as it was gripped."""
+    """With the log to its place; ``hangs``: the log is seen in the grapple, otherwise it lies as it was gripped."""
     taken = {log.id for log in grasp.logs} | {log.id for log in logs if is_between_jaws(arm, log, start)}
     around = collision_scene(arm.profile, logs, without=taken)
     seen = next((log for log in logs if log.id == grasp.log.id), None) if hangs else None
     held = held_log(arm, grasp.pose, grasp.log) if seen is None else held_log(arm, start, seen)
-    held = replace(held, diameter_m=hypot(*(log.diameter_m for log in grasp.logs)))  # a bundle is as thick as all
+    held = replace(held, diameter_m=hypot(*(log.diameter_m for log in grasp.logs)))  # a bundle counts as one thick log
     high_m, free_m = travel_height_m(arm.profile), approach_length_m(arm.profile, grasp.log)
     try:
         return motion_planner(arm, start, place, around, held, high_m, free_m)
-    except Unreachable:  # close to the stakes: over it first, and from there straight down
+    except Unreachable:  # close to the stakes: first above the place, then straight down
         if place.z_m >= high_m:
             raise
         return motion_planner(arm, start, place.at_height(high_m), around, held, high_m, free_m)
 
 
 def closing_motion(arm: Arm, start: Pose, grasp: Grasp, begin_s: float) -> Trajectory:
-    """The pin follows the sweep of tongs that have been closing for ``begin_s``."""
+    """The pin follows the sweep of jaws that have been closing for ``begin_s``."""
     height = closing_height_curve(arm.profile, grasp.support_z_m, grasp.thinnest_m)
 
     def path(time_s: float) -> Pose:
@@ -119,7 +125,7 @@ def closing_motion(arm: Arm, start: Pose, grasp: Grasp, begin_s: float) -> Traje
 
 
 def extraction_motion(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
-    """The log that the tongs pinch out of its row, along the ground; no motion where that is out of reach."""
+    """Drags the pinched log out of its row along the ground; no motion where that is out of reach."""
     (x, y), log = arm.xy(start), grasp.log
     way = x - log.center_m[0], y - log.center_m[1]
     along = way[0] * log.axis[0] + way[1] * log.axis[1]
@@ -134,14 +140,14 @@ def extraction_motion(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
 
 
 def bundle_lift_motion(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
-    """A bundle up, slowly: its logs settle, and the tongs follow them under it."""
+    """Lifts a bundle slowly: its logs settle, and the jaws follow under them."""
     column = start if grasp.dragging else grasp.pose
     goal = column.at_height(travel_height_m(arm.profile))
     return slow_line(arm, start, goal, PILE_LIFT_S if grasp.penetrates and not grasp.dragging else BUNDLE_LIFT_S)
 
 
 def stow_motion(arm: Arm, motion_planner: MotionPlanner, start: Pose, logs: Sequence[LogObservation]) -> Trajectory:
-    """Over the bunk, high enough for what hangs open to be clear of the stakes; no motion where it is there."""
+    """Over the bunk, high enough for the open grapple to clear the stakes; no lateral motion where it is there."""
     bunk, high_m = arm.profile.bunk, retreat_height_m(arm.profile)
     if is_over_bunk(bunk, *arm.xy(start)):
         return straight_line(arm, start, start.at_height(max(start.z_m, high_m)))

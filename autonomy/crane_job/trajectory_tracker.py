@@ -1,4 +1,4 @@
-"""A joint motion being followed: its clock slows down smoothly to wait or to stop, and where joints fall behind."""
+"""Trajectory tracking: a motion's clock that slows down smoothly to wait, to stop, and where joints fall behind."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint
 
 ARRIVAL_TOLERANCE: Final = (0.015, 0.015, 0.02, 0.02, 0.06)
-"""How near each joint comes to its goal before the next phase, rad (EXT m): a few cm at the pin."""
+"""Greatest distance of each joint from its goal before the next phase, rad (EXT m): a few cm at the pin."""
 BRAKE_S: Final = 0.8
-"""From full speed to a stop on the way."""
+"""Time from full speed to a stop on the path."""
 _MAX_LAG_S: Final = 0.4
 
 Axes = tuple[float, ...]
 
 
 class TrajectoryTracker:
-    """Where on its ``motion`` a crane is sent: at ``clock_s`` of it, ``rate`` of its seconds in a second."""
+    """The tracked ``motion``, the time on it ``clock_s``, and its ``rate`` in seconds per second."""
 
     def __init__(self, profile: Profile, last_setpoint: Axes) -> None:
         self.motion: Trajectory = hold(last_setpoint)
@@ -28,51 +28,55 @@ class TrajectoryTracker:
         self._profile = profile
 
     def begin(self, motion: Trajectory) -> None:
-        """Another motion, from its start."""
+        """Track another motion from its start."""
         self.motion, self.clock_s, self.rate = motion, 0.0, 1.0
 
     @property
-    def sent(self) -> Axes:
-        """Where the joints are sent, rad (EXT m)."""
+    def setpoint(self) -> Axes:
+        """The present joint setpoint, rad (EXT m)."""
         return self.motion.at(self.clock_s)[0]
 
     @property
     def left_s(self) -> float:
-        """How much of the motion is left; below zero, how long it has been over."""
+        """Time left of the motion, s; negative after its end."""
         return self.motion.duration_s - self.clock_s
 
     @property
     def is_stopped(self) -> bool:
-        """Whether it has come to a stop."""
+        """Whether the clock stands still."""
         return self.rate == 0.0
 
     def hold_here(self) -> None:
-        """Stay here: there is no way on."""
-        self.motion = hold(self.sent)
+        """Replace the rest of the motion by a hold at the present setpoint."""
+        self.motion = hold(self.setpoint)
 
     def advance(self, dt_s: float, wanted: float, measured: Sequence[float]) -> None:
-        """``wanted`` rate from now on, less when a joint falls behind."""
+        """Advance by ``dt_s`` and approach the ``wanted`` rate, or a lower one while a joint falls behind."""
         wanted = min(wanted, self._following_rate(measured))
-        self.clock_s += self.rate * dt_s  # as the last window foretold
+        self.clock_s += self.rate * dt_s  # at the rate that the last datagram announced
         most = dt_s / BRAKE_S
         self.rate += min(max(wanted - self.rate, -most), most)
 
     def _following_rate(self, measured: Sequence[float]) -> float:
-        """1 while the joints follow, less when one falls behind by more than ``_MAX_LAG_S``, 0 at twice that."""
+        """1 while the joints follow, less while one lags by more than ``_MAX_LAG_S``, 0 at twice that."""
         lags = [
             abs(q - p) / joint(self._profile, j).speed_limit
-            for j, q, p in zip(JOINTS, self.sent, measured, strict=True)
+            for j, q, p in zip(JOINTS, self.setpoint, measured, strict=True)
         ]
         return min(max(2.0 - max(lags) / _MAX_LAG_S, 0.0), 1.0)
 
-    def arrived(self, measured: Sequence[float], share: float) -> bool:
-        """Whether every joint is near its goal; ``share`` of ``ARRIVAL_TOLERANCE`` is near."""
-        return all(abs(p - g) <= share * near for p, g, near in zip(measured, self.motion.goal, ARRIVAL_TOLERANCE, strict=True))
+    def arrived(self, measured: Sequence[float], tolerance_factor: float) -> bool:
+        """Whether every joint is within ``tolerance_factor`` times ``ARRIVAL_TOLERANCE`` of its goal."""
+        return all(
+            abs(p - g) <= tolerance_factor * near
+            for p, g, near in zip(measured, self.motion.goal, ARRIVAL_TOLERANCE, strict=True)
+        )
 
     def worst_joint(self, measured: Sequence[float]) -> str:
-        """The end of a sentence: which joint is farthest off; empty when all are near."""
+        """The end of a sentence that names the joint farthest from its setpoint; empty when all are near."""
         errors = [
-            (abs(p - w) / near, j, p - w) for j, p, w, near in zip(JOINTS, measured, self.sent, ARRIVAL_TOLERANCE, strict=True)
+            (abs(p - w) / near, j, p - w)
+            for j, p, w, near in zip(JOINTS, measured, self.setpoint, ARRIVAL_TOLERANCE, strict=True)
         ]
         share, axis, error = max(errors)
         unit = "m" if axis is Joint.EXT else "rad"

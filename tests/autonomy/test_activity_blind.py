@@ -49,6 +49,6 @@ def test_a_lost_encoder_still_pauses_it() -> None:
     planner = Activity(FORWARDER, profile_hash(FORWARDER))
     lost = replace(crane.report(), position=(nan, *crane.report().position[1:]))
     assert planner.step(crane.now_ns, lost, crane.seen()) is None
-    assert planner.paused == "a joint position is unknown"
+    assert planner.paused_code == "activity.position-unknown"
     assert crane.step(planner) is not None and planner.paused is None
     assert not isfinite(crane.report().position[Joint.ROT])

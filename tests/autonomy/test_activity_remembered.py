@@ -58,4 +58,4 @@ def test_tongs_that_shut_on_nothing_three_times_end_it() -> None:
     crane = Remembering(PROFILE, [GROUND_LOG], slippery=9)
     planner = Activity(PROFILE, profile_hash(PROFILE))
     crane.run(planner)
-    assert planner.failure == "log 0 was missed 3 times"
+    assert planner.failure_code == "activity.log-missed"

@@ -79,7 +79,7 @@ def test_a_log_in_the_air_without_a_way_on_goes_down_again(monkeypatch: pytest.M
     monkeypatch.setattr("autonomy.crane_job.cycle.plan_place", refuse_room)
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity(direct=False)
     crane.run(planner)
-    assert planner.failure == "no room"
+    assert planner.failure_code == "grasp.bunk-full"
     assert "LIFT" in phases(crane) and phases(crane)[-3:] == ["LOWER", "OPEN", "FAILED"]
     (log,) = crane.logs
     assert crane.held is None and log.center_m == pytest.approx(GROUND_LOG.center_m, abs=0.1)

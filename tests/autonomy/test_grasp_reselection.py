@@ -136,7 +136,7 @@ def test_where_a_camera_shows_no_grasp_it_is_asked_again_before_there_is_said_to
     if better:
         assert planner.phase is Phase.ABOVE and len(asked) == 4
     else:
-        assert planner.failure == "nothing is safe"
+        assert planner.failure_code == "grasp.none-safe"
         assert asked[-1] - asked[0] == pytest.approx(DETECTION_TIMEOUT_NS, abs=3 * TICK_NS)
 
 

@@ -76,12 +76,12 @@ def test_the_count_is_set_right_by_every_log() -> None:
 def test_count_and_angle_are_inverse(rotator: RotatorEstimate, angle: float) -> None:
     assert rotator.angle(rotator.sent(angle)) == pytest.approx(angle)
     q = (0.1, 0.2, 0.3, 0.4, angle)
-    assert rotator.believed(rotator.counted(q)) == pytest.approx(q)
+    assert rotator.to_angles(rotator.to_counts(q)) == pytest.approx(q)
 
 
 @given(ROTATORS, ANGLE, ANGLE)
 def test_what_is_seen_leaves_the_count_within_a_quarter_turn_of_the_angle(rotator, sent, angle) -> None:
-    seen = rotator.seen(sent, angle)
+    seen = rotator.corrected(sent, angle)
     assert abs(seen.angle(sent) - sent) <= pi / 2 + 1e-9
     assert all(SCALE_BOUNDS[0] <= pace <= SCALE_BOUNDS[1] for pace in seen.paces)
 
@@ -91,7 +91,7 @@ def test_repeated_looks_find_how_much_of_a_turn_is_made() -> None:
     for goal in 4 * (1.5, -1.0, 1.2, -0.8, 1.0, -1.4):
         before, sent = sent, rotator.sent(goal)
         true += made[sent > before] * (sent - before)
-        rotator = rotator.seen(sent, true)
+        rotator = rotator.corrected(sent, true)
     assert rotator.paces == pytest.approx(made, abs=0.02)
     assert remainder(rotator.angle(sent) - true, pi) == pytest.approx(0.0, abs=0.02)
 
