@@ -50,7 +50,7 @@ def survey(camera: Camera, truth: Any, depth_scale: float, rng: random.Random) -
     """
     pin, fb = intrinsics(camera), camera.fx_px * camera.baseline_m
     errors = (truth.mount_position_m, truth.mount_rpy_rad)
-    view = mount_view((np.zeros(3), IDENTITY), pin, camera.position_m, camera.rpy_rad, *errors)
+    view = mount_view(((0.0, 0.0, 0.0), IDENTITY), pin, camera.position_m, camera.rpy_rad, *errors)
     pixels, depths, targets = [], [], []
     for _ in range(TARGET_COUNT):
         u = rng.uniform(MARGIN_PX, pin.width_px - MARGIN_PX)

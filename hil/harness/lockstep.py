@@ -21,7 +21,8 @@ from controller.config import Settings
 from controller.guard.guard import Guard
 from controller.process.bus_link import BusLink
 from controller.process.tick_recording import record
-from controller.step import Controller, Inputs, step
+from controller.step import Controller, step
+from controller.tick import Inputs
 from hil.harness.operator import Operator
 from hil.wire.bitrates import CRANE_BITRATE, MACHINE_BITRATE
 from hil.wire.core import WireCore
@@ -156,8 +157,8 @@ class Lockstep:
             self.vehicle_report = vehicle
             if self._observer.recorder:
                 self._observer.recorder.on_report(outputs.vehicle_report)
-            for hook in self._observer.on_vehicle:
-                hook(vehicle)
+            for vehicle_hook in self._observer.on_vehicle:
+                vehicle_hook(vehicle)
         requests = self.activity.step(self.now_ns, report, self._detect())
         if requests:
             self._datagrams.extend([requests] if isinstance(requests, bytes) else requests)

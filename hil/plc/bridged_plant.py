@@ -53,9 +53,9 @@ class BridgedPlant(PlcPlant):
         if self.cut:
             answer = command = None
         if isinstance(answer, list):
-            shake.take_registers(answer, now_ns)
+            shake.accept_registers(answer, now_ns)
         elif answer is not None:
-            shake.take_datagram(answer, now_ns)
+            shake.accept_datagram(answer, now_ns)
         if command is not None:
             self._answer = self._serve(command, now_ns)
         if now_ns >= self._exchange_ns:
@@ -71,7 +71,7 @@ class BridgedPlant(PlcPlant):
             try:
                 gate.write(_CLIENT, plc.COMMAND_AT, command, now_ns)
             except RegisterRefused as refused:
-                self.bridge.handshake.refusal(refused.code)
+                self.bridge.handshake.command_refused(refused.code)
                 return None
             return self.plc.status()
         gate.datagram(_CLIENT, command, now_ns)

@@ -22,7 +22,8 @@ from can_dbc.messages.tick_record import RecordRefused, TickRecord
 from controller.config import ConfigError, Settings
 from controller.config import load as load_settings
 from controller.process.tick_recording import restore_inputs, transmitted
-from controller.step import Controller, Inputs, step
+from controller.step import Controller, step
+from controller.tick import Inputs
 from hil.replay.difference import differing_lines
 from hil.replay.recording import manifest_of, messages
 from host.exit_codes import CommandFailed, ExitCode

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, TextIO
 
@@ -180,7 +181,7 @@ def wait_for_work(check: Check, page: str) -> None:
     """Start the target; wait until the services without READY notification work: page, recorder, planner."""
     started = systemctl("start", "timberhand.target")
     check.expect(started.returncode == 0, f"the target does not start: {started.stderr}")
-    checks = {
+    checks: dict[str, Callable[[], object]] = {
         # Page and recorder read the controller's timing page as different users.
         "console": lambda: json.load(urllib.request.urlopen(f"{page}api/state", timeout=5.0))["timing"],
         "recorder": lambda: any(map(has_timing, Path("/var/lib/timberhand").glob("*/run.mcap"))),

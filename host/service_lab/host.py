@@ -6,6 +6,7 @@ The guest writes JSON lines to its first console: ``{"event": ...}`` for every s
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import json
 import os
 import platform
@@ -104,9 +105,8 @@ def build_wheel(folder: Path) -> Path:
 
 def _build_options() -> list[str]:
     """Build without a network when this environment has the build tool."""
-    import setuptools
-
-    return ["--no-build-isolation"] if int(setuptools.__version__.split(".")[0]) >= 77 else []
+    version = importlib.metadata.version("setuptools")
+    return ["--no-build-isolation"] if int(version.split(".")[0]) >= 77 else []
 
 
 def run(wheel: Path | None, timeout_s: float, show_step: Callable[[str], None]) -> dict[str, Any]:

@@ -111,7 +111,7 @@ class Pilot:
         """The longest gap between polls that overlaps the window [ms]."""
         return max((b - a for a, b in self.gaps if b >= begin_ns and a <= end_ns), default=0) * 1e-6
 
-    def _turn(self) -> None:
+    def _poll(self) -> None:
         now_ns = time.monotonic_ns()
         if now_ns - self._polled_ns > 10_000_000:
             self.gaps.append((self._polled_ns, now_ns))

@@ -92,7 +92,7 @@ def vcan(
         mem_mb=mem,
         timeout_s=timeout,
         boot_timeout_s=boot_timeout,
-        kernel="lab" if time_travel else kernel and kernel.value,
+        kernel="lab" if time_travel or kernel is Kernel.LAB else "debian" if kernel is Kernel.DEBIAN else None,
         time_travel=time_travel,
     )
     try:

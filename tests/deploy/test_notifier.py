@@ -118,10 +118,10 @@ def test_bad_ticks_starve_the_watchdog(systemd: Systemd) -> None:
 def test_ready_is_repeated_until_it_was_taken(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
     """A full queue of systemd must not leave the unit starting for ever."""
     notifier = Notifier(lambda: "well")
-    tell = Notifier._tell
-    monkeypatch.setattr(Notifier, "_tell", lambda self, what: False)
+    tell = Notifier._send
+    monkeypatch.setattr(Notifier, "_send", lambda self, what: False)
     notifier.tick_done(START, True)
-    monkeypatch.setattr(Notifier, "_tell", tell)
+    monkeypatch.setattr(Notifier, "_send", tell)
     notifier.tick_done(START + T, True)
     assert [h.get("READY") for h in systemd.heard()] == ["1"]
 
@@ -185,7 +185,7 @@ def test_neutral_first_and_then_stopping(systemd: Systemd, loop: Loop) -> None:
     (bus,) = loop.buses
     bus.at_send = lambda: said.extend(systemd.heard())
     said: list[dict[str, str]] = []
-    loop.leave()
+    loop.shut_down()
     assert said == [], "nothing is said before the last frame"
     assert systemd.heard() == [{"STOPPING": "1", "STATUS": "Ending."}]
 

@@ -110,8 +110,8 @@ def test_a_daemon_that_is_slow_to_answer_is_asked_once(tmp_path: Path, monkeypat
         bus.drain([])
         daemon.send_signal(signal.SIGSTOP)
         dialled: list[str] = []
-        dial = wire_client._dial
-        monkeypatch.setattr(wire_client, "_dial", lambda name, *rest: dialled.append(name) or dial(name, *rest))
+        dial = wire_client._connect_and_send
+        monkeypatch.setattr(wire_client, "_connect_and_send", lambda name, *rest: dialled.append(name) or dial(name, *rest))
         assert not any(bus.reopen() for _ in range(5))
         daemon.send_signal(signal.SIGCONT)
         reopen(bus)

@@ -17,7 +17,8 @@ from can_dbc.messages import datagrams, tick_record
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from controller.config import load as load_settings
 from controller.process.tick_recording import record
-from controller.step import Controller, Inputs, step
+from controller.step import Controller, step
+from controller.tick import Inputs
 from hil.replay.recording import contents, files_of, manifest_of
 from hil.replay.replay import replay
 from host.exit_codes import CommandFailed, ExitCode

@@ -209,7 +209,7 @@ def test_room_comes_back_for_a_frame_that_the_bus_refuses(daemon: subprocess.Pop
 def test_a_client_that_only_sends_keeps_a_bounded_backlog(
     daemon: subprocess.Popen[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("can_dbc.bus.wire_client._BACKLOG", 8)
+    monkeypatch.setattr("can_dbc.bus.wire_client._MAX_BACKLOG_FRAMES", 8)
     with open_bus("wire:crane0", tx_queue=1) as a, open_bus("wire:crane0", tx_queue=40) as b:
         assert all(b.send(i, b"") for i in range(30))
         assert a.send(0x100, b"")

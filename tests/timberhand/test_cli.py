@@ -46,7 +46,7 @@ def test_the_report_is_written_from_saved_results_and_an_empty_or_broken_folder_
         shutil.copyfile(DOCS / "results" / f"{name}.json", tmp_path / "results" / f"{name}.json")
     done = runner.invoke(app, ["report", "--docs", str(tmp_path)])
     assert done.exit_code == 0 and "2 experiments" in done.stdout
-    assert "[navigation]" in (tmp_path / "figures.md").read_text()
+    assert "[navigation]" in (tmp_path / "results.md").read_text()
     (tmp_path / "results" / "navigation.json").write_text("{")
     broken = runner.invoke(app, ["report", "--docs", str(tmp_path)])
     assert isinstance(broken.exception, CommandFailed) and broken.exception.code == "report.results-unusable"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -43,7 +43,7 @@ def bus(
         raise typer.Exit(ExitCode.FIGURE_MISSED)
 
 
-def _show(result: dict, reached: bool) -> None:
+def _show(result: dict[str, Any], reached: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Any, Final
 
 import typer
@@ -49,7 +50,7 @@ def measure(repetitions: int) -> dict[str, Any]:
     database = load("crane")
     reference = {m.name: m for m in parse(database.path).messages}
     rng = random.Random(1)
-    rows = []
+    rows: list[dict[str, Any]] = []
     gc.disable()
     try:
         for name, ours in database.messages.items():
@@ -98,7 +99,7 @@ def _timed(
     from statistics import median
     from time import perf_counter_ns
 
-    cases = {
+    cases: dict[str, Callable[[], object]] = {
         "encode_ns": lambda: ours.encode(*values),
         "cantools_encode_ns": lambda: theirs.encode(named),
         "cantools_encode_unchecked_ns": lambda: theirs.encode(named, strict=False),

@@ -27,7 +27,7 @@ def motion(
     import json
 
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import Progress, TaskID
 
     from experiments.benches.motion import GOAL_MS, run
     from host.exit_codes import CommandFailed, ExitCode
@@ -40,7 +40,11 @@ def motion(
             machine = load_profile(name)
             with Progress(console=error, transient=True, disable=not error.is_terminal) as bar:
                 task = bar.add_task(name, total=None)
-                bench = run(machine, seeds, lambda done, total, t=task: bar.update(t, completed=done, total=total))
+
+                def progress(done: int, total: int, bar: Progress = bar, task: TaskID = task) -> None:
+                    bar.update(task, completed=done, total=total)
+
+                bench = run(machine, seeds, progress)
         except (ProfileError, ValueError) as trouble:
             raise CommandFailed.from_error(trouble, ExitCode.CONFIGURATION) from None
         found[name] = bench.metrics()

@@ -25,13 +25,13 @@ def plant(
     from rich.console import Console
     from rich.table import Table
 
-    from experiments.common.result import environment, judge
+    from experiments.common.result import environment, evaluate
     from experiments.plant.bench import LOG_COUNTS, METRICS, measure
     from host.exit_codes import ExitCode
 
     screen = Console(stderr=as_json, highlight=False, soft_wrap=True)
     metrics, noisy, _ = measure(profile, truth, quick, screen)
-    missed, inconclusive = judge(METRICS, metrics, noisy)
+    missed, inconclusive = evaluate(METRICS, metrics, noisy)
     if as_json:
         verdict = {"missed": missed, "inconclusive": inconclusive, "noisy": noisy}
         typer.echo(json.dumps({"environment": environment(), "metrics": metrics, **verdict}, indent=2))

@@ -6,14 +6,17 @@ import os
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from experiments.common.registry import EXPERIMENTS
 from timberhand.commands.options import ProfileOption, TruthOption
 
-Name = StrEnum("Name", {name.upper().replace("-", "_"): name for name in EXPERIMENTS})
+if TYPE_CHECKING:
+    Name = StrEnum("Name", "NAME")
+else:
+    Name = StrEnum("Name", {name.upper().replace("-", "_"): name for name in EXPERIMENTS})
 
 
 class Bus(StrEnum):

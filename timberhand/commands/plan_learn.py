@@ -41,7 +41,7 @@ def learn(
 
     from autonomy.motion.dmp import DemonstrationRefused
     from autonomy.motion.movement_primitives import encode, learn_primitives
-    from training.motion.demonstration_recordings import draw, motions_in
+    from training.motion.demonstration_recordings import motions_in
 
     machine, motions = motions_in(recording, profile)
     try:
@@ -54,7 +54,9 @@ def learn(
 
         _write(csv, format_demonstrations(machine.name, motions).encode())
     if plot is not None:
-        draw(plot, machine, motions, primitives)
+        from training.motion.primitives_plot import plot_primitives
+
+        plot_primitives(plot, machine, motions, primitives)
     found = {
         "profile": machine.name,
         "motions": len(motions),

@@ -1,4 +1,4 @@
-"""``timberhand report``: the overview page of all experiments, from their saved results."""
+"""``timberhand report``: writes the result pages again from the saved results."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import typer
 
 
 def report(
-    docs: Annotated[Path, typer.Option(help="Folder that holds results/ and gets figures.md.")] = Path("docs"),
+    docs: Annotated[Path, typer.Option(help="Folder that holds results/ and the pages.")] = Path("docs"),
 ) -> None:
-    """Write figures.md: the results of every experiment beside the limits and the papers' figures.
+    """Write the page of every experiment and the overview results.md from the saved results.
 
-    An experiment with --docs does this itself; use this command for results from
-    elsewhere. Measures nothing.
+    Measures nothing: numbers, plots and commits stay as they are. An experiment
+    with --docs writes its page itself; use this command for results from
+    elsewhere, and after a change of the text of a page.
 
     [bold]Examples[/bold]
 
@@ -22,7 +23,8 @@ def report(
 
       timberhand report --docs /srv/timberhand/docs
     """
-    from experiments.common import overview
+    from experiments.common import overview, pages
+    from experiments.loop_design import page as loop_design
     from host.exit_codes import CommandFailed, ExitCode
 
     try:
@@ -33,7 +35,11 @@ def report(
                 f"{docs / 'results'} holds no results of experiments; name the folder with --docs",
                 ExitCode.CONFIGURATION,
             )
-        print(f"{overview.write(docs)}: {len(found)} experiments")
+        written = pages.rewrite(docs)
+        if (docs / "results" / "loop-design.json").exists() and (docs / "loop-design.md").exists():
+            written = [loop_design.rewrite(docs), *written]
+        print("\n".join(map(str, written)))
+        print(f"{len(found)} experiments")
     except (OSError, ValueError) as error:
         raise CommandFailed(
             "report.results-unusable", f"the results in {docs} cannot be used: {error}", ExitCode.CONFIGURATION

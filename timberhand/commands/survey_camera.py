@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -71,12 +71,14 @@ def survey_camera(
     except CameraMountError as error:
         raise CommandFailed.from_error(error, ExitCode.FIGURE_MISSED) from None
     remark = f"by {len(seen.places_m)} surveyed targets"
-    values = {
+    values: dict[str, Any] = {
         "position_m": [round(v, 4) for v in found.position_m],
         "rpy_rad": [round(v, 5) for v in found.rpy_rad],
         "depth_scale": round(found.depth_scale, 5),
     }
-    changed = [(("cameras", camera, name), value, remark) for name, value in values.items()]
+    changed: list[tuple[tuple[str, ...], Any, str]] = [
+        (("cameras", camera, name), value, remark) for name, value in values.items()
+    ]
     try:
         write_profile(Path(profile_path(profile)), out, changed, datetime.date.today().isoformat())
     except ProfileNotWritten as error:

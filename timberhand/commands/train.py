@@ -185,7 +185,9 @@ def detector(
 
 @app.command()
 def scorers(
-    out: Annotated[Path, typer.Option(help="Folder of the segment_merging and segment_quality weights and their cards.")] = Path(),
+    out: Annotated[
+        Path, typer.Option(help="Folder of the segment_merging and segment_quality weights and their cards.")
+    ] = Path(),
     seed: Seed = 1,
     pictures: Annotated[int, typer.Option(min=2, help="Number of rendered pictures; 2.5 MB each.")] = 1024,
     folder: Folder = None,
