@@ -13,15 +13,12 @@ The stages of a tick, in order (the loop does the first and the last two)::
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Final
 
 from can_dbc.dbc.codec import Database, DbcError, load
-from can_dbc.frame import Frame, RawFrame
+from can_dbc.frame import RawFrame
 from can_dbc.messages.crane import CraneSetpoint, OperatorAction, SpoolTest
-from can_dbc.messages.tick_record import BusReading
 from can_dbc.messages.vehicle import DriveSetpoint
-from can_dbc.protocols.canopen import sync_frame
 from controller.bus_io.bus_monitor import BusMonitor
 from controller.carrier.vehicle import Vehicle
 from controller.config import ConfigError, Settings
@@ -34,7 +31,9 @@ from controller.estimation.motion_monitor import MotionMonitor
 from controller.requests.gate import RequestGate
 from controller.requests.setpoint_gate import RequestRefused
 from controller.state_report import StateReporter
-from controller.supervisor import OPERATING, Event, Supervisor
+from controller.supervisor import Supervisor
+from controller.tick import Inputs, Outputs
+from controller.transitions import OPERATING, Event
 from machine.joints import JOINTS
 from machine.profile import joint
 from machine.sensing.encoder import position_from_counts
@@ -44,43 +43,6 @@ from machine.status.reasons import Reason
 HALF_SPEED_SHARE: Final = 0.5
 MAX_ELAPSED_PERIODS: Final = 4
 """After a pause the laws count at most this many periods."""
-
-
-@dataclass(slots=True)
-class Inputs:
-    """Inputs of one tick; the caller keeps one object and refills it.  Counters are totals since the start.
-
-    ``frames`` and ``bus`` are from crane0.  ``machine_frames`` and ``machine_bus`` are from mach0 and stay empty on a
-    machine without a carrier.
-    """
-
-    frames: list[Frame] = field(default_factory=list)
-    machine_frames: list[Frame] = field(default_factory=list)
-    bus: BusReading = field(default_factory=BusReading)
-    machine_bus: BusReading = field(default_factory=BusReading)
-    datagrams: list[bytes] = field(default_factory=list)
-    late_ns: int = 0
-    missed_ticks: int = 0
-    tick_ns: int = 0
-    """Duration of the previous tick."""
-
-
-@dataclass(slots=True)
-class Outputs:
-    """Outputs of one tick, valid until the next `step`.
-
-    ``frames`` go out at once on crane0, ``machine_frames`` on mach0.  ``sync`` goes out on crane0 one SYNC lead before
-    the next tick, so that the encoders' samples are in when that tick begins and are no older than the lead.
-    """
-
-    frames: list[RawFrame] = field(default_factory=list)
-    machine_frames: list[RawFrame] = field(default_factory=list)
-    sync: RawFrame = field(default_factory=lambda: sync_frame(1))
-    report: bytes | None = None
-    vehicle_report: bytes | None = None
-    mode: Mode = Mode.BOOT
-    reason: Reason = Reason.NONE
-    detail: int = 0
 
 
 class Controller:

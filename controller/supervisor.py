@@ -10,7 +10,6 @@ stops.
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Any, Final
 
 from controller.bus_io.bus_monitor import BusMonitor
@@ -19,64 +18,13 @@ from controller.carrier.inputs import CarrierInputs
 from controller.crane.inputs import CraneInputs
 from controller.crane.startup import Startup
 from controller.estimation.joint_estimator import JointEstimator
+from controller.transitions import OPERATING, TRANSITIONS, Event
 from machine.joints import JOINTS
 from machine.profile import Profile, encoders, joint
 from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reaction, Reason
 
-
-class Event(IntEnum):
-    """Events that may change the mode."""
-
-    BOOTED = 0
-    """All encoders are set up."""
-    ARM = 1
-    """The operator armed, and nothing prevents it."""
-    DISARM = 2
-    RESET = 3
-    SETPOINT = 4
-    """A setpoint was accepted."""
-    DONE = 5
-    """A final setpoint was reached, and its lease is over."""
-    HOLD = 6
-    """Reaction H, or the operator's stop."""
-    RAMP = 7
-    """Reaction R1."""
-    CUT = 8
-    """Reaction R0."""
-    LATCHED = 9
-    """The ramp of an R1 is over."""
-
-
-TRANSITIONS: Final[dict[tuple[Mode, Event], Mode]] = {
-    (Mode.BOOT, Event.BOOTED): Mode.STANDBY,
-    (Mode.BOOT, Event.CUT): Mode.FAULT,
-    (Mode.STANDBY, Event.ARM): Mode.ARMED,
-    (Mode.STANDBY, Event.HOLD): Mode.STOP,
-    (Mode.STANDBY, Event.CUT): Mode.FAULT,
-    (Mode.ARMED, Event.DISARM): Mode.STANDBY,
-    (Mode.ARMED, Event.SETPOINT): Mode.ACTIVE,
-    (Mode.ARMED, Event.HOLD): Mode.STOP,
-    (Mode.ARMED, Event.RAMP): Mode.FAULT,
-    (Mode.ARMED, Event.CUT): Mode.FAULT,
-    (Mode.ACTIVE, Event.DISARM): Mode.STOP,
-    (Mode.ACTIVE, Event.DONE): Mode.ARMED,
-    (Mode.ACTIVE, Event.HOLD): Mode.STOP,
-    (Mode.ACTIVE, Event.RAMP): Mode.STOP,
-    (Mode.ACTIVE, Event.CUT): Mode.FAULT,
-    (Mode.STOP, Event.ARM): Mode.ARMED,
-    (Mode.STOP, Event.DISARM): Mode.STANDBY,
-    (Mode.STOP, Event.RESET): Mode.STANDBY,
-    (Mode.STOP, Event.RAMP): Mode.FAULT,  # a second fault while stopping: neutral at once
-    (Mode.STOP, Event.CUT): Mode.FAULT,
-    (Mode.STOP, Event.LATCHED): Mode.FAULT,
-    (Mode.FAULT, Event.RESET): Mode.BOOT,
-}
-"""Mode after an event; a pair that is not listed changes nothing."""
-
-OPERATING: Final = (Mode.ARMED, Mode.ACTIVE)
-"""Modes in which setpoints are accepted."""
 _WAITING: Final = (Mode.BOOT, Mode.STANDBY)
 RAMP_NS: Final = 60_000_000
 """Ramp of an R1: with the slowest detection before it (20 ms), neutral well within 100 ms of the loss."""

@@ -83,7 +83,3 @@ class ValveMap:
         rim = max(deadband, 2.0 * half)
         inside = abs(spool) / rim if abs(spool) < rim else 1.0
         return 100.0 * self._sign * (spool + self._ahead * inside)
-
-    def limit(self, velocity: float) -> float:
-        """Limit a velocity to what the valve can give on that side."""
-        return min(velocity, self.full_plus) if velocity >= 0.0 else max(velocity, -self.full_minus)

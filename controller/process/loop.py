@@ -23,7 +23,8 @@ from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, sleep_until
 from controller.process.tick_recording import record
 from controller.process.timing import LoopTiming
-from controller.step import Controller, Inputs, Outputs, step
+from controller.step import Controller, step
+from controller.tick import Inputs, Outputs
 from machine.status.faults import describe
 
 Address = tuple[str, int]

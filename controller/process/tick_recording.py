@@ -10,7 +10,7 @@ from dataclasses import replace
 from can_dbc.frame import RawFrame
 from can_dbc.messages import tick_record
 from can_dbc.messages.tick_record import TickRecord
-from controller.step import Inputs, Outputs
+from controller.tick import Inputs, Outputs
 
 
 def record(inputs: Inputs, outputs: Outputs, now_ns: int) -> bytes:

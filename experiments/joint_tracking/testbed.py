@@ -17,12 +17,12 @@ from controller.config import Settings
 from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.motion_monitor import MotionMonitor
 from controller.laws.crane import LOADS, CraneLaw
-from controller.laws.time_scaling import Pace
-from machine.encoder import counts_from_position, position_from_counts
+from controller.laws.time_scaling import TimeScaling
 from machine.joints import JOINTS, N_JOINTS
-from machine.load import profile_hash
+from machine.loading.profile_file import profile_hash
 from machine.profile import Profile, joint
-from machine.reasons import Reason
+from machine.sensing.encoder import counts_from_position, position_from_counts
+from machine.status.reasons import Reason
 from sim.world import STEP_NS, World
 
 NAMES: Final = tuple(j.name.lower() for j in JOINTS)
@@ -71,7 +71,7 @@ class Rig:
         self._rng = random.Random(f"joint-tracking {seed}")
         self.estimators = [JointEstimator(spec, period_s) for spec in self._specs]
         self.law = CraneLaw(profile, period_s)
-        self._pace = Pace(profile)
+        self._pace = TimeScaling(profile)
         self._monitors = [MotionMonitor(spec, period_s) for spec in self._specs]
         self._ahead = [0.0] * N_JOINTS
         self._spools = [0.0] * N_JOINTS
@@ -119,13 +119,13 @@ class Rig:
         for j, name in enumerate(NAMES):
             if LOADS[j] is not None:
                 push, against = (round(10.0 * pa / BAR) / 10.0 for pa in pressures[name])
-                self._loads[j] = self.law.load_bar(j, push, against)
+                self._loads[j] = self.law.load_pressure_bar(j, push, against)
         self._step()
         self._now_ns += self._period_ns
         for spec, estimator, count in zip(self._specs, self.estimators, counts, strict=True):
             estimator.predict(self._now_ns)
             if spec.encoder is not None and count is not None:
-                estimator.sample(position_from_counts(spec.encoder, count), stamp_ns)
+                estimator.update(position_from_counts(spec.encoder, count), stamp_ns)
 
     def _tick(self, reference: Reference, elapsed_s: float, trace: Trace) -> None:
         pace, law = self._pace, self.law
@@ -153,7 +153,9 @@ class Rig:
         trace.limited.append(self.world.hydraulics.flow_limited)
 
 
-def believed(profile: Profile, world: World, kind: str, calibration: Calibration | None, damped: bool) -> Profile:
+def controller_profile(
+    profile: Profile, world: World, kind: str, calibration: Calibration | None, damped: bool
+) -> Profile:
     """The profile with another law, with or without pressure damping, and valves as a calibration leaves them."""
     import msgspec
 
@@ -177,13 +179,13 @@ class Calibration:
     def __init__(self, seed: int) -> None:
         self._rng = random.Random(f"calibration {seed}")
 
-    def valve(self, believed: Any, true: Any) -> Any:
+    def valve(self, valve_spec: Any, true: Any) -> Any:
         """The valve map with errors of one sigma as above."""
         import msgspec
 
         off = self._rng.gauss
         return msgspec.structs.replace(
-            believed,
+            valve_spec,
             deadband_plus_pct=100.0 * true.deadband_plus + off(0.0, self.DEADBAND_PCT),
             deadband_minus_pct=100.0 * true.deadband_minus + off(0.0, self.DEADBAND_PCT),
             full_speed_plus=true.full_speed_plus * (1.0 + off(0.0, self.SPEED)),

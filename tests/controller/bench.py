@@ -30,7 +30,8 @@ from can_dbc.protocols.e2e import Sender
 from can_dbc.protocols.nmea2000 import frames as packet
 from controller.config import load as load_settings
 from controller.laws.valve_map import ValveMap
-from controller.step import Controller, Inputs, Outputs, step
+from controller.step import Controller, step
+from controller.tick import Inputs, Outputs
 from machine.joints import JOINTS, N_JOINTS
 from machine.profile import encoders, joint
 from machine.sensing.encoder import counts_from_position

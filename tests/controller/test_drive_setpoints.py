@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, SpoolKnot, SpoolTest
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering
-from controller.step import Inputs, step
+from controller.step import step
+from controller.tick import Inputs
 from machine.joints import Joint
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.controller.bench import AORO, GNSS, MACHINE
-from tests.controller.driving import CARRIER, MS, TRANSPORT, DriveBench, T
+from tests.controller.drive_bench import CARRIER, MS, TRANSPORT, DriveBench, T
 
 LIMIT = CARRIER.articulation_limit_rad
 RATE = CARRIER.articulation_rate_limit_rad_s

@@ -354,12 +354,10 @@ def test_joint_that_moves_the_wrong_way_stops():
 
 
 def test_descriptions_name_the_joint_and_the_node():
-    assert describe(Reason.ENCODER_LOST, Joint.TILT) == (
-        "The encoder of joint tilt is no longer received. Check its cable, then reset and arm."
-    )
+    assert "joint tilt" in describe(Reason.ENCODER_LOST, Joint.TILT)
     assert "valve node" in describe(pack(Reason.SAFETY_NODE_LOST, 0x10))
-    assert describe(Reason.POSITION_OUTSIDE, Joint.EXT).startswith("Joint ext is outside")
-    assert describe(Reason.NODE_ABSENT, 5).startswith("Node 5 ")
+    assert "joint ext" in describe(Reason.POSITION_OUTSIDE, Joint.EXT).lower()
+    assert "Node 5 " in describe(Reason.NODE_ABSENT, 5)
     for reason in Reason:
         assert "{" not in describe(reason, 1)
 

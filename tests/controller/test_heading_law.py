@@ -21,7 +21,7 @@ from machine.geometry.carrier import heading_rate_rad_s
 from machine.status.modes import Mode
 from sim.geometry.geodesy import LocalFrame
 from sim.nodes.vehicle import spool_for
-from tests.controller.driving import CARRIER, DriveBench, T
+from tests.controller.drive_bench import CARRIER, DriveBench, T
 
 DT = T * 1e-9
 KP = CARRIER.heading_kp_1_s

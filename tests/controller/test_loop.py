@@ -24,6 +24,7 @@ from controller.process.timing import LoopTiming
 from controller.process.warm_up import NullBus, warm_up
 from controller.step import Controller
 from machine.status.reasons import Reason
+from tests.codes import coded
 from tests.controller.bench import DATABASE, MS, SETTINGS, Bench, T
 
 LEAD = SETTINGS.sync_lead_ns
@@ -342,7 +343,7 @@ def test_addresses_and_settings():
     assert bus_address("mach0=wire:mach0") == ("mach0", "wire:mach0")
     assert parser().parse_args(["--profile", "x", "--setpoint-port", "1"]).report == []
     assert load("palms_471", 100).period_ns == 10 * MS
-    with pytest.raises(ConfigError, match="Hz"):
+    with pytest.raises(ConfigError, check=coded("config.rate")):
         load("palms_471", 2000)
 
 

@@ -14,6 +14,7 @@ from controller.config import ConfigError
 from controller.crane.outputs import CraneWriter
 from machine.loading.profile_file import load_profile
 from machine.profile import Plc, Profile
+from tests.codes import coded
 
 DATABASE = load("crane")
 NAMES = ("JointRefA", "JointRefB", "JointRefC")
@@ -64,5 +65,5 @@ def test_at_rest_unknown_or_out_of_reach_is_not_available() -> None:
 def test_a_machine_whose_joints_the_frames_cannot_carry_is_refused_at_the_start() -> None:
     wide = profile("references")
     slew = msgspec.structs.replace(wide.joints["slew"], upper=3.5)
-    with pytest.raises(ConfigError, match="JointRefA"):
+    with pytest.raises(ConfigError, check=coded("config.reference-range")):
         CraneWriter(DATABASE, msgspec.structs.replace(wide, joints=wide.joints | {"slew": slew}))

@@ -89,7 +89,6 @@ def test_the_map_is_monotonic_and_saturates(valve):
 def test_the_two_sides_differ():
     made = ValveMap(LIFT)
     assert made.spool_pct(0.12) > -made.spool_pct(-0.12)
-    assert made.limit(9.0) == LIFT.full_speed_plus and made.limit(-9.0) == -LIFT.full_speed_minus
 
 
 def test_a_short_lever_makes_the_joint_faster_and_an_unknown_place_changes_nothing():

@@ -14,7 +14,7 @@ from machine.joints import ARTICULATION
 from machine.status.faults import FAULTS, describe
 from machine.status.modes import Mode
 from machine.status.reasons import Reaction, Reason
-from tests.controller.driving import CARRIER, MS, DriveBench, T
+from tests.controller.drive_bench import CARRIER, MS, DriveBench, T
 
 SWAY = math.degrees(CARRIER.tilt_limit_rad)
 
@@ -261,7 +261,7 @@ def test_the_articulation_outside_its_range_latches():
     go(bench, 12)
     assert bench.controller.supervisor.reason in (Reason.POSITION_OUTSIDE, Reason.ENCODER_JUMP)
     assert bench.controller.supervisor.detail == ARTICULATION and bench.braked
-    assert describe(Reason.POSITION_OUTSIDE, ARTICULATION).startswith("The articulation is outside")
+    assert "articulation" in describe(Reason.POSITION_OUTSIDE, ARTICULATION)
 
 
 def test_arm_stuck():
@@ -272,7 +272,7 @@ def test_arm_stuck():
     bench.lies["ArmHeightA"] = {"Arm2": held[1]}
     ms = until(bench, Reason.ARM_STUCK, ARM_STUCK_NS // MS + 100, speed_m_s=0.0, heights_m=(0.45,) * 4)
     assert ms >= ARM_STUCK_NS // MS - 100 and bench.controller.supervisor.detail == 1
-    assert describe(Reason.ARM_STUCK, 1).startswith("The front right arm does not follow")
+    assert "front right arm" in describe(Reason.ARM_STUCK, 1)
 
 
 @pytest.mark.slow

@@ -1,5 +1,5 @@
-"""The carrier's loops: the closed form of docs/reference/machines.md section 7.2, the running law against its response, margins over all
-machines.
+"""The carrier's loops: the closed form of docs/reference/machines.md section 7.2, the running law against its response,
+margins over all machines.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from experiments.loop_design import carrier as loops
 from experiments.loop_design.carrier import CarrierCase, angle_spec, arm_loop, heading_loop, natural
 from experiments.loop_design.loop import FREQUENCY_RAD_S, LawResponse, Spool, margins
 from experiments.loop_design.page import write
-from experiments.loop_design.study import GAIN_DB, PHASE_DEG, Work, study, work_of
-from machine.carrier import heading_rate_rad_s
-from machine.load import load_profile
+from experiments.loop_design.study import MIN_GAIN_DB, MIN_PHASE_DEG, CaseSet, case_set, study
+from machine.geometry.carrier import heading_rate_rad_s
+from machine.loading.profile_file import load_profile
 
 pytestmark = pytest.mark.computed
 
@@ -31,7 +31,7 @@ T_S, LEAD_S = 0.005, 0.003
 S = 1j * FREQUENCY_RAD_S
 QUICK = Spool(0.0, 1.0, 1e4, 1.0)
 VALVE = Spool(0.075, 1.0, 40.0, 0.8)
-SPREAD = Work({}, {"steer": VALVE, "arm_fl": VALVE}, tuple(np.linspace(0.04, 0.15, 5)), (0.8, 1.0, 1.2))
+SPREAD = CaseSet({}, {"steer": VALVE, "arm_fl": VALVE}, tuple(np.linspace(0.04, 0.15, 5)), (0.8, 1.0, 1.2))
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.639, 1.0])
@@ -90,9 +90,9 @@ def test_the_response_of_the_angle_law_is_that_of_its_code(w):
         now_ns = (k + 1) * period_ns
         t, sampled = now_ns * 1e-9, (now_ns - lead_ns) * 1e-9
         estimator.predict(now_ns)
-        estimator.sample(speed * sampled - small * math.sin(w * sampled), now_ns - lead_ns)
+        estimator.update(speed * sampled - small * math.sin(w * sampled), now_ns - lead_ns)
         rate = law.step(speed * t, speed, estimator.position)
-        law.told(rate, speed, T_S)
+        law.note_command(rate, speed, T_S)
         samples.append(rate - speed)
         times.append(t)
     half = len(times) // 2
@@ -123,25 +123,25 @@ def test_the_running_waypoint_law_settles_as_its_damping_says():
 
 
 def test_the_shipped_gains_keep_their_margins_over_all_machines():
-    judged = loops.studies(PROFILE, SPREAD)
-    assert [loop.name for loop in judged] == ["heading", "articulation", "swing arm"]
-    for loop in judged:
-        assert loop.phase_deg >= PHASE_DEG and loop.gain_db >= GAIN_DB, (loop.name, loop.worst)
-    assert len(judged[0].cases) == 180
+    made = loops.studies(PROFILE, SPREAD)
+    assert [loop.name for loop in made] == ["heading", "articulation", "swing arm"]
+    for loop in made:
+        assert loop.phase_deg >= MIN_PHASE_DEG and loop.gain_db >= MIN_GAIN_DB, (loop.name, loop.worst)
+    assert len(made[0].cases) == 180
     assert loops.studies(load_profile("palms_471"), SPREAD) == []
 
 
 def test_twice_the_gains_would_not():
     eager = msgspec.structs.replace(CARRIER, heading_kp_1_s=6.0, arm_kp_1_s=5.0)
-    judged = loops.studies(msgspec.structs.replace(PROFILE, carrier=eager), SPREAD)
-    assert {loop.name for loop in judged if not loop.holds} == {"heading", "swing arm"}
+    made = loops.studies(msgspec.structs.replace(PROFILE, carrier=eager), SPREAD)
+    assert {loop.name for loop in made if not loop.holds} == {"heading", "swing arm"}
     late = arm_loop(CARRIER, replace(VALVE, delay_s=0.15))
     assert margins(FREQUENCY_RAD_S, late).phase_deg < margins(FREQUENCY_RAD_S, arm_loop(CARRIER, VALVE)).phase_deg
 
 
 @pytest.mark.slow
 def test_the_page_shows_the_carrier(tmp_path):
-    few = replace(work_of("aoro_fc8"), delays_s=(0.08,), gains=(1.0,))
+    few = replace(case_set("aoro_fc8"), delays_s=(0.08,), gains=(1.0,))
     assert write([(PROFILE, study(PROFILE, few) + loops.studies(PROFILE, few), few)], tmp_path)
     text = (tmp_path / "loop-design.md").read_text()
     assert all(f"| {name} |" in text for name in ("heading", "articulation", "swing arm"))

@@ -18,13 +18,13 @@ from controller.estimation.joint_estimator import JointEstimator
 from controller.laws.feedback import LAWS
 from controller.laws.joint import JointLaw
 from controller.laws.valve_map import ValveMap
-from experiments.common.worlds import home_at, opened
+from experiments.common.worlds import home_at, trial_world
 from experiments.loop_design.loop import FREQUENCY_RAD_S, LawResponse, Spool, margins, open_loop
 from experiments.loop_design.mechanics import mechanics
 from experiments.loop_design.page import with_law, write
-from experiments.loop_design.study import GAIN_DB, PHASE_DEG, study, work_of
+from experiments.loop_design.study import MIN_GAIN_DB, MIN_PHASE_DEG, case_set, study
 from host.exit_codes import CommandFailed, ExitCode
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from timberhand.cli import app
 
 pytestmark = pytest.mark.computed
@@ -41,7 +41,7 @@ def spec_of(kind="pd", name="slew", **law):
 
 @pytest.fixture(scope="module")
 def works():
-    return {name: work_of(name) for name in ("palms_471", "aoro_fc8")}
+    return {name: case_set(name) for name in ("palms_471", "aoro_fc8")}
 
 
 def test_margins_of_an_integrator_with_a_dead_time():
@@ -83,10 +83,10 @@ def test_the_controllers_response_is_that_of_its_code(kind, w):
         now_ns = (k + 1) * period_ns
         t, sampled = now_ns * 1e-9, (now_ns - lead_ns) * 1e-9
         estimator.predict(now_ns)
-        estimator.sample(speed * sampled - small * math.sin(w * sampled), now_ns - lead_ns)
+        estimator.update(speed * sampled - small * math.sin(w * sampled), now_ns - lead_ns)
         lead = 0.0 if kind == "pid" else speed
-        law.wanted(speed * t, speed, lead, estimator.position, estimator.velocity, math.nan, T_S)
-        samples.append(law.finish(1.0, T_S) - lead)
+        law.desired_velocity(speed * t, speed, lead, estimator.position, estimator.velocity, math.nan, T_S)
+        samples.append(law.command(1.0, T_S) - lead)
         times.append(t)
         law._max_rate = math.inf
     half = len(times) // 2
@@ -101,7 +101,7 @@ def test_the_controllers_response_is_that_of_its_code(kind, w):
 
 
 def test_a_standing_joint_passes_the_metered_oil_one_to_one():
-    with opened("palms_471", "nominal", 0, home=home_at("palms_471", 4.0, 1.0)) as world:
+    with trial_world("palms_471", "nominal", 0, home=home_at("palms_471", 4.0, 1.0)) as world:
         for name in ("slew", "lift", "tilt", "ext", "rot"):
             made = mechanics(world, name, 100.0)
             low, high = made.response(np.array([1e-3j, 400j]))
@@ -110,7 +110,7 @@ def test_a_standing_joint_passes_the_metered_oil_one_to_one():
 
 
 def test_inertia_and_springs_are_those_of_a_hand_calculation():
-    with opened("palms_471", "nominal", 0, home=home_at("palms_471", 5.0, 1.0)) as world:
+    with trial_world("palms_471", "nominal", 0, home=home_at("palms_471", 5.0, 1.0)) as world:
         slew = mechanics(world, "slew")
         q, supply, c = world.q["slew"], world.truth.supply, world.truth.functions["slew"].cylinder
         volume = c.dead_volume_m3 + c.area_a * (q - c.arm_at[0])
@@ -128,20 +128,22 @@ def test_a_longer_delay_costs_phase_and_a_higher_gain_costs_gain(works):
     spec, work = spec_of(name="lift"), works["palms_471"]
     made, valve = work.places["lift"][0][1], work.valves["lift"]
 
-    def judged(delay_s, gain):
+    def margins_of(delay_s, gain):
         law = LawResponse(spec, T_S, LEAD_S)
         spool = Spool(delay_s, gain, valve.rad_s, valve.zeta)
         return margins(FREQUENCY_RAD_S, open_loop(S, spec, law, made, spool, T_S))
 
-    assert judged(0.15, 1.0).phase_deg < judged(0.04, 1.0).phase_deg
-    assert judged(0.075, 1.2).gain_db == pytest.approx(judged(0.075, 1.0).gain_db - 20.0 * math.log10(1.2), abs=1e-6)
+    assert margins_of(0.15, 1.0).phase_deg < margins_of(0.04, 1.0).phase_deg
+    assert margins_of(0.075, 1.2).gain_db == pytest.approx(
+        margins_of(0.075, 1.0).gain_db - 20.0 * math.log10(1.2), abs=1e-6
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
 def test_the_shipped_gains_keep_their_margins_over_all_machines(works, name):
     for joint in study(load_profile(name), works[name]):
-        assert joint.phase_deg >= PHASE_DEG and joint.gain_db >= GAIN_DB, (joint.name, joint.worst)
+        assert joint.phase_deg >= MIN_PHASE_DEG and joint.gain_db >= MIN_GAIN_DB, (joint.name, joint.worst)
         assert len(joint.cases) == 360
 
 
@@ -153,8 +155,8 @@ def test_the_old_gains_would_not(works):
         n: msgspec.structs.replace(s, law=msgspec.structs.replace(s.law, kp_1_s=3.0, damping_per_bar=0.0))
         for n, s in profile.joints.items()
     }
-    judged = study(msgspec.structs.replace(profile, joints=joints), works["palms_471"])
-    assert {j.name for j in judged if not j.holds} >= {"slew", "lift"}
+    studies = study(msgspec.structs.replace(profile, joints=joints), works["palms_471"])
+    assert {j.name for j in studies if not j.holds} >= {"slew", "lift"}
 
 
 @pytest.mark.slow

@@ -18,16 +18,17 @@ from can_dbc.timing.page import Facts, ProcessCounters
 from controller.config import load as settings_of
 from controller.guard.__main__ import build, profile_path
 from controller.process.tick_recording import record
-from controller.step import Controller, Inputs, step
+from controller.step import Controller, step
+from controller.tick import Inputs
 from experiments.timing import soak
-from experiments.timing.bus_observer import Witness
+from experiments.timing.bus_observer import BusObserver
 from experiments.timing.reference_loops import missing_tools
 from experiments.timing.setpoint_source import BEHIND_NS, Planner, Swing
 from host.exit_codes import ExitCode
 from machine.joints import JOINTS
-from machine.load import load_profile
-from machine.modes import Mode
-from machine.reasons import Reason
+from machine.loading.profile_file import load_profile
+from machine.status.modes import Mode
+from machine.status.reasons import Reason
 from sim.kinematic.machine import KinematicMachine, KinematicWorld
 from sim.nodes.valve import FUNCTIONS
 from sim.truth.load import load_truth
@@ -47,7 +48,7 @@ class Virtual:
         cycle_ns = min(5_000_000, self.period_ns)
         self.machine = KinematicMachine(settings.profile, 1, step_ns=min(cycle_ns, 2_500_000), cycle_ns=cycle_ns)
         self.planner = Planner(settings.profile)
-        self.witness = Witness(settings.profile, self.period_ns)
+        self.witness = BusObserver(settings.profile, self.period_ns)
         self.now_ns, self.guard_ns = START_NS, 0
         self.inputs = Inputs()
         self.heard: list[tuple[str, Frame]] = []
@@ -155,7 +156,7 @@ def test_the_witness_misses_a_record_but_not_a_missed_period():
     bench.witness.take = records.append  # type: ignore[method-assign]
     for _ in range(400):
         bench.tick()
-    witness = Witness(PALMS, 5_000_000)
+    witness = BusObserver(PALMS, 5_000_000)
     for data in records[:100] + records[101:]:
         witness.take(data)
     witness.take(records[-1][:-1] + bytes([records[-1][-1] ^ 1]))
@@ -181,23 +182,23 @@ def test_growth_is_what_the_second_half_holds_beyond_the_first():
 def test_a_machine_kept_still_by_the_host_alone_is_inconclusive():
     still = dict.fromkeys(soak.LOSSES, 0.0) | {"active_share": 0.2, "ticks": 4000.0, "allocated_blocks_growth": 0.0}
     late = {Reason.ENCODER_LOST, Reason.LOOP_LATE}
-    assert "active_share" in soak.untold(still, late)
-    assert not soak.untold(still, late | {Reason.JOINT_RUNAWAY})  # the laws stopped it
-    assert not soak.untold(still, set())  # nobody says why
-    assert not soak.untold(still | {"unanswered": 1.0}, late)  # an input is missing, not late
-    assert not soak.untold(still | {"active_share": 0.9}, late)
+    assert "active_share" in soak.undecided(still, late)
+    assert not soak.undecided(still, late | {Reason.JOINT_RUNAWAY})  # the laws stopped it
+    assert not soak.undecided(still, set())  # nobody says why
+    assert not soak.undecided(still | {"unanswered": 1.0}, late)  # an input is missing, not late
+    assert not soak.undecided(still | {"active_share": 0.9}, late)
 
 
 def test_a_short_soak_cannot_tell_a_leak_from_a_breath_but_a_long_one_can():
     moving = dict.fromkeys(soak.LOSSES, 0.0) | {"active_share": 1.0, "ticks": 4000.0, "allocated_blocks_growth": 2.0}
-    assert "allocated_blocks_growth" in soak.untold(moving, set())
-    assert not soak.untold(moving | {"allocated_blocks_growth": 20.0}, set())
+    assert "allocated_blocks_growth" in soak.undecided(moving, set())
+    assert not soak.undecided(moving | {"allocated_blocks_growth": 20.0}, set())
     stopped = moving | {"allocated_blocks_growth": 15.0}
-    assert "allocated_blocks_growth" in soak.untold(stopped, {Reason.VALVE_FEEDBACK_LOST}) and not soak.untold(
+    assert "allocated_blocks_growth" in soak.undecided(stopped, {Reason.VALVE_FEEDBACK_LOST}) and not soak.undecided(
         stopped, set()
     )
-    assert not soak.untold(stopped | {"allocated_blocks_growth": 50.0}, {Reason.VALVE_FEEDBACK_LOST})
-    assert not soak.untold(moving | {"ticks": 360_000.0}, set())
+    assert not soak.undecided(stopped | {"allocated_blocks_growth": 50.0}, {Reason.VALVE_FEEDBACK_LOST})
+    assert not soak.undecided(moving | {"ticks": 360_000.0}, set())
 
 
 def test_the_commands_have_help_and_refuse_what_they_do_not_know():

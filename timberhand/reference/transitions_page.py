@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from controller.supervisor import TRANSITIONS, Event
+from controller.transitions import TRANSITIONS, Event
 from machine.status.modes import Mode
 from timberhand.reference.markdown import generated, table
 
@@ -19,7 +19,7 @@ def page() -> str:
     )
     head = generated(
         "Modes and transitions",
-        "`controller.supervisor.TRANSITIONS`",
+        "`controller.transitions.TRANSITIONS`",
         "Rows are modes, columns events; a cell is the mode that follows, and an empty cell changes nothing. Only a\n"
         "person's ARM leads from STANDBY or STOP to ARMED. Valves move in ACTIVE, and while a stop ramps down.",
     )

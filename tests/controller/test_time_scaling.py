@@ -14,6 +14,7 @@ from controller.laws.valve_map import ValveMap
 from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
 from tests.controller.bench import MS, PROFILE, SETTINGS, SPECS, Bench, T
+from tests.controller.smooth_motion import GOALS, drive
 
 VALVES = [ValveMap(s.valve) for s in SPECS]
 ZERO = (0.0,) * 5
@@ -124,34 +125,9 @@ def test_a_trajectory_keeps_its_past_while_it_is_behind_and_no_more():
 # -- in the controller
 
 
-GOALS = (0.8, 0.35, 0.6, 0.5, 1.2)
-
-
 def bench_with(flow_m3_s):
     profile = with_pump(flow_m3_s)
     return Bench(Settings(profile, profile_hash(profile), profile.rate_hz))
-
-
-def drive(bench, total_s, seconds):
-    """A planner that plans all joints together; yields after each tick."""
-    start, origin_ns = list(bench.q), bench.now_ns
-
-    def plan(t_s):
-        x = min(max(t_s / total_s, 0.0), 1.0)
-        s = 35 * x**4 - 84 * x**5 + 70 * x**6 - 20 * x**7
-        ds = (140 * x**3 - 420 * x**4 + 420 * x**5 - 140 * x**6) / total_s
-        return [p + d * s for p, d in zip(start, GOALS, strict=True)], [d * ds for d in GOALS]
-
-    for k in range(int(seconds * 200)):
-        datagrams = []
-        if k % 10 == 0:
-            t_s = (bench.now_ns - origin_ns) * 1e-9
-            datagrams = [
-                bench.setpoint([(50 * i, *plan(t_s + 0.05 * i)) for i in range(9)], final=t_s + 0.4 >= total_s)
-            ]
-        bench.tick(datagrams)
-        assert bench.mode is Mode.ACTIVE, (bench.reason, k)
-        yield start
 
 
 def test_a_motion_that_asks_for_too_much_oil_is_done_later_on_its_path():

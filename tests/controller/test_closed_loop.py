@@ -2,7 +2,6 @@
 
 import msgspec
 import pytest
-from test_pace import GOALS, drive
 
 from controller.config import Settings
 from controller.laws.feedback import LAWS
@@ -11,6 +10,7 @@ from machine.loading.profile_file import profile_hash
 from machine.motion_limits import SPEED_HEADROOM_SHARE
 from machine.status.modes import Mode
 from tests.controller.bench import SETTINGS, SPECS, Bench
+from tests.controller.smooth_motion import GOALS, drive
 
 SLEW = SPECS[0]
 TOTAL_S = 16.0

@@ -1,0 +1,126 @@
+"""One job on one command path in lockstep: success, accuracy and latency as plain data."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from autonomy.crane_job.activity import Activity
+from can_dbc.messages.crane import StateReport
+from controller.config import load as load_settings
+from controller.guard.__main__ import build as build_guard
+from controller.guard.__main__ import profile_path
+from experiments.common.pool import Job
+from experiments.common.result import mean
+from hil.harness.lockstep import START_NS, Lockstep, Observer
+from hil.harness.operator import Operator
+from hil.plc.bridged_plant import BridgedPlant
+from hil.plc.profile import write_plc_profile
+from machine.geometry.kinematics import pin_position
+from machine.status.modes import Mode
+from sim.plant import Plant
+
+LIMIT_NS: Final = 150_000_000_000
+SETTLE_NS: Final = 3_000_000_000
+REST_NS: Final = 600_000_000
+"""After this time at rest the reference should have been reached."""
+NS_PER_MS: Final = 1e6
+LIFT: Final = 1
+
+
+@dataclass(slots=True)
+class PathObserver:
+    """Accuracy and latency of one job, sampled at every report and after every slice of the lockstep."""
+
+    system: Lockstep
+    plant: Plant
+    rests_mm: list[float] = field(default_factory=list)
+    squares: float = 0.0
+    moments: int = 0
+    behind: list[float] = field(default_factory=list)
+    """True less estimated boom angle; ``speeds`` holds the speed of the boom at the same times."""
+    speeds: list[float] = field(default_factory=list)
+    delays_ms: list[float] = field(default_factory=list)
+    _still_since_ns: int = 0
+    _last: tuple[float, ...] = ()
+    _rested: bool = False
+    _commanded_ns: int | None = None
+    _was_open: bool = False
+
+    def report(self, report: StateReport) -> None:
+        """Sample the accuracy, and the age of the controller's measurements."""
+        if report.mode != Mode.ACTIVE:
+            self._last = ()
+            return
+        true, reference = self.plant.joint_positions(), report.reference
+        kin = self.plant.profile.kinematics
+        error_mm = 1e3 * math.dist(pin_position(kin, true[:4]), pin_position(kin, reference[:4]))
+        if reference != self._last:
+            self._last, self._still_since_ns, self._rested = reference, report.stamp_ns, False
+            self.squares += error_mm * error_mm
+            self.moments += 1
+            self.behind.append(true[LIFT] - report.position[LIFT])
+            self.speeds.append(report.velocity[LIFT])
+        elif not self._rested and report.stamp_ns - self._still_since_ns >= REST_NS:
+            self._rested = True
+            self.rests_mm.append(error_mm)
+
+    def slice(self) -> None:
+        """Measure how long the first opening command takes to reach the boom's valve."""
+        plant = self.plant
+        commanded = self.system._controller.crane.spools_pct[LIFT] != 0.0
+        output = plant.plc.outputs[LIFT] if isinstance(plant, BridgedPlant) else plant.valve.outputs_pct[LIFT]
+        if not commanded:
+            self._commanded_ns = None
+        elif self._commanded_ns is None and not self._was_open and output == 0.0:
+            self._commanded_ns = self.system.now_ns
+        if self._commanded_ns is not None and output != 0.0:
+            self.delays_ms.append((self.system.now_ns - self._commanded_ns) / NS_PER_MS)
+            self._commanded_ns = None
+        self._was_open = commanded
+
+
+def perform(job: Job) -> dict[str, Any]:
+    """Run one job on the path ``job.kind``."""
+    path_name, name, truth = job.kind, job.options["profile"], job.options["truth"]
+    with tempfile.TemporaryDirectory() as directory:
+        path = profile_path(name)
+        if path_name in ("references", "valves"):
+            path = write_plc_profile(name, path_name, Path(directory))
+        settings, guard = load_settings(path), build_guard(path)
+    profile = settings.profile
+    if path_name == "can":
+        plant = Plant(profile, job.seed, truth)
+    else:
+        plant = BridgedPlant(profile, job.seed, truth, transport="modbus" if path_name == "references" else "udp")
+    try:
+        activity = Activity(profile, settings.profile_hash)
+        reports: list[Any] = []
+        operator = Operator(settings.profile_hash, lambda *_: None)
+        system = Lockstep(settings, guard, plant, activity, operator, Observer(None, reports))
+        observer = PathObserver(system, plant)
+        reports.append(observer.report)
+        while not (activity.done or activity.failure or operator.gave_up) and system.now_ns < START_NS + LIMIT_NS:
+            system.advance()
+            observer.slice()
+        ended_ns = system.now_ns
+        while not plant.evaluate().success and system.now_ns < ended_ns + SETTLE_NS:
+            system.advance()
+        return {
+            "success": bool(activity.done and plant.evaluate().success), "stops": operator.stops,
+            "seconds": (ended_ns - START_NS) * 1e-9, "rests_mm": observer.rests_mm, "squares": observer.squares,
+            "moments": observer.moments, "age_ms": 1e3 * slope(observer.speeds, observer.behind),
+            "delays_ms": observer.delays_ms,
+        }  # fmt: skip
+    finally:
+        plant.close()
+
+
+def slope(x: list[float], y: list[float]) -> float:
+    """Slope of the least-squares line through (x, y); NaN if all x are equal."""
+    mean_x, mean_y = mean(x), mean(y)
+    square = sum((a - mean_x) ** 2 for a in x)
+    return sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / square if square else math.nan
