@@ -12,7 +12,7 @@ from typing import Final
 
 from autonomy.motion.arm import Arm
 from autonomy.motion.setpoint_stream import SetpointStream
-from autonomy.motion.trajectory import Trajectory, joint_motion, hold
+from autonomy.motion.trajectory import Trajectory, hold, joint_motion
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import GrappleCommand, OperatorAction, StateReport
 from controller.config import Settings

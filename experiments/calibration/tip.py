@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from experiments.common.pool import Job
-from experiments.common.worlds import hang, opened
+from experiments.common.worlds import hang, trial_world
+from machine.geometry.kinematics import Unreachable, pin_position
+from machine.geometry.sag import aim_free, true_pin
 from machine.joints import Joint
-from machine.kinematics import Unreachable, pin_position
-from machine.lift import hanging_kg, lift_moment_nm
 from machine.profile import Profile, joint
-from machine.sag import aim_free, true_pin
+from machine.sensing.weighing import hanging_load_kg, lift_moment_nm
 from sim.world import STEP_S, World
 
 LOAD_KG: Final = 200.0
@@ -41,7 +41,7 @@ def tip_errors(job: Job, shipped: Profile, calibrated: Profile) -> dict[str, Any
         except Unreachable:
             continue
         home = dict(zip(("slew", "lift", "tilt", "ext"), q, strict=True))
-        with opened(job.options["profile"], job.options["truth"], job.seed, home=home) as world:
+        with trial_world(job.options["profile"], job.options["truth"], job.seed, home=home) as world:
             # A cylinder's friction depends on where it came from: every second pose is reached from above.
             _run(world, NUDGE_S, NUDGE_SPOOL if i % 2 else -NUDGE_SPOOL)
             for kg, before, after in ((0.0, "before", "empty"), (LOAD_KG, "loaded_before", "loaded")):
@@ -53,7 +53,9 @@ def tip_errors(job: Job, shipped: Profile, calibrated: Profile) -> dict[str, Any
                 found[before].append(1e3 * math.dist(pin_position(shipped.kinematics, shown), true))
                 pin = true_pin(calibrated.sag, calibrated.kinematics, corrected, kg)
                 found[after].append(1e3 * math.dist(pin, true))
-                found["load_kg"].append(hanging_kg(calibrated.sag, calibrated.kinematics, corrected, moment_nm) - kg)
+                found["load_kg"].append(
+                    hanging_load_kg(calibrated.sag, calibrated.kinematics, corrected, moment_nm) - kg
+                )
     return found
 
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from autonomy.calibration.plan import CalibrationPlan
 from autonomy.calibration.profile_file import profile_changes, write_profile
-from autonomy.calibration.result import JointResult, CalibrationResult, identify
+from autonomy.calibration.result import CalibrationResult, JointResult, identify
 from autonomy.calibration.survey import OFFSETS
 from autonomy.calibration.turn_fit import TurnFit
 from controller.guard.__main__ import profile_path
@@ -76,7 +76,9 @@ def _rotator_errors(job: Job, profile: Profile, truth: Any, turns: TurnFit, cali
     }
 
 
-def _joint_errors(job: Job, profile: Profile, plan: CalibrationPlan, truth: Any, which: Joint, r: JointResult) -> dict[str, Any]:
+def _joint_errors(
+    job: Job, profile: Profile, plan: CalibrationPlan, truth: Any, which: Joint, r: JointResult
+) -> dict[str, Any]:
     valve = truth.functions[which.name.lower()].valve
     real = [real_full_speed(job, profile, plan, valve, which, side, r.valve.at) for side in (+1, -1)]
     return {
@@ -107,7 +109,9 @@ def _profile_errors(profile: Profile, valve: Any, which: Joint, real: list[float
     }
 
 
-def real_full_speed(job: Job, profile: Profile, plan: CalibrationPlan, valve: Any, which: Joint, side: int, at: float) -> float:
+def real_full_speed(
+    job: Job, profile: Profile, plan: CalibrationPlan, valve: Any, which: Joint, side: int, at: float
+) -> float:
     """Full speed of the plant at the place where the calibration states it: no bus, no controller, no sensor.
 
     The plant is driven past the place with a steady spool and timed; the metering curve of its truth leads from that

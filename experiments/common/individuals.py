@@ -44,7 +44,8 @@ def calibrated(job: Job) -> dict[str, Any]:
 
 @contextmanager
 def controller_profile(name: str, text: str | None) -> Iterator[str]:
-    """Path of the profile for controller, guard and planner: the shipped one, or a file with the calibrated ``text``."""
+    """Path of the profile for controller, guard and planner: the shipped one, or a file with the calibrated
+    ``text``."""
     if text is None:
         yield str(profile_path(name))
         return

@@ -1,15 +1,15 @@
-"""The shortest time for a path: what joint speeds, joint accelerations and the pump's flow allow, nothing else.
+"""Shortest time for a path under limits of joint speeds, joint accelerations and the pump's flow.
 
-The path is a sequence of joint positions; its own timing does not count.  Over the path's parameter s the state is the
-squared speed x = (ds/dt)^2 and the control u = d2s/dt2, so every limit is linear in both:
+The path is a sequence of joint positions; its own timing does not count.  Over the path parameter s the state is the
+squared speed x = (ds/dt)^2 and the control is u = d2s/dt2, so that every limit is linear in both:
 
     speed         q'^2 x <= v^2
     flow          (sum |q'| flow lever)^2 x <= pump^2
     acceleration  -a <= q' u + q'' x <= a
 
-A backward pass gives the greatest x from which the rest can still be done, a forward pass drives as fast as that allows
-(reachability analysis after Pham and Pham, 2018).  Jerk, delay, swing and error are not in it: no controller reaches
-this time.
+A backward pass gives the largest x from which the rest of the path is feasible; a forward pass drives as fast as that
+allows (reachability analysis after Pham and Pham, 2018).  Jerk, delay, swing and error are not included: no controller
+reaches this time.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ from scipy.interpolate import CubicSpline
 from machine.joints import JOINTS
 from machine.profile import Profile, joint
 
-POINTS: Final = 400
-SAME: Final = 1e-6
-"""Samples nearer than this share of the path are one: the slow ends of a timed motion would make the spline shake."""
-FLAT: Final = 1e-9
+POINT_COUNT: Final = 400
+MIN_SPACING_SHARE: Final = 1e-6
+"""Samples nearer than this share of the path are merged; the slow ends of a timed motion would disturb the spline."""
+EPSILON: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Per joint: speed [unit/s], acceleration [unit/s^2], flow on the plus and the minus side [m^3/unit], lever tables
-    (positions, shares; empty for none); ``pump_m3_s`` for all together.
+    """Limits per joint: speed [unit/s], acceleration [unit/s^2], flow on the plus and the minus side [m^3/unit].
+
+    ``levers``: tables of positions and shares per joint, empty for none; ``pump_m3_s``: flow of all joints together.
     """
 
     speed: np.ndarray
@@ -53,7 +54,7 @@ class Limits:
 
 
 def full_limits(profile: Profile) -> Limits:
-    """All that the profile allows, without the shares that a planner leaves to the law."""
+    """The full limits of the profile, without the margins that a planner leaves to the law."""
     specs = [joint(profile, j) for j in JOINTS]
     return Limits(
         np.array([s.speed_limit for s in specs]),
@@ -66,7 +67,7 @@ def full_limits(profile: Profile) -> Limits:
 
 
 def minimum_time_s(path: np.ndarray, limits: Limits) -> float:
-    """The shortest time from rest to rest along joint positions (n, joints); 0 for a path that stands still."""
+    """The shortest time [s] from rest to rest along joint positions (n, joints); 0 for a path without motion."""
     q, slope, bend, step = _resampled(path, limits.speed)
     if not step:
         return 0.0
@@ -74,10 +75,10 @@ def minimum_time_s(path: np.ndarray, limits: Limits) -> float:
     reach = np.zeros(len(q))
     for i in range(len(q) - 2, -1, -1):
         low, high = _bounds(slope[i], bend[i], limits.acceleration)
-        # The next point's share of the control: 0 <= x + 2 step u <= what is left there.
+        # Bounds from the next point: 0 <= x + 2 step u <= its largest x.
         low = np.vstack([low, [0.0, -0.5 / step]])
         high = np.vstack([high, [0.5 * reach[i + 1] / step, -0.5 / step]])
-        reach[i] = min(most[i], _flat(slope[i], bend[i], limits.acceleration), _crossing(low, high))
+        reach[i] = min(most[i], _at_zero_slope(slope[i], bend[i], limits.acceleration), _crossing(low, high))
     x, time_s = 0.0, 0.0
     for i in range(len(q) - 1):
         _, high = _bounds(slope[i], bend[i], limits.acceleration)
@@ -92,44 +93,44 @@ def minimum_time_s(path: np.ndarray, limits: Limits) -> float:
 
 
 def _resampled(path: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Positions, slopes and bends at even steps of s, the time that the way takes at the joints' speeds."""
+    """Positions, first and second derivatives at even steps of s (time at the joints' speed limits), and the step."""
     ways = np.concatenate([[0.0], np.cumsum(np.sqrt(np.sum((np.diff(path, axis=0) / speed) ** 2, axis=1)))])
     end = float(ways[-1])
     if end <= 0.0:
         return path[:1], path[:1], path[:1], 0.0
     kept = [0]
     for i, way in enumerate(ways):
-        if way - ways[kept[-1]] > SAME * end:
+        if way - ways[kept[-1]] > MIN_SPACING_SHARE * end:
             kept.append(i)
     curve = CubicSpline(ways[kept], path[kept])
-    s = np.linspace(0.0, float(ways[kept[-1]]), POINTS + 1)
+    s = np.linspace(0.0, float(ways[kept[-1]]), POINT_COUNT + 1)
     return curve(s), curve(s, 1), curve(s, 2), float(s[1])
 
 
 def _greatest(q: np.ndarray, slope: np.ndarray, limits: Limits) -> np.ndarray:
-    """x that speeds and flow allow, (n,)."""
+    """Largest x allowed by speeds and flow, (n,)."""
     by_speed = np.max(np.abs(slope) / limits.speed, axis=1)
     by_flow = limits.flow(q, slope) / limits.pump_m3_s
-    greatest: np.ndarray = np.maximum(np.maximum(by_speed, by_flow), FLAT) ** -2
+    greatest: np.ndarray = np.maximum(np.maximum(by_speed, by_flow), EPSILON) ** -2
     return greatest
 
 
 def _bounds(slope: np.ndarray, bend: np.ndarray, most: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The control's lower and upper bounds as lines (at x = 0, per x), one per joint that moves along s."""
-    moves = np.abs(slope) > FLAT
+    """Lower and upper bounds of the control as lines (at x = 0, per x), one per joint that moves along s."""
+    moves = np.abs(slope) > EPSILON
     size, lean = most[moves] / np.abs(slope[moves]), -bend[moves] / slope[moves]
     return np.column_stack([-size, lean]), np.column_stack([size, lean])
 
 
-def _flat(slope: np.ndarray, bend: np.ndarray, most: np.ndarray) -> float:
-    """x that the joints allow which only bend here: their acceleration is q'' x."""
-    still = (np.abs(slope) <= FLAT) & (np.abs(bend) > FLAT)
+def _at_zero_slope(slope: np.ndarray, bend: np.ndarray, most: np.ndarray) -> float:
+    """Largest x allowed by joints whose slope is zero here: their acceleration is q'' x."""
+    still = (np.abs(slope) <= EPSILON) & (np.abs(bend) > EPSILON)
     return float(np.min(most[still] / np.abs(bend[still]))) if np.any(still) else float("inf")
 
 
 def _crossing(low: np.ndarray, high: np.ndarray) -> float:
-    """Greatest x at which no lower line is above an upper one; all hold at x = 0."""
+    """Largest x at which no lower line is above an upper one; all hold at x = 0."""
     rise = low[:, None, 1] - high[None, :, 1]
     room = high[None, :, 0] - low[:, None, 0]
-    rising = rise > FLAT
+    rising = rise > EPSILON
     return max(0.0, float(np.min(room[rising] / rise[rising]))) if np.any(rising) else float("inf")

@@ -1,12 +1,11 @@
-"""The page that holds all experiments at a glance: what was asked, what was reached, what was missed, what papers have.
+"""The page of all experiments, ``docs/results.md``: what each one asks, which limits it meets, what the papers report.
 
-Written from the committed results alone, whenever one of them is refreshed.
+Input: the saved results in ``docs/results``.  Written whenever one of them is refreshed; measures nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Final
@@ -14,19 +13,19 @@ from typing import Final
 import msgspec
 
 from experiments.common.registry import EXPERIMENTS
-from experiments.common.result import Figure, Result
+from experiments.common.result import Metric, Result
 
-TITLE: Final = "Figures at a glance"
+TITLE: Final = "Results at a glance"
 INTRODUCTION: Final = (
-    "What the experiments ask, and whether what they measured is within the limits that were set before. Each page "
-    "says how every figure is measured, by which command, on which machine. This one is written whenever an experiment "
-    "is run with `--docs docs`; no number is typed."
+    "This page lists every experiment, the question it answers, and how many of its limits are met. The limits were "
+    "set before the measurement. Each linked page states how every metric is measured, with which command and on which "
+    "machine. `timberhand report` writes this page from the saved results."
 )
 
 
 def write(docs: Path) -> Path:
-    """Write ``figures.md`` from ``results/*.json`` in the folder; the page."""
-    path = docs / "figures.md"
+    """Write ``results.md`` from ``results/*.json`` in the folder; returns its path."""
+    path = docs / "results.md"
     path.write_text(page(results_in(docs), {p.stem for p in docs.glob("*.md")}))
     return path
 
@@ -38,45 +37,55 @@ def results_in(docs: Path) -> dict[str, Result]:
 
 
 def read(path: Path) -> Result:
-    """A saved result; a figure that is no number is NaN."""
+    """A saved result; a metric without a number is NaN.
+
+    Raises:
+        ValueError: the file is not a result.
+    """
     document = msgspec.json.decode(path.read_bytes())
     document["metrics"] = {k: float("nan") if v is None else v for k, v in document["metrics"].items()}
     return msgspec.convert(document, Result)
 
 
 def page(results: Mapping[str, Result], pages: Collection[str]) -> str:
-    """The page as Markdown; an experiment that is none of the ``pages`` is linked to its numbers."""
+    """The page as Markdown; an experiment without one of the ``pages`` is linked to its numbers."""
     links = {n: f"[{n}]({f'{n}.md' if n in pages else f'results/{n}.json'})" for n in results}
-    lines = [f"# {TITLE}", "", INTRODUCTION, "", "| experiment | asks | limits held | commit |", "|---|---|---|---|"]
+    lines = [f"# {TITLE}", "", _conclusion(results), "", INTRODUCTION, ""]
+    lines += ["| experiment | question | limits met | commit |", "|---|---|---|---|"]
     for name, result in results.items():
-        held = len(result.limits) - len(result.missed) - len(result.inconclusive)
+        met = len(result.limits) - len(result.missed) - len(result.inconclusive)
         unsure = f", {len(result.inconclusive)} inconclusive" if result.inconclusive else ""
         lines.append(
-            f"| {links[name]} | {EXPERIMENTS[name].sentence} | {held} of {len(result.limits)}{unsure} "
+            f"| {links[name]} | {EXPERIMENTS[name].sentence} | {met} of {len(result.limits)}{unsure} "
             f"| `{result.commit}` |"
         )
-    lines += ["", "## Beside the papers", "", "| | figure | paper | here |", "|---|---|---|---|"]
-    for name, result, figure in _figures(results):
-        if figure.name in result.paper:
-            here = figure.text(result.metrics[figure.name]) + result.interval_text(figure)
-            lines.append(f"| {links[name]} | {figure.title} | {figure.text(result.paper[figure.name])} | {here} |")
-    lines += ["", "## Missed", "", "| | figure | measured | limit |", "|---|---|---|---|"]
-    for name, result, figure in _figures(results):
-        if figure.name in result.missed:
-            here = figure.text(result.metrics[figure.name]) + result.interval_text(figure)
-            lines.append(f"| {links[name]} | {figure.title} | {here} | {figure.limit_text()} |")
+    lines += ["", "## Compared with the papers", "", "| | metric | paper | here |", "|---|---|---|---|"]
+    for name, result, metric in _metrics(results):
+        if metric.name in result.paper:
+            here = metric.text(result.metrics[metric.name]) + result.interval_text(metric)
+            lines.append(f"| {links[name]} | {metric.title} | {metric.text(result.paper[metric.name])} | {here} |")
+    lines += ["", "## Missed limits", "", "| | metric | measured | limit |", "|---|---|---|---|"]
+    for name, result, metric in _metrics(results):
+        if metric.name in result.missed:
+            here = metric.text(result.metrics[metric.name]) + result.interval_text(metric)
+            lines.append(f"| {links[name]} | {metric.title} | {here} | {metric.limit_text()} |")
     return "\n".join(lines) + "\n"
 
 
-def _figures(results: Mapping[str, Result]) -> Iterator[tuple[str, Result, Figure]]:
-    """All figures that are in a result, in the order of their pages; "the same" says of what."""
+def _conclusion(results: Mapping[str, Result]) -> str:
+    total = sum(len(r.limits) for r in results.values())
+    missed = sum(len(r.missed) for r in results.values())
+    unsure = sum(len(r.inconclusive) for r in results.values())
+    return (
+        f"{len(results)} experiments set {total} limits: {total - missed - unsure} are met, {missed} are missed and "
+        f"{unsure} are inconclusive."
+    )
+
+
+def _metrics(results: Mapping[str, Result]) -> Iterator[tuple[str, Result, Metric]]:
+    """All metrics that are in a result, in the order of their pages."""
     for name, result in results.items():
         module = import_module(EXPERIMENTS[name].module)
-        known = module.FIGURES if hasattr(module, "FIGURES") else module.figures(result.metrics)
-        of = ""
-        for figure in known:
-            same = figure.title.startswith("The same")
-            of = of if same else figure.title
-            if figure.name in result.metrics:
-                title = f"{of}: t{figure.title[1:]}" if same else figure.title
-                yield name, result, replace(figure, title=title)
+        for metric in module.page_of(result, {}).metrics:
+            if metric.name in result.metrics:
+                yield name, result, metric

@@ -1,4 +1,8 @@
-"""The experiments by name.  Each module has ``run(options, console) -> Result``, imported when it is asked for."""
+"""The experiments by name.
+
+Each module has ``run(options, console) -> Result`` and ``page_of(result, trials) -> Page``; it is imported when it is
+used.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +19,10 @@ from experiments.common.result import Result
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What the command line says; ``trials``, ``repetitions`` and ``minutes`` None are the experiment's default,
-    ``docs`` the folder to refresh, ``bus`` where the frames of a live experiment travel (wire or vcan), ``data`` a
-    folder to judge on.
+    """Options of the command line.
+
+    ``trials``, ``repetitions`` and ``minutes``: None is the default of the experiment.  ``docs``: folder whose page is
+    rewritten.  ``bus``: bus of a live experiment (wire or vcan).  ``data``: folder with data to evaluate.
     """
 
     seed: int
@@ -36,7 +41,7 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What an experiment is about, and where it is."""
+    """The question that an experiment answers, and its module."""
 
     sentence: str
     module: str
@@ -48,61 +53,63 @@ EXPERIMENTS: Final = {
         "experiments.plant.experiment",
     ),
     "calibration": Entry(
-        "Does calibration recover what the plant hides? Dead-bands, gains, delays, zeros, sag; many individuals.",
+        "Does calibration recover the hidden truth? Dead-bands, gains, dead times, zeros, sag; many individuals.",
         "experiments.calibration.experiment",
     ),
     "joint-tracking": Entry(
-        "Which joint law follows best, rests nearest and quiets its valves? Four laws, both machines, disturbances.",
+        "Which joint law tracks best, rests nearest and closes its valves? Four laws, both machines, disturbances.",
         "experiments.joint_tracking.experiment",
     ),
     "crane-accuracy": Entry(
-        "How near does the tip come to its goal, by encoders and in truth? Paper B's four goals, calibrated machines.",
+        "How near does the tip come to its goal, by encoders and truly? Paper B's four goals, calibrated machines.",
         "experiments.crane_accuracy.experiment",
     ),
     "timing": Entry(
-        "Does the controller wake on time and cost little? Beside cyclictest and a plain loop, quiet and loaded.",
+        "Does the controller wake on time and cost little? Compared with cyclictest and a sleep loop, quiet and "
+        "loaded.",
         "experiments.timing.experiment",
     ),
     "plc": Entry(
-        "Does a PLC between crane0 and the valves do the job as well? Both roles beside CAN: logs, accuracy, latency.",
+        "Does a PLC between crane0 and the valves work as well? Both roles compared with CAN: logs, accuracy, latency.",
         "experiments.plc.experiment",
     ),
     "grasp-network": Entry(
-        "Is it paper A's network, what has it learnt, what does a picture cost? Parameters, Cornell folds, latency.",
+        "Is it paper A's network, what has it learnt, how fast is it? Parameters, Cornell folds, latency.",
         "experiments.grasp_network.experiment",
     ),
     "detector": Entry(
-        "Are logs found in worlds that look otherwise than those of the training? mAP of boxes and masks; photographs.",
+        "Are logs found in worlds unlike those of the training? mAP of boxes and masks; photographs.",
         "experiments.detector.experiment",
     ),
     "log-localization": Entry(
-        "Where is the log? Paper B's approach to two logs at 0, 45 and 90 degrees: its own pipeline and ours.",
+        "How precisely is a log located? Paper B's approach to logs at 0, 45 and 90 degrees: its pipeline and ours.",
         "experiments.log_localization.experiment",
     ),
     "grasp-configs": Entry(
-        "How many grasps hold, how good are they? Paper A's twelve configurations, camera to lift, three planners.",
+        "How many grasps succeed, how good are they? Paper A's twelve configurations, camera to lift, three planners.",
         "experiments.grasp_configs.experiment",
     ),
     "navigation": Entry(
-        "Does the machine find its path and stay on it? Paper B's four waypoints, six starts, mud, slope; both ways.",
+        "Does the machine follow its path? Paper B's four waypoints, six starts, mud, slope; both methods.",
         "experiments.navigation.experiment",
     ),
     "forwarding-mission": Entry(
-        "Does the forwarder bring in 24 logs alone? Paper B's trial both ways; other fields, other machines.",
+        "Does the forwarder load 24 logs by itself? Paper B's trial by both methods; other fields, other machines.",
         "experiments.forwarding_mission.experiment",
     ),
     "productivity": Entry(
-        "How much wood in an hour? Single logs, piles, a full bunk unloaded; beside the shortest possible and people.",
+        "How much wood per hour? Single logs, piles, unloading; compared with the shortest possible time and "
+        "operators.",
         "experiments.productivity.experiment",
     ),
     "soak": Entry(
-        "Does nothing grow and no frame get lost in half an hour at the control rate?",
+        "Does memory stay constant and is no frame lost in half an hour at the control rate?",
         "experiments.timing.soak",
     ),
 }
 
 
 def load(name: str) -> Callable[[Options, Console], Result]:
-    """The experiment's ``run``."""
+    """The ``run`` function of an experiment."""
     runner: Callable[[Options, Console], Result] = import_module(EXPERIMENTS[name].module).run
     return runner

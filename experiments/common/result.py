@@ -1,8 +1,8 @@
-"""What an experiment leaves behind: figures with their limits, and result.json (docs/architecture.md, "Experiments").
+"""The result of an experiment: metrics with their limits, and result.json (docs/architecture.md, "Experiments").
 
-``metrics`` is a flat map from name to number; a rate has its Wilson 95 % interval beside it as ``NAME_low`` and
-``NAME_high``.  ``limits`` holds [least, most] (null: open) and ``missed`` the names outside theirs.  A clocked figure
-that misses its limit on a noisy host is ``inconclusive`` instead: noise can only slow a run down.
+``metrics`` is a flat map from name to number.  A rate comes with its Wilson 95 % interval as ``NAME_low`` and
+``NAME_high``.  ``limits`` holds [least, most] (null: no limit) and ``missed`` the names outside theirs.  A clocked
+metric that misses its limit on a noisy host is ``inconclusive`` instead, because noise only slows a run down.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Z_95: Final = 1.959963984540054
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
-    """One figure: key in ``metrics``, what it is, unit, how it is measured, limits (None: only reported).
+class Metric:
+    """One metric: its key in ``metrics``, title, printed unit, how it is measured, limits (None: only reported).
 
-    ``scale`` turns the number into the printed unit.  ``clocked``: depends on the host's clock.
+    ``scale`` converts the number into the printed unit.  ``clocked``: the number depends on the host's speed.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Figure:
     clocked: bool = False
 
     def holds(self, value: float) -> bool:
-        """Whether a value is finite and inside the limits."""
+        """Whether a value is finite and within the limits."""
         low = self.least is None or value >= self.least
         high = self.most is None or value <= self.most
         return math.isfinite(value) and low and high
@@ -58,7 +58,7 @@ class Figure:
 
 
 def _digits(value: float) -> str:
-    """Four digits, but a great whole number in full."""
+    """Four significant digits; a large whole number in full."""
     return f"{value:.0f}" if value >= 1e4 and value.is_integer() else f"{value:.4g}"
 
 
@@ -78,13 +78,13 @@ class Result:
     missed: tuple[str, ...] = ()
     inconclusive: tuple[str, ...] = ()
 
-    def interval_text(self, figure: Figure) -> str:
-        """The interval beside a rate, with the number of trials; empty for other figures."""
-        low, high = (self.metrics.get(f"{figure.name}_{end}") for end in ("low", "high"))
+    def interval_text(self, metric: Metric) -> str:
+        """The interval of a rate with its number of trials; empty for other metrics."""
+        low, high = (self.metrics.get(f"{metric.name}_{end}") for end in ("low", "high"))
         if low is None or high is None:
             return ""
-        n = self.metrics[f"{figure.name}_n"]
-        return f" ({low * figure.scale:.1f} to {high * figure.scale:.1f}, n = {n:.0f})"
+        n = self.metrics[f"{metric.name}_n"]
+        return f" ({low * metric.scale:.1f} to {high * metric.scale:.1f}, n = {n:.0f})"
 
     def save(self, path: Path) -> None:
         """Write it as JSON with sorted metrics."""
@@ -92,24 +92,24 @@ class Result:
         path.write_text(self.json() + "\n")
 
     def json(self) -> str:
-        """result.json as text; a figure that is no number stands as null."""
+        """result.json as text; a metric without a number is null."""
         document = asdict(self)
         document["metrics"] = {k: v if math.isfinite(v) else None for k, v in sorted(self.metrics.items())}
         return json.dumps(document, indent=2)
 
 
-def judge(
-    figures: Iterable[Figure], metrics: Mapping[str, float], noisy: bool
+def evaluate(
+    definitions: Iterable[Metric], metrics: Mapping[str, float], noisy: bool
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the figures that are missed, and of those a noisy host leaves open."""
-    failed = [f for f in figures if f.name in metrics and not f.holds(metrics[f.name])]
-    open_ = tuple(f.name for f in failed if f.clocked and noisy)
-    return tuple(f.name for f in failed if f.name not in open_), open_
+    """Names of the metrics that miss their limit, and of those that a noisy host leaves inconclusive."""
+    failed = [m for m in definitions if m.name in metrics and not m.holds(metrics[m.name])]
+    inconclusive = tuple(m.name for m in failed if m.clocked and noisy)
+    return tuple(m.name for m in failed if m.name not in inconclusive), inconclusive
 
 
-def judged(
+def make_result(
     experiment: str,
-    figures: Sequence[Figure],
+    definitions: Sequence[Metric],
     metrics: dict[str, float],
     *,
     profile: str,
@@ -119,8 +119,8 @@ def judged(
     paper: Mapping[str, float] | None = None,
     noisy: bool = False,
 ) -> Result:
-    """The result of an experiment whose figures all have one judge; ``more`` is told beside the host's environment."""
-    missed, inconclusive = judge(figures, metrics, noisy)
+    """The result of an experiment, evaluated against its limits; ``more`` is added to the host's environment."""
+    missed, inconclusive = evaluate(definitions, metrics, noisy)
     return Result(
         experiment=experiment,
         commit=commit(),
@@ -130,10 +130,15 @@ def judged(
         metrics=metrics,
         paper=dict(paper or {}),
         environment={**environment(), **more},
-        limits={f.name: (f.least, f.most) for f in figures if f.least is not None or f.most is not None},
+        limits=limits_of(definitions),
         missed=missed,
         inconclusive=inconclusive,
     )
+
+
+def limits_of(definitions: Iterable[Metric]) -> dict[str, tuple[float | None, float | None]]:
+    """(least, most) of every metric that has a limit."""
+    return {m.name: (m.least, m.most) for m in definitions if m.least is not None or m.most is not None}
 
 
 def wilson(hits: int, n: int) -> tuple[float, float]:
@@ -153,7 +158,7 @@ def rate(name: str, hits: int, n: int) -> dict[str, float]:
 
 
 def mean(values: Sequence[float]) -> float:
-    """Of nothing it is NaN."""
+    """Arithmetic mean; NaN without values."""
     return sum(values) / len(values) if values else math.nan
 
 
@@ -172,7 +177,7 @@ def _git(*arguments: str) -> str:
 
 
 def environment() -> dict[str, str]:
-    """Where the figures were measured."""
+    """The host and the packages that measured."""
     versions = {}
     for name in PACKAGES:
         try:

@@ -1,127 +1,179 @@
-"""The page of an experiment in docs/: written from its result and pictures, never by hand."""
+"""The result page of an experiment in docs/: conclusion and one plot first, then the method, then the tables.
+
+Input: a saved `Result` and the `Page` that its experiment makes from it.  Output: Markdown, result.json and the plots.
+No number on a page is typed: a conclusion is a template whose names are metrics.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from rich.console import Console
 
 from experiments.common import overview
 from experiments.common.registry import Options
-from experiments.common.result import Figure, Result
+from experiments.common.result import Metric, Result
+
+_FIELD: Final = re.compile(r"\{(paper:)?([^{}]+)\}")
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A heading of the page: an introduction, its figures, and pictures (file name, caption)."""
+    """A heading of the page: a text, its metrics as a table, and plots (file name, caption)."""
 
     title: str
     text: str
-    figures: tuple[Figure, ...]
-    pictures: tuple[tuple[str, str], ...] = ()
+    metrics: tuple[Metric, ...]
+    plots: tuple[tuple[str, str], ...] = ()
 
 
-def tell(
-    result: Result,
-    title: str,
-    introduction: str,
-    sections: Sequence[Section],
-    options: Options,
-    console: Console,
-    setting: str | None = None,
-) -> None:
-    """Save the result beside its pictures in ``options.out``, show it, and refresh the docs when asked."""
-    result.save(options.out / "result.json")
-    show(result, sections, console)
-    if options.docs is not None:
-        refresh(result, title, introduction, sections, options.out, options.docs, setting)
+@dataclass(frozen=True, slots=True)
+class Page:
+    """What a result page says beside the numbers.
 
-
-def refresh(
-    result: Result,
-    title: str,
-    introduction: str,
-    sections: Sequence[Section],
-    pictures: Path,
-    docs: Path,
-    setting: str | None = None,
-) -> None:
-    """Write ``docs/NAME.md``, ``docs/results/NAME.json``, the pictures beside it in ``docs/results/NAME``, and the page
-    of all experiments anew.
-
-    ``setting`` says what was measured where, in place of the usual sentence on profile, truth and packages.
+    ``conclusion``: templates of sentences in which ``{name}`` stands for the value of a metric with its unit, and
+    ``{paper:name}`` for the paper's.  A sentence with a metric that the result lacks is left out.  ``setting``: what
+    was measured where, in place of the usual sentence on profile, truth and packages.
     """
+
+    title: str
+    conclusion: tuple[str, ...]
+    introduction: str
+    sections: tuple[Section, ...]
+    setting: str = ""
+    command: str = ""
+    """What repeats the measurement, if not ``timberhand experiment NAME --docs docs``."""
+
+    @property
+    def metrics(self) -> tuple[Metric, ...]:
+        """Those of all sections, in their order."""
+        return tuple(m for section in self.sections for m in section.metrics)
+
+
+def publish(result: Result, page: Page, options: Options, console: Console) -> None:
+    """Save the result beside its plots in ``options.out``, print it, and write the docs if asked to."""
+    result.save(options.out / "result.json")
+    show(result, page.sections, console)
+    if options.docs is not None:
+        write(result, page, options.out, options.docs)
+
+
+def write(result: Result, page: Page, plots: Path, docs: Path) -> None:
+    """Write ``docs/NAME.md``, ``docs/results/NAME.json``, its plots in ``docs/results/NAME``, and the overview page."""
     name = result.experiment
     result.save(docs / "results" / f"{name}.json")
     folder = docs / "results" / name
     folder.mkdir(parents=True, exist_ok=True)
-    for section in sections:
-        for file, _ in section.pictures:
-            shutil.copyfile(pictures / file, folder / file)
-    (docs / f"{name}.md").write_text(page(result, title, introduction, sections, setting))
+    for section in page.sections:
+        for file, _ in section.plots:
+            shutil.copyfile(plots / file, folder / file)
+    (docs / f"{name}.md").write_text(markdown(result, page))
     overview.write(docs)
+
+
+def markdown(result: Result, page: Page) -> str:
+    """The page as Markdown."""
+    first = next((plot for section in page.sections for plot in section.plots), None)
+    out = [f"# {page.title}", "", conclusion(result, page), ""]
+    out += [*_plot(result, *first), ""] if first else []
+    numbers = f"[results/{result.experiment}.json](results/{result.experiment}.json) holds all numbers."
+    command = f"`{page.command or f'timberhand experiment {result.experiment} --docs docs'}` repeats the measurement."
+    out += ["## Method", "", page.introduction, "", f"{page.setting or _setting(result)} {command} {numbers}", ""]
+    for section in page.sections:
+        out += [f"## {section.title}", ""]
+        out += [section.text, ""] if section.text else []
+        shown = [m for m in section.metrics if m.name in result.metrics]
+        out += ["| metric | measured | limit | |", "|---|---|---|---|"] if shown else []
+        for m in shown:
+            value = m.text(result.metrics[m.name]) + result.interval_text(m)
+            paper = f" (paper: {m.text(result.paper[m.name])})" if m.name in result.paper else ""
+            out.append(f"| {m.title} | {value}{paper} | {m.limit_text()} | {_state(m, result)} |")
+        out += ["", "How each is measured:", ""] if shown else []
+        out += [f"- *{m.title}*: {m.how}" for m in shown]
+        out += [""] if shown else []
+        for plot in section.plots:
+            out += [*_plot(result, *plot), ""] if plot != first else []
+    return "\n".join(out).rstrip() + "\n"
+
+
+def conclusion(result: Result, page: Page) -> str:
+    """What was found, in one paragraph: the page's sentences, then how many limits are met and which are not."""
+    by_name = {m.name: m for m in page.metrics}
+    said = [_sentence(result, by_name, template) for template in page.conclusion]
+    return " ".join(s for s in (*said, limits_sentence(result, page.metrics)) if s)
+
+
+def _sentence(result: Result, metrics: dict[str, Metric], template: str) -> str:
+    """The template with its values; empty when one of them is missing."""
+    for paper, name in _FIELD.findall(template):
+        value = (result.paper if paper else result.metrics).get(name, math.nan)
+        if name not in metrics or math.isnan(value):
+            return ""
+    return _FIELD.sub(
+        lambda m: metrics[m.group(2)].text((result.paper if m.group(1) else result.metrics)[m.group(2)]), template
+    )
+
+
+def limits_sentence(result: Result, metrics: Iterable[Metric]) -> str:
+    """How many limits are met, and every metric that is missed or inconclusive."""
+    total, missed, unsure = len(result.limits), len(result.missed), len(result.inconclusive)
+    if not total:
+        return ""
+    by_name = {m.name: m for m in metrics}
+    parts = [{1: "The limit is met.", 2: "Both limits are met."}.get(total, f"All {total} limits are met.")]
+    if missed or unsure:
+        parts = [f"{total - missed - unsure} of {total} limits are met."]
+    for word, names in (("Missed", result.missed), ("Inconclusive", result.inconclusive)):
+        named = [by_name[n] for n in names if n in by_name]
+        listed = "; ".join(f"{m.title} ({m.text(result.metrics[m.name])}, limit {m.limit_text()})" for m in named)
+        parts += [f"{word}: {listed}."] if listed else []
+    return " ".join(parts)
+
+
+def _plot(result: Result, file: str, caption: str) -> tuple[str, ...]:
+    return f"![{caption}](results/{result.experiment}/{file})", "", f"*{caption}*"
 
 
 def _setting(result: Result) -> str:
     e = result.environment
     return (
-        f"Profile `{result.profile}`, truth `{e.get('truth', '')}`, seed {result.seed}, {result.trials} trials of each "
-        f"kind, commit `{result.commit}`. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python "
+        f"Profile `{result.profile}`, ground truth `{e.get('truth', '')}`, seed {result.seed}, {result.trials} trials "
+        f"of each kind, commit `{result.commit}`. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python "
         f"{e['python']}, pybullet {e['pybullet']}, numba {e['numba']}."
     )
 
 
-def page(result: Result, title: str, introduction: str, sections: Sequence[Section], setting: str | None = None) -> str:
-    """The page as Markdown."""
-    numbers = (
-        "All numbers, with the ones that have no row "
-        f"here: [results/{result.experiment}.json](results/{result.experiment}.json)."
-    )
-    out = [f"# {title}", "", introduction, "", f"{setting or _setting(result)} {numbers}", ""]
-    for section in sections:
-        out += [f"## {section.title}", "", section.text]
-        shown = [f for f in section.figures if f.name in result.metrics]
-        out += ["", "| what | measured | limit | |", "|---|---|---|---|"] if shown else []
-        for f in shown:
-            value = f.text(result.metrics[f.name]) + result.interval_text(f)
-            paper = f" (paper: {f.text(result.paper[f.name])})" if f.name in result.paper else ""
-            out.append(f"| {f.title} | {value}{paper} | {f.limit_text()} | {_verdict(f, result)} |")
-        out += ["", "How:", ""] if shown else []
-        out += [f"- *{f.title}.* {f.how}" for f in shown]
-        for file, caption in section.pictures:
-            out += ["", f"![{caption}](results/{result.experiment}/{file})", "", f"*{caption}*"]
-        out.append("")
-    return "\n".join(out).rstrip() + "\n"
-
-
-def _verdict(figure: Figure, result: Result) -> str:
-    if not figure.limit_text():
+def _state(metric: Metric, result: Result) -> str:
+    if not metric.limit_text():
         return ""
-    if figure.name in result.missed:
+    if metric.name in result.missed:
         return "**missed**"
-    return "inconclusive" if figure.name in result.inconclusive else "reached"
+    return "inconclusive" if metric.name in result.inconclusive else "met"
 
 
 def show(result: Result, sections: Sequence[Section], console: Console) -> None:
-    """The figures as a list for a person."""
+    """Print the metrics as a list."""
     for section in sections:
-        shown = [f for f in section.figures if f.name in result.metrics]
+        shown = [m for m in section.metrics if m.name in result.metrics]
         if shown:
             console.print(f"\n[bold]{section.title}[/bold]", highlight=False)
-        for f in shown:
-            console.print(_line(f, result), highlight=False, soft_wrap=True)
+        for m in shown:
+            console.print(_line(m, result), highlight=False, soft_wrap=True)
 
 
-def _line(f: Figure, result: Result) -> str:
-    mark = "[dim]·[/dim]" if not f.limit_text() else "[green]✔[/green]"
-    if f.name in result.missed:
+def _line(metric: Metric, result: Result) -> str:
+    mark = "[dim]·[/dim]" if not metric.limit_text() else "[green]✔[/green]"
+    if metric.name in result.missed:
         mark = "[red]✘[/red]"
-    elif f.name in result.inconclusive:
+    elif metric.name in result.inconclusive:
         mark = "[yellow]?[/yellow]"
-    interval = result.interval_text(f)
-    limit = f"[dim]({f.limit_text()})[/dim]" if f.limit_text() else ""
-    note = " [yellow]inconclusive: this run cannot tell[/yellow]" if f.name in result.inconclusive else ""
-    return f"{mark} {f.title}: {f.text(result.metrics[f.name])}{interval} {limit}{note}"
+    interval = result.interval_text(metric)
+    limit = f"[dim]({metric.limit_text()})[/dim]" if metric.limit_text() else ""
+    note = " [yellow]inconclusive[/yellow]" if metric.name in result.inconclusive else ""
+    return f"{mark} {metric.title}: {metric.text(result.metrics[metric.name])}{interval} {limit}{note}"

@@ -1,4 +1,4 @@
-"""What experiments of many trials share: a truth that can be used, a checkpoint of their own, failures told by name."""
+"""Helpers for experiments with many trials: checks of the truth, the checkpoint, and printed failures."""
 
 from __future__ import annotations
 
@@ -12,29 +12,32 @@ from rich.console import Console
 from experiments.common.pool import Checkpoint
 from experiments.common.registry import Options
 from experiments.common.result import ROOT
-from experiments.common.worlds import opened, profile_named
+from experiments.common.worlds import profile_named, trial_world
 from host.exit_codes import CommandFailed, ExitCode
-from machine.load import profile_hash
+from machine.loading.profile_file import profile_hash
 
-SOURCES: Final = ("machine", "sim", "can_dbc", "hil/experiments")
+SOURCES: Final = ("machine", "sim", "can_dbc", "experiments")
+"""Folders of the checkout on which the outcome of every trial depends."""
+LOCKSTEP_SOURCES: Final = ("autonomy", "controller", "hil")
+"""Further folders on which trials of the whole machine in lockstep depend."""
 
 
-def individuals(truth: str) -> str:
-    """The truth of trials that are each of another individual: sampled, unless one was asked for."""
+def sampled_unless_given(truth: str) -> str:
+    """The truth for trials that each use another individual machine: sampled, unless the caller chose one."""
     return "sampled" if truth == "nominal" else truth
 
 
 def check_truth(profile: str, truth: str) -> None:
-    """Open a world of it once, before any trial does.
+    """Open one world with this truth, so that a truth that cannot be used fails before the first trial.
 
     Raises:
         CommandFailed: the truth file cannot be used.
     """
     try:
-        with opened(profile, truth, 0):
+        with trial_world(profile, truth, 0):
             pass
     except ValueError as error:
-        raise CommandFailed(ExitCode.CONFIGURATION, str(error)) from None
+        raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
 
 
 def checkpoint(
@@ -45,11 +48,11 @@ def checkpoint(
     sources: Sequence[str] = (),
     published: str = "",
 ) -> Checkpoint:
-    """The run's checkpoint in its folder; that of a run whose outcomes might be others is not continued.
+    """The checkpoint of a run in its folder.  It continues only a run with the same fingerprint.
 
-    ``asked``: what of the run decides them, jobs or seed and counts; ``sources``: folders and files of the checkout
-    that they depend on beside ``SOURCES``; ``published``: a file of the docs that holds all outcomes of a long run, so
-    that a later one goes on from there.
+    The fingerprint covers ``asked`` (the jobs, or seed and counts), the profiles, the truth, and the content of
+    ``SOURCES`` and of ``sources``, further folders and files of the checkout.  ``published``: a file in the docs with
+    all outcomes of a long run, from which a later run continues.
     """
     parts = [repr(asked), *(repr(profile_hash(profile_named(p))) for p in profiles), source_hash(*sources), truth]
     parts += [Path(truth).read_text()] if Path(truth).is_file() else []
@@ -59,7 +62,10 @@ def checkpoint(
 
 
 def source_hash(*more: str) -> str:
-    """Of ``SOURCES`` and further folders or files of the checkout."""
+    """Hash over the content of ``SOURCES`` and of further folders or files of the checkout.
+
+    One that does not exist counts as empty: a run after a move starts anew.
+    """
     digest = hashlib.sha256()
     for folder in (*SOURCES, *more):
         for path in sorted([ROOT / folder, *(ROOT / folder).rglob("*")]):
@@ -68,8 +74,8 @@ def source_hash(*more: str) -> str:
     return digest.hexdigest()[:16]
 
 
-def tell_failures(outcomes: Mapping[str, Any], console: Console) -> None:
-    """Why trials did not end well, by name."""
+def print_failures(outcomes: Mapping[str, Any], console: Console) -> None:
+    """Print why trials failed, by name."""
     for name, outcome in outcomes.items():
         if outcome.get("failure"):
             console.print(f"{name}: {outcome['failure']}", highlight=False)

@@ -1,4 +1,4 @@
-"""Worlds for the trials, and small readings of one that several trials need."""
+"""Physics worlds for trials, and helpers that read or load them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any, Final
 
-from machine.kinematics import Point, inverse, solve
-from machine.load import load_profile
+from machine.geometry.kinematics import Point, inverse, solve
+from machine.loading.profile_file import load_profile
 from machine.profile import Profile, joint_limits
-from sim.scenes.arrangements import LogSpec, arrangement
+from sim.scenes.arrangements import arrangement
+from sim.wood.log_shape import LogSpec
 from sim.world import World, open_world
 
 CARRIER_PROFILE: Final = "aoro_fc8"
@@ -20,17 +21,17 @@ ARM: Final = ("slew", "lift", "tilt", "ext")
 
 @cache
 def profile_named(name: str) -> Profile:
-    """A profile, read once per process."""
+    """The profile of that name or file, read once per process."""
     return load_profile(name)
 
 
 def carrier_profile(name: str) -> str:
-    """The profile itself when it has a carrier, else the shipped machine that has one."""
+    """The profile itself if it has a carrier, otherwise the shipped machine with one."""
     return name if profile_named(name).carrier is not None else CARRIER_PROFILE
 
 
 @contextmanager
-def opened(
+def trial_world(
     profile: str,
     truth: str,
     seed: int,
@@ -38,9 +39,9 @@ def opened(
     logs: int = 1,
     home: dict[str, float] | None = None,
 ) -> Iterator[World]:
-    """A world of one trial, closed at the end; the same arguments give the same world.
+    """A world for one trial, closed at the end; the same arguments give the same world.
 
-    A scene by name is an arrangement of ``sim.scenes.arrangements`` with so many logs.
+    A scene given by name is an arrangement of that many logs (`sim.scenes.arrangements`).
     """
     p = profile_named(profile)
     specs = arrangement(scene, p, wood_of(profile, truth), seed, logs) if isinstance(scene, str) else scene
@@ -53,13 +54,13 @@ def opened(
 
 @cache
 def wood_of(profile: str, truth: str) -> Any:
-    """What the logs of a truth are like; the same for every individual machine."""
-    with opened(profile, truth, 0) as world:
+    """Properties of the logs of a truth; the same for every individual machine."""
+    with trial_world(profile, truth, 0) as world:
         return world.truth.wood
 
 
 def home_at(profile: str, reach_m: float, height_m: float, ext_m: float | None = None) -> dict[str, float]:
-    """Joint positions with slew 0 and the pin at this reach and height in the base frame."""
+    """Joint positions with slew 0 and the hanger pin at this reach and height in the base frame."""
     p = profile_named(profile)
     turn = p.kinematics.theta1_offset_rad
     point = (reach_m * math.cos(turn), reach_m * math.sin(turn), height_m)
@@ -69,27 +70,27 @@ def home_at(profile: str, reach_m: float, height_m: float, ext_m: float | None =
 
 
 def to_base(world: World, point: Sequence[float]) -> Point:
-    """A point of the world in the crane's base frame."""
+    """Transform a point from the world frame to the crane's base frame."""
     p = world.client
     x, y, z = p.multiplyTransforms(*p.invertTransform(*world.base_pose()), point, (0.0, 0.0, 0.0, 1.0))[0]
     return x, y, z
 
 
 def yaw_in_base(world: World, axis: Sequence[float]) -> float:
-    """Direction [rad] of a horizontal axis of the world in the crane's base frame."""
+    """Direction [rad] of a horizontal axis, given in the world frame, in the crane's base frame."""
     foot, tip = to_base(world, (0.0, 0.0, 0.0)), to_base(world, axis)
     return math.atan2(tip[1] - foot[1], tip[0] - foot[0])
 
 
 def hang(world: World, mass_kg: float) -> None:
-    """Make the rotator heavier by a load, its inertia as before: a dense weight on the hook."""
+    """Hang a load on the hook: add its mass to the rotator and keep the inertia, as for a dense weight."""
     link = world.crane.link["rotator"]
     own = world.truth.links["rotator"].mass_kg
     world.client.changeDynamics(world.crane.body, link, mass=own + mass_kg)
 
 
 def mass_points(world: World, links: Sequence[str]) -> list[tuple[float, Point]]:
-    """Mass [kg] and centre of mass in the world of the given links."""
+    """Mass [kg] and centre of mass [m] in the world frame of each link."""
     p, body = world.client, world.crane.body
     out = []
     for name in links:
@@ -99,7 +100,7 @@ def mass_points(world: World, links: Sequence[str]) -> list[tuple[float, Point]]
 
 
 def step_neutral(world: World, steps: int) -> None:
-    """Every spool shut."""
+    """Advance the physics with every spool closed."""
     neutral = [0.0] * len(world.functions)
     for _ in range(steps):
         world.step(neutral)

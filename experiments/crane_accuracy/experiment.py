@@ -1,4 +1,4 @@
-"""The crane-accuracy experiment: machines are calibrated, then every variant moves on them; judged, drawn, written."""
+"""The crane-accuracy experiment: calibrates machines, lets every variant move on them, publishes the result."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import Result, judged
-from experiments.common.result_page import tell
-from experiments.common.trials import check_truth, checkpoint, individuals, tell_failures
+from experiments.common.result import Result, make_result
+from experiments.common.result_page import Page, publish
+from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, print_failures, sampled_unless_given
 from experiments.common.worlds import carrier_profile, profile_named
-from experiments.crane_accuracy.metrics import FIGURES, INTRODUCTION, PAPER, SECTIONS, gather
+from experiments.crane_accuracy.metrics import CONCLUSION, INTRODUCTION, METRICS, PAPER, SECTIONS, gather
 from experiments.crane_accuracy.plan import (
     GOALS_M,
     OWN,
@@ -35,20 +35,19 @@ QUICK_MACHINES: Final = 1
 QUICK_REPETITIONS: Final = 2
 QUICK_GOALS: Final = (0, 2)
 FIRST_SEED: Final = 20_000
-"""Judged on machines that nobody looked at while plans and laws were made."""
+"""These machines were not looked at while plans and laws were developed."""
 SEEDS_PER_RUN: Final = 1000
 TRACED_GOAL: Final = 2
 TRACED: Final = (OWN, UNSHAPED, UNCOMPENSATED)
-SOURCES: Final = ("autonomy", "controller", "hil/harness/lockstep.py", "hil/calibration/crane.py", "hil/harness/operator.py")
 
 
 def run(options: Options, console: Console) -> Result:
-    """Measure everything; writes ``options.out`` and, when asked, the docs.
+    """Run the experiment; write ``options.out`` and, if requested, the docs.
 
     Raises:
-        Stopped: the truth file cannot be used.
+        CommandFailed: the truth file cannot be used.
     """
-    name, truth = carrier_profile(options.profile), individuals(options.truth)
+    name, truth = carrier_profile(options.profile), sampled_unless_given(options.truth)
     check_truth(name, truth)
     machines = options.trials or (QUICK_MACHINES if options.quick else MACHINES)
     own_law = law_of(profile_named(name))
@@ -57,27 +56,33 @@ def run(options: Options, console: Console) -> Result:
         Job(f"{i}/calibration", "calibration", s, {"profile": name, "truth": truth}) for i, s in enumerate(seeds)
     ]
     asked = (options.quick, options.repetitions)
-    with checkpoint(options, (calibrations, asked, GOALS_M), [name], truth, SOURCES) as kept:
+    with checkpoint(options, (calibrations, asked, GOALS_M), [name], truth, LOCKSTEP_SOURCES) as kept:
         texts = pool.run(perform, calibrations, kept, options.workers, "calibrations", console)
         jobs = motions(calibrations, texts, variants(own_law), *asked)
         outcomes = texts | pool.run(perform, jobs, kept, options.workers, "runs with motions", console)
         often = str(options.repetitions or REPETITIONS)
-        result = judged(
-            "crane-accuracy", FIGURES, gather(outcomes, own_law), profile=name, seed=options.seed, trials=machines,
+        result = make_result(
+            "crane-accuracy", METRICS, gather(outcomes, own_law), profile=name, seed=options.seed, trials=machines,
             more={"truth": truth, "law": own_law, "repetitions": often}, paper=PAPER,
         )  # fmt: skip
         draw(outcomes, profile_named(name).kinematics, options.out)
-        tell_failures(texts, console)
-        words = INTRODUCTION.format(repetitions=often)
-        tell(result, "Crane accuracy, measured", words, SECTIONS, options, console)
+        print_failures(texts, console)
+        publish(result, page_of(result, {}), options, console)
     return result
+
+
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page."""
+    introduction = INTRODUCTION.format(repetitions=result.environment["repetitions"])
+    return Page("Crane accuracy", CONCLUSION, introduction, SECTIONS)
 
 
 def motions(
     calibrations: list[Job], texts: Mapping[str, Any], names: tuple[str, ...], quick: bool, own: int | None
 ) -> list[Job]:
-    """One job for every machine that has a calibrated profile, and variant, the longest first; ``own`` are the
-    repetitions of the profile's own law, None for paper B's.
+    """One job for every variant on every machine with a calibrated profile, the longest first.
+
+    ``own``: repetitions with the law of the profile; None: as many as paper B made.
     """
     jobs = []
     for variant in names:

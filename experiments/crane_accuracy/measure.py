@@ -1,8 +1,8 @@
-"""What one motion was worth, from what was seen of it: errors at rest, time, swing, quiet valves.
+"""Metrics of one motion from its trace: errors at rest, motion time, swing, share of closed valves.
 
-Times in s from the begin of the reference.  The motion is over when the pin by encoder kinematics is within `NEAR_M` of
-its end and stays; it arrived when, besides, the reference is at its end.  Swing counts from the end of the reference:
-the grapple does not wait for the pin to settle.
+Times are in s from the start of the reference.  A motion ends when the pin, by encoder kinematics, stays within
+`NEAR_M` of its end point.  It has arrived when, in addition, the reference is at its end.  Swing counts from the end of
+the reference, whether or not the pin has settled.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 
 NEAR_M: Final = 0.02
 REST_S: Final = (2.5, 3.0)
-"""After arrival: the mean of this stretch is where the crane rests."""
+"""Interval after arrival whose mean is the rest position of the crane."""
 SWING_S: Final = (1.0, 3.0)
-"""After the end of the reference."""
+"""Interval after the end of the reference in which swing counts."""
 QUIET_S: Final = 2.0
 
 
@@ -34,9 +34,11 @@ class Trace:
     shut: np.ndarray
 
 
-def figures(trace: Trace, commanded_m: Any, goal_m: Any, reference_end_s: float) -> dict[str, Any]:
-    """Plain data: vectors [m] of the encoder error (reached less commanded), of encoders and true pin against the goal,
-    motion time [s] (None when the pin did not stay near its end), swing [deg], counts of shut and of all commands.
+def motion_metrics(trace: Trace, commanded_m: Any, goal_m: Any, reference_end_s: float) -> dict[str, Any]:
+    """Metrics of one motion as plain data.
+
+    Vectors [m]: encoder error (reached less commanded), encoders and true pin relative to the goal.  ``motion_s`` is
+    None if the pin did not stay near its end.  ``shut`` of ``commands`` valve commands after settling were zero.
     """
     near = np.linalg.norm(trace.encoder_m - commanded_m, axis=1) <= NEAR_M
     away = np.flatnonzero(~near)
@@ -60,7 +62,7 @@ def figures(trace: Trace, commanded_m: Any, goal_m: Any, reference_end_s: float)
     }
 
 
-def _within(time_s: np.ndarray, from_s: float, stretch: tuple[float, float]) -> np.ndarray:
-    """Samples of a stretch after a time; the last half second of a record that is too short for it."""
-    found = (time_s >= from_s + stretch[0]) & (time_s <= from_s + stretch[1])
+def _within(time_s: np.ndarray, from_s: float, interval: tuple[float, float]) -> np.ndarray:
+    """Samples in an interval after a time; the last half second if the trace is too short."""
+    found = (time_s >= from_s + interval[0]) & (time_s <= from_s + interval[1])
     return found if found.any() else time_s >= time_s[-1] - 0.5

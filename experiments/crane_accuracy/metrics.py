@@ -1,4 +1,4 @@
-"""What the crane-accuracy experiment reports: figures with their limits, how the motions become metrics, the page."""
+"""Metrics of the crane-accuracy experiment with their limits, and the page that shows them."""
 
 from __future__ import annotations
 
@@ -7,142 +7,153 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments.common.result import Figure, rate
+from experiments.common.result import Metric, rate
 from experiments.common.result_page import Section
 from experiments.crane_accuracy.plan import LAWS, OWN, UNCALIBRATED, UNCOMPENSATED, UNSHAPED
 
 MM, PERCENT = 1e3, 100.0
 PAPER: Final = {"encoder_error_mean_m": 0.08, "encoder_error_xy_mean_m": 0.04, "encoder_error_z_mean_m": 0.06}
-"""Paper B, Fig. 20: means of 80 points, tip by forward kinematics of the joint sensors."""
+"""Paper B, Fig. 20: means of 80 points, tip from forward kinematics of the joint sensors."""
 
 
-def _mm(name: str, title: str, how: str, most: float | None = None) -> Figure:
-    return Figure(name, title, "mm", how, most=most, scale=MM)
+CONCLUSION: Final = (
+    "By encoders the tip comes to rest {encoder_error_mean_m} from its goal on average (paper B: "
+    "{paper:encoder_error_mean_m}); the true pin is {tip_error_mean_m} from the goal.",
+    "A motion takes {time_ratio} times the shortest time that the machine allows, and shaped references reduce the "
+    "swing of the grapple by {sway_reduction}.",
+)
+INTRODUCTION: Final = (
+    "This experiment repeats paper B's test of the crane (4.1.2, 5.1.3) on `aoro_fc8`: motions from the middle of the "
+    "trail to [4.27, ±1.86, 1] and [6, ±1.86, 1] m in the crane's base frame, {repetitions} of each on every machine "
+    "(paper B: 20 on one machine), half of them empty, half with 200 kg on the hook. Every machine is another "
+    "individual drawn from the truth's spread and calibrated first with `timberhand calibrate`, survey included. "
+    "Controller, guard, bus and plant run in lockstep. The paper does not state where its motions start. Here the pin "
+    "starts 3 m from the slew axis and 3.5 m high above the middle line of the bunk, so that the open grapple stays "
+    "clear of the stakes."
+)
+
+
+def _mm(name: str, title: str, how: str, most: float | None = None) -> Metric:
+    return Metric(name, title, "mm", how, most=most, scale=MM)
 
 
 ACCURACY: Final = (
-    _mm("encoder_error_mean_m", "By encoder kinematics, 3-D, mean",
-        "Distance of the hanger pin by the controller's joint positions from the place where the encoders were sent, "
-        "mean of half a second, 3 s after arrival; all machines, goals, repetitions and loads.", 0.010),
-    _mm("encoder_error_xy_mean_m", "The same, horizontal", "The same points.", 0.007),
-    _mm("encoder_error_z_mean_m", "The same, height", "The same points."),
-    _mm("encoder_error_p95_m", "The same, 3-D, 95 of 100 are below", "The same points.", 0.020),
-    _mm("encoder_error_max_m", "The same, 3-D, worst", "The same points."),
-    _mm("encoder_error_empty_mean_m", "The same, 3-D, grapple empty, mean", "Half of the points."),
-    _mm("encoder_error_loaded_mean_m", "The same, 3-D, with 200 kg, mean", "The other half."),
-    _mm("tip_error_mean_m", "True pin against the goal, 3-D, mean",
-        "Where the pin really is in the crane's base frame, from the plant; same times.", 0.03),
-    _mm("tip_error_p95_m", "The same, 95 of 100 are below", "The same points."),
-    _mm("tip_error_empty_mean_m", "The same, grapple empty, mean", "Half of the points."),
-    _mm("tip_error_loaded_mean_m", "The same, with 200 kg, mean", "The other half."),
-    _mm("aim_offset_mean_m", "How far beside the goal the encoders are sent, mean",
-        "What the profile's sag model adds for the lean of the column."),
-    _mm("tip_error_uncorrected_mean_m", "True pin against the goal without sag compensation, mean",
+    _mm("encoder_error_mean_m", "Error by encoders, 3-D, mean",
+        "Distance of the hanger pin, by the controller's joint positions, from the point to which the encoders were "
+        "commanded; mean over half a second, 3 s after arrival; all machines, goals, repetitions and loads.", 0.010),
+    _mm("encoder_error_xy_mean_m", "Error by encoders, horizontal, mean", "The same points.", 0.007),
+    _mm("encoder_error_z_mean_m", "Error by encoders, height, mean", "The same points."),
+    _mm("encoder_error_p95_m", "Error by encoders, 3-D, 95th percentile", "The same points.", 0.020),
+    _mm("encoder_error_max_m", "Error by encoders, 3-D, worst", "The same points."),
+    _mm("encoder_error_empty_mean_m", "Error by encoders, 3-D, grapple empty, mean", "Half of the points."),
+    _mm("encoder_error_loaded_mean_m", "Error by encoders, 3-D, with 200 kg, mean", "The other half."),
+    _mm("tip_error_mean_m", "True pin from the goal, 3-D, mean",
+        "Position of the pin in the crane's base frame, from the plant's ground truth; same times.", 0.03),
+    _mm("tip_error_p95_m", "True pin from the goal, 3-D, 95th percentile", "The same points."),
+    _mm("tip_error_empty_mean_m", "True pin from the goal, grapple empty, mean", "Half of the points."),
+    _mm("tip_error_loaded_mean_m", "True pin from the goal, with 200 kg, mean", "The other half."),
+    _mm("aim_offset_mean_m", "Offset of the commanded encoder position from the goal, mean",
+        "The correction of the profile's sag model for the lean of the column."),
+    _mm("tip_error_uncorrected_mean_m", "True pin from the goal without sag compensation, mean",
         "The calibrated profile without its sag table."),
-    _mm("uncompensated_encoder_error_mean_m", "By encoder kinematics against the goal itself, without sag compensation",
-        "The same motions; here the encoders are sent to the goal, as in paper B."),
-    _mm("uncalibrated_error_mean_m", "By encoder kinematics against the goal before calibration, mean",
+    _mm("uncompensated_encoder_error_mean_m", "Error by encoders against the goal without sag compensation, mean",
+        "The same motions; the encoders are commanded to the goal itself, as in paper B."),
+    _mm("uncalibrated_error_mean_m", "Error by encoders against the goal before calibration, mean",
         "The profile as shipped, on the same individuals.", 0.06),
-    _mm("uncalibrated_tip_error_mean_m", "True pin against the goal before calibration, mean", "The same motions."),
+    _mm("uncalibrated_tip_error_mean_m", "True pin from the goal before calibration, mean", "The same motions."),
 )  # fmt: skip
 MOTION: Final = (
-    Figure("time_ratio", "Motion time over the shortest possible, mean", "",
-           "From the begin of the reference until the pin by encoders is within 20 mm of its end and stays, over the "
-           "time that full joint speeds, joint accelerations and the pump's flow allow for the same path (no jerk, "
-           "delay or swing in it).", most=1.15),
-    Figure("time_ratio_p95", "The same, 95 of 100 are below", "", "The same motions."),
-    Figure("planned_ratio", "Planned duration over the shortest possible, mean", "", "What the reference takes."),
-    Figure("motion_s", "Motion time, mean", "s", "As above."),
-    Figure("ended", "Motions that ended", "%", "Within 20 mm of the end, and stayed.", least=0.99, scale=PERCENT),
-    Figure("limit_cycle_share", "Valves commanded after settling", "%",
-           "Valve commands on the bus in which any joint's is not exactly zero, from 2 s after arrival on.", most=0.05,
-           scale=PERCENT),
-    Figure("stops", "Controlled stops", "", "All runs of all variants.", most=0),
-    Figure("failures", "Motions that failed", "", "Stopped, refused, or never begun; all variants.", most=0),
-    Figure("calibration_failures", "Machines without a calibrated profile", "",
-           "The calibration stopped or doubted a value; such a machine makes no motions.", most=0),
+    Metric("time_ratio", "Motion time over the shortest possible, mean", "",
+           "From the start of the reference until the pin by encoders stays within 20 mm of its end, over the time "
+           "that full joint speeds, joint accelerations and the pump's flow allow for the same path (without jerk "
+           "limit, delay or swing).", most=1.15),
+    Metric("time_ratio_p95", "Motion time over the shortest possible, 95th percentile", "", "The same motions."),
+    Metric("planned_ratio", "Planned duration over the shortest possible, mean", "", "Duration of the reference."),
+    Metric("motion_s", "Motion time, mean", "s", "The same motions."),
+    Metric("ended", "Completed motions", "%", "The pin stays within 20 mm of the end.", least=0.99, scale=PERCENT),
+    Metric("limit_cycle_share", "Valve commands that are not zero after settling", "%",
+           "Share of the valve commands on the bus with any joint not exactly zero, from 2 s after arrival on.",
+           most=0.05, scale=PERCENT),
+    Metric("stops", "Controlled stops", "", "All runs of all variants.", most=0),
+    Metric("failures", "Failed motions", "", "Stopped, refused or never started; all variants.", most=0),
+    Metric("calibration_failures", "Machines without a calibrated profile", "",
+           "The calibration stopped or rejected a value; such a machine makes no motions.", most=0),
 )  # fmt: skip
 SWING: Final = (
-    Figure("sway_residual_deg", "Swing of the grapple, 95 of 100 are below", "deg",
-           "Greatest lean of the grapple against the vertical, both planes, in truth, 1 to 3 s after the end of the "
-           "reference, whether or not the pin has settled.",
-           most=3.0),
-    Figure("sway_residual_mean_deg", "The same, mean", "deg", "The same motions."),
-    Figure("unshaped_sway_residual_deg", "The same with unshaped references, 95 of 100 are below", "deg",
-           "The same paths in the same time with a plain time law."),
-    Figure("unshaped_sway_residual_mean_deg", "The same, mean", "deg", "The same motions."),
-    Figure("sway_reduction", "How much less the grapple swings", "%",
-           "1 less the ratio of the two means.", least=0.6, scale=PERCENT),
+    Metric("sway_residual_deg", "Swing of the grapple, 95th percentile", "deg",
+           "Largest true lean of the grapple from the vertical in both planes, 1 to 3 s after the end of the "
+           "reference, whether or not the pin has settled.", most=3.0),
+    Metric("sway_residual_mean_deg", "Swing of the grapple, mean", "deg", "The same motions."),
+    Metric("unshaped_sway_residual_deg", "Swing with unshaped references, 95th percentile", "deg",
+           "The same paths in the same time with a time law that ignores the swing."),
+    Metric("unshaped_sway_residual_mean_deg", "Swing with unshaped references, mean", "deg", "The same motions."),
+    Metric("sway_reduction", "Reduction of the swing by shaping", "%",
+           "One minus the ratio of the two means.", least=0.6, scale=PERCENT),
 )  # fmt: skip
 LAW_NAMES: Final = {"pd": "PD", "smc": "sliding mode", "sta": "super-twisting"}
 
 
-def _law(prefix: str) -> tuple[Figure, ...]:
+def _law(prefix: str) -> tuple[Metric, ...]:
     name = LAW_NAMES[prefix]
-    how = "As above, with this law on every joint and the gain budget of the profile."
+    how = "As above, with this law on every joint and the gain of the profile."
     return (
-        _mm(f"{prefix}.encoder_error_mean_m", f"{name}: by encoder kinematics, 3-D, mean", how),
-        _mm(f"{prefix}.encoder_error_p95_m", f"{name}: 95 of 100 are below", how),
-        _mm(f"{prefix}.tip_error_mean_m", f"{name}: true pin, mean", how),
-        Figure(f"{prefix}.time_ratio", f"{name}: motion time over the shortest possible", "", how),
-        Figure(f"{prefix}.sway_residual_deg", f"{name}: swing, 95 of 100 are below", "deg", how),
-        Figure(f"{prefix}.limit_cycle_share", f"{name}: valves commanded after settling", "%", how, scale=PERCENT),
-    )
+        _mm(f"{prefix}.encoder_error_mean_m", f"{name}: error by encoders, 3-D, mean", how),
+        _mm(f"{prefix}.encoder_error_p95_m", f"{name}: error by encoders, 3-D, 95th percentile", how),
+        _mm(f"{prefix}.tip_error_mean_m", f"{name}: true pin from the goal, mean", how),
+        Metric(f"{prefix}.time_ratio", f"{name}: motion time over the shortest possible, mean", "", how),
+        Metric(f"{prefix}.sway_residual_deg", f"{name}: swing of the grapple, 95th percentile", "deg", how),
+        Metric(f"{prefix}.limit_cycle_share", f"{name}: valve commands that are not zero after settling", "%", how,
+               scale=PERCENT),
+    )  # fmt: skip
 
 
 SECTIONS: Final = (
     Section(
-        "Where the crane rests",
-        "Figures 19 and 20 of paper B. The paper's 8, 4 and 6 cm are of the same kind as the first three rows: forward "
-        "kinematics of the joint sensors, in which the give of the steel is not. With sag compensation the encoders "
-        "are sent beside the goal on purpose, so that the true pin is on it; their error is counted from where they "
-        "were sent. The row without compensation counts it from the goal itself. All limits are of this project.",
+        "Accuracy at rest",
+        "Figures 19 and 20 of paper B. The 8, 4 and 6 cm of the paper are comparable with the first three rows: "
+        "forward kinematics of the joint sensors, without the deflection of the steel. With sag compensation the "
+        "encoders are commanded to a point beside the goal, so that the true pin is at the goal; their error is "
+        "measured from that point. Without compensation it is measured from the goal itself. All limits are those of "
+        "this project.",
         ACCURACY,
         (
-            ("histogram.png", "As Fig. 20: error by encoder kinematics in 3-D, horizontal, height. Dashed: the mean of "
-             "paper B; solid: the mean here."),
-            ("points.png", "As Fig. 19, zoomed: where the pin rests by encoder kinematics, seen from above, around "
-             "where it was sent. Squares: empty; x: with 200 kg."),
-            ("true_points.png", "The true pin at the same times around the goal, seen from beside: squares empty, x "
-             "with 200 kg; light: without sag compensation."),
+            ("histogram.png", "As Fig. 20 of paper B: error by encoders in 3-D, horizontal and in height. Dashed: mean "
+             "of paper B; solid: mean here."),
+            ("points.png", "As Fig. 19 of paper B, enlarged: rest positions of the pin by encoders, from above, "
+                           "relative "
+             "to the commanded point. Squares: empty; x: with 200 kg."),
+            ("true_points.png", "True pin at the same times relative to the goal, from the side. Squares: empty; x: "
+                                "with "
+             "200 kg; light: without sag compensation."),
         ),
     ),
     Section(
-        "How long it takes, and whether it is quiet then",
+        "Motion time and settling",
         "The shortest time is a bound that no machine reaches: full acceleration of every joint from one moment to the "
-        "next, all of the pump's flow, no swing to care for.",
+        "next, the full flow of the pump, and no regard for swing.",
         MOTION,
-        (("motion.png", "One motion to point 3 with 200 kg: the way of the pin, its errors, the valve commands, the "
-          "lean of the grapple."),),
+        (("motion.png", "One motion to point 3 with 200 kg: path of the pin, its errors, the valve commands, the lean "
+                        "of "
+          "the grapple."),),
     ),
     Section(
-        "How the grapple swings",
+        "Swing of the grapple",
         "The grapple hangs from two joints without actuator and sensor.",
         SWING,
     ),
     Section(
-        "The laws",
-        "The same machines and goals, one empty and one loaded motion to each; the profile's own law has all its "
-        "motions in these figures, and it alone is run without sag, without calibration and unshaped. Sliding mode "
+        "Control laws",
+        "The same machines and goals with one empty and one loaded motion to each goal. For the law of the profile all "
+        "its motions count, and only it runs without sag compensation, without calibration and unshaped. Sliding mode "
         "and super-twisting are reconstructions: paper B names them without equations.",
-        tuple(f for prefix in LAWS.values() for f in _law(prefix)),
+        tuple(m for prefix in LAWS.values() for m in _law(prefix)),
     ),
 )  # fmt: skip
-FIGURES: Final = tuple(f for section in SECTIONS for f in section.figures)
-INTRODUCTION: Final = (
-    "Paper B's test of the crane (4.1.2, 5.1.3) on `aoro_fc8`: motions from the middle of the trail to [4.27, ±1.86, "
-    "1] and [6, ±1.86, 1] m in the crane's base frame, {repetitions} of each on every machine (paper B: 20 on one), "
-    "half of them empty, half with 200 kg on the hook. "
-    "Every machine is another individual drawn from the truth's spread that `timberhand calibrate` was run on first, "
-    "survey included; controller, guard, bus and plant run in lockstep. The paper does not say where its motions "
-    "start: here the pin stands 3 m from the slew axis and 3.5 m high over the bunk's middle line, so that the open "
-    "grapple is clear of the stakes on the whole way. `timberhand experiment crane-accuracy --docs docs` measures "
-    "everything and writes this page; no number is typed."
-)
+METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
 
 
 def accuracy(motions: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """The metrics of one variant's motions; empty without any."""
+    """Metrics of the motions of one variant; empty without motions."""
     if not motions:
         return {}
     error, true = (np.array([m[key] for m in motions]) for key in ("encoder_m", "true_m"))
@@ -188,7 +199,7 @@ def gather(outcomes: Mapping[str, Any], own_law: str) -> dict[str, float]:
     for law, prefix in LAWS.items():
         found = by_variant.get(OWN if law == own_law else law, {})
         metrics |= {f"{prefix}.{name}": value for name, value in found.items()}
-    bare, raw, plain = (by_variant.get(v, {}) for v in (UNCOMPENSATED, UNCALIBRATED, UNSHAPED))
+    bare, raw, unshaped = (by_variant.get(v, {}) for v in (UNCOMPENSATED, UNCALIBRATED, UNSHAPED))
     if own := done.get(OWN):
         metrics["aim_offset_mean_m"] = _mean_size(
             np.array([m["encoder_to_goal_m"] for m in own]) - np.array([m["encoder_m"] for m in own])
@@ -201,11 +212,11 @@ def gather(outcomes: Mapping[str, Any], own_law: str) -> dict[str, float]:
             np.array([m["encoder_to_goal_m"] for m in done[UNCALIBRATED]])
         )
         metrics["uncalibrated_tip_error_mean_m"] = raw["tip_error_mean_m"]
-    if plain:
+    if unshaped:
         for name in ("sway_residual_deg", "sway_residual_mean_deg"):
-            metrics[f"unshaped_{name}"] = plain[name]
+            metrics[f"unshaped_{name}"] = unshaped[name]
         if "sway_residual_mean_deg" in metrics:
-            metrics["sway_reduction"] = 1.0 - metrics["sway_residual_mean_deg"] / plain["sway_residual_mean_deg"]
+            metrics["sway_reduction"] = 1.0 - metrics["sway_residual_mean_deg"] / unshaped["sway_residual_mean_deg"]
     if own_law in LAWS:
         alone = ("tip_error_uncorrected_mean_m", "uncalibrated_error_mean_m", "sway_reduction")
         metrics |= {f"{LAWS[own_law]}.{name}": metrics[name] for name in alone if name in metrics}

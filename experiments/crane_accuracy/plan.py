@@ -1,8 +1,8 @@
-"""Which motions are made: paper B's four goals from the middle of the trail, how often, with which load, by whom.
+"""The test plan: paper B's four goals from the middle of the trail, repetitions, loads and variants.
 
-Paper B does not give its start.  Here the hanger pin stands over the middle line of the bunk (slew 0), `START_M` from
-the slew axis and as high as the arm lifts it there: a hanging open grapple (1.2 m) is 0.5 m above the stakes, and on
-the straight way to the nearest goal it stays 0.2 m clear of them.
+Paper B does not state its start.  Here the hanger pin starts above the middle line of the bunk (slew 0), `START_M` from
+the slew axis and as high as the arm lifts it there.  A hanging open grapple (1.2 m) is then 0.5 m above the stakes and
+stays 0.2 m clear of them on the straight path to the nearest goal.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 
 from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
-from machine.kinematics import Point
+from machine.geometry.kinematics import Point
 from machine.profile import Profile
 
 PROFILE: Final = "aoro_fc8"
@@ -23,16 +23,16 @@ START_M: Final = 3.0
 START_HEIGHT_M: Final = 3.5
 LOADS_KG: Final = (0.0, 200.0)
 REPETITIONS: Final = 20
-"""Of every goal by the profile's own law: 80 points on every machine, half of them loaded."""
+"""Motions to every goal with the law of the profile: 80 points on every machine, half of them loaded."""
 FEW: Final = 2
-"""Of every goal by the other laws: one empty, one loaded."""
+"""Motions to every goal with the other laws: one empty, one loaded."""
 LOADED_ONCE: Final = (1, 2)
-"""Goals that a variant with one motion to each goal visits loaded: one near and one far, one on either side."""
+"""Goals visited with a load by a variant with one motion to each goal: one near, one far, one on either side."""
 OWN: Final = "own"
 LAWS: Final = {"pd": "pd", "sliding_mode": "smc", "super_twisting": "sta"}
-"""Laws that are compared and the prefix of their metrics."""
+"""The laws compared, and the prefix of their metrics."""
 UNCOMPENSATED, UNCALIBRATED, UNSHAPED = "uncompensated", "uncalibrated", "unshaped"
-"""A profile without sag; the profile as shipped; references of the same duration that leave the grapple swinging."""
+"""Variants: a profile without sag; the profile as shipped; references of the same duration without swing shaping."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +44,9 @@ class Visit:
 
 
 def visits(repetitions: int, goals: Sequence[int] = range(len(GOALS_M))) -> list[Visit]:
-    """Every goal so often, the empty half first, going round the goals; of an odd number, half of the goals' last
-    motions are loaded (`LOADED_ONCE`).
+    """The motions to every goal, empty ones first, alternating between the goals.
+
+    With an odd number of repetitions the last motion is loaded for half of the goals (`LOADED_ONCE`).
     """
     half, odd = divmod(repetitions, 2)
     made = []
@@ -56,30 +57,30 @@ def visits(repetitions: int, goals: Sequence[int] = range(len(GOALS_M))) -> list
 
 
 def repetitions(variant: str) -> int:
-    """How often a variant moves to every goal of a machine."""
+    """Motions of a variant to every goal on one machine."""
     return REPETITIONS if variant == OWN else FEW if variant in LAWS else 1
 
 
 def law_of(profile: Profile) -> str:
-    """The law that all joints of a profile have; empty when they differ."""
+    """The law of all joints of a profile; empty if they differ."""
     kinds = {spec.law.kind for spec in profile.joints.values() if spec.encoder is not None}
     return kinds.pop() if len(kinds) == 1 else ""
 
 
 def variants(own_law: str) -> tuple[str, ...]:
-    """Everything that runs on a machine; the profile's own law is not tried twice."""
+    """All variants that run on a machine; the law of the profile runs once."""
     return (OWN, *(law for law in LAWS if law != own_law), UNCOMPENSATED, UNCALIBRATED, UNSHAPED)
 
 
 def pose_at(arm: Arm, point: Point) -> Pose:
-    """The arm's pose with its true pin at a point, the telescope as it is easy for the arm.
+    """The pose of the arm with its true pin at a point; the arm chooses the telescope.
 
     Raises:
-        Unreachable: with the reason.
+        Unreachable: no pose reaches the point.
     """
-    return arm.reach(*point, point[2])
+    return arm.compact_pose_above(*point, point[2])
 
 
 def start_pose(arm: Arm) -> Pose:
-    """The middle of the trail."""
+    """The start of every motion, above the middle of the trail."""
     return pose_at(arm, (START_M, 0.0, START_HEIGHT_M))

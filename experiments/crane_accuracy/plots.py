@@ -1,4 +1,4 @@
-"""Pictures of the crane-accuracy experiment."""
+"""Plots of the crane-accuracy experiment."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments.common.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 from experiments.crane_accuracy.metrics import MM, PAPER
 from experiments.crane_accuracy.plan import GOALS_M, OWN, UNCOMPENSATED, UNSHAPED
-from machine.kinematics import pin_position
+from machine.geometry.kinematics import pin_position
 from machine.profile import Kinematics
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 
 COLOURS: Final = {"slew": OIL, "lift": TIMBER, "tilt": MOSS, "ext": STEEL}
 BIN_MM: Final = 1.0
@@ -20,7 +20,7 @@ LONGEST_MM: Final = 100.0
 
 
 def draw(outcomes: Mapping[str, Any], kinematics: Kinematics, out: Path) -> None:
-    """All pictures into ``out``; without motions there are none to draw, and axes stay empty."""
+    """Write all plots into ``out``; without motions the axes stay empty."""
     own, bare = (_motions(outcomes, variant) for variant in (OWN, UNCOMPENSATED))
     _histogram(own, out / "histogram.png")
     _points([("encoder_m", own, OIL)], _from_above, ("x [mm]", "y [mm]"), out / "points.png")

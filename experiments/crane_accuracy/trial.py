@@ -1,4 +1,4 @@
-"""The two kinds of jobs: calibrate one individual machine, and let a variant make its motions on it."""
+"""The two kinds of jobs: calibrate an individual machine, and run the motions of a variant on it."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from experiments.common.worlds import profile_named
 from experiments.crane_accuracy import measure
 from experiments.crane_accuracy.plan import LAWS, UNCOMPENSATED, UNSHAPED, Visit
 from experiments.crane_accuracy.reach_cycles import Run
-from experiments.crane_accuracy.testbed import Seen, Stand
+from experiments.crane_accuracy.testbed import AccuracyTestbed, Samples
 from machine.joints import JOINTS, Joint
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from machine.profile import Profile
 
 
@@ -29,8 +29,10 @@ def perform(job: Job) -> dict[str, Any]:
 
 
 def measured(job: Job) -> dict[str, Any]:
-    """Options: profile (shipped name), truth, variant, visits ((goal, load) pairs), text (of the profile to run; None:
-    as shipped), and ``trace`` for the number of the motion whose curves are to be kept.
+    """Run the motions of one variant.
+
+    Options: profile (shipped name), truth, variant, visits ((goal, load) pairs), text (of the profile to run; None: as
+    shipped), and optionally ``trace``, the number of the motion whose curves are kept.
     """
     o = job.options
     shipped = profile_named(o["profile"])
@@ -41,16 +43,16 @@ def measured(job: Job) -> dict[str, Any]:
             path = Path(folder) / "calibrated.toml"
             path.write_text(o["text"], encoding="utf-8")
         profile = varied(load_profile(path), o["variant"])
-        stand = Stand(profile, path, shipped, o["truth"], job.seed, visits, shaped=o["variant"] != UNSHAPED)
+        testbed = AccuracyTestbed(profile, path, shipped, o["truth"], job.seed, visits, shaped=o["variant"] != UNSHAPED)
     try:
-        stand.run()
-        return _outcome(stand, o.get("trace"))
+        testbed.run()
+        return _outcome(testbed, o.get("trace"))
     finally:
-        stand.close()
+        testbed.close()
 
 
 def varied(profile: Profile, variant: str) -> Profile:
-    """The profile of a variant: another law on every joint, or without what is known of the sag."""
+    """The profile of a variant: another law on every joint, or no sag model."""
     if variant == UNCOMPENSATED:
         return msgspec.structs.replace(profile, sag=None)
     if variant not in LAWS:
@@ -62,11 +64,11 @@ def varied(profile: Profile, variant: str) -> Profile:
     return msgspec.structs.replace(profile, joints=joints)
 
 
-def _outcome(stand: Stand, traced: int | None) -> dict[str, Any]:
-    limits = full_limits(stand.profile)
+def _outcome(testbed: AccuracyTestbed, traced: int | None) -> dict[str, Any]:
+    limits = full_limits(testbed.profile)
     shortest: dict[tuple[int, float], float] = {}
     motions = []
-    for run, seen in zip(stand.rounds.runs, stand.seen, strict=True):
+    for run, samples in zip(testbed.cycles.runs, testbed.samples, strict=True):
         facts: dict[str, Any] = {"goal": run.visit.goal, "load_kg": run.visit.load_kg, "believed_kg": run.load_kg}
         if run.failed or not run.over_ns:
             motions.append({**facts, "failed": True})
@@ -75,25 +77,27 @@ def _outcome(stand: Stand, traced: int | None) -> dict[str, Any]:
         if key not in shortest:
             shortest[key] = minimum_time_s(np.array(run.motion.position), limits)
         ended_s = (run.ended_ns - run.begun_ns) * 1e-9
-        found = measure.figures(stand.trace(run, seen), np.array(run.commanded_m), np.array(run.goal_m), ended_s)
-        off = np.mean(seen.position[-25:], axis=0) - np.array(run.motion.goal)
+        found = measure.motion_metrics(
+            testbed.trace(run, samples), np.array(run.commanded_m), np.array(run.goal_m), ended_s
+        )
+        off = np.mean(samples.position[-25:], axis=0) - np.array(run.motion.goal)
         motions.append({
             **facts, **found, "failed": False, "planned_s": run.motion.duration_s, "minimum_s": shortest[key],
             "joints": off[: Joint.ROT].tolist(),
         })  # fmt: skip
     outcome = {
         "motions": motions,
-        "missing": len(stand.rounds.visits) - len(motions),
-        "stops": stand.operator.stops,
+        "missing": len(testbed.cycles.visits) - len(motions),
+        "stops": testbed.operator.stops,
     }
     if traced is not None and traced < len(motions) and not motions[traced]["failed"]:
-        outcome["trace"] = _curves(stand, stand.rounds.runs[traced], stand.seen[traced])
+        outcome["trace"] = _curves(testbed, testbed.cycles.runs[traced], testbed.samples[traced])
     return outcome
 
 
-def _curves(stand: Stand, run: Run, seen: Seen) -> dict[str, Any]:
-    """One motion for the picture."""
-    trace = stand.trace(run, seen)
+def _curves(testbed: AccuracyTestbed, run: Run, samples: Samples) -> dict[str, Any]:
+    """Curves of one motion for the plot."""
+    trace = testbed.trace(run, samples)
     reference = [run.motion.at(t)[0] for t in trace.time_s.tolist()]
     curves: dict[str, Any] = {
         "goal_m": list(run.goal_m),
@@ -106,6 +110,6 @@ def _curves(stand: Stand, run: Run, seen: Seen) -> dict[str, Any]:
         "spools": {},
     }
     for j in JOINTS[: Joint.ROT]:
-        times, values = stand.spools(run, j)
+        times, values = testbed.spools(run, j)
         curves["spools"][j.name.lower()] = {"time_s": times[::4].tolist(), "percent": (100.0 * values[::4]).tolist()}
     return curves

@@ -1,1 +1,1 @@
-"""How well are logs found? Average precision on pictures whose worlds and renderer were not trained on."""
+"""The detector experiment: average precision on pictures whose worlds and renderer were not used for training."""

@@ -1,7 +1,7 @@
-"""Real photographs, where someone has them: the preview sheets of TimberSeg 1.0 (Fortin et al. 2022, CC BY 4.0).
+"""Photographs, if available: the preview sheets of TimberSeg 1.0 (Fortin et al. 2022, CC BY 4.0).
 
-A look, not a benchmark: some twenty small photographs without depth, and masks that were derived from coloured
-overlays.  Nothing of them is kept in the project.  The folder is TIMBERHAND_DATA/timberseg_previews (TIMBERHAND_DATA:
+A check, not a benchmark: about twenty small photographs without depth, and masks derived from coloured overlays.
+Nothing of them is part of the project.  The folder is TIMBERHAND_DATA/timberseg_previews (TIMBERHAND_DATA:
 ../shared/data beside the checkout unless set).
 """
 
@@ -20,15 +20,15 @@ from scipy import ndimage
 from experiments.common.result import ROOT
 
 SHEETS: Final = ("horizontal_grid", "vertical_grid")
-LEAST_SIDE_PX: Final = 60
+MIN_SIDE_PX: Final = 60
 OUTLINE_PX: Final = 5  # the outlines of boxes are thinner than this
-LEAST_INK: Final = 0.06  # of a row or column that is no gutter
-GUTTER: Final = 245  # what is brighter in all colours parts the photographs
+MIN_INK_SHARE: Final = 0.06  # of a row or column that is not a gutter
+GUTTER_LEVEL: Final = 245  # brighter pixels in all colours separate the photographs
 
 
 @dataclass(frozen=True, slots=True)
 class Photo:
-    """A photograph (H, W, 3) uint8 and where there is wood in it (H, W) bool."""
+    """A photograph (H, W, 3) uint8 and its pixels with wood (H, W) bool."""
 
     name: str
     rgb: np.ndarray
@@ -36,12 +36,12 @@ class Photo:
 
 
 def folder() -> Path:
-    """Where the sheets are looked for."""
+    """Folder of the sheets."""
     return Path(os.environ.get("TIMBERHAND_DATA") or ROOT.parent / "shared" / "data") / "timberseg_previews"
 
 
 def photos(where: Path) -> list[Photo]:
-    """All photographs of the sheets; none when the folder is not there."""
+    """All photographs of the sheets; none without the folder."""
     found = []
     for sheet in SHEETS:
         plain, masks = where / f"{sheet}_plain.png", where / f"{sheet}_woodmask.png"
@@ -52,21 +52,21 @@ def photos(where: Path) -> list[Photo]:
 
 
 def cut(name: str, sheet: np.ndarray, wood: np.ndarray) -> list[Photo]:
-    """The photographs of a sheet (H, W, 3), which white gutters part."""
+    """The photographs of a sheet (H, W, 3), separated by white gutters."""
     wood = ndimage.binary_opening(wood, np.ones((OUTLINE_PX, OUTLINE_PX)))
     out = []
-    for window in _windows((sheet < GUTTER).any(axis=2), 0, 0):
+    for window in _windows((sheet < GUTTER_LEVEL).any(axis=2), 0, 0):
         rgb = sheet[window]
-        if min(rgb.shape[:2]) >= LEAST_SIDE_PX:
+        if min(rgb.shape[:2]) >= MIN_SIDE_PX:
             out.append(Photo(f"{name} {len(out) + 1}", np.ascontiguousarray(rgb), wood[window]))
     return out
 
 
 def _windows(inked: np.ndarray, top: int, left: int) -> Iterator[tuple[slice, slice]]:
-    """Windows that empty rows and columns part, in turn until none is left."""
-    bands = _bands(inked.mean(axis=1) > LEAST_INK)
+    """Windows separated by empty rows and columns, divided recursively."""
+    bands = _bands(inked.mean(axis=1) > MIN_INK_SHARE)
     if len(bands) == 1:
-        columns = _bands(inked[bands[0][0] : bands[0][1]].mean(axis=0) > LEAST_INK)
+        columns = _bands(inked[bands[0][0] : bands[0][1]].mean(axis=0) > MIN_INK_SHARE)
         if len(columns) == 1:
             (y0, y1), (x0, x1) = bands[0], columns[0]
             yield slice(top + y0, top + y1), slice(left + x0, left + x1)
@@ -84,6 +84,6 @@ def _bands(inked: np.ndarray) -> list[tuple[int, int]]:
 
 
 def overlap(found: np.ndarray, wood: np.ndarray) -> float:
-    """Shared area over the union's of two masks; NaN when both are empty."""
+    """Intersection over union of two masks; NaN if both are empty."""
     union = np.count_nonzero(found | wood)
     return np.count_nonzero(found & wood) / union if union else float("nan")

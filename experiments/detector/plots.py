@@ -1,4 +1,4 @@
-"""The pictures of the detector's page: precision over recall, found logs, and photographs for those who have them."""
+"""Plots of the detector experiment: precision over recall, detected logs, and photographs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from autonomy.perception.segmentation.instances import Instance
-from experiments.common.plot_style import sheet
+from experiments.detector.metrics import PAPER
 from experiments.detector.worlds import TestPicture
+from runtime.plot_style import sheet
 from training.common.average_precision import Curve
 
 COLOURS: Final = np.array(
@@ -19,23 +20,22 @@ COLOURS: Final = np.array(
     float,
 )
 TILE_PX: Final = 456
-PAPER: Final = 0.8051
 
 
 def precision_recall(path: Path, curves: Mapping[str, Curve]) -> None:
-    """As paper B's Fig. 7."""
+    """Plot precision over recall, as in Fig. 7 of paper B."""
     with sheet(path, width=8.0, height=3.6) as axis:
         for name, curve in curves.items():
             recall, precision = np.append(0.0, curve.recall), np.append(1.0, curve.precision)
             axis.plot(recall, precision, label=f"{name}: AP {100 * curve.average:.1f} %")
         axis.set(xlabel="recall", ylabel="precision", xlim=(0.0, 1.01), ylim=(0.0, 1.02))
         axis.set_title("Boxes of logs, least overlap 0.5")
-        words = f"paper B: AP {100 * PAPER:.2f} % on its own photographs"
+        words = f"paper B: AP {100 * PAPER['map50']:.2f} % on its own photographs"
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), alignment="left", title=words)
 
 
 def overlaid(rgb: np.ndarray, found: Sequence[Instance]) -> Image.Image:
-    """A picture with masks, boxes, scores and ends; ends that are the log's own are filled."""
+    """A picture with masks, boxes, scores and ends; visible ends are filled."""
     picture = rgb.astype(float)
     for i, log in enumerate(found):
         picture[log.mask] = 0.45 * picture[log.mask] + 0.55 * COLOURS[i % len(COLOURS)]
@@ -52,12 +52,12 @@ def overlaid(rgb: np.ndarray, found: Sequence[Instance]) -> Image.Image:
 
 
 def gallery(path: Path, looks: Sequence[tuple[TestPicture, tuple[Instance, ...]]], columns: int = 3) -> None:
-    """Test pictures with what is found in them."""
+    """Write test pictures with their detections."""
     contact_sheet(path, [overlaid(seen.rgb, found) for seen, found in looks], columns)
 
 
 def contact_sheet(path: Path, images: Sequence[Image.Image], columns: int) -> None:
-    """Pictures in rows, each made to fit a tile."""
+    """Write pictures in rows, each scaled to a tile."""
     tiles = []
     for image in images:
         factor = min(TILE_PX / image.width, TILE_PX * 9 / 16 / image.height)

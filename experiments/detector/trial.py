@@ -1,4 +1,4 @@
-"""One test picture: what is found in it against what is there.  Plain data out, for the pool."""
+"""One test picture: detections compared with the ground truth, as plain data."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.networks.weights import SHIPPED
-from autonomy.perception.papers.box_detector import BoxFinder
+from autonomy.perception.papers.box_detector import BoxDetector
 from autonomy.perception.segmentation.instances import Instance
-from autonomy.perception.segmentation.log_segmenter import LogFinder
+from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from experiments.common.pool import Job
 from experiments.detector.worlds import SIZE_PX, TestPicture, picture
 from training.common.average_precision import Matches, box_overlaps, mask_overlaps
@@ -19,19 +19,19 @@ from training.detection.detector_weights import box_of
 SIZES: Final = {
     "rgbd": SIZE_PX, "double": 2 * SIZE_PX, "whole": SIZE_PX, "half": SIZE_PX // 2, "depth": SIZE_PX,
 }  # fmt: skip
-"""What is judged, by the length of the largest picture that the network sees of the whole."""
-NEARER: Final = ("rgbd", "depth")
-"""Those that look at the wood from nearer, as the machine does."""
+"""Variants by the side [px] of the largest whole picture that the network processes."""
+ENLARGED: Final = ("rgbd", "depth")
+"""Variants that also process enlarged regions with wood, as the machine does."""
 
 
 PARTED: Final = "parted"
-"""The wood that the first of SIZES finds, cut up into logs as the truth cuts it up."""
+"""The wood found by the first variant, divided into logs by the ground truth."""
 FAITHFUL: Final = "faithful"
-"""Paper B's detector in its role: colour alone, boxes alone."""
+"""Paper B's detector: colour only, boxes only."""
 
 
 def shipped() -> tuple[str, ...]:
-    """Which of SIZES and FAITHFUL have weights."""
+    """The variants of SIZES and FAITHFUL that have weights."""
     files = {name: f"logs_{_variant(name)}" for name in SIZES} | {FAITHFUL: "log_boxes"}
     return tuple(name for name, file in files.items() if (SHIPPED / f"{file}.safetensors").is_file())
 
@@ -41,29 +41,29 @@ def _variant(name: str) -> str:
 
 
 @cache
-def finder(name: str) -> LogFinder:
-    """The network of a name in SIZES with its shipped weights."""
-    return LogFinder(_variant(name), size_px=SIZES[name], nearer=name in NEARER)
+def finder(name: str) -> LogSegmenter:
+    """The network of a variant in SIZES with its shipped weights."""
+    return LogSegmenter(_variant(name), size_px=SIZES[name], use_window=name in ENLARGED)
 
 
 @cache
-def box_finder() -> BoxFinder:
+def box_finder() -> BoxDetector:
     """Paper B's detector with its shipped weights."""
-    return BoxFinder()
+    return BoxDetector()
 
 
 def paper_boxes(seen: TestPicture) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes (N, 4) and scores (N,) that paper B's detector finds in a picture that is SIZE_PX wide."""
+    """Boxes (N, 4) and scores (N,) of paper B's detector for a picture that is SIZE_PX wide."""
     height, width = seen.rgb.shape[:2]
     top = (SIZE_PX - height) // 2
     square = np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8)
     square[top : top + height, :width] = seen.rgb
-    boxes, scores = box_finder().boxes(square)
+    boxes, scores = box_finder().detect(square)
     return boxes - (0, top, 0, top), scores
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """A picture by its machine (``kind``) and number."""
+    """Evaluate one picture, given by its machine (``kind``) and number."""
     seen = picture(job.kind, job.options["number"], job.seed, job.options["truth"])
     masks, ignored = seen.truths()
     boxes = np.array([box_of(m) for m in masks])
@@ -73,7 +73,7 @@ def perform(job: Job) -> dict[str, Any]:
             places, scores = paper_boxes(seen)
             found[name] = {"scores": scores.tolist(), "boxes": box_overlaps(places, boxes).tolist()}
             continue
-        logs = finder(name).find(seen.rgb, seen.depth_m, seen.intrinsics)
+        logs = finder(name).segment_picture(seen.rgb, seen.depth_m, seen.intrinsics)
         found[name] = {
             "scores": [i.score for i in logs],
             "boxes": box_overlaps(np.array([i.box_px for i in logs]), boxes).tolist(),
@@ -88,19 +88,19 @@ def perform(job: Job) -> dict[str, Any]:
 
 
 def parted(wood: np.ndarray, masks: list[np.ndarray], boxes: np.ndarray) -> dict[str, Any]:
-    """What ``wood`` (H, W) would be worth, were it cut up as the true ``masks`` with their ``boxes`` (M, 4) are."""
+    """Detections if ``wood`` (H, W) were divided into logs like the true ``masks`` with their ``boxes`` (M, 4)."""
     places = [box_of(wood & m) for m in masks if (wood & m).any()]
     return {"scores": [1.0] * len(places), "boxes": box_overlaps(np.array(places), boxes).tolist()}
 
 
 def matches(outcome: dict[str, Any], name: str, by: str) -> Matches:
-    """What ``name`` found in a picture, compared ``by`` boxes or masks."""
+    """The detections of a variant in a picture, compared ``by`` boxes or masks."""
     found, truths = outcome["found"][name], len(outcome["ignored"])
     overlaps = np.array(found[by], float).reshape(len(found["scores"]), truths)
     return Matches(np.array(found["scores"]), overlaps, np.array(outcome["ignored"], bool))
 
 
-def look(machine: str, number: int, seed: int, truth: str, name: str) -> tuple[TestPicture, tuple[Instance, ...]]:
-    """A picture with what is found in it, to be drawn."""
+def example(machine: str, number: int, seed: int, truth: str, name: str) -> tuple[TestPicture, tuple[Instance, ...]]:
+    """A picture with its detections, for a plot."""
     seen = picture(machine, number, seed, truth)
-    return seen, finder(name).find(seen.rgb, seen.depth_m, seen.intrinsics)
+    return seen, finder(name).segment_picture(seen.rgb, seen.depth_m, seen.intrinsics)

@@ -1,4 +1,4 @@
-"""Pictures to judge by: piles nobody trained on, drawn by the other renderer as oval, bumpy logs on grassy ground.
+"""Test pictures: piles that were not used for training, drawn by another renderer as oval, bumpy logs on grassy ground.
 
 Nothing is shared with the training pictures but the machines' cameras: other piles, other grounds, pybullet's renderer
 with its own light and colours, meshes instead of round cones.
@@ -13,20 +13,20 @@ from typing import Final
 
 import numpy as np
 
-from machine.optics import Intrinsics, intrinsics
+from machine.geometry.optics import Intrinsics, intrinsics
 from sim.camera.geometry import View, look_at
-from sim.camera.ground_cover import Clutter, Density
-from sim.camera.mesh_renderer import TinyRenderer
+from sim.camera.ground_cover import Density, GroundCover
+from sim.camera.mesh_renderer import MeshRenderer
 from sim.camera.scene import Boxes, SceneBuilder
-from sim.scenes.settled_logs import stereo
+from sim.scenes.settled_logs import stereo_noise
 from training.pictures.piles import HELD_OUT, Pile, chunk, ground_of, profile_of
 from training.pictures.props import Steel
 
 SIZE_PX: Final = 608
-LEAST_PX: Final = 100  # of a log: of one that shows less nobody knows that it is there, it does not count
+MIN_LOG_PX: Final = 100  # a log with fewer pixels does not count
 CHUNK_OF_TESTS: Final = HELD_OUT + 1
 LITTER: Final = Density(0.12, 0.06)
-LITTER_M: Final = 2.5  # grass and branches lie on the tiles that come so near to what the camera looks at
+LITTER_M: Final = 2.5  # grass and branches lie on the tiles within this distance of the camera's target
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +44,15 @@ class TestPicture:
     range_m: float
 
     def truths(self) -> tuple[list[np.ndarray], np.ndarray]:
-        """Mask (H, W) of every log that shows, and which (M,) of them show too little to count."""
+        """Masks (H, W) of all visible logs, and which (M,) of them have too few pixels to count."""
         sizes = np.bincount(np.maximum(self.mask, 0).ravel())[:1000]
         own = [i for i in range(1, len(sizes)) if sizes[i]]
-        return [self.mask == i for i in own], np.array([sizes[i] < LEAST_PX for i in own], bool)
+        return [self.mask == i for i in own], np.array([sizes[i] < MIN_LOG_PX for i in own], bool)
 
 
 def picture(machine: str, number: int, seed: int, truth: str = "nominal") -> TestPicture:
-    """Test picture ``number`` of a machine; ``seed`` draws everything but the pile, ``truth`` says how depth errs."""
+    """Test picture ``number`` of a machine; ``seed`` draws everything but the pile, ``truth`` gives the errors of the
+    depth."""
     piles = chunk(machine, CHUNK_OF_TESTS)
     pile = piles[number % len(piles)]
     rng = random.Random(f"test picture {machine} {number} {seed}")
@@ -62,20 +63,20 @@ def picture(machine: str, number: int, seed: int, truth: str = "nominal") -> Tes
     for log in pile.logs:
         b.log(log)
     bare = b.build()
-    litter = Clutter(ground, LITTER, rng.getrandbits(16)).around(target[0], target[1], LITTER_M)
+    litter = GroundCover(ground, LITTER, rng.getrandbits(16)).around(target[0], target[1], LITTER_M)
     scene = replace(bare, rods=bare.rods + litter, boxes=_steel(pile, target, rng))
-    renderer = TinyRenderer(scene, rng.uniform(0.002, 0.006), rng.uniform(0.03, 0.12), rng.getrandbits(16))
+    renderer = MeshRenderer(scene, rng.uniform(0.002, 0.006), rng.uniform(0.03, 0.12), rng.getrandbits(16))
     try:
         exact = renderer.render(view)
     finally:
         renderer.close()
-    depth = stereo(profile_of(machine), camera, f"{number} {seed}", truth, seed).apply(exact, view.intrinsics, 0)
+    depth = stereo_noise(profile_of(machine), camera, f"{number} {seed}", truth, seed).apply(exact, view.intrinsics, 0)
     away = float(np.linalg.norm(view.position_m - target))
     return TestPicture(exact.rgb, depth, exact.mask, view.intrinsics, machine, pile.kind, camera, away)
 
 
 def _view(pile: Pile, camera: str, rng: random.Random) -> tuple[View, np.ndarray]:
-    """From where the machine's camera would look, over the bonnet, from the stick or straight down; and at what."""
+    """View of the machine's camera (over the bonnet, from the stick or straight down), and its target (3,) [m]."""
     pin = intrinsics(profile_of(pile.machine).cameras[camera]).letterbox(SIZE_PX).inner
     mark = pile.logs[rng.randrange(len(pile.logs))].position_m
     target = np.array([mark[0] + rng.gauss(0.0, 0.3), mark[1] + rng.gauss(0.0, 0.3), mark[2]])
@@ -94,7 +95,7 @@ def _view(pile: Pile, camera: str, rng: random.Random) -> tuple[View, np.ndarray
 
 
 def _steel(pile: Pile, target: np.ndarray, rng: random.Random) -> Boxes:
-    """The bunk of logs that lie in it; in a quarter of the pictures a grapple above the logs."""
+    """The bunk around logs that lie in it; in a quarter of the pictures a grapple above the logs."""
     steel, profile = Steel(rng), profile_of(pile.machine)
     if pile.kind == "bunk":
         steel.bunk(profile, np.zeros(3), 0.0)

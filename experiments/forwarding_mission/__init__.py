@@ -1,1 +1,1 @@
-"""The whole forwarding task: paper B's trial on its field, both ways, and many more with ours."""
+"""The forwarding-mission experiment: paper B's complete task by both methods, and many more missions with ours."""

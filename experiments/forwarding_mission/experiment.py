@@ -1,4 +1,4 @@
-"""The forwarding-mission experiment: paper B's trial both ways, then ours on other machines and fields."""
+"""The forwarding-mission experiment: paper B's trial by both methods, then ours on other machines and fields."""
 
 from __future__ import annotations
 
@@ -8,72 +8,76 @@ from typing import Any, Final
 from rich.console import Console
 
 from experiments.common import pool
-from experiments.common.mission_trial import MISSION_SOURCES
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import ROOT, Result, judged
-from experiments.common.result_page import tell
-from experiments.common.trials import check_truth, checkpoint, individuals, tell_failures
+from experiments.common.result import ROOT, Result, make_result
+from experiments.common.result_page import Page, publish
+from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, print_failures, sampled_unless_given
 from experiments.common.worlds import carrier_profile
-from experiments.forwarding_mission.metrics import CM, FIGURES, INTRODUCTION, PAPER, SEEN_BY, gather, sections
+from experiments.forwarding_mission.metrics import CM, CONCLUSION, INTRODUCTION, METRICS, PAPER, gather, sections
 from experiments.forwarding_mission.plots import draw
 from experiments.forwarding_mission.trial import ACROSS_M, ALONG_M, TURN_DEG, perform
 
 TRIALS: Final = 20
-"""Missions on sampled machines; each is a quarter of an hour of the machine's time."""
+"""Missions on sampled machines; each takes a quarter of an hour of simulated time."""
 MACHINES: Final = 5
-"""Individuals that drive them in turn."""
+"""Individuals that alternate."""
 FIRST_SEED: Final = 60_000
 SEEDS_PER_RUN: Final = 1000
-EYES: Final = {"ours": "ours", "paper-b": "faithful"}
-"""What sees the logs, each way."""
+DETECTORS: Final = {"ours": "ours", "paper-b": "faithful"}
+"""Detector of each method."""
 NOMINAL: Final = "machine/nominal"
 LIMIT_S: Final = 5400.0
 FILE: Final = ROOT / "docs" / "examples" / "paper_b.geojson"
-RAW: Final = "results/forwarding-mission/trials.jsonl.xz"
-"""What became of every log, way and grasp of all missions, in the docs."""
+PUBLISHED_TRIALS: Final = "results/forwarding-mission/trials.jsonl.xz"
+"""Outcomes of all missions, in the docs."""
 
 
 def run(options: Options, console: Console) -> Result:
-    """Measure everything; writes ``options.out`` and, when asked, the docs.
+    """Run the experiment; write ``options.out`` and, if requested, the docs.
 
     Raises:
-        Stopped: the truth file cannot be used.
+        CommandFailed: the truth file cannot be used.
     """
-    name, truth = carrier_profile(options.profile), individuals(options.truth)
+    name, truth = carrier_profile(options.profile), sampled_unless_given(options.truth)
     check_truth(name, truth)
     trials = 0 if options.quick else options.trials or TRIALS
     machines = calibrations(options, name, truth, MACHINES if trials else 0)
-    with checkpoint(options, machines, [name], truth, MISSION_SOURCES, RAW) as kept:  # more missions go on from fewer
+    with checkpoint(options, machines, [name], truth, LOCKSTEP_SOURCES, PUBLISHED_TRIALS) as kept:
         outcomes = pool.run(perform, machines, kept, options.workers, "calibrations", console)
         jobs = [*trial(options, name, outcomes), *missions(options, name, truth, trials, outcomes)]
         outcomes |= pool.run(perform, jobs, kept, options.workers, "missions", console)
-        result = judged(
-            "forwarding-mission", FIGURES, gather(outcomes), profile=name, seed=options.seed, trials=trials,
-            more={"truth": truth, "eyes": EYES["ours"], "machines": str(max(0, len(machines) - 1))}, paper=PAPER,
+        result = make_result(
+            "forwarding-mission", METRICS, gather(outcomes), profile=name, seed=options.seed, trials=trials,
+            more={"truth": truth, "eyes": DETECTORS["ours"], "machines": str(max(0, len(machines) - 1))}, paper=PAPER,
         )  # fmt: skip
         draw(outcomes, options.out)
-        tell_failures(outcomes, console)
-        words = INTRODUCTION.format(
-            machines=len(machines) - 1, along=CM * ALONG_M, across=CM * ACROSS_M, turn=TURN_DEG, eyes=SEEN_BY
-        )
-        tell(result, "The forwarding mission", words, sections(outcomes), options, console)
+        print_failures(outcomes, console)
+        publish(result, page_of(result, outcomes), options, console)
         kept.publish()
     return result
 
 
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page; ``trials``: outcomes of the missions, for the error table."""
+    introduction = INTRODUCTION.format(
+        machines=result.environment["machines"], along=CM * ALONG_M, across=CM * ACROSS_M, turn=TURN_DEG
+    )
+    return Page("Forwarding mission", CONCLUSION, introduction, sections(trials))
+
+
 def trial(options: Options, profile: str, machines: Mapping[str, Any]) -> list[Job]:
-    """The trial on the field of the file with the nominal machine, each way."""
+    """One mission of the nominal machine on the original field by each method."""
     what: dict[str, Any] = {
         "profile": profile, "truth": "nominal", "file": str(FILE), "shuffled": False, "short": options.quick,
         "text": machines[NOMINAL]["profile"] if NOMINAL in machines else None, "limit_s": LIMIT_S,
     }  # fmt: skip
     ways = ("ours",) if options.quick else ("ours", "paper-b")
-    return [Job(f"first/{way}", "mission", options.seed, what | {"way": way, "eyes": EYES[way]}) for way in ways]
+    return [Job(f"first/{way}", "mission", options.seed, what | {"way": way, "eyes": DETECTORS[way]}) for way in ways]
 
 
 def calibrations(options: Options, profile: str, truth: str, count: int) -> list[Job]:
-    """The nominal machine and the individuals, to be calibrated first; a quick look does without."""
+    """Calibration jobs of the nominal machine and the individuals; none for a quick run."""
     first = FIRST_SEED + SEEDS_PER_RUN * options.seed
     what = {"profile": profile, "truth": truth}
     nominal = Job(NOMINAL, "calibration", options.seed, what | {"truth": "nominal"})
@@ -81,9 +85,9 @@ def calibrations(options: Options, profile: str, truth: str, count: int) -> list
 
 
 def missions(options: Options, profile: str, truth: str, trials: int, machines: Mapping[str, Any]) -> list[Job]:
-    """Missions of ours on the individuals in turn, each on its own field.
+    """Our missions on alternating individuals, each on its own field.
 
-    The seed makes the individual; the field has one of its own.
+    The seed draws the individual; the field has a seed of its own.
     """
     first = FIRST_SEED + SEEDS_PER_RUN * options.seed
     jobs = []
@@ -93,7 +97,7 @@ def missions(options: Options, profile: str, truth: str, trials: int, machines: 
             continue
         what: dict[str, Any] = {
             "profile": profile, "truth": truth, "file": str(FILE), "shuffled": True, "text": text, "way": "ours",
-            "eyes": EYES["ours"], "field": first + MACHINES + i, "limit_s": LIMIT_S,
+            "eyes": DETECTORS["ours"], "field": first + MACHINES + i, "limit_s": LIMIT_S,
         }  # fmt: skip
         jobs.append(Job(f"mission/{i}", "mission", first + i % MACHINES, what))
     return jobs

@@ -1,4 +1,4 @@
-"""Pictures of the forwarding-mission experiment: the field with what was done on it, and the offsets of the grasps."""
+"""Plots of the forwarding-mission experiment: maps of the missions, and offsets of the grasps."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments.common.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 from experiments.forwarding_mission.metrics import CM, FIRST, offsets
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 
-TITLES: Final = {"ours": "ours", "faithful": "paper B's way"}
+TITLES: Final = {"ours": "ours", "faithful": "paper B's method"}
 PAPER_MM: Final = (160.3, 308.2, 743.3, 684.3, 307.5, 434.1, 219.1, 285.3, 357.4, 374.2, 151.5, 356.3, 74.7, 416.9,
                    35.7, 421.2, 163.4, 222.9, 120.4, 475.4, 235.3, 222.1, 173.9)  # fmt: skip
-"""Distances of paper B's Table 1."""
+"""Distances in Table 1 of paper B."""
 LOG_WIDTH: Final = 3.2
 LAP_M: Final = 0.6
-"""A second lap's logs are drawn so far beside the first's."""
+"""Logs of the second lap are drawn this far beside those of the first."""
 
 
 def draw(outcomes: Mapping[str, Any], out: Path) -> None:
-    """All of them."""
+    """Write all plots into ``out``."""
     _maps({prefix: outcomes[name] for prefix, name in FIRST.items() if name in outcomes}, out / "map.png")
     ours = [o for name, o in outcomes.items() if name.startswith("mission/") or name == FIRST["ours"]]
     _offsets(ours, out / "offsets.png")
@@ -35,7 +35,7 @@ def _maps(trials: Mapping[str, Any], path: Path) -> None:
 
 
 def field(axis: Any, outcome: Mapping[str, Any], title: str) -> None:
-    """One mission from above."""
+    """Draw one mission from above."""
     way = np.array(outcome["path"], float).reshape(-1, 4)
     axis.plot(way[:, 1], way[:, 2], color=STEEL, lw=0.9, zorder=1)
     if len(way):
@@ -63,7 +63,7 @@ def field(axis: Any, outcome: Mapping[str, Any], title: str) -> None:
 
 
 def _lying(outcome: Mapping[str, Any]) -> list[tuple[float, float, float]]:
-    """Where every log lay: those of later laps are drawn beside the first one's place, outside of it."""
+    """Original place of every log; those of later laps are drawn outside of the first lap's."""
     logs, places = outcome["logs"], outcome["places"] or len(outcome["logs"])
     middle = float(np.mean([log["place_m"][1] for log in logs[:places]]))
     at = []

@@ -1,1 +1,1 @@
-"""Paper A's twelve configurations of logs: camera, perception, grasp plan, crane on the bus, judged by the physics."""
+"""Paper A's twelve configurations of logs: camera, perception, grasp plan and crane on the bus."""

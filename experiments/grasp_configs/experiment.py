@@ -1,10 +1,10 @@
-"""Paper A's grasping attempts and more of them: three sources of poses by three planners, the whole chain on the bus.
+"""Paper A's grasping attempts and more: three sources of poses and three planners, with the whole machine on the bus.
 
-The paper made 5 attempts with each of its 12 configurations.  Here ``--trials`` is how many attempts each configuration
-gets with our perception and our search (default 100: 1,200 attempts); the first 5 of each are the paper's 60, on the
-nominal machine, and the rest is made by that one and by calibrated individuals in turn.  The other pairs of the
-ablation get a twentieth, at least 5, on the nominal machine.  ``--quick`` leaves them out; the page then keeps those
-that are published, and says of which commit they are.
+The paper made 5 attempts with each of its 12 configurations.  Here ``--trials`` is the number of attempts per
+configuration with our perception and our search (default 100: 1,200 attempts).  The first 5 of each repeat the paper's
+60 on the nominal machine; the others alternate between that machine and calibrated individuals.  Every other pair of
+the ablation gets a twentieth of the attempts, at least 5, on the nominal machine.  ``--quick`` leaves them out; the
+page then keeps the published ones and names their commit.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from experiments.common import overview, pool
 from experiments.common.individuals import calibrated
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import Result, judged, rate
-from experiments.common.result_page import tell
-from experiments.common.trials import checkpoint, individuals
+from experiments.common.result import Result, make_result, rate
+from experiments.common.result_page import Page, publish
+from experiments.common.trials import LOCKSTEP_SOURCES, checkpoint, sampled_unless_given
 from experiments.grasp_configs.grasp_categories import ALL_LOGS, PILES
-from experiments.grasp_configs.metrics import FIGURES, INTRODUCTION, sections
+from experiments.grasp_configs.metrics import CONCLUSION, INTRODUCTION, METRICS, sections
 from experiments.grasp_configs.plots import draw_chain, draw_table
-from experiments.grasp_configs.pose_sources import POSES
+from experiments.grasp_configs.pose_sources import POSE_SOURCES
 from experiments.grasp_configs.trial import NETWORKS, attempt, weights_of
 from sim.scenes.arrangements import CONFIGURATIONS
 
@@ -37,20 +37,22 @@ PAPER: Final = {"paper60_success": 59 / 60, "optimal": 48 / 59}
 """Paper A, section IV-C: the simulated trials."""
 ATTEMPTS, PAPER_ATTEMPTS, SHARE = 100, 5, 20
 MACHINES: Final = 5
-"""Individuals that make attempts in turn with the nominal machine."""
+"""Individuals that alternate with the nominal machine."""
 FIRST_MACHINE: Final = 70_000
 FIRST_SEED: Final = 20_000
-"""Judged on scenes that nobody looked at while the planner was made (those had seeds from 7000 on)."""
+"""These scenes were not looked at while the planner was developed (those had seeds from 7000 on)."""
 PLANNERS: Final = ("search", *NETWORKS)
 BEST: Final = ("ours", "search")
-RAW: Final = "results/grasp-configs/trials.jsonl.xz"
-"""What became of every attempt, in the docs."""
-SOURCES: Final = ("autonomy", "controller", "hil/harness/lockstep.py")
+PUBLISHED_TRIALS: Final = "results/grasp-configs/trials.jsonl.xz"
+"""Outcomes of all attempts, in the docs."""
 
 
 def machines_of(options: Options, attempts: int) -> list[Job]:
-    """The calibrations of the individuals that are needed."""
-    what, first = {"profile": options.profile, "truth": individuals(options.truth)}, FIRST_MACHINE + options.seed
+    """Calibration jobs of the individuals that the attempts need."""
+    what, first = (
+        {"profile": options.profile, "truth": sampled_unless_given(options.truth)},
+        FIRST_MACHINE + options.seed,
+    )
     count = min(MACHINES, max(0, attempts - PAPER_ATTEMPTS - 1))
     return [Job(f"machine/{i}", "calibration", first + i, what) for i in range(count)]
 
@@ -61,8 +63,9 @@ def jobs_of(
     attempts: int,
     machines: Mapping[str, Any] = MappingProxyType({}),
 ) -> list[Job]:
-    """All attempts; the first pair gets ``attempts`` of each configuration, the others a twentieth.  ``machines`` are
-    the calibrated individuals by the names of their jobs; without any, the nominal one makes all.
+    """Jobs of all attempts: ``attempts`` of each configuration for the first pair, a twentieth for the others.
+
+    ``machines``: the calibrated individuals by the names of their jobs; without any, the nominal machine makes all.
     """
     found = []
     for pair in pairs:
@@ -75,22 +78,22 @@ def jobs_of(
                 turn = (k - PAPER_ATTEMPTS) % (MACHINES + 1) if k >= PAPER_ATTEMPTS and pair == pairs[0] else 0
                 machine = machines.get(f"machine/{turn - 1}")
                 if machine is not None and machine["profile"] is not None:
-                    plain |= {"truth": individuals(options.truth), "text": machine["profile"], "scene": seed}
+                    plain |= {"truth": sampled_unless_given(options.truth), "text": machine["profile"], "scene": seed}
                     seed = FIRST_MACHINE + options.seed + turn - 1
                 found.append(Job(f"{'.'.join(pair)}/{number}/{k}", "grasp", seed, plain))
     return found
 
 
 def pairs_of() -> list[tuple[str, str]]:
-    """The ablation's pairs whose weights are there, the one that is judged first."""
-    pairs = [(poses, planner) for poses in POSES for planner in PLANNERS]
+    """Pairs of the ablation whose weights exist; the evaluated pair comes first."""
+    pairs = [(poses, planner) for poses in POSE_SOURCES for planner in PLANNERS]
     ready = [p for p in pairs if weights_of(*p)]
     first = BEST if BEST in ready else ("true", "search")
     return [first, *(p for p in ready if p != first)]
 
 
 def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[str, float]:
-    """The metrics: of the judged pair by the issue's names, of every pair with its name before them."""
+    """Metrics of every pair with its name as prefix, and of the evaluated pair without a prefix."""
     by_pair: dict[str, list[tuple[int, dict[str, Any]]]] = {}
     for name, o in outcomes.items():
         if name.startswith("machine/"):
@@ -119,7 +122,7 @@ def gather(outcomes: dict[str, dict[str, Any]], first: tuple[str, str]) -> dict[
 
 
 def of_trials(trials: Sequence[dict[str, Any]], prefix: str) -> dict[str, float]:
-    """Success, optimal among the successful, logs a grasp, times."""
+    """Success, share of optimal grasps, logs per grasp, and times of some trials."""
     up = [o for o in trials if o["lifted"] > 0]
     piles = [o["lifted"] for o in trials if o["configuration"] in PILES]
     all_of = [o["lifted"] == o["logs"] for o in trials if o["configuration"] in ALL_LOGS]
@@ -137,11 +140,11 @@ def of_trials(trials: Sequence[dict[str, Any]], prefix: str) -> dict[str, float]
 
 
 def published_ablation(docs: Path | None, judged_pair: tuple[str, str]) -> tuple[dict[str, float], str]:
-    """The metrics of the other pairs that a folder of docs holds, and of which commit they are; ({}, "") for none."""
+    """Published metrics of the other pairs and their commit; ({}, "") without any."""
     saved = None if docs is None else overview.results_in(docs).get("grasp-configs")
     if saved is None:
         return {}, ""
-    pairs = {".".join(pair) for pair in product(POSES, PLANNERS)} - {".".join(judged_pair)}
+    pairs = {".".join(pair) for pair in product(POSE_SOURCES, PLANNERS)} - {".".join(judged_pair)}
     kept = {name: value for name, value in saved.metrics.items() if name.rpartition(".")[0] in pairs}
     return kept, saved.environment.get("ablation", saved.commit) if kept else ""
 
@@ -160,30 +163,36 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def run(options: Options, console: Console) -> Result:
-    """All attempts; writes ``options.out`` and, when asked, the docs."""
+    """Run all attempts; write ``options.out`` and, if requested, the docs."""
     pairs = pairs_of()
     attempts = options.trials or (1 if options.quick else ATTEMPTS)
     calibrations = machines_of(options, attempts)
-    asked = (options.seed, pairs)  # more attempts go on from fewer
-    with checkpoint(options, asked, [options.profile], options.truth, SOURCES, RAW) as kept:
+    asked = (options.seed, pairs)  # a run with more attempts continues one with fewer
+    with checkpoint(options, asked, [options.profile], options.truth, LOCKSTEP_SOURCES, PUBLISHED_TRIALS) as kept:
         machines = pool.run(calibrated, calibrations, kept, options.workers, "calibrations", console)
         jobs = jobs_of(options, pairs[:1] if options.quick else pairs, attempts, machines)
         outcomes = machines | pool.run(attempt, jobs, kept, options.workers, "grasping attempts", console)
         kept_metrics, since = published_ablation(options.docs, pairs[0]) if options.quick else ({}, "")
         more = {"truth": options.truth, "judged": " poses, ".join(pairs[0])} | ({"ablation": since} if since else {})
-        result = judged(
-            "grasp-configs", FIGURES, kept_metrics | gather(outcomes, pairs[0]), profile=options.profile,
+        result = make_result(
+            "grasp-configs", METRICS, kept_metrics | gather(outcomes, pairs[0]), profile=options.profile,
             seed=options.seed, trials=len(jobs), more=more, paper=PAPER,
         )  # fmt: skip
         draw_chain(options.out / "chain.png", options.profile, options.truth, FIRST_SEED)
         draw_table(options.out / "configurations.png", outcomes, ".".join(pairs[0]))
-        _tell_failures(outcomes, ".".join(pairs[0]), console)
-        tell(result, "Grasping logs in twelve configurations", INTRODUCTION, sections(since), options, console)
+        _print_failures(outcomes, ".".join(pairs[0]), console)
+        publish(result, page_of(result, {}), options, console)
         kept.publish()
     return result
 
 
-def _tell_failures(outcomes: dict[str, dict[str, Any]], pair: str, console: Console) -> None:
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page."""
+    since = result.environment.get("ablation", "")
+    return Page("Grasping logs in twelve configurations", CONCLUSION, INTRODUCTION, sections(since))
+
+
+def _print_failures(outcomes: dict[str, dict[str, Any]], pair: str, console: Console) -> None:
     for name, o in outcomes.items():
         if name.startswith(f"{pair}/") and o["category"] == "failed":
             console.print(f"{name}: {o['failure'] or o['reason']}", highlight=False, soft_wrap=True)

@@ -1,108 +1,119 @@
-"""The figures of the experiment, their limits and its page."""
+"""Metrics of the grasp-configuration experiment with their limits, and the page that shows them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Final
 
-from experiments.common.result import Figure
+from experiments.common.result import Metric
 from experiments.common.result_page import Section
 
-WORDS: Final = {
+POSE_TITLES: Final = {
     "true": "true poses",
     "ours": "our perception",
-    "masked": "our perception, true masks",
+    "masked": "our perception with true masks",
     "faithful": "paper A's perception",
 }
-BY: Final = {"search": "search", "cnn": "paper A's network", "cnn_physical": "the network on physical labels"}
+PLANNER_TITLES: Final = {
+    "search": "search", "cnn": "paper A's network", "cnn_physical": "network trained on physical labels",
+}  # fmt: skip
+
+CONCLUSION: Final = (
+    "Our perception and search lift at least one log in {success} of the attempts; in 60 attempts as in paper A it is "
+    "{paper60_success} (paper: {paper:paper60_success}).",
+    "{optimal} of the successful grasps are optimal (paper: {paper:optimal}), and perception and planning take "
+    "{plan_ms} of CPU time.",
+)
+INTRODUCTION: Final = (
+    "This experiment repeats paper A's grasping attempts on the virtual machine: camera, segmentation, grasp plan, "
+    "crane on the bus, lift."
+)
 
 
-def _pair(poses: str, planner: str) -> tuple[Figure, ...]:
-    name, words = f"{poses}.{planner}", f"{WORDS[poses]}, {BY[planner]}"
+def _pair(poses: str, planner: str) -> tuple[Metric, ...]:
+    name, title = f"{poses}.{planner}", f"{POSE_TITLES[poses]}, {PLANNER_TITLES[planner]}"
     return (
-        Figure(f"{name}.success", f"Success: {words}", "%", "Of all attempts, by the plant's physics.", scale=100.0),
-        Figure(f"{name}.optimal", f"Optimal of these: {words}", "%", "Of the successful ones.", scale=100.0),
-        Figure(f"{name}.logs_per_grasp_10_12", f"Logs per grasp in 10 to 12: {words}", "", "Mean."),
+        Metric(
+            f"{name}.success", f"Success: {title}", "%", "Share of all attempts, by the plant's physics.", scale=100.0
+        ),
+        Metric(f"{name}.optimal", f"Optimal grasps: {title}", "%", "Share of the successful ones.", scale=100.0),
+        Metric(f"{name}.logs_per_grasp_10_12", f"Logs per grasp in configurations 10 to 12: {title}", "", "Mean."),
     )
 
 
-JUDGED: Final = (
-    Figure("paper60_success", "Success of 60 attempts as in the paper", "%",
-           "Five attempts with each configuration: a log at least hangs clear of the ground after 2 s.", scale=100.0),
-    Figure("success", "Success", "%", "The same of all attempts.", least=0.99, scale=100.0),
-    Figure("first_closing", "Lifted at the first closing of the tongs", "%",
-           "The rest of the successful ones took a second closing before the lift, or more.", scale=100.0),
-    Figure("nominal.success", "Success of the nominal machine", "%", "Of its attempts.", scale=100.0),
-    Figure("individuals.success", "Success of calibrated individuals", "%",
-           "Of the attempts of five machines drawn around the nominal one.", scale=100.0),
-    Figure("success_wilson_low", "Success, lower bound of the Wilson 95 % interval", "%",
-           "To be above paper A's 59 of 60.", least=0.9833, scale=100.0),
-    Figure("optimal", "Optimal grasps of the successful ones", "%",
-           "Neither from under another log nor at an edge (NI), aligned within 20 deg (MA), not misled by perception "
+EVALUATED: Final = (
+    Metric("paper60_success", "Success of 60 attempts as in the paper", "%",
+           "Five attempts with each configuration: at least one log hangs clear of the ground after 2 s.", scale=100.0),
+    Metric("success", "Success", "%", "The same criterion, all attempts.", least=0.99, scale=100.0),
+    Metric("first_closing", "Lifted with the first closing of the grapple", "%",
+           "The other successful attempts closed again before the lift.", scale=100.0),
+    Metric("nominal.success", "Success of the nominal machine", "%", "Share of its attempts.", scale=100.0),
+    Metric("individuals.success", "Success of calibrated individuals", "%",
+           "Share of the attempts of five machines drawn around the nominal one.", scale=100.0),
+    Metric("success_wilson_low", "Success, lower bound of the Wilson 95 % interval", "%",
+           "The limit is paper A's 59 of 60.", least=0.9833, scale=100.0),
+    Metric("optimal", "Optimal grasps among the successful ones", "%",
+           "Not from under another log nor at an edge (NI), aligned within 20 deg (MA), and not misled by perception "
            "(SE).", least=0.95, scale=100.0),
-    Figure("ni", "Sub-optimal: not intuitive", "", "From under another log, or at an edge."),
-    Figure("se", "Sub-optimal: segmentation error", "", "Sub-optimal where perception missed or misplaced a log."),
-    Figure("ma", "Sub-optimal: misaligned", "", "More than 20 deg off the logs' mean direction."),
-    Figure("logs_per_grasp_10_12", "Logs per grasp in configurations 10 to 12", "", "Mean of all attempts.",
+    Metric("ni", "Sub-optimal: not intuitive (NI)", "", "From under another log, or at an edge."),
+    Metric("se", "Sub-optimal: segmentation error (SE)", "",
+           "Sub-optimal where perception missed or misplaced a log."),
+    Metric("ma", "Sub-optimal: misaligned (MA)", "", "More than 20 deg off the mean direction of the logs."),
+    Metric("logs_per_grasp_10_12", "Logs per grasp in configurations 10 to 12", "", "Mean of all attempts.",
            least=1.5),
-    Figure("all_logs", "All logs at once in configurations 2, 4, 5, 6, 7", "%",
+    Metric("all_logs", "All logs at once in configurations 2, 4, 5, 6, 7", "%",
            "As the paper observed consistently.", scale=100.0),
-    Figure("plan_ms", "Perceive and plan", "ms", "Time of the processor from a picture to the grasp: one picture's "
-           "perception and the choice of the grasp, median.", most=60.0, clocked=True),
-    Figure("perceive_ms", "Of which perception", "ms", "The same attempts, median.", clocked=True),
-    Figure("choose_ms", "Of which the choice of the grasp", "ms", "The same attempts, median.", clocked=True),
+    Metric("plan_ms", "Perception and planning", "ms", "CPU time from a picture to the grasp: perception of one "
+                                                       "picture "
+           "and choice of the grasp, median.", most=60.0, clocked=True),
+    Metric("perceive_ms", "Perception alone", "ms", "The same attempts, median.", clocked=True),
+    Metric("choose_ms", "Choice of the grasp alone", "ms", "The same attempts, median.", clocked=True),
 )  # fmt: skip
-ABLATION: Final = tuple(f for poses in WORDS for planner in BY for f in _pair(poses, planner))
+ABLATION: Final = tuple(m for poses in POSE_TITLES for planner in PLANNER_TITLES for m in _pair(poses, planner))
 PER_CONFIGURATION: Final = tuple(
-    Figure(f"config{n}.{what}", f"Configuration {n}: {words}", unit, "Of its attempts.", scale=scale)
+    Metric(f"config{n}.{key}", f"Configuration {n}: {title}", unit, "Share or mean of its attempts.", scale=scale)
     for n in range(1, 13)
-    for what, words, unit, scale in (
+    for key, title, unit, scale in (
         ("success", "success", "%", 100.0), ("optimal", "optimal", "%", 100.0), ("logs", "logs per grasp", "", 1.0)
     )
 )  # fmt: skip
-FIGURES: Final = (*JUDGED, *PER_CONFIGURATION, *ABLATION)
+METRICS: Final = (*EVALUATED, *PER_CONFIGURATION, *ABLATION)
 SECTIONS: Final = (
     Section(
         "Twelve configurations",
-        "Logs of random size lie at a random place in a random direction in one of paper A's arrangements (rebuilt "
-        "from its sentences). One grasp, lifted and held for two seconds; physics alone judges. The camera's mount "
-        "and scale of depth are surveyed before the run. Logs are seen from where the crane stands at first; where "
-        "a grasp is of logs among others, ours looks again from above it, twice at most, and plans anew. What the "
-        "tongs tell before anything is lifted is used, too: where they stall at the sides of a heap, or wider than "
-        "what they are to hold, they open again and close higher up, three times at most; where they have shut on "
-        "nothing or pinch a log that they were to be under, or turn out to be shut and to weigh nothing when they "
-        "have risen by 0.2 m, they open, look again and are sent anew, twice at most. That counts as the same "
-        "attempt; how many needed no second closing is told beside it.",
-        JUDGED,
-        (("chain.png", "As paper A's Fig. 5: the pile, the virtual depth picture with the grasp of the search, "
-          "the network's quality with its grasp."),),
+        "Logs of random size lie at a random place in a random direction in one of paper A's arrangements, rebuilt "
+        "from its text. One grasp is lifted and held for two seconds; the physics decides the outcome. The mount of "
+        "the camera and the scale of its depth are surveyed before the run. The camera sees the logs from the start "
+        "position of the crane. If a grasp is of logs among others, the planner looks again from above, at most twice, "
+        "and plans anew. The feedback of the grapple before the lift is used as well. If the jaws stall at the sides "
+        "of a heap, or wider than expected, they open and close again higher up, at most three times. If they have "
+        "closed on nothing, pinch a log that they should be under, or are closed without weight after rising by 0.2 m, "
+        "they open, look again and start anew, at most twice. All of this counts as one attempt; the share that needed "
+        "no second closing is reported as well.",
+        EVALUATED,
+        (("chain.png", "As Fig. 5 of paper A: the pile, the virtual depth picture with the grasp of the search, and "
+                       "the "
+          "quality map of the network with its grasp."),),
     ),
     Section(
         "By configuration",
-        "As paper A's Table II.",
+        "As Table II of paper A.",
         PER_CONFIGURATION,
         (("configurations.png", "Share of the attempts by outcome, and logs per grasp."),),
     ),
     Section(
-        "What perception and planner are worth",
-        "Every source of poses with every planner, on the same scenes. No planner sees the plant's truth but with the "
-        "true poses.",
+        "Contribution of perception and planner",
+        "Every source of poses with every planner on the same scenes. A planner knows the plant's ground truth only "
+        "with the true poses.",
         ABLATION,
-        (),
     ),
 )  # fmt: skip
 
 
 def sections(since: str = "") -> tuple[Section, ...]:
-    """The page's parts; ``since``: the commit at which the ablation was measured, where that is not the result's."""
+    """Sections of the page; ``since``: the commit of the ablation, if it differs from that of the result."""
     *parts, ablation = SECTIONS
     return (
         *parts,
-        replace(ablation, text=f"{ablation.text} Measured before, at commit `{since}`.") if since else ablation,
+        replace(ablation, text=f"{ablation.text} Measured earlier, at commit `{since}`.") if since else ablation,
     )
-
-
-INTRODUCTION: Final = (
-    "Paper A's grasping attempts on the virtual test-bed: camera, segmentation, plan, crane on the bus, lift. "
-    "`timberhand experiment grasp-configs --docs docs` measures everything and writes this page; no number is typed."
-)

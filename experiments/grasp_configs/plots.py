@@ -1,4 +1,4 @@
-"""Pictures: the chain from pile to grasp as in paper A's Fig. 5, and its Table II as bars."""
+"""Plots: the chain from pile to grasp as in Fig. 5 of paper A, and its Table II as bars."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from sim.camera.render import ImagingConditions, render
 from sim.camera.scene import scene_from_world
 from sim.plant import Plant
 
-SHOWN: Final = 9  # the configuration of the paper's Fig. 5
+SHOWN_CONFIGURATION: Final = 9  # that of Fig. 5 of the paper
 COLOURS: Final = {"optimal": MOSS, "NI": TIMBER, "SE": OIL, "MA": STEEL, "failed": RUST}
 
 
 def draw_chain(path: Path, name: str, truth: str, seed: int) -> None:
-    """Pile, virtual depth with both grasps, quality map with the network's."""
+    """Draw the pile, the virtual depth with the grasp of the search, and the quality map with that of the network."""
     profile = profile_named(name)
-    plant = Plant(profile, seed, truth, scene=arranged(name, truth, SHOWN, seed))
+    plant = Plant(profile, seed, truth, scene=arranged(name, truth, SHOWN_CONFIGURATION, seed))
     try:
         logs = true_poses(plant)
         x, y, z = (float(v) for v in np.mean([log.center_m for log in logs], axis=0))
@@ -72,7 +72,7 @@ def _opening_px(jaws: Jaws, camera: Camera, point_m: np.ndarray) -> float:
 
 
 def _mark(axis: Any, at: tuple[float, float], theta: float, opening_px: float, colour: str) -> None:
-    """A grasp: its middle, the opening, and the blades at both ends."""
+    """Draw a grasp: its middle, the opening, and the jaws at both ends."""
     u, v = at
     c, s, half = math.cos(theta), math.sin(theta), opening_px / 2
     axis.plot([u - half * c, u + half * c], [v - half * s, v + half * s], color=colour, lw=1.2, ls=":")
@@ -83,7 +83,7 @@ def _mark(axis: Any, at: tuple[float, float], theta: float, opening_px: float, c
 
 
 def draw_table(path: Path, outcomes: Mapping[str, dict[str, Any]], pair: str) -> None:
-    """Outcomes and logs per grasp of every configuration."""
+    """Draw outcomes and logs per grasp of every configuration."""
     trials = [o for name, o in outcomes.items() if name.startswith(f"{pair}/")]
     numbers = sorted({o["configuration"] for o in trials})
     with sheet(path, 2, 9.0, 3.2) as (shares, logs):

@@ -1,8 +1,8 @@
-"""Where a grasp planner's logs come from: the plant itself, or the camera on the stick and a perception.
+"""Sources of the log poses for a grasp planner: the plant itself, or the camera on the stick and a perception.
 
-``true``: as a detector without errors.  ``ours``: this project's perception with its own segmentation; ``masked``: the
-same with true masks.  ``faithful``: paper A's steps on our masks (bounding extents of each mask's points).  The camera
-was surveyed; it sees the logs from where the crane stands at the start, and again from above where the activity waits
+``true``: a detector without errors.  ``ours``: this project's perception with its own segmentation; ``masked``: the
+same with true masks.  ``faithful``: paper A's steps on our masks (bounding extents of the points of each mask).  The
+camera is surveyed.  It sees the logs from the start position of the crane, and again from above when the activity waits
 for that.
 """
 
@@ -18,7 +18,7 @@ from typing import Final, Protocol
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from autonomy.perception.camera.frame import Frame, Pose, rescaled
+from autonomy.perception.camera.frame import Pose, RgbdFrame, rescaled
 from autonomy.perception.camera.mount import optical_pose
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.papers import paper_a
@@ -30,44 +30,44 @@ from sim.plant import Plant
 from sim.wood.logs import LogState
 
 CAMERA: Final = "stick"
-PICTURES: Final = 3
-LEAST_PX: Final = 60
+PICTURE_COUNT: Final = 3
+MIN_MASK_PX: Final = 60
 RATE_NS: Final = 66_666_667
-LOOK_NS: Final = PICTURES * RATE_NS
+DETECTION_NS: Final = PICTURE_COUNT * RATE_NS
 MISSED_M, MISSED_RAD, MISSED_WIDTH_M = 0.15, math.radians(8.0), 0.06
-"""A log that is seen further off than this, or more turned, or so much thicker or thinner, misleads a planner."""
+"""A log with a larger error in position, direction or diameter misleads a planner."""
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """The logs, and what seeing took."""
+class Detection:
+    """The detected logs, and the CPU time per picture [s]."""
 
     logs: tuple[LogObservation, ...] = ()
     seconds: float = 0.0
 
 
 def true_poses(plant: Plant) -> tuple[LogObservation, ...]:
-    """What lies where, as the plant knows it."""
+    """Ground-truth poses of all logs."""
     return tuple(
         LogObservation(i, log.position_m, log.axis, log.length_m, log.diameter_m) for i, log in enumerate(plant.logs())
     )
 
 
-class Known:
-    """The poses that the plant knows."""
+class TruePoses:
+    """Ground truth of the plant."""
 
     def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
         self._plant = plant
 
-    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
-        """What lies where now."""
-        return Seen(true_poses(self._plant))
+    def detect(self, stamp_ns: int, q: Sequence[float]) -> Detection:
+        """The logs now."""
+        return Detection(true_poses(self._plant))
 
 
-class Ours:
-    """Three pictures of the standing camera at a look, through the whole perception; each look adds to the ones before.
+class OurPerception:
+    """Our perception of three pictures per detection from the resting camera; detections are combined.
 
-    ``masked``: with a perfect segmentation, the renderer's masks.
+    ``masked``: with the masks of the renderer as a perfect segmentation.
     """
 
     def __init__(self, plant: Plant, profile: Profile, seed: int, masked: bool = False) -> None:
@@ -75,35 +75,35 @@ class Ours:
         self._camera = _Surveyed(plant, profile, seed)
         self._perception = Perception(profile, SURVEYED)
 
-    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
-        """The logs as they are known after the pictures."""
+    def detect(self, stamp_ns: int, q: Sequence[float]) -> Detection:
+        """The logs after these pictures."""
         from autonomy.perception.segmentation.log_segmenter import segment
 
-        seen = self._camera.look(stamp_ns, q)
+        seen = self._camera.detect(stamp_ns, q)
         begun = time.process_time()
         for frame in seen.frames:
             masks: Sequence[Masked] = seen.masks if self._masked else segment(frame)
             tracks = self._perception.step(frame, seen.pose, masks)
         seconds = (time.process_time() - begun) / len(seen.frames)
-        return Seen(tuple(t.estimate.observation(t.id) for t in tracks if t.hits > 1), seconds)
+        return Detection(tuple(t.estimate.observation(t.id) for t in tracks if t.hits > 1), seconds)
 
 
-class Faithful:
-    """Paper A's way with one picture: points under each mask, their middle, main direction and extents.
+class PaperPerception:
+    """Paper A's perception of one picture: middle, main direction and extents of the points under each mask.
 
-    What it sees is as good as known to it: nothing is looked at twice.
+    It does not combine detections.
     """
 
     def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
         self._camera = _Surveyed(plant, profile, seed)
 
-    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
-        """The logs of a picture."""
+    def detect(self, stamp_ns: int, q: Sequence[float]) -> Detection:
+        """The logs in one picture."""
         from autonomy.perception.segmentation.log_segmenter import segment
 
-        seen, begun = self._camera.look(stamp_ns, q), time.process_time()
+        seen, begun = self._camera.detect(stamp_ns, q), time.process_time()
         frame, pose = seen.frames[0], seen.pose
-        found = [paper_a.log_of(frame, one.mask) for one in segment(frame)]
+        found = [paper_a.log_from_mask(frame, one.mask) for one in segment(frame)]
         logs = []
         for log in found:
             if log is not None and log.diameter_m > 0.0 and log.length_m > 0.0:
@@ -111,26 +111,26 @@ class Faithful:
                 logs.append(
                     LogObservation(len(logs), _triple(at), _triple(axis), float(log.length_m), float(log.diameter_m))
                 )
-        return Seen(tuple(logs), time.process_time() - begun)
+        return Detection(tuple(logs), time.process_time() - begun)
 
 
-class Sight(Protocol):
-    """Sees the logs from where the crane stands."""
+class PoseSource(Protocol):
+    """Detects the logs from the present position of the crane."""
 
-    def look(self, stamp_ns: int, q: Sequence[float]) -> Seen:
-        """The logs, now that the joints are measured at ``q`` [rad, EXT m]."""
+    def detect(self, stamp_ns: int, q: Sequence[float]) -> Detection:
+        """Detect the logs with the joints measured at ``q`` [rad, EXT m]."""
 
 
-POSES: Final[dict[str, Callable[[Plant, Profile, int], Sight]]] = {
-    "true": Known,
-    "ours": Ours,
-    "masked": partial(Ours, masked=True),
-    "faithful": Faithful,
+POSE_SOURCES: Final[dict[str, Callable[[Plant, Profile, int], PoseSource]]] = {
+    "true": TruePoses,
+    "ours": OurPerception,
+    "masked": partial(OurPerception, masked=True),
+    "faithful": PaperPerception,
 }
 
 
 def misled(truth: Sequence[LogState], seen: Sequence[LogObservation]) -> bool:
-    """Whether perception missed a log, made one up, or has one far from where it is (paper A's SE)."""
+    """Whether perception missed a log, invented one, or misplaced one (paper A's SE)."""
     if len(seen) != len(truth):
         return True
     apart = [[math.dist(o.center_m, log.position_m) for o in seen] for log in truth]
@@ -153,31 +153,31 @@ class Mask:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """Pictures of the standing camera, where the profile says it stands, and the true masks in them."""
+class Pictures:
+    """Pictures of the resting camera, its pose by the profile, and the true masks."""
 
-    frames: tuple[Frame, ...]
+    frames: tuple[RgbdFrame, ...]
     pose: Pose
     masks: tuple[Mask, ...]
 
 
 class _Surveyed:
-    """The camera on the stick of a machine known as ``profile``, as a survey of its mount and depth left it."""
+    """The camera on the stick with the mount and depth scale from a survey."""
 
     def __init__(self, plant: Plant, profile: Profile, seed: int) -> None:
         self._plant = plant
         self._rig = CameraRig(plant.world, plant.profile, plant.world.truth, seed, size_px=None)
         self._profile = surveyed_profile(profile, plant.world.truth, CAMERA, seed)
 
-    def look(self, stamp_ns: int, q: Sequence[float]) -> Look:
-        """``PICTURES`` of what lies there now."""
+    def detect(self, stamp_ns: int, q: Sequence[float]) -> Pictures:
+        """``PICTURE_COUNT`` of what lies there now."""
         camera, ids = self._profile.cameras[CAMERA], self._rig.picture(CAMERA)[2].mask
         pose = optical_pose(self._profile, camera, q)
         numbers = range(1, len(self._plant.logs()) + 1)
-        masks = [Mask(ids == i) for i in numbers if np.count_nonzero(ids == i) >= LEAST_PX]
-        taken = [self._rig.frame(CAMERA, stamp_ns + i * RATE_NS) for i in range(PICTURES)]
-        frames = [Frame(f.name, f.stamp_ns, f.rgb, f.depth_m, f.intrinsics) for f in taken]
-        return Look(tuple(rescaled(f, camera.depth_scale) for f in frames), pose, tuple(masks))
+        masks = [Mask(ids == i) for i in numbers if np.count_nonzero(ids == i) >= MIN_MASK_PX]
+        taken = [self._rig.frame(CAMERA, stamp_ns + i * RATE_NS) for i in range(PICTURE_COUNT)]
+        frames = [RgbdFrame(f.name, f.stamp_ns, f.rgb, f.depth_m, f.intrinsics) for f in taken]
+        return Pictures(tuple(rescaled(f, camera.depth_scale) for f in frames), pose, tuple(masks))
 
 
 def _triple(v: np.ndarray) -> tuple[float, float, float]:

@@ -1,7 +1,8 @@
-"""One grasping attempt of paper A IV-A: a fresh arrangement, see, plan, crane on the bus, lift, hold; physics judges.
+"""One grasping attempt of paper A IV-A: new arrangement, detection, plan, crane on the bus, lift, hold.
 
-Controller, guard, CAN bytes and plant as in every lockstep run.  The logs are seen by the camera on the stick from
-where the crane rests, at the start and where the activity looks again, or as the plant knows them (poses ``true``).
+Controller, guard, CAN bytes and plant are those of every lockstep run.  The logs are detected by the camera on the
+stick from where the crane rests, at the start and where the activity asks for another detection, or taken from the
+plant (poses ``true``).  The physics decides the outcome.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from experiments.common.individuals import controller_profile
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named, wood_of
 from experiments.grasp_configs.grasp_categories import Grip, category, lifted
-from experiments.grasp_configs.pose_sources import LOOK_NS, POSES, Seen, Sight, misled
+from experiments.grasp_configs.pose_sources import DETECTION_NS, POSE_SOURCES, Detection, PoseSource, misled
 from hil.harness.lockstep import START_NS, Lockstep, Observer
 from hil.harness.operator import Operator
 from machine.loading.profile_file import load_profile, profile_hash
@@ -46,23 +47,20 @@ NETWORKS: Final = {"cnn": "grasp_cornell", "cnn_physical": "grasp_physical"}
 
 @dataclass(slots=True)
 class Attempt:
-    """The planner's seat in a lockstep run: autonomy's activity, shown what is seen from where it rests; notes what it
-    does.
-    """
+    """The planner of the lockstep run: the autonomy's activity with detections from where the crane rests."""
 
     activity: Activity
-    sight: Sight
-    seen: Seen = field(default_factory=Seen)
-    """The last look, ..."""
+    source: PoseSource
+    seen: Detection = field(default_factory=Detection)
     looks: int = 0
-    """... and how many there were."""
+    """Number of detections; ``seen`` is the last one."""
     _q: tuple[float, ...] = ()
-    """Where the joints were last measured."""
+    """Joint positions last measured."""
     _up_ns: int = 0
-    """Since when the lift is done."""
+    """Time at which the lift was completed [ns]; 0: not yet."""
     _looked_ns: int = 0
     _rested_ns: int = 0
-    """Since when the crane rests above the logs."""
+    """Time since which the crane rests above the logs [ns]."""
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
         """One turn (contract of ``hil.harness.lockstep.Planner``): looks at the start until a grasp is chosen, and one
@@ -78,7 +76,7 @@ class Attempt:
         phase = self.activity.phase
         if phase <= Phase.LOOK:
             wants = phase is Phase.LOOK or not self.seen.logs
-            if wants and now_ns >= self._looked_ns + LOOK_NS:
+            if wants and now_ns >= self._looked_ns + DETECTION_NS:
                 self._look(now_ns)
             return self.seen.logs
         rests = phase is Phase.ABOVE and self.activity.arrived
@@ -90,17 +88,17 @@ class Attempt:
         return self.seen.logs
 
     def _look(self, now_ns: int) -> None:
-        self.seen = self.sight.look(now_ns, self._q)
+        self.seen = self.source.detect(now_ns, self._q)
         self.looks, self._looked_ns = self.looks + 1, now_ns
 
     def over(self, now_ns: int) -> bool:
-        """Whether the grapple is up and has been held still for two seconds."""
+        """Whether the grapple has been held still for two seconds after the lift."""
         return self._up_ns > 0 and now_ns - self._up_ns > HELD_NS
 
 
 @dataclass(slots=True)
 class Timed:
-    """A planner that notes its proposal and what it took."""
+    """A planner that keeps its proposal and its CPU time."""
 
     planner: GraspPlanner
     proposal: GraspCandidate | None = None
@@ -122,14 +120,14 @@ def _network(name: str) -> GraspNet:
 
 
 def weights_of(poses: str, planner: str) -> bool:
-    """Whether the weights are there that a pair of the ablation needs."""
+    """Whether the weights that a pair of the ablation needs exist."""
     needed = [f"{NETWORKS[planner]}.safetensors"] if planner in NETWORKS else []
     needed += [SEGMENTATION] if poses in ("ours", "faithful") else []
     return all(WEIGHTS.with_name(name).exists() for name in needed)
 
 
 def planner_named(name: str) -> GraspPlanner:
-    """The planner of an ablation.
+    """The planner with this name.
 
     Raises:
         WeightsError: the network's weights are missing or damaged.
@@ -140,8 +138,9 @@ def planner_named(name: str) -> GraspPlanner:
 
 
 def attempt(job: Job) -> dict[str, Any]:
-    """Options: profile, truth, configuration, poses (of ``poses.POSES``), planner (search, cnn or cnn_physical), scene
-    (its seed, for the job's is that of the machine), text (of the calibrated profile; None: as shipped).
+    """Options: profile, truth, configuration, poses (of ``pose_sources.POSE_SOURCES``), planner (search, cnn or
+    cnn_physical), scene (its seed, for the job's is that of the machine), text (of the calibrated profile; None: as
+    shipped).
     """
     with controller_profile(job.options["profile"], job.options.get("text")) as name:
         return _attempt(job, name, job.options.get("scene", job.seed))
@@ -159,14 +158,14 @@ def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
         activity = Activity(
             profile, digest, grasp_selector=PlannerSelection(timed), motion_planner=TimeOptimalPlanner(direct=False)
         )
-        seat = Attempt(activity, POSES[o["poses"]](plant, profile, field))
+        planner_run = Attempt(activity, POSE_SOURCES[o["poses"]](plant, profile, field))
         operator = Operator(digest, lambda *_: None)
         settings = Settings(profile, digest, profile.rate_hz)
         guard = build_guard(Path(name))
-        system = Lockstep(settings, guard, plant, seat, operator, Observer(None, []))
+        system = Lockstep(settings, guard, plant, planner_run, operator, Observer(None, []))
         grip, closings = Grip(0.0, 0.0, 0.0), 0
         phase = activity.phase
-        while not activity.failure and not operator.gave_up and not seat.over(system.now_ns):
+        while not activity.failure and not operator.gave_up and not planner_run.over(system.now_ns):
             system.advance()
             if activity.phase is not phase:
                 phase = activity.phase
@@ -176,16 +175,16 @@ def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
             if system.now_ns > START_NS + LIMIT_NS:
                 break
         ground = profile.workspace.ground_z_m
-        up = lifted(before, plant.logs(), ground) if seat.over(system.now_ns) else []
+        up = lifted(before, plant.logs(), ground) if planner_run.over(system.now_ns) else []
         verdict = plant.evaluate()
         up = [i for i in up if verdict.logs[i].left_ground or not verdict.logs[i].max_grip_n]
-        p, seen = timed.proposal, seat.seen
+        p, seen = timed.proposal, planner_run.seen
         wrong = misled(before, seen.logs)
         rise = [now.position_m[2] - was.position_m[2] for was, now in zip(before, plant.logs(), strict=True)]
         return {
             "configuration": number, "individual": o["truth"] == "sampled",
             "category": category(number, before, up, grip, wrong), "lifted": len(up),
-            "misled": wrong, "looks": seat.looks, "closings": closings, "seen": len(seen.logs),
+            "misled": wrong, "looks": planner_run.looks, "closings": closings, "seen": len(seen.logs),
             "see_ms": 1e3 * seen.seconds, "logs": len(before), "up": up,
             "failure": activity.failure, "stops": operator.stops, "expected": list(p.logs) if p else [],
             "probability": p.probability if p else math.nan, "reason": p.reason if p else "",
@@ -198,7 +197,7 @@ def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
 
 
 def _grip(plant: Plant) -> Grip:
-    """Where the tongs closed."""
+    """True position where the grapple closed."""
     x, y, _ = plant.tip()
     (_, turn) = plant.link_poses()["rotator"]
     m = plant.world.client.getMatrixFromQuaternion(turn)
@@ -206,6 +205,6 @@ def _grip(plant: Plant) -> Grip:
 
 
 def arranged(profile: str, truth: str, number: int, seed: int) -> tuple[LogSpec, ...]:
-    """The logs of an attempt: random place, direction and sizes, and who lies where."""
+    """The logs of an attempt: random place, direction and sizes."""
     wood = wood_of(profile, truth)
     return configuration(number, profile_named(profile), wood, seed * SEEDS_PER_ATTEMPT + number)

@@ -1,1 +1,1 @@
-"""Paper A's grasp network: its parameters, two cross-validations on Cornell data, and what a picture costs."""
+"""The grasp-network experiment: parameters, two cross-validations on Cornell data, and latency."""

@@ -1,9 +1,10 @@
-"""The grasp-network experiment: count, cross-validate where the data are at hand, time, draw, write."""
+"""The grasp-network experiment: counts parameters, cross-validates if data are available, measures latency."""
 
 from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
@@ -14,14 +15,14 @@ from rich.console import Console
 from autonomy.grasp.network import PAPER as NETWORK
 from autonomy.grasp.network import WEIGHTS, GraspNet, normalized_relief
 from autonomy.networks.graph import parameter_count
-from autonomy.networks.weights import WeightsRefused, load
+from autonomy.networks.weights import WeightsError, load
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.common.result import ROOT, Result, make_result, rate
-from experiments.common.result_page import tell
+from experiments.common.result_page import Page, publish
 from experiments.grasp_network import folds, latency
-from experiments.grasp_network.metrics import METRICS, PAPER, SECTIONS
+from experiments.grasp_network.metrics import CONCLUSION, INTRODUCTION, METRICS, PAPER, SECTIONS
 from experiments.grasp_network.plots import draw
 from host.exit_codes import CommandFailed, ExitCode
 
@@ -31,9 +32,9 @@ CORNELL: Final = "cornell_rgbd_01"
 
 
 def run(options: Options, console: Console) -> Result:
-    """Measure everything; writes ``options.out`` and, when asked, the docs.
+    """Run the experiment; write ``options.out`` and, if requested, the docs.
 
-    With ``options.data`` the shipped weights are judged on that folder instead of a cross-validation.
+    With ``options.data`` the shipped weights are evaluated on that folder instead of a cross-validation.
 
     Raises:
         CommandFailed: no torch, no usable weights, or a folder without samples.
@@ -52,11 +53,11 @@ def run(options: Options, console: Console) -> Result:
     try:
         arrays, facts = load(WEIGHTS, NETWORK)
         skipped, pictures = _cornell(options, facts, arrays, metrics, console)
-    except (WeightsRefused, DatasetError) as error:
+    except (WeightsError, DatasetError) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
     scenes = [picture for _, picture in latency.log_scenes(options.seed)]
     with console.status("timing"):
-        paths = latency.ways(arrays)
+        paths = latency.inference_paths(arrays)
         times = latency.times_ms(paths, scenes, QUICK_ROUNDS if options.quick else ROUNDS)
         metrics |= latency.metrics(times, latency.agreement(paths, [*scenes, *pictures]))
     metrics["prepare_ms"] = _prepare_ms(options.seed)
@@ -66,7 +67,7 @@ def run(options: Options, console: Console) -> Result:
     )  # fmt: skip
     options.out.mkdir(parents=True, exist_ok=True)
     draw(metrics, times, GraspNet(arrays), options.seed, options.out)
-    tell(result, "The grasp network, measured", INTRODUCTION, SECTIONS, options, console, _setting(result))
+    publish(result, page_of(result, {}), options, console)
     (options.out / "folds.jsonl").unlink(missing_ok=True)
     if skipped:
         console.print(f"[yellow]skipped:[/yellow] {skipped}", highlight=False)
@@ -76,7 +77,7 @@ def run(options: Options, console: Console) -> Result:
 def _cornell(
     options: Options, facts: dict[str, str], arrays: dict[str, Any], metrics: dict[str, float], console: Console
 ) -> tuple[str, list[np.ndarray]]:
-    """What was skipped and why, and the pictures at hand as the network sees them; adds to ``metrics``."""
+    """Add to ``metrics``; returns what was skipped and why, and the available pictures as network inputs."""
     from training.grasp.cornell import load as load_samples
     from training.grasp.cornell_weights import on_samples
     from training.grasp.views import centre, cut
@@ -85,13 +86,15 @@ def _cornell(
     if options.data is None and not folder.is_dir():
         return f"both cross-validations (no Cornell samples under {CORNELL} in TIMBERHAND_DATA)", []
     samples = load_samples(folder)
-    pictures = [normalized_relief(cut(s.depth_m, centre(s.depth_m)))[None, None] for s in samples[:: 8 if options.quick else 1]]
+    pictures = [
+        normalized_relief(cut(s.depth_m, centre(s.depth_m)))[None, None] for s in samples[:: 8 if options.quick else 1]
+    ]
     if options.data is not None:
         found = on_samples(GraspNet(arrays), samples, facts)
         metrics |= rate("data_right", sum(f["right"] for f in found), len(found))
         metrics |= rate("data_own_size", sum(f["own_size"] for f in found), len(found))
         metrics["data_trained_on"] = float(sum(f["trained_on"] for f in found))
-        return "both cross-validations (--data judges the shipped weights)", pictures
+        return "both cross-validations (--data evaluates the shipped weights)", pictures
     if options.quick:
         return "both cross-validations (--quick)", pictures
     metrics |= cross_validated(options, folder, samples, console)
@@ -99,7 +102,7 @@ def _cornell(
 
 
 def cross_validated(options: Options, folder: Path, samples: Any, console: Console) -> dict[str, float]:
-    """Both cross-validations; finished folds are kept until the whole run is done."""
+    """Run both cross-validations; finished folds are kept until the whole run is done."""
     from training.grasp.network_training import EPOCHS
 
     plain = {"data": str(folder), "epochs": EPOCHS}
@@ -111,7 +114,7 @@ def cross_validated(options: Options, folder: Path, samples: Any, console: Conso
 
 
 def gather(outcomes: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
-    """The rates of both cross-validations."""
+    """Success rates of both cross-validations."""
     metrics: dict[str, float] = {}
     for kind, name in zip(folds.KINDS, ("cornell_grouped", "cornell_paper_split"), strict=True):
         trials = [t for job, found in outcomes.items() if job.startswith(f"{kind}-") for t in found]
@@ -121,7 +124,7 @@ def gather(outcomes: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
 
 
 def data_root() -> Path:
-    """Where the third-party data lie: TIMBERHAND_DATA, else beside the checkout."""
+    """Folder of the third-party data: TIMBERHAND_DATA, otherwise beside the checkout."""
     return Path(os.environ.get("TIMBERHAND_DATA", ROOT.parent / "shared" / "data"))
 
 
@@ -141,14 +144,12 @@ def _setting(result: Result) -> str:
     return (
         f"Seed {result.seed}, commit `{result.commit}`. Training of every fold: {EPOCHS} epochs of {COPIES} views a "
         f"sample, batches of {BATCH}, AdamW with {LEARNING_RATE} and a cosine; one schedule, set before the folds were "
-        "judged; preprocessing and views were chosen by earlier looks at some of these samples, so both rates may "
-        f"be a little too good. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python {e['python']}, "
+        "evaluated; preprocessing and views were chosen on some of these samples, so both rates may be slightly too "
+        f"high. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python {e['python']}, "
         f"torch {e['torch']}."
     )
 
 
-INTRODUCTION: Final = (
-    "Paper A plans its grasps with a small network. This page says whether ours is that network, what it has learnt "
-    "from the 80 Cornell samples at hand, and how fast it runs. `timberhand experiment grasp-network --docs docs` "
-    "measures everything and writes the page; no number is typed."
-)
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page."""
+    return Page("Grasp network", CONCLUSION, INTRODUCTION, SECTIONS, _setting(result))

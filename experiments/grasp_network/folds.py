@@ -1,7 +1,7 @@
-"""One fold of a cross-validation on Cornell data: train on the rest, judge every picture of the fold.
+"""One fold of a cross-validation on Cornell data: trains on the rest, tests on every picture of the fold.
 
-``grouped``: runs of neighbouring numbers, tested on their plain crops.  ``paper``: augmented copies dealt at random,
-tested on copies, as paper A describes it.
+``grouped``: runs of neighbouring numbers, tested on their original crops.  ``paper``: augmented views split at
+random, tested on views, as paper A describes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ KINDS: Final = ("grouped", "paper")
 
 
 def perform(job: Job) -> list[dict[str, Any]]:
-    """Every judged picture of fold ``options["fold"]``."""
+    """Results for every test picture of fold ``options["fold"]``."""
     import torch
 
     torch.set_num_threads(1)
@@ -66,7 +66,7 @@ def _examples(folder: str, seed: int) -> tuple[tuple[Sample, ...], list[Example]
 
 
 def identity(samples: tuple[Sample, ...], seed: int, epochs: int) -> str:
-    """Of all that decides a fold's outcome: the network, the schedule, and the pictures as it sees them."""
+    """Hash of everything that decides the outcome of a fold: network, schedule, and the preprocessed pictures."""
     digest = hashlib.sha256(
         f"{fingerprint(BODY)} {seed} {epochs} {COPIES} {BATCH} {LEARNING_RATE} {len(samples)}".encode()
     )

@@ -1,4 +1,4 @@
-"""What a picture costs on one thread, by every way of running the same network; does the grasp stay the same?"""
+"""Latency of a picture on one thread for every inference path of the same network, and agreement of the grasps."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from autonomy.grasp.network import (
 from autonomy.grasp.virtual_scene import camera_above, operational_area, render
 from autonomy.networks.openvino_net import OpenVinoNet
 
-EAGER: Final = "torch eager, unchanged"
+EAGER: Final = "PyTorch eager, original"
 PATHS: Final = {
     "torch": EAGER,
-    "f32": "OpenVINO f32, unchanged",
+    "f32": "OpenVINO f32, original",
     "heads": "OpenVINO f32, heads before the upsampling",
-    "low": "OpenVINO f32, the grasp alone",
-    "mixed": "OpenVINO mixed, the grasp alone",
+    "low": "OpenVINO f32, grasp only",
+    "mixed": "OpenVINO mixed, grasp only",
 }
-MOST_PX: Final = 3.0
-MOST_DEG: Final = 3.0
+MAX_DISTANCE_PX: Final = 3.0
+MAX_ANGLE_DEG: Final = 3.0
 SCENES: Final = 12
 
-Way = Callable[[np.ndarray], PixelGrasp]
+InferencePath = Callable[[np.ndarray], PixelGrasp]
 
 
-def ways(arrays: Mapping[str, np.ndarray]) -> dict[str, Way]:
-    """A picture (1, 1, 300, 300) to its grasp, by path."""
+def inference_paths(arrays: Mapping[str, np.ndarray]) -> dict[str, InferencePath]:
+    """The paths by name; each maps a picture (1, 1, 300, 300) to its grasp."""
     import torch
 
     from autonomy.networks.torch_net import random_net
@@ -62,14 +62,12 @@ def ways(arrays: Mapping[str, np.ndarray]) -> dict[str, Way]:
     }
 
 
-def _through(net: Callable[[np.ndarray], dict[str, np.ndarray]]) -> Way:
+def _through(net: Callable[[np.ndarray], dict[str, np.ndarray]]) -> InferencePath:
     return lambda picture: best_pixel(stack_maps(net(picture)))
 
 
-def times_ms(paths: Mapping[str, Way], pictures: Sequence[np.ndarray], rounds: int) -> dict[str, list[float]]:
-    """Processor time of every call [ms], the paths taking turns; on an idle host it is the time that passes, and on a
-    busy one it leaves out the waiting for the processor.
-    """
+def times_ms(paths: Mapping[str, InferencePath], pictures: Sequence[np.ndarray], rounds: int) -> dict[str, list[float]]:
+    """CPU time of every call [ms], paths measured alternately; it excludes the time spent waiting for a processor."""
     found: dict[str, list[float]] = {name: [] for name in paths}
     for i in range(-2, rounds):
         for name, way in paths.items():
@@ -80,8 +78,10 @@ def times_ms(paths: Mapping[str, Way], pictures: Sequence[np.ndarray], rounds: i
     return found
 
 
-def agreement(paths: Mapping[str, Way], pictures: Sequence[np.ndarray]) -> dict[str, list[tuple[float, float]]]:
-    """(distance of the pixels [px], angle [deg]) from the unchanged network in torch, by path and picture."""
+def agreement(
+    paths: Mapping[str, InferencePath], pictures: Sequence[np.ndarray]
+) -> dict[str, list[tuple[float, float]]]:
+    """(distance [px], angle [deg]) of the grasp from that of the original network in PyTorch, by path and picture."""
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in paths}
     for picture in pictures:
         wanted = paths["torch"](picture)
@@ -94,9 +94,9 @@ def agreement(paths: Mapping[str, Way], pictures: Sequence[np.ndarray]) -> dict[
 
 
 def metrics(times: Mapping[str, list[float]], apart: Mapping[str, list[tuple[float, float]]]) -> dict[str, float]:
-    """Medians, ratios, agreement; the fastest path is the fastest of those that agree.
+    """Medians, ratios and agreement; the fastest path is the fastest of those that agree.
 
-    Agreement is in 95 of 100 pictures: where two places are as good but for rounding, either is right.
+    Agreement is the 95th percentile over the pictures: if two places are equally good, rounding decides.
     """
     medians = {name: float(np.median(found)) for name, found in times.items()}
     out: dict[str, float] = {}
@@ -105,7 +105,7 @@ def metrics(times: Mapping[str, list[float]], apart: Mapping[str, list[tuple[flo
         out[f"{name}_ms"] = median
         out[f"{name}_ratio"] = median / medians["torch"]
         out[f"{name}_argmax_px"], out[f"{name}_angle_deg"] = map(float, worst[name])
-    agreeing = [n for n in medians if worst[n][0] <= MOST_PX and worst[n][1] <= MOST_DEG]
+    agreeing = [n for n in medians if worst[n][0] <= MAX_DISTANCE_PX and worst[n][1] <= MAX_ANGLE_DEG]
     fastest = min(agreeing, key=lambda n: medians[n])
     return out | {
         "latency_ratio": out[f"{fastest}_ratio"],
@@ -115,7 +115,7 @@ def metrics(times: Mapping[str, list[float]], apart: Mapping[str, list[tuple[flo
 
 
 def log_scenes(seed: int, count: int = SCENES) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(depth [m], network input) of drawn logs on the ground as paper A's virtual camera sees them."""
+    """(depth [m], network input) of rendered logs on the ground, seen by paper A's virtual camera."""
     found = []
     for i in range(count):
         rng: Any = np.random.default_rng([seed, i])

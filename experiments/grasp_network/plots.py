@@ -1,4 +1,4 @@
-"""The pictures of the experiment; none shows anything of the Cornell data."""
+"""Plots of the grasp-network experiment; none shows anything of the Cornell data."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 
 from autonomy.grasp.network import GraspNet, best_pixel, normalized_relief
 from experiments.grasp_network.latency import PATHS, log_scenes
-from experiments.grasp_network.metrics import PAPER, RATIO
+from experiments.grasp_network.metrics import MAX_LATENCY_RATIO, PAPER
 from runtime.plot_style import OIL, RUST, STEEL, TIMBER, sheet
 
 BARS = {
-    "cornell_paper_split": "copies at random\n(paper's way)",
+    "cornell_paper_split": "views at random\n(as in the paper)",
     "cornell_grouped": "objects apart",
-    "cornell_paper_split_own_size": "copies at random,\nlabel's size",
+    "cornell_paper_split_own_size": "views at random,\nlabel's size",
     "cornell_grouped_own_size": "objects apart,\nlabel's size",
 }
 SHOWN = (0, 1, 3, 6, 10)
@@ -24,7 +24,7 @@ CHOSEN = "#35d04a"
 
 
 def draw(metrics: Mapping[str, float], times: Mapping[str, list[float]], net: GraspNet, seed: int, out: Path) -> None:
-    """Write every picture the metrics allow."""
+    """Write every plot into ``out``."""
     _cornell(metrics, out / "cornell.png")
     _latency(times, out / "latency.png")
     _logs(net, seed, out / "logs.png")
@@ -43,8 +43,8 @@ def _cornell(m: Mapping[str, float], path: Path) -> None:
         axis.set_xticks(range(len(shown)), list(shown.values()))
         axis.set_xlim(-0.5, len(BARS) - 0.5)
         axis.set_ylim(0, 100)
-        axis.set_ylabel("right grasps [%]")
-        axis.set_title("Cornell samples, 10 folds" if shown else "Cornell samples: none at hand, nothing judged")
+        axis.set_ylabel("correct grasps [%]")
+        axis.set_title("Cornell samples, 10 folds" if shown else "Cornell samples: none available")
         axis.legend(loc="upper right")
 
 
@@ -56,9 +56,9 @@ def _latency(times: Mapping[str, list[float]], path: Path) -> None:
             axis.barh(-i, middle, 0.6, color=STEEL if name == "torch" else TIMBER)
             axis.plot([low, high], [-i, -i], color="black", lw=1.2)
             axis.text(max(middle, high) + 0.015, -i, f"{middle:.2f}", va="center")
-        axis.axvline(RATIO, color=RUST, ls="--", lw=0.9)
+        axis.axvline(MAX_LATENCY_RATIO, color=RUST, ls="--", lw=0.9)
         axis.set_yticks([-i for i in range(len(PATHS))], list(PATHS.values()))
-        axis.set_xlabel("time of a picture, torch eager = 1")
+        axis.set_xlabel("time of a picture, PyTorch eager = 1")
         axis.set_title("One thread")
 
 

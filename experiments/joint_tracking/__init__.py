@@ -1,1 +1,1 @@
-"""``timberhand experiment joint-tracking``: the joint laws beside each other on the same motions and disturbances."""
+"""``timberhand experiment joint-tracking``: compares the joint control laws on the same motions and disturbances."""

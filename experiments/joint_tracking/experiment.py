@@ -1,4 +1,4 @@
-"""The joint-tracking experiment: which trials, run on all cores, judged, drawn and written."""
+"""The joint-tracking experiment: plans the trials, runs them on all cores, evaluates and publishes the result."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import Figure, Result, judged
-from experiments.common.result_page import Section, tell
-from experiments.common.trials import check_truth, checkpoint, individuals
+from experiments.common.result import Result, make_result
+from experiments.common.result_page import Page, publish
+from experiments.common.trials import check_truth, checkpoint, sampled_unless_given
 from experiments.common.worlds import profile_named
 from experiments.joint_tracking.individuals import CORNERS
-from experiments.joint_tracking.metrics import INTRODUCTION, LAWS, MACHINES, sections
+from experiments.joint_tracking.metrics import INTRODUCTION, LAWS, MACHINES, conclusion, sections
 from experiments.joint_tracking.plots import draw
 from experiments.joint_tracking.trial import perform
 
 TRIALS: Final = 6
 QUICK_TRIALS: Final = 1
 FIRST_SEED: Final = 1000
-"""Judged on machines that nobody looked at while the laws were tuned."""
+"""These machines were not looked at while the laws were tuned."""
 SEEDS_PER_RUN: Final = 1000
 STATES: Final = {"calibrated": True, "shipped": False}
 CALIBRATED: Final = ("cycle", "steps", "ramps", "pick_up", "pump", "dip", "wide", "corner")
@@ -36,7 +36,7 @@ WORST: Final = ("rest_m", "settle_s", "wobble_m", "tip_peak_m")
 
 
 def machines(options: Options) -> dict[str, str]:
-    """Profiles by short name; a profile of one's own takes the place of its kind."""
+    """Profiles by short name; a profile given by the caller replaces the shipped one of its kind."""
     kind = "palms" if profile_named(options.profile).carrier is None else "aoro"
     return {**MACHINES, kind: options.profile}
 
@@ -47,7 +47,7 @@ def plan(options: Options, trials: int) -> list[Job]:
     corners = QUICK_CORNERS if options.quick else range(len(CORNERS))
     jobs = []
     for short, profile in machines(options).items():
-        # Without a truth of one's own every trial is an individual: one machine alone says little about a law.
+        # Unless the caller gives a truth, every trial is another individual: one machine says little about a law.
         same = profile == options.profile and options.truth not in ("nominal", "sampled")
         what = {"profile": profile, "truth": options.truth if same else "sampled"}
         for (state, calibrated), law in product(STATES.items(), LAWS):
@@ -69,15 +69,15 @@ def plan(options: Options, trials: int) -> list[Job]:
 
 
 def own_law(profile: str) -> str:
-    """The law of a profile's slew, which stands for all."""
+    """The law of the slew of a profile, which represents all joints."""
     return profile_named(profile).joints["slew"].law.kind
 
 
 def run(options: Options, console: Console) -> Result:
-    """Measure everything; writes ``options.out`` and, when asked, the docs.
+    """Run the experiment; write ``options.out`` and, if requested, the docs.
 
     Raises:
-        Stopped: the truth file cannot be used.
+        CommandFailed: the truth file cannot be used.
     """
     check_truth(options.profile, options.truth)
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
@@ -86,32 +86,33 @@ def run(options: Options, console: Console) -> Result:
     with checkpoint(options, jobs, profiles.values(), options.truth, ["controller"]) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "joint-tracking trials", console)
         metrics = gather(outcomes)
-        shown = sections_of(profiles, metrics)
-        result = judged(
-            "joint-tracking", [f for section in shown for f in section.figures], metrics,
+        result = make_result(
+            "joint-tracking", [m for s in sections(laws_of(profiles), metrics) for m in s.metrics], metrics,
             profile=", ".join(profiles.values()), seed=options.seed, trials=trials,
-            more={"truth": individuals(options.truth)},
+            more={"truth": sampled_unless_given(options.truth)},
         )  # fmt: skip
         draw(metrics, outcomes, profiles, options.out)
-        tell(result, "Joint laws, compared", INTRODUCTION, shown, options, console)
+        publish(result, page_of(result, {}), options, console)
     return result
 
 
-def sections_of(profiles: Mapping[str, str], metrics: Mapping[str, float]) -> tuple[Section, ...]:
-    """The page's sections for profiles by short name."""
-    return sections({short: own_law(profile) for short, profile in profiles.items()}, metrics)
+def laws_of(profiles: Mapping[str, str]) -> dict[str, str]:
+    """The law of each profile, by the short name of its machine."""
+    return {short: own_law(profile) for short, profile in profiles.items()}
 
 
-def figures(metrics: Mapping[str, float]) -> list[Figure]:
-    """Those of the shipped machines."""
-    return [f for section in sections_of(MACHINES, metrics) for f in section.figures]
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page."""
+    profiles = dict(zip(MACHINES, result.profile.split(", "), strict=True))
+    laws = laws_of(profiles)
+    return Page("Joint control laws", conclusion(laws), INTRODUCTION, sections(laws, result.metrics))
 
 
 def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
-    """Means over the trials of each kind: machine, law, state and scenario are in the name.
+    """Means over the trials of each kind; machine, law, state and scenario are in the name.
 
-    The worst is kept beside the mean where it matters.  Over all trials of a law: its valves shut and the motions that
-    did not settle in each state, how many machines of twice the spread it had, and how many of them diverged.
+    Some metrics also have their worst value.  Over all trials of a law: the share of valves closed and of motions that
+    did not settle in each state, and how many of its machines with twice the spread diverged.
     """
     groups: dict[str, list[dict[str, Any]]] = {}
     for name, outcome in outcomes.items():
@@ -152,5 +153,5 @@ def _over_all(outcomes: Mapping[str, Any]) -> dict[str, float]:
     for short in {name.split("/")[0] for name in outcomes}:
         if plain := found.pop(f"{short}_stop_plain", 0.0):
             found[f"{short}_stop_damped_over_plain"] = found.pop(f"{short}_stop_damped") / plain
-    # Where nothing settles at all, no valve is shut after settling: that must not pass for lack of a figure.
+    # If no motion settles, no valve is closed after settling: this counts as 0, not as a missing metric.
     return found | {name: sum(values) / len(values) if values else 0.0 for name, values in shares.items()}

@@ -11,10 +11,10 @@ from typing import Any, Final
 import msgspec
 
 from experiments.common.pool import Job
-from experiments.common.worlds import home_at, opened, profile_named
-from experiments.joint_tracking.testbed import Calibration, Rig, believed
-from machine.kinematics import max_reach_m
-from machine.load import load_profile
+from experiments.common.worlds import home_at, profile_named, trial_world
+from experiments.joint_tracking.testbed import Calibration, Rig, controller_profile
+from machine.geometry.kinematics import max_reach_m
+from machine.loading.profile_file import load_profile
 from sim.world import World
 
 REACH_SHARE, HEIGHT_M = 0.55, 1.0
@@ -36,11 +36,11 @@ class Machine:
         o = job.options
         profile = load_profile(o["profile"])
         home = home_at(o["profile"], REACH_SHARE * max_reach_m(profile), HEIGHT_M)
-        with opened(o["profile"], o["truth"], job.seed) as world:
+        with trial_world(o["profile"], o["truth"], job.seed) as world:
             truth = world.truth if machine is None else machine(job, world)
         self._world = world = World(profile, truth, job.seed, (), home=home)
         calibration = Calibration(job.seed) if o["calibrated"] else None
-        made = believed(profile, world, o["law"], calibration, o.get("damped", True))
+        made = controller_profile(profile, world, o["law"], calibration, o.get("damped", True))
         self._rig = Rig(made, world, job.seed)
 
     def __enter__(self) -> Rig:
@@ -76,7 +76,7 @@ def cornered(job: Job, world: World) -> Any:
 
 def _changed(job: Job, world: World, change: Callable[[Any, Any], tuple[float, float, float]]) -> Any:
     """``change``: drawn and nominal valve to dead time [s], not below one physics step, and full speeds."""
-    with opened(job.options["profile"], "nominal", job.seed) as middle:
+    with trial_world(job.options["profile"], "nominal", job.seed) as middle:
         nominal = middle.truth
     functions = {}
     for name, function in world.truth.functions.items():

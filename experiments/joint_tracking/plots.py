@@ -7,9 +7,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
-from experiments.common.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, limit_band, sheet
 from experiments.joint_tracking.metrics import KILO, LAWS, MM, PERCENT, REST_M, SHUT
 from experiments.joint_tracking.trial import DIVERGED_M
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, limit_band, sheet
 
 COLOURS: Final = dict(zip(LAWS, (OIL, TIMBER, MOSS, STEEL), strict=True))
 SHADES: Final = (("calibrated", -0.19, 1.0), ("shipped", 0.19, 0.45))

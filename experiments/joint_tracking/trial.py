@@ -19,7 +19,7 @@ from experiments.joint_tracking import motions
 from experiments.joint_tracking.individuals import CORNERS, Machine, cornered, kind_of, widened
 from experiments.joint_tracking.motions import START_S, duration_s, legs
 from experiments.joint_tracking.testbed import NAMES, Rig, Trace
-from machine.kinematics import pin_position
+from machine.geometry.kinematics import pin_position
 from sim.world import World
 
 ARM: Final = ("slew", "lift", "tilt", "ext")

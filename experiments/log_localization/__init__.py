@@ -1,1 +1,1 @@
-"""Where is the log? Paper B's test of its vision (4.1.3, 5.1.2), with its own pipeline and ours on the same frames."""
+"""The log-localization experiment: paper B's test of its vision (4.1.3, 5.1.2), its pipeline and ours compared."""

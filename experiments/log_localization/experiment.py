@@ -1,8 +1,9 @@
-"""The log-localization experiment: paper B's approaches and single frames over angle and range; judged, drawn, told."""
+"""The log-localization experiment: paper B's approaches, and single frames over angle and range."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 from rich.console import Console
 
@@ -10,11 +11,11 @@ from autonomy.networks.weights import SHIPPED
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import Result, judged
-from experiments.common.result_page import tell
-from experiments.common.trials import check_truth, checkpoint, individuals
+from experiments.common.result import Result, make_result
+from experiments.common.result_page import Page, publish
+from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, sampled_unless_given
 from experiments.common.worlds import carrier_profile, profile_named
-from experiments.log_localization.metrics import DEGREES, FIGURES, INTRODUCTION, PAPER, gather, sections
+from experiments.log_localization.metrics import CONCLUSION, DEGREES, INTRODUCTION, METRICS, PAPER, gather, sections
 from experiments.log_localization.plots import draw, overlay
 from experiments.log_localization.trial import SEGMENTERS, perform
 from host.exit_codes import CommandFailed, ExitCode
@@ -22,37 +23,46 @@ from host.exit_codes import CommandFailed, ExitCode
 TRIALS: Final = 12
 QUICK_TRIALS: Final = 1
 FIRST_SEED: Final = 30_000
-"""Judged on sites that nobody looked at while perception was made."""
+"""These sites were not looked at while perception was developed."""
 SEEDS_PER_RUN: Final = 1000
 ANGLES: Final = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)
 QUICK_ANGLES: Final = (0.0, 90.0)
-CURVE_SHARE: Final = 2  # of so many trials one is a curve too
+TRIALS_PER_CURVE: Final = 2
 
 
 def run(options: Options, console: Console) -> Result:
-    """Measure everything; writes ``options.out`` and, when asked, the docs.
+    """Run the experiment; write ``options.out`` and, if requested, the docs.
 
     Raises:
         CommandFailed: the truth file cannot be used, or the machine has no front camera.
     """
-    name, truth = carrier_profile(options.profile), individuals(options.truth)
+    name, truth = carrier_profile(options.profile), sampled_unless_given(options.truth)
     profile = profile_named(name)
     if "front" not in profile.cameras:
-        raise CommandFailed(ExitCode.CONFIGURATION, f"{name} has no camera named front; add [cameras.front] to the profile")
+        raise CommandFailed(
+            "log-localization.no-front-camera",
+            f"{name} has no camera named front; add [cameras.front] to the profile",
+            ExitCode.CONFIGURATION,
+        )
     check_truth(name, truth)
     masks = "network" if (SHIPPED / "logs_rgbd.safetensors").exists() else "true"
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
     jobs = plan(options, name, truth, trials, masks)
-    with checkpoint(options, jobs, [name], truth, ["autonomy"]) as kept:
+    with checkpoint(options, jobs, [name], truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "log-localization trials", console)
-        result = judged(
-            "log-localization", FIGURES, gather(outcomes), profile=name, seed=options.seed, trials=trials,
+        result = make_result(
+            "log-localization", METRICS, gather(outcomes), profile=name, seed=options.seed, trials=trials,
             more={"truth": truth, "masks": masks}, paper=PAPER,
         )  # fmt: skip
         draw(outcomes, options.out)
         overlay(profile, truth, jobs[0].seed, SEGMENTERS[masks], options.out / "overlay.png")
-        tell(result, "Where is the log?", INTRODUCTION, sections(masks), options, console)
+        publish(result, page_of(result, {}), options, console)
     return result
+
+
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page."""
+    return Page("Log localization", CONCLUSION, INTRODUCTION, sections(result.environment["masks"]))
 
 
 def plan(options: Options, profile: str, truth: str, trials: int, masks: str) -> list[Job]:
@@ -64,6 +74,6 @@ def plan(options: Options, profile: str, truth: str, trials: int, masks: str) ->
         for i in range(trials)
         for d in DEGREES
     ]
-    curves = range(max(1, trials // CURVE_SHARE))
+    curves = range(max(1, trials // TRIALS_PER_CURVE))
     angles = QUICK_ANGLES if options.quick else ANGLES
     return jobs + [Job(f"curve/{a:g}/{i}", "curve", first + i, what | {"degrees": a}) for i in curves for a in angles]

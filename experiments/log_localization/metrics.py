@@ -1,4 +1,4 @@
-"""What the log-localization experiment reports: figures with their limits, the page and its explanation."""
+"""Metrics of the log-localization experiment with their limits, and the page that shows them."""
 
 from __future__ import annotations
 
@@ -8,21 +8,29 @@ from typing import Any, Final
 
 import numpy as np
 
-from autonomy.perception.papers.paper_b import end_on_miss_m
-from experiments.common.result import Figure, rate
+from autonomy.perception.papers.paper_b import end_on_error_m
+from experiments.common.result import Metric, rate
 from experiments.common.result_page import Section
 
 CM: Final = 100.0
 DEGREES: Final = (0, 45, 90)
 LIMITS_M: Final = {0: 0.02, 45: 0.03, 90: 0.05}
 PAPER_M: Final = {0: 0.03, 45: 0.10, 90: 0.30}
-SEEN: Final = {0: "across the view", 45: "at 45 degrees", 90: "end-on"}
+VIEWS: Final = {0: "across the view", 45: "at 45 degrees", 90: "end-on"}
 PAPER: Final = {f"faithful.deg{d}.median_m": error for d, error in PAPER_M.items()}
 
 
-def _places(prefix: str, what: str, limits: Mapping[int, float | None]) -> tuple[Figure, ...]:
+CONCLUSION: Final = (
+    "Our perception locates a log with a median error of {deg0.median_m} across the view, {deg45.median_m} at 45 "
+    "degrees and {deg90.median_m} end-on; paper B's pipeline on the same frames reaches {faithful.deg0.median_m}, "
+    "{faithful.deg45.median_m} and {faithful.deg90.median_m}.",
+    "It finds {found} of the logs.",
+)
+
+
+def _positions(prefix: str, title: str, limits: Mapping[int, float | None]) -> tuple[Metric, ...]:
     return tuple(
-        Figure(f"{prefix}deg{d}.median_m", f"{what}, log {SEEN[d]}: median", "cm",
+        Metric(f"{prefix}deg{d}.median_m", f"{title}, log {VIEWS[d]}: median error", "cm",
                "Distance in space from the estimate to the middle of the log's pith, both logs of all approaches.",
                most=limits[d], scale=CM)
         for d in DEGREES
@@ -30,84 +38,94 @@ def _places(prefix: str, what: str, limits: Mapping[int, float | None]) -> tuple
 
 
 OURS: Final = (
-    *_places("", "Ours", LIMITS_M),
-    Figure("p95_m", "Ours: 95th percentile", "cm", "Of the same distances, all angles together.", most=0.10, scale=CM),
-    Figure("axis_median_deg", "Axis, median", "deg", "Angle to the chord of the log.", most=2.0),
-    Figure("diameter_median_m", "Diameter, median error", "cm", "Against the diameter at half length.", most=0.015,
+    *_positions("", "Ours", LIMITS_M),
+    Metric("p95_m", "Ours: error of the position, 95th percentile", "cm", "The same distances, all angles.", most=0.10,
            scale=CM),
-    Figure("length_median_m", "Length, median error", "cm", "Where both ends are seen.", most=0.10, scale=CM),
-    Figure("found", "Logs found", "%", "An estimate within 1 m of the log at its stop.", least=0.95, scale=100.0),
-    Figure("honesty", "Squared error over what was claimed, mean", "", "Each direction of the position, in claimed "
-           "standard deviations, squared; 1 is honest, more is too sure.", most=4.0),
+    Metric("axis_median_deg", "Ours: error of the axis, median", "deg", "Angle to the chord of the log.", most=2.0),
+    Metric("diameter_median_m", "Ours: error of the diameter, median", "cm", "Against the diameter at half length.",
+           most=0.015, scale=CM),
+    Metric("length_median_m", "Ours: error of the length, median", "cm", "If both ends are visible.", most=0.10,
+           scale=CM),
+    Metric("found", "Logs found", "%", "An estimate within 1 m of the log at its stop.", least=0.95, scale=100.0),
+    Metric("honesty", "Squared error over the claimed variance, mean", "",
+           "Each direction of the position, normalized by its claimed standard deviation; 1 is consistent, more is "
+           "overconfident.", most=4.0),
 )  # fmt: skip
 FAITHFUL: Final = (
-    *_places("faithful.", "Paper B's pipeline", dict.fromkeys(DEGREES)),
-    *(Figure(f"faithful.deg{d}.centred_m", f"The same with a radius added, log {SEEN[d]}: median", "cm",
-             "12.5 cm, half of the paper's mean diameter, are added along the line of sight to every estimate.",
+    *_positions("faithful.", "Paper B's pipeline", dict.fromkeys(DEGREES)),
+    *(Metric(f"faithful.deg{d}.centred_m", f"Paper B's pipeline with a radius added, log {VIEWS[d]}: median error",
+             "cm", "12.5 cm, half of the paper's mean diameter, are added along the line of sight to every estimate.",
              scale=CM) for d in DEGREES),
-    Figure("faithful.p95_m", "Paper B's pipeline: 95th percentile", "cm", "All angles together.", scale=CM),
-    Figure("faithful.axis_median_deg", "Paper A's perception: axis, median", "deg", "Last frame at the stop."),
-    Figure("faithful.diameter_median_m", "Paper A's perception: diameter, median error", "cm", "Last frame.", scale=CM),
-    Figure("faithful.length_median_m", "Paper A's perception: length, median error", "cm", "Last frame.", scale=CM),
+    Metric("faithful.p95_m", "Paper B's pipeline: error of the position, 95th percentile", "cm", "All angles.",
+           scale=CM),
+    Metric("faithful.axis_median_deg", "Paper A's perception: error of the axis, median", "deg",
+           "Last frame at the stop."),
+    Metric("faithful.diameter_median_m", "Paper A's perception: error of the diameter, median", "cm", "Last frame.",
+           scale=CM),
+    Metric("faithful.length_median_m", "Paper A's perception: error of the length, median", "cm", "Last frame.",
+           scale=CM),
 )  # fmt: skip
-FIGURES: Final = OURS + FAITHFUL
+METRICS: Final = OURS + FAITHFUL
 INTRODUCTION: Final = (
-    "Paper B's test of its vision (4.1.3, 5.1.2): two logs lie 5 m apart, across the way of the machine, at 45 degrees "
-    "or along it; the machine comes from 40 m away and stops before each, the camera 5.2 m from the log (the first is "
-    "taken away before it drives on). Paper B's own pipeline and ours see the same frames. Every trial is another "
-    "machine, camera and ground: rough, with grass and branches; logs taper by 4 to 12 mm a metre, bow by up to 3 %, "
-    "are oval and have rough bark, and pybullet's renderer draws them. Depth has the errors of stereo: alike over ten "
-    "pixels, growing with the square of the range, edges that grow, holes, and a scale error of 0.5 to 1 % that stays "
-    "for a run. Before a run the camera's mount and the scale of its depth are surveyed with 14 targets; both "
-    "pipelines get the result. Poses come from a dual-antenna RTK receiver with its errors. There is no public RGB-D "
-    "data of logs: all of this is synthetic. Beyond 10 m no pipeline is fed: a log is a few pixels wide there. "
-    "`timberhand experiment log-localization --docs docs` measures everything and writes this page; no number is typed."
+    "This experiment repeats paper B's test of its vision (4.1.3, 5.1.2). Two logs lie 5 m apart, across the path of "
+    "the machine, at 45 degrees or along it. The machine comes from 40 m away and stops before each log, with the "
+    "camera 5.2 m from it (the first log is removed before the machine continues). Paper B's own pipeline and ours "
+    "process the same frames. Every trial uses another machine, camera and ground: rough, with grass and branches. "
+    "Logs taper by 4 to 12 mm per metre, bow by up to 3 %, are oval and have rough bark; pybullet's renderer draws "
+    "them. Depth has stereo errors: correlated over ten pixels, growing with the square of the range, with enlarged "
+    "edges, holes, and a scale error of 0.5 to 1 % that is constant during a run. Before a run the mount of the camera "
+    "and the scale of its depth are surveyed with 14 targets; both pipelines use the result. Poses come from a "
+    "dual-antenna RTK receiver with its errors. There is no public RGB-D data set of logs, so all of this is "
+    "synthetic. Frames from beyond 10 m are not used: there a log is only a few pixels wide."
 )
 
 
 def explanation() -> str:
     """Why paper B's error grows with the angle, with the numbers of its set-up."""
     height, near, far, diameter, pitch = 2.4, 3.68, 5.68, 0.25, 0.5
-    back, up = end_on_miss_m(near, far, height, diameter, pitch)
+    back, up = end_on_error_m(near, far, height, diameter, pitch)
     middle = 2.0 / (1.0 / near + 1.0 / far)
     return (
-        "Paper B takes the depth at the middle of the box and no more. Three things follow. (1) What is seen is the "
-        f"surface: {CM * diameter / 2:.1f} cm off the axis, at any angle. (2) A box's middle is the middle of a "
-        "picture, not of a log: equal steps in the picture are equal steps in the inverse of the distance, so for a "
-        f"log end-on whose ends are {near:.2f} and {far:.2f} m ahead it lies near the harmonic mean "
+        "Paper B uses the depth at the middle of the box and nothing else. This has three consequences. (1) The camera "
+        f"sees the surface, which is {CM * diameter / 2:.1f} cm off the axis at any angle. (2) The middle of a box is "
+        "the middle in the picture, not of the log: equal steps in the picture are equal steps in the inverse of the "
+        f"distance. For a log end-on whose ends are {near:.2f} and {far:.2f} m ahead it lies near the harmonic mean "
         f"2 / (1/{near:.2f} + 1/{far:.2f}) = {middle:.2f} m, {CM * (0.5 * (near + far) - middle):.0f} cm short. (3) "
-        "The box also holds the near end's disc, which moves its middle further towards the machine. Together, in "
-        f"closed form for a log of {CM * diameter:.0f} cm on level ground: {CM * back:.0f} cm short and "
-        f"{CM * up:.0f} cm high, {CM * math.hypot(back, up):.0f} cm in all. Across the view (2) and (3) vanish and "
-        "only the radius is left, 12 cm; 45 degrees lie between. The paper reports 3, 10 and 30 cm and does not say "
-        "how the surface became the middle; with half its mean diameter added along the line of sight (the second "
-        "rows below) the same growth comes out from a smaller start. None of this averages out over frames. Ours fits "
-        "a cylinder to outline and visible surface, so that neither the radius nor perspective is left over."
+        "The box also contains the disc of the near end, which moves its middle further towards the machine. Together, "
+        f"in closed form for a log of {CM * diameter:.0f} cm on level ground: {CM * back:.0f} cm short and "
+        f"{CM * up:.0f} cm high, {CM * math.hypot(back, up):.0f} cm in total. Across the view (2) and (3) vanish and "
+        "only the radius remains, 12 cm; 45 degrees lie between. The paper reports 3, 10 and 30 cm and does not state "
+        "how it derives the middle from the surface. With half of its mean diameter added along the line of sight (the "
+        "second group of rows below) the same growth results from a smaller start. None of this averages out over "
+        "frames. Our perception fits a cylinder to outline and visible surface, so that neither the radius nor the "
+        "perspective remains as an error."
     )
 
 
 def sections(masks: str) -> tuple[Section, ...]:
-    """Sections of the page; ``masks``: where the instance masks came from."""
-    told = {
-        "true": "Masks here are the renderer's own; the boxes that paper B's pipeline gets bound them, in whole pixels "
-        "of its 608 x 608 picture.",
-        "network": "Masks are the shipped network's; the boxes that paper B's pipeline gets bound them.",
+    """Sections of the page; ``masks``: the source of the instance masks."""
+    source = {
+        "true": "The masks are the renderer's own; paper B's pipeline gets their bounding boxes in whole pixels of its "
+        "608 x 608 picture.",
+        "network": "The masks are those of the shipped network; paper B's pipeline gets their bounding boxes.",
     }[masks]
     return (
-        Section("Ours", "Robust cylinder fits, joined over frames and motion by an information filter with what the "
-                f"camera gets wrong for good among its states. {told}", OURS,
-                (("errors.png", "Errors of the position at the stops, as paper B's Figs 16 to 18: ours dark, the "
-                  "paper's pipeline light."),
+        Section("Our perception", "Robust cylinder fits are combined over frames and motion by an information filter "
+                f"whose state includes the constant errors of the camera. {source}", OURS,
+                (("errors.png", "Errors of the position at the stops, as in Figs 16 to 18 of paper B. Dark: ours; "
+                                "light: "
+                  "the paper's pipeline."),
                  ("overlay.png", "Single frames at the stop: our cylinder (red) and paper B's point (blue), on colour "
                   "and on depth."))),
         Section("The paper's pipeline on the same frames", explanation(), FAITHFUL,
                 (("curve.png", "Error of single frames over the angle and over the range: 10, 50 and 90 % of all "
-                  "trials; ours dark, the paper's pipeline light."),)),
+                               "trials. "
+                  "Dark: ours; light: the paper's pipeline."),)),
     )  # fmt: skip
 
 
 def gather(outcomes: Mapping[str, Any]) -> dict[str, float]:
-    """The figures of all approaches."""
+    """Metrics of all approaches."""
     rows: dict[int, list[dict[str, Any]]] = {d: [] for d in DEGREES}
     for name, outcome in outcomes.items():
         kind, degrees, *_ = name.split("/")
@@ -135,12 +153,12 @@ def _median(rows: list[dict[str, Any]], key: str) -> float:
 
 
 def _quantile(rows: list[dict[str, Any]], key: str, share: float) -> float:
-    """Of all rows; a log that was not found counts as an infinite error of its position."""
+    """Quantile over all rows; a log that was not found counts as an infinite error of its position."""
     values = [row[key] for row in rows]
     if key.endswith("error_m"):
         values = [math.inf if math.isnan(v) else v for v in values]
     values = [v for v in values if not math.isnan(v)]
     if not values:
         return math.nan
-    # No interpolation beside what was not found.
+    # No interpolation next to an infinite error.
     return float(np.median(values) if share == 0.5 else np.quantile(values, share, method="higher"))

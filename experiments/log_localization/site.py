@@ -1,8 +1,8 @@
-"""The test site: rough ground with grass and branches, two logs 5 m apart, and a carrier that drives towards them.
+"""The test site: rough ground with grass and branches, two logs 5 m apart, and a carrier that approaches them.
 
-Logs differ from those that anything was trained on: tapered, bowed, oval, with rough bark, and pybullet draws them.
-The carrier is not simulated: it stands with its wheels on the ground wherever it is put.  World frame: it drives along
-+x, and log 1 lies at the origin.
+The logs differ from those used for training: tapered, bowed, oval, with rough bark, and drawn by pybullet.  The carrier
+is not simulated: it is placed with its wheels on the ground.  World frame: it drives along +x, and log 1 lies at the
+origin.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from autonomy.perception.camera.frame import Frame, Pose, rescaled
+from autonomy.perception.camera.frame import Pose, RgbdFrame, rescaled
 from hil.calibration.camera_survey import survey
-from machine.optics import intrinsics, rpy_matrix
+from machine.geometry.optics import intrinsics, rpy_matrix
 from machine.profile import Camera, Profile
 from sim.camera.geometry import View, look_at, mount_view
-from sim.camera.ground_cover import CLEARING, Clutter
-from sim.camera.mesh_renderer import TinyRenderer
+from sim.camera.ground_cover import CLEARING, GroundCover
+from sim.camera.mesh_renderer import MeshRenderer
 from sim.camera.noise import StereoNoise
 from sim.camera.render import Picture
 from sim.camera.scene import Ground, LogPose, Scene, SceneBuilder
@@ -30,15 +30,15 @@ from sim.world import open_world
 
 CAMERA: Final = "front"
 APART_M: Final = 5.0
-STOP_M: Final = 4.68  # from below the camera to the log's middle: 5.2 m from the camera 2.3 m above it
+STOP_M: Final = 4.68  # from below the camera to the middle of the log: 5.2 m from the camera, which is 2.3 m above
 LATERAL_M: Final = 0.4
 CLUTTER_M: Final = 2.2  # grass and branches are drawn this far around a log
-BUMP_M, OVAL = 0.003, 0.05  # bark (standard deviation) and the greatest flattening of a log
+BUMP_M, OVAL = 0.003, 0.05  # bark (standard deviation) and the largest flattening of a log
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A log that is drawn for the site: its pose, and the middle of its pith (3,) [m]."""
+    """A log of the site: its pose, and the middle of its pith (3,) [m]."""
 
     pose: LogPose
     center_m: np.ndarray
@@ -51,7 +51,7 @@ class Shape:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One picture without noise, where its camera truly was, and the pose of the front frame."""
+    """One picture without noise, the true view of its camera, and the pose of the front frame."""
 
     picture: Picture
     view: View
@@ -60,9 +60,9 @@ class Shot:
 
 
 class Site:
-    """One trial's ground, logs, camera and receiver, all drawn from ``seed``.
+    """Ground, logs, camera and receiver of one trial, all drawn from ``seed``.
 
-    ``degrees`` turns both logs: 0 lies across the way of the machine, 90 along it (paper B, Fig. 11).
+    ``degrees`` turns both logs: 0 lies across the path of the machine, 90 along it (paper B, Fig. 11).
     """
 
     def __init__(self, profile: Profile, truth: str, seed: int, degrees: float, logs: int = 2) -> None:
@@ -79,7 +79,7 @@ class Site:
         self._seed = seed
         self._noise = StereoNoise(self.camera, self._truth.cameras[CAMERA], f"{CAMERA} {seed}")
         self._frames = 0
-        self._renderers: dict[int, TinyRenderer] = {}
+        self._renderers: dict[int, MeshRenderer] = {}
         gnss = self._truth.gnss
         rtk = gnss.fixes["rtk_fixed"]
         self._gnss = (rtk.noise_m, rtk.wander_m, gnss.height_factor, gnss.attitude_noise_rad, gnss.phase_noise_m)
@@ -95,7 +95,7 @@ class Site:
 
     @property
     def logs(self) -> list[Shape]:
-        """The logs in truth."""
+        """Ground truth of the logs."""
         return self._lying
 
     def _log(self, number: int, x: float, degrees: float) -> Shape:
@@ -106,7 +106,7 @@ class Site:
         half = 0.5 * length
         ends = [self._ground.height(x + s * half * math.cos(yaw), y + s * half * math.sin(yaw)) for s in (-1, 1)]
         pitch = math.atan2(ends[1] - ends[0], length)
-        # It lies on the highest places beneath it, a little sunk into grass.
+        # It lies on the highest points below it, slightly sunk into grass.
         steps = np.linspace(-half, half, 9)
         over = [self._ground.height(x + s * math.cos(yaw), y + s * math.sin(yaw)) - s * math.tan(pitch) for s in steps]
         z = max(over) + 0.5 * diameter - 0.02
@@ -126,14 +126,14 @@ class Site:
         for log in self._lying[first:]:
             b.log(log.pose)
         scene = b.build()
-        clutter = Clutter(self._ground, CLEARING, self._seed)
+        clutter = GroundCover(self._ground, CLEARING, self._seed)
         for log in self._lying[first:]:
             near = clutter.around(float(log.center_m[0]), float(log.center_m[1]), CLUTTER_M)
             scene = replace(scene, rods=scene.rods + near)
         return scene
 
     def _front(self, x: float) -> tuple[np.ndarray, np.ndarray]:
-        """Pose of the front frame on the ground, the camera above ``x``: position and rotation."""
+        """Pose (position, rotation) of the front frame on the ground with the camera above ``x``."""
         c = self.profile.carrier
         at = x - self.camera.position_m[0]
         side = 0.5 * c.track_width_m
@@ -147,36 +147,37 @@ class Site:
         return np.array([at, 0.0, z]), rpy_matrix((roll, pitch, 0.0))
 
     def shot(self, x: float, first: int = 0) -> Shot:
-        """The picture with the camera above ``x``; logs before number ``first`` have been taken away."""
+        """The picture with the camera above ``x``; logs before number ``first`` are removed."""
         at, turn = self._front(x)
         view = self._view(at, turn)
         if first not in self._renderers:
-            self._renderers[first] = TinyRenderer(self._scene(first), BUMP_M, self._oval, self._seed)
+            self._renderers[first] = MeshRenderer(self._scene(first), BUMP_M, self._oval, self._seed)
         return Shot(self._renderers[first].render(view), view, at, turn)
 
-    def believed(self, shot: Shot) -> Pose:
-        """Where the machine believes the camera of a shot to be: its receiver errs anew in every frame."""
+    def estimated_pose(self, shot: Shot) -> Pose:
+        """Pose of the camera as the machine estimates it; the receiver has a new error in every frame."""
         noise, _, up, attitude, phase = self._gnss
-        heard = shot.at_m + self._wander + np.array([self._rng.gauss(0.0, noise * f) for f in (1.0, 1.0, up)])
+        measured = shot.at_m + self._wander + np.array([self._rng.gauss(0.0, noise * f) for f in (1.0, 1.0, up)])
         heading = math.sqrt(2.0) * phase / 1.8
         wrong = rpy_matrix([self._rng.gauss(0.0, s) for s in (attitude, attitude, heading)])
-        return _optical(heard, shot.turn @ wrong, self.surveyed)
+        return _optical(measured, shot.turn @ wrong, self.surveyed)
 
     def _view(self, at: np.ndarray, turn: np.ndarray) -> View:
         truth, camera = self._truth.cameras[CAMERA], self.camera
         errors = (truth.mount_position_m, truth.mount_rpy_rad)
         return mount_view((at, _quaternion(turn)), intrinsics(camera), camera.position_m, camera.rpy_rad, *errors)
 
-    def frame(self, shot: Shot, stamp_ns: int) -> Frame:
-        """What the surveyed camera delivers of a shot: every call has noise of its own."""
+    def frame(self, shot: Shot, stamp_ns: int) -> RgbdFrame:
+        """The frame that the surveyed camera delivers for a shot; every call has its own noise."""
         pin = intrinsics(self.camera)
         depth_m = self._noise.apply(shot.picture, pin, self._frames)
         self._frames += 1
-        raw = Frame(CAMERA, stamp_ns, shot.picture.rgb, depth_m, pin)
+        raw = RgbdFrame(CAMERA, stamp_ns, shot.picture.rgb, depth_m, pin)
         return rescaled(raw, self.surveyed.depth_scale)
 
     def single(self, range_m: float) -> Shot:
-        """Log 1 from a camera so far away, at its height and aimed as on the machine, its pose known exactly."""
+        """Log 1 from a camera at this range, with the height and direction of the machine's, at an exactly known
+        pose."""
         log = self._lying[0]
         height = self.camera.position_m[2] + 0.8
         ahead = math.sqrt(max(0.3, range_m**2 - (height - 0.12) ** 2))
@@ -184,7 +185,7 @@ class Site:
         eye = log.center_m + np.array([-ahead, 0.0, height - 0.12])
         view = look_at(eye, eye + np.array([math.cos(pitch), 0.0, -math.sin(pitch)]), intrinsics(self.camera))
         if 0 not in self._renderers:
-            self._renderers[0] = TinyRenderer(self._scene(0), BUMP_M, self._oval, self._seed)
+            self._renderers[0] = MeshRenderer(self._scene(0), BUMP_M, self._oval, self._seed)
         return Shot(self._renderers[0].render(view), view, eye, np.eye(3))
 
 

@@ -1,4 +1,4 @@
-"""One approach with both pipelines on the same frames, or single frames over angle and range: plain data in and out."""
+"""One approach with both pipelines on the same frames, or single frames over angle and range, as plain data."""
 
 from __future__ import annotations
 
@@ -9,44 +9,44 @@ from typing import Any, Final
 
 import numpy as np
 
-from autonomy.perception.camera.frame import Frame, Pose
+from autonomy.perception.camera.frame import Pose, RgbdFrame
 from autonomy.perception.papers import paper_a
-from autonomy.perception.papers.paper_b import DETECTOR_PX, Box, RunningAverage, in_picture, position_of
+from autonomy.perception.papers.paper_b import DETECTOR_PX, Box, RunningAverage, box_in_picture, position_in_box
 from autonomy.perception.pipeline import Masked, Perception
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from experiments.log_localization.site import APART_M, STOP_M, Shape, Shot, Site
 from hil.calibration.camera_survey import SURVEYED_BY_GNSS
 
-FURTHEST_M: Final = 10.0  # a log further off is less than 6 px wide in the detector's picture: no pipeline is fed
-STEP_M: Final = 0.55  # of the approach between two frames
-AT_EACH: Final = 3  # frames at each of these places: drawing is slow, noise is not
-STANDING: Final = 15  # frames at each stop: one second
+MAX_RANGE_M: Final = 10.0  # beyond it a log is less than 6 px wide in the detector's picture
+STEP_M: Final = 0.55  # between two positions of the approach
+FRAMES_PER_POSITION: Final = 3  # rendering is slow, noise is not
+FRAMES_PER_STOP: Final = 15  # one second
 RATE_NS: Final = 66_666_667
-LEAST_PX: Final = 60  # a mask with fewer pixels is not seen
+MIN_MASK_PX: Final = 60  # smaller masks are ignored
 MEAN_RADIUS_M: Final = 0.125  # of paper B's logs
-FOUND_M: Final = 1.0  # an estimate further from a log is not of it
+FOUND_M: Final = 1.0  # an estimate farther from a log does not belong to it
 RANGES_M: Final = (3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 
-Segmenter = Callable[[Frame, Shot], Sequence[Masked]]
+Segmenter = Callable[[RgbdFrame, Shot], Sequence[Masked]]
 
 
 @dataclass(frozen=True, slots=True)
 class TrueMask:
-    """A mask that the renderer knows."""
+    """A mask of the renderer."""
 
     mask: np.ndarray
 
 
-def true_masks(frame: Frame, shot: Shot) -> list[TrueMask]:
-    """The masks as the renderer drew them."""
+def true_masks(frame: RgbdFrame, shot: Shot) -> list[TrueMask]:
+    """The masks of the renderer."""
     mask = shot.picture.mask
     found = [TrueMask(mask == i) for i in np.unique(mask) if 0 < i < 1000]
-    return [m for m in found if np.count_nonzero(m.mask) >= LEAST_PX]
+    return [m for m in found if np.count_nonzero(m.mask) >= MIN_MASK_PX]
 
 
-def network_masks(frame: Frame, shot: Shot) -> Sequence[Masked]:
-    """The masks that the shipped network finds."""
+def network_masks(frame: RgbdFrame, shot: Shot) -> Sequence[Masked]:
+    """The masks of the shipped network."""
     from autonomy.perception.segmentation.log_segmenter import segment
 
     return segment(frame)
@@ -68,69 +68,69 @@ def perform(job: Job) -> dict[str, Any]:
 
 
 def approach(site: Site, segment: Segmenter) -> dict[str, Any]:
-    """Drive up to log 1, stop, take it away, drive up to log 2: errors of each at its own stop."""
+    """Approach log 1, stop, remove it, approach log 2: errors of each log at its stop."""
     ours = Perception(site.profile, SURVEYED_BY_GNSS)
     faithful, centred = RunningAverage(), RunningAverage(MEAN_RADIUS_M)
     clock, out = 0, []
-    start = -FURTHEST_M
+    start = -MAX_RANGE_M
     for number, log in enumerate(site.logs):
         stop = number * APART_M - STOP_M
         drive = [site.shot(float(x), number) for x in np.arange(start, stop, STEP_M)]
         standing = site.shot(stop, number)
         tracks: tuple = ()
-        for shot in [*(d for d in drive for _ in range(AT_EACH)), *[standing] * STANDING]:
+        for shot in [*(d for d in drive for _ in range(FRAMES_PER_POSITION)), *[standing] * FRAMES_PER_STOP]:
             clock += RATE_NS
             frame = site.frame(shot, clock)
-            instances, pose = _near(frame, segment(frame, shot)), site.believed(shot)
+            instances, pose = _near(frame, segment(frame, shot)), site.estimated_pose(shot)
             tracks = ours.step(frame, pose, instances)
             boxes = [detected(frame, i.mask) for i in instances]
             faithful.add(frame, pose, boxes)
             centred.add(frame, pose, boxes)
         mask = _mask_of(log, number, standing, instances)
-        out.append(_judged(log, tracks, faithful.positions_m(), centred.positions_m(), frame, pose, mask))
+        out.append(_log_errors(log, tracks, faithful.positions_m(), centred.positions_m(), frame, pose, mask))
         start = stop + STEP_M
     return {"logs": out}
 
 
-def _near(frame: Frame, instances: Sequence[Masked]) -> list[Masked]:
-    """Those near enough to be looked at."""
+def _near(frame: RgbdFrame, instances: Sequence[Masked]) -> list[Masked]:
+    """The instances within range."""
     kept = []
     for one in instances:
         z = frame.depth_m[one.mask]
         z = z[np.isfinite(z)]
-        if len(z) and float(np.median(z)) < FURTHEST_M:
+        if len(z) and float(np.median(z)) < MAX_RANGE_M:
             kept.append(one)
     return kept
 
 
-def detected(frame: Frame, mask: np.ndarray) -> Box:
-    """The box that a perfect detector gives in its letterbox, whole pixels of that, in pixels of the frame."""
+def detected(frame: RgbdFrame, mask: np.ndarray) -> Box:
+    """The box of a perfect detector: whole pixels of its letterbox, in pixels of the frame."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     letterbox = frame.intrinsics.letterbox(DETECTOR_PX)
     scale = letterbox.inner.width_px / frame.intrinsics.width_px
     at_u, at_v = letterbox.left_px, letterbox.top_px
     left, right = columns[0] * scale + at_u, (columns[-1] + 1) * scale + at_u
     top, bottom = rows[0] * scale + at_v, (rows[-1] + 1) * scale + at_v
-    return in_picture((round(left), round(top), round(right), round(bottom)), frame.intrinsics)
+    return box_in_picture((round(left), round(top), round(right), round(bottom)), frame.intrinsics)
 
 
 def _mask_of(log: Shape, number: int, shot: Shot, instances: Sequence[Masked]) -> np.ndarray | None:
-    """The mask that has most of a log's pixels."""
+    """The mask with most pixels of a log; None without one."""
     truth = shot.picture.mask == log.pose.instance
     shares = [np.count_nonzero(truth & i.mask) for i in instances]
     return instances[int(np.argmax(shares))].mask if shares and max(shares) > 0 else None
 
 
-def _judged(
+def _log_errors(
     log: Shape,
     tracks: Sequence,
     positions: list[np.ndarray],
     centred: list[np.ndarray],
-    frame: Frame,
+    frame: RgbdFrame,
     pose: Pose,
     mask: np.ndarray | None,
 ) -> dict[str, Any]:
-    """Errors of one log; NaN where it was not found."""
+    """Errors of one log; NaN if it was not found."""
     out: dict[str, Any] = dict.fromkeys(
         ("error_m", "axis_deg", "diameter_m", "length_m", "nees", "faithful_error_m", "faithful_centred_m",
          "faithful_axis_deg", "faithful_diameter_m", "faithful_length_m"), math.nan
@@ -151,7 +151,7 @@ def _judged(
         apart = [float(np.linalg.norm(p - log.center_m)) for p in places]
         if apart and min(apart) < FOUND_M:
             out[key] = min(apart)
-    plain = paper_a.log_of(frame, mask) if mask is not None else None
+    plain = paper_a.log_from_mask(frame, mask) if mask is not None else None
     if plain is not None:
         out["faithful_axis_deg"] = _degrees(pose.rotation @ plain.axis, log.axis)
         out["faithful_diameter_m"] = abs(plain.diameter_m - log.pose.diameter_m)
@@ -160,7 +160,7 @@ def _judged(
 
 
 def _curve(site: Site, segment: Segmenter) -> dict[str, Any]:
-    """Errors of single frames at each of ``RANGES_M``: ours, faithful."""
+    """Errors of single frames at each of ``RANGES_M``, by our and by the paper's pipeline."""
     perception, log = Perception(site.profile), site.logs[0]
     ours, faithful = [], []
     for range_m in RANGES_M:
@@ -170,7 +170,7 @@ def _curve(site: Site, segment: Segmenter) -> dict[str, Any]:
         fits = perception.fits(frame, instances)
         apart = [float(np.linalg.norm(shot.view.to_world(f.body.center_m) - log.center_m)) for f in fits]
         ours.append(min(apart, default=math.nan))
-        points = [position_of(frame, detected(frame, i.mask)) for i in instances]
+        points = [position_in_box(frame, detected(frame, i.mask)) for i in instances]
         apart = [float(np.linalg.norm(shot.view.to_world(p) - log.center_m)) for p in points if p is not None]
         faithful.append(min(apart, default=math.nan))
     return {"ours": ours, "faithful": faithful}

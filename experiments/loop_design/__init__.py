@@ -1,1 +1,1 @@
-"""Loop design that can be checked: each joint's linear model, its margins over all machines of the truth's spread."""
+"""Loop design: linear model of each joint, and its margins over all machines of the truth's spread."""

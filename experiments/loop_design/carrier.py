@@ -1,10 +1,10 @@
-"""The carrier's loops as linear models: heading to a waypoint, angle of the articulation, height of an arm.
+"""Linear models of the carrier's loops: heading to a waypoint, angle of the articulation, height of an arm.
 
-Heading (docs/reference/machines.md section 7.2), about straight ahead: ``psi = (lr s + v) / (L s^2)`` times the articulation rate, and the
-bearing to a waypoint ``d`` metres ahead turns by ``v / (d s)`` times the heading, so that the loop has three
-integrators near it; without valve and receiver it is L s^2 + Kp lr s + Kp v = 0.  The receiver's heading is
-``latency`` old; what the machine turned since a sample came is known from odometry, so only the age at reception is
-missing, held for a sample.  Commands go out every 20 ms.  The machines are those of the truth's spread.
+Heading (docs/reference/machines.md section 7.2), linearized about straight ahead: ``psi = (lr s + v) / (L s^2)`` times
+the articulation rate, and the bearing to a waypoint ``d`` metres ahead turns by ``v / (d s)`` times the heading, so
+that the loop has three integrators near it.  Without valve and receiver it is L s^2 + Kp lr s + Kp v = 0.  The
+receiver's heading is ``latency`` old.  Odometry covers the turn since the last sample, so only the age at reception is
+missing, held for a sample.  Commands are sent every 20 ms.  The machines are those of the truth's spread.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from experiments.loop_design.loop import (
     margins,
     open_loop,
 )
-from experiments.loop_design.study import JointStudy, Work
+from experiments.loop_design.study import CaseSet, JointStudy
 from machine.profile import Carrier, JointSpec, Law, Profile, Valve
 
 COMMAND_S: Final = 0.02
-"""VehCmd and ArmCmd, and what the swing-arm controller measures, come so often."""
+"""Period of VehCmd, ArmCmd and the measurements of the swing-arm controller."""
 SAMPLE_S: Final = 0.1
 LATENCIES_S: Final = (0.05, 0.1)
 SPEED_SHARES: Final = (0.5, 1.0)
-"""Of the cruising speed."""
+"""Speeds as shares of the cruising speed."""
 DISTANCES_M: Final = (math.inf, 6.0, 3.0)
-"""To the waypoint: far, at the steering radius, and where the next one is taken at the latest."""
+"""Distances to the waypoint: far, at the steering radius, and where the next waypoint is taken at the latest."""
 SWING_RAD_S, SWING_ZETA = 25.0, 0.1
-"""Assumed: halves and tyres on the oil of the steering cylinders."""
+"""Assumed oscillation of the machine halves and tyres on the oil of the steering cylinders."""
 
 
 @dataclass(frozen=True, slots=True)
 class CarrierCase:
-    """One machine."""
+    """One machine at one operating point."""
 
     delay_s: float
     gain: float
@@ -64,7 +64,7 @@ class CarrierCase:
 
 @dataclass(frozen=True, slots=True)
 class Swing:
-    """What stands in the place of a joint's mechanics: one mode (`experiments.loop_design.mechanics.Mechanics`)."""
+    """Replaces a joint's mechanics by one mode (`experiments.loop_design.mechanics.Mechanics`)."""
 
     def response(self, s: Array) -> Array:
         """Angle over metered travel."""
@@ -72,12 +72,12 @@ class Swing:
         return w * w / (s * s + 2.0 * SWING_ZETA * w * s + w * w)
 
     def oil(self, s: Array) -> Array:
-        """Nothing measures it."""
+        """Zero: no sensor measures this pressure."""
         return 0.0 * s
 
 
-def studies(profile: Profile, work: Work) -> list[JointStudy]:
-    """All loops of the carrier with the profile's gains; none for a machine that stands still."""
+def studies(profile: Profile, work: CaseSet) -> list[JointStudy]:
+    """All loops of the carrier with the gains of the profile; none for a machine without a carrier."""
     carrier = profile.carrier
     if carrier is None:
         return []
@@ -97,7 +97,7 @@ def _hold(s: Array, period_s: float) -> Array:
 
 
 def heading_loop(carrier: Carrier, spool: Spool, case: CarrierCase) -> Array:
-    """Open loop of paper B's law, cut at the commanded articulation rate."""
+    """Open-loop response of paper B's law, cut at the commanded articulation rate."""
     s, v = 1j * FREQUENCY_RAD_S, case.speed_m_s
     base = carrier.front_axle_m + carrier.rear_axle_m
     bends = _hold(s, COMMAND_S) * np.exp(-s * TRANSPORT_S) * spool.response(s) * Swing().response(s)
@@ -107,14 +107,14 @@ def heading_loop(carrier: Carrier, spool: Spool, case: CarrierCase) -> Array:
 
 
 def arm_loop(carrier: Carrier, spool: Spool) -> Array:
-    """Open loop of one arm's height, cut at the commanded speed."""
+    """Open-loop response of the height of one arm, cut at the commanded speed."""
     s = 1j * FREQUENCY_RAD_S
     measured = _hold(s, COMMAND_S) * np.exp(-s * TRANSPORT_S)
     return carrier.arm_kp_1_s * _hold(s, COMMAND_S) * np.exp(-s * TRANSPORT_S) * spool.response(s) / s * measured
 
 
 def angle_spec(carrier: Carrier) -> JointSpec:
-    """The articulation with its law, as a joint."""
+    """The articulation and its law as a joint specification."""
     valve, rate = carrier.steer_valve, carrier.articulation_rate_limit_rad_s
     reaction_s = valve.delay_s + carrier.articulation_lag_s
     same = Valve(
@@ -130,7 +130,7 @@ def _proportional(kp_1_s: float) -> Law:
     return Law("pd", kp_1_s, kd=0.0, layer=0.1, damping_per_bar=0.0, stop_band=0.001, velocity_filter_s=0.03)
 
 
-def _heading(carrier: Carrier, work: Work) -> JointStudy:
+def _heading(carrier: Carrier, work: CaseSet) -> JointStudy:
     valve = work.valves["steer"]
     cases = [
         CarrierCase(delay, gain, share * carrier.cruise_speed_m_s, distance, latency)
@@ -139,7 +139,7 @@ def _heading(carrier: Carrier, work: Work) -> JointStudy:
         )
     ]
     loops = [heading_loop(carrier, replace(valve, delay_s=c.delay_s, gain=c.gain), c) for c in cases]
-    judged = [
+    case_margins = [
         margins(FREQUENCY_RAD_S, loop, 2 if math.isinf(c.distance_m) else 3)
         for loop, c in zip(loops, cases, strict=True)
     ]
@@ -147,10 +147,10 @@ def _heading(carrier: Carrier, work: Work) -> JointStudy:
     law = _proportional(carrier.heading_kp_1_s)
     spec = msgspec.structs.replace(angle_spec(carrier), law=law)
     loop = heading_loop(carrier, valve, usual)
-    return _made("heading", spec, margins(FREQUENCY_RAD_S, loop, 2), loop, cases, judged, loops)
+    return _made("heading", spec, margins(FREQUENCY_RAD_S, loop, 2), loop, cases, case_margins, loops)
 
 
-def _angle(carrier: Carrier, work: Work, period_s: float, lead_s: float) -> JointStudy:
+def _angle(carrier: Carrier, work: CaseSet, period_s: float, lead_s: float) -> JointStudy:
     valve, spec, s = work.valves["steer"], angle_spec(carrier), 1j * FREQUENCY_RAD_S
     law = LawResponse(spec, period_s, lead_s)
 
@@ -161,18 +161,18 @@ def _angle(carrier: Carrier, work: Work, period_s: float, lead_s: float) -> Join
     cases = [CarrierCase(delay, gain) for delay, gain in product(work.delays_s, work.gains)]
     loops = [loop(c.delay_s, c.gain) for c in cases]
     usual = loop(valve.delay_s, 1.0)
-    judged = [margins(FREQUENCY_RAD_S, each) for each in loops]
-    return _made("articulation", spec, margins(FREQUENCY_RAD_S, usual), usual, cases, judged, loops)
+    case_margins = [margins(FREQUENCY_RAD_S, each) for each in loops]
+    return _made("articulation", spec, margins(FREQUENCY_RAD_S, usual), usual, cases, case_margins, loops)
 
 
-def _arm(carrier: Carrier, work: Work) -> JointStudy:
+def _arm(carrier: Carrier, work: CaseSet) -> JointStudy:
     valve = work.valves["arm_fl"]
     cases = [CarrierCase(delay, gain) for delay, gain in product(work.delays_s, work.gains)]
     loops = [arm_loop(carrier, replace(valve, delay_s=c.delay_s, gain=c.gain)) for c in cases]
     spec = msgspec.structs.replace(angle_spec(carrier), law=_proportional(carrier.arm_kp_1_s))
     usual = arm_loop(carrier, valve)
-    judged = [margins(FREQUENCY_RAD_S, each) for each in loops]
-    return _made("swing arm", spec, margins(FREQUENCY_RAD_S, usual), usual, cases, judged, loops)
+    case_margins = [margins(FREQUENCY_RAD_S, each) for each in loops]
+    return _made("swing arm", spec, margins(FREQUENCY_RAD_S, usual), usual, cases, case_margins, loops)
 
 
 def _made(
@@ -181,8 +181,8 @@ def _made(
     nominal: Margins,
     nominal_loop: Array,
     cases: Sequence[CarrierCase],
-    judged: Sequence[Margins],
+    case_margins: Sequence[Margins],
     loops: Sequence[Array],
 ) -> JointStudy:
-    worst = min(range(len(cases)), key=lambda i: judged[i].gain_db)
-    return JointStudy(name, spec, nominal, nominal_loop, tuple(cases), tuple(judged), loops[worst])
+    worst = min(range(len(cases)), key=lambda i: case_margins[i].gain_db)
+    return JointStudy(name, spec, nominal, nominal_loop, tuple(cases), tuple(case_margins), loops[worst])

@@ -1,8 +1,9 @@
-"""The loop of one joint as a frequency response: valve, mechanics, sensors, estimator and law, cut at the command.
+"""Frequency response of the control loop of one joint: valve, mechanics, sensors, estimator and law, cut at the
+command.
 
-The controller is taken as it runs, sampled, with the gains that its own code computes (`controller.estimation.joint_estimator`,
-`controller.laws`); `tests/experiments/test_loop_design.py` drives that code with sines and compares.  Laws are linear inside
-their boundary layer; where super-twisting is not, its gain over the amplitude is a range (``amplitude``).
+The controller is modelled as it runs: sampled, with the gains that its own code computes (`controller.crane.estimator`,
+`controller.laws`).  `tests/experiments/test_loop_design.py` excites that code with sines and compares.  The laws are
+linear inside their boundary layer; super-twisting is not, so its gain over the amplitude is a range (``amplitude``).
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from machine.profile import JointSpec
 
 FREQUENCY_RAD_S: Final = np.geomspace(0.05, 80.0, 700)
 TRANSPORT_S: Final = 1.0e-3
-"""From the tick's decision until the valve node has the command."""
+"""Delay from the decision of the tick until the valve node has the command."""
 SENSOR_S: Final = 2.5e-3
-"""How old a position is when the encoder takes it."""
+"""Age of a position when the encoder samples it."""
 PA_PER_BAR: Final = 1.0e5
 
 Array = np.ndarray[Any, np.dtype[Any]]
@@ -31,7 +32,7 @@ Array = np.ndarray[Any, np.dtype[Any]]
 
 @dataclass(frozen=True, slots=True)
 class Spool:
-    """The true valve: dead time, gain over the profile's, second-order spool."""
+    """The true valve: dead time, gain relative to the profile, second-order spool."""
 
     delay_s: float
     gain: float
@@ -46,10 +47,10 @@ class Spool:
 
 
 class LawResponse:
-    """The controller of one joint: velocity command over position and load pressure, without their sign."""
+    """Response of one joint's controller: velocity command over position and load pressure, without their sign."""
 
     def __init__(self, spec: JointSpec, period_s: float, lead_s: float, amplitude: float = 1.0) -> None:
-        """``lead_s``: SYNC before the tick; ``amplitude``: error over the layer, for super-twisting."""
+        """``lead_s``: time of SYNC before the tick; ``amplitude``: error over the layer, for super-twisting."""
         self._spec, self._period_s, self._lead_s, self._amplitude = spec, period_s, lead_s, amplitude
 
     def response(self, s: Array) -> tuple[Array, Array]:
@@ -94,7 +95,7 @@ class LawResponse:
 def open_loop(
     s: Array, spec: JointSpec, law: LawResponse, mechanics: Mechanics, spool: Spool, period_s: float
 ) -> Array:
-    """The loop's response, negative feedback, cut at the velocity command."""
+    """Response of the loop with negative feedback, cut at the velocity command."""
     hold = (1.0 - np.exp(-s * period_s)) / (s * period_s)
     travel = hold * np.exp(-s * TRANSPORT_S) * spool.response(s) / s
     moved = mechanics.response(s)
@@ -117,21 +118,21 @@ class Margins:
 
 
 def margins(frequency_rad_s: Array, loop: Array, integrators: int = 1) -> Margins:
-    """Least margins of a loop that begins with so many integrators, from its response on a fine grid.
+    """Least margins of a loop that starts with this number of integrators, from its response on a fine grid.
 
-    Every passage counts: of the unit circle, and of the negative real axis.  An encirclement shows as a negative
-    margin.  Where the phase comes back over the axis, the margin is towards less gain if there is more than 1.
+    Every crossing of the unit circle and of the negative real axis counts.  An encirclement appears as a negative
+    margin.  Where the phase returns over the axis with a gain above 1, the margin is towards less gain.
     """
     log_gain, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
     phase -= 2.0 * math.pi * round((phase[0] + integrators * math.pi / 2.0) / (2.0 * math.pi))
-    at_one, one_phase = _passages(frequency_rad_s, log_gain, phase)
-    # Distance of the passages from the nearest odd multiple of 180 deg; the first one below tells of encirclement.
+    at_one, one_phase = _crossings(frequency_rad_s, log_gain, phase)
+    # Distance of the crossings from the nearest odd multiple of 180 deg; a value below the first shows an encirclement.
     nearest = one_phase + math.pi
     nearest = np.where(nearest < 0.0, nearest, np.abs(nearest - 2.0 * math.pi * np.round(nearest / (2.0 * math.pi))))
     least_gain = math.inf
     for turn in range(4):
         axis = phase + (2 * turn + 1) * math.pi
-        _, gains = _passages(frequency_rad_s, axis, log_gain)
+        _, gains = _crossings(frequency_rad_s, axis, log_gain)
         back = np.diff(axis)[np.nonzero(np.signbit(axis[:-1]) != np.signbit(axis[1:]))[0]] > 0.0
         least_gain = min([least_gain, *np.where(back, np.abs(gains), -gains)])
     return Margins(
@@ -141,8 +142,8 @@ def margins(frequency_rad_s: Array, loop: Array, integrators: int = 1) -> Margin
     )
 
 
-def _passages(x: Array, y: Array, other: Array) -> tuple[Array, Array]:
-    """Where ``y`` passes zero: ``x`` and ``other`` there, by linear interpolation."""
+def _crossings(x: Array, y: Array, other: Array) -> tuple[Array, Array]:
+    """Zero crossings of ``y``: ``x`` and ``other`` there, by linear interpolation."""
     i = np.nonzero(np.signbit(y[:-1]) != np.signbit(y[1:]))[0]
     share = y[i] / (y[i] - y[i + 1])
     return x[i] + share * (x[i + 1] - x[i]), other[i] + share * (other[i + 1] - other[i])

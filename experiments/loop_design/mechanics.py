@@ -1,10 +1,10 @@
-"""What a joint's valve drives, linearised about a pose: oil springs, inertia, hanging load, a column that gives way.
+"""The mechanics that a joint's valve drives, linearized about a pose: oil, inertia, hanging load, compliant column.
 
-Read from an opened World at rest (bodies and hydraulics of the truth).  Metered travel in, joint position out, both in
-the joint's unit: 1 at rest, and above it the modes that an encoder sees.  The valve is open a little, as it is in
-motion: the chamber that fills is behind a pressure compensator that waits for the load-sensing pump, the one that
-empties is behind a compensator when its load drives the joint and behind a bare edge when not, and that damps.
-Oil, edges and damping orifices as in ``sim.hydraulics.kernel``.  The other joints stand still.
+Input: an opened World at rest (bodies and hydraulics of the truth).  Output: joint position over metered travel, both
+in the unit of the joint: 1 at rest, and the modes that an encoder sees.  The valve is slightly open, as in motion.  The
+chamber that fills lies behind a pressure compensator that waits for the load-sensing pump.  The chamber that empties
+lies behind a compensator if its load drives the joint, otherwise behind a metering edge, which damps.  Oil, edges and
+damping orifices are those of ``sim.hydraulics.kernel``.  The other joints do not move.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from sim.bullet.client import GRAVITY_M_S2
 from sim.hydraulics.kernel import STEADY_S
-from sim.hydraulics.layout import OUT_OVER_IN, SOFT_PA
+from sim.hydraulics.layout import METER_OUT_FACTOR, SOFT_PA
 from sim.mechanics.crane import crane_links
-from sim.world import GRAVITY_M_S2, World
+from sim.world import World
 
 DRIVEN: Final = {
     "slew": ("turntable", "flexure", "mast", "boom", "stick", "telescope"),
@@ -38,18 +39,19 @@ Array = np.ndarray[Any, np.dtype[Any]]
 
 @dataclass(frozen=True, slots=True)
 class Chamber:
-    """One side of the piston: spring [Nm/rad, N/m], and how fast a pressure change runs off through its edge [1/s],
-    at once or only until the pump has followed (``wait_s``).
+    """One side of the piston: spring [Nm/rad, N/m] and decay rate of a pressure change through its edge [1/s].
+
+    ``wait_s``: the change decays only until the pump has followed; 0: at once.
     """
 
     spring: float
-    runs_off_1_s: float
+    decay_1_s: float
     wait_s: float
 
     def impedance(self, s: Array, relaxation_1_s: float) -> Array:
-        """Force over travel; part of the oil passes the damping orifice to the hose."""
+        """Force over travel; part of the oil flows through the damping orifice into the hose."""
         soft = 1.0 + relaxation_1_s * STEADY_S / (1.0 + s * STEADY_S)
-        off = self.runs_off_1_s * (s * self.wait_s / (1.0 + s * self.wait_s) if self.wait_s else 1.0)
+        off = self.decay_1_s * (s * self.wait_s / (1.0 + s * self.wait_s) if self.wait_s else 1.0)
         return self.spring * s / (s * soft + off)
 
 
@@ -78,7 +80,7 @@ class Mechanics:
     column_damping_s: float
 
     def oil(self, s: Array) -> Array:
-        """Force of the oil over the travel by which the joint lags behind the metered oil."""
+        """Force of the oil over the lag of the joint behind the metered oil."""
         r = self.relaxation_1_s
         return self.filling.impedance(s, r) + self.emptying.impedance(s, r)
 
@@ -92,8 +94,9 @@ class Mechanics:
 
 
 def mechanics(world: World, name: str, load_kg: float = 0.0, direction: int = 1, opening: float = OPENING) -> Mechanics:
-    """The joint ``name`` of a world at rest, with a load in the grapple, moving in a ``direction`` (1, -1) with its
-    valve open by the share ``opening``.
+    """Linearize the joint ``name`` of a world at rest, with a load in the grapple.
+
+    It moves in a ``direction`` (1, -1) with its valve open by the share ``opening``.
     """
     at, axis, slides = _axis(world, name)
     foot, bends, _ = _axis(world, "flex_roll" if name == "slew" else "flex_pitch")
@@ -129,7 +132,7 @@ def mechanics(world: World, name: str, load_kg: float = 0.0, direction: int = 1,
 
 
 def _pendulum(world: World, load_kg: float) -> tuple[float, float]:
-    """Mass times depth [kg m] and inertia [kg m^2] of all that hangs, about the fork's hinge."""
+    """Mass times depth [kg m] and inertia [kg m^2] of all hanging parts about the fork's hinge."""
     hinge = _axis(world, "fork")
     moment = sum(_mass(world, link) * float(hinge[0][2] - _centre(world, link)[2]) for link in HANGING)
     depth = float(hinge[0][2] - world.crane.pose("rotator")[0][2]) + LOG_BELOW_ROTATOR_M
@@ -138,7 +141,7 @@ def _pendulum(world: World, load_kg: float) -> tuple[float, float]:
 
 
 def _chambers(world: World, name: str, direction: int, opening: float) -> tuple[float, Chamber, Chamber]:
-    """Lever arm, and the chambers that fill and empty in this direction."""
+    """Lever arm [m], and the chambers that fill and empty in this direction."""
     supply, function, q = world.truth.supply, world.truth.functions[name], world.q[name]
     c, valve = function.cylinder, function.valve
     grid = np.linspace(c.arm_at[0], c.arm_at[-1], 257)
@@ -152,8 +155,8 @@ def _chambers(world: World, name: str, direction: int, opening: float) -> tuple[
     made = []
     for side, (area, volume) in enumerate(sides):
         fills = (side == 0) == (direction > 0)
-        # In steady motion what leaves takes nearly the margin, or what the load pushes with.
-        braked = supply.pressure_margin_pa / OUT_OVER_IN**2
+        # In steady motion the pressure drop at the outlet is nearly the margin, or the pressure caused by the load.
+        braked = supply.pressure_margin_pa / METER_OUT_FACTOR**2
         drop = supply.pressure_margin_pa if fills else max(pressures[side] - supply.tank_pa, braked)
         bare = fills or drop < supply.pressure_margin_pa
         slope = area * speed * (1.0 / drop - 0.5 / (drop + SOFT_PA)) if bare else 0.0
@@ -168,7 +171,7 @@ Hinge = tuple[Array, Array, bool]
 
 
 def _axis(world: World, name: str) -> Hinge:
-    """Origin and direction of a joint in the world, and whether it slides."""
+    """Origin and direction of a joint in the world frame, and whether it is prismatic."""
     joint = next(j for j in crane_links(world.profile, world.truth)[1] if j.name == name)
     place, turn = world.crane.pose(joint.child)
     return np.array(place), _turned(world, turn) @ np.array(joint.axis), joint.kind == "prismatic"
@@ -188,7 +191,7 @@ def _centre(world: World, link: str) -> Array:
 
 
 def _product(world: World, links: tuple[str, ...], one: Hinge, other: Hinge) -> float:
-    """Inertia that two hinges share in the masses of ``links``; of one hinge with itself, its moment of inertia."""
+    """Coupling inertia of two hinges in the masses of ``links``; for one hinge twice, its moment of inertia."""
     total = 0.0
     for link in links:
         index = world.crane.link[link]

@@ -1,9 +1,12 @@
-"""The page docs/loop-design.md: margins of every joint, law and machine, with pictures; written, never typed."""
+"""The page docs/loop-design.md: conclusion and one plot, then margins of every joint, law and machine.
+
+Input: the studies of all machines, or the saved ``docs/results/loop-design.json``.  Output: Markdown, JSON and plots.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,46 +15,47 @@ import msgspec
 from controller.laws.feedback import LAWS
 from experiments.common.result import commit, environment
 from experiments.loop_design.carrier import natural
-from experiments.loop_design.plots import draw
-from experiments.loop_design.study import GAIN_DB, PHASE_DEG, JointStudy, Work, study
+from experiments.loop_design.plots import draw, plot_name
+from experiments.loop_design.study import MIN_GAIN_DB, MIN_PHASE_DEG, CaseSet, JointStudy, study
+from machine.loading.profile_file import load_profile
 from machine.profile import Carrier, Profile
 
 NAMES: Final = {
     "pd": "PD",
     "sliding_mode": "sliding mode",
     "super_twisting": "super-twisting",
-    "pid": "plain PID",
-    "undamped": "the profile's without pressure feedback",
+    "pid": "PID baseline",
+    "undamped": "own law without pressure feedback",
 }
 INTRODUCTION: Final = (
-    "Each joint's loop as a linear model: the true valve (dead time, second-order spool, gain), the mechanics it "
-    "drives (oil springs, inertia, the hanging load as a pendulum, the column that gives way), the encoder, and "
-    "the controller as it runs: sampled, with the estimator's Kalman gains, delay compensation and pressure "
-    "feedback, cut at the velocity command. The mechanics are linearised from the opened physics, near, working "
-    "and far reach, empty and loaded, either way, valve a little and much open; dead times and gains over the "
-    "whole spread of the truth. The controller knows none of that, only the profile. Tests drive the running code "
-    "with sines and compare it with these responses, and python-control judges the worst loop again. `timberhand "
-    "bench loop-design --docs docs` computes everything and writes this page; no number is typed."
+    "The loop of each joint is a linear model: the true valve (dead time, second-order spool, gain), the mechanics "
+    "that it drives (oil springs, inertia, the hanging load as a pendulum, the compliant column), the encoder, and the "
+    "controller as it runs: sampled, with the estimator's Kalman gains, delay compensation and pressure feedback, cut "
+    "at the velocity command. The mechanics are linearized from the physics at near, working and far reach, empty and "
+    "loaded, in both directions, with the valve slightly and widely open; dead times and gains cover the whole spread "
+    "of the truth. The controller knows only the profile. Tests excite the running code with sines and compare it with "
+    "these responses, and python-control computes the margins of the worst loop again. `timberhand bench loop-design "
+    "--docs docs` computes everything and writes this page."
 )
 CARRIER: Final = (
-    "The carrier's loops (docs/reference/machines.md sections 7.2 and 7.3). *heading* is paper B's law: bearing to the waypoint less heading, to "
-    "the rate of the articulation, judged slow and at cruising speed, far from the waypoint and near, with the "
-    "receiver's latency and the odometry between its samples. *articulation* closes a wanted angle on the encoder, "
-    "*swing arm* a height. Without valve and receiver the heading is L s^2 + Kp lr s + Kp v = 0:"
+    "The loops of the carrier (docs/reference/machines.md sections 7.2, 7.3). *heading* is paper B's law, from bearing "
+    "less heading to the rate of the articulation, at half and full cruising speed, far from the waypoint and near it, "
+    "with the latency of the receiver and odometry between its samples. *articulation* controls an angle by the "
+    "encoder, *swing arm* a height. Without valve and receiver the heading is L s^2 + Kp lr s + Kp v = 0:"
 )
 LEAST: Final = (
-    "Least margins with every law that a profile may name, and what the profile's law would keep without pressure "
-    "feedback (`damping_per_bar`):"
+    "Least margins with every law that a profile may use, and with the profile's law without pressure feedback "
+    "(`damping_per_bar`):"
 )
 HOW: Final = (
-    "- *Law.* All laws have the same budget, the profile's `kp_1_s` (the plain PID a quarter of it): the gain "
-    "inside the boundary layer, where they are linear. Super-twisting is not even there; its gain depends on the "
-    "amplitude, so it is judged at several.\n"
-    "- *Phase, gain.* The least margins over all machines; every passage of the unit circle and of the negative "
-    "real axis counts, so a swinging load that crosses twice is judged twice.\n"
-    "- *Bandwidth.* Where the closed loop of the nominal machine at working reach falls below -3 dB. "
-    "Feed-forward, which carries a motion, is not in it.\n"
-    "- *Worst machine.* That of the least gain margin."
+    "- *Law*: all laws use the gain `kp_1_s` of the profile (the PID a quarter of it) inside their boundary layer, "
+    "where they are linear. Super-twisting is nonlinear there as well; its gain depends on the amplitude, so several "
+    "amplitudes are evaluated.\n"
+    "- *Phase, gain*: the least margins over all machines. Every crossing of the unit circle and of the negative real "
+    "axis counts, so a loop that a swinging load makes cross twice is evaluated twice.\n"
+    "- *Bandwidth*: frequency at which the closed loop of the nominal machine at working reach falls below -3 dB. "
+    "Feed-forward, which moves the joint, is not included.\n"
+    "- *Worst machine*: that of the least gain margin."
 )
 
 
@@ -73,53 +77,113 @@ def undamped(profile: Profile) -> Profile:
     return msgspec.structs.replace(profile, joints=joints)
 
 
-def write(machines: Sequence[tuple[Profile, list[JointStudy], Work]], docs: Path) -> bool:
-    """Write the page, ``docs/results/loop-design.json`` and the pictures; returns whether every law holds."""
-    folder = docs / "results" / "loop-design"
-    e = environment()
-    out = [
-        "# Loop design", "", INTRODUCTION, "",
-        f"Commit `{commit()}`, Python {e['python']}. Needed everywhere: {PHASE_DEG:.0f} deg and {GAIN_DB:.0f} dB. All "
-        "numbers: [results/loop-design.json](results/loop-design.json).", "", HOW, "",
-    ]  # fmt: skip
-    document: dict[str, Any] = {"needed": {"phase_deg": PHASE_DEG, "gain_db": GAIN_DB}, "machines": {}}
-    holds = True
-    for profile, studies, work in machines:
-        laws = {kind: study(with_law(profile, kind), work) for kind in LAWS}
-        holds = holds and all(joint.holds for judged in laws.values() for joint in judged)
-        laws["undamped"] = study(undamped(profile), work)
-        document["machines"][profile.name] = {
-            kind: {joint.name: joint.document() for joint in judged} for kind, judged in laws.items()
-        }
-        driven = [joint for joint in studies if joint.name not in profile.joints]
-        if driven:
-            document["machines"][profile.name]["carrier"] = {loop.name: loop.document() for loop in driven}
-            holds = holds and all(loop.holds for loop in driven)
-        own = [joint for joint in studies if joint.name in profile.joints]
-        out += [f"## {profile.title}", "", *_own(own), "", LEAST, "", *_laws(laws), ""]
-        if profile.carrier is not None:
-            out += [CARRIER, "", *_natural(profile.carrier), "", *_own(driven), ""]
-        for joint, file in zip(studies, draw(profile.name, studies, folder), strict=True):
-            caption = f"{joint.name}: loop gain and phase, and the margins of all machines."
-            out += [f"![{caption}](results/loop-design/{file.name})", ""]
-    document["reached"] = holds
+def write(machines: Sequence[tuple[Profile, list[JointStudy], CaseSet]], docs: Path) -> bool:
+    """Write the page, ``docs/results/loop-design.json`` and the plots; returns whether every margin meets its limit."""
+    document: dict[str, Any] = {
+        "commit": commit(),
+        "python": environment()["python"],
+        "needed": {"phase_deg": MIN_PHASE_DEG, "gain_db": MIN_GAIN_DB},
+        "machines": {},
+    }
+    for profile, studies, cases in machines:
+        laws = {kind: study(with_law(profile, kind), cases) for kind in LAWS}
+        laws["undamped"] = study(undamped(profile), cases)
+        found = {kind: {joint.name: joint.document() for joint in studied} for kind, studied in laws.items()}
+        if loops := {s.name: s.document() for s in studies if s.name not in profile.joints}:
+            found["carrier"] = loops
+        document["machines"][profile.name] = found
+        draw(profile.name, studies, docs / "results" / "loop-design")
+    document["reached"] = all(loop["holds"] for _, _, loop in _with_limits(document))
     (docs / "results").mkdir(parents=True, exist_ok=True)
     (docs / "results" / "loop-design.json").write_text(json.dumps(document, indent=2) + "\n")
-    (docs / "loop-design.md").write_text("\n".join(out).rstrip() + "\n")
-    return holds
+    (docs / "loop-design.md").write_text(markdown(document, [profile for profile, _, _ in machines]))
+    return bool(document["reached"])
 
 
-def _own(studies: Sequence[JointStudy]) -> list[str]:
+def rewrite(docs: Path) -> Path:
+    """Write the page again from ``docs/results/loop-design.json``, whose machines are shipped profiles; its path.
+
+    Raises:
+        ValueError: the file is not a saved study, or names an unknown profile.
+    """
+    document = json.loads((docs / "results" / "loop-design.json").read_text())
+    path = docs / "loop-design.md"
+    path.write_text(markdown(document, [load_profile(name) for name in document["machines"]]))
+    return path
+
+
+def markdown(document: Mapping[str, Any], profiles: Sequence[Profile]) -> str:
+    """The page from the saved numbers."""
+    needed = document["needed"]
+    plots = {
+        profile.name: [_plot(profile.name, name) for name in (*_own(document, profile), *_carrier(document, profile))]
+        for profile in profiles
+    }
+    first = plots[profiles[0].name][0]
+    out = [
+        "# Loop design", "", _conclusion(document), "", first, "", "## Method", "", INTRODUCTION, "",
+        f"Commit `{document['commit']}`, Python {document['python']}. Limits: {needed['phase_deg']:.0f} deg phase "
+        f"margin and {needed['gain_db']:.0f} dB gain margin. [results/loop-design.json](results/loop-design.json) "
+        "holds all numbers.", "", HOW, "",
+    ]  # fmt: skip
+    for profile in profiles:
+        own, carrier = _own(document, profile), _carrier(document, profile)
+        laws = {kind: joints for kind, joints in document["machines"][profile.name].items() if kind != "carrier"}
+        out += [f"## {profile.title}", "", *_table(own), "", LEAST, "", *_laws(laws), ""]
+        if profile.carrier is not None and carrier:
+            out += [CARRIER, "", *_natural(profile.carrier), "", *_table(carrier, "P"), ""]
+        for plot in plots[profile.name]:
+            out += [plot, ""] if plot != first else []
+    return "\n".join(out).rstrip() + "\n"
+
+
+def _own(document: Mapping[str, Any], profile: Profile) -> dict[str, Any]:
+    """Joints of a machine with the law of its profile."""
+    laws = document["machines"][profile.name]
+    return {name: laws[joint["law"]][name] for name, joint in laws["undamped"].items()}
+
+
+def _carrier(document: Mapping[str, Any], profile: Profile) -> dict[str, Any]:
+    found: dict[str, Any] = document["machines"][profile.name].get("carrier", {})
+    return found
+
+
+def _with_limits(document: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Machine, joint and numbers of every loop whose margins have limits."""
+    for machine, laws in document["machines"].items():
+        for kind, joints in laws.items():
+            if kind != "undamped":
+                yield from ((machine, name, joint) for name, joint in joints.items())
+
+
+def _conclusion(document: Mapping[str, Any]) -> str:
+    loops = list(_with_limits(document))
+    phase = min(loops, key=lambda x: x[2]["phase_margin_deg"])
+    gain = min(loops, key=lambda x: x[2]["gain_margin_db"])
+    met = sum(loop["holds"] for _, _, loop in loops)
+    return (
+        f"{met} of {len(loops)} loops keep their margins on every machine of the truth's spread, with every law. The "
+        f"least phase margin is {phase[2]['phase_margin_deg']:.0f} deg ({phase[1]} of `{phase[0]}`), the least gain "
+        f"margin {gain[2]['gain_margin_db']:.1f} dB ({gain[1]} of `{gain[0]}`)."
+    )
+
+
+def _plot(machine: str, name: str) -> str:
+    caption = f"{name} of {machine}: loop gain and phase, and the margins of all machines."
+    return f"![{caption}](results/loop-design/{plot_name(machine, name)})"
+
+
+def _table(joints: Mapping[str, Any], law: str = "") -> list[str]:
+    """Rows of the loops; ``law``: its name, if not that of the saved one."""
     lines = [
         "| joint | law | kp [1/s] | phase [deg] | gain [dB] | bandwidth [Hz] | worst machine | |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for joint in studies:
-        law = joint.spec.law
-        name = NAMES[law.kind] if law.kind != "pd" or law.kd else "P"
+    for name, joint in joints.items():
         lines.append(
-            f"| {joint.name} | {name} | {law.kp_1_s:.3g} | {joint.phase_deg:.0f} | {joint.gain_db:.1f} | "
-            f"{joint.bandwidth_hz:.2f} | {joint.worst} | {'reached' if joint.holds else '**missed**'} |"
+            f"| {name} | {law or NAMES[joint['law']]} | {joint['kp_1_s']:.3g} | {joint['phase_margin_deg']:.0f} | "
+            f"{joint['gain_margin_db']:.1f} | {joint['bandwidth_hz']:.2f} | {joint['worst']} | "
+            f"{'met' if joint['holds'] else '**missed**'} |"
         )
     return lines
 
@@ -132,12 +196,16 @@ def _natural(carrier: Carrier) -> list[str]:
     return lines
 
 
-def _laws(laws: Mapping[str, Sequence[JointStudy]]) -> list[str]:
+def _laws(laws: Mapping[str, Mapping[str, Any]]) -> list[str]:
     lines = [
         "| joint | " + " | ".join(f"{NAMES[kind]} [deg, dB]" for kind in laws) + " |",
         "|---|" + "---|" * len(laws),
     ]
-    for rows in zip(*laws.values(), strict=True):
-        cells = [f"{j.phase_deg:.0f}, {j.gain_db:.1f}{'' if j.holds else ' (too little)'}" for j in rows]
-        lines.append(f"| {rows[0].name} | " + " | ".join(cells) + " |")
+    for name in laws["undamped"]:
+        rows = [joints[name] for joints in laws.values()]
+        cells = [
+            f"{j['phase_margin_deg']:.0f}, {j['gain_margin_db']:.1f}{'' if j['holds'] else ' (too little)'}"
+            for j in rows
+        ]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return lines

@@ -1,4 +1,4 @@
-"""Bode and Nichols pictures of every joint's loop: the nominal machine, the worst one, and the cloud of all margins."""
+"""Plots of every joint's loop: Bode diagram of the nominal and the worst machine, and the margins of all machines."""
 
 from __future__ import annotations
 
@@ -8,16 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.common.plot_style import OIL, RUST, STEEL, sheet
 from experiments.loop_design.loop import FREQUENCY_RAD_S
-from experiments.loop_design.study import GAIN_DB, PHASE_DEG, JointStudy
+from experiments.loop_design.study import MIN_GAIN_DB, MIN_PHASE_DEG, JointStudy
+from runtime.plot_style import OIL, RUST, STEEL, sheet
+
+
+def plot_name(machine: str, loop: str) -> str:
+    """File name of the plot of a loop."""
+    return f"{machine}-{loop.replace(' ', '-')}.png"
 
 
 def draw(machine: str, studies: Sequence[JointStudy], out: Path) -> list[Path]:
-    """One picture per joint; returns the files."""
+    """Write one plot per loop into ``out``; returns the files."""
     files = []
     for joint in studies:
-        path = out / f"{machine}-{joint.name.replace(' ', '-')}.png"
+        path = out / plot_name(machine, joint.name)
         with sheet(path, 3, width=11.0, height=3.4) as (gain, phase, cloud):
             hz = FREQUENCY_RAD_S / (2.0 * math.pi)
             for loop, colour, name in ((joint.nominal_loop, OIL, "nominal"), (joint.worst_loop, RUST, "worst")):
@@ -38,8 +43,8 @@ def draw(machine: str, studies: Sequence[JointStudy], out: Path) -> list[Path]:
                 [m.phase_deg for m in joint.margins], [m.gain_db for m in joint.margins], c=delays, s=7, cmap="viridis"
             )
             cloud.figure.colorbar(shown, label="dead time [ms]")
-            cloud.axvline(PHASE_DEG, color=RUST, lw=0.8, ls="--")
-            cloud.axhline(GAIN_DB, color=RUST, lw=0.8, ls="--")
+            cloud.axvline(MIN_PHASE_DEG, color=RUST, lw=0.8, ls="--")
+            cloud.axhline(MIN_GAIN_DB, color=RUST, lw=0.8, ls="--")
             cloud.set_xlabel("phase margin [deg]")
             cloud.set_title("gain margin [dB], all machines")
         files.append(path)

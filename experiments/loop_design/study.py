@@ -1,7 +1,7 @@
-"""Margins of every joint's loop over all machines that the truth's spread allows, in the poses and loads of its work.
+"""Margins of every joint's loop over all machines of the truth's spread, in several poses and with several loads.
 
-The controller knows the profile alone; the true dead time and gain lie anywhere in the spread.  Near, working and far
-reach, the grapple empty and with a rated load, moving either way, the valve open little and much.
+The controller knows only the profile; the true dead time and gain lie anywhere in the spread.  Cases: near, working and
+far reach; empty grapple and rated load; both directions; valve slightly and widely open.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ import control
 import numpy as np
 
 from controller.config import Settings
-from experiments.common.worlds import home_at, opened, profile_named
+from experiments.common.worlds import home_at, profile_named, trial_world
 from experiments.loop_design.loop import FREQUENCY_RAD_S, Array, LawResponse, Margins, Spool, margins, open_loop
 from experiments.loop_design.mechanics import Mechanics, mechanics
-from machine.kinematics import max_reach_m
-from machine.load import profile_hash
+from machine.geometry.kinematics import max_reach_m
+from machine.loading.profile_file import profile_hash
 from machine.profile import JointSpec, Profile
 
-PHASE_DEG: Final = 40.0
-GAIN_DB: Final = 6.0
+MIN_PHASE_DEG: Final = 40.0
+MIN_GAIN_DB: Final = 6.0
 REACH_SHARES: Final = {"near": 0.45, "working": 0.65, "far": 0.85}
 HEIGHT_M: Final = 1.0
 RATED_KG: Final = {"palms_471": 120.0, "aoro_fc8": 200.0}
@@ -54,11 +54,11 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
-    """Where the loops are judged: mechanics of every joint with an encoder in each pose, and the machines."""
+class CaseSet:
+    """The cases of a study: mechanics of every joint with an encoder in each pose, and the machines."""
 
     places: dict[str, list[tuple[Case, Mechanics]]]
-    """Per joint; the cases are those of the nominal machine."""
+    """Mechanics per joint; the cases are those of the nominal machine."""
     valves: dict[str, Spool]
     """The nominal true valve of each joint."""
     delays_s: tuple[float, ...]
@@ -67,7 +67,7 @@ class Work:
 
 @dataclass(frozen=True, slots=True)
 class JointStudy:
-    """One joint: margins of every case, and the loops of the nominal and of the worst one."""
+    """One joint: margins of every case, and the loops of the nominal and the worst case."""
 
     name: str
     spec: JointSpec
@@ -76,7 +76,7 @@ class JointStudy:
     cases: tuple[Case, ...]
     margins: tuple[Margins, ...]
     worst_loop: Array
-    """That of the least gain margin."""
+    """Loop of the case with the least gain margin."""
 
     @property
     def phase_deg(self) -> float:
@@ -90,7 +90,7 @@ class JointStudy:
 
     @property
     def worst(self) -> Case:
-        """The case of the least gain margin."""
+        """The case with the least gain margin."""
         return self.cases[min(range(len(self.cases)), key=lambda i: self.margins[i].gain_db)]
 
     @property
@@ -100,7 +100,7 @@ class JointStudy:
         return float(FREQUENCY_RAD_S[np.argmax(closed < math.sqrt(0.5))] / (2.0 * math.pi))
 
     def document(self) -> dict[str, Any]:
-        """What a report needs; the worst loop is judged again by python-control."""
+        """Numbers for the page; python-control computes the margins of the worst loop again."""
         frd = control.FrequencyResponseData(self.worst_loop, FREQUENCY_RAD_S)
         gain, phase, *_ = control.stability_margins(frd)
         return {
@@ -118,12 +118,12 @@ class JointStudy:
 
     @property
     def holds(self) -> bool:
-        """Whether the margins hold everywhere."""
-        return self.phase_deg >= PHASE_DEG and self.gain_db >= GAIN_DB
+        """Whether all margins meet their limits."""
+        return self.phase_deg >= MIN_PHASE_DEG and self.gain_db >= MIN_GAIN_DB
 
 
-def work_of(source: str, truth: str = "nominal") -> Work:
-    """Reads the machine ``source`` (a shipped profile or a file) in its poses.
+def case_set(source: str, truth: str = "nominal") -> CaseSet:
+    """Linearize the machine ``source`` (a shipped profile or a file) in all poses.
 
     Raises:
         ValueError: the truth cannot be used with this profile.
@@ -133,7 +133,7 @@ def work_of(source: str, truth: str = "nominal") -> Work:
     places: dict[str, list[tuple[Case, Mechanics]]] = {}
     for pose, share in REACH_SHARES.items():
         home = home_at(source, share * max_reach_m(profile), HEIGHT_M)
-        with opened(source, truth, 0, home=home) as world:
+        with trial_world(source, truth, 0, home=home) as world:
             spread = world.truth.spread
             valves = {
                 n: Spool(f.valve.delay_s, 1.0, f.valve.spool_rad_s, f.valve.spool_zeta)
@@ -145,15 +145,15 @@ def work_of(source: str, truth: str = "nominal") -> Work:
                     places.setdefault(name, []).append((case, mechanics(world, name, kg, way, opening)))
     delays = np.linspace(spread.delay_min_s, spread.delay_max_s, DELAYS)
     gains = np.linspace(1.0 - spread.gain, 1.0 + spread.gain, GAINS)
-    return Work(places, valves, tuple(delays.tolist()), tuple(gains.tolist()))
+    return CaseSet(places, valves, tuple(delays.tolist()), tuple(gains.tolist()))
 
 
-def study(profile: Profile, work: Work) -> list[JointStudy]:
-    """Every joint that has an encoder, with the profile's gains."""
+def study(profile: Profile, work: CaseSet) -> list[JointStudy]:
+    """Study every joint with an encoder, with the gains of the profile."""
     return [_joint(profile, name, work) for name in work.places]
 
 
-def _joint(profile: Profile, name: str, work: Work) -> JointStudy:
+def _joint(profile: Profile, name: str, work: CaseSet) -> JointStudy:
     settings = Settings(profile, profile_hash(profile), profile.rate_hz)
     period_s, lead_s = settings.period_ns * 1e-9, settings.sync_lead_ns * 1e-9
     spec, valve, s = profile.joints[name], work.valves[name], 1j * FREQUENCY_RAD_S
@@ -168,10 +168,10 @@ def _joint(profile: Profile, name: str, work: Work) -> JointStudy:
         (replace(case, delay_s=delay, gain=gain, amplitude=amplitude), made)
         for (case, made), delay, gain, amplitude in product(work.places[name], work.delays_s, work.gains, amplitudes)
     ]
-    judged = [margins(FREQUENCY_RAD_S, loop(*each)) for each in every]
-    worst = min(range(len(every)), key=lambda i: judged[i].gain_db)
+    case_margins = [margins(FREQUENCY_RAD_S, loop(*each)) for each in every]
+    worst = min(range(len(every)), key=lambda i: case_margins[i].gain_db)
     middle = next(each for each in work.places[name] if each[0].pose == "working")
     nominal = loop(*middle)
     cases = tuple(case for case, _ in every)
     at = margins(FREQUENCY_RAD_S, nominal)
-    return JointStudy(name, spec, at, nominal, cases, tuple(judged), loop(*every[worst]))
+    return JointStudy(name, spec, at, nominal, cases, tuple(case_margins), loop(*every[worst]))

@@ -1,1 +1,1 @@
-"""Navigation: paper B's way and ours along four waypoints, on the machine on the bus."""
+"""The navigation experiment: paper B's law and our path follower along four waypoints, with the whole machine."""

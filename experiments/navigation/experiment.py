@@ -1,20 +1,21 @@
-"""The navigation experiment: two ways, three grounds, six starts, two laps; judged, drawn, told."""
+"""The navigation experiment: two methods, three grounds, six starts, two laps."""
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 from rich.console import Console
 
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import Result, judged
-from experiments.common.result_page import tell
-from experiments.common.trials import check_truth, checkpoint, individuals
+from experiments.common.result import Result, make_result
+from experiments.common.result_page import Page, publish
+from experiments.common.trials import LOCKSTEP_SOURCES, check_truth, checkpoint, sampled_unless_given
 from experiments.common.worlds import carrier_profile, profile_named
-from experiments.navigation.metrics import FIGURES, GROUNDS, INTRODUCTION, LAP, PAPER, SECTIONS, gather
+from experiments.navigation.metrics import CONCLUSION, GROUNDS, INTRODUCTION, LAP, METRICS, PAPER, SECTIONS, gather
 from experiments.navigation.plots import draw
 from experiments.navigation.trial import Pose, perform
 
@@ -22,7 +23,7 @@ TRIALS: Final = 1
 """Individual machines; each makes 36 drives of five minutes."""
 LAPS: Final = 2
 CORNERS: Final = ((15.0, -10.0), (15.0, 10.0), (-15.0, 10.0), (-15.0, -10.0))
-"""Waypoints in the field [m east, north]: 5 m from its edges, in the order in which they are driven at."""
+"""Waypoints in the field [m east, north], 5 m from its edges, in driving order."""
 STARTS: Final = (
     (-12.0, -10.0, 0.0),
     (-4.0, -14.0, 20.0),
@@ -33,48 +34,53 @@ STARTS: Final = (
 )
 """Front axle [m east, north] and direction [deg from east, + left]."""
 QUICK_START: Final = (4.0, -10.0, 0.0)
-WAYS: Final = ("faithful", "ours")
+METHODS: Final = ("faithful", "ours")
 FIRST_SEED: Final = 7000
 SEEDS_PER_RUN: Final = 100
 
 
 def run(options: Options, console: Console) -> Result:
-    """Measure everything; writes ``options.out`` and, when asked, the docs.
+    """Run the experiment; write ``options.out`` and, if requested, the docs.
 
     Raises:
-        Stopped: the truth file cannot be used.
+        CommandFailed: the truth file cannot be used.
     """
-    name, truth = carrier_profile(options.profile), individuals(options.truth)
+    name, truth = carrier_profile(options.profile), sampled_unless_given(options.truth)
     carrier = profile_named(name).carrier
     assert carrier is not None
     check_truth(name, truth)
     trials = 1 if options.quick else options.trials or TRIALS
     points = list(CORNERS[:2]) if options.quick else list(CORNERS) * LAPS
     jobs = plan(options, name, truth, trials, points)
-    with checkpoint(options, jobs, [name], truth, ["autonomy", "controller"]) as kept:
+    with checkpoint(options, jobs, [name], truth, LOCKSTEP_SOURCES) as kept:
         outcomes = pool.run(perform, jobs, kept, options.workers, "navigation drives", console)
-        result = judged(
-            "navigation", FIGURES, gather(outcomes, points, carrier, LAP), profile=name, seed=options.seed,
+        result = make_result(
+            "navigation", METRICS, gather(outcomes, points, carrier, LAP), profile=name, seed=options.seed,
             trials=trials, more={"truth": truth}, paper=PAPER,
         )  # fmt: skip
         draw(outcomes, points, carrier, options.out)
-        tell(result, "Navigation", INTRODUCTION, SECTIONS, options, console)
+        publish(result, page_of(result, {}), options, console)
     return result
 
 
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page."""
+    return Page("Navigation", CONCLUSION, INTRODUCTION, SECTIONS)
+
+
 def plan(options: Options, profile: str, truth: str, trials: int, points: list[tuple[float, float]]) -> list[Job]:
-    """Every drive, named way/ground/trial/start.  Both ways and all grounds get the same individuals."""
+    """Every drive, named METHOD/GROUND/TRIAL/START; both methods and all grounds use the same individuals."""
     first = FIRST_SEED + options.seed * SEEDS_PER_RUN
     grounds = ("mud",) if options.quick else tuple(GROUNDS)
     starts = (QUICK_START,) if options.quick else STARTS
     what = {"profile": profile, "truth": truth, "points": [list(p) for p in points]}
     return [
-        Job(f"{way}/{ground}/{trial}/{k}", way, first + trial,
-            what | {"way": way, "terrain": ground, "pose": list(_pose(start))})
+        Job(f"{method}/{ground}/{trial}/{k}", method, first + trial,
+            what | {"way": method, "terrain": ground, "pose": list(_pose(start))})
         for trial in range(trials)
         for ground in grounds
         for k, start in enumerate(starts)
-        for way in WAYS
+        for method in METHODS
     ]  # fmt: skip
 
 

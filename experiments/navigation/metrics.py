@@ -1,4 +1,4 @@
-"""What the navigation experiment reports: figures with their limits, and the page."""
+"""Metrics of the navigation experiment with their limits, and the page that shows them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.navigation.clothoid_path import Point2
-from experiments.common.result import Figure, rate
+from experiments.common.result import Metric, rate
 from experiments.common.result_page import Section
 from experiments.navigation import measure
 from experiments.navigation.measure import Drive
@@ -20,78 +20,88 @@ GROUNDS: Final = {"flat": "firm level ground", "mud": "mud", "hill": "a side slo
 LAP: Final = 4
 PAPER: Final = {"heading_deg_per_m": 9.0}
 
+CONCLUSION: Final = (
+    "Our path follower keeps the front axle within {lateral_p95_m} of the planned path (95th percentile) and stops "
+    "within {stop_max_m} of the goal.",
+    "With paper B's law the last laps of all starts agree within {faithful.lateral_p95_m}, and the heading settles by "
+    "{heading_deg_per_m} (paper: {paper:heading_deg_per_m}).",
+)
 OURS: Final = (
-    Figure("lateral_p95_m", "Ours: lateral error, 95th percentile", "cm",
-           "True middle of the front axle from the planned path, after the bend at the first waypoint, all grounds, "
-           "starts and laps together.", most=0.08, scale=CM),
-    *(Figure(f"{g}.lateral_p95_m", f"Ours on {words}", "cm", "The same on this ground.", scale=CM)
-      for g, words in GROUNDS.items()),
-    Figure("lateral_max_m", "Ours: greatest lateral error", "cm", "Of the same.", scale=CM),
-    Figure("own_p95_m", "Ours: lateral error that the machine saw", "cm", "By its own location: what the follower "
-           "leaves; the rest is localization.", scale=CM),
-    Figure("stop_max_m", "Stop beside the wanted place, along the path, greatest", "cm",
-           "Where the front axle came to rest at the end of each drive.", most=0.05, scale=CM),
+    Metric("lateral_p95_m", "Ours: lateral error, 95th percentile", "cm",
+           "True middle of the front axle from the planned path, after the bend at the first waypoint; all grounds, "
+           "starts and laps.", most=0.08, scale=CM),
+    *(Metric(f"{g}.lateral_p95_m", f"Ours on {title}: lateral error, 95th percentile", "cm", "On this ground.",
+             scale=CM)
+      for g, title in GROUNDS.items()),
+    Metric("lateral_max_m", "Ours: largest lateral error", "cm", "All grounds.", scale=CM),
+    Metric("own_p95_m", "Ours: lateral error by the machine's own location, 95th percentile", "cm",
+           "The error of the follower; the rest is localization.", scale=CM),
+    Metric("stop_max_m", "Ours: stopping error along the path, largest", "cm",
+           "Rest position of the front axle at the end of each drive.", most=0.05, scale=CM),
 )  # fmt: skip
 FAITHFUL: Final = (
-    Figure("faithful.lateral_p95_m", "Paper B's law: lateral error on the last lap, 95th percentile", "cm",
+    Metric("faithful.lateral_p95_m", "Paper B's law: lateral error on the last lap, 95th percentile", "cm",
            "From the common path, the mean of the last laps of all starts.", most=0.20, scale=CM),
-    *(Figure(f"{g}.faithful.lateral_p95_m", f"Paper B's law on {words}", "cm", "The same on this ground.", scale=CM)
-      for g, words in GROUNDS.items()),
-    Figure("faithful.coming_p95_m", "Paper B's law: the same on the way there, 95th percentile", "cm",
-           "From the first corner to the last lap: how far apart the starts still are while they come together.",
-           scale=CM),
-    Figure("heading_deg_per_m", "Paper B's law: the heading settles by", "deg/m", "Turn of the front per metre driven, "
-           "between 10 and 90 % of each corner; median of all corners.", least=9.0),
-    Figure("full_bend_deg_per_m", "Turn at full articulation", "deg/m", "While the articulation is at its end; median. "
+    *(Metric(f"{g}.faithful.lateral_p95_m", f"Paper B's law on {title}: lateral error on the last lap, 95th percentile",
+             "cm", "On this ground.", scale=CM) for g, title in GROUNDS.items()),
+    Metric("faithful.coming_p95_m", "Paper B's law: lateral error before the last lap, 95th percentile", "cm",
+           "From the first corner to the last lap: distance between the starts while they converge.", scale=CM),
+    Metric("heading_deg_per_m", "Paper B's law: settling of the heading", "deg/m", "Turn of the front per metre, "
+                                                                                   "between "
+           "10 and 90 % of each corner; median of all corners.", least=9.0),
+    Metric("full_bend_deg_per_m", "Turn at full articulation", "deg/m", "While the articulation is at its limit; "
+                                                                        "median. "
            "9.03 without slip."),
 )  # fmt: skip
 BOTH: Final = (
-    Figure("arrived", "Drives that arrived", "%", "At the last waypoint, or at the end of the path.", 1.0, None, 100.0),
-    Figure("stops", "Stops by the supervisor", "", "Of all drives.", most=0.0),
-    Figure("located_p95_m", "Localization: error of the position, 95th percentile", "cm", "Middle of the front axle "
-           "in the plane, all drives; antennas stand up to 3 cm beside their places.", scale=CM),
-    Figure("honesty", "Squared error over what was claimed, mean", "", "Of the position, in claimed standard "
-           "deviations of its worst direction; 2 is honest in two dimensions, more is too sure.", most=4.0),
+    Metric("arrived", "Completed drives", "%", "At the last waypoint, or at the end of the path.", 1.0, None, 100.0),
+    Metric("stops", "Stops by the supervisor", "", "All drives.", most=0.0),
+    Metric("located_p95_m", "Localization: error of the position, 95th percentile", "cm", "Middle of the front axle in "
+           "the plane, all drives; antennas are mounted up to 3 cm off.", scale=CM),
+    Metric("honesty", "Localization: squared error over the claimed variance, mean", "", "Error of the position over "
+                                                                                         "the "
+           "claimed standard deviation of its worst direction; 2 is consistent in two dimensions, more is "
+           "overconfident.",
+           most=4.0),
 )  # fmt: skip
-FIGURES: Final = OURS + FAITHFUL + BOTH
+METRICS: Final = OURS + FAITHFUL + BOTH
 SECTIONS: Final = (
     Section(
-        "Ours",
-        "The polyline is rounded by clothoids and arcs that the machine can drive, and the front axle follows it with "
-        "feed-forward of the articulation and feedback on the lateral and the course error of an extended Kalman "
-        "filter over receiver, wheels, articulation and inclination. The speed is what bends, slope and ground allow.",
+        "Our path follower",
+        "The polyline is rounded by clothoids and arcs that the machine can drive. The front axle follows it with "
+        "feed-forward of the articulation and feedback on lateral and course error from an extended Kalman filter over "
+        "receiver, wheels, articulation and inclination. Bends, slope and ground limit the speed.",
         OURS,
-        (("lateral.png", "Lateral error of ours over the way, every start; dashed is the limit."),
-         ("steering.png", "Articulation over the way on one start: paper B's law and ours.")),
+        (("lateral.png", "Lateral error of our follower along the path, every start; dashed: limit."),
+         ("steering.png", "Articulation along the path from one start: paper B's law and ours.")),
     ),
     Section(
         "Paper B's law",
-        "Bearing to the waypoint less heading sets the rate of the articulation, in the controller's tick; the "
-        "waypoint changes within R tan(turn / 2) of it. The law knows no path, only points: starts that come to a "
-        "corner from different sides leave it on different lines, and each corner brings them closer by the "
-        "distance of the switch over the length of the leg. So the error is measured from the path that all starts "
-        "come to, on the last lap; the way there is told beside it.",
+        "Bearing to the waypoint less heading sets the rate of the articulation in the controller's tick; the waypoint "
+        "changes within R tan(turn / 2) of it. The law knows points but no path. Starts that reach a corner from "
+        "different sides leave it on different lines, and each corner brings them closer by the ratio of the switching "
+        "distance to the length of the leg. Therefore the error is measured from the path to which all starts "
+        "converge, on the last lap; the part before is reported as well.",
         FAITHFUL,
-        (("paths.png", "As paper B's Fig. 13: three starts by its law, two laps. Squares are starts, circles ends, "
-          "diamonds waypoints."),
-         ("heading.png", "As paper B's Fig. 14: bearing less heading over the way, the same three starts."),
-         ("all.png", "As paper B's Fig. 15: all starts in one picture, paper B's law and ours.")),
+        (("paths.png", "As Fig. 13 of paper B: three starts by its law, two laps. Squares: starts; circles: ends; "
+          "diamonds: waypoints."),
+         ("heading.png", "As Fig. 14 of paper B: bearing less heading along the path, the same three starts."),
+         ("all.png", "As Fig. 15 of paper B: all starts, paper B's law and ours.")),
     ),
-    Section("Both", "", BOTH, ()),
+    Section("Both", "", BOTH),
 )  # fmt: skip
 INTRODUCTION: Final = (
-    "Paper B's test of its navigation (4.1.1, 5.1.1): four waypoints on a field of 40 by 30 m at 63.657853 N, "
-    "19.895562 E, two laps from each of six starts, at 2.3 km/h. The whole machine is on its two buses in lockstep; "
-    "its receiver has the noise, the wandering error and the delay of RTK, its antennas stand beside their places, and "
-    "every trial draws another individual. Ground: firm, mud (half the friction, a third of the tyres' slip stiffness, "
-    "rolling resistance of 0.13) and a plane that rises by 10 degrees across two of the legs. Each way drives every "
-    "start on every ground. `timberhand experiment navigation --docs docs` measures everything and writes this page; "
-    "no number is typed."
+    "This experiment repeats paper B's test of its navigation (4.1.1, 5.1.1): four waypoints on a field of 40 by 30 m "
+    "at 63.657853 N, 19.895562 E, two laps from each of six starts, at 2.3 km/h. The whole machine is on its two buses "
+    "in lockstep. Its receiver has the noise, the drift and the delay of RTK, its antennas are mounted with errors, "
+    "and every trial uses another individual machine. Ground: firm, mud (half the friction, a third of the tyres' slip "
+    "stiffness, rolling resistance of 0.13) and a plane that rises by 10 degrees across two of the legs. Both methods "
+    "drive every start on every ground."
 )
 
 
 def gather(outcomes: Mapping[str, Any], points: Sequence[Point2], carrier: Carrier, lap: int = LAP) -> dict[str, float]:
-    """The figures of all drives; outcomes are named way/ground/trial/start."""
+    """Metrics of all drives; outcomes are named METHOD/GROUND/TRIAL/START."""
     groups: dict[tuple[str, str, str], list[Drive]] = {}
     for name, outcome in outcomes.items():
         way, ground, trial, _ = name.split("/")
@@ -120,7 +130,7 @@ def gather(outcomes: Mapping[str, Any], points: Sequence[Point2], carrier: Carri
             rates += steady
             fulls += full
         if len(good) > 1 and len(points) >= 2 * lap:
-            for before, last in measure.faithful_errors(good, points, lap):
+            for before, last in measure.convergence_errors(good, points, lap):
                 common.setdefault(ground, []).append(last)
                 coming.append(before)
     metrics = {f"{g}.lateral_p95_m": _p95(parts) for g, parts in ours.items()}

@@ -1,4 +1,4 @@
-"""Pictures of the navigation experiment: paper B's Figs 13 to 15, and ours beside them."""
+"""Plots of the navigation experiment: Figs 13 to 15 of paper B, and ours."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.navigation.clothoid_path import Point2
-from experiments.common.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, limit_band, sheet
 from experiments.navigation import measure
 from experiments.navigation.measure import Drive
 from experiments.navigation.metrics import CM, GROUNDS
 from machine.profile import Carrier
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, limit_band, sheet
 
 COLOURS: Final = (OIL, TIMBER, MOSS, RUST, STEEL, "#8a6fae")
 SHOWN: Final = (0, 2, 4)
-"""Starts of the pictures with three."""
+"""Starts in the plots with three."""
 LIMIT_CM: Final = 8.0
 
 
 def draw(outcomes: Mapping[str, Any], points: Sequence[Point2], carrier: Carrier, out: Path) -> None:
-    """All of them, from the first trial; on the first ground that was driven where one is shown."""
+    """Write all plots of the first trial; those of one ground show the first ground driven."""
     grounds = [g for g in GROUNDS if any(name.split("/")[1:3] == [g, "0"] for name in outcomes)]
     drives = {
         (way, ground): [
@@ -69,8 +69,8 @@ def _headings(drives: Sequence[Drive], points: Sequence[Point2], path: Path) -> 
     with sheet(path, max(1, len(some)), width=9.5, height=2.6) as axes:
         for i, (axis, drive) in enumerate(zip(np.atleast_1d(axes), some, strict=True)):
             error = np.degrees(measure.heading_error(drive, points))
-            axis.plot(drive.way_m, error, color=COLOURS[i], lw=1.0)
-            axis.set(title=f"start {i + 1}", xlabel="way [m]", ylim=(-100, 180), yticks=(-90, 0, 90, 180))
+            axis.plot(drive.distance_m, error, color=COLOURS[i], lw=1.0)
+            axis.set(title=f"start {i + 1}", xlabel="distance [m]", ylim=(-100, 180), yticks=(-90, 0, 90, 180))
             if not i:
                 axis.set_ylabel("bearing less heading [deg]")
 
@@ -88,9 +88,13 @@ def _steering(faithful: Sequence[Drive], ours: Sequence[Drive], carrier: Carrier
     with sheet(path, 2, width=9.5, height=2.6) as axes:
         for axis, drives, title in zip(axes, (faithful, ours), ("paper B's law", "ours"), strict=True):
             if drives:
-                axis.plot(drives[0].way_m, np.degrees(drives[0]["bend_rad"]), color=OIL, lw=1.0, label="articulation")
-                axis.plot(drives[0].way_m, np.degrees(drives[0]["wanted_rad"]), color=TIMBER, lw=0.7, label="wanted")
-            axis.set(title=title, xlabel="way [m]", ylim=(-1.1 * limit, 1.1 * limit))
+                axis.plot(
+                    drives[0].distance_m, np.degrees(drives[0]["bend_rad"]), color=OIL, lw=1.0, label="articulation"
+                )
+                axis.plot(
+                    drives[0].distance_m, np.degrees(drives[0]["wanted_rad"]), color=TIMBER, lw=0.7, label="wanted"
+                )
+            axis.set(title=title, xlabel="distance [m]", ylim=(-1.1 * limit, 1.1 * limit))
             for end in (-limit, limit):
                 axis.axhline(end, color=RUST, lw=0.8, ls="--")
         axes[0].set_ylabel("articulation [deg]")
@@ -106,6 +110,6 @@ def _lateral(drives: Mapping[str, Sequence[Drive]], points: Sequence[Point2], ca
                 after = ways > measure.corner_end_m(way, points[0])
                 begin = ways[int(np.argmax(after))]
                 axis.plot(ways[after] - begin, CM * off[after], color=COLOURS[i % len(COLOURS)], lw=0.8)
-            axis.set(title=GROUNDS[ground], xlabel="way after the first bend [m]", ylim=(-12, 12))
+            axis.set(title=GROUNDS[ground], xlabel="distance after the first bend [m]", ylim=(-12, 12))
             limit_band(axis, -LIMIT_CM, LIMIT_CM)
         np.atleast_1d(axes)[0].set_ylabel("off the path, + left [cm]")

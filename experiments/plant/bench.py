@@ -17,15 +17,15 @@ from typing import Any, Final
 
 from rich.console import Console
 
-from experiments.common.result import Figure
-from experiments.common.worlds import carrier_profile, opened, profile_named
+from experiments.common.result import Metric
+from experiments.common.worlds import carrier_profile, profile_named, trial_world
 from experiments.plant.busworld import BusWorld
 from experiments.plant.driver import Driver
 from experiments.plant.trial import over_stakes_m, take, unload
-from machine.kinematics import Unreachable
+from machine.geometry.kinematics import Unreachable
 from sim.mechanics.carrier import Drive
 from sim.plant import Plant
-from sim.scenes.arrangements import LogSpec
+from sim.wood.log_shape import LogSpec
 from sim.world import STEP_S
 
 LOG_COUNTS: Final = (1, 12, 50, 200)
@@ -33,14 +33,14 @@ PICTURE_LOGS: Final = 12
 PER_SECOND: Final = round(1.0 / STEP_S)
 STOLEN: Final = 0.05  # share of the wall time that the process did not run
 UNEQUAL: Final = 0.20  # spread of the fixed work, (p90 - median) / median
-FIGURES: Final = (
-    Figure("rtf_crane12", "Real-time factor, crane at work among 12 logs, no camera", "x",
+METRICS: Final = (
+    Metric("rtf_crane12", "Real-time factor, crane at work among 12 logs, no camera", "x",
            "Physics, hydraulics and judge-free yard of the fixed crane while it drives its functions among 12 logs.",
            least=5.0, clocked=True),
-    Figure("rtf_mission", "Real-time factor, forwarder: driving, then crane work, all CAN nodes", "x",
+    Metric("rtf_mission", "Real-time factor, forwarder: driving, then crane work, all CAN nodes", "x",
            "The whole plant behind both buses: 20 s of driving past a row of logs, then a grasp into the bunk.",
            least=3.0, clocked=True),
-    Figure("camera608_ms", "Camera picture 608 x 608 with depth, 12 logs in the yard", "ms",
+    Metric("camera608_ms", "Camera picture 608 x 608 with depth, 12 logs in the yard", "ms",
            "One frame of the emulated stereo camera: colour, depth and its errors.", most=12.0, clocked=True),
 )  # fmt: skip
 
@@ -141,7 +141,7 @@ def heap(count: int, x_m: float, y_m: float) -> tuple[LogSpec, ...]:
 def _crane(profile: str, truth: str, stretches: int) -> Stopwatch:
     """Stretches of one second of the crane moving all its functions, 12 logs in a heap."""
     p = profile_named(profile)
-    with opened(profile, truth, 1, heap(12, *p.workspace.pick_center_m)) as world:
+    with trial_world(profile, truth, 1, heap(12, *p.workspace.pick_center_m)) as world:
         driver, watch = Driver(world), Stopwatch()
         start = dict(driver.reference)
         _second(driver, start, 0)
@@ -208,7 +208,7 @@ def _load_one(bus: BusWorld, driver: Driver, quick: bool) -> None:
 
 def _growth(profile: str, truth: str, count: int, stretches: int) -> Stopwatch:
     """Half-second stretches of the standing crane with so many logs on the ground."""
-    with opened(profile, truth, 1, rows_of_logs(count, 12.0, -6.0)) as world:
+    with trial_world(profile, truth, 1, rows_of_logs(count, 12.0, -6.0)) as world:
         watch = Stopwatch()
         neutral = [0.0] * len(world.functions)
         for i in range(stretches + 1):
@@ -226,7 +226,7 @@ def _camera(profile: str, truth: str, pictures: int) -> Stopwatch:
     from sim.camera.rig import CameraRig
 
     p = profile_named(profile)
-    with opened(profile, truth, 1, heap(PICTURE_LOGS, *p.workspace.pick_center_m)) as world:
+    with trial_world(profile, truth, 1, heap(PICTURE_LOGS, *p.workspace.pick_center_m)) as world:
         rig = CameraRig(world, p, world.truth, 1, 608)
         name = next(iter(p.cameras))
         rig.frame(name, 0)

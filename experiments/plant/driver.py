@@ -11,9 +11,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from machine.grapple import grapple_yaw, lowest_tip_below_pin_m, rotator_for_yaw, tip_below_pin_m
+from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m, rotator_for_yaw, tip_below_pin_m
+from machine.geometry.kinematics import Point, Unreachable, inverse, reachable_extensions, solve
 from machine.joints import Joint
-from machine.kinematics import Point, Unreachable, inverse, reachable_extensions, solve
 from machine.profile import joint_limits
 from sim.world import STEP_S, World
 
@@ -144,7 +144,7 @@ class Driver:
         pin rises, so the load is laid down and not dropped.
         """
         tongs = self.world.profile.grapple.tongs
-        low = floor_m + tip_below_pin_m(tongs, self.world.tong_angle)
+        low = floor_m + tip_below_pin_m(tongs, self.world.jaw_angle_rad)
         ext = self.extension_for(x, y, low, carry_m)
         above = self.pose((x, y, carry_m), ext)
         self.move({**above, "rot": self.rotator(above["slew"], log_yaw)})
@@ -159,7 +159,7 @@ class Driver:
         tongs = self.world.profile.grapple.tongs
         self.grapple = OPENING
         for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
-            angle = self.world.tong_angle
+            angle = self.world.jaw_angle_rad
             wanted = floor + max(tip_below_pin_m(tongs, angle - ahead) for ahead in LOOK_AHEAD_RAD)
             z = max(z, min(wanted, z + RAISE_SPEED_M_S * STEP_S))
             self._follow((x, y, z), ext)
@@ -174,7 +174,7 @@ class Driver:
         self.grapple = -0.7
         still_s = 0.0
         for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
-            angle = world.tong_angle
+            angle = world.jaw_angle_rad
             wanted = floor + max(tip_below_pin_m(tongs, angle + ahead) for ahead in LOOK_AHEAD_RAD)
             z = max(z, min(wanted, z + RAISE_SPEED_M_S * STEP_S))
             self._follow((x, y, z), ext)

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from experiments.common.pool import Job
-from experiments.common.worlds import opened
+from experiments.common.worlds import trial_world
 from experiments.plant.driver import DRIVEN, Driver
 from experiments.plant.trial import take
-from machine.grapple import lowest_tip_below_pin_m, tip_below_pin_m
-from machine.kinematics import Unreachable
+from machine.geometry.grapple import lowest_tip_below_pin_m, tip_below_pin_m
+from machine.geometry.kinematics import Unreachable
 from sim.world import STEP_S, World
 
 PAGE_BYTES: Final = 4096
@@ -31,7 +31,7 @@ def shift(job: Job) -> dict[str, Any]:
     """Options: profile, truth, seconds (simulated)."""
     o = job.options
     rng = random.Random(f"endurance {job.seed}")
-    with opened(o["profile"], o["truth"], job.seed, "single", 1) as world:
+    with trial_world(o["profile"], o["truth"], job.seed, "single", 1) as world:
         steps = 0
 
         def count() -> None:
@@ -42,12 +42,12 @@ def shift(job: Job) -> dict[str, Any]:
         home = {name: world.q[name] for name in DRIVEN}
         rows: list[dict[str, float]] = []
         while steps * STEP_S < o["seconds"]:
-            before = world.yard.states()[0].position_m
+            before = world.log_bodies.states()[0].position_m
             take(world, driver, rng)
             _lay_down(world, driver, rng)
             driver.move(home)
             driver.wait(3.0)
-            after = world.yard.states()[0].position_m
+            after = world.log_bodies.states()[0].position_m
             rows.append(
                 {
                     "time_s": steps * STEP_S,
@@ -82,7 +82,7 @@ def _lay_down(world: World, driver: Driver, rng: random.Random) -> None:
     while True:
         x, y = (c + rng.uniform(-1.0, 1.0) * space.pick_half_size_m for c in space.pick_center_m)
         floor = space.ground_z_m + LAY_DOWN_M
-        low, high = floor + tip_below_pin_m(tongs, world.tong_angle), floor + tips + 0.8
+        low, high = floor + tip_below_pin_m(tongs, world.jaw_angle_rad), floor + tips + 0.8
         try:
             driver.extension_for(x, y, low, high)
         except Unreachable:
@@ -95,7 +95,7 @@ def _finite(world: World) -> bool:
     """Whether every joint, speed, pressure and log position is a number."""
     values = [*world.q.values(), *world.qd.values(), world.hydraulics.energy_j]
     values += [v for pair in world.hydraulics.pressures_pa.values() for v in pair]
-    values += [v for log in world.yard.states() for v in (*log.position_m, log.speed_m_s)]
+    values += [v for log in world.log_bodies.states() for v in (*log.position_m, log.speed_m_s)]
     return all(map(math.isfinite, values))
 
 
@@ -108,13 +108,13 @@ def fingerprint(job: Job) -> str:
     """Options: profile, truth, scene, logs.  SHA-256 over all joints, speeds, pressures and logs, every step."""
     o = job.options
     digest = hashlib.sha256()
-    with opened(o["profile"], o["truth"], job.seed, o["scene"], o["logs"]) as world:
+    with trial_world(o["profile"], o["truth"], job.seed, o["scene"], o["logs"]) as world:
         p = world.client
 
         def note() -> None:
             values = [*world.q.values(), *world.qd.values()]
             values += [v for pair in world.hydraulics.pressures_pa.values() for v in pair]
-            for log in world.yard.logs:
+            for log in world.log_bodies.body_ids:
                 position, turn = p.getBasePositionAndOrientation(log)
                 values += [*position, *turn]
             digest.update(struct.pack(f"<{len(values)}d", *values))

@@ -9,10 +9,11 @@ from typing import Any, Final
 import numpy as np
 
 from experiments.common.pool import Job
-from experiments.common.worlds import home_at, opened, step_neutral
+from experiments.common.worlds import home_at, step_neutral, trial_world
 from experiments.plant.driver import Driver
 from experiments.plant.trial import take
-from sim.world import GRAVITY_M_S2, STEP_S, World
+from sim.bullet.client import GRAVITY_M_S2
+from sim.world import STEP_S, World
 
 EVERY: Final = 4
 WINDOW_S: Final = 2.0  # longer than the slowest swing
@@ -24,7 +25,7 @@ NOISE_J: Final = 0.05  # windows with less motion than this are at rest
 def left_alone(job: Job) -> dict[str, Any]:
     """Slew, lift and extend at full spool, shut everything: the kinetic energy's peaks must fall from then on."""
     o = job.options
-    with opened(o["profile"], o["truth"], job.seed, home=home_at(o["profile"], 4.5, 0.6, 0.5)) as world:
+    with trial_world(o["profile"], o["truth"], job.seed, home=home_at(o["profile"], 4.5, 0.6, 0.5)) as world:
         spools = [{"slew": 1.0, "lift": 1.0, "ext": 1.0}.get(f, 0.0) for f in world.functions]
         for _ in range(round(1.5 / STEP_S)):
             world.step(spools)
@@ -63,13 +64,13 @@ def _kinetic(mass: float, principal: Any, turn: Any, linear: Any, angular: Any, 
 def falling(job: Job) -> dict[str, Any]:
     """Let a pile of logs fall from a height: kinetic and potential energy together may only shrink."""
     o = job.options
-    with opened(o["profile"], o["truth"], job.seed, "pile", 4) as world:
+    with trial_world(o["profile"], o["truth"], job.seed, "pile", 4) as world:
         p = world.client
-        world.yard.wake()
-        for log in world.yard.logs:
+        world.log_bodies.wake()
+        for log in world.log_bodies.body_ids:
             (x, y, z), turn = p.getBasePositionAndOrientation(log)
             p.resetBasePositionAndOrientation(log, (x, y, z + FALL_M), turn)
-        lowest = _logs_energy(world) - FALL_M * GRAVITY_M_S2 * sum(world.yard.masses)
+        lowest = _logs_energy(world) - FALL_M * GRAVITY_M_S2 * sum(world.log_bodies.masses)
         energy = [_logs_energy(world) - lowest]
         for _ in range(round(3.0 / STEP_S)):
             step_neutral(world, 1)
@@ -85,7 +86,7 @@ def falling(job: Job) -> dict[str, Any]:
 def _logs_energy(world: World) -> float:
     p = world.client
     total = 0.0
-    for log in world.yard.logs:
+    for log in world.log_bodies.body_ids:
         d, (position, turn) = p.getDynamicsInfo(log, -1), p.getBasePositionAndOrientation(log)
         linear, angular = p.getBaseVelocity(log)
         total += _kinetic(d[0], d[2], turn, linear, angular, p) + d[0] * GRAVITY_M_S2 * position[2]
@@ -98,7 +99,7 @@ def lifting(job: Job) -> dict[str, Any]:
     The oil's own account: pump = work on the joints + losses + what the chambers store.
     """
     o = job.options
-    with opened(o["profile"], o["truth"], job.seed, "single", 1) as world:
+    with trial_world(o["profile"], o["truth"], job.seed, "single", 1) as world:
         driver = Driver(world)
         take(world, driver)
         driver.rest(2.0)
@@ -124,7 +125,7 @@ def _potential_j(world: World) -> float:
     total = 0.0
     for i, s in enumerate(p.getLinkStates(body, list(range(p.getNumJoints(body))), computeForwardKinematics=1)):
         total += p.getDynamicsInfo(body, i)[0] * GRAVITY_M_S2 * s[0][2]
-    for log in world.yard.logs:
+    for log in world.log_bodies.body_ids:
         total += p.getDynamicsInfo(log, -1)[0] * GRAVITY_M_S2 * p.getBasePositionAndOrientation(log)[0][2]
     return total
 
@@ -133,8 +134,8 @@ def resting(job: Job) -> dict[str, Any]:
     """Logs left alone for a minute, as the plant has them (woken, they may fall asleep again) and kept awake."""
     o = job.options
     metrics, traces = {}, {}
-    with opened(o["profile"], o["truth"], job.seed, o["scene"], o["logs"]) as world:
-        p, yard = world.client, world.yard
+    with trial_world(o["profile"], o["truth"], job.seed, o["scene"], o["logs"]) as world:
+        p, yard = world.client, world.log_bodies
         yard.wake()
         for name in ("", "awake_"):
             if name:

@@ -1,8 +1,9 @@
-"""The plant experiment: which trials, run on all cores, judged together, drawn and written."""
+"""The plant experiment: plans the trials, runs them on all cores, evaluates and publishes the result."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
@@ -13,12 +14,12 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import Result, judged, mean, rate
-from experiments.common.result_page import tell
+from experiments.common.result import Result, make_result, mean, rate
+from experiments.common.result_page import Page, publish
 from experiments.common.trials import check_truth, checkpoint
 from experiments.common.worlds import carrier_profile, profile_named
 from experiments.plant import bench, endurance, energy, physics, rolling, trial
-from experiments.plant.metrics import FIGURES, PAPER, SECTIONS
+from experiments.plant.metrics import CONCLUSION, INTRODUCTION, METRICS, PAPER, SECTIONS
 from experiments.plant.plots import draw
 
 TRIALS: Final = 200
@@ -56,19 +57,19 @@ FUNCTIONS: Final = {
 
 
 def perform(job: Job) -> Any:
-    """Run one job in whatever process this is."""
+    """Run one job in the current process."""
     return FUNCTIONS[job.kind](job)
 
 
 def plan(options: Options, trials: int) -> list[Job]:
-    """Every job of the run, the long ones first."""
+    """Every job of the run, the longest first."""
     seed = options.seed * SEEDS_PER_RUN
     common = {"profile": options.profile, "truth": options.truth, "quick": options.quick}
     shift_s = QUICK_SHIFT_S if options.quick else SHIFT_S
     jobs = [Job("shift", "shift", seed, {**common, "seconds": shift_s})]
     jobs += [Job(kind, kind, seed, {**common, **scene}) for kind, scene in RESTS.items()]
     jobs += [Job(kind, kind, seed, common) for kind in CRANE]
-    # A truth file is of one machine; the carrier has the shipped one beside a fixed crane's.
+    # A truth file belongs to one machine; with a fixed crane's file the carrier uses the shipped truth.
     other = carrier_profile(options.profile)
     same = other == options.profile or options.truth in ("nominal", "sampled")
     under = {**common, "profile": other, "truth": options.truth if same else "nominal"}
@@ -80,10 +81,10 @@ def plan(options: Options, trials: int) -> list[Job]:
 
 
 def run(options: Options, console: Console) -> Result:
-    """Measure everything; writes ``options.out`` and, when asked, the docs.
+    """Run the experiment; write ``options.out`` and, if requested, the docs.
 
     Raises:
-        Stopped: the truth file or a scene cannot be used.
+        CommandFailed: the truth file or a scene cannot be used.
     """
     check_truth(options.profile, options.truth)
     trials = options.trials or (QUICK_TRIALS if options.quick else TRIALS)
@@ -95,24 +96,22 @@ def run(options: Options, console: Console) -> Result:
         speed, noisy, costs = bench.measure(options.profile, options.truth, options.quick, console)
         metrics |= speed
         traces |= costs
-        result = judged(
-            "plant", FIGURES, metrics, profile=profile_named(options.profile).name, seed=options.seed, trials=trials,
+        result = make_result(
+            "plant", METRICS, metrics, profile=profile_named(options.profile).name, seed=options.seed, trials=trials,
             more={"truth": options.truth}, paper=PAPER, noisy=noisy,
         )  # fmt: skip
         draw(metrics, traces, options.out)
-        tell(result, "The plant, measured", INTRODUCTION, SECTIONS, options, console)
+        publish(result, page_of(result, {}), options, console)
     return result
 
 
-INTRODUCTION: Final = (
-    "The plant stands where the machine stands: crane, hydraulics, carrier, logs and CAN nodes. This page says how "
-    "much of a machine it is. `timberhand experiment plant --docs docs` measures everything and writes the page; no "
-    "number is typed."
-)
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page."""
+    return Page("Plant experiment", CONCLUSION, INTRODUCTION, SECTIONS)
 
 
 def _repeats(options: Options) -> bool:
-    """Whether two fresh processes agree on every byte of a grasp."""
+    """Whether two new processes produce the same bytes for a grasp."""
     o = {"profile": options.profile, "truth": options.truth, "scene": "pile", "logs": 3}
     job = Job("repeat", "repeat", options.seed * SEEDS_PER_RUN, o)
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as processes:
@@ -121,7 +120,7 @@ def _repeats(options: Options) -> bool:
 
 
 def gather(outcomes: dict[str, Any]) -> tuple[dict[str, float], dict[str, Any]]:
-    """Metrics and traces of all jobs together."""
+    """Metrics and traces of all jobs."""
     by_kind: dict[str, list[Any]] = {}
     for name, outcome in outcomes.items():
         by_kind.setdefault(name.split("/")[0], []).append(outcome)

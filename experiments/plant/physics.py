@@ -13,13 +13,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from experiments.common.pool import Job
-from experiments.common.worlds import hang, home_at, mass_points, opened, profile_named, step_neutral
+from experiments.common.worlds import hang, home_at, mass_points, profile_named, step_neutral, trial_world
 from experiments.plant.driver import Driver
 from experiments.plant.signals import Ringing, ringing
 from experiments.plant.trial import take
-from sim.hydraulics import Hydraulics
-from sim.scenes.arrangements import LogSpec
-from sim.world import GRAVITY_M_S2, STEP_S, World
+from sim.bullet.client import GRAVITY_M_S2
+from sim.hydraulics.circuit import Hydraulics
+from sim.wood.log_shape import LogSpec
+from sim.world import STEP_S, World
 
 SAG_REACH_M: Final = 6.0
 SAG_LOADS_KG: Final = (0.0, 50.0, 100.0, 150.0, 200.0, 250.0)
@@ -39,7 +40,9 @@ def sag(job: Job) -> Outcome:
     """
     o = job.options
     rows = []
-    with opened(o["profile"], o["truth"], job.seed, home=home_at(o["profile"], SAG_REACH_M, PIN_HEIGHT_M)) as world:
+    with trial_world(
+        o["profile"], o["truth"], job.seed, home=home_at(o["profile"], SAG_REACH_M, PIN_HEIGHT_M)
+    ) as world:
         load = 0.0
         for target in SAG_LOADS_KG:
             while load < target:
@@ -115,7 +118,7 @@ def boom_stop(job: Job) -> Outcome:
     metrics: dict[str, float] = {}
     traces: dict[str, Any] = {}
     for name, kg in (("empty", 0.0), ("250kg", 250.0)):
-        with opened(o["profile"], o["truth"], job.seed, home=home_at(o["profile"], 5.5, 0.4)) as world:
+        with trial_world(o["profile"], o["truth"], job.seed, home=home_at(o["profile"], 5.5, 0.4)) as world:
             hang(world, kg)
             step_neutral(world, round(3.0 / STEP_S))
             spools = [0.6 if f == "lift" else 0.0 for f in world.functions]
@@ -141,7 +144,7 @@ def pendulum(job: Job) -> Outcome:
     metrics: dict[str, float] = {}
     traces: dict[str, Any] = {}
     for hinge, links in (("hanger", BEYOND_HANGER), ("fork", BEYOND_FORK)):
-        with opened(o["profile"], o["truth"], job.seed, home=home_at(o["profile"], 4.0, PIN_HEIGHT_M)) as world:
+        with trial_world(o["profile"], o["truth"], job.seed, home=home_at(o["profile"], 4.0, PIN_HEIGHT_M)) as world:
             step_neutral(world, round(1.0 / STEP_S))
             rest = world.q[hinge]
             theory_hz, inertia = compound(world, hinge, links)
@@ -204,11 +207,11 @@ def slew_stop(job: Job) -> Outcome:
     """
     o = job.options
     x, y = profile_named(o["profile"]).workspace.pick_center_m
-    with opened(o["profile"], o["truth"], job.seed, (LogSpec(x, y, SLEW_LOG_YAW_RAD, 2.5, 0.30, 600.0),)) as world:
+    with trial_world(o["profile"], o["truth"], job.seed, (LogSpec(x, y, SLEW_LOG_YAW_RAD, 2.5, 0.30, 600.0),)) as world:
         driver = Driver(world)
         take(world, driver)
         driver.wait(3.0)
-        held = tuple(b for b, t in zip(world.yard.logs, world.touched(), strict=True) if t)
+        held = tuple(b for b, t in zip(world.log_bodies.body_ids, world.touched(), strict=True) if t)
         theory_hz, _ = compound(world, "fork", BEYOND_FORK, held)
         spools = [0.45 if f == "slew" else -0.2 if f == "grapple" else 0.0 for f in world.functions]
         angles = []
@@ -243,7 +246,7 @@ def sharing(job: Job) -> Outcome:
     directions = {n: 1.0 if 2.0 * q < joints[n].lower + joints[n].upper else -1.0 for n, q in home.items()}
 
     def speeds(spools: dict[str, float]) -> tuple[dict[str, float], float]:
-        with opened(o["profile"], o["truth"], job.seed, home=home) as world:
+        with trial_world(o["profile"], o["truth"], job.seed, home=home) as world:
             commands = [spools.get(f, 0.0) for f in world.functions]
             start: dict[str, float] = {}
             limited = 0
@@ -281,9 +284,9 @@ def cylinder_spring(job: Job) -> Outcome:
     """
     o = job.options
     inertia, load_nm, q0 = 4000.0, 8000.0, 0.4
-    with opened(o["profile"], o["truth"], job.seed) as world:
+    with trial_world(o["profile"], o["truth"], job.seed) as world:
         truth = world.truth
-        at = [world.tong_angle if f == "grapple" else world.q[f] for f in world.functions]
+        at = [world.jaw_angle_rad if f == "grapple" else world.q[f] for f in world.functions]
     i = world.functions.index("lift")
     lift = truth.functions["lift"]
     bare = replace(lift.cylinder, coulomb=0.0, stiction=0.0, viscous=0.0, relaxation_1_s=0.0)

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments.common.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, limit_band, sheet
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, limit_band, sheet
 
 Metrics = dict[str, float]
 RATES: Final = (

@@ -12,10 +12,11 @@ from typing import Any, Final
 import numpy as np
 
 from experiments.common.pool import Job
-from experiments.common.worlds import opened
-from machine.carrier import turning_radius_m
+from experiments.common.worlds import trial_world
+from machine.geometry.carrier import turning_radius_m
+from sim.bullet.client import GRAVITY_M_S2
 from sim.mechanics.carrier import PARKED, Drive
-from sim.world import GRAVITY_M_S2, STEP_S, World
+from sim.world import STEP_S, World
 
 EVERY: Final = 20
 STEER_KP_1_S: Final = 2.5
@@ -45,7 +46,7 @@ def turning(job: Job) -> dict[str, Any]:
     metrics: dict[str, float] = {}
     traces = []
     errors = []
-    with opened(o["profile"], o["truth"], job.seed) as world:
+    with trial_world(o["profile"], o["truth"], job.seed) as world:
         spec, carrier = world.profile.carrier, world.carrier
         assert spec is not None and carrier is not None
         drive = Drive(spec.cruise_speed_m_s)
@@ -88,7 +89,7 @@ def fit_circle(path: list[tuple[float, float]]) -> tuple[tuple[float, float], fl
 def braking(job: Job) -> dict[str, Any]:
     """Stand, then drive straight and brake: weight on the wheels, stopping distance, swing of the empty grapple."""
     o = job.options
-    with opened(o["profile"], o["truth"], job.seed) as world:
+    with trial_world(o["profile"], o["truth"], job.seed) as world:
         spec, carrier = world.profile.carrier, world.carrier
         assert spec is not None and carrier is not None
         p, body, neutral = world.client, world.crane.body, [0.0] * len(world.functions)

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from experiments.common.pool import Job
-from experiments.common.worlds import opened, to_base, yaw_in_base
+from experiments.common.worlds import to_base, trial_world, yaw_in_base
 from experiments.plant.driver import Driver
-from machine.grapple import lowest_tip_below_pin_m
-from machine.kinematics import Unreachable
-from sim.evaluator import LIFTED_M, Judge
+from machine.geometry.grapple import lowest_tip_below_pin_m
+from machine.geometry.kinematics import Unreachable
+from sim.evaluator import LIFTED_M, Evaluator
 from sim.wood.bunk import from_bunk
 from sim.wood.logs import LogState
 from sim.world import STEP_S, World
@@ -34,11 +34,11 @@ def grasp(job: Job) -> dict[str, Any]:
     ``in_bunk``: logs at rest in the bunk after unloading.
     """
     o = job.options
-    with opened(o["profile"], o["truth"], job.seed, o["scene"], o["logs"]) as world:
-        judge, fastest = Judge(world), Fastest(world)
+    with trial_world(o["profile"], o["truth"], job.seed, o["scene"], o["logs"]) as world:
+        evaluator, fastest = Evaluator(world), Fastest(world)
 
         def watch() -> None:
-            judge.watch()
+            evaluator.watch()
             fastest.watch()
 
         driver = Driver(world, watch)
@@ -49,25 +49,28 @@ def grasp(job: Job) -> dict[str, Any]:
         for _ in range(round(WEIGH_S / STEP_S)):
             driver.tick({})
             weighed.append(world.load_kg())
-        after = judge.verdict()
+        after = evaluator.evaluate()
         # Also the top log of a pile, which the grapple itself does not touch.
-        held = [log.position_m[2] - world.terrain.height(*log.position_m[:2]) > LIFTED_M for log in world.yard.states()]
+        held = [
+            log.position_m[2] - world.terrain.height(*log.position_m[:2]) > LIFTED_M
+            for log in world.log_bodies.states()
+        ]
         outcome: dict[str, Any] = {
             "held": sum(held),
             "raised": sum(v.lifted or h for v, h in zip(after.logs, held, strict=True)),
             "load_kg": sum(weighed) / len(weighed),
-            "true_load_kg": sum(m for m, h in zip(world.yard.masses, held, strict=True) if h),
+            "true_load_kg": sum(m for m, h in zip(world.log_bodies.masses, held, strict=True) if h),
         }
         if o["unload"] and any(held):
-            hanging = [log for log, h in zip(world.yard.states(), held, strict=True) if h]
+            hanging = [log for log, h in zip(world.log_bodies.states(), held, strict=True) if h]
             unload(world, driver, hanging)
             for _ in range(UNLOADED_S):
                 driver.wait(1.0)
-                verdict = judge.verdict()
+                verdict = evaluator.evaluate()
                 if all(v.at_rest for v in verdict.logs):
                     break
             outcome["in_bunk"] = sum(v.done for v, h in zip(verdict.logs, held, strict=True) if h)
-        last = judge.verdict()
+        last = evaluator.evaluate()
         outcome |= {
             "penetration_m": last.max_penetration_m,
             "log_speed_m_s": fastest.m_s,
@@ -116,7 +119,7 @@ def take(
     The aim is off by ``across_m``, ``turned_rad`` and the noise of ``rng`` (None: no noise).
     """
     tips = lowest_tip_below_pin_m(world.profile.grapple.tongs)
-    x, y, yaw, ground = _aim(world, driver, rng, across_m, logs or world.yard.states())
+    x, y, yaw, ground = _aim(world, driver, rng, across_m, logs or world.log_bodies.states())
     top = ground + SHOWN_M + tips if lift_to_m is None else lift_to_m
     driver.pick(x, y, yaw + turned_rad, ground + HOVER_M + tips, ground, top)
 

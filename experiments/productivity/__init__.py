@@ -1,1 +1,1 @@
-"""How much wood in an hour: single logs, piles, and a full bunk unloaded at a landing."""
+"""The productivity experiment: wood per hour from single logs and piles, and unloading at a landing."""

@@ -1,4 +1,4 @@
-"""What the productivity experiment reports: figures with their limits, and the page."""
+"""Metrics of the productivity experiment with their limits, and the page that shows them."""
 
 from __future__ import annotations
 
@@ -9,68 +9,76 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments.common.result import Figure, rate
+from experiments.common.result import Metric, rate
 from experiments.common.result_page import Section
 
 HOUR_S: Final = 3600.0
 EXPERT_S: Final = (20.0, 25.0)
-"""An expert's single log from the ground into the bunk (docs/reference/machines.md section 10, assumed)."""
+"""Time of an expert for a single log from the ground into the bunk (docs/reference/machines.md section 10, assumed)."""
 HUMAN_S: Final = (18.0, 25.0)
-"""A crane cycle of an operator with 40 to 50 grapple loads a load (derived on assumed sizes, Manner 2016)."""
-KINDS_SHOWN: Final = {"singles": "Single logs", "piles": "Piles", "landing": "Unloading"}
+"""Crane cycle of an operator with 40 to 50 grapple loads per load (derived on assumed sizes, Manner 2016)."""
+KIND_TITLES: Final = {"singles": "Single logs", "piles": "Piles", "landing": "Unloading"}
 
+CONCLUSION: Final = (
+    "A crane cycle for one log takes {cycle_median_s} in the median, {over_shortest} times the shortest possible time.",
+    "The machine loads {logs_per_hour} single logs or {piles.logs_per_hour} logs from piles per hour, driving "
+    "included, and unloads a full bunk in {unload_s}.",
+)
 CYCLES: Final = (
-    Figure("cycle_median_s", "Crane cycle, one log from the ground into the bunk: median", "s", "From the look at the "
-           "logs until the crane is clear of the stakes with the log in the bunk; grasps of one log along the route "
+    Metric("cycle_median_s", "Crane cycle, one log from the ground into the bunk: median", "s", "From the detection of "
+           "the logs until the crane is clear of the stakes with the log in the bunk; grasps of one log on the route "
            "of single logs.", most=25.0),
-    Figure("cycle_p90_s", "The same, 90 of 100 are below", "s", "The same grasps."),
-    Figure("shortest_median_s", "Shortest time for the same ways, median", "s", "What joint speeds, joint "
-           "accelerations and the pump's flow allow for the same paths, and the time that the tongs need; no look, no "
-           "settling, no jerk."),
-    Figure("over_shortest", "Crane cycle over that, mean", "", "Of the same grasps."),
-    Figure("piles.cycle_median_s", "Crane cycle from a pile: median", "s", "One grasp, whatever it holds."),
-    Figure("piles.logs_per_grasp", "Logs a grasp from a pile", "", "Of those that did not come up empty."),
+    Metric("cycle_p90_s", "Crane cycle, one log from the ground into the bunk: 90th percentile", "s",
+           "The same grasps."),
+    Metric("shortest_median_s", "Shortest possible time for the same paths, median", "s", "What joint speeds, joint "
+           "accelerations and the pump's flow allow for the same paths, plus closing and opening of the grapple; "
+           "without detection, settling and jerk limit."),
+    Metric("over_shortest", "Crane cycle over the shortest possible time, mean", "", "The same grasps."),
+    Metric("piles.cycle_median_s", "Crane cycle from a pile: median", "s", "One grasp of any number of logs."),
+    Metric("piles.logs_per_grasp", "Logs per grasp from a pile", "", "Grasps with at least one log."),
 )  # fmt: skip
 HOURS: Final = (
-    Figure("logs_per_hour", "Single logs: logs an hour", "", "Loaded logs over the time from the first state that "
-           "follows arming to the end of the route, driving included."),
-    Figure("m3_per_hour", "Single logs: wood an hour", "m³", "The same; cylinders of the mid diameter."),
-    Figure("crane_logs_per_hour", "Single logs: logs an hour of crane work", "", "The same, without driving."),
-    Figure("piles.logs_per_hour", "Piles: logs an hour", "", "The same for piles."),
-    Figure("piles.m3_per_hour", "Piles: wood an hour", "m³", "The same."),
-    Figure("loaded", "Logs loaded, of all that lay there", "%", "By the plant's physics; both.", scale=100.0),
-    Figure("faults", "Stops and faults", "", "All runs.", most=0.0),
+    Metric("logs_per_hour", "Single logs: logs per hour", "", "Loaded logs over the time from the first state after "
+           "arming to the end of the route, driving included."),
+    Metric("m3_per_hour", "Single logs: wood per hour", "m³", "The same time; cylinders of the mid diameter."),
+    Metric("crane_logs_per_hour", "Single logs: logs per hour of crane work", "", "The same, without driving."),
+    Metric("piles.logs_per_hour", "Piles: logs per hour", "", "As for single logs."),
+    Metric("piles.m3_per_hour", "Piles: wood per hour", "m³", "As for single logs."),
+    Metric("loaded", "Logs loaded", "%", "Share of all single logs and logs in piles, by the plant's physics.",
+           scale=100.0),
+    Metric("faults", "Stops and faults", "", "All runs.", most=0.0),
 )  # fmt: skip
 UNLOADING: Final = (
-    Figure("unload_s", "A full bunk unloaded in", "min", "From the begin of the first grasp to the end of the last.",
+    Metric("unload_s", "Time to unload a full bunk", "min", "From the start of the first grasp to the end of the last.",
            scale=1 / 60),
-    Figure("unload_logs_per_hour", "Logs an hour while unloading", "", "The same time."),
-    Figure("unload_m3_per_hour", "Wood an hour while unloading", "m³", "The same time."),
-    Figure("unload_cycle_median_s", "Crane cycle while unloading: median", "s", "One grasp, whatever it holds."),
-    Figure("unload_logs_per_grasp", "Logs a grasp while unloading", "", "Of those that did not come up empty."),
-    Figure("unloaded", "Logs that lie at the landing", "%", "Within 3 m of its middle and not on board.", scale=100.0),
+    Metric("unload_logs_per_hour", "Logs per hour while unloading", "", "The same time."),
+    Metric("unload_m3_per_hour", "Wood per hour while unloading", "m³", "The same time."),
+    Metric("unload_cycle_median_s", "Crane cycle while unloading: median", "s", "One grasp of any number of logs."),
+    Metric("unload_logs_per_grasp", "Logs per grasp while unloading", "", "Grasps with at least one log."),
+    Metric("unloaded", "Logs delivered to the landing", "%", "Within 3 m of its middle and not on board.", scale=100.0),
 )  # fmt: skip
-FIGURES: Final = CYCLES + HOURS + UNLOADING
+METRICS: Final = CYCLES + HOURS + UNLOADING
 INTRODUCTION: Final = (
-    "How much wood in an hour. Three pieces of work on the nominal machine, with birch logs of about 2 m by 25 cm: "
-    "single logs right and left of a straight route; mini-piles of paper A's sizes, two to six logs each; and a full "
-    "bunk that is driven to a landing and unloaded. The whole machine is on its two buses in lockstep; a detector "
-    "that makes no mistakes sees the logs. `timberhand experiment productivity --docs docs` measures everything and "
-    "writes this page; no number is typed."
+    "This experiment measures how much wood the machine moves per hour. The nominal machine has three tasks with birch "
+    "logs of about 2 m by 25 cm: single logs right and left of a straight route; small piles of paper A's sizes, two "
+    "to six logs each; and a full bunk that is driven to a landing and unloaded. The whole machine is on its two buses "
+    "in lockstep; an ideal detector without errors sees the logs."
 )
 HUMAN: Final = (
-    f"People: an expert takes a single log into the bunk in {EXPERT_S[0]:.0f} to {EXPERT_S[1]:.0f} s (assumed; 145 to "
-    f"180 logs an hour of crane work). Over 8868 loads of nine operators (Manner 2016) loading is 45 % of 45.8 "
-    f"minutes a load, the crane moves in 75 % of it: {HUMAN_S[0]:.0f} to {HUMAN_S[1]:.0f} s a cycle at 40 to 50 "
-    "grapple loads, and 20 to 22 m³ an hour of productive work with 16 m³ a load (derived on assumed sizes); unloading "
-    "is 19 %, 8.7 minutes. Those cycles hold many thin logs; ours hold one or a few."
+    f"Human operators: an expert loads a single log into the bunk in {EXPERT_S[0]:.0f} to {EXPERT_S[1]:.0f} s "
+    "(assumed; 145 to 180 logs per hour of crane work). In 8868 loads of nine operators (Manner 2016) loading takes 45 "
+    f"% of 45.8 minutes per load, and the crane moves for 75 % of it: {HUMAN_S[0]:.0f} to {HUMAN_S[1]:.0f} s per cycle "
+    "with 40 to 50 grapple loads, and 20 to 22 m³ per hour of productive work with 16 m³ per load (derived on assumed "
+    "sizes). Unloading takes 19 %, 8.7 minutes. Those cycles hold many thin logs; ours hold one or a few."
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Cycle:
-    """One grasp: what the crane was about, logs in it, its time, the time of its phases and the shortest possible [s];
-    ``good`` when it did what it was to do.
+    """One grasp: state of the manager, number of logs, duration, durations of its phases and shortest possible time
+    [s].
+
+    ``good``: it succeeded.
     """
 
     state: str
@@ -81,14 +89,14 @@ class Cycle:
     good: bool
 
 
-def cycles(outcome: Mapping[str, Any], tongs_s: float) -> Iterator[Cycle]:
-    """The grasps of a mission that came to an end; ``tongs_s`` is what closing and opening take at least."""
+def cycles(outcome: Mapping[str, Any], grapple_s: float) -> Iterator[Cycle]:
+    """The completed grasps of a mission; ``grapple_s``: minimum time for closing and opening the grapple."""
     for grasp in outcome["grasps"]:
         if "end_s" not in grasp:
             continue
         ends = [begin for _, begin, _ in grasp["phases"][1:]] + [grasp["end_s"]]
         phases = tuple((n, end - begin) for (n, begin, _), end in zip(grasp["phases"], ends, strict=True))
-        shortest = sum(s for name, _, s in grasp["phases"] if name != "CLOSE") + tongs_s
+        shortest = sum(s for name, _, s in grasp["phases"] if name != "CLOSE") + grapple_s
         logs = grasp["attempts"][-1]["logs"] if grasp["attempts"] else 0
         yield Cycle(grasp["state"], logs, grasp["end_s"] - grasp["begin_s"], phases, shortest, grasp["failure"] is None)
 
@@ -96,16 +104,16 @@ def cycles(outcome: Mapping[str, Any], tongs_s: float) -> Iterator[Cycle]:
 def sections() -> tuple[Section, ...]:
     """Sections of the page."""
     return (
-        Section("The crane's cycle", HUMAN, CYCLES, (
-            ("cycles.png", "Every grasp and its phases; black bars: the shortest possible for the same ways."),
+        Section("Crane cycle", HUMAN, CYCLES, (
+            ("cycles.png", "Every grasp and its phases; black bars: the shortest possible time for the same paths."),
         )),
-        Section("Logs and wood in an hour", "", HOURS),
+        Section("Logs and wood per hour", "", HOURS),
         Section("Unloading", "", UNLOADING),
     )  # fmt: skip
 
 
-def gather(outcomes: Mapping[str, Any], tongs_s: float) -> dict[str, float]:
-    """The figures of all runs; outcomes are named KIND/NUMBER."""
+def gather(outcomes: Mapping[str, Any], grapple_s: float) -> dict[str, float]:
+    """Metrics of all runs; outcomes are named KIND/NUMBER."""
     kinds: dict[str, list[Mapping[str, Any]]] = {}
     for name, outcome in outcomes.items():
         kinds.setdefault(name.split("/")[0], []).append(outcome)
@@ -115,14 +123,14 @@ def gather(outcomes: Mapping[str, Any], tongs_s: float) -> dict[str, float]:
     metrics |= rate("loaded", sum(log["in_bunk"] for log in logs), len(logs))
     for kind, prefix in (("singles", ""), ("piles", "piles.")):
         if some := kinds.get(kind):
-            metrics |= {f"{prefix}{k}": v for k, v in _loading(some, tongs_s, kind == "singles").items()}
+            metrics |= {f"{prefix}{k}": v for k, v in _loading(some, grapple_s, kind == "singles").items()}
     if some := kinds.get("landing"):
-        metrics |= _unloading(some, tongs_s)
+        metrics |= _unloading(some, grapple_s)
     return metrics
 
 
-def _loading(outcomes: Sequence[Mapping[str, Any]], tongs_s: float, single: bool) -> dict[str, float]:
-    good = [c for o in outcomes for c in cycles(o, tongs_s) if c.good and c.state == "COLLECT"]
+def _loading(outcomes: Sequence[Mapping[str, Any]], grapple_s: float, single: bool) -> dict[str, float]:
+    good = [c for o in outcomes for c in cycles(o, grapple_s) if c.good and c.state == "COLLECT"]
     shown = [c for c in good if c.logs == 1] if single else good
     wood = sum(_m3(log) for o in outcomes for log in o["logs"] if log["in_bunk"])
     logs = sum(log["in_bunk"] for o in outcomes for log in o["logs"])
@@ -132,7 +140,7 @@ def _loading(outcomes: Sequence[Mapping[str, Any]], tongs_s: float, single: bool
         return metrics
     metrics["cycle_median_s"] = float(np.median([c.seconds for c in shown]))
     if single:
-        crane_s = sum(c.seconds for o in outcomes for c in cycles(o, tongs_s))
+        crane_s = sum(c.seconds for o in outcomes for c in cycles(o, grapple_s))
         metrics |= {
             "cycle_p90_s": float(np.percentile([c.seconds for c in shown], 90.0)),
             "shortest_median_s": float(np.median([c.shortest_s for c in shown])),
@@ -144,8 +152,8 @@ def _loading(outcomes: Sequence[Mapping[str, Any]], tongs_s: float, single: bool
     return metrics
 
 
-def _unloading(outcomes: Sequence[Mapping[str, Any]], tongs_s: float) -> dict[str, float]:
-    parts = [[c for c in cycles(o, tongs_s) if c.state == "UNLOAD"] for o in outcomes]
+def _unloading(outcomes: Sequence[Mapping[str, Any]], grapple_s: float) -> dict[str, float]:
+    parts = [[c for c in cycles(o, grapple_s) if c.state == "UNLOAD"] for o in outcomes]
     spans = [_span_s(o) for o in outcomes]
     at_landing = [log["landed"] for o in outcomes for log in o["logs"]]
     metrics = rate("unloaded", sum(at_landing), len(at_landing))
@@ -164,7 +172,7 @@ def _unloading(outcomes: Sequence[Mapping[str, Any]], tongs_s: float) -> dict[st
 
 
 def _span_s(outcome: Mapping[str, Any]) -> float:
-    """From the first to the last grasp at the landing."""
+    """Time from the first to the last grasp at the landing [s]."""
     some = [g for g in outcome["grasps"] if g["state"] == "UNLOAD" and "end_s" in g]
     return some[-1]["end_s"] - some[0]["begin_s"] if some else math.nan
 

@@ -1,4 +1,4 @@
-"""The picture of the productivity experiment: every grasp, phase by phase, beside the shortest possible."""
+"""Plot of the productivity experiment: every grasp, phase by phase, and the shortest possible time."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from typing import Any, Final
 
 import numpy as np
 
-from experiments.common.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
-from experiments.productivity.metrics import EXPERT_S, KINDS_SHOWN, Cycle, cycles
+from experiments.productivity.metrics import EXPERT_S, KIND_TITLES, Cycle, cycles
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 
 COLOURS: Final = {
     "LOOK": STEEL, "ABOVE": OIL, "DESCEND": "#5b93b8", "CLOSE": MOSS, "LIFT": "#87a978", "CARRY": TIMBER,
     "LOWER": "#c29a6b", "OPEN": "#d9c3a5", "RETREAT": "#8a6fae",
 }  # fmt: skip
-MOST: Final = 30
+MAX_SHOWN_COUNT: Final = 30
 
 
-def draw(outcomes: Mapping[str, Any], tongs_s: float, out: Path) -> None:
-    """All of them."""
+def draw(outcomes: Mapping[str, Any], grapple_s: float, out: Path) -> None:
+    """Write the plot into ``out``."""
     groups = {
-        title: [c for name, o in outcomes.items() if name.startswith(f"{kind}/") for c in cycles(o, tongs_s)]
-        for kind, title in KINDS_SHOWN.items()
+        title: [c for name, o in outcomes.items() if name.startswith(f"{kind}/") for c in cycles(o, grapple_s)]
+        for kind, title in KIND_TITLES.items()
     }
-    groups = {title: some[:MOST] for title, some in groups.items() if some}
+    groups = {title: some[:MAX_SHOWN_COUNT] for title, some in groups.items() if some}
     with sheet(out / "cycles.png", max(1, len(groups)), width=4.2 * max(1, len(groups)), height=4.2) as axes:
         for axis, (title, some) in zip(np.atleast_1d(axes), groups.items(), strict=False):
             _bars(axis, some, title)

@@ -1,4 +1,4 @@
-"""One piece of work with a judge beside the machine: plain data in and out."""
+"""One task of the whole machine in lockstep, as plain data."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Any
 from experiments.common.mission_trial import run_mission
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
-from experiments.productivity.tasks import work
+from experiments.productivity.tasks import task
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """``options``: profile, truth, amount, way, limit_s; the kind of the job is that of the work."""
+    """``options``: profile, truth, amount, way, limit_s; the kind of the job is that of the task."""
     o = job.options
-    mission, site = work(job.kind, profile_named(o["profile"]), o["truth"], job.seed, o["amount"])
+    mission, site = task(job.kind, profile_named(o["profile"]), o["truth"], job.seed, o["amount"])
     return run_mission(job, mission, site)

@@ -1,1 +1,1 @@
-"""The timing experiment: the real controller process against the host it runs on."""
+"""The timing experiment and the soak test: the real controller process on the host it runs on."""

@@ -1,8 +1,8 @@
-"""Takes the controller's tick records and says whether anything is missing: ``python -m experiments.timing.bus_observer``.
+"""Checks the controller's tick records for missing data: ``python -m experiments.timing.bus_observer``.
 
-Checks what the controller received and sent, frame by frame, with the means of `experiments.timing.continuity`, and that no
-record is missing but for missed periods.  Says its totals once a second, one JSON object a line.  Exit codes: 0 stopped
-by SIGTERM or SIGINT, 2 usage, 3 profile.
+Input: UDP datagrams with tick records.  It checks the frames that the controller received and sent
+(`experiments.timing.continuity`), and that no record is missing apart from missed periods.  It prints its totals once a
+second as a JSON line.  Exit codes: 0 stopped by SIGTERM or SIGINT, 2 usage, 3 profile.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from typing import Final
 from can_dbc.messages.tick_record import RecordRefused, TickRecord, decode
 from can_dbc.protocols.canopen import SYNC_ID
 from experiments.timing.continuity import Continuity, databases
-from machine.load import ProfileError, load_profile
+from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile
 
-TELL_NS: Final = 1_000_000_000
+PRINT_PERIOD_NS: Final = 1_000_000_000
 BUFFER_BYTES: Final = 4 << 20
 SO_RCVBUFFORCE: Final = 33
-"""socket(7); as root it goes beyond the system's limit."""
+"""socket(7): as root it exceeds the limit of the system."""
 
 
-class Witness:
-    """Records in, totals out; pure."""
+class BusObserver:
+    """Tick records in, totals out; pure."""
 
     def __init__(self, profile: Profile, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -43,8 +43,8 @@ class Witness:
         self._first: dict[int, int] = {}
         self.records = self.lost = self.unreadable = 0
 
-    def take(self, data: bytes) -> None:
-        """One datagram."""
+    def add(self, data: bytes) -> None:
+        """Add one datagram."""
         try:
             record = decode(data)
         except RecordRefused:
@@ -56,15 +56,15 @@ class Witness:
             passed = (record.now_ns - last.now_ns) // self._period_ns
             self.lost += max(0, passed - 1 - (record.missed_ticks - last.missed_ticks))
         for frame in (*record.frames_in, *record.machine_frames_in):
-            self.received.take(frame.key, frame.data)
+            self.received.add(frame.key, frame.data)
         for key, payload in (*record.frames_out, *record.machine_frames_out):
-            self.sent.take(key, payload)
+            self.sent.add(key, payload)
         if not self._first and all(self.received.frames[key] for key in self._encoders):
             self._first = {key: self.received.frames[key] for key in self._encoders}
             self._first[SYNC_ID] = self.sent.frames[SYNC_ID]
 
     def unanswered(self) -> int:
-        """SYNCs since all encoders run that at least one of them left without an answer; one may be on its way."""
+        """SYNCs without an answer of at least one encoder since all encoders run; one answer may be in flight."""
         if not self._first:
             return 0
         syncs = self.sent.frames[SYNC_ID] - self._first[SYNC_ID]
@@ -72,7 +72,7 @@ class Witness:
         return max(0, syncs - answers - 1)
 
     def totals(self) -> dict[str, int]:
-        """Everything so far."""
+        """All counters."""
         return {
             "records": self.records,
             "records_lost": self.lost,
@@ -88,16 +88,16 @@ class Witness:
 def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m experiments.timing.bus_observer", description="Watches the tick records."
+        prog="python -m experiments.timing.bus_observer", description="Check the tick records of a controller."
     )
     parser.add_argument("--profile", required=True)
     parser.add_argument("--rate", required=True, type=int, metavar="HZ")
     parser.add_argument("--port", required=True, type=int, help="UDP port of the tick records")
     options = parser.parse_args(arguments)
     try:
-        witness = Witness(load_profile(options.profile), 1_000_000_000 // options.rate)
+        observer = BusObserver(load_profile(options.profile), 1_000_000_000 // options.rate)
     except ProfileError as error:
-        sys.stderr.write(f"witness: {error}\n")
+        sys.stderr.write(f"bus observer: {error}\n")
         return 3
     ended: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -110,15 +110,15 @@ def main(arguments: list[str] | None = None) -> int:
         gc.collect()
         gc.freeze()
         print("ready", flush=True)
-        tell_ns = 0
+        next_print_ns = 0
         while not ended:
             with contextlib.suppress(TimeoutError):
-                witness.take(link.recv(65_536))
+                observer.add(link.recv(65_536))
             now_ns = time.monotonic_ns()
-            if now_ns >= tell_ns:
-                tell_ns = now_ns + TELL_NS
-                print(json.dumps(witness.totals()), flush=True)
-    print(json.dumps(witness.totals()), flush=True)
+            if now_ns >= next_print_ns:
+                next_print_ns = now_ns + PRINT_PERIOD_NS
+                print(json.dumps(observer.totals()), flush=True)
+    print(json.dumps(observer.totals()), flush=True)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Is anything lost?  The counters of protected frames must follow each other; pure."""
+"""Detects lost frames: the counters of protected frames must be consecutive; pure."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from machine.profile import Profile
 
 
 class Continuity:
-    """What one participant saw of a bus.  ``frames`` by key; ``gaps`` and ``damaged`` count protected frames whose
-    counter does not follow the one before, or whose CRC is wrong.
+    """Frames that one participant saw on a bus.
+
+    ``frames`` counts them by key; ``gaps`` and ``damaged`` count protected frames with a counter that is not
+    consecutive, or with a wrong CRC.
     """
 
     def __init__(self, databases: Iterable[Database]) -> None:
@@ -22,8 +24,8 @@ class Continuity:
         self.frames: Counter[int] = Counter()
         self.gaps = self.damaged = 0
 
-    def take(self, key: int, data: bytes) -> None:
-        """One frame, in the order of the bus."""
+    def add(self, key: int, data: bytes) -> None:
+        """Add one frame, in the order of the bus."""
         self.frames[key] += 1
         ids = self._ids.get(key)
         if ids is None:
@@ -39,5 +41,5 @@ class Continuity:
 
 
 def databases(profile: Profile) -> list[Database]:
-    """The databases of a machine's own protected frames."""
+    """The databases that define the protected frames of a machine."""
     return [load("crane"), *([load("machine")] if profile.machine_bus else [])]

@@ -1,8 +1,10 @@
-"""The machine of the timing stand: ``python -m experiments.timing.emulated_machine --profile aoro_fc8 --bus crane0=wire:crane0 ...``.
+"""The emulated machine of the timing testbed.
 
-Every CAN node of the machine on its buses, around joints that follow their valves (`sim.kinematic.machine`): the traffic of the
-whole machine for a fraction of a core.  ``--cycle-us`` is the period of the PLC and the fast pressures.
-Says ``ready`` on stdout, then once a second a JSON line with how well it keeps time.
+``python -m experiments.timing.emulated_machine --profile aoro_fc8 --bus crane0=wire:crane0 ...``
+
+Every CAN node of the machine on its buses, around joints that follow their valves (`sim.kinematic`): the traffic of the
+whole machine for a fraction of a core.  ``--cycle-us`` is the period of the PLC and the fast pressures.  It prints
+``ready``, then once a second a JSON line with its timing.
 
 Exit codes: 0 stopped by SIGTERM or SIGINT; 2 usage; 3 profile; 4 bus.
 """
@@ -18,32 +20,33 @@ import sys
 import time
 from collections.abc import Mapping
 
-from can_dbc.bus.base import Bus, BusError, open_bus
+from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
 from experiments.timing.continuity import Continuity, databases
-from machine.load import ProfileError, load_profile
+from machine.loading.profile_file import ProfileError, load_profile
 from sim.kinematic.machine import KinematicMachine
-from sim.process.live import TX_QUEUE, LiveMachine
+from sim.process.live import TX_QUEUE_FRAMES, LiveMachine
 
 STEP_NS = 2_500_000
-TELL_NS = 1_000_000_000
+PRINT_PERIOD_NS = 1_000_000_000
 
 
-class LiveRig(LiveMachine):
-    """A kinematic machine that tells how it keeps time, and whether a frame for it was lost."""
+class EmulatedMachine(LiveMachine):
+    """A kinematic machine that reports its timing and lost frames."""
 
     def __init__(self, machine: KinematicMachine, buses: Mapping[str, Bus], continuity: Continuity) -> None:
         super().__init__(machine, buses)
         self._continuity = continuity
-        self._tell_ns = 0
+        self._next_print_ns = 0
 
-    def _heard(self, frames: list[Frame]) -> None:
+    def _on_received(self, frames: list[Frame]) -> None:
         for frame in frames:
-            self._continuity.take(frame.key, frame.data)
+            self._continuity.add(frame.key, frame.data)
 
-    def _stepped(self, now_ns: int) -> None:
-        if now_ns >= self._tell_ns:
-            self._tell_ns = now_ns + TELL_NS
+    def _on_step(self, now_ns: int) -> None:
+        if now_ns >= self._next_print_ns:
+            self._next_print_ns = now_ns + PRINT_PERIOD_NS
             seen = {"gaps": self._continuity.gaps, "damaged": self._continuity.damaged}
             print(json.dumps(self.report() | seen | {"cpu_s": time.process_time()}), flush=True)
 
@@ -51,7 +54,7 @@ class LiveRig(LiveMachine):
 def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m experiments.timing.emulated_machine", description="A light machine on its CAN buses."
+        prog="python -m experiments.timing.emulated_machine", description="A kinematic machine on its CAN buses."
     )
     parser.add_argument("--profile", required=True)
     parser.add_argument("--seed", type=int, default=1)
@@ -65,8 +68,8 @@ def main(arguments: list[str] | None = None) -> int:
         with contextlib.ExitStack() as stack:
             buses = {}
             for name, _, address in (text.partition("=") for text in options.bus):
-                buses[name] = stack.enter_context(open_bus(address, tx_queue=TX_QUEUE, participant="rig"))
-            live = LiveRig(machine, buses, Continuity(databases(profile)))
+                buses[name] = stack.enter_context(open_bus(address, tx_queue=TX_QUEUE_FRAMES, participant="rig"))
+            live = EmulatedMachine(machine, buses, Continuity(databases(profile)))
             signal.signal(signal.SIGTERM, live.stop)
             signal.signal(signal.SIGINT, live.stop)
             gc.collect()
@@ -74,10 +77,10 @@ def main(arguments: list[str] | None = None) -> int:
             print("ready", flush=True)
             live.run()
     except (ProfileError, ValueError) as error:
-        sys.stderr.write(f"rig: {error}\n")
+        sys.stderr.write(f"emulated machine: {error}\n")
         return 3
     except (BusError, OSError) as error:
-        sys.stderr.write(f"rig: {error}\n")
+        sys.stderr.write(f"emulated machine: {error}\n")
         return 4
     return 0
 

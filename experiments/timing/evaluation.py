@@ -1,9 +1,9 @@
-"""From windows to figures and verdicts; pure.
+"""Turns measurement windows into metrics and compares them with their limits; pure.
 
-What depends on the host's clock is compared with cyclictest in the same windows, and only in those in which cyclictest
-says that the host was quiet: it wakes once in each of our periods, so a stall of the host that is long enough to make
-us miss a deadline shows there too.  Where too few windows are quiet, or a run is too short to tell, the verdict is
-"inconclusive", whether the number would pass or not.
+Metrics that depend on the host's clock are compared with cyclictest in the same windows, and only in those in which
+cyclictest shows a quiet host.  cyclictest wakes once per period of the controller, so a stall of the host that is long
+enough for a missed deadline shows there too.  If too few windows are quiet, or a run is too short, such a metric is
+inconclusive, whatever its value.
 """
 
 from __future__ import annotations
@@ -16,44 +16,44 @@ from typing import Final
 import numpy as np
 
 from can_dbc.timing.durations import BINS, Durations, edge_ns
-from experiments.common.result import Figure
-from experiments.timing.measurement import Window, pooled
+from experiments.common.result import Metric
+from experiments.timing.measurement import MeasurementWindow, pooled
 
-QUIET_LONGEST: Final = 0.2
-"""Of a period: cyclictest's longest lateness in a quiet window."""
-QUIET_P99: Final = 0.05
-"""Of a period: cyclictest's p99 in a quiet window."""
-QUIET_STEAL: Final = 0.005
+QUIET_LONGEST_SHARE: Final = 0.2
+"""Longest lateness of cyclictest in a quiet window, as a share of the period."""
+QUIET_P99_SHARE: Final = 0.05
+"""Lateness of cyclictest at p99 in a quiet window, as a share of the period."""
+QUIET_STEAL_SHARE: Final = 0.005
 """Share of the time of one processor that the hypervisor may take in a quiet window."""
-QUIET_SHARE: Final = 0.5
-"""Of the windows, for the host to be called quiet enough."""
-RATIO_CYCLES: Final = 10_000
-MISS_CYCLES: Final = 100_000
-STEADY_TICKS: Final = 10_000
-CPU_TICKS: Final = 1_000
-RESAMPLES: Final = 400
+QUIET_WINDOW_SHARE: Final = 0.5
+"""Share of quiet windows from which on the host counts as quiet."""
+MIN_RATIO_CYCLES: Final = 10_000
+MIN_MISS_CYCLES: Final = 100_000
+MIN_STEADY_TICKS: Final = 10_000
+MIN_CPU_TICKS: Final = 1_000
+RESAMPLE_COUNT: Final = 400
 EDGES_NS: Final = np.array([0, *(edge_ns(i) for i in range(BINS))], float)
 
 
-def quiet(window: Window) -> bool:
-    """Whether cyclictest and the steal counter say that the host left us alone."""
+def quiet(window: MeasurementWindow) -> bool:
+    """Whether cyclictest and the steal counter show a quiet host."""
     period_ns = window.end.period_ns
     return (
-        window.cyclictest.longest_ns <= QUIET_LONGEST * period_ns
-        and window.cyclictest.quantile_ns(0.99) <= QUIET_P99 * period_ns
-        and window.host.steal_ms <= QUIET_STEAL * 1e3 * window.host.seconds
+        window.cyclictest.longest_ns <= QUIET_LONGEST_SHARE * period_ns
+        and window.cyclictest.quantile_ns(0.99) <= QUIET_P99_SHARE * period_ns
+        and window.host.steal_ms <= QUIET_STEAL_SHARE * 1e3 * window.host.seconds
     )
 
 
-def chosen(windows: Sequence[Window]) -> tuple[list[Window], bool]:
-    """The quiet windows and True; all of them and False where too few are quiet."""
+def compared_windows(windows: Sequence[MeasurementWindow]) -> tuple[list[MeasurementWindow], bool]:
+    """The quiet windows and True; all windows and False if too few are quiet."""
     good = [w for w in windows if quiet(w)]
-    enough = len(good) >= QUIET_SHARE * len(windows)
+    enough = len(good) >= QUIET_WINDOW_SHARE * len(windows)
     return (good, True) if enough and good else (list(windows), False)
 
 
 def quantile_us(bins: np.ndarray, share: float, longest_ns: float) -> float:
-    """A quantile by linear interpolation inside its bin [us]; NaN when empty."""
+    """A quantile [us], interpolated linearly inside its bin; NaN without entries."""
     total = bins.sum()
     if not total:
         return math.nan
@@ -65,7 +65,7 @@ def quantile_us(bins: np.ndarray, share: float, longest_ns: float) -> float:
 
 
 def spread_us(name: str, histogram: Durations) -> dict[str, float]:
-    """``NAME_p50_us``, p99, p99.9 and the longest."""
+    """Metrics ``NAME_p50_us``, p99, p99.9 and the longest [us]."""
     bins, longest = np.array(histogram.bins), histogram.longest_ns
     shares = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
     found = {f"{name}_{k}_us": quantile_us(bins, share, longest) for k, share in shares.items()}
@@ -73,7 +73,7 @@ def spread_us(name: str, histogram: Durations) -> dict[str, float]:
 
 
 def ratio(name: str, ours: Sequence[Durations], theirs: Sequence[Durations], share: float) -> dict[str, float]:
-    """Ratio of a quantile over all windows, with a 95 % bootstrap interval over the windows."""
+    """Ratio of a quantile over all windows as metric ``name``, with a 95 % bootstrap interval over the windows."""
     a, b = (np.array([h.bins for h in side], float) for side in (ours, theirs))
     tops = [max((h.longest_ns for h in side), default=0) for side in (ours, theirs)]
 
@@ -86,13 +86,13 @@ def ratio(name: str, ours: Sequence[Durations], theirs: Sequence[Durations], sha
         return {name: math.nan}
     every = np.arange(n)
     rng = np.random.default_rng(1)
-    drawn = [of(rng.integers(0, n, n)) for _ in range(RESAMPLES)] if n > 1 else [of(every)]
+    drawn = [of(rng.integers(0, n, n)) for _ in range(RESAMPLE_COUNT)] if n > 1 else [of(every)]
     low, high = np.quantile(drawn, (0.025, 0.975))
     return {name: of(every), f"{name}_low": float(low), f"{name}_high": float(high), f"{name}_n": float(n)}
 
 
-def per_tick(windows: Sequence[Window]) -> dict[str, float]:
-    """What the process did in all windows: totals, or per tick where the name says so."""
+def process_metrics(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
+    """Counters of the process over all windows: totals, or per tick where the name says so."""
     ticks = max(1, sum(w.ticks for w in windows))
     first, last = windows[0].begin.process, windows[-1].end.process
     span = max(1, windows[-1].end.ticks - windows[0].begin.ticks)
@@ -114,17 +114,18 @@ def per_tick(windows: Sequence[Window]) -> dict[str, float]:
     }
 
 
-def block_growth(windows: Sequence[Window]) -> int:
-    """Blocks that the interpreter holds at the end beyond those at the beginning; what breathes from reading to
-    reading is taken out by comparing the least of each half.
+def block_growth(windows: Sequence[MeasurementWindow]) -> int:
+    """Growth of the interpreter's memory blocks: minimum of the second half of the readings less that of the first.
+
+    The minima remove blocks that come and go between readings.
     """
     readings = [w.begin.process.allocated_blocks for w in windows] + [windows[-1].end.process.allocated_blocks]
     half = max(1, len(readings) // 2)
     return min(readings[half:]) - min(readings[:half])
 
 
-def of_host(windows: Sequence[Window], enough: bool) -> dict[str, float]:
-    """Verdict on the host, and what it did."""
+def host_metrics(windows: Sequence[MeasurementWindow], enough: bool) -> dict[str, float]:
+    """Metrics of the host."""
     seconds = sum(w.host.seconds for w in windows)
     pressures = [w.host.pressure for w in windows if w.host.pressure is not None]
     return {
@@ -139,73 +140,73 @@ def of_host(windows: Sequence[Window], enough: bool) -> dict[str, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """Names of the figures that are missed, and of those that stay open, each with the reason."""
+class Evaluation:
+    """Names of the missed metrics, and the inconclusive ones with their reason."""
 
     missed: tuple[str, ...]
     inconclusive: dict[str, str]
 
 
-def judge(figures: Iterable[Figure], metrics: Mapping[str, float], enough: Mapping[str, str]) -> Verdict:
-    """Every figure with a limit; ``enough`` names those that this run cannot tell, with the reason.
+def evaluate(definitions: Iterable[Metric], metrics: Mapping[str, float], undecidable: Mapping[str, str]) -> Evaluation:
+    """Compare every metric that has a limit with it.
 
-    A figure that this run cannot tell is inconclusive, even when its number lies within the limit; one that has no
-    number is inconclusive too.
+    ``undecidable``: metrics that this run cannot decide, with the reason.  They are inconclusive even if their value
+    meets the limit.  A metric without a value is inconclusive, too.
     """
-    missed, open_ = [], {}
-    for figure in figures:
-        if figure.least is None and figure.most is None:
+    missed, inconclusive = [], {}
+    for metric in definitions:
+        if metric.least is None and metric.most is None:
             continue
-        value = metrics.get(figure.name, math.nan)
-        if figure.name in enough:
-            open_[figure.name] = enough[figure.name]
+        value = metrics.get(metric.name, math.nan)
+        if metric.name in undecidable:
+            inconclusive[metric.name] = undecidable[metric.name]
         elif math.isnan(value):
-            open_[figure.name] = "it could not be measured here"
-        elif not figure.holds(value):
-            missed.append(figure.name)
-    return Verdict(tuple(missed), open_)
+            inconclusive[metric.name] = "it could not be measured here"
+        elif not metric.holds(value):
+            missed.append(metric.name)
+    return Evaluation(tuple(missed), inconclusive)
 
 
-def untold(metrics: Mapping[str, float]) -> dict[str, str]:
-    """The figures that a run with these metrics cannot tell, with the reason."""
+def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
+    """The metrics that a run with these values cannot decide, with the reason."""
     found: dict[str, str] = {}
-    noisy = "cyclictest itself was late: the host is too noisy to tell"
+    noisy = "cyclictest itself was late: the host is too noisy"
     ticks = metrics["ticks"]
     for name in ("wakeup_p50_ratio", "wakeup_p99_ratio"):
         if not metrics["host_verdict"]:
             found[name] = noisy
-        elif metrics["judged_cycles"] < RATIO_CYCLES:
-            found[name] = f"{metrics['judged_cycles']:.0f} cycles are too few; it takes {RATIO_CYCLES}"
+        elif metrics["judged_cycles"] < MIN_RATIO_CYCLES:
+            found[name] = f"{metrics['judged_cycles']:.0f} cycles are too few; at least {MIN_RATIO_CYCLES} are needed"
     if not metrics["host_verdict"] and metrics["missed"]:
         found["missed"] = noisy
-    elif metrics["judged_cycles"] < MISS_CYCLES and not metrics["missed"]:
-        found["missed"] = f"{metrics['judged_cycles']:.0f} cycles are too few; it takes {MISS_CYCLES}"
+    elif metrics["judged_cycles"] < MIN_MISS_CYCLES and not metrics["missed"]:
+        found["missed"] = f"{metrics['judged_cycles']:.0f} cycles are too few; at least {MIN_MISS_CYCLES} are needed"
     for name in ("page_faults", "gc_runs", "allocated_blocks_growth"):
-        if ticks < STEADY_TICKS and metrics[name] <= 0.0:
-            found[name] = f"{ticks:.0f} ticks are too few; it takes {STEADY_TICKS}"
+        if ticks < MIN_STEADY_TICKS and metrics[name] <= 0.0:
+            found[name] = f"{ticks:.0f} ticks are too few; at least {MIN_STEADY_TICKS} are needed"
     for name, count in (("tick_cpu_p99_us", ticks), ("tick1k_cpu_p99_us", metrics.get("ticks_1k", 0.0))):
-        if count < CPU_TICKS:
-            found[name] = f"{count:.0f} ticks are too few; it takes {CPU_TICKS}"
+        if count < MIN_CPU_TICKS:
+            found[name] = f"{count:.0f} ticks are too few; at least {MIN_CPU_TICKS} are needed"
     if not metrics["host_verdict"] and metrics.get("sample_to_command_p99_us", 0.0) > metrics["period_us"]:
         found["sample_to_command_p99_us"] = noisy
     for end in ("", "_1k"):
-        if reason := _loaded_open(metrics, end):
+        if reason := _loaded_undecidable(metrics, end):
             found[f"missed_loaded{end}_share"] = reason
     return found
 
 
-def _loaded_open(metrics: Mapping[str, float], end: str) -> str:
-    """Why the comparison under load tells nothing, if so."""
+def _loaded_undecidable(metrics: Mapping[str, float], end: str) -> str:
+    """Why the comparison under load is inconclusive; empty if it is not."""
     ours, plain = metrics.get(f"missed_loaded{end}", 0.0), metrics.get(f"missed_loaded_plain{end}", 0.0)
     if ours and metrics.get(f"missed_loaded_cyclictest{end}", 0.0) >= ours:
-        return "cyclictest missed as many: the host took the processor away"
+        return "cyclictest missed as many deadlines: the host withheld the processor"
     if plain < 100.0 and ours * 100.0 <= plain:
-        return f"the plain loop missed only {plain:.0f}, too few to tell a hundredth"
+        return f"the sleep loop missed only {plain:.0f} deadlines, too few to decide a limit of one percent"
     return ""
 
 
-def wakeups(kind: str, windows: Sequence[Window]) -> dict[str, float]:
-    """Lateness of ours, cyclictest's and the plain loop's wake-ups, as metrics that begin with ``kind``."""
+def wakeups(kind: str, windows: Sequence[MeasurementWindow]) -> dict[str, float]:
+    """Lateness of the wake-ups of controller, cyclictest and sleep loop, as metrics whose names begin with ``kind``."""
     found: dict[str, float] = {}
     ours, theirs, plain = loops(windows)
     for name, histogram in (("wakeup", ours), ("cyclictest", theirs), ("plain", plain)):
@@ -213,10 +214,10 @@ def wakeups(kind: str, windows: Sequence[Window]) -> dict[str, float]:
     return found
 
 
-def loops(windows: Sequence[Window]) -> tuple[Durations, Durations, Durations]:
-    """Ours, cyclictest's and the plain loop's histograms over all windows."""
+def loops(windows: Sequence[MeasurementWindow]) -> tuple[Durations, Durations, Durations]:
+    """Histograms of controller, cyclictest and sleep loop over all windows."""
     return (
         pooled([w.durations["wake"] for w in windows]),
         pooled([w.cyclictest for w in windows]),
-        pooled([w.plain.lateness for w in windows]),
+        pooled([w.sleep_loop.lateness for w in windows]),
     )

@@ -1,7 +1,7 @@
-"""What the host did meanwhile: time that the hypervisor took, pressure, load; and what kind of host it is.
+"""Activity of the host during a measurement (steal, pressure, load), and its description.
 
-Sources: proc(5) for stat and loadavg, the kernel's accounting/psi.rst for pressure.  What a host does not tell is None
-or "unknown", never 0.
+Sources: proc(5) for stat and loadavg, the kernel's accounting/psi.rst for pressure.  What a host does not report is
+None or "unknown", never 0.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Final
 
 _STEAL: Final = 7
-"""Place of steal in a line of /proc/stat: user nice system idle iowait irq softirq steal."""
+"""Index of steal in a line of /proc/stat: user nice system idle iowait irq softirq steal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Totals since boot: steal and busy time of all processors, time that somebody waited for one [us]."""
+    """Totals since boot: steal of all processors, time in which a process waited for one [us]; load average."""
 
     at_ns: int
     steal_ms: float
@@ -28,7 +28,7 @@ class Sample:
 
 
 def sample() -> Sample:
-    """Now."""
+    """The totals now."""
     words = _read("/proc/stat").split("\n", 1)[0].split()[1:]
     tick_ms = 1e3 / os.sysconf("SC_CLK_TCK")
     steal = float(words[_STEAL]) * tick_ms if len(words) > _STEAL else 0.0
@@ -46,8 +46,9 @@ def pressure_us(text: str) -> int | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Meanwhile:
-    """Between two samples: seconds, steal over all processors [ms], share of time somebody waited, load at the end."""
+class HostActivity:
+    """Between two samples: seconds, steal of all processors [ms], share of time with a waiting process, load at the
+    end."""
 
     seconds: float
     steal_ms: float
@@ -55,21 +56,21 @@ class Meanwhile:
     load: float
 
 
-def between(first: Sample, last: Sample) -> Meanwhile:
-    """What happened between two samples."""
+def between(first: Sample, last: Sample) -> HostActivity:
+    """Activity between two samples."""
     seconds = (last.at_ns - first.at_ns) * 1e-9
     waited = None
     if first.pressure_us is not None and last.pressure_us is not None:
         waited = (last.pressure_us - first.pressure_us) * 1e-6 / seconds
-    return Meanwhile(seconds, last.steal_ms - first.steal_ms, waited, last.load)
+    return HostActivity(seconds, last.steal_ms - first.steal_ms, waited, last.load)
 
 
 def describe() -> dict[str, str]:
-    """Kernel, preemption model, frequency governor, isolated processors, hypervisor, for the report's head."""
+    """Kernel, preemption model, frequency governor, isolated processors and hypervisor."""
     return {
         "kernel": platform.release(),
         "preemption": preemption(platform.version(), _read("/sys/kernel/debug/sched/preempt")),
-        "governor": _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").strip() or "none told",
+        "governor": _read("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").strip() or "none reported",
         "isolated": _read("/sys/devices/system/cpu/isolated").strip() or "none",
         "clock": _read("/sys/devices/system/clocksource/clocksource0/current_clocksource").strip() or "unknown",
         "hypervisor": "yes" if " hypervisor" in _read("/proc/cpuinfo") else "no",

@@ -1,4 +1,5 @@
-"""Windows of a measurement: our histograms, those of the reference loops, the host, all over the same seconds."""
+"""Measurement windows: histograms of controller, cyclictest and sleep loop and the host's activity, all over the same
+seconds."""
 
 from __future__ import annotations
 
@@ -14,29 +15,29 @@ import numpy as np
 from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import Facts, Timing
 from experiments.timing import host_activity, reference_loops
-from experiments.timing.reference_loops import Plain
-from experiments.timing.testbed import Stand
+from experiments.timing.reference_loops import SleepLoopReport
+from experiments.timing.testbed import TimingTestbed
 from host.exit_codes import CommandFailed, ExitCode
 
 GRACE_S: Final = 60.0
-"""On a host under heavy load the helpers, of normal priority, take their time to end."""
+"""Helpers of normal priority end late on a host under heavy load."""
 LOAD_SETTLES_S: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
-    """``begin`` and ``end`` are the controller's facts (totals); the histograms hold what came between."""
+class MeasurementWindow:
+    """One window: the controller's totals at ``begin`` and ``end``, and the histograms of the time between."""
 
     begin: Facts
     end: Facts
     durations: dict[str, Durations]
     cyclictest: Durations
-    plain: Plain
-    host: host_activity.Meanwhile
+    sleep_loop: SleepLoopReport
+    host: host_activity.HostActivity
 
     @property
     def ticks(self) -> int:
-        """Ticks that ran."""
+        """Ticks executed."""
         return self.end.ticks - self.begin.ticks
 
     @property
@@ -45,38 +46,38 @@ class Window:
         return self.end.missed - self.begin.missed
 
 
-def measure(stand: Stand, seconds: float, directory: Path) -> Window:
-    """One window of so many seconds and one or two more.
+def measure(testbed: TimingTestbed, seconds: float, directory: Path) -> MeasurementWindow:
+    """Measure one window of this length, plus one or two seconds.
 
-    cyclictest begins before and ends after it, so that no stall of the host within it stays unseen.
+    cyclictest starts before the window and ends after it, so that it sees every stall of the host within.
     """
     report = directory / "cyclictest.json"
     report.unlink(missing_ok=True)
-    period_ns = stand.setting.period_ns
-    reference_loops.start_cyclictest(stand.helpers, stand.cpu, period_ns, stand.stamp_ns, report)
-    stand.wait(reference_loops.START_S)
-    first, begin = host_activity.sample(), stand.fresh_timing()
-    reference_loops.start_plain(stand.helpers, period_ns, seconds, stand.cpu)
-    said = stand.await_end("plain", seconds + GRACE_S)
-    end, last = stand.fresh_timing(), host_activity.sample()
-    stand.end_helper("cyclictest")
-    return Window(
+    period_ns = testbed.setting.period_ns
+    reference_loops.start_cyclictest(testbed.helpers, testbed.cpu, period_ns, testbed.stamp_ns, report)
+    testbed.wait(reference_loops.START_S)
+    first, begin = host_activity.sample(), testbed.fresh_timing()
+    reference_loops.start_sleep_loop(testbed.helpers, period_ns, seconds, testbed.cpu)
+    output = testbed.await_end("sleep-loop", seconds + GRACE_S)
+    end, last = testbed.fresh_timing(), host_activity.sample()
+    testbed.end_helper("cyclictest")
+    return MeasurementWindow(
         begin=begin.facts,
         end=end.facts,
         durations=between(begin, end),
         cyclictest=reference_loops.read_cyclictest(report.read_text()),
-        plain=reference_loops.read_plain(said),
+        sleep_loop=reference_loops.read_sleep_loop(output),
         host=host_activity.between(first, last),
     )
 
 
 def between(begin: Timing, end: Timing) -> dict[str, Durations]:
-    """The histograms of what came after ``begin``."""
+    """Histograms of the time between two readings of the timing page."""
     return {name: end.durations[name] - begin.durations[name] for name in end.durations}
 
 
 def pooled(histograms: Sequence[Durations]) -> Durations:
-    """All of them as one."""
+    """The sum of histograms."""
     if not histograms:
         return Durations()
     bins = np.sum([np.frombuffer(h.bins, np.uint64) for h in histograms], axis=0, dtype=np.uint64)
@@ -84,38 +85,40 @@ def pooled(histograms: Sequence[Durations]) -> Durations:
 
 
 @contextlib.contextmanager
-def load(stand: Stand, seconds: float) -> Iterator[None]:
-    """Every core busy for the block, which may last so many seconds."""
-    child = reference_loops.start_load(stand.helpers, seconds)
-    stand.wait(LOAD_SETTLES_S)
+def load(testbed: TimingTestbed, seconds: float) -> Iterator[None]:
+    """Keep every core busy for the block, which may last up to ``seconds``."""
+    child = reference_loops.start_load(testbed.helpers, seconds)
+    testbed.wait(LOAD_SETTLES_S)
     try:
         yield
         if child.process.poll() is not None:
-            raise Stopped(Exit.CONFIGURATION, f"stress-ng ended before its time: {child.complaint()}")
+            raise CommandFailed(
+                "timing.load-ended", f"stress-ng ended before its time: {child.complaint()}", ExitCode.CONFIGURATION
+            )
     finally:
-        stand.helpers.stop("load")
+        testbed.helpers.stop("load")
 
 
-def system_calls(stand: Stand, seconds: float, directory: Path) -> tuple[dict[str, int], float] | None:
-    """System calls of the controller by name, and the ticks in which they were made; None where it cannot be traced.
+def system_calls(testbed: TimingTestbed, seconds: float, directory: Path) -> tuple[dict[str, int], float] | None:
+    """System calls of the controller by name, and the number of ticks; None if it cannot be traced.
 
-    Tracing slows the loop down; how often it calls the system stays the same.
+    Tracing slows the loop down but does not change how many system calls a tick makes.
     """
     table = directory / "strace.txt"
     table.unlink(missing_ok=True)
-    pid = stand.family.children["controller"].process.pid
-    child = stand.helpers.launch("strace", "strace", "-c", "-f", "-p", pid, "-o", table)
+    pid = testbed.family.children["controller"].process.pid
+    child = testbed.helpers.launch("strace", "strace", "-c", "-f", "-p", pid, "-o", table)
     limit = time.monotonic() + GRACE_S
     while "attached" not in child.errors.read_text():
         if child.process.poll() is not None or time.monotonic() > limit:
-            stand.helpers.stop("strace")
+            testbed.helpers.stop("strace")
             return None
         time.sleep(0.005)
-    begin, begin_s = stand.timing().facts, time.monotonic()
-    stand.wait(seconds)
+    begin, begin_s = testbed.timing().facts, time.monotonic()
+    testbed.wait(seconds)
     passed_s = time.monotonic() - begin_s
-    stand.helpers.stop("strace")
-    missed = stand.fresh_timing().facts.missed - begin.missed
+    testbed.helpers.stop("strace")
+    missed = testbed.fresh_timing().facts.missed - begin.missed
     calls = reference_loops.count_calls(table.read_text()) if table.exists() else {}
-    ticks = passed_s * stand.setting.rate_hz - missed
+    ticks = passed_s * testbed.setting.rate_hz - missed
     return (calls, ticks) if calls and ticks > 0 else None

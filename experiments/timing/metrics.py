@@ -1,122 +1,139 @@
-"""What the timing experiment reports: figures, limits, how each is measured, and the sections of docs/timing.md."""
+"""Metrics of the timing experiment with their limits, and the page that shows them."""
 
 from __future__ import annotations
 
 from typing import Final
 
-from experiments.common.result import Figure
+from experiments.common.result import Metric
 from experiments.common.result_page import Section
 
-SHARE_OF_PLAIN: Final = 0.01
-"""Missed deadlines under load, at most this share of the plain loop's."""
+MAX_MISSED_SHARE: Final = 0.01
+"""Limit for our missed deadlines under load, as a share of the sleep loop's."""
 
+CONCLUSION: Final = (
+    "A tick of the controller takes {tick_cpu_p50_us} of CPU time in the median and {tick_cpu_p99_us} at the 99th "
+    "percentile; the controller uses {cpu_share} of one processor at 200 Hz.",
+    "Its wake-ups are late by {wakeup_p50_us} in the median, those of cyclictest by {cyclictest_p50_us}.",
+    "With every core loaded it missed {missed_loaded} deadlines, cyclictest {missed_loaded_cyclictest} and the sleep "
+    "loop {missed_loaded_plain}.",
+)
+INTRODUCTION: Final = (
+    "The measured controller is the process that runs on the machine: `python -m controller` with SCHED_FIFO and "
+    "locked memory, beside the real guard, on the wire bus. Every CAN node of the machine is emulated, on joints that "
+    "follow their valves, so that the processors are free for what is measured."
+)
 
-OURS: Final = Section(
-    "What is ours",
-    "Own processor time, faults, garbage, system calls: the host's noise reaches these little or not at all, so they "
-    "are judged on any host. The whole forwarder is on both buses and moves, with every law at work; reports and a "
+OWN: Final = Section(
+    "Cost of the controller",
+    "CPU time, page faults, garbage collection and system calls hardly depend on the host's noise, so their limits "
+    "hold on any host. The whole forwarder is on both buses and moves with every control law active; reports and a "
     "record of every tick leave the process as on the machine.",
     (
-        Figure("tick_cpu_p50_us", "Processor time of a tick, median", "us",
+        Metric("tick_cpu_p50_us", "CPU time of a tick, median", "us",
                "The thread's own clock (CLOCK_THREAD_CPUTIME_ID) around the tick, 200 Hz, quiet windows."),
-        Figure("tick_cpu_p99_us", "The same, p99", "us", "10 % of the period is the limit.", most=500.0),
-        Figure("tick_cpu_max_us", "The same, longest", "us", "Of all ticks."),
-        Figure("tick1k_cpu_p99_us", "Processor time of a tick at 1 kHz, fixed crane, p99", "us",
-               "50 % of the period is the limit. The wire runs at 4 Mbit/s: ten frames of 8 bytes in a millisecond do "
-               "not fit on a CAN bus of 1 Mbit/s.", most=500.0),
-        Figure("cpu_share", "Share of a processor that the controller uses at 200 Hz", "%",
-               "getrusage over all quiet windows.", scale=100.0),
-        Figure("frames_per_s", "Frames received and sent, both buses", "1/s", "The controller's own counters."),
-        Figure("frames_lost", "Frames refused by a bus or lost before they were read", "", "The same.", most=0.0),
-        Figure("page_faults", "Page faults", "", "Minor and major, in all quiet windows together.", most=0.0),
-        Figure("gc_runs", "Runs of the garbage collector", "", "The same.", most=0.0),
-        Figure("allocated_blocks_growth", "Memory blocks that stay", "",
-               "Blocks that the interpreter holds: least of the second half of the windows less least of the first.",
+        Metric("tick_cpu_p99_us", "CPU time of a tick, p99", "us", "The limit is 10 % of the period.", most=500.0),
+        Metric("tick_cpu_max_us", "CPU time of a tick, longest", "us", "All ticks."),
+        Metric("tick1k_cpu_p99_us", "CPU time of a tick at 1 kHz, fixed crane, p99", "us",
+               "The limit is 50 % of the period. The wire bus runs at 4 Mbit/s: ten frames of 8 bytes per millisecond "
+               "do not fit on a CAN bus of 1 Mbit/s.", most=500.0),
+        Metric("cpu_share", "CPU load of the controller at 200 Hz", "%", "getrusage over all quiet windows.",
+               scale=100.0),
+        Metric("frames_per_s", "Frames received and sent, both buses", "1/s", "The controller's own counters."),
+        Metric("frames_lost", "Frames refused by a bus or lost before they were read", "",
+               "The controller's own counters.", most=0.0),
+        Metric("page_faults", "Page faults", "", "Minor and major, all quiet windows.", most=0.0),
+        Metric("gc_runs", "Runs of the garbage collector", "", "All quiet windows.", most=0.0),
+        Metric("allocated_blocks_growth", "Growth of allocated memory blocks", "",
+               "Blocks of the interpreter: minimum of the second half of the windows less minimum of the first half.",
                most=0.0),
-        Figure("resident_growth_kb", "Growth of the resident memory", "kB", "From the first to the last reading.",
+        Metric("resident_growth_kb", "Growth of resident memory", "kB", "From the first to the last reading.",
                most=0.0),
-        Figure("syscalls_per_tick", "System calls per tick", "",
+        Metric("syscalls_per_tick", "System calls per tick", "",
                "Counted by strace for a few seconds after the measurement.", most=60.0),
-        Figure("voluntary_switches_per_tick", "Times a tick that it waits", "",
-               "Context switches that the process asked for: one for SYNC, one for the tick.", most=2.05),
-        Figure("involuntary_switches_per_tick", "Times a tick that it is pushed off the processor", "",
-               "By a process of higher priority or by the kernel."),
+        Metric("voluntary_switches_per_tick", "Voluntary context switches per tick", "",
+               "One wait for SYNC and one for the tick.", most=2.05),
+        Metric("involuntary_switches_per_tick", "Involuntary context switches per tick", "",
+               "Caused by a process of higher priority or by the kernel."),
     ),
-    (("stages.png", "Where the time of a tick goes: median, p99 and longest of every stage (log scale)."),),
+    (("stages.png", "Duration of the stages of a tick: median, p99 and longest (log scale)."),),
 )  # fmt: skip
-PUNCTUAL: Final = Section(
-    "Beside cyclictest",
-    "Lateness of a wake-up is the host's more than ours. So cyclictest (rt-tests, in C, nothing to do) wakes at "
-    "our priority on our core in the same seconds, 0.8 of a period after our tick, and a plain `time.sleep` loop of "
-    "normal priority beside it. Only windows in which cyclictest says that the host was quiet are compared: its "
-    "longest lateness within a fifth of the period, its p99 within a twentieth, steal within 0.5 %. A host with fewer "
-    "than half its windows quiet cannot tell, and the verdict is *inconclusive*, whatever the numbers are.",
+WAKEUPS: Final = Section(
+    "Wake-ups compared with cyclictest",
+    "The lateness of a wake-up depends more on the host than on the controller. Therefore cyclictest (rt-tests, in C, "
+    "without work) wakes at the controller's priority on its core during the same seconds, 0.8 of a period after the "
+    "tick, and a `time.sleep` loop of normal priority runs beside it. Only windows in which cyclictest shows a quiet "
+    "host are compared: its longest lateness is at most a fifth of the period, its p99 at most a twentieth, and steal "
+    "at most 0.5 %. If fewer than half of the windows are quiet, the host is too noisy, and these metrics are "
+    "*inconclusive* whatever their values.",
     (
-        Figure("host_verdict", "Host quiet enough to tell (1 yes, 0 no)", "", "The rule above."),
-        Figure("quiet_windows", "Quiet windows", "", "By the rule above."),
-        Figure("windows", "of", "", "Windows in all."),
-        Figure("wakeup_p50_us", "Our lateness, median", "us", "From the deadline to the first reading of the clock."),
-        Figure("cyclictest_p50_us", "cyclictest's", "us", "Its own histogram."),
-        Figure("wakeup_p50_ratio", "Ratio of the medians", "x",
+        Metric("host_verdict", "Host quiet enough (1 yes, 0 no)", "", "The rule above."),
+        Metric("quiet_windows", "Quiet windows", "", "The rule above."),
+        Metric("windows", "All windows", "", "Quiet and noisy ones."),
+        Metric("wakeup_p50_us", "Controller: lateness, median", "us",
+               "From the deadline to the first reading of the clock."),
+        Metric("cyclictest_p50_us", "cyclictest: lateness, median", "us", "Its own histogram."),
+        Metric("wakeup_p50_ratio", "Ratio of the medians", "x",
                "Interpolated inside the bins of 1 us; interval by bootstrap over the windows.", most=1.5),
-        Figure("wakeup_p99_us", "Our lateness, p99", "us", "As above."),
-        Figure("cyclictest_p99_us", "cyclictest's", "us", "As above."),
-        Figure("wakeup_p99_ratio", "Ratio of the p99", "x", "As above.", most=2.0),
-        Figure("wakeup_p999_us", "Our lateness, p99.9", "us", "As above."),
-        Figure("cyclictest_p999_us", "cyclictest's", "us", "As above."),
-        Figure("wakeup_max_us", "Our longest lateness", "us", "As above."),
-        Figure("cyclictest_max_us", "cyclictest's", "us", "As above."),
-        Figure("plain_p50_us", "The plain loop's lateness, median", "us", "As above."),
-        Figure("plain_p99_us", "The plain loop's, p99", "us", "As above."),
-        Figure("judged_cycles", "Cycles judged", "", "Our ticks in the windows that are compared."),
-        Figure("missed", "Deadlines missed in them", "",
-               "Whole periods skipped; zero is asked for in 100,000 cycles.", most=0.0),
-        Figure("steal_ms", "Time the hypervisor took", "ms", "/proc/stat, all processors, all windows."),
-        Figure("pressure", "Share of time somebody waited for a processor", "%", "/proc/pressure/cpu.", scale=100.0),
+        Metric("wakeup_p99_us", "Controller: lateness, p99", "us", "As for the median."),
+        Metric("cyclictest_p99_us", "cyclictest: lateness, p99", "us", "As for the median."),
+        Metric("wakeup_p99_ratio", "Ratio of the p99", "x", "As for the medians.", most=2.0),
+        Metric("wakeup_p999_us", "Controller: lateness, p99.9", "us", "As for the median."),
+        Metric("cyclictest_p999_us", "cyclictest: lateness, p99.9", "us", "As for the median."),
+        Metric("wakeup_max_us", "Controller: lateness, longest", "us", "As for the median."),
+        Metric("cyclictest_max_us", "cyclictest: lateness, longest", "us", "As for the median."),
+        Metric("plain_p50_us", "Sleep loop: lateness, median", "us", "Its own histogram."),
+        Metric("plain_p99_us", "Sleep loop: lateness, p99", "us", "Its own histogram."),
+        Metric("judged_cycles", "Cycles compared", "", "Ticks of the controller in the windows that are compared."),
+        Metric("missed", "Deadlines missed in these cycles", "",
+               "Whole periods skipped; the limit is zero in 100,000 cycles.", most=0.0),
+        Metric("steal_ms", "Time taken by the hypervisor", "ms", "/proc/stat, all processors, all windows."),
+        Metric("pressure", "Share of time in which a process waited for a processor", "%", "/proc/pressure/cpu.",
+               scale=100.0),
     ),
-    (("wakeups.png", "Lateness of wake-ups, quiet and with both cores loaded; the limit of a period is dashed."),),
+    (("wakeups.png", "Lateness of wake-ups on a quiet host and with every core loaded; dashed: one period."),),
 )  # fmt: skip
 LOADED: Final = Section(
-    "With every core loaded",
-    "stress-ng keeps every core and the memory busy. The plain loop runs in the same seconds on the same core and in "
-    "the same session, as a script does that is started from the terminal of the load.",
+    "Wake-ups with every core loaded",
+    "stress-ng keeps every core and the memory busy. The sleep loop runs during the same seconds on the same core and "
+    "in the same session, like a script started from the terminal of the load.",
     (
-        Figure("wakeup_loaded_p50_us", "Our lateness, median", "us", "200 Hz."),
-        Figure("wakeup_loaded_p99_us", "Our lateness, p99", "us", "200 Hz."),
-        Figure("cyclictest_loaded_p99_us", "cyclictest's, p99", "us", "200 Hz."),
-        Figure("plain_loaded_p99_us", "The plain loop's, p99", "us", "200 Hz."),
-        Figure("missed_loaded", "Deadlines that we missed", "", "200 Hz."),
-        Figure("missed_loaded_cyclictest", "that cyclictest missed", "", "Periods that its wake-ups were late by."),
-        Figure("missed_loaded_plain", "that the plain loop missed", "", "Periods skipped."),
-        Figure("missed_loaded_share", "Ours as a share of the plain loop's", "%", "200 Hz.", most=SHARE_OF_PLAIN,
-               scale=100.0),
-        Figure("wakeup1k_p99_us", "At 1 kHz, quiet: our lateness, p99", "us", "Fixed crane."),
-        Figure("cyclictest1k_p99_us", "cyclictest's, p99", "us", "Fixed crane."),
-        Figure("missed_1k", "Deadlines that we missed", "", "Fixed crane."),
-        Figure("missed_loaded_1k", "At 1 kHz, loaded: deadlines that we missed", "", "Fixed crane."),
-        Figure("missed_loaded_cyclictest_1k", "that cyclictest missed", "", "Fixed crane."),
-        Figure("missed_loaded_plain_1k", "that the plain loop missed", "", "Fixed crane."),
-        Figure("stops", "Stops of the machine in the whole measurement", "",
-               "The controller's own supervisor may stop a machine whose loop is late."),
+        Metric("wakeup_loaded_p50_us", "Controller: lateness, median", "us", "200 Hz."),
+        Metric("wakeup_loaded_p99_us", "Controller: lateness, p99", "us", "200 Hz."),
+        Metric("cyclictest_loaded_p99_us", "cyclictest: lateness, p99", "us", "200 Hz."),
+        Metric("plain_loaded_p99_us", "Sleep loop: lateness, p99", "us", "200 Hz."),
+        Metric("missed_loaded", "Deadlines missed by the controller", "", "200 Hz."),
+        Metric("missed_loaded_cyclictest", "Deadlines missed by cyclictest", "",
+               "Periods by which its wake-ups were late."),
+        Metric("missed_loaded_plain", "Deadlines missed by the sleep loop", "", "Periods skipped."),
+        Metric("missed_loaded_share", "Deadlines missed, controller over sleep loop", "%", "200 Hz.",
+               most=MAX_MISSED_SHARE, scale=100.0),
+        Metric("wakeup1k_p99_us", "Controller at 1 kHz, quiet: lateness, p99", "us", "Fixed crane."),
+        Metric("cyclictest1k_p99_us", "cyclictest at 1 kHz, quiet: lateness, p99", "us", "Fixed crane."),
+        Metric("missed_1k", "Deadlines missed by the controller at 1 kHz, quiet", "", "Fixed crane."),
+        Metric("missed_loaded_1k", "Deadlines missed by the controller at 1 kHz, loaded", "", "Fixed crane."),
+        Metric("missed_loaded_cyclictest_1k", "Deadlines missed by cyclictest at 1 kHz, loaded", "", "Fixed crane."),
+        Metric("missed_loaded_plain_1k", "Deadlines missed by the sleep loop at 1 kHz, loaded", "", "Fixed crane."),
+        Metric("stops", "Stops of the machine in the whole measurement", "",
+               "The controller's supervisor stops a machine whose loop is late."),
     ),
 )  # fmt: skip
-FRAMES: Final = Section(
+LATENCY: Final = Section(
     "From sample to command",
-    "The encoders sample on SYNC; the tick that uses the samples sends the valve command. The wire gives every frame "
-    "its time on the bus.",
+    "The encoders sample on SYNC; the tick that uses the samples sends the valve command. The wire bus gives every "
+    "frame its transmission time.",
     (
-        Figure("sample_to_command_p50_us", "From the encoders' sample to the valve command, median", "us",
-               "From the stamp of SYNC on the wire to the command handed to the bus, 200 Hz, quiet windows."),
-        Figure("sample_to_command_p99_us", "The same, p99", "us", "One period is the limit.", most=5000.0,
-               clocked=True),
-        Figure("rx_decode_us", "Receive and decode one frame, raw path", "us", "On this host, per frame.", most=5.0,
-               clocked=True),
-        Figure("rx_decode_pythoncan_us", "The same through python-can", "us", "The same frames."),
+        Metric("sample_to_command_p50_us", "From the encoders' sample to the valve command, median", "us",
+               "From the time stamp of SYNC on the wire bus to the command passed to the bus, 200 Hz, quiet windows."),
+        Metric("sample_to_command_p99_us", "From the encoders' sample to the valve command, p99", "us",
+               "The limit is one period.", most=5000.0, clocked=True),
+        Metric("rx_decode_us", "Receiving and decoding one frame, raw socket", "us", "On this host, per frame.",
+               most=5.0, clocked=True),
+        Metric("rx_decode_pythoncan_us", "Receiving and decoding one frame, python-can", "us", "The same frames."),
     ),
     (
         ("sample-to-command.png", "From the encoders' sample to the valve command."),
         ("ages.png", "Age of every input when a tick used it: newest and longest."),
     ),
 )  # fmt: skip
-SECTIONS: Final = (OURS, PUNCTUAL, LOADED, FRAMES)
-FIGURES: Final = tuple(f for section in SECTIONS for f in section.figures)
+SECTIONS: Final = (OWN, WAKEUPS, LOADED, LATENCY)
+METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)

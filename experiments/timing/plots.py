@@ -1,4 +1,4 @@
-"""The plots of the timing experiment, one function per picture."""
+"""Plots of the timing experiment, one function per plot."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import Any, Final
 import numpy as np
 
 from can_dbc.timing.durations import BINS, Durations
-from can_dbc.timing.page import InputAge
-from experiments.common.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
+from can_dbc.timing.page import STAGES, InputAge
 from experiments.timing.evaluation import EDGES_NS, quantile_us
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 
-WITHIN: Final = ("read", "decode", "estimate", "supervise", "law", "encode", "send", "tell")
-NAMES: Final = (("ours", OIL), ("cyclictest", MOSS), ("plain time.sleep", RUST))
+OUTSIDE: Final = ("wake", "sync", "tick", "cpu", "sample_to_command")
+"""Durations of the timing page that are not a stage of the tick."""
+WITHIN: Final = tuple(name for name in STAGES if name not in OUTSIDE)
+NAMES: Final = (("controller", OIL), ("cyclictest", MOSS), ("time.sleep loop", RUST))
 POINTS: Final = 60
 Loops = tuple[Durations, Durations, Durations]
 
@@ -22,7 +24,7 @@ Loops = tuple[Durations, Durations, Durations]
 def draw(
     quiet: Loops, loaded: Loops, durations: Mapping[str, Durations], inputs: Mapping[str, InputAge], out: Path
 ) -> None:
-    """Every picture into ``out``; all of the stand at 200 Hz."""
+    """Write every plot into ``out``; all show the testbed at 200 Hz."""
     out.mkdir(parents=True, exist_ok=True)
     wakeups(quiet, loaded, out / "wakeups.png")
     stages(durations, out / "stages.png")
@@ -31,7 +33,7 @@ def draw(
 
 
 def exceeded(histogram: Durations) -> tuple[np.ndarray, np.ndarray]:
-    """Lateness [us] and the share of wake-ups that were later, one point per filled bin."""
+    """Lateness [us] and the share of later wake-ups, one point per filled bin."""
     bins = np.array(histogram.bins, float)
     total = bins.sum()
     if not total:
@@ -43,7 +45,7 @@ def exceeded(histogram: Durations) -> tuple[np.ndarray, np.ndarray]:
 
 
 def wakeups(quiet: Loops, loaded: Loops, path: Path) -> None:
-    """Share of wake-ups that are later than x, for the three loops."""
+    """Share of wake-ups later than x, for the three loops."""
     with sheet(path, 2, height=3.4) as axes:
         for axis, loops, title in zip(axes, (quiet, loaded), ("Quiet", "Every core loaded"), strict=True):
             for histogram, (name, colour) in zip(loops, NAMES, strict=True):
@@ -53,13 +55,13 @@ def wakeups(quiet: Loops, loaded: Loops, path: Path) -> None:
             axis.set_xscale("log")
             axis.set_yscale("log")
             axis.set_xlabel("lateness [us]")
-            axis.set_ylabel("share of wake-ups that are later")
+            axis.set_ylabel("share of later wake-ups")
             axis.set_title(title)
         axes[0].legend()
 
 
 def stages(durations: Mapping[str, Durations], path: Path) -> None:
-    """Median, p99 and longest of the stages, of the tick by the clock and by its own processor time."""
+    """Median, p99 and longest of every stage, of the tick by the clock and by CPU time."""
     names = [n for n in (*WITHIN, "tick", "cpu") if n in durations and durations[n].longest_ns]
     with sheet(path, height=0.5 + 0.34 * len(names)) as axis:
         for y, name in enumerate(reversed(names)):
@@ -79,11 +81,11 @@ def stages(durations: Mapping[str, Durations], path: Path) -> None:
 
 
 def _label(name: str) -> str:
-    return {"tell": "report, record", "tick": "whole tick, by the clock", "cpu": "whole tick, own time"}.get(name, name)
+    return {"tick": "whole tick, by the clock", "cpu": "whole tick, CPU time"}.get(name, name)
 
 
 def sample_to_command(histogram: Durations, path: Path) -> None:
-    """Histogram over the whole range that was met."""
+    """Histogram over the whole range of values."""
     bins = np.array(histogram.bins, float)
     filled = np.flatnonzero(bins)
     with sheet(path) as axis:
@@ -101,7 +103,7 @@ def sample_to_command(histogram: Durations, path: Path) -> None:
 
 
 def ages(inputs: Mapping[str, InputAge], path: Path) -> None:
-    """Newest and longest age of every input that was used."""
+    """Newest and longest age of every input used."""
     used: Sequence[tuple[str, Any]] = sorted((n, a) for n, a in inputs.items() if a.count)
     with sheet(path, height=0.6 + 0.2 * max(1, len(used))) as axis:
         for y, (_, age) in enumerate(reversed(used)):

@@ -1,10 +1,10 @@
-"""What receiving a frame costs, along every path, in one run and in turns.
+"""Benchmark: cost of receiving a frame along every path, measured alternately in one run.
 
-Every path gets a drain's worth of crane0 traffic outside the clock, then takes it in and decodes it as the controller
-does (E2E check, `MessageCodec.receive`), on the clock of the process's own CPU time.  Where the kernel has CAN the
-frames go over an interface.  Where it has none, an AF_UNIX datagram pair carries the same struct can_frame with the
+Every path gets the crane0 traffic of one tick outside the clock, then receives and decodes it as the controller
+does (E2E check, `MessageCodec.receive`), on the clock of the process's own CPU time.  If the kernel has CAN, the
+frames travel over an interface.  If it has none, an AF_UNIX datagram pair carries the same struct can_frame with the
 same time stamps, and the code on top is the same: ours (`can_dbc.bus.frame_socket`) as python-can's (its `SocketcanBus`
-with that socket in place of its own).  Figures are medians over rounds, in microseconds per frame.
+with that socket in place of its own).  Results are medians over rounds, in microseconds per frame.
 """
 
 from __future__ import annotations
@@ -26,41 +26,40 @@ from typing import Any, Final
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from can_dbc.bus.base import DRAIN_LIMIT, BusStats, kernel_has_can, open_bus
+from can_dbc.bus.base import DRAIN_LIMIT, BusStats
+from can_dbc.bus.factory import kernel_has_can, open_bus
 from can_dbc.bus.frame_socket import CAN_FRAME, FrameSocket
 from can_dbc.bus.wire_client import WireClient
 from can_dbc.dbc.codec import Database, MessageCodec, load
-from can_dbc.frame import Frame
+from can_dbc.frame import Frame, RawFrame
 from can_dbc.protocols.e2e import Checker, Sender
 from hil.wire.server import Server
 from host.exit_codes import CommandFailed, ExitCode
 
 DRAIN_FRAMES: Final = 14
-"""Frames per drain: what a tick at 200 Hz brings on crane0."""
+"""Frames per drain: those that arrive on crane0 during a tick at 200 Hz."""
 TICK_NS: Final = 5_000_000
 LIMIT_US: Final = 5.0
-"""Receive, check and decode may cost this much per frame on an ordinary host."""
+"""Limit for receive, check and decode of one frame on an ordinary host."""
 QUIET_S: Final = 0.1
-"""A kernel interface is measured on when nothing was heard on it for so long."""
+"""A kernel interface is used only if nothing was received on it for this time."""
 _SO_TIMESTAMPNS: Final = 35
-
-Wire = tuple[int, bytes]
 
 
 class Traffic:
-    """What the controller hears on crane0, by cycle time, with values in range and running E2E counters."""
+    """Frames that the controller receives on crane0, by cycle time, with valid values and running E2E counters."""
 
     def __init__(self, database: Database) -> None:
         rng = random.Random(1)
-        heard = [c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders]
-        self._messages = [(c, _payload(c, rng), Sender(c.data_ids) if c.data_ids else None) for c in heard]
+        received = [c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders]
+        self._messages = [(c, _payload(c, rng), Sender(c.data_ids) if c.data_ids else None) for c in received]
         self._frames = self._endless()
 
-    def take(self, count: int) -> list[Wire]:
+    def take(self, count: int) -> list[RawFrame]:
         """The next frames on the bus."""
         return [next(self._frames) for _ in range(count)]
 
-    def _endless(self) -> Iterator[Wire]:
+    def _endless(self) -> Iterator[RawFrame]:
         now_ns = 0
         while True:
             for codec, payload, sender in self._messages:
@@ -70,21 +69,21 @@ class Traffic:
 
 
 class Reader:
-    """E2E check and decoding by key, as `controller.crane.inputs` does it; ``believed`` counts the good frames."""
+    """E2E check and decoding by key, as `controller.crane.inputs` does it; ``accepted`` counts the good frames."""
 
     def __init__(self, database: Database) -> None:
         self._slots = {
             key: (Checker(codec.data_ids) if codec.data_ids else None, codec.receive)
             for key, codec in database.by_key.items()
         }
-        self.believed = 0
+        self.accepted = 0
 
     def read(self, frames: Sequence[Frame]) -> None:
         for _, key, data in frames:
             checker, receive = self._slots[key]
             if checker is None or checker.check(data).usable:
                 receive(data)
-                self.believed += 1
+                self.accepted += 1
 
     def read_messages(self, messages: Sequence[can.Message]) -> None:
         """The same for python-can's messages."""
@@ -93,26 +92,27 @@ class Reader:
             data = bytes(message.data)
             if checker is None or checker.check(data).usable:
                 receive(data)
-                self.believed += 1
+                self.accepted += 1
 
 
 @dataclass(frozen=True, slots=True)
 class Lane:
-    """One path: ``send`` makes frames wait (not timed), ``drain`` takes all of them into a list."""
+    """One path: ``send`` queues frames (not timed), ``drain`` receives all of them into a list."""
 
     name: str
     label: str
-    send: Callable[[list[Wire]], None]
+    send: Callable[[list[RawFrame]], None]
     drain: Callable[[list[Any]], object]
     messages: bool = False
 
 
 def measure(frames: int, rounds: int) -> dict[str, Any]:
-    """Figures of every path there is: rounds of ``frames`` frames each, the paths in turns.
+    """Measure every available path alternately, in rounds of ``frames`` frames each.
 
     ``metrics``: ``rx_us`` and ``rx_decode_us`` of the fast path, the same with the name of each other path, and
-    ``rx_decode_ratio``, python-can's cost by ours.  ``lab``: measured inside user-mode Linux, where a system call costs
-    a hundred times as much, so that nothing but the ratio means anything.  Raises `CommandFailed` when the bus is in use.
+    ``rx_decode_ratio``, python-can's cost by ours.  ``lab``: measured in user-mode Linux, where a system call costs a
+    hundred times as much, so that only the ratio is meaningful.  Raises `CommandFailed` when the bus is in
+    use.
     """
     database = load("crane")
     clock, clock_name = _clock()
@@ -122,7 +122,11 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
         time.sleep(QUIET_S)
         for lane in lanes:
             if _discard(lane):
-                raise CommandFailed(ExitCode.BUS, f"{lane.label}: the bus is in use; stop what runs on it, then measure.")
+                raise CommandFailed(
+                    "receive-cost.bus-in-use",
+                    f"{lane.label}: the bus is in use; stop what runs on it, then measure.",
+                    ExitCode.BUS,
+                )
         traffic = {lane.name: Traffic(database) for lane in lanes}
         readers = {lane.name: Reader(database) for lane in lanes}
         gc.collect()
@@ -134,8 +138,8 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
                 samples.setdefault(f"rx_{lane.name}_us", []).append(rx_ns / frames / 1000)
                 samples.setdefault(f"rx_decode_{lane.name}_us", []).append((rx_ns + decode_ns) / frames / 1000)
     for name, reader in readers.items():
-        if reader.believed < rounds * frames - 200:  # the first frame of each stream only qualifies it
-            raise AssertionError(f"path {name} believed {reader.believed} of {rounds * frames} frames")
+        if reader.accepted < rounds * frames - 200:  # the first frame of each stream only initializes its counter
+            raise AssertionError(f"path {name} accepted {reader.accepted} of {rounds * frames} frames")
     metrics = {name.replace("_ours", ""): median(values) for name, values in samples.items()}
     metrics["rx_decode_ratio"] = metrics["rx_decode_pythoncan_us"] / metrics["rx_decode_us"]
     return {
@@ -146,7 +150,7 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
 
 def _round(lane: Lane, traffic: Traffic, reader: Reader, frames: int, clock: Callable[[], int]) -> tuple[int, int]:
     """Time [ns] of receiving, and of checking and decoding, for one round."""
-    _discard(lane)  # on an interface everybody heard the other paths' frames
+    _discard(lane)  # on an interface every socket received the frames of the other paths
     read = reader.read_messages if lane.messages else reader.read
     rx_ns = decode_ns = 0
     for start in range(0, frames, DRAIN_FRAMES):
@@ -160,12 +164,16 @@ def _round(lane: Lane, traffic: Traffic, reader: Reader, frames: int, clock: Cal
         decode_ns += clock() - middle_ns
         rx_ns += middle_ns - begin_ns
         if len(received) != wanted:
-            raise CommandFailed(ExitCode.BUS, f"{lane.label} gave {len(received)} of {wanted} frames; is anybody else sending?")
+            raise CommandFailed(
+                "receive-cost.frames-missing",
+                f"{lane.label} gave {len(received)} of {wanted} frames; is anybody else sending?",
+                ExitCode.BUS,
+            )
     return rx_ns, decode_ns
 
 
 def _discard(lane: Lane) -> int:
-    """Takes in and throws away all that waits; returns how much it was."""
+    """Receive and discard all waiting frames; returns their number."""
     count = 0
     while True:
         scrap: list[Any] = []
@@ -186,7 +194,7 @@ def _lanes(stack: contextlib.ExitStack) -> list[Lane]:
 
 
 def _interface() -> str | None:
-    """A kernel CAN interface that nobody depends on; None where there is none."""
+    """A virtual kernel CAN interface; None if there is none."""
     present = {name for _, name in socket.if_nameindex()}
     return next((name for name in ("vcan0", "vcan1") if name in present), None) if kernel_has_can() else None
 
@@ -218,7 +226,7 @@ def _python_can_on_a_pair(stack: contextlib.ExitStack) -> Lane:
 
 
 class _OnPair(SocketcanBus):
-    """python-can's own receive path on a socket that is given."""
+    """python-can's own receive path on a given socket."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.socket, self.channel = sock, "pair"
@@ -226,7 +234,7 @@ class _OnPair(SocketcanBus):
 
 
 def _wire(stack: contextlib.ExitStack) -> Lane:
-    """A client of a wire bus whose daemon is this process too, so that its bus time takes none of ours."""
+    """A client of a wire bus whose daemon runs in this process, so that the bus time is not measured."""
     directory = Path(stack.enter_context(tempfile.TemporaryDirectory()))
     server = Server("bench", 1_000_000, directory)
     stack.callback(server.close)
@@ -244,7 +252,7 @@ def _wire(stack: contextlib.ExitStack) -> Lane:
     (member,) = server.members.values()
     sender = server.core.attach("sender", queue_limit=DRAIN_FRAMES)
 
-    def send(frames: list[Wire]) -> None:
+    def send(frames: list[RawFrame]) -> None:
         for key, data in frames:
             server.core.submit(sender, key, data)
         server.core.advance(server.core.now_ns + DRAIN_FRAMES * TICK_NS)
@@ -265,18 +273,20 @@ def _pair(stack: contextlib.ExitStack) -> tuple[socket.socket, socket.socket]:
     return stack.enter_context(near), stack.enter_context(far)
 
 
-def _through(sock: socket.socket) -> Callable[[list[Wire]], None]:
-    def send(frames: list[Wire]) -> None:
+def _through(sock: socket.socket) -> Callable[[list[RawFrame]], None]:
+    def send(frames: list[RawFrame]) -> None:
         for key, data in frames:
             sock.send(CAN_FRAME.pack(key, len(data), data))
 
     return send
 
 
-def _all_of(send_all: Callable[[list[Wire]], int]) -> Callable[[list[Wire]], None]:
-    def send(frames: list[Wire]) -> None:
+def _all_of(send_all: Callable[[list[RawFrame]], int]) -> Callable[[list[RawFrame]], None]:
+    def send(frames: list[RawFrame]) -> None:
         if send_all(frames) != len(frames):
-            raise CommandFailed(ExitCode.BUS, "The interface takes no frames; see `ip link`.")
+            raise CommandFailed(
+                "receive-cost.interface-blocked", "The interface takes no frames; see `ip link`.", ExitCode.BUS
+            )
 
     return send
 
@@ -290,7 +300,7 @@ def _recv_all(bus: can.BusABC) -> Callable[[list[Any]], object]:
 
 
 def _payload(codec: MessageCodec, rng: random.Random) -> bytes:
-    """Bytes of the message with every value in range and available."""
+    """Payload of the message with every value in range and available."""
     while True:
         values = []
         for s in codec.signals:

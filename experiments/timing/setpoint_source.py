@@ -1,9 +1,10 @@
-"""The planner of the timing stand: arms the machine and keeps every joint in slow motion, so that the laws work.
+"""The setpoint source of the timing testbed: arms the machine and moves every joint slowly, so that the laws work.
 
-``python -m experiments.timing.setpoint_source --profile aoro_fc8 --controller HOST:PORT --report-port N``.  A setpoint of 0.4 s every
-50 ms, each joint swinging through a tenth of its range about where it stood.  Says on stdout, one JSON object a line,
-every change of mode, and once a second what it has seen.  Exit codes: 0 stopped by SIGTERM or SIGINT, 2 usage, 3
-profile.
+``python -m experiments.timing.setpoint_source --profile aoro_fc8 --controller HOST:PORT --report-port N``
+
+It sends a setpoint of 0.4 s every 50 ms, in which each joint swings through a tenth of its range.  It prints a JSON
+line for every change of mode, and once a second the newest report.  Exit codes: 0 stopped by SIGTERM or SIGINT, 2
+usage, 3 profile.
 """
 
 from __future__ import annotations
@@ -19,35 +20,29 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from can_dbc.messages.crane import (
-    CraneSetpoint,
-    DatagramRefused,
-    GrappleCommand,
-    Knot,
-    StateReport,
-    decode,
-    encode,
-    udp_address,
-)
+from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
+from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.envelope import DatagramRefused
+from can_dbc.messages.udp_address import udp_address
 from hil.harness.operator import Operator
-from machine.faults import describe
 from machine.joints import JOINTS
-from machine.load import ProfileError, load_profile, profile_hash
-from machine.modes import Mode
+from machine.loading.profile_file import ProfileError, load_profile, profile_hash
 from machine.profile import Profile
+from machine.status.faults import describe
+from machine.status.modes import Mode
 
-EVERY_NS: Final = 50_000_000
-TELL_NS: Final = 1_000_000_000
+SEND_PERIOD_NS: Final = 50_000_000
+PRINT_PERIOD_NS: Final = 1_000_000_000
 KNOTS_MS: Final = (0, 100, 200, 300, 400)
 LEASE_MS: Final = 350
-BEHIND_NS: Final = 2_000_000
-"""A stamp lies this far back: a controller in the middle of its tick must not find it in the future."""
-SWING: Final = 0.05
-"""Share of a joint's range on either side of the start."""
+STAMP_AGE_NS: Final = 2_000_000
+"""Age of a time stamp when it is sent: a controller in the middle of its tick must not find it in the future."""
+SWING_SHARE: Final = 0.05
+"""Amplitude of the swing as a share of the joint's range."""
 REASON_MASK: Final = 0xFF
-"""The detail stands above it."""
-BRISKNESS: Final = 0.4
-"""Share of the joint's speed and acceleration limits that the motion uses."""
+"""The bits above it hold the detail."""
+SPEED_SHARE: Final = 0.4
+"""Share of the joint's speed and acceleration limits used by the motion."""
 
 
 class Swing:
@@ -55,9 +50,9 @@ class Swing:
 
     def __init__(self, start: float, lower: float, upper: float, speed: float, acceleration: float) -> None:
         self.start = start
-        self.reach = 2 * SWING * (upper - lower) * (1.0 if upper - start > start - lower else -1.0)
+        self.reach = 2 * SWING_SHARE * (upper - lower) * (1.0 if upper - start > start - lower else -1.0)
         half = abs(self.reach) / 2
-        self.w = BRISKNESS * min(speed / half, math.sqrt(acceleration / half))
+        self.w = SPEED_SHARE * min(speed / half, math.sqrt(acceleration / half))
 
     def at(self, t_s: float) -> tuple[float, float]:
         """Position and velocity."""
@@ -65,7 +60,7 @@ class Swing:
         return self.start + half * (1.0 - math.cos(angle)), half * self.w * math.sin(angle)
 
 
-class Planner:
+class SetpointSource:
     """Reports in, datagrams out; pure."""
 
     def __init__(self, profile: Profile) -> None:
@@ -77,16 +72,16 @@ class Planner:
         self._sequence = 0
         self.report: StateReport | None = None
 
-    def hear(self, report: StateReport) -> bytes | None:
-        """What the operator presses on this report, if anything."""
+    def receive(self, report: StateReport) -> bytes | None:
+        """Receive a report; returns the command of the emulated operator, if any."""
         self.report = report
         if report.mode not in (Mode.ARMED, Mode.ACTIVE):
             self._swings = []
         return self.operator.step(report)
 
     def setpoint(self, now_ns: int) -> bytes | None:
-        """The setpoint of this moment; None while the machine is not armed."""
-        report, stamp_ns = self.report, now_ns - BEHIND_NS
+        """The setpoint to send now; None while the machine is not armed."""
+        report, stamp_ns = self.report, now_ns - STAMP_AGE_NS
         if report is None or report.mode not in (Mode.ARMED, Mode.ACTIVE):
             return None
         if not self._swings:
@@ -101,7 +96,7 @@ class Planner:
         )
 
     def _from(self, reference: Sequence[float]) -> list[Swing]:
-        """A blind joint has no position; it starts at 0, as the controller's own reference does."""
+        """A joint without an encoder has no position; it starts at 0, as the controller's own reference does."""
         starts = [0.0 if math.isnan(q) else q for q in reference]
         return [
             Swing(q, s.lower, s.upper, s.speed_limit, s.acceleration_limit)
@@ -116,16 +111,16 @@ class Planner:
 def main(arguments: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m experiments.timing.setpoint_source", description="Keeps a machine in motion."
+        prog="python -m experiments.timing.setpoint_source", description="Keep a machine in motion."
     )
     parser.add_argument("--profile", required=True)
     parser.add_argument("--controller", required=True, type=udp_address, metavar="HOST:PORT")
     parser.add_argument("--report-port", required=True, type=int)
     options = parser.parse_args(arguments)
     try:
-        planner = Planner(load_profile(options.profile))
+        source = SetpointSource(load_profile(options.profile))
     except ProfileError as error:
-        sys.stderr.write(f"planner: {error}\n")
+        sys.stderr.write(f"setpoint source: {error}\n")
         return 3
     ended: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -136,37 +131,37 @@ def main(arguments: list[str] | None = None) -> int:
         gc.collect()
         gc.freeze()
         print("ready", flush=True)
-        _serve(planner, link, options.controller, ended)
+        _serve(source, link, options.controller, ended)
     return 0
 
 
-def _serve(planner: Planner, link: socket.socket, controller: tuple[str, int], ended: list[int]) -> None:
-    send_ns = tell_ns = 0
+def _serve(source: SetpointSource, link: socket.socket, controller: tuple[str, int], ended: list[int]) -> None:
+    send_ns = next_print_ns = 0
     mode = -1
     while not ended:
         try:
             message = decode(link.recv(2048))
-        except (OSError, DatagramRefused):  # nobody there yet, or not for us
+        except (OSError, DatagramRefused):  # no controller yet, or another datagram
             message = None
         if isinstance(message, StateReport):
-            if press := planner.hear(message):
+            if press := source.receive(message):
                 link.sendto(press, controller)
             if message.mode != mode:
                 mode = message.mode
-                _tell(planner, event="mode", why=describe(message.reason), reason=message.reason & REASON_MASK)
+                _print(source, event="mode", why=describe(message.reason), reason=message.reason & REASON_MASK)
         now_ns = time.monotonic_ns()
-        if now_ns >= send_ns and (datagram := planner.setpoint(now_ns)):
-            send_ns = max(send_ns + EVERY_NS, now_ns)
+        if now_ns >= send_ns and (datagram := source.setpoint(now_ns)):
+            send_ns = max(send_ns + SEND_PERIOD_NS, now_ns)
             link.sendto(datagram, controller)
-        if now_ns >= tell_ns and planner.report is not None:
-            tell_ns = now_ns + TELL_NS
-            _tell(planner, event="report")
+        if now_ns >= next_print_ns and source.report is not None:
+            next_print_ns = now_ns + PRINT_PERIOD_NS
+            _print(source, event="report")
 
 
-def _tell(planner: Planner, **more: str | int) -> None:
-    report = planner.report
+def _print(source: SetpointSource, **more: str | int) -> None:
+    report = source.report
     assert report is not None
-    state = {"mode": Mode(report.mode).name, "stops": planner.operator.stops, "refused": report.refused}
+    state = {"mode": Mode(report.mode).name, "stops": source.operator.stops, "refused": report.refused}
     facts = {"stamp_ns": report.stamp_ns, "refusal": describe(report.refusal)}
     print(json.dumps(more | state | facts), flush=True)
 

@@ -1,7 +1,7 @@
-"""The loop that everybody writes first: ``python -m experiments.timing.sleep_loop --period-us 5000 --seconds 10``.
+"""The naive control loop: ``python -m experiments.timing.sleep_loop --period-us 5000 --seconds 10``.
 
-``time.sleep`` until the next deadline, normal priority, nothing to do in between; a period that is over when it wakes
-is missed and skipped.  Says one JSON object at its end: the bins of its lateness, and what it missed.
+It calls ``time.sleep`` until the next deadline at normal priority and does no work.  A period that has passed when it
+wakes is missed and skipped.  At the end it prints one JSON object: the bins of its lateness and the missed periods.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""The soak: the controller at its rate for half an hour, and nothing may grow and no frame may be lost."""
+"""The soak test: the controller runs at its rate for half an hour; nothing may grow and no frame may be lost."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -12,100 +12,110 @@ from typing import Any, Final
 from rich.console import Console
 
 from can_dbc.timing.page import Facts
-from experiments.common.plot_style import OIL, STEEL, TIMBER, sheet
 from experiments.common.registry import Options
-from experiments.common.result import Figure, Result, commit, environment
-from experiments.common.result_page import Section, tell
+from experiments.common.result import Metric, Result, commit, environment, limits_of
+from experiments.common.result_page import Page, Section, publish
 from experiments.timing import evaluation, host_activity
-from experiments.timing.evaluation import STEADY_TICKS
+from experiments.timing.evaluation import MIN_STEADY_TICKS
 from experiments.timing.measurement import between
 from experiments.timing.plots import exceeded
-from experiments.timing.testbed import Setting, Stand
-from machine.load import load_profile
-from machine.reasons import Reason
+from experiments.timing.testbed import TestbedConfig, TimingTestbed
+from machine.loading.profile_file import load_profile
+from machine.status.reasons import Reason
+from runtime.plot_style import OIL, STEEL, TIMBER, sheet
 
 MINUTES: Final = 30.0
 QUICK_MINUTES: Final = 1.0 / 3.0
 WARM_S: Final = 5.0
 EVERY_S: Final = 5.0
-READINGS: Final = 20
-"""At least; a short run reads more often."""
-MOVING: Final = 0.5
-TOO_LATE: Final = frozenset({
+MIN_READINGS: Final = 20
+"""Minimum number of readings; a short run reads more often."""
+MIN_ACTIVE_SHARE: Final = 0.5
+LATENESS_REASONS: Final = frozenset({
     Reason.ESTOP_LOST, Reason.GUARD_LOST, Reason.GUARD_REFUSES, Reason.ENCODER_LOST, Reason.VALVE_FEEDBACK_LOST,
     Reason.PRESSURE_LOST, Reason.CARRIER_LOST, Reason.SWING_ARMS_LOST, Reason.GNSS_LOST, Reason.ENGINE_LOST,
     Reason.SAFETY_NODE_LOST, Reason.ENCODER_NODE_LOST, Reason.PRESSURE_NODE_LOST, Reason.LOOP_LATE,
     Reason.LOOP_STALLED, Reason.LEASE_LOST,
 })  # fmt: skip
-"""Stops for something that came too late; where no frame is lost, one of the processes was not let run."""
+"""Reasons for a stop because something was late; if no frame is lost, the host stalled one of the processes."""
 LOSSES: Final = ("gaps", "gaps_rig", "unanswered", "frames_lost", "records_lost")
 FLAT_KB: Final = 64.0
-"""Memory that may come and go: resident memory is counted in pages, some of them shared."""
+"""Tolerance for resident memory: it is counted in pages, some of them shared."""
 
-BREATH_BLOCKS: Final = 8.0
-"""So many blocks come and go with the moment of the reading; a leak of one a second is more even in a short run."""
+JITTER_BLOCKS: Final = 8.0
+"""Blocks that come and go between readings; a leak of one block per second exceeds this even in a short run."""
 STOP_BLOCKS: Final = 40.0
-"""So many may stay after a stop and the arming that follows it (25 measured; a second stop adds none)."""
+"""Blocks that may remain after a stop and the following arming (25 measured; a second stop adds none)."""
 
 MEMORY: Final = Section(
     "Memory",
-    "Read every few seconds; the greatest of the second half less the greatest of the first. Memory breathes, so the "
-    "blocks of the interpreter are compared by their least.",
+    "Read every few seconds. Growth is the maximum of the second half of the run less the maximum of the first half. "
+    "The interpreter's memory blocks come and go, so their minima are compared.",
     (
-        Figure("controller_growth_kb", "Controller's resident memory grows by", "kB", "getrusage and /proc/PID/status.",
+        Metric("controller_growth_kb", "Growth of the controller's resident memory", "kB",
+               "getrusage and /proc/PID/status.", most=FLAT_KB),
+        Metric("guard_growth_kb", "Growth of the guard's resident memory", "kB", "VmRSS of /proc/PID/status.",
                most=FLAT_KB),
-        Figure("guard_growth_kb", "Guard's resident memory grows by", "kB", "VmRSS of /proc/PID/status.", most=FLAT_KB),
-        Figure("allocated_blocks_growth", "Blocks that stay in the controller", "",
-               "sys.getallocatedblocks, by the timing page.", most=0.0),
-        Figure("gc_runs", "Runs of the garbage collector", "", "In the controller.", most=0.0),
-        Figure("major_faults", "Page faults that go to the disk", "", "In the controller.", most=0.0),
+        Metric("allocated_blocks_growth", "Growth of allocated memory blocks in the controller", "",
+               "sys.getallocatedblocks, from the timing page.", most=0.0),
+        Metric("gc_runs", "Runs of the garbage collector", "", "In the controller.", most=0.0),
+        Metric("major_faults", "Major page faults", "", "In the controller.", most=0.0),
     ),
-    (("memory.png", "Resident memory of controller and guard, and the controller's blocks, over the run."),),
+    (("memory.png", "Resident memory of controller and guard, and memory blocks of the controller, over the run."),),
 )  # fmt: skip
 FRAMES: Final = Section(
     "Frames",
-    "A witness reads the controller's record of every tick: all frames it received and sent, in order. Protected "
-    "frames carry a counter and a CRC; a counter that does not follow the one before is a lost frame. Encoders carry "
-    "none: they must answer every SYNC. The rig checks what it receives in the same way.",
+    "A bus observer reads the controller's record of every tick: all frames that it received and sent, in order. "
+    "Protected frames carry a counter and a CRC; a counter that is not consecutive is a lost frame. Encoder frames "
+    "carry none, but every SYNC must be answered. The emulated machine checks its received frames in the same way.",
     (
-        Figure("minutes", "Length", "min", "After a few seconds of warming up."),
-        Figure("received", "Frames received by the controller", "", "All buses."),
-        Figure("sent", "Frames sent by it", "", "All buses."),
-        Figure("gaps", "Gaps in its protected frames, in and out", "", "By the witness.", most=0.0),
-        Figure("gaps_rig", "Gaps in what the rig received", "", "By the rig.", most=0.0),
-        Figure("damaged", "Frames with a wrong CRC", "", "Both.", most=0.0),
-        Figure("unanswered", "SYNCs that an encoder left without an answer", "", "By the witness.", most=0.0),
-        Figure("frames_lost", "Frames refused by a bus or lost before they were read", "", "Controller and rig.",
+        Metric("minutes", "Duration", "min", "After a few seconds of warm-up."),
+        Metric("received", "Frames received by the controller", "", "All buses."),
+        Metric("sent", "Frames sent by the controller", "", "All buses."),
+        Metric("gaps", "Gaps in its protected frames, received and sent", "", "By the bus observer.", most=0.0),
+        Metric("gaps_rig", "Gaps in the frames received by the emulated machine", "", "By the emulated machine.",
                most=0.0),
-        Figure("records_lost", "Tick records that are missing", "", "By their nominal times.", most=0.0),
+        Metric("damaged", "Frames with a wrong CRC", "", "By both.", most=0.0),
+        Metric("unanswered", "SYNCs not answered by an encoder", "", "By the bus observer.", most=0.0),
+        Metric("frames_lost", "Frames refused by a bus or lost before they were read", "",
+               "Controller and emulated machine.", most=0.0),
+        Metric("records_lost", "Missing tick records", "", "By their nominal times.", most=0.0),
     ),
 )  # fmt: skip
 TIMES: Final = Section(
-    "Time",
-    "The histogram of the whole run. In user-mode Linux a system call costs a hundred times the host's, so these "
-    "numbers say that the machine lived with them, not what the controller costs.",
+    "Timing",
+    "The histogram of the whole run. In user-mode Linux a system call costs a hundred times as much as on the host, so "
+    "these numbers show that the machine works there, not what the controller costs.",
     (
-        Figure("ticks", "Ticks", "", "That ran."),
-        Figure("missed", "Periods missed", "", "Skipped whole."),
-        Figure("stops", "Stops of the machine", "", "The planner's stand-in armed it again after each."),
-        Figure("active_share", "Share of the readings in which the machine moved", "%",
-               "Mode ACTIVE; a host that stalls any of the processes stops the machine, as it should.",
-               least=MOVING, scale=100.0),
-        Figure("wakeup_p50_us", "Lateness, median", "us", "Of all ticks."),
-        Figure("wakeup_p99_us", "Lateness, p99", "us", "Of all ticks."),
-        Figure("wakeup_max_us", "Longest lateness", "us", "Of all ticks."),
-        Figure("tick_cpu_p99_us", "Processor time of a tick, p99", "us", "Of all ticks."),
-        Figure("steal_ms", "Time the hypervisor took", "ms", "/proc/stat."),
+        Metric("ticks", "Ticks", "", "Executed."),
+        Metric("missed", "Missed periods", "", "Whole periods skipped."),
+        Metric("stops", "Stops of the machine", "", "The emulated operator arms it again after each."),
+        Metric("active_share", "Share of the readings in which the machine moved", "%",
+               "Mode ACTIVE; a host that stalls one of the processes stops the machine, as intended.",
+               least=MIN_ACTIVE_SHARE, scale=100.0),
+        Metric("wakeup_p50_us", "Lateness, median", "us", "All ticks."),
+        Metric("wakeup_p99_us", "Lateness, p99", "us", "All ticks."),
+        Metric("wakeup_max_us", "Lateness, longest", "us", "All ticks."),
+        Metric("tick_cpu_p99_us", "CPU time of a tick, p99", "us", "All ticks."),
+        Metric("steal_ms", "Time taken by the hypervisor", "ms", "/proc/stat."),
     ),
-    (("lateness.png", "Share of wake-ups that were later than x."),),
+    (("lateness.png", "Share of wake-ups later than x."),),
 )  # fmt: skip
 SECTIONS: Final = (FRAMES, MEMORY, TIMES)
-FIGURES: Final = tuple(f for section in SECTIONS for f in section.figures)
+METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
+CONCLUSION: Final = (
+    "In {minutes} the controller received {received} frames and sent {sent}; {records_lost} tick records are missing, "
+    "and its resident memory grew by {controller_growth_kb}.",
+)
+INTRODUCTION: Final = (
+    "The real controller and guard run on the timing testbed without a pause. "
+    "Nothing may grow, and no frame may be lost."
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One look: seconds since the start, the controller's facts, resident memory of both [kB], mode."""
+    """One reading: seconds since the start, the controller's counters, resident memory of both [kB], mode."""
 
     at_s: float
     facts: Facts
@@ -115,24 +125,29 @@ class Reading:
 
 
 def run(options: Options, console: Console) -> Result:
-    """Soak; writes ``options.out`` and, when asked, the docs."""
+    """Run the soak test; write ``options.out`` and, if requested, the docs."""
     minutes = options.minutes or (QUICK_MINUTES if options.quick else MINUTES)
     profile = load_profile(options.profile)
-    setting = Setting(options.profile, profile.rate_hz, options.bus)
+    setting = TestbedConfig(options.profile, profile.rate_hz, options.bus)
     console.print(f"soak: {minutes:.3g} minutes, {profile.name} at {profile.rate_hz} Hz on {options.bus}")
     first = host_activity.sample()
-    with console.status("soak: starting") as status, Stand(setting, options.out / "stand") as stand:
-        stand.wait(WARM_S)
-        begin = stand.fresh_timing()
-        before = copied(stand.said)
+    with console.status("soak: starting") as status, TimingTestbed(setting, options.out / "testbed") as testbed:
+        testbed.wait(WARM_S)
+        begin = testbed.fresh_timing()
+        before = copied(testbed.status)
         began, readings = time.monotonic(), list[Reading]()
         while (passed := time.monotonic() - began) < 60.0 * minutes:
-            readings.append(read(stand, passed))
+            readings.append(read(testbed, passed))
             status.update(f"soak: {passed / 60:.1f} of {minutes:.3g} min, {readings[-1].facts.words}")
-            stand.wait(min(EVERY_S, 60.0 * minutes / READINGS, 60.0 * minutes - passed))
-        end = stand.fresh_timing()
-        readings.append(read(stand, time.monotonic() - began))
-        after, stops, modes, halts = copied(stand.said), stand.stops, list(stand.modes), set(stand.halts)
+            testbed.wait(min(EVERY_S, 60.0 * minutes / MIN_READINGS, 60.0 * minutes - passed))
+        end = testbed.fresh_timing()
+        readings.append(read(testbed, time.monotonic() - began))
+        after, stops, modes, stop_reasons = (
+            copied(testbed.status),
+            testbed.stops,
+            list(testbed.modes),
+            set(testbed.stop_reasons),
+        )
     durations = between(begin, end)
     metrics = {
         "minutes": minutes,
@@ -146,7 +161,7 @@ def run(options: Options, console: Console) -> Result:
         **evaluation.spread_us("wakeup", durations["wake"]),
         **evaluation.spread_us("tick_cpu", durations["cpu"]),
     }
-    found = evaluation.judge(FIGURES, metrics, untold(metrics, halts))
+    found = evaluation.evaluate(METRICS, metrics, undecided(metrics, stop_reasons))
     result = Result(
         experiment="soak",
         commit=commit(),
@@ -155,8 +170,15 @@ def run(options: Options, console: Console) -> Result:
         trials=1,
         metrics=metrics,
         paper={},
-        environment={**environment(), **host_activity.describe(), "bus": options.bus, "lab": lab(), "modes": "; ".join(modes)},
-        limits={f.name: (f.least, f.most) for f in FIGURES if f.limit_text()},
+        environment={
+            **environment(),
+            **host_activity.describe(),
+            "bus": options.bus,
+            "rate_hz": str(profile.rate_hz),
+            "lab": lab(),
+            "modes": "; ".join(modes),
+        },
+        limits=limits_of(METRICS),
         missed=found.missed,
         inconclusive=tuple(found.inconclusive),
     )
@@ -168,47 +190,47 @@ def run(options: Options, console: Console) -> Result:
         axis.set_xscale("log")
         axis.set_yscale("log")
         axis.set_xlabel("lateness [us]")
-        axis.set_ylabel("share of wake-ups that are later")
-    e = result.environment
-    words = (
-        f"Commit `{result.commit}`, `{profile.name}` at {profile.rate_hz} Hz on {options.bus}{e['lab']}. Host: "
-        f"{e['processor']}, {e['cpus']} cores, kernel {e['kernel']}, Python {e['python']}."
-    )
-    tell(result, "Soak", INTRODUCTION, SECTIONS, options, console, words)
+        axis.set_ylabel("share of later wake-ups")
+    publish(result, page_of(result, {}), options, console)
     return result
 
 
-INTRODUCTION: Final = (
-    "The real controller and guard drive the timing stand without a pause: nothing may grow, and no frame may be lost. "
-    "`make soak` measures it and fails when one of the limits is missed; no number is typed."
-)
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page."""
+    e = result.environment
+    rate = f" at {e['rate_hz']} Hz" if "rate_hz" in e else ""
+    setting = (
+        f"Commit `{result.commit}`, `{result.profile}`{rate} on {e['bus']}{e['lab']}. Host: "
+        f"{e['processor']}, {e['cpus']} cores, kernel {e['kernel']}, Python {e['python']}."
+    )
+    return Page("Soak test", CONCLUSION, INTRODUCTION, SECTIONS, setting, "make soak")
 
 
-def untold(metrics: dict[str, float], halts: set[Reason]) -> dict[str, str]:
-    """What this run cannot tell, with the reason.
+def undecided(metrics: dict[str, float], stop_reasons: set[Reason]) -> dict[str, str]:
+    """The metrics that this run cannot decide, with the reason.
 
-    ``halts``: why the machine stopped.  Inputs that are late though none is lost are the host's doing only.
+    ``stop_reasons``: why the machine stopped.  Late inputs without a lost frame are caused by the host alone.
     """
     found = {}
-    late = bool(halts) and halts <= TOO_LATE and not any(metrics[name] for name in LOSSES)
-    if metrics["active_share"] < MOVING and late:
-        found["active_share"] = "the host did not let the processes run in time: inputs came late, none was lost"
-    most = STOP_BLOCKS if halts else BREATH_BLOCKS
-    if metrics["ticks"] < STEADY_TICKS and 0.0 < metrics["allocated_blocks_growth"] <= most:
-        found["allocated_blocks_growth"] = f"{metrics['ticks']:.0f} ticks are too few to tell a leak from a breath"
+    late = bool(stop_reasons) and stop_reasons <= LATENESS_REASONS and not any(metrics[name] for name in LOSSES)
+    if metrics["active_share"] < MIN_ACTIVE_SHARE and late:
+        found["active_share"] = "the host stalled the processes: inputs were late, none was lost"
+    most = STOP_BLOCKS if stop_reasons else JITTER_BLOCKS
+    if metrics["ticks"] < MIN_STEADY_TICKS and 0.0 < metrics["allocated_blocks_growth"] <= most:
+        found["allocated_blocks_growth"] = f"{metrics['ticks']:.0f} ticks are too few to detect a leak"
     return found
 
 
 def lab() -> str:
-    """Words for the kernel in which the soak ran."""
+    """Where the test ran, if in user-mode Linux."""
     return " in user-mode Linux" if os.environ.get("TIMBERHAND_LAB") == "uml" else ""
 
 
-def read(stand: Stand, at_s: float) -> Reading:
-    """One look at a running stand."""
-    pids = {name: child.process.pid for name, child in stand.family.children.items()}
+def read(testbed: TimingTestbed, at_s: float) -> Reading:
+    """Read a running testbed."""
+    pids = {name: child.process.pid for name, child in testbed.family.children.items()}
     return Reading(
-        at_s, stand.timing().facts, resident_kb(pids["controller"]), resident_kb(pids["guard"]), stand.mode
+        at_s, testbed.timing().facts, resident_kb(pids["controller"]), resident_kb(pids["guard"]), testbed.mode
     )  # fmt: skip
 
 
@@ -221,7 +243,7 @@ def resident_kb(pid: int) -> int:
 
 
 def memory(readings: Sequence[Reading]) -> dict[str, float]:
-    """What has grown between the halves of a run, and what the controller's process counted."""
+    """Growth between the halves of a run, and counters of the controller's process."""
     half = max(1, len(readings) // 2)
     early, late = readings[:half], readings[half:]
     first, last = readings[0].facts.process, readings[-1].facts.process
@@ -236,16 +258,17 @@ def memory(readings: Sequence[Reading]) -> dict[str, float]:
     }
 
 
-def copied(said: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """What the processes have said until now."""
-    return {name: dict(words) for name, words in said.items()}
+def copied(status: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """A copy of the newest messages of all processes."""
+    return {name: dict(words) for name, words in status.items()}
 
 
 def frames(
     before: dict[str, dict[str, Any]], after: dict[str, dict[str, Any]], begin: Facts, end: Facts
 ) -> dict[str, float]:
-    """What witness, rig and the controller's own counters say of the time between; a rig that is alone on its bus at
-    the start is refused frames, so totals mean nothing.
+    """Counts of frames between two readings, by bus observer, emulated machine and controller.
+
+    Only differences count: a machine that is alone on its bus at the start has frames refused.
     """
 
     def grown(who: str, *names: str) -> float:
@@ -253,20 +276,20 @@ def frames(
 
     lost = sum(b.dropped + b.refused for b in end.buses) - sum(b.dropped + b.refused for b in begin.buses)
     return {
-        "received": grown("witness", "received"),
-        "sent": grown("witness", "sent"),
-        "gaps": grown("witness", "gaps"),
-        "gaps_rig": grown("rig", "gaps"),
-        "damaged": grown("witness", "damaged") + grown("rig", "damaged"),
-        "unanswered": grown("witness", "unanswered"),
-        "records_lost": grown("witness", "records_lost", "records_unreadable"),
-        "frames_lost": lost + grown("rig", "dropped_frames", "refused_frames"),
-        "rig_stalls": grown("rig", "stalls"),
+        "received": grown("observer", "received"),
+        "sent": grown("observer", "sent"),
+        "gaps": grown("observer", "gaps"),
+        "gaps_rig": grown("machine", "gaps"),
+        "damaged": grown("observer", "damaged") + grown("machine", "damaged"),
+        "unanswered": grown("observer", "unanswered"),
+        "records_lost": grown("observer", "records_lost", "records_unreadable"),
+        "frames_lost": lost + grown("machine", "dropped_frames", "refused_frames"),
+        "rig_stalls": grown("machine", "stalls"),
     }
 
 
 def draw_memory(readings: Sequence[Reading], path: Path) -> None:
-    """Growth since the first reading."""
+    """Plot the growth since the first reading."""
     minutes = [r.at_s / 60 for r in readings]
     with sheet(path, 2) as axes:
         for name, colour in (("controller_kb", OIL), ("guard_kb", TIMBER)):
