@@ -56,7 +56,7 @@ def main(arguments: list[str] | None = None) -> int:
             os.close(options.ready_fd)
         serve(servers, stop)
     except BusError as error:
-        print(error, file=sys.stderr)
+        print(f"{error} [{error.code}]", file=sys.stderr)
         return 4
     finally:
         for server in servers:

@@ -23,6 +23,7 @@ from can_dbc.frame import ERROR, EXTENDED, Frame
 from hil.wire.faults import Fault, Kind
 from hil.wire.launch import wire_daemon
 from hil.wire.stuffing import frame_bits
+from tests.codes import coded
 
 PATIENCE_S = 5.0
 
@@ -103,19 +104,19 @@ def test_no_other_file_is_ever_removed(tmp_path: Path) -> None:
         ["--bus", "crane0:1000000", "--join", "vcan0"],
     ],
 )
-def test_senseless_arguments_are_a_usage_error(arguments: list[str], tmp_path: Path) -> None:
+def test_malformed_arguments_are_a_usage_error(arguments: list[str], tmp_path: Path) -> None:
     assert run_daemon("--dir", str(tmp_path), *arguments).returncode == 2
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_launch_that_fails_says_why(daemon: subprocess.Popen[str]) -> None:
-    with pytest.raises(BusError, match="is another wire daemon running"), wire_daemon({"crane0": 1_000_000}):
+def test_a_launch_that_fails_reports_the_reason(daemon: subprocess.Popen[str]) -> None:
+    with pytest.raises(BusError, match=r"\[wire.cannot-listen\]"), wire_daemon({"crane0": 1_000_000}):
         pass
 
 
-def test_a_directory_too_deep_for_a_socket_is_told_so(tmp_path: Path) -> None:
+def test_a_directory_with_a_path_too_long_for_a_socket_is_refused(tmp_path: Path) -> None:
     deep = tmp_path / ("d" * 110)
-    with pytest.raises(BusError, match=r"107 bytes at most.*shorter directory"), wire_daemon({"a": 1_000_000}, deep):
+    with pytest.raises(BusError, match=r"\[wire.path-too-long\]"), wire_daemon({"a": 1_000_000}, deep):
         pass
 
 
@@ -152,10 +153,10 @@ def test_faults_act_and_heal_by_control_messages(daemon: subprocess.Popen[str]) 
 
 
 @pytest.mark.parametrize("request_", [{}, {"inject": {"kind": "melt"}}, {"inject": 3}, {"hello": {}}, ["heal"]])
-def test_a_senseless_request_is_refused_and_harms_nobody(
+def test_a_malformed_request_is_refused_without_side_effects(
     request_: dict[str, object], daemon: subprocess.Popen[str]
 ) -> None:
-    with pytest.raises(BusError, match="refuses"):
+    with pytest.raises(BusError, check=coded("wire.refused")):
         control("crane0", request_)
     assert control("crane0", {"stats": True})["nodes"] == []
 

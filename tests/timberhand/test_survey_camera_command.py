@@ -74,7 +74,7 @@ def test_a_camera_that_nobody_surveyed_leaves_the_machines_hash_as_it_was() -> N
     ("case", "code", "words"),
     [
         ("few", ExitCode.FIGURE_MISSED, "survey at least 6"),
-        ("mixed", ExitCode.FIGURE_MISSED, "which target is which"),
+        ("mixed", ExitCode.FIGURE_MISSED, "targets"),
         ("nobody says where the crane stands", ExitCode.USAGE, "--joints"),
         ("three joints", ExitCode.USAGE, "four numbers"),
         ("a comma for a point", ExitCode.CONFIGURATION, ":3: y_m is '4,2'"),

@@ -19,7 +19,7 @@ import pytest
 
 from can_dbc.dbc import codec
 from can_dbc.frame import Frame
-from can_dbc.trace.candump import read
+from can_dbc.trace.candump import read_trace
 from can_dbc.bus.reconnector import FIRST_RETRY_NS, RETRY_PERIOD_NS
 from controller.config import load as load_settings
 from controller.guard.__main__ import PERIOD_NS as GUARD_PERIOD_NS
@@ -73,7 +73,7 @@ class Recording:
         self.page: dict[str, int] = json.loads(self.page_text)
         self.said = {path.name: path.read_text() for path in directory.glob("*.out")}
         self.frames: dict[int | str, list[Seen]] = {}
-        for frame in read(directory / "vcan0.log"):
+        for frame in read_trace(directory / "vcan0.log"):
             assert isinstance(frame, Frame), frame
             name = NAMES.get(frame.key)
             message = DATABASE.messages[name] if name else None

@@ -41,7 +41,7 @@ def console(
 
       timberhand console --report-port 8472 --controller 127.0.0.1:8470
     """
-    from console.__main__ import Refused, serve
+    from console.__main__ import StartError, serve
     from host.exit_codes import CommandFailed, ExitCode
 
     try:
@@ -57,5 +57,5 @@ def console(
             key_file=key_file,
             timing=timing,
         )
-    except Refused as refused:
-        raise CommandFailed.from_error(refused, ExitCode(refused.code)) from refused
+    except StartError as error:
+        raise CommandFailed.from_error(error, ExitCode(error.exit_code)) from error
