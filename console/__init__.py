@@ -1,0 +1,1 @@
+"""The operator's web page: a server that shows crane, vehicle and mission, and sends operator commands."""

@@ -1,8 +1,8 @@
 """``python -m console``: serves the operator's page until it is interrupted.
 
-When the page can be opened, one JSON line with its ``url`` goes to stdout.
+Once the page can be opened, one JSON line with its ``url`` is written to stdout.
 
-Exit codes: 0 interrupted in good order, 2 usage, 3 configuration, 4 a port is busy.
+Exit codes: 0 interrupted, 2 usage, 3 configuration, 4 a port is in use.
 """
 
 from __future__ import annotations
@@ -18,14 +18,18 @@ from pathlib import Path
 from typing import Any
 
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
+from runtime.errors import CodedError
 
 
-class Refused(Exception):
-    """The console cannot start: the exit code and one sentence."""
+class StartError(CodedError):
+    """The console cannot start: an error code, one sentence and the exit code of the process."""
 
-    def __init__(self, code: int, sentence: str) -> None:
-        super().__init__(sentence)
-        self.code = code
+    def __init__(self, code: str, sentence: str, exit_code: int) -> None:
+        super().__init__(code, sentence)
+        self.exit_code = exit_code
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.code, str(self), self.exit_code)
 
 
 def serve(
@@ -41,16 +45,21 @@ def serve(
     key_file: Path | None = None,
     timing: Path | None = None,
 ) -> None:
-    """Serve until SIGINT or SIGTERM; raises `Refused`."""
+    """Serve until SIGINT or SIGTERM.
+
+    Raises:
+        StartError: the console cannot start.
+    """
     from console.server import Console, create_app
 
     try:
         machine = load_profile(profile)
         key = key_file.read_bytes().strip() if key_file else None
     except ProfileError as error:
-        raise Refused(3, str(error)) from error
+        raise StartError(error.code, str(error), 3) from error
     except OSError as error:
-        raise Refused(3, f"{key_file} cannot be read ({error.strerror}); give the file with the key") from error
+        sentence = f"{key_file} cannot be read ({error.strerror}); give the file with the key"
+        raise StartError("console.key-file", sentence, 3) from error
     page = _listen(socket.SOCK_STREAM, bind, port, "--port")
     reports = _listen(socket.SOCK_DGRAM, "127.0.0.1", report_port, "--report-port")
     console = Console(
@@ -67,7 +76,11 @@ def serve(
 
 
 def serve_plant(*, port: int, plant: str, bind: str = "127.0.0.1", allow_hosts: Sequence[str] = ()) -> None:
-    """Serve the view of a simulated plant until SIGINT or SIGTERM; raises `Refused`."""
+    """Serve the view of a simulated plant until SIGINT or SIGTERM.
+
+    Raises:
+        StartError: the console cannot start.
+    """
     from console.plant_view import create_plant_app
 
     address = _address(plant, "--plant")
@@ -76,10 +89,10 @@ def serve_plant(*, port: int, plant: str, bind: str = "127.0.0.1", allow_hosts: 
 
 
 def _run(app: Any, page: socket.socket, bind: str) -> None:
-    """Say where the page is and serve it."""
+    """Write the page's address to stdout and serve it."""
     import uvicorn
 
-    # A page that keeps its websocket open must not hold up the end.
+    # A page that keeps its websocket open must not delay the shutdown.
     config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1, ws="websockets-sansio")
     host = f"[{bind}]" if ":" in bind else bind
     sys.stdout.write(json.dumps({"url": f"http://{host}:{page.getsockname()[1]}/"}) + "\n")
@@ -98,7 +111,8 @@ def _listen(kind: socket.SocketKind, host: str, port: int, option: str) -> socke
             s.listen(64)
     except OSError as error:
         s.close()
-        raise Refused(4, f"cannot use {host}:{port} ({error.strerror}); choose another {option}") from error
+        sentence = f"cannot use {host}:{port} ({error.strerror}); choose another {option}"
+        raise StartError("console.port-in-use", sentence, 4) from error
     return s
 
 
@@ -109,23 +123,32 @@ def _address(text: str | None, option: str) -> tuple[str, int] | None:
     try:
         return str(ipaddress.ip_address(host or "127.0.0.1")), int(port)
     except ValueError:
-        raise Refused(2, f"{option} {text} is not HOST:PORT, as in 127.0.0.1:5005") from None
+        sentence = f"{option} {text} is not HOST:PORT, as in 127.0.0.1:5005"
+        raise StartError("console.address", sentence, 2) from None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The process; returns its exit code."""
+    """Run the process; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m console", description="The operator's web page.")
-    parser.add_argument("--port", type=int, default=8471, help="of the page (default 8471)")
-    parser.add_argument("--report-port", type=int, help="UDP port of the reports of controller and planner")
-    parser.add_argument("--plant", metavar="HOST:PORT", help="show the simulated plant that answers there instead")
+    parser.add_argument("--port", type=int, default=8471, help="port of the page (default 8471)")
+    parser.add_argument("--report-port", type=int, help="UDP port that receives the reports of controller and planner")
+    parser.add_argument("--plant", metavar="HOST:PORT", help="request port of a simulated plant to show instead")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file")
-    parser.add_argument("--controller", metavar="HOST:PORT", help="where commands go; without it the page only watches")
-    parser.add_argument("--planner", metavar="HOST:PORT", help="where the orders to a mission go")
-    parser.add_argument("--scene", metavar="HOST:PORT", help="a detector to ask for the logs that lie there")
+    parser.add_argument(
+        "--controller",
+        metavar="HOST:PORT",
+        help="controller that receives operator commands; without it the page is read-only",
+    )
+    parser.add_argument(
+        "--planner", metavar="HOST:PORT", help="planner that receives mission commands (its --order-port)"
+    )
+    parser.add_argument("--scene", metavar="HOST:PORT", help="log detector to request logs from")
     parser.add_argument("--bind", default="127.0.0.1", help="address to serve on (default: this machine only)")
-    parser.add_argument("--allow-host", action="append", default=[], help="a host name to serve besides this machine's")
+    parser.add_argument(
+        "--allow-host", action="append", default=[], help="host name to serve in addition to this machine's"
+    )
     parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
-    parser.add_argument("--timing", type=Path, metavar="FILE", help="the controller's timing page, to be shown")
+    parser.add_argument("--timing", type=Path, metavar="FILE", help="timing page of the controller to show")
     a = parser.parse_args(arguments)
     if (a.report_port is None) == (a.plant is None):
         parser.error("give --report-port (the operator's page) or --plant (the view of a simulated plant)")
@@ -146,9 +169,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             key_file=a.key_file,
             timing=a.timing,
         )
-    except Refused as refused:
-        sys.stderr.write(f"console: {refused}\n")
-        return refused.code
+    except StartError as error:
+        sys.stderr.write(f"console: {error}\n")
+        return error.exit_code
     except KeyboardInterrupt:
         return 0
     return 0

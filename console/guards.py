@@ -1,8 +1,8 @@
-"""What every request must pass before a handler sees it: the Host it names and the page it comes from.
+"""Checks of every request before a handler receives it: its Host and its Origin.
 
-A foreign ``Host`` is DNS rebinding; a foreign ``Origin`` on the websocket or on a command is another site's page that
-uses this browser.  Both are refused with a sentence.  Every answer carries a policy that lets the page load nothing
-from anywhere but here (docs/reference/safety.md section 3).
+A foreign ``Host`` is DNS rebinding; a foreign ``Origin`` on the websocket or on a command is a page of another site in
+this browser.  Both are refused with a sentence.  Every response carries a policy that only lets the page load resources
+from this server (docs/reference/safety.md section 3).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _INLINE: Final = re.compile(r"<script type=\"importmap\">(.*?)</script>", re.DOT
 
 
 def content_security_policy(page: str) -> str:
-    """The policy for a page: everything from here, and of inline scripts only the page's own import map."""
+    """The policy of a page: resources from this server only, and no inline script but the page's import map."""
     hashes = (hashlib.sha256(text.encode()).digest() for text in _INLINE.findall(page))
     allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in hashes)
     return (
@@ -33,12 +33,12 @@ def content_security_policy(page: str) -> str:
 
 
 def is_loopback(host: str | None) -> bool:
-    """Whether a peer's address is this machine."""
+    """Whether a peer's address is of this machine."""
     return host is not None and (host in ("::1", "testclient") or host.startswith("127."))
 
 
 class RequestGuards:
-    """ASGI middleware (module docstring: contract); ``names`` are the host names served, without port."""
+    """ASGI middleware; ``names`` are the served host names, without port."""
 
     def __init__(self, app: ASGIApp, names: Collection[str], policy: str) -> None:
         self._app = app
@@ -59,29 +59,29 @@ class RequestGuards:
             return
         refusal = self._refusal(Headers(scope=scope))
         if refusal is None:
-            await self._app(scope, receive, self._marking(send))
+            await self._app(scope, receive, self._with_headers(send))
         elif scope["type"] == "websocket":
             await receive()
             await send({"type": "websocket.close", "code": 1008, "reason": refusal})
         else:
-            await PlainTextResponse(refusal, 403)(scope, receive, self._marking(send))
+            await PlainTextResponse(refusal, 403)(scope, receive, self._with_headers(send))
 
     def _refusal(self, headers: Headers) -> str | None:
         host = headers.get("host", "")
         if urlsplit(f"//{host}").hostname not in self._names:
-            return "This console does not serve that host name; start it with --allow-host to add one."
+            return "This console does not serve that host name; start it with --allow-host to add it."
         origin = headers.get("origin")
         # A browser always sends Origin with a websocket and with a POST; a tool such as curl sends none.
         if origin is not None and urlsplit(origin).netloc != host:
-            return "A page of another site may not use this console."
+            return "Pages of other sites may not use this console."
         return None
 
-    def _marking(self, send: Send) -> Send:
-        async def marked(message: Message) -> None:
+    def _with_headers(self, send: Send) -> Send:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 for name, value in self._headers:
                     headers[name] = value
             await send(message)
 
-        return marked
+        return send_with_headers

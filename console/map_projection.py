@@ -1,6 +1,6 @@
-"""Degrees on the ground as metres east and north of a first place: good to a picture of a site, not to steer by.
+"""Local map projection: degrees to metres east and north of the first place, accurate enough to draw a site.
 
-The errors grow with the square of the distance: some centimetres at 500 m, and every part of the picture has the same.
+The error grows with the square of the distance, to some centimetres at 500 m, and is the same for all parts of the map.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Metres = tuple[float, float]
 
 
 class MapProjection:
-    """The map's ground; its origin is the first place that it is asked for."""
+    """Projection of the map; its origin is the first place that is projected."""
 
     def __init__(self) -> None:
         self._origin: tuple[float, float] | None = None

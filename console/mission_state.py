@@ -11,30 +11,30 @@ from collections import deque
 from typing import Any, Final
 
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.mission import LatLon, KnownLog, MissionReport, decode_mission
+from can_dbc.messages.mission import KnownLog, LatLon, MissionReport, decode_mission
 from can_dbc.messages.vehicle import VEHICLE_INPUTS, Driving, VehicleReport
 from console.map_projection import MapProjection, Metres
 from machine.profile import Profile
 
-TOLD_NS: Final = 2_000_000_000
-"""A planner that has said nothing for this long is shown as lost; it tells twice a second."""
-VEHICLE_NS: Final = 500_000_000
-"""So, too, a vehicle of which nothing came; it reports 20 times a second."""
-AHEAD_NS: Final = 1_000_000_000
+MISSION_TIMEOUT_NS: Final = 2_000_000_000
+"""Without a mission report for this long the planner is shown as disconnected; it reports twice a second."""
+VEHICLE_TIMEOUT_NS: Final = 500_000_000
+"""Without a vehicle report for this long the vehicle is shown as disconnected; it reports 20 times a second."""
+MAX_FUTURE_NS: Final = 1_000_000_000
 TRAIL_M: Final = 0.25
 TRAIL_POINTS: Final = 8_000
-"""Two kilometres."""
+"""Two kilometres of track."""
 FIXES: Final = {
     0: "no position",
-    1: "rough",
-    2: "corrected",
-    3: "precise",
+    1: "GNSS fix",
+    2: "DGNSS fix",
+    3: "precise GNSS",
     4: "RTK fixed",
     5: "RTK float",
-    6: "reckoned",
+    6: "estimated",
 }
-"""Method of PGN 129029."""
-DRIVING: Final = {Driving.STANDING: "stands", Driving.DRIVING: "led by the planner", Driving.BRAKING: "brakes"}
+"""GNSS methods of PGN 129029."""
+DRIVING: Final = {Driving.STANDING: "standing", Driving.DRIVING: "driving", Driving.BRAKING: "braking"}
 INPUT_NAMES: Final = dict(
     zip(
         VEHICLE_INPUTS,
@@ -46,7 +46,7 @@ INPUT_NAMES: Final = dict(
 
 
 def describe_carrier(profile: Profile) -> dict[str, Any] | None:
-    """What map and view need to draw the machine, [m, rad]; None for one that stands still."""
+    """Dimensions for map and 3-D view [m, rad]; None for a stationary machine."""
     c = profile.carrier
     if c is None:
         return None
@@ -58,36 +58,36 @@ def describe_carrier(profile: Profile) -> dict[str, Any] | None:
 
 
 class MissionState:
-    """Takes mission and vehicle reports; gives what the page shows of them."""
+    """Accepts mission and vehicle reports and returns the page's state of them."""
 
     def __init__(self, profile: Profile, profile_hash: int, key: bytes | None = None) -> None:
-        self.told = 0
-        """Mission reports taken: the page is sent the mission when this has grown."""
+        self.report_count = 0
+        """Accepted mission reports: the mission is sent to the page when this has changed."""
         self.trail: deque[Metres] = deque(maxlen=TRAIL_POINTS)
-        """Where the articulation axis was."""
+        """Track of the articulation axis."""
         self._carrier = profile.carrier
         self._hash, self._key = profile_hash, key
         self._ground = MapProjection()
         self._mission: MissionReport | None = None
-        self._stamp_ns = self._told_ns = self._heard_ns = self._placed_ns = 0
+        self._stamp_ns = self._report_ns = self._received_ns = self._placed_ns = 0
         self._vehicle: VehicleReport | None = None
         self._place: dict[str, float] | None = None
 
     def on_mission(self, datagram: bytes, now_ns: int) -> bool:
-        """Take a datagram; False when it is no report of this machine's mission, or an old one."""
+        """Accept a datagram; False when it is not a newer report of this machine's mission."""
         try:
             profile_hash, stamp_ns, report = decode_mission(datagram, self._key)
         except DatagramRefused:
             return False
-        if profile_hash != self._hash or not self._stamp_ns < stamp_ns <= now_ns + AHEAD_NS:
+        if profile_hash != self._hash or not self._stamp_ns < stamp_ns <= now_ns + MAX_FUTURE_NS:
             return False
-        self._mission, self._stamp_ns, self._told_ns = report, stamp_ns, now_ns
-        self.told += 1
+        self._mission, self._stamp_ns, self._report_ns = report, stamp_ns, now_ns
+        self.report_count += 1
         return True
 
     def on_vehicle(self, report: VehicleReport, now_ns: int) -> None:
-        """Take the newest report of the vehicle."""
-        self._vehicle, self._heard_ns = report, now_ns
+        """Accept a vehicle report."""
+        self._vehicle, self._received_ns = report, now_ns
         place = self._placed(report)
         if place is None:
             return
@@ -97,16 +97,16 @@ class MissionState:
             self.trail.append(here)
 
     def alive(self, now_ns: int) -> bool:
-        """Whether the planner has spoken lately."""
-        return self._mission is not None and now_ns - self._told_ns < TOLD_NS
+        """Whether the planner is connected."""
+        return self._mission is not None and now_ns - self._report_ns < MISSION_TIMEOUT_NS
 
     def state(self, now_ns: int) -> dict[str, Any]:
-        """For every state of the page: the vehicle, how old the mission is, and when to ask for the latter."""
-        told_s = None if self._mission is None else round((now_ns - self._told_ns) * 1e-9, 1)
+        """Part of every page state: the vehicle, and the age of the mission report."""
+        told_s = None if self._mission is None else round((now_ns - self._report_ns) * 1e-9, 1)
         return {"mission_age_s": told_s, "mission_alive": self.alive(now_ns), "vehicle": self._shown(now_ns)}
 
     def mission(self) -> dict[str, Any] | None:
-        """The mission as it was told last; None before the first report."""
+        """The newest mission report; None before the first."""
         m = self._mission
         if m is None:
             return None
@@ -142,7 +142,7 @@ class MissionState:
         return self._ground.metres(*place)
 
     def _placed(self, r: VehicleReport) -> dict[str, float] | None:
-        """The articulation axis and the directions of both halves; None when not all of it is known."""
+        """The articulation axis and the directions of both halves; None unless all of it is known."""
         known = (r.latitude_deg, r.longitude_deg, r.heading_rad, r.articulation_rad)
         if self._carrier is None or not all(map(math.isfinite, known)):
             return None
@@ -162,10 +162,10 @@ class MissionState:
         if r is None:
             return None
         return {
-            "age_s": round((now_ns - self._heard_ns) * 1e-9, 1),
-            "alive": now_ns - self._heard_ns < VEHICLE_NS,
+            "age_s": round((now_ns - self._received_ns) * 1e-9, 1),
+            "alive": now_ns - self._received_ns < VEHICLE_TIMEOUT_NS,
             "place": self._place,
-            "place_alive": self._place is not None and now_ns - self._placed_ns < VEHICLE_NS,
+            "place_alive": self._place is not None and now_ns - self._placed_ns < VEHICLE_TIMEOUT_NS,
             "driving": DRIVING.get(Driving(r.driving), "?") if r.driving in set(Driving) else "?",
             "speed_m_s": _number(r.speed_m_s),
             "heading_deg": _number(math.degrees(r.heading_rad)),

@@ -1,14 +1,13 @@
-"""The operator's web page: watch crane and mission, stop them, arm them, order the mission about.
+"""The server of the operator's web page: shows crane, vehicle and mission; sends operator commands.
 
-Inputs: the controller's reports of crane and vehicle and the planner's of its mission (UDP, one port), the detector's
-log list (UDP, asked twice a second, optional), the controller's timing page (read once a second, optional) and the
-operator's commands and orders (POST).  Outputs: a page, ``/ws`` with the state 20 times a second (and the mission when
-something new was told of it), ``/api/state``, ``/api/trail`` (where the vehicle was), ``/api/machine``, ``/healthz``;
-one ``OperatorCommand`` datagram per command to the controller, one ``MissionOrder`` per order to the planner.
+Inputs: crane and vehicle reports of the controller and mission reports of the planner (UDP, one port), log lists of the
+detector (UDP, requested ten times a second, optional), the controller's timing page (read once a second, optional), and
+commands by POST.  Outputs: the page, ``/ws`` with the state 20 times a second (and the mission after each report),
+``/api/state``, ``/api/trail`` (the vehicle's track), ``/api/machine``, ``/healthz``; one ``OperatorCommand`` datagram
+per command to the controller, one ``MissionOrder`` datagram per mission command to the planner.
 
-STOP is accepted from every page that may see the console; ARM, DISARM, RESET and the orders of a mission only from this
-machine (an ssh tunnel counts as this machine).  Everything is served from the package: no other host is ever asked for
-anything.
+STOP is accepted from every page that the console serves; ARM, DISARM, RESET and mission commands only from this machine
+(an ssh tunnel counts as this machine).  All resources are served from the package; no other host is contacted.
 """
 
 from __future__ import annotations
@@ -42,8 +41,8 @@ from console.state import CraneState, describe_machine
 from machine.profile import Profile
 
 PERIOD_S: Final = 0.05
-ASK_LOGS_S: Final = 0.1  # a log in the tongs is drawn where they are
-LOOK_AT_TIMING_S: Final = 1.0
+LOG_REQUEST_PERIOD_S: Final = 0.1  # a log in the grapple moves with it
+TIMING_PERIOD_S: Final = 1.0
 STATIC: Final = Path(__file__).with_name("static")
 
 Address = tuple[str, int]
@@ -51,8 +50,9 @@ Address = tuple[str, int]
 
 @dataclass(slots=True)
 class Console:
-    """The console's configuration and what it knows.  ``controller`` None: the page only watches; ``planner`` None: the
-    mission cannot be ordered about.
+    """Configuration and state of the console.
+
+    ``controller`` None: the page is read-only; ``planner`` None: it sends no mission commands.
     """
 
     profile: Profile
@@ -65,34 +65,42 @@ class Console:
     planner: Address | None = None
     timing_page: Path | None = None
     clock: Callable[[], int] = time.monotonic_ns
-    watch: CraneState = field(init=False)
+    crane_state: CraneState = field(init=False)
     _sequence: int = 0
 
     def __post_init__(self) -> None:
-        self.watch = CraneState(self.profile, self.key, self.profile_hash)
+        self.crane_state = CraneState(self.profile, self.key, self.profile_hash)
 
     def command(self, action: OperatorAction) -> None:
-        """Send one operator command; raises OSError."""
+        """Send one operator command.
+
+        Raises:
+            OSError: it cannot be sent.
+        """
         assert self.controller is not None
         message = OperatorCommand(self._next(), self.profile_hash, self.clock(), action)
         _send(encode(message, self.key), self.controller)
 
     def order(self, order: Order) -> None:
-        """Send one order to the planner; raises OSError."""
+        """Send one mission command to the planner.
+
+        Raises:
+            OSError: it cannot be sent.
+        """
         assert self.planner is not None
         message = MissionOrder(self._next(), self.profile_hash, self.clock(), order)
         _send(encode_order(message, self.key), self.planner)
 
     def _next(self) -> int:
-        # Starts from the clock, so that a restarted console is no replay of the one before.
+        # Starts from the clock, so that commands of a restarted console are not taken for a replay.
         self._sequence = max(self._sequence + 1, self.clock() // 1_000_000 & 0x7FFF_FFFF)
         return self._sequence
 
     def state_for(self, peer: str | None) -> dict[str, Any]:
-        """The page's state with what the viewer at ``peer`` may do."""
+        """The page's state and the permissions of the viewer at ``peer``."""
         can = self.controller is not None
         return {
-            **self.watch.state(self.clock()),
+            **self.crane_state.state(self.clock()),
             "may_stop": can,
             "may_command": can and is_loopback(peer),
             "may_order": self.planner is not None and is_loopback(peer),
@@ -103,7 +111,7 @@ def _send(data: bytes, to: Address) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.connect(to)
         out.send(data)
-        # On loopback the kernel says at once when nobody listens.
+        # On loopback the kernel reports at once that nobody listens.
         if code := out.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
             raise OSError(code, os.strerror(code))
 
@@ -113,7 +121,7 @@ class _Reports(asyncio.DatagramProtocol):
         self._console = console
 
     def datagram_received(self, data: bytes, addr: Address) -> None:
-        self._console.watch.on_report(data, self._console.clock())
+        self._console.crane_state.on_report(data, self._console.clock())
 
 
 class _Logs(asyncio.DatagramProtocol):
@@ -122,28 +130,28 @@ class _Logs(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: Address) -> None:
         with contextlib.suppress(LogListError):
-            self._console.watch.logs = decode_logs(data)
+            self._console.crane_state.logs = decode_logs(data)
 
 
-async def _ask_logs(transport: asyncio.DatagramTransport) -> None:
+async def _request_logs(transport: asyncio.DatagramTransport) -> None:
     while True:
-        transport.sendto(encode_request(()))  # what is known already will do
-        await asyncio.sleep(ASK_LOGS_S)
+        transport.sendto(encode_request(()))  # without joints: the logs that are already known
+        await asyncio.sleep(LOG_REQUEST_PERIOD_S)
 
 
-async def _watch_timing(watch: CraneState, page: Path) -> None:
+async def _read_timing(crane_state: CraneState, page: Path) -> None:
     while True:
-        with contextlib.suppress(TimingRefused):  # none, or none yet; what was read before grows old
-            watch.on_timing(await asyncio.to_thread(read_timing, page))
-        await asyncio.sleep(LOOK_AT_TIMING_S)
+        with contextlib.suppress(TimingRefused):  # no page yet; the last state times out
+            crane_state.on_timing(await asyncio.to_thread(read_timing, page))
+        await asyncio.sleep(TIMING_PERIOD_S)
 
 
-def _elsewhere(name: str) -> Response:
+def _not_local(name: str) -> Response:
     return PlainTextResponse(f"{name} is accepted only from the machine that runs the console.", 403)
 
 
-def _answer(send: Callable[[], None], who: str, where: Address) -> Response:
-    """Send, and say when nobody is there."""
+def _respond(send: Callable[[], None], who: str, where: Address) -> Response:
+    """Send, and report an unreachable receiver."""
     try:
         send()
     except OSError as error:
@@ -152,7 +160,7 @@ def _answer(send: Callable[[], None], who: str, where: Address) -> Response:
 
 
 def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette:
-    """The ASGI application; ``allow_hosts`` are names to serve besides this machine's own."""
+    """The ASGI application; ``allow_hosts`` are host names to serve in addition to this machine's."""
     page = (STATIC / "index.html").read_text()
     machine = describe_machine(console.profile)
 
@@ -167,11 +175,11 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
                 stack.callback(reports.close)
             if console.scene:
                 scene, _logs = await loop.create_datagram_endpoint(lambda: _Logs(console), remote_addr=console.scene)
-                asking = asyncio.create_task(_ask_logs(scene))
+                requesting = asyncio.create_task(_request_logs(scene))
                 stack.callback(scene.close)
-                stack.callback(asking.cancel)
+                stack.callback(requesting.cancel)
             if console.timing_page:
-                stack.callback(asyncio.create_task(_watch_timing(console.watch, console.timing_page)).cancel)
+                stack.callback(asyncio.create_task(_read_timing(console.crane_state, console.timing_page)).cancel)
             yield
 
     async def index(_: Request) -> Response:
@@ -182,45 +190,45 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
 
     async def api_state(request: Request) -> Response:
         state = console.state_for(request.client.host if request.client else None)
-        return JSONResponse(state | {"mission": console.watch.forwarding.mission()})
+        return JSONResponse(state | {"mission": console.crane_state.mission_state.mission()})
 
     async def api_trail(_: Request) -> Response:
-        return JSONResponse(list(console.watch.forwarding.trail))
+        return JSONResponse(list(console.crane_state.mission_state.trail))
 
     async def healthz(_: Request) -> Response:
-        alive = console.watch.alive(console.clock())
+        alive = console.crane_state.alive(console.clock())
         return JSONResponse({"console": "ok", "controller": "alive" if alive else "silent"})
 
     async def operator(request: Request) -> Response:
         name = request.path_params["action"].upper()
         if name not in OperatorAction.__members__:
-            return PlainTextResponse(f"There is no command {name}.", 404)
+            return PlainTextResponse(f"Unknown command {name}.", 404)
         if console.controller is None:
-            return PlainTextResponse("This console only watches; start it with --controller HOST:PORT.", 409)
+            return PlainTextResponse("This console is read-only; start it with --controller HOST:PORT.", 409)
         peer = request.client.host if request.client else None
         if name != "STOP" and not is_loopback(peer):
-            return _elsewhere(name)
-        return _answer(lambda: console.command(OperatorAction[name]), "controller", console.controller)
+            return _not_local(name)
+        return _respond(lambda: console.command(OperatorAction[name]), "controller", console.controller)
 
     async def mission(request: Request) -> Response:
         name = request.path_params["order"].upper().replace("-", "_")
         if name not in Order.__members__:
-            return PlainTextResponse(f"There is no order {name}.", 404)
+            return PlainTextResponse(f"Unknown mission command {name}.", 404)
         if console.planner is None:
-            return PlainTextResponse("This console gives no orders; start it with --planner HOST:PORT.", 409)
+            return PlainTextResponse("This console sends no mission commands; start it with --planner HOST:PORT.", 409)
         if not is_loopback(request.client.host if request.client else None):
-            return _elsewhere(name)
-        return _answer(lambda: console.order(Order[name]), "planner", console.planner)
+            return _not_local(name)
+        return _respond(lambda: console.order(Order[name]), "planner", console.planner)
 
     async def ws(socket: WebSocket) -> None:
         await socket.accept()
         peer = socket.client.host if socket.client else None
         with contextlib.suppress(WebSocketDisconnect):
-            told = 0
+            sent_count = 0
             while True:
-                state, forwarding = console.state_for(peer), console.watch.forwarding
-                if told != forwarding.told:
-                    told, state["mission"] = forwarding.told, forwarding.mission()
+                state, mission_state = console.state_for(peer), console.crane_state.mission_state
+                if sent_count != mission_state.report_count:
+                    sent_count, state["mission"] = mission_state.report_count, mission_state.mission()
                 await socket.send_text(json.dumps(state, separators=(",", ":")))
                 await asyncio.sleep(PERIOD_S)
 

@@ -1,7 +1,7 @@
-"""What the page shows: the newest state report of the controller, in words and numbers for a browser.
+"""The page's state of controller and crane, from the newest reports.
 
 Pure: datagrams and integer times in, JSON-ready dictionaries out.  An unknown number (NaN) becomes None.  Peaks (tick
-time, lateness) are the worst of the last second, because the page is told less often than the controller reports.
+time, delay) are maxima of the last second, because the page is updated less often than the controller reports.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from machine.status import faults
 from machine.status.modes import Mode
 from machine.status.stale_inputs import STALE_INPUT_NAMES
 
-ALIVE_NS: Final = 300_000_000
-"""A controller that has said nothing for this long is shown as lost."""
+REPORT_TIMEOUT_NS: Final = 300_000_000
+"""Without a report for this long the controller is shown as disconnected."""
 WINDOW_NS: Final = 1_000_000_000
-TIMING_OLD_NS: Final = 3_000_000_000
+TIMING_TIMEOUT_NS: Final = 3_000_000_000
 """The controller writes its timing once a second."""
 
 PARTS: Final = ("column", "boom", "stick", "telescope", "grapple")
@@ -37,7 +37,7 @@ _NAMES: Final = tuple((j.name.lower(), PARTS[j]) for j in JOINTS)
 
 
 def describe_machine(profile: Profile) -> dict[str, Any]:
-    """What never changes: names, limits and the geometry of the surroundings."""
+    """Constant data of the machine: names, limits, geometry of bunk and surroundings."""
     bunk, place = profile.bunk, profile.workspace
     return {
         "name": profile.name,
@@ -57,49 +57,49 @@ def describe_machine(profile: Profile) -> dict[str, Any]:
 
 
 class CraneState:
-    """Takes reports and log lists, gives the page's state; ``forwarding`` is what it knows of vehicle and mission."""
+    """Accepts reports and log lists and returns the page's state; ``mission_state`` is that of vehicle and mission."""
 
     def __init__(self, profile: Profile, key: bytes | None = None, profile_hash: int = 0) -> None:
         self.logs: tuple[LogObservation, ...] = ()
-        self.forwarding = MissionState(profile, profile_hash, key)
+        self.mission_state = MissionState(profile, profile_hash, key)
         self._profile = profile
         self._key = key
         self._report: StateReport | None = None
-        self._heard_ns = 0
+        self._received_ns = 0
         self._recent: deque[tuple[int, StateReport]] = deque()
         self._timing: dict[str, Any] | None = None
         self._timing_ns = 0
 
     def on_report(self, datagram: bytes, now_ns: int) -> bool:
-        """Take a datagram; False when it is none of the reports that are shown."""
+        """Accept a datagram; False when it is not a report that is shown."""
         try:
             report = decode(datagram, self._key)
         except DatagramRefused:
-            return self.forwarding.on_mission(datagram, now_ns)
+            return self.mission_state.on_mission(datagram, now_ns)
         if isinstance(report, VehicleReport):
-            self.forwarding.on_vehicle(report, now_ns)
+            self.mission_state.on_vehicle(report, now_ns)
             return True
         if not isinstance(report, StateReport):
             return False
-        self._report, self._heard_ns = report, now_ns
+        self._report, self._received_ns = report, now_ns
         self._recent.append((now_ns, report))
         self._forget(now_ns)
         return True
 
     def on_timing(self, timing: Timing) -> None:
-        """Take a state of the controller's timing page."""
-        self._timing, self._timing_ns = _punctuality(timing), timing.facts.written_ns
+        """Accept a state of the controller's timing page."""
+        self._timing, self._timing_ns = _timing_facts(timing), timing.facts.written_ns
 
     def alive(self, now_ns: int) -> bool:
-        """Whether the controller has spoken lately."""
-        return self._report is not None and now_ns - self._heard_ns < ALIVE_NS
+        """Whether the controller is connected."""
+        return self._report is not None and now_ns - self._received_ns < REPORT_TIMEOUT_NS
 
     def state(self, now_ns: int) -> dict[str, Any]:
-        """The state for the page; before the controller's first report without what it says of the crane."""
+        """The state for the page; without crane data before the controller's first report."""
         r = self._report
         base = {"alive": self.alive(now_ns), "logs": [asdict(log) for log in self.logs], "timing": None}
-        base |= self.forwarding.state(now_ns)
-        if self._timing and now_ns - self._timing_ns < TIMING_OLD_NS:
+        base |= self.mission_state.state(now_ns)
+        if self._timing and now_ns - self._timing_ns < TIMING_TIMEOUT_NS:
             base["timing"] = self._timing
         if r is None:
             return base
@@ -107,7 +107,7 @@ class CraneState:
         window = [report for _, report in self._recent] or [r]
         return base | {
             "time_s": r.stamp_ns / 1e9,
-            "silent_s": round((now_ns - self._heard_ns) / 1e9, 2),
+            "silent_s": round((now_ns - self._received_ns) / 1e9, 2),
             "mode": Mode(r.mode).name if r.mode in set(Mode) else f"MODE {r.mode}",
             "reason": _sentence(r.reason),
             "position": _numbers(r.position),
@@ -132,9 +132,9 @@ class CraneState:
     def _drawing(self, r: StateReport) -> dict[str, Any]:
         kin, tongs = self._profile.kinematics, self._profile.grapple.tongs
         q = r.position
-        if joint(self._profile, Joint.ROT).encoder is None:  # drawn where it was told to be
-            told = r.reference[Joint.ROT]
-            q = (*q[: Joint.ROT], told if math.isfinite(told) else 0.0)
+        if joint(self._profile, Joint.ROT).encoder is None:  # drawn at its reference
+            reference = r.reference[Joint.ROT]
+            q = (*q[: Joint.ROT], reference if math.isfinite(reference) else 0.0)
         if not all(map(math.isfinite, q)):
             return {"points": None, "reference_points": None}
         opening = r.opening_pct if math.isfinite(r.opening_pct) else 100.0
@@ -143,7 +143,7 @@ class CraneState:
         return {
             "points": _points(kinematics.chain_points(kin, q)),
             "reference_points": _points(kinematics.chain_points(kin, r.reference)) if ghost else None,
-            "tongs": {
+            "jaws": {
                 "yaw_rad": round(grapple.grapple_yaw(self._profile, q), 4),
                 "half_gap_m": round(grapple.half_gap_m(tongs, angle), 4),
                 "tip_below_m": round(grapple.tip_below_pin_m(tongs, angle), 4),
@@ -151,8 +151,8 @@ class CraneState:
         }
 
 
-def _punctuality(timing: Timing) -> dict[str, Any]:
-    """How punctual the controller has been since its start; durations are p99, the input is the oldest ever used."""
+def _timing_facts(timing: Timing) -> dict[str, Any]:
+    """Timing of the controller since its start: durations at the 99th percentile, and the oldest input used."""
     facts, found = timing.facts, timing.durations
     inputs = {name: age.longest_ns for name, age in facts.inputs.items() if age.count}
     oldest = max(inputs, key=inputs.__getitem__, default="")
@@ -189,4 +189,4 @@ def _sentence(reason: int) -> str:
     try:
         return faults.describe(reason)
     except ValueError:
-        return f"The controller gives reason {reason & 0xFF}, which this console does not know; run one release."
+        return f"The controller reports the unknown reason {reason & 0xFF}; run controller and console of one release."

@@ -1,4 +1,4 @@
-// The operator's page: takes the state from the websocket, shows it, and sends the operator's commands by POST.
+// The operator page: receives the state by websocket, shows it, and sends operator commands by POST.
 
 import { createMission } from "./mission.js";
 import { createPlot, LINES } from "./plot.js";
@@ -25,18 +25,18 @@ async function send(path, name, otherwise) {
     const answer = await fetch(path, { method: "POST", signal: AbortSignal.timeout(2000) });
     if (!answer.ok) throw new Error((await answer.text()) || answer.statusText);
   } catch (error) {
-    alarm(`${name.toUpperCase()} was not sent (${error.message}). ${otherwise}`, 10000);
+    alarm(`${name.toUpperCase()} could not be sent (${error.message}). ${otherwise}`, 10000);
   }
 }
 
-const HARD_WIRED = "Press the hard-wired emergency stop.", NOTHING = "Nothing was done.";
-const command = (action) => send(`api/operator/${action}`, action, action === "stop" ? HARD_WIRED : NOTHING);
-const order = (name) => send(`api/mission/${name}`, name.replace("-", " "), NOTHING);
+const HARD_WIRED = "Press the hard-wired emergency stop.", NO_ACTION = "No action was taken.";
+const command = (action) => send(`api/operator/${action}`, action, action === "stop" ? HARD_WIRED : NO_ACTION);
+const sendMission = (name) => send(`api/mission/${name}`, name.replace("-", " "), NO_ACTION);
 
 $("stop").addEventListener("click", () => command("stop"));
 $("reset").addEventListener("click", () => command("reset"));
 $("disarm").addEventListener("click", () => command("disarm"));
-// Not modal: a modal dialog would put STOP out of reach.
+// Not modal: a modal dialog would disable STOP.
 $("arm").addEventListener("click", () => { $("confirm").show(); $("confirm-no").focus(); });
 $("confirm-no").addEventListener("click", () => $("confirm").close());
 $("confirm-yes").addEventListener("click", () => { $("confirm").close(); command("arm"); });
@@ -47,7 +47,7 @@ window.addEventListener("keydown", (event) => {
   for (const id of ["confirm", "end"]) if ($(id).open) $(id).close();
   if (!event.repeat) command("stop");
 }, { capture: true });
-// A focused button is clicked by the release of the space bar, which means STOP here.
+// Releasing the space bar clicks a focused button; here it only means STOP.
 window.addEventListener("keyup", (event) => { if (event.key === " ") event.preventDefault(); }, { capture: true });
 
 // ---- link ------------------------------------------------------------------------------------------------
@@ -70,12 +70,12 @@ function watch() {
   const linked = now - lastMessage < LOST_AFTER_MS;
   const known = linked && reportAlive;
   document.body.dataset.link = known ? "ok" : "lost";
-  text("mode", known ? (MODE_WORDS[mode] ?? mode) : "NO CONTACT");
+  text("mode", known ? (MODE_WORDS[mode] ?? mode) : "NO CONNECTION");
   text("mode-mark", known ? (MODE_MARKS[mode] ?? "?") : "○");
   if (now < alarmUntil) return;
-  if (!linked) alarm("No contact with the console server: what you see is old.");
-  else if (!mode) alarm("The controller has not reported yet.");
-  else if (!reportAlive) alarm("No report from the controller: what you see is old.");
+  if (!linked) alarm("No connection to the console server: the display is outdated.");
+  else if (!mode) alarm("Waiting for the first controller report.");
+  else if (!reportAlive) alarm("No report from the controller: the display is outdated.");
   else $("alarm").hidden = true;
 }
 
@@ -85,7 +85,7 @@ function alarm(text, holdMs = 0) {
   if (holdMs) alarmUntil = performance.now() + holdMs;
 }
 
-// ---- showing ---------------------------------------------------------------------------------------------
+// ---- display ---------------------------------------------------------------------------------------------
 
 function show(state) {
   reportAlive = state.alive;
@@ -150,7 +150,7 @@ function error(spec, value) {
   return spec.kind === "prismatic" ? `${fixed(value * 1000, 0)} mm` : `${fixed((value * 180) / Math.PI, 2)}°`;
 }
 
-/** A fixed number of digits without a minus sign before zero. */
+/** A fixed number of digits, without a minus sign before zero. */
 function fixed(value, digits) {
   const shown = value.toFixed(digits);
   return (Number(shown) === 0 ? Math.abs(Number(shown)).toFixed(digits) : shown).replace("-", "−");
@@ -196,10 +196,10 @@ function build() {
 }
 
 async function start() {
-  // STOP is wired above and works even if everything below fails.
+  // STOP is connected above and works even if everything below fails.
   machine = await (await fetch("api/machine")).json();
   build();
-  if (machine.carrier) mission = createMission(machine, order, { number, text });
+  if (machine.carrier) mission = createMission(machine, sendMission, { number, text });
   connect();
   setInterval(watch, 100);
   try {
@@ -213,9 +213,9 @@ async function start() {
     }
   } catch (error) {
     const note = document.createElement("p");
-    note.textContent = `The 3-D view needs WebGL and cannot be shown here (${error.message}). All else works.`;
+    note.textContent = `The 3-D view needs WebGL and is not available here (${error.message}). Everything else works.`;
     $("scene").replaceChildren(note);
   }
 }
 
-start().catch((error) => alarm(`The page cannot start: ${error.message}`, Infinity));
+start().catch((error) => alarm(`The page could not start: ${error.message}`, Infinity));

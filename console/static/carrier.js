@@ -1,5 +1,5 @@
-// The carrier under the crane: rear frame with the bunk, bent front half, four wheels on their arms, and the ground where
-// the heights of the frame put it.  Group `rear` is the rear frame: x ahead, y left, origin on the articulation axis.
+// The carrier in the 3-D view: rear frame with the bunk, articulated front half, four wheels on their swing arms, and the
+// ground at the height of the wheels.  Group `rear` is the rear frame: x ahead, y left, origin on the articulation axis.
 
 import * as THREE from "three";
 
@@ -13,7 +13,7 @@ function box(parent, [x, y, z], size, color) {
   parent.add(mesh);
 }
 
-/** A wheel on its arm; `update(height)` is how high the frame stands over it, from its lowest. */
+/** A wheel on its swing arm; `update(height)` sets the frame height above its lowest position [m]. */
 function createWheel(parent, c, axle, side) {
   const wheel = new THREE.Group(), y = (side * c.track_width_m) / 2;
   const tyre = new THREE.CylinderGeometry(c.wheel_radius_m, c.wheel_radius_m, c.wheel_width_m, 28);
@@ -32,7 +32,7 @@ function createWheel(parent, c, axle, side) {
   };
 }
 
-/** Builds it into `scene`; `update(vehicle)` bends it and raises it, `ground` is moved to where the wheels stand. */
+/** Adds the carrier to `scene`; `update(vehicle)` sets articulation and heights, and moves `ground` below the wheels. */
 export function createCarrier(scene, machine, ground) {
   const c = machine.carrier, [x, y, z] = c.crane_base_m, turn = -c.crane_yaw_rad;
   const rear = new THREE.Group(), front = new THREE.Group();

@@ -1,14 +1,14 @@
-// The site from above: route, fence, landing, the way driven, the machine to scale, the logs.  Metres, north up.
+// Map of the site: route, fences, landings, track, logs, and the machine to scale.  Metres, north up.
 
 const STEPS_M = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
 const MACHINE_VIEW_M = 14;
 const NAMES = ["text", "soft", "line", "panel", "good", "reference", "stop-bright", "route", "trail", "log", "target", "halo"];
 
-/** Draws into `canvas`; returns `{mission, vehicle, trail, crane, view, draw}`.  `onMoved` is told of a hand on it. */
+/** Draws into `canvas`; returns `{mission, vehicle, crane, trail, view}`.  Calls `onMoved` when the user moves the map. */
 export function createMap(canvas, machine, onMoved) {
   const carrier = machine.carrier;
-  let mission = null, told = true, vehicle = null, points = null, trail = [];
-  let view = "site", center = [0, 0], scale = 10, asked = false, ink = inks();
+  let mission = null, current = true, vehicle = null, points = null, trail = [];
+  let view = "site", center = [0, 0], scale = 10, scheduled = false, ink = inks();
 
   matchMedia("(prefers-color-scheme: light)").addEventListener("change", () => { ink = inks(); draw(); });
   new ResizeObserver(draw).observe(canvas);
@@ -19,12 +19,12 @@ export function createMap(canvas, machine, onMoved) {
   }
 
   function draw() {
-    if (asked) return;
-    asked = true;
-    requestAnimationFrame(() => { asked = false; paint(); });
+    if (scheduled) return;
+    scheduled = true;
+    requestAnimationFrame(() => { scheduled = false; paint(); });
   }
 
-  // ---- what is seen ----------------------------------------------------------------------------------------
+  // ---- map section ----------------------------------------------------------------------------------------
 
   function fit(width, height) {
     const place = vehicle?.place;
@@ -61,7 +61,7 @@ export function createMap(canvas, machine, onMoved) {
     };
     g.lineJoin = g.lineCap = "round";
     g.font = "12px system-ui, sans-serif";
-    g.globalAlpha = told ? 1 : 0.4; // what is old pales; the machine does by itself
+    g.globalAlpha = current ? 1 : 0.4; // outdated data are drawn pale; the machine has its own state
     if (mission) paintSite(g, at, path);
     stroke(g, ink.trail, 2.5, [], () => path(trail));
     if (mission) for (const log of mission.logs) paintLog(g, at, log);
@@ -99,7 +99,7 @@ export function createMap(canvas, machine, onMoved) {
     stroke(g, log.given_up ? ink.soft : ink.log, wide, log.given_up ? [2, 5] : [], line);
   }
 
-  /** The name of the log that is aimed at, on its far side from the machine. */
+  /** The name of the target log, on its far side from the machine. */
   function paintName(g, at, log) {
     const [x, y] = at(log.at), place = vehicle?.place;
     const [px, py] = place ? at([place.x_m, place.y_m]) : [x, y + 1];
@@ -131,8 +131,8 @@ export function createMap(canvas, machine, onMoved) {
       return rear(c.crane_base_m[0] + x * Math.cos(t) - y * Math.sin(t),
         c.crane_base_m[1] + x * Math.sin(t) + y * Math.cos(t));
     };
-    const foot = yard(0, 0);
-    stroke(g, color, 1, [3, 5], () => { g.beginPath(); g.arc(...foot, machine.reach_m * scale, 0, 2 * Math.PI); });
+    const base = yard(0, 0);
+    stroke(g, color, 1, [3, 5], () => { g.beginPath(); g.arc(...base, machine.reach_m * scale, 0, 2 * Math.PI); });
     for (const [to, axle] of [[front, c.front_axle_m], [rear, -c.rear_axle_m]]) {
       for (const side of [-1, 1]) {
         const y = (side * c.track_width_m) / 2;
@@ -159,7 +159,7 @@ export function createMap(canvas, machine, onMoved) {
       const [x, y] = yard(points.at(-1)[0], points.at(-1)[1]);
       dot(g, x, y, 4, ink.reference);
     }
-    dot(g, ...foot, 3, color);
+    dot(g, ...base, 3, color);
   }
 
   function paintScale(g, width, height) {
@@ -194,36 +194,36 @@ export function createMap(canvas, machine, onMoved) {
     g.fill();
   }
 
-  function label(g, words, x, y, color) {
+  function label(g, text, x, y, color) {
     g.lineWidth = 3;
     g.strokeStyle = ink.halo;
-    g.strokeText(words, x, y);
+    g.strokeText(text, x, y);
     g.fillStyle = color;
-    g.fillText(words, x, y);
+    g.fillText(text, x, y);
   }
 
-  // ---- a hand on it: drag, wheel, two fingers --------------------------------------------------------------
+  // ---- user input: drag, wheel, two fingers --------------------------------------------------------------
 
   const held = new Map();
   const spread = () => { const [a, b] = [...held.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]); };
-  const byHand = () => { view = "free"; onMoved(); };
+  const movedByUser = () => { view = "free"; onMoved(); };
   canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); held.set(e.pointerId, [e.offsetX, e.offsetY]); });
   canvas.addEventListener("pointermove", (e) => {
     const before = held.get(e.pointerId);
     if (!before) return;
     const apart = held.size === 2 ? spread() : 0;
     held.set(e.pointerId, [e.offsetX, e.offsetY]);
-    byHand();
+    movedByUser();
     center = [center[0] - (e.offsetX - before[0]) / scale / held.size, center[1] + (e.offsetY - before[1]) / scale / held.size];
     if (apart) zoom(spread() / apart);
     draw();
   });
   for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (e) => held.delete(e.pointerId));
-  canvas.addEventListener("wheel", (e) => { e.preventDefault(); byHand(); zoom(Math.exp(-e.deltaY / 500)); draw(); }, { passive: false });
+  canvas.addEventListener("wheel", (e) => { e.preventDefault(); movedByUser(); zoom(Math.exp(-e.deltaY / 500)); draw(); }, { passive: false });
   const zoom = (by) => { scale = Math.min(200, Math.max(0.05, scale * by)); };
 
   return {
-    mission(report, fresh) { mission = report; told = fresh; },
+    mission(report, isCurrent) { mission = report; current = isCurrent; },
     vehicle(now) {
       vehicle = now;
       const p = now?.place, last = trail.at(-1);

@@ -1,20 +1,20 @@
-// The mission and the vehicle in words and numbers, and the orders that a person gives.  Shown once a mission was told.
+// Mission and vehicle in text and numbers, and the mission commands.  Shown after the first mission report.
 
 import { createMap } from "./map.js";
 
 const $ = (id) => document.getElementById(id);
-const ORDERS = { auto: "auto", pause: "pause", "next-step": "next-step" };
+const COMMANDS = { auto: "auto", pause: "pause", "next-step": "next-step" };
 const ARMS = ["front left", "front right", "rear left", "rear right"];
 
-/** `order(name)` sends one; returns `{show(state)}`. */
-export function createMission(machine, order, { number, text }) {
+/** `send(name)` sends a mission command; returns `{show(state), recall()}`. */
+export function createMission(machine, send, { number, text }) {
   let map = null, mission = null;
 
-  for (const [id, name] of Object.entries(ORDERS)) $(id).addEventListener("click", () => order(name));
-  $("single").addEventListener("click", () => order(mission?.single_step ? "run-through" : "single-step"));
+  for (const [id, name] of Object.entries(COMMANDS)) $(id).addEventListener("click", () => send(name));
+  $("single").addEventListener("click", () => send(mission?.single_step ? "run-through" : "single-step"));
   $("abort").addEventListener("click", () => { $("end").show(); $("end-no").focus(); });
   $("end-no").addEventListener("click", () => $("end").close());
-  $("end-yes").addEventListener("click", () => { $("end").close(); order("abort"); });
+  $("end-yes").addEventListener("click", () => { $("end").close(); send("abort"); });
 
   function begin() {
     document.body.dataset.mission = "there";
@@ -26,7 +26,7 @@ export function createMission(machine, order, { number, text }) {
     recall();
   }
 
-  /** The way driven before this page was opened, or while it had no contact. */
+  /** The track driven before this page was opened or while it was disconnected. */
   async function recall() {
     const answer = await fetch("api/trail");
     if (answer.ok) map?.trail(await answer.json());
@@ -39,21 +39,21 @@ export function createMission(machine, order, { number, text }) {
       showMission(mission);
     }
     if (!mission) return;
-    const m = mission, told = state.mission_alive, open = told && !m.ended && state.may_order;
-    $("mission").classList.toggle("old", !told);
-    text("mission-age", told ? m.name : `told ${age(state.mission_age_s)} ago`);
-    text("mission-note", note(m, told));
+    const m = mission, current = state.mission_alive, open = current && !m.ended && state.may_order;
+    $("mission").classList.toggle("old", !current);
+    text("mission-age", current ? m.name : `last report ${age(state.mission_age_s)} ago`);
+    text("mission-note", note(m, current));
     $("auto").disabled = !open || m.auto;
     $("pause").disabled = !open || !m.auto;
     $("single").disabled = $("abort").disabled = !open;
     $("next-step").disabled = !open || !m.waits_for || !m.auto;
     $("single").setAttribute("aria-pressed", m.single_step);
     if (!open && $("end").open) $("end").close();
-    map.mission(mission, told);
+    map.mission(mission, current);
     map.crane(state.points ?? null);
     map.vehicle(state.vehicle);
     showVehicle(state.vehicle);
-    $("site").classList.toggle("old", !told && !state.vehicle?.place_alive);
+    $("site").classList.toggle("old", !current && !state.vehicle?.place_alive);
   }
 
   function showMission(m) {
@@ -66,26 +66,26 @@ export function createMission(machine, order, { number, text }) {
     text("known", String(m.logs.filter((log) => !log.given_up).length));
     text("target", m.targets.length ? `log ${m.targets.join(", ")}` : "–");
     text("missed-grasps", String(m.missed));
-    const left = m.given_up.map((g) => `Log ${g.log} is left: ${g.reason}.`);
+    const left = m.given_up.map((g) => `Log ${g.log} given up: ${g.reason}.`);
     if ($("given-up").dataset.shown !== left.join()) {
       $("given-up").dataset.shown = left.join();
-      $("given-up").replaceChildren(...left.map((words) => Object.assign(document.createElement("li"), { textContent: words })));
+      $("given-up").replaceChildren(...left.map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence })));
     }
   }
 
-  function note(m, told) {
-    if (!told) return m.ended ? "The mission has ended." : "The planner is silent: what you see here is old.";
-    if (m.ended) return m.failure ? `It ended early: ${m.failure}.` : "";
-    if (m.refusal) return `Not obeyed: ${m.refusal}.`;
-    if (!m.auto) return "Paused. Press Auto to go on.";
-    if (m.paused) return `It waits: ${m.paused}.`;
-    if (m.waits_for) return `It waits for you, because ${m.waits_for}. Press Next step.`;
+  function note(m, current) {
+    if (!current) return m.ended ? "The mission has ended." : "No report from the planner: the display is outdated.";
+    if (m.ended) return m.failure ? `The mission failed: ${m.failure}.` : "";
+    if (m.refusal) return `Command refused: ${m.refusal}.`;
+    if (!m.auto) return "Paused. Press Auto to resume.";
+    if (m.paused) return `Paused: ${m.paused}.`;
+    if (m.waits_for) return `Ready for the next step: ${m.waits_for}. Press Next step.`;
     return "";
   }
 
   function showVehicle(v) {
     $("vehicle").classList.toggle("old", !v?.alive);
-    text("vehicle-age", !v ? "not reported yet" : v.alive ? v.driving : `told ${age(v.age_s)} ago`);
+    text("vehicle-age", !v ? "no report yet" : v.alive ? v.driving : `last report ${age(v.age_s)} ago`);
     if (!v) return;
     text("speed", v.speed_m_s === null ? "–" : `${number(v.speed_m_s * 3.6, 1)} km/h`);
     text("heading", v.heading_deg === null ? "–" : `${number((v.heading_deg + 360) % 360, 0)}°`);
@@ -101,7 +101,7 @@ export function createMission(machine, order, { number, text }) {
       $(`arm-${i}`).title = ARMS[i];
       text(`arm-${i}`, h === null ? "–" : `${number(h * 100, 0)} cm`);
     });
-    text("vehicle-note", v.stale.length ? `Nothing fresh of: ${v.stale.join(", ")}.` : "");
+    text("vehicle-note", v.stale.length ? `Outdated inputs: ${v.stale.join(", ")}.` : "");
   }
 
   function sided(degrees, plus, minus) {

@@ -1,4 +1,4 @@
-// The simulated plant in three dimensions: boxes on moving links, logs, ground, numbers and the hand levers.
+// 3-D view of the simulated plant: link shapes, logs, ground, numbers and the hand levers.
 // World frame: metres, z up.  A pose is [x, y, z, qx, qy, qz, qw].
 
 import * as THREE from "three";
@@ -15,7 +15,7 @@ function place(object, pose) {
   object.quaternion.set(pose[3], pose[4], pose[5], pose[6]);
 }
 
-/** Everything that is drawn; `update(view)` moves it. */
+/** Builds the scene; `update(state, follow)` moves it. */
 function createView(container, scene) {
   const { world, camera, controls, draw, look } = createViewport(
     container, { nearest: 1, farthest: 80, sight: 300 });
@@ -75,7 +75,7 @@ function createView(container, scene) {
   return { update, view };
 }
 
-/** A tapered, bowed log along its z axis: rings around the bow, one group for bark, one for the ends. */
+/** A tapered, bowed log along its z axis: rings along the bow; one material group for the bark, one for the ends. */
 function logShape({ length_m: length, diameter_m: diameter, taper_m_m: taper, sweep_m: sweep }) {
   const RINGS = 9, SIDES = 18, at = [], index = [];
   for (let i = 0; i < RINGS; i++) {
@@ -112,7 +112,7 @@ function logShape({ length_m: length, diameter_m: diameter, taper_m_m: taper, sw
   return shape;
 }
 
-/** Flat ground as a disc with a grid, rough ground as the height grid it is. */
+/** Flat ground as a disc with a grid, rough ground as its height grid. */
 function ground(g) {
   const group = new THREE.Group();
   if (g.heights) {
@@ -185,7 +185,7 @@ async function pull(name, value) {
     const answer = await fetch(`api/plant/lever?${query}`, { method: "POST", signal: AbortSignal.timeout(1500) });
     $("refusal").textContent = answer.ok ? "" : await answer.text();
   } catch (error) {
-    $("refusal").textContent = `The lever did not move: ${error.message}`;
+    $("refusal").textContent = `The lever could not be moved: ${error.message}`;
   }
 }
 
@@ -218,7 +218,7 @@ function buildLevers(levers) {
 
 // ---- link --------------------------------------------------------------------------------------------------
 
-let view = null, heard = 0, follow = false;
+let view = null, received = 0, follow = false;
 
 function connect() {
   const url = new URL("ws/plant", location.href);
@@ -227,7 +227,7 @@ function connect() {
   socket.addEventListener("message", (event) => {
     const state = JSON.parse(event.data);
     if (!state) return;
-    heard = performance.now();
+    received = performance.now();
     $("clock").textContent = `${state.time_s.toFixed(1)} s`;
     view?.update(state, follow);
     showFacts(state.facts);
@@ -237,11 +237,11 @@ function connect() {
 }
 
 function watch() {
-  const alive = performance.now() - heard < LOST_AFTER_MS;
+  const alive = performance.now() - received < LOST_AFTER_MS;
   document.body.dataset.link = alive ? "ok" : "lost";
-  if (!alive) $("clock").textContent = "NO CONTACT";
-  $("alarm").hidden = alive || !heard;
-  $("alarm").textContent = "The plant is silent: what you see is old.";
+  if (!alive) $("clock").textContent = "NO CONNECTION";
+  $("alarm").hidden = alive || !received;
+  $("alarm").textContent = "No data from the plant: the display is outdated.";
 }
 
 async function start() {
@@ -266,12 +266,12 @@ async function start() {
     });
   } catch (error) {
     const note = document.createElement("p");
-    note.textContent = `The 3-D view needs WebGL and cannot be shown here (${error.message}). The numbers go on.`;
+    note.textContent = `The 3-D view needs WebGL and is not available here (${error.message}). The numbers are still updated.`;
     $("scene").replaceChildren(note);
   }
 }
 
 start().catch((error) => {
   $("alarm").hidden = false;
-  $("alarm").textContent = `The page cannot start: ${error.message}`;
+  $("alarm").textContent = `The page could not start: ${error.message}`;
 });

@@ -1,7 +1,7 @@
-// A small time plot: one line per joint over the last seconds, drawn on a canvas.
+// Time plot on a canvas: one line per joint over the last seconds.
 
 const SPAN_S = 20;
-/** Dashes by joint; the colours are the style sheet's. */
+/** Dash pattern of each joint; the colours come from the style sheet. */
 export const LINES = [[], [7, 3], [2, 3], [9, 3, 2, 3], [4, 4]];
 
 /** Keeps samples of `{t, values}` (t in seconds, a value may be null) and draws them; returns `{add}`. */

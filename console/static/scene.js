@@ -1,4 +1,4 @@
-// The crane, the ground, the bunk and the logs in three dimensions.  Base frame of the crane: metres, z up.
+// 3-D view of crane, ground, bunk and logs, in the base frame of the crane: metres, z up.
 
 import * as THREE from "three";
 import { createCarrier } from "./carrier.js";
@@ -6,9 +6,9 @@ import { createViewport } from "./viewport.js";
 
 const CRANE = 0xe0a22e, STEEL = 0x8b979f, DARK = 0x39443f, BARK = 0x8a5a35, WOOD = 0xe2b883, GHOST = 0xcfe3ff;
 const UP = new THREE.Vector3(0, 1, 0);
-/** For a crane of this reach; a longer one is looked at from farther away. */
+/** The views fit a crane of this reach; a longer one is seen from farther away. */
 const VIEWED_M = 6.95;
-/** A machine that drives works on all sides: its views look at its middle. */
+/** View target of a machine that drives, which works on all sides. */
 const VEHICLE = [0.5, 0, 0.5];
 const VIEWS = {
   corner: [[6.8, 9.4, 4.9], [0.75, 2.2, 0.7]],
@@ -19,7 +19,7 @@ const VIEWS = {
 const v3 = (p) => new THREE.Vector3(p[0], p[1], p[2]);
 const paint = (color) => new THREE.MeshLambertMaterial({ color });
 
-/** A bar between two movable ends; round or square. */
+/** A bar between two movable end points, round or square. */
 class Bar {
   constructor(parent, radius, color, square = false) {
     const shape = square
@@ -58,10 +58,10 @@ class Crane {
     this.rotator = new Bar(parent, 0.11, DARK);
     this.body = new Bar(parent, 0.07, CRANE, true);
     this.pins = [0.15, 0.14, 0.07].map((r) => ball(parent, r, STEEL));
-    this.tongs = [0, 1].map(() => [new Bar(parent, 0.045, CRANE), new Bar(parent, 0.035, STEEL)]);
+    this.jaws = [0, 1].map(() => [new Bar(parent, 0.045, CRANE), new Bar(parent, 0.035, STEEL)]);
     this.knees = [0, 1].map(() => ball(parent, 0.047, CRANE));
   }
-  update(points, tongs) {
+  update(points, jaws) {
     const [base, boomPin, stickPin, front, pin, rotator, grapple] = points.map(v3);
     const axis = pin.clone().sub(front).normalize();
     const back = front.clone().addScaledVector(axis, -axis.dot(front.clone().sub(stickPin)));
@@ -72,22 +72,22 @@ class Crane {
     this.link.span(pin, rotator);
     this.rotator.span(rotator.clone().setZ(rotator.z + 0.1), rotator.clone().setZ(rotator.z - 0.08));
     [boomPin, stickPin, pin].forEach((p, i) => this.pins[i].position.copy(p));
-    const open = new THREE.Vector3(Math.cos(tongs.yaw_rad), Math.sin(tongs.yaw_rad), 0);
+    const open = new THREE.Vector3(Math.cos(jaws.yaw_rad), Math.sin(jaws.yaw_rad), 0);
     const at = (x, below) => pin.clone().addScaledVector(open, x).setZ(pin.z - below);
     const depth = pin.z - grapple.z;
     this.body.span(at(-0.3, depth), at(0.3, depth));
     [-1, 1].forEach((side, i) => {
-      const pivot = at(side * 0.275, depth), tip = at(side * tongs.half_gap_m, tongs.tip_below_m);
-      const outward = Math.max(0.12, 0.5 * Math.abs(tongs.half_gap_m));
-      const knee = at(side * (0.275 + outward), depth + 0.45 * (tongs.tip_below_m - depth));
-      this.tongs[i][0].span(pivot, knee);
-      this.tongs[i][1].span(knee, tip);
+      const pivot = at(side * 0.275, depth), tip = at(side * jaws.half_gap_m, jaws.tip_below_m);
+      const outward = Math.max(0.12, 0.5 * Math.abs(jaws.half_gap_m));
+      const knee = at(side * (0.275 + outward), depth + 0.45 * (jaws.tip_below_m - depth));
+      this.jaws[i][0].span(pivot, knee);
+      this.jaws[i][1].span(knee, tip);
       this.knees[i].position.copy(knee);
     });
   }
 }
 
-/** The ground, with the yard where a machine that stands still picks its logs; returns what may be moved. */
+/** The ground, with the picking area of a stationary machine; returns the group to move. */
 function addGround(scene, machine) {
   const z = machine.ground_z_m, ground = new THREE.Group();
   const disc = new THREE.Mesh(new THREE.CircleGeometry(14, 64), paint(0x22302a));
@@ -176,9 +176,9 @@ export function createScene(container, machine) {
   }
 
   function update(state) {
-    // An unknown pose is not drawn at all.
+    // An unknown pose is not drawn.
     craneGroup.visible = Boolean(state.points);
-    if (state.points) crane.update(state.points, state.tongs);
+    if (state.points) crane.update(state.points, state.jaws);
     ghost.visible = Boolean(state.reference_points);
     ghostPin.visible = ghost.visible && v3(state.reference_points[4]).distanceTo(v3(state.points[4])) > 0.1;
     if (state.reference_points) {

@@ -1,4 +1,4 @@
-// A three-dimensional window: renderer, camera and controls; draws when something has changed.  Metres, z up.
+// 3-D viewport: renderer, camera and controls; draws on change.  Metres, z up.
 
 import * as THREE from "three";
 import { OrbitControls } from "./vendor/OrbitControls.js";
@@ -16,11 +16,11 @@ export function createViewport(container, { nearest, farthest, sight }) {
   controls.minDistance = nearest;
   controls.maxDistance = farthest;
 
-  let asked = false;
+  let scheduled = false;
   function draw() {
-    if (asked) return;
-    asked = true;
-    requestAnimationFrame(() => { asked = false; renderer.render(world, camera); });
+    if (scheduled) return;
+    scheduled = true;
+    requestAnimationFrame(() => { scheduled = false; renderer.render(world, camera); });
   }
   controls.addEventListener("change", draw);
   new ResizeObserver(() => {
@@ -28,7 +28,7 @@ export function createViewport(container, { nearest, farthest, sight }) {
     if (!w || !h) return;
     renderer.setSize(w, h);
     camera.aspect = w / h;
-    // As wide as a crane reaches to both sides, in a tall panel too.
+    // Keeps the reach of the crane on both sides in view, also in a tall panel.
     camera.fov = Math.max(42, 2 * Math.atan(0.58 * h / w) * 180 / Math.PI);
     camera.updateProjectionMatrix();
     draw();

@@ -18,19 +18,19 @@ MEASURED = (0.5, 0.9, -2.0, 0.5, nan)
 
 
 def drawn(profile, told: float) -> dict:
-    watch = CraneState(profile)
+    crane_state = CraneState(profile)
     report = StateReport(
         1, profile_hash(profile), 5_000_000_000, Mode.ACTIVE, 0, 0, 1, 0, 0, 0, MEASURED,
         (0.0,) * 5, (*MEASURED[:4], told), nan, nan, nan, 0, 0, 0, 0,
     )  # fmt: skip
-    assert watch.on_report(encode(report), 0)
-    state = watch.state(0)
+    assert crane_state.on_report(encode(report), 0)
+    state = crane_state.state(0)
     json.dumps(state, allow_nan=False)
     return state
 
 
 def test_a_rotator_without_encoder_is_drawn_where_it_was_told_to_be():
-    across = drawn(FORWARDER, nan)["tongs"]["yaw_rad"]
-    assert drawn(FORWARDER, 0.3)["tongs"]["yaw_rad"] == pytest.approx(across + 0.3)
+    across = drawn(FORWARDER, nan)["jaws"]["yaw_rad"]
+    assert drawn(FORWARDER, 0.3)["jaws"]["yaw_rad"] == pytest.approx(across + 0.3)
     assert drawn(FORWARDER, 0.3)["position"][4] is None and drawn(FORWARDER, 0.3)["opening_pct"] is None
     assert drawn(PALMS, 0.3)["points"] is None, "a lost encoder is not guessed"

@@ -19,7 +19,7 @@ from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.timing.page import TimingWriter
 from console.server import STATIC, Console, create_app
-from console.state import ALIVE_NS, TIMING_OLD_NS, CraneState, describe_machine
+from console.state import REPORT_TIMEOUT_NS, TIMING_TIMEOUT_NS, CraneState, describe_machine
 from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
@@ -187,11 +187,11 @@ def test_console_without_a_controller_only_watches():
 
 
 def test_state_flows_over_the_websocket(console, client):
-    console.watch.on_report(encode(REPORT), 10**10)
+    console.crane_state.on_report(encode(REPORT), 10**10)
     with client.websocket_connect("ws://127.0.0.1:8471/ws", headers={"origin": HERE}) as ws:
         state = ws.receive_json()
         assert state["mode"] == "ACTIVE" and state["alive"] and state["may_command"]
-        console.watch.on_report(encode(replace(REPORT, mode=Mode.FAULT)), 10**10)
+        console.crane_state.on_report(encode(replace(REPORT, mode=Mode.FAULT)), 10**10)
         while ws.receive_json()["mode"] != "FAULT":
             pass
 
@@ -232,9 +232,9 @@ def test_logs_of_a_detector_are_shown(controller_socket):
 
 
 def watched(report=REPORT, at_ns=0, seen_ns=0):
-    watch = CraneState(PROFILE)
-    assert watch.on_report(encode(report), at_ns)
-    return watch.state(seen_ns)
+    crane_state = CraneState(PROFILE)
+    assert crane_state.on_report(encode(report), at_ns)
+    return crane_state.state(seen_ns)
 
 
 def test_state_says_why_and_what_is_stale():
@@ -257,41 +257,44 @@ def test_unknown_numbers_are_none_and_the_state_is_json():
 
 
 def test_silence_is_noticed_within_a_second():
-    watch = CraneState(PROFILE)
-    watch.on_report(encode(REPORT), 0)
-    assert watch.state(ALIVE_NS - 1)["alive"] and not watch.state(ALIVE_NS)["alive"]
+    crane_state = CraneState(PROFILE)
+    crane_state.on_report(encode(REPORT), 0)
+    assert crane_state.state(REPORT_TIMEOUT_NS - 1)["alive"] and not crane_state.state(REPORT_TIMEOUT_NS)["alive"]
     # The page is told every 50 ms and looks every 100 ms.
-    assert ALIVE_NS + 150_000_000 < 1_000_000_000
+    assert REPORT_TIMEOUT_NS + 150_000_000 < 1_000_000_000
 
 
 def test_peaks_hold_for_a_second():
-    watch = CraneState(PROFILE)
+    crane_state = CraneState(PROFILE)
     for k, tick_ns in enumerate((900_000, 100_000, 100_000)):
         report = replace(REPORT, tick_ns=tick_ns, stamp_ns=k * 20_000_000, frames_received=64 * k)
-        watch.on_report(encode(report), k * 20_000_000)
-    assert watch.state(50_000_000)["tick_ms"] == 0.9
-    assert watch.state(50_000_000)["frames_per_s"] == 3200
-    assert watch.state(1_010_000_000)["tick_ms"] == 0.1
+        crane_state.on_report(encode(report), k * 20_000_000)
+    assert crane_state.state(50_000_000)["tick_ms"] == 0.9
+    assert crane_state.state(50_000_000)["frames_per_s"] == 3200
+    assert crane_state.state(1_010_000_000)["tick_ms"] == 0.1
 
 
 def test_timing_is_shown_while_the_controller_writes_it(timing):
-    watch = CraneState(PROFILE)
-    assert watch.state(0)["timing"] is None
+    crane_state = CraneState(PROFILE)
+    assert crane_state.state(0)["timing"] is None
     page = timing(100, missed=3, written_ns=10**10)
-    watch.on_timing(page)
-    seen = watch.state(10**10)["timing"]
+    crane_state.on_timing(page)
+    seen = crane_state.state(10**10)["timing"]
     wake, cpu = page.durations["wake"], page.durations["cpu"]
     assert (seen["ticks"], seen["missed"]) == (100, 3)
     assert (seen["wake_us"], seen["cpu_us"]) == (wake.quantile_ns(0.99) / 1e3, cpu.quantile_ns(0.99) / 1e3)
     assert seen["sample_to_command_ms"] == page.durations["sample_to_command"].quantile_ns(0.99) / 1e6
     assert (seen["oldest_input"], seen["oldest_input_ms"]) == ("Input6", 16.0)
     json.dumps(seen, allow_nan=False)
-    assert watch.state(10**10 + TIMING_OLD_NS - 1)["timing"] and not watch.state(10**10 + TIMING_OLD_NS)["timing"]
+    assert (
+        crane_state.state(10**10 + TIMING_TIMEOUT_NS - 1)["timing"]
+        and not crane_state.state(10**10 + TIMING_TIMEOUT_NS)["timing"]
+    )
 
 
 def test_the_page_file_is_read_and_its_end_is_noticed(timing, tmp_path, monkeypatch):
-    monkeypatch.setattr("console.server.LOOK_AT_TIMING_S", 0.01)
-    monkeypatch.setattr("console.state.TIMING_OLD_NS", 200_000_000)
+    monkeypatch.setattr("console.server.TIMING_PERIOD_S", 0.01)
+    monkeypatch.setattr("console.state.TIMING_TIMEOUT_NS", 200_000_000)
     path = tmp_path / "controller.timing"
     console = Console(PROFILE, 1, timing_page=path)
     with client_of(console) as client, client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
@@ -308,12 +311,12 @@ def test_the_page_file_is_read_and_its_end_is_noticed(timing, tmp_path, monkeypa
 
 
 def test_foreign_datagrams_change_nothing():
-    watch = CraneState(PROFILE)
+    crane_state = CraneState(PROFILE)
     good = encode(REPORT)
     command = OperatorCommand(1, 2, 3, OperatorAction.STOP)
     for bad in (b"", b"x", good[:-1], good[:40] + b"\xff" + good[41:], encode(command)):
-        assert not watch.on_report(bad, 0)
-    assert "mode" not in watch.state(0)
+        assert not crane_state.on_report(bad, 0)
+    assert "mode" not in crane_state.state(0)
 
 
 def test_drawing_hangs_the_grapple_below_the_pin():
@@ -321,7 +324,7 @@ def test_drawing_hangs_the_grapple_below_the_pin():
     base, _, _, _, pin, rotator, grapple = state["points"]
     assert base == [0, 0, 0] and pin[:2] == grapple[:2] and pin[2] > rotator[2] > grapple[2]
     assert state["reference_points"][4] != pin
-    assert state["tongs"]["yaw_rad"] == pytest.approx(0.4)
+    assert state["jaws"]["yaw_rad"] == pytest.approx(0.4)
 
 
 def test_machine_description_names_every_joint_once():

@@ -13,9 +13,9 @@ from starlette.testclient import TestClient
 
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.mission import MissionOrder, Order, decode_order, encode_mission
-from can_dbc.messages.vehicle import VEHICLE_INPUTS
+from can_dbc.messages.vehicle import VEHICLE_INPUTS, Driving
 from console.map_projection import MapProjection
-from console.mission_state import INPUT_NAMES, TOLD_NS, TRAIL_M, VEHICLE_NS
+from console.mission_state import DRIVING, FIXES, INPUT_NAMES, MISSION_TIMEOUT_NS, TRAIL_M, VEHICLE_TIMEOUT_NS
 from console.server import Console, create_app
 from console.state import CraneState, describe_machine
 from machine.loading.profile_file import load_profile, profile_hash
@@ -25,24 +25,24 @@ from tests.console.vehicle_reports import HASH, PROFILE, VEHICLE
 BASE = "http://127.0.0.1:8471"
 
 
-def watch(profile=PROFILE, key=None) -> CraneState:
+def crane_state(profile=PROFILE, key=None) -> CraneState:
     return CraneState(profile, key, profile_hash(profile))
 
 
 def told(
-    watch: CraneState, report=TOLD, stamp_ns: int = 10**9, code: int = HASH, key=None, now_ns: int = 10**9
+    crane_state: CraneState, report=TOLD, stamp_ns: int = 10**9, code: int = HASH, key=None, now_ns: int = 10**9
 ) -> bool:
-    return watch.on_report(encode_mission(report, 1, code, stamp_ns, key), now_ns)
+    return crane_state.on_report(encode_mission(report, 1, code, stamp_ns, key), now_ns)
 
 
 # ---- the mission ------------------------------------------------------------------------------------------------
 
 
 def test_a_mission_is_shown_in_words_and_metres() -> None:
-    seen = watch()
-    assert seen.forwarding.mission() is None and seen.state(0)["mission_age_s"] is None
+    seen = crane_state()
+    assert seen.mission_state.mission() is None and seen.state(0)["mission_age_s"] is None
     assert told(seen)
-    mission = seen.forwarding.mission()
+    mission = seen.mission_state.mission()
     json.dumps(mission, allow_nan=False)
     assert (mission["words"], mission["on_board"], mission["targets"]) == ("drives up to the log", 3, (7,))
     assert mission["given_up"] == [{"log": 9, "reason": "log 9 was missed 3 times"}]
@@ -52,43 +52,43 @@ def test_a_mission_is_shown_in_words_and_metres() -> None:
 
 
 def test_a_silent_planner_is_noticed_and_its_age_is_told() -> None:
-    seen = watch()
+    seen = crane_state()
     told(seen, now_ns=10**9)
-    assert seen.state(10**9 + TOLD_NS - 1)["mission_alive"]
-    late = seen.state(10**9 + 4 * TOLD_NS)
+    assert seen.state(10**9 + MISSION_TIMEOUT_NS - 1)["mission_alive"]
+    late = seen.state(10**9 + 4 * MISSION_TIMEOUT_NS)
     assert not late["mission_alive"] and late["mission_age_s"] == 8.0
 
 
 def test_only_newer_reports_of_this_machine_with_its_key_are_taken() -> None:
-    seen = watch(key=b"right")
+    seen = crane_state(key=b"right")
     assert not told(seen) and not told(seen, key=b"wrong") and not told(seen, key=b"right", code=HASH ^ 1)
     assert not told(seen, key=b"right", stamp_ns=5 * 10**9), "from the future"
-    assert seen.forwarding.told == 0
+    assert seen.mission_state.report_count == 0
     assert told(seen, key=b"right")
     assert not told(seen, key=b"right"), "once more"
-    assert told(seen, key=b"right", stamp_ns=10**9 + 1) and seen.forwarding.told == 2
+    assert told(seen, key=b"right", stamp_ns=10**9 + 1) and seen.mission_state.report_count == 2
 
 
 # ---- the vehicle ------------------------------------------------------------------------------------------------
 
 
 def test_the_vehicle_is_shown_in_degrees_and_where_its_joint_is() -> None:
-    seen = watch()
+    seen = crane_state()
     assert seen.state(0)["vehicle"] is None
     assert seen.on_report(encode(VEHICLE), 10**9)
     shown = seen.state(10**9)["vehicle"]
     json.dumps(shown, allow_nan=False)
-    assert (shown["driving"], shown["fix"], shown["satellites"]) == ("led by the planner", "RTK fixed", 18)
+    assert (shown["driving"], shown["fix"], shown["satellites"]) == (DRIVING[Driving.DRIVING], FIXES[4], 18)
     assert (shown["heading_deg"], shown["articulation_deg"]) == (pytest.approx(90.0), pytest.approx(11.459, abs=1e-3))
     place, carrier = shown["place"], PROFILE.carrier
     # It heads east: the antenna stands so far east of the joint.
     assert place["x_m"] == pytest.approx(-carrier.antenna_main_m[0]) and place["y_m"] == pytest.approx(0.0, abs=1e-3)
     assert place["front_rad"] == pytest.approx(0.0, abs=1e-3) and place["rear_rad"] == pytest.approx(-0.2, abs=1e-3)
-    assert not seen.state(10**9 + VEHICLE_NS)["vehicle"]["alive"]
+    assert not seen.state(10**9 + VEHICLE_TIMEOUT_NS)["vehicle"]["alive"]
 
 
 def test_it_turns_with_its_heading() -> None:
-    seen = watch()
+    seen = crane_state()
     seen.on_report(encode(replace(VEHICLE, heading_rad=math.radians(30.0))), 1)
     place, ahead = seen.state(1)["vehicle"]["place"], PROFILE.carrier.antenna_main_m[0]
     assert place["x_m"] == pytest.approx(-ahead * 0.5, abs=2e-3)
@@ -96,22 +96,22 @@ def test_it_turns_with_its_heading() -> None:
 
 
 def test_an_unknown_place_keeps_the_last_one_and_says_so() -> None:
-    seen = watch()
+    seen = crane_state()
     seen.on_report(encode(VEHICLE), 0)
     lost = replace(VEHICLE, latitude_deg=math.nan, roll_rad=math.nan, fix=0, stale_mask=1 << 3 | 1 << 7)
-    seen.on_report(encode(lost), VEHICLE_NS)
-    shown = seen.state(VEHICLE_NS)["vehicle"]
+    seen.on_report(encode(lost), VEHICLE_TIMEOUT_NS)
+    shown = seen.state(VEHICLE_TIMEOUT_NS)["vehicle"]
     assert shown["alive"] and not shown["place_alive"] and shown["place"] is not None
-    assert shown["roll_deg"] is None and shown["fix"] == "no position"
+    assert shown["roll_deg"] is None and shown["fix"] == FIXES[0]
     assert shown["stale"] == ["position", "articulation"]
     assert set(INPUT_NAMES) == set(VEHICLE_INPUTS)
 
 
 def test_the_trail_grows_with_the_way() -> None:
-    seen = watch()
+    seen = crane_state()
     for k in range(100):
         seen.on_report(encode(replace(VEHICLE, longitude_deg=HERE[1] + 1e-6 * k)), k)
-    trail, step_m = seen.forwarding.trail, 0.0495
+    trail, step_m = seen.mission_state.trail, 0.0495
     assert len(trail) == pytest.approx(99 * step_m / (TRAIL_M + step_m / 2), abs=2)
     assert trail[-1][0] - trail[0][0] == pytest.approx(99 * step_m, abs=0.3)
 
@@ -186,8 +186,8 @@ def test_the_mission_comes_by_the_websocket_when_it_is_new() -> None:
     console = console_of()
     with client_of(console) as client, client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
         assert "mission" not in ws.receive_json()
-        console.watch.on_report(encode(VEHICLE), 10**10)
-        told(console.watch, stamp_ns=10**10, now_ns=10**10)
+        console.crane_state.on_report(encode(VEHICLE), 10**10)
+        told(console.crane_state, stamp_ns=10**10, now_ns=10**10)
         while "mission" not in (state := ws.receive_json()):
             pass
         assert state["mission"]["words"] == TOLD.words and state["vehicle"]["place"]
