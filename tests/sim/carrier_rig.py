@@ -1,4 +1,4 @@
-"""The carrier alone in a physics client: the crane is a lump on its foot, steering and arms are speed motors."""
+"""The carrier alone in a physics client: the crane is a mass on its foot; speed motors drive steering and arms."""
 
 from __future__ import annotations
 

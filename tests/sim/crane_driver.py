@@ -1,4 +1,4 @@
-"""A crude crane driver for plant tests: smooth references and a P law on the plant's true joints, spools out.
+"""A simple crane driver for plant tests: smooth references and a P law on the plant's true joints, spools out.
 
 It is not the controller: it reads the plant directly and compensates the profile's dead-bands.  ``Driver.pick`` and
 ``place`` take a log from the ground to the bunk.  Positions are of the hanger pin in the crane's base frame.
@@ -89,7 +89,7 @@ class Driver:
         self.tick(rates)
 
     def tip_below_pin(self, angle: float) -> float:
-        """Tong tips below the hanger pin [m] at a tong angle, from the profile's table."""
+        """Jaw tips below the hanger pin [m] at a jaw angle, from the profile's table."""
         table = self.w.profile.grapple.tongs
         pairs = list(zip(table.angle_rad, table.tip_below_pin_m, strict=True))
         for (a0, z0), (a1, z1) in pairwise(pairs):

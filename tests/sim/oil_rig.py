@@ -1,4 +1,4 @@
-"""Hydraulic functions on bare inertias: each joint is one mass with a constant load, stepped as Bullet steps it."""
+"""Hydraulic functions on bare inertias: each joint is one mass with a constant load, stepped as in Bullet."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes and logs as pure geometry: sizes, arrangements, mass properties, and what is impossible."""
+"""Scenes and logs as pure geometry: sizes, arrangements, mass properties, and impossible requests."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def scene(kind: str, machine: str = "palms_471", seed: int = 0, logs: int = 1, *
 
 
 @pytest.mark.parametrize("machine", MACHINES)
-def test_sizes_are_those_of_the_machines_wood_and_the_seed_alone_decides(machine):
+def test_log_sizes_follow_the_truth_and_only_the_seed_changes_them(machine):
     w = WOOD[machine]
     logs = [log for seed in range(40) for log in scene("separate", machine, seed, 2)]
     for name in ("length_m", "diameter_m", "taper_m_m"):
@@ -40,7 +40,7 @@ def test_sizes_are_those_of_the_machines_wood_and_the_seed_alone_decides(machine
     assert scene("separate", machine, 3, 2) == scene("separate", machine, 3, 2) != scene("separate", machine, 4, 2)
 
 
-def test_random_logs_lie_in_the_pick_area_and_apart():
+def test_random_logs_lie_apart_in_the_pick_area():
     (cx, cy), half = PALMS.workspace.pick_center_m, PALMS.workspace.pick_half_size_m
     for seed in range(10):
         logs = random_scene(PALMS, PINE, seed, 3)
@@ -54,13 +54,13 @@ def test_the_carriers_pick_area_is_beside_the_machine_where_it_starts():
 
 
 @pytest.mark.parametrize("kind", ["parallel", "skewed", "crossed", "pile", "bunk"])
-def test_logs_are_let_go_clear_of_each_other(kind):
+def test_logs_are_clear_of_each_other_at_release(kind):
     for seed in range(5):
         logs = scene(kind, seed=seed, logs=min(6, KINDS[kind][1]) if kind != "crossed" else 3)
         assert all(clearance(a, b) > 0.0 for a, b in combinations(logs, 2))
 
 
-def test_arrangements_are_what_their_names_say():
+def test_each_arrangement_matches_its_name():
     at, yaw = (2.0, 5.0), 0.7
     (one,) = scene("single", at=at, yaw_rad=yaw)
     assert math.dist((one.x_m, one.y_m), at) < 0.3 and abs(math.sin(one.yaw_rad - yaw)) < 0.05
@@ -108,7 +108,7 @@ def test_a_straight_log_has_the_inertia_of_a_cylinder():
 
 
 @given(st.floats(0.002, 0.012), st.floats(0.0, 0.03), st.floats(0.12, 0.3))
-def test_a_tapered_bowed_log_weighs_what_its_frustum_does_and_lies_towards_its_butt(taper, sweep, diameter):
+def test_a_tapered_bowed_log_has_the_mass_of_its_frustum_and_a_centre_nearer_the_butt(taper, sweep, diameter):
     spec = LogSpec(0, 0, 0, 2.6, diameter, 600.0, taper, sweep)
     a, b = spec.radius(-0.5), spec.radius(0.5)
     frustum = math.pi * 2.6 / 3 * (a * a + a * b + b * b)
@@ -126,7 +126,7 @@ def test_a_tapered_bowed_log_weighs_what_its_frustum_does_and_lies_towards_its_b
 
 
 @given(st.floats(-3, 3), st.floats(-1, 1), st.floats(-3, 3))
-def test_the_axes_where_a_log_is_let_go_are_those_of_its_quaternion(yaw, pitch, roll):
+def test_the_axes_at_release_match_the_quaternion(yaw, pitch, roll):
     spec = LogSpec(0, 0, yaw, 2.6, 0.2, 600.0, pitch_rad=pitch, roll_rad=roll)
     x, y, z, w = quaternion_of(spec)
     bow, along = spec.directions()

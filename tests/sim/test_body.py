@@ -1,4 +1,4 @@
-"""The machines' bodies: rigid kinematics equal to the profile's, tongs as its table, what collides with what."""
+"""The machines' bodies: rigid kinematics equal to the profile's, jaws as in its table, collision pairs."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_hanger_pin_of_the_urdf_equals_the_denavit_hartenberg_chain(world):
         assert math.dist(world.tip(), expected) < (1e-6 if world.carrier is None else 1e-5)
 
 
-def test_slew_zero_reaches_forward_and_positive_pitch_lifts(world):
+def test_slew_zero_points_forward_and_positive_pitch_lifts(world):
     pose(world, slew=0.0, lift=0.0, tilt=-0.1, ext=0.5)
     x, y, z = world.tip()
     forward, aside = (y, x) if world.profile.name == "palms_471" else (x, y)
@@ -62,12 +62,12 @@ def test_slew_zero_reaches_forward_and_positive_pitch_lifts(world):
     assert turned > 1.0
 
 
-def test_tong_tips_follow_the_profile_table(world):
+def test_jaw_tips_follow_the_profile_table(world):
     table, p = world.profile.grapple.tongs, world.client
     base = p.invertTransform(*world.base_pose())
     reach = {"slew": 0.0, "lift": 0.6, "tilt": -1.2, "ext": 0.5, "rot": 0.0, "fork": 0.0}
     pose(world, **reach, tong_left=0.0, tong_right=0.0)
-    # The tips in the tong frames, from the open row: half gap from the pivots, below the pivots.
+    # The tips in the jaw frames, from the open row: half gap from the pivots, below the pivots.
     k = world.profile.kinematics
     pivot_z = k.hanger_to_fork_m + k.fork_to_rotator_m + k.rotator_to_tong_pivot_m
     pivot_x = abs(p.getJointInfo(world.crane.body, world.crane.index["tong_right"])[14][0])
@@ -83,7 +83,7 @@ def test_tong_tips_follow_the_profile_table(world):
             assert pin[2] - tip[2] == pytest.approx(below, abs=3e-3)
 
 
-def test_the_grapple_hits_the_bunk_and_nothing_else_of_the_machine():
+def test_the_grapple_collides_only_with_the_bunk():
     profile = load_profile("aoro_fc8")
     w = World(profile, load_truth("nominal", 0, "aoro_fc8"), 0, ())
     bunk = profile.bunk
@@ -109,7 +109,7 @@ def test_the_grapple_hits_the_bunk_and_nothing_else_of_the_machine():
     w.close()
 
 
-def test_home_is_plumb_and_still(world):
+def test_the_column_is_plumb_and_still_at_home(world):
     w = World(world.profile, world.truth, 0, ())
     for joint, value in HOME_POSE[world.profile.name].items():
         assert w.q[joint] == pytest.approx(value, abs=2e-3)
@@ -122,7 +122,7 @@ def test_home_is_plumb_and_still(world):
     w.close()
 
 
-def test_a_machine_without_a_plant_is_refused_in_one_sentence(world):
+def test_a_machine_without_steel_dimensions_is_refused(world):
     stranger = msgspec.structs.replace(world.profile, name="tractor")
     with pytest.raises(PlantError, check=coded("plant.unknown-machine")):
         World(stranger, world.truth, 0, ())
@@ -141,7 +141,7 @@ def test_equal_inputs_give_bit_identical_motion(world):
     assert run() == run()
 
 
-def test_nobody_outside_sim_reads_the_truth_and_sim_knows_no_machine_kinematics():
+def test_only_sim_imports_the_truth_and_sim_does_not_import_the_machine_kinematics():
     outside = ("can_dbc", "machine", "controller", "autonomy", "recorder", "hil", "console", "timberhand")
     forbidden = dict.fromkeys(outside, ("sim.truth", "load_truth"))
     forbidden["sim"] = ("machine.geometry.kinematics", "machine.geometry.grapple")

@@ -1,4 +1,4 @@
-"""The physics client: what it has bound it keeps, but never beyond its own life."""
+"""The physics client: it caches functions, but never beyond its own lifetime."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from sim.bullet.client import new_client
 pytestmark = pytest.mark.computed
 
 
-def test_a_closed_client_reaches_no_later_one():
+def test_a_closed_client_does_not_reach_a_later_one():
     first = new_client()
     assert first.getNumBodies() == 0
     number = first._client
     first.disconnect()
     second = new_client()
     try:
-        assert second._client == number  # Bullet gives it anew
+        assert second._client == number  # Bullet reuses it
         with pytest.raises(Exception, match=r"[Nn]ot connected"):
             first.getNumBodies()
     finally:
         second.disconnect()
 
 
-def test_two_clients_do_not_share_what_they_have_bound():
+def test_two_clients_do_not_share_cached_functions():
     one, other = new_client(), new_client()
     try:
         one.createMultiBody(1.0, one.createCollisionShape(one.GEOM_SPHERE, radius=0.1))

@@ -18,7 +18,7 @@ angles = st.floats(-1.5, 1.5)
 
 
 @given(angles, angles, angles)
-def test_rpy_matrix_is_the_quaternions(roll: float, pitch: float, yaw: float) -> None:
+def test_the_rpy_matrix_matches_the_quaternion(roll: float, pitch: float, yaw: float) -> None:
     assert np.allclose(rpy_matrix((roll, pitch, yaw)), quaternion_matrix(rpy_quaternion(roll, pitch, yaw)), atol=1e-12)
 
 
@@ -29,7 +29,7 @@ def test_deprojecting_inverts_projecting(u: float, v: float, z: float) -> None:
 
 
 @given(st.floats(-2.0, 2.0), st.floats(-1.0, 1.0), st.floats(0.5, 20.0))
-def test_a_letterbox_shows_the_same_ray_where_the_bars_put_it(x: float, y: float, z: float) -> None:
+def test_a_letterbox_shifts_a_ray_by_its_bars(x: float, y: float, z: float) -> None:
     pin = Intrinsics(1280, 720, 530.0, 530.0, 640.0, 360.0)
     box = pin.letterbox(608)
     (native,) = pin.project(np.array([[x, y, z]]))
@@ -60,7 +60,7 @@ def test_a_free_camera_looks_at_its_target_with_a_level_horizon() -> None:
         look_at((0.0, 0.0, 5.0), (0.0, 0.0, 0.0), pinhole(640, 480, 1.0))
 
 
-def test_an_orbit_stands_where_its_angles_say() -> None:
+def test_an_orbit_view_is_placed_by_its_angles() -> None:
     view = orbit((1.0, 2.0, 0.0), 5.0, math.pi / 2, math.radians(30.0), pinhole(64, 48, 1.0))
     assert view.position_m == pytest.approx((1.0, 2.0 + 5.0 * math.cos(math.radians(30.0)), 2.5))
 

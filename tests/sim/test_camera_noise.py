@@ -40,7 +40,7 @@ def test_averaging_eight_by_eight_pixels_does_not_remove_it() -> None:
     assert np.nanstd(blocks) > 0.75 * np.nanstd(e)
 
 
-def test_errors_are_alike_over_ten_pixels_and_not_over_forty() -> None:
+def test_errors_correlate_over_ten_pixels_and_not_over_forty() -> None:
     e = errors(5.0)
     e = (e - np.nanmean(e)) / np.nanstd(e)
 
@@ -51,7 +51,7 @@ def test_errors_are_alike_over_ten_pixels_and_not_over_forty() -> None:
     assert abs(alike(40)) < 0.06
 
 
-def test_frames_err_independently_and_repeatably() -> None:
+def test_frame_errors_are_independent_and_repeatable() -> None:
     e = errors(5.0, 3)
     assert abs(np.corrcoef(e[0].ravel(), e[1].ravel())[0, 1]) < 0.1
     again = StereoNoise(CAMERA, SMOOTH, 1).apply(wall(5.0), PIN, 2)
@@ -60,7 +60,7 @@ def test_frames_err_independently_and_repeatably() -> None:
     assert not np.array_equal(again, other, equal_nan=True)
 
 
-def test_the_scale_error_stays_for_the_run_and_is_half_to_one_per_cent() -> None:
+def test_the_scale_error_is_constant_in_a_run_and_half_to_one_per_cent() -> None:
     scales = [StereoNoise(CAMERA, TRUTH, seed).scale for seed in range(40)]
     assert all(0.005 <= abs(s - 1.0) <= 0.010 for s in scales)
     assert 8 < sum(s > 1.0 for s in scales) < 32
@@ -94,7 +94,7 @@ def test_range_limits_and_sky_are_unknown() -> None:
     assert np.isfinite(depth[320:]).mean() > 0.99
 
 
-def test_a_near_surface_grows_and_its_left_side_is_hidden_from_the_other_eye() -> None:
+def test_a_near_surface_grows_and_occludes_the_other_imager_on_its_left() -> None:
     picture = wall(6.0)
     picture.depth_m[:, 300:400] = 2.0
     quiet = replace(SMOOTH, disparity_sigma_px=1e-6)
@@ -108,7 +108,7 @@ def test_a_near_surface_grows_and_its_left_side_is_hidden_from_the_other_eye() -
     assert np.isnan(depth[50:-50, 420:]).mean() < 0.01
 
 
-def test_the_noise_leaves_logs_where_they_are() -> None:
+def test_noise_does_not_move_logs() -> None:
     b = SceneBuilder(Ground.flat())
     b.log(log(1, 0.0, 0.0, diameter=0.3))
     picture = render(b.build(), ABOVE)

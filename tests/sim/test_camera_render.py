@@ -74,7 +74,7 @@ def test_every_point_of_a_log_lies_on_its_cone(taper: float) -> None:
     assert cap.any() and np.all(across[cap] <= radius[cap] + 1e-3)
 
 
-def test_a_bowed_log_is_whole_and_bows_to_its_side() -> None:
+def test_a_bowed_log_has_no_gaps_and_bows_to_its_side() -> None:
     straight, bowed = log(1, 0.0, 0.0, diameter=0.2), log(1, 0.0, 0.0, diameter=0.2, sweep_m=0.075)
     # Local x is down for ``lying``: turn the log a quarter about its axis so that it bows sideways.
     half = math.sqrt(0.5)
@@ -106,7 +106,7 @@ def test_ground_depth_meets_the_terrain(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["flat", "rough"])
-def test_pybullets_renderer_sees_the_same(kind: str) -> None:
+def test_pybullets_renderer_agrees(kind: str) -> None:
     terrain = Terrain(kind, 4)
     scene = site(8, ground=Ground(*terrain.origin_m, terrain.cell_m, terrain.heights))
     ours = render(scene, ABOVE)
@@ -150,13 +150,13 @@ def test_the_grapple_hides_what_is_under_it() -> None:
     assert 0.4 < label.visible_share < 0.8
 
 
-def test_a_box_around_the_camera_does_not_blind_it() -> None:
+def test_a_box_around_the_camera_does_not_hide_the_scene() -> None:
     b = SceneBuilder(Ground.flat())
     b.box((0.4, 0.4, 0.4), (0.0, 0.0, 3.0), (0.0, 0.0, 0.0, 1.0), (0.5, 0.5, 0.5), CRANE)
     assert np.all(render(b.build(), DOWN).mask == GROUND)
 
 
-def test_a_box_the_camera_stands_beside_is_cut_at_the_lens() -> None:
+def test_a_box_beside_the_camera_is_clipped_at_the_near_plane() -> None:
     b = SceneBuilder(Ground.flat())
     b.box((0.2, 8.0, 0.2), (0.3, 0.0, 3.0), (0.0, 0.0, 0.0, 1.0), (0.5, 0.5, 0.5), CRANE)
     picture = render(b.build(), look_at((0.0, 0.0, 3.0), (0.0, 5.0, 3.0), LENS))
@@ -166,7 +166,7 @@ def test_a_box_the_camera_stands_beside_is_cut_at_the_lens() -> None:
     assert np.nanmin(picture.depth_m[picture.mask == CRANE]) < 0.3
 
 
-def test_labels_bound_what_the_mask_shows() -> None:
+def test_labels_bound_the_masks() -> None:
     scene = site(10, seed=3)
     picture = render(scene, ABOVE)
     for label in labels(scene, ABOVE, picture):
@@ -187,7 +187,7 @@ def test_a_log_behind_the_camera_has_no_box() -> None:
     assert (label.box_visible, label.box_full, label.visible_share) == (None, None, 0.0)
 
 
-def test_the_sun_casts_a_shadow_and_light_changes_with_the_day() -> None:
+def test_the_sun_casts_a_shadow_and_light_changes_with_the_conditions() -> None:
     sun = ImagingConditions(sun=(0.0, 0.6, 0.8), sky_gain=0.4, sun_gain=0.8, grain=0.0)
     dark = ImagingConditions(sun=(0.0, 0.6, 0.8), sky_gain=0.4, sun_gain=0.0, grain=0.0)
     scene = scene_of(log(1, 0.0, 0.0, diameter=0.3))
@@ -204,7 +204,7 @@ def test_the_sun_casts_a_shadow_and_light_changes_with_the_day() -> None:
     ) == ImagingConditions.random(1)
 
 
-def test_clutter_stands_still_and_hides_logs() -> None:
+def test_ground_cover_is_fixed_and_hides_logs() -> None:
     clutter = GroundCover(Ground.flat(), CLEARING, 5)
     rods, again = clutter.around(0.0, 0.0), GroundCover(Ground.flat(), CLEARING, 5).around(3.0, 0.0)
     here = np.abs(rods.start_m[:, :2]).max(axis=1) < 3.0

@@ -1,4 +1,4 @@
-"""Cameras on a plant: mounts, frames and the scene read off the physics."""
+"""Cameras on a plant: mounts, frames and the scene read from the physics."""
 
 from collections.abc import Iterator
 
@@ -30,7 +30,7 @@ def world() -> Iterator[World]:
     plant.close()
 
 
-def test_the_scene_has_the_logs_where_the_physics_has_them(world: World) -> None:
+def test_the_scene_has_the_logs_at_their_physical_poses(world: World) -> None:
     scene = WorldScenes(world)()
     assert [log.instance for log in scene.logs] == [1, 2]
     for log, state in zip(scene.logs, world.log_bodies.states(), strict=True):
@@ -54,7 +54,7 @@ def test_a_frame_carries_the_nominal_mount_and_the_true_pose(world: World) -> No
     assert np.nanmedian(frame.depth_m) == pytest.approx(3.1, abs=0.15)
 
 
-def test_the_mounting_error_moves_the_picture_but_not_the_nominal_mount(world: World) -> None:
+def test_the_mount_error_moves_the_picture_but_not_the_nominal_mount(world: World) -> None:
     camera = world.truth.cameras["d435"]
     off = replace(camera, mount_position_m=(0.0, 0.03, 0.0), mount_rpy_rad=(0.0, 0.0, 0.02))
     truth = replace(world.truth, cameras=world.truth.cameras | {"d435": off})

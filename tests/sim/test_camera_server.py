@@ -1,4 +1,4 @@
-"""The plant's cameras on a socket: drawn when asked, refused in a sentence, and nothing of the truth goes out."""
+"""The plant's cameras on a socket: rendered on request, refusals, and no ground truth in the frames."""
 
 import contextlib
 import socket
@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from can_dbc.messages.rgbd import HEADER_BYTES, RgbdError, RgbdMessage, decode, encode_request, start
+from can_dbc.messages.rgbd import HEADER_BYTES, RgbdError, RgbdMessage, decode, decode_header, encode_request
 from machine.geometry.optics import Intrinsics
 from sim.camera.rig import Mount, RgbdFrame
 from sim.camera.server import CameraServer, rgbd_message
@@ -42,14 +42,14 @@ def asked(server: CameraServer, camera: str) -> socket.socket:
 
 def answer(client: socket.socket) -> RgbdMessage:
     data = b""
-    while len(data) < HEADER_BYTES or len(data) < HEADER_BYTES + start(data[:HEADER_BYTES]).rest:
+    while len(data) < HEADER_BYTES or len(data) < HEADER_BYTES + decode_header(data[:HEADER_BYTES]).remaining_bytes:
         chunk = client.recv(4096)
         assert chunk
         data += chunk
     return decode(data)
 
 
-def test_a_picture_is_drawn_only_when_somebody_asks() -> None:
+def test_a_picture_is_rendered_on_request_only() -> None:
     rig = Rig()
     server = CameraServer(rig, 0)
     server.serve(1)
@@ -73,14 +73,14 @@ def test_a_picture_is_drawn_only_when_somebody_asks() -> None:
     server.close()
 
 
-def test_an_unknown_camera_is_refused_in_a_sentence() -> None:
+def test_an_unknown_camera_is_refused() -> None:
     server = CameraServer(Rig(), 0)
     with asked(server, "rear") as client, pytest.raises(RgbdError, check=coded("rgbd.refused")):
         answer(client)
     server.close()
 
 
-def test_who_talks_nonsense_is_hung_up_on() -> None:
+def test_a_malformed_request_closes_the_connection() -> None:
     server = CameraServer(Rig(), 0)
     with socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as client:
         client.sendall(b"GET / HTTP/1.1\r\n\r\n")
@@ -89,6 +89,6 @@ def test_who_talks_nonsense_is_hung_up_on() -> None:
     server.close()
 
 
-def test_the_true_pose_stays_in_the_plant() -> None:
+def test_the_true_pose_is_not_sent() -> None:
     sent = rgbd_message(Rig().capture("front", None, 5))
     assert not any("true" in name or "pose" in name for name in type(sent).__slots__)

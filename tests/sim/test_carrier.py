@@ -47,7 +47,7 @@ def test_frames_agree_with_the_profile(rig):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_no_part_has_an_inertia_that_bodies_cannot_have(seed):
+def test_every_link_has_a_possible_inertia(seed):
     """Bullet drops the whole inertia of a part whose largest exceeds the sum of the others, by rounding even."""
     links, _ = carrier_links(PROFILE, load_truth("sampled", seed, PROFILE.name))
     for link in links:

@@ -1,4 +1,4 @@
-"""The oil on the real linkage: the crane holds, rings after a stop, follows the profile's speeds, squeezes."""
+"""The hydraulics on the real linkage: the crane holds, rings after a stop, follows the profile's speeds, grips."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def run(w: World, seconds: float, **commands: float) -> list[tuple[float, float,
     [("slew", {}), ("lift", {"lift": 0.5}), ("tilt", {"tilt": -1.2}), ("ext", {"ext": 0.9}), ("rot", {})],
 )
 @pytest.mark.parametrize("sign", [1, -1])
-def test_half_command_gives_the_speed_the_profile_expects(crane, joint, home, sign):
+def test_half_command_gives_the_speed_of_the_profile(crane, joint, home, sign):
     w, valve = crane(**home), PROFILE.joints[joint].valve
     run(w, 0.8, **{joint: 0.56 * sign})
     before = w.q[joint]
@@ -68,12 +68,12 @@ def test_a_boom_stop_rings_and_decays(crane):
     assert max(late) - min(late) < 0.35 * (max(early) - min(early))
 
 
-def test_a_reaching_crane_needs_more_holding_pressure(crane):
+def test_an_extended_crane_needs_more_holding_pressure(crane):
     near, far = crane(lift=0.3, tilt=-1.5), crane(lift=0.3, tilt=-0.3, ext=1.5)
     assert far.hydraulics.pressures_pa["lift"][0] > near.hydraulics.pressures_pa["lift"][0] + 1e6
 
 
-def test_the_empty_grapple_closes_shows_its_pressure_stays_closed_and_opens(crane):
+def test_the_empty_grapple_closes_with_pressure_stays_closed_and_opens(crane):
     w = crane()
     run(w, 1.0, grapple=-1.0)
     assert w.hydraulics.pressures_pa["grapple"][1] < 3e6

@@ -1,4 +1,4 @@
-"""The judge: logs in the bunk, sag, moments and margins from the plant's truth, on a fixed machine and on a carrier."""
+"""The evaluator: logs in the bunk, sag, moments and margins from the ground truth, on a fixed machine and a carrier."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_log_leaning_out_of_the_bunk_is_not_in_it():
     world.close()
 
 
-def test_the_tip_sags_under_a_load_that_the_rigid_chain_does_not_see():
+def test_the_tip_sags_under_a_load_unlike_the_rigid_chain():
     def load(world):
         link = world.crane.link["rotator"]
         own = world.client.getDynamicsInfo(world.crane.body, link)[0]
@@ -70,7 +70,7 @@ def test_the_tip_sags_under_a_load_that_the_rigid_chain_does_not_see():
     empty_world.close()
 
 
-def test_a_loaded_carrier_is_judged_in_its_own_frame():
+def test_a_loaded_carrier_is_evaluated_in_its_own_frame():
     world, verdict = watched("aoro_fc8", lambda p, w: arrangement("bunk", p, w, 1, 8), 400)
     assert all(v.in_bunk and v.released for v in verdict.logs)
     assert verdict.tip_margin_m is not None and 0.3 < verdict.tip_margin_m < 1.5

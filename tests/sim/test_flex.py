@@ -1,4 +1,4 @@
-"""What gives and what swings: the column under load and after a stop, the pendulum's period and decay."""
+"""Flexibility and swing: the column under load and after a stop, the pendulum's period and decay."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def make(truth=NOMINAL, pin=None, **home):
 
 
 def hang(w: World, kg: float, seconds: float) -> None:
-    """Let a weight down on the hanger pin."""
+    """Lower a weight onto the hanger pin."""
     n = round(seconds / STEP_S)
     link = w.crane.link["hanger"]
     for i in range(n):
@@ -40,7 +40,7 @@ def hang(w: World, kg: float, seconds: float) -> None:
 
 
 def unseen(w: World) -> tuple[float, ...]:
-    """The tip against what the encoders say."""
+    """The tip relative to the encoders' reading."""
     return tuple(a - b for a, b in zip(w.tip(), w.rigid_tip(), strict=True))
 
 
@@ -53,7 +53,7 @@ def test_250_kg_at_6_m_move_the_tip_a_decimetre_unseen_by_the_encoders():
     w.close()
 
 
-def test_the_column_bends_alike_at_every_slew_and_three_times_less_when_three_times_as_stiff():
+def test_the_column_bends_equally_at_every_slew_and_in_inverse_proportion_to_its_stiffness():
     for truth, least, most in ((NOMINAL, 0.080, 0.120), (STIFF, 0.027, 0.040)):
         w = make(truth, pin=(6.0, 0.0, 1.0))
         before = unseen(w)
@@ -133,7 +133,7 @@ def test_the_empty_grapple_swings_with_the_period_and_damping_of_its_mass():
 
 @pytest.mark.computed
 @pytest.mark.slow
-def test_a_held_log_makes_the_pendulum_longer():
+def test_a_held_log_lengthens_the_pendulum():
     scene = random_scene(PROFILE, NOMINAL.wood, 403, 1)
     w = World(PROFILE, NOMINAL, 403, scene)
     driver = Driver(w)

@@ -31,7 +31,7 @@ def attempt(seed: int, across_m: float = 0.0, turned_rad: float = 0.0):
 
 @pytest.mark.computed
 @pytest.mark.slow
-def test_a_log_is_grasped_carried_and_laid_into_the_bunk():
+def test_a_log_is_grasped_carried_and_placed_in_the_bunk():
     w, evaluator, driver = attempt(403)
     held = evaluator.evaluate()
     assert held.logs[0].lifted and not held.logs[0].released and not held.success
@@ -48,7 +48,7 @@ def test_a_log_is_grasped_carried_and_laid_into_the_bunk():
 @pytest.mark.computed
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "least_m", "most_m"), [(423, 0.0, 0.13), (2, 0.29, 0.31)])
-def test_thin_and_thick_logs_are_scooped_up_held_and_let_go(seed, least_m, most_m):
+def test_thin_and_thick_logs_are_grasped_held_and_released(seed, least_m, most_m):
     w, evaluator, driver = attempt(seed)
     assert least_m < w.log_bodies.states()[0].diameter_m < most_m
     assert evaluator.evaluate().logs[0].lifted and not evaluator.evaluate().logs[0].released

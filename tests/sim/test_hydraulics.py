@@ -25,7 +25,7 @@ EVERY = [(PALMS, n, i) for n, i in HEAVY.items()] + [(AORO, n, i) for n, i in AO
 NAMES = [f"{t.machine}-{n}" for t, n, _ in EVERY]
 
 
-def test_a_load_at_rest_is_carried_by_the_pressure_of_force_over_area():
+def test_pressure_times_area_balances_a_load_at_rest():
     rig = Rig(PALMS, {"lift": 8000.0}, {"lift": -20000.0})
     rig.run(5.0)
     c = rig.truth.functions["lift"].cylinder
@@ -40,7 +40,7 @@ def test_the_oil_spring_rings_at_the_frequency_of_bulk_modulus_and_volumes(truth
     c = rig.truth.functions[name].cylinder
     half = c.dead_volume_m3 + abs(c.arm_nominal) * (c.arm_at[1] - c.arm_at[0]) / 2 * np.array([c.area_a, c.area_b])
     spring = c.arm_nominal**2 * truth.supply.bulk_modulus_pa * np.sum(np.array([c.area_a, c.area_b]) ** 2 / half)
-    # Softly, so that no chamber falls empty.
+    # Gently, so that no chamber becomes empty.
     rig.qd[name] = speed = 0.2 * REST_PA * c.area_b * abs(c.arm_nominal) / math.sqrt(spring * inertia)
     rest, crossings, before = rig.q[name], [], 0.0
     for k in range(round(60 / math.sqrt(spring / inertia) / STEP_S)):
@@ -97,7 +97,7 @@ def test_functions_slow_each_other_when_the_pump_is_the_limit():
         assert min(speeds.values()) < 0.8
 
 
-def test_the_heaviest_load_starves_first_unless_the_valve_shares_the_flow():
+def test_the_heaviest_load_stops_first_unless_the_valve_shares_the_flow():
     _, starving = busy("pre_compensated", 25000.0)
     _, sharing = busy("post_compensated", 25000.0)
     assert starving["lift"] < 0.02 and min(starving[n] for n in ("slew", "tilt", "ext")) > 0.3
@@ -135,7 +135,7 @@ def test_a_neutral_valve_holds_the_load():
     assert tip_m < 1e-3
 
 
-def test_the_dead_time_passes_before_anything_moves():
+def test_nothing_moves_before_the_dead_time():
     rig = Rig(PALMS, {"slew": 5000.0}, valve={"delay_s": 0.1})
     steps = 0
     while rig.oil.spools["slew"] == 0.0:
@@ -194,7 +194,7 @@ def test_the_grapple_squeezes_to_its_limit_locks_and_opens_with_more():
     held = rig.torque["grapple"]
     rig.run(20.0)
     assert rig.torque["grapple"] == pytest.approx(held, rel=0.01) and held > 0.9 * squeeze
-    rig.stops["grapple"] = (0.9, 0.9)  # a thick log is wedged between the tongs
+    rig.stops["grapple"] = (0.9, 0.9)  # a thick log is wedged between the jaws
     rig.run(2.0, grapple=1.0)
     assert -rig.torque["grapple"] > 1.1 * squeeze
     del rig.stops["grapple"]
@@ -220,7 +220,7 @@ def _with_pressures_of(rig: Rig, supply: dict[str, float]) -> Hydraulics:
     return oil
 
 
-def test_a_crash_empties_no_chamber_beyond_nothing():
+def test_a_crash_makes_no_chamber_pressure_negative():
     oil = Hydraulics(PALMS, STEP_S)
     q = [sum(f.cylinder.arm_at[:: len(f.cylinder.arm_at) - 1]) / 2 for f in PALMS.functions.values()]
     oil.hold([0.0] * 6, q)
@@ -245,7 +245,7 @@ def test_light_joints_stay_calm_with_any_inertia(factor):
 
 
 @pytest.mark.parametrize(("truth", "inertias"), [(PALMS, HEAVY), (AORO, AORO_HEAVY)], ids=["palms", "aoro"])
-def test_pressures_stay_physical_and_energy_is_never_made(truth, inertias):
+def test_pressures_stay_physical_and_energy_is_conserved(truth, inertias):
     stops = {n: (f.cylinder.arm_at[0], f.cylinder.arm_at[-1]) for n, f in truth.functions.items()}
     rig = Rig(truth, inertias, {"lift": -20000.0}, stops=stops)
     rng, start = random.Random(3), rig.oil.stored_j
@@ -262,7 +262,7 @@ def test_pressures_stay_physical_and_energy_is_never_made(truth, inertias):
         assert rig.oil.loss_j >= lost
         lost = rig.oil.loss_j
     oil = rig.oil
-    # The counter takes the last step's work in with the next state.
+    # The counter adds the last step's work with the next state.
     assert oil.energy_out_j == pytest.approx(worked, abs=0.01 * oil.energy_j)
     missing = oil.energy_j - oil.energy_out_j - oil.loss_j - (oil.stored_j - start)
     assert oil.energy_j > 1e4 and abs(missing) < 0.02 * oil.energy_j
@@ -284,7 +284,7 @@ def test_a_float_valve_lets_the_arms_of_an_axle_swing_against_each_other():
     assert abs(rig.q["arm_rl"] - start["arm_rl"]) < 1e-3
 
 
-def test_never_both_axles_float_nor_a_machine_without_arms():
+def test_both_axles_never_float_and_a_machine_without_arms_cannot():
     oil = Hydraulics(AORO, STEP_S)
     oil.float_rear = True
     with pytest.raises(PlantError, check=coded("hydraulics.other-axle-floats")):

@@ -1,4 +1,4 @@
-"""The perfect detector speaks of the crane's base frame, which a carrier carries about."""
+"""The ideal detector reports in the crane's base frame, which a carrier moves."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from sim.instruments.ideal_detector import detect
 from sim.plant import Plant
 
 
-def test_a_fixed_machine_is_its_own_world() -> None:
+def test_on_a_fixed_machine_the_base_frame_is_the_world() -> None:
     plant = Plant(load_profile("palms_471"), seed=3)
     (seen,), (log,) = detect(plant), plant.logs()
     assert (seen.position_m, seen.axis) == (log.position_m, log.axis)
     assert (seen.length_m, seen.diameter_m) == (log.length_m, log.diameter_m)
 
 
-def test_on_a_carrier_logs_lie_below_the_raised_crane_and_behind_it_is_ahead() -> None:
-    """Slew 0 looks backward, and the base stands its height above the ground."""
+def test_on_a_carrier_logs_lie_below_the_crane_base_and_ahead_means_backwards() -> None:
+    """Slew 0 points backward, and the base is its height above the ground."""
     plant = Plant(load_profile("aoro_fc8"), seed=3)
     (seen,), (log,) = detect(plant), plant.logs()
     (x, y, z), _ = plant.base_pose()

@@ -1,4 +1,4 @@
-"""Logs as bodies: they lie still from the start, taper and bow are felt, a bunk holds them, a touch wakes them."""
+"""Logs as bodies: they are still at the start, taper and bow have an effect, a bunk holds them, a touch wakes them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STEP_S = 0.0025
 
 
 class Stand:
-    """A yard on ground of its own, without a machine; the bunk stands at ``base``."""
+    """Logs on ground of their own, without a machine; the bunk stands at ``base``."""
 
     def __init__(self, scene: tuple[LogSpec, ...], machine: str = "palms_471", kind: str = "flat") -> None:
         profile, truth = PROFILES[machine], TRUTHS[machine]
@@ -82,7 +82,7 @@ def of(kind: str, seed: int, logs: int, machine: str = "palms_471") -> tuple[Log
     ("kind", "logs", "machine"),
     [("separate", 3, "palms_471"), ("crossed", 3, "palms_471"), ("pile", 6, "palms_471"), ("pile", 5, "aoro_fc8")],
 )
-def test_logs_lie_still_from_the_start_and_in_nothing(stands, kind, logs, machine):
+def test_logs_are_still_at_the_start_and_overlap_nothing(stands, kind, logs, machine):
     for seed in range(2):
         stand = Stand(of(kind, seed, logs, machine), machine)
         stands.append(stand)
@@ -94,7 +94,7 @@ def test_logs_lie_still_from_the_start_and_in_nothing(stands, kind, logs, machin
         assert max(math.dist(a, b) for a, b in zip(before, after, strict=True)) < 2e-3
 
 
-def test_even_without_sleep_a_pile_stands(stands):
+def test_a_pile_is_stable_without_sleep(stands):
     stand = Stand(of("pile", 0, 6))
     stands.append(stand)
     stand.awake()
@@ -165,8 +165,8 @@ def test_a_touch_wakes_a_sleeping_log(stands):
     assert stand.fastest(0.6) > 0.05
 
 
-def test_ground_that_sleeps_carries_logs_as_ground_awake_does(stands):
-    """To the bit: while both sleep Bullet works out no contacts, and when a log is touched they are as they were."""
+def test_sleeping_ground_carries_logs_like_awake_ground(stands):
+    """To the bit: while both sleep Bullet computes no contacts; when a log is touched they are unchanged."""
     ways = []
     for awake in (False, True):
         stand = Stand(of("pile", 1, 2))
@@ -209,7 +209,7 @@ def test_logs_lie_on_uneven_ground(stands, kind):
     assert stand.fastest(0.5) < 5e-3
 
 
-def test_logs_in_each_other_and_in_the_bunk_are_refused():
+def test_overlapping_logs_are_refused():
     a = LogSpec(-2.0, 4.0, 0.0, 2.6, 0.2, 600.0, z_m=0.004)
     with pytest.raises(PlantError, check=coded("logs.overlap")):
         Stand((a, LogSpec(-2.0, 4.1, 0.1, 2.6, 0.2, 600.0, z_m=0.004)))
@@ -218,7 +218,7 @@ def test_logs_in_each_other_and_in_the_bunk_are_refused():
         Stand((LogSpec(x, y, 0.0, 2.6, 0.2, 600.0, z_m=0.1),))
 
 
-def test_the_bunk_stands_where_the_profile_says_on_either_machine():
+def test_the_bunk_is_at_the_profiles_place_on_both_machines():
     for machine in MACHINES:
         profile = PROFILES[machine]
         b, c = profile.bunk, profile.carrier

@@ -106,7 +106,7 @@ def test_encoders_answer_sync_only_when_operational(bench):
     assert 0x183 not in [k for k, _ in bench.exchange([sync_frame(2)])]
 
 
-def test_sdo_reads_what_the_profile_says_and_refuses_what_is_not_there(bench):
+def test_sdo_reads_the_profiles_values_and_refuses_unknown_objects(bench):
     for spec in PROFILE.joints.values():
         node = spec.encoder.node
         ((key, data),) = bench.exchange([upload_request(node, 0x1000, 0)])
@@ -131,7 +131,7 @@ def test_tpdo_mapping_and_validity_follow_sdo_writes(bench):
     assert 0x702 not in [k for k, _ in bench.sent]
 
 
-def test_nmt_reset_boots_again_and_forgets_the_configuration(bench):
+def test_an_nmt_reset_boots_again_without_the_configuration(bench):
     bench.start_encoders()
     bench.exchange([download_request(2, 0x1A00, 0, b"\x01")])
     out = bench.exchange([nmt_frame(NmtCommand.RESET_NODE)], T_NS)
@@ -167,7 +167,7 @@ def test_the_other_nodes_answer_identity_and_refuse_the_rest(bench):
             assert (answer.node, answer.abort) == (node, abort) and (abort or answer.unsigned == value)
 
 
-def test_a_node_reports_its_own_fault_once_and_its_end(bench):
+def test_a_node_reports_its_own_fault_and_its_end_once(bench):
     bench.plant.valve.set_emergency(0x5030)
     bench.plant.valve.set_emergency(0x5030)
     (emergency,) = [e for k, d in bench.exchange([]) if (e := parse_emergency(k, d))]
@@ -218,7 +218,7 @@ def test_the_valve_follows_fresh_armed_commands_and_echoes_them(bench):
         ({"sync": False}, ExitCode.COMMAND_TIMEOUT),
     ],
 )
-def test_the_valve_goes_neutral_by_absence_and_needs_a_new_arming(bench, loss, exit_code):
+def test_the_valve_goes_neutral_without_commands_and_needs_a_new_arming(bench, loss, exit_code):
     moving = {"spools": (60.0, 0.0, 0.0, 0.0)}
     bench.cycle(100, **moving)
     lost = moving | loss
@@ -315,7 +315,7 @@ def digest(seed: int) -> str:
     return h.hexdigest()
 
 
-def test_equal_seeds_give_equal_bytes_and_other_seeds_others():
+def test_only_equal_seeds_give_equal_node_bytes():
     assert digest(3) == digest(3) != digest(4)
 
 

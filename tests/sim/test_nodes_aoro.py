@@ -1,4 +1,4 @@
-"""The whole carrier behind its two buses: it drives, bends, lifts and stops by frames, and shows no hidden sensor."""
+"""The whole carrier behind its two buses: frames make it drive, bend, lift and stop, and no hidden sensor is sent."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def bench():
     b.plant.close()
 
 
-def test_it_drives_bends_and_stops_by_frames(bench):
+def test_frames_make_it_drive_bend_and_stop(bench):
     bench.cycle(10)
     start = bench.plant.vehicle()
     bench.cycle(150, drive=(0.15, 0.5, 0.0))
@@ -104,7 +104,7 @@ def test_it_drives_bends_and_stops_by_frames(bench):
     assert stopped.articulation_rad == pytest.approx(moved.articulation_rad, abs=0.06)
 
 
-def test_the_receiver_sees_where_it_really_is(bench):
+def test_the_receiver_reports_the_true_position(bench):
     bench.cycle(200, drive=(-0.1, 0.6, 0.0))
     receiver, readings = Receiver(GNSS), {}
     for bus, key, data in bench.sent:
@@ -120,7 +120,7 @@ def test_the_receiver_sees_where_it_really_is(bench):
     assert metres == pytest.approx(antenna, abs=0.15)
 
 
-def test_the_arms_lift_the_frame_and_tell_their_heights(bench):
+def test_the_arms_lift_the_frame_and_report_their_heights(bench):
     bench.cycle(10)
     before = bench.plant.vehicle()
     bench.cycle(60, arms=(40.0,) * 4)
@@ -164,7 +164,7 @@ def test_the_emergency_stop_stops_crane_carrier_and_arms(bench):
     assert bench.plant.vehicle().speed_m_s > 0.1
 
 
-def test_it_hides_what_no_sensor_measures(bench):
+def test_the_bus_carries_measured_values_only(bench):
     bench.cycle(5)
     raw = next(d for _, k, d in reversed(bench.sent) if k == CRANE.message("GrappleStat").key)
     bits = int.from_bytes(raw, "little")
@@ -246,7 +246,7 @@ def test_hand_levers_move_a_silent_machine_and_yield_to_the_bus(bench):
 
 
 @pytest.mark.parametrize("terrain", ["flat", "rough"])
-def test_what_the_page_asks_for_fits_into_a_datagram(terrain):
+def test_the_answers_for_the_page_fit_into_a_datagram(terrain):
     lying = random_scene(PROFILE, load_truth("nominal", 0, PROFILE.name).wood, 0, 1) if terrain == "flat" else ()
     bench = Bench(terrain=terrain, scene=lying)
     scene, view = (msgspec.json.encode(f(bench.plant)) for f in (scene_of, view_of))

@@ -48,7 +48,7 @@ QUIET = msgspec.structs.replace(
     st.floats(-89.9, 89.9), st.floats(-180.0, 180.0), st.floats(-50.0, 3000.0),
     st.floats(-1000.0, 1000.0), st.floats(-1000.0, 1000.0), st.floats(-20.0, 20.0),
 )  # fmt: skip
-def test_local_metres_become_the_same_place_as_pymap3d_says(lat, lon, height, east, north, up):
+def test_local_metres_agree_with_pymap3d(lat, lon, height, east, north, up):
     mine = LocalFrame(lat, lon, height).geodetic(east, north, up)
     back = pymap3d.geodetic2enu(*mine, lat, lon, height)
     assert back == pytest.approx((east, north, up), abs=1e-3)
@@ -146,7 +146,7 @@ def test_position_is_that_of_the_true_main_antenna():
         assert math.remainder(heading - (math.pi / 2 - psi), math.tau) == pytest.approx(0.0, abs=2e-3)
 
 
-def test_antennas_beside_their_places_turn_the_heading():
+def test_misplaced_antennas_turn_the_heading():
     askew = msgspec.structs.replace(QUIET, aux_offset_m=(0.0, 0.03, 0.0))
     bench = Bench(None, askew)
     bench.wait(0.5)
@@ -154,7 +154,7 @@ def test_antennas_beside_their_places_turn_the_heading():
     assert math.pi / 2 - bench.last("VesselHeading")["Heading"] == pytest.approx(math.atan(0.03 / baseline), abs=2e-4)
 
 
-def test_the_heading_is_that_of_the_machine_however_the_antennas_stand():
+def test_the_heading_does_not_depend_on_the_antennas_layout():
     swapped = msgspec.structs.replace(CARRIER, antenna_main_m=CARRIER.antenna_aux_m, antenna_aux_m=(0.4, 1.0, 2.0))
     out: list[tuple[int, bytes]] = []
     pose = ((0.0, 0.0, 0.0), rpy_quaternion(0.0, 0.0, 0.5))
@@ -165,7 +165,7 @@ def test_the_heading_is_that_of_the_machine_however_the_antennas_stand():
     assert heading == pytest.approx(math.pi / 2 - 0.5, abs=1e-4)
 
 
-def test_motion_is_told_clockwise_and_attitude_right_side_down():
+def test_motion_is_clockwise_and_roll_is_right_side_down():
     bench = Bench(driving(0.6, 0.1))
     bench.wait(8.0)
     assert bench.last("RateOfTurn")["Rate"] == pytest.approx(-0.1, abs=1e-3)
@@ -188,7 +188,7 @@ def test_a_solution_is_fifty_to_a_hundred_milliseconds_old():
     assert 0.048 <= min(ages) < 0.06 and 0.09 < max(ages) <= 0.104
 
 
-def test_noise_is_as_large_as_it_should_be():
+def test_noise_has_the_size_of_the_truth():
     bench = Bench(None, TRUTH)
     bench.wait(60.0)
     places = bench.places()
@@ -209,7 +209,7 @@ def test_the_error_wanders_slowly():
     assert max(east) - min(east) > 0.3 and 0.01 < statistics.stdev(steps) < 0.1
 
 
-def test_a_worse_fix_says_so_and_is_worse():
+def test_a_worse_fix_is_reported_and_is_worse():
     spread = {}
     for fix, method in ((Fix.RTK_FIXED, 4), (Fix.RTK_FLOAT, 5), (Fix.DGNSS, 2), (Fix.SINGLE, 1)):
         bench = Bench(None, TRUTH)
@@ -267,7 +267,7 @@ def test_faults_of_heading_position_and_power():
     assert len(bench.sent) > count
 
 
-def test_equal_seeds_give_equal_bytes_and_others_others():
+def test_only_equal_seeds_give_equal_bytes():
     def run(seed):
         bench = Bench(driving(), TRUTH, seed)
         bench.wait(3.0)

@@ -1,4 +1,4 @@
-"""The emulated inertial sensor on a grapple: what it says, in which direction, how late, and nobody else differs."""
+"""The emulated inertial sensor on a grapple: readings, directions, delay, and no effect on other nodes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def heard(node: ImuNode, outbox: Outbox) -> list[dict[str, float]]:
     return frames
 
 
-def test_it_says_lean_and_rate_late_and_not_quite_right():
+def test_it_reports_lean_and_rate_with_delay_and_error():
     outbox: Outbox = []
     node = ImuNode(IMU, CRANE, outbox, STEP_NS, seed=3)
     said, true = [], []
@@ -71,7 +71,7 @@ def test_a_cut_cable_is_silent():
 
 @pytest.mark.parametrize("slew", [0.0, 1.0])
 @pytest.mark.parametrize(("hinge", "outward", "left"), [("hanger", 1.0, 0.0), ("fork", 0.0, 1.0)])
-def test_leans_are_where_the_grapple_hangs_as_seen_from_its_pin(slew, hinge, outward, left):
+def test_the_lean_is_the_grapples_direction_from_its_pin(slew, hinge, outward, left):
     world = open_world(PLAIN, home={"slew": slew})
     try:
         body = world.crane
@@ -101,7 +101,7 @@ def frames(profile, ticks: int) -> list[tuple[str, int, bytes]]:
         plant.close()
 
 
-def test_only_a_machine_that_has_one_sends_it_and_all_else_is_the_same_to_the_byte():
+def test_only_a_machine_with_an_imu_sends_it_and_all_other_frames_are_equal():
     plain, sensing = frames(PLAIN, 100), frames(SENSING, 100)
     assert not [key for _, key, _ in plain if key in OWN_KEYS]
     own = [(key, data) for _, key, data in sensing if key in OWN_KEYS]

@@ -112,7 +112,7 @@ def test_the_smaller_name_wins_the_address(vehicle):
     assert vehicle.out == [] and vehicle.node.brake and vehicle.node.drive_m_s == 0.0
 
 
-def test_no_two_nodes_of_the_machine_have_one_name():
+def test_the_nodes_names_are_unique():
     nodes = [VehicleNode(MACHINE, [], CARRIER, bool), ArmNode(MACHINE, [], bool), EngineNode(MACHINE, [])]
     assert len({n.name for n in nodes}) == len({n.address for n in nodes}) == 3
 
@@ -183,7 +183,7 @@ def test_speed_and_steering_stay_within_the_machine(vehicle):
     assert vehicle.node.steer < 0.0
 
 
-def test_broken_and_repeated_frames_count_as_none(vehicle):
+def test_invalid_and_repeated_frames_are_ignored(vehicle):
     drive(vehicle)
     codec = MACHINE.message("VehCmd")
     stale = Sender(codec.data_ids, counter=2).protect(codec.encode(0, 0, 0xA, 0.0, 0.6, 0.0))
@@ -228,7 +228,7 @@ def test_the_arms_hold_a_tenth_of_a_second_after_the_last_good_frame_of_either_k
     assert arms.node.state is ArmState.ACTIVE
 
 
-def test_both_floats_at_once_are_refused(arms):
+def test_floating_both_axles_is_refused(arms):
     lift(arms, floats=(1, 0))
     lift(arms, 1, floats=(1, 1))
     assert not arms.node.float_front and not arms.node.float_rear and arms.node.spools == [0.0] * 4
@@ -257,7 +257,7 @@ class Running(EngineNode):
         self.energy_j += 40e3 * STEP_NS * 1e-9
 
 
-def test_the_engine_droops_under_load_and_tells_its_trouble():
+def test_the_engine_droops_under_load_and_reports_its_fault():
     bench = Bench(lambda out, _: Running(MACHINE, out))
     bench.node.speed_m_s, bench.node.brake = -0.5, False
     bench.wait(3_000_000_000)

@@ -1,4 +1,4 @@
-"""The live shell: frames on a real bus, requests over UDP, clean end, one sentence per mistake."""
+"""The live plant: frames on a real bus, requests over UDP, clean end, one line per usage mistake."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_sync_is_answered_on_the_bus_after_nmt_start(live):
     )
 
 
-def test_requests_show_the_truth_and_press_the_button(live):
+def test_requests_read_the_ground_truth_and_press_the_stop(live):
     shell, far, udp, thread = live
     state = ask(udp, "state")
     assert len(state["joints"]) == 5 and len(state["logs"]) == 1 and not state["verdict"]["success"]
@@ -87,7 +87,7 @@ def test_requests_show_the_truth_and_press_the_button(live):
     assert not thread.is_alive() and shell.report()["time_s"] > 0.0
 
 
-def test_a_surveyor_reads_the_pin_with_millimetres_of_noise(live):
+def test_the_total_station_reads_the_pin_with_millimetres_of_noise(live):
     _, _, udp, _ = live
     tip = ask(udp, "state")["tip_m"]
     readings = [ask(udp, "survey")["pin_m"] for _ in range(20)]
@@ -97,7 +97,7 @@ def test_a_surveyor_reads_the_pin_with_millimetres_of_noise(live):
     assert all(abs(a - b) < 0.003 for a, b in zip(mean, tip, strict=True))
 
 
-def test_a_surveyor_reads_the_grapples_direction_within_a_degree_and_modulo_half_a_turn(live):
+def test_the_total_station_reads_the_grapples_direction_modulo_half_a_turn(live):
     _, _, udp, _ = live
     slew, *_, rot = ask(udp, "state")["joints"]
     along = grapple_yaw(PROFILE, (slew, 0.0, 0.0, 0.0, rot))
@@ -118,7 +118,7 @@ def test_a_surveyor_reads_the_grapples_direction_within_a_degree_and_modulo_half
         (["--bus", "crane0=nonsense"], 4, "nonsense"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_an_exit_code(arguments, code, words, capsys):
+def test_a_usage_mistake_gives_one_line_and_an_exit_code(arguments, code, words, capsys):
     assert main(arguments) == code
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
@@ -130,7 +130,7 @@ def test_a_bad_bus_argument_is_a_usage_error(capsys):
     assert stop.value.code == 2 and "NAME=ADDRESS" in capsys.readouterr().err
 
 
-def test_a_carrier_lives_on_two_buses_and_answers_its_page():
+def test_a_carrier_runs_on_two_buses_and_answers_requests():
     profile, port = load_profile("aoro_fc8"), free_port()
     channels = {name: f"virtual:{name}-{next(_channels)}" for name in ("crane0", "mach0")}
     plant = Plant(profile, scene=())

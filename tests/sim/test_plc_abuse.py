@@ -35,7 +35,7 @@ def plc() -> Iterator[ServedPlc]:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Waits for something that has to happen; the test's own time-out ends a wait in vain."""
+    """Wait for a condition; the test's own timeout ends the wait."""
     while not condition():
         time.sleep(0.005)
 
@@ -68,7 +68,7 @@ def abuser(plc: ServedPlc) -> Iterator[Abuser]:
 
 
 def rightful(plc: ServedPlc, between: Callable[[int], None]) -> int:
-    """``ROUNDS`` exchanges with something nasty before each; how many were answered with their own number."""
+    """``ROUNDS`` exchanges, each after an attack; returns how many were answered with their own number."""
 
     async def run() -> int:
         client, good = ModbusClient(LOOPBACK, plc.port, 5.0), 0
@@ -113,12 +113,12 @@ def test_greedy_clients_that_flood_and_never_read(plc: ServedPlc, abuser: Abuser
     assert plc.server.counts.evicted >= 20 - MAX_CONNECTIONS
 
 
-def test_half_open_connections_without_end(plc: ServedPlc, abuser: Abuser) -> None:
+def test_many_half_open_connections(plc: ServedPlc, abuser: Abuser) -> None:
     served(plc, lambda n: None if n > 40 else abuser.connect() and None)
     assert plc.server.counts.evicted >= 40 - MAX_CONNECTIONS
 
 
-def test_a_slow_client_is_ended(plc: ServedPlc, abuser: Abuser, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_client_is_disconnected(plc: ServedPlc, abuser: Abuser, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus, "REQUEST_S", 0.3)
     slow = abuser.connect()
 
@@ -130,7 +130,7 @@ def test_a_slow_client_is_ended(plc: ServedPlc, abuser: Abuser, monkeypatch: pyt
     until(lambda: plc.server.counts.slow == 1)
 
 
-def test_an_idle_client_is_ended(plc: ServedPlc, abuser: Abuser, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_idle_client_is_disconnected(plc: ServedPlc, abuser: Abuser, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus, "IDLE_S", 0.1)
     abuser.connect()
     until(lambda: plc.server.counts.slow == 1)
@@ -156,7 +156,7 @@ ANSWERED = [
 
 
 @pytest.mark.parametrize("data", MALFORMED)
-def test_what_is_no_modbus_ends_the_connection(plc: ServedPlc, abuser: Abuser, data: bytes) -> None:
+def test_bytes_that_are_not_modbus_end_the_connection(plc: ServedPlc, abuser: Abuser, data: bytes) -> None:
     stranger = abuser.connect()
     stranger.sendall(data)
     with contextlib.suppress(ConnectionResetError):
@@ -164,7 +164,7 @@ def test_what_is_no_modbus_ends_the_connection(plc: ServedPlc, abuser: Abuser, d
     assert plc.server.counts.malformed == 1
 
 
-def test_a_malformed_request_is_answered_with_its_exception(plc: ServedPlc, abuser: Abuser) -> None:
+def test_a_malformed_request_gets_its_exception(plc: ServedPlc, abuser: Abuser) -> None:
     stranger = abuser.connect()
     for pdu, function, code in ANSWERED:
         stranger.sendall(struct.pack(">HHHB", 9, 0, len(pdu) + 1, 1) + pdu)
@@ -184,7 +184,7 @@ def test_noise_is_survived(plc: ServedPlc, abuser: Abuser) -> None:
     served(plc, nasty)
 
 
-def test_strangers_may_read_while_one_commands_and_not_write(plc: ServedPlc) -> None:
+def test_other_clients_may_read_but_not_write_while_one_commands(plc: ServedPlc) -> None:
     async def run() -> None:
         ours, theirs = (ModbusClient(LOOPBACK, plc.port, 5.0) for _ in range(2))
         await ours.connect()
@@ -203,7 +203,7 @@ def test_strangers_may_read_while_one_commands_and_not_write(plc: ServedPlc) -> 
 
 
 class Cable:
-    """A proxy between client and PLC that can stop forwarding without a word to either end."""
+    """A proxy between client and PLC that can stop forwarding silently."""
 
     def __init__(self, port: int) -> None:
         self._port = port
@@ -231,7 +231,7 @@ class Cable:
             sink.close()
 
 
-def test_a_half_open_connection_is_noticed_left_and_never_speaks_again(plc: ServedPlc) -> None:
+def test_a_half_open_connection_is_detected_and_abandoned(plc: ServedPlc) -> None:
     """The far end of a dead connection still commands until the watchdog; the PLC is then SAFE, and latched."""
 
     async def run() -> None:
@@ -256,7 +256,7 @@ def test_a_half_open_connection_is_noticed_left_and_never_speaks_again(plc: Serv
     assert plc.program.arbiter.accepted == 2
 
 
-def test_closing_discards_what_the_kernel_still_holds(plc: ServedPlc) -> None:
+def test_closing_discards_the_kernels_buffer(plc: ServedPlc) -> None:
     async def run() -> bytes:
         client = ModbusClient(LOOPBACK, plc.port, 1.0)
         await client.connect()

@@ -133,7 +133,7 @@ STATUS = status_registers(Feedback(heartbeat=9, state=State.HOLD, accepted=4), 3
 
 
 async def converse(port: int) -> None:
-    """What our client does with any server that holds a status block."""
+    """Our client against any server that holds a status block."""
     client = ModbusClient(LOOPBACK, port, 1.0)
     with pytest.raises(LinkError):
         await client.status()
@@ -173,7 +173,7 @@ def test_our_client_with_pymodbus_own_server() -> None:
     asyncio.run(run())
 
 
-def test_our_client_tells_a_refusal_from_a_lost_link(plc: ServedPlc) -> None:
+def test_our_client_distinguishes_a_refusal_from_a_lost_link(plc: ServedPlc) -> None:
     async def run() -> None:
         client = ModbusClient(LOOPBACK, plc.port, 1.0)
         await client.connect()
@@ -190,7 +190,7 @@ def test_our_client_tells_a_refusal_from_a_lost_link(plc: ServedPlc) -> None:
     asyncio.run(run())
 
 
-def test_nobody_there_is_one_sentence() -> None:
+def test_a_missing_server_is_a_link_error() -> None:
     async def run() -> None:
         with pytest.raises(LinkError, check=coded("plc-link.no-answer")):
             await ModbusClient(LOOPBACK, 1, 0.5).connect()

@@ -1,4 +1,4 @@
-"""How the emulated PLC takes commands: split writes, sequence, one commander, watchdog, illegal values, datagrams."""
+"""The emulated PLC's command arbiter: split writes, sequence, one commander, watchdog, illegal values, datagrams."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def refused(g: CommandArbiter, client: int, address: int, values: list[int], now
     return refusal.value.code
 
 
-def test_a_whole_block_counts_once_per_sequence_number() -> None:
+def test_a_whole_block_is_accepted_once_per_sequence_number() -> None:
     g = arbiter()
     g.write(US, 100, block(7), 0)
     assert (g.command, g.sequence, g.accepted) == (MOVE, 7, 1)
@@ -49,7 +49,7 @@ def test_a_whole_block_counts_once_per_sequence_number() -> None:
     assert (g.command, g.accepted) == (Command(), 2)
 
 
-def test_the_sequence_goes_round() -> None:
+def test_the_sequence_number_wraps() -> None:
     g = arbiter()
     g.write(US, 100, block(0xFFFF), 0)
     g.write(US, 100, block(0, Command()), 1)
@@ -58,8 +58,8 @@ def test_the_sequence_goes_round() -> None:
 
 @settings(max_examples=50)
 @given(st.lists(st.integers(1, 31), unique=True).map(sorted), st.booleans())
-def test_a_split_write_counts_when_its_number_is_written(cuts: list[int], one_by_one: bool) -> None:
-    """However a client cuts the block, nothing counts before register 101, and then everything."""
+def test_a_split_write_is_accepted_with_its_sequence_number(cuts: list[int], one_by_one: bool) -> None:
+    """However a client splits the block, register 101 commits it as a whole."""
     g, words = arbiter(), block(3)
     edges = list(range(33)) if one_by_one else [0, *cuts, 32]
     pieces = [(a, words[a:b]) for a, b in pairwise(edges)]
@@ -72,7 +72,7 @@ def test_a_split_write_counts_when_its_number_is_written(cuts: list[int], one_by
     assert (g.accepted, g.command) == (1, MOVE)
 
 
-def test_two_clients_do_not_finish_each_others_writes() -> None:
+def test_two_clients_do_not_complete_each_others_writes() -> None:
     g, words = arbiter(), block(3)
     g.write(US, 102, words[2:], 0)
     g.write(THEM, 101, [9], 0)
@@ -97,7 +97,7 @@ def test_an_illegal_value_is_exception_3_and_changes_nothing(register: int, valu
     assert g.fault is Fault.NONE
 
 
-def test_an_illegal_reference_names_its_axis_and_is_judged_at_the_commit() -> None:
+def test_an_illegal_reference_names_its_axis_at_the_commit() -> None:
     g = arbiter()
     g.write(US, 100, block(1), 0)
     too_far = block(2, Command(Mode.VALVES, True, (0.0, 0.0, 1.000_001 + 1e-6, 0, 0, 0, 0)))
@@ -109,13 +109,13 @@ def test_an_illegal_reference_names_its_axis_and_is_judged_at_the_commit() -> No
 @pytest.mark.parametrize(
     ("address", "count"), [(0, 1), (10, 1), (12, 4), (48, 1), (99, 2), (99, 32), (131, 2), (132, 1), (11, 2)]
 )
-def test_a_write_elsewhere_is_exception_2(address: int, count: int) -> None:
+def test_a_write_to_another_address_is_exception_2(address: int, count: int) -> None:
     g = arbiter()
     assert refused(g, US, address, [0] * count) == 2
     assert g.fault is Fault.NONE
 
 
-def test_who_commands_keeps_the_command_until_the_watchdog() -> None:
+def test_the_commander_keeps_the_command_until_the_watchdog_expires() -> None:
     g = arbiter()
     g.write(US, 100, block(500), 0)
     assert refused(g, THEM, 100, block(501), 100 * MS) == 6
@@ -127,7 +127,7 @@ def test_who_commands_keeps_the_command_until_the_watchdog() -> None:
     assert (g.commander(301 * MS), g.sequence) == (THEM, 2), "a new commander begins with its own numbers"
 
 
-def test_who_has_left_may_be_followed_at_once() -> None:
+def test_a_disconnected_commander_is_replaced_at_once() -> None:
     g = arbiter()
     g.write(US, 100, block(500), 0)
     g.disconnected(THEM)
@@ -139,7 +139,7 @@ def test_who_has_left_may_be_followed_at_once() -> None:
     assert refused(g, US, 100, block(501), 20 * MS) == 6
 
 
-def test_a_moving_heartbeat_is_a_sign_of_life_and_a_frozen_one_is_none() -> None:
+def test_only_a_changing_heartbeat_feeds_the_watchdog() -> None:
     g = arbiter()
     g.write(US, 100, block(1, heartbeat=10), 0)
     g.write(US, 100, [11], 250 * MS)
@@ -158,7 +158,7 @@ def test_the_watchdog_register_is_bounded(value: int, code: int) -> None:
     assert g.commander(51 * MS) is None
 
 
-def test_unfinished_writes_of_many_clients_take_bounded_memory() -> None:
+def test_drafts_of_many_clients_use_bounded_memory() -> None:
     g = arbiter()
     for client in range(1000):
         g.write(client, 127, [50], 0)
@@ -169,7 +169,7 @@ def datagram(sequence: int, command: Command = MOVE) -> bytes:
     return encode_command(Header(sequence, 0, 0), command)
 
 
-def test_datagrams_old_damaged_or_strange_are_dropped_and_illegal_ones_are_a_fault() -> None:
+def test_invalid_datagrams_are_dropped_and_illegal_values_are_a_fault() -> None:
     g, us, them = arbiter(), ("127.0.0.1", 5), ("127.0.0.1", 6)
     assert g.datagram(us, datagram(9), 0) == Header(9, 0, 0)
     assert g.datagram(us, datagram(9, Command()), 1) is None

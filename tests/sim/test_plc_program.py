@@ -24,7 +24,7 @@ SPOOLS = Command(Mode.VALVES, True, (0.5, -0.25, 0, 0, 0, 0, 0), grapple=Grapple
 
 
 class Rig:
-    """A program with inputs to turn; ``run`` scans in physics steps and can command on the way."""
+    """A program with adjustable inputs; ``run`` scans in physics steps and can send commands meanwhile."""
 
     def __init__(self, role: Role) -> None:
         self.inputs = Inputs(HOME, (10.0,) * 8, 1.0, 0.0, MOTION_ALLOWED)
@@ -47,7 +47,7 @@ class Rig:
         return self.program.state
 
 
-def test_it_holds_until_an_armed_command_and_obeys_it() -> None:
+def test_it_holds_until_an_armed_command_and_executes_it() -> None:
     rig = Rig(Role.VALVES)
     assert rig.program.state is State.INIT
     rig.run(50)
@@ -60,7 +60,7 @@ def test_it_holds_until_an_armed_command_and_obeys_it() -> None:
     assert rig.program.feedback.accepted == rig.sequence
 
 
-def test_silence_of_50_ms_ramps_to_neutral_and_a_new_command_goes_on() -> None:
+def test_50_ms_without_commands_ramps_to_neutral_and_a_new_command_resumes() -> None:
     rig = Rig(Role.VALVES)
     rig.run(100, SPOOLS)
     rig.run(50)
@@ -74,7 +74,7 @@ def test_silence_of_50_ms_ramps_to_neutral_and_a_new_command_goes_on() -> None:
     assert rig.state is State.EXECUTE
 
 
-def test_silence_of_300_ms_is_safe_and_latched() -> None:
+def test_300_ms_without_commands_is_safe_and_latched() -> None:
     rig = Rig(Role.VALVES)
     rig.run(100, SPOOLS)
     rig.run(300)
@@ -136,7 +136,7 @@ def test_feedback_is_in_tenths_of_degrees_and_millimetres() -> None:
         assert abs(got - rig.inputs.positions[j]) <= 0.5 * resolution + 1e-12
 
 
-def test_the_law_brings_every_joint_to_its_reference_and_rests() -> None:
+def test_the_law_moves_every_joint_to_its_reference_and_rests() -> None:
     """On an ideal valve with 80 ms of dead time; the stop band keeps the quantised feedback from hunting."""
     rig = Rig(Role.REFERENCES)
     specs = [joint(PROFILE, j) for j in JOINTS]
@@ -168,7 +168,7 @@ def test_a_speed_share_slows_the_law() -> None:
     assert outputs[0] > outputs[1] > 0.0
 
 
-def test_a_machine_that_drives_has_no_such_plc() -> None:
+def test_a_machine_that_drives_has_no_emulated_plc() -> None:
     profile = msgspec.structs.replace(load_profile("aoro_fc8"))
     with pytest.raises(PlantError, check=coded("plc.mobile-machine")):
         PlcPlant(profile, role=Role.VALVES)

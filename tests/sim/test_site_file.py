@@ -1,4 +1,4 @@
-"""The site of a mission as a file, and the plant that stands on it."""
+"""The site of a mission as a file, and its plant."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.codes import coded
 SITE = Site(63.5, 19.5, (LogSpec(8.0, 3.0, 0.3, 2.0, 0.25, 900.0), LogSpec(-35.0, 0.0, 0.0, 2.5, 0.2, 850.0)), 1, 2)
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_a_saved_site_loads_equal(tmp_path: Path) -> None:
     SITE.save(tmp_path / "site.json")
     assert load_site(tmp_path / "site.json") == SITE
 
@@ -30,15 +30,13 @@ def test_the_plant_stands_at_the_site_among_its_logs() -> None:
     plant.close()
 
 
-def test_a_machine_that_stands_still_has_no_site() -> None:
+def test_a_machine_that_does_not_drive_has_no_site() -> None:
     with pytest.raises(PlantError, check=coded("site.fixed-machine")):
         SITE.plant(load_profile("palms_471"), "nominal", 1)
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b'{"latitude_deg": 1}', b'{"latitude_deg": "x"}', b"\xff"])
-def test_a_file_that_is_none_is_one_sentence(
-    content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_malformed_site_file_is_refused(content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "site.json"
     path.write_bytes(content)
     with pytest.raises(PlantError, check=coded("site.malformed")):
@@ -47,7 +45,7 @@ def test_a_file_that_is_none_is_one_sentence(
     assert str(path) in message and message.count("\n") == 1
 
 
-def test_a_file_that_is_missing_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_site_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "none.json"
     with pytest.raises(PlantError, check=coded("site.unreadable")):
         load_site(path)

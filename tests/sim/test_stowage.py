@@ -50,13 +50,13 @@ def world() -> Iterator[World]:
     world.close()
 
 
-def test_what_has_lain_still_is_stowed_and_what_lies_on_the_ground_is_not(world):
+def test_a_still_load_is_stowed_and_logs_on_the_ground_are_not(world):
     assert world.log_bodies.stowed == ()
     go(world, 1.0)
     assert world.log_bodies.stowed == tuple(range(LOGS))
 
 
-def test_the_machine_carries_a_stowed_load_as_it_carries_one_that_is_awake(world):
+def test_a_stowed_load_weighs_like_an_awake_one(world):
     other = laden(stowing=False)
     for seconds, drive in ((2.0, PARKED), (1.0, AHEAD), (3.0, AHEAD), (3.0, PARKED)):
         for w in (world, other):
@@ -71,7 +71,7 @@ def test_the_machine_carries_a_stowed_load_as_it_carries_one_that_is_awake(world
     other.close()
 
 
-def test_a_start_and_a_stop_wake_the_load_and_leave_it_where_it_lay(world):
+def test_a_start_and_a_stop_wake_the_load_without_moving_it(world):
     go(world, 1.0)
     before = [in_base(world, log) for log in range(LOGS)]
     woken = 0
@@ -85,7 +85,7 @@ def test_a_start_and_a_stop_wake_the_load_and_leave_it_where_it_lay(world):
     assert woken >= 2
 
 
-def test_a_log_that_is_let_fall_onto_the_load_wakes_it_first_and_is_stowed_with_it(world):
+def test_a_falling_log_wakes_the_load_and_is_stowed_with_it(world):
     go(world, 1.0)
     p, falling = world.client, world.log_bodies.body_ids[LOGS]
     top = max(p.getAABB(world.log_bodies.body_ids[i])[1][2] for i in range(LOGS))
@@ -106,7 +106,7 @@ def test_a_log_that_is_let_fall_onto_the_load_wakes_it_first_and_is_stowed_with_
 
 
 @pytest.mark.parametrize(("above_m", "stowed"), [(0.1, False), (0.6, True)])
-def test_a_load_with_open_tongs_close_above_it_stays_awake(above_m, stowed):
+def test_a_load_below_open_jaws_stays_awake(above_m, stowed):
     x, y = PROFILE.bunk.center_m
     hanging = PROFILE.grapple.tongs.tip_below_pin_m[0]
     slew, lift, tilt, ext = solve(PROFILE, x, y, PROFILE.bunk.floor_z_m + 0.35 + above_m + hanging)
@@ -116,7 +116,7 @@ def test_a_load_with_open_tongs_close_above_it_stays_awake(above_m, stowed):
     world.close()
 
 
-def test_equal_worlds_stow_and_wake_alike(world):
+def test_equal_worlds_stow_and_wake_equally(world):
     other = laden()
     for w in (world, other):
         go(w, 1.0)
@@ -127,7 +127,7 @@ def test_equal_worlds_stow_and_wake_alike(world):
     other.close()
 
 
-def test_the_weight_in_a_frame_turns_with_its_axes_and_its_acceleration():
+def test_apparent_weight_follows_rotation_and_acceleration():
     level, look_s = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), 0.01
     weight = ApparentWeight(look_s)
     rest = weight.now

@@ -40,7 +40,7 @@ def test_vector_and_grid_agree_with_height(kind):
         assert at == pytest.approx(terrain.heights[i, j], abs=1e-9)
 
 
-def test_kinds():
+def test_terrain_kinds():
     assert Terrain("flat", 1, -1.3).height(3.0, -7.0) == -1.3
     slope = Terrain("slope")
     assert slope.height(5.0, 2.0) == pytest.approx(0.2)
@@ -49,7 +49,7 @@ def test_kinds():
         Terrain("lunar")
 
 
-def test_rough_is_drawn_from_the_seed_and_as_rough_as_it_says():
+def test_rough_terrain_follows_its_seed_and_has_the_stated_roughness():
     one, same, other = Terrain("rough", 1), Terrain("rough", 1), Terrain("rough", 2)
     assert np.array_equal(one.heights, same.heights)
     assert not np.array_equal(one.heights, other.heights)

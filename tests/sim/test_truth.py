@@ -1,4 +1,4 @@
-"""The hidden truth: complete files, bounded individuals, the same one for the same seed."""
+"""The ground truth: complete files, bounded individuals, the same individual for the same seed."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ machines = pytest.mark.parametrize("machine", MACHINES)
 
 
 def ratios(one, other) -> dict[str, float]:
-    """Field by field, one over other; fields that are zero or no numbers are left out."""
+    """The ratios one / other, field by field; zeros and fields that are not numbers are left out."""
     fields = {f: (getattr(one, f), getattr(other, f)) for f in one.__struct_fields__}
     return {f: a / b for f, (a, b) in fields.items() if isinstance(a, float) and b}
 
 
 @machines
-def test_the_truth_is_about_the_joints_of_the_profile(machine):
+def test_the_truth_has_the_profiles_joints(machine):
     truth, profile = load_truth("nominal", 0, machine), load_profile(machine)
     assert truth.machine == machine and list(truth.functions)[:6] == [*profile.joints, "grapple"]
     assert (truth.carrier is None) == (profile.carrier is None) == (len(truth.functions) == 6)
@@ -88,7 +88,7 @@ def test_another_process_draws_the_same_individual():
     assert other.stdout.strip() == str(load_truth("sampled", 7, "aoro_fc8")), other.stderr
 
 
-def test_individuals_differ_among_themselves_and_are_near_the_nominal_one_on_average():
+def test_individuals_differ_and_average_near_the_nominal_machine():
     many = [load_truth("sampled", seed, "palms_471").functions["lift"] for seed in range(200)]
     nominal = load_truth("nominal", 0, "palms_471").functions["lift"]
     speeds = [f.valve.full_speed_plus / nominal.valve.full_speed_plus for f in many]
@@ -103,7 +103,7 @@ def test_parts_draw_independently():
     assert len({round(s, 9) for s in speeds}) == len(speeds)
 
 
-def test_a_file_of_ones_own_is_read_and_a_bad_one_refused_in_a_sentence(tmp_path):
+def test_a_users_truth_file_is_read_and_a_bad_one_refused(tmp_path):
     nominal, path = load_truth("nominal", 0, "palms_471"), tmp_path / "mine.toml"
     text = Path(sim.truth.__file__).with_name("nominal.toml").read_text()
     path.write_text(text.replace("relief_pa = 19.0e6", "relief_pa = 18.0e6"))

@@ -40,7 +40,7 @@ class Wheel:
         return self.out[0]
 
 
-def test_load_is_the_spring_of_the_depth_and_never_pulls():
+def test_the_normal_load_follows_the_depth_and_never_pulls():
     wheel = Wheel()
     assert wheel.run(STEP_S)[2] == pytest.approx(LOAD_N)
     assert wheel.contact[0] == pytest.approx([0.0, 0.0, 0.0, LOAD_N], abs=1e-9)
@@ -108,7 +108,7 @@ def test_a_braked_wheel_turns_with_its_arm():
     assert wheel.angle[0] == pytest.approx(angle, abs=1e-9)
 
 
-def test_a_lifted_wheel_does_not_race():
+def test_a_lifted_wheel_does_not_overspeed():
     wheel = Wheel()
     wheel.arms[0, [2, 9]] = 0.9
     wheel.run(5.0, torque=5000.0, top=1.0)

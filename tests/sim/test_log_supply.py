@@ -1,4 +1,4 @@
-"""Logs of a mission: where the plan says, and those of later laps on the ground that the plant has."""
+"""Logs of a mission: at the places of the plan; those of later laps wait on the plant's ground."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sim.site.log_supply import LogPlace, place_logs
 PROFILE = load_profile("aoro_fc8")
 
 
-def test_logs_lie_where_they_are_said_to_and_the_later_ones_wait_apart_on_the_ground() -> None:
+def test_logs_lie_at_their_places_and_later_ones_wait_apart() -> None:
     places = [LogPlace(4.0 * i, 3.0, 0.1 * i, 2.0, 0.25) for i in range(12)]
     scene = place_logs(PROFILE, "nominal", 1, places, rounds=2)
     assert len(scene) == 24
