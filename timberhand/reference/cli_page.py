@@ -18,7 +18,8 @@ def page() -> str:
 
     command = get_command(app)
     _show_whole_sentences(command)
-    with command.make_context("timberhand", [], resilient_parsing=True) as context:
+    made: Any = command.make_context("timberhand", [], resilient_parsing=True)
+    with made as context:
         text = get_docs_for_click(obj=command, ctx=context, name="timberhand", title="x")
     text = html.unescape(re.sub(r"</?span[^>]*>", "", text)).split("\n", 1)[1]
     # Examples are lines indented by two blanks: without a fence Markdown would join them.
