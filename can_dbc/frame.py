@@ -1,8 +1,8 @@
-"""The one representation of a CAN frame that all of timberhand passes around.
+"""The representation of a CAN frame that all of timberhand uses.
 
-A key carries the identifier and the frame kind the way SocketCAN does (``linux/can.h``): the low 29 bits
-are the identifier, the top three bits say extended, remote and error.  So ``0x210`` and ``0x210 | EXTENDED``
-are two different frames, and a table of codecs is a plain ``dict`` over keys.
+A key holds the identifier and the frame kind as in SocketCAN (``linux/can.h``): the low 29 bits are the
+identifier, the top three bits mean extended, remote and error.  So ``0x210`` and ``0x210 | EXTENDED`` are two different
+frames, and a table of codecs is a plain ``dict`` over keys.
 """
 
 from __future__ import annotations

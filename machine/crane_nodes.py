@@ -23,7 +23,7 @@ class CraneNode(IntEnum):
 
 PRESSURE_NODES: Final = (CraneNode.PRESSURES_A, CraneNode.PRESSURES_B, CraneNode.PRESSURES_C)
 
-NODE_NAMES: Final = {
+NODE_NAMES: Final[dict[int, str]] = {
     CraneNode.SAFETY_MODULE: "the safety module",
     CraneNode.VALVES: "the valve node",
     CraneNode.PRESSURES_A: "pressure module A",

@@ -1,4 +1,4 @@
-"""The crane's joints: the one enumeration that every array over joints is indexed by."""
+"""The crane's joints: the enumeration that indexes every array over joints."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Final
 class Joint(IntEnum):
     """Actuated joints in chain order (paper A III-A, RRRP + rotator; paper B 3.1.2, q1..q5).
 
-    LIFT is the main (inner) boom, TILT the stick (outer boom), EXT the telescope.  Angles are in rad, EXT in
-    m.
+    LIFT is the main (inner) boom, TILT the stick (outer boom), EXT the telescope.  Angles are in rad, EXT in m.
     """
 
     SLEW = 0
@@ -23,4 +22,4 @@ class Joint(IntEnum):
 JOINTS: Final = tuple(Joint)
 N_JOINTS: Final = len(JOINTS)
 ARTICULATION: Final = N_JOINTS
-"""The number of the carrier's articulation where encoders are counted: it follows the crane's joints."""
+"""The number of the carrier's articulation where encoders are numbered; it follows the crane's joints."""

@@ -1,9 +1,8 @@
-"""What a machine is, as the controller and the planner know it: the profile (TOML) and its validation.
+"""The profile (TOML): a machine as controller and planner know it.
 
-A profile never holds the truth of one individual machine (that is ``sim/truth``); it holds what a
-commissioning engineer wrote down: geometry, limits, sensor nodes, valve map, gains.  Every limit and gain is
-per second, so any control rate works.  For the prismatic joint EXT read metres where a field says
-``rad``-free ``position``/``speed``.
+A profile holds what a commissioning engineer writes down: geometry, limits, sensor nodes, valve map, gains.  It never
+holds the ground truth of an individual machine (``sim/truth``).  Limits and gains are per second, so that every
+control rate works.  Positions and speeds without a unit in their name are in rad, for the prismatic joint EXT in m.
 """
 
 from __future__ import annotations
@@ -32,8 +31,7 @@ class Kinematics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Encoder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A CANopen (CiA 406) encoder: node id, message in ``crane.dbc`` and what start-up reads back and
-    compares.
+    """A CANopen (CiA 406) encoder: node id, message in ``crane.dbc`` and the values that start-up reads and compares.
 
     position = direction * (counts - zero_counts) * unit_per_count, wrapped modulo ``total_counts`` around
     ``zero_counts`` for rotary encoders (object 6002h).  ``unit_per_count`` is rad or m.
@@ -53,11 +51,11 @@ class Encoder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Valve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A valve function.
 
-    Dead-band on either side [%], metering ``exponent`` behind it, speed at full command [unit/s], sign; dead time and
-    lag of the spool behind it [s], and ``oil_s``, how much later still the joint follows, for pump and oil; pump flow
-    that a joint speed takes on either side [m^3 per unit]; ``hysteresis_pct``, the whole width of the spool's play [%
-    of the stroke].  ``lever``: arm of the cylinder at the joint positions ``lever_at``, as a share of where the full
-    speeds and flows hold; empty when it is the same everywhere.
+    Dead band on either side [%], metering ``exponent`` beyond it, speed at full command [unit/s], sign; dead time and
+    lag of the spool [s], and ``oil_s``, the further delay of the joint due to pump and oil; pump flow per joint speed
+    on either side [m^3 per unit]; ``hysteresis_pct``, the full width of the spool's hysteresis [% of the stroke].
+    ``lever``: lever arm of the cylinder at the joint positions ``lever_at``, as a share of the arm for which the full
+    speeds and flows hold; empty if it is constant.
     """
 
     signal: str
@@ -78,11 +76,11 @@ class Valve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A joint's law (docs/reference/machines.md section 4).
+    """A joint's control law (docs/reference/machines.md section 4).
 
-    ``kp_1_s`` [1/s] is what every ``kind`` may spend on small errors, ``kd`` [-] the gain of the PD's and PID's error
-    rate, ``layer`` [unit] the boundary layer of the sliding laws.  ``damping_per_bar`` [unit/s per bar] gives way to
-    vibrations of the load pressure.  Within ``stop_band`` [unit] a joint that came to rest is left alone.
+    ``kp_1_s`` [1/s] is the gain of every ``kind`` for small errors, ``kd`` [-] the gain of the error rate of PD and
+    PID, ``layer`` [unit] the boundary layer of the sliding-mode laws.  ``damping_per_bar`` [unit/s per bar] damps
+    vibrations of the load pressure.  Within ``stop_band`` [unit] a joint at rest is not corrected.
     ``velocity_filter_s`` filters the velocity where a PLC runs the law.
     """
 
@@ -96,18 +94,18 @@ class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Hydraulics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What feeds the functions: the flow [m^3/s] that the pump gives at work."""
+    """The pump: its flow at working speed [m^3/s]."""
 
     pump_flow_m3_s: float
 
 
 class Sag(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the column leans under the weight, as a survey found it; `machine.geometry.sag` says what it does to the pin.
+    """Lean of the column under the crane's weight, from a survey; `machine.geometry.sag` applies it to the pin.
 
     Lean of the empty crane [rad] = ``head_rad_m`` * r_head + ``pin_rad_m`` * r_pin - ``rest_rad``, and
-    ``load_rad_nm`` per Nm that a load adds.  Moment of the empty crane at the lift joint [Nm] = ``head_nm_m`` *
-    (r_head - a1) + ``pin_nm_m`` * (r_pin - a1).  The last three are 0 where no pressures were measured: then nothing
-    is known of loads.
+    ``load_rad_nm`` per Nm of a load.  Moment of the empty crane at the lift joint [Nm] = ``head_nm_m`` *
+    (r_head - a1) + ``pin_nm_m`` * (r_pin - a1).  The last three are 0 if no pressures were measured; loads are then
+    unknown.
     """
 
     head_rad_m: float
@@ -119,14 +117,13 @@ class Sag(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Imu(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An inertial sensor on the grapple, and how its swing is damped (`controller.laws.sway`).
+    """An inertial sensor on the grapple, and the damping of its swing (`controller.laws.sway`).
 
-    ``node`` and ``message`` in ``crane.dbc`` as for an encoder.  It is mounted on the part above the rotator that
-    swings on both hinges and does not turn, so that its axes are the crane's: radial lean and rate are positive when
-    the grapple hangs and swings outward, tangential ones to the left, as the slew turns.  ``gain`` [-] is twice the
-    damping ratio that the pin's motion adds to a pendulum of ``pendulum_m`` [m], the length of a point pendulum of the
-    grapple's period; the pin goes no faster than ``pin_speed_m_s`` for it, and within ``dead_zone_rad`` of swing
-    nothing is done.
+    ``node`` and ``message`` in ``crane.dbc`` as for an encoder.  The sensor is mounted above the rotator, on the part
+    that swings on both hinges and does not turn, so that its axes are the crane's: radial lean and rate are positive
+    outward, tangential ones to the left, as the slew turns.  ``gain`` [-] is twice the damping ratio that the pin's
+    motion adds to a pendulum of ``pendulum_m`` [m], the length of a point pendulum of the grapple's period; damping
+    moves the pin at ``pin_speed_m_s`` at most, and not at all within ``dead_zone_rad`` of swing.
     """
 
     node: int
@@ -138,9 +135,7 @@ class Imu(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class JointSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One actuated joint.  Positions in rad (m for ``prismatic``), speeds per second, accelerations per
-    second squared.
-    """
+    """One actuated joint.  Positions in rad (m for ``prismatic``), speeds per s, accelerations per s^2."""
 
     kind: Literal["revolute", "prismatic"]
     lower: float
@@ -152,8 +147,8 @@ class JointSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     law: Law
 
 
-class TongTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Tong geometry over the tong angle (0 = fully open), docs/reference/machines.md section 1.5."""
+class JawTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Jaw geometry as a function of the jaw angle, 0 = fully open (docs/reference/machines.md section 1.5)."""
 
     angle_rad: tuple[float, ...]
     half_gap_m: tuple[float, ...]
@@ -161,17 +156,17 @@ class TongTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Grapple(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The grapple: geometry, open-loop times, the pressure that says closed, and whether its opening is measured."""
+    """The grapple: geometry, open-loop times, the pressure that means closed, and whether its opening is measured."""
 
     close_time_s: float
     open_time_s: float
     hold_pressure_bar: float
     opening_sensor: bool
-    tongs: TongTable
+    tongs: JawTable
 
 
 class Bunk(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The load bunk: a floor with stakes whose long axis is horizontal; base frame."""
+    """The load bunk, a horizontal floor with stakes, in the base frame."""
 
     center_m: tuple[float, float]
     yaw_rad: float
@@ -182,7 +177,7 @@ class Bunk(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Workspace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where logs lie and how they may be: centre of the pick area and the ground, base frame."""
+    """The area to pick logs from and the height of the ground, in the base frame."""
 
     ground_z_m: float
     pick_center_m: tuple[float, float]
@@ -194,8 +189,8 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
     ``position_m`` and ``rpy_rad`` (about the fixed axes x, then y, then z) place its body frame, x forward, y left,
     z up, in the frame of ``link``; a positive pitch looks down.  Its optical frame is x right, y down, z forward.
-    ``fx_px`` .. ``cy_px`` are of the rectified left picture of ``width_px`` by ``height_px``.  Its depth is to be
-    divided by ``depth_scale``, which a survey finds.
+    ``fx_px`` .. ``cy_px`` are those of the rectified left picture of ``width_px`` by ``height_px``.  Divide its depth
+    by ``depth_scale``, the result of a survey.
     """
 
     model: str
@@ -216,9 +211,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 
 class CarrierValve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A valve that the carrier's own nodes drive: dead-band on either side [%], speed at full command [unit/s],
-    delay [s].
-    """
+    """A valve of the carrier's own nodes: dead band on either side [%], speed at full command [unit/s], delay [s]."""
 
     deadband_plus_pct: float
     deadband_minus_pct: float
@@ -228,14 +221,14 @@ class CarrierValve(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Carrier(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An articulated four-wheel carrier on swing arms (docs/reference/machines.md section 7); ``machine.geometry.carrier`` has its geometry.
+    """An articulated four-wheel carrier on swing arms (docs/reference/machines.md section 7).
 
+    Its geometry is in ``machine.geometry.carrier``.
     Frames ``rear`` and ``front`` share the articulation axis: origin on it, x forward, y left, z up, z = 0 at the
     pivots of the swing arms.  ``front_axle_m`` and ``rear_axle_m`` are their distances from the axis at the
-    transport height.  A height counts how far the frame stands above its lowest position; ``arm_drop_low_m`` is
-    the wheel hub below its pivot there (negative: above it).  Beyond ``tilt_limit_rad`` of roll or pitch the machine
-    does not drive.  Steering speeds are in rad/s, + bends left; swing-arm
-    speeds in m/s of height, + lifts the frame.
+    transport height.  A height is that of the frame above its lowest position; ``arm_drop_low_m`` is the drop of the
+    wheel hub below its pivot there (negative: above it).  Beyond ``tilt_limit_rad`` of roll or pitch the machine does
+    not drive.  Steering speeds are in rad/s, + bends left; swing-arm speeds in m/s of height, + lifts the frame.
     """
 
     front_axle_m: float
@@ -270,8 +263,9 @@ class Carrier(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Plc(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A machine PLC on Ethernet in place of the nodes on crane0 (docs/reference/can-bus.md section 10).  ``role``: it closes the joint loops
-    on the controller's references, or passes the controller's valve commands on.
+    """A machine PLC on Ethernet in place of the nodes on crane0 (docs/reference/can-bus.md section 10).
+
+    ``role``: the PLC closes the joint loops on the controller's references, or passes on its valve commands.
     """
 
     role: Literal["references", "valves"]
@@ -285,8 +279,8 @@ class Timeouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Profile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A whole machine; ``carrier`` is None when it stands still, ``cameras`` may be empty, ``plc``, ``sag`` and
-    ``imu`` None without one."""
+    """A machine; ``carrier`` is None for a stationary machine, ``cameras`` may be empty, ``plc``, ``sag`` and ``imu``
+    are None without one."""
 
     schema: Literal[1]
     name: str
@@ -322,5 +316,5 @@ def encoders(profile: Profile) -> dict[int, Encoder]:
 
 
 def joint_limits(profile: Profile) -> tuple[tuple[float, float], ...]:
-    """(lower, upper) of every joint, indexed by ``Joint``; rad, m for EXT."""
+    """(lower, upper) of every joint, indexed by ``Joint`` [rad, m for EXT]."""
     return tuple((spec.lower, spec.upper) for spec in (joint(profile, j) for j in JOINTS))

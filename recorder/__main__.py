@@ -1,10 +1,10 @@
 """``python -m recorder``: records buses, tick records, state reports and timing until SIGTERM or SIGINT.
 
-The receiving thread only takes and queues, the writing thread only writes, so a disk that hangs for seconds costs
-nothing, and one that hangs longer costs records, which are counted and told on stderr at most once a second.
+The receiving thread only receives and queues, the writing thread only writes: a disk that blocks for seconds costs
+nothing, and one that blocks longer costs records, which are counted and reported on stderr at most once per second.
 When everything is open, one JSON line with ``ready`` goes to stdout.
 
-Exit codes: 0 ended in good order, 2 usage, 3 the directory or profile cannot be used, 4 a bus or port cannot be used.
+Exit codes: 0 normal end, 2 usage, 3 the directory or profile cannot be used, 4 a bus or port cannot be used.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Final
 
 from can_dbc.bus.base import Bus, BusError, BusState
-from can_dbc.bus.batch import widen
+from can_dbc.bus.batch import enlarge_receive_buffer
 from can_dbc.bus.factory import open_bus
-from can_dbc.bus.reconnector import LostLink
+from can_dbc.bus.reconnector import Reconnector
 from can_dbc.frame import Frame
 from can_dbc.timing.page import Timing, TimingRefused, read_timing
 from machine.loading.profile_file import ProfileError, load_profile
@@ -35,19 +35,19 @@ from recorder.recorder import Recorder, RecordingRefused
 
 QUEUE_ITEMS: Final = 50_000
 """About ten seconds of two busy buses."""
-FLUSH_S: Final = 0.1
-LOOK_S: Final = 0.02
-BATCH_BYTES: Final = 65536
-TIMING_S: Final = 1.0
+FLUSH_PERIOD_S: Final = 0.1
+POLL_PERIOD_S: Final = 0.02
+MAX_DATAGRAM_BYTES: Final = 65536
+TIMING_PERIOD_S: Final = 1.0
 
 Item = tuple[str, str, list[Frame] | bytes | Timing]
 
 
-class Shell:
-    """The receiving side: what waits goes into the queue; what does not fit is counted.
+class InputCollector:
+    """The receiving side: queues everything that arrives, and counts what does not fit.
 
-    It looks every 20 ms instead of waking for every frame: stamps are the bus's own, the sockets hold far more, and a
-    recorder that sleeps leaves the processor to those who are in a hurry.
+    It polls every 20 ms instead of waking for every frame: the bus stamps the frames, the sockets hold far more, and a
+    sleeping recorder leaves the processor to real-time processes.
     """
 
     def __init__(
@@ -57,26 +57,26 @@ class Shell:
         self.dropped = 0
         self._buses = tuple(buses.values())
         self.wake, self._ask = socket.socketpair()
-        self._takers = [self._taker(name, bus) for name, bus in buses.items()]
-        self._takers += [self._datagrams(kind, sock) for kind, sock in (("tick", ticks), ("report", reports))]
-        self._takers += [self._page(timing)] if timing else []
+        self._receivers = [self._frames_of(name, bus) for name, bus in buses.items()]
+        self._receivers += [self._datagrams(kind, sock) for kind, sock in (("tick", ticks), ("report", reports))]
+        self._receivers += [self._timing_page(timing)] if timing else []
 
     def run(self) -> None:
-        """Receive until ``end``, and then what still waits."""
+        """Receives until ``end``, then what still waits."""
         ended = False
         while not ended:
-            ended = bool(select.select([self.wake], [], [], LOOK_S)[0])
-            for take in self._takers:
-                take()
+            ended = bool(select.select([self.wake], [], [], POLL_PERIOD_S)[0])
+            for receive in self._receivers:
+                receive()
         self.items.put(None)
 
     def end(self) -> None:
-        """Make ``run`` return; callable from a signal handler."""
+        """Makes ``run`` return; may be called from a signal handler."""
         self._ask.send(b"x")
 
     @property
     def lost(self) -> int:
-        """Frames and records that were there and that nobody will write: the kernel's buffer or the queue was full."""
+        """Frames and records lost because the kernel's buffer or the queue was full."""
         return self.dropped + sum(bus.stats.dropped for bus in self._buses)
 
     def _put(self, item: Item, count: int) -> None:
@@ -85,60 +85,60 @@ class Shell:
         except queue.Full:
             self.dropped += count
 
-    def _taker(self, name: str, bus: Bus) -> Callable[[], None]:
-        link, told = LostLink(bus), False
-        lost, tell_after = 0, 0.0
+    def _frames_of(self, name: str, bus: Bus) -> Callable[[], None]:
+        link, was_down = Reconnector(bus), False
+        lost, report_after_s = 0, 0.0
 
-        def take() -> None:
-            nonlocal told, lost, tell_after
+        def receive() -> None:
+            nonlocal was_down, lost, report_after_s
             frames: list[Frame] = []
             if bus.drain(frames):
                 self._put(("frames", name, frames), len(frames))
             down = bus.stats.state is BusState.DOWN
-            if down != told:
-                told = down
-                say(f"{name} is {'down; recording goes on when it is back' if down else 'back'}")
-            if bus.stats.dropped > lost and (now := time.monotonic()) >= tell_after:
-                lost, tell_after = bus.stats.dropped, now + 1.0
-                say(f"{lost} frames of {name} came too fast to be recorded; give the recorder more processor time")
+            if down != was_down:
+                was_down = down
+                report(f"{name} is {'down; recording continues when it is back' if down else 'back'}")
+            if bus.stats.dropped > lost and (now := time.monotonic()) >= report_after_s:
+                lost, report_after_s = bus.stats.dropped, now + 1.0
+                report(f"{lost} frames of {name} arrived too fast to record; give the recorder more processor time")
             link.watch(time.monotonic_ns())
 
-        return take
+        return receive
 
-    def _page(self, path: Path) -> Callable[[], None]:
-        look_at, written_ns = 0.0, 0
+    def _timing_page(self, path: Path) -> Callable[[], None]:
+        next_read_s, written_ns = 0.0, 0
 
-        def take() -> None:
-            nonlocal look_at, written_ns
-            if (now := time.monotonic()) < look_at:
+        def receive() -> None:
+            nonlocal next_read_s, written_ns
+            if (now := time.monotonic()) < next_read_s:
                 return
-            look_at = now + TIMING_S
-            with contextlib.suppress(TimingRefused):  # no controller, or one that has not begun
+            next_read_s = now + TIMING_PERIOD_S
+            with contextlib.suppress(TimingRefused):  # no controller, or one that has not started
                 timing = read_timing(path)
                 if timing.facts.written_ns != written_ns:
                     written_ns = timing.facts.written_ns
                     self._put(("timing", "", timing), 1)
 
-        return take
+        return receive
 
     def _datagrams(self, kind: str, sock: socket.socket) -> Callable[[], None]:
-        def take() -> None:
+        def receive() -> None:
             try:
                 while True:
-                    self._put((kind, "", sock.recv(BATCH_BYTES)), 1)
+                    self._put((kind, "", sock.recv(MAX_DATAGRAM_BYTES)), 1)
             except BlockingIOError:
                 pass
 
-        return take
+        return receive
 
 
-def write_all(recorder: Recorder, shell: Shell) -> None:
-    """The writing thread: everything in the queue to the recorder, until None comes."""
-    told, tell_after = 0, 0.0
-    flush_at = time.monotonic() + FLUSH_S
+def write_all(recorder: Recorder, inputs: InputCollector) -> None:
+    """The writing thread: passes everything in the queue to the recorder, until None."""
+    reported, report_after_s = 0, 0.0
+    flush_at = time.monotonic() + FLUSH_PERIOD_S
     while True:
         try:
-            item = shell.items.get(timeout=max(0.0, flush_at - time.monotonic()))
+            item = inputs.items.get(timeout=max(0.0, flush_at - time.monotonic()))
         except queue.Empty:
             item = ("", "", b"")
         if item is None:
@@ -156,43 +156,49 @@ def write_all(recorder: Recorder, shell: Shell) -> None:
         now = time.monotonic()
         if now >= flush_at:
             recorder.flush(time.monotonic_ns())
-            flush_at = time.monotonic() + FLUSH_S
-        lost = recorder.dropped + shell.dropped
-        if lost > told and now >= tell_after:
-            say(f"{lost} records could not be written so far; make room on the disk")
-            told, tell_after = lost, now + 1.0
-    recorder.dropped += shell.lost
+            flush_at = time.monotonic() + FLUSH_PERIOD_S
+        lost = recorder.dropped + inputs.dropped
+        if lost > reported and now >= report_after_s:
+            report(f"{lost} records could not be written so far; free space on the disk")
+            reported, report_after_s = lost, now + 1.0
+    recorder.dropped += inputs.lost
     recorder.close()
 
 
-def say(sentence: str) -> None:
-    """One line on stderr."""
+def report(sentence: str) -> None:
+    """Writes one line to stderr."""
     sys.stderr.write(f"recorder: {sentence}\n")
 
 
 def udp_socket(port: int) -> socket.socket:
-    """A bound, non-blocking socket on loopback; raises OSError."""
+    """A non-blocking socket bound on loopback; raises OSError."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setblocking(False)
-    widen(sock, 4 << 20)
+    enlarge_receive_buffer(sock, 4 << 20)
     sock.bind(("127.0.0.1", port))
     return sock
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The process; returns its exit code."""
+    """Runs the process; returns its exit code."""
     parser = argparse.ArgumentParser(prog="python -m recorder", description="Records buses, ticks and reports.")
-    parser.add_argument("--out", type=Path, required=True, help="directory of the recording; it must hold none yet")
-    parser.add_argument("--bus", action="append", default=[], metavar="NAME=ADDRESS", help="as in crane0=wire:crane0")
+    parser.add_argument("--out", type=Path, required=True, help="directory of the recording, without one so far")
+    parser.add_argument(
+        "--bus",
+        action="append",
+        default=[],
+        metavar="NAME=ADDRESS",
+        help="bus to record, for example crane0=wire:crane0",
+    )
     parser.add_argument("--tick-port", type=int, required=True, help="UDP port of the controller's tick records")
     parser.add_argument("--report-port", type=int, required=True, help="UDP port of the controller's state reports")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file")
-    parser.add_argument("--timing", type=Path, metavar="FILE", help="the controller's timing page, kept once a second")
-    parser.add_argument("--seed", type=int, help="of the run, for the manifest")
-    parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
     parser.add_argument(
-        "--no-sync", action="store_true", help="leave it to the system when data reaches the disk (on a bench)"
+        "--timing", type=Path, metavar="FILE", help="the controller's timing page, recorded once per second"
     )
+    parser.add_argument("--seed", type=int, help="seed of the run, for the manifest")
+    parser.add_argument("--key-file", type=Path, help="file with the key of authenticated datagrams")
+    parser.add_argument("--no-sync", action="store_true", help="do not flush data to the disk (for benches)")
     a = parser.parse_args(arguments)
     addresses = dict(text.partition("=")[::2] for text in a.bus)
     try:
@@ -206,22 +212,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         key = a.key_file.read_bytes().strip() if a.key_file else None
         recorder = Recorder(a.out, profile, describe(profile, tuple(addresses), a.seed, live=True), key, not a.no_sync)
     except (ProfileError, RecordingRefused) as error:
-        say(str(error))
+        report(str(error))
         return 3
     except BusError as error:
-        say(str(error))
+        report(str(error))
         return 4
     except (OSError, OverflowError) as error:
-        say(f"a port or file cannot be used ({error}); choose another")
+        report(f"a port or file cannot be used ({error}); choose another")
         return 4
-    shell = Shell(buses, ticks, reports, a.timing)
+    inputs = InputCollector(buses, ticks, reports, a.timing)
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: shell.end())
-    writer = threading.Thread(target=write_all, args=(recorder, shell), name="writer")
+        signal.signal(number, lambda *_: inputs.end())
+    writer = threading.Thread(target=write_all, args=(recorder, inputs), name="writer")
     writer.start()
     sys.stdout.write(json.dumps({"ready": True, "out": str(a.out)}) + "\n")
     sys.stdout.flush()
-    shell.run()
+    inputs.run()
     writer.join()
     for bus in buses.values():
         bus.close()

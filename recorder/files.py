@@ -1,6 +1,6 @@
-"""Files that only ever grow by whole commits, so that a full disk costs records but never breaks what is written.
+"""Files that grow only by complete commits, so that a full disk costs records but never damages written data.
 
-A commit that fails part way is cut off again.  ``durable`` adds fsync: a power cut then loses nothing committed.
+A commit that fails part way is truncated again.  ``durable`` adds fsync: a power cut then loses nothing committed.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from pathlib import Path
 class CommitFile:
     """An append-only file with a buffer; ``write`` cannot fail, ``commit`` can (OSError) and is all or nothing.
 
-    It has the three methods that ``mcap.writer.Writer`` asks of a stream: ``write``, ``tell`` and ``flush``.
+    It has the three methods that ``mcap.writer.Writer`` needs of a stream: ``write``, ``tell`` and ``flush``.
     """
 
     def __init__(self, path: Path, durable: bool) -> None:
-        """Create the file; raises OSError, also when it exists already."""
+        """Creates the file; raises OSError, also if it exists already."""
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         self._durable = durable
         self.buffer = bytearray()
@@ -28,19 +28,19 @@ class CommitFile:
         return self._fd
 
     def write(self, data: bytes) -> int:
-        """Add to the buffer."""
+        """Appends to the buffer."""
         self.buffer += data
         return len(data)
 
     def tell(self) -> int:
-        """Where the next byte will stand."""
+        """Position of the next byte."""
         return self._committed + len(self.buffer)
 
     def flush(self) -> None:
-        """Nothing: only ``commit`` touches the disk."""
+        """Does nothing: only ``commit`` writes to the disk."""
 
     def commit(self) -> None:
-        """Bring the buffer to the file; on OSError the file is as before and the buffer is gone."""
+        """Writes the buffer to the file; after an OSError the file is as before and the buffer is empty."""
         data, self.buffer = memoryview(bytes(self.buffer)), bytearray()
         if not data:
             return
@@ -57,5 +57,5 @@ class CommitFile:
         self._committed += at
 
     def close(self) -> None:
-        """Close without committing."""
+        """Closes without committing."""
         os.close(self._fd)

@@ -1,8 +1,8 @@
-"""``manifest.json``: what a recording is of, so that a reader years later can tell.
+"""``manifest.json``: identifies the software, the machine and the time of a recording.
 
-In lockstep a recording holds nothing of the host's clock or of the host, so that one seed gives the same bytes on
-every run.  Live, the manifest carries one pair of monotonic and UTC time; adding their difference to a monotonic
-stamp gives UTC.  It is written to a temporary file, flushed to the disk and renamed.
+In lockstep a recording contains nothing of the host or its clock, so that a seed gives the same bytes on every run.
+Live, the manifest has one pair of monotonic and UTC time; adding their difference to a monotonic stamp gives UTC.  It
+is written to a temporary file, flushed to the disk and renamed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NAME = "manifest.json"
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Identity of a recording; ``complete`` and ``dropped`` are set when it closes.
 
-    ``dropped`` counts what was lost to a full disk, and the frames that came faster than the recorder could take them.
+    ``dropped`` counts records lost to a full disk, and frames that arrived faster than the recorder could receive them.
     """
 
     timberhand: str
@@ -43,7 +43,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     @property
     def live(self) -> bool:
-        """True for a recording in real time, which must outlive a power cut."""
+        """True for a recording in real time, which must survive a power cut."""
         return self.start_utc_ns is not None
 
     @property
@@ -53,7 +53,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 def describe(profile: Profile, buses: tuple[str, ...], seed: int | None = None, live: bool = False) -> Manifest:
-    """The manifest of a recording that starts now; only with ``live`` does it look at the clock."""
+    """The manifest of a recording that starts now; reads the clock only with ``live``."""
     shipped = {name for bus, names in databases(profile).items() if bus in buses for name in names}
     manifest = Manifest(
         timberhand=version("timberhand"),
@@ -76,13 +76,13 @@ def describe(profile: Profile, buses: tuple[str, ...], seed: int | None = None, 
 
 
 def databases(profile: Profile) -> dict[str, tuple[str, ...]]:
-    """Bus name to the databases whose messages are on it."""
+    """Bus name to the databases of its messages."""
     buses = {profile.crane_bus: ("crane",)}
     return buses | ({profile.machine_bus: ("machine", "gnss")} if profile.machine_bus else {})
 
 
 def write(directory: Path, manifest: Manifest) -> None:
-    """Puts the manifest into the run's directory in one step; raises OSError."""
+    """Writes the manifest into the run's directory atomically; raises OSError."""
     new = directory / (NAME + ".new")
     with new.open("wb") as file:
         file.write(msgspec.json.format(msgspec.json.encode(manifest)) + b"\n")

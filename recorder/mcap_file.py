@@ -1,7 +1,7 @@
-"""The bytes that ``mcap.writer.Writer`` would write with chunks and every index, at a fraction of its cost a message.
+"""Writes the same bytes as ``mcap.writer.Writer`` with chunks and every index, at a fraction of its cost per message.
 
-The library packs a message field by field, which took a fifth of a lockstep run.  Here a message is one ``struct``; the
-records that come once a chunk or once a file are the library's own.
+The library packs a message field by field, which took a fifth of a lockstep run.  Here a message is one ``struct``;
+records that come once per chunk or file are written by the library.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ _COMPRESSOR: Final = zstandard.ZstdCompressor()
 
 
 class Stream(Protocol):
-    """Where the file goes."""
+    """The output of a file."""
 
     def write(self, data: bytes) -> int: ...
     def tell(self) -> int: ...
 
 
 class McapFile:
-    """One file; ``flush`` ends a chunk, ``finish`` the file.  Nothing touches a disk but what the stream does."""
+    """One file; ``flush`` ends a chunk, ``finish`` the file.  Only the stream writes to the disk."""
 
     def __init__(self, stream: Stream, library: str) -> None:
         self._stream = stream
@@ -52,25 +52,25 @@ class McapFile:
         self._counts: dict[int, int] = {}
         self._chunk = bytearray()
         self._index: dict[int, list[int]] = {}
-        """Of each channel's messages in this chunk the log time and the place in turn."""
+        """By channel: log time and position of its messages in this chunk, alternating."""
         stream.write(MCAP0_MAGIC + _bytes(Header("", library)))
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """A new schema; its number."""
+        """Adds a schema; returns its number."""
         schema = Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
         self._schemas.append(schema)
         self._chunk += _bytes(schema)
         return schema.id
 
     def register_channel(self, topic: str, encoding: str, schema_id: int) -> int:
-        """A new channel; its number."""
+        """Adds a channel; returns its number."""
         channel = Channel(len(self._channels) + 1, topic, encoding, {}, schema_id)
         self._channels.append(channel)
         self._chunk += _bytes(channel)
         return channel.id
 
     def add_message(self, channel_id: int, log_ns: int, data: bytes, publish_ns: int) -> None:
-        """A message in the chunk that is open."""
+        """Adds a message to the open chunk."""
         chunk = self._chunk
         try:
             index = self._index[channel_id]
@@ -81,7 +81,7 @@ class McapFile:
         chunk += data
 
     def flush(self) -> None:
-        """Write the chunk and its indices; nothing when it holds no message."""
+        """Writes the chunk and its indices, unless it has no message."""
         if not self._index:
             return
         stream, data = self._stream, bytes(self._chunk)
@@ -114,7 +114,7 @@ class McapFile:
         self._chunk, self._index = bytearray(), {}
 
     def finish(self) -> None:
-        """Write what is open, the summary and the footer."""
+        """Writes the open chunk, the summary and the footer."""
         self.flush()
         stream = self._stream
         stream.write(_bytes(DataEnd(0)))
@@ -153,4 +153,5 @@ class McapFile:
 def _bytes(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
-    return builder.end()
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data

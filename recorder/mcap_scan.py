@@ -1,8 +1,8 @@
-"""Reads an MCAP file from front to back and stops, without an error, where the good part ends.
+"""Reads an MCAP file from front to back and stops, without an error, where its valid part ends.
 
-The index of an MCAP file stands at its end, so a file whose writer was killed cannot be read through it.  Every
-record carries its length and every chunk its CRC, so all but the unfinished chunk can be read in order (MCAP
-specification, "Record Content" and "Chunk").
+The index of an MCAP file is at its end, so it is missing if the writer was killed.  Every record has its length and
+every chunk its CRC, so that all but the unfinished chunk can be read in order (MCAP specification, "Record Content" and
+"Chunk").
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class NotMcap(CodedError, ValueError):
 
 
 class Stored(NamedTuple):
-    """A message as it stands in the file: channel id, both times [ns] and the payload."""
+    """A message as stored in the file: channel id, both times [ns] and the payload."""
 
     channel_id: int
     log_ns: int
@@ -42,7 +42,7 @@ class Stored(NamedTuple):
 
 
 def is_complete(path: Path) -> bool:
-    """True when the file ends with a footer and the closing magic, that is when its writer finished."""
+    """Whether the file ends with a footer and the closing magic, that is, whether its writer finished."""
     with path.open("rb") as file:
         file.seek(0, 2)
         if file.tell() < 2 * len(MCAP0_MAGIC) + _FOOTER_BYTES:
@@ -52,10 +52,10 @@ def is_complete(path: Path) -> bool:
 
 
 def scan(path: Path, topics: Collection[str] | None = None) -> Iterator[Schema | Channel | Stored]:
-    """Every schema, channel and message (of ``topics``; None: all) up to the end of the good part.
+    """Every schema, channel and message (of ``topics``; None: all) up to the end of the valid part.
 
     Raises:
-        NotMcap: when the file begins like no MCAP file.
+        NotMcap: The file does not start like an MCAP file.
     """
     with path.open("rb") as file:
         magic = file.read(len(MCAP0_MAGIC))

@@ -1,18 +1,18 @@
-"""The recorder itself: what it is told goes into a candump log per bus and into ``run.mcap``.
+"""The recorder: writes its inputs to a candump file per bus and to ``run.mcap``.
 
 Inputs: frames of the buses, the controller's tick records, state reports and timing page, each with its own monotonic
 stamp; the recorder has no clock.  Outputs, in one directory:
 
 * ``<bus>.log``: ``candump -L`` text, for can-utils, SavvyCAN and python-can.
-* ``run.mcap`` (then ``run-0002.mcap`` and so on, one for each 512 MiB or after a full disk): ``/<bus>/raw`` (the
-  16 bytes of the kernel's ``struct can_frame``, then the sender's name where it is known), ``/<bus>/<message>``
+* ``run.mcap`` (then ``run-0002.mcap`` and so on, one per 512 MiB and after a full disk): ``/<bus>/raw`` (the
+  16 bytes of the kernel's ``struct can_frame``, then the sender's name if it is known), ``/<bus>/<message>``
   (decoded signals, JSON), ``/controller/tick`` (raw, see ``can_dbc.messages.tick_record``), ``/controller/report``,
   ``/timing`` (the controller's timing page) and ``/manifest`` (JSON).
-  Publish time is monotonic, log time is UTC where the manifest has it (live), else monotonic too.
+  Publish time is monotonic; log time is UTC if the manifest has it (live), else monotonic, too.
 * ``manifest.json``: see ``recorder.manifest``.
 
-A chunk closes at least every 200 ms of recorded time, and live it is flushed to the disk, so a killed process or a
-power cut loses no more than 250 ms.  A disk that fills up costs records, counted in ``dropped``, and nothing else.
+A chunk ends at least every 200 ms of recorded time, and live it is flushed to the disk, so that a killed process or a
+power cut loses at most 250 ms.  A full disk costs records, counted in ``dropped``, and nothing else.
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ class Recorder:
     def __init__(
         self, directory: Path, profile: Profile, manifest: Manifest, key: bytes | None = None, sync: bool = True
     ) -> None:
-        """Start a recording in ``directory``, which is created; ``key`` is that of authenticated reports.
+        """Starts a recording in ``directory``, which is created; ``key`` is that of authenticated reports.
 
         Raises:
-            RecordingRefused: the directory cannot be written or holds a recording already.
+            RecordingRefused: The directory cannot be written or contains a recording.
         """
         self.dropped = 0
         """Records lost because they could not be written."""
         self.refused = 0
-        """Reports and tick records that were not what they should be."""
+        """Reports and tick records that were invalid."""
         self._directory = directory
         self._manifest = manifest
         self._durable = sync and manifest.live
@@ -88,7 +88,7 @@ class Recorder:
             if run_files(directory):
                 recover(directory)
                 raise RecordingRefused(
-                    "recording.exists", f"{directory} already holds a recording; name another directory"
+                    "recording.exists", f"{directory} already contains a recording; give another directory"
                 )
             manifests.write(directory, manifest)
             self._text = {bus: CommitFile(directory / f"{bus}.log", self._durable) for bus in manifest.buses}
@@ -96,11 +96,11 @@ class Recorder:
         except OSError as error:
             raise RecordingRefused(
                 "recording.cannot-write",
-                f"cannot record in {directory} ({error.strerror}); make room or name another directory",
+                f"cannot record in {directory} ({error.strerror}); free space on the disk or give another directory",
             ) from error
 
     def on_frame(self, bus: str, frame: Frame, sent_by: str = "") -> None:
-        """A frame was on ``bus``; ``sent_by`` names the sender where it is known."""
+        """Records a frame on ``bus``; ``sent_by`` names the sender if it is known."""
         stamp_ns, key, data = frame
         self._at(stamp_ns)
         us = (stamp_ns + self._offset_ns) // 1000
@@ -112,7 +112,7 @@ class Recorder:
             self._add(f"/{bus}/{decoded[0]}", stamp_ns, _JSON.encode(decoded[1]))
 
     def on_tick(self, record: bytes) -> None:
-        """The controller's record of one tick, as it came."""
+        """Records the controller's record of one tick, unchanged."""
         try:
             stamp_ns = tick_record.decode(record).now_ns
         except tick_record.RecordRefused:
@@ -122,7 +122,7 @@ class Recorder:
         self._add(TICK, stamp_ns, record)
 
     def on_report(self, datagram: bytes) -> None:
-        """The controller's state report or vehicle report, as it came."""
+        """Records the controller's state report or vehicle report."""
         try:
             report = datagrams.decode(datagram, self._key)
         except DatagramRefused:
@@ -138,13 +138,13 @@ class Recorder:
         self._add(topic, report.stamp_ns, _JSON.encode(report))
 
     def on_timing(self, timing: Timing) -> None:
-        """The controller's timing, once for each state of its page."""
+        """Records the controller's timing, once per state of its page."""
         stamp_ns = timing.facts.written_ns
         self._at(stamp_ns)
         self._add(TIMING, stamp_ns, _JSON.encode(timing.named()))
 
     def flush(self, now_ns: int) -> None:
-        """Close the chunk and bring everything to the files; what cannot be written is counted in ``dropped``."""
+        """Ends the chunk and writes everything to the files; ``dropped`` counts what cannot be written."""
         self._now_ns = now_ns
         self._chunk_start_ns = self._chunk_end_ns = None
         for text in self._text.values():
@@ -164,7 +164,7 @@ class Recorder:
             self._abandon()
 
     def close(self) -> None:
-        """Complete the files."""
+        """Completes the files."""
         self.flush(self._now_ns)
         if self._segment:
             try:
@@ -180,9 +180,9 @@ class Recorder:
             self.dropped += 1
 
     def _at(self, stamp_ns: int) -> None:
-        """Closes the chunk before a record that would make it longer than CHUNK_NS, in whatever order records come."""
+        """Ends the chunk before a record that would make it longer than CHUNK_NS, in any order of records."""
         start_ns = self._chunk_start_ns
-        if start_ns is not None and start_ns <= stamp_ns < start_ns + CHUNK_NS:  # as nearly always
+        if start_ns is not None and start_ns <= stamp_ns < start_ns + CHUNK_NS:  # the usual case
             self._chunk_end_ns = max(self._chunk_end_ns or 0, stamp_ns)
             return
         start_ns = stamp_ns if start_ns is None else min(start_ns, stamp_ns)
@@ -199,7 +199,7 @@ class Recorder:
             self._segment.add(topic, stamp_ns + self._offset_ns, stamp_ns, data)
 
     def _open_segment(self) -> None:
-        """The next file; its first chunk holds every channel and the manifest, and is written at once."""
+        """Opens the next file; its first chunk has every channel and the manifest, and is written immediately."""
         name = f"run-{self._segments + 1:04d}.mcap" if self._segments else RUN_NAME
         segment = _Segment(self._directory / name, self._durable)
         for bus, signals in self._signals.items():
@@ -223,7 +223,7 @@ class Recorder:
         self._segment = segment
 
     def _abandon(self) -> None:
-        """Leave a file that could not be written readable up to its last commit; the next flush tries anew."""
+        """Closes a file that could not be written, readable up to its last commit; the next flush opens another."""
         if self._segment:
             self.dropped += self._segment.pending
             self._segment.close()
@@ -250,14 +250,14 @@ class _Segment:
         self.pending += 1
 
     def commit(self) -> int:
-        """Close the chunk and write it; the size of the file [bytes]; raises OSError."""
+        """Ends the chunk and writes it; returns the size of the file [bytes]; raises OSError."""
         self._writer.flush()
         self._file.commit()
         self.pending = 0
         return self._file.tell()
 
     def finish(self) -> None:
-        """Write the index and close; raises OSError."""
+        """Writes the index and closes the file; raises OSError."""
         self._writer.finish()
         self._file.commit()
         self._file.close()

@@ -1,9 +1,9 @@
-"""Makes a recording whose writer was killed readable again, for every tool.
+"""Repairs a recording whose writer was killed, so that every tool can read it.
 
-Input is a run's directory.  Each MCAP file without a footer is read up to its last whole chunk and rewritten with an
-index beside itself, flushed to the disk and put in place by one atomic rename: at any moment the file is the old one
-or the new one.  A candump log loses its unfinished last line.  A recording that is in order, or that a living recorder
-still holds (``flock``), is not touched.
+Input is a run's directory.  Each MCAP file without a footer is read up to its last complete chunk and rewritten with an
+index next to itself, flushed to the disk and put in place by an atomic rename: at any time the file is either the old
+or the new one.  A candump file loses its unfinished last line.  A complete recording, or one that a running recorder
+still holds (``flock``), is not changed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ RUN_NAME = "run.mcap"
 
 
 class Recovered(NamedTuple):
-    """One mended file and how many messages it holds."""
+    """One repaired file and its number of messages."""
 
     path: Path
     messages: int
@@ -34,23 +34,23 @@ def run_files(directory: Path) -> list[Path]:
 
 
 def recover(directory: Path) -> list[Recovered]:
-    """Mends what is unfinished in a run's directory; returns what was mended.
+    """Repairs the unfinished files in a run's directory; returns the repaired ones.
 
     Raises:
-        OSError: when the directory cannot be written; nothing is lost then.
+        OSError: The directory cannot be written; nothing is lost.
     """
-    mended = []
+    recovered: list[Recovered] = []
     for path in run_files(directory):
         with path.open("rb") as held:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                return mended
+                return recovered
             if not is_complete(path):
-                mended.append(_rewrite(path))
+                recovered.append(_rewrite(path))
     for log in directory.glob("*.log"):
         _trim_line(log)
-    return mended
+    return recovered
 
 
 def _trim_line(path: Path) -> None:
@@ -81,7 +81,7 @@ def _rewrite(path: Path) -> Recovered:
             else:
                 writer.add_message(channels[record.channel_id], record.log_ns, record.data, record.publish_ns)
                 messages += 1
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
         file.flush()
         os.fsync(file.fileno())
     os.replace(new, path)

@@ -1,7 +1,7 @@
-"""Decoded signals of a bus for the log: which message a frame is, and its values under their DBC names.
+"""Decodes the frames of a bus for a recording: message name, and values under their DBC names.
 
-Values are the plain physical ones (``codec.decode``): a log shows what was on the bus, also a value out of range or a
-frame that a receiver refuses.  Only a frame of the wrong length has no values.
+Values are physical and unchecked (``codec.decode``): a recording shows what was on the bus, including values out of
+range and frames that a receiver refuses.  Only a frame of wrong length has no values.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from can_dbc.dbc.codec import Database, MessageCodec
 
 
 class BusSignals:
-    """The messages of one bus, out of one or more databases."""
+    """The messages of one bus, from one or more databases."""
 
     def __init__(self, databases: Iterable[Database]) -> None:
         self._databases = tuple(databases)

@@ -1,4 +1,7 @@
-"""One house style for every plot, drawn without a display; the same data give the same PNG bytes."""
+"""The style of every plot, drawn without a display; the same data give the same PNG bytes.
+
+The only module of this package that needs more than the standard library (matplotlib).
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import matplotlib
+from cycler import cycler
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
 
 TIMBER, OIL, STEEL, MOSS, RUST = "#9a6a38", "#1f5f8b", "#5b6670", "#4d7c4a", "#b5452c"
-STYLE: Final = {
+STYLE: Final[dict[Any, Any]] = {
     "figure.dpi": 110,
     "figure.facecolor": "white",
     "figure.constrained_layout.use": True,
@@ -28,13 +32,13 @@ STYLE: Final = {
     "axes.axisbelow": True,
     "lines.linewidth": 1.3,
     "legend.frameon": False,
-    "axes.prop_cycle": matplotlib.cycler(ls=["-", "--"]) * matplotlib.cycler(color=[OIL, TIMBER, MOSS, RUST, STEEL]),
+    "axes.prop_cycle": cycler(ls=["-", "--"]) * cycler(color=[OIL, TIMBER, MOSS, RUST, STEEL]),
 }
 
 
 @contextmanager
 def sheet(path: Path, columns: int = 1, width: float = 8.0, height: float = 3.2) -> Iterator[Any]:
-    """A row of axes (one Axes for a single column) that is saved to ``path`` at the end; inches."""
+    """Yields a row of axes (one Axes for a single column) and saves it to ``path`` at the end; sizes in inches."""
     with pyplot.rc_context(STYLE):
         figure, axes = pyplot.subplots(1, columns, figsize=(width, height))
         try:
@@ -46,7 +50,7 @@ def sheet(path: Path, columns: int = 1, width: float = 8.0, height: float = 3.2)
 
 
 def limit_band(axis: Any, least: float | None, most: float | None) -> None:
-    """Shade what a figure must not be, on the y axis."""
+    """Shades the y values below ``least`` and above ``most``, which a result must not have."""
     low, high = axis.get_ylim()
     if least is not None:
         axis.axhspan(min(low, least), least, color=RUST, alpha=0.08, lw=0)

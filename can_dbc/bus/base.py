@@ -1,16 +1,16 @@
 """One small interface to any CAN bus, made for a real-time loop; `can_dbc.bus.factory` opens one.
 
-Contract of every `Bus`: nothing but opening raises, `BusError`, one sentence that says what to do.  `drain`, `send` and
-`send_all` never block.  `drain` gives data and remote frames in the order of the bus; error frames become
-`BusStats.state` and never reach a codec.  Own frames do not come back unless asked for, so a frame with an own
-identifier is somebody else's; on SocketCAN that may be another process on this machine.
+Contract of every `Bus`: only opening raises (`BusError`).  `drain`, `send` and `send_all` never block.  `drain` returns
+data and remote frames in the order of the bus; error frames update `BusStats.state` and never reach a codec.  Own
+frames come back only on request, so a frame with an own identifier comes from another sender; on SocketCAN that may be
+another process on this machine.
 
-A frame that is not taken (queue full, bus off, link or daemon gone) is counted in `BusStats.refused` and is never
-sent later.  Bus-off ends by itself (restart-ms of the interface; the restart time of the wire).  A lost link stays DOWN
-until `reopen` finds it again.  Both ways back count in `BusStats.recoveries`, and no frame from before is delivered
-after them.
+A frame that is not accepted (queue full, bus off, link or daemon lost) is counted in `BusStats.refused` and never sent
+later.  Bus-off ends by itself (restart-ms of the interface; restart time of the wire).  A lost link stays DOWN until
+`reopen` finds it again.  Both recoveries count in `BusStats.recoveries`, and no frame from before is delivered after
+them.
 
-This module and the wire and SocketCAN backends need the standard library alone (the guard imports them).
+This module and the wire and SocketCAN backends need only the standard library (the guard imports them).
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from can_dbc.frame import Frame
 from runtime.errors import CodedError
 
 DRAIN_LIMIT: Final = 1024
-"""Most frames one `Bus.drain` takes (a few more where they arrive in packets): a flooded bus cannot hold the tick."""
+"""Most frames of one `Bus.drain` (a few more if they arrive in packets): a flooded bus must not delay the tick."""
 _FLUSH_DRAINS: Final = 16
-"""Most drains of one `Bus.flush`; what they leave is recognised by its stamp."""
+"""Most drains of one `Bus.flush`; frames that remain are recognized by their stamp."""
 
 # Error classes and controller flags of linux/can/error.h.
 ERR_TX_TIMEOUT: Final = 0x001
@@ -57,7 +57,7 @@ class BusState(IntEnum):
     PASSIVE = 2
     OFF = 3
     DOWN = 4
-    """The link is down, unplugged, or the wire daemon has gone."""
+    """The link is down or unplugged, or the wire daemon has ended."""
 
 
 @dataclass(slots=True)
@@ -66,33 +66,33 @@ class BusStats:
 
     state: BusState = BusState.ACTIVE
     received: int = 0
-    """Data and remote frames that `Bus.drain` gave."""
+    """Data and remote frames returned by `Bus.drain`."""
     sent: int = 0
-    """Frames taken for sending."""
+    """Frames accepted for sending."""
     refused: int = 0
-    """Frames that `Bus.send` and `Bus.send_all` did not take."""
+    """Frames that `Bus.send` and `Bus.send_all` did not accept."""
     dropped: int = 0
-    """Received frames lost because this reader was too slow."""
+    """Received frames lost because the reader was too slow."""
     error_frames: int = 0
     recoveries: int = 0
-    """How often the state came back from OFF or DOWN."""
+    """Number of recoveries from OFF or DOWN."""
     tx_errors: int = 0
-    """Transmit error counter of the node, where the backend tells it."""
+    """Transmit error counter of the node, if the backend reports it."""
     rx_errors: int = 0
 
     def enter(self, state: BusState) -> bool:
-        """Changes the state; True when that is a recovery."""
+        """Changes the state; True if this is a recovery."""
         recovered = state < BusState.OFF <= self.state
         self.recoveries += recovered
         self.state = state
         return recovered
 
     def note_error(self, key: int, data: bytes) -> bool:
-        """Takes one error frame (linux/can/error.h: class in the key, 8 data bytes) into the state.
+        """Updates the state with one error frame (linux/can/error.h: class in the key, 8 data bytes).
 
-        True when the node has recovered: what was received before is out of date.  Lost arbitration and the time-out
-        of the driver's transmitter are counted and change no state: the one is everyday life on a bus, and the other
-        shows as frames that find no room.
+        True if the node has recovered; frames received before are then out of date.  Lost arbitration and time-outs of
+        the driver's transmitter are counted and change no state: the former is normal, and the latter shows as frames
+        that are not accepted.
         """
         self.error_frames += 1
         flags = data[1] if key & ERR_CRTL else 0
@@ -120,31 +120,33 @@ class Bus(Protocol):
     stats: BusStats
 
     def fileno(self) -> int:
-        """Descriptor that becomes readable when frames wait; -1 where the backend has none.  `reopen` changes it."""
+        """Descriptor that becomes readable when frames wait; -1 if the backend has none.  `reopen` changes it."""
 
     def drain(self, frames: list[Frame]) -> int:
-        """Appends every waiting frame, at most `DRAIN_LIMIT`; returns how many were appended."""
+        """Appends every waiting frame, at most `DRAIN_LIMIT`; returns how many."""
 
     def send(self, key: int, data: bytes) -> bool:
-        """Hands over one frame of 0 to 8 bytes; False when it was not taken."""
+        """Sends one frame of 0 to 8 bytes; False if it was not accepted."""
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
-        """Hands over (key, data) frames in order, in one system call where the backend can; returns how many were
-        taken.  The first frame that is not taken and all behind it are refused."""
+        """Sends (key, data) frames in order, with one system call if the backend can; returns how many were accepted.
+
+        The first frame that is not accepted and all frames behind it are refused.
+        """
 
     def flush(self) -> None:
-        """Discards what was received up to now (error frames still change the state) and, where the backend can, own
-        frames that are not on the bus yet."""
+        """Discards the frames received so far (error frames still change the state) and, if the backend can, own frames
+        that are not on the bus yet."""
 
     def reopen(self) -> bool:
-        """One try to get a lost link back, never longer than a few milliseconds; True when the bus is usable.
+        """One attempt to restore a lost link, a few milliseconds at most; True if the bus is usable.
 
-        Only DOWN asks for it: a bus that works is left alone (True), so is one that is bus-off or closed (False).  A
-        link that comes back is opened anew and holds no frames from before.  Cheap enough for every cycle.
+        Has an effect only in state DOWN: does nothing to a working bus (True) or to one that is bus-off or closed
+        (False).  A restored link is a new one and holds no frames from before.  Cheap enough for every cycle.
         """
 
     def close(self) -> None:
-        """Leaves the bus; closing twice is fine."""
+        """Leaves the bus; may be called twice."""
 
     def __enter__(self) -> Self: ...
 
@@ -152,39 +154,39 @@ class Bus(Protocol):
 
 
 class BaseBus:
-    """What every backend shares.  A backend gives `_take`, `send_all`, `_open_again` and `_leave`."""
+    """Base class of every backend, which implements `_receive`, `send_all`, `_reopen_link` and `_release`."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.stats = BusStats()
         self._flushed_ns = 0
-        """Frames stamped before this are thrown away; 0 once a newer one came."""
+        """Frames stamped before this are discarded; 0 after a newer one has come."""
         self._closed = False
 
-    def _take(self, frames: list[Frame]) -> None:
-        """Appends what waits, without blocking."""
+    def _receive(self, frames: list[Frame]) -> None:
+        """Appends the waiting frames, without blocking."""
         raise NotImplementedError
 
-    def _open_again(self) -> bool:
-        """Leaves the lost link and opens it anew; True when it is usable."""
+    def _reopen_link(self) -> bool:
+        """Releases the lost link and opens it again; True if it is usable."""
         return False
 
-    def _leave(self) -> None:
-        """Gives back what the backend holds; never fails."""
+    def _release(self) -> None:
+        """Releases the backend's resources; never fails."""
 
     def drain(self, frames: list[Frame]) -> int:
         stats = self.stats
         if stats.state is BusState.DOWN:
             return 0
         before = len(frames)
-        self._take(frames)
+        self._receive(frames)
         if self._flushed_ns and len(frames) > before:
             frames[before:] = [frame for frame in frames[before:] if frame.stamp_ns >= self._flushed_ns]
             if len(frames) > before:
                 self._flushed_ns = 0  # in the order of the bus nothing older follows
-        taken = len(frames) - before
-        stats.received += taken
-        return taken
+        count = len(frames) - before
+        stats.received += count
+        return count
 
     def send(self, key: int, data: bytes) -> bool:
         return self.send_all(((key, data),)) == 1
@@ -195,15 +197,15 @@ class BaseBus:
     def flush(self) -> None:
         self._flushed_ns = time.monotonic_ns()
         for _ in range(_FLUSH_DRAINS):
-            scrap: list[Frame] = []
+            discarded: list[Frame] = []
             if self.stats.state is not BusState.DOWN:
-                self._take(scrap)
-            if not scrap:
+                self._receive(discarded)
+            if not discarded:
                 return
 
     def reopen(self) -> bool:
         stats = self.stats
-        if stats.state is BusState.DOWN and not self._closed and self._open_again():
+        if stats.state is BusState.DOWN and not self._closed and self._reopen_link():
             stats.enter(BusState.ACTIVE)
             self.flush()
         return stats.state < BusState.OFF
@@ -211,7 +213,7 @@ class BaseBus:
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            self._leave()
+            self._release()
             self.stats.enter(BusState.DOWN)
 
     def __enter__(self) -> Self:

@@ -1,8 +1,8 @@
-"""Many datagrams in one system call: recvmmsg(2) and sendmmsg(2) on buffers that are made once.
+"""Many datagrams in one system call: recvmmsg(2) and sendmmsg(2) on preallocated buffers.
 
-A drain of a busy socket costs one call instead of one per frame, and so do the frames of a tick, which counts at
-200 Hz and even more inside user-mode Linux, where a call costs a hundred times as much.  Standard library alone; Linux
-with glibc or musl.
+A drain of a busy socket costs one call instead of one per frame, and so does sending the frames of a tick.  This
+matters at 200 Hz, and more so in user-mode Linux, where a call costs a hundred times as much.  Standard library only;
+Linux with glibc or musl.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class _Buffers:
 class Batch(_Buffers):
     """Room for ``count`` datagrams of at most ``size`` bytes with ``ancillary`` bytes of control data each.
 
-    After `receive` datagram i lies at ``data[i * size]``, its control messages at ``control[i * ancillary]``; control
-    data that a datagram did not bring reads as zeros.
+    After `receive` datagram i is at ``data[i * size]``, its control messages at ``control[i * ancillary]``; missing
+    control data reads as zeros.
     """
 
     __slots__ = ("_fresh", "_used", "_zeros")
@@ -61,22 +61,22 @@ class Batch(_Buffers):
         self._used = 0
 
     def receive(self, descriptor: int) -> int:
-        """Takes what waits, at most ``count``, without blocking; 0 when nothing does.  Raises OSError otherwise."""
-        if self._used:  # the kernel writes the sizes it found over the sizes it is offered
+        """Receives at most ``count`` waiting datagrams without blocking; 0 if none waits.  Raises OSError otherwise."""
+        if self._used:  # the kernel overwrites the offered sizes with the received ones
             self._headers[: self._used * _HEADER.size] = self._fresh[: self._used * _HEADER.size]
             self.control[: self._used * self.ancillary] = self._zeros[: self._used * self.ancillary]
             self._used = 0
-        taken: int = _recvmmsg(descriptor, self._address, self.count, socket.MSG_DONTWAIT, None)
-        if taken >= 0:
-            self._used = taken
-            return taken
+        received: int = _recvmmsg(descriptor, self._address, self.count, socket.MSG_DONTWAIT, None)
+        if received >= 0:
+            self._used = received
+            return received
         code = ctypes.get_errno()
         if code in (errno.EAGAIN, errno.EINTR):
             return 0
         raise OSError(code, os.strerror(code))
 
     def lengths(self) -> Iterator[int]:
-        """Bytes of each datagram that the last `receive` took."""
+        """Size in bytes of each datagram of the last `receive`."""
         return (length for (length,) in _LENGTH.iter_unpack(self._headers[: self._used * _HEADER.size]))
 
 
@@ -89,9 +89,9 @@ class Outbox(_Buffers):
         super().__init__(size, 0, count)
 
     def send(self, descriptor: int, count: int) -> int:
-        """Sends the first ``count`` datagrams without blocking; returns how many the kernel took, from the first on.
+        """Sends the first ``count`` datagrams without blocking; returns how many of them the kernel accepted.
 
-        Raises OSError with the reason when it took none.
+        Raises OSError with the reason if it accepted none.
         """
         sent: int = _sendmmsg(descriptor, self._address, count, socket.MSG_DONTWAIT)
         if sent >= 0:
@@ -100,8 +100,8 @@ class Outbox(_Buffers):
         raise OSError(code, os.strerror(code))
 
 
-def widen(sock: socket.socket, size: int) -> None:
-    """Give a socket a receive buffer of ``size`` bytes; beyond the system's limit only root can."""
+def enlarge_receive_buffer(sock: socket.socket, size: int) -> None:
+    """Gives a socket a receive buffer of ``size`` bytes; only root can exceed the system's limit."""
     try:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, size)
     except PermissionError:

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from can_dbc.bus.base import Bus, BusError
-from can_dbc.bus.filters import Wanted, filter_of
+from can_dbc.bus.filters import FilterItem, filter_of
 
 VCAN_NAMES: Final = {"crane0": "vcan0", "mach0": "vcan1"}
 
@@ -20,18 +20,24 @@ VCAN_NAMES: Final = {"crane0": "vcan0", "mach0": "vcan1"}
 def open_bus(
     address: str,
     *,
-    filters: Iterable[Wanted] | None = None,
+    filters: Iterable[FilterItem] | None = None,
     receive_own: bool = False,
     tx_queue: int = 10,
     participant: str | None = None,
 ) -> Bus:
-    """Opens the bus at `address`; raises `BusError`.
+    """Opens the bus at `address`.
 
-    `filters` are the exact keys and the (key, mask) pairs to receive (`can_dbc.bus.filters`; None: all; error frames always
-    arrive); the kernel takes at most 512 and does a few dozen at no cost.  `receive_own` also gives back own frames
-    once they were on the bus.  `tx_queue` bounds the own frames that wait on the
-    wire, like ``txqueuelen`` does in the kernel; a process that plays many nodes needs more than 10.
-    `participant` is the name by which faults on the wire find this process (default: the program's name).
+    Args:
+        address: See the module docstring.
+        filters: Exact keys and (key, mask) pairs to receive (`can_dbc.bus.filters`); None for all.  Error frames always
+            arrive.  The kernel accepts at most 512; a few dozen cost nothing.
+        receive_own: Also returns own frames after they were on the bus.
+        tx_queue: Limit of the own frames waiting on the wire, like ``txqueuelen`` in the kernel; a process that
+            emulates many nodes needs more than 10.
+        participant: The name of this process for faults on the wire (default: the program's name).
+
+    Raises:
+        BusError: The bus cannot be opened.
     """
     backend, _, channel = address.partition(":")
     wanted = filter_of(filters)
@@ -39,9 +45,9 @@ def open_bus(
         raise BusError(
             "bus.address",
             f"'{address}' is not a bus address; write wire:crane0, socketcan:can0 or another python-can "
-            "interface and its channel, as in virtual:test.",
+            "interface and its channel, for example virtual:test.",
         )
-    # Backends load on demand: the guard must not pull in python-can.
+    # Backends are imported on demand: the guard must not import python-can.
     if backend == "wire":
         from can_dbc.bus.wire_client import WireClient
 
@@ -56,7 +62,7 @@ def open_bus(
 
 
 def default_address(logical_name: str, explicit: str | None = None) -> str:
-    """The address for ``crane0`` or ``mach0``: an explicit one, ``TIMBERHAND_<NAME>`` from the environment,
+    """The address for ``crane0`` or ``mach0``: the explicit one, else ``TIMBERHAND_<NAME>`` from the environment, else
     a SocketCAN interface of that name or its vcan stand-in where the kernel has one, else the wire."""
     chosen = explicit or os.environ.get(f"TIMBERHAND_{logical_name.upper()}")
     if chosen:

@@ -1,7 +1,7 @@
-"""Which frames a participant receives: exact keys, and pairs of key and mask for messages matched by PGN.
+"""The frames that a participant receives: exact keys, and (key, mask) pairs for messages matched by PGN.
 
 A pair ``(key, mask)`` matches a frame whose key equals ``key`` in the bits of ``mask``.  The kind bits (extended,
-remote) always count, so no mask lets a remote frame or an 11-bit identifier pass for another.
+remote) always count: no mask matches a remote frame or an 11-bit identifier by accident.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from typing import Final
 
 from can_dbc.frame import EXTENDED, EXTENDED_MASK, REMOTE
 
-Wanted = int | tuple[int, int]
+FilterItem = int | tuple[int, int]
 _KIND: Final = EXTENDED | REMOTE
 
 
 class Filter:
-    """``key in filter`` is True for a wanted frame; ``pairs`` says the same as (key, mask), kind bits included."""
+    """``key in filter`` is True for a frame to receive; ``pairs`` is the same as (key, mask), with kind bits."""
 
     __slots__ = ("_keys", "_masked", "pairs")
 
     def __init__(self, wanted: Iterable[int | Sequence[int]]) -> None:
-        """Raises TypeError or ValueError for what is neither a key nor a pair."""
+        """Raises TypeError or ValueError for an item that is neither a key nor a pair."""
         pairs: set[tuple[int, int]] = set()
         for item in wanted:
             key, mask = (item, EXTENDED_MASK) if isinstance(item, int) else item
@@ -37,6 +37,6 @@ class Filter:
         )
 
 
-def filter_of(wanted: Iterable[Wanted] | None) -> Filter | None:
-    """The filter for what a participant asks for; None, which lets everything pass, for None."""
+def filter_of(wanted: Iterable[FilterItem] | None) -> Filter | None:
+    """The filter of a participant's items; None, which passes everything, for None."""
     return None if wanted is None else Filter(wanted)

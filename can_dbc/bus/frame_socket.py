@@ -1,6 +1,6 @@
 """Frames in and out of any datagram socket that carries struct can_frame, many in one system call.
 
-`can_dbc.bus.socketcan` uses it on raw CAN sockets, `timberhand bench bus` on an AF_UNIX pair where the kernel has no CAN:
+`can_dbc.bus.socketcan` uses it on raw CAN sockets, `timberhand bench bus` on an AF_UNIX pair if the kernel has no CAN:
 the same buffers, the same control data, the same loop.
 """
 
@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
-from can_dbc.bus.batch import Batch, Outbox, widen
+from can_dbc.bus.batch import Batch, Outbox, enlarge_receive_buffer
 from can_dbc.bus.hardware_clock import HardwareClock
 from can_dbc.frame import ERROR, Frame
 
@@ -21,8 +21,8 @@ CAN_FRAME: Final = struct.Struct("=IB3x8s")
 RECEIVE_BUFFER_BYTES: Final = 4 << 20
 
 # Control data of one frame, each a struct cmsghdr of 16 bytes and its content: the timespec of SO_TIMESTAMPNS; three
-# timespecs of SO_TIMESTAMPING where the adapter stamps, the last one its own; the counter of SO_RXQ_OVFL once frames
-# were lost.
+# timespecs of SO_TIMESTAMPING if the adapter stamps, the last one by the adapter; the counter of SO_RXQ_OVFL once
+# frames have been lost.
 _CONTROL_BYTES: Final = 32 + 64 + 24
 _SOFTWARE: Final = struct.Struct("@16xqq88x")
 _HARDWARE: Final = struct.Struct("@16xqq12xi32xqq24x")
@@ -33,23 +33,23 @@ _COUNT: Final = struct.Struct("@16xI")
 _SO_TIMESTAMPNS: Final = 35
 _SO_TIMESTAMPING: Final = 37
 _SO_RXQ_OVFL: Final = 40
-_HARDWARE_STAMPS: Final = 1 << 2 | 1 << 6  # make them, and give them as they are
+_HARDWARE_STAMPS: Final = 1 << 2 | 1 << 6  # generate them, and report them unconverted
 _SECOND_NS: Final = 1_000_000_000
 
 
 class FrameSocket:
     """The fast path of one non-blocking socket, which it owns.
 
-    Stamps are the kernel's own (taken in the receive interrupt), turned from CLOCK_REALTIME into CLOCK_MONOTONIC with
-    the offset at each call; they never lie in the future.  An adapter that stamps by itself is believed
-    (`can_dbc.bus.hardware_clock`).  `dropped` counts the frames that the socket's receive buffer had no room for.
+    Stamps are the kernel's (taken in the receive interrupt), converted from CLOCK_REALTIME to CLOCK_MONOTONIC with the
+    offset at each call; they are never in the future.  Stamps of an adapter are preferred
+    (`can_dbc.bus.hardware_clock`).  `dropped` counts the frames for which the socket's receive buffer had no room.
     """
 
     __slots__ = ("_batch", "_clock", "_counted", "_outbox", "dropped", "sock")
 
     def __init__(self, sock: socket.socket, buffer_bytes: int = RECEIVE_BUFFER_BYTES) -> None:
         sock.setblocking(False)
-        widen(sock, buffer_bytes)
+        enlarge_receive_buffer(sock, buffer_bytes)
         for option, value in ((_SO_TIMESTAMPNS, 1), (_SO_TIMESTAMPING, _HARDWARE_STAMPS), (_SO_RXQ_OVFL, 1)):
             sock.setsockopt(socket.SOL_SOCKET, option, value)
         self.sock = sock
@@ -60,10 +60,10 @@ class FrameSocket:
         self._clock = HardwareClock()
 
     def receive(self, frames: list[Frame], limit: int, note_error: Callable[[int, bytes], bool]) -> None:
-        """Appends what waits, at most `limit` frames; one system call unless more than a full batch waits.
+        """Appends the waiting frames, at most `limit`; one system call unless more than a full batch waits.
 
-        Error frames go to `note_error`; where it says that the node has recovered, what came before is taken back.
-        Raises OSError when the link is lost.
+        Error frames go to `note_error`; if it reports a recovery of the node, the frames appended before are removed.
+        Raises OSError if the link is lost.
         """
         batch, first = self._batch, len(frames)
         new, append = tuple.__new__, frames.append  # Frame(...) costs half as much again
@@ -80,7 +80,7 @@ class FrameSocket:
                         del frames[first:]
                     continue
                 stamp_ns = seconds * _SECOND_NS + nanoseconds + offset_ns
-                if stamp_ns > now_ns:  # a clock set back since its arrival must not make a frame look fresher
+                if stamp_ns > now_ns:  # a clock set back since the arrival must not make a frame look newer
                     stamp_ns = now_ns
                 append(new(Frame, (stamp_ns, key, data if length == 8 else data[:length])))
             self._count_dropped(waiting)
@@ -88,9 +88,9 @@ class FrameSocket:
                 return
 
     def send(self, frames: Sequence[tuple[int, bytes]]) -> int:
-        """Sends frames in order without blocking, up to the first that is none (more than 8 bytes) or finds no room.
+        """Sends frames in order without blocking, up to the first that is invalid (more than 8 bytes) or finds no room.
 
-        Returns how many the kernel took.  Raises OSError with the reason when it took none of a batch.
+        Returns how many the kernel accepted.  Raises OSError with the reason if it accepted none of a batch.
         """
         outbox, sent = self._outbox, 0
         while sent < len(frames):
@@ -100,9 +100,9 @@ class FrameSocket:
                     break
                 CAN_FRAME.pack_into(outbox.data, count * CAN_FRAME.size, key, len(data), data)
                 count += 1
-            taken = outbox.send(self.sock.fileno(), count) if count else 0
-            sent += taken
-            if taken < outbox.count:
+            accepted = outbox.send(self.sock.fileno(), count) if count else 0
+            sent += accepted
+            if accepted < outbox.count:
                 break
         return sent
 
@@ -125,7 +125,7 @@ class FrameSocket:
                 yield 0, self._clock.stamp_ns(own_ns, seconds * _SECOND_NS + nanoseconds)
 
     def _count_dropped(self, waiting: int) -> None:
-        """The counter with the last frame tells all that was lost before it; it is 32 bits wide and wraps."""
+        """The last frame carries the count of all frames lost before it; it is 32 bits wide and wraps."""
         at = (waiting - 1) * _CONTROL_BYTES + 32
         control = self._batch.control
         if _KIND.unpack_from(control, at)[0] == _SO_TIMESTAMPING:

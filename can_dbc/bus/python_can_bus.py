@@ -1,7 +1,7 @@
-"""Any python-can interface behind our `Bus`: for adapters that have no SocketCAN driver, and for tests.
+"""Any python-can interface as a `Bus`: for adapters without a SocketCAN driver, and for tests.
 
-python-can stamps in wall-clock seconds or in the adapter's own time; a stamp more than a second away from
-now is of the second sort and is replaced by the time of the drain.
+python-can stamps in wall-clock seconds or in the adapter's own time; a stamp more than a second away from now is
+assumed to be of the adapter and is replaced by the time of the drain.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _FAILURES: Final = (can.CanError, OSError, ValueError, ImportError)
 
 
 class PythonCanBus(BaseBus):
-    """One python-can bus (contract: `can_dbc.bus.base.Bus`).  `reopen` takes as long as the adapter's driver takes."""
+    """One python-can bus (contract: `can_dbc.bus.base.Bus`).  `reopen` takes as long as the adapter's driver."""
 
     def __init__(self, interface: str, channel: str, wanted: Filter | None = None, receive_own: bool = False) -> None:
         super().__init__(channel)
@@ -45,7 +45,7 @@ class PythonCanBus(BaseBus):
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
         stats, sent = self.stats, 0
         if stats.state < BusState.OFF:
-            with contextlib.suppress(can.CanError, OSError):  # no room: this one and the rest are refused
+            with contextlib.suppress(can.CanError, OSError):  # no room: this frame and the rest are refused
                 for key, data in frames:
                     if len(data) > 8:
                         break
@@ -60,7 +60,7 @@ class PythonCanBus(BaseBus):
             self._can.flush_tx_buffer()
         super().flush()
 
-    def _take(self, frames: list[Frame]) -> None:
+    def _receive(self, frames: list[Frame]) -> None:
         stats, wanted, first = self.stats, self._wanted, len(frames)
         offset_ns = time.monotonic_ns() - time.time_ns()
         for _ in range(DRAIN_LIMIT):
@@ -86,15 +86,15 @@ class PythonCanBus(BaseBus):
     def _open(self) -> can.BusABC:
         return can.Bus(interface=self._interface, channel=self.name, receive_own_messages=self._receive_own)
 
-    def _open_again(self) -> bool:
-        self._leave()
+    def _reopen_link(self) -> bool:
+        self._release()
         try:
             self._can = self._open()
         except _FAILURES:
             return False
         return True
 
-    def _leave(self) -> None:
+    def _release(self) -> None:
         with contextlib.suppress(can.CanError, OSError):
             self._can.shutdown()
 
@@ -122,5 +122,5 @@ def key_of(message: can.Message) -> int:
 
 
 def payload_of(message: can.Message) -> bytes:
-    """The payload of a message; that of a remote frame is as many zeros as it asks for bytes."""
+    """The payload of a message; for a remote frame as many zeros as it requests bytes."""
     return bytes(message.dlc) if message.is_remote_frame else bytes(message.data)

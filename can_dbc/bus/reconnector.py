@@ -1,4 +1,4 @@
-"""Gets a lost bus back: tried anew twice a second for as long as it takes.  Standard library alone."""
+"""Restores a lost bus: tries twice a second until it is back.  Standard library only."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import Final
 
 from can_dbc.bus.base import Bus, BusState
 
-GONE_NS: Final = 200_000_000
-"""A link is down for this long before it is tried anew."""
-RETRY_NS: Final = 500_000_000
+FIRST_RETRY_NS: Final = 200_000_000
+"""Time from the loss of a link to the first attempt."""
+RETRY_PERIOD_NS: Final = 500_000_000
 
 
-class LostLink:
-    """Watches one bus; every process that shall outlive its link has one."""
+class Reconnector:
+    """Watches one bus, for a process that survives the loss of its link."""
 
     __slots__ = ("_bus", "_try_ns")
 
@@ -21,11 +21,11 @@ class LostLink:
         self._try_ns = 0
 
     def watch(self, now_ns: int) -> None:
-        """Call it once a cycle; cheap while the bus is there."""
+        """To be called once per cycle; cheap while the bus is up."""
         if self._bus.stats.state is not BusState.DOWN:
             self._try_ns = 0
         elif not self._try_ns:
-            self._try_ns = now_ns + GONE_NS
+            self._try_ns = now_ns + FIRST_RETRY_NS
         elif now_ns >= self._try_ns:
             self._bus.reopen()
-            self._try_ns = now_ns + RETRY_NS
+            self._try_ns = now_ns + RETRY_PERIOD_NS

@@ -1,9 +1,9 @@
 """A CAN bus of the Linux kernel over a raw socket: the fast path (`can_dbc.bus.frame_socket`), standard library only.
 
-A link that goes down or is deleted makes the state DOWN.  `SocketCanBus.reopen` looks for an interface of the same
-name, whatever its index, that is up and has a carrier, and binds a new socket to it.  Own frames that wait in the queue
-of an interface cannot be called back; the kernel itself empties the queue when the link goes down or bus-off.  While
-bus-off nothing is handed over, for the kernel would take it and lose it in silence.
+When the link goes down or is deleted, the state becomes DOWN.  `SocketCanBus.reopen` looks for an interface of the same
+name, with any index, that is up and has a carrier, and binds a new socket to it.  Own frames in the queue of an
+interface cannot be cancelled; the kernel empties the queue when the link goes down or bus-off.  While bus-off nothing
+is sent, because the kernel would accept and silently drop it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from can_dbc.frame import Frame
 # Options that Python does not name everywhere: linux/can/raw.h, linux/sockios.h, linux/if.h.
 _CAN_RAW_ERR_FILTER: Final = 2
 _ERR_MASK: Final = 0x1FFF_FFFF
-_MOST_FILTERS: Final = 512
+_MAX_FILTERS: Final = 512
 _SIOCGIFFLAGS: Final = 0x8913
 _FLAGS: Final = struct.Struct("@16sH14x")  # struct ifreq; cut after the flags
 _IFF_UP: Final = 0x1
@@ -37,10 +37,10 @@ class SocketCanBus(BaseBus):
 
     def __init__(self, interface: str, wanted: Filter | None = None, receive_own: bool = False) -> None:
         super().__init__(interface)
-        if wanted is not None and len(wanted.pairs) > _MOST_FILTERS:
+        if wanted is not None and len(wanted.pairs) > _MAX_FILTERS:
             raise BusError(
                 "bus.too-many-filters",
-                f"{len(wanted.pairs)} filters are more than the {_MOST_FILTERS} that the kernel takes for "
+                f"{len(wanted.pairs)} filters are more than the {_MAX_FILTERS} that the kernel accepts for "
                 f"{interface}; give pairs of key and mask.",
             )
         self._wanted, self._receive_own = wanted, receive_own
@@ -74,7 +74,7 @@ class SocketCanBus(BaseBus):
         stats.refused += len(frames) - sent
         return sent
 
-    def _take(self, frames: list[Frame]) -> None:
+    def _receive(self, frames: list[Frame]) -> None:
         link, stats = self._link, self.stats
         before = link.dropped
         try:
@@ -83,7 +83,7 @@ class SocketCanBus(BaseBus):
             stats.enter(BusState.DOWN)
         stats.dropped += link.dropped - before
 
-    def _open_again(self) -> bool:
+    def _reopen_link(self) -> bool:
         try:
             link = self._open(_IFF_UP | _IFF_RUNNING)
         except OSError:
@@ -92,14 +92,14 @@ class SocketCanBus(BaseBus):
         self._link = link
         return True
 
-    def _leave(self) -> None:
+    def _release(self) -> None:
         self._link.close()
 
     def _open(self, needed: int) -> FrameSocket:
-        """A socket bound to the interface; OSError when it is missing or a flag that is needed is not set.
+        """A socket bound to the interface; OSError if the interface is missing or lacks one of the flags ``needed``.
 
-        An interface that is bus-off is up but does not run.  The kernel takes up to a second to say that a fresh one
-        runs, so only a link that was lost is asked for that.
+        An interface that is bus-off is up but not running.  The kernel needs up to a second to mark a new interface as
+        running, so only a link that was lost has to be running.
         """
         raw = socket.SOL_CAN_RAW
         sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)

@@ -1,11 +1,11 @@
-"""Client of the wire, our user-space CAN bus: a `Bus` over a Unix socket, standard library only.
+"""Client of the wire, the user-space CAN bus: a `Bus` over a Unix socket, standard library only.
 
-Protocol (SOCK_SEQPACKET, one socket file per bus in `wire_directory`): a packet is up to `BATCH` `RECORD`s, or one with
-flag `CONTROL` followed by a JSON object.  A participant opens with the control packet ``{"hello": {...}}``.  Every
-record to a client carries how many of its frames have left the queue (modulo 2**16) and how many received ones were
-lost, so the client knows without a round trip when its transmit queue is full, as a SocketCAN sender does from ENOBUFS.
-A record with flag `DISCARD` empties the transmit queue of the client that sends it.  Frames in the queue of a client
-that closes still go out, as long as somebody acknowledges.
+Protocol (SOCK_SEQPACKET, one socket file per bus in `wire_directory`): a packet is up to `MAX_BATCH_RECORDS`
+`RECORD`s, or one with flag `CONTROL` followed by a JSON object.  A participant starts with the control packet
+``{"hello": {...}}``.  Every record to a client carries the number of its frames that have left the queue (modulo 2**16)
+and the number of received frames that were lost, so the client knows without a round trip when its transmit queue is
+full, as a SocketCAN sender does from ENOBUFS.  A record with flag `DISCARD` empties the transmit queue of its sender.
+Frames in the queue of a client that closes are still sent as long as another node acknowledges.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from can_dbc.frame import ERROR, Frame
 RECORD: Final = struct.Struct("=IB3x8sQHHI")
 """key, length, data: struct can_frame; end-of-frame time [ns, CLOCK_MONOTONIC]; flags; done; dropped."""
 _RECEIVED: Final = struct.Struct("=IB3x8sQH6x")
-"""A record without the counters; the last ones of a packet tell all."""
+"""A record without the counters; those of the last record of a packet are enough."""
 _COUNTERS: Final = struct.Struct("=26xHI")
 CONTROL: Final = 1
 STATUS: Final = 2
-"""Flag of a record that carries no frame, only the counters."""
+"""Flag of a record without a frame: counters only."""
 DISCARD: Final = 4
-BATCH: Final = 64
+MAX_BATCH_RECORDS: Final = 64
 """Most records in one packet."""
-CONTROL_BYTES: Final = 1 << 16
+MAX_CONTROL_BYTES: Final = 1 << 16
 """Most bytes of a control packet."""
-_PACKETS: Final = 16
-"""Most packets taken by one system call."""
+_MAX_PACKETS: Final = 16
+"""Most packets received by one system call."""
 _OPEN_TIMEOUT_S: Final = 2.0
 _REOPEN_TIMEOUT_S: Final = 0.002
-_BACKLOG: Final = 4096
+_MAX_BACKLOG_FRAMES: Final = 4096
 
 
 def wire_directory() -> Path:
-    """Where the socket files lie: ``TIMBERHAND_WIRE_DIR``, else the user's runtime directory, else a
-    directory in the temporary one that belongs to this user."""
+    """Directory of the socket files: ``TIMBERHAND_WIRE_DIR``, else the user's runtime directory, else a directory of
+    this user in the temporary one."""
     if explicit := os.environ.get("TIMBERHAND_WIRE_DIR"):
         return Path(explicit)
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
@@ -59,8 +59,8 @@ def wire_directory() -> Path:
 class WireClient(BaseBus):
     """One participant on a wire bus (contract: `can_dbc.bus.base.Bus`).
 
-    With `error_frames` they come out of `drain` too, and what came before a recovery stays: that is how python-can's
-    programs want it.
+    With `error_frames`, `drain` also returns error frames and keeps the frames from before a recovery, as python-can's
+    programs expect.
     """
 
     def __init__(
@@ -82,9 +82,9 @@ class WireClient(BaseBus):
         self._hello = {"hello": hello}
         self._tx_queue = tx_queue
         self._error_frames = error_frames
-        self._batch = Batch(RECORD.size * BATCH, count=_PACKETS)
-        self._backlog: list[Frame] = []  # read while looking for room in the transmit queue
-        self._asked: socket.socket | None = None  # a new connection whose greeting is not answered yet
+        self._batch = Batch(RECORD.size * MAX_BATCH_RECORDS, count=_MAX_PACKETS)
+        self._backlog: list[Frame] = []  # received while waiting for room in the transmit queue
+        self._opening: socket.socket | None = None  # a new connection whose hello is not answered yet
         self._accepted = self._done = self._dropped = 0
         self._sock, reply = _connect(name, self._hello)
         self._sock.setblocking(False)
@@ -101,7 +101,7 @@ class WireClient(BaseBus):
                 self._bound_backlog()
             room = self._tx_queue - self.pending if stats.state < BusState.OFF else 0
             records = []
-            for key, data in frames[sent : sent + min(room, BATCH)]:
+            for key, data in frames[sent : sent + min(room, MAX_BATCH_RECORDS)]:
                 if len(data) > 8:
                     break
                 records.append(RECORD.pack(key, len(data), data, 0, 0, 0, 0))
@@ -118,16 +118,16 @@ class WireClient(BaseBus):
         super().flush()
 
     def discard(self) -> None:
-        """Takes back the own frames that have not begun on the bus."""
+        """Cancels the own frames whose transmission has not begun."""
         if self.stats.state is not BusState.DOWN:
             self._post(RECORD.pack(0, 0, b"", 0, DISCARD, 0, 0))
 
     @property
     def pending(self) -> int:
-        """Own frames taken but not yet known to have been on the bus."""
+        """Own frames accepted but not yet known to have been on the bus."""
         return (self._accepted - self._done) & 0xFFFF
 
-    def _take(self, frames: list[Frame]) -> None:
+    def _receive(self, frames: list[Frame]) -> None:
         first = len(frames)
         if self._backlog:
             frames.extend(self._backlog)
@@ -135,7 +135,7 @@ class WireClient(BaseBus):
         self._read(frames, first)
 
     def _read(self, frames: list[Frame], first: int) -> None:
-        """Appends what waits in the socket; at a recovery takes back all from `first` on."""
+        """Appends the frames waiting in the socket; at a recovery removes all from `first` on."""
         stats, batch = self.stats, self._batch
         new, append = tuple.__new__, frames.append
         for _ in range(DRAIN_LIMIT // batch.count):
@@ -146,7 +146,7 @@ class WireClient(BaseBus):
                 return
             at = 0
             for size in batch.lengths():
-                if not size:  # the daemon has gone
+                if not size:  # the daemon has ended
                     stats.enter(BusState.DOWN)
                     return
                 for key, length, data, stamp_ns, flags in _RECEIVED.iter_unpack(batch.data[at : at + size]):
@@ -167,8 +167,8 @@ class WireClient(BaseBus):
                 return
 
     def _bound_backlog(self) -> None:
-        """Somebody who only sends must not grow without bound."""
-        surplus = len(self._backlog) - _BACKLOG
+        """Bounds the backlog of a client that only sends."""
+        surplus = len(self._backlog) - _MAX_BACKLOG_FRAMES
         if surplus > 0:
             self.stats.dropped += surplus
             del self._backlog[:surplus]
@@ -176,47 +176,48 @@ class WireClient(BaseBus):
     def _post(self, packet: bytes) -> bool:
         try:
             self._sock.send(packet)
-        except BlockingIOError:  # the daemon is behind
+        except BlockingIOError:  # the daemon is too slow
             return False
         except OSError:
             self.stats.enter(BusState.DOWN)
             return False
         return True
 
-    def _open_again(self) -> bool:
-        """A daemon that is slow to answer is asked once; later calls only look for its answer."""
-        patience_s = 0.0
+    def _reopen_link(self) -> bool:
+        """Sends one hello to a slow daemon; later calls only check for its answer."""
+        timeout_s = 0.0
         try:
-            if self._asked is None:
-                patience_s = _REOPEN_TIMEOUT_S
-                self._asked = _dial(self.name, self._hello, 0.0)
-            if not select.select([self._asked], [], [], patience_s)[0]:
+            if self._opening is None:
+                timeout_s = _REOPEN_TIMEOUT_S
+                self._opening = _connect_and_send(self.name, self._hello, 0.0)
+            if not select.select([self._opening], [], [], timeout_s)[0]:
                 return False
-            reply = _answer(self._asked)
+            reply = _receive_answer(self._opening)
         except (OSError, ValueError):
-            self._forget()
+            self._close_opening()
             return False
         self._sock.close()
-        self._sock, self._asked = self._asked, None
+        self._sock, self._opening = self._opening, None
         self._backlog.clear()
         self._accepted = self._done = self._dropped = 0
         self.bitrate = reply["bitrate"]
         return True
 
-    def _forget(self) -> None:
-        if self._asked is not None:
-            self._asked.close()
-            self._asked = None
+    def _close_opening(self) -> None:
+        if self._opening is not None:
+            self._opening.close()
+            self._opening = None
 
-    def _leave(self) -> None:
-        self._forget()
+    def _release(self) -> None:
+        self._close_opening()
         self._sock.close()
 
 
 def control(name: str, message: dict[str, Any]) -> dict[str, Any]:
-    """Asks the daemon of bus `name` (requests: `hil.wire.daemon`) without taking part in the bus.
+    """Sends a request to the daemon of bus `name` (see `hil.wire.daemon`) without joining the bus; returns its answer.
 
-    Raises `BusError` when there is no daemon, when it does not answer, or with the reason of its refusal.
+    Raises:
+        BusError: There is no daemon, it does not answer, or it refuses; the sentence has its reason.
     """
     sock, reply = _connect(name, message)
     sock.close()
@@ -224,15 +225,15 @@ def control(name: str, message: dict[str, Any]) -> dict[str, Any]:
 
 
 class _RefusedError(ValueError):
-    """The daemon's own reason why it does not do what it was asked."""
+    """The daemon's reason for refusing a request."""
 
 
 def _connect(name: str, message: dict[str, Any]) -> tuple[socket.socket, dict[str, Any]]:
-    """A connection to the daemon and its answer to the first message; raises `BusError`."""
+    """A connection to the daemon, and its answer to the first message; raises `BusError`."""
     sock = None
     try:
-        sock = _dial(name, message, _OPEN_TIMEOUT_S)
-        return sock, _answer(sock)
+        sock = _connect_and_send(name, message, _OPEN_TIMEOUT_S)
+        return sock, _receive_answer(sock)
     except (OSError, ValueError) as error:
         if sock is not None:
             sock.close()
@@ -245,8 +246,8 @@ def _connect(name: str, message: dict[str, Any]) -> tuple[socket.socket, dict[st
         ) from error
 
 
-def _dial(name: str, message: dict[str, Any], timeout_s: float) -> socket.socket:
-    """A connection to the daemon that has been sent its first message, a control packet; raises OSError."""
+def _connect_and_send(name: str, message: dict[str, Any], timeout_s: float) -> socket.socket:
+    """A connection to the daemon, with the first control packet sent; raises OSError."""
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         sock.settimeout(timeout_s)
@@ -258,15 +259,15 @@ def _dial(name: str, message: dict[str, Any], timeout_s: float) -> socket.socket
     return sock
 
 
-def _answer(sock: socket.socket) -> dict[str, Any]:
-    """The daemon's answer to a control packet; raises OSError when none comes, ValueError for a refusal."""
-    reply: dict[str, Any] = json.loads(sock.recv(CONTROL_BYTES)[RECORD.size :])
+def _receive_answer(sock: socket.socket) -> dict[str, Any]:
+    """The daemon's answer to a control packet; raises OSError if none comes, ValueError for a refusal."""
+    reply: dict[str, Any] = json.loads(sock.recv(MAX_CONTROL_BYTES)[RECORD.size :])
     if "error" in reply:
         raise _RefusedError(reply["error"])
     return reply
 
 
 def _program() -> str:
-    """The running program's name; that of the package under ``python -m package``."""
+    """The name of the running program; for ``python -m package`` that of the package."""
     path = Path(sys.argv[0])
     return path.parent.name if path.stem == "__main__" else path.stem or "python"

@@ -1,8 +1,8 @@
 """The wire as a python-can interface: ``python -m can.viewer -i timberhand -c crane0``.
 
-Registered under the entry point group ``can.interface`` as ``timberhand``, so that viewer, logger, player and
-every other python-can program can join a wire bus.  Stamps are wall-clock seconds, as python-can expects.
-One thread may receive while another sends.
+Registered in the entry point group ``can.interface`` as ``timberhand``, so that viewer, logger, player and every other
+python-can program can join a wire bus.  Stamps are wall-clock seconds, as python-can expects.  One thread may receive
+while another one sends.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ class WireBus(can.BusABC):
         tx_queue: int = 10,
         **_: object,
     ) -> None:
-        """Other python-can options (bitrate, fd, ...) are the daemon's business and ignored.
+        """Ignores other python-can options (bitrate, fd, ...), which belong to the daemon.
 
-        Raises `can.CanInitializationError`.
+        Raises:
+            can.CanInitializationError: The bus cannot be opened.
         """
         try:
             self._client = WireClient(channel, None, receive_own_messages, tx_queue, error_frames=True)
@@ -48,17 +49,17 @@ class WireBus(can.BusABC):
             raise can.CanInitializationError(str(error)) from error
         self.channel_info = f"timberhand wire {channel} at {self._client.bitrate} bit/s"
         self._waiting: deque[Frame] = deque()
-        self._lock = threading.Lock()  # the client's counters and buffer are shared by both directions
+        self._lock = threading.Lock()  # both directions share the client's counters and buffer
         super().__init__(channel, can_filters)
 
     def fileno(self) -> int:
         return self._client.fileno()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Waits for room in the transmit queue up to `timeout` (None: for ever, 0: not at all).
+        """Waits for room in the transmit queue up to `timeout` seconds (None: for ever, 0: not at all).
 
-        Raises `can.CanOperationError` when there is none, the bus is off or gone, or the message is none of
-        classical CAN.
+        Raises:
+            can.CanOperationError: There is no room, the bus is off or down, or the message is not classical CAN.
         """
         if msg.is_error_frame or msg.is_fd:
             raise can.CanOperationError(f"{self.channel_info}: error frames and CAN FD cannot be sent.")
@@ -72,14 +73,14 @@ class WireBus(can.BusABC):
                 raise can.CanOperationError(f"{self.channel_info}: the bus is {state.name.lower()}.")
             if deadline_s is not None and time.monotonic() >= deadline_s:
                 raise can.CanOperationError(f"{self.channel_info}: the transmit queue is full.")
-            time.sleep(0.0005)  # a few frame times: the receiving thread may take the news from the socket
+            time.sleep(0.0005)  # a few frame times: the receiving thread may read the counters from the socket
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if not self._waiting:
             with self._lock:
                 self._fetch()
             if not self._waiting and self._client.stats.state is BusState.DOWN:
-                raise can.CanOperationError(f"{self.channel_info}: the wire daemon has gone.")
+                raise can.CanOperationError(f"{self.channel_info}: the wire daemon has ended.")
             if not self._waiting and select.select([self._client], [], [], timeout)[0]:
                 with self._lock:
                     self._fetch()
@@ -97,7 +98,7 @@ class WireBus(can.BusABC):
         self._waiting.extend(frames)
 
     def flush_tx_buffer(self) -> None:
-        """Takes back the own frames that have not begun on the bus."""
+        """Cancels the own frames whose transmission has not begun."""
         with self._lock:
             self._client.discard()
 
@@ -107,7 +108,7 @@ class WireBus(can.BusABC):
 
     @state.setter
     def state(self, new_state: can.BusState) -> None:
-        raise NotImplementedError("The wire keeps the state by the error counters; it cannot be set.")
+        raise NotImplementedError("The state follows the error counters of the wire; it cannot be set.")
 
     def shutdown(self) -> None:
         super().shutdown()

@@ -1,10 +1,9 @@
-"""Checks a DBC or KCD file: does it load, do the compiled codecs equal cantools, and is the file well made.
+"""Checks a DBC or KCD file: whether it loads, whether the compiled codecs equal cantools, and lint.
 
-``check(path, frames, seed)`` returns a ``Report``; it never raises for a bad file.  The comparison drives
-both codecs with the same random payloads and values; where cantools refuses a value, ours has to refuse it
-too.  Lint looks at what a loader does not tell: overlapping bits, ranges that the bits cannot hold, missing
-units and cycle times, identifiers used twice.  Times and counts only; no clock, the randomness comes from
-the seed.
+``check(path, frames, seed)`` returns a ``Report``; it never raises for a bad file.  The comparison drives both codecs
+with the same random payloads and values; where cantools refuses a value, the codec must refuse it, too.  Lint finds
+what a loader does not report: overlapping bits, ranges that the bits cannot hold, missing units and cycle times,
+duplicate identifiers.  Deterministic for a seed.
 """
 
 from __future__ import annotations
@@ -20,13 +19,12 @@ from can_dbc.dbc.codec import DbcError, FrameRefused, MessageCodec, Policy, Sign
 from can_dbc.dbc.signals import ERROR, NOT_AVAILABLE, EncodeRefused
 from can_dbc.frame import describe
 
-SHOWN: Final = 5
+MAX_EXAMPLES: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One lint warning: ``where`` is message or message.signal, ``rule`` a short name, ``text`` a
-    sentence."""
+    """One lint warning: ``where`` is message or message.signal, ``rule`` a short name, ``text`` a sentence."""
 
     where: str
     rule: str
@@ -35,8 +33,8 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The result for one file.  ``error`` is the reason it cannot be loaded, else empty; ``differences``
-    are the first few cases where the codec and cantools disagree, ``different`` counts them all."""
+    """The result for one file.  ``error`` is the reason why it cannot be loaded, else empty; ``differences`` are the
+    first cases where codec and cantools disagree, ``different`` counts them all."""
 
     path: str
     error: str
@@ -84,7 +82,7 @@ def check(name_or_path: str, frames: int, seed: int) -> Report:
         decoded,
         encoded,
         len(differences),
-        tuple(differences[:SHOWN]),
+        tuple(differences[:MAX_EXAMPLES]),
         lint(database),
     )
 
@@ -93,7 +91,7 @@ def check(name_or_path: str, frames: int, seed: int) -> Report:
 
 
 def _refusals() -> tuple[type[Exception], ...]:
-    """What cantools raises for data it does not take."""
+    """The exceptions of cantools for data that it refuses."""
     import bitstruct  # type: ignore[import-untyped]
     from cantools.database.errors import Error
 
@@ -101,7 +99,7 @@ def _refusals() -> tuple[type[Exception], ...]:
 
 
 def random_payload(rng: random.Random, codec: MessageCodec) -> bytes:
-    """Random bytes; three times in four with known values in the multiplexers."""
+    """Random bytes, in three of four cases with known multiplexer values."""
     payload = rng.randbytes(codec.length)
     if rng.random() < 0.25 or not any(s.is_multiplexer for s in codec.signals):
         return payload
@@ -117,8 +115,7 @@ def random_payload(rng: random.Random, codec: MessageCodec) -> bytes:
 
 
 def random_values(rng: random.Random, codec: MessageCodec, payload: bytes) -> list[Any] | None:
-    """Values around those of a payload: as they are, off the grid, at and beyond the limits; None if
-    unreadable."""
+    """Values around those of a payload: unchanged, off the grid, at and beyond the limits; None if unreadable."""
     try:
         values = list(codec.decode(payload))
     except FrameRefused:
@@ -166,7 +163,8 @@ def _same(a: float, b: float) -> bool:
 def compare_encode(message: Any, codec: MessageCodec, values: Sequence[Any]) -> list[str]:
     """Differences (none or one) between cantools and the codec for one set of values.
 
-    Ours may refuse more: not finite, and out of range although the value table labels it as no measurement.
+    The codec may refuse more: values that are not finite, and values out of range that the value table labels as no
+    measurement.
     """
     given: dict[str, Any] = {}
     stricter = False
@@ -195,15 +193,14 @@ def compare_encode(message: Any, codec: MessageCodec, values: Sequence[Any]) -> 
 
 
 def lint(database: Any) -> tuple[Finding, ...]:
-    """What is wrong with a cantools database although it can be read (loaded with ``strict=False`` if need
-    be)."""
+    """The warnings for a cantools database that can be read (loaded with ``strict=False`` if necessary)."""
     findings: list[Finding] = []
     ids = Counter((m.frame_id, m.is_extended_frame) for m in database.messages)
     for message in database.messages:
         name = message.name
         if ids[message.frame_id, message.is_extended_frame] > 1:
             key = message.frame_id | (0x8000_0000 if message.is_extended_frame else 0)
-            findings.append(Finding(name, "identifier", f"another message has the identifier {describe(key)} too"))
+            findings.append(Finding(name, "identifier", f"another message also has the identifier {describe(key)}"))
         if "GenMsgCycleTime" not in (message.dbc.attributes if message.dbc else {}) and not message.cycle_time:
             findings.append(Finding(name, "cycle-time", "no GenMsgCycleTime"))
         findings += _overlaps(message)
@@ -226,7 +223,7 @@ def _signal_findings(where: str, s: Any) -> list[Finding]:
     for limit, text in ((s.minimum, "minimum"), (s.maximum, "maximum")):
         if limit is not None and not low - slack <= limit <= high + slack:
             reach = f"{low:.12g} to {high:.12g}"
-            findings.append(Finding(where, "range", f"{text} {limit} is beyond what the bits hold, {reach}"))
+            findings.append(Finding(where, "range", f"{text} {limit} is outside the range of the bits, {reach}"))
     if s.minimum is not None and s.maximum is not None and s.minimum > s.maximum:
         findings.append(Finding(where, "range", f"minimum {s.minimum} is above maximum {s.maximum}"))
     return findings
@@ -241,7 +238,7 @@ def _bits(s: Any) -> set[int]:
 
 
 def _together(a: Any, b: Any, parents: dict[str, Any]) -> bool:
-    """Whether two signals can be present in the same frame: no common multiplexer tells them apart."""
+    """Whether two signals can be present in the same frame: no common multiplexer separates them."""
 
     def selections(s: Any) -> dict[str, set[int]]:
         found: dict[str, set[int]] = {}

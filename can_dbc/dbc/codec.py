@@ -1,4 +1,4 @@
-"""DBC files in, flat codecs out: the contract between bytes on the bus and numbers in the program.
+"""Compiles DBC files to flat codecs: the contract between bytes on the bus and numbers in the program.
 
 ``load("crane")`` (or ``"machine"``, ``"gnss"``, or a path to any DBC or KCD) reads the file with cantools
 once, at start-up, and returns a ``Database`` of ``MessageCodec``.  A codec is plain data with three
@@ -6,12 +6,12 @@ compiled functions:
 
 * ``decode(data)``: physical values in signal order, equal to cantools' ``decode(decode_choices=False)``;
   checks the length only.  Signals that a multiplexer leaves out are None.
-* ``receive(data)``: the same for a live system.  The frame is refused whole (``FrameRefused``) when a value
-  is out of range; a raw value labelled NotAvailable or Error becomes None.
-* ``encode(*values)``: bytes from physical values in signal order.  Never wraps: ``EncodeRefused``, or the
-  nearest valid value where the DBC says saturate.  None writes NotAvailable.  Values round half to even.
+* ``receive(data)``: the same for a live system.  A frame with a value out of range is refused as a whole
+  (``FrameRefused``); a raw value labelled NotAvailable or Error becomes None.
+* ``encode(*values)``: bytes from physical values in signal order.  Never wraps: raises ``EncodeRefused``, or takes
+  the nearest valid value if the DBC says saturate.  None writes NotAvailable.  Values round half to even.
 
-A file that cannot be used raises ``DbcError`` with file, line where known, and reason.
+A file that cannot be used raises ``DbcError`` with file, line if known, and reason.
 """
 
 from __future__ import annotations
@@ -39,16 +39,15 @@ PDU1_MASK: Final = EXTENDED | 0x03FF_0000
 
 
 class DbcError(CodedError):
-    """A DBC file that cannot be used; the text is ``file[:line]: reason``."""
+    """A DBC file cannot be used; the sentence is ``file[:line]: reason``."""
 
 
 @dataclass(frozen=True, slots=True)
 class MessageCodec:
     """One message: identity, timing, E2E Data IDs (None without E2E) and the three compiled functions.
 
-    ``key`` follows ``can_dbc.frame``; times are in ns, 0 where the DBC gives none.  ``index`` maps a signal
-    name to its place in a value tuple.  ``by_pgn``: matched whatever priority and source address (J1939,
-    NMEA 2000).
+    ``key`` follows ``can_dbc.frame``; times are in ns, 0 if the DBC gives none.  ``index`` maps a signal name to its
+    place in a value tuple.  ``by_pgn``: matched with any priority and source address (J1939, NMEA 2000).
     """
 
     name: str
@@ -82,10 +81,10 @@ class Database:
     by_pgn: Mapping[int, MessageCodec]
 
     def message(self, name: str) -> MessageCodec:
-        """The codec of a message; DbcError when the file has no such message."""
+        """The codec of a message; raises DbcError if the file has no such message."""
         codec = self.messages.get(name)
         if codec is None:
-            raise DbcError("dbc.unknown-message", f"{self.path}: no message is called {name}")
+            raise DbcError("dbc.unknown-message", f"{self.path}: there is no message {name}")
         return codec
 
     def find(self, key: int) -> MessageCodec | None:
@@ -99,7 +98,7 @@ def pgn_key(key: int) -> int:
 
 
 def resolve(name_or_path: str | Path) -> Path:
-    """The path of a shipped database (a name without suffix) or of a file; DbcError when there is none."""
+    """The path of a shipped database (a name without suffix) or of a file; raises DbcError if there is none."""
     path = Path(name_or_path)
     if str(name_or_path) in SHIPPED:
         return Path(__file__).parents[1] / f"{name_or_path}.dbc"
@@ -130,7 +129,7 @@ def load(name_or_path: str | Path) -> Database:
 
 
 def parse(path: Path, *, strict: bool = True) -> Any:
-    """The cantools database of a file; DbcError with the line where it can be told."""
+    """The cantools database of a file; raises DbcError, with the line if known."""
     import cantools
     from cantools.database.errors import Error
 
@@ -148,7 +147,7 @@ def parse(path: Path, *, strict: bool = True) -> Any:
 
 
 def _line_of(reason: str, text: str) -> str:
-    """``:line`` of a cantools complaint: the line it gives, or that of the message it names."""
+    """``:line`` of a cantools error: the line it gives, or that of the message it names."""
     given = re.search(r"line (\d+)", reason)
     if given:
         return f":{given[1]}"

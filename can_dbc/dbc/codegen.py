@@ -1,9 +1,9 @@
 """Turns the signals of one message into flat Python functions: decode, receive and encode.
 
-The source text is generated once at start-up and compiled with ``exec``; its only inputs are numbers and
-signal names taken from a DBC, and a name enters the text only if it is a plain identifier.  The fast path
-holds shifts, masks and one chained comparison per signal.  Anything unusual (a sentinel, a value out of
-range, None) leaves it for the reference code in ``signals``, so there is one definition of what is refused.
+The source text is generated once at start-up and compiled with ``exec``; its only inputs are numbers and signal names
+of a DBC, and a name enters the text only if it is a plain identifier.  The fast path has shifts, masks and one chained
+comparison per signal.  Anything unusual (a sentinel, a value out of range, None) goes to the reference code in
+``signals``, so that there is one definition of what is refused.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def _physical_expression(s: SignalInfo, raw: str) -> str:
         text = raw if scale == 1 else f"{raw} * {scale}"
         return f"{text} + {offset}" if offset else text
     text = f"{raw} * {s.scale!r}"
-    # adding 0 only turns -0.0 into 0.0, which an integer times a positive scale never gives
+    # adding 0 only turns -0.0 into 0.0, which does not result from an integer times a positive scale
     return text if s.offset == 0 and s.scale > 0 and not s.is_float else f"{text} + {s.offset!r}"
 
 
@@ -149,7 +149,7 @@ def _flat_decode(
 
 
 def _receive_checks(s: SignalInfo, raw: str) -> list[str]:
-    """Conditions under which a raw value needs no second look."""
+    """Conditions under which the fast path may use a raw value."""
     if s.is_float:
         low = -math.inf if s.minimum is None else min(s.physical(s.convert(s.minimum)), s.minimum)
         high = math.inf if s.maximum is None else max(s.physical(s.convert(s.maximum)), s.maximum)
@@ -195,8 +195,7 @@ def _parameters(signals: Sequence[SignalInfo]) -> list[str]:
 
 
 def _fast_limits(s: SignalInfo) -> tuple[float, float]:
-    """The physical interval in which rounding provably stays within range and bits; empty where none is
-    found."""
+    """The physical interval in which rounding provably stays within range and bits; empty if none is found."""
     tolerance = abs(s.scale) * 1e-6
     low = -math.inf if s.minimum is None else s.minimum - tolerance
     high = math.inf if s.maximum is None else s.maximum + tolerance
@@ -289,7 +288,7 @@ def _children(signals: Sequence[SignalInfo], parent: int | None, mux: int | None
 
 
 def _mux_ids(signals: Sequence[SignalInfo], parent: int) -> set[int]:
-    """Accepted multiplexer values: those with signals of their own, and those that the value table names."""
+    """Valid multiplexer values: those with signals of their own, and those of the value table."""
     ids = {mux for s in signals if s.parent == parent for mux in s.parent_ids}
     return ids | set(signals[parent].choices)
 
@@ -332,7 +331,9 @@ def _multiplexed_encoder(name: str, length: int, signals: tuple[SignalInfo, ...]
             if signals[i].is_multiplexer:
                 value = values[i]
                 if not isinstance(value, (int, float)) or not math.isfinite(value):
-                    raise EncodeRefused("codec.multiplexer", f"{name}.{signals[i].name} = {value!r} selects nothing")
+                    raise EncodeRefused(
+                        "codec.multiplexer", f"{name}.{signals[i].name} = {value!r} is not a multiplexer value"
+                    )
                 if int(value) not in _mux_ids(signals, i):
                     raise EncodeRefused(
                         "codec.multiplexer", f"{name}.{signals[i].name} = {value} is not a known multiplexer value"

@@ -1,10 +1,10 @@
-"""One signal of a DBC: where its bits lie, what they mean, and the exact conversion both ways.
+"""One signal of a DBC: the place of its bits, their meaning, and the exact conversion in both directions.
 
-This is the reference that the generated code of ``codegen`` short-cuts.  Conversions repeat cantools'
-floating point expressions term by term, so that results are equal bit for bit.  Encoding never wraps: a
-value that is not finite, or out of range with the policy *refuse*, raises ``EncodeRefused``; *saturate*
-takes the nearest valid value. A raw value that the value table labels ``NotAvailable`` or ``Error`` is no
-measurement: ``valid`` turns it into None, and encoding None writes the raw value labelled ``NotAvailable``.
+This is the reference for the generated code of ``codegen``.  Conversions repeat cantools' floating-point expressions
+term by term, so that results are equal bit for bit.  Encoding never wraps: a value that is not finite, or out of range
+with the policy *refuse*, raises ``EncodeRefused``; *saturate* takes the nearest valid value.  A raw value that the
+value table labels ``NotAvailable`` or ``Error`` is not a measurement: ``valid`` turns it into None, and encoding None
+writes the raw value labelled ``NotAvailable``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Refusal(StrEnum):
 
 
 class FrameRefused(ValueError):
-    """A received frame that must not be used; ``reason`` says why, ``where`` names the message or signal."""
+    """A received frame must not be used; ``reason`` says why, ``where`` names the message or signal."""
 
     def __init__(self, reason: Refusal, where: str) -> None:
         super().__init__(f"{where}: {reason.value}")
@@ -63,12 +63,14 @@ class Scaling(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SignalInfo:
-    """A compiled signal.  ``minimum`` and ``maximum`` are physical, None where the DBC gives none.
-    ``shift`` counts from the least significant bit of the payload read as one little-endian (or, with
-    ``big_endian``, big-endian) number.  ``parent`` is the index of the multiplexer and ``parent_ids`` its
-    values for which this signal is present.  Derived: ``raw_min`` and ``raw_max`` are what the bits hold,
-    ``raw_low`` and ``raw_high`` what the declared range allows, ``sentinels`` the raw values that stand for
-    "no measurement", ``not_available`` the one of them that encoding None writes."""
+    """A compiled signal.
+
+    ``minimum`` and ``maximum`` are physical, None if the DBC gives none.  ``shift`` counts from the least significant
+    bit of the payload read as one little-endian (or, with ``big_endian``, big-endian) number.  ``parent`` is the index
+    of the multiplexer and ``parent_ids`` its values for which this signal is present.  Derived: ``raw_min`` and
+    ``raw_max`` are the limits of the bits, ``raw_low`` and ``raw_high`` those of the declared range, ``sentinels`` the
+    raw values that mean "no measurement", ``not_available`` the one that encoding None writes.
+    """
 
     name: str
     unit: str
@@ -137,8 +139,7 @@ class SignalInfo:
         )
 
     def valid(self, raw: int | float) -> Value:
-        """The physical value of a received raw value, None for a sentinel; raises FrameRefused out of
-        range."""
+        """The physical value of a received raw value, None for a sentinel; raises FrameRefused if out of range."""
         if raw in self.sentinels:
             return None
         value = self.physical(raw)
@@ -209,11 +210,11 @@ def integer_raw(value: int | float, scale: int) -> int:
 
 
 def pack_float(value: float, bits: int) -> int:
-    """The IEEE 754 bits of a number; OverflowError when it is too large for the width."""
+    """The IEEE 754 bits of a number; raises OverflowError if it is too large for the width."""
     return int.from_bytes(struct.pack(FLOAT_FORMATS[bits], value), "little")
 
 
 def unpack_float(raw: int, bits: int) -> float:
-    """The number that IEEE 754 bits stand for."""
+    """The number of IEEE 754 bits."""
     value: float = struct.unpack(FLOAT_FORMATS[bits], raw.to_bytes(bits // 8, "little"))[0]
     return value

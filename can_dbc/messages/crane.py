@@ -25,7 +25,7 @@ _REPORT: Final = struct.Struct(f"<BBHIHHH{3 * N_AXES + 3}d4I")
 
 
 class GrappleCommand(IntEnum):
-    """Open-loop grapple command (paper A III-A); the numbers are ``ValveCmdB.GrappleMode``."""
+    """Open-loop grapple command (paper A III-A); the numbers are those of ``ValveCmdB.GrappleMode``."""
 
     NEUTRAL = 0
     OPEN = 1
@@ -34,7 +34,7 @@ class GrappleCommand(IntEnum):
 
 
 class OperatorAction(IntEnum):
-    """What a human may ask of the controller; every one is an edge, never a level."""
+    """Requests of an operator to the controller; each one is an edge, not a level."""
 
     ARM = 1
     DISARM = 2
@@ -53,9 +53,9 @@ class Knot:
 
 @dataclass(frozen=True, slots=True)
 class CraneSetpoint:
-    """A short joint trajectory with a lease: obeyed until ``stamp_ns + lease_ns`` and not a moment longer.
+    """A short joint trajectory with a lease: valid until ``stamp_ns + lease_ns``.
 
-    ``final`` says that the last knot is the end of the motion: once reached, the lease may run out in peace.
+    ``final`` marks the last knot as the end of the motion: once it is reached, the end of the lease is no fault.
     """
 
     sequence: int
@@ -77,9 +77,9 @@ class SpoolKnot:
 
 @dataclass(frozen=True, slots=True)
 class SpoolTest:
-    """A spool command for one function (a ``Joint`` number), to find out what its valve does; all others stay neutral.
+    """A spool command for one function (a ``Joint`` number), to identify its valve; all others stay neutral.
 
-    Straight lines between the knots, neutral past the last one.  Obeyed until ``stamp_ns + lease_ns``.
+    Linear between the knots, neutral after the last one.  Valid until ``stamp_ns + lease_ns``.
     """
 
     sequence: int
@@ -92,7 +92,7 @@ class SpoolTest:
 
 @dataclass(frozen=True, slots=True)
 class OperatorCommand:
-    """One action of a human operator."""
+    """One request of an operator."""
 
     sequence: int
     profile_hash: int
@@ -102,9 +102,9 @@ class OperatorCommand:
 
 @dataclass(frozen=True, slots=True)
 class StateReport:
-    """What the controller says of itself, 50 times a second.
+    """State of the controller, 50 times per second.
 
-    ``position``, ``velocity`` and ``reference`` are in ``Joint`` order; an unknown value is NaN.  ``mode`` is
+    ``position``, ``velocity`` and ``reference`` are in ``Joint`` order; unknown values are NaN.  ``mode`` is
     a ``machine.status.modes.Mode``, ``reason`` the supervisor's number; ``refused`` counts setpoints refused since
     start, ``refusal`` is the last reason.  ``tick_ns`` is the longest tick, ``late_ns`` the worst lateness
     since the last report.
@@ -133,13 +133,13 @@ class StateReport:
 
 
 def crane_body(m: CraneSetpoint) -> bytes:
-    """The body of a crane setpoint; times finer than 1 us are cut."""
+    """The body of a crane setpoint; times are truncated to 1 us."""
     head = _CRANE.pack(m.lease_ns // 1000, m.grapple, int(m.final), len(m.knots), N_AXES)
     return head + b"".join(_KNOT.pack(k.after_ns // 1000, *k.position, *k.velocity) for k in m.knots)
 
 
 def spool_body(m: SpoolTest) -> bytes:
-    """The body of a spool test; times finer than 1 us are cut."""
+    """The body of a spool test; times are truncated to 1 us."""
     head = _SPOOL.pack(m.lease_ns // 1000, m.function, len(m.knots))
     return head + b"".join(_SPOOL_KNOT.pack(k.after_ns // 1000, k.percent) for k in m.knots)
 

@@ -37,7 +37,7 @@ Datagram = CraneSetpoint | SpoolTest | DriveSetpoint | OperatorCommand | StateRe
 
 
 def encode(message: Datagram, key: bytes | None = None) -> bytes:
-    """The bytes of a datagram; times finer than 1 us are cut.  With ``key`` it is authenticated."""
+    """The bytes of a datagram; times are truncated to 1 us.  With ``key`` it is authenticated."""
     kind, body = _body(message)
     return sealed(kind, (message.sequence, message.profile_hash, message.stamp_ns), body, key)
 

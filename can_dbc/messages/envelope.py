@@ -31,7 +31,7 @@ Common = tuple[int, int, int]
 
 
 class Kind(IntEnum):
-    """What a datagram says."""
+    """The kind of a datagram."""
 
     CRANE = 1
     DRIVE = 2
@@ -44,7 +44,7 @@ class Kind(IntEnum):
 
 
 class DatagramFault(IntEnum):
-    """Why a datagram was refused before anyone looked at its meaning."""
+    """Why a datagram is refused before its contents are used."""
 
     LENGTH = 1
     MAGIC = 2
@@ -57,7 +57,7 @@ class DatagramFault(IntEnum):
 
 
 class DatagramRefused(ValueError):
-    """A datagram that was refused whole; ``fault`` says why."""
+    """A datagram is refused as a whole; ``fault`` says why."""
 
     def __init__(self, fault: DatagramFault) -> None:
         super().__init__(f"datagram refused: {fault.name.lower().replace('_', ' ')}")
@@ -65,7 +65,7 @@ class DatagramRefused(ValueError):
 
 
 def sealed(kind: Kind, common: Common, body: bytes, key: bytes | None) -> bytes:
-    """A body in its envelope."""
+    """The datagram with a body."""
     data = _HEADER.pack(MAGIC, VERSION, kind, *common) + body
     if key is not None:
         data += _mac(data, key)

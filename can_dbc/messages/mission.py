@@ -1,9 +1,9 @@
-"""What planner and console say to each other about a mission: how it stands, and what a person orders.
+"""The datagrams between planner and console about a mission: its report, and operator commands to the mission.
 
-Both travel in the envelope of `can_dbc.messages.crane` (magic, version, profile, stamp, CRC, HMAC where there is a key); the
-controller refuses either.  A `MissionReport` is JSON within it, so that it may say more than a fixed layout could; one
-that does not fit its schema in every field is refused whole.  Places are (latitude, longitude) in degrees, WGS84,
-directions degrees clockwise from true north.
+Both travel in the envelope of `can_dbc.messages.envelope` (magic, version, profile, stamp, CRC, HMAC if there is a
+key); the controller refuses both.  A `MissionReport` is JSON, to hold more than a fixed layout could; a report that
+does not match its schema in every field is refused as a whole.  Places are (latitude, longitude) in degrees, WGS84;
+directions are degrees clockwise from true north.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from can_dbc.messages.envelope import DatagramFault, DatagramRefused, Kind, seal
 
 SCHEMA: Final = 1
 MAX_BYTES: Final = 60_000
-MAX_ROUTE: Final = 300
+MAX_ROUTE_POINTS: Final = 300
 MAX_FENCES: Final = 20
 MAX_CORNERS: Final = 300
 """Of all fences together."""
@@ -27,64 +27,64 @@ MAX_LANDINGS: Final = 20
 MAX_LOGS: Final = 150
 MAX_GIVEN_UP: Final = 20
 MAX_TARGETS: Final = 8
-MAX_TEXT: Final = 120
+MAX_TEXT_CHARS: Final = 120
 
-_ORDER: Final = struct.Struct("<I")
+_COMMAND: Final = struct.Struct("<I")
 
 
-class Order(IntEnum):
-    """What a person may order of a mission; every one is an edge, never a level."""
+class MissionAction(IntEnum):
+    """Operator commands to a mission; each one is an edge, not a level."""
 
     AUTO = 1
     PAUSE = 2
     SINGLE_STEP = 3
     RUN_THROUGH = 4
-    """No single step any more."""
+    """End of single steps."""
     NEXT_STEP = 5
     ABORT = 6
 
 
 @dataclass(frozen=True, slots=True)
-class MissionOrder:
-    """One order of a person to the planner."""
+class MissionCommand:
+    """One operator command to the planner."""
 
     sequence: int
     profile_hash: int
     stamp_ns: int
-    order: Order
+    action: MissionAction
 
 
-Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
+Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT_CHARS)]
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Metres = Annotated[float, msgspec.Meta(ge=0.0)]
 Bearing = Annotated[float, msgspec.Meta(ge=0.0, le=360.0)]
 LatLon = tuple[Annotated[float, msgspec.Meta(ge=-90.0, le=90.0)], Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)]]
 
 
-class Area(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A fence without its closing corner; the machine stays in it, or out of it."""
+class Fence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A fence without its closing corner; the machine stays inside it, or outside if ``keep_out``."""
 
     corners: Annotated[tuple[LatLon, ...], msgspec.Meta(max_length=MAX_CORNERS)]
     keep_out: bool
     name: Text
 
 
-class Pile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A landing."""
 
     place: LatLon
     name: Text
 
 
-class GivenUp(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A log that is left lying, and why."""
+class AbandonedLog(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A log that the planner no longer tries to load, and why."""
 
     log: int
     reason: Text
 
 
-class Lying(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A log that the planner knows: its middle, its direction, how long ago it was seen; how often it was missed."""
+class KnownLog(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A log on the planner's map: center, direction, time since it was seen, and number of missed grasps."""
 
     number: int
     place: LatLon
@@ -96,8 +96,8 @@ class Lying(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     given_up: bool
 
 
-class Whereabouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the planner takes the middle of the front axle to be, and how well it knows (1 sigma)."""
+class MachinePose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The planner's estimate of the middle of the front axle, with its standard deviation (1 sigma)."""
 
     place: LatLon
     heading_deg: Bearing
@@ -105,12 +105,12 @@ class Whereabouts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MissionReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a mission stands, twice a second.
+    """The state of a mission, twice per second.
 
-    ``state`` is its short name and ``words`` what the machine is about in it; ``paused`` says why nothing moves,
-    ``waits_for`` what has come about and waits for the next single step, ``failure`` why it ended early.  ``targets``
-    are the numbers of the logs that are aimed at, ``crane`` is what the crane is about.  ``route`` is driven round and
-    round when ``closed``.  ``order`` is the sequence number of the last order and ``refusal`` why it was not obeyed.
+    ``state`` is the short name of its state and ``words`` describes it; ``paused`` says why nothing moves,
+    ``waits_for`` which transition waits for the next single step, ``failure`` why the mission ended early.  ``targets``
+    are the numbers of the logs to grasp, ``crane`` describes what the crane does.  ``route`` is driven repeatedly if
+    ``closed``.  ``order`` is the sequence number of the last command and ``refusal`` why it was refused.
     """
 
     schema: Literal[1]
@@ -130,36 +130,41 @@ class MissionReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     on_board_m3: Metres
     unloaded: Count
     missed: Count
-    given_up: Annotated[tuple[GivenUp, ...], msgspec.Meta(max_length=MAX_GIVEN_UP)]
+    given_up: Annotated[tuple[AbandonedLog, ...], msgspec.Meta(max_length=MAX_GIVEN_UP)]
     driven_m: Metres
     targets: Annotated[tuple[int, ...], msgspec.Meta(max_length=MAX_TARGETS)]
     crane: Text
-    here: Whereabouts | None
-    route: Annotated[tuple[LatLon, ...], msgspec.Meta(max_length=MAX_ROUTE)]
+    here: MachinePose | None
+    route: Annotated[tuple[LatLon, ...], msgspec.Meta(max_length=MAX_ROUTE_POINTS)]
     closed: bool
-    fences: Annotated[tuple[Area, ...], msgspec.Meta(max_length=MAX_FENCES)]
-    landings: Annotated[tuple[Pile, ...], msgspec.Meta(max_length=MAX_LANDINGS)]
-    logs: Annotated[tuple[Lying, ...], msgspec.Meta(max_length=MAX_LOGS)]
+    fences: Annotated[tuple[Fence, ...], msgspec.Meta(max_length=MAX_FENCES)]
+    landings: Annotated[tuple[Landing, ...], msgspec.Meta(max_length=MAX_LANDINGS)]
+    logs: Annotated[tuple[KnownLog, ...], msgspec.Meta(max_length=MAX_LOGS)]
 
 
 _REPORT: Final = msgspec.json.Decoder(MissionReport)
 _JSON: Final = msgspec.json.Encoder()
 
 
-def encode_order(order: MissionOrder, key: bytes | None = None) -> bytes:
-    """The bytes of an order."""
-    return sealed(Kind.ORDER, (order.sequence, order.profile_hash, order.stamp_ns), _ORDER.pack(order.order), key)
+def encode_mission_command(command: MissionCommand, key: bytes | None = None) -> bytes:
+    """The bytes of a command."""
+    common = (command.sequence, command.profile_hash, command.stamp_ns)
+    return sealed(Kind.ORDER, common, _COMMAND.pack(command.action), key)
 
 
-def decode_order(data: bytes, key: bytes | None = None) -> MissionOrder:
-    """The order in a datagram; raises DatagramRefused."""
+def decode_mission_command(data: bytes, key: bytes | None = None) -> MissionCommand:
+    """The command in a datagram.
+
+    Raises:
+        DatagramRefused: it is not a valid command.
+    """
     kind, common, body = unsealed(data, key)
     if kind != Kind.ORDER:
         raise DatagramRefused(DatagramFault.KIND)
-    if len(body) != _ORDER.size:
+    if len(body) != _COMMAND.size:
         raise DatagramRefused(DatagramFault.LENGTH)
     try:
-        return MissionOrder(*common, Order(*_ORDER.unpack(body)))
+        return MissionCommand(*common, MissionAction(*_COMMAND.unpack(body)))
     except ValueError:
         raise DatagramRefused(DatagramFault.VALUE) from None
 
@@ -167,10 +172,10 @@ def decode_order(data: bytes, key: bytes | None = None) -> MissionOrder:
 def encode_mission(
     report: MissionReport, sequence: int, profile_hash: int, stamp_ns: int, key: bytes | None = None
 ) -> bytes:
-    """The bytes of a report; raises ValueError when it is longer than ``MAX_BYTES``."""
+    """The bytes of a report; raises ValueError if it is longer than ``MAX_BYTES``."""
     data = sealed(Kind.MISSION, (sequence, profile_hash, stamp_ns), _JSON.encode(report), key)
     if len(data) > MAX_BYTES:
-        raise ValueError(f"a mission report of {len(data)} bytes; {MAX_BYTES} is the most that one datagram takes")
+        raise ValueError(f"a mission report of {len(data)} bytes does not fit; one datagram holds at most {MAX_BYTES}")
     return data
 
 

@@ -1,4 +1,4 @@
-"""One controller tick as bytes: everything that went in and came out, so that a record can be replayed.
+"""One controller tick as bytes: all its inputs and outputs, for replay.
 
 Little-endian; bus 0 is crane0, bus 1 is mach0::
 
@@ -8,7 +8,7 @@ Little-endian; bus 0 is crane0, bus 1 is mach0::
     frames in: (stamp u64, key u32, bus u8, length u8, data 8) | datagrams: (length u16, bytes)
     frames out: (key u32, bus u8, length u8, data 8) | report | vehicle report, all that is left | CRC-32
 
-The controller sends it as one UDP datagram per tick; ``decode`` refuses a damaged one whole.
+The controller sends one UDP datagram per tick; ``decode`` refuses a damaged one as a whole.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from runtime.errors import CodedError
 MAGIC: Final = 0x52544854  # "THTR"
 VERSION: Final = 2
 MAX_BYTES: Final = 65_000
-"""Most bytes of a record: what one UDP datagram carries."""
+"""Most bytes of a record: the capacity of one UDP datagram."""
 
 _VERSION: Final = struct.Struct("<IH")
 _HEAD: Final = struct.Struct("<I5HQqQQ" + "HQQQQ" * 2)
@@ -37,22 +37,22 @@ _CRC: Final = struct.Struct("<I")
 
 
 class RecordRefused(CodedError, ValueError):
-    """A tick record that is damaged or of another version; the text says which."""
+    """A tick record is damaged or of another version."""
 
 
 @dataclass(slots=True)
 class BusReading:
-    """What a tick saw of one bus: state of the own node (`can_dbc.bus.base.BusState`) and counters since start."""
+    """One bus as a tick reads it: state of the own node (`can_dbc.bus.base.BusState`) and counters since start."""
 
     state: int = 0
     dropped: int = 0
     """Received frames that were lost."""
     refused: int = 0
-    """Frames the bus did not take."""
+    """Frames that the bus did not accept."""
     errors: int = 0
     """Error frames."""
     recoveries: int = 0
-    """How often the state came back from OFF or DOWN."""
+    """Number of recoveries from OFF or DOWN."""
 
     def take(self, stats: BusStats) -> None:
         """Reads the counters of a bus."""
@@ -62,9 +62,9 @@ class BusReading:
 
 @dataclass(frozen=True, slots=True)
 class TickRecord:
-    """Inputs and outputs of one tick; a report is empty when none was due.  Counters are totals.
+    """Inputs and outputs of one tick; a report is empty if none was due.  Counters are totals.
 
-    ``frames_in`` and ``frames_out`` are of crane0, in send order and with SYNC last; those of mach0 stand apart.
+    ``frames_in`` and ``frames_out`` are those of crane0, in send order and with SYNC last.
     """
 
     now_ns: int
@@ -112,13 +112,13 @@ def decode(data: bytes) -> TickRecord:
     if len(data) < _VERSION.size + _CRC.size:
         raise RecordRefused("tick-record.length", f"a tick record of {len(data)} bytes is too short")
     if zlib.crc32(data[: -_CRC.size]) != _CRC.unpack_from(data, len(data) - _CRC.size)[0]:
-        raise RecordRefused("tick-record.checksum", "a tick record with a wrong checksum")
+        raise RecordRefused("tick-record.checksum", "the tick record has a wrong checksum")
     magic, version = _VERSION.unpack_from(data)
     if magic != MAGIC:
-        raise RecordRefused("tick-record.magic", "not a tick record")
+        raise RecordRefused("tick-record.magic", "the bytes are not a tick record")
     if version != VERSION:
         raise RecordRefused(
-            "tick-record.version", f"a tick record of version {version}, this release reads version {VERSION}"
+            "tick-record.version", f"the tick record has version {version}, this release reads version {VERSION}"
         )
     end = len(data) - _CRC.size
     frames_in: tuple[list[Frame], list[Frame]] = ([], [])
@@ -140,9 +140,9 @@ def decode(data: bytes) -> TickRecord:
             frames_out[bus].append((key, payload[:length]))
             at += _OUT.size
     except (struct.error, IndexError):
-        raise RecordRefused("tick-record.contents", "a tick record whose contents do not fit its counts") from None
+        raise RecordRefused("tick-record.contents", "the contents of the tick record do not match its counts") from None
     if at + n_report > end:
-        raise RecordRefused("tick-record.contents", "a tick record whose contents do not fit its counts")
+        raise RecordRefused("tick-record.contents", "the contents of the tick record do not match its counts")
     return TickRecord(
         now_ns, late_ns, tick_ns, missed, BusReading(*counters[:5]), BusReading(*counters[5:]),
         tuple(frames_in[0]), tuple(frames_in[1]), tuple(datagrams), tuple(frames_out[0]), tuple(frames_out[1]),

@@ -6,10 +6,10 @@ import socket
 
 
 def udp_address(text: str) -> tuple[str, int]:
-    """A command line's HOST:PORT as numbers, so that sending never waits for a name server.
+    """HOST:PORT of a command line as a numeric address, so that sending never waits for a name server.
 
     Raises:
-        ValueError: one sentence that says what to write.
+        ValueError: not HOST:PORT, or an unknown host; one sentence that says what to write.
     """
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:

@@ -1,4 +1,4 @@
-"""What planner and controller say to each other about driving: a drive setpoint, and a report of the vehicle.
+"""The datagrams about driving: drive setpoint (planner to controller) and vehicle report (controller to planner).
 
 They travel in the envelope of `can_dbc.messages.envelope`; `can_dbc.messages.datagrams` encodes and decodes them.
 """
@@ -22,31 +22,31 @@ Heights = tuple[float, float, float, float]
 
 
 class Steering(IntEnum):
-    """What steers the machine while a drive setpoint lasts."""
+    """What steers the machine during a drive setpoint."""
 
     WAYPOINT = 0
     """The bearing to the waypoint (paper B's law)."""
     ARTICULATION = 1
-    """A wanted angle of the articulation."""
+    """A requested articulation angle."""
 
 
 class Driving(IntEnum):
-    """What the vehicle does."""
+    """State of the vehicle."""
 
     STANDING = 0
     DRIVING = 1
-    """A drive setpoint is obeyed; also while it asks for no speed."""
+    """A drive setpoint is executed, also one of zero speed."""
     BRAKING = 2
-    """The setpoint is over, and the machine slows down."""
+    """The setpoint has ended, and the machine slows down."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriveSetpoint:
-    """A drive command with a lease: obeyed until ``stamp_ns + lease_ns`` and not a moment longer.
+    """A drive command with a lease: valid until ``stamp_ns + lease_ns``.
 
     WAYPOINT steers to ``latitude_deg`` and ``longitude_deg`` (WGS 84); ARTICULATION bends to ``articulation_rad``,
-    which moves with ``articulation_rate_rad_s`` (+ left).  What the other way of steering needs is 0.  ``speed_m_s``
-    is that of the front axle, + forwards; 0 stands with the brake on.  ``level`` corrects the heights for roll and
+    which moves with ``articulation_rate_rad_s`` (+ left).  The fields of the other steering are 0.  ``speed_m_s``
+    is that of the front axle, + forward; 0 stands still with the brake on.  ``level`` corrects the heights for roll and
     pitch.  One axle may float, never both.
     """
 
@@ -68,14 +68,14 @@ class DriveSetpoint:
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """What the controller knows of the vehicle, 20 times a second on a machine that drives; unknown is NaN.
+    """State of the vehicle, 20 times per second on a machine that drives; unknown values are NaN.
 
     ``*_ns`` are monotonic reception stamps of the values that follow them, 0 for never.  ``driving`` is a `Driving`;
     ``refused`` counts drive setpoints refused since start, ``refusal`` is the last reason.  ``heading_rad`` is
     clockwise from true north, of the half that carries the antennas, but ``yaw_rate_rad_s`` is + when it turns left.
     ``fix`` is the method of PGN 129029, ``sigma_m`` the horizontal error (1 sigma) that goes with it.  ``roll_rad`` is
     + with the right side down, ``pitch_rad`` + nose up.  ``stale_mask`` has a bit, in the order of `VEHICLE_INPUTS`,
-    for every input of which nothing fresh is known.
+    for every stale input.
     """
 
     sequence: int

@@ -1,4 +1,6 @@
-"""The cyclic UDP datagrams between bridge and PLC, 100 Hz each way (docs/reference/can-bus.md section 10), packed little-endian.
+"""The cyclic UDP datagrams between bridge and PLC, 100 Hz in each direction, packed little-endian.
+
+Layout (docs/reference/can-bus.md section 10)::
 
     header 28: magic 'CRN1' u32 | version u16 | type u16 | seq u32 | time u64 us | echo_seq u32 | mode u16 | arm u16
     command, 96: header | 7 x (reference i32, rate i32; 1e-6) | grapple, grapple %, speed %, reset: 4 x u16 | CRC-32
@@ -6,8 +8,8 @@
         | 8 pressures i16 0.1 bar | E-stop bits, fault, axis, longest cycle us, opening 0.1 %, load kg: 6 x u16
         | 12 reserved | CRC-32
 
-``echo_seq`` is the sequence number of the newest good datagram from the other side; it gives the round trip.  Pure;
-decoding raises `DatagramRefused` and uses nothing, encoding raises `MapError` for what does not fit.
+``echo_seq`` is the sequence number of the newest valid datagram from the other side; it gives the round-trip time.
+Pure; decoding raises `DatagramRefused` and uses nothing, encoding raises `MapError` for values that do not fit.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ class DatagramRefused(CodedError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Who counts what: own number, own clock [us], and the newest number heard from the other side."""
+    """Own sequence number, own clock [us], and the newest sequence number received from the other side."""
 
     sequence: int
     time_us: int
@@ -45,21 +47,21 @@ class Header:
 
 
 def encode_command(header: Header, command: Command) -> bytes:
-    """96 bytes."""
+    """The 96 bytes of a command; raises MapError for a value that does not fit."""
     c = command
     body = [v for pair in zip(_micros(c.reference, "reference"), _micros(c.rate, "rate"), strict=True) for v in pair]
-    grapple_pct = plc.whole(c.grapple_pct, 1, 0, 100, "the grapple's share")
-    speed_pct = plc.whole(c.max_speed_pct, 1, 0, 100, "the greatest speed")
+    grapple_pct = plc.whole(c.grapple_pct, 1, 0, 100, "the grapple percentage")
+    speed_pct = plc.whole(c.max_speed_pct, 1, 0, 100, "the maximum speed")
     end = (c.grapple, grapple_pct, speed_pct, int(c.reset))
     return _closed(_COMMAND.pack(*_head(header, COMMAND_TYPE), c.mode, ARM_KEY if c.armed else 0, *body, *end))
 
 
 def decode_command(data: bytes) -> tuple[Header, Command]:
-    """Header and command of 96 bytes; values that mean nothing raise MapError, so that the PLC can name the fault."""
+    """Header and command in 96 bytes; raises MapError for an undefined value, so that the PLC can name the fault."""
     header, mode, arm, values = _opened(data, _COMMAND, COMMAND_TYPE)
     *body, grapple, grapple_pct, speed_pct, reset = values
     if mode not in set(Mode) or arm not in (0, ARM_KEY) or grapple not in set(Grapple):
-        raise MapError("plc.illegal-value", "mode, arm key or grapple command means nothing")
+        raise MapError("plc.illegal-value", "mode, arm key or grapple command is not defined")
     if grapple_pct > 100 or speed_pct > 100 or reset > 1:
         raise MapError("plc.illegal-value", "grapple share, speed or reset is out of range")
     reference, rate = _halves(body)
@@ -69,7 +71,7 @@ def decode_command(data: bytes) -> tuple[Header, Command]:
 
 
 def encode_reply(header: Header, feedback: Feedback) -> bytes:
-    """128 bytes; ``feedback.heartbeat`` and ``accepted`` travel as sequence and echo."""
+    """The 128 bytes of a reply; ``feedback.heartbeat`` and ``accepted`` are sent as sequence and echo."""
     f = feedback
     body = [
         v for pair in zip(_micros(f.position, "position"), _micros(f.velocity, "velocity"), strict=True) for v in pair
@@ -82,13 +84,13 @@ def encode_reply(header: Header, feedback: Feedback) -> bytes:
 
 
 def decode_reply(data: bytes) -> tuple[Header, Feedback]:
-    """Header and feedback of 128 bytes."""
+    """Header and feedback in 128 bytes."""
     header, state, _, values = _opened(data, _REPLY, REPLY_TYPE)
     position, velocity = _halves(values[: 2 * N_AXES])
     pressures = values[2 * N_AXES : 2 * N_AXES + N_PRESSURES]
     estop, fault, axis, longest, opening, load = values[2 * N_AXES + N_PRESSURES :]
     if state not in set(State):
-        raise DatagramRefused("plc-datagram.state", f"the PLC's state is {state}, which means nothing")
+        raise DatagramRefused("plc-datagram.state", f"the PLC's state is {state}, which is not defined")
     return header, Feedback(
         heartbeat=header.sequence & 0xFFFF,
         state=State(state),
@@ -125,12 +127,15 @@ def _closed(data: bytes) -> bytes:
 
 def _opened(data: bytes, layout: struct.Struct, kind: int) -> tuple[Header, int, int, tuple[int, ...]]:
     if len(data) != layout.size + _CRC.size:
-        raise DatagramRefused("plc-datagram.length", f"{len(data)} bytes, not {layout.size + _CRC.size}")
+        raise DatagramRefused(
+            "plc-datagram.length", f"the datagram has {len(data)} bytes, not {layout.size + _CRC.size}"
+        )
     if zlib.crc32(data[: -_CRC.size]) != _CRC.unpack_from(data, layout.size)[0]:
-        raise DatagramRefused("plc-datagram.checksum", "wrong checksum")
+        raise DatagramRefused("plc-datagram.checksum", "the datagram has a wrong checksum")
     magic, version, got, sequence, time_us, echo, mode, arm, *values = layout.unpack_from(data)
     if (magic, version, got) != (MAGIC, VERSION, kind):
         raise DatagramRefused(
-            "plc-datagram.header", f"magic 0x{magic:08X}, version {version}, type {got}: not a datagram for us"
+            "plc-datagram.header",
+            f"magic 0x{magic:08X}, version {version}, type {got}: not a datagram of this protocol",
         )
     return Header(sequence, time_us, echo), mode, arm, tuple(values)

@@ -1,9 +1,9 @@
-"""The register map between bridge and PLC (docs/reference/can-bus.md section 10): values in SI units to 16-bit registers and back.
+"""The register map between bridge and PLC: converts values in SI units to 16-bit registers and back.
 
 Pure.  Two roles: in REFERENCES (A) the PLC closes the joint loops and a command carries positions and rates; in VALVES
-(B) it passes valve openings on, as shares of full opening.  A register holds 16 bits; a 32-bit number takes two, the
-high word first unless `WordOrder` says else.  Reading raises `MapError` and uses nothing; writing refuses what does not
-fit, it never clamps.
+(B) it passes on valve openings, as shares of full opening.  A register holds 16 bits; a 32-bit number takes two, the
+high word first unless `WordOrder` differs.  Reading raises `MapError` and uses nothing; writing refuses values that do
+not fit, and never clamps.  Source: docs/reference/can-bus.md section 10.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _U16: Final = 0xFFFF
 
 
 class Role(IntEnum):
-    """Who closes the joint loops; the number is that of the command's `Mode` that moves."""
+    """Who closes the joint loops; the number is that of the command's `Mode` with motion."""
 
     REFERENCES = 1
     VALVES = 2
@@ -54,7 +54,7 @@ class WordOrder(IntEnum):
 
 
 class Mode(IntEnum):
-    """What a command asks for; the numbers are those of ``ValveCmdA.Mode``."""
+    """Mode of a command; the numbers are those of ``ValveCmdA.Mode``."""
 
     NEUTRAL = 0
     REFERENCES = 1
@@ -62,29 +62,32 @@ class Mode(IntEnum):
 
 
 class State(IntEnum):
-    """State of the PLC; 3 is the end of a trajectory that a PLC stores (docs/reference/machines.md section 1.6), which this map has not."""
+    """State of the PLC.
+
+    3, the end of a trajectory stored in the PLC (docs/reference/machines.md section 1.6), is not part of this map.
+    """
 
     INIT = 0
     HOLD = 1
-    """Neutral: nothing asked for, or nothing heard for a moment."""
+    """Neutral: nothing requested, or nothing received for a moment."""
     EXECUTE = 2
     SAFE = 4
-    """The watchdog ran out or the emergency stop opened; latched until a reset edge."""
+    """The watchdog expired or the emergency stop opened; latched until a reset edge."""
 
 
 class Fault(IntEnum):
-    """Why the PLC refused or stopped, register 6; 0 after a reset edge."""
+    """Why the PLC refused a command or stopped, register 6; 0 after a reset edge."""
 
     NONE = 0
     ILLEGAL_VALUE = 1
-    """A command held a value outside its range."""
+    """A command contained a value outside its range."""
     WATCHDOG = 2
-    """No sign of life from the commanding side for the watchdog's time."""
+    """No heartbeat of the commanding side for the watchdog's time."""
     EMERGENCY_STOP = 3
 
 
 class Estop(IntEnum):
-    """Bits of the emergency stop register; all of the first three are 1 when the machine may move."""
+    """Bits of the emergency stop register; the first three are 1 when the machine may move."""
 
     CHANNEL_A = 1
     CHANNEL_B = 2
@@ -104,11 +107,11 @@ class Grapple(IntEnum):
 
 NO_AXIS: Final = 15
 RANGE_MARGIN: Final = 0.05
-"""How far past a joint's range [rad, m] a reference may lie: a machine found there must be able to hold still."""
+"""How far beyond a joint's range [rad, m] a reference may be: a machine found there must be able to hold still."""
 
 
 class MapError(CodedError, ValueError):
-    """A value that the map cannot carry, or registers without a meaning; ``axis`` is `NO_AXIS` where none is concerned."""
+    """A value that the map cannot carry, or undefined registers; ``axis`` is `NO_AXIS` if none is concerned."""
 
     def __init__(self, code: str, sentence: str, axis: int = NO_AXIS) -> None:
         super().__init__(code, sentence)
@@ -133,7 +136,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """What the PLC says: positions rad or m, velocities per second, pressures bar, opening 0..1, load kg."""
+    """Feedback of the PLC: positions [rad, m], velocities per second, pressures [bar], opening 0..1, load [kg]."""
 
     heartbeat: int = 0
     state: State = State.INIT
@@ -152,7 +155,7 @@ class Feedback:
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What a command may hold on this machine: per axis, (lower, upper) of the reference and the greatest rate."""
+    """Limits of a command on this machine: per axis, (lower, upper) of the reference and the greatest rate."""
 
     role: Role
     reference: tuple[tuple[float, float], ...]
@@ -160,7 +163,7 @@ class Bounds:
 
     @classmethod
     def references(cls, joints: Sequence[tuple[float, float, float]]) -> Bounds:
-        """Those of role REFERENCES, from (lower, upper, greatest rate) of every joint."""
+        """Limits of role REFERENCES, from (lower, upper, greatest rate) of every joint."""
         spare = N_AXES - N_JOINTS
         return cls(
             Role.REFERENCES,
@@ -170,18 +173,18 @@ class Bounds:
 
     @classmethod
     def valves(cls) -> Bounds:
-        """Those of role VALVES: full opening either way."""
+        """Limits of role VALVES: full opening in both directions."""
         return cls(Role.VALVES, ((-1.0, 1.0),) * N_JOINTS + ((0.0, 0.0),) * (N_AXES - N_JOINTS))
 
     def check(self, command: Command) -> None:
-        """Raises MapError for a command that this machine cannot obey."""
+        """Raises MapError for a command that this machine cannot execute."""
         if command.mode not in (Mode.NEUTRAL, int(self.role)):
             raise MapError("plc.role", f"mode {command.mode} is not of role {self.role.name}")
         if command.mode is Mode.NEUTRAL:
             return
         for axis, (value, rate) in enumerate(zip(command.reference, command.rate, strict=True)):
             lower, upper = self.reference[axis]
-            # Half a unit of the map: a limit that is no whole number of units is rounded on the way.
+            # Half a unit of the map: a limit that is not a whole number of units is rounded in transfer.
             if not lower - 0.5e-6 <= value <= upper + 0.5e-6:
                 raise MapError(
                     "plc.reference", f"reference of axis {axis} is {value:.6f}, allowed {lower:g} to {upper:g}", axis
@@ -236,8 +239,8 @@ def command_registers(command: Command, heartbeat: int, sequence: int, order: Wo
     for axis, value in enumerate(command.reference):
         words += _pair(micro(value, f"reference of axis {axis}"), order)
     words += [signed16(r, _MILLI, f"rate of axis {i}") & _U16 for i, r in enumerate(command.rate)]
-    grapple_pct = whole(command.grapple_pct, 1, 0, 100, "the grapple's share")
-    speed_pct = whole(command.max_speed_pct, 1, 0, 100, "the greatest speed")
+    grapple_pct = whole(command.grapple_pct, 1, 0, 100, "the grapple percentage")
+    speed_pct = whole(command.max_speed_pct, 1, 0, 100, "the maximum speed")
     return [*words, command.grapple, grapple_pct, speed_pct, int(command.reset), 0, 0, 0]
 
 
@@ -255,10 +258,10 @@ _CHOICES: Final = {
 
 
 def check_single(address: int, value: int) -> None:
-    """Raises MapError for a register of the command block whose value means nothing by itself."""
+    """Raises MapError for a register of the command block with an undefined value."""
     allowed = _CHOICES.get(address)
     if allowed is not None and value not in allowed:
-        raise MapError("plc.illegal-value", f"register {address} is {value}, which means nothing")
+        raise MapError("plc.illegal-value", f"register {address} is {value}, which is not defined")
 
 
 def read_command(registers: Sequence[int], order: WordOrder) -> Command:
@@ -295,7 +298,7 @@ def status_registers(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> 
 
 
 def check_identity(registers: Sequence[int], order: WordOrder) -> None:
-    """Raises MapError, with what to do, unless the block is of this map, this version and this word order."""
+    """Raises MapError unless the block is of this map, this version and this word order."""
     if len(registers) != STATUS_COUNT:
         raise MapError("plc.block-size", f"a status block has {STATUS_COUNT} registers, not {len(registers)}")
     if registers[0] != MAGIC:
@@ -306,14 +309,14 @@ def check_identity(registers: Sequence[int], order: WordOrder) -> None:
     if registers[1] != MAP_VERSION:
         raise MapError(
             "plc.version",
-            f"the PLC has map version {registers[1]}, we have {MAP_VERSION}; load the matching PLC program",
+            f"the PLC has map version {registers[1]}, not {MAP_VERSION}; load the matching PLC program",
         )
     if _long(registers, 2, order) != WORD_TEST:
         other = WordOrder(1 - order)
         if _long(registers, 2, other) == WORD_TEST:
             raise MapError(
                 "plc.word-order",
-                f"the PLC's word order is {other.name}, ours {order.name}; change our setting or the PLC's",
+                f"the PLC's word order is {other.name}, the setting is {order.name}; change one of them",
             )
         raise MapError(
             "plc.byte-order",
@@ -327,7 +330,7 @@ def read_status(registers: Sequence[int], order: WordOrder) -> tuple[Feedback, i
     try:
         state = State(registers[5])
     except ValueError:
-        raise MapError("plc.state", f"the PLC's state is {registers[5]}, which means nothing") from None
+        raise MapError("plc.state", f"the PLC's state is {registers[5]}, which is not defined") from None
     feedback = Feedback(
         heartbeat=registers[4],
         state=state,

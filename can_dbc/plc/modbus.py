@@ -1,9 +1,9 @@
-"""Modbus/TCP: a client for one PLC and a server for an emulated one; the only module that touches pymodbus (pinned).
+"""Modbus/TCP: a client for one PLC and a server for an emulated one; the only module that uses pymodbus (pinned).
 
-pymodbus speaks the protocol (frames, function codes, exceptions); what a register means is the business of the caller's
-`Registers`.  Both ends live in one asyncio loop and hold bounded memory whatever the other side does.  The server keeps
-at most `MAX_CONNECTIONS`, takes one request at a time from each of them in turn, at most one per `PACE_S`, and ends a
-connection that is idle, half open or slow; who commands is never evicted for somebody new.
+pymodbus handles the protocol (frames, function codes, exceptions); the caller's `Registers` define the meaning of a
+register.  Both ends run in one asyncio loop and use bounded memory whatever the other side does.  The server keeps at
+most `MAX_CONNECTIONS`, accepts one request at a time from each of them in turn, at most one per `PACE_S`, and ends a
+connection that is idle, half open or slow; the commanding client is never evicted for a new one.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_CONNECTIONS: Final = 8
 PACE_S: Final = 0.001
 IDLE_S: Final = 10.0
 REQUEST_S: Final = 2.0
-"""A request, once begun, is to be complete within this time, and its answer taken."""
+"""A started request must be complete within this time, and so must the transfer of its answer."""
 _FUNCTIONS: Final = frozenset((3, 4, 6, 16, 23))
 _WRITE_SINGLE: Final = 6
 _MBAP: Final = struct.Struct(">HHHB")
@@ -39,16 +39,16 @@ _MAX_PDU: Final = 253
 _RESET_ON_CLOSE: Final = struct.pack("ii", 1, 0)
 _REFUSED: Final = (ModbusException, ValueError, OSError, TimeoutError)
 
-# Whoever uses this module is told by exceptions and counters; the library's own log would repeat them on stderr.
+# Exceptions and counters report every problem; the library's own log would repeat them on stderr.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 
 class LinkError(CodedError):
-    """The PLC cannot be reached or does not answer as it should; the text says what happened."""
+    """The PLC cannot be reached or does not answer correctly; the sentence says what happened."""
 
 
 class RegisterRefused(Exception):
-    """A request that the registers refuse, by Modbus exception code (2 address, 3 value, 6 busy)."""
+    """The registers refuse a request, by Modbus exception code (2 address, 3 value, 6 busy)."""
 
     ADDRESS, VALUE, BUSY = ExcCodes.ILLEGAL_ADDRESS, ExcCodes.ILLEGAL_VALUE, ExcCodes.DEVICE_BUSY
 
@@ -58,7 +58,7 @@ class RegisterRefused(Exception):
 
 
 class Registers(Protocol):
-    """What a server serves; both raise RegisterRefused and then have changed nothing."""
+    """The registers of a server; reading and writing raise RegisterRefused, and then change nothing."""
 
     def read(self, address: int, count: int) -> list[int]:
         """Registers from ``address`` on."""
@@ -89,7 +89,7 @@ class ModbusClient:
         return self._client is not None and self._client.connected
 
     async def connect(self) -> None:
-        """Connects anew; raises LinkError."""
+        """Connects, after closing an existing connection; raises LinkError."""
         self.close()
         client = AsyncModbusTcpClient(
             self._host, port=self._port, timeout=self._timeout_s, retries=0, reconnect_delay=0
@@ -103,7 +103,7 @@ class ModbusClient:
                 "plc-link.no-answer", f"no PLC answers at {self._host}:{self._port}; check its address, port and cable"
             )
         sock = client.ctx.transport.get_extra_info("socket")
-        # Closing discards what the kernel still holds: no old command arrives when a cut cable is whole again.
+        # Closing discards data in the kernel: no old command arrives after a cable is reconnected.
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_ON_CLOSE)
         self._client = client
 
@@ -111,10 +111,10 @@ class ModbusClient:
         """Writes the command block and reads the status block in one request (FC 23).
 
         Raises:
-            RegisterRefused: the PLC refused the write; the connection stays.
-            LinkError: anything else; the connection is closed.
+            RegisterRefused: The PLC refused the write; the connection stays open.
+            LinkError: Any other failure; the connection is closed.
         """
-        return await self._ask(
+        return await self._request(
             lambda client: client.readwrite_registers(
                 read_address=STATUS_AT, read_count=STATUS_COUNT, write_address=COMMAND_AT, values=list(command),
                 device_id=UNIT,
@@ -123,9 +123,9 @@ class ModbusClient:
 
     async def status(self) -> list[int]:
         """Reads the status block (FC 3); raises as `exchange` does."""
-        return await self._ask(lambda c: c.read_holding_registers(STATUS_AT, count=STATUS_COUNT, device_id=UNIT))
+        return await self._request(lambda c: c.read_holding_registers(STATUS_AT, count=STATUS_COUNT, device_id=UNIT))
 
-    async def _ask(self, request: Any) -> list[int]:
+    async def _request(self, request: Any) -> list[int]:
         client = self._client
         if client is None or not client.connected:
             raise LinkError("plc-link.not-connected", "not connected")
@@ -144,7 +144,7 @@ class ModbusClient:
         return list(response.registers)
 
     def close(self) -> None:
-        """Ends the connection; closing twice is fine."""
+        """Ends the connection; may be called twice."""
         if self._client is not None:
             self._client.close()
             self._client = None
@@ -159,25 +159,25 @@ class ServerCounts:
 
     connections: int = 0
     evicted: int = 0
-    """Connections ended because there were too many."""
+    """Connections ended because of too many connections."""
     requests: int = 0
     refused: int = 0
     """Requests answered with an exception."""
     malformed: int = 0
-    """Connections ended because what came was no Modbus/TCP."""
+    """Connections ended because the data was not Modbus/TCP."""
     slow: int = 0
-    """Connections ended because they were idle, or did not complete a request or take its answer."""
+    """Connections ended because they were idle, or did not complete a request or read its answer."""
 
 
 class _Context:
-    """What pymodbus' requests ask for values; one per connection, so that a write has an author."""
+    """The data store of pymodbus' requests; one per connection, so that a write has an author."""
 
     def __init__(self, registers: Registers, client: int) -> None:
         self._registers, self._client = registers, client
         self._written: list[int] = []
 
     async def async_getValues(self, _unit: int, function: int, address: int, count: int = 1) -> Any:
-        if function == _WRITE_SINGLE:  # its answer repeats the request; what is read back may not be accepted yet
+        if function == _WRITE_SINGLE:  # the answer repeats the request; the value may not be accepted yet
             return self._written
         try:
             return self._registers.read(address, count)
@@ -199,7 +199,7 @@ class _Connection:
     def __init__(self, number: int, registers: Registers, writer: asyncio.StreamWriter) -> None:
         self.number, self.writer = number, writer
         self.active = 0
-        """Number of its last complete request among all; 0 before the first."""
+        """Number of its last complete request, counted over all connections; 0 before the first."""
         self._context = _Context(registers, number)
         self._decoder = DecodePDU(True)
         self._framer = FramerSocket(self._decoder)
@@ -225,7 +225,7 @@ class _Connection:
 
 
 class ModbusServer:
-    """Serves registers on one address; `start`, then it runs in the loop until `close`."""
+    """Serves registers on one address, in the running loop from `start` to `close`."""
 
     def __init__(self, registers: Registers, host: str, port: int) -> None:
         self.counts = ServerCounts()
@@ -234,7 +234,7 @@ class ModbusServer:
         self._connections: dict[int, _Connection] = {}
 
     async def start(self) -> None:
-        """Listens; raises LinkError.  ``port`` is then the port in use (0 took a free one)."""
+        """Listens; raises LinkError.  ``port`` is then the port in use (0 chooses a free one)."""
         try:
             self._server = await asyncio.start_server(
                 self._serve, self._host, self.port, limit=2 * _MAX_PDU, backlog=MAX_CONNECTIONS
@@ -260,25 +260,25 @@ class ModbusServer:
         self._connections[connection.number] = connection
         writer.transport.set_write_buffer_limits(high=4 * _MAX_PDU)
         try:
-            await self._converse(connection, reader)
+            await self._serve_requests(connection, reader)
         except TimeoutError:
             self.counts.slow += 1
         except (asyncio.IncompleteReadError, OSError):
-            pass  # the client has gone
+            pass  # the client has disconnected
         finally:
             self._connections.pop(connection.number, None)
             self._registers.closed(connection.number)
             writer.transport.abort()
 
     def _evict(self) -> None:
-        """Ends the connection that has been useless for longest; never the one that commands."""
+        """Ends the connection without a request for longest, never the commanding one."""
         others = [c for c in self._connections.values() if not self._registers.commands(c.number)]
         victim = min(others, key=lambda c: (c.active, c.number))
         self.counts.evicted += 1
         self._connections.pop(victim.number)
         victim.writer.transport.abort()
 
-    async def _converse(self, connection: _Connection, reader: asyncio.StreamReader) -> None:
+    async def _serve_requests(self, connection: _Connection, reader: asyncio.StreamReader) -> None:
         clock, writer = asyncio.get_running_loop().time, connection.writer
         while True:
             async with asyncio.timeout(IDLE_S):
@@ -297,12 +297,12 @@ class ModbusServer:
             writer.write(answer)
             async with asyncio.timeout(REQUEST_S):
                 await writer.drain()
-            # Even a client that sends without waiting gets its turn only so often, and lets everybody else have one.
+            # Limits the rate of a client that sends without waiting, so that the others get their turn.
             await asyncio.sleep(max(0.0, begun + PACE_S - clock()))
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is one of this machine alone."""
+    """Whether an address is a loopback address of this machine."""
     with contextlib.suppress(OSError):
         return socket.gethostbyname(host).startswith("127.")
     return False

@@ -1,9 +1,8 @@
 """CANopen on the fast path: NMT, heartbeat, emergency, encoder position and expedited SDO as pure functions.
 
-Frames go in and out as ``(key, data)`` with keys of ``can_dbc.frame``; time is ``now_ns``, monotonic.
-Nothing here waits: an SDO transfer is a request frame now and a response frame in a later tick.  A frame
-that is not of the kind asked for gives None, never an exception.  Sources: CiA 301 4.2 (sections 7.2.4,
-7.2.8), CiA 406.
+Frames are ``(key, data)`` with keys of ``can_dbc.frame``; time is ``now_ns``, monotonic.  Nothing here waits: an SDO
+transfer is a request frame now and a response frame in a later tick.  Parsing a frame of another kind returns None,
+never raises.  Sources: CiA 301 4.2 (sections 7.2.4, 7.2.8), CiA 406.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class NmtCommand(IntEnum):
 
 
 class NodeState(IntEnum):
-    """What a heartbeat says."""
+    """State in a heartbeat."""
 
     BOOT_UP = 0x00
     STOPPED = 0x04
@@ -74,7 +73,7 @@ def parse_heartbeat(key: int, data: bytes) -> tuple[int, int] | None:
 
 
 class Emergency(NamedTuple):
-    """An emergency message: error code, error register 1001h and five bytes of the maker."""
+    """An emergency message: error code, error register 1001h and five manufacturer bytes."""
 
     node: int
     code: int
@@ -110,7 +109,7 @@ def parse_emergency(key: int, data: bytes) -> Emergency | None:
 
 
 def emergency_frame(emergency: Emergency) -> RawFrame:
-    """The frame of an emergency message; the maker's bytes are filled up with zeros."""
+    """The frame of an emergency message; the manufacturer bytes are padded with zeros."""
     data = struct.pack("<HB5s", emergency.code, emergency.register, emergency.manufacturer)
     return EMCY_BASE + emergency.node, data
 
@@ -119,7 +118,7 @@ def emergency_frame(emergency: Emergency) -> RawFrame:
 
 
 class Presence(IntEnum):
-    """What the monitor knows of a node."""
+    """Presence of a node according to its heartbeat."""
 
     WAITING = 0
     ALIVE = 1
@@ -128,12 +127,12 @@ class Presence(IntEnum):
 
 
 class HeartbeatMonitor:
-    """Watches the heartbeats of the nodes that must be there.
+    """Monitors the heartbeats of the nodes that must be present.
 
-    A CANopen heartbeat consumer starts with the first heartbeat and so never reports a node that is dead at
-    boot. Here a node that has not spoken ``boot_timeout_ns`` after ``start_ns`` is NEVER_SEEN; one that
-    fell silent for its own timeout is LOST.  ``timeouts_ns`` maps a node to that timeout.  ``boots`` counts
-    boot-up messages, so that a restart between two ticks is seen although the heartbeats went on.
+    A CANopen heartbeat consumer starts with the first heartbeat and so never reports a node that is dead at boot.  Here
+    a node without a heartbeat until ``boot_timeout_ns`` after ``start_ns`` is NEVER_SEEN; one that is silent for its
+    own timeout is LOST.  ``timeouts_ns`` maps a node to that timeout.  ``boots`` counts boot-up messages, so that a
+    restart between two ticks is detected although the heartbeats continue.
     """
 
     __slots__ = ("_boot_deadline_ns", "_seen_ns", "_timeouts_ns", "boots", "states")
@@ -146,12 +145,12 @@ class HeartbeatMonitor:
         self.boots = dict.fromkeys(self._timeouts_ns, 0)
 
     def forget(self) -> None:
-        """As before the first heartbeat; boots stay counted."""
+        """Returns to the state before the first heartbeat; keeps the counts of boots."""
         self._seen_ns.clear()
         self.states.clear()
 
     def receive(self, key: int, data: bytes, now_ns: int) -> bool:
-        """Takes a frame; False if it is no heartbeat of a watched node."""
+        """Accepts a frame; False if it is not a heartbeat of a monitored node."""
         parsed = parse_heartbeat(key, data)
         if parsed is None or parsed[0] not in self._timeouts_ns:
             return False
@@ -163,18 +162,18 @@ class HeartbeatMonitor:
         return True
 
     def presence(self, node: int, now_ns: int) -> Presence:
-        """The presence of a watched node at ``now_ns``."""
+        """The presence of a monitored node at ``now_ns``."""
         seen_ns = self._seen_ns.get(node)
         if seen_ns is None:
             return Presence.WAITING if now_ns < self._boot_deadline_ns else Presence.NEVER_SEEN
         return Presence.ALIVE if now_ns - seen_ns <= self._timeouts_ns[node] else Presence.LOST
 
     def operational(self, node: int, now_ns: int) -> bool:
-        """Whether a node is alive and says OPERATIONAL."""
+        """Whether a node is alive and OPERATIONAL."""
         return self.states.get(node) == NodeState.OPERATIONAL and self.presence(node, now_ns) is Presence.ALIVE
 
     def next_loss_ns(self) -> int:
-        """The last moment until which every node that has spoken is ALIVE, if none speaks again."""
+        """The time until which every node seen so far stays ALIVE without further heartbeats."""
         timeouts_ns = self._timeouts_ns
         return min((seen_ns + timeouts_ns[node] for node, seen_ns in self._seen_ns.items()), default=0)
 
@@ -187,10 +186,10 @@ class HeartbeatMonitor:
 
 
 class PositionUnwrapper:
-    """Turns the position value 6004h, which wraps at the total range 6002h, into a running count [steps].
+    """Unwraps the position value 6004h, which wraps at the total range 6002h, to a continuous count [steps].
 
     ``total_range`` 0 means 2**32.  Between two updates the shaft must move by less than half the range.
-    The first update gives the value itself; ``position`` is the last result.
+    The first update returns the value itself; ``position`` is the last result.
     """
 
     __slots__ = ("_half", "_range", "_raw", "position")
@@ -202,7 +201,7 @@ class PositionUnwrapper:
         self.position = 0
 
     def update(self, raw: int) -> int:
-        """The running count for a new position value."""
+        """The continuous count for a new position value."""
         if self._raw is None:
             self.position = raw
         else:
@@ -215,8 +214,7 @@ class PositionUnwrapper:
 
 
 class SdoKind(IntEnum):
-    """What an SDO frame is; SEGMENTED is a transfer of more than four bytes, which this path does not
-    carry."""
+    """Kind of an SDO frame; SEGMENTED is a transfer of more than four bytes, which is not supported here."""
 
     UPLOAD = 0
     DOWNLOAD = 1
@@ -226,8 +224,7 @@ class SdoKind(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Sdo:
-    """A parsed SDO frame.  ``data`` holds the value, little-endian; ``abort`` the abort code, 0 without
-    one."""
+    """A parsed SDO frame.  ``data`` is the value, little-endian; ``abort`` the abort code, 0 without one."""
 
     kind: SdoKind
     node: int
@@ -272,7 +269,7 @@ def abort_text(code: int) -> str:
 
 
 def upload_request(node: int, index: int, sub: int) -> RawFrame:
-    """Client: ask a node for an object."""
+    """Client: request an object of a node."""
     return SDO_TO_SERVER + node, struct.pack("<BHB4x", 0x40, index, sub)
 
 
@@ -297,12 +294,12 @@ def abort_frame(base: int, node: int, index: int, sub: int, code: int) -> RawFra
 
 
 def parse_response(key: int, data: bytes) -> Sdo | None:
-    """Client: a server's answer; UPLOAD carries the value, DOWNLOAD is the confirmation."""
+    """Client: a server's response; UPLOAD carries the value, DOWNLOAD is the confirmation."""
     return _parse(key - SDO_TO_CLIENT, data, SdoKind.UPLOAD, carrying=2, bare=3)
 
 
 def parse_request(key: int, data: bytes) -> Sdo | None:
-    """Server: a client's request; DOWNLOAD carries the value, UPLOAD asks for it."""
+    """Server: a client's request; DOWNLOAD carries the value, UPLOAD requests it."""
     return _parse(key - SDO_TO_SERVER, data, SdoKind.DOWNLOAD, carrying=1, bare=2)
 
 
@@ -313,8 +310,7 @@ def _expedited(command: int, index: int, sub: int, data: bytes) -> bytes:
 
 
 def _parse(node: int, data: bytes, value_kind: SdoKind, carrying: int, bare: int) -> Sdo | None:
-    """``carrying`` and ``bare`` are the command specifiers with a value (of ``value_kind``) and without
-    one."""
+    """``carrying`` and ``bare`` are the command specifiers with a value (of ``value_kind``) and without one."""
     if not 0 < node <= MAX_NODE or len(data) != 8:
         return None
     command, index, sub, value = struct.unpack("<BHB4s", data)

@@ -1,12 +1,11 @@
-"""AUTOSAR E2E Profile 2: a CRC, a counter and a Data ID that make a received frame trustworthy.
+"""AUTOSAR E2E Profile 2: a CRC, a counter and a Data ID protect every frame.
 
 Byte 0 holds the CRC-8H2F (polynomial 0x2F, start and final exclusive-or 0xFF, no reflection) over bytes 1
 to the end and then the Data ID ``data_ids[counter]``; the low nibble of byte 1 holds the counter, 0 to 15.
-Corruption, repetition, loss, wrong order and a frame from another sender or with another meaning are told
-apart by ``Status``. Sources: AUTOSAR FO R22-11 PRS_E2EProtocol, 6.3; the check ``crc8(b"123456789") ==
-0xDF``.
+``Status`` distinguishes corruption, repetition, loss, wrong order and frames of another sender or message.  Sources:
+AUTOSAR FO R22-11 PRS_E2EProtocol, 6.3; check value ``crc8(b"123456789") == 0xDF``.
 
-Pure; no allocation beyond small integers on the checking side.
+Pure; the checking side allocates nothing but small integers.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
-MAX_DELTA: Final = 2
+MAX_COUNTER_STEP: Final = 2
 GOOD_TO_TRUST: Final = 2
 BAD_IN_WINDOW: Final = 3
 WINDOW_MASK: Final = (1 << 100) - 1
@@ -41,9 +40,9 @@ def crc8(data: bytes, start: int = 0xFF) -> int:
 
 
 def frame_crc(data: bytes, data_ids: bytes) -> int:
-    """The CRC that belongs into byte 0 of a frame whose counter is set."""
+    """The CRC for byte 0 of a frame whose counter is set."""
     t, crc = TABLE, 0xFF
-    if len(data) == 8:  # nearly all are; unrolled this takes three quarters of the loop's time
+    if len(data) == 8:  # the usual length; unrolled, this takes three quarters of the loop's time
         _, a, b, c, d, e, f, g = data
         return t[t[t[t[t[t[t[t[crc ^ a] ^ b] ^ c] ^ d] ^ e] ^ f] ^ g] ^ data_ids[a & 0x0F]] ^ 0xFF
     for byte in data[1:]:
@@ -54,7 +53,7 @@ def frame_crc(data: bytes, data_ids: bytes) -> int:
 def protect(payload: bytes, counter: int, data_ids: bytes) -> bytes:
     """``payload`` (a whole frame of at least 2 bytes) with counter and CRC filled in.
 
-    ``data_ids`` are the 16 Data IDs of the message; the high nibble of byte 1 is left as it is.
+    ``data_ids`` are the 16 Data IDs of the message; the high nibble of byte 1 is unchanged.
     """
     counter &= 0x0F
     table, crc = TABLE, TABLE[0xFF ^ (payload[1] & 0xF0 | counter)]
@@ -65,7 +64,7 @@ def protect(payload: bytes, counter: int, data_ids: bytes) -> bytes:
 
 
 class Sender:
-    """The sending side of one message: owns the counter.  ``counter`` is the one that the next frame gets."""
+    """The sending side of one message.  ``counter`` is that of the next frame."""
 
     __slots__ = ("counter", "data_ids")
 
@@ -74,14 +73,14 @@ class Sender:
         self.counter = counter & 0x0F
 
     def protect(self, payload: bytes) -> bytes:
-        """The frame to send for a payload; the counter goes on by one."""
+        """The frame to send for a payload; increments the counter."""
         counter = self.counter
         self.counter = (counter + 1) & 0x0F
         return protect(payload, counter, self.data_ids)
 
 
 class Status(IntEnum):
-    """What a received frame is worth; only OK and OK_SOME_LOST may be used."""
+    """Result of checking a received frame; only OK and OK_SOME_LOST are usable."""
 
     OK = 0
     OK_SOME_LOST = 1
@@ -97,11 +96,11 @@ class Status(IntEnum):
 class Checker:
     """The receiving side of one message.
 
-    Counter steps of 1 and 2 are accepted, 0 is a repetition, more means lost frames and starts over.  Two
-    good frames in a row are needed at first and after the stream has become invalid: a wrong sequence, two
-    bad CRCs in a row, or 3 among the last 100 frames.  A single bad CRC only drops its frame.  ``trusted``
-    tells whether the stream is valid, ``counter`` is that of the last frame with a good CRC.  Call
-    ``reset`` after a timeout or when the sender restarts: the counter alone cannot show a gap of 16 frames.
+    Counter steps of 1 and 2 are accepted, 0 is a repetition, more means lost frames and starts over.  Two good frames
+    in a row are needed at first and after the stream has become invalid by a wrong sequence, two bad CRCs in a row, or
+    3 among the last 100 frames.  A single bad CRC only drops its frame.  ``trusted`` is whether the stream is valid,
+    ``counter`` that of the last frame with a good CRC.  Call ``reset`` after a timeout or when the sender restarts: the
+    counter alone cannot show a gap of 16 frames.
     """
 
     __slots__ = ("_bad", "_good", "_last_bad", "counter", "data_ids", "trusted")
@@ -111,7 +110,7 @@ class Checker:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the stream: the next two frames have to qualify it again."""
+        """Resets the stream: the next two frames must qualify it again."""
         self.counter = -1
         self.trusted = False
         self._good = 0
@@ -119,7 +118,7 @@ class Checker:
         self._last_bad = False
 
     def check(self, data: bytes) -> Status:
-        """Judges one received frame and takes note of it."""
+        """Checks one received frame and updates the stream's state."""
         if len(data) < 2 or frame_crc(data, self.data_ids) != data[0]:
             self._bad = (self._bad << 1 | 1) & WINDOW_MASK
             if self._last_bad or self._bad.bit_count() >= BAD_IN_WINDOW:
@@ -137,7 +136,7 @@ class Checker:
             return Status.INITIAL
         if delta == 0:
             return Status.REPEATED
-        if delta > MAX_DELTA:
+        if delta > MAX_COUNTER_STEP:
             self._distrust()
             self._good = 1
             return Status.WRONG_SEQUENCE

@@ -1,10 +1,9 @@
 """NMEA 2000 on top of 29-bit frames: identifier fields, fast packets, and the PGNs of ``gnss.dbc``.
 
-Layouts stand in ``gnss.dbc`` alone; a message there that is longer than 8 bytes travels as a fast packet.
-``Receiver.receive`` takes every frame of a bus and returns a ``Reading`` when one is complete; what it does
-not know it ignores, what it must not use it refuses (``FrameRefused``).  ``encode`` and ``frames`` go the
-other way; a field not given is sent as "not available".  Time is ``now_ns``, monotonic.  Source: NMEA 2000
-as documented by canboat.
+Layouts are in ``gnss.dbc`` only; a message there that is longer than 8 bytes travels as a fast packet.
+``Receiver.receive`` accepts every frame of a bus and returns a ``Reading`` when a message is complete; it ignores
+unknown frames and refuses invalid ones (``FrameRefused``).  ``encode`` and ``frames`` are the inverse; a field not
+given is sent as "not available".  Time is ``now_ns``, monotonic.  Source: NMEA 2000 as documented by canboat.
 """
 
 from __future__ import annotations
@@ -19,16 +18,15 @@ from can_dbc.dbc.signals import FrameRefused, Refusal
 from can_dbc.frame import ERROR, EXTENDED, REMOTE
 
 BROADCAST: Final = 255
-FAST_PACKET_AGE_NS: Final = 750_000_000
-MAX_OPEN: Final = 64
-FIRST_DATA: Final = 6
-NEXT_DATA: Final = 7
-MAX_FAST_PACKET: Final = FIRST_DATA + 31 * NEXT_DATA
+MAX_FAST_PACKET_AGE_NS: Final = 750_000_000
+MAX_OPEN_PACKETS: Final = 64
+FIRST_FRAME_BYTES: Final = 6
+NEXT_FRAME_BYTES: Final = 7
+MAX_FAST_PACKET_BYTES: Final = FIRST_FRAME_BYTES + 31 * NEXT_FRAME_BYTES
 
 
 class Identifier(NamedTuple):
-    """The parts of a 29-bit identifier: priority 0 to 7, PGN, source and destination address (255 for
-    all)."""
+    """The parts of a 29-bit identifier: priority 0 to 7, PGN, source and destination address (255: all)."""
 
     priority: int
     pgn: int
@@ -46,14 +44,13 @@ def split_id(key: int) -> Identifier:
 
 
 def join_id(priority: int, pgn: int, source: int, destination: int = BROADCAST) -> int:
-    """The extended key of a PGN; ValueError for a destination or low byte that the PGN's format cannot
-    carry."""
+    """The extended key of a PGN; raises ValueError for a destination or low byte that the PGN's format excludes."""
     if pgn >> 8 & 0xFF < 240:
         if pgn & 0xFF:
             raise ValueError(f"PGN {pgn} is addressed, its low byte must be 0")
         pgn |= destination
     elif destination != BROADCAST:
-        raise ValueError(f"PGN {pgn} is broadcast only, it cannot go to address {destination}")
+        raise ValueError(f"PGN {pgn} is broadcast only, it cannot be sent to address {destination}")
     return EXTENDED | priority << 26 | pgn << 8 | source
 
 
@@ -66,20 +63,20 @@ class _Assembly:
         self.parts: dict[int, bytes] = {}
 
     def payload(self) -> bytes | None:
-        """The payload once every frame is there."""
+        """The payload, once every frame has arrived."""
         if self.length is None:
             return None
-        needed = 1 + max(0, -(-(self.length - FIRST_DATA) // NEXT_DATA))
+        needed = 1 + max(0, -(-(self.length - FIRST_FRAME_BYTES) // NEXT_FRAME_BYTES))
         if any(index not in self.parts for index in range(needed)):
             return None
         return b"".join(self.parts[i] for i in range(needed))[: self.length]
 
 
 class Reassembler:
-    """Puts fast packets together, per source, PGN and sequence number, frames in any order.
+    """Reassembles fast packets per source, PGN and sequence number, with frames in any order.
 
-    A frame whose index is already there starts the packet anew.  A packet not complete after 750 ms is
-    dropped, and at most 64 are open; ``lost`` counts the dropped ones.
+    A frame with a repeated index starts a new packet.  A packet not complete after 750 ms is dropped, and at most 64
+    are open; ``lost`` counts the dropped ones.
     """
 
     def __init__(self) -> None:
@@ -87,21 +84,21 @@ class Reassembler:
         self.lost = 0
 
     def add(self, key: int, data: bytes, now_ns: int) -> bytes | None:
-        """Takes one frame; the payload when it completes a packet.  FrameRefused for an impossible frame."""
+        """Adds one frame; returns the payload if it completes a packet.  Raises FrameRefused for an invalid frame."""
         if len(data) < 2:
             raise FrameRefused(Refusal.LENGTH, f"fast packet frame of PGN {split_id(key).pgn}")
         index, slot = data[0] & 0x1F, (key & 0x03FF_FFFF, data[0] >> 5)
         assembly = self._open.get(slot)
-        if assembly is not None and (index in assembly.parts or now_ns - assembly.started_ns > FAST_PACKET_AGE_NS):
+        if assembly is not None and (index in assembly.parts or now_ns - assembly.started_ns > MAX_FAST_PACKET_AGE_NS):
             del self._open[slot]
             self.lost += 1
             assembly = None
         if assembly is None:
-            if len(self._open) >= MAX_OPEN:
+            if len(self._open) >= MAX_OPEN_PACKETS:
                 self._drop_oldest()
             assembly = self._open[slot] = _Assembly(now_ns)
         if index == 0:
-            if data[1] > MAX_FAST_PACKET:
+            if data[1] > MAX_FAST_PACKET_BYTES:
                 del self._open[slot]
                 raise FrameRefused(Refusal.LENGTH, f"fast packet of PGN {split_id(key).pgn}")
             assembly.length = data[1]
@@ -120,20 +117,18 @@ class Reassembler:
 
 
 def fast_packet(payload: bytes, sequence: int) -> Iterator[bytes]:
-    """The frames of a fast packet, filled up with ones; ``sequence`` 0 to 7 tells packets of one PGN
-    apart."""
-    if len(payload) > MAX_FAST_PACKET:
-        raise ValueError(f"a fast packet carries at most {MAX_FAST_PACKET} bytes, not {len(payload)}")
+    """The frames of a fast packet, padded with ones; ``sequence`` 0 to 7 distinguishes packets of one PGN."""
+    if len(payload) > MAX_FAST_PACKET_BYTES:
+        raise ValueError(f"a fast packet carries at most {MAX_FAST_PACKET_BYTES} bytes, not {len(payload)}")
     head = (sequence & 7) << 5
-    yield (bytes((head, len(payload))) + payload[:FIRST_DATA]).ljust(8, b"\xff")
-    for index, start in enumerate(range(FIRST_DATA, len(payload), NEXT_DATA), 1):
-        yield (bytes((head | index,)) + payload[start : start + NEXT_DATA]).ljust(8, b"\xff")
+    yield (bytes((head, len(payload))) + payload[:FIRST_FRAME_BYTES]).ljust(8, b"\xff")
+    for index, start in enumerate(range(FIRST_FRAME_BYTES, len(payload), NEXT_FRAME_BYTES), 1):
+        yield (bytes((head | index,)) + payload[start : start + NEXT_FRAME_BYTES]).ljust(8, b"\xff")
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One decoded PGN: where it came from, its codec, and the values in signal order (None: not
-    available)."""
+    """One decoded PGN: its identifier, its codec, and the values in signal order (None: not available)."""
 
     identifier: Identifier
     codec: MessageCodec
@@ -153,7 +148,7 @@ class Receiver:
         self.reassembler = Reassembler()
 
     def receive(self, key: int, data: bytes, now_ns: int) -> Reading | None:
-        """A reading when this frame is or completes one, else None; FrameRefused when it must not be used."""
+        """A reading if this frame is or completes a message, else None; raises FrameRefused if it must not be used."""
         if not key & EXTENDED or key & (ERROR | REMOTE):
             return None
         codec = self.database.find(key)
@@ -168,13 +163,12 @@ class Receiver:
 
 
 def decode(codec: MessageCodec, payload: bytes) -> Values:
-    """Checked values of a PGN; a fast packet may go on behind the described part (repeated groups, later
-    fields)."""
+    """Checked values of a PGN; a fast packet may be longer than described (repeated groups, later fields)."""
     return codec.receive(payload[: codec.length] if codec.length > 8 else payload)
 
 
 def encode(codec: MessageCodec, **fields: Any) -> bytes:
-    """The payload of a PGN; fields not given are "not available".  EncodeRefused for a bad value."""
+    """The payload of a PGN; fields not given are "not available".  Raises EncodeRefused for an invalid value."""
     unknown = fields.keys() - codec.index.keys()
     if unknown:
         raise EncodeRefused("codec.unknown-field", f"{codec.name} has no field {', '.join(sorted(unknown))}")
@@ -182,10 +176,9 @@ def encode(codec: MessageCodec, **fields: Any) -> bytes:
 
 
 def frames(codec: MessageCodec, payload: bytes, source: int, sequence: int = 0) -> list[tuple[int, bytes]]:
-    """The frames that carry a payload: one, or those of a fast packet; the priority is that of the
-    database."""
+    """The frames that carry a payload: one, or those of a fast packet; the priority is that of the database."""
     if not codec.by_pgn:
-        raise DbcError("dbc.not-by-pgn", f"{codec.name} is not matched by PGN; it has no source address to choose")
+        raise DbcError("dbc.not-by-pgn", f"{codec.name} is not matched by PGN; its source address cannot be chosen")
     key = codec.key & ~0xFF | source
     if codec.length <= 8:
         return [(key, payload)]

@@ -1,7 +1,7 @@
-"""Durations in fixed bins: what a real-time loop may keep of its own timing without growing.
+"""A histogram of durations in fixed bins: timing statistics of a real-time loop in constant memory.
 
 Bins are 1 us wide up to 1 ms, 10 us up to 10 ms, 100 us up to 100 ms, and one holds the rest, so a quantile is within
-1 us, or within 1 % above 1 ms.  Standard library alone.
+1 us, or within 1 % above 1 ms.  Standard library only.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ QUANTILES: Final = {"p50_us": 0.5, "p99_us": 0.99, "p999_us": 0.999}
 
 
 def bin_of(duration_ns: int) -> int:
-    """Where a duration is counted; a negative one counts as 0."""
+    """The bin of a duration; a negative one counts as 0."""
     if duration_ns < _FINE_END:
         return duration_ns // _US if duration_ns > 0 else 0
     if duration_ns < _MIDDLE_END:
@@ -28,7 +28,7 @@ def bin_of(duration_ns: int) -> int:
 
 
 def edge_ns(i: int) -> int:
-    """Upper edge of bin i; that of the last one has no meaning (use ``longest_ns``)."""
+    """Upper edge of bin i; meaningless for the last one (use ``longest_ns``)."""
     if i < _MIDDLE_AT:
         return (i + 1) * _US
     if i < _COARSE_AT:
@@ -47,7 +47,7 @@ class Durations:
 
     def add(self, duration_ns: int) -> None:
         """Counts one duration."""
-        if 0 <= duration_ns < _FINE_END:  # as `bin_of`, without its call: this runs a dozen times a tick
+        if 0 <= duration_ns < _FINE_END:  # as `bin_of`, without the call: this runs a dozen times per tick
             self.bins[duration_ns // _US] += 1
         else:
             self.bins[bin_of(duration_ns)] += 1
@@ -57,21 +57,21 @@ class Durations:
 
     @property
     def count(self) -> int:
-        """How many were counted."""
+        """Number of durations."""
         return sum(self.bins)
 
     def over(self, limit_ns: int) -> int:
-        """How many lie in bins above the one that holds ``limit_ns``."""
+        """Number of durations in bins above that of ``limit_ns``."""
         return sum(self.bins[bin_of(limit_ns) + 1 :])
 
     def periods(self, period_ns: int) -> int:
-        """How many whole periods the durations hold in all: what a loop that was late by them skipped."""
+        """Number of whole periods in the durations: those that a loop skipped if it was late by them."""
         first = bin_of(period_ns)
         within = sum(n * (edge_ns(i - 1) // period_ns) for i, n in enumerate(self.bins[first:_REST], first) if n)
         return within + self.bins[_REST] * (self.longest_ns // period_ns)
 
     def quantile_ns(self, share: float) -> int:
-        """Upper edge of the bin in which ``share`` of the durations are reached; 0 when empty."""
+        """Upper edge of the bin at which ``share`` of the durations are reached; 0 if empty."""
         wanted, seen = share * self.count, 0
         for i, n in enumerate(self.bins):
             seen += n
@@ -85,7 +85,7 @@ class Durations:
         return found | {"max_us": self.longest_ns / 1000, "count": self.count}
 
     def __sub__(self, earlier: Self) -> Durations:
-        """What came after ``earlier``, a former state of the same histogram; the longest is then a bin's edge."""
+        """The durations after ``earlier``, a former state of the same histogram; the longest is then a bin's edge."""
         bins = array("Q", [a - b for a, b in zip(self.bins, earlier.bins, strict=True)])
         last = max((i for i, n in enumerate(bins) if n), default=-1)
         longest_ns = 0 if last < 0 else self.longest_ns if last == _REST else min(edge_ns(last), self.longest_ns)

@@ -1,9 +1,9 @@
-"""The controller's timing in shared memory: written once a second, read by console, recorder and tools at any time.
+"""The controller's timing page in shared memory: written once per second, read by console, recorder and tools.
 
 A file in a memory file system, mapped by the writer: ``magic u32 | version u32 | sequence u64 | bytes of facts u64``,
 then the facts as JSON (`Facts`), then one block of bins per name in `STAGES`.  The sequence is odd while the writer
-writes; a reader copies the page and takes the copy only when the sequence was even and is still the same.  Nothing
-here blocks the writer.
+writes; a reader copies the page and accepts the copy only if the sequence was even and is unchanged.  Nothing here
+blocks the writer.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ STAGES: Final = (
     "wake", "sync", "tick", "cpu", "receive", "decode", "estimate", "supervise", "control", "encode", "send", "record",
     "sample_to_command",
 )  # fmt: skip
-"""What is measured: lateness of the tick and of SYNC; the tick by the clock and by CPU time; its stages in order; and the
-time from the encoders' sample to the valve command that uses it.
+"""Measured are: lateness of the tick and of SYNC; the tick by the clock and by CPU time; its stages in order; the time
+from the encoders' sample to the valve command that uses it.
 
 "estimate" includes the reference, "supervise" includes the acceptance of requests, and "record" is everything after the
 frames are sent: reports, tick record and this page.
@@ -51,7 +51,7 @@ class TimingRefused(CodedError):
 
 
 class BusCounters(msgspec.Struct, frozen=True):
-    """One bus of the controller: state as `can_dbc.bus.base.BusState` names it, counts since it was opened."""
+    """One bus of the controller: name of the `can_dbc.bus.base.BusState`, counts since it was opened."""
 
     name: str
     state: str
@@ -64,7 +64,7 @@ class BusCounters(msgspec.Struct, frozen=True):
 
 
 class ProcessCounters(msgspec.Struct, frozen=True):
-    """What the system counts of the process (getrusage(2)), and its memory."""
+    """The system's counters of the process (getrusage(2)), and its memory."""
 
     cpu_ns: int
     minor_faults: int
@@ -77,7 +77,7 @@ class ProcessCounters(msgspec.Struct, frozen=True):
 
 
 class InputAge(msgspec.Struct):
-    """How old an input was when a tick used it: the last time, and at worst; ``count`` times in all."""
+    """Age of an input when a tick used it: newest and longest; ``count`` is the number of uses."""
 
     newest_ns: int = 0
     longest_ns: int = 0
@@ -85,8 +85,9 @@ class InputAge(msgspec.Struct):
 
 
 class Facts(msgspec.Struct, frozen=True):
-    """Everything but the histograms; times on CLOCK_MONOTONIC.  ``missed`` are skipped periods, ``late`` are ticks
-    that began more than two periods late.
+    """Everything but the histograms; times on CLOCK_MONOTONIC.
+
+    ``missed`` counts skipped periods, ``late`` ticks that began more than two periods late.
     """
 
     pid: int
@@ -114,37 +115,37 @@ class Timing:
 
     @property
     def age_ns(self) -> int:
-        """How long ago it was written."""
+        """Time since it was written."""
         return time.monotonic_ns() - self.facts.written_ns
 
     def named(self) -> dict[str, Any]:
         """The whole page as plain values for JSON: the facts, and of each histogram the summary."""
         facts: dict[str, Any] = msgspec.to_builtins(self.facts)
-        for name in ("longest_ns", "total_ns"):  # they belong to the bins
+        for name in ("longest_ns", "total_ns"):  # part of the histograms
             del facts[name]
         return facts | {"durations": {METRIC_KEYS[name]: found.summary() for name, found in self.durations.items()}}
 
 
 def default_path() -> Path:
-    """Where the page lies: in ``RUNTIME_DIRECTORY`` (set by systemd), else in this user's directory in /dev/shm."""
+    """Path of the page: in ``RUNTIME_DIRECTORY`` (set by systemd), else in this user's directory in /dev/shm."""
     runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
     return Path(runtime or f"/dev/shm/timberhand-{os.getuid()}") / "controller.timing"
 
 
 class TimingWriter:
-    """Owns the page at ``path``; raises OSError when it cannot be made.  Readable by everyone: it holds no secret."""
+    """Owns the page at ``path``; raises OSError if it cannot be created.  Everyone may read it; it holds no secret."""
 
     __slots__ = ("_inode", "_map", "_path", "_sequence")
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-        # A new file each time: a reader of a former life's page keeps what it has mapped.
+        # A new file each time: a reader of a former process's page keeps its mapping.
         with contextlib.suppress(FileNotFoundError):
             path.unlink()
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         try:
-            os.fchmod(descriptor, 0o644)  # whatever the umask
-            os.posix_fallocate(descriptor, 0, _SIZE)  # no fault, and no full file system, at the first write
+            os.fchmod(descriptor, 0o644)  # independent of the umask
+            os.posix_fallocate(descriptor, 0, _SIZE)  # no page fault and no full file system at the first write
             self._map = mmap.mmap(descriptor, _SIZE)
             self._inode = os.fstat(descriptor).st_ino
         finally:
@@ -154,11 +155,11 @@ class TimingWriter:
         _HEAD.pack_into(self._map, 0, _MAGIC, _VERSION, 0, 0)
 
     def publish(self, facts: Facts, durations: Mapping[str, Durations]) -> None:
-        """Writes one state of everything."""
+        """Writes facts and histograms."""
         text = msgspec.json.encode(facts)
         page, size = self._map, len(text)
         if size > _FACTS_BYTES:
-            return  # a page that says less than before is worse than an old one
+            return  # an incomplete page is worse than an old one
         _SEQUENCE.pack_into(page, _SEQUENCE_AT, self._sequence + 1)
         _HEAD.pack_into(page, 0, _MAGIC, _VERSION, self._sequence + 1, size)
         page[_HEAD.size : _HEAD.size + size] = text
@@ -170,7 +171,7 @@ class TimingWriter:
         _SEQUENCE.pack_into(page, _SEQUENCE_AT, self._sequence)
 
     def close(self) -> None:
-        """Takes the page away, unless it is another's by now; closing twice is fine."""
+        """Removes the page, unless another process owns it by now; may be called twice."""
         with contextlib.suppress(OSError):
             if self._path.stat().st_ino == self._inode:
                 self._path.unlink()
@@ -190,7 +191,7 @@ def read_timing(path: Path | None = None) -> Timing:
                     if (magic, version) != (_MAGIC, _VERSION):
                         raise TimingRefused(
                             "timing.other-release",
-                            f"{path} is no timing page of this release; look with the same release.",
+                            f"{path} is not a timing page of this release; use the same release to read it.",
                         )
                     if sequence and not sequence & 1:
                         return _timing(data, size)
@@ -198,10 +199,11 @@ def read_timing(path: Path | None = None) -> Timing:
     except (OSError, msgspec.MsgspecError) as error:
         reason = getattr(error, "strerror", None) or error
         raise TimingRefused(
-            "timing.no-page", f"No controller tells its timing at {path} ({reason}); start it, or name its page."
+            "timing.no-page",
+            f"No controller publishes its timing at {path} ({reason}); start it, or give the path of its page.",
         ) from (error)
     raise TimingRefused(
-        "timing.not-written", f"The controller has not written its timing to {path} yet; look again in a second."
+        "timing.not-written", f"The controller has not written its timing to {path} yet; try again in a second."
     )
 
 

@@ -1,9 +1,8 @@
-"""Recorded CAN logs of other tools as frames: candump (both forms), PCAN-View and Yacht Devices text, ASC,
-BLF.
+"""Reads CAN traces of other tools: candump (both forms), PCAN-View and Yacht Devices text, ASC and BLF.
 
-``read`` yields a ``Frame`` per good record and a ``Broken`` per line that cannot be understood, and never
-raises for what a file contains.  Stamps are ns on the log's own scale, 0 where the log has none.  Blank
-lines, comments and header lines of the known formats are not records and pass unmentioned.
+``read_trace`` yields a ``Frame`` per valid record and a ``MalformedRecord`` per line that cannot be parsed; it never
+raises for the contents of a file.  Stamps are ns on the trace's own scale, 0 if it has none.  Blank lines, comments and
+header lines of the known formats are not records and are skipped.
 """
 
 from __future__ import annotations
@@ -32,15 +31,15 @@ PAYLOAD: Final = re.compile(r"(?:#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2}\.?)*)(?:_[0-9A
 MAX_DATA: Final = 64
 
 
-class Broken(NamedTuple):
-    """A record that cannot be understood: line number (0 in a binary file) and what stands there."""
+class MalformedRecord(NamedTuple):
+    """A record that cannot be parsed: line number (0 in a binary file) and its text."""
 
     line: int
     text: str
 
 
-def read(path: Path) -> Iterator[Frame | Broken]:
-    """The records of a log in file order; OSError when the file cannot be opened."""
+def read_trace(path: Path) -> Iterator[Frame | MalformedRecord]:
+    """The records of a trace in file order; raises OSError if the file cannot be opened."""
     content = path.read_bytes()
     if path.suffix.lower() == ".blf":
         return _binary(content)
@@ -51,15 +50,15 @@ def read(path: Path) -> Iterator[Frame | Broken]:
 # -- text ----------------------------------------------------------------------------------------------------
 
 
-def _text(lines: list[str]) -> Iterator[Frame | Broken]:
+def _text(lines: list[str]) -> Iterator[Frame | MalformedRecord]:
     for number, line in enumerate(lines, 1):
         line = line.strip()
         if line and line[0] not in "#;":
-            yield parse_line(line) or Broken(number, line)
+            yield parse_line(line) or MalformedRecord(number, line)
 
 
 def parse_line(line: str) -> Frame | None:
-    """One line of any of the text formats; None when it is none of them or damaged."""
+    """The frame in one line of any of the text formats; None if the line is of another format or damaged."""
     if found := CANDUMP.match(line):
         return _candump(found[1], found[3], found[4])
     if found := CANDUMP_SCREEN.match(line):
@@ -86,7 +85,7 @@ def _frame(stamp: str, identifier: str, data: str, length: int | None = None, re
     if len(payload) > MAX_DATA or length not in (None, len(payload)):
         return None
     if len(identifier) == 8:
-        # an 8-digit word carries the error bit; without it, it is a 29-bit identifier
+        # eight digits with the error bit are an error frame, without it a 29-bit identifier
         key = value & (ERROR | EXTENDED_MASK) if value & ERROR else value & EXTENDED_MASK | EXTENDED
     else:
         key = value & STANDARD_MASK
@@ -94,7 +93,7 @@ def _frame(stamp: str, identifier: str, data: str, length: int | None = None, re
 
 
 def _nanoseconds(text: str) -> int:
-    """Decimal seconds, exactly."""
+    """Decimal seconds as ns, exactly."""
     whole, _, fraction = text.partition(".")
     return int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
 
@@ -113,8 +112,8 @@ def _converted(message: Any) -> Frame:
     return Frame(round(message.timestamp * 1e9), key, bytes(message.data))
 
 
-def _asc(lines: list[str]) -> Iterator[Frame | Broken]:
-    """ASC line by line, so that a damaged record costs itself alone; the header goes in front of each."""
+def _asc(lines: list[str]) -> Iterator[Frame | MalformedRecord]:
+    """Reads ASC line by line, each with the header in front, so that a damaged record affects only itself."""
     from can.io.asc import ASCReader
 
     start = next((i for i, line in enumerate(lines) if re.match(r"\s*\d+\.\d+\s", line)), len(lines))
@@ -129,11 +128,11 @@ def _asc(lines: list[str]) -> Iterator[Frame | Broken]:
         if messages:
             yield from messages
         elif not re.search(r"Start of measurement|Statistic|SV:|J1939TP|\bStatus:|Trigger|log ", line):
-            yield Broken(number, line.strip())
+            yield MalformedRecord(number, line.strip())
 
 
-def _binary(content: bytes) -> Iterator[Frame | Broken]:
-    """BLF up to the first damage: what follows a broken container cannot be found again."""
+def _binary(content: bytes) -> Iterator[Frame | MalformedRecord]:
+    """Reads BLF up to the first damage; records behind a damaged container cannot be found."""
     from can.io.blf import BLFParseError, BLFReader
 
     try:
@@ -141,4 +140,4 @@ def _binary(content: bytes) -> Iterator[Frame | Broken]:
             for message in reader:
                 yield _converted(message)
     except (BLFParseError, struct.error, zlib.error, ValueError, IndexError, OverflowError) as error:
-        yield Broken(0, f"damaged from here on: {error}")
+        yield MalformedRecord(0, f"damaged from here on: {error}")

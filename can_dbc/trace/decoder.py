@@ -1,8 +1,7 @@
-"""From recorded frames to named values: the core of ``timberhand log decode``.
+"""Decodes traces to named values: the core of ``timberhand recording decode``.
 
-Every record of ``logread`` goes in; an ``Entry`` comes out for each message that a database knows.  Nothing
-raises for what a log contains: a frame of wrong length, out of range or with a bad CRC is an entry with
-``fault`` set.
+Input is every record of `can_dbc.trace.candump`; output is a ``DecodedMessage`` for each message of a database.
+Nothing raises for the contents of a trace: a frame of wrong length, out of range or with a bad CRC has ``fault`` set.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ from can_dbc.dbc.codec import Database, FrameRefused, MessageCodec, load
 from can_dbc.frame import ERROR, REMOTE, Frame, describe
 from can_dbc.protocols.e2e import frame_crc
 from can_dbc.protocols.nmea2000 import Reassembler
-from can_dbc.trace.candump import Broken
+from can_dbc.trace.candump import MalformedRecord
 
-SHOWN: Final = 5
+MAX_EXAMPLES: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class DecodedMessage:
     """One decoded message: stamp of its last frame [ns], identifier as candump writes it, values by name."""
 
     stamp_ns: int
@@ -60,8 +59,7 @@ class Entry:
 
 
 class Decoder:
-    """Decodes frames with the first of the databases that knows them; raises DbcError for an unusable
-    file."""
+    """Decodes frames with the first database that has their message; raises DbcError for an unusable file."""
 
     def __init__(self, files: Sequence[str]) -> None:
         self.databases: list[Database] = [load(file) for file in files]
@@ -70,12 +68,12 @@ class Decoder:
         self.messages: Counter[str] = Counter()
         self.broken_examples: list[str] = []
 
-    def run(self, records: Iterable[Frame | Broken]) -> Iterator[Entry]:
-        """The entries of a log, counting as it goes; ``summary`` is complete at the end."""
+    def run(self, records: Iterable[Frame | MalformedRecord]) -> Iterator[DecodedMessage]:
+        """Yields the decoded messages of a trace; ``summary`` is complete at the end."""
         for record in records:
-            if isinstance(record, Broken):
+            if isinstance(record, MalformedRecord):
                 self.counts["broken"] += 1
-                if len(self.broken_examples) < SHOWN:
+                if len(self.broken_examples) < MAX_EXAMPLES:
                     self.broken_examples.append(f"line {record.line}: {record.text[:80]}")
                 continue
             self.counts["frames"] += 1
@@ -86,7 +84,7 @@ class Decoder:
                 yield entry
 
     def summary(self) -> dict[str, Any]:
-        """Counts of what was read, by kind and by message."""
+        """Counts of the records, by kind and by message."""
         names = ("frames", "decoded", "unknown", "refused", "bad_crc", "error_frames", "broken")
         return {name: self.counts[name] for name in names} | {
             "lost_fast_packets": self.reassembler.lost,
@@ -94,7 +92,7 @@ class Decoder:
             "broken_examples": self.broken_examples,
         }
 
-    def _frame(self, frame: Frame) -> Entry | None:
+    def _frame(self, frame: Frame) -> DecodedMessage | None:
         if frame.key & (ERROR | REMOTE):
             self.counts["error_frames" if frame.key & ERROR else "unknown"] += 1
             return None
@@ -106,7 +104,7 @@ class Decoder:
             data = self._payload(frame, codec)
         except FrameRefused as refusal:
             self.counts["refused"] += 1
-            return _entry(frame, codec, {}, str(refusal))
+            return _decoded(frame, codec, {}, str(refusal))
         if data is None:
             return None
         fault = ""
@@ -114,11 +112,11 @@ class Decoder:
             values = codec.named(codec.receive(data))
         except FrameRefused as refusal:
             self.counts["refused"] += 1
-            values, fault = self._anyway(codec, data), str(refusal)
+            values, fault = self._unchecked(codec, data), str(refusal)
         if not fault and codec.data_ids and frame_crc(data, codec.data_ids) != data[0]:
             self.counts["bad_crc"] += 1
             fault = "bad CRC"
-        return _entry(frame, codec, values, fault)
+        return _decoded(frame, codec, values, fault)
 
     def _payload(self, frame: Frame, codec: MessageCodec) -> bytes | None:
         """The bytes to decode; None while a fast packet is incomplete."""
@@ -128,15 +126,15 @@ class Decoder:
         return None if data is None else data[: codec.length]
 
     @staticmethod
-    def _anyway(codec: MessageCodec, data: bytes) -> dict[str, Any]:
-        """What a refused frame says, as far as it can be read."""
+    def _unchecked(codec: MessageCodec, data: bytes) -> dict[str, Any]:
+        """The values of a refused frame, as far as they can be decoded."""
         try:
             return codec.named(codec.decode(data))
         except FrameRefused:
             return {}
 
 
-def _entry(frame: Frame, codec: MessageCodec, values: dict[str, Any], fault: str) -> Entry:
+def _decoded(frame: Frame, codec: MessageCodec, values: dict[str, Any], fault: str) -> DecodedMessage:
     labels, units = {}, {}
     values = {name: value for name, value in values.items() if not name.startswith("Reserved")}
     for s in codec.signals:
@@ -147,4 +145,4 @@ def _entry(frame: Frame, codec: MessageCodec, values: dict[str, Any], fault: str
                 labels[s.name] = label
         if s.unit not in ("", "1"):
             units[s.name] = s.unit
-    return Entry(frame.stamp_ns, describe(frame.key), codec.name, values, labels, units, fault)
+    return DecodedMessage(frame.stamp_ns, describe(frame.key), codec.name, values, labels, units, fault)

@@ -123,7 +123,7 @@ class ReachCycles:
         """Evaluate a report: mode, weight of the load, and whether the pin is away from its rest position."""
         if report.mode not in (Mode.ARMED, Mode.ACTIVE):
             if self.phase is Phase.OUT or self.phase is Phase.REST:
-                self._pose_with_extension(now_ns, failed=True)
+                self._finish(now_ns, failed=True)
             if not self.done:
                 self.phase = Phase.WAIT
         elif self.phase is Phase.WAIT and all(map(isfinite, self._measured(report))):
@@ -174,7 +174,7 @@ class ReachCycles:
                 self.runs[-1].ended_ns, self.runs[-1].failed = now_ns, not stands
                 self.phase, self._stands_ns = Phase.REST, now_ns
             case Phase.REST if now_ns >= min(self._stands_ns + REST_NS, self.runs[-1].ended_ns + LONGEST_REST_NS):
-                self._pose_with_extension(now_ns)
+                self._finish(now_ns)
                 self._begin(Phase.BACK, self._return_motion(self._motion.goal), now_ns)
 
     def _load_or_depart(self, now_ns: int) -> None:
@@ -193,6 +193,6 @@ class ReachCycles:
         self.runs.append(Run(visit, goal_m, motion, commanded_m, self._arm.load_kg, now_ns))
         self._begin(Phase.OUT, motion, now_ns)
 
-    def _over(self, now_ns: int, failed: bool = False) -> None:
+    def _finish(self, now_ns: int, failed: bool = False) -> None:
         self.runs[-1].over_ns = now_ns
         self.runs[-1].failed |= failed

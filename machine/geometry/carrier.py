@@ -3,8 +3,8 @@
 Inputs are the profile's ``Carrier`` and SI numbers; every function is pure.  Frames ``rear`` and ``front`` share the
 articulation axis (origin on it, x forward, y left, z up, z = 0 at the pivots of the swing arms); the articulation
 angle is positive when the front is turned left against the rear.  The front arms lead and the rear arms trail:
-their hubs stand ``front_axle_m`` ahead of and ``rear_axle_m`` behind the axis at the transport height, and a
-little nearer at every height at which the arm is steeper.  A height counts from the lowest position of the frame.
+their hubs are ``front_axle_m`` ahead of and ``rear_axle_m`` behind the axis at the transport height, and slightly
+closer at every height at which the arm is steeper.  Heights count from the lowest position of the frame.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ ARMS: Final = ("arm_fl", "arm_fr", "arm_rl", "arm_rr")
 
 
 def arm_angle_from_height(carrier: Carrier, height_m: float) -> float:
-    """Angle of a swing arm below the horizontal, rad, that raises the frame by ``height_m``; raises ValueError
-    when the arm is too short for it.
+    """Angle of a swing arm below the horizontal [rad] that raises the frame by ``height_m``.
+
+    Raises:
+        ValueError: the arm is too short for this height.
     """
     share = (carrier.arm_drop_low_m + height_m) / carrier.arm_length_m
     if not -1.0 <= share <= 1.0:
@@ -34,32 +36,32 @@ def arm_angle_from_height(carrier: Carrier, height_m: float) -> float:
 
 
 def height_from_arm_angle(carrier: Carrier, angle_rad: float) -> float:
-    """The inverse of ``arm_angle_from_height``, m."""
+    """The inverse of ``arm_angle_from_height`` [m]."""
     return carrier.arm_length_m * sin(angle_rad) - carrier.arm_drop_low_m
 
 
 def pivot_height_m(carrier: Carrier, height_m: float) -> float:
-    """The pivots' plane above level ground, m, with every arm at ``height_m``."""
+    """Height of the pivots' plane above level ground with every arm at ``height_m`` [m]."""
     return carrier.wheel_radius_m + carrier.arm_drop_low_m + height_m
 
 
 def arm_pivot_m(carrier: Carrier, arm: str) -> Point:
-    """Pivot of one of ``ARMS`` in the frame of its half, m; y is the middle plane of the wheel."""
+    """Pivot of one of ``ARMS`` in the frame of its half [m]; y is the middle plane of the wheel."""
     transport = arm_angle_from_height(carrier, carrier.arm_transport_m)
     axle, ahead = _axle(carrier, arm)
     return ahead * (axle - carrier.arm_length_m * cos(transport)), _side_m(carrier, arm), 0.0
 
 
 def hub_m(carrier: Carrier, arm: str, height_m: float) -> Point:
-    """Wheel hub of one of ``ARMS`` in the frame of its half, m, at a height of that arm."""
+    """Wheel hub of one of ``ARMS`` in the frame of its half at a height of that arm [m]."""
     x, y, _ = arm_pivot_m(carrier, arm)
     reach = carrier.arm_length_m * cos(arm_angle_from_height(carrier, height_m))
     return x + _axle(carrier, arm)[1] * reach, y, -(carrier.arm_drop_low_m + height_m)
 
 
 def turning_radius_m(carrier: Carrier, articulation_rad: float) -> float:
-    """Radius of the circle the middle of the front axle drives at a steady articulation, m; infinite when
-    straight (docs/reference/machines.md section 7.1).
+    """Radius of the circle of the front axle's middle at a constant articulation [m]; infinite when straight
+    (docs/reference/machines.md section 7.1).
     """
     bend = abs(sin(articulation_rad))
     return (carrier.front_axle_m * cos(articulation_rad) + carrier.rear_axle_m) / bend if bend else inf
@@ -68,7 +70,7 @@ def turning_radius_m(carrier: Carrier, articulation_rad: float) -> float:
 def heading_rate_rad_s(
     carrier: Carrier, speed_m_s: float, articulation_rad: float, articulation_rate_rad_s: float
 ) -> float:
-    """Turn rate of the front's heading without slip, rad/s; ``speed_m_s`` is that of the front axle
+    """Rate of the front half's heading without slip [rad/s]; ``speed_m_s`` is the speed of the front axle
     (docs/reference/machines.md section 7.1).
     """
     turned = speed_m_s * sin(articulation_rad) + carrier.rear_axle_m * articulation_rate_rad_s
@@ -76,31 +78,31 @@ def heading_rate_rad_s(
 
 
 def rear_from_front(articulation_rad: float, point: Point) -> Point:
-    """A point of the front frame seen in the rear frame, m."""
+    """A point of the front frame in the rear frame [m]."""
     return _turned(point, articulation_rad)
 
 
 def front_from_rear(articulation_rad: float, point: Point) -> Point:
-    """A point of the rear frame seen in the front frame, m."""
+    """A point of the rear frame in the front frame [m]."""
     return _turned(point, -articulation_rad)
 
 
 def rear_from_base(carrier: Carrier, point: Point) -> Point:
-    """A point of the crane's base frame seen in the rear frame, m."""
+    """A point of the crane's base frame in the rear frame [m]."""
     x, y, z = _turned(point, carrier.crane_yaw_rad)
     bx, by, bz = carrier.crane_base_m
     return x + bx, y + by, z + bz
 
 
 def base_from_rear(carrier: Carrier, point: Point) -> Point:
-    """A point of the rear frame seen in the crane's base frame, m."""
+    """A point of the rear frame in the crane's base frame [m]."""
     bx, by, bz = carrier.crane_base_m
     return _turned((point[0] - bx, point[1] - by, point[2] - bz), -carrier.crane_yaw_rad)
 
 
 def wheel_gap_m(carrier: Carrier, articulation_rad: float) -> float:
-    """Free length between the front and the rear wheel on the inner side of a bend, m, at the transport height;
-    0 or less means that they touch.
+    """Free length between front and rear wheel on the inner side of a bend at the transport height [m]; 0 or less
+    means that they touch.
     """
     side = 0.5 * carrier.track_width_m
     x, y, _ = rear_from_front(abs(articulation_rad), (carrier.front_axle_m, side, 0.0))

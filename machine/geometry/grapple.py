@@ -1,11 +1,10 @@
-"""Geometry of the hanging grapple: yaw, rotator and tongs.
+"""Geometry of the hanging grapple: yaw, rotator and jaws.
 
-Angles in the base frame, rad, counter-clockwise seen from above.  The grapple hangs straight down; with the
-rotator at 0 its tongs open across the reach: along base x on ``palms_471``, whose reach is +y at slew 0, so a log
-held then lies along y.  The carrier's x axis is that opening axis and turns with ``slew + rot``.  The **grapple yaw**
-is the direction of the opening axis; a log whose axis points to ``psi`` is gripped with yaw ``psi + pi/2``.  Log and
-grapple are symmetric, so a yaw counts modulo pi.  Tong angle 0 is fully open, the last value of the profile's table
-is closed without a load.
+Angles are in the base frame, rad, counter-clockwise seen from above.  The grapple hangs straight down; with the
+rotator at 0 its jaws open across the reach: along base x on ``palms_471``, whose reach is +y at slew 0, so that a
+grasped log lies along y.  The opening axis turns with ``slew + rot``.  The **grapple yaw** is the direction of the
+opening axis; a log whose axis points to ``psi`` is grasped with yaw ``psi + pi/2``.  Log and grapple are symmetric, so
+a yaw counts modulo pi.  Jaw angle 0 is fully open, the last value of the profile's table is closed without a load.
 """
 
 from __future__ import annotations
@@ -16,18 +15,19 @@ from math import ceil, degrees, floor, pi
 
 from machine.geometry.kinematics import Unreachable
 from machine.joints import Joint
-from machine.profile import Kinematics, Profile, TongTable, joint
+from machine.profile import JawTable, Kinematics, Profile, joint
 
 
 def grapple_yaw(profile: Profile, q: Sequence[float]) -> float:
-    """Direction of the opening axis, rad, not wrapped; ``q`` is indexed by ``Joint``."""
+    """Direction of the opening axis [rad], not wrapped; ``q`` is indexed by ``Joint``."""
     return q[Joint.SLEW] + q[Joint.ROT] + _across(profile.kinematics)
 
 
 def rotator_for_yaw(profile: Profile, slew: float, yaw: float, near: float = 0.0) -> float:
     """Rotator angle within its limits that gives ``yaw`` modulo pi at this slew, the one nearest to ``near``.
 
-    Raises ``Unreachable`` when the rotator turns less than pi and none fits.
+    Raises:
+        Unreachable: the rotator turns less than pi, and no angle fits.
     """
     spec = joint(profile, Joint.ROT)
     turn = yaw - slew - _across(profile.kinematics)
@@ -43,40 +43,38 @@ def rotator_for_yaw(profile: Profile, slew: float, yaw: float, near: float = 0.0
 
 
 def _across(kin: Kinematics) -> float:
-    """Direction across the reach at slew 0, rad."""
+    """Direction across the reach at slew 0 [rad]."""
     return kin.theta1_offset_rad - pi / 2
 
 
-def pin_to_tong_pivot_m(kin: Kinematics) -> float:
-    """Height of the hanger pin above the tong pivots of the hanging grapple, m."""
+def pin_to_jaw_pivot_m(kin: Kinematics) -> float:
+    """Height of the hanger pin above the jaw pivots of the hanging grapple [m]."""
     return kin.hanger_to_fork_m + kin.fork_to_rotator_m + kin.rotator_to_tong_pivot_m
 
 
-def tip_below_pin_m(tongs: TongTable, tong_rad: float) -> float:
-    """Depth of the tong tips below the hanger pin, m; linear between table rows, held beyond them."""
-    return _interpolate(tongs.angle_rad, tongs.tip_below_pin_m, tong_rad)
+def tip_below_pin_m(jaws: JawTable, jaw_rad: float) -> float:
+    """Depth of the jaw tips below the hanger pin [m]; linear between table rows, constant beyond them."""
+    return _interpolate(jaws.angle_rad, jaws.tip_below_pin_m, jaw_rad)
 
 
-def half_gap_m(tongs: TongTable, tong_rad: float) -> float:
-    """Half the distance between the tips, m; negative when the tongs interleave."""
-    return _interpolate(tongs.angle_rad, tongs.half_gap_m, tong_rad)
+def half_gap_m(jaws: JawTable, jaw_rad: float) -> float:
+    """Half the distance between the jaw tips [m]; negative when the jaws overlap."""
+    return _interpolate(jaws.angle_rad, jaws.half_gap_m, jaw_rad)
 
 
-def lowest_tip_below_pin_m(tongs: TongTable) -> float:
-    """The greatest depth the tips sweep through while closing, m: the clearance a closing grapple needs."""
-    return max(tongs.tip_below_pin_m)
+def lowest_tip_below_pin_m(jaws: JawTable) -> float:
+    """The greatest depth of the tips while closing [m]: the clearance that a closing grapple needs."""
+    return max(jaws.tip_below_pin_m)
 
 
-def tong_angle_from_opening_pct(tongs: TongTable, opening_pct: float) -> float:
-    """Tong angle, rad, for the opening reported on the bus (100 = fully open, 0 = closed); out of range is
-    clipped.
-    """
-    return (1.0 - min(max(opening_pct, 0.0), 100.0) / 100.0) * tongs.angle_rad[-1]
+def jaw_angle_from_opening_pct(jaws: JawTable, opening_pct: float) -> float:
+    """Jaw angle [rad] for the opening reported on the bus (100 = fully open, 0 = closed); clipped to that range."""
+    return (1.0 - min(max(opening_pct, 0.0), 100.0) / 100.0) * jaws.angle_rad[-1]
 
 
-def opening_pct_from_tong_angle(tongs: TongTable, tong_rad: float) -> float:
-    """The inverse of ``tong_angle_from_opening_pct``."""
-    return 100.0 * (1.0 - min(max(tong_rad / tongs.angle_rad[-1], 0.0), 1.0))
+def opening_pct_from_jaw_angle(jaws: JawTable, jaw_rad: float) -> float:
+    """The inverse of ``jaw_angle_from_opening_pct``."""
+    return 100.0 * (1.0 - min(max(jaw_rad / jaws.angle_rad[-1], 0.0), 1.0))
 
 
 def _interpolate(xs: Sequence[float], ys: Sequence[float], x: float) -> float:

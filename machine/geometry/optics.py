@@ -1,4 +1,4 @@
-"""Pinhole cameras: what a picture's pixels look at, and how a camera's axes stand.
+"""Pinhole cameras: projection between pixels and points, and the orientation of a camera's axes.
 
 Integer pixel coordinates are pixel centres (as in OpenCV), so the picture spans -0.5..width-0.5.  The optical frame is
 x right, y down, z forward; depth is the optical z.  A body frame is x forward, y left, z up.
@@ -24,7 +24,7 @@ BODY_FROM_OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """A pinhole: size [px], focal lengths [px] and principal point [px]."""
+    """A pinhole camera: picture size, focal lengths and principal point [px]."""
 
     width_px: int
     height_px: int
@@ -45,7 +45,7 @@ class Intrinsics:
         )
 
     def crop(self, left_px: int, top_px: int, width_px: int, height_px: int) -> Intrinsics:
-        """A window of this picture; a window that reaches outside widens it (negative left or top pads)."""
+        """A window of this picture; it may extend beyond the picture (a negative left or top pads)."""
         return Intrinsics(width_px, height_px, self.fx_px, self.fy_px, self.cx_px - left_px, self.cy_px - top_px)
 
     def square(self, size_px: int) -> Intrinsics:
@@ -55,7 +55,7 @@ class Intrinsics:
         return window.scaled(size_px / side)
 
     def letterbox(self, size_px: int) -> Letterbox:
-        """Paper B 3.2.2: the whole view inside a square of ``size_px``, black bars where it does not reach."""
+        """Paper B 3.2.2: the whole view inside a square of ``size_px``, padded with black bars."""
         inner = self.scaled(size_px / max(self.width_px, self.height_px))
         left, top = (size_px - inner.width_px) // 2, (size_px - inner.height_px) // 2
         return Letterbox(inner.crop(-left, -top, size_px, size_px), inner, left, top)
@@ -81,7 +81,7 @@ class Letterbox:
     top_px: int
 
     def pad(self, picture: Array, fill: float) -> Array:
-        """``picture`` of the inner size set into the square, ``fill`` in the bars."""
+        """The square with ``picture`` of the inner size in it and ``fill`` in the bars."""
         square = np.full((self.outer.height_px, self.outer.width_px, *picture.shape[2:]), fill, picture.dtype)
         rows = slice(self.top_px, self.top_px + self.inner.height_px)
         square[rows, self.left_px : self.left_px + self.inner.width_px] = picture
@@ -89,7 +89,7 @@ class Letterbox:
 
 
 def intrinsics(camera: Camera) -> Intrinsics:
-    """The pinhole a profile describes."""
+    """The pinhole of a profile's camera."""
     c = camera
     return Intrinsics(c.width_px, c.height_px, c.fx_px, c.fy_px, c.cx_px, c.cy_px)
 

@@ -1,11 +1,12 @@
-"""Where the hanger pin really is: the column leans under the crane's weight, and no encoder sees it.
+"""The true position of the hanger pin: the column leans under the crane's weight, and no encoder measures it.
 
     lean [rad] = head * r_head + pin * r_pin - rest + load * g * kg * r_pin        forward and down, about the foot
 
 with r_head and r_pin the horizontal distances of stick pin and hanger pin from the slew axis: the weights of boom,
-stick and grapple act there, and a load hangs from the pin.  ``profile.sag`` holds what a survey found (docs/reference/plant-model.md section 2:
-the column is what gives most).  ``true_pin`` goes from joints to the point, ``aim`` and ``aim_free`` back; without a
-sag table both are the encoder kinematics of `machine.geometry.kinematics`.  Plain floats, base frame, m and rad.
+stick and grapple act there, and a load hangs from the pin.  ``profile.sag`` holds the result of a survey
+(docs/reference/plant-model.md section 2: the column yields most).  ``true_pin`` maps joints to the point, ``aim`` and
+``aim_free`` are its inverse; without a sag table both are the encoder kinematics of `machine.geometry.kinematics`.
+Plain floats, base frame, m and rad.
 """
 
 from __future__ import annotations
@@ -20,22 +21,22 @@ from machine.profile import Kinematics, Profile, Sag, joint_limits
 
 GRAVITY_M_S2: Final = 9.81
 FOOT_SHARE: Final = 0.2
-"""Height of the slew bearing, where a column bends, as a share of the boom pin's height."""
-MOST_KG: Final = 2000.0
-"""More than any crane of this kind lifts: a greater load is a broken sensor."""
-NEAR_M: Final = 1e-6
-"""How near the true pin comes to the point that was asked for, ..."""
-ROUNDS: Final = 12
-"""... within this many rounds: each leaves a fiftieth of what was left, a soft column's a tenth."""
+"""Height of the slew bearing, about which the column bends, as a share of the boom pin's height."""
+MAX_LOAD_KG: Final = 2000.0
+"""More than any crane of this kind lifts; a greater value means a broken sensor."""
+AIM_TOLERANCE_M: Final = 1e-6
+"""Greatest distance of the true pin from the requested point."""
+MAX_AIM_ITERATIONS: Final = 12
+"""Each iteration reduces the error to a fiftieth, with a soft column to a tenth."""
 
 
-def sane_load_kg(load_kg: float) -> float:
-    """A reported load as a planner may use it: 0 where it is unknown (NaN), negative or absurd."""
-    return load_kg if isfinite(load_kg) and 0.0 <= load_kg <= MOST_KG else 0.0
+def plausible_load_kg(load_kg: float) -> float:
+    """A reported load for use by a planner: 0 if it is unknown (NaN), negative or implausibly high."""
+    return load_kg if isfinite(load_kg) and 0.0 <= load_kg <= MAX_LOAD_KG else 0.0
 
 
 def distances(kin: Kinematics, q: Sequence[float]) -> tuple[float, float, float]:
-    """Stick pin's and hanger pin's distance ahead of the slew axis and the hanger pin's height, column straight, m."""
+    """Distances of stick pin and hanger pin from the slew axis and the hanger pin's height, without sag [m]."""
     x, y, z = pin_position(kin, q)
     theta = q[Joint.SLEW] + kin.theta1_offset_rad
     head = kin.a1_m + kin.a2_m * cos(q[Joint.LIFT] + kin.theta2_offset_rad)
@@ -43,18 +44,18 @@ def distances(kin: Kinematics, q: Sequence[float]) -> tuple[float, float, float]
 
 
 def lean_rad(sag: Sag, kin: Kinematics, q: Sequence[float], load_kg: float = 0.0) -> float:
-    """How far the column leans forward at these joints with this load."""
+    """Forward lean of the column for a joint vector and a load [rad]."""
     head, pin, _ = distances(kin, q)
     return _lean(sag, head, pin, load_kg)
 
 
 def _lean(sag: Sag, head: float, pin: float, load_kg: float) -> float:
-    weighed = sag.pin_rad_m + sag.load_rad_nm * GRAVITY_M_S2 * load_kg
-    return sag.head_rad_m * head + weighed * pin - sag.rest_rad
+    pin_rad_m = sag.pin_rad_m + sag.load_rad_nm * GRAVITY_M_S2 * load_kg
+    return sag.head_rad_m * head + pin_rad_m * pin - sag.rest_rad
 
 
 def true_pin(sag: Sag | None, kin: Kinematics, q: Sequence[float], load_kg: float = 0.0) -> Point:
-    """The hanger pin with the column leaning."""
+    """The hanger pin with the column leaning [m]."""
     if sag is None:
         return pin_position(kin, q)
     head, r, z = distances(kin, q)
@@ -77,7 +78,8 @@ def aim(
 ) -> tuple[float, float, float]:
     """Slew, lift and tilt that bring the true pin to a point with the given extension; `kinematics.inverse` with sag.
 
-    Raises ``Unreachable``; its text names the point that the straight crane would have to reach.
+    Raises:
+        Unreachable: the sentence names the point that the crane without sag would have to reach.
     """
     if sag is None:
         return inverse(kin, limits, x, y, z, ext_m)
@@ -85,7 +87,7 @@ def aim(
     def joints(px: float, py: float, pz: float) -> tuple[float, float, float, float]:
         return *inverse(kin, limits, px, py, pz, ext_m), ext_m
 
-    return _settled(sag, kin, joints, x, y, z, load_kg)[:3]
+    return _iterate(sag, kin, joints, x, y, z, load_kg)[:3]
 
 
 def aim_free(
@@ -98,7 +100,8 @@ def aim_free(
 ) -> tuple[float, float, float, float]:
     """Slew, lift, tilt and extension that bring the true pin to a point; `kinematics.solve` with the profile's sag.
 
-    Raises ``Unreachable``.
+    Raises:
+        Unreachable: no joint position inside the limits reaches the point.
     """
     if profile.sag is None:
         return solve(profile, x, y, z, preference)
@@ -106,11 +109,11 @@ def aim_free(
     ext_m = solve(profile, x, y, z, preference)[Joint.EXT]
     try:
         return *aim(profile.sag, kin, joint_limits(profile), x, y, z, ext_m, load_kg), ext_m
-    except Unreachable:  # at the edge of the work space the extension has to give way too
-        return _settled(profile.sag, kin, lambda px, py, pz: solve(profile, px, py, pz, preference), x, y, z, load_kg)
+    except Unreachable:  # at the edge of the work space the extension has to change, too
+        return _iterate(profile.sag, kin, lambda px, py, pz: solve(profile, px, py, pz, preference), x, y, z, load_kg)
 
 
-def _settled(
+def _iterate(
     sag: Sag,
     kin: Kinematics,
     joints: Callable[[float, float, float], tuple[float, float, float, float]],
@@ -119,13 +122,13 @@ def _settled(
     z: float,
     load_kg: float,
 ) -> tuple[float, float, float, float]:
-    """Joints for a point that stands as far above the wished one as the crane sags there: a fixed point."""
+    """Joints for the point that lies above the requested one by as much as the crane sags: fixed-point iteration."""
     up = (0.0, 0.0, 0.0)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_AIM_ITERATIONS):
         q = joints(x + up[0], y + up[1], z + up[2])
         there = true_pin(sag, kin, q, load_kg)
         off = (x - there[0], y - there[1], z - there[2])
-        if hypot(*off) < NEAR_M:
+        if hypot(*off) < AIM_TOLERANCE_M:
             break
         up = (up[0] + off[0], up[1] + off[1], up[2] + off[2])
     return q

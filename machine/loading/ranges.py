@@ -22,12 +22,12 @@ from machine.profile import (
     Grapple,
     Hydraulics,
     Imu,
+    JawTable,
     Kinematics,
     Law,
     Profile,
     Sag,
     Timeouts,
-    TongTable,
     Valve,
     Workspace,
 )
@@ -102,7 +102,7 @@ _RANGES: Final[dict[type[msgspec.Struct], dict[str, Range]]] = {
         "open_time_s": (0.2, 20.0, "s"),
         "hold_pressure_bar": (10.0, 350.0, "bar"),
     },
-    TongTable: {
+    JawTable: {
         "angle_rad": (0.0, TURN_RAD, "rad"),
         "half_gap_m": _OFFSET_RANGE,
         "tip_below_pin_m": (0.0, 3.0, "m"),

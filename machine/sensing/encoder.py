@@ -2,8 +2,7 @@
 
 Input is the profile's ``Encoder`` and the position object as sent (u32 rotary, i32 linear); output is rad or
 m.  A rotary encoder counts modulo ``total_counts`` (6002h), so its position lies within half a range about
-``zero_counts`` whatever the raw value.  Pure and total: every integer has a position, plausibility is the
-caller's matter.
+``zero_counts`` for every raw value.  Pure and total: every integer has a position; the caller checks plausibility.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from machine.profile import Encoder
 
 
 def position_from_counts(encoder: Encoder, counts: int) -> float:
-    """Joint position in rad (m when linear) for a raw position value."""
+    """Joint position [rad, m for a linear encoder] of a raw position value."""
     delta = counts - encoder.zero_counts
     if encoder.kind == "rotary":
         half = encoder.total_counts // 2
@@ -21,6 +20,6 @@ def position_from_counts(encoder: Encoder, counts: int) -> float:
 
 
 def counts_from_position(encoder: Encoder, position: float) -> int:
-    """The raw value nearest to a joint position: 0..total_counts-1 when rotary, signed when linear."""
+    """The raw value nearest to a joint position: 0..total_counts-1 for a rotary encoder, signed for a linear one."""
     counts = encoder.zero_counts + round(encoder.direction * position / encoder.unit_per_count)
     return counts % encoder.total_counts if encoder.kind == "rotary" else counts

@@ -1,53 +1,57 @@
-"""What goes wrong on the way to a waypoint: position, heading, carrier, steering, swing arms."""
+"""Faults while driving: position, heading, carrier, steering, swing arms."""
 
 from __future__ import annotations
 
 from typing import Final
 
-from machine.status.reasons import About, Fault, Reaction, Reason
+from machine.status.reasons import DetailKind, Fault, Reaction, Reason
 
-_N, _A = About.NOTHING, About.ARM
+_N, _A = DetailKind.NOTHING, DetailKind.ARM
 
 DRIVING: Final[dict[Reason, Fault]] = {
     Reason.POSITION_LOST: Fault(
-        Reaction.HOLD, 510, _N, "The position was lost on the way to a waypoint", "Check the GNSS receiver, then arm."
+        Reaction.HOLD,
+        510,
+        _N,
+        "The position was lost while driving to a waypoint",
+        "Check the GNSS receiver, then arm.",
     ),
     Reason.HEADING_LOST: Fault(
-        Reaction.HOLD, 310, _N, "The heading was lost on the way to a waypoint", "Check both antennas, then arm."
+        Reaction.HOLD, 310, _N, "The heading was lost while driving to a waypoint", "Check both antennas, then arm."
     ),
     Reason.FIX_LOST: Fault(
         Reaction.HOLD,
         1200,
         _N,
-        "The position is neither RTK fixed nor float on the way to a waypoint",
+        "The position is neither RTK fixed nor float while driving to a waypoint",
         "Wait for the fix, or check the correction service; then arm.",
     ),
     Reason.POSITION_JUMP: Fault(
         Reaction.HOLD,
         310,
         _N,
-        "The position jumped on the way to a waypoint",
-        "Compare it with the machine's place, then arm.",
+        "The position jumped while driving to a waypoint",
+        "Compare it with where the machine is, then arm.",
     ),
     Reason.HEADING_JUMP: Fault(
         Reaction.HOLD,
         310,
         _N,
-        "The heading jumped on the way to a waypoint",
-        "Compare it with where the front looks, then arm.",
+        "The heading jumped while driving to a waypoint",
+        "Compare it with the direction of the front half, then arm.",
     ),
     Reason.HEADING_FROZEN: Fault(
         Reaction.HOLD,
         710,
         _N,
-        "The heading stands still while the machine turns",
+        "The heading does not change while the machine turns",
         "Restart the GNSS receiver, then arm.",
     ),
     Reason.HEADING_REVERSED: Fault(
         Reaction.HOLD,
         860,
         _N,
-        "The machine does not go where its heading looks",
+        "The machine does not move in the direction of its heading",
         "Check that the antennas are not swapped, then arm.",
     ),
     Reason.CARRIER_FAULT: Fault(
@@ -61,15 +65,15 @@ DRIVING: Final[dict[Reason, Fault]] = {
         Reaction.CUT,
         500,
         _N,
-        "The carrier moves faster than it was told, or against it",
+        "The carrier moves faster than commanded, or in the opposite direction",
         "Secure the machine against rolling, check brake and drive; then reset and arm.",
     ),
     Reason.CARRIER_STUCK: Fault(
         Reaction.HOLD,
         2600,
         _N,
-        "The carrier does not move though it is told to",
-        "Look for an obstacle or a brake that does not open, then arm.",
+        "The carrier does not move although it is commanded to",
+        "Check for an obstacle or a brake that does not open, then arm.",
     ),
     Reason.STEERING_DISAGREES: Fault(
         Reaction.RAMP,
@@ -82,7 +86,7 @@ DRIVING: Final[dict[Reason, Fault]] = {
         Reaction.HOLD,
         110,
         _N,
-        "The machine leans more than it may while driving",
+        "The machine tilts beyond the limit for driving",
         "Drive it out by hand, straight down the slope.",
     ),
     Reason.ARMS_FAULT: Fault(
@@ -96,20 +100,20 @@ DRIVING: Final[dict[Reason, Fault]] = {
         Reaction.HOLD, 60, _A, "The {} arm is outside its travel", "Check the sensor of its height, then arm."
     ),
     Reason.ARM_STUCK: Fault(
-        Reaction.HOLD, 2100, _A, "The {} arm does not follow its command", "Look for a stuck valve, then arm."
+        Reaction.HOLD, 2100, _A, "The {} arm does not follow its command", "Check for a stuck valve, then arm."
     ),
     Reason.STEERING_STUCK: Fault(
         Reaction.HOLD,
         900,
         _N,
         "The articulation does not follow its command",
-        "Look for a stuck steering valve or something between the wheels, then arm.",
+        "Check for a stuck steering valve or an object between the wheels, then arm.",
     ),
     Reason.STEERING_RUNAWAY: Fault(
         Reaction.CUT,
         500,
         _N,
-        "The articulation bends without a command, or against it",
-        "Look for a steering valve stuck open, then reset and arm.",
+        "The articulation moves without a command, or against it",
+        "Check for a steering valve stuck open, then reset and arm.",
     ),
 }

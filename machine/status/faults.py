@@ -1,4 +1,4 @@
-"""What is known about every reason: reaction, detection bound, a sentence for the operator and what to do."""
+"""Every reason with its reaction, detection bound, a sentence for the operator and what to do about it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Final
 from machine.crane_nodes import NODE_NAMES
 from machine.joints import ARTICULATION, JOINTS
 from machine.status.driving_faults import DRIVING
-from machine.status.reasons import About, Fault, Reaction, Reason
+from machine.status.reasons import DetailKind, Fault, Reaction, Reason
 from machine.status.refusals import PLANNER, REFUSALS
 
-_N, _J, _D, _B = About.NOTHING, About.JOINT, About.NODE, About.BUS
+_N, _J, _D, _B = DetailKind.NOTHING, DetailKind.JOINT, DetailKind.NODE, DetailKind.BUS
 _SESSION: Final = "Release, reset and arm again."
 
 FAULTS: Final[dict[Reason, Fault]] = {
@@ -26,14 +26,18 @@ FAULTS: Final[dict[Reason, Fault]] = {
         "Compare objects 1000h, 1018h, 6001h, 6002h and 6005h with the profile, then reset.",
     ),
     Reason.NODE_CONFIGURATION: Fault(
-        Reaction.REFUSE, 2000, _D, "{} refuses its set-up", "Check the device's EDS, power it off and on, then reset."
+        Reaction.REFUSE,
+        2000,
+        _D,
+        "{} refuses its configuration",
+        "Check the device's EDS, power it off and on, then reset.",
     ),
     Reason.INPUT_MISSING: Fault(
         Reaction.REFUSE,
         0,
         _N,
         "Arming is refused: an input is missing or stale",
-        "Look which frames are missing (stale mask) and start that node.",
+        "See the stale mask for the missing frames and start that node.",
     ),
     Reason.GUARD_NOT_READY: Fault(
         Reaction.REFUSE, 0, _N, "Arming is refused: the guard does not enable", "Start the guard or read its verdict."
@@ -46,7 +50,7 @@ FAULTS: Final[dict[Reason, Fault]] = {
     ),
     Reason.FAULT_LATCHED: Fault(Reaction.REFUSE, 0, _N, "Arming is refused: a fault is latched", "Reset, then arm."),
     Reason.STILL_STOPPING: Fault(
-        Reaction.REFUSE, 0, _N, "Arming is refused: the machine is still stopping", "Arm again when it stands."
+        Reaction.REFUSE, 0, _N, "Arming is refused: the machine is still stopping", "Arm again when it stands still."
     ),
     Reason.NODE_NOT_OPERATIONAL: Fault(
         Reaction.REFUSE, 2000, _D, "Arming is refused: {} is not operational", "Check its power, cable and NMT state."
@@ -59,8 +63,8 @@ FAULTS: Final[dict[Reason, Fault]] = {
         "Check cable, termination and bit rate, and arm after a quiet minute.",
     ),
     Reason.CONTROLLER_ENDED: Fault(Reaction.NOTE, 0, _N, "The controller has ended", "Start it again."),
-    Reason.OPERATOR_STOP: Fault(Reaction.HOLD, 0, _N, "The operator stopped the machine", "Arm to go on."),
-    Reason.OPERATOR_DISARM: Fault(Reaction.HOLD, 0, _N, "The operator disarmed the machine", "Arm to go on."),
+    Reason.OPERATOR_STOP: Fault(Reaction.HOLD, 0, _N, "The operator stopped the machine", "Arm to continue."),
+    Reason.OPERATOR_DISARM: Fault(Reaction.HOLD, 0, _N, "The operator disarmed the machine", "Arm to continue."),
     Reason.ESTOP_PRESSED: Fault(Reaction.CUT, 15, _N, "The emergency stop is pressed", _SESSION, True),
     Reason.ESTOP_CHANNELS: Fault(
         Reaction.CUT,
@@ -73,7 +77,7 @@ FAULTS: Final[dict[Reason, Fault]] = {
     Reason.ESTOP_LOST: Fault(
         Reaction.CUT, 40, _N, "The emergency stop state is no longer received", "Check the safety module, then reset."
     ),
-    Reason.GUARD_LOST: Fault(Reaction.CUT, 60, _N, "The guard is no longer heard", "Start the guard, then reset."),
+    Reason.GUARD_LOST: Fault(Reaction.CUT, 60, _N, "The guard is no longer received", "Start the guard, then reset."),
     Reason.GUARD_REFUSES: Fault(
         Reaction.CUT, 20, _N, "The guard withdrew its enable", "Read the guard's verdict, then reset and arm."
     ),
@@ -100,7 +104,7 @@ FAULTS: Final[dict[Reason, Fault]] = {
         Reaction.RAMP,
         35,
         _N,
-        "The valve node does not take our commands",
+        "The valve node does not accept the controller's commands",
         "Check the bus to the machine PLC and its exit code, then reset.",
     ),
     Reason.VALVE_NODE_FAULT: Fault(
@@ -128,7 +132,7 @@ FAULTS: Final[dict[Reason, Fault]] = {
         Reaction.DEGRADE, 260, _D, "The heartbeat of {} is lost; half speed", "Check the pressure modules."
     ),
     Reason.NODE_RESTARTED: Fault(
-        Reaction.RAMP, 105, _D, "{} restarted or left the operational state", "Find why, then reset and arm."
+        Reaction.RAMP, 105, _D, "{} restarted or left the operational state", "Find the cause, then reset and arm."
     ),
     Reason.EMERGENCY_MESSAGE: Fault(
         Reaction.RAMP, 5, _D, "{} sends an emergency message", "Read its error register, then reset and arm."
@@ -158,16 +162,20 @@ FAULTS: Final[dict[Reason, Fault]] = {
         510,
         _N,
         "Position or heading is no longer received",
-        "Check the GNSS receiver; crane work may go on.",
+        "Check the GNSS receiver; crane work can continue.",
     ),
     Reason.ENGINE_LOST: Fault(
-        Reaction.NOTE, 110, _N, "The engine is no longer heard", "Check the engine controller; crane work may go on."
+        Reaction.NOTE,
+        110,
+        _N,
+        "The engine is no longer received",
+        "Check the engine controller; crane work can continue.",
     ),
     Reason.BUS_OFF: Fault(
         Reaction.CUT,
         20,
         _B,
-        "Our CAN controller on {} is bus-off",
+        "The CAN controller on {} is bus-off",
         "Check cable and termination, then reset and arm.",
         True,
     ),
@@ -188,7 +196,7 @@ FAULTS: Final[dict[Reason, Fault]] = {
         Reaction.CUT,
         20,
         _B,
-        "Another controller sends our frames on {}",
+        "Another controller sends this controller's frames on {}",
         "Stop the other controller, then reset.",
         True,
     ),
@@ -196,7 +204,7 @@ FAULTS: Final[dict[Reason, Fault]] = {
         Reaction.RAMP,
         20,
         _N,
-        "Another device has our address 27h on the machine bus",
+        "Another device uses the controller's address 27h on the machine bus",
         "Give that device another address, then reset and arm.",
     ),
     Reason.LOOP_LATE: Fault(
@@ -220,16 +228,20 @@ FAULTS: Final[dict[Reason, Fault]] = {
         400,
         _J,
         "{} does not follow its command",
-        "Look for a stuck valve or a frozen encoder, then arm.",
+        "Check for a stuck valve or a frozen encoder, then arm.",
     ),
     Reason.JOINT_RUNAWAY: Fault(
-        Reaction.CUT, 150, _J, "{} moves without a command", "Look for a valve stuck open, then reset and arm."
+        Reaction.CUT, 150, _J, "{} moves without a command", "Check for a valve stuck open, then reset and arm."
     ),
     Reason.JOINT_REVERSED: Fault(
         Reaction.RAMP, 200, _J, "{} moves against its command", "Check signs in the profile, then reset and arm."
     ),
     Reason.TEST_RANGE: Fault(
-        Reaction.HOLD, 10, _J, "The spool test of {} comes to the end of its range", "Begin further from the end; arm."
+        Reaction.HOLD,
+        10,
+        _J,
+        "The spool test of {} reaches the end of its range",
+        "Start farther from the end, then arm.",
     ),
     Reason.TEST_SPEED: Fault(
         Reaction.HOLD,
@@ -243,7 +255,7 @@ FAULTS: Final[dict[Reason, Fault]] = {
         10,
         _J,
         "The spool test of {} lasts too long without a pause",
-        "Cut it into shorter ones, then arm.",
+        "Split it into shorter tests, then arm.",
     ),
     **DRIVING,
     **REFUSALS,
@@ -254,22 +266,22 @@ _ARM_NAMES: Final = ("front left", "front right", "rear left", "rear right")
 
 
 def describe(reason: int, detail: int = 0) -> str:
-    """The operator's sentence and what to do; ``reason`` may carry its detail in bits 8 to 15."""
+    """The operator's sentence and advice; ``reason`` may carry its detail in bits 8 to 15."""
     known = Reason(reason & 0xFF)
     detail = detail or reason >> 8
     fault = FAULTS[known]
     if known is Reason.NONE:
         return f"{fault.sentence} {fault.advice}"
     subject = ""
-    if fault.about is About.JOINT:
+    if fault.about is DetailKind.JOINT:
         subject = "the articulation" if detail == ARTICULATION else f"joint {detail}"
         if detail < len(JOINTS):
             subject = f"joint {JOINTS[detail].name.lower()}"
-    elif fault.about is About.NODE:
+    elif fault.about is DetailKind.NODE:
         subject = NODE_NAMES.get(detail, f"node {detail}")
-    elif fault.about is About.BUS:
+    elif fault.about is DetailKind.BUS:
         subject = _BUS_NAMES[detail] if detail < len(_BUS_NAMES) else f"bus {detail}"
-    elif fault.about is About.ARM:
+    elif fault.about is DetailKind.ARM:
         subject = _ARM_NAMES[detail] if detail < len(_ARM_NAMES) else f"swing {detail}"
     sentence = fault.sentence.format(subject)
     return f"{sentence[0].upper()}{sentence[1:]}. {fault.advice}"

@@ -1,4 +1,4 @@
-"""The controller's modes: the one enumeration that supervisor, planner, console and recorder share."""
+"""The controller's modes, shared by supervisor, planner, console and recorder."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from enum import IntEnum
 
 
 class Mode(IntEnum):
-    """The supervisor's mode, as it stands in ``StateReport.mode`` and ``CtrlStatus.Mode``.
+    """The supervisor's mode, as in ``StateReport.mode`` and ``CtrlStatus.Mode``.
 
-    Setpoints are obeyed in ARMED (the first makes it ACTIVE) and ACTIVE, and refused in every other mode.
+    Setpoints are executed in ARMED (the first one changes it to ACTIVE) and ACTIVE, and refused in every other mode.
     """
 
     BOOT = 0

@@ -1,4 +1,4 @@
-"""Every reason the controller gives, by number, and the words in which one is described.
+"""Every reason that the controller reports, by number, and the record that describes one.
 
 The numbers travel in ``CtrlStatus.Reason`` (8 bits) and, with the detail above them, in ``StateReport.reason``.
 """
@@ -10,24 +10,27 @@ from typing import NamedTuple
 
 
 class Reaction(IntEnum):
-    """What a reason does, from mild to hard (docs/reference/safety.md section 4; stop categories of IEC 60204-1)."""
+    """What a reason makes the controller do, from mild to severe.
+
+    Source: docs/reference/safety.md section 4; stop categories of IEC 60204-1.
+    """
 
     NOTE = 0
-    """Said, nothing more."""
+    """Only reported."""
     REFUSE = 1
-    """A datagram or an arming request is refused whole (X)."""
+    """A datagram or an arming request is refused as a whole (X)."""
     DEGRADE = 2
     """Half speed (D)."""
     HOLD = 3
-    """Slow down, then neutral; the operator arms again (H, SS2)."""
+    """Slow down, then neutral; the operator must arm again (H, SS2)."""
     RAMP = 4
     """Short ramp to neutral, enable off, latched (R1, SS1)."""
     CUT = 5
     """Neutral and enable off in the next frame, latched (R0, SS0)."""
 
 
-class About(IntEnum):
-    """What the detail number of a reason names."""
+class DetailKind(IntEnum):
+    """What the detail number of a reason refers to."""
 
     NOTHING = 0
     JOINT = 1
@@ -39,7 +42,7 @@ class About(IntEnum):
 
 
 class Reason(IntEnum):
-    """Why the controller refuses, slows or stops; 101 to 108 are 100 + ``DatagramFault``."""
+    """Why the controller refuses, slows down or stops; 101 to 108 are 100 + ``DatagramFault``."""
 
     NONE = 0
     NODE_ABSENT = 1
@@ -154,14 +157,15 @@ class Reason(IntEnum):
 
 
 class Fault(NamedTuple):
-    """What is known about a reason; ``always`` says that it also latches while nothing is armed.
+    """The description of a reason; with ``always`` it also latches while nothing is armed.
 
-    ``bound_ms`` is the FDTI of docs/reference/safety.md section 5 (injection to latched); 0 means at once, on arrival.
+    ``bound_ms`` is the fault detection time of docs/reference/safety.md section 5 (injection to latched); 0 means
+    immediately, on arrival.
     """
 
     reaction: Reaction
     bound_ms: int
-    about: About
+    about: DetailKind
     sentence: str
     advice: str
     always: bool = False

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from can_dbc.bus.batch import Batch, widen
+from can_dbc.bus.batch import Batch, enlarge_receive_buffer
 
 Pair = tuple[socket.socket, socket.socket]
 
@@ -73,5 +73,5 @@ def test_a_closed_socket_is_an_error(pair: Pair) -> None:
 
 def test_a_wider_buffer_holds_more() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        widen(sock, 64 * 1024)
+        enlarge_receive_buffer(sock, 64 * 1024)
         assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) >= 64 * 1024

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from can_dbc.bus import factory as bus_module
+from can_dbc.bus import factory as factory
 from can_dbc.bus.base import (
     CRTL_ACTIVE,
     CRTL_PASSIVE,
@@ -46,7 +46,7 @@ def test_a_missing_daemon_is_told_with_the_remedy(tmp_path, monkeypatch) -> None
 
 
 def test_a_missing_interface_is_told_with_the_remedy() -> None:
-    expected = "bus.interface" if bus_module.kernel_has_can() else "bus.no-can"
+    expected = "bus.interface" if factory.kernel_has_can() else "bus.no-can"
     with pytest.raises(BusError, check=coded(expected)):
         open_bus("socketcan:nocan9")
 
@@ -72,7 +72,7 @@ def test_an_unknown_python_can_interface_is_told() -> None:
 )
 def test_default_address_prefers_the_kernel(has_can, interfaces, expected, monkeypatch) -> None:
     monkeypatch.delenv("TIMBERHAND_CRANE0", raising=False)
-    monkeypatch.setattr(bus_module, "kernel_has_can", lambda: has_can)
+    monkeypatch.setattr(factory, "kernel_has_can", lambda: has_can)
     monkeypatch.setattr("socket.if_nameindex", lambda: list(enumerate(interfaces)))
     assert default_address("crane0") == expected
 
@@ -168,7 +168,7 @@ class Waiting(BaseBus):
         super().__init__("test")
         self.bunches: list[list[Frame]] = []
 
-    def _take(self, frames: list[Frame]) -> None:
+    def _receive(self, frames: list[Frame]) -> None:
         if self.bunches:
             frames += self.bunches.pop(0)
 

@@ -9,7 +9,7 @@ import can
 import pytest
 
 from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame
-from can_dbc.trace.candump import Broken, parse_line, read
+from can_dbc.trace.candump import MalformedRecord, parse_line, read_trace
 from can_dbc.trace.decoder import Decoder
 
 CANBOAT = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can" / "canboat"
@@ -59,9 +59,9 @@ def test_real_logs(name: str, count: int) -> None:
     path = CANBOAT / name
     if not path.exists():
         pytest.skip("no canboat samples under TIMBERHAND_DATA/can")
-    records = list(read(path))
+    records = list(read_trace(path))
     assert len(records) == count
-    assert not any(isinstance(r, Broken) for r in records)
+    assert not any(isinstance(r, MalformedRecord) for r in records)
 
 
 def messages() -> list[can.Message]:
@@ -77,7 +77,7 @@ def test_files_python_can_writes(tmp_path: Path, suffix: str) -> None:
     with can.Logger(path) as logger:
         for message in messages():
             logger.on_message_received(message)
-    frames = list(read(path))
+    frames = list(read_trace(path))
     assert [(f.key, f.data) for f in frames] == [
         (m.arbitration_id | (EXTENDED if m.is_extended_id else 0), bytes(m.data)) for m in messages()
     ]
@@ -96,10 +96,10 @@ def test_truncation_at_any_byte_never_crashes(tmp_path: Path, suffix: str) -> No
     whole = path.read_bytes()
     for cut in range(0, len(whole), max(1, len(whole) // 60)):
         path.write_bytes(whole[:cut])
-        assert len([r for r in read(path) if isinstance(r, Frame)]) <= 20
+        assert len([r for r in read_trace(path) if isinstance(r, Frame)]) <= 20
     for position in range(0, len(whole), max(1, len(whole) // 60)):
         path.write_bytes(whole[:position] + b"\xfe" + whole[position + 1 :])
-        list(read(path))
+        list(read_trace(path))
 
 
 def test_asc_damage_costs_its_line_alone(tmp_path: Path) -> None:
@@ -111,9 +111,9 @@ def test_asc_damage_costs_its_line_alone(tmp_path: Path) -> None:
     at = next(i for i, line in enumerate(lines) if " 21A " in line)
     lines[at] = lines[at][:20]
     path.write_text("\n".join(lines))
-    records = list(read(path))
+    records = list(read_trace(path))
     assert sum(isinstance(r, Frame) for r in records) == 19
-    assert [r.line for r in records if isinstance(r, Broken)] == [at + 1]
+    assert [r.line for r in records if isinstance(r, MalformedRecord)] == [at + 1]
 
 
 def test_decoder_counts_everything() -> None:
@@ -123,7 +123,7 @@ def test_decoder_counts_everything() -> None:
     press = codec.load("crane").messages["PressA"]
     assert press.data_ids
     good = protect(press.encode(0, 0, 0, 1.0, 2.0, None, 4.0), 3, press.data_ids)
-    records: list[Frame | Broken] = [
+    records: list[Frame | MalformedRecord] = [
         Frame(1, 0x1A0, good),
         Frame(2, 0x1A0, good[:-1] + b"\x01"),
         Frame(3, 0x1A0, good[:7]),
@@ -131,7 +131,7 @@ def test_decoder_counts_everything() -> None:
         Frame(5, 0x7FF, b""),
         Frame(6, ERROR | 0x88, bytes(8)),
         Frame(7, 0x1A0 | REMOTE, b""),
-        Broken(9, "x"),
+        MalformedRecord(9, "x"),
     ]
     decoder = Decoder(["crane"])
     entries = list(decoder.run(records))

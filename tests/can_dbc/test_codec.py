@@ -324,7 +324,8 @@ BROKEN = [
     (
         'BO_ 1 M: 8 A\nBA_DEF_ BO_ "E2EProfile" ENUM "None","P02";\nBA_DEF_DEF_ "E2EProfile" "None";\n'
         'BA_ "E2EProfile" BO_ 1 1;\n',
-        "dbc.data-ids", ("M",),
+        "dbc.data-ids",
+        ("M",),
     ),
 ]
 

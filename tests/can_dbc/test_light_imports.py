@@ -8,7 +8,7 @@ from pathlib import Path
 
 import can_dbc
 
-MODULES = "dbc.codec protocols.e2e protocols.canopen protocols.nmea2000 trace.candump".split()
+MODULES = ["dbc.codec", "protocols.e2e", "protocols.canopen", "protocols.nmea2000", "trace.candump"]
 
 
 def test_codecs_do_not_import_cantools_after_start() -> None:

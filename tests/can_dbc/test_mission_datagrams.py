@@ -14,13 +14,13 @@ from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramFault, DatagramRefused
 from can_dbc.messages.mission import (
     MAX_BYTES,
-    MissionOrder,
+    MissionAction,
+    MissionCommand,
     MissionReport,
-    Order,
     decode_mission,
-    decode_order,
+    decode_mission_command,
     encode_mission,
-    encode_order,
+    encode_mission_command,
 )
 from tests.can_dbc.mission_told import TOLD
 
@@ -50,10 +50,10 @@ def test_what_is_told_arrives(key) -> None:
     assert decode_mission(told(key=key), key) == (77, 10**9, TOLD)
 
 
-@given(st.sampled_from(Order), st.integers(0, 2**32 - 1), st.integers(0, 2**63), st.sampled_from([None, KEY]))
-def test_an_order_arrives(order, sequence, stamp_ns, key) -> None:
-    message = MissionOrder(sequence, 77, stamp_ns, order)
-    assert decode_order(encode_order(message, key), key) == message
+@given(st.sampled_from(MissionAction), st.integers(0, 2**32 - 1), st.integers(0, 2**63), st.sampled_from([None, KEY]))
+def test_a_command_is_decoded(order, sequence, stamp_ns, key) -> None:
+    message = MissionCommand(sequence, 77, stamp_ns, order)
+    assert decode_mission_command(encode_mission_command(message, key), key) == message
 
 
 @pytest.mark.parametrize(
@@ -74,25 +74,28 @@ def test_a_number_that_is_none_is_refused() -> None:
 
 
 def test_keys_must_agree() -> None:
-    order = encode_order(MissionOrder(1, 2, 3, Order.ABORT), KEY)
-    assert fault_of(decode_order, order, b"other") is DatagramFault.AUTHENTICATION
-    assert fault_of(decode_order, encode_order(MissionOrder(1, 2, 3, Order.ABORT)), KEY) is not None
+    order = encode_mission_command(MissionCommand(1, 2, 3, MissionAction.ABORT), KEY)
+    assert fault_of(decode_mission_command, order, b"other") is DatagramFault.AUTHENTICATION
+    assert (
+        fault_of(decode_mission_command, encode_mission_command(MissionCommand(1, 2, 3, MissionAction.ABORT)), KEY)
+        is not None
+    )
     assert fault_of(decode_mission, told(), KEY) is DatagramFault.AUTHENTICATION
 
 
 def test_one_kind_is_never_taken_for_another() -> None:
     """Least of all by the controller."""
-    order = encode_order(MissionOrder(1, 2, 3, Order.AUTO))
+    order = encode_mission_command(MissionCommand(1, 2, 3, MissionAction.AUTO))
     press = encode(OperatorCommand(1, 2, 3, OperatorAction.ARM))
-    for take, data in ((decode, order), (decode, told()), (decode_order, press), (decode_order, told()),
+    for take, data in ((decode, order), (decode, told()), (decode_mission_command, press), (decode_mission_command, told()),
                        (decode_mission, press), (decode_mission, order)):  # fmt: skip
         assert fault_of(take, data) is DatagramFault.KIND
 
 
-def test_an_unknown_order_is_refused() -> None:
-    data = bytearray(encode_order(MissionOrder(1, 2, 3, Order.AUTO))[:-4])
+def test_an_unknown_command_is_refused() -> None:
+    data = bytearray(encode_mission_command(MissionCommand(1, 2, 3, MissionAction.AUTO))[:-4])
     data[24] = 99
-    assert fault_of(decode_order, bytes(data) + zlib.crc32(data).to_bytes(4, "little")) is DatagramFault.VALUE
+    assert fault_of(decode_mission_command, bytes(data) + zlib.crc32(data).to_bytes(4, "little")) is DatagramFault.VALUE
 
 
 def test_a_report_beyond_one_datagram_is_not_sent() -> None:

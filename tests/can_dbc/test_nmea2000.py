@@ -18,7 +18,7 @@ from can_dbc.dbc import codec
 from can_dbc.dbc.signals import EncodeRefused, FrameRefused
 from can_dbc.frame import ERROR, EXTENDED, Frame
 from can_dbc.protocols import nmea2000 as n2k
-from can_dbc.trace.candump import read
+from can_dbc.trace.candump import read_trace
 
 CANBOAT = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "can" / "canboat"
 PGNS = sorted(CANBOAT.glob("pgns/*.yaml"))
@@ -120,7 +120,7 @@ def test_a_real_log_against_the_nmea2000_package() -> None:
         pytest.skip("no canboat samples under TIMBERHAND_DATA/can")
     receiver, compared = n2k.Receiver(), 0
     theirs = NMEA2000Decoder()
-    for frame in read(log):
+    for frame in read_trace(log):
         assert isinstance(frame, Frame)
         reading = receiver.receive(frame.key, frame.data, frame.stamp_ns)
         if reading is not None:
@@ -173,7 +173,7 @@ def packet(payload: bytes, sequence: int = 0) -> list[bytes]:
 
 
 @FIXED
-@given(st.binary(min_size=1, max_size=n2k.MAX_FAST_PACKET), st.integers(0, 7), st.randoms(use_true_random=False))
+@given(st.binary(min_size=1, max_size=n2k.MAX_FAST_PACKET_BYTES), st.integers(0, 7), st.randoms(use_true_random=False))
 def test_fast_packets_survive_any_order(payload: bytes, sequence: int, rng: random.Random) -> None:
     frames = packet(payload, sequence)
     assert len(frames) == 1 + max(0, -(-(len(payload) - 6) // 7))
@@ -222,7 +222,7 @@ def test_memory_is_bounded() -> None:
     reassembler = n2k.Reassembler()
     for source in range(200):
         reassembler.add(FAST & ~0xFF | source, packet(bytes(20))[0], source)
-    assert reassembler.lost == 200 - n2k.MAX_OPEN
+    assert reassembler.lost == 200 - n2k.MAX_OPEN_PACKETS
 
 
 @pytest.mark.parametrize("frame", [b"", b"\x00", b"\x00\xe0\x00", b"\x00\xff"])

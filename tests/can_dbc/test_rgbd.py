@@ -7,16 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from can_dbc.messages.rgbd import (
-    QUESTION,
-    START_BYTES,
+    HEADER_BYTES,
+    REQUEST_HEADER,
     RgbdError,
     RgbdMessage,
     decode,
+    decode_header,
     encode,
-    encode_question,
     encode_refusal,
-    question_bytes,
-    start,
+    encode_request,
+    request_name_bytes,
 )
 from tests.codes import coded
 
@@ -33,7 +33,7 @@ def frame(width: int = 5, height: int = 3, seed: int = 0) -> RgbdMessage:
 def test_a_frame_arrives_as_it_was_sent(width: int, height: int, seed: int) -> None:
     sent = frame(width, height, seed)
     data = encode(sent)
-    assert decode(data) == sent and len(data) == START_BYTES + start(data[:START_BYTES]).rest
+    assert decode(data) == sent and len(data) == HEADER_BYTES + decode_header(data[:HEADER_BYTES]).remaining_bytes
 
 
 @given(st.data())
@@ -53,7 +53,7 @@ def test_a_cut_or_lengthened_frame_is_refused(kept: int, more: int) -> None:
             decode(broken)
 
 
-@given(st.binary(min_size=START_BYTES, max_size=START_BYTES + 40))
+@given(st.binary(min_size=HEADER_BYTES, max_size=HEADER_BYTES + 40))
 def test_noise_is_no_frame(noise: bytes) -> None:
     with pytest.raises(RgbdError):
         decode(noise)
@@ -65,10 +65,10 @@ def test_a_refusal_says_why() -> None:
 
 
 def test_what_is_asked_is_the_cameras_name() -> None:
-    asked = encode_question("front")
-    assert asked[QUESTION.size :] == b"front" and question_bytes(asked[: QUESTION.size]) == 5
+    asked = encode_request("front")
+    assert asked[REQUEST_HEADER.size :] == b"front" and request_name_bytes(asked[: REQUEST_HEADER.size]) == 5
     with pytest.raises(RgbdError, check=coded("rgbd.no-request")):
-        question_bytes(bytes(QUESTION.size))
+        request_name_bytes(bytes(REQUEST_HEADER.size))
 
 
 @pytest.mark.parametrize(

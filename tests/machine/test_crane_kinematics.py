@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import machine.geometry.kinematics as kinematics
 from machine.geometry.kinematics import (
-    STOP_MARGIN_SHARE,
     MIN_BEND_RAD,
+    STOP_MARGIN_SHARE,
     Unreachable,
     chain_points,
     inverse,

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from machine.geometry.grapple import (
     grapple_yaw,
     half_gap_m,
+    jaw_angle_from_opening_pct,
     lowest_tip_below_pin_m,
-    opening_pct_from_tong_angle,
-    pin_to_tong_pivot_m,
+    opening_pct_from_jaw_angle,
+    pin_to_jaw_pivot_m,
     rotator_for_yaw,
     tip_below_pin_m,
-    tong_angle_from_opening_pct,
 )
 from machine.geometry.kinematics import Unreachable, pin_position
 from machine.loading.profile_file import load_profile
@@ -98,7 +98,7 @@ def test_tips_close_monotonically_and_sweep_0_18_m_lower():
     gaps = [half_gap_m(TONGS, i * 2.234 / 200) for i in range(201)]
     assert all(a > b for a, b in pairwise(gaps))
     assert lowest_tip_below_pin_m(TONGS) - tip_below_pin_m(TONGS, 0.0) == pytest.approx(0.18, abs=2e-3)
-    assert pin_to_tong_pivot_m(PALMS.kinematics) == pytest.approx(0.617)
+    assert pin_to_jaw_pivot_m(PALMS.kinematics) == pytest.approx(0.617)
 
 
 def test_outside_the_table_the_end_values_hold():
@@ -128,12 +128,12 @@ def test_the_table_of_the_cr250_is_one_rigid_tong_that_opens_1_40_m():
 
 @given(st.floats(0.0, 100.0))
 def test_opening_is_linear_in_the_tong_angle(opening_pct):
-    angle = tong_angle_from_opening_pct(TONGS, opening_pct)
+    angle = jaw_angle_from_opening_pct(TONGS, opening_pct)
     assert 0.0 <= angle <= 2.234
-    assert opening_pct_from_tong_angle(TONGS, angle) == pytest.approx(opening_pct, abs=1e-9)
+    assert opening_pct_from_jaw_angle(TONGS, angle) == pytest.approx(opening_pct, abs=1e-9)
 
 
 def test_full_opening_is_tong_zero_and_out_of_range_is_clipped():
-    assert tong_angle_from_opening_pct(TONGS, 100.0) == 0.0 == tong_angle_from_opening_pct(TONGS, 120.0)
-    assert tong_angle_from_opening_pct(TONGS, 0.0) == 2.234 == tong_angle_from_opening_pct(TONGS, -3.0)
-    assert opening_pct_from_tong_angle(TONGS, -0.1) == 100.0 and opening_pct_from_tong_angle(TONGS, 3.0) == 0.0
+    assert jaw_angle_from_opening_pct(TONGS, 100.0) == 0.0 == jaw_angle_from_opening_pct(TONGS, 120.0)
+    assert jaw_angle_from_opening_pct(TONGS, 0.0) == 2.234 == jaw_angle_from_opening_pct(TONGS, -3.0)
+    assert opening_pct_from_jaw_angle(TONGS, -0.1) == 100.0 and opening_pct_from_jaw_angle(TONGS, 3.0) == 0.0

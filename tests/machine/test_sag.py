@@ -10,11 +10,20 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from machine.geometry.kinematics import Unreachable, inverse, pin_position, solve
-from machine.geometry.sag import FOOT_SHARE, GRAVITY_M_S2, MOST_KG, aim, aim_free, lean_rad, sane_load_kg, true_pin
+from machine.geometry.sag import (
+    FOOT_SHARE,
+    GRAVITY_M_S2,
+    MAX_LOAD_KG,
+    aim,
+    aim_free,
+    lean_rad,
+    plausible_load_kg,
+    true_pin,
+)
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import Sag, joint_limits
-from machine.sensing.weighing import empty_moment_nm, hanging_kg, lift_moment_nm
+from machine.sensing.weighing import empty_moment_nm, hanging_load_kg, lift_moment_nm
 from tests.codes import coded
 
 PALMS, AORO = load_profile("palms_471"), load_profile("aoro_fc8")
@@ -84,10 +93,10 @@ def test_a_point_that_no_joints_reach_is_refused_in_words():
         aim_free(LEANING, 0.0, 7.5, KIN.d1_m, None, 400.0)
 
 
-@pytest.mark.parametrize("said", [nan, -5.0, MOST_KG + 1.0, float("inf")])
+@pytest.mark.parametrize("said", [nan, -5.0, MAX_LOAD_KG + 1.0, float("inf")])
 def test_an_insane_load_counts_as_none(said):
-    assert sane_load_kg(said) == 0.0
-    assert sane_load_kg(180.0) == 180.0
+    assert plausible_load_kg(said) == 0.0
+    assert plausible_load_kg(180.0) == 180.0
 
 
 def test_the_moment_is_pressure_times_area_times_arm():
@@ -108,11 +117,11 @@ def test_the_moment_is_pressure_times_area_times_arm():
 def test_a_load_is_what_the_empty_crane_does_not_weigh(q, load_kg):
     ahead = (lambda p: p[0] * cos(q[0] + pi / 2) + p[1] * sin(q[0] + pi / 2))(pin_position(KIN, q)) - KIN.a1_m
     moment_nm = empty_moment_nm(SOFT, KIN, q) + load_kg * GRAVITY_M_S2 * ahead
-    found = hanging_kg(SOFT, KIN, q, moment_nm)
+    found = hanging_load_kg(SOFT, KIN, q, moment_nm)
     assert isnan(found) if ahead < 1.0 else found == pytest.approx(load_kg, abs=1e-6)
 
 
 def test_nothing_is_known_of_a_load_before_a_calibration():
     q = (0.3, 0.6, -1.2, 0.9, 0.0)
-    assert isnan(hanging_kg(None, KIN, q, 2e4))
-    assert isnan(hanging_kg(Sag(0.004, 0.003, 0.012), KIN, q, 2e4))
+    assert isnan(hanging_load_kg(None, KIN, q, 2e4))
+    assert isnan(hanging_load_kg(Sag(0.004, 0.003, 0.012), KIN, q, 2e4))

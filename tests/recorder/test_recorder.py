@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from can_dbc.frame import Frame
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import VehicleReport
-from can_dbc.trace.candump import read as read_log
+from can_dbc.trace.candump import read_trace
 from recorder import files
 from recorder import manifest as manifests
 from recorder import recorder as recorder_module
@@ -57,7 +57,7 @@ def test_candump_log_is_read_back_by_python_can(run):
 
 
 def test_candump_log_is_read_back_by_our_reader(run):
-    got = list(read_log(run / "crane0.log"))
+    got = list(read_trace(run / "crane0.log"))
     sent = [frame for k in range(TICKS) for frame in frames(k)]
     assert [(f.stamp_ns // 1000, f.key, f.data) for f in got] == [(f.stamp_ns // 1000, f.key, f.data) for f in sent]
 

@@ -22,7 +22,7 @@ from can_dbc.bus.factory import open_bus
 from can_dbc.messages import tick_record
 from can_dbc.timing.page import TimingWriter
 from recorder import manifest as manifests
-from recorder.__main__ import FLUSH_S, Shell, udp_socket, write_all
+from recorder.__main__ import FLUSH_PERIOD_S, InputCollector, udp_socket, write_all
 from recorder.mcap_scan import NotMcap, Stored, is_complete, scan
 from recorder.recorder import CHUNK_NS, TICK, Recorder
 from recorder.recover import recover
@@ -169,7 +169,7 @@ def live(tmp_path):
 
 
 def test_killed_recorder_loses_only_what_was_not_yet_due(live, tmp_path):
-    assert CHUNK_NS / 1e9 <= 0.25 and FLUSH_S <= 0.25
+    assert CHUNK_NS / 1e9 <= 0.25 and FLUSH_PERIOD_S <= 0.25
     live.send(0.4)
     path, first, limit = tmp_path / "run.mcap", len(live.sent), time.monotonic() + 20
     # The timer brings the last chunk to the file although nothing more comes.
@@ -185,20 +185,20 @@ def test_killed_recorder_loses_only_what_was_not_yet_due(live, tmp_path):
     assert manifests.read(tmp_path).complete is False
 
 
-def test_shell_records_what_is_on_a_bus(tmp_path):
-    with open_bus("virtual:shell-test") as mine, open_bus("virtual:shell-test") as plant:
-        shell = Shell({"crane0": mine}, udp_socket(0), udp_socket(0))
+def test_the_collector_records_what_is_on_a_bus(tmp_path):
+    with open_bus("virtual:collector-test") as mine, open_bus("virtual:collector-test") as plant:
+        inputs = InputCollector({"crane0": mine}, udp_socket(0), udp_socket(0))
         recorder = Recorder(tmp_path, PROFILE, manifest(live=True))
-        writer = threading.Thread(target=write_all, args=(recorder, shell))
+        writer = threading.Thread(target=write_all, args=(recorder, inputs))
         writer.start()
-        receiver = threading.Thread(target=shell.run)
+        receiver = threading.Thread(target=inputs.run)
         receiver.start()
         for k in range(50):
             assert plant.send(0x80, bytes([k]))
         limit = time.monotonic() + 20
         while mine.stats.received < 50 and time.monotonic() < limit:
             time.sleep(0.01)
-        shell.end()
+        inputs.end()
         receiver.join(10)
         writer.join(10)
     got = list(can.CanutilsLogReader(tmp_path / "crane0.log"))
@@ -206,51 +206,51 @@ def test_shell_records_what_is_on_a_bus(tmp_path):
     assert manifests.read(tmp_path).complete
 
 
-def test_frames_that_the_kernel_had_to_drop_are_told(tmp_path, capfd):
-    with open_bus("virtual:shell-loses") as bus:
-        shell = Shell({"crane0": bus}, udp_socket(0), udp_socket(0))
-        take = shell._takers[0]
-        take()
+def test_frames_that_the_kernel_dropped_are_reported_once(tmp_path, capfd):
+    with open_bus("virtual:collector-loses") as bus:
+        inputs = InputCollector({"crane0": bus}, udp_socket(0), udp_socket(0))
+        receive = inputs._receivers[0]
+        receive()
         assert not capfd.readouterr().err
         bus.stats.dropped += 7
-        take()
-        take()
-        assert capfd.readouterr().err.count("7 frames of crane0 came too fast") == 1
-        shell.items.put(None)
-        write_all(Recorder(tmp_path, PROFILE, manifest()), shell)
+        receive()
+        receive()
+        assert capfd.readouterr().err.count("7 frames of crane0") == 1
+        inputs.items.put(None)
+        write_all(Recorder(tmp_path, PROFILE, manifest()), inputs)
     assert manifests.read(tmp_path).dropped == 7, "a recording with gaps says so"
 
 
-def test_shell_takes_each_state_of_the_timing_page_once(timing, tmp_path, monkeypatch):
-    monkeypatch.setattr("recorder.__main__.TIMING_S", 0.0)
+def test_the_collector_receives_each_state_of_the_timing_page_once(timing, tmp_path, monkeypatch):
+    monkeypatch.setattr("recorder.__main__.TIMING_PERIOD_S", 0.0)
     page = tmp_path / "controller.timing"
-    shell = Shell({}, udp_socket(0), udp_socket(0), page)
-    *_, take = shell._takers
-    take()
-    assert shell.items.empty(), "no controller yet"
+    inputs = InputCollector({}, udp_socket(0), udp_socket(0), page)
+    *_, receive = inputs._receivers
+    receive()
+    assert inputs.items.empty(), "no controller yet"
     writer = TimingWriter(page)
     for k in (1, 1, 2):
         written = timing(100, written_ns=k)
         writer.publish(written.facts, written.durations)
-        take()
+        receive()
     writer.close()
-    take()
-    taken = [shell.items.get_nowait() for _ in range(shell.items.qsize())]
-    assert [(kind, told.facts.written_ns) for kind, _, told in taken] == [("timing", 1), ("timing", 2)]
+    receive()
+    received = [inputs.items.get_nowait() for _ in range(inputs.items.qsize())]
+    assert [(kind, told.facts.written_ns) for kind, _, told in received] == [("timing", 1), ("timing", 2)]
 
 
 def test_what_does_not_fit_into_the_queue_is_counted(tmp_path, capfd):
-    shell = Shell({}, udp_socket(0), udp_socket(0))
-    shell.items = queue.Queue(2)
+    inputs = InputCollector({}, udp_socket(0), udp_socket(0))
+    inputs.items = queue.Queue(2)
     for k in range(5):
-        shell._put(("tick", "", tick(k)), 1)
+        inputs._put(("tick", "", tick(k)), 1)
     recorder = Recorder(tmp_path, PROFILE, manifest())
-    writer = threading.Thread(target=write_all, args=(recorder, shell))
+    writer = threading.Thread(target=write_all, args=(recorder, inputs))
     writer.start()
-    shell.items.put(None)
+    inputs.items.put(None)
     writer.join(10)
     assert recorder.dropped == 3 and manifests.read(tmp_path).dropped == 3
-    assert "3 records could not be written" in capfd.readouterr().err
+    assert "3 records" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
