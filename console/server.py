@@ -4,7 +4,7 @@ Inputs: crane and vehicle reports of the controller and mission reports of the p
 detector (UDP, requested ten times a second, optional), the controller's timing page (read once a second, optional), and
 commands by POST.  Outputs: the page, ``/ws`` with the state 20 times a second (and the mission after each report),
 ``/api/state``, ``/api/trail`` (the vehicle's track), ``/api/machine``, ``/healthz``; one ``OperatorCommand`` datagram
-per command to the controller, one ``MissionOrder`` datagram per mission command to the planner.
+per command to the controller, one ``MissionCommand`` datagram per mission command to the planner.
 
 STOP is accepted from every page that the console serves; ARM, DISARM, RESET and mission commands only from this machine
 (an ssh tunnel counts as this machine).  All resources are served from the package; no other host is contacted.
@@ -34,7 +34,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
-from can_dbc.messages.mission import MissionOrder, Order, encode_order
+from can_dbc.messages.mission import MissionAction, MissionCommand, encode_mission_command
 from can_dbc.timing.page import TimingRefused, read_timing
 from console.guards import LOOPBACK_NAMES, RequestGuards, content_security_policy, is_loopback
 from console.state import CraneState, describe_machine
@@ -81,15 +81,15 @@ class Console:
         message = OperatorCommand(self._next(), self.profile_hash, self.clock(), action)
         _send(encode(message, self.key), self.controller)
 
-    def order(self, order: Order) -> None:
+    def mission_command(self, action: MissionAction) -> None:
         """Send one mission command to the planner.
 
         Raises:
             OSError: it cannot be sent.
         """
         assert self.planner is not None
-        message = MissionOrder(self._next(), self.profile_hash, self.clock(), order)
-        _send(encode_order(message, self.key), self.planner)
+        message = MissionCommand(self._next(), self.profile_hash, self.clock(), action)
+        _send(encode_mission_command(message, self.key), self.planner)
 
     def _next(self) -> int:
         # Starts from the clock, so that commands of a restarted console are not taken for a replay.
@@ -212,13 +212,13 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
 
     async def mission(request: Request) -> Response:
         name = request.path_params["order"].upper().replace("-", "_")
-        if name not in Order.__members__:
+        if name not in MissionAction.__members__:
             return PlainTextResponse(f"Unknown mission command {name}.", 404)
         if console.planner is None:
             return PlainTextResponse("This console sends no mission commands; start it with --planner HOST:PORT.", 409)
         if not is_loopback(request.client.host if request.client else None):
             return _not_local(name)
-        return _respond(lambda: console.order(Order[name]), "planner", console.planner)
+        return _respond(lambda: console.mission_command(MissionAction[name]), "planner", console.planner)
 
     async def ws(socket: WebSocket) -> None:
         await socket.accept()

@@ -1,7 +1,7 @@
-"""What a mission tells those who watch it: the manager's state as a `MissionReport`, cut to what one datagram takes.
+"""The mission report: the manager's state, limited to the size of one datagram.
 
-Long routes and fences keep their first and last point and lose others evenly; of many logs those nearest to the machine
-are told, of those given up the last.
+Long routes and fences are thinned evenly and keep their first and last point.  Of many mapped logs the nearest ones are
+reported, of the given-up ones the last.
 """
 
 from __future__ import annotations
@@ -29,37 +29,37 @@ from can_dbc.messages.mission import (
     MAX_ROUTE_POINTS,
     MAX_TARGETS,
     MAX_TEXT_CHARS,
-    Fence,
     AbandonedLog,
-    LatLon,
+    Fence,
     KnownLog,
-    MissionReport,
     Landing,
+    LatLon,
     MachinePose,
+    MissionReport,
 )
 
-DIGITS: Final = 8
-"""Of a degree: about a millimetre."""
+DEGREE_DECIMALS: Final = 8
+"""Decimal places of a degree: about a millimetre."""
 CRANE_PHASES: Final = {
     Phase.WAIT: "",
-    Phase.LOOK: "looks for the log",
+    Phase.LOOK: "detects the log",
     Phase.ABOVE: "moves above the log",
-    Phase.DESCEND: "goes down to the log",
+    Phase.DESCEND: "descends to the log",
     Phase.CLOSE: "grips the log",
     Phase.LIFT: "lifts the log",
     Phase.CARRY: "carries the log",
     Phase.LOWER: "lowers the log",
-    Phase.OPEN: "lets the log go",
-    Phase.RETREAT: "leaves the load",
-    Phase.STOW: "goes over the bunk",
+    Phase.OPEN: "releases the log",
+    Phase.RETREAT: "retreats from the load",
+    Phase.STOW: "moves over the bunk",
     Phase.DONE: "is done",
-    Phase.FAILED: "has given up",
+    Phase.FAILED: "has failed",
 }
 T = TypeVar("T")
 
 
 class MissionPublisher:
-    """Speaks for one manager and its mission."""
+    """Makes the reports of one manager and its mission."""
 
     def __init__(self, manager: ActivityManager, mission: ForwardingMission) -> None:
         self._manager = manager
@@ -74,7 +74,7 @@ class MissionPublisher:
         self._landings = tuple(Landing(_place(x.position), _text(x.name)) for x in mission.landings[:MAX_LANDINGS])
 
     def report(self, now_ns: int, auto: bool, order: int = 0, refusal: str = "") -> MissionReport:
-        """How it stands now; ``auto``: where the switch is; ``order`` and ``refusal`` are those of the last order."""
+        """The report; ``auto`` is the mode switch, ``order`` and ``refusal`` are those of the last command."""
         manager, tally = self._manager, self._manager.tally
         given_up = list(tally.given_up.items())[-MAX_GIVEN_UP:]
         activity = manager.activity
@@ -109,7 +109,7 @@ class MissionPublisher:
         )
 
     def _targets(self) -> tuple[int, ...]:
-        """The logs of the grasp; before there is one, what the machine drives to or stands beside."""
+        """The logs of the grasp; without one, the log that the machine drives to."""
         manager = self._manager
         if manager.activity is None or manager.activity.grasp is None:
             return () if manager.target is None else (manager.target,)
@@ -127,7 +127,7 @@ class MissionPublisher:
     def _logs(self, now_ns: int) -> tuple[KnownLog, ...]:
         world = self._manager.world
         location, logs = world.location, list(world.log_map.logs)
-        if not logs:  # nor need there be a plane
+        if not logs:  # there may be no plane yet
             return ()
         if len(logs) > MAX_LOGS and location is not None and location.usable:
             here = (location.x_m, location.y_m)
@@ -149,28 +149,28 @@ class MissionPublisher:
 
 
 def _thinned(items: Sequence[T], most: int) -> list[T]:
-    """At most so many, evenly, with the first and the last."""
+    """At most ``most`` items, evenly spaced, with the first and the last."""
     if len(items) <= most:
         return list(items)
     return [items[round(k * (len(items) - 1) / (most - 1))] for k in range(most)]
 
 
 def _place(point: Point) -> LatLon:
-    return round(point.latitude_deg, DIGITS), round(point.longitude_deg, DIGITS)
+    return round(point.latitude_deg, DEGREE_DECIMALS), round(point.longitude_deg, DEGREE_DECIMALS)
 
 
 def _degrees(plane: LocalPlane, points: Sequence[Sequence[float] | np.ndarray]) -> list[LatLon]:
-    """Places of points of the plane; all at once, for one by one they would cost the planner tens of ms."""
+    """WGS84 positions of points of the plane; converted together, because single conversions would take tens of ms."""
     if not points:
         return []
     east, north = np.array(points, dtype=float).T
     origin = (plane.latitude_deg, plane.longitude_deg, plane.altitude_m)
     latitude, longitude, _ = pymap3d.enu2geodetic(east, north, np.zeros_like(east), *origin)
-    return [(round(a, DIGITS), round(b, DIGITS)) for a, b in zip(latitude.tolist(), longitude.tolist(), strict=True)]
+    return [(round(a, DEGREE_DECIMALS), round(b, DEGREE_DECIMALS)) for a, b in zip(latitude.tolist(), longitude.tolist(), strict=True)]
 
 
 def _text(text: str) -> str:
-    """Cut to what fits, in bytes; what cannot be printed would take many of them."""
+    """The text limited to the field's bytes; unprintable characters become spaces."""
     plain = "".join(c if c.isprintable() else " " for c in text)
     if len(plain.encode()) <= MAX_TEXT_CHARS:
         return plain

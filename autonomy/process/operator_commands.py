@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.mission import MissionOrder, decode_order
+from can_dbc.messages.mission import MissionCommand, decode_mission_command
 from runtime.errors import CodedError
 
 MAX_AGE_NS: Final = 1_000_000_000
@@ -27,23 +27,23 @@ class CommandReceiver:
         self._hash, self._key = profile_hash, key
         self._last = (-1, -1)
 
-    def accept(self, data: bytes, now_ns: int) -> MissionOrder:
+    def accept(self, data: bytes, now_ns: int) -> MissionCommand:
         """The command in a datagram.
 
         Raises:
             CommandRefused: it is not accepted and must not be executed.
         """
         try:
-            order = decode_order(data, self._key)
+            command = decode_mission_command(data, self._key)
         except DatagramRefused as error:
             raise CommandRefused("command.datagram", str(error)) from None
-        if order.profile_hash != self._hash:
+        if command.profile_hash != self._hash:
             raise CommandRefused("command.other-profile", "it is for a machine with another profile")
-        if order.stamp_ns > now_ns:
+        if command.stamp_ns > now_ns:
             raise CommandRefused("command.future", "its stamp lies in the future")
-        if now_ns - order.stamp_ns > MAX_AGE_NS:
-            raise CommandRefused("command.too-old", f"it is {(now_ns - order.stamp_ns) * 1e-9:.1f} s old")
-        if (order.stamp_ns, order.sequence) <= self._last:
+        if now_ns - command.stamp_ns > MAX_AGE_NS:
+            raise CommandRefused("command.too-old", f"it is {(now_ns - command.stamp_ns) * 1e-9:.1f} s old")
+        if (command.stamp_ns, command.sequence) <= self._last:
             raise CommandRefused("command.repeated", "it was sent before, or a later one was")
-        self._last = (order.stamp_ns, order.sequence)
-        return order
+        self._last = (command.stamp_ns, command.sequence)
+        return command

@@ -128,7 +128,7 @@ class PlannerProcess:
                 emit("order", order=None, refused=str(error))
                 continue
             refused = self._job.execute(command)
-            emit("order", order=command.order.name, refused=refused or None)
+            emit("order", order=command.action.name, refused=refused or None)
             self._report_ns = 0  # the operator sees the result at once
 
     def _report_mission(self, now_ns: int) -> None:

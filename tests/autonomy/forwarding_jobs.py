@@ -8,7 +8,7 @@ from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.transition_table import OURS
 from autonomy.missions.model import ForwardingMission, Point
 from autonomy.process.jobs import ForwardingJob
-from can_dbc.messages.mission import MissionOrder, Order
+from can_dbc.messages.mission import MissionCommand, MissionAction
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.manager_missions import PLANE, PROFILE
@@ -38,5 +38,5 @@ def run(forwarder: Forwarder, job: ForwardingJob, enough, limit: int = 20_000) -
     raise AssertionError(said[-5:])
 
 
-def ordered(number: int, order: Order) -> MissionOrder:
-    return MissionOrder(number, 0, 0, order)
+def command(number: int, action: MissionAction) -> MissionCommand:
+    return MissionCommand(number, 0, 0, action)

@@ -7,9 +7,9 @@ import pytest
 from autonomy.manager.transition_table import State
 from autonomy.process.jobs import STOPPING_TIMEOUT_NS
 from can_dbc.messages.datagrams import decode
-from can_dbc.messages.mission import Order
+from can_dbc.messages.mission import MissionAction
 from can_dbc.messages.vehicle import DriveSetpoint
-from tests.autonomy.forwarding_jobs import begin, ordered, run
+from tests.autonomy.forwarding_jobs import begin, command, run
 from tests.autonomy.manager_missions import LOGS
 
 
@@ -70,7 +70,7 @@ def test_a_pause_stops_the_crane_smoothly_and_auto_takes_the_log_on(phase: str) 
     run(forwarder, job, lambda j: manager.activity is not None and manager.activity.phase.name == phase)
     for _ in range(10):
         forwarder.step(job)  # type: ignore[arg-type]
-    assert job.execute(ordered(1, Order.PAUSE)) == "" and not job.report(0).auto
+    assert job.execute(command(1, MissionAction.PAUSE)) == "" and not job.report(0).auto
     for _ in range(100):  # a grip that has begun is ended; then the crane stands
         forwarder.step(job)  # type: ignore[arg-type]
     before, stands = manager.activity, forwarder.crane.q
@@ -78,6 +78,6 @@ def test_a_pause_stops_the_crane_smoothly_and_auto_takes_the_log_on(phase: str) 
         forwarder.step(job)  # type: ignore[arg-type]
     assert forwarder.crane.q == stands and manager.state is State.COLLECT and manager.activity is before
     assert forwarder.crane.setpoint is not None, "it is held, not abandoned"
-    assert job.execute(ordered(2, Order.AUTO)) == ""
+    assert job.execute(command(2, MissionAction.AUTO)) == ""
     run(forwarder, job, lambda j: j.idle)
     assert job.done and manager.tally.loaded == 1 and forwarder.in_bunk == 1

@@ -17,13 +17,13 @@ from can_dbc.messages.mission import (
     MAX_CORNERS,
     MAX_LOGS,
     MAX_ROUTE_POINTS,
-    Order,
+    MissionAction,
     decode_mission,
     encode_mission,
 )
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
-from tests.autonomy.forwarding_jobs import begin, ordered, run
+from tests.autonomy.forwarding_jobs import begin, command, run
 from tests.autonomy.manager_missions import LOGS, PLANE, PROFILE
 from tests.autonomy.mapped_logs import lying
 
@@ -72,26 +72,26 @@ def test_orders_are_done_and_told() -> None:
     forwarder, job, manager = begin()
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
 
-    def give(number: int, order: Order) -> str:
-        refusal = job.execute(ordered(number, order))
+    def give(number: int, action: MissionAction) -> str:
+        refusal = job.execute(command(number, action))
         told = job.report(forwarder.crane.now_ns)
         assert (told.order, told.refusal) == (number, refusal)
         return refusal
 
-    assert give(1, Order.PAUSE) == "" and not job.report(0).auto
+    assert give(1, MissionAction.PAUSE) == "" and not job.report(0).auto
     run(forwarder, job, lambda j: forwarder.speed_m_s == 0.0)
     assert job.report(forwarder.crane.now_ns).paused
-    assert give(2, Order.NEXT_STEP) == "nothing waits for the next step"
-    assert give(3, Order.SINGLE_STEP) == "" and job.report(0).single_step
-    assert give(4, Order.AUTO) == "" and job.report(0).auto
+    assert give(2, MissionAction.NEXT_STEP) == "nothing waits for the next step"
+    assert give(3, MissionAction.SINGLE_STEP) == "" and job.report(0).single_step
+    assert give(4, MissionAction.AUTO) == "" and job.report(0).auto
     run(forwarder, job, lambda j: manager.pending_event is not None)
     assert (
         job.report(forwarder.crane.now_ns).waits_for == EVENT_DESCRIPTIONS[Event.ROUTE_END]
         and manager.state is State.SEARCH
     )
-    assert give(5, Order.NEXT_STEP) == ""
+    assert give(5, MissionAction.NEXT_STEP) == ""
     run(forwarder, job, lambda j: manager.state is State.DONE)
-    assert give(6, Order.AUTO) == "the mission has ended" and job.report(0).ended
+    assert give(6, MissionAction.AUTO) == "the mission has ended" and job.report(0).ended
 
 
 def test_it_speaks_before_the_machine_is_located() -> None:
@@ -108,9 +108,9 @@ def test_it_speaks_before_the_machine_is_located() -> None:
 
 def test_run_through_needs_no_more_steps() -> None:
     forwarder, job, manager = begin()
-    job.execute(ordered(1, Order.SINGLE_STEP))
+    job.execute(command(1, MissionAction.SINGLE_STEP))
     run(forwarder, job, lambda j: manager.pending_event is Event.AUTO)
-    job.execute(ordered(2, Order.RUN_THROUGH))
+    job.execute(command(2, MissionAction.RUN_THROUGH))
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     assert not job.report(0).single_step
 
@@ -118,7 +118,7 @@ def test_run_through_needs_no_more_steps() -> None:
 def test_an_ordered_abort_ends_the_mission_and_says_by_whom() -> None:
     forwarder, job, _ = begin()
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
-    assert job.execute(ordered(1, Order.ABORT)) == ""
+    assert job.execute(command(1, MissionAction.ABORT)) == ""
     run(forwarder, job, lambda j: j.idle)
     told = job.report(forwarder.crane.now_ns)
     assert told.ended and told.failure == job.failure == ABORTED and forwarder.speed_m_s < 0.05
@@ -132,8 +132,8 @@ def test_one_log_can_be_ended_but_has_no_mission() -> None:
             self.failure = reason
 
     job = SingleLogJob(crane := Crane())  # type: ignore[arg-type]
-    assert "no mission" in job.execute(ordered(1, Order.PAUSE)) and not crane.failure
-    assert job.execute(ordered(2, Order.ABORT)) == "" and crane.failure == ABORTED
+    assert job.execute(command(1, MissionAction.PAUSE)) and not crane.failure
+    assert job.execute(command(2, MissionAction.ABORT)) == "" and crane.failure == ABORTED
     assert job.report(0) is None
 
 

@@ -12,7 +12,13 @@ import pytest
 
 from autonomy.process.command_line import arguments
 from autonomy.process.planner_process import PlannerProcess
-from can_dbc.messages.mission import MissionOrder, MissionReport, Order, decode_mission, encode_order
+from can_dbc.messages.mission import (
+    MissionAction,
+    MissionCommand,
+    MissionReport,
+    decode_mission,
+    encode_mission_command,
+)
 from tests.can_dbc.mission_told import TOLD
 
 HASH, KEY = 77, b"key"
@@ -25,7 +31,7 @@ class Jobless:
     failure = None
 
     def __init__(self) -> None:
-        self.ordered: list[Order] = []
+        self.executed: list[MissionAction] = []
 
     def step(self, *_: object) -> list[bytes]:
         return []
@@ -33,9 +39,9 @@ class Jobless:
     def events(self) -> Iterator[Any]:
         return iter(())
 
-    def execute(self, order: MissionOrder) -> str:
-        self.ordered.append(order.order)
-        return "not now" if order.order is Order.PAUSE else ""
+    def execute(self, command: MissionCommand) -> str:
+        self.executed.append(command.action)
+        return "not now" if command.action is MissionAction.PAUSE else ""
 
     def report(self, now_ns: int) -> MissionReport:
         return TOLD
@@ -61,10 +67,13 @@ def process(watcher) -> Iterator[tuple[PlannerProcess, Jobless]]:
     made.close()
 
 
-def give(process: PlannerProcess, order: Order, key: bytes | None = KEY, late_ns: int = 0) -> None:
+def give(process: PlannerProcess, action: MissionAction, key: bytes | None = KEY, late_ns: int = 0) -> None:
     now_ns = time.monotonic_ns()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        out.sendto(encode_order(MissionOrder(1, HASH, now_ns - late_ns, order), key), process._commands.getsockname())
+        out.sendto(
+            encode_mission_command(MissionCommand(1, HASH, now_ns - late_ns, action), key),
+            process._commands.getsockname(),
+        )
     process.step(time.monotonic_ns())
 
 
@@ -73,16 +82,16 @@ def said(capsys) -> list[dict[str, Any]]:
 
 
 def test_a_command_is_executed_and_emitted(process, capsys) -> None:
-    give(process[0], Order.ABORT)
-    give(process[0], Order.PAUSE)
-    assert process[1].ordered == [Order.ABORT, Order.PAUSE]
+    give(process[0], MissionAction.ABORT)
+    give(process[0], MissionAction.PAUSE)
+    assert process[1].executed == [MissionAction.ABORT, MissionAction.PAUSE]
     assert [(m.get("order"), m.get("refused")) for m in said(capsys)] == [("ABORT", None), ("PAUSE", "not now")]
 
 
 def test_old_and_unsigned_commands_are_not_executed(process, capsys) -> None:
-    give(process[0], Order.ABORT, late_ns=2_000_000_000)
-    give(process[0], Order.ABORT, key=None)
-    assert process[1].ordered == []
+    give(process[0], MissionAction.ABORT, late_ns=2_000_000_000)
+    give(process[0], MissionAction.ABORT, key=None)
+    assert process[1].executed == []
     first, second = said(capsys)
     assert "order" not in first and "2.0 s" in first["refused"] and second["refused"]
 
@@ -99,7 +108,7 @@ def test_reports_are_sent_twice_a_second_and_after_a_command(process, watcher) -
         except BlockingIOError:
             break
     assert [report for *_, report in reports] == [TOLD] * 4 and reports[0][:2] == (HASH, begin_ns)
-    give(process[0], Order.AUTO)
+    give(process[0], MissionAction.AUTO)
     assert watcher.recv(65536)
 
 

@@ -16,7 +16,7 @@ import uvicorn
 
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
-from can_dbc.messages.mission import MissionReport, Order, decode_order, encode_mission
+from can_dbc.messages.mission import MissionAction, MissionReport, decode_mission_command, encode_mission
 from console.server import Console, create_app
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
@@ -75,8 +75,8 @@ class Stage:
         for thread in self._threads:
             thread.join()
 
-    def ordered(self) -> Order:
-        return decode_order(self.orders.recv(100)).order
+    def ordered(self) -> MissionAction:
+        return decode_mission_command(self.orders.recv(100)).action
 
     def _feed(self) -> None:
         q = (0.4, 0.9, -1.6, 0.5, 0.0)
@@ -148,11 +148,13 @@ def test_the_map_shows_route_log_target_and_machine(stage: Stage, browser: Brows
 
 @pytest.mark.parametrize(
     ("button", "before", "order"),
-    [("pause", {}, Order.PAUSE), ("auto", {"auto": False}, Order.AUTO), ("single", {}, Order.SINGLE_STEP),
-     ("single", {"single_step": True}, Order.RUN_THROUGH),
-     ("next-step", {"single_step": True, "waits_for": "a log is near"}, Order.NEXT_STEP)],
+    [("pause", {}, MissionAction.PAUSE), ("auto", {"auto": False}, MissionAction.AUTO),
+     ("single", {}, MissionAction.SINGLE_STEP), ("single", {"single_step": True}, MissionAction.RUN_THROUGH),
+     ("next-step", {"single_step": True, "waits_for": "a log is near"}, MissionAction.NEXT_STEP)],
 )  # fmt: skip
-def test_a_click_gives_the_order(stage: Stage, browser: Browser, button: str, before: dict, order: Order) -> None:
+def test_a_click_gives_the_order(
+    stage: Stage, browser: Browser, button: str, before: dict, order: MissionAction
+) -> None:
     stage.mission = msgspec.structs.replace(TOLD, state="SEARCH", words="is another", **before)
     shows(browser, "mission-words", "is another")
     browser.until(f"!document.getElementById('{button}').disabled")
@@ -171,7 +173,9 @@ def test_an_abort_is_asked_for_twice(stage: Stage, browser: Browser) -> None:
     browser.until("document.getElementById('end').open")
     browser.click("end-yes")
     browser.click("pause")
-    assert [stage.ordered(), stage.ordered()] == [Order.ABORT, Order.PAUSE], "and the first click ordered nothing"
+    assert [stage.ordered(), stage.ordered()] == [MissionAction.ABORT, MissionAction.PAUSE], (
+        "and the first click ordered nothing"
+    )
 
 
 def test_what_stands_still_says_why(stage: Stage, browser: Browser) -> None:

@@ -12,7 +12,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from can_dbc.messages.datagrams import encode
-from can_dbc.messages.mission import MissionOrder, Order, decode_order, encode_mission
+from can_dbc.messages.mission import MissionAction, MissionCommand, decode_mission_command, encode_mission
 from can_dbc.messages.vehicle import VEHICLE_INPUTS, Driving
 from console.map_projection import MapProjection
 from console.mission_state import DRIVING, FIXES, INPUT_NAMES, MISSION_TIMEOUT_NS, TRAIL_M, VEHICLE_TIMEOUT_NS
@@ -150,14 +150,14 @@ def console_of(planner=None, key=None) -> Console:
     return Console(PROFILE, HASH, key=key, planner=planner and planner.getsockname(), clock=lambda: 10**10)
 
 
-@pytest.mark.parametrize("order", list(Order))
+@pytest.mark.parametrize("order", list(MissionAction))
 def test_an_order_sends_its_datagram(planner, order) -> None:
     client = client_of(console_of(planner, b"key"))
     for _ in range(2):
         name = order.name.lower().replace("_", "-")
         assert client.post(f"/api/mission/{name}", headers={"origin": BASE}).status_code == 204
-    first, second = (decode_order(planner.recv(100), b"key") for _ in range(2))
-    assert first == MissionOrder(first.sequence, HASH, 10**10, order) and second.sequence > first.sequence
+    first, second = (decode_mission_command(planner.recv(100), b"key") for _ in range(2))
+    assert first == MissionCommand(first.sequence, HASH, 10**10, order) and second.sequence > first.sequence
 
 
 def test_orders_pass_the_same_guards_as_commands(planner) -> None:
