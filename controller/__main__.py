@@ -20,10 +20,10 @@ from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.bus.filters import FilterItem
 from can_dbc.dbc.codec import DbcError
 from can_dbc.dbc.codec import load as read_dbc
-from can_dbc.messages.udp_address import udp_address
+from can_dbc.messages.udp_address import address_argument
 from can_dbc.timing.page import METRIC_KEYS, STAGES, TimingWriter, default_path
 from controller.config import ConfigError, Settings, load
-from controller.process.loop import Address, Loop
+from controller.process.loop import Loop
 from controller.process.realtime import make_sleep, prepare, stop_garbage_collection
 from controller.process.timing import LoopTiming
 from controller.process.warm_up import warm_up
@@ -33,14 +33,6 @@ from machine.status.modes import Mode
 from runtime.allocator import keep_memory
 
 PRIORITY: Final = 80
-
-
-def address(text: str) -> Address:
-    """Parse HOST:PORT; raises ArgumentTypeError."""
-    try:
-        return udp_address(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def parser() -> argparse.ArgumentParser:
@@ -55,9 +47,9 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--bus", type=bus_address, action="append", default=[], metavar="NAME=ADDRESS",
                       help="address of crane0 and, on a machine with a carrier, of mach0")  # fmt: skip
     made.add_argument("--setpoint-port", type=int, required=True, help="UDP port on 127.0.0.1; 0 chooses a free one")
-    made.add_argument("--report", type=address, action="append", default=[], metavar="HOST:PORT",
+    made.add_argument("--report", type=address_argument, action="append", default=[], metavar="HOST:PORT",
                       help="receiver of state reports; may be given more than once")  # fmt: skip
-    made.add_argument("--record", type=address, metavar="HOST:PORT", help="receiver of every tick's record")
+    made.add_argument("--record", type=address_argument, metavar="HOST:PORT", help="receiver of every tick's record")
     made.add_argument("--rate", type=int, default=0, metavar="HZ", help="control rate; default: the profile's")
     made.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
     made.add_argument("--cpu", type=int, help="processor to run on; use only an isolated one")

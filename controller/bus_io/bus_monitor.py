@@ -23,8 +23,17 @@ class BusMonitor:
     """Monitors one bus; `update` once per tick.  ``number`` is 0 for crane0 and 1 for mach0."""
 
     __slots__ = (
-        "_dropped", "_recoveries", "_recovered_ns", "_recovery_count", "_refused", "_refusing_ticks",
-        "_unusable_until_ns", "frames_lost", "number", "reason", "recovered",
+        "_dropped",
+        "_recovered_ns",
+        "_recoveries",
+        "_recovery_count",
+        "_refused",
+        "_refusing_ticks",
+        "_unusable_until_ns",
+        "frames_lost",
+        "number",
+        "reason",
+        "recovered",
     )  # fmt: skip
 
     def __init__(self, number: int) -> None:

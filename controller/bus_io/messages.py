@@ -22,7 +22,7 @@ class PeriodicTimer:
     messages of the same period do not all fall into one tick.
     """
 
-    __slots__ = ("_offset_ns", "_next_ns", "_period_ns")
+    __slots__ = ("_next_ns", "_offset_ns", "_period_ns")
 
     def __init__(self, period_ns: int, offset_ns: int = 0) -> None:
         self._period_ns = period_ns

@@ -41,8 +41,8 @@ class Crane:
 
     __slots__ = (
         "_check", "_estimators", "_final", "_gate", "_grapple_request", "_inputs", "_load", "_load_due",
-        "_load_updated", "_opening_sensed", "_pressure_pairs", "_pressures_bar", "_sensed", "commands", "governor", "grapple", "law",
-        "lease_end_ns", "leased", "load_kg", "spool_run", "spools_pct", "sway",
+        "_load_updated", "_opening_sensed", "_pressure_pairs", "_pressures_bar", "_sensed", "commands", "governor",
+        "grapple", "law", "lease_end_ns", "leased", "load_kg", "spool_run", "spools_pct", "sway",
     )  # fmt: skip
 
     def __init__(

@@ -39,7 +39,13 @@ class NodeMonitor:
     """Monitors the required nodes: safety nodes, pressure modules and ``encoder_nodes``."""
 
     __slots__ = (
-        "_communication_count", "_communication_ns", "_finding", "_good_until_ns", "_heartbeats", "_changed", "booted",
+        "_changed",
+        "_communication_count",
+        "_communication_ns",
+        "_finding",
+        "_good_until_ns",
+        "_heartbeats",
+        "booted",
         "by_number",
     )  # fmt: skip
 

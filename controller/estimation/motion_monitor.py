@@ -40,8 +40,23 @@ class MotionMonitor:
     """Monitors one joint; `step` returns the fault, or `Reason.NONE`."""
 
     __slots__ = (
-        "_against", "_at", "_behind", "_decay", "_early", "_early_at", "_early_lag", "_command_decay", "_expected",
-        "_late", "_late_lag", "_limit", "_line", "_min_travel", "_overspeed", "_period_s", "_recent_command",
+        "_against",
+        "_at",
+        "_behind",
+        "_command_decay",
+        "_decay",
+        "_early",
+        "_early_at",
+        "_early_lag",
+        "_expected",
+        "_late",
+        "_late_lag",
+        "_limit",
+        "_line",
+        "_min_travel",
+        "_overspeed",
+        "_period_s",
+        "_recent_command",
     )  # fmt: skip
 
     def __init__(self, spec: TrackedJoint, period_s: float, later_s: float = 0.0, lag_s: float = LATE_LAG_S) -> None:

@@ -22,7 +22,7 @@ from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.bus.reconnector import Reconnector
 from can_dbc.dbc.codec import DbcError, load
 from can_dbc.frame import Frame
-from can_dbc.messages.udp_address import udp_address
+from can_dbc.messages.udp_address import address_argument
 from can_dbc.plc.map import WordOrder
 from can_dbc.plc.modbus import is_loopback
 from controller.config import ConfigError
@@ -38,14 +38,6 @@ TX_QUEUE: Final = 64
 """Frames; this process emulates a dozen nodes."""
 
 
-def address(text: str) -> tuple[str, int]:
-    """Parse HOST:PORT; raises ArgumentTypeError."""
-    try:
-        return udp_address(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(
@@ -57,8 +49,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--profile", required=True, help="shipped profile name or TOML file with a [plc] table")
     made.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="address of the crane bus")
     link = made.add_mutually_exclusive_group(required=True)
-    link.add_argument("--modbus", type=address, metavar="HOST:PORT", help="the PLC's Modbus/TCP server")
-    link.add_argument("--udp", type=address, metavar="HOST:PORT", help="the PLC's port for cyclic datagrams")
+    link.add_argument("--modbus", type=address_argument, metavar="HOST:PORT", help="the PLC's Modbus/TCP server")
+    link.add_argument("--udp", type=address_argument, metavar="HOST:PORT", help="the PLC's port for cyclic datagrams")
     made.add_argument("--word-order", choices=("high", "low"), default="high", help="which half of 32 bits comes first")
     made.add_argument("--allow-network", action="store_true", help="the PLC may be on another host")
     made.add_argument("--no-realtime", action="store_true", help="do not request FIFO scheduling and locked memory")

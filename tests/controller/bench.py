@@ -1,8 +1,8 @@
-"""A bench for the controller: emulated nodes and an integrator for a crane, in virtual time, in one process.
+"""Test bench for the controller: emulated nodes and a simple crane, in virtual time, in one process.
 
-It answers SDO like an encoder, sends every input frame at its period with a valid E2E header, and turns spool
-commands into joint motion through dead time, lag and dead-band.  A machine with a carrier (`AORO`) has mach0 too.
-Faults are put on by name: ``dropped`` messages, ``changed`` signals, ``corrupt`` messages.
+The bench answers SDO like an encoder, sends every input frame at its period with a valid E2E header, and turns spool
+commands into joint motion through dead time, lag and dead-band.  A machine with a carrier (`AORO`) has mach0 as well.
+Faults are injected by name: ``dropped`` messages, ``changed`` signals, ``corrupt`` messages.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ DEVICE = {"rotary": 0x00010196, "linear": 0x00080196}
 
 
 def count_until(tick: Callable[[], Any], done: Callable[[], bool], limit: int = 100) -> int:
-    """How many ticks it takes until ``done``; fails when it does not come about."""
+    """Number of ticks until ``done``; fails after ``limit`` ticks."""
     for k in range(1, limit + 1):
         tick()
         if done():
@@ -114,7 +114,7 @@ class EncoderNode:
 
 
 class Bench:
-    """A controller and its surroundings; `tick` advances both by one period."""
+    """A controller and its environment; `tick` advances both by one period."""
 
     def __init__(self, settings=SETTINGS, start_ns: int = 1_000_000_000, home=HOME, guard=None) -> None:
         self.settings = settings
@@ -155,13 +155,13 @@ class Bench:
         self.machine_extra: list[tuple[int, bytes]] = []
         self.machine_commands: dict[str, dict[str, Any]] = {}
         self.machine_sent: list[tuple[int, bytes]] = []
-        """Everything the controller said on mach0."""
+        """All frames that the controller sent on mach0."""
         self.last_frames: dict[str, Frame] = {}
         if guard is not None:
             self.dropped.add("GuardStat")
             del self.nodes[0x7D]
 
-    # -- surroundings
+    # -- environment
 
     def tick(self, datagrams: Iterable[bytes] = (), **measured: int) -> Outputs:
         """One period: the frames answered to the last SYNC reach the controller, which then steps."""
@@ -178,12 +178,12 @@ class Bench:
             else:
                 setattr(self.inputs, name, value)
         outputs = step(self.controller, self.inputs, self.now_ns)
-        self._obey(outputs)
-        self._obey_machine(outputs)
+        self._apply_crane_frames(outputs)
+        self._apply_carrier_frames(outputs)
         if self.guard is not None:
-            heard = [frame for frame in self.inputs.frames if frame.key not in (0x1FD, 0x77D)]
-            heard += [Frame(self.now_ns, key, data) for key, data in outputs.frames]
-            self.pending += self.guard.step(self.now_ns, heard)
+            frames = [frame for frame in self.inputs.frames if frame.key not in (0x1FD, 0x77D)]
+            frames += [Frame(self.now_ns, key, data) for key, data in outputs.frames]
+            self.pending += self.guard.step(self.now_ns, frames)
         if outputs.report is not None:
             report = decode(outputs.report, self.settings.key)
             assert isinstance(report, StateReport)
@@ -243,7 +243,7 @@ class Bench:
             data = bytes([data[0] ^ 0x55]) + data[1:]
         return codec.key, data
 
-    def _obey(self, outputs: Outputs) -> None:
+    def _apply_crane_frames(self, outputs: Outputs) -> None:
         a, b = DATABASE.message("ValveCmdA"), DATABASE.message("ValveCmdB")
         for key, data in outputs.frames:
             if key == a.key:
@@ -277,14 +277,14 @@ class Bench:
             self.v[j] = self.moves_alone.get(j, 0.0) + (-self.v[j] if j in self.backward else self.v[j])
             self.q[j] += self.v[j] * T * 1e-9
 
-    def _obey_machine(self, outputs: Outputs) -> None:
+    def _apply_carrier_frames(self, outputs: Outputs) -> None:
         self.machine_sent += outputs.machine_frames
         for key, data in outputs.machine_frames:
             codec = MACHINE.find(key)
             assert codec is not None
             self.machine_commands[codec.name] = codec.named(codec.decode(data))
 
-    # -- what a person and a planner say
+    # -- messages of the operator and the planner
 
     def operator(self, action: OperatorAction, **fields: int) -> bytes:
         self.sequence += 1
@@ -306,7 +306,7 @@ class Bench:
         return self.setpoint([(0, reference, [0.0] * 5), (400, reference, [0.0] * 5)], **fields)
 
     def moving(self, j: int, speed: float, lease_ms: int = 200, **fields) -> bytes:
-        """A setpoint that goes on from the reference with a constant velocity of one joint."""
+        """A setpoint that continues from the reference with a constant velocity of one joint."""
         start = list(self.controller.reference_position)
         v = [0.0] * 5
         v[j] = speed

@@ -1,4 +1,4 @@
-"""A bench that drives: a carrier of rigid geometry behind VehCmd and ArmCmd, and a GNSS receiver on its front half."""
+"""Test bench with a driving carrier: rigid geometry behind VehCmd and ArmCmd, and a GNSS receiver on the front half."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ TRANSPORT = (CARRIER.arm_transport_m,) * 4
 
 
 class DriveBench(Bench):
-    """Adds a carrier that moves.  ``east_m``, ``north_m`` and ``yaw_rad`` are of the front axle; what is in ``lies`` is
-    sent in place of what is true.
+    """Adds a moving carrier.  ``east_m``, ``north_m`` and ``yaw_rad`` are of the front axle; values in ``lies`` are
+    sent in place of the true ones.
     """
 
     def __init__(self) -> None:
@@ -40,11 +40,11 @@ class DriveBench(Bench):
         self._rates = deque([0.0] * (round(CARRIER.steer_valve.delay_s * 1e9) // T))
         self._spools = deque([(0.0,) * 4] * (round(CARRIER.arm_valve.delay_s * 1e9) // T))
         self._epochs: deque[tuple[int, dict[str, dict[str, Any]]]] = deque()
-        self._show()
+        self._update_nodes()
 
     def tick(self, datagrams=(), **measured):
         self._move()
-        self._show()
+        self._update_nodes()
         return super().tick(datagrams, **measured)
 
     def _move(self) -> None:
@@ -68,8 +68,8 @@ class DriveBench(Bench):
             full = valve.full_speed_plus if plus else -valve.full_speed_minus
             self.heights_m[i] += full * max(0.0, abs(spool) - dead) / (100.0 - dead) * dt
 
-    def _show(self) -> None:
-        """What the nodes send from here on."""
+    def _update_nodes(self) -> None:
+        """Update the values that the nodes send."""
         self.articulation_rad = self.bend_rad
         middle = CARRIER.arm_travel_m / 2
         # The epoch is measured now and sent 70 ms later.
@@ -99,7 +99,7 @@ class DriveBench(Bench):
         for name, values in self.lies.items():
             self.changed[name] = self.changed.get(name, {}) | values
 
-    # -- what a planner says
+    # -- messages of the planner
 
     def to(self, east_m: float, north_m: float, speed_m_s: float = 0.6, **fields) -> bytes:
         """A drive setpoint to a waypoint."""
@@ -122,13 +122,13 @@ class DriveBench(Bench):
         return encode(DriveSetpoint(**values))
 
     def go(self, ticks: int, *place: float, **fields) -> DriveBench:
-        """Drives to a waypoint, the planner renewing its setpoint every 50 ms."""
+        """Drive to a waypoint with a setpoint every 50 ms."""
         for k in range(ticks):
             self.tick([self.to(*(place or (50.0, 0.0)), **fields)] if k % 10 == 0 and self.operating else ())
         return self
 
     def under_way(self, ticks: int = 400, *place: float, **fields) -> DriveBench:
-        """Armed, and on its way for a while."""
+        """Arm and drive for a while."""
         self.armed()
         self.run(40)
         self.go(ticks, *place, **fields)

@@ -1,4 +1,4 @@
-"""Losses and faults of mach0 and of both buses: reaction, bound, neutral in time; and a bus that comes back."""
+"""Faults of mach0 and of both buses: reaction, time to neutral, and recovery."""
 
 import pytest
 
@@ -14,7 +14,7 @@ S = 1_000_000_000
 
 
 def until_reason(bench, reason, limit=120):
-    """Ticks until the reason stands; the planner goes on sending."""
+    """Number of ticks until the reason is set; the planner continues to send."""
     for k in range(1, limit + 1):
         bench.tick([bench.moving(0, 0.08)] if k % 10 == 0 and bench.mode is Mode.ACTIVE else ())
         if bench.reason == reason:
@@ -31,7 +31,7 @@ LOSSES = [
 
 @pytest.mark.parametrize(("name", "reason"), LOSSES)
 @pytest.mark.parametrize("how", ["dropped", "corrupt", "frozen"])
-def test_loss_of_the_carrier_or_its_arms_is_neutral_within_the_promise(name, reason, how):
+def test_loss_of_carrier_or_arms_is_neutral_in_time(name, reason, how):
     bench = Bench(AORO).active()
     while name not in [MACHINE.find(f.key).name for f in bench.inputs.machine_frames if MACHINE.find(f.key)]:
         bench.drive(0, 0.08, 1)
@@ -45,7 +45,7 @@ def test_loss_of_the_carrier_or_its_arms_is_neutral_within_the_promise(name, rea
     assert bench.mode is Mode.FAULT, "a fault stays until a human resets it"
 
 
-def test_without_the_carrier_nothing_is_armed():
+def test_arming_needs_the_carrier():
     bench = Bench(AORO)
     bench.dropped.add("ArmHeightA")
     bench.run(200)
@@ -59,7 +59,7 @@ def test_without_the_carrier_nothing_is_armed():
     ("name", "reason"),
     [("PositionRapidUpdate", Reason.GNSS_LOST), ("VesselHeading", Reason.GNSS_LOST), ("EEC1", Reason.ENGINE_LOST)],
 )
-def test_position_and_engine_are_missed_in_words_only(name, reason):
+def test_loss_of_position_or_engine_is_only_reported(name, reason):
     bench = Bench(AORO).active()
     bench.dropped.add(name)
     assert until_reason(bench, reason, 140) * T <= FAULTS[reason].bound_ms * MS + 100 * MS  # one period before it
@@ -70,14 +70,14 @@ def test_position_and_engine_are_missed_in_words_only(name, reason):
     assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE
 
 
-def test_a_receiver_without_a_fix_is_a_lost_position():
+def test_receiver_without_a_fix_is_a_lost_position():
     bench = Bench(AORO).boot()
     bench.changed["PositionRapidUpdate"] = {"Latitude": None, "Longitude": None}
     bench.run(21)
     assert bench.mode is Mode.STANDBY and bench.reason == Reason.GNSS_LOST
 
 
-def test_another_controller_on_mach0_is_noticed_in_every_mode():
+def test_foreign_controller_on_mach0_is_detected_in_every_mode():
     for prepare in (Bench.boot, Bench.armed, Bench.active):
         bench = prepare(Bench(AORO))
         bench.machine_extra.append((MACHINE.message("VehCmd").key, bytes(8)))
@@ -87,7 +87,7 @@ def test_another_controller_on_mach0_is_noticed_in_every_mode():
     assert "the machine bus" in describe(Reason.FOREIGN_CONTROLLER, 1)
 
 
-def test_a_lost_address_stops_the_machine():
+def test_lost_address_stops_the_machine():
     bench = Bench(AORO).active()
     bench.machine_extra.append((MACHINE.message("AddressClaim").key, bytes(8)))
     assert until_reason(bench, Reason.ADDRESS_LOST) * T <= FAULTS[Reason.ADDRESS_LOST].bound_ms * MS
@@ -100,7 +100,7 @@ def test_a_lost_address_stops_the_machine():
     [(3, Reason.BUS_OFF, Mode.FAULT), (4, Reason.BUS_DOWN, Mode.FAULT), (2, Reason.BUS_PASSIVE, Mode.ACTIVE),
      (1, Reason.NONE, Mode.ACTIVE)],
 )  # fmt: skip
-def test_machine_bus_state(state, reason, mode):
+def test_mach0_bus_state(state, reason, mode):
     bench = Bench(AORO).active()
     bench.tick(machine_bus_state=state)
     assert bench.mode is mode and bench.reason == reason
@@ -109,7 +109,7 @@ def test_machine_bus_state(state, reason, mode):
 
 
 @pytest.mark.parametrize("prepare", [Bench.boot, Bench.armed])
-def test_machine_bus_off_latches_while_nothing_moves(prepare):
+def test_mach0_bus_off_latches_while_nothing_moves(prepare):
     bench = prepare(Bench(AORO))
     bench.tick(machine_bus_state=3)
     assert bench.mode is Mode.FAULT and bench.reason == Reason.BUS_OFF
@@ -119,7 +119,7 @@ def test_three_refused_sends_in_a_row_on_mach0_stop_and_two_do_not():
     bench = Bench(AORO).active()
 
     def send(refused):
-        """Up to the tick in which a refusal of the next commands is seen."""
+        """Tick until the refusal of the next commands is seen."""
         while not bench.controller.outputs.machine_frames:
             bench.drive(0, 0.08, 1)
         bench.tick([bench.moving(0, 0.08)], machine_bus_refused=refused)
@@ -139,11 +139,11 @@ def test_frames_of_an_overflowed_tick_of_mach0_are_not_used():
     machine, crane = bench.controller.carrier_bus.inputs, bench.controller.crane_inputs
     while bench.count % 4:
         bench.drive(0, 0.08, 1)
-    heard, others = machine.count, crane.count
+    count, others = machine.count, crane.count
     bench.tick([bench.moving(0, 0.08)], machine_bus_dropped=3)
-    assert machine.count == heard and crane.count > others
+    assert machine.count == count and crane.count > others
     bench.drive(0, 0.08, 4)
-    assert machine.count > heard and bench.mode is Mode.ACTIVE
+    assert machine.count > count and bench.mode is Mode.ACTIVE
 
 
 # -- a bus that comes back ----------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ PREPARED = {"start": lambda b: b.run(60), "standby": Bench.boot, "armed": Bench.
 
 
 @pytest.mark.parametrize("prepare", PREPARED.values(), ids=PREPARED)
-def test_a_recovery_of_crane0_begins_anew(prepare):
+def test_recovery_of_crane0_forgets_all_inputs(prepare):
     bench = Bench()
     prepare(bench)
     received = bench.controller.crane_inputs
@@ -160,11 +160,11 @@ def test_a_recovery_of_crane0_begins_anew(prepare):
     bench.encoders[3].writes.clear()
     outputs = bench.tick(bus_recoveries=1)
     assert bench.mode is Mode.FAULT and bench.reason == Reason.BUS_OFF and bench.neutral
-    assert received.count == count, "what came with it is not trusted"
+    assert received.count == count, "frames received with the recovery are not used"
     assert all(state.values is None for state in received.messages)
     assert not any(received.nodes.operational(n, bench.now_ns) for n in received.nodes.by_number)
     silenced = [data[1] for key, data in outputs.frames if key == 0 and data[0] == 0x80]
-    assert len(silenced) == 1 and silenced[0] in bench.encoders, "an encoder is silenced, to be asked anew"
+    assert len(silenced) == 1 and silenced[0] in bench.encoders, "an encoder is silenced before it is set up again"
     bench.run(2)
     assert received.guard.values is None, "two good frames qualify"
     bench.run(200)
@@ -176,7 +176,7 @@ def test_a_recovery_of_crane0_begins_anew(prepare):
     assert bench.mode is Mode.ARMED
 
 
-def test_a_device_swapped_while_the_bus_was_off_is_noticed():
+def test_device_swapped_during_bus_off_is_detected():
     bench = Bench().boot()
     bench.encoders[2].objects[0x1018, 1] = 8
     bench.tick(bus_recoveries=1)
@@ -186,7 +186,7 @@ def test_a_device_swapped_while_the_bus_was_off_is_noticed():
     assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 2
 
 
-def test_a_reset_does_not_pass_by_the_start_up_of_a_bus_that_came_back():
+def test_reset_does_not_skip_start_up_after_recovery():
     bench = Bench().active()
     bench.tick(bus_recoveries=1)
     bench.tick([bench.operator(OperatorAction.RESET)])
@@ -197,7 +197,7 @@ def test_a_reset_does_not_pass_by_the_start_up_of_a_bus_that_came_back():
     assert bench.mode is Mode.STANDBY and bench.reason == Reason.NONE
 
 
-def test_a_node_that_is_silent_after_a_recovery_is_missed():
+def test_node_silent_after_recovery_is_detected():
     bench = Bench().boot()
     bench.silent_nodes.add(0x10)
     bench.tick(bus_recoveries=1)
@@ -211,7 +211,7 @@ def test_a_node_that_is_silent_after_a_recovery_is_missed():
 
 
 @pytest.mark.parametrize("prepare", PREPARED.values(), ids=PREPARED)
-def test_a_recovery_of_mach0_begins_anew(prepare):
+def test_recovery_of_mach0_forgets_all_inputs(prepare):
     bench = Bench(AORO)
     prepare(bench)
     machine = bench.controller.carrier_bus.inputs
@@ -222,7 +222,7 @@ def test_a_recovery_of_mach0_begins_anew(prepare):
     assert bench.controller.supervisor.detail == 1
     assert machine.count == count and all(state.values is None for state in machine.messages)
     assert bench.machine_sent[0][0] == MACHINE.message("AddressClaim").key
-    assert bench.controller.startup.complete is start_up, "crane0 was not touched"
+    assert bench.controller.startup.complete is start_up, "crane0 is not affected"
     bench.run(150)
     bench.tick([bench.operator(OperatorAction.RESET)])
     bench.tick([bench.operator(OperatorAction.ARM)])
@@ -247,7 +247,7 @@ def test_three_recoveries_within_a_minute_refuse_arming_for_a_minute(settings, w
     assert not monitor.usable(last_ns + 60 * S - 1) and monitor.usable(last_ns + 60 * S)
 
 
-def test_recoveries_that_are_far_apart_do_no_harm():
+def test_recoveries_far_apart_do_not_refuse_arming():
     bench = Bench().boot()
     monitor = bench.controller.crane_bus_monitor
     reading = bench.inputs.bus

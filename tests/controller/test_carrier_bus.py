@@ -1,4 +1,4 @@
-"""mach0: the address claim, what is said and how often, what is heard and how old it is, and that nothing raises."""
+"""mach0: address claim, frames sent and their periods, received values and their age; no input raises."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def of(bench, name):
 # -- address ------------------------------------------------------------------------------------------------
 
 
-def test_the_address_is_claimed_once_and_before_anything_else():
+def test_address_is_claimed_once_before_any_other_frame():
     bench = Bench(AORO)
     bench.run(40)
     assert bench.machine_sent[0][0] == CLAIM.key == 0x98EEFF27
@@ -54,16 +54,16 @@ def test_the_address_is_claimed_once_and_before_anything_else():
     ("asked", "answers"),
     [(request(), 1), (request(0x27), 1), (request(0x30), 0), (request(pgn=65226), 0), ((request()[0], b"\x00\xee"), 0)],
 )
-def test_a_request_for_the_claim_is_answered(asked, answers):
+def test_request_for_the_claim_is_answered(asked, answers):
     bench = Bench(AORO)
     bench.run(2)
     bench.machine_sent.clear()
     bench.machine_extra += [asked] * 3
     bench.run(2)
-    assert claims(bench) == [CLAIM.key] * answers, "at most one claim per tick, however often it is asked for"
+    assert claims(bench) == [CLAIM.key] * answers, "at most one claim per tick, however many requests came"
 
 
-def test_a_claim_of_lower_priority_is_answered_and_we_go_on():
+def test_claim_of_lower_priority_is_answered_and_sending_continues():
     bench = Bench(AORO).armed()
     bench.machine_sent.clear()
     bench.machine_extra.append((CLAIM.key, b"\xff" * 8))
@@ -73,7 +73,7 @@ def test_a_claim_of_lower_priority_is_answered_and_we_go_on():
 
 
 @pytest.mark.parametrize("theirs", ["higher", "same"])
-def test_a_lost_address_is_silence_until_a_reset(theirs):
+def test_lost_address_stops_all_frames_until_a_reset(theirs):
     bench = Bench(AORO)
     bench.run(1)
     name = bytes(8) if theirs == "higher" else bench.machine_sent[0][1]
@@ -94,11 +94,11 @@ def test_a_lost_address_is_silence_until_a_reset(theirs):
     assert bench.mode is Mode.ARMED
 
 
-# -- what is said -------------------------------------------------------------------------------------------
+# -- frames sent --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", ["boot", "armed", "active"])
-def test_the_carrier_stands_with_its_brake_on_in_every_mode(mode):
+def test_carrier_brake_is_on_in_every_mode(mode):
     bench = getattr(Bench(AORO), mode)()
     bench.machine_sent.clear()
     bench.run(200)
@@ -114,28 +114,28 @@ def test_the_carrier_stands_with_its_brake_on_in_every_mode(mode):
     assert bench.machine_commands["CtrlAlive"]["Mode"] == bench.mode
 
 
-def test_a_carrier_command_reaches_the_frames():
+def test_carrier_command_reaches_the_frames():
     bus, sent = CarrierBus((MACHINE, GNSS)), []
     bus.command = CarrierCommand(True, -0.1, 0.639, 0.0, (10.0, -20.0, 30.0, -40.0), float_rear=True)
     bus.encode(Mode.ACTIVE, Reason.NONE, False, 10**9, sent)
     drive, arms_a, arms_b = (MACHINE.message(n) for n in COMMANDS)
-    said = dict(sent)
-    assert drive.decode(said[drive.key])[2:] == (0xA, -0.1, 0.639, 0.0)
-    assert arms_a.decode(said[arms_a.key])[2:] == (0xA, 10.0, -20.0, 30.0, -40.0)
-    assert arms_b.decode(said[arms_b.key])[2:] == (0xA, 0, 1)
+    frames = dict(sent)
+    assert drive.decode(frames[drive.key])[2:] == (0xA, -0.1, 0.639, 0.0)
+    assert arms_a.decode(frames[arms_a.key])[2:] == (0xA, 10.0, -20.0, 30.0, -40.0)
+    assert arms_b.decode(frames[arms_b.key])[2:] == (0xA, 0, 1)
     assert not STANDING.moving and STANDING.brake_pct == 100.0
 
 
-def test_the_last_words_are_neutral_and_say_that_the_controller_ended():
+def test_shutdown_frames_are_neutral_and_give_the_reason():
     bench = Bench(AORO).armed()
     bench.controller.outputs.machine_frames[:] = bench.controller.carrier_shutdown_frames()
     bench.machine_commands.clear()
-    bench._obey_machine(bench.controller.outputs)
+    bench._apply_carrier_frames(bench.controller.outputs)
     assert bench.machine_commands["VehCmd"]["Brake"] == 100 and bench.machine_commands["ArmCmdA"]["ArmKey"] == 0
     assert bench.machine_commands["CtrlAlive"]["Reason"] == Reason.CONTROLLER_ENDED
 
 
-def test_a_machine_that_stands_still_says_nothing_on_mach0():
+def test_machine_on_a_fixed_base_sends_nothing_on_mach0():
     bench = Bench().armed()
     bench.machine_extra.append((CLAIM.key, bytes(8)))
     bench.run(40)
@@ -143,7 +143,7 @@ def test_a_machine_that_stands_still_says_nothing_on_mach0():
     assert bench.controller.carrier_shutdown_frames() == [] and bench.mode is Mode.ARMED
 
 
-# -- what is heard ------------------------------------------------------------------------------------------
+# -- frames received ---------------------------------------------------------------------------------------
 
 
 def test_every_input_of_both_buses_is_fresh_with_its_age():
@@ -172,7 +172,7 @@ def put(bench, name, source=0x1C, priority=None, **fields):
     bench.tick()
 
 
-def test_pgns_are_taken_from_any_source_with_any_priority():
+def test_pgns_are_received_from_any_source_with_any_priority():
     bench = Bench(AORO)
     machine = bench.controller.carrier_bus.inputs
     bench.dropped |= set(GNSS.messages)
@@ -184,7 +184,7 @@ def test_pgns_are_taken_from_any_source_with_any_priority():
     assert not machine.unknown
 
 
-def test_a_fast_packet_may_be_longer_and_a_short_or_broken_one_is_refused():
+def test_fast_packet_may_be_longer_and_a_short_or_broken_one_is_refused():
     bench = Bench(AORO)
     machine = bench.controller.carrier_bus.inputs
     bench.dropped |= set(GNSS.messages)
@@ -205,7 +205,7 @@ def test_a_fast_packet_may_be_longer_and_a_short_or_broken_one_is_refused():
     ("name", "timeout_ms"),
     [("PositionRapidUpdate", 500), ("VesselHeading", 300), ("GnssPositionData", 3000), ("EEC1", 100), ("VehStat", 90)],
 )
-def test_a_value_is_forgotten_by_its_own_time_out(name, timeout_ms):
+def test_every_value_has_its_own_time_out(name, timeout_ms):
     bench = Bench(AORO)
     bench.run(21)
     slot = dict(bench.controller.inputs_in_use)[name]
@@ -217,7 +217,7 @@ def test_a_value_is_forgotten_by_its_own_time_out(name, timeout_ms):
     assert timeout_ms * MS < bench.now_ns - slot.stamp_ns <= timeout_ms * MS + T
 
 
-def test_the_articulation_encoder_is_set_up_and_needed_like_the_others():
+def test_articulation_encoder_is_set_up_and_needed_like_the_others():
     bench = Bench(AORO).boot()
     assert bench.encoders[7].state == 5 and bench.encoders[7].objects[0x1800, 1] == 0x187
     bench.tick([bench.operator(1)])
@@ -229,7 +229,7 @@ def test_the_articulation_encoder_is_set_up_and_needed_like_the_others():
     assert bench.controller.stale_mask == 1 << 7
 
 
-def test_a_wrong_articulation_node_is_a_configuration_error():
+def test_wrong_articulation_node_is_a_configuration_error():
     carrier = AORO.profile.carrier
     encoder = msgspec.structs.replace(carrier.articulation_encoder, node=8)
     profile = msgspec.structs.replace(

@@ -17,8 +17,10 @@ TOTAL_S = 16.0
 
 
 @pytest.mark.parametrize("kind", [kind for kind in LAWS if kind != "pid"])
-def test_a_smooth_motion_of_all_joints_is_tracked(kind):
-    """Profile of the 2026 test-bed (docs/reference/machines.md section 1.6), planner at 20 Hz, slow enough for the pump."""
+def test_smooth_motion_of_all_joints_is_tracked(kind):
+    """Profile of the 2026 test-bed (docs/reference/machines.md section 1.6), planner at 20 Hz, slow enough for the
+    pump.
+    """
     joints = {
         name: msgspec.structs.replace(s, law=msgspec.structs.replace(s.law, kind=kind))
         for name, s in SETTINGS.profile.joints.items()
@@ -38,7 +40,7 @@ def test_a_smooth_motion_of_all_joints_is_tracked(kind):
     assert bench.mode is Mode.ARMED
 
 
-def test_at_rest_the_valves_are_shut():
+def test_valves_are_shut_at_rest():
     bench = Bench().armed()
     for _ in drive(bench, 8.0, 10.0):
         pass

@@ -1,4 +1,4 @@
-"""Drive setpoints: every reason to refuse one, the lease, the stop, and crane and carrier one at a time."""
+"""Drive setpoints: every reason for refusal, the lease, the stop, and crane and carrier one at a time."""
 
 import gc
 import math
@@ -75,7 +75,7 @@ def standing() -> DriveBench:
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_drive_setpoint_is_refused_with_its_reason_and_changes_nothing(name, standing):
+def test_drive_setpoint_is_refused_with_its_reason_and_changes_nothing(name, standing):
     reason, detail, make = BAD[name]
     standing.run(201)  # the third refusal within a second would hold the machine
     standing.tick([standing.to(9, 0, 0.0, lease_ms=500)])
@@ -91,7 +91,7 @@ def test_a_drive_setpoint_is_refused_with_its_reason_and_changes_nothing(name, s
 
 
 @pytest.mark.parametrize("name", EDGES)
-def test_a_drive_setpoint_at_the_edge_of_what_is_allowed_is_obeyed(name):
+def test_drive_setpoint_at_the_limit_is_accepted(name):
     bench = ready()
     bench.tick([EDGES[name](bench)])
     assert bench.mode is Mode.ACTIVE and bench.vehicle.gate.refused == 0
@@ -116,7 +116,7 @@ def test_not_armed():
         ({"ArmHeightB": {"Roll": 20.0}}, Reason.TILTED),
     ],
 )
-def test_what_is_needed_and_not_there_refuses_a_drive(lie, reason):
+def test_missing_inputs_refuse_a_drive(lie, reason):
     bench = ready()
     bench.lies = lie
     bench.run(220)
@@ -127,7 +127,7 @@ def test_what_is_needed_and_not_there_refuses_a_drive(lie, reason):
     assert (bench.mode is Mode.ACTIVE) is of_gnss, "an angle of the articulation needs no GNSS"
 
 
-def test_three_refused_drive_setpoints_within_a_second_stop_a_machine_that_drives():
+def test_three_refusals_within_a_second_stop_a_driving_machine():
     bench = DriveBench().under_way(120)
     for k in range(3):
         assert bench.mode is Mode.ACTIVE, k
@@ -135,7 +135,7 @@ def test_three_refused_drive_setpoints_within_a_second_stop_a_machine_that_drive
     assert bench.mode is Mode.STOP and bench.reason == Reason.SETPOINTS_REFUSED
 
 
-def test_a_lease_that_ends_while_driving_stops_smoothly_and_nothing_starts_again():
+def test_lease_that_ends_while_driving_stops_smoothly_and_nothing_starts_again():
     bench = DriveBench().under_way(300)
     assert bench.speed_m_s == pytest.approx(0.6, abs=0.01)
     bench.tick([bench.to(50, 0, lease_ms=100)])
@@ -160,7 +160,7 @@ def test_a_lease_that_ends_while_driving_stops_smoothly_and_nothing_starts_again
     assert bench.mode is Mode.ACTIVE and not bench.braked
 
 
-def test_the_whole_stop_after_a_lost_lease_is_watched():
+def test_inputs_are_checked_during_the_stop_after_a_lost_lease():
     bench = DriveBench().under_way(300)
     bench.run(45)
     assert bench.mode is Mode.STOP and bench.vehicle.driving is Driving.BRAKING
@@ -169,7 +169,7 @@ def test_the_whole_stop_after_a_lost_lease_is_watched():
     assert bench.mode is Mode.FAULT and bench.reason == Reason.CARRIER_LOST and bench.drive_command["ArmKey"] == 0
 
 
-def test_a_lease_that_ends_at_standstill_ends_in_peace():
+def test_lease_that_ends_at_standstill_is_no_fault():
     bench = ready()
     bench.tick([bench.to(9, 0, 0.0, heights_m=(0.2,) * 4)])
     bench.run(20)
@@ -179,7 +179,7 @@ def test_a_lease_that_ends_at_standstill_ends_in_peace():
     assert bench.machine_commands["ArmCmdA"]["Arm1"] == 0.0
 
 
-def test_a_stop_by_the_operator_stops_the_carrier():
+def test_stop_by_the_operator_stops_the_carrier():
     bench = DriveBench().under_way(300)
     bench.tick([bench.operator(OperatorAction.STOP)])
     assert bench.mode is Mode.STOP and bench.vehicle.driving is Driving.BRAKING
@@ -187,7 +187,7 @@ def test_a_stop_by_the_operator_stops_the_carrier():
     assert bench.speed_m_s == 0.0 and bench.braked and bench.drive_command["ArmKey"] == 0
 
 
-def test_a_fault_that_latches_brakes_at_once():
+def test_fault_that_latches_brakes_at_once():
     bench = DriveBench().under_way(300)
     bench.lies = {"VehStat": {"Fault": 2}}
     for _ in range(10):
@@ -198,7 +198,7 @@ def test_a_fault_that_latches_brakes_at_once():
     assert bench.braked and bench.drive_command["ArmKey"] == 0, "in the same tick, not with the next period"
 
 
-def test_a_new_session_counts_anew():
+def test_new_session_restarts_the_sequence():
     bench = DriveBench().under_way(60)
     old = bench.to(50, 0, stamp_ns=bench.now_ns - 150 * MS, lease_ms=500)
     bench.tick([bench.operator(OperatorAction.STOP)])
@@ -221,7 +221,7 @@ def crane_to(bench: DriveBench, by: float) -> bytes:
     return encode(CraneSetpoint(*stamp, GrappleCommand.NEUTRAL, False, knots))
 
 
-def test_the_crane_does_not_move_while_the_machine_drives_but_may_be_held():
+def test_crane_may_be_held_but_not_moved_while_driving():
     bench = DriveBench().under_way(200)
     bench.tick([crane_to(bench, 0.1)])
     assert bench.controller.gate.refusal is Reason.CARRIER_MOVES and bench.mode is Mode.ACTIVE
@@ -233,13 +233,13 @@ def test_the_crane_does_not_move_while_the_machine_drives_but_may_be_held():
     assert bench.controller.gate.refusal is Reason.CARRIER_MOVES and bench.controller.gate.refused == 2
 
 
-def test_the_crane_may_move_while_the_machine_creeps():
+def test_crane_may_move_while_the_carrier_creeps():
     bench = DriveBench().under_way(200, speed_m_s=0.08)
     bench.tick([crane_to(bench, 0.1)])
     assert bench.controller.gate.refused == 0 and bench.controller.crane.leased
 
 
-def test_nothing_drives_while_the_crane_moves():
+def test_drive_is_refused_while_the_crane_moves():
     bench = ready()
     bench.tick([bench.hold()])
     bench.drive(0, 0.08, 60)
@@ -253,7 +253,7 @@ def test_nothing_drives_while_the_crane_moves():
     assert bench.mode is Mode.ACTIVE and bench.vehicle.driving is Driving.DRIVING
 
 
-def test_each_lease_is_its_own():
+def test_crane_and_carrier_have_separate_leases():
     bench = DriveBench().under_way(200, speed_m_s=0.0)
     bench.tick([crane_to(bench, 0.0)])
     bench.go(10, speed_m_s=0.0)
@@ -261,12 +261,12 @@ def test_each_lease_is_its_own():
     final = bench.hold(final=True)
     bench.tick([final])
     bench.go(60, speed_m_s=0.0)
-    assert not bench.controller.crane.leased and bench.mode is Mode.ACTIVE, "the drive goes on"
+    assert not bench.controller.crane.leased and bench.mode is Mode.ACTIVE, "the drive continues"
     bench.run(45)
     assert bench.mode is Mode.ARMED
 
 
-def test_a_lost_lease_of_the_crane_stops_the_carrier_as_well():
+def test_lost_lease_of_the_crane_stops_the_carrier_as_well():
     bench = DriveBench().under_way(200)
     bench.tick([crane_to(bench, 0.0)])
     bench.go(45)
@@ -274,7 +274,7 @@ def test_a_lost_lease_of_the_crane_stops_the_carrier_as_well():
     assert bench.vehicle.driving is Driving.BRAKING
 
 
-def test_float_valves_open_only_while_it_rolls():
+def test_float_valves_open_only_while_rolling():
     bench = ready()
     bench.tick([bench.to(9, 0, 0.0, float_rear=True)])
     bench.run(8)
@@ -285,14 +285,14 @@ def test_float_valves_open_only_while_it_rolls():
     assert bench.machine_commands["ArmCmdB"]["FloatRear"] == 0 and bench.braked
 
 
-def test_the_vehicle_report_says_what_is_known():
+def test_vehicle_report_carries_known_values():
     bench = DriveBench().under_way(400, 20.0, 20.0)
     report = bench.last_report
     assert len(bench.vehicle_reports) == pytest.approx(bench.count / 10, abs=2)
     assert report.driving == Driving.DRIVING and report.stale_mask == 0
     assert (report.fix, report.satellites) == (4, 19) and report.sigma_m == pytest.approx(0.0105)
     assert report.heading_rad == pytest.approx(math.pi / 2 - bench.yaw_rad, abs=0.05)
-    assert report.yaw_rate_rad_s > 0.05, "+ when it turns left, and it does"
+    assert report.yaw_rate_rad_s > 0.05, "positive when it turns left"
     assert report.articulation_rad == pytest.approx(bench.bend_rad, abs=0.01)
     assert report.speed_m_s == pytest.approx(bench.speed_m_s, abs=0.01)
     assert report.heights_m == pytest.approx(TRANSPORT, abs=0.002)
@@ -301,7 +301,7 @@ def test_the_vehicle_report_says_what_is_known():
     assert report.drive_sequence == bench.vehicle.gate.sequence > 0
 
 
-def test_the_vehicle_report_says_what_is_not_known():
+def test_vehicle_report_carries_nan_for_unknown_values():
     bench = DriveBench()
     bench.dropped |= {"PositionRapidUpdate", "VesselHeading", "RateOfTurn", "GnssPositionData"}
     bench.run(40)
@@ -333,11 +333,11 @@ hostile = st.lists(st.tuples(st.one_of(wild.map(encode), near, st.none()), noise
 
 @given(hostile)
 @settings(max_examples=20, deadline=None)
-def test_nothing_raises_and_the_carrier_stays_in_its_envelope(script):
+def test_random_input_never_raises_or_leaves_the_envelope_of_the_carrier(script):
     bench = DriveBench().armed()
-    for said, frames, ticks in script:
+    for request, frames, ticks in script:
         bench.machine_extra += frames
-        datagram = bench.drive_setpoint(**said) if isinstance(said, dict) else said
+        datagram = bench.drive_setpoint(**request) if isinstance(request, dict) else request
         bench.tick([datagram] if datagram else [])
         for _ in range(ticks):
             bench.tick()
@@ -350,14 +350,14 @@ def test_nothing_raises_and_the_carrier_stays_in_its_envelope(script):
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_driving_leaves_nothing_behind():
-    """The same inputs again, to a second controller, whose memory is watched."""
+def test_driving_keeps_no_memory():
+    """Repeat the same inputs on a second controller and measure its memory."""
     bench = DriveBench().armed()
     tape = []
     for k in range(2400):
-        said = [bench.to(60.0, 20.0) if k // 400 % 2 else bench.bend(0.1)] if k % 10 == 0 else []
-        bench.tick(said)
-        tape.append((bench.inputs.frames, bench.inputs.machine_frames, said, bench.now_ns))
+        datagrams = [bench.to(60.0, 20.0) if k // 400 % 2 else bench.bend(0.1)] if k % 10 == 0 else []
+        bench.tick(datagrams)
+        tape.append((bench.inputs.frames, bench.inputs.machine_frames, datagrams, bench.now_ns))
     assert bench.vehicle.driving is Driving.DRIVING
     twin, inputs = DriveBench().armed(), Inputs()
 

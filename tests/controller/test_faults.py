@@ -1,4 +1,4 @@
-"""Loss and fault of every input: the reaction, its detection bound and neutral commands in time, in virtual time."""
+"""Loss and fault of every input: reaction, detection time and neutral commands in time, in virtual time."""
 
 import pytest
 
@@ -14,7 +14,7 @@ PROMISE_NS = 100 * MS
 
 
 def until_reason(bench: Bench, reason: Reason, limit: int = 100) -> int:
-    """Ticks until the reason stands; the planner goes on sending."""
+    """Number of ticks until the reason is set; the planner continues to send."""
     for k in range(1, limit + 1):
         bench.tick([bench.moving(0, 0.08)] if k % 10 == 0 and bench.mode is Mode.ACTIVE else ())
         if bench.reason == reason:
@@ -54,7 +54,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "reason", "how"), CASES)
-def test_loss_of_each_needed_input_is_neutral_within_the_promise(name, reason, how):
+def test_loss_of_each_needed_input_is_neutral_in_time(name, reason, how):
     bench = Bench().active()
     getattr(bench, how).add(name)
     ticks = until_reason(bench, reason)
@@ -69,7 +69,7 @@ def test_loss_of_each_needed_input_is_neutral_within_the_promise(name, reason, h
 
 
 @pytest.mark.parametrize("name", ["PressA", "PressB", "PressC", "GrappleStat"])
-def test_loss_of_a_helpful_input_halves_the_speed(name):
+def test_loss_of_an_optional_input_halves_the_speed(name):
     bench = Bench().active()
     bench.dropped.add(name)
     reason = Reason.GRAPPLE_STATUS_LOST if name == "GrappleStat" else Reason.PRESSURE_LOST
@@ -107,7 +107,7 @@ VALUES = [
 
 
 @pytest.mark.parametrize(("name", "values", "reason"), VALUES)
-def test_a_bad_value_is_found_in_time(name, values, reason):
+def test_bad_value_is_detected_in_time(name, values, reason):
     bench = Bench().active()
     bench.changed[name] = values
     assert until_reason(bench, reason) * T <= FAULTS[reason].bound_ms * MS
@@ -168,7 +168,7 @@ def test_restart_or_leaving_operational(node, state):
     assert bench.mode is Mode.FAULT
 
 
-def test_a_restarted_encoder_is_set_up_again_before_arming():
+def test_restarted_encoder_is_set_up_again_before_arming():
     bench = Bench().active()
     bench.encoders[3].state = 0x7F
     bench.encoders[3].writes.clear()
@@ -206,7 +206,7 @@ def test_three_communication_emergencies_in_ten_seconds_stop():
     assert bench.reason == Reason.EMERGENCY_MESSAGE
 
 
-def test_another_controller_is_noticed_in_every_mode():
+def test_foreign_controller_is_detected_in_every_mode():
     for prepare in (Bench.boot, Bench.armed, Bench.active):
         bench = prepare(Bench())
         bench.extra.append((0x210, bytes(8)))
@@ -249,7 +249,7 @@ def test_frames_of_an_overflowed_tick_are_not_used():
 def test_late_loop_degrades_and_stalled_loop_stops():
     bench = Bench().active()
     bench.tick(late_ns=2 * T)
-    assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE, "two periods are borne"
+    assert bench.mode is Mode.ACTIVE and bench.reason == Reason.NONE, "two periods late is tolerated"
     bench.tick([bench.moving(0, 0.08)], late_ns=2 * T + 1)
     assert bench.mode is Mode.ACTIVE and bench.reason == Reason.LOOP_LATE
     bench.tick([bench.moving(0, 0.08)], late_ns=50 * MS + 1)
@@ -268,7 +268,7 @@ def test_three_late_cycles_stop_when_they_fall_within_a_second(apart, mode):
     assert (bench.mode, bench.reason) == (mode, Reason.LOOP_STALLED if mode is Mode.STOP else Reason.LOOP_LATE)
 
 
-def test_a_second_fault_while_stopping_is_neutral_at_once():
+def test_second_fault_while_stopping_is_neutral_at_once():
     bench = Bench().active()
     bench.tick([bench.operator(OperatorAction.STOP)])
     bench.run(3)
@@ -287,7 +287,7 @@ def test_lease_lost_while_moving_slows_down_and_stops():
     assert bench.neutral and bench.mode is Mode.STOP
 
 
-def test_a_trajectory_that_ends_in_motion_ends_its_lease():
+def test_trajectory_that_ends_in_motion_ends_its_lease():
     bench = Bench().active()
     start = list(bench.controller.reference_position)
     speed = [0.08, 0.0, 0.0, 0.0, 0.0]
@@ -306,7 +306,7 @@ def test_three_refused_setpoints_in_a_second_stop():
     assert bench.mode is Mode.STOP and bench.reason == Reason.SETPOINTS_REFUSED
 
 
-def test_refusals_before_a_movement_do_not_stop_it():
+def test_refusals_before_a_motion_do_not_stop_it():
     bench = Bench().armed()
     bench.tick([b"rubbish"] * 5)
     bench.tick([bench.hold()])
@@ -329,7 +329,7 @@ def test_stuck_joint_holds_within_400_ms():
     assert k * T <= FAULTS[Reason.JOINT_STUCK].bound_ms * MS
 
 
-def test_joint_that_moves_alone_cuts_within_150_ms():
+def test_uncommanded_motion_cuts_within_150_ms():
     bench = Bench().armed()
     bench.tick([bench.hold()])
     bench.moves_alone[0] = 0.4
@@ -338,7 +338,7 @@ def test_joint_that_moves_alone_cuts_within_150_ms():
     assert k * T <= FAULTS[Reason.JOINT_RUNAWAY].bound_ms * MS
 
 
-def test_joint_that_moves_the_wrong_way_stops():
+def test_motion_against_the_command_stops():
     bench = Bench().armed()
     bench.backward.add(0)
     moving_ticks = 0
@@ -362,7 +362,7 @@ def test_descriptions_name_the_joint_and_the_node():
         assert "{" not in describe(reason, 1)
 
 
-def test_a_final_setpoint_whose_lease_ends_on_the_way_stops():
+def test_final_setpoint_whose_lease_ends_too_early_stops():
     bench = Bench().armed()
     start = list(bench.controller.reference_position)
     end = [start[0] + 0.1, *start[1:]]

@@ -1,4 +1,4 @@
-"""The grapple: by time, pressure and opening; closed told from holding; tongs that stick."""
+"""The grapple law: time, pressure and opening; closed and holding; jammed jaws."""
 
 import math
 
@@ -23,7 +23,7 @@ def run(law, wanted, seconds, clamp=math.nan, opening=math.nan, release=math.nan
     return start_ns + round(seconds * 200) * T
 
 
-def test_by_time_without_sensors():
+def test_time_decides_without_sensors():
     law = made()
     now = run(law, GrappleCommand.OPEN, 3.4)
     assert (law.state, law.spool_pct, law.mode) == (GrappleState.OPENING, 100.0, GrappleCommand.OPEN)
@@ -35,7 +35,7 @@ def test_by_time_without_sensors():
     assert (law.state, law.spool_pct, law.mode) == (GrappleState.HOLDING, 0.0, GrappleCommand.HOLD)
 
 
-def test_it_never_opens_by_itself():
+def test_grapple_never_opens_by_itself():
     law = made()
     now = run(law, GrappleCommand.CLOSE, 0.5, 20.0, 60.0)
     now = run(law, GrappleCommand.CLOSE, 0.2, HIGH, 30.0, start_ns=now)
@@ -49,7 +49,7 @@ def test_it_never_opens_by_itself():
     assert law.state is GrappleState.OPEN
 
 
-def test_without_pressure_it_closes_for_a_while_longer():
+def test_closing_takes_longer_while_the_pressure_is_low():
     law = made()
     now = run(law, GrappleCommand.CLOSE, 5.0, 10.0, 40.0)
     assert law.state is GrappleState.CLOSING
@@ -57,7 +57,7 @@ def test_without_pressure_it_closes_for_a_while_longer():
     assert law.state is GrappleState.HOLDING
 
 
-def test_a_kick_of_the_pressure_is_no_grip():
+def test_pressure_kick_is_no_grip():
     law = made()
     now = run(law, GrappleCommand.CLOSE, 0.04, HIGH, 99.0)
     run(law, GrappleCommand.CLOSE, 1.0, 30.0, 60.0, start_ns=now)
@@ -69,16 +69,16 @@ def test_a_kick_of_the_pressure_is_no_grip():
     [(2.0, 30.0, GrappleState.HOLDING), (3.4, 1.0, GrappleState.CLOSED),
      (2.0, math.nan, GrappleState.HOLDING), (3.3, math.nan, GrappleState.CLOSED)],
 )  # fmt: skip
-def test_closed_on_nothing_is_told_from_holding(seconds, opening, state):
-    """By the opening where it is measured, else by how long the tongs moved before the pressure rose."""
+def test_closed_and_holding_are_distinguished(seconds, opening, state):
+    """By the opening where it is measured, else by the time until the pressure rose."""
     law = made()
     now = run(law, GrappleCommand.CLOSE, seconds, 40.0, opening)
     run(law, GrappleCommand.CLOSE, 0.1, HIGH, opening, start_ns=now)
     assert law.state is state and law.mode is GrappleCommand.HOLD
 
 
-def test_what_weighs_something_is_held_whatever_the_tongs_say():
-    """A thin log between interleaved tongs: shut to the end of their way, and yet not empty."""
+def test_measured_load_means_holding():
+    """A thin log between interleaved jaws: fully closed, and yet not empty."""
     law = made()
     now = run(law, GrappleCommand.CLOSE, 3.4, 40.0, 1.0)
     now = run(law, GrappleCommand.CLOSE, 0.1, HIGH, 1.0, start_ns=now)
@@ -88,18 +88,18 @@ def test_what_weighs_something_is_held_whatever_the_tongs_say():
     assert law.state is GrappleState.CLOSED and not law.loaded
     now += 3 * SECOND
     law.observe_load(2.0 * LOADED_KG, now)
-    assert law.state is GrappleState.CLOSED, "a swing of the tongs"
+    assert law.state is GrappleState.CLOSED, "a swing of the empty grapple"
     law.observe_load(2.0 * LOADED_KG, now + SECOND // 2)
     assert law.state is GrappleState.HOLDING and law.loaded
     law.observe_load(0.0, now + SECOND)
-    assert law.state is GrappleState.HOLDING and not law.loaded, "on the ground it is held still"
+    assert law.state is GrappleState.HOLDING and not law.loaded, "a log on the ground is still held"
     law.observe_load(2.0 * LOADED_KG, now + SECOND)
     law.step(GrappleCommand.OPEN, 0.0, 1.0, 0.0, now + SECOND)
     law.observe_load(2.0 * LOADED_KG, now + 2 * SECOND)
     assert law.state is GrappleState.OPENING and not law.loaded
 
 
-def test_the_load_cell_tells_the_controller_that_the_grapple_is_loaded():
+def test_load_cell_sets_loaded():
     bench = Bench().armed()
     for k in range(1100):
         bench.tick([bench.hold(grapple=GrappleCommand.CLOSE)] if k % 10 == 0 else ())
@@ -116,7 +116,7 @@ def held(opening):
     return law, run(law, GrappleCommand.CLOSE, 0.1, HIGH, opening, start_ns=now)
 
 
-def test_tongs_that_stick_are_shaken_loose():
+def test_jammed_jaws_are_shaken_loose():
     law, now = held(20.0)
     now = run(law, GrappleCommand.OPEN, 0.9, 0.0, 20.5, start_ns=now)
     assert law.mode is GrappleCommand.OPEN
@@ -129,7 +129,7 @@ def test_tongs_that_stick_are_shaken_loose():
     assert law.state is GrappleState.OPEN
 
 
-def test_tongs_that_stick_for_good_are_given_up():
+def test_shaking_ends_after_its_limit():
     law, now = held(20.0)
     shakes, before = 0, GrappleCommand.OPEN
     for k in range(4000):
@@ -139,23 +139,23 @@ def test_tongs_that_stick_for_good_are_given_up():
     assert shakes == 3 and law.spool_pct == 0.0
 
 
-def test_without_a_sensor_full_pressure_at_once_says_that_they_stick():
+def test_full_pressure_at_once_means_jammed_without_a_sensor():
     law, now = held(math.nan)
     run(law, GrappleCommand.OPEN, 0.2, 0.0, math.nan, HIGH, start_ns=now)
     assert law.mode is GrappleCommand.CLOSE
     law, now = held(math.nan)
     now = run(law, GrappleCommand.OPEN, 2.0, 0.0, math.nan, 30.0, start_ns=now)
     run(law, GrappleCommand.OPEN, 0.1, 0.0, math.nan, HIGH, start_ns=now)
-    assert law.state is GrappleState.OPEN, "at the end of their way the pressure says that they are open"
+    assert law.state is GrappleState.OPEN, "pressure at the end of the stroke means open"
 
 
-def test_tongs_of_which_nothing_is_known_are_not_shaken():
+def test_jaws_of_unknown_state_are_not_shaken():
     law = made()
     run(law, GrappleCommand.OPEN, 0.3, 0.0, math.nan, HIGH)
     assert law.mode is not GrappleCommand.CLOSE
 
 
-def test_it_holds_through_a_stop_and_a_fault():
+def test_grapple_holds_through_stop_and_fault():
     bench = Bench().armed()
     for k in range(1100):
         bench.tick([bench.hold(grapple=GrappleCommand.CLOSE)] if k % 10 == 0 else ())
@@ -169,18 +169,18 @@ def test_it_holds_through_a_stop_and_a_fault():
         assert bench.neutral and bench.commands_b["GrappleMode"] == GrappleCommand.HOLD
 
 
-def test_what_settled_loosely_is_gripped_again_while_closing_is_asked_for():
+def test_loose_bundle_is_gripped_again_while_close_is_requested():
     law = made()
     now = run(law, GrappleCommand.CLOSE, 0.5, 20.0, 60.0)
     now = run(law, GrappleCommand.CLOSE, 0.2, HIGH, 40.0, start_ns=now)
     assert law.state is GrappleState.HOLDING
     now = run(law, GrappleCommand.CLOSE, 0.05, 60.0, 40.0, start_ns=now)
-    assert law.state is GrappleState.HOLDING, "a dip of the pressure is no loose log"
+    assert law.state is GrappleState.HOLDING, "a pressure dip is no loose log"
     kept = run(law, GrappleCommand.HOLD, 0.5, 60.0, 40.0, start_ns=now)
-    assert law.state is GrappleState.HOLDING, "a planner that holds is obeyed"
+    assert law.state is GrappleState.HOLDING, "HOLD does not close again"
     now = run(law, GrappleCommand.CLOSE, 0.2, 60.0, 40.0, start_ns=kept)
     assert (law.state, law.spool_pct) == (GrappleState.CLOSING, -100.0)
     now = run(law, GrappleCommand.CLOSE, 0.2, HIGH, 35.0, start_ns=now)
     assert (law.state, law.spool_pct) == (GrappleState.HOLDING, 0.0)
     run(law, GrappleCommand.CLOSE, 1.0, math.nan, 35.0, start_ns=now)
-    assert law.state is GrappleState.HOLDING, "without pressure nothing is known to be loose"
+    assert law.state is GrappleState.HOLDING, "without a pressure sensor nothing counts as loose"

@@ -1,4 +1,4 @@
-"""The guard by itself, rule by rule, and with the controller and the bench around it."""
+"""The guard alone, rule by rule, and together with the controller on the bench."""
 
 import random
 from pathlib import Path
@@ -67,7 +67,7 @@ class Traffic:
         return self
 
 
-def test_enables_after_a_calm_while_and_says_so():
+def test_enables_after_200_ms_without_a_broken_rule():
     traffic = Traffic()
     traffic.tick()
     assert traffic.status[-1]["Enable"] == 0
@@ -149,17 +149,17 @@ def test_each_rule(name):
     assert k * T <= bound_ms * MS
     status = traffic.status[-1]
     assert (status["Enable"], status["Verdict"], status["FaultAxis"]) == (0, verdict, axis)
-    assert any(key == 0x1FD for key, _ in traffic.sent), "said at once"
+    assert any(key == 0x1FD for key, _ in traffic.sent), "sent at once"
     assert traffic.guard.events == events + 1
 
 
-def test_a_frozen_encoder_counts_as_gone():
+def test_frozen_encoder_counts_as_lost():
     traffic = Traffic().good()
     encoder_frozen(traffic)
     assert traffic.guard.verdict is Verdict.ENCODER
 
 
-def test_neutral_commands_are_fine_without_encoders_and_outside():
+def test_neutral_commands_pass_without_encoders_and_outside_the_range():
     traffic = Traffic().good()
     traffic.dropped |= {"EncSlew", "EncLift"}
     assert traffic.tick(60) is Verdict.GOOD
@@ -168,14 +168,14 @@ def test_neutral_commands_are_fine_without_encoders_and_outside():
     assert traffic.tick(10) is Verdict.GOOD
 
 
-def test_inward_from_outside_is_fine():
+def test_motion_back_into_the_range_passes():
     traffic = Traffic().good()
     outside(traffic)
     traffic.a["Slew"] = -13.0
     assert traffic.tick(10) is Verdict.GOOD
 
 
-def test_slow_growth_is_fine_and_closing_is_free():
+def test_slow_growth_and_closing_pass():
     traffic = Traffic().good()
     for pct in range(80):
         traffic.a.update({"Mode": 2, "Tilt": float(pct)})
@@ -184,7 +184,7 @@ def test_slow_growth_is_fine_and_closing_is_free():
     assert traffic.tick() is Verdict.GOOD
 
 
-def test_growth_that_lasts_too_fast_is_noticed():
+def test_lasting_fast_growth_is_detected():
     traffic = Traffic().good()
     for pct in range(0, 96, 6):
         traffic.a.update({"Mode": 2, "Tilt": float(pct)})
@@ -192,7 +192,7 @@ def test_growth_that_lasts_too_fast_is_noticed():
     assert traffic.guard.verdict is Verdict.RATE
 
 
-def test_reversing_is_growth():
+def test_reversal_counts_as_growth():
     traffic = Traffic().good()
     for pct in range(60):
         traffic.a.update({"Mode": 2, "Tilt": float(pct)})
@@ -231,7 +231,7 @@ def test_another_guard(key):
     assert traffic.tick() is Verdict.OTHER_GUARD
 
 
-def test_the_way_back_needs_neutral_commands_for_a_while():
+def test_enable_returns_after_200_ms_of_neutral_commands():
     traffic = Traffic().good()
     traffic.a.update(MOVING)
     traffic.estop["ChannelA"] = 0
@@ -262,7 +262,7 @@ def test_own_checksum_and_layout_agree_with_the_codecs():
 
 @given(st.lists(st.tuples(st.sampled_from([m.key for m in DATABASE.messages.values()]), st.binary(max_size=8))))
 @settings(max_examples=100, deadline=None)
-def test_no_traffic_raises_or_enables(frames):
+def test_random_traffic_never_raises_or_enables(frames):
     guard = build(PROFILE)
     for k in range(5):
         guard.step(10**9 + k * T, [Frame(10**9, key, data) for key, data in frames])
@@ -273,7 +273,7 @@ def bench_with_guard():
     return Bench(guard=build(PROFILE))
 
 
-def test_the_guard_lets_the_controller_work_and_stops_it():
+def test_guard_enables_and_stops_the_controller():
     bench = bench_with_guard().armed()
     bench.tick([bench.hold()])
     for k in range(240):
@@ -291,21 +291,21 @@ def test_the_guard_lets_the_controller_work_and_stops_it():
     assert bench.mode is Mode.ARMED
 
 
-def test_emergency_stop_with_both_layers_is_named_for_what_it_is():
+def test_emergency_stop_keeps_its_reason_with_guard_and_controller():
     bench = bench_with_guard().active()
     bench.changed["EstopStat"] = {"ChannelA": 0, "ChannelB": 0}
     bench.run(4)
     assert bench.reason == Reason.ESTOP_PRESSED and not bench.guard.enabled
 
 
-def test_a_controller_that_ignores_a_lost_encoder_is_stopped_by_the_guard():
+def test_guard_stops_a_controller_that_ignores_a_lost_encoder():
     traffic = Traffic().good()
     encoder_gone(traffic)
-    assert traffic.tick(16) is Verdict.GOOD, "the controller has its time first"
+    assert traffic.tick(16) is Verdict.GOOD, "the controller has time to react first"
     assert traffic.tick(4) is Verdict.ENCODER
 
 
-def test_configuration_errors_say_what_to_do(tmp_path, capsys):
+def test_configuration_errors_have_codes_and_exit_codes(tmp_path, capsys):
     with pytest.raises(GuardConfigError, check=coded("guard.profile-unreadable")):
         read_envelope(tmp_path / "none.toml")
     (tmp_path / "half.toml").write_text("[joints.slew]\nlower = 0\n")
@@ -318,7 +318,7 @@ def test_configuration_errors_say_what_to_do(tmp_path, capsys):
     assert capsys.readouterr().err.count("guard: ") == 2
 
 
-def test_the_guard_imports_nothing_but_the_standard_library():
+def test_guard_imports_nothing_but_the_standard_library():
     import subprocess
     import sys
 
@@ -332,14 +332,14 @@ def test_the_guard_imports_nothing_but_the_standard_library():
     assert done.stdout.strip() == "[]"
 
 
-def test_the_guard_is_small():
+def test_guard_has_at_most_600_lines():
     folder = Path(__file__).parents[2] / "controller" / "guard"
     assert sum(len(p.read_text().splitlines()) for p in folder.glob("*.py")) <= 600
     assert Guard.__slots__
 
 
 @pytest.mark.parametrize("mode", [1, 2])
-def test_an_opening_or_closing_grapple_is_no_neutral_command(mode):
+def test_opening_or_closing_grapple_is_not_neutral(mode):
     """The grapple moves by its mode alone, so the mode must be armed like any other motion."""
     traffic = Traffic()
     traffic.tick(60)
@@ -349,7 +349,7 @@ def test_an_opening_or_closing_grapple_is_no_neutral_command(mode):
     assert traffic.guard.verdict is Verdict.NOT_ARMED
 
 
-def test_a_held_grapple_is_neutral():
+def test_held_grapple_is_neutral():
     traffic = Traffic()
     traffic.b = {"ArmKey": 0, "GrappleMode": 3}
     traffic.tick(60)

@@ -1,4 +1,4 @@
-"""The laws that steer, drive and raise the carrier, alone and closed on a carrier of rigid geometry."""
+"""The laws that steer, drive and level the carrier, alone and in closed loop on rigid geometry."""
 
 import math
 
@@ -34,7 +34,7 @@ metres = st.floats(-400.0, 400.0)
 
 
 @given(metres, metres, st.floats(-80.0, 80.0), st.floats(-180.0, 180.0))
-def test_metres_between_two_places_agree_with_the_ellipsoid(east, north, lat, lon):
+def test_local_metres_agree_with_the_ellipsoid(east, north, lat, lon):
     latitude, longitude, _ = LocalFrame(lat, lon, 0.0).geodetic(east, north, 0.0)
     found = east_north_m(lat, lon, latitude, longitude)
     assert math.dist(found, (east, north)) < 0.02 + 3e-4 * math.hypot(east, north)
@@ -49,7 +49,7 @@ def test_metres_across_the_date_line():
 
 
 @given(metres, metres, angles)
-def test_the_rate_is_kp_times_the_wrapped_error(east, north, yaw):
+def test_rate_is_kp_times_the_wrapped_error(east, north, yaw):
     rate = WaypointLaw(CARRIER).step(east, north, yaw)
     error = rate / KP
     assert abs(error) <= math.pi + 1e-9
@@ -58,17 +58,17 @@ def test_the_rate_is_kp_times_the_wrapped_error(east, north, yaw):
     assert math.sin(yaw + error) == pytest.approx(math.sin(bearing), abs=1e-6)
 
 
-def test_near_the_waypoint_the_last_bearing_stays():
+def test_last_bearing_is_kept_near_the_waypoint():
     law = WaypointLaw(CARRIER)
     law.step(MIN_BEARING_M + 0.1, 0.0, 0.0)
     assert law.step(0.0, MIN_BEARING_M - 0.1, 0.0) == 0.0
     assert law.step(0.0, MIN_BEARING_M + 0.1, 0.0) == pytest.approx(KP * math.pi / 2)
     law.reset()
-    assert law.step(0.0, MIN_BEARING_M - 0.1, 0.0) == pytest.approx(KP * math.pi / 2), "the first bearing is taken as it is"
+    assert law.step(0.0, MIN_BEARING_M - 0.1, 0.0) == pytest.approx(KP * math.pi / 2), "the first bearing is used"
 
 
 @pytest.mark.parametrize("unknown", [(math.nan, 1.0, 0.0), (1.0, math.nan, 0.0), (1.0, 1.0, math.nan)])
-def test_what_is_unknown_steers_nowhere(unknown):
+def test_unknown_inputs_give_no_rate(unknown):
     assert WaypointLaw(CARRIER).step(*unknown) == 0.0
 
 
@@ -76,7 +76,7 @@ def test_what_is_unknown_steers_nowhere(unknown):
 
 
 @given(st.lists(st.tuples(st.floats(-50.0, 50.0) | st.just(math.nan), st.floats(-1.0, 1.0) | st.just(math.nan))))
-def test_the_rate_keeps_its_limits_whatever_is_wanted(script):
+def test_rate_keeps_its_limits(script):
     limits, before = SteeringLimits(CARRIER), 0.0
     for wanted, angle in script:
         rate = limits.step(wanted if wanted == wanted else 0.0, angle, DT)
@@ -93,7 +93,7 @@ def test_the_rate_keeps_its_limits_whatever_is_wanted(script):
 # -- angle
 
 
-def test_a_wanted_angle_is_reached_and_then_left_alone():
+def test_wanted_angle_is_reached_without_hunting():
     bench = DriveBench().armed()
     bench.run(40)
     for k in range(800):
@@ -107,7 +107,7 @@ def test_a_wanted_angle_is_reached_and_then_left_alone():
     assert rates == {0.0}
 
 
-def test_a_wanted_angle_that_moves_is_followed_by_its_rate():
+def test_moving_angle_is_followed_by_feed_forward():
     bench = DriveBench().armed()
     bench.run(40)
     begin, errors = bench.now_ns, []
@@ -119,7 +119,7 @@ def test_a_wanted_angle_that_moves_is_followed_by_its_rate():
     assert max(errors[300:]) < 0.04  # valve and oil are 0.18 s behind, at 0.15 rad/s
 
 
-def test_an_unknown_angle_asks_for_nothing():
+def test_unknown_angle_gives_no_rate():
     assert AngleLaw(CARRIER, DT).step(0.3, 0.1, math.nan) == 0.0
     limits = SteeringLimits(CARRIER)
     assert limits.step(0.2, math.nan, DT) == 0.0
@@ -146,7 +146,7 @@ def run(law: DriveLaw, wanted: float, measured: float, seconds: float) -> None:
         law.step(wanted, measured, 1.0, DT)
 
 
-def test_the_brake_waits_until_it_stands_or_too_long():
+def test_brake_waits_for_standstill_or_a_time_limit():
     law = DriveLaw(CARRIER)
     run(law, 0.4, 0.4, 2.0)
     assert law.speed_m_s == pytest.approx(0.4) and not law.brake
@@ -155,13 +155,13 @@ def test_the_brake_waits_until_it_stands_or_too_long():
     run(law, 0.0, STANDING_M_S / 2, 0.1)
     assert law.brake
     run(law, 0.0, 0.2, 0.1)
-    assert law.brake, "it is not opened for a machine that slides"
+    assert law.brake, "the brake stays on while the machine slides"
     run(law, 0.4, 0.4, 2.0)
     run(law, 0.0, 0.2, 1.0 + SETTLE_S + 0.1)
     assert law.brake
 
 
-def test_a_stop_is_as_hard_as_it_says():
+def test_stop_has_its_deceleration():
     law = DriveLaw(CARRIER)
     run(law, 0.6, 0.6, 2.0)
     seconds = law.stop_s
@@ -175,7 +175,7 @@ def test_a_stop_is_as_hard_as_it_says():
 
 
 @given(st.floats(-0.2, 0.2))
-def test_the_spool_is_the_inverse_of_the_dead_band(speed):
+def test_spool_is_the_inverse_of_the_dead_band(speed):
     percent = spool_pct(CARRIER.arm_valve, speed)
     assert percent == pytest.approx(100.0 * spool_for(CARRIER.arm_valve, speed), abs=1e-9)
     assert -100.0 <= percent <= 100.0 and percent * speed >= 0.0
@@ -187,7 +187,7 @@ tilts = st.floats(-0.4, 0.4) | st.just(math.nan)
 
 @settings(max_examples=40)
 @given(heights, heights, st.lists(st.tuples(st.booleans(), tilts, tilts), max_size=30))
-def test_arms_keep_travel_and_speed_whatever_the_tilt(wanted, measured, script):
+def test_arms_keep_travel_and_speed_limits(wanted, measured, script):
     arms = Suspension(CARRIER)
     for level, roll, pitch in script:
         for _ in range(100):
@@ -197,7 +197,7 @@ def test_arms_keep_travel_and_speed_whatever_the_tilt(wanted, measured, script):
         assert max(abs(arms.levelling.roll_m), abs(arms.levelling.pitch_m)) <= CARRIER.arm_travel_m
 
 
-def test_an_arm_in_the_band_is_left_alone_until_it_is_out_of_it():
+def test_arm_within_its_band_is_not_controlled():
     arms, band = Suspension(CARRIER), CARRIER.arm_in_band_m
     wanted = (0.3,) * 4
 
@@ -207,13 +207,13 @@ def test_an_arm_in_the_band_is_left_alone_until_it_is_out_of_it():
 
     assert speed(0.3 - 0.9 * band) == 0.0
     assert speed(0.3 - 1.1 * band) > 0.0
-    assert speed(0.3 - 0.9 * band) > 0.0, "once it moves it goes on until it is near"
+    assert speed(0.3 - 0.9 * band) > 0.0, "once it moves it continues until it is near"
     assert speed(0.3 - 0.3 * band) == 0.0
     assert speed(0.3 + 0.9 * band) == 0.0
     assert speed(math.nan) == 0.0
 
 
-def test_the_arms_of_a_floating_axle_are_left_to_it():
+def test_arms_of_a_floating_axle_are_not_controlled():
     arms = Suspension(CARRIER)
     arms.step((0.5,) * 4, (0.3,) * 4, False, (0.0, 0.0), (False, True), 1.0, DT)
     assert arms.spools_pct[0] == arms.spools_pct[1] > 0.0 and arms.spools_pct[2:] == [0.0, 0.0]
@@ -242,7 +242,7 @@ def test_levelling_raises_the_low_side_until_the_frame_is_level(roll, pitch):
     for _ in range(4000):
         arms.step((0.3,) * 4, heights, False, lean(), (False, False), 1.0, DT)
         heights = [h + s * DT for h, s in zip(heights, arms.speeds_m_s, strict=True)]
-    assert heights == pytest.approx([0.3] * 4, abs=CARRIER.arm_in_band_m), "and back when it is no longer asked for"
+    assert heights == pytest.approx([0.3] * 4, abs=CARRIER.arm_in_band_m), "returns when levelling ends"
 
 
 # -- closed on a carrier
@@ -255,8 +255,8 @@ def test_levelling_raises_the_low_side_until_the_frame_is_level(roll, pitch):
         *(pytest.param(yaw, (20.0, 6.0), marks=[pytest.mark.slow, pytest.mark.computed]) for yaw in (1.6, 3.1, -2.0)),
     ],
 )
-def test_the_machine_comes_to_a_waypoint_from_any_heading(yaw, place):
-    """One that is not within its turning circle: to such a one no forward motion leads."""
+def test_waypoint_is_reached_from_any_heading(yaw, place):
+    """Waypoints within the turning circle are left out: no forward motion reaches them."""
     bench = DriveBench()
     bench.yaw_rad = yaw
     bench.armed().run(40)
@@ -270,7 +270,7 @@ def test_the_machine_comes_to_a_waypoint_from_any_heading(yaw, place):
     assert bench.mode is Mode.ACTIVE and least < 0.3
 
 
-def test_a_machine_that_leans_is_where_its_axle_is():
+def test_leaning_mast_is_corrected():
     bench = DriveBench()
     bench.roll_rad, bench.pitch_rad = math.radians(10.0), math.radians(5.0)
     bench.under_way(300, 40.0, 0.0)
@@ -279,7 +279,7 @@ def test_a_machine_that_leans_is_where_its_axle_is():
     assert abs(left) < 0.03 and abs(ahead) < 0.1, "the mast is 0.4 m aside"
 
 
-def test_between_two_samples_the_heading_goes_on_with_the_odometry():
+def test_odometry_propagates_the_heading_between_samples():
     bench = DriveBench().under_way(500, 3.0, 30.0)
     yaw_rate = heading_rate_rad_s(CARRIER, bench.speed_m_s, bench.bend_rad, bench.bend_rate)
     steps = []

@@ -1,4 +1,4 @@
-"""The Kalman filter of a joint: its gains against independent solvers, and what it makes of an encoder's samples."""
+"""The Kalman filter of a joint: gains against independent solvers, and estimates from encoder samples."""
 
 import math
 
@@ -42,7 +42,7 @@ def test_gains_are_the_solution_of_the_riccati_equation(spec):
 
 
 @given(st.floats(1e-3, 0.02), st.floats(1e-6, 1.0), st.floats(1e-10, 1e-4))
-def test_gains_of_any_noise(period_s, density, variance):
+def test_gains_are_stable_for_any_noise(period_s, density, variance):
     f, q = model(period_s, density)
     h = np.array([[1.0, 0.0]])
     p = solve_discrete_are(f.T, h.T, q, np.array([[variance]]))
@@ -50,7 +50,7 @@ def test_gains_of_any_noise(period_s, density, variance):
     assert steady_gains(period_s, density, variance) == pytest.approx(wanted.ravel().tolist(), rel=1e-4)
 
 
-def test_estimates_are_those_of_a_kalman_filter_that_has_settled():
+def test_estimates_agree_with_a_settled_kalman_filter():
     density, variance = acceleration_density(SLEW), measurement_variance(SLEW.encoder)
     reference = KalmanFilter(2, 1)
     reference.F, reference.Q = model(PERIOD_S, density)
@@ -71,7 +71,7 @@ def test_estimates_are_those_of_a_kalman_filter_that_has_settled():
 
 @given(st.sampled_from(SENSED), st.floats(-0.9, 0.9), st.floats(0.05, 2.0), st.sets(st.integers(1, 199), max_size=60))
 @settings(max_examples=20, deadline=None)
-def test_whole_counts_are_tracked_as_filterpys_steady_state_does(spec, share, hz, lost):
+def test_estimates_agree_with_filterpy_on_quantised_samples(spec, share, hz, lost):
     """Sines of any joint, rounded to its encoder's counts, some samples lost: two scalar recurrences, one filter."""
     density, variance = acceleration_density(spec), measurement_variance(spec.encoder)
     reference = KalmanFilter(2, 1)
@@ -105,7 +105,7 @@ def follow(estimator, positions, age_ns=0, start_ns=10**9):
 
 
 @pytest.mark.parametrize("age_ns", [0, T // 2, T])
-def test_a_ramp_is_tracked_without_lag_whatever_the_age_of_the_sample(age_ns):
+def test_ramp_is_tracked_without_lag_whatever_the_age_of_the_sample(age_ns):
     estimator = JointEstimator(SLEW, PERIOD_S)
     assert not estimator.known and math.isnan(estimator.position)
     follow(estimator, [0.1 * (k * T - age_ns) * 1e-9 for k in range(400)], age_ns)
@@ -115,7 +115,7 @@ def test_a_ramp_is_tracked_without_lag_whatever_the_age_of_the_sample(age_ns):
     assert not estimator.known and math.isnan(estimator.velocity)
 
 
-def test_the_rate_does_not_change_what_the_filter_does():
+def test_filter_is_independent_of_the_rate():
     slow, fast = JointEstimator(SLEW, 0.01), JointEstimator(SLEW, 0.005)
     for estimator, dt in ((slow, 10 * MS), (fast, 5 * MS)):
         for k in range(1, int(0.1e9 / dt) + 1):
@@ -124,7 +124,7 @@ def test_the_rate_does_not_change_what_the_filter_does():
     assert slow.velocity == pytest.approx(fast.velocity, rel=0.15)
 
 
-def test_a_missing_sample_is_coasted_over():
+def test_missing_sample_is_extrapolated():
     estimator = JointEstimator(SLEW, PERIOD_S)
     follow(estimator, [0.2 * k * PERIOD_S for k in range(200)])
     before = estimator.position
@@ -132,7 +132,7 @@ def test_a_missing_sample_is_coasted_over():
     assert estimator.position == pytest.approx(before + 0.2 * PERIOD_S, abs=2e-4)
 
 
-def test_a_joint_stands_still_a_while_after_it_stopped_and_noise_does_not_move_it():
+def test_standstill_is_detected_despite_noise():
     estimator = JointEstimator(SLEW, PERIOD_S)
     assert not estimator.still, "unknown is not still"
     follow(estimator, [0.1 * k * PERIOD_S for k in range(100)])

@@ -1,4 +1,4 @@
-"""The joint laws: the four feedbacks, the shell around them, rest, and all joints together."""
+"""The joint laws: the four feedbacks, their common structure, end positioning, and all joints together."""
 
 import math
 
@@ -32,7 +32,7 @@ def made(kind="pd", spec=SLEW, **law):
 
 
 def budget(kind, law):
-    """The gain that a law may spend."""
+    """Greatest gain of a law over its budget."""
     return law.kp_1_s * (PID_SHARE if kind == "pid" else 1.0)
 
 
@@ -42,7 +42,7 @@ def step(law, q_ref=0.0, v_ref=0.0, lead=0.0, q=0.0, v=0.0, load=math.nan, elaps
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_small_error_gets_the_budget_and_a_large_one_no_more(kind):
+def test_gain_is_the_budget_at_most(kind):
     law = spec_of(kind, kd=0.0).law
     small, large = 1e-4 * law.layer, 100.0 * law.layer
     gain = budget(kind, law)
@@ -66,7 +66,7 @@ def test_every_feedback_is_odd(kind, error, rate):
 
 
 @pytest.mark.parametrize("kind", KINDS[1:])
-def test_integrals_grow_with_the_error_stand_while_frozen_and_are_forgotten(kind):
+def test_integrals_grow_freeze_and_reset(kind):
     law = spec_of(kind, kd=0.0).law
     feedback, error = LAWS[kind](law), 0.01 * spec_of(kind).law.layer
     first = feedback.step(error, 0.0, T_S, True)
@@ -88,7 +88,7 @@ def test_integrals_of_the_sliding_laws_are_bounded(kind):
     assert out <= 2.0 * law.kp_1_s * law.layer
 
 
-def test_the_feed_forward_leads_and_the_change_per_second_is_limited():
+def test_feed_forward_leads_and_the_change_per_second_is_limited():
     law = made()
     assert law.lead_ns == round((SLEW.valve.delay_s + SLEW.valve.lag_s) * 1e9)
     assert step(law, lead=0.2) == pytest.approx(ACCELERATION_FACTOR * SLEW.acceleration_limit * T_S)
@@ -97,17 +97,17 @@ def test_the_feed_forward_leads_and_the_change_per_second_is_limited():
     assert command == pytest.approx(0.2)
 
 
-def test_the_plain_pid_has_no_feed_forward():
+def test_plain_pid_has_no_feed_forward():
     assert step(made("pid"), v_ref=0.2, lead=0.2, v=0.2) == 0.0
 
 
-def test_what_is_in_flight_is_not_commanded_again():
+def test_travel_in_flight_is_not_commanded_again():
     law, error = made("pd", kp_1_s=2.0, kd=0.0), 0.05
     ticks = round((SLEW.valve.delay_s + SLEW.valve.lag_s) / T_S)
     commands = [step(law, error, 0.01, 0.01) - 0.01 for _ in range(ticks)]
     assert max(commands) == pytest.approx(2.0 * error, rel=0.1)
     asked = sum(commands) * T_S
-    assert commands[-1] == pytest.approx(2.0 * (error - asked), rel=0.05), "what is under way counts as done"
+    assert commands[-1] == pytest.approx(2.0 * (error - asked), rel=0.05), "travel in flight counts as done"
 
 
 def test_in_flight_is_the_travel_of_the_last_delay():
@@ -119,7 +119,7 @@ def test_in_flight_is_the_travel_of_the_last_delay():
     assert flight.travel == 0.0
 
 
-def test_a_vibration_has_no_mean_and_an_unknown_pressure_is_none():
+def test_vibration_has_no_mean_and_is_zero_for_an_unknown_pressure():
     vibration = VibrationFilter()
     assert vibration.step(90.0, T_S) == 0.0
     for _ in range(4000):
@@ -128,10 +128,10 @@ def test_a_vibration_has_no_mean_and_an_unknown_pressure_is_none():
     swing = [vibration.step(120.0 + 10.0 * math.sin(9.0 * k * T_S), T_S) for k in range(2000)]
     assert 7.0 < max(swing[1000:]) < 11.0
     assert vibration.step(math.nan, T_S) == 0.0
-    assert vibration.step(50.0, T_S) == 0.0, "it begins anew"
+    assert vibration.step(50.0, T_S) == 0.0, "the filter restarts"
 
 
-def test_the_joint_gives_way_to_a_vibration_of_its_load():
+def test_joint_yields_to_a_vibration_of_its_load():
     law = made(damping_per_bar=1e-3)
     for k in range(400):
         command = step(law, v_ref=0.1, lead=0.1, q=0.0, v=0.1, load=50.0 if k < 399 else 60.0, elapsed_s=T_S)
@@ -143,7 +143,7 @@ def test_the_joint_gives_way_to_a_vibration_of_its_load():
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(st.floats(-4, 4), st.floats(-2, 2), st.floats(-2, 2), st.floats(-4, 4), st.floats(-2, 2), st.floats(-300, 300))
-def test_a_law_never_exceeds_its_cap_and_never_drives_out_of_the_range(kind, q_ref, v_ref, lead, q, v, load):
+def test_law_never_exceeds_its_cap_and_never_drives_out_of_the_range(kind, q_ref, v_ref, lead, q, v, load):
     for cap in (1.0, 0.5):
         law = made(kind)
         for _ in range(2):
@@ -153,7 +153,7 @@ def test_a_law_never_exceeds_its_cap_and_never_drives_out_of_the_range(kind, q_r
         assert not (q < SLEW.lower and command < 0.0)
 
 
-def test_a_joint_without_an_encoder_is_driven_by_its_reference_alone():
+def test_joint_without_an_encoder_is_driven_by_feed_forward():
     law = JointLaw(msgspec.structs.replace(SLEW, encoder=None), ValveMap(SLEW.valve), T_S)
     assert step(law, q_ref=1.0, lead=0.001, q=math.nan, v=math.nan) == pytest.approx(0.001)
     assert not law.resting
@@ -181,7 +181,7 @@ class Oil:
 
 
 def settle(wrong, start, seconds=20.0, rest=None):
-    """(error at the end, when the valve opened last, how often it opened) of a joint that rests ``start`` off."""
+    """(final error, time of the last opening, number of openings) of a joint that rests ``start`` off its goal."""
     rest, oil = rest or EndPositioning(SLEW), Oil(wrong)
     rest.reset()
     rest.follow()
@@ -198,13 +198,13 @@ def settle(wrong, start, seconds=20.0, rest=None):
 
 @pytest.mark.parametrize("wrong", [0.0, 0.02, -0.01, 0.06, -0.06])
 @pytest.mark.parametrize("start", [0.002, -0.006, 0.011, 0.04, -0.12])
-def test_a_joint_comes_to_rest_near_its_goal_whatever_its_dead_band(wrong, start):
+def test_joint_rests_near_its_goal_for_any_dead_band(wrong, start):
     error, last_s, openings = settle(wrong, start)
     assert abs(error) <= 2.0 * SLEW.law.stop_band
     assert last_s < 16.0 and openings <= 8
 
 
-def test_what_is_learned_makes_the_next_stop_shorter():
+def test_learning_shortens_the_next_stop():
     rest = EndPositioning(SLEW)
     first = settle(-0.04, 0.01, rest=rest)
     second = settle(-0.04, 0.01, rest=rest)
@@ -228,12 +228,12 @@ def first_inch(rest, way, oil):
     return open_s, way - oil.q
 
 
-def test_a_long_inch_of_a_valve_that_gives_more_than_is_known_ends_when_enough_is_under_way():
+def test_long_inch_ends_when_enough_travel_is_in_flight():
     _, left = first_inch(EndPositioning(SLEW), 0.01, Oil(wrong=INCH_SHARE))
-    assert -0.006 < left < 0.0, "by the clock alone it would go nearly as far beyond as it came from"
+    assert -0.006 < left < 0.0, "by time alone the inch would overshoot by nearly its length"
 
 
-def test_a_short_inch_that_a_swinging_load_may_have_moved_teaches_little():
+def test_short_inch_teaches_little():
     def next_inch_s(*earlier):
         rest = EndPositioning(SLEW)
         for way in earlier:
@@ -243,7 +243,7 @@ def test_a_short_inch_that_a_swinging_load_may_have_moved_teaches_little():
     assert next_inch_s(0.0015) > 0.7 * next_inch_s() > next_inch_s(0.006)
 
 
-def test_within_the_stop_band_nothing_happens():
+def test_valve_stays_shut_within_the_stop_band():
     rest = EndPositioning(SLEW)
     rest.follow()
     for k in range(2000):
@@ -252,7 +252,7 @@ def test_within_the_stop_band_nothing_happens():
     assert rest.resting
 
 
-def test_a_load_that_swings_on_the_oil_is_not_chased():
+def test_swinging_load_is_not_chased():
     rest, commands = EndPositioning(SLEW), 0
     rest.follow()
     for k in range(4000):
@@ -261,7 +261,7 @@ def test_a_load_that_swings_on_the_oil_is_not_chased():
     assert commands < 0.05 * 4000
 
 
-def test_a_stuck_valve_is_not_opened_ever_further():
+def test_opening_of_a_stuck_valve_is_bounded():
     rest = EndPositioning(SLEW)
     rest.follow()
     widest = max(abs(rest.step(0.005, 0.005, 0.005, T_S)) for _ in range(20_000))
@@ -269,7 +269,7 @@ def test_a_stuck_valve_is_not_opened_ever_further():
     assert widest > INCH_SHARE * SLEW.valve.full_speed_plus
 
 
-def test_a_moving_reference_takes_the_joint_back():
+def test_moving_reference_returns_control_to_the_law():
     law = made()
     for _ in range(200):
         assert step(law) == 0.0
@@ -277,7 +277,7 @@ def test_a_moving_reference_takes_the_joint_back():
     assert step(law, v_ref=0.05, lead=0.05) > 0.0 and not law.resting
 
 
-def test_a_reference_that_jumps_is_for_the_law_and_one_that_trembles_for_nobody():
+def test_reference_jump_uses_the_law_and_noise_is_ignored():
     law = made()
     for k in range(200):
         assert step(law, q_ref=0.4 * SLEW.law.stop_band * (-1) ** k) == 0.0
@@ -287,7 +287,7 @@ def test_a_reference_that_jumps_is_for_the_law_and_one_that_trembles_for_nobody(
         command = step(law, q_ref=far)
     assert not law.resting and command == pytest.approx(SLEW.law.kp_1_s * far, rel=0.3)
     law.reset()
-    assert step(law, q_ref=far, q=far) == 0.0 and law.resting, "where it stands when it starts is no jump"
+    assert step(law, q_ref=far, q=far) == 0.0 and law.resting, "the first reference is no jump"
 
 
 # -- all joints
@@ -316,14 +316,14 @@ def run(law, velocities, cap=1.0):
     return law.commands
 
 
-def test_one_joint_at_its_limit_slows_all_by_the_same_share():
+def test_limit_of_one_joint_scales_all_joints():
     wanted = [0.2, 0.05, -0.1, 0.1, 0.3]
     free, slow = list(run(crane(), wanted)), run(crane(), wanted, cap=0.1)
     shares = [s / f for s, f in zip(slow, free, strict=True)]
     assert max(shares) < 1.0 and shares == pytest.approx([shares[0]] * 5)
 
 
-def test_the_joints_ask_for_no_more_flow_than_the_pump_gives():
+def test_joints_stay_within_the_pump_flow():
     wanted, limit = [0.2, 0.1, -0.2, 0.2, 0.3], 4.0e-4
     law = crane(limit)
     commands = run(law, wanted)
@@ -339,11 +339,13 @@ def test_the_joints_ask_for_no_more_flow_than_the_pump_gives():
 def test_load_pressure_counts_the_chambers_by_their_areas():
     law = crane()
     lift = SPECS[Joint.LIFT].valve
-    assert law.load_pressure_bar(Joint.LIFT, 90.0, 20.0) == pytest.approx(90.0 - 20.0 * lift.flow_minus / lift.flow_plus)
-    assert math.isnan(law.load_pressure_bar(Joint.LIFT, None, 20.0)) and math.isnan(law.load_pressure_bar(Joint.LIFT, 90.0, None))
+    expected = 90.0 - 20.0 * lift.flow_minus / lift.flow_plus
+    assert law.load_pressure_bar(Joint.LIFT, 90.0, 20.0) == pytest.approx(expected)
+    assert math.isnan(law.load_pressure_bar(Joint.LIFT, None, 20.0))
+    assert math.isnan(law.load_pressure_bar(Joint.LIFT, 90.0, None))
 
 
-def test_a_stop_lets_the_last_commands_fade_and_a_reset_forgets_them():
+def test_stop_fades_the_last_commands_and_reset_clears_them():
     law = crane()
     before = list(run(law, [0.1] * 5))
     law.fade(0.5)
@@ -353,7 +355,7 @@ def test_a_stop_lets_the_last_commands_fade_and_a_reset_forgets_them():
 
 
 def opened_s(left: float) -> float:
-    """When the valve first opens for a joint that arrived so many stop bands away and swings by one and a half."""
+    """Time of the first opening for a joint that arrived some stop bands away and swings by one and a half."""
     rest, band = EndPositioning(SLEW), SLEW.law.stop_band
     rest.follow()
     for k in range(600):
@@ -363,12 +365,12 @@ def opened_s(left: float) -> float:
     return math.inf
 
 
-def test_a_joint_that_arrives_far_off_is_not_waited_for_but_one_that_is_near_is():
+def test_only_a_joint_near_its_goal_must_settle_first():
     assert opened_s(8.0) < 0.5
     assert opened_s(1.5) > 1.0
 
 
-def test_the_feed_forward_looks_ahead_by_what_spool_pump_and_oil_take():
+def test_feed_forward_leads_by_delay_lag_and_oil():
     valve = msgspec.structs.replace(SLEW.valve, delay_s=0.08, lag_s=0.04, oil_s=0.13)
     spec = msgspec.structs.replace(SLEW, valve=valve)
     assert JointLaw(spec, ValveMap(valve), 0.005).lead_ns == pytest.approx(250_000_000, abs=1)

@@ -1,4 +1,4 @@
-"""What hangs in the grapple: by the load cell, else by the pressures of a lift that rests or moves steadily."""
+"""The load in the grapple: by the load cell, else by the pressures of a lift at rest or steady speed."""
 
 import dataclasses
 import math
@@ -31,7 +31,7 @@ def run(estimate: LoadEstimator, kg: float, seconds: float, velocity=lambda time
     return found
 
 
-def test_the_load_at_rest_is_what_the_empty_crane_does_not_weigh():
+def test_load_at_rest_is_the_moment_beyond_the_empty_crane():
     estimate = LoadEstimator(PROFILE)
     assert run(estimate, 0.0, PERIOD_S) == pytest.approx(0.0, abs=1e-6)
     after = run(estimate, 200.0, 0.8)
@@ -39,19 +39,19 @@ def test_the_load_at_rest_is_what_the_empty_crane_does_not_weigh():
     assert run(estimate, 200.0, 6.0) == pytest.approx(200.0, abs=1.0)
 
 
-def test_it_counts_while_the_lift_moves_steadily_and_not_while_it_changes_speed():
+def test_pressures_count_only_at_steady_speed():
     estimate = LoadEstimator(PROFILE)
     run(estimate, 100.0, 1.0)
-    assert run(estimate, 300.0, 0.4, lambda t: 0.4 * t) == pytest.approx(100.0, abs=15.0), "it speeds up: the old value"
+    assert run(estimate, 300.0, 0.4, lambda t: 0.4 * t) == pytest.approx(100.0, abs=15.0), "kept"
     assert run(estimate, 300.0, 8.0, lambda t: 0.16) == pytest.approx(300.0, abs=1.0)
 
 
-def test_a_light_grapple_is_no_negative_load():
+def test_load_is_never_negative():
     assert run(LoadEstimator(PROFILE), -40.0, 1.0) == 0.0
 
 
 @pytest.mark.parametrize("gone", ["pressure", "position", "sag"])
-def test_what_is_unknown_is_nan_at_once_and_begins_anew(gone):
+def test_unknown_input_gives_nan_and_restarts_the_filter(gone):
     profile = msgspec.structs.replace(PROFILE, sag=None) if gone == "sag" else PROFILE
     estimate = LoadEstimator(profile)
     run(estimate, 250.0, 2.0)
@@ -62,7 +62,7 @@ def test_what_is_unknown_is_nan_at_once_and_begins_anew(gone):
     assert math.isnan(again) if gone == "sag" else again == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_rotator_without_an_encoder_is_not_missed():
+def test_rotator_position_is_not_needed():
     a, b = pressures(150.0)
     assert LoadEstimator(PROFILE).step((*HOME[:4], math.nan), 0.0, a, b, PERIOD_S) == pytest.approx(150.0)
 
@@ -76,7 +76,7 @@ def report(profile, **grapple) -> float:
     return bench.reports[-1].load_kg
 
 
-def test_the_report_has_the_load_cell_first_then_the_pressures_then_nothing():
+def test_load_cell_has_priority_over_pressures():
     assert report(PROFILE, Load=77.0) == 77.0
     assert report(PROFILE, Load=None) == pytest.approx(180.0, abs=3.0)
     assert math.isnan(report(SETTINGS.profile, Load=None))

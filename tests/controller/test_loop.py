@@ -1,4 +1,4 @@
-"""The shell: deadlines, skipping, datagrams, records, the way out; with a bus in memory and a clock of its own."""
+"""The loop: deadlines, skipped periods, datagrams, records, shutdown; with a bus in memory and a scripted clock."""
 
 import json
 import socket
@@ -31,7 +31,7 @@ LEAD = SETTINGS.sync_lead_ns
 
 
 class MemoryBus(NullBus):
-    """Keeps what is sent, and counts the tries to get it back."""
+    """Keeps the frames sent, and counts the tries to reopen it."""
 
     def __init__(self, clock=None):
         super().__init__("memory")
@@ -63,7 +63,7 @@ class MemoryBus(NullBus):
 
 
 class Clock:
-    """A clock that wakes late by what the script says, in ns."""
+    """A clock that wakes late by the values of a script [ns]."""
 
     def __init__(self, lateness=()):
         self.now_ns = 10**9
@@ -102,7 +102,7 @@ def build(udp, clock, bus=None, page=None):
 
 
 def run(loop, ticks):
-    """Runs ``ticks`` ticks, then ends as SIGTERM does: within a tick."""
+    """Run ``ticks`` ticks, then end within a tick, as SIGTERM does."""
     tick = loop.tick
 
     def counted(now_ns, late_ns):
@@ -132,7 +132,7 @@ def test_absolute_deadlines_skip_and_never_burst(udp):
     assert [r.missed_ticks for r in record] == [0, 0, 2, 2, 2]
 
 
-def test_a_cycle_is_sync_then_after_the_lead_the_commands(udp):
+def test_cycle_is_sync_then_after_the_lead_the_commands(udp):
     clock = Clock()
     bus = MemoryBus(clock)
     run(build(udp, clock, bus), 4)
@@ -143,7 +143,7 @@ def test_a_cycle_is_sync_then_after_the_lead_the_commands(udp):
     assert [at for key, at in bus.sent_at if key == command][:4] == [first + k * T for k in range(4)]
 
 
-def test_a_stall_before_sync_makes_one_late_sync_and_no_more(udp):
+def test_stall_before_sync_makes_one_late_sync_and_no_more(udp):
     clock = Clock([0, 23 * MS])
     bus = MemoryBus(clock)
     loop = build(udp, clock, bus)
@@ -161,7 +161,7 @@ def test_records_hold_frames_datagrams_outputs_and_reports(udp):
     bus.waiting = list(frame.inputs.frames)
     udp[1].sendto(b"hello", udp[0].getsockname())
     outputs = loop.tick(10**9, 0)
-    assert bus.sent == outputs.frames, "SYNC goes later"
+    assert bus.sent == outputs.frames, "SYNC goes out later"
     record = tick_record.decode(udp[2].recv(65535))
     assert record.frames_in == tuple(frame.inputs.frames) and record.datagrams == (b"hello",)
     assert record.frames_out == (*outputs.frames, outputs.sync) and record.report == outputs.report
@@ -171,7 +171,7 @@ def test_records_hold_frames_datagrams_outputs_and_reports(udp):
 
 
 @pytest.mark.parametrize("how", ["stop", "exception"])
-def test_neutral_and_disarmed_whatever_the_way_out(udp, how):
+def test_loop_always_ends_neutral_and_disarmed(udp, how):
     clock, bus = Clock(), MemoryBus()
     loop = build(udp, clock, bus)
     loop.controller = Bench().active().controller
@@ -191,7 +191,7 @@ def test_neutral_and_disarmed_whatever_the_way_out(udp, how):
     assert bus.closed
 
 
-def test_a_lost_link_is_tried_until_it_is_back_and_the_process_lives(udp):
+def test_lost_link_is_reopened_and_the_process_survives(udp):
     clock, bus = Clock(), MemoryBus()
     loop = build(udp, clock, bus)
     now_ns = 10**9
@@ -213,7 +213,7 @@ def test_a_lost_link_is_tried_until_it_is_back_and_the_process_lives(udp):
     assert bus.tries == 4
 
 
-def test_what_waited_through_a_loss_is_thrown_away(udp):
+def test_frames_from_before_a_loss_are_discarded(udp):
     clock, bus = Clock(), MemoryBus()
     loop = build(udp, clock, bus)
     bus.stats.recoveries = 1
@@ -224,7 +224,7 @@ def test_what_waited_through_a_loss_is_thrown_away(udp):
     assert bus.flushed == 1
 
 
-def test_the_page_tells_what_the_loop_measured(udp, tmp_path):
+def test_timing_page_carries_the_measurements(udp, tmp_path):
     clock = Clock([0, 0, 1 * MS] + [0] * 600)
     loop = build(udp, clock, page=tmp_path / "page")
     run(loop, 202)
@@ -240,7 +240,7 @@ def test_the_page_tells_what_the_loop_measured(udp, tmp_path):
     assert not (tmp_path / "page").exists()
 
 
-def test_sample_to_command_counts_from_the_sync_that_the_oldest_encoder_answered(udp):
+def test_sample_to_command_counts_from_the_sync_of_the_oldest_sample(udp):
     """One encoder answers after the tick: its value is used a period later, and is a period older."""
     clock = Clock()
     bus = MemoryBus(clock)
@@ -264,7 +264,7 @@ def test_sample_to_command_counts_from_the_sync_that_the_oldest_encoder_answered
     assert found == [LEAD] * 3 + [LEAD + T] * 3
 
 
-def test_a_flood_of_datagrams_does_not_hold_the_tick(udp):
+def test_flood_of_datagrams_does_not_delay_the_tick(udp):
     loop = build(udp, Clock())
     command = encode(OperatorCommand(1, SETTINGS.profile_hash, 10**9, OperatorAction.STOP))
     for _ in range(40):
@@ -273,7 +273,7 @@ def test_a_flood_of_datagrams_does_not_hold_the_tick(udp):
     assert len(loop._inputs.datagrams) == 16
 
 
-def test_sleep_until_the_past_returns_and_the_future_is_reached():
+def test_sleep_until_returns_for_the_past_and_reaches_the_future():
     import time
 
     sleep_until(0)
@@ -285,7 +285,7 @@ def test_sleep_until_the_past_returns_and_the_future_is_reached():
 
 
 @pytest.mark.parametrize("profile", ["palms_471", "aoro_fc8"])
-def test_the_rehearsal_walks_through_every_mode_and_leaves_nothing(profile, monkeypatch):
+def test_warm_up_runs_every_code_path(profile, monkeypatch):
     settings = load(profile)
     controller = Controller(settings, DATABASE)
     seen, driven, worked = set(), set(), []
@@ -302,9 +302,9 @@ def test_the_rehearsal_walks_through_every_mode_and_leaves_nothing(profile, monk
     warm_up(settings, controller)
     assert {"ARMED", "ACTIVE"} <= seen
     assert all(slot.stamp_ns for _, slot in controller.inputs_in_use), "every input has been decoded"
-    assert controller.gate.refused > 100, "nonsense was refused"
+    assert controller.gate.refused > 100, "invalid datagrams were refused"
     assert len(worked) > 100 and (not controller.vehicle or driven == {Driving.DRIVING, Driving.BRAKING})
-    assert not controller.vehicle or controller.vehicle.gate.sequence, "a drive setpoint was obeyed"
+    assert not controller.vehicle or controller.vehicle.gate.sequence, "a drive setpoint was accepted"
 
 
 def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):
@@ -326,14 +326,14 @@ def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):
     assert len(errors) == 7
 
 
-def test_a_busy_port_is_one_sentence_and_exit_4(capsys, udp):
+def test_busy_port_is_one_sentence_and_exit_4(capsys, udp):
     port = udp[0].getsockname()[1]
     arguments = ["--profile", "palms_471", "--setpoint-port", str(port), "--bus", "crane0=virtual:busy"]
     assert main(arguments) == 4
     assert f"UDP port {port} cannot be used" in capsys.readouterr().err
 
 
-def test_the_setpoint_socket_is_on_loopback_only():
+def test_setpoint_socket_is_on_loopback_only():
     with listen(0) as made:
         assert made.getsockname()[0] == "127.0.0.1"
 
@@ -349,7 +349,7 @@ def test_addresses_and_settings():
 
 @pytest.mark.slow  # a worker of a parallel run died of its signal once: it runs in the pass that is one process
 def test_main_runs_and_ends_by_signal(capsys, monkeypatch):
-    """One short life on an in-memory bus; SIGTERM after some ticks."""
+    """A short run on an in-memory bus, with SIGTERM after some ticks."""
     import signal
 
     from controller.process import loop as loop_module
@@ -383,15 +383,15 @@ def test_main_runs_and_ends_by_signal(capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("profile", ["palms_471", "aoro_fc8"])
-def test_the_bus_is_filtered_by_all_that_is_looked_at_and_nothing_more(profile):
-    """Every message of the databases, from another node too where the source does not matter, and strangers."""
+def test_bus_filter_passes_all_inputs_and_nothing_else(profile):
+    """Every message of the databases, also from another node where the source does not matter, and foreign frames."""
     controller = Controller(load(profile), DATABASE)
     crane = Filter(controller.crane_inputs.filters())
     listened = {slot.codec.key for _, slot in controller.inputs_in_use if not slot.machine}
     assert all(key in crane for key in listened)
     for node in controller.crane_inputs.nodes.by_number:
         assert {0x80 + node, 0x580 + node, 0x700 + node} <= {k for k in range(0x800) if k in crane}
-    assert DATABASE.message("ValveCmdA").key in crane, "another who speaks for us is heard"
+    assert DATABASE.message("ValveCmdA").key in crane, "foreign frames with the controller's keys are received"
     assert 0x600 not in crane and 0x7FF not in crane
     if controller.carrier_bus is None:
         return

@@ -1,4 +1,4 @@
-"""The motion monitor on its own: silent on every valve within the spread, and awake when a joint does what it likes."""
+"""The motion monitor alone: no fault on any valve within the spread, and a fault when a joint does not follow."""
 
 import math
 from collections import deque
@@ -16,7 +16,7 @@ JOINTS = SPECS[:4]
 
 
 class Valve:
-    """Dead time, spool, dead-band that is not the profile's, metering curve, gain, and oil that gives way."""
+    """Dead time, spool, a dead-band unlike the profile's, metering curve, gain, and compressible oil."""
 
     def __init__(self, spec, delay_s, gain=1.0, exponent=1.04, missing=0.0, oil_rad_s=8.0, zeta=0.3):
         self.full, self.gain, self.exponent, self.missing = spec.valve.full_speed_plus, gain, exponent, missing
@@ -51,7 +51,7 @@ def alarm(spec, valve, commands):
 
 
 def there_and_back(spec, total_s=2.5, rest_s=0.3):
-    """At the speed limit, back at once; then an inch and a jerky stop."""
+    """Motion at the speed limit and back at once; then an inch and a jerky stop."""
     n, top = round(total_s / PERIOD_S), spec.speed_limit
     out = [top * smooth(k * PERIOD_S, total_s) for k in range(n)]
     rest = [0.0] * round(rest_s / PERIOD_S)
@@ -65,13 +65,13 @@ def there_and_back(spec, total_s=2.5, rest_s=0.3):
 @pytest.mark.parametrize(
     ("gain", "exponent", "missing"), [(1.0, 1.04, 0.0), (0.8, 1.1, 0.027), (1.2, 1.0, -0.027), (0.7, 1.1, 0.0)]
 )
-def test_no_valve_within_the_spread_is_called_wrong(spec, delay_s, gain, exponent, missing):
+def test_valves_within_the_spread_raise_no_fault(spec, delay_s, gain, exponent, missing):
     valve = Valve(spec, delay_s, gain, exponent, missing)
     assert alarm(spec, valve, there_and_back(spec)) is Reason.NONE
 
 
 @pytest.mark.parametrize("spec", JOINTS, ids=["slew", "lift", "tilt", "ext"])
-def test_a_joint_that_stops_although_commanded_is_found_in_time(spec):
+def test_stuck_joint_is_detected_in_time(spec):
     monitor, valve = MotionMonitor(spec, PERIOD_S), Valve(spec, 0.08)
     command = 0.8 * spec.speed_limit
     for _ in range(400):
@@ -81,14 +81,14 @@ def test_a_joint_that_stops_although_commanded_is_found_in_time(spec):
 
 
 @pytest.mark.parametrize("spec", JOINTS, ids=["slew", "lift", "tilt", "ext"])
-def test_motion_without_a_command_is_found_in_time(spec):
+def test_uncommanded_motion_is_detected_in_time(spec):
     monitor = MotionMonitor(spec, PERIOD_S)
     ticks = next(k for k in range(200) if monitor.step(0.0, spec.speed_limit) is Reason.JOINT_RUNAWAY)
     assert ticks * T <= FAULTS[Reason.JOINT_RUNAWAY].bound_ms * 1_000_000
 
 
 @pytest.mark.parametrize("spec", JOINTS, ids=["slew", "lift", "tilt", "ext"])
-def test_motion_against_the_command_is_found(spec):
+def test_motion_against_the_command_is_detected(spec):
     monitor, valve = MotionMonitor(spec, PERIOD_S), Valve(spec, 0.08)
     command = 0.4 * spec.speed_limit
     reasons = [monitor.step(command, -valve.move(command)) for _ in range(120)]
@@ -96,7 +96,7 @@ def test_motion_against_the_command_is_found(spec):
     assert reasons.index(Reason.JOINT_REVERSED) * T <= (LATE_DELAY_S + 0.2) * 1e9
 
 
-def test_a_reset_forgets():
+def test_reset_clears_the_history():
     monitor = MotionMonitor(SPECS[0], PERIOD_S)
     for _ in range(20):
         monitor.step(0.3, -0.3)

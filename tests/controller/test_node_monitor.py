@@ -1,4 +1,4 @@
-"""The nodes of crane0: their worst is found when something is said and when nothing is said for too long."""
+"""Supervision of the nodes of crane0: findings by frames and by silence."""
 
 from can_dbc.frame import Frame
 from can_dbc.protocols.canopen import Emergency, emergency_frame, heartbeat_frame
@@ -7,35 +7,35 @@ from machine.status.reasons import Reason
 from tests.controller.bench import MS, Bench
 
 
-def heard(nodes, now_ns, *frames):
+def receive(nodes, now_ns, *frames):
     nodes.begin_tick()
     for key, data in frames:
         assert nodes.receive(Frame(now_ns, key, data), now_ns)
 
 
-def test_silence_is_found_when_nobody_speaks_any_more():
+def test_silence_is_detected_without_any_frame():
     nodes = NodeMonitor([2])
-    heard(nodes, 10 * MS, heartbeat_frame(2, 5), heartbeat_frame(0x20, 5))
-    heard(nodes, 15 * MS, heartbeat_frame(0x10, 5))
+    receive(nodes, 10 * MS, heartbeat_frame(2, 5), heartbeat_frame(0x20, 5))
+    receive(nodes, 15 * MS, heartbeat_frame(0x10, 5))
     end_ns = 10 * MS + HEARTBEAT_TIMEOUT_NS
     for now_ns in (15 * MS, 200 * MS, end_ns):
-        heard(nodes, now_ns)
+        receive(nodes, now_ns)
         assert nodes.worst_finding(now_ns) == (Reason.NONE, 0)
-    heard(nodes, end_ns + 1)
+    receive(nodes, end_ns + 1)
     assert nodes.worst_finding(end_ns + 1) == (Reason.ENCODER_NODE_LOST, 2), "worse than the lost pressure module"
-    heard(nodes, end_ns + 6 * MS)
+    receive(nodes, end_ns + 6 * MS)
     assert nodes.worst_finding(end_ns + 6 * MS) == (Reason.SAFETY_NODE_LOST, 0x10)
 
 
-def test_the_hardest_finding_is_told_whoever_comes_first():
+def test_hardest_finding_wins_in_any_order():
     nodes = NodeMonitor([2])
-    heard(nodes, 0, emergency_frame(Emergency(2, 0x4200, 1, b"")), emergency_frame(Emergency(0x22, 0x5000, 1, b"")))
+    receive(nodes, 0, emergency_frame(Emergency(2, 0x4200, 1, b"")), emergency_frame(Emergency(0x22, 0x5000, 1, b"")))
     assert nodes.worst_finding(0) == (Reason.EMERGENCY_MESSAGE, 0x22)
-    heard(nodes, 1, emergency_frame(Emergency(0x22, 0, 0, b"")))
+    receive(nodes, 1, emergency_frame(Emergency(0x22, 0, 0, b"")))
     assert nodes.worst_finding(1) == (Reason.EMERGENCY_WARNING, 2)
 
 
-def test_a_restart_between_two_heartbeats_is_news_of_one_tick():
+def test_restart_between_heartbeats_counts_in_one_tick():
     bench = Bench().boot()
     while bench.count % 20 != 2:
         bench.tick()

@@ -1,4 +1,4 @@
-"""The PLC bridge on virtual time: what it plays on crane0, what it lets through, what it does without."""
+"""The PLC bridge in virtual time: emulated nodes on crane0, passed commands, and losses."""
 
 from __future__ import annotations
 
@@ -45,7 +45,6 @@ class Rig:
         self.now_ns = 1_000 * MS
         self.answers = True
         self.acknowledges = True
-        self.said: list[Frame] = []
         self.sent: list[RawFrame] = []
         self.command = Command()
         self.mode = ControllerMode.ACTIVE
@@ -59,7 +58,7 @@ class Rig:
         return Frame(self.now_ns, codec.key, sender.protect(data))
 
     def control(self, arm: int = ARMED, mode: int = MOVES, enable: int = ARMED, **values: Any) -> list[Frame]:
-        """What controller and guard say in a tick."""
+        """Frames of controller and guard in a tick."""
         a = {k: v for k, v in values.items() if k in ("Slew", "Lift", "Tilt", "Ext")}
         b = {k: v for k, v in values.items() if k in ("Rot", "Grapple", "GrappleMode")}
         return [
@@ -88,7 +87,7 @@ class Rig:
         return out
 
     def run(self, ms: int, **values: Any) -> None:
-        """The controller says the same for a while."""
+        """Repeat the same frames of the controller."""
         for _ in range(ms // 5):
             self.step(self.control(**values))
 
@@ -107,7 +106,7 @@ def await_frame(rig: Rig, name: str, **values: Any) -> dict[str, Any]:
     raise AssertionError(f"no {name}")
 
 
-def test_it_is_silent_before_the_plc_answers_and_while_it_initialises() -> None:
+def test_bridge_is_silent_until_the_plc_has_initialised() -> None:
     rig = Rig()
     rig.answers = False
     rig.run(300)
@@ -117,7 +116,7 @@ def test_it_is_silent_before_the_plc_answers_and_while_it_initialises() -> None:
     assert not rig.sent
 
 
-def test_the_controllers_own_start_up_sets_up_the_played_encoders() -> None:
+def test_start_up_configures_the_emulated_encoders() -> None:
     rig = Rig()
     startup, ours = Startup(profile("valves")), list[Frame]()
     for _ in range(400):
@@ -136,7 +135,7 @@ def test_the_controllers_own_start_up_sets_up_the_played_encoders() -> None:
     assert rig.decoded("EncSlew") is None, "only SYNC makes an encoder answer"
 
 
-def test_nothing_is_said_50_ms_after_the_last_answer_and_the_nodes_boot_after_a_long_silence() -> None:
+def test_bridge_is_silent_50_ms_after_the_last_answer_and_nodes_boot_later() -> None:
     rig = Rig()
     rig.run(300)
     rig.answers = False
@@ -156,7 +155,7 @@ def test_nothing_is_said_50_ms_after_the_last_answer_and_the_nodes_boot_after_a_
     assert sorted(boots) == [1, 2, 3, 4, 5, 6, 0x10, 0x20, 0x21, 0x22]
 
 
-def test_a_frozen_heartbeat_of_the_plc_is_silence() -> None:
+def test_frozen_heartbeat_of_the_plc_silences_the_bridge() -> None:
     rig = Rig()
     rig.run(100)
     rig.answers = False
@@ -198,7 +197,7 @@ def test_without_arm_key_enable_or_a_known_mode_it_is_neutral(missing: dict[str,
 
 
 @pytest.mark.parametrize("lost", ["ValveCmdA", "ValveCmdB", "GuardStat"])
-def test_a_loss_while_armed_is_neutral_in_time_and_stays_so_until_a_disarm(lost: str) -> None:
+def test_loss_while_armed_is_neutral_until_a_disarm(lost: str) -> None:
     rig = Rig()
     rig.run(100, Slew=50.0)
     key = DATABASE.message(lost).key
@@ -242,13 +241,13 @@ def test_role_references_passes_references_and_ignores_spools() -> None:
     assert command.reference == pytest.approx((0.5, 0.7, -1.6, 0.5, 1.5, 0, 0), abs=1e-4)
     assert command.rate == pytest.approx((0.1, 0, 0, -0.05, 0, 0, 0), abs=5e-4)
     referring(rig, dict.fromkeys([*NAMES, *(f"{n}Rate" for n in NAMES)]), 20)
-    assert (rig.command.mode, rig.command.armed) == (Mode.NEUTRAL, True), "not available: nothing is to move"
+    assert (rig.command.mode, rig.command.armed) == (Mode.NEUTRAL, True), "not available: nothing may move"
     rig.run(100)
-    assert rig.command == Command() and rig.bridge.gate.exit == 5, "the references are gone"
+    assert rig.command == Command() and rig.bridge.gate.exit == 5, "the references are stale"
 
 
 @pytest.mark.parametrize("values", [{"Lift": 1.4}, {"Slew": 0.0, "LiftRate": 0.2}, {"Ext": 0.0}])
-def test_a_reference_outside_the_machine_is_refused_and_never_clamped(values: dict[str, float]) -> None:
+def test_reference_outside_the_machine_is_refused_and_never_clamped(values: dict[str, float]) -> None:
     rig = Rig("references")
     inside = {"Lift": 0.7, "Tilt": -1.6, "Ext": 0.5}
     referring(rig, inside, 100)
@@ -260,7 +259,7 @@ def test_a_reference_outside_the_machine_is_refused_and_never_clamped(values: di
     assert rig.command == Command(), "until a disarm"
 
 
-def test_the_echo_moves_only_while_the_plc_takes_commands() -> None:
+def test_echo_changes_only_while_the_plc_accepts_commands() -> None:
     rig = Rig()
     rig.run(200)
     first = await_frame(rig, "ValveFbB")["EchoCounter"]
@@ -270,7 +269,7 @@ def test_the_echo_moves_only_while_the_plc_takes_commands() -> None:
     assert len({await_frame(rig, "ValveFbB")["EchoCounter"] for _ in range(5)}) == 1
 
 
-def test_what_the_plc_says_is_on_the_bus_and_what_it_does_not_measure_is_not_available() -> None:
+def test_plc_values_are_on_the_bus_and_others_not_available() -> None:
     rig = Rig()
     rig.feedback = replace(
         rig.feedback, state=State.EXECUTE, pressure_bar=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0), load_kg=80,
@@ -289,7 +288,7 @@ def test_what_the_plc_says_is_on_the_bus_and_what_it_does_not_measure_is_not_ava
     assert (grapple["Opening"], grapple["ClampPress"], grapple["Load"]) == (50.0, 7.0, 80)
 
 
-def test_a_reset_is_asked_only_after_an_operator_acknowledged_and_never_armed() -> None:
+def test_reset_needs_an_operators_reset_and_never_an_armed_controller() -> None:
     rig = Rig()
     rig.run(100, Slew=50.0)
     rig.feedback = replace(rig.feedback, state=State.SAFE, fault=Fault.WATCHDOG)
@@ -309,7 +308,7 @@ def test_a_reset_is_asked_only_after_an_operator_acknowledged_and_never_armed() 
     assert edges == 2, "a pulse of 200 ms, again after as long"
 
 
-def test_positions_arrive_without_steps() -> None:
+def test_positions_are_interpolated() -> None:
     between = LinearInterpolator()
     between.sample(1.0, 10 * MS, 50 * MS)
     assert between.at(10 * MS) == 1.0
@@ -319,7 +318,7 @@ def test_positions_arrive_without_steps() -> None:
     assert [between.at(t * MS) for t in (200, 225, 250)] == [2.0, 3.0, 4.0], "a gap is bridged over 50 ms at most"
 
 
-def test_the_handshake_times_the_round_trip_by_the_echo() -> None:
+def test_handshake_measures_the_round_trip_by_the_echo() -> None:
     shake = Handshake()
     for n in range(1, 11):
         shake.datagram(Command(), n * 10 * MS)
@@ -330,17 +329,17 @@ def test_the_handshake_times_the_round_trip_by_the_echo() -> None:
     assert not shake.accept_datagram(encode_reply(Header(1, 0, 5), reply), 105 * MS), "old"
     assert not shake.accept_datagram(encode_reply(Header(2, 0, 6), reply)[:-1], 106 * MS), "cut"
     assert shake.accept_datagram(encode_reply(Header(3, 0, 99), reply), 107 * MS)
-    assert (shake.round_trip.count, shake.dropped) == (1, 2), "a number that we never sent proves nothing"
+    assert (shake.round_trip.count, shake.dropped) == (1, 2), "a number that was never sent proves nothing"
 
 
-def test_a_plc_of_another_word_order_is_not_believed() -> None:
+def test_plc_of_another_word_order_is_refused() -> None:
     shake = Handshake(WordOrder.HIGH_FIRST)
     status = plc.status_registers(Feedback(state=State.HOLD), 300, WordOrder.LOW_FIRST)
     assert not shake.accept_registers(status, 0)
     assert shake.feedback is None and "LOW_FIRST" in shake.problem
 
 
-def test_a_machine_without_a_plc_or_with_a_carrier_is_refused_in_words() -> None:
+def test_machine_without_a_plc_or_with_a_carrier_is_refused() -> None:
     with pytest.raises(ConfigError, check=coded("config.no-plc")):
         role_of(load_profile("palms_471"))
     with pytest.raises(ConfigError, check=coded("config.plc-carrier")):

@@ -1,4 +1,4 @@
-"""The joint references on crane0: only for a PLC that closes the joint loops, and nothing that a frame cannot carry."""
+"""The joint references on crane0: only for a PLC that closes the joint loops, and only within the frames' range."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def decoded(frames: list[RawFrame]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("role", [None, "valves"])
-def test_nobody_else_is_bothered_with_them(role: str | None) -> None:
+def test_only_a_plc_with_role_references_gets_them(role: str | None) -> None:
     frames: list[RawFrame] = []
     CraneWriter(DATABASE, profile(role)).references(HERE, SPEEDS, True, frames)
     assert not frames
 
 
-def test_they_carry_position_and_the_velocity_to_command() -> None:
+def test_references_carry_position_and_commanded_velocity() -> None:
     frames: list[RawFrame] = []
     CraneWriter(DATABASE, profile("references")).references(HERE, SPEEDS, True, frames)
     found = decoded(frames)
@@ -50,7 +50,7 @@ def test_they_carry_position_and_the_velocity_to_command() -> None:
         assert found[f"{name}Rate"] == pytest.approx(speed, abs=5.01e-4)
 
 
-def test_at_rest_unknown_or_out_of_reach_is_not_available() -> None:
+def test_references_at_rest_unknown_or_out_of_range_are_not_available() -> None:
     writer, frames = CraneWriter(DATABASE, profile("references")), list[RawFrame]()
     writer.references(HERE, SPEEDS, False, frames)
     assert decoded(frames)["Slew"] is decoded(frames)["RotRate"] is None
@@ -62,7 +62,7 @@ def test_at_rest_unknown_or_out_of_reach_is_not_available() -> None:
     assert found["Ext"] == pytest.approx(0.5, abs=1e-4) and found["ExtRate"] == pytest.approx(0.1, abs=1e-3)
 
 
-def test_a_machine_whose_joints_the_frames_cannot_carry_is_refused_at_the_start() -> None:
+def test_joint_range_beyond_the_frames_is_refused_at_start() -> None:
     wide = profile("references")
     slew = msgspec.structs.replace(wide.joints["slew"], upper=3.5)
     with pytest.raises(ConfigError, check=coded("config.reference-range")):

@@ -1,4 +1,4 @@
-"""A machine whose rotator and opening have no sensor: the controller starts, moves and never reads them."""
+"""A machine without sensors for rotator and opening: the controller starts, moves and never reads them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def forwarder(monkeypatch) -> Bench:
 
 
 @pytest.mark.parametrize("which", [Joint.SLEW, Joint.EXT, Joint.ROT])
-def test_it_starts_arms_and_moves_and_the_rotator_goes_blind(forwarder, which):
+def test_controller_arms_and_moves_without_a_rotator_encoder(forwarder, which):
     forwarder.active(which, 0.1, 200)
     report = forwarder.reports[-1]
     assert forwarder.mode is Mode.ACTIVE and report.refused == 0
@@ -36,18 +36,18 @@ def test_it_starts_arms_and_moves_and_the_rotator_goes_blind(forwarder, which):
         assert report.reference[Joint.ROT] == pytest.approx(forwarder.q[Joint.ROT], abs=0.05)
 
 
-def test_the_opening_on_the_bus_is_not_believed_and_time_closes_the_grapple(forwarder):
+def test_opening_on_the_bus_is_ignored_without_a_sensor(forwarder):
     forwarder.changed["GrappleStat"] = {"Opening": 100.0}
     forwarder.armed()
     for k in range(700):
         forwarder.tick([forwarder.hold(grapple=GrappleCommand.OPEN)] if k % 10 == 0 else ())
         if k == 300:
-            assert forwarder.controller.crane.grapple.state is GrappleState.OPENING, "100 % open says nothing here"
+            assert forwarder.controller.crane.grapple.state is GrappleState.OPENING, "100 % open means nothing here"
     assert isnan(forwarder.reports[-1].opening_pct)
     assert forwarder.controller.crane.grapple.state is GrappleState.OPEN
 
 
-def test_the_guard_reads_the_forwarder_and_lets_it_move(monkeypatch):
+def test_guard_enables_the_forwarder(monkeypatch):
     monkeypatch.setattr(bench, "SPECS", [joint(SETTINGS.profile, j) for j in JOINTS])
     watched = Bench(settings=SETTINGS, home=(0.0, 0.9, -2.0, 0.5, 0.0), guard=build(profile_path("aoro_fc8")))
     watched.active(Joint.ROT, 0.1, 200)

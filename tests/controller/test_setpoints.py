@@ -1,4 +1,4 @@
-"""Every reason a setpoint is refused for, each with a setpoint that differs in that one thing from a good one."""
+"""Every reason to refuse a setpoint, each with a setpoint that differs from a good one in that respect only."""
 
 import math
 import struct
@@ -81,7 +81,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_refused_with_its_reason_and_nothing_moves(name):
+def test_setpoint_is_refused_with_its_reason_and_nothing_moves(name):
     reason, detail, make = BAD[name]
     bench = Bench().armed()
     bench.tick([bench.hold()])
@@ -106,19 +106,19 @@ def test_every_refusal_reason_is_tried():
     assert {100 + f for f in DatagramFault} <= set(Reason)
 
 
-def test_refused_while_not_armed():
+def test_setpoint_is_refused_while_not_armed():
     bench = Bench().boot()
     bench.tick([bench.hold()])
     assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.NOT_ARMED
 
 
-def test_key_is_demanded_when_configured():
+def test_key_is_required_when_configured():
     bench = Bench(settings=load("palms_471", key=b"0123456789abcdef"))
     bench.tick([bench.hold()])
     assert bench.controller.gate.refusal is Reason.DATAGRAM_AUTHENTICATION
 
 
-def test_a_new_session_may_count_from_the_beginning_but_not_go_back_in_time():
+def test_new_session_may_count_from_the_beginning_but_not_go_back_in_time():
     bench = Bench().active()
     old = bench.moving(0, 0.08)
     bench.tick([bench.operator(2)])

@@ -1,4 +1,4 @@
-"""Spool tests through the whole controller: what reaches the bus, what stops them, and what follows them."""
+"""Spool tests through the whole controller: frames on the bus, stops, and what follows a test."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def spools(bench: Bench) -> list[float]:
 
 
 def running(bench: Bench, percent: float, seconds: float, joint: int = Joint.SLEW, step=lambda bench: False) -> None:
-    """Ramps to ``percent`` and stays there, renewed every 50 ms; ``step`` may end it."""
+    """Ramp to ``percent`` and stay there, renewed every 50 ms; ``step`` may end it."""
     sign = 1 if percent > 0 else -1
     begin_ns = bench.now_ns
     edge = bench.specs[joint].valve.deadband_plus_pct
@@ -55,7 +55,7 @@ def running(bench: Bench, percent: float, seconds: float, joint: int = Joint.SLE
             bench.tick()
 
 
-def test_one_spool_follows_its_knots_and_every_other_one_is_neutral() -> None:
+def test_one_spool_follows_its_knots_and_all_others_are_neutral() -> None:
     bench = Bench().armed()
     bench.tick([asked(bench, *RAMP)])
     assert bench.mode is Mode.ACTIVE
@@ -65,17 +65,17 @@ def test_one_spool_follows_its_knots_and_every_other_one_is_neutral() -> None:
         slew, *others = spools(bench)
         assert slew == pytest.approx(12.0 + 18.0 * (now_ms - 5) / 400, abs=0.06)
         assert others == [0.0] * 4 and bench.commands_b["GrappleMode"] == 0
-    assert bench.controller.reference_position[0] == pytest.approx(bench.q[0], abs=0.01), "the reference goes along"
+    assert bench.controller.reference_position[0] == pytest.approx(bench.q[0], abs=0.01), "it follows the joint"
 
 
-def test_a_test_that_ends_neutral_ends_in_armed() -> None:
+def test_test_that_ends_neutral_ends_in_armed() -> None:
     bench = Bench().armed()
     bench.tick([asked(bench, (0, 0.0), (5, 12.0), (100, 14.0), (105, 0.0))])
     assert count_until(bench.tick, lambda: bench.mode is Mode.ARMED, 60) * T == pytest.approx(200 * MS, abs=2 * T)
     assert spools(bench) == [0.0] * 5
 
 
-def test_a_lost_lease_closes_the_valve_on_a_ramp_and_stops() -> None:
+def test_lost_lease_closes_the_valve_on_a_ramp_and_stops() -> None:
     bench = Bench().armed()
     running(bench, 40.0, 0.6)
     opened = []
@@ -85,7 +85,7 @@ def test_a_lost_lease_closes_the_valve_on_a_ramp_and_stops() -> None:
         opened.append(spools(bench)[0])
         bench.tick()
     fading = [p for p in opened if p > 0.0]
-    assert fading == sorted(fading, reverse=True) and len(fading) > 10, "not at a stroke"
+    assert fading == sorted(fading, reverse=True) and len(fading) > 10, "not in one step"
     assert spools(bench) == [0.0] * 5 and not bench.controller.crane.spool_run.running
 
 
@@ -96,7 +96,7 @@ def test_knots_that_end_open_stop_before_the_lease_does() -> None:
     assert 95 * MS <= ticks * T <= 110 * MS and bench.controller.supervisor.reason is Reason.LEASE_LOST
 
 
-def test_a_trajectory_waits_for_a_shut_valve_and_then_begins_where_the_joint_is() -> None:
+def test_trajectory_is_accepted_once_the_valve_is_shut() -> None:
     bench = Bench().armed()
     running(bench, 30.0, 0.4)
     bench.tick([bench.hold()])
@@ -110,7 +110,7 @@ def test_a_trajectory_waits_for_a_shut_valve_and_then_begins_where_the_joint_is(
     assert abs(bench.controller.reference_position[0] - bench.q[0]) < 0.02
 
 
-def test_a_moving_trajectory_is_not_broken_by_a_test() -> None:
+def test_test_does_not_interrupt_a_moving_trajectory() -> None:
     bench = Bench().active()
     refused = bench.controller.gate.refused
     bench.tick([asked(bench, *RAMP, joint=Joint.LIFT)])
@@ -119,20 +119,20 @@ def test_a_moving_trajectory_is_not_broken_by_a_test() -> None:
     assert not bench.controller.crane.spool_run.running
 
 
-def test_not_before_a_human_armed() -> None:
+def test_test_needs_an_armed_machine() -> None:
     bench = Bench().boot()
     bench.tick([asked(bench, *RAMP)])
     assert bench.mode is Mode.STANDBY and bench.controller.gate.refusal is Reason.NOT_ARMED
 
 
-def test_a_rotator_without_encoder_is_driven_and_its_commanded_way_counts() -> None:
+def test_rotator_without_encoder_is_limited_by_its_integrated_angle() -> None:
     blind = Bench(AORO).armed()
     running(blind, 40.0, 0.6, Joint.ROT)
     assert blind.mode is Mode.ACTIVE and spools(blind) == [0.0, 0.0, 0.0, 0.0, pytest.approx(40.0, abs=0.1)]
     assert blind.controller.crane.spool_run.integrated_rad == pytest.approx(0.667 * 0.42, abs=0.05)
 
 
-def test_a_rotator_without_encoder_that_is_told_to_go_on_is_stopped() -> None:
+def test_rotator_without_encoder_is_stopped_at_its_time_limit() -> None:
     blind = Bench(AORO).armed()
     running(blind, 60.0, 8.0, Joint.ROT, step=lambda bench: bench.mode is Mode.STOP)
     supervisor = blind.controller.supervisor
@@ -141,7 +141,7 @@ def test_a_rotator_without_encoder_that_is_told_to_go_on_is_stopped() -> None:
     assert spools(blind) == [0.0] * 5
 
 
-def test_a_wild_command_is_refused() -> None:
+def test_wild_command_is_refused() -> None:
     bench = Bench().armed()
     bench.tick([asked(bench, (0, 0.0), (5, 40.0))])
     assert (bench.controller.gate.refusal, bench.controller.gate.detail) == (Reason.TEST_SPOOL, Joint.SLEW)
@@ -165,7 +165,7 @@ def stopped_by(bench: Bench, reason: Reason, joint: Joint) -> bool:
     return bench.mode is Mode.STOP and (supervisor.reason, supervisor.detail) == (reason, joint)
 
 
-def test_a_joint_near_its_end_is_stopped_inside_its_range() -> None:
+def test_joint_is_stopped_inside_its_range() -> None:
     bench = Bench(home=(1.5, *HOME[1:])).armed()
     running(bench, 50.0, 3.0, step=lambda b: b.mode is Mode.STOP)
     assert stopped_by(bench, Reason.TEST_RANGE, Joint.SLEW)
@@ -173,7 +173,7 @@ def test_a_joint_near_its_end_is_stopped_inside_its_range() -> None:
     assert bench.q[0] < 1.74533
 
 
-def test_a_joint_that_is_faster_than_the_profile_says_is_stopped() -> None:
+def test_joint_faster_than_the_profile_is_stopped() -> None:
     bench = Bench().armed()
     running(bench, 40.0, 0.7)
     bench.moves_alone[Joint.SLEW] = 0.35
@@ -182,7 +182,7 @@ def test_a_joint_that_is_faster_than_the_profile_says_is_stopped() -> None:
     assert ticks * T < 100 * MS, "the estimator's filter and a tick"
 
 
-def test_a_test_without_end_is_stopped() -> None:
+def test_test_without_end_is_stopped() -> None:
     bench = Bench().armed()
     running(bench, 5.0, 25.0, step=lambda b: b.mode is Mode.STOP)
     assert stopped_by(bench, Reason.TEST_TOO_LONG, Joint.SLEW)
@@ -190,7 +190,7 @@ def test_a_test_without_end_is_stopped() -> None:
 
 
 @pytest.mark.parametrize("joint", JOINTS)
-def test_the_guard_agrees_and_no_monitor_cries_under_the_dead_band(joint: Joint) -> None:
+def test_guard_and_monitors_accept_a_test_below_the_dead_band(joint: Joint) -> None:
     bench = Bench(guard=build_guard(profile_path("palms_471"))).armed()
     running(bench, 11.0 if joint != Joint.ROT else 9.0, 2.0, joint)
     assert bench.mode is Mode.ACTIVE and bench.guard.enabled

@@ -1,4 +1,4 @@
-"""A spool test in force: what it lets through, what it refuses, and when it stops; the controller around it."""
+"""A spool test in force: accepted and refused programs, and reasons to stop."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def reason_of(run: SpoolTestRun, test: SpoolTest, now_ns: int = NOW) -> Reason:
     return refusal.value.reason
 
 
-def test_lines_between_the_knots_and_neutral_past_the_last() -> None:
+def test_program_is_linear_between_knots_and_neutral_after_the_last() -> None:
     run = SpoolTestRun(PALMS)
     run.start(asked((0, 0.0), (5, 10.0), (105, 20.0)), NOW)
     assert run.percent(NOW) == 0.0
@@ -41,7 +41,7 @@ def test_lines_between_the_knots_and_neutral_past_the_last() -> None:
     assert run.cut_short(NOW + 106 * MS) and not run.ends_neutral(NOW + 106 * MS)
 
 
-def test_a_joint_without_encoder_is_refused() -> None:
+def test_joint_without_encoder_is_refused() -> None:
     tilt = msgspec.structs.replace(AORO.joints["tilt"], encoder=None)
     run = SpoolTestRun(msgspec.structs.replace(AORO, joints={**AORO.joints, "tilt": tilt}))
     assert reason_of(run, asked((0, 0.0), joint=Joint.TILT)) is Reason.TEST_FUNCTION
@@ -49,7 +49,7 @@ def test_a_joint_without_encoder_is_refused() -> None:
 
 
 def stopped(run: SpoolTestRun, percent: float, most_s: float = 10.0) -> tuple[Reason, float]:
-    """A rotator's test, driven tick by tick: why it is to stop, and after how long [s]."""
+    """Drive a rotator's test tick by tick: reason to stop, and time until then [s]."""
     ramp = 200 * MS
     for now in range(NOW, NOW + int(most_s * 1e9), 5 * MS):
         if now == NOW:
@@ -62,7 +62,7 @@ def stopped(run: SpoolTestRun, percent: float, most_s: float = 10.0) -> tuple[Re
     return Reason.NONE, most_s
 
 
-def test_a_rotator_without_encoder_stays_within_its_range_by_what_it_is_told() -> None:
+def test_rotator_without_encoder_stays_within_its_range_by_its_commands() -> None:
     run = SpoolTestRun(AORO)
     # 70 % is 1.33 rad/s, with 0.4 rad for stopping: 5.88 of 6.28 rad
     reason, after_s = stopped(run, 70.0)
@@ -70,20 +70,20 @@ def test_a_rotator_without_encoder_stays_within_its_range_by_what_it_is_told() -
     assert run.integrated_rad == pytest.approx(5.88, abs=0.02)
     run.start(asked((0, 0.0), joint=Joint.ROT), NOW)
     run.end()
-    assert stopped(run, 70.0)[1] < 0.25, "its way counts over all tests"
+    assert stopped(run, 70.0)[1] < 0.25, "the angle counts over all tests"
     run.start(asked((0, 0.0), joint=Joint.ROT), NOW)
     run.end()
-    assert stopped(run, -70.0, most_s=3.0) == (Reason.NONE, 3.0), "the way back is free"
+    assert stopped(run, -70.0, most_s=3.0) == (Reason.NONE, 3.0), "turning back is allowed"
 
 
-def test_a_rotator_without_encoder_is_tested_five_seconds_at_most() -> None:
+def test_rotator_without_encoder_is_tested_five_seconds_at_most() -> None:
     run = SpoolTestRun(AORO)
     reason, after_s = stopped(run, 9.0)
     assert reason is Reason.TEST_TOO_LONG and after_s == pytest.approx(5.0, abs=0.02)
-    assert run.integrated_rad == 0.0, "inside the dead-band, as it seems"
+    assert run.integrated_rad == 0.0, "inside the dead-band by the profile"
 
 
-def test_a_rotator_without_encoder_keeps_to_speed_and_half_speed() -> None:
+def test_rotator_without_encoder_keeps_to_speed_and_half_speed() -> None:
     assert reason_of(SpoolTestRun(AORO), asked((0, 0.0), (500, 78.0), joint=Joint.ROT)) is Reason.TEST_SPOOL
     run = SpoolTestRun(AORO)
     run.start(asked((0, 0.0), (500, 70.0), (600, 70.0), joint=Joint.ROT), NOW)
@@ -98,13 +98,13 @@ def test_more_speed_than_the_limit_is_refused() -> None:
     assert reason_of(SpoolTestRun(PALMS), asked((0, 0.0), (500, 74.0))) is Reason.TEST_SPOOL
 
 
-def test_the_dead_band_may_be_stepped_over_and_the_opening_not() -> None:
+def test_dead_band_may_be_stepped_over_and_the_opening_not() -> None:
     run = SpoolTestRun(PALMS)
     run.start(asked((0, 0.0), (5, 12.0), (105, 20.0)), NOW)
     assert reason_of(SpoolTestRun(PALMS), asked((0, 0.0), (5, 20.0), (105, 20.0))) is Reason.TEST_SPOOL
 
 
-def test_a_step_from_the_present_command_is_refused_and_closing_is_free() -> None:
+def test_step_from_the_present_command_is_refused_and_closing_is_free() -> None:
     run = SpoolTestRun(PALMS)
     run.start(asked((0, 0.0), (400, 40.0)), NOW)
     at = NOW + 200 * MS
@@ -114,7 +114,7 @@ def test_a_step_from_the_present_command_is_refused_and_closing_is_free() -> Non
     assert run.percent(at) == 0.0
 
 
-def test_a_late_window_of_the_same_program_is_taken() -> None:
+def test_late_window_of_the_same_program_is_accepted() -> None:
     run = SpoolTestRun(PALMS)
     run.start(asked((0, 0.0), (200, 30.0), (400, 60.0)), NOW)
     run.start(asked((0, 15.0), (100, 30.0), (300, 60.0), stamp_ns=NOW + 100 * MS), NOW + 110 * MS)
@@ -141,7 +141,7 @@ def test_another_function_waits_until_the_valve_is_shut() -> None:
         (-1.70, -0.2, -30.0, Reason.TEST_RANGE),
     ],
 )
-def test_range_and_speed_are_judged_from_the_encoder(
+def test_range_and_speed_are_checked_by_the_encoder(
     position: float, velocity: float, percent: float, reason: Reason
 ) -> None:
     run = SpoolTestRun(PALMS)
@@ -149,14 +149,14 @@ def test_range_and_speed_are_judged_from_the_encoder(
     assert run.check(position, velocity, 1.0, NOW + 300 * MS) is reason
 
 
-def test_half_speed_halves_what_it_may_reach() -> None:
+def test_half_speed_halves_the_speed_limit() -> None:
     run = SpoolTestRun(PALMS)
     run.start(asked((0, 0.0), (400, 30.0)), NOW)
     assert run.check(0.0, 0.25, 1.0, NOW) is Reason.NONE
     assert run.check(0.0, 0.25, 0.5, NOW) is Reason.TEST_SPEED
 
 
-def test_it_lasts_twenty_seconds_at_most_whatever_windows_come() -> None:
+def test_test_lasts_twenty_seconds_at_most() -> None:
     run = SpoolTestRun(PALMS)
     run.start(asked((0, 0.0), (100, 5.0)), NOW)
     now, reason = NOW, Reason.NONE
@@ -168,7 +168,7 @@ def test_it_lasts_twenty_seconds_at_most_whatever_windows_come() -> None:
     assert MAX_OPEN_NS <= now - NOW <= MAX_OPEN_NS + 200 * MS
 
 
-def test_the_command_carries_the_profiles_sign_and_fades() -> None:
+def test_command_carries_the_profiles_sign_and_fades() -> None:
     run = SpoolTestRun(PALMS)
     run.start(asked((0, 0.0), (400, 40.0), joint=Joint.LIFT), NOW)
     spool, speed = run.drive(1.0, NOW + 400 * MS)

@@ -15,7 +15,7 @@ from tests.codes import coded
 from tests.controller.bench import DATABASE, MS, PROFILE, SETTINGS, Bench, T
 
 
-def test_every_encoder_is_set_up_as_the_bus_reference_says():
+def test_every_encoder_is_configured_as_in_the_bus_reference():
     bench = Bench().boot()
     rotary, linear = bench.encoders[2].objects, bench.encoders[5].objects
     assert [rotary[0x1A00, i] for i in (1, 2, 3)] == [0x60040020, 0x21200010, 0x65030010]
@@ -39,7 +39,7 @@ def test_at_most_one_frame_per_tick():
         assert len(setup) <= 1
 
 
-def test_absent_encoder_is_named_and_taken_in_when_it_comes():
+def test_absent_encoder_is_reported_and_set_up_when_it_appears():
     bench = Bench()
     bench.encoders[4].silent = True
     bench.run(500)
@@ -68,14 +68,14 @@ def test_wrong_identity_or_range_is_refused_until_reset(place, value):
     assert bench.mode is Mode.STANDBY
 
 
-def test_a_device_that_refuses_its_set_up():
+def test_refused_set_up_is_a_configuration_fault():
     bench = Bench()
     bench.encoders[6].refuses.add((0x1A00, 2))
     bench.run(200)
     assert bench.reason == Reason.NODE_CONFIGURATION and bench.controller.supervisor.detail == 6
 
 
-def test_a_device_swapped_while_running_is_noticed():
+def test_device_swapped_while_running_is_detected():
     bench = Bench().boot()
     bench.encoders[2].objects[0x1018, 1] = 8
     bench.extra.append((0x702, b"\x00"))
@@ -85,7 +85,7 @@ def test_a_device_swapped_while_running_is_noticed():
     assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 2
 
 
-def test_three_tries_of_300_ms_then_over_again():
+def test_three_tries_of_300_ms_then_again():
     setup = EncoderSetup(Bench().settings.profile.joints["slew"].encoder)
     sent = []
     for k in range(400):
@@ -95,7 +95,7 @@ def test_three_tries_of_300_ms_then_over_again():
     assert setup.reason is Reason.NODE_ABSENT
 
 
-def test_a_stray_answer_is_ignored():
+def test_stray_answer_is_ignored():
     setup = EncoderSetup(Bench().settings.profile.joints["slew"].encoder)
     stray = Sdo(SdoKind.UPLOAD, 2, 0x6004, 0, b"\1\0\0\0", 0)
     setup.receive(stray)
@@ -105,7 +105,7 @@ def test_a_stray_answer_is_ignored():
     assert setup.phase is Phase.CONFIGURING and setup.reason is Reason.NODE_ABSENT
 
 
-def test_an_encoder_that_left_operational_by_itself_is_set_up_again_by_a_reset():
+def test_encoder_that_left_operational_by_itself_is_set_up_again_by_a_reset():
     bench = Bench().boot()
     bench.encoders[3].state = 0x7F  # what a CiA 301 device does after a communication error
     bench.run(100)
@@ -118,7 +118,7 @@ def test_an_encoder_that_left_operational_by_itself_is_set_up_again_by_a_reset()
     assert bench.mode is Mode.ARMED
 
 
-def test_a_node_that_boots_late_is_started():
+def test_node_that_boots_late_is_started():
     bench = Bench().boot()
     starts = [f for f in _frames(bench, 40) if f == (0, b"\x01\x00")]
     assert not starts
@@ -130,7 +130,7 @@ def _frames(bench, ticks):
     return [frame for _ in range(ticks) for frame in list(bench.tick().frames)]
 
 
-def test_a_lost_preset_is_a_device_that_is_not_the_one_it_was():
+def test_lost_preset_is_an_identity_fault():
     bench = Bench().boot()
     bench.encoders[4].objects[0x6003, 0] = 1234
     bench.encoders[4].state = 0x7F
@@ -139,7 +139,7 @@ def test_a_lost_preset_is_a_device_that_is_not_the_one_it_was():
     assert bench.reason == Reason.NODE_IDENTITY and bench.controller.supervisor.detail == 4
 
 
-def test_a_node_that_cannot_send_its_message_is_a_configuration_error():
+def test_node_that_cannot_send_its_message_is_a_configuration_error():
     encoder = PROFILE.joints["slew"].encoder
     slew = msgspec.structs.replace(PROFILE.joints["slew"], encoder=msgspec.structs.replace(encoder, node=16))
     profile = msgspec.structs.replace(PROFILE, joints=PROFILE.joints | {"slew": slew})

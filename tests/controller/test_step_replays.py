@@ -1,4 +1,4 @@
-"""Determinism, hostile inputs, memory: what replay and a long run rely on."""
+"""Determinism, hostile inputs and memory: the basis of replay and of long runs."""
 
 import gc
 import tracemalloc
@@ -37,7 +37,7 @@ five = st.tuples(number, number, number, number, number)
 
 @st.composite
 def setpoints(draw):
-    """Setpoints with a right checksum and wild contents."""
+    """Setpoints with a valid checksum and random contents."""
     n = draw(st.integers(1, 4))
     knots = tuple(Knot(1000 * draw(st.integers(0, 4_000_000)), draw(five), draw(five)) for _ in range(n))
     return encode(
@@ -51,7 +51,7 @@ def setpoints(draw):
 
 @st.composite
 def near_setpoints(draw):
-    """Knots near where the machine is: some are accepted."""
+    """Knots near the present position: some are accepted."""
     small = st.floats(-0.4, 0.4)
     return [
         (50 * (i + 1), [draw(small) for _ in range(5)], [draw(small) for _ in range(5)])
@@ -79,7 +79,7 @@ def inside_the_envelope(bench):
 
 @given(hostile, st.sampled_from(["boot", "armed", "active"]))
 @settings(max_examples=25, deadline=None)
-def test_nothing_raises_and_outputs_stay_in_the_envelope(script, state):
+def test_random_input_never_raises_or_leaves_the_envelope(script, state):
     bench = PREPARED[state]()
     for extra, datagrams in script:
         bench.extra = list(extra)
@@ -113,7 +113,7 @@ def note(bench, tape, datagrams=(), **measured):
 
 
 @pytest.mark.parametrize("settings_", [SETTINGS, AORO], ids=lambda s: s.profile.name)
-def test_a_record_of_a_whole_life_replays_to_the_same_bytes(settings_):
+def test_record_of_a_whole_run_replays_to_the_same_bytes(settings_):
     bench, tape = Bench(settings_), []
     for _ in range(150):
         note(bench, tape)
@@ -140,12 +140,12 @@ def test_a_record_of_a_whole_life_replays_to_the_same_bytes(settings_):
         outputs = step(controller, inputs, tick.now_ns)
         assert transmitted(outputs) == (tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report)
         assert tick.frames_out[-1][0] == 0x080, "SYNC goes out last"
-    spoken = [said for data in tape for said in tick_record.decode(data).machine_frames_out]
-    assert bool(spoken) is (settings_ is AORO)
+    sent = [frame for data in tape for frame in tick_record.decode(data).machine_frames_out]
+    assert bool(sent) is (settings_ is AORO)
 
 
 @pytest.mark.parametrize("settings_", [SETTINGS, pytest.param(AORO, marks=pytest.mark.slow)])
-def test_a_tick_leaves_nothing_behind(settings_):
+def test_tick_keeps_no_memory(settings_):
     bench = Bench(settings_).active()
     planned = []
     for k in range(40):
@@ -182,7 +182,7 @@ def test_a_tick_leaves_nothing_behind(settings_):
         gc.enable()
 
 
-def test_reports_come_50_times_a_second_and_tell_what_is_unknown():
+def test_reports_come_50_times_a_second_with_nan_for_unknown_values():
     bench = Bench()
     bench.run(5)
     assert all(p != p for p in bench.reports[0].position)
@@ -209,11 +209,11 @@ def test_status_and_heartbeat_on_the_bus_and_sync_apart():
     assert all(b == a % 240 + 1 for a, b in pairwise(counters))
 
 
-def test_farewell_is_neutral_and_disarmed():
+def test_shutdown_frames_are_neutral_and_disarmed():
     bench = Bench().active()
     out = bench.controller.shutdown_frames()
     bench.controller.outputs.frames[:] = out
-    bench._obey(bench.controller.outputs)
+    bench._apply_crane_frames(bench.controller.outputs)
     assert bench.neutral and bench.commands_b["ArmKey"] == 0
     codec = DATABASE.message("CtrlStatus")
     assert out[-1][0] == codec.key and codec.named(codec.decode(out[-1][1]))["Reason"] == 13

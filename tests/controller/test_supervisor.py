@@ -1,4 +1,4 @@
-"""The mode table, exhaustively, and how the operator moves through it."""
+"""The mode table, exhaustively, and the operator's way through it."""
 
 import pytest
 
@@ -43,7 +43,7 @@ def test_only_arm_leads_to_armed_but_the_end_of_a_motion():
     assert [key for key in TRANSITIONS if key[0] is Mode.FAULT] == [(Mode.FAULT, Event.RESET)]
 
 
-def test_boot_to_active_and_back_in_peace():
+def test_boot_to_active_and_back():
     bench = Bench().armed()
     assert bench.neutral and bench.commands_b["ArmKey"] == 0xA
     bench.tick([bench.hold(final=True)])
@@ -66,7 +66,7 @@ def test_stop_from_every_mode():
         assert bench.mode is Mode.STOP
 
 
-def test_stop_is_obeyed_with_a_wrong_profile_and_an_old_stamp():
+def test_stop_is_accepted_with_a_wrong_profile_and_an_old_stamp():
     bench = Bench().active()
     bench.tick([bench.operator(OperatorAction.STOP, profile_hash=1, stamp_ns=5, sequence=0)])
     assert bench.mode is Mode.STOP
@@ -236,7 +236,7 @@ def test_every_reason_is_described():
                and fault.sentence[:12] != "The operator")  # fmt: skip
 
 
-def test_the_last_arm_command_replayed_does_not_arm_again():
+def test_last_arm_command_replayed_does_not_arm_again():
     bench = Bench().boot()
     arm = bench.operator(OperatorAction.ARM)
     bench.tick([arm])

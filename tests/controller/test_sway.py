@@ -1,4 +1,4 @@
-"""Damping of a swinging grapple: the law on a pendulum of its own, the joints' part, and the sensor that helps."""
+"""Sway damping: the law on a pendulum, the joints' part, and the optional sensor."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Pendulum:
 
 
 def damped(pendulum, seconds, imu=IMU, delay_s=0.15, age_s=0.0):
-    """The damper with its way back on a pendulum behind a dead time; the swing over time."""
+    """Swing over time of a pendulum with damping behind a dead time."""
     damper = DirectionalDamper(imu, delay_s)
     line, seen = deque([0.0] * round(delay_s / T_S)), deque()
     swings, displaced = [], 0.0
@@ -85,14 +85,14 @@ def decay(swings, begin_s, end_s, period_s):
     return math.log(begin / end) / (2.0 * math.pi * (end_s - begin_s) / period_s)
 
 
-def test_the_pendulum_alone_keeps_its_swing():
+def test_undamped_pendulum_keeps_its_swing():
     swings = damped(Pendulum(0.8, 0.1), 4.0, msgspec.structs.replace(IMU, gain=0.0))
     assert min(swings) == pytest.approx(0.1, rel=0.02)
 
 
 @pytest.mark.parametrize("delay_s", [0.1, 0.25])
 @pytest.mark.parametrize("age_s", [0.0, 0.03])
-def test_half_the_gain_is_the_damping_ratio_whatever_the_delay(delay_s, age_s):
+def test_damping_ratio_is_half_the_gain_for_any_delay(delay_s, age_s):
     fast = msgspec.structs.replace(IMU, pin_speed_m_s=0.5, dead_zone_rad=0.003)
     pendulum = Pendulum(0.8, 0.15)
     swings = damped(pendulum, 4.0, fast, delay_s, age_s)
@@ -100,7 +100,7 @@ def test_half_the_gain_is_the_damping_ratio_whatever_the_delay(delay_s, age_s):
 
 
 @pytest.mark.parametrize("length_m", [0.56, 0.7, 0.95, 1.1])
-def test_a_pendulum_of_another_length_is_damped_too_and_the_pin_comes_back(length_m):
+def test_pendulum_of_another_length_is_damped_too_and_the_pin_comes_back(length_m):
     pendulum = Pendulum(length_m, 0.12)
     swings = damped(pendulum, 6.0)
     assert swings[round(3.6 / T_S)] < 0.5 * 0.12
@@ -109,7 +109,7 @@ def test_a_pendulum_of_another_length_is_damped_too_and_the_pin_comes_back(lengt
 
 
 @pytest.mark.parametrize("age_s", [0.01, 0.05])
-def test_an_old_swing_counts_as_what_has_become_of_it(age_s):
+def test_old_swing_is_predicted_by_its_age(age_s):
     w = math.sqrt(GRAVITY_M_S2 / IMU.pendulum_m)
     lean, rate, turned = 0.05, 0.12, w * age_s
     now = (lean * math.cos(turned) + rate / w * math.sin(turned), rate * math.cos(turned) - w * lean * math.sin(turned))
@@ -119,7 +119,7 @@ def test_an_old_swing_counts_as_what_has_become_of_it(age_s):
     assert old.velocity_m_s == pytest.approx(new.velocity_m_s, rel=1e-9) and old.velocity_m_s > 0.0
 
 
-def test_it_begins_above_the_dead_zone_and_ends_in_it():
+def test_damping_begins_above_the_dead_zone_and_ends_in_it():
     damper = DirectionalDamper(IMU, 0.15)
     damper.step((START_ZONES - 0.1) * IMU.dead_zone_rad, 0.0, 0.0, T_S)
     assert damper.velocity_m_s == 0.0
@@ -133,7 +133,7 @@ def test_it_begins_above_the_dead_zone_and_ends_in_it():
     assert damper.velocity_m_s == 0.0
 
 
-def test_the_pin_is_never_faster_than_allowed_and_nothing_jumps_when_it_starts_or_stops():
+def test_pin_keeps_its_speed_limit_without_jumps():
     damper, before = DirectionalDamper(IMU, 0.0), 0.0
     for k in range(400):
         if k < 200:
@@ -154,7 +154,7 @@ def sway(imu=IMU):
 
 @pytest.mark.parametrize(("swing", "ahead"), [((0.2, 0.0, 0.0, 0.0), (1, 0)), ((0.0, 0.2, 0.0, 0.0), (0, 1))])
 @pytest.mark.parametrize("pose", [POSE, (-1.2, 1.1, -2.3, 0.2, 0.5), (0.9, 0.2, -0.4, 2.2, 0.0)])
-def test_the_joints_move_the_pin_level_and_towards_the_grapple(swing, ahead, pose):
+def test_joints_move_the_pin_level_and_towards_the_grapple(swing, ahead, pose):
     law = sway()
     for _ in range(round(FADE_S / T_S) + 1):
         law.step(swing, 0.0, True, pose, T_S)
@@ -171,7 +171,7 @@ def test_the_joints_move_the_pin_level_and_towards_the_grapple(swing, ahead, pos
     assert law.velocity[Joint.LIFT] == law.velocity[Joint.ROT] == 0.0
 
 
-def test_after_its_time_it_takes_the_pin_back_and_is_exactly_over():
+def test_pin_returns_exactly_after_the_time_limit():
     law, moved = sway(), []
 
     def tick():
@@ -187,7 +187,7 @@ def test_after_its_time_it_takes_the_pin_back_and_is_exactly_over():
     assert not law.active and not any(law.velocity)
 
 
-def test_while_the_reference_moves_nothing_begins_and_what_was_begun_fades():
+def test_damping_does_not_begin_and_fades_while_the_reference_moves():
     law = sway()
     for _ in range(100):
         law.step((0.2, 0.2, 0.0, 0.0), 0.0, False, POSE, T_S)
@@ -204,14 +204,14 @@ def test_while_the_reference_moves_nothing_begins_and_what_was_begun_fades():
     assert not any(law.velocity) and not any(law.displacement)
 
 
-def test_joints_that_nobody_knows_are_not_moved():
+def test_unknown_joints_are_not_moved():
     law = sway()
     law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, POSE, T_S)
     law.step((0.2, 0.2, 0.0, 0.0), 0.0, True, (0.3, math.nan, -1.4, 0.8, 0.0), T_S)
     assert not law.active and not any(law.velocity) and not any(law.displacement)
 
 
-def test_a_joint_that_is_moved_on_top_of_its_reference_does_not_rest_and_rests_afterwards():
+def test_end_positioning_waits_for_the_damping():
     spec = joint(PROFILE, Joint.SLEW)
     law = JointLaw(spec, ValveMap(spec.valve), T_S)
     law.desired_velocity(0.2, 0.0, 0.0, 0.2, 0.0, math.nan, T_S)
@@ -235,19 +235,19 @@ def sensing(imu=IMU) -> Settings:
 
 
 def feel(bench: Bench, **values: float) -> None:
-    """One frame of the sensor in the next tick."""
+    """Send one frame of the sensor in the next tick."""
     bench.extra.append(bench._frame("GrappleImu", values))
 
 
 def at_rest(bench: Bench) -> Bench:
-    """ACTIVE, with a reference that stands and a lease that does not run out."""
+    """ACTIVE, with a constant reference and a lease that does not end."""
     bench.armed()
     bench.tick([bench.hold(lease_ms=500)])
     assert bench.mode is Mode.ACTIVE
     return bench
 
 
-def test_the_controller_damps_with_a_sensor_and_stops_when_it_is_silent():
+def test_controller_damps_with_a_sensor_and_stops_when_it_is_silent():
     bench = at_rest(Bench(sensing()))
     for k in range(60):
         if k % 2 == 0:
@@ -261,11 +261,11 @@ def test_the_controller_damps_with_a_sensor_and_stops_when_it_is_silent():
     swung = bench.controller.crane.sway
     assert bench.controller.crane_inputs.imu.values is None
     assert bench.controller.crane_inputs.stale_mask == 0 and bench.mode is Mode.ACTIVE
-    assert swung.velocity[Joint.SLEW] <= 0.0, "only the way back is left"
+    assert swung.velocity[Joint.SLEW] <= 0.0, "only the return is left"
 
 
 @pytest.mark.parametrize("values", [{"Status": 2}, {"LeanRadial": None}, {"RateTangential": None}])
-def test_a_sensor_that_says_it_is_broken_is_not_believed(values):
+def test_faulty_sensor_is_ignored(values):
     bench = at_rest(Bench(sensing()))
     for k in range(60):
         feel(bench, **{"LeanTangential": 0.15, "LeanRadial": 0.15, **values})
@@ -274,7 +274,7 @@ def test_a_sensor_that_says_it_is_broken_is_not_believed(values):
     assert not bench.controller.crane.sway.active
 
 
-def test_nothing_is_damped_in_standby_and_the_sensor_is_not_needed_to_arm():
+def test_standby_has_no_damping_and_arming_needs_no_sensor():
     bench = Bench(sensing()).boot()
     for _ in range(20):
         feel(bench, LeanTangential=0.15)
@@ -287,7 +287,7 @@ def test_nothing_is_damped_in_standby_and_the_sensor_is_not_needed_to_arm():
     assert bench.mode is Mode.ARMED
 
 
-def test_a_machine_without_one_does_not_listen_for_it():
+def test_machine_without_a_sensor_does_not_receive_its_frames():
     bench = Bench().boot()
     received = bench.controller.crane_inputs
     assert received.imu is None and bench.controller.crane.sway is None
@@ -298,10 +298,10 @@ def test_a_machine_without_one_does_not_listen_for_it():
     assert received.unknown == unknown + 1
 
 
-def test_a_node_that_cannot_send_the_frame_is_refused():
+def test_wrong_sensor_node_is_a_configuration_error():
     with pytest.raises(ConfigError, check=coded("config.imu-node")):
         Controller(sensing(msgspec.structs.replace(IMU, node=0x24)), DATABASE)
 
 
-def test_its_time_out_is_the_dbcs():
+def test_sensor_time_out_is_that_of_the_dbc():
     assert Controller(sensing(), DATABASE).crane_inputs.imu.timeout_ns == 50 * MS

@@ -1,4 +1,4 @@
-"""The trajectory's own time: slowed for the pump and at half speed, on the path, joined to what the planner says."""
+"""Time scaling: slowed for the pump and at half speed, on the path, and joined to the planner's setpoints."""
 
 from itertools import pairwise
 
@@ -38,14 +38,14 @@ def line(stamp_ns, velocity, n=9):
     )  # fmt: skip
 
 
-def test_the_rate_is_one_while_the_pump_and_the_joints_can():
+def test_rate_is_one_within_the_limits_of_pump_and_joints():
     pace = TimeScaling(with_pump(1.0))
     for _ in range(100):
         pace.step([s.speed_limit for s in SPECS], VALVES, 1.0, T)
     assert (pace.rate, pace.behind_ns) == (1.0, 0)
 
 
-def test_the_rate_falls_smoothly_to_what_the_pump_gives_and_the_time_behind_is_bounded():
+def test_rate_falls_smoothly_and_the_time_behind_is_bounded():
     velocity = [0.2, 0.1, -0.2, 0.2, 0.0]
     flow = sum(
         (v * s.valve.flow_plus if v >= 0 else -v * s.valve.flow_minus) for v, s in zip(velocity, SPECS, strict=True)
@@ -63,7 +63,7 @@ def test_the_rate_falls_smoothly_to_what_the_pump_gives_and_the_time_behind_is_b
     assert (pace.rate, pace.behind_ns) == (1.0, 0)
 
 
-def test_a_lower_cap_slows_the_time_when_a_joint_is_faster():
+def test_lower_cap_slows_the_time_when_a_joint_is_faster():
     pace = TimeScaling(with_pump(1.0))
     for _ in range(200):
         pace.step([SPECS[0].speed_limit, 0.0, 0.0, 0.0, 0.0], VALVES, 0.5, T)
@@ -74,7 +74,7 @@ def follower(flow_m3_s):
     return ReferenceGovernor(with_pump(flow_m3_s), VALVES, [120 * MS] * 5)
 
 
-def test_a_slowed_reference_stays_on_the_path():
+def test_slowed_reference_stays_on_the_path():
     made, velocity = follower(1.0e-4), [0.2, 0.1, -0.1, 0.1, 0.0]
     for k in range(160):
         now_ns = 10**9 + k * T
@@ -89,7 +89,7 @@ def test_a_slowed_reference_stays_on_the_path():
     assert made.planned(now_ns)[0] == pytest.approx([v * now_ns * 1e-9 for v in velocity], abs=1e-9)
 
 
-def test_it_catches_up_at_rest_and_a_hold_forgets():
+def test_time_catches_up_at_rest_and_hold_resets():
     made, velocity = follower(1.0e-4), [0.2, 0.1, -0.1, 0.1, 0.0]
     made.candidate.load(line(10**9, velocity))
     made.accept(10**9, True)
@@ -107,7 +107,7 @@ def test_it_catches_up_at_rest_and_a_hold_forgets():
     assert made.position[0] == 0.3 and made.behind_ns == 0
 
 
-def test_a_trajectory_keeps_its_past_while_it_is_behind_and_no_more():
+def test_trajectory_keeps_past_knots_only_while_behind():
     old, new = Trajectory(), Trajectory()
     old.load(line(10**9, [0.1] * 5))
     for k in range(1, 60):
@@ -130,7 +130,7 @@ def bench_with(flow_m3_s):
     return Bench(Settings(profile, profile_hash(profile), profile.rate_hz))
 
 
-def test_a_motion_that_asks_for_too_much_oil_is_done_later_on_its_path():
+def test_motion_beyond_the_pump_flow_stays_on_its_path():
     bench = bench_with(SETTINGS.profile.hydraulics.pump_flow_m3_s * 0.85)
     bench.armed()
     behind, off = 0, 0.0
@@ -140,12 +140,12 @@ def test_a_motion_that_asks_for_too_much_oil_is_done_later_on_its_path():
         shares = [(q - p) / d for q, p, d in zip(bench.q, start, GOALS, strict=True)]
         off = max(off, max(shares[:4]) - min(shares[:4]))
     assert behind > 100 * MS, "the motion should need more than the pump gives"
-    assert off < 0.03, "all joints are at the same place of the path"
+    assert off < 0.03, "all joints are at the same point of the path"
     for q, p, d, spec in zip(bench.q, start, GOALS, SPECS, strict=True):
         assert abs(q - p - d) <= 2.0 * spec.law.stop_band
 
 
-def test_a_setpoint_that_begins_at_the_slowed_reference_is_taken_too():
+def test_setpoint_at_the_slowed_reference_is_accepted():
     bench = bench_with(SETTINGS.profile.hydraulics.pump_flow_m3_s * 0.5)
     bench.armed()
     for _ in drive(bench, 9.0, 4.0):

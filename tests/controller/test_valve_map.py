@@ -1,4 +1,4 @@
-"""Joint velocity to spool command and what it undoes: dead-band, metering curve, lever."""
+"""Joint velocity to spool command: compensation of dead-band, metering curve, hysteresis and lever."""
 
 import math
 
@@ -16,13 +16,13 @@ CURVED = msgspec.structs.replace(SLEW, exponent=1.3, deadband_plus_pct=9.0, dead
 
 
 def metered(valve, u):
-    """What a valve of docs/reference/machines.md section 3 makes of a command: share of the full speed."""
+    """Share of the full speed of a valve of docs/reference/machines.md section 3 for a command."""
     deadband = (valve.deadband_plus_pct if u > 0 else valve.deadband_minus_pct) / 100.0
     half = valve.hysteresis_pct / 200.0
     return math.copysign((max(0.0, abs(u) - deadband) / (1.0 - half - deadband)) ** valve.exponent, u)
 
 
-class Play:
+class Hysteresis:
     """The spool behind its command."""
 
     def __init__(self, valve, at=0.0):
@@ -35,7 +35,7 @@ class Play:
 
 @pytest.mark.parametrize("valve", [SLEW, CURVED])
 @given(velocity=st.floats(-0.5, 0.5))
-def test_the_map_is_the_inverse_of_the_valve(valve, velocity):
+def test_map_is_the_inverse_of_the_valve(valve, velocity):
     u = ValveMap(valve).spool_pct(velocity) / 100.0
     if abs(velocity) > LINEAR_SHARE * 0.5:
         assert metered(valve, u) * 0.5 == pytest.approx(velocity, abs=1e-9)
@@ -48,9 +48,9 @@ def test_the_map_is_the_inverse_of_the_valve(valve, velocity):
     st.lists(st.floats(0.02, 0.45).flatmap(lambda v: st.sampled_from([v, -v])), min_size=2, max_size=8),
     st.floats(-0.01, 0.01),
 )
-def test_the_spools_play_is_undone_after_every_turn(goals, at):
-    """Sweeps from goal to goal: once a sweep is longer than what turns the play, the spool stands where it should."""
-    made, play, velocity = ValveMap(PLAY), Play(PLAY, at), 0.0
+def test_hysteresis_is_compensated_after_every_reversal(goals, at):
+    """In sweeps between goals the spool is correct once a sweep is long enough to reverse the lead."""
+    made, play, velocity = ValveMap(PLAY), Hysteresis(PLAY, at), 0.0
     for goal in goals:
         last = metered(PLAY, play.at)
         for k in range(1, 51):
@@ -62,14 +62,14 @@ def test_the_spools_play_is_undone_after_every_turn(goals, at):
             assert metered(PLAY, spool) * 0.5 == pytest.approx(goal, abs=1e-9)
 
 
-def test_without_the_play_undone_the_joint_would_be_slower_out_than_in():
-    plain, play = ValveMap(SLEW), Play(PLAY)
+def test_without_compensation_hysteresis_costs_speed():
+    plain, play = ValveMap(SLEW), Hysteresis(PLAY)
     rising = [metered(PLAY, play.step(plain.spool_pct(0.005 * k) / 100.0)) for k in range(81)][40]
     falling = [metered(PLAY, play.step(plain.spool_pct(0.4 - 0.005 * k) / 100.0)) for k in range(81)][40]
     assert 0.5 * (falling - rising) == pytest.approx(0.5 * 0.02 / 0.87, rel=0.02)
 
 
-def test_a_flicker_of_the_command_does_not_turn_the_play_and_shut_is_shut():
+def test_flicker_does_not_reverse_the_lead_and_zero_is_zero():
     made = ValveMap(PLAY)
     for k in range(50):
         made.spool_pct(0.005 * k)
@@ -79,19 +79,19 @@ def test_a_flicker_of_the_command_does_not_turn_the_play_and_shut_is_shut():
 
 
 @pytest.mark.parametrize("valve", [LIFT, CURVED, PLAY])
-def test_the_map_is_monotonic_and_saturates(valve):
+def test_map_is_monotonic_and_saturates(valve):
     made = ValveMap(valve)
     values = [made.spool_pct(v / 1000) for v in range(-600, 601)]
     assert values == sorted(values) and values[0] == -100.0 and values[-1] == 100.0
     assert made.spool_pct(0.0) == 0.0
 
 
-def test_the_two_sides_differ():
+def test_two_sides_differ():
     made = ValveMap(LIFT)
     assert made.spool_pct(0.12) > -made.spool_pct(-0.12)
 
 
-def test_a_short_lever_makes_the_joint_faster_and_an_unknown_place_changes_nothing():
+def test_short_lever_makes_the_joint_faster():
     made = ValveMap(LIFT)
     made.set_position(LIFT.lever_at[-1] + 1.0)
     assert made.arm == LIFT.lever[-1]
@@ -106,7 +106,7 @@ def test_a_short_lever_makes_the_joint_faster_and_an_unknown_place_changes_nothi
     assert made.arm == LIFT.lever[0]
 
 
-def test_a_joint_without_a_lever_is_the_same_everywhere():
+def test_joint_without_a_lever_is_the_same_everywhere():
     made = ValveMap(SLEW)
     made.set_position(1.0)
     assert (made.arm, made.full_plus) == (1.0, SLEW.full_speed_plus)

@@ -1,6 +1,4 @@
-"""Faults of the carrier: each is found within its bound while the machine drives, reacts as it should, and does no harm
-where it does not matter.
-"""
+"""Faults of the carrier: detection in time while the machine drives, the reaction, and no false alarms."""
 
 import math
 
@@ -20,12 +18,12 @@ SWAY = math.degrees(CARRIER.tilt_limit_rad)
 
 
 def turning() -> DriveBench:
-    """On its way through a bend to the left."""
+    """Drive through a bend to the left."""
     return DriveBench().under_way(300, 4.0, 30.0)
 
 
 def aside() -> DriveBench:
-    """Just told to turn around: it bends as fast as it may."""
+    """Just commanded to turn around: it bends at its limit."""
     return DriveBench().under_way(20, 2.0, 30.0)
 
 
@@ -34,7 +32,7 @@ def straight() -> DriveBench:
 
 
 def until(bench: DriveBench, reason: Reason, limit_ms: int, *place: float, **fields) -> int:
-    """Milliseconds until the reason stands, the planner going on; fails when it does not come in time."""
+    """Milliseconds until the reason is set while the planner continues; fails when it takes too long."""
     since = bench.now_ns
     while bench.now_ns - since < limit_ms * MS:
         bench.go(1, *(place or (50.0, 0.0)), **fields) if bench.count % 10 == 0 else bench.run(1)
@@ -157,7 +155,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_found_within_its_bound_and_the_machine_stops(name):
+def test_fault_is_detected_in_time_and_the_machine_stops(name):
     reason, prepare, inject = CASES[name]
     bench = prepare()
     inject(bench)
@@ -179,7 +177,7 @@ GNSS = {name: case for name, case in CASES.items() if Reason.POSITION_LOST <= ca
 
 
 @pytest.mark.parametrize("name", GNSS)
-def test_gnss_does_not_matter_while_the_planner_steers_by_the_articulation(name):
+def test_gnss_faults_do_not_stop_articulation_steering(name):
     _, _, inject = GNSS[name]
     bench = DriveBench().armed()
     bench.run(40)
@@ -191,7 +189,7 @@ def test_gnss_does_not_matter_while_the_planner_steers_by_the_articulation(name)
 
 
 @pytest.mark.parametrize("name", [n for n in CASES if n not in ("runaway", "rolls back")])
-def test_a_machine_that_does_not_drive_is_not_stopped(name):
+def test_machine_that_does_not_drive_is_not_stopped(name):
     _, _, inject = CASES[name]
     bench = DriveBench().armed()
     bench.run(60)
@@ -200,14 +198,14 @@ def test_a_machine_that_does_not_drive_is_not_stopped(name):
     assert bench.mode is Mode.ARMED
 
 
-def test_a_carrier_that_rolls_under_the_crane_is_a_runaway():
+def test_carrier_that_rolls_under_the_crane_is_a_runaway():
     bench = DriveBench().armed()
     bench.lies["VehStat"] = {"Speed": OVERSPEED_M_S + 0.02}
     until(bench, Reason.CARRIER_RUNAWAY, FAULTS[Reason.CARRIER_RUNAWAY].bound_ms, speed_m_s=0.0)
     assert bench.mode is Mode.FAULT
 
 
-def test_antennas_swapped_from_the_start_show_once_it_moves():
+def test_swapped_antennas_are_detected_in_motion():
     bench = DriveBench().armed()
     bench.yaw_rad = math.pi  # backwards to what it says
     bench.run(60)
@@ -225,7 +223,7 @@ def test_antennas_swapped_from_the_start_show_once_it_moves():
     assert elapsed_ms <= FAULTS[Reason.HEADING_REVERSED].bound_ms
 
 
-def test_a_float_position_slows_the_way_to_a_waypoint_and_nothing_else():
+def test_rtk_float_slows_only_waypoint_driving():
     bench = straight()
     bench.lies["GnssPositionData"] = {"Method": 5}
     go(bench, 400)
@@ -236,7 +234,7 @@ def test_a_float_position_slows_the_way_to_a_waypoint_and_nothing_else():
     assert bench.drive_command["Speed"] == pytest.approx(0.6)
 
 
-def test_a_step_aside_of_the_position_needs_two_samples_and_a_small_one_does_no_harm():
+def test_position_step_needs_two_samples_and_a_small_one_is_accepted():
     bench = straight()
     bench.north_m += MAX_REPEATED_JUMP_M - 0.1
     go(bench, 100)
@@ -246,7 +244,7 @@ def test_a_step_aside_of_the_position_needs_two_samples_and_a_small_one_does_no_
     assert bench.mode is Mode.ACTIVE and MAX_REPEATED_JUMP_M + 0.2 < MAX_JUMP_M
 
 
-def test_a_position_that_wanders_off_step_by_step_is_found():
+def test_drifting_position_is_detected():
     bench = straight()
     for _ in range(100):
         bench.north_m += 0.03  # 6 m/s aside
@@ -254,7 +252,7 @@ def test_a_position_that_wanders_off_step_by_step_is_found():
     assert bench.reason == Reason.POSITION_JUMP
 
 
-def test_the_articulation_outside_its_range_latches():
+def test_articulation_outside_its_range_latches():
     bench = straight()
     bend_outside(bench)
     bench.lies["VehStat"] = {"Articulation": bench.bend_rad}
@@ -277,7 +275,7 @@ def test_arm_stuck():
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_a_long_drive_around_trips_nothing():
+def test_long_drive_raises_no_fault():
     bench = DriveBench().armed()
     bench.run(40)
     places = [(12.0, 0.0), (12.0, 8.0), (0.0, 8.0), (0.0, 0.0)]
