@@ -1,9 +1,9 @@
 """Logs along the route, from a camera of a machine that drives; the logs lie still in the plane.
 
 The pose of the camera is that of the crane's base in the plane (from the GNSS receiver) with the kinematic chain from
-there to the camera: the half of the carrier that holds it and the articulation.  ``CylinderLocalizer`` fits cylinders to
-the network's masks and merges them over pictures.  ``PaperBLocalizer`` takes the depth at the middle of each mask's box
-(paper B 3.2.3), which gives a point only.
+there to the camera: the half of the carrier that holds it and the articulation.  ``CylinderLocalizer`` fits cylinders
+to the network's masks and merges them over pictures.  ``PaperBLocalizer`` takes the depth at the middle of each mask's
+box (paper B 3.2.3), which gives a point only.
 """
 
 from __future__ import annotations

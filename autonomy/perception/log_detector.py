@@ -1,7 +1,7 @@
 """The log detector: one camera of the machine in, the list of logs in the crane's base frame out.
 
-``LogDetector.detect`` takes a picture only while the crane is at rest, because the pose of a camera on a moving stick is
-not known well enough.  Otherwise it returns None, and the caller requests again.
+``LogDetector.detect`` takes a picture only while the crane is at rest, because the pose of a camera on a moving stick
+is not known well enough.  Otherwise it returns None, and the caller requests again.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from experiments.detector.plots import contact_sheet, gallery, overlaid, precisi
 from experiments.detector.trial import FAITHFUL, PARTED, box_finder, example, finder, matches, perform, shipped
 from host.exit_codes import CommandFailed, ExitCode
 from machine.geometry.optics import pinhole
-from training.common.average_precision import average_precision, curve, taken
+from training.common.average_precision import average_precision, curve, matched_truths
 from training.pictures.piles import MACHINES
 
 TRIALS: Final = 120
@@ -98,7 +98,7 @@ def lost(outcomes: list[dict[str, Any]]) -> dict[str, float]:
     found, pixels = [], []
     for outcome in outcomes:
         picture = matches(outcome, "rgbd", "boxes")
-        found.append(taken(picture, 0.5)[~picture.ignored])
+        found.append(matched_truths(picture, 0.5)[~picture.ignored])
         pixels.append(np.array(outcome["pixels"])[~picture.ignored])
     every, large = np.concatenate(found), np.concatenate(pixels) >= LARGE_PX
     shares = {"found_large": every[large], "found_small": every[~large]}

@@ -80,14 +80,15 @@ def _cornell(
     """Add to ``metrics``; returns what was skipped and why, and the available pictures as network inputs."""
     from training.grasp.cornell import load as load_samples
     from training.grasp.cornell_weights import on_samples
-    from training.grasp.views import centre, cut
+    from training.grasp.views import central_view, view_depth
 
     folder = options.data or data_root() / CORNELL
     if options.data is None and not folder.is_dir():
         return f"both cross-validations (no Cornell samples under {CORNELL} in TIMBERHAND_DATA)", []
     samples = load_samples(folder)
     pictures = [
-        normalized_relief(cut(s.depth_m, centre(s.depth_m)))[None, None] for s in samples[:: 8 if options.quick else 1]
+        normalized_relief(view_depth(s.depth_m, central_view(s.depth_m)))[None, None]
+        for s in samples[:: 8 if options.quick else 1]
     ]
     if options.data is not None:
         found = on_samples(GraspNet(arrays), samples, facts)
@@ -138,14 +139,14 @@ def _prepare_ms(seed: int) -> float:
 
 
 def _setting(result: Result) -> str:
-    from training.grasp.network_training import BATCH, COPIES, EPOCHS, LEARNING_RATE
+    from training.grasp.network_training import BATCH, EPOCHS, LEARNING_RATE, VIEWS_PER_SAMPLE
 
     e = result.environment
     return (
-        f"Seed {result.seed}, commit `{result.commit}`. Training of every fold: {EPOCHS} epochs of {COPIES} views a "
-        f"sample, batches of {BATCH}, AdamW with {LEARNING_RATE} and a cosine; one schedule, set before the folds were "
-        "evaluated; preprocessing and views were chosen on some of these samples, so both rates may be slightly too "
-        f"high. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python {e['python']}, "
+        f"Seed {result.seed}, commit `{result.commit}`. Training of every fold: {EPOCHS} epochs of {VIEWS_PER_SAMPLE} "
+        f"views a sample, batches of {BATCH}, AdamW with {LEARNING_RATE} and a cosine; one schedule, set before the "
+        "folds were evaluated; preprocessing and views were chosen on some of these samples, so both rates may be "
+        f"slightly too high. Host: {e['processor']}, {e['cpus']} cores, {e['machine']}, Python {e['python']}, "
         f"torch {e['torch']}."
     )
 

@@ -20,15 +20,15 @@ from training.grasp.cornell import Sample, grouped_folds, load, paper_folds
 from training.grasp.network_training import (
     BATCH,
     BODY,
-    COPIES,
     LEARNING_RATE,
+    VIEWS_PER_SAMPLE,
     Example,
-    copies,
-    fit,
-    judge,
-    plain,
+    augmented_examples,
+    evaluate,
+    median_size_px,
+    plain_examples,
     predict,
-    usual_size,
+    train_network,
 )
 
 FOLDS: Final = 10
@@ -45,31 +45,31 @@ def perform(job: Job) -> list[dict[str, Any]]:
     epochs = job.options["epochs"]
     if job.kind == "grouped":
         training_part, test_part = grouped_folds([s.number for s in samples], FOLDS)[job.options["fold"]]
-        many = COPIES
+        many = VIEWS_PER_SAMPLE
         learned = [views[many * i + k] for i in training_part for k in range(many)]
         numbers = {samples[i].number for i in test_part}
         asked = [e for e in crops if e.number in numbers]
-        size = usual_size([e for e in crops if e.number in {samples[i].number for i in training_part}])
+        size = median_size_px([e for e in crops if e.number in {samples[i].number for i in training_part}])
     else:
         training_part, test_part = paper_folds(len(views), FOLDS, job.seed)[job.options["fold"]]
         learned, asked = [views[i] for i in training_part], [views[i] for i in test_part]
-        size = usual_size(learned)
-    net, _ = fit(learned, job.seed, job.name, quiet, epochs=epochs)
+        size = median_size_px(learned)
+    net, _ = train_network(learned, job.seed, job.name, quiet, epochs=epochs)
     found = predict(net, asked)
-    return [{"number": e.number, **judge(maps, e.grasps, size)} for e, maps in zip(asked, found, strict=True)]
+    return [{"number": e.number, **evaluate(maps, e.grasps, size)} for e, maps in zip(asked, found, strict=True)]
 
 
 @lru_cache(maxsize=1)
 def _examples(folder: str, seed: int) -> tuple[tuple[Sample, ...], list[Example], list[Example]]:
     samples = load(Path(folder))
-    return samples, plain(samples), copies(samples, seed)
+    return samples, plain_examples(samples), augmented_examples(samples, seed)
 
 
 def identity(samples: tuple[Sample, ...], seed: int, epochs: int) -> str:
     """Hash of everything that decides the outcome of a fold: network, schedule, and the preprocessed pictures."""
     digest = hashlib.sha256(
-        f"{fingerprint(BODY)} {seed} {epochs} {COPIES} {BATCH} {LEARNING_RATE} {len(samples)}".encode()
+        f"{fingerprint(BODY)} {seed} {epochs} {VIEWS_PER_SAMPLE} {BATCH} {LEARNING_RATE} {len(samples)}".encode()
     )
-    for example in (*plain(samples[:2]), *copies(samples[:1], seed, 2)):
-        digest.update(example.low.tobytes() + example.pulled.tobytes())
+    for example in (*plain_examples(samples[:2]), *augmented_examples(samples[:1], seed, 2)):
+        digest.update(example.low.tobytes() + example.projected.tobytes())
     return digest.hexdigest()[:16]

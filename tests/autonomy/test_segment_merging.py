@@ -20,7 +20,7 @@ from tests.codes import coded
 from tests.training.drawn_logs import perfect_maps, picture
 from training.detection import segment_scorers
 from training.detection.segment_scorers import quality_examples
-from training.detection.segmentation import targets
+from training.detection.targets import targets
 
 ROOM = np.ones((20, 60), bool)
 

@@ -31,28 +31,28 @@ def test_overlaps_of_masks():
     assert mask_overlaps([], [a]).shape == (0, 1)
 
 
-def test_all_found_and_nothing_else_is_one():
+def test_perfect_detections_give_one():
     assert curve([matches([0.9, 0.8], [[0.9, 0.0], [0.0, 0.6]])], 0.5).average == pytest.approx(1.0)
 
 
-def test_a_false_find_that_is_surer_halves_precision():
+def test_a_false_detection_with_a_higher_score_halves_precision():
     # Surest is wrong: precision 1/2 at every recall up to 1.
     assert curve([matches([0.9, 0.8], [[0.0], [0.7]])], 0.5).average == pytest.approx(0.5)
     # Less sure than the right one: harmless.
     assert curve([matches([0.8, 0.9], [[0.0], [0.7]])], 0.5).average == pytest.approx(1.0)
 
 
-def test_a_truth_is_taken_once():
+def test_a_ground_truth_is_matched_once():
     double = curve([matches([0.9, 0.8], [[0.9], [0.9]])], 0.5)
     assert double.precision.tolist() == [1.0, 0.5]
     assert double.average == pytest.approx(1.0)
 
 
-def test_half_of_the_truths_found_reads_51_of_101_recalls():
+def test_half_of_the_truths_gives_51_of_101_recalls():
     assert curve([matches([0.9], [[0.9, 0.0]])], 0.5).average == pytest.approx(51 / 101)
 
 
-def test_worked_case_of_two_pictures():
+def test_a_worked_example_of_two_pictures():
     # By score: right (a), wrong (b), right (b); three truths.  Precision 1, 1/2, 2/3 at recall 1/3, 1/3, 2/3.
     a = matches([0.9], [[0.8, 0.1]])
     b = matches([0.8, 0.7], [[0.2], [0.6]])
@@ -63,7 +63,7 @@ def test_worked_case_of_two_pictures():
     assert whole.average == pytest.approx((34 + 33 * 2 / 3) / 101)
 
 
-def test_what_is_ignored_neither_counts_nor_harms():
+def test_ignored_truths_have_no_effect():
     one = matches([0.9, 0.8], [[0.8, 0.0], [0.0, 0.9]], [True, False])
     assert curve([one], 0.5).average == pytest.approx(1.0)
     assert curve([one], 0.5).scores.tolist() == [0.8]
@@ -72,11 +72,11 @@ def test_what_is_ignored_neither_counts_nor_harms():
     assert curve([two], 0.5).average == pytest.approx(1.0)
 
 
-def test_the_mean_over_thresholds_counts_how_tight_a_find_is():
+def test_the_mean_over_thresholds_rewards_tight_detections():
     assert average_precision([matches([0.9], [[0.74]])]) == pytest.approx(0.5)  # 0.50, 0.55, 0.60, 0.65, 0.70
     assert average_precision([matches([0.9], [[1.0]])]) == pytest.approx(1.0)
 
 
-def test_without_truths_there_is_no_average():
+def test_without_truths_the_average_is_nan():
     assert np.isnan(curve([matches([0.5], [[]])], 0.5).average)
     assert curve([Matches(np.zeros(0), np.zeros((0, 1)), np.array([False]))], 0.5).average == 0.0

@@ -1,14 +1,15 @@
-"""Paper B's detector in its role: decoding, targets, refusals."""
+"""The box detector in the role of paper B's: decoding, targets, training, errors."""
 
 import numpy as np
 import pytest
 import torch
 from rich.console import Console
 
-from autonomy.networks.graph import parameter_count
+from autonomy.networks.graph import NetworkError, parameter_count
 from autonomy.networks.torch_net import random_net
 from autonomy.networks.weights import WeightsError, save
 from autonomy.perception.papers.box_detector import SIZE_PX, BoxDetector, box_net, decode_boxes
+from tests.codes import coded
 from tests.training.drawn_logs import picture
 from training.common.loop import Schedule
 from training.detection import boxes
@@ -34,7 +35,7 @@ def test_boxes_of_perfect_maps_are_those_of_the_logs():
         assert np.abs(found - box).max(axis=1).min() < 0.51
 
 
-def test_a_second_box_upon_the_first_is_dropped_and_a_neighbour_is_kept():
+def test_duplicate_boxes_are_suppressed_and_neighbours_are_kept():
     maps = np.full((5, 30, 30), -9.0, np.float32)
     for x, score in ((10, 3.0), (12, 2.0), (20, 1.0)):
         maps[:, 10, x] = (score, *np.log([6.0, 3.0, 6.0, 3.0]))
@@ -45,7 +46,7 @@ def test_a_second_box_upon_the_first_is_dropped_and_a_neighbour_is_kept():
     assert len(found) == 2 and scores[0] > scores[1]
 
 
-def test_nothing_is_found_in_nothing():
+def test_empty_maps_give_no_boxes():
     found, scores = decode_boxes(np.full((5, 10, 10), -9.0, np.float32))
     assert found.shape == (0, 4) and scores.shape == (0,)
 
@@ -54,7 +55,7 @@ def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
     path = tmp_path / "boxes.safetensors"
     save(path, box_net(), random_net(box_net(), 1).arrays(), {})
     finder = BoxDetector(path)
-    with pytest.raises(ValueError, match="608 x 608"):
+    with pytest.raises(NetworkError, check=coded("network.bad-picture")):
         finder.detect(np.zeros((304, 304, 3), np.uint8))
     found, _ = finder.detect(np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8))
     assert found.shape[1] == 4
@@ -63,21 +64,21 @@ def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
     assert parameter_count(box_net()) < 500_000
 
 
-def test_a_few_steps_learn(monkeypatch):
+def test_a_few_steps_reduce_the_loss(monkeypatch):
     monkeypatch.setattr(boxes, "CROPS", ((64, 1.0),))
     samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 60, 14), size=160) for i in range(4)]
     _, losses = run([(samples.__getitem__, 4)], Schedule(10, 3e-3), 2, 5, None, Console(stderr=True, quiet=True))
     assert np.mean(losses[-3:]) < 0.8 * np.mean(losses[:2])
 
 
-def test_what_the_overlap_of_two_boxes_lacks():
+def test_the_generalised_overlap_of_two_boxes():
     """Of boxes about one cell: nothing of equal ones, a half of one in another of twice the size."""
 
     def box(*sides):
         return torch.log(torch.tensor(sides, dtype=torch.float32)).reshape(1, 4, 1, 1)
 
     def lacks(a, b):
-        return boxes._apart(a, b).item()
+        return boxes._giou_loss(a, b).item()
 
     one = box(2.0, 3.0, 2.0, 3.0)
     assert lacks(one, one) == pytest.approx(0.0, abs=1e-6)
@@ -86,7 +87,7 @@ def test_what_the_overlap_of_two_boxes_lacks():
     assert lacks(left, right) == pytest.approx(1.0, abs=0.05), "beside each other they share next to nothing"
 
 
-def test_training_goes_on_from_weights(tmp_path):
+def test_training_starts_from_weights(tmp_path):
     sample = [picture(((90.0, 80.0), 0.3, 60, 14), size=304)]
     start = random_net(box_net(), 7).arrays()
     quiet = Console(stderr=True, quiet=True)
@@ -96,7 +97,7 @@ def test_training_goes_on_from_weights(tmp_path):
     assert np.abs(other.arrays()["boxes.weight"] - start["boxes.weight"]).max() > 1e-3
 
 
-def test_small_and_large_pictures_give_batches_in_turn():
+def test_batches_of_small_and_large_pictures_alternate():
     small, large = ([picture(((90.0, 80.0), 0.3, 60, 14), size=size)] for size in (304, 608))
     batch = boxes.batches([(small.__getitem__, 1), (large.__getitem__, 1)], 8, 5)
     assert [batch(step)[0].shape for step in (0, 1, 2)] == [(8, 3, 256, 256), (2, 3, 512, 512), (8, 3, 256, 256)]

@@ -21,7 +21,7 @@ from sim.camera.geometry import View
 from sim.camera.render import render as sim_render
 from sim.camera.scene import Ground, LogPose, SceneBuilder
 from timberhand.commands import train
-from training.grasp.label_kernel import draw, facts_of, judge
+from training.grasp.label_kernel import draw, evaluate_candidate, facts_of
 from training.grasp.physical_frames import LOW_PX, frames
 from training.pictures.piles import Pile
 
@@ -91,7 +91,7 @@ def test_the_compiled_rule_is_the_planners() -> None:
         ours = score_grasps(JAWS, w, upon, blade_sections(JAWS, w, x, y, yaw), level)
         for k in range(40):
             at, captured = np.empty((w.count, 2)), np.empty(w.count, np.bool_)
-            lever, mass = judge(*facts, packed(w), upon, x[k], y[k], yaw[k], level[k], at, captured)
+            lever, mass = evaluate_candidate(*facts, packed(w), upon, x[k], y[k], yaw[k], level[k], at, captured)
             assert (lever > 0.0) == ours.safe[k], (seed, k)
             if ours.safe[k]:
                 safe += 1
@@ -115,25 +115,25 @@ def test_a_frame_is_a_picture_with_quality_on_the_wood_and_equal_seeds_are_equal
     rows, columns = np.nonzero(frame.low > 1.0)
     along = np.linalg.svd(np.stack([columns - columns.mean(), rows - rows.mean()]))[0][:, 0]
     theta = 0.5 * math.atan2(frame.labels[2, v, u], frame.labels[1, v, u])
-    assert abs(math.cos(theta) * along[0] + math.sin(theta) * along[1]) < 0.25, "the tongs close across it"
+    assert abs(math.cos(theta) * along[0] + math.sin(theta) * along[1]) < 0.25, "the jaws close across it"
 
 
 def test_frames_become_examples_of_equation_5() -> None:
     """Against the sums over all 90 000 pixels."""
     torch = pytest.importorskip("torch")
     from training.grasp.network_training import equation_5, upsampling
-    from training.grasp.physical_weights import examples
+    from training.grasp.physical_weights import examples_of
 
     single = [LogPose(1, (0.3, 0.2, GROUND + 0.1), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)), 2.6, 0.2)]
     found = list(frames(single, GROUND, JAWS, 3, 2))
-    made, up = examples(found), upsampling()
+    made, up = examples_of(found), upsampling()
     maps = np.random.default_rng(1).normal(0.0, 0.3, (2, 3, LOW_PX, LOW_PX)).astype(np.float32)
     explicit = (
         np.mean([np.sum((up @ m @ up.T - up @ f.labels @ up.T) ** 2) for m, f in zip(maps, found, strict=True)])
         / len(up) ** 2
     )
-    pulled, square = torch.tensor(np.stack([e.pulled for e in made])), torch.tensor([e.square for e in made])
-    loss = equation_5(torch.from_numpy(maps), pulled, square, torch.from_numpy(up.T @ up))
+    projected, square = torch.tensor(np.stack([e.projected for e in made])), torch.tensor([e.square for e in made])
+    loss = equation_5(torch.from_numpy(maps), projected, square, torch.from_numpy(up.T @ up))
     assert float(loss) == pytest.approx(explicit, rel=1e-4)
 
 
@@ -152,7 +152,7 @@ def test_weights_from_physical_labels_come_with_their_card(tmp_path: Path, monke
         return [Pile(machine, first, "parallel", "flat", 0, GROUND, logs)]
 
     monkeypatch.setattr(physical_weights, "piles", lain)
-    monkeypatch.setattr(physical_weights, "HELD_BACK", 4)
+    monkeypatch.setattr(physical_weights, "TEST_FRAMES", 4)
     out = tmp_path / "grasp_physical.safetensors"
     made, card = physical_weights.produce(3, out, Console(quiet=True), count=8, epochs=1)
     assert made == out and GraspNet.shipped(out).maps(np.full((300, 300), 3.0, np.float32)).q.shape[0] > 0
@@ -162,11 +162,14 @@ def test_weights_from_physical_labels_come_with_their_card(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
-    [(["grasp"], "--data is missing"), (["grasp", "--labels", "physical", "--data", "."], "physical labels need none")],
+    ("arguments", "code"),
+    [
+        (["grasp"], "train.data-missing"),
+        (["grasp", "--labels", "physical", "--data", "."], "train.data-not-wanted"),
+    ],
 )
-def test_which_labels_need_data(arguments: list[str], says: str) -> None:
+def test_which_labels_need_data(arguments: list[str], code: str) -> None:
     pytest.importorskip("torch")
     done = CliRunner().invoke(train.app, arguments)
     assert isinstance(done.exception, CommandFailed) and done.exception.exit_code == ExitCode.USAGE
-    assert says in str(done.exception)
+    assert done.exception.code == code

@@ -18,11 +18,12 @@ from rich.console import Console
 from autonomy.grasp.network import PAPER, GraspMaps, heads_first
 from autonomy.networks.graph import parameter_shapes
 from autonomy.networks.torch_net import random_net
+from tests.codes import coded
 from training.common.dataset_error import DatasetError
 from training.grasp import network_training
 from training.grasp.cornell import Sample, grouped_folds, load, paper_folds, rectangles
-from training.grasp.rectangles import Rectangle, angle_between, from_corners, iou, right, wrapped
-from training.grasp.views import View, centre, cut, drawn, label_maps, seen
+from training.grasp.rectangles import Rectangle, angle_between, from_corners, iou, is_correct, wrapped
+from training.grasp.views import View, central_view, label_maps, random_view, view_depth, visible_grasps
 
 CORNELL = Path(os.environ.get("TIMBERHAND_DATA", Path(__file__).parents[3] / "shared" / "data")) / "cornell_rgbd_01"
 OBJECTS = (100, 102, 106, 110, 114, 118, 122, 126, *range(129, 180, 4))
@@ -61,12 +62,12 @@ def test_shared_area_of_a_cross_and_of_strangers() -> None:
 
 def test_the_metric_s_two_conditions() -> None:
     label = Rectangle(100, 100, 0.0, 40, 20)
-    assert right(Rectangle(100, 100, math.radians(29), 40, 20), [label])
-    assert not right(Rectangle(100, 100, math.radians(31), 40, 20), [label])
-    assert right(Rectangle(100, 100, math.radians(179), 40, 20), [label])
-    assert right(Rectangle(123, 100, 0, 40, 20), [label])  # 17/63 = 0.27
-    assert not right(Rectangle(125, 100, 0, 40, 20), [label])  # 15/65 = 0.23
-    assert not right(label, [])
+    assert is_correct(Rectangle(100, 100, math.radians(29), 40, 20), [label])
+    assert not is_correct(Rectangle(100, 100, math.radians(31), 40, 20), [label])
+    assert is_correct(Rectangle(100, 100, math.radians(179), 40, 20), [label])
+    assert is_correct(Rectangle(123, 100, 0, 40, 20), [label])  # 17/63 = 0.27
+    assert not is_correct(Rectangle(125, 100, 0, 40, 20), [label])  # 15/65 = 0.23
+    assert not is_correct(label, [])
 
 
 @given(rectangle)
@@ -106,19 +107,19 @@ def test_a_folder_in_the_layout_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("labels", ["1 2\n3 4\n5 6\n", "one two\n" * 4, "1 2 3\n" * 4])
-def test_labels_in_no_layout_are_refused(tmp_path: Path, labels: str) -> None:
+def test_malformed_labels_are_refused(tmp_path: Path, labels: str) -> None:
     written(tmp_path, 1, labels)
-    with pytest.raises(DatasetError, match=r"pcd0001cpos\.txt.*four lines"):
+    with pytest.raises(DatasetError, check=coded("dataset.bad-rectangles")):
         rectangles(tmp_path / "pcd0001cpos.txt")
 
 
 def test_a_folder_without_samples_and_a_broken_tiff_are_refused(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(DatasetError, match="no Cornell samples"):
+        with pytest.raises(DatasetError, check=coded("dataset.no-samples")):
             load(folder)
     written(tmp_path, 1, SQUARE)
     (tmp_path / "pcd0001d.tiff").write_bytes(b"II*\0 no picture")
-    with pytest.raises(DatasetError, match=r"pcd0001d\.tiff"):
+    with pytest.raises(DatasetError, check=coded("dataset.bad-depth")):
         load(tmp_path)
 
 
@@ -130,22 +131,22 @@ def test_the_real_samples() -> None:
     assert sum(map(len, labels)) == 373
 
 
-def test_no_object_is_on_both_sides_of_a_grouped_fold() -> None:
+def test_a_grouped_fold_separates_objects() -> None:
     numbers = list(range(100, 180))
     kind = {n: max(o for o in OBJECTS if o <= n) for n in numbers}
     folds = grouped_folds(numbers, 10)
     assert sorted(i for _, test in folds for i in test) == list(range(80))
-    for network_training, test in folds:
+    for train, test in folds:
         assert not {kind[numbers[i]] for i in train} & {kind[numbers[i]] for i in test}
-        assert len(network_training) >= 64
+        assert len(train) >= 64
 
 
-def test_the_paper_s_folds_deal_every_copy_once() -> None:
+def test_the_paper_s_folds_test_every_copy_once() -> None:
     folds = paper_folds(800, 10, 1)
     assert sorted(i for _, test in folds for i in test) == list(range(800))
-    assert all(len(network_training) == 720 and not set(network_training) & set(test) for network_training, test in folds)
+    assert all(len(train) == 720 and not set(train) & set(test) for train, test in folds)
     # What the paper's protocol leaks: nearly every test copy has a brother in the training set.
-    network_training, test = folds[0]
+    train, test = folds[0]
     assert sum(i // 10 in {j // 10 for j in train} for i in test) == 80
 
 
@@ -154,28 +155,28 @@ def test_the_paper_s_folds_deal_every_copy_once() -> None:
 def test_a_view_moves_depth_and_grasps_alike(turned: float, zoom: float, shift: float, theta: float) -> None:
     v, u = np.mgrid[:480, :640].astype(np.float32)
     view = View(320 + shift, 240 - shift, turned, zoom)
-    (g,) = seen([Rectangle(330, 250, theta, 40, 20)], view)
+    (g,) = visible_grasps([Rectangle(330, 250, theta, 40, 20)], view)
     at = (round(g.v_px), round(g.u_px))
-    assert abs(cut(u, view)[at] - 330) <= 1 and abs(cut(v, view)[at] - 250) <= 1
+    assert abs(view_depth(u, view)[at] - 330) <= 1 and abs(view_depth(v, view)[at] - 250) <= 1
     tip = np.array([g.u_px + 30 * math.cos(g.theta_rad), g.v_px + 30 * math.sin(g.theta_rad)])
-    x, y = (float(cut(m, view)[round(tip[1]), round(tip[0])]) for m in (u, v))
+    x, y = (float(view_depth(m, view)[round(tip[1]), round(tip[0])]) for m in (u, v))
     assert angle_between(math.atan2(y - 250, x - 330), theta) < 0.1
     assert math.isclose(g.opening_px, 40 / zoom)
 
 
 def test_the_plain_crop_is_the_middle() -> None:
     v, u = np.mgrid[:480, :640].astype(np.float32)
-    view = centre(u)
-    assert cut(u, view)[0, 0] == 170 and cut(v, view)[0, 0] == 90 and cut(u, view)[299, 299] == 469
+    view = central_view(u)
+    assert view_depth(u, view)[0, 0] == 170 and view_depth(v, view)[0, 0] == 90 and view_depth(u, view)[299, 299] == 469
 
 
 def test_copies_are_drawn_alike_and_show_a_grasp() -> None:
     grasps = (Rectangle(200, 380, 0.3, 40, 20),)
     depth = np.ones((480, 640), np.float32)
-    views = [drawn(depth, grasps, np.random.default_rng([1, i])) for i in range(50)]
-    assert views == [drawn(depth, grasps, np.random.default_rng([1, i])) for i in range(50)]
+    views = [random_view(depth, grasps, np.random.default_rng([1, i])) for i in range(50)]
+    assert views == [random_view(depth, grasps, np.random.default_rng([1, i])) for i in range(50)]
     assert len(set(views)) == 50
-    assert all(seen(grasps, view) for view in views)
+    assert all(visible_grasps(grasps, view) for view in views)
 
 
 def test_labels_by_the_paper() -> None:
@@ -197,9 +198,9 @@ def test_equation_5_at_a_third_of_the_side() -> None:
     full = torch.nn.functional.interpolate(maps, scale_factor=3, mode="bilinear").numpy()
     wanted = np.square(full - labels).sum() / (2 * 300 * 300)
     up = network_training.upsampling()
-    pulled = torch.from_numpy(up.T @ labels @ up)
+    projected = torch.from_numpy(up.T @ labels @ up)
     square = torch.from_numpy(np.square(labels).sum((1, 2, 3)))
-    got = network_training.equation_5(maps, pulled, square, torch.from_numpy(up.T @ up)).item()
+    got = network_training.equation_5(maps, projected, square, torch.from_numpy(up.T @ up)).item()
     assert math.isclose(got, wanted, rel_tol=1e-4)
 
 
@@ -230,22 +231,23 @@ def bar(number: int, theta: float) -> Sample:
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_a_few_bars_are_learnt() -> None:
+def test_the_network_learns_a_few_bars() -> None:
     torch.set_num_threads(1)
     samples = [bar(i, a) for i, a in enumerate((0.0, 0.8, -0.8, 1.5))]
-    examples = network_training.copies(samples, 1, 8)
-    net, losses = network_training.fit(examples, 1, "bars", Console(file=io.StringIO()), epochs=12)
+    examples = network_training.augmented_examples(samples, 1, 8)
+    net, losses = network_training.train_network(examples, 1, "bars", Console(file=io.StringIO()), epochs=12)
     assert np.mean(losses[-8:]) < 0.6 * np.mean(losses[:8])
-    asked = network_training.copies(samples, 2, 4)
-    size = network_training.usual_size(asked)
-    hits = [network_training.judge(m, e.grasps, size)["right"] for m, e in zip(network_training.predict(net, asked), asked, strict=True)]
+    asked = network_training.augmented_examples(samples, 2, 4)
+    size = network_training.median_size_px(asked)
+    predicted = zip(network_training.predict(net, asked), asked, strict=True)
+    hits = [network_training.evaluate(m, e.grasps, size)["right"] for m, e in predicted]
     assert sum(hits) >= 12
 
 
-def test_a_grasp_is_judged_by_its_place_and_direction() -> None:
+def test_a_grasp_is_evaluated_by_position_and_direction() -> None:
     q = np.zeros((100, 100), np.float32)
     q[50, 40] = 1.0
     maps = GraspMaps(q, np.ones_like(q), np.zeros_like(q), 3)
-    found = network_training.judge(maps, [Rectangle(121, 151, 0.1, 90, 80)], (30.0, 20.0))
+    found = network_training.evaluate(maps, [Rectangle(121, 151, 0.1, 90, 80)], (30.0, 20.0))
     assert (found["u_px"], found["v_px"]) == (121, 151)
     assert not found["right"] and found["own_size"]

@@ -1,4 +1,4 @@
-"""Labels of log pictures under mirror and window, and those made from masks alone."""
+"""Labels of log pictures under mirroring, windows and scaling, and labels from masks only."""
 
 import math
 from dataclasses import replace
@@ -26,7 +26,7 @@ from training.pictures.labels import (
 LOGS = (((60.0, 60.0), 0.4, 80, 10), ((110.0, 110.0), 1.2, 60, 12))
 
 
-def test_a_mirror_twice_is_none():
+def test_mirroring_twice_is_the_identity():
     sample = picture(*LOGS)
     twice = mirrored(mirrored(sample))
     assert np.array_equal(twice.ids, sample.ids)
@@ -34,7 +34,7 @@ def test_a_mirror_twice_is_none():
     assert twice.intrinsics == sample.intrinsics
 
 
-def test_a_mirrored_log_lies_where_its_pixels_are():
+def test_a_mirrored_label_agrees_with_its_pixels():
     sample = mirrored(picture(*LOGS))
     v, u = np.nonzero(sample.ids == 1)
     assert sample.logs[0, CENTRE_U] == pytest.approx(u.mean(), abs=1.0)
@@ -42,7 +42,7 @@ def test_a_mirrored_log_lies_where_its_pixels_are():
     assert abs(math.remainder(math.atan2(slope[1], slope[0]) - sample.logs[0, ANGLE], math.pi)) < 0.02
 
 
-def test_a_window_judges_what_is_seen_anew():
+def test_a_window_determines_the_visible_part_again():
     sample = picture(((60.0, 70.0), 0.0, 100, 10))
     left = cropped(sample, 0, 20, 64)
     assert left.ids.shape == (64, 64)
@@ -56,13 +56,13 @@ def test_a_window_judges_what_is_seen_anew():
     ) / sample.intrinsics.fx_px
 
 
-def test_heights_go_where_the_pixels_go():
+def test_heights_move_with_the_pixels():
     sample = replace(picture(*LOGS), height_m=np.arange(160 * 160, dtype=np.float32).reshape(160, 160))
     assert cropped(mirrored(sample), 10, 20, 64).height_m[0, 0] == sample.height_m[20, 159 - 10]
     assert cropped(picture(*LOGS), 10, 20, 64).height_m is None
 
 
-def test_enlarged_logs_lie_where_their_pixels_are():
+def test_enlarged_labels_agree_with_their_pixels():
     large = enlarged(picture(*LOGS))
     assert large.rgb.shape == (320, 320, 3) and large.ids.shape == large.depth_m.shape == (320, 320)
     for log in large.logs:
@@ -71,7 +71,7 @@ def test_enlarged_logs_lie_where_their_pixels_are():
     assert large.logs[0, ANGLE] == picture(*LOGS).logs[0, ANGLE]
 
 
-def test_a_mask_alone_tells_axis_and_extent_but_not_whether_ends_are_seen():
+def test_a_mask_determines_axis_and_extent_but_not_visible_ends():
     row = row_of_mask(3, strip((160, 160), (80, 80), 0.7, 100, 10))
     assert row[ID] == 3 and row[END_SEEN] == 0.0
     assert row[ANGLE] == pytest.approx(0.7, abs=0.02)

@@ -1,4 +1,4 @@
-"""Targets, random changes, loss and run of the segmentation's training."""
+"""Targets, augmentation, loss and run of the segmentation training."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,13 @@ import torch
 from rich.console import Console
 
 from autonomy.networks.graph import parameter_count
-from autonomy.perception.segmentation.network import CHANNELS, MAPS, OFFSET_PX, STRIDE, channels, unet
+from autonomy.perception.segmentation.network import CHANNELS, MAPS, OFFSET_PX, STRIDE, network_input, unet
 from tests.training.drawn_logs import perfect_maps, picture
 from training.common.loop import Schedule
 from training.detection import segmentation
-from training.detection.segmentation import batches, changed, loss, recoloured, run, targets
+from training.detection.augmentation import augmented, recoloured
+from training.detection.segmentation import batches, loss, run
+from training.detection.targets import targets
 from training.pictures.labels import IGNORED
 
 LOGS = (((90.0, 100.0), 0.4, 120, 14), ((140.0, 120.0), 1.2, 100, 16))
@@ -36,14 +38,14 @@ def test_targets_point_to_the_centre_and_along_the_axis():
     assert weights[1][maps[0] == 0].sum() == 0.0
 
 
-def test_ignored_pixels_teach_nothing():
+def test_ignored_pixels_have_no_weight():
     sample = picture(*LOGS, size=208)
     sample.ids[sample.ids == 2] = IGNORED
     maps, weights = targets(sample)
     assert weights[0][60, 70] == 0.0 and maps[0][60, 70] == 0.0
 
 
-def test_the_perfect_net_has_the_least_loss():
+def test_a_perfect_net_has_the_lowest_loss():
     sample = picture(*LOGS, size=208)
     maps, weights = (torch.from_numpy(a[None]) for a in targets(sample))
     perfect = torch.from_numpy(perfect_maps(maps[0].numpy())[None])
@@ -58,31 +60,31 @@ def test_the_perfect_net_has_the_least_loss():
         assert value(worse) > value(perfect) + 0.01, MAPS[i]
 
 
-def test_changes_are_drawn_from_the_generator_alone():
+def test_augmentation_depends_only_on_the_generator():
     sample = picture(*LOGS, size=208)
-    one, two = (changed(sample, np.random.default_rng(7), 96) for _ in range(2))
+    one, two = (augmented(sample, np.random.default_rng(7), 96) for _ in range(2))
     assert np.array_equal(one.rgb, two.rgb) and one.ids.shape == (96, 96)
     assert one.logs.shape[0] > 0
-    many = {changed(sample, np.random.default_rng(s), 96).rgb.tobytes() for s in range(6)}
+    many = {augmented(sample, np.random.default_rng(s), 96).rgb.tobytes() for s in range(6)}
     assert len(many) == 6
 
 
-def test_grey_stays_grey_when_only_hue_and_saturation_change():
+def test_grey_stays_grey_under_changes_of_hue_and_saturation():
     rng = np.random.default_rng(1)
     grey = np.full((8, 8, 3), 120, np.uint8)
     spread = [np.ptp(recoloured(grey, rng).astype(int).mean(axis=(0, 1))) for _ in range(30)]
-    assert max(spread) < 120 * 0.8  # gains of the channels alone part them
+    assert max(spread) < 120 * 0.8  # gains of the network_input alone part them
 
 
-def test_networks_are_small_and_take_what_the_channels_give():
+def test_networks_are_small_and_accept_the_input():
     sample = picture(((50.0, 50.0), 0.4, 60, 10), size=96)
     for variant, width in CHANNELS.items():
-        assert channels(sample.rgb, sample.depth_m, sample.intrinsics, variant).shape == (width, 96, 96)
+        assert network_input(sample.rgb, sample.depth_m, sample.intrinsics, variant).shape == (width, 96, 96)
         assert unet(variant).channels == width
         assert parameter_count(unet(variant)) < 500_000
 
 
-def test_a_few_steps_learn_and_repeat(small):
+def test_a_few_steps_reduce_the_loss_deterministically(small):
     torch.set_num_threads(1)  # sums of another order are other sums
     samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 90, 14), size=160) for i in range(4)]
 
@@ -94,7 +96,7 @@ def test_a_few_steps_learn_and_repeat(small):
     assert once() == first
 
 
-def test_a_batch_depends_on_its_number_alone(small):
+def test_a_batch_depends_only_on_its_number(small):
     torch.set_num_threads(1)  # sums of another order are other sums
     samples = [picture(((60.0 + 9 * i, 80.0), 0.3 * i, 90, 14), size=160) for i in range(4)]
     batch = batches(samples.__getitem__, 4, 2, "rgbd", 0)

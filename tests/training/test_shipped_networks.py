@@ -1,4 +1,4 @@
-"""The networks that come with the package: each with its card, and it sees."""
+"""The shipped networks: cards that match the weights, and detections."""
 
 import hashlib
 
@@ -36,19 +36,19 @@ def found(boxes_of, seen) -> float:
 
 
 @pytest.mark.parametrize("weights", sorted(SHIPPED.glob("*.safetensors")), ids=lambda path: path.stem)
-def test_the_card_is_of_these_weights(weights):
+def test_the_card_matches_the_weights(weights):
     assert hashlib.sha256(weights.read_bytes()).hexdigest() in weights.with_suffix(".md").read_text()
     assert weights.stat().st_size < 5_000_000
 
 
 @pytest.mark.parametrize(("variant", "least"), [("rgbd", 0.7), ("depth", 0.55)])
-def test_logs_that_show_well_are_found(variant, least, seen):
+def test_well_visible_logs_are_segmented(variant, least, seen):
     finder = LogSegmenter(variant)
     share = found(lambda s: [i.box_px for i in finder.segment_picture(s.rgb, s.depth_m, s.intrinsics)], seen)
     assert share >= least, share
 
 
-def test_the_variant_for_depth_alone_needs_no_colour(seen):
+def test_the_depth_variant_ignores_colour(seen):
     finder = LogSegmenter("depth")
     sample = next(s for s, truth in seen if len(truth) > 2)
     plain = finder.segment_picture(sample.rgb, sample.depth_m, sample.intrinsics)
@@ -56,7 +56,7 @@ def test_the_variant_for_depth_alone_needs_no_colour(seen):
     assert plain and [i.box_px for i in plain] == [i.box_px for i in dark]
 
 
-def test_boxes_from_colour_lie_on_logs(seen):
+def test_boxes_from_colour_overlap_logs(seen):
     finder = BoxDetector()
 
     def boxes_of(sample):

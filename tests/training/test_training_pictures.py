@@ -1,4 +1,4 @@
-"""Settled piles, the pictures drawn of them, and the shards they are kept in."""
+"""Settled piles, the pictures drawn of them, and the shards that store these."""
 
 import math
 import random
@@ -13,13 +13,15 @@ from autonomy.perception.papers.box_detector import BoxDetector
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from autonomy.perception.segmentation.log_segmenter import LogSegmenter
 from autonomy.perception.segmentation.network import unet
-from autonomy.perception.segmentation.segment_merging import judges as judges_in
+from autonomy.perception.segmentation.segment_merging import load_scorers
 from machine.geometry.optics import pinhole
 from sim.camera.geometry import look_at
 from sim.camera.scene import LogPose
+from tests.codes import coded
+from training.common.dataset_error import DatasetError
 from training.detection import detector_weights, scorer_weights
 from training.pictures import drawing, piles, shards
-from training.pictures.drawing import MOST_LOGS, draw, labelled
+from training.pictures.drawing import MAX_LOGS, draw, labelled
 from training.pictures.labels import ANGLE, CENTRE_U, CENTRE_V, ID, IGNORED
 from training.pictures.piles import HELD_OUT, chunk, profile_of, settle
 from training.pictures.props import Steel
@@ -35,7 +37,7 @@ def pile():
 def few(monkeypatch, tmp_path):
     monkeypatch.setattr(piles, "CHUNK", 2)
     monkeypatch.setattr(shards, "SHARD", 2)
-    monkeypatch.setattr(shards, "REUSE_PILES", 1)
+    monkeypatch.setattr(shards, "TRAINING_CHUNKS", 1)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path
 
@@ -47,17 +49,17 @@ def test_a_pile_rests_on_its_ground_and_repeats(pile):
     assert pile.datum_m - 0.03 < low < pile.datum_m + 0.1
 
 
-def test_piles_are_kept_whole(few):
+def test_piles_are_stored_completely(few):
     first = chunk("palms_471", 0)
     (file,) = (few / "timberhand" / "piles").iterdir()
     assert chunk("palms_471", 0) == first and len(first) == 2
     assert [p.number for p in chunk("palms_471", 3)] == [6, 7]
     file.write_bytes(file.read_bytes()[:300])
-    with pytest.raises(ValueError, match="delete it"):
+    with pytest.raises(DatasetError, check=coded("dataset.bad-piles")):
         chunk("palms_471", 0)
 
 
-def test_a_picture_and_its_truth_agree_and_repeat(pile):
+def test_a_picture_agrees_with_its_ground_truth_and_is_deterministic(pile):
     one = draw(pile, 3, 152)
     two = draw(pile, 3, 152)
     assert np.array_equal(one.rgb, two.rgb) and np.array_equal(one.depth_m, two.depth_m, equal_nan=True)
@@ -69,7 +71,7 @@ def test_a_picture_and_its_truth_agree_and_repeat(pile):
         assert u.min() <= log[CENTRE_U] <= u.max() and v.min() <= log[CENTRE_V] <= v.max()
 
 
-def test_a_held_log_is_between_the_tongs():
+def test_a_held_log_is_between_the_jaws():
     log = LogPose(1, (3.0, 1.0, 1.5), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)), 2.5, 0.2)  # along +x
     steel = Steel(random.Random(2))
     steel.holding(profile_of("palms_471"), log)
@@ -82,10 +84,10 @@ def test_a_held_log_is_between_the_tongs():
     assert beside[:, 1].min() < 0.9 and beside[:, 1].max() > 1.1 and np.ptp(points[:, 0]) < 1.0
 
 
-def test_a_plain_sky_is_of_one_colour(pile, monkeypatch):
+def test_a_plain_sky_has_one_colour(pile, monkeypatch):
     monkeypatch.setattr(drawing, "PLAIN_SHARE", 1.0)
-    monkeypatch.setattr(drawing, "_lens", lambda rgb, rng: rgb)
-    monkeypatch.setattr(drawing, "_noisy", lambda machine, camera, picture, pin, rng: picture.depth_m)  # no holes
+    monkeypatch.setattr(drawing, "_lens_and_compression", lambda rgb, rng: rgb)
+    monkeypatch.setattr(drawing, "_stereo_depth", lambda machine, camera, picture, pin, rng: picture.depth_m)  # no holes
     seen = 0
     for seed in range(12):
         sample = draw(pile, seed, 96)
@@ -112,7 +114,7 @@ def test_angle_centre_and_ends_are_those_of_the_projected_log():
     assert row[7 + hidden] == 0.0 and row[7 + 1 - hidden] == 1.0
 
 
-def test_logs_of_which_little_shows_are_ignored():
+def test_logs_with_few_visible_pixels_are_ignored():
     view = look_at((0.0, -4.0, 3.0), (0.0, 0.0, 0.0), pinhole(200, 160, 1.2))
     mask = np.zeros((160, 200), np.int16)
     mask[80, 100:105] = 1
@@ -128,7 +130,7 @@ def test_shards_are_drawn_once_and_read_back(few, monkeypatch):
     again = [own(1), own(3)]  # of shards 0 and 1
     assert drawn == [0, 1, 2, 3]
     for index, sample in ((1, again[0]), (3, again[1])):
-        assert sample.rgb.shape == (96, 96, 3) and sample.logs.shape[0] <= MOST_LOGS
+        assert sample.rgb.shape == (96, 96, 3) and sample.logs.shape[0] <= MAX_LOGS
         assert np.isfinite(sample.depth_m).any() and np.isnan(sample.depth_m).any()
         assert np.array_equal(pictures(few, 96)(index).ids, sample.ids)
         height = height_over_plane(sample.depth_m, sample.intrinsics)
@@ -137,25 +139,25 @@ def test_shards_are_drawn_once_and_read_back(few, monkeypatch):
     assert not list(few.glob("*.part*"))
 
 
-def test_pictures_kept_apart_show_piles_that_are_kept_apart(few):
+def test_held_out_pictures_show_held_out_piles(few):
     shard(few, HELD_OUT, 96)
     kept = {p.name.split("-")[1] for p in (few / "timberhand" / "piles").iterdir()}
     assert kept == {f"{HELD_OUT:07d}"}
 
 
-def test_a_damaged_shard_is_named(few):
+def test_a_damaged_shard_is_refused(few):
     shard(few, 0, 96)
     (folder,) = few.glob("logs-*")
     (folder / "ids.npy").write_bytes(b"")
-    with pytest.raises(ValueError, match="delete it"):
+    with pytest.raises(DatasetError, check=coded("dataset.bad-shard")):
         shard(few, 0, 96)
 
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_weights_come_with_a_card_and_find_logs_by_themselves(few, monkeypatch):
+def test_weights_are_written_with_a_card(few, monkeypatch):
     monkeypatch.setattr(detector_weights, "BATCH", 2)
-    monkeypatch.setattr(detector_weights, "JUDGED", 2)
+    monkeypatch.setattr(detector_weights, "TEST_PICTURES", 2)
     out = few / "logs_depth.safetensors"
     card = detector_weights.produce("depth", detector_weights.Plan(2, 2, 1), few, out, Console(quiet=True))
     assert "mAP@0.5" in card.read_text() and "timberhand train segmentation --variant depth" in card.read_text()
@@ -172,22 +174,22 @@ def test_weights_come_with_a_card_and_find_logs_by_themselves(few, monkeypatch):
     assert np.abs(before - after).max() < 1e-4
 
 
-def test_the_depth_variant_begins_with_what_colour_and_depth_were_looked_at_with(tmp_path):
-    """Its first layer has the depth's part of the other's; other networks than these are refused as they were."""
+def test_the_depth_variant_can_start_from_weights_of_the_rgbd_variant(tmp_path):
+    """Its first layer is the depth part of the other's; weights of other networks are refused."""
     both, alone = tmp_path / "logs_rgbd.safetensors", tmp_path / "logs_depth.safetensors"
     arrays = random_net(unet("rgbd"), 1).arrays()
     save(both, unet("rgbd"), arrays, {})
-    taken = detector_weights.begun(both, "depth")
+    taken = detector_weights.initial_arrays(both, "depth")
     assert np.array_equal(taken["in2.weight"], arrays["in2.weight"][:, 3:])
     assert all(np.array_equal(taken[k], arrays[k]) for k in arrays if k != "in2.weight")
     save(alone, unet("depth"), taken, {})
-    assert np.array_equal(detector_weights.begun(alone, "depth")["in2.weight"], taken["in2.weight"])
-    with pytest.raises(WeightsError, match="logs_rgbd"):
-        detector_weights.begun(alone, "rgbd")
+    assert np.array_equal(detector_weights.initial_arrays(alone, "depth")["in2.weight"], taken["in2.weight"])
+    with pytest.raises(WeightsError, check=coded("weights.other-network")):
+        detector_weights.initial_arrays(alone, "rgbd")
 
 
-def test_small_and_large_pictures_come_in_turn(few):
-    source = detector_weights.mixed(pictures(few), detector_weights.Plan(2, 1, 1, large=2), few, Console(quiet=True))
+def test_small_and_large_pictures_alternate(few):
+    source = detector_weights.mixed_pictures(pictures(few), detector_weights.Plan(2, 1, 1, large=2), few, Console(quiet=True))
     assert [source(i).ids.shape[0] for i in range(4)] == [304, 608, 304, 608]
     assert np.array_equal(source(1).ids, source(5).ids) and not np.array_equal(source(1).ids, source(3).ids)
     assert "--pictures 2 --large 2 --steps 1" in detector_weights.Plan(2, 1, 1, large=2).command(
@@ -197,10 +199,10 @@ def test_small_and_large_pictures_come_in_turn(few):
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_judges_come_with_their_cards(few, monkeypatch):
+def test_scorers_are_written_with_their_cards(few, monkeypatch):
     monkeypatch.setattr(scorer_weights, "STEPS", 40)
     monkeypatch.setattr(scorer_weights, "SIZE_PX", 304)
-    card = scorer_weights.produce(4, 1, few, few / "judges", None, Console(quiet=True))
-    assert "timberhand train judges --pictures 4 --seed 1" in card.read_text()
-    told = judges_in(few / "judges").joins.chance(np.zeros((3, 19), np.float32))
+    card = scorer_weights.produce(4, 1, few, few / "scorers", None, Console(quiet=True))
+    assert "timberhand train scorers --pictures 4 --seed 1" in card.read_text()
+    told = load_scorers(few / "scorers").merge.probability(np.zeros((3, 19), np.float32))
     assert told.shape == (3,) and (told > 0.0).all() and (told < 1.0).all()

@@ -1,8 +1,8 @@
-"""Average precision as COCO measures it, for one class, from overlaps.
+"""Average precision as COCO measures it, for one class, from overlaps (intersection over union).
 
-In every picture the found ones take turns, surest first, and each takes the truth that it overlaps most of those still
-free, if by at least the threshold; else, if it overlaps an ignored one so much, it does not count at all.  Precision is
-made to fall with recall and read at 101 recalls.
+In every picture, detections are matched in descending order of score.  Each takes the free ground truth that it
+overlaps most, if by at least the threshold.  Otherwise, a detection that overlaps an ignored ground truth by the
+threshold does not count at all.  Precision is made monotonic in recall and read at 101 recalls.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ RECALLS: Final = np.linspace(0.0, 1.0, 101)
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """One picture: scores (N,) of what was found, its overlaps (N, M) with the truths, which (M,) are ignored."""
+    """One picture: scores (N,) of detections, their overlaps (N, M) with ground truths, which of these are ignored
+    (M,)."""
 
     scores: np.ndarray
     overlaps: np.ndarray
@@ -28,7 +29,7 @@ class Matches:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Precision (K,) and recall (K,) as the least score falls, and the average precision."""
+    """Precision (K,) and recall (K,) for falling scores (K,), and the average precision."""
 
     precision: np.ndarray
     recall: np.ndarray
@@ -37,34 +38,34 @@ class Curve:
 
 
 def box_overlaps(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Shared area over the union's (N, M) of boxes (N, 4) and (M, 4): left, top, right, bottom, the last exclusive."""
+    """Intersection over union (N, M) of boxes (N, 4) and (M, 4): left, top, right, bottom, the last two exclusive."""
     found, truth = np.asarray(found, float).reshape(-1, 4), np.asarray(truth, float).reshape(-1, 4)
     low = np.maximum(found[:, None, :2], truth[None, :, :2])
     high = np.minimum(found[:, None, 2:], truth[None, :, 2:])
     shared = np.prod(np.maximum(high - low, 0.0), axis=2)
     areas = [np.prod(np.maximum(b[:, 2:] - b[:, :2], 0.0), axis=1) for b in (found, truth)]
     union = areas[0][:, None] + areas[1][None] - shared
-    return np.divide(shared, union, out=np.zeros_like(shared), where=union > 0.0)
+    return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0.0))
 
 
 def mask_overlaps(found: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> np.ndarray:
-    """Shared area over the union's (N, M) of masks (H, W)."""
+    """Intersection over union (N, M) of masks (H, W)."""
     if not len(found) or not len(truth):
         return np.zeros((len(found), len(truth)))
     a, b = (np.stack([m.ravel() for m in masks]).astype(np.float32) for masks in (found, truth))
     shared = a @ b.T
     union = a.sum(axis=1)[:, None] + b.sum(axis=1)[None] - shared
-    return np.divide(shared, union, out=np.zeros_like(shared), where=union > 0.0)
+    return np.asarray(np.divide(shared, union, out=np.zeros_like(shared), where=union > 0.0))
 
 
 def curve(pictures: Sequence[Matches], threshold: float) -> Curve:
-    """Precision over recall of all pictures at one least overlap.  Without truths the average is NaN."""
+    """Precision over recall of all pictures at an overlap threshold; the average is NaN without ground truths."""
     scores, right, truths = [], [], 0
     for picture in pictures:
         truths += int(np.count_nonzero(~picture.ignored))
-        for score, verdict in _judged(picture, threshold):
+        for score, is_true in _verdicts(picture, threshold):
             scores.append(score)
-            right.append(verdict)
+            right.append(is_true)
     order = np.argsort(-np.array(scores), kind="stable")
     hits = np.cumsum(np.array(right, float)[order])
     found = np.arange(1, len(order) + 1)
@@ -77,18 +78,18 @@ def average_precision(pictures: Sequence[Matches], thresholds: Sequence[float] =
     return float(np.mean([curve(pictures, t).average for t in thresholds]))
 
 
-def taken(picture: Matches, threshold: float) -> np.ndarray:
-    """Which truths (M,) were found, at whatever score."""
-    return _dealt(picture, threshold)[1]
+def matched_truths(picture: Matches, threshold: float) -> np.ndarray:
+    """Which ground truths (M,) were detected, at any score."""
+    return _matched(picture, threshold)[1]
 
 
-def _judged(picture: Matches, threshold: float) -> list[tuple[float, bool]]:
-    """Score and verdict of everything found that counts."""
-    return _dealt(picture, threshold)[0]
+def _verdicts(picture: Matches, threshold: float) -> list[tuple[float, bool]]:
+    """Score of every detection that counts, and whether it is true."""
+    return _matched(picture, threshold)[0]
 
 
-def _dealt(picture: Matches, threshold: float) -> tuple[list[tuple[float, bool]], np.ndarray]:
-    """Score and verdict of everything found that counts, and which truths (M,) it took."""
+def _matched(picture: Matches, threshold: float) -> tuple[list[tuple[float, bool]], np.ndarray]:
+    """Score of every detection that counts, whether it is true, and which ground truths (M,) were matched."""
     free = np.ones(len(picture.ignored), bool)
     out = []
     for i in np.argsort(-picture.scores, kind="stable"):

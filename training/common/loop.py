@@ -1,7 +1,7 @@
-"""One training loop for every network: AdamW, warm-up and cosine, deterministic by seed, resumable at any step.
+"""One training loop for every network: AdamW with warm-up and cosine schedule, deterministic, resumable at any step.
 
-What a step learns from is a function of its number, so a run that was stopped goes on as if it had not been.  Progress
-goes to stderr.  Ctrl-C ends the step, writes a checkpoint and leaves with KeyboardInterrupt.
+The batch of a step is a function of its number, so that a resumed run equals an uninterrupted one.  Progress is shown
+on stderr.  Ctrl-C finishes the step, writes a checkpoint and raises KeyboardInterrupt.
 """
 
 from __future__ import annotations
@@ -21,20 +21,26 @@ from typing import Any, Final
 import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import TextColumn
 
 from autonomy.networks.graph import Network
 from autonomy.networks.torch_net import TorchNet, random_net
+from runtime.errors import CodedError
+from training.common.progress import progress_bar
 
 Batch = tuple[torch.Tensor, ...]
-WARM_UP: Final = 0.05
+WARM_UP_SHARE: Final = 0.05
 """Share of the steps in which the learning rate rises."""
-SMOOTHING: Final = 0.98
+LOSS_SMOOTHING: Final = 0.98
+
+
+class TrainingError(CodedError, ValueError):
+    """A training that cannot continue."""
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """How long and how fast: steps, greatest learning rate, weight decay, whether products are taken in bf16."""
+    """Steps, peak learning rate, weight decay, whether products are computed in bf16, checkpoint interval."""
 
     steps: int
     learning_rate: float = 1e-3
@@ -44,7 +50,7 @@ class Schedule:
 
     def rate(self, step: int) -> float:
         """Learning rate of a step (0-based)."""
-        warm = max(1, round(WARM_UP * self.steps))
+        warm = max(1, round(WARM_UP_SHARE * self.steps))
         if step < warm:
             return self.learning_rate * (step + 1) / warm
         return self.learning_rate * 0.5 * (1.0 + math.cos(math.pi * (step - warm) / max(1, self.steps - warm)))
@@ -63,36 +69,40 @@ def train(
     """Train in place; returns the loss of every step.
 
     Args:
-        net: what is trained.
-        batch: the tensors of a step, by its number alone.
-        loss: of the net and these tensors, a scalar.
+        net: the module to train.
+        batch: returns the tensors of a step; depends on the number of the step only.
+        loss: returns the scalar loss of the net and these tensors.
         schedule: as above.
-        checkpoint: file that is written now and then and removed at the end; None keeps nothing.
-        run: says what is trained on what; a checkpoint of another run is not continued.
+        checkpoint: file that is written at intervals and removed at the end; None disables checkpoints.
+        run: identifies network and data; a checkpoint of another run is ignored.
         title: of the progress bar.
-        console: where the bar is drawn.
+        console: of the progress bar.
+
+    Raises:
+        TrainingError: the loss is not finite.
+        KeyboardInterrupt: after Ctrl-C.
     """
     optimiser = torch.optim.AdamW(net.parameters(), schedule.learning_rate, weight_decay=schedule.weight_decay)
     name = f"{run} {asdict(schedule) | {'checkpoint_every_s': 0}}"
-    losses = _resumed(checkpoint, name, net, optimiser)
+    losses = _read_checkpoint(checkpoint, name, net, optimiser)
     net.train()
     written_s = time.monotonic()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-               TextColumn("{task.fields[loss]}"))  # fmt: skip
-    with Progress(*columns, console=console, transient=True) as progress:
+    with progress_bar(console, TextColumn("{task.fields[loss]}")) as progress:
         task = progress.add_task(title, total=schedule.steps, completed=len(losses), loss="")
         smooth = losses[-1] if losses else None
-        with _held_interrupt() as interrupted:
+        with _deferred_interrupt() as interrupted:
             for step in range(len(losses), schedule.steps):
                 value = _step(net, optimiser, batch(step), loss, schedule, step)
                 if not math.isfinite(value):
-                    raise ValueError(f"{title}: the loss of step {step} is {value}; lower the learning rate")
+                    raise TrainingError(
+                        "training.diverged", f"{title}: the loss of step {step} is {value}; lower the learning rate"
+                    )
                 losses.append(value)
-                smooth = value if smooth is None else SMOOTHING * smooth + (1.0 - SMOOTHING) * value
+                smooth = value if smooth is None else LOSS_SMOOTHING * smooth + (1.0 - LOSS_SMOOTHING) * value
                 progress.update(task, advance=1, loss=f"loss {smooth:.4f}")
                 due = time.monotonic() - written_s > schedule.checkpoint_every_s
                 if checkpoint and (due or interrupted):
-                    _keep(checkpoint, name, net, optimiser, losses)
+                    _write_checkpoint(checkpoint, name, net, optimiser, losses)
                     written_s = time.monotonic()
                 if interrupted:
                     raise KeyboardInterrupt
@@ -101,26 +111,32 @@ def train(
     return losses
 
 
-def begun(network: Network, seed: int, start: Mapping[str, np.ndarray] | None) -> TorchNet:
-    """A network of pictures to be trained, from the arrays ``start`` or from scratch."""
+def initialised(network: Network, seed: int, start: Mapping[str, np.ndarray] | None) -> TorchNet:
+    """A network of pictures with the arrays ``start``, or with random parameters from ``seed``."""
     net = random_net(network, seed)
     if start is not None:
         net.load(start)
-    return net.to(memory_format=torch.channels_last)
+    return channels_last(net)
+
+
+def channels_last(net: TorchNet) -> TorchNet:
+    """The net with its parameters in channels-last layout, which convolutions on a CPU prefer."""
+    moved: TorchNet = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # absent from the stubs
+    return moved
 
 
 def stacked(rows: Sequence[tuple[np.ndarray, ...]]) -> tuple[torch.Tensor, ...]:
-    """A batch of samples, whose first array is the picture."""
+    """A batch from samples, whose first array is the picture."""
     images, *rest = (torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True))
     return (images.contiguous(memory_format=torch.channels_last), *rest)
 
 
 @contextmanager
-def _held_interrupt() -> Iterator[list[int]]:
-    """Ctrl-C is noted here instead of raised in the middle of a step, where the weights are half changed."""
+def _deferred_interrupt() -> Iterator[list[int]]:
+    """Collects Ctrl-C instead of raising it in the middle of a step, where the weights are half updated."""
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield noted  # only the main thread gets signals
+        yield noted  # only the main thread receives signals
         return
     before = signal.signal(signal.SIGINT, lambda number, _: noted.append(number))
     try:
@@ -142,19 +158,19 @@ def _step(
     optimiser.zero_grad(set_to_none=True)
     with torch.autocast("cpu", torch.bfloat16, enabled=schedule.bf16):
         value = loss(net, *tensors)
-    value.backward()
+    value.backward()  # type: ignore[no-untyped-call]  # torch has no annotation for it
     optimiser.step()
     return value.item()
 
 
-def _keep(path: Path, name: str, net: torch.nn.Module, optimiser: torch.optim.Optimizer, losses: list[float]) -> None:
+def _write_checkpoint(path: Path, name: str, net: torch.nn.Module, optimiser: torch.optim.Optimizer, losses: list[float]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".part")
     torch.save({"run": name, "net": net.state_dict(), "optimiser": optimiser.state_dict(), "losses": losses}, draft)
     os.replace(draft, path)
 
 
-def _resumed(path: Path | None, name: str, net: torch.nn.Module, optimiser: torch.optim.Optimizer) -> list[float]:
+def _read_checkpoint(path: Path | None, name: str, net: torch.nn.Module, optimiser: torch.optim.Optimizer) -> list[float]:
     if path is None or not path.is_file():
         return []
     try:

@@ -1,4 +1,4 @@
-"""The card beside a weight file: what it is, of what it was made, how good it is and how to make it again."""
+"""The model card beside a weight file: data, schedule, metrics, limits and the command that reproduces it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from autonomy.networks.weights import save
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """What a trainer has to say: a title, what the network does, its data, its schedule, the seed, what it reached
-    (name to text), what it is not good for, and the command that makes it again.
+    """Contents of a model card: title, purpose, training data, schedule, seed, metrics (name to text), limits, and the
+    command that reproduces the weights.
     """
 
     title: str
@@ -32,12 +32,12 @@ class Card:
 
 
 def write(path: Path, network: Network, arrays: Mapping[str, np.ndarray], card: Card, facts: Mapping[str, str]) -> Path:
-    """Write the weights at ``path`` and the card beside them; returns the card's path.
+    """Write the weights to ``path`` and the card beside them; returns the card's path.
 
-    ``facts`` go into the weight file's header, beside data, seed and metrics.
+    ``facts`` are written to the weight file's header with data, command, seed and metrics.
     """
-    told = {"data": card.data, "seed": str(card.seed), "command": card.command}
-    save(path, network, arrays, {**told, **card.metrics, **facts})
+    header = {"data": card.data, "seed": str(card.seed), "command": card.command}
+    save(path, network, arrays, {**header, **card.metrics, **facts})
     beside = path.with_suffix(".md")
     beside.write_text(text(path, network, card))
     return beside

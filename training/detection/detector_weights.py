@@ -1,4 +1,4 @@
-"""The log networks' weight files: trained on drawn pictures, judged on drawn pictures of piles kept apart."""
+"""The weight files of the log detectors: trained on drawn pictures, tested on drawn pictures of held-out piles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from autonomy.networks.weights import WeightsError, load
 from autonomy.perception.papers.box_detector import box_net
@@ -18,6 +17,7 @@ from autonomy.perception.segmentation.network import CHANNELS, unet
 from training.common.average_precision import Matches, average_precision, box_overlaps, curve, mask_overlaps
 from training.common.loop import Schedule
 from training.common.model_card import Card, write
+from training.common.progress import progress_bar
 from training.detection import boxes
 from training.detection.segmentation import CROPS, run
 from training.pictures import shards
@@ -27,18 +27,18 @@ from training.pictures.shards import pictures, shard
 
 BATCH: Final = 16
 LEARNING_RATE: Final = 3e-3
-SMALL_PX, LARGE_PX, FIRST_LARGE = 304, 608, 10_000  # sizes of pictures, and the first shard of large ones
-JUDGED: Final = 128  # pictures
-PHOTOS: Final = {
+SMALL_PX, LARGE_PX, FIRST_LARGE = 304, 608, 10_000  # sizes of pictures, and the number of the first shard of large ones
+TEST_PICTURES: Final = 128  # of held-out piles
+LIMITS: Final = {
     "rgbd": "Its colours are drawn: on photographs it is a sketch.",
     "depth": "Photographs, which have no depth.",
 }
-LEAST_PX: Final = 30  # of a log that counts when the card's figures are made
+MIN_LOG_PX: Final = 30  # of a log that counts in the figures of the card
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is learnt from how many pictures, in how many steps, from which weights (None: from scratch)."""
+    """The plan of a training: pictures, steps, seed, learning rate, initial weights (None: random)."""
 
     count: int
     steps: int
@@ -46,10 +46,10 @@ class Plan:
     learning_rate: float = LEARNING_RATE
     start: Path | None = None
     large: int = 0
-    """Pictures of twice the size, of which half of the windows are cut when there are any: bark seen from near by."""
+    """Pictures of twice the size, which show bark from close up; if there are any, half of the windows are theirs."""
 
-    def words(self, crops_px: str) -> str:
-        """For the card."""
+    def schedule_text(self, crops_px: str) -> str:
+        """The schedule for the card."""
         begin = f", begun with {self.start.name}" if self.start else ""
         return (
             f"{self.steps} steps of up to {BATCH} windows of {crops_px} px, AdamW with {self.learning_rate} and a "
@@ -57,7 +57,7 @@ class Plan:
         )
 
     def command(self, what: str, out: Path) -> str:
-        """That makes the weights again."""
+        """The command that reproduces the weights."""
         start = f" --start {self.start.name}" if self.start else ""
         return (
             f"timberhand train {what} --pictures {self.count}{f' --large {self.large}' if self.large else ''} "
@@ -66,24 +66,25 @@ class Plan:
 
 
 def produce(variant: str, plan: Plan, folder: Path, out: Path, console: Console) -> Path:
-    """Train on pictures kept in ``folder`` (drawn first where missing) and write weights and card; a run that was
-    stopped goes on.  Returns the card's path.
+    """Train on the pictures of ``folder`` and write weights and card; an interrupted run continues.
+
+    Missing pictures are drawn first.  Returns the path of the card.
 
     Raises:
-        WeightsError: the weights to start from are missing, damaged or of another network.
+        WeightsError: the initial weights are missing, damaged or of another network.
     """
-    start = begun(plan.start, variant) if plan.start else None
-    source = ready(folder, plan.count, console)
-    some, count = (mixed(source, plan, folder, console), 2 * plan.count) if plan.large else (source, plan.count)
+    start = initial_arrays(plan.start, variant) if plan.start else None
+    source = small_pictures(folder, plan.count, console)
+    some, count = (mixed_pictures(source, plan, folder, console), 2 * plan.count) if plan.large else (source, plan.count)
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
     kept = out.with_suffix(".checkpoint")
     net, losses = run(some, count, variant, schedule, BATCH, plan.seed, kept, console, start)
     return ship(variant, net.arrays(), losses, plan, source, out)
 
 
-def begun(weights: Path, variant: str) -> dict[str, np.ndarray]:
-    """The arrays of a file to start from: one of the same variant, or for ``depth`` one of ``rgbd``, without what looks
-    at colours.
+def initial_arrays(weights: Path, variant: str) -> dict[str, np.ndarray]:
+    """The arrays of a weight file for the start: one of the same variant, or for ``depth`` one of ``rgbd`` without the
+    colour channels.
 
     Raises:
         WeightsError: as ``load``.
@@ -99,25 +100,25 @@ def begun(weights: Path, variant: str) -> dict[str, np.ndarray]:
 
 
 def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path:
-    """Paper B's detector in its role, in the same way.  Returns the card's path.
+    """Train the box detector in the role of paper B's in the same way.  Returns the path of the card.
 
     Raises:
         WeightsError: as ``produce``.
     """
     start = load(plan.start, box_net())[0] if plan.start else None
-    source = ready(folder, plan.count, console)
+    source = small_pictures(folder, plan.count, console)
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
     kept = out.with_suffix(".checkpoint")
     sources = [(source, plan.count)]
     if plan.large:
-        sources.append((large(plan, folder, console), plan.large))
+        sources.append((large_pictures(plan, folder, console), plan.large))
     net, losses = boxes.run(sources, schedule, BATCH, plan.seed, kept, console, start)
     card = Card(
         "Boxes of logs in colour pictures",
         "Letterboxed colour picture of 608 x 608 px in, boxes of logs out: the role of paper B's YOLOv3 (3.2.2).",
         f"{plan.count + plan.large} pictures drawn by the analytic renderer of settled piles (training); nothing "
         "photographed",
-        plan.words(" and ".join(str(crop) for (crop, _), _ in zip(boxes.CROPS, sources, strict=False))),
+        plan.schedule_text(" and ".join(str(crop) for (crop, _), _ in zip(boxes.CROPS, sources, strict=False))),
         plan.seed,
         {"loss, mean of the last 100 steps": f"{np.mean(losses[-100:]):.4f}"},
         "photographs: its colours are drawn. How it does on worlds that are drawn otherwise is in docs/detector.md.",
@@ -126,28 +127,27 @@ def produce_boxes(plan: Plan, folder: Path, out: Path, console: Console) -> Path
     return write(out, box_net(), net.arrays(), card, {})
 
 
-def ready(folder: Path, count: int, console: Console) -> Callable[[int], Labelled]:
-    """Draw what is missing of the first ``count`` pictures and of the ones kept apart."""
-    _draw(folder, [*range(-(-count // shards.SHARD)), HELD_OUT], SMALL_PX, console)
+def small_pictures(folder: Path, count: int, console: Console) -> Callable[[int], Labelled]:
+    """The small pictures by number; missing ones of the first ``count`` and of the held-out ones are drawn."""
+    _draw_missing(folder, [*range(-(-count // shards.SHARD)), HELD_OUT], SMALL_PX, console)
     return pictures(folder)
 
 
-def mixed(small: Callable[[int], Labelled], plan: Plan, folder: Path, console: Console) -> Callable[[int], Labelled]:
-    """Small and large pictures in turn, the large ones drawn where they are missing."""
-    some = large(plan, folder, console)
+def mixed_pictures(small: Callable[[int], Labelled], plan: Plan, folder: Path, console: Console) -> Callable[[int], Labelled]:
+    """Small and large pictures alternately; missing large ones are drawn."""
+    some = large_pictures(plan, folder, console)
     return lambda i: some(i // 2 % plan.large) if i % 2 else small(i // 2)
 
 
-def large(plan: Plan, folder: Path, console: Console) -> Callable[[int], Labelled]:
-    """The large pictures of a plan by their number, drawn where they are missing."""
-    _draw(folder, range(FIRST_LARGE, FIRST_LARGE - (-plan.large // shards.SHARD)), LARGE_PX, console)
+def large_pictures(plan: Plan, folder: Path, console: Console) -> Callable[[int], Labelled]:
+    """The large pictures of a plan by number; missing ones are drawn."""
+    _draw_missing(folder, range(FIRST_LARGE, FIRST_LARGE - (-plan.large // shards.SHARD)), LARGE_PX, console)
     source, first = pictures(folder, LARGE_PX), FIRST_LARGE * shards.SHARD
     return lambda i: source(first + i)
 
 
-def _draw(folder: Path, numbers: Sequence[int], size_px: int, console: Console) -> None:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+def _draw_missing(folder: Path, numbers: Sequence[int], size_px: int, console: Console) -> None:
+    with progress_bar(console) as progress:
         task = progress.add_task("drawing pictures", total=shards.SHARD * len(numbers))
         for done, number in enumerate(numbers, 1):
             shard(folder, number, size_px, tick=lambda: progress.advance(task))
@@ -166,39 +166,39 @@ def ship(
     network = unet(variant)
     card = Card(
         f"Logs in pictures, from {'colour and depth' if variant == 'rgbd' else 'depth alone'}",
-        "Picture in, eight maps out, of which single logs are made: mask, centre, offset to it, angle, ends, edges.",
+        "Picture in, eight maps out, from which single logs are decoded: mask, centre, offset to it, angle, ends, edges.",
         f"{plan.count} pictures drawn by the analytic renderer of settled piles (training); nothing photographed",
-        plan.words(" and ".join(str(crop) for crop, _ in CROPS)),
+        plan.schedule_text(" and ".join(str(crop) for crop, _ in CROPS)),
         plan.seed,
         {"loss, mean of the last 100 steps": f"{np.mean(losses[-100:]):.4f}"},
-        f"wood that is no log on the ground: standing trees, stumps, planks. {PHOTOS[variant]} What it does on worlds "
+        f"wood that is no log on the ground: standing trees, stumps, planks. {LIMITS[variant]} What it does on worlds "
         "that are drawn otherwise is in docs/detector.md.",
         plan.command(f"segmentation --variant {variant}", out),
     )
     write(out, network, arrays, card, {})
-    figures = judged(LogSegmenter(variant, out), source)
+    figures = test_metrics(LogSegmenter(variant, out), source)
     return write(out, network, arrays, replace(card, metrics={**card.metrics, **figures}), {})
 
 
-def judged(finder: LogSegmenter, source: Callable[[int], Labelled]) -> dict[str, str]:
-    """Average precision on drawn pictures of piles kept apart, as text."""
+def test_metrics(segmenter: LogSegmenter, source: Callable[[int], Labelled]) -> dict[str, str]:
+    """Average precision on drawn pictures of held-out piles, as text."""
     by_masks, by_boxes = [], []
-    for index in range(HELD_OUT * shards.SHARD, HELD_OUT * shards.SHARD + JUDGED):
-        by_mask, by_box = matches(finder, source(index))
+    for index in range(HELD_OUT * shards.SHARD, HELD_OUT * shards.SHARD + TEST_PICTURES):
+        by_mask, by_box = matches(segmenter, source(index))
         by_masks.append(by_mask)
         by_boxes.append(by_box)
-    told = {}
+    figures = {}
     for name, found in (("boxes", by_boxes), ("masks", by_masks)):
-        told[f"{name}, mAP@0.5 on {JUDGED} pictures of piles kept apart"] = f"{curve(found, 0.5).average:.3f}"
-        told[f"{name}, mAP@0.5:0.95 on them"] = f"{average_precision(found):.3f}"
-    return told
+        figures[f"{name}, mAP@0.5 on {TEST_PICTURES} pictures of held-out piles"] = f"{curve(found, 0.5).average:.3f}"
+        figures[f"{name}, mAP@0.5:0.95 on them"] = f"{average_precision(found):.3f}"
+    return figures
 
 
-def matches(finder: LogSegmenter, sample: Labelled) -> tuple[Matches, Matches]:
-    """What is found in a picture against its truth, by masks and by boxes."""
-    found = finder.segment_picture(sample.rgb, sample.depth_m, sample.intrinsics)
+def matches(segmenter: LogSegmenter, sample: Labelled) -> tuple[Matches, Matches]:
+    """Detections in a picture against its ground truth, by masks and by boxes."""
+    found = segmenter.segment_picture(sample.rgb, sample.depth_m, sample.intrinsics)
     truth = [sample.ids == log[ID] for log in sample.logs]
-    small = np.array([t.sum() < LEAST_PX for t in truth], bool)
+    small = np.array([t.sum() < MIN_LOG_PX for t in truth], bool)
     scores = np.array([i.score for i in found])
     by_box = box_overlaps(np.array([i.box_px for i in found]), np.array([box_of(t) for t in truth]))
     return (
@@ -208,6 +208,6 @@ def matches(finder: LogSegmenter, sample: Labelled) -> tuple[Matches, Matches]:
 
 
 def box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of a mask that is not empty, the last two exclusive."""
+    """Left, top, right, bottom of a non-empty mask, the last two exclusive."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)

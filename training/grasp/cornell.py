@@ -1,7 +1,7 @@
 """The Cornell grasping data in its original layout: a folder of pcdNNNNr.png, d.tiff, cpos.txt and cneg.txt.
 
-Depth is float32 metres; a rectangle is four lines "x y".  A rectangle with a corner that is no number is left out, as
-are files of samples that lack depth or labels.  Nobody publishes which pictures show one object; consecutive numbers
+Depth is float32 metres; a rectangle is four lines "x y".  Rectangles with a corner that is not a number are skipped, as
+are samples without depth or labels.  It is not published which pictures show the same object; consecutive numbers
 usually do, so ``grouped_folds`` keeps neighbours together.
 """
 
@@ -15,19 +15,16 @@ from typing import Final
 
 import numpy as np
 
+from training.common.dataset_error import DatasetError
 from training.grasp.rectangles import Rectangle, from_corners
 
-GUARD: Final = 4
-"""Numbers beside a test run that are not trained on. An object has 3 to 5 pictures in a row, by looking at them."""
-
-
-class DatasetError(ValueError):
-    """A folder or file that is not in the layout; the message says what is wrong and where."""
+GUARD_COUNT: Final = 4
+"""Numbers beside a test fold that are excluded from training: an object has 3 to 5 consecutive pictures."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One picture: its number, depth (H, W) float32 [m] with NaN where unknown, and where to grasp."""
+    """One picture: its number, depth (H, W) float32 [m] with NaN where unknown, and its grasps."""
 
     number: int
     depth_m: np.ndarray
@@ -39,12 +36,14 @@ def load(folder: Path) -> tuple[Sample, ...]:
     """All samples in the order of their numbers.
 
     Raises:
-        DatasetError: no sample, or a file that cannot be read.
+        DatasetError: there is no sample, or a file cannot be read.
     """
     files = sorted(folder.rglob("pcd*d.tiff")) if folder.is_dir() else []
     found = [s for path in files if (s := _sample(path)) is not None]
     if not found:
-        raise DatasetError(f"{folder}: no Cornell samples; it must hold pcdNNNNd.tiff beside pcdNNNNcpos.txt")
+        raise DatasetError(
+            "dataset.no-samples", f"{folder}: no Cornell samples; the folder must hold pcdNNNNd.tiff and pcdNNNNcpos.txt"
+        )
     return tuple(sorted(found, key=lambda s: s.number))
 
 
@@ -67,42 +66,49 @@ def depth(path: Path) -> np.ndarray:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             found = np.asarray(image, np.float32)
     except (OSError, UnidentifiedImageError, ValueError) as error:
-        raise DatasetError(f"{path}: cannot be read as a TIFF of float32 metres ({error})") from None
+        raise DatasetError(
+            "dataset.bad-depth", f"{path}: cannot be read as a TIFF of float32 metres ({error})"
+        ) from None
     if found.ndim != 2:
-        raise DatasetError(f"{path}: is no depth picture but has the shape {found.shape}")
+        raise DatasetError("dataset.bad-depth", f"{path}: not a depth picture but of shape {found.shape}")
     return np.where(np.isfinite(found) & (found > 0.0), found, np.float32(np.nan))
 
 
 def rectangles(path: Path) -> tuple[Rectangle, ...]:
-    """The rectangles of a label file; those with a corner that is no number are left out.
+    """The rectangles of a label file, without those with a corner that is not a number.
 
     Raises:
-        DatasetError: lines that are not two numbers, or no multiple of four of them.
+        DatasetError: a line is not two numbers, or the number of lines is not a multiple of four.
     """
     try:
         lines = [[float(x) for x in line.split()] for line in path.read_text().splitlines() if line.strip()]
         corners = np.array(lines, float).reshape(-1, 4, 2)
     except (ValueError, OSError) as error:
-        raise DatasetError(f"{path}: must hold four lines 'x y' for every rectangle ({error})") from None
+        raise DatasetError(
+            "dataset.bad-rectangles", f"{path}: must hold four lines 'x y' for every rectangle ({error})"
+        ) from None
     made = (from_corners(c) for c in corners if np.isfinite(c).all())
     return tuple(r for r in made if r.opening_px > 0.0 and r.jaw_px > 0.0)
 
 
 def grouped_folds(numbers: list[int], folds: int) -> list[tuple[list[int], list[int]]]:
-    """(train, test) places in ``numbers`` (ascending): every test fold is a run of neighbours, and numbers nearer than
-    ``GUARD`` + 1 to it are not trained on, so that no object is on both sides.
+    """(train, test) indices into ``numbers`` (ascending).
+
+    Every test fold is a run of neighbours.  Numbers within ``GUARD_COUNT`` of it are excluded from training, so that no object
+    is on both sides.
     """
     found = []
     for test in np.array_split(np.arange(len(numbers)), folds):
-        low, high = numbers[test[0]] - GUARD, numbers[test[-1]] + GUARD
+        low, high = numbers[test[0]] - GUARD_COUNT, numbers[test[-1]] + GUARD_COUNT
         train = [i for i, n in enumerate(numbers) if not low <= n <= high]
         found.append((train, test.tolist()))
     return found
 
 
 def paper_folds(count: int, folds: int, seed: int) -> list[tuple[list[int], list[int]]]:
-    """(train, test) places of augmented copies, dealt at random as in the paper: copies of one object, even of one
-    picture, are on both sides.
+    """(train, test) indices of augmented copies, assigned at random as in the paper.
+
+    Copies of one object, even of one picture, are on both sides.
     """
     order = np.random.default_rng(seed).permutation(count)
     parts = np.array_split(order, folds)

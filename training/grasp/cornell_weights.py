@@ -1,4 +1,4 @@
-"""The grasp network's weight file from Cornell samples, and how it does on any folder of such samples."""
+"""The grasp network's weight file from Cornell samples, and its evaluation on any such samples."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from autonomy.grasp.network import PAPER, GraspNet
 from training.common.model_card import Card, write
 from training.grasp import network_training
 from training.grasp.cornell import Sample
-from training.grasp.rectangles import Rectangle, right
-from training.grasp.views import centre, cut, seen
+from training.grasp.network_training import BATCH, LEARNING_RATE, VIEWS_PER_SAMPLE
+from training.grasp.rectangles import Rectangle, is_correct
+from training.grasp.views import central_view, view_depth, visible_grasps
 
 
 def produce(samples: Sequence[Sample], seed: int, epochs: int, out: Path, console: Console) -> tuple[Path, Path]:
-    """Train on all samples and write weights and card; a run that was stopped goes on. Returns both paths."""
+    """Train on all samples and write weights and card; an interrupted run continues.  Returns both paths."""
     with console.status("cutting views"):
-        examples = network_training.copies(samples, seed)
+        examples = network_training.augmented_examples(samples, seed)
     kept = out.with_suffix(".checkpoint")
-    net, losses = network_training.fit(examples, seed, "grasp network", console, kept, epochs=epochs)
+    net, losses = network_training.train_network(examples, seed, "grasp network", console, kept, epochs=epochs)
     return out, ship(net.arrays(), losses, samples, seed, epochs, out)
 
 
@@ -31,50 +32,50 @@ def ship(
     out: Path,
 ) -> Path:  # fmt: skip
     """Write trained weights with their card; returns the card's path."""
-    opening, jaw = network_training.usual_size(network_training.plain(samples))
+    opening, jaw = network_training.median_size_px(network_training.plain_examples(samples))
     facts = {
         "numbers": " ".join(str(s.number) for s in samples),
         "opening_px": f"{opening:.3f}",
         "jaw_px": f"{jaw:.3f}",
     }
-    judged = on_samples(GraspNet(arrays), samples, facts)
-    hits = sum(j["right"] for j in judged)
-    copies = len(samples) * network_training.COPIES
+    results = on_samples(GraspNet(arrays), samples, facts)
+    hits = sum(r["right"] for r in results)
+    views = len(samples) * VIEWS_PER_SAMPLE
     card = Card(
         "Paper A's grasp network on Cornell samples",
         "Depth picture in, grasp quality and closing direction at every pixel out (paper A, Table I).",
         f"{len(samples)} samples of the Cornell grasping data (Jiang, Moseson, Saxena 2011), numbers "
         f"{samples[0].number:04d} to {samples[-1].number:04d}; research data without an explicit licence, not part of "
         "this package",
-        f"{epochs} epochs of {copies} views (plain crop and {network_training.COPIES - 1} random zooms, crops and turns of each), "
-        f"batches of {network_training.BATCH}, AdamW with {network_training.LEARNING_RATE} and a cosine, products in bf16; eq. 5",
+        f"{epochs} epochs of {views} views (plain crop and {VIEWS_PER_SAMPLE - 1} random zooms, crops and rotations of "
+        f"each), batches of {BATCH}, AdamW with {LEARNING_RATE} and a cosine, products in bf16; eq. 5",
         seed,
         {
             "loss (eq. 5), mean of the last 100 steps": f"{np.mean(losses[-100:]):.4f}",
-            "rectangle metric on the samples it was trained on": f"{hits} of {len(judged)}; what it does on others is "
-            "in docs/grasp-network.md",
+            "rectangle metric on the training samples": f"{hits} of {len(results)}; for other samples see "
+            "docs/grasp-network.md",
         },
-        "anything but depth seen from above or aslant with ground around the objects. It was never shown a log.",
+        "anything but depth seen from above or aslant with ground around the objects. It was not trained on logs.",
         f"timberhand train grasp --data CORNELL --seed {seed} --epochs {epochs} --out {out.name}",
     )
     return write(out, PAPER, arrays, card, facts)
 
 
 def on_samples(net: GraspNet, samples: Sequence[Sample], facts: Mapping[str, str]) -> list[dict[str, Any]]:
-    """The grasp on every sample's plain crop, as the running net chooses it, and whether it is right.
+    """The grasp that the net chooses on every sample's plain crop, and whether it is correct.
 
-    ``facts``: of the weight file; they tell the usual rectangle and which numbers were trained on.
+    ``facts`` of the weight file give the size of the rectangle and the numbers of the training samples.
     """
     known = set(facts["numbers"].split())
     found = []
     for s in samples:
-        view = centre(s.depth_m)
-        labels = seen(s.grasps, view)
+        view = central_view(s.depth_m)
+        labels = visible_grasps(s.grasps, view)
         if not labels:
             continue
-        g = net.best(cut(s.depth_m, view))
+        g = net.best(view_depth(s.depth_m, view))
         usual = Rectangle(g.u_px, g.v_px, g.theta_rad, float(facts["opening_px"]), float(facts["jaw_px"]))
-        own = any(right(Rectangle(g.u_px, g.v_px, g.theta_rad, r.opening_px, r.jaw_px), [r]) for r in labels)
-        found.append({"number": s.number, "right": right(usual, labels), "own_size": own,
+        own = any(is_correct(Rectangle(g.u_px, g.v_px, g.theta_rad, r.opening_px, r.jaw_px), [r]) for r in labels)
+        found.append({"number": s.number, "right": is_correct(usual, labels), "own_size": own,
                       "trained_on": str(s.number) in known, "q": g.q})  # fmt: skip
     return found

@@ -1,7 +1,8 @@
-"""The label rule of ``autonomy.grasp.quality`` and the virtual camera compiled, for training frames by the million.
+"""The label rule of ``autonomy.grasp.quality`` and the virtual camera, compiled for millions of training frames.
 
-The same formulas for one candidate at a time; ``tests/hil`` holds both against their originals.  A world is (n, 8):
-centre, axis, length, radius.  ``facts`` are the numbers of a grapple and of the rule, ``outline`` (k, 2) its claws.
+The formulas are the same, for one candidate at a time; ``tests/training`` compares both with their originals.  A world
+is (n, 8): centre, axis, length, radius.  ``facts`` are numbers of the grapple and of the rule, ``outline`` (k, 2) is the
+outline of its jaws.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from autonomy.grasp.candidates import CENTRING_SCALE_M
 from autonomy.grasp.grapple_heights import HALF_PLATE_M, SCOOP_SHARE, TIP_CLEARANCE_M
 from autonomy.grasp.jaws import Jaws
 
-GAP, BLADE, PLATE, HOLDS, GRIP, SCOOPS, ROOM = range(7)
-_TIP, _SLACK, _ACROSS, _LEVER = quality.TIP_HEIGHT_M, quality.STRICT_RULE.slack_m, quality.MAX_AXIS_OBLIQUITY, quality.LEVER_SCALE_M
+HALF_GAP, BLADE, PLATE, CAPACITY, TIP_FORCE, SCOOP_SPAN, ROOM = range(7)
+_TIP, _SLACK = quality.TIP_HEIGHT_M, quality.STRICT_RULE.slack_m
+_MAX_OBLIQUITY, _LEVER = quality.MAX_AXIS_OBLIQUITY, quality.LEVER_SCALE_M
 _SCOOP, _FRICTION, _DENSITY = quality.STRICT_RULE.scoop_share, quality.FRICTION_COEFFICIENT, quality.DENSITY_KG_M3
 _GRAVITY: Final = quality.GRAVITY_M_S2
 _MIDDLE, _ALONE, _ROW = CENTRING_SCALE_M, quality.OFF_CENTRE_SCALE_M, quality.LOWEST_ROW_M
@@ -27,13 +29,16 @@ _HALF_PLATE, _UNDER = HALF_PLATE_M, SCOOP_SHARE
 
 
 def facts_of(jaws: Jaws) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of a grapple for ``judge``: facts (7,) and outline (k, 2)."""
-    facts = (jaws.half_gap_m, jaws.blade_m, jaws.plate_m, jaws.capacity_m2, jaws.tip_force_n, jaws.scoop_span_m, jaws.room_m)
+    """Numbers of a grapple for ``evaluate_candidate``: facts (7,) and outline (k, 2)."""
+    facts = (
+        jaws.half_gap_m, jaws.blade_m, jaws.plate_m, jaws.capacity_m2, jaws.tip_force_n, jaws.scoop_span_m,
+        jaws.room_m,
+    )  # fmt: skip
     return np.array(facts), np.array([jaws.height_m, jaws.half_width_m]).T.copy()
 
 
 @njit(cache=True)
-def _half_width(outline, height):
+def _half_width(outline: np.ndarray, height: float) -> float:
     if height <= outline[0, 0]:
         return outline[0, 1]
     for i in range(1, len(outline)):
@@ -44,11 +49,14 @@ def _half_width(outline, height):
 
 
 @njit(cache=True)
-def judge(facts, outline, world, upon, x, y, yaw, level, at, captured):
-    """(lever by middle, mass [kg]) of a safe candidate, else (0, 0); ``at`` (n, 2), ``captured`` (n,) are scratch."""
+def evaluate_candidate(
+    facts: np.ndarray, outline: np.ndarray, world: np.ndarray, upon: np.ndarray,
+    x: float, y: float, yaw: float, level: float, at: np.ndarray, captured: np.ndarray,
+) -> tuple[float, float]:  # fmt: skip
+    """(lever by middle, mass [kg]) of a safe candidate, otherwise (0, 0); ``at`` (n, 2) and ``captured`` (n,) are scratch."""
     n = len(world)
     cu, su = math.cos(yaw), math.sin(yaw)
-    w, gap, tip = facts[BLADE] / 2, facts[GAP], level + _TIP
+    w, gap, tip = facts[BLADE] / 2, facts[HALF_GAP], level + _TIP
     some = False
     left, right = gap, -gap
     for i in range(n):
@@ -80,7 +88,7 @@ def judge(facts, outline, world, upon, x, y, yaw, level, at, captured):
             if nearest > gap + facts[PLATE]:
                 continue
             return 0.0, 0.0
-        square = abs(au) < _ACROSS * max(math.sqrt(1.0 - world[i, 5] * world[i, 5]), 1e-6)
+        square = abs(au) < _MAX_OBLIQUITY * max(math.sqrt(1.0 - world[i, 5] * world[i, 5]), 1e-6)
         whole = part > 0.9 * min(reach, half)
         if not (square and whole and z + high - tip < facts[ROOM] and farthest < _half_width(outline, z - tip)):
             return 0.0, 0.0
@@ -106,17 +114,20 @@ def judge(facts, outline, world, upon, x, y, yaw, level, at, captured):
         if at[i, 0] < level + _ROW:
             row += 2.0 * r
             in_row += 1
-    if in_row > 1 and row * (in_row - 1) / in_row >= facts[SCOOPS]:
+    if in_row > 1 and row * (in_row - 1) / in_row >= facts[SCOOP_SPAN]:
         return 0.0, 0.0
-    if area >= facts[HOLDS] or _GRAVITY * abs(tilt) >= _FRICTION * facts[GRIP] * facts[BLADE]:
+    if area >= facts[CAPACITY] or _GRAVITY * abs(tilt) >= _FRICTION * facts[TIP_FORCE] * facts[BLADE]:
         return 0.0, 0.0
     off = ((left + right) / 2 / _MIDDLE) ** 2 + (far / _ALONE) ** 2
     return math.exp(-((tilt / mass / _LEVER) ** 2) - off), mass
 
 
 @njit(cache=True)
-def draw(inverse, owner, world, eye, fx, fy, cx, cy):
-    """Inverse depths of cylinders seen straight down from ``eye`` into ``inverse``; ``owner`` gets their numbers."""
+def draw(
+    inverse: np.ndarray, owner: np.ndarray, world: np.ndarray, eye: np.ndarray,
+    fx: float, fy: float, cx: float, cy: float,
+) -> None:  # fmt: skip
+    """Write inverse depths of cylinders, seen straight down from ``eye``, to ``inverse`` and their numbers to ``owner``."""
     height, width = inverse.shape
     for i in range(len(world)):
         px, py, pz = world[i, 0] - eye[0], eye[1] - world[i, 1], eye[2] - world[i, 2]
@@ -168,12 +179,16 @@ def draw(inverse, owner, world, eye, fx, fy, cx, cy):
 
 
 @njit(cache=True)
-def label(facts, outline, worlds, upon, moves, levels, eye, inverse, fx, fy, cx, cy, step, turned, near, out):
-    """Quality and direction (3, h, w) on a grid every ``step`` pixels: the best of all closing directions there.
+def label(
+    facts: np.ndarray, outline: np.ndarray, worlds: np.ndarray, upon: np.ndarray, moves: np.ndarray,
+    levels: np.ndarray, eye: np.ndarray, inverse: np.ndarray, fx: float, fy: float, cx: float, cy: float,
+    step: int, turned: np.ndarray, near: float, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Write quality and direction (3, h, w) on a grid every ``step`` pixels to ``out``: the best closing direction there.
 
-    ``worlds`` (1 + d, n, 8): as seen, then draws; ``moves`` (d, 4): errors of x, y, yaw, level; ``levels`` (m,) are the
-    heights that logs may be taken above; ``turned`` (k,) are turned off every log's square direction; only logs within
-    ``near`` lend theirs.
+    ``worlds`` (1 + d, n, 8): as seen, then samples; ``moves`` (d, 4): errors of x, y, yaw, level; ``levels`` (m,): heights
+    above which logs may be gripped; ``turned`` (k,): offsets from the direction across a log; only logs within ``near``
+    contribute their direction.
     """
     n, draws = worlds.shape[1], len(moves)
     at, captured = np.empty((n, 2)), np.empty(n, np.bool_)
@@ -197,7 +212,7 @@ def label(facts, outline, worlds, upon, moves, levels, eye, inverse, fx, fy, cx,
                 square = math.atan2(seen[i, 4], seen[i, 3]) + math.pi / 2
                 for turn in turned:
                     for level in levels:
-                        lever, mass = judge(facts, outline, seen, upon, x, y, square + turn, level, at, captured)
+                        lever, mass = evaluate_candidate(facts, outline, seen, upon, x, y, square + turn, level, at, captured)
                         value = lever * (0.6 + 0.4 * mass / wood) * math.exp(-abs(turn))
                         if value > best:
                             best, best_yaw, best_level = value, square + turn, level
@@ -205,7 +220,7 @@ def label(facts, outline, worlds, upon, moves, levels, eye, inverse, fx, fy, cx,
                 held = 0
                 for d in range(draws):
                     m = moves[d]
-                    lever, _ = judge(
+                    lever, _ = evaluate_candidate(
                         facts, outline, worlds[1 + d], upon, x + m[0], y + m[1], best_yaw + m[2], best_level + m[3],
                         at, captured,
                     )  # fmt: skip

@@ -1,8 +1,9 @@
 """Training frames for the grasp network with physical labels: settled piles, the virtual camera, the label rule.
 
-What the network sees is what the planner shows it: logs as perfect, shortened cylinders from 3 m above.  What it learns
-is the probability that a grasp there holds, by draws of what perception and crane are unsure of, and the direction.
-The judge of an experiment is never this rule (docs/reference/perception.md section 6).  Frames are at the network's own 100 x 100.
+The input is what the planner renders: logs as perfect, shortened cylinders seen from 3 m above.  The labels are the
+probability that a grasp at a pixel holds, from samples of the errors of perception and crane, and the closing direction.
+This rule never evaluates an experiment (docs/reference/perception.md section 6).  Frames are at the network's own
+100 x 100.
 """
 
 from __future__ import annotations
@@ -25,26 +26,28 @@ from training.grasp.label_kernel import draw, facts_of, label
 
 LOW_PX: Final = SIDE_PX // POOL
 GRID_PX: Final = 4
-"""Labels are worked out at every fourth pixel of the 100 x 100 and interpolated."""
+"""Labels are computed at every fourth pixel of the 100 x 100 and interpolated."""
 DRAWS: Final = 8
-TURNED_RAD: Final = np.radians([-10.0, 0.0, 10.0])
-NEAR_M: Final = 0.45
-REUSED: Final = 20
-"""Frames of one pile: others of its logs gone, other places of the camera."""
-MOVES_M: Final = 0.25
+TURN_OFFSETS_RAD: Final = np.radians([-10.0, 0.0, 10.0])
+MAX_LOG_DISTANCE_M: Final = 0.45
+FRAMES_PER_PILE: Final = 20
+"""Frames of one pile, each with other logs removed and another position of the camera."""
+CAMERA_SHIFT_M: Final = 0.25
 
 
 @dataclass(frozen=True, slots=True)
 class GraspFrame:
-    """Network input ``low`` (100, 100) float32 and labels (3, 100, 100): quality, quality times cos 2 theta and times
-    sin 2 theta.  Only the ratio of the last two says anything; the paper has them zero outside its rectangles.
+    """Network input ``low`` (100, 100) float32 and labels (3, 100, 100).
+
+    The labels are quality, quality times cos 2 theta, and quality times sin 2 theta.  Only the ratio of the last two is
+    meaningful; in the paper they are zero outside the rectangles.
     """
 
     low: np.ndarray
     labels: np.ndarray
 
 
-def world_of(logs: Sequence[LogPose]) -> Cylinders:
+def cylinders_of(logs: Sequence[LogPose]) -> Cylinders:
     """Settled logs as cylinders."""
     return Cylinders(
         np.array([log.position_m for log in logs], float),
@@ -55,18 +58,18 @@ def world_of(logs: Sequence[LogPose]) -> Cylinders:
 
 
 def frames(
-    pile: Sequence[LogPose], ground_z_m: float, jaws: Jaws, seed: int, count: int = REUSED
+    pile: Sequence[LogPose], ground_z_m: float, jaws: Jaws, seed: int, count: int = FRAMES_PER_PILE
 ) -> Iterator[GraspFrame]:
-    """``count`` frames of one pile; equal arguments, equal frames."""
+    """``count`` frames of one pile; deterministic."""
     rng = np.random.default_rng([seed, 7])
     facts = facts_of(jaws)
-    whole = world_of(pile)
+    whole = cylinders_of(pile)
     sigma = default_covariance(LogObservation(0, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.6, 0.2))
     for k in range(count):
         keep = rng.random(whole.count) < rng.choice([1.0, 0.8, 0.5])
         keep[rng.integers(whole.count)] = True
         world = Cylinders(whole.center[keep], whole.axis[keep], whole.length[keep], whole.radius[keep])
-        yield frame(_turned(world, rng.uniform(-np.pi, np.pi)), ground_z_m, jaws, facts, sigma, rng, k)
+        yield frame(_rotated(world, rng.uniform(-np.pi, np.pi)), ground_z_m, jaws, facts, sigma, rng, k)
 
 
 def frame(
@@ -75,7 +78,8 @@ def frame(
 ) -> GraspFrame:  # fmt: skip
     """One frame of a world."""
     recreated = shortened_logs(world, jaws.blade_m)
-    eye = operational_area(recreated).centroid_m + rng.uniform(-MOVES_M, MOVES_M, 3) + np.array([0.0, 0.0, CAMERA_HEIGHT_M])
+    shift_m = rng.uniform(-CAMERA_SHIFT_M, CAMERA_SHIFT_M, 3)
+    eye = operational_area(recreated).centroid_m + shift_m + np.array([0.0, 0.0, CAMERA_HEIGHT_M])
     pin = D435.scaled(1.0 / POOL)
     lens = (pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px)
     below = eye[2] - ground_z_m
@@ -97,37 +101,37 @@ def frame(
         inverse,
         *lens,
         GRID_PX,
-        TURNED_RAD,
-        NEAR_M,
+        TURN_OFFSETS_RAD,
+        MAX_LOG_DISTANCE_M,
         out,
     )
-    out[1:] *= out[0]  # where no grasp holds, no direction is to be learnt: it would drown the quality in eq. 5
-    # As ``network.prepare`` does with a level ground that is known.
+    out[1:] *= out[0]  # without a grasp there is no direction to learn, and its error would dominate the quality in eq. 5
+    # As ``network.normalized_relief``, with a known level ground.
     low = np.arcsinh(np.clip(1.0 - 1.0 / (inverse * below), -MAX_RELIEF, MAX_RELIEF) / RELIEF_SCALE).astype(np.float32)
-    return GraspFrame(low, _spread(out))
+    return GraspFrame(low, _interpolated_labels(out))
 
 
 def _packed(world: Cylinders) -> np.ndarray:
     return np.concatenate([world.center, world.axis, world.length[..., None], world.radius[..., None]], axis=-1)
 
 
-def _turned(world: Cylinders, yaw: float) -> Cylinders:
+def _rotated(world: Cylinders, yaw: float) -> Cylinders:
     c, s = np.cos(yaw), np.sin(yaw)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     middle = world.center.mean(axis=0) * (1.0, 1.0, 0.0)
     return Cylinders((world.center - middle) @ turn.T, world.axis @ turn.T, world.length, world.radius)
 
 
-def _weights() -> np.ndarray:
-    """Linear interpolation from the grid to all pixels along one side (100, 25), held beyond its ends."""
+def _interpolation_matrix() -> np.ndarray:
+    """Linear interpolation (100, 25) from the grid to all pixels along one side, constant beyond its ends."""
     at = np.clip((np.arange(LOW_PX) - GRID_PX // 2) / GRID_PX, 0.0, LOW_PX // GRID_PX - 1.0)
     eye = np.eye(LOW_PX // GRID_PX)
     return np.stack([np.interp(at, np.arange(len(eye)), row) for row in eye], axis=1).astype(np.float32)
 
 
-_UP: Final = _weights()
+_UP: Final = _interpolation_matrix()
 
 
-def _spread(grid: np.ndarray) -> np.ndarray:
+def _interpolated_labels(grid: np.ndarray) -> np.ndarray:
     labels: np.ndarray = _UP @ grid.astype(np.float32) @ _UP.T
     return labels

@@ -1,8 +1,8 @@
-"""Grasp rectangles and the metric by which grasps on pictures are judged (paper A II-D, after Jiang et al. 2011).
+"""Grasp rectangles and the rectangle metric for grasps on pictures (paper A II-D, after Jiang et al. 2011).
 
-A rectangle is its centre [px], the direction in which the tongs close (x right, y down), the opening along it and the
-jaws' size across it.  A grasp is right when it shares more than a quarter of the union's area with one labelled
-rectangle and turns less than 30 degrees from it.
+A rectangle is its centre [px], the direction in which the jaws close (x is_correct, y down), the opening along it and the
+size of the jaws across it.  A grasp is correct when its intersection over union with one labelled rectangle is more than
+a quarter and its direction differs by less than 30 degrees.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Final
 
 import numpy as np
 
-LEAST_IOU: Final = 0.25
-MOST_ANGLE_RAD: Final = math.radians(30.0)
+MIN_IOU: Final = 0.25
+MAX_ANGLE_RAD: Final = math.radians(30.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Rectangle:
-    """A grasp on a picture."""
+    """A grasp rectangle in a picture."""
 
     u_px: float
     v_px: float
@@ -38,7 +38,7 @@ class Rectangle:
 
 
 def from_corners(corners: np.ndarray) -> Rectangle:
-    """The rectangle of four corners (4, 2), as Cornell stores them; hand-drawn ones are slightly skew."""
+    """The rectangle of four corners (4, 2) as in the Cornell data, where hand-drawn ones are slightly skewed."""
     (p0, p1, p2, _), (u, v) = corners, corners.mean(axis=0)
     along, across = p1 - p0, p2 - p1
     theta = wrapped(math.atan2(along[1], along[0]))
@@ -46,25 +46,25 @@ def from_corners(corners: np.ndarray) -> Rectangle:
 
 
 def wrapped(theta_rad: float) -> float:
-    """The direction in [-pi/2, pi/2): half a turn changes no grasp."""
+    """The direction in [-pi/2, pi/2), because half a turn does not change a grasp."""
     return (theta_rad + math.pi / 2) % math.pi - math.pi / 2
 
 
 def angle_between(a_rad: float, b_rad: float) -> float:
-    """Between two directions, 0 to pi/2."""
+    """The angle between two directions, 0 to pi/2."""
     return abs(wrapped(a_rad - b_rad))
 
 
 def iou(a: Rectangle, b: Rectangle) -> float:
-    """Shared area over the union's, exact."""
+    """Exact intersection over union."""
     shared = _area(_clipped(a.corners(), b.corners()))
     return shared / (a.opening_px * a.jaw_px + b.opening_px * b.jaw_px - shared)
 
 
-def right(grasp: Rectangle, labels: Iterable[Rectangle]) -> bool:
-    """Whether the grasp fits one of the labels."""
+def is_correct(grasp: Rectangle, labels: Iterable[Rectangle]) -> bool:
+    """Whether the grasp is correct for one of the labels."""
     return any(
-        angle_between(grasp.theta_rad, label.theta_rad) < MOST_ANGLE_RAD and iou(grasp, label) > LEAST_IOU
+        angle_between(grasp.theta_rad, label.theta_rad) < MAX_ANGLE_RAD and iou(grasp, label) > MIN_IOU
         for label in labels
     )
 

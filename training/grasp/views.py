@@ -1,4 +1,4 @@
-"""Views of a labelled depth picture: the 300 x 300 window the network sees, its labels, and random copies of it."""
+"""Views of a labelled depth picture: the network's 300 x 300 window, its labels, and random copies."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from scipy.ndimage import map_coordinates
 from training.grasp.rectangles import Rectangle, wrapped
 
 SIDE_PX: Final = 300
-ZOOM: Final = (0.5, 1.0)
-"""Share of the window's side that a random copy shows, as in the framework that paper A took over (its [10])."""
-SHIFT_PX: Final = 40.0
-ATTEMPTS: Final = 200
+ZOOM_RANGE: Final = (0.5, 1.0)
+"""Share of the window's side that a random copy shows, as in the framework that paper A adopts (its [10])."""
+MAX_SHIFT_PX: Final = 40.0
+MAX_ATTEMPTS: Final = 200
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A square window: its middle in the picture [px], how it is turned, and picture pixels per window pixel."""
+    """A square window: its middle in the picture [px], its rotation, and picture pixels per window pixel."""
 
     u_px: float
     v_px: float
@@ -29,40 +29,40 @@ class View:
     zoom: float = 1.0
 
 
-def centre(depth_m: np.ndarray) -> View:
-    """The paper's crop, at the middle of the picture."""
+def central_view(depth_m: np.ndarray) -> View:
+    """The paper's crop in the middle of the picture."""
     height, width = depth_m.shape
     return View((width - 1) / 2, (height - 1) / 2)
 
 
-def drawn(depth_m: np.ndarray, grasps: tuple[Rectangle, ...], rng: np.random.Generator) -> View:
-    """A random copy (paper A II-D: zooms, crops, rotations) that holds the middle of at least one grasp.
+def random_view(depth_m: np.ndarray, grasps: tuple[Rectangle, ...], rng: np.random.Generator) -> View:
+    """A random copy (paper A II-D: zooms, crops, rotations) with the middle of at least one grasp.
 
-    Its middle lies near the line from the picture's middle, where the plain crop is, to the grasps'.
+    Its middle lies near the line from the middle of the picture to the mean of the grasps.
     """
-    plain = centre(depth_m)
+    plain = central_view(depth_m)
     start = np.array([plain.u_px, plain.v_px])
     way = np.mean([(g.u_px, g.v_px) for g in grasps], axis=0) - start
-    for _ in range(ATTEMPTS):
-        turned, zoom = rng.uniform(-math.pi, math.pi), rng.uniform(*ZOOM)
-        u, v = start + rng.uniform(0.0, 1.0) * way + rng.uniform(-SHIFT_PX, SHIFT_PX, 2)
+    for _ in range(MAX_ATTEMPTS):
+        turned, zoom = rng.uniform(-math.pi, math.pi), rng.uniform(*ZOOM_RANGE)
+        u, v = start + rng.uniform(0.0, 1.0) * way + rng.uniform(-MAX_SHIFT_PX, MAX_SHIFT_PX, 2)
         view = View(float(u), float(v), float(turned), float(zoom))
-        if seen(grasps, view):
+        if visible_grasps(grasps, view):
             return view
     return View(grasps[0].u_px, grasps[0].v_px)
 
 
-def cut(depth_m: np.ndarray, view: View) -> np.ndarray:
-    """The window's depth (300, 300) float32 [m], bilinear; beyond the picture its border repeats, NaN stays NaN."""
+def view_depth(depth_m: np.ndarray, view: View) -> np.ndarray:
+    """The depth (300, 300) float32 [m] of a view, bilinear; the border of the picture repeats, NaN stays NaN."""
     across = (np.arange(SIDE_PX) - (SIDE_PX - 1) / 2) * view.zoom
     c, s = math.cos(view.turned_rad), math.sin(view.turned_rad)
     u = view.u_px + c * across[None, :] - s * across[:, None]
     v = view.v_px + s * across[None, :] + c * across[:, None]
-    return map_coordinates(depth_m, [v, u], order=1, mode="nearest", output=np.float32)
+    return np.asarray(map_coordinates(depth_m, [v, u], order=1, mode="nearest", output=np.float32))
 
 
-def seen(grasps: Iterable[Rectangle], view: View) -> tuple[Rectangle, ...]:
-    """The grasps with their middle inside the window, in window pixels."""
+def visible_grasps(grasps: Iterable[Rectangle], view: View) -> tuple[Rectangle, ...]:
+    """The grasps with their middle inside the view, in pixels of the view."""
     c, s = math.cos(view.turned_rad), math.sin(view.turned_rad)
     found = []
     for g in grasps:
@@ -75,8 +75,10 @@ def seen(grasps: Iterable[Rectangle], view: View) -> tuple[Rectangle, ...]:
 
 
 def label_maps(grasps: Iterable[Rectangle]) -> np.ndarray:
-    """Q, cos 2 theta, sin 2 theta (3, 300, 300) float32: Q is 1 inside the rectangles and 0 elsewhere (paper A II-D);
-    the direction is the mean of the rectangles that cover a pixel, and 0 where there is none.
+    """Q, cos 2 theta, sin 2 theta (3, 300, 300) float32.
+
+    Q is 1 inside the rectangles and 0 elsewhere (paper A II-D).  The direction is the mean of the rectangles that cover a
+    pixel, and 0 where there is none.
     """
     v, u = np.mgrid[:SIDE_PX, :SIDE_PX]
     covered, cos2, sin2 = (np.zeros((SIDE_PX, SIDE_PX), np.float32) for _ in range(3))

@@ -1,6 +1,7 @@
-"""TimberSeg 1.0, or any data set in COCO's format, as labelled pictures, for users who have it.
+"""TimberSeg 1.0, or any other data set in COCO format, as labelled pictures.
 
-One class: every annotation is a log, a polygon or a run-length mask.  Crowds are not judged.  There is no depth.
+There is one class: every annotation is a log, given as polygons or as a run-length mask.  Crowds are ignored.  There is
+no depth.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from machine.geometry.optics import pinhole
 from training.common.dataset_error import DatasetError
 from training.pictures.labels import IGNORED, ROW, Labelled, row_of_mask
 
-MOST: Final = 250  # logs in a picture: ids are bytes
-VIEW_RAD: Final = 1.4  # nobody tells the photographs' field of view; without depth it does not matter
-LEAST_PX: Final = 8
+MAX_LOGS: Final = 250  # logs in a picture; ids are bytes
+FIELD_OF_VIEW_RAD: Final = 1.4  # assumed; the field of view is unknown and has no effect without depth
+MIN_LOG_PX: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
 class CocoPicture:
-    """A file and its annotations as they stand in the JSON."""
+    """A file and its annotations as in the JSON."""
 
     path: Path
     width_px: int
@@ -36,7 +37,7 @@ def load(annotations: Path, images: Path) -> tuple[CocoPicture, ...]:
     """The pictures of a COCO file, in the order of their ids; ``images`` is the folder of their files.
 
     Raises:
-        DatasetError: no COCO file, or one without pictures.
+        DatasetError: the file is not a COCO file or has no pictures.
     """
     try:
         whole = json.loads(annotations.read_text())
@@ -49,11 +50,15 @@ def load(annotations: Path, images: Path) -> tuple[CocoPicture, ...]:
             for i in rows
         )
     except OSError as error:
-        raise DatasetError(f"{annotations}: cannot be read ({error.strerror}); give COCO's JSON file") from None
+        raise DatasetError(
+            "dataset.unreadable", f"{annotations}: cannot be read ({error.strerror}); give the JSON file of a COCO data set"
+        ) from None
     except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{annotations}: is no COCO file ({type(error).__name__}: {error})") from None
+        raise DatasetError(
+            "dataset.not-coco", f"{annotations}: not a COCO file ({type(error).__name__}: {error})"
+        ) from None
     if not found:
-        raise DatasetError(f"{annotations}: has no pictures")
+        raise DatasetError("dataset.no-pictures", f"{annotations}: the COCO file has no pictures")
     return found
 
 
@@ -61,7 +66,7 @@ def labelled(picture: CocoPicture, size_px: int) -> Labelled:
     """The picture letterboxed into a square, its logs labelled; depth is unknown everywhere.
 
     Raises:
-        DatasetError: the file is missing or no picture, or an annotation is broken.
+        DatasetError: the file is missing or not a picture, or an annotation is invalid.
     """
     factor = size_px / max(picture.width_px, picture.height_px)
     w, h = max(1, round(picture.width_px * factor)), max(1, round(picture.height_px * factor))
@@ -71,23 +76,24 @@ def labelled(picture: CocoPicture, size_px: int) -> Labelled:
         with Image.open(picture.path) as image:
             rgb[top : top + h, left : left + w] = np.asarray(image.convert("RGB").resize((w, h), Image.Resampling.BOX))
     except (OSError, UnidentifiedImageError) as error:
-        raise DatasetError(f"{picture.path}: cannot be read as a picture ({error})") from None
-    ids, rows = np.zeros((size_px, size_px), np.uint8), []
+        raise DatasetError("dataset.bad-picture", f"{picture.path}: cannot be read as a picture ({error})") from None
+    ids = np.zeros((size_px, size_px), np.uint8)
+    rows: list[tuple[float, ...]] = []
     for annotation in picture.annotations:
         own = np.zeros_like(ids, bool)
         own[top : top + h, left : left + w] = _mask(annotation, picture, (w, h))
-        if annotation.get("iscrowd") or len(rows) == MOST or np.count_nonzero(own) < LEAST_PX:
+        if annotation.get("iscrowd") or len(rows) == MAX_LOGS or np.count_nonzero(own) < MIN_LOG_PX:
             ids[own] = IGNORED
             continue
         ids[own] = len(rows) + 1
         rows.append(row_of_mask(len(rows) + 1, own))
     depth = np.full(ids.shape, np.nan, np.float32)
     logs = np.array(rows, np.float32).reshape(-1, ROW)
-    return Labelled(rgb, depth, ids, logs, pinhole(size_px, size_px, VIEW_RAD))
+    return Labelled(rgb, depth, ids, logs, pinhole(size_px, size_px, FIELD_OF_VIEW_RAD))
 
 
 def _mask(annotation: dict[str, Any], picture: CocoPicture, size: tuple[int, int]) -> np.ndarray:
-    """Mask (h, w) of an annotation at another size."""
+    """Mask (h, w) of an annotation, scaled to ``size`` (width, height)."""
     try:
         shape = annotation["segmentation"]
         if isinstance(shape, list):
@@ -100,7 +106,10 @@ def _mask(annotation: dict[str, Any], picture: CocoPicture, size: tuple[int, int
         whole = Image.fromarray(_runs(shape))
         return np.asarray(whole.resize(size, Image.Resampling.NEAREST))
     except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise DatasetError(f"annotation {annotation.get('id')} of {picture.path.name} is broken ({error})") from None
+        raise DatasetError(
+            "dataset.bad-annotation",
+            f"annotation {annotation.get('id')} of {picture.path.name} is invalid ({error})",
+        ) from None
 
 
 def _runs(shape: dict[str, Any]) -> np.ndarray:
@@ -109,13 +118,13 @@ def _runs(shape: dict[str, Any]) -> np.ndarray:
     counts = shape["counts"]
     lengths = _unpacked(counts) if isinstance(counts, str) else [int(n) for n in counts]
     if sum(lengths) != height * width or min(lengths, default=0) < 0:
-        raise ValueError(f"runs of {sum(lengths)} pixels for {width} x {height}")
+        raise ValueError(f"run lengths of {sum(lengths)} pixels for {width} x {height}")
     values = np.arange(len(lengths)) % 2 == 1
     return np.repeat(values, lengths).reshape(width, height).T
 
 
 def _unpacked(text: str) -> list[int]:
-    """COCO's packed run lengths: five bits a character, from the third on as differences to the last but one."""
+    """COCO's packed run lengths: five bits per character; from the third on, differences to the last but one."""
     lengths: list[int] = []
     at = 0
     while at < len(text):

@@ -1,8 +1,8 @@
-"""Training pictures with their truth: a settled pile, seen by the analytic renderer through a camera of its machine.
+"""Training pictures with ground truth: a settled pile, rendered analytically through a camera of its machine.
 
-Everything but the pile is drawn anew from the picture's seed: which logs are already picked, camera, zoom, place and
-tilt, light, surfaces, clutter, steel in view, errors of depth.  In part of the pictures logs and ground are painted
-plainly, so that no texture is needed to know a log.
+Everything except the pile is drawn from the seed of the picture: which logs are already removed, camera, zoom, position
+and tilt, light, surfaces, clutter, steel in view, errors of depth.  In some pictures logs and ground have plain
+colours, so that the network does not depend on texture.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from training.pictures.labels import IGNORED, ROW, Labelled, elongation, seen_al
 from training.pictures.piles import MACHINES, Pile, ground_of, profile_of, terrain_of
 from training.pictures.props import Steel
 
-MOST_LOGS: Final = 16
-LEAST_PX: Final = 14
+MAX_LOGS: Final = 16
+MIN_LOG_PX: Final = 14
 PLAIN_SHARE: Final = 0.35
 PLAIN_SKY_SHARE: Final = 0.4  # of the other pictures
 HELD_SHARE: Final = 0.12  # of pictures in which a grapple holds a log
-AWAY_SHARE: Final = 0.05  # of pictures that look past the logs
-NEAREST: Final = 4.2  # zoom of the largest window: of letterboxes of the size and of up to four times the size
-LEAST_CONTRAST: Final = 45.0  # between logs and ground, in most plain pictures
+AWAY_SHARE: Final = 0.05  # of pictures that show few logs or none
+MAX_ZOOM: Final = 4.2  # zoom of the smallest window over the letterboxed picture
+MIN_CONTRAST: Final = 45.0  # between logs and ground, in most plain pictures
 
 
 def draw(pile: Pile, seed: int, size_px: int = 304) -> Labelled:
-    """A picture of ``pile``, drawn from ``seed``; equal arguments, equal sample."""
+    """A picture of ``pile``, drawn from ``seed``; deterministic."""
     rng = random.Random(f"frame {pile.machine} {pile.number} {seed}")
     held = rng.random() < HELD_SHARE
     scene, keep = _scene(pile, rng, held)
@@ -52,14 +52,15 @@ def draw(pile: Pile, seed: int, size_px: int = 304) -> Labelled:
         picture = replace(picture, rgb=_plain(picture, view, look, rng))
     elif rng.random() < PLAIN_SKY_SHARE:
         picture = replace(picture, rgb=np.where((picture.mask == SKY)[..., None], _sky(rng), picture.rgb))
-    depth = _noisy(pile.machine, camera, picture, view.intrinsics, rng)
+    depth = _stereo_depth(pile.machine, camera, picture, view.intrinsics, rng)
     ids, logs = labelled(picture.mask, view, keep)
-    return Labelled(_lens(picture.rgb, rng), depth, ids, logs, view.intrinsics)
+    return Labelled(_lens_and_compression(picture.rgb, rng), depth, ids, logs, view.intrinsics)
 
 
 def labelled(mask: np.ndarray, view: View, logs: tuple[LogPose, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """``ids`` and ``logs`` of a sample from the renderer's instances (H, W)."""
-    ids, rows = np.zeros(mask.shape, np.uint8), []
+    """``ids`` and ``logs`` of a sample, from the renderer's instances (H, W)."""
+    ids = np.zeros(mask.shape, np.uint8)
+    rows: list[tuple[float, ...]] = []
     pixels: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     v, u = np.nonzero((mask > 0) & (mask < 1000))
     of = mask[v, u]
@@ -71,7 +72,7 @@ def labelled(mask: np.ndarray, view: View, logs: tuple[LogPose, ...]) -> tuple[n
         if log.instance not in pixels:
             continue
         u, v = pixels[log.instance]
-        if len(u) < LEAST_PX or len(rows) == MOST_LOGS:
+        if len(u) < MIN_LOG_PX or len(rows) == MAX_LOGS:
             ids[v, u] = IGNORED
             continue
         number = len(rows) + 1
@@ -88,7 +89,7 @@ def _row(u: np.ndarray, v: np.ndarray, view: View, log: LogPose, shape: tuple[in
     spine = np.full((len(points), 2), 1e6)
     spine[front] = pin.project(ahead[front])
     width = 2.0 * radii * pin.fx_px / np.maximum(ahead[:, 2], 0.2)
-    # The chord of the part that is in the picture, for a log may run far out of it or behind the camera.
+    # The chord of the part in the picture, because a log may extend far beyond it or behind the camera.
     margin = width
     inside = front & (spine[:, 0] > -margin) & (spine[:, 0] < shape[1] + margin)
     inside &= (spine[:, 1] > -margin) & (spine[:, 1] < shape[0] + margin)
@@ -112,7 +113,7 @@ def _row(u: np.ndarray, v: np.ndarray, view: View, log: LogPose, shape: tuple[in
 
 
 def _scene(pile: Pile, rng: random.Random, held: bool) -> tuple[Scene, tuple[LogPose, ...]]:
-    """The pile without the logs that are already picked, from the top; of a held one, the last is in the air."""
+    """The pile without the logs already removed from the top; when one is held, the topmost log is in the air."""
     logs = sorted(pile.logs, key=lambda log: log.position_m[2])
     if len(logs) > 1 and rng.random() < 0.4:
         logs = logs[: rng.randint(1, len(logs))]
@@ -127,20 +128,19 @@ def _scene(pile: Pile, rng: random.Random, held: bool) -> tuple[Scene, tuple[Log
 
 
 def _pinhole(pile: Pile, camera: str, rng: random.Random, size_px: int) -> Intrinsics:
-    """The whole picture letterboxed, or a window at a zoom between those of letterboxes of once and of NEAREST times
-    the size."""
+    """The whole picture letterboxed, or a window with a zoom between 1 and MAX_ZOOM times that of the letterbox."""
     pin = intrinsics(profile_of(pile.machine).cameras[camera])
     whole = size_px / max(pin.width_px, pin.height_px)
     if rng.random() < 0.1:
         return pin.letterbox(size_px).outer
-    zoomed = pin.scaled(whole * math.exp(rng.uniform(-0.1, math.log(NEAREST))))
+    zoomed = pin.scaled(whole * math.exp(rng.uniform(-0.1, math.log(MAX_ZOOM))))
     left = rng.uniform(-0.1, 1.1) * (zoomed.width_px - size_px)
     top = rng.uniform(-0.1, 1.1) * (zoomed.height_px - size_px)
     return zoomed.crop(round(left), round(top), size_px, size_px)
 
 
 def _view(pile: Pile, logs: tuple[LogPose, ...], camera: str, rng: random.Random, size_px: int, ground: Ground) -> View:
-    """A camera that looks at some of the logs from where a machine's cameras come."""
+    """A view of some of the logs from where a machine's cameras can be."""
     pin = _pinhole(pile, camera, rng, size_px)
     mark = rng.choice(logs)
     points, _ = mark.spine(8)
@@ -152,7 +152,7 @@ def _view(pile: Pile, logs: tuple[LogPose, ...], camera: str, rng: random.Random
     for _ in range(20):
         if camera == "d435" or rng.random() < 0.15:
             elevation, reach = math.radians(rng.uniform(70.0, 89.0)), rng.uniform(2.0, 4.5)
-        elif camera == "front" or rng.random() < 0.4:  # at a carrier's height
+        elif camera == "front" or rng.random() < 0.4:  # height of a camera on a carrier
             height, reach = rng.uniform(1.6, 3.2), 3.0 * 4.0 ** rng.random()
             elevation = math.asin(min(0.99, height / reach))
         else:
@@ -161,26 +161,26 @@ def _view(pile: Pile, logs: tuple[LogPose, ...], camera: str, rng: random.Random
                 math.exp(rng.uniform(math.log(2.0), math.log(9.0))),
             )
         eye = target + reach * (math.cos(elevation) * way + np.array([0.0, 0.0, math.sin(elevation)]))
-        if eye[2] > ground.height(eye[0], eye[1]) + 0.7 and _free(eye, logs):
+        if eye[2] > ground.height(eye[0], eye[1]) + 0.7 and _clear_of_logs(eye, logs):
             break
     view = look_at(eye, target, pin)
-    # The principal point may be far off the window's middle: turn so that the target is in it.
+    # The principal point may be far from the middle of the window: turn the target into the window.
     middle = np.array([(size_px / 2 - pin.cx_px) / pin.fx_px, (size_px / 2 - pin.cy_px) / pin.fy_px, 1.0])
-    turn = _between(middle / np.linalg.norm(middle), np.array([0.0, 0.0, 1.0]))
+    turn = _rotation_between(middle / np.linalg.norm(middle), np.array([0.0, 0.0, 1.0]))
     roll = rng.gauss(0.0, 0.06) if rng.random() < 0.7 else rng.uniform(-math.pi, math.pi)
     c, s = math.cos(roll), math.sin(roll)
     spin = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return View(pin, view.position_m, view.rotation @ spin @ turn)
 
 
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Rotation (3, 3) that turns unit vector ``a`` into ``b`` the short way."""
+def _rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The smallest rotation (3, 3) from unit vector ``a`` to ``b``."""
     w, c = np.cross(a, b), float(a @ b)
     k = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
     return np.eye(3) + k + k @ k / (1.0 + c)
 
 
-def _free(eye: np.ndarray, logs: tuple[LogPose, ...]) -> bool:
+def _clear_of_logs(eye: np.ndarray, logs: tuple[LogPose, ...]) -> bool:
     return all(np.linalg.norm(log.spine(12)[0] - eye, axis=1).min() > 1.2 for log in logs)
 
 
@@ -201,27 +201,27 @@ def _steel(pile: Pile, logs: tuple[LogPose, ...], view: View, rng: random.Random
         away, turn = rng.uniform(2.2, 6.0), rng.uniform(-math.pi, math.pi)
         spot = mark + np.array([away * math.cos(turn), away * math.sin(turn), 0.0])
         spot[2] = ground_of(pile).height(spot[0], spot[1])
-        # A crate that stands in a log would teach nonsense.
+        # A crate must not intersect a log.
         if all(np.linalg.norm(log.spine(6)[0] - spot, axis=1).min() > 1.4 for log in logs):
             steel.block(spot)
     return steel.build()
 
 
 @lru_cache(maxsize=48)
-def _litter(ground: tuple[str, int, float], kind: int, seed: int) -> GroundCover:
+def _ground_cover(ground: tuple[str, int, float], kind: int, seed: int) -> GroundCover:
     return GroundCover(Ground(*terrain_of(*ground).grid), (BARE, LANDING, CLEARING)[kind], seed)
 
 
 def _clutter(pile: Pile, logs: tuple[LogPose, ...], rng: random.Random) -> Rods:
-    """Grass and branches; few seeds, so that tiles are made once and used often."""
+    """Grass and branches; with few seeds, so that tiles are generated once and reused."""
     kind = rng.choices((0, 1, 2), (0.3, 0.3, 0.4))[0]
     x, y, _ = rng.choice(logs).position_m
     seed = rng.randrange(3) if kind else 0
-    return _litter((pile.terrain, pile.terrain_seed, pile.datum_m), kind, seed).around(x, y, 5.0)
+    return _ground_cover((pile.terrain, pile.terrain_seed, pile.datum_m), kind, seed).around(x, y, 5.0)
 
 
-def _noisy(machine: str, camera: str, picture: Picture, pin: Intrinsics, rng: random.Random) -> np.ndarray:
-    """Depth as stereo gives it, better or worse than nominal; now and then nearly perfect or full of holes."""
+def _stereo_depth(machine: str, camera: str, picture: Picture, pin: Intrinsics, rng: random.Random) -> np.ndarray:
+    """Stereo depth, better or worse than nominal; sometimes nearly perfect or full of holes."""
     sigma = math.exp(rng.uniform(math.log(0.25), math.log(1.6)))
     edges = (rng.uniform(0.3, 1.1), rng.uniform(0.3, 1.1))
     holes, plain_holes = math.exp(rng.uniform(-1.0, 2.0)), rng.uniform(0.01, 0.25)
@@ -234,7 +234,7 @@ def _noisy(machine: str, camera: str, picture: Picture, pin: Intrinsics, rng: ra
 
 
 def _plain(picture: Picture, view: View, look: ImagingConditions, rng: random.Random) -> np.ndarray:
-    """The picture with ground, logs and sky in one colour each, lit by the sun; the rest stays as it is."""
+    """The picture with ground, logs and sky in one colour each, lit by the sun; the rest is unchanged."""
     pin, s = view.intrinsics, np.nan_to_num(1.0 / picture.depth_m, nan=0.0)
     h, w = s.shape
     u = ((np.arange(w) - pin.cx_px) / pin.fx_px).astype(np.float32)
@@ -248,12 +248,12 @@ def _plain(picture: Picture, view: View, look: ImagingConditions, rng: random.Ra
     sun = view.rotation.T @ np.asarray(look.sun)
     ambient = rng.uniform(0.35, 0.75)
     light = ambient + (1.0 - ambient) * np.clip(np.tensordot(sun.astype(np.float32), normal, 1), 0.0, 1.0)
-    bark, earth, keep = _colour(rng), _colour(rng), rng.choice((0.0, 0.0, 0.3, 0.6))  # keep: of the texture
+    bark, earth, keep = _colour(rng), _colour(rng), rng.choice((0.0, 0.0, 0.3, 0.6))  # keep: share of the texture
     if rng.random() < 0.8:
-        while np.linalg.norm(bark - earth) < LEAST_CONTRAST:
+        while np.linalg.norm(bark - earth) < MIN_CONTRAST:
             bark, earth = _colour(rng), _colour(rng)
     paint, painted = np.zeros((COVER + 2, 3), np.float32), np.zeros(COVER + 2, np.float32)
-    for instance in range(1, MOST_LOGS + 1):
+    for instance in range(1, MAX_LOGS + 1):
         paint[instance], painted[instance] = bark * rng.uniform(0.9, 1.1), 1.0 - keep
     paint[GROUND], painted[GROUND] = earth, 1.0 - keep
     paint[COVER], painted[COVER] = _colour(rng), rng.choice((0.0, 1.0))
@@ -263,7 +263,7 @@ def _plain(picture: Picture, view: View, look: ImagingConditions, rng: random.Ra
 
 
 def _sky(rng: random.Random) -> np.ndarray:
-    """One colour (3,) uint8: white, bright or any."""
+    """One colour (3,) uint8: white, bright or random."""
     kind = rng.random()
     if kind < 0.4:
         return np.full(3, 255, np.uint8)
@@ -272,15 +272,15 @@ def _sky(rng: random.Random) -> np.ndarray:
 
 
 def _colour(rng: random.Random) -> np.ndarray:
-    """Mostly earth and wood, now and then any."""
+    """Mostly the colour of earth or wood, sometimes random."""
     if rng.random() < 0.25:
         return np.array([rng.uniform(20.0, 250.0) for _ in range(3)], np.float32)
     grey, warm = rng.uniform(60.0, 210.0), rng.uniform(0.0, 0.5)
     return np.array([grey * (1.0 + 0.5 * warm), grey, grey * (1.0 - warm)], np.float32)
 
 
-def _lens(rgb: np.ndarray, rng: random.Random) -> np.ndarray:
-    """Blur and compression of a real picture, in half of the pictures each."""
+def _lens_and_compression(rgb: np.ndarray, rng: random.Random) -> np.ndarray:
+    """Blur and compression of a real camera, each in half of the pictures."""
     picture = Image.fromarray(rgb)
     if rng.random() < 0.5:
         picture = picture.filter(ImageFilter.GaussianBlur(rng.uniform(0.3, 1.4)))

@@ -1,4 +1,4 @@
-"""A labelled picture of logs, whatever it comes from: what the segmentation learns from."""
+"""A labelled picture of logs: the training sample of the segmentation, whatever its source."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from machine.geometry.optics import Intrinsics
 ID, CENTRE_U, CENTRE_V, START_U, START_V, END_U, END_V, START_SEEN, END_SEEN, ANGLE, ELONGATION = range(11)
 ROW: Final = 11
 IGNORED: Final = 255
-LONG: Final = 3.0  # from so many widths on a log's angle in the picture counts in full
+FULL_ELONGATION_WIDTHS: Final = 3.0  # from this length in widths on, the angle of a log has full weight
 
 
 @dataclass(frozen=True, slots=True)
 class Labelled:
-    """One picture and its truth.
+    """One picture with its ground truth.
 
-    rgb (H, W, 3) uint8; depth_m (H, W) float32, NaN unknown; ids (H, W) uint8: 0 no log, 1.. a log, IGNORED something
-    that is not to be judged; logs (N, ROW) float32: id, centre u v (middle of what is seen), first end u v, last end u
-    v [px], whether either end is seen (1 or 0), angle of the axis in the picture [rad, modulo pi], elongation (0 seen
-    end-on .. 1); height_m (H, W) float32 over the whole picture's prevailing plane, where it is known beforehand.
+    rgb (H, W, 3) uint8; depth_m (H, W) float32, NaN unknown; ids (H, W) uint8: 0 no log, 1.. a log, IGNORED excluded
+    from loss and metrics; logs (N, ROW) float32: id, centre u v (middle of the visible part), first end u v, last end
+    u v [px], whether each end is visible (1 or 0), angle of the axis in the picture [rad, modulo pi], elongation (0
+    seen end-on .. 1); height_m (H, W) float32 over the dominant plane of the whole picture, if it was computed before.
     """
 
     rgb: np.ndarray
@@ -36,8 +36,10 @@ class Labelled:
 
 
 def seen_along(u: np.ndarray, v: np.ndarray, axis: np.ndarray) -> tuple[tuple[float, float], float]:
-    """Middle (u, v) of a log's visible pixels (halfway along the unit ``axis`` (2,), median across) and their extent
-    along it [px]."""
+    """Middle (u, v) of a log's visible pixels and their extent along the unit ``axis`` (2,) [px].
+
+    The middle is half-way along the axis and the median across it.
+    """
     along, across = u * axis[0] + v * axis[1], v * axis[0] - u * axis[1]
     middle, side = (float(along.min()) + float(along.max())) / 2.0, float(np.median(across))
     centre = (middle * axis[0] - side * axis[1], middle * axis[1] + side * axis[0])
@@ -45,13 +47,16 @@ def seen_along(u: np.ndarray, v: np.ndarray, axis: np.ndarray) -> tuple[tuple[fl
 
 
 def elongation(extent_px: float, width_px: float) -> float:
-    """0 for a log seen end-on, 1 for one seen LONG widths long."""
-    return min(1.0, max(0.0, (extent_px / max(width_px, 1.0) - 1.0) / (LONG - 1.0)))
+    """0 for a log seen end-on, 1 for one that appears FULL_ELONGATION_WIDTHS widths long or more."""
+    return min(1.0, max(0.0, (extent_px / max(width_px, 1.0) - 1.0) / (FULL_ELONGATION_WIDTHS - 1.0)))
 
 
 def row_of_mask(number: int, mask: np.ndarray) -> tuple[float, ...]:
-    """A row for a log of which only the mask (H, W) is known: its principal axis; the ends are where the mask ends, and
-    are said to be unseen because nobody knows."""
+    """The row of a log of which only the mask (H, W) is known.
+
+    The axis is the principal axis of the mask.  The ends are those of the mask and marked as not visible, because their
+    visibility is unknown.
+    """
     v, u = np.nonzero(mask)
     points = np.stack([u, v]).astype(float)
     values, vectors = np.linalg.eigh(np.cov(points) if len(u) > 1 else np.eye(2))
@@ -65,7 +70,7 @@ def row_of_mask(number: int, mask: np.ndarray) -> tuple[float, ...]:
 
 
 def mirrored(sample: Labelled) -> Labelled:
-    """The same picture seen in a mirror."""
+    """The picture mirrored left to right."""
     w, pin = sample.rgb.shape[1], sample.intrinsics
     logs = sample.logs.copy()
     logs[:, (CENTRE_U, START_U, END_U)] = w - 1.0 - logs[:, (CENTRE_U, START_U, END_U)]
@@ -76,7 +81,7 @@ def mirrored(sample: Labelled) -> Labelled:
 
 
 def enlarged(sample: Labelled) -> Labelled:
-    """The same picture twice as large."""
+    """The picture at twice the size."""
     rgb, depth, pin = doubled(sample.rgb, sample.depth_m, sample.intrinsics)
     logs = sample.logs.copy()
     logs[:, CENTRE_U : END_V + 1] = 2.0 * logs[:, CENTRE_U : END_V + 1] + 0.5
@@ -85,7 +90,7 @@ def enlarged(sample: Labelled) -> Labelled:
 
 
 def cropped(sample: Labelled, left: int, top: int, size_px: int) -> Labelled:
-    """A square window that lies inside the picture; what is seen of every log is judged anew."""
+    """A square window inside the picture; the visible part of every log is determined again."""
     window = (slice(top, top + size_px), slice(left, left + size_px))
     ids, rows = sample.ids[window], []
     v, u = np.nonzero((ids > 0) & (ids != IGNORED))

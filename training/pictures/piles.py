@@ -1,7 +1,7 @@
-"""Settled piles to learn from: each is brought to rest once by the plant's physics and kept on disk.
+"""Settled piles for training: each is brought to rest once by the plant's physics and kept on disk.
 
-A chunk of CHUNK piles depends on the machine and the chunk's number alone, so a split by chunk is a split by pile.
-Chunks of HELD_OUT and above are never trained on: they are the experiments'.
+A chunk of CHUNK piles depends only on the machine and the number of the chunk, so that a split by chunk is a split by
+pile.  Chunks from HELD_OUT on are never used for training; they are reserved for experiments.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ from sim.geometry.shape import Vector
 from sim.ground.terrain import Terrain
 from sim.scenes.arrangements import KINDS
 from sim.scenes.settled_logs import settle_logs
+from training.common.dataset_error import DatasetError
 
-EDITION: Final = 1  # raised when the same seed would give other piles
+FORMAT_VERSION: Final = 1  # incremented when the same seed would give other piles
 CHUNK: Final = 64
 HELD_OUT: Final = 1_000_000
-TERRAINS: Final = 12  # grounds are dear to make: so many are shared by all piles of a kind
+TERRAINS: Final = 12  # expensive to generate: so many are shared by all piles of a kind
 MACHINES: Final = ("palms_471", "aoro_fc8")
-SHARES: Final = {
+KIND_WEIGHTS: Final = {
     "palms_471": {
         "single": 1.0, "separate": 2.0, "parallel": 1.5, "skewed": 1.0, "crossed": 2.0, "pile": 4.0, "bunk": 1.0,
     },
@@ -40,15 +41,19 @@ SHARES: Final = {
     },
 }  # fmt: skip
 """How often a kind of ``sim.scenes.arrangements`` is drawn for a machine."""
-MOST: Final = {"separate": 5, "row": 10, "bunk": 12}
-ROUTE_M: Final = 3.2  # of a row, for each log
+MAX_LOGS: Final = {"separate": 5, "row": 10, "bunk": 12}
+ROUTE_M_PER_LOG: Final = 3.2  # of a row
 COLUMNS: Final = 11
+MAX_DRAWS: Final = 50
 
 
 @dataclass(frozen=True, slots=True)
 class Pile:
-    """Logs at rest, world frame, instances 1, 2, ...; ``kind`` as in ``sim.scenes.arrangements``; ``number`` within the machine;
-    the ground is ``terrain`` of ``terrain_seed`` with its datum at ``datum_m``."""
+    """Logs at rest in the world frame, instances 1, 2, ...
+
+    ``kind`` as in ``sim.scenes.arrangements``; ``number`` is unique for the machine; the ground is ``terrain`` of
+    ``terrain_seed`` with its datum at ``datum_m``.
+    """
 
     machine: str
     number: int
@@ -73,38 +78,39 @@ def profile_of(machine: str) -> Profile:
 
 @lru_cache(maxsize=2 * TERRAINS + 4)
 def terrain_of(kind: str, seed: int, datum_m: float) -> Terrain:
-    """The ground of a pile; rough ones are remembered."""
+    """The ground of a pile, cached."""
     return Terrain(kind, seed, datum_m)
 
 
 def ground_of(pile: Pile) -> Ground:
-    """The ground of a pile as the renderer wants it."""
+    """The ground of a pile for the renderer."""
     return Ground(*terrain_of(pile.terrain, pile.terrain_seed, pile.datum_m).grid)
 
 
 def cache_folder() -> Path:
-    """Where piles are kept unless a folder is given: below XDG_CACHE_HOME or ~/.cache."""
+    """The default folder of piles: below XDG_CACHE_HOME or ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "timberhand" / "piles"
 
 
 def settle(machine: str, number: int) -> Pile:
-    """One pile by its number.  A draw that finds no room or no rest is drawn again.
+    """One pile by its number; a draw without room or rest is repeated.
 
-    Raises ValueError when fifty draws in a row fail.
+    Raises:
+        DatasetError: MAX_DRAWS draws in a row failed.
     """
     profile = profile_of(machine)
     rng = random.Random(f"pile {machine} {number}")
     mobile = profile.carrier is not None
     datum = 0.0 if mobile else profile.workspace.ground_z_m
     last: ValueError | None = None
-    for _ in range(50):
-        kind = rng.choices(list(SHARES[machine]), list(SHARES[machine].values()))[0]
+    for _ in range(MAX_DRAWS):
+        kind = rng.choices(list(KIND_WEIGHTS[machine]), list(KIND_WEIGHTS[machine].values()))[0]
         low, high = KINDS[kind]
-        logs = rng.randint(max(low, 3 if kind in ("row", "bunk") else low), min(high, MOST.get(kind, high)))
-        # A fixed machine stands on a yard, a carrier on whatever there is.
+        logs = rng.randint(max(low, 3 if kind in ("row", "bunk") else low), min(high, MAX_LOGS.get(kind, high)))
+        # A fixed machine stands on a yard, a carrier on any terrain.
         ground = rng.choices(("flat", "slope", "rough"), (2.0, 1.0, 3.0) if mobile else (8.0, 1.0, 1.0))[0]
         terrain_seed = rng.randrange(TERRAINS) + (TERRAINS if number >= HELD_OUT * CHUNK else 0)
-        route = ((0.0, 0.0), (6.0 + ROUTE_M * logs, 0.0))
+        route = ((0.0, 0.0), (6.0 + ROUTE_M_PER_LOG * logs, 0.0))
         terrain = terrain_of(ground, terrain_seed if ground == "rough" else 0, datum)
         try:
             poses = settle_logs(profile, kind, rng.getrandbits(31), logs, terrain, route)
@@ -112,15 +118,20 @@ def settle(machine: str, number: int) -> Pile:
             last = error
             continue
         return Pile(machine, number, kind, ground, terrain_seed if ground == "rough" else 0, datum, poses)
-    raise ValueError(f"pile {number} of {machine} found no rest in 50 draws; the last reason: {last}")
+    raise DatasetError(
+        "dataset.no-rest", f"pile {number} of {machine} did not come to rest in {MAX_DRAWS} draws; last reason: {last}"
+    )
 
 
 def chunk(machine: str, index: int, folder: Path | None = None, tick: Callable[[], None] = lambda: None) -> list[Pile]:
-    """CHUNK piles, read from ``folder`` (default ``cache_folder()``) or settle_logs and kept there; ``tick`` after each.
+    """CHUNK piles, read from ``folder`` (default ``cache_folder()``) or settled and written there.
 
-    Raises ValueError for a file that does not hold such piles.
+    ``tick`` is called after each pile that is settled.
+
+    Raises:
+        DatasetError: the file does not hold such piles, or a pile does not come to rest.
     """
-    path = (folder or cache_folder()) / f"{machine}-{index:07d}-e{EDITION}.npz"
+    path = (folder or cache_folder()) / f"{machine}-{index:07d}-e{FORMAT_VERSION}.npz"
     if path.exists():
         return _read(path, machine, index)
     piles = []
@@ -137,10 +148,10 @@ def piles(machine: str, first_chunk: int, chunks: int, folder: Path | None = Non
         yield from chunk(machine, index, folder)
 
 
-def _write(path: Path, baked: list[Pile]) -> None:
+def _write(path: Path, settled: list[Pile]) -> None:
     rows = [
         (*log.position_m, *log.quaternion, log.length_m, log.diameter_m, log.taper_m_m, log.sweep_m)
-        for pile in baked
+        for pile in settled
         for log in pile.logs
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -148,13 +159,13 @@ def _write(path: Path, baked: list[Pile]) -> None:
     np.savez_compressed(
         part,
         logs=np.array(rows),
-        counts=np.array([len(p.logs) for p in baked]),
-        kinds=np.array([p.kind for p in baked]),
-        terrains=np.array([p.terrain for p in baked]),
-        terrain_seeds=np.array([p.terrain_seed for p in baked]),
-        datum_m=np.array([p.datum_m for p in baked]),
+        counts=np.array([len(p.logs) for p in settled]),
+        kinds=np.array([p.kind for p in settled]),
+        terrains=np.array([p.terrain for p in settled]),
+        terrain_seeds=np.array([p.terrain_seed for p in settled]),
+        datum_m=np.array([p.datum_m for p in settled]),
     )
-    part.replace(path)  # whole or not at all, whoever else bakes
+    part.replace(path)  # atomic, even if another process writes the same chunk
 
 
 def _read(path: Path, machine: str, index: int) -> list[Pile]:
@@ -174,4 +185,6 @@ def _read(path: Path, machine: str, index: int) -> list[Pile]:
             out.append(Pile(machine, index * CHUNK + i, str(data["kinds"][i]), *ground, logs))
         return out
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path} does not hold settled piles ({error}); delete it and they are settled anew") from None
+        raise DatasetError(
+            "dataset.bad-piles", f"{path} does not hold settled piles ({error}); delete it to have them settled again"
+        ) from None

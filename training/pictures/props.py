@@ -1,4 +1,4 @@
-"""What stands and hangs about the logs of a training picture: a grapple above them, a boom across them, a bunk."""
+"""Steel around the logs of a training picture: a grapple above them, a boom across them, a bunk, crates."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, jaw_geometry
 from sim.wood.bunk import bunk_shapes
 from training.pictures.piles import profile_of
 
-PAINTS: Final = ((0.95, 0.72, 0.1), (0.45, 0.47, 0.5), (0.2, 0.2, 0.22), (0.8, 0.2, 0.15), (0.2, 0.45, 0.25))
+COLOURS: Final = ((0.95, 0.72, 0.1), (0.45, 0.47, 0.5), (0.2, 0.2, 0.22), (0.8, 0.2, 0.15), (0.2, 0.45, 0.25))
 
 
 class Steel:
-    """Collects boxes at poses; ``build`` packs them as the renderer wants them."""
+    """Collects boxes at poses; ``build`` packs them for the renderer."""
 
     def __init__(self, rng: random.Random) -> None:
         self._rng = rng
@@ -31,16 +31,16 @@ class Steel:
     def box(
         self, size_m: tuple[float, ...], at_m: np.ndarray, axes: np.ndarray, colour: tuple[float, ...], instance: int
     ) -> None:
-        """A box: full edge lengths, middle (3,), axes as columns (3, 3)."""
+        """Add a box: full edge lengths, middle (3,), axes as columns (3, 3)."""
         self._rows.append((np.asarray(at_m, float), axes, np.asarray(size_m, float) / 2, colour, instance))
 
     def shape(self, shape: Shape, at_m: np.ndarray, axes: np.ndarray, instance: int) -> None:
-        """A box of the plant whose link frame stands at ``at_m`` with ``axes``."""
+        """Add a box of the plant; the frame of its link is at ``at_m`` with ``axes``."""
         middle = at_m + axes @ np.asarray(shape.position_m)
         self.box(shape.size_m, middle, axes @ quaternion_matrix(shape.quaternion), shape.colour, instance)
 
     def grapple(self, profile: Profile, at_m: np.ndarray, yaw_rad: float, opening: float) -> None:
-        """A grapple whose rotator is at ``at_m``; ``opening`` 0 closed to 1 open."""
+        """Add a grapple with its rotator at ``at_m``; ``opening`` is 0 closed to 1 open."""
         tongs, k = jaw_geometry(profile), profile.kinematics
         hang = rpy_matrix((self._rng.gauss(0.0, 0.05), self._rng.gauss(0.0, 0.05), yaw_rad))
         angle = (1.0 - opening) * tongs.closed_rad
@@ -55,7 +55,7 @@ class Steel:
             self.shape(shape, at_m + hang @ at, hang @ turn, CRANE)
 
     def holding(self, profile: Profile, log: LogPose) -> None:
-        """A grapple that is closed around the middle of a log."""
+        """Add a grapple that is closed around the middle of a log."""
         rng, tongs = self._rng, jaw_geometry(profile)
         opening, along = rng.uniform(0.12, 0.35), quaternion_matrix(log.quaternion)[:, 2]
         turn = (1.0 - opening) * tongs.closed_rad
@@ -66,34 +66,38 @@ class Steel:
         self.grapple(profile, middle + np.array([0.0, 0.0, up_m]), yaw, opening)
 
     def boom(self, middle_m: np.ndarray) -> None:
-        """A beam of a crane through ``middle_m``, any way."""
+        """Add a beam of a crane through ``middle_m`` in a random direction."""
         rng = self._rng
         axes = rpy_matrix((rng.uniform(-0.3, 0.3), rng.uniform(-1.0, 1.0), rng.uniform(-math.pi, math.pi)))
         size = (rng.uniform(1.5, 4.0), rng.uniform(0.1, 0.3), rng.uniform(0.1, 0.3))
-        self.box(size, middle_m, axes, rng.choice(PAINTS), CRANE)
+        self.box(size, middle_m, axes, rng.choice(COLOURS), CRANE)
 
     def bunk(self, profile: Profile, at_m: np.ndarray, yaw_rad: float) -> None:
-        """A bunk whose link frame stands at ``at_m``."""
+        """Add a bunk; the frame of its link is at ``at_m``."""
         axes = rpy_matrix((0.0, 0.0, yaw_rad))
         for shape in bunk_shapes(profile):
             self.shape(shape, at_m, axes, BUNK)
 
     def block(self, at_m: np.ndarray) -> None:
-        """A part of a carrier, a crate or a stone: a box on the ground."""
+        """Add a part of a carrier, a crate or a stone: a box on the ground."""
         rng = self._rng
         size = tuple(rng.uniform(0.2, 1.5) for _ in range(3))
         grey = rng.uniform(0.2, 0.7)
-        colour = rng.choice((*PAINTS, (grey, grey, grey)))
+        colour = rng.choice((*COLOURS, (grey, grey, grey)))
         axes = rpy_matrix((0.0, 0.0, rng.uniform(-3.0, 3.0)))
         self.box(size, at_m + np.array([0.0, 0.0, size[2] / 3]), axes, colour, CARRIER)
 
     def build(self) -> Boxes:
         """The packed boxes."""
         n = len(self._rows)
-        columns = list(zip(*self._rows, strict=True)) if n else [()] * 5
-        shapes = ((n, 3), (n, 3, 3), (n, 3), (n, 3))
-        fields = [np.array(c, float).reshape(s) for c, s in zip(columns[:4], shapes, strict=True)]
-        return Boxes(*fields, np.array(columns[4], np.int16))
+        at, axes, half, colours, instances = zip(*self._rows, strict=True) if n else [()] * 5
+        return Boxes(
+            np.array(at, float).reshape(n, 3),
+            np.array(axes, float).reshape(n, 3, 3),
+            np.array(half, float).reshape(n, 3),
+            np.array(colours, float).reshape(n, 3),
+            np.array(instances, np.int16),
+        )
 
 
 @cache

@@ -1,8 +1,8 @@
-"""Training pictures kept on disk in shards of SHARD, drawn once, read often; a shard depends on its number alone.
+"""Training pictures on disk in shards of SHARD pictures; the content of a shard depends only on its number.
 
-A shard is a folder of plain numpy files that are mapped, not read: rgb uint8, depth_mm uint16 (0 unknown), ids uint8,
-logs float32 (SHARD, MOST_LOGS, ROW; rows beyond a picture's logs are 0), lens float32 (fx, fy, cx, cy), height_mm int16
-(over the whole picture's prevailing plane, UNKNOWN_MM unknown).
+A shard is a folder of numpy files that are memory-mapped: rgb uint8, depth_mm uint16 (0 unknown), ids uint8, logs
+float32 (SHARD, MAX_LOGS, ROW; rows beyond a picture's logs are 0), lens float32 (fx, fy, cx, cy), height_mm int16 (over
+the dominant plane of the whole picture, UNKNOWN_MM unknown).
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ import numpy as np
 
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from machine.geometry.optics import Intrinsics
-from training.pictures.drawing import MOST_LOGS, draw
+from training.common.dataset_error import DatasetError
+from training.pictures.drawing import MAX_LOGS, draw
 from training.pictures.labels import ID, ROW, Labelled
 from training.pictures.piles import HELD_OUT, MACHINES, Pile, chunk
 
-EDITION: Final = 3
+FORMAT_VERSION: Final = 3
 SHARD: Final = 256
-REUSE_PILES: Final = 12  # chunks of piles that training pictures are drawn from
+TRAINING_CHUNKS: Final = 12  # chunks of piles from which training pictures are drawn
 MM: Final = 1000.0
-UNKNOWN_MM, MOST_MM = -32768, 30000
+UNKNOWN_MM, MAX_MM = -32768, 30000
 
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """Mapped arrays of SHARD pictures."""
+    """Memory-mapped arrays of SHARD pictures."""
 
     rgb: np.ndarray
     depth_mm: np.ndarray
@@ -44,23 +45,32 @@ class Shard:
 
 
 def shard(folder: Path, number: int, size_px: int = 304, tick: Callable[[], None] = lambda: None) -> Shard:
-    """Shard ``number`` from ``folder``, drawn first when it is not there; ``tick`` after each picture.
+    """Shard ``number`` of ``folder``; it is drawn when it is missing, with a call of ``tick`` after each
+    picture.
 
-    Numbers from HELD_OUT are of piles that no training shard holds.  Raises ValueError for a damaged shard.
+    Shards from HELD_OUT on use piles that no training shard uses.
+
+    Raises:
+        DatasetError: the shard is damaged.
     """
-    path = folder / f"logs-{size_px}-{number:07d}-e{EDITION}"
+    path = folder / f"logs-{size_px}-{number:07d}-e{FORMAT_VERSION}"
     if not path.is_dir():
-        _bake(path, number, size_px, tick)
+        _write_shard(path, number, size_px, tick)
     try:
         arrays = [np.load(path / f"{name}.npy", mmap_mode="r") for name in Shard.__dataclass_fields__]
     except (OSError, EOFError, ValueError) as error:
-        raise ValueError(f"{path} is no shard of pictures ({error}); delete it and it is drawn anew") from None
+        raise DatasetError(
+            "dataset.bad-shard", f"{path} is not a shard of pictures ({error}); delete it to have it drawn again"
+        ) from None
     if arrays[0].shape != (SHARD, size_px, size_px, 3):
-        raise ValueError(f"{path} holds pictures of shape {arrays[0].shape}; delete it and it is drawn anew")
+        raise DatasetError(
+            "dataset.bad-shard",
+            f"{path} holds pictures of shape {arrays[0].shape}; delete it to have it drawn again",
+        )
     return Shard(*arrays)
 
 
-def drawn(number: int, size_px: int) -> Iterator[Labelled]:
+def drawn_pictures(number: int, size_px: int) -> Iterator[Labelled]:
     """The pictures of a shard."""
     rng = random.Random(f"shard {number} {size_px}")
     piles = _piles(number, rng)
@@ -69,27 +79,31 @@ def drawn(number: int, size_px: int) -> Iterator[Labelled]:
 
 
 def _piles(number: int, rng: random.Random) -> list[Pile]:
-    """Those of two chunks of either machine, so that a shard mixes many piles but reads few files."""
+    """The piles of two chunks of each machine, so that a shard mixes many piles but reads few files."""
     if number >= HELD_OUT:
         return [pile for machine in MACHINES for pile in chunk(machine, HELD_OUT + number % 2)]
-    return [pile for machine in MACHINES for k in range(2) for pile in chunk(machine, rng.randrange(REUSE_PILES))]
+    return [pile for machine in MACHINES for k in range(2) for pile in chunk(machine, rng.randrange(TRAINING_CHUNKS))]
 
 
-def _bake(path: Path, number: int, size_px: int, tick: Callable[[], None]) -> None:
+def _write_shard(path: Path, number: int, size_px: int, tick: Callable[[], None]) -> None:
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     part.mkdir(parents=True, exist_ok=True)
     square = (SHARD, size_px, size_px)
-    kinds = {"rgb": ((*square, 3), np.uint8), "depth_mm": (square, np.uint16), "ids": (square, np.uint8)}
-    kinds |= {"logs": ((SHARD, MOST_LOGS, ROW), np.float32), "lens": ((SHARD, 4), np.float32)}
-    kinds |= {"height_mm": (square, np.int16)}
-    arrays = {name: np.zeros(shape, kind) for name, (shape, kind) in kinds.items()}
-    for i, sample in enumerate(drawn(number, size_px)):
+    arrays: dict[str, np.ndarray] = {
+        "rgb": np.zeros((*square, 3), np.uint8),
+        "depth_mm": np.zeros(square, np.uint16),
+        "ids": np.zeros(square, np.uint8),
+        "logs": np.zeros((SHARD, MAX_LOGS, ROW), np.float32),
+        "lens": np.zeros((SHARD, 4), np.float32),
+        "height_mm": np.zeros(square, np.int16),
+    }
+    for i, sample in enumerate(drawn_pictures(number, size_px)):
         pin = sample.intrinsics
         arrays["rgb"][i] = sample.rgb
         arrays["depth_mm"][i] = np.nan_to_num(np.minimum(sample.depth_m * MM, 65535.0), nan=0.0)
         arrays["ids"][i] = sample.ids
         arrays["logs"][i, : len(sample.logs)] = sample.logs
-        arrays["height_mm"][i] = _whole_mm(height_over_plane(sample.depth_m, pin))
+        arrays["height_mm"][i] = _to_millimetres(height_over_plane(sample.depth_m, pin))
         arrays["lens"][i] = (pin.fx_px, pin.fy_px, pin.cx_px, pin.cy_px)
         tick()
     for name, array in arrays.items():
@@ -100,12 +114,12 @@ def _bake(path: Path, number: int, size_px: int, tick: Callable[[], None]) -> No
         part.rename(path)
 
 
-def _whole_mm(height_m: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(height_m), np.clip(height_m * MM, -MOST_MM, MOST_MM), UNKNOWN_MM).astype(np.int16)
+def _to_millimetres(height_m: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(height_m), np.clip(height_m * MM, -MAX_MM, MAX_MM), UNKNOWN_MM).astype(np.int16)
 
 
 def picture(shards: Callable[[int], Shard], index: int) -> Labelled:
-    """Picture ``index`` of all shards in a row; ``shards`` gives a shard by its number."""
+    """Picture ``index``, counted over all shards; ``shards`` returns a shard by its number."""
     own, i = shards(index // SHARD), index % SHARD
     depth = own.depth_mm[i].astype(np.float32) * np.float32(1.0 / MM)
     height = own.height_mm[i].astype(np.float32) * np.float32(1.0 / MM)
@@ -118,6 +132,6 @@ def picture(shards: Callable[[int], Shard], index: int) -> Labelled:
 
 
 def pictures(folder: Path, size_px: int = 304) -> Callable[[int], Labelled]:
-    """The pictures kept in ``folder``, by their number; a missing shard is drawn when it is first asked for."""
+    """A function that returns the pictures of ``folder`` by number; a missing shard is drawn on first use."""
     shards = lru_cache(maxsize=None)(lambda number: shard(folder, number, size_px))
     return lambda index: picture(shards, index)

@@ -49,8 +49,8 @@ class Contour:
     def without(self, fitted: dict[int, Cylinder], pin: Intrinsics) -> Contour:
         """The contour without the points on the outlines of neighbouring logs ``fitted`` (by mask number).
 
-        A log in front is mostly seen whole and fitted well.  The initial cylinder of a half hidden log is not, and would
-        take the neighbour's outline for its own.
+        A log in front is mostly seen whole and fitted well.  The initial cylinder of a half hidden log is not, and
+        would take the neighbour's outline for its own.
         """
         own = self.own.copy()
         for number, body in fitted.items():

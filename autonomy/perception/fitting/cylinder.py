@@ -56,8 +56,8 @@ def cross(a: Sequence[float], b: Sequence[float]) -> np.ndarray:
 
 
 def across_view(axis: np.ndarray, point_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across the axis (3,): the first is across the line of sight to ``point_m``, the second as close to
-    the line of sight as possible."""
+    """Two unit vectors across the axis (3,): the first is across the line of sight to ``point_m``, the second as close
+    to the line of sight as possible."""
     along, sight = axis.tolist(), point_m.tolist()
     first = cross(sight, along)
     size = math.sqrt(float(first @ first))
@@ -70,8 +70,8 @@ def across_view(axis: np.ndarray, point_m: np.ndarray) -> tuple[np.ndarray, np.n
 
 @dataclass(frozen=True, slots=True)
 class CylinderBatch:
-    """K cylinders: ``line`` (K, 2, 3) holds a point on each axis and the axis; ``size`` (4, K, 1) start, end, radius and
-    growth.
+    """K cylinders:  ``line`` (K, 2, 3) holds a point on each axis and the axis; ``size`` (4, K, 1) start, end, radius
+    and growth.
     """
 
     line: np.ndarray

@@ -75,9 +75,10 @@ MODEL_SIGMA: Final = np.array([0.004, 0.004, 0.004, 0.004, 0.008, 0.008, 0.003])
 class CylinderFit:
     """A fitted cylinder in the optical frame, with its middle as the point.
 
-    ``covariance`` (7, 7) is that of one frame's errors in the order of ``log_list.estimate``, but along the directions of
-    ``across_view``, and without the common scale error of depth.  ``ends_seen`` says which ends have contour of their
-    own.  ``explained`` is the share of the contour that the cylinder explains, ``rms_px`` the distance between the two.
+    ``covariance`` (7, 7) is that of one frame's errors in the order of ``log_list.estimate``, but along the directions
+    of ``across_view``, and without the common scale error of depth.  ``ends_seen`` says which ends have contour of
+    their own.  ``explained`` is the share of the contour that the cylinder explains, ``rms_px`` the distance between
+    the two.
     """
 
     body: Cylinder
@@ -314,8 +315,8 @@ class _Problem:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residuals (N,), derivatives (N, 10) and weights (N,) of a cylinder whose axis is an arch.
 
-        ``bow`` (2,) [m] is the rise of the arch across the view and along it.  Locally, the arch is the straight cylinder
-        shifted.
+        ``bow`` (2,) [m] is the rise of the arch across the view and along it.  Locally, the arch is the straight
+        cylinder shifted.
         """
         raw = self.residuals(CylinderBatch.around(body, _STEPS), metres_px)
         half = 0.5 * body.length_m
@@ -331,8 +332,8 @@ class _Problem:
     def _systematic_sigmas(self, body: Cylinder) -> np.ndarray:
         """Standard deviations (7,) of systematic errors.
 
-        Causes: bark and bow, a share of a pixel of the outline, grass in front of the log, which makes depth nearer, and
-        foreground fattening: of objects in front, and of the nearer parts of a log that is seen along its axis.
+        Causes: bark and bow, a share of a pixel of the outline, grass in front of the log, which makes depth nearer,
+        and foreground fattening: of objects in front, and of the nearer parts of a log that is seen along its axis.
         """
         z = float(body.center_m[2])
         slant2 = min(0.99, float(body.axis @ body.center_m) ** 2 / float(body.center_m @ body.center_m))

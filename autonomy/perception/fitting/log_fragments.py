@@ -1,8 +1,8 @@
 """Plausibility of fits, and fits that are fragments of one log.
 
 A log that lies behind another one can show as two masks.  Fragments of one log lie on one line, have the same width,
-and miss the ends that face each other.  Paper A's two failures with real logs came from a width greater than the length,
-which turns the axis by 90 degrees: such fits are rejected.
+and miss the ends that face each other.  Paper A's two failures with real logs came from a width greater than the
+length, which turns the axis by 90 degrees: such fits are rejected.
 """
 
 from __future__ import annotations

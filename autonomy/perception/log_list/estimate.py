@@ -17,10 +17,10 @@ SIZE: Final = 7
 class LogEstimate:
     """One log: centre (3,) [m] and unit axis (3,) in the crane's base frame, length and diameter [m].
 
-    ``covariance`` (7, 7) is that of errors in the order ACROSS_1, ACROSS_2 [m] (of the axis at the centre, along the two
-    directions of ``frame``), TILT_1, TILT_2 [rad] (of the axis towards these), START, END [m] (of the ends at -length/2
-    and +length/2, along the axis), RADIUS [m].  ``ends_seen`` says which ends are visible, not cut off by the edge of the
-    picture or by something in front; the length is a lower bound unless both are.  ``score`` is in 0..1.
+    ``covariance`` (7, 7) is that of errors in the order ACROSS_1, ACROSS_2 [m] (of the axis at the centre, along the
+    two directions of ``frame``), TILT_1, TILT_2 [rad] (of the axis towards these), START, END [m] (of the ends at
+    -length/2 and +length/2, along the axis), RADIUS [m].  ``ends_seen`` says which ends are visible, not cut off by the
+    edge of the picture or by something in front; the length is a lower bound unless both are.  ``score`` is in 0..1.
     """
 
     center_m: np.ndarray

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from scipy import ndimage
 
-from autonomy.networks.graph import Add, BatchNorm, Conv, Layer, Network, Relu, Resize
+from autonomy.networks.graph import Add, BatchNorm, Conv, Layer, Network, NetworkError, Relu, Resize
 from autonomy.networks.openvino_net import OpenVinoNet
 from autonomy.networks.weights import SHIPPED, load
 
@@ -63,15 +63,17 @@ class BoxDetector:
         self._net = OpenVinoNet(network, arrays, (1, 3, SIZE_PX, SIZE_PX), precision)
 
     def detect(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes (N, 4) left, top, right, bottom [px] in a picture (608, 608, 3) uint8 and their scores (N,), descending.
+        """Boxes (N, 4) left, top, right, bottom [px] in a picture (608, 608, 3) uint8 and their scores (N,),
+        descending.
 
         Raises:
-            ValueError: a picture of another size or type.
+            NetworkError: the picture has another size or type.
         """
         if rgb.shape != (SIZE_PX, SIZE_PX, 3) or rgb.dtype != np.uint8:
-            raise ValueError(
-                f"the detector takes letterboxed pictures of {SIZE_PX} x {SIZE_PX} px, uint8, not {rgb.dtype} of shape "
-                f"{rgb.shape}"
+            raise NetworkError(
+                "network.bad-picture",
+                f"the box detector needs letterboxed pictures of {SIZE_PX} x {SIZE_PX} px, uint8, not {rgb.dtype} of "
+                f"shape {rgb.shape}",
             )
         return decode_boxes(self._net(network_input(rgb)[None])["boxes"][0])
 

@@ -2,9 +2,9 @@
 
 The paper names the steps (masks of a segmentation network "coupled with a point-cloud obtained from a depth camera are
 then combined to infer the length and diameter of the logs, and localize them") but gives no formulas.  This is their
-plainest reading: the centroid of the cloud is the centre, its first principal axis the axis, its extents along the first
-and second principal axes are length and diameter.  The method takes the visible surface, with its fattened edges, for
-the log.  When the diameter comes out greater than the length, the axis is 90 degrees off; these are the paper's two
+plainest reading: the centroid of the cloud is the centre, its first principal axis the axis, its extents along the
+first and second principal axes are length and diameter.  The method takes the visible surface, with its fattened edges,
+for the log.  When the diameter comes out greater than the length, the axis is 90 degrees off; these are the paper's two
 failures (IV).
 """
 

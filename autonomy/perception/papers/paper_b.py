@@ -1,10 +1,10 @@
 """Paper B's vision node (3.2.3), implemented faithfully: a position from a box and the depth at its middle.
 
-The box comes from a detector that sees the picture letterboxed to 608 x 608 (3.2.2).  Depth is the mean over 8 x 8 px at
-the middle of the box.  The pinhole model (equation 2) turns it into a point, the kinematic chain transforms the point
-into the machine's frame, and estimates of one log are averaged.  The result is a point of the surface that is seen
-through the middle of the box: near the log's middle when the log lies across the view, and up to three decimetres short
-of it when the log is seen end-on.
+The box comes from a detector that sees the picture letterboxed to 608 x 608 (3.2.2).  Depth is the mean over 8 x 8 px
+at the middle of the box.  The pinhole model (equation 2) turns it into a point, the kinematic chain transforms the
+point into the machine's frame, and estimates of one log are averaged.  The result is a point of the surface that is
+seen through the middle of the box: near the log's middle when the log lies across the view, and up to three decimetres
+short of it when the log is seen end-on.
 """
 
 from __future__ import annotations

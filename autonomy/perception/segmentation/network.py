@@ -16,8 +16,8 @@ from autonomy.perception.segmentation.ground_plane import height_over_plane
 from machine.geometry.optics import Intrinsics
 
 MAPS: Final = ("mask", "centre", "offset_u", "offset_v", "cos2", "sin2", "ends", "edge")
-"""Mask, centre, ends and edge are logits; the offset to the log's centre is in units of OFFSET_PX of the input; the angle
-is given by cosine and sine of its double."""
+"""Mask, centre, ends and edge are logits; the offset to the log's centre is in units of OFFSET_PX of the input; the
+angle is given by cosine and sine of its double."""
 MASK, CENTRE, OFFSET_U, OFFSET_V, COS2, SIN2, ENDS, EDGE = range(8)
 STRIDE: Final = 2  # input pixels for each pixel of a map
 MULTIPLE: Final = 16

@@ -1,7 +1,8 @@
 """Features of pairs of segments, for many pairs at once, and a fast test which pairs may be one log.
 
 A log that another one crosses is several segments.  They lie on one line in the picture and in depth, vote for one
-centre, and what lies between them is nearer.  All features are independent of scale, because a network learns from them.
+centre, and what lies between them is nearer.  All features are independent of scale, because a network learns from
+them.
 """
 
 from __future__ import annotations
@@ -150,8 +151,8 @@ def pair_features(
 def may_merge(foreground: Foreground, big: SegmentTable, small: SegmentTable, border_px: np.ndarray) -> np.ndarray:
     """Whether (n,) the scorer must decide about a pair.
 
-    Two segments may be one log when they touch or lie near one line, and when nothing separates them: between them there
-    is neither background that is clearly farther away nor an end of a log.
+    Two segments may be one log when they touch or lie near one line, and when nothing separates them: between them
+    there is neither background that is clearly farther away nor an end of a log.
     """
     away = small.middle - big.middle
     along, offset = _dot(away, big.axis), np.abs(_cross(big.axis, away))

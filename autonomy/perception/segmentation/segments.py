@@ -49,9 +49,10 @@ class Segment:
     """A set of pixels of a foreground.
 
     ``members`` (n,): indices of its pixels.  ``middle`` (2,).  ``axis`` (2,): by its shape when it is elongated,
-    otherwise ``predicted_axis`` (2,), that of the network's maps.  ``half_width``; ``low`` and ``high``: range along the
-    axis from the middle; ``elongation``; ``vote`` (2,): median of the voted centres.  ``line``: inverse depth at the
-    middle and its slope along the axis [1/m, 1/m per pixel], None unknown; ``line_error``: its relative median error.
+    otherwise ``predicted_axis`` (2,), that of the network's maps.  ``half_width``; ``low`` and ``high``: range along
+    the axis from the middle; ``elongation``; ``vote`` (2,): median of the voted centres.  ``line``: inverse depth at
+    the middle and its slope along the axis [1/m, 1/m per pixel], None unknown; ``line_error``: its relative median
+    error.
     """
 
     members: np.ndarray

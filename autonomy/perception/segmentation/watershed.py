@@ -1,7 +1,8 @@
 """Over-segmentation of the foreground by a watershed of the boundary map.
 
 The boundary map combines the network's edges with turns of the log axis.  A small network draws an edge where it cannot
-tell how far away the middle of a log is; and where two logs cross, the axis turns even if the edge between them is faint.
+tell how far away the middle of a log is; and where two logs cross, the axis turns even if the edge between them is
+faint.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from autonomy.perception.camera.frame import RgbdFrame
-from can_dbc.messages.rgbd import HEADER_BYTES, MM_PER_M, RgbdError, RgbdMessage, decode, encode_request, start
+from can_dbc.messages.rgbd import HEADER_BYTES, MM_PER_M, RgbdError, RgbdMessage, decode, decode_header, encode_request
 from machine.geometry.optics import Intrinsics
 
 MAX_RECEIVE_BYTES: Final = 1 << 20
@@ -61,7 +61,7 @@ class StreamCamera:
         wanted = HEADER_BYTES
         while True:
             if len(self._data) >= HEADER_BYTES:
-                wanted = HEADER_BYTES + start(bytes(self._data[:HEADER_BYTES])).rest
+                wanted = HEADER_BYTES + decode_header(bytes(self._data[:HEADER_BYTES])).remaining_bytes
             if len(self._data) >= wanted > HEADER_BYTES:
                 break
             left_s = end_s - time.monotonic()

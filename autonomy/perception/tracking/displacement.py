@@ -23,8 +23,8 @@ _MIN_GONE_SAMPLES: Final = 10
 def is_displaced(frame: RgbdFrame, pose: Pose, log: LogEstimate, fit: CylinderFit) -> bool:
     """Whether ``fit`` is ``log`` in another place.
 
-    The two must have similar shapes, and along the old axis the picture must show what was behind the log, or ``fit`` in
-    front of it.
+    The two must have similar shapes, and along the old axis the picture must show what was behind the log, or ``fit``
+    in front of it.
     """
     return _similar(pose, log, fit) and _gone(frame, pose, log, fit)
 

@@ -32,8 +32,8 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 @dataclass(frozen=True, slots=True)
 class CameraErrors:
-    """Standard deviations of errors: systematic ones of the camera (scale of depth as a share, rotation and shift of the
-    mount), and those of the pose in every picture."""
+    """Standard deviations of errors: systematic ones of the camera (scale of depth as a share, rotation and shift of
+    the mount), and those of the pose in every picture."""
 
     scale: float = 0.0075
     mount_rad: float = 0.004
