@@ -1,6 +1,6 @@
-"""What makes timberhand a set of services of one computer.
+"""Installation of timberhand as systemd services.
 
-``install.sh`` lays out program, units, settings and users, from a checkout or from a wheel (``__main__``); ``units``
-are systemd's; ``system`` is what the rest of the system is told; ``timberhand.conf`` holds the settings, each with its
-explanation.
+``install.sh`` installs program, units, settings and users, from a checkout or a wheel (``__main__``); ``units`` are
+the systemd units; ``system`` holds udev rules, users and kernel settings; ``timberhand.conf`` holds the settings with
+their explanations.
 """

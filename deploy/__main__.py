@@ -1,7 +1,7 @@
-"""``python3.11 timberhand-VERSION.whl/deploy [options]``: `install.sh`, for whoever has nothing but the wheel.
+"""``python3.11 timberhand-VERSION.whl/deploy [options]``: run `install.sh` from the wheel alone.
 
-Needs Python alone, and nothing unpacked or installed before.  ``python3.11 -m deploy`` does the same with a checkout or
-an installed wheel.  The options, and the exit status, are the script's.
+Requires only Python; nothing must be unpacked or installed before.  ``python3.11 -m deploy`` does the same with a
+checkout or an installed wheel.  Options and exit status are those of the script.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SCRIPT: Final = "install.sh"
 
 
 def install(options: Sequence[str]) -> int:
-    """Run the script; inside a wheel it installs that wheel unless ``options`` name another one."""
+    """Run the script; from a wheel it installs that wheel unless ``options`` name another one."""
     wheel = next((folder for folder in HERE.parents if folder.is_file()), None)
     if wheel is None:
         return subprocess.call(["sh", str(HERE / SCRIPT), *options])

@@ -1,0 +1,1 @@
+"""Hardware in the loop: runs the whole machine, emulated, in lockstep or live."""

@@ -1,0 +1,1 @@
+"""What timberhand needs from the host computer: exit codes, systemd, doctor, labs."""

@@ -1,15 +1,16 @@
-"""An occasional check: the control loop on Debian's PREEMPT_RT kernel, in qemu, without root.
+"""A manual test: the control loop on Debian's PREEMPT_RT kernel, in qemu, without root.
 
     python deploy/rt_check/check.py [--kernel FILE.deb] [--accel kvm] [--timeout S]
 
-Boots ``linux-image-rt-amd64`` with an initial file system of this Python, this checkout and what both need, a virtual
-CAN bus and light emulated nodes; starts guard and controller as systemd would and looks: the kernel is PREEMPT_RT, both
-say they are ready, run at their FIFO priorities with locked memory, and the controller reaches STANDBY, for which every
-encoder must have answered.  It says nothing about latency: that takes the machine's own computer.
+Boots ``linux-image-rt-amd64`` with an initial file system of this Python, this checkout and their dependencies, with a
+virtual CAN bus and light emulated nodes.  Starts guard and controller as systemd would, and checks that the kernel is
+PREEMPT_RT, that both report READY and run at their FIFO priorities with locked memory, and that the controller reaches
+STANDBY, which requires an answer of every encoder.  It says nothing about latency; measure that on the machine's own
+computer.
 
-Needs the Debian packages qemu-system-x86 and cpio, and fetches the kernel's package once, into the user's cache.  Takes
+Requires the Debian packages qemu-system-x86 and cpio; downloads the kernel package once into the user's cache.  Takes
 some minutes.
-Exit status: 0 all is well, 2 usage, 3 it cannot be run here, 6 something was found otherwise.
+Exit status: 0 all checks passed, 2 usage, 3 it cannot run here, 6 a check failed.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 CHECKOUT = HERE.parents[1]
 META_PACKAGE = "linux-image-rt-amd64"
-OURS = ("can_dbc", "machine", "controller", "sim", "hil")
 ENTRIES = (
     "controller.__main__",
     "controller.guard.__main__",
@@ -37,11 +37,11 @@ ENTRIES = (
     "host.vcan_lab.links",
     "ctypes",
 )
-LEFT_OUT = ("test", "idlelib", "tkinter", "ensurepip", "lib2to3", "turtledemo", "site-packages", "__pycache__")
-LOOK = """
+EXCLUDED = ("test", "idlelib", "tkinter", "ensurepip", "lib2to3", "turtledemo", "site-packages", "__pycache__")
+LIST_FILES = """
 import importlib, json, sys, sysconfig
 for name in sys.argv[1:]: importlib.import_module(name)
-importlib.import_module("can_dbc.dbc.codec").load("crane")  # imports what only reading a DBC needs
+importlib.import_module("can_dbc.dbc.codec").load("crane")  # also imports what only reading a DBC needs
 files = [f for m in list(sys.modules.values()) if (f := getattr(m, "__file__", None))]
 maps = {line.split(None, 5)[5].strip() for line in open("/proc/self/maps") if line.count("/")}
 print(json.dumps({"files": files, "maps": sorted(maps), "stdlib": sysconfig.get_path("stdlib"),
@@ -54,7 +54,7 @@ EXPECTED: dict[str, Any] = {
 
 
 class CannotRun(Exception):
-    """One sentence: what is missing and how to get it."""
+    """The check cannot run here; the sentence tells what is missing and how to get it."""
 
 
 def main() -> int:
@@ -79,20 +79,20 @@ def main() -> int:
         return 3
     result["seconds"] = round(time.monotonic() - began_s)
     sys.stdout.write(json.dumps(result, indent=2) + "\n")
-    faults = judge(result)
-    for sentence in faults or ["all is well"]:
+    faults = evaluate(result)
+    for sentence in faults or ["all checks passed"]:
         say(sentence)
     return 6 if faults else 0
 
 
 def say(sentence: str) -> None:
-    """For whoever waits."""
+    """Print one line on stderr."""
     sys.stderr.write(f"rt check: {sentence}\n")
 
 
-def judge(result: dict[str, Any]) -> list[str]:
-    """What is not as it should be, one sentence each."""
-    faults = [f"the guest says: {result['error']}"] if "error" in result else []
+def evaluate(result: dict[str, Any]) -> list[str]:
+    """One sentence for each check that failed."""
+    faults = [f"the guest reports: {result['error']}"] if "error" in result else []
     if "PREEMPT_RT" not in result.get("kernel", ""):
         faults.append(f"the kernel is not PREEMPT_RT: {result.get('kernel', 'unknown')}")
     faults += [f"{k} is {result.get(k)}, not {v}" for k, v in EXPECTED.items() if result.get(k) != v]
@@ -102,7 +102,7 @@ def judge(result: dict[str, Any]) -> list[str]:
 
 
 def fetch(cache: Path) -> Path:
-    """The kernel's package, from the Debian archive; kept in ``cache``."""
+    """The kernel package from the Debian archive; kept in ``cache``."""
     depends = subprocess.run(["apt-cache", "depends", META_PACKAGE], capture_output=True, text=True).stdout
     found = re.search(r"Depends: (linux-image-\S*rt-amd64)", depends)
     if not found:
@@ -113,16 +113,16 @@ def fetch(cache: Path) -> Path:
         done = subprocess.run(["apt-get", "download", found[1]], cwd=cache, capture_output=True, text=True)
         there = sorted(cache.glob(f"{found[1]}_*.deb"))
         if not there:
-            raise CannotRun(f"{found[1]} cannot be fetched: {done.stderr.strip().splitlines()[-1:]}")
+            raise CannotRun(f"{found[1]} cannot be downloaded: {done.stderr.strip().splitlines()[-1:]}")
     return there[-1]
 
 
 def initial_files(work: Path) -> Path:
-    """The archive that the kernel unpacks as its file system: what a run of ours imports, and little else."""
-    looked = subprocess.run(
-        [sys.executable, "-c", LOOK, *ENTRIES], cwd=CHECKOUT, capture_output=True, text=True, check=True
+    """The archive that the kernel unpacks as its file system: what the processes import, and little else."""
+    listed = subprocess.run(
+        [sys.executable, "-c", LIST_FILES, *ENTRIES], cwd=CHECKOUT, capture_output=True, text=True, check=True
     )  # fmt: skip
-    found = json.loads(looked.stdout)
+    found = json.loads(listed.stdout)
     site = found["site"]
     libraries = {Path(text) for text in found["maps"] if ".so" in text and Path(text).is_file()}
     files = libraries | {alias for lib in libraries for alias in lib.parent.glob("*.so*") if alias.resolve() == lib}
@@ -132,7 +132,8 @@ def initial_files(work: Path) -> Path:
         if text.startswith(site):
             top = Path(site) / Path(text).relative_to(site).parts[0]
             files |= set(walk(top)) if top.is_dir() else {top}
-    for package in OURS:
+    modules = [Path(text).relative_to(CHECKOUT) for text in found["files"] if text.startswith(f"{CHECKOUT}/")]
+    for package in {path.parts[0] for path in modules if not str(CHECKOUT / path).startswith(site)}:
         files |= set(walk(CHECKOUT / package))
     names = sorted({str(p) for f in files for p in (f, *f.parents) if p != Path("/")})
     own = work / "own"
@@ -163,14 +164,14 @@ def initial_files(work: Path) -> Path:
 
 
 def walk(folder: Path) -> list[Path]:
-    """The files of a package that are worth carrying."""
-    return [p for p in folder.rglob("*") if p.is_file() and not set(p.relative_to(folder).parts) & set(LEFT_OUT)]
+    """The files of a package that the guest needs."""
+    return [p for p in folder.rglob("*") if p.is_file() and not set(p.relative_to(folder).parts) & set(EXCLUDED)]
 
 
 def boot(work: Path, archive: Path, accelerator: str, timeout_s: float) -> dict[str, Any]:
-    """Run the guest to its end; its result, or what its console said last."""
+    """Run the guest to its end; return its result, or the last lines of its console."""
     kernel = next((work / "kernel/boot").glob("vmlinuz-*"))
-    # Emulated, the guest's clock counts its instructions, so that a slow host does not make its loops late.
+    # When emulated, the guest's clock counts instructions, so that a slow host does not delay its loops.
     clock = ["-icount", "shift=0,sleep=off", "-rtc", "clock=vm"] if accelerator == "tcg" else []
     command = [
         "qemu-system-x86_64", "-accel", accelerator, *clock, "-cpu", "max", "-smp", "1", "-m", "1536",
@@ -185,13 +186,13 @@ def boot(work: Path, archive: Path, accelerator: str, timeout_s: float) -> dict[
         except subprocess.TimeoutExpired:
             guest.kill()
             console = guest.communicate()[0].decode(errors="replace")
-    told = re.search(r"RESULT (\{.*\})", console)
-    if told is None:
+    answer = re.search(r"RESULT (\{.*\})", console)
+    if answer is None:
         before_panic = console.partition("Kernel panic")[0].splitlines()
-        return {"error": "no result; its last words: " + " / ".join(before_panic[-12:])}
-    result: dict[str, Any] = json.loads(told[1])
+        return {"error": "no result; the last lines: " + " / ".join(before_panic[-12:])}
+    result: dict[str, Any] = json.loads(answer[1])
     result["files_mb"] = size_mb
-    if judge(result):
+    if evaluate(result):
         say("the console's end:\n" + console[-4000:])
     return result
 

@@ -1,7 +1,7 @@
-"""First process of the guest: starts guard and controller beside emulated nodes and looks at them.
+"""First process of the guest: starts guard and controller with emulated nodes and checks them.
 
-Prints one line that begins with ``RESULT`` and goes on as JSON; then the guest ends.  ``/check.json`` tells where
-Python and the checkout lie.
+Prints one line, ``RESULT`` and a JSON object; then the guest powers off.  ``/check.json`` holds the paths of Python and
+the checkout.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ MODULES = ("net/can/can", "net/can/can-raw", "drivers/net/can/dev/can-dev", "dri
 BUS = "crane0"
 PROFILE = "palms_471"
 SETPOINTS, REPORTS = 24701, 24702
-PATIENCE_S = 240.0
-"""Of the guest's own time."""
+TIMEOUT_S = 240.0
+"""Time limit of every wait, in time of the guest."""
 TICKS_S = 3.0
 RUNTIME = Path("/run/timberhand")
 _POWER_OFF = 0x4321_FEDC
@@ -38,9 +38,9 @@ def main() -> None:
     os.environ |= {"PATH": "/usr/bin:/bin", "PYTHONPATH": ":".join(where["path"]), "RUNTIME_DIRECTORY": str(RUNTIME)}
     result: dict[str, Any] = {"kernel": " ".join((os.uname().release, os.uname().version))}
     try:
-        furnish()
+        set_up()
         result |= run(where["python"], Path(where["path"][0]))
-    except Exception as error:  # noqa: BLE001  the first process reports, whatever it is
+    except Exception as error:  # noqa: BLE001  the first process reports every error
         result["error"] = f"{type(error).__name__}: {error}"
     for said in sorted(RUNTIME.glob("*.err")):
         sys.stdout.write(f"{said.stem}: {said.read_text()[-1500:]}\n")
@@ -50,8 +50,8 @@ def main() -> None:
     libc.reboot(_POWER_OFF)
 
 
-def furnish() -> None:
-    """File systems, CAN and one virtual bus."""
+def set_up() -> None:
+    """Mount file systems, load CAN, create one virtual bus."""
     places = {
         "/proc": "proc",
         "/sys": "sysfs",
@@ -73,13 +73,13 @@ def furnish() -> None:
 
 
 def run(python: str, checkout: Path) -> dict[str, Any]:
-    """Everything that is looked at, by name."""
+    """Run all checks; the results by name."""
     bus = ("--profile", PROFILE, "--bus", f"crane0=socketcan:{BUS}")
     reports = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     reports.bind(("127.0.0.1", REPORTS))
     began_s = time.monotonic()
     nodes, _ = start(python, checkout, "experiments.timing.emulated_machine", *bus)
-    if not await_word(nodes, RUNTIME / "experiments.timing.emulated_machine.out", "ready"):
+    if not await_text(nodes, RUNTIME / "experiments.timing.emulated_machine.out", "ready"):
         raise TimeoutError("the emulated nodes do not start")
     guard, guard_ready = start(python, checkout, "controller.guard", *bus)
     controller, controller_ready = start(
@@ -111,7 +111,7 @@ def run(python: str, checkout: Path) -> dict[str, Any]:
 
 
 def start(python: str, checkout: Path, module: str, *words: object) -> tuple[subprocess.Popen[bytes], socket.socket]:
-    """A process as systemd would start it (Type=notify); what it notifies comes on the socket."""
+    """Start a process like systemd (Type=notify); its notifications arrive at the socket."""
     place = f"/run/timberhand/{module}.notify"
     notified = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     notified.bind(place)
@@ -124,17 +124,17 @@ def start(python: str, checkout: Path, module: str, *words: object) -> tuple[sub
 
 
 def await_ready(notified: socket.socket) -> bool:
-    """Whether READY=1 comes."""
-    limit_s = time.monotonic() + PATIENCE_S
+    """Whether READY=1 arrives."""
+    limit_s = time.monotonic() + TIMEOUT_S
     while (left_s := limit_s - time.monotonic()) > 0 and select.select([notified], [], [], left_s)[0]:
         if b"READY=1" in notified.recv(4096):
             return True
     return False
 
 
-def await_word(process: subprocess.Popen[bytes], out: Path, word: str) -> bool:
-    """Whether a process says something before it ends."""
-    limit_s = time.monotonic() + PATIENCE_S
+def await_text(process: subprocess.Popen[bytes], out: Path, word: str) -> bool:
+    """Whether a process prints ``word`` before it ends."""
+    limit_s = time.monotonic() + TIMEOUT_S
     while time.monotonic() < limit_s and process.poll() is None:
         if word in out.read_text():
             return True
@@ -143,12 +143,12 @@ def await_word(process: subprocess.Popen[bytes], out: Path, word: str) -> bool:
 
 
 def await_mode(reports: socket.socket, wanted: str) -> bool:
-    """Whether the controller reaches a mode: STANDBY needs every encoder's answers."""
+    """Whether the controller reaches a mode; STANDBY requires answers of every encoder."""
     from can_dbc.messages.crane import StateReport
     from can_dbc.messages.datagrams import decode
     from machine.status.modes import Mode
 
-    limit_s = time.monotonic() + PATIENCE_S
+    limit_s = time.monotonic() + TIMEOUT_S
     while (left_s := limit_s - time.monotonic()) > 0 and select.select([reports], [], [], left_s)[0]:
         report = decode(reports.recv(2048))
         if isinstance(report, StateReport) and Mode(report.mode).name == wanted:

@@ -1,0 +1,1 @@
+"""Calibration of a virtual machine, and the emulated survey of its cameras."""

@@ -1,0 +1,1 @@
+"""The one-log job, in lockstep and live."""

@@ -1,0 +1,1 @@
+"""Demonstrations of crane motions by an emulated operator at the hand levers."""

@@ -1,0 +1,1 @@
+"""Whole forwarding missions, in lockstep and live."""

@@ -1,0 +1,1 @@
+"""Views of the plant: its cameras, still pictures, a live page."""

@@ -1,0 +1,1 @@
+"""The emulated PLC path between crane0 and the plant."""

@@ -1,0 +1,1 @@
+"""Reads recordings and replays them through today's controller."""

@@ -1,0 +1,1 @@
+"""The status of the systemd services and of the controller's timing."""
