@@ -1,4 +1,4 @@
-"""What systemd and the kernel say about a service."""
+"""Queries systemd and the kernel about a service."""
 
 from __future__ import annotations
 
@@ -9,41 +9,41 @@ from pathlib import Path
 
 
 def systemctl(*words: str) -> subprocess.CompletedProcess[str]:
-    """The command with its output."""
+    """Run systemctl and return its output."""
     return subprocess.run(["systemctl", "--no-pager", *words], capture_output=True, text=True, check=False)
 
 
 def show(unit: str, *names: str) -> dict[str, str]:
-    """Properties of a unit."""
+    """Properties of one unit, by name."""
     return next(iter(show_all([unit], *names)), {})
 
 
 def show_all(units: Sequence[str], *names: str) -> list[dict[str, str]]:
-    """Properties of several units, in their order."""
+    """Properties of several units, in the order of ``units``."""
     blocks = systemctl("show", *units, "--property", ",".join(names)).stdout.split("\n\n")
     return [dict(line.partition("=")[::2] for line in block.splitlines()) for block in blocks if block.strip()]
 
 
 def main_pid(unit: str) -> int:
-    """The service's process; 0 when there is none."""
+    """The main process of a unit; 0 when there is none."""
     return int(show(unit, "MainPID").get("MainPID") or 0)
 
 
 def journal(unit: str) -> list[str]:
-    """Every line that the unit, and systemd about it, has said."""
+    """Every journal line of the unit, including those of systemd about it."""
     subprocess.run(["journalctl", "--sync"], check=False)
     command = ["journalctl", "--no-pager", "--output", "cat", "--unit", unit]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.splitlines()
 
 
 def last_journal_line(unit: str) -> str:
-    """The last line that a process of the unit has said; empty where this user may not read it."""
+    """The last journal line of the unit's processes; empty when this user may not read it."""
     command = ["journalctl", "--no-pager", "--quiet", "--output", "cat", "--lines", "1", f"_SYSTEMD_UNIT={unit}"]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
 
 def process_facts(pid: int) -> dict[str, object]:
-    """How a live process is scheduled, what it may, and how much of its memory is locked."""
+    """Scheduling, rights and locked memory of a running process."""
     status = dict(line.partition(":\t")[::2] for line in Path(f"/proc/{pid}/status").read_text().splitlines())
     return {
         "policy": {os.SCHED_OTHER: "other", os.SCHED_FIFO: "fifo"}.get(os.sched_getscheduler(pid), "another"),

@@ -16,11 +16,15 @@ from autonomy.missions.validation import legs
 from runtime.plot_style import MOSS, OIL, RUST, STEEL, TIMBER, sheet
 
 LOG_LENGTH_M = 3.0
-"""Drawn where a log's length is not known."""
+"""Length of a log whose length is unknown."""
 
 
 def draw(mission: ForwardingMission, review: Review | None, path: Path) -> None:
-    """Write the map as PNG; raises OSError."""
+    """Write the map as PNG.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     frame = site_frame(mission)
     route = frame.points_enu(mission.waypoints)[:, :2]
     fences = [(frame.points_enu(fence.corners)[:, :2], fence.keep_out) for fence in mission.fences]
@@ -53,7 +57,7 @@ def draw(mission: ForwardingMission, review: Review | None, path: Path) -> None:
 
 
 def _size(span: np.ndarray) -> tuple[float, float]:
-    """Inches of the sheet, so that the map fills it."""
+    """Size of the sheet in inches, so that the map fills it."""
     width = 8.0
     return width, float(np.clip(width * span[1] / span[0] * 0.92 + 1.3, 3.4, 11.0))
 
@@ -65,8 +69,8 @@ def _fence(axis: Any, ring: np.ndarray, keep_out: bool) -> None:
     axis.plot(*closed.T, color=color, lw=1.4, ls="-" if keep_out else "--", zorder=2)
 
 
-def _route(axis: Any, route: np.ndarray, ways: list[tuple[int, int]], review: Review | None) -> None:
-    for i, j in ways:
+def _route(axis: Any, route: np.ndarray, edges: list[tuple[int, int]], review: Review | None) -> None:
+    for i, j in edges:
         a, b = route[i], route[j]
         axis.plot(*np.array([a, b]).T, color=OIL, lw=1.6, zorder=3)
         if np.linalg.norm(b - a) > 1.0:
@@ -100,22 +104,22 @@ def _log(axis: Any, log: KnownLog, at: np.ndarray) -> None:
 def _legend(axis: Any, mission: ForwardingMission, review: Review | None) -> None:
     from matplotlib.lines import Line2D
 
-    told = []
+    entries = []
     if review is not None:
         laps = f" in {mission.options.laps} laps" if mission.options.laps > 1 else ""
         label = f"route, {review.length_m:.0f} m{laps}"
-        told.append(Line2D([], [], color=OIL, lw=1.6, label=label))
+        entries.append(Line2D([], [], color=OIL, lw=1.6, label=label))
     if review is not None and review.corners:
-        told.append(Line2D([], [], color=STEEL, lw=0.7, ls=":", label="turns in here"))
+        entries.append(Line2D([], [], color=STEEL, lw=0.7, ls=":", label="turn begins"))
     if any(not fence.keep_out for fence in mission.fences):
-        told.append(Line2D([], [], color=MOSS, lw=1.4, ls="--", label="fence"))
+        entries.append(Line2D([], [], color=MOSS, lw=1.4, ls="--", label="fence"))
     if any(fence.keep_out for fence in mission.fences):
-        told.append(Line2D([], [], color=RUST, lw=1.4, label="keep out"))
+        entries.append(Line2D([], [], color=RUST, lw=1.4, label="keep out"))
     if mission.logs:
-        told.append(Line2D([], [], color=TIMBER, lw=4.0, label=f"{len(mission.logs)} logs"))
+        entries.append(Line2D([], [], color=TIMBER, lw=4.0, label=f"{len(mission.logs)} logs"))
     if any(log.sigma_m for log in mission.logs):
-        told.append(Line2D([], [], color=TIMBER, alpha=0.4, lw=0.8, label="log within, 2 sigma"))
+        entries.append(Line2D([], [], color=TIMBER, alpha=0.4, lw=0.8, label="log within, 2 sigma"))
     if mission.landings:
-        told.append(Line2D([], [], marker="s", ms=8, mfc="white", mec=MOSS, mew=2.0, ls="none", label="landing"))
-    if told:
-        axis.legend(handles=told, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=min(len(told), 4))
+        entries.append(Line2D([], [], marker="s", ms=8, mfc="white", mec=MOSS, mew=2.0, ls="none", label="landing"))
+    if entries:
+        axis.legend(handles=entries, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=min(len(entries), 4))

@@ -129,9 +129,7 @@ class LiveRun(ABC, Generic[Outcome]):
             return self._summarize(ports["sim"])
         finally:
             for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(
-                    number, signal.SIG_IGN
-                )  # ending takes a bounded time; a second Ctrl-C must not disturb its order
+                signal.signal(number, signal.SIG_IGN)  # the end is short; a second Ctrl-C must not disturb it
             self._processes.stop_all(END_ORDER)
             self._socket.close()
 

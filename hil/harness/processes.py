@@ -144,7 +144,7 @@ class ProcessGroup:
         pid = self.children[name].process.pid
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, pid, niceness)
-            # Each child is a session, and sessions compete as groups regardless of their niceness (sched(7), autogroup).
+            # Sessions compete as groups, whatever the niceness of their processes (sched(7), autogroup).
             Path(f"/proc/{pid}/autogroup").write_text(str(niceness))
 
     def stop(self, name: str, seconds: float = 5.0) -> int | None:

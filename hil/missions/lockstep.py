@@ -107,10 +107,10 @@ class MissionRun:
         self._shown: tuple[State | None, str, str, str] = (None, "", "", "")
         self.states: list[tuple[float, str]] = []
         code = profile_hash(profile)
-        remembers = detector != "perfect"
+        uses_memory = detector != "perfect"
         self.manager = ActivityManager(
-            profile, code, mission, TABLES[manager], chooser=PlannerSelection(SamplingPlanner()), remembers=remembers,
-            emptier=PlannerSelection(PilePlanner(SamplingPlanner())),
+            profile, code, mission, TABLES[manager], selector=PlannerSelection(SamplingPlanner()), uses_memory=uses_memory,
+            unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())),
         )  # fmt: skip
         self.manager.auto()
         self.plant = plant

@@ -1,4 +1,4 @@
-"""Bringing interfaces up, with an `ip` that writes down what it is told."""
+"""The script that brings interfaces up, with an `ip` that records its arguments."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ def test_a_real_interface_gets_bit_rate_restart_and_a_short_queue(can_up, pretty
     )
 
 
-def test_a_bus_that_runs_as_wanted_is_not_disturbed(can_up) -> None:
+def test_a_correctly_configured_interface_is_left_alone(can_up) -> None:
     assert can_up("crane0", RUNNING) == (0, [], "")
     wrong = RUNNING | {"linkinfo": REAL["linkinfo"]}
     assert len(can_up("crane0", wrong)[1]) == 4
 
 
-def test_a_bit_rate_is_not_taken_for_another_that_begins_alike(can_up) -> None:
+def test_bit_rates_with_a_common_prefix_are_distinguished(can_up) -> None:
     assert len(can_up("crane0", RUNNING, CRANE_BITRATE="100000")[1]) == 4
 
 
@@ -77,7 +77,7 @@ def test_a_virtual_interface_is_only_brought_up(can_up) -> None:
 
 
 @pytest.mark.parametrize("address", ["", "wire:crane0", "kvaser:0", "slcan:/dev/ttyUSB0"])
-def test_what_is_no_interface_of_the_kernel_is_left_alone(can_up, address: str) -> None:
+def test_an_address_outside_the_kernel_is_left_alone(can_up, address: str) -> None:
     assert can_up("crane0", None, CRANE_BUS=address) == (0, [], "")
 
 

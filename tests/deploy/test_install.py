@@ -1,4 +1,4 @@
-"""The installation into a tree of its own, with a small wheel, and its sentences."""
+"""The installation into a separate tree, with a small wheel, and its messages."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_install_twice_change_settings_and_remove(tmp_path: Path, wheel: Path) -
     assert "was changed here and stays" in removed.stderr
 
 
-def test_a_dry_run_says_all_and_does_nothing(tmp_path: Path, wheel: Path) -> None:
+def test_a_dry_run_prints_every_step_and_executes_none(tmp_path: Path, wheel: Path) -> None:
     root = tmp_path / "root"
     root.mkdir()
     done = install("--dry-run", "--root", root, "--wheel", wheel)
@@ -129,13 +129,13 @@ def test_a_dry_run_says_all_and_does_nothing(tmp_path: Path, wheel: Path) -> Non
         (["--dry-run", "--root", "/tmp", "--python", "false"], 3, "false is older than Python 3.11"),
     ],
 )
-def test_every_mistake_is_one_sentence(words: list[str], status: int, sentence: str) -> None:
+def test_every_usage_error_is_one_sentence(words: list[str], status: int, sentence: str) -> None:
     done = install(*words)
     assert (done.returncode, done.stdout) == (status, "")
     assert sentence in done.stderr and done.stderr.count("\n") == 1
 
 
-def test_an_unpacked_wheel_cannot_be_built_from(tmp_path: Path) -> None:
+def test_an_unpacked_wheel_cannot_be_built(tmp_path: Path) -> None:
     shutil.copytree(DEPLOY, tmp_path / "deploy", ignore=shutil.ignore_patterns("__pycache__"))
     script = tmp_path / "deploy/install.sh"
     done = subprocess.run(["sh", script, "--dry-run"], capture_output=True, text=True, check=False)
@@ -144,7 +144,7 @@ def test_an_unpacked_wheel_cannot_be_built_from(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_real_wheel_carries_all_that_is_laid_out(tmp_path: Path) -> None:
+def test_the_real_wheel_contains_everything_that_is_installed(tmp_path: Path) -> None:
     wheel = build_wheel(tmp_path)
     shipped = set(zipfile.ZipFile(wheel).namelist())
     wanted = [file for name in ("units", "system") for file in (DEPLOY / name).iterdir()]

@@ -1,4 +1,4 @@
-"""The unit files: judged by systemd's own tools, and held against the settings and the programs that they start."""
+"""The unit files: checked by systemd's tools, and compared with the settings and the programs that they start."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ CONF = dict(
     if not line.startswith("#") and line
 )
 EXPOSURE = {"controller": 1.3, "guard": 1.0, "autonomy": 0.9, "recorder": 1.1, "console": 0.9, "plc": 1.4, "can@": 1.1}
-"""What systemd-analyze says of each unit, of 10; to make one worse is to change it here too.  Never above 1.5."""
+"""Exposure of each unit by systemd-analyze, of 10; at most 1.5."""
 EPHEMERAL = 32768
-"""From here on the kernel gives ports to whoever asks for any (ip_local_port_range)."""
+"""First ephemeral port of the kernel (ip_local_port_range)."""
 INTENDED = {"RestrictRealtime", "RestrictAddressFamilies", "IPAddressAllow", "PrivateUsers", "CapabilityBoundingSet"}
-"""Lines of the hardening that may differ: FIFO, CAN, the network, and the one that configures interfaces."""
+"""Hardening settings that may differ between units: FIFO, CAN, network, and interface configuration."""
 
 needs_systemd = pytest.mark.skipif(
     shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing (apt-get install systemd)"
@@ -73,7 +73,7 @@ def test_every_process_has_its_unit() -> None:
 
 @needs_systemd
 @pytest.mark.parametrize("unit", UNITS, ids=lambda u: u.stem)
-def test_exposure_is_small(unit: Path) -> None:
+def test_the_security_exposure_of_every_unit_is_small(unit: Path) -> None:
     done = subprocess.run(
         ["systemd-analyze", "security", "--offline=yes", "--no-pager", str(unit)],
         capture_output=True, text=True, check=False,
@@ -84,7 +84,7 @@ def test_exposure_is_small(unit: Path) -> None:
 
 
 @needs_systemd
-def test_systemd_finds_no_fault(tmp_path: Path) -> None:
+def test_systemd_analyze_reports_no_fault(tmp_path: Path) -> None:
     for unit in (DEPLOY / "units").iterdir():
         text = unit.read_text().replace("/opt/timberhand/bin/python", sys.executable)
         (tmp_path / unit.name).write_text(text.replace("/usr/lib/timberhand/can-up", str(DEPLOY / "system/can-up")))
@@ -115,7 +115,7 @@ def test_the_hardening_is_the_same_everywhere() -> None:
         assert body - common == more, unit.name
 
 
-def test_only_the_control_processes_are_hard_timed_and_the_guard_goes_first() -> None:
+def test_only_the_control_processes_are_real_time_and_the_guard_has_the_highest_priority() -> None:
     priority = {unit.stem: setting(unit, "CPUSchedulingPriority") for unit in UNITS}
     timed = {name: int(value[0]) for name, value in priority.items() if value}
     assert timed == {"timberhand-controller": 80, "timberhand-guard": 85, "timberhand-plc": 70}
@@ -128,7 +128,7 @@ def test_only_the_control_processes_are_hard_timed_and_the_guard_goes_first() ->
         assert setting(unit, "LimitMEMLOCK") == ["infinity"]
 
 
-def test_every_process_is_a_user_of_its_own_that_the_installation_makes() -> None:
+def test_every_process_has_its_own_user_created_by_the_installation() -> None:
     users = [setting(unit, "User")[0] for unit in PROCESSES]
     made = set(re.findall(r"^u (\S+)", (DEPLOY / "system/sysusers.conf").read_text(), re.MULTILINE))
     assert len(set(users)) == len(users)
@@ -137,7 +137,7 @@ def test_every_process_is_a_user_of_its_own_that_the_installation_makes() -> Non
         assert setting(unit, "User") == setting(unit, "Group")
 
 
-def test_settings_and_units_fit_each_other() -> None:
+def test_settings_and_units_match() -> None:
     used = set()
     for text in [unit.read_text() for unit in UNITS] + [(DEPLOY / "system/can-up").read_text()]:
         used |= set(re.findall(r"\$\{?([A-Z]+(?:_[A-Z]+)*)\b", text))
@@ -148,7 +148,7 @@ def test_settings_and_units_fit_each_other() -> None:
     assert all(int(port) < EPHEMERAL for port in ports)
 
 
-def test_the_programs_understand_their_arguments() -> None:
+def test_the_programs_accept_the_arguments_of_their_units() -> None:
     unit = DEPLOY / "units"
     control = words(unit / "timberhand-controller.service")
     assert control[:3] == ["-P", "-m", "controller"]
@@ -195,7 +195,7 @@ def test_every_option_that_the_settings_explain_exists() -> None:
         assert given[given.index("--timing") + 1] == str(SERVICE_PAGE)
 
 
-def test_the_target_pulls_every_process_in_and_takes_it_along() -> None:
+def test_the_target_starts_and_stops_every_process() -> None:
     for unit in PROCESSES:
         assert setting(unit, "WantedBy") == ["timberhand.target"], unit.name
         assert setting(unit, "PartOf") == ["timberhand.target"], unit.name

@@ -16,7 +16,7 @@ from can_dbc.frame import Frame
 from hil.wire.core import WireCore
 from hil.wire.inprocess import InProcessBus
 
-PATIENCE_S = 5.0
+TIMEOUT_S = 5.0
 BITRATE = 1_000_000
 Open = Callable[..., Bus]
 
@@ -48,7 +48,7 @@ class Backend:
     def receive(self, bus: Bus, count: int) -> list[Frame]:
         """Drains until `count` frames are there; fails when they do not come."""
         frames: list[Frame] = []
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while len(frames) < count:
             assert time.monotonic() < deadline, f"{len(frames)} of {count} frames arrived"
             self.settle()
@@ -57,7 +57,7 @@ class Backend:
 
     def send(self, bus: Bus, key: int, data: bytes) -> None:
         """Sends, waiting for room in the queue."""
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not bus.send(key, data):
             assert time.monotonic() < deadline, "no room in the transmit queue"
             self.settle()

@@ -70,7 +70,8 @@ class Stop:
             elif self.motion.duration_s < 0.5 and now_ns - self.begun_ns > WAIT_NS:
                 x, y, z = self.goal_m
                 start = self.arm.pose(self.motion.goal)
-                self.motion = straight_line(self.arm, start, self.arm.compact_pose_above(x, y, z, z), shaped=self.shaped)
+                goal = self.arm.compact_pose_above(x, y, z, z)
+                self.motion = straight_line(self.arm, start, goal, shaped=self.shaped)
                 self.begun_ns = now_ns
             elif self.motion.duration_s > 0.5 and not self.stands_ns:
                 self.stands_ns = now_ns * np.allclose(report.reference, self.motion.goal, atol=1e-6)

@@ -17,7 +17,7 @@ from can_dbc.frame import Frame
 from hil.wire.core import WireCore
 from hil.wire.faults import Fault, Kind
 from hil.wire.launch import wire_daemon
-from tests.hil.bus_backends import BITRATE, PATIENCE_S, Backend, counted_receives
+from tests.hil.bus_backends import BITRATE, TIMEOUT_S, Backend, counted_receives
 
 
 @pytest.mark.parametrize("address", ["in-process", "wire:lone", "timberhand:lone"])
@@ -119,7 +119,7 @@ def test_a_daemon_that_is_slow_to_answer_is_asked_once(tmp_path: Path, monkeypat
 
 
 def reopen(bus: Bus) -> None:
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while not bus.reopen():
         assert time.monotonic() < deadline, "the link did not come back"
         time.sleep(0.001)
@@ -147,7 +147,7 @@ def test_a_drain_of_the_wire_takes_what_waits_in_one_call(wire_dir: Path, monkey
         drains = 0
         frames: list[Frame] = []
         while len(frames) < 8:
-            select.select([b], [], [], PATIENCE_S)
+            select.select([b], [], [], TIMEOUT_S)
             b.drain(frames)
             drains += 1
         assert len(calls) == drains
@@ -174,7 +174,7 @@ def test_a_recovery_leaves_nothing_from_before_it(
 
 def wait_for_state(state: str) -> str:
     """The name of the first participant that gets into it."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while True:
         for node in control("fast", {"stats": True})["nodes"]:
             if node["state"] == state:

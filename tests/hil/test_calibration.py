@@ -50,7 +50,7 @@ def test_the_hidden_truth_is_recovered_in_four_minutes(profile: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_the_nominal_forwarder_turns_what_it_is_told_to_once_its_rotator_was_surveyed() -> None:
+def test_the_nominal_forwarder_turns_exactly_after_a_survey_of_its_rotator() -> None:
     found = calibrated(Job("one", "calibration", 1, {"profile": "aoro_fc8", "truth": "nominal"}))
     assert found["failure"] is None and found["implausible"] == [] and found["seconds"] < 240.0
     its_rotator_is_found(found["rotator"])
@@ -64,7 +64,7 @@ def its_rotator_is_found(rotator: dict[str, Any]) -> None:
     assert max(map(abs, rotator["quarter"])) < 0.03
 
 
-def test_a_valve_that_is_connected_the_wrong_way_round_ends_the_run(tmp_path: Path) -> None:
+def test_a_valve_with_reversed_polarity_ends_the_run(tmp_path: Path) -> None:
     before, section, after = (SHIPPED / "palms_471.toml").read_text().partition("[joints.slew.valve]")
     path = tmp_path / "crossed.toml"
     path.write_text(before + section + after.replace("sign = 1 ", "sign = -1", 1))

@@ -1,4 +1,4 @@
-"""The plant's camera seen through the socket: the live plant draws when asked, and perception can use what comes."""
+"""The plant's camera over the socket: the live plant renders on request, and perception accepts the frames."""
 
 import threading
 import time
@@ -6,17 +6,17 @@ import time
 import numpy as np
 import pytest
 
-from autonomy.perception.camera.frame import check
+from autonomy.perception.camera.frame import check_frame
 from autonomy.perception.sources.stream import StreamCamera
 from can_dbc.bus.factory import open_bus
-from experiments.common.worlds import profile_named
+from machine.loading.profile_file import load_profile
 from sim.plant import Plant
 from sim.process.live_plant import LivePlant
 
 
 @pytest.mark.slow
-def test_a_live_plant_serves_its_cameras_when_they_are_asked_for() -> None:
-    profile = profile_named("palms_471")
+def test_a_live_plant_serves_its_cameras_on_request() -> None:
+    profile = load_profile("palms_471")
     plant = Plant(profile, seed=0)
     try:
         with open_bus("virtual:camera-stream") as bus:
@@ -40,7 +40,7 @@ def test_a_live_plant_serves_its_cameras_when_they_are_asked_for() -> None:
     finally:
         plant.close()
     assert first is not None and later is not None
-    check(first)
+    check_frame(first)
     assert first.camera == "d435" and later.stamp_ns > first.stamp_ns
     assert first.rgb.shape == (608, 608, 3) and first.rgb.max() > 60
     assert np.nanmedian(first.depth_m) == pytest.approx(3.1, abs=0.2)

@@ -1,4 +1,4 @@
-"""The job of the demo by what the camera on the stick sees: in virtual time, the log gets into the bunk."""
+"""The one-log job with the camera on the stick, in virtual time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.computed]
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_log_that_only_a_camera_sees_gets_into_the_bunk(seed: int, tmp_path: Path) -> None:
+def test_a_log_detected_by_a_camera_lands_in_the_bunk(seed: int, tmp_path: Path) -> None:
     summary = run_lockstep("palms_471", seed, "nominal", tmp_path, 120.0, Console(file=io.StringIO()), "stick")
     assert summary.in_bunk, f"{summary.verdict} {summary.failure}"
     assert summary.exit_code is ExitCode.OK

@@ -1,4 +1,4 @@
-"""The report of a run: what went to the landing, with places and times."""
+"""The report of a run: the forwarded loads with positions and times."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def taken(at_s: int, volume_m3: float = 0.1, assortment: str = "") -> LoadedLog:
     return LoadedLog(Point(63.65, 19.89), at_s * 1_000_000_000, volume_m3, assortment)
 
 
-def test_a_run_leaves_a_report_of_its_loads(tmp_path: Path) -> None:
+def test_a_run_writes_a_report_of_its_loads(tmp_path: Path) -> None:
     loads = [
         Load((taken(10), taken(70, 0.2, "pulp")), 130_000_000_000, 41.7),
         Load((taken(200),), 260_000_000_000, 9.0),
@@ -39,6 +39,6 @@ def test_a_run_leaves_a_report_of_its_loads(tmp_path: Path) -> None:
     assert text["CreationDate"] == ["2026-05-04T12:04:20+00:00"]
 
 
-def test_a_run_that_forwarded_nothing_leaves_none(tmp_path: Path) -> None:
+def test_a_run_without_forwarded_logs_has_no_report(tmp_path: Path) -> None:
     assert report_loads(tmp_path, [], MISSION, PROFILE, BEGUN, 0) is None
     assert not list(tmp_path.iterdir())

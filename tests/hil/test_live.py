@@ -1,4 +1,4 @@
-"""The whole machine as processes in real time, on the wire and on vcan, and what happens when something dies.
+"""The whole machine as processes in real time, on the wire and on vcan, including the death of processes.
 
 A host whose time is stolen for longer than a frame's time-out stops the machine, as it must; the run then shows it and
 the operator arms again.  What is asserted is the outcome, never a duration.

@@ -55,7 +55,7 @@ sys.exit(summary.exit_code)
 @pytest.mark.slow
 @pytest.mark.computed
 @pytest.mark.timeout(900)
-def test_a_log_comes_aboard_although_the_planner_freezes_on_the_way(tmp_path: Path) -> None:
+def test_a_log_is_loaded_although_the_planner_freezes_on_the_route(tmp_path: Path) -> None:
     if lab_kernel.find(shim.user_cache()) is None:
         pytest.skip(lab_kernel.MISSING)
     path, out = mission_file(tmp_path / "mission.geojson", (8.0, 3.6, 80.0)), tmp_path / "run"

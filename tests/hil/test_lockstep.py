@@ -1,4 +1,4 @@
-"""The whole job on virtual time: a log gets into the bunk, and one seed always leaves the same bytes."""
+"""The one-log job on virtual time: the log lands in the bunk, and equal seeds give equal bytes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def digest(directory: Path) -> dict[str, str]:
     return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(directory.iterdir())}
 
 
-def test_the_log_gets_into_the_bunk_and_the_record_replays(tmp_path: Path) -> None:
+def test_the_log_lands_in_the_bunk_and_the_recording_replays(tmp_path: Path) -> None:
     summary = job(101, tmp_path / "run")
     assert summary.in_bunk, summary.verdict
     assert summary.exit_code is ExitCode.OK
@@ -38,13 +38,13 @@ def test_the_log_gets_into_the_bunk_and_the_record_replays(tmp_path: Path) -> No
     assert result.ticks == summary.ticks
 
 
-def test_the_machine_on_wheels_loads_its_log_at_the_height_it_drives_at(tmp_path: Path) -> None:
+def test_the_forwarder_loads_its_log_at_its_driving_height(tmp_path: Path) -> None:
     summary = job(104, tmp_path / "run", machine="aoro_fc8")
     assert summary.in_bunk, summary.verdict
     assert (summary.exit_code, summary.stops) == (ExitCode.OK, 0)
 
 
-def test_one_seed_leaves_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
+def test_equal_seeds_give_equal_bytes_and_different_seeds_do_not(tmp_path: Path) -> None:
     first, again, other = (job(s, tmp_path / n, 4.0) for s, n in ((5, "a"), (5, "b"), (6, "c")))
     assert digest(tmp_path / "a") == digest(tmp_path / "b")
     assert digest(tmp_path / "a")["crane0.log"] != digest(tmp_path / "c")["crane0.log"]
@@ -52,7 +52,7 @@ def test_one_seed_leaves_the_same_bytes_and_another_does_not(tmp_path: Path) -> 
     assert first.ticks == other.ticks
 
 
-def test_a_job_that_is_not_done_is_not_called_done(tmp_path: Path) -> None:
+def test_an_unfinished_job_is_reported_as_unfinished(tmp_path: Path) -> None:
     summary = job(5, tmp_path / "short", 4.0)
     assert not summary.in_bunk
     assert summary.exit_code is ExitCode.FIGURE_MISSED

@@ -86,7 +86,7 @@ def life(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, list[
     plant.close()
 
 
-def test_it_comes_to_standby_is_armed_and_slews(life) -> None:
+def test_it_reaches_standby_is_armed_and_slews(life) -> None:
     _, reports, system = life
     modes = [Mode(r.mode) for r in reports]
     order = [m for k, m in enumerate(modes) if k == 0 or m is not modes[k - 1]]
@@ -120,14 +120,14 @@ def test_the_carrier_stands_with_its_brake_on(life) -> None:
     assert 45 < len(commands) / (len(ticks(directory)) / SETTINGS.rate_hz) < 55
 
 
-def test_an_encoder_sample_is_no_older_than_the_sync_lead_when_it_is_used(life) -> None:
+def test_an_encoder_sample_is_at_most_one_sync_lead_old_when_used(life) -> None:
     directory, _, _ = life
     slew = 0x182
     ages = [t.now_ns - f.stamp_ns for t in ticks(directory)[-200:] for f in t.frames_in if f.key == slew]
     assert len(ages) == 200 and max(ages) < SETTINGS.period_ns // 2
 
 
-def test_the_record_of_both_buses_replays_byte_for_byte(life) -> None:
+def test_the_recording_of_both_buses_replays_byte_for_byte(life) -> None:
     directory, _, system = life
     assert (directory / "mach0.log").read_text().count("\n") > 2000
     assert sum(len(t.machine_frames_in) for t in ticks(directory)) > 1000

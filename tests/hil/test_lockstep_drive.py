@@ -150,7 +150,7 @@ def test_the_recording_has_the_vehicle_and_replays_to_the_same_bytes(trip) -> No
     assert result.agrees and result.ticks == system.ticks, result
 
 
-def test_a_planner_that_dies_on_the_way_leaves_the_machine_standing() -> None:
+def test_the_machine_stops_when_the_planner_dies_on_the_route() -> None:
     plant = Plant(PROFILE, seed=5, truth="sampled", logs=0)
     try:
         planner = Drives(lambda _, elapsed_ns: place(60.0, 0.0) | {"speed_m_s": 0.639} if elapsed_ns < 4e9 else None)
@@ -206,7 +206,7 @@ def test_twenty_metres_of_rigid_geometry() -> None:
     assert math.hypot(carrier.x_m - goal[0], carrier.y_m - goal[1]) < 0.3 and reports[-1].reason == Reason.NONE
 
 
-def test_an_angle_that_moves_is_followed_on_rigid_geometry() -> None:
+def test_a_moving_articulation_angle_is_followed_on_rigid_geometry() -> None:
     rig = Rig(PROFILE, 8, "nominal", step_ns=2_500_000)
     errors: list[float] = []
     wanted = [0.0]

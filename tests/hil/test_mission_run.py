@@ -1,4 +1,4 @@
-"""A short mission on the plant, both ways, and the page of the activity manager."""
+"""A short mission on the plant, with both activity managers."""
 
 from __future__ import annotations
 
@@ -8,25 +8,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from autonomy.manager.state_chart import diagram, page
-from autonomy.manager.transition_table import OURS, PAPER_B
 from host.exit_codes import ExitCode
 from tests.hil.short_missions import mission_file
 from timberhand.cli import app
-
-DOCS = Path(__file__).parents[2] / "docs"
-
-
-def test_the_page_of_the_activity_manager_is_as_the_code_has_it() -> None:
-    assert (DOCS / "activity.md").read_text() == page(), "run `timberhand mission states --docs docs`"
-
-
-@pytest.mark.parametrize("table", [PAPER_B, OURS], ids=["paper_b", "ours"])
-def test_every_change_is_in_the_diagram(table) -> None:
-    text = diagram(table)
-    for (begin, event), end in table.items():
-        line = next(x for x in text.splitlines() if x.strip().startswith(f"{begin.name} --> {end.name} "))
-        assert event.name.lower().replace("_", " ") in line
 
 
 def test_a_file_that_is_no_mission_is_refused(tmp_path: Path) -> None:

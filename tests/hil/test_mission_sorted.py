@@ -1,4 +1,4 @@
-"""A sorted mission on the plant whose planner dies with the load on board: another goes on from what the file says."""
+"""A sorted mission on the plant whose planner dies with the load on board; another resumes from the checkpoint file."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Silent:
 @pytest.mark.slow
 @pytest.mark.computed
 @pytest.mark.timeout(900)
-def test_each_assortment_comes_to_its_landing_although_the_planner_starts_anew(tmp_path: Path) -> None:
+def test_each_assortment_reaches_its_landing_although_the_planner_restarts(tmp_path: Path) -> None:
     known = tuple(KnownLog(point(x, y), "", 90.0, 2.0, 0.25, "", kind) for kind, x, y in LIE)
     landings = tuple(Landing(point(x, y), kind, None, (kind,)) for kind, x, y in LANDINGS)
     way = (point(0.0, 0.0), point(26.0, 0.0))
@@ -50,15 +50,16 @@ def test_each_assortment_comes_to_its_landing_although_the_planner_starts_anew(t
         while first.state is not State.HAUL and system.now_ns < 400e9:
             system.advance()
         assert first.state is State.HAUL and first.tally.loaded == 1, (first.state, first.failure)
-        CheckpointFile(book).keep(first.progress(), system.now_ns, 10**18)
+        CheckpointFile(book).write(first.progress(), system.now_ns, 10**18)
         run.manager = Silent()  # type: ignore[assignment]
         dead_ns = system.now_ns
         while system.now_ns < dead_ns + int(DEAD_S * 1e9):
             system.advance()
-        assert plant.world.carrier.speed_m_s == pytest.approx(0.0, abs=0.01), "nobody drives"
+        assert plant.world.carrier.speed_m_s == pytest.approx(0.0, abs=0.01), "the machine does not drive"
         progress = read_checkpoint(book, told, system.now_ns, 10**18 + int(DEAD_S * 1e9))
         run.manager = ActivityManager(
-            profile, profile_hash(profile), told, chooser=PlannerSelection(SamplingPlanner()), emptier=PlannerSelection(PilePlanner(SamplingPlanner())),
+            profile, profile_hash(profile), told, selector=PlannerSelection(SamplingPlanner()),
+            unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())),
             progress=progress,
         )  # fmt: skip
         run.manager.auto()

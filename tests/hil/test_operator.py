@@ -1,4 +1,4 @@
-"""The stand-in for a person: arms once, arms again after a stop, resets a fault, and gives up in the end."""
+"""The emulated operator: arms, arms again after a stop, resets a fault, and finally gives up."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def pressed(operator: Operator, mode: Mode, stamp_ns: int) -> OperatorAction | N
     return command.action
 
 
-def test_looks_before_arming_and_does_not_hammer() -> None:
+def test_the_operator_waits_before_arming_and_between_presses() -> None:
     seen: list[OperatorAction] = []
     operator = Operator(7, lambda action, _: seen.append(action))
     assert pressed(operator, Mode.STANDBY, 10 * REACTION_NS) is None
@@ -36,14 +36,14 @@ def test_looks_before_arming_and_does_not_hammer() -> None:
     assert seen == [OperatorAction.ARM, OperatorAction.ARM]
 
 
-def test_leaves_a_working_machine_alone() -> None:
+def test_the_operator_does_nothing_while_the_machine_works() -> None:
     operator = Operator(7, lambda *_: None)
     for mode in (Mode.BOOT, Mode.ARMED, Mode.ACTIVE):
         assert pressed(operator, mode, 10 * REACTION_NS) is None
         assert pressed(operator, mode, 20 * REACTION_NS) is None
 
 
-def test_resets_a_fault_and_rearms_a_stop_until_patience_ends() -> None:
+def test_the_operator_resets_and_rearms_until_there_are_too_many_stops() -> None:
     operator = Operator(7, lambda *_: None)
     now_ns = 0
     for number in range(1, MAX_STOPS + 2):

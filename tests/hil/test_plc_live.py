@@ -1,4 +1,4 @@
-"""The PLC path as processes in real time, and what bridge and emulated PLC say when they are started wrongly."""
+"""The PLC path as processes in real time, and the usage errors of bridge and emulated PLC."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(*arguments: str, timeout: float = 60.0, **environment: str) -> subproces
 
 
 @pytest.mark.timeout(400)
-def test_a_log_goes_into_the_bunk_through_modbus(tmp_path: Path) -> None:
+def test_a_log_lands_in_the_bunk_over_modbus(tmp_path: Path) -> None:
     """What is asserted is the outcome; a host that is short of processor time stops the machine, rightly."""
     arguments = ["demo", "--plc", "--bus", "wire", "--no-console", "--json", "--max-stops", "60", "--limit-s", "300"]
     done = run("timberhand", *arguments, "--out", str(tmp_path / "run"), timeout=380, TIMBERHAND_WIRE_DIR=str(tmp_path))
@@ -44,24 +44,24 @@ def test_a_log_goes_into_the_bunk_through_modbus(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("module", ["controller.plc", "sim.plc"])
-def test_it_keeps_to_loopback_unless_told(module: str, tmp_path: Path) -> None:
+def test_only_loopback_addresses_are_accepted_by_default(module: str, tmp_path: Path) -> None:
     profile = str(write_plc_profile("palms_471", "valves", tmp_path))
     done = run(module, "--profile", profile, "--modbus", "192.0.2.1:502")
     assert done.returncode == 2 and "--allow-network" in done.stderr
 
 
 @pytest.mark.parametrize("module", ["controller.plc", "sim.plc"])
-def test_a_profile_without_a_plc_is_refused_in_words(module: str) -> None:
+def test_a_profile_without_a_plc_is_refused(module: str) -> None:
     done = run(module, "--profile", "palms_471", "--modbus", "127.0.0.1:1502")
     assert done.returncode == 3 and "[plc]" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_a_way_to_the_plc_must_be_given() -> None:
+def test_the_link_to_the_plc_is_a_required_option() -> None:
     assert run("controller.plc", "--profile", "palms_471").returncode == 2
     assert run("sim.plc", "--profile", "palms_471").returncode == 2
 
 
-def test_systemd_hears_how_the_bridge_is_though_no_plc_answers(tmp_path: Path) -> None:
+def test_the_bridge_reports_its_status_to_systemd_although_no_plc_answers(tmp_path: Path) -> None:
     """It is ready when it is on the bus; what the PLC does stands in its status."""
     profile = str(write_plc_profile("palms_471", "valves", tmp_path))
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd, wire_daemon({"crane0": 1_000_000}, tmp_path):

@@ -59,7 +59,7 @@ class Run:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("role", "transport"), [("references", "modbus"), ("valves", "udp")])
-def test_a_log_goes_into_the_bunk(role: RoleName, transport: Transport, tmp_path: Path) -> None:
+def test_a_log_lands_in_the_bunk(role: RoleName, transport: Transport, tmp_path: Path) -> None:
     run = Run(role, transport, tmp_path)
     while not run.activity.done and not run.activity.failure and run.system.now_ns < START_NS + 120 * S:
         run.system.advance()

@@ -38,7 +38,7 @@ def core_with(count: int, **options: int) -> tuple[WireCore, list[Node]]:
 
 @given(TRAFFIC)
 @settings(max_examples=150)
-def test_at_each_idle_moment_the_most_urgent_head_goes(rows: list[tuple[int, int, int, bytes]]) -> None:
+def test_the_frame_of_highest_priority_wins_the_idle_bus(rows: list[tuple[int, int, int, bytes]]) -> None:
     """Replays what the bus did and checks every decision against all queues as they stood then."""
     core, nodes = core_with(4)
     finished: list[tuple[Node, Frame]] = []
@@ -64,7 +64,7 @@ def test_at_each_idle_moment_the_most_urgent_head_goes(rows: list[tuple[int, int
 
 @given(TRAFFIC, st.lists(st.integers(1, 500_000), max_size=30))
 @settings(max_examples=60)
-def test_the_outcome_does_not_depend_on_how_time_is_cut(
+def test_the_result_does_not_depend_on_the_time_steps(
     rows: list[tuple[int, int, int, bytes]], steps: list[int]
 ) -> None:
     def run(extra: list[int]) -> list[tuple[str, Frame]]:
@@ -96,7 +96,7 @@ def test_a_frame_arrives_at_its_last_bit() -> None:
     assert core.next_ns() is None
 
 
-def test_time_does_not_run_back() -> None:
+def test_time_cannot_go_back() -> None:
     core, _ = core_with(1)
     core.advance(10)
     with pytest.raises(WireError, check=coded("wire.time-reversed")):
@@ -130,7 +130,7 @@ def test_a_full_receive_queue_drops_and_counts() -> None:
     assert len(quick.take()) == 8 and quick.dropped == 0
 
 
-def test_a_lone_sender_turns_passive_and_never_goes_off() -> None:
+def test_a_lone_sender_becomes_passive_and_never_bus_off() -> None:
     """ISO 11898-1: without an acknowledge TEC rises by 8 up to 128 and then stays."""
     core, (a,) = core_with(1)
     core.submit(a, 0x100, b"")
@@ -148,7 +148,7 @@ def test_a_lone_sender_turns_passive_and_never_goes_off() -> None:
     assert (a.tec, a.state) == (127, BusState.WARNING)
 
 
-def test_counters_go_down_with_good_frames() -> None:
+def test_good_frames_lower_the_error_counters() -> None:
     core, (a, b) = core_with(2)
     core.inject(Fault(Kind.ERROR, end_ns=1 * MS))
     core.submit(a, 0x100, b"")
@@ -188,7 +188,7 @@ def test_bus_off_flushes_refuses_and_restarts() -> None:
     assert frames[0].stamp_ns == restarted_ns + 128 * 11 * BIT_NS + frame_ns(0x103, b"new")
 
 
-def test_without_restart_a_node_stays_off_until_told() -> None:
+def test_without_automatic_restart_a_node_stays_bus_off_until_restarted() -> None:
     core, (a, _) = core_with(2, restart_ns=0)
     core.inject(Fault(Kind.ERROR, end_ns=20 * MS))
     core.submit(a, 0x100, b"")
@@ -207,7 +207,7 @@ def test_a_passive_sender_pauses_before_its_next_frame() -> None:
     assert second.stamp_ns - first.stamp_ns == frame_ns(0x100, b"") + (3 + 8) * BIT_NS
 
 
-def test_a_node_that_leaves_takes_its_frames_along() -> None:
+def test_a_detached_node_loses_its_pending_frames() -> None:
     core, (a, b) = core_with(2)
     c = core.attach("c")
     core.submit(a, 0x100, b"")
@@ -218,7 +218,7 @@ def test_a_node_that_leaves_takes_its_frames_along() -> None:
     assert [frame.key for frame in b.take()] == [0x200]
 
 
-def test_a_retired_node_sends_what_waits_but_does_not_linger_unheard() -> None:
+def test_a_retired_node_sends_its_queue_unless_nobody_acknowledges() -> None:
     core, (a, b) = core_with(2)
     for key in (0x100, 0x101):
         core.submit(a, key, b"")
@@ -246,7 +246,7 @@ def test_the_in_process_bus_follows_the_state_of_its_node() -> None:
     assert len(core.nodes) == 1 and a.fileno() == -1
 
 
-def test_the_in_process_bus_forgets_what_was_before_a_recovery() -> None:
+def test_the_in_process_bus_drops_frames_from_before_a_recovery() -> None:
     core = WireCore(1_000_000, restart_ns=10 * MS)
     a, b = InProcessBus(core, "a"), InProcessBus(core, "b")
     b.send(0x100, b"old")
@@ -265,7 +265,7 @@ def test_the_in_process_bus_forgets_what_was_before_a_recovery() -> None:
     assert (a.stats.state, a.stats.recoveries, a.stats.received) == (BusState.ACTIVE, 1, 1)
 
 
-def test_discarding_spares_the_frame_on_the_bus_and_settles_the_counter() -> None:
+def test_discarding_keeps_the_frame_on_the_bus_and_counts_the_others() -> None:
     core, (a, b) = core_with(2)
     for i in range(5):
         core.submit(a, 0x100 + i, b"")

@@ -25,7 +25,7 @@ from hil.wire.launch import wire_daemon
 from hil.wire.stuffing import frame_bits
 from tests.codes import coded
 
-PATIENCE_S = 5.0
+TIMEOUT_S = 5.0
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[subproce
 
 def receive(bus: object, count: int) -> list[Frame]:
     frames: list[Frame] = []
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while len(frames) < count:
         assert select.select([bus], [], [], deadline - time.monotonic())[0], f"{len(frames)} of {count}"
         bus.drain(frames)
@@ -49,7 +49,7 @@ def run_daemon(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=30)
 
 
-def test_frames_of_one_bus_keep_the_pace_of_its_bit_rate(daemon: subprocess.Popen[str]) -> None:
+def test_frames_are_spaced_by_the_bit_rate(daemon: subprocess.Popen[str]) -> None:
     with open_bus("wire:mach0", tx_queue=50) as a, open_bus("wire:mach0") as b, open_bus("wire:crane0") as c:
         key, data = 0x0CFF2030 | EXTENDED, bytes(range(8))
         for _ in range(40):
@@ -66,11 +66,11 @@ def test_frames_of_one_bus_keep_the_pace_of_its_bit_rate(daemon: subprocess.Pope
 def test_a_signal_ends_it_cleanly(number: signal.Signals, daemon: subprocess.Popen[str], tmp_path: Path) -> None:
     assert (tmp_path / "crane0").stat().st_mode & 0o777 == 0o660
     daemon.send_signal(number)
-    assert daemon.wait(PATIENCE_S) == 0
+    assert daemon.wait(TIMEOUT_S) == 0
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_living_bus_is_not_taken_over(daemon: subprocess.Popen[str], tmp_path: Path) -> None:
+def test_a_running_bus_is_not_taken_over(daemon: subprocess.Popen[str], tmp_path: Path) -> None:
     result = run_daemon("--bus", "crane0:1000000", "--dir", str(tmp_path))
     assert result.returncode == 4 and "is another wire daemon running?" in result.stderr
     with open_bus("wire:crane0"):
@@ -132,7 +132,7 @@ def test_faults_act_and_heal_by_control_messages(daemon: subprocess.Popen[str]) 
 
         control("crane0", {"inject": Fault(Kind.ERROR, node="left").to_json()})
         a.send(0x100, b"never")
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while a.stats.state is not BusState.OFF:
             assert time.monotonic() < deadline
             select.select([a], [], [], 1.0)
@@ -166,7 +166,7 @@ def test_a_client_that_breaks_the_protocol_is_dropped(
     packet: bytes, daemon: subprocess.Popen[str], tmp_path: Path
 ) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
-        sock.settimeout(PATIENCE_S)
+        sock.settimeout(TIMEOUT_S)
         sock.connect(str(tmp_path / "crane0"))
         sock.send(packet)
         assert sock.recv(100) == b""
@@ -176,7 +176,7 @@ def test_a_client_that_breaks_the_protocol_is_dropped(
 def test_a_client_that_sends_half_a_record_is_dropped(daemon: subprocess.Popen[str], tmp_path: Path) -> None:
     hello = {"hello": {"name": "half", "filters": None, "receive_own": False, "tx_queue": 10}}
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
-        sock.settimeout(PATIENCE_S)
+        sock.settimeout(TIMEOUT_S)
         sock.connect(str(tmp_path / "crane0"))
         sock.send(RECORD.pack(0, 0, b"", 0, CONTROL, 0, 0) + json.dumps(hello).encode())
         sock.recv(1000)
@@ -185,7 +185,7 @@ def test_a_client_that_sends_half_a_record_is_dropped(daemon: subprocess.Popen[s
     assert control("crane0", {"stats": True})["nodes"] == []
 
 
-def test_the_last_frames_of_a_client_that_never_read_still_count(daemon: subprocess.Popen[str], tmp_path: Path) -> None:
+def test_the_last_frames_of_a_client_that_never_read_are_sent(daemon: subprocess.Popen[str], tmp_path: Path) -> None:
     hello = {"hello": {"name": "mute", "filters": None, "receive_own": False, "tx_queue": 10}}
     with open_bus("wire:crane0") as bus:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
@@ -193,15 +193,15 @@ def test_the_last_frames_of_a_client_that_never_read_still_count(daemon: subproc
             sock.send(RECORD.pack(0, 0, b"", 0, CONTROL, 0, 0) + json.dumps(hello).encode())
             sock.recv(1000)
             bus.send(0x100, b"")
-            assert select.select([sock], [], [], PATIENCE_S)[0]
+            assert select.select([sock], [], [], TIMEOUT_S)[0]
             sock.send(RECORD.pack(0x200, 3, b"bye", 0, 0, 0, 0))
         assert [(frame.key, frame.data) for frame in receive(bus, 1)] == [(0x200, b"bye")]
 
 
-def test_room_comes_back_for_a_frame_that_the_bus_refuses(daemon: subprocess.Popen[str]) -> None:
+def test_a_frame_refused_by_the_bus_frees_its_place_in_the_queue(daemon: subprocess.Popen[str]) -> None:
     with open_bus("wire:crane0", tx_queue=1) as a, open_bus("wire:crane0") as b:
         assert a.send(ERROR, b"")
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not a.send(0x100, b""):
             assert time.monotonic() < deadline
         assert [frame.key for frame in receive(b, 1)] == [0x100]
@@ -245,14 +245,14 @@ def test_a_client_that_never_reads_loses_frames_alone(daemon: subprocess.Popen[s
         quick.drain(frames)
         assert quick.stats.dropped == 0 and len({frame.stamp_ns for frame in frames}) == len(frames)
         while not slow.stats.dropped:
-            assert select.select([slow], [], [], PATIENCE_S)[0]
+            assert select.select([slow], [], [], TIMEOUT_S)[0]
             slow.drain([])
 
 
-def test_a_lone_sender_tries_until_somebody_joins(daemon: subprocess.Popen[str]) -> None:
+def test_a_lone_sender_retries_until_another_node_joins(daemon: subprocess.Popen[str]) -> None:
     with open_bus("wire:crane0") as bus:
         bus.send(0x100, b"")
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while bus.stats.state is not BusState.PASSIVE:
             assert time.monotonic() < deadline
             select.select([bus], [], [], 1.0)

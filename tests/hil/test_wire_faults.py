@@ -1,4 +1,4 @@
-"""Every kind of damage, its window and aim, and that the seed decides alone."""
+"""Every kind of fault, its window and selection, and its reproducibility."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ def test_delay_and_repeat_shift_the_reception_and_its_stamp() -> None:
     assert [frame.stamp_ns - stamp_ns for frame in b.take()] == [7 * MS, 9 * MS, 11 * MS]
 
 
-def test_receivers_see_time_run_forward_even_when_frames_are_late() -> None:
+def test_stamps_never_decrease_even_when_frames_are_delayed() -> None:
     core, a, b = setup(Fault(Kind.DELAY, key=0x100, mask=0x7FF, shift_ns=1_234_567))
     traffic(core, a, 20 * MS)
     stamps = [frame.stamp_ns for frame in b.take()]
     assert len(stamps) > 30 and stamps == sorted(stamps)
 
 
-def test_corrupt_flips_just_so_many_bits_and_nobody_notices() -> None:
+def test_corrupt_flips_the_given_number_of_bits_undetected() -> None:
     core, a, b = setup(Fault(Kind.CORRUPT, count=3, key=0x100, mask=0x7FF))
     traffic(core, a, 50 * MS)
     for frame in data_frames(b):
@@ -88,7 +88,7 @@ def test_errors_on_one_node_drive_it_off_within_milliseconds() -> None:
     assert core.errors == 32
 
 
-def test_probability_hits_its_share_and_the_seed_decides() -> None:
+def test_a_fault_hits_with_its_probability_reproducibly() -> None:
     def survivors(seed: int) -> list[int]:
         core, a, b = setup(Fault(Kind.DROP, probability=0.3, seed=seed))
         traffic(core, a, 1000 * MS, (0x100,))
@@ -110,13 +110,13 @@ def test_a_babbling_node_takes_the_whole_bus_and_then_stops() -> None:
     assert own[-1] == 19 and len(core.nodes) == 2
 
 
-def test_a_babbling_node_may_keep_a_pace() -> None:
+def test_a_babbling_node_can_have_a_period() -> None:
     core, _, b = setup(Fault(Kind.BABBLE, 0, 10 * MS, key=0x7FF, shift_ns=MS, node="noise", data=b"\1"))
     core.advance(10 * MS)
     assert 8 <= len(data_frames(b)) <= 10
 
 
-def test_a_cut_node_is_alone_and_then_comes_back() -> None:
+def test_a_cut_node_is_isolated_and_reconnects() -> None:
     core, a, b = setup(Fault(Kind.CUT, 5 * MS, 30 * MS, node="a"))
     c = core.attach("c")
     traffic(core, a, 20 * MS, (0x100,))
@@ -129,7 +129,7 @@ def test_a_cut_node_is_alone_and_then_comes_back() -> None:
     assert all(frame.stamp_ns > 30 * MS for frame in data_frames(b)[5:])
 
 
-def test_a_cut_bus_leaves_everyone_alone_even_those_who_join_later() -> None:
+def test_a_cut_bus_isolates_every_node_including_later_ones() -> None:
     core, a, b = setup(Fault(Kind.CUT, 5 * MS))
     traffic(core, a, 20 * MS, (0x100,))
     c = core.attach("c")
@@ -139,7 +139,7 @@ def test_a_cut_bus_leaves_everyone_alone_even_those_who_join_later() -> None:
     assert len(data_frames(b)) == 5 and c.rx == []
 
 
-def test_a_cut_changes_nothing_in_the_past() -> None:
+def test_a_cut_does_not_change_the_past() -> None:
     """A frame that waited behind a babbling node is tried only after the cut, on a cable of its own."""
     core, a, b = setup(Fault(Kind.BABBLE, end_ns=10 * MS, key=0), Fault(Kind.CUT, 5 * MS, node="a"))
     core.submit(a, 0x700, b"")
@@ -148,7 +148,7 @@ def test_a_cut_changes_nothing_in_the_past() -> None:
     assert core.busy_ns <= 10 * MS + 65_000 and b.rx
 
 
-def test_a_cut_and_its_end_do_not_wake_a_node_that_is_off() -> None:
+def test_a_cut_and_its_end_do_not_restart_a_bus_off_node() -> None:
     core = WireCore(1_000_000, restart_ns=0)
     a, b = core.attach("a"), core.attach("b")
     core.inject(Fault(Kind.ERROR, end_ns=10 * MS))
@@ -163,7 +163,7 @@ def test_a_cut_and_its_end_do_not_wake_a_node_that_is_off() -> None:
     assert a.rx == [] and b.done == 1
 
 
-def test_healing_takes_every_fault_away() -> None:
+def test_healing_removes_every_fault() -> None:
     core, a, b = setup(
         Fault(Kind.DROP, key=0x100, mask=0x7FF),
         Fault(Kind.CUT, node="b"),
@@ -206,6 +206,6 @@ def test_a_fault_survives_json(fault: Fault) -> None:
         {"kind": "babble", "data": "00" * 9},
     ],
 )
-def test_a_senseless_fault_is_refused(fields: dict[str, object]) -> None:
+def test_a_malformed_fault_is_refused(fields: dict[str, object]) -> None:
     with pytest.raises((ValueError, TypeError)):
         Fault.from_json(fields)

@@ -63,7 +63,7 @@ def test_all_zeros_are_stuffed_after_every_fifth_bit() -> None:
 
 
 @given(KEYS, KEYS)
-def test_priority_orders_as_the_bits_on_the_bus(left: int, right: int) -> None:
+def test_priority_has_the_order_of_the_arbitration_bits(left: int, right: int) -> None:
     """The first differing bit decides, dominant (0) wins: the order of the strings."""
     one, other = arbitration_field(left).ljust(32, "0"), arbitration_field(right).ljust(32, "0")
     assert (priority(left) < priority(right)) == (one < other)

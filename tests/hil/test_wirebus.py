@@ -20,7 +20,7 @@ from can_dbc.bus.wirebus import WireBus
 from hil.wire.faults import Fault, Kind
 from hil.wire.launch import wire_daemon
 
-PATIENCE_S = 10.0
+TIMEOUT_S = 10.0
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_messages_pass_unchanged(message: can.Message, daemon: object) -> None:
     with WireBus("crane0") as a, WireBus("crane0") as b:
         before_s = time.time()
         a.send(message)
-        received = b.recv(PATIENCE_S)
+        received = b.recv(TIMEOUT_S)
         assert received is not None and received.equals(message, None, check_channel=False, check_direction=False)
         assert before_s - 0.1 < received.timestamp < time.time() + 0.1
         assert received.channel == "crane0"
@@ -65,9 +65,9 @@ def test_recv_times_out_and_own_messages_come_only_when_asked_for(daemon: object
     message = can.Message(arbitration_id=1, is_extended_id=False)
     with WireBus("crane0") as a, WireBus("crane0", receive_own_messages=True) as b:
         a.send(message)
-        assert b.recv(PATIENCE_S) is not None
+        assert b.recv(TIMEOUT_S) is not None
         b.send(message)
-        assert b.recv(PATIENCE_S) is not None and a.recv(PATIENCE_S) is not None
+        assert b.recv(TIMEOUT_S) is not None and a.recv(TIMEOUT_S) is not None
         assert a.recv(0) is None and a.recv(0.01) is None
 
 
@@ -76,7 +76,7 @@ def test_filters_of_python_can_apply(daemon: object) -> None:
     with WireBus("crane0") as a, WireBus("crane0", can_filters=wanted) as b:
         for identifier, extended in ((0x130, False), (0x123, True), (0x125, False)):
             a.send(can.Message(arbitration_id=identifier, is_extended_id=extended))
-        received = b.recv(PATIENCE_S)
+        received = b.recv(TIMEOUT_S)
         assert received is not None and received.arbitration_id == 0x125
 
 
@@ -90,9 +90,9 @@ def test_send_waits_for_room_as_long_as_it_may(daemon: object) -> None:
             with pytest.raises(can.CanOperationError, match="queue is full"):
                 a.send(message, timeout=timeout_s)
         with WireBus("crane0") as b:
-            a.send(message, timeout=PATIENCE_S)
+            a.send(message, timeout=TIMEOUT_S)
             a.send(message)
-            assert all(b.recv(PATIENCE_S) for _ in range(4))
+            assert all(b.recv(TIMEOUT_S) for _ in range(4))
 
 
 def test_what_classical_can_does_not_carry_is_refused(daemon: object) -> None:
@@ -106,7 +106,7 @@ def test_error_frames_are_messages_and_set_the_state(daemon: object) -> None:
     with WireBus("crane0") as bus:
         assert bus.state is can.BusState.ACTIVE
         bus.send(can.Message(arbitration_id=1, is_extended_id=False))  # nobody acknowledges
-        messages = [bus.recv(PATIENCE_S) for _ in range(16)]
+        messages = [bus.recv(TIMEOUT_S) for _ in range(16)]
         assert all(message is not None and message.is_error_frame for message in messages)
         assert bus.state is can.BusState.PASSIVE
 
@@ -132,7 +132,7 @@ def test_a_notifier_hears_a_periodic_task(daemon: object) -> None:
         notifier = can.Notifier(b, [heard.put], timeout=0.1)
         try:
             a.send_periodic(can.Message(arbitration_id=0x80, is_extended_id=False), 0.002)
-            assert [heard.get(timeout=PATIENCE_S).arbitration_id for _ in range(20)] == [0x80] * 20
+            assert [heard.get(timeout=TIMEOUT_S).arbitration_id for _ in range(20)] == [0x80] * 20
         finally:
             a.stop_all_periodic_tasks()
             notifier.stop()
@@ -146,13 +146,13 @@ def test_logger_and_player_of_python_can_join(tool_environment: None, daemon: ob
     join = ["-i", "timberhand", "-c", "crane0"]
     logger = subprocess.Popen([sys.executable, "-u", "-m", "can.logger", *join], stdout=subprocess.PIPE, text=True)
     try:
-        deadline = time.monotonic() + 2 * PATIENCE_S
+        deadline = time.monotonic() + 2 * TIMEOUT_S
         while not control("crane0", {"stats": True})["nodes"]:
             assert time.monotonic() < deadline and logger.poll() is None
             time.sleep(0.02)
         command = [sys.executable, "-m", "can.player", *join, str(log)]
         subprocess.run(command, check=True, timeout=30, stdout=subprocess.DEVNULL)
-        watchdog = threading.Timer(PATIENCE_S, logger.kill)
+        watchdog = threading.Timer(TIMEOUT_S, logger.kill)
         watchdog.start()
         printed: list[tuple[str, str]] = []
         for line in logger.stdout:
@@ -171,7 +171,7 @@ def test_faults_reach_python_can_programs_too(daemon: object) -> None:
     with WireBus("crane0") as a, WireBus("crane0") as b:
         control("crane0", {"inject": Fault(Kind.REPEAT, count=2).to_json()})
         a.send(can.Message(arbitration_id=5, is_extended_id=False))
-        assert [b.recv(PATIENCE_S).arbitration_id for _ in range(3)] == [5, 5, 5]
+        assert [b.recv(TIMEOUT_S).arbitration_id for _ in range(3)] == [5, 5, 5]
 
 
 def test_the_output_buffer_can_be_emptied(daemon: object) -> None:
@@ -181,10 +181,10 @@ def test_the_output_buffer_can_be_emptied(daemon: object) -> None:
             a.send(can.Message(arbitration_id=0x100 + i, is_extended_id=False))
         a.flush_tx_buffer()
         with WireBus("crane0") as b:
-            a.send(can.Message(arbitration_id=0x200, is_extended_id=False), timeout=PATIENCE_S)
-            seen = [b.recv(PATIENCE_S)]
+            a.send(can.Message(arbitration_id=0x200, is_extended_id=False), timeout=TIMEOUT_S)
+            seen = [b.recv(TIMEOUT_S)]
             while seen[-1] is not None and seen[-1].arbitration_id != 0x200:
-                seen.append(b.recv(PATIENCE_S))
+                seen.append(b.recv(TIMEOUT_S))
             # What a closed participant of another test still had in its queue goes out too, once somebody hears it.
             own = [
                 m and m.arbitration_id for m in seen if m is None or m.arbitration_id in (0x200, *range(0x100, 0x10A))

@@ -20,7 +20,7 @@ LAB = [sys.executable, "-m", "host.vcan_lab"]
 REQUEST = Request(
     argv=("true",), cwd="/", env={"A": "b"}, uid=1000, gid=100, groups=(100, 4), umask=0o22, mem_mb=256
 )  # fmt: skip
-PATIENCE_S = 30.0
+TIMEOUT_S = 30.0
 Run = Callable[..., subprocess.CompletedProcess[bytes]]
 
 
@@ -54,7 +54,7 @@ def descendants(pid: int) -> set[int]:
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while not condition():
         assert time.monotonic() < deadline, what
         time.sleep(0.02)

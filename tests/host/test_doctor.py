@@ -312,7 +312,7 @@ def contents(root: Path) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_tuning_is_shown_done_once_and_undone(computer: Path) -> None:
+def test_tuning_is_shown_applied_once_and_undone(computer: Path) -> None:
     before = contents(computer)
     shown = tune(computer, "--cpu", "3")
     assert shown.returncode == 0, shown.stderr
@@ -349,7 +349,7 @@ def test_tuning_is_shown_done_once_and_undone(computer: Path) -> None:
 
 
 @pytest.mark.slow
-def test_without_a_processor_only_what_serves_all_is_changed(computer: Path) -> None:
+def test_without_a_processor_only_global_settings_change(computer: Path) -> None:
     assert tune(computer, "--apply").returncode == 0
     governors = [p.read_text() for p in sorted(computer.glob("sys/devices/system/cpu/cpu*/cpufreq/scaling_governor"))]
     assert governors == ["performance\n"] * 4

@@ -1,4 +1,4 @@
-"""The services under a real systemd in user-mode Linux: the whole lab, and what it is built from."""
+"""The services under a real systemd in user-mode Linux."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_controller_and_guard_die_and_lose_their_bus_and_the_valves_are_neutral() -> None:
+def test_the_valves_are_neutral_after_every_failure_of_controller_guard_and_bus() -> None:
     if fault := missing():
         pytest.skip(f"service lab: {fault}")
     done = subprocess.run(
@@ -36,7 +36,7 @@ def test_controller_and_guard_die_and_lose_their_bus_and_the_valves_are_neutral(
         pytest.skip(f"inconclusive: {result['inconclusive']}")
 
 
-def test_the_states_that_count_as_moving_are_the_valve_nodes_own() -> None:
+def test_the_moving_states_are_those_of_the_valve_node() -> None:
     from sim.nodes.valve import ValveState
 
     assert set(MOVING) == {ValveState.ACTIVE, ValveState.RAMP}

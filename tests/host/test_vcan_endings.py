@@ -1,4 +1,4 @@
-"""How runs in the vcan lab end, and that nothing is left behind."""
+"""The end of runs in the vcan lab, without leftovers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.host.lab_runs import LAB, PATIENCE_S, ROOT, Run, descendants, environment, require_lab, wait_until
+from tests.host.lab_runs import LAB, ROOT, TIMEOUT_S, Run, descendants, environment, require_lab, wait_until
 
 
 @pytest.mark.slow
@@ -27,7 +27,7 @@ def test_how_a_command_ends(lab: Run, command: list[str], status: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("deaths", [1, 2])
-def test_a_guest_that_dies_before_the_command_is_booted_once_more(lab: Run, tmp_path: Path, deaths: int) -> None:
+def test_a_guest_that_dies_before_the_command_boots_once_more(lab: Run, tmp_path: Path, deaths: int) -> None:
     real = shutil.which("linux.uml")
     if real is None:
         pytest.skip("linux.uml is missing (apt-get install user-mode-linux)")
@@ -46,7 +46,7 @@ echo "a sad end"
 
 
 @pytest.mark.slow
-def test_a_command_out_of_time_is_ended_even_if_it_will_not(
+def test_a_command_over_its_time_limit_is_killed(
     lab: Run,
 ) -> None:
     done = lab("--timeout", "2", "--", "sh", "-c", "trap 'echo told; trap \"\" TERM' TERM; while :; do :; done")
@@ -54,11 +54,11 @@ def test_a_command_out_of_time_is_ended_even_if_it_will_not(
 
 
 @pytest.mark.slow
-def test_a_reader_that_goes_away_ends_the_writer(lab: Run) -> None:
+def test_a_closed_reader_ends_the_writer(lab: Run) -> None:
     endless = subprocess.Popen([*LAB, "--", "yes"], cwd=ROOT, env=environment(), stdout=subprocess.PIPE)
     assert endless.stdout and endless.stdout.readline() == b"y\n"
     endless.stdout.close()
-    assert endless.wait(PATIENCE_S) == 128 + signal.SIGPIPE
+    assert endless.wait(TIMEOUT_S) == 128 + signal.SIGPIPE
 
 
 @pytest.mark.slow
@@ -76,7 +76,7 @@ def test_a_lab_leaves_nothing_behind(number: signal.Signals, tmp_path: Path) -> 
     below = descendants(wrapper.pid)
     assert len(below) >= (4 if way == "uml" else 2)
     wrapper.send_signal(number)
-    assert wrapper.wait(PATIENCE_S) == (130 if number == signal.SIGINT else -signal.SIGKILL)
+    assert wrapper.wait(TIMEOUT_S) == (130 if number == signal.SIGINT else -signal.SIGKILL)
     wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in below), f"left behind: {below}")
     assert list(temporary.iterdir()) == []
 
@@ -94,13 +94,13 @@ def test_a_killed_user_mode_kernel_is_reported(tmp_path: Path) -> None:
     keeper = min(below)
     kernel = min(descendants(keeper))
     os.kill(kernel, signal.SIGKILL)
-    _, complaint = wrapper.communicate(timeout=PATIENCE_S)
+    _, complaint = wrapper.communicate(timeout=TIMEOUT_S)
     assert wrapper.returncode == 4
     assert b"the guest died" in complaint
     wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in below), f"left behind: {below}")
 
 
-def test_a_command_that_ends_before_it_is_looked_at_is_heard_of() -> None:
+def test_a_command_that_ends_at_once_is_reported() -> None:
     """The starting call returns when the command is over: its status must still come to the supervisor."""
     script = (
         "import json, os, socket, subprocess\n"
@@ -116,12 +116,12 @@ def test_a_command_that_ends_before_it_is_looked_at_is_heard_of() -> None:
         "print(near.recv(999).decode())\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, env=environment(), capture_output=True, timeout=PATIENCE_S, check=True
+        [sys.executable, "-c", script], cwd=ROOT, env=environment(), capture_output=True, timeout=TIMEOUT_S, check=True
     )  # fmt: skip
     assert b'{"exit": 7}' in done.stdout
 
 
-def test_what_the_command_leaves_behind_is_ended_natively_too(tmp_path: Path) -> None:
+def test_leftover_processes_are_ended_natively_too(tmp_path: Path) -> None:
     """A process that left the command's group and session is still below the lab."""
     script = (
         "import os, sys; from host.vcan_lab.choose import Method; from host.vcan_lab.host import run\n"
@@ -131,7 +131,7 @@ def test_what_the_command_leaves_behind_is_ended_natively_too(tmp_path: Path) ->
         "                  groups=tuple(os.getgroups()), umask=0o22)\n"
         "sys.exit(run(request, Method('existing', 'for this test', None)))\n"
     )
-    done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], cwd=ROOT, timeout=PATIENCE_S)
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], cwd=ROOT, timeout=TIMEOUT_S)
     assert done.returncode == 0
     left = int((tmp_path / "left").read_text())
     wait_until(lambda: not Path(f"/proc/{left}").exists(), f"process {left} is left behind")

@@ -1,4 +1,4 @@
-"""Real runs in the vcan lab on this machine, and what it says where it cannot run."""
+"""Real runs in the vcan lab on this computer, and its errors where it cannot run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from host.vcan_lab import lab_kernel, shim
 from host.vcan_lab.choose import survey
-from tests.host.lab_runs import LAB, PATIENCE_S, REQUEST, ROOT, Run, environment, require_lab
+from tests.host.lab_runs import LAB, REQUEST, ROOT, TIMEOUT_S, Run, environment, require_lab
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_candump_sees_a_frame_from_a_python_socket(lab: Run) -> None:
 
 
 @pytest.mark.slow
-def test_files_written_inside_lie_outside_whatever_the_folder(lab: Run, tmp_path: Path) -> None:
+def test_files_written_inside_appear_on_the_host(lab: Run, tmp_path: Path) -> None:
     """Working directory, temporary directory: with a space and a letter beyond ASCII; two labs at once."""
     odd = tmp_path / "an odd földer"
     odd.mkdir()
@@ -69,7 +69,7 @@ def test_files_written_inside_lie_outside_whatever_the_folder(lab: Run, tmp_path
         cwd=odd, env=environment(), stdout=subprocess.PIPE,
     )  # fmt: skip
     done = lab("--", "sh", "-c", script, cwd=odd, TMPDIR=str(odd))
-    assert b"vcan1" in beside.communicate(timeout=PATIENCE_S)[0]
+    assert b"vcan1" in beside.communicate(timeout=TIMEOUT_S)[0]
     made = Path(os.fsdecode(done.stdout.strip()))
     assert done.returncode == beside.returncode == 0
     assert sorted(odd.iterdir()) == sorted([odd / "log.txt", odd / "big", odd / "beside.txt", made])
@@ -78,7 +78,7 @@ def test_files_written_inside_lie_outside_whatever_the_folder(lab: Run, tmp_path
 
 
 @pytest.mark.slow
-def test_the_shim_does_no_harm_where_it_is_not_needed(lab: Run, tmp_path: Path) -> None:
+def test_the_shim_is_harmless_where_it_is_not_needed(lab: Run, tmp_path: Path) -> None:
     if require_lab() != "uml" or not any(Path(folder, "cc").exists() for folder in os.get_exec_path()):
         pytest.skip("needs user-mode Linux and a C compiler")
     wrapper = (
@@ -95,7 +95,7 @@ def test_the_shim_does_no_harm_where_it_is_not_needed(lab: Run, tmp_path: Path) 
     assert [path.name for path in (cache / "timberhand").iterdir()] == ["xstate_shim.so"]
 
 
-def test_check_prints_the_way_and_why() -> None:
+def test_check_prints_the_method_and_the_reason() -> None:
     done = subprocess.run([*LAB, "--check", "--json"], cwd=ROOT, env=environment(), capture_output=True, check=False)
     found = json.loads(done.stdout)
     assert set(found) - {"code"} == {"way", "why", "kernel", "links"}
@@ -124,14 +124,14 @@ def test_without_the_own_kernel_simulated_time_is_refused_in_one_sentence(tmp_pa
 
 
 @pytest.mark.slow
-def test_an_hour_of_simulated_time_takes_no_hour_and_is_the_same_twice() -> None:
+def test_an_hour_of_simulated_time_is_short_and_reproducible() -> None:
     if lab_kernel.find(shim.user_cache()) is None:
         pytest.skip(lab_kernel.MISSING)
     script = "import time; print(time.monotonic_ns()); time.sleep(3600); print(time.monotonic_ns() // 1000_000)"
     runs = [
         subprocess.run(
             [*LAB, "--time-travel", "--", sys.executable, "-B", "-c", script],
-            cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=PATIENCE_S, check=True,
+            cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=TIMEOUT_S, check=True,
         ).stdout.split()
         for _ in range(2)
     ]  # fmt: skip

@@ -11,7 +11,7 @@ from tests.codes import coded
 from tests.host.lab_runs import REQUEST
 
 
-def test_the_order_carries_the_caller_and_the_lab() -> None:
+def test_the_order_contains_the_caller_and_the_lab() -> None:
     text = order(REQUEST, "uml", new_links=True)
     assert text["user"] == [1000, 100, [100, 4]]
     assert text["links"] == ["vcan0", "vcan1"]
@@ -20,7 +20,7 @@ def test_the_order_carries_the_caller_and_the_lab() -> None:
     assert order(replace(REQUEST, root=True), "uml", new_links=True)["user"] is None
 
 
-def test_existing_interfaces_are_not_made_again() -> None:
+def test_existing_interfaces_are_not_created_again() -> None:
     assert order(REQUEST, "native", new_links=False)["links"] == []
 
 
@@ -33,7 +33,7 @@ def test_existing_interfaces_are_not_made_again() -> None:
         (REQUEST, ["/dev/shm/venv"]),
     ],
 )
-def test_what_lies_in_shared_memory_stays_in_sight(request_: Request, needed: list[str]) -> None:
+def test_needed_files_in_shared_memory_stay_visible(request_: Request, needed: list[str]) -> None:
     assert order(request_, "uml", True, needed)["host_shm"]
 
 
@@ -62,5 +62,5 @@ def test_an_impossible_interface_name_is_refused(name: str) -> None:
     assert link_fault(name)
 
 
-def test_an_interface_name_passes() -> None:
+def test_a_valid_interface_name_is_accepted() -> None:
     assert link_fault("fifteen-letters") is None

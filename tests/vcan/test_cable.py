@@ -16,7 +16,7 @@ from can_dbc.bus.factory import open_bus
 from can_dbc.frame import Frame
 from hil.wire.launch import wire_daemon
 
-PATIENCE_S = 10.0
+TIMEOUT_S = 10.0
 LEFT, RIGHT = "left0", "right0"
 
 
@@ -43,7 +43,7 @@ def ip(*arguments: str) -> None:
 
 
 @pytest.mark.parametrize("way", ["down", "delete"])
-def test_an_interface_that_was_lost_is_plugged_in_again(way: str, cable: None) -> None:
+def test_a_lost_interface_rejoins(way: str, cable: None) -> None:
     with open_bus(f"socketcan:{RIGHT}") as right:
         if way == "down":
             ip("link", "set", LEFT, "down")
@@ -57,7 +57,7 @@ def test_an_interface_that_was_lost_is_plugged_in_again(way: str, cable: None) -
 
 def carries(sender: Bus, receiver: Bus, key: int) -> bool:
     """Sends until a frame has gone through the cable."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     frames: list[Frame] = []
     while key not in [frame.key for frame in frames]:
         assert time.monotonic() < deadline, f"{sender.name} does not reach {receiver.name}"

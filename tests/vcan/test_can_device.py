@@ -118,7 +118,7 @@ def state_becomes(bus: Bus, state: BusState) -> None:
     wait(f"the state becomes {state.name}", lambda: bus.drain([]) or bus.stats.state is state)
 
 
-def test_the_states_of_the_controller_are_told_with_its_counters(adapter: Adapter) -> None:
+def test_states_of_the_can_controller_are_reported_with_their_counters(adapter: Adapter) -> None:
     with open_bus(f"socketcan:{adapter.link}") as bus:
         for state, wanted, errors in (
             ("w", BusState.WARNING, 100), ("p", BusState.PASSIVE, 130), ("a", BusState.ACTIVE, 5),
@@ -129,7 +129,7 @@ def test_the_states_of_the_controller_are_told_with_its_counters(adapter: Adapte
         assert (bus.stats.error_frames, bus.stats.recoveries) == (3, 0)
 
 
-def test_bus_off_refuses_and_what_waited_never_goes_out(adapter: Adapter) -> None:
+def test_bus_off_refuses_frames_and_drops_the_queue(adapter: Adapter) -> None:
     """Without restart-ms the link has to be set down and up; the kernel empties its queue, we read anew."""
     with open_bus(f"socketcan:{adapter.link}") as bus, open_bus(f"socketcan:{adapter.link}") as other:
         bus.send_all([(0x100 + i, b"") for i in range(QUEUE)])
@@ -172,7 +172,7 @@ def test_a_link_that_is_up_but_bus_off_is_not_back(adapter: Adapter) -> None:
         assert not late.reopen() and late.stats.state is BusState.DOWN
 
 
-def test_an_adapter_that_recovers_by_itself_is_believed(adapter: Adapter) -> None:
+def test_the_automatic_recovery_of_an_adapter_is_recognized(adapter: Adapter) -> None:
     with open_bus(f"socketcan:{adapter.link}") as bus:
         adapter.report("b")
         state_becomes(bus, BusState.OFF)

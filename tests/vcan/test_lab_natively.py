@@ -1,4 +1,4 @@
-"""The lab's native ways, tried inside the lab: there is a kernel with CAN and vcan, whatever the host has."""
+"""The native methods of the lab, tested inside the lab, where the kernel has CAN and vcan."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 
 @pytest.mark.parametrize(("link", "way"), [("vcan0", "existing"), ("nest0", "namespace")])
-def test_a_kernel_with_can_needs_no_second_one(link: str, way: str) -> None:
+def test_a_kernel_with_can_needs_no_user_mode_kernel(link: str, way: str) -> None:
     command = ["sh", "-c", f'echo "$TIMBERHAND_LAB" $(cat); ip link show {link} >&2 && kill -HUP $$']
     done = subprocess.run(
         [sys.executable, "-m", "host.vcan_lab", "-v", "--link", link, "--", *command], capture_output=True, check=False

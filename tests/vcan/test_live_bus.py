@@ -1,4 +1,4 @@
-"""What the project relies on from a kernel's CAN: frames, kinds, filters, python-can, our processes on two buses."""
+"""The features of the kernel's CAN that timberhand relies on: frames, filters, python-can, processes on two buses."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.frame import EXTENDED, Frame
 
 RAW = struct.Struct("=IB3x8s")
-PATIENCE_S = 10.0
+TIMEOUT_S = 10.0
 CYCLE_NS = 5_000_000
 
 
 def wait_for(bus: Bus, count: int) -> list[Frame]:
     frames: list[Frame] = []
     while len(frames) < count:
-        assert select.select([bus.fileno()], [], [], PATIENCE_S)[0], f"{len(frames)} of {count} frames arrived"
+        assert select.select([bus.fileno()], [], [], TIMEOUT_S)[0], f"{len(frames)} of {count} frames arrived"
         bus.drain(frames)
     return frames
 
 
-def test_the_logical_buses_find_their_interfaces(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_logical_buses_map_to_their_interfaces(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("TIMBERHAND_CRANE0", "TIMBERHAND_MACH0"):
         monkeypatch.delenv(name, raising=False)
     present = {name for _, name in socket.if_nameindex()}
@@ -56,7 +56,7 @@ def test_python_can_and_our_bus_read_each_other(extended: bool) -> None:
         theirs.send(can.Message(arbitration_id=0x123, is_extended_id=extended, data=b"to us"))
         assert [(f.key, f.data) for f in wait_for(ours, 1)] == [(key, b"to us")]
         assert ours.send(key, b"to them")
-        message = theirs.recv(PATIENCE_S)
+        message = theirs.recv(TIMEOUT_S)
         assert message is not None
         assert (message.arbitration_id, message.is_extended_id, bytes(message.data)) == (0x123, extended, b"to them")
 
@@ -121,13 +121,13 @@ def test_every_sync_is_answered_by_another_process() -> None:
         while len(frames) < 6 * cycles:
             frames += wait_for(bus, 1)
         bus.send(0x7FF, b"")
-    assert answerer.wait(PATIENCE_S) == 0
+    assert answerer.wait(TIMEOUT_S) == 0
     expected = [(0x181 + node, struct.pack("<I", cycle)) for cycle in range(cycles) for node in range(6)]
     assert [(f.key, f.data) for f in frames] == expected
 
 
 @pytest.mark.parametrize("tool", ["candump", "cansend"])
-def test_can_utils_talk_to_our_bus(tool: str) -> None:
+def test_can_utils_exchange_frames_with_our_bus(tool: str) -> None:
     try:
         with open_bus("socketcan:vcan0") as bus:
             if tool == "cansend":

@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from can_dbc.bus.reconnector import FIRST_RETRY_NS, RETRY_PERIOD_NS
 from can_dbc.dbc import codec
 from can_dbc.frame import Frame
 from can_dbc.trace.candump import read_trace
-from can_dbc.bus.reconnector import FIRST_RETRY_NS, RETRY_PERIOD_NS
 from controller.config import load as load_settings
 from controller.guard.__main__ import PERIOD_NS as GUARD_PERIOD_NS
 from host.service_lab.pilot import LEASE_NS
@@ -182,7 +182,7 @@ def test_heartbeats_keep_their_period(run: Recording, name: str) -> None:
     assert all(abs(b - a - HEARTBEAT_NS) <= CODE_NS for a, b in pairwise(stamps[1:]))
 
 
-def test_a_lease_that_ends_slows_down_and_is_neutral_after_the_ramp(run: Recording) -> None:
+def test_an_expired_lease_ramps_down_to_neutral(run: Recording) -> None:
     """The first tick at its end or after it begins the profile's ramp; the pilot's last knot is no later."""
     end_ns, ramp_ns = run.page["setpoint"] + LEASE_NS, SETTINGS.profile.timeouts.stop_ramp_ms * MS
     neutral_ns = run.first("ValveCmdA", run.page["setpoint"], neutral)
@@ -204,7 +204,7 @@ def test_an_emergency_stop_is_neutral_at_the_next_tick(run: Recording) -> None:
     assert run.reason(Mode.FAULT, pressed_ns) is Reason.ESTOP_PRESSED
 
 
-def test_the_valve_node_goes_neutral_by_itself_when_the_controller_hangs(run: Recording) -> None:
+def test_the_valve_node_goes_to_neutral_when_the_controller_hangs(run: Recording) -> None:
     """SYNC is missed first; then the node's own ramp, its fault, and the pilot is off."""
     frozen_ns = run.page["frozen"]
     silent_ns = run.last("Sync", frozen_ns)
@@ -218,7 +218,7 @@ def test_the_valve_node_goes_neutral_by_itself_when_the_controller_hangs(run: Re
     assert 0 < off_ns - run.last("ValveCmdA", frozen_ns) - PILOT_NS <= NODES_STEP_NS + CYCLE_NS + CODE_NS
 
 
-def test_a_controller_that_wakes_late_skips_and_begins_neutral_and_disarmed(run: Recording) -> None:
+def test_a_controller_that_wakes_late_skips_ticks_and_restarts_disarmed(run: Recording) -> None:
     frozen_ns, thawed_ns = run.page["frozen"], run.page["thawed"]
     commands = [frame for frame in run.frames["ValveCmdA"] if frozen_ns <= frame.at_ns < thawed_ns + 20 * MS]
     assert len(commands) <= 4 + 1  # those of 20 ms, and none of the hundred that were missed
@@ -241,7 +241,7 @@ def test_without_the_guard_valves_and_controller_are_neutral_within_60_ms(run: R
 
 
 @pytest.mark.parametrize(("down", "up"), [("down", "up"), ("down_long", "up_long")])
-def test_an_interface_that_comes_back_is_used_again_neutral_and_disarmed(run: Recording, down: str, up: str) -> None:
+def test_a_returned_interface_is_used_again_disarmed(run: Recording, down: str, up: str) -> None:
     down_ns, up_ns = run.page[down], run.page[up]
     tries = [down_ns + FIRST_RETRY_NS + k * RETRY_PERIOD_NS for k in range(10)]
     due_ns = next(at_ns for at_ns in tries if at_ns >= up_ns)
@@ -253,7 +253,7 @@ def test_an_interface_that_comes_back_is_used_again_neutral_and_disarmed(run: Re
     assert run.reason(Mode.FAULT, back_ns) is Reason.BUS_DOWN
 
 
-def test_the_demonstration_in_simulated_time_misses_no_tick_and_loses_no_setpoint(
+def test_the_demo_in_simulated_time_misses_no_tick_and_no_setpoint(
     travel: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
     """Every process of it: on a host of any speed the machine is never stopped, for none of them is ever late."""

@@ -24,7 +24,7 @@ from machine.status.modes import Mode
 PROFILE = "palms_471"
 BUS = "socketcan:vcan0"
 SETPOINTS, REPORTS = 24701, 24702
-PATIENCE_S = 30.0
+TIMEOUT_S = 30.0
 
 
 def nodes() -> None:
@@ -87,7 +87,7 @@ class Run:
         return Mode(self.pilot.report.mode) if self.pilot.report else None
 
     def until(self, mode: Mode) -> None:
-        assert self.pilot.until(lambda: self.mode() is mode, PATIENCE_S), f"no {mode.name}: {self.pilot.report}"
+        assert self.pilot.until(lambda: self.mode() is mode, TIMEOUT_S), f"no {mode.name}: {self.pilot.report}"
 
     def wait(self, seconds: float) -> None:
         self.pilot.until(lambda: False, seconds)
@@ -96,7 +96,7 @@ class Run:
         """Bring the crane into motion from whatever mode, as a human and a planner would."""
         if self.mode() is Mode.FAULT:
             self.pilot.press(OperatorAction.RESET)
-        assert self.pilot.until(lambda: self.mode() in (Mode.STANDBY, Mode.STOP), PATIENCE_S), self.pilot.report
+        assert self.pilot.until(lambda: self.mode() in (Mode.STANDBY, Mode.STOP), TIMEOUT_S), self.pilot.report
         self.wait(0.3)
         self.pilot.press(OperatorAction.ARM)
         self.until(Mode.ARMED)

@@ -141,8 +141,8 @@ def _lockstep(
     from recorder.manifest import describe
     from recorder.recorder import Recorder, RecordingRefused
 
-    pressed: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+    interrupts: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
     recorder = None
     try:
         buses = tuple(bus for bus in (profile.crane_bus, profile.machine_bus) if bus)
@@ -150,7 +150,8 @@ def _lockstep(
         with _Progress(screen) as progress:
             outcome = run_lockstep(
                 name, truth, seed, surveyed=surveyed, recorder=recorder,
-                show=lambda plan: _confirm(profile, plan, yes=True), watch=progress.show, aborted=lambda: bool(pressed),
+                show=lambda plan: _confirm(profile, plan, yes=True), watch=progress.show,
+                aborted=lambda: bool(interrupts),
             )  # fmt: skip
     except (ValueError, RecordingRefused) as error:
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
@@ -158,7 +159,7 @@ def _lockstep(
         signal.signal(signal.SIGINT, before)
         if recorder is not None:
             recorder.close()
-    if pressed:
+    if interrupts:
         raise CommandFailed(
             "calibrate.interrupted", "interrupted; the valves are neutral, no profile is written", ExitCode.INTERRUPTED
         )
@@ -195,7 +196,7 @@ def _live(
             f"--lease-ms {lease_ms}: {profile.name} allows 1..{profile.timeouts.lease_max_ms}",
             ExitCode.USAGE,
         )
-    pressed: list[int] = []
+    interrupts: list[int] = []
     try:
         where = udp_address(controller)
         reader = _surveyor(survey, screen)
@@ -225,20 +226,20 @@ def _live(
         confirm(plan)
         readings = 1 if survey == "ask" else READING_COUNT
         run = Calibration(profile, profile_hash(profile), plan, load("crane"), lease_ms * 1_000_000, key, readings)
-        before = signal.signal(signal.SIGINT, lambda number, _: pressed.append(number))
+        before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
         try:
             with (
-                open_bus(address, filters=run.trace.keys, participant="calibrate") as heard,
+                open_bus(address, filters=run.trace.keys, participant="calibrate") as bus_frames,
                 _Progress(screen) as shown,
             ):
 
-                def turn(calibration: Calibration) -> None:
-                    if pressed:
+                def watch(calibration: Calibration) -> None:
+                    if interrupts:
                         calibration.abort("interrupted")
                         calibration.idle = calibration.idle or calibration.begun_ns is None
                     shown.show(calibration)
 
-                live.run(run, link, heard, reader, turn)
+                live.run(run, link, bus_frames, reader, watch)
         finally:
             signal.signal(signal.SIGINT, before)
     except CalibrationImpossible as error:
@@ -247,7 +248,7 @@ def _live(
         raise CommandFailed.from_error(error, ExitCode.BUS) from None
     finally:
         link.close()
-    if pressed:
+    if interrupts:
         raise CommandFailed(
             "calibrate.interrupted", "interrupted; the valves are neutral, no profile is written", ExitCode.INTERRUPTED
         )
