@@ -55,7 +55,7 @@ def main(argv: list[str] | None = None) -> int:
         ports = f"{options.report_port}" + (f" or {options.order_port}" if options.order_port is not None else "")
         return _complain(f"UDP port {ports} cannot be opened ({error}); choose another one", BUSY)
     try:
-        process.keep(time.monotonic_ns())
+        process.write_checkpoint(time.monotonic_ns())
     except OSError as error:
         process.close()
         return _complain(f"{options.progress}: the checkpoint cannot be written there: {error.strerror}")

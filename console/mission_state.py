@@ -102,8 +102,8 @@ class MissionState:
 
     def state(self, now_ns: int) -> dict[str, Any]:
         """Part of every page state: the vehicle, and the age of the mission report."""
-        told_s = None if self._mission is None else round((now_ns - self._report_ns) * 1e-9, 1)
-        return {"mission_age_s": told_s, "mission_alive": self.alive(now_ns), "vehicle": self._shown(now_ns)}
+        age_s = None if self._mission is None else round((now_ns - self._report_ns) * 1e-9, 1)
+        return {"mission_age_s": age_s, "mission_alive": self.alive(now_ns), "vehicle": self._vehicle_state(now_ns)}
 
     def mission(self) -> dict[str, Any] | None:
         """The newest mission report; None before the first."""
@@ -157,7 +157,7 @@ class MissionState:
             "rear_rad": round(math.remainder(yaw - r.articulation_rad, math.tau), 4),
         }
 
-    def _shown(self, now_ns: int) -> dict[str, Any] | None:
+    def _vehicle_state(self, now_ns: int) -> dict[str, Any] | None:
         r = self._vehicle
         if r is None:
             return None

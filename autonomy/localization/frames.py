@@ -35,16 +35,20 @@ class Frames:
     def base(self) -> Pose:
         """The crane's base frame."""
         rear = self.rear()
-        foot, *ends = (np.array(rear_from_base(self._carrier, tuple(p))) for p in (np.zeros(3), *np.eye(3)))
-        turn = np.stack([end - foot for end in ends], axis=1)
-        return Pose(rear.position_m + rear.rotation @ foot, rear.rotation @ turn)
+        base_offset, *ends = (np.array(rear_from_base(self._carrier, tuple(p))) for p in (np.zeros(3), *np.eye(3)))
+        turn = np.stack([end - base_offset for end in ends], axis=1)
+        return Pose(rear.position_m + rear.rotation @ base_offset, rear.rotation @ turn)
 
     def _rear(self, values: np.ndarray) -> Pose:
-        x, y, z, yaw, bend, roll, pitch = values
-        lean = tilt(roll, pitch)
-        ahead = lean @ (np.cos(bend), np.sin(bend), 0.0)  # direction of the front half without the rear's yaw
+        x, y, z, yaw, articulation, roll, pitch = values
+        tilt_rotation = tilt(roll, pitch)
+        ahead = tilt_rotation @ (
+            np.cos(articulation),
+            np.sin(articulation),
+            0.0,
+        )  # direction of the front half without the rear's yaw
         rear = yaw - np.arctan2(ahead[1], ahead[0])
         c, s = np.cos(rear), np.sin(rear)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ lean
-        axle = np.array(rear_from_front(float(bend), axle_m(self._carrier, self._height)))
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tilt_rotation
+        axle = np.array(rear_from_front(float(articulation), axle_m(self._carrier, self._height)))
         return Pose(np.array([x, y, z]) - turn @ axle, turn)

@@ -33,7 +33,7 @@ class LocalPlane:
             raise PlaneError(
                 "plane.origin",
                 f"invalid origin of the local plane: latitude {self.latitude_deg} deg, longitude "
-                f"{self.longitude_deg} deg, altitude {self.altitude_m} m"
+                f"{self.longitude_deg} deg, altitude {self.altitude_m} m",
             )
 
     def local(self, latitude_deg: float, longitude_deg: float, altitude_m: float | None = None) -> Point:

@@ -95,23 +95,23 @@ class Localizer:
         assert last is not None
         roll, pitch = self._front_roll_pitch(report)
         wheels = 0.5 * (report.speed_m_s + last.speed_m_s) * gap / SECOND_NS
-        way = wheels * math.cos(pitch)
-        odometry = Odometry(gap / SECOND_NS, way, last.articulation_rad, report.articulation_rad, roll)
+        distance = wheels * math.cos(pitch)
+        odometry = Odometry(gap / SECOND_NS, distance, last.articulation_rad, report.articulation_rad, roll)
         self._filter.predict_motion(odometry, report.stamp_ns)
-        if changed := max(abs(now - then) for now, then in zip(report.heights_m, last.heights_m, strict=True)):
+        if changed := max(abs(now - valid_ns) for now, valid_ns in zip(report.heights_m, last.heights_m, strict=True)):
             self._filter.add_position_noise(CREEP_M_PER_M * changed if math.isfinite(changed) else 0.0)
         z, spread = self._z
         self._z = z + wheels * math.sin(pitch), math.hypot(spread, 0.02 * math.sqrt(abs(wheels)))
         if report.heading_ns != last.heading_ns and math.isfinite(report.heading_rad):
-            then = report.heading_ns - LATENCY_NS
-            if self._filter.heading(yaw_from_heading(report.heading_rad), then):
+            valid_ns = report.heading_ns - LATENCY_NS
+            if self._filter.heading(yaw_from_heading(report.heading_rad), valid_ns):
                 self._heading_ns = report.heading_ns
                 self._turned.clear()
             else:
                 self.rejected += 1
-                self._recover_heading(report, then)
+                self._recover_heading(report, valid_ns)
             if math.isfinite(report.yaw_rate_rad_s):
-                self._filter.turn(report.yaw_rate_rad_s, report.speed_m_s, TURN_OVER_NS, then)
+                self._filter.turn(report.yaw_rate_rad_s, report.speed_m_s, TURN_OVER_NS, valid_ns)
 
     def _update_position(self, report: VehicleReport) -> None:
         """Update with a new position."""
@@ -121,7 +121,7 @@ class Localizer:
         east, north, _ = self.plane.local(report.latitude_deg, report.longitude_deg)
         roll, pitch = self._front_roll_pitch(report)
         reach = antenna_reach(self._carrier, roll, pitch, self._front_height(report))
-        then = report.position_ns - LATENCY_NS
+        valid_ns = report.position_ns - LATENCY_NS
         if self._status is Status.STARTING and self._fitting == 0:
             if not math.isfinite(report.heading_rad) or report.stamp_ns - report.heading_ns > FRESH_NS:
                 return
@@ -131,7 +131,7 @@ class Localizer:
             self._filter.initialize(x, y, yaw, report.fix, INITIAL_SIGMA_M, report.stamp_ns)
             self._heading_ns = report.heading_ns
             self._z = math.nan, math.inf
-        fits = self._filter.position(east, north, reach, report.fix, report.sigma_m, then)
+        fits = self._filter.position(east, north, reach, report.fix, report.sigma_m, valid_ns)
         self._height(report, reach[2])
         if fits:
             self._position_ns = report.position_ns
@@ -141,7 +141,7 @@ class Localizer:
         self.rejected += 1
         self._fitting = 0
         if self._status is Status.LOST:
-            self._strays.append(np.array([east, north]) - self._filter.predicted_position(reach, then))
+            self._strays.append(np.array([east, north]) - self._filter.predicted_position(reach, valid_ns))
             self._recover_position(report)
 
     def _recover_position(self, report: VehicleReport) -> None:
@@ -149,7 +149,7 @@ class Localizer:
         del self._strays[:-AGREEING_COUNT]
         sigma = self._noise.fixes[report.fix][0]
         middle = np.mean(self._strays, axis=0)
-        apart = max(math.dist(stray, middle) for stray in self._strays)
+        apart = max(math.dist(offset, middle) for offset in self._strays)
         if len(self._strays) < AGREEING_COUNT or apart > AGREE_SIGMAS * sigma:
             return
         at = self._filter.x[[State.X, State.Y]] + middle
@@ -158,12 +158,12 @@ class Localizer:
         self._jumps += 1
         self._strays.clear()
 
-    def _recover_heading(self, report: VehicleReport, then: int) -> None:
+    def _recover_heading(self, report: VehicleReport, valid_ns: int) -> None:
         """Re-initialize the heading of a standing machine when the last ones agree on another one."""
         if self._status is not Status.LOST or abs(report.speed_m_s) > STANDSTILL_M_S:
             self._turned.clear()
             return
-        self._turned.append(self._filter.heading_off(yaw_from_heading(report.heading_rad), then))
+        self._turned.append(self._filter.heading_off(yaw_from_heading(report.heading_rad), valid_ns))
         del self._turned[:-AGREEING_COUNT]
         turn = sum(self._turned) / len(self._turned)
         apart = max(abs(t - turn) for t in self._turned)

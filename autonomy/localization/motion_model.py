@@ -70,11 +70,11 @@ class NoiseModel:
     side: GaussMarkov = GaussMarkov(0.02, 6.0)
     slide: GaussMarkov = GaussMarkov(0.25, 200.0)
     scale: GaussMarkov = GaussMarkov(0.12, 30.0)
-    way_m: float = 0.01
+    distance_m: float = 0.01
     """Position noise per square root of a metre driven."""
-    way_rad: float = 0.003
+    distance_yaw_rad: float = 0.003
     """Yaw noise per square root of a metre driven."""
-    rest_m: float = 0.002
+    standstill_m: float = 0.002
     """Position noise per square root of a second: the machine rocks while its crane works."""
     heading_start_rad: float = 0.015
     heading_rad: float = 2e-5
@@ -99,44 +99,46 @@ class Odometry:
     """
 
     seconds: float
-    way_m: float
-    bend_before_rad: float
-    bend_rad: float
-    lean_rad: float = 0.0
+    distance_m: float
+    articulation_before_rad: float
+    articulation_rad: float
+    roll_rad: float = 0.0
 
 
-def turned_without_slip(carrier: Carrier, odometry: Odometry, way_m: float) -> float:
-    """Turn of the front half over a distance ``way_m`` of its axle, without slip [rad]."""
-    bend = 0.5 * (odometry.bend_before_rad + odometry.bend_rad)
-    swing = odometry.bend_rad - odometry.bend_before_rad
+def turned_without_slip(carrier: Carrier, odometry: Odometry, distance_m: float) -> float:
+    """Turn of the front half over a distance ``distance_m`` of its axle, without slip [rad]."""
+    articulation = 0.5 * (odometry.articulation_before_rad + odometry.articulation_rad)
+    swing = odometry.articulation_rad - odometry.articulation_before_rad
     lf, lr = carrier.front_axle_m, carrier.rear_axle_m
-    return (way_m * math.sin(bend) + lr * swing) / (lf * math.cos(bend) + lr)
+    return (distance_m * math.sin(articulation) + lr * swing) / (lf * math.cos(articulation) + lr)
 
 
 def predicted_state(carrier: Carrier, noise: NoiseModel, x: Array, odometry: Odometry) -> tuple[Array, Array, Array]:
     """State (12,), Jacobian (12, 12) and process noise (12, 12) one step later."""
     s, d = State, odometry
-    way = d.way_m * (1.0 + x[s.SCALE])
-    turned = turned_without_slip(carrier, d, way) + x[s.CURVE] * way
-    course = x[s.YAW] + 0.5 * turned + drift_rad(x, d.lean_rad)
+    distance = d.distance_m * (1.0 + x[s.SCALE])
+    turned = turned_without_slip(carrier, d, distance) + x[s.CURVE] * distance
+    course = x[s.YAW] + 0.5 * turned + drift_rad(x, d.roll_rad)
     c, si = math.cos(course), math.sin(course)
     out = x.copy()
-    out[s.X] += way * c
-    out[s.Y] += way * si
+    out[s.X] += distance * c
+    out[s.Y] += distance * si
     out[s.YAW] += turned
     jacobian = np.eye(SIZE)
-    bend = 0.5 * (d.bend_before_rad + d.bend_rad)
-    of_way = math.sin(bend) / (carrier.front_axle_m * math.cos(bend) + carrier.rear_axle_m) + x[s.CURVE]
-    for place, of_turn, of_length in ((s.CURVE, way, 0.0), (s.SCALE, of_way * d.way_m, d.way_m)):
+    articulation = 0.5 * (d.articulation_before_rad + d.articulation_rad)
+    from_distance = (
+        math.sin(articulation) / (carrier.front_axle_m * math.cos(articulation) + carrier.rear_axle_m) + x[s.CURVE]
+    )
+    for place, of_turn, of_length in ((s.CURVE, distance, 0.0), (s.SCALE, from_distance * d.distance_m, d.distance_m)):
         jacobian[s.YAW, place] = of_turn
-        jacobian[s.X, place] = c * of_length - 0.5 * way * si * of_turn
-        jacobian[s.Y, place] = si * of_length + 0.5 * way * c * of_turn
-    for place, of_course in ((s.YAW, 1.0), (s.SIDE, 1.0), (s.SLIDE, -d.lean_rad)):
-        jacobian[s.X, place], jacobian[s.Y, place] = -of_course * way * si, of_course * way * c
-    driven = abs(d.way_m)
+        jacobian[s.X, place] = c * of_length - 0.5 * distance * si * of_turn
+        jacobian[s.Y, place] = si * of_length + 0.5 * distance * c * of_turn
+    for place, of_course in ((s.YAW, 1.0), (s.SIDE, 1.0), (s.SLIDE, -d.roll_rad)):
+        jacobian[s.X, place], jacobian[s.Y, place] = -of_course * distance * si, of_course * distance * c
+    driven = abs(d.distance_m)
     added = np.zeros(SIZE)
-    added[[s.X, s.Y]] = noise.way_m**2 * driven + noise.rest_m**2 * d.seconds
-    added[s.YAW] = noise.way_rad**2 * driven
+    added[[s.X, s.Y]] = noise.distance_m**2 * driven + noise.standstill_m**2 * d.seconds
+    added[s.YAW] = noise.distance_yaw_rad**2 * driven
     added[s.HEADING] = noise.heading_rad**2 * d.seconds
     for place, drift in (
         (s.CURVE, noise.curve), (s.SIDE, noise.side), (s.SCALE, noise.scale), (s.SLIDE, noise.slide)
@@ -147,9 +149,9 @@ def predicted_state(carrier: Carrier, noise: NoiseModel, x: Array, odometry: Odo
     return out, jacobian, np.diag(added)
 
 
-def drift_rad(x: Array, lean_rad: float) -> float:
+def drift_rad(x: Array, roll_rad: float) -> float:
     """Direction of the front axle's motion relative to the front half, + left [rad]."""
-    return float(x[State.SIDE] - x[State.SLIDE] * lean_rad)
+    return float(x[State.SIDE] - x[State.SLIDE] * roll_rad)
 
 
 def tilt(roll_rad: float, pitch_rad: float) -> Array:
@@ -187,9 +189,9 @@ def predicted_antenna(x: Array, reach: Array) -> tuple[Array, Array]:
     return shown, jacobian
 
 
-def front_attitude(roll_rad: float, pitch_rad: float, bend_rad: float) -> tuple[float, float]:
+def front_attitude(roll_rad: float, pitch_rad: float, articulation_rad: float) -> tuple[float, float]:
     """Roll and pitch of the front half from those of the rear, for a rigid articulation axis."""
     down = tilt(roll_rad, pitch_rad)[2]
-    c, s = math.cos(bend_rad), math.sin(bend_rad)
+    c, s = math.cos(articulation_rad), math.sin(articulation_rad)
     ahead, left, up = c * down[0] + s * down[1], -s * down[0] + c * down[1], down[2]
     return math.atan2(left, up), math.asin(max(-1.0, min(1.0, ahead)))

@@ -41,8 +41,8 @@ class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
         super().__init__(SIZE, 2)
         self._carrier, self._noise = carrier, noise
         self._stamps: deque[int] = deque(maxlen=HISTORY_STEPS)
-        self._ways: deque[Array] = deque(maxlen=HISTORY_STEPS)
-        self._way = np.zeros(3)
+        self._motions: deque[Array] = deque(maxlen=HISTORY_STEPS)
+        self._motion = np.zeros(3)
         self._fix = 0
 
     def initialize(self, x_m: float, y_m: float, yaw_rad: float, fix: int, sigma_m: float, stamp_ns: int) -> None:
@@ -60,7 +60,7 @@ class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
         self._fix = 0
         self._set_fix(fix)
         self._stamps.clear()
-        self._ways.clear()
+        self._motions.clear()
         self._store(stamp_ns)
 
     def reset_position(self, x_m: float, y_m: float, sigma_m: float) -> None:
@@ -101,7 +101,7 @@ class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
             self.Q[place, place] = sigma**2 * (1.0 - keep * keep)
         self._next = after
         self.predict()
-        self._way = self._way + (after - before)[[State.X, State.Y, State.YAW]]
+        self._motion = self._motion + (after - before)[[State.X, State.Y, State.YAW]]
         self._store(stamp_ns)
 
     def add_position_noise(self, sigma_m: float) -> None:
@@ -169,7 +169,7 @@ class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
 
     def _store(self, stamp_ns: int) -> None:
         self._stamps.append(stamp_ns)
-        self._ways.append(self._way)
+        self._motions.append(self._motion)
 
     def _state_before(self, since: Array) -> Array:
         """The state before the motion ``since``."""
@@ -182,8 +182,8 @@ class VehicleFilter(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has
         stamps = self._stamps
         i = bisect_left(stamps, stamp_ns)
         if i == 0 or i == len(stamps):
-            since: Array = self._way - self._ways[min(i, len(stamps) - 1)]
+            since: Array = self._motion - self._motions[min(i, len(stamps) - 1)]
             return since
         share = (stamp_ns - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
-        since = self._way - (self._ways[i - 1] + share * (self._ways[i] - self._ways[i - 1]))
+        since = self._motion - (self._motions[i - 1] + share * (self._motions[i] - self._motions[i - 1]))
         return since

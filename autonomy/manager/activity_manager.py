@@ -69,10 +69,10 @@ class Transition:
 class ActivityManager:
     """Runs one mission.  ``state``, ``paused``, ``failure``, ``tally`` and ``changes`` are for the operator.
 
-    ``table`` is `OURS` or `PAPER_B`.  ``chooser`` picks grasps on the ground, ``emptier`` those from the bunk.
-    ``motions`` plans crane motions; the default is ours, or the shipped demonstrations for paper B.  ``remembers``: the
-    camera only sees logs while driving, and the crane works from memory.  ``progress`` resumes from a checkpoint; the
-    logs in the bunk are then detected, not remembered.
+    ``table`` is `OURS` or `PAPER_B`.  ``selector`` picks grasps on the ground, ``unloading_selector`` those from the
+    bunk.  ``motions`` plans crane motions; the default is ours, or the shipped demonstrations for paper B.
+    ``uses_memory``: the camera only sees logs while driving, and the crane works from memory.  ``progress`` resumes
+    from a checkpoint; the logs in the bunk are then detected, not remembered.
     """
 
     def __init__(
@@ -81,16 +81,16 @@ class ActivityManager:
         profile_hash: int,
         mission: ForwardingMission,
         table: Table = OURS,
-        chooser: GraspSelector = select_direct,
+        selector: GraspSelector = select_direct,
         plane: LocalPlane | None = None,
         key: bytes | None = None,
         lease_ns: int = LEASE_NS,
         motions: MotionPlanner | None = None,
-        remembers: bool = False,
-        emptier: GraspSelector | None = None,
+        uses_memory: bool = False,
+        unloading_selector: GraspSelector | None = None,
         progress: Checkpoint | None = None,
     ) -> None:
-        assert profile.carrier is not None and not (remembers and progress)
+        assert profile.carrier is not None and not (uses_memory and progress)
         self.resumed = progress is not None
         self.state, self.paused, self.failure = State.IDLE, "the controller has not reported", ""
         self.changes: deque[Transition] = deque(maxlen=HISTORY_LENGTH)
@@ -99,15 +99,15 @@ class ActivityManager:
         self.world = WorldModel(profile, mission, plane, progress.known if progress else None)
         self.load = LoadBookkeeping(profile, mission, self.world, progress)
         self._digest = mission_digest(mission)
-        self.log_memory = LogMemory(profile) if remembers else None
+        self.log_memory = LogMemory(profile) if uses_memory else None
         self._auto = self._step_released = False
         self.pending_event: Event | None = None
         """In single-step mode: the event that waits for `next_step`."""
         self._table, self._key = table, key
         motions = motions or (MovementPrimitivePlanner(load(profile)) if table is PAPER_B else TimeOptimalPlanner())
         self._crane = CraneExecutor(
-            profile, profile_hash, self.world, self.load, chooser, emptier or chooser, motions, lease_ns, key,
-            progress.rotator if progress else RotatorEstimate(), table is PAPER_B,
+            profile, profile_hash, self.world, self.load, selector, unloading_selector or selector, motions, lease_ns,
+            key, progress.rotator if progress else RotatorEstimate(), table is PAPER_B,
         )  # fmt: skip
         options, carrier = mission.options, profile.carrier
         transport, loading = options.transport_height_m, options.loading_height_m
@@ -121,7 +121,7 @@ class ActivityManager:
         self.route = RouteDriver(carrier, self._navigator, mission, table is PAPER_B, left, driven_m)
         self._target = TargetLog(self.world, self.route, self.load)
         self._events = EventConditions(self.world, self.route, self.load, self._target, self._crane)
-        self._begun = self._unloaded = False
+        self._route_begun = self._unloaded = False
 
     @property
     def activity(self) -> Activity | None:
@@ -141,12 +141,12 @@ class ActivityManager:
     @property
     def description(self) -> str:
         """What the machine is doing, with landing or round where there are several."""
-        words, rounds = RULES[self.state].description, self.world.sorting.rounds
+        text, rounds = RULES[self.state].description, self.world.sorting.rounds
         if self.state in (State.HAUL, State.SETTLE, State.UNLOAD) and (name := self.load.landing_name):
-            return f"{words} ({name})"
+            return f"{text} ({name})"
         if self.state is State.IDLE and self.resumed:
-            return f"{words}, to resume the mission"
-        return f"{words} (round {rounds + 1})" if self.state is State.SEARCH and rounds else words
+            return f"{text}, to resume the mission"
+        return f"{text} (round {rounds + 1})" if self.state is State.SEARCH and rounds else text
 
     def progress(self) -> Checkpoint:
         """A checkpoint of the mission."""
@@ -267,7 +267,7 @@ class ActivityManager:
         if event is Event.ROUND_END:
             self.world.sorting.start_round()
             self.route.restart()
-            self._begun = False
+            self._route_begun = False
         state = next_state(self._table, self.state, event)
         if state is State.FAILED:
             self._fail(RULES[self.state].timeout_reason)
@@ -294,7 +294,7 @@ class ActivityManager:
         self._navigator.holds_heights = rule.height is not Height.KEEP
         if rule.drives:
             self._drive(state)
-        elif state is State.LOOK and self._target.lies_ahead:
+        elif state is State.LOOK and self._target.is_ahead:
             self._target.restart_average()
         elif state is State.COLLECT and self.activity is None:
             self._crane.load_target(self.target)
@@ -308,12 +308,14 @@ class ActivityManager:
         assert here is not None
         try:
             if state is State.HAUL:
-                landing, lie_rad = self.load.landing()
-                self.route.drive_to_landing(here, landing, lie_rad, partial(self.world.landing_stop_m, landing))
+                landing, log_direction_rad = self.load.landing()
+                self.route.drive_to_landing(
+                    here, landing, log_direction_rad, partial(self.world.landing_stop_m, landing)
+                )
                 return
-            if not self._begun and not self.route.ended:
+            if not self._route_begun and not self.route.ended:
                 self.route.begin(here, self.world.plane)
-                self._begun = True
+                self._route_begun = True
             elif self._unloaded:
                 self.route.rejoin(here)
         except PathRefused as error:
@@ -339,7 +341,7 @@ class ActivityManager:
         if (data := self._crane.step(now_ns, report, logs, halted=bool(self._off()))) is not None:
             out.append(data)
         if vehicle is not None and self.world.location is not None and self.state is not State.IDLE:
-            asked = self._navigator.step(now_ns, vehicle, self.world.location)
-            if asked is not None and not RULES[self.state].crane:
-                out.append(encode(asked, self._key))
+            request = self._navigator.step(now_ns, vehicle, self.world.location)
+            if request is not None and not RULES[self.state].crane:
+                out.append(encode(request, self._key))
         return out

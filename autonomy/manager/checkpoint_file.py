@@ -73,7 +73,7 @@ class CheckpointFile:
         """Whether the next checkpoint is due."""
         return now_ns >= self._due_ns
 
-    def keep(self, progress: Checkpoint, now_ns: int, unix_ns: int) -> None:
+    def write(self, progress: Checkpoint, now_ns: int, unix_ns: int) -> None:
         """Write the checkpoint if it has changed.
 
         Raises:

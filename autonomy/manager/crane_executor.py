@@ -36,9 +36,9 @@ MAX_FAILURES: Final = 3
 class CraneExecutor:
     """Starts and ends crane jobs; ``job`` is the active one, None between two.
 
-    ``chooser`` picks grasps on the ground, ``emptier`` those from the bunk.  ``rotator`` is the known state of a
-    rotator without an encoder.  ``as_paper_b`` works as paper B does: a grasp takes only its target, gives it up after
-    one failure, and ends over the bunk.
+    ``selector`` picks grasps on the ground, ``unloading_selector`` those from the bunk.  ``rotator`` is the known state
+    of a rotator without an encoder.  ``as_paper_b`` works as paper B does: a grasp takes only its target, gives it up
+    after one failure, and ends over the bunk.
     """
 
     def __init__(
@@ -47,8 +47,8 @@ class CraneExecutor:
         profile_hash: int,
         world: WorldModel,
         load: LoadBookkeeping,
-        chooser: GraspSelector,
-        emptier: GraspSelector,
+        selector: GraspSelector,
+        unloading_selector: GraspSelector,
         motions: MotionPlanner,
         lease_ns: int,
         key: bytes | None,
@@ -60,10 +60,10 @@ class CraneExecutor:
         """Why the mission cannot continue; empty while it can."""
         self._profile, self._hash = profile, profile_hash
         self._world, self._load = world, load
-        self._chooser, self._emptier, self._motions = chooser, emptier, motions
+        self._selector, self._unloading_selector, self._motions = selector, unloading_selector, motions
         self._lease_ns, self._key = lease_ns, key
         self._rotator, self._as_paper_b = rotator, as_paper_b
-        self._rests: tuple[float, ...] | None = None
+        self._reference: tuple[float, ...] | None = None
         self._stops = self._failures = 0
 
     @property
@@ -86,21 +86,22 @@ class CraneExecutor:
         self._begin(None, None)
 
     def _begin(self, mission: CraneJob | None, target: int | None) -> None:
-        if self._rests is None:  # without an encoder only the reference of a previous planner is known
-            told = self._world.report.reference if self._world.report is not None else ()
-            told = tuple(r if isfinite(r) else 0.0 for r in told) or (0.0,) * N_JOINTS
-            self._rests = self.rotator.to_angles(told)
+        if self._reference is None:  # without an encoder only the reference of a previous planner is known
+            reference = self._world.report.reference if self._world.report is not None else ()
+            reference = tuple(r if isfinite(r) else 0.0 for r in reference) or (0.0,) * N_JOINTS
+            self._reference = self.rotator.to_angles(reference)
 
         def choose(arm: Arm, job: CraneJob, logs: Sequence[LogObservation], slew_rad: float, rot_rad: float) -> Grasp:
             job = replace(job, leave=self._load.logs_to_leave(logs, target))
-            return self._chooser(arm, job, logs, slew_rad, rot_rad)
+            return self._selector(arm, job, logs, slew_rad, rot_rad)
 
         unloads = mission is not None and mission.source is not None
         onward: Callable[[LogObservation], bool] | None = self._unloads_next if unloads else self._fetches_next
         self._stops = 0
         self.job = Activity(
-            self._profile, self._hash, mission, self._lease_ns, self._key, self._emptier if unloads else choose,
-            self._rests, self._motions, None if self._as_paper_b else onward, mission is None, self.rotator,
+            self._profile, self._hash, mission, self._lease_ns, self._key,
+            self._unloading_selector if unloads else choose, self._reference, self._motions,
+            None if self._as_paper_b else onward, mission is None, self.rotator,
         )  # fmt: skip
 
     def _unloads_next(self, log: LogObservation) -> bool:
@@ -178,5 +179,5 @@ class CraneExecutor:
         return not self.failure
 
     def _end(self, job: Activity) -> None:
-        self._rests, self._rotator = job.last_setpoint, job.rotator
+        self._reference, self._rotator = job.last_setpoint, job.rotator
         self.job = None

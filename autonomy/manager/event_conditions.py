@@ -59,8 +59,8 @@ class EventConditions:
             case Event.OUTSIDE:
                 return self._target.is_past()
             case Event.VALID | Event.INVALID:
-                looked = self._world.list_ns > self._since_ns
-                return looked and self._target.is_graspable() == (event is Event.VALID)
+                detected = self._world.list_ns > self._since_ns
+                return detected and self._target.is_graspable() == (event is Event.VALID)
             case Event.COLLECTED:
                 return self._crane.collected(now_ns)
             case Event.MISSED:
@@ -81,8 +81,8 @@ class EventConditions:
         """Whether a state has timed out; for driving states the time counts from the last progress."""
         if self._route.driven_m > self._progress_m + PROGRESS_M:
             self._progress_m, self._progress_ns = self._route.driven_m, now_ns
-        begun = max(self._since_ns, self._progress_ns) if rule.drives else self._since_ns
-        return now_ns - begun > rule.timeout_s * SECOND_NS
+        begin_ns = max(self._since_ns, self._progress_ns) if rule.drives else self._since_ns
+        return now_ns - begin_ns > rule.timeout_s * SECOND_NS
 
     def _settled(self, so: bool, now_ns: int) -> bool:
         """Whether a condition has held for ``SETTLED_NS``."""

@@ -30,7 +30,7 @@ class LoadBookkeeping:
         self._world, self._bunk = world, profile.bunk
         self._wanted, self._lands = mission.options.logs_wanted, bool(mission.landings)
         bearings = [landing.bearing_deg for landing in mission.landings]
-        self._lie_rad = [None if deg is None else yaw_from_bearing(deg) for deg in bearings]
+        self._log_direction_rad = [None if deg is None else yaw_from_bearing(deg) for deg in bearings]
 
     @property
     def has_enough(self) -> bool:
@@ -68,7 +68,7 @@ class LoadBookkeeping:
         here, places = self._world.location, self._world.landings
         assert here is not None
         which = self.sorting.choose_landing(places, (here.x_m, here.y_m))
-        return places[which], self._lie_rad[which] if self._lie_rad else None
+        return places[which], self._log_direction_rad[which] if self._log_direction_rad else None
 
     def logs_to_leave(self, logs: Sequence[LogObservation], target: int | None) -> tuple[int, ...]:
         """List numbers of the logs that a grasp of the target must leave."""
@@ -77,30 +77,30 @@ class LoadBookkeeping:
         found = []
         for log in logs:
             number = world.map_number(log.id)
-            lay = None if number is None else log_map.get(number)
-            kind, with_ = ("" if known is None else known.assortment for known in (lay, first))
-            if not self.sorting.may_share_grasp(kind, with_) or (lay is not None and world.is_on_landing(lay)):
+            mapped = None if number is None else log_map.get(number)
+            kind, with_ = ("" if known is None else known.assortment for known in (mapped, first))
+            if not self.sorting.may_share_grasp(kind, with_) or (mapped is not None and world.is_on_landing(mapped)):
                 found.append(log.id)
         return tuple(found)
 
     def book_loaded(self, job: Activity, now_ns: int) -> None:
         """Book a grasp that was placed in the bunk."""
         assert job.grasp is not None
-        taken = [self._taken(log, now_ns) for log in job.grasp.logs]
-        self.tally.book_loaded(taken, job.lifted_kg)
-        self.sorting.book_loaded(log.assortment for log in taken)
+        loaded_logs = [self._loaded_log(log, now_ns) for log in job.grasp.logs]
+        self.tally.book_loaded(loaded_logs, job.lifted_kg)
+        self.sorting.book_loaded(log.assortment for log in loaded_logs)
 
-    def _taken(self, log: LogObservation, now_ns: int) -> LoadedLog:
+    def _loaded_log(self, log: LogObservation, now_ns: int) -> LoadedLog:
         """Remove a grasped log from the map and return it with the place where it had lain."""
         world = self._world
         number = world.map_number(log.id)
-        lay = None if number is None else world.log_map.get(number)
+        mapped = None if number is None else world.log_map.get(number)
         if number is not None:
             world.log_map.remove(number)
-        at = world.base.to_base(np.asarray(log.center_m)) if lay is None else lay.center_m
+        at = world.base.to_base(np.asarray(log.center_m)) if mapped is None else mapped.center_m
         lat, lon, _ = world.plane.geodetic(float(at[0]), float(at[1]))
         wood = volume_m3(log.length_m, log.diameter_m)
-        return LoadedLog(Point(lat, lon), now_ns, wood, "" if lay is None else lay.assortment)
+        return LoadedLog(Point(lat, lon), now_ns, wood, "" if mapped is None else mapped.assortment)
 
     def book_miss(self, job: Activity, target: int | None, for_good: bool) -> None:
         """Book a failed grasp; the log is given up after too many failures (``for_good``: at once)."""

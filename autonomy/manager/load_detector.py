@@ -32,7 +32,7 @@ class LoadDetector:
 
     def __init__(self, logs: Sequence[LogObservation]) -> None:
         weight_kg = GREEN_KG_M3 * sum(volume_m3(log.length_m, log.diameter_m) for log in logs)
-        self._least_kg = min(MIN_LOAD_KG, MIN_LOAD_SHARE * weight_kg)
+        self._min_load_kg = min(MIN_LOAD_KG, MIN_LOAD_SHARE * weight_kg)
         self._readings: deque[tuple[int, float]] = deque()
 
     def update(self, stamp_ns: int, load_kg: float) -> None:
@@ -48,4 +48,4 @@ class LoadDetector:
         """Whether the mean reading is too small for the logs, over a long enough time."""
         readings = self._readings
         long_enough = len(readings) > 1 and 1.1 * (readings[-1][0] - readings[0][0]) >= WINDOW_NS
-        return long_enough and fmean(kg for _, kg in readings) < self._least_kg
+        return long_enough and fmean(kg for _, kg in readings) < self._min_load_kg

@@ -53,7 +53,7 @@ class CraneReach:
 
     def __init__(self, arm: Arm, carrier: Carrier) -> None:
         self._arm, self.ground_z_m = arm, arm.profile.workspace.ground_z_m
-        self._aside_m = 0.5 * (carrier.track_width_m + carrier.wheel_width_m) + SIDE_CLEARANCE_M
+        self._side_clearance_m = 0.5 * (carrier.track_width_m + carrier.wheel_width_m) + SIDE_CLEARANCE_M
         bunk = arm.profile.bunk
         self._rear_end_m = bunk.center_m[0] + 0.5 * bunk.length_m + SIDE_CLEARANCE_M
         slew = arm.profile.joints["slew"]
@@ -61,12 +61,12 @@ class CraneReach:
         self._out_m_s = arm.profile.joints["ext"].speed_limit
         self._longest_m = arm.profile.joints["ext"].upper - TELESCOPE_RESERVE_M
         kin = arm.profile.kinematics
-        self.farthest_m = kin.a1_m + kin.a2_m + math.hypot(kin.a3_m, kin.d4_m + self._longest_m) + BEYOND_ARM_M
+        self.max_distance_m = kin.a1_m + kin.a2_m + math.hypot(kin.a3_m, kin.d4_m + self._longest_m) + BEYOND_ARM_M
 
     def work_s(self, log: LogObservation) -> float:
         """Rough duration of the crane's motion to a log and back [s]; infinite if it cannot be grasped."""
         x, y, _ = log.center_m
-        if abs(y) < self._aside_m + 0.5 * log.diameter_m and x < self._rear_end_m + 0.5 * log.length_m:
+        if abs(y) < self._side_clearance_m + 0.5 * log.diameter_m and x < self._rear_end_m + 0.5 * log.length_m:
             return math.inf  # under the machine, or its bunk
         try:
             pose = plan_single_log_grasp(self._arm, log, 0.0).pose
@@ -89,7 +89,7 @@ def best_stop(
     @cache
     def work_s(i: int, j: int) -> float:
         log, base = logs[j], bases[i]
-        if math.dist(log.center_m[:2], base.position_m[:2]) > reach.farthest_m:
+        if math.dist(log.center_m[:2], base.position_m[:2]) > reach.max_distance_m:
             return math.inf
         return reach.work_s(_at_ground_height(log.observation(base), reach.ground_z_m))
 
@@ -101,10 +101,10 @@ def best_stop(
     if last is None:
         return None
     work = np.array([[work_s(i, j) for j in range(len(logs))] for i in range(last + 1)])
-    taken = np.isfinite(work)
-    counts, sums = taken.sum(axis=1), np.where(taken, work, 0.0).sum(axis=1)
+    graspable = np.isfinite(work)
+    counts, sums = graspable.sum(axis=1), np.where(graspable, work, 0.0).sum(axis=1)
     best = min(range(last + 1), key=lambda i: (-counts[i], sums[i], places[i]))
-    order = sorted(np.flatnonzero(taken[best]).tolist(), key=lambda j: work[best, j])
+    order = sorted(np.flatnonzero(graspable[best]).tolist(), key=lambda j: work[best, j])
     return LoadingStop(float(places[best]), tuple(logs[j].number for j in order), float(sums[best]))
 
 
@@ -125,15 +125,15 @@ def base_on_path(
     rear = math.atan2(joint[1] - rear_m[1], joint[0] - rear_m[0])
     c, s = math.cos(rear), math.sin(rear)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    foot, axes = _base_in_rear(carrier)
+    base_offset, axes = _base_in_rear(carrier)
     origin = np.array([*joint, pivot_height_m(carrier, height_m)])
-    return Pose(origin + turn @ foot, turn @ axes)
+    return Pose(origin + turn @ base_offset, turn @ axes)
 
 
 @lru_cache(maxsize=8)
 def _base_in_rear(carrier: Carrier) -> tuple[np.ndarray, np.ndarray]:
     """The crane's base in the rear frame: position (3,) and rotation (3, 3)."""
-    foot, *ends = (
+    base_offset, *ends = (
         np.array(rear_from_base(carrier, (float(p[0]), float(p[1]), float(p[2])))) for p in (np.zeros(3), *np.eye(3))
     )
-    return foot, np.stack([end - foot for end in ends], axis=1)
+    return base_offset, np.stack([end - base_offset for end in ends], axis=1)

@@ -110,18 +110,18 @@ class LogMap:
         """The log with this number, None if it is not mapped."""
         return self._logs.get(number)
 
-    def observe(self, seen: Iterable[LogObservation], base: Pose, now_ns: int) -> dict[int, int]:
+    def observe(self, observations: Iterable[LogObservation], base: Pose, now_ns: int) -> dict[int, int]:
         """Merge a list of observations; returns the map number of each list number."""
-        fresh = [_observed_log(o, base, now_ns) for o in seen if not lies_in_bunk(self._bunk, o)]
-        names = [o.id for o in seen if not lies_in_bunk(self._bunk, o)]
+        observed = [_observed_log(o, base, now_ns) for o in observations if not lies_in_bunk(self._bunk, o)]
+        names = [o.id for o in observations if not lies_in_bunk(self._bunk, o)]
         known = list(self._logs.values())
-        costs = np.full((len(known), len(fresh)), _BAR_COST)
+        costs = np.full((len(known), len(observed)), _BAR_COST)
         for i, log in enumerate(known):
-            for j, sighting in enumerate(fresh):
+            for j, sighting in enumerate(observed):
                 costs[i, j] = _distance_m(log, sighting)
         pairs = {int(j): int(i) for i, j in zip(*linear_sum_assignment(costs), strict=True) if costs[i, j] < _BAR_COST}
         numbers = {}
-        for j, sighting in enumerate(fresh):
+        for j, sighting in enumerate(observed):
             if j in pairs:
                 before = known[pairs[j]]
                 self._logs[before.number] = _averaged(before, sighting)
@@ -185,11 +185,11 @@ def _distance_m(log: MappedLog, sighting: MappedLog) -> float:
     off = sighting.center_m - log.center_m
     along = float(off @ log.axis)
     across = float(np.linalg.norm(off - along * log.axis))
-    loose = 3.0 * (log.sigma_m + sighting.sigma_m)
-    askew = math.acos(min(1.0, abs(float(log.axis @ sighting.axis))))
-    if askew > MAX_ANGLE_RAD + 3.0 * max(log.turn_rad, sighting.turn_rad):
+    tolerance_m = 3.0 * (log.sigma_m + sighting.sigma_m)
+    angle_rad = math.acos(min(1.0, abs(float(log.axis @ sighting.axis))))
+    if angle_rad > MAX_ANGLE_RAD + 3.0 * max(log.turn_rad, sighting.turn_rad):
         return _BAR_COST
-    if abs(along) > MAX_ALONG_M + loose or across > MAX_ACROSS_M + loose:
+    if abs(along) > MAX_ALONG_M + tolerance_m or across > MAX_ACROSS_M + tolerance_m:
         return _BAR_COST
     return math.hypot(along, across)
 
@@ -200,8 +200,8 @@ def _averaged(log: MappedLog, sighting: MappedLog) -> MappedLog:
         return replace(sighting, number=log.number, misses=log.misses, assortment=log.assortment)
     before, now = 1.0 / log.sigma_m**2, 1.0 / sighting.sigma_m**2
     share = now / (before + now)
-    sense = 1.0 if float(log.axis @ sighting.axis) >= 0.0 else -1.0
-    axis = log.axis + share * (sense * sighting.axis - log.axis)
+    sign = 1.0 if float(log.axis @ sighting.axis) >= 0.0 else -1.0
+    axis = log.axis + share * (sign * sighting.axis - log.axis)
     return replace(
         log,
         center_m=log.center_m + share * (sighting.center_m - log.center_m),

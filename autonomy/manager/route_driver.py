@@ -107,8 +107,8 @@ class RouteDriver:
         self.along_m, self._last, self._ended, self._landing_drive = 0.0, None, False, None
         self._to_come = len(points)
         if self.as_paper_b:
-            ways = [Waypoint(p.latitude_deg, p.longitude_deg) for p in places]
-            self._active = WaypointDrive(self._carrier, ways, self._speed)
+            candidates = [Waypoint(p.latitude_deg, p.longitude_deg) for p in places]
+            self._active = WaypointDrive(self._carrier, candidates, self._speed)
             self.length_m = sum(math.dist(a, b) for a, b in pairwise([(location.x_m, location.y_m), *points]))
             return
         by, back = ([], []) if left is None else (_points(plane, left.by), _points(plane, left.at or ()))
@@ -148,29 +148,35 @@ class RouteDriver:
         """Stop smoothly."""
         self._navigator.pause()
 
-    def drive_to_landing(self, location: Location, landing: Point2, lie_rad: float | None, stop_on: StopFinder) -> None:
+    def drive_to_landing(
+        self, location: Location, landing: Point2, log_direction_rad: float | None, stop_on: StopFinder
+    ) -> None:
         """Drive to a landing along the shortest path that passes it with room for the crane.
 
-        ``lie_rad`` is the log direction there; a path along it is preferred (None: any direction).
+        ``log_direction_rad`` is the log direction there; a path along it is preferred (None: any direction).
 
         Raises:
             PathRefused: no path passes the landing.
         """
         if self._landing_drive is None:
-            ways = list[tuple[float, Path]]()
-            if lie_rad is not None:
-                ways = self._paths_past(location, landing, (lie_rad, lie_rad + math.pi), [], stop_on)
+            candidates = list[tuple[float, Path]]()
+            if log_direction_rad is not None:
+                candidates = self._paths_past(
+                    location, landing, (log_direction_rad, log_direction_rad + math.pi), [], stop_on
+                )
                 # A detour may pass the landing before its last leg, in another direction.
-                ways = [
-                    w for w in ways if abs(math.remainder(w[1].at(w[0])[2] - lie_rad, math.pi)) < MAX_LANDING_ANGLE_RAD
+                candidates = [
+                    w
+                    for w in candidates
+                    if abs(math.remainder(w[1].at(w[0])[2] - log_direction_rad, math.pi)) < MAX_LANDING_ANGLE_RAD
                 ]
             # Beside the landing or too near for a plain path: drive a little ahead, or make a detour.
-            ways = ways or self._paths_past(location, landing, _ALL_ROUND, [[]], stop_on)
-            if not ways:
+            candidates = candidates or self._paths_past(location, landing, _ALL_ROUND, [[]], stop_on)
+            if not candidates:
                 raise PathRefused(
                     "path.landing", "no path leads past the landing with room to turn; move it or give it more room"
                 )
-            stop_m, path = min(ways, key=lambda w: w[0])
+            stop_m, path = min(candidates, key=lambda w: w[0])
             self._landing_drive = PathDrive(self._carrier, path, stop_m, self._speed)
         self._drive(self._landing_drive)
 
@@ -183,19 +189,19 @@ class RouteDriver:
         stop_on: StopFinder,
     ) -> list[tuple[float, Path]]:
         """Paths past a landing in these directions; else the paths by ``else_``; else paths with a turn first."""
-        ways = self._drivable_paths(location, _lines_past(landing, directions), stop_on)
-        ways = ways or self._drivable_paths(location, else_, stop_on)
+        candidates = self._drivable_paths(location, _lines_past(landing, directions), stop_on)
+        candidates = candidates or self._drivable_paths(location, else_, stop_on)
         turned = ([*turn, *p] for p in _lines_past(landing, directions) for turn in self._turn_first(location, p))
-        return ways or self._drivable_paths(location, turned, stop_on)
+        return candidates or self._drivable_paths(location, turned, stop_on)
 
     def _drivable_paths(
-        self, location: Location, ways: Iterable[list[Point2]], stop_on: StopFinder
+        self, location: Location, candidates: Iterable[list[Point2]], stop_on: StopFinder
     ) -> list[tuple[float, Path]]:
         """The drivable paths by these points from which the landing is reached, each with its stop [m].  Every path
         starts at the machine: stopping is inaccurate before the machine is on its path.
         """
         found = []
-        for points in ways:
+        for points in candidates:
             try:
                 path = self._ahead_path(location, points)
             except PathRefused:
@@ -228,23 +234,25 @@ class RouteDriver:
         that, try all of them with a turn first.
         """
         here = (location.x_m, location.y_m)
-        ways = [[*back, *by, *rest]] if back else []
-        ways += [[*by, *rest]] if by else []
-        ways.append(list(rest))
+        candidates = [[*back, *by, *rest]] if back else []
+        candidates += [[*by, *rest]] if by else []
+        candidates.append(list(rest))
         past = [list(rest[1:])] if turn and len(rest) > 1 and math.dist(here, rest[0]) < NEAR_M else []
         turned = (
-            [*corners, *points] for points in (ways if turn else ()) for corners in self._turn_first(location, points)
+            [*corners, *points]
+            for points in (candidates if turn else ())
+            for corners in self._turn_first(location, points)
         )
         refused = PathRefused("path.none", "there is no drivable path")
-        for begins, choice in (
-            (self._ahead_path, (*ways, *past)),
-            (self._aligned_path, (*ways, *past)),
+        for plan, choice in (
+            (self._ahead_path, (*candidates, *past)),
+            (self._aligned_path, (*candidates, *past)),
             (self._ahead_path, turned),
-            (self._direct_path, (*ways, *past)),
+            (self._direct_path, (*candidates, *past)),
         ):
             for points in choice:
                 try:
-                    self._route(location, points, begins)
+                    self._route(location, points, plan)
                     return
                 except PathRefused as error:
                     refused = error
@@ -275,10 +283,10 @@ class RouteDriver:
     def update_distance(self, location: Location) -> None:
         """Update the driven distance."""
         here = (location.x_m, location.y_m)
-        way_m = 0.0 if self._last is None else math.dist(here, self._last)
-        self._last, self.driven_m = here, self.driven_m + way_m
+        distance_m = 0.0 if self._last is None else math.dist(here, self._last)
+        self._last, self.driven_m = here, self.driven_m + distance_m
         if not isinstance(self._active, PathDrive):
-            self.along_m += way_m
+            self.along_m += distance_m
         elif self._active.steer is not None:
             self.along_m = self._active.steer.s_m
 
@@ -287,12 +295,12 @@ class RouteDriver:
         assert self._path is not None
         return self._base(self._path, along_m)
 
-    def _route(self, location: Location, points: Sequence[Point2], begins: Callable[..., Path]) -> None:
-        """Make the path by these points the active route; ``begins`` plans it."""
+    def _route(self, location: Location, points: Sequence[Point2], plan: Callable[..., Path]) -> None:
+        """Make the path by these points the active route; ``plan`` plans it."""
         points = list(points)
         if len(points) > 1 and math.dist((location.x_m, location.y_m), points[0]) < REACHED_M:
             del points[0]
-        self._path = path = begins(location, points)
+        self._path = path = plan(location, points)
         self._active, self.length_m, self.along_m = (
             PathDrive(self._carrier, path, None, self._speed),
             path.length_m,
@@ -327,12 +335,12 @@ class RouteDriver:
         wheelbase = self._carrier.front_axle_m + self._carrier.rear_axle_m
         return base_on_path(self._carrier, path.at(along_m)[:3], path.at(along_m - wheelbase)[:2], 0.0)
 
-    def _drive(self, way: PathDrive | WaypointDrive) -> None:
+    def _drive(self, drive: PathDrive | WaypointDrive) -> None:
         """Start this drive, or resume it."""
-        if self._navigator.phase in (Phase.PAUSED, Phase.STOPPED) and self._navigator.active is way:
+        if self._navigator.phase in (Phase.PAUSED, Phase.STOPPED) and self._navigator.active is drive:
             self._navigator.resume()
         else:
-            self._navigator.drive(way)
+            self._navigator.drive(drive)
 
 
 def _points(plane: LocalPlane, places: Iterable[Point]) -> list[Point2]:

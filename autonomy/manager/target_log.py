@@ -37,7 +37,7 @@ class TargetLog:
         self.number, self._was_inside = None, False
 
     @property
-    def lies_ahead(self) -> bool:
+    def is_ahead(self) -> bool:
         """Whether the front camera can see the target; it cannot see beside the machine."""
         return self.number is not None and not self._world.is_in_circle(self.log)
 

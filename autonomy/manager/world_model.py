@@ -155,8 +155,8 @@ class WorldModel:
         for number in self._known.gone:
             self.log_map.remove(number)
         for missed in self._known.missed:
-            lay = listed_log(missed.log, plane, ground_m)
-            self.log_map.restore(replace(lay, number=missed.number, misses=missed.misses, hits=0))
+            mapped = listed_log(missed.log, plane, ground_m)
+            self.log_map.restore(replace(mapped, number=missed.number, misses=missed.misses, hits=0))
         self.log_map.reserve_numbers(self._known.free)
 
     def known(self) -> LogKnowledge:
@@ -172,8 +172,8 @@ class WorldModel:
         x, y, _ = log.center_m.tolist()
         place = Point(*self.plane.geodetic(x, y)[:2])
         bearing = bearing_from_yaw(math.atan2(log.axis[1], log.axis[0]))
-        kept = KnownLog(place, "", bearing, log.length_m, log.diameter_m, "", log.assortment, None, log.sigma_m)
-        return MissedLog(log.number, kept, log.misses)
+        known_log = KnownLog(place, "", bearing, log.length_m, log.diameter_m, "", log.assortment, None, log.sigma_m)
+        return MissedLog(log.number, known_log, log.misses)
 
     def log_before_wheel(self) -> MappedLog | None:
         """The first log that a front wheel would hit next; None without one."""
@@ -183,9 +183,9 @@ class WorldModel:
         turn = np.array([[cos, -sin], [sin, cos]])
         for log in self.log_map.logs:
             spine = log.center_m + np.linspace(-0.5, 0.5, SPINE_POINTS)[:, None] * log.length_m * log.axis
-            ahead, aside = ((spine[:, :2] - (here.x_m, here.y_m)) @ turn).T
+            ahead, lateral = ((spine[:, :2] - (here.x_m, here.y_m)) @ turn).T
             near = (ahead > 0.0) & (ahead < c.wheel_radius_m + 0.5 * log.diameter_m + BRAKING_M)
-            if np.any(near & (np.abs(np.abs(aside) - 0.5 * c.track_width_m) < 0.5 * c.wheel_width_m)):
+            if np.any(near & (np.abs(np.abs(lateral) - 0.5 * c.track_width_m) < 0.5 * c.wheel_width_m)):
                 return log
         return None
 
@@ -225,13 +225,13 @@ class WorldModel:
         stop = best_stop([pile], self._reach, base_at, 0.0, end_m)
         return None if stop is None else stop.along_m
 
-    def landing_pile(self, point: Point2, lie_rad: float | None = None) -> Bunk:
-        """The landing as a bunk on the ground for the crane: beside the machine, parallel to it or to ``lie_rad`` [rad]
-        in the plane.
+    def landing_pile(self, point: Point2, log_direction_rad: float | None = None) -> Bunk:
+        """The landing as a bunk on the ground for the crane: beside the machine, parallel to it or to
+        ``log_direction_rad`` [rad] in the plane.
         """
         x, y, _ = self.base.to_optical(np.array([*point, self.base.position_m[2]])).tolist()
-        looks = math.atan2(self.base.rotation[1, 0], self.base.rotation[0, 0])
-        yaw = 0.0 if lie_rad is None else math.remainder(lie_rad - looks, math.pi)
+        base_yaw = math.atan2(self.base.rotation[1, 0], self.base.rotation[0, 0])
+        yaw = 0.0 if log_direction_rad is None else math.remainder(log_direction_rad - base_yaw, math.pi)
         return Bunk((x, y), yaw, PILE_LENGTH_M, PILE_WIDTH_M, self._ground_z_m, PILE_HEIGHT_M)
 
     def blocked_reason(self, now_ns: int) -> str:
@@ -251,11 +251,11 @@ class WorldModel:
         """Whether the controller is in STOP or FAULT."""
         return self.report is not None and self.report.mode in (Mode.STOP, Mode.FAULT)
 
-    def is_at_height(self, wanted_m: float) -> bool:
+    def is_at_height(self, height_m: float) -> bool:
         """Whether all four swing arms are at a height."""
         assert self.vehicle is not None
         near = 1.5 * self._carrier.arm_in_band_m
-        return all(abs(h - wanted_m) <= near for h in self.vehicle.heights_m)
+        return all(abs(h - height_m) <= near for h in self.vehicle.heights_m)
 
     def is_standing(self) -> bool:
         """Whether the machine is at standstill."""
@@ -336,5 +336,5 @@ class WorldModel:
 
     def _relevant(self) -> list[MappedLog]:
         """Wanted logs close enough to affect the next stop."""
-        foot = self.base.position_m[:2]
-        return [g for g in self._wanted() if math.dist(g.center_m[:2], foot) < HORIZON_M]
+        base_position = self.base.position_m[:2]
+        return [g for g in self._wanted() if math.dist(g.center_m[:2], base_position) < HORIZON_M]

@@ -65,15 +65,15 @@ def assemble(
         MissionError: an unknown or unsuitable role, a property of the wrong type, or two routes.
     """
     draft = Draft(ForwardingMission(), source, kind)
-    troubles: list[tuple[Place, str, str]] = []
-    roles = [_role(shape, troubles) for shape in shapes]
+    problems: list[tuple[Place, str, str]] = []
+    roles = [_role(shape, problems) for shape in shapes]
     points, lines = ([s for s, role in zip(shapes, roles, strict=True) if role == r] for r in ("waypoint", "route"))
-    loose = [s for s, role in zip(shapes, roles, strict=True) if role == ""]
-    if loose and not lines and not points:
-        points, loose = loose, []
-    if loose:
-        draft.notes.append(f"{_counted(len(loose), 'point')} without a role beside the route ignored")
-    troubles += [
+    without_role = [s for s, role in zip(shapes, roles, strict=True) if role == ""]
+    if without_role and not lines and not points:
+        points, without_role = without_role, []
+    if without_role:
+        draft.notes.append(f"{_counted(len(without_role), 'point')} without a role beside the route ignored")
+    problems += [
         (
             line.place, "mission.second-route",
             'is a second route; a mission has one, so delete one of them or give it another "role"',
@@ -82,8 +82,8 @@ def assemble(
     ]  # fmt: skip
     if lines and points:
         sentence = "is a waypoint beside a route; keep the line or the points, not both"
-        troubles.append((points[0].place, "mission.waypoint-beside-route", sentence))
-    reader = _Reader(draft, troubles)
+        problems.append((points[0].place, "mission.waypoint-beside-route", sentence))
+    reader = _Reader(draft, problems)
     route = [p for shape in (lines[:1] or points) for p in shape.rings[0]]
     waypoints = tuple(reader.point(("waypoint", i), position) for i, position in enumerate(route))
     fences: list[Fence] = []
@@ -96,8 +96,8 @@ def assemble(
             landings.append(reader.landing(shape, len(landings)))
         elif role == "log":
             logs.append(reader.log(shape, len(logs)))
-    if troubles:
-        raise source.errors(troubles)
+    if problems:
+        raise source.errors(problems)
     draft.mission = ForwardingMission(
         name, waypoints, tuple(fences), tuple(landings), tuple(logs), options or Options()
     )
@@ -114,20 +114,20 @@ def merged(route: Draft, harvest: Draft) -> Draft:
     )  # fmt: skip
 
 
-def _role(shape: Shape, troubles: list[tuple[Place, str, str]]) -> str:
+def _role(shape: Shape, problems: list[tuple[Place, str, str]]) -> str:
     """The role of a shape; "" for a point without one."""
     role = shape.properties.get("role")
     if role is None:
         return {"point": "", "line": "route", "polygon": "fence"}[shape.kind]
     if role not in ROLES:
-        sentence = f"role {_shown(role)} is unknown; use one of {', '.join(ROLES)}"
-        troubles.append((shape.place, "mission.unknown-role", sentence))
+        sentence = f"role {_abbreviated(role)} is unknown; use one of {', '.join(ROLES)}"
+        problems.append((shape.place, "mission.unknown-role", sentence))
         return "none"
     fits = {"route": ("line",), "waypoint": ("point",), "fence": ("polygon",), "keep-out": ("polygon",),
             "log": ("point", "line"), "landing": ("point",)}[role]  # fmt: skip
     if shape.kind not in fits:
         sentence = f"a {shape.kind} cannot be a {role}; draw a {' or a '.join(fits)}"
-        troubles.append((shape.place, "mission.role-shape", sentence))
+        problems.append((shape.place, "mission.role-shape", sentence))
         return "none"
     return str(role)
 
@@ -135,8 +135,8 @@ def _role(shape: Shape, troubles: list[tuple[Place, str, str]]) -> str:
 class _Reader:
     """Converts shapes to parts of a mission, and collects their places and problems."""
 
-    def __init__(self, draft: Draft, troubles: list[tuple[Place, str, str]]) -> None:
-        self.draft, self.troubles = draft, troubles
+    def __init__(self, draft: Draft, problems: list[tuple[Place, str, str]]) -> None:
+        self.draft, self.problems = draft, problems
 
     def point(self, key: Key, position: Position) -> Point:
         self.draft.places[key] = position.place
@@ -157,7 +157,7 @@ class _Reader:
             self.point(("landing", number), shape.rings[0][0]),
             self.text(shape, "name"),
             self.number(shape, "bearing_deg"),
-            self.words(shape, "assortments"),
+            self.names(shape, "assortments"),
         )
 
     def log(self, shape: Shape, number: int) -> KnownLog:
@@ -168,13 +168,13 @@ class _Reader:
         if shape.kind == "line":
             if len(ring) != 2:
                 sentence = f"a log drawn as a line has two ends, not {len(ring)} points"
-                self.troubles.append((shape.place, "mission.log-line", sentence))
+                self.problems.append((shape.place, "mission.log-line", sentence))
             elif not _far_from_sane(ring):
                 at, known["bearing_deg"], known["length_m"] = _from_ends(*ring)
         key = self.number(shape, "product_key")
         if key is not None and not (key.is_integer() and 0.0 < key < 2**31):
             sentence = f"product_key is {key:g}; StanForD product keys are integers from 1"
-            self.troubles.append((shape.place, "mission.product-key", sentence))
+            self.problems.append((shape.place, "mission.product-key", sentence))
             key = None
         return KnownLog(
             at,
@@ -199,7 +199,7 @@ class _Reader:
             return None
 
     def _not_a(self, shape: Shape, name: str, value: object, kind: str) -> None:
-        self.troubles.append((shape.place, "mission.property-type", f"{name} is {_shown(value)}, not a {kind}"))
+        self.problems.append((shape.place, "mission.property-type", f"{name} is {_abbreviated(value)}, not a {kind}"))
 
     def text(self, shape: Shape, name: str) -> str:
         value = shape.properties.get(name)
@@ -210,7 +210,7 @@ class _Reader:
             return ""
         return str(value)
 
-    def words(self, shape: Shape, name: str) -> tuple[str, ...]:
+    def names(self, shape: Shape, name: str) -> tuple[str, ...]:
         value = shape.properties.get(name)
         if value is None:
             return ()
@@ -222,7 +222,7 @@ class _Reader:
         return ()
 
 
-def _shown(value: object) -> str:
+def _abbreviated(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:37]}..."
 

@@ -41,8 +41,8 @@ def _check_crs(document: dict[str, Any], source: Source) -> None:
     crs = document.get("crs")
     if crs is None:
         return
-    said = crs.get("properties", crs) if isinstance(crs, dict) else crs
-    named = str(said.get("name", said)) if isinstance(said, dict) else str(said)
+    crs_name = crs.get("properties", crs) if isinstance(crs, dict) else crs
+    named = str(crs_name.get("name", crs_name)) if isinstance(crs_name, dict) else str(crs_name)
     if not any(word in named.lower() for word in _WGS84):
         raise source.error(
             "mission.datum",
@@ -176,8 +176,12 @@ def write(mission: ForwardingMission) -> bytes:
         features.append(_feature("LineString", [_position(p) for p in mission.waypoints], {"role": "route"}))
     features += [_fence(fence) for fence in mission.fences]
     for landing in mission.landings:
-        about = {"name": landing.name, "bearing_deg": landing.bearing_deg, "assortments": list(landing.assortments)}
-        features.append(_feature("Point", _position(landing.position), {"role": "landing"} | _told(about)))
+        properties = {
+            "name": landing.name,
+            "bearing_deg": landing.bearing_deg,
+            "assortments": list(landing.assortments),
+        }
+        features.append(_feature("Point", _position(landing.position), {"role": "landing"} | _with_values(properties)))
     features += [_log(log) for log in mission.logs]
     lines = ",\n".join("    " + _text(feature) for feature in features)
     body = f"[\n{lines}\n  ]" if lines else "[]"
@@ -187,13 +191,13 @@ def write(mission: ForwardingMission) -> bytes:
 def _fence(fence: Fence) -> dict[str, Any]:
     ring = [_position(p) for p in (*fence.corners, *fence.corners[:1])]
     return _feature(
-        "Polygon", [ring], {"role": "keep-out" if fence.keep_out else "fence"} | _told({"name": fence.name})
+        "Polygon", [ring], {"role": "keep-out" if fence.keep_out else "fence"} | _with_values({"name": fence.name})
     )
 
 
 def _log(log: KnownLog) -> dict[str, Any]:
-    about = {name: getattr(log, name) for name in log.__struct_fields__ if name != "position"}
-    return _feature("Point", _position(log.position), {"role": "log"} | _told(about))
+    properties = {name: getattr(log, name) for name in log.__struct_fields__ if name != "position"}
+    return _feature("Point", _position(log.position), {"role": "log"} | _with_values(properties))
 
 
 def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
@@ -209,7 +213,7 @@ def _position(point: Point) -> list[float]:
     return [point.longitude_deg, point.latitude_deg, *height]
 
 
-def _told(properties: dict[str, Any]) -> dict[str, Any]:
+def _with_values(properties: dict[str, Any]) -> dict[str, Any]:
     """The properties that have a value."""
     return {key: value for key, value in properties.items() if value not in (None, "", [])}
 

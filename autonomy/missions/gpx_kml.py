@@ -77,9 +77,9 @@ def read_gpx(data: bytes, name: str) -> Draft:
             notes.append("an empty route ignored")
     for point in root.all("wpt"):
         kind = point.value("type").lower()
-        about: dict[str, Any] = {"role": kind} if kind in ROLES else {}
-        about |= {"key" if kind == "log" else "name": point.value("name")}
-        shapes.append(Shape("point", ((_gpx_position(point, source),),), about, point.line))
+        properties: dict[str, Any] = {"role": kind} if kind in ROLES else {}
+        properties |= {"key" if kind == "log" else "name": point.value("name")}
+        shapes.append(Shape("point", ((_gpx_position(point, source),),), properties, point.line))
     title = root.value("metadata", "name") or (lines[0][2].value("name") if lines else "")
     draft = assemble(shapes, source, "GPX", title)
     draft.notes += notes
@@ -128,23 +128,23 @@ class _Kml:
         self.count = 0
 
     def placemark(self, placemark: Element) -> None:
-        about: dict[str, Any] = {"name": placemark.value("name")}
+        properties: dict[str, Any] = {"name": placemark.value("name")}
         for data in placemark.all("ExtendedData"):
-            about |= {entry.attributes.get("name", ""): entry.value("value") for entry in data.all("Data")}
+            properties |= {entry.attributes.get("name", ""): entry.value("value") for entry in data.all("Data")}
             for schema in data.all("SchemaData"):
-                about |= {e.attributes.get("name", ""): e.text.strip() for e in schema.all("SimpleData")}
-        if about.get("role") == "log":
-            about.setdefault("key", about["name"])
-        self.geometries(placemark, about)
+                properties |= {e.attributes.get("name", ""): e.text.strip() for e in schema.all("SimpleData")}
+        if properties.get("role") == "log":
+            properties.setdefault("key", properties["name"])
+        self.geometries(placemark, properties)
 
-    def geometries(self, owner: Element, about: dict[str, Any]) -> None:
+    def geometries(self, owner: Element, properties: dict[str, Any]) -> None:
         for child in owner.children:
             if child.name == "MultiGeometry":
-                self.geometries(child, about)
+                self.geometries(child, properties)
             elif child.name == "Point":
-                self.add("point", [self.positions(child)], about, child.line)
+                self.add("point", [self.positions(child)], properties, child.line)
             elif child.name in ("LineString", "LinearRing"):
-                self.add("line", [self.positions(child)], about, child.line)
+                self.add("line", [self.positions(child)], properties, child.line)
             elif child.name == "Polygon":
                 rings = [
                     self.positions(ring)
@@ -152,11 +152,11 @@ class _Kml:
                     for boundary in child.all(side)
                     for ring in boundary.all("LinearRing")
                 ]
-                self.add("polygon", rings, about, child.line)
+                self.add("polygon", rings, properties, child.line)
 
-    def add(self, kind: Any, rings: list[tuple[Position, ...]], about: dict[str, Any], place: Place) -> None:
+    def add(self, kind: Any, rings: list[tuple[Position, ...]], properties: dict[str, Any], place: Place) -> None:
         if rings and all(rings):
-            self.shapes.append(Shape(kind, tuple(rings), about, place))
+            self.shapes.append(Shape(kind, tuple(rings), properties, place))
         else:
             self.notes.append(f"an empty {kind} ignored")
 

@@ -66,21 +66,21 @@ def review(mission: ForwardingMission, profile: Profile) -> Review:
         )
     frame = site_frame(mission)
     at = frame.points_enu(mission.waypoints)[:, :2]
-    ways = legs(mission)
+    route_legs = legs(mission)
     laps = mission.options.laps
-    lengths = [float(np.linalg.norm(at[j] - at[i])) for i, j in ways]
-    closing = lengths[-1] if laps > 1 and len(ways) == len(at) else 0.0
+    lengths = [float(np.linalg.norm(at[j] - at[i])) for i, j in route_legs]
+    closing = lengths[-1] if laps > 1 and len(route_legs) == len(at) else 0.0
     length = laps * sum(lengths) - closing
     speed = mission.options.speed_m_s or carrier.cruise_speed_m_s
     radius = turning_radius_m(carrier, carrier.articulation_limit_rad)
-    corners = _corners(at, ways, radius)
+    corners = _corners(at, route_legs, radius)
     logs = _wanted(mission)
     warnings = [
         *_site(mission, carrier),
         *_speed(mission, carrier),
-        *_tight(corners, ways, lengths, radius),
+        *_tight(corners, route_legs, lengths, radius),
         *_room(mission, frame, carrier),
-        *_logs(mission, frame, at, ways, profile),
+        *_logs(mission, frame, at, route_legs, profile),
         *_unlisted(mission),
     ]
     return Review(length, length / speed, logs, LOG_S * logs, corners, tuple(warnings))
@@ -92,18 +92,18 @@ def _wanted(mission: ForwardingMission) -> int:
     logs = sum(1 for log in mission.logs if not wanted or log.assortment in wanted)
     if mission.options.logs == "search":
         logs *= mission.options.laps
-    most = mission.options.logs_wanted
-    if most is None:
+    limit = mission.options.logs_wanted
+    if limit is None:
         return logs
-    return min(logs, most) if logs else most
+    return min(logs, limit) if logs else limit
 
 
-def _corners(at: np.ndarray, ways: list[tuple[int, int]], radius_m: float) -> tuple[Corner, ...]:
+def _corners(at: np.ndarray, route_legs: list[tuple[int, int]], radius_m: float) -> tuple[Corner, ...]:
     """Every waypoint between two legs."""
     found = []
-    follows = list(pairwise(ways))
-    if len(ways) > 1 and ways[-1][1] == ways[0][0]:
-        follows.append((ways[-1], ways[0]))
+    follows = list(pairwise(route_legs))
+    if len(route_legs) > 1 and route_legs[-1][1] == route_legs[0][0]:
+        follows.append((route_legs[-1], route_legs[0]))
     for (a, b), (_, c) in follows:
         one, two = at[b] - at[a], at[c] - at[b]
         turn = abs(math.atan2(one[0] * two[1] - one[1] * two[0], float(one @ two)))
@@ -133,7 +133,7 @@ def _speed(mission: ForwardingMission, carrier: Carrier) -> list[Problem]:
 
 
 def _tight(
-    corners: tuple[Corner, ...], ways: list[tuple[int, int]], lengths: list[float], radius_m: float
+    corners: tuple[Corner, ...], route_legs: list[tuple[int, int]], lengths: list[float], radius_m: float
 ) -> list[Problem]:
     """Corners that the machine cannot drive as drawn: too sharp, or with legs too short for the bends."""
     found = []
@@ -145,7 +145,7 @@ def _tight(
                 f"waypoint {corner.waypoint + 1}: the route turns by {math.degrees(corner.turn_rad):.0f} degrees on "
                 f"the spot; the machine's smallest circle has a radius of {radius_m:.1f} m, so draw a loop",
             ))  # fmt: skip
-    for (i, j), length in zip(ways, lengths, strict=True):
+    for (i, j), length in zip(route_legs, lengths, strict=True):
         needed = room.get(i, 0.0) + room.get(j, 0.0)
         if length < needed:
             found.append(Problem(
@@ -177,12 +177,12 @@ def _room(mission: ForwardingMission, frame: LocalFrame, carrier: Carrier) -> li
 
 
 def _logs(
-    mission: ForwardingMission, frame: LocalFrame, at: np.ndarray, ways: list[tuple[int, int]], profile: Profile
+    mission: ForwardingMission, frame: LocalFrame, at: np.ndarray, route_legs: list[tuple[int, int]], profile: Profile
 ) -> list[Problem]:
     """Logs that the crane cannot reach from the route, or that lie on the route."""
     if not mission.logs or not len(at) or profile.carrier is None:
         return []
-    path = at[[ways[0][0], *(j for _, j in ways)]] if ways else at
+    path = at[[route_legs[0][0], *(j for _, j in route_legs)]] if route_legs else at
     away = path_distance_m(path, frame.points_enu([log.position for log in mission.logs])[:, :2])
     reach = max_reach_m(profile)
     half = 0.5 * (profile.carrier.track_width_m + profile.carrier.wheel_width_m)

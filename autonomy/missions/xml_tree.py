@@ -89,10 +89,10 @@ class _Builder:
             raise TooMany("mission.nesting", self.line(), "is nested deeper than any mission")
         for counted in (name, ANY):
             if counted in self.limits:
-                most, what = self.limits[counted]
+                limit, what = self.limits[counted]
                 self.counts[counted] = self.counts.get(counted, 0) + 1
-                if self.counts[counted] > most:
-                    raise TooMany("mission.too-many-elements", self.line(), f"has more than {most} {what}")
+                if self.counts[counted] > limit:
+                    raise TooMany("mission.too-many-elements", self.line(), f"has more than {limit} {what}")
         local = {key.rpartition("}")[2]: value for key, value in attributes.items()}
         element = Element(name, namespace.lstrip("{"), local, self.line())
         if self.open:

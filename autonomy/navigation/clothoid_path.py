@@ -95,8 +95,8 @@ class Path:
 def path_limits(carrier: Carrier, share: float = COMFORT_SHARE, rate_share: float = RATE_SHARE) -> Limits:
     """Limits of the machine at its cruising speed."""
     sharpest = 1.0 / turning_radius_m(carrier, carrier.articulation_limit_rad)
-    swing_1_m = rate_share * carrier.articulation_rate_limit_rad_s / carrier.cruise_speed_m_s
-    return Limits(share * sharpest, swing_1_m / (carrier.front_axle_m + carrier.rear_axle_m))
+    articulation_rad_m = rate_share * carrier.articulation_rate_limit_rad_s / carrier.cruise_speed_m_s
+    return Limits(share * sharpest, articulation_rad_m / (carrier.front_axle_m + carrier.rear_axle_m))
 
 
 def drivable_path(points: Sequence[Point2], carrier: Carrier) -> Path:
@@ -220,7 +220,7 @@ def _sampled(xy: np.ndarray, bends: Sequence[_Bend]) -> Path:
     headings: list[np.ndarray] = []
     curves: list[np.ndarray] = []
     corners: list[float] = []
-    way = 0.0
+    distance = 0.0
     heading = math.atan2(*(xy[1] - xy[0])[::-1])
     begin = 0.0
     for i in range(len(xy) - 1):
@@ -229,21 +229,21 @@ def _sampled(xy: np.ndarray, bends: Sequence[_Bend]) -> Path:
         length = math.dist(xy[i], xy[i + 1]) - begin - end
         n = max(2, math.ceil(length / SPACING_M) + 1)
         along = np.linspace(0.0, length, n)
-        s.append(way + along)
+        s.append(distance + along)
         points.append(xy[i] + np.outer(begin + along, ahead))
         headings.append(np.full(n, heading))
         curves.append(np.zeros(n))
-        way += length
+        distance += length
         if i < len(bends) and end > 0.0:
             ds, local, turned, curve = _corner(bends[i].turn_rad, bends[i].limits)
             side = np.array([-ahead[1], ahead[0]])
             start = xy[i + 1] - end * ahead
-            s.append(way + ds)
+            s.append(distance + ds)
             points.append(start + np.outer(local[:, 0], ahead) + np.outer(local[:, 1], side))
             headings.append(heading + turned)
             curves.append(curve)
-            corners.append(way + 0.5 * float(ds[-1]))
-            way += float(ds[-1])
+            corners.append(distance + 0.5 * float(ds[-1]))
+            distance += float(ds[-1])
         if i < len(bends):
             heading += bends[i].turn_rad
         begin = end

@@ -16,20 +16,20 @@ Heading = tuple[float, float, float]
 
 def dubins_corners(start: Heading, goal: Heading, radius_m: float) -> Iterator[list[Point2]]:
     """Corner points of all manoeuvres from one heading to another with two arcs of a radius, the shortest first."""
-    ways = []
+    manoeuvres = []
     for first in (1.0, -1.0):
         for last in (1.0, -1.0):
             begin, end = _circle_centre(start, first, radius_m), _circle_centre(goal, last, radius_m)
-            apart = math.dist(begin, end)
+            centre_distance = math.dist(begin, end)
             straight = math.atan2(end[1] - begin[1], end[0] - begin[0])
             if first != last:
-                if apart < 2.0 * radius_m:
+                if centre_distance < 2.0 * radius_m:
                     continue  # the circles overlap: no straight line leads from one side to the other
-                straight += first * math.asin(2.0 * radius_m / apart)
+                straight += first * math.asin(2.0 * radius_m / centre_distance)
             out, back = _angle(first * (straight - start[2])), _angle(last * (goal[2] - straight))
-            along = apart if first == last else math.sqrt(apart**2 - 4.0 * radius_m**2)
-            ways.append((radius_m * (out + back) + along, first, out, last, back))
-    for _, first, out, last, back in sorted(ways):
+            along = centre_distance if first == last else math.sqrt(centre_distance**2 - 4.0 * radius_m**2)
+            manoeuvres.append((radius_m * (out + back) + along, first, out, last, back))
+    for _, first, out, last, back in sorted(manoeuvres):
         onto = (goal[0], goal[1], goal[2] + math.pi)
         yield [*_corners(start, first, out, radius_m), *reversed(_corners(onto, -last, back, radius_m))]
 

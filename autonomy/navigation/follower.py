@@ -77,12 +77,15 @@ def follow_path(
     carrier: Carrier, path: Path, state: FollowerState, location: Location, speed_m_s: float
 ) -> tuple[FollowerState, SteeringCommand]:
     """One step at the location's stamp; ``speed_m_s`` is the speed about to be requested."""
-    bend, speed = location.articulation_rad, location.speed_m_s
-    turn_1_m = math.sin(bend) / (carrier.front_axle_m * math.cos(bend) + carrier.rear_axle_m) + location.slip_curve_1_m
-    way = speed * REACTION_S
-    course = location.course_rad + 0.5 * way * turn_1_m
-    x, y = location.x_m + way * math.cos(course), location.y_m + way * math.sin(course)
-    course = location.course_rad + way * turn_1_m
+    articulation, speed = location.articulation_rad, location.speed_m_s
+    turn_1_m = (
+        math.sin(articulation) / (carrier.front_axle_m * math.cos(articulation) + carrier.rear_axle_m)
+        + location.slip_curve_1_m
+    )
+    ahead_m = speed * REACTION_S
+    course = location.course_rad + 0.5 * ahead_m * turn_1_m
+    x, y = location.x_m + ahead_m * math.cos(course), location.y_m + ahead_m * math.sin(course)
+    course = location.course_rad + ahead_m * turn_1_m
     around = () if state.s_m is None else (state.s_m - BACK_M, state.s_m + FORTH_M)
     s = path.nearest(x, y, *around)
     px, py, heading, curve = path.at(s)
@@ -94,9 +97,9 @@ def follow_path(
         integral = max(-INTEGRAL_LIMIT_M, min(INTEGRAL_LIMIT_M, integral))
     pull = LAMBDA_1_M * (off + integral)
     wanted = max(-MAX_RETURN_RAD, min(MAX_RETURN_RAD, -math.atan(pull)))
-    of_way = -LAMBDA_1_M / (1.0 + pull**2) * math.sin(off_course)
+    course_change = -LAMBDA_1_M / (1.0 + pull**2) * math.sin(off_course)
     own = curve * math.cos(off_course) / max(0.3, 1.0 - curve * off)
-    kappa = own + of_way - GAMMA_1_M * wrapped(off_course - wanted) - location.slip_curve_1_m
+    kappa = own + course_change - GAMMA_1_M * wrapped(off_course - wanted) - location.slip_curve_1_m
     angle, rate = _articulation(carrier, state, location, kappa, speed_m_s)
     return FollowerState(s, angle, rate, location.stamp_ns, integral), SteeringCommand(angle, rate, s, off, off_course)
 

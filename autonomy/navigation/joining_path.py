@@ -50,11 +50,13 @@ def _approaches(here: Point2, yaw_rad: float, points: Sequence[Point2]) -> Itera
     if not points:
         return
     goal = points[0]
-    ahead = [_off(here, yaw_rad, way) for way in AHEAD_M]
-    about = [_off(goal, 2.0 * math.pi * k / ABOUT_POINTS, way) for way in ABOUT_M for k in range(ABOUT_POINTS)]
-    yield from ([point] for point in (*ahead, *about))
-    yield from ([a, b] for a in ahead for b in about)
+    ahead = [_off(here, yaw_rad, distance) for distance in AHEAD_M]
+    around = [
+        _off(goal, 2.0 * math.pi * k / ABOUT_POINTS, distance) for distance in ABOUT_M for k in range(ABOUT_POINTS)
+    ]
+    yield from ([point] for point in (*ahead, *around))
+    yield from ([a, b] for a in ahead for b in around)
 
 
-def _off(point: Point2, yaw_rad: float, way_m: float) -> Point2:
-    return point[0] + way_m * math.cos(yaw_rad), point[1] + way_m * math.sin(yaw_rad)
+def _off(point: Point2, yaw_rad: float, distance_m: float) -> Point2:
+    return point[0] + distance_m * math.cos(yaw_rad), point[1] + distance_m * math.sin(yaw_rad)

@@ -66,11 +66,11 @@ class Navigator:
         self.active: PathDrive | WaypointDrive | None = None
         """The current or last drive."""
         self._sequence = 0
-        self._asked_ns = self._obeyed_ns = self._moved_ns = self._rolled_ns = 0
+        self._requested_ns = self._obeyed_ns = self._moved_ns = self._rolled_ns = 0
 
-    def drive(self, way: PathDrive | WaypointDrive) -> None:
+    def drive(self, drive: PathDrive | WaypointDrive) -> None:
         """Start this drive; it replaces an active one."""
-        self.active = way
+        self.active = drive
         self._begin()
 
     def pause(self) -> None:
@@ -90,41 +90,41 @@ class Navigator:
 
     def step(self, now_ns: int, report: VehicleReport, location: Location) -> DriveSetpoint | None:
         """The setpoint to send now, or None."""
-        still = abs(report.speed_m_s) < STANDSTILL_M_S and report.driving != Driving.BRAKING
-        self.is_standing = still and now_ns - self._rolled_ns >= REST_NS
+        at_standstill = abs(report.speed_m_s) < STANDSTILL_M_S and report.driving != Driving.BRAKING
+        self.is_standing = at_standstill and now_ns - self._rolled_ns >= REST_NS
         order = DriveRequest()
         if self.phase is Phase.DRIVING:
             order = self.active.step(report) if isinstance(self.active, WaypointDrive) else self.active.step(location)  # type: ignore[union-attr]
             self._supervise(now_ns, report, order)
         if self.phase is not Phase.DRIVING:
             if isinstance(self.active, PathDrive):
-                self.active.rest(location)
+                self.active.reset(location)
             idle = (self.phase is Phase.IDLE or self.is_standing) and not self.holds_heights
             if idle or not math.isfinite(report.articulation_rad):
                 return None
             order = DriveRequest(articulation_rad=report.articulation_rad)
-        if not still or order.speed_m_s:
+        if not at_standstill or order.speed_m_s:
             self._rolled_ns = now_ns
         limit = self._limit_rad
-        bend = min(max(order.articulation_rad, -limit), limit)
+        articulation = min(max(order.articulation_rad, -limit), limit)
         # As a beam axle: paper B opens it just before the machine moves and closes it while the crane works.
         floats = self.phase is Phase.DRIVING
         # Starts from the clock, so that the setpoints of a restarted planner are not taken for a replay.
         self._sequence = self._sequence + 1 if self._sequence else now_ns // 1_000_000 & 0xFFFF_FFFF
         return DriveSetpoint(
             self._sequence, self._profile_hash, now_ns, self._lease_ns, order.steering, order.latitude_deg,
-            order.longitude_deg, bend, order.articulation_rate_rad_s, order.speed_m_s,
+            order.longitude_deg, articulation, order.articulation_rate_rad_s, order.speed_m_s,
             self.heights_m, floats, False, self.level,
         )  # fmt: skip
 
     def _begin(self) -> None:
         self.phase, self.reason = Phase.DRIVING, ""
-        self._asked_ns = self._obeyed_ns = self._moved_ns = 0
+        self._requested_ns = self._obeyed_ns = self._moved_ns = 0
 
     def _supervise(self, now_ns: int, report: VehicleReport, order: DriveRequest) -> None:
         """End the drive on arrival or on a problem."""
-        if not self._asked_ns:
-            self._asked_ns = self._obeyed_ns = self._moved_ns = now_ns
+        if not self._requested_ns:
+            self._requested_ns = self._obeyed_ns = self._moved_ns = now_ns
         if report.driving == Driving.DRIVING:
             self._obeyed_ns = now_ns
         if abs(report.speed_m_s) > STUCK_M_S or not order.speed_m_s or report.driving != Driving.DRIVING:

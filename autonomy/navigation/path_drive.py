@@ -91,7 +91,7 @@ class PathDrive:
             Steering.ARTICULATION, 0.0, 0.0, steer.articulation_rad, steer.articulation_rate_rad_s, speed, False
         )
 
-    def rest(self, location: Location) -> None:
+    def reset(self, location: Location) -> None:
         """Reset the speed correction while the machine stands; it is not valid for the next start."""
         self._following = replace(self._following, articulation_rad=None, stamp_ns=0)
         self._correction = 0.0
@@ -100,9 +100,9 @@ class PathDrive:
     def _halt(self, location: Location) -> DriveRequest:
         """Come to rest: on a slope the drive must hold the machine until the brake is on."""
         self._halting_ns = self._halting_ns or location.stamp_ns
-        rests = abs(location.speed_m_s) < HALTED_M_S or location.stamp_ns - self._halting_ns > HALT_NS
-        speed = 0.0 if rests else self._corrected(0.0, location)
-        return DriveRequest(Steering.ARTICULATION, 0.0, 0.0, location.articulation_rad, 0.0, speed, rests)
+        at_rest = abs(location.speed_m_s) < HALTED_M_S or location.stamp_ns - self._halting_ns > HALT_NS
+        speed = 0.0 if at_rest else self._corrected(0.0, location)
+        return DriveRequest(Steering.ARTICULATION, 0.0, 0.0, location.articulation_rad, 0.0, speed, at_rest)
 
     def _stop_reason(self, location: Location) -> str:
         if not location.usable:
@@ -115,10 +115,10 @@ class PathDrive:
         return ""
 
     def _margin(self, location: Location) -> float:
-        bend = location.articulation_rad
+        articulation = location.articulation_rad
         lf, lr = self._carrier.front_axle_m, self._carrier.rear_axle_m
         return tip_margin_m(
-            self._carrier, location, location.speed_m_s**2 * math.sin(bend) / (lf * math.cos(bend) + lr)
+            self._carrier, location, location.speed_m_s**2 * math.sin(articulation) / (lf * math.cos(articulation) + lr)
         )
 
     def _wanted(self, location: Location) -> float:
@@ -127,8 +127,8 @@ class PathDrive:
         if location.status is Status.DEAD_RECKONING:
             share *= RECKONING_SHARE
         s = self._following.s_m
-        bend = math.inf if s is None else bend_speed_m_s(self._carrier, self.path, s)
-        wanted = min(share * self._speed, bend)
+        articulation = math.inf if s is None else bend_speed_m_s(self._carrier, self.path, s)
+        wanted = min(share * self._speed, articulation)
         return wanted if self.steer is None else min(wanted, stopping_speed_m_s(self.left_m - STOP_M))
 
     def _corrected(self, wanted_m_s: float, location: Location) -> float:

@@ -92,9 +92,9 @@ def bend_speed_m_s(carrier: Carrier, path: Path, s_m: float) -> float:
     limit = RATE_SHARE * carrier.articulation_rate_limit_rad_s
     curves = [path.at(s_m + k * LOOK_AHEAD_STEP_M)[3] for k in range(int(LOOK_AHEAD_M / LOOK_AHEAD_STEP_M) + 2)]
     for before, after in pairwise(curves):
-        swing_1_m = abs(after - before) / LOOK_AHEAD_STEP_M * (lf + lr)
-        if swing_1_m > 0.0:
-            fastest = min(fastest, limit / swing_1_m)
+        articulation_rad_m = abs(after - before) / LOOK_AHEAD_STEP_M * (lf + lr)
+        if articulation_rad_m > 0.0:
+            fastest = min(fastest, limit / articulation_rad_m)
     return fastest
 
 

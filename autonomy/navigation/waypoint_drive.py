@@ -66,8 +66,8 @@ class WaypointDrive:
 
     def step(self, report: VehicleReport) -> DriveRequest:
         """The drive request for one report."""
-        seen = report.position_ns and report.stamp_ns - report.position_ns <= FRESH_NS
-        if not seen or not math.isfinite(report.latitude_deg + report.longitude_deg):
+        has_position = report.position_ns and report.stamp_ns - report.position_ns <= FRESH_NS
+        if not has_position or not math.isfinite(report.latitude_deg + report.longitude_deg):
             return DriveRequest(Steering.WAYPOINT, stop_reason="no position from the receiver")
         if not math.isfinite(report.heading_rad) or report.stamp_ns - report.heading_ns > FRESH_NS:
             return DriveRequest(Steering.WAYPOINT, stop_reason="no heading from the receiver")

@@ -6,36 +6,24 @@ import argparse
 from pathlib import Path
 
 from autonomy.manager.transition_table import TABLES
-from can_dbc.messages.udp_address import udp_address
+from can_dbc.messages.udp_address import address_argument
 
 Address = tuple[str, int]
-
-
-def address(text: str) -> Address:
-    """HOST:PORT of a command line.
-
-    Raises:
-        ArgumentTypeError: it is not an address.
-    """
-    try:
-        return udp_address(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def arguments(argv: list[str]) -> argparse.Namespace:
     """The parsed command line; ends the process with code 2 when it is wrong."""
     parser = argparse.ArgumentParser(prog="python -m autonomy", description="Loads one log, or executes a mission.")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file of the machine")
-    parser.add_argument("--controller", type=address, required=True, help="HOST:PORT that accepts setpoints")
+    parser.add_argument("--controller", type=address_argument, required=True, help="HOST:PORT that accepts setpoints")
     parser.add_argument("--report-port", type=int, required=True, help="local UDP port for state reports")
-    parser.add_argument("--scene", type=address, required=True, help="HOST:PORT of the log detector")
+    parser.add_argument("--scene", type=address_argument, required=True, help="HOST:PORT of the log detector")
     parser.add_argument("--log", type=int, help="number of the log to pick (default: the best one)")
     parser.add_argument("--mission", type=Path, help="mission file to execute, in any format of `timberhand plan`")
     parser.add_argument("--progress", type=Path, help="checkpoint file of the mission, from which it is resumed")
     parser.add_argument("--manager", choices=TABLES, default="ours", help="transition table of the activity manager")
     parser.add_argument(
-        "--tell", type=address, action="append", default=[], help="HOST:PORT that receives mission reports"
+        "--tell", type=address_argument, action="append", default=[], help="HOST:PORT that receives mission reports"
     )
     parser.add_argument("--order-port", type=int, help="local UDP port for operator commands to the mission")
     parser.add_argument("--lease-ms", type=int, default=200, help="validity of a setpoint")

@@ -43,7 +43,7 @@ def make_job(options: argparse.Namespace, profile: Profile, lease_ns: int, key: 
         checkpoint = read_checkpoint(options.progress, mission, time.monotonic_ns(), time.time_ns())
     manager = ActivityManager(
         profile, code, mission, TABLES[options.manager], selector, key=key, lease_ns=lease_ns,
-        emptier=PlannerSelection(PilePlanner(SamplingPlanner())), progress=checkpoint,
+        unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())), progress=checkpoint,
     )  # fmt: skip
     if checkpoint is not None:
         tally = manager.tally

@@ -147,8 +147,8 @@ class ForwardingJob:
         manager = self._manager
         if manager.state not in FINAL_STATES:
             return False
-        rests = manager.world.is_standing() and (manager.activity is None or manager.activity.idle)
-        return rests or self._now_ns - self._ended_ns > STOPPING_TIMEOUT_NS
+        at_rest = manager.world.is_standing() and (manager.activity is None or manager.activity.idle)
+        return at_rest or self._now_ns - self._ended_ns > STOPPING_TIMEOUT_NS
 
     @property
     def done(self) -> bool:

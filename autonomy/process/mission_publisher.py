@@ -148,11 +148,11 @@ class MissionPublisher:
         )
 
 
-def _thinned(items: Sequence[T], most: int) -> list[T]:
-    """At most ``most`` items, evenly spaced, with the first and the last."""
-    if len(items) <= most:
+def _thinned(items: Sequence[T], limit: int) -> list[T]:
+    """At most ``limit`` items, evenly spaced, with the first and the last."""
+    if len(items) <= limit:
         return list(items)
-    return [items[round(k * (len(items) - 1) / (most - 1))] for k in range(most)]
+    return [items[round(k * (len(items) - 1) / (limit - 1))] for k in range(limit)]
 
 
 def _place(point: Point) -> LatLon:
@@ -166,7 +166,10 @@ def _degrees(plane: LocalPlane, points: Sequence[Sequence[float] | np.ndarray]) 
     east, north = np.array(points, dtype=float).T
     origin = (plane.latitude_deg, plane.longitude_deg, plane.altitude_m)
     latitude, longitude, _ = pymap3d.enu2geodetic(east, north, np.zeros_like(east), *origin)
-    return [(round(a, DEGREE_DECIMALS), round(b, DEGREE_DECIMALS)) for a, b in zip(latitude.tolist(), longitude.tolist(), strict=True)]
+    return [
+        (round(a, DEGREE_DECIMALS), round(b, DEGREE_DECIMALS))
+        for a, b in zip(latitude.tolist(), longitude.tolist(), strict=True)
+    ]
 
 
 def _text(text: str) -> str:

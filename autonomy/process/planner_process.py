@@ -83,7 +83,7 @@ class PlannerProcess:
                 self._job.abort(f"ended by {signal.Signals(self.signals[0]).name}")
             self.step(time.monotonic_ns())
         self._report_mission(time.monotonic_ns())
-        self._keep_or_emit(time.monotonic_ns())
+        self._write_or_emit(time.monotonic_ns())
 
     def step(self, now_ns: int) -> None:
         """One step: request logs, receive, step the job, send, emit events, report."""
@@ -99,9 +99,9 @@ class PlannerProcess:
             self._report_ns = now_ns + REPORT_PERIOD_NS
             self._report_mission(now_ns)
         if self._checkpoint_file is not None and self._checkpoint_file.due(now_ns):
-            self._keep_or_emit(now_ns)
+            self._write_or_emit(now_ns)
 
-    def keep(self, now_ns: int) -> None:
+    def write_checkpoint(self, now_ns: int) -> None:
         """Write the checkpoint.
 
         Raises:
@@ -109,12 +109,12 @@ class PlannerProcess:
         """
         checkpoint = self._job.progress()
         if self._checkpoint_file is not None and checkpoint is not None:
-            self._checkpoint_file.keep(checkpoint, now_ns, time.time_ns())
+            self._checkpoint_file.write(checkpoint, now_ns, time.time_ns())
 
-    def _keep_or_emit(self, now_ns: int) -> None:
+    def _write_or_emit(self, now_ns: int) -> None:
         """Write the checkpoint; a full disk does not stop a machine that works."""
         try:
-            self.keep(now_ns)
+            self.write_checkpoint(now_ns)
         except OSError as error:
             reason = f"the checkpoint cannot be written: {error.strerror}"
             if self._changed("progress", reason):

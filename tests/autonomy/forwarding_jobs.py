@@ -8,7 +8,7 @@ from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.transition_table import OURS
 from autonomy.missions.model import ForwardingMission, Point
 from autonomy.process.jobs import ForwardingJob
-from can_dbc.messages.mission import MissionCommand, MissionAction
+from can_dbc.messages.mission import MissionAction, MissionCommand
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.manager_missions import PLANE, PROFILE

@@ -10,7 +10,7 @@ from autonomy.localization.local_plane import LocalPlane
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.checkpoint_file import CheckpointFile, read_checkpoint
 from autonomy.manager.transition_table import FINAL_STATES, OURS, State
-from autonomy.missions.model import ForwardingMission, Landing, Options, Point
+from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
 from machine.loading.profile_file import load_profile, profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
 from tests.autonomy.mapped_logs import lying
@@ -59,10 +59,20 @@ def again(
     machine: Forwarder, manager: ActivityManager, told: ForwardingMission, path: Path, table=OURS
 ) -> ActivityManager:
     """Another planner, with what the file says alone, some time later: the machine has come to rest."""
-    CheckpointFile(path).keep(manager.progress(), machine.crane.now_ns, 10**18)
+    CheckpointFile(path).write(manager.progress(), machine.crane.now_ns, 10**18)
     progress = read_checkpoint(path, told, machine.crane.now_ns, 10**18)
     machine.drive = machine.crane.setpoint = None
     for _ in range(60):
         machine.crane.now_ns += 50_000_000
         machine._move()
     return ActivityManager(PROFILE, profile_hash(PROFILE), told, table, progress=progress)
+
+
+LISTED_LOGS = ((15.0, 4.2), (36.0, -4.2))
+
+
+def listed_mission(landing=None, lie=LISTED_LOGS, end_m: float = 50.0, **options) -> ForwardingMission:
+    known = tuple(KnownLog(place(x, y), "", 90.0, 2.0, 0.25) for x, y in lie)
+    landings = () if landing is None else (Landing(place(*landing)),)
+    way = (place(10.0, 0.0), place(end_m, 0.0))
+    return ForwardingMission("test", way, (), landings, known, Options(logs="listed", **options))

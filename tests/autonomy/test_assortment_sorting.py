@@ -53,23 +53,23 @@ def managed(told: ForwardingMission, **how) -> ActivityManager:
 
 
 # ---------------------------------------------------------------------- the rules
-def test_without_a_choice_every_log_is_wanted() -> None:
+def test_without_selection_every_log_is_wanted() -> None:
     plain = sorting(SAW, PULP, sorts=False)
     assert plain.wants("") and plain.wants("veneer")
 
 
-def test_logs_of_other_assortments_and_unknown_ones_stay_lying() -> None:
+def test_logs_of_other_and_unknown_assortments_are_left() -> None:
     only = sorting(sorts=False, only=SAW)
     assert only.wants("saw logs") and not only.wants("pulpwood") and not only.wants("")
 
 
-def test_the_first_landing_that_names_an_assortment_takes_it_else_the_first_that_names_none() -> None:
+def test_landings_that_name_an_assortment_precede_those_that_name_none() -> None:
     several = sorting(ALL, SAW, ALL, (*PULP, *SAW))
     assert [several.landing_of(kind) for kind in ("saw logs", "pulpwood", "veneer", "")] == [1, 3, 0, 0]
     assert sorting(SAW).landing_of("pulpwood") is None and not sorting(SAW).wants("pulpwood")
 
 
-def test_the_first_log_aboard_decides_until_the_load_is_unloaded() -> None:
+def test_the_first_log_on_board_decides_the_landing() -> None:
     both = sorting(SAW, PULP)
     assert both.wants("saw logs") and both.wants("pulpwood")
     both.book_loaded(["pulpwood", "saw logs"])
@@ -80,13 +80,13 @@ def test_the_first_log_aboard_decides_until_the_load_is_unloaded() -> None:
     assert both.wants("saw logs")
 
 
-def test_a_first_grasp_holds_what_one_landing_takes() -> None:
+def test_a_first_grasp_holds_logs_of_one_landing() -> None:
     both = sorting(SAW, PULP)
     assert both.may_share_grasp("pulpwood", "pulpwood") and not both.may_share_grasp("saw logs", "pulpwood")
     assert sorting(SAW, PULP, sorts=False).may_share_grasp("saw logs", "pulpwood")
 
 
-def test_a_load_goes_to_the_nearest_landing_and_does_not_change_its_mind() -> None:
+def test_a_load_keeps_the_nearest_landing() -> None:
     plain = sorting(ALL, ALL, sorts=False)
     assert plain.choose_landing([(0.0, 0.0), (9.0, 0.0)], (8.0, 0.0)) == 1
     assert plain.choose_landing([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 1
@@ -97,7 +97,7 @@ def test_a_load_goes_to_the_nearest_landing_and_does_not_change_its_mind() -> No
     assert sorted_.choose_landing([(0.0, 0.0), (9.0, 0.0)], (1.0, 0.0)) == 1
 
 
-def test_another_round_is_for_what_the_load_of_this_one_had_no_place_for() -> None:
+def test_another_round_is_needed_for_logs_of_other_landings() -> None:
     both = sorting(SAW, PULP)
     assert not both.needs_another_round(PULP), "nothing was loaded"
     both.book_loaded(SAW)
@@ -110,7 +110,7 @@ def test_another_round_is_for_what_the_load_of_this_one_had_no_place_for() -> No
     assert not sorting(SAW, PULP, sorts=False).needs_another_round(PULP)
 
 
-def test_a_landing_is_called_by_its_name_or_number_where_there_are_several() -> None:
+def test_one_of_several_landings_has_its_name_or_number() -> None:
     several = Sorting(mission((), ((0.0, 0.0, ()), (9.0, 0.0, ()))))
     assert [several.landing_name(i) for i in (0, 1, None)] == ["Road", "landing 2", ""]
     assert sorting(ALL).landing_name(0) == ""
@@ -124,7 +124,7 @@ KINDS = st.sampled_from(["", "saw logs", "pulpwood", "energy"])
     st.lists(KINDS.filter(bool), max_size=2).map(tuple),
     st.lists(st.lists(KINDS, min_size=1, max_size=3), max_size=6),
 )
-def test_what_is_wanted_always_goes_where_the_load_goes(takes, only, grasps) -> None:
+def test_wanted_logs_always_belong_to_the_landing_of_the_load(takes, only, grasps) -> None:
     rules = sorting(*takes, only=only)
     for kinds in grasps:
         if not rules.wants(kinds[0]):
@@ -137,7 +137,7 @@ def test_what_is_wanted_always_goes_where_the_load_goes(takes, only, grasps) -> 
 
 # ---------------------------------------------------------------------- whole missions
 @whole
-def test_unwanted_logs_stay_lying_and_nobody_stops_for_them() -> None:
+def test_the_machine_does_not_stop_for_unwanted_logs() -> None:
     lie = (("pulpwood", 14.0, 4.2), ("saw logs", 22.0, 4.4))
     machine, manager = forwarder(lie), managed(mission(lie, assortments=SAW))
     machine.run(manager, ended)
@@ -148,11 +148,11 @@ def test_unwanted_logs_stay_lying_and_nobody_stops_for_them() -> None:
 
 @whole
 @pytest.mark.parametrize(("only", "grasp"), [(SAW, (2,)), ((), (1, 2))])
-def test_a_log_that_nobody_wants_is_not_scooped_up_with_its_neighbour(only, grasp) -> None:
+def test_an_unwanted_log_is_not_grasped_with_its_neighbour(only, grasp) -> None:
     lie = (("pulpwood", 18.0, 4.4), ("saw logs", 18.0, 4.9))
     machine, manager = (
         forwarder(lie),
-        managed(mission(lie, assortments=only), chooser=PlannerSelection(SamplingPlanner())),
+        managed(mission(lie, assortments=only), selector=PlannerSelection(SamplingPlanner())),
     )
     machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
     assert manager.activity is not None and manager.activity.grasp is not None
@@ -160,10 +160,10 @@ def test_a_log_that_nobody_wants_is_not_scooped_up_with_its_neighbour(only, gras
 
 
 @whole
-def test_the_first_grasp_of_a_sorted_load_is_of_one_landing() -> None:
+def test_the_first_grasp_of_a_sorted_load_has_one_landing() -> None:
     lie = (("pulpwood", 18.0, 4.4), ("saw logs", 18.0, 4.9))
     told = mission(lie, ((34.0, 14.0, SAW), (34.0, -14.0, PULP)), sort_by_assortment=True)
-    machine, manager = forwarder(lie), managed(told, chooser=PlannerSelection(SamplingPlanner()))
+    machine, manager = forwarder(lie), managed(told, selector=PlannerSelection(SamplingPlanner()))
     machine.run(manager, lambda m: ended(m) or (m.activity is not None and m.activity.grasp is not None))
     assert manager.activity is not None and manager.activity.grasp is not None
     assert len(manager.activity.grasp.logs) == 1
@@ -195,7 +195,7 @@ def test_two_landings_get_their_own_assortments_in_two_rounds() -> None:
 
 
 @whole
-def test_a_planner_that_starts_anew_with_the_load_under_way_drives_the_second_round(tmp_path: Path) -> None:
+def test_a_planner_restarted_with_a_load_drives_the_second_round(tmp_path: Path) -> None:
     lie = (("saw logs", 15.0, 4.2), ("pulpwood", 18.0, -4.4))
     told = mission(lie, ((34.0, 14.0, SAW), (34.0, -14.0, PULP)), sort_by_assortment=True)
     machine, manager = forwarder(lie), managed(told)
@@ -220,7 +220,7 @@ def test_the_round_in_which_nothing_was_loaded_is_the_last() -> None:
 
 
 @whole
-def test_unsorted_a_load_goes_to_the_landing_that_is_nearest_when_the_machine_sets_out() -> None:
+def test_an_unsorted_load_goes_to_the_nearest_landing() -> None:
     lie = (("saw logs", 15.0, 4.2),)
     landings = ((-30.0, 12.0, SAW), (34.0, 14.0, PULP))
     machine, manager = forwarder(lie), managed(mission(lie, landings))

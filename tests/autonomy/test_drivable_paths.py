@@ -19,7 +19,7 @@ POINT = st.tuples(st.floats(-60.0, 60.0), st.floats(-60.0, 60.0))
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(POINT, min_size=2, max_size=7))
-def test_every_path_is_one_the_machine_can_drive_or_is_refused(points: list[tuple[float, float]]) -> None:
+def test_every_path_is_drivable_or_refused(points: list[tuple[float, float]]) -> None:
     try:
         path = drivable_path(points, CARRIER)
     except PathRefused as error:
@@ -55,20 +55,20 @@ def test_a_corner_is_cut_alike_on_both_legs(size: float, way: float) -> None:
     assert along == pytest.approx(0.0, abs=0.01)
 
 
-def test_the_machine_bends_no_sharper_than_nine_degrees_to_the_metre() -> None:
+def test_paths_turn_at_most_nine_degrees_per_metre() -> None:
     path = drivable_path(SQUARE, CARRIER)
     sharpest = 1.0 / turning_radius_m(CARRIER, CARRIER.articulation_limit_rad)
     assert math.degrees(sharpest) == pytest.approx(9.03, abs=0.01)
     assert np.abs(path.curve_1_m).max() < 0.81 * sharpest
 
 
-def test_a_thousand_points_on_a_line_are_a_line() -> None:
+def test_a_thousand_points_on_a_line_make_a_straight_path() -> None:
     points = [(0.02 * i, 0.03 * math.sin(i)) for i in range(1000)]
     path = drivable_path(points, CARRIER)
     assert np.abs(path.curve_1_m).max() == 0.0
 
 
-def test_short_legs_are_driven_harder_or_refused() -> None:
+def test_short_legs_are_driven_with_sharper_bends_or_refused() -> None:
     easy = drivable_path([(0, 0), (30, 0), (30, 30)], CARRIER)
     hard = drivable_path([(0, 0), (8.2, 0), (8.2, 30)], CARRIER)
     assert np.abs(hard.curve_1_m).max() > np.abs(easy.curve_1_m).max()
@@ -95,7 +95,7 @@ def test_the_nearest_point_is_found(s: float, off: float) -> None:
     assert path.nearest(x, y, s - 1.0, s + 1.0) == pytest.approx(s, abs=0.03)
 
 
-def test_past_its_ends_a_path_goes_on_straight() -> None:
+def test_a_path_continues_straight_past_its_ends() -> None:
     path = drivable_path(SQUARE, CARRIER)
     assert path.nearest(25.0, 22.0) == pytest.approx(path.length_m + 2.0, abs=1e-6)
     assert path.at(path.length_m + 2.0)[:2] == pytest.approx((25.0, 22.0))

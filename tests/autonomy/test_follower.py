@@ -44,14 +44,14 @@ def test_the_follower_stays_on_a_path_with_corners() -> None:
 
 @settings(max_examples=12, deadline=None)
 @given(st.floats(-4.0, 4.0), st.floats(-2.0, 2.0), st.floats(-0.08, 0.08))
-def test_it_comes_back_from_anywhere_and_slides_uphill_straight(off: float, yaw: float, slip: float) -> None:
+def test_the_follower_returns_from_anywhere_and_compensates_side_slip(off: float, yaw: float, slip: float) -> None:
     path = drivable_path([(-5.0, 0.0), (80.0, 0.0)], CARRIER)
     errors = glide(path, 0.0, off, yaw, 45.0, slip)
     assert max(map(abs, errors[-50:])) < 0.02
     assert max(map(abs, errors)) < abs(off) + 13.0  # no wider than its turning circle
 
 
-def test_it_keeps_to_its_lap_where_the_path_crosses_itself() -> None:
+def test_the_follower_stays_on_its_lap_where_the_path_crosses_itself() -> None:
     path = drivable_path([(0, 0), (40, 0), (40, 20), (20, 20), (20, -30)], CARRIER)
     _, steer = follow_path(CARRIER, path, FollowerState(s_m=20.0), at(20.0, 0.4, 0.0), 0.6)
     assert steer.s_m == pytest.approx(20.0, abs=0.2) and steer.off_m == pytest.approx(0.4, abs=0.05)
@@ -60,7 +60,7 @@ def test_it_keeps_to_its_lap_where_the_path_crosses_itself() -> None:
     assert steer.s_m == pytest.approx(late, abs=0.2) and abs(steer.off_rad) < 0.01
 
 
-def test_it_steers_by_where_it_goes_and_not_by_where_it_points() -> None:
+def test_the_follower_steers_by_course_not_by_heading() -> None:
     path = drivable_path([(-5.0, 0.0), (80.0, 0.0)], CARRIER)
     slides = at(10.0, 0.0, 0.05, course_rad=0.0)
     _, steer = follow_path(CARRIER, path, FollowerState(s_m=10.0), slides, 0.6)
@@ -77,7 +77,7 @@ def test_a_standing_machine_is_not_steered() -> None:
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.6, 0.6))
-def test_leaning_costs_margin_and_margin_costs_speed(roll: float, pitch: float, bend: float) -> None:
+def test_leaning_reduces_the_margin_and_the_speed(roll: float, pitch: float, bend: float) -> None:
     level = speed.tip_margin_m(CARRIER, at(0, 0, 0, articulation_rad=bend))
     leans = speed.tip_margin_m(CARRIER, at(0, 0, 0, articulation_rad=bend, roll_rad=roll, pitch_rad=pitch))
     more = speed.tip_margin_m(CARRIER, at(0, 0, 0, articulation_rad=bend, roll_rad=3 * roll, pitch_rad=pitch))
@@ -95,7 +95,7 @@ def test_the_margin_of_a_level_machine_is_half_its_track() -> None:
     assert speed.tip_margin_m(CARRIER, at(0, 0, 0, roll_rad=0.2), 1.0) < right_down
 
 
-def test_rocking_slows_down_and_is_forgotten() -> None:
+def test_rocking_reduces_the_speed_for_a_while() -> None:
     rocking = speed.Rocking()
     for i in range(60):
         rate = rocking.step(at(0, 0, 0, roll_rad=0.02 * (i % 2), stamp_ns=10**9 + i * 50_000_000))
@@ -105,7 +105,7 @@ def test_rocking_slows_down_and_is_forgotten() -> None:
     assert speed.terrain_speed_share(1.0, rate) == 1.0
 
 
-def test_too_near_to_tipping_nothing_drives() -> None:
+def test_close_to_tipping_the_machine_does_not_drive() -> None:
     way = PathDrive(CARRIER, drivable_path(SQUARE, CARRIER))
     order = way.step(at(0.0, 0.0, 0.0, roll_rad=0.6))
     assert order.speed_m_s == 0.0 and "tipping" in order.stop_reason

@@ -41,7 +41,7 @@ def test_logs_of_a_harvesters_production() -> None:
     assert all(log.bearing_deg is None for log in logs)
 
 
-def test_a_tips_place_is_better_than_the_harvesters_own() -> None:
+def test_the_crane_tips_position_is_better_than_the_harvesters() -> None:
     logs = load_mission(EXAMPLE).mission.logs
     places = SITE.points_enu([log.position for log in logs])
     assert places[0, :2] == pytest.approx((-10.0, -9.0), abs=0.02) and logs[0].sigma_m == TIP_SIGMA_M
@@ -57,7 +57,7 @@ def test_south_and_west() -> None:
     )
 
 
-def test_diameters_of_harvesters_that_measure_less() -> None:
+def test_diameters_of_harvesters_with_fewer_measurements() -> None:
     ends = TEXT.replace('"Mid ob">210', '"Butt ob">230')
     assert read(ends.encode(), "h").mission.logs[0].diameter_m == pytest.approx(0.5 * (0.230 + 0.190))
     lines = [line for line in TEXT.splitlines() if "LogDiameter" not in line]
@@ -101,7 +101,7 @@ def test_an_hpr_alone_is_no_route() -> None:
     assert (len(both.mission.waypoints), len(both.mission.logs)) == (3, 7)
 
 
-def test_logs_of_another_site_do_not_fit_the_route(tmp_path: Path) -> None:
+def test_logs_of_another_site_are_refused(tmp_path: Path) -> None:
     (tmp_path / "far.hpr").write_text(TEXT.replace(">63.", ">33."))
     with pytest.raises(MissionError, check=coded("mission.too-far-apart")):
         load_mission(EXAMPLE.with_name("route.gpx"), logs=tmp_path / "far.hpr")
@@ -191,20 +191,20 @@ def test_every_key_that_is_used_is_defined_once() -> None:
     assert len(set(texts(root, ".//s:PartialLoadKey"))) == 4
 
 
-def test_two_assortments_with_one_number_are_told_apart() -> None:
+def test_two_assortments_with_one_key_get_separate_keys() -> None:
     logs = (BIRCH, replace(BIRCH, assortment="fuel"), replace(BIRCH, assortment="veneer", product_key=1), STRAY)
     root = report((ForwardedLoad(logs, ROAD, NOON),))
     assert sorted(texts(root, ".//s:ProductDefinition/s:ProductKey"), key=int) == ["1", "2", "3", "31"]
 
 
-def test_names_are_text_whatever_is_in_them() -> None:
+def test_names_may_contain_any_character() -> None:
     assert texts(report(), ".//s:ObjectName") == ["Hörnefors <12> & co"]
     odd = replace(WHO, site="a\x00b\ud800\U0001f332")
     root = ET.fromstring(write_fpr(LOADS, odd, NOON, "x"))
     assert texts(root, ".//s:ObjectName") == ["ab\U0001f332"]
 
 
-def test_a_report_of_nothing_that_can_be() -> None:
+def test_invalid_loads_are_refused() -> None:
     assert report(()).find(".//s:Load", NS) is None
     for load, code in (
         (ForwardedLoad((), ROAD, NOON), "fpr.empty-load"),
@@ -215,6 +215,6 @@ def test_a_report_of_nothing_that_can_be() -> None:
             write_fpr((load,), WHO, datetime(2026, 6, 1, tzinfo=UTC), "x")
 
 
-def test_an_fpr_is_no_mission() -> None:
+def test_an_fpr_is_not_a_mission() -> None:
     with pytest.raises(MissionError, check=coded("mission.unknown-xml")):
         read(write_fpr(LOADS, WHO, NOON, "x"), "f")

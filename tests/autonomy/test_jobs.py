@@ -15,7 +15,7 @@ from tests.autonomy.manager_missions import LOGS
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_a_mission_tells_its_states_its_grasps_and_its_load_and_ends_idle() -> None:
+def test_a_mission_emits_its_states_grasps_and_load_and_ends_idle() -> None:
     forwarder, job, _ = begin(LOGS[0])
     said = run(forwarder, job, lambda j: j.idle)
     assert job.done and job.failure is None
@@ -28,7 +28,7 @@ def test_a_mission_tells_its_states_its_grasps_and_its_load_and_ends_idle() -> N
     assert outcome["driven_m"] == pytest.approx(26.0, abs=1.0)
 
 
-def test_an_aborted_mission_stands_before_it_is_idle() -> None:
+def test_an_aborted_mission_is_idle_after_standstill() -> None:
     forwarder, job, manager = begin()
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     job.abort("ended by SIGTERM")
@@ -37,7 +37,7 @@ def test_an_aborted_mission_stands_before_it_is_idle() -> None:
     assert job.failure == "ended by SIGTERM" and forwarder.speed_m_s < 0.05 and manager.state is State.FAILED
 
 
-def test_a_mission_whose_machine_does_not_come_to_rest_ends_all_the_same() -> None:
+def test_a_mission_ends_although_the_machine_does_not_stop() -> None:
     forwarder, job, _ = begin()
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     job.abort("enough")
@@ -47,7 +47,7 @@ def test_a_mission_whose_machine_does_not_come_to_rest_ends_all_the_same() -> No
     assert STOPPING_TIMEOUT_NS <= forwarder.crane.now_ns - ended_ns < 2 * STOPPING_TIMEOUT_NS
 
 
-def test_what_a_mission_asks_for_holds_as_long_as_it_is_told() -> None:
+def test_setpoints_have_the_requested_lease() -> None:
     forwarder, job, _ = begin(lease_ns=350_000_000)
     run(forwarder, job, lambda j: forwarder.drive is not None)
     assert forwarder.drive is not None and forwarder.drive.lease_ns == 350_000_000
@@ -65,7 +65,7 @@ def test_an_ended_job_sends_no_speed() -> None:
 @pytest.mark.slow
 @pytest.mark.computed
 @pytest.mark.parametrize("phase", ["ABOVE", "DESCEND", "CLOSE", "CARRY", "LOWER", "OPEN"])
-def test_a_pause_stops_the_crane_smoothly_and_auto_takes_the_log_on(phase: str) -> None:
+def test_pause_stops_the_crane_smoothly_and_auto_resumes_with_the_log(phase: str) -> None:
     forwarder, job, manager = begin(LOGS[0])
     run(forwarder, job, lambda j: manager.activity is not None and manager.activity.phase.name == phase)
     for _ in range(10):

@@ -25,7 +25,7 @@ def straight(along_m: float):
     return base_on_path(CARRIER, (along_m, 0.0, 0.0), (along_m - WHEELBASE_M, 0.0), 0.0)
 
 
-def test_the_base_looks_back_over_the_bunk() -> None:
+def test_the_base_faces_backwards_over_the_bunk() -> None:
     base = straight(10.0)
     assert base.position_m == pytest.approx(
         [10.0 - CARRIER.front_axle_m + CARRIER.crane_base_m[0], 0.0, 1.15], abs=0.03
@@ -42,20 +42,20 @@ def test_the_base_in_a_bend_agrees_with_the_geometry_of_the_carrier() -> None:
     assert base.position_m[:2] == pytest.approx(CARRIER.crane_base_m[:2], abs=1e-9)
 
 
-def test_one_log_is_taken_from_where_it_is_beside_the_bunk() -> None:
+def test_one_log_is_loaded_from_beside_the_bunk() -> None:
     stop = best_stop([lying(3, 20.0, 4.5)], REACH, straight, 10.0, 40.0)
     assert stop is not None and stop.numbers == (3,)
     x, y, _ = lying(3, 20.0, 4.5).observation(straight(stop.along_m)).center_m
     assert 0.0 < x < 7.0 and abs(abs(y) - 4.5) < 1e-6
 
 
-def test_several_logs_are_taken_from_one_stop() -> None:
+def test_several_logs_are_loaded_from_one_stop() -> None:
     logs = [lying(1, 20.0, 4.0), lying(2, 23.0, 4.2), lying(3, 21.5, -4.0)]
     stop = best_stop(logs, REACH, straight, 10.0, 40.0)
     assert stop is not None and sorted(stop.numbers) == [1, 2, 3]
 
 
-def test_no_log_is_left_behind_for_a_richer_place() -> None:
+def test_no_log_is_left_for_a_place_with_more_logs() -> None:
     logs = [lying(1, 16.0, 4.0), lying(2, 40.0, 4.0), lying(3, 41.0, 4.0), lying(4, 42.0, -4.0)]
     first = best_stop(logs, REACH, straight, 10.0, 60.0)
     assert first is not None and first.numbers == (1,)
@@ -64,18 +64,18 @@ def test_no_log_is_left_behind_for_a_richer_place() -> None:
 
 
 @pytest.mark.parametrize("y_m", [0.0, 1.2, 12.0])
-def test_logs_under_the_machine_or_out_of_reach_make_no_stop(y_m: float) -> None:
+def test_logs_under_the_machine_or_out_of_reach_need_no_stop(y_m: float) -> None:
     stop = best_stop([lying(1, 20.0, y_m)], REACH, straight, 18.0, 23.0)
     assert stop is None
 
 
-def test_work_is_less_for_a_log_that_is_near_the_bunk() -> None:
+def test_work_is_less_for_a_log_near_the_bunk() -> None:
     near, far = (lying(1, 20.0, y).observation(straight(26.0)) for y in (3.5, 6.5))
     assert 0.0 < REACH.work_s(near) < REACH.work_s(far) < math.inf
     assert np.isinf(REACH.work_s(lying(1, 20.0, 0.5).observation(straight(22.0))))
 
 
-def test_how_high_the_site_lies_above_the_sea_does_not_matter() -> None:
+def test_the_altitude_of_the_site_does_not_matter() -> None:
     log = lying(3, 20.0, 4.5)
     high = dataclasses.replace(log, center_m=log.center_m + np.array([0.0, 0.0, 260.0]))
     assert best_stop([high], REACH, straight, 10.0, 40.0) == best_stop([log], REACH, straight, 10.0, 40.0)
@@ -107,14 +107,14 @@ def looked_everywhere(logs, begin_m: float, end_m: float) -> LoadingStop | None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_looking_only_where_it_matters_finds_the_same_stop(seed: int) -> None:
+def test_the_limited_search_finds_the_same_stop(seed: int) -> None:
     rng = np.random.default_rng(seed)
     logs = [lying(n, 20.0 + rng.uniform(-12.0, 14.0), rng.uniform(-9.5, 9.5)) for n in range(1, 5)]
     stop = best_stop(logs, REACH, straight, 16.0, 24.0)
     assert stop is not None and stop == looked_everywhere(logs, 16.0, 24.0)
 
 
-def test_a_log_at_the_end_of_the_reach_is_taken_or_left_as_the_crane_can() -> None:
+def test_a_log_at_the_end_of_reach_agrees_with_the_grasp_planner() -> None:
     ways = np.arange(6.0, 9.5, 0.2).tolist()
     stops = [best_stop([lying(1, 20.0, y)], REACH, straight, 24.0, 25.0) for y in ways]
     assert stops == [looked_everywhere([lying(1, 20.0, y)], 24.0, 25.0) for y in ways]

@@ -56,7 +56,7 @@ def test_the_antimeridian_is_no_border(longitude: float, east: float) -> None:
     assert LocalFrame(60.0, -longitude).points_enu([place])[0][0] == pytest.approx(east, abs=1e-6)
 
 
-def test_a_point_without_a_height_lies_at_the_origins() -> None:
+def test_a_point_without_a_height_is_at_the_origins() -> None:
     frame = LocalFrame(63.0, 19.0, 200.0)
     flat = frame.points_enu([Point(63.02, 19.0), Point(63.02, 19.0, 200.0)])
     assert flat[0] == pytest.approx(flat[1])

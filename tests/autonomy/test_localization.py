@@ -73,7 +73,7 @@ class Drive:
     st.floats(-80.0, 80.0), st.floats(-179.0, 179.0), st.floats(-500.0, 500.0), st.floats(-500.0, 500.0),
     st.floats(-20.0, 20.0),
 )  # fmt: skip
-def test_the_plane_agrees_with_another_formula_and_goes_back(
+def test_the_plane_agrees_with_another_formula_and_inverts(
     lat: float, lon: float, east: float, north: float, up: float
 ) -> None:
     plane, site = LocalPlane(lat, lon, 260.0), LocalFrame(lat, lon, 260.0)
@@ -81,7 +81,7 @@ def test_the_plane_agrees_with_another_formula_and_goes_back(
     assert plane.local(*plane.geodetic(east, north, up)) == pytest.approx((east, north, up), abs=1e-5)
 
 
-def test_a_plane_without_a_place_is_refused() -> None:
+def test_an_invalid_origin_is_refused() -> None:
     for at in ((91.0, 0.0), (math.nan, 0.0), (0.0, 181.0)):
         with pytest.raises(ValueError, check=coded("plane.origin")):
             LocalPlane(*at)
@@ -90,7 +90,7 @@ def test_a_plane_without_a_place_is_refused() -> None:
 
 
 @given(ANGLE)
-def test_headings_are_yaws_seen_from_north(heading: float) -> None:
+def test_headings_convert_to_yaws(heading: float) -> None:
     yaw = yaw_from_heading(heading)
     assert -math.pi <= yaw <= math.pi
     assert math.cos(yaw) == pytest.approx(math.sin(heading), abs=1e-9)
@@ -121,7 +121,7 @@ def test_the_front_leans_with_the_rear(roll: float, pitch: float, bend: float) -
 
 
 @pytest.mark.parametrize("ground", [FIRM, MUD, SLOPE], ids=["firm", "mud", "slope"])
-def test_the_covariance_is_honest(ground: Ground) -> None:
+def test_the_covariance_is_consistent(ground: Ground) -> None:
     """NEES of x, y and yaw at the end of six drives: chi square with 18 degrees of freedom, and not far below."""
     total = 0.0
     for seed in range(6):
@@ -132,7 +132,7 @@ def test_the_covariance_is_honest(ground: Ground) -> None:
     assert 3.0 < total < 34.8  # 99 % below; the individuals are drawn a little tamer than the filter expects
 
 
-def test_ten_centimetres_of_error_would_show() -> None:
+def test_an_error_of_ten_centimetres_would_be_detected() -> None:
     """The bound of the test above bites: what is off by four of its sigmas is not honest."""
     drive = Drive()
     location = drive.on(6.0)[-1]
@@ -140,7 +140,7 @@ def test_ten_centimetres_of_error_would_show() -> None:
     assert float(off @ np.linalg.solve(location.covariance, off)) > 16.0
 
 
-def test_antennas_beside_their_places_are_reckoned_with() -> None:
+def test_antenna_offsets_are_covered_by_the_covariance() -> None:
     drive = Drive(own=Individual(main_off_m=(0.03, -0.03)))
     location = drive.on(8.0)[-1]
     off = drive.off(location)
@@ -148,7 +148,7 @@ def test_antennas_beside_their_places_are_reckoned_with() -> None:
     assert float(off @ np.linalg.solve(location.covariance, off)) < 6.0
 
 
-def test_what_comes_late_is_taken_as_of_when_it_was_true() -> None:
+def test_delayed_measurements_are_used_at_their_time_of_validity() -> None:
     drive = Drive(replace(FIRM, spin=0.0, loose=0.0), Individual(wander_m=0.0), bend_rad=0.0)
     behind = []
     for _ in range(30):
@@ -157,7 +157,7 @@ def test_what_comes_late_is_taken_as_of_when_it_was_true() -> None:
     assert np.mean(behind[10:]) == pytest.approx(0.0, abs=0.012)  # 75 ms are 4.5 cm
 
 
-def test_slip_is_found() -> None:
+def test_slip_is_estimated() -> None:
     drive = Drive(MUD, Individual(), bend_rad=0.0)
     location = drive.on(20.0)[-1]
     assert location.speed_m_s == pytest.approx(drive.vehicle.speed, abs=0.03)
@@ -169,7 +169,7 @@ def test_slip_is_found() -> None:
     assert np.mean(drift) == pytest.approx(-SLOPE.drift_rad, abs=0.02)
 
 
-def test_one_wild_position_changes_nothing() -> None:
+def test_one_outlier_position_is_rejected() -> None:
     drive = Drive()
     before = drive.on(5.0)[-1]
     drive.vehicle.jump_m = (4.0, -3.0)
@@ -182,7 +182,7 @@ def test_one_wild_position_changes_nothing() -> None:
     assert np.hypot(*drive.off(after)[:2]) < 0.08
 
 
-def test_positions_that_stay_elsewhere_are_believed_after_a_loss() -> None:
+def test_consistent_positions_elsewhere_are_accepted_after_a_loss() -> None:
     drive = Drive()
     drive.on(5.0)
     drive.vehicle.jump_m = (4.0, -3.0)
@@ -196,7 +196,7 @@ def test_positions_that_stay_elsewhere_are_believed_after_a_loss() -> None:
 
 
 @pytest.mark.parametrize("turn_rad", [0.25, -0.4])
-def test_a_machine_that_was_turned_finds_its_heading_again_where_it_stands(turn_rad: float) -> None:
+def test_a_machine_turned_at_standstill_recovers_its_heading(turn_rad: float) -> None:
     drive = Drive()
     drive.on(5.0)
     drive.speed_m_s = 0.0
@@ -209,7 +209,7 @@ def test_a_machine_that_was_turned_finds_its_heading_again_where_it_stands(turn_
     assert abs(yaw_rad) < 0.03 and math.hypot(x_m, y_m) < 0.1
 
 
-def test_a_heading_that_nothing_can_have_made_is_not_believed() -> None:
+def test_an_impossible_heading_is_rejected() -> None:
     drive = Drive()
     drive.on(5.0)
     drive.speed_m_s = 0.0
@@ -219,7 +219,7 @@ def test_a_heading_that_nothing_can_have_made_is_not_believed() -> None:
     assert last.status is Status.LOST and "heading" in last.reason
 
 
-def test_two_seconds_without_satellites_are_reckoned_and_then_it_is_lost() -> None:
+def test_two_seconds_without_satellites_are_dead_reckoned_then_lost() -> None:
     drive = Drive()
     drive.on(5.0)
     drive.vehicle.sky = False
@@ -240,14 +240,14 @@ def test_two_seconds_without_satellites_are_reckoned_and_then_it_is_lost() -> No
     assert np.hypot(*drive.off(back[-1])[:2]) < 0.1 and back[-1].jumps == 0
 
 
-def test_a_receiver_that_repeats_itself_is_found_out() -> None:
+def test_a_frozen_receiver_is_detected() -> None:
     drive = Drive()
     drive.on(5.0)
     drive.vehicle.frozen = True
     assert drive.on(4.0)[-1].status is Status.LOST
 
 
-def test_swapped_antennas_are_found_out_once_it_drives() -> None:
+def test_swapped_antennas_are_detected_while_driving() -> None:
     drive = Drive(own=Individual(heading_off_rad=math.pi))
     drive.on(1.0)
     assert drive.on(5.0)[-1].status is Status.LOST
@@ -266,7 +266,7 @@ def test_swapped_antennas_are_found_out_once_it_drives() -> None:
     ],
 )
 @pytest.mark.parametrize("from_the_start", [False, True])
-def test_what_is_missing_is_named(field: str, value: float, reason: str, from_the_start: bool) -> None:
+def test_the_reason_names_the_missing_input(field: str, value: float, reason: str, from_the_start: bool) -> None:
     drive = Drive()
     if not from_the_start:
         drive.on(3.0)
@@ -283,12 +283,12 @@ def test_unknown_roll_and_height_are_taken_as_level() -> None:
     assert last.usable and last.roll_rad == 0.0 and np.hypot(*drive.off(last)[:2]) < 0.1
 
 
-def test_a_worse_fix_is_believed_less() -> None:
+def test_a_worse_fix_has_less_weight() -> None:
     good, poor = Drive().on(5.0)[-1], Drive(own=Individual(fix=5, white_m=0.05, wander_m=0.25))
     assert poor.on(5.0)[-1].sigma_m > 5.0 * good.sigma_m
 
 
-def test_the_origin_is_the_first_position_when_nobody_says_another() -> None:
+def test_the_first_position_is_the_default_origin() -> None:
     drive = Drive()
     drive.localizer = Localizer(CARRIER)
     drive.on(2.0)

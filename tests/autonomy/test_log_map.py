@@ -18,7 +18,7 @@ PROFILE = load_profile("aoro_fc8")
 
 
 @given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-3, 3), st.floats(-3, 3)), min_size=3, max_size=8))
-def test_a_log_keeps_its_number_and_place_while_the_machine_passes(poses) -> None:
+def test_a_log_keeps_its_number_and_position_while_the_machine_passes(poses) -> None:
     field, logs = LogMap(PROFILE.bunk), [lying(7, 12.0, 30.0), lying(9, 15.0, 30.0, 1.2)]
     numbers = set()
     for k, pose in enumerate(poses):
@@ -31,7 +31,7 @@ def test_a_log_keeps_its_number_and_place_while_the_machine_passes(poses) -> Non
         assert log.hits == len(poses)
 
 
-def test_an_average_gets_better_than_its_sightings() -> None:
+def test_an_average_is_better_than_its_observations() -> None:
     field, rng, at = LogMap(PROFILE.bunk), np.random.default_rng(3), base(0.0, 0.0, 0.3)
     true = lying(1, 6.0, 5.0)
     for k in range(40):
@@ -41,7 +41,7 @@ def test_an_average_gets_better_than_its_sightings() -> None:
     assert log.sigma_m == pytest.approx(0.1 / math.sqrt(40), rel=1e-6)
 
 
-def test_a_sighting_that_is_known_better_weighs_more() -> None:
+def test_a_more_certain_observation_has_more_weight() -> None:
     field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
     true = lying(1, 6.0, 5.0)
     (o,) = seen([true], at)
@@ -61,7 +61,7 @@ def test_one_observation_does_not_confirm_a_log() -> None:
     assert len(field.logs) == 1
 
 
-def test_what_lies_in_the_bunk_is_no_log_of_the_field() -> None:
+def test_logs_in_the_bunk_are_not_mapped() -> None:
     field, at, bunk = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0), PROFILE.bunk
     inside = LogObservation(4, (*bunk.center_m, bunk.floor_z_m + 0.2), (1.0, 0.0, 0.0), 2.0, 0.25)
     for k in range(3):
@@ -69,7 +69,7 @@ def test_what_lies_in_the_bunk_is_no_log_of_the_field() -> None:
     assert not field.logs
 
 
-def test_two_logs_side_by_side_are_two() -> None:
+def test_two_logs_side_by_side_stay_separate() -> None:
     field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
     logs = [lying(1, 6.0, 5.0), lying(2, 6.0, 5.3)]
     for k in range(3):
@@ -77,7 +77,7 @@ def test_two_logs_side_by_side_are_two() -> None:
     assert len(field.logs) == 2
 
 
-def test_an_average_begun_anew_forgets_what_was_wrong_and_misses_are_counted() -> None:
+def test_a_restarted_average_drops_old_observations_and_keeps_misses() -> None:
     field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
     true = lying(1, 6.0, 5.0)
     for k in range(5):
@@ -92,14 +92,14 @@ def test_an_average_begun_anew_forgets_what_was_wrong_and_misses_are_counted() -
     assert not field.logs and field.get(1) is None
 
 
-def test_a_log_known_beforehand_is_there_at_once_and_is_the_one_that_is_seen() -> None:
+def test_a_listed_log_is_mapped_at_once_and_matched_when_observed() -> None:
     field, at = LogMap(PROFILE.bunk), base(0.0, 0.0, 0.0)
     field.add_known(lying(0, 6.1, 5.0))
     assert nearest(field.logs, np.array([0.0, 0.0])) is field.logs[0]
     assert field.observe(seen([lying(5, 6.0, 5.0)], at), at, 1) == {5: 1}
 
 
-def test_an_axis_that_is_not_known_does_not_make_two_logs_of_one() -> None:
+def test_an_unknown_axis_does_not_split_a_log() -> None:
     sure, unsure = (tuple(np.diag([0.01] * 2 + [turn**2] * 2 + [0.04] * 2 + [0.01])[np.triu_indices(7)].tolist())
                     for turn in (0.02, 0.6))  # fmt: skip
     for covariance, logs in ((unsure, 1), (sure, 2)):

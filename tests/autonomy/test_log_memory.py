@@ -62,7 +62,7 @@ class Hands:
         return logs
 
 
-def test_what_lies_on_the_ground_stays_in_the_plane_while_the_machine_moves() -> None:
+def test_logs_on_the_ground_stay_in_the_plane_while_the_machine_moves() -> None:
     field, memory = field_of((-4.0, 3.0), (-4.0, -30.0)), LogMemory(PROFILE)
     (first,) = memory.log_list(PERIOD_NS, field, HERE, None, None) or ()
     assert memory.log_list(PERIOD_NS + 1, field, HERE, None, None) is None, "four times a second"
@@ -98,7 +98,7 @@ def test_a_log_goes_with_the_grapple_and_stays_in_the_bunk() -> None:
     assert aboard.center_m == pytest.approx(log.center_m) and hands.memory.in_bunk == 1
 
 
-def test_a_log_that_the_scale_does_not_feel_lies_where_it_was() -> None:
+def test_a_log_that_the_scale_does_not_detect_stays_on_the_ground() -> None:
     hands = Hands(field_of((-4.0, 3.0)))
     hands.begin()
     grasp, hands.load_kg = hands.job.grasp, 3.0
@@ -111,7 +111,7 @@ def test_a_log_that_the_scale_does_not_feel_lies_where_it_was() -> None:
     assert hands.memory.in_bunk == 0
 
 
-def test_a_log_that_is_light_for_a_moment_still_hangs() -> None:
+def test_a_short_low_reading_does_not_lose_the_log() -> None:
     hands = Hands(field_of((-4.0, 3.0)))
     hands.begin()
     grasp, hands.load_kg = hands.job.grasp, 90.0
@@ -124,7 +124,7 @@ def test_a_log_that_is_light_for_a_moment_still_hangs() -> None:
         assert log.center_m[2] > grasp.log.center_m[2] + 0.9
 
 
-def test_without_a_scale_the_log_is_believed_to_hang() -> None:
+def test_without_a_scale_the_log_is_assumed_to_hang() -> None:
     hands = Hands(field_of((-4.0, 3.0)))
     hands.begin()
     for phase in (Phase.CLOSE, Phase.LIFT):

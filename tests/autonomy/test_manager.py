@@ -24,7 +24,7 @@ from tests.autonomy.mapped_logs import lying
 
 
 @whole
-def test_all_logs_in_reach_are_taken_from_one_stop() -> None:
+def test_all_logs_in_reach_are_loaded_from_one_stop() -> None:
     forwarder, manager = begin()
     forwarder.run(manager, ended)
     assert manager.state is State.DONE, manager.failure
@@ -35,14 +35,14 @@ def test_all_logs_in_reach_are_taken_from_one_stop() -> None:
 
 
 @whole
-def test_a_mission_that_has_as_many_logs_as_it_wants_ends_where_it_is() -> None:
+def test_a_mission_ends_on_the_spot_once_it_has_the_wanted_logs() -> None:
     forwarder, manager = begin(logs_wanted=1)
     forwarder.run(manager, ended)
     assert manager.state is State.DONE and forwarder.in_bunk == manager.tally.loaded == 1
     assert forwarder.x_m < 24.0 and forwarder.speed_m_s == 0.0
 
 
-def test_the_machine_stops_at_a_log_that_its_mission_lists_before_anybody_has_seen_it() -> None:
+def test_the_machine_stops_at_a_listed_log_before_it_is_detected() -> None:
     listed = KnownLog(place(15.0, 4.2), bearing_deg=80.0, length_m=2.4)
     forwarder, manager = begin((), known=(listed,), logs="listed")
     forwarder.run(manager, at(State.CHECK))
@@ -56,7 +56,7 @@ def test_the_machine_stops_at_a_log_that_its_mission_lists_before_anybody_has_se
 
 
 @pytest.mark.parametrize("keep_out", [False, True])
-def test_a_machine_that_has_left_its_fence_stands(keep_out: bool) -> None:
+def test_a_machine_outside_its_fence_stops(keep_out: bool) -> None:
     reach = (16.0, 40.0) if keep_out else (-10.0, 16.0)
     corners = tuple(place(x, y) for x, y in ((reach[0], -9.0), (reach[1], -9.0), (reach[1], 9.0), (reach[0], 9.0)))
     forwarder, manager = begin((), fences=(Fence(corners, keep_out),))
@@ -68,7 +68,7 @@ def test_a_machine_that_has_left_its_fence_stands(keep_out: bool) -> None:
 
 
 @pytest.mark.parametrize(("y_m", "yaw", "hit"), [(1.1, 0.0, True), (-1.4, 1.4, True), (0.0, 0.0, False)])
-def test_a_machine_does_not_run_into_a_log(y_m: float, yaw: float, hit: bool) -> None:
+def test_a_machine_stops_before_a_log_in_its_wheel_path(y_m: float, yaw: float, hit: bool) -> None:
     forwarder, manager = begin(((1, 15.0, y_m, yaw),), end_m=20.0)
     forwarder.run(manager, ended)
     if not hit:  # it passes below the machine, between the wheels
@@ -81,7 +81,7 @@ def test_a_machine_does_not_run_into_a_log(y_m: float, yaw: float, hit: bool) ->
 
 
 @whole
-def test_paper_b_takes_a_log_by_the_steps_of_its_flowchart() -> None:
+def test_paper_b_loads_a_log_by_the_states_of_its_flowchart() -> None:
     forwarder, manager = begin(LOGS[:1], PAPER_B)
     forwarder.run(manager, ended)
     assert manager.state is State.DONE and forwarder.in_bunk == 1
@@ -90,13 +90,13 @@ def test_paper_b_takes_a_log_by_the_steps_of_its_flowchart() -> None:
 
 
 @whole
-def test_paper_b_comes_back_to_a_log_that_it_came_past_while_it_went_on_to_another() -> None:
+def test_paper_b_loads_a_second_log_that_it_passed_meanwhile() -> None:
     forwarder, manager = begin(((1, 13.0, 2.8, 0.0), (2, 17.0, -2.8, 0.0)), PAPER_B, end_m=32.0)
     forwarder.run(manager, ended)
     assert manager.state is State.DONE and forwarder.in_bunk == manager.tally.loaded == 2
 
 
-def test_the_circle_is_left_on_its_far_side_alone() -> None:
+def test_the_circle_is_only_left_on_its_far_side() -> None:
     forwarder, manager = begin((), PAPER_B)
     forwarder.run(manager, at(State.SEARCH))
     world = manager.world
@@ -106,7 +106,7 @@ def test_the_circle_is_left_on_its_far_side_alone() -> None:
     assert world.has_passed(None), "a log that is gone keeps nobody waiting"
 
 
-def test_without_logs_the_machine_drives_to_the_end_and_no_further() -> None:
+def test_without_logs_the_machine_drives_to_the_end_of_the_route() -> None:
     forwarder, manager = begin(())
     forwarder.run(manager, ended)
     assert states(manager) == [State.RAISE, State.SEARCH, State.DONE]
@@ -124,7 +124,7 @@ def test_heights_of_the_mission_are_used() -> None:
 
 @whole
 @pytest.mark.parametrize("state", [State.SEARCH, State.APPROACH, State.LOWER, State.COLLECT])
-def test_a_stop_in_any_state_pauses_and_the_mission_goes_on_when_armed(state: State) -> None:
+def test_a_stop_pauses_any_state_and_arming_resumes_it(state: State) -> None:
     forwarder, manager = begin(LOGS[:1])
     forwarder.run(manager, at(state))
     forwarder.crane.mode = Mode.STOP
@@ -139,7 +139,7 @@ def test_a_stop_in_any_state_pauses_and_the_mission_goes_on_when_armed(state: St
 
 
 @whole
-def test_the_switch_to_idle_stops_the_machine_and_auto_goes_on() -> None:
+def test_idle_stops_the_machine_and_auto_resumes() -> None:
     forwarder, manager = begin(LOGS[:1])
     forwarder.run(manager, at(State.SEARCH))
     for _ in range(100):
@@ -155,7 +155,7 @@ def test_the_switch_to_idle_stops_the_machine_and_auto_goes_on() -> None:
     assert manager.state is State.DONE and forwarder.in_bunk == 1
 
 
-def test_in_single_step_every_change_waits_for_the_operator() -> None:
+def test_in_single_step_every_transition_waits_for_the_operator() -> None:
     forwarder, manager = begin(LOGS[:1])
     manager.single_step = True
     for _ in range(40):
@@ -170,7 +170,7 @@ def test_in_single_step_every_change_waits_for_the_operator() -> None:
 
 
 @whole
-def test_in_single_step_nothing_that_comes_about_is_lost_while_the_operator_thinks() -> None:
+def test_in_single_step_no_event_is_lost_while_waiting() -> None:
     forwarder, manager = begin(LOGS[:1])
     manager.single_step = True
     while not ended(manager):
@@ -183,7 +183,7 @@ def test_in_single_step_nothing_that_comes_about_is_lost_while_the_operator_thin
     assert manager.tally.loaded == forwarder.in_bunk == 1
 
 
-def test_abort_ends_in_words_and_the_machine_stands() -> None:
+def test_abort_fails_the_mission_with_its_reason_and_stops_the_machine() -> None:
     forwarder, manager = begin(LOGS[:1])
     forwarder.run(manager, at(State.SEARCH))
     for _ in range(60):
@@ -197,7 +197,7 @@ def test_abort_ends_in_words_and_the_machine_stands() -> None:
     assert manager.failure == "the supervisor wants it"
 
 
-def test_arms_that_do_not_move_end_the_mission_with_their_sentence() -> None:
+def test_swing_arms_that_do_not_move_time_out() -> None:
     forwarder, manager = begin(())
     while not ended(manager):
         forwarder.step(manager)
@@ -206,7 +206,7 @@ def test_arms_that_do_not_move_end_the_mission_with_their_sentence() -> None:
     assert forwarder.crane.now_ns - 5_000_000_000 < 40e9
 
 
-def test_wheels_that_do_not_turn_end_the_mission_with_a_reason() -> None:
+def test_wheels_that_do_not_turn_fail_the_mission() -> None:
     forwarder, manager = begin(())
     forwarder.run(manager, at(State.SEARCH))
     while not ended(manager):
@@ -217,7 +217,7 @@ def test_wheels_that_do_not_turn_end_the_mission_with_a_reason() -> None:
 
 
 @whole
-def test_a_log_that_slips_away_is_given_up_and_the_next_one_taken() -> None:
+def test_a_log_that_slips_repeatedly_is_given_up_and_the_next_one_loaded() -> None:
     forwarder, manager = begin(((1, 15.0, 4.2, 0.0), (2, 26.0, 4.2, 0.0)), end_m=36.0)
     forwarder.crane.slippery = 9  # three grasps in each of three tries
     forwarder.run(manager, ended, 900.0)
@@ -227,7 +227,7 @@ def test_a_log_that_slips_away_is_given_up_and_the_next_one_taken() -> None:
 
 
 @whole
-def test_at_the_end_of_the_route_the_load_goes_to_the_landing() -> None:
+def test_at_the_end_of_the_route_the_load_is_brought_to_the_landing() -> None:
     forwarder, manager = begin(landing=(30.0, 12.0))
     forwarder.run(manager, ended, 900.0)
     assert manager.state is State.DONE, manager.failure
@@ -244,7 +244,7 @@ def test_at_the_end_of_the_route_the_load_goes_to_the_landing() -> None:
 
 @whole
 @pytest.mark.parametrize("bearing_deg", [30.0, 100.0])
-def test_logs_are_laid_along_the_bearing_of_their_landing(bearing_deg) -> None:
+def test_logs_are_placed_along_the_bearing_of_their_landing(bearing_deg) -> None:
     forwarder, manager = begin(landing=(30.0, 12.0), bearing_deg=bearing_deg)
     forwarder.run(manager, ended, 900.0)
     assert manager.state is State.DONE, manager.failure
@@ -256,7 +256,7 @@ def test_logs_are_laid_along_the_bearing_of_their_landing(bearing_deg) -> None:
 
 
 @whole
-def test_what_lay_in_the_bunk_before_the_mission_is_unloaded_too() -> None:
+def test_logs_from_before_the_mission_are_unloaded_too() -> None:
     forwarder, manager = begin((), landing=(30.0, 12.0))
     x, y = PROFILE.bunk.center_m
     aboard = LogObservation(7, (x, y, PROFILE.bunk.floor_z_m + 0.15), (1.0, 0.0, 0.0), 2.0, 0.25)
@@ -270,7 +270,7 @@ def test_what_lay_in_the_bunk_before_the_mission_is_unloaded_too() -> None:
 
 
 @whole
-def test_a_full_bunk_is_brought_to_the_landing_and_the_rest_of_the_route_is_searched(monkeypatch) -> None:
+def test_a_full_bunk_is_unloaded_and_the_route_resumed(monkeypatch) -> None:
     monkeypatch.setattr(Tally, "full", lambda self, _bunk, _next_m3=0.0: self.on_board >= 1)
     logs = ((1, 15.0, 4.2, 0.0), (2, 36.0, 4.2, 0.0))
     forwarder, manager = begin(logs, end_m=50.0, landing=(20.0, -20.0))
@@ -285,10 +285,10 @@ def test_a_full_bunk_is_brought_to_the_landing_and_the_rest_of_the_route_is_sear
 
 @whole
 @pytest.mark.parametrize("table", [OURS, PAPER_B])
-def test_a_bunk_that_is_full_to_the_brim_ends_the_collecting(table, monkeypatch) -> None:
+def test_a_bunk_without_room_ends_the_collecting(table, monkeypatch) -> None:
     def place(arm, mission, grasp, logs, *held):
         if any(lies_in_bunk(PROFILE.bunk, log) for log in logs):
-            raise BunkFull("the bunk is full")
+            raise BunkFull("grasp.bunk-full", "the bunk is full")
         return plan_place(arm, mission, grasp, logs, *held)
 
     monkeypatch.setattr("autonomy.crane_job.cycle.plan_place", place)
@@ -300,7 +300,7 @@ def test_a_bunk_that_is_full_to_the_brim_ends_the_collecting(table, monkeypatch)
     assert forwarder.crane.held is None
 
 
-def test_a_landing_without_room_is_refused_in_words() -> None:
+def test_a_landing_without_room_fails_the_mission() -> None:
     forwarder, manager = begin((), landing=(12.0, 0.0))
     manager.tally.on_board = 1
     manager.route.drive_to_landing = refuse  # type: ignore[method-assign]
@@ -313,7 +313,7 @@ def refuse(*_: object) -> None:
 
 
 @whole
-def test_a_grasp_that_the_controller_stops_again_and_again_is_given_up() -> None:
+def test_a_grasp_that_is_stopped_repeatedly_is_given_up() -> None:
     forwarder, manager = begin(LOGS[:1], PAPER_B)
     while not ended(manager):
         forwarder.run(manager, lambda m: ended(m) or (m.state is State.COLLECT and not m.paused))
@@ -327,7 +327,7 @@ def test_a_grasp_that_the_controller_stops_again_and_again_is_given_up() -> None
     assert list(manager.tally.given_up.values()) == ["the controller stopped the crane 3 times"]
 
 
-def test_paper_b_drives_on_when_the_log_is_not_seen_again_at_standstill() -> None:
+def test_paper_b_drives_on_when_the_log_is_not_detected_again() -> None:
     forwarder, manager = begin(LOGS[:1], PAPER_B)
     forwarder.run(manager, at(State.LOOK))
     forwarder.blind = {1}
@@ -349,7 +349,7 @@ def test_the_same_inputs_give_the_same_bytes() -> None:
     assert datagrams() == datagrams()
 
 
-def test_a_route_that_cannot_be_driven_is_refused_in_words() -> None:
+def test_a_route_that_cannot_be_driven_fails_the_mission() -> None:
     points = ((10.0, 0.0), (10.5, 0.0), (10.5, 1.0), (9.0, 1.0))
     way = tuple(Point(*PLANE.geodetic(*p)[:2]) for p in points)
     manager = ActivityManager(PROFILE, profile_hash(PROFILE), ForwardingMission("test", way), plane=PLANE)

@@ -91,7 +91,7 @@ def test_the_shipped_examples_hold_the_same_route(name: str) -> None:
     assert corners[:, :2] == pytest.approx(np.array([(-18, -12), (18, -12), (18, 12)]), abs=2e-3)
 
 
-def test_a_plan_gives_its_speed_and_fences_and_says_what_it_left_out() -> None:
+def test_a_plan_has_speed_and_fences_and_notes_on_ignored_items() -> None:
     circle = {"circle": {"center": [SITE.latitude_deg, SITE.longitude_deg], "radius": 4.0}, "inclusion": False}
     ring = {"inclusion": True, "polygon": [[p.latitude_deg, p.longitude_deg] for p in FENCE]}
     speed = {"type": "SimpleItem", "command": 178, "params": [1, 0.5, -1, 0, 0, 0, 0]}
@@ -119,7 +119,7 @@ def test_a_log_may_be_drawn_by_its_ends() -> None:
     assert SITE.points_enu([log.position])[0][:2] == pytest.approx((4.0, 5.0), abs=1e-4)
 
 
-def test_kml_data_and_gpx_types_say_what_a_point_is() -> None:
+def test_kml_data_and_gpx_types_give_the_role_of_a_point() -> None:
     values = {"role": "landing", "assortments": "a, b"}
     data = "".join(f'<Data name="{key}"><value>{value}</value></Data>' for key, value in values.items())
     data = f"<ExtendedData>{data}</ExtendedData>"
@@ -132,7 +132,7 @@ def test_kml_data_and_gpx_types_say_what_a_point_is() -> None:
     assert [log.key for log in mission.logs] == ["7"]
 
 
-def test_what_is_saved_is_read_again(tmp_path: Path) -> None:
+def test_a_saved_mission_is_read_back(tmp_path: Path) -> None:
     mission = load_mission(EXAMPLES / "site.kml", logs=EXAMPLES / "harvest.hpr").mission
     save_mission(tmp_path / "m.geojson", mission)
     assert load_mission(tmp_path / "m.geojson").mission == mission

@@ -151,7 +151,7 @@ def missions(draw: st.DrawFn) -> ForwardingMission:
 
 @settings(max_examples=25)
 @given(missions())
-def test_what_is_written_is_read_again(mission: ForwardingMission) -> None:
+def test_a_written_mission_is_read_back(mission: ForwardingMission) -> None:
     data = geojson.write(mission)
     draft = read(data, "m")
     verify(draft)

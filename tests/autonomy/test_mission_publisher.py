@@ -34,7 +34,7 @@ def near(place, x_m, y_m, within_m=0.15) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_it_tells_where_the_machine_is_and_which_logs_it_knows() -> None:
+def test_the_report_has_the_machine_position_and_the_mapped_logs() -> None:
     forwarder, job, manager = begin(LOGS[0])
     run(forwarder, job, lambda j: manager.state is State.APPROACH)
     told = job.report(forwarder.crane.now_ns)
@@ -54,7 +54,7 @@ def test_it_tells_where_the_machine_is_and_which_logs_it_knows() -> None:
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_what_the_crane_aims_at_is_its_grasp() -> None:
+def test_the_targets_are_the_logs_of_the_grasp() -> None:
     """It may begin with another log than the one that the machine stopped for."""
     forwarder, job, manager = begin(LOGS[0], (9, LOGS[0][1], -LOGS[0][2], 0.0))
     run(forwarder, job, lambda j: manager.activity is not None and manager.activity.grasp is not None)
@@ -68,7 +68,7 @@ def test_what_the_crane_aims_at_is_its_grasp() -> None:
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_orders_are_done_and_told() -> None:
+def test_commands_are_executed_and_reported() -> None:
     forwarder, job, manager = begin()
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
 
@@ -94,7 +94,7 @@ def test_orders_are_done_and_told() -> None:
     assert give(6, MissionAction.AUTO) == "the mission has ended" and job.report(0).ended
 
 
-def test_it_speaks_before_the_machine_is_located() -> None:
+def test_there_is_a_report_before_the_machine_is_located() -> None:
     mission = ForwardingMission("test", (Point(*PLANE.geodetic(10.0, 0.0)[:2]),))
     manager = ActivityManager(PROFILE, profile_hash(PROFILE), mission, OURS)
     forwarder, job = Forwarder(PROFILE, PLANE, [], (0.0, 0.1, 0.05)), ForwardingJob(manager, mission)
@@ -115,7 +115,7 @@ def test_run_through_needs_no_more_steps() -> None:
     assert not job.report(0).single_step
 
 
-def test_an_ordered_abort_ends_the_mission_and_says_by_whom() -> None:
+def test_a_commanded_abort_is_reported_as_the_operators() -> None:
     forwarder, job, _ = begin()
     run(forwarder, job, lambda j: forwarder.speed_m_s > 0.3)
     assert job.execute(command(1, MissionAction.ABORT)) == ""
@@ -124,7 +124,7 @@ def test_an_ordered_abort_ends_the_mission_and_says_by_whom() -> None:
     assert told.ended and told.failure == job.failure == ABORTED and forwarder.speed_m_s < 0.05
 
 
-def test_one_log_can_be_ended_but_has_no_mission() -> None:
+def test_a_single_log_job_only_accepts_abort() -> None:
     class Crane:
         failure = ""
 

@@ -37,7 +37,7 @@ class Way:
         return review(mission, AORO)
 
 
-def test_paper_bs_mission_is_easy_for_its_machine() -> None:
+def test_paper_bs_mission_has_no_warnings() -> None:
     mission = load_mission(Path(__file__).parents[2] / "docs" / "examples" / "paper_b.geojson").mission
     found = review(mission, AORO)
     assert found.length_m == pytest.approx(2 * (40 + 30 + 40 + 30) - 30, abs=0.01)
@@ -49,7 +49,7 @@ def test_paper_bs_mission_is_easy_for_its_machine() -> None:
         assert corner.switch_m == pytest.approx(RADIUS, abs=0.01)  # R tan(45 degrees)
 
 
-def test_a_round_has_a_corner_at_every_waypoint_and_one_way_has_none_at_its_ends() -> None:
+def test_a_closed_route_has_a_corner_at_every_waypoint() -> None:
     assert [c.waypoint for c in Way(SQUARE).review().corners] == [1, 2]
     assert sorted(c.waypoint for c in Way(SQUARE).review(laps=2).corners) == [0, 1, 2, 3]
     assert Way(SQUARE[:1]).review().length_m == 0.0
@@ -93,7 +93,7 @@ def test_logs_out_of_reach_and_under_the_wheels() -> None:
     assert len(many) == 6 and "15 more" in many[-1].sentence
 
 
-def test_how_many_logs_are_fetched() -> None:
+def test_the_number_of_logs_to_collect() -> None:
     logs = [KnownLog(at(0, -12), assortment=name) for name in ("a", "a", "b")]
     assert Way(SQUARE).review(*logs).logs == 3
     assert Way(SQUARE).review(*logs, laps=2).logs == 6  # searched for, and laid anew for every lap
@@ -103,7 +103,7 @@ def test_how_many_logs_are_fetched() -> None:
     assert Way(SQUARE).review(logs_wanted=7).logs == 7
 
 
-def test_an_assortment_of_which_there_is_no_log() -> None:
+def test_an_assortment_without_logs() -> None:
     log = KnownLog(at(0, -12), assortment="pulpwood")
     warnings = Way(SQUARE).review(log, assortments=("pulpwood", "pulp wood"), logs="listed").warnings
     assert [w.code for w in warnings] == ["mission.unlisted-assortment"] and '"pulp wood"' in warnings[0].sentence

@@ -48,7 +48,7 @@ def drive(
 
 @pytest.mark.parametrize("ground", [FIRM, MUD], ids=["firm", "mud"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_it_stops_within_five_centimetres_of_where_it_should(ground: Ground, seed: int) -> None:
+def test_the_machine_stops_within_five_centimetres_of_its_stop(ground: Ground, seed: int) -> None:
     path = drivable_path([(0.0, 0.0), (12.0, 0.0), (20.0, 6.0)], CARRIER)
     vehicle, navigator, _ = drive(
         PathDrive(CARRIER, path, 9.0), ground, replace(individual(seed), main_off_m=(0.0, 0.0))
@@ -57,7 +57,7 @@ def test_it_stops_within_five_centimetres_of_where_it_should(ground: Ground, see
     assert vehicle.x == pytest.approx(9.0, abs=0.05) and abs(vehicle.y) < 0.08
 
 
-def test_the_last_setpoints_ask_for_no_speed() -> None:
+def test_the_last_setpoints_have_zero_speed() -> None:
     """A lease may only run out in peace while the machine is told to stand."""
     navigator, way, here = begun()
     navigator.step(10**9, report(), here)
@@ -71,7 +71,7 @@ def test_the_last_setpoints_ask_for_no_speed() -> None:
     assert [a.speed_m_s for a in asked[:-1] if a] == [0.0] * 9
 
 
-def test_who_was_just_told_to_drive_is_told_to_stand() -> None:
+def test_a_pause_right_after_the_start_sends_stop_setpoints() -> None:
     navigator, _, here = begun()
     asked = navigator.step(10**9, report(speed_m_s=0.0), here)
     assert asked is not None and asked.speed_m_s > 0.0
@@ -80,7 +80,7 @@ def test_who_was_just_told_to_drive_is_told_to_stand() -> None:
     assert asked is not None and asked.speed_m_s == 0.0
 
 
-def test_the_place_to_stop_at_can_be_moved() -> None:
+def test_the_stop_can_be_moved() -> None:
     way = PathDrive(CARRIER, drivable_path([(0.0, 0.0), (30.0, 0.0)], CARRIER))
     assert way.left_m == 30.0
     way.stop_at(4.0)
@@ -90,7 +90,7 @@ def test_the_place_to_stop_at_can_be_moved() -> None:
     assert way.left_m == pytest.approx(26.0, abs=0.05)
 
 
-def test_paper_b_goes_from_waypoint_to_waypoint() -> None:
+def test_paper_b_drives_from_waypoint_to_waypoint() -> None:
     plane = LocalPlane(CARRIER.site_lat_deg, CARRIER.site_lon_deg, 260.0)
     places = [Waypoint(*plane.geodetic(*p)[:2]) for p in ((14.0, 0.0), (14.0, 22.0))]
     way = WaypointDrive(CARRIER, places)
@@ -121,7 +121,7 @@ def report(**values: float) -> VehicleReport:
         ({"heading_ns": 1}, "no heading"),
     ],
 )
-def test_paper_b_stands_without_a_receiver(what: dict[str, float], reason: str) -> None:
+def test_paper_b_stops_without_a_receiver(what: dict[str, float], reason: str) -> None:
     plane = LocalPlane(CARRIER.site_lat_deg, CARRIER.site_lon_deg)
     way = WaypointDrive(CARRIER, [Waypoint(*plane.geodetic(0.0, 40.0)[:2])])
     assert way.step(report()).speed_m_s == CARRIER.cruise_speed_m_s
@@ -150,7 +150,7 @@ def begun(location: Location | None = None) -> tuple[Navigator, PathDrive, Locat
     return navigator, way, location or at(1.0, 0.0, 0.0)
 
 
-def test_every_setpoint_has_a_lease_and_survives_the_wire() -> None:
+def test_every_setpoint_has_a_lease_and_survives_encoding() -> None:
     navigator, _, here = begun()
     first = navigator.step(10**9, report(), here)
     second = navigator.step(10**9 + 50_000_000, report(stamp_ns=10**9 + 50_000_000), here)
@@ -161,7 +161,7 @@ def test_every_setpoint_has_a_lease_and_survives_the_wire() -> None:
     assert decode(encode(first)) == first
 
 
-def test_the_front_axle_floats_while_it_drives_and_no_longer() -> None:
+def test_the_front_axle_only_floats_while_driving() -> None:
     navigator, _, here = begun()
     driven = navigator.step(10**9, report(), here)
     assert driven is not None and (driven.float_front, driven.float_rear) == (True, False)
@@ -173,7 +173,7 @@ def test_the_front_axle_floats_while_it_drives_and_no_longer() -> None:
     assert held is not None and not (held.float_front or held.float_rear), "while the crane works it stands firm"
 
 
-def test_pause_stands_and_resume_drives_on() -> None:
+def test_pause_stops_and_resume_drives_on() -> None:
     navigator, way, here = begun()
     navigator.step(10**9, report(), here)
     navigator.pause()
@@ -198,7 +198,7 @@ def test_pause_stands_and_resume_drives_on() -> None:
         (at(1.0, 0.0, 0.0, covariance=np.eye(3)), "1.00 m"),
     ],
 )
-def test_who_does_not_know_where_it_is_stands_until_told(here: Location, reason: str) -> None:
+def test_an_unlocated_machine_stops_until_resumed(here: Location, reason: str) -> None:
     navigator, _, good = begun()
     navigator.step(10**9, report(), good)
     asked = navigator.step(2 * 10**9, report(), here)
@@ -218,14 +218,14 @@ def test_dead_reckoning_drives_slowly() -> None:
     assert 0.0 < slow < 0.7 * fast
 
 
-def test_a_machine_that_is_carried_away_stops() -> None:
+def test_a_machine_off_its_path_stops() -> None:
     navigator, _, here = begun()
     navigator.step(10**9, report(), here)
     navigator.step(2 * 10**9, report(), replace(here, y_m=2.2))
     assert navigator.phase is Phase.STOPPED and "beside" in navigator.reason
 
 
-def test_a_controller_that_does_not_drive_is_not_asked_for_ever() -> None:
+def test_a_controller_that_does_not_drive_stops_the_drive() -> None:
     navigator, _, here = begun()
     for k in range(2):
         navigator.step(
@@ -234,7 +234,7 @@ def test_a_controller_that_does_not_drive_is_not_asked_for_ever() -> None:
     assert navigator.phase is Phase.STOPPED and "512" in navigator.reason
 
 
-def test_wheels_that_do_not_turn_are_given_up() -> None:
+def test_wheels_that_do_not_turn_stop_the_drive() -> None:
     navigator, _, here = begun()
     for k in range(2):
         navigator.step(10**9 + k * (MOTION_TIMEOUT_NS + 1), report(speed_m_s=0.0), here)
@@ -248,7 +248,7 @@ def test_an_unknown_articulation_sends_nothing() -> None:
     assert navigator.reason == "because"
 
 
-def test_an_articulation_past_its_end_is_asked_for_at_its_end() -> None:
+def test_an_articulation_past_its_limit_is_clamped() -> None:
     navigator, _, here = begun()
     navigator.stop("because")
     asked = navigator.step(10**9, report(articulation_rad=0.7), here)

@@ -25,7 +25,7 @@ PAIRS = list(itertools.product(TABLES, State, Event))
 
 
 @pytest.mark.parametrize(("name", "state", "event"), PAIRS)
-def test_what_is_in_the_table_follows_and_nothing_else_can(name: str, state: State, event: Event) -> None:
+def test_only_transitions_of_the_table_are_possible(name: str, state: State, event: Event) -> None:
     table = TABLES[name]
     if (state, event) in table:
         assert next_state(table, state, event) is table[state, event]
@@ -53,11 +53,11 @@ def test_every_state_is_reached_and_left(table) -> None:
 
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
-def test_nothing_leads_out_of_the_end(table) -> None:
+def test_final_states_have_no_transitions(table) -> None:
     assert not any(state in FINAL_STATES for state, _ in table)
 
 
-def test_every_state_and_event_is_said_in_words_and_has_an_end() -> None:
+def test_every_state_and_event_has_a_description_and_an_end() -> None:
     assert set(RULES) == set(State) and set(EVENT_DESCRIPTIONS) == set(Event)
     for state, rule in RULES.items():
         assert rule.description
@@ -65,7 +65,7 @@ def test_every_state_and_event_is_said_in_words_and_has_an_end() -> None:
         assert math.isinf(rule.timeout_s) == waits and bool(rule.timeout_reason) != waits
 
 
-def test_the_machine_drives_only_after_the_crane_was_brought_over_the_bunk() -> None:
+def test_the_machine_only_drives_after_the_crane_is_stowed() -> None:
     for table in TABLES.values():
         seen, todo = set(), [end for (begin, _), end in table.items() if begin in (State.COLLECT, State.UNLOAD)]
         while todo:
@@ -75,7 +75,7 @@ def test_the_machine_drives_only_after_the_crane_was_brought_over_the_bunk() -> 
         assert not any(RULES[state].drives for state in seen), seen
 
 
-def test_the_crane_works_only_where_the_machine_stands_and_the_frame_was_lowered() -> None:
+def test_the_crane_only_works_at_standstill_with_the_frame_lowered() -> None:
     for table in TABLES.values():
         for (begin, event), end in table.items():
             if end is not State.STOW and RULES[end].crane and not RULES[begin].crane:  # there it has been at work
@@ -83,7 +83,7 @@ def test_the_crane_works_only_where_the_machine_stands_and_the_frame_was_lowered
     assert not any(rule.crane and rule.drives for rule in RULES.values())
 
 
-def test_paper_b_looks_at_standstill_and_passes_the_log_before_it_loads() -> None:
+def test_paper_b_observes_at_standstill_and_passes_the_log_before_loading() -> None:
     """Fig. 8: no way from the search to the crane leaves one of these out."""
     for needed in (State.HALT, State.LOOK, State.APPROACH, State.CHECK, State.LOWER):
         reached, front = {State.SEARCH}, [State.SEARCH]

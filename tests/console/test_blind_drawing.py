@@ -29,7 +29,7 @@ def drawn(profile, told: float) -> dict:
     return state
 
 
-def test_a_rotator_without_encoder_is_drawn_where_it_was_told_to_be():
+def test_a_rotator_without_encoder_is_drawn_at_its_reference():
     across = drawn(FORWARDER, nan)["jaws"]["yaw_rad"]
     assert drawn(FORWARDER, 0.3)["jaws"]["yaw_rad"] == pytest.approx(across + 0.3)
     assert drawn(FORWARDER, 0.3)["position"][4] is None and drawn(FORWARDER, 0.3)["opening_pct"] is None

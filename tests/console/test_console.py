@@ -83,7 +83,7 @@ def test_page_and_every_file_it_names_are_served_from_here(client):
 
 
 @pytest.mark.parametrize("file", ["carrier.js", "map.js"])
-def test_the_page_is_told_all_that_it_draws_the_carrier_with(file):
+def test_the_machine_description_has_all_carrier_dimensions(file):
     told = describe_machine(load_profile("aoro_fc8"))["carrier"]
     wanted = set(re.findall(r"\bc\.(\w+)", (STATIC / file).read_text()))
     assert wanted and wanted <= set(told)
@@ -160,7 +160,7 @@ def test_command_is_authenticated_with_a_key(console, controller_socket):
     assert decode(controller_socket.recv(100), b"secret").action is OperatorAction.STOP
 
 
-def test_stop_from_elsewhere_is_sent_but_arm_is_refused(console, controller_socket):
+def test_stop_from_another_machine_is_sent_but_arm_is_refused(console, controller_socket):
     client = client_of(console, peer="192.0.2.7")
     assert client.post("/api/operator/stop").status_code == 204
     assert decode(controller_socket.recv(100)).action is OperatorAction.STOP
@@ -174,13 +174,13 @@ def test_command_by_get_or_unknown_is_refused(client):
     assert client.post("/api/operator/launch").status_code == 404
 
 
-def test_stop_says_when_nobody_listens(console, controller_socket):
+def test_an_unreachable_controller_is_reported(console, controller_socket):
     controller_socket.close()
     answer = client_of(console).post("/api/operator/stop")
     assert answer.status_code == 502 and "cannot be reached" in answer.text
 
 
-def test_console_without_a_controller_only_watches():
+def test_a_console_without_a_controller_is_read_only():
     client = client_of(Console(PROFILE, 1))
     assert client.post("/api/operator/stop").status_code == 409
     assert client.get("/api/state").json()["may_stop"] is False
@@ -237,7 +237,7 @@ def watched(report=REPORT, at_ns=0, seen_ns=0):
     return crane_state.state(seen_ns)
 
 
-def test_state_says_why_and_what_is_stale():
+def test_the_state_has_the_reason_and_the_stale_inputs():
     state = watched()
     assert state["reason"].startswith("Joint tilt does not follow its command")
     assert state["stale"] == ["emergency stop", "tilt encoder"]
@@ -256,7 +256,7 @@ def test_unknown_numbers_are_none_and_the_state_is_json():
     json.dumps(state, allow_nan=False)
 
 
-def test_silence_is_noticed_within_a_second():
+def test_a_silent_controller_is_detected_within_a_second():
     crane_state = CraneState(PROFILE)
     crane_state.on_report(encode(REPORT), 0)
     assert crane_state.state(REPORT_TIMEOUT_NS - 1)["alive"] and not crane_state.state(REPORT_TIMEOUT_NS)["alive"]
@@ -292,7 +292,7 @@ def test_timing_is_shown_while_the_controller_writes_it(timing):
     )
 
 
-def test_the_page_file_is_read_and_its_end_is_noticed(timing, tmp_path, monkeypatch):
+def test_the_timing_page_is_read_until_it_ends(timing, tmp_path, monkeypatch):
     monkeypatch.setattr("console.server.TIMING_PERIOD_S", 0.01)
     monkeypatch.setattr("console.state.TIMING_TIMEOUT_NS", 200_000_000)
     path = tmp_path / "controller.timing"
@@ -341,7 +341,7 @@ def run_console(*arguments):
     )
 
 
-def test_busy_ports_and_wrong_settings_are_one_sentence():
+def test_start_errors_are_one_sentence_with_an_exit_code():
     with socket.socket() as page, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reports:
         page.bind(("127.0.0.1", 0))
         page.listen()

@@ -117,7 +117,7 @@ def shows(browser: Browser, element: str, words: str) -> None:
     browser.wait(lambda: words in browser.text(element), f"{element}: {words}")
 
 
-def test_mission_and_vehicle_are_told_in_words(stage: Stage, browser: Browser) -> None:
+def test_mission_and_vehicle_are_shown_as_text(stage: Stage, browser: Browser) -> None:
     shows(browser, "mission-words", "The machine drives up to the log.")
     told = {
         "mission-age": "Test field",
@@ -152,7 +152,7 @@ def test_the_map_shows_route_log_target_and_machine(stage: Stage, browser: Brows
      ("single", {}, MissionAction.SINGLE_STEP), ("single", {"single_step": True}, MissionAction.RUN_THROUGH),
      ("next-step", {"single_step": True, "waits_for": "a log is near"}, MissionAction.NEXT_STEP)],
 )  # fmt: skip
-def test_a_click_gives_the_order(
+def test_a_click_sends_the_command(
     stage: Stage, browser: Browser, button: str, before: dict, order: MissionAction
 ) -> None:
     stage.mission = msgspec.structs.replace(TOLD, state="SEARCH", words="is another", **before)
@@ -162,7 +162,7 @@ def test_a_click_gives_the_order(
     assert stage.ordered() is order
 
 
-def test_an_abort_is_asked_for_twice(stage: Stage, browser: Browser) -> None:
+def test_an_abort_must_be_confirmed(stage: Stage, browser: Browser) -> None:
     browser.until("document.getElementById('abort').checkVisibility()")
     browser.until("!document.getElementById('abort').disabled")
     browser.click("abort")
@@ -178,7 +178,7 @@ def test_an_abort_is_asked_for_twice(stage: Stage, browser: Browser) -> None:
     )
 
 
-def test_what_stands_still_says_why(stage: Stage, browser: Browser) -> None:
+def test_the_note_gives_the_reason_of_a_pause(stage: Stage, browser: Browser) -> None:
     for fields, words in (
         ({"auto": False, "paused": "the switch is at Idle"}, "Auto"),
         ({"paused": "the controller is silent"}, "the controller is silent"),
@@ -191,7 +191,7 @@ def test_what_stands_still_says_why(stage: Stage, browser: Browser) -> None:
     browser.until("['auto', 'pause', 'single', 'next-step', 'abort'].every(b => document.getElementById(b).disabled)")
 
 
-def test_an_old_mission_turns_grey_and_takes_no_orders(stage: Stage, browser: Browser) -> None:
+def test_an_outdated_mission_is_grey_and_accepts_no_commands(stage: Stage, browser: Browser) -> None:
     browser.until("document.getElementById('mission').checkVisibility()")
     browser.until("!document.getElementById('pause').disabled")
     assert not browser.value("document.getElementById('mission').classList.contains('old')")
@@ -204,7 +204,7 @@ def test_an_old_mission_turns_grey_and_takes_no_orders(stage: Stage, browser: Br
 
 
 @pytest.mark.parametrize("stage", [("palms_471", TOLD), ("aoro_fc8", None)], indirect=True)
-def test_without_a_mission_or_a_carrier_none_of_it_shows(stage: Stage, browser: Browser) -> None:
+def test_without_a_mission_or_a_carrier_their_cards_are_hidden(stage: Stage, browser: Browser) -> None:
     shows(browser, "mode", "ACTIVE")
     for element in ("mission", "vehicle", "site"):
         assert not browser.text(element) and not browser.value(

@@ -38,7 +38,7 @@ def told(
 # ---- the mission ------------------------------------------------------------------------------------------------
 
 
-def test_a_mission_is_shown_in_words_and_metres() -> None:
+def test_the_mission_state_is_in_text_and_metres() -> None:
     seen = crane_state()
     assert seen.mission_state.mission() is None and seen.state(0)["mission_age_s"] is None
     assert told(seen)
@@ -51,7 +51,7 @@ def test_a_mission_is_shown_in_words_and_metres() -> None:
     assert (log["number"], log["given_up"]) == (9, True) and log["yaw_rad"] == pytest.approx(math.pi / 4, abs=1e-3)
 
 
-def test_a_silent_planner_is_noticed_and_its_age_is_told() -> None:
+def test_a_silent_planner_is_detected_and_its_age_shown() -> None:
     seen = crane_state()
     told(seen, now_ns=10**9)
     assert seen.state(10**9 + MISSION_TIMEOUT_NS - 1)["mission_alive"]
@@ -59,7 +59,7 @@ def test_a_silent_planner_is_noticed_and_its_age_is_told() -> None:
     assert not late["mission_alive"] and late["mission_age_s"] == 8.0
 
 
-def test_only_newer_reports_of_this_machine_with_its_key_are_taken() -> None:
+def test_only_newer_authenticated_reports_of_this_machine_are_accepted() -> None:
     seen = crane_state(key=b"right")
     assert not told(seen) and not told(seen, key=b"wrong") and not told(seen, key=b"right", code=HASH ^ 1)
     assert not told(seen, key=b"right", stamp_ns=5 * 10**9), "from the future"
@@ -72,7 +72,7 @@ def test_only_newer_reports_of_this_machine_with_its_key_are_taken() -> None:
 # ---- the vehicle ------------------------------------------------------------------------------------------------
 
 
-def test_the_vehicle_is_shown_in_degrees_and_where_its_joint_is() -> None:
+def test_the_vehicle_state_is_in_degrees_at_its_articulation() -> None:
     seen = crane_state()
     assert seen.state(0)["vehicle"] is None
     assert seen.on_report(encode(VEHICLE), 10**9)
@@ -87,7 +87,7 @@ def test_the_vehicle_is_shown_in_degrees_and_where_its_joint_is() -> None:
     assert not seen.state(10**9 + VEHICLE_TIMEOUT_NS)["vehicle"]["alive"]
 
 
-def test_it_turns_with_its_heading() -> None:
+def test_the_vehicle_is_drawn_with_its_heading() -> None:
     seen = crane_state()
     seen.on_report(encode(replace(VEHICLE, heading_rad=math.radians(30.0))), 1)
     place, ahead = seen.state(1)["vehicle"]["place"], PROFILE.carrier.antenna_main_m[0]
@@ -95,7 +95,7 @@ def test_it_turns_with_its_heading() -> None:
     assert place["y_m"] == pytest.approx(-ahead * math.sqrt(0.75), abs=2e-3)
 
 
-def test_an_unknown_place_keeps_the_last_one_and_says_so() -> None:
+def test_an_unknown_position_keeps_the_last_one_as_outdated() -> None:
     seen = crane_state()
     seen.on_report(encode(VEHICLE), 0)
     lost = replace(VEHICLE, latitude_deg=math.nan, roll_rad=math.nan, fix=0, stale_mask=1 << 3 | 1 << 7)
@@ -107,7 +107,7 @@ def test_an_unknown_place_keeps_the_last_one_and_says_so() -> None:
     assert set(INPUT_NAMES) == set(VEHICLE_INPUTS)
 
 
-def test_the_trail_grows_with_the_way() -> None:
+def test_the_trail_grows_with_the_distance() -> None:
     seen = crane_state()
     for k in range(100):
         seen.on_report(encode(replace(VEHICLE, longitude_deg=HERE[1] + 1e-6 * k)), k)
@@ -116,7 +116,7 @@ def test_the_trail_grows_with_the_way() -> None:
     assert trail[-1][0] - trail[0][0] == pytest.approx(99 * step_m, abs=0.3)
 
 
-def test_the_ground_is_that_of_the_ellipsoid() -> None:
+def test_the_projection_agrees_with_the_ellipsoid() -> None:
     ground = MapProjection()
     ground.metres(*HERE)
     for lat, lon in ((63.6600, 19.8955), (63.6578, 19.9050), (63.6550, 19.8900)):
@@ -125,7 +125,7 @@ def test_the_ground_is_that_of_the_ellipsoid() -> None:
     assert MapProjection().metres(*HERE) == (0.0, 0.0)
 
 
-def test_a_machine_that_stands_still_has_no_carrier_to_draw() -> None:
+def test_a_stationary_machine_has_no_carrier() -> None:
     assert describe_machine(load_profile("palms_471"))["carrier"] is None
     carrier = describe_machine(PROFILE)["carrier"]
     assert describe_machine(PROFILE)["reach_m"] == pytest.approx(9.0, abs=0.1) and carrier["track_width_m"] == 2.1
@@ -151,7 +151,7 @@ def console_of(planner=None, key=None) -> Console:
 
 
 @pytest.mark.parametrize("order", list(MissionAction))
-def test_an_order_sends_its_datagram(planner, order) -> None:
+def test_a_mission_command_sends_its_datagram(planner, order) -> None:
     client = client_of(console_of(planner, b"key"))
     for _ in range(2):
         name = order.name.lower().replace("_", "-")
@@ -160,7 +160,7 @@ def test_an_order_sends_its_datagram(planner, order) -> None:
     assert first == MissionCommand(first.sequence, HASH, 10**10, order) and second.sequence > first.sequence
 
 
-def test_orders_pass_the_same_guards_as_commands(planner) -> None:
+def test_mission_commands_pass_the_same_guards(planner) -> None:
     console = console_of(planner)
     assert client_of(console, "192.0.2.7").post("/api/mission/pause").status_code == 403
     here = client_of(console)
@@ -174,7 +174,7 @@ def test_orders_pass_the_same_guards_as_commands(planner) -> None:
     assert client_of(console, "192.0.2.7").get("/api/state").json()["may_order"] is False
 
 
-def test_an_order_that_nobody_takes_is_not_called_done(planner) -> None:
+def test_an_unreachable_planner_is_reported(planner) -> None:
     assert client_of(console_of()).post("/api/mission/pause").status_code == 409
     console = console_of(planner)
     planner.close()
@@ -182,7 +182,7 @@ def test_an_order_that_nobody_takes_is_not_called_done(planner) -> None:
     assert answer.status_code == 502 and "planner" in answer.text
 
 
-def test_the_mission_comes_by_the_websocket_when_it_is_new() -> None:
+def test_the_websocket_sends_new_mission_reports() -> None:
     console = console_of()
     with client_of(console) as client, client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
         assert "mission" not in ws.receive_json()

@@ -41,13 +41,13 @@ def plant() -> Iterator[tuple[tuple[str, int], list[dict[str, str]]]]:
     port.close()
 
 
-def test_the_page_and_what_never_changes(plant) -> None:
+def test_the_page_and_the_constant_data_are_served(plant) -> None:
     with TestClient(create_plant_app(plant[0]), base_url="http://127.0.0.1") as page:
         assert "simulated plant" in page.get("/plant").text
         assert page.get("/api/plant").json() == {"title": "a plant"}
 
 
-def test_what_moves_comes_by_itself(plant) -> None:
+def test_poses_are_pushed_by_the_websocket(plant) -> None:
     with (
         TestClient(create_plant_app(plant[0]), base_url="http://127.0.0.1") as page,
         page.websocket_connect("/ws/plant", headers={"host": "127.0.0.1"}) as ws,
@@ -56,7 +56,7 @@ def test_what_moves_comes_by_itself(plant) -> None:
         assert ws.receive_json() == {"time_s": 1.5}
 
 
-def test_a_lever_goes_to_the_plant_and_its_refusal_comes_back(plant) -> None:
+def test_a_lever_request_returns_the_plants_refusal(plant) -> None:
     with TestClient(create_plant_app(plant[0]), base_url="http://127.0.0.1") as page:
         assert page.post("/api/plant/lever?name=slew&value=0.6").status_code == 204
         refused = page.post("/api/plant/lever?name=boom&value=0.6")
@@ -70,7 +70,7 @@ def test_levers_are_refused_to_other_machines(plant) -> None:
     assert plant[1] == []
 
 
-def test_a_silent_plant_is_named() -> None:
+def test_a_silent_plant_is_reported() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
         deaf.bind(("127.0.0.1", 0))
         with TestClient(create_plant_app(deaf.getsockname()), base_url="http://127.0.0.1") as page:
