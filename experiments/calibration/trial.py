@@ -140,7 +140,7 @@ def real_full_speed(
         run(RUN_S, side * TESTED_SPOOL)
         first = world.q[name]
         run(TIMED_S, side * TESTED_SPOOL)
-        return abs(world.q[name] - first) / TIMED_S / share
+        return float(abs(world.q[name] - first) / TIMED_S / share)
 
 
 def _survey_errors(truth: Any, result: CalibrationResult) -> dict[str, Any]:

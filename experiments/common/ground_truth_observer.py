@@ -69,7 +69,9 @@ class GroundTruthObserver:
         now_ns, manager = run.system.now_ns, run.manager
         if now_ns >= self._next_path_ns:
             self._next_path_ns = now_ns + PATH_PERIOD_NS
-            x, y, _ = run.plant.world.carrier.front_axle()
+            carrier = run.plant.world.carrier
+            assert carrier is not None
+            x, y, _ = carrier.front_axle()
             self.path.append([round(self._seconds(), 1), round(x, 3), round(y, 3), manager.tally.on_board])
         if now_ns >= self._next_detection_ns:
             self._next_detection_ns = now_ns + DETECTION_PERIOD_NS

@@ -54,8 +54,8 @@ def photos(where: Path) -> list[Photo]:
 def cut(name: str, sheet: np.ndarray, wood: np.ndarray) -> list[Photo]:
     """The photographs of a sheet (H, W, 3), separated by white gutters."""
     wood = ndimage.binary_opening(wood, np.ones((OUTLINE_PX, OUTLINE_PX)))
-    out = []
-    for window in _windows((sheet < GUTTER_LEVEL).any(axis=2), 0, 0):
+    out: list[Photo] = []
+    for window in _windows(np.asarray((sheet < GUTTER_LEVEL).any(axis=2)), 0, 0):
         rgb = sheet[window]
         if min(rgb.shape[:2]) >= MIN_SIDE_PX:
             out.append(Photo(f"{name} {len(out) + 1}", np.ascontiguousarray(rgb), wood[window]))

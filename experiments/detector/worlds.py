@@ -91,7 +91,7 @@ def _view(pile: Pile, camera: str, rng: random.Random) -> tuple[View, np.ndarray
         flat, height = reach * math.cos(elevation), reach * math.sin(elevation)
     eye = target + np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), height])
     eye[2] = max(eye[2], ground_of(pile).height(eye[0], eye[1]) + 1.2)
-    return look_at(eye, target, pin), target
+    return look_at(eye.tolist(), target.tolist(), pin), target
 
 
 def _steel(pile: Pile, target: np.ndarray, rng: random.Random) -> Boxes:

@@ -20,9 +20,10 @@ from scipy.optimize import linear_sum_assignment
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame, rescaled
 from autonomy.perception.camera.mount import optical_pose
+from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.log_list.observation import LogObservation
 from autonomy.perception.papers import paper_a
-from autonomy.perception.pipeline import Masked, Perception
+from autonomy.perception.pipeline import Perception
 from hil.calibration.camera_survey import SURVEYED, surveyed_profile
 from machine.profile import Profile
 from sim.camera.rig import CameraRig
@@ -104,7 +105,7 @@ class PaperPerception:
         seen, begun = self._camera.detect(stamp_ns, q), time.process_time()
         frame, pose = seen.frames[0], seen.pose
         found = [paper_a.log_from_mask(frame, one.mask) for one in segment(frame)]
-        logs = []
+        logs: list[LogObservation] = []
         for log in found:
             if log is not None and log.diameter_m > 0.0 and log.length_m > 0.0:
                 at, axis = pose.to_base(log.center_m), pose.rotation @ log.axis

@@ -51,7 +51,7 @@ def plan(options: Options, trials: int) -> list[Job]:
         same = profile == options.profile and options.truth not in ("nominal", "sampled")
         what = {"profile": profile, "truth": options.truth if same else "sampled"}
         for (state, calibrated), law in product(STATES.items(), LAWS):
-            kinds = CALIBRATED if calibrated else SHIPPED
+            kinds: tuple[str, ...] = CALIBRATED if calibrated else SHIPPED
             if options.quick and law != own_law(profile):
                 kinds = ("cycle",) if calibrated else ()
             for kind in kinds:

@@ -81,6 +81,7 @@ class Site:
         self._frames = 0
         self._renderers: dict[int, MeshRenderer] = {}
         gnss = self._truth.gnss
+        assert gnss is not None
         rtk = gnss.fixes["rtk_fixed"]
         self._gnss = (rtk.noise_m, rtk.wander_m, gnss.height_factor, gnss.attitude_noise_rad, gnss.phase_noise_m)
         self._wander = np.array([self._rng.gauss(0.0, rtk.wander_m) for _ in range(3)]) * (1, 1, gnss.height_factor)
@@ -135,10 +136,11 @@ class Site:
     def _front(self, x: float) -> tuple[np.ndarray, np.ndarray]:
         """Pose (position, rotation) of the front frame on the ground with the camera above ``x``."""
         c = self.profile.carrier
+        assert c is not None
         at = x - self.camera.position_m[0]
         side = 0.5 * c.track_width_m
         left, right = (self._ground.height(at + c.front_axle_m, s) for s in (side, -side))
-        rear = 0.5 * sum(self._ground.height(at - c.rear_axle_m, s) for s in (side, -side))
+        rear = 0.5 * (self._ground.height(at - c.rear_axle_m, side) + self._ground.height(at - c.rear_axle_m, -side))
         front = 0.5 * (left + right)
         span = c.front_axle_m + c.rear_axle_m
         pitch, roll = math.atan2(rear - front, span), math.atan2(left - right, 2.0 * side)
@@ -165,7 +167,9 @@ class Site:
     def _view(self, at: np.ndarray, turn: np.ndarray) -> View:
         truth, camera = self._truth.cameras[CAMERA], self.camera
         errors = (truth.mount_position_m, truth.mount_rpy_rad)
-        return mount_view((at, _quaternion(turn)), intrinsics(camera), camera.position_m, camera.rpy_rad, *errors)
+        return mount_view(
+            (at.tolist(), _quaternion(turn)), intrinsics(camera), camera.position_m, camera.rpy_rad, *errors
+        )
 
     def frame(self, shot: Shot, stamp_ns: int) -> RgbdFrame:
         """The frame that the surveyed camera delivers for a shot; every call has its own noise."""
@@ -176,8 +180,7 @@ class Site:
         return rescaled(raw, self.surveyed.depth_scale)
 
     def single(self, range_m: float) -> Shot:
-        """Log 1 from a camera at this range, with the height and direction of the machine's, at an exactly known
-        pose."""
+        """Log 1 from a camera at this range and an exactly known pose, mounted as on the machine."""
         log = self._lying[0]
         height = self.camera.position_m[2] + 0.8
         ahead = math.sqrt(max(0.3, range_m**2 - (height - 0.12) ** 2))
@@ -190,7 +193,7 @@ class Site:
 
 
 def _optical(at: np.ndarray, turn: np.ndarray, camera: Camera) -> Pose:
-    view = mount_view((at, _quaternion(turn)), intrinsics(camera), camera.position_m, camera.rpy_rad)
+    view = mount_view((at.tolist(), _quaternion(turn)), intrinsics(camera), camera.position_m, camera.rpy_rad)
     return Pose(view.position_m, view.rotation)
 
 

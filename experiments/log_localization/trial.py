@@ -10,9 +10,11 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.perception.camera.frame import Pose, RgbdFrame
+from autonomy.perception.fitting.measure import Masked
 from autonomy.perception.papers import paper_a
 from autonomy.perception.papers.paper_b import DETECTOR_PX, Box, RunningAverage, box_in_picture, position_in_box
-from autonomy.perception.pipeline import Masked, Perception
+from autonomy.perception.pipeline import Perception
+from autonomy.perception.tracking.log_filter import Track
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from experiments.log_localization.site import APART_M, STOP_M, Shape, Shot, Site
@@ -77,7 +79,7 @@ def approach(site: Site, segment: Segmenter) -> dict[str, Any]:
         stop = number * APART_M - STOP_M
         drive = [site.shot(float(x), number) for x in np.arange(start, stop, STEP_M)]
         standing = site.shot(stop, number)
-        tracks: tuple = ()
+        tracks: tuple[Track, ...] = ()
         for shot in [*(d for d in drive for _ in range(FRAMES_PER_POSITION)), *[standing] * FRAMES_PER_STOP]:
             clock += RATE_NS
             frame = site.frame(shot, clock)
@@ -123,7 +125,7 @@ def _mask_of(log: Shape, number: int, shot: Shot, instances: Sequence[Masked]) -
 
 def _log_errors(
     log: Shape,
-    tracks: Sequence,
+    tracks: Sequence[Track],
     positions: list[np.ndarray],
     centred: list[np.ndarray],
     frame: RgbdFrame,

@@ -103,14 +103,16 @@ def heading_loop(carrier: Carrier, spool: Spool, case: CarrierCase) -> Array:
     bends = _hold(s, COMMAND_S) * np.exp(-s * TRANSPORT_S) * spool.response(s) * Swing().response(s)
     turns = (carrier.rear_axle_m * s + v) / (base * s * s)
     missing = _hold(s, SAMPLE_S) * (1.0 - np.exp(-s * case.latency_s))
-    return carrier.heading_kp_1_s * bends * turns * (1.0 - missing) * (1.0 + v / case.distance_m / s)
+    loop: Array = carrier.heading_kp_1_s * bends * turns * (1.0 - missing) * (1.0 + v / case.distance_m / s)
+    return loop
 
 
 def arm_loop(carrier: Carrier, spool: Spool) -> Array:
     """Open-loop response of the height of one arm, cut at the commanded speed."""
     s = 1j * FREQUENCY_RAD_S
     measured = _hold(s, COMMAND_S) * np.exp(-s * TRANSPORT_S)
-    return carrier.arm_kp_1_s * _hold(s, COMMAND_S) * np.exp(-s * TRANSPORT_S) * spool.response(s) / s * measured
+    loop: Array = carrier.arm_kp_1_s * _hold(s, COMMAND_S) * np.exp(-s * TRANSPORT_S) * spool.response(s) / s * measured
+    return loop
 
 
 def angle_spec(carrier: Carrier) -> JointSpec:

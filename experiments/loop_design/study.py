@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, replace
 from itertools import product
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import control
 import numpy as np
@@ -32,6 +32,18 @@ OPENINGS: Final = (0.1, 0.4)
 AMPLITUDES: Final = (0.1, 0.3, 1.0)
 DELAYS: Final = 5
 GAINS: Final = 3
+
+
+class AnyCase(Protocol):
+    """A case of a study: the machine and its operating point, with its description as text."""
+
+    @property
+    def delay_s(self) -> float:
+        """Dead time of the valve [s]."""
+
+    @property
+    def gain(self) -> float:
+        """Gain of the valve over the profile's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +85,7 @@ class JointStudy:
     spec: JointSpec
     nominal: Margins
     nominal_loop: Array
-    cases: tuple[Case, ...]
+    cases: tuple[AnyCase, ...]
     margins: tuple[Margins, ...]
     worst_loop: Array
     """Loop of the case with the least gain margin."""
@@ -89,7 +101,7 @@ class JointStudy:
         return min(m.gain_db for m in self.margins)
 
     @property
-    def worst(self) -> Case:
+    def worst(self) -> AnyCase:
         """The case with the least gain margin."""
         return self.cases[min(range(len(self.cases)), key=lambda i: self.margins[i].gain_db)]
 

@@ -52,7 +52,8 @@ def heading_error(drive: Drive, points: Sequence[Point2]) -> Array:
     """Bearing to the waypoint less heading [rad], as paper B's Fig. 14 (n,)."""
     goals = np.array(points)[drive["goal"].astype(int)]
     bearing = np.arctan2(goals[:, 1] - drive["y_m"], goals[:, 0] - drive["x_m"])
-    return np.remainder(bearing - drive["yaw_rad"] + math.pi, 2.0 * math.pi) - math.pi
+    error: Array = np.remainder(bearing - drive["yaw_rad"] + math.pi, 2.0 * math.pi) - math.pi
+    return error
 
 
 def after_first_corner(drive: Drive, points: Sequence[Point2]) -> int:
@@ -155,4 +156,5 @@ def turn_rates(drive: Drive) -> tuple[list[float], list[float]]:
 
 def located(drive: Drive) -> Array:
     """Error of the estimated position [m]."""
-    return np.hypot(drive["seen_x_m"] - drive["x_m"], drive["seen_y_m"] - drive["y_m"])
+    error: Array = np.hypot(drive["seen_x_m"] - drive["x_m"], drive["seen_y_m"] - drive["y_m"])
+    return error

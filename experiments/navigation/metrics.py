@@ -123,7 +123,8 @@ def gather(outcomes: Mapping[str, Any], points: Sequence[Point2], carrier: Carri
                 after = ways > measure.corner_end_m(path, points[0])
                 ours.setdefault(ground, []).append(np.abs(lateral[after]))
                 own.append(np.abs(drive["off_m"][after]))
-                stops.append(abs(path.nearest(*drive.outcome["rest_m"], path.length_m - 1.0) - path.length_m))
+                x, y = drive.outcome["rest_m"]
+                stops.append(abs(path.nearest(x, y, path.length_m - 1.0) - path.length_m))
             continue
         for drive in good:
             steady, full = measure.turn_rates(drive)
@@ -135,9 +136,9 @@ def gather(outcomes: Mapping[str, Any], points: Sequence[Point2], carrier: Carri
                 coming.append(before)
     metrics = {f"{g}.lateral_p95_m": _p95(parts) for g, parts in ours.items()}
     metrics |= {f"{g}.faithful.lateral_p95_m": _p95(parts) for g, parts in common.items()}
-    every, last = [p for parts in ours.values() for p in parts], [p for parts in common.values() for p in parts]
+    every, final = [p for parts in ours.values() for p in parts], [p for parts in common.values() for p in parts]
     for name, parts in (("lateral_p95_m", every), ("own_p95_m", own), ("located_p95_m", off),
-                        ("faithful.lateral_p95_m", last), ("faithful.coming_p95_m", coming)):  # fmt: skip
+                        ("faithful.lateral_p95_m", final), ("faithful.coming_p95_m", coming)):  # fmt: skip
         if any(len(p) for p in parts):
             metrics[name] = _p95(parts)
     if every:

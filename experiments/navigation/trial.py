@@ -134,7 +134,9 @@ def perform(job: Job) -> dict[str, Any]:
         ended_ns, phase = system.now_ns, planner.navigator.phase
         while system.now_ns < ended_ns + REST_NS:
             system.advance()
-        at = plant.world.carrier.front_axle()
+        body = plant.world.carrier
+        assert body is not None
+        at = body.front_axle()
         return {
             "rows": [[round(v, 5) if math.isfinite(v) else None for v in row] for row in planner.rows],
             "arrived": phase is Phase.ARRIVED, "reason": planner.navigator.reason, "stops": operator.stops,

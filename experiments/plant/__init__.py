@@ -1,1 +1,1 @@
-"""``timberhand experiment plant``: does the simulated machine behave like steel, oil and wood?"""
+"""The plant experiment: does the simulated machine behave like steel, oil and wood?"""

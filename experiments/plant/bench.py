@@ -1,8 +1,8 @@
-"""How fast the plant is: real-time factors, cost over the number of logs, milliseconds of a camera picture.
+"""Speed of the plant: real-time factors, cost over the number of logs, time of a camera picture.
 
-Every stretch of simulated time is timed by the wall and by the process's own processor time, with a fixed piece of
-Python work timed before it.  The figure is the median over the stretches; ``*_per_reference`` is its cost as a ratio
-to that work.  The host is called noisy when it took the processor away or the fixed work itself took unequal time.
+Every interval of simulated time is measured by wall time and by CPU time, with a fixed piece of Python work measured
+before it.  The result is the median over the intervals; ``*_per_reference`` is its cost relative
+to that work.  The host is noisy if it withheld the processor or the fixed work itself took unequal time.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import time
 from dataclasses import dataclass, field
 from itertools import islice, product
 from statistics import median
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from rich.console import Console
 
@@ -26,28 +26,28 @@ from machine.geometry.kinematics import Unreachable
 from sim.mechanics.carrier import Drive
 from sim.plant import Plant
 from sim.wood.log_shape import LogSpec
-from sim.world import STEP_S
+from sim.world import STEP_S, World
 
 LOG_COUNTS: Final = (1, 12, 50, 200)
 PICTURE_LOGS: Final = 12
 PER_SECOND: Final = round(1.0 / STEP_S)
-STOLEN: Final = 0.05  # share of the wall time that the process did not run
-UNEQUAL: Final = 0.20  # spread of the fixed work, (p90 - median) / median
+MAX_STEAL_SHARE: Final = 0.05  # share of the wall time that the process did not run
+MAX_SPREAD: Final = 0.20  # spread of the fixed work, (p90 - median) / median
 METRICS: Final = (
     Metric("rtf_crane12", "Real-time factor, crane at work among 12 logs, no camera", "x",
-           "Physics, hydraulics and judge-free yard of the fixed crane while it drives its functions among 12 logs.",
+           "Physics and hydraulics of the fixed crane while it drives its functions among 12 logs.",
            least=5.0, clocked=True),
     Metric("rtf_mission", "Real-time factor, forwarder: driving, then crane work, all CAN nodes", "x",
            "The whole plant behind both buses: 20 s of driving past a row of logs, then a grasp into the bunk.",
            least=3.0, clocked=True),
-    Metric("camera608_ms", "Camera picture 608 x 608 with depth, 12 logs in the yard", "ms",
+    Metric("camera608_ms", "Camera picture 608 x 608 with depth, 12 logs", "ms",
            "One frame of the emulated stereo camera: colour, depth and its errors.", most=12.0, clocked=True),
 )  # fmt: skip
 
 
 @dataclass(slots=True)
 class Stopwatch:
-    """Collects timed stretches of one workload, and the fixed work beside them."""
+    """Collects measured intervals of one workload, and of the fixed work beside them."""
 
     wall_s: list[float] = field(default_factory=list)
     processor_s: list[float] = field(default_factory=list)
@@ -56,30 +56,30 @@ class Stopwatch:
     _processor: float = 0.0
 
     def begin(self) -> None:
-        """Do the fixed work, then start a stretch."""
+        """Do the fixed work, then start an interval."""
         self.reference_s.append(_fixed_work_s())
         self._wall, self._processor = time.perf_counter(), time.process_time()
 
     def end(self) -> None:
-        """End the stretch."""
+        """End the interval."""
         self.wall_s.append(time.perf_counter() - self._wall)
         self.processor_s.append(time.process_time() - self._processor)
 
     @property
-    def stolen(self) -> float:
+    def steal_share(self) -> float:
         """Share of the wall time in which the process did not run."""
         return max(0.0, 1.0 - sum(self.processor_s) / sum(self.wall_s))
 
     @property
-    def unequal(self) -> float:
+    def spread(self) -> float:
         """Spread of the fixed work."""
         ordered = sorted(self.reference_s)
         return ordered[9 * (len(ordered) - 1) // 10] / median(ordered) - 1.0
 
     @property
     def noisy(self) -> bool:
-        """Whether the host was too busy for a verdict."""
-        return self.stolen > STOLEN or self.unequal > UNEQUAL
+        """Whether the host was too busy for a comparison with limits."""
+        return self.steal_share > MAX_STEAL_SHARE or self.spread > MAX_SPREAD
 
 
 def _fixed_work_s() -> float:
@@ -119,8 +119,8 @@ def measure(profile: str, truth: str, quick: bool, console: Console) -> tuple[di
         metrics[name] = 1.0 / median(watch.wall_s)
         metrics[f"{name}_processor"] = 1.0 / median(watch.processor_s)
         metrics[f"{name}_per_reference"] = median(watch.wall_s) / reference
-    metrics["host_stolen"] = max(w.stolen for w in watches.values())
-    metrics["host_unequal"] = max(w.unequal for w in watches.values())
+    metrics["host_stolen"] = max(w.steal_share for w in watches.values())
+    metrics["host_unequal"] = max(w.spread for w in watches.values())
     return metrics, any(w.noisy for w in watches.values()), {"step_ms": cost}
 
 
@@ -131,7 +131,7 @@ def rows_of_logs(count: int, x_m: float, y_m: float) -> tuple[LogSpec, ...]:
 
 
 def heap(count: int, x_m: float, y_m: float) -> tuple[LogSpec, ...]:
-    """Logs let go in layers of four, one above the other: a heap with many contacts."""
+    """Logs released in layers of four above each other: a heap with many contacts."""
     return tuple(
         LogSpec(x_m + 0.30 * (i % 4 - 1.5), y_m, math.pi / 2, 2.6, 0.2, 600.0, z_m=0.26 * (i // 4))
         for i in range(count)
@@ -139,7 +139,7 @@ def heap(count: int, x_m: float, y_m: float) -> tuple[LogSpec, ...]:
 
 
 def _crane(profile: str, truth: str, stretches: int) -> Stopwatch:
-    """Stretches of one second of the crane moving all its functions, 12 logs in a heap."""
+    """Intervals of one second with the crane moving all its functions, 12 logs in a heap."""
     p = profile_named(profile)
     with trial_world(profile, truth, 1, heap(12, *p.workspace.pick_center_m)) as world:
         driver, watch = Driver(world), Stopwatch()
@@ -185,29 +185,30 @@ def _mission(profile: str, truth: str, quick: bool) -> Stopwatch:
             rate = 0.05 * math.cos(2.0 * math.pi * i / PER_SECOND / 8.0)
             bus.step(neutral, Drive(spec.cruise_speed_m_s), rate)
             lap()
-        _load_one(bus, Driver(bus, lap), quick)
+        world = cast(World, bus)
+        _load_one(world, Driver(world, lap), quick)
         return watch
     finally:
         plant.close()
 
 
-def _load_one(bus: BusWorld, driver: Driver, quick: bool) -> None:
+def _load_one(world: World, driver: Driver, quick: bool) -> None:
     """Grasp the nearest log that the crane reaches and lay it into the bunk."""
     driver.wait(1.0)
-    centre, logs = bus.base_pose()[0], bus.yard.states()
+    centre, logs = world.base_pose()[0], world.log_bodies.states()
     for i in sorted(range(len(logs)), key=lambda i: math.dist(logs[i].position_m, centre)):
         try:
-            take(bus, driver, lift_to_m=None if quick else over_stakes_m(bus), logs=[logs[i]])
+            take(world, driver, lift_to_m=None if quick else over_stakes_m(world), logs=[logs[i]])
         except Unreachable:
             continue
         if not quick:
-            unload(bus, driver, [bus.yard.states()[i]])
+            unload(world, driver, [world.log_bodies.states()[i]])
         return
     raise RuntimeError("the crane reaches no log of the row after the drive; the bench needs another route")
 
 
 def _growth(profile: str, truth: str, count: int, stretches: int) -> Stopwatch:
-    """Half-second stretches of the standing crane with so many logs on the ground."""
+    """Half-second intervals of the crane at rest with this number of logs on the ground."""
     with trial_world(profile, truth, 1, rows_of_logs(count, 12.0, -6.0)) as world:
         watch = Stopwatch()
         neutral = [0.0] * len(world.functions)
@@ -222,7 +223,7 @@ def _growth(profile: str, truth: str, count: int, stretches: int) -> Stopwatch:
 
 
 def _camera(profile: str, truth: str, pictures: int) -> Stopwatch:
-    """One picture per stretch while the crane moves."""
+    """One picture per interval while the crane moves."""
     from sim.camera.rig import CameraRig
 
     p = profile_named(profile)

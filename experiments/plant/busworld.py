@@ -1,7 +1,7 @@
-"""The whole plant behind its bus, looking like a World to the open-loop driver: spools in, CAN frames out and back.
+"""The whole plant behind its bus with the interface of a World: spools in, CAN frames to the plant and back.
 
-It stands where controller and guard stand and sends what they send, at their periods: valve commands, guard and SYNC
-every 5 ms, vehicle and swing-arm commands every 20 ms.  There is no supervision; it serves timing alone.
+It replaces controller and guard and sends their messages at their periods: valve commands, guard and SYNC every 5 ms,
+vehicle and swing-arm commands every 20 ms.  It has no supervision; it serves timing only.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MACHINE_BUS: Final = "mach0"
 
 
 class BusWorld:
-    """``step`` as World's; every other name is the plant's world."""
+    """``step`` is like that of a World; every other attribute is that of the plant's world."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant, self._world = plant, plant.world
@@ -44,7 +44,7 @@ class BusWorld:
         return getattr(self._world, name)
 
     def step(self, spools: Sequence[float], drive: Drive = PARKED, articulation_rad_s: float = 0.0) -> None:
-        """One physics step of the plant with the spools asked for over the bus, -1..1."""
+        """One physics step of the plant with the spools (-1 to 1) commanded over the bus."""
         frames: list[tuple[str, int, bytes]] = []
         if self._steps % CYCLE_STEPS == 0:
             frames += [(self._crane_bus, *frame) for frame in self._fast(spools)]

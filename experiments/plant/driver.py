@@ -1,8 +1,8 @@
-"""An open-loop driver of the crane for plant trials: smooth joint references, feed-forward and P, spools out.
+"""An open-loop driver of the crane for plant trials: smooth joint references, feed-forward and P control, spools out.
 
-It stands where the controller stands and knows what the controller knows: the profile's kinematics, dead-bands and
-speeds, and the joint positions an encoder would show.  It does not see the tip, the structure's bending, the pendulum
-or the logs; where to grasp is told once, before the motion.  Points and angles are in the crane's base frame.
+It replaces the controller and has the same knowledge: the profile's kinematics, dead-bands and speeds, and the joint
+positions by encoders.  It does not know the tip, the bending of the structure, the pendulum or the logs; the grasp
+target is given once, before the motion.  Points and angles are in the crane's base frame.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from sim.world import STEP_S, World
 
 ARM: Final = ("slew", "lift", "tilt", "ext")
 DRIVEN: Final = (*ARM, "rot")
-CLEARANCE_M: Final = 0.02  # tips over the ground; more, and they pinch a thin log instead of getting under it
+CLEARANCE_M: Final = 0.02  # tips over the ground; higher tips would pinch a thin log instead of reaching under it
 GAIN_1_S: Final = 3.0
 LINE_SPEED_M_S: Final = 0.6
 RAISE_SPEED_M_S: Final = 0.35
-REST_SHARE: Final = 0.004  # of full speed: below it the spool stays in its dead-band
+REST_SHARE: Final = 0.004  # share of full speed below which the spool stays in its dead-band
 CLOSE_LIMIT_S: Final = 8.0
 GRIPPED_S: Final = 0.3
 STILL_RAD_S: Final = 0.02
-OPENING: Final = 0.6  # share of full spool: the pin keeps up with the tips
+OPENING: Final = 0.6  # share of full spool at which the pin follows the tips
 LOOK_AHEAD_RAD: Final = (0.0, 0.05, 0.10, 0.15)
 RELEASED_RAD: Final = 0.45  # tips clear of the load, not yet at the stakes
 
 
 class Driver:
-    """Moves one World; every method steps the physics until its motion is over."""
+    """Moves one World; every method advances the physics until its motion is over."""
 
     def __init__(self, world: World, each_step: Callable[[], None] | None = None) -> None:
         self.world = world
@@ -60,12 +60,12 @@ class Driver:
             self._each_step()
 
     def wait(self, seconds: float) -> None:
-        """Hold the reference."""
+        """Hold the reference for a time."""
         for _ in range(round(seconds / STEP_S)):
             self.tick({})
 
     def rest(self, seconds: float) -> None:
-        """Every spool neutral: the cylinders are shut."""
+        """Keep every spool neutral for a time: the cylinders are closed."""
         neutral = [0.0] * len(self.world.functions)
         for _ in range(round(seconds / STEP_S)):
             self.world.step(neutral)
@@ -97,7 +97,11 @@ class Driver:
         return dict(zip(ARM, (*inverse(self._kin, self._limits, *pin, ext_m), ext_m), strict=True))
 
     def extension_for(self, x: float, y: float, low_m: float, high_m: float) -> float:
-        """A telescope position [m] that serves the whole vertical line; raises ``Unreachable``."""
+        """A telescope position [m] that reaches the whole vertical line.
+
+        Raises:
+            Unreachable: there is none.
+        """
         spans = [reachable_extensions(self.world.profile, x, y, z) for z in (low_m, (low_m + high_m) / 2, high_m)]
         common = [(max(a[0], b[0], c[0]), min(a[1], b[1], c[1])) for a in spans[0] for b in spans[1] for c in spans[2]]
         least, most = max(common, key=lambda span: span[1] - span[0], default=(0.0, -1.0))
@@ -108,7 +112,7 @@ class Driver:
         return min(max(wish, least + margin), most - margin)
 
     def log_yaw(self) -> float:
-        """Direction [rad] of a log that the grapple holds squarely, by the present reference."""
+        """Direction [rad] of a log that the grapple holds squarely at the present reference."""
         q = [self.reference[name] for name in DRIVEN]
         return grapple_yaw(self.world.profile, q) - math.pi / 2
 
@@ -140,8 +144,8 @@ class Driver:
     def place(self, x: float, y: float, log_yaw: float, floor_m: float, carry_m: float) -> None:
         """Carry to (x, y), turn the load to ``log_yaw``, set it down, open and go up again.
 
-        The tips stay ``floor_m`` high: closed ones are lowered until then, and while they open and sweep lower the
-        pin rises, so the load is laid down and not dropped.
+        The tips stay ``floor_m`` above the base: closed tips are lowered to this height, and while they open and sweep
+        lower the pin rises, so that the load is laid down and not dropped.
         """
         tongs = self.world.profile.grapple.tongs
         low = floor_m + tip_below_pin_m(tongs, self.world.jaw_angle_rad)
@@ -169,7 +173,7 @@ class Driver:
         return z
 
     def _close_while_raising(self, x: float, y: float, z: float, floor: float, ext: float) -> float:
-        """Close until the tongs stand still on a load; the tips sweep lower, so the pin rises meanwhile."""
+        """Close until the jaws stop on a load; the tips sweep lower, so the pin rises meanwhile."""
         world, tongs = self.world, self.world.profile.grapple.tongs
         self.grapple = -0.7
         still_s = 0.0
@@ -192,5 +196,5 @@ class Driver:
 
 
 def _minimum_jerk(t: float, duration_s: float) -> tuple[float, float]:
-    """Share of the way and its rate [1/s] at the share ``t`` of the time."""
+    """Progress and its rate [1/s] at the share ``t`` of the time."""
     return t**3 * (10 - 15 * t + 6 * t * t), 30 * t * t * (1 - t) ** 2 / duration_s

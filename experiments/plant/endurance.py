@@ -1,8 +1,8 @@
-"""An hour of work, and the same trial twice in two processes.
+"""One hour of continuous work, and the same trial in two processes.
 
-``shift``: the crane takes a log, lays it down somewhere else in the pick area and goes home, again and again.
-Reported: not-a-numbers, growth of the process's memory, drift of the tip at home, share of cycles that moved the log.
-``fingerprint``: a hash over everything that moves in one grasp.
+``shift``: the crane takes a log, lays it down elsewhere in the pick area and returns home, repeatedly.  Metrics: values
+that are not finite, growth of memory, drift of the tip at home, share of cycles that moved the log.  ``fingerprint``: a
+hash over everything that moves in one grasp.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from machine.geometry.kinematics import Unreachable
 from sim.world import STEP_S, World
 
 PAGE_BYTES: Final = 4096
-WARM_CYCLES: Final = 3  # before memory and drift are compared
+WARM_CYCLES: Final = 3  # cycles before memory and drift are compared
 LAY_DOWN_M: Final = 0.06
 
 
@@ -76,7 +76,7 @@ def shift(job: Job) -> dict[str, Any]:
 
 
 def _lay_down(world: World, driver: Driver, rng: random.Random) -> None:
-    """Put what hangs down somewhere in the pick area, its axis anyhow."""
+    """Lay the load down at a random place of the pick area in a random direction."""
     space, tongs = world.profile.workspace, world.profile.grapple.tongs
     tips = lowest_tip_below_pin_m(tongs)
     while True:
@@ -92,7 +92,7 @@ def _lay_down(world: World, driver: Driver, rng: random.Random) -> None:
 
 
 def _finite(world: World) -> bool:
-    """Whether every joint, speed, pressure and log position is a number."""
+    """Whether every joint, speed, pressure and log position is finite."""
     values = [*world.q.values(), *world.qd.values(), world.hydraulics.energy_j]
     values += [v for pair in world.hydraulics.pressures_pa.values() for v in pair]
     values += [v for log in world.log_bodies.states() for v in (*log.position_m, log.speed_m_s)]

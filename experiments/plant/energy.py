@@ -1,4 +1,4 @@
-"""Energy is never created: machine left alone, logs falling on a heap, pump against lifted load; and logs at rest."""
+"""Energy balance: the undisturbed machine, falling logs, pump against lifted load; and logs at rest."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ EVERY: Final = 4
 WINDOW_S: Final = 2.0  # longer than the slowest swing
 RAISE_RAD: Final = 0.2
 FALL_M: Final = 0.6
-NOISE_J: Final = 0.05  # windows with less motion than this are at rest
+NOISE_J: Final = 0.05  # windows with less kinetic energy are at rest
 
 
 def left_alone(job: Job) -> dict[str, Any]:
-    """Slew, lift and extend at full spool, shut everything: the kinetic energy's peaks must fall from then on."""
+    """Slew, lift and extend at full spool, then close all spools: the peaks of the kinetic energy must decrease."""
     o = job.options
     with trial_world(o["profile"], o["truth"], job.seed, home=home_at(o["profile"], 4.5, 0.6, 0.5)) as world:
         spools = [{"slew": 1.0, "lift": 1.0, "ext": 1.0}.get(f, 0.0) for f in world.functions]
@@ -62,7 +62,7 @@ def _kinetic(mass: float, principal: Any, turn: Any, linear: Any, angular: Any, 
 
 
 def falling(job: Job) -> dict[str, Any]:
-    """Let a pile of logs fall from a height: kinetic and potential energy together may only shrink."""
+    """Drop a pile of logs: the sum of kinetic and potential energy may only decrease."""
     o = job.options
     with trial_world(o["profile"], o["truth"], job.seed, "pile", 4) as world:
         p = world.client
@@ -94,9 +94,9 @@ def _logs_energy(world: World) -> float:
 
 
 def lifting(job: Job) -> dict[str, Any]:
-    """Raise a grasped log with the boom: what the pump gives against what machine and log gain in height.
+    """Raise a grasped log with the boom: pump energy against the potential energy gained by machine and log.
 
-    The oil's own account: pump = work on the joints + losses + what the chambers store.
+    Energy balance of the oil: pump = work on the joints + losses + energy stored in the chambers.
     """
     o = job.options
     with trial_world(o["profile"], o["truth"], job.seed, "single", 1) as world:
@@ -131,23 +131,23 @@ def _potential_j(world: World) -> float:
 
 
 def resting(job: Job) -> dict[str, Any]:
-    """Logs left alone for a minute, as the plant has them (woken, they may fall asleep again) and kept awake."""
+    """Undisturbed logs for one minute: woken, when they may fall asleep again, and then kept awake."""
     o = job.options
     metrics, traces = {}, {}
     with trial_world(o["profile"], o["truth"], job.seed, o["scene"], o["logs"]) as world:
-        p, yard = world.client, world.log_bodies
-        yard.wake()
+        p, bodies = world.client, world.log_bodies
+        bodies.wake()
         for name in ("", "awake_"):
             if name:
-                for log in yard.logs:
+                for log in bodies.body_ids:
                     p.changeDynamics(log, -1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING)
-            start, trace = [log.position_m for log in yard.states()], []
+            start, trace = [log.position_m for log in bodies.states()], []
             for _ in range(round((6.0 if o["quick"] else 60.0) / STEP_S / EVERY)):
                 step_neutral(world, EVERY)
-                trace.append(max(log.speed_m_s for log in yard.states()))
+                trace.append(max(log.speed_m_s for log in bodies.states()))
             metrics[f"{name}fastest_m_s"] = max(trace)
             metrics[f"{name}moved_m"] = max(
-                math.dist(a, log.position_m) for a, log in zip(start, yard.states(), strict=True)
+                math.dist(a, log.position_m) for a, log in zip(start, bodies.states(), strict=True)
             )
             traces[f"{name}speed_m_s"] = [float(f"{v:.4g}") for v in trace[::25]]
     return {"metrics": metrics, "traces": {**traces, "step_s": 25 * EVERY * STEP_S}}

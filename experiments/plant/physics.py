@@ -1,7 +1,7 @@
-"""The crane against closed-form answers: sag, ringing, pressures, pendulum, pump sharing, cylinder spring.
+"""The crane compared with closed-form solutions: sag, ringing, pressures, pendulum, pump sharing, cylinder spring.
 
-Every function takes a Job (options: profile, truth, quick) and returns ``{"metrics": ..., "traces": ...}``; traces are
-what the plots show.  Sag and ringing are of the true hanger pin; nothing here uses the controller.
+Every function takes a Job (options: profile, truth, quick) and returns ``{"metrics": ..., "traces": ...}``; the plots
+show the traces.  Sag and ringing are those of the true hanger pin; the controller is not involved.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ Outcome = dict[str, Any]
 
 
 def sag(job: Job) -> Outcome:
-    """Hang 0 to 250 kg on the hook at 6 m, every spool shut; what the tip does and what the encoders say it does.
+    """Hang 0 to 250 kg on the hook at 6 m with every spool closed: sag of the true tip and of the tip by encoders.
 
-    The same run gives the holding pressure of the lift cylinder and what statics asks for.
+    The same run gives the holding pressure of the lift cylinder and the force required by statics.
     """
     o = job.options
     rows = []
@@ -80,7 +80,7 @@ def sag(job: Job) -> Outcome:
 
 
 def _standing(world: World) -> dict[str, float]:
-    """Averages over one second of standing still."""
+    """Averages over one second at rest."""
     neutral = [0.0] * len(world.functions)
     lift = world.truth.functions["lift"].cylinder
     rows = []
@@ -113,7 +113,7 @@ def _lift_moment(world: World) -> float:
 
 
 def boom_stop(job: Job) -> Outcome:
-    """Raise the boom at 60 % of full spool, shut it at once, and watch the tip ring."""
+    """Raise the boom at 60 % of full spool, close the spool at once, and record the ringing of the tip."""
     o = job.options
     metrics: dict[str, float] = {}
     traces: dict[str, Any] = {}
@@ -176,7 +176,7 @@ def _against(name: str, seen: Ringing, hz: float, zeta: float) -> dict[str, floa
 
 
 def compound(world: World, hinge: str, links: tuple[str, ...], logs: tuple[int, ...] = ()) -> tuple[float, float]:
-    """Natural frequency [Hz] and inertia [kg m^2] about a hinge of what hangs below it, as it hangs now."""
+    """Natural frequency [Hz] and inertia [kg m^2] about a hinge of the parts below it in their present position."""
     p, body = world.client, world.crane.body
     state = p.getLinkState(body, world.crane.link[hinge], computeForwardKinematics=1)
     axis = np.array(p.getMatrixFromQuaternion(state[5])).reshape(3, 3) @ np.array(
@@ -203,7 +203,7 @@ def compound(world: World, hinge: str, links: tuple[str, ...], logs: tuple[int, 
 def slew_stop(job: Job) -> Outcome:
     """Grasp a thick log, slew, stop: it swings across the reach; period against the compound pendulum with the log.
 
-    The log is thick enough for the tongs to clamp it; a thin one lies loose in the closed tongs and swings by itself.
+    The log is thick enough to be clamped; a thin one lies loose in the closed grapple and swings by itself.
     """
     o = job.options
     x, y = profile_named(o["profile"]).workspace.pick_center_m
@@ -238,11 +238,11 @@ def slew_stop(job: Job) -> Outcome:
 
 
 def sharing(job: Job) -> Outcome:
-    """Full spool on each function alone, then on all of them at once: the pump has to be shared."""
+    """Full spool on each function alone, then on all of them together, which share the pump."""
     o = job.options
     home = home_at(o["profile"], 4.5, 0.4, 0.5)
     joints = profile_named(o["profile"]).joints
-    # Away from the nearer stop, so that no function arrives at it.
+    # Away from the nearer end stop, so that no function reaches it.
     directions = {n: 1.0 if 2.0 * q < joints[n].lower + joints[n].upper else -1.0 for n, q in home.items()}
 
     def speeds(spools: dict[str, float]) -> tuple[dict[str, float], float]:
@@ -279,7 +279,7 @@ def sharing(job: Job) -> Outcome:
 def cylinder_spring(job: Job) -> Outcome:
     """The lift cylinder alone, spool shut, against an inertia on its joint: frequency of the oil spring.
 
-    Friction and damping orifices are taken away, so that nothing but the oil is left.
+    Friction and damping orifices are removed, so that only the oil remains.
     Closed form: w^2 = beta r^2 (AA^2 / VA + AB^2 / VB) / I.
     """
     o = job.options

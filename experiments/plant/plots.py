@@ -1,8 +1,9 @@
-"""The plots of the plant experiment, one function per picture."""
+"""Plots of the plant experiment, one function per plot."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,7 +22,7 @@ RATES: Final = (
 
 
 def draw(metrics: Metrics, traces: dict[str, Any], out: Path) -> None:
-    """Every picture into ``out``."""
+    """Write every plot into ``out``."""
     _grasps(metrics, out / "grasps.png")
     _grasp_quality(traces["good"], out / "grasp-quality.png")
     _sag(traces["sag"], out / "sag.png")
@@ -37,7 +38,7 @@ def draw(metrics: Metrics, traces: dict[str, Any], out: Path) -> None:
     _cost(traces["step_ms"], out / "cost.png")
 
 
-def _time(values: list[float], step_s: float) -> np.ndarray:
+def _time(values: Sequence[float] | np.ndarray, step_s: float) -> np.ndarray:
     return np.arange(len(values)) * step_s
 
 
@@ -66,11 +67,11 @@ def _grasp_quality(good: list[list[float]], path: Path) -> None:
         rows = np.array(good) if good else np.zeros((0, 4))
         left.hist(1e3 * rows[:, 0], bins=np.linspace(0, 6, 25), color=OIL)
         left.axvline(5.0, color=RUST, ls="--", lw=0.8)
-        left.set_xlabel("deepest tong in a log [mm]")
+        left.set_xlabel("deepest penetration of a jaw [mm]")
         left.set_ylabel("good grasps")
         middle.hist(rows[:, 1], bins=np.linspace(0, 4, 25), color=TIMBER)
         middle.axvline(3.0, color=RUST, ls="--", lw=0.8)
-        middle.set_xlabel("fastest end or middle of a log [m/s]")
+        middle.set_xlabel("highest speed of a log [m/s]")
         right.plot(rows[:, 2], rows[:, 3], "o", ms=3, color=MOSS)
         top = max(10.0, *rows[:, 2:].max(axis=0)) if len(rows) else 10.0
         right.plot([0, top], [0, top], color=STEEL, lw=0.8)
@@ -85,7 +86,7 @@ def _sag(rows: list[dict[str, float]], path: Path) -> None:
     load = [r["load_kg"] for r in rows]
     with sheet(path, 2) as (left, right):
         left.plot(load, [1e3 * r["sag_m"] for r in rows], "o-", label="sag of the true tip")
-        left.plot(load, [1e3 * r["encoder_drop_m"] for r in rows], "s-", label="drop the encoders see")
+        left.plot(load, [1e3 * r["encoder_drop_m"] for r in rows], "s-", label="drop shown by encoders")
         left.plot([250, 250], [80, 120], color=RUST, lw=5, alpha=0.3, solid_capstyle="butt", label="80 to 120 mm")
         left.set_xlabel("load on the hook at 6 m [kg]")
         left.set_ylabel("[mm]")
@@ -203,9 +204,9 @@ def _energy(traces: dict[str, Any], path: Path) -> None:
     with sheet(path, 2) as (left, right):
         kinetic = np.maximum(traces["kinetic_j"], 1e-6)
         left.semilogy(_time(kinetic, traces["kinetic_step_s"]), kinetic)
-        left.set_xlabel("time after everything is shut [s]")
+        left.set_xlabel("time after all spools are closed [s]")
         left.set_ylabel("kinetic energy [J]")
-        left.set_title("Machine left alone")
+        left.set_title("Undisturbed machine")
         falling = np.array(traces["falling_j"])
         right.plot(_time(falling, traces["falling_step_s"]), falling, color=TIMBER)
         right.set_xlabel("time [s]")

@@ -1,4 +1,4 @@
-"""The carrier against closed-form answers: turning radius, weight on the wheels, a braking stop that swings the load.
+"""The carrier compared with closed-form solutions: turning radius, weight on the wheels, swing after braking.
 
 Options as in ``physics``; the profile is one with a carrier.
 """
@@ -25,7 +25,7 @@ TURN_M: Final = 16.0
 
 
 def _steer(world: World, target_rad: float) -> list[float]:
-    """Spools that bring the articulation to an angle, everything else shut."""
+    """Spools that bring the articulation to an angle, all others closed."""
     carrier = world.profile.carrier
     assert carrier is not None
     valve = carrier.steer_valve

@@ -1,4 +1,4 @@
-"""Reading a decaying oscillation: frequency from its zero crossings, damping from its peaks."""
+"""Analysis of a decaying oscillation: frequency from zero crossings, damping from peaks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 
 class Ringing(NamedTuple):
-    """Frequency [Hz], damping ratio, first peak to peak in the signal's unit, number of half swings seen."""
+    """Frequency [Hz], damping ratio, first peak-to-peak value in the unit of the signal, number of half swings."""
 
     hz: float
     zeta: float
@@ -20,7 +20,7 @@ class Ringing(NamedTuple):
 def ringing(values: Sequence[float], step_s: float, floor: float, rest: float | None = None) -> Ringing:
     """The oscillation of ``values`` about ``rest`` (default: the mean of the last quarter).
 
-    Half swings smaller than ``floor`` and all after them are left out.  Fewer than three half swings: all NaN.
+    Half swings smaller than ``floor`` and all later ones are ignored.  Fewer than three half swings: all NaN.
     """
     tail = values[3 * len(values) // 4 :]
     middle = sum(tail) / len(tail) if rest is None else rest

@@ -1,4 +1,4 @@
-"""One grasp trial: fresh logs, an aim with noise, pick, perhaps unload into the bunk; judged by the plant's truth."""
+"""One grasp trial: new logs, an aim with noise, pick, optionally unload into the bunk; by the plant's ground truth."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from sim.world import STEP_S, World
 AIM_M: Final = 0.04
 AIM_RAD: Final = math.radians(4.0)
 HOVER_M: Final = 0.5  # tips over the ground before the descent
-SHOWN_M: Final = 1.0  # tips over the ground after it: higher than a log must hang to count as lifted
+LIFT_HEIGHT_M: Final = 1.0  # tips over the ground after the lift: higher than the criterion for a lifted log
 WEIGH_S: Final = 0.5
-UNLOADED_S: Final = 20  # a crooked log may rock that long before it lies still
+UNLOADED_S: Final = 20  # a crooked log may rock this long
 OVER_STAKES_M: Final = 0.15
 OVER_FLOOR_M: Final = 0.05
 
@@ -35,7 +35,7 @@ def grasp(job: Job) -> dict[str, Any]:
     """
     o = job.options
     with trial_world(o["profile"], o["truth"], job.seed, o["scene"], o["logs"]) as world:
-        evaluator, fastest = Evaluator(world), Fastest(world)
+        evaluator, fastest = Evaluator(world), TopSpeed(world)
 
         def watch() -> None:
             evaluator.watch()
@@ -50,7 +50,7 @@ def grasp(job: Job) -> dict[str, Any]:
             driver.tick({})
             weighed.append(world.load_kg())
         after = evaluator.evaluate()
-        # Also the top log of a pile, which the grapple itself does not touch.
+        # This includes the top log of a pile, which the grapple does not touch.
         held = [
             log.position_m[2] - world.terrain.height(*log.position_m[:2]) > LIFTED_M
             for log in world.log_bodies.states()
@@ -82,19 +82,19 @@ def grasp(job: Job) -> dict[str, Any]:
         return outcome
 
 
-class Fastest:
-    """The greatest speed of a log's middle or ends so far [m/s]; the judge's own is a bound that adds the spin."""
+class TopSpeed:
+    """Highest speed of the middle or an end of a log so far [m/s]; the evaluator's own value is an upper bound."""
 
     def __init__(self, world: World) -> None:
         self._world, self._steps, self.m_s = world, 0, 0.0
 
     def watch(self) -> None:
-        """Once per physics step; looks at every fourth."""
+        """Sample the speeds; called in every physics step, evaluates every fourth."""
         self._steps += 1
         if self._steps % 4:
             return
-        p, yard = self._world.client, self._world.yard
-        for body, spec in zip(yard.logs, yard.scene, strict=True):
+        p, bodies = self._world.client, self._world.log_bodies
+        for body, spec in zip(bodies.body_ids, bodies.scene, strict=True):
             v, w = p.getBaseVelocity(body)
             if v == w == (0.0, 0.0, 0.0):
                 continue
@@ -114,26 +114,26 @@ def take(
     lift_to_m: float | None = None,
     logs: Sequence[LogState] | None = None,
 ) -> None:
-    """Grasp at the middle of the logs (default: all) and lift; ``Unreachable`` when nothing serves.
+    """Grasp at the middle of the logs (default: all) and lift.
 
     The aim is off by ``across_m``, ``turned_rad`` and the noise of ``rng`` (None: no noise).
     """
     tips = lowest_tip_below_pin_m(world.profile.grapple.tongs)
     x, y, yaw, ground = _aim(world, driver, rng, across_m, logs or world.log_bodies.states())
-    top = ground + SHOWN_M + tips if lift_to_m is None else lift_to_m
+    top = ground + LIFT_HEIGHT_M + tips if lift_to_m is None else lift_to_m
     driver.pick(x, y, yaw + turned_rad, ground + HOVER_M + tips, ground, top)
 
 
 def over_stakes_m(world: World) -> float:
-    """Height of the pin [m] at which the load passes over the stakes."""
+    """Height of the pin [m] at which a load clears the stakes."""
     bunk = world.profile.bunk
     return bunk.floor_z_m + bunk.stake_height_m + OVER_STAKES_M + lowest_tip_below_pin_m(world.profile.grapple.tongs)
 
 
 def unload(world: World, driver: Driver, logs: Sequence[LogState]) -> None:
-    """Lay the logs that hang in the grapple into the middle of the bunk, along it.
+    """Lay the logs that hang in the grapple lengthwise into the middle of the bunk.
 
-    As an operator does, it looks once how they hang: a thin log may lie askew in the closed tongs.
+    Like an operator, it uses one view of how they hang: a thin log may lie askew in the closed grapple.
     """
     bunk = world.profile.bunk
     x, y, yaw = _middle(world, logs)
@@ -151,7 +151,7 @@ def _middle(world: World, logs: Sequence[LogState]) -> tuple[float, float, float
     """Middle (x, y) [m] and direction [rad] of logs in the base frame."""
     centre = [sum(log.position_m[i] for log in logs) / len(logs) for i in range(3)]
     x, y, _ = to_base(world, centre)
-    # An axis counts modulo pi: average the doubled angles.
+    # An axis is defined modulo pi: average the doubled angles.
     doubled = [2.0 * yaw_in_base(world, log.axis) for log in logs]
     return x, y, math.atan2(sum(map(math.sin, doubled)), sum(map(math.cos, doubled))) / 2.0
 
@@ -159,7 +159,11 @@ def _middle(world: World, logs: Sequence[LogState]) -> tuple[float, float, float
 def _aim(
     world: World, driver: Driver, rng: random.Random | None, across_m: float, logs: Sequence[LogState]
 ) -> tuple[float, float, float, float]:
-    """Where to grasp in the base frame: x, y, yaw across which to close, height of the ground; noise included."""
+    """Grasp target in the base frame with noise: x, y, direction of the logs, height of the ground.
+
+    Raises:
+        Unreachable: the crane reaches neither side of the logs.
+    """
     x, y, yaw = _middle(world, logs)
     spot = [sum(log.position_m[i] for log in logs) / len(logs) for i in range(2)]
     ground = to_base(world, (*spot, world.terrain.height(*spot)))[2]
@@ -171,7 +175,7 @@ def _aim(
     for offset in (side, -side):
         at = (x - offset * math.sin(yaw) + noise[0], y + offset * math.cos(yaw) + noise[1])
         try:
-            driver.extension_for(*at, ground + tips, ground + SHOWN_M + tips)
+            driver.extension_for(*at, ground + tips, ground + LIFT_HEIGHT_M + tips)
         except Unreachable:
             continue
         return (*at, yaw + noise[2], ground)

@@ -88,8 +88,10 @@ def perform(job: Job) -> dict[str, Any]:
     path_name, name, truth = job.kind, job.options["profile"], job.options["truth"]
     with tempfile.TemporaryDirectory() as directory:
         path = profile_path(name)
-        if path_name in ("references", "valves"):
-            path = write_plc_profile(name, path_name, Path(directory))
+        if path_name == "references":
+            path = write_plc_profile(name, "references", Path(directory))
+        elif path_name == "valves":
+            path = write_plc_profile(name, "valves", Path(directory))
         settings, guard = load_settings(path), build_guard(path)
     profile = settings.profile
     if path_name == "can":

@@ -174,9 +174,9 @@ def _unloading(outcomes: Sequence[Mapping[str, Any]], grapple_s: float) -> dict[
 def _span_s(outcome: Mapping[str, Any]) -> float:
     """Time from the first to the last grasp at the landing [s]."""
     some = [g for g in outcome["grasps"] if g["state"] == "UNLOAD" and "end_s" in g]
-    return some[-1]["end_s"] - some[0]["begin_s"] if some else math.nan
+    return float(some[-1]["end_s"] - some[0]["begin_s"]) if some else math.nan
 
 
 def _m3(log: Mapping[str, Any]) -> float:
     length_m, diameter_m = log["size_m"]
-    return 0.25 * math.pi * diameter_m**2 * length_m
+    return float(0.25 * math.pi * diameter_m**2 * length_m)

@@ -51,7 +51,7 @@ def task(kind: str, profile: Profile, truth: str, seed: int, amount: int) -> tup
     build = {"singles": _singles, "piles": _piles, "landing": _bunk}[kind]
     logs, end_m = build(profile, truth, seed, rng, amount)
     way = tuple(Point(*plane.geodetic(front_m + x, 0.0)[:2]) for x in (0.0, end_m))
-    landings = ()
+    landings: tuple[Landing, ...] = ()
     if kind == "landing":
         ahead, left = LANDING_M
         landings = (Landing(Point(*plane.geodetic(front_m + end_m + ahead, left)[:2])),)
@@ -61,7 +61,7 @@ def task(kind: str, profile: Profile, truth: str, seed: int, amount: int) -> tup
 
 def _singles(profile: Profile, truth: str, seed: int, rng: random.Random, amount: int) -> tuple[list[LogSpec], float]:
     """Right and left of the route in turn, up to 25 degrees askew, as on paper B's field."""
-    logs = []
+    logs: list[LogSpec] = []
     for i in range(amount):
         x = profile.carrier.front_axle_m + BEFORE_M + i * SINGLE_APART_M  # type: ignore[union-attr]
         y = (1 if i % 2 else -1) * rng.uniform(*ASIDE_M)
@@ -71,7 +71,7 @@ def _singles(profile: Profile, truth: str, seed: int, rng: random.Random, amount
 
 def _piles(profile: Profile, truth: str, seed: int, rng: random.Random, amount: int) -> tuple[list[LogSpec], float]:
     """Two to six logs each, as paper A's configurations 6, 7 and 10 to 12, right and left in turn."""
-    logs = []
+    logs: list[LogSpec] = []
     for i in range(amount):
         x = profile.carrier.front_axle_m + BEFORE_M + i * PILE_APART_M  # type: ignore[union-attr]
         y = (1 if i % 2 else -1) * PILE_ASIDE_M

@@ -23,7 +23,7 @@ from typing import Final
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused
-from can_dbc.messages.udp_address import udp_address
+from can_dbc.messages.udp_address import address_argument
 from hil.harness.operator import Operator
 from machine.joints import JOINTS
 from machine.loading.profile_file import ProfileError, load_profile, profile_hash
@@ -114,7 +114,7 @@ def main(arguments: list[str] | None = None) -> int:
         prog="python -m experiments.timing.setpoint_source", description="Keep a machine in motion."
     )
     parser.add_argument("--profile", required=True)
-    parser.add_argument("--controller", required=True, type=udp_address, metavar="HOST:PORT")
+    parser.add_argument("--controller", required=True, type=address_argument, metavar="HOST:PORT")
     parser.add_argument("--report-port", required=True, type=int)
     options = parser.parse_args(arguments)
     try:

@@ -131,7 +131,7 @@ def test_the_shipped_gains_keep_their_margins_over_all_machines():
     assert loops.studies(load_profile("palms_471"), SPREAD) == []
 
 
-def test_twice_the_gains_would_not():
+def test_twice_the_gains_lose_their_margins():
     eager = msgspec.structs.replace(CARRIER, heading_kp_1_s=6.0, arm_kp_1_s=5.0)
     made = loops.studies(msgspec.structs.replace(PROFILE, carrier=eager), SPREAD)
     assert {loop.name for loop in made if not loop.holds} == {"heading", "swing arm"}

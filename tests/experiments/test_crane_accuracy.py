@@ -36,7 +36,7 @@ from experiments.crane_accuracy.plan import (
     variants,
     visits,
 )
-from experiments.crane_accuracy.reach_cycles import Part, Rounds
+from experiments.crane_accuracy.reach_cycles import Phase, ReachCycles
 from experiments.crane_accuracy.trial import varied
 from machine.geometry.kinematics import pin_position
 from machine.loading.profile_file import load_profile, profile_hash
@@ -60,7 +60,7 @@ def line(way: float) -> np.ndarray:
     return np.column_stack([way * done, np.zeros(60)])
 
 
-def test_the_shortest_time_of_a_straight_way_is_the_textbooks():
+def test_the_shortest_time_of_a_straight_path_is_the_textbook_value():
     assert minimum_time_s(line(0.5), limits(9.0, 2.0)) == pytest.approx(2.0 * math.sqrt(0.5 / 2.0), rel=1e-3)
     assert minimum_time_s(line(3.0), limits(1.0, 2.0)) == pytest.approx(3.0 / 1.0 + 1.0 / 2.0, rel=1e-3)
     assert minimum_time_s(line(3.0)[:1], limits(1.0, 2.0)) == 0.0
@@ -105,7 +105,9 @@ def trace(error: Callable[[np.ndarray], np.ndarray], shut_from_s: float = 0.0) -
 
 
 def test_a_motion_is_over_when_the_pin_stays_near_its_end():
-    found = measure.figures(trace(lambda t: np.maximum(0.004, 1.0 - t / 4.0)), (1.0, 2.0, 3.0), (1.0, 2.0, 2.99), 5.0)
+    found = measure.motion_metrics(
+        trace(lambda t: np.maximum(0.004, 1.0 - t / 4.0)), (1.0, 2.0, 3.0), (1.0, 2.0, 2.99), 5.0
+    )
     assert found["motion_s"] == pytest.approx(3.92, abs=0.021) and found["arrived_s"] == 5.0
     assert found["encoder_m"] == pytest.approx([0.004, 0.0, 0.0])
     assert found["encoder_to_goal_m"] == pytest.approx([0.004, 0.0, 0.01])
@@ -115,11 +117,13 @@ def test_a_motion_is_over_when_the_pin_stays_near_its_end():
 
 
 def test_a_pin_that_leaves_again_has_not_arrived_before():
-    left = measure.figures(trace(lambda t: np.where((t > 6.0) & (t < 6.5), 0.03, 0.0)), (1.0, 2.0, 3.0), (0,) * 3, 5.0)
+    left = measure.motion_metrics(
+        trace(lambda t: np.where((t > 6.0) & (t < 6.5), 0.03, 0.0)), (1.0, 2.0, 3.0), (0,) * 3, 5.0
+    )
     assert left["motion_s"] == left["arrived_s"] == pytest.approx(6.5, abs=0.021)
     assert left["swing_deg"] == 5.0, "the grapple does not wait for the pin"
-    assert measure.figures(trace(lambda t: 0.0 * t), (1.0, 2.0, 3.0), (0,) * 3, 6.1)["swing_deg"] == 2.0
-    never = measure.figures(trace(lambda t: 0.03 + 0.0 * t, 9.0), (1.0, 2.0, 3.0), (0,) * 3, 5.0)
+    assert measure.motion_metrics(trace(lambda t: 0.0 * t), (1.0, 2.0, 3.0), (0,) * 3, 6.1)["swing_deg"] == 2.0
+    never = measure.motion_metrics(trace(lambda t: 0.03 + 0.0 * t, 9.0), (1.0, 2.0, 3.0), (0,) * 3, 5.0)
     assert never["motion_s"] is None and never["arrived_s"] == 5.0
     assert never["shut"] == pytest.approx(600, abs=1) and never["commands"] == 1000
 
@@ -133,7 +137,7 @@ def test_the_points_are_the_papers():
     assert len(visits(3)) == 12 and sum(v.load_kg > 0.0 for v in visits(3)) == 6
 
 
-def test_a_law_and_the_missing_sag_are_all_that_a_variant_changes():
+def test_a_variant_changes_only_the_law_or_the_sag_model():
     known = msgspec.structs.replace(AORO, sag=Sag(1e-3, 1e-3, 1e-2))
     assert varied(known, OWN) is known and varied(known, UNSHAPED) is known
     assert varied(known, UNCOMPENSATED) == AORO
@@ -209,61 +213,61 @@ class Echo:
         )  # fmt: skip
 
 
-def drive(rounds: Rounds, echo: Echo, seconds: float, from_ns: int = 1_000_000_000) -> int:
+def drive(cycles: ReachCycles, echo: Echo, seconds: float, from_ns: int = 1_000_000_000) -> int:
     now_ns = from_ns
-    while now_ns < from_ns + seconds * 1e9 and not rounds.done:
+    while now_ns < from_ns + seconds * 1e9 and not cycles.done:
         now_ns += TICK_NS
-        echo.hear(rounds.step(now_ns, echo.report(now_ns), ()))
+        echo.hear(cycles.step(now_ns, echo.report(now_ns), ()))
     return now_ns
 
 
-def test_the_planner_goes_there_and_back_and_weighs_what_was_hung_on():
+def test_the_planner_goes_there_and_back_and_weighs_the_load():
     echo, hung = Echo(), []
 
     def hang(load_kg: float) -> None:
-        hung.append((load_kg, rounds.part, pin_position(AORO.kinematics, echo.position)))
+        hung.append((load_kg, cycles.phase, pin_position(AORO.kinematics, echo.position)))
         echo.load_kg = load_kg - 3.0
 
-    rounds = Rounds(AORO, profile_hash(AORO), [Visit(2, 0.0), Visit(0, 200.0)], hang)
-    drive(rounds, echo, 120.0)
-    assert rounds.done and [r.visit.goal for r in rounds.runs] == [2, 0]
-    assert [(load, part) for load, part, _ in hung] == [(200.0, Part.PAUSE)]
+    cycles = ReachCycles(AORO, profile_hash(AORO), [Visit(2, 0.0), Visit(0, 200.0)], hang)
+    drive(cycles, echo, 120.0)
+    assert cycles.done and [r.visit.goal for r in cycles.runs] == [2, 0]
+    assert [(load, phase) for load, phase, _ in hung] == [(200.0, Phase.PAUSE)]
     assert hung[0][2] == pytest.approx((3.0, 0.0, 3.5), abs=1e-6), "at the start, at rest"
-    assert [r.load_kg for r in rounds.runs] == pytest.approx([0.0, 197.0])
-    for run in rounds.runs:
+    assert [r.load_kg for r in cycles.runs] == pytest.approx([0.0, 197.0])
+    for run in cycles.runs:
         assert run.commanded_m == pytest.approx(run.goal_m, abs=1e-6), "no sag is known"
         assert run.begun_ns + run.motion.duration_s * 1e9 == pytest.approx(run.ended_ns, abs=6e7)
         assert run.over_ns - run.ended_ns == pytest.approx(3.5e9, abs=6e7) and not run.failed
-        assert run.motion.at(0.0)[0][:4] == pytest.approx(rounds.runs[0].motion.at(0.0)[0][:4], abs=1e-6)
+        assert run.motion.at(0.0)[0][:4] == pytest.approx(cycles.runs[0].motion.at(0.0)[0][:4], abs=1e-6)
 
 
-def test_the_rest_begins_when_the_pin_stays_near_and_has_an_end():
+def test_the_rest_starts_when_the_pin_stays_near_and_ends():
     echo = Echo()
-    rounds = Rounds(AORO, profile_hash(AORO), [Visit(0, 0.0), Visit(0, 0.0)], lambda kg: None)
+    cycles = ReachCycles(AORO, profile_hash(AORO), [Visit(0, 0.0), Visit(0, 0.0)], lambda kg: None)
     now_ns = 1_000_000_000
     for away_s, rest_s in ((2.0, 5.5), (99.0, 10.0)):
-        while rounds.part is not Part.REST:
-            now_ns = drive(rounds, echo, 0.1, now_ns)
+        while cycles.phase is not Phase.REST:
+            now_ns = drive(cycles, echo, 0.1, now_ns)
         echo.off_rad = 0.02
-        now_ns = drive(rounds, echo, min(away_s, 12.0), now_ns)
+        now_ns = drive(cycles, echo, min(away_s, 12.0), now_ns)
         echo.off_rad = 0.0
-        while rounds.part is Part.REST:
-            now_ns = drive(rounds, echo, 0.1, now_ns)
-        assert rounds.runs[-1].over_ns - rounds.runs[-1].ended_ns == pytest.approx(rest_s * 1e9, abs=2e8)
+        while cycles.phase is Phase.REST:
+            now_ns = drive(cycles, echo, 0.1, now_ns)
+        assert cycles.runs[-1].over_ns - cycles.runs[-1].ended_ns == pytest.approx(rest_s * 1e9, abs=2e8)
 
 
 def test_a_stop_fails_the_motion_and_the_next_one_follows_from_the_start():
     echo = Echo()
-    rounds = Rounds(AORO, profile_hash(AORO), [Visit(1, 0.0), Visit(3, 0.0)], lambda kg: None)
+    cycles = ReachCycles(AORO, profile_hash(AORO), [Visit(1, 0.0), Visit(3, 0.0)], lambda kg: None)
     now_ns = 1_000_000_000
-    while rounds.part is not Part.OUT:
-        now_ns = drive(rounds, echo, 0.5, now_ns)
+    while cycles.phase is not Phase.OUT:
+        now_ns = drive(cycles, echo, 0.5, now_ns)
     echo.mode = Mode.STOP
-    now_ns = drive(rounds, echo, 1.0, now_ns)
-    assert rounds.part is Part.WAIT and rounds.runs[0].failed
+    now_ns = drive(cycles, echo, 1.0, now_ns)
+    assert cycles.phase is Phase.WAIT and cycles.runs[0].failed
     echo.mode = Mode.ARMED
-    drive(rounds, echo, 60.0, now_ns)
-    assert rounds.done and [r.failed for r in rounds.runs] == [True, False]
+    drive(cycles, echo, 60.0, now_ns)
+    assert cycles.done and [r.failed for r in cycles.runs] == [True, False]
 
 
 def test_repetitions_are_those_of_the_profiles_own_law_alone():

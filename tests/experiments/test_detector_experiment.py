@@ -1,14 +1,16 @@
-"""The detector's experiment: its worlds, its figures, its photographs."""
+"""The detector experiment: test worlds, metrics, photographs."""
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 from experiments.common.registry import Options
-from experiments.common.result import judged
-from experiments.common.result_page import page
+from experiments.common.result import make_result
+from experiments.common.result_page import markdown
 from experiments.detector import experiment, photos, trial, worlds
+from experiments.detector.metrics import METRICS, PAPER
 from host.exit_codes import CommandFailed, ExitCode
+from tests.codes import coded
 
 
 @pytest.fixture
@@ -17,14 +19,14 @@ def few_piles(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
-def test_a_test_picture_repeats_and_its_truths_are_its_logs(few_piles):
+def test_a_test_picture_is_reproducible_and_its_masks_are_its_logs(few_piles):
     one = worlds.picture("palms_471", 0, 1)
     two = worlds.picture("palms_471", 0, 1)
     assert np.array_equal(one.rgb, two.rgb) and np.array_equal(one.depth_m, two.depth_m, equal_nan=True)
     assert not np.array_equal(one.mask, worlds.picture("palms_471", 0, 2).mask)
     masks, ignored = one.truths()
     assert masks and all(m.any() for m in masks)
-    assert ignored.tolist() == [np.count_nonzero(m) < worlds.LEAST_PX for m in masks]
+    assert ignored.tolist() == [np.count_nonzero(m) < worlds.MIN_LOG_PX for m in masks]
     assert one.rgb.shape[:2] == one.depth_m.shape == (one.intrinsics.height_px, one.intrinsics.width_px)
 
 
@@ -35,7 +37,7 @@ def outcome(machine, scores, boxes, ignored):
     return {"machine": machine, "ignored": ignored, "pixels": pixels, "found": {"rgbd": found, "parted": whole}}
 
 
-def test_figures_follow_from_what_was_found():
+def test_metrics_follow_from_the_detections():
     outcomes = [
         outcome("palms_471", [0.9, 0.6], [[0.92, 0.0], [0.0, 0.1]], [False, False]),
         outcome("aoro_fc8", [0.8], [[0.96]], [False]),
@@ -49,13 +51,14 @@ def test_figures_follow_from_what_was_found():
     assert metrics["map50_95"] < metrics["map50"]
     assert metrics["parted.map50"] == 1.0 and metrics["parted.map50_95"] == pytest.approx(0.9)
     assert metrics["found_large"] == 1.0 and metrics["found_small"] == 0.0
-    text = page(judged("detector", experiment.FIGURES, metrics, profile="p", seed=1, trials=1,
-                       more={"truth": "nominal"}, paper={"map50": 0.8051}),
-                "t", "i", experiment.SECTIONS)  # fmt: skip
+    result = make_result(
+        "detector", METRICS, metrics, profile="p", seed=1, trials=1, more={"truth": "nominal"}, paper=PAPER
+    )
+    text = markdown(result, experiment.page_of(result, {}))
     assert "**missed**" in text and "80.51%" in text
 
 
-def test_wood_that_is_parted_right_is_as_good_as_the_wood():
+def test_perfectly_separated_wood_is_as_good_as_its_pixels():
     masks = [np.zeros((20, 30), bool) for _ in range(3)]
     masks[0][5:10, :20], masks[1][10:15, :20], masks[2][16:18, 25:28] = True, True, True
     wood = np.zeros((20, 30), bool)
@@ -66,10 +69,10 @@ def test_wood_that_is_parted_right_is_as_good_as_the_wood():
     assert trial.parted(np.any([], axis=0), masks, np.zeros((3, 4)))["boxes"] == []
 
 
-def test_without_weights_it_says_what_to_do(monkeypatch, tmp_path):
+def test_missing_weights_end_the_command(monkeypatch, tmp_path):
     monkeypatch.setattr(trial, "SHIPPED", tmp_path)
     options = Options(seed=1, truth="nominal", profile="palms_471", out=tmp_path)
-    with pytest.raises(CommandFailed, match="timberhand train segmentation") as stop:
+    with pytest.raises(CommandFailed, check=coded("detector.no-weights")) as stop:
         experiment.run(options, Console(quiet=True))
     assert stop.value.exit_code == ExitCode.CONFIGURATION
 

@@ -1,4 +1,4 @@
-"""What every experiment shares: figures and their limits, Wilson intervals, the pool with its checkpoint, the page."""
+"""Shared parts of the experiments: metrics and limits, Wilson intervals, the pool with its checkpoint, the page."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
-from experiments.common.result import Figure, Result, judge, rate, wilson
-from experiments.common.result_page import page
-from experiments.common.trials import check_truth, checkpoint
+from experiments.common.result import ROOT, Metric, Result, evaluate, rate, wilson
+from experiments.common.result_page import Page, Section, markdown
+from experiments.common.trials import LOCKSTEP_SOURCES, SOURCES, check_truth, checkpoint, source_hash
 from experiments.plant.signals import ringing
 from host.exit_codes import CommandFailed
 
 QUIET = Console(quiet=True)
-SPEED = Figure("speed", "How fast", "m/s", "With a watch.", least=2.0, clocked=True)
-SHARE = Figure("share", "How often", "%", "By counting.", most=0.02, scale=100.0)
+SPEED = Metric("speed", "How fast", "m/s", "With a watch.", least=2.0, clocked=True)
+SHARE = Metric("share", "How often", "%", "By counting.", most=0.02, scale=100.0)
 
 
 def square(job: Job) -> dict[str, int]:
@@ -31,7 +31,7 @@ def square(job: Job) -> dict[str, int]:
 
 
 def interrupted(job: Job) -> dict[str, int]:
-    """A trial during which somebody presses Ctrl-C."""
+    """A trial interrupted by Ctrl-C."""
     if job.seed == 3:
         raise KeyboardInterrupt
     return square(job)
@@ -59,15 +59,15 @@ def test_a_wilson_interval_holds_the_rate(n, data):
     assert 0.0 <= low <= hits / n + 1e-12 and hits / n - 1e-12 <= high <= 1.0
 
 
-def test_figures_are_judged_against_their_limits():
-    figures = (SPEED, SHARE)
-    assert judge(figures, {"speed": 2.0, "share": 0.02}, noisy=False) == ((), ())
-    assert judge(figures, {"speed": 1.9, "share": 0.03}, noisy=False) == (("speed", "share"), ())
-    assert judge(figures, {"speed": math.nan}, noisy=False) == (("speed",), ())
+def test_metrics_are_compared_with_their_limits():
+    definitions = (SPEED, SHARE)
+    assert evaluate(definitions, {"speed": 2.0, "share": 0.02}, noisy=False) == ((), ())
+    assert evaluate(definitions, {"speed": 1.9, "share": 0.03}, noisy=False) == (("speed", "share"), ())
+    assert evaluate(definitions, {"speed": math.nan}, noisy=False) == (("speed",), ())
 
 
-def test_a_noisy_host_leaves_only_clocked_figures_open():
-    assert judge((SPEED, SHARE), {"speed": 1.9, "share": 0.03}, noisy=True) == (("share",), ("speed",))
+def test_a_noisy_host_leaves_only_clocked_metrics_inconclusive():
+    assert evaluate((SPEED, SHARE), {"speed": 1.9, "share": 0.03}, noisy=True) == (("share",), ("speed",))
 
 
 def test_no_trials_make_no_rate():
@@ -86,7 +86,7 @@ def test_the_number_of_workers_changes_nothing(tmp_path):
     assert os.getpid() not in {o["process"] for o in two.values()}
 
 
-def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
+def test_an_interrupted_run_continues_where_it_stopped(tmp_path):
     path = tmp_path / "trials.jsonl"
     with pytest.raises(KeyboardInterrupt), Checkpoint(path, "run") as checkpoint:
         pool.run(interrupted, jobs(6), checkpoint, 1, "trials", QUIET)
@@ -99,7 +99,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path):
     assert not path.exists()
 
 
-def test_a_checkpoint_of_another_run_is_not_taken(tmp_path):
+def test_a_checkpoint_of_another_run_is_ignored(tmp_path):
     path = tmp_path / "trials.jsonl"
     first = Checkpoint(path, "one")
     first.add("square/0", 0)
@@ -108,7 +108,7 @@ def test_a_checkpoint_of_another_run_is_not_taken(tmp_path):
     assert Checkpoint(path, "two").done == {}
 
 
-def test_what_was_published_is_gone_on_from_where_nothing_else_is_left(tmp_path):
+def test_a_run_continues_from_published_trials_if_it_has_no_checkpoint(tmp_path):
     path, published = tmp_path / "run" / "trials.jsonl", tmp_path / "docs" / "trials.jsonl.xz"
     with Checkpoint(path, "run", published) as checkpoint:
         checkpoint.add("square/0", 0)
@@ -124,7 +124,7 @@ def test_what_was_published_is_gone_on_from_where_nothing_else_is_left(tmp_path)
     assert Checkpoint(tmp_path / "third.jsonl", "run", published).done == {}
 
 
-def test_a_run_with_another_truth_begins_anew(tmp_path):
+def test_a_run_with_another_truth_starts_anew(tmp_path):
     truth = tmp_path / "truth.toml"
     truth.write_text("a = 1")
     options = Options(seed=1, truth=str(truth), profile="palms_471", out=tmp_path / "run")
@@ -140,12 +140,13 @@ def test_a_run_with_another_truth_begins_anew(tmp_path):
     assert begun().done == {}
 
 
-def test_a_truth_that_is_none_stops_before_any_trial(tmp_path):
-    with pytest.raises(CommandFailed, match=r"none\.toml"):
+def test_an_unusable_truth_stops_before_any_trial(tmp_path):
+    with pytest.raises(CommandFailed) as caught:
         check_truth("palms_471", str(tmp_path / "none.toml"))
+    assert "none.toml" in str(caught.value)
 
 
-def test_an_error_says_which_trial(tmp_path):
+def test_an_error_names_the_trial(tmp_path):
     checkpoint = Checkpoint(tmp_path / "trials.jsonl", "run")
     with pytest.raises(ZeroDivisionError) as caught:
         pool.run(failing, jobs(1), checkpoint, 1, "trials", QUIET)
@@ -162,7 +163,7 @@ def test_a_known_oscillation_is_read_back(hz, zeta):
     assert seen.zeta == pytest.approx(zeta, abs=0.01)
 
 
-def test_what_does_not_oscillate_has_no_frequency():
+def test_a_decay_without_oscillation_has_no_frequency():
     assert math.isnan(ringing([math.exp(-0.01 * i) for i in range(1000)], 0.01, 1e-3).hz)
 
 
@@ -171,18 +172,24 @@ def made(metrics: dict[str, float], missed: tuple[str, ...] = ()) -> Result:
     return Result("thing", "abc", "palms_471", 1, 5, metrics, {"speed": 3.0}, environment, missed=missed)
 
 
-def test_result_json_is_flat_and_holds_no_nan(tmp_path):
+def test_result_json_is_flat_and_without_nan(tmp_path):
     made({"speed": 2.5, "broken": math.nan}).save(tmp_path / "deep" / "result.json")
     document = json.loads((tmp_path / "deep" / "result.json").read_text())
     assert document["metrics"] == {"speed": 2.5, "broken": None}
     assert {"experiment", "commit", "profile", "seed", "trials", "paper", "environment"} <= document.keys()
 
 
-def test_the_page_says_what_was_measured_and_what_was_missed():
-    class Heading:
-        title, text, figures, pictures = "Motion", "It moves.", (SPEED, SHARE), (("a.png", "A picture."),)
-
-    text = page(made({"speed": 2.5, **rate("share", 1, 20)}, ("share",)), "Thing", "About it.", [Heading()])
-    assert "| How fast | 2.5 m/s (paper: 3 m/s) | at least 2 | reached |" in text
+def test_the_page_shows_conclusion_and_plot_first_and_then_the_table():
+    sections = (Section("Motion", "It moves.", (SPEED, SHARE), (("a.png", "A plot."), ("b.png", "Another."))),)
+    page = Page("Thing", ("It moves at {speed} (paper: {paper:speed}).", "Never {missing}."), "About it.", sections)
+    text = markdown(made({"speed": 2.5, **rate("share", 1, 20)}, ("share",)), page)
+    assert "It moves at 2.5 m/s (paper: 3 m/s)." in text and "Never" not in text
+    assert "| How fast | 2.5 m/s (paper: 3 m/s) | at least 2 | met |" in text
     assert "| How often | 5% (0.9 to 23.6, n = 20) | at most 2 | **missed** |" in text
-    assert "![A picture.](results/thing/a.png)" in text
+    places = [text.index(part) for part in ("It moves at", "![A plot.]", "## Method", "| How fast", "![Another.]")]
+    assert places == sorted(places) and text.count("a.png") == 1
+
+
+def test_every_source_of_a_fingerprint_exists_and_a_missing_one_does_not_fail():
+    assert all((ROOT / folder).is_dir() for folder in (*SOURCES, *LOCKSTEP_SOURCES))
+    assert source_hash("moved/elsewhere") == source_hash() != source_hash("controller")

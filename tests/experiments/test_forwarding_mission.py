@@ -1,4 +1,4 @@
-"""The forwarding-mission experiment: its figures on missions whose answers are known, its fields, and one log."""
+"""The forwarding-mission experiment: metrics of missions with known answers, its fields, and one log."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_grasps_of_several_logs_and_grasps_from_the_bunk_are_no_offsets() -> Non
     assert metrics["grasp_offset_mean_m"] == pytest.approx(0.01)
 
 
-def test_a_log_that_was_lost_a_stop_and_a_mission_that_failed_miss_their_limits() -> None:
+def test_a_lost_log_a_stop_and_a_failed_mission_miss_their_limits() -> None:
     bad = outcome(finished=False, stops=2)
     bad["logs"][0] |= {"in_bunk": False, "detected": False}
     metrics = gather({"mission/0": bad, "machine/0": {"profile": None, "failure": "x"}})
@@ -78,34 +78,34 @@ def test_a_log_that_was_lost_a_stop_and_a_mission_that_failed_miss_their_limits(
     assert not limits["grasp_offset_mean_m"].holds(0.09)
 
 
-def test_several_logs_that_are_loaded_from_one_stand_are_one_stop() -> None:
+def test_several_logs_loaded_from_one_place_are_one_stop() -> None:
     stands = [[0.0, 0.0, 1.0], [0.02, 0.0, 30.0], [5.0, 0.0, 60.0], [5.0, 0.01, 90.0], [0.0, 0.0, 120.0]]
     assert gather({"first/ours": outcome() | {"stands": stands}})["stops_mean"] == 3.0
 
 
-def test_paper_b_s_way_is_told_apart() -> None:
+def test_metrics_of_paper_b_have_their_own_prefix() -> None:
     metrics = gather({"first/ours": outcome(), "first/paper-b": outcome(off_m=(0.3, 0.4, 0.0))})
     assert metrics["faithful.grasp_offset_mean_m"] == pytest.approx(0.5)
     assert metrics["grasp_offset_mean_m"] == metrics["first.grasp_offset_mean_m"] == pytest.approx(0.05)
 
 
-def test_the_table_is_the_paper_s_with_a_dash_where_nothing_was_reached_for() -> None:
+def test_the_table_is_like_the_paper_s_with_a_dash_without_a_grasp() -> None:
     ours = outcome()
     ours["grasps"] = ours["grasps"][:2]
     ours["logs"][2]["in_bunk"] = False
     lines = table({"first/ours": ours}).splitlines()
     assert lines[4].startswith("| 1 | 30 | 40 | 0 | 50 | yes | – |")
     assert lines[6].startswith("| 3 | – | – | – | – | **no** |")
-    assert "| mean size | 30 | 40 | 0 | 50 | 2 of 3 |" in lines[7]
+    assert "| mean absolute | 30 | 40 | 0 | 50 | 2 of 3 |" in lines[7]
     assert [row["off_m"] for row in by_log(ours)][2] is None
 
 
-def test_the_paper_s_numbers_fit_together() -> None:
+def test_the_paper_s_numbers_are_consistent() -> None:
     assert len(PAPER_MM) == 23
     assert np.mean(PAPER_MM) == pytest.approx(PAPER_TABLE_MM["distance"], abs=15.0)
 
 
-def test_the_last_try_at_a_log_is_the_one_in_the_table() -> None:
+def test_the_last_grasp_of_a_log_is_in_the_table() -> None:
     again = outcome()
     again["grasps"].append(grasp(0, (0.0, 0.0, 0.02)))
     assert by_log(again)[0]["off_m"] == [0.0, 0.0, 0.02]
@@ -128,7 +128,7 @@ def test_every_mission_has_a_field_of_its_own_and_the_individuals_take_turns() -
     assert not calibrations(OPTIONS, "aoro_fc8", "sampled", 0)
 
 
-def test_a_shuffled_field_can_be_driven_and_is_another_every_time() -> None:
+def test_a_shuffled_field_can_be_driven_and_differs_by_seed() -> None:
     plane = LocalPlane(MISSION.waypoints[0].latitude_deg, MISSION.waypoints[0].longitude_deg)
     seen = set()
     for seed in range(5):
@@ -143,12 +143,12 @@ def test_a_shuffled_field_can_be_driven_and_is_another_every_time() -> None:
     assert len(seen) == 5
 
 
-def test_a_short_mission_has_one_log_on_a_straight_way() -> None:
+def test_a_short_mission_has_one_log_on_a_straight_path() -> None:
     mission = short(MISSION)
     assert len(mission.waypoints) == 2 and len(mission.logs) == mission.options.laps == 1
 
 
-def test_pictures_are_drawn(tmp_path: Path) -> None:
+def test_plots_are_drawn(tmp_path: Path) -> None:
     nothing = outcome(1, path=[], stands=[], grasps=[])
     draw({"first/ours": outcome(), "first/paper-b": outcome(), "mission/0": nothing}, tmp_path)
     draw({"first/ours": nothing}, tmp_path)
@@ -158,7 +158,7 @@ def test_pictures_are_drawn(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.computed
 @pytest.mark.timeout(900)
-def test_a_judged_mission_of_one_log() -> None:
+def test_an_observed_mission_of_one_log() -> None:
     job = trial(SimpleNamespace(seed=1, quick=True), "aoro_fc8", {})[0]
     done = perform(job)
     assert done["finished"] and done["stops"] == 0, done["failure"]

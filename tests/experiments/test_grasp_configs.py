@@ -12,7 +12,7 @@ import pytest
 from autonomy.perception.log_list.observation import LogObservation
 from experiments.common.pool import Job
 from experiments.common.registry import Options
-from experiments.common.result import judged
+from experiments.common.result import make_result
 from experiments.grasp_configs.experiment import (
     MACHINES,
     PAPER_ATTEMPTS,
@@ -22,7 +22,7 @@ from experiments.grasp_configs.experiment import (
     published_ablation,
 )
 from experiments.grasp_configs.grasp_categories import Grip, category, lies_on, lifted
-from experiments.grasp_configs.metrics import FIGURES, SECTIONS, sections
+from experiments.grasp_configs.metrics import METRICS, SECTIONS, sections
 from experiments.grasp_configs.pose_sources import misled
 from experiments.grasp_configs.trial import attempt
 from sim.scenes.arrangements import CONFIGURATIONS
@@ -66,18 +66,18 @@ def test_a_log_that_drags_is_not_lifted_and_one_pushed_onto_another_is_not_eithe
         (6, [state(), state(y=0.1, up=0.18)], [0], CENTRE, False, "NI"),
     ],
 )
-def test_the_papers_words(
+def test_the_papers_categories(
     number: int, before: list[LogState], up: list[int], grip: Grip, wrong: bool, word: str
 ) -> None:
     assert category(number, before, up, grip, wrong) == word
 
 
-def test_what_lies_on_what() -> None:
+def test_which_log_lies_on_which() -> None:
     assert lies_on(state(up=0.2, yaw=1.2), state()) and not lies_on(state(), state(up=0.2, yaw=1.2))
     assert not lies_on(state(y=0.21), state()) and not lies_on(state(y=1.0, up=0.3), state())
 
 
-def test_a_log_that_is_missed_misplaced_or_made_up_misleads() -> None:
+def test_a_missed_misplaced_or_invented_log_misleads() -> None:
     def seen(x: float, y: float, yaw: float = 0.0, diameter: float = 0.2) -> LogObservation:
         return LogObservation(0, (x, y, GROUND + 0.1), (math.cos(yaw), math.sin(yaw), 0.0), 2.6, diameter)
 
@@ -97,7 +97,7 @@ def outcome(number: int, word: str, up: int, plan_ms: float = 10.0) -> dict[str,
     }  # fmt: skip
 
 
-def test_the_metrics_are_those_of_the_judged_pair_and_of_every_pair_by_name() -> None:
+def test_the_evaluated_pair_has_plain_names_and_every_pair_has_a_prefix() -> None:
     found = {}
     for number in CONFIGURATIONS:
         for k in range(6):
@@ -113,20 +113,20 @@ def test_the_metrics_are_those_of_the_judged_pair_and_of_every_pair_by_name() ->
     assert metrics["logs_per_grasp_10_12"] == 5.0 and metrics["all_logs"] == pytest.approx(28 / 30)
     assert metrics["true.cnn.optimal"] == 0.0 and metrics["true.cnn.ni"] == 72.0
     assert metrics["config5.success"] == pytest.approx(5 / 6) and metrics["config12.logs"] == 6.0
-    judged = SECTIONS[0].figures + SECTIONS[1].figures
-    assert {f.name for f in judged} <= metrics.keys()
-    assert [f.name for f in FIGURES if f.name in metrics and not f.holds(metrics[f.name])] == [
+    shown = SECTIONS[0].metrics + SECTIONS[1].metrics
+    assert {f.name for f in shown} <= metrics.keys()
+    assert [f.name for f in METRICS if f.name in metrics and not f.holds(metrics[f.name])] == [
         "success", "success_wilson_low"
     ]  # fmt: skip
 
 
-def test_a_quick_look_keeps_the_published_ablation_and_tells_its_commit(tmp_path: Path) -> None:
+def test_a_quick_run_keeps_the_published_ablation_and_its_commit(tmp_path: Path) -> None:
     pair = ("ours", "search")
     assert published_ablation(None, pair) == published_ablation(tmp_path, pair) == ({}, "")
     metrics = {"success": 0.5, "config1.success": 0.5, "ours.search.success": 0.5, "true.cnn.success": 0.9}
     kept = {"true.cnn.success": 0.9}
     for more, since in (({}, "new"), ({"ablation": "old"}, "old")):
-        saved = judged("grasp-configs", FIGURES, metrics, profile="palms_471", seed=1, trials=1, more=more)
+        saved = make_result("grasp-configs", METRICS, metrics, profile="palms_471", seed=1, trials=1, more=more)
         replace(saved, commit="new").save(tmp_path / "results" / "grasp-configs.json")
         assert published_ablation(tmp_path, pair) == (kept, since)
     assert sections() == SECTIONS and sections("old")[:-1] == SECTIONS[:-1] and "`old`" in sections("old")[-1].text
@@ -139,7 +139,7 @@ def test_every_pair_sees_the_same_scenes_and_the_first_gets_most() -> None:
     assert {(j.options["configuration"], j.seed) for j in jobs if j.options["planner"] == "cnn"} < first
 
 
-def test_after_the_papers_attempts_machines_take_turns_on_scenes_of_their_own() -> None:
+def test_after_the_papers_attempts_machines_alternate_on_their_own_scenes() -> None:
     calibrations = machines_of(OPTIONS, 17)
     assert len(calibrations) == MACHINES and machines_of(OPTIONS, PAPER_ATTEMPTS) == []
     known = {job.name: {"profile": f"text {job.name}"} for job in calibrations}
@@ -155,7 +155,7 @@ def test_after_the_papers_attempts_machines_take_turns_on_scenes_of_their_own() 
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_a_small_pile_comes_up_whole_over_the_bus() -> None:
+def test_a_small_pile_is_lifted_completely_over_the_bus() -> None:
     options = {
         "profile": "palms_471", "truth": "nominal", "configuration": 7, "poses": "true", "planner": "search",
     }  # fmt: skip

@@ -74,7 +74,7 @@ def test_without_data_the_folds_are_skipped_by_name(tmp_path: Path, monkeypatch:
     assert not pictures and not metrics
 
 
-def test_any_folder_in_the_layout_is_judged(tmp_path: Path) -> None:
+def test_any_folder_in_the_layout_is_evaluated(tmp_path: Path) -> None:
     folder = layout(tmp_path / "mine", (100, 500, 501))
     arrays, facts = load(WEIGHTS, PAPER)
     metrics: dict[str, float] = {}
@@ -84,7 +84,7 @@ def test_any_folder_in_the_layout_is_judged(tmp_path: Path) -> None:
     assert metrics["data_trained_on"] == 1
 
 
-def test_a_folder_without_samples_is_a_sentence(tmp_path: Path) -> None:
+def test_a_folder_without_samples_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CommandFailed, match="no Cornell samples") as stopped:
         experiment.run(options(tmp_path, data=tmp_path / "none"), QUIET)
     assert stopped.value.exit_code == ExitCode.CONFIGURATION
@@ -113,7 +113,7 @@ def test_the_shipped_weights_close_across_a_log() -> None:
             assert logs[round(grasp.v_px), round(grasp.u_px)]
 
 
-def test_scenes_are_drawn_alike() -> None:
+def test_scenes_are_reproducible() -> None:
     first, again, other = latency.log_scenes(1, 2), latency.log_scenes(1, 2), latency.log_scenes(2, 2)
     assert all((a[0] == b[0]).all() for a, b in zip(first, again, strict=True))
     assert (first[0][0] != other[0][0]).any()

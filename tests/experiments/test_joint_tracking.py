@@ -12,10 +12,10 @@ from experiments.common.pool import Job
 from experiments.common.registry import Options
 from experiments.joint_tracking import experiment, individuals, motions
 from experiments.joint_tracking.individuals import CORNERS
-from experiments.joint_tracking.metrics import LAWS, sections, table, verdict
+from experiments.joint_tracking.metrics import LAWS, best_laws, sections, table
 from experiments.joint_tracking.testbed import NAMES, Calibration
 from experiments.joint_tracking.trial import _slow, perform
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 
 pytestmark = pytest.mark.computed
 
@@ -29,7 +29,7 @@ def options(tmp_path, **more):
 
 @pytest.mark.parametrize("t", [0.31, 0.8, 1.4, 2.9, 4.1, 4.39])
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_reference_moves_as_fast_as_it_says(t, side):
+def test_the_velocity_of_a_reference_is_its_derivative(t, side):
     for reference, _ in (
         motions.ramp(PALMS, START, "slew", side),
         (motions.legs(START, [(0.3, 4.0, {"slew": side * 0.4, "lift": 0.1})]), 4.3),
@@ -40,7 +40,7 @@ def test_a_reference_moves_as_fast_as_it_says(t, side):
         assert len(now) == len(NAMES)
 
 
-def test_references_stand_before_and_after():
+def test_references_rest_before_and_after():
     reference, over_s = motions.ramp(PALMS, START, "tilt", -1)
     assert reference(0.0) == (START, [0.0] * 5)
     q, v = reference(over_s + 1.0)
@@ -55,13 +55,13 @@ def test_a_calibration_is_near_the_truth_and_repeats():
         deadband_plus, deadband_minus, full_speed_plus, full_speed_minus = 0.14, 0.1, 0.6, 0.4
         delay_s, exponent, hysteresis = 0.1, 1.1, 0.02
 
-    believed = PALMS.joints["slew"].valve
-    found = Calibration(3).valve(believed, True_)
-    assert found == Calibration(3).valve(believed, True_) != Calibration(4).valve(believed, True_)
+    shipped_valve = PALMS.joints["slew"].valve
+    found = Calibration(3).valve(shipped_valve, True_)
+    assert found == Calibration(3).valve(shipped_valve, True_) != Calibration(4).valve(shipped_valve, True_)
     assert found.deadband_plus_pct == pytest.approx(14.0, abs=2.0)
     assert found.full_speed_minus == pytest.approx(0.4, rel=0.1)
     assert found.hysteresis_pct == pytest.approx(2.0, abs=1.0)
-    assert (found.exponent, found.signal, found.flow_plus) == (1.1, believed.signal, believed.flow_plus)
+    assert (found.exponent, found.signal, found.flow_plus) == (1.1, shipped_valve.signal, shipped_valve.flow_plus)
 
 
 def test_every_law_is_tried_on_both_machines_and_the_same_individuals(tmp_path):
@@ -83,7 +83,7 @@ def test_every_law_meets_every_corner_of_twice_the_spread_and_a_quick_run_is_sho
     assert len(experiment.plan(options(tmp_path, quick=True), 1)) < len(jobs) / 4
 
 
-def test_gathering_takes_means_counts_and_the_worst():
+def test_metrics_are_means_counts_and_worst_values():
     outcomes = {
         "palms/pd/shipped/wide/0": {"rest_m": [0.001, 0.003], "diverged": False, "alarms": 1, "trace": {},
                                     "shut_share": 1.0},
@@ -100,7 +100,7 @@ def test_gathering_takes_means_counts_and_the_worst():
     assert metrics["palms_stop_damped_over_plain"] == pytest.approx(0.5)
 
 
-def test_machines_that_never_settle_do_not_pass_for_lack_of_a_figure():
+def test_machines_that_never_settle_miss_the_limit():
     found = experiment.gather(
         {"palms/pd/shipped/wide/0": {"shut_share": math.nan, "unsettled_share": 1.0, "diverged": False}}
     )
@@ -112,11 +112,11 @@ def test_the_table_marks_the_best_law_and_leaves_out_what_was_not_measured():
     metrics |= {f"palms_{law}_calibrated_shut_share": 0.9 + 0.01 * i for i, law in enumerate(LAWS)}
     rows = [line for line in table("palms", metrics).splitlines() if line][2:]
     assert len(rows) == 2 and "| **10** | 20 | 30 | 40 |" in rows[0] and "| **93** |" in rows[1]
-    assert "PD 1, sliding mode 0, super-twisting 0, plain PID 1" in verdict("palms", "pd", metrics)
+    assert "PD 1, sliding mode 0, super-twisting 0, PID baseline 1" in best_laws("palms", "pd", metrics)
 
 
-def test_every_figure_has_its_own_name():
-    shown = [f.name for s in sections({"palms": "pd", "aoro": "sliding_mode"}, {}) for f in s.figures]
+def test_every_metric_has_its_own_name():
+    shown = [f.name for s in sections({"palms": "pd", "aoro": "sliding_mode"}, {}) for f in s.metrics]
     assert len(shown) == len(set(shown)) and all(name.startswith(("palms_", "aoro_")) for name in shown)
 
 
@@ -129,7 +129,7 @@ def test_a_mean_over_a_window_is_the_mean_of_its_values():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["cycle", "pump", "pick_up", "wide", "dip"])
-def test_a_calibrated_machine_rests_near_and_shuts_its_valves(kind):
+def test_a_calibrated_machine_rests_near_and_closes_its_valves(kind):
     law = PALMS.joints["slew"].law.kind
     job = Job("t", kind, 3, {"profile": "palms_471", "truth": "sampled", "law": law, "calibrated": True})
     found = perform(job)
@@ -150,7 +150,7 @@ def test_no_law_diverges_in_the_worst_corner_of_twice_the_spread(law):
 @pytest.mark.slow
 def test_a_law_without_margins_diverges_there(monkeypatch):
     """Five times the budget: the figure can fail."""
-    real = individuals.believed
+    real = individuals.controller_profile
 
     def eager(*given):
         made = real(*given)
@@ -158,19 +158,19 @@ def test_a_law_without_margins_diverges_there(monkeypatch):
                   for n, s in made.joints.items()}  # fmt: skip
         return msgspec.structs.replace(made, joints=joints)
 
-    monkeypatch.setattr(individuals, "believed", eager)
+    monkeypatch.setattr(individuals, "controller_profile", eager)
     what = {"profile": "aoro_fc8", "truth": "sampled", "law": "pd", "calibrated": False, "corner": 7}
     assert perform(Job("t", "corner", 3, what))["diverged"]
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_the_experiment_writes_its_result_pictures_and_page(tmp_path):
+def test_the_experiment_writes_its_result_plots_and_page(tmp_path):
     result = experiment.run(options(tmp_path / "out", quick=True, docs=tmp_path / "docs"), Console(quiet=True))
     document = json.loads((tmp_path / "out" / "result.json").read_text())
     assert document["experiment"] == "joint-tracking" and not result.missed, result.missed
     laws = {n: experiment.own_law(p) for n, p in experiment.machines(options(tmp_path)).items()}
-    shown = [f.name for s in sections(laws, result.metrics) for f in s.figures]
+    shown = [f.name for s in sections(laws, result.metrics) for f in s.metrics]
     own = [name for name in shown if not any(f"_{law}_" in name for law in LAWS if law not in laws.values())]
     assert all(math.isfinite(result.metrics[name]) for name in own) and len(own) > 15
     page = (tmp_path / "docs" / "joint-tracking.md").read_text()

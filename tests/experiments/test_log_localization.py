@@ -48,14 +48,14 @@ def test_medians_are_of_all_logs_and_a_missed_log_counts_as_far_off() -> None:
     assert metrics["faithful.deg90.median_m"] == 0.2 and metrics["axis_median_deg"] == 0.5
 
 
-def test_every_figure_of_the_issue_is_gathered() -> None:
+def test_every_metric_is_computed() -> None:
     metrics = gather({f"approach/{d}/0": {"logs": [row(0.01)]} for d in (0, 45, 90)})
     for prefix in ("", "faithful."):
         for name in ("deg0.median_m", "deg45.median_m", "deg90.median_m", "p95_m", "axis_median_deg",
                      "diameter_median_m", "length_median_m"):  # fmt: skip
             assert math.isfinite(metrics[prefix + name])
     for masks in ("true", "network"):
-        assert {f.name for s in sections(masks) for f in s.figures} <= set(metrics)
+        assert {f.name for s in sections(masks) for f in s.metrics} <= set(metrics)
 
 
 def test_the_explanation_has_the_numbers_of_the_set_up() -> None:
@@ -72,7 +72,7 @@ def test_jobs_are_paired_over_angles_and_named_once() -> None:
     }
 
 
-def test_pictures_are_drawn_from_few_trials(tmp_path: Path) -> None:
+def test_plots_are_drawn_from_few_trials(tmp_path: Path) -> None:
     outcomes = {f"approach/{d}/0": {"logs": [row(0.01), row(math.nan)]} for d in (0, 45, 90)}
     curve = {"ours": [0.01] * len(RANGES_M), "faithful": [0.2] * 5 + [math.nan]}
     draw(outcomes | {"curve/0/0": curve, "curve/90/0": curve}, tmp_path)
@@ -90,9 +90,9 @@ def test_the_site_is_as_paper_b_describes_it_and_the_survey_finds_the_camera() -
         assert heading == pytest.approx(45.0, abs=2.5)
         shot = site.shot(-STOP_M)
         assert np.linalg.norm(shot.view.position_m - first.center_m) == pytest.approx(5.2, abs=0.35)
-        believed = site.believed(shot)
-        assert np.linalg.norm(believed.position_m - shot.view.position_m) < 0.08
-        assert np.abs(believed.rotation - shot.view.rotation).max() < 0.02
+        estimated_pose = site.estimated_pose(shot)
+        assert np.linalg.norm(estimated_pose.position_m - shot.view.position_m) < 0.08
+        assert np.abs(estimated_pose.rotation - shot.view.rotation).max() < 0.02
         frame = site.frame(shot, 1)
         (mask, *_) = true_masks(frame, shot)
         known = np.isfinite(frame.depth_m) & np.isfinite(shot.picture.depth_m) & (shot.picture.depth_m < 7.0)
@@ -109,10 +109,12 @@ def test_the_site_is_as_paper_b_describes_it_and_the_survey_finds_the_camera() -
 @pytest.mark.slow
 @pytest.mark.computed
 @pytest.mark.timeout(600)
-def test_the_command_judges_draws_and_writes_the_page(tmp_path: Path) -> None:
+def test_the_command_evaluates_draws_and_writes_the_page(tmp_path: Path) -> None:
     arguments = ["--quick", "--seed", "3", "--out", str(tmp_path / "out"), "--docs", str(tmp_path / "docs")]
     done = CliRunner().invoke(app, ["experiment", "log-localization", *arguments])
-    missed = isinstance(done.exception, CommandFailed) and done.exception.exit_code is ExitCode.FIGURE_MISSED  # two trials are few
+    missed = (
+        isinstance(done.exception, CommandFailed) and done.exception.exit_code is ExitCode.FIGURE_MISSED
+    )  # two trials are few
     assert done.exit_code == 0 or missed, done.output
     document = json.loads((tmp_path / "out" / "result.json").read_text())
     metrics = document["metrics"]

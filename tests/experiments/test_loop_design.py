@@ -148,7 +148,7 @@ def test_the_shipped_gains_keep_their_margins_over_all_machines(works, name):
 
 
 @pytest.mark.slow
-def test_the_old_gains_would_not(works):
+def test_the_old_gains_lose_their_margins(works):
     """3 1/s on every joint: what the bound of the dead time alone allows."""
     profile = load_profile("palms_471")
     joints = {
@@ -162,7 +162,7 @@ def test_the_old_gains_would_not(works):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_law_keeps_the_margins_with_the_same_budget(works, name, kind):
+def test_every_law_keeps_the_margins_with_the_same_gain(works, name, kind):
     for joint in study(with_law(load_profile(name), kind), works[name]):
         assert joint.holds, (joint.name, joint.phase_deg, joint.gain_db, joint.worst)
 

@@ -1,4 +1,4 @@
-"""The bench of clear ways: scenes in the base frame, and figures that can be told."""
+"""The benchmark of motion planning: scenes in the base frame, and metrics without motions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from experiments.benches.motion import Bench, observed
 from experiments.common.worlds import wood_of
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 from sim.scenes.arrangements import arrangement
 from timberhand.cli import app
 
@@ -25,16 +25,16 @@ def test_the_logs_of_a_scene_lie_in_the_pick_area_on_the_ground(name: str) -> No
         assert 0.0 <= low < 0.05
 
 
-def test_no_motion_is_no_crash() -> None:
-    figures = Bench().metrics()
-    assert figures["motions"] == 0 and figures["cpu_p95_ms"] != figures["cpu_p95_ms"]
+def test_no_motion_gives_empty_metrics() -> None:
+    metrics = Bench().metrics()
+    assert metrics["motions"] == 0 and metrics["cpu_p95_ms"] != metrics["cpu_p95_ms"]
 
 
 @pytest.mark.slow
 @pytest.mark.computed
-def test_the_bench_plans_every_motion_and_none_is_slower_on_the_whole() -> None:
+def test_the_benchmark_plans_every_motion_and_is_faster_on_average() -> None:
     result = CliRunner().invoke(app, ["bench", "motion", "--seeds", "1", "--profile", "aoro_fc8", "--json"])
     assert result.exit_code == 0
-    figures = json.loads(result.stdout)["aoro_fc8"]
-    assert figures["motions"] == 12 and figures["blocked"] == 0
-    assert figures["ours_mean_s"] < figures["travel_mean_s"]
+    metrics = json.loads(result.stdout)["aoro_fc8"]
+    assert metrics["motions"] == 12 and metrics["blocked"] == 0
+    assert metrics["ours_mean_s"] < metrics["travel_mean_s"]

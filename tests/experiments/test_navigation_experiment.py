@@ -69,7 +69,7 @@ def faithful(off_m: float = 0.0, laps: int = LAPS, curve_deg_m: float = 10.0) ->
             "rejected": 0, "seconds": 1.0}  # fmt: skip
 
 
-def test_the_plan_drives_every_start_on_every_ground_both_ways() -> None:
+def test_the_plan_drives_every_start_on_every_ground_by_both_methods() -> None:
     options = SimpleNamespace(seed=3, quick=False)
     jobs = plan(options, "aoro_fc8", "sampled", 2, POINTS)
     assert len(jobs) == len({j.name for j in jobs}) == 2 * 2 * len(GROUNDS) * len(STARTS)
@@ -107,7 +107,7 @@ def test_what_came_before_the_first_bend_does_not_count() -> None:
     assert gather({"ours/flat/0/0": outcome}, POINTS, CARRIER)["lateral_p95_m"] < 2e-3
 
 
-def test_starts_that_come_together_are_near_their_common_path_on_the_last_lap() -> None:
+def test_converging_starts_are_near_their_common_path_on_the_last_lap() -> None:
     outcomes = {f"faithful/flat/0/{k}": faithful(off) for k, off in enumerate((0.0, 0.5, -0.5))}
     metrics = gather(outcomes, POINTS, CARRIER)
     assert metrics["faithful.lateral_p95_m"] < 0.02
@@ -118,7 +118,7 @@ def test_starts_that_come_together_are_near_their_common_path_on_the_last_lap() 
     assert slow["heading_deg_per_m"] < 8.0
 
 
-def test_a_drive_that_did_not_arrive_is_no_path_but_counts() -> None:
+def test_a_drive_that_did_not_arrive_counts_without_a_path() -> None:
     broken = faithful(3.0) | {"arrived": False, "stops": 2}
     outcomes = {"faithful/flat/0/0": faithful(), "faithful/flat/0/1": faithful(), "faithful/flat/0/2": broken}
     metrics = gather(outcomes, POINTS, CARRIER)
@@ -128,7 +128,7 @@ def test_a_drive_that_did_not_arrive_is_no_path_but_counts() -> None:
     assert not limits["arrived"].holds(metrics["arrived"]) and not limits["stops"].holds(2.0)
 
 
-def test_a_drive_that_never_began_is_borne() -> None:
+def test_a_drive_that_never_started_is_handled() -> None:
     nothing = {"rows": [], "begin": [None] * 3, "rest_m": [0.0, 0.0], "arrived": False, "reason": "x", "stops": 1}
     metrics = gather({"ours/flat/0/0": nothing, "faithful/flat/0/0": nothing}, POINTS, CARRIER)
     assert metrics["arrived"] == 0.0 and "lateral_p95_m" not in metrics
@@ -153,7 +153,7 @@ def test_a_first_bend_ends_where_the_path_is_straight_again() -> None:
     assert path.at(end + 0.1)[3] == 0.0 and path.at(end - 0.3)[3] != 0.0
 
 
-def test_pictures_are_drawn(tmp_path: Path) -> None:
+def test_plots_are_drawn(tmp_path: Path) -> None:
     outcomes = {"ours/mud/0/0": ours(0.02, points=POINTS[:2]), "faithful/mud/0/0": faithful()}
     draw(outcomes, POINTS, CARRIER, tmp_path)
     names = {"paths.png", "heading.png", "all.png", "steering.png", "lateral.png"}

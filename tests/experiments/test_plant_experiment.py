@@ -1,4 +1,4 @@
-"""The plant experiment: its plan, its readings, one trial of a kind, and the whole quick run behind the command."""
+"""The plant experiment: plan, evaluation, one trial of each kind, and the complete quick run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from experiments.common.pool import Job
 from experiments.common.registry import EXPERIMENTS, Options, load
 from experiments.plant import endurance, experiment, physics, rolling, trial
-from experiments.plant.metrics import FIGURES, SECTIONS
+from experiments.plant.metrics import METRICS, SECTIONS
 from timberhand.cli import app
 
 pytestmark = pytest.mark.computed
@@ -45,9 +45,9 @@ def test_a_truth_file_of_the_fixed_crane_does_not_reach_the_carrier(tmp_path):
     assert jobs["turning"]["profile"] == "aoro_fc8"
 
 
-def test_figures_have_one_name_each_and_pictures_one_section():
-    assert len({f.name for f in FIGURES}) == len(FIGURES)
-    files = [file for section in SECTIONS for file, _ in section.pictures]
+def test_names_of_metrics_and_files_of_plots_are_unique():
+    assert len({f.name for f in METRICS}) == len(METRICS)
+    files = [file for section in SECTIONS for file, _ in section.plots]
     assert len(set(files)) == len(files)
 
 
@@ -81,7 +81,7 @@ def test_another_seed_is_another_grasp():
     assert first == same != other
 
 
-def test_a_truth_that_is_none_is_one_sentence(tmp_path):
+def test_an_unusable_truth_file_is_named(tmp_path):
     done = CliRunner().invoke(
         app, ["experiment", "plant", "--truth", str(tmp_path / "no.toml"), "--out", str(tmp_path)]
     )
@@ -90,19 +90,19 @@ def test_a_truth_that_is_none_is_one_sentence(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_the_quick_run_reaches_its_figures_and_writes_everything(tmp_path):
+def test_the_quick_run_meets_its_limits_and_writes_everything(tmp_path):
     result = experiment.run(
         options(tmp_path / "out", quick=True, workers=2, docs=tmp_path / "docs"), Console(quiet=True)
     )
-    clocked = {f.name for f in FIGURES if f.clocked}
+    clocked = {f.name for f in METRICS if f.clocked}
     assert set(result.missed) <= clocked
     document = json.loads((tmp_path / "out" / "result.json").read_text())
     assert document["experiment"] == "plant" and document["trials"] == experiment.QUICK_TRIALS
     assert all(isinstance(v, float) for v in document["metrics"].values())
-    assert {f.name for f in FIGURES} <= document["metrics"].keys()
+    assert {f.name for f in METRICS} <= document["metrics"].keys()
     page = (tmp_path / "docs" / "plant.md").read_text()
     for section in SECTIONS:
         assert section.title in page
-        for file, _ in section.pictures:
+        for file, _ in section.plots:
             assert (tmp_path / "docs" / "results" / "plant" / file).stat().st_size > 5000
     assert not (tmp_path / "out" / "trials.jsonl").exists()

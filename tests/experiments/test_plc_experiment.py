@@ -1,4 +1,4 @@
-"""The PLC experiment's figures from plain outcomes."""
+"""Metrics of the PLC experiment from plain outcomes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from experiments.plc import FIGURES, WAYS, gather, slope
+from experiments.plc.metrics import METRICS, PATHS, gather
+from experiments.plc.trial import slope
 
 
 def outcome(success: bool, rests_mm: list[float]) -> dict[str, Any]:
@@ -17,17 +18,17 @@ def outcome(success: bool, rests_mm: list[float]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def test_every_way_has_every_figure_and_a_lost_log_is_a_miss() -> None:
-    trials = {f"{way}-{i}": outcome(way != "valves" or i > 0, [1.0, 2.0 + i]) for way in WAYS for i in range(4)}
+def test_every_path_has_every_metric_and_a_lost_log_misses_the_limit() -> None:
+    trials = {f"{path}-{i}": outcome(path != "valves" or i > 0, [1.0, 2.0 + i]) for path in PATHS for i in range(4)}
     metrics = gather(trials)
-    assert {f.name for f in FIGURES} <= metrics.keys()
+    assert {f.name for f in METRICS} <= metrics.keys()
     assert metrics["can_success"] == 1.0 and metrics["valves_success"] == 0.75 and metrics["can_stops"] == 4.0
     assert (metrics["references_rest_max_mm"], metrics["can_track_mm"]) == (5.0, 10.0)
     assert metrics["valves_command_ms"] == 12.5
-    assert [f.name for f in FIGURES if not f.holds(metrics[f.name])] == ["valves_success"]
+    assert [f.name for f in METRICS if not f.holds(metrics[f.name])] == ["valves_success"]
 
 
-def test_the_age_is_a_slope_so_an_offset_does_not_count() -> None:
+def test_the_age_is_a_slope_so_that_an_offset_does_not_count() -> None:
     speeds = [-0.2, -0.1, 0.0, 0.1, 0.2]
     assert slope(speeds, [0.02 * v + 0.7 for v in speeds]) == pytest.approx(0.02)
     assert math.isnan(slope([1.0, 1.0], [1.0, 2.0]))

@@ -1,4 +1,4 @@
-"""The productivity experiment: its figures on runs whose answers are known, and the work that it sets."""
+"""The productivity experiment: metrics of runs with known answers, and its tasks."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import pytest
 
 from autonomy.missions.validation import problems_of
 from experiments.productivity.experiment import AMOUNTS, QUICK, plan
-from experiments.productivity.metrics import FIGURES, cycles, gather
+from experiments.productivity.metrics import METRICS, cycles, gather
 from experiments.productivity.plots import draw
-from experiments.productivity.tasks import KINDS, work
-from machine.load import load_profile
+from experiments.productivity.tasks import KINDS, task
+from machine.loading.profile_file import load_profile
 
 PROFILE = load_profile("aoro_fc8")
 TONGS_S = 5.0
@@ -44,12 +44,12 @@ def test_logs_and_wood_an_hour() -> None:
     assert metrics["over_shortest"] == pytest.approx(25.0 / 13.0)
 
 
-def test_the_goal_is_an_expert_s_time() -> None:
-    limit = next(f for f in FIGURES if f.name == "cycle_median_s")
+def test_the_limit_is_an_expert_s_time() -> None:
+    limit = next(f for f in METRICS if f.name == "cycle_median_s")
     assert limit.holds(25.0) and not limit.holds(25.1)
 
 
-def test_only_grasps_that_did_what_they_were_to_do_are_cycles() -> None:
+def test_only_successful_grasps_are_cycles() -> None:
     grasps = [grasp(0.0, 20.0), grasp(30.0, 99.0, failure="missed"), grasp(140.0, 90.0, logs=2)]
     grasps.append({"begin_s": 300.0, "state": "COLLECT", "phases": [], "attempts": []})  # cut off by the limit
     metrics = gather({"singles/0": run(grasps)}, TONGS_S)
@@ -57,7 +57,7 @@ def test_only_grasps_that_did_what_they_were_to_do_are_cycles() -> None:
     assert metrics["crane_logs_per_hour"] == pytest.approx(3600.0 * 2 / 209.0)
 
 
-def test_a_pile_counts_whatever_a_grasp_holds() -> None:
+def test_a_pile_counts_all_logs_of_a_grasp() -> None:
     metrics = gather({"piles/0": run([grasp(0.0, 30.0, logs=2), grasp(40.0, 40.0)], logs=3)}, TONGS_S)
     assert metrics["piles.cycle_median_s"] == pytest.approx(35.0)
     assert metrics["piles.logs_per_grasp"] == pytest.approx(1.5)
@@ -77,7 +77,7 @@ def test_phases_fill_a_cycle() -> None:
     assert sum(seconds for _, seconds in one.phases) == pytest.approx(one.seconds) == pytest.approx(20.0)
 
 
-def test_every_kind_of_work_is_in_the_plan() -> None:
+def test_every_task_is_in_the_plan() -> None:
     jobs = plan(SimpleNamespace(seed=1, truth="nominal", quick=False), "aoro_fc8", 2)
     assert len(jobs) == len({job.name for job in jobs}) == 2 * len(AMOUNTS) and set(AMOUNTS) == set(KINDS)
     assert [job.kind for job in plan(SimpleNamespace(seed=1, truth="nominal", quick=True), "aoro_fc8", 1)] == list(
@@ -86,9 +86,9 @@ def test_every_kind_of_work_is_in_the_plan() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_work_can_be_driven_and_its_logs_do_not_touch_the_machine(kind: str) -> None:
-    mission, site = work(kind, PROFILE, "nominal", 3, AMOUNTS[kind])
-    assert not problems_of(mission) and work(kind, PROFILE, "nominal", 3, AMOUNTS[kind])[1] == site
+def test_a_task_can_be_driven_and_its_logs_do_not_touch_the_machine(kind: str) -> None:
+    mission, site = task(kind, PROFILE, "nominal", 3, AMOUNTS[kind])
+    assert not problems_of(mission) and task(kind, PROFILE, "nominal", 3, AMOUNTS[kind])[1] == site
     assert len(site.logs) == {"singles": 12, "piles": 20, "landing": 24}[kind]
     assert bool(mission.landings) == (kind == "landing")
     half = 0.5 * (PROFILE.carrier.track_width_m + PROFILE.carrier.wheel_width_m)
@@ -100,7 +100,7 @@ def test_the_work_can_be_driven_and_its_logs_do_not_touch_the_machine(kind: str)
             assert np.abs(ends).min() - 0.5 * log.diameter_m > half
 
 
-def test_the_picture_is_drawn(tmp_path: Path) -> None:
+def test_the_plot_is_drawn(tmp_path: Path) -> None:
     draw({"singles/0": run([grasp(0.0, 20.0)]), "landing/0": run([grasp(0.0, 9.0, 2, "UNLOAD", "x")])}, 5.0, tmp_path)
     draw({"singles/0": run([])}, 5.0, tmp_path / "none")
     assert (tmp_path / "cycles.png").exists() and (tmp_path / "none" / "cycles.png").exists()

@@ -19,7 +19,7 @@ from timberhand.commands.bench import app
 TICKS = 40
 
 
-def test_the_traffic_is_what_the_controller_hears() -> None:
+def test_the_traffic_is_what_the_controller_receives() -> None:
     """Every message at its cycle time, every value in range, every counter in step."""
     database = load("crane")
     heard = {c.key: c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders}
@@ -42,13 +42,13 @@ def result() -> dict[str, Any]:
     return measure(frames=30, rounds=10)
 
 
-def test_every_path_takes_every_frame(result: dict[str, Any]) -> None:
+def test_every_path_receives_every_frame(result: dict[str, Any]) -> None:
     assert set(result["paths"]) == {"ours", "pythoncan", "wire"}
     assert {"rx_us", "rx_decode_us", "rx_pythoncan_us", "rx_decode_pythoncan_us"} < set(result["metrics"])
     assert all(value > 0 for value in result["metrics"].values())
 
 
-def test_a_path_that_loses_a_frame_is_no_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_that_loses_a_frame_ends_the_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
     take = Traffic.take
     monkeypatch.setattr(Traffic, "take", lambda self, count: take(self, count)[:-1])
     with pytest.raises(CommandFailed, match="13 of 14 frames"):
@@ -57,10 +57,14 @@ def test_a_path_that_loses_a_frame_is_no_measurement(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize(
     ("cost_us", "lab", "code"),
-    [(LIMIT_US, False, ExitCode.OK), (LIMIT_US + 0.1, False, ExitCode.FIGURE_MISSED), (LIMIT_US + 0.1, True, ExitCode.OK)],
+    [
+        (LIMIT_US, False, ExitCode.OK),
+        (LIMIT_US + 0.1, False, ExitCode.FIGURE_MISSED),
+        (LIMIT_US + 0.1, True, ExitCode.OK),
+    ],
 )
 @pytest.mark.parametrize("form", [[], ["--json"]])
-def test_the_verdict(
+def test_the_command_compares_with_its_limit(
     cost_us: float,
     lab: bool,
     code: ExitCode,

@@ -1,4 +1,4 @@
-"""The timing stand's parts without a clock: readings, verdicts, the light machine, the planner, the witness."""
+"""Parts of the timing experiment without a clock: readings, evaluation, frame continuity."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import STAGES, BusCounters, Facts, ProcessCounters
 from experiments.timing import evaluation, experiment, host_activity, reference_loops
 from experiments.timing.continuity import Continuity
-from experiments.timing.host_activity import Meanwhile
-from experiments.timing.measurement import Window, pooled
-from experiments.timing.metrics import FIGURES, SECTIONS
-from experiments.timing.reference_loops import Plain
+from experiments.timing.host_activity import HostActivity
+from experiments.timing.measurement import MeasurementWindow, pooled
+from experiments.timing.metrics import METRICS, SECTIONS
+from experiments.timing.reference_loops import SleepLoopReport
 
 PERIOD_NS = 5_000_000
 
@@ -38,38 +38,40 @@ def facts(ticks: int, missed: int = 0, faults: int = 0, blocks: int = 1000) -> F
 def window(
     late: Sequence[float] = (30.0,),
     theirs: Sequence[float] = (25.0,),
-    plain: Plain | None = None,
+    plain: SleepLoopReport | None = None,
     *,
     ticks: int = 2000,
     at: int = 0,
     missed: int = 0,
     steal_ms: float = 0.0,
     faults: int = 0,
-) -> Window:
-    """``ticks`` wake-ups that go round through ``late``, and as many of cyclictest's."""
+) -> MeasurementWindow:
+    """``ticks`` wake-ups that cycle through ``late``, and as many of cyclictest's."""
     durations = {name: histogram(300.0, times=ticks) for name in STAGES}
     durations["wake"] = histogram(*late, times=max(1, ticks // len(late)))
-    return Window(
+    return MeasurementWindow(
         facts(at),
         facts(at + ticks, missed, faults),
         durations,
         histogram(*theirs, times=max(1, ticks // len(theirs))),
-        plain or Plain(histogram(400.0, times=ticks), 0),
-        Meanwhile(10.0, steal_ms, 0.1, 0.5),
+        plain or SleepLoopReport(histogram(400.0, times=ticks), 0),
+        HostActivity(10.0, steal_ms, 0.1, 0.5),
     )
 
 
-def metrics_of(quiet: list[Window], loaded: list[Window]) -> dict[str, float]:
+def metrics_of(quiet: list[MeasurementWindow], loaded: list[MeasurementWindow]) -> dict[str, float]:
     slow = experiment.Measured(quiet, loaded, ({"clock_nanosleep": 4000, "recvmsg": 8000}, 2000.0), 0, [])
     fast = experiment.Measured(quiet[:1], loaded[:1], None, 0, [])
     return experiment.gather(slow, fast)[0]
 
 
-def test_a_pressure_file_gives_the_time_somebody_waited():
+def test_a_pressure_file_gives_the_waiting_time():
     text = "some avg10=31.01 avg60=14.01 avg300=7.94 total=5137622117\nfull avg10=0.00 total=7\n"
     assert host_activity.pressure_us(text) == 5137622117
     assert host_activity.pressure_us("") is None
-    between = host_activity.between(host_activity.Sample(0, 10.0, 1_000_000, 0.0), host_activity.Sample(2_000_000_000, 40.0, 1_500_000, 3.0))
+    between = host_activity.between(
+        host_activity.Sample(0, 10.0, 1_000_000, 0.0), host_activity.Sample(2_000_000_000, 40.0, 1_500_000, 3.0)
+    )
     assert (between.seconds, between.steal_ms, between.pressure, between.load) == (2.0, 30.0, 0.25, 3.0)
     assert host_activity.between(host_activity.Sample(0, 0, None, 0), host_activity.Sample(1, 0, 5, 0)).pressure is None
 
@@ -88,7 +90,7 @@ def test_the_preemption_model_is_read_from_the_kernel(version, dynamic, model):
 
 
 @pytest.mark.parametrize(("stamp_ns", "period_ns"), [(7_001_234_567, 5_000_000), (12_000_999_999, 1_000_000)])
-def test_cyclictest_wakes_at_a_fixed_distance_from_our_ticks(stamp_ns, period_ns):
+def test_cyclictest_wakes_at_a_fixed_distance_from_the_ticks(stamp_ns, period_ns):
     offset_ns = 1000 * reference_loops.offset_us(stamp_ns, period_ns)
     assert 0 <= offset_ns < period_ns
     distance = (offset_ns - stamp_ns) % period_ns
@@ -103,8 +105,8 @@ def test_cyclictests_report_becomes_a_histogram():
     assert found.quantile_ns(0.5) == 13_000
 
 
-def test_the_plain_loops_words_become_a_histogram():
-    plain = reference_loops.read_plain({"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4})
+def test_the_output_of_the_sleep_loop_becomes_a_histogram():
+    plain = reference_loops.read_sleep_loop({"bins": {"5": 3}, "longest_ns": 5_500, "missed": 4})
     assert plain.lateness.count == 3 and plain.missed == 4
 
 
@@ -136,21 +138,21 @@ def test_a_quantile_lies_inside_its_bin():
     ("made", "is_quiet"),
     [
         (window(), True),
-        (window(theirs=[25.0] * 999 + [1001.0]), False),  # a stall that could have made us miss
+        (window(theirs=[25.0] * 999 + [1001.0]), False),  # a stall that could cause a missed deadline
         (window(theirs=[25.0] * 98 + [260.0] * 2), False),
         (window(steal_ms=60.0), False),
-        (window(late=[25.0] * 999 + [4000.0]), True),  # ours alone is late: that is ours to answer for
+        (window(late=[25.0] * 999 + [4000.0]), True),  # only the controller is late: it counts
     ],
 )
-def test_cyclictest_says_whether_a_window_was_quiet(made, is_quiet):
+def test_cyclictest_decides_whether_a_window_is_quiet(made, is_quiet):
     assert evaluation.quiet(made) is is_quiet
 
 
-def test_only_quiet_windows_are_judged_where_they_are_at_least_half():
+def test_only_quiet_windows_are_compared_if_they_are_at_least_half():
     noisy = window(theirs=[2000.0], at=2000)
     good = window()
-    assert evaluation.chosen([good, noisy]) == ([good], True)
-    assert evaluation.chosen([good, noisy, noisy]) == ([good, noisy, noisy], False)
+    assert evaluation.compared_windows([good, noisy]) == ([good], True)
+    assert evaluation.compared_windows([good, noisy, noisy]) == ([good, noisy, noisy], False)
 
 
 def test_a_ratio_compares_quantiles_and_has_an_interval():
@@ -159,84 +161,82 @@ def test_a_ratio_compares_quantiles_and_has_an_interval():
     assert found["r_low"] <= found["r"] <= found["r_high"]
 
 
-def test_a_long_quiet_run_is_judged_and_a_slow_loop_misses():
+def test_a_long_quiet_run_is_evaluated_and_a_slow_loop_misses_its_limits():
     quiet = [window(late=[60.0], ticks=6000, at=6000 * i) for i in range(20)]
-    loaded = [window(plain=Plain(histogram(9000.0), 500))]
+    loaded = [window(plain=SleepLoopReport(histogram(9000.0), 500))]
     metrics = metrics_of(quiet, loaded)
     assert metrics["host_verdict"] == 1.0 and metrics["judged_cycles"] == 120_000
-    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
+    found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
     assert found.missed == ("wakeup_p50_ratio", "wakeup_p99_ratio")
     assert not {"missed", "page_faults", "missed_loaded_share"} & found.inconclusive.keys()
 
 
-def test_a_noisy_host_never_passes_what_hangs_on_its_clock():
+def test_on_a_noisy_host_clock_metrics_are_inconclusive():
     metrics = metrics_of([window(theirs=[3000.0], late=[3000.0], ticks=6000) for _ in range(20)], [window()])
     assert metrics["host_verdict"] == 0.0 and metrics["wakeup_p50_ratio"] == pytest.approx(1.0, abs=0.01)
-    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
+    found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
     assert {"wakeup_p50_ratio", "wakeup_p99_ratio"} <= found.inconclusive.keys()
     assert found.missed == ()
 
 
-def test_a_short_run_cannot_tell():
+def test_a_short_run_is_inconclusive():
     metrics = metrics_of([window(ticks=600)], [window()])
-    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
+    found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
     open_ = {"wakeup_p50_ratio", "missed", "page_faults", "gc_runs", "tick_cpu_p99_us", "missed_loaded_share"}
     assert open_ <= found.inconclusive.keys() and not found.missed
 
 
-def test_what_does_not_hang_on_the_clock_is_missed_on_any_host():
+def test_metrics_without_the_clock_can_miss_on_any_host():
     metrics = metrics_of([window(theirs=[3000.0], ticks=600, faults=2)], [window()])
-    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
+    found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
     assert "page_faults" in found.missed
 
 
-def test_a_deadline_missed_in_a_quiet_window_is_ours():
+def test_a_deadline_missed_in_a_quiet_window_counts():
     metrics = metrics_of([window(missed=1)], [window()])
-    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
+    found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
     assert "missed" in found.missed
 
 
 @pytest.mark.parametrize(
     ("ours", "plain", "theirs", "outcome"),
     [
-        (0, 500, 25.0, "reached"),
-        (4, 500, 25.0, "reached"),
+        (0, 500, 25.0, "met"),
+        (4, 500, 25.0, "met"),
         (6, 500, 25.0, "missed"),
         (6, 500, 9000.0, "inconclusive"),  # cyclictest missed too
-        (0, 50, 25.0, "inconclusive"),  # too few to tell a hundredth
+        (0, 50, 25.0, "inconclusive"),  # too few to decide one percent
         (0, 0, 25.0, "inconclusive"),
     ],
 )
-def test_missed_deadlines_under_load_are_compared_with_the_plain_loop(ours, plain, theirs, outcome):
-    pressed = window(theirs=[theirs], plain=Plain(histogram(9000.0), plain), missed=ours)
+def test_missed_deadlines_under_load_are_compared_with_the_sleep_loop(ours, plain, theirs, outcome):
+    pressed = window(theirs=[theirs], plain=SleepLoopReport(histogram(9000.0), plain), missed=ours)
     metrics = metrics_of([window()], [pressed])
-    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
+    found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
     name = "missed_loaded_share"
-    assert outcome == (
-        "missed" if name in found.missed else "inconclusive" if name in found.inconclusive else "reached"
-    )
+    assert outcome == ("missed" if name in found.missed else "inconclusive" if name in found.inconclusive else "met")
 
 
-def test_a_figure_without_a_number_is_inconclusive():
+def test_a_metric_without_a_value_is_inconclusive():
     metrics = metrics_of([window()], [window()]) | experiment.system_call_metrics(None)
-    found = evaluation.judge(FIGURES, metrics, evaluation.untold(metrics))
+    found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
     assert "syscalls_per_tick" in found.inconclusive and "syscalls_per_tick" not in found.missed
 
 
-def test_the_names_others_rely_on_are_there():
+def test_all_metric_names_exist():
     metrics = metrics_of([window()], [window()])
-    frames = {"rx_decode_us", "rx_decode_pythoncan_us"}  # of the bus bench
+    frames = {"rx_decode_us", "rx_decode_pythoncan_us"}  # from receive_cost
     assert set(metrics) >= {
         "tick_cpu_p50_us", "tick_cpu_p99_us", "tick1k_cpu_p99_us", "wakeup_p50_ratio", "wakeup_p99_ratio", "missed",
         "missed_loaded", "missed_loaded_plain", "sample_to_command_p99_us", "page_faults", "gc_runs", "host_verdict",
         "missed_1k", "syscalls_per_tick", "voluntary_switches_per_tick", "steal_ms", "cyclictest_p99_us",
     }  # fmt: skip
-    assert {f.name for f in FIGURES} <= set(metrics) | frames | {"stops"}
-    assert len({f.name for f in FIGURES}) == len(FIGURES)
-    assert len({file for s in SECTIONS for file, _ in s.pictures}) == 4
+    assert {f.name for f in METRICS} <= set(metrics) | frames | {"stops"}
+    assert len({f.name for f in METRICS}) == len(METRICS)
+    assert len({file for s in SECTIONS for file, _ in s.plots}) == 4
 
 
-def test_blocks_that_breathe_do_not_grow():
+def test_blocks_that_come_and_go_are_no_growth():
     made = [window(at=2000 * i) for i in range(6)]
     assert evaluation.block_growth(made) == 0
 
@@ -247,9 +247,9 @@ def test_a_lost_frame_is_a_gap_in_the_counter():
     sender, seen = Sender(codec.data_ids), Continuity([database])
     frames = [sender.protect(codec.encode(*(0 for _ in codec.signals))) for _ in range(20)]
     for data in frames[:5] + frames[6:]:
-        seen.take(codec.key, data)
-    seen.take(codec.key, bytes(8))
-    seen.take(0x182, b"\x01\x02")  # an encoder's, unprotected
+        seen.add(codec.key, data)
+    seen.add(codec.key, bytes(8))
+    seen.add(0x182, b"\x01\x02")  # an encoder's, unprotected
     assert (seen.gaps, seen.damaged, seen.frames[codec.key], seen.frames[0x182]) == (1, 1, 20, 1)
 
 
@@ -260,5 +260,5 @@ def test_counters_of_different_messages_are_kept_apart():
     senders = {c.key: Sender(c.data_ids, start) for c, start in ((a, 3), (b, 9))}
     for _ in range(40):
         for codec in (a, b):
-            seen.take(codec.key, senders[codec.key].protect(codec.encode(*(0 for _ in codec.signals))))
+            seen.add(codec.key, senders[codec.key].protect(codec.encode(*(0 for _ in codec.signals))))
     assert seen.gaps == seen.damaged == 0

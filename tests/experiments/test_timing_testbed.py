@@ -1,4 +1,4 @@
-"""The timing stand: its light machine and planner with the real controller in virtual time, its witness, the soak."""
+"""The timing testbed: emulated machine and setpoint source with the real controller in virtual time, observer, soak."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from controller.tick import Inputs
 from experiments.timing import soak
 from experiments.timing.bus_observer import BusObserver
 from experiments.timing.reference_loops import missing_tools
-from experiments.timing.setpoint_source import BEHIND_NS, Planner, Swing
+from experiments.timing.setpoint_source import STAMP_AGE_NS, SetpointSource, Swing
 from host.exit_codes import ExitCode
 from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile
@@ -39,7 +39,7 @@ PALMS = load_profile("palms_471")
 
 
 class Virtual:
-    """Controller, guard, planner, witness and the light machine in one process, in steps of a period."""
+    """Controller, guard, setpoint source, observer and emulated machine in one process, in steps of a period."""
 
     def __init__(self, profile: str, rate_hz: int) -> None:
         settings = settings_of(profile, rate_hz)
@@ -47,11 +47,11 @@ class Virtual:
         self.controller, self.guard = Controller(settings), build(profile_path(profile))
         cycle_ns = min(5_000_000, self.period_ns)
         self.machine = KinematicMachine(settings.profile, 1, step_ns=min(cycle_ns, 2_500_000), cycle_ns=cycle_ns)
-        self.planner = Planner(settings.profile)
-        self.witness = BusObserver(settings.profile, self.period_ns)
+        self.source = SetpointSource(settings.profile)
+        self.observer = BusObserver(settings.profile, self.period_ns)
         self.now_ns, self.guard_ns = START_NS, 0
         self.inputs = Inputs()
-        self.heard: list[tuple[str, Frame]] = []
+        self.received: list[tuple[str, Frame]] = []
         self.for_guard: list[Frame] = []
         self.datagrams: list[bytes] = []
         self.modes: list[tuple[int, int]] = []
@@ -59,12 +59,12 @@ class Virtual:
     def tick(self) -> None:
         self.now_ns += self.period_ns
         crane, machine = self.profile.crane_bus, self.profile.machine_bus
-        sent = self.machine.step(self.now_ns, self.heard)
+        sent = self.machine.step(self.now_ns, self.received)
         inputs = self.inputs
         inputs.frames[:] = [Frame(self.now_ns, key, data) for bus, key, data in sent if bus == crane]
         inputs.machine_frames[:] = [Frame(self.now_ns, key, data) for bus, key, data in sent if bus == machine]
         self.for_guard += inputs.frames
-        self.heard, guarded = [], []
+        self.received, guarded = [], []
         if self.now_ns >= self.guard_ns:
             self.guard_ns = self.now_ns + 5_000_000
             guarded = self.guard.step(self.now_ns, self.for_guard)
@@ -72,22 +72,22 @@ class Virtual:
         inputs.frames += [Frame(self.now_ns, key, data) for key, data in guarded]
         inputs.datagrams[:], self.datagrams = self.datagrams, []
         outputs = step(self.controller, inputs, self.now_ns)
-        self.witness.take(record(inputs, outputs, self.now_ns))
-        self.heard = [(crane, Frame(self.now_ns, *wire)) for wire in (*outputs.frames, outputs.sync, *guarded)]
-        self.heard += [(machine or "", Frame(self.now_ns, *wire)) for wire in outputs.machine_frames]
+        self.observer.add(record(inputs, outputs, self.now_ns))
+        self.received = [(crane, Frame(self.now_ns, *wire)) for wire in (*outputs.frames, outputs.sync, *guarded)]
+        self.received += [(machine or "", Frame(self.now_ns, *wire)) for wire in outputs.machine_frames]
         self.for_guard += [Frame(self.now_ns, *wire) for wire in outputs.frames]
         if outputs.report is not None:
             report = decode(outputs.report)
             assert isinstance(report, StateReport)
             if not self.modes or self.modes[-1][0] != report.mode:
                 self.modes.append((report.mode, report.reason))
-            self.datagrams += [d for d in (self.planner.hear(report),) if d]
+            self.datagrams += [d for d in (self.source.receive(report),) if d]
         if self.now_ns % 50_000_000 < self.period_ns:
-            self.datagrams += [d for d in (self.planner.setpoint(self.now_ns),) if d]
+            self.datagrams += [d for d in (self.source.setpoint(self.now_ns),) if d]
 
 
 @pytest.mark.parametrize(("profile", "rate_hz", "seconds"), [("aoro_fc8", 200, 5.0), ("palms_471", 1000, 4.0)])
-def test_the_light_machine_is_armed_moved_and_never_stopped(profile, rate_hz, seconds):
+def test_the_emulated_machine_is_armed_moves_and_never_stops(profile, rate_hz, seconds):
     bench = Virtual(profile, rate_hz)
     begin = bench.machine.joint_positions()
     for _ in range(round(seconds * rate_hz)):
@@ -95,12 +95,12 @@ def test_the_light_machine_is_armed_moved_and_never_stopped(profile, rate_hz, se
     assert [mode for mode, _ in bench.modes] == [Mode.BOOT, Mode.STANDBY, Mode.ARMED, Mode.ACTIVE]
     moved = [abs(b - a) for a, b in zip(begin, bench.machine.joint_positions(), strict=True)]
     assert min(moved) > 0.005
-    report = bench.planner.report
+    report = bench.source.report
     assert report is not None and report.refused == 0
     for measured, wanted, spec in zip(report.position, report.reference, bench.profile.joints.values(), strict=True):
         if spec.encoder is not None:
             assert measured == pytest.approx(wanted, abs=0.1 * spec.speed_limit)
-    totals = bench.witness.totals()
+    totals = bench.observer.totals()
     assert totals["records"] == seconds * rate_hz
     assert not any(totals[name] for name in ("records_lost", "records_unreadable", "gaps", "damaged", "unanswered"))
 
@@ -136,35 +136,35 @@ def test_a_swing_begins_at_rest_and_stays_within_range_and_speed():
             assert 0.0 < max(abs(v) for _, v in samples) < 0.5 * spec.speed_limit
 
 
-def test_the_planner_says_nothing_to_a_machine_that_is_not_armed():
-    planner = Planner(PALMS)
+def test_no_setpoint_is_sent_to_a_machine_that_is_not_armed():
+    source = SetpointSource(PALMS)
     report = StateReport(
         1, 0, START_NS, Mode.STANDBY, 0, 0, 0, 0, 0, 0, (0.0,) * 5, (0.0,) * 5, (0.1, math.nan, 0.0, 0.5, 0.0),
         1.0, 0.0, 0.0, 0, 0, 0, 0,
     )  # fmt: skip
-    planner.hear(report)
-    assert planner.setpoint(START_NS) is None
-    planner.hear(replace(report, mode=Mode.ARMED))
-    first = decode(planner.setpoint(START_NS) or b"")
-    assert isinstance(first, CraneSetpoint) and first.stamp_ns == START_NS - BEHIND_NS
+    source.receive(report)
+    assert source.setpoint(START_NS) is None
+    source.receive(replace(report, mode=Mode.ARMED))
+    first = decode(source.setpoint(START_NS) or b"")
+    assert isinstance(first, CraneSetpoint) and first.stamp_ns == START_NS - STAMP_AGE_NS
     assert first.knots[0].position == (0.1, 0.0, 0.0, 0.5, 0.0) and first.knots[0].velocity == (0.0,) * 5
 
 
-def test_the_witness_misses_a_record_but_not_a_missed_period():
+def test_the_observer_reports_a_lost_record_but_not_a_missed_period():
     bench = Virtual("palms_471", 200)
     records = []
-    bench.witness.take = records.append  # type: ignore[method-assign]
+    bench.observer.add = records.append  # type: ignore[method-assign]
     for _ in range(400):
         bench.tick()
-    witness = BusObserver(PALMS, 5_000_000)
+    observer = BusObserver(PALMS, 5_000_000)
     for data in records[:100] + records[101:]:
-        witness.take(data)
-    witness.take(records[-1][:-1] + bytes([records[-1][-1] ^ 1]))
-    totals = witness.totals()
+        observer.add(data)
+    observer.add(records[-1][:-1] + bytes([records[-1][-1] ^ 1]))
+    totals = observer.totals()
     assert totals["records_lost"] == 1 and totals["records_unreadable"] == 1 and totals["gaps"] > 0
 
 
-def test_growth_is_what_the_second_half_holds_beyond_the_first():
+def test_growth_compares_the_halves_of_a_run():
     process = ProcessCounters(0, 5, 0, 0, 0, 3, 1000, 0)
     facts = Facts(1, 0, 0, 5_000_000, 0, 0, 0, "ACTIVE", "", (), process, {}, (), ())
 
@@ -179,17 +179,17 @@ def test_growth_is_what_the_second_half_holds_beyond_the_first():
     assert soak.memory(growing)["allocated_blocks_growth"] == 5.0
 
 
-def test_a_machine_kept_still_by_the_host_alone_is_inconclusive():
+def test_a_machine_stopped_by_the_host_alone_is_inconclusive():
     still = dict.fromkeys(soak.LOSSES, 0.0) | {"active_share": 0.2, "ticks": 4000.0, "allocated_blocks_growth": 0.0}
     late = {Reason.ENCODER_LOST, Reason.LOOP_LATE}
     assert "active_share" in soak.undecided(still, late)
     assert not soak.undecided(still, late | {Reason.JOINT_RUNAWAY})  # the laws stopped it
-    assert not soak.undecided(still, set())  # nobody says why
+    assert not soak.undecided(still, set())  # without a reason
     assert not soak.undecided(still | {"unanswered": 1.0}, late)  # an input is missing, not late
     assert not soak.undecided(still | {"active_share": 0.9}, late)
 
 
-def test_a_short_soak_cannot_tell_a_leak_from_a_breath_but_a_long_one_can():
+def test_only_a_long_soak_detects_a_small_leak():
     moving = dict.fromkeys(soak.LOSSES, 0.0) | {"active_share": 1.0, "ticks": 4000.0, "allocated_blocks_growth": 2.0}
     assert "allocated_blocks_growth" in soak.undecided(moving, set())
     assert not soak.undecided(moving | {"allocated_blocks_growth": 20.0}, set())
@@ -201,14 +201,14 @@ def test_a_short_soak_cannot_tell_a_leak_from_a_breath_but_a_long_one_can():
     assert not soak.undecided(moving | {"ticks": 360_000.0}, set())
 
 
-def test_the_commands_have_help_and_refuse_what_they_do_not_know():
+def test_the_commands_have_help_and_refuse_an_unknown_bus():
     text = CliRunner().invoke(app, ["experiment", "--help"], env={"COLUMNS": "200"}).output
     assert "timing" in text and "soak" in text and "--minutes" in text
     assert CliRunner().invoke(app, ["experiment", "soak", "--bus", "can0"]).exit_code == 2
 
 
 @pytest.mark.slow
-def test_a_short_soak_loses_nothing_and_grows_by_nothing(tmp_path):
+def test_a_short_soak_loses_no_frame_and_does_not_grow(tmp_path):
     result = CliRunner().invoke(app, ["experiment", "soak", "--quick", "--profile", "aoro_fc8", "--out", str(tmp_path)])
     document = json.loads((tmp_path / "result.json").read_text())
     assert result.exit_code == 0, (document["missed"], result.output[-2000:])
@@ -219,7 +219,7 @@ def test_a_short_soak_loses_nothing_and_grows_by_nothing(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_quick_measurement_writes_everything_and_passes_nothing_it_cannot_tell(tmp_path):
+def test_a_quick_measurement_writes_everything_and_leaves_undecided_limits_inconclusive(tmp_path):
     if missing := missing_tools():
         pytest.skip(f"not installed here: {', '.join(missing.values())}")
     if os.geteuid():
@@ -234,6 +234,6 @@ def test_a_quick_measurement_writes_everything_and_passes_nothing_it_cannot_tell
     assert metrics["ticks"] > 600 and metrics["ticks_1k"] > 2000 and metrics["frames_per_s"] > 3000
     assert metrics["cyclictest_p50_us"] > 0 and metrics["rx_decode_us"] > 0 and metrics["syscalls_per_tick"] > 4
     page = (tmp_path / "docs" / "timing.md").read_text()
-    assert "Verdict on the host" in page and "inconclusive" in page
-    pictures = {path.name for path in (tmp_path / "docs" / "results" / "timing").iterdir()}
-    assert pictures == {"wakeups.png", "stages.png", "sample-to-command.png", "ages.png"}
+    assert "**inconclusive**" in page and "| inconclusive |" in page
+    plots = {path.name for path in (tmp_path / "docs" / "results" / "timing").iterdir()}
+    assert plots == {"wakeups.png", "stages.png", "sample-to-command.png", "ages.png"}
