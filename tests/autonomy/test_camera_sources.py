@@ -1,4 +1,4 @@
-"""Where frames come from: recordings, a ZED behind a fake of its SDK, and a stream with servers good and bad."""
+"""Sources of frames: frame folders, a ZED with a fake SDK, and a stream with valid and invalid servers."""
 
 import json
 import socket
@@ -13,11 +13,12 @@ from PIL import Image
 
 from autonomy.perception.camera.frame import RgbdFrame
 from autonomy.perception.sources.camera_source import SourceError
-from autonomy.perception.sources.frame_folder import INDEX, Recorder, Recording
+from autonomy.perception.sources.frame_folder import INDEX, FrameFolder, FrameFolderWriter
 from autonomy.perception.sources.stream import StreamCamera
 from autonomy.perception.sources.zed import ZedCamera
-from can_dbc.messages.rgbd import QUESTION, RgbdMessage, encode, encode_refusal, question_bytes
+from can_dbc.messages.rgbd import REQUEST_HEADER, RgbdMessage, encode, encode_refusal, request_name_bytes
 from machine.geometry.optics import Intrinsics
+from tests.codes import coded
 
 PIN = Intrinsics(8, 6, 10.0, 10.0, 3.5, 2.5)
 
@@ -30,50 +31,50 @@ def picture(stamp_ns: int) -> RgbdFrame:
 
 
 @pytest.mark.parametrize(("depth", "error_m"), [("png", 5.1e-4), ("npy", 0.0)])
-def test_a_recording_gives_back_what_was_recorded(tmp_path: Path, depth: str, error_m: float) -> None:
-    recorder = Recorder(tmp_path / "run", depth)
+def test_a_frame_folder_returns_the_frames_that_were_written(tmp_path: Path, depth: str, error_m: float) -> None:
+    writer = FrameFolderWriter(tmp_path / "run", depth)
     for stamp in (5, 9):
-        recorder.add(picture(stamp))
-    recorder.close()
-    recording = Recording(tmp_path / "run")
+        writer.add(picture(stamp))
+    writer.close()
+    folder = FrameFolder(tmp_path / "run")
     for stamp in (5, 9):
-        frame, was = recording.frame(), picture(stamp)
+        frame, was = folder.frame(), picture(stamp)
         assert frame is not None and (frame.stamp_ns, frame.camera, frame.intrinsics) == (stamp, "front", PIN)
         assert np.array_equal(frame.rgb, was.rgb) and frame.depth_m.dtype == np.float32
         assert np.array_equal(np.isnan(frame.depth_m), np.isnan(was.depth_m))
         assert np.nanmax(np.abs(frame.depth_m - was.depth_m)) <= error_m
-    assert recording.frame() is None
+    assert folder.frame() is None
 
 
-def test_what_is_no_recording_says_so(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="is no recording"):
-        Recording(tmp_path)
+def test_a_folder_without_valid_index_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, check=coded("camera-source.no-frame-folder")):
+        FrameFolder(tmp_path)
     (tmp_path / INDEX).write_text("{}")
-    with pytest.raises(SourceError, match="record the folder again"):
-        Recording(tmp_path)
+    with pytest.raises(SourceError, check=coded("camera-source.bad-index")):
+        FrameFolder(tmp_path)
 
 
-def test_a_recording_with_missing_or_wrong_pictures_says_so(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path)
-    recorder.add(picture(5))
-    recorder.close()
-    with pytest.raises(SourceError, match="already holds"):
-        Recorder(tmp_path)
+def test_missing_or_wrong_pictures_are_refused(tmp_path: Path) -> None:
+    writer = FrameFolderWriter(tmp_path)
+    writer.add(picture(5))
+    writer.close()
+    with pytest.raises(SourceError, check=coded("camera-source.folder-in-use")):
+        FrameFolderWriter(tmp_path)
     index = json.loads((tmp_path / INDEX).read_text())
     (tmp_path / INDEX).write_text(json.dumps({**index, "width_px": 80}))
-    with pytest.raises(SourceError, match="80 x 6"):
-        Recording(tmp_path).frame()
+    with pytest.raises(SourceError, check=coded("camera-source.bad-frame-size")):
+        FrameFolder(tmp_path).frame()
     (tmp_path / INDEX).write_text(json.dumps(index))
     Image.fromarray(np.zeros((3, 3, 3), np.uint8)).save(tmp_path / "000000.png")
-    with pytest.raises(SourceError, match="3 x 3"):
-        Recording(tmp_path).frame()
+    with pytest.raises(SourceError, check=coded("camera-source.bad-frame-size")):
+        FrameFolder(tmp_path).frame()
     (tmp_path / "000000.depth.png").write_bytes(b"no picture")
-    with pytest.raises(SourceError, match="frame 0"):
-        Recording(tmp_path).frame()
+    with pytest.raises(SourceError, check=coded("camera-source.bad-frame")):
+        FrameFolder(tmp_path).frame()
 
 
 def fake_sdk(state: str = "SUCCESS", grabbed: str = "SUCCESS", opened: bool = True) -> SimpleNamespace:
-    """``pyzed.sl`` as far as it is used."""
+    """The part of ``pyzed.sl`` that is used."""
     depth = np.array([[1.0, np.inf, -np.inf], [np.nan, 2.5, 0.0]], np.float32)
     bgra = np.dstack([np.full((2, 3), v, np.uint8) for v in (1, 2, 3, 255)])
     left = SimpleNamespace(fx=5.0, fy=5.5, cx=1.0, cy=0.5)
@@ -123,7 +124,7 @@ def fake_sdk(state: str = "SUCCESS", grabbed: str = "SUCCESS", opened: bool = Tr
     )  # fmt: skip
 
 
-def test_a_zed_gives_its_own_intrinsics_rgb_and_nan_for_all_that_is_unknown() -> None:
+def test_a_zed_delivers_its_intrinsics_rgb_and_nan_for_unknown_depth() -> None:
     sdk = fake_sdk()
     camera = ZedCamera("front", sdk=sdk)
     frame = camera.frame()
@@ -134,25 +135,25 @@ def test_a_zed_gives_its_own_intrinsics_rgb_and_nan_for_all_that_is_unknown() ->
     assert sdk.Camera.closed
 
 
-def test_a_zed_that_cannot_be_opened_is_late_or_gone_says_so() -> None:
-    with pytest.raises(SourceError, match="cannot be opened: CAMERA NOT DETECTED"):
+def test_a_zed_that_cannot_be_opened_is_late_or_disconnected() -> None:
+    with pytest.raises(SourceError, check=coded("camera-source.not-opened")):
         ZedCamera("front", sdk=fake_sdk(state="CAMERA NOT DETECTED"))
-    with pytest.raises(SourceError, match="no resolution 'HD9'"):
+    with pytest.raises(SourceError, check=coded("camera-source.no-resolution")):
         ZedCamera("front", "HD9", sdk=fake_sdk())
     assert ZedCamera("front", sdk=fake_sdk(grabbed="TIMEOUT")).frame() is None
-    with pytest.raises(SourceError, match="is gone: UNPLUGGED"):
+    with pytest.raises(SourceError, check=coded("camera-source.disconnected")):
         ZedCamera("front", sdk=fake_sdk(grabbed="UNPLUGGED", opened=False)).frame()
 
 
-def test_without_its_sdk_a_zed_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_zed_without_its_sdk_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyzed", None)
-    with pytest.raises(SourceError, match="pyzed") as told:
+    with pytest.raises(SourceError, check=coded("camera-source.no-sdk")) as told:
         ZedCamera("front")
     assert "\n" not in str(told.value)
 
 
 class Server:
-    """Answers questions on a free port with what ``answers`` gives: bytes, or None to hang up."""
+    """Replies to requests on a free port with what ``answers`` returns: bytes, or None to close the connection."""
 
     def __init__(self, answers) -> None:
         self._answers, self.asked = iter(answers), []
@@ -167,8 +168,8 @@ class Server:
             except OSError:
                 return
             with client:
-                while head := client.recv(QUESTION.size):
-                    self.asked.append(client.recv(question_bytes(head)).decode())
+                while head := client.recv(REQUEST_HEADER.size):
+                    self.asked.append(client.recv(request_name_bytes(head)).decode())
                     parts = next(self._answers, None)
                     if parts is None:
                         break
@@ -185,7 +186,7 @@ def wire(stamp_ns: int) -> bytes:
     return encode(RgbdMessage("front", stamp_ns, 2, 2, 3.0, 3.0, 0.5, 0.5, bytes(range(12)), depth.tobytes()))
 
 
-def test_the_newest_frame_is_asked_for_and_unknown_depth_is_nan() -> None:
+def test_the_newest_frame_is_requested_and_unknown_depth_is_nan() -> None:
     server = Server([[(0.0, wire(1))], [(0.0, wire(2))]])
     camera = StreamCamera(server.address, "front", timeout_s=5.0)
     frame, later = camera.frame(), camera.frame()
@@ -197,11 +198,11 @@ def test_the_newest_frame_is_asked_for_and_unknown_depth_is_nan() -> None:
     server.close()
 
 
-def test_a_slow_frame_is_not_waited_for_and_not_lost() -> None:
+def test_a_slow_frame_does_not_block_and_is_not_lost() -> None:
     data = wire(7)
     server = Server([[(0.0, data[:30]), (0.25, data[30:])]])
     camera = StreamCamera(server.address, "front", timeout_s=0.1)
-    assert camera.frame() is None and "within 100 ms" in camera.problem
+    assert camera.frame() is None and camera.problem_code == "camera-source.timeout"
     frame = None
     for _ in range(100):
         frame = frame or camera.frame()
@@ -210,22 +211,22 @@ def test_a_slow_frame_is_not_waited_for_and_not_lost() -> None:
     server.close()
 
 
-def test_broken_frames_refusals_and_hangups_are_told_and_the_next_call_connects_anew() -> None:
+def test_invalid_frames_refusals_and_closed_connections_are_reported_and_the_next_call_connects_again() -> None:
     broken = bytearray(wire(1))
     broken[-1] ^= 1
     server = Server(
         [[(0.0, bytes(broken))], [(0.0, encode_refusal("front", "no such camera"))], None, [(0.0, wire(3))]]
     )
     camera = StreamCamera(server.address, "front", timeout_s=5.0)
-    for words in ("checksum", "no such camera", "hung up"):
-        assert camera.frame() is None and words in camera.problem
+    for code in ("rgbd.checksum", "rgbd.refused", "camera-source.connection"):
+        assert camera.frame() is None and camera.problem_code == code
     frame = camera.frame()
-    assert frame is not None and frame.stamp_ns == 3 and camera.problem == ""
+    assert frame is not None and frame.stamp_ns == 3 and camera.problem == camera.problem_code == ""
     camera.close()
     server.close()
 
 
-def test_nobody_there_is_a_sentence() -> None:
+def test_a_missing_server_is_reported() -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"127.0.0.1:{free.getsockname()[1]}"
     camera = StreamCamera(address, "front", timeout_s=0.5)

@@ -163,14 +163,18 @@ def _step(
     return value.item()
 
 
-def _write_checkpoint(path: Path, name: str, net: torch.nn.Module, optimiser: torch.optim.Optimizer, losses: list[float]) -> None:
+def _write_checkpoint(
+    path: Path, name: str, net: torch.nn.Module, optimiser: torch.optim.Optimizer, losses: list[float]
+) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(path.name + ".part")
     torch.save({"run": name, "net": net.state_dict(), "optimiser": optimiser.state_dict(), "losses": losses}, draft)
     os.replace(draft, path)
 
 
-def _read_checkpoint(path: Path | None, name: str, net: torch.nn.Module, optimiser: torch.optim.Optimizer) -> list[float]:
+def _read_checkpoint(
+    path: Path | None, name: str, net: torch.nn.Module, optimiser: torch.optim.Optimizer
+) -> list[float]:
     if path is None or not path.is_file():
         return []
     try:

@@ -75,7 +75,9 @@ def produce(variant: str, plan: Plan, folder: Path, out: Path, console: Console)
     """
     start = initial_arrays(plan.start, variant) if plan.start else None
     source = small_pictures(folder, plan.count, console)
-    some, count = (mixed_pictures(source, plan, folder, console), 2 * plan.count) if plan.large else (source, plan.count)
+    some, count = source, plan.count
+    if plan.large:
+        some, count = mixed_pictures(source, plan, folder, console), 2 * plan.count
     schedule = Schedule(plan.steps, plan.learning_rate, bf16=True)
     kept = out.with_suffix(".checkpoint")
     net, losses = run(some, count, variant, schedule, BATCH, plan.seed, kept, console, start)
@@ -133,7 +135,9 @@ def small_pictures(folder: Path, count: int, console: Console) -> Callable[[int]
     return pictures(folder)
 
 
-def mixed_pictures(small: Callable[[int], Labelled], plan: Plan, folder: Path, console: Console) -> Callable[[int], Labelled]:
+def mixed_pictures(
+    small: Callable[[int], Labelled], plan: Plan, folder: Path, console: Console
+) -> Callable[[int], Labelled]:
     """Small and large pictures alternately; missing large ones are drawn."""
     some = large_pictures(plan, folder, console)
     return lambda i: some(i // 2 % plan.large) if i % 2 else small(i // 2)
@@ -166,7 +170,7 @@ def ship(
     network = unet(variant)
     card = Card(
         f"Logs in pictures, from {'colour and depth' if variant == 'rgbd' else 'depth alone'}",
-        "Picture in, eight maps out, from which single logs are decoded: mask, centre, offset to it, angle, ends, edges.",
+        "Picture in, eight maps out, from which logs are decoded: mask, centre, offset to it, angle, ends, edges.",
         f"{plan.count} pictures drawn by the analytic renderer of settled piles (training); nothing photographed",
         plan.schedule_text(" and ".join(str(crop) for crop, _ in CROPS)),
         plan.seed,

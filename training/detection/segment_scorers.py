@@ -46,7 +46,7 @@ class Examples:
 
 
 def merge_examples(foreground: Foreground, ids: np.ndarray, rng: np.random.Generator) -> Examples:
-    """Pairs of segments and whether they are one log; ``ids`` (h, w) holds the log of each pixel of the maps, 0 none."""
+    """Pairs of segments and whether they are one log; ``ids`` (h, w): the log of each pixel of the maps, 0 none."""
     segments, found = over_segment(foreground), []
     for round_ in range(ROUNDS):
         merger = SegmentMerger(foreground, segments)

@@ -35,9 +35,9 @@ lie beside it."""
 def targets(sample: Labelled) -> tuple[np.ndarray, np.ndarray]:
     """The maps (8, h, w) float32 that the network should predict (probabilities for its logits), and weights (8, h, w).
 
-    The weights are: of mask, peaks and edges (0 where the picture is ignored); of the offset; of the angle; four factors
-    that turn an error of the offset (u, v) into errors along and across the log in units of the tolerance; 1 where two
-    logs meet.
+    The weights are: of mask, peaks and edges (0 where the picture is ignored); of the offset; of the angle; four
+    factors that turn an error of the offset (u, v) into errors along and across the log in units of the tolerance; 1
+    where two logs meet.
     """
     h, w = (n // STRIDE for n in sample.ids.shape)
     blocks = sample.ids[: h * STRIDE, : w * STRIDE].reshape(h, STRIDE, w, STRIDE)

@@ -42,7 +42,8 @@ def load(folder: Path) -> tuple[Sample, ...]:
     found = [s for path in files if (s := _sample(path)) is not None]
     if not found:
         raise DatasetError(
-            "dataset.no-samples", f"{folder}: no Cornell samples; the folder must hold pcdNNNNd.tiff and pcdNNNNcpos.txt"
+            "dataset.no-samples",
+            f"{folder}: no Cornell samples; the folder must hold pcdNNNNd.tiff and pcdNNNNcpos.txt",
         )
     return tuple(sorted(found, key=lambda s: s.number))
 
@@ -94,8 +95,8 @@ def rectangles(path: Path) -> tuple[Rectangle, ...]:
 def grouped_folds(numbers: list[int], folds: int) -> list[tuple[list[int], list[int]]]:
     """(train, test) indices into ``numbers`` (ascending).
 
-    Every test fold is a run of neighbours.  Numbers within ``GUARD_COUNT`` of it are excluded from training, so that no object
-    is on both sides.
+    Every test fold is a run of neighbours.  Numbers within ``GUARD_COUNT`` of it are excluded from training, so that no
+    object is on both sides.
     """
     found = []
     for test in np.array_split(np.arange(len(numbers)), folds):

@@ -1,8 +1,8 @@
 """The label rule of ``autonomy.grasp.quality`` and the virtual camera, compiled for millions of training frames.
 
 The formulas are the same, for one candidate at a time; ``tests/training`` compares both with their originals.  A world
-is (n, 8): centre, axis, length, radius.  ``facts`` are numbers of the grapple and of the rule, ``outline`` (k, 2) is the
-outline of its jaws.
+is (n, 8): centre, axis, length, radius.  ``facts`` are numbers of the grapple and of the rule, ``outline`` (k, 2) is
+the outline of its jaws.
 """
 
 from __future__ import annotations
@@ -39,13 +39,16 @@ def facts_of(jaws: Jaws) -> tuple[np.ndarray, np.ndarray]:
 
 @njit(cache=True)
 def _half_width(outline: np.ndarray, height: float) -> float:
+    first: float = outline[0, 1]
+    last: float = outline[-1, 1]
     if height <= outline[0, 0]:
-        return outline[0, 1]
+        return first
     for i in range(1, len(outline)):
         if height <= outline[i, 0]:
             share = (height - outline[i - 1, 0]) / (outline[i, 0] - outline[i - 1, 0])
-            return outline[i - 1, 1] + share * (outline[i, 1] - outline[i - 1, 1])
-    return outline[-1, 1]
+            between: float = outline[i - 1, 1] + share * (outline[i, 1] - outline[i - 1, 1])
+            return between
+    return last
 
 
 @njit(cache=True)
@@ -53,7 +56,8 @@ def evaluate_candidate(
     facts: np.ndarray, outline: np.ndarray, world: np.ndarray, upon: np.ndarray,
     x: float, y: float, yaw: float, level: float, at: np.ndarray, captured: np.ndarray,
 ) -> tuple[float, float]:  # fmt: skip
-    """(lever by middle, mass [kg]) of a safe candidate, otherwise (0, 0); ``at`` (n, 2) and ``captured`` (n,) are scratch."""
+    """(lever by middle, mass [kg]) of a safe candidate, otherwise (0, 0); ``at`` (n, 2) and ``captured`` (n,) are
+    scratch."""
     n = len(world)
     cu, su = math.cos(yaw), math.sin(yaw)
     w, gap, tip = facts[BLADE] / 2, facts[HALF_GAP], level + _TIP
@@ -127,7 +131,8 @@ def draw(
     inverse: np.ndarray, owner: np.ndarray, world: np.ndarray, eye: np.ndarray,
     fx: float, fy: float, cx: float, cy: float,
 ) -> None:  # fmt: skip
-    """Write inverse depths of cylinders, seen straight down from ``eye``, to ``inverse`` and their numbers to ``owner``."""
+    """Write inverse depths of cylinders, seen straight down from ``eye``, to ``inverse`` and their numbers to
+    ``owner``."""
     height, width = inverse.shape
     for i in range(len(world)):
         px, py, pz = world[i, 0] - eye[0], eye[1] - world[i, 1], eye[2] - world[i, 2]
@@ -184,11 +189,12 @@ def label(
     levels: np.ndarray, eye: np.ndarray, inverse: np.ndarray, fx: float, fy: float, cx: float, cy: float,
     step: int, turned: np.ndarray, near: float, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Write quality and direction (3, h, w) on a grid every ``step`` pixels to ``out``: the best closing direction there.
+    """Write quality and direction (3, h, w) on a grid every ``step`` pixels to ``out``: the best closing direction
+    there.
 
-    ``worlds`` (1 + d, n, 8): as seen, then samples; ``moves`` (d, 4): errors of x, y, yaw, level; ``levels`` (m,): heights
-    above which logs may be gripped; ``turned`` (k,): offsets from the direction across a log; only logs within ``near``
-    contribute their direction.
+    ``worlds`` (1 + d, n, 8): as seen, then samples; ``moves`` (d, 4): errors of x, y, yaw, level; ``levels`` (m,):
+    heights above which logs may be gripped; ``turned`` (k,): offsets from the direction across a log; only logs within
+    ``near`` contribute their direction.
     """
     n, draws = worlds.shape[1], len(moves)
     at, captured = np.empty((n, 2)), np.empty(n, np.bool_)
@@ -212,7 +218,9 @@ def label(
                 square = math.atan2(seen[i, 4], seen[i, 3]) + math.pi / 2
                 for turn in turned:
                     for level in levels:
-                        lever, mass = evaluate_candidate(facts, outline, seen, upon, x, y, square + turn, level, at, captured)
+                        lever, mass = evaluate_candidate(
+                            facts, outline, seen, upon, x, y, square + turn, level, at, captured
+                        )
                         value = lever * (0.6 + 0.4 * mass / wood) * math.exp(-abs(turn))
                         if value > best:
                             best, best_yaw, best_level = value, square + turn, level

@@ -1,9 +1,9 @@
 """Training frames for the grasp network with physical labels: settled piles, the virtual camera, the label rule.
 
 The input is what the planner renders: logs as perfect, shortened cylinders seen from 3 m above.  The labels are the
-probability that a grasp at a pixel holds, from samples of the errors of perception and crane, and the closing direction.
-This rule never evaluates an experiment (docs/reference/perception.md section 6).  Frames are at the network's own
-100 x 100.
+probability that a grasp at a pixel holds, from samples of the errors of perception and crane, and the closing
+direction.  This rule never evaluates an experiment (docs/reference/perception.md section 6).  Frames are at the
+network's own 100 x 100.
 """
 
 from __future__ import annotations
@@ -105,7 +105,8 @@ def frame(
         MAX_LOG_DISTANCE_M,
         out,
     )
-    out[1:] *= out[0]  # without a grasp there is no direction to learn, and its error would dominate the quality in eq. 5
+    # Without a grasp there is no direction to learn, and its error would dominate the quality in eq. 5.
+    out[1:] *= out[0]
     # As ``network.normalized_relief``, with a known level ground.
     low = np.arcsinh(np.clip(1.0 - 1.0 / (inverse * below), -MAX_RELIEF, MAX_RELIEF) / RELIEF_SCALE).astype(np.float32)
     return GraspFrame(low, _interpolated_labels(out))

@@ -1,7 +1,7 @@
 """Paper A's network trained on physical labels of settled piles instead of Cornell rectangles.
 
-Network, loss and schedule are the same, and ``autonomy.grasp.cnn_planner`` uses the weights like the paper's.  The piles
-come from ``training.pictures.piles``.
+Network, loss and schedule are the same, and ``autonomy.grasp.cnn_planner`` uses the weights like the paper's.  The
+piles come from ``training.pictures.piles``.
 """
 
 from __future__ import annotations
@@ -78,7 +78,9 @@ def produce(
         found = drawn_frames(count, seed, 0, folder, lambda: progress.advance(task))
     kept = out.with_suffix(".checkpoint")
     title = "grasp network, physical labels"
-    net, losses = network_training.train_network(examples_of(found), seed, title, console, kept, epochs=epochs, batch=BATCH)
+    net, losses = network_training.train_network(
+        examples_of(found), seed, title, console, kept, epochs=epochs, batch=BATCH
+    )
     share = quality_share(net, drawn_frames(TEST_FRAMES, seed + 1, HELD_OUT, folder))
     card = Card(
         "Paper A's grasp network on physical labels",

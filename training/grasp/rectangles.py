@@ -1,8 +1,8 @@
 """Grasp rectangles and the rectangle metric for grasps on pictures (paper A II-D, after Jiang et al. 2011).
 
-A rectangle is its centre [px], the direction in which the jaws close (x is_correct, y down), the opening along it and the
-size of the jaws across it.  A grasp is correct when its intersection over union with one labelled rectangle is more than
-a quarter and its direction differs by less than 30 degrees.
+A rectangle is its centre [px], the direction in which the jaws close (x is_correct, y down), the opening along it and
+the size of the jaws across it.  A grasp is correct when its intersection over union with one labelled rectangle is more
+than a quarter and its direction differs by less than 30 degrees.
 """
 
 from __future__ import annotations

@@ -77,8 +77,8 @@ def visible_grasps(grasps: Iterable[Rectangle], view: View) -> tuple[Rectangle, 
 def label_maps(grasps: Iterable[Rectangle]) -> np.ndarray:
     """Q, cos 2 theta, sin 2 theta (3, 300, 300) float32.
 
-    Q is 1 inside the rectangles and 0 elsewhere (paper A II-D).  The direction is the mean of the rectangles that cover a
-    pixel, and 0 where there is none.
+    Q is 1 inside the rectangles and 0 elsewhere (paper A II-D).  The direction is the mean of the rectangles that cover
+    a pixel, and 0 where there is none.
     """
     v, u = np.mgrid[:SIDE_PX, :SIDE_PX]
     covered, cos2, sin2 = (np.zeros((SIDE_PX, SIDE_PX), np.float32) for _ in range(3))

@@ -58,5 +58,6 @@ def plot_primitives(path: Path, profile: Profile, motions: Sequence[JointTrack],
 def _across_and_height(arm: Arm, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Position across the bunk's length, and height [m]."""
     bunk = arm.profile.bunk
-    xy = np.array([arm.xy(Pose(*row[:4], 0.0)) for row in poses.tolist()]) - np.array(bunk.center_m)
+    pins = [arm.xy(Pose(slew, r, z, ext, 0.0)) for slew, r, z, ext, *_ in poses.tolist()]
+    xy = np.array(pins) - np.array(bunk.center_m)
     return xy @ np.array([-np.sin(bunk.yaw_rad), np.cos(bunk.yaw_rad)]), poses[:, 2]

@@ -51,7 +51,8 @@ def load(annotations: Path, images: Path) -> tuple[CocoPicture, ...]:
         )
     except OSError as error:
         raise DatasetError(
-            "dataset.unreadable", f"{annotations}: cannot be read ({error.strerror}); give the JSON file of a COCO data set"
+            "dataset.unreadable",
+            f"{annotations}: cannot be read ({error.strerror}); give the JSON file of a COCO data set",
         ) from None
     except (ValueError, KeyError, TypeError) as error:
         raise DatasetError(

@@ -177,7 +177,7 @@ def _rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The smallest rotation (3, 3) from unit vector ``a`` to ``b``."""
     w, c = np.cross(a, b), float(a @ b)
     k = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-    return np.eye(3) + k + k @ k / (1.0 + c)
+    return np.asarray(np.eye(3) + k + k @ k / (1.0 + c))
 
 
 def _clear_of_logs(eye: np.ndarray, logs: tuple[LogPose, ...]) -> bool:

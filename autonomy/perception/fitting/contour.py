@@ -57,7 +57,8 @@ class Contour:
             touch = np.flatnonzero(own & (self.beside == number))
             if len(touch):
                 rays = pixel_rays(pin, self.u_px[touch], self.v_px[touch])
-                own[touch] = outline_distance(CylinderBatch.of(body), rays)[0] < -SHARED_PX * body.center_m[2] / pin.fx_px
+                shared_m = SHARED_PX * body.center_m[2] / pin.fx_px
+                own[touch] = outline_distance(CylinderBatch.of(body), rays)[0] < -shared_m
         return Contour(self.u_px, self.v_px, own, self.beside)
 
 

@@ -167,7 +167,7 @@ def axial_positions(body: Cylinder, rays: np.ndarray, first: int) -> np.ndarray:
     near = _Closest.of(bodies, rays)
     met = _surface_depth(bodies, near) * near.along - near.point
     at = np.concatenate([near.place[0, :first], met[0, first:]])
-    return np.clip(at, body.start_m, body.end_m)
+    return np.asarray(np.clip(at, body.start_m, body.end_m))
 
 
 def _outline_distance(bodies: CylinderBatch, near: _Closest) -> np.ndarray:

@@ -245,7 +245,9 @@ class _Problem:
         ends = ((start - self.prior.start_m) / END_SIGMA_M, (end - self.prior.end_m) / END_SIGMA_M)
         return np.concatenate([edge, deep, *ends, usual, growth / TAPER_SIGMA], axis=1)
 
-    def linearised(self, raw: np.ndarray, scale_factor: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    def linearised(
+        self, raw: np.ndarray, scale_factor: float = 1.0
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         """Residuals (N,), their derivatives (N, 8), weights (N,) and cost, from residuals (9, N) around a cylinder."""
         cauchy_scale = self._cauchy_scale(raw[0], scale_factor)
         far = (raw[0] / cauchy_scale) ** 2
@@ -261,7 +263,8 @@ class _Problem:
 
     def _cauchy_scale(self, residuals: np.ndarray, scale_factor: float) -> np.ndarray:
         """Scale (N,) of the Cauchy loss: smaller for depth that is too near, because grass is."""
-        wide = np.where(self.cauchy_scale == OUTLINE_CAUCHY_SCALE, scale_factor * OUTLINE_CAUCHY_SCALE, self.cauchy_scale)
+        is_outline = self.cauchy_scale == OUTLINE_CAUCHY_SCALE
+        wide = np.where(is_outline, scale_factor * OUTLINE_CAUCHY_SCALE, self.cauchy_scale)
         near = (self.cauchy_scale == DEPTH_CAUCHY_SCALE) & (residuals > 0.0)
         return np.asarray(np.where(near, NEAR_CAUCHY_SCALE, wide))
 
@@ -321,7 +324,7 @@ class _Problem:
         raw = self.residuals(CylinderBatch.around(body, _STEPS), metres_px)
         half = 0.5 * body.length_m
         at = (axial_positions(body, self.rays, len(self.own)) - body.start_m) / half - 1.0
-        arch = np.concatenate([1.0 / 3.0 - at * at, np.zeros(4)])  # of mean 0, so that the mean position of the log stays
+        arch = np.concatenate([1.0 / 3.0 - at * at, np.zeros(4)])  # of mean 0, so that the mean position is kept
         jacobian = (raw[1:] - raw[0]).T / DERIVATIVE_STEP
         jacobian = np.hstack([jacobian, jacobian[:, :2] * arch[:, None]])
         raw = raw + jacobian[:, 8:] @ bow

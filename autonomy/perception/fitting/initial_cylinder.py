@@ -64,7 +64,7 @@ def initial_cylinder(
 
 
 def ransac_line(x: np.ndarray, y: np.ndarray, slack: float, seed: int) -> tuple[float, float]:
-    """Intercept a and slope b of y = a + b x through most of the points: RANSAC, then least squares over its inliers."""
+    """Intercept a and slope b of y = a + b x through most of the points: RANSAC, then least squares over inliers."""
     rng = np.random.default_rng(seed)
     i, j = rng.integers(0, len(x), (2, RANSAC_PAIRS))
     apart = x[j] - x[i]

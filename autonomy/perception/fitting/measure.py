@@ -63,7 +63,8 @@ def measure(
         fit = scene.fit([i], known[i], contours[i], fits)
         if fit is not None:
             fits[i] = fit
-    rejections = [Rejection(i, "too-little-depth", "too little of its depth is known") for i in range(len(masks)) if i not in fits]
+    unfitted = [i for i in range(len(masks)) if i not in fits]
+    rejections = [Rejection(i, "too-little-depth", "too little of its depth is known") for i in unfitted]
     accepted = []
     for group in fragment_groups(dict(sorted(fits.items()))):
         fit = fits[group[0]]

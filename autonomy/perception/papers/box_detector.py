@@ -104,4 +104,4 @@ def decode_boxes(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _overlaps(box: np.ndarray, others: np.ndarray) -> np.ndarray:
     shared = np.prod(np.maximum(np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2]), 0.0), axis=1)
     areas = np.prod(others[:, 2:] - others[:, :2], axis=1) + np.prod(box[2:] - box[:2])
-    return np.divide(shared, areas - shared, out=np.zeros_like(shared), where=areas > shared)
+    return np.asarray(np.divide(shared, areas - shared, out=np.zeros_like(shared), where=areas > shared))

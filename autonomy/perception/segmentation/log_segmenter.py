@@ -251,10 +251,11 @@ def _opened(wood: np.ndarray, size: int) -> np.ndarray:
     """The morphological opening of ``wood`` (h, w) bool with a square of ``size`` (odd) pixels."""
     for grow in (False, True):
         for axis in (0, 1):
-            pads = [(size // 2, size // 2) if a == axis else (0, 0) for a in (0, 1)]
-            padded: np.ndarray = np.pad(wood, pads)
-            wood = np.full(wood.shape, not grow)
+            lines = wood if axis == 0 else wood.T
+            padded: np.ndarray = np.pad(lines, ((size // 2, size // 2), (0, 0)))
+            lines = np.full(lines.shape, not grow)
             for i in range(size):
-                part = padded[i : i + len(wood)] if axis == 0 else padded[:, i : i + wood.shape[1]]
-                wood = wood | part if grow else wood & part
+                part = padded[i : i + len(lines)]
+                lines = lines | part if grow else lines & part
+            wood = lines if axis == 0 else lines.T
     return wood

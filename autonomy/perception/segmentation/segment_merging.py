@@ -161,7 +161,7 @@ class SegmentMerger:
         return found
 
     def merge_pair(self, i: int, j: int) -> np.ndarray:
-        """Merge segment ``j`` into segment ``i``, ``i`` < ``j``; returns the former indices (n - 1,) of the segments."""
+        """Merge segment ``j`` into ``i``, ``i`` < ``j``; returns the former indices (n - 1,) of the segments."""
         members = np.concatenate([self.segments[i].members, self.segments[j].members])
         self.segments[i] = make_segment(self.foreground, members)
         for of in (self._border_px, self._boundary_sum):

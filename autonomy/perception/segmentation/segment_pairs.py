@@ -168,7 +168,7 @@ def may_merge(foreground: Foreground, big: SegmentTable, small: SegmentTable, bo
     ask = ask[may[ask] & (end - start > MIN_GAP_PX)[ask]]
     hidden, inverse, line = _gap(foreground, big.take(ask), start[ask], end[ask])
     may[ask] = (~hidden & (inverse < line / NEARER)).sum(axis=1) <= MIN_BACKGROUND_SHARE * GAP_SAMPLES
-    return may
+    return np.asarray(may)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -197,7 +197,7 @@ def _between(big: SegmentTable, small: SegmentTable, along: np.ndarray) -> tuple
 def _gap(
     foreground: Foreground, big: SegmentTable, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Along gaps (n, GAP_SAMPLES): foreground, inverse depth, and inverse depth of the big segment's line, NaN unknown."""
+    """Along gaps (n, GAP_SAMPLES): foreground, inverse depth, and that of the big segment's line, NaN unknown."""
     at = start[:, None] + (end - start)[:, None] * GAP_SHARES
     place = np.rint(big.middle[:, None] + at[..., None] * big.axis[:, None]).astype(int)
     row = np.clip(place[..., 1], 0, foreground.mask.shape[0] - 1)

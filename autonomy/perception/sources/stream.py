@@ -23,25 +23,30 @@ MAX_RECEIVE_BYTES: Final = 1 << 20
 class StreamCamera:
     """One camera of a server at ``address``: ``HOST:PORT``, or ``unix:PATH``.
 
-    ``problem`` says why the last call returned no frame; it is empty when the call returned one.
+    ``problem`` says why the last call returned no frame, and ``problem_code`` is its code; both are empty when the call
+    returned a frame.
     """
 
     def __init__(self, address: str, camera: str, timeout_s: float = 0.1) -> None:
         self._address, self._camera, self._timeout_s = address, camera, timeout_s
         self._socket: socket.socket | None = None
         self._requested, self._data = False, bytearray()
-        self.problem = ""
+        self.problem = self.problem_code = ""
 
     def frame(self) -> RgbdFrame | None:
-        """The newest frame, or None with ``problem`` set."""
+        """The newest frame, or None with ``problem`` and ``problem_code`` set."""
         end_s = time.monotonic() + self._timeout_s
         try:
             frame = self._receive(end_s)
         except (OSError, RgbdError) as error:
             self.close()
             self.problem = f"no frame of camera {self._camera} from {self._address}: {error or type(error).__name__}"
+            self.problem_code = error.code if isinstance(error, RgbdError) else "camera-source.connection"
             return None
-        self.problem = "" if frame else f"no frame of camera {self._camera} within {1000 * self._timeout_s:.0f} ms"
+        self.problem = self.problem_code = ""
+        if frame is None:
+            self.problem = f"no frame of camera {self._camera} within {1000 * self._timeout_s:.0f} ms"
+            self.problem_code = "camera-source.timeout"
         return frame
 
     def close(self) -> None:

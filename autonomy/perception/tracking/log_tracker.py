@@ -24,7 +24,7 @@ DUPLICATE_DISTANCE_SHARE, MIN_PARALLEL_COSINE, MAX_LENGTH_DIFFERENCE_M = 0.7, 0.
 """Two logs are duplicates when their lengths differ by less, their axes are at most 20 degrees apart, and the distance
 of their axes is below this share of the sum of their radii."""
 FRAGMENT_DISTANCE_SHARE: Final = 0.5
-"""A shorter log is a fragment of a longer one when the distance of their axes is below this share of the sum of radii."""
+"""A shorter log is a fragment of a longer one when their axes are nearer than this share of the sum of their radii."""
 NO_PAIR_COST: Final = 1e9  # in the assignment matrix
 
 
