@@ -56,16 +56,16 @@ def approach_motion(
     broad = [
         replace(o, diameter_m=o.diameter_m + 2.0 * APPROACH_CLEARANCE_M) if o.id == grasp.log.id else o for o in logs
     ]
-    around, high_m = collision_scene(arm.profile, broad), travel_height_m(arm.profile)
+    scene, high_m = collision_scene(arm.profile, broad), travel_height_m(arm.profile)
     if motion_planner.direct and not grasp.is_bundle:
         stands = arm.profile.carrier is None
         goal = grasp.pose if stands else grasp.pose.at_height(grasp.pose.z_m + MACHINE_LEAN_M)
         try:
-            return motion_planner(arm, start, goal, around, None, high_m, 0.0)
+            return motion_planner(arm, start, goal, scene, None, high_m, 0.0)
         except Unreachable:  # a stump or a log beside it: approach from above
             pass
     over = grasp.pose.at_height(hover_height_m(arm.profile, grasp))
-    return motion_planner(arm, start, over, around, None, high_m, 0.0)
+    return motion_planner(arm, start, over, scene, None, high_m, 0.0)
 
 
 def corrected_grasp(arm: Arm, grasp: Grasp, logs: Sequence[LogObservation]) -> Grasp:
@@ -101,17 +101,17 @@ def carry_motion(
 ) -> Trajectory:
     """With the log to its place; ``hangs``: the log is seen in the grapple, otherwise it lies as it was gripped."""
     taken = {log.id for log in grasp.logs} | {log.id for log in logs if is_between_jaws(arm, log, start)}
-    around = collision_scene(arm.profile, logs, without=taken)
+    scene = collision_scene(arm.profile, logs, without=taken)
     seen = next((log for log in logs if log.id == grasp.log.id), None) if hangs else None
     held = held_log(arm, grasp.pose, grasp.log) if seen is None else held_log(arm, start, seen)
     held = replace(held, diameter_m=hypot(*(log.diameter_m for log in grasp.logs)))  # a bundle counts as one thick log
     high_m, free_m = travel_height_m(arm.profile), approach_length_m(arm.profile, grasp.log)
     try:
-        return motion_planner(arm, start, place, around, held, high_m, free_m)
+        return motion_planner(arm, start, place, scene, held, high_m, free_m)
     except Unreachable:  # close to the stakes: first above the place, then straight down
         if place.z_m >= high_m:
             raise
-        return motion_planner(arm, start, place.at_height(high_m), around, held, high_m, free_m)
+        return motion_planner(arm, start, place.at_height(high_m), scene, held, high_m, free_m)
 
 
 def closing_motion(arm: Arm, start: Pose, grasp: Grasp, begin_s: float) -> Trajectory:
@@ -127,9 +127,9 @@ def closing_motion(arm: Arm, start: Pose, grasp: Grasp, begin_s: float) -> Traje
 def extraction_motion(arm: Arm, start: Pose, grasp: Grasp) -> Trajectory:
     """Drags the pinched log out of its row along the ground; no motion where that is out of reach."""
     (x, y), log = arm.xy(start), grasp.log
-    way = x - log.center_m[0], y - log.center_m[1]
-    along = way[0] * log.axis[0] + way[1] * log.axis[1]
-    out = way[0] - along * log.axis[0], way[1] - along * log.axis[1]
+    offset = x - log.center_m[0], y - log.center_m[1]
+    along = offset[0] * log.axis[0] + offset[1] * log.axis[1]
+    out = offset[0] - along * log.axis[0], offset[1] - along * log.axis[1]
     far = EXTRACTION_DISTANCE_M / max(hypot(*out), 1e-3)
     try:
         aside = arm.pose_above(x + far * out[0], y + far * out[1], start.z_m, travel_height_m(arm.profile))

@@ -17,7 +17,7 @@ from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.grapple import lowest_tip_below_pin_m, rotator_for_yaw, tip_below_pin_m
-from machine.profile import Profile, TongTable
+from machine.profile import Profile, JawTable
 
 TIP_CLEARANCE_M: Final = (0.025, 0.05)
 """Least and greatest height of the tips over the support while closing: 3 to 5 cm lift 19 of 20 logs, 1.5 cm 13 of
@@ -101,7 +101,7 @@ def closing_height_curve(profile: Profile, support_z_m: float, diameter_m: float
 
 
 @lru_cache(maxsize=64)
-def _sweep(tongs: TongTable, close_time_s: float, diameter_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _sweep(tongs: JawTable, close_time_s: float, diameter_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Times [s] and the depth of closing tips below the pin then [m]; cached, as logs repeat."""
     rate = tongs.angle_rad[-1] / close_time_s
     meet = float(np.interp(_CONTACT_SHARE * diameter_m, tongs.half_gap_m[::-1], tongs.angle_rad[::-1]))

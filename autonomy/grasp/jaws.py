@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from machine.geometry.grapple import pin_to_tong_pivot_m
+from machine.geometry.grapple import pin_to_jaw_pivot_m
 from machine.profile import Profile
 
 C4_CHORD_M: Final = 0.648
@@ -65,7 +65,7 @@ def jaws_of(profile: Profile) -> Jaws:
     """The grapple of a profile; the pivots follow from its table of tip positions."""
     table = profile.grapple.tongs
     angle, gap = np.array(table.angle_rad), np.array(table.half_gap_m)
-    down = table.tip_below_pin_m[0] - pin_to_tong_pivot_m(profile.kinematics)
+    down = table.tip_below_pin_m[0] - pin_to_jaw_pivot_m(profile.kinematics)
     columns = np.stack([np.ones_like(angle), np.cos(angle)], axis=1)
     (pivot, out), *_ = np.linalg.lstsq(columns, gap + down * np.sin(angle), rcond=None)
     chord = hypot(float(out), down)

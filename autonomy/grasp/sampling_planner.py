@@ -210,9 +210,9 @@ class SamplingPlanner:
         left = len(logs) - len(taken)
         reason = (
             f"{_log_count(taken)} ({names}) of {len(logs)} at once, "
-            f"{100 * probability:.0f} % of {DRAW_COUNT} samples hold it"
-            + (f"; {left} stay" if left else "")
-            + ("; no better grasp exists" if probability < RELAX_BELOW_PROBABILITY else "")
+            f"{100 * probability:.0f} % of {DRAW_COUNT} draws hold it"
+            + (f"; {left} left lying" if left else "")
+            + ("; nothing better is there" if probability < RELAX_BELOW_PROBABILITY else "")
         )
         return GraspCandidate(
             float(best.x[i]), float(best.y[i]), float(best.yaw[i]), float(best.level[i]), taken, probability, reason

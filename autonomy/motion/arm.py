@@ -1,4 +1,7 @@
-"""x"""
+"""The arm for planning: poses above a point, with the telescope where it is fastest or most compact.
+
+Inputs: one machine with a load.  Failure: ``Unreachable``.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +13,25 @@ import numpy as np
 from autonomy.motion.arm_kinematics import STOP_MARGIN, ArmKinematics
 from autonomy.motion.pose import Pose
 from autonomy.motion.telescope import fastest_extension
-from machine.joints import Joint
 from machine.geometry.kinematics import Unreachable
-from machine.profile import Profile
 from machine.geometry.sag import aim_free
+from machine.joints import Joint
+from machine.profile import Profile
 
 SLEW_MARGIN_RAD: Final = 0.01
 _EXTENSION_CACHE_GRID_M: Final = 0.1
-"""Places are as good as each other for the telescope within this."""
+"""Grid of the cache of extensions: places within one cell share an extension."""
 DEXTEROUS_STRETCH: Final = 0.88
-"""Distance of the pin from the boom pin over the length of the straight arm that leaves speed in all
-directions.
-"""
+"""Distance of the pin from the boom pin, as a share of the straight arm's length, that leaves speed in all
+directions."""
 
 
 class Arm(ArmKinematics):
-    """x"""
+    """One machine with a load [kg] in its grapple, prepared for planning.
+
+    ``free_telescope``: `pose_above` chooses the extension from which the crane gets over the bunk fastest; otherwise it
+    works like `compact_pose_above`.
+    """
 
     def __init__(self, profile: Profile, load_kg: float = 0.0, free_telescope: bool = True) -> None:
         super().__init__(profile, load_kg)
@@ -37,15 +43,17 @@ class Arm(ArmKinematics):
         return self if load_kg == self.load_kg else Arm(self.profile, load_kg, self._free_telescope)
 
     def pose_above(self, x: float, y: float, low_z_m: float, high_z_m: float) -> Pose:
-        """The pose above a point at ``low_z_m`` whose telescope also serves at ``high_z_m``; rotator at 0.
+        """The pose above a point at ``low_z_m`` whose extension also serves at ``high_z_m``; rotator at 0.
 
         Raises:
-            Unreachable: with the reason.
+            Unreachable: the point is out of reach at one of the heights.
         """
         if not self._free_telescope:
             return self.compact_pose_above(x, y, low_z_m, high_z_m)
         try:
-            return self._pose_with_extension(x, y, low_z_m, high_z_m, self._fastest_extension(hypot(x, y), low_z_m, high_z_m))
+            return self._pose_with_extension(
+                x, y, low_z_m, high_z_m, self._fastest_extension(hypot(x, y), low_z_m, high_z_m)
+            )
         except Unreachable:
             return self.compact_pose_above(x, y, low_z_m, high_z_m)
 
@@ -53,7 +61,7 @@ class Arm(ArmKinematics):
         """The same with the telescope out only as far as leaves the arm speed in all directions there.
 
         Raises:
-            Unreachable: with the reason.
+            Unreachable: the point is out of reach at one of the heights.
         """
         r = hypot(x, y) - self._kin.a1_m
         stretch = max(hypot(r, z - self._kin.d1_m) for z in (low_z_m, high_z_m)) / DEXTEROUS_STRETCH
@@ -65,19 +73,25 @@ class Arm(ArmKinematics):
         slew, _, _, ext = aim_free(self.profile, x, y, low_z_m, wish_m, self.load_kg)
         low, high = self._limits[Joint.SLEW]
         if not low + SLEW_MARGIN_RAD <= slew <= high - SLEW_MARGIN_RAD:
-            raise Unreachable(f"point ({x:.2f}, {y:.2f}) m is at the stop of the slew")
+            raise Unreachable(f"point ({x:.2f}, {y:.2f}) m is at the stop of the slew", "motion.at-slew-stop")
         pose = Pose(slew, hypot(x, y), low_z_m, ext, 0.0)
         heights = high_z_m, low_z_m, 0.5 * (low_z_m + high_z_m), high_z_m
         self.joints(np.array([pose.at_height(z) for z in heights]))
         return pose
 
     def _fastest_extension(self, r_m: float, low_z_m: float, high_z_m: float) -> float:
-        """The telescope's best extension at a distance, m, about: for the way up and over the bunk."""
-        key = round(r_m / _EXTENSION_CACHE_GRID_M), round(low_z_m / _EXTENSION_CACHE_GRID_M), round(high_z_m / _EXTENSION_CACHE_GRID_M)
+        """The extension from which the crane gets up and over the bunk fastest, from a horizontal distance, m."""
+        key = (
+            round(r_m / _EXTENSION_CACHE_GRID_M),
+            round(low_z_m / _EXTENSION_CACHE_GRID_M),
+            round(high_z_m / _EXTENSION_CACHE_GRID_M),
+        )
         if key not in self._extension_cache:
             r, low, high = (k * _EXTENSION_CACHE_GRID_M for k in key)
             down, up = (Pose(0.0, r, z, 0.0, 0.0) for z in (low, high))
-            self._extension_cache[key] = fastest_extension(self, down, up, up._replace(r_m=hypot(*self.profile.bunk.center_m)))
+            self._extension_cache[key] = fastest_extension(
+                self, down, up, up._replace(r_m=hypot(*self.profile.bunk.center_m))
+            )
         if (found := self._extension_cache[key]) is None:
-            raise Unreachable("no extension serves at both heights")
+            raise Unreachable("no extension serves at both heights", "motion.no-common-extension")
         return found

@@ -1,4 +1,9 @@
-"""x"""
+"""Kinematics and limits of the arm for planning: poses of the hanger pin, their joints, and the limits with margin.
+
+A pose is ``(slew_rad, r_m, z_m, ext_m, rot_rad)``: the place of the pin, the extension (the redundancy) and the
+rotator. A straight line in poses is a straight line in the crane's plane while it slews, so a grapple keeps its
+height.  The pin is its true place: where the profile knows the column's sag, that of crane and load is compensated.
+"""
 
 from __future__ import annotations
 
@@ -9,30 +14,30 @@ from typing import Final
 import numpy as np
 
 from autonomy.motion.pose import Pose
-from machine.joints import JOINTS, Joint
 from machine.geometry.kinematics import Unreachable
+from machine.geometry.sag import AIM_TOLERANCE_M, FOOT_SHARE, GRAVITY_M_S2, MAX_AIM_ITERATIONS, aim, true_pin
+from machine.joints import JOINTS, Joint
 from machine.profile import Profile, joint_limits
-from machine.geometry.sag import FOOT_SHARE, GRAVITY_M_S2, NEAR_M, ROUNDS, aim, true_pin
 
 SPEED_SHARE: Final = 0.99
 ACCELERATION_SHARE: Final = 0.96
 FLOW_SHARE: Final = 0.95
-"""Shares of the profile's limits that a plan uses.  Speeds and accelerations keep a margin for rounding only, as a law
-may go beyond them to catch up; of the pump's oil it needs the rest itself.
+"""Shares of the profile's limits that a plan uses.  Speeds and accelerations keep a margin for rounding only, as the
+joint law may exceed them to catch up; it needs the rest of the pump's flow for that, too.
 """
 SAMPLED_ACCELERATION_SHARE: Final = 0.99
-"""The same of the samples of a single leg: cubics between them overshoot where the acceleration turns, and the margin
-of `ACCELERATION_SHARE` is there to bear that; slowing the whole leg for it would undo what its swing was planned for.
+"""The same for the samples of a single leg: cubics between them overshoot where the acceleration turns, and the margin
+of `ACCELERATION_SHARE` absorbs that; slowing the whole leg would spoil its swing compensation.
 """
 STOP_MARGIN: Final = 0.005
-"""How far from its stops a joint is planned to stay, rad (EXT m): curves overshoot their points a little, and a
-controller refuses what leaves the range by anything.  A motion that begins nearer may do so."""
+"""Planned distance of a joint from its stops, rad (EXT m): curves overshoot their points a little, and a controller
+refuses any setpoint outside the range.  A motion that begins nearer may stay there."""
 STOP_ROUNDING: Final = 1e-9
-"""Rounding of a joint at its stop."""
+"""Rounding tolerance of a joint at its stop."""
 
 
 class ArmKinematics:
-    """x"""
+    """Kinematics and limits of one machine with a load [kg] in its grapple."""
 
     def __init__(self, profile: Profile, load_kg: float = 0.0) -> None:
         self.profile, self.load_kg = profile, load_kg
@@ -46,7 +51,7 @@ class ArmKinematics:
         self._pump_m3_s = FLOW_SHARE * profile.hydraulics.pump_flow_m3_s
 
     def pump_load(self, q: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Flow that joint velocities (n, 5) at positions (n, 5) take, over what a plan may ask of the pump, (n,)."""
+        """Pump flow of joint velocities (n, 5) at positions (n, 5), as a share of what a plan may use, (n,)."""
         flow = np.zeros(len(q))
         for j, valve in enumerate(self._valves):
             per_speed = np.where(velocity[:, j] >= 0.0, valve.flow_plus, valve.flow_minus)
@@ -65,9 +70,9 @@ class ArmKinematics:
         return pose.r_m * cos(theta), pose.r_m * sin(theta)
 
     def joints(self, poses: np.ndarray) -> np.ndarray:
-        """Joint vectors (n, 5) of poses (n, 5).
+        """Joint vectors (n, 5) of poses (n, 5), with the sag compensated.
 
-        The first is where a motion begins: it may be at a stop, from which the others keep away.
+        The first pose is where a motion begins: it may be at a stop, from which the others keep away.
 
         Raises:
             Unreachable: a pose is outside the joint limits.
@@ -76,19 +81,19 @@ class ArmKinematics:
         return self._joints_or_reason(poses) if np.any(outside) else q
 
     def _sag_compensated(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """All at once, and which are out of reach: `machine.geometry.sag.aim` for arrays."""
+        """Joints of all poses at once, and which are out of reach: `machine.geometry.sag.aim` for arrays."""
         q, outside = self.straight_column_joints(poses)
         if (sag := self.profile.sag) is None:
             return q, outside
         kin, at = self._kin, poses
-        for _ in range(ROUNDS):
+        for _ in range(MAX_AIM_ITERATIONS):
             head = kin.a1_m + kin.a2_m * np.cos(q[:, Joint.LIFT] + kin.theta2_offset_rad)
             r, up = at[:, 1], at[:, 2] - FOOT_SHARE * kin.d1_m
             weighed = sag.pin_rad_m + sag.load_rad_nm * GRAVITY_M_S2 * self.load_kg
             lean = sag.head_rad_m * head + weighed * r - sag.rest_rad
             c, s = np.cos(lean), np.sin(lean)
             off = np.column_stack([poses[:, 1] - r * c - up * s, poses[:, 2] - FOOT_SHARE * kin.d1_m - up * c + r * s])
-            if np.any(outside) or np.max(np.abs(off)) < 0.5 * NEAR_M:
+            if np.any(outside) or np.max(np.abs(off)) < 0.5 * AIM_TOLERANCE_M:
                 break
             at = at.copy()
             at[:, 1:3] += off
@@ -96,7 +101,7 @@ class ArmKinematics:
         return q, outside
 
     def _joints_or_reason(self, poses: np.ndarray) -> np.ndarray:
-        """The same, to say what is in the way."""
+        """Joints pose by pose, which raises with the reason."""
         sag, out, limits = self.profile.sag, np.empty_like(poses), self._limits
         for i, (slew, r, z, ext, rot) in enumerate(poses.tolist()):
             theta = slew + self._kin.theta1_offset_rad
@@ -115,15 +120,15 @@ class ArmKinematics:
         return np.minimum(inner, at), np.maximum(outer, at)
 
     def approximate_joints(self, poses: np.ndarray) -> np.ndarray:
-        """The same all at once, as if the column stood straight: to look at many ways, not to drive one."""
+        """Joints of poses without sag, to compare many paths; raises ``Unreachable``."""
         q, outside = self.straight_column_joints(poses)
         if np.any(outside):
-            self.joints(poses[np.argmax(outside)][None])  # says what is in the way
-            raise Unreachable("a pose of the way is at the edge of the crane's reach")
+            self.joints(poses[np.argmax(outside)][None])  # raises with the reason
+            raise Unreachable("a pose of the path is at the edge of the crane's reach", "motion.edge-of-reach")
         return q
 
     def straight_column_joints(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Joint vectors (n, 5) of poses (n, 5), the column straight, and which of them are out of reach (n,)."""
+        """Joint vectors (n, 5) of poses (n, 5) without sag, and which of them are out of reach (n,)."""
         kin, (slew, r, z, ext, rot) = self._kin, poses.T
         boom, length = kin.a2_m, kin.d4_m + ext
         ahead, up = r - kin.a1_m, z - kin.d1_m

@@ -1,8 +1,8 @@
-"""Whether a motion is clear: what is asked for beside everything that stands, with the swing that the motion causes.
+"""Clearance of a motion from all obstacles, with the swing of the grapple that the motion causes.
 
-A part keeps a margin; near the ends of a motion it may be as near to a thing as it is there, for a grapple goes into
-bunks and over logs.  The hanging grapple leans as a pendulum of the shortest and of the longest period would under
-this very pin.  No clock, no randomness.
+Every part keeps a margin; near the ends of a motion it may be as near to an obstacle as it is there, for a grapple goes
+into bunks and over logs.  The hanging grapple leans as a pendulum of the shortest and of the longest period would under
+this pin.  No clock, no randomness.
 """
 
 from __future__ import annotations
@@ -16,32 +16,35 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.distances import obstacle_distances, motion_between_samples
-from autonomy.motion.obstacles import HeldLog, CollisionScene, swept_capsules
+from autonomy.motion.distances import motion_between_samples, obstacle_distances
+from autonomy.motion.obstacles import CollisionScene, HeldLog, swept_capsules
 from autonomy.motion.time_law import PENDULUM_S
 from autonomy.motion.trajectory import Trajectory
 
 MARGIN_M: Final = 0.10
-"""Least clearance on the way, beyond the swing that is foreseen; near its ends a part may be as near to a thing as it
+"""Least clearance along the path, beyond the predicted swing; near its ends a part may be as near to an obstacle as it
 is there."""
 ASSUMED_SWING_RAD: Final = 0.06
-"""Lean of the hanging grapple that a way has room for before its law is known."""
+"""Lean of the hanging grapple for which a path leaves room before its time law is known."""
 DEPARTURE_ZONE_M: Final = 1.2
-"""How far from its ends a way may still be near what is near there."""
+"""Distance from its ends within which a path may stay as near to obstacles as it is there."""
 CONTACT_ALLOWANCE_M: Final = 0.02
-"""What is that near at an end may also come a little nearer: it is gripped or lies there."""
+"""An obstacle this near at an end may also come this much nearer: it is gripped or lies there."""
 SAMPLE_COUNT: Final = 49
 BROAD_PHASE_M: Final = 0.8
-"""Beyond this from all that moves a thing is not looked at; more than radii, margin and sway together."""
+"""Obstacles farther than this from all that moves are ignored; more than radii, margin and swing together."""
 _DAMPING_RATIO: Final = 0.03
 
 
-def clearance_reserve(arm: Arm, motion: Trajectory, around: CollisionScene, held: HeldLog | None = None) -> tuple[float, str]:
-    """By how much any motion is clearer than asked for [m], negative where it is too near, and of what from what."""
+def clearance_reserve(
+    arm: Arm, motion: Trajectory, scene: CollisionScene, held: HeldLog | None = None
+) -> tuple[float, str]:
+    """Least clearance of a motion beyond what is required [m], negative where it is too near, and a sentence about
+    it."""
     time_s = np.linspace(0.0, motion.duration_s, SAMPLE_COUNT)
     q = np.array([motion.at(t)[0] for t in time_s])
     pin = pin_positions(arm, np.array([arm.pose(row) for row in q.tolist()]))
-    found, why, _ = evaluate_clearance(arm, q, pin, around, held, time_s[1])
+    found, why, _ = evaluate_clearance(arm, q, pin, scene, held, time_s[1])
     return found, why
 
 
@@ -52,7 +55,7 @@ def pin_positions(arm: Arm, poses: np.ndarray) -> np.ndarray:
 
 
 def _predicted_swing(pin: np.ndarray, step_s: float) -> np.ndarray:
-    """Lean of the hanging grapple [rad] under a pin (n, 3) that moves in steps of time, (pendulums, n, 2)."""
+    """Lean of the hanging grapple [rad] under a pin (n, 3) sampled every ``step_s``, (pendulums, n, 2)."""
     fine = np.linspace(0.0, len(pin) - 1.0, (len(pin) - 1) * 4 + 1)
     curve = CubicSpline(np.arange(len(pin)), pin[:, :2], bc_type="clamped")
     push = curve(fine, 2) / step_s**2 / 9.81
@@ -66,12 +69,12 @@ def _predicted_swing(pin: np.ndarray, step_s: float) -> np.ndarray:
 
 
 def evaluate_clearance(
-    arm: Arm, q: np.ndarray, pin: np.ndarray, around: CollisionScene, held: HeldLog | None, step_s: float | None
+    arm: Arm, q: np.ndarray, pin: np.ndarray, scene: CollisionScene, held: HeldLog | None, step_s: float | None
 ) -> tuple[float, str, int]:
-    """By how much the least clearance is over (negative: under) what is asked for, of what from what, and where.
+    """Least clearance beyond what is required [m] (negative: too near), a sentence about it, and the sample.
 
-    ``step_s``: time between samples; None where no time is known yet, with room for some swing.  Beyond what is asked
-    for, what is given may be less than it is.
+    ``step_s``: time between samples; None before the time law is known, with room for an assumed swing.  Where the
+    clearance suffices, the value may be less than the true one.
     """
     body = swept_capsules(arm.profile, q, pin, held)
     deep = body.depth(body.b)
@@ -83,8 +86,8 @@ def evaluate_clearance(
         room = room + np.where(body.hangs, ASSUMED_SWING_RAD * np.max(deep[..., 0], axis=0), 0.0)
     room = room * left[:, None]
     low, high = np.min(np.minimum(body.a, body.b), axis=(0, 1)), np.max(np.maximum(body.a, body.b), axis=(0, 1))
-    things = around.arrays.near(low - BROAD_PHASE_M, high + BROAD_PHASE_M)
-    # All samples with every lean, and both ends once more as they stand, at once.
+    things = scene.arrays.near(low - BROAD_PHASE_M, high + BROAD_PHASE_M)
+    # All samples with every lean, and both ends as they stand, at once.
     leans = [] if step_s is None else [body.shifted(lean * depth, depth) for lean in _predicted_swing(pin, step_s)]
     bodies = [*(leans or [body]), body.rows([0, -1])]
     whole = replace(body, a=np.concatenate([b.a for b in bodies]), b=np.concatenate([b.b for b in bodies]))
@@ -99,12 +102,13 @@ def evaluate_clearance(
 
 
 def _required_clearance(ends: np.ndarray, away: list[np.ndarray], room: np.ndarray) -> np.ndarray:
-    """The clearance asked for (n, m, k), given what it is at both ends (2, m, k) and how far samples are from each.
+    """The required clearance (n, m, k) from that at both ends (2, m, k) and the samples' distances from each end.
 
-    It is the margin, or near an end what there is at that end: a part may leave a thing at which it stands.
+    It is the margin, or near an end the clearance at that end: a part may leave an obstacle at which it stands.
     """
     need = np.full((len(room), *ends.shape[1:]), MARGIN_M)
     for here, far in zip(ends - CONTACT_ALLOWANCE_M, away, strict=True):
         close = far < DEPARTURE_ZONE_M
         need[close] = np.minimum(need[close], here)
-    return need + room[:, :, None]
+    result: np.ndarray = need + room[:, :, None]
+    return result

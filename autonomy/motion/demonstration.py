@@ -1,8 +1,8 @@
-"""Demonstrations: what an operator's hands did with the crane, cut out of a recording of its bus.
+"""Demonstrations: an operator's motions of the crane, segmented from a recording of its bus.
 
-Encoder frames become joint positions over time, smoothed without delay; a motion begins where a joint begins to move
-and ends where all of them stand for a while.  Motions that bring the pin nowhere (corrections, levers tried out) teach
-nothing and are left out.  A file of demonstrations is text: a line of names, then numbers, motions separated by their
+Encoder frames become joint positions over time, smoothed without delay.  A motion begins where a joint begins to move
+and ends where all of them rest for a while.  Motions that do not move the pin (corrections, tests of the levers) are
+left out. A file of demonstrations is text: a comment, column names, then numbers, motions told apart by their
 number.  No clock; equal frames give equal demonstrations.
 """
 
@@ -17,10 +17,11 @@ import numpy as np
 
 from can_dbc.dbc.codec import Database
 from can_dbc.frame import Frame
-from machine.sensing.encoder import position_from_counts
-from machine.joints import JOINTS, Joint
 from machine.geometry.kinematics import pin_position
-from machine.profile import Profile, joint
+from machine.joints import JOINTS, Joint
+from machine.profile import Encoder, Profile, joint
+from machine.sensing.encoder import position_from_counts
+from runtime.errors import CodedError
 
 AXES: Final = (Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT)
 """The joints of a demonstration (paper B: q1 to q4)."""
@@ -28,7 +29,7 @@ GRID_S: Final = 0.05
 SMOOTHING_SIGMA_S: Final = 0.15
 """Standard deviation of the smoothing: shorter than a hand's motion, longer than its tremor."""
 MOVING_SHARE: Final = 0.03
-"""Share of a joint's greatest speed from which it moves."""
+"""A joint moves from this share of its greatest speed on."""
 PAUSE_S: Final = 0.7
 """A rest at least this long ends a motion; shorter ones are hesitation within it."""
 MIN_PIN_TRAVEL_M: Final = 1.0
@@ -36,8 +37,8 @@ MIN_DURATION_S: Final = 1.5
 _CSV_HEADER: Final = ("motion", "time_s", "slew_rad", "lift_rad", "tilt_rad", "ext_m")
 
 
-class RecordingRefused(ValueError):
-    """A recording or a file without demonstrations; the text says what is missing."""
+class RecordingRefused(CodedError, ValueError):
+    """A recording or a file without demonstrations; the sentence says what is missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,50 +50,58 @@ class JointTrack:
 
 
 def joint_track(profile: Profile, database: Database, frames: Iterable[Frame]) -> JointTrack:
-    """The joints over time from the encoder frames of a crane bus, raw, every `GRID_S` from the first to the last.
+    """The joints over time from the encoder frames of a crane bus, unsmoothed, every `GRID_S` from first to last.
 
     Raises:
-        RecordingRefused: an encoder is never heard.
+        RecordingRefused: an encoder is missing, or the recording is too short.
     """
-    encoders = [joint(profile, j).encoder for j in AXES]
-    missing = next((j for j, e in zip(AXES, encoders, strict=True) if e is None), None)
-    if missing is not None:
-        raise RecordingRefused(f"the {missing.name.lower()} of {profile.name} has no encoder to learn from")
+    encoders: list[Encoder] = []
+    for j in AXES:
+        encoder = joint(profile, j).encoder
+        if encoder is None:
+            raise RecordingRefused(
+                "demonstration.no-encoder", f"the {j.name.lower()} of {profile.name} has no encoder to learn from"
+            )
+        encoders.append(encoder)
     codecs = {database.messages[e.message].key: (i, e, database.messages[e.message]) for i, e in enumerate(encoders)}
-    heard: list[tuple[list[int], list[float]]] = [([], []) for _ in AXES]
+    samples: list[tuple[list[int], list[float]]] = [([], []) for _ in AXES]
     for stamp_ns, key, data in frames:
         found = codecs.get(key)
         if found is None or len(data) != found[2].length:
             continue
         i, encoder, codec = found
-        if heard[i][0] and stamp_ns <= heard[i][0][-1]:
+        if samples[i][0] and stamp_ns <= samples[i][0][-1]:
             continue
-        heard[i][0].append(stamp_ns)
+        samples[i][0].append(stamp_ns)
         counts = int(codec.named(codec.decode(data))["Position"])
-        heard[i][1].append(position_from_counts(encoder, counts))
-    for j, e, (stamps, _) in zip(AXES, encoders, heard, strict=True):
+        samples[i][1].append(position_from_counts(encoder, counts))
+    for j, e, (stamps, _) in zip(AXES, encoders, samples, strict=True):
         if len(stamps) < 2:
-            raise RecordingRefused(f"the recording holds no frames {e.message} of the {j.name.lower()} encoder")
-    begin, end = max(h[0][0] for h in heard), min(h[0][-1] for h in heard)
+            raise RecordingRefused(
+                "demonstration.encoder-missing",
+                f"the recording holds no frames {e.message} of the {j.name.lower()} encoder",
+            )
+    begin, end = max(h[0][0] for h in samples), min(h[0][-1] for h in samples)
     if end - begin < MIN_DURATION_S * 1e9:
-        raise RecordingRefused(f"the recording holds {max(0, end - begin) * 1e-9:.1f} s of all encoders together")
+        seconds = max(0, end - begin) * 1e-9
+        raise RecordingRefused("demonstration.too-short", f"the recording holds only {seconds:.1f} s with all encoders")
     time_s = np.arange(int((end - begin) * 1e-9 / GRID_S) + 1) * GRID_S
     columns = [
         np.interp(time_s, (np.array(t) - begin) * 1e-9, _unwrapped(e, v))
-        for e, (t, v) in zip(encoders, heard, strict=True)
+        for e, (t, v) in zip(encoders, samples, strict=True)
     ]
     return JointTrack(time_s, np.column_stack(columns))
 
 
-def _unwrapped(encoder, positions: list[float]) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """A slew that passes the end of its encoder's range does not jump."""
+def _unwrapped(encoder: Encoder, positions: list[float]) -> np.ndarray:
+    """Encoder positions without the jump where a slew passes the end of its encoder's range."""
     if encoder.kind != "rotary":
         return np.array(positions)
     return np.unwrap(positions, period=encoder.total_counts * encoder.unit_per_count)
 
 
 def smoothed(positions: np.ndarray, sigma_s: float = SMOOTHING_SIGMA_S) -> np.ndarray:
-    """Positions (n, m) every `GRID_S` without tremor and noise and without delay; the ends stay."""
+    """Positions (n, m) every `GRID_S` without tremor, noise and delay; the ends stay."""
     half = int(np.ceil(4.0 * sigma_s / GRID_S))
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * GRID_S / sigma_s) ** 2)
     kernel /= kernel.sum()
@@ -123,7 +132,7 @@ def segment_motions(profile: Profile, whole: JointTrack) -> tuple[JointTrack, ..
 
 
 def format_demonstrations(profile_name: str, motions: Sequence[JointTrack], every: int = 2) -> str:
-    """Demonstrations as a file: names in a comment and a head, then every ``every``-th sample."""
+    """Demonstrations as the text of a file, with every ``every``-th sample."""
     lines = [f"# demonstrations of {profile_name}; joint positions as recorded, smoothed", ",".join(_CSV_HEADER)]
     for number, motion in enumerate(motions, 1):
         keep = sorted({*range(0, len(motion.time_s), every), len(motion.time_s) - 1})
@@ -133,19 +142,28 @@ def format_demonstrations(profile_name: str, motions: Sequence[JointTrack], ever
 
 
 def read_demonstrations(path: Path) -> tuple[str, tuple[JointTrack, ...]]:
-    """Name of the machine and the motions of a file; raises RecordingRefused."""
+    """Name of the machine and the motions of a file.
+
+    Raises:
+        RecordingRefused: the file cannot be read or is no file of demonstrations.
+    """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise RecordingRefused(f"{path} cannot be read ({error})") from None
+        raise RecordingRefused("demonstration.unreadable", f"{path} cannot be read ({error})") from None
     if len(lines) < 3 or not lines[0].startswith("# demonstrations of ") or lines[1] != ",".join(_CSV_HEADER):
-        raise RecordingRefused(f"{path} is no file of demonstrations; give a recording or a file that `learn` reads")
+        raise RecordingRefused(
+            "demonstration.wrong-format",
+            f"{path} is no file of demonstrations; give a recording or a file written by `learn`",
+        )
     name = lines[0].removeprefix("# demonstrations of ").split(";")[0].strip()
     try:
         table = np.array([[float(x) for x in line.split(",")] for line in lines[2:] if line])
         assert table.shape[1] == len(_CSV_HEADER) and np.all(np.isfinite(table))
     except (ValueError, AssertionError, IndexError):
-        raise RecordingRefused(f"{path} holds a line that is not {len(_CSV_HEADER)} numbers") from None
+        raise RecordingRefused(
+            "demonstration.malformed-line", f"{path} holds a line that is not {len(_CSV_HEADER)} numbers"
+        ) from None
     motions = []
     for number in np.unique(table[:, 0]):
         rows = table[table[:, 0] == number]
@@ -156,5 +174,5 @@ def read_demonstrations(path: Path) -> tuple[str, tuple[JointTrack, ...]]:
 
 
 def joint_vectors(motion: JointTrack) -> np.ndarray:
-    """Joint vectors (n, 5) of a motion; the rotator, which nobody measures, at 0."""
+    """Joint vectors (n, 5) of a motion; the unmeasured rotator at 0."""
     return np.column_stack([motion.position, np.zeros((len(motion.position), len(JOINTS) - len(AXES)))])

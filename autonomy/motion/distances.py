@@ -1,7 +1,7 @@
-"""How near a moving crane comes to what stands about: swept rods against boxes, rods and the ground.
+"""Distances between a moving crane and obstacles: swept capsules against boxes, capsules and the ground.
 
-Distances are exact for every sample, negative inside of rods and the ground (0 inside of a box's core), and vectorised;
-what a part does between two samples is covered by its greatest movement.  m.
+Distances are exact for every sample, negative inside capsules and the ground (0 inside a box), and vectorized; the
+motion of a part between two samples is bounded by its greatest displacement.  Lengths in m.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.motion.obstacles import Ground, ObstacleArrays, CollisionScene, SweptCapsules
+from autonomy.motion.obstacles import CollisionScene, Ground, ObstacleArrays, SweptCapsules
 
 _SMALL: Final = 1e-12
 
@@ -26,14 +26,15 @@ def segment_segment(p0: np.ndarray, p1: np.ndarray, q0: np.ndarray, q1: np.ndarr
     t = np.clip((b * s + e) / np.maximum(c, _SMALL), 0.0, 1.0)
     s = np.clip((b * t - d) / np.maximum(a, _SMALL), 0.0, 1.0)
     t = np.clip((b * s + e) / np.maximum(c, _SMALL), 0.0, 1.0)
-    return np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
+    result: np.ndarray = np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
+    return result
 
 
 def segment_box(p0: np.ndarray, p1: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Distances of segments (..., 3) and boxes of half edges (..., 3) about the origin, exact; 0 inside.
 
-    The squared distance along the segment is convex and a quadratic between the places where it crosses a face's
-    plane: its slope, a broken line, is looked up there.
+    The squared distance along the segment is convex, and quadratic between the crossings of the faces' planes; the zero
+    of its piecewise linear slope is the nearest point.
     """
     way = p1 - p0
     safe = np.where(np.abs(way) > _SMALL, way, 1.0)
@@ -44,7 +45,8 @@ def segment_box(p0: np.ndarray, p1: np.ndarray, half: np.ndarray) -> np.ndarray:
 
     def out(at: np.ndarray) -> np.ndarray:
         points = p0[..., None, :] + at[..., None] * way[..., None, :]
-        return points - np.clip(points, -half[..., None, :], half[..., None, :])
+        result: np.ndarray = points - np.clip(points, -half[..., None, :], half[..., None, :])
+        return result
 
     slope = np.sum(out(t) * way[..., None, :], axis=-1)
     k = np.clip(np.sum(slope < 0.0, axis=-1), 1, t.shape[-1] - 1)[..., None]
@@ -52,27 +54,29 @@ def segment_box(p0: np.ndarray, p1: np.ndarray, half: np.ndarray) -> np.ndarray:
     t0, t1 = np.take_along_axis(t, k - 1, -1), np.take_along_axis(t, k, -1)
     rise = s1 - s0
     best = np.where(s0 >= 0.0, t0, np.where(s1 <= 0.0, t1, t0 - s0 * (t1 - t0) / np.where(rise > _SMALL, rise, 1.0)))
-    return np.linalg.norm(out(best)[..., 0, :], axis=-1)
+    result: np.ndarray = np.linalg.norm(out(best)[..., 0, :], axis=-1)
+    return result
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("...i,...i->...", a, b)
+    result: np.ndarray = np.einsum("...i,...i->...", a, b)
+    return result
 
 
-def clearances(around: CollisionScene, body: SweptCapsules, near_m: float = np.inf) -> np.ndarray:
-    """Distances (n, m, k) of m parts at n samples from the ground, the boxes and the rods (`CollisionScene.names`).
+def clearances(scene: CollisionScene, body: SweptCapsules, near_m: float = np.inf) -> np.ndarray:
+    """Distances (n, m, k) of m parts at n samples from the ground, the boxes and the capsules (`CollisionScene.names`).
 
-    Beyond ``near_m`` what is given may be less than the distance, but not less than ``near_m``.
+    Beyond ``near_m`` a value may be less than the distance, but not less than ``near_m``.
     """
-    return obstacle_distances(around.arrays, body, np.array(near_m))
+    return obstacle_distances(scene.arrays, body, np.array(near_m))
 
 
 def obstacle_distances(things: ObstacleArrays, body: SweptCapsules, near_m: np.ndarray) -> np.ndarray:
-    """The same from things as arrays; ``near_m`` broadcasts to (n, m, 1)."""
+    """The same for obstacles as arrays; ``near_m`` broadcasts to (n, m, 1)."""
     limit = near_m + body.radius[:, None]
     middle, way = (body.a + body.b) / 2, (body.b - body.a) / 2
     columns = [_height_above_ground(things.ground, body.a, body.b)]
-    # Axis by axis a part and a thing are at least as far from each other as what encloses them.
+    # Axis by axis, a part and an obstacle are at least as far apart as their bounding boxes.
     x, y, z = (middle[..., i, None] - things.center[:, i] for i in range(3))
     cos_, sin_ = things.turn.T
     x, y = cos_ * x + sin_ * y, cos_ * y - sin_ * x
@@ -95,33 +99,37 @@ def obstacle_distances(things: ObstacleArrays, body: SweptCapsules, near_m: np.n
     begin, end = things.middle[k] - things.along[k], things.middle[k] + things.along[k]
     far[i, m, k] = segment_segment(body.a[i, m], body.b[i, m], begin, end) - things.radius[k]
     columns.append(far)
-    return np.concatenate(columns, axis=2) - body.radius[:, None]
+    result: np.ndarray = np.concatenate(columns, axis=2) - body.radius[:, None]
+    return result
 
 
 def _gap_length(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Length of a gap (n, m, k) given by what it is along each axis; negative is none."""
+    """Length of a gap (n, m, k) from its components along the axes; negative components count as 0."""
     x, y, z = np.maximum(x, 0.0), np.maximum(y, 0.0), np.maximum(z, 0.0)
-    return np.sqrt(x * x + y * y + z * z)
+    result: np.ndarray = np.sqrt(x * x + y * y + z * z)
+    return result
 
 
 def _height_above_ground(ground: Ground, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Height of both ends and the middle over the ground, the least of them, (n, m, 1)."""
+    """Least height of both ends and the middle above the ground, (n, m, 1)."""
     heights = []
     for share in (0.0, 0.5, 1.0):
         p = a + share * (b - a)
         heights.append(p[..., 2] - (ground(p[..., 0], p[..., 1]) if callable(ground) else ground))
-    return np.min(np.stack(heights, axis=-1), axis=-1)[..., None]
+    result: np.ndarray = np.min(np.stack(heights, axis=-1), axis=-1)[..., None]
+    return result
 
 
 def motion_between_samples(body: SweptCapsules) -> np.ndarray:
-    """By how much a part may be nearer between two samples than at either, (n, m): half of its movement."""
+    """By how much a part may be nearer between two samples than at either, (n, m): half of its displacement."""
     move = np.maximum(np.linalg.norm(np.diff(body.a, axis=0), axis=2), np.linalg.norm(np.diff(body.b, axis=0), axis=2))
     nothing = np.zeros((1, move.shape[1]))
-    return 0.5 * np.maximum(np.concatenate([nothing, move]), np.concatenate([move, nothing]))
+    result: np.ndarray = 0.5 * np.maximum(np.concatenate([nothing, move]), np.concatenate([move, nothing]))
+    return result
 
 
-def least_clearance(around: CollisionScene, body: SweptCapsules) -> tuple[float, str, str, int]:
-    """The least clearance [m], of which part from what, and at which sample."""
-    apart = clearances(around, body)
+def least_clearance(scene: CollisionScene, body: SweptCapsules) -> tuple[float, str, str, int]:
+    """The least clearance [m], the part, the obstacle, and the sample."""
+    apart = clearances(scene, body)
     i, m, k = np.unravel_index(int(np.argmin(apart)), apart.shape)
-    return float(apart[i, m, k]), body.names[m], around.names[k], int(i)
+    return float(apart[i, m, k]), body.names[m], scene.names[k], int(i)

@@ -1,7 +1,7 @@
-"""Whose motions the crane makes: ours, clear of everything and straight to the place, or paper B's, as people showed.
+"""Motion planners behind one protocol: time-optimal clear paths, or paper B's movement primitives.
 
-An activity asks for a way from rest to rest and says what stands around and what hangs in the grapple; where no way is
-clear it is told so.  No clock, no randomness.
+An activity requests a motion from rest to rest past the obstacles of a scene, with a load in the grapple.  Failure:
+``Unreachable`` where no motion is clear.  No clock, no randomness.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import Final, Protocol
 
 from autonomy.motion.arm import Arm
 from autonomy.motion.clearance import MARGIN_M, clearance_reserve
-from autonomy.motion.movement_primitives import Primitives, PrimitiveMotions
-from autonomy.motion.obstacles import HeldLog, CollisionScene
+from autonomy.motion.movement_primitives import PrimitiveMotions, Primitives
+from autonomy.motion.obstacles import CollisionScene, HeldLog
 from autonomy.motion.path_search import PathBlocked, plan_path
 from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, travel_over
@@ -19,85 +19,109 @@ from machine.geometry.kinematics import Unreachable
 
 
 class MotionPlanner(Protocol):
-    """A way from rest to rest.
+    """Plans a motion from rest to rest.
 
-    ``direct``: it goes down to a log, and with it up, over and down into the bunk, in one; else an activity asks for
-    each of these alone.  ``free_telescope``: it is quickest with the telescope far out at a log (`Arm`).
+    ``direct``: one motion leads down to a log, or with it up, over and down into the bunk; otherwise an activity
+    requests each of these alone.  ``free_telescope``: the planner is fastest with the telescope far out at a log
+    (`Arm`).
     """
 
     @property
     def direct(self) -> bool:
-        """Whether a way may begin and end beside a log or between the stakes."""
+        """Whether a motion may begin and end beside a log or between the stakes."""
 
     @property
     def free_telescope(self) -> bool:
-        """Whether the telescope may be anywhere."""
+        """Whether the extension at a log is free."""
 
     def __call__(
-        self, arm: Arm, start: Pose, goal: Pose, around: CollisionScene, held: HeldLog | None, high_m: float, free_m: float
+        self,
+        arm: Arm,
+        start: Pose,
+        goal: Pose,
+        scene: CollisionScene,
+        held: HeldLog | None,
+        high_m: float,
+        free_m: float,
     ) -> Trajectory:
-        """The motion.  ``high_m``: where `travel_over` would pass, ``free_m`` before the goal.
+        """The motion.
+
+        ``high_m`` is the height at which `travel_over` would pass, reached ``free_m`` before the goal.
 
         Raises:
-            machine.geometry.kinematics.Unreachable: none that is clear; in one sentence.
+            machine.geometry.kinematics.Unreachable: no motion is clear.
         """
 
 
 class TimeOptimalPlanner:
-    """Ours: the fastest clear way; where none is found, always at full height, if that is clear."""
+    """The fastest clear motion; where none is found, the one at full height if that is clear."""
 
     def __init__(self, direct: bool = True) -> None:
         self.direct: Final = direct
         self.free_telescope: Final = True
 
     def __call__(
-        self, arm: Arm, start: Pose, goal: Pose, around: CollisionScene, held: HeldLog | None, high_m: float, free_m: float
+        self,
+        arm: Arm,
+        start: Pose,
+        goal: Pose,
+        scene: CollisionScene,
+        held: HeldLog | None,
+        high_m: float,
+        free_m: float,
     ) -> Trajectory:
-        """The fastest clear way."""
+        """The fastest clear motion."""
         try:
-            return plan_path(arm, start, goal, around, held).motion
+            return plan_path(arm, start, goal, scene, held).motion
         except PathBlocked as error:
             slow = _at_full_height(arm, start, goal, high_m, free_m, error)
-            if clearance_reserve(arm, slow, around, held)[0] < 0.0:
+            if clearance_reserve(arm, slow, scene, held)[0] < 0.0:
                 raise
             return slow
 
 
 class MovementPrimitivePlanner:
-    """Paper B's: movement primitives that a person showed.
+    """Paper B's movement primitives, learned from demonstrations.
 
-    They know no obstacles; one that would touch something is not driven, but the way at full height.
+    Primitives know no obstacles; where one would touch something, the motion at full height replaces it.
     """
 
     def __init__(self, primitives: Primitives) -> None:
         self.direct: Final = False
         self.free_telescope: Final = False
-        """People showed other postures."""
+        """The demonstrations have other postures."""
         self._shown = PrimitiveMotions(primitives)
 
     def __call__(
-        self, arm: Arm, start: Pose, goal: Pose, around: CollisionScene, held: HeldLog | None, high_m: float, free_m: float
+        self,
+        arm: Arm,
+        start: Pose,
+        goal: Pose,
+        scene: CollisionScene,
+        held: HeldLog | None,
+        high_m: float,
+        free_m: float,
     ) -> Trajectory:
-        """The primitive from here to there."""
-        found, trouble = [], Unreachable("")
-        # Where the telescope ends decides how well what was shown fits; it may end where it began.
+        """The primitive from start to goal."""
+        found, trouble = [], Unreachable("", "motion.primitive-blocked")
+        # The final extension decides how well the demonstrations fit; it may also stay as it is.
         for ext_m in (goal.ext_m, 0.5 * (start.ext_m + goal.ext_m), start.ext_m):
             try:
                 found.append(self._shown(arm, start, goal._replace(ext_m=ext_m)))
             except Unreachable as error:
                 trouble = error
         for motion in sorted(found, key=lambda m: m.duration_s)[:1]:
-            spare_m, why = clearance_reserve(arm, motion, around, held)
+            spare_m, why = clearance_reserve(arm, motion, scene, held)
             if spare_m >= -MARGIN_M:
                 return motion
-            trouble = Unreachable(why)
+            trouble = Unreachable(why, "motion.primitive-blocked")
         return _at_full_height(arm, start, goal, high_m, free_m, trouble)
 
 
 def _at_full_height(
     arm: Arm, start: Pose, goal: Pose, high_m: float, free_m: float, trouble: Unreachable
 ) -> Trajectory:
-    """The way at full height; raises ``trouble``, what was wrong with the better one, where it is out of reach."""
+    """The motion at full height; raises ``trouble``, the failure of the better one, where it is out of reach."""
     try:
         return travel_over(arm, start, goal, max(high_m, start.z_m, goal.z_m), free_m)
     except Unreachable:

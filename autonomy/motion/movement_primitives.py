@@ -1,9 +1,9 @@
-"""Motions between bunk and log as a person showed them: the primitives of one machine, and Algorithm 1 of paper B.
+"""Movement primitives of one machine between bunk and log, and Algorithm 1 of paper B.
 
 A primitive moves the pin in the crane's plane: slew, distance, height and telescope.  There a quasi-parabola over the
-stakes stays one whatever the goal; the slew alone is scaled, so that the other side is the mirror image
-(`autonomy.motion.dmp`).  ``out`` leads from the bunk to a log, ``back`` from it to the bunk; where only one was shown,
-the other is its reverse (paper B 3.2.5).  The rotator turns along with the motion.
+stakes keeps its shape whatever the goal; only the slew is scaled, so that the other side is the mirror image
+(`autonomy.motion.dmp`).  ``out`` leads from the bunk to a log, ``back`` from it to the bunk; where only one was
+demonstrated, the other is its reverse (paper B 3.2.5).  The rotator turns along with the motion.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ from autonomy.motion.arm import Arm
 from autonomy.motion.demonstration import JointTrack, joint_vectors
 from autonomy.motion.dmp import BASIS_COUNT, DemonstrationRefused, Dmp, learn
 from autonomy.motion.pose import Pose
-from autonomy.motion.trajectory import STEP_S, Trajectory, within_limits, smooth_progress
+from autonomy.motion.trajectory import STEP_S, Trajectory, smooth_progress, within_limits
 from can_dbc.messages.crane import GrappleCommand
 from machine.geometry.kinematics import Unreachable, reachable_extensions
 from machine.profile import Bunk, Profile
+from runtime.errors import CodedError
 
 SCHEMA: Final = 1
 BUNK_MARGIN_M: Final = 0.4
-"""A motion that ends within this of the bunk's sides ends at the bunk."""
-SHIPPED_FOLDER: Final = Path(__file__).parent / "shown"
+"""A motion that ends within this distance of the bunk's sides ends at the bunk."""
+SHIPPED_FOLDER: Final = Path(__file__).parent / "demonstration_data"
 _SCALED_AXES: Final = (True, False, False, False)
 _LIMIT_RESERVE_M: Final = 0.08
-"""How far inside its limits a telescope is that gives way to a height or a distance."""
+"""Distance from its limits of a telescope that gives way to a height or a distance."""
 
 
-class PrimitivesRefused(ValueError):
-    """A file of primitives that cannot be used; the text says why."""
+class PrimitivesRefused(CodedError, ValueError):
+    """A file of primitives that cannot be used; the sentence says why."""
 
 
 class Primitive(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -46,12 +47,12 @@ class Primitive(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: list[list[float]]
 
     def dmp(self) -> Dmp:
-        """The same as equations."""
+        """The primitive as equations."""
         return Dmp(self.duration_s, np.array(self.weights), _SCALED_AXES)
 
 
 class Primitives(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What one machine was shown: out to a log and back to the bunk."""
+    """The primitives of one machine: out to a log and back to the bunk."""
 
     schema: int
     profile: str
@@ -73,8 +74,9 @@ def is_near_bunk(bunk: Bunk, xy: Sequence[float]) -> bool:
 
 
 def split_by_direction(arm: Arm, motions: Sequence[JointTrack]) -> tuple[list[JointTrack], list[JointTrack]]:
-    """Motions out of the bunk, and into it; others, which lead nowhere near it, are left out."""
-    out, back = [], []
+    """Motions out of the bunk, and into it; others are left out."""
+    out: list[JointTrack] = []
+    back: list[JointTrack] = []
     for motion in motions:
         q = joint_vectors(motion)
         begins, ends = (is_near_bunk(arm.profile.bunk, arm.xy(arm.pose(q[i]))) for i in (0, -1))
@@ -93,8 +95,9 @@ def learn_primitives(profile: Profile, motions: Sequence[JointTrack], bases: int
     out, back = split_by_direction(arm, motions)
     if not out and not back:
         raise DemonstrationRefused(
+            "demonstration.not-at-bunk",
             f"none of the {len(motions)} motions leads between the bunk and another place; "
-            "show some from the bunk to a log and back"
+            "demonstrate some from the bunk to a log and back",
         )
     shown = [[(m.time_s, pose_track(arm, m)) for m in group] for group in (out, back)]
     for mine, other in ((0, 1), (1, 0)):
@@ -118,36 +121,45 @@ def encode(primitives: Primitives) -> bytes:
 
 
 def load(profile: Profile, path: Path | None = None) -> Primitives:
-    """The primitives in a file, by default those that ship for the machine; raises PrimitivesRefused."""
+    """The primitives in a file, by default those shipped for the machine.
+
+    Raises:
+        PrimitivesRefused: the file cannot be read or is not for this machine.
+    """
     path = path or SHIPPED_FOLDER / f"{profile.name}.json"
     hint = "learn some with `timberhand plan learn LOG --out FILE`"
     try:
         found = msgspec.json.decode(path.read_bytes(), type=Primitives)
     except OSError as error:
-        raise PrimitivesRefused(f"{path} cannot be read ({error.strerror}); {hint}") from None
+        raise PrimitivesRefused("primitives.unreadable", f"{path} cannot be read ({error.strerror}); {hint}") from None
     except msgspec.MsgspecError as error:
-        raise PrimitivesRefused(f"{path} is no file of primitives ({error}); {hint}") from None
+        raise PrimitivesRefused("primitives.malformed", f"{path} is no file of primitives ({error}); {hint}") from None
     if found.schema != SCHEMA or found.profile != profile.name:
-        raise PrimitivesRefused(f"{path} is of {found.profile}, schema {found.schema}, not of {profile.name}; {hint}")
+        raise PrimitivesRefused(
+            "primitives.other-machine",
+            f"{path} is for {found.profile}, schema {found.schema}, not for {profile.name}, schema {SCHEMA}; {hint}",
+        )
     for primitive in (found.out, found.back):
         rows = primitive.weights
         good = len(rows) == len(_SCALED_AXES) and len({len(row) for row in rows}) == 1 and len(rows[0]) >= 2
         if not good or not 0.5 < primitive.duration_s < 120.0 or not np.all(np.isfinite(primitive.weights)):
-            raise PrimitivesRefused(f"{path} holds a primitive that makes no sense; {hint}")
+            raise PrimitivesRefused(
+                "primitives.implausible", f"{path} holds a primitive with implausible weights or duration; {hint}"
+            )
     return found
 
 
 class PrimitiveMotions:
-    """A source of motions with the signature of `autonomy.motion.trajectory.travel_over`: as people move, by primitives.
+    """Motions by primitives, with the signature of `autonomy.motion.trajectory.travel_over`.
 
-    Heights that are asked for are not looked at: the way over the stakes is in what was shown.
+    The requested heights are ignored: the demonstrations contain the path over the stakes.
     """
 
     def __init__(self, primitives: Primitives) -> None:
         self._out, self._back = primitives.out.dmp(), primitives.back.dmp()
 
     def __call__(self, arm: Arm, start: Pose, goal: Pose, height_m: float = 0.0, free_m: float = 0.0) -> Trajectory:
-        """Back where the goal is at the bunk, else out.
+        """The back primitive where the goal is at the bunk, otherwise the out primitive.
 
         Raises:
             machine.geometry.kinematics.Unreachable: the motion would leave the crane's reach.
@@ -157,19 +169,19 @@ class PrimitiveMotions:
 
 
 def primitive_motion(arm: Arm, dmp: Dmp, start: Pose, goal: Pose) -> Trajectory:
-    """The motion of a primitive from rest to rest, slowed down to the arm's limits if need be; raises Unreachable."""
-    way = dmp.rollout(np.array(start[:4]), np.array(goal[:4]))
+    """The motion of a primitive from rest to rest, slowed down to the arm's limits; raises ``Unreachable``."""
+    path = dmp.rollout(np.array(start[:4]), np.array(goal[:4]))
 
     def sampled(duration_s: float) -> np.ndarray:
         time_s = np.linspace(0.0, duration_s, max(2, int(np.ceil(duration_s / STEP_S)) + 1))
         turned = start.rot_rad + smooth_progress(time_s / duration_s) * (goal.rot_rad - start.rot_rad)
-        return _joints(arm, np.column_stack([way.at(time_s, duration_s), turned]))
+        return _joints(arm, np.column_stack([path.at(time_s, duration_s), turned]))
 
-    return within_limits(arm, sampled, way.duration_s)
+    return within_limits(arm, sampled, path.duration_s)
 
 
 def _joints(arm: Arm, poses: np.ndarray) -> np.ndarray:
-    """Joints of poses; where the arm is too short or too long for a pose, its telescope gives way, smoothly."""
+    """Joints of poses; where the arm is too short or too long for a pose, its telescope gives way smoothly."""
     try:
         return arm.joints(poses)
     except Unreachable:
@@ -179,8 +191,11 @@ def _joints(arm: Arm, poses: np.ndarray) -> np.ndarray:
     for i, pose in enumerate(map(Pose._make, poses[coarse].tolist())):
         spans = reachable_extensions(arm.profile, *arm.xy(pose), pose.z_m)
         if not spans:
-            arm.joints(poses[coarse[i] : coarse[i] + 1])  # says what is in the way
-            raise Unreachable(f"the shown way leaves the crane's reach at a height of {pose.z_m:.2f} m")
+            arm.joints(poses[coarse[i] : coarse[i] + 1])  # raises with the reason
+            raise Unreachable(
+                f"the primitive leaves the crane's reach at a height of {pose.z_m:.2f} m",
+                "motion.primitive-out-of-reach",
+            )
         low[i], high[i] = min(spans, key=lambda s: max(s[0] - pose.ext_m, pose.ext_m - s[1], 0.0))
     room = np.minimum(_LIMIT_RESERVE_M, (high - low) / 2)
     ext = poses[coarse, 3]
@@ -190,7 +205,7 @@ def _joints(arm: Arm, poses: np.ndarray) -> np.ndarray:
     share = coarse / coarse[-1]
     bump = np.maximum(np.sin(np.pi * share) ** 2, 1e-3)
     shape = np.zeros(len(coarse))
-    for i in np.flatnonzero(np.abs(wanted) > 0.0):
+    for i in np.flatnonzero(np.abs(wanted) > 0.0).tolist():
         there = wanted[i] * np.minimum(bump / bump[i], 1.0)
         shape = np.where(np.abs(there) > np.abs(shape), there, shape)
     kernel = np.hanning(9)[1:-1]
@@ -202,7 +217,7 @@ def _joints(arm: Arm, poses: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A step of Algorithm 1: the motion, and what the grapple does during it and after it."""
+    """A step of Algorithm 1: the motion, and the grapple's commands during and after it."""
 
     motion: Trajectory
     meanwhile: GrappleCommand
@@ -213,7 +228,7 @@ def algorithm_1(arm: Arm, primitives: Primitives, start: Pose, target: Pose, bun
     """Paper B's Algorithm 1: from the bunk towards the log while the grapple opens, then it closes (lines 2 to 5);
     with the log to the bunk, then it opens (lines 6 to 9).
 
-    The second stage is to begin when the first has reached its target and the grapple is closed (line 7).  Raises
+    The second stage begins when the first has reached its target and the grapple is closed (line 7).  Raises
     ``Unreachable``.
     """
     move = PrimitiveMotions(primitives)

@@ -1,8 +1,8 @@
-"""What a moving crane may touch, as boxes, rods and the ground, and what of it moves, as swept rods.
+"""Collision geometry: obstacles as boxes, capsules and the ground, and the moving crane as swept capsules.
 
-Everything that moves is a rod with round ends (a capsule): boom, stick with telescope, the hanging grapple and the log
-in it.  Everything that stands still is a box that is turned about the vertical, a rod (logs, trees) or the ground.
-How near they come to each other: ``autonomy.motion.distances``.  Crane base frame, m and rad.
+Everything that moves is a capsule: boom, stick with telescope, the hanging grapple and the log in it.  Everything that
+stands still is a box turned about the vertical, a capsule (logs, trees) or the ground.  ``autonomy.motion.distances``
+computes their distances.  Crane base frame, m and rad.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.perception.log_list.observation import LogObservation
-from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m, pin_to_tong_pivot_m
+from machine.geometry.grapple import grapple_yaw, lowest_tip_below_pin_m, pin_to_jaw_pivot_m
 from machine.joints import Joint
 from machine.profile import Bunk, Profile
 
@@ -26,10 +26,10 @@ STAKE_THICKNESS_M: Final = 0.08
 FLOOR_THICKNESS_M: Final = 0.12
 FRAME_HALF_WIDTH_M: Final = 0.45
 HOOD_M: Final = (0.6, 0.65, 0.6)
-"""Where the hood begins ahead of the articulation, half its width, half its height."""
+"""Start of the hood ahead of the articulation, half its width, half its height."""
 FRONT_OVERHANG_M: Final = 0.85
 REAR_OVERHANG_M: Final = 2.0
-"""The frames beyond their axles."""
+"""Overhang of the frames beyond their axles."""
 BOOM_RADIUS_M: Final = 0.17
 STICK_RADIUS_M: Final = 0.14
 GRAPPLE_RADIUS_M: Final = 0.20
@@ -41,7 +41,7 @@ Ground = float | Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A box with a vertical edge: middle, half edges, turn about the vertical [rad]; ``name`` for sentences."""
+    """A box turned about the vertical: centre, half edges, turn [rad]; ``name`` is for sentences."""
 
     name: str
     center_m: tuple[float, float, float]
@@ -61,8 +61,8 @@ class Capsule:
 
 @dataclass(frozen=True, slots=True)
 class ObstacleArrays:
-    """What stands still as arrays: k boxes (middles, half edges, cos and sin of their turn) and j rods (middles, half
-    ways from end to end, radii); names of the ground and of them all.
+    """Obstacles as arrays: k boxes (centres, half edges, cos and sin of their turn) and j capsules (middles, half axes,
+    radii), and the names of the ground and of them all.
     """
 
     ground: Ground
@@ -75,28 +75,28 @@ class ObstacleArrays:
     radius: np.ndarray
 
     def near(self, low: np.ndarray, high: np.ndarray) -> ObstacleArrays:
-        """Without what is wholly outside of a range (3,) to (3,)."""
+        """The obstacles without those wholly outside a range (3,) to (3,)."""
         wide = np.hypot(self.half[:, 0], self.half[:, 1])
         box = np.column_stack([wide, wide, self.half[:, 2]])
         rod = np.abs(self.along) + self.radius[:, None]
         boxes = np.all((self.center - box < high) & (self.center + box > low), axis=1)
-        rods = np.all((self.middle - rod < high) & (self.middle + rod > low), axis=1)
-        names = tuple(n for n, kept in zip(self.names, [True, *boxes, *rods], strict=True) if kept)
+        capsules = np.all((self.middle - rod < high) & (self.middle + rod > low), axis=1)
+        names = tuple(n for n, kept in zip(self.names, [True, *boxes, *capsules], strict=True) if kept)
         return ObstacleArrays(
             self.ground,
             names,
             self.center[boxes],
             self.half[boxes],
             self.turn[boxes],
-            self.middle[rods],
-            self.along[rods],
-            self.radius[rods],
+            self.middle[capsules],
+            self.along[capsules],
+            self.radius[capsules],
         )
 
 
 @dataclass(frozen=True)
 class CollisionScene:
-    """What stands still about the crane."""
+    """The obstacles about the crane."""
 
     ground: Ground
     boxes: tuple[Box, ...] = ()
@@ -104,12 +104,12 @@ class CollisionScene:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The ground, the boxes, the rods: the columns of `clearances`."""
+        """The names of the ground, the boxes and the capsules: the columns of `clearances`."""
         return ("the ground", *(b.name for b in self.boxes), *(r.name for r in self.capsules))
 
     @cached_property
     def arrays(self) -> ObstacleArrays:
-        """The same as arrays."""
+        """The obstacles as arrays."""
         yaw = np.array([b.yaw_rad for b in self.boxes])
         begin, end = (np.array([getattr(r, f) for r in self.capsules]).reshape(-1, 3) for f in ("a_m", "b_m"))
         return ObstacleArrays(
@@ -126,8 +126,8 @@ class CollisionScene:
 
 @dataclass(frozen=True, slots=True)
 class HeldLog:
-    """A log in the grapple: the point gripped is ``along_m`` from its middle, its axis ``skew_rad`` off the tongs' and
-    ``tilt_rad`` off the level.
+    """A log in the grapple, gripped ``along_m`` from its middle, its axis ``skew_rad`` off the jaws' and ``tilt_rad``
+    off the level.
     """
 
     length_m: float
@@ -138,7 +138,7 @@ class HeldLog:
 
 
 def held_log(arm: Arm, pose: Pose, log: LogObservation) -> HeldLog:
-    """A log as it is held by a grapple at a pose: seen hanging in it, or lying where it will be gripped."""
+    """A log as the grapple holds it at a pose: seen hanging in it, or lying where it will be gripped."""
     yaw = grapple_yaw(arm.profile, (pose.slew_rad, 0.0, 0.0, 0.0, pose.rot_rad)) - pi / 2
     skew = remainder(atan2(log.axis[1], log.axis[0]) - yaw, pi)
     x, y = arm.xy(pose)
@@ -150,7 +150,7 @@ def held_log(arm: Arm, pose: Pose, log: LogObservation) -> HeldLog:
 
 @dataclass(frozen=True, slots=True)
 class SweptCapsules:
-    """Moving rods: ends (n, m, 3) of m parts at n samples, radii (m,), names, and which of them hang (m,)."""
+    """Moving capsules: ends (n, m, 3) of m parts at n samples, radii (m,), names, and which of them hang (m,)."""
 
     a: np.ndarray
     b: np.ndarray
@@ -163,7 +163,7 @@ class SweptCapsules:
         return SweptCapsules(self.a[at], self.b[at], self.radius, self.names, self.hangs)
 
     def shifted(self, offset: np.ndarray, depth_m: float) -> SweptCapsules:
-        """With the hanging parts swung: ``offset`` (n, 2) is how far a point ``depth_m`` below the pin is aside."""
+        """The capsules with the hanging parts swung: ``offset`` (n, 2) moves a point ``depth_m`` below the pin."""
         move = np.zeros((len(offset), 1, 3))
         move[:, 0, :2] = offset
         hanging = self.hangs[None, :, None]
@@ -173,13 +173,14 @@ class SweptCapsules:
         return SweptCapsules(top, low, self.radius, self.names, self.hangs)
 
     def depth(self, points: np.ndarray) -> np.ndarray:
-        """How far points (n, m, 3) are below the pin, (n, m, 1)."""
+        """Depth of points (n, m, 3) below the pin, (n, m, 1)."""
         pin_z = self.b[:, 1:2, 2:3]
-        return np.maximum(pin_z - points[..., 2:3], 0.0)
+        result: np.ndarray = np.maximum(pin_z - points[..., 2:3], 0.0)
+        return result
 
 
 def bunk_boxes(bunk: Bunk) -> tuple[Box, ...]:
-    """The floor, and each row of stakes as a wall: a log is to pass over it wherever they stand."""
+    """The floor, and each row of stakes as a wall: a log passes over the whole row wherever the stakes are."""
     c, s = cos(bunk.yaw_rad), sin(bunk.yaw_rad)
     x, y = bunk.center_m
     side = bunk.width_m / 2 + STAKE_THICKNESS_M / 2
@@ -223,17 +224,19 @@ def carrier_boxes(profile: Profile) -> tuple[Box, ...]:
 
 
 def log_capsules(logs: Iterable[LogObservation]) -> tuple[Capsule, ...]:
-    """Logs as rods; their round ends stay inside of them."""
-    rods = []
+    """Logs as capsules; their round ends stay inside the logs."""
+    capsules = []
     for log in logs:
         half = max(log.length_m - log.diameter_m, 0.0) / 2
         ends = ((c - half * a, c + half * a) for c, a in zip(log.center_m, log.axis, strict=True))
         a, b = zip(*ends, strict=True)
-        rods.append(Capsule(f"log {log.id}", a, b, log.diameter_m / 2))
-    return tuple(rods)
+        capsules.append(Capsule(f"log {log.id}", a, b, log.diameter_m / 2))
+    return tuple(capsules)
 
 
-def tree_capsule(x_m: float, y_m: float, radius_m: float, foot_z_m: float, height_m: float = 15.0, number: int = 1) -> Capsule:
+def tree_capsule(
+    x_m: float, y_m: float, radius_m: float, foot_z_m: float, height_m: float = 15.0, number: int = 1
+) -> Capsule:
     """A standing tree."""
     return Capsule(f"tree {number}", (x_m, y_m, foot_z_m), (x_m, y_m, foot_z_m + height_m), radius_m)
 
@@ -245,15 +248,17 @@ def collision_scene(
     ground: Ground | None = None,
     without: Iterable[int] = (),
 ) -> CollisionScene:
-    """The machine's own obstacles, the logs but for those ``without`` (the one to grasp), the trees and the ground."""
+    """The machine's own obstacles, the logs except those of ``without``, the trees and the ground."""
     left_out = set(without)
-    rods = (*log_capsules(log for log in logs if log.id not in left_out), *trees)
+    capsules = (*log_capsules(log for log in logs if log.id not in left_out), *trees)
     level = profile.workspace.ground_z_m if ground is None else ground
-    return CollisionScene(level, (*carrier_boxes(profile), *bunk_boxes(profile.bunk)), rods)
+    return CollisionScene(level, (*carrier_boxes(profile), *bunk_boxes(profile.bunk)), capsules)
 
 
-def swept_capsules(profile: Profile, q: np.ndarray, pin: np.ndarray, held: HeldLog | None, opened: bool = True) -> SweptCapsules:
-    """The crane at joints (n, 5) whose pin truly is at (n, 3), with what it holds; ``opened``: its tongs."""
+def swept_capsules(
+    profile: Profile, q: np.ndarray, pin: np.ndarray, held: HeldLog | None, opened: bool = True
+) -> SweptCapsules:
+    """The crane at joints (n, 5) with its true pin at (n, 3), and its load; ``opened``: the jaws are open."""
     kin, n = profile.kinematics, len(q)
     theta = q[:, Joint.SLEW] + kin.theta1_offset_rad
     c, s = np.cos(theta), np.sin(theta)
@@ -265,17 +270,17 @@ def swept_capsules(profile: Profile, q: np.ndarray, pin: np.ndarray, held: HeldL
     foot = at(np.full(n, kin.a1_m), np.full(n, kin.d1_m))
     elbow = at(kin.a1_m + kin.a2_m * np.cos(lift), kin.d1_m + kin.a2_m * np.sin(lift))
     # The stick reaches back behind its pin no farther than its radius; the telescope ends at the hanger.
-    yaw = q[:, Joint.SLEW] + q[:, Joint.ROT] + (grapple_yaw(profile, np.zeros(len(Joint))))
+    yaw = q[:, Joint.SLEW] + q[:, Joint.ROT] + grapple_yaw(profile, [0.0] * len(Joint))
     opening = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(n)])
-    tongs = profile.grapple.tongs
-    pivot = pin - np.array([0.0, 0.0, pin_to_tong_pivot_m(kin)])
+    jaws = profile.grapple.tongs
+    pivot = pin - np.array([0.0, 0.0, pin_to_jaw_pivot_m(kin)])
     parts: list[tuple[str, np.ndarray, np.ndarray, float, bool]] = [
         ("boom", foot, elbow, BOOM_RADIUS_M, False),
         ("stick", elbow, pin, STICK_RADIUS_M, False),
         ("grapple", pin, pivot, GRAPPLE_RADIUS_M, True),
     ]
-    half_gap = tongs.half_gap_m[0] if opened and held is None else 0.25
-    deep = tongs.tip_below_pin_m[0] if opened and held is None else lowest_tip_below_pin_m(tongs)
+    half_gap = jaws.half_gap_m[0] if opened and held is None else 0.25
+    deep = jaws.tip_below_pin_m[0] if opened and held is None else lowest_tip_below_pin_m(jaws)
     for side in (-1.0, 1.0):
         tip = pin + side * half_gap * opening - np.array([0.0, 0.0, deep - JAW_RADIUS_M])
         parts.append(("tong", pivot, tip, JAW_RADIUS_M, True))
@@ -283,7 +288,7 @@ def swept_capsules(profile: Profile, q: np.ndarray, pin: np.ndarray, held: HeldL
         turn = yaw - pi / 2 + held.skew_rad
         level, up = cos(held.tilt_rad), sin(held.tilt_rad)
         axis = np.column_stack([level * np.cos(turn), level * np.sin(turn), np.full(n, up)])
-        low = lowest_tip_below_pin_m(tongs) - held.diameter_m / 2
+        low = lowest_tip_below_pin_m(jaws) - held.diameter_m / 2
         middle = pin - held.along_m * axis - np.array([0.0, 0.0, low])
         half = max(held.length_m - held.diameter_m, 0.0) / 2
         parts.append(("log", middle - half * axis, middle + half * axis, held.diameter_m / 2, True))

@@ -1,10 +1,11 @@
-"""Ways that touch nothing: over, around or with the arm drawn in, the fastest that stays clear, from rest to rest.
+"""Search for the fastest collision-free path from rest to rest: over, around, or with the arm drawn in.
 
-A way is straight, or up, over and down, its legs overlapping in time.  Only one leg moves the pin sideways, so its law
-alone decides about the swing, and it is not disturbed by what the height does meanwhile.  First the height is found at
-which sharp corners are clear; there the overlaps are tried from the fastest on.  Each way is checked with everything
-that moves against everything that stands (`autonomy.motion.clearance`), with a margin and with the grapple leaning as
-this very motion makes it swing.  Laws are those of `autonomy.motion.time_optimal`.  No clock, no randomness.
+A path is straight, or up, over and down with legs that overlap in time.  Only one leg moves the pin sideways, so its
+time law alone decides about the swing, which the vertical motion does not disturb.  The search first finds the height
+at which a path with sharp corners is clear, and then tries the overlaps there, fastest first.  Each candidate is
+checked with everything that moves against every obstacle (`autonomy.motion.clearance`), with a margin and with the
+grapple leaning as this motion makes it swing.  Time laws come from `autonomy.motion.time_optimal`.  No clock, no
+randomness.
 """
 
 from __future__ import annotations
@@ -16,51 +17,51 @@ from typing import Final
 import numpy as np
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.clearance import SAMPLE_COUNT, evaluate_clearance, pin_positions, clearance_reserve
-from autonomy.motion.obstacles import HeldLog, CollisionScene
+from autonomy.motion.clearance import SAMPLE_COUNT, evaluate_clearance, pin_positions
+from autonomy.motion.obstacles import CollisionScene, HeldLog
 from autonomy.motion.pose import Pose
 from autonomy.motion.telescope import with_fastest_extensions
 from autonomy.motion.time_optimal import time_optimal_law
-from autonomy.motion.trajectory import Leg, Trajectory, make_leg, superposed, travel_over
-from machine.joints import Joint
+from autonomy.motion.trajectory import Leg, Trajectory, make_leg, superposed
 from machine.geometry.kinematics import Unreachable
+from machine.joints import Joint
 
 TRIES_PER_HEIGHT: Final = 8
-"""So many overlaps at one height are checked, the fastest first, before the next shape's turn."""
+"""Number of overlaps checked at one height, fastest first, before the next shape."""
 MAX_TRIES: Final = 64
-"""No more ways than so many are checked at all."""
+"""Greatest number of candidates checked in all."""
 MAX_RISE_M: Final = 4.0
-"""So far over the higher end a way is looked for, ..."""
+"""Greatest height above the higher end, ..."""
 HEIGHT_MARGINS_M: Final = (0.0, 0.4, 0.9)
-"""... and where none is clear as it swings, so much higher."""
+"""... and the additions to it where no candidate is clear as it swings."""
 _HEIGHT_STEP_M: Final = 0.05
 REACH_FACTORS: Final = (None, 0.6, 1.25)
-"""Distance from the slew axis half-way, as a share of the nearer or the farther end's: as it comes, drawn in,
-stretched out."""
+"""Distance from the slew axis half-way, relative to the nearer or the farther end: unchanged, drawn in, stretched
+out."""
 OVERLAP_SHARES: Final = (1.0, 0.7, 0.45, 0.3, 0.2, 0.08)
-"""Share of a rise that may be left when the way over begins, and of the way over when the way down begins."""
+"""Share of the rise that may be left when the lateral leg begins, and of that when the descent begins."""
 _ASSUMED_LIFT_M_S: Final = 0.7
 _ASSUMED_REACH_M_S: Final = 0.9
-"""Speeds of the pin by which ways are compared before their laws are known, ..."""
+"""Speeds of the pin by which candidates are compared before their time laws are known, ..."""
 _RAMP_SHARE: Final = 0.3
-"""... and the share of a leg in which it sets in and ends."""
+"""... and the share of a leg in which it accelerates and decelerates."""
 _POSE_COUNT: Final = 65
 _PRUNE_SHARE: Final = 0.7
-"""A way that is higher by this share of what was missing may be clear."""
+"""A candidate that is higher by this share of the missing clearance may be clear."""
 _HOPELESS_M: Final = 0.2
-"""A way that is by so much too near to a thing, with room for swing, is so however it swings: it gets no law."""
+"""A candidate that lacks more clearance than this, including room for swing, is blocked however it swings."""
 _TOLERANCE: Final = 1e-6
 _COARSE_COUNT: Final = 25
 
 
 class PathBlocked(Unreachable):
-    """No way is clear; the text says what is in the way of the best."""
+    """No path is clear; the sentence says what blocks the best one."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClearMotion:
-    """A way that is clear: the motion, its least clearance beyond what is asked for [m], its shape in words, how many
-    ways were looked at.
+    """A clear motion, its least clearance beyond what is required [m], its shape in words, and how many candidates were
+    checked.
     """
 
     motion: Trajectory
@@ -71,7 +72,7 @@ class ClearMotion:
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A way: via points, how early over and down begin, its height, its shape in words."""
+    """A path: via points, how early the lateral leg and the descent begin, its height, its shape in words."""
 
     via: tuple[Pose, ...]
     up_left: float
@@ -82,7 +83,7 @@ class _Candidate:
 
 @dataclass(frozen=True, slots=True)
 class _Failure:
-    """What one way taught: by how much it was too near, where from what, and in which half."""
+    """A rejected candidate: the missing clearance, the reason, and whether it was on the descent."""
 
     candidate: _Candidate
     short_m: float
@@ -90,8 +91,11 @@ class _Failure:
     late: bool
 
     def rules_out(self, other: _Candidate) -> bool:
-        """Whether another is no farther away where this one was too near."""
-        if other.shape != self.candidate.shape or other.height_m > self.candidate.height_m + _PRUNE_SHARE * self.short_m:
+        """Whether another candidate is no farther away where this one was too near."""
+        if (
+            other.shape != self.candidate.shape
+            or other.height_m > self.candidate.height_m + _PRUNE_SHARE * self.short_m
+        ):
             return False
         if self.late:
             return other.over_left >= self.candidate.over_left
@@ -102,58 +106,37 @@ def plan_path(
     arm: Arm,
     start: Pose,
     goal: Pose,
-    around: CollisionScene,
+    scene: CollisionScene,
     held: HeldLog | None = None,
     least_height_m: float = -np.inf,
 ) -> ClearMotion:
-    """The fastest clear way from rest at ``start`` to rest at ``goal``.
+    """The fastest clear motion from rest at ``start`` to rest at ``goal``.
 
-    ``held`` is what hangs in the grapple, empty tongs are open; ``least_height_m``: the way goes at least so high.
+    ``held`` is the log in the grapple; an empty grapple is open.  The path reaches at least ``least_height_m``.
 
     Raises:
-        Blocked: nothing is clear; in one sentence.
+        PathBlocked: no path is clear.
         machine.geometry.kinematics.Unreachable: an end is out of reach.
     """
     arm.joints(np.array([start, goal]))
-    planner = _PathSearch(arm, start, goal, around, held)
+    planner = _PathSearch(arm, start, goal, scene, held)
     top = max(start.z_m, goal.z_m)
     line = _Candidate((start, goal), 1.0, 1.0, top, "straight")
     if least_height_m <= top and planner.may_be_clear(line) and (found := planner.clear_motion(line)):
         return found
     for reach in REACH_FACTORS:
         height = planner.least_height(max(top, least_height_m), top + MAX_RISE_M, reach)
-        for more in HEIGHT_MARGINS_M if height is not None else ():
+        if height is None:
+            continue
+        for more in HEIGHT_MARGINS_M:
             if planner.tried >= MAX_TRIES:
                 break
             if found := planner.best(height + more, reach):
                 return found
     best = max(planner.failures, key=lambda f: -f.short_m, default=None)
-    reason = best.why if best else "every way leaves the crane's reach"
-    raise PathBlocked(f"no way is clear from ({_coordinates(arm, start)}) to ({_coordinates(arm, goal)}) m: {reason}")
-
-
-class ClearPathPlanner:
-    """A source of motions with the signature of `autonomy.motion.trajectory.travel_over` that stays clear of a scene.
-
-    ``patient``: `travel_over` itself is looked at as well, which takes some tenths of a second: on a level way its slower
-    laws are the shorter ones.
-    """
-
-    def __init__(self, around: CollisionScene, held: HeldLog | None = None, patient: bool = False) -> None:
-        self._around, self._held, self._patient = around, held, patient
-
-    def __call__(self, arm: Arm, start: Pose, goal: Pose, height_m: float = 0.0, free_m: float = 0.0) -> Trajectory:
-        """The fastest clear way; only ``patient`` looks at heights, the scene says how high is high enough.
-
-        Raises:
-            Blocked: nothing is clear; in one sentence.
-        """
-        ours = plan_path(arm, start, goal, self._around, self._held).motion
-        if not self._patient:
-            return ours
-        always = travel_over(arm, start, goal, max(height_m, start.z_m, goal.z_m), free_m)
-        shorter = always.duration_s < ours.duration_s
-        return always if shorter and clearance_reserve(arm, always, self._around, self._held)[0] >= 0.0 else ours
+    reason = best.why if best else "every path leaves the crane's reach"
+    ends = f"from ({_coordinates(arm, start)}) to ({_coordinates(arm, goal)}) m"
+    raise PathBlocked(f"no path is clear {ends}: {reason}", "motion.path-blocked")
 
 
 def _coordinates(arm: Arm, pose: Pose) -> str:
@@ -163,12 +146,12 @@ def _coordinates(arm: Arm, pose: Pose) -> str:
 
 @dataclass(slots=True)
 class _PathSearch:
-    """One question; what was tried, and failures."""
+    """The search for one path, with what was tried."""
 
     arm: Arm
     start: Pose
     goal: Pose
-    around: CollisionScene
+    scene: CollisionScene
     held: HeldLog | None
     tried: int = 0
     reserve_m: float = 0.0
@@ -177,7 +160,7 @@ class _PathSearch:
     extension_cache: dict[tuple[Pose, ...], tuple[Pose, ...]] = field(default_factory=dict)
 
     def least_height(self, low_m: float, high_m: float, reach: float | None) -> float | None:
-        """The least height, within a few cm, at which the way with sharp corners is clear; None where none is."""
+        """The least height, within a few cm, at which the path with sharp corners is clear; None where none is."""
         height = low_m
         while height <= high_m and self.tried < MAX_TRIES:
             sharp = self._candidate(height, reach, OVERLAP_SHARES[-1], OVERLAP_SHARES[-1])
@@ -191,44 +174,48 @@ class _PathSearch:
             height += _HEIGHT_STEP_M - spare_m
         return None
 
-    def may_be_clear(self, way: _Candidate) -> bool:
-        """Whether a law may make a way clear."""
-        poses = self._poses(way)
+    def may_be_clear(self, candidate: _Candidate) -> bool:
+        """Whether some time law may make the candidate clear."""
+        poses = self._poses(candidate)
         try:
             q = self.arm.approximate_joints(poses)
         except Unreachable:
             return False
-        spare_m, why, _ = evaluate_clearance(self.arm, q, pin_positions(self.arm, poses), self.around, self.held, None)
+        spare_m, why, _ = evaluate_clearance(self.arm, q, pin_positions(self.arm, poses), self.scene, self.held, None)
         if spare_m > -_HOPELESS_M:
             return True
         self.tried += 1
-        self.failures.append(_Failure(way, -spare_m, why, False))
+        self.failures.append(_Failure(candidate, -spare_m, why, False))
         return False
 
-    def clear_motion(self, way: _Candidate) -> ClearMotion | None:
-        """The motion of a way if it is clear as it swings."""
-        if any(failure.rules_out(way) for failure in self.failures):
+    def clear_motion(self, candidate: _Candidate) -> ClearMotion | None:
+        """The motion of a candidate if it is clear as it swings."""
+        if any(failure.rules_out(candidate) for failure in self.failures):
             return None
         try:
-            legs = self._legs(way)
+            legs = self._legs(candidate)
             time_s, poses, q = self._sampled(legs)
-            # Slowed down as a whole it will swing less than it is judged for here.
-            spare_m = self._evaluate(way, poses, q, float(time_s[1]))
-            return ClearMotion(superposed(self.arm, legs), spare_m, way.shape, self.tried) if spare_m >= 0.0 else None
+            # Slowed down as a whole, the motion swings less than assumed here.
+            spare_m = self._evaluate(candidate, poses, q, float(time_s[1]))
+            return (
+                ClearMotion(superposed(self.arm, legs), spare_m, candidate.shape, self.tried)
+                if spare_m >= 0.0
+                else None
+            )
         except Unreachable:
             return None
 
     def best(self, height_m: float, reach: float | None) -> ClearMotion | None:
-        """The fastest clear way of a shape, at this height."""
-        ways = [self._candidate(height_m, reach, u, o) for u in OVERLAP_SHARES for o in OVERLAP_SHARES]
-        seconds = self._estimated_durations(ways)
+        """The fastest clear motion of a shape at this height."""
+        candidates = [self._candidate(height_m, reach, u, o) for u in OVERLAP_SHARES for o in OVERLAP_SHARES]
+        seconds = self._estimated_durations(candidates)
         tries = self.tried + TRIES_PER_HEIGHT
         for i in np.argsort(seconds, kind="stable"):
             if not np.isfinite(seconds[i]) or self.tried >= tries:
                 break
-            if found := self.clear_motion(ways[i]):
+            if found := self.clear_motion(candidates[i]):
                 return found
-        return self.clear_motion(ways[-1])
+        return self.clear_motion(candidates[-1])
 
     def _candidate(self, height: float, reach: float | None, up_left: float, over_left: float) -> _Candidate:
         start, goal = self.start, self.goal
@@ -248,54 +235,57 @@ class _PathSearch:
         slew, ext, rot = self.arm.speed[[Joint.SLEW, Joint.EXT, Joint.ROT]]
         return np.array([slew, _ASSUMED_REACH_M_S, _ASSUMED_LIFT_M_S, ext, rot])
 
-    def _spans(self, way: _Candidate) -> tuple[np.ndarray, list[tuple[float, float]]]:
-        """The legs (k, 5), and from when to when each runs [s, about]."""
-        via = np.array(way.via)
+    def _spans(self, candidate: _Candidate) -> tuple[np.ndarray, list[tuple[float, float]]]:
+        """The legs (k, 5), and the approximate begin and end of each, s."""
+        via = np.array(candidate.via)
         legs = np.diff(via, axis=0)
         long = np.max(np.abs(legs) / self._speeds(), axis=1)
         spans, at = [], 0.0
         for i, seconds in enumerate(long):
             spans.append((at, at + seconds))
-            left = way.up_left if i == 0 else way.over_left if i == len(long) - 2 else OVERLAP_SHARES[-1]
+            left = candidate.up_left if i == 0 else candidate.over_left if i == len(long) - 2 else OVERLAP_SHARES[-1]
             at += seconds * (1.0 - left)
         if len(spans) > 2:
-            # Down only when the way up is done.
+            # The descent begins only when the rise is done.
             begin = max(spans[-1][0], spans[0][1] if long[-1] > _TOLERANCE else 0.0)
             spans[-1] = begin, begin + float(long[-1])
         return legs, spans
 
-    def _legs(self, way: _Candidate) -> list[tuple[float, Leg]]:
-        """The legs of a way and when they begin; raises Unreachable."""
-        key = way.height_m, way.shape
+    def _legs(self, candidate: _Candidate) -> list[tuple[float, Leg]]:
+        """The legs of a candidate and when they begin; raises ``Unreachable``."""
+        key = candidate.height_m, candidate.shape
         if key not in self.leg_cache:
-            legs = [make_leg(self.arm, a, b, lambda line: time_optimal_law(self.arm, line)) for a, b in pairwise(way.via)]
+            legs = [
+                make_leg(self.arm, a, b, lambda line: time_optimal_law(self.arm, line))
+                for a, b in pairwise(candidate.via)
+            ]
             early = [dict(zip(OVERLAP_SHARES, part.times_left(*OVERLAP_SHARES), strict=True)) for part in legs]
             self.leg_cache[key] = legs, early
         legs, early = self.leg_cache[key]
         if len(legs) == 1:
             return [(0.0, legs[0])]
         up, *middle, down = legs
-        at = early[0][way.up_left]
+        at = early[0][candidate.up_left]
         timed = [(0.0, up)]
         for part in middle:
             timed.append((at, part))
             at += part.duration_s
-        after = timed[-1][0] + early[-2][way.over_left]
+        after = timed[-1][0] + early[-2][candidate.over_left]
         timed.append((max(after, up.duration_s) if down.law else after, down))
         return timed
 
     def _sampled(self, legs: list[tuple[float, Leg]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Times (n,), poses (n, 5) and joints (n, 5) of legs; raises Unreachable."""
+        """Times (n,), poses (n, 5) and joints (n, 5) of legs; raises ``Unreachable``."""
         time_s = np.linspace(0.0, max(max(at + part.duration_s for at, part in legs), _TOLERANCE), SAMPLE_COUNT)
         poses = np.array(self.start) + sum(part.progress_at(time_s - at)[:, None] * part.delta for at, part in legs)
         return time_s, poses, self.arm.approximate_joints(poses)
 
-    def _estimated_durations(self, ways: list[_Candidate]) -> np.ndarray:
-        """How long ways of the same legs take, slower where the legs together ask for too much, about (n,); infinite
-        where they are out of reach.
+    def _estimated_durations(self, candidates: list[_Candidate]) -> np.ndarray:
+        """Approximate durations (n,) of candidates of the same legs, longer where the legs together exceed the limits;
+        infinite where they are out of reach.
         """
         try:
-            timed = [self._legs(way) for way in ways]
+            timed = [self._legs(candidate) for candidate in candidates]
             end_s = np.array([max(max(at + part.duration_s for at, part in legs), _TOLERANCE) for legs in timed])
             time_s = np.linspace(0.0, end_s, _COARSE_COUNT, axis=1)
             poses = np.array(self.start) + sum(
@@ -304,37 +294,41 @@ class _PathSearch:
             )
             q, outside = self.arm.straight_column_joints(poses.reshape(-1, 5))
         except Unreachable:
-            return np.full(len(ways), np.inf)
-        q = q.reshape(len(ways), _COARSE_COUNT, 5)
+            return np.full(len(candidates), np.inf)
+        q = q.reshape(len(candidates), _COARSE_COUNT, 5)
         speed = np.diff(q, axis=1) / time_s[:, 1, None, None]
         middle = 0.5 * (q[:, 1:] + q[:, :-1])
-        flow = self.arm.pump_load(middle.reshape(-1, 5), speed.reshape(-1, 5)).reshape(len(ways), -1)
+        flow = self.arm.pump_load(middle.reshape(-1, 5), speed.reshape(-1, 5)).reshape(len(candidates), -1)
         load = np.maximum(np.max(flow, axis=1), np.max(np.abs(speed) / self.arm.speed, axis=(1, 2)))
-        reached = ~np.any(outside.reshape(len(ways), -1), axis=1)
+        reached = ~np.any(outside.reshape(len(candidates), -1), axis=1)
         return np.where(reached, end_s * np.maximum(load, 1.0), np.inf)
 
-    def _poses(self, way: _Candidate) -> np.ndarray:
-        """Poses (n, 5) evenly along a way."""
-        legs, spans = self._spans(way)
+    def _poses(self, candidate: _Candidate) -> np.ndarray:
+        """Poses (n, 5) evenly along a candidate."""
+        legs, spans = self._spans(candidate)
         time_s = np.linspace(0.0, max(max(end for _, end in spans), _TOLERANCE), 2 * _POSE_COUNT)
         line = np.array(self.start) + np.zeros((len(time_s), 1))
         for step, (begin, end) in zip(legs, spans, strict=True):
             if end - begin > _TOLERANCE:
                 line = line + _ramp((time_s - begin) / (end - begin))[:, None] * step
-        along = np.cumsum(np.append(0.0, np.linalg.norm(np.diff(line, axis=0) / self._speeds(), axis=1) + _TOLERANCE**2))
+        along = np.cumsum(
+            np.append(0.0, np.linalg.norm(np.diff(line, axis=0) / self._speeds(), axis=1) + _TOLERANCE**2)
+        )
         even = np.linspace(0.0, along[-1], _POSE_COUNT)
         return np.column_stack([np.interp(even, along, column) for column in line.T])
 
-    def _evaluate(self, way: _Candidate, poses: np.ndarray, q: np.ndarray, step_s: float | None) -> float:
+    def _evaluate(self, candidate: _Candidate, poses: np.ndarray, q: np.ndarray, step_s: float | None) -> float:
         self.tried += 1
-        spare_m, why, at = evaluate_clearance(self.arm, q, pin_positions(self.arm, poses), self.around, self.held, step_s)
+        spare_m, why, at = evaluate_clearance(
+            self.arm, q, pin_positions(self.arm, poses), self.scene, self.held, step_s
+        )
         if spare_m < 0.0:
-            self.failures.append(_Failure(way, -spare_m, why, _is_on_descent(poses, at)))
+            self.failures.append(_Failure(candidate, -spare_m, why, _is_on_descent(poses, at)))
         return spare_m
 
 
 def _is_on_descent(poses: np.ndarray, at: int) -> bool:
-    """Whether what happened at a sample is the way down's to mend: it had begun, or, on the level, is nearer."""
+    """Whether the descent decides about the clearance at a sample: it has begun, or its end is nearer."""
     top = int(np.argmax(poses[:, 2]))
     if poses[at, 2] < poses[top, 2] - _HEIGHT_STEP_M:
         return at > top
@@ -343,9 +337,12 @@ def _is_on_descent(poses: np.ndarray, at: int) -> bool:
 
 
 def _ramp(tau: np.ndarray) -> np.ndarray:
-    """From 0 to 1 with an even middle and soft ends."""
+    """From 0 to 1 with a constant slope in the middle and smooth ends."""
     t = np.clip(tau, 0.0, 1.0)
     full = 1.0 / (1.0 - _RAMP_SHARE)
     soft = 0.5 * full / _RAMP_SHARE
     middle = full * (t - 0.5 * _RAMP_SHARE)
-    return np.where(t < _RAMP_SHARE, soft * t**2, np.where(t > 1.0 - _RAMP_SHARE, 1.0 - soft * (1.0 - t) ** 2, middle))
+    result: np.ndarray = np.where(
+        t < _RAMP_SHARE, soft * t**2, np.where(t > 1.0 - _RAMP_SHARE, 1.0 - soft * (1.0 - t) ** 2, middle)
+    )
+    return result

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Pose(NamedTuple):
-    """Hanger pin in the crane's plane, telescope and rotator."""
+    """Place of the hanger pin in the crane's plane, extension of the telescope, and rotator angle."""
 
     slew_rad: float
     r_m: float

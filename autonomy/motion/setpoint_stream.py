@@ -1,9 +1,9 @@
-"""From a planned motion to setpoint datagrams: the next 400 ms of it, every 50 ms, with a lease.
+"""From a planned motion to setpoint datagrams: its next 400 ms, every 50 ms, with a lease.
 
-A motion is a function of time; a datagram shows a window of it, so that the controller can interpolate and a
-late planner does not reach the valves.  Before its start and past its end a motion stands still, so a hold is
-nothing special: its window is one pose, and ``final`` is set.  One that has come to a stop on its way is a hold, too:
-whoever thinks about the way on for longer than the lease does not end in a stop of the controller.
+A motion is a function of time.  A datagram carries a window of it, so that the controller can interpolate and a late
+planner does not reach the valves.  Before its start and past its end a motion stands still, so a hold is a window of
+one pose with ``final`` set.  A motion that has stopped on its path is a hold, too: a planner that plans for longer
+than the lease does not cause a controller stop.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Motion(Protocol):
 
     @property
     def duration_s(self) -> float:
-        """When it is at its end and at rest."""
+        """Time of its end, at rest."""
 
     def at(self, time_s: float) -> tuple[Axes, Axes]:
         """Positions and velocities [rad, m; per second] in ``Joint`` order at any time, at rest outside."""
@@ -33,8 +33,7 @@ class Motion(Protocol):
 class SetpointStream:
     """Numbers and encodes the crane setpoints of one planner.
 
-    The sequence starts at the monotonic time in ms: a planner that is started again is never taken for a
-    replay.
+    The sequence starts at the monotonic time in ms, so that the datagrams of a restarted planner are not replays.
     """
 
     def __init__(self, profile_hash: int, lease_ns: int, key: bytes | None = None) -> None:
@@ -45,7 +44,7 @@ class SetpointStream:
         self._due_ns = 0
 
     def due(self, now_ns: int) -> bool:
-        """Whether a datagram is to be sent now; then the next is due ``PERIOD_NS`` after this one was."""
+        """Whether to send a datagram now; if so, the next is due ``PERIOD_NS`` after this one was."""
         if now_ns < self._due_ns:
             return False
         on_time = self._due_ns > now_ns - PERIOD_NS // 2
@@ -53,7 +52,7 @@ class SetpointStream:
         return True
 
     def datagram(self, now_ns: int, motion: Motion, time_s: float, grapple: GrappleCommand, rate: float = 1.0) -> bytes:
-        """The window of ``motion`` that starts at its ``time_s``, now; ``rate`` is its seconds per real
+        """The datagram with the window of ``motion`` that starts now at its ``time_s``; ``rate`` is its seconds per
         second.
         """
         knots = []
@@ -74,7 +73,7 @@ class SetpointStream:
         return encode(setpoint, self._key)
 
     def spool(self, now_ns: int, function: int, knots: tuple[SpoolKnot, ...]) -> bytes:
-        """A stretch of a spool program, from now on."""
+        """The datagram with a stretch of a spool program, from now on."""
         test = SpoolTest(self._next(now_ns), self._profile_hash, now_ns, self._lease_ns, function, knots)
         return encode(test, self._key)
 

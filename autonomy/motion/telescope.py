@@ -1,8 +1,8 @@
-"""How far the telescope is out along a way: what is left free by where the pin goes decides how fast it gets there.
+"""Choice of the telescope's extension along a path, the arm's redundancy, for the shortest travel time.
 
-A crane whose telescope stands still raises, lowers and draws in its grapple with the boom, its slowest joint; an
-operator lets the telescope do most of it.  For the corners of a way those extensions are taken with which every joint,
-and the pump, has least to do.  Speeds only, no laws; no clock, no randomness.
+With a fixed telescope, a crane raises, lowers and retracts its grapple with the boom, its slowest joint; operators
+let the telescope do most of it.  The corners of a path get those extensions with which every joint, and the pump, has
+least to do. Speeds only, no time laws; no clock, no randomness.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from machine.joints import Joint
 from machine.profile import joint_limits
 
 EXTENSION_COUNT: Final = 13
-"""Extensions that are compared."""
+"""Number of extensions that are compared."""
 _SAMPLES: Final = 7
 _TOTAL_WORK_WEIGHT: Final = 0.15
-"""Weight of all joints' work beside that of the one that has most to do."""
+"""Weight of all joints' work relative to that of the busiest joint."""
 OUTER_RESERVE_M: Final = 0.2
-"""What it keeps free at its outer end where the crane goes down: for what is not where it was seen."""
+"""Reserve at the outer end for a descent, where a log may not be exactly where it was detected."""
 END_RESERVE_M: Final = 0.03
-"""What a telescope keeps free at its ends."""
+"""Reserve at both ends."""
 
 
 def candidate_extensions(arm: ArmKinematics) -> np.ndarray:
-    """Extensions to compare, m."""
+    """The extensions to compare, m."""
     low, high = joint_limits(arm.profile)[Joint.EXT]
     return np.linspace(low + END_RESERVE_M, high - END_RESERVE_M, EXTENSION_COUNT)
 
 
 def fastest_extension(arm: ArmKinematics, low: Pose, high: Pose, home: Pose) -> float | None:
-    """The extension of a pose from which the crane gets up and over home fastest; None where none serves at both
-    heights alike, with `OUTER_RESERVE_M` to spare.
+    """The extension from which the crane gets up and over ``home`` fastest; None where none serves at both heights with
+    `OUTER_RESERVE_M` to spare.
     """
     least, most = joint_limits(arm.profile)[Joint.EXT]
     free = np.linspace(least + END_RESERVE_M, most - OUTER_RESERVE_M, EXTENSION_COUNT)
@@ -53,7 +53,7 @@ def fastest_extension(arm: ArmKinematics, low: Pose, high: Pose, home: Pose) -> 
 
 
 def full_speed_times(arm: ArmKinematics, start: Pose, goal: Pose, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """How long a straight way takes at full speed, with every extension ``before`` (n,) and ``after`` it (m,), (n, m).
+    """Duration of a straight path at full speed, from every extension ``before`` (n,) to every ``after`` (m,), (n, m).
 
     Infinite where it leaves the crane's reach.
     """
@@ -72,7 +72,7 @@ def full_speed_times(arm: ArmKinematics, start: Pose, goal: Pose, before: np.nda
 
 
 def with_fastest_extensions(arm: ArmKinematics, via: Sequence[Pose]) -> tuple[Pose, ...]:
-    """The way with the extensions between its ends that leave least to do; as it came where none is in reach."""
+    """The via points with the fastest extensions between the ends; unchanged where none is in reach."""
     if len(via) < 3:
         return tuple(via)
     free = candidate_extensions(arm)

@@ -1,14 +1,14 @@
-"""How fast a way is driven: as fast as speeds, accelerations and the pump allow, and so that the grapple hangs still.
+"""Swing-free time law of a path: as fast as speeds, accelerations and the pump allow, with little residual swing.
 
-The progress along the way is a cubic B-spline over the share of the time, at rest up to the acceleration at both ends.
-Its coefficients and its duration come from a sequence of linear programs: limits and swing are linearised about the
-last solution, and the step is kept small enough, ever smaller.  Without regard to swing the result is within a few
-percent of the shortest time for the way.
+The progress along the path is a cubic B-spline over the share of the time, at rest up to the acceleration at both
+ends. Its coefficients and its duration come from sequential linear programming: limits and swing are linearized about
+the last solution, within a shrinking trust region.  Without regard to swing the result is within a few percent of the
+shortest time for the path.
 
 Swing: a pendulum of frequency w and damping ratio z below a pin of velocity v(t) keeps, after a motion from rest to
-rest of duration T, the angle |integral v(t) e^((z + i) w (t - T)) dt| w^2 / g (docs/reference/machines.md section 5).  It is bounded in both
-horizontal directions for all of `PENDULUM_S` and `DAMPING`, as no sensor tells the period and a load changes it.  No
-clock, no randomness: equal ways have equal laws.
+rest of duration T, the angle |integral v(t) e^((z + i) w (t - T)) dt| w^2 / g (docs/reference/machines.md section
+5).  It is bounded in both horizontal directions for all of `PENDULUM_S` and `DAMPING`, as no sensor measures the
+period and a load changes it.  No clock, no randomness: equal paths have equal laws.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from machine.joints import N_JOINTS
 PENDULUM_S: Final = (1.5, 1.65, 1.8, 1.95, 2.1)
 """Periods of the empty and the loaded grapple (docs/reference/machines.md section 5), with some spread."""
 DAMPING: Final = (0.0, 0.15)
-"""Damping ratios of free links and of links with friction or a brake (docs/reference/machines.md section 5).  Undamped is not the worst: where
-an earlier swing has died away, nothing is left to cancel a later one.
+"""Damping ratios of free links and of links with friction or a brake (docs/reference/machines.md section 5).
+Undamped is not the worst case: where an earlier swing has decayed, it cannot cancel a later one.
 """
 SWING_RAD: Final = 0.038
-"""What a motion may leave of swing."""
+"""Bound of the residual swing of a motion."""
 MIN_DURATION_S: Final = 0.6
 GRAVITY_M_S2: Final = 9.81
 _PIECE_COUNT: Final = 56
 """Pieces of the spline: the acceleration rises and falls within one, a few percent of the time."""
 _SAMPLE_COUNT: Final = 3 * _PIECE_COUNT
-"""Places where the limits are looked at, but for the first."""
+"""Places at which the limits are checked, without the first."""
 _ROUND_COUNT: Final = 14
 _DURATION_TRUST: Final = 0.3
 """Share by which the duration may change in the first round, ..."""
 _COEFFICIENT_TRUST: Final = 0.25
-"""... how much of that every coefficient may, ..."""
+"""... the share of that by which every coefficient may change, ..."""
 _TRUST_SHRINK: Final = 0.75
-"""... and what is left of it in the next round."""
+"""... and the factor on both in every further round."""
 _CONVERGED_SHARE: Final = 1e-3
-"""Share by which the duration still changes when the search is over."""
+"""The search has converged when the duration changes by less than this share."""
 _SWING_PENALTY: Final = 2.0
-"""What swing of twice its bound would cost, in motion times."""
+"""Cost of swing at twice its bound, in durations."""
 _SWING_TOLERANCE: Final = 1.05
-"""So much of its bound the swing may be: what is linear in a round is not quite so in truth."""
+"""The swing may exceed its bound by this factor: the linearization is not exact."""
 _SLOWDOWN: Final = 1.03
 _TOLERANCE: Final = 1e-9
 
@@ -57,7 +57,7 @@ PENDULUM_RAD_S: Final = np.tile(2.0 * np.pi / np.array(PENDULUM_S), len(DAMPING)
 PENDULUM_POLES: Final = PENDULUM_RAD_S * (1j + np.repeat(DAMPING, len(PENDULUM_S)))
 _OCTAGON: Final = np.exp(0.25j * np.pi * np.arange(8))
 _DIRECTION_RAD: Final = SWING_RAD * float(np.cos(np.pi / 8.0) * np.sqrt(0.5))
-"""Bound on an octagon's side in either direction that keeps the swing of both together in a circle."""
+"""Bound on an octagon's side in either direction that keeps the combined swing within a circle."""
 
 _TAU: Final = np.linspace(0.0, 1.0, _SAMPLE_COUNT + 1)
 _KNOTS: Final = np.concatenate([np.zeros(3), np.linspace(0.0, 1.0, _PIECE_COUNT + 1), np.ones(3)])
@@ -70,7 +70,7 @@ _DIFFERENCE: Final = np.diff(np.eye(_COEFFICIENT_COUNT), axis=0)
 
 
 class PathGeometry:
-    """A way in poses (n, 5), evenly sampled over its progress, as a smooth curve of joints and of the pin's place."""
+    """A path through poses (n, 5), evenly sampled over its progress, as a smooth curve of joints and pin."""
 
     def __init__(self, arm: Arm, poses: np.ndarray) -> None:
         q = arm.joints(poses)
@@ -79,7 +79,7 @@ class PathGeometry:
         self._share = np.linspace(0.0, 1.0, len(poses))
         self.moving = np.flatnonzero(np.ptp(q, axis=0) > _TOLERANCE)
         self.acceleration = arm.acceleration[self.moving]
-        # However it is driven, a way leaves no more swing than its length over that of the shortest pendulum.
+        # No law leaves more swing than the path's length over that of the shortest pendulum.
         length_m = float(np.sum(np.linalg.norm(np.diff(pin, axis=0), axis=1)))
         self.sideways = length_m * float(np.max(PENDULUM_RAD_S)) ** 2 / GRAVITY_M_S2 > SWING_RAD
         self.curve = CubicSpline(self._share, np.hstack([q, pin]))
@@ -88,14 +88,14 @@ class PathGeometry:
         self._cost_slope = np.diff(self._cost) * (len(poses) - 1)
 
     def cost(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Seconds per unit of progress that speeds and pump ask for, and how that changes with the progress."""
+        """Seconds per unit of progress that speeds and pump require, and its derivative by the progress."""
         piece = np.minimum((at * len(self._cost_slope)).astype(int), len(self._cost_slope) - 1)
         return np.interp(at, self._share, self._cost), self._cost_slope[piece]
 
 
 @dataclass(frozen=True, slots=True)
 class SplineTimeLaw:
-    """Progress along a way over time."""
+    """Progress along a path over time, as a B-spline."""
 
     duration_s: float
     coefficients: np.ndarray
@@ -103,23 +103,24 @@ class SplineTimeLaw:
     def progress(self, time_s: np.ndarray) -> np.ndarray:
         """Progress (0 to 1) at times; 0 before and 1 after the motion."""
         share = np.clip(time_s / self.duration_s, 0.0, 1.0)
-        return np.clip(BSpline(_KNOTS, self.coefficients, 3)(share), 0.0, 1.0)
+        result: np.ndarray = np.clip(BSpline(_KNOTS, self.coefficients, 3)(share), 0.0, 1.0)
+        return result
 
     def slowed(self, duration_s: float) -> SplineTimeLaw:
-        """The same, evenly slowed."""
+        """The same law, evenly slowed."""
         return SplineTimeLaw(duration_s, self.coefficients)
 
 
 class _LinearizedLaw:
-    """The limits and the swing of one law, and how they change with its coefficients c and its duration T."""
+    """Limits and swing of one law, and their derivatives by its coefficients c and its duration T."""
 
-    def __init__(self, way: PathGeometry, c: np.ndarray) -> None:
+    def __init__(self, path: PathGeometry, c: np.ndarray) -> None:
         s, self.v, self._a = np.clip(_B0 @ c, 0.0, 1.0), _B1 @ c, _B2 @ c
-        slopes = [way.curve(s, nu) for nu in range(1, 4)]
-        self._joints = [d[:, way.moving] for d in slopes]
+        slopes = [path.curve(s, nu) for nu in range(1, 4)]
+        self._joints = [d[:, path.moving] for d in slopes]
         self._pin = [d[:, N_JOINTS:].T[:, None] for d in slopes[:2]]
-        self._most = way.acceleration
-        self._cost, self._cost_slope = way.cost(s)
+        self._most = path.acceleration
+        self._cost, self._cost_slope = path.cost(s)
         d1, d2, _ = self._joints
         self._push = d1 * self._a[:, None] + d2 * self.v[:, None] ** 2
         self.shortest_s = max(
@@ -143,20 +144,23 @@ class _LinearizedLaw:
         return np.vstack(rows), np.concatenate(bounds)
 
     def swing(self, duration_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Complex swing [rad] in both directions for every pendulum (2, n), its change with c (2, n, _COUNT) and T."""
+        """Complex swing [rad] in both directions for every pendulum (2, n), and its derivatives by c and T."""
         before = _TAU - 1.0
-        wave = np.exp(duration_s * np.outer(PENDULUM_POLES, before)) * (PENDULUM_RAD_S**2 / GRAVITY_M_S2 / _SAMPLE_COUNT)[:, None]
+        wave = (
+            np.exp(duration_s * np.outer(PENDULUM_POLES, before))
+            * (PENDULUM_RAD_S**2 / GRAVITY_M_S2 / _SAMPLE_COUNT)[:, None]
+        )
         pin, bend = self._pin
         by_c = (wave * pin) @ _B1 + (wave * bend * self.v) @ _B0
         return (wave * pin) @ self.v, by_c, (wave * pin * PENDULUM_POLES[:, None] * before) @ self.v
 
 
-def swing_free_law(way: PathGeometry, shaped: bool = True) -> SplineTimeLaw:
-    """The law that drives a way fast; ``shaped``: and leaves at most `SWING_RAD` of swing."""
-    shaped = shaped and way.sideways
+def swing_free_law(path: PathGeometry, shaped: bool = True) -> SplineTimeLaw:
+    """A fast law of a path; ``shaped``: it leaves at most `SWING_RAD` of swing."""
+    shaped = shaped and path.sideways
     rise = np.clip((np.arange(_COEFFICIENT_COUNT) - 2) / (_COEFFICIENT_COUNT - 5), 0.0, 1.0)
     c = rise**3 * (10.0 - 15.0 * rise + 6.0 * rise**2)
-    state = _LinearizedLaw(way, c)
+    state = _LinearizedLaw(path, c)
     duration_s, trust, found = state.shortest_s, _DURATION_TRUST, []
     for _ in range(_ROUND_COUNT):
         step = _solve_step(state, c, duration_s, trust, shaped)
@@ -164,34 +168,40 @@ def swing_free_law(way: PathGeometry, shaped: bool = True) -> SplineTimeLaw:
             break
         c = c.copy()
         c[_FREE] += step[:-2]
-        state = _LinearizedLaw(way, c)
+        state = _LinearizedLaw(path, c)
         before_s, duration_s = duration_s, max(duration_s + float(step[-2]), state.shortest_s)
         trust *= _TRUST_SHRINK
         over = _residual_swing_rad(state, duration_s) / SWING_RAD if shaped else 0.0
         found.append((max(over, _SWING_TOLERANCE), duration_s, c))
         if over <= _SWING_TOLERANCE and abs(duration_s - before_s) < _CONVERGED_SHARE * duration_s:
             break
-    return _best_law(way, found or [(np.inf, duration_s, c)], shaped)
+    return _best_law(path, found or [(np.inf, duration_s, c)], shaped)
 
 
-def _best_law(way: PathGeometry, found: list[tuple[float, float, np.ndarray]], shaped: bool) -> SplineTimeLaw:
-    """The fastest law whose swing is small; where none is, the least swing, slowed until it is."""
+def _best_law(path: PathGeometry, found: list[tuple[float, float, np.ndarray]], shaped: bool) -> SplineTimeLaw:
+    """The fastest law whose swing is small; where none is, the one with least swing, slowed until its swing is
+    small."""
     _, duration_s, c = min(found, key=lambda law: law[:2])
-    state = _LinearizedLaw(way, c)
+    state = _LinearizedLaw(path, c)
     while shaped and _residual_swing_rad(state, duration_s) > _SWING_TOLERANCE * SWING_RAD:
         duration_s *= _SLOWDOWN
     return SplineTimeLaw(duration_s, c)
 
 
 def _residual_swing_rad(state: _LinearizedLaw, duration_s: float) -> float:
-    """Greatest swing [rad] that stays."""
+    """Greatest residual swing [rad]."""
     return float(np.max(np.linalg.norm(np.abs(state.swing(duration_s)[0]), axis=0)))
 
 
-def _solve_step(state: _LinearizedLaw, c: np.ndarray, duration_s: float, trust: float, shaped: bool) -> np.ndarray | None:
-    """The best change of coefficients and duration, and what is left over of swing in shares of its bound."""
+def _solve_step(
+    state: _LinearizedLaw, c: np.ndarray, duration_s: float, trust: float, shaped: bool
+) -> np.ndarray | None:
+    """The best change of coefficients and duration, and the excess swing in shares of its bound."""
     rows, bounds = state.limits(duration_s)
-    parts = [np.hstack([rows, np.zeros((len(rows), 1))]), np.hstack([-_DIFFERENCE, np.zeros((_COEFFICIENT_COUNT - 1, 2))])]
+    parts = [
+        np.hstack([rows, np.zeros((len(rows), 1))]),
+        np.hstack([-_DIFFERENCE, np.zeros((_COEFFICIENT_COUNT - 1, 2))]),
+    ]
     most = [bounds, _DIFFERENCE @ c]
     if shaped:
         left, by_c, by_t = (x / _DIRECTION_RAD for x in state.swing(duration_s))
@@ -202,7 +212,7 @@ def _solve_step(state: _LinearizedLaw, c: np.ndarray, duration_s: float, trust: 
     keep = np.r_[_FREE, _COEFFICIENT_COUNT, _COEFFICIENT_COUNT + 1]
     n = len(keep) - 2
     price = np.concatenate([np.zeros(n), [1.0, _SWING_PENALTY * duration_s]])
-    reach = [(-_COEFFICIENT_TRUST * trust, _COEFFICIENT_TRUST * trust)] * n
+    reach: list[tuple[float, float | None]] = [(-_COEFFICIENT_TRUST * trust, _COEFFICIENT_TRUST * trust)] * n
     reach += [(-trust * duration_s, trust * duration_s), (0.0, None)]
     solved = linprog(
         price,
@@ -210,6 +220,7 @@ def _solve_step(state: _LinearizedLaw, c: np.ndarray, duration_s: float, trust: 
         np.concatenate(most),
         bounds=reach,
         method="highs",
-        options={"presolve": False},  # it takes longer than it saves: next to every row counts
+        options={"presolve": False},  # it costs more than it saves: nearly every row matters
     )
-    return solved.x
+    step: np.ndarray | None = solved.x
+    return step

@@ -1,13 +1,13 @@
-"""A fast planner's time law: along a given way as fast as the limits allow, shaped so that the grapple hangs still.
+"""Time-optimal path parametrization with residual swing suppression, in a few milliseconds.
 
-`autonomy.motion.time_law` finds a law by linear programs in a few tenths of a second; this one takes some milliseconds.
-It goes through the phase plane of progress and speed once backward and once forward (Bobrow 1985, Pham 2018), which is
-the fastest law under speeds, pump and accelerations, and then averages the progress over a window in time.  Averaging
-keeps the way, bounds the jerk by twice the acceleration over the window's first part, and takes out the swing whose
-periods the window holds: of a family of windows the shortest is taken that leaves at most `SWING_RAD`, judged by the
-same pendulums.  Where averaging cut a corner of the limits, the speed there is lowered and the law made again.
+`autonomy.motion.time_law` finds a law by linear programs in a few tenths of a second.  This one integrates the phase
+plane of progress and speed once backward and once forward (Bobrow 1985, Pham 2018), which gives the fastest law under
+speed, pump and acceleration limits, and then averages the progress over a window in time.  Averaging keeps the path,
+bounds the jerk by twice the acceleration over the window's first part, and cancels the swing whose periods the window
+holds.  Of a family of windows it takes the shortest that leaves at most `SWING_RAD`, by the same pendulums.  Where
+averaging violates a limit, the speed there is lowered and the law computed again.
 
-No clock, no randomness: equal ways have equal laws.
+No clock, no randomness: equal paths have equal laws.
 """
 
 from __future__ import annotations
@@ -21,39 +21,40 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import nnls
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.time_law import GRAVITY_M_S2, PENDULUM_RAD_S, PENDULUM_POLES, SWING_RAD, PathGeometry
+from autonomy.motion.time_law import GRAVITY_M_S2, PENDULUM_POLES, PENDULUM_RAD_S, SWING_RAD, PathGeometry
 from autonomy.motion.trajectory import STEP_S
 from machine.joints import N_JOINTS
 
 GRID_COUNT: Final = 128
-"""Pieces of the way on which the phase plane is walked through."""
+"""Pieces of the path on which the phase plane is integrated."""
 SAMPLES_PER_PIECE: Final = 4
-"""Samples of the way's joints per piece."""
+"""Samples of the path's joints per piece."""
 JERK_WINDOW_S: Final = 0.24
 """Least window: accelerations rise within it."""
 TAP_S: Final = 0.04
-"""Impulses of a window stand so far apart, ..."""
+"""Distance between the impulses of a window, ..."""
 TAP_COUNTS: Final = (0, 12, 18, 22, 26, 30, 34, 38, 43, 48, 53)
-"""... and there are one of these numbers of them more than one: at most, a period of the slowest pendulum."""
+"""... and their numbers less one to choose from: at most a period of the slowest pendulum."""
 REFINEMENT_COUNT: Final = 3
-"""How often the swing of a window is made straight about it: a way is bent, so two impulses do not just add up."""
+"""How often the swing of a window is linearized again: paths are curved, so impulses do not simply superpose."""
 ROUND_COUNT: Final = 2
 _MAX_DURATION_S: Final = 60.0
 _TINY: Final = 1e-9
 _TAP_STEPS: Final = round(TAP_S / STEP_S)
 _DECAY: Final = np.exp(-np.outer(PENDULUM_POLES, np.arange(int(_MAX_DURATION_S / TAP_S)) * TAP_S))
-"""What is left of a pendulum's swing some taps later."""
+"""Decay of a pendulum's swing over a number of taps."""
 _GAIN: Final = (PENDULUM_RAD_S**2 / GRAVITY_M_S2)[:, None]
 _GOOD_SHARE: Final = 0.6
 """A window is good enough at this share of the bound."""
 _SUM_WEIGHT: Final = 3.0
-"""Weight of the wish that a window's impulses sum to 1, in bounds of the swing."""
+"""Weight of the condition that a window's impulses sum to 1, in bounds of the swing."""
 
 
 def _jerk_kernel() -> np.ndarray:
     n = round(JERK_WINDOW_S / STEP_S / 2)
     kernel = np.convolve(np.ones(n), np.ones(n))
-    return kernel / kernel.sum()
+    result: np.ndarray = kernel / kernel.sum()
+    return result
 
 
 _JERK_KERNEL: Final = _jerk_kernel()
@@ -61,7 +62,7 @@ _JERK_KERNEL: Final = _jerk_kernel()
 
 @dataclass(frozen=True)
 class SampledTimeLaw:
-    """A law: progress (n,) every `STEP_S` from 0 to 1, and the swing [rad] it leaves."""
+    """A time law: progress (n,) every `STEP_S` from 0 to 1, and the residual swing [rad]."""
 
     done: np.ndarray
     swing_rad: float
@@ -72,36 +73,37 @@ class SampledTimeLaw:
 
     @property
     def duration_s(self) -> float:
-        """When it is at its end."""
+        """Time of its end."""
         return (len(self.done) - 1) * STEP_S
 
     def progress(self, time_s: np.ndarray) -> np.ndarray:
         """Progress (0 to 1) at times; 0 before and 1 after the motion."""
         at: np.ndarray = self._curve(np.clip(time_s, 0.0, self.duration_s))
-        return np.clip(at, 0.0, 1.0)
+        result: np.ndarray = np.clip(at, 0.0, 1.0)
+        return result
 
 
 class PathLimits:
-    """A way's limits on its grid: slope and bend of the moving joints, greatest speed by speeds and pump."""
+    """A path's limits on its grid: first and second derivative of the moving joints, and the greatest speed."""
 
-    def __init__(self, arm: Arm, way: PathGeometry) -> None:
+    def __init__(self, arm: Arm, path: PathGeometry) -> None:
         self.s = np.linspace(0.0, 1.0, GRID_COUNT + 1)
-        self.slope = way.curve(self.s, 1)[:, way.moving]
-        self.bend = way.curve(self.s, 2)[:, way.moving]
-        self.most = way.acceleration
-        self.speed = 1.0 / np.maximum(way.cost(self.s)[0], _TINY)
+        self.slope = path.curve(self.s, 1)[:, path.moving]
+        self.bend = path.curve(self.s, 2)[:, path.moving]
+        self.most = path.acceleration
+        self.speed = 1.0 / np.maximum(path.cost(self.s)[0], _TINY)
         fine = np.linspace(0.0, 1.0, SAMPLES_PER_PIECE * GRID_COUNT + 1)
-        self.fine, self.table = fine, way.curve(fine)
+        self.fine, self.table = fine, path.curve(fine)
         self.pin = self.table[:, N_JOINTS:]
         self._pin_slope = np.gradient(self.pin, fine, axis=0)
-        self.sideways = way.sideways
+        self.sideways = path.sideways
 
     def pin_at(self, progress: np.ndarray) -> np.ndarray:
         """The pin (n, 2) at progress (n,)."""
         return np.column_stack([np.interp(progress, self.fine, column) for column in self.pin.T])
 
     def pin_slope_at(self, progress: np.ndarray) -> np.ndarray:
-        """Its change with the progress (n, 2) there."""
+        """The pin's derivative by the progress (n, 2) there."""
         return np.column_stack([np.interp(progress, self.fine, column) for column in self._pin_slope.T])
 
     def fastest(self, brake: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -146,12 +148,13 @@ def _sampled(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
     span = np.maximum(time[i + 1] - time[i], _TINY)
     part = at - time[i]
     done = i / GRID_COUNT + speed[i] * part + 0.5 * (speed[i + 1] - speed[i]) / span * part**2
-    return np.clip(done, 0.0, 1.0)
+    result: np.ndarray = np.clip(done, 0.0, 1.0)
+    return result
 
 
 @lru_cache(maxsize=256)
 def _weights(length: int) -> np.ndarray:
-    """What a way of so many places, one every `TAP_S`, from rest to rest, leaves of swing [rad]: real and imaginary
+    """Residual swing [rad] per place of a path with one place every `TAP_S`, from rest to rest: real and imaginary
     parts for every pendulum, (2 n, length).
     """
     late = _GAIN * _DECAY[:, : length - 1][:, ::-1]
@@ -161,8 +164,8 @@ def _weights(length: int) -> np.ndarray:
 
 
 def _residual_swing(pin: np.ndarray) -> np.ndarray:
-    """Swing [rad] that ways (t, m), every `TAP_S` from rest to rest, leave: of every pendulum, real and imaginary, (2
-    n, m).
+    """Residual swing [rad] of paths (t, m), every `TAP_S` from rest to rest: real and imaginary part for every
+    pendulum, (2 n, m).
     """
     found: np.ndarray = _weights(len(pin)) @ pin
     return found
@@ -173,13 +176,15 @@ def _max_swing_rad(left: np.ndarray) -> float:
     return float(np.sqrt(np.max(size[: len(size) // 2] + size[len(size) // 2 :])))
 
 
-def time_optimal_law(arm: Arm, way: PathGeometry, shaped: bool = True) -> SampledTimeLaw:
-    """The fastest law of a way that keeps the limits and, if ``shaped``, leaves at most `SWING_RAD` of swing."""
-    limits = PathLimits(arm, way)
+def time_optimal_law(arm: Arm, path: PathGeometry, shaped: bool = True) -> SampledTimeLaw:
+    """The fastest law of a path that keeps the limits and, if ``shaped``, leaves at most `SWING_RAD` of swing."""
+    limits = PathLimits(arm, path)
     brake = np.ones(GRID_COUNT + 1)
     taps = None if shaped and limits.sideways else 0
     for turn in range(ROUND_COUNT + 1):
-        raw = np.convolve(np.pad(_sampled(*limits.fastest(brake)), len(_JERK_KERNEL) - 1, mode="edge"), _JERK_KERNEL, mode="valid")
+        raw = np.convolve(
+            np.pad(_sampled(*limits.fastest(brake)), len(_JERK_KERNEL) - 1, mode="edge"), _JERK_KERNEL, mode="valid"
+        )
         taps, law = _shortest_window(limits, raw, taps)
         load = _load(arm, limits, law.done)
         over = float(np.max(load))
@@ -190,7 +195,7 @@ def time_optimal_law(arm: Arm, way: PathGeometry, shaped: bool = True) -> Sample
 
 
 def _shortest_window(limits: PathLimits, raw: np.ndarray, taps: int | None) -> tuple[int, SampledTimeLaw]:
-    """The law through a window of so many taps, None: through the shortest that leaves little swing."""
+    """The law through a window of ``taps``; None: through the shortest window that leaves little swing."""
     if taps is not None:
         return taps, _with_window(limits, raw, taps)
     low, high = 0, len(TAP_COUNTS) - 1
@@ -206,13 +211,13 @@ def _shortest_window(limits: PathLimits, raw: np.ndarray, taps: int | None) -> t
 
 
 def _with_window(limits: PathLimits, raw: np.ndarray, taps: int) -> SampledTimeLaw:
-    """A law averaged over the window of so many taps that leaves least swing."""
+    """The law averaged over the window of ``taps`` that leaves least swing."""
     whole = len(raw) + taps * _TAP_STEPS
     whole += (whole + 1) % _TAP_STEPS
     impulses = np.full(taps + 1, 1.0 / (taps + 1))
     if not limits.sideways:
         return SampledTimeLaw(_convolved(raw, impulses, whole), 0.0)
-    # The raw law every `TAP_S` up to the common end, once later with every impulse.
+    # The raw law every `TAP_S` up to the common end, delayed by every impulse.
     at = np.arange((whole - 1) % _TAP_STEPS - taps * _TAP_STEPS, whole, _TAP_STEPS)
     places = np.where(at < 0, 0.0, raw[np.clip(at, 0, len(raw) - 1)])
     delayed = np.lib.stride_tricks.sliding_window_view(places, taps + 1)[:, ::-1]
@@ -221,7 +226,7 @@ def _with_window(limits: PathLimits, raw: np.ndarray, taps: int) -> SampledTimeL
         if _max_swing_rad(left) <= _GOOD_SHARE * SWING_RAD:
             break
         wish = _improved_impulses(limits, delayed, left, impulses)
-        for share in (1.0, 0.5, 0.25):  # a way is bent: half a step may be better than a whole one
+        for share in (1.0, 0.5, 0.25):  # paths are curved: half a step may be better than a whole one
             tried = impulses + share * (wish - impulses)
             then = _residual_swing(limits.pin_at(delayed @ tried))
             if _max_swing_rad(then) < _max_swing_rad(left):
@@ -233,7 +238,7 @@ def _with_window(limits: PathLimits, raw: np.ndarray, taps: int) -> SampledTimeL
 
 
 def _convolved(raw: np.ndarray, impulses: np.ndarray, length: int) -> np.ndarray:
-    """The raw law once later with every impulse, ``length`` samples."""
+    """The raw law convolved with the impulses, ``length`` samples."""
     kernel = np.zeros((len(impulses) - 1) * _TAP_STEPS + 1)
     kernel[::_TAP_STEPS] = impulses
     late = length - len(raw)
@@ -242,7 +247,7 @@ def _convolved(raw: np.ndarray, impulses: np.ndarray, length: int) -> np.ndarray
 
 
 def _improved_impulses(limits: PathLimits, delayed: np.ndarray, left: np.ndarray, impulses: np.ndarray) -> np.ndarray:
-    """Impulses whose swing, linearised about the present ones, is least."""
+    """Impulses with the least swing, linearized about the present ones."""
     slope = limits.pin_slope_at(delayed @ impulses) / SWING_RAD
     weights = _weights(len(delayed))
     rows = np.vstack([weights * column for column in slope.T]) @ delayed
@@ -258,26 +263,30 @@ def _improved_impulses(limits: PathLimits, delayed: np.ndarray, left: np.ndarray
 
 
 def _load(arm: Arm, limits: PathLimits, progress: np.ndarray) -> np.ndarray:
-    """Shares of the limits at the samples, as a factor of time (1 = just)."""
+    """Use of the limits at the samples, as a factor of time (1 = just within)."""
     q = np.column_stack([np.interp(progress, limits.fine, column) for column in limits.table[:, :N_JOINTS].T])
     v = np.gradient(q, STEP_S, axis=0)
     a = np.gradient(v, STEP_S, axis=0)
     fast = np.maximum(np.max(np.abs(v) / arm.speed, axis=1), arm.pump_load(q, v))
-    return np.maximum(fast, np.sqrt(np.max(np.abs(a) / arm.acceleration, axis=1)))
+    result: np.ndarray = np.maximum(fast, np.sqrt(np.max(np.abs(a) / arm.acceleration, axis=1)))
+    return result
 
 
 def _reduced_speeds(brake: np.ndarray, load: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Lower speeds on the grid about where a limit was broken."""
+    """Lower speed factors on the grid where a limit was violated."""
     worst = np.ones(GRID_COUNT + 1)
     at = np.clip(np.rint(where * GRID_COUNT).astype(int), 0, GRID_COUNT)
     np.maximum.at(worst, at, load)
     wide = np.max(np.stack([np.roll(worst, k) for k in range(-3, 4)]), axis=0)
-    return brake / np.clip(wide, 1.0, 1.6)
+    result: np.ndarray = brake / np.clip(wide, 1.0, 1.6)
+    return result
 
 
 def _slowed(limits: PathLimits, law: SampledTimeLaw, factor: float) -> SampledTimeLaw:
-    """The same, evenly slowed."""
+    """The same law, evenly slowed."""
     n = max(int(np.ceil((len(law.done) - 1) * factor)), 2)
     n += n % _TAP_STEPS
     done = law.progress(np.linspace(0.0, law.duration_s, n + 1))
-    return SampledTimeLaw(done, _max_swing_rad(_residual_swing(limits.pin_at(done[::_TAP_STEPS]))) if limits.sideways else 0.0)
+    return SampledTimeLaw(
+        done, _max_swing_rad(_residual_swing(limits.pin_at(done[::_TAP_STEPS]))) if limits.sideways else 0.0
+    )

@@ -1,8 +1,8 @@
-"""Smooth, synchronised joint motions between poses that leave the grapple hanging still.
+"""Smooth, synchronized joint motions between poses with little residual swing of the grapple.
 
-A leg is a straight line in poses, driven by a time law of `autonomy.motion.time_law`.  Legs over different coordinates
-may overlap; a motion has at most one leg that moves the pin sideways, so that leg's law decides about the swing.
-Failure: ``machine.geometry.kinematics.Unreachable``.  No clock: a plan is a function of its own time.
+A leg is a straight line in poses, driven by a time law of `autonomy.motion.time_law`.  Legs over different
+coordinates may overlap; a motion has at most one leg that moves the pin sideways, so that leg's law decides about the
+swing.  Failure: ``machine.geometry.kinematics.Unreachable``.  No clock: a plan is a function of its own time.
 """
 
 from __future__ import annotations
@@ -21,24 +21,25 @@ from machine.joints import Joint
 
 STEP_S: Final = 0.02
 _GENTLE_SHARE: Final = 0.5
-"""Share of the acceleration limits that a motion without regard to the arm's reach uses."""
+"""Share of the acceleration limits that `joint_motion` uses."""
 _PROGRESS_GRID: Final = np.linspace(0.0, 1.0, 81)
 _RISE_LEFT_M: Final = 0.12
-"""How far under its height a rising grapple may still be when it starts to move sideways."""
+"""Rise that may be left when a grapple begins to move sideways."""
 _APPROACH_LEFT_M: Final = 0.35
-"""How far from the point under it a grapple may be when it starts to go down."""
+"""Horizontal distance that may be left when a grapple begins to descend."""
 _TOLERANCE: Final = 1e-6
 _MAX_SLOPE, _MAX_CURVATURE = 2.1875, 7.5132
-"""Greatest slope and greatest curvature of `smooth_progress`."""
+"""Greatest slope and curvature of `smooth_progress`."""
 
 Axes = tuple[float, ...]
 
 
 def smooth_progress(tau: np.ndarray) -> np.ndarray:
-    """Progress 0..1 over ``tau`` = time / duration (clipped), at rest up to the jerk at both ends (docs/reference/machines.md section 1.6)."""
+    """Progress 0..1 over ``tau`` = time / duration (clipped), at rest up to the jerk at both ends
+    (docs/reference/machines.md section 1.6)."""
     t = np.clip(tau, 0.0, 1.0)
-    way: np.ndarray = t**4 * (35.0 + t * (-84.0 + t * (70.0 - 20.0 * t)))
-    return way
+    progress: np.ndarray = t**4 * (35.0 + t * (-84.0 + t * (70.0 - 20.0 * t)))
+    return progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,7 @@ class Trajectory:
         return self.position[-1]
 
     def at(self, time_s: float) -> tuple[Axes, Axes]:
-        """Joint positions and velocities at a time; before the start and past the end it stands still."""
+        """Joint positions and velocities at a time; at rest before the start and past the end."""
         i = int(time_s // STEP_S)
         if i < 0 or i >= len(self.position) - 1:
             return self.position[0 if i < 0 else -1], (0.0,) * len(self.goal)
@@ -74,7 +75,7 @@ class Trajectory:
 
 
 def _curve(position: np.ndarray) -> CubicSpline:
-    """Positions every ``STEP_S``, from rest to rest, as a curve whose acceleration does not jump."""
+    """Positions every ``STEP_S``, from rest to rest, as a curve with continuous acceleration."""
     return CubicSpline(np.arange(len(position)) * STEP_S, position, bc_type="clamped")
 
 
@@ -84,7 +85,7 @@ def _sampled_trajectory(position: np.ndarray) -> Trajectory:
 
 
 def with_rotation(motion: Trajectory, from_s: float, by_rad: float) -> Trajectory:
-    """The motion with the rotator turned by so much more from a time on, until its end."""
+    """The motion with the rotator turned by ``by_rad`` more between a time and its end."""
     position, velocity = np.array(motion.position), np.array(motion.velocity)
     span_s = motion.duration_s - from_s
     time = (np.arange(len(position)) * STEP_S - from_s) / span_s
@@ -96,10 +97,10 @@ def with_rotation(motion: Trajectory, from_s: float, by_rad: float) -> Trajector
 
 
 def with_quick_rotation(arm: Arm, motion: Trajectory) -> Trajectory:
-    """The motion with its turn of the rotator made at one go, when half of it was to be done.
+    """The motion with its rotator turn made in one quick move, at the time when half of it was due.
 
-    For a rotator that is counted and not measured: what its valve gives is known to a few per mille of its stroke, a
-    third of a slow turn (measured on the plant: 6 deg of 23 over 6 s) and nothing of a quick one.
+    For a rotator without an encoder: the valve's opening is known to a few per mille of its stroke, which loses a third
+    of a slow turn (measured on the plant: 6 deg of 23 over 6 s) and nothing of a quick one.
     """
     position, velocity = np.array(motion.position), np.array(motion.velocity)
     angle = position[:, Joint.ROT]
@@ -118,16 +119,16 @@ def with_quick_rotation(arm: Arm, motion: Trajectory) -> Trajectory:
 
 
 def hold(q: Sequence[float]) -> Trajectory:
-    """Standing still at a joint position."""
+    """A hold at a joint position."""
     return _sampled_trajectory(np.array([q, q], dtype=float))
 
 
 class TimeLaw(Protocol):
-    """How far a way is done over time."""
+    """Progress along a path over time."""
 
     @property
     def duration_s(self) -> float:
-        """When it is done."""
+        """Time of its end."""
 
     def progress(self, time_s: np.ndarray) -> np.ndarray:
         """Progress (0 to 1) at times; 0 before and 1 after the motion."""
@@ -135,7 +136,7 @@ class TimeLaw(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """A straight way in poses with its time law; None where there is nowhere to go."""
+    """A straight path in poses with its time law; None where start and goal are the same."""
 
     start: np.ndarray
     delta: np.ndarray
@@ -143,33 +144,33 @@ class Leg:
 
     @property
     def duration_s(self) -> float:
-        """Time of the leg alone."""
+        """Duration of the leg alone."""
         return self.law.duration_s if self.law else 0.0
 
     def progress_at(self, time_s: np.ndarray) -> np.ndarray:
-        """Progress at times from its own start."""
+        """Progress at times from the leg's own start."""
         return self.law.progress(time_s) if self.law else np.zeros_like(time_s)
 
     def times_left(self, *left: float) -> list[float]:
-        """The times from which the progress that is left is at most so much (shares)."""
+        """The times from which on at most these shares of the progress are left."""
         done = self.progress_at(_PROGRESS_GRID * self.duration_s)
         return [float(_PROGRESS_GRID[np.argmax(done >= 1.0 - share)]) * self.duration_s for share in left]
 
 
 def make_leg(arm: Arm, start: Pose, goal: Pose, law: Callable[[PathGeometry], TimeLaw] = swing_free_law) -> Leg:
-    """The straight way from start to goal, driven by a law of `autonomy.motion.time_law` or of another maker."""
-    first, way = np.array(start), np.array(goal) - np.array(start)
-    if np.max(np.abs(way)) < _TOLERANCE:
-        return Leg(first, way, None)
-    return Leg(first, way, law(_path_geometry(arm, first, way)))
+    """The straight path from start to goal, driven by a time law."""
+    first, delta = np.array(start), np.array(goal) - np.array(start)
+    if np.max(np.abs(delta)) < _TOLERANCE:
+        return Leg(first, delta, None)
+    return Leg(first, delta, law(_path_geometry(arm, first, delta)))
 
 
-def _path_geometry(arm: Arm, first: np.ndarray, way: np.ndarray) -> PathGeometry:
-    return PathGeometry(arm, first + _PROGRESS_GRID[:, None] * way)
+def _path_geometry(arm: Arm, first: np.ndarray, delta: np.ndarray) -> PathGeometry:
+    return PathGeometry(arm, first + _PROGRESS_GRID[:, None] * delta)
 
 
 def superposed(arm: Arm, legs: Sequence[tuple[float, Leg]]) -> Trajectory:
-    """The sum of legs, each from its starting time, slowed down as a whole if their overlap asks for it."""
+    """The sum of legs, each from its starting time, slowed down as a whole if their overlap exceeds the limits."""
     end_s = max(at + leg.duration_s for at, leg in legs)
 
     def sampled(duration_s: float) -> np.ndarray:
@@ -183,7 +184,7 @@ def superposed(arm: Arm, legs: Sequence[tuple[float, Leg]]) -> Trajectory:
 def within_limits(
     arm: Arm, sampled: Callable[[float], np.ndarray], end_s: float, accelerations: np.ndarray | None = None
 ) -> Trajectory:
-    """A motion of ``end_s``, or as much longer as the arm's limits (or these ``accelerations``) ask for.
+    """A motion of ``end_s``, or longer if the arm's limits (or these ``accelerations``) require it.
 
     ``sampled(duration_s)`` gives its joint vectors (n, 5) every ``STEP_S``, from rest to rest.
     """
@@ -193,8 +194,8 @@ def within_limits(
 
 
 def _time_stretch(arm: Arm, position: np.ndarray, accelerations: np.ndarray) -> float:
-    """By how much a motion sampled every ``STEP_S`` is to be stretched in time to keep the arm's limits and these
-    ``accelerations`` (1 = just).
+    """Factor by which a motion sampled every ``STEP_S`` must be stretched in time to keep the arm's limits and these
+    ``accelerations`` (1 = just within).
     """
     curve = _curve(position)
     velocity, acceleration = curve(curve.x, 1), curve(curve.x, 2)
@@ -216,10 +217,10 @@ def straight_line(arm: Arm, start: Pose, goal: Pose, shaped: bool = True) -> Tra
 
 
 def travel_over(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: float = 0.0) -> Trajectory:
-    """To ``height_m``, over, and down to the goal, with rounded corners.
+    """Up to ``height_m``, over, and down to the goal, with rounded corners.
 
-    With ``free_m`` the pin may rise on the way, as long as it is up ``free_m`` before the goal; without, it goes
-    sideways only when it is almost up.
+    With ``free_m`` the pin may rise while it moves sideways, as long as it is up ``free_m`` before the goal; without,
+    it moves sideways only when it is almost up.
     """
     up = make_leg(arm, start, start.at_height(height_m))
     over = make_leg(arm, start.at_height(height_m), goal.at_height(height_m))
@@ -235,34 +236,33 @@ def travel_over(arm: Arm, start: Pose, goal: Pose, height_m: float, free_m: floa
 
 
 def joint_motion(arm: Arm, start: Sequence[float], goal: Sequence[float]) -> Trajectory:
-    """Every joint straight from start to goal, together, within the limits but gently, whatever the arm's reach."""
-    first, way = np.array(start, dtype=float), np.array(goal, dtype=float) - np.array(start, dtype=float)
+    """Every joint straight from start to goal, synchronized and gentle, whatever the arm's reach."""
+    first, delta = np.array(start, dtype=float), np.array(goal, dtype=float) - np.array(start, dtype=float)
     tau = np.linspace(0.0, 1.0, 121)
     done = smooth_progress(tau)
     speed = np.gradient(done, tau[1])
     steepest = float(np.max(np.abs(np.gradient(speed, tau[1]))))
-    fastest = float(np.max(np.abs(way) / arm.speed)) * float(np.max(speed))
-    pushed = float(np.sqrt(np.max(np.abs(way) / (_GENTLE_SHARE * arm.acceleration)) * steepest))
+    fastest = float(np.max(np.abs(delta) / arm.speed)) * float(np.max(speed))
+    pushed = float(np.sqrt(np.max(np.abs(delta) / (_GENTLE_SHARE * arm.acceleration)) * steepest))
     duration = max(MIN_DURATION_S, fastest, pushed)
     time = np.arange(int(np.ceil(duration / STEP_S)) + 2) * STEP_S
-    return _sampled_trajectory(first + smooth_progress(time / duration)[:, None] * way)
+    return _sampled_trajectory(first + smooth_progress(time / duration)[:, None] * delta)
 
 
 def slow_line(arm: Arm, start: Pose, goal: Pose, least_s: float) -> Trajectory:
-    """A straight line in poses in ``least_s``, or as much longer as the arm's limits ask for."""
-    first, way = np.array(start), np.array(goal) - np.array(start)
+    """A straight line in poses in ``least_s``, or longer if the arm's limits require it."""
+    first, delta = np.array(start), np.array(goal) - np.array(start)
 
     def sampled(duration_s: float) -> np.ndarray:
         time = np.arange(int(np.ceil(duration_s / STEP_S)) + 1) * STEP_S
-        return arm.joints(first + smooth_progress(time / duration_s)[:, None] * way)
+        return arm.joints(first + smooth_progress(time / duration_s)[:, None] * delta)
 
     return within_limits(arm, sampled, least_s)
 
 
 def follow_path(arm: Arm, start: Pose, path: Callable[[float], Pose], end_s: float, blend_s: float) -> Trajectory:
-    """A motion along given poses over time; what ``start`` is off the path at time 0 fades out within
-    ``blend_s``.
-    """
+    """A motion along given poses over time; the initial offset of ``start`` from the path fades out within
+    ``blend_s``."""
     time = np.arange(int(np.ceil(end_s / STEP_S)) + 1) * STEP_S
     nominal = np.array([path(t) for t in time])
     fade = 1.0 - smooth_progress(time / blend_s)

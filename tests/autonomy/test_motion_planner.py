@@ -6,21 +6,22 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.phase_motions import MACHINE_LEAN_M, approach_motion, carry_motion
-from autonomy.grasp.selection import plan_single_log_grasp
-from autonomy.grasp.placement import plan_place
 from autonomy.grasp.grapple_heights import hover_height_m, travel_height_m
+from autonomy.grasp.placement import plan_place
+from autonomy.grasp.selection import plan_single_log_grasp
 from autonomy.missions.crane_job import CraneJob
 from autonomy.motion import motion_planner
 from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
 from autonomy.motion.clearance import MARGIN_M, clearance_reserve
-from autonomy.motion.obstacles import CollisionScene, held_log, collision_scene, tree_capsule
-from autonomy.motion.path_search import PathBlocked, plan_path
 from autonomy.motion.motion_planner import MovementPrimitivePlanner, TimeOptimalPlanner
 from autonomy.motion.movement_primitives import load
+from autonomy.motion.obstacles import CollisionScene, collision_scene, held_log, tree_capsule
+from autonomy.motion.path_search import PathBlocked, plan_path
+from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, travel_over
 from autonomy.perception.log_list.observation import LogObservation
 from machine.loading.profile_file import load_profile
+from tests.codes import coded
 
 PROFILE = load_profile("aoro_fc8")
 ARM, HIGH = Arm(PROFILE), travel_height_m(PROFILE)
@@ -36,7 +37,7 @@ def pins(motion: Trajectory) -> np.ndarray:
 
 
 def blocked(*_: object) -> None:
-    raise PathBlocked("no way is clear: so it was asked for")
+    raise PathBlocked("no path is clear: as requested", "motion.path-blocked")
 
 
 def test_ours_goes_down_to_the_log_in_one_and_with_it_into_the_bunk() -> None:
@@ -53,7 +54,7 @@ def test_ours_goes_down_to_the_log_in_one_and_with_it_into_the_bunk() -> None:
 def test_a_place_that_is_reached_from_above_alone_is(monkeypatch: pytest.MonkeyPatch) -> None:
     def only_high(arm: Arm, start: Pose, goal: Pose, *more: object) -> object:
         if goal.z_m < HIGH:
-            raise PathBlocked("too near to the stakes")
+            raise PathBlocked("too near to the stakes", "motion.path-blocked")
         return plan_path(arm, start, goal, *more)  # type: ignore[arg-type]
 
     monkeypatch.setattr(motion_planner, "plan_path", only_high)
@@ -84,7 +85,7 @@ def test_where_no_swift_way_is_clear_the_one_at_full_height_is_taken_only_if_it_
     assert slow == travel_over(ARM, PLACE, OVER, HIGH, 0.0)
     x, y = (0.5 * (a + b) for a, b in zip(ARM.xy(PLACE), ARM.xy(OVER), strict=True))
     stands = collision_scene(PROFILE, trees=[tree_capsule(x, y, 0.2, GROUND)])
-    with pytest.raises(PathBlocked, match="so it was asked for"):
+    with pytest.raises(PathBlocked, check=coded("motion.path-blocked")):
         TimeOptimalPlanner()(ARM, PLACE, OVER, stands, None, HIGH, 0.0)
 
 

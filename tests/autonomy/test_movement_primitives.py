@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.motion.dmp import DemonstrationRefused, Dmp, learn
+from tests.codes import coded
 
 TIME_S = np.linspace(0.0, 6.0, 301)
 TAU = TIME_S / 6.0
@@ -116,14 +117,14 @@ def test_what_teaches_nothing_is_refused_in_words() -> None:
     flat = SHOWN.copy()
     flat[:, 0] = 0.2
     cases = {
-        "no demonstration to learn": [],
-        "5 samples": [(TIME_S[:5], SHOWN[:5])],
-        "not finite": [(TIME_S, np.where(TAU[:, None] > 0.5, np.nan, SHOWN))],
-        "do not increase": [(TIME_S[::-1], SHOWN)],
-        "moves coordinate 0": [(TIME_S, flat)],
+        "demonstration.none": [],
+        "demonstration.too-few-samples": [(TIME_S[:5], SHOWN[:5])],
+        "demonstration.not-finite": [(TIME_S, np.where(TAU[:, None] > 0.5, np.nan, SHOWN))],
+        "demonstration.times-not-increasing": [(TIME_S[::-1], SHOWN)],
+        "demonstration.coordinate-unmoved": [(TIME_S, flat)],
     }
-    for words, shown in cases.items():
-        with pytest.raises(DemonstrationRefused, match=words):
+    for code, shown in cases.items():
+        with pytest.raises(DemonstrationRefused, check=coded(code)):
             learn(shown, (True, False))
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(DemonstrationRefused, check=coded("primitive.not-finite")):
         SCALED.rollout(np.array([0.0, np.nan]), np.array([1.0, 1.0]))

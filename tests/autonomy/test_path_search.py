@@ -12,17 +12,18 @@ from motion_figures import figures
 from autonomy.grasp.grapple_heights import travel_height_m
 from autonomy.motion import clearance
 from autonomy.motion.arm import Arm
-from autonomy.motion.pose import Pose
 from autonomy.motion.clearance import clearance_reserve
 from autonomy.motion.distances import clearances
-from autonomy.motion.obstacles import HeldLog, Capsule, CollisionScene, collision_scene, swept_capsules, tree_capsule
-from autonomy.motion.path_search import PathBlocked, ClearPathPlanner, plan_path
+from autonomy.motion.obstacles import Capsule, CollisionScene, HeldLog, collision_scene, swept_capsules, tree_capsule
+from autonomy.motion.path_search import PathBlocked, plan_path
+from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import Trajectory, slow_line, travel_over
 from autonomy.perception.log_list.observation import LogObservation
-from machine.joints import JOINTS
 from machine.geometry.kinematics import Unreachable
+from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile, joint
+from tests.codes import coded
 
 PALMS, AORO = load_profile("palms_471"), load_profile("aoro_fc8")
 ARMS = {"palms_471": Arm(PALMS), "aoro_fc8": Arm(AORO)}
@@ -157,13 +158,14 @@ def test_what_cannot_be_passed_is_named_in_a_sentence() -> None:
         Capsule(f"tree {i}", (r * cos(0.75), r * sin(0.75), -1.15), (r * cos(0.75), r * sin(0.75), 12.0), 0.3)
         for i, r in enumerate(np.arange(0.6, 9.0, 0.4))
     ]
-    with pytest.raises(PathBlocked, match=r"no way is clear from \(3\.00, 4\.20, 0\.60\).* too near to tree \d+"):
+    with pytest.raises(PathBlocked, check=coded("motion.path-blocked")) as blocked:
         plan_path(arm, start, goal, collision_scene(AORO, trees=wall))
+    assert "(3.00, 4.20, 0.60)" in str(blocked.value) and "tree" in str(blocked.value)
 
 
 def test_an_end_out_of_reach_is_refused_as_such() -> None:
     arm, (start, goal) = ARMS["aoro_fc8"], beside()
-    with pytest.raises(Unreachable, match="out of reach") as refused:
+    with pytest.raises(Unreachable, check=coded("reach.too-far")) as refused:
         plan_path(arm, start, goal._replace(r_m=12.0), collision_scene(AORO))
     assert not isinstance(refused.value, PathBlocked)
 
@@ -178,26 +180,6 @@ def test_higher_ground_lifts_the_way() -> None:
     low = fine(arm, plan_path(arm, start, goal, CollisionScene(-1.15)).motion)[1]
     high = fine(arm, plan_path(arm, start, goal, CollisionScene(hill)).motion)[1]
     assert high[:, 2].max() > low[:, 2].max() + 0.3
-
-
-def test_the_planner_has_no_moods_and_can_stand_in_for_travel() -> None:
-    arm, (start, goal) = ARMS["palms_471"], places(PALMS, 7)
-    move = ClearPathPlanner(collision_scene(PALMS), LOG)
-    assert move(arm, start, goal, 1.65, 2.0).position == move(arm, start, goal).position
-
-
-def test_patience_takes_the_shorter_of_two_clear_ways() -> None:
-    arm, (start, _) = ARMS["palms_471"], places(PALMS, 8)
-    start, around = start.at_height(1.6), collision_scene(PALMS)
-    goal = start._replace(slew_rad=start.slew_rad - 0.8)
-    quick, patient = (ClearPathPlanner(around, LOG, patient=p)(arm, start, goal, 1.6) for p in (False, True))
-    assert patient.duration_s < quick.duration_s
-    assert clearance_reserve(arm, patient, around, LOG)[0] >= 0.0
-    # Where travel would go through a tree, patience is no excuse.
-    x, y = arm.xy(start._replace(slew_rad=start.slew_rad - 0.4, r_m=start.r_m))
-    trunk = collision_scene(PALMS, trees=[tree_capsule(x, y, 0.1, -1.4)])
-    around_it = ClearPathPlanner(trunk, LOG, patient=True)(arm, start, goal, 1.6)
-    assert clearance_reserve(arm, around_it, trunk, LOG)[0] > -0.02
 
 
 def test_standing_still_is_a_way() -> None:

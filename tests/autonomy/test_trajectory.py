@@ -10,9 +10,18 @@ from hypothesis import strategies as st
 from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.motion.time_law import SWING_RAD
-from autonomy.motion.trajectory import Trajectory, joint_motion, with_quick_rotation, follow_path, hold, smooth_progress, straight_line, travel_over
-from machine.joints import JOINTS
+from autonomy.motion.trajectory import (
+    Trajectory,
+    follow_path,
+    hold,
+    joint_motion,
+    smooth_progress,
+    straight_line,
+    travel_over,
+    with_quick_rotation,
+)
 from machine.geometry.kinematics import Unreachable, pin_position
+from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile
 from machine.profile import joint
 
@@ -20,6 +29,7 @@ PROFILE = load_profile("palms_471")
 ARM = Arm(PROFILE)
 TOP = 1.65
 FINE_S = 0.005
+from tests.codes import coded
 
 
 def poses(slew: float = 1.6) -> st.SearchStrategy[Pose]:
@@ -143,9 +153,9 @@ def test_follow_fades_a_wrong_start_out() -> None:
 
 def test_a_pose_outside_the_limits_is_refused_in_words() -> None:
     near = ARM.pose_above(-1.8, 4.4, -0.1, TOP)
-    with pytest.raises(Unreachable, match="out of reach"):
+    with pytest.raises(Unreachable, check=coded("reach.too-far")):
         straight_line(ARM, near, near._replace(r_m=9.0))
-    with pytest.raises(Unreachable, match="slew"):
+    with pytest.raises(Unreachable, check=coded("reach.slew")):
         ARM.pose_above(0.5, -4.0, -0.1, TOP)
 
 
