@@ -99,7 +99,7 @@ def replay(
         CommandFailed: no recording, or one of another profile or DBC.
     """
     manifest = manifest_of(files)
-    first = list(islice(_ticks(files), _RATE_TICKS))
+    first = list(islice(recorded_ticks(files), _RATE_TICKS))
     settings = settings_for(manifest, first, profile, key)
     result = Result(
         total=sum(1 for _ in messages(files, TICK)),
@@ -112,7 +112,7 @@ def replay(
         return result
     controller, inputs = Controller(settings), Inputs()
     before: TickRecord | None = None
-    for tick in _ticks(files):
+    for tick in recorded_ticks(files):
         if before and (lost := _missing_between(before, tick, settings.period_ns)):
             result.missing = (
                 f"{lost} ticks are missing after tick {result.ticks - 1} ({_seconds(first[0], before)}); a replay "
@@ -131,7 +131,8 @@ def replay(
     return result
 
 
-def _ticks(files: list[Path]) -> Iterator[TickRecord]:
+def recorded_ticks(files: list[Path]) -> Iterator[TickRecord]:
+    """The tick records of a recording, in order; raises CommandFailed."""
     try:
         for data in messages(files, TICK):
             yield tick_record.decode(data)
