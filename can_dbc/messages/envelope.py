@@ -1,4 +1,4 @@
-"""The envelope of every UDP datagram between planner, operator and controller (design section 5).
+"""The envelope of every UDP datagram between planner, operator and controller (docs/architecture.md, "Setpoints").
 
 All kinds share one header and one trailer, little-endian::
 

@@ -17,7 +17,7 @@ from dataclasses import asdict
 
 import msgspec
 
-from can_dbc.messages.udp_address import udp_address
+from can_dbc.messages.udp_address import address_argument, udp_address
 from can_dbc.plc.map import Role, WordOrder
 from can_dbc.plc.modbus import LinkError, ModbusServer, is_loopback
 from machine.loading.profile_file import load_profile
@@ -81,16 +81,9 @@ class LivePlc(LivePlant):
         self._loop.run_until_complete(asyncio.sleep(0))
 
 
-def _address(text: str) -> Address:
-    try:
-        return udp_address(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
 def _listening(text: str) -> Address:
     host, _, port = text.rpartition(":")
-    return (udp_address(f"{host}:1")[0], 0) if port == "0" and host else _address(text)
+    return (udp_address(f"{host}:1")[0], 0) if port == "0" and host else address_argument(text)
 
 
 def main(arguments: list[str] | None = None) -> int:

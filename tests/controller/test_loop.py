@@ -12,10 +12,11 @@ from can_dbc.frame import Frame
 from can_dbc.messages import tick_record
 from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.udp_address import address_argument
 from can_dbc.messages.vehicle import Driving
 from can_dbc.protocols.canopen import SYNC_ID
 from can_dbc.timing.page import TimingWriter, read_timing
-from controller.__main__ import address, bus_address, listen, main, parser
+from controller.__main__ import bus_address, listen, main, parser
 from controller.carrier.vehicle import Vehicle
 from controller.config import ConfigError, load
 from controller.process.loop import Loop
@@ -339,7 +340,7 @@ def test_setpoint_socket_is_on_loopback_only():
 
 
 def test_addresses_and_settings():
-    assert address("127.0.0.1:5006") == ("127.0.0.1", 5006)
+    assert address_argument("127.0.0.1:5006") == ("127.0.0.1", 5006)
     assert bus_address("mach0=wire:mach0") == ("mach0", "wire:mach0")
     assert parser().parse_args(["--profile", "x", "--setpoint-port", "1"]).report == []
     assert load("palms_471", 100).period_ns == 10 * MS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import math
 import struct
@@ -25,8 +26,9 @@ from can_dbc.messages.crane import (
 )
 from can_dbc.messages.datagrams import Datagram, decode, encode
 from can_dbc.messages.envelope import DatagramFault, DatagramRefused
-from can_dbc.messages.udp_address import udp_address
+from can_dbc.messages.udp_address import AddressError, address_argument, udp_address
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
+from tests.codes import coded
 
 KEY = b"a key of the two sides"
 BODY_AT = 24  # bytes of the header
@@ -283,8 +285,11 @@ def test_a_refusal_says_why() -> None:
     "text", ["", "5006", "127.0.0.1", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:65536", "nosuch.invalid:6"]
 )
 def test_an_address_that_is_none_is_one_sentence(text):
-    with pytest.raises(ValueError, match=r"127\.0\.0\.1:5006"):
+    code = "address.unknown-host" if text.startswith("nosuch") else "address.malformed"
+    with pytest.raises(AddressError, check=coded(code)):
         udp_address(text)
+    with pytest.raises(argparse.ArgumentTypeError):
+        address_argument(text)
 
 
 def test_an_address_is_resolved_once():
