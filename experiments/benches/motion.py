@@ -43,8 +43,10 @@ GOAL_MS: Final = 50.0
 
 @dataclass(slots=True)
 class Bench:
-    """Measurements of one machine: CPU times [ms], durations [s] of our motions and of travel, clearance of travel
-    [m]."""
+    """Measurements of one machine.
+
+    CPU times [ms], durations [s] of our motions and of travel, clearance of travel [m].
+    """
 
     cpu_ms: list[float] = field(default_factory=list)
     best_ms: list[float] = field(default_factory=list)
@@ -128,7 +130,7 @@ def _cycle(bench: Bench, arm: Arm, home: Pose, logs: list[LogObservation]) -> No
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What stands around, what is held, and where `travel_over` passes: its height and how far before the goal [m]."""
+    """Obstacles, the held log, and for `travel_over` its height and the straight approach before the goal [m]."""
 
     around: CollisionScene
     held: HeldLog | None

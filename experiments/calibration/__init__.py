@@ -1,1 +1,1 @@
-"""Does ``timberhand calibrate`` recover what the plant hides?"""
+"""The calibration experiment: does ``timberhand calibrate`` recover the hidden truth?"""

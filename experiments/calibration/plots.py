@@ -11,7 +11,7 @@ from runtime.plot_style import MOSS, OIL, STEEL, limit_band, sheet
 
 
 def draw(path: Path, outcomes: Sequence[dict[str, Any]]) -> None:
-    """Errors per joint: dead-band, gain, dead time."""
+    """Plot the errors of every joint: dead-band, full speed, dead time."""
     ended = [o for o in outcomes if not o["failure"]]
     names = list(dict.fromkeys(n for o in ended for n in o["joints"]))
     with sheet(path, 3, 9.0, 3.0) as (deadband, gain, delay):

@@ -1,7 +1,7 @@
-"""What a rotator without an encoder really turns when a planner commands quarter turns, by any profile of its machine.
+"""True angle of a rotator without an encoder when a planner commands quarter turns, with any profile of its machine.
 
-Controller, guard, bus and plant as in every lockstep run; the turns go through the laws, as the planner's do.  The
-plant is made from the profile as shipped: a calibration changes what is believed of a machine, not the machine.
+Controller, guard, bus and plant are those of every lockstep run; the turns go through the control laws, as a planner's
+do. The plant is built from the profile as shipped: a calibration changes the controller's profile, not the machine.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import GrappleCommand, OperatorAction, StateReport
 from controller.config import Settings
 from controller.guard.__main__ import build as build_guard
+from experiments.common.errors import ExperimentError
 from experiments.common.pool import Job
 from experiments.common.worlds import profile_named
 from hil.harness.lockstep import START_NS, Lockstep, Observer
@@ -29,14 +30,14 @@ from sim.plant import Plant
 
 QUARTER_RAD: Final = pi / 2
 TURNS_RAD: Final = (QUARTER_RAD, 0.0, -QUARTER_RAD, 0.0)
-"""Where the turns end, one after the other: twice to either side."""
+"""End angles of the turns in order: two to either side."""
 REST_NS: Final = 1_500_000_000
 LEASE_NS: Final = 200_000_000
 LONGEST_S: Final = 60.0
 
 
 class _Turner:
-    """A planner that only turns the rotator; ``turned_rad`` are the true ways of the turns that are over."""
+    """A planner that only turns the rotator; ``turned_rad`` are the true angles of the completed turns."""
 
     def __init__(self, profile: Profile, plant: Plant) -> None:
         self.turned_rad: list[float] = []
@@ -71,10 +72,10 @@ class _Turner:
 
 
 def turn_errors(job: Job, path: Path) -> list[float]:
-    """By how much of a commanded quarter turn its true way differs, for each of `TURNS_RAD`, with a profile's file.
+    """Relative error of the true angle of every commanded turn in `TURNS_RAD`, with the profile in a file.
 
     Raises:
-        ValueError: the machine did not make all turns.
+        ExperimentError: the machine did not make all turns.
     """
     profile = load_profile(path)
     plant = Plant(profile_named(job.options["profile"]), seed=job.seed, truth=job.options["truth"], logs=0)
@@ -89,11 +90,13 @@ def turn_errors(job: Job, path: Path) -> list[float]:
     finally:
         plant.close()
     if not turner.done:
-        raise ValueError(f"only {len(turner.turned_rad)} of {len(TURNS_RAD)} quarter turns were made")
+        raise ExperimentError(
+            "experiment.quarter-turns", f"only {len(turner.turned_rad)} of {len(TURNS_RAD)} quarter turns were made"
+        )
     before = (0.0, *TURNS_RAD)
     asked = [b - a for a, b in zip(before, TURNS_RAD, strict=False)]
     return [true / want - 1.0 for true, want in zip(turner.turned_rad, asked, strict=True)]
 
 
 def _pressed(action: OperatorAction, report: StateReport) -> None:
-    """The human who arms says nothing."""
+    """The emulated operator prints nothing."""

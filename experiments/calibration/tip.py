@@ -1,8 +1,8 @@
-"""Where the hanger pin truly is, against where a calibrated profile says it is, at poses that no survey has seen.
+"""True position of the hanger pin compared with that of a calibrated profile, at poses that were not surveyed.
 
-The plant stands at the poses with its oil locked, empty and with a load on its hook; what the encoders would show goes
-through the shipped profile's kinematics and through the calibrated one's.  The load is known there, as a load cell
-would tell it; what the lift's pressures alone say of it is compared beside it.
+The plant rests at the poses with its oil locked, empty and with a load on its hook.  The encoder readings go through
+the kinematics of the shipped and of the calibrated profile.  There the load is known, as from a load cell; the load by
+the lift's pressures alone is compared with it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ GOALS: Final = (
     (4.27, 1.86, 1.0), (4.27, -1.86, 1.0), (6.0, 1.86, 1.0), (6.0, -1.86, 1.0),
     (3.0, 0.8, 1.6), (4.4, -2.4, 2.8), (5.2, 0.0, 1.8), (6.3, -1.0, 2.4),
 )  # fmt: skip
-"""Ahead of and beside the crane at slew 0 [m]: the four of paper B, and others; some are beyond the smaller crane."""
+"""Positions ahead of and beside the crane at slew 0 [m]: the four of paper B, and others; some are out of reach for the
+smaller crane.
+"""
 NUDGE_SPOOL, NUDGE_S = 0.22, 0.4
 HANG_S, REST_S, LOOK_S = 1.0, 4.0, 2.0
 
@@ -67,7 +69,7 @@ def _run(world: World, seconds: float, lift_spool: float = 0.0) -> None:
 
 
 def _hang_slowly(world: World, kg: float) -> None:
-    """Onto the hook without a shock."""
+    """Hang a load on the hook without a shock."""
     parts = 20
     for i in range(parts):
         hang(world, kg * (i + 1) / parts)
@@ -75,7 +77,7 @@ def _hang_slowly(world: World, kg: float) -> None:
 
 
 def _look(world: World, profile: Profile) -> tuple[list[float], Sequence[float], float]:
-    """Means over a while: what the encoders show through a profile, the true pin, and the moment by the pressures."""
+    """Means over an interval: encoder readings through a profile, the true pin, and the moment by the pressures."""
     names = [j.name.lower() for j in Joint]
     steps = round(LOOK_S / STEP_S)
     q, tip, bar = [0.0] * len(names), [0.0] * 3, [0.0] * 2
@@ -91,7 +93,7 @@ def _look(world: World, profile: Profile) -> tuple[list[float], Sequence[float],
 
 
 def _read_by(shown: Sequence[float], shipped: Profile, calibrated: Profile) -> list[float]:
-    """The same counts through the calibrated profile's zeros."""
+    """The same encoder counts with the zeros of the calibrated profile."""
     out = list(shown)
     for j in Joint:
         a, b = joint(shipped, j).encoder, joint(calibrated, j).encoder

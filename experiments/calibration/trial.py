@@ -1,4 +1,4 @@
-"""One calibration of one individual machine in lockstep, compared with the truth that only the plant knows."""
+"""One calibration of one individual machine in lockstep, compared with the hidden ground truth."""
 
 from __future__ import annotations
 
@@ -24,12 +24,14 @@ from machine.profile import Profile
 from sim.world import STEP_S
 
 TESTED_SPOOL: Final = 0.45
-"""The plant's own speed is taken at this spool: oil and steel come to rest soon, and every joint has room."""
+"""Spool at which the plant's own speed is measured: transients are short, and every joint has enough travel."""
 REST_S, RUN_S, TIMED_S = 0.2, 2.0, 1.0
 
 
 def calibrated(job: Job) -> dict[str, Any]:
-    """Options: profile, truth.  Errors of everything that was found; ``failure`` when the run did not end well."""
+    """Run a calibration; options: profile, truth.  Outcome: errors of all identified values, or the reason in
+    ``failure``.
+    """
     name, truth_name = job.options["profile"], job.options["truth"]
     profile = profile_named(name)
     outcome = run_lockstep(name, truth_name, job.seed, surveyed=True)
@@ -44,7 +46,7 @@ def calibrated(job: Job) -> dict[str, Any]:
         joints[j.name.lower()] = _joint_errors(job, profile, outcome.plan, truth, j, r)
     found = {
         **facts,
-        "implausible": list(result.implausible),
+        "implausible": [problem.sentence for problem in result.implausible],
         "joints": joints,
         **_survey_errors(truth, result),
     }
@@ -59,7 +61,7 @@ def calibrated(job: Job) -> dict[str, Any]:
 
 
 def _rotator_errors(job: Job, profile: Profile, truth: Any, turns: TurnFit, calibrated: Path) -> dict[str, Any]:
-    """Of a rotator without an encoder, against the truth of its valve; and what is wrong of commanded quarter turns."""
+    """Errors of a rotator without an encoder against its true valve, and of commanded quarter turns."""
     valve, known = truth.functions["rot"].valve, profile.joints["rot"].valve
     deadbands, fulls = (valve.deadband_plus, valve.deadband_minus), (valve.full_speed_plus, valve.full_speed_minus)
     sides = (turns.plus, turns.minus)
@@ -97,7 +99,7 @@ def _joint_errors(
 
 
 def _profile_errors(profile: Profile, valve: Any, which: Joint, real: list[float]) -> dict[str, list[float]]:
-    """How far off the profile is before it is calibrated."""
+    """Errors of the profile before calibration."""
     known = profile.joints[which.name.lower()].valve
     return {
         "deadband_pct": [
@@ -112,10 +114,10 @@ def _profile_errors(profile: Profile, valve: Any, which: Joint, real: list[float
 def real_full_speed(
     job: Job, profile: Profile, plan: CalibrationPlan, valve: Any, which: Joint, side: int, at: float
 ) -> float:
-    """Full speed of the plant at the place where the calibration states it: no bus, no controller, no sensor.
+    """Full speed of the plant where the calibration states it, measured without bus, controller and sensors.
 
-    The plant is driven past the place with a steady spool and timed; the metering curve of its truth leads from that
-    spool to the full one.  A load that pushes the joint is in it, as it is on a machine.
+    The plant is driven past that place with a constant spool and timed; the true metering curve converts the speed to
+    full spool.  A load that pushes the joint is included, as on a machine.
     """
     name = which.name.lower()
     deadband = valve.deadband_plus if side > 0 else valve.deadband_minus

@@ -32,7 +32,7 @@ def calibrated(job: Job) -> dict[str, Any]:
     known = profile_named(name)
     result = identify(known, outcome.calibration.found)
     if result.implausible:
-        return {"profile": None, "failure": "; ".join(result.implausible)}
+        return {"profile": None, "failure": "; ".join(problem.sentence for problem in result.implausible)}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "calibrated.toml"
         try:

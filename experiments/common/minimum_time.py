@@ -71,7 +71,7 @@ def minimum_time_s(path: np.ndarray, limits: Limits) -> float:
     q, slope, bend, step = _resampled(path, limits.speed)
     if not step:
         return 0.0
-    most = _greatest(q, slope, limits)
+    most = _largest(q, slope, limits)
     reach = np.zeros(len(q))
     for i in range(len(q) - 2, -1, -1):
         low, high = _bounds(slope[i], bend[i], limits.acceleration)
@@ -107,7 +107,7 @@ def _resampled(path: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndar
     return curve(s), curve(s, 1), curve(s, 2), float(s[1])
 
 
-def _greatest(q: np.ndarray, slope: np.ndarray, limits: Limits) -> np.ndarray:
+def _largest(q: np.ndarray, slope: np.ndarray, limits: Limits) -> np.ndarray:
     """Largest x allowed by speeds and flow, (n,)."""
     by_speed = np.max(np.abs(slope) / limits.speed, axis=1)
     by_flow = limits.flow(q, slope) / limits.pump_m3_s

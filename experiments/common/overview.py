@@ -1,6 +1,6 @@
-"""The page of all experiments, ``docs/results.md``: what each one asks, which limits it meets, what the papers report.
+"""The page of all experiments, ``docs/results.md``: questions, limits, and comparison with the papers.
 
-Input: the saved results in ``docs/results``.  Written whenever one of them is refreshed; measures nothing.
+Input: the saved results in ``docs/results``.  It is written whenever one of them is refreshed; nothing is measured.
 """
 
 from __future__ import annotations

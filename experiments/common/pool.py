@@ -22,6 +22,7 @@ from typing import Any, Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from experiments.common.errors import ExperimentError
 from runtime.allocator import keep_memory
 
 WAITING_PER_WORKER: Final = 2
@@ -87,12 +88,12 @@ def read_published(path: Path) -> dict[str, Any]:
     """The outcomes of a published file by the names of their jobs, whichever run made them.
 
     Raises:
-        ValueError: the file is missing or damaged.
+        ExperimentError: the file is missing or damaged.
     """
     try:
         _, *lines = lzma.decompress(path.read_bytes()).decode().splitlines()
     except (OSError, lzma.LZMAError) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from None
+        raise ExperimentError("experiment.published-trials", f"{path} cannot be read: {error}") from None
     return _outcomes(lines)
 
 

@@ -35,11 +35,11 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """What a result page says beside the numbers.
+    """The text of a result page.
 
     ``conclusion``: templates of sentences in which ``{name}`` stands for the value of a metric with its unit, and
-    ``{paper:name}`` for the paper's.  A sentence with a metric that the result lacks is left out.  ``setting``: what
-    was measured where, in place of the usual sentence on profile, truth and packages.
+    ``{paper:name}`` for the value of the paper.  A sentence with a metric that the result lacks is left out.
+    ``setting``: what was measured where, instead of the usual sentence on profile, truth and packages.
     """
 
     title: str
@@ -57,7 +57,7 @@ class Page:
 
 
 def publish(result: Result, page: Page, options: Options, console: Console) -> None:
-    """Save the result beside its plots in ``options.out``, print it, and write the docs if asked to."""
+    """Save the result beside its plots in ``options.out``, print it, and write the docs if requested."""
     result.save(options.out / "result.json")
     show(result, page.sections, console)
     if options.docs is not None:
@@ -103,7 +103,8 @@ def markdown(result: Result, page: Page) -> str:
 
 
 def conclusion(result: Result, page: Page) -> str:
-    """What was found, in one paragraph: the page's sentences, then how many limits are met and which are not."""
+    """The conclusion in one paragraph: the sentences of the page, then the number of limits met and those that are
+    not."""
     by_name = {m.name: m for m in page.metrics}
     said = [_sentence(result, by_name, template) for template in page.conclusion]
     return " ".join(s for s in (*said, limits_sentence(result, page.metrics)) if s)

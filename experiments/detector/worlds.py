@@ -31,8 +31,11 @@ LITTER_M: Final = 2.5  # grass and branches lie on the tiles within this distanc
 
 @dataclass(frozen=True, slots=True)
 class TestPicture:
-    """rgb (H, W, 3) uint8, depth_m (H, W) float32 as stereo gives it, mask (H, W) int16 with the logs' instances 1, 2,
-    ..., range [m] from the camera to what it looks at."""
+    """A test picture.
+
+    rgb (H, W, 3) uint8, depth_m (H, W) float32 with stereo errors, mask (H, W) int16 with the instances 1, 2, ... of
+    the logs, range [m] from the camera to its target.
+    """
 
     rgb: np.ndarray
     depth_m: np.ndarray

@@ -171,7 +171,7 @@ class _Surveyed:
         self._profile = surveyed_profile(profile, plant.world.truth, CAMERA, seed)
 
     def detect(self, stamp_ns: int, q: Sequence[float]) -> Pictures:
-        """``PICTURE_COUNT`` of what lies there now."""
+        """``PICTURE_COUNT`` pictures of the present scene."""
         camera, ids = self._profile.cameras[CAMERA], self._rig.picture(CAMERA)[2].mask
         pose = optical_pose(self._profile, camera, q)
         numbers = range(1, len(self._plant.logs()) + 1)

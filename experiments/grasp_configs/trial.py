@@ -63,8 +63,9 @@ class Attempt:
     """Time since which the crane rests above the logs [ns]."""
 
     def step(self, now_ns: int, report: StateReport | None, logs: tuple[LogObservation, ...]) -> bytes | None:
-        """One turn (contract of ``hil.harness.lockstep.Planner``): looks at the start until a grasp is chosen, and one
-        at each rest above it."""
+        """One planner cycle (contract of ``hil.harness.lockstep.Planner``): detects logs at the start until a grasp is
+        chosen, and once at each rest above it.
+        """
         activity = self.activity
         self._q = self._q if report is None else report.position
         data = activity.step(now_ns, report, self._looked(now_ns) if logs and self._q else ())
@@ -97,7 +98,7 @@ class Attempt:
 
 
 @dataclass(slots=True)
-class Timed:
+class TimedPlanner:
     """A planner that keeps its proposal and its CPU time."""
 
     planner: GraspPlanner
@@ -138,8 +139,10 @@ def planner_named(name: str) -> GraspPlanner:
 
 
 def attempt(job: Job) -> dict[str, Any]:
-    """Options: profile, truth, configuration, poses (of ``pose_sources.POSE_SOURCES``), planner (search, cnn or
-    cnn_physical), scene (its seed, for the job's is that of the machine), text (of the calibrated profile; None: as
+    """Run one attempt.
+
+    Options: profile, truth, configuration, poses (of ``pose_sources.POSE_SOURCES``), planner (search, cnn or
+    cnn_physical), scene (its seed; that of the job draws the machine), text (of the calibrated profile; None: as
     shipped).
     """
     with controller_profile(job.options["profile"], job.options.get("text")) as name:
@@ -154,7 +157,7 @@ def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
     plant = Plant(profile_named(o["profile"]), job.seed, o["truth"], scene=scene)
     try:
         before = plant.logs()
-        timed = Timed(planner_named(o["planner"]))
+        timed = TimedPlanner(planner_named(o["planner"]))
         activity = Activity(
             profile, digest, grasp_selector=PlannerSelection(timed), motion_planner=TimeOptimalPlanner(direct=False)
         )

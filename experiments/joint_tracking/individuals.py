@@ -1,6 +1,5 @@
-"""Whose crane it is: an individual of the truth's spread, or one twice as far off, with a controller that knows its
-valves as a calibration leaves them or as the profile assumes them.
-"""
+"""Individual machines of the truth's spread or twice that spread, with calibrated or shipped valves in the
+controller."""
 
 from __future__ import annotations
 
@@ -12,25 +11,26 @@ import msgspec
 
 from experiments.common.pool import Job
 from experiments.common.worlds import home_at, profile_named, trial_world
-from experiments.joint_tracking.testbed import Calibration, Rig, controller_profile
+from experiments.joint_tracking.testbed import Calibration, JointTestbed, controller_profile
 from machine.geometry.kinematics import max_reach_m
 from machine.loading.profile_file import load_profile
 from sim.world import World
 
 REACH_SHARE, HEIGHT_M = 0.55, 1.0
-WIDE: Final = 2.0
-"""Twice the spread of delay and gain that the truth states."""
+WIDE_FACTOR: Final = 2.0
+"""Factor on the spread of dead time and gain."""
 CORNERS: Final = tuple(product((0, 1), (0, 1), (False, True)))
-"""Corners of that: least or greatest delay, least or greatest gain, of all joints together; empty or loaded."""
+"""Corners of that spread for all joints together: least or largest dead time, least or largest gain, empty or loaded.
+"""
 
 
 def kind_of(job: Job) -> str:
-    """The shipped machine that a profile is like."""
+    """The shipped machine that a profile resembles."""
     return "palms_471" if profile_named(job.options["profile"]).carrier is None else "aoro_fc8"
 
 
 class Machine:
-    """A rig on a world of its own; closes it.  ``machine`` changes the truth of the individual."""
+    """Context of a testbed on a world of its own; ``machine`` changes the truth of the individual."""
 
     def __init__(self, job: Job, machine: Callable[[Job, World], Any] | None = None) -> None:
         o = job.options
@@ -41,9 +41,9 @@ class Machine:
         self._world = world = World(profile, truth, job.seed, (), home=home)
         calibration = Calibration(job.seed) if o["calibrated"] else None
         made = controller_profile(profile, world, o["law"], calibration, o.get("damped", True))
-        self._rig = Rig(made, world, job.seed)
+        self._rig = JointTestbed(made, world, job.seed)
 
-    def __enter__(self) -> Rig:
+    def __enter__(self) -> JointTestbed:
         return self._rig
 
     def __exit__(self, *_: object) -> None:
@@ -51,31 +51,32 @@ class Machine:
 
 
 def widened(job: Job, world: World) -> Any:
-    """Twice as far from the middle of the spread in dead time, from the nominal one in gain."""
+    """The truth with twice the deviation of the dead time from the middle of the spread, and of the gain from
+    nominal."""
     middle_s = 0.5 * (world.truth.spread.delay_min_s + world.truth.spread.delay_max_s)
 
     def change(drawn: Any, nominal: Any) -> tuple[float, float, float]:
         plus, minus = (
-            n + WIDE * (d - n)
+            n + WIDE_FACTOR * (d - n)
             for d, n in ((drawn.full_speed_plus, nominal.full_speed_plus),
                          (drawn.full_speed_minus, nominal.full_speed_minus))
         )  # fmt: skip
-        return middle_s + WIDE * (drawn.delay_s - middle_s), plus, minus
+        return middle_s + WIDE_FACTOR * (drawn.delay_s - middle_s), plus, minus
 
     return _changed(job, world, change)
 
 
 def cornered(job: Job, world: World) -> Any:
-    """All joints at the same bounds of twice the spread."""
+    """The truth with all joints at the same bounds of twice the spread."""
     spread, (late, fast, _) = world.truth.spread, CORNERS[job.options["corner"]]
     middle_s, half_s = 0.5 * (spread.delay_max_s + spread.delay_min_s), 0.5 * (spread.delay_max_s - spread.delay_min_s)
-    delay_s = middle_s + (WIDE if late else -WIDE) * half_s
-    gain = 1.0 + (WIDE if fast else -WIDE) * spread.gain
+    delay_s = middle_s + (WIDE_FACTOR if late else -WIDE_FACTOR) * half_s
+    gain = 1.0 + (WIDE_FACTOR if fast else -WIDE_FACTOR) * spread.gain
     return _changed(job, world, lambda _, n: (delay_s, gain * n.full_speed_plus, gain * n.full_speed_minus))
 
 
 def _changed(job: Job, world: World, change: Callable[[Any, Any], tuple[float, float, float]]) -> Any:
-    """``change``: drawn and nominal valve to dead time [s], not below one physics step, and full speeds."""
+    """``change`` maps drawn and nominal valve to dead time [s], which is at least one physics step, and full speeds."""
     with trial_world(job.options["profile"], "nominal", job.seed) as middle:
         nominal = middle.truth
     functions = {}

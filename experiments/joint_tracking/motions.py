@@ -1,4 +1,4 @@
-"""References of the experiment: smooth motions between joint poses, ramps and steps; functions of their own time."""
+"""References of the experiment as functions of their own time: smooth motions between joint poses, ramps and steps."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from experiments.joint_tracking.testbed import NAMES, Reference
 from machine.profile import Profile
 
 START_S: Final = 0.3
-"""Every motion begins after this time at rest."""
-PEAK: Final = 2.1875
-"""Greatest speed of the profile over its mean (docs/reference/machines.md section 1.6)."""
+"""Every motion starts after this time at rest."""
+PEAK_OVER_MEAN: Final = 2.1875
+"""Peak speed of the motion profile over its mean (docs/reference/machines.md section 1.6)."""
 STEP_S: Final = 0.08
-"""A step goes as far as the joint does in this time at its speed limit: the gate refuses more."""
+"""A step is as large as the distance of the joint in this time at its speed limit: the gate refuses more."""
 RAMP_SHARE: Final = 0.5
 RAMP_S: Final = 2.5
 RAMP_ENDS_S: Final = 0.8
@@ -27,7 +27,7 @@ def smooth(x: float) -> tuple[float, float]:
 
 
 def legs(start: Sequence[float], moves: Sequence[tuple[float, float, Mapping[str, float]]]) -> Reference:
-    """The sum of smooth moves: (begin [s], duration [s], way of each joint)."""
+    """The sum of smooth moves, each with start [s], duration [s] and distance of each joint."""
 
     def reference(time_s: float) -> tuple[list[float], list[float]]:
         q, v = list(start), [0.0] * len(start)
@@ -43,12 +43,12 @@ def legs(start: Sequence[float], moves: Sequence[tuple[float, float, Mapping[str
 
 
 def duration_s(profile: Profile, ways: Mapping[str, float], share: float) -> float:
-    """How long a smooth move takes whose fastest joint uses this share of its speed limit."""
-    return max(PEAK * abs(way) / (share * profile.joints[name].speed_limit) for name, way in ways.items())
+    """Duration [s] of a smooth move whose fastest joint uses this share of its speed limit."""
+    return max(PEAK_OVER_MEAN * abs(way) / (share * profile.joints[name].speed_limit) for name, way in ways.items())
 
 
 def step(profile: Profile, start: Sequence[float], name: str, side: int) -> tuple[Reference, float]:
-    """The position jumps as far as the gate lets it; and when it does."""
+    """A step of the position, as large as the gate allows, and its time [s]."""
     way = side * STEP_S * profile.joints[name].speed_limit
 
     def reference(time_s: float) -> tuple[list[float], list[float]]:
@@ -67,7 +67,7 @@ def ramp(
     share: float = RAMP_SHARE,
     ends_s: float = RAMP_ENDS_S,
 ) -> tuple[Reference, float]:
-    """A constant speed, a share of the limit, between smooth ends; and when it is over."""
+    """A constant speed, a share of the limit, with smooth ends, and the time of its end [s]."""
     speed = side * share * profile.joints[name].speed_limit
     j = NAMES.index(name)
 

@@ -1,4 +1,4 @@
-"""Pictures of the joint-tracking experiment."""
+"""Plots of the joint-tracking experiment."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PANELS: Final = (
 
 
 def draw(metrics: Mapping[str, float], outcomes: Mapping[str, Any], machines: Mapping[str, str], out: Path) -> None:
-    """All pictures into ``out``."""
+    """Write all plots into ``out``."""
     kept = {name.split("/")[1]: outcome["trace"] for name, outcome in outcomes.items() if "trace" in outcome}
     for short in machines:
         _compare(metrics, short, out / f"{short}.png")

@@ -1,8 +1,8 @@
-"""The joint laws on the physics, without bus and planner: sensors, estimators, pace, laws, valve maps, monitors.
+"""The testbed: joint laws on the physics, without bus and planner.
 
-As in the real loop: encoders answer a SYNC half a period before the tick with rounded counts, noise and their own
-latency; pressures are rounded to the bus's 0.1 bar; the command reaches the valves after the tick.  A reference is a
-function of its own time.
+It has sensors, estimators, pace, laws, valve maps and monitors.  As in the real loop, encoders answer a SYNC half a
+period before the tick with rounded counts, noise and their own latency; pressures are rounded to the 0.1 bar of the
+bus; the command reaches the valves after the tick.  A reference is a function of its own time.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.motion_monitor import MotionMonitor
 from controller.laws.crane import LOADS, CraneLaw
 from controller.laws.time_scaling import TimeScaling
+from experiments.common.errors import ExperimentError
 from machine.joints import JOINTS, N_JOINTS
 from machine.loading.profile_file import profile_hash
 from machine.profile import Profile, joint
@@ -27,8 +28,8 @@ from sim.world import STEP_NS, World
 
 NAMES: Final = tuple(j.name.lower() for j in JOINTS)
 BAR: Final = 1.0e5
-STEPS: Final = 2
-"""Physics steps of a tick; SYNC is between them."""
+STEPS_PER_TICK: Final = 2
+"""Physics steps per tick; SYNC is between them."""
 
 Reference = Callable[[float], tuple[Sequence[float], Sequence[float]]]
 """Positions and velocities of every joint at a time [s]."""
@@ -36,9 +37,10 @@ Reference = Callable[[float], tuple[Sequence[float], Sequence[float]]]
 
 @dataclass(slots=True)
 class Trace:
-    """What happened in every tick, in ``Joint`` order: reference at its own time, true and estimated positions,
-    commanded velocities, spool commands [%], load pressures [bar]; the trajectory's rate, whether the pump was the
-    limit.
+    """Samples of every tick, in ``Joint`` order.
+
+    Reference at its own time, true and estimated positions, commanded velocities, spool commands [%], load pressures
+    [bar]; the rate of the trajectory, and whether the pump was the limit.
     """
 
     time_s: list[float] = field(default_factory=list)
@@ -55,13 +57,16 @@ class Trace:
     """Time, joint and reason of every alarm of a motion monitor."""
 
 
-class Rig:
-    """One machine with one law; ``profile`` is what the controller believes, ``world`` what is so."""
+class JointTestbed:
+    """One machine with one law; ``profile`` is the controller's, ``world`` the ground truth."""
 
     def __init__(self, profile: Profile, world: World, seed: int) -> None:
         settings = Settings(profile, profile_hash(profile), profile.rate_hz)
-        if settings.period_ns != STEPS * STEP_NS:
-            raise ValueError(f"{profile.name}: the rig ticks at 200 Hz, the profile at {profile.rate_hz} Hz")
+        if settings.period_ns != STEPS_PER_TICK * STEP_NS:
+            raise ExperimentError(
+                "experiment.control-rate",
+                f"{profile.name}: this experiment needs a profile with 200 Hz, not {profile.rate_hz} Hz",
+            )
         self._period_ns, self._lead_ns = settings.period_ns, settings.sync_lead_ns
         period_s = self._period_ns * 1e-9
         self.world, self.profile = world, profile
@@ -82,11 +87,11 @@ class Rig:
             self._measure()
 
     def positions(self) -> list[float]:
-        """Where the joints are to the controller's knowledge; in truth where it cannot know."""
+        """Joint positions as the controller estimates them; true positions of joints without an encoder."""
         return [e.position if e.known else self.world.q[name] for e, name in zip(self.estimators, NAMES, strict=True)]
 
     def run(self, reference: Reference, seconds: float, on_tick: Callable[[float], None] | None = None) -> Trace:
-        """Follows a reference from its time 0 on; ``on_tick`` is called with the time before every tick."""
+        """Follow a reference from its time 0; ``on_tick`` is called with the time before every tick."""
         trace, begin_ns = Trace(), self._now_ns
         energy_j = self.world.hydraulics.energy_j
         for _ in range(round(seconds * 1e9 / self._period_ns)):
@@ -106,7 +111,7 @@ class Rig:
         self.world.step(commands)
 
     def _measure(self) -> None:
-        """One period of physics with its sensors."""
+        """Advance the physics by one period and sample the sensors."""
         self._step()
         stamp_ns = self._now_ns + self._period_ns - self._lead_ns
         counts: list[int | None] = []
@@ -156,7 +161,7 @@ class Rig:
 def controller_profile(
     profile: Profile, world: World, kind: str, calibration: Calibration | None, damped: bool
 ) -> Profile:
-    """The profile with another law, with or without pressure damping, and valves as a calibration leaves them."""
+    """The profile with another law, with or without pressure damping, and with calibrated or shipped valves."""
     import msgspec
 
     joints: dict[str, Any] = {}
@@ -169,7 +174,7 @@ def controller_profile(
 
 
 class Calibration:
-    """What a calibration finds of a valve: the truth, within its accuracy."""
+    """The result of a calibration: the true valve with errors of its accuracy."""
 
     DEADBAND_PCT: Final = 0.4
     HYSTERESIS_PCT: Final = 0.2
@@ -180,7 +185,7 @@ class Calibration:
         self._rng = random.Random(f"calibration {seed}")
 
     def valve(self, valve_spec: Any, true: Any) -> Any:
-        """The valve map with errors of one sigma as above."""
+        """The valve map with errors of the standard deviations above."""
         import msgspec
 
         off = self._rng.gauss

@@ -1,7 +1,7 @@
-"""One trial: a machine, a law, a motion or a disturbance; what came of it, at the joints and at the tip.
+"""One trial: a machine with a law makes a motion or meets a disturbance; metrics of joints and tip.
 
-The tip is the hanger pin by kinematics of the true joint positions, so that the column's give is not in it, as in
-paper B's accuracy test.
+The tip is the hanger pin by kinematics of the true joint positions, without the deflection of the column, as in paper
+B's accuracy test.
 """
 
 from __future__ import annotations
@@ -18,56 +18,56 @@ from experiments.common.worlds import hang
 from experiments.joint_tracking import motions
 from experiments.joint_tracking.individuals import CORNERS, Machine, cornered, kind_of, widened
 from experiments.joint_tracking.motions import START_S, duration_s, legs
-from experiments.joint_tracking.testbed import NAMES, Rig, Trace
+from experiments.joint_tracking.testbed import NAMES, JointTestbed, Trace
 from machine.geometry.kinematics import pin_position
 from sim.world import World
 
 ARM: Final = ("slew", "lift", "tilt", "ext")
 NEAR_M: Final = 0.015
-"""Settled: the tip stays this near to its goal."""
+"""The tip has settled when it stays this near to its goal."""
 REST_S: Final = 9.0
 QUIET_S: Final = 2.0
-"""After a motion: from then on, and from when the tip is near for good, the valves should be shut."""
+"""The valves should be closed this long after a motion, or from when the tip stays near its goal, if later."""
 END_S: Final = 0.5
 WOBBLE_S: Final = 1.5
-"""What the error does faster than a mean over this time is wobble."""
+"""Window of the moving average; the error without it is the oscillation of the tip."""
 RIPPLE_S: Final = 0.2
 RINGING_S: Final = 1.0
-"""The same for pressures, and for what rings after a stop."""
+"""Window of the moving average for ringing after a stop."""
 DIVERGED_M: Final = 0.3
-"""A tip that wobbles by more, or rests this far off and no nearer than where the motion left it, has diverged; a slow
-one has not.
-"""
+"""A tip has diverged if it oscillates by more, or rests this far off and no nearer than at the end of the motion."""
 CYCLE: Final = {
     "palms_471": {"slew": 0.9, "lift": -0.25, "tilt": 0.45, "ext": 0.45, "rot": 0.8},
     "aoro_fc8": {"slew": 1.1, "lift": -0.30, "tilt": 0.55, "ext": 0.80, "rot": 0.8},
 }
 LIFT_RAD: Final = 0.12
-"""How far the boom rises at both ends of a crane cycle: the quasi-parabola of paper B."""
+"""Rise of the boom in the first half of a crane cycle: the quasi-parabola of paper B."""
 LOAD_KG: Final = {"palms_471": 100.0, "aoro_fc8": 200.0}
 PICK_KG_S: Final = 400.0
-"""A log leaves the ground within a quarter or half of a second."""
+"""Rate at which the load comes on the hook: a log leaves the ground within a quarter to half a second."""
 DIP, DIP_S = 0.25, 1.0
-"""In the middle of a motion the supply gives this share of its pressure for so long."""
+"""In the middle of a motion the supply delivers this share of its pressure for this time."""
 STOPPED: Final = ("lift", "slew")
 STOP_SHARE: Final = 0.8
 STOP_S: Final = 4.0
 RINGS_S: Final = (0.25, 2.5)
-"""When after a stop its ringing counts."""
+"""Interval after a stop in which its ringing counts."""
 
 
 def perform(job: Job) -> dict[str, Any]:
-    """Options: profile (the shipped one or a file), truth, law, calibrated, and ``trace`` to keep the curves."""
+    """Run one trial; options: profile (a shipped one or a file), truth, law, calibrated, and ``trace`` to keep the
+    curves.
+    """
     return KINDS[job.kind](job)
 
 
 def cycle(job: Job, machine: Callable[[Job, World], Any] | None = None) -> dict[str, Any]:
-    """There and back with all joints together, quasi-parabolic, within the pump's flow."""
-    with Machine(job, machine) as rig:
+    """Move there and back with all joints together, quasi-parabolic, within the pump's flow."""
+    with Machine(job, machine) as testbed:
         if load_kg := job.options.get("load_kg", 0.0):
-            hang(rig.world, load_kg)
-        start, ways = rig.positions(), CYCLE[kind_of(job)]
-        out = duration_s(rig.profile, ways, job.options.get("share", 0.45))
+            hang(testbed.world, load_kg)
+        start, ways = testbed.positions(), CYCLE[kind_of(job)]
+        out = duration_s(testbed.profile, ways, job.options.get("share", 0.45))
         rise = {"lift": LIFT_RAD}
         back = {name: -way for name, way in ways.items()}
         there_s = START_S + out
@@ -76,41 +76,41 @@ def cycle(job: Job, machine: Callable[[Job, World], Any] | None = None) -> dict[
             (there_s + REST_S, out, back),
         ]  # fmt: skip
         legs_of = ((START_S, there_s), (there_s + REST_S, there_s + REST_S + out))
-        full_pa = rig.world.hydraulics.relief_pa
+        full_pa = testbed.world.hydraulics.relief_pa
 
         def dip(time_s: float) -> None:
             low = any(0.0 <= time_s - (begin_s + 0.5 * out) < DIP_S for begin_s, _ in legs_of)
-            rig.world.hydraulics.relief_pa = (DIP if low else 1.0) * full_pa
+            testbed.world.hydraulics.relief_pa = (DIP if low else 1.0) * full_pa
 
-        trace = rig.run(legs(start, moves), there_s + REST_S + out + REST_S, dip if job.kind == "dip" else None)
-        return _tip_figures(rig, trace, legs_of, job)
+        trace = testbed.run(legs(start, moves), there_s + REST_S + out + REST_S, dip if job.kind == "dip" else None)
+        return _tip_metrics(testbed, trace, legs_of, job)
 
 
 def pump(job: Job) -> dict[str, Any]:
-    """The same at full speed: more oil than the pump gives."""
+    """The cycle at full speed, which needs more flow than the pump delivers."""
     return cycle(_with(job, share=1.0))
 
 
 def wide(job: Job) -> dict[str, Any]:
-    """The same on a machine whose delays and gains lie twice as far off as the truth's spread allows."""
+    """The cycle on a machine whose dead times and gains deviate twice as much as the truth's spread allows."""
     return cycle(job, widened)
 
 
 def corner(job: Job) -> dict[str, Any]:
-    """The same on a machine in a corner of twice the spread, ``job.options["corner"]`` of `CORNERS`."""
+    """The cycle on a machine in a corner of twice the spread; the option ``corner`` is an index of `CORNERS`."""
     loaded = CORNERS[job.options["corner"]][2]
     return cycle(_with(job, load_kg=LOAD_KG[kind_of(job)] if loaded else 0.0), cornered)
 
 
 def steps(job: Job) -> dict[str, Any]:
-    """Every joint steps alone, one way and back: overshoot and settling."""
-    with Machine(job) as rig:
+    """Steps of every joint alone in both directions: overshoot and settling."""
+    with Machine(job) as testbed:
         overshoot, settling, left, chatter = [], [], [], []
         for name in ARM:
             for side in (1, -1):
-                start = rig.positions()
-                reference, begin_s = motions.step(rig.profile, start, name, side)
-                trace = rig.run(reference, begin_s + REST_S)
+                start = testbed.positions()
+                reference, begin_s = motions.step(testbed.profile, start, name, side)
+                trace = testbed.run(reference, begin_s + REST_S)
                 j = NAMES.index(name)
                 q = np.array([x[j] for x in trace.position])
                 goal = trace.reference[-1][j]
@@ -125,13 +125,13 @@ def steps(job: Job) -> dict[str, Any]:
 
 
 def ramps(job: Job) -> dict[str, Any]:
-    """Every joint alone at a constant speed, one way and back: error on the way."""
-    with Machine(job) as rig:
+    """Constant speed of every joint alone in both directions: tracking error."""
+    with Machine(job) as testbed:
         rms, ripple, chatter = [], [], []
         for name in ARM:
             for side in (1, -1):
-                reference, over_s = motions.ramp(rig.profile, rig.positions(), name, side)
-                trace = rig.run(reference, over_s + REST_S)
+                reference, over_s = motions.ramp(testbed.profile, testbed.positions(), name, side)
+                trace = testbed.run(reference, over_s + REST_S)
                 j, moving = NAMES.index(name), np.array(trace.time_s) < over_s
                 error = (np.array(trace.position) - np.array(trace.reference))[moving, j]
                 rms.append(float(np.sqrt((error**2).mean())))
@@ -141,33 +141,35 @@ def ramps(job: Job) -> dict[str, Any]:
 
 
 def pick_up(job: Job) -> dict[str, Any]:
-    """A load comes on the hook while the boom rises and stays while it stands."""
+    """A load is picked up while the boom rises, and stays on the hook."""
     load_kg = LOAD_KG[kind_of(job)]
-    with Machine(job) as rig:
-        start = rig.positions()
+    with Machine(job) as testbed:
+        start = testbed.positions()
         ways = {"lift": 0.2, "ext": 0.1}
-        out, begin_s = duration_s(rig.profile, ways, 0.45), 1.0
+        out, begin_s = duration_s(testbed.profile, ways, 0.45), 1.0
 
         def load(time_s: float) -> None:
-            hang(rig.world, min(max(0.0, (time_s - begin_s - START_S) * PICK_KG_S), load_kg))
+            hang(testbed.world, min(max(0.0, (time_s - begin_s - START_S) * PICK_KG_S), load_kg))
 
-        trace = rig.run(legs(start, [(begin_s, out, ways)]), begin_s + out + REST_S, load)
-        return _tip_figures(rig, trace, ((begin_s, begin_s + out),), job)
+        trace = testbed.run(legs(start, [(begin_s, out, ways)]), begin_s + out + REST_S, load)
+        return _tip_metrics(testbed, trace, ((begin_s, begin_s + out),), job)
 
 
 def stop(job: Job) -> dict[str, Any]:
-    """Boom and slew stop from most of their speed as hard as they may, with and without pressure feedback: how the pin
-    rings then, across the arm for the slew, up and down for the boom.
+    """Ringing of the pin after a stop of boom and slew from high speed with full deceleration, with and without
+    pressure feedback.
+
+    Lateral ringing for the slew, vertical ringing for the boom.
     """
     found: dict[str, Any] = {}
     for name, loaded, damped in product(STOPPED, (False, True), (True, False)):
         key = f"{name}_{'loaded' if loaded else 'empty'}_{'damped' if damped else 'plain'}"
-        with Machine(_with(job, damped=damped)) as rig:
+        with Machine(_with(job, damped=damped)) as testbed:
             if loaded:
-                hang(rig.world, LOAD_KG[kind_of(job)])
-            start = rig.positions()
-            rig.run(lambda _, at=start: (at, [0.0] * len(at)), 1.0)  # type: ignore[misc]
-            both = [_stop(rig, name, side) for side in (1, -1)]
+                hang(testbed.world, LOAD_KG[kind_of(job)])
+            start = testbed.positions()
+            testbed.run(lambda _, at=start: (at, [0.0] * len(at)), 1.0)  # type: ignore[misc]
+            both = [_stop(testbed, name, side) for side in (1, -1)]
         found[f"{key}_ring_m"] = [ring_m for ring_m, _, _ in both]
         found[f"{key}_ripple_bar"] = [ripple_bar for _, ripple_bar, _ in both]
         if job.options.get("trace") and loaded:
@@ -175,12 +177,12 @@ def stop(job: Job) -> dict[str, Any]:
     return found
 
 
-def _stop(rig: Rig, name: str, side: int) -> tuple[float, float, list[Any]]:
-    """Ringing of the pin [m] and ripple [bar] after a stop, and the curve: time after it, ringing."""
-    spec, pins = rig.profile.joints[name], []
+def _stop(testbed: JointTestbed, name: str, side: int) -> tuple[float, float, list[Any]]:
+    """Ringing of the pin [m] and pressure ripple [bar] after a stop, and the curve: time after the stop, ringing."""
+    spec, pins = testbed.profile.joints[name], []
     ends_s = 1.5 * STOP_SHARE * spec.speed_limit / spec.acceleration_limit
-    reference, over_s = motions.ramp(rig.profile, rig.positions(), name, side, STOP_SHARE, ends_s)
-    trace = rig.run(reference, over_s + STOP_S, lambda _: pins.append(rig.world.crane.pose("hanger")[0]))
+    reference, over_s = motions.ramp(testbed.profile, testbed.positions(), name, side, STOP_SHARE, ends_s)
+    trace = testbed.run(reference, over_s + STOP_S, lambda _: pins.append(testbed.world.crane.pose("hanger")[0]))
     t, pin = np.array(trace.time_s), np.array(pins)
     out = pin[-1, :2] / np.linalg.norm(pin[-1, :2])
     way = pin[:, 2] if name == "lift" else pin[:, :2] @ np.array((-out[1], out[0]))
@@ -200,9 +202,11 @@ def _with(job: Job, **options: Any) -> Job:
     return Job(job.name, job.kind, job.seed, {**job.options, **options})
 
 
-def _tip_figures(rig: Rig, trace: Trace, moved: tuple[tuple[float, float], ...], job: Job) -> dict[str, Any]:
-    """Errors of the tip and what the valves did, over the motions between the given times."""
-    kinematics, t = rig.profile.kinematics, np.array(trace.time_s)
+def _tip_metrics(
+    testbed: JointTestbed, trace: Trace, moved: tuple[tuple[float, float], ...], job: Job
+) -> dict[str, Any]:
+    """Errors of the tip and metrics of the valves over the motions between the given times."""
+    kinematics, t = testbed.profile.kinematics, np.array(trace.time_s)
     tip = np.array([pin_position(kinematics, q) for q in trace.position])
     goal = np.array([pin_position(kinematics, q) for q in trace.reference])
     error = np.linalg.norm(tip - goal, axis=1)
@@ -252,7 +256,7 @@ def _tip_figures(rig: Rig, trace: Trace, moved: tuple[tuple[float, float], ...],
 
 
 def _slow(values: Any, over_s: float, period_s: float) -> Any:
-    """Mean over a window about every moment, along the first axis."""
+    """Moving average over a centred window, along the first axis."""
     n = round(0.5 * over_s / period_s)
     padded = np.concatenate((np.repeat(values[:1], n + 1, axis=0), values, np.repeat(values[-1:], n, axis=0)))
     summed = np.cumsum(padded, axis=0)
@@ -260,13 +264,13 @@ def _slow(values: Any, over_s: float, period_s: float) -> Any:
 
 
 def _chatter_pct_s(trace: Trace, when: Any) -> float:
-    """Way of all spools of the arm per second [%/s]."""
+    """Travel of all spools of the arm per second [%/s]."""
     spools = np.array(trace.spool_pct)[when, : len(ARM)]
     return float(np.abs(np.diff(spools, axis=0)).sum() / (when.sum() * trace.time_s[1]))
 
 
 def _ripple_bar(trace: Trace, when: Any, joints: Sequence[int] = range(len(ARM)), over_s: float = RIPPLE_S) -> float:
-    """Root mean square of what the load pressures do faster than a mean over a time; mean of the joints."""
+    """RMS [bar] of the load pressures without their moving average; mean of the joints."""
     pressures = np.array(trace.load_bar)[:, list(joints)]
     pressures = pressures[:, np.isfinite(pressures).all(axis=0)]
     fast = (pressures - _slow(pressures, over_s, trace.time_s[1]))[when]

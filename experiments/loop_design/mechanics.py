@@ -59,10 +59,10 @@ class Chamber:
 class Mechanics:
     """One joint in one pose; revolute: kg m^2 and Nm/rad, prismatic: kg and N/m.
 
-    ``damping`` of the seals; ``inertia`` of all that follows rigidly, ``swinging`` what the hanging mass adds below its
-    ``pendulum_rad_s``, of which the share ``pendulum_free`` stays behind far above it.  The column:
-    ``column_inertia`` of all above its hinge, ``shared_inertia`` of hinge and joint, ``column_spring`` with
-    ``column_damping_s`` damper over spring.
+    ``damping`` of the seals; ``inertia`` of all parts that follow rigidly; ``swinging``: inertia that the hanging mass
+    adds below its ``pendulum_rad_s``, of which the share ``pendulum_free`` does not follow far above it.  The column:
+    ``column_inertia`` of all parts above its hinge, ``shared_inertia`` of hinge and joint, ``column_spring``, and
+    ``column_damping_s``, its damper over its spring.
     """
 
     filling: Chamber

@@ -46,7 +46,7 @@ COLUMNS: Final = (
 )  # fmt: skip
 
 
-class Planner:
+class NavigationPlanner:
     """Waits until the machine is armed and located, drives, and stores the samples."""
 
     def __init__(self, profile: Profile, plane: LocalPlane, points: Sequence[tuple[float, float]], way: str) -> None:
@@ -124,7 +124,7 @@ def perform(job: Job) -> dict[str, Any]:
     try:
         place(plant, o["pose"])
         plane = LocalPlane(carrier.site_lat_deg, carrier.site_lon_deg, o.get("altitude_m", 0.0))
-        planner = Planner(profile, plane, [(x, y) for x, y in o["points"]], o["way"])
+        planner = NavigationPlanner(profile, plane, [(x, y) for x, y in o["points"]], o["way"])
         planner.truth = plant.world.carrier
         operator = Operator(profile_hash(profile), lambda *_: None)
         observer = Observer(None, [], [planner.receive])

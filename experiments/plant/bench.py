@@ -17,11 +17,12 @@ from typing import Any, Final, cast
 
 from rich.console import Console
 
+from experiments.common.errors import ExperimentError
 from experiments.common.result import Metric
 from experiments.common.worlds import carrier_profile, profile_named, trial_world
 from experiments.plant.busworld import BusWorld
 from experiments.plant.driver import Driver
-from experiments.plant.trial import over_stakes_m, take, unload
+from experiments.plant.trial import over_stakes_m, pick_logs, unload
 from machine.geometry.kinematics import Unreachable
 from sim.mechanics.carrier import Drive
 from sim.plant import Plant
@@ -198,13 +199,15 @@ def _load_one(world: World, driver: Driver, quick: bool) -> None:
     centre, logs = world.base_pose()[0], world.log_bodies.states()
     for i in sorted(range(len(logs)), key=lambda i: math.dist(logs[i].position_m, centre)):
         try:
-            take(world, driver, lift_to_m=None if quick else over_stakes_m(world), logs=[logs[i]])
+            pick_logs(world, driver, lift_to_m=None if quick else over_stakes_m(world), logs=[logs[i]])
         except Unreachable:
             continue
         if not quick:
             unload(world, driver, [world.log_bodies.states()[i]])
         return
-    raise RuntimeError("the crane reaches no log of the row after the drive; the bench needs another route")
+    raise ExperimentError(
+        "experiment.plant-benchmark", "the crane reaches no log of the row after the drive; change the route"
+    )
 
 
 def _growth(profile: str, truth: str, count: int, stretches: int) -> Stopwatch:

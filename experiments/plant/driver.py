@@ -74,7 +74,7 @@ class Driver:
         self.reference = {name: self.world.q[name] for name in DRIVEN}
 
     def move(self, goal: Mapping[str, float]) -> None:
-        """All joints to ``goal`` on one minimum-jerk profile whose peak speeds are the profile's limits."""
+        """Move all joints to ``goal`` on one minimum-jerk profile whose peak speeds are the profile's limits."""
         start = dict(self.reference)
         delta = {name: value - start[name] for name, value in goal.items()}
         peaks = (15 / 8 * abs(d) / self.world.profile.joints[name].speed_limit for name, d in delta.items())
@@ -85,7 +85,7 @@ class Driver:
             self.tick({name: rate * d for name, d in delta.items()})
 
     def line(self, start: Point, end: Point, ext_m: float) -> None:
-        """The hanger pin along a straight line with the telescope held."""
+        """Move the hanger pin along a straight line with the telescope fixed."""
         steps = math.ceil(max(0.3, 15 / 8 * math.dist(start, end) / LINE_SPEED_M_S) / STEP_S)
         for i in range(1, steps + 1):
             share, _ = _minimum_jerk(i / steps, steps * STEP_S)
@@ -106,7 +106,10 @@ class Driver:
         common = [(max(a[0], b[0], c[0]), min(a[1], b[1], c[1])) for a in spans[0] for b in spans[1] for c in spans[2]]
         least, most = max(common, key=lambda span: span[1] - span[0], default=(0.0, -1.0))
         if least > most:
-            raise Unreachable(f"no telescope position serves ({x:.2f}, {y:.2f}) m from {low_m:.2f} to {high_m:.2f} m")
+            raise Unreachable(
+                f"no telescope position reaches ({x:.2f}, {y:.2f}) m from {low_m:.2f} to {high_m:.2f} m",
+                "experiment.no-telescope-position",
+            )
         margin = 0.1 * (most - least)
         wish = solve(self.world.profile, x, y, (low_m + high_m) / 2)[Joint.EXT]
         return min(max(wish, least + margin), most - margin)

@@ -17,7 +17,7 @@ from typing import Any, Final
 from experiments.common.pool import Job
 from experiments.common.worlds import trial_world
 from experiments.plant.driver import DRIVEN, Driver
-from experiments.plant.trial import take
+from experiments.plant.trial import pick_logs
 from machine.geometry.grapple import lowest_tip_below_pin_m, tip_below_pin_m
 from machine.geometry.kinematics import Unreachable
 from sim.world import STEP_S, World
@@ -43,7 +43,7 @@ def shift(job: Job) -> dict[str, Any]:
         rows: list[dict[str, float]] = []
         while steps * STEP_S < o["seconds"]:
             before = world.log_bodies.states()[0].position_m
-            take(world, driver, rng)
+            pick_logs(world, driver, rng)
             _lay_down(world, driver, rng)
             driver.move(home)
             driver.wait(3.0)
@@ -119,5 +119,5 @@ def fingerprint(job: Job) -> str:
                 values += [*position, *turn]
             digest.update(struct.pack(f"<{len(values)}d", *values))
 
-        take(world, Driver(world, note))
+        pick_logs(world, Driver(world, note))
     return digest.hexdigest()

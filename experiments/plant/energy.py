@@ -11,11 +11,11 @@ import numpy as np
 from experiments.common.pool import Job
 from experiments.common.worlds import home_at, step_neutral, trial_world
 from experiments.plant.driver import Driver
-from experiments.plant.trial import take
+from experiments.plant.trial import pick_logs
 from sim.bullet.client import GRAVITY_M_S2
 from sim.world import STEP_S, World
 
-EVERY: Final = 4
+STEPS_PER_SAMPLE: Final = 4
 WINDOW_S: Final = 2.0  # longer than the slowest swing
 RAISE_RAD: Final = 0.2
 FALL_M: Final = 0.6
@@ -31,15 +31,15 @@ def left_alone(job: Job) -> dict[str, Any]:
             world.step(spools)
         step_neutral(world, round(0.4 / STEP_S))
         kinetic = []
-        for _ in range(round((8.0 if o["quick"] else 20.0) / STEP_S / EVERY)):
-            step_neutral(world, EVERY)
+        for _ in range(round((8.0 if o["quick"] else 20.0) / STEP_S / STEPS_PER_SAMPLE)):
+            step_neutral(world, STEPS_PER_SAMPLE)
             kinetic.append(machine_kinetic_j(world))
-    n = round(WINDOW_S / STEP_S / EVERY)
+    n = round(WINDOW_S / STEP_S / STEPS_PER_SAMPLE)
     peaks = [max(kinetic[i : i + n]) for i in range(0, len(kinetic) - n + 1, n)]
     growth = max((b / a for a, b in pairwise(peaks) if b > NOISE_J), default=0.0)
     return {
         "metrics": {"kinetic_growth": growth, "kinetic_after_stop_j": peaks[0], "kinetic_last_j": peaks[-1]},
-        "traces": {"kinetic_j": [float(f"{k:.4g}") for k in kinetic], "kinetic_step_s": STEP_S * EVERY},
+        "traces": {"kinetic_j": [float(f"{k:.4g}") for k in kinetic], "kinetic_step_s": STEP_S * STEPS_PER_SAMPLE},
     }
 
 
@@ -101,7 +101,7 @@ def lifting(job: Job) -> dict[str, Any]:
     o = job.options
     with trial_world(o["profile"], o["truth"], job.seed, "single", 1) as world:
         driver = Driver(world)
-        take(world, driver)
+        pick_logs(world, driver)
         driver.rest(2.0)
         oil = world.hydraulics
         before, pump, stored = _potential_j(world), oil.energy_j, oil.stored_j
@@ -142,12 +142,12 @@ def resting(job: Job) -> dict[str, Any]:
                 for log in bodies.body_ids:
                     p.changeDynamics(log, -1, activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING)
             start, trace = [log.position_m for log in bodies.states()], []
-            for _ in range(round((6.0 if o["quick"] else 60.0) / STEP_S / EVERY)):
-                step_neutral(world, EVERY)
+            for _ in range(round((6.0 if o["quick"] else 60.0) / STEP_S / STEPS_PER_SAMPLE)):
+                step_neutral(world, STEPS_PER_SAMPLE)
                 trace.append(max(log.speed_m_s for log in bodies.states()))
             metrics[f"{name}fastest_m_s"] = max(trace)
             metrics[f"{name}moved_m"] = max(
                 math.dist(a, log.position_m) for a, log in zip(start, bodies.states(), strict=True)
             )
             traces[f"{name}speed_m_s"] = [float(f"{v:.4g}") for v in trace[::25]]
-    return {"metrics": metrics, "traces": {**traces, "step_s": 25 * EVERY * STEP_S}}
+    return {"metrics": metrics, "traces": {**traces, "step_s": 25 * STEPS_PER_SAMPLE * STEP_S}}

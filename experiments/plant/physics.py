@@ -16,7 +16,7 @@ from experiments.common.pool import Job
 from experiments.common.worlds import hang, home_at, mass_points, profile_named, step_neutral, trial_world
 from experiments.plant.driver import Driver
 from experiments.plant.signals import Ringing, ringing
-from experiments.plant.trial import take
+from experiments.plant.trial import pick_logs
 from sim.bullet.client import GRAVITY_M_S2
 from sim.hydraulics.circuit import Hydraulics
 from sim.wood.log_shape import LogSpec
@@ -26,7 +26,7 @@ SAG_REACH_M: Final = 6.0
 SAG_LOADS_KG: Final = (0.0, 50.0, 100.0, 150.0, 200.0, 250.0)
 PIN_HEIGHT_M: Final = 1.2
 SLEW_LOG_YAW_RAD: Final = 0.4
-EVERY: Final = 4  # physics steps between samples of a trace
+STEPS_PER_SAMPLE: Final = 4  # physics steps between samples of a trace
 BEYOND_LIFT: Final = ("boom", "stick", "telescope", "hanger", "fork", "rotator", "tong_left", "tong_right")
 BEYOND_HANGER: Final = BEYOND_LIFT[3:]
 BEYOND_FORK: Final = BEYOND_LIFT[4:]
@@ -125,14 +125,14 @@ def boom_stop(job: Job) -> Outcome:
             heights = []
             for i in range(round(9.0 / STEP_S)):
                 world.step(spools if i * STEP_S < 1.5 else [0.0] * len(spools))
-                if i % EVERY == 0:
+                if i % STEPS_PER_SAMPLE == 0:
                     heights.append(world.tip()[2])
-        after = heights[round(1.8 / STEP_S / EVERY) :]
-        ring = ringing(after, STEP_S * EVERY, floor=5e-4)
+        after = heights[round(1.8 / STEP_S / STEPS_PER_SAMPLE) :]
+        ring = ringing(after, STEP_S * STEPS_PER_SAMPLE, floor=5e-4)
         metrics |= {f"ring_hz_{name}": ring.hz, f"ring_zeta_{name}": ring.zeta, f"ring_pp_m_{name}": ring.peak_to_peak}
         traces[name] = [round(h, 6) for h in heights]
     metrics |= {"ring_hz": metrics["ring_hz_empty"], "ring_zeta": metrics["ring_zeta_empty"]}
-    return {"metrics": metrics, "traces": {"boom_stop": traces, "boom_stop_step_s": STEP_S * EVERY}}
+    return {"metrics": metrics, "traces": {"boom_stop": traces, "boom_stop_step_s": STEP_S * STEPS_PER_SAMPLE}}
 
 
 def pendulum(job: Job) -> Outcome:
@@ -152,9 +152,9 @@ def pendulum(job: Job) -> Outcome:
             angles = []
             for i in range(round(12.0 / STEP_S)):
                 world.step([0.0] * len(world.functions))
-                if i % EVERY == 0:
+                if i % STEPS_PER_SAMPLE == 0:
                     angles.append(world.q[hinge])
-            swing = ringing(angles, STEP_S * EVERY, floor=2e-3)
+            swing = ringing(angles, STEP_S * STEPS_PER_SAMPLE, floor=2e-3)
             c = getattr(world.truth.structure, f"{hinge}_damping_nm_s_rad")
             zeta = c / (2.0 * inertia * 2.0 * math.pi * theory_hz)
         metrics |= _against(hinge, swing, theory_hz, zeta)
@@ -163,7 +163,7 @@ def pendulum(job: Job) -> Outcome:
         }  # fmt: skip
     metrics["pendulum_period_error"] = max(metrics["hanger_period_error"], metrics["fork_period_error"])
     metrics["pendulum_damping_error"] = max(metrics["hanger_damping_error"], metrics["fork_damping_error"])
-    return {"metrics": metrics, "traces": {"pendulum": traces, "pendulum_step_s": STEP_S * EVERY}}
+    return {"metrics": metrics, "traces": {"pendulum": traces, "pendulum_step_s": STEP_S * STEPS_PER_SAMPLE}}
 
 
 def _against(name: str, seen: Ringing, hz: float, zeta: float) -> dict[str, float]:
@@ -201,7 +201,7 @@ def compound(world: World, hinge: str, links: tuple[str, ...], logs: tuple[int, 
 
 
 def slew_stop(job: Job) -> Outcome:
-    """Grasp a thick log, slew, stop: it swings across the reach; period against the compound pendulum with the log.
+    """Grasp a thick log, slew and stop: swing period across the reach against the compound pendulum with the log.
 
     The log is thick enough to be clamped; a thin one lies loose in the closed grapple and swings by itself.
     """
@@ -209,7 +209,7 @@ def slew_stop(job: Job) -> Outcome:
     x, y = profile_named(o["profile"]).workspace.pick_center_m
     with trial_world(o["profile"], o["truth"], job.seed, (LogSpec(x, y, SLEW_LOG_YAW_RAD, 2.5, 0.30, 600.0),)) as world:
         driver = Driver(world)
-        take(world, driver)
+        pick_logs(world, driver)
         driver.wait(3.0)
         held = tuple(b for b, t in zip(world.log_bodies.body_ids, world.touched(), strict=True) if t)
         theory_hz, _ = compound(world, "fork", BEYOND_FORK, held)
@@ -219,9 +219,9 @@ def slew_stop(job: Job) -> Outcome:
             if i * STEP_S >= 1.5:
                 spools[world.functions.index("slew")] = 0.0
             world.step(spools)
-            if i % EVERY == 0:
+            if i % STEPS_PER_SAMPLE == 0:
                 angles.append(world.q["fork"])
-        swing = ringing(angles[round(2.2 / STEP_S / EVERY) :], STEP_S * EVERY, floor=4e-3)
+        swing = ringing(angles[round(2.2 / STEP_S / STEPS_PER_SAMPLE) :], STEP_S * STEPS_PER_SAMPLE, floor=4e-3)
     return {
         "metrics": {
             "slew_pendulum_hz": swing.hz,
@@ -231,7 +231,7 @@ def slew_stop(job: Job) -> Outcome:
         },
         "traces": {
             "slew_stop": [round(a, 6) for a in angles],
-            "slew_stop_step_s": STEP_S * EVERY,
+            "slew_stop_step_s": STEP_S * STEPS_PER_SAMPLE,
             "slew_stop_hz": theory_hz,
         },
     }

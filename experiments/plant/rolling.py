@@ -18,7 +18,7 @@ from sim.bullet.client import GRAVITY_M_S2
 from sim.mechanics.carrier import PARKED, Drive
 from sim.world import STEP_S, World
 
-EVERY: Final = 20
+STEPS_PER_SAMPLE: Final = 20
 STEER_KP_1_S: Final = 2.5
 SHARES: Final = (0.5, 1.0)  # of the articulation's limit
 TURN_M: Final = 16.0
@@ -58,7 +58,7 @@ def turning(job: Job) -> dict[str, Any]:
             length_m = TURN_M / 4 if o["quick"] else TURN_M
             for i in range(round(length_m / spec.cruise_speed_m_s / STEP_S)):
                 world.step(_steer(world, target), drive)
-                if i % EVERY == 0:
+                if i % STEPS_PER_SAMPLE == 0:
                     path.append(carrier.front_axle()[:2])
                     headings.append(carrier.heading_rad)
                     angles.append(world.q["articulation"])
@@ -71,7 +71,7 @@ def turning(job: Job) -> dict[str, Any]:
             errors += [abs(radius / theory - 1.0), abs(abs(per_m) * theory - 1.0)]
             traces.append({"path": path[::4], "centre": centre, "radius": theory, "articulation_rad": angle})
             metrics |= {"turn_radius_m": radius, "turn_deg_m": math.degrees(abs(per_m)), "turn_speed_m_s": run / (
-                (len(path) - 1) * EVERY * STEP_S
+                (len(path) - 1) * STEPS_PER_SAMPLE * STEP_S
             )}  # fmt: skip
     metrics["turn_radius_error"] = max(errors)
     return {"metrics": metrics, "traces": {"turning": traces}}
@@ -87,7 +87,7 @@ def fit_circle(path: list[tuple[float, float]]) -> tuple[tuple[float, float], fl
 
 
 def braking(job: Job) -> dict[str, Any]:
-    """Stand, then drive straight and brake: weight on the wheels, stopping distance, swing of the empty grapple."""
+    """Rest, then drive straight and brake: weight on the wheels, stopping distance, swing of the empty grapple."""
     o = job.options
     with trial_world(o["profile"], o["truth"], job.seed) as world:
         spec, carrier = world.profile.carrier, world.carrier
@@ -106,18 +106,18 @@ def braking(job: Job) -> dict[str, Any]:
         for i in range(round(14.0 / STEP_S)):
             rolling = i * STEP_S < stop
             world.step(neutral, Drive(spec.cruise_speed_m_s) if rolling else PARKED)
-            if i % EVERY == 0:
+            if i % STEPS_PER_SAMPLE == 0:
                 pin, grapple = world.link_poses()["hanger"][0], world.link_poses()["rotator"][0]
                 hang.append(math.atan2(math.dist(pin[:2], grapple[:2]), pin[2] - grapple[2]))
                 speeds.append(carrier.speed_m_s)
-        at = round(stop / STEP_S / EVERY)
+        at = round(stop / STEP_S / STEPS_PER_SAMPLE)
     return {
         "metrics": {
             "weight_error": abs(loads / (mass * GRAVITY_M_S2) - 1.0),
             "parked_creep_m": crept,
             "cruise_speed_error": abs(speeds[at - 1] / spec.cruise_speed_m_s - 1.0),
             "brake_swing_rad": max(hang[at:]),
-            "cruise_swing_rad": max(hang[at - round(1.0 / STEP_S / EVERY) : at]),
+            "cruise_swing_rad": max(hang[at - round(1.0 / STEP_S / STEPS_PER_SAMPLE) : at]),
         },
-        "traces": {"braking": {"hang_rad": hang, "speed_m_s": speeds, "step_s": STEP_S * EVERY}},
+        "traces": {"braking": {"hang_rad": hang, "speed_m_s": speeds, "step_s": STEP_S * STEPS_PER_SAMPLE}},
     }

@@ -44,7 +44,7 @@ def grasp(job: Job) -> dict[str, Any]:
         driver = Driver(world, watch)
         rng = random.Random(f"aim {job.seed}")
         high = over_stakes_m(world) if o["unload"] else None
-        take(world, driver, rng, o["across_m"], o["turned_rad"], high)
+        pick_logs(world, driver, rng, o["across_m"], o["turned_rad"], high)
         weighed = []
         for _ in range(round(WEIGH_S / STEP_S)):
             driver.tick({})
@@ -105,7 +105,7 @@ class TopSpeed:
                 self.m_s = max(self.m_s, math.hypot(*(a + side * b for a, b in zip(v, turn, strict=True))))
 
 
-def take(
+def pick_logs(
     world: World,
     driver: Driver,
     rng: random.Random | None = None,
@@ -179,4 +179,7 @@ def _aim(
         except Unreachable:
             continue
         return (*at, yaw + noise[2], ground)
-    raise Unreachable(f"the aim ({x:.2f}, {y:.2f}) m is out of reach; narrow the profile's pick area")
+    raise Unreachable(
+        f"the grasp target ({x:.2f}, {y:.2f}) m is out of reach; narrow the pick area of the profile",
+        "experiment.target-out-of-reach",
+    )

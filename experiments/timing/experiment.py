@@ -126,13 +126,15 @@ def setting(result: Result) -> str:
     """One sentence on what was measured where."""
     e = result.environment
     plan = FULL if result.trials == FULL.quiet else QUICK
+    quiet = "The host was quiet enough for the comparison of wake-ups."
+    if not result.metrics["host_verdict"]:
+        quiet = "The host was too noisy for the comparison of wake-ups, which is therefore **inconclusive**."
     return (
-        f"Commit `{result.commit}`; `{FORWARDER}` on both buses at 200 Hz, quiet windows {plan.quiet} x "
+        f"Commit `{result.commit}`; `{result.profile}` on both buses at 200 Hz, quiet windows {plan.quiet} x "
         f"{plan.quiet_s:.0f} s, loaded ones {plan.loaded} x {plan.loaded_s:.0f} s; `{FIXED_CRANE}` at 1 kHz, "
         f"{plan.fast} of {plan.fast_s:.0f} s each. Host: {e['processor']}, {e['cpus']} cores, hypervisor: "
         f"{e['hypervisor']}, kernel {e['kernel']}, preemption {e['preemption']}, clock {e['clock']}, governor "
-        f"{e['governor']}, isolated processors {e['isolated']}, Python {e['python']}. Host: "
-        f"**{e['host_verdict']}**."
+        f"{e['governor']}, isolated processors {e['isolated']}, Python {e['python']}. {quiet}"
     )
 
 

@@ -33,6 +33,7 @@ from can_dbc.bus.wire_client import WireClient
 from can_dbc.dbc.codec import Database, MessageCodec, load
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.protocols.e2e import Checker, Sender
+from experiments.common.errors import ExperimentError
 from hil.wire.server import Server
 from host.exit_codes import CommandFailed, ExitCode
 
@@ -69,7 +70,7 @@ class Traffic:
 
 
 class Reader:
-    """E2E check and decoding by key, as `controller.crane.inputs` does it; ``accepted`` counts the good frames."""
+    """Checks and decodes frames by key, as `controller.crane.inputs` does; ``accepted`` counts the good frames."""
 
     def __init__(self, database: Database) -> None:
         self._slots = {
@@ -139,7 +140,9 @@ def measure(frames: int, rounds: int) -> dict[str, Any]:
                 samples.setdefault(f"rx_decode_{lane.name}_us", []).append((rx_ns + decode_ns) / frames / 1000)
     for name, reader in readers.items():
         if reader.accepted < rounds * frames - 200:  # the first frame of each stream only initializes its counter
-            raise AssertionError(f"path {name} accepted {reader.accepted} of {rounds * frames} frames")
+            raise ExperimentError(
+                "experiment.frames-rejected", f"path {name} accepted {reader.accepted} of {rounds * frames} frames"
+            )
     metrics = {name.replace("_ours", ""): median(values) for name, values in samples.items()}
     metrics["rx_decode_ratio"] = metrics["rx_decode_pythoncan_us"] / metrics["rx_decode_us"]
     return {

@@ -27,7 +27,7 @@ from runtime.plot_style import OIL, STEEL, TIMBER, sheet
 MINUTES: Final = 30.0
 QUICK_MINUTES: Final = 1.0 / 3.0
 WARM_S: Final = 5.0
-EVERY_S: Final = 5.0
+READING_PERIOD_S: Final = 5.0
 MIN_READINGS: Final = 20
 """Minimum number of readings; a short run reads more often."""
 MIN_ACTIVE_SHARE: Final = 0.5
@@ -139,7 +139,7 @@ def run(options: Options, console: Console) -> Result:
         while (passed := time.monotonic() - began) < 60.0 * minutes:
             readings.append(read(testbed, passed))
             status.update(f"soak: {passed / 60:.1f} of {minutes:.3g} min, {readings[-1].facts.words}")
-            testbed.wait(min(EVERY_S, 60.0 * minutes / MIN_READINGS, 60.0 * minutes - passed))
+            testbed.wait(min(READING_PERIOD_S, 60.0 * minutes / MIN_READINGS, 60.0 * minutes - passed))
         end = testbed.fresh_timing()
         readings.append(read(testbed, time.monotonic() - began))
         after, stops, modes, stop_reasons = (
