@@ -46,10 +46,10 @@ def draw(pile: Pile, seed: int, size_px: int = 304) -> Labelled:
     view = _view(pile, keep, camera, rng, size_px, scene.ground)
     boxes = _steel(pile, keep, view, rng, held)
     scene = replace(scene, boxes=boxes, rods=scene.rods + _clutter(pile, keep, rng))
-    look = ImagingConditions.random(rng.getrandbits(31))
-    picture = render(scene, view, look, rng.getrandbits(16))
+    conditions = ImagingConditions.random(rng.getrandbits(31))
+    picture = render(scene, view, conditions, rng.getrandbits(16))
     if rng.random() < PLAIN_SHARE:
-        picture = replace(picture, rgb=_plain(picture, view, look, rng))
+        picture = replace(picture, rgb=_plain(picture, view, conditions, rng))
     elif rng.random() < PLAIN_SKY_SHARE:
         picture = replace(picture, rgb=np.where((picture.mask == SKY)[..., None], _sky(rng), picture.rgb))
     depth = _stereo_depth(pile.machine, camera, picture, view.intrinsics, rng)
@@ -148,7 +148,7 @@ def _view(pile: Pile, logs: tuple[LogPose, ...], camera: str, rng: random.Random
     if rng.random() < AWAY_SHARE:
         target += np.array([rng.gauss(0.0, 6.0), rng.gauss(0.0, 6.0), 0.0])
     azimuth = rng.uniform(-math.pi, math.pi)
-    way = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+    direction = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     for _ in range(20):
         if camera == "d435" or rng.random() < 0.15:
             elevation, reach = math.radians(rng.uniform(70.0, 89.0)), rng.uniform(2.0, 4.5)
@@ -160,7 +160,7 @@ def _view(pile: Pile, logs: tuple[LogPose, ...], camera: str, rng: random.Random
                 math.radians(rng.uniform(15.0, 85.0)),
                 math.exp(rng.uniform(math.log(2.0), math.log(9.0))),
             )
-        eye = target + reach * (math.cos(elevation) * way + np.array([0.0, 0.0, math.sin(elevation)]))
+        eye = target + reach * (math.cos(elevation) * direction + np.array([0.0, 0.0, math.sin(elevation)]))
         if eye[2] > ground.height(eye[0], eye[1]) + 0.7 and _clear_of_logs(eye, logs):
             break
     view = look_at(eye, target, pin)
@@ -233,7 +233,7 @@ def _stereo_depth(machine: str, camera: str, picture: Picture, pin: Intrinsics, 
     return noise.apply(picture, pin, 0)
 
 
-def _plain(picture: Picture, view: View, look: ImagingConditions, rng: random.Random) -> np.ndarray:
+def _plain(picture: Picture, view: View, conditions: ImagingConditions, rng: random.Random) -> np.ndarray:
     """The picture with ground, logs and sky in one colour each, lit by the sun; the rest is unchanged."""
     pin, s = view.intrinsics, np.nan_to_num(1.0 / picture.depth_m, nan=0.0)
     h, w = s.shape
@@ -245,7 +245,7 @@ def _plain(picture: Picture, view: View, look: ImagingConditions, rng: random.Ra
     normal[1, :-1] = (s[:-1] - s[1:]) * pin.fy_px
     normal[2] = -s - u * normal[0] - v * normal[1]
     normal /= np.sqrt((normal * normal).sum(axis=0)) + 1e-9
-    sun = view.rotation.T @ np.asarray(look.sun)
+    sun = view.rotation.T @ np.asarray(conditions.sun)
     ambient = rng.uniform(0.35, 0.75)
     light = ambient + (1.0 - ambient) * np.clip(np.tensordot(sun.astype(np.float32), normal, 1), 0.0, 1.0)
     bark, earth, keep = _colour(rng), _colour(rng), rng.choice((0.0, 0.0, 0.3, 0.6))  # keep: share of the texture

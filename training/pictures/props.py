@@ -41,14 +41,14 @@ class Steel:
 
     def grapple(self, profile: Profile, at_m: np.ndarray, yaw_rad: float, opening: float) -> None:
         """Add a grapple with its rotator at ``at_m``; ``opening`` is 0 closed to 1 open."""
-        tongs, k = jaw_geometry(profile), profile.kinematics
+        jaws, k = jaw_geometry(profile), profile.kinematics
         hang = rpy_matrix((self._rng.gauss(0.0, 0.05), self._rng.gauss(0.0, 0.05), yaw_rad))
-        angle = (1.0 - opening) * tongs.closed_rad
+        angle = (1.0 - opening) * jaws.closed_rad
         frames = {"rotator": (np.zeros(3), np.eye(3))}
         frames["fork"] = (np.array([0.0, 0.0, k.fork_to_rotator_m]), np.eye(3))
         frames["hanger"] = (np.array([0.0, 0.0, k.fork_to_rotator_m + k.hanger_to_fork_m]), np.eye(3))
         for side, link in ((-1, "tong_left"), (1, "tong_right")):
-            pivot = np.array([side * tongs.pivot_x_m, PIVOT_Y_M, -tongs.pivot_z_m])
+            pivot = np.array([side * jaws.pivot_x_m, PIVOT_Y_M, -jaws.pivot_z_m])
             frames[link] = (pivot, rpy_matrix((0.0, side * angle, 0.0)))
         for shape in _grapple(profile.name):
             at, turn = frames[shape.link]
@@ -56,10 +56,10 @@ class Steel:
 
     def holding(self, profile: Profile, log: LogPose) -> None:
         """Add a grapple that is closed around the middle of a log."""
-        rng, tongs = self._rng, jaw_geometry(profile)
+        rng, jaws = self._rng, jaw_geometry(profile)
         opening, along = rng.uniform(0.12, 0.35), quaternion_matrix(log.quaternion)[:, 2]
-        turn = (1.0 - opening) * tongs.closed_rad
-        tip_m = tongs.pivot_z_m + tongs.out_m * math.sin(turn) + tongs.down_m * math.cos(turn)
+        turn = (1.0 - opening) * jaws.closed_rad
+        tip_m = jaws.pivot_z_m + jaws.out_m * math.sin(turn) + jaws.down_m * math.cos(turn)
         up_m = tip_m - log.diameter_m / 2 - rng.uniform(0.0, 0.08)
         middle = np.asarray(log.position_m) + rng.gauss(0.0, 0.1) * along
         yaw = math.atan2(along[1], along[0]) - math.pi / 2
