@@ -342,11 +342,6 @@ class Controller:
         return self.crane.governor.position
 
     @property
-    def reference_velocity(self) -> list[float]:
-        """Velocity of the reference [rad/s, m/s]."""
-        return self.crane.governor.velocity
-
-    @property
     def stale_mask(self) -> int:
         """Stale inputs of both buses, one bit each."""
         bus = self.carrier_bus

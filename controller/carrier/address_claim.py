@@ -53,7 +53,7 @@ class AddressClaim:
             wanted = int.from_bytes(frame.data, "little")
             self._due |= wanted == CLAIM_PGN and destination in (ADDRESS, BROADCAST)
         elif pgn == CLAIM_PGN and source == ADDRESS and len(frame.data) == self._claim.length:
-            # The NAME with the smaller number wins; two of the same cannot tell themselves apart, and both go.
+            # The smaller NAME wins; two nodes of the same NAME cannot be distinguished, and both give up.
             theirs, ours = (int.from_bytes(name, "little") for name in (frame.data, self._name))
             self.lost |= theirs <= ours
             self._due = True

@@ -32,7 +32,7 @@ FROZEN_SAMPLES_COUNT: Final = 5
 """A heading that stays the same to the last digit over this many samples while the machine turns is frozen."""
 MIN_TURN_RAD_S: Final = 0.02
 MIN_COURSE_SPEED_M_S: Final = 0.25
-"""From this speed on the course over ground tells forward from reverse."""
+"""From this speed on the course over ground distinguishes forward from reverse."""
 MAX_COURSE_ERROR_RAD: Final = 1.2
 """Greatest angle between course and heading; beyond it the heading is wrong."""
 MAX_BEND_RAD: Final = 1.2

@@ -2,8 +2,8 @@
 
 The joint laws compensate the dead-band by the profile's value, so it cannot be measured through them.  A spool test
 bypasses the laws and nothing else: the gate checks lease, order and arming as for every setpoint; range, speed and
-duration are checked here in every tick by the encoder.  The command may not grow faster, nor ask for more speed by the
-profile's valve map, than a law's.
+duration are checked here in every tick by the encoder.  The command may not grow faster than a law's, nor request more
+speed by the profile's valve map.
 
 A joint without an encoder cannot be tested, except a rotator, which only turns the grapple on the spot.  Its angle is
 integrated from the commands of all its tests since the start and stays within its range; no test of it lasts over 5 s.
@@ -95,7 +95,7 @@ class SpoolTestRun:
         self._last = 0.0
         self.function = NO_FUNCTION
         self.integrated_rad = 0.0
-        """How far all tests together told a rotator without an encoder to turn."""
+        """Commanded turn of a rotator without an encoder, summed over all tests."""
 
     @property
     def running(self) -> bool:

@@ -20,9 +20,6 @@ ACCELERATION_SHARE: Final = 1.0 / 3.0
 """Root mean square of the acceleration over the joint's limit, ..."""
 ACCELERATION_S: Final = 0.1
 """... which lasts about this long: together the spectral density of the white acceleration."""
-STILL_S: Final = 0.2
-"""A joint stands still when its speed has been below `STILL_SHARE` of its full speed for this long."""
-STILL_SHARE: Final = 0.012
 _JUMP_WINDOW_NS: Final = 100_000_000
 _JUMP_LIMIT_COUNT: Final = 3
 _NAN: Final = math.nan
@@ -72,8 +69,8 @@ class JointEstimator:
     """Tracks one joint; ``known`` is False until the first sample, and then position and velocity are NaN."""
 
     __slots__ = (
-        "_alpha", "_beta", "_gate_speed", "_jump_stamps", "_measured", "_measured_ns", "_moved_ns", "_period_s",
-        "_predicted_ns", "_slack", "_slow", "jumped", "known", "position", "refused", "velocity",
+        "_alpha", "_beta", "_gate_speed", "_jump_stamps", "_measured", "_measured_ns", "_period_s",
+        "_predicted_ns", "_slack", "jumped", "known", "position", "refused", "velocity",
     )  # fmt: skip
 
     def __init__(self, spec: TrackedJoint, period_s: float) -> None:
@@ -85,20 +82,14 @@ class JointEstimator:
             self._slack = 4.0 * encoder.unit_per_count + 6.0 * encoder.noise
         self._period_s = period_s
         self._gate_speed = 3.0 * max(valve.full_speed_plus, valve.full_speed_minus, spec.speed_limit)
-        self._slow = STILL_SHARE * min(valve.full_speed_plus, valve.full_speed_minus)
         self.refused = 0
         self.reset()
-
-    @property
-    def still(self) -> bool:
-        """Whether the joint stands still."""
-        return self.known and self._predicted_ns - self._moved_ns >= STILL_S * 1e9
 
     def reset(self) -> None:
         """Forget everything: the value is unknown again."""
         self.known = self.jumped = False
         self.position = self.velocity = self._measured = _NAN
-        self._measured_ns = self._predicted_ns = self._moved_ns = 0
+        self._measured_ns = self._predicted_ns = 0
         self._jump_stamps = [-_JUMP_WINDOW_NS] * _JUMP_LIMIT_COUNT
 
     def predict(self, now_ns: int) -> None:
@@ -131,13 +122,11 @@ class JointEstimator:
         self.velocity += correction
         self.position += self._alpha * residual + correction * age_s
         self._measured, self._measured_ns = measured, stamp_ns
-        if abs(self.velocity) > self._slow:
-            self._moved_ns = self._predicted_ns
 
     def _start(self, measured: float, stamp_ns: int) -> None:
         self.known = True
         self.position = self._measured = measured
         self.velocity = 0.0
-        self._measured_ns, self._moved_ns = stamp_ns, self._predicted_ns
+        self._measured_ns = stamp_ns
         for i in range(_JUMP_LIMIT_COUNT):
             self._jump_stamps[i] = stamp_ns - _JUMP_WINDOW_NS

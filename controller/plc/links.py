@@ -98,7 +98,7 @@ class UdpLink:
             data = shake.datagram(self._bridge.command(now_ns), now_ns)
             try:
                 self._socket.send(data)
-            except OSError as error:  # nobody listens, or the interface is gone; the answers grow old
+            except OSError as error:  # no receiver, or the interface is gone; the answers grow old
                 shake.exchange_failed(f"The PLC cannot be reached: {error.strerror}")
             await timer.wait()
 

@@ -30,4 +30,4 @@ class BusLink:
         if stats.recoveries != reading.recoveries:
             self.bus.flush()
             frames.clear()
-        reading.take(stats)
+        reading.copy_from(stats)

@@ -317,8 +317,8 @@ def test_refusals_before_a_motion_do_not_stop_it():
 def test_stuck_joint_holds_within_400_ms():
     bench = Bench().active(speed=0.13)
     for _ in range(15):
-        bench.drive(0, bench.controller.reference_velocity[0] + 0.02, 10)
-        if bench.controller.reference_velocity[0] > 0.25:
+        bench.drive(0, bench.controller.crane.governor.velocity[0] + 0.02, 10)
+        if bench.controller.crane.governor.velocity[0] > 0.25:
             break
     bench.stuck.add(0)
     for k in range(1, 81):

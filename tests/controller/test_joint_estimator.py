@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
 from controller.estimation.joint_estimator import (
-    STILL_S,
     JointEstimator,
     acceleration_density,
     measurement_variance,
@@ -130,17 +129,3 @@ def test_missing_sample_is_extrapolated():
     before = estimator.position
     estimator.predict(10**9 + 200 * T)
     assert estimator.position == pytest.approx(before + 0.2 * PERIOD_S, abs=2e-4)
-
-
-def test_standstill_is_detected_despite_noise():
-    estimator = JointEstimator(SLEW, PERIOD_S)
-    assert not estimator.still, "unknown is not still"
-    follow(estimator, [0.1 * k * PERIOD_S for k in range(100)])
-    assert not estimator.still
-    end = 0.1 * 99 * PERIOD_S
-    ticks = round(STILL_S / PERIOD_S)
-    follow(estimator, [end] * (ticks // 2), start_ns=10**9 + 100 * T)
-    assert not estimator.still
-    rest = [end + 1.5e-4 * (-1) ** k for k in range(3 * ticks)]
-    follow(estimator, rest, start_ns=10**9 + (100 + ticks // 2) * T)
-    assert estimator.still

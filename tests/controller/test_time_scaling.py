@@ -153,7 +153,7 @@ def test_setpoint_at_the_slowed_reference_is_accepted():
     follower = bench.controller.crane.governor
     assert follower.behind_ns > 100 * MS
     here = list(bench.controller.reference_position)
-    speed = list(bench.controller.reference_velocity)
+    speed = list(bench.controller.crane.governor.velocity)
     end = [h + 0.2 * v for h, v in zip(here, speed, strict=True)]
     bench.tick([bench.setpoint([(0, here, speed), (400, end, [0.0] * 5)])])
     assert bench.mode is Mode.ACTIVE and follower.behind_ns == 0
