@@ -23,10 +23,10 @@ from math import atan, cos, hypot, sin, sqrt
 from typing import Final
 
 from machine.geometry.kinematics import jacobian
+from machine.geometry.sag import GRAVITY_M_S2
 from machine.joints import N_JOINTS, Joint
 from machine.profile import Imu, Profile, joint
 
-GRAVITY_M_S2: Final = 9.81
 RETURN_1_S: Final = 1.5
 SENSOR_DELAY_S: Final = 0.02
 """Delay of the sensor's own filter before it sends."""
