@@ -1,1 +1,1 @@
-"""The activity manager: what the forwarder does next, as a table, and what it needs to know to decide."""
+"""The activity manager: transition tables, world model, route and crane execution, load bookkeeping, checkpoints."""

@@ -28,7 +28,7 @@ GREEN_KG_M3: Final = 900.0
 
 
 class LoadDetector:
-    """The load of one grasp from the time it closed; ``feel`` accepts every report."""
+    """The load of one grasp from the time it closed; ``update`` accepts every report."""
 
     def __init__(self, logs: Sequence[LogObservation]) -> None:
         weight_kg = GREEN_KG_M3 * sum(volume_m3(log.length_m, log.diameter_m) for log in logs)

@@ -35,7 +35,7 @@ LIFTED_M: Final = 0.5
 
 
 class LogMemory:
-    """Call ``list`` once per step; see the module's contract."""
+    """Call ``log_list`` once per step; see the module's contract."""
 
     def __init__(self, profile: Profile) -> None:
         self._profile, self._arm = profile, Arm(profile)

@@ -1,1 +1,1 @@
-"""How the machine drives along waypoints: paper B's way and our own."""
+"""Driving: along a planned path with path following (ours), or from waypoint to waypoint (paper B)."""

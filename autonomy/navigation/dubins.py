@@ -1,6 +1,6 @@
 """Turning manoeuvres between two headings: two arcs and a straight line (Dubins 1957).
 
-Each is given by the corners of polygons round its arcs; `autonomy.navigation.clothoid_path.drivable` rounds them.
+Each is given by the corners of polygons round its arcs; `autonomy.navigation.clothoid_path.drivable_path` rounds them.
 """
 
 from __future__ import annotations

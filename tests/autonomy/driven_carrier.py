@@ -1,11 +1,11 @@
-"""The carrier whose driving is tested, and where it is."""
+"""The carrier of the driving tests, and locations of it."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from autonomy.localization.location import Location, Status
-from machine.load import load_profile
+from machine.loading.profile_file import load_profile
 
 CARRIER = load_profile("aoro_fc8").carrier
 assert CARRIER is not None

@@ -1,5 +1,5 @@
-"""A forwarder without mass on level ground: it drives, rises and sinks as it is told, under the crane of
-`crane_stand_in`; a perfect detector sees what lies near it.
+"""A forwarder without mass on level ground: it executes drive setpoints and frame heights, with the crane of
+`crane_stand_in`; a perfect detector lists the logs near it.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Forwarder:
         return sum(over_bunk(self.profile, o.center_m) for o in self.crane.logs if o.id != held)
 
     def vehicle(self) -> VehicleReport:
-        """What the controller says of the carrier."""
+        """The controller's vehicle report."""
         now_ns = self.crane.now_ns
         x, y, yaw = (0.5 * (a + b) for a, b in zip(self._past[0], self._past[1], strict=True))
         assert LATENCY_NS == 75_000_000  # between those two

@@ -24,7 +24,7 @@ def begin(*logs, end_m: float = 26.0, **told: Any) -> tuple[Forwarder, Forwardin
 
 
 def run(forwarder: Forwarder, job: ForwardingJob, enough, limit: int = 20_000) -> list[tuple[str, dict[str, Any]]]:
-    """What is told on the way, each time that it has changed."""
+    """The events until ``enough(job)``, each time that they change."""
     told: dict[str, Any] = {}
     said = []
     for _ in range(limit):

@@ -29,7 +29,7 @@ def place(x_m: float, y_m: float) -> Point:
 def begin(
     lie=LOGS, table=OURS, end_m: float = 26.0, landing=None, bearing_deg=None, known=(), fences=(), **options
 ) -> tuple[Forwarder, ActivityManager]:
-    """A machine that looks east, logs along its way, and a manager with the switch at Auto."""
+    """A machine that faces east, logs along its route, and a manager in Auto."""
     way = (place(10.0, 0.0), place(end_m, 0.0))
     landings = () if landing is None else (Landing(place(*landing), bearing_deg=bearing_deg),)
     mission = ForwardingMission("test", way, fences, landings, known, Options(**options))
@@ -58,7 +58,7 @@ def states(manager: ActivityManager) -> list[State]:
 def again(
     machine: Forwarder, manager: ActivityManager, told: ForwardingMission, path: Path, table=OURS
 ) -> ActivityManager:
-    """Another planner, with what the file says alone, some time later: the machine has come to rest."""
+    """Another planner that only has the checkpoint file, some time later: the machine stands."""
     CheckpointFile(path).write(manager.progress(), machine.crane.now_ns, 10**18)
     progress = read_checkpoint(path, told, machine.crane.now_ns, 10**18)
     machine.drive = machine.crane.setpoint = None

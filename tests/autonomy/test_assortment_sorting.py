@@ -23,7 +23,7 @@ from tests.autonomy.mapped_logs import lying
 
 SAW, PULP, ALL, NONE = ("saw logs",), ("pulpwood",), (), ("energy",)
 Lie = tuple[str, float, float]
-"""A log's assortment and place [m]; it lies along the way."""
+"""A log's assortment and position [m]; it lies along the route."""
 
 
 def sorting(*takes: tuple[str, ...], sorts: bool = True, only: tuple[str, ...] = ()) -> Sorting:
@@ -75,7 +75,7 @@ def test_the_first_log_on_board_decides_the_landing() -> None:
     both.book_loaded(["pulpwood", "saw logs"])
     assert both.landing == 1 and both.wants("pulpwood") and not both.wants("saw logs")
     both.book_loaded(["saw logs"])
-    assert both.landing == 1, "one that came up by mistake changes nothing"
+    assert both.landing == 1, "a log loaded by mistake changes nothing"
     both.book_unloaded()
     assert both.wants("saw logs")
 
@@ -128,7 +128,7 @@ def test_wanted_logs_always_belong_to_the_landing_of_the_load(takes, only, grasp
     rules = sorting(*takes, only=only)
     for kinds in grasps:
         if not rules.wants(kinds[0]):
-            continue  # nobody reaches out for what is to stay
+            continue  # the machine does not stop for logs to be left
         taken = [k for k in kinds if rules.wants(k) and rules.may_share_grasp(k, kinds[0])]
         rules.book_loaded(taken)
         assert not taken or {rules.landing_of(k) for k in taken} == {rules.landing}
@@ -209,7 +209,7 @@ def test_a_planner_restarted_with_a_load_drives_the_second_round(tmp_path: Path)
 
 @whole
 def test_the_round_in_which_nothing_was_loaded_is_the_last() -> None:
-    """A listed log that nobody finds calls for one more round, not for ever more."""
+    """A listed log that is not found needs one more round, not endless ones."""
     lie = (("saw logs", 15.0, 4.2), ("pulpwood", 18.0, -9.5))
     landings = ((34.0, 14.0, SAW), (34.0, -14.0, PULP))
     machine, manager = forwarder(lie), managed(mission(lie, landings, sort_by_assortment=True))

@@ -48,7 +48,7 @@ class World:
         )  # fmt: skip
 
     def live(self, mode: Mode, enough: int = 0, **changes: object) -> None:
-        """Reports and answers, until so many setpoints have come or the process has ended."""
+        """Send reports and log lists until ``enough`` setpoints are received or the process has ended."""
         deadline = time.monotonic() + 20.0
         while time.monotonic() < deadline and self.process.poll() is None:
             report = replace(self.crane.report(), stamp_ns=time.monotonic_ns(), mode=mode, **changes)  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ from autonomy.navigation.path_drive import PathDrive
 
 
 def glide(path: Path, x: float, y: float, yaw: float, metres: float, slip: float = 0.0) -> list[float]:
-    """Lateral errors of a perfect machine that does what the follower wants, 50 ms a step."""
+    """Lateral errors of a perfect machine that executes the follower's output, 50 ms per step."""
     lf, lr = CARRIER.front_axle_m, CARRIER.rear_axle_m
     bend, v, dt, stamp = 0.0, 0.6, 0.05, 10**9
     state, errors = FollowerState(), []

@@ -1,4 +1,4 @@
-"""StanForD 2010: logs from a harvester's hpr, and the fpr of what was forwarded against the structure of its schema."""
+"""StanForD 2010: logs from a harvester's hpr, and the structure of the fpr against its schema."""
 
 from __future__ import annotations
 

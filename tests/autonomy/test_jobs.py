@@ -1,4 +1,4 @@
-"""The planning process's jobs: what they tell, when they are idle, how they end."""
+"""The jobs of the planning process: their events, when they are idle, how they end."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ NEAR = st.floats(-5000.0, 5000.0)
 
 
 def proj(frame: LocalFrame) -> pyproj.Transformer:
-    """PROJ's own way from degrees to the topocentric frame, sharing no code with ours."""
+    """PROJ's conversion from degrees to the topocentric frame, which shares no code with ours."""
     return pyproj.Transformer.from_pipeline(
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
         f"+step +proj=topocentric +ellps=WGS84 +lon_0={frame.longitude_deg!r} +lat_0={frame.latitude_deg!r} "

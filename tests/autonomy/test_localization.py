@@ -47,7 +47,7 @@ class Drive:
         self.tamper = lambda report: report
 
     def on(self, seconds: float) -> list[Location]:
-        """The locations of so many seconds."""
+        """The locations during a drive of this duration."""
         out = []
         for _ in range(round(seconds * 200)):
             report = self.vehicle.step()
@@ -133,7 +133,7 @@ def test_the_covariance_is_consistent(ground: Ground) -> None:
 
 
 def test_an_error_of_ten_centimetres_would_be_detected() -> None:
-    """The bound of the test above bites: what is off by four of its sigmas is not honest."""
+    """The bound of the test above is effective: an error of four sigmas is not consistent."""
     drive = Drive()
     location = drive.on(6.0)[-1]
     off = drive.off(location) + np.array([0.15, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""The map of the logs: numbers that stay, averages that get better, nothing from the bunk."""
+"""The log map: stable numbers, improving averages, no logs from the bunk."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def field_of(*places: tuple[float, float]) -> LogMap:
 
 
 class Hands:
-    """A job whose crane is where a test says; `step` makes one turn of memory."""
+    """A job with a crane pose set by the test; `step` makes one step of the memory."""
 
     def __init__(self, field: LogMap) -> None:
         self.memory, self.field, self.now_ns = LogMemory(PROFILE), field, 0

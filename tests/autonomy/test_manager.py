@@ -1,4 +1,4 @@
-"""Missions on the stand-in: what is done, what is never done at once, and what ends in words."""
+"""Missions on the stand-in: their states, their safety conditions, and the reasons of their failures."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_the_circle_is_only_left_on_its_far_side() -> None:
     for away_m, inside, past in ((5.4, False, False), (5.2, True, False), (-5.2, True, False), (-5.4, False, True)):
         log = replace(lying(1, 0.0, 0.0), center_m=world.base.to_base(np.array([-away_m, 0.0, 0.0])))
         assert (world.is_in_circle(log), world.has_passed(log)) == (inside, past), away_m
-    assert world.has_passed(None), "a log that is gone keeps nobody waiting"
+    assert world.has_passed(None), "a log that is no longer mapped counts as passed"
 
 
 def test_without_logs_the_machine_drives_to_the_end_of_the_route() -> None:
@@ -265,7 +265,7 @@ def test_logs_from_before_the_mission_are_unloaded_too() -> None:
     forwarder.run(manager, ended, 900.0)
     assert manager.state is State.DONE, manager.failure
     assert manager.tally.unloaded == 1 and manager.tally.on_board == manager.tally.loaded == forwarder.in_bunk == 0
-    assert not manager.tally.loads, "what was on board before was forwarded by somebody else"
+    assert not manager.tally.loads, "logs from before the mission are not part of a load"
     assert math.dist(forwarder.field[7].center_m[:2], (30.0, 12.0)) < 1.6
 
 

@@ -1,4 +1,4 @@
-"""Mission files whose places cannot be right."""
+"""Mission files with wrong coordinates."""
 
 from __future__ import annotations
 

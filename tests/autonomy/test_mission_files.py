@@ -152,7 +152,7 @@ def test_files_cut_off_and_files_of_other_kinds(tmp_path: Path) -> None:
         load_mission(tmp_path)
 
 
-# -- what the parts of GeoJSON must be --------------------------------------------------------------------------
+# -- invalid parts of GeoJSON ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What each format of a mission file says."""
+"""The content of every mission file format."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Mission files that nobody wrote: every one is read or refused with sentences, never with a traceback; and what is
-written is read again.
+"""Random mission files: each one is read or refused with problems, never with a traceback; written files are read
+back.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a mission tells: how it stands, where things lie, and never more than a datagram takes."""
+"""The mission report: state, positions, and a size that fits a datagram."""
 
 from __future__ import annotations
 
@@ -158,5 +158,7 @@ def test_the_longest_mission_fits_in_a_datagram() -> None:
     assert sum(len(f.corners) for f in told.fences) <= MAX_CORNERS
     assert near(told.route[0], *PLANE.local(corners[0].latitude_deg, corners[0].longitude_deg)[:2])
     assert near(told.route[-1], *PLANE.local(corners[-1].latitude_deg, corners[-1].longitude_deg)[:2])
-    assert max(math.dist(PLANE.local(*log.place)[:2], (0.0, 0.0)) for log in told.logs) < 31.0, "the nearest are told"
+    assert max(math.dist(PLANE.local(*log.place)[:2], (0.0, 0.0)) for log in told.logs) < 31.0, (
+        "the nearest logs are reported"
+    )
     assert [g.log for g in told.given_up][-1] == 499 and told.given_up[0].reason.endswith("…")

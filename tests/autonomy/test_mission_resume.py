@@ -78,7 +78,7 @@ def test_a_resumed_mission_has_the_same_tally(landing, left_at, tmp_path: Path) 
     machine.run(manager, over, 900.0)
     assert manager.state is State.DONE, manager.failure
     assert manager.tally.loaded == 2 and not manager.tally.given_up
-    assert states(manager).count(State.APPROACH) == 2 - before, "nobody looks again for what was taken"
+    assert states(manager).count(State.APPROACH) == 2 - before, "loaded logs are not searched for again"
     assert states(manager)[:3] == [State.STOW, State.RAISE, State.SEARCH], "the crane was anywhere"
     assert min(behind) > left_m - 1.0, "it does not drive back"
     if landing is None:
@@ -180,7 +180,7 @@ LAPS = ForwardingMission("test", tuple(place(*p) for p in ((10.0, 0.0), (30.0, 0
 
 @pytest.fixture(scope="module")
 def undisturbed_m() -> float:
-    """The way of a planner that drives all laps."""
+    """Distance of a planner that drives all laps."""
     machine, manager = begun(LAPS, ())
     machine.run(manager, ended, 900.0)
     return machine.driven_m
@@ -200,7 +200,7 @@ def test_the_remaining_waypoints_of_all_laps_are_counted(
         math.dist(PLANE.local(left.at[1].latitude_deg, left.at[1].longitude_deg)[:2], (machine.x_m, machine.y_m)) < 0.5
     )
     manager = again(machine, manager, told, tmp_path / "progress.json")
-    assert manager.progress().left == left, "as long as nothing was driven"
+    assert manager.progress().left == left, "until something was driven"
     manager.auto()
     machine.run(manager, ended, 900.0)
     assert manager.state is State.DONE
@@ -244,7 +244,7 @@ HEADINGS = st.tuples(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0), st.floats(-
 
 @given(HEADINGS)
 def test_a_machine_with_any_heading_can_turn_onto_its_route(start) -> None:
-    """One of the ways is drivable, as the ride tries them; the shortest may have a leg too short for its bends."""
+    """One of the candidates is drivable; the shortest may have a leg too short for its bends."""
     x, y, yaw = start
     ahead = (x + 3.0 * math.cos(yaw), y + 3.0 * math.sin(yaw))
     ways = dubins_corners((*ahead, yaw), (0.0, 0.0, 0.0), 9.5)

@@ -96,7 +96,7 @@ def test_logs_out_of_reach_and_under_the_wheels() -> None:
 def test_the_number_of_logs_to_collect() -> None:
     logs = [KnownLog(at(0, -12), assortment=name) for name in ("a", "a", "b")]
     assert Way(SQUARE).review(*logs).logs == 3
-    assert Way(SQUARE).review(*logs, laps=2).logs == 6  # searched for, and laid anew for every lap
+    assert Way(SQUARE).review(*logs, laps=2).logs == 6  # searched for, and laid again for every lap
     assert Way(SQUARE).review(*logs, laps=2, logs="listed").logs == 3
     assert Way(SQUARE).review(*logs, assortments=("a",)).logs == 2
     assert Way(SQUARE).review(*logs, logs_wanted=1).logs == 1

@@ -58,7 +58,7 @@ def test_the_machine_stops_within_five_centimetres_of_its_stop(ground: Ground, s
 
 
 def test_the_last_setpoints_have_zero_speed() -> None:
-    """A lease may only run out in peace while the machine is told to stand."""
+    """A lease may only expire while stop setpoints are sent."""
     navigator, way, here = begun()
     navigator.step(10**9, report(), here)
     way.stop_at(1.0)
@@ -205,7 +205,7 @@ def test_an_unlocated_machine_stops_until_resumed(here: Location, reason: str) -
     assert navigator.phase is Phase.STOPPED and reason in navigator.reason
     assert asked is not None and asked.speed_m_s == 0.0
     navigator.step(3 * 10**9, report(), good)
-    assert navigator.phase is Phase.STOPPED  # being located again is no reason to drive on by itself
+    assert navigator.phase is Phase.STOPPED  # the machine does not resume by itself when it is located again
     navigator.resume()
     assert navigator.step(4 * 10**9, report(), good) is not None and navigator.phase is Phase.DRIVING
 

@@ -19,7 +19,7 @@ from can_dbc.messages.mission import (
     decode_mission,
     encode_mission_command,
 )
-from tests.can_dbc.mission_told import TOLD
+from tests.can_dbc.example_mission_report import MISSION_REPORT
 
 HASH, KEY = 77, b"key"
 
@@ -44,7 +44,7 @@ class Jobless:
         return "not now" if command.action is MissionAction.PAUSE else ""
 
     def report(self, now_ns: int) -> MissionReport:
-        return TOLD
+        return MISSION_REPORT
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ def test_reports_are_sent_twice_a_second_and_after_a_command(process, watcher) -
             reports.append(decode_mission(watcher.recv(65536), KEY))
         except BlockingIOError:
             break
-    assert [report for *_, report in reports] == [TOLD] * 4 and reports[0][:2] == (HASH, begin_ns)
+    assert [report for *_, report in reports] == [MISSION_REPORT] * 4 and reports[0][:2] == (HASH, begin_ns)
     give(process[0], MissionAction.AUTO)
     assert watcher.recv(65536)
 

@@ -1,4 +1,4 @@
-"""Every transition of both tables, and what a table must be like."""
+"""Every transition of both tables, and the invariants of the tables."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_the_crane_only_works_at_standstill_with_the_frame_lowered() -> None:
 
 
 def test_paper_b_observes_at_standstill_and_passes_the_log_before_loading() -> None:
-    """Fig. 8: no way from the search to the crane leaves one of these out."""
+    """Fig. 8: every path from the search to the crane includes these states."""
     for needed in (State.HALT, State.LOOK, State.APPROACH, State.CHECK, State.LOWER):
         reached, front = {State.SEARCH}, [State.SEARCH]
         while front:

@@ -1,4 +1,4 @@
-"""A Chromium without a window, driven over its DevTools protocol: what a page shows, and clicks on it."""
+"""A headless Chromium, driven over its DevTools protocol: the content of a page, and clicks on it."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Browser:
         return str(self.value(f"(e => e?.checkVisibility() ? e.innerText : '')(document.getElementById({element!r}))"))
 
     def click(self, element: str) -> None:
-        """A real click on its middle: what covers it is clicked instead."""
+        """A real click on its centre; an element that covers it receives the click."""
         box = self.value(
             f"(() => {{ const e = document.getElementById({element!r}); e.scrollIntoView({{block: 'center'}});"
             " const b = e.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
@@ -89,7 +89,7 @@ class Browser:
             self._ask("Input.dispatchMouseEvent", type=kind, x=box[0], y=box[1], button="left", clickCount=1)
 
     def picture(self, path: Path) -> None:
-        """Save what is seen as PNG."""
+        """Save a screenshot as PNG."""
         path.write_bytes(base64.b64decode(self._ask("Page.captureScreenshot", format="png")["data"]))
 
     def until(self, script: str) -> Any:

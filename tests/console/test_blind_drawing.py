@@ -1,4 +1,4 @@
-"""The page draws a crane whose rotator has no encoder."""
+"""Drawing of a crane whose rotator has no encoder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The console: what the page may do, who may ask, and what the state says."""
+"""The console's server: permissions, guards and the page's state."""
 
 from __future__ import annotations
 
@@ -217,7 +217,7 @@ def test_logs_of_a_detector_are_shown(controller_socket):
     (known,) = decode_logs(answer)
     with client_of(console) as client:
         question, peer = controller_socket.recvfrom(100)
-        assert all(value != value for value in decode_request(question)), "it has no joints to tell"
+        assert all(value != value for value in decode_request(question)), "the request has no joints"
         controller_socket.sendto(b'{"nonsense": 1}', peer)
         controller_socket.sendto(answer, peer)
         with client.websocket_connect("ws://127.0.0.1:8471/ws") as ws:
@@ -225,7 +225,7 @@ def test_logs_of_a_detector_are_shown(controller_socket):
                 pass
         (shown,) = logs
         assert shown["axis"] == [0.0, 1.0, 0.0] and shown["center_m"] == list(known.center_m)
-        assert {"center_m", "axis", "length_m", "diameter_m"} <= set(shown)  # what scene.js draws
+        assert {"center_m", "axis", "length_m", "diameter_m"} <= set(shown)  # the dimensions drawn by scene.js
 
 
 # ---- the pure part ----------------------------------------------------------------------------------------------
@@ -260,7 +260,7 @@ def test_a_silent_controller_is_detected_within_a_second():
     crane_state = CraneState(PROFILE)
     crane_state.on_report(encode(REPORT), 0)
     assert crane_state.state(REPORT_TIMEOUT_NS - 1)["alive"] and not crane_state.state(REPORT_TIMEOUT_NS)["alive"]
-    # The page is told every 50 ms and looks every 100 ms.
+    # The page is updated every 50 ms and checks every 100 ms.
     assert REPORT_TIMEOUT_NS + 150_000_000 < 1_000_000_000
 
 

@@ -1,4 +1,4 @@
-"""The page in a browser: mission and map show what was told, and a click orders what it says."""
+"""The page in a browser: mission and map show the report, and a click sends its command."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from can_dbc.messages.mission import MissionAction, MissionReport, decode_missio
 from console.server import Console, create_app
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.status.modes import Mode
-from tests.can_dbc.mission_told import TOLD
+from tests.can_dbc.example_mission_report import MISSION_REPORT
 from tests.console.browser import MISSING, Browser, installed
 from tests.console.vehicle_reports import VEHICLE
 
@@ -45,7 +45,7 @@ class Stage:
     profile: str
     orders: socket.socket
     port: int = 0
-    mission: MissionReport | None = TOLD
+    mission: MissionReport | None = MISSION_REPORT
     speaks: bool = True
     over: bool = False
     _threads: list[threading.Thread] = field(default_factory=list)
@@ -97,7 +97,7 @@ def stage(request) -> Iterator[Stage]:
     orders = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     orders.bind(("127.0.0.1", 0))
     orders.settimeout(10)
-    profile, told = getattr(request, "param", ("aoro_fc8", TOLD))
+    profile, told = getattr(request, "param", ("aoro_fc8", MISSION_REPORT))
     made = Stage(profile, orders, mission=told)
     made.begin()
     yield made
@@ -142,7 +142,7 @@ def test_the_map_shows_route_log_target_and_machine(stage: Stage, browser: Brows
     shows(browser, "mission-words", "drives up")
     for name in ("route", "log", "target", "good"):
         browser.wait(lambda name=name: browser.value(f"{INK}('{name}')") > 15, name)
-    stage.mission = msgspec.structs.replace(TOLD, targets=(), logs=(), landings=())
+    stage.mission = msgspec.structs.replace(MISSION_REPORT, targets=(), logs=(), landings=())
     browser.until(f"{INK}('target') === 0 && {INK}('log') === 0 && {INK}('route') > 15")
 
 
@@ -155,7 +155,7 @@ def test_the_map_shows_route_log_target_and_machine(stage: Stage, browser: Brows
 def test_a_click_sends_the_command(
     stage: Stage, browser: Browser, button: str, before: dict, order: MissionAction
 ) -> None:
-    stage.mission = msgspec.structs.replace(TOLD, state="SEARCH", words="is another", **before)
+    stage.mission = msgspec.structs.replace(MISSION_REPORT, state="SEARCH", words="is another", **before)
     shows(browser, "mission-words", "is another")
     browser.until(f"!document.getElementById('{button}').disabled")
     browser.click(button)
@@ -186,7 +186,7 @@ def test_the_note_gives_the_reason_of_a_pause(stage: Stage, browser: Browser) ->
         ({"refusal": "nothing waits for the next step"}, "nothing waits"),
         ({"ended": True, "failure": "aborted by the operator"}, "aborted by the operator"),
     ):
-        stage.mission = msgspec.structs.replace(TOLD, **fields)
+        stage.mission = msgspec.structs.replace(MISSION_REPORT, **fields)
         shows(browser, "mission-note", words)
     browser.until("['auto', 'pause', 'single', 'next-step', 'abort'].every(b => document.getElementById(b).disabled)")
 
@@ -197,13 +197,13 @@ def test_an_outdated_mission_is_grey_and_accepts_no_commands(stage: Stage, brows
     assert not browser.value("document.getElementById('mission').classList.contains('old')")
     stage.speaks = False
     browser.until("document.getElementById('mission').classList.contains('old')")
-    assert browser.text("mission-age") != TOLD.name and browser.text("mission-note")
+    assert browser.text("mission-age") != MISSION_REPORT.name and browser.text("mission-note")
     assert browser.value("document.getElementById('pause').disabled")
     assert browser.value("getComputedStyle(document.getElementById('mission')).filter") == "grayscale(1)"
-    assert not browser.value("document.getElementById('stop').disabled"), "STOP is none of it"
+    assert not browser.value("document.getElementById('stop').disabled"), "STOP stays enabled"
 
 
-@pytest.mark.parametrize("stage", [("palms_471", TOLD), ("aoro_fc8", None)], indirect=True)
+@pytest.mark.parametrize("stage", [("palms_471", MISSION_REPORT), ("aoro_fc8", None)], indirect=True)
 def test_without_a_mission_or_a_carrier_their_cards_are_hidden(stage: Stage, browser: Browser) -> None:
     shows(browser, "mode", "ACTIVE")
     for element in ("mission", "vehicle", "site"):

@@ -1,4 +1,4 @@
-"""What the page is told of mission and vehicle, and who may order the mission about."""
+"""The page's state of mission and vehicle, and the permissions for mission commands."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from console.mission_state import DRIVING, FIXES, INPUT_NAMES, MISSION_TIMEOUT_N
 from console.server import Console, create_app
 from console.state import CraneState, describe_machine
 from machine.loading.profile_file import load_profile, profile_hash
-from tests.can_dbc.mission_told import HERE, TOLD
+from tests.can_dbc.example_mission_report import HERE, MISSION_REPORT
 from tests.console.vehicle_reports import HASH, PROFILE, VEHICLE
 
 BASE = "http://127.0.0.1:8471"
@@ -30,7 +30,7 @@ def crane_state(profile=PROFILE, key=None) -> CraneState:
 
 
 def told(
-    crane_state: CraneState, report=TOLD, stamp_ns: int = 10**9, code: int = HASH, key=None, now_ns: int = 10**9
+    crane_state: CraneState, report=MISSION_REPORT, stamp_ns: int = 10**9, code: int = HASH, key=None, now_ns: int = 10**9
 ) -> bool:
     return crane_state.on_report(encode_mission(report, 1, code, stamp_ns, key), now_ns)
 
@@ -81,7 +81,7 @@ def test_the_vehicle_state_is_in_degrees_at_its_articulation() -> None:
     assert (shown["driving"], shown["fix"], shown["satellites"]) == (DRIVING[Driving.DRIVING], FIXES[4], 18)
     assert (shown["heading_deg"], shown["articulation_deg"]) == (pytest.approx(90.0), pytest.approx(11.459, abs=1e-3))
     place, carrier = shown["place"], PROFILE.carrier
-    # It heads east: the antenna stands so far east of the joint.
+    # The vehicle heads east: the antenna is this far east of the articulation axis.
     assert place["x_m"] == pytest.approx(-carrier.antenna_main_m[0]) and place["y_m"] == pytest.approx(0.0, abs=1e-3)
     assert place["front_rad"] == pytest.approx(0.0, abs=1e-3) and place["rear_rad"] == pytest.approx(-0.2, abs=1e-3)
     assert not seen.state(10**9 + VEHICLE_TIMEOUT_NS)["vehicle"]["alive"]
@@ -190,7 +190,7 @@ def test_the_websocket_sends_new_mission_reports() -> None:
         told(console.crane_state, stamp_ns=10**10, now_ns=10**10)
         while "mission" not in (state := ws.receive_json()):
             pass
-        assert state["mission"]["words"] == TOLD.words and state["vehicle"]["place"]
+        assert state["mission"]["words"] == MISSION_REPORT.words and state["vehicle"]["place"]
         assert "mission" not in ws.receive_json()
         assert client.get("/api/state").json()["mission"]["targets"] == [7]
         assert len(client.get("/api/trail").json()) == 1

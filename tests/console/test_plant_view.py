@@ -17,7 +17,7 @@ ANSWERS = {"scene": {"title": "a plant"}, "view": {"time_s": 1.5}, "lever": {"ok
 
 @pytest.fixture
 def plant() -> Iterator[tuple[tuple[str, int], list[dict[str, str]]]]:
-    """A stand-in that answers like the plant's request port, and what it was asked."""
+    """A stand-in for the plant's request port; it keeps the requests."""
     asked: list[dict[str, str]] = []
     port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     port.bind(("127.0.0.1", 0))

@@ -6,7 +6,7 @@ import math
 
 from can_dbc.messages.vehicle import Driving, VehicleReport
 from machine.loading.profile_file import load_profile, profile_hash
-from tests.can_dbc.mission_told import HERE
+from tests.can_dbc.example_mission_report import HERE
 
 PROFILE = load_profile("aoro_fc8")
 HASH = profile_hash(PROFILE)
