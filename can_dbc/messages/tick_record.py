@@ -54,8 +54,8 @@ class BusReading:
     recoveries: int = 0
     """Number of recoveries from OFF or DOWN."""
 
-    def take(self, stats: BusStats) -> None:
-        """Reads the counters of a bus."""
+    def copy_from(self, stats: BusStats) -> None:
+        """Copies state and counters of a bus."""
         self.state, self.dropped, self.refused = stats.state, stats.dropped, stats.refused
         self.errors, self.recoveries = stats.error_frames, stats.recoveries
 

@@ -234,19 +234,19 @@ def _imu_problems(profile: Profile, imu: Imu) -> Iterator[Problem]:
 
 
 def _grapple_problems(profile: Profile) -> Iterator[Problem]:
-    tongs, path = profile.grapple.tongs, "grapple.tongs"
-    rows = len(tongs.angle_rad)
+    jaws, path = profile.grapple.tongs, "grapple.tongs"
+    rows = len(jaws.angle_rad)
     for key in ("half_gap_m", "tip_below_pin_m"):
-        given = len(getattr(tongs, key))
+        given = len(getattr(jaws, key))
         if given != rows:
             text = f"{given} values for {rows} angles; give one for each angle_rad"
             yield Problem("profile.jaw-table-length", f"{path}.{key}", text)
-    if rows < 2 or tongs.angle_rad[0] != 0.0:
+    if rows < 2 or jaws.angle_rad[0] != 0.0:
         text = "needs at least two angles, starting with 0.0 (fully open)"
         yield Problem("profile.jaw-table-start", f"{path}.angle_rad", text)
-    if any(a >= b for a, b in pairwise(tongs.angle_rad)):
+    if any(a >= b for a, b in pairwise(jaws.angle_rad)):
         yield Problem("profile.jaw-table-order", f"{path}.angle_rad", "must rise from row to row")
-    if any(a <= b for a, b in pairwise(tongs.half_gap_m)):
+    if any(a <= b for a, b in pairwise(jaws.half_gap_m)):
         text = "must fall from row to row (angle 0 is fully open)"
         yield Problem("profile.jaw-table-order", f"{path}.half_gap_m", text)
 

@@ -1,4 +1,4 @@
-"""Many datagrams in one system call, as one call each would have given them."""
+"""Many datagrams in one system call, with the same result as one call each."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def taken(batch: Batch, count: int) -> list[bytes]:
     return [bytes(batch.data[i * batch.size : i * batch.size + length]) for i, length in enumerate(lengths)]
 
 
-def test_takes_all_that_waits_in_order_and_never_blocks(pair: Pair) -> None:
+def test_receives_all_waiting_datagrams_in_order_and_never_blocks(pair: Pair) -> None:
     sender, receiver = pair
     batch = Batch(size=16, count=4)
     assert batch.receive(receiver.fileno()) == 0
@@ -40,7 +40,7 @@ def test_takes_all_that_waits_in_order_and_never_blocks(pair: Pair) -> None:
     assert batch.receive(receiver.fileno()) == 0
 
 
-def test_a_longer_datagram_is_cut_and_the_next_is_whole(pair: Pair) -> None:
+def test_a_longer_datagram_is_truncated_and_the_next_is_complete(pair: Pair) -> None:
     sender, receiver = pair
     batch = Batch(size=8)
     sender.send(b"0123456789")
@@ -49,7 +49,7 @@ def test_a_longer_datagram_is_cut_and_the_next_is_whole(pair: Pair) -> None:
     assert taken(batch, 2) == [b"01234567", b"abc"]
 
 
-def test_control_data_comes_along_and_is_offered_anew_each_time(pair: Pair) -> None:
+def test_control_data_is_received_and_its_size_reset_each_time(pair: Pair) -> None:
     sender, receiver = pair
     receiver.setsockopt(socket.SOL_SOCKET, 16, 1)  # SO_PASSCRED: every datagram carries its sender
     batch = Batch(size=8, ancillary=socket.CMSG_SPACE(12))
@@ -71,7 +71,7 @@ def test_a_closed_socket_is_an_error(pair: Pair) -> None:
         Batch(size=8).receive(number)
 
 
-def test_a_wider_buffer_holds_more() -> None:
+def test_an_enlarged_buffer_holds_more() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         enlarge_receive_buffer(sock, 64 * 1024)
         assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) >= 64 * 1024

@@ -1,4 +1,4 @@
-"""Opening a bus, choosing an address, reading error frames, and what a kernel without room answers."""
+"""Opening a bus, choosing an address, error frames, and a kernel queue without room."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ def test_an_address_names_backend_and_channel(address: str) -> None:
         open_bus(address)
 
 
-def test_a_missing_daemon_is_told_with_the_remedy(tmp_path, monkeypatch) -> None:
+def test_a_missing_daemon_is_reported(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(tmp_path))
     with pytest.raises(BusError, check=coded("wire.no-daemon")):
         open_bus("wire:crane0")
 
 
-def test_a_missing_interface_is_told_with_the_remedy() -> None:
+def test_a_missing_interface_is_reported() -> None:
     expected = "bus.interface" if factory.kernel_has_can() else "bus.no-can"
     with pytest.raises(BusError, check=coded(expected)):
         open_bus("socketcan:nocan9")
 
 
-def test_more_filters_than_the_kernel_takes_are_told() -> None:
+def test_too_many_filters_for_the_kernel_are_reported() -> None:
     with pytest.raises(BusError, check=coded("bus.too-many-filters")):
         open_bus("socketcan:can0", filters=range(513))
 
 
-def test_an_unknown_python_can_interface_is_told() -> None:
+def test_an_unknown_python_can_interface_is_reported() -> None:
     with pytest.raises(BusError, check=coded("bus.adapter")):
         open_bus("nosuch:1")
 
@@ -77,7 +77,7 @@ def test_default_address_prefers_the_kernel(has_can, interfaces, expected, monke
     assert default_address("crane0") == expected
 
 
-def test_default_address_obeys_the_user(monkeypatch) -> None:
+def test_default_address_follows_the_environment_and_the_argument(monkeypatch) -> None:
     monkeypatch.setenv("TIMBERHAND_CRANE0", "socketcan:can3")
     assert default_address("crane0") == "socketcan:can3"
     assert default_address("crane0", "pcan:PCAN_USBBUS1") == "pcan:PCAN_USBBUS1"
@@ -107,7 +107,7 @@ def test_error_frames_set_the_state_and_recovery_clears_it(classes: int, flags: 
 
 @pytest.mark.parametrize("error_class", [ERR_TX_TIMEOUT, ERR_LOSTARB])
 @pytest.mark.parametrize("state", [BusState.ACTIVE, BusState.PASSIVE, BusState.OFF])
-def test_lost_arbitration_and_a_transmit_time_out_are_counted_only(error_class: int, state: BusState) -> None:
+def test_lost_arbitration_and_a_transmit_time_out_are_only_counted(error_class: int, state: BusState) -> None:
     stats = BusStats(state)
     assert not stats.note_error(ERROR | error_class, bytes(8))
     assert (stats.state, stats.error_frames, stats.recoveries) == (state, 1, 0)
@@ -115,7 +115,7 @@ def test_lost_arbitration_and_a_transmit_time_out_are_counted_only(error_class: 
 
 @pytest.mark.parametrize("lost", [BusState.OFF, BusState.DOWN])
 @pytest.mark.parametrize("back", [BusState.ACTIVE, BusState.WARNING, BusState.PASSIVE])
-def test_only_the_way_back_from_off_or_down_is_a_recovery(lost: BusState, back: BusState) -> None:
+def test_only_the_return_from_off_or_down_is_a_recovery(lost: BusState, back: BusState) -> None:
     stats = BusStats()
     ways = [stats.enter(state) for state in (BusState.PASSIVE, lost, lost, back, BusState.ACTIVE, lost)]
     assert ways == [False, False, False, True, False, False]
@@ -151,7 +151,7 @@ def test_a_kernel_queue_without_room_refuses(number: int, state: BusState) -> No
     assert (bus.stats.refused, bus.stats.sent, bus.stats.state) == (3, 0, state)
 
 
-def test_the_guard_can_open_wire_and_socketcan_with_the_standard_library_alone() -> None:
+def test_the_guard_can_open_wire_and_socketcan_with_the_standard_library_only() -> None:
     code = (
         "import sys; import can_dbc.bus.base, can_dbc.bus.socketcan, can_dbc.bus.wire_client;"
         "own = {'can_dbc'}; names = {name.partition('.')[0] for name in sys.modules};"
@@ -162,7 +162,7 @@ def test_the_guard_can_open_wire_and_socketcan_with_the_standard_library_alone()
 
 
 class Waiting(BaseBus):
-    """A bus on which bunches of frames wait, each for one drain."""
+    """A bus with groups of waiting frames, one for each drain."""
 
     def __init__(self) -> None:
         super().__init__("test")
@@ -173,8 +173,8 @@ class Waiting(BaseBus):
             frames += self.bunches.pop(0)
 
 
-def test_a_flush_reads_until_nothing_waits_whatever_the_stamps() -> None:
-    """An adapter that stamps in its own time gives every frame the time of the drain."""
+def test_a_flush_reads_until_no_frame_waits_for_any_stamps() -> None:
+    """With an adapter that stamps in its own time, every frame gets the time of the drain."""
     bus, far = Waiting(), 1 << 62
     bus.bunches = [[Frame(far, key, b"old")] for key in range(3)]
     bus.flush()
@@ -184,8 +184,8 @@ def test_a_flush_reads_until_nothing_waits_whatever_the_stamps() -> None:
     assert bus.stats.received == 1
 
 
-def test_after_a_flush_a_frame_from_before_is_known_by_its_stamp() -> None:
-    """The wire's daemon may hold frames back for a moment, and a flooded socket more than one flush reads."""
+def test_after_a_flush_an_older_frame_is_recognized_by_its_stamp() -> None:
+    """The wire's daemon may delay frames for a moment, and a flooded socket holds more than one flush reads."""
     bus = Waiting()
     before_ns = time.monotonic_ns()
     bus.flush()

@@ -23,7 +23,7 @@ SO_TIMESTAMPNS, SO_TIMESTAMPING, SO_RXQ_OVFL = 35, 37, 40
 
 
 class Pair:
-    """A fast path and the far end that it hears."""
+    """A fast path and its far end."""
 
     def __init__(self) -> None:
         near, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -84,7 +84,7 @@ def test_a_drain_is_one_system_call(pair: Pair, calls: list[int]) -> None:
         assert len(pair.take()) == count and calls == [count]
 
 
-def test_more_than_a_batch_comes_in_several(pair: Pair, calls: list[int]) -> None:
+def test_more_than_a_batch_arrives_in_several_calls(pair: Pair, calls: list[int]) -> None:
     pair.link._batch = Batch(CAN_FRAME.size, pair.link._batch.ancillary, count=4)
     for key in range(9):
         pair.put(key, b"")
@@ -95,7 +95,7 @@ def test_more_than_a_batch_comes_in_several(pair: Pair, calls: list[int]) -> Non
     assert [frame.key for frame in pair.take()] == [8]
 
 
-def test_error_frames_never_come_out_and_a_recovery_takes_back_what_was_before(pair: Pair) -> None:
+def test_error_frames_are_not_returned_and_a_recovery_removes_older_frames(pair: Pair) -> None:
     pair.put(0x100, b"")
     pair.put(ERROR | ERR_BUSOFF, bytes(8))
     assert [frame.key for frame in pair.take()] == [0x100]
@@ -108,14 +108,14 @@ def test_error_frames_never_come_out_and_a_recovery_takes_back_what_was_before(p
     assert (pair.stats.error_frames, pair.stats.recoveries) == (2, 1)
 
 
-def test_a_far_end_that_has_gone_is_an_error(pair: Pair) -> None:
+def test_a_closed_far_end_is_an_error(pair: Pair) -> None:
     pair.link.close()
     with pytest.raises(OSError, match="Bad file descriptor"):
         pair.take()
 
 
 def test_frames_are_sent_up_to_the_first_that_finds_no_room(pair: Pair) -> None:
-    """A socket that nobody reads holds a few and answers EAGAIN, as a full queue answers ENOBUFS."""
+    """An unread socket holds a few frames and then fails with EAGAIN, as a full queue with ENOBUFS."""
     pair.link.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
     pair.far.setblocking(False)
     wanted = [(i, bytes([i])) for i in range(200)]
@@ -165,7 +165,7 @@ def test_lost_frames_are_counted_over_the_wrap(
         assert pair.link.dropped == lost
 
 
-def test_an_adapter_that_stamps_by_itself_is_believed(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stamps_of_an_adapter_are_used(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two frames a millisecond apart on the bus; the interrupt of the second came 300 us late."""
     now_ns = time.time_ns() - 10_000_000
     controls = [control_data(now_ns, 77_000_000_000), control_data(now_ns + 1_300_000, 77_001_000_000)]
@@ -173,7 +173,7 @@ def test_an_adapter_that_stamps_by_itself_is_believed(pair: Pair, monkeypatch: p
     assert second.stamp_ns - first.stamp_ns == pytest.approx(1_000_000, abs=1_000_000 * DRIFT_PPM // 1_000_000)
 
 
-def test_a_clock_set_back_makes_no_frame_of_the_future(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_set_back_gives_no_stamp_in_the_future(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     (frame,) = deliver(pair, monkeypatch, [control_data(time.time_ns() + 10_000_000_000)])
     assert frame.stamp_ns <= time.monotonic_ns()
 
@@ -207,7 +207,7 @@ def test_hardware_stamps_are_never_early_and_never_later_than_the_interrupt(
 
 
 @pytest.mark.parametrize("jump_ns", [-(10**12), -(10**9), 10**9, 10**12])
-def test_an_adapter_that_starts_its_clock_anew_is_followed(jump_ns: int) -> None:
+def test_a_restarted_clock_of_an_adapter_is_followed(jump_ns: int) -> None:
     clock = HardwareClock()
     for i in range(3):
         clock.stamp_ns(10**13 + i * 10**6, 10**18 + i * 10**6)
@@ -222,7 +222,7 @@ SHORT = st.builds(lambda i, kind: i | kind, st.integers(0, STANDARD_MASK), st.sa
 
 
 @given(st.lists(st.one_of(SHORT, KEYS, st.tuples(KEYS, st.integers(0, EXTENDED_MASK)))), st.one_of(SHORT, KEYS))
-def test_a_filter_says_what_the_kernel_says(wanted: list[int | tuple[int, int]], key: int) -> None:
+def test_a_filter_matches_like_the_kernel(wanted: list[int | tuple[int, int]], key: int) -> None:
     """A frame passes when ``received & mask == filter & mask`` for one pair (linux/can/raw.h); kinds always count."""
     wanted_one = Filter(wanted)
     assert (key in wanted_one) == any(key & mask == pair_key & mask for pair_key, mask in wanted_one.pairs)
@@ -234,7 +234,7 @@ def test_a_filter_says_what_the_kernel_says(wanted: list[int | tuple[int, int]],
     assert set(Filter(wanted_one.pairs).pairs) == set(wanted_one.pairs)  # as it travels to the wire
 
 
-def test_what_is_no_filter_is_refused() -> None:
+def test_an_invalid_filter_is_refused() -> None:
     for wrong in (["x"], [(1, 2, 3)], [None]):
         with pytest.raises((TypeError, ValueError)):
             Filter(wrong)  # type: ignore[arg-type]

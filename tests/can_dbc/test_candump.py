@@ -1,4 +1,4 @@
-"""Log formats in, frames out; damage is counted and never fatal."""
+"""Trace formats to frames; damage is counted and never fatal."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ SAMPLES = [
 
 
 @pytest.mark.parametrize(("name", "count"), SAMPLES)
-def test_real_logs(name: str, count: int) -> None:
+def test_real_traces(name: str, count: int) -> None:
     path = CANBOAT / name
     if not path.exists():
         pytest.skip("no canboat samples under TIMBERHAND_DATA/can")
@@ -102,7 +102,7 @@ def test_truncation_at_any_byte_never_crashes(tmp_path: Path, suffix: str) -> No
         list(read_trace(path))
 
 
-def test_asc_damage_costs_its_line_alone(tmp_path: Path) -> None:
+def test_damage_in_asc_affects_only_its_line(tmp_path: Path) -> None:
     path = tmp_path / "x.asc"
     with can.Logger(path) as logger:
         for message in messages()[:20]:

@@ -1,4 +1,4 @@
-"""CANopen as pure functions, with the ``canopen`` library as the other side where it speaks."""
+"""CANopen as pure functions, with the ``canopen`` library as the other side where possible."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_emergency_is_not_sync() -> None:
     assert co.parse_emergency(0x100, bytes(8)) is None
 
 
-def test_heartbeat_monitor_sees_a_node_that_is_dead_at_boot() -> None:
+def test_heartbeat_monitor_detects_a_node_that_is_dead_at_boot() -> None:
     monitor = co.HeartbeatMonitor({1: 250 * MS, 2: 150 * MS}, boot_timeout_ns=2000 * MS, start_ns=10 * MS)
     assert not monitor.receive(0x703, b"\x05", 20 * MS)
     assert monitor.receive(0x701, b"\x00", 20 * MS)
@@ -71,7 +71,7 @@ def test_heartbeat_monitor_sees_a_node_that_is_dead_at_boot() -> None:
     assert monitor.states[2] == co.NodeState.PRE_OPERATIONAL
 
 
-def test_the_next_loss_is_that_of_the_node_whose_time_is_over_first() -> None:
+def test_the_next_loss_is_that_of_the_node_with_the_earliest_timeout() -> None:
     monitor = co.HeartbeatMonitor({1: 250 * MS, 2: 150 * MS}, boot_timeout_ns=0, start_ns=0)
     assert monitor.next_loss_ns() == 0
     monitor.receive(0x701, b"\x05", 10 * MS)
@@ -82,7 +82,7 @@ def test_the_next_loss_is_that_of_the_node_whose_time_is_over_first() -> None:
     assert not monitor.missing(loss_ns) and monitor.missing(loss_ns + 1) == (2,)
 
 
-def test_a_monitor_that_forgot_knows_nobody() -> None:
+def test_a_reset_monitor_has_seen_no_node() -> None:
     monitor = co.HeartbeatMonitor({1: 250 * MS}, boot_timeout_ns=0, start_ns=0)
     monitor.receive(0x701, b"\x00", 10 * MS)
     monitor.receive(0x701, b"\x05", 20 * MS)
@@ -107,7 +107,7 @@ def test_position_unwrapping_is_modular(total: int, start: int, steps: list[floa
         assert unwrapper.update(true % span) == true == unwrapper.position
 
 
-def test_signed_position_wraps_too() -> None:
+def test_signed_position_wraps_as_well() -> None:
     unwrapper = co.PositionUnwrapper(0)
     assert [unwrapper.update(p) for p in (2**31 - 1, -(2**31), -(2**31) + 5, 2**31 - 1)] == [
         2**31 - 1, 2**31, 2**31 + 5, 2**31 - 1,
@@ -139,7 +139,7 @@ def test_parse_response(data: str, kind: co.SdoKind, value: bytes, abort: int) -
 
 @settings(max_examples=200, deadline=None, derandomize=True, database=None)
 @given(st.integers(1, 127), st.integers(0, 0xFFFF), st.integers(0, 255), st.binary(min_size=1, max_size=4))
-def test_client_and_server_understand_each_other(node: int, index: int, sub: int, value: bytes) -> None:
+def test_client_and_server_parse_each_others_frames(node: int, index: int, sub: int, value: bytes) -> None:
     ask = co.parse_request(*co.upload_request(node, index, sub))
     assert ask == co.Sdo(co.SdoKind.UPLOAD, node, index, sub, b"", 0)
     answer = co.parse_response(*co.upload_response(node, index, sub, value))

@@ -142,7 +142,7 @@ def test_swing_arms_are_commanded_as_spools_and_reported_as_heights() -> None:
     assert MACHINE.messages["ArmCmdB"].signals[3].bits == 2
 
 
-def test_a_request_is_matched_by_pgn_whoever_it_asks() -> None:
+def test_a_request_is_matched_by_pgn_for_any_destination() -> None:
     for identifier in (0x18EAFF27, 0x18EA0355, 0x0CEA30FE):
         assert MACHINE.find(identifier | EXTENDED) is MACHINE.messages["Request"]
 
@@ -156,7 +156,7 @@ def test_physical_units() -> None:
     assert CRANE.messages["GuardStat"].signals[2].choices[0xA] == "Enabled"
 
 
-def test_data_ids_tell_messages_apart() -> None:
+def test_data_ids_distinguish_messages() -> None:
     lists = [m.data_ids for m in chain(CRANE.messages.values(), MACHINE.messages.values()) if m.data_ids]
     assert len(lists) == 23
     for counter in range(16):

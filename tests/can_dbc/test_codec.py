@@ -1,4 +1,4 @@
-"""The compiled codec: equal to cantools bit for bit, never wraps, refuses whole."""
+"""The compiled codec: equal to cantools bit for bit, never wraps, refuses whole frames."""
 
 from __future__ import annotations
 

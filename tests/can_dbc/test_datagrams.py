@@ -1,4 +1,4 @@
-"""The setpoint datagrams: round trip, every reason to refuse, and no surprise from arbitrary bytes."""
+"""The datagrams of crane and vehicle: round trip, every reason to refuse, and arbitrary bytes."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_round_trip_keeps_every_field(message: Datagram, key: bytes | None) -> N
     assert type(back) is type(message) and same(back, message)
 
 
-def test_times_finer_than_a_microsecond_are_cut() -> None:
+def test_times_are_truncated_to_a_microsecond() -> None:
     sent = dataclasses.replace(a_setpoint(), lease_ns=200_000_999)
     back = decode(encode(sent))
     assert isinstance(back, CraneSetpoint) and back.lease_ns == 200_000_000
@@ -127,7 +127,7 @@ def test_noise_is_refused_and_never_raises_anything_else(noise: bytes, key: byte
 
 
 @given(datagrams, st.data())
-def test_a_well_sealed_but_arbitrary_body_gives_a_message_or_a_refusal(message: Datagram, data: st.DataObject) -> None:
+def test_an_arbitrary_body_in_a_valid_envelope_gives_a_message_or_a_refusal(message: Datagram, data: st.DataObject) -> None:
     body = data.draw(st.binary(max_size=200))
     kind = struct.pack("<H", data.draw(st.integers(0, 7)))
     header = encode(message)[:BODY_AT]
@@ -143,7 +143,7 @@ def test_a_well_sealed_but_arbitrary_body_gives_a_message_or_a_refusal(message: 
 
 
 @given(datagrams, st.data())
-def test_a_datagram_cut_short_or_grown_is_refused(message: Datagram, data: st.DataObject) -> None:
+def test_a_shortened_or_lengthened_datagram_is_refused(message: Datagram, data: st.DataObject) -> None:
     raw = encode(message)
     cut = data.draw(st.integers(0, len(raw) - 1))
     fault_of(raw[:cut])
@@ -181,7 +181,7 @@ def test_authentication(sent_with: bytes | None, read_with: bytes) -> None:
     assert fault_of(encode(a_setpoint(), sent_with), read_with) is DatagramFault.AUTHENTICATION
 
 
-def test_a_forged_body_with_a_right_crc_fails_authentication() -> None:
+def test_a_forged_body_with_a_valid_crc_fails_authentication() -> None:
     raw = bytearray(encode(a_setpoint(), KEY)[:-4])
     raw[BODY_AT + 20] ^= 1
     assert fault_of(sealed(bytes(raw)), KEY) is DatagramFault.AUTHENTICATION
@@ -276,7 +276,7 @@ def test_another_number_of_axes_is_refused() -> None:
     assert fault_of(sealed(bytes(raw))) is DatagramFault.LENGTH
 
 
-def test_a_refusal_says_why() -> None:
+def test_a_refusal_has_its_reason() -> None:
     with pytest.raises(DatagramRefused, check=lambda e: e.fault is DatagramFault.NOT_FINITE):
         decode(encode(a_setpoint((Knot(0, (math.nan,) * 5, (0.0,) * 5),))))
 
@@ -284,7 +284,7 @@ def test_a_refusal_says_why() -> None:
 @pytest.mark.parametrize(
     "text", ["", "5006", "127.0.0.1", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:65536", "nosuch.invalid:6"]
 )
-def test_an_address_that_is_none_is_one_sentence(text):
+def test_an_invalid_address_is_refused(text):
     code = "address.unknown-host" if text.startswith("nosuch") else "address.malformed"
     with pytest.raises(AddressError, check=coded(code)):
         udp_address(text)
@@ -307,7 +307,7 @@ def test_an_address_is_resolved_once():
         ({"function": N_AXES}, DatagramFault.VALUE),
     ],
 )
-def test_a_spool_test_is_refused_whole(change: dict[str, object], fault: DatagramFault) -> None:
+def test_an_invalid_spool_test_is_refused(change: dict[str, object], fault: DatagramFault) -> None:
     good = SpoolTest(1, 2, 3, 200_000_000, 0, (SpoolKnot(0, 0.0), SpoolKnot(5_000_000, 12.0)))
     assert decode(encode(good)) == good
     assert fault_of(encode(dataclasses.replace(good, **change))) is fault  # type: ignore[arg-type]

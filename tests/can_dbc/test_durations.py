@@ -14,7 +14,7 @@ def width_ns(duration_ns: int) -> int:
 
 
 @given(ANY)
-def test_a_duration_lies_below_its_bins_edge_and_above_the_edge_before(duration_ns):
+def test_a_duration_lies_between_the_edges_of_its_bin(duration_ns):
     i = bin_of(duration_ns)
     assert 0 <= i < BINS
     if i < BINS - 1:
@@ -34,7 +34,7 @@ def test_quantiles_are_within_a_bin_of_the_true_ones(durations, share):
         assert abs(made.quantile_ns(share) - true_ns) <= width_ns(true_ns)
 
 
-def test_nothing_has_quantile_zero_and_the_rest_its_longest():
+def test_an_empty_histogram_has_quantile_zero_and_the_last_bin_the_longest():
     made = Durations()
     assert made.quantile_ns(0.99) == 0
     assert made.summary() == {"p50_us": 0, "p99_us": 0, "p999_us": 0, "max_us": 0, "count": 0}
@@ -42,7 +42,7 @@ def test_nothing_has_quantile_zero_and_the_rest_its_longest():
     assert made.quantile_ns(0.5) == 700 * MS
 
 
-def test_a_difference_holds_what_came_after():
+def test_a_difference_has_the_later_durations():
     early = Durations()
     for duration_ns in (5 * US, 900 * MS):
         early.add(duration_ns)
@@ -55,7 +55,7 @@ def test_a_difference_holds_what_came_after():
     assert (now - now).longest_ns == 0
 
 
-def test_over_counts_what_is_beyond_a_limit():
+def test_over_counts_durations_beyond_a_limit():
     made = Durations()
     for duration_ns in (1 * MS, 10 * MS + 1, 50 * MS, 300 * MS):
         made.add(duration_ns)

@@ -32,7 +32,7 @@ def test_equals_autosar_e2e(payload: bytes, counter: int, data_ids: bytes) -> No
 
 @FIXED
 @given(st.binary(min_size=2, max_size=16), st.integers(0, 15), st.integers(0, 16 * 8 - 1))
-def test_every_single_bit_error_is_seen(payload: bytes, counter: int, position: int) -> None:
+def test_every_single_bit_error_is_detected(payload: bytes, counter: int, position: int) -> None:
     frame = bytearray(protect(payload, counter, IDS))
     frame[position // 8 % len(frame)] ^= 1 << position % 8
     assert frame_crc(bytes(frame), IDS) != frame[0]

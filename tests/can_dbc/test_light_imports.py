@@ -1,4 +1,4 @@
-"""What the floor of the codecs may import at run time: cantools only inside ``load``."""
+"""Imports at run time: cantools only inside ``load``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Orders and mission reports: what goes in comes out, and what is not whole does not."""
+"""Mission commands and mission reports: round trip, and refusal of damaged datagrams."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from can_dbc.messages.mission import (
     encode_mission,
     encode_mission_command,
 )
-from tests.can_dbc.mission_told import TOLD
+from tests.can_dbc.example_mission_report import MISSION_REPORT
 
 KEY = b"secret"
 
 
-def told(report: MissionReport = TOLD, key: bytes | None = None) -> bytes:
+def told(report: MissionReport = MISSION_REPORT, key: bytes | None = None) -> bytes:
     return encode_mission(report, 5, 77, 10**9, key)
 
 
@@ -46,8 +46,8 @@ def fault_of(take, *arguments) -> DatagramFault:
 
 
 @pytest.mark.parametrize("key", [None, KEY])
-def test_what_is_told_arrives(key) -> None:
-    assert decode_mission(told(key=key), key) == (77, 10**9, TOLD)
+def test_a_report_is_decoded_as_it_was_encoded(key) -> None:
+    assert decode_mission(told(key=key), key) == (77, 10**9, MISSION_REPORT)
 
 
 @given(st.sampled_from(MissionAction), st.integers(0, 2**32 - 1), st.integers(0, 2**63), st.sampled_from([None, KEY]))
@@ -63,17 +63,17 @@ def test_a_command_is_decoded(order, sequence, stamp_ns, key) -> None:
      {"fences": [{"corners": [], "keep_out": False, "name": ""}] * 21},
      {"fences": [{"corners": [[1.0, 2.0]] * 200, "keep_out": False, "name": ""}] * 2}],
     )  # fmt: skip
-def test_a_report_that_does_not_fit_is_refused_whole(fields) -> None:
-    assert decode_mission(changed())[2] == TOLD, "the way to make one is right"
+def test_a_report_that_does_not_match_its_schema_is_refused(fields) -> None:
+    assert decode_mission(changed())[2] == MISSION_REPORT, "the way to make one is right"
     assert fault_of(decode_mission, changed(**fields)) is DatagramFault.VALUE
 
 
-def test_a_number_that_is_none_is_refused() -> None:
-    lost = msgspec.structs.replace(TOLD, driven_m=float("nan"))
+def test_nan_and_infinity_are_refused() -> None:
+    lost = msgspec.structs.replace(MISSION_REPORT, driven_m=float("nan"))
     assert fault_of(decode_mission, told(lost)) is DatagramFault.VALUE
 
 
-def test_keys_must_agree() -> None:
+def test_both_sides_need_the_same_key() -> None:
     order = encode_mission_command(MissionCommand(1, 2, 3, MissionAction.ABORT), KEY)
     assert fault_of(decode_mission_command, order, b"other") is DatagramFault.AUTHENTICATION
     assert (
@@ -83,8 +83,8 @@ def test_keys_must_agree() -> None:
     assert fault_of(decode_mission, told(), KEY) is DatagramFault.AUTHENTICATION
 
 
-def test_one_kind_is_never_taken_for_another() -> None:
-    """Least of all by the controller."""
+def test_one_kind_is_never_decoded_as_another() -> None:
+    """In particular not by the controller."""
     order = encode_mission_command(MissionCommand(1, 2, 3, MissionAction.AUTO))
     press = encode(OperatorCommand(1, 2, 3, OperatorAction.ARM))
     for take, data in ((decode, order), (decode, told()), (decode_mission_command, press), (decode_mission_command, told()),
@@ -99,6 +99,6 @@ def test_an_unknown_command_is_refused() -> None:
 
 
 def test_a_report_beyond_one_datagram_is_not_sent() -> None:
-    long = msgspec.structs.replace(TOLD, logs=TOLD.logs * 1000)
+    long = msgspec.structs.replace(MISSION_REPORT, logs=MISSION_REPORT.logs * 1000)
     with pytest.raises(ValueError, match=str(MAX_BYTES)):
         told(long)

@@ -1,4 +1,4 @@
-"""NMEA 2000: canboat's samples, the independent ``nmea2000`` package, fast packets in every disorder."""
+"""NMEA 2000: canboat's samples, the independent ``nmea2000`` package, fast packets in any order."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_canboat_samples() -> None:
 
 
 def theirs_as_ours(message: Any) -> dict[str, Any]:
-    """A message of the nmea2000 package with our names and raw numbers."""
+    """A message of the nmea2000 package with the names of the database and raw numbers."""
     return {
         "SID" if f.id == "sid" else f.id[0].upper() + f.id[1:]: f.raw_value
         for f in message.fields
@@ -105,7 +105,7 @@ def theirs_as_ours(message: Any) -> dict[str, Any]:
 
 
 def same(message: codec.MessageCodec, ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
-    """Whether both say the same; a lookup without an entry is a number there and nothing here."""
+    """Whether both agree; a lookup without an entry is a number there and None here."""
     none = {s.name: s.sentinels for s in message.signals}
     ours = {name: value for name, value in ours.items() if not name.startswith("Reserved")}
     theirs = {name: value for name, value in theirs.items() if value not in none.get(name, ())}
@@ -209,7 +209,7 @@ def test_a_lost_frame_costs_one_packet(missing: int) -> None:
     assert reassembler.lost == 1
 
 
-def test_a_packet_starts_anew_when_its_index_comes_again() -> None:
+def test_a_repeated_index_starts_a_new_packet() -> None:
     reassembler = n2k.Reassembler()
     old, new = packet(bytes(20)), packet(bytes(range(20)))
     assert [reassembler.add(FAST, f, 0) for f in old[:2]] == [None, None]

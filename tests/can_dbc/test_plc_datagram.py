@@ -1,4 +1,4 @@
-"""The cyclic datagrams: sizes, round trips, and nothing of a damaged one used."""
+"""The cyclic datagrams: sizes, round trips, and refusal of damaged ones."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FEEDBACK = Feedback(7, State.EXECUTE, 1, 2, 7, 9, 444, (0.1,) * 7, (-0.2,) * 7, 
 
 @settings(max_examples=50)
 @given(HEADERS, MICROS, MICROS)
-def test_a_command_comes_back(header: Header, reference: tuple[float, ...], rate: tuple[float, ...]) -> None:
+def test_a_command_survives_the_round_trip(header: Header, reference: tuple[float, ...], rate: tuple[float, ...]) -> None:
     command = Command(Mode.REFERENCES, True, reference, rate, Grapple.OPEN, 100, 50)
     data = encode_command(header, command)
     assert len(data) == COMMAND_BYTES == 96
@@ -40,7 +40,7 @@ def test_a_command_comes_back(header: Header, reference: tuple[float, ...], rate
 
 @settings(max_examples=50)
 @given(HEADERS, MICROS, MICROS)
-def test_a_reply_comes_back(header: Header, position: tuple[float, ...], velocity: tuple[float, ...]) -> None:
+def test_a_reply_survives_the_round_trip(header: Header, position: tuple[float, ...], velocity: tuple[float, ...]) -> None:
     feedback = Feedback(
         header.sequence & 0xFFFF,
         State.HOLD,
@@ -93,8 +93,8 @@ def test_noise_is_refused(data: bytes) -> None:
 
 
 @pytest.mark.parametrize(("at", "value"), [(24, 3), (26, 0x5AA4), (84, 4), (86, 101), (88, 101), (90, 2)])
-def test_a_command_that_means_nothing_is_refused_as_a_value(at: int, value: int) -> None:
-    """The checksum is right, so the PLC knows that the sender said it: that is a fault, not a damaged datagram."""
+def test_an_undefined_command_is_refused_by_its_value(at: int, value: int) -> None:
+    """The checksum is valid, so the sender meant it: a fault, not a damaged datagram."""
     data = bytearray(encode_command(Header(1, 2, 3), COMMAND))
     struct.pack_into("<H", data, at, value)
     struct.pack_into("<I", data, 92, zlib.crc32(data[:92]))
@@ -102,7 +102,7 @@ def test_a_command_that_means_nothing_is_refused_as_a_value(at: int, value: int)
         decode_command(bytes(data))
 
 
-def test_what_does_not_fit_is_not_sent() -> None:
+def test_a_value_that_does_not_fit_is_not_sent() -> None:
     with pytest.raises(MapError):
         encode_command(Header(1, 2, 3), Command(reference=(3000.0,) + (0.0,) * 6))
     with pytest.raises(MapError):

@@ -64,7 +64,7 @@ FEEDBACKS = st.builds(
 
 @settings(max_examples=50)
 @given(COMMANDS, U16, U16, st.sampled_from(WordOrder))
-def test_a_command_comes_back(command: Command, heartbeat: int, sequence: int, order: WordOrder) -> None:
+def test_a_command_survives_the_round_trip(command: Command, heartbeat: int, sequence: int, order: WordOrder) -> None:
     registers = command_registers(command, heartbeat, sequence, order)
     assert len(registers) == COMMAND_COUNT and all(0 <= r <= 0xFFFF for r in registers)
     assert registers[:2] == [heartbeat, sequence]
@@ -73,14 +73,14 @@ def test_a_command_comes_back(command: Command, heartbeat: int, sequence: int, o
 
 @settings(max_examples=50)
 @given(FEEDBACKS, U16, st.sampled_from(WordOrder))
-def test_a_status_comes_back(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> None:
+def test_a_status_survives_the_round_trip(feedback: Feedback, watchdog_ms: int, order: WordOrder) -> None:
     registers = status_registers(feedback, watchdog_ms, order)
     assert len(registers) == STATUS_COUNT and all(0 <= r <= 0xFFFF for r in registers)
     assert read_status(registers, order) == (feedback, watchdog_ms)
 
 
 def test_the_addresses_are_those_of_the_map() -> None:
-    """Addresses 0-47 and 100-131 as written down, with values chosen so that each register is told apart."""
+    """Addresses 0-47 and 100-131 as documented, with a distinct value in each register."""
     feedback = Feedback(
         heartbeat=11, state=State.EXECUTE, fault=1, fault_axis=3, estop=7, accepted=21, longest_cycle_us=31,
         position=(0.065537, -0.000001, 0.0, 0.0, 0.0, 0.0, 0.0), velocity=(0.001, -0.001, 0.0, 0.0, 0.0, 0.0, 0.007),
@@ -110,7 +110,7 @@ def test_the_addresses_are_those_of_the_map() -> None:
         (WordOrder.HIGH_FIRST, (0x0201, 0x0403), "plc.byte-order", "0x02010403"),
     ],
 )
-def test_the_word_order_test_tells_what_is_wrong(
+def test_the_word_order_test_names_the_problem(
     order: WordOrder, registers: tuple[int, int], code: str, named: str
 ) -> None:
     status = status_registers(Feedback(), 300, order)
@@ -140,7 +140,7 @@ def test_a_status_of_another_map_is_refused(register: int, value: int) -> None:
         Command(reference=(0.0,) * 6),
     ],
 )
-def test_what_does_not_fit_is_refused_and_never_clamped(command: Command) -> None:
+def test_a_value_that_does_not_fit_is_refused_and_never_clamped(command: Command) -> None:
     with pytest.raises(MapError):
         command_registers(command, 0, 1, WordOrder.HIGH_FIRST)
 
@@ -148,7 +148,7 @@ def test_what_does_not_fit_is_refused_and_never_clamped(command: Command) -> Non
 @pytest.mark.parametrize(
     ("register", "value"), [(102, 3), (103, 0x5AA4), (125, 4), (126, 101), (127, 101), (128, 2), (129, 1), (131, 9)]
 )
-def test_a_command_that_means_nothing_is_refused(register: int, value: int) -> None:
+def test_an_undefined_command_is_refused(register: int, value: int) -> None:
     block = command_registers(Command(), 0, 1, WordOrder.HIGH_FIRST)
     block[register - plc.COMMAND_AT] = value
     with pytest.raises(MapError, check=coded("plc.illegal-value")) as refused:
@@ -177,7 +177,7 @@ def test_bounds_name_the_axis() -> None:
 
 @settings(max_examples=50)
 @given(st.integers(0, 0xFFFF), st.integers(1, 0x7FFE))
-def test_a_sequence_advances_round_its_ring(last: int, step: int) -> None:
+def test_a_sequence_number_advances_and_wraps(last: int, step: int) -> None:
     ahead = (last + step) & 0xFFFF
     assert advances(ahead, last)
     assert not advances(last, ahead) and not advances(last, last)

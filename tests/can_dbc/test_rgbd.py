@@ -1,4 +1,4 @@
-"""Frames on a stream: whole or refused."""
+"""RGB-D frames on a stream: complete or refused."""
 
 import random
 
@@ -54,17 +54,17 @@ def test_a_cut_or_lengthened_frame_is_refused(kept: int, more: int) -> None:
 
 
 @given(st.binary(min_size=HEADER_BYTES, max_size=HEADER_BYTES + 40))
-def test_noise_is_no_frame(noise: bytes) -> None:
+def test_noise_is_not_a_frame(noise: bytes) -> None:
     with pytest.raises(RgbdError):
         decode(noise)
 
 
-def test_a_refusal_says_why() -> None:
+def test_a_refusal_has_its_reason() -> None:
     with pytest.raises(RgbdError, match=r"^the lens is covered$", check=coded("rgbd.refused")):
         decode(encode_refusal("front", "the lens is covered"))
 
 
-def test_what_is_asked_is_the_cameras_name() -> None:
+def test_a_request_carries_the_cameras_name() -> None:
     asked = encode_request("front")
     assert asked[REQUEST_HEADER.size :] == b"front" and request_name_bytes(asked[: REQUEST_HEADER.size]) == 5
     with pytest.raises(RgbdError, check=coded("rgbd.no-request")):
@@ -80,7 +80,7 @@ def test_what_is_asked_is_the_cameras_name() -> None:
         (lambda f: RgbdMessage(**{**_fields(f), "camera": ""}), "rgbd.camera-name"),
     ],
 )
-def test_what_does_not_agree_is_not_sent(broken, code: str) -> None:
+def test_an_inconsistent_frame_is_not_sent(broken, code: str) -> None:
     with pytest.raises(RgbdError, check=coded(code)):
         encode(broken(frame()))
 

@@ -1,4 +1,4 @@
-"""Tick records: what goes in comes out, and damage and other versions are refused."""
+"""Tick records: round trip; damage and other versions are refused."""
 
 import dataclasses
 import struct
@@ -35,8 +35,8 @@ def test_round_trip(tick):
 
 @given(ticks)
 @settings(max_examples=30)
-def test_without_a_vehicle_the_record_is_what_it_was(tick):
-    """A machine that stands still has no vehicle report, and its bytes are those of an earlier release."""
+def test_without_a_vehicle_the_record_has_the_former_bytes(tick):
+    """A stationary machine has no vehicle report, and its bytes are those of an earlier release."""
     whole, without = encode(tick), encode(dataclasses.replace(tick, vehicle_report=b""))
     assert len(whole) - len(without) == len(tick.vehicle_report)
     assert whole[: len(without) - 4] == without[:-4]
@@ -52,7 +52,7 @@ def test_a_damaged_record_is_refused(tick, place, flip):
 
 
 @given(st.binary(max_size=200))
-def test_rubbish_is_refused(data):
+def test_arbitrary_bytes_are_refused(data):
     with pytest.raises(RecordRefused):
         decode(data)
 
@@ -69,7 +69,7 @@ def test_a_record_of_version_1_is_refused_by_its_number():
 
 
 @pytest.mark.parametrize("bus", [2, 255])
-def test_a_frame_of_a_bus_that_is_not_there_is_refused(bus):
+def test_a_frame_of_an_unknown_bus_is_refused(bus):
     tick = TickRecord(1, 0, 0, 0, BusReading(), BusReading(), (Frame(1, 2, b""),), (), (), (), (), b"")
     body = bytearray(encode(tick)[:-4])
     at = body.index(struct.pack("<QIB", 1, 2, 0)) + 12
@@ -78,8 +78,8 @@ def test_a_frame_of_a_bus_that_is_not_there_is_refused(bus):
         decode(sealed(bytes(body)))
 
 
-def test_a_reading_takes_the_counters_of_a_bus():
+def test_a_reading_copies_the_counters_of_a_bus():
     stats = BusStats(state=BusState.OFF, refused=1, dropped=2, error_frames=3, recoveries=4)
     reading = BusReading()
-    reading.take(stats)
+    reading.copy_from(stats)
     assert reading == BusReading(state=3, dropped=2, refused=1, errors=3, recoveries=4)

@@ -1,4 +1,4 @@
-"""The shared page of the controller's timing: what is written is read, whole or not at all."""
+"""The timing page of the controller: read completely or not at all."""
 
 import os
 import stat
@@ -39,7 +39,7 @@ def histograms(duration_ns: int = 1000, count: int = 1) -> dict[str, Durations]:
     return made
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_a_written_page_is_read(tmp_path):
     path = tmp_path / "sub" / "controller.timing"
     writer = TimingWriter(path)
     with pytest.raises(TimingRefused, check=coded("timing.not-written")):
@@ -55,7 +55,7 @@ def test_what_is_written_is_read(tmp_path):
         read_timing(path)
 
 
-def test_others_may_read_it_whatever_the_umask(tmp_path):
+def test_every_user_may_read_it_with_any_umask(tmp_path):
     before = os.umask(0o077)
     try:
         writer = TimingWriter(tmp_path / "page")
@@ -65,7 +65,7 @@ def test_others_may_read_it_whatever_the_umask(tmp_path):
     writer.close()
 
 
-def test_a_page_in_the_middle_of_a_change_or_of_another_release_is_refused(tmp_path):
+def test_a_page_during_a_write_or_of_another_release_is_refused(tmp_path):
     path = tmp_path / "page"
     writer = TimingWriter(path)
     writer.publish(facts(), histograms())
@@ -84,7 +84,7 @@ def test_a_page_in_the_middle_of_a_change_or_of_another_release_is_refused(tmp_p
 
 
 def test_a_reader_never_sees_a_mixture(tmp_path):
-    """The writer goes on without pause; every copy that is taken is of one state."""
+    """While the writer writes continuously, every copy is of a single state."""
     path = tmp_path / "page"
     writer = TimingWriter(path)
     states = [(facts(k, f"{k} " * 100 * k), histograms(2000, k)) for k in (1, 5, 9)]
@@ -110,7 +110,7 @@ def test_a_reader_never_sees_a_mixture(tmp_path):
         thread.join()
 
 
-def test_a_second_controller_takes_the_place_and_the_first_leaves_it_alone(tmp_path):
+def test_a_second_controller_replaces_the_page_and_the_first_keeps_off_it(tmp_path):
     path = tmp_path / "page"
     first, second = TimingWriter(path), TimingWriter(path)
     second.publish(facts(ticks=7), histograms())
@@ -121,7 +121,7 @@ def test_a_second_controller_takes_the_place_and_the_first_leaves_it_alone(tmp_p
     assert not path.exists()
 
 
-def test_facts_that_do_not_fit_leave_the_former_page(tmp_path):
+def test_facts_that_do_not_fit_keep_the_former_page(tmp_path):
     path = tmp_path / "page"
     writer = TimingWriter(path)
     writer.publish(facts(), histograms())
@@ -129,7 +129,7 @@ def test_facts_that_do_not_fit_leave_the_former_page(tmp_path):
     assert read_timing(path).facts.words == facts().words
 
 
-def test_the_path_is_that_of_the_service_or_of_the_user(monkeypatch):
+def test_the_path_is_that_of_the_service_or_the_user(monkeypatch):
     monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/timberhand:/run/other")
     assert str(default_path()) == "/run/timberhand/controller.timing"
     monkeypatch.delenv("RUNTIME_DIRECTORY")

@@ -1,4 +1,4 @@
-"""One contract, every backend: what a loop may rely on whatever bus it was given.
+"""The contract of every bus backend.
 
 TIMBERHAND_TEST_CAN names the SocketCAN interface (default vcan0).
 """
@@ -28,7 +28,7 @@ def test_frames_arrive_in_order_with_payload_and_stamp(backend: Backend) -> None
     assert a.stats.state is b.stats.state is BusState.ACTIVE
 
 
-def test_extended_standard_and_remote_frames_are_told_apart(backend: Backend) -> None:
+def test_extended_standard_and_remote_frames_are_distinguished(backend: Backend) -> None:
     a, b = backend.open(), backend.open()
     sent = [
         (0x123, b"s"),
@@ -49,22 +49,22 @@ def test_own_frames_do_not_come_back(backend: Backend) -> None:
     assert [frame.key for frame in backend.receive(a, 1)] == [0x200]
 
 
-def test_own_frames_come_back_when_asked_for(backend: Backend) -> None:
+def test_own_frames_come_back_on_request(backend: Backend) -> None:
     a = backend.open(receive_own=True)
     backend.open()
     backend.send(a, 0x100, b"own")
     assert [(frame.key, frame.data) for frame in backend.receive(a, 1)] == [(0x100, b"own")]
 
 
-def test_filters_take_exact_keys(backend: Backend) -> None:
+def test_filters_accept_exact_keys(backend: Backend) -> None:
     a, b = backend.open(), backend.open(filters=[0x100, 0x200 | EXTENDED])
     for key in (0x101, 0x100 | EXTENDED, 0x100 | REMOTE, 0x200, 0x200 | EXTENDED, 0x100):
         backend.send(a, key, b"")
     assert [frame.key for frame in backend.receive(b, 2)] == [0x200 | EXTENDED, 0x100]
 
 
-def test_filters_take_pairs_of_key_and_mask(backend: Backend) -> None:
-    """A message matched by PGN, whoever sends it at whatever priority; the kind of a frame always counts."""
+def test_filters_accept_pairs_of_key_and_mask(backend: Backend) -> None:
+    """A message matched by PGN, from any sender and with any priority; the kind of a frame always counts."""
     a, b = backend.open(), backend.open(filters=[(0x18FF2000 | EXTENDED, 0x03FF_FF00), 0x100])
     wanted = [0x0CFF_2030 | EXTENDED, 0x18FF_20AA | EXTENDED, 0x100]
     others = [0x0CFF_2130 | EXTENDED, 0x0CFF_2030 | EXTENDED | REMOTE, 0x700, 0x000, 0x101, 0x100 | EXTENDED]
@@ -80,8 +80,8 @@ def test_forty_masks_are_as_good_as_one(backend: Backend) -> None:
     assert [frame.key for frame in backend.receive(b, 2)] == [39 << 8 | 0x55 | EXTENDED, 0x55 | EXTENDED]
 
 
-def test_an_own_identifier_from_another_node_is_heard(backend: Backend) -> None:
-    """Own frames do not come back, so one with an own identifier is somebody else's: a fault the loop must see."""
+def test_an_own_identifier_from_another_node_is_received(backend: Backend) -> None:
+    """Own frames do not come back, so one with an own identifier is foreign: a fault that the loop must detect."""
     a, b = backend.open(filters=[0x210]), backend.open()
     backend.send(a, 0x210, b"mine")
     backend.receive(b, 1)
@@ -98,7 +98,7 @@ def test_the_frames_of_a_tick_go_together_in_order(backend: Backend) -> None:
     assert (a.stats.sent, a.stats.refused) == (4, 0)
 
 
-def test_what_follows_a_frame_that_was_not_taken_is_refused(backend: Backend) -> None:
+def test_frames_after_one_that_was_not_accepted_are_refused(backend: Backend) -> None:
     a, b = backend.open(), backend.open()
     assert a.send_all([(0x100, b""), (0x101, bytes(9)), (0x102, b"")]) == 1
     assert (a.stats.sent, a.stats.refused) == (1, 2)
@@ -106,7 +106,7 @@ def test_what_follows_a_frame_that_was_not_taken_is_refused(backend: Backend) ->
     assert [frame.key for frame in backend.receive(b, 2)] == [0x100, 0x103]
 
 
-def test_a_flush_discards_what_waits(backend: Backend) -> None:
+def test_a_flush_discards_waiting_frames(backend: Backend) -> None:
     a, b, c = backend.open(), backend.open(), backend.open()
     for i in range(5):
         backend.send(a, 0x100 + i, b"old")
@@ -117,7 +117,7 @@ def test_a_flush_discards_what_waits(backend: Backend) -> None:
     assert b.stats.received == 1 and b.stats.state is BusState.ACTIVE
 
 
-def test_a_bus_that_works_is_not_opened_anew(backend: Backend) -> None:
+def test_a_working_bus_is_not_reopened(backend: Backend) -> None:
     a, b, c = backend.open(), backend.open(), backend.open()
     backend.send(a, 0x100, b"")
     backend.receive(c, 1)

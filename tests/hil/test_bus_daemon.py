@@ -24,7 +24,7 @@ from tests.hil.bus_backends import BITRATE, TIMEOUT_S, Backend, counted_receives
 def test_a_full_queue_refuses_and_never_sends_later(
     address: str, wire_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nobody acknowledges a lone sender, so its queue fills up; what was refused never reaches the bus."""
+    """No node acknowledges a lone sender, so its queue fills up; refused frames never reach the bus."""
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(wire_dir))
     backend = Backend(address, address, WireCore(BITRATE) if address == "in-process" else None)
     with backend.open() as a:
@@ -36,7 +36,7 @@ def test_a_full_queue_refuses_and_never_sends_later(
 
 
 @pytest.mark.parametrize("address", ["in-process", "wire:lone", "timberhand:lone"])
-def test_a_tick_that_finds_too_little_room_is_refused_from_there_on(
+def test_a_tick_with_too_little_room_is_refused_from_there_on(
     address: str, wire_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(wire_dir))
@@ -50,7 +50,7 @@ def test_a_tick_that_finds_too_little_room_is_refused_from_there_on(
 
 
 @pytest.mark.parametrize("address", ["in-process", "wire:lone", "timberhand:lone"])
-def test_a_flush_takes_back_what_has_not_begun_on_the_bus(
+def test_a_flush_cancels_frames_not_yet_on_the_bus(
     address: str, wire_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(wire_dir))
@@ -71,7 +71,7 @@ def test_a_flush_takes_back_what_has_not_begun_on_the_bus(
 def test_a_daemon_that_comes_back_is_found_again(
     interface: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the filters of before, and without a frame from before."""
+    """With the former filters, and without older frames."""
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(tmp_path))
     backend = Backend(interface, f"{interface}:crane0")
     with wire_daemon({"crane0": BITRATE}) as daemon:
@@ -100,7 +100,7 @@ def test_a_daemon_that_comes_back_is_found_again(
         assert [(frame.key, frame.data) for frame in backend.receive(other, 10)] == new
 
 
-def test_a_daemon_that_is_slow_to_answer_is_asked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_daemon_receives_one_hello(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(tmp_path))
     with wire_daemon({"crane0": BITRATE}) as daemon:
         bus = open_bus("wire:crane0")
@@ -136,7 +136,7 @@ def test_a_dead_daemon_means_down(interface: str, tmp_path: Path, monkeypatch: p
         assert bus.stats.state is BusState.DOWN
 
 
-def test_a_drain_of_the_wire_takes_what_waits_in_one_call(wire_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drain_of_the_wire_is_one_call(wire_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(wire_dir))
     backend = Backend("wire", "wire:fast")
     calls = counted_receives(monkeypatch)
@@ -154,10 +154,10 @@ def test_a_drain_of_the_wire_takes_what_waits_in_one_call(wire_dir: Path, monkey
 
 
 @pytest.mark.parametrize("interface", ["wire", "timberhand"])
-def test_a_recovery_leaves_nothing_from_before_it(
+def test_a_recovery_leaves_no_older_frames(
     interface: str, wire_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also when all of it, bus-off included, is found by one drain."""
+    """Also if a single drain finds all of it, including bus-off."""
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(wire_dir))
     backend = Backend(interface, f"{interface}:fast")
     with backend.open() as bus, backend.open() as other:

@@ -1,4 +1,4 @@
-"""SocketCAN beyond the contract: links that go and come back, floods, error frames.
+"""SocketCAN beyond the contract: links that go down and come back, floods, error frames.
 
 TIMBERHAND_TEST_CAN names the interface (default vcan0).
 """
@@ -40,7 +40,7 @@ def ip(*arguments: str) -> None:
 
 @pytest.mark.parametrize("way", ["down", "delete"])
 @pytest.mark.parametrize("found_by", ["drain", "send"])
-def test_a_link_that_goes_and_comes_back(way: str, found_by: str, link: str) -> None:
+def test_a_link_that_goes_down_and_comes_back(way: str, found_by: str, link: str) -> None:
     """Down and up again, or deleted and created again, which gives it another index."""
     backend = Backend("socketcan", f"socketcan:{link}")
     with backend.open() as a, backend.open(filters=[0x100, 0x101]) as b:
@@ -65,7 +65,7 @@ def test_a_link_that_goes_and_comes_back(way: str, found_by: str, link: str) -> 
         assert [(frame.key, frame.data) for frame in backend.receive(b, 1)] == [(0x101, b"new")]
 
 
-def test_a_link_that_was_down_for_a_moment_is_noticed(link: str) -> None:
+def test_a_link_that_was_down_for_a_moment_is_detected(link: str) -> None:
     with open_bus(f"socketcan:{link}") as a:
         ip("link", "set", link, "down")
         ip("link", "set", link, "up")
@@ -80,7 +80,7 @@ def test_a_link_that_is_down_is_not_opened(link: str) -> None:
         open_bus(f"socketcan:{link}")
 
 
-def test_a_drain_of_a_link_takes_what_waits_in_one_call(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drain_of_a_link_is_one_call(monkeypatch: pytest.MonkeyPatch) -> None:
     address = f"socketcan:{kernel_interface()}"
     calls = counted_receives(monkeypatch)
     with open_bus(address) as a, open_bus(address) as b:
@@ -90,7 +90,7 @@ def test_a_drain_of_a_link_takes_what_waits_in_one_call(monkeypatch: pytest.Monk
             assert b.drain([]) == count and len(calls) == 1
 
 
-def test_a_flooded_link_does_not_hold_the_drain() -> None:
+def test_a_flooded_link_does_not_delay_the_drain() -> None:
     address = f"socketcan:{kernel_interface()}"
     with open_bus(address) as a, open_bus(address) as b:
         for _ in range(40):
@@ -101,7 +101,7 @@ def test_a_flooded_link_does_not_hold_the_drain() -> None:
         assert [frame.key for frame in Backend("").receive(b, 1)] == [0x200]
 
 
-def test_a_recovery_of_a_link_leaves_nothing_from_before_it() -> None:
+def test_a_recovery_of_a_link_leaves_no_older_frames() -> None:
     address = f"socketcan:{kernel_interface()}"
     with open_bus(address) as a, open_bus(address) as b:
         a.send(0x100, b"old")
@@ -113,7 +113,7 @@ def test_a_recovery_of_a_link_leaves_nothing_from_before_it() -> None:
         assert (b.stats.state, b.stats.recoveries) == (BusState.ACTIVE, 1)
 
 
-def test_a_slow_kernel_reader_counts_what_it_lost() -> None:
+def test_a_slow_kernel_reader_counts_lost_frames() -> None:
     address = f"socketcan:{kernel_interface()}"
     with open_bus(address) as a, open_bus(address) as b:
         for i in range(20_000):
@@ -127,7 +127,7 @@ def test_a_slow_kernel_reader_counts_what_it_lost() -> None:
         assert b.stats.dropped + len(frames) == a.stats.sent
 
 
-def test_error_frames_of_the_kernel_become_state() -> None:
+def test_error_frames_of_the_kernel_set_the_state() -> None:
     address = f"socketcan:{kernel_interface()}"
     with open_bus(address) as a, open_bus(address) as b:
         frames: list[Frame] = []

@@ -61,7 +61,7 @@ def test_messages_pass_unchanged(message: can.Message, daemon: object) -> None:
         assert received.channel == "crane0"
 
 
-def test_recv_times_out_and_own_messages_come_only_when_asked_for(daemon: object) -> None:
+def test_recv_times_out_and_own_messages_come_only_on_request(daemon: object) -> None:
     message = can.Message(arbitration_id=1, is_extended_id=False)
     with WireBus("crane0") as a, WireBus("crane0", receive_own_messages=True) as b:
         a.send(message)
@@ -80,8 +80,8 @@ def test_filters_of_python_can_apply(daemon: object) -> None:
         assert received is not None and received.arbitration_id == 0x125
 
 
-def test_send_waits_for_room_as_long_as_it_may(daemon: object) -> None:
-    """Nobody acknowledges a lone sender, so its queue stays full until a second participant joins."""
+def test_send_waits_for_room_until_its_timeout(daemon: object) -> None:
+    """No node acknowledges a lone sender, so its queue stays full until a second participant joins."""
     message = can.Message(arbitration_id=1, is_extended_id=False)
     with WireBus("crane0", tx_queue=2) as a:
         a.send(message)
@@ -95,7 +95,7 @@ def test_send_waits_for_room_as_long_as_it_may(daemon: object) -> None:
             assert all(b.recv(TIMEOUT_S) for _ in range(4))
 
 
-def test_what_classical_can_does_not_carry_is_refused(daemon: object) -> None:
+def test_messages_beyond_classical_can_are_refused(daemon: object) -> None:
     with WireBus("crane0") as bus:
         for message in (can.Message(is_fd=True), can.Message(is_error_frame=True)):
             with pytest.raises(can.CanOperationError, match="cannot be sent"):
@@ -126,7 +126,7 @@ def test_a_missing_or_dead_daemon_is_an_error_not_a_hang(
         assert bus.state is can.BusState.ERROR
 
 
-def test_a_notifier_hears_a_periodic_task(daemon: object) -> None:
+def test_a_notifier_receives_a_periodic_task(daemon: object) -> None:
     heard: queue.SimpleQueue[can.Message] = queue.SimpleQueue()
     with WireBus("crane0") as a, WireBus("crane0") as b:
         notifier = can.Notifier(b, [heard.put], timeout=0.1)
@@ -175,7 +175,7 @@ def test_faults_reach_python_can_programs_too(daemon: object) -> None:
 
 
 def test_the_output_buffer_can_be_emptied(daemon: object) -> None:
-    """Nobody acknowledges a lone sender, so all of it waits."""
+    """No node acknowledges a lone sender, so all frames wait."""
     with WireBus("crane0") as a:
         for i in range(10):
             a.send(can.Message(arbitration_id=0x100 + i, is_extended_id=False))

@@ -81,7 +81,7 @@ def test_the_forwarder_reaches_the_goals_of_paper_b_far_from_every_stop(goal):
         assert 0.2 < (value - low) / (high - low) < 0.8
 
 
-def test_the_forwarder_reaches_9_m_backwards_and_not_ahead():
+def test_the_forwarder_reaches_9_m_backward_and_not_ahead():
     profile = PROFILES["aoro_fc8"]
     assert max_reach_m(profile) == pytest.approx(9.0, abs=0.01)
     assert hypot(*pin_position(profile.kinematics, (0.0, 0.0, -0.0873, 2.5))[:2]) == pytest.approx(9.0, abs=0.03)
@@ -92,7 +92,7 @@ def test_the_forwarder_reaches_9_m_backwards_and_not_ahead():
 
 
 @both
-def test_pick_area_and_bunk_are_within_reach_with_a_log_hanging(profile):
+def test_pick_area_and_bunk_are_within_reach_with_a_hanging_log(profile):
     (x, y), half = profile.workspace.pick_center_m, profile.workspace.pick_half_size_m
     ground, bunk = profile.workspace.ground_z_m, profile.bunk
     for dx in (-half, 0.0, half):

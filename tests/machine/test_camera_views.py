@@ -1,4 +1,4 @@
-"""The cameras see what they are for: their pictures by plain projection of points that matter."""
+"""The cameras see their work area: projection of the relevant points into their pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Carrier geometry: swing arms there and back, the turning circle, the frames of the two halves."""
+"""Carrier geometry: swing arms in both directions, the turning circle, the frames of the two halves."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ def test_at_transport_height_the_axles_are_where_the_profile_says():
         assert x == pytest.approx(CARRIER.front_axle_m if arm[4] == "f" else -CARRIER.rear_axle_m)
 
 
-def test_an_arm_too_short_says_so():
+def test_an_arm_that_is_too_short_is_refused():
     with pytest.raises(ValueError, match=r"1\.200 m.*1\.00 m"):
         arm_angle_from_height(CARRIER, 1.2)
 
 
-def test_full_articulation_turns_9_degrees_a_metre():
+def test_full_articulation_turns_9_degrees_per_metre():
     radius = turning_radius_m(CARRIER, CARRIER.articulation_limit_rad)
     assert radius == pytest.approx(6.34, abs=0.01)
     assert degrees(1.0 / radius) == pytest.approx(9.03, abs=0.02)
@@ -72,7 +72,7 @@ def test_full_articulation_turns_9_degrees_a_metre():
 
 
 @given(bends, st.floats(-1.0, 1.0), st.floats(-0.3, 0.3))
-def test_heading_rate_lets_no_axle_slip_sideways(bend, speed, rate):
+def test_heading_rate_implies_no_side_slip_of_the_axles(bend, speed, rate):
     """The rear axle's middle, moved with both rates, may only move along the rear frame."""
     front = heading_rate_rad_s(CARRIER, speed, bend, rate)
     rear = front - rate
@@ -85,7 +85,7 @@ def test_heading_rate_lets_no_axle_slip_sideways(bend, speed, rate):
 
 
 @given(bends, points)
-def test_the_halves_frames_are_each_others_inverse_and_plus_bends_left(bend, point):
+def test_the_frames_of_the_halves_are_inverse_and_plus_bends_left(bend, point):
     back = front_from_rear(bend, rear_from_front(bend, point))
     assert back == pytest.approx(point, abs=1e-12)
     nose = rear_from_front(bend, (CARRIER.front_axle_m, 0.0, 0.0))
@@ -98,7 +98,7 @@ def test_crane_base_and_rear_frame(point):
     assert rear_from_base(CARRIER, (0.0, 0.0, 0.0)) == CARRIER.crane_base_m
 
 
-def test_the_crane_looks_back_over_the_bunk_and_the_ground_is_where_the_wheels_stand():
+def test_the_crane_faces_the_bunk_and_the_wheels_stand_on_the_ground():
     bunk, place = AORO.bunk, AORO.workspace
     x, y, floor = rear_from_base(CARRIER, (*bunk.center_m, bunk.floor_z_m))
     assert -CARRIER.rear_axle_m - bunk.length_m / 2 < x < CARRIER.crane_base_m[0] - bunk.length_m / 2
@@ -115,7 +115,7 @@ def test_the_crane_looks_back_over_the_bunk_and_the_ground_is_where_the_wheels_s
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
-def test_the_wheels_come_nearer_the_more_it_bends(a, b):
+def test_the_wheels_get_closer_with_the_articulation(a, b):
     less, more = sorted((a, b))
     assert wheel_gap_m(CARRIER, more) <= wheel_gap_m(CARRIER, less) + 1e-12
     straight = CARRIER.front_axle_m + CARRIER.rear_axle_m - 2 * CARRIER.wheel_radius_m

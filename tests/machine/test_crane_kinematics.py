@@ -182,7 +182,7 @@ def test_reachable_extensions_are_exactly_those_the_inverse_accepts(q):
 
 @given(st.floats(0.5, 6.5), st.floats(-1.0, 4.0), st.floats(-1.7, 1.7), joint_values())
 @settings(max_examples=200)
-def test_solve_with_a_pose_takes_the_least_travel_time(r, z, slew, present):
+def test_solve_with_a_pose_minimizes_the_travel_time(r, z, slew, present):
     x, y = -r * sin(slew), r * cos(slew)
     speeds = [PALMS.joints[name].speed_limit for name in ("lift", "tilt", "ext")]
 
@@ -197,7 +197,7 @@ def test_solve_with_a_pose_takes_the_least_travel_time(r, z, slew, present):
         assert best <= travel_s(solve(PALMS, x, y, z, wish)) + 0.01
 
 
-def test_solve_takes_the_wished_extension_or_the_nearest_one():
+def test_solve_uses_the_preferred_extension_or_the_nearest_one():
     assert solve(PALMS, 0.0, 4.5, 0.5, 0.9)[3] == pytest.approx(0.9)
     far = solve(PALMS, 0.0, 6.3, 0.5, 0.2)
     assert far[3] > 0.2
@@ -214,7 +214,7 @@ def test_solve_without_preference_keeps_off_the_stops_and_the_straight_arm():
         assert q[Joint.TILT] < -MIN_BEND_RAD
 
 
-def test_points_that_only_a_stretched_arm_reaches_are_still_reached():
+def test_points_that_need_a_straight_arm_are_reached():
     z = KIN.d1_m
     assert solve(PALMS, 0.0, 6.94, z)[3] > 1.78
     edge = max_reach_m(PALMS)
@@ -233,7 +233,7 @@ def test_points_that_only_a_stretched_arm_reaches_are_still_reached():
         ((0.0, -0.0601374, 1.36434), "reach.slew", ("180.0 deg",)),
     ],
 )
-def test_unreachable_says_why(point, code, named):
+def test_solve_gives_the_reason_of_an_unreachable_point(point, code, named):
     with pytest.raises(Unreachable, check=coded(code)) as caught:
         solve(PALMS, *point)
     assert all(number in str(caught.value) for number in named)
@@ -253,13 +253,13 @@ def test_unreachable_says_why(point, code, named):
         ((-4.0, -1.5, 1.0), 1.0, "reach.slew", ("110.6 deg",)),
     ],
 )
-def test_inverse_says_why(point, ext, code, named):
+def test_inverse_gives_the_reason_of_an_unreachable_point(point, ext, code, named):
     with pytest.raises(Unreachable, check=coded(code)) as caught:
         inverse(KIN, LIMITS, *point, ext)
     assert all(number in str(caught.value) for number in named)
 
 
-def test_a_stick_that_stops_early_is_named():
+def test_the_stops_of_the_stick_are_named():
     stiff = [*LIMITS]
     stiff[Joint.TILT] = (-2.0, -0.5)
     with pytest.raises(Unreachable, check=coded("reach.stick-straight-stop")):
@@ -275,7 +275,7 @@ def test_the_boom_pin_itself_cannot_be_reached_with_any_extension():
         solve(profile, 0.0, 0.5, KIN.d1_m)
 
 
-def test_slew_wraps_into_its_limits_from_either_side():
+def test_slew_wraps_into_its_limits_from_both_sides():
     for slew in (-1.7, -0.4, 0.0, 1.7):
         x, y, z = pin_position(KIN, (slew, 0.4, -1.2, 0.8))
         assert inverse(KIN, LIMITS, x, y, z, 0.8)[0] == pytest.approx(slew, abs=1e-12)

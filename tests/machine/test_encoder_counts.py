@@ -1,4 +1,4 @@
-"""Encoder counts and joint positions: wrap, sign and the exact way back."""
+"""Encoder counts and joint positions: wrap, sign and exact inverse."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ rotary = st.builds(
 
 
 @given(rotary, st.integers(0, 2**32 - 1))
-def test_rotary_counts_survive_the_way_there_and_back(encoder: Encoder, counts: int):
+def test_rotary_counts_survive_the_round_trip(encoder: Encoder, counts: int):
     position = position_from_counts(encoder, counts)
     assert abs(position) <= pi + 1e-9
     assert counts_from_position(encoder, position) == counts % encoder.total_counts
@@ -48,7 +48,7 @@ def test_rotary_position_survives_within_half_a_count(encoder: Encoder, position
 
 
 @given(rotary, st.integers(0, 2**25), st.integers(-3, 3))
-def test_whole_turns_do_not_count(encoder: Encoder, counts: int, turns: int):
+def test_full_turns_do_not_matter(encoder: Encoder, counts: int, turns: int):
     assert position_from_counts(encoder, counts) == position_from_counts(encoder, counts + turns * encoder.total_counts)
 
 

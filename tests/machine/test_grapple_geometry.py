@@ -1,4 +1,4 @@
-"""The hanging grapple: yaw modulo pi, rotator choice, tong table against the joint table."""
+"""The hanging grapple: yaw modulo pi, rotator choice, jaw table against the joint table."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_rotator_gives_the_yaw_modulo_pi_with_the_least_turn(slew, yaw, near):
             assert abs(rot - near) <= abs(other - near) + 1e-9
 
 
-def test_convention_at_rotator_zero_the_tongs_open_across_the_reach():
+def test_convention_at_rotator_zero_the_jaws_open_across_the_reach():
     # Reach +y at slew 0; the carrier's x axis is the opening axis.
     assert grapple_yaw(PALMS, (0.0, 0.4, -1.0, 0.8, 0.0)) == 0.0
     # A log along y (psi = pi/2) is gripped with yaw psi + pi/2 = pi, the same axis.
@@ -53,7 +53,7 @@ def test_convention_at_rotator_zero_the_tongs_open_across_the_reach():
 
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
 @given(st.floats(-1.7, 1.7))
-def test_at_rotator_zero_the_tongs_open_across_the_reach_of_either_machine(name, slew):
+def test_at_rotator_zero_the_jaws_open_across_the_reach_of_both_machines(name, slew):
     profile = load_profile(name)
     x, y, _ = pin_position(profile.kinematics, (slew, 0.4, -1.0, 0.8, 0.0))
     assert same_axis(grapple_yaw(profile, (slew, 0.4, -1.0, 0.8, 0.0)), atan2(y, x) + pi / 2)
@@ -61,7 +61,7 @@ def test_at_rotator_zero_the_tongs_open_across_the_reach_of_either_machine(name,
     assert rotator_for_yaw(profile, slew, atan2(y, x) + pi / 2) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_stiff_rotator_says_so():
+def test_a_rotator_with_a_small_range_is_reported():
     spec = msgspec.structs.replace(ROT, lower=-0.2, upper=0.2)
     stiff = msgspec.structs.replace(PALMS, joints={**PALMS.joints, "rot": spec})
     assert rotator_for_yaw(stiff, 1.0, 1.1) == pytest.approx(0.1)
@@ -81,7 +81,7 @@ def tip(tong_rad: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("angle", TONGS.angle_rad)
-def test_the_tong_table_is_the_joint_table(angle):
+def test_the_jaw_table_agrees_with_the_joint_table(angle):
     gap, depth = tip(angle)
     assert half_gap_m(TONGS, angle) == pytest.approx(gap, abs=1.5e-3)
     assert tip_below_pin_m(TONGS, angle) == pytest.approx(depth, abs=1.5e-3)
@@ -101,7 +101,7 @@ def test_tips_close_monotonically_and_sweep_0_18_m_lower():
     assert pin_to_jaw_pivot_m(PALMS.kinematics) == pytest.approx(0.617)
 
 
-def test_outside_the_table_the_end_values_hold():
+def test_outside_the_table_the_end_values_apply():
     assert half_gap_m(TONGS, -1.0) == 0.733 and half_gap_m(TONGS, 9.0) == -0.368
     assert tip_below_pin_m(TONGS, -1.0) == 1.075 and tip_below_pin_m(TONGS, 9.0) == 0.696
 
@@ -112,7 +112,7 @@ def cr250_tip(tong_rad: float) -> tuple[float, float]:
     return 0.25 + 0.45 * (c - s), 0.15 + 0.27 + 0.30 + 0.45 * (c + s)
 
 
-def test_the_table_of_the_cr250_is_one_rigid_tong_that_opens_1_40_m():
+def test_the_table_of_the_cr250_is_one_rigid_jaw_that_opens_1_40_m():
     tongs = load_profile("aoro_fc8").grapple.tongs
     for angle in tongs.angle_rad:
         gap, depth = cr250_tip(angle)
@@ -127,13 +127,13 @@ def test_the_table_of_the_cr250_is_one_rigid_tong_that_opens_1_40_m():
 
 
 @given(st.floats(0.0, 100.0))
-def test_opening_is_linear_in_the_tong_angle(opening_pct):
+def test_opening_is_linear_in_the_jaw_angle(opening_pct):
     angle = jaw_angle_from_opening_pct(TONGS, opening_pct)
     assert 0.0 <= angle <= 2.234
     assert opening_pct_from_jaw_angle(TONGS, angle) == pytest.approx(opening_pct, abs=1e-9)
 
 
-def test_full_opening_is_tong_zero_and_out_of_range_is_clipped():
+def test_full_opening_is_jaw_angle_zero_and_out_of_range_is_clipped():
     assert jaw_angle_from_opening_pct(TONGS, 100.0) == 0.0 == jaw_angle_from_opening_pct(TONGS, 120.0)
     assert jaw_angle_from_opening_pct(TONGS, 0.0) == 2.234 == jaw_angle_from_opening_pct(TONGS, -3.0)
     assert opening_pct_from_jaw_angle(TONGS, -0.1) == 100.0 and opening_pct_from_jaw_angle(TONGS, 3.0) == 0.0

@@ -1,4 +1,4 @@
-"""Names that stand in a profile and in the DBC must be the same; no floor below can check both."""
+"""The names in profiles and in the DBC agree."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def test_access_by_enum():
 
 
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
-def test_every_value_of_a_shipped_profile_carries_its_mark(name):
+def test_every_value_of_a_shipped_profile_has_its_source(name):
     for line in (FOLDER / f"{name}.toml").read_text().splitlines():
         if " = " in line and not line.startswith("#"):
             assert re.search(r"# .*\[(A|B|FPI|XT28|man|derived|mem|est|set)\]", line), line
@@ -113,14 +113,14 @@ def test_wrong_keys_and_types(tmp_path, changes, code, path, named):
     assert all(word in sentence for word in named)
 
 
-def test_sag_is_optional_and_counts_in_the_hash(tmp_path):
+def test_sag_is_optional_and_part_of_the_hash(tmp_path):
     assert load_profile("palms_471").sag is None
     leaning = load_profile(write(tmp_path, {"sag": SAG}))
     assert leaning.sag == Sag(**SAG)
     assert profile_hash(leaning) != profile_hash(load_profile("palms_471"))
 
 
-def test_no_shipped_machine_has_an_imu_and_none_counts_in_no_hash(tmp_path):
+def test_no_shipped_machine_has_an_imu_and_a_missing_one_is_not_hashed(tmp_path):
     for name in shipped_profiles():
         profile = load_profile(name)
         assert profile.imu is None
@@ -162,7 +162,7 @@ def test_broken_toml_names_the_line(tmp_path):
     assert str(broken) in str(caught.value) and "line 3, column 11" in str(caught.value)
 
 
-def test_an_error_keeps_its_problems_on_the_way_between_processes(tmp_path):
+def test_an_error_keeps_its_problems_between_processes(tmp_path):
     with pytest.raises(ProfileError) as caught:
         load_profile(write(tmp_path, {"rate_hz": 300}))
     copy = pickle.loads(pickle.dumps(caught.value))

@@ -141,7 +141,7 @@ def test_wrong_carriers(tmp_path, changes, code, path, named):
     ],
     ids=lambda v: "",
 )
-def test_a_sag_that_no_column_has_is_refused(tmp_path, changes, code, path, named):
+def test_an_implausible_sag_is_refused(tmp_path, changes, code, path, named):
     found, sentence = the_problem(tmp_path, {"sag": {**SAG, **changes}})
     assert found == (code, path)
     assert all(word in sentence for word in named)
@@ -161,13 +161,13 @@ def test_a_sag_that_no_column_has_is_refused(tmp_path, changes, code, path, name
     ],
     ids=lambda v: "",
 )
-def test_an_imu_that_no_grapple_has_is_refused(tmp_path, changes, code, path, named):
+def test_an_implausible_imu_is_refused(tmp_path, changes, code, path, named):
     found, sentence = the_problem(tmp_path, {"imu": {**IMU, **changes}}, AORO)
     assert found == (code, path)
     assert all(word in sentence for word in named)
 
 
-def test_a_speed_in_degrees_is_named_and_so_is_what_the_valve_gives(tmp_path):
+def test_a_speed_in_degrees_is_reported_with_its_consequences(tmp_path):
     found = problems(tmp_path, {"joints.slew.speed_limit": 20.0})
     assert [(problem.code, problem.path) for problem in found] == [
         ("profile.out-of-range", "joints.slew.speed_limit"),
@@ -187,13 +187,13 @@ def test_encoder_kind_must_match_message_and_joint(tmp_path):
     assert ("profile.encoder-kind", "joints.slew.encoder.kind") in codes({"joints.slew.encoder.kind": "linear"})
 
 
-def test_a_delay_in_ms_is_named_before_its_gain(tmp_path):
+def test_a_delay_in_ms_is_reported_before_its_gain(tmp_path):
     found = problems(tmp_path, {"joints.slew.valve.delay_s": 80.0})
     assert (found[0].code, found[0].path) == ("profile.out-of-range", "joints.slew.valve.delay_s")
     assert "given in ms?" in found[0].sentence
 
 
-def test_all_problems_come_at_once(tmp_path):
+def test_all_problems_are_reported_at_once(tmp_path):
     found = problems(
         tmp_path,
         {"timeouts.lease_max_ms": 5000, "rate_hz": 300, "joints.lift.lower": 2.0, "name": "My crane"},

@@ -1,4 +1,4 @@
-"""Where the hanger pin truly is, and the joints that bring it to a point; what the lift cylinder carries."""
+"""The true position of the hanger pin and its inverse, and weighing by the lift cylinder."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_the_joints_for_a_true_point_bring_the_true_pin_there(sag, q, load_kg):
 
 @given(GIVES, INSIDE, LOADS)
 @settings(max_examples=50, deadline=None)
-def test_a_chosen_extension_serves_as_well(sag, q, load_kg):
+def test_a_given_extension_works_as_well(sag, q, load_kg):
     profile = msgspec.structs.replace(PALMS, sag=sag)
     point = true_pin(sag, KIN, q, load_kg)
     try:
@@ -62,7 +62,7 @@ def test_a_chosen_extension_serves_as_well(sag, q, load_kg):
     assert all(low - 1e-6 <= v <= high + 1e-6 for v, (low, high) in zip(found, LIMITS, strict=False))
 
 
-def test_without_a_sag_table_all_is_as_the_encoders_say():
+def test_without_a_sag_table_the_encoder_kinematics_apply():
     q = (0.3, 0.6, -1.2, 0.9, 0.0)
     point = pin_position(KIN, q)
     assert true_pin(None, KIN, q, 200.0) == point
@@ -86,7 +86,7 @@ def test_a_load_turns_the_crane_about_its_foot_by_its_moment(profile):
     assert tz < z - 0.02
 
 
-def test_a_point_that_no_joints_reach_is_refused_in_words():
+def test_an_unreachable_point_is_refused():
     with pytest.raises(Unreachable, check=coded("reach.too-far")):
         aim(SOFT, KIN, LIMITS, 0.0, 7.5, KIN.d1_m, LIMITS[Joint.EXT][1], 400.0)
     with pytest.raises(Unreachable, check=coded("reach.too-far")):
@@ -94,7 +94,7 @@ def test_a_point_that_no_joints_reach_is_refused_in_words():
 
 
 @pytest.mark.parametrize("said", [nan, -5.0, MAX_LOAD_KG + 1.0, float("inf")])
-def test_an_insane_load_counts_as_none(said):
+def test_an_implausible_load_counts_as_zero(said):
     assert plausible_load_kg(said) == 0.0
     assert plausible_load_kg(180.0) == 180.0
 
@@ -114,14 +114,14 @@ def test_the_moment_is_pressure_times_area_times_arm():
 
 
 @given(INSIDE, LOADS)
-def test_a_load_is_what_the_empty_crane_does_not_weigh(q, load_kg):
+def test_a_load_is_the_moment_beyond_that_of_the_empty_crane(q, load_kg):
     ahead = (lambda p: p[0] * cos(q[0] + pi / 2) + p[1] * sin(q[0] + pi / 2))(pin_position(KIN, q)) - KIN.a1_m
     moment_nm = empty_moment_nm(SOFT, KIN, q) + load_kg * GRAVITY_M_S2 * ahead
     found = hanging_load_kg(SOFT, KIN, q, moment_nm)
     assert isnan(found) if ahead < 1.0 else found == pytest.approx(load_kg, abs=1e-6)
 
 
-def test_nothing_is_known_of_a_load_before_a_calibration():
+def test_a_load_is_unknown_before_a_calibration():
     q = (0.3, 0.6, -1.2, 0.9, 0.0)
     assert isnan(hanging_load_kg(None, KIN, q, 2e4))
     assert isnan(hanging_load_kg(Sag(0.004, 0.003, 0.012), KIN, q, 2e4))

@@ -1,4 +1,4 @@
-"""Our MCAP writer: byte for byte what the library's own writer makes of the same messages."""
+"""The MCAP writer: byte for byte the output of the library's writer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MESSAGES = st.lists(st.tuples(st.integers(0, len(TOPICS) - 1), TIMES, TIMES, st.
 
 
 def written(chunks) -> tuple[bytes, bytes]:
-    """The file by our writer and by the library's."""
+    """The file by this writer and by the library's."""
     files = []
     for ours in (True, False):
         stream = BytesIO()

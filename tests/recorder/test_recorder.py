@@ -1,4 +1,4 @@
-"""The recorder: what it is told can be read back, by our reader and by other people's tools."""
+"""The recorder: its files can be read back, by the trace reader and by other tools."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def by_topic(path):
     return found
 
 
-def test_candump_log_is_read_back_by_python_can(run):
+def test_candump_file_is_read_back_by_python_can(run):
     messages = list(can.CanutilsLogReader(run / "crane0.log"))
     sent = [frame for k in range(TICKS) for frame in frames(k)]
     assert len(messages) == len(sent)
@@ -56,7 +56,7 @@ def test_candump_log_is_read_back_by_python_can(run):
         assert bytes(message.data) == frame.data
 
 
-def test_candump_log_is_read_back_by_our_reader(run):
+def test_candump_file_is_read_back_by_the_trace_reader(run):
     got = list(read_trace(run / "crane0.log"))
     sent = [frame for k in range(TICKS) for frame in frames(k)]
     assert [(f.stamp_ns // 1000, f.key, f.data) for f in got] == [(f.stamp_ns // 1000, f.key, f.data) for f in sent]
@@ -69,7 +69,7 @@ def test_candump_line_is_that_of_candump(run):
     assert lines[2] == "(7.000002) crane0 123#R"
 
 
-def test_mcap_holds_raw_decoded_ticks_and_reports(run):
+def test_mcap_has_raw_and_decoded_frames_ticks_and_reports(run):
     found = by_topic(run / "run.mcap")
     sent = [frame for k in range(TICKS) for frame in frames(k)]
     raw = [struct.unpack("<IB3x8s", data) for _, _, data in found["/crane0/raw"]]
@@ -83,7 +83,7 @@ def test_mcap_holds_raw_decoded_ticks_and_reports(run):
     assert json.loads(found["/manifest"][0][2])["seed"] == 3
 
 
-def test_channels_say_how_they_are_encoded(run):
+def test_channels_have_their_encoding(run):
     with (run / "run.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
     channels = {c.topic: c for c in summary.channels.values()}
@@ -109,21 +109,21 @@ def test_every_state_of_the_timing_page_is_a_message(timing, tmp_path):
     assert first["inputs"]["Input6"]["longest_ns"] == 16_000_000
 
 
-def test_sender_stands_behind_the_raw_frame(tmp_path):
+def test_the_sender_follows_the_raw_frame(tmp_path):
     recorder = Recorder(tmp_path, PROFILE, manifest())
     recorder.on_frame("crane0", Frame(START_NS, 0x80, b"\x01"), "plant")
     recorder.close()
     assert by_topic(tmp_path / "run.mcap")["/crane0/raw"][0][2][16:] == b"plant"
 
 
-def test_a_frame_of_a_wrong_length_is_kept_raw(tmp_path):
+def test_a_frame_of_wrong_length_is_recorded_raw(tmp_path):
     recorder = Recorder(tmp_path, PROFILE, manifest())
     recorder.on_frame("crane0", Frame(START_NS, CRANE.message("EncSlew").key, b"\x01"))
     recorder.close()
     assert set(by_topic(tmp_path / "run.mcap")) == {"/manifest", "/crane0/raw"}
 
 
-def test_one_input_gives_the_same_bytes(tmp_path):
+def test_the_same_input_gives_the_same_bytes(tmp_path):
     for name in "ab":
         record(tmp_path / name, TICKS)
     for name in ("run.mcap", "crane0.log", "manifest.json"):
@@ -189,7 +189,7 @@ def test_damaged_datagrams_are_counted(tmp_path):
     assert recorder.refused == 3
 
 
-def test_directory_with_a_recording_is_refused_and_kept(run):
+def test_a_directory_with_a_recording_is_refused_and_unchanged(run):
     before = (run / "run.mcap").read_bytes()
     with pytest.raises(RecordingRefused, check=coded("recording.exists")):
         Recorder(run, PROFILE, manifest())
@@ -213,7 +213,7 @@ def test_a_large_recording_goes_into_several_files(tmp_path, monkeypatch):
 
 
 class FullDisk:
-    """Lets ``os.pwrite`` fail half-way through while ``full``."""
+    """Makes ``os.pwrite`` fail half-way while ``full``."""
 
     def __init__(self, monkeypatch):
         self.full = False
@@ -257,7 +257,7 @@ def test_full_disk_while_running_costs_counted_records_and_nothing_else(tmp_path
     assert len(list(can.CanutilsLogReader(tmp_path / "crane0.log"))) == 4 * 200
 
 
-def test_scan_gives_only_the_topics_asked_for(run):
+def test_scan_returns_only_the_requested_topics(run):
     records = list(scan(run / "run.mcap", {"/controller/tick"}))
     assert {r.topic for r in records if isinstance(r, Channel)} == {"/controller/tick"}
     assert len([r for r in records if isinstance(r, Stored)]) == TICKS

@@ -70,7 +70,7 @@ def test_truncated_anywhere_is_readable_again_and_loses_one_chunk_at_most(whole,
     assert len(set(seen)) > 8
 
 
-def test_flipped_byte_ends_the_good_part(whole, tmp_path):
+def test_a_flipped_byte_ends_the_valid_part(whole, tmp_path):
     data = bytearray((whole / "run.mcap").read_bytes())
     data[len(data) // 2] ^= 0x55
     (tmp_path / "run.mcap").write_bytes(data)
@@ -78,14 +78,14 @@ def test_flipped_byte_ends_the_good_part(whole, tmp_path):
     assert 0 < len(kept) < TICKS and kept == [tick(k) for k in range(len(kept))]
 
 
-def test_what_is_in_order_is_not_touched(whole, tmp_path):
+def test_a_complete_recording_is_not_changed(whole, tmp_path):
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     before = {p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in tmp_path.iterdir()}
     assert recover(tmp_path) == []
     assert {p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in tmp_path.iterdir()} == before
 
 
-def test_living_recorder_is_left_alone(tmp_path):
+def test_a_running_recorder_is_not_disturbed(tmp_path):
     recorder = Recorder(tmp_path, PROFILE, manifest())
     feed(recorder, range(100))
     assert recover(tmp_path) == []
@@ -93,7 +93,7 @@ def test_living_recorder_is_left_alone(tmp_path):
     assert ticks_of(tmp_path / "run.mcap") == [tick(k) for k in range(100)]
 
 
-def test_unfinished_line_of_the_text_log_is_cut(whole, tmp_path):
+def test_an_unfinished_line_of_the_candump_file_is_removed(whole, tmp_path):
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     log = tmp_path / "crane0.log"
     lines = log.read_bytes().splitlines(keepends=True)
@@ -102,7 +102,7 @@ def test_unfinished_line_of_the_text_log_is_cut(whole, tmp_path):
     assert log.read_bytes() == b"".join(lines[:10])
 
 
-def test_another_file_is_refused_by_name(tmp_path):
+def test_a_file_of_another_kind_is_refused_with_its_name(tmp_path):
     (tmp_path / "run.mcap").write_text("this is no recording")
     with pytest.raises(NotMcap, check=coded("recording.not-mcap")):
         list(scan(tmp_path / "run.mcap"))
@@ -124,7 +124,7 @@ def free_port():
 
 
 class Process:
-    """``python -m recorder`` on a python-can bus of this machine that nobody else uses, and a sender of ticks."""
+    """``python -m recorder`` on a private python-can bus of this machine, and a sender of ticks."""
 
     def __init__(self, out):
         self.out, self.port = out, free_port()
@@ -168,7 +168,7 @@ def live(tmp_path):
         yield process
 
 
-def test_killed_recorder_loses_only_what_was_not_yet_due(live, tmp_path):
+def test_a_killed_recorder_loses_only_the_last_moment(live, tmp_path):
     assert CHUNK_NS / 1e9 <= 0.25 and FLUSH_PERIOD_S <= 0.25
     live.send(0.4)
     path, first, limit = tmp_path / "run.mcap", len(live.sent), time.monotonic() + 20
@@ -239,7 +239,7 @@ def test_the_collector_receives_each_state_of_the_timing_page_once(timing, tmp_p
     assert [(kind, told.facts.written_ns) for kind, _, told in received] == [("timing", 1), ("timing", 2)]
 
 
-def test_what_does_not_fit_into_the_queue_is_counted(tmp_path, capfd):
+def test_records_that_do_not_fit_into_the_queue_are_counted(tmp_path, capfd):
     inputs = InputCollector({}, udp_socket(0), udp_socket(0))
     inputs.items = queue.Queue(2)
     for k in range(5):
@@ -254,7 +254,7 @@ def test_what_does_not_fit_into_the_queue_is_counted(tmp_path, capfd):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_ended_recorder_leaves_complete_files(live, tmp_path, number):
+def test_a_stopped_recorder_leaves_complete_files(live, tmp_path, number):
     live.send(0.3)
     assert live.end(number) == 0
     assert ticks_of(tmp_path / "run.mcap") == live.sent
@@ -271,7 +271,7 @@ def test_ended_recorder_leaves_complete_files(live, tmp_path, number):
         (2, ["--out", "OUT", "--bus", "rail0=virtual:x"]),
     ],
 )
-def test_what_cannot_be_used_is_said_at_once(tmp_path, code, arguments):
+def test_unusable_arguments_are_reported_at_once(tmp_path, code, arguments):
     arguments = [str(tmp_path) if a == "OUT" else a for a in arguments]
     done = subprocess.run(
         [sys.executable, "-m", "recorder", "--tick-port", "0", "--report-port", "0", *arguments],

@@ -1,4 +1,4 @@
-"""Memory that is given back is kept."""
+"""Freed memory stays with the process."""
 
 import subprocess
 import sys
@@ -23,6 +23,6 @@ def counted(how: str) -> int:
     return int(run.stdout)
 
 
-def test_a_picture_that_comes_again_needs_no_fresh_pages():
+def test_a_repeated_allocation_needs_no_new_pages():
     assert counted("kept") < 100, "page faults of four times 64 MB"
     assert counted("as it is") > 100, "else there is nothing to be kept"

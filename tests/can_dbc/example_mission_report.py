@@ -5,7 +5,7 @@ from __future__ import annotations
 from can_dbc.messages.mission import AbandonedLog, Fence, KnownLog, Landing, MachinePose, MissionReport
 
 HERE = (63.657853, 19.895562)
-TOLD = MissionReport(
+MISSION_REPORT = MissionReport(
     schema=1,
     name="Test field",
     state="APPROACH",
