@@ -1,11 +1,11 @@
 """The supervisor: modes, events and reactions.
 
 Inputs of a tick: received values, the loop's own lateness, accepted setpoints and operator actions.  Outputs:
-``mode``, ``reason`` with ``detail``, and ``half_speed``.  The transitions are data (`TRANSITIONS`); everything else
-only decides which event occurs.  Nothing starts by itself: only the operator's ARM enters ARMED, and a latched FAULT
-needs RESET and then ARM.  STOP begins with a ramp while the machine moves (``ramp_ns``, and as long as a carrier needs
-to stand); the valves are neutral in every other mode but ACTIVE.  The supervisor never clips: it refuses, slows or
-stops.
+``mode``, ``reason`` with ``detail``, and ``half_speed``.  The transitions are data (`controller.transitions`); the
+supervisor only decides which event occurs.  Nothing starts by itself: only the operator's ARM enters ARMED, and a
+latched FAULT needs RESET and then ARM.  STOP begins with a ramp while the machine moves (``ramp_ns``, and as long as a
+carrier needs to stand); the valves are neutral in every other mode but ACTIVE.  The supervisor never clips: it refuses,
+slows or stops.
 """
 
 from __future__ import annotations

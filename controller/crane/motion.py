@@ -1,6 +1,6 @@
 """The crane as one part of the controller: accepted requests, their lease, the laws, and the spool commands.
 
-Inputs: accepted setpoints and spool tests, received values, joint estimates.  Outputs of a tick:  ``commands`` (joint
+Inputs: accepted setpoints and spool tests, received values, joint estimates.  Outputs of a tick: ``commands`` (joint
 velocities [rad/s, m/s]), ``spools_pct`` and the grapple's command.  A setpoint is a short trajectory or a spool test;
 it is in force until its lease ends.  The mode belongs to the supervisor; this part only acts on it.
 """

@@ -1,7 +1,7 @@
 """Sway damping: damps a grapple that still swings after the motion, on a machine with an inertial sensor on it.
 
 A pendulum of length L whose pin moves by x swings by theta'' = -w^2 theta - x''/L, w^2 = g/L, theta positive where it
-hangs ahead of its pin.  A pin that moves with x' = gain w L theta gives theta'' = -w^2 theta - gain w theta':  ``gain``
+hangs ahead of its pin.  A pin that moves with x' = gain w L theta gives theta'' = -w^2 theta - gain w theta': ``gain``
 is twice the damping ratio.  The valve answers late and the sensor's value is old, so theta is predicted by both delays:
 a free pendulum turns in its phase plane (theta, theta'/w) by w t.  (For small w t that is theta + t theta'.)
 

@@ -1,5 +1,4 @@
-"""The two links to the PLC, each a coroutine beside the bridge: one exchange every 10 ms, one at a time, nothing
-queued.
+"""The two links to the PLC, each a coroutine beside the bridge: one exchange every 10 ms, nothing queued.
 
 A connection that fails is closed at once and tried again after a pause that grows to a second.  The bridge detects the
 loss by the age of the last answer, not by the connection.
