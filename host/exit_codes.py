@@ -9,7 +9,7 @@ from runtime.errors import CodedError
 
 
 class ExitCode(IntEnum):
-    """The exit codes of every command and process (design section 9)."""
+    """The exit codes of every command and process (docs/reference/cli.md)."""
 
     OK = 0
     USAGE = 2

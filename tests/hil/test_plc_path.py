@@ -126,12 +126,12 @@ def test_the_emergency_stop_behind_the_plc_stops_and_latches(tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_a_fault_of_the_plc_stops_the_controller(tmp_path: Path) -> None:
-    """It holds by itself, and says so; PLC_FAULT here."""
+    """The PLC holds and reports its fault; the controller stops with PLC_FAULT."""
     run = Run("references", "modbus", tmp_path)
     run.until(Mode.ACTIVE)
     while not run.moving():
         run.system.advance()
-    run.plant.plc.arbiter.note(Fault.ILLEGAL_VALUE, 1)
+    run.plant.plc.arbiter.latch_fault(Fault.ILLEGAL_VALUE, 1)
     run.until(Mode.STOP)
     assert run.system.report is not None and run.system.report.reason & 0xFF == Reason.PLC_FAULT
     run.wait(50)

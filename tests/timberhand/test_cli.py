@@ -58,11 +58,11 @@ def test_the_version_is_that_of_the_package() -> None:
 
 
 def test_an_error_is_one_line_with_its_code_and_the_documented_exit_code(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "timberhand", "report", "--docs", str(tmp_path)]
+    command = [sys.executable, "-m", "timberhand", "recording", "decode", str(tmp_path / "none.log")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == ExitCode.CONFIGURATION and done.stdout == ""
     (line,) = done.stderr.splitlines()
-    assert line.startswith("timberhand: ") and line.endswith(" [report.no-results]")
+    assert line.startswith("timberhand: ") and line.endswith(" [recording.unreadable]")
 
 
 def test_a_command_failure_crosses_process_boundaries() -> None:

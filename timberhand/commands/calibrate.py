@@ -93,7 +93,7 @@ def calibrate(
         print(json.dumps(result_document(result, facts, changed), indent=2))
     _show(result, screen)
     if result.implausible:
-        screen.print("\n".join(f"[red]✘[/red] {sentence}" for sentence in result.implausible), highlight=False)
+        screen.print("\n".join(f"[red]✘[/red] {problem.sentence}" for problem in result.implausible), highlight=False)
         raise CommandFailed(
             "calibrate.implausible",
             f"no profile is written: {len(result.implausible)} values are implausible, see {folder}",
@@ -181,7 +181,8 @@ def _live(
 ) -> Calibration:
     from autonomy.calibration import live
     from autonomy.calibration.plan import CalibrationImpossible, make_plan
-    from autonomy.calibration.procedure import READING_COUNT, Calibration
+    from autonomy.calibration.procedure import Calibration
+    from autonomy.calibration.procedure_state import READING_COUNT
     from can_dbc.bus.base import BusError
     from can_dbc.bus.factory import open_bus
     from can_dbc.dbc.codec import load
