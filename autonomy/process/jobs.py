@@ -29,6 +29,11 @@ STOPPING_TIMEOUT_NS: Final = 5_000_000_000
 """After its end a mission keeps sending stop setpoints until the machine stands, at most for this long."""
 
 ABORTED: Final = "aborted by the operator"
+"""Reason of a commanded abort."""
+MISSION_ENDED: Final = "the mission has ended"
+NO_PENDING_STEP: Final = "no transition waits for the next step"
+ONLY_ABORT: Final = "a single-log job only accepts Abort"
+"""Reasons for which a command is refused."""
 
 
 class Job(Protocol):
@@ -114,7 +119,7 @@ class SingleLogJob:
     def execute(self, command: MissionCommand) -> str:
         """Only Abort is accepted."""
         if command.action is not MissionAction.ABORT:
-            return "a single-log job only accepts Abort"
+            return ONLY_ABORT
         self.abort(ABORTED)
         return ""
 
@@ -200,7 +205,7 @@ class ForwardingJob:
     def _executed(self, action: MissionAction) -> str:
         manager = self._manager
         if manager.state in FINAL_STATES:
-            return "the mission has ended"
+            return MISSION_ENDED
         match action:
             case MissionAction.AUTO:
                 self._auto = True
@@ -214,7 +219,7 @@ class ForwardingJob:
                 manager.single_step = False
             case MissionAction.NEXT_STEP:
                 if manager.pending_event is None:
-                    return "no transition waits for the next step"
+                    return NO_PENDING_STEP
                 manager.next_step()
             case MissionAction.ABORT:
                 manager.abort(ABORTED)

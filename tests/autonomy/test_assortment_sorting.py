@@ -14,7 +14,7 @@ from autonomy.grasp.sampling_planner import SamplingPlanner
 from autonomy.grasp.selection import PlannerSelection
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.sorting import Sorting
-from autonomy.manager.transition_table import State
+from autonomy.manager.transition_table import RULES, State
 from autonomy.missions.model import ForwardingMission, KnownLog, Landing, Options, Point
 from machine.loading.profile_file import profile_hash
 from tests.autonomy.forwarder_stand_in import Forwarder
@@ -190,8 +190,9 @@ def test_two_landings_get_their_own_assortments_in_two_rounds() -> None:
         assert math.dist(machine.field[number].center_m[:2], (x, y)) < 1.6
     assert machine.field[3].center_m[:2] == pytest.approx((21.0, 4.4), abs=0.01), "no landing takes it"
     assert manager.world.sorting.rounds == 1, "in the second one both were served"
-    assert {"drives the load to the landing (Road)", "unloads the bunk (landing 2)"} <= words
-    assert "follows the waypoints and looks for logs (round 2)" in words
+    named = {f"{RULES[State.HAUL].description} (Road)", f"{RULES[State.UNLOAD].description} (landing 2)"}
+    assert named <= words
+    assert f"{RULES[State.SEARCH].description} (round 2)" in words
 
 
 @whole

@@ -228,7 +228,7 @@ def test_two_seconds_without_satellites_are_dead_reckoned_then_lost() -> None:
     for one in out:
         age = one.stamp_ns - last_fix
         if age > 2_000_000_000:
-            assert one.status is Status.LOST and one.reason == "no position from the receiver"
+            assert one.status is Status.LOST and "position" in one.reason
         elif age > 600_000_000:
             assert one.status is Status.DEAD_RECKONING and one.reason
     reckoned = next(one for one in reversed(out) if one.status is Status.DEAD_RECKONING)

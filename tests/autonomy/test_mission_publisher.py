@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from autonomy.crane_job.phases import Phase
 from autonomy.manager.activity_manager import ActivityManager
-from autonomy.manager.transition_table import EVENT_DESCRIPTIONS, OURS, Event, State
+from autonomy.manager.transition_table import EVENT_DESCRIPTIONS, OURS, RULES, Event, State
 from autonomy.manager.world_model import MAX_ATTEMPTS
 from autonomy.missions.model import Fence, ForwardingMission, Landing, Options, Point
-from autonomy.process.jobs import ABORTED, ForwardingJob, SingleLogJob
+from autonomy.process.jobs import ABORTED, MISSION_ENDED, NO_PENDING_STEP, ONLY_ABORT, ForwardingJob, SingleLogJob
+from autonomy.process.mission_publisher import CRANE_PHASES
 from can_dbc.messages.mission import (
     MAX_CORNERS,
     MAX_LOGS,
@@ -38,7 +40,7 @@ def test_the_report_has_the_machine_position_and_the_mapped_logs() -> None:
     forwarder, job, manager = begin(LOGS[0])
     run(forwarder, job, lambda j: manager.state is State.APPROACH)
     told = job.report(forwarder.crane.now_ns)
-    assert (told.name, told.state, told.words) == ("test", "APPROACH", "drives up to the log")
+    assert (told.name, told.state, told.words) == ("test", "APPROACH", RULES[State.APPROACH].description)
     assert told.auto and not told.paused and not told.ended and told.crane == ""
     assert near(told.route[0], 10.0, 0.0, 0.01) and near(told.route[1], 26.0, 0.0, 0.01) and not told.closed
     assert told.here is not None and near(told.here.place, forwarder.x_m, forwarder.y_m)
@@ -63,7 +65,7 @@ def test_the_targets_are_the_logs_of_the_grasp() -> None:
     told = job.report(forwarder.crane.now_ns)
     (aimed,) = (log for log in told.logs if log.number in told.targets)
     assert near(aimed.place, *forwarder.base().to_base(np.array(taken.center_m))[:2])
-    assert told.crane == "moves above the log" and len(told.logs) == 2
+    assert told.crane == CRANE_PHASES[Phase.ABOVE] and len(told.logs) == 2
 
 
 @pytest.mark.slow
@@ -81,7 +83,7 @@ def test_commands_are_executed_and_reported() -> None:
     assert give(1, MissionAction.PAUSE) == "" and not job.report(0).auto
     run(forwarder, job, lambda j: forwarder.speed_m_s == 0.0)
     assert job.report(forwarder.crane.now_ns).paused
-    assert give(2, MissionAction.NEXT_STEP) == "nothing waits for the next step"
+    assert give(2, MissionAction.NEXT_STEP) == NO_PENDING_STEP
     assert give(3, MissionAction.SINGLE_STEP) == "" and job.report(0).single_step
     assert give(4, MissionAction.AUTO) == "" and job.report(0).auto
     run(forwarder, job, lambda j: manager.pending_event is not None)
@@ -91,7 +93,7 @@ def test_commands_are_executed_and_reported() -> None:
     )
     assert give(5, MissionAction.NEXT_STEP) == ""
     run(forwarder, job, lambda j: manager.state is State.DONE)
-    assert give(6, MissionAction.AUTO) == "the mission has ended" and job.report(0).ended
+    assert give(6, MissionAction.AUTO) == MISSION_ENDED and job.report(0).ended
 
 
 def test_there_is_a_report_before_the_machine_is_located() -> None:
@@ -132,7 +134,7 @@ def test_a_single_log_job_only_accepts_abort() -> None:
             self.failure = reason
 
     job = SingleLogJob(crane := Crane())  # type: ignore[arg-type]
-    assert job.execute(command(1, MissionAction.PAUSE)) and not crane.failure
+    assert job.execute(command(1, MissionAction.PAUSE)) == ONLY_ABORT and not crane.failure
     assert job.execute(command(2, MissionAction.ABORT)) == "" and crane.failure == ABORTED
     assert job.report(0) is None
 
