@@ -133,11 +133,11 @@ class World:
                 collides_with_itself=True,
             )
             body.collide_only(GRAPPLE_LINKS, ("rear", "front"))
-            body.rub(["rear"], truth.contact.bunk_friction)
+            body.set_friction(["rear"], truth.contact.bunk_friction)
         for joint in PASSIVE_JOINTS:
-            body.damp(joint, getattr(truth.structure, f"{joint}_damping_nm_s_rad"))
-        body.rub((*JAW_LINKS, "rotator"), truth.contact.tong_friction)
-        body.sense("hanger")
+            body.set_damping(joint, getattr(truth.structure, f"{joint}_damping_nm_s_rad"))
+        body.set_friction((*JAW_LINKS, "rotator"), truth.contact.tong_friction)
+        body.add_force_sensor("hanger")
         return body
 
     def _moments(self) -> tuple[float, float]:
@@ -281,14 +281,15 @@ class World:
         return rigid_pin(self._chain, self.q)
 
     def load_kg(self) -> float:
-        """What a load cell at the hanger pin shows beyond the empty grapple."""
+        """Reading of a load cell at the hanger pin, less the empty grapple."""
         links = self.truth.links
         grapple = sum(links[n].mass_kg for n in ("hanger", "fork", "rotator")) + 2 * links["tong"].mass_kg
         return max(0.0, self.hanging_n / GRAVITY_M_S2 - grapple)
 
     def lean_rad(self) -> tuple[float, float]:
-        """How far the part above the rotator, which does not turn, hangs from the vertical [rad]: outward of its pin
-        in the crane's plane, and to the left.
+        """Lean of the part above the rotator, which does not turn, from the vertical [rad].
+
+        Outward of its pin in the crane's plane, and to the left.
         """
         _, turn = self.crane.pose("fork")
         x, y, z = self.client.getMatrixFromQuaternion(turn)[6:]  # the vertical, as that part has it
@@ -313,5 +314,5 @@ def open_world(
     terrain: str = "flat",
     home: Mapping[str, float] | None = None,
 ) -> World:
-    """A World whose truth is given by name (nominal, sampled or a TOML file)."""
+    """A World with a truth given by name (nominal, sampled or a TOML file)."""
     return World(profile, load_truth(truth, seed, profile.name), seed, scene, terrain, home)

@@ -54,11 +54,11 @@ class Body:
             p.changeDynamics(self.body, i, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0)
             p.setJointMotorControl2(self.body, i, p.VELOCITY_CONTROL, force=0.0)
 
-    def damp(self, joint: str, damping: float) -> None:
+    def set_damping(self, joint: str, damping: float) -> None:
         """Passive damping of a joint [Nm s/rad]."""
         self._p.changeDynamics(self.body, self.index[joint], jointDamping=damping)
 
-    def rub(self, links: Iterable[str], friction: float) -> None:
+    def set_friction(self, links: Iterable[str], friction: float) -> None:
         """Friction factor of links."""
         for name in links:
             self._p.changeDynamics(self.body, self.link[name], lateralFriction=friction)
@@ -93,7 +93,7 @@ class Body:
                 self.body, self.index[joint], self._p.VELOCITY_CONTROL, targetVelocity=0.0, force=force
             )
 
-    def sense(self, joint: str) -> None:
+    def add_force_sensor(self, joint: str) -> None:
         """Add a force sensor at a joint; ``states`` returns its reading."""
         self._p.enableJointForceTorqueSensor(self.body, self.index[joint], True)
 
@@ -132,7 +132,7 @@ def fixed_boxes(client: BulletClient, shapes: Sequence[Shape], friction: float) 
     """Create boxes that never move, as one body in the world."""
     links = [LinkDef("boxes", 1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), tuple(shapes))]
     body = Body(client, links, (), fixed=True)
-    body.rub(["boxes"], friction)
+    body.set_friction(["boxes"], friction)
     return body.body
 
 

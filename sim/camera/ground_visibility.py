@@ -90,8 +90,10 @@ def draw_grid(
     cx: float,
     cy: float,
 ) -> None:
-    """Height grid at every ``stride``-th point, two triangles a cell, where a cell's middle is between ``nearest`` and
-    ``furthest`` metres from the camera."""
+    """Draw the height grid at every ``stride``-th point, two triangles per cell.
+
+    Only cells whose middle is between ``nearest`` and ``furthest`` metres from the camera are drawn.
+    """
     width = inverse.shape[1]
     span = cell * stride
     last_i, last_j = (heights.shape[0] - 1) // stride, (heights.shape[1] - 1) // stride

@@ -48,7 +48,7 @@ def _bytes(picture: np.ndarray) -> np.ndarray:
 
 
 def _pyramid(picture: np.ndarray) -> np.ndarray:
-    """All levels (LEVELS, size, size, 3) of a square picture, each stored in its top left corner."""
+    """All levels (MIP_LEVEL_COUNT, size, size, 3) of a square picture, each stored in its top left corner."""
     out = np.zeros((MIP_LEVEL_COUNT, *picture.shape), np.uint8)
     level = picture
     for i in range(MIP_LEVEL_COUNT):
@@ -131,8 +131,11 @@ def _horizon(rng: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Textures:
-    """ground (LEVELS, GROUND_PX, GROUND_PX, 6), two colours that patch (PATCH_PX, PATCH_PX) mixes; bark, end grain,
-    horizon; all uint8."""
+    """Textures of a style, all uint8.
+
+    ``ground`` (MIP_LEVEL_COUNT, GROUND_PX, GROUND_PX, 6) holds two colours that ``patch`` (PATCH_PX, PATCH_PX) mixes;
+    ``bark``, ``end`` (grain) and ``horizon`` are single pictures.
+    """
 
     ground: np.ndarray
     patch: np.ndarray
@@ -157,5 +160,5 @@ def _variant(style: str, variant: int) -> Textures:
 
 
 def textures(style: str, seed: int) -> Textures:
-    """The surfaces of a style ("asphalt" with pine, "forest" with birch) in one of VARIANTS appearances."""
+    """The surfaces of a style ("asphalt" with pine, "forest" with birch) in one of VARIANT_COUNT appearances."""
     return _variant(style, seed % VARIANT_COUNT)

@@ -266,7 +266,7 @@ def draw_rod(
     m = 1.0 + k * k
     sw = start[0] * wx + start[1] * wy + start[2] * wz
     c = start[0] ** 2 + start[1] ** 2 + start[2] ** 2 - m * sw * sw + 2.0 * r0 * k * sw - r0 * r0
-    if c > 0.0 and last >= first:  # else the camera is inside the endless cone and sees a cap at most
+    if c > 0.0 and last >= first:  # else the camera is inside the infinite cone and sees a cap at most
         slide = m * sw - r0 * k
         bu, bv, b1 = slide * wx - start[0], slide * wy - start[1], slide * wz - start[2]
         p0 = n0[0] * start[0] + n0[1] * start[1] + n0[2] * start[2]

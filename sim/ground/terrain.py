@@ -32,7 +32,7 @@ class Soil(NamedTuple):
 KINDS: Final = ("flat", "rough", "slope", "hill", "mud")
 SIDE_SLOPE: Final = 0.10  # rise per metre towards +y of kind "slope"
 HILL_SLOPE: Final = math.tan(math.radians(10.0))  # of kind "hill"
-MUD: Final = Soil(0.5, 0.3, 0.10)  # assumed: a wheel pulls with a third of its load and sinks in
+MUD: Final = Soil(0.5, 0.3, 0.10)  # assumed: a wheel pulls at most a third of its load and sinks in
 EXTENT_M: Final = 120.0  # edge of all but rough
 ROUGH_CELL_COUNT: Final = 400
 ROUGH_CELL_M: Final = 0.2
@@ -59,20 +59,6 @@ def surface_height(x: float, y: float, x0: float, y0: float, cell: float, height
     return height
 
 
-@njit(cache=True)
-def _surface_heights(
-    xs: NDArray[np.float64],
-    ys: NDArray[np.float64],
-    x0: float,
-    y0: float,
-    cell: float,
-    heights: NDArray[np.float64],
-    out: NDArray[np.float64],
-) -> None:
-    for k in range(xs.size):
-        out[k] = surface_height(xs[k], ys[k], x0, y0, cell, heights)
-
-
 def _smooth(noise: NDArray[np.float64], length_cells: float) -> NDArray[np.float64]:
     """Gaussian-filtered noise of unit standard deviation, wrapped at the edges."""
     f = np.fft.fftfreq(noise.shape[0])
@@ -83,7 +69,7 @@ def _smooth(noise: NDArray[np.float64], length_cells: float) -> NDArray[np.float
 
 
 def _rough(seed: int) -> NDArray[np.float64]:
-    """Undulation of LAYERS, with the origin in the middle of the grid at height 0; exact in single precision."""
+    """Undulation of ROUGHNESS_LAYERS with height 0 in the middle of the grid; exact in single precision."""
     rng = np.random.default_rng(random.Random(f"terrain {seed}").getrandbits(64))
     shape = (ROUGH_CELL_COUNT, ROUGH_CELL_COUNT)
     heights = np.zeros(shape)
@@ -124,13 +110,6 @@ class Terrain:
     def height(self, x: float, y: float) -> float:
         """Height of the surface [m]."""
         return surface_height(x, y, *self.grid)
-
-    def heights_at(self, xs: NDArray[np.float64], ys: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Heights [m] at points of any shape."""
-        xs, ys = np.broadcast_arrays(np.asarray(xs, dtype=np.float64), np.asarray(ys, dtype=np.float64))
-        out = np.empty(xs.size)
-        _surface_heights(xs.ravel(), ys.ravel(), *self.grid, out)
-        return out.reshape(xs.shape)
 
     def normal(self, x: float, y: float) -> Vector:
         """Unit normal, upward, of the triangle at a point."""

@@ -115,7 +115,7 @@ def wheel_step(
         bx, by, bz = -reach * rx, -reach * ry, -reach * rz
         dx, dy, dz = px + bx - gx, py + by - gy, pz + bz - gz
         ux, uy, uz = vx + wy * dz - wz * dy, vy + wz * dx - wx * dz, vz + wx * dy - wy * dx
-        # The arm does not roll on the ground: its turning about the axle is not the wheel's.
+        # The arm does not roll on the ground: its rotation about the axle is not the wheel's.
         turn = wx * ax + wy * ay + wz * az
         forward = ux * tx + uy * ty + uz * tz + turn * reach
         across = ux * lx + uy * ly + uz * lz
@@ -157,7 +157,7 @@ def wheel_step(
         spin[k], bristle[k, 0], bristle[k, 1] = w, q0, q1
         ft, fl, reaction = sum_t / SUBSTEP_COUNT, sum_l / SUBSTEP_COUNT, sum_reaction / SUBSTEP_COUNT
         fx, fy, fz = ft * tx + fl * lx + load * nx, ft * ty + fl * ly + load * ny, ft * tz + fl * lz + load * nz
-        # What turns the wheel about its axle reaches the arm only through motor and brake.
+        # Torque about the axle reaches the arm only through motor and brake.
         about = ax * (by * fz - bz * fy) + ay * (bz * fx - bx * fz) + az * (bx * fy - by * fx) + reaction
         mx, my, mz = dy * fz - dz * fy, dz * fx - dx * fz, dx * fy - dy * fx
         out[k, 0], out[k, 1], out[k, 2] = fx, fy, fz

@@ -29,7 +29,7 @@ from sim.truth.load import Truth
 
 CARRIER_JOINTS: Final = ("articulation", *geometry.ARMS)
 CARRIER_LINKS: Final = ("rear", "front", *geometry.ARMS)
-STOP_MARGIN: Final = 0.03  # the hard stops stand a little outside the working range [rad]
+STOP_MARGIN_RAD: Final = 0.03  # of the hard stops outside the working range
 WHEEL_BOX_COUNT: Final = 4  # boxes that make a wheel
 BEAM_M: Final = (0.12, 0.20)  # width and height of a swing arm
 SUPPORT_POLYGON: Final = (0, 1, 3, 2)  # wheels clockwise seen from above: fl fr rr rl
@@ -97,14 +97,14 @@ def carrier_links(profile: Profile, truth: Truth) -> tuple[list[LinkDef], list[J
     c, t = _specified(profile, truth)
     halves = zip(("rear", "front"), (t.rear, t.front), strict=True)
     links = [LinkDef(n, f.mass_kg, f.com_m, f.inertia_kg_m2, _shapes(c, n)) for n, f in halves]
-    limit = c.articulation_limit_rad + STOP_MARGIN
+    limit = c.articulation_limit_rad + STOP_MARGIN_RAD
     joints = [JointDef("articulation", "revolute", "rear", "front", lower=-limit, upper=limit)]
     low, high = (geometry.arm_angle_from_height(c, h) for h in (0.0, c.arm_travel_m))
     for name in geometry.ARMS:
         links.append(_arm_link(c, t, name))
         parent, axis = ("front", 1.0) if name[4] == "f" else ("rear", -1.0)
         at = geometry.arm_pivot_m(c, name)
-        lower, upper = low - STOP_MARGIN, high + STOP_MARGIN
+        lower, upper = low - STOP_MARGIN_RAD, high + STOP_MARGIN_RAD
         joints.append(
             JointDef(name, "revolute", parent, name, origin_m=at, axis=(0.0, axis, 0.0), lower=lower, upper=upper)
         )
@@ -159,7 +159,7 @@ class Carrier:
             client.setCollisionFilterPair(body, terrain.body, i, -1, 0)
 
     def place(self, x_m: float, y_m: float, heading_rad: float, height_m: float) -> None:
-        """Stand at rest on the ground, straight, the articulation axis over (x, y), all arms at ``height_m``.
+        """Put the carrier at rest on the ground, straight, the articulation axis over (x, y), all arms at ``height_m``.
 
         The tyres are pressed by the mean load; the crane's joints stay as they are.
         """
@@ -248,7 +248,7 @@ class Carrier:
 
     @property
     def speed_m_s(self) -> float:
-        """Speed of the front axle along the front's x axis, at the height of the arm pivots [m/s]: the true one."""
+        """True speed of the front axle along the front's x axis, at the height of the arm pivots [m/s]."""
         s = self._p.getLinkState(
             self._body, self._index["articulation"], computeLinkVelocity=1, computeForwardKinematics=1
         )
@@ -273,11 +273,6 @@ class Carrier:
     def heading_rad(self) -> float:
         """Heading of the front half [rad]."""
         return self.attitude("front")[2]
-
-    @property
-    def rear_heading_rad(self) -> float:
-        """Heading of the rear half [rad]."""
-        return self.attitude("rear")[2]
 
     @property
     def roll_rad(self) -> float:

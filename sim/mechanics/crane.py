@@ -21,7 +21,6 @@ from sim.geometry.shape import IDENTITY, Shape, Vector, rpy_quaternion
 from sim.mechanics.grapple import PIVOT_Y_M, grapple_shapes, jaw_geometry
 from sim.truth.load import Truth
 
-ACTIVE_JOINTS: Final = ("slew", "lift", "tilt", "ext")
 FLEX_JOINTS: Final = ("flex_pitch", "flex_roll")
 PASSIVE_JOINTS: Final = ("hanger", "fork")
 CRANE_JOINTS: Final = ("slew", *FLEX_JOINTS, "lift", "tilt", "ext", *PASSIVE_JOINTS, "rot", "tong_left", "tong_right")
@@ -29,7 +28,7 @@ CRANE_LINKS: Final = (
     *("base", "turntable", "flexure", "mast", "boom", "stick", "telescope"),
     *(*PASSIVE_JOINTS, "rotator", "tong_left", "tong_right"),
 )
-STOP_MARGIN: Final = 0.03  # hard stops: a little outside the working range, behind the cylinders' cushions [rad, m]
+STOP_MARGIN: Final = 0.03  # of the hard stops outside the working range, behind the cylinders' cushions [rad, m]
 FLEX_STOP_RAD: Final = 0.15
 # Links without an entry in the tables of masses: mass [kg] and principal inertia [kg m^2] of small steel parts.
 SMALL_LINKS: Final = {"base": (100.0, 5.0), "turntable": (15.0, 0.5), "flexure": (5.0, 0.1)}

@@ -1,4 +1,4 @@
-"""What the simple nodes of crane0 share: NMT state, boot-up, heartbeat, emergency, identity; E-stop box, pressures.
+"""The simple nodes of crane0: NMT state, boot-up, heartbeat, emergency, identity; emergency stop, pressures.
 
 Unlike an encoder these nodes start by themselves (boot-up, then operational); NMT can stop and reset them.  A node
 that is not operational sends heartbeats and SDO answers only; its object dictionary holds what CiA 301 demands of
@@ -36,14 +36,14 @@ class Device(CanopenSlave):
             self.outbox.append(answer)
 
     def set_emergency(self, code: int) -> None:
-        """The node finds a fault of its own (CiA 301 emergency code), or with 0 that it is over; a change is sent."""
+        """Set (CiA 301 emergency code) or clear (0) a fault of the node; a change is sent."""
         register = bytes((int(code != 0),))
         if code != self._emergency:
             self._emergency, self.objects[0x1001, 0] = code, register
             self.outbox.append(emergency_frame(Emergency(self.node, code, register[0], bytes(5))))
 
     def tick(self, now_ns: int) -> None:
-        """Boot-up, heartbeat, and what the device sends by itself."""
+        """Boot-up, heartbeat, and the node's periodic frames."""
         if self.state == NodeState.BOOT_UP:
             self.outbox.append((HEARTBEAT_BASE + self.node, b"\x00"))
             self.state = NodeState.OPERATIONAL
@@ -123,7 +123,7 @@ class EstopBox(Device):
 
 
 class PressureModule(Device):
-    """One of three modules with four transducers each; ``sense`` gives the pressures [Pa] they feel."""
+    """One of three modules with four transducers each; ``sense`` reads the pressures [Pa]."""
 
     def __init__(
         self,

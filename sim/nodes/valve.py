@@ -24,10 +24,10 @@ RAMP_NS = 60 * MS  # with 15 ms until SYNC counts as lost: neutral within 100 ms
 PILOT_NS = 300 * MS
 CYCLE_NS = 5 * MS
 SLOW_NS = 20 * MS
-END_BAR = 150.0  # a grapple cylinder at its end or on a log shows more than this while the pump pushes
+END_BAR = 150.0  # pressure above this, while the pump pushes: the grapple cylinder is at its end or on a log
 MODE_SPOOL = 2
-CYCLE_US = 400  # what this PLC reports as its longest cycle
-HOLD_PCT = -20.0  # a held grapple keeps a little closing flow, so that its pressure stays
+CYCLE_US = 400  # reported as the PLC's longest cycle
+HOLD_PCT = -20.0  # a held grapple gets a small closing flow, which maintains its pressure
 FUNCTIONS = ("slew", "lift", "tilt", "ext", "rot", "grapple")
 NO_AXIS = 15
 
@@ -130,7 +130,7 @@ class ValveNode(Device):
         missing = self._missing_condition(now_ns)
         if missing is not None and self.valve_state is ValveState.ACTIVE:
             self._locked, self._lost_ns, self._ramp_from = missing, now_ns, list(self.outputs_pct)
-            self._ramp_from[-1] = 0.0  # the grapple's valve shuts at once and holds
+            self._ramp_from[-1] = 0.0  # the grapple's valve closes at once and holds
         wanted = [0.0] * len(FUNCTIONS)
         armed = self._b.get("ArmKey") == ARM_KEY
         if missing is ExitCode.SAFETY_STOP or (missing is not None and not self._commands_fresh(now_ns, PILOT_NS)):

@@ -22,7 +22,7 @@ CYCLE_NS = 10 * MS
 LAW_CYCLE_COUNT = 2  # the joint law runs at 50 Hz
 HOLD_NS = 50 * MS
 RAMP_NS = 40 * MS
-HOLD_SHARE = -0.2  # a held grapple keeps a little closing flow, so that its pressure stays
+HOLD_SHARE = -0.2  # a held grapple gets a small closing flow, which maintains its pressure
 MOTION_ALLOWED = Estop.CHANNEL_A | Estop.CHANNEL_B | Estop.PILOT_ON
 
 
@@ -120,7 +120,7 @@ class Program:
         elif self.state is State.EXECUTE:
             self.state, self._lost_ns = State.HOLD, now_ns
             self._from = list(self.outputs)
-            self._from[-1] = 0.0  # the grapple's valve shuts at once and holds
+            self._from[-1] = 0.0  # the grapple's valve closes at once and holds
         else:
             self.state = State.HOLD
 

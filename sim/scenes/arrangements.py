@@ -20,7 +20,7 @@ from machine.profile import Profile
 from sim.errors import PlantError
 from sim.truth.wood import Wood
 from sim.wood.log_shape import LogSpec
-from sim.wood.stacking import GAP_M, beside, distances, seen_from_above, spine, upon
+from sim.wood.stacking import GAP_M, beside, distances, footprint_gap, spine, upon
 
 MAX_TRY_COUNT: Final = 100
 KINDS: Final = {
@@ -104,7 +104,7 @@ def random_scene(profile: Profile, wood: Wood, seed: int, logs: int) -> tuple[Lo
         density, rng = sampler.density(), sampler.rng
         x, y, yaw = cx + rng.uniform(-half, half), cy + rng.uniform(-half, half), rng.uniform(-math.pi / 2, math.pi / 2)
         spec = sampler.log(x, y, yaw, density)
-        if all(seen_from_above(spec, other) > 0.1 for other in found):
+        if all(footprint_gap(spec, other) > 0.1 for other in found):
             found.append(spec)
             failed = 0
         else:
@@ -196,7 +196,7 @@ def _drawn(sampler: LogSampler, logs: int, yaws: Callable[[], float]) -> list[Lo
 
 
 def _rows(counts: Sequence[int], logs: Sequence[LogSpec]) -> list[LogSpec]:
-    """Rows of logs along x, side by side in y, each row upon the one below it and about its middle."""
+    """Rows of logs along x, side by side in y, each row on top of and centred over the one below it."""
     following = iter(logs)
     out: list[LogSpec] = []
     middle = 0.0
@@ -252,7 +252,7 @@ def _row(sampler: LogSampler, logs: int, route: Sequence[tuple[float, float]]) -
             x = a[0] + left * math.cos(along) - side * off * math.sin(along)
             y = a[1] + left * math.sin(along) + side * off * math.cos(along)
             spec = sampler.log(x, y, yaw + along)
-            if _off_route(spec, route) and all(seen_from_above(spec, other) > 0.3 for other in found):
+            if _off_route(spec, route) and all(footprint_gap(spec, other) > 0.3 for other in found):
                 found.append(spec)
                 break
         else:
@@ -289,7 +289,7 @@ def _driven(route: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def _bunk(sampler: LogSampler, logs: int, profile: Profile) -> tuple[LogSpec, ...]:
-    """Logs along the bunk, from stake to stake and row upon row."""
+    """Logs along the bunk, from stake to stake, row upon row."""
     rng, stake = sampler.rng, profile.bunk.width_m / 2 - 0.01
     out: list[LogSpec] = []
     edge = -stake

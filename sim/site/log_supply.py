@@ -97,6 +97,6 @@ class LogSupplier:
                 fresh = self._lying[i] = self._waiting[i].pop(0)
                 x, y, _ = states[fresh].position_m
                 log_bodies.wake()
-                log_bodies.carry(fresh, at[0] - x, at[1] - y)
+                log_bodies.move(fresh, at[0] - x, at[1] - y)
                 laid += 1
         return laid

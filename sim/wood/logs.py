@@ -27,7 +27,7 @@ from sim.truth.body import Contact
 from sim.truth.load import Truth
 from sim.wood.bunk import bunk_boxes, from_bunk
 from sim.wood.log_shape import LogSpec, Mass, log_segments, mass_of, quaternion_of
-from sim.wood.stacking import seen_from_above
+from sim.wood.stacking import footprint_gap
 
 SLEEP_SPEED: Final = 0.02  # [m/s, rad/s]
 SETTLE_STEP_S: Final = 0.0025
@@ -91,7 +91,7 @@ class LogBodies:
         for state in (client.ACTIVATION_STATE_ENABLE_SLEEPING, client.ACTIVATION_STATE_SLEEP):
             for body in self.body_ids:
                 client.changeDynamics(body, -1, activationState=state, sleepThreshold=SLEEP_SPEED)
-        # Body axes -> log frame: the turn about y, and the log's origin seen from the centre of mass.
+        # Body axes -> log frame: the turn about y, and the log's origin relative to the centre of mass.
         self._turn = np.array([m.turn_rad for m in wood])
         self._com = np.array([m.com_m for m in wood]).reshape(-1, 3)
         self.stowed: tuple[int, ...] = ()
@@ -105,7 +105,7 @@ class LogBodies:
             if i not in self.stowed:
                 self._p.changeDynamics(body, -1, activationState=self._p.ACTIVATION_STATE_WAKE_UP)
 
-    def carry(self, which: int, east_m: float, north_m: float) -> None:
+    def move(self, which: int, east_m: float, north_m: float) -> None:
         """Move a log, without turning it, to another place on level ground."""
         (x, y, z), turn = self._p.getBasePositionAndOrientation(self.body_ids[which])
         self._p.resetBasePositionAndOrientation(self.body_ids[which], (x + east_m, y + north_m, z), turn)
@@ -216,7 +216,7 @@ def _lifts(scene: Sequence[LogSpec], terrain: Terrain) -> list[float]:
         (i, j)
         for i, a in enumerate(scene)
         for j in range(i)
-        if math.hypot(a.x_m - scene[j].x_m, a.y_m - scene[j].y_m) < 4.0 and seen_from_above(a, scene[j]) < NEIGHBOUR_M
+        if math.hypot(a.x_m - scene[j].x_m, a.y_m - scene[j].y_m) < 4.0 and footprint_gap(a, scene[j]) < NEIGHBOUR_M
     ]
     for _ in scene:
         for i, j in near:

@@ -46,8 +46,8 @@ def clearance(a: LogSpec, b: LogSpec) -> float:
     return float(np.min(distances(p, q) - radii))
 
 
-def seen_from_above(a: LogSpec, b: LogSpec) -> float:
-    """Gap [m] between two logs' footprints."""
+def footprint_gap(a: LogSpec, b: LogSpec) -> float:
+    """Gap [m] between two logs' footprints on the ground plane; negative when they overlap."""
     (p, _), (q, _) = spine(a), spine(b)
     flat = np.array([1.0, 1.0, 0.0])
     return float(np.min(distances(p * flat, q * flat))) - (a.diameter_m + b.diameter_m) / 2

@@ -200,7 +200,7 @@ class Stowage:
             p.resetBaseVelocity(log, _carried(*moving, at[0], place), moving[1])
         if self._fixed_body is not None:
             body, tie = self._fixed_body
-            p.removeConstraint(tie)  # Bullet does not do so with the body
+            p.removeConstraint(tie)  # Bullet does not remove it with the body
             p.removeBody(body)
         log_bodies.stowed, self._relative_poses, self._fixed_body, self._still_s = (), [], None, 0.0
 

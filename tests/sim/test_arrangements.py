@@ -14,7 +14,7 @@ from sim.errors import PlantError
 from sim.scenes.arrangements import CONFIGURATIONS, KINDS, arrangement, configuration, random_scene
 from sim.truth.load import load_truth
 from sim.wood.log_shape import LogSpec, log_segments, mass_of, quaternion_of
-from sim.wood.stacking import clearance, seen_from_above
+from sim.wood.stacking import clearance, footprint_gap
 from tests.codes import coded
 
 MACHINES = ("palms_471", "aoro_fc8")
@@ -45,7 +45,7 @@ def test_random_logs_lie_apart_in_the_pick_area():
     for seed in range(10):
         logs = random_scene(PALMS, PINE, seed, 3)
         assert all(abs(log.x_m - cx) <= half and abs(log.y_m - cy) <= half for log in logs)
-        assert all(seen_from_above(a, b) > 0.1 for a, b in combinations(logs, 2))
+        assert all(footprint_gap(a, b) > 0.1 for a, b in combinations(logs, 2))
 
 
 def test_the_carriers_pick_area_is_beside_the_machine_where_it_starts():

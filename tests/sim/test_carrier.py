@@ -38,7 +38,7 @@ def test_frames_agree_with_the_profile(rig):
     (x, y, z), _ = r.carrier.pose("rear")
     assert (x, y) == pytest.approx((3.0, -2.0), abs=1e-9)
     assert z == pytest.approx(geometry.pivot_height_m(C, 0.2), abs=0.01)
-    assert r.carrier.heading_rad == pytest.approx(0.7) and r.carrier.rear_heading_rad == pytest.approx(0.7)
+    assert r.carrier.heading_rad == pytest.approx(0.7) and r.carrier.attitude("rear")[2] == pytest.approx(0.7)
     assert r.carrier.arm_heights_m == pytest.approx((0.2,) * 4)
     ahead = geometry.hub_m(C, "arm_fl", 0.2)[0]
     axle = r.carrier.front_axle()
@@ -183,7 +183,7 @@ def test_parked_machine_creeps_less_than_a_twentieth_of_a_millimetre_a_second_wh
     _slew(r, 3 * cycle, cycle)
     after = r.carrier.pose("rear")
     assert math.dist(after[0], before[0]) / (3 * cycle) < 5e-5
-    assert abs(r.carrier.rear_heading_rad) < 1e-3
+    assert abs(r.carrier.attitude("rear")[2]) < 1e-3
 
 
 def test_roll_stiffness_is_that_of_the_tyres(rig):

@@ -28,12 +28,8 @@ def test_bullet_and_height_are_one_surface(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_vector_and_grid_agree_with_height(kind):
+def test_the_grid_agrees_with_the_height(kind):
     terrain = Terrain(kind, 2)
-    xs, ys = np.meshgrid(np.linspace(-45.0, 45.0, 31), np.linspace(-45.0, 45.0, 17))
-    heights = terrain.heights_at(xs, ys)
-    assert heights.shape == xs.shape
-    assert heights[7, 3] == terrain.height(float(xs[7, 3]), float(ys[7, 3]))
     x0, y0 = terrain.origin_m
     for i, j in ((0, 0), (1, 0), (0, 1), (len(terrain.heights) - 1,) * 2):
         at = terrain.height(x0 + i * terrain.cell_m, y0 + j * terrain.cell_m)
