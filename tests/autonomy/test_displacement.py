@@ -52,21 +52,21 @@ LAY = (0.0, RADIUS_M)
 
 
 @pytest.mark.parametrize("now", [(0.0, 0.6), (0.3, 0.5), (0.6, RADIUS_M)], ids=["lifted", "carried", "rolled away"])
-def test_a_log_that_is_seen_elsewhere_and_not_there_has_moved(now: Place) -> None:
+def test_a_log_seen_elsewhere_and_not_in_its_place_is_displaced(now: Place) -> None:
     assert is_displaced(picture(now), DOWN, log_at(LAY), fit_at(now))
 
 
-def test_tongs_over_its_middle_do_not_hide_that_it_is_gone() -> None:
+def test_a_grapple_over_its_middle_does_not_hide_that_it_is_gone() -> None:
     now = (0.0, 0.6)
     assert is_displaced(picture(now, tongs=slice(140, 180)), DOWN, log_at(LAY), fit_at(now))
 
 
-def test_a_log_that_still_lies_there_is_not_the_like_one_beside_it() -> None:
+def test_a_log_in_its_place_is_not_the_similar_one_beside_it() -> None:
     beside = (0.5, RADIUS_M)
     assert not is_displaced(picture(LAY, beside), DOWN, log_at(LAY), fit_at(beside))
 
 
-def test_what_is_hidden_may_lie_there_still() -> None:
+def test_a_hidden_log_is_not_displaced() -> None:
     now = (0.5, 0.6)
     assert not is_displaced(picture(now, tongs=slice(0, 320)), DOWN, log_at(LAY), fit_at(now))
 
@@ -76,26 +76,26 @@ def test_what_is_hidden_may_lie_there_still() -> None:
     [fit_at((0.0, 0.6), length_m=1.2), fit_at((0.0, 0.6), radius_m=0.2), fit_at((0.0, 1.8))],
     ids=["a shorter log", "a thicker log", "far away"],
 )
-def test_another_log_is_not_it(other: CylinderFit) -> None:
+def test_a_fit_of_another_shape_is_another_log(other: CylinderFit) -> None:
     assert not is_displaced(picture(), DOWN, log_at(LAY), other)
 
 
-def test_a_log_half_of_which_is_still_seen_there_has_not_moved() -> None:
+def test_a_log_that_is_half_visible_in_its_place_is_not_displaced() -> None:
     frame = picture(LAY, length_m=0.4 * LENGTH_M)
     assert not is_displaced(frame, DOWN, log_at(LAY), fit_at((0.6, RADIUS_M)))
 
 
-def test_a_log_out_of_the_picture_is_not_missed_in_it() -> None:
+def test_a_log_outside_the_picture_is_not_displaced() -> None:
     outside = log_at((4.0, RADIUS_M))
     assert not is_displaced(picture((3.0, 0.6)), DOWN, outside, fit_at((3.0, 0.6)))
 
 
-def test_half_a_log_in_the_picture_tells_of_the_whole() -> None:
+def test_half_a_log_in_the_picture_suffices() -> None:
     half_outside = log_at(LAY, x_m=2.4)
     assert is_displaced(picture(), DOWN, half_outside, fit_at((0.6, 0.6), x_m=1.6)), "what is in view is the ground"
 
 
-def test_nothing_is_known_where_no_depth_is() -> None:
+def test_without_depth_a_log_is_not_displaced() -> None:
     frame = picture((0.0, 0.6))
     frame.depth_m[:] = np.nan
     assert not is_displaced(frame, DOWN, log_at(LAY), fit_at((0.0, 0.6)))

@@ -17,12 +17,12 @@ FRAME = RgbdFrame("front", 0, np.zeros((720, 1280, 3), np.uint8), np.full((720, 
 STILL = Pose(np.array([1.0, 2.0, 3.0]), BODY_FROM_OPTICAL)
 
 
-def test_the_letterboxs_corners_are_the_pictures() -> None:
+def test_the_corners_of_the_letterbox_are_those_of_the_picture() -> None:
     assert box_in_picture((0, 133, 608, 475), PIN) == pytest.approx((0.0, 0.0, 1280.0, 720.0))
     assert box_in_picture((304, 304, 304, 304), PIN) == pytest.approx((640.0, 360.0, 640.0, 360.0))
 
 
-def test_depth_is_the_mean_of_eight_by_eight_pixels_at_the_boxs_middle() -> None:
+def test_depth_is_the_mean_of_eight_by_eight_pixels_in_the_middle_of_the_box() -> None:
     depth_m = np.full((720, 1280), 9.0, np.float32)
     depth_m[296:304, 496:504] = np.square(np.arange(64, dtype=np.float32)).reshape(8, 8) / 4096.0 + 4.0
     point = position_in_box(replace(FRAME, depth_m=depth_m), (450.0, 280.0, 550.0, 320.0))
@@ -30,7 +30,7 @@ def test_depth_is_the_mean_of_eight_by_eight_pixels_at_the_boxs_middle() -> None
     assert point[:2] == pytest.approx(((499.5 - 640.0) / 530.0 * point[2], (299.5 - 360.0) / 530.0 * point[2]))
 
 
-def test_unknown_pixels_are_left_out_and_without_any_there_is_no_position() -> None:
+def test_unknown_pixels_are_ignored_and_without_known_ones_there_is_no_position() -> None:
     depth_m = np.full((720, 1280), np.nan, np.float32)
     box = (450.0, 280.0, 550.0, 320.0)
     assert position_in_box(replace(FRAME, depth_m=depth_m), box) is None
@@ -50,14 +50,14 @@ def test_estimates_of_a_log_are_averaged_in_the_machines_frame() -> None:
     assert first == pytest.approx((6.0, 2.0, 3.0), abs=1e-6) and second == pytest.approx((9.0, 2.0, 3.0), abs=1e-6)
 
 
-def test_a_radius_is_added_along_the_sight() -> None:
+def test_a_radius_is_added_along_the_line_of_sight() -> None:
     average = RunningAverage(radius_m=0.125)
     average.add(FRAME, STILL, [(636.5, 356.5, 644.5, 364.5)])
     assert average.positions_m()[0] == pytest.approx((6.125, 2.0, 3.0), abs=1e-6)
 
 
 @given(st.floats(3.0, 6.0), st.floats(1.0, 3.0), st.floats(2.0, 3.0), st.floats(0.1, 0.4), st.floats(0.0, 0.6))
-def test_the_closed_form_is_what_a_ray_through_the_boxs_middle_hits(
+def test_the_closed_form_agrees_with_a_ray_through_the_middle_of_the_box(
     near: float, length: float, height: float, diameter: float, pitch: float
 ) -> None:
     """The same by brute force: project the rims, take the middle, follow the ray to the log."""
@@ -80,7 +80,7 @@ def test_the_closed_form_is_what_a_ray_through_the_boxs_middle_hits(
     assert high == pytest.approx(up - 0.5 * diameter, abs=1e-9)
 
 
-def test_a_log_of_two_metres_end_on_is_missed_by_decimetres() -> None:
+def test_the_error_for_a_two_metre_log_end_on_is_decimetres() -> None:
     back, high = end_on_error_m(4.2, 6.2, 2.4, 0.25)
     harmonic = 0.5 * (4.2 + 6.2) - 2.0 / (1.0 / 4.2 + 1.0 / 6.2)
     assert harmonic == pytest.approx(0.19, abs=0.005)

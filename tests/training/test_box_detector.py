@@ -54,10 +54,10 @@ def test_empty_maps_give_no_boxes():
 def test_pictures_of_another_size_and_foreign_weights_are_refused(tmp_path):
     path = tmp_path / "boxes.safetensors"
     save(path, box_net(), random_net(box_net(), 1).arrays(), {})
-    finder = BoxDetector(path)
+    detector = BoxDetector(path)
     with pytest.raises(NetworkError, check=coded("network.bad-picture")):
-        finder.detect(np.zeros((304, 304, 3), np.uint8))
-    found, _ = finder.detect(np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8))
+        detector.detect(np.zeros((304, 304, 3), np.uint8))
+    found, _ = detector.detect(np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8))
     assert found.shape[1] == 4
     with pytest.raises(WeightsError):
         BoxDetector(tmp_path / "none.safetensors")

@@ -1,4 +1,4 @@
-"""Labels of log pictures under mirroring, windows and scaling, and labels from masks only."""
+"""Labels of log pictures under mirroring, windows and scaling."""
 
 import math
 from dataclasses import replace
@@ -6,12 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.training.drawn_logs import picture, strip
+from tests.training.drawn_logs import picture
 from training.pictures.labels import (
     ANGLE,
     CENTRE_U,
-    ELONGATION,
-    END_SEEN,
     END_U,
     END_V,
     ID,
@@ -20,7 +18,6 @@ from training.pictures.labels import (
     cropped,
     enlarged,
     mirrored,
-    row_of_mask,
 )
 
 LOGS = (((60.0, 60.0), 0.4, 80, 10), ((110.0, 110.0), 1.2, 60, 12))
@@ -69,12 +66,3 @@ def test_enlarged_labels_agree_with_their_pixels():
         _, u = np.nonzero(large.ids == log[ID])
         assert log[CENTRE_U] == pytest.approx((u.min() + u.max()) / 2, abs=1.5)
     assert large.logs[0, ANGLE] == picture(*LOGS).logs[0, ANGLE]
-
-
-def test_a_mask_determines_axis_and_extent_but_not_visible_ends():
-    row = row_of_mask(3, strip((160, 160), (80, 80), 0.7, 100, 10))
-    assert row[ID] == 3 and row[END_SEEN] == 0.0
-    assert row[ANGLE] == pytest.approx(0.7, abs=0.02)
-    assert math.dist(row[3:5], row[5:7]) == pytest.approx(100, abs=4)
-    assert row[ELONGATION] == 1.0
-    assert row_of_mask(1, strip((160, 160), (80, 80), 0.7, 20, 20))[ELONGATION] < 0.2

@@ -43,25 +43,25 @@ def test_the_card_matches_the_weights(weights):
 
 @pytest.mark.parametrize(("variant", "least"), [("rgbd", 0.7), ("depth", 0.55)])
 def test_well_visible_logs_are_segmented(variant, least, seen):
-    finder = LogSegmenter(variant)
-    share = found(lambda s: [i.box_px for i in finder.segment_picture(s.rgb, s.depth_m, s.intrinsics)], seen)
+    detector = LogSegmenter(variant)
+    share = found(lambda s: [i.box_px for i in detector.segment_picture(s.rgb, s.depth_m, s.intrinsics)], seen)
     assert share >= least, share
 
 
 def test_the_depth_variant_ignores_colour(seen):
-    finder = LogSegmenter("depth")
+    detector = LogSegmenter("depth")
     sample = next(s for s, truth in seen if len(truth) > 2)
-    plain = finder.segment_picture(sample.rgb, sample.depth_m, sample.intrinsics)
-    dark = finder.segment_picture(np.full_like(sample.rgb, 7), sample.depth_m, sample.intrinsics)
+    plain = detector.segment_picture(sample.rgb, sample.depth_m, sample.intrinsics)
+    dark = detector.segment_picture(np.full_like(sample.rgb, 7), sample.depth_m, sample.intrinsics)
     assert plain and [i.box_px for i in plain] == [i.box_px for i in dark]
 
 
 def test_boxes_from_colour_overlap_logs(seen):
-    finder = BoxDetector()
+    detector = BoxDetector()
 
     def boxes_of(sample):
         square = np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8)
         square[: sample.rgb.shape[0], : sample.rgb.shape[1]] = sample.rgb
-        return finder.detect(square)[0]
+        return detector.detect(square)[0]
 
     assert found(boxes_of, seen) >= 0.5

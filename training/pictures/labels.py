@@ -51,24 +51,6 @@ def elongation(extent_px: float, width_px: float) -> float:
     return min(1.0, max(0.0, (extent_px / max(width_px, 1.0) - 1.0) / (FULL_ELONGATION_WIDTHS - 1.0)))
 
 
-def row_of_mask(number: int, mask: np.ndarray) -> tuple[float, ...]:
-    """The row of a log of which only the mask (H, W) is known.
-
-    The axis is the principal axis of the mask.  The ends are those of the mask and marked as not visible, because their
-    visibility is unknown.
-    """
-    v, u = np.nonzero(mask)
-    points = np.stack([u, v]).astype(float)
-    values, vectors = np.linalg.eigh(np.cov(points) if len(u) > 1 else np.eye(2))
-    axis = vectors[:, -1]
-    (cu, cv), extent = seen_along(u, v, axis)
-    half = 0.5 * extent * axis
-    width = math.sqrt(12.0 * max(float(values[0]), 0.0)) + 1.0
-    angle = math.atan2(axis[1], axis[0]) % math.pi
-    return (number, cu, cv, cu - half[0], cv - half[1], cu + half[0], cv + half[1], 0.0, 0.0, angle,
-            elongation(extent, width))  # fmt: skip
-
-
 def mirrored(sample: Labelled) -> Labelled:
     """The picture mirrored left to right."""
     w, pin = sample.rgb.shape[1], sample.intrinsics
