@@ -37,10 +37,12 @@ LATE_PERIODS: Final = 2
 LATE_LIMIT_COUNT: Final = 3
 LATE_WINDOW_NS: Final = 1_000_000_000
 STALLED_NS: Final = 50_000_000
-_RELEASED, _PRESSED = 1, 0
+_RELEASED: Final = 1
+_PRESSED: Final = 0
 _YES: Final = 1
 _ENABLED: Final = 0xA
-_VALVE_PILOT_OFF, _VALVE_FAULT = 3, 4
+_VALVE_PILOT_OFF: Final = 3
+_VALVE_FAULT: Final = 4
 _ALARM_SIGNALS: Final = {"rotary": "Alarms", "linear": "SystemReg"}
 
 

@@ -14,7 +14,9 @@ from can_dbc.messages.envelope import Common, finite
 
 _DRIVE: Final = struct.Struct("<IBB9d")
 _VEHICLE: Final = struct.Struct("<IBHHBBH3Q14d")
-_FLOAT_FRONT, _FLOAT_REAR, _LEVEL = 1, 2, 4
+_FLOAT_FRONT: Final = 1
+_FLOAT_REAR: Final = 2
+_LEVEL: Final = 4
 _FLAGS: Final = _FLOAT_FRONT | _FLOAT_REAR | _LEVEL
 
 Heights = tuple[float, float, float, float]

@@ -89,8 +89,10 @@ class Status(IntEnum):
     WRONG_SEQUENCE = 4
     ERROR = 5
 
-    def __init__(self, value: int) -> None:
-        self.usable: Final = value <= 1
+    @property
+    def usable(self) -> bool:
+        """Whether the frame may be used."""
+        return self <= Status.OK_SOME_LOST
 
 
 class Checker:

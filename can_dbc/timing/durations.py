@@ -10,8 +10,12 @@ from array import array
 from typing import Final, Self
 
 _US: Final = 1_000
-_FINE_END, _MIDDLE_END, _COARSE_END = 1_000 * _US, 10_000 * _US, 100_000 * _US
-_MIDDLE_AT, _COARSE_AT, _REST = 1_000, 1_900, 2_800
+_FINE_END: Final = 1_000 * _US
+_MIDDLE_END: Final = 10_000 * _US
+_COARSE_END: Final = 100_000 * _US
+_MIDDLE_AT: Final = 1_000
+_COARSE_AT: Final = 1_900
+_REST: Final = 2_800
 BINS: Final = _REST + 1
 QUANTILES: Final = {"p50_us": 0.5, "p99_us": 0.99, "p999_us": 0.999}
 

@@ -16,7 +16,8 @@ from machine.status.reasons import Reason
 SEND_REFUSAL_LIMIT_TICKS: Final = 3
 RECOVERY_LIMIT_COUNT: Final = 3
 RECOVERY_WINDOW_NS: Final = 60_000_000_000
-_OFF, _PASSIVE = int(BusState.OFF), int(BusState.PASSIVE)
+_OFF: Final = int(BusState.OFF)
+_PASSIVE: Final = int(BusState.PASSIVE)
 
 
 class BusMonitor:

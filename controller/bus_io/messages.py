@@ -12,7 +12,10 @@ from machine.status.modes import Mode
 from machine.status.reasons import Reaction, Reason
 
 ARM_KEY: Final = 0xA
-_RUN, _DEGRADED, _CONTROLLED_STOP, _SAFE_STOP = range(4)
+_RUN: Final = 0
+_DEGRADED: Final = 1
+_CONTROLLED_STOP: Final = 2
+_SAFE_STOP: Final = 3
 
 
 class PeriodicTimer:

@@ -25,7 +25,8 @@ from machine.status.reasons import Reason
 
 STATUS_NS: Final = 20_000_000
 HEARTBEAT_NS: Final = 100_000_000
-_SPOOL, _NEUTRAL = 2, 0
+_SPOOL: Final = 2
+_NEUTRAL: Final = 0
 _MAX_FLOW_PCT: Final = 100.0
 
 

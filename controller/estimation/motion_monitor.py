@@ -17,8 +17,10 @@ from typing import Final
 from controller.estimation.joint_estimator import TrackedJoint
 from machine.status.reasons import Reason
 
-EARLY_DELAY_S, EARLY_LAG_S = 0.03, 0.03
-LATE_DELAY_S, LATE_LAG_S = 0.15, 0.06
+EARLY_DELAY_S: Final = 0.03
+EARLY_LAG_S: Final = 0.03
+LATE_DELAY_S: Final = 0.15
+LATE_LAG_S: Final = 0.06
 """Bounds of the dead time, and the lags behind it: spool, and compressible oil."""
 _MEMORY_S: Final = 0.5
 _COMMAND_DECAY_S: Final = 0.2

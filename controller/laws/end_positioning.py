@@ -33,10 +33,12 @@ LEARNING_SHARE: Final = 0.7
 """Share of an inch's error that the next one in that direction corrects, ..."""
 FULL_LEARNING_BANDS: Final = 4.0
 """... and less for a distance below this many stop bands, because a swinging load may cause as much."""
-GAIN_RANGE: Final = (0.3, 4.0)
+MIN_GAIN: Final = 0.3
+MAX_GAIN: Final = 4.0
 WIDENING_SHARE: Final = 0.25
 """Every inch at one place widens the stop band by this share."""
-FAST_MEAN_S, SLOW_MEAN_S = 0.1, 0.4
+FAST_MEAN_S: Final = 0.1
+SLOW_MEAN_S: Final = 0.4
 SETTLED_SHARE: Final = 0.4
 """Settled: a fast and a slow mean of the error agree to this share of the stop band for `SETTLED_S`."""
 SETTLED_S: Final = 0.2
@@ -189,6 +191,5 @@ class EndPositioning:
         if went < NO_MOTION_SHARE:
             self._open[side] = min(self._open[side] + OPENING_STEP_SHARE, MAX_OPENING_SHARE)
         else:
-            low, high = GAIN_RANGE
             learned = LEARNING_SHARE * min(1.0, self._distance / (FULL_LEARNING_BANDS * self._band))
-            self._gain[side] = min(max(self._gain[side] * (1.0 + learned * (went - 1.0)), low), high)
+            self._gain[side] = min(max(self._gain[side] * (1.0 + learned * (went - 1.0)), MIN_GAIN), MAX_GAIN)
