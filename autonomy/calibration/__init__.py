@@ -1,1 +1,2 @@
-"""Commissioning: identifies a machine's valves, sensors and steel through its bus (design section 6)."""
+"""Commissioning: identifies a machine's valves, sensors and steel through its bus (docs/architecture.md, "Machine and
+truth")."""

@@ -1,10 +1,10 @@
-"""Dead time and lag of one valve's spool, from the commands on the bus and the spools that the valve node reports.
+"""Dead time and lag of a valve's spool, from the commands on the bus and the spool positions of the valve node.
 
     spool'' = w^2 (command(t - dead time) - spool) - 2 z w spool'          (docs/reference/machines.md section 3)
 
-``delay_s`` is the pure dead time from the command's frame to the spool's first motion; ``lag_s`` = 2 z / w is how far
-a moving spool stays behind after it.  Joints show neither cleanly: pump and oil stand between.  How long the joint
-itself takes, command to encoder, is `response_s`, for the report.
+``delay_s`` is the pure dead time from the command's frame to the first motion of the spool; ``lag_s`` = 2 z / w is the
+delay of a moving spool beyond it.  Joints show neither cleanly, because pump and oil are between.  `response_s` is the
+delay of the joint itself, from command to encoder, for the report.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from autonomy.calibration.trace import FINE_FACTOR, GRID_S, SpoolTestRecord
 
 MAX_DELAY_S: Final = 0.3
 SPOOL_RESOLUTION: Final = 0.0005
-"""Spools are reported in 0.05 %."""
+"""Valve nodes report spools in steps of 0.05 %."""
 _DELAY_GUESSES_S: Final = (0.04, 0.08, 0.12, 0.16)
 MOVED_SHARE: Final = 0.2
 
@@ -37,7 +37,7 @@ class DelayFit:
 
 
 def fit_delay(tests: Sequence[SpoolTestRecord]) -> DelayFit | None:
-    """From the staircases of both sides; None where the valve node reports no spools."""
+    """The fit of the staircases of both sides; None where the valve node reports no spools."""
     usable = [t for t in tests if t.spool is not None and float(np.ptp(t.spool)) > 0.02]
     if not usable:
         return None
@@ -57,7 +57,10 @@ def _fit(tests: Sequence[SpoolTestRecord]) -> tuple[float, float, float]:
             command = t.fine_command
             time = np.arange(len(command)) * step_s
             delayed = np.interp(time - p[0], time, command, left=command[0])
-            out.append((t.spool - lfilter(*_spool_filter(p[1], p[2], step_s), delayed)[FINE_FACTOR - 1 :: FINE_FACTOR]) / SPOOL_RESOLUTION)
+            out.append(
+                (t.spool - lfilter(*_spool_filter(p[1], p[2], step_s), delayed)[FINE_FACTOR - 1 :: FINE_FACTOR])
+                / SPOOL_RESOLUTION
+            )
         return np.concatenate(out)
 
     best = min(
@@ -76,7 +79,7 @@ def _fit(tests: Sequence[SpoolTestRecord]) -> tuple[float, float, float]:
 
 
 def _spool_filter(omega: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """The spool as a digital filter."""
+    """The spool's second-order response as a digital filter (bilinear)."""
     k = 2.0 / step_s
     first = k * k + 2.0 * zeta * omega * k + omega * omega
     b = np.array([1.0, 2.0, 1.0]) * omega * omega / first
@@ -85,9 +88,10 @@ def _spool_filter(omega: float, zeta: float, step_s: float) -> tuple[np.ndarray,
 
 
 def response_s(test: SpoolTestRecord, deadband: float) -> float:
-    """From the command that leaves the dead-band to the joint's first motion in a staircase [s]; NaN if it never moves.
+    """Time from the command that leaves the dead-band to the joint's first motion in a staircase, s; NaN if it never
+    moves.
 
-    Motion is seen when the joint has gone `MOVED_SHARE` of what it goes in the first 0.3 s of steady motion.
+    The joint counts as moving once it has travelled `MOVED_SHARE` of its travel in the first 0.3 s of steady motion.
     """
     opened = np.flatnonzero(test.side * test.command > deadband)
     if not len(opened):

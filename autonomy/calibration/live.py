@@ -1,7 +1,7 @@
-"""The calibration on a machine that runs: sockets and bus around the pure procedure.
+"""The calibration on a running machine: sockets and bus around the pure procedure.
 
-It listens on the crane's bus and never sends there; what moves the machine are setpoint datagrams to the controller,
-which judges them like any planner's.  One thread, no waiting but for the next turn.
+It listens on the crane's bus and never sends there.  The machine moves by setpoint datagrams to the controller, which
+checks them like any planner's.  One thread; it blocks only between ticks.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ Address = tuple[str, int]
 
 
 class SurveyAnswer(msgspec.Struct):
-    """A surveying instrument's answer, in the crane's base frame: the hanger pin [m], and the direction along which the
-    grapple opens [rad], where the instrument can tell it.
+    """A surveying instrument's answer in the crane's base frame: the hanger pin [m], and the direction along which the
+    grapple opens [rad] where the instrument can measure it.
     """
 
     pin_m: tuple[float, float, float]
@@ -39,7 +39,7 @@ class SurveyAnswer(msgspec.Struct):
 
 
 class SurveyInstrument:
-    """Asks a surveying instrument over UDP: one question under way at a time."""
+    """A surveying instrument over UDP, with one request under way at a time."""
 
     def __init__(self, address: Address) -> None:
         self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -48,12 +48,12 @@ class SurveyInstrument:
         self._asked_ns = 0
 
     def read(self, now_ns: int) -> Point | None:
-        """Where the newest answer has the pin, or None; asks ten times a second."""
+        """The pin of the newest answer, or None; requests ten times a second."""
         found = self._newest(now_ns)
         return None if found is None else found.pin_m
 
     def read_yaw(self, now_ns: int) -> float | None:
-        """The direction of the newest answer, NaN when the instrument tells none, or None; asks as often."""
+        """The direction of the newest answer, NaN where it has none, or None; requests as often."""
         found = self._newest(now_ns)
         return None if found is None else nan if found.yaw_rad is None else found.yaw_rad
 
@@ -73,12 +73,12 @@ class SurveyInstrument:
         return found
 
     def close(self) -> None:
-        """Gives the port back."""
+        """Close the socket."""
         self._link.close()
 
 
 class Surveyor(Protocol):
-    """Whoever reads the hanger pin and the grapple's direction, as `SurveyInstrument` does; None: nothing yet."""
+    """A source of the hanger pin and the grapple's direction, like `SurveyInstrument`; None: nothing yet."""
 
     def read(self, now_ns: int) -> Point | None:
         """The pin, base frame, m."""
@@ -88,7 +88,7 @@ class Surveyor(Protocol):
 
 
 class ControllerLink:
-    """Reports in, datagrams out; ``foreign`` when the controller means another profile."""
+    """Receives reports and sends datagrams; ``foreign``: the controller runs another profile."""
 
     def __init__(self, controller: Address, report_port: int, profile_hash: int, key: bytes | None) -> None:
         self.foreign = False
@@ -98,11 +98,11 @@ class ControllerLink:
         self._socket.setblocking(False)
 
     def wait(self, seconds: float) -> None:
-        """Until something came, or for a moment."""
+        """Wait until a report arrives, at most ``seconds``."""
         select.select([self._socket], [], [], seconds)
 
     def newest(self) -> StateReport | None:
-        """The newest report that has come since the last call."""
+        """The newest report that arrived since the last call."""
         newest = None
         while True:
             try:
@@ -118,17 +118,17 @@ class ControllerLink:
                     newest = message
 
     def send(self, data: bytes) -> None:
-        """To the controller; one that nobody hears is followed by the next."""
+        """Send to the controller; a lost datagram is followed by the next."""
         with suppress(ConnectionRefusedError, BlockingIOError):
             self._socket.sendto(data, self._controller)
 
     def close(self) -> None:
-        """Gives the port back."""
+        """Close the socket."""
         self._socket.close()
 
 
 def first_report(link: ControllerLink, within_s: float, ready: tuple[int, ...]) -> StateReport | None:
-    """The first report of a controller that could be armed; None when none comes in time."""
+    """The first report of a controller in a ``ready`` mode; None when none arrives in time."""
     end_ns = time.monotonic_ns() + int(within_s * 1e9)
     while time.monotonic_ns() < end_ns and not link.foreign:
         link.wait(POLL_S)
@@ -145,11 +145,11 @@ def run(
     surveyor: Surveyor | None,
     turn: Callable[[Calibration], None],
 ) -> None:
-    """Turns until the procedure is over; ``turn`` is called each time and may abort it."""
+    """Run ticks until the procedure is over; ``turn`` is called after each and may abort it."""
     frames: list[Frame] = []
     while not (calibration.idle or calibration.done):
         link.wait(POLL_S)
-        # A person may take minutes to read an instrument: the time of the turn is the time after it.
+        # A person may take minutes to read an instrument: take the tick's time afterwards.
         reading = yaw_rad = None
         if surveyor is not None and calibration.wants_reading:
             reading = surveyor.read(time.monotonic_ns())
@@ -163,5 +163,5 @@ def run(
             link.send(data)
         turn(calibration)
         if link.foreign:
-            calibration.abort("the controller runs another profile")
+            calibration.abort("the controller runs another profile", "calibration.other-profile")
             return

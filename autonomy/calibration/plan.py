@@ -1,7 +1,7 @@
-"""Where a machine is calibrated: which joint is tested from which pose, how far it goes, and what it stays clear of.
+"""Plan of a calibration: the pose and the range of each joint's tests, and what they stay clear of.
 
-Every pose of every test keeps the open grapple above ground, bunk and logs, and every joint away from its stops; a
-machine on which that cannot be done is refused with a sentence (`CalibrationImpossible`) before anything moves.
+Every pose of every test keeps the open grapple above ground, bunk and logs, and every joint away from its stops.
+Failure: ``CalibrationImpossible`` before anything moves.
 """
 
 from __future__ import annotations
@@ -14,27 +14,28 @@ from typing import Final
 
 import numpy as np
 
-from autonomy.calibration.spool_program import PULSES, staircase, sweep, predicted_travel
+from autonomy.calibration.spool_program import PULSES, predicted_travel, staircase, sweep
 from autonomy.calibration.survey import most_informative_poses
-from machine.joints import JOINTS, Joint
 from machine.geometry.kinematics import pin_position
+from machine.joints import JOINTS, Joint
 from machine.profile import JointSpec, Profile, joint
+from runtime.errors import CodedError
 
 RANGE_MARGIN: Final = 1.35
-"""A joint may go this much farther than its profile says: gains differ by a fifth, levers by a tenth."""
+"""A joint may travel this many times farther than its profile says: gains differ by a fifth, levers by a tenth."""
 BEGIN_SHARE: Final = 0.13
-"""Where in its stretch a joint's tests begin: what comes back may come further back than it went."""
+"""Where in their range a joint's tests begin: the way back may be longer than the way out."""
 STOP_MARGIN_SHARE, MIN_STOP_MARGIN = 0.03, 0.05
-"""What a test leaves free at either end of a range: a share of it, and at least so much [rad, m]."""
+"""Margin of a test at either end of a joint's range: a share of the range, and at least this much [rad, m]."""
 TIP_CLEARANCE_M: Final = 0.35
-"""Free height under the tips of the open grapple."""
+"""Free height below the tips of the open grapple."""
 MIN_REACH_M: Final = 2.0
 SURVEY_POSE_COUNT: Final = 6
 SURVEY_SLEW: Final = (-0.35, 0.0, 0.35)
 SURVEY_REACH: Final = (0.15, 0.85)
-"""Survey poses use this part of the free ranges: what lies further out takes long to reach and tells little more."""
+"""Part of the free ranges used by survey poses: what lies farther out takes long to reach and tells little more."""
 MAX_HEIGHT_ABOVE_CLEAR_M: Final = 5.0
-"""A pose is at most so much above the clear height: a boom that stands upright tells little and frightens people."""
+"""Greatest height of a pose above the clear height: an upright boom tells little and frightens people."""
 TESTED_JOINT_WEIGHT: Final = 6.0
 HEIGHT_WEIGHT: Final = 0.3
 TRAVEL_WEIGHT_1_S: Final = 0.03
@@ -42,26 +43,26 @@ _GRID_COUNT: Final = 9
 _BOOM_JOINTS: Final = (Joint.LIFT, Joint.TILT, Joint.EXT)
 
 
-class CalibrationImpossible(ValueError):
-    """The machine cannot be calibrated here; the text says which joint has no room and what to do."""
+class CalibrationImpossible(CodedError, ValueError):
+    """The machine cannot be calibrated here; the sentence says which joint lacks room and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointPlan:
-    """The tests of one joint: the pose they begin from, and the stretch that they may use [rad, m]."""
+    """The tests of one joint: their start pose, and the range that they may use [rad, m]."""
 
     joint: Joint
     pose: tuple[float, ...]
     low: float
     high: float
     fastest: float
-    """Greatest speed that is asked for [rad/s, m/s]."""
+    """Greatest speed of the tests [rad/s, m/s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationPlan:
-    """All tests in their order; ``skipped`` are the joints without an encoder, ``turned`` is the one of them that is
-    tested by the surveyor's readings.
+    """All tests in order.  ``skipped`` are the joints without an encoder; ``turned`` is the one of them that is tested
+    by surveyed directions.
     """
 
     joints: tuple[JointPlan, ...]
@@ -72,25 +73,31 @@ class CalibrationPlan:
 
 
 def free_range(spec: JointSpec) -> tuple[float, float]:
-    """What tests may use of a joint's range."""
+    """The part of a joint's range that tests may use."""
     margin = max(STOP_MARGIN_SHARE * (spec.upper - spec.lower), MIN_STOP_MARGIN)
     return spec.lower + margin, spec.upper - margin
 
 
 def clear_height_m(profile: Profile) -> float:
-    """Lowest hanger pin at which the open grapple passes over everything."""
+    """Lowest height of the hanger pin at which the open grapple passes over everything, m."""
     top = max(profile.workspace.ground_z_m, profile.bunk.floor_z_m + profile.bunk.stake_height_m)
     return top + max(profile.grapple.tongs.tip_below_pin_m) + TIP_CLEARANCE_M
 
 
-def test_range(spec: JointSpec) -> float:
-    """How far the tests of one side go at most [rad, m]."""
-    ways = [abs(predicted_travel(program(spec, side), spec, side)) for program in (sweep, staircase) for side in (1, -1)]
+def required_range(spec: JointSpec) -> float:
+    """Greatest travel of the tests of both sides [rad, m]."""
+    ways = [
+        abs(predicted_travel(program(spec, side), spec, side)) for program in (sweep, staircase) for side in (1, -1)
+    ]
     return RANGE_MARGIN * (max(ways[:2]) + max(ways[2:]))
 
 
 def make_plan(profile: Profile, position: Sequence[float], surveyed: bool) -> CalibrationPlan:
-    """The plan from where the crane stands (``Joint`` order, NaN without an encoder); raises NoRoom."""
+    """The plan from the present joints (``Joint`` order, NaN without an encoder).
+
+    Raises:
+        CalibrationImpossible: a joint has too little room.
+    """
     here = [0.0 if np.isnan(p) else float(p) for p in position]
     clear = clear_height_m(profile)
     sensed = [j for j in JOINTS if joint(profile, j).encoder is not None]
@@ -115,34 +122,36 @@ def _is_clear(profile: Profile, q: Sequence[float], clear_m: float) -> bool:
 def _joint_plan(profile: Profile, which: Joint, before: Sequence[float], slew: float, clear_m: float) -> JointPlan:
     spec = joint(profile, which)
     low, high = free_range(spec)
-    way = test_range(spec)
+    needed = required_range(spec)
     name = which.name.lower()
-    if way > high - low:
+    if needed > high - low:
         raise CalibrationImpossible(
-            f"the {name} has {high - low:.2f} of free range, its tests may need {way:.2f}; lower its speed_limit or "
-            "correct full_speed in the profile"
+            "calibration.range-too-short",
+            f"the {name} has {high - low:.2f} of free range, its tests may need {needed:.2f}; lower its speed_limit or "
+            "correct full_speed in the profile",
         )
     best: tuple[float, tuple[float, ...], float] | None = None
     for boom in product(*_grids(profile)):
         q = [slew, *boom, 0.0]
         middle = 0.5 * (low + high) if which is Joint.ROT else q[which]
-        start = min(max(middle - 0.5 * way, low), high - way)
-        stretch = [_with(q, which, start + share * way) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+        start = min(max(middle - 0.5 * needed, low), high - needed)
+        stretch = [_with(q, which, start + share * needed) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
         if all(_is_clear(profile, s, clear_m) for s in stretch):
             cost = _cost(profile, which, stretch[2]) + TRAVEL_WEIGHT_1_S * _travel_time_s(profile, before, stretch[0])
             if best is None or cost < best[0]:
-                best = (cost, tuple(_with(q, which, start + BEGIN_SHARE * way)), start)
+                best = (cost, tuple(_with(q, which, start + BEGIN_SHARE * needed)), start)
     if best is None:
         raise CalibrationImpossible(
-            f"no pose leaves the {name} {way:.2f} of free way with the grapple {TIP_CLEARANCE_M} m clear of ground and bunk; "
-            "check [workspace], [bunk] and the joint limits in the profile"
+            "calibration.no-clear-pose",
+            f"no pose leaves the {name} {needed:.2f} of free travel with the grapple {TIP_CLEARANCE_M} m clear of "
+            "ground and bunk; check [workspace], [bunk] and the joint limits in the profile",
         )
-    return JointPlan(which, best[1], best[2], best[2] + way, 0.8 * spec.speed_limit)
+    return JointPlan(which, best[1], best[2], best[2] + needed, 0.8 * spec.speed_limit)
 
 
 def _cost(profile: Profile, which: Joint, q: Sequence[float]) -> float:
-    """A slewing crane is to be short and low, so that it rings fast; else the tested joint is to stand in the middle of
-    its range, where a cylinder's lever changes least, and the others near the middle of theirs.
+    """Cost of a test pose.  A slewing crane should be short and low, so that it rings fast; otherwise the tested joint
+    should be in the middle of its range, where a cylinder's lever changes least, and the others near the middle.
     """
     off = 0.0
     for j in _BOOM_JOINTS:
@@ -156,7 +165,7 @@ def _cost(profile: Profile, which: Joint, q: Sequence[float]) -> float:
 
 
 def _travel_time_s(profile: Profile, start: Sequence[float], goal: Sequence[float]) -> float:
-    """How long the slowest joint needs from pose to pose."""
+    """Duration of a move at the speed limit of the slowest joint, s."""
     return max(abs(goal[j] - start[j]) / joint(profile, j).speed_limit for j in JOINTS)
 
 
@@ -167,20 +176,21 @@ def _with(q: Sequence[float], which: Joint, value: float) -> list[float]:
 
 
 def _survey_poses(profile: Profile, here: Sequence[float], clear_m: float) -> tuple[tuple[float, ...], ...]:
-    """Poses that tell offsets and lean apart, in the order of the shortest way."""
+    """Poses that separate offsets from lean, in the fastest order."""
     slew_low, slew_high = free_range(joint(profile, Joint.SLEW))
     slews = sorted({min(max(here[Joint.SLEW] + d, slew_low), slew_high) for d in SURVEY_SLEW})
     grids = []
     for j in _BOOM_JOINTS:
         low, high = free_range(joint(profile, j))
-        grids.append(np.linspace(*(low + share * (high - low) for share in SURVEY_REACH), 5).tolist())
+        begin, end = (low + share * (high - low) for share in SURVEY_REACH)
+        grids.append(np.linspace(begin, end, 5).tolist())
     candidates = [q for s, *boom in product(slews, *grids) if _is_clear(profile, q := [s, *boom, 0.0], clear_m)]
     chosen = [candidates[i] for i in most_informative_poses(profile.kinematics, candidates, SURVEY_POSE_COUNT)]
     return tuple(_shortest_order(profile, chosen))
 
 
-def _shortest_order(profile: Profile, poses: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
-    """The poses in the order that takes least time, counted by the slowest joint of every leg."""
+def _shortest_order(profile: Profile, poses: Sequence[list[float]]) -> list[tuple[float, ...]]:
+    """The poses in the order with the least total travel time."""
 
     def time_s(order: Sequence[Sequence[float]]) -> float:
         return sum(_travel_time_s(profile, p, q) for p, q in pairwise(order))
@@ -189,7 +199,7 @@ def _shortest_order(profile: Profile, poses: Sequence[Sequence[float]]) -> list[
 
 
 def plan_summary(profile: Profile, plan: CalibrationPlan) -> list[str]:
-    """What will move and how far, a line per test, for the person who says yes."""
+    """What will move and how far, a line per test, for the person who confirms."""
     lines = []
     for p in plan.joints:
         unit = "m" if p.joint is Joint.EXT else "rad"

@@ -1,13 +1,13 @@
-"""The calibration run as a pure step machine: reports and bus frames in, setpoints out, a list of tests at the end.
+"""The calibration as a pure state machine: reports and bus frames in, setpoints out, a list of test records at the end.
 
-``Calibration.step(now_ns, report, frames, survey)`` returns the datagram to send now, or None.  It waits until a human
-has armed, wiggles every joint a little to see that it moves the right way, then takes joint after joint to its pose by
-an ordinary trajectory and runs its slow sweep and its staircase on either side by spool tests, closes and opens the
-grapple, and stands at the survey's poses.  A rotator without an encoder turns there and back at the last of them,
-while the surveyor reads the grapple's direction at every rest.  One function moves at a time.
+``Calibration.step`` returns the datagram to send now, or None.  The procedure waits until a person has armed, wiggles
+every joint to see that it moves the right way, then takes joint after joint to its pose by an ordinary trajectory and
+runs its slow sweep and its staircase on either side as spool tests.  It closes and opens the grapple, and stands at
+the survey poses.  A rotator without an encoder turns there and back at the last of them, while the surveyor reads the
+grapple's direction at every rest.  One function moves at a time.
 
-It never insists: a stop, a refusal, a joint that moves the wrong way or not at all, or too little room ends the run
-with a sentence in ``failure``; ``abort`` closes the valve and ends it.  Nothing goes on after that.
+Failure: a stop, a refusal, a joint that moves the wrong way or not at all, or too little room ends the run with a
+sentence in ``failure``; ``abort`` closes the valve and ends it.  A run that has ended does not continue.
 """
 
 from __future__ import annotations
@@ -16,114 +16,59 @@ from collections.abc import Sequence
 from math import isfinite, isnan
 from typing import Final
 
-from autonomy.calibration.plan import BEGIN_SHARE, CalibrationPlan
-from autonomy.calibration.spool_run import LEAD_S, TAIL_S, SpoolRun, MonitoredSpoolRun, program_for
+from autonomy.calibration.plan import BEGIN_SHARE
+from autonomy.calibration.procedure_state import CalibrationState
+from autonomy.calibration.spool_run import LEAD_S, TAIL_S, MonitoredSpoolRun, SpoolRun, program_for
 from autonomy.calibration.survey import SurveyReading
-from autonomy.calibration.tasks import YawReadingTask, Findings, GrappleTask, PinReadingTask, PulseTask, SpoolTask, Task, MoveTask, build_tasks
-from autonomy.calibration.trace import BusTrace
-from autonomy.calibration.rotator_turns import RotatorTurns
-from autonomy.motion.arm import Arm
-from autonomy.motion.setpoint_stream import SetpointStream
-from autonomy.motion.trajectory import Trajectory, joint_motion, hold
-from can_dbc.dbc.codec import Database
+from autonomy.calibration.tasks import (
+    GrappleTask,
+    MoveTask,
+    PinReadingTask,
+    PulseTask,
+    SpoolTask,
+    Task,
+    YawReadingTask,
+)
+from autonomy.motion.trajectory import hold, joint_motion
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import GrappleCommand, StateReport
-from machine.status.faults import describe
-from machine.joints import JOINTS, Joint
 from machine.geometry.kinematics import Point
+from machine.joints import JOINTS, Joint
+from machine.profile import JointSpec, joint
+from machine.status.faults import describe
 from machine.status.modes import Mode
-from machine.profile import JointSpec, Profile, joint
+from runtime.errors import Problem
 
 SETTLE_S: Final = 0.4
 SURVEY_SETTLE_S: Final = 1.5
 YAW_SETTLE_S: Final = 0.4
-"""The grapple rests soon after a turn: nothing but its rotator has moved."""
-READING_COUNT: Final = 8
+"""The grapple settles soon after a turn: nothing but its rotator has moved."""
 READING_PERIOD_NS: Final = 100_000_000
 REPORT_TIMEOUT_NS: Final = 300_000_000
 GRAPPLE_TIMEOUT_S: Final = 12.0
 MIN_GRAPPLE_S, UNSENSED_EXTRA_S = 0.5, 1.0
 ARRIVAL_TOLERANCE: Final = (0.02, 0.02, 0.03, 0.03, 0.08)
 EXPECTED_PULSE_S: Final = 2.0
-"""About how long a pulse takes."""
+"""Approximate duration of a pulse."""
 _TIMEOUT_FACTOR: Final = 2.0
 _TIMEOUT_EXTRA_S: Final = 20.0
-"""A joint whose dead-band is not known yet may have to be inched to where it is sent."""
+"""Extra time, as a joint whose dead-band is unknown may have to inch to its goal."""
 _BRAKE_S: Final = 0.8
 _STATE_OPEN, _STATE_CLOSED_EMPTY, _STATE_HOLDING = 1, 4, 5  # GrappleStat.State
 _MAX_TICK_S: Final = 0.1
 
 
-class Calibration:
-    """One run.  ``task`` is what it does now (None before and after), ``failure`` why it ended early, ``done`` that it
-    is complete; ``wants_reading`` asks the surveyor for the pin's position now, ``wants_yaw`` for the direction along
-    which the grapple opens.
+class Calibration(CalibrationState):
+    """One run.
+
+    ``task`` is the present task (None before and after), ``failure`` why the run ended early and ``failure_code`` its
+    code, ``done`` whether it is complete.  ``wants_reading`` requests the pin's position from the surveyor now,
+    ``wants_yaw`` the direction along which the grapple opens.
     """
 
-    def __init__(
-        self,
-        profile: Profile,
-        profile_hash: int,
-        plan: CalibrationPlan,
-        database: Database,
-        lease_ns: int = 200_000_000,
-        key: bytes | None = None,
-        asked_readings: int = READING_COUNT,
-    ) -> None:
-        self.trace = BusTrace(profile, database)
-        self.found = Findings()
-        self.failure: str | None = None
-        self.waiting: str | None = "the controller has not reported"
-        self.idle = False
-        self.wants_reading = self.wants_yaw = False
-        self.begun_ns: int | None = None
-        self.elapsed_s = 0.0
-        self._profile, self._plan = profile, plan
-        self._plans = {p.joint: p for p in plan.joints}
-        self._tasks = build_tasks(plan)
-        self._at = 0
-        self._arm = Arm(profile)
-        self._stream = SetpointStream(profile_hash, lease_ns, key)
-        self._readings = asked_readings
-        self._report: StateReport | None = None
-        self._report_ns = 0
-        self._refused: int | None = None
-        self._task_ns = 0
-        self._last_ns: int | None = None
-        self._entered = False
-        self._motion: Trajectory = hold((0.0,) * len(JOINTS))
-        self._clock_s = 0.0
-        self._rate = 1.0
-        self._spool: SpoolRun | None = None
-        self._turning = RotatorTurns(joint(profile, Joint.ROT), self.found.turns)
-        self._points: list[Point] = []
-        self._point_ns = 0
-        self._poses: list[tuple[float, ...]] = []
-        self._at_end = False
-
-    @property
-    def done(self) -> bool:
-        """Whether every task is done."""
-        return self._at >= len(self._tasks) and self.failure is None
-
-    @property
-    def task(self) -> Task | None:
-        """What is being done."""
-        return self._tasks[self._at] if self.begun_ns is not None and self._at < len(self._tasks) else None
-
-    @property
-    def progress(self) -> tuple[int, int]:
-        """Tasks done, and all."""
-        return self._at, len(self._tasks)
-
     def remaining_s(self) -> float:
-        """How long the rest should take."""
+        """Expected duration of the rest, s."""
         return sum(self._expected_s(task) for task in self._tasks[self._at :])
-
-    def abort(self, reason: str) -> None:
-        """Ends the run: a spool test closes its valve, a motion brakes on its path."""
-        if self.failure is None and not self.done:
-            self.failure = reason
 
     def step(
         self,
@@ -133,10 +78,10 @@ class Calibration:
         survey: Point | None = None,
         yaw_rad: float | None = None,
     ) -> bytes | None:
-        """One turn (20 Hz or faster): the datagram to send now, or None.
+        """Execute one tick (20 Hz or faster) and return the datagram to send now, or None.
 
-        ``survey`` and ``yaw_rad`` are the surveyor's answers, base frame, m and rad modulo pi; NaN: no direction can be
-        read, and the rotator is not tested.
+        ``survey`` and ``yaw_rad`` are the surveyor's answers, base frame, m and rad modulo pi; NaN: the direction
+        cannot be read, and the rotator is not tested.
         """
         self.trace.accept(frames)
         dt_s = min((now_ns - (self._last_ns or now_ns)) * 1e-9, _MAX_TICK_S)
@@ -145,16 +90,16 @@ class Calibration:
             self._report, self._report_ns = report, now_ns
         if self.idle:
             return None
-        obstacle = self._blocked_reason(now_ns)
-        if obstacle is not None:
-            self._interrupt(obstacle)
+        blocked = self._blocked_reason(now_ns)
+        if blocked is not None:
+            self._interrupt(blocked)
             return None
-        self.waiting = None
+        self._waiting = None
         if self.begun_ns is None:
             self.begun_ns = now_ns
         self.elapsed_s = (now_ns - self.begun_ns) * 1e-9
         self._check_refusals()
-        if self.failure is not None:
+        if self._failure is not None:
             return self._brake(now_ns, dt_s)
         if self.done:
             self.idle = True
@@ -163,34 +108,37 @@ class Calibration:
             self._enter(now_ns)
         return self._run_task(now_ns, dt_s, survey, yaw_rad)
 
-    def _blocked_reason(self, now_ns: int) -> str | None:
+    def _blocked_reason(self, now_ns: int) -> Problem | None:
         report = self._report
         if report is None:
-            return "the controller has not reported"
+            return Problem("calibration.no-report", "the controller has not reported")
         if now_ns - self._report_ns > REPORT_TIMEOUT_NS:
-            return "the controller is silent"
+            return Problem("calibration.controller-silent", "the controller is silent")
         if report.mode not in (Mode.ARMED, Mode.ACTIVE):
             name = next((mode.name for mode in Mode if mode == report.mode), str(report.mode))
             stopped = report.mode in (Mode.STOP, Mode.FAULT)
-            return f"the controller is in {name}: {describe(report.reason)}" if stopped else f"it is in {name}"
+            why = f": {describe(report.reason)}" if stopped else ""
+            return Problem("calibration.controller-mode", f"the controller is in {name}{why}")
         sensed = (p for j, p in zip(JOINTS, report.position, strict=True) if joint(self._profile, j).encoder)
-        return None if all(map(isfinite, sensed)) else "a joint position is unknown"
+        if all(map(isfinite, sensed)):
+            return None
+        return Problem("calibration.position-unknown", "a joint position is unknown")
 
-    def _interrupt(self, obstacle: str) -> None:
-        """Before the start it waits; a run that was interrupted is over, for nobody knows what moved meanwhile."""
-        self.waiting = obstacle
+    def _interrupt(self, blocked: Problem) -> None:
+        """Wait before the start; end a run that was interrupted, because anything may have moved since."""
+        self._waiting = blocked
         if self.begun_ns is not None:
-            self.failure = self.failure or obstacle
+            self._failure = self._failure or blocked
             self.idle = True
 
     def _check_refusals(self) -> None:
         assert self._report is not None
         before, self._refused = self._refused, self._report.refused
         if before is not None and self._report.refused != before:
-            self.abort(describe(self._report.refusal))
+            self.abort(describe(self._report.refusal), "calibration.setpoint-refused")
 
     def _position(self) -> tuple[float, ...]:
-        """The measured joints; one without an encoder stands where it was."""
+        """The measured joints; one without an encoder at 0."""
         assert self._report is not None
         return tuple(p if isfinite(p) else 0.0 for p in self._report.position)
 
@@ -213,7 +161,7 @@ class Calibration:
         return SURVEY_SETTLE_S + self._readings * READING_PERIOD_NS * 1e-9
 
     def _enter(self, now_ns: int) -> None:
-        """Begins the task."""
+        """Begin the task."""
         self._entered, self._task_ns = True, now_ns
         self._clock_s, self._rate = 0.0, 1.0
         task = self._tasks[self._at]
@@ -233,7 +181,7 @@ class Calibration:
                 self._points, self._poses, self._point_ns = [], [], 0
 
     def _check_room(self, task: SpoolTask, end: float) -> None:
-        """A test that might come to the end of the joint's range begins from farther away, or is not tried."""
+        """Move a test that might reach the end of the joint's range farther away, or end the run."""
         spec, plan = self._spec(task.joint), self._plans[task.joint]
         if task.kind == "wiggle" or spec.lower < end < spec.upper:
             return
@@ -243,7 +191,8 @@ class Calibration:
         start[task.joint] = plan.low + aside if task.side > 0 else plan.high - aside
         name = task.joint.name.lower()
         if abs(start[task.joint] - stands) < 3.0 * ARRIVAL_TOLERANCE[task.joint]:
-            self.abort(f"the {name} has no room for its {task.kind}: it would end at {end:.2f}, past its stop")
+            why = f"it would end at {end:.2f}, beyond its stop"
+            self.abort(f"the {name} has no room for its {task.kind}: {why}", "calibration.no-room")
             return
         self._tasks.insert(self._at, MoveTask(tuple(start), f"back for more room of the {name}"))
         self._enter(self._task_ns)
@@ -264,7 +213,7 @@ class Calibration:
                 if self._clock_s >= self._motion.duration_s + SETTLE_S and self._arrived():
                     self._next_task()
                 elif self._clock_s > _TIMEOUT_FACTOR * self._motion.duration_s + _TIMEOUT_EXTRA_S:
-                    self.abort(f"the crane did not come {task.why}")
+                    self.abort(f"the crane did not move {task.why}", "calibration.move-timeout")
                 return self._motion_datagram(now_ns, GrappleCommand.NEUTRAL)
             case GrappleTask():
                 self._run_grapple(task, time_s)
@@ -294,22 +243,22 @@ class Calibration:
         run, position = self._spool, self._position()[task.joint]
         run_s = time_s - LEAD_S
         if run_s >= 0.0 and not run.begun:
-            # However late this turn is, the program begins at its beginning.
+            # However late this tick is, the program starts from its beginning.
             run.begun, self._task_ns, run_s = True, now_ns - round(LEAD_S * 1e9), 0.0
         if wrong := run.follow(run_s, position, self._report.velocity[task.joint]):
-            self.abort(wrong)
+            self.abort(wrong.sentence, wrong.code)
             return None
         if run_s >= run.program.duration_s + TAIL_S:
             self._finish_spool(task, run.final_check(position), now_ns)
             return None
-        # A program that has just been changed is told at once, and its end always, however late this turn is.
+        # A changed program is sent at once, and its end always, however late this tick is.
         if run.is_silent(run_s) or not (self._stream.due(now_ns) or run.changed):
             return None
         return self._stream.spool(now_ns, task.joint, run.window(run_s))
 
-    def _finish_spool(self, task: SpoolTask | PulseTask, wrong: str | None, now_ns: int) -> None:
+    def _finish_spool(self, task: SpoolTask | PulseTask, wrong: Problem | None, now_ns: int) -> None:
         if wrong:
-            self.abort(wrong)
+            self.abort(wrong.sentence, wrong.code)
             return
         if isinstance(task, PulseTask):
             self._turning.pulse_finished(self.trace.test(task.joint, task.side, "pulse", self._task_ns, now_ns))
@@ -320,10 +269,10 @@ class Calibration:
         self._next_task()
 
     def _run_grapple(self, task: GrappleTask, time_s: float) -> None:
-        """Until the valve node says that the grapple is at its end; only a time from end to end counts.
+        """Wait until the valve node reports the end position; only a time from end to end counts.
 
-        A grapple without an opening sensor is opened for the profile's time and may fall short of its end: then its
-        opening time stays unknown, and so does the next closing time.
+        A grapple without an opening sensor opens for the profile's time and may stop short of its end: then its opening
+        time stays unknown, and so does the next closing time.
         """
         state = self.trace.grapple_state.values[-1] if self.trace.grapple_state.values else 0.0
         opens, grapple = task.command is GrappleCommand.OPEN, self._profile.grapple
@@ -336,7 +285,8 @@ class Calibration:
             self._at_end = False
             self._next_task()
         elif time_s > GRAPPLE_TIMEOUT_S:
-            self.abort(f"the grapple did not {task.command.name.lower()} within {GRAPPLE_TIMEOUT_S:.0f} s")
+            verb = task.command.name.lower()
+            self.abort(f"the grapple did not {verb} within {GRAPPLE_TIMEOUT_S:.0f} s", "calibration.grapple-timeout")
 
     def _run_pin_reading(self, task: PinReadingTask, time_s: float, now_ns: int, survey: Point | None) -> None:
         self.wants_reading = time_s >= SURVEY_SETTLE_S and now_ns >= self._point_ns
@@ -359,18 +309,18 @@ class Calibration:
         if yaw_rad is None or time_s < YAW_SETTLE_S:
             return
         if isnan(yaw_rad):
-            del self._tasks[self._at :]  # nothing but the rotator's turns is left
+            del self._tasks[self._at :]  # only the rotator's turns are left
             self.wants_yaw = False
             return
         self._point_ns = now_ns + READING_PERIOD_NS
         if self._turning.add_reading(yaw_rad, self._position()[Joint.SLEW]) >= self._readings:
             if wrong := self._turning.finish_rest():
-                self.abort(wrong)
+                self.abort(wrong.sentence, wrong.code)
                 return
             self._next_task()
 
     def _brake(self, now_ns: int, dt_s: float) -> bytes | None:
-        """The end of a run that failed: valve closed, or the motion slowed to a stand on its path."""
+        """End a failed run: close the valve, or brake the motion on its path."""
         task = self._tasks[self._at] if self._at < len(self._tasks) else None
         if isinstance(task, SpoolTask | PulseTask) and self._entered:
             run_s = (now_ns - self._task_ns) * 1e-9 - LEAD_S

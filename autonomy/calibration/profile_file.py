@@ -1,7 +1,7 @@
-"""The profile with what was found in it: a copy of the file, its comments kept, every changed value marked [cal].
+"""The calibrated profile: a copy of the file with its comments kept and every changed value marked [cal].
 
-The shipped file is never touched and an existing one never overwritten.  The copy is loaded and checked before it
-gets its name, so a profile that this release would refuse is never left behind.
+The shipped file stays untouched and an existing file is never overwritten.  The copy is loaded and checked before it
+gets its name, so no invalid profile is left behind.
 """
 
 from __future__ import annotations
@@ -14,30 +14,31 @@ from typing import Any, Final
 import tomlkit
 from tomlkit.items import Item
 
-from autonomy.calibration.result import JointResult, CalibrationResult
+from autonomy.calibration.result import CalibrationResult, JointResult
 from autonomy.calibration.survey import OFFSETS, SurveyFit
 from autonomy.calibration.turn_fit import TurnFit
 from can_dbc.messages.crane import GrappleCommand
 from machine.joints import Joint
-from machine.sensing.weighing import lever_share
 from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import JointSpec, Profile, joint
+from machine.sensing.weighing import lever_share
+from runtime.errors import CodedError
 
 SPEED_LIMIT_SHARE: Final = 0.9
-"""A joint that cannot reach its speed limit gets one at this share of what it can."""
+"""A joint that cannot reach its speed limit gets a limit at this share of what it reaches."""
 SIGNIFICANT_SAG_DIGITS: Final = 5
-"""Significant digits of a sag value."""
+"""Significant digits of a sag parameter."""
 COMMENT_COLUMN: Final = 40
 """Column of the comments, as in the shipped profiles."""
 Change = tuple[tuple[str, ...], Any, str]
 
 
-class ProfileNotWritten(ValueError):
-    """No profile was written; the text says why and what to do."""
+class ProfileNotWritten(CodedError, ValueError):
+    """No profile was written; the sentence says why and what to do."""
 
 
 def profile_changes(profile: Profile, result: CalibrationResult) -> list[Change]:
-    """What a calibration changes in its profile: key path, value, remark."""
+    """The changes of a calibration to its profile: key path, value, remark."""
     found: list[Change] = []
     for j, r in result.joints.items():
         found += _joint_changes(("joints", j.name.lower()), joint(profile, j), r)
@@ -52,7 +53,7 @@ def profile_changes(profile: Profile, result: CalibrationResult) -> list[Change]
 
 
 def _survey_changes(profile: Profile, survey: SurveyFit) -> list[Change]:
-    """Zeros and sag, all of them or none: they were fitted together, and one explains what another leaves."""
+    """Zeros and sag, all or none: they were fitted together and compensate each other."""
     found: list[Change] = []
     for j, offset in zip(OFFSETS, survey.offsets, strict=True):
         encoder = joint(profile, j).encoder
@@ -77,7 +78,7 @@ def _survey_changes(profile: Profile, survey: SurveyFit) -> list[Change]:
 
 def _joint_changes(path: tuple[str, ...], spec: JointSpec, r: JointResult) -> list[Change]:
     valve, unit = r.valve, "m" if r.joint is Joint.EXT else "rad"
-    # A profile's full speeds hold where the lever has its nominal arm; they were measured somewhere else.
+    # A profile's full speeds hold at the lever's nominal arm; they were measured elsewhere.
     arm = lever_share(spec.valve, valve.at)
     fulls = [arm * full for full in valve.full_speeds]
     where = f"measured at {r.joint.name.lower()} {valve.at:+.2f} {unit}"
@@ -123,10 +124,10 @@ def _limit_changes(path: tuple[str, ...], spec: JointSpec, fulls: Sequence[float
 
 
 def write_profile(source: Path, out: Path, changed: list[Change], date: str) -> None:
-    """Writes the calibrated copy of ``source``.
+    """Write the calibrated copy of ``source``.
 
     Raises:
-        NotWritten: ``out`` is there already, cannot be written, or would be no valid profile.
+        ProfileNotWritten: ``out`` exists, cannot be written, or would be no valid profile.
     """
     document = tomlkit.parse(source.read_text(encoding="utf-8"))
     for path, value, remark in changed:
@@ -142,13 +143,20 @@ def write_profile(source: Path, out: Path, changed: list[Change], date: str) -> 
         out.parent.mkdir(parents=True, exist_ok=True)
         scratch.write_text(text, encoding="utf-8")
         load_profile(scratch)
-        os.link(scratch, out)  # never over an existing file, whole or not at all
+        os.link(scratch, out)  # whole or not at all, and never over an existing file
     except ProfileError as error:
-        raise ProfileNotWritten(f"the calibrated profile would be refused: {error}") from None
+        raise ProfileNotWritten(
+            "calibration.profile-invalid", f"the calibrated profile would be refused: {error}"
+        ) from None
     except FileExistsError:
-        raise ProfileNotWritten(f"{out} exists and is not overwritten; choose another --out") from None
+        raise ProfileNotWritten(
+            "calibration.profile-exists", f"{out} exists and is not overwritten; choose another --out"
+        ) from None
     except OSError as error:
-        raise ProfileNotWritten(f"{out}: the profile cannot be written: {error.strerror}; choose another --out") from None
+        raise ProfileNotWritten(
+            "calibration.profile-unwritable",
+            f"{out}: the profile cannot be written: {error.strerror}; choose another --out",
+        ) from None
     finally:
         scratch.unlink(missing_ok=True)
 

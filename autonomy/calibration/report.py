@@ -1,4 +1,4 @@
-"""The report of a calibration: result.json and a page of pictures per joint, for the person who decides.
+"""The report of a calibration: result.json and a page of plots per joint, for the person who decides.
 
 Everything comes from the `CalibrationResult`; the same result gives the same files.
 """
@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from autonomy.calibration.profile_file import Change
-from autonomy.calibration.result import JointResult, CalibrationResult
+from autonomy.calibration.result import CalibrationResult, JointResult
 from autonomy.calibration.survey import OFFSETS
 from autonomy.calibration.turn_fit import TurnFit
 from machine.joints import Joint
@@ -23,7 +23,7 @@ SMALL_BELOW, SMALL_DECIMALS = 1e-3, 12
 
 
 def result_document(result: CalibrationResult, facts: dict[str, Any], changed: list[Change]) -> dict[str, Any]:
-    """Everything that was found, as plain data."""
+    """The whole result as plain data."""
     joints = {j.name.lower(): _joint(r) for j, r in result.joints.items()}
     survey = None
     if (s := result.survey) is not None:
@@ -38,7 +38,7 @@ def result_document(result: CalibrationResult, facts: dict[str, Any], changed: l
         {
             **facts,
             "plausible": not result.implausible,
-            "implausible": list(result.implausible),
+            "implausible": [problem.sentence for problem in result.implausible],
             "joints": joints,
             "grapple_s": {c.name.lower(): t for c, t in result.grapple_s.items()},
             "survey": survey,
@@ -82,7 +82,7 @@ def _rotator(turns: TurnFit) -> dict[str, Any]:
 
 
 def _rounded(value: Any) -> Any:
-    """Numbers to six decimals, small ones to twelve, so that a last bit does not show; what is no number is null."""
+    """Numbers rounded to six decimals, small ones to twelve, to hide last bits; non-finite numbers become null."""
     if isinstance(value, dict):
         return {k: _rounded(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -95,7 +95,7 @@ def _rounded(value: Any) -> Any:
 
 
 def write_report(folder: Path, result: CalibrationResult, facts: dict[str, Any], changed: list[Change]) -> None:
-    """``result.json``, ``JOINT.png`` for every joint and ``survey.png``."""
+    """Write ``result.json``, ``JOINT.png`` for every joint and ``survey.png``."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "result.json").write_text(json.dumps(result_document(result, facts, changed), indent=2) + "\n")
     for j, r in result.joints.items():
@@ -121,7 +121,8 @@ def _save(figure: Any, path: Path) -> None:
 
 
 def _draw_joint(path: Path, r: JointResult) -> None:
-    """Speed over spool with the fitted curve; sweep (dead-band and hysteresis); staircase; spool after its command."""
+    """Speed over spool with the fitted curve; sweeps (dead-band and hysteresis); staircases; spool after its
+    command."""
     unit = "m" if r.joint is Joint.EXT else "rad"
     figure, (curve, sweep, stairs, delay) = _figure(4)
     for test, modelled in zip(r.tests, r.valve.modelled, strict=True):
@@ -156,7 +157,7 @@ def _draw_joint(path: Path, r: JointResult) -> None:
 
 
 def _draw_survey(path: Path, result: CalibrationResult) -> None:
-    """What encoders and survey disagree about at every pose, before and after."""
+    """Distance between surveyed and computed pin at every pose, before and after the fit."""
     s = result.survey
     assert s is not None
     figure, axis = _figure(1)

@@ -1,7 +1,8 @@
-"""The turns of a joint without an encoder while they run: where it stands by what a surveyor saw, and what comes next.
+"""The turns of a rotator without an encoder during the procedure: its angle by the surveyor's readings, and the next
+pulse.
 
-Directions are of the grapple in the crane's base frame [rad], modulo pi; the slew's part is taken off.  Nothing here
-sends; the procedure runs the programs.
+Directions are those of the grapple in the crane's base frame [rad], modulo pi, without the slew.  Nothing here sends;
+the procedure runs the programs.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ from autonomy.calibration.tasks import PulseTask
 from autonomy.calibration.trace import SpoolTestRecord
 from autonomy.calibration.turn_fit import Turn, fit_turns, pulse_to
 from machine.profile import JointSpec
+from runtime.errors import Problem
 
 MIN_FIRST_TURN_RAD: Final = 0.1
-"""A first turn that is shorter was none: four times the noise of two single readings."""
+"""A shorter first turn counts as no motion: four times the noise of two single readings."""
 
 
 class RotatorTurns:
-    """``turns`` are those that are complete."""
+    """``turns`` holds the completed turns."""
 
     def __init__(self, spec: JointSpec, turns: list[Turn]) -> None:
         self.turns = turns
@@ -30,22 +32,22 @@ class RotatorTurns:
         self._before_rad: float | None = None
 
     def program(self, task: PulseTask) -> SpoolProgram:
-        """The pulse of a task by all that is known so far."""
+        """The pulse of a task by all turns so far."""
         return pulse_to(self._spec, fit_turns(self.turns, self._spec), task.side, task.share, task.to_rad)
 
     def pulse_finished(self, record: SpoolTestRecord) -> None:
-        """A pulse is over."""
+        """Record a pulse that has ended."""
         self._record = record
 
     def add_reading(self, yaw_rad: float, slew_rad: float) -> int:
-        """One reading of the direction at rest; returns how many there are here."""
+        """Add one reading of the direction at rest; returns how many there are at this rest."""
         direction = yaw_rad - slew_rad
         first = self._seen[0] if self._seen else direction
         self._seen.append(first + remainder(direction - first, pi))
         return len(self._seen)
 
-    def finish_rest(self) -> str | None:
-        """Enough was read here: completes the turn before; a sentence when it was none."""
+    def finish_rest(self) -> Problem | None:
+        """Complete the turn before this rest; returns the problem when it was no proper turn."""
         readings, direction = len(self._seen), sum(self._seen) / len(self._seen)
         record, before, self._before_rad = self._record, self._before_rad, direction
         self._seen = []
@@ -56,7 +58,9 @@ class RotatorTurns:
             return None
         name, turned = record.joint.name.lower(), record.side * remainder(direction - before, pi)
         if turned < -MIN_FIRST_TURN_RAD:
-            return f"the {name} moves the wrong way: check the sign of its valve in the profile"
+            why = "check the sign of its valve in the profile"
+            return Problem("calibration.wrong-direction", f"the {name} moves the wrong way: {why}")
         if turned < MIN_FIRST_TURN_RAD:
-            return f"the {name} does not move: check its valve and pump, or correct deadband in the profile"
+            why = "check its valve and pump, or correct deadband in the profile"
+            return Problem("calibration.no-motion", f"the {name} does not move: {why}")
         return None

@@ -1,8 +1,8 @@
-"""Spool programs of one function: straight lines over time, made for one question each.
+"""Spool programs of one valve function: piecewise linear commands over time, each for one question.
 
-Percent of full command, + moves the joint in its positive direction; time in s from the start of the program.  Every
-program begins and ends neutral, crosses the dead-band of the profile in a step (nothing moves there) and opens the
-valve by half the rate that the controller allows.
+Commands in percent of full command, + moves the joint in its positive direction; time in s from the program's start.
+Every program begins and ends neutral, crosses the dead-band of the profile in a step (nothing moves there) and opens
+the valve at half the rate that the controller allows.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from can_dbc.messages.crane import MAX_KNOTS, SpoolKnot
 from machine.profile import JointSpec
 
 OPENING_FACTOR: Final = 2.0
-"""The opening grows this many times faster than the acceleration limit; the controller allows four."""
+"""The opening grows this many times faster than the acceleration limit; the controller allows four times."""
 END_GUARD_S: Final = 0.001
-"""So short before its end a program is over: every program ends neutral."""
+"""A program is over this long before its end: every program ends neutral."""
 STEP_S: Final = 0.005
 """A step inside the dead-band takes one control period."""
 BELOW_DEADBAND_PCT: Final = 4.0
-"""How far under the profile's dead-band a slow program begins: a valve may open this much earlier than assumed."""
+"""How far below the profile's dead-band a slow program begins: a valve may open this much earlier."""
 WIGGLE_PCT_S, WIGGLE_ABOVE_PCT = 14.0, 20.0
 SWEEP_PCT_S, SWEEP_ABOVE_PCT = 7.0, 16.0
 STAIRCASE_SPEED_SHARES: Final = (0.3, 0.55, 0.8)
-"""Steady speeds of the staircase, as shares of the speed limit by the profile's valve map."""
+"""Steady speeds of the staircase, as shares of the speed limit, by the profile's valve map."""
 HOLD_S: Final = 0.9
 PULSE_OPENING_FACTOR: Final = 0.5
-"""A pulse opens and shuts as gently as the planner's motions do: one that jerks loses 0.05 s of its way to the pump."""
+"""A pulse opens and closes as gently as the planner's motions: an abrupt one loses 0.05 s of its travel to the pump."""
 PULSES: Final = ((0.12, 0.4), (0.35, 0.9), (0.7, 1.6))
-"""A rotator without an encoder turns there and back at these shares of its speed limit, so far [rad]: the slow turns
-tell the dead-band, and each is short enough that those before it tell its half turns.
+"""Turns of a rotator without an encoder, there and back: share of its speed limit and angle [rad].  The slow turns
+reveal the dead-band, and each is short enough for the earlier ones to resolve its half turns.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class SpoolProgram:
-    """Corner points (time [s], command [%]) with straight lines between; neutral before the first and past the last."""
+    """Corner points (time [s], command [%]) joined by straight lines; neutral before the first and after the last."""
 
     points: tuple[tuple[float, float], ...]
 
     @property
     def duration_s(self) -> float:
-        """When it is over."""
+        """Time of its end."""
         return self.points[-1][0]
 
     def at(self, time_s: float) -> float:
@@ -58,7 +58,7 @@ class SpoolProgram:
         return 0.0
 
     def window(self, time_s: float, horizon_s: float) -> tuple[SpoolKnot, ...]:
-        """Knots of the stretch from ``time_s`` on; at its end the program has more to say or is neutral."""
+        """Knots from ``time_s`` on; at the end of the window the program continues or is neutral."""
         if time_s > self.duration_s - END_GUARD_S:
             return (SpoolKnot(0, 0.0),)
         end_s = min(time_s + horizon_s, self.duration_s)
@@ -72,7 +72,7 @@ class SpoolProgram:
         return tuple(knots)
 
     def closing(self, time_s: float, closing_s: float) -> SpoolProgram:
-        """The way out: from the command at ``time_s`` straight to neutral."""
+        """A program that goes straight to neutral from the command at ``time_s``."""
         return SpoolProgram(((time_s, self.at(time_s)), (time_s + closing_s, 0.0)))
 
 
@@ -89,7 +89,7 @@ def command_for(spec: JointSpec, side: int, speed: float) -> float:
 
 
 def _ramp(spec: JointSpec, side: int, rate_pct_s: float, over_pct: float, back: bool) -> SpoolProgram:
-    """Up through the edge of the dead-band at a steady rate, to ``over_pct`` past it, and down again or shut."""
+    """Up through the edge of the dead-band at a steady rate, to ``over_pct`` beyond it, and back or closed."""
     low = max(0.0, deadband_pct(spec, side) - BELOW_DEADBAND_PCT)
     top = deadband_pct(spec, side) + over_pct
     up_s = (top - low) / rate_pct_s
@@ -101,7 +101,7 @@ def _ramp(spec: JointSpec, side: int, rate_pct_s: float, over_pct: float, back: 
 
 
 def wiggle(spec: JointSpec, side: int) -> SpoolProgram:
-    """Open until something moves; it is broken off as soon as something does."""
+    """Open slowly until the joint moves; the run ends the program then."""
     return _ramp(spec, side, WIGGLE_PCT_S, WIGGLE_ABOVE_PCT, back=False)
 
 
@@ -111,7 +111,7 @@ def sweep(spec: JointSpec, side: int) -> SpoolProgram:
 
 
 def reversed_sweep(program: SpoolProgram, time_s: float) -> SpoolProgram:
-    """A sweep that turns at ``time_s`` instead of at its top."""
+    """A sweep that reverses at ``time_s`` instead of at its top."""
     (t0, p0), (t1, p1), (_, _), (_, _), _ = program.points
     top = program.at(time_s)
     end_s = time_s + (time_s - t1)
@@ -119,12 +119,12 @@ def reversed_sweep(program: SpoolProgram, time_s: float) -> SpoolProgram:
 
 
 def staircase(spec: JointSpec, side: int) -> SpoolProgram:
-    """Three steady speeds, each long enough for the oil to come to rest, and shut."""
+    """Three steady speeds, each long enough for the oil to settle, then closed."""
     return _staircase(spec, side, STAIRCASE_SPEED_SHARES, HOLD_S, OPENING_FACTOR)
 
 
 def pulse(spec: JointSpec, side: int, share: float, hold_s: float) -> SpoolProgram:
-    """One steady speed, by the profile's valve map a ``share`` of the speed limit, for so long, and shut."""
+    """One steady speed for ``hold_s``, a ``share`` of the speed limit by the profile's valve map, then closed."""
     return _staircase(spec, side, (share,), hold_s, PULSE_OPENING_FACTOR)
 
 
@@ -145,7 +145,7 @@ def _staircase(spec: JointSpec, side: int, shares: Sequence[float], hold_s: floa
 
 
 def predicted_travel(program: SpoolProgram, spec: JointSpec, side: int) -> float:
-    """How far the profile's valve map says that the joint goes [rad, m], with its sign."""
+    """Travel of the joint by the profile's valve map [rad, m], with its sign."""
     full = spec.valve.full_speed_plus if side > 0 else spec.valve.full_speed_minus
     deadband = deadband_pct(spec, side)
     way, step_s = 0.0, 0.01

@@ -1,16 +1,17 @@
-"""Zero offsets of the encoders and the column's give, from surveyed positions of the hanger pin.
+"""Zero offsets of the encoders and compliance of the column, from surveyed positions of the hanger pin.
 
-A surveying instrument shows where the pin is; the encoders say where it should be; the lift cylinder's pressures say
-what the crane weighs there.  One least-squares fit explains all of it: the zero of slew, lift, tilt and telescope, and
+A surveying instrument measures the pin; the encoders give its computed position; the pressures of the lift cylinder
+give the moment of the crane's weight.  One least-squares fit determines the zeros of slew, lift, tilt and telescope,
+and
 
     moment at the lift joint [Nm] = head * (r_head - a1) + pin * (r_pin - a1)
     lean of the column [rad]      = give * (head * r_head + pin * r_pin) - rest
 
 with r_head and r_pin the horizontal distances of stick pin and hanger pin from the slew axis: the weights of boom,
-stick and grapple act there, and the same weights bend the column.  A column that leans and a boom whose zero is off
-look nearly alike; the moments tell how the lean grows with the reach, and the give [rad/Nm] is what a load will bend.
-Without pressures head and pin of the lean are fitted by themselves, and nothing is known of loads.  The column's give
-to the side (roll) shows only under a load off the crane's plane: an empty grapple cannot tell it.
+stick and grapple act there, and the same weights bend the column.  A leaning column and a boom with a zero offset
+look nearly alike; the moments separate them, and the compliance ``give`` [rad/Nm] predicts the lean under a load.
+Without pressures, head and pin of the lean are fitted directly, and the effect of loads stays unknown.  The column's
+compliance to the side (roll) shows only under a load off the crane's plane: an empty grapple cannot reveal it.
 """
 
 from __future__ import annotations
@@ -23,35 +24,40 @@ from typing import Final
 import numpy as np
 from scipy.optimize import least_squares
 
-from machine.joints import N_JOINTS, Joint
 from machine.geometry.kinematics import Point
-from machine.sensing.weighing import empty_moment_nm
-from machine.profile import Kinematics, Sag
 from machine.geometry.sag import true_pin
+from machine.joints import N_JOINTS, Joint
+from machine.profile import Kinematics, Sag
+from machine.sensing.weighing import empty_moment_nm
+from runtime.errors import CodedError
 
 OFFSETS: Final = (Joint.SLEW, Joint.LIFT, Joint.TILT, Joint.EXT)
 PIN_SIGMA_M: Final = 0.002
-"""Of one surveyed position; several readings at one pose are averaged by the caller."""
+"""Standard deviation of one surveyed position; the caller averages several readings at one pose."""
 OFFSET_SIGMA: Final = (0.07, 0.02, 0.02, 0.02)
-"""How far off an encoder's zero is on a machine that nobody has surveyed [rad, m] (docs/reference/machines.md sections 1.6 and 14)."""
+"""Zero offsets of an unsurveyed machine [rad, m] (docs/reference/machines.md sections 1.6 and 14)."""
 LEAN_SIGMA: Final = 0.01
-"""Of each of the two lean terms [rad/m]: 0.1 m of sag at full reach."""
+"""Standard deviation of each of the two lean terms [rad/m]: 0.1 m of sag at full reach."""
 REST_SIGMA: Final = 0.05
 MOMENT_SIGMA_NM: Final = 600.0
-"""Of one moment by pressures: a cylinder at rest holds up to its friction either way."""
+"""Standard deviation of one moment by pressures: a resting cylinder holds up to its friction either way."""
 WEIGHT_SIGMA_N: Final = 2e4
-"""Of each of the two terms of the moment: two tons at either pin."""
+"""Standard deviation of each of the two terms of the moment: two tons at either pin."""
 USUAL_COMPLIANCE_RAD_NM: Final = 1e-6
-"""A usual column's give, and how far others are from it."""
+"""Compliance of a usual column, and its standard deviation."""
 USUAL_PARAMETERS: Final = (1.0, 0.01, 6e3, 8e3)
-"""Give, rest, head and pin of a usual crane, where the poses of a survey are chosen."""
+"""Compliance, rest, head and pin of a usual crane, for choosing the poses of a survey."""
 MIN_POSES: Final = 5
+
+
+class SurveyError(CodedError, ValueError):
+    """A survey that determines nothing; the sentence says why."""
 
 
 @dataclass(frozen=True, slots=True)
 class SurveyReading:
-    """One pose: what the encoders say (``Joint`` order, rad and m), where the pin is (base frame, m), and the moment
-    that the lift cylinder's pressures show [Nm], NaN without pressure sensors.
+    """One pose: the encoders' positions (``Joint`` order, rad and m), the surveyed pin (base frame, m), and the
+    moment by the lift cylinder's pressures [Nm], NaN without pressure sensors.
     """
 
     position: tuple[float, ...]
@@ -61,10 +67,10 @@ class SurveyReading:
 
 @dataclass(frozen=True, slots=True)
 class SurveyFit:
-    """What to subtract from the encoders (`OFFSETS` order: rad, rad, rad, m) and the crane's sag.
+    """The offsets to subtract from the encoders (`OFFSETS` order: rad, rad, rad, m) and the crane's sag.
 
     ``errors`` are standard errors of the offsets.  ``before_m`` and ``after_m`` are the distances between surveyed and
-    computed pin at every pose, without and with the fit; ``moments_nm`` what is left of every moment, none without
+    computed pin at every pose, without and with the fit; ``moments_nm`` are the residuals of the moments, empty without
     pressures.
     """
 
@@ -79,8 +85,8 @@ class SurveyFit:
 def _sag(p: Sequence[float]) -> Sag:
     """The sag of the parameters after the offsets.
 
-    Three are the lean by itself: head, pin, rest.  Four tie it to the moment: give [`USUAL_COMPLIANCE_RAD_NM`], rest, head and pin
-    of the moment.
+    Three parameters are the lean itself: head, pin, rest.  Four tie it to the moment: compliance
+    [`USUAL_COMPLIANCE_RAD_NM`], rest, and head and pin of the moment.
     """
     if len(p) == 3:
         return Sag(p[0], p[1], p[2])
@@ -96,13 +102,13 @@ def _corrected(position: Sequence[float], offsets: Sequence[float]) -> list[floa
 
 
 def _prior_sigma(weighed: bool) -> np.ndarray:
-    """How far the parameters may be from 0 on a machine that nobody has surveyed."""
+    """Standard deviations of the parameters on an unsurveyed machine."""
     lean = (1.0, REST_SIGMA, WEIGHT_SIGMA_N, WEIGHT_SIGMA_N) if weighed else (LEAN_SIGMA, LEAN_SIGMA, REST_SIGMA)
     return np.array([*OFFSET_SIGMA, *lean])
 
 
 def _misfit(kin: Kinematics, readings: Sequence[SurveyReading], p: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """What the parameters leave of pins (n, 3) [m] and moments [Nm]."""
+    """Residuals of the pins (n, 3) [m] and of the moments [Nm]."""
     sag, shown = _sag(p[4:]), [_corrected(r.position, p[:4]) for r in readings]
     pins = np.array([r.pin_m for r in readings]) - np.array([true_pin(sag, kin, q) for q in shown])
     moments = [r.moment_nm - empty_moment_nm(sag, kin, q) for r, q in zip(readings, shown, strict=True)]
@@ -110,12 +116,18 @@ def _misfit(kin: Kinematics, readings: Sequence[SurveyReading], p: Sequence[floa
 
 
 def fit_survey(kin: Kinematics, readings: Sequence[SurveyReading], known: Sag | None = None) -> SurveyFit:
-    """Offsets and sag from at least `MIN_POSES` readings; ValueError with fewer.
+    """Offsets and sag from at least `MIN_POSES` readings.
 
-    ``known``: the sag that the profile has so far; only ``before_m`` depends on it.
+    ``known``: the sag in the present profile; only ``before_m`` depends on it.
+
+    Raises:
+        SurveyError: there are too few readings.
     """
     if len(readings) < MIN_POSES:
-        raise ValueError(f"{len(readings)} surveyed poses are too few; survey {MIN_POSES} or more, far apart")
+        raise SurveyError(
+            "survey.too-few-poses",
+            f"{len(readings)} surveyed poses are too few; survey {MIN_POSES} or more, far apart",
+        )
     weighed = all(isfinite(r.moment_nm) for r in readings)
     spread = _prior_sigma(weighed)
     start = np.zeros(len(spread))
@@ -143,7 +155,7 @@ def fit_survey(kin: Kinematics, readings: Sequence[SurveyReading], known: Sag | 
 
 
 def most_informative_poses(kin: Kinematics, candidates: Sequence[Sequence[float]], count: int) -> list[int]:
-    """Which of the candidate poses, surveyed together, leave the pin best known at all of them (greedy)."""
+    """The candidate poses that, surveyed together, leave the least uncertainty of the pin at all of them (greedy)."""
     usual = [*[0.0] * 4, *USUAL_PARAMETERS]
     spread = _prior_sigma(True)
     rows = []

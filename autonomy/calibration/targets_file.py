@@ -1,4 +1,4 @@
-"""Targets of a camera's survey as a CSV file: where each is, and where and how deep the camera sees it."""
+"""Targets of a camera survey as a CSV file: their positions, and their pixels and depths in the camera's image."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from typing import Final
 
 import numpy as np
 
+from runtime.errors import CodedError
+
 COLUMNS: Final = ("u_px", "v_px", "x_m", "y_m", "z_m")
 DEPTH_COLUMN: Final = "depth_m"
 
 
-class TargetsFileError(ValueError):
-    """The file is no list of targets; the message names the line and what is wrong."""
+class TargetsFileError(CodedError, ValueError):
+    """The file is no list of targets; the sentence names the line and what is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
 class SurveyTargets:
-    """Pixels (N, 2), depths (N,) [m], NaN where none is known, and places in the crane's base frame (N, 3) [m]."""
+    """Pixels (N, 2), depths (N,) [m], NaN where unknown, and positions in the crane's base frame (N, 3) [m]."""
 
     pixels_px: np.ndarray
     depths_m: np.ndarray
@@ -28,21 +30,22 @@ class SurveyTargets:
 
 
 def load_targets(path: Path) -> SurveyTargets:
-    """The targets of a file with the columns ``COLUMNS`` and, where the camera measures it, ``DEPTH_COLUMN``.
+    """The targets of a file with the columns ``COLUMNS`` and, where the camera measures depth, ``DEPTH_COLUMN``.
 
     Raises:
-        TargetsRefused: it cannot be read, a column is missing or a value is no finite number.
+        TargetsFileError: the file cannot be read, a column is missing or a value is not a finite number.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise TargetsFileError(f"{path}: cannot be read as text: {error}") from None
+        raise TargetsFileError("targets.unreadable", f"{path}: cannot be read as text: {error}") from None
     rows = csv.DictReader(text.splitlines(), skipinitialspace=True)
     names = [(name or "").strip() for name in rows.fieldnames or ()]
     missing = [name for name in COLUMNS if name not in names]
     if missing:
         raise TargetsFileError(
-            f"{path}:1: column {missing[0]} is missing; the first line is {','.join((*COLUMNS, DEPTH_COLUMN))}"
+            "targets.column-missing",
+            f"{path}:1: column {missing[0]} is missing; the first line is {','.join((*COLUMNS, DEPTH_COLUMN))}",
         )
     rows.fieldnames = names
     values, depths = [], []
@@ -61,5 +64,7 @@ def _number(text: str | None, name: str, where: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise TargetsFileError(f"{where}: {name} is {text!r}, which is no number; decimals have a point")
+        raise TargetsFileError(
+            "targets.not-a-number", f"{where}: {name} is {text!r}, not a number; write decimals with a point"
+        )
     return value

@@ -1,4 +1,4 @@
-"""What a calibration does, piece by piece, and what it brings home."""
+"""The tasks of a calibration in order, and what they record."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class SpoolTask:
 
 @dataclass(frozen=True, slots=True)
 class GrappleTask:
-    """The grapple opens or closes, the crane stands."""
+    """Open or close the grapple while the crane stands."""
 
     command: GrappleCommand
 
@@ -46,8 +46,8 @@ class PinReadingTask:
 
 @dataclass(frozen=True, slots=True)
 class PulseTask:
-    """A joint without an encoder turns by its spool alone, by the profile at a ``share`` of its speed limit, to an
-    angle counted from where it stood before its first pulse [rad].
+    """Turn a joint without an encoder by its spool alone, at a ``share`` of its speed limit by the profile, to an angle
+    counted from its angle before the first pulse [rad].
     """
 
     joint: Joint
@@ -68,7 +68,7 @@ Task = MoveTask | SpoolTask | GrappleTask | PinReadingTask | PulseTask | YawRead
 
 @dataclass(slots=True)
 class Findings:
-    """What a run has brought home."""
+    """The records of a run."""
 
     wiggles: list[SpoolTestRecord] = field(default_factory=list)
     tests: list[SpoolTestRecord] = field(default_factory=list)
@@ -78,7 +78,7 @@ class Findings:
 
 
 def build_tasks(plan: CalibrationPlan) -> list[Task]:
-    """Everything in order: first every joint's wiggle where the crane stands, inward first."""
+    """All tasks in order; first the wiggle of every joint at the present pose."""
     tasks: list[Task] = []
     for p in plan.joints:
         tasks += [SpoolTask(p.joint, +1, "wiggle"), SpoolTask(p.joint, -1, "wiggle")]

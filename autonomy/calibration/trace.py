@@ -1,7 +1,7 @@
-"""What the bus said while a function was tested: commands, spools, joint positions, lift pressures, with their times.
+"""Bus signals recorded during spool tests: commands, spools, joint positions and lift pressures, with their times.
 
-Frames go in as they come (`BusTrace.accept`, any number at a time), columns over a stretch of time come out.  Nothing
-here sends.  Positions are the encoder's counts through the profile, not the controller's estimate; commands and spools
+Frames go in as they arrive (`BusTrace.accept`, any number at a time); columns over a period come out.  Nothing here
+sends.  Positions are the encoder's counts through the profile, not the controller's estimate.  Commands and spools
 carry the profile's sign, so that + is positive joint motion everywhere.
 """
 
@@ -15,12 +15,12 @@ from typing import Final
 
 import numpy as np
 
-from can_dbc.dbc.codec import Database
+from can_dbc.dbc.codec import Database, MessageCodec
 from can_dbc.frame import Frame
-from machine.sensing.encoder import position_from_counts
 from machine.joints import JOINTS, Joint
+from machine.profile import Encoder, Profile, joint
+from machine.sensing.encoder import position_from_counts
 from machine.sensing.weighing import lift_moment_nm
-from machine.profile import Profile, joint
 
 GRID_S: Final = 0.005
 FINE_FACTOR: Final = 4
@@ -36,13 +36,13 @@ class SignalColumn:
         self.times_ns, self.values = array("q"), array("d")
 
     def add(self, stamp_ns: int, value: float) -> None:
-        """One more sample; an older one than the last is left out."""
+        """Append a sample; one older than the last is dropped."""
         if not self.times_ns or stamp_ns > self.times_ns[-1]:
             self.times_ns.append(stamp_ns)
             self.values.append(value)
 
     def between(self, from_ns: int, to_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Times [s after ``from_ns``] and values of a stretch."""
+        """Times [s after ``from_ns``] and values of a period."""
         times = np.frombuffer(self.times_ns, np.int64)
         first, last = np.searchsorted(times, (from_ns, to_ns))
         values = np.frombuffer(self.values, float)[first:last].copy()
@@ -51,11 +51,11 @@ class SignalColumn:
 
 @dataclass(frozen=True, slots=True)
 class SpoolTestRecord:
-    """One program as it was run: which joint and side, what for, and the bus's columns on a grid of `GRID_S`.
+    """One program as it ran: joint, side, kind, and the bus signals on a grid of `GRID_S`.
 
-    ``command`` and ``spool`` in shares of full (1 = 100 %), ``position`` in rad or m.  ``fine_command`` has `FINE_FACTOR`
-    values per grid step, for a dead time is looked for between them.  ``spool`` is None where the valve node reports
-    none.
+    ``command`` and ``spool`` are shares of full (1 = 100 %), ``position`` is in rad or m.  ``fine_command`` has
+    `FINE_FACTOR` values per grid step, for finding a dead time between them.  ``spool`` is None where the valve node
+    reports none.
     """
 
     joint: Joint
@@ -69,7 +69,7 @@ class SpoolTestRecord:
 
 
 class BusTrace:
-    """Everything about valves and joints since the start."""
+    """All valve and joint signals since the start."""
 
     def __init__(self, profile: Profile, database: Database) -> None:
         self._profile = profile
@@ -78,8 +78,8 @@ class BusTrace:
         self.positions = [SignalColumn() for _ in JOINTS]
         self.grapple_state, self.opening, self.grapple_spool = SignalColumn(), SignalColumn(), SignalColumn()
         self.lift_bar = (SignalColumn(), SignalColumn())
-        """Pressures of the lift cylinder: the side that pushes upward, the other."""
-        self._readers = {}
+        """Pressures of the lift cylinder: the lifting side, the other."""
+        self._readers: dict[int, tuple[MessageCodec, list[tuple[int, float, SignalColumn]]]] = {}
         for message, columns in (("ValveCmdA", self.commands), ("ValveCmdB", self.commands)):
             self._read_valves(database, message, "", columns)
         for message in ("ValveFbA", "ValveFbB"):
@@ -92,7 +92,7 @@ class BusTrace:
         press = database.message("PressA")
         sides = zip(("LiftA", "LiftB"), self.lift_bar, strict=True)
         self._readers[press.key] = (press, [(press.index[name], 1.0, column) for name, column in sides])
-        self._encoders = {}
+        self._encoders: dict[int, tuple[MessageCodec, int, Encoder, SignalColumn]] = {}
         for j in JOINTS:
             encoder = joint(profile, j).encoder
             if encoder is not None:
@@ -110,11 +110,11 @@ class BusTrace:
 
     @property
     def keys(self) -> tuple[int, ...]:
-        """The frames it wants."""
+        """The keys of the frames it uses."""
         return (*self._readers, *self._encoders)
 
     def accept(self, frames: Iterable[Frame]) -> None:
-        """Frames as they came; what cannot be read is left out."""
+        """Store frames as they arrive; unreadable ones are dropped."""
         for stamp_ns, key, data in frames:
             if (encoder := self._encoders.get(key)) is not None:
                 codec, at, spec, column = encoder
@@ -127,14 +127,14 @@ class BusTrace:
                         column.add(stamp_ns, scale * values[at])
 
     def lift_moment_nm(self, position: float, from_ns: int, to_ns: int) -> float:
-        """Mean moment at a lift joint that stands at ``position`` [rad], by the pressures; NaN without any."""
+        """Mean moment at a resting lift joint at ``position`` [rad], by the pressures; NaN without any."""
         a, b = (column.between(from_ns, to_ns)[1] for column in self.lift_bar)
         if not (len(a) and len(b)):
             return nan
         return lift_moment_nm(self._profile, position, float(np.mean(a)), float(np.mean(b)))
 
     def test(self, which: Joint, side: int, kind: str, from_ns: int, to_ns: int) -> SpoolTestRecord:
-        """The columns of one joint between two times."""
+        """The record of one joint between two times."""
         grid = np.arange(0.0, (to_ns - from_ns) * _NS, GRID_S)
         times, commands = self.commands[which].between(from_ns, to_ns)
         # A command holds until the next one; a spool and a joint move between their samples.

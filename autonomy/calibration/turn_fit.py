@@ -1,11 +1,12 @@
-"""Dead-band and full speed of a rotator without an encoder, from how far known spool programs turned it.
+"""Dead-band and full speed of a rotator without an encoder, from the turns that known spool programs made.
 
-    turn = full * integral of ((play(spool) - dead-band) / (1 - half of the play - dead-band))^n      (docs/reference/machines.md section 3)
+    turn = full * integral of ((play(spool) - dead-band) / (1 - half of the play - dead-band))^n
+                                                                            (docs/reference/machines.md section 3)
 
-A surveyor reads the grapple's direction at rest before and after every program.  Dead time and lag of the spool come at
-its opening and at its closing alike: they shift a turn and do not change it.  Play and exponent are the profile's, so
-the values are those with which its valve map makes the turns that were seen.  A grapple looks the same after half a
-turn; the turns of a side grow from one that cannot be mistaken, and each tells the half turns of the next.
+A surveyor reads the grapple's direction at rest before and after every program.  Dead time and lag of the spool act
+alike at its opening and its closing: they shift a turn and do not change it.  Play and exponent are the profile's, so
+the fitted values are those with which its valve map reproduces the turns.  A grapple looks the same after half a
+turn; the turns of a side grow from one that is unambiguous, and each resolves the half turns of the next.
 """
 
 from __future__ import annotations
@@ -24,18 +25,19 @@ from autonomy.calibration.valve_fit import apply_backlash
 from machine.profile import JointSpec
 
 YAW_SIGMA_RAD: Final = radians(1.0)
-"""Of one reading of the direction, 1 sigma; several readings at one rest are averaged by the caller."""
+"""Standard deviation of one reading of the direction; the caller averages several readings at one rest."""
 DEADBAND_SIGMA, FULL_SPEED_SIGMA = 0.04, 0.4
-"""How far a valve is from its profile, share of the stroke and of the full speed: it leads where turns are few."""
+"""Standard deviations of a valve from its profile, share of the stroke and of the full speed; they matter for few
+turns."""
 HOLD_BOUNDS_S: Final = (0.2, 3.0)
-"""Bounds of how long a pulse holds: the controller ends a test of a joint without encoder after five seconds."""
+"""Bounds of a pulse's hold time: the controller ends a test of a joint without an encoder after five seconds."""
 SIDES: Final = (1, -1)
 
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One program as it was run, and the rotator's direction at rest before and after it [rad], modulo pi and without
-    the slew; either is the mean of so many ``readings``.
+    """One program as it ran, and the rotator's direction at rest before and after it [rad], modulo pi and without the
+    slew; both are means of ``readings`` readings.
     """
 
     record: SpoolTestRecord
@@ -46,8 +48,8 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class SideFit:
-    """One side: dead-band [share of full command], full speed [rad/s], the standard errors of both, and of each of its
-    turns how far it went and what the fit leaves of that [rad, + is to this side].
+    """One side: dead-band [share of full command], full speed [rad/s], their standard errors, and for each of its turns
+    the angle and the residual [rad, + is to this side].
     """
 
     deadband: float
@@ -66,7 +68,7 @@ class TurnFit:
 
     @property
     def angle_rad(self) -> float:
-        """Where it stands now, counted from where it stood before its first turn."""
+        """The present angle, counted from the angle before the first turn."""
         return sum(self.plus.turns_rad) - sum(self.minus.turns_rad)
 
     def side(self, side: int) -> SideFit:
@@ -75,13 +77,13 @@ class TurnFit:
 
 
 def fit_turns(turns: Sequence[Turn], spec: JointSpec) -> TurnFit:
-    """From the turns so far; a side without any is as the profile has it."""
+    """The fit of all turns so far; a side without turns keeps the profile's values."""
     plus, minus = (_fit_side([t for t in turns if t.record.side == side], spec, side) for side in SIDES)
     return TurnFit(plus, minus)
 
 
 def pulse_to(spec: JointSpec, fit: TurnFit, side: int, share: float, to_rad: float) -> SpoolProgram:
-    """A pulse that should end at an angle, counted as ``angle_rad``."""
+    """The pulse that should end at an angle, counted as ``angle_rad``."""
     known = fit.side(side)
 
     def turn_rad(hold_s: float) -> float:
@@ -102,7 +104,7 @@ def _half_backlash(spec: JointSpec) -> float:
 
 
 def _full_speed_seconds(spool: np.ndarray, spec: JointSpec, deadband: float) -> float:
-    """How long the full speed would take for the turn that a spool behind its play makes, on the grid of a record."""
+    """Time at full speed for the turn of a spool behind its backlash, on the grid of a record, s."""
     opening = np.clip((spool - deadband) / (1.0 - _half_backlash(spec) - deadband), 0.0, 1.0)
     return float(np.sum(opening**spec.valve.exponent)) * GRID_S
 
@@ -132,7 +134,8 @@ def _solve_side(
     deadband, full = known
 
     def left(p: np.ndarray) -> np.ndarray:
-        return np.array(seen) - [p[1] * full * _full_speed_seconds(s, spec, p[0]) for s in spools]
+        result: np.ndarray = np.array(seen) - [p[1] * full * _full_speed_seconds(s, spec, p[0]) for s in spools]
+        return result
 
     def residuals(p: np.ndarray) -> np.ndarray:
         before = [(p[0] - deadband) / DEADBAND_SIGMA, (p[1] - 1.0) / FULL_SPEED_SIGMA]

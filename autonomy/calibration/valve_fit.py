@@ -1,9 +1,10 @@
 """Dead-band, hysteresis, gain and metering curve of one valve function, from its sweeps and staircases.
 
-The model is the spool section as it is built (docs/reference/machines.md section 3): the measured spool passes a play of the hysteresis'
-width, a dead-band and a metering curve ``speed = full * opening^n``; a cylinder's lever makes the joint faster or
-slower along its way, and the oil between valve and joint is a spring that rings.  All tests of both sides are fitted
-together, on positions, so that no noisy derivative is ever taken.  Least squares with a soft loss; no randomness.
+The model follows the construction of a spool valve (docs/reference/machines.md section 3): the measured spool passes
+a play as wide as the hysteresis, a dead-band and a metering curve ``speed = full * opening^n``; a cylinder's lever
+makes the joint faster or slower along its travel, and the oil between valve and joint is a spring that rings.  All
+tests of both sides are fitted together, on positions, so that no noisy derivative is needed.  Least squares with a
+soft loss; no randomness.
 """
 
 from __future__ import annotations
@@ -21,18 +22,19 @@ from machine.joints import Joint
 from machine.profile import JointSpec
 
 EXPONENT, EXPONENT_SIGMA = 1.05, 0.05
-"""Metering edges of compensated spools are nearly straight; the data decide within this."""
+"""Metering edges of compensated spools are nearly straight; the data decide within this deviation."""
 HYSTERESIS, HYSTERESIS_SIGMA = 0.02, 0.02
 LEVER_SIGMA: Final = 0.7
-"""Relative change of a joint's speed per rad along a cylinder's lever; a gear and a telescope have none."""
+"""Standard deviation of a joint's relative change of speed per rad along a cylinder's lever; a gear and a telescope
+have none."""
 RESIDUAL_SCALE_S: Final = 0.004
-"""Of the speed limit times one second: residuals far above it are down-weighted."""
+"""Scale of the residuals, as time at the speed limit: residuals far above it are down-weighted."""
 DECIMATION: Final = 2
-"""The fit looks at every second sample."""
+"""The fit uses every second sample."""
 _LEVER_JOINTS: Final = (Joint.LIFT, Joint.TILT)
 _MAX_EVALUATIONS: Final = 60
 PRIOR_WEIGHT: Final = 10.0
-"""Of what is known beforehand against the data: neighbouring residuals are alike, a hundred of them count as one."""
+"""Weight of the prior against the data: neighbouring residuals are correlated, a hundred of them count as one."""
 _PARAMETER_NAMES: Final = (
     "deadband_plus", "deadband_minus", "hysteresis", "exponent", "full_plus", "full_minus", "lever", "ring_rad_s",
     "ring_zeta", "lag_plus_s", "lag_minus_s",
@@ -41,12 +43,11 @@ _PARAMETER_NAMES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ValveFit:
-    """What the fit found: shares of full command, speeds at full command and ``at`` (rad, m), and how well it fits.
+    """The fitted parameters: shares of full command, speeds at full command and at joint position ``at`` (rad, m).
 
-    ``ringing`` is the oil spring (rad/s, damping ratio), ``lags_s`` oil and pump between the spool's opening and the
-    joint, plus and minus side; ``residual`` the root mean square of the position residuals [rad, m]; ``modelled`` the
-    fitted positions of every test, in order.
-    ``errors`` are standard errors by name of the parameter.
+    ``ringing`` is the oil spring (rad/s, damping ratio), ``lags_s`` the delay of oil and pump between spool and joint,
+    plus and minus side; ``residual`` the root mean square of the position residuals [rad, m]; ``modelled`` the fitted
+    positions of every test, in order.  ``errors`` are standard errors by parameter name.
     """
 
     deadbands: tuple[float, float]
@@ -63,7 +64,7 @@ class ValveFit:
 
 
 def apply_backlash(spool: np.ndarray, half: float) -> np.ndarray:
-    """A spool that was neutral before, behind a play of twice ``half``."""
+    """The spool behind a play of twice ``half``; it was neutral before."""
     out, at = [], 0.0
     for x in spool.tolist():
         if x - half > at:
@@ -75,7 +76,7 @@ def apply_backlash(spool: np.ndarray, half: float) -> np.ndarray:
 
 
 class _TestModel:
-    """One test, ready for the model."""
+    """One test, prepared for the model."""
 
     def __init__(self, test: SpoolTestRecord, reference: float) -> None:
         self.side = test.side
@@ -88,7 +89,7 @@ class _TestModel:
         self._played: dict[float, np.ndarray] = {}
 
     def after_backlash(self, half: float) -> np.ndarray:
-        """The spool behind its play; kept, because most evaluations of a gradient share it."""
+        """The spool behind its play; cached, because most evaluations of a gradient share it."""
         if half not in self._played:
             if len(self._played) > 3:
                 self._played.clear()
@@ -105,7 +106,8 @@ class _TestModel:
         way = np.cumsum(speed) * self.step_s
         time = np.arange(len(way)) * self.step_s
         b, a = _second_order_lag(p[7], p[8], self.step_s)
-        return self.start + lfilter(b, a, np.interp(time - lag_s, time, way))
+        result: np.ndarray = self.start + lfilter(b, a, np.interp(time - lag_s, time, way))
+        return result
 
 
 def _second_order_lag(rad_s: float, zeta: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -142,7 +144,9 @@ def fit_valve(tests: Sequence[SpoolTestRecord], spec: JointSpec) -> ValveFit:
         ]  # fmt: skip
         return np.concatenate([*((s.position - s.model(p)) / noise for s in stretches), np.array(prior) * PRIOR_WEIGHT])
 
-    found = least_squares(residuals, start, bounds=(low, high), x_scale=scale, loss="soft_l1", max_nfev=_MAX_EVALUATIONS)
+    found = least_squares(
+        residuals, start, bounds=(low, high), x_scale=scale, loss="soft_l1", max_nfev=_MAX_EVALUATIONS
+    )
     p = found.x
     modelled = tuple(
         np.interp(t.time_s, t.time_s[::DECIMATION], s.model(p)) for t, s in zip(tests, stretches, strict=True)
@@ -164,7 +168,7 @@ def fit_valve(tests: Sequence[SpoolTestRecord], spec: JointSpec) -> ValveFit:
 
 
 def _standard_errors(found: Any) -> dict[str, float]:
-    """Of the parameters, from the curvature of the cost; neighbouring residuals are alike, so few of them count."""
+    """Standard errors of the parameters from the curvature of the cost, for correlated residuals."""
     try:
         covariance = np.linalg.inv(found.jac.T @ found.jac)
     except np.linalg.LinAlgError:
@@ -175,9 +179,9 @@ def _standard_errors(found: Any) -> dict[str, float]:
 
 
 def deadband_difference(fit: ValveFit, test: SpoolTestRecord) -> float:
-    """By how much the dead-band of another test of that side differs from the fit's [share of full]; NaN if unclear.
+    """Difference between the dead-band of another test of that side and the fit's [share of full]; NaN if unclear.
 
-    The test is not one of those that were fitted.  Everything but the dead-band is taken from the fit.
+    The test is not one of the fitted ones; all other parameters are taken from the fit.
     """
     stretch = _TestModel(test, fit.at)
     first = 0 if test.side > 0 else 1

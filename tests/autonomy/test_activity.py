@@ -1,4 +1,4 @@
-"""The whole cycle on a crane that follows exactly: the log ends in the bunk, and nothing is hit on the way."""
+"""The whole cycle on a crane that follows exactly: the log ends in the bunk, and nothing is hit during the motion."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from math import atan2, cos, hypot, nan, pi, remainder, sin
 import msgspec
 import numpy as np
 import pytest
-from crane_stand_in import GROUND_LOG, TICK_NS, StandIn, clearances
 
 from autonomy.crane_job.activity import Activity, Phase
 from autonomy.crane_job.phase_motions import corrected_grasp
@@ -27,6 +26,7 @@ from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Sag, joint
 from machine.status.modes import Mode
+from tests.autonomy.crane_stand_in import GROUND_LOG, TICK_NS, StandIn, clearances
 
 PROFILE = load_profile("palms_471")
 CYCLE = ["LOOK", "ABOVE", "DESCEND", "CLOSE", "LIFT", "CARRY", "LOWER", "OPEN", "RETREAT", "DONE"]
@@ -81,7 +81,7 @@ def test_a_column_that_leans_under_the_log_is_known_where_the_log_is_laid_down()
 
 
 @pytest.mark.parametrize("load_kg", [nan, -3.0, 1e5])
-def test_a_load_that_cannot_be_is_not_planned_for(load_kg: float) -> None:
+def test_an_implausible_load_is_not_planned_for(load_kg: float) -> None:
     profile = msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 2.0e-6))
     crane = StandIn(profile, [GROUND_LOG], log_kg=load_kg)
     planner = Activity(profile, profile_hash(profile))
@@ -108,7 +108,7 @@ def test_a_random_log_goes_from_the_ground_into_the_bunk(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_motions_that_are_made_one_by_one_lead_there_too(seed: int) -> None:
+def test_separate_motions_lead_there_too(seed: int) -> None:
     crane, planner = StandIn(PROFILE, [random_log(seed)]), activity(direct=False)
     crane.run(planner)
     assert planner.done and phases(crane) == CYCLE and lies_in_bunk(PROFILE.bunk, crane.logs[0])
@@ -118,7 +118,7 @@ def test_motions_that_are_made_one_by_one_lead_there_too(seed: int) -> None:
     assert least["tip"] > 0.005 and least["stakes"] > 0.08
 
 
-def test_with_another_log_in_view_the_crane_stays_in_the_bunk_and_goes_on_from_there() -> None:
+def test_with_another_log_in_view_the_crane_stays_in_the_bunk_and_continues_from_there() -> None:
     other = replace(GROUND_LOG, id=1, center_m=(1.5, 4.8, GROUND_LOG.center_m[2]))
     crane = StandIn(PROFILE, [GROUND_LOG, other])
     wanted: list[int] = []
@@ -143,7 +143,7 @@ def test_with_another_log_in_view_the_crane_stays_in_the_bunk_and_goes_on_from_t
     assert least["tip"] > 0.005 and least["stakes"] > 0.08
 
 
-def test_a_log_that_hangs_askew_is_turned_on_the_way() -> None:
+def test_a_log_that_hangs_askew_is_turned_during_the_motion() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     run_until(crane, planner, Phase.LIFT)
     crane._psi += 0.15  # it slipped while it was gripped
@@ -156,7 +156,7 @@ def test_a_log_that_hangs_askew_is_turned_on_the_way() -> None:
     assert np.all(np.diff(moving) == 1), "without a stop"
 
 
-def test_nothing_is_let_go_in_the_air_while_a_joint_hangs_back() -> None:
+def test_nothing_is_released_in_the_air_while_a_joint_lags() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     run_until(crane, planner, Phase.CARRY)
     stuck = crane.q[Joint.SLEW]
@@ -172,7 +172,7 @@ def test_nothing_is_let_go_in_the_air_while_a_joint_hangs_back() -> None:
         crane._carry()
 
 
-def test_without_grapple_feedback_time_alone_does_it() -> None:
+def test_without_grapple_feedback_time_alone_decides() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG], feedback=False), activity()
     crane.run(planner)
     assert planner.done and phases(crane) == CYCLE
@@ -191,7 +191,7 @@ def test_datagrams_come_every_50_ms_however_often_it_is_called() -> None:
     assert all(isinstance(m, CraneSetpoint) and m.stamp_ns == now_ns for now_ns, m in sent)
 
 
-def test_what_turns_out_to_lie_a_little_elsewhere_is_gripped_there() -> None:
+def test_a_log_that_lies_a_little_elsewhere_is_gripped_there() -> None:
     """As where the machine leans towards the crane that reaches out."""
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     run_until(crane, planner, Phase.ABOVE, more_s=1.0)
@@ -208,7 +208,7 @@ def test_what_turns_out_to_lie_a_little_elsewhere_is_gripped_there() -> None:
     ("moved_m", "why"),
     [((0.01, 0.0, 0.01), "the tongs forgive it"), ((0.25, 0.2, 0.0), "another log"), ((0.0, 0.0, -0.9), "another log")],
 )
-def test_other_news_of_a_log_change_no_aim(moved_m: tuple[float, float, float], why: str) -> None:
+def test_other_changes_of_a_log_leave_the_aim(moved_m: tuple[float, float, float], why: str) -> None:
     arm = Arm(PROFILE)
     grasp = plan_single_log_grasp(arm, GROUND_LOG, 0.0)
     seen = replace(GROUND_LOG, center_m=tuple(c + d for c, d in zip(GROUND_LOG.center_m, moved_m, strict=True)))
@@ -225,7 +225,7 @@ def test_nothing_is_aimed_at_below_the_ground() -> None:
     assert lower.pose.z_m == pytest.approx(grasp.pose.z_m + lower.support_z_m - grasp.support_z_m)
 
 
-def test_a_log_that_has_come_to_its_place_is_let_go_at_once() -> None:
+def test_a_log_at_its_place_is_released_at_once() -> None:
     profile = msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 2.0e-6))
     crane = StandIn(profile, [GROUND_LOG], log_kg=90.0)
     planner = Activity(profile, profile_hash(profile), motion_planner=TimeOptimalPlanner())
@@ -236,7 +236,7 @@ def test_a_log_that_has_come_to_its_place_is_let_go_at_once() -> None:
     assert planner.done and 0.0 < lowers_s < 0.3
 
 
-def test_the_pin_waits_for_slow_tongs() -> None:
+def test_the_pin_waits_for_slow_jaws() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     run_until(crane, planner, Phase.CLOSE)
     heights = []

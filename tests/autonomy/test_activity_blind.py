@@ -7,7 +7,6 @@ from dataclasses import replace
 from math import cos, isfinite, nan, pi, sin
 
 import pytest
-from crane_stand_in import StandIn
 
 from autonomy.crane_job.activity import Activity
 from autonomy.grasp.placement import lies_in_bunk
@@ -15,6 +14,7 @@ from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash
+from tests.autonomy.crane_stand_in import StandIn
 
 FORWARDER = load_profile("aoro_fc8")
 HOME = (0.0, 1.25, -2.39, 0.10, 0.0)

@@ -1,4 +1,4 @@
-"""Several logs in the tongs: lifted slowly, the tongs closing on; what stays behind is forgotten, what fell missed."""
+"""Several logs in the jaws: lifted slowly while these close; logs that stay behind are dropped, fallen ones missed."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from crane_stand_in import StandIn
-from grasp_scenes import PROFILE, cross, pair
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.phase_motions import BUNDLE_LIFT_S
@@ -21,10 +19,12 @@ from can_dbc.messages.crane import CraneSetpoint, GrappleCommand
 from can_dbc.messages.datagrams import decode
 from machine.geometry.kinematics import Unreachable
 from machine.loading.profile_file import profile_hash
+from tests.autonomy.crane_stand_in import StandIn
+from tests.autonomy.grasp_scenes import PROFILE, cross, pair
 
 
 class Bundle(StandIn):
-    """A crane whose grapple takes the logs between its tongs; ``slips`` stay where they were."""
+    """A crane whose grapple takes the logs between its jaws; ``slips`` stay where they were."""
 
     slips: tuple[int, ...] = ()
 
@@ -61,7 +61,7 @@ def until(crane: Bundle, planner: Activity, phase: Phase) -> list[GrappleCommand
     return asked
 
 
-def test_a_bundle_is_lifted_slowly_with_the_tongs_closing_on() -> None:
+def test_a_bundle_is_lifted_slowly_while_the_jaws_keep_closing() -> None:
     crane, planner = made(pair())
     until(crane, planner, Phase.LIFT)
     assert planner.grasp is not None and {log.id for log in planner.grasp.logs} == {0, 1}
@@ -72,7 +72,7 @@ def test_a_bundle_is_lifted_slowly_with_the_tongs_closing_on() -> None:
     assert (crane.now_ns - begun_ns) * 1e-9 > BUNDLE_LIFT_S
 
 
-def test_the_pin_waits_while_the_tongs_close_again() -> None:
+def test_the_pin_waits_while_the_jaws_close_again() -> None:
     crane, planner = made(pair())
     until(crane, planner, Phase.LIFT)
     for _ in range(80):
@@ -88,13 +88,13 @@ def test_the_pin_waits_while_the_tongs_close_again() -> None:
     assert heights[-1] == pytest.approx(heights[-10], abs=2e-3) and heights[-1] > heights[0] - 1e-3
 
 
-def test_what_stayed_behind_is_not_carried() -> None:
+def test_a_log_that_stayed_behind_is_not_carried() -> None:
     crane, planner = made(pair(), slips=(0,))
     until(crane, planner, Phase.CARRY)
     assert planner.grasp is not None and [log.id for log in planner.grasp.logs] == [1] and planner.missed == 0
 
 
-def test_a_bundle_that_slips_whole_is_looked_for_again() -> None:
+def test_a_bundle_that_slips_off_whole_is_gripped_again() -> None:
     crane, planner = made(pair(), slips=(0, 1))
     until(crane, planner, Phase.CLOSE)
     crane.slips = (0, 1)
@@ -113,7 +113,7 @@ def test_a_single_log_of_many_is_taken_from_the_top_and_laid_down() -> None:
     assert not any(lies_in_bunk(PROFILE.bunk, log) for log in crane.logs)
 
 
-def test_a_bundle_without_a_way_on_is_let_go_a_little_over_where_it_lay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bundle_without_a_path_on_is_released_a_little_above_where_it_lay(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise Unreachable("no way is clear")
 

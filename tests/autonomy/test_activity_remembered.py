@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 from math import dist
 
 import pytest
-from crane_stand_in import GROUND_LOG, StandIn
-from grasp_scenes import PROFILE
 
 from autonomy.crane_job.activity import Activity
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.loading.profile_file import profile_hash
+from tests.autonomy.crane_stand_in import GROUND_LOG, StandIn
+from tests.autonomy.grasp_scenes import PROFILE
 
 _SHUT = 4
 
@@ -40,13 +40,13 @@ class Remembering(StandIn):
         return tuple(told)
 
     def report(self) -> StateReport:
-        """As a controller with a sensor at the tongs says it: shut on nothing, or holding."""
+        """The report of a controller with an opening sensor: closed empty, or holding."""
         told = super().report()
         return replace(told, grapple_state=_SHUT) if self.gripped and self.held is None else told
 
 
 @pytest.mark.parametrize("slips", [0, 1])
-def test_a_remembered_log_does_not_tell_whether_it_was_lifted_but_the_tongs_do(slips: int) -> None:
+def test_not_the_remembered_log_but_the_jaws_tell_whether_it_was_lifted(slips: int) -> None:
     crane = Remembering(PROFILE, [GROUND_LOG], slippery=slips)
     planner = Activity(PROFILE, profile_hash(PROFILE))
     crane.run(planner)
@@ -54,7 +54,7 @@ def test_a_remembered_log_does_not_tell_whether_it_was_lifted_but_the_tongs_do(s
     assert planner.missed == slips
 
 
-def test_tongs_that_shut_on_nothing_three_times_end_it() -> None:
+def test_jaws_that_close_on_nothing_three_times_end_the_job() -> None:
     crane = Remembering(PROFILE, [GROUND_LOG], slippery=9)
     planner = Activity(PROFILE, profile_hash(PROFILE))
     crane.run(planner)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from crane_stand_in import GROUND_LOG, StandIn
-from test_activity import PROFILE, activity, phases, run_until
 
 from autonomy.crane_job.activity import Activity, Phase
 from autonomy.grasp.grapple_heights import retreat_height_m
@@ -15,6 +13,8 @@ from can_dbc.messages.crane import GrappleCommand
 from can_dbc.messages.datagrams import decode
 from machine.geometry.kinematics import Unreachable
 from machine.loading.profile_file import profile_hash
+from tests.autonomy.crane_stand_in import GROUND_LOG, StandIn
+from tests.autonomy.test_activity import PROFILE, activity, phases, run_until
 
 ARM = Arm(PROFILE)
 BUNK = PROFILE.bunk
@@ -37,7 +37,7 @@ def over_the_bunk(q: tuple[float, ...]) -> bool:
     return near and pin.z_m > retreat_height_m(PROFILE) - 0.02
 
 
-def test_from_beside_a_log_it_goes_over_the_bunk_and_keeps_its_tongs_as_they_are() -> None:
+def test_from_beside_a_log_it_goes_over_the_bunk_and_keeps_its_jaws_as_they_are() -> None:
     crane = StandIn(PROFILE, [GROUND_LOG])
     planner = activity()
     run_until(crane, planner, Phase.DESCEND)
@@ -48,7 +48,7 @@ def test_from_beside_a_log_it_goes_over_the_bunk_and_keeps_its_tongs_as_they_are
     assert over_the_bunk(crane.q)
 
 
-def test_where_it_rests_there_already_nothing_moves() -> None:
+def test_where_it_already_rests_there_nothing_moves() -> None:
     crane = StandIn(PROFILE, [])
     over = ARM.pose_above(*BUNK.center_m, retreat_height_m(PROFILE) + 0.2, retreat_height_m(PROFILE) + 0.2)
     crane.q = tuple(ARM.joints(np.array([over]))[0].tolist())
@@ -58,9 +58,7 @@ def test_where_it_rests_there_already_nothing_moves() -> None:
 
 
 @pytest.mark.parametrize("trouble", [Unreachable("no way is clear"), NoGrasp("grasp.bunk-full", "the bunk is full")])
-def test_a_log_for_which_there_is_no_way_on_is_let_go_where_it_lay(
-    trouble: Exception, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_without_a_path_on_is_released_where_it_lay(trouble: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise trouble
 
@@ -74,7 +72,7 @@ def test_a_log_for_which_there_is_no_way_on_is_let_go_where_it_lay(
     assert log.center_m == pytest.approx(GROUND_LOG.center_m, abs=0.1)
 
 
-def test_a_log_in_the_air_without_a_way_on_goes_down_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lifted_log_without_a_path_on_goes_down_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lifted alone first, it hangs over where it lay when there turns out to be no room."""
     monkeypatch.setattr("autonomy.crane_job.cycle.plan_place", refuse_room)
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity(direct=False)

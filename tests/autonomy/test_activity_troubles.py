@@ -7,8 +7,6 @@ from math import nan
 
 import numpy as np
 import pytest
-from crane_stand_in import GROUND_LOG, HOME, TICK_NS, StandIn, clearances
-from test_activity import CYCLE, PROFILE, activity, phases, report, run_until
 
 from autonomy.crane_job.activity import Phase
 from autonomy.crane_job.grasp_verification import is_between_jaws
@@ -21,6 +19,8 @@ from machine.geometry.grapple import lowest_tip_below_pin_m
 from machine.joints import JOINTS, Joint
 from machine.profile import joint
 from machine.status.modes import Mode
+from tests.autonomy.crane_stand_in import GROUND_LOG, HOME, TICK_NS, StandIn, clearances
+from tests.autonomy.test_activity import CYCLE, PROFILE, activity, phases, report, run_until
 
 
 def test_nothing_is_sent_before_the_controller_is_armed() -> None:
@@ -58,7 +58,7 @@ def test_a_stop_in_any_phase_pauses_and_arming_resumes_it(phase: Phase, mode: Mo
     assert clearances(PROFILE, crane.trace[::2])["tip"] > 0.005
 
 
-def test_a_crane_that_was_driven_aside_first_goes_back_over_the_log() -> None:
+def test_a_crane_that_was_moved_aside_first_returns_above_the_log() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     run_until(crane, planner, Phase.DESCEND, more_s=1.0)
     crane.mode = Mode.STOP
@@ -79,7 +79,7 @@ def test_a_silent_controller_pauses() -> None:
     assert sum(a is not None for a in answers) <= 6 and answers[-1] is None
 
 
-def test_a_log_in_the_tongs_that_is_listed_twice_stands_in_no_way() -> None:
+def test_a_held_log_that_is_listed_twice_is_no_obstacle() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     crane.until(planner, Phase.CLOSE)
     while crane.held is None:
@@ -91,7 +91,7 @@ def test_a_log_in_the_tongs_that_is_listed_twice_stands_in_no_way() -> None:
     assert planner.done, planner.failure
 
 
-def test_only_what_lies_in_closed_tongs_is_between_them() -> None:
+def test_only_what_lies_in_closed_jaws_is_between_them() -> None:
     arm = Arm(PROFILE)
     x, y, z = GROUND_LOG.center_m
     pin = arm.pose_above(x, y, z + lowest_tip_below_pin_m(PROFILE.grapple.tongs) - 0.1, 2.0)
@@ -108,14 +108,14 @@ def test_only_what_lies_in_closed_tongs_is_between_them() -> None:
     assert not is_between_jaws(arm, ends, pin), "it ends before them"
 
 
-def test_a_missed_log_is_looked_for_again() -> None:
+def test_a_missed_log_is_gripped_again() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG], slippery=2), activity()
     crane.run(planner)
     assert planner.done and planner.missed == 2
     assert phases(crane).count("LOOK") == 3 and phases(crane)[-7:] == CYCLE[3:]
 
 
-def test_a_log_that_is_missed_three_times_ends_the_mission() -> None:
+def test_a_log_that_is_missed_three_times_ends_the_job() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG], slippery=9), activity()
     crane.run(planner)
     assert planner.phase is Phase.FAILED and planner.failure_code == "activity.log-missed"
@@ -123,7 +123,7 @@ def test_a_log_that_is_missed_three_times_ends_the_mission() -> None:
 
 
 @pytest.mark.parametrize("slips", [1, 9])
-def test_a_list_that_comes_late_is_judged_once(slips: int) -> None:
+def test_a_late_list_is_evaluated_once(slips: int) -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG], slippery=slips), activity()
     told, arrived_ns = crane.seen, None
 
@@ -141,7 +141,7 @@ def test_a_list_that_comes_late_is_judged_once(slips: int) -> None:
     assert phases(crane).count("LOOK") == min(slips + 1, 3)
 
 
-def test_a_log_that_is_lost_on_the_way_is_picked_again() -> None:
+def test_a_log_that_is_lost_during_the_motion_is_picked_again() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     run_until(crane, planner, Phase.CARRY, more_s=2.0)
     crane.held = None
@@ -150,7 +150,7 @@ def test_a_log_that_is_lost_on_the_way_is_picked_again() -> None:
     assert planner.done and planner.missed == 1
 
 
-def test_a_log_that_falls_beside_the_bunk_is_said_to() -> None:
+def test_a_log_that_falls_beside_the_bunk_is_reported() -> None:
     crane, planner = StandIn(PROFILE, [GROUND_LOG]), activity()
     run_until(crane, planner, Phase.RETREAT)
     crane.logs = [replace(crane.logs[0], center_m=(3.0, 3.0, -1.29))]
@@ -158,7 +158,7 @@ def test_a_log_that_falls_beside_the_bunk_is_said_to() -> None:
     assert planner.failure_code == "activity.log-misplaced" and "(3.00, 3.00, -1.29)" in (planner.failure or "")
 
 
-def test_no_log_list_ends_the_mission() -> None:
+def test_no_log_list_ends_the_job() -> None:
     crane, planner = StandIn(PROFILE, []), activity()
     crane.run(planner)
     assert planner.failure_code == "activity.look-timeout"

@@ -10,9 +10,9 @@ from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.motion.trajectory import straight_line
 from machine.geometry.kinematics import pin_position
+from machine.geometry.sag import true_pin
 from machine.loading.profile_file import load_profile
 from machine.profile import Sag
-from machine.geometry.sag import true_pin
 
 PROFILE = load_profile("palms_471")
 LEANING = Arm(msgspec.structs.replace(PROFILE, sag=Sag(0.0054, 0.0036, 0.028, 1.2e-6, 4500.0, 3000.0)))

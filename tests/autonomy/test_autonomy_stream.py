@@ -58,13 +58,13 @@ def test_a_hold_is_one_pose_and_final() -> None:
     assert all(k.position == q and k.velocity == (0.0,) * 5 for k in setpoint.knots)
 
 
-def test_a_motion_that_stands_on_its_way_is_a_hold_and_final() -> None:
+def test_a_motion_that_stops_on_its_path_is_a_hold_and_final() -> None:
     setpoint = window(0.5, rate=0.0)
     assert setpoint.final
     assert all(k.position[0] == pytest.approx(0.05) and k.velocity == (0.0,) * 5 for k in setpoint.knots)
 
 
-def test_sequences_rise_by_one_and_a_restart_goes_on_above() -> None:
+def test_sequences_rise_by_one_and_a_restart_continues_above() -> None:
     def sequences(start_ns: int) -> list[int]:
         stream = SetpointStream(1, 100_000_000)
         out = []

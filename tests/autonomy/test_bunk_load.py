@@ -1,4 +1,4 @@
-"""A heap in the bunk: where a log comes to lie, and how many go in before it is full."""
+"""The load of a bunk: where a log comes to rest, and how many fit before the bunk is full."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autonomy.grasp.bunk_load import GRID_M, BunkLoad, settled_in_bunk, log_in_bunk
+from autonomy.grasp.bunk_load import GRID_M, BunkLoad, log_in_bunk, settled_in_bunk
 from autonomy.perception.log_list.observation import LogObservation
 from machine.loading.profile_file import load_profile
 from machine.profile import Bunk
@@ -80,7 +80,7 @@ def test_what_lies_across_counts_everywhere_between_its_ends() -> None:
     assert all(across.place_at(a).support_z_m == pytest.approx(z + R_M) for a in (0.0, 0.4))
 
 
-def test_a_log_that_was_let_go_lies_where_it_fell_to() -> None:
+def test_a_released_log_lies_where_it_fell() -> None:
     z = FLOOR_M + R_M
     bed = [lying(-0.13, z), lying(0.13, z)]
     laid = settled_in_bunk(BUNK, replace(lying(0.05, z + 0.9), axis=(0.99, 0.1, 0.1)), bed)
@@ -124,7 +124,7 @@ def test_paper_bs_logs_find_room(seed: int) -> None:
 
 
 def rolled(logs: list[LogObservation], across_m: float) -> tuple[float, float]:
-    """Where a circle that is let go comes to rest, in steps of half a millimetre."""
+    """Where a released circle comes to rest, in steps of half a millimetre."""
     beds = [(log_in_bunk(BUNK, log)[1], log.center_m[2]) for log in logs]
 
     def height(x: float) -> float:

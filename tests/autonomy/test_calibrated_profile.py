@@ -8,13 +8,14 @@ import pytest
 
 import machine
 from autonomy.calibration.profile_file import ProfileNotWritten, profile_changes, write_profile
-from autonomy.calibration.result import JointResult, CalibrationResult
+from autonomy.calibration.result import CalibrationResult, JointResult
 from autonomy.calibration.survey import SurveyFit
 from autonomy.calibration.turn_fit import SideFit, TurnFit
 from autonomy.calibration.valve_fit import ValveFit
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash, shipped_profiles
 from machine.profile import Sag
+from tests.codes import coded
 
 SHIPPED = Path(machine.__file__).parent
 CHANGES = [
@@ -79,7 +80,9 @@ def test_a_full_speed_is_written_for_the_nominal_arm_of_the_lever() -> None:
         (0.12, 0.13), 0.021, 1.04, (0.2, 0.22), 0.0, lever.lever_at[5], (10.0, 0.4), (0.0, 0.0), 0.0, (), {}
     )
     lift = JointResult(Joint.LIFT, valve, None, (0.3, 0.3), (0.0, 0.0), 0.18, ())
-    found = {path[-1]: value for path, value, _ in profile_changes(profile, CalibrationResult({Joint.LIFT: lift}, {}, None))}
+    found = {
+        path[-1]: value for path, value, _ in profile_changes(profile, CalibrationResult({Joint.LIFT: lift}, {}, None))
+    }
     assert lever.lever[5] < 0.95, "measured where the arm is short and the joint fast"
     assert found["full_speed_plus"] == pytest.approx(0.2 * lever.lever[5], abs=1e-4)
     assert found["full_speed_minus"] == pytest.approx(0.22 * lever.lever[5], abs=1e-4)
@@ -102,13 +105,13 @@ def test_surveyed_turns_are_written_and_a_rotator_that_is_slower_gets_a_lower_li
 def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
     out.write_text("mine")
-    with pytest.raises(ProfileNotWritten, match="exists"):
+    with pytest.raises(ProfileNotWritten, check=coded("calibration.profile-exists")):
         write_profile(SHIPPED / "palms_471.toml", out, CHANGES, "2026-11-21")
     assert out.read_text() == "mine"
 
 
 def test_a_profile_that_would_be_refused_is_not_left_behind(tmp_path: Path) -> None:
     bad = [(("joints", "slew", "valve", "full_speed_plus"), 0.01, "too slow for its limit")]
-    with pytest.raises(ProfileNotWritten, match="would be refused"):
+    with pytest.raises(ProfileNotWritten, check=coded("calibration.profile-invalid")):
         write_profile(SHIPPED / "palms_471.toml", tmp_path / "mine.toml", bad, "2026-11-21")
     assert list(tmp_path.iterdir()) == []

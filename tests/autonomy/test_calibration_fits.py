@@ -7,20 +7,21 @@ from functools import cache
 
 import numpy as np
 import pytest
-from valve_stand_in import StandIn
 
 from autonomy.calibration.delay_fit import fit_delay, response_s
-from autonomy.calibration.spool_program import staircase, sweep, reversed_sweep, wiggle
 from autonomy.calibration.result import identify
-from autonomy.calibration.survey import SurveyReading, fit_survey, most_informative_poses
+from autonomy.calibration.spool_program import reversed_sweep, staircase, sweep, wiggle
+from autonomy.calibration.survey import SurveyError, SurveyReading, fit_survey, most_informative_poses
 from autonomy.calibration.tasks import Findings
 from autonomy.calibration.trace import SpoolTestRecord
-from autonomy.calibration.valve_fit import fit_valve, deadband_difference
+from autonomy.calibration.valve_fit import deadband_difference, fit_valve
+from machine.geometry.sag import true_pin
 from machine.joints import Joint
-from machine.sensing.weighing import empty_moment_nm
 from machine.loading.profile_file import load_profile
 from machine.profile import Sag
-from machine.geometry.sag import true_pin
+from machine.sensing.weighing import empty_moment_nm
+from tests.autonomy.valve_stand_in import StandIn
+from tests.codes import coded
 
 PALMS = load_profile("palms_471")
 SLEW = PALMS.joints["slew"]
@@ -146,7 +147,7 @@ def test_a_crane_with_a_known_sag_is_compared_with_that() -> None:
 
 
 def test_too_few_surveyed_poses_are_refused() -> None:
-    with pytest.raises(ValueError, match="too few"):
+    with pytest.raises(SurveyError, check=coded("survey.too-few-poses")):
         fit_survey(PALMS.kinematics, surveyed(0.0)[:4])
 
 
@@ -162,17 +163,17 @@ def test_a_good_run_is_plausible() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("machine", "says"),
+    ("machine", "code"),
     [
-        (StandIn(full_speeds=(0.2, 0.22)), "full speed over the profile's 0.4"),
-        (StandIn(hysteresis=0.09, deadbands=(0.12, 0.12)), "a hysteresis of"),
-        (StandIn(full_speeds=(0.75, 0.26)), "faster than the other"),
+        (StandIn(full_speeds=(0.2, 0.22)), "implausible.out-of-range"),
+        (StandIn(hysteresis=0.09, deadbands=(0.12, 0.12)), "implausible.hysteresis"),
+        (StandIn(full_speeds=(0.75, 0.26)), "implausible.sides-differ"),
     ],
     ids=["slow", "sticking", "one-sided"],
 )
-def test_what_cannot_be_believed_is_said(machine: StandIn, says: str) -> None:
+def test_implausible_values_are_reported(machine: StandIn, code: str) -> None:
     result = identify(PALMS, found(measured(machine)))
-    assert any(says in sentence for sentence in result.implausible), result.implausible
+    assert any(problem.code == code for problem in result.implausible), result.implausible
 
 
 @pytest.mark.slow
@@ -181,5 +182,5 @@ def test_a_joint_that_was_held_does_not_fit_a_valve() -> None:
     held = tests[1].position.copy()
     held[len(held) // 2 :] = held[len(held) // 2]
     tests[1] = dataclasses.replace(tests[1], position=held)
-    sentences = identify(PALMS, found(tuple(tests))).implausible
-    assert any("does not fit a valve" in s for s in sentences), sentences
+    problems = identify(PALMS, found(tuple(tests))).implausible
+    assert any(problem.code == "implausible.motion-residual" for problem in problems), problems

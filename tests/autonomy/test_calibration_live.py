@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from autonomy.calibration.live import SURVEY_REQUEST, SurveyInstrument, ControllerLink, first_report
+from autonomy.calibration.live import SURVEY_REQUEST, ControllerLink, SurveyInstrument, first_report
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from machine.status.modes import Mode
@@ -37,14 +37,14 @@ def free_port() -> int:
 
 
 def waited_for(read: Callable[[int], Any]) -> Any:
-    """The answer that is on its way."""
+    """The answer that is under way."""
     end = time.monotonic() + 5.0
     while (reading := read(10**9 + 1)) is None and time.monotonic() < end:
         time.sleep(0.005)
     return reading
 
 
-def test_an_instrument_is_asked_and_its_answer_is_read(far: socket.socket) -> None:
+def test_an_instrument_is_requested_and_its_answer_is_read(far: socket.socket) -> None:
     instrument = SurveyInstrument(far.getsockname())
     assert instrument.read(10**9) is None
     question, asker = far.recvfrom(100)
@@ -55,7 +55,7 @@ def test_an_instrument_is_asked_and_its_answer_is_read(far: socket.socket) -> No
     instrument.close()
 
 
-def test_an_instrument_tells_the_grapples_direction_or_that_it_cannot(far: socket.socket) -> None:
+def test_an_instrument_gives_the_grapples_direction_or_says_that_it_cannot(far: socket.socket) -> None:
     instrument = SurveyInstrument(far.getsockname())
     assert instrument.read_yaw(10**9) is None
     _, asker = far.recvfrom(100)

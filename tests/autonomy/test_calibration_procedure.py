@@ -1,4 +1,4 @@
-"""The calibration run: a good machine is done, any other is told why not and left with its valves shut."""
+"""The calibration run: a good machine finishes; any other ends with a reason and closed valves."""
 
 from __future__ import annotations
 
@@ -6,28 +6,36 @@ from math import nan
 
 import msgspec
 import pytest
-from commissioned_crane import HOME, SAG, Crane
 
 from autonomy.calibration.plan import CalibrationImpossible, make_plan, plan_summary
 from autonomy.calibration.profile_file import profile_changes
-from autonomy.calibration.spool_program import STAIRCASE_SPEED_SHARES, command_for, staircase, sweep, reversed_sweep, wiggle
 from autonomy.calibration.report import result_document
 from autonomy.calibration.result import CalibrationResult, identify
+from autonomy.calibration.spool_program import (
+    STAIRCASE_SPEED_SHARES,
+    command_for,
+    reversed_sweep,
+    staircase,
+    sweep,
+    wiggle,
+)
 from autonomy.calibration.survey import fit_survey
-from autonomy.calibration.tasks import SpoolTask, MoveTask
+from autonomy.calibration.tasks import MoveTask, SpoolTask
 from autonomy.calibration.turn_fit import fit_turns
 from can_dbc.messages.crane import CraneSetpoint, SpoolTest
-from machine.joints import JOINTS, Joint
 from machine.geometry.kinematics import pin_position
+from machine.joints import JOINTS, Joint
 from machine.loading.profile_file import load_profile
 from machine.status.modes import Mode
+from tests.autonomy.commissioned_crane import HOME, SAG, Crane
+from tests.codes import coded
 
 PALMS = load_profile("palms_471")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["palms_471", "aoro_fc8"])
-def test_a_good_machine_is_done_in_under_four_minutes(name: str) -> None:
+def test_a_good_machine_takes_under_four_minutes(name: str) -> None:
     crane = Crane(name)
     run = crane.run()
     assert run.failure is None and run.done
@@ -59,13 +67,16 @@ def test_a_rotator_without_encoder_turns_there_and_back_and_its_valve_is_found()
 
 
 @pytest.mark.parametrize(
-    ("fault", "says"),
-    [({"backward": {Joint.ROT}}, "rot moves the wrong way"), ({"stuck": {Joint.ROT}}, "rot does not move")],
+    ("fault", "code"),
+    [
+        ({"backward": {Joint.ROT}}, "calibration.wrong-direction"),
+        ({"stuck": {Joint.ROT}}, "calibration.no-motion"),
+    ],
 )
-def test_a_rotator_that_does_not_do_as_it_is_told_ends_the_run(fault: dict, says: str) -> None:
+def test_a_rotator_that_does_not_follow_its_command_ends_the_run(fault: dict, code: str) -> None:
     crane = Crane("aoro_fc8", only_turns=True, **fault)
     run = crane.run()
-    assert run.failure is not None and says in run.failure
+    assert run.failure_code == code and "rot" in (run.failure or "")
     assert ends_shut(crane) and abs(crane.q[Joint.ROT]) < 0.6
 
 
@@ -74,7 +85,7 @@ def test_an_abort_while_the_rotator_turns_shuts_its_valve() -> None:
     crane.run(done=lambda c: c._spools()[Joint.ROT] > 12.0)
     crane.calibration.abort("interrupted")
     run = crane.run()
-    assert run.failure == "interrupted" and ends_shut(crane)
+    assert run.failure_code == "calibration.aborted" and ends_shut(crane)
 
 
 def test_without_a_readable_direction_the_rotator_stays_as_it_was() -> None:
@@ -83,7 +94,7 @@ def test_without_a_readable_direction_the_rotator_stays_as_it_was() -> None:
     assert run.failure is None and run.done and not run.found.turns
     assert not any(isinstance(m, SpoolTest) for m in crane.heard)
     result = identify(crane.profile, run.found)
-    assert result.turns is None and len(result.kept) == 1 and "no encoder" in result.kept[0]
+    assert result.turns is None and len(result.kept) == 1 and "rot" in result.kept[0]
     assert result_document(result, {}, [])["kept"] == list(result.kept)
     assert not profile_changes(crane.profile, CalibrationResult({}, {}, None, kept=result.kept))
 
@@ -102,7 +113,7 @@ def test_a_joint_that_moves_the_wrong_way_ends_the_run_at_once(joint: Joint) -> 
     crane = Crane(backward={joint})
     before = crane.q[joint]
     run = crane.run()
-    assert run.failure is not None and f"the {joint.name.lower()} moves the wrong way" in run.failure
+    assert run.failure_code == "calibration.wrong-direction" and joint.name.lower() in (run.failure or "")
     assert abs(crane.q[joint] - before) < 0.03
     assert ends_shut(crane)
 
@@ -110,7 +121,7 @@ def test_a_joint_that_moves_the_wrong_way_ends_the_run_at_once(joint: Joint) -> 
 def test_a_joint_that_does_not_move_ends_the_run() -> None:
     crane = Crane(stuck={Joint.LIFT})
     run = crane.run()
-    assert run.failure is not None and "the lift does not move" in run.failure
+    assert run.failure_code == "calibration.no-motion" and "lift" in (run.failure or "")
     assert ends_shut(crane)
 
 
@@ -122,7 +133,7 @@ def test_an_abort_shuts_the_valve_within_a_tenth_of_a_second(after_s: float) -> 
     crane.calibration.abort("interrupted")
     aborted_ns = crane.now_ns
     run = crane.run()
-    assert run.failure == "interrupted" and not run.done
+    assert run.failure_code == "calibration.aborted" and not run.done
     assert crane.now_ns - aborted_ns < 200_000_000
     assert ends_shut(crane)
 
@@ -146,7 +157,12 @@ def test_a_stop_ends_the_run_and_nothing_is_sent_after_it() -> None:
     sent = len(crane.heard)
     crane.mode = Mode.ARMED
     crane.run(5.0)
-    assert run.idle and "STOP" in (run.failure or "") and len(crane.heard) == sent
+    assert (
+        run.idle
+        and run.failure_code == "calibration.controller-mode"
+        and "STOP" in (run.failure or "")
+        and len(crane.heard) == sent
+    )
 
 
 def test_a_refused_setpoint_ends_the_run() -> None:
@@ -154,13 +170,14 @@ def test_a_refused_setpoint_ends_the_run() -> None:
     crane.run(3.0)
     crane.refuses = 1
     run = crane.run()
-    assert run.failure is not None and "refused" in run.failure
+    assert run.failure_code == "calibration.setpoint-refused"
 
 
-def test_it_waits_until_a_human_arms() -> None:
+def test_it_waits_until_a_person_arms() -> None:
     crane = Crane(mode=Mode.STANDBY)
     run = crane.run(5.0)
-    assert not crane.heard and run.begun_ns is None and run.failure is None and "STANDBY" in (run.waiting or "")
+    assert not crane.heard and run.begun_ns is None and run.failure is None
+    assert run.waiting_code == "calibration.controller-mode" and "STANDBY" in (run.waiting or "")
 
 
 def ends_shut(crane: Crane) -> bool:
@@ -190,7 +207,7 @@ def test_a_plan_stays_clear_of_ground_bunk_and_stops(name: str) -> None:
 
 def test_a_machine_without_room_is_refused_before_anything_moves() -> None:
     bunk = msgspec.structs.replace(PALMS.bunk, stake_height_m=9.0)
-    with pytest.raises(CalibrationImpossible, match="clear of ground and bunk"):
+    with pytest.raises(CalibrationImpossible, check=coded("calibration.no-clear-pose")):
         make_plan(msgspec.structs.replace(PALMS, bunk=bunk), (0.0, 0.7, -1.5, 0.3, nan), surveyed=False)
 
 
@@ -206,7 +223,7 @@ def test_programs_begin_and_end_neutral_and_reach_their_speeds() -> None:
             assert top == pytest.approx(command_for(spec, side, STAIRCASE_SPEED_SHARES[-1] * spec.speed_limit))
 
 
-def test_a_program_begins_at_its_beginning_however_late_the_turn_is() -> None:
+def test_a_program_starts_from_its_beginning_however_late_the_tick_is() -> None:
     crane = Crane()
     crane.run(0.1)
     assert not crane.heard
@@ -216,7 +233,7 @@ def test_a_program_begins_at_its_beginning_however_late_the_turn_is() -> None:
     assert isinstance(first, SpoolTest) and first.knots[0].percent == 0.0 and first.knots[1].after_ns == 5_000_000
 
 
-def test_a_task_tells_what_it_is() -> None:
+def test_a_task_describes_itself() -> None:
     crane = Crane()
     crane.run(1.0)
     assert crane.calibration.task == SpoolTask(Joint.SLEW, 1, "wiggle")
@@ -224,7 +241,7 @@ def test_a_task_tells_what_it_is() -> None:
     assert at == 0 and count > 40 and 150.0 < crane.calibration.remaining_s() < 260.0
 
 
-def test_a_changed_program_is_told_at_once_and_its_end_however_late() -> None:
+def test_a_changed_program_is_sent_at_once_and_its_end_however_late() -> None:
     crane = Crane()
     crane.run(done=lambda c: any(c._spools()))
     crane.run(3.0, lambda c: c.calibration._spool.closed)

@@ -83,12 +83,12 @@ def test_encoder_frames_become_joint_positions_over_time() -> None:
     assert np.max(np.abs(found.position - expected)) < 1e-3
 
 
-def test_an_encoder_that_is_not_heard_is_named() -> None:
+def test_an_encoder_without_frames_is_named() -> None:
     with pytest.raises(RecordingRefused, check=coded("demonstration.encoder-missing")):
         joint_track(PROFILE, CRANE, frames(shown(), without=Joint.TILT))
 
 
-def test_motions_are_cut_from_rest_to_rest_and_small_corrections_are_left_out() -> None:
+def test_motions_are_segmented_from_rest_to_rest_without_small_corrections() -> None:
     out, back = segment_motions(PROFILE, shown())
     assert out.time_s[0] == back.time_s[0] == 0.0
     assert out.time_s[-1] == pytest.approx(4.0, abs=0.7)
@@ -96,7 +96,7 @@ def test_motions_are_cut_from_rest_to_rest_and_small_corrections_are_left_out() 
     assert out.position[-1] == pytest.approx(back.position[0], abs=0.012)
 
 
-def test_what_brings_the_pin_nowhere_is_no_motion() -> None:
+def test_a_motion_that_does_not_move_the_pin_is_left_out() -> None:
     time_s = np.arange(0.0, 10.0, GRID_S)
     turned = REST + (0.2 * rise(time_s, 3.0, 6.0))[:, None] * np.array([1.0, 0.0, 0.0, 0.0])
     assert segment_motions(PROFILE, JointTrack(time_s, turned)) == ()
@@ -104,7 +104,7 @@ def test_what_brings_the_pin_nowhere_is_no_motion() -> None:
     assert len(segment_motions(PROFILE, JointTrack(time_s, enough))) == 1
 
 
-def test_a_still_machine_shows_nothing() -> None:
+def test_a_still_machine_gives_no_demonstration() -> None:
     still = JointTrack(np.arange(200) * GRID_S, np.tile(REST, (200, 1)))
     assert segment_motions(PROFILE, still) == ()
 
@@ -140,7 +140,7 @@ def test_a_file_of_demonstrations_reads_back(tmp_path: Path) -> None:
         "# demonstrations of aoro_fc8; x\nmotion,time_s,slew_rad,lift_rad,tilt_rad,ext_m\n1,2,x\n",
     ],
 )
-def test_another_file_is_refused_in_words(tmp_path: Path, text: str) -> None:
+def test_another_file_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "other.csv").write_text(text)
     with pytest.raises(RecordingRefused, check=lambda e: e.code in FILE_CODES and "other.csv" in str(e)):
         read_demonstrations(tmp_path / "other.csv")
@@ -161,7 +161,10 @@ def test_the_shipped_primitives_are_what_the_shipped_demonstrations_teach() -> N
 @pytest.mark.parametrize("x", [3.2, 4.6])
 @pytest.mark.parametrize("y", [-4.2, -2.6, 2.6, 4.2])
 def test_what_was_learned_leads_over_the_stakes_to_any_log_and_back(x: float, y: float) -> None:
-    move, log = PrimitiveMotions(movement_primitives.load(PROFILE)), ARM.compact_pose_above(x, y, 0.1, 3.0)._replace(rot_rad=0.4)
+    move, log = (
+        PrimitiveMotions(movement_primitives.load(PROFILE)),
+        ARM.compact_pose_above(x, y, 0.1, 3.0)._replace(rot_rad=0.4),
+    )
     for start, goal in ((OVER_BUNK, log), (log, OVER_BUNK)):
         motion = move(ARM, start, goal)
         q = np.array(motion.position)
@@ -194,13 +197,13 @@ def test_algorithm_1_opens_on_the_way_closes_there_and_opens_over_the_bunk() -> 
     assert out.motion.at(out.motion.duration_s + 1.0)[1] == (0.0,) * 5
 
 
-def test_a_log_out_of_reach_is_refused_in_words() -> None:
+def test_a_log_out_of_reach_is_refused() -> None:
     far = Pose(0.7, 12.0, 0.1, 2.5, 0.0)
     with pytest.raises(Unreachable, check=coded("reach.too-far")):
         PrimitiveMotions(movement_primitives.load(PROFILE))(ARM, OVER_BUNK, far)
 
 
-def test_one_way_alone_teaches_the_other_in_reverse() -> None:
+def test_one_direction_alone_teaches_the_other_in_reverse() -> None:
     _, motions = read_demonstrations(SHIPPED)
     out, _ = movement_primitives.split_by_direction(ARM, motions)
     learned = learn_primitives(PROFILE, out)
@@ -217,7 +220,7 @@ def test_motions_beside_the_bunk_teach_nothing() -> None:
         learn_primitives(PROFILE, segment_motions(PROFILE, beside))
 
 
-def test_a_file_of_primitives_is_taken_whole_or_refused_in_words(tmp_path: Path) -> None:
+def test_a_file_of_primitives_is_accepted_whole_or_refused(tmp_path: Path) -> None:
     file = tmp_path / "some.json"
     good = movement_primitives.load(PROFILE)
     file.write_bytes(movement_primitives.encode(good))

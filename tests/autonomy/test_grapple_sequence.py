@@ -1,4 +1,4 @@
-"""When tongs that let go may open on: not among what they left, however high a bunk or low a pile is."""
+"""The grapple: when opening jaws may open further, and what their report says."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from autonomy.crane_job.grapple import GrappleSequence, is_between_stakes
-from autonomy.grasp.grasp import Grasp
 from autonomy.grasp.grapple_heights import travel_height_m
+from autonomy.grasp.grasp import Grasp
 from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.perception.log_list.observation import LogObservation
@@ -25,7 +25,7 @@ PILE = Bunk((0.4, -2.9), 0.0, 3.0, 2.6, -1.4, 1.5)
 
 
 @pytest.mark.parametrize("bunk", [AORO.bunk, PILE])
-def test_they_are_among_it_until_open_tips_are_over_its_top(bunk: Bunk) -> None:
+def test_jaws_are_between_the_stakes_until_the_open_tips_are_above_them(bunk: Bunk) -> None:
     top = bunk.floor_z_m + bunk.stake_height_m + tip_below_pin_m(AORO.grapple.tongs, 0.0)
     high = travel_height_m(AORO)
     for above_m, among in ((-0.3, True), (-0.05, True), (0.05, False), (0.3, False)):
@@ -33,7 +33,7 @@ def test_they_are_among_it_until_open_tips_are_over_its_top(bunk: Bunk) -> None:
         assert is_between_stakes(ARM, bunk, tuple(q)) is among
 
 
-def test_beside_it_they_may_open_at_any_height() -> None:
+def test_beside_the_bunk_jaws_may_open_at_any_height() -> None:
     q = ARM.joints(np.array([ARM.pose_above(*PILE.center_m, 0.0, travel_height_m(AORO))]))[0].tolist()
     assert is_between_stakes(ARM, PILE, tuple(q)) and not is_between_stakes(ARM, AORO.bunk, tuple(q))
 
@@ -50,7 +50,7 @@ def test_beside_it_they_may_open_at_any_height() -> None:
         (nan, [0.13], 3, False),  # no sensor
     ],
 )
-def test_tongs_are_wide_by_what_they_are_to_hold(
+def test_jaws_stall_wide_by_what_they_should_hold(
     opening_pct: float, diameters_m: list[float], climbs: int, wide: bool
 ) -> None:
     logs = [LogObservation(i, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, d) for i, d in enumerate(diameters_m)]
@@ -69,7 +69,7 @@ def test_tongs_are_wide_by_what_they_are_to_hold(
         (nan, 0, 0.28, True, False),
     ],
 )
-def test_tongs_tell_that_they_have_missed(
+def test_jaws_tell_that_they_have_missed(
     opening_pct: float, state: int, diameter_m: float, drawn: bool, missed: bool
 ) -> None:
     log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, diameter_m)
@@ -80,7 +80,7 @@ def test_tongs_tell_that_they_have_missed(
 @pytest.mark.parametrize(
     ("state", "load_kg", "nothing"), [(4, 2.0, True), (4, 15.0, False), (5, 2.0, False), (4, nan, False)]
 )
-def test_shut_tongs_that_weigh_nothing_hold_nothing(state: int, load_kg: float, nothing: bool) -> None:
+def test_closed_jaws_that_weigh_nothing_hold_nothing(state: int, load_kg: float, nothing: bool) -> None:
     assert tongs_at(0.0, state, load_kg).holds_nothing is nothing
 
 
@@ -94,7 +94,7 @@ def test_shut_tongs_that_weigh_nothing_hold_nothing(state: int, load_kg: float, 
         ((nan, nan, nan), False),
     ],
 )
-def test_opening_tongs_that_come_to_bear_push(loads_kg: tuple[float, ...], pushed: bool) -> None:
+def test_opening_jaws_that_bear_a_load_push(loads_kg: tuple[float, ...], pushed: bool) -> None:
     tongs = tongs_at(nan)
     log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, 0.25)
     grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0)

@@ -66,7 +66,7 @@ def test_the_paper_s_parameters_layer_by_layer() -> None:
     assert parameter_count(PAPER) == 78_803
 
 
-def test_torch_says_the_same(arrays, picture, unchanged: GraspMaps) -> None:
+def test_torch_gives_the_same(arrays, picture, unchanged: GraspMaps) -> None:
     net = random_net(PAPER, 3).eval()
     with torch.inference_mode():
         wanted = stack_maps({name: v.numpy() for name, v in net(torch.from_numpy(picture)).items()})

@@ -6,8 +6,6 @@ from dataclasses import replace
 from math import hypot
 
 import pytest
-from crane_stand_in import TICK_NS, StandIn
-from grasp_scenes import PROFILE, pair
 
 from autonomy.crane_job.activity import DETECTION_TIMEOUT_NS, Activity
 from autonomy.crane_job.phases import Phase
@@ -17,6 +15,8 @@ from autonomy.grasp.selection import PlannerSelection
 from autonomy.perception.log_list.observation import TRIANGLE, LogObservation
 from machine.geometry.kinematics import Unreachable
 from machine.loading.profile_file import profile_hash
+from tests.autonomy.crane_stand_in import TICK_NS, StandIn
+from tests.autonomy.grasp_scenes import PROFILE, pair
 
 OFF_M = 0.09
 
@@ -63,7 +63,7 @@ def until(crane: StandIn, planner: Activity, phase: Phase) -> list[tuple[float, 
     return found
 
 
-def test_from_above_the_grasp_is_chosen_again_and_gone_over() -> None:
+def test_from_above_the_grasp_is_selected_again_and_approached() -> None:
     crane, planner = made()
     assert len(until(crane, planner, Phase.CLOSE)) > 1
     middle = sum(log.center_m[1] for log in crane.logs) / 2
@@ -72,13 +72,13 @@ def test_from_above_the_grasp_is_chosen_again_and_gone_over() -> None:
     assert phases.count("LOOK") and phases.index("DESCEND") > phases.index("ABOVE")
 
 
-def test_logs_that_nobody_measured_are_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unmeasured_logs_are_detected_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Camera, "seen", StandIn.seen)
     crane, planner = made()
     assert len(until(crane, planner, Phase.CLOSE)) == 1
 
 
-def test_where_nothing_is_seen_from_above_the_crane_goes_on_after_a_moment() -> None:
+def test_without_a_detection_from_above_the_crane_continues_after_a_moment() -> None:
     crane, planner = made()
     crane.covered = True
     until(crane, planner, Phase.ABOVE)
@@ -89,7 +89,7 @@ def test_where_nothing_is_seen_from_above_the_crane_goes_on_after_a_moment() -> 
     assert crane.now_ns - since_ns <= DETECTION_TIMEOUT_NS + 4 * TICK_NS
 
 
-def test_a_better_grasp_to_which_there_is_no_way_is_let_be(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_better_grasp_without_a_path_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     crane, planner = made()
     until(crane, planner, Phase.ABOVE)
 
@@ -101,7 +101,7 @@ def test_a_better_grasp_to_which_there_is_no_way_is_let_be(monkeypatch: pytest.M
     assert planner.failure is None
 
 
-def test_a_second_look_that_finds_no_grasp_changes_none() -> None:
+def test_a_reselection_that_finds_no_grasp_changes_none() -> None:
     sampling = SamplingPlanner()
     asked = []
 
@@ -120,7 +120,7 @@ def test_a_second_look_that_finds_no_grasp_changes_none() -> None:
 
 
 @pytest.mark.parametrize("better", [True, False])
-def test_where_a_camera_shows_no_grasp_it_is_asked_again_before_there_is_said_to_be_none(better: bool) -> None:
+def test_without_a_grasp_further_detections_are_used_before_the_job_fails(better: bool) -> None:
     sampling = SamplingPlanner()
     asked: list[int] = []
 
@@ -140,7 +140,7 @@ def test_where_a_camera_shows_no_grasp_it_is_asked_again_before_there_is_said_to
         assert asked[-1] - asked[0] == pytest.approx(DETECTION_TIMEOUT_NS, abs=3 * TICK_NS)
 
 
-def test_where_logs_are_told_exactly_there_is_none_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_exactly_known_logs_the_job_fails_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Camera, "seen", StandIn.seen)
 
     def refuse(request: GraspRequest) -> GraspCandidate:

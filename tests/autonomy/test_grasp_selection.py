@@ -8,7 +8,6 @@ from math import atan2, cos, pi, remainder, sin
 
 import numpy as np
 import pytest
-from crane_stand_in import GROUND_LOG, log_ends, over_bunk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,6 +22,7 @@ from autonomy.motion.pose import Pose
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.grapple import half_gap_m, lowest_tip_below_pin_m, tip_below_pin_m
 from machine.loading.profile_file import load_profile
+from tests.autonomy.crane_stand_in import GROUND_LOG, log_ends, over_bunk
 from tests.codes import coded
 
 PROFILE = load_profile("palms_471")
@@ -104,7 +104,9 @@ def test_the_closing_height_starts_at_rest_and_is_smooth() -> None:
 
 def test_a_log_on_others_is_gripped_at_its_own_height() -> None:
     high = replace(GROUND_LOG, center_m=(-1.8, 4.4, -0.9))
-    assert plan_single_log_grasp(ARM, high, 0.0).pose.z_m - plan_single_log_grasp(ARM, GROUND_LOG, 0.0).pose.z_m == pytest.approx(0.39)
+    assert plan_single_log_grasp(ARM, high, 0.0).pose.z_m - plan_single_log_grasp(
+        ARM, GROUND_LOG, 0.0
+    ).pose.z_m == pytest.approx(0.39)
 
 
 def test_a_log_whose_centre_is_just_out_of_reach_is_gripped_off_its_centre() -> None:
@@ -173,7 +175,7 @@ def test_a_place_is_above_what_is_in_the_bunk_until_the_bunk_is_full() -> None:
         plan_place(ARM, CraneJob(), grasp, layer(-BELOW_STAKE_TOP_M - radius_m + 0.01))
 
 
-def test_a_mission_may_name_the_place() -> None:
+def test_a_job_may_name_the_place() -> None:
     grasp = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
     assert ARM.xy(plan_place(ARM, CraneJob(place_m=(3.2, 1.0)), grasp, [])) == pytest.approx((3.2, 1.0))
     with pytest.raises(NoGrasp, check=coded("grasp.place-out-of-reach")):

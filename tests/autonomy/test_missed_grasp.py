@@ -6,8 +6,6 @@ from dataclasses import replace
 from math import hypot, nan, pi
 
 import pytest
-from crane_stand_in import StandIn
-from grasp_scenes import GROUND, PROFILE, log, measured, pair
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.cycle import EXTRACTION_DEPTH_M
@@ -22,6 +20,8 @@ from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import GrappleCommand, StateReport
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import profile_hash
+from tests.autonomy.crane_stand_in import StandIn
+from tests.autonomy.grasp_scenes import GROUND, PROFILE, log, measured, pair
 
 SHUT, HOLDING = 4, 5
 PINCH_RAD = 0.92  # of 2.25
@@ -51,11 +51,13 @@ def thick_pair() -> list[LogObservation]:
 
 
 def phases_until_lifted(crane: Slipping) -> list[Phase]:
-    phases = crane.until(Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner())), Phase.LIFT)
+    phases = crane.until(
+        Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner())), Phase.LIFT
+    )
     return phases[phases.index(Phase.CLOSE) :]
 
 
-def test_tongs_that_shut_on_nothing_open_look_and_close_again() -> None:
+def test_jaws_that_close_on_nothing_open_detect_and_close_again() -> None:
     crane = Slipping(PROFILE, thick_pair())
     assert phases_until_lifted(crane) == [Phase.CLOSE, Phase.ABOVE, Phase.DESCEND, Phase.CLOSE, Phase.LIFT]
     risen = [m for m in crane.trace if m.phase == "ABOVE"][-1]
@@ -63,14 +65,14 @@ def test_tongs_that_shut_on_nothing_open_look_and_close_again() -> None:
     assert risen.pin[2] > closed.pin[2] + 0.2 and risen.tong_rad < 0.2, "from above, and open"
 
 
-def test_after_some_times_the_crane_goes_up_all_the_same() -> None:
+def test_after_a_few_attempts_the_crane_lifts_anyway() -> None:
     crane = Slipping(PROFILE, thick_pair())
     crane.misses = 99
     assert phases_until_lifted(crane).count(Phase.CLOSE) == 1 + MAX_RESTARTS
 
 
 @pytest.mark.parametrize("known_how", ["told", "thin", "blind"])
-def test_what_nobody_measured_or_may_be_in_shut_tongs_is_lifted_as_it_is(known_how: str) -> None:
+def test_unmeasured_logs_and_what_closed_jaws_may_hold_are_lifted_as_they_are(known_how: str) -> None:
     thin = [replace(log, diameter_m=0.15) for log in pair()]
     crane = Slipping(PROFILE, thin if known_how == "thin" else thick_pair(), feedback=known_how != "blind")
     crane.measures = known_how != "told"
@@ -80,7 +82,7 @@ def test_what_nobody_measured_or_may_be_in_shut_tongs_is_lifted_as_it_is(known_h
 
 
 class Weighed(Slipping):
-    """With a load cell: tongs that shut on nothing weigh ``empty_kg`` as they rise."""
+    """With a load cell: jaws that closed on nothing weigh ``empty_kg`` as they rise."""
 
     empty_kg = 1.0
 
@@ -91,7 +93,7 @@ class Weighed(Slipping):
 
 
 @pytest.mark.parametrize(("empty_kg", "anew"), [(1.0, True), (12.0, False)])
-def test_shut_tongs_that_weigh_nothing_as_they_rise_are_sent_anew(empty_kg: float, anew: bool) -> None:
+def test_closed_jaws_that_weigh_nothing_as_they_rise_restart(empty_kg: float, anew: bool) -> None:
     crane = Weighed(PROFILE, [replace(log, diameter_m=0.15) for log in pair()], log_kg=40.0)
     crane.empty_kg = empty_kg
     planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(SamplingPlanner()))
@@ -105,15 +107,15 @@ def test_shut_tongs_that_weigh_nothing_as_they_rise_are_sent_anew(empty_kg: floa
 
 
 class Hiding(Weighed):
-    """The first log is hidden from the camera by tongs that have shut; another one lies in sight."""
+    """Closed jaws hide the first log from the camera; another one is in view."""
 
     def seen(self) -> tuple[LogObservation, ...]:
         return super().seen()[self.gripped :]
 
 
 @pytest.mark.parametrize(("weighs_kg", "follows"), [(20.0, Phase.CARRY), (9.0, Phase.LOOK), (nan, Phase.LOOK)])
-def test_a_thin_log_that_vanished_in_shut_tongs_is_carried_on_where_it_weighs(weighs_kg: float, follows: Phase) -> None:
-    """The controller says that tongs hold something from 30 kg on; a log of 20 kg was let go again, now and then."""
+def test_a_thin_log_hidden_in_closed_jaws_is_carried_on_where_it_weighs(weighs_kg: float, follows: Phase) -> None:
+    """The controller reports a held load from 30 kg on; a log of 20 kg was sometimes released again."""
     thin = replace(pair()[0], diameter_m=0.12)
     x, y, z = thin.center_m
     aside = replace(thin, id=thin.id + 7, center_m=(x, y - 2.0, z))
@@ -162,7 +164,7 @@ def test_a_log_that_is_pinched_in_its_row_is_dragged_out_and_gripped_there() -> 
     assert crane.pin()[1] == pytest.approx(pins[-1][1], abs=0.03), "it goes up from there"
 
 
-def test_tongs_that_draw_a_log_go_in_beside_it_before_they_close() -> None:
+def test_extracting_jaws_go_in_beside_the_log_before_they_close() -> None:
     pair_of = [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)]
     over = {}
     for draws in (True, False):
@@ -175,7 +177,7 @@ def test_tongs_that_draw_a_log_go_in_beside_it_before_they_close() -> None:
     assert over[False] > 0.15, "they sweep deeper as they close"
 
 
-def test_what_is_pinched_still_after_the_drag_is_looked_at_anew() -> None:
+def test_a_log_still_pinched_after_the_drag_is_detected_again() -> None:
     crane = Pinching(PROFILE, [log(0, -0.3, diameter=0.3), log(1, 0.0, diameter=0.3)])
     crane.free_m = 9.0
     planner = Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(extracting))
@@ -183,7 +185,7 @@ def test_what_is_pinched_still_after_the_drag_is_looked_at_anew() -> None:
     assert phases.count(Phase.ABOVE) == 1 + MAX_RESTARTS
 
 
-def test_where_no_better_grasp_is_seen_after_a_drag_the_old_one_is_closed_on_before_it_drags_again() -> None:
+def test_without_a_better_grasp_after_a_drag_the_old_one_closes_before_it_drags_again() -> None:
     asked = []
 
     def once(request: GraspRequest) -> GraspCandidate:

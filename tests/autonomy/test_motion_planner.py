@@ -40,8 +40,8 @@ def blocked(*_: object) -> None:
     raise PathBlocked("no path is clear: as requested", "motion.path-blocked")
 
 
-def test_ours_goes_down_to_the_log_in_one_and_with_it_into_the_bunk() -> None:
-    """On tyres to just above it: the machine leans, and the rest of the way is straight down."""
+def test_the_time_optimal_planner_goes_down_to_the_log_and_into_the_bunk_in_one_motion() -> None:
+    """On tyres to just above it: the machine leans, and the rest of the descent is vertical."""
     out = approach_motion(ARM, TimeOptimalPlanner(), PLACE, GRASP, [LOG])
     back = carry_motion(ARM, TimeOptimalPlanner(), GRASP.pose, PLACE, GRASP, [LOG], hangs=False)
     assert pins(out)[-1] == pytest.approx(GRASP.pose.at_height(GRASP.pose.z_m + MACHINE_LEAN_M)[:3], abs=1e-3)
@@ -51,7 +51,7 @@ def test_ours_goes_down_to_the_log_in_one_and_with_it_into_the_bunk() -> None:
     assert clearance_reserve(ARM, back, collision_scene(PROFILE), held)[0] >= -0.01
 
 
-def test_a_place_that_is_reached_from_above_alone_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_place_only_reachable_from_above_is_reached(monkeypatch: pytest.MonkeyPatch) -> None:
     def only_high(arm: Arm, start: Pose, goal: Pose, *more: object) -> object:
         if goal.z_m < HIGH:
             raise PathBlocked("too near to the stakes", "motion.path-blocked")
@@ -63,7 +63,7 @@ def test_a_place_that_is_reached_from_above_alone_is(monkeypatch: pytest.MonkeyP
     assert pins(motion)[-1] == pytest.approx((PLACE.slew_rad, PLACE.r_m, HIGH), abs=2e-3)
 
 
-def test_the_last_of_the_way_down_is_over_the_log() -> None:
+def test_the_end_of_the_descent_is_above_the_log() -> None:
     pin = pins(approach_motion(ARM, TimeOptimalPlanner(), PLACE, GRASP, [LOG]))
     aside = np.abs(pin[:, 1] - GRASP.pose.r_m)
     assert np.max(aside[pin[:, 2] < GRASP.pose.z_m + 0.3]) < 0.25
@@ -76,7 +76,7 @@ def test_among_other_logs_it_stops_above() -> None:
     assert pins(out)[-1, 2] == pytest.approx(hover_height_m(PROFILE, gathered), abs=1e-3)
 
 
-def test_where_no_swift_way_is_clear_the_one_at_full_height_is_taken_only_if_it_is(
+def test_where_no_fast_path_is_clear_the_one_at_full_height_replaces_it_only_if_clear(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(motion_planner, "plan_path", blocked)
@@ -89,13 +89,13 @@ def test_where_no_swift_way_is_clear_the_one_at_full_height_is_taken_only_if_it_
         TimeOptimalPlanner()(ARM, PLACE, OVER, stands, None, HIGH, 0.0)
 
 
-def test_a_search_for_a_way_comes_to_an_end() -> None:
+def test_a_path_search_ends() -> None:
     wall = [tree_capsule(2.0 + 0.3 * k, 2.2, 0.15, GROUND) for k in range(12)]
     with pytest.raises(PathBlocked):
         plan_path(ARM, PLACE, GRASP.pose, collision_scene(PROFILE, trees=wall))
 
 
-def test_paper_bs_way_is_the_primitive_unless_it_would_touch_something() -> None:
+def test_paper_bs_planner_uses_the_primitive_unless_it_would_touch_something() -> None:
     shown = MovementPrimitivePlanner(load(PROFILE))
     free = collision_scene(PROFILE)
     start = PLACE.at_height(PLACE.z_m + 0.9)
@@ -103,6 +103,6 @@ def test_paper_bs_way_is_the_primitive_unless_it_would_touch_something() -> None
     assert not shown.direct and clearance_reserve(ARM, motion, free)[0] >= -MARGIN_M
     assert motion != travel_over(ARM, start, OVER, HIGH, 0.0)
     z = pins(motion)[len(motion.position) // 2][2]
-    in_the_way = collision_scene(PROFILE, trees=[tree_capsule(*ARM.xy(ARM.pose(motion.position[len(motion.position) // 2])), 0.1,
-                                                   GROUND, z - GROUND - 0.3)])  # fmt: skip
+    middle = ARM.xy(ARM.pose(motion.position[len(motion.position) // 2]))
+    in_the_way = collision_scene(PROFILE, trees=[tree_capsule(*middle, 0.1, GROUND, z - GROUND - 0.3)])
     assert shown(ARM, start, OVER, in_the_way, None, HIGH, 0.0) == travel_over(ARM, start, OVER, HIGH, 0.0)

@@ -36,7 +36,7 @@ places = st.floats(-2.0, 2.0)
 
 
 @pytest.mark.parametrize("dmp", [SCALED, PLAIN])
-def test_it_shows_what_was_shown(dmp: Dmp) -> None:
+def test_it_reproduces_the_demonstration(dmp: Dmp) -> None:
     again = dmp.rollout(SHOWN[0], SHOWN[-1])
     assert again.duration_s == pytest.approx(6.0)
     assert np.max(np.abs(again.at(TIME_S) - SHOWN) / np.ptp(SHOWN, axis=0)) < 0.02
@@ -65,14 +65,14 @@ def test_the_other_side_is_the_mirror_image_and_the_height_stays_a_lift() -> Non
 
 
 @pytest.mark.parametrize("end", [0.1, 0.299999, 0.3, 0.300001, 0.5])
-def test_a_lift_that_ends_where_it_began_neither_blows_up_nor_turns_into_a_dip(end: float) -> None:
+def test_a_lift_that_ends_where_it_began_neither_diverges_nor_turns_into_a_dip(end: float) -> None:
     height = PLAIN.rollout(np.array([0.0, 0.3]), np.array([1.0, end])).position[:, 1]
     assert 0.55 < height.max() < 1.0
     assert height.min() > min(0.3, end) - 0.05
 
 
 def test_the_classic_factor_would_have_made_it_a_dip() -> None:
-    """The trap itself: a lift learned in shares of its way turns over with the sign of the way."""
+    """The trap itself: a lift learned in shares of its travel flips with the sign of the travel."""
     classic = learn([(TIME_S, SHOWN)], (True, True), least_way=0.05)
     assert classic.rollout(np.array([0.0, 0.3]), np.array([1.0, 0.4])).position[:, 1].min() < 0.05
 
@@ -96,7 +96,7 @@ def test_it_agrees_with_the_library_as_installed() -> None:
     assert np.max(np.abs(PLAIN.rollout(SHOWN[0], goal).at(time_s) - theirs) / size) < 0.03
 
 
-def test_a_motion_is_the_same_at_any_rate_and_at_any_pace() -> None:
+def test_a_motion_is_the_same_at_any_sampling_and_duration() -> None:
     motion = SCALED.rollout(SHOWN[0], SHOWN[-1])
     coarse, fine = motion.at(np.arange(0.0, 6.0, 0.5)), motion.at(np.arange(0.0, 6.0, 0.005))
     assert coarse == pytest.approx(fine[::100])
@@ -113,7 +113,7 @@ def test_demonstrations_count_alike_and_the_duration_is_their_mean() -> None:
     assert np.max(np.abs(position - SCALED.rollout(SHOWN[0], SHOWN[-1]).position)) < 0.01
 
 
-def test_what_teaches_nothing_is_refused_in_words() -> None:
+def test_demonstrations_that_teach_nothing_are_refused() -> None:
     flat = SHOWN.copy()
     flat[:, 0] = 0.2
     cases = {

@@ -10,17 +10,17 @@ from hypothesis.extra.numpy import arrays
 from scipy.optimize import minimize_scalar
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.distances import motion_between_samples, clearances, least_clearance, segment_box, segment_segment
+from autonomy.motion.distances import clearances, least_clearance, motion_between_samples, segment_box, segment_segment
 from autonomy.motion.obstacles import (
     Box,
-    HeldLog,
     Capsule,
     CollisionScene,
+    HeldLog,
     SweptCapsules,
     bunk_boxes,
     carrier_boxes,
-    held_log,
     collision_scene,
+    held_log,
     swept_capsules,
     tree_capsule,
 )
@@ -65,7 +65,7 @@ def one(a: tuple[float, ...], b: tuple[float, ...], radius: float) -> SweptCapsu
     return SweptCapsules(np.array([[a]]), np.array([[b]]), np.array([radius]), ("thing",), np.array([True]))
 
 
-def test_ground_box_and_rod_are_measured_to_the_skin() -> None:
+def test_ground_box_and_capsule_are_measured_to_the_surface() -> None:
     around = CollisionScene(
         -1.0,
         (Box("crate", (2.0, 0.0, 0.0), (0.5, 0.1, 0.5), np.pi / 2),),
@@ -79,7 +79,9 @@ def test_ground_box_and_rod_are_measured_to_the_skin() -> None:
 
 def test_a_bound_never_claims_more_than_the_distance() -> None:
     rng = np.random.default_rng(3)
-    body = SweptCapsules(*rng.normal(size=(2, 20, 3, 3)) * 3.0, rng.uniform(0.05, 0.3, 3), ("a", "b", "c"), np.ones(3, bool))
+    body = SweptCapsules(
+        *rng.normal(size=(2, 20, 3, 3)) * 3.0, rng.uniform(0.05, 0.3, 3), ("a", "b", "c"), np.ones(3, bool)
+    )
     logs = [LogObservation(i, tuple(rng.normal(size=3) * 3), (1.0, 0.0, 0.0), 2.0, 0.2) for i in range(5)]
     around = collision_scene(AORO, logs)
     exact, quick = clearances(around, body), clearances(around, body, 0.5)
@@ -123,7 +125,7 @@ def test_the_carrier_stands_where_the_plant_has_it() -> None:
     assert carrier_boxes(PALMS) == ()
 
 
-def test_a_held_log_hangs_under_the_pin_across_the_tongs() -> None:
+def test_a_held_log_hangs_under_the_pin_across_the_jaws() -> None:
     arm = Arm(AORO)
     pose = arm.pose_above(4.0, 3.0, 1.0, 3.0)
     q = arm.joints(np.array([pose]))
@@ -148,7 +150,9 @@ def test_a_log_is_held_where_it_lay_whichever_way_it_is_taken(turned: float, sen
     log = LogObservation(0, (4.0, 3.0, -1.0), axis, 2.0, 0.25)
     pose = arm.pose_above(4.0 + 0.2 * np.cos(0.4), 3.0 + 0.2 * np.sin(0.4), 0.3, 3.0)
     pose = pose._replace(rot_rad=0.45 - pose.slew_rad + np.pi / 2 + np.pi / 2 + turned)  # 0.05 rad askew
-    body = swept_capsules(AORO, arm.joints(np.array([pose])), np.array([[*arm.xy(pose), pose.z_m]]), held_log(arm, pose, log))
+    body = swept_capsules(
+        AORO, arm.joints(np.array([pose])), np.array([[*arm.xy(pose), pose.z_m]]), held_log(arm, pose, log)
+    )
     ends = np.array([body.a[0, -1, :2], body.b[0, -1, :2]])
     expected = np.array(log.center_m[:2]) + np.array([[-1.0], [1.0]]) * 0.875 * np.array([np.cos(0.4), np.sin(0.4)])
     assert sorted(map(tuple, ends.round(6))) == sorted(map(tuple, expected.round(6)))

@@ -1,4 +1,4 @@
-"""Ways that touch nothing: as fast as may be where the way is free, over or around where it is not."""
+"""Collision-free paths: fastest where the path is free, over or around obstacles where it is not."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from math import cos, sin
 
 import numpy as np
 import pytest
-from motion_figures import figures
 
 from autonomy.grasp.grapple_heights import travel_height_m
 from autonomy.motion import clearance
@@ -23,6 +22,7 @@ from machine.geometry.kinematics import Unreachable
 from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile, joint
+from tests.autonomy.motion_figures import figures
 from tests.codes import coded
 
 PALMS, AORO = load_profile("palms_471"), load_profile("aoro_fc8")
@@ -89,7 +89,7 @@ def test_a_log_goes_over_the_stakes_and_touches_nothing(profile: Profile, seed: 
 
 @pytest.mark.parametrize("profile", [PALMS, AORO], ids=lambda p: p.name)
 @pytest.mark.parametrize("seed", [11, 12, 13, 14])
-def test_whoever_looks_finds_limits_kept_and_nothing_touched(profile: Profile, seed: int) -> None:
+def test_random_paths_keep_limits_and_touch_nothing(profile: Profile, seed: int) -> None:
     arm, ends = ARMS[profile.name], places(profile, seed)
     start, goal = ends if seed % 2 else reversed(ends)
     around, held = collision_scene(profile, logs_about(profile, seed)), LOG if seed % 2 else None
@@ -108,7 +108,7 @@ def test_it_is_no_slower_than_always_at_the_greatest_height(profile: Profile) ->
 
 
 @pytest.mark.parametrize("profile", [PALMS, AORO], ids=lambda p: p.name)
-def test_where_the_way_is_free_it_goes_straight(profile: Profile) -> None:
+def test_where_the_path_is_free_it_goes_straight(profile: Profile) -> None:
     arm = ARMS[profile.name]
     start, _ = places(profile, 5)
     goal = start._replace(slew_rad=start.slew_rad - 0.3, z_m=start.z_m + 0.3)
@@ -152,7 +152,7 @@ def test_a_tree_between_two_places_is_gone_around() -> None:
     assert_kept(AORO, path.motion, start, goal)
 
 
-def test_what_cannot_be_passed_is_named_in_a_sentence() -> None:
+def test_an_obstacle_that_cannot_be_passed_is_named() -> None:
     arm, (start, goal) = ARMS["aoro_fc8"], beside()
     wall = [
         Capsule(f"tree {i}", (r * cos(0.75), r * sin(0.75), -1.15), (r * cos(0.75), r * sin(0.75), 12.0), 0.3)
@@ -170,7 +170,7 @@ def test_an_end_out_of_reach_is_refused_as_such() -> None:
     assert not isinstance(refused.value, PathBlocked)
 
 
-def test_higher_ground_lifts_the_way() -> None:
+def test_higher_ground_lifts_the_path() -> None:
     arm, (start, goal) = ARMS["aoro_fc8"], beside()
 
     def hill(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -182,13 +182,13 @@ def test_higher_ground_lifts_the_way() -> None:
     assert high[:, 2].max() > low[:, 2].max() + 0.3
 
 
-def test_standing_still_is_a_way() -> None:
+def test_standing_still_is_a_path() -> None:
     arm, (start, _) = ARMS["palms_471"], places(PALMS, 8)
     path = plan_path(arm, start, start, collision_scene(PALMS))
     assert np.ptp(np.array(path.motion.position), axis=0) == pytest.approx(np.zeros(5))
 
 
-def test_from_a_landing_into_a_full_bunk_the_way_is_over_the_stakes_not_around_them() -> None:
+def test_from_a_landing_into_a_full_bunk_the_path_is_over_the_stakes_not_around_them() -> None:
     # Begun before the tongs are up, this way is too near to the load: it is the rise that must be done first.
     bunk = AORO.bunk
     heap = [(0.33 * i - 0.8, bunk.floor_z_m + 0.13 + 0.2 * row) for row in range(4) for i in range(5)]
@@ -200,7 +200,7 @@ def test_from_a_landing_into_a_full_bunk_the_way_is_over_the_stakes_not_around_t
     assert path.name == "over" and path.motion.duration_s < 12.0
 
 
-def test_a_slow_lift_keeps_the_arms_limits_however_short_it_is_asked_to_be() -> None:
+def test_a_slow_lift_keeps_the_arms_limits_however_short_its_requested_time() -> None:
     arm = ARMS["aoro_fc8"]
     start = arm.pose_above(2.4, 0.3, 0.4, travel_height_m(AORO))
     goal = start.at_height(travel_height_m(AORO))

@@ -1,4 +1,4 @@
-"""Open tongs pressed into a heap: where, how deep, and what happens when nothing comes up."""
+"""Grasps that penetrate a pile: where, how deep, and what happens when nothing comes up."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from math import hypot, inf, pi, remainder
 
 import numpy as np
 import pytest
-from crane_stand_in import StandIn
-from grasp_scenes import PROFILE as PALMS
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.grasp_verification import is_at_target
@@ -25,6 +23,8 @@ from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.loading.profile_file import load_profile, profile_hash
 from machine.profile import Bunk
+from tests.autonomy.crane_stand_in import StandIn
+from tests.autonomy.grasp_scenes import PROFILE as PALMS
 from tests.codes import coded
 
 AORO = load_profile("aoro_fc8")
@@ -50,7 +50,7 @@ def planner() -> PilePlanner:
     return PilePlanner(SamplingPlanner())
 
 
-def test_a_heap_is_pressed_into_and_several_logs_are_between_the_tongs() -> None:
+def test_a_pile_is_penetrated_and_several_logs_are_between_the_jaws() -> None:
     logs = heap()
     p = planner()(GraspRequest(ARM, logs, 0.0))
     assert p.penetrates and len(p.logs) >= 2 and "\n" not in p.reason
@@ -75,7 +75,7 @@ def test_logs_that_lie_on_no_others_are_left_to_the_other_planner() -> None:
     assert not p.penetrates and p == SamplingPlanner()(GraspRequest(ARM, row(0, 3, 0), 0.0))
 
 
-def test_a_row_of_which_no_grasp_is_safe_is_pressed_into() -> None:
+def test_a_row_without_a_safe_grasp_is_penetrated() -> None:
     def never(request: GraspRequest) -> GraspCandidate:
         raise NoGrasp("grasp.none-safe", "no grasp of the 6 logs is safe")
 
@@ -108,12 +108,12 @@ def test_a_log_that_only_rolled_has_not_come_up() -> None:
     assert hypot(first.x_m - second.x_m, first.y_m - second.y_m) > FAILED_RADIUS_M / 2
 
 
-def test_the_same_heap_gives_the_same_grasp() -> None:
+def test_the_same_pile_gives_the_same_grasp() -> None:
     assert planner()(GraspRequest(ARM, heap(), 0.0)) == planner()(GraspRequest(ARM, heap(), 0.0))
 
 
 class Resisting(StandIn):
-    """A crane that a heap does not let down farther than ``floor_z_m``."""
+    """A crane that a pile stops at ``floor_z_m``."""
 
     floor_z_m = -inf
 
@@ -125,7 +125,7 @@ class Resisting(StandIn):
 
 
 @pytest.mark.parametrize(("pressed", "short_m"), [(True, 0.12), (True, 0.4), (False, 0.12)])
-def test_tongs_that_rest_on_wood_close_there_where_they_were_pressed(pressed: bool, short_m: float) -> None:
+def test_penetrating_jaws_that_rest_on_wood_close_there(pressed: bool, short_m: float) -> None:
     logs = [LogObservation(0, (-1.8, 4.4, -1.29), (0.6, 0.8, 0.0), 2.6, 0.2)]
 
     def chooser(arm, mission, seen, slew, rot):  # type: ignore[no-untyped-def]
@@ -156,7 +156,7 @@ def test_a_log_that_rolls_beside_a_landing_is_laid_down_but_not_one_that_still_h
     assert not is_at_target(unloading, pile, replace(rolled, center_m=(*BUNK.center_m, 0.6)))
 
 
-def test_no_place_is_pressed_into_where_a_log_that_is_to_stay_is_between_the_tongs() -> None:
+def test_no_place_with_a_log_that_must_stay_between_the_jaws_is_penetrated() -> None:
     logs = heap()
     taken = planner()(GraspRequest(ARM, logs, 0.0)).logs
     other = planner()(GraspRequest(ARM, logs, 0.0, stay=taken[:1]))

@@ -8,16 +8,16 @@ from dataclasses import replace
 from math import atan2, cos, degrees, pi, remainder, sin
 
 import pytest
-from crane_stand_in import StandIn
 from hypothesis import given
 from hypothesis import strategies as st
-from test_activity_blind import HOME, Blind, birch
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.rotator_estimate import SCALE_BOUNDS, RotatorEstimate, has_no_encoder, planning_profile
 from machine.geometry.grapple import grapple_yaw
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile, profile_hash
+from tests.autonomy.crane_stand_in import StandIn
+from tests.autonomy.test_activity_blind import HOME, Blind, birch
 
 FORWARDER, LOADER = load_profile("aoro_fc8"), load_profile("palms_471")
 ANGLE = st.floats(-pi, pi)
@@ -25,7 +25,7 @@ ROTATORS = st.builds(RotatorEstimate, ANGLE, ANGLE, st.tuples(st.floats(*SCALE_B
 
 
 class Drifting(Blind):
-    """Its rotator makes only part of every turn, and a log that it grips lies across its tongs."""
+    """Its rotator makes only part of every turn, and a gripped log lies across its jaws."""
 
     made = (0.85, 0.7)
     """Of turns to the negative and to the positive side."""
@@ -54,7 +54,7 @@ class Drifting(Blind):
 
 
 def askew_deg(count: int, learns: bool) -> list[float]:
-    """How far each log of a row of jobs was askew between the tongs."""
+    """How far each log of a series of jobs was askew between the jaws."""
     crane, rests, rotator, found = Drifting(FORWARDER, [], q=HOME), HOME, None, []
     for seed in range(count):
         crane.logs = [birch(seed)]
@@ -66,7 +66,7 @@ def askew_deg(count: int, learns: bool) -> list[float]:
     return found
 
 
-def test_the_count_is_set_right_by_every_log() -> None:
+def test_every_log_corrects_the_count() -> None:
     learned = askew_deg(7, learns=True)
     assert max(learned[2:]) < 8.0
     assert max(askew_deg(7, learns=False)) > 20.0, "without it the count drifts"
@@ -80,13 +80,13 @@ def test_count_and_angle_are_inverse(rotator: RotatorEstimate, angle: float) -> 
 
 
 @given(ROTATORS, ANGLE, ANGLE)
-def test_what_is_seen_leaves_the_count_within_a_quarter_turn_of_the_angle(rotator, sent, angle) -> None:
+def test_observations_keep_the_count_within_a_quarter_turn_of_the_angle(rotator, sent, angle) -> None:
     seen = rotator.corrected(sent, angle)
     assert abs(seen.angle(sent) - sent) <= pi / 2 + 1e-9
     assert all(SCALE_BOUNDS[0] <= pace <= SCALE_BOUNDS[1] for pace in seen.paces)
 
 
-def test_repeated_looks_find_how_much_of_a_turn_is_made() -> None:
+def test_repeated_observations_find_the_ratio_of_angle_to_count() -> None:
     made, true, rotator, sent = (0.8, 1.1), 0.3, RotatorEstimate(), 0.0
     for goal in 4 * (1.5, -1.0, 1.2, -0.8, 1.0, -1.4):
         before, sent = sent, rotator.sent(goal)
@@ -96,7 +96,7 @@ def test_repeated_looks_find_how_much_of_a_turn_is_made() -> None:
     assert remainder(rotator.angle(sent) - true, pi) == pytest.approx(0.0, abs=0.02)
 
 
-def test_a_counted_rotator_is_planned_within_half_its_range_and_no_faster_than_it_may_be_sent() -> None:
+def test_a_rotator_without_encoder_is_planned_within_half_its_range_and_its_command_limit() -> None:
     whole, slow = FORWARDER.joints["rot"], planning_profile(FORWARDER, RotatorEstimate(paces=(0.9, 0.8))).joints["rot"]
     assert (slow.lower, slow.upper) == (whole.lower / 2, whole.upper / 2)
     assert slow.speed_limit == pytest.approx(0.8 * whole.speed_limit)
@@ -104,7 +104,7 @@ def test_a_counted_rotator_is_planned_within_half_its_range_and_no_faster_than_i
     assert has_no_encoder(FORWARDER) and planning_profile(LOADER, RotatorEstimate(paces=(0.9, 0.8))) is LOADER
 
 
-def test_a_measured_rotator_is_left_as_it_is() -> None:
+def test_a_rotator_with_encoder_is_left_as_it_is() -> None:
     crane = StandIn(LOADER, [replace(birch(0), center_m=(-1.8, 4.4, -1.29), length_m=2.6, diameter_m=0.2)])
     planner = Activity(LOADER, profile_hash(LOADER))
     crane.run(planner)

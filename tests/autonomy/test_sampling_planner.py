@@ -7,7 +7,6 @@ from math import atan2, pi, remainder
 
 import numpy as np
 import pytest
-from grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
 
 from autonomy.grasp.cylinders import CovarianceError, as_cylinders, default_covariance, sample_cylinders
 from autonomy.grasp.grapple_heights import hover_height_m
@@ -23,6 +22,7 @@ from autonomy.perception.log_list.estimate import LogEstimate
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import load_profile
+from tests.autonomy.grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
 from tests.codes import coded
 
 JAWS = jaws_of(PROFILE)
@@ -33,7 +33,11 @@ def planned(logs: list[LogObservation]) -> GraspCandidate:
 
 
 def is_safe(
-    logs: list[LogObservation], across_m: float, yaw: float = pi / 2, level: float = GROUND, rule: CaptureRule = STRICT_RULE
+    logs: list[LogObservation],
+    across_m: float,
+    yaw: float = pi / 2,
+    level: float = GROUND,
+    rule: CaptureRule = STRICT_RULE,
 ) -> bool:
     world = as_cylinders(logs)
     at = blade_sections(JAWS, world, np.array([X]), np.array([Y + across_m]), np.array([yaw]))
@@ -65,7 +69,7 @@ def test_a_thick_log_beside_a_thin_one_does_not_lie_on_it() -> None:
     assert rests_upon(as_cylinders(small_pile())).tolist() == [[False, False, True], [False, False, True], [False] * 3]
 
 
-def test_a_single_log_is_taken_across_its_middle() -> None:
+def test_a_single_log_is_gripped_across_its_middle() -> None:
     turned = log(7, yaw=0.6)
     p = planned([turned])
     assert p.logs == (0,) and p.probability > 0.9
@@ -102,8 +106,8 @@ def test_the_rule(logs: list[LogObservation], across_m: float, yaw: float, safe:
     assert is_safe(logs, across_m, yaw) is safe
 
 
-def test_no_log_is_drawn_from_under_another() -> None:
-    """(c): the lower log alone between the tongs, the upper one far off its middle across it."""
+def test_no_log_is_pulled_from_under_another() -> None:
+    """(c): the lower log alone between the jaws, the upper one far off its middle across it."""
     under, over = log(0), log(1, 0.0, 0.2, yaw=pi / 2, along_m=0.8)
     assert is_safe([under], 0.0)
     assert not is_safe([under, over], 0.0)
@@ -126,7 +130,7 @@ def _both(at: object) -> tuple[object]:
     return (type(at)(*(getattr(at, f.name)[:, None, :] for f in fields(at))),)  # type: ignore[arg-type]
 
 
-def test_what_perception_is_unsure_of_makes_a_grasp_less_probable() -> None:
+def test_uncertain_perception_makes_a_grasp_less_probable() -> None:
     wide = LogEstimate(np.zeros(3), np.ones(3), 1.0, 0.1, np.diag([0.3, 0.05, 0.2, 0.05, 0.2, 0.2, 0.02]) ** 2)
     known = wide.observation(0).covariance
     unsure = [replace(o, covariance=known) for o in pair()]
@@ -150,7 +154,7 @@ def test_a_machine_on_wheels_takes_the_ground_from_the_logs(sunk_m: float) -> No
     assert alone.support_z_m == pytest.approx(ground + 0.3, abs=1e-3), "it lies on a bank"
 
 
-def test_draws_have_the_spread_they_are_asked_for() -> None:
+def test_samples_have_the_requested_spread() -> None:
     world = as_cylinders([log(0, yaw=0.8)])
     sigma = np.sqrt(np.diag(default_covariance(log(0))))
     drawn = sample_cylinders(world, np.diag(sigma**2)[None], 4000, 3)
@@ -175,7 +179,7 @@ def test_higher_logs_out_of_reach_hide_none_in_reach() -> None:
     assert planned([*far, log(12)]).logs == (12,)
 
 
-def test_nothing_to_take_is_said_in_one_sentence() -> None:
+def test_nothing_to_grip_is_one_error() -> None:
     with pytest.raises(NoGrasp, check=coded("grasp.no-log-in-view")):
         planned([])
     standing = replace(log(0), axis=(0.0, 0.1, 0.995))
@@ -195,14 +199,14 @@ def test_a_proposal_becomes_a_grasp_of_several_logs() -> None:
     assert restricted_to(ARM, grasp, [0, 1, 2]) is grasp
 
 
-def test_a_mission_that_names_its_log_is_served_directly() -> None:
+def test_a_job_that_names_its_log_is_served_directly() -> None:
     grasp = PlannerSelection(SamplingPlanner())(ARM, CraneJob(log_id=1), pair(), 0.0, 0.0)
     assert [o.id for o in grasp.logs] == [1] and not grasp.is_bundle
     opening = grasp.pose.slew_rad + grasp.pose.rot_rad
     assert abs(remainder(opening - atan2(0.0, 1.0), pi)) == pytest.approx(pi / 2)
 
 
-def test_what_is_to_stay_is_never_taken_and_still_in_the_way() -> None:
+def test_a_log_that_must_stay_is_never_taken_and_still_an_obstacle() -> None:
     apart = [log(0, -0.3), log(1, 0.3)]
     assert SamplingPlanner()(GraspRequest(ARM, apart, 0.0)).logs == (0, 1)
     p = SamplingPlanner()(GraspRequest(ARM, apart, 0.0, stay={0}))
@@ -213,14 +217,14 @@ def test_what_is_to_stay_is_never_taken_and_still_in_the_way() -> None:
         SamplingPlanner()(GraspRequest(ARM, pair(), 0.0, stay=(0, 1)))
 
 
-def test_nothing_is_taken_from_under_a_log_that_is_to_stay() -> None:
+def test_nothing_is_taken_from_under_a_log_that_must_stay() -> None:
     logs = small_pile()
     assert 2 not in SamplingPlanner()(GraspRequest(ARM, [*logs[:2], log(2, 1.0)], 0.0, stay=(2,))).logs
     with pytest.raises(NoGrasp):
         SamplingPlanner()(GraspRequest(ARM, logs, 0.0, stay=(2,)))
 
 
-def test_a_mission_says_which_logs_are_left_by_their_numbers() -> None:
+def test_a_job_names_the_logs_that_stay_by_their_numbers() -> None:
     apart = [log(7, -0.3), log(8, 0.3)]
     grasp = PlannerSelection(SamplingPlanner())(ARM, CraneJob(leave=(7,)), apart, 0.0, 0.0)
     assert grasp.log.id == 8 and not grasp.others
@@ -239,7 +243,7 @@ def measured(logs: list[LogObservation]) -> list[LogObservation]:
     return [replace(o, covariance=well.observation(0).covariance) for o in logs]
 
 
-def test_tongs_are_pressed_into_a_heap_that_a_camera_measured_but_not_into_the_ground() -> None:
+def test_jaws_penetrate_a_pile_that_a_camera_measured_but_not_the_ground() -> None:
     heap = [*(log(i, 0.21 * i) for i in range(-3, 4)), log(9, 0.105, 0.18)]
     known, seen = planned(heap), planned(measured(heap))
     assert known.logs == seen.logs == (7,)
@@ -249,7 +253,7 @@ def test_tongs_are_pressed_into_a_heap_that_a_camera_measured_but_not_into_the_g
     assert not whole.penetrates and whole.support_z_m == pytest.approx(GROUND, abs=1e-3)
 
 
-def test_tongs_are_not_pressed_in_over_a_log_that_lies_across() -> None:
+def test_jaws_do_not_penetrate_over_a_log_that_lies_across() -> None:
     """They would take it, too, and hang askew."""
     row = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
     on_top = log(9, 0.0, 0.22)
@@ -260,8 +264,8 @@ def test_tongs_are_not_pressed_in_over_a_log_that_lies_across() -> None:
     assert planned(measured([*row, on_top])).penetrates
 
 
-def test_what_floats_in_the_air_is_not_gripped_and_in_nobody_s_way() -> None:
-    """A glimpse of the crane's own tongs, as a camera that looked past them once measured it."""
+def test_a_floating_log_is_neither_gripped_nor_an_obstacle() -> None:
+    """A detection of the crane's own jaws, as a camera once measured it."""
     ghost = LogObservation(9, (X, Y, GROUND + 1.6), (-0.8, 0.38, -0.46), 1.92, 0.09)
     logs = measured(pair())
     alone, haunted = planned(logs), planned([ghost, *logs])
@@ -274,7 +278,7 @@ def test_what_floats_in_the_air_is_not_gripped_and_in_nobody_s_way() -> None:
 WALL = [log(i, 0.24 * i, diameter=0.24) for i in range(-3, 4)]
 
 
-def test_a_log_is_drawn_out_of_a_row_that_is_too_wide() -> None:
+def test_a_log_is_extracted_from_a_row_that_is_too_wide() -> None:
     with pytest.raises(NoGrasp, check=coded("grasp.none-safe")):
         planned(WALL)
     p = planned(measured(WALL))
@@ -298,14 +302,14 @@ def on_top(a: LogObservation, b: LogObservation) -> LogObservation:
     return replace(a, id=8, center_m=(x, 0.5 * (ya + yb), z + 0.21))
 
 
-def test_where_no_grasp_is_safe_a_camera_s_logs_are_gripped_at_the_top_all_the_same() -> None:
+def test_without_a_safe_grasp_camera_measured_logs_are_gripped_at_the_top() -> None:
     p = SamplingPlanner()(GraspRequest(ARM, measured(WALL), 0.0, stay=(0, 6)))
     assert p.probability == 0.3 and len(p.logs) == 1 and "\n" not in p.reason
     one = WALL[p.logs[0]]
     assert np.hypot(p.x_m - one.center_m[0], p.y_m - one.center_m[1]) < 0.01
 
 
-def test_on_wheels_nothing_is_pressed_lower_than_the_lowest_log() -> None:
+def test_on_wheels_nothing_penetrates_below_the_lowest_log() -> None:
     arm = Arm(load_profile("aoro_fc8"))
     x, y = arm.profile.workspace.pick_center_m
     logs = measured([LogObservation(i, (x, y + 0.25 * i, -1.0), (1.0, 0.0, 0.0), 2.6, 0.2) for i in range(-4, 5)])

@@ -7,14 +7,14 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from grasp_scenes import GROUND, log, small_pile
 from hypothesis import given
 from hypothesis import strategies as st
 
 from autonomy.grasp.cylinders import Cylinders, as_cylinders, default_covariance
-from autonomy.grasp.settled_poses import CONTACT_OVERLAP_M, surface_gaps, settled_poses
+from autonomy.grasp.settled_poses import CONTACT_OVERLAP_M, settled_poses, surface_gaps
 from autonomy.perception.log_list.estimate import ACROSS_2, RADIUS, TILT_2
 from autonomy.perception.log_list.observation import LogObservation
+from tests.autonomy.grasp_scenes import GROUND, log, small_pile
 
 WELL = np.array([0.012, 0.018, 0.007, 0.017, 0.02, 0.03, 0.005])
 """Standard deviations of a log that a surveyed camera sees whole, in the order of ``LogEstimate``, ..."""
@@ -58,7 +58,7 @@ def test_a_log_on_others_stays_there_however_badly_its_height_is_known() -> None
     assert laid(pile, *ground, unsure)[0].center[2] == pytest.approx(top, abs=0.02)
 
 
-def test_what_raises_all_logs_alike_is_taken_from_those_on_others_too() -> None:
+def test_a_common_height_error_is_removed_from_the_logs_on_others_too() -> None:
     pile = small_pile()
     known = np.sqrt(np.diag(default_covariance(pile[0])))
     known[ACROSS_2] = 0.04
@@ -81,7 +81,7 @@ def test_logs_that_lie_on_something_else_are_left_alone() -> None:
     assert sigma == pytest.approx(np.stack([np.diag(WELL**2)] * 3))
 
 
-def test_of_two_logs_in_each_other_the_less_known_gives_way() -> None:
+def test_of_two_overlapping_logs_the_less_certain_moves() -> None:
     world, _ = laid([log(0), log(1, 0.12)], WELL, HIDDEN)
     assert surface_gaps(world)[0, 1] == pytest.approx(-CONTACT_OVERLAP_M, abs=0.005)
     assert world.center[0] == pytest.approx(as_cylinders([log(0)]).center[0], abs=0.01)
@@ -93,7 +93,7 @@ def test_of_two_logs_in_each_other_the_less_known_gives_way() -> None:
     spread=st.floats(0.0, 0.5),
     sizes=st.lists(st.floats(0.06, 0.5), min_size=5, max_size=5),
 )
-def test_whatever_is_seen_what_comes_out_is_finite_and_no_less_sure(
+def test_any_input_gives_finite_estimates_that_are_no_less_certain(
     heights: list[float], spread: float, sizes: list[float]
 ) -> None:
     logs = [log(i, spread * i, z, 0.3 * i, sizes[i]) for i, z in enumerate(heights)]

@@ -13,8 +13,8 @@ from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.motion.time_law import SWING_RAD, PathGeometry, swing_free_law
 from autonomy.motion.trajectory import STEP_S, Trajectory, straight_line
-from machine.joints import JOINTS
 from machine.geometry.kinematics import pin_position
+from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile, joint
 
@@ -124,7 +124,7 @@ def test_any_straight_motion_keeps_limits_and_swing(name: str, slew: float, near
     assert max(swing_left_rad(crane.profile, motion, p) for p in (1.53, 1.75, 2.05)) < 1.2 * SWING_RAD
 
 
-def test_an_equal_way_has_an_equal_law_and_a_point_has_none() -> None:
+def test_equal_paths_have_equal_laws_and_a_point_has_none() -> None:
     start, end = trial(GOALS[0])
     first, again = (straight_line(Arm(FORWARDER.profile), start, end) for _ in range(2))
     assert first.position == again.position and first.velocity == again.velocity

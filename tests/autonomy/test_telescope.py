@@ -12,10 +12,10 @@ from autonomy.grasp.grapple_heights import travel_height_m
 from autonomy.motion.arm import Arm
 from autonomy.motion.arm_kinematics import STOP_MARGIN
 from autonomy.motion.pose import Pose
-from autonomy.motion.telescope import OUTER_RESERVE_M, with_fastest_extensions, fastest_extension, full_speed_times
+from autonomy.motion.telescope import OUTER_RESERVE_M, fastest_extension, full_speed_times, with_fastest_extensions
 from autonomy.motion.trajectory import Trajectory, hold, with_rotation
-from machine.joints import Joint
 from machine.geometry.kinematics import Unreachable
+from machine.joints import Joint
 from machine.loading.profile_file import load_profile
 from machine.profile import joint_limits
 
@@ -32,7 +32,7 @@ def worked_s(via: tuple[Pose, ...]) -> float:
 
 
 @pytest.mark.parametrize("height_m", [2.6, 3.0])
-def test_an_eased_way_leaves_less_to_do_and_only_its_corners_change(height_m: float) -> None:
+def test_chosen_extensions_leave_less_work_and_change_only_the_corners(height_m: float) -> None:
     plain = way(height_m)
     easy = with_fastest_extensions(AORO, plain)
     assert worked_s(easy) < 0.9 * worked_s(plain)
@@ -42,12 +42,12 @@ def test_an_eased_way_leaves_less_to_do_and_only_its_corners_change(height_m: fl
     assert all(low + STOP_MARGIN < p.ext_m < high - STOP_MARGIN for p in easy)
 
 
-def test_a_way_without_corners_or_out_of_reach_stays_as_it_is() -> None:
+def test_a_path_without_corners_or_out_of_reach_stays_as_it_is() -> None:
     assert with_fastest_extensions(AORO, (START, GOAL)) == (START, GOAL)
     assert with_fastest_extensions(AORO, way(9.0)) == way(9.0)
 
 
-def test_over_a_log_the_telescope_is_out_for_a_fast_way_home() -> None:
+def test_above_a_log_the_telescope_is_out_for_a_fast_path_home() -> None:
     high_m, home_m = travel_height_m(AORO.profile), hypot(*AORO.profile.bunk.center_m)
     pose = AORO.pose_above(3.3, 3.0, 0.2, high_m)
     short = pose._replace(ext_m=0.05)

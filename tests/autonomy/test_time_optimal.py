@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from autonomy.motion.arm import Arm
-from autonomy.motion.time_optimal import STEP_S, time_optimal_law
 from autonomy.motion.time_law import SWING_RAD, PathGeometry, swing_free_law
+from autonomy.motion.time_optimal import STEP_S, time_optimal_law
 from machine.joints import N_JOINTS
 from machine.loading.profile_file import load_profile
 
@@ -64,12 +64,12 @@ def test_without_regard_to_swing_it_is_as_fast_as_the_slow_law(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_a_calm_way_takes_a_second_longer_than_the_slow_law_at_most(name: str) -> None:
+def test_a_level_path_takes_at_most_a_second_longer_than_the_slow_law(name: str) -> None:
     way = way_over(name)
     assert time_optimal_law(ARMS[name], way).duration_s < swing_free_law(way).duration_s + 1.3
 
 
-def test_a_vertical_way_needs_no_window() -> None:
+def test_a_vertical_path_needs_no_window() -> None:
     arm = ARMS["palms_471"]
     low = np.array(arm.pose_above(-1.8, 4.4, 0.0, 1.6))
     way = PathGeometry(arm, low + np.linspace(0.0, 1.0, 81)[:, None] * np.array([0.0, 0.0, 1.2, 0.0, 0.0]))
@@ -78,11 +78,12 @@ def test_a_vertical_way_needs_no_window() -> None:
     assert law.duration_s < 1.08 * swing_free_law(way).duration_s
 
 
-def test_a_way_too_short_to_swing_anything_is_driven_as_fast_as_one_that_goes_straight_up() -> None:
+def test_a_path_too_short_to_swing_anything_is_as_fast_as_a_vertical_one() -> None:
     arm = ARMS["palms_471"]
     low = np.array(arm.pose_above(-1.8, 4.4, 0.0, 1.6))
     up, aside = (
-        PathGeometry(arm, low + np.linspace(0.0, 1.0, 81)[:, None] * np.array([0.0, r_m, 1.2, 0.0, 0.0])) for r_m in (0.0, 0.015)
+        PathGeometry(arm, low + np.linspace(0.0, 1.0, 81)[:, None] * np.array([0.0, r_m, 1.2, 0.0, 0.0]))
+        for r_m in (0.0, 0.015)
     )
     assert swing_free_law(aside).duration_s < swing_free_law(up).duration_s + 0.05
     pin = aside.curve(np.linspace(0.0, 1.0, 2))[:, N_JOINTS:]

@@ -24,12 +24,12 @@ from machine.geometry.kinematics import Unreachable, pin_position
 from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile
 from machine.profile import joint
+from tests.codes import coded
 
 PROFILE = load_profile("palms_471")
 ARM = Arm(PROFILE)
 TOP = 1.65
 FINE_S = 0.005
-from tests.codes import coded
 
 
 def poses(slew: float = 1.6) -> st.SearchStrategy[Pose]:
@@ -143,7 +143,7 @@ def test_hold_stands_still() -> None:
     assert all(motion.at(t) == (q, (0.0,) * 5) for t in (-1.0, 0.0, 0.01, 1.0))
 
 
-def test_follow_fades_a_wrong_start_out() -> None:
+def test_a_wrong_start_fades_out() -> None:
     path = ARM.pose_above(-1.8, 4.4, -0.1, TOP)
     start = path._replace(slew_rad=path.slew_rad + 0.01, z_m=path.z_m + 0.05)
     motion = follow_path(ARM, start, lambda t: path.at_height(path.z_m + 0.02 * t), 3.0, 1.0)
@@ -151,7 +151,7 @@ def test_follow_fades_a_wrong_start_out() -> None:
     assert ARM.pose(motion.at(2.0)[0]) == pytest.approx(path.at_height(path.z_m + 0.04), abs=1e-6)
 
 
-def test_a_pose_outside_the_limits_is_refused_in_words() -> None:
+def test_a_pose_outside_the_limits_is_refused() -> None:
     near = ARM.pose_above(-1.8, 4.4, -0.1, TOP)
     with pytest.raises(Unreachable, check=coded("reach.too-far")):
         straight_line(ARM, near, near._replace(r_m=9.0))
@@ -159,7 +159,7 @@ def test_a_pose_outside_the_limits_is_refused_in_words() -> None:
         ARM.pose_above(0.5, -4.0, -0.1, TOP)
 
 
-def test_a_brisk_turn_is_the_same_turn_in_less_time_and_within_the_limits() -> None:
+def test_a_quick_turn_is_the_same_turn_in_less_time_and_within_the_limits() -> None:
     arm = Arm(load_profile("aoro_fc8"))
     start = np.array([0.0, 0.3, -1.5, 0.5, 0.0])
     slow = joint_motion(arm, start, start + np.array([1.5, 0.2, 0.1, 0.4, 0.7]))

@@ -7,14 +7,14 @@ from math import pi
 
 import numpy as np
 import pytest
-from valve_stand_in import StandIn
 
-from autonomy.calibration.spool_program import PULSES
 from autonomy.calibration.result import identify
+from autonomy.calibration.spool_program import PULSES
 from autonomy.calibration.tasks import Findings
 from autonomy.calibration.turn_fit import YAW_SIGMA_RAD, Turn, TurnFit, fit_turns, pulse_to
 from machine.joints import Joint
 from machine.loading.profile_file import load_profile
+from tests.autonomy.valve_stand_in import StandIn
 
 AORO = load_profile("aoro_fc8")
 ROT = AORO.joints["rot"]
@@ -78,25 +78,24 @@ def test_half_turns_are_not_mistaken_on_a_machine_far_from_its_profile() -> None
     assert abs(stood[-1]) < 0.15
 
 
-def test_single_readings_of_a_person_are_enough_to_be_believed() -> None:
+def test_single_readings_of_a_person_are_plausible() -> None:
     turns, _ = surveyed(SLOW_PLUS, readings=1)
     result = identify(AORO, Findings(turns=turns))
     assert result.turns is not None and result.implausible == ()
     assert max(errors(result.turns, SLOW_PLUS)[1]) < 0.1
 
 
-def test_without_turns_a_side_is_as_the_profile_has_it() -> None:
+def test_without_turns_a_side_keeps_the_profiles_values() -> None:
     fit = fit_turns([], ROT)
     assert (fit.plus.deadband, fit.minus.full_speed) == (0.01 * ROT.valve.deadband_plus_pct, ROT.valve.full_speed_minus)
     assert fit.angle_rad == 0.0
 
 
-def test_what_cannot_be_believed_of_turns_is_said() -> None:
+def test_implausible_turns_are_reported() -> None:
     turns, _ = surveyed(SLOW_PLUS)
     wrong = [*turns[:-2], replace(turns[-2], after_rad=turns[-2].after_rad + 0.9), turns[-1]]
-    sentences = identify(AORO, Findings(turns=wrong)).implausible
-    assert any("rot plus" in s for s in sentences), sentences
+    problems = identify(AORO, Findings(turns=wrong)).implausible
+    assert any("rot plus" in problem.sentence for problem in problems), problems
     crawling, _ = surveyed(replace(SLOW_PLUS, full_speeds=(0.8, 2.35)))
-    sentences = identify(AORO, Findings(turns=crawling)).implausible
-    assert any("full speed over the profile's 0.4" in s for s in sentences), sentences
-    assert any("faster than the other" in s for s in sentences), sentences
+    problems = identify(AORO, Findings(turns=crawling)).implausible
+    assert {"implausible.out-of-range", "implausible.sides-differ"} <= {problem.code for problem in problems}, problems

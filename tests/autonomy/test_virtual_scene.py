@@ -6,7 +6,6 @@ from math import cos, hypot, pi, remainder, sin
 
 import numpy as np
 import pytest
-from grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,6 +26,7 @@ from autonomy.grasp.virtual_scene import (
 from autonomy.motion.arm import Arm
 from autonomy.perception.log_list.observation import LogObservation
 from machine.loading.profile_file import load_profile
+from tests.autonomy.grasp_scenes import ARM, GROUND, PROFILE, X, Y, cross, log, pair, small_pile
 from tests.codes import coded
 
 JAWS = jaws_of(PROFILE)
@@ -145,7 +145,7 @@ def test_the_shipped_weights_from_physical_labels_close_across_a_log_near_its_mi
     assert abs(remainder(p.yaw_rad - yaw - pi / 2, pi)) < 0.25
 
 
-def test_on_wheels_the_lowest_log_tells_where_the_ground_is() -> None:
+def test_on_wheels_the_lowest_log_gives_the_ground() -> None:
     arm = Arm(load_profile("aoro_fc8"))
     x, y = arm.profile.workspace.pick_center_m
     one = LogObservation(0, (x, y, arm.profile.workspace.ground_z_m + 0.2), (1.0, 0.0, 0.0), 2.6, 0.2)
@@ -185,7 +185,7 @@ def test_predictions_are_averaged_where_they_belong() -> None:
     assert mean.q[149:152, 149:152].sum() == pytest.approx(1.0) and mean.q[150, 150] >= 0.25
 
 
-def test_the_network_plans_as_if_logs_that_are_to_stay_were_not_there() -> None:
+def test_the_network_plans_as_if_logs_that_must_stay_were_not_there() -> None:
     logs = [log(0, -0.4), log(1), log(2, 0.4)]
     planner = CnnPlanner(Chosen(150.0, 150.0, pi / 2))
     without = planner(GraspRequest(ARM, [logs[1]], 0.0))

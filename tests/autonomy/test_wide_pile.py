@@ -1,22 +1,22 @@
-"""A heap too wide for the tongs: these stall at its sides, open again and close higher up, round what lies on top."""
+"""A pile too wide for the jaws: these stall at its sides, open again and close higher up, around what lies on top."""
 
 from __future__ import annotations
 
 from itertools import pairwise
 
 import pytest
-from crane_stand_in import StandIn
-from grasp_scenes import GROUND, PROFILE, measured, small_pile
 
 from autonomy.crane_job.activity import Activity
 from autonomy.crane_job.grasp_recovery import MAX_REGRIPS_HIGHER
 from autonomy.crane_job.phases import Phase
-from autonomy.grasp.selection import PlannerSelection
 from autonomy.grasp.sampling_planner import SamplingPlanner
+from autonomy.grasp.selection import PlannerSelection
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import GrappleCommand
 from machine.geometry.grapple import tip_below_pin_m
 from machine.loading.profile_file import profile_hash
+from tests.autonomy.crane_stand_in import StandIn
+from tests.autonomy.grasp_scenes import GROUND, PROFILE, measured, small_pile
 
 STALL_RAD = 0.5  # of 2.25: opened by four fifths
 
@@ -47,7 +47,7 @@ def driven(heap: Heap) -> tuple[list[Phase], Activity]:
     return phases[phases.index(Phase.DESCEND) :], planner
 
 
-def test_tongs_that_stall_at_the_sides_of_a_heap_close_higher_up() -> None:
+def test_jaws_that_stall_at_the_sides_of_a_pile_close_higher_up() -> None:
     heap = Heap(PROFILE, small_pile())
     phases, _ = driven(heap)
     closes = [i for i, p in enumerate(phases) if p is Phase.CLOSE]
@@ -58,20 +58,20 @@ def test_tongs_that_stall_at_the_sides_of_a_heap_close_higher_up() -> None:
     assert all(after - before == pytest.approx(0.1, abs=0.02) for before, after in pairwise(lows))
 
 
-def test_a_heap_that_gives_way_slowly_is_not_let_go() -> None:
+def test_a_pile_that_yields_slowly_is_not_released() -> None:
     heap = Heap(PROFILE, small_pile())
     heap.gives_rad = 0.002
     assert driven(heap)[0].count(Phase.CLOSE) == 1
     assert heap.tong_rad > STALL_RAD + 0.1
 
 
-def test_what_gives_nowhere_is_lifted_after_all() -> None:
+def test_a_pile_that_never_yields_is_lifted_after_all() -> None:
     heap = Heap(PROFILE, small_pile())
     heap.shoulder_m = 9.0
     assert driven(heap)[0].count(Phase.CLOSE) == 1 + MAX_REGRIPS_HIGHER
 
 
-def test_logs_that_nobody_measured_and_tongs_without_a_sensor_are_lifted_as_they_are() -> None:
+def test_unmeasured_logs_and_jaws_without_a_sensor_are_lifted_as_they_are() -> None:
     known, blind = Heap(PROFILE, small_pile()), Heap(PROFILE, small_pile(), feedback=False)
     known.measures = False
     for heap in (known, blind):
