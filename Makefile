@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help setup demo test check lint bench soak lab-kernel clean
+.PHONY: help setup demo test check lint docs bench soak lab-kernel clean
 
 help:  ## show this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -19,7 +19,7 @@ setup: $(VENV)/.ready  ## create the virtual environment from the pinned constra
 demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--lockstep", ARGS="--bus vcan", ...
 	@$(BIN)/timberhand demo $(ARGS)
 
-test: lint  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
+test: lint docs  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
 	@sh deploy/debian_packages.sh
 	@$(BIN)/pytest -m "not slow" -n 2 $(ARGS) || [ $$? -eq 5 ]
 	@$(BIN)/pytest -m "slow and computed" -n 2 $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
@@ -34,6 +34,10 @@ lint: setup  ## style, types and the three floors
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-cache
 
+docs: setup  ## build the site into docs/_build; broken links and stale reference pages are errors
+	@$(BIN)/python -m timberhand.reference --check
+	@$(BIN)/sphinx-build -W --keep-going -q docs docs/_build && echo "docs/_build/index.html"
+
 bench: setup  ## measure: codecs beside cantools, the bus beside python-can, the plant against real time
 	@$(BIN)/timberhand bench codec $(ARGS)
 	@$(BIN)/timberhand bench bus $(ARGS)
@@ -47,4 +51,4 @@ lab-kernel:  ## build the vcan lab's own kernel with simulated time, once (minut
 	@sh deploy/lab_kernel/build.sh
 
 clean:  ## remove the virtual environment and everything generated
-	rm -rf $(VENV) build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build docs/_build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

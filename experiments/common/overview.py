@@ -60,12 +60,12 @@ def page(results: Mapping[str, Result], pages: Collection[str]) -> str:
             f"| `{result.commit}` |"
         )
     lines += ["", "## Compared with the papers", "", "| | metric | paper | here |", "|---|---|---|---|"]
-    for name, result, metric in _metrics(results):
+    for name, result, metric in metrics_of(results):
         if metric.name in result.paper:
             here = metric.text(result.metrics[metric.name]) + result.interval_text(metric)
             lines.append(f"| {links[name]} | {metric.title} | {metric.text(result.paper[metric.name])} | {here} |")
     lines += ["", "## Missed limits", "", "| | metric | measured | limit |", "|---|---|---|---|"]
-    for name, result, metric in _metrics(results):
+    for name, result, metric in metrics_of(results):
         if metric.name in result.missed:
             here = metric.text(result.metrics[metric.name]) + result.interval_text(metric)
             lines.append(f"| {links[name]} | {metric.title} | {here} | {metric.limit_text()} |")
@@ -82,7 +82,7 @@ def _conclusion(results: Mapping[str, Result]) -> str:
     )
 
 
-def _metrics(results: Mapping[str, Result]) -> Iterator[tuple[str, Result, Metric]]:
+def metrics_of(results: Mapping[str, Result]) -> Iterator[tuple[str, Result, Metric]]:
     """All metrics that are in a result, in the order of their pages."""
     for name, result in results.items():
         module = import_module(EXPERIMENTS[name].module)

@@ -1,4 +1,4 @@
-"""Writes the generated pages of docs/reference, or with ``--check`` says which ones are stale.
+"""Writes the generated reference pages and the README's table of results, or with ``--check`` says which are stale.
 
 Exit codes: 0 fine, 2 usage, 6 a page is stale (``--check``).
 """
@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from host.exit_codes import ExitCode
-from timberhand.reference import cli_page, errors_page, faults_page, frames_page, transitions_page
+from timberhand.reference import cli_page, errors_page, faults_page, frames_page, results_table, transitions_page
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -24,7 +24,8 @@ def pages(repository: Path = REPOSITORY) -> dict[Path, str]:
         "frames": frames_page.page(),
         "transitions": transitions_page.page(),
     }
-    return {repository / "docs" / "reference" / f"{name}.md": text for name, text in made.items()}
+    reference = {repository / "docs" / "reference" / f"{name}.md": text for name, text in made.items()}
+    return reference | {repository / "README.md": results_table.readme(repository)}
 
 
 def stale(repository: Path = REPOSITORY) -> list[Path]:
