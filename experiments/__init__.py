@@ -1,1 +1,1 @@
-"""Experiments: repeatable commands that measure, judge against a limit, and write result.json, plots and docs."""
+"""Experiments: repeatable commands that measure, compare with limits, and write result.json, plots and a page."""

@@ -37,16 +37,16 @@ def run_mission(job: Job, mission: ForwardingMission, site: Site) -> dict[str, A
                 run = MissionRun(mission, name, profile, plant, None, display, o["way"], site, o["eyes"], job.seed)
                 observer = GroundTruthObserver(run, profile, LocalPlane(site.latitude_deg, site.longitude_deg))
                 summary = run.run(o["limit_s"], "", observer.step)
-            verdict, lying = plant.evaluate(), plant.logs()
+            evaluation, lying = plant.evaluate(), plant.logs()
             plane = LocalPlane(site.latitude_deg, site.longitude_deg)
             landings = [plane.local(x.position.latitude_deg, x.position.longitude_deg)[:2] for x in mission.landings]
             return {
                 **summary_of(summary),
                 "logs": [
                     {"place_m": [s.x_m, s.y_m, s.yaw_rad], "size_m": [s.length_m, s.diameter_m],
-                     "detected": i in observer.known, "in_bunk": verdict.logs[i].in_bunk,
+                     "detected": i in observer.known, "in_bunk": evaluation.logs[i].in_bunk,
                      "lies_m": [[round(v, 3) for v in at] for at in (lying[i].position_m, *lying[i].ends_m)],
-                     "landed": not verdict.logs[i].in_bunk
+                     "landed": not evaluation.logs[i].in_bunk
                      and any(math.dist(lying[i].position_m[:2], at) < LANDED_M for at in landings)}
                     for i, s in enumerate(site.logs)
                 ],

@@ -179,8 +179,8 @@ def _attempt(job: Job, name: str, field: int) -> dict[str, Any]:
                 break
         ground = profile.workspace.ground_z_m
         up = lifted(before, plant.logs(), ground) if planner_run.over(system.now_ns) else []
-        verdict = plant.evaluate()
-        up = [i for i in up if verdict.logs[i].left_ground or not verdict.logs[i].max_grip_n]
+        evaluation = plant.evaluate()
+        up = [i for i in up if evaluation.logs[i].left_ground or not evaluation.logs[i].max_grip_n]
         p, seen = timed.proposal, planner_run.seen
         wrong = misled(before, seen.logs)
         rise = [now.position_m[2] - was.position_m[2] for was, now in zip(before, plant.logs(), strict=True)]

@@ -128,10 +128,10 @@ class Driver:
 
         The grapple is open before.  Returns the telescope position of the motion.
         """
-        tongs = self.world.profile.grapple.tongs
+        jaws = self.world.profile.grapple.tongs
         floor = ground_m + CLEARANCE_M
-        low = floor + tip_below_pin_m(tongs, 0.0)
-        top = max(hover_m, lift_to_m, floor + lowest_tip_below_pin_m(tongs))
+        low = floor + tip_below_pin_m(jaws, 0.0)
+        top = max(hover_m, lift_to_m, floor + lowest_tip_below_pin_m(jaws))
         ext = self.extension_for(x, y, low, top)
         above = self.pose((x, y, hover_m), ext)
         self.move({**above, "rot": self.rotator(above["slew"], log_yaw)})
@@ -150,8 +150,8 @@ class Driver:
         The tips stay ``floor_m`` above the base: closed tips are lowered to this height, and while they open and sweep
         lower the pin rises, so that the load is laid down and not dropped.
         """
-        tongs = self.world.profile.grapple.tongs
-        low = floor_m + tip_below_pin_m(tongs, self.world.jaw_angle_rad)
+        jaws = self.world.profile.grapple.tongs
+        low = floor_m + tip_below_pin_m(jaws, self.world.jaw_angle_rad)
         ext = self.extension_for(x, y, low, carry_m)
         above = self.pose((x, y, carry_m), ext)
         self.move({**above, "rot": self.rotator(above["slew"], log_yaw)})
@@ -163,11 +163,11 @@ class Driver:
         self.line((x, y, z), (x, y, carry_m), ext)
 
     def _open_while_raising(self, x: float, y: float, z: float, floor: float, ext: float) -> float:
-        tongs = self.world.profile.grapple.tongs
+        jaws = self.world.profile.grapple.tongs
         self.grapple = OPENING
         for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
             angle = self.world.jaw_angle_rad
-            wanted = floor + max(tip_below_pin_m(tongs, angle - ahead) for ahead in LOOK_AHEAD_RAD)
+            wanted = floor + max(tip_below_pin_m(jaws, angle - ahead) for ahead in LOOK_AHEAD_RAD)
             z = max(z, min(wanted, z + RAISE_SPEED_M_S * STEP_S))
             self._follow((x, y, z), ext)
             if angle < RELEASED_RAD:
@@ -177,12 +177,12 @@ class Driver:
 
     def _close_while_raising(self, x: float, y: float, z: float, floor: float, ext: float) -> float:
         """Close until the jaws stop on a load; the tips sweep lower, so the pin rises meanwhile."""
-        world, tongs = self.world, self.world.profile.grapple.tongs
+        world, jaws = self.world, self.world.profile.grapple.tongs
         self.grapple = -0.7
         still_s = 0.0
         for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
             angle = world.jaw_angle_rad
-            wanted = floor + max(tip_below_pin_m(tongs, angle + ahead) for ahead in LOOK_AHEAD_RAD)
+            wanted = floor + max(tip_below_pin_m(jaws, angle + ahead) for ahead in LOOK_AHEAD_RAD)
             z = max(z, min(wanted, z + RAISE_SPEED_M_S * STEP_S))
             self._follow((x, y, z), ext)
             moving = abs(world.qd["tong_left"]) + abs(world.qd["tong_right"]) > STILL_RAD_S

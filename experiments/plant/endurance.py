@@ -77,12 +77,12 @@ def shift(job: Job) -> dict[str, Any]:
 
 def _lay_down(world: World, driver: Driver, rng: random.Random) -> None:
     """Lay the load down at a random place of the pick area in a random direction."""
-    space, tongs = world.profile.workspace, world.profile.grapple.tongs
-    tips = lowest_tip_below_pin_m(tongs)
+    space, jaws = world.profile.workspace, world.profile.grapple.tongs
+    tips = lowest_tip_below_pin_m(jaws)
     while True:
         x, y = (c + rng.uniform(-1.0, 1.0) * space.pick_half_size_m for c in space.pick_center_m)
         floor = space.ground_z_m + LAY_DOWN_M
-        low, high = floor + tip_below_pin_m(tongs, world.jaw_angle_rad), floor + tips + 0.8
+        low, high = floor + tip_below_pin_m(jaws, world.jaw_angle_rad), floor + tips + 0.8
         try:
             driver.extension_for(x, y, low, high)
         except Unreachable:

@@ -27,8 +27,8 @@ SECTIONS: Final = (
         "Grasping",
         "A grasp works by friction and shape alone: no constraint is ever made between grapple and log, and the "
         "hydraulics are in the loop. Every trial has new logs. An open-loop driver moves the crane. It knows the "
-        "profile and the joint positions that encoders show. It is told once where to grasp, with an error of 4 cm in "
-        "x and y and of 4 deg in yaw (one sigma), and once, before unloading, how the log hangs.",
+        "profile and the joint positions that encoders show. It receives the grasp target once, with an error of 4 cm "
+        "in x and y and of 4 deg in yaw (one sigma), and once, before unloading, the position of the hanging log.",
         (
             Metric("single_success", "Single log lifted", "%",
                    "At least half a metre off the ground one second after the lift.",

@@ -66,10 +66,10 @@ def grasp(job: Job) -> dict[str, Any]:
             unload(world, driver, hanging)
             for _ in range(UNLOADED_S):
                 driver.wait(1.0)
-                verdict = evaluator.evaluate()
-                if all(v.at_rest for v in verdict.logs):
+                evaluation = evaluator.evaluate()
+                if all(v.at_rest for v in evaluation.logs):
                     break
-            outcome["in_bunk"] = sum(v.done for v, h in zip(verdict.logs, held, strict=True) if h)
+            outcome["in_bunk"] = sum(v.done for v, h in zip(evaluation.logs, held, strict=True) if h)
         last = evaluator.evaluate()
         outcome |= {
             "penetration_m": last.max_penetration_m,

@@ -1,4 +1,4 @@
-"""The crane-accuracy experiment: the judge of the shortest time, what a motion was worth, its planner, the command."""
+"""The crane-accuracy experiment: the shortest time, metrics of a motion, its planner, the command."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def test_metrics_are_means_over_the_points_of_their_variant():
 
 
 class Echo:
-    """A controller whose joints stand where the newest setpoint says, the lift ``off_rad`` beside it."""
+    """A controller whose joints are at the newest setpoint, the lift ``off_rad`` off."""
 
     def __init__(self) -> None:
         self.mode, self.load_kg, self.off_rad = Mode.ARMED, 0.0, 0.0

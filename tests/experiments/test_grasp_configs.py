@@ -1,4 +1,4 @@
-"""The grasping experiment: its words from plain states, its metrics from plain outcomes, and one whole attempt."""
+"""The grasping experiment: categories of grasps, metrics from plain outcomes, and one complete attempt."""
 
 from __future__ import annotations
 

@@ -19,6 +19,7 @@ from autonomy.networks.weights import load
 from experiments.common.registry import Options
 from experiments.grasp_network import experiment, folds, latency
 from host.exit_codes import CommandFailed, ExitCode
+from tests.codes import coded
 from timberhand.commands import train
 from training.grasp.cornell import load as load_samples
 
@@ -85,7 +86,7 @@ def test_any_folder_in_the_layout_is_evaluated(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_samples_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CommandFailed, match="no Cornell samples") as stopped:
+    with pytest.raises(CommandFailed, check=coded("dataset.no-samples")) as stopped:
         experiment.run(options(tmp_path, data=tmp_path / "none"), QUIET)
     assert stopped.value.exit_code == ExitCode.CONFIGURATION
 
@@ -100,7 +101,7 @@ def test_a_checkpoint_belongs_to_its_seed_schedule_and_data(tmp_path: Path) -> N
 
 
 def test_the_shipped_weights_close_across_a_log() -> None:
-    """They never saw one; what they learnt holds because depth is told relative to the ground."""
+    """They were never trained on one; it works because depth is relative to the ground."""
     net = GraspNet.shipped()
     for depth, _ in latency.log_scenes(3, 9)[::4]:  # one log each
         logs = binary_dilation(normalized_relief(depth) > 1.0, iterations=5)
@@ -122,7 +123,7 @@ def test_scenes_are_reproducible() -> None:
 def test_train_needs_data() -> None:
     done = CliRunner().invoke(train.app, ["grasp", "--data", "/nowhere"])
     assert isinstance(done.exception, CommandFailed) and done.exception.exit_code == ExitCode.CONFIGURATION
-    assert "/nowhere: no Cornell samples" in str(done.exception)
+    assert done.exception.code == "dataset.no-samples" and "/nowhere" in str(done.exception)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The joint-tracking experiment: its motions, one trial on the physics, what is gathered, and the command."""
+"""The joint-tracking experiment: its motions, one trial on the physics, its metrics, and the command."""
 
 import json
 import math

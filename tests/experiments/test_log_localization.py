@@ -1,4 +1,4 @@
-"""The log-localization experiment: its site, its judge, its page, and a quick run."""
+"""The log-localization experiment: its site, its metrics, its page, and a quick run."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The navigation experiment: its measures on drives whose answers are known, and one drive on the buses."""
+"""The navigation experiment: its measures on drives with known answers, and one drive on the buses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The measurement of the bus: its traffic, that every path takes all of it, and the verdict.  No times."""
+"""The benchmark of receiving frames: its traffic, complete reception on every path, and its limit.  No times."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from can_dbc.protocols.e2e import Checker, Status
 from experiments.timing import receive_cost
 from experiments.timing.receive_cost import LIMIT_US, Traffic, measure
 from host.exit_codes import CommandFailed, ExitCode
+from tests.codes import coded
 from timberhand.commands.bench import app
 
 TICKS = 40
@@ -22,15 +23,15 @@ TICKS = 40
 def test_the_traffic_is_what_the_controller_receives() -> None:
     """Every message at its cycle time, every value in range, every counter in step."""
     database = load("crane")
-    heard = {c.key: c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders}
-    per_second = sum(10**9 // codec.cycle_time_ns for codec in heard.values())
-    checkers = {key: Checker(codec.data_ids) for key, codec in heard.items() if codec.data_ids}
+    received = {c.key: c for c in database.messages.values() if c.cycle_time_ns and "CTRL" not in c.senders}
+    per_second = sum(10**9 // codec.cycle_time_ns for codec in received.values())
+    checkers = {key: Checker(codec.data_ids) for key, codec in received.items() if codec.data_ids}
     frames = Traffic(database).take(per_second * TICKS // 200)
     for key, count in Counter(key for key, _ in frames).items():
-        assert abs(count - TICKS * 5_000_000 / heard[key].cycle_time_ns) <= 1
+        assert abs(count - TICKS * 5_000_000 / received[key].cycle_time_ns) <= 1
     first = set()
     for key, data in frames:
-        assert None not in heard[key].receive(data)
+        assert None not in received[key].receive(data)
         if key in checkers:
             assert checkers[key].check(data) is (Status.OK if key in first else Status.INITIAL)
             first.add(key)
@@ -51,7 +52,7 @@ def test_every_path_receives_every_frame(result: dict[str, Any]) -> None:
 def test_a_path_that_loses_a_frame_ends_the_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
     take = Traffic.take
     monkeypatch.setattr(Traffic, "take", lambda self, count: take(self, count)[:-1])
-    with pytest.raises(CommandFailed, match="13 of 14 frames"):
+    with pytest.raises(CommandFailed, check=coded("receive-cost.frames-missing")):
         measure(frames=30, rounds=3)
 
 
