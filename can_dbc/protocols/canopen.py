@@ -1,8 +1,8 @@
-"""CANopen on the fast path: NMT, heartbeat, emergency, encoder position and expedited SDO as pure functions.
+"""CANopen on the fast path: NMT, heartbeat, emergency and expedited SDO as pure functions.
 
 Frames are ``(key, data)`` with keys of ``can_dbc.frame``; time is ``now_ns``, monotonic.  Nothing here waits: an SDO
 transfer is a request frame now and a response frame in a later tick.  Parsing a frame of another kind returns None,
-never raises.  Sources: CiA 301 4.2 (sections 7.2.4, 7.2.8), CiA 406.
+never raises.  Sources: CiA 301 4.2 (sections 7.2.4, 7.2.8).
 """
 
 from __future__ import annotations
@@ -182,34 +182,6 @@ class HeartbeatMonitor:
         return tuple(n for n in self._timeouts_ns if self.presence(n, now_ns) >= Presence.LOST)
 
 
-# -- encoder position --------------------------------------------------------------------------------------
-
-
-class PositionUnwrapper:
-    """Unwraps the position value 6004h, which wraps at the total range 6002h, to a continuous count [steps].
-
-    ``total_range`` 0 means 2**32.  Between two updates the shaft must move by less than half the range.
-    The first update returns the value itself; ``position`` is the last result.
-    """
-
-    __slots__ = ("_half", "_range", "_raw", "position")
-
-    def __init__(self, total_range: int) -> None:
-        self._range = total_range or 1 << 32
-        self._half = self._range // 2
-        self._raw: int | None = None
-        self.position = 0
-
-    def update(self, raw: int) -> int:
-        """The continuous count for a new position value."""
-        if self._raw is None:
-            self.position = raw
-        else:
-            self.position += (raw - self._raw + self._half) % self._range - self._half
-        self._raw = raw
-        return self.position
-
-
 # -- SDO -----------------------------------------------------------------------------------------------------
 
 
@@ -237,35 +209,6 @@ class Sdo:
     def unsigned(self) -> int:
         """The value as an unsigned number."""
         return int.from_bytes(self.data, "little")
-
-    @property
-    def signed(self) -> int:
-        """The value as a signed number of the transferred width."""
-        return int.from_bytes(self.data, "little", signed=True)
-
-
-ABORT_TEXTS: Final = {
-    0x05030000: "toggle bit not alternated", 0x05040000: "SDO protocol timed out",
-    0x05040001: "command specifier not valid", 0x05040002: "invalid block size",
-    0x05040003: "invalid sequence number", 0x05040004: "CRC error", 0x05040005: "out of memory",
-    0x06010000: "unsupported access to an object", 0x06010001: "attempt to read a write only object",
-    0x06010002: "attempt to write a read only object", 0x06020000: "object does not exist",
-    0x06040041: "object cannot be mapped to the PDO", 0x06040042: "mapped objects exceed the PDO length",
-    0x06040043: "general parameter incompatibility", 0x06040047: "general internal incompatibility",
-    0x06060000: "hardware error", 0x06070010: "data type does not match, length wrong",
-    0x06070012: "data type does not match, too long", 0x06070013: "data type does not match, too short",
-    0x06090011: "sub-index does not exist", 0x06090030: "invalid value", 0x06090031: "value too high",
-    0x06090032: "value too low", 0x06090036: "maximum is less than minimum",
-    0x060A0023: "resource not available", 0x08000000: "general error",
-    0x08000020: "data cannot be transferred or stored", 0x08000021: "refused because of local control",
-    0x08000022: "refused because of the device state", 0x08000023: "object dictionary is not present",
-    0x08000024: "no data available",
-}  # fmt: skip
-
-
-def abort_text(code: int) -> str:
-    """An abort code in words (CiA 301, table 22)."""
-    return f"{ABORT_TEXTS.get(code, 'unknown abort code')} (0x{code:08X})"
 
 
 def upload_request(node: int, index: int, sub: int) -> RawFrame:

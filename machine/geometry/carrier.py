@@ -82,11 +82,6 @@ def rear_from_front(articulation_rad: float, point: Point) -> Point:
     return _turned(point, articulation_rad)
 
 
-def front_from_rear(articulation_rad: float, point: Point) -> Point:
-    """A point of the rear frame in the front frame [m]."""
-    return _turned(point, -articulation_rad)
-
-
 def rear_from_base(carrier: Carrier, point: Point) -> Point:
     """A point of the crane's base frame in the rear frame [m]."""
     x, y, z = _turned(point, carrier.crane_yaw_rad)

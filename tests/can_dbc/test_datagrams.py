@@ -127,7 +127,9 @@ def test_noise_is_refused_and_never_raises_anything_else(noise: bytes, key: byte
 
 
 @given(datagrams, st.data())
-def test_an_arbitrary_body_in_a_valid_envelope_gives_a_message_or_a_refusal(message: Datagram, data: st.DataObject) -> None:
+def test_an_arbitrary_body_in_a_valid_envelope_gives_a_message_or_a_refusal(
+    message: Datagram, data: st.DataObject
+) -> None:
     body = data.draw(st.binary(max_size=200))
     kind = struct.pack("<H", data.draw(st.integers(0, 7)))
     header = encode(message)[:BODY_AT]

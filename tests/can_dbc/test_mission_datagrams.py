@@ -27,13 +27,13 @@ from tests.can_dbc.example_mission_report import MISSION_REPORT
 KEY = b"secret"
 
 
-def told(report: MissionReport = MISSION_REPORT, key: bytes | None = None) -> bytes:
+def encoded_report(report: MissionReport = MISSION_REPORT, key: bytes | None = None) -> bytes:
     return encode_mission(report, 5, 77, 10**9, key)
 
 
 def changed(**fields: object) -> bytes:
     """A report with fields that its schema does not know or not allow, and a right checksum."""
-    whole = told()
+    whole = encoded_report()
     body = msgspec.json.encode(msgspec.json.decode(whole[24:-4]) | fields)
     data = whole[:24] + body
     return data + zlib.crc32(data).to_bytes(4, "little")
@@ -47,7 +47,7 @@ def fault_of(take, *arguments) -> DatagramFault:
 
 @pytest.mark.parametrize("key", [None, KEY])
 def test_a_report_is_decoded_as_it_was_encoded(key) -> None:
-    assert decode_mission(told(key=key), key) == (77, 10**9, MISSION_REPORT)
+    assert decode_mission(encoded_report(key=key), key) == (77, 10**9, MISSION_REPORT)
 
 
 @given(st.sampled_from(MissionAction), st.integers(0, 2**32 - 1), st.integers(0, 2**63), st.sampled_from([None, KEY]))
@@ -70,7 +70,7 @@ def test_a_report_that_does_not_match_its_schema_is_refused(fields) -> None:
 
 def test_nan_and_infinity_are_refused() -> None:
     lost = msgspec.structs.replace(MISSION_REPORT, driven_m=float("nan"))
-    assert fault_of(decode_mission, told(lost)) is DatagramFault.VALUE
+    assert fault_of(decode_mission, encoded_report(lost)) is DatagramFault.VALUE
 
 
 def test_both_sides_need_the_same_key() -> None:
@@ -80,16 +80,18 @@ def test_both_sides_need_the_same_key() -> None:
         fault_of(decode_mission_command, encode_mission_command(MissionCommand(1, 2, 3, MissionAction.ABORT)), KEY)
         is not None
     )
-    assert fault_of(decode_mission, told(), KEY) is DatagramFault.AUTHENTICATION
+    assert fault_of(decode_mission, encoded_report(), KEY) is DatagramFault.AUTHENTICATION
 
 
 def test_one_kind_is_never_decoded_as_another() -> None:
     """In particular not by the controller."""
     order = encode_mission_command(MissionCommand(1, 2, 3, MissionAction.AUTO))
     press = encode(OperatorCommand(1, 2, 3, OperatorAction.ARM))
-    for take, data in ((decode, order), (decode, told()), (decode_mission_command, press), (decode_mission_command, told()),
-                       (decode_mission, press), (decode_mission, order)):  # fmt: skip
-        assert fault_of(take, data) is DatagramFault.KIND
+    for decoder, data in (
+        (decode, order), (decode, encoded_report()), (decode_mission_command, press), (decode_mission_command, encoded_report()),
+        (decode_mission, press), (decode_mission, order),
+    ):  # fmt: skip
+        assert fault_of(decoder, data) is DatagramFault.KIND
 
 
 def test_an_unknown_command_is_refused() -> None:
@@ -101,4 +103,4 @@ def test_an_unknown_command_is_refused() -> None:
 def test_a_report_beyond_one_datagram_is_not_sent() -> None:
     long = msgspec.structs.replace(MISSION_REPORT, logs=MISSION_REPORT.logs * 1000)
     with pytest.raises(ValueError, match=str(MAX_BYTES)):
-        told(long)
+        encoded_report(long)

@@ -31,7 +31,9 @@ FEEDBACK = Feedback(7, State.EXECUTE, 1, 2, 7, 9, 444, (0.1,) * 7, (-0.2,) * 7, 
 
 @settings(max_examples=50)
 @given(HEADERS, MICROS, MICROS)
-def test_a_command_survives_the_round_trip(header: Header, reference: tuple[float, ...], rate: tuple[float, ...]) -> None:
+def test_a_command_survives_the_round_trip(
+    header: Header, reference: tuple[float, ...], rate: tuple[float, ...]
+) -> None:
     command = Command(Mode.REFERENCES, True, reference, rate, Grapple.OPEN, 100, 50)
     data = encode_command(header, command)
     assert len(data) == COMMAND_BYTES == 96
@@ -40,7 +42,9 @@ def test_a_command_survives_the_round_trip(header: Header, reference: tuple[floa
 
 @settings(max_examples=50)
 @given(HEADERS, MICROS, MICROS)
-def test_a_reply_survives_the_round_trip(header: Header, position: tuple[float, ...], velocity: tuple[float, ...]) -> None:
+def test_a_reply_survives_the_round_trip(
+    header: Header, position: tuple[float, ...], velocity: tuple[float, ...]
+) -> None:
     feedback = Feedback(
         header.sequence & 0xFFFF,
         State.HOLD,

@@ -1,0 +1,183 @@
+"""Loads the tick that was compiled ahead of time, where one is ready for exactly these sources.
+
+A build is a folder of extension modules with ``manifest.json``; `host.compiled.build` makes it below `builds_folder`.
+`activate`, called before the tick is imported, installs a finder that serves the extension modules in place of the
+``.py`` files.  A build is used as a whole or not at all: one source file that differs, another Python or another
+platform, and the interpreter runs.  ``TIMBERHAND_COMPILED=0`` switches it off.  In an installed wheel with compiled
+modules the extension modules lie beside their sources, and the switch works as well.  Standard library only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.abc
+import importlib.util
+import json
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+SWITCH: Final = "TIMBERHAND_COMPILED"
+"""Environment variable; 0 keeps the tick on the interpreter."""
+PACKAGES: Final = ("runtime", "can_dbc", "machine", "controller")
+"""Packages whose sources a build was made from: the compiled modules and all that they import."""
+MANIFEST: Final = "manifest.json"
+TICK: Final = "controller.step"
+"""A module that every build holds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Build:
+    """A compiled tick: its key, and the file of each extension module."""
+
+    key: str
+    files: dict[str, Path]
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """What runs the tick in this process: ``kind`` is "compiled" or "interpreter"; ``reason`` says why no build runs."""
+
+    kind: str
+    key: str = ""
+    reason: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.key}".strip()
+
+
+def source_root() -> Path:
+    """The folder that holds the packages."""
+    return Path(__file__).resolve().parents[1]
+
+
+def builds_folder(root: Path | None = None) -> Path:
+    """Where builds lie: in the checkout, or in the user's cache when the sources are installed."""
+    root = root or source_root()
+    if (root / "pyproject.toml").is_file():
+        return root / "build" / "compiled"
+    return Path.home() / ".cache" / "timberhand" / "compiled"
+
+
+def platform_tag() -> str:
+    """The Python and the platform that a build is for."""
+    return f"{'.'.join(map(str, sys.version_info[:3]))}{EXTENSION_SUFFIXES[0]}"
+
+
+def source_hashes(root: Path) -> dict[str, str]:
+    """SHA-256 of every source file of `PACKAGES` by its path below ``root``."""
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for package in PACKAGES
+        for path in sorted((root / package).rglob("*.py"))
+    }
+
+
+def key_of(manifest: dict[str, Any]) -> str:
+    """The name of the build with this manifest: platform, compiler and sources."""
+    identity = [manifest["platform"], manifest["mypy"], manifest["modules"], sorted(manifest["sources"].items())]
+    return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
+
+
+def mismatch(manifest: dict[str, Any], sources: dict[str, str]) -> str:
+    """Why a build with this manifest cannot be used here; empty when it can."""
+    if manifest["platform"] != platform_tag():
+        return f"it was made for {manifest['platform']}, this is {platform_tag()}"
+    made: dict[str, str] = manifest["sources"]
+    changed = sorted(path for path in made.keys() | sources.keys() if made.get(path) != sources.get(path))
+    if changed:
+        more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+        return f"{changed[0]}{more} changed since"
+    return ""
+
+
+def find_build(root: Path | None = None, folder: Path | None = None) -> tuple[Build | None, str]:
+    """The build for the sources below ``root``, or None and the reason."""
+    root = root or source_root()
+    folder = folder or builds_folder(root)
+    sources: dict[str, str] = {}
+    reason = "no build"
+    for path in sorted(folder.glob(f"*/{MANIFEST}")):
+        try:
+            manifest = json.loads(path.read_text())
+            sources = sources or source_hashes(root)
+            problem = mismatch(manifest, sources)
+            files = {name: path.parent / file for name, file in manifest["files"].items()}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            problem, files = f"its manifest cannot be read ({error})", {}
+        if not problem and (missing := [file.name for file in files.values() if not file.is_file()]):
+            problem = f"{missing[0]} is missing"
+        if not problem:
+            return Build(path.parent.name, files), ""
+        reason = f"build {path.parent.name}: {problem}"
+    return None, reason
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Serves modules by full name from the given files, before the path is searched."""
+
+    def __init__(self, files: dict[str, Path]) -> None:
+        self._files = files
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        file = self._files.get(fullname)
+        return None if file is None else importlib.util.spec_from_file_location(fullname, file)
+
+
+_running = Running("interpreter", reason="not activated")
+
+
+def activate(root: Path | None = None, folder: Path | None = None) -> Running:
+    """Serve the tick from its build from now on, if one fits; call it before the tick is imported.
+
+    Never raises, because the interpreter is always there.
+    """
+    global _running
+    root = root or source_root()
+    _running = _activated(root, folder)
+    return _running
+
+
+def _activated(root: Path, folder: Path | None) -> Running:
+    beside = _beside(root)
+    if os.environ.get(SWITCH) == "0":
+        if beside:
+            sources = {name: root.joinpath(*name.split(".")).with_suffix(".py") for name in beside}
+            sys.meta_path.insert(0, _Finder(sources))
+        return Running("interpreter", reason=f"{SWITCH}=0")
+    if beside:
+        return Running("compiled", "installed")
+    build, reason = find_build(root, folder)
+    if build is None:
+        return Running("interpreter", reason=reason)
+    early = sorted(build.files.keys() & sys.modules.keys())
+    if early:
+        return Running("interpreter", reason=f"{early[0]} was imported before")
+    sys.meta_path.insert(0, _Finder(build.files))
+    return Running("compiled", build.key)
+
+
+def running() -> Running:
+    """What runs the tick in this process."""
+    if _running.kind == "interpreter" and _running.reason == "not activated" and _beside(source_root()):
+        return Running("compiled", "installed")
+    return _running
+
+
+def _beside(root: Path) -> list[str]:
+    """Modules whose extension module lies beside the source, as in a compiled wheel."""
+    suffix = EXTENSION_SUFFIXES[0]
+    if not root.joinpath(*TICK.split(".")).with_suffix(suffix).is_file():
+        return []
+    return [
+        ".".join(path.relative_to(root).parts).removesuffix(suffix)
+        for package in PACKAGES
+        for path in (root / package).rglob(f"*{suffix}")
+    ]
