@@ -60,8 +60,3 @@ def wrapped(angle_rad: float) -> float:
 def yaw_from_heading(heading_rad: float) -> float:
     """Yaw, counter-clockwise from east, of a heading, clockwise from north."""
     return wrapped(0.5 * math.pi - heading_rad)
-
-
-def heading_from_yaw(yaw_rad: float) -> float:
-    """Heading, clockwise from north 0..2 pi, of a yaw, counter-clockwise from east."""
-    return (0.5 * math.pi - yaw_rad) % (2.0 * math.pi)

@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from autonomy.localization.local_plane import LocalPlane, heading_from_yaw
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.localization.motion_model import antenna_reach, front_attitude
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
 from controller.laws.drive import DriveLaw
@@ -28,6 +28,11 @@ DEAD_TICKS: Final = 16
 DRIVE_LAG_S: Final = 0.25
 STEER_LAG_S: Final = 0.06
 START_NS: Final = 1_000_000_000
+
+
+def heading_from_yaw(yaw_rad: float) -> float:
+    """Heading, clockwise from north 0..2 pi, of a yaw, counter-clockwise from east."""
+    return (0.5 * math.pi - yaw_rad) % (2.0 * math.pi)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from collections import deque
 
 import numpy as np
 
-from autonomy.localization.local_plane import LocalPlane, heading_from_yaw
+from autonomy.localization.local_plane import LocalPlane
 from autonomy.localization.localizer import LATENCY_NS
 from autonomy.manager.activity_manager import ActivityManager
 from autonomy.manager.loading_stops import base_on_path
@@ -23,6 +23,7 @@ from machine.geometry.carrier import heading_rate_rad_s
 from machine.loading.profile_file import profile_hash
 from machine.profile import Profile
 from machine.status.modes import Mode
+from tests.autonomy.carrier_model import heading_from_yaw
 from tests.autonomy.crane_stand_in import TICK_NS, StandIn, over_bunk
 
 TICK_S = TICK_NS * 1e-9

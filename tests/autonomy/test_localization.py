@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.localization.frames import Frames
-from autonomy.localization.local_plane import LocalPlane, heading_from_yaw, wrapped, yaw_from_heading
+from autonomy.localization.local_plane import LocalPlane, wrapped, yaw_from_heading
 from autonomy.localization.localizer import AGREEING_COUNT, Localizer
 from autonomy.localization.location import Location, Status
 from autonomy.localization.motion_model import (
@@ -27,7 +27,7 @@ from autonomy.localization.motion_model import (
 from can_dbc.messages.vehicle import DriveSetpoint, Steering, VehicleReport
 from machine.loading.profile_file import load_profile
 from sim.geometry.geodesy import LocalFrame
-from tests.autonomy.carrier_model import FIRM, MUD, SLOPE, Ground, Individual, Vehicle, individual
+from tests.autonomy.carrier_model import FIRM, MUD, SLOPE, Ground, Individual, Vehicle, heading_from_yaw, individual
 from tests.codes import coded
 
 PROFILE = load_profile("aoro_fc8")
