@@ -18,6 +18,7 @@ from runtime.errors import CodedError
 from timberhand.commands import (
     bench,
     calibrate,
+    compile_tick,
     console,
     dbc,
     demo,
@@ -76,6 +77,7 @@ app.command("replay")(replay.replay)
 app.command("record")(record.record)
 app.command("console")(console.console)
 app.command("doctor")(doctor.doctor)
+app.command("compile")(compile_tick.compile_tick)
 app.add_typer(dbc.app, name="dbc")
 app.add_typer(recording.app, name="recording")
 app.add_typer(plan.app, name="plan")

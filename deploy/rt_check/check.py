@@ -32,6 +32,7 @@ CHECKOUT = HERE.parents[1]
 META_PACKAGE = "linux-image-rt-amd64"
 ENTRIES = (
     "controller.__main__",
+    "controller.process.command",
     "controller.guard.__main__",
     "experiments.timing.emulated_machine",
     "host.vcan_lab.links",

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from driven_carrier import CARRIER, SQUARE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.navigation.clothoid_path import HARDEST_SHARE, SPACING_M, PathRefused, drivable_path, path_limits
 from machine.geometry.carrier import turning_radius_m
+from tests.autonomy.driven_carrier import CARRIER, SQUARE
 from tests.codes import coded
 
 POINT = st.tuples(st.floats(-60.0, 60.0), st.floats(-60.0, 60.0))

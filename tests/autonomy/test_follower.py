@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import pytest
-from driven_carrier import CARRIER, SQUARE, at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,6 +12,7 @@ from autonomy.navigation import speed
 from autonomy.navigation.clothoid_path import Path, drivable_path
 from autonomy.navigation.follower import FollowerState, follow_path
 from autonomy.navigation.path_drive import PathDrive
+from tests.autonomy.driven_carrier import CARRIER, SQUARE, at
 
 # -- follower
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driven_carrier import CARRIER, at
 
 from autonomy.localization.local_plane import LocalPlane
 from autonomy.localization.localizer import Localizer
@@ -20,6 +19,7 @@ from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.vehicle import DriveSetpoint, Driving, Steering, VehicleReport
 from machine.geometry.carrier import turning_radius_m
 from tests.autonomy.carrier_model import FIRM, MUD, Ground, Individual, Vehicle, individual
+from tests.autonomy.driven_carrier import CARRIER, at
 from tests.codes import coded
 
 # -- drives on the model

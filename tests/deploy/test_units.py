@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from autonomy.__main__ import arguments as autonomy_arguments
-from controller.__main__ import parser as controller_parser
+from controller.process.command import parser as controller_parser
 from controller.plc.__main__ import parser as plc_parser
 from timberhand.service_status.status import SERVICE_PAGE
 

@@ -142,7 +142,7 @@ def test_a_killed_process_ends_the_run_with_one_sentence(tmp_path: Path, demo: D
     _, err = process.communicate(timeout=60)
     assert process.returncode == ExitCode.SAFETY_STOP, err
     assert "Traceback" not in err
-    assert "ended in the middle of the run" in err
+    assert "[live.process-ended]" in err
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["complete"]
 
 

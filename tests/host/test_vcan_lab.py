@@ -45,7 +45,7 @@ def test_candump_sees_a_frame_from_a_python_socket(lab: Run) -> None:
         pytest.skip("candump is missing (apt-get install can-utils)")
     script = """if True:
         import subprocess
-        from can_dbc.bus.base import open_bus
+        from can_dbc.bus.factory import open_bus
         dump = subprocess.Popen(["candump", "-n", "1", "vcan0"], stdout=subprocess.PIPE)
         with open_bus("socketcan:vcan0") as bus:
             while dump.poll() is None:

@@ -89,7 +89,7 @@ def test_an_ordinary_user_gets_fifo_and_locked_memory() -> None:
 
 ANSWERER = """
 import sys
-from can_dbc.bus.base import open_bus
+from can_dbc.bus.factory import open_bus
 import select
 with open_bus("socketcan:vcan0", filters=[0x80, 0x7FF]) as bus:
     print("ready", flush=True)

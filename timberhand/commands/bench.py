@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from timberhand.commands import bench_bus, bench_codec, bench_loop_design, bench_motion, bench_plant
+from timberhand.commands import bench_bus, bench_codec, bench_loop_design, bench_motion, bench_plant, bench_tick
 
 app = typer.Typer(no_args_is_help=True, help="Benchmarks: measure the documented figures again.")
 app.command("bus")(bench_bus.bus)
@@ -12,3 +12,4 @@ app.command("codec")(bench_codec.codec)
 app.command("loop-design")(bench_loop_design.loop_design)
 app.command("plant")(bench_plant.plant)
 app.command("motion")(bench_motion.motion)
+app.command("tick")(bench_tick.tick)

@@ -1,0 +1,170 @@
+"""One side of a comparison: ``python -m hil.tick.worker``, on the compiled tick unless ``TIMBERHAND_COMPILED=0``.
+
+``cost RECORDING TICKS`` replays a recording twice, hot and cold, and prints one JSON object.  ``random RECORDING SEED
+TICKS`` runs random ticks and prints a digest of all outputs after every pass.  ``pipe PROFILE`` reads tick records,
+each behind its length (u32), and answers each with the digest of its outputs.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import json
+import struct
+import sys
+import time
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from runtime.compiled import activate, running
+
+if TYPE_CHECKING:
+    from can_dbc.messages.tick_record import TickRecord
+    from controller.config import Settings
+
+WARM_TICKS: Final = 200
+CACHE_LINE_BYTES: Final = 64
+MIN_EVICTION_BYTES: Final = 24 << 20
+
+
+def eviction_bytes() -> int:
+    """A size that does not fit beside the tick in the last-level cache: three quarters more, within reason."""
+    sizes = [MIN_EVICTION_BYTES * 4 // 7]
+    for path in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*/size"):
+        text = path.read_text().strip()
+        sizes.append(int(text[:-1]) << {"K": 10, "M": 20}.get(text[-1], 0) if text[-1].isalpha() else int(text))
+    return min(max(sizes) * 7 // 4, 128 << 20)
+
+
+def digest_of(outputs: tuple[Any, ...]) -> bytes:
+    """A digest of the frames and reports of one tick."""
+    frames, machine_frames, report, vehicle_report = outputs
+    made = hashlib.sha256()
+    for part in (frames, machine_frames):
+        made.update(struct.pack("<I", len(part)))
+        for key, data in part:
+            made.update(struct.pack("<IB", key, len(data)) + data)
+    made.update(struct.pack("<I", len(report)) + report + vehicle_report)
+    return made.digest()
+
+
+def recorded(place: Path, limit: int) -> tuple[Settings, list[TickRecord]]:
+    """Settings and the first ticks of a recording."""
+    from hil.replay.recording import files_of, manifest_of
+    from hil.replay.replay import recorded_ticks, settings_for
+
+    files = files_of(place)
+    ticks = list(islice(recorded_ticks(files), limit or None))
+    return settings_for(manifest_of(files), ticks[:64], None, None), ticks
+
+
+def cost(place: Path, limit: int) -> dict[str, Any]:
+    """Replay with warm and with evicted caches: quantiles of time and of processor time [us], and differing ticks."""
+    settings, ticks = recorded(place, limit)
+    evicted = bytearray(eviction_bytes())
+    lines = bytes(len(evicted) // CACHE_LINE_BYTES)
+
+    def evict() -> None:
+        evicted[::CACHE_LINE_BYTES] = lines
+
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return {
+        "tick": str(running()), "ticks": len(ticks), "hot": _timed(settings, ticks, lambda: None),
+        "cold": _timed(settings, ticks, evict),
+    }  # fmt: skip
+
+
+def _timed(settings: Settings, ticks: list[TickRecord], between: Callable[[], None]) -> dict[str, Any]:
+    from controller.process.tick_recording import restore_inputs, transmitted
+    from controller.step import Controller, step
+    from controller.tick import Inputs
+
+    controller, inputs = Controller(settings), Inputs()
+    wall, cpu = [], []
+    differing = 0
+    for tick in ticks:
+        restore_inputs(inputs, tick)
+        between()
+        cpu_begin, begin = time.thread_time_ns(), time.perf_counter_ns()
+        outputs = step(controller, inputs, tick.now_ns)
+        end, cpu_end = time.perf_counter_ns(), time.thread_time_ns()
+        wall.append(end - begin)
+        cpu.append(cpu_end - cpu_begin)
+        differing += transmitted(outputs) != (
+            tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report
+        )  # fmt: skip
+    return {"differing": differing, **_quantiles("", wall), **_quantiles("cpu_", cpu)}
+
+
+def _quantiles(prefix: str, durations_ns: list[int]) -> dict[str, float]:
+    ordered = sorted(durations_ns[WARM_TICKS:] or durations_ns)
+    return {
+        f"{prefix}p50_us": ordered[len(ordered) // 2] / 1000,
+        f"{prefix}p99_us": ordered[len(ordered) * 99 // 100] / 1000,
+    }
+
+
+def random_ticks(place: Path, seed: int, wanted: int) -> None:
+    """Run random ticks; after each pass print ticks so far, modes seen, and the digest of everything."""
+    from can_dbc.dbc.codec import load
+    from controller.process.tick_recording import restore_inputs, transmitted
+    from controller.step import Controller, step
+    from controller.tick import Inputs
+    from hil.tick.random_ticks import RandomTicks
+
+    settings, ticks = recorded(place, 0)
+    crane, machine, gnss = load("crane"), load("machine"), load("gnss")
+    supply = RandomTicks(ticks, (crane, machine, gnss), seed)
+    done, modes, digest = 0, set(), hashlib.sha256()
+    while done < wanted:
+        controller, inputs = Controller(settings, crane, (machine, gnss)), Inputs()
+        for tick in supply.one_pass():
+            restore_inputs(inputs, tick)
+            outputs = step(controller, inputs, tick.now_ns)
+            digest.update(digest_of(transmitted(outputs)))
+            modes.add(outputs.mode.name)
+            done += 1
+        print(json.dumps({"ticks": done, "digest": digest.hexdigest(), "modes": sorted(modes)}), flush=True)
+
+
+def pipe(profile: str) -> None:
+    """Answer every tick record on stdin with the digest of its outputs on stdout."""
+    from can_dbc.messages import tick_record
+    from controller.config import load as load_settings
+    from controller.process.tick_recording import restore_inputs, transmitted
+    from controller.step import Controller, step
+    from controller.tick import Inputs
+
+    controller, inputs = Controller(load_settings(profile)), Inputs()
+    sys.stdout.buffer.write(str(running()).encode() + b"\n")
+    sys.stdout.buffer.flush()
+    while size := sys.stdin.buffer.read(4):
+        (length,) = struct.unpack("<I", size)
+        if length == 0:
+            controller, inputs = Controller(load_settings(profile)), Inputs()
+            continue
+        tick = tick_record.decode(sys.stdin.buffer.read(length))
+        restore_inputs(inputs, tick)
+        sys.stdout.buffer.write(digest_of(transmitted(step(controller, inputs, tick.now_ns))))
+        sys.stdout.buffer.flush()
+
+
+def main(arguments: list[str]) -> int:
+    """Run one command."""
+    activate()
+    command, *rest = arguments
+    if command == "cost":
+        print(json.dumps(cost(Path(rest[0]), int(rest[1]))))
+    elif command == "random":
+        random_ticks(Path(rest[0]), int(rest[1]), int(rest[2]))
+    else:
+        pipe(rest[0])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

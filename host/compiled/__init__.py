@@ -1,0 +1,1 @@
+"""Compiles the controller's tick ahead of time with mypyc; `runtime.compiled` finds and loads the result."""

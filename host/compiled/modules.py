@@ -1,0 +1,71 @@
+"""The modules that are compiled ahead of time: what runs in every tick of the controller.
+
+The one list, for `timberhand compile` and for a compiled wheel (setup.py).  A module belongs here when it runs in the
+tick, names no ``__file__``, and has no class that interpreted code subclasses.  Left out: modules on ctypes and msgspec
+(buses, timing page, profile), which mypyc does not make faster, and the guard, which stays on the interpreter so that
+no fault of the compiler is in both.  Standard library only.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+MODULES: Final = (
+    "can_dbc.messages.crane",
+    "can_dbc.messages.datagrams",
+    "can_dbc.messages.envelope",
+    "can_dbc.messages.tick_record",
+    "can_dbc.messages.vehicle",
+    "can_dbc.protocols.canopen",
+    "can_dbc.protocols.e2e",
+    "can_dbc.protocols.nmea2000",
+    "can_dbc.timing.durations",
+    "controller.bus_io.bus_monitor",
+    "controller.bus_io.message_state",
+    "controller.bus_io.messages",
+    "controller.carrier.address_claim",
+    "controller.carrier.bus",
+    "controller.carrier.dead_reckoning",
+    "controller.carrier.inputs",
+    "controller.carrier.monitors",
+    "controller.carrier.outputs",
+    "controller.carrier.vehicle",
+    "controller.config",
+    "controller.crane.inputs",
+    "controller.crane.motion",
+    "controller.crane.nodes",
+    "controller.crane.outputs",
+    "controller.crane.reference_governor",
+    "controller.crane.spool_test_run",
+    "controller.crane.startup",
+    "controller.crane.trajectory",
+    "controller.crane.trajectory_check",
+    "controller.estimation.joint_estimator",
+    "controller.estimation.load_estimator",
+    "controller.estimation.motion_monitor",
+    "controller.laws.crane",
+    "controller.laws.drive",
+    "controller.laws.end_positioning",
+    "controller.laws.feedback",
+    "controller.laws.grapple",
+    "controller.laws.heading",
+    "controller.laws.joint",
+    "controller.laws.suspension",
+    "controller.laws.sway",
+    "controller.laws.time_scaling",
+    "controller.laws.valve_map",
+    "controller.process.loop",
+    "controller.process.tick_recording",
+    "controller.process.timing",
+    "controller.requests.gate",
+    "controller.requests.setpoint_gate",
+    "controller.state_report",
+    "controller.step",
+    "controller.supervisor",
+    "controller.tick",
+    "controller.transitions",
+    "machine.sensing.encoder",
+    "machine.sensing.weighing",
+    "machine.geometry.kinematics",
+    "machine.geometry.sag",
+)
