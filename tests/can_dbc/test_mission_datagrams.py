@@ -88,8 +88,8 @@ def test_one_kind_is_never_decoded_as_another() -> None:
     order = encode_mission_command(MissionCommand(1, 2, 3, MissionAction.AUTO))
     press = encode(OperatorCommand(1, 2, 3, OperatorAction.ARM))
     for decoder, data in (
-        (decode, order), (decode, encoded_report()), (decode_mission_command, press), (decode_mission_command, encoded_report()),
-        (decode_mission, press), (decode_mission, order),
+        (decode, order), (decode, encoded_report()), (decode_mission_command, press),
+        (decode_mission_command, encoded_report()), (decode_mission, press), (decode_mission, order),
     ):  # fmt: skip
         assert fault_of(decoder, data) is DatagramFault.KIND
 
