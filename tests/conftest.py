@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from can_dbc.durations import Durations
-from can_dbc.timing_page import STAGES, BusCounters, Facts, InputAge, ProcessCounters, Timing
+from can_dbc.timing.durations import Durations
+from can_dbc.timing.page import STAGES, BusCounters, Facts, InputAge, ProcessCounters, Timing
 
 settings.register_profile("no clock", deadline=None)  # how long an example takes is the host's affair, and no failure
 settings.load_profile("no clock")

@@ -16,7 +16,7 @@ from autonomy.crane_job.phases import Phase
 from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
 from can_dbc.messages.datagrams import decode
-from machine.geometry.grapple import grapple_yaw, half_gap_m, opening_pct_from_tong_angle, tip_below_pin_m
+from machine.geometry.grapple import grapple_yaw, half_gap_m, opening_pct_from_jaw_angle, tip_below_pin_m
 from machine.joints import JOINTS
 from machine.loading.profile_file import profile_hash
 from machine.status.modes import Mode
@@ -61,7 +61,7 @@ class StandIn:
 
     def report(self) -> StateReport:
         """What the controller says now."""
-        opening = opening_pct_from_tong_angle(self.profile.grapple.tongs, self.tong_rad)
+        opening = opening_pct_from_jaw_angle(self.profile.grapple.tongs, self.tong_rad)
         state = 5 if self.gripped else 0
         sequence = self.setpoint.sequence if self.setpoint else 0
         return StateReport(
