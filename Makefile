@@ -21,12 +21,12 @@ demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--locks
 
 test: lint docs  ## the whole suite: unit, property, contract, lockstep and live runs on the wire and on vcan
 	@sh deploy/debian_packages.sh
-	@$(BIN)/pytest -m "not slow" -n 2 $(ARGS) || [ $$? -eq 5 ]
-	@$(BIN)/pytest -m "slow and computed" -n 2 $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
+	@$(BIN)/pytest -m "not slow" -n 2 --dist worksteal $(ARGS) || [ $$? -eq 5 ]
+	@$(BIN)/pytest -m "slow and computed" -n 2 --dist worksteal $(ARGS) || [ $$? -eq 5 ] # 5: ARGS name no such test
 	@$(BIN)/pytest -m "slow and not computed" $(ARGS) || [ $$? -eq 5 ]
 
 check: lint  ## lint, types, architecture and the fast tests
-	@$(BIN)/pytest -q -m "not slow" -n 2 $(ARGS)
+	@$(BIN)/pytest -q -m "not slow" -n 2 --dist worksteal $(ARGS)
 
 lint: setup  ## style, types and the three floors
 	@$(BIN)/ruff check .

@@ -139,6 +139,8 @@ def test_a_single_log_job_only_accepts_abort() -> None:
     assert job.report(0) is None
 
 
+@pytest.mark.slow
+@pytest.mark.computed
 def test_the_longest_mission_fits_in_a_datagram() -> None:
     corners = tuple(Point(*PLANE.geodetic(9e3 * math.cos(a), 9e3 * math.sin(a))[:2]) for a in np.linspace(0, 6, 2000))
     mission = ForwardingMission(
