@@ -109,7 +109,8 @@ class MissionRun:
         code = profile_hash(profile)
         uses_memory = detector != "perfect"
         self.manager = ActivityManager(
-            profile, code, mission, TABLES[manager], selector=PlannerSelection(SamplingPlanner()), uses_memory=uses_memory,
+            profile, code, mission, TABLES[manager], selector=PlannerSelection(SamplingPlanner()),
+            uses_memory=uses_memory,
             unloading_selector=PlannerSelection(PilePlanner(SamplingPlanner())),
         )  # fmt: skip
         self.manager.auto()

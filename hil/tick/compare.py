@@ -119,7 +119,8 @@ def environment() -> dict[str, Any]:
     except metadata.PackageNotFoundError:
         mypy = ""
     return {
-        "python": platform.python_version(), "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
         "cpus": os.cpu_count(), "mypy": mypy, "evicted_mb": eviction_bytes() >> 20,
     }  # fmt: skip
 

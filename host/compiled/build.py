@@ -6,6 +6,7 @@ rename.  Of two builders at once the second waits and finds the work done.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import fcntl
 import importlib.util
@@ -77,7 +78,7 @@ def _build(root: Path, folder: Path, progress: Progress) -> str:
                 copy.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, copy)
         shutil.copyfile(root / "host" / "__init__.py", tree / "host" / "__init__.py")
-        sources = compiled.source_hashes(tree)
+        sources = {str(path): compiled.hash_of(tree / path) for path in needed_sources(tree)}
         _run_compiler(tree, made, progress)
         suffix = EXTENSION_SUFFIXES[0]
         files = {
@@ -97,6 +98,28 @@ def _build(root: Path, folder: Path, progress: Progress) -> str:
     return key
 
 
+def needed_sources(tree: Path) -> list[Path]:
+    """The source files that determine a build: those of `MODULES`, and what they import from our packages.
+
+    The compiler takes types and constants from modules that are imported only.
+    """
+    found: dict[Path, None] = {}
+    waiting = [Path(*module.split(".")).with_suffix(".py") for module in MODULES]
+    while waiting:
+        path = waiting.pop()
+        if path in found:
+            continue
+        found[path] = None
+        for node in ast.walk(ast.parse((tree / path).read_bytes())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            for name in names:
+                place = Path(*name.split("."))
+                waiting += [p for p in (place.with_suffix(".py"), place / "__init__.py") if (tree / p).is_file()]
+    return sorted(found)
+
+
 def _run_compiler(tree: Path, made: Path, progress: Progress) -> None:
     progress("checking types and generating C")
     last: deque[str] = deque(maxlen=12)
@@ -110,7 +133,8 @@ def _run_compiler(tree: Path, made: Path, progress: Progress) -> None:
             last.append(line.rstrip()[:300])
             if line.startswith("building '"):
                 # The first extension holds all code; the others are a stub each.
-                progress("compiling C, about a minute" if done == 0 else f"linking {done} of {len(MODULES)}")
+                if done < 2:
+                    progress(("compiling C, about a minute", "linking")[done])
                 done += 1
     if process.returncode:
         raise _failed("compile.failed", "the tick does not compile; the last lines are:\n" + "\n".join(last))

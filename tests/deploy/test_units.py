@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from autonomy.__main__ import arguments as autonomy_arguments
-from controller.process.command import parser as controller_parser
 from controller.plc.__main__ import parser as plc_parser
+from controller.process.command import parser as controller_parser
 from timberhand.service_status.status import SERVICE_PAGE
 
 DEPLOY = Path(__file__).parents[2] / "deploy"

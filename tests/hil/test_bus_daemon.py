@@ -111,7 +111,9 @@ def test_a_slow_daemon_receives_one_hello(tmp_path: Path, monkeypatch: pytest.Mo
         daemon.send_signal(signal.SIGSTOP)
         dialled: list[str] = []
         dial = wire_client._connect_and_send
-        monkeypatch.setattr(wire_client, "_connect_and_send", lambda name, *rest: dialled.append(name) or dial(name, *rest))
+        monkeypatch.setattr(
+            wire_client, "_connect_and_send", lambda name, *rest: dialled.append(name) or dial(name, *rest)
+        )
         assert not any(bus.reopen() for _ in range(5))
         daemon.send_signal(signal.SIGCONT)
         reopen(bus)
@@ -154,9 +156,7 @@ def test_a_drain_of_the_wire_is_one_call(wire_dir: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("interface", ["wire", "timberhand"])
-def test_a_recovery_leaves_no_older_frames(
-    interface: str, wire_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recovery_leaves_no_older_frames(interface: str, wire_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also if a single drain finds all of it, including bus-off."""
     monkeypatch.setenv("TIMBERHAND_WIRE_DIR", str(wire_dir))
     backend = Backend(interface, f"{interface}:fast")
