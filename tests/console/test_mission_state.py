@@ -30,7 +30,12 @@ def crane_state(profile=PROFILE, key=None) -> CraneState:
 
 
 def told(
-    crane_state: CraneState, report=MISSION_REPORT, stamp_ns: int = 10**9, code: int = HASH, key=None, now_ns: int = 10**9
+    crane_state: CraneState,
+    report=MISSION_REPORT,
+    stamp_ns: int = 10**9,
+    code: int = HASH,
+    key=None,
+    now_ns: int = 10**9,
 ) -> bool:
     return crane_state.on_report(encode_mission(report, 1, code, stamp_ns, key), now_ns)
 
