@@ -34,7 +34,7 @@ def result_document(result: CalibrationResult, facts: dict[str, Any], changed: l
             "moments_left_nm": list(s.moments_nm),
             "before_mm": [1e3 * d for d in s.before_m], "after_mm": [1e3 * d for d in s.after_m],
         }  # fmt: skip
-    return _rounded(
+    document: dict[str, Any] = _rounded(
         {
             **facts,
             "plausible": not result.implausible,
@@ -47,6 +47,7 @@ def result_document(result: CalibrationResult, facts: dict[str, Any], changed: l
             "changes": {".".join(path): value for path, value, _ in changed},
         }
     )
+    return document
 
 
 def _joint(r: JointResult) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.perception.log_list.observation import LogObservation
 from machine.geometry.grapple import lowest_tip_below_pin_m, rotator_for_yaw, tip_below_pin_m
-from machine.profile import Profile, JawTable
+from machine.profile import JawTable, Profile
 
 TIP_CLEARANCE_M: Final = (0.025, 0.05)
 """Least and greatest height of the tips over the support while closing: 3 to 5 cm lift 19 of 20 logs, 1.5 cm 13 of
