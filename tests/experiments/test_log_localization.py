@@ -123,6 +123,6 @@ def test_the_command_evaluates_draws_and_writes_the_page(tmp_path: Path) -> None
         assert metrics[f"deg{degrees}.median_m"] < 0.12 < metrics["faithful.deg90.median_m"]
     assert metrics["faithful.deg90.median_m"] > metrics["faithful.deg0.median_m"]
     page = (tmp_path / "docs" / "log-localization.md").read_text()
-    assert "harmonic mean" in page and "no number is typed" in page
+    assert "harmonic mean" in page and "timberhand experiment log-localization --docs docs" in page
     for name in ("errors", "curve", "overlay"):
         assert (tmp_path / "docs" / "results" / "log-localization" / f"{name}.png").stat().st_size > 5000
