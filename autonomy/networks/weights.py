@@ -57,9 +57,7 @@ def load(path: Path, network: Network) -> tuple[dict[str, np.ndarray], dict[str,
             facts = dict(file.metadata() or {})
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
-        raise WeightsError(
-            "weights.missing", f"{path}: no such weight file; `timberhand train` makes one"
-        ) from None
+        raise WeightsError("weights.missing", f"{path}: no such weight file; `timberhand train` makes one") from None
     except (SafetensorError, OSError, ValueError, TypeError) as error:
         raise WeightsError(
             "weights.damaged", f"{path}: damaged or not a safetensors file ({error}); fetch or train it again"

@@ -104,9 +104,7 @@ class PaperBLocalizer:
 
 _PAPER_B_SIGMAS: Final = (0.10, 0.10, 0.6, 0.6, 0.2, 0.2, 0.05)
 """Of a box [m, rad]: the position as in the paper's own errors; the axis of a log seen end-on is arbitrary."""
-_PAPER_B_COVARIANCE: Final = tuple(
-    np.diag(np.square(_PAPER_B_SIGMAS))[np.triu_indices(len(_PAPER_B_SIGMAS))].tolist()
-)
+_PAPER_B_COVARIANCE: Final = tuple(np.diag(np.square(_PAPER_B_SIGMAS))[np.triu_indices(len(_PAPER_B_SIGMAS))].tolist())
 
 
 class DrivingLogDetector:

@@ -40,9 +40,7 @@ class Perception:
         Raises:
             RgbdFrameError: the frame is invalid, or from a camera that the profile does not have.
         """
-        fits = [
-            fit for fit in self.fits(frame, instances) if abs(fit.body.axis @ pose.rotation[2]) < MAX_SINE_TO_LEVEL
-        ]
+        fits = [fit for fit in self.fits(frame, instances) if abs(fit.body.axis @ pose.rotation[2]) < MAX_SINE_TO_LEVEL]
         return self._tracker.step(fits, pose, frame.stamp_ns, partial(is_displaced, frame, pose))
 
     def fits(self, frame: RgbdFrame, instances: Sequence[Masked]) -> list[CylinderFit]:

@@ -1,4 +1,4 @@
-"""The front camera of a driving machine: a drawn log is detected in its place, with a bent machine or a straight one."""
+"""The front camera of a driving machine detects a drawn log in its place, also when the machine is bent."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_the_paper_b_localizer_falls_short_of_a_log_seen_end_on_as_in_the_paper(
 
 @pytest.mark.parametrize("localizer", [PaperBLocalizer(), CylinderLocalizer(PROFILE)], ids=["paper_b", "ours"])
 def test_masks_with_a_low_score_are_not_logs(localizer) -> None:
-    """Sunlight between boom and stick in the machine's own shadow was segmented with scores of 0.03 to 0.19, 12 times."""
+    """Sunlight between boom and stick in the machine's shadow was segmented 12 times with scores of 0.03 to 0.19."""
     at, field = base(0.0, 0.0, math.pi), Scene(8.0, 0.5, 1.5)
     field.score = 0.19
     assert detect(field, at, 0.0, localizer, 2 * MIN_HITS_WITH_HIDDEN_END) == ()

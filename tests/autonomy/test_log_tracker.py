@@ -84,7 +84,10 @@ def test_noise_averages_and_the_covariance_is_consistent() -> None:
 
 
 def test_a_scale_error_remains_while_the_camera_stands_and_shrinks_when_it_drives() -> None:
-    center, errors = (8.0, 0.2, 0.12), CameraErrors(scale=0.01, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6)
+    center, errors = (
+        (8.0, 0.2, 0.12),
+        CameraErrors(scale=0.01, mount_rad=1e-5, mount_m=1e-5, pose_rad=1e-6, pose_m=1e-6),
+    )
     claims, misses = [], []
     for drive in (0.0, 4.0):
         tracks = LogTracker(errors)

@@ -87,7 +87,9 @@ def test_a_held_log_is_between_the_jaws():
 def test_a_plain_sky_has_one_colour(pile, monkeypatch):
     monkeypatch.setattr(drawing, "PLAIN_SHARE", 1.0)
     monkeypatch.setattr(drawing, "_lens_and_compression", lambda rgb, rng: rgb)
-    monkeypatch.setattr(drawing, "_stereo_depth", lambda machine, camera, picture, pin, rng: picture.depth_m)  # no holes
+    monkeypatch.setattr(
+        drawing, "_stereo_depth", lambda machine, camera, picture, pin, rng: picture.depth_m
+    )  # no holes
     seen = 0
     for seed in range(12):
         sample = draw(pile, seed, 96)
@@ -189,7 +191,9 @@ def test_the_depth_variant_can_start_from_weights_of_the_rgbd_variant(tmp_path):
 
 
 def test_small_and_large_pictures_alternate(few):
-    source = detector_weights.mixed_pictures(pictures(few), detector_weights.Plan(2, 1, 1, large=2), few, Console(quiet=True))
+    source = detector_weights.mixed_pictures(
+        pictures(few), detector_weights.Plan(2, 1, 1, large=2), few, Console(quiet=True)
+    )
     assert [source(i).ids.shape[0] for i in range(4)] == [304, 608, 304, 608]
     assert np.array_equal(source(1).ids, source(5).ids) and not np.array_equal(source(1).ids, source(3).ids)
     assert "--pictures 2 --large 2 --steps 1" in detector_weights.Plan(2, 1, 1, large=2).command(

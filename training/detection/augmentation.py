@@ -60,5 +60,3 @@ def recoloured(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         grain = rng.standard_normal(4096, np.float32) * rng.uniform(1.0, 12.0)
         x += np.resize(np.roll(grain, rng.integers(4096)), x.shape[0] * 3).reshape(x.shape)
     return np.asarray(np.clip(x, 0.0, 255.0, out=x).reshape(rgb.shape))
-
-

@@ -109,9 +109,7 @@ def train_scorer(
         some = torch.from_numpy(np.random.default_rng([seed, step]).integers(0, len(target), BATCH))
         return features[..., some], target[some], weight[some]
 
-    def loss(
-        net: torch.nn.Module, features: torch.Tensor, target: torch.Tensor, weight: torch.Tensor
-    ) -> torch.Tensor:
+    def loss(net: torch.nn.Module, features: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
         logit = net(features)["logit"].reshape(-1)
         return (F.binary_cross_entropy_with_logits(logit, target, reduction="none") * weight).mean()
 

@@ -116,5 +116,3 @@ def _add_peak(heat: np.ndarray, u_px: float, v_px: float) -> None:
     dx, dy = np.arange(x0, x1) - x, np.arange(y0, y1)[:, None] - y
     peak = np.exp(-(dx * dx + dy * dy) / (2.0 * PEAK_SIGMA_PX * PEAK_SIGMA_PX))
     np.maximum(heat[y0:y1, x0:x1], peak, out=heat[y0:y1, x0:x1])
-
-

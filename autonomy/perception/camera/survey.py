@@ -17,7 +17,10 @@ from machine.profile import Camera
 
 MIN_TARGETS: Final = 6
 MOUNT_PRIOR_SIGMA: Final = (0.03, 0.03, 0.03, 0.035, 0.035, 0.035)
-"""Standard deviations of a mount that was not surveyed: x, y, z [m] and roll, pitch, yaw [rad] (docs/reference/machines.md section 8)."""
+"""Standard deviations of a mount that was not surveyed: x, y, z [m] and roll, pitch, yaw [rad].
+
+Source: docs/reference/machines.md section 8.
+"""
 MAX_RESIDUAL_SIGMAS: Final = 5.0
 """Largest root mean square residual of the pixels, in their standard deviation."""
 MIN_DEPTH_M: Final = 0.05
