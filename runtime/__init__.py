@@ -1,1 +1,1 @@
-"""What every process needs and no floor owns: errors with codes, and how the allocator behaves."""
+"""What any floor may use: errors with codes, the behaviour of the allocator, the style of plots."""
