@@ -30,7 +30,8 @@ def test_every_path_is_drivable_or_refused(points: list[tuple[float, float]]) ->
     step = np.diff(path.s_m)
     assert step.min() > 0.0 and step.max() <= SPACING_M * (1 + 1e-9)
     assert np.abs(np.diff(path.curve_1_m) / step).max() <= hard.change_1_m2 * (1 + 1e-6)
-    assert np.abs(np.hypot(*np.diff(path.xy_m, axis=0).T) / step - 1.0).max() < 1e-3
+    # A corner ends up to 0.04 mm beside its leg, however short the step is that takes it there.
+    assert np.abs(np.hypot(*np.diff(path.xy_m, axis=0).T) - step).max() < 1e-3 * SPACING_M
     turned = 0.5 * (path.curve_1_m[1:] + path.curve_1_m[:-1]) * step
     assert np.abs(np.diff(path.heading_rad) - turned).max() < 2e-4
     assert path.xy_m[0] == pytest.approx(points[0]) and path.xy_m[-1] == pytest.approx(points[-1], abs=1e-3)
