@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help setup demo test check lint docs bench soak lab-kernel clean
+.PHONY: help setup wheel demo test check lint docs bench soak lab-kernel clean
 
 help:  ## show this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -13,8 +13,12 @@ help:  ## show this list
 $(VENV)/.ready: pyproject.toml constraints.txt deploy/setup.sh
 	@PYTHON=$(PYTHON) sh deploy/setup.sh $(VENV)
 	@touch $@
+	@sh deploy/compile_in_background.sh $(VENV)
 
-setup: $(VENV)/.ready  ## create the virtual environment from the pinned constraints
+setup: $(VENV)/.ready  ## create the virtual environment; compiles the tick in the background
+
+wheel: setup  ## a wheel for this platform with the compiled tick, in dist/
+	@TIMBERHAND_COMPILE=1 $(BIN)/python -m pip wheel --no-deps --no-build-isolation -w dist .
 
 demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--lockstep", ARGS="--bus vcan", ...
 	@$(BIN)/timberhand demo $(ARGS)
@@ -38,8 +42,10 @@ docs: setup  ## build the site into docs/_build; broken links and stale referenc
 	@$(BIN)/python -m timberhand.reference --check
 	@$(BIN)/sphinx-build -W --keep-going -q docs docs/_build && echo "docs/_build/index.html"
 
-bench: setup  ## measure: codecs beside cantools, the bus beside python-can, the plant against real time
+bench: setup  ## measure: codecs beside cantools, the tick compiled and not, the bus beside python-can, the plant against real time
 	@$(BIN)/timberhand bench codec $(ARGS)
+	@$(BIN)/timberhand compile
+	@$(BIN)/timberhand bench tick
 	@$(BIN)/timberhand bench bus $(ARGS)
 	@$(BIN)/timberhand bench plant $(ARGS)
 

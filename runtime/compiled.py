@@ -25,7 +25,7 @@ from typing import Any, Final
 SWITCH: Final = "TIMBERHAND_COMPILED"
 """Environment variable; 0 keeps the tick on the interpreter."""
 PACKAGES: Final = ("runtime", "can_dbc", "machine", "controller")
-"""Packages whose sources a build was made from: the compiled modules and all that they import."""
+"""Packages of the compiled modules and of all that they import."""
 MANIFEST: Final = "manifest.json"
 TICK: Final = "controller.step"
 """A module that every build holds."""
@@ -41,7 +41,7 @@ class Build:
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """What runs the tick in this process: ``kind`` is "compiled" or "interpreter"; ``reason`` says why no build runs."""
+    """What runs the tick here: ``kind`` is "compiled" or "interpreter", ``reason`` says why no build runs."""
 
     kind: str
     key: str = ""
@@ -69,13 +69,12 @@ def platform_tag() -> str:
     return f"{'.'.join(map(str, sys.version_info[:3]))}{EXTENSION_SUFFIXES[0]}"
 
 
-def source_hashes(root: Path) -> dict[str, str]:
-    """SHA-256 of every source file of `PACKAGES` by its path below ``root``."""
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for package in PACKAGES
-        for path in sorted((root / package).rglob("*.py"))
-    }
+def hash_of(path: Path) -> str:
+    """SHA-256 of a file; empty when it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""
 
 
 def key_of(manifest: dict[str, Any]) -> str:
@@ -84,12 +83,11 @@ def key_of(manifest: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
 
 
-def mismatch(manifest: dict[str, Any], sources: dict[str, str]) -> str:
-    """Why a build with this manifest cannot be used here; empty when it can."""
+def mismatch(manifest: dict[str, Any], root: Path) -> str:
+    """Why a build with this manifest cannot be used with the sources below ``root``; empty when it can."""
     if manifest["platform"] != platform_tag():
         return f"it was made for {manifest['platform']}, this is {platform_tag()}"
-    made: dict[str, str] = manifest["sources"]
-    changed = sorted(path for path in made.keys() | sources.keys() if made.get(path) != sources.get(path))
+    changed = [path for path, made in manifest["sources"].items() if hash_of(root / path) != made]
     if changed:
         more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
         return f"{changed[0]}{more} changed since"
@@ -100,15 +98,13 @@ def find_build(root: Path | None = None, folder: Path | None = None) -> tuple[Bu
     """The build for the sources below ``root``, or None and the reason."""
     root = root or source_root()
     folder = folder or builds_folder(root)
-    sources: dict[str, str] = {}
     reason = "no build"
     for path in sorted(folder.glob(f"*/{MANIFEST}")):
         try:
             manifest = json.loads(path.read_text())
-            sources = sources or source_hashes(root)
-            problem = mismatch(manifest, sources)
+            problem = mismatch(manifest, root)
             files = {name: path.parent / file for name, file in manifest["files"].items()}
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             problem, files = f"its manifest cannot be read ({error})", {}
         if not problem and (missing := [file.name for file in files.values() if not file.is_file()]):
             problem = f"{missing[0]} is missing"

@@ -8,10 +8,12 @@ comparison per signal.  Anything unusual (a sentinel, a value out of range, None
 
 from __future__ import annotations
 
+import hashlib
+import importlib
 import keyword
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from can_dbc.dbc.signals import (
@@ -62,7 +64,28 @@ def compile_message(name: str, length: int, signals: Sequence[SignalInfo]) -> tu
         lines += _flat_encode(length, signals)
     source = "\n".join(lines) + "\n"
     exec(compile(source, f"<codec of {name}>", "exec"), space)
+    compiled = AHEAD_OF_TIME.get(key_of(source))
+    if compiled is not None:
+        made = compiled(space["_slow_receive"], space["_slow_encode"], space["_length"])
+        return space["decode"], made.receive, made.encode, source
     return space["decode"], space["receive"], space["encode"], source
+
+
+def key_of(source: str) -> str:
+    """The key of a message's generated text among the functions that were compiled ahead of time."""
+    return hashlib.sha256(source.encode()).hexdigest()[:32]
+
+
+def _ahead_of_time() -> Mapping[str, Any]:
+    """Classes with compiled ``receive`` and ``encode`` by `key_of`; empty on the interpreter."""
+    try:
+        codecs: Mapping[str, Any] = importlib.import_module("can_dbc.dbc.compiled_codecs").CODECS
+    except ImportError:
+        return {}
+    return codecs
+
+
+AHEAD_OF_TIME: Final = _ahead_of_time()
 
 
 # -- decode ------------------------------------------------------------------------------------------------
@@ -124,7 +147,7 @@ def _physical_expression(s: SignalInfo, raw: str) -> str:
 def _flat_decode(
     function: str, length: int, signals: Sequence[SignalInfo], aligned: bool, *, checked: bool
 ) -> list[str]:
-    checks = [check for i, s in enumerate(signals) for check in _receive_checks(s, f"r{i}")] if checked else []
+    checks = [check for i, s in enumerate(signals) for check in receive_checks(s, f"r{i}")] if checked else []
     lines = [f"def {function}(data):", f" if _len(data) != {length}: _length()"]
     raws = [f"r{i}" for i in range(len(signals))]
     if aligned:
@@ -148,7 +171,7 @@ def _flat_decode(
     ]
 
 
-def _receive_checks(s: SignalInfo, raw: str) -> list[str]:
+def receive_checks(s: SignalInfo, raw: str) -> list[str]:
     """Conditions under which the fast path may use a raw value."""
     if s.is_float:
         low = -math.inf if s.minimum is None else min(s.physical(s.convert(s.minimum)), s.minimum)
@@ -188,13 +211,13 @@ def _refuser(reason: Refusal, name: str) -> Callable[[], None]:
 # -- encode ------------------------------------------------------------------------------------------------
 
 
-def _parameters(signals: Sequence[SignalInfo]) -> list[str]:
+def parameters(signals: Sequence[SignalInfo]) -> list[str]:
     names = [s.name for s in signals]
     plain = all(n.isascii() and n.isidentifier() and not keyword.iskeyword(n) and n[0] != "_" for n in names)
     return names if plain and len(set(names)) == len(names) else [f"v{i}" for i in range(len(names))]
 
 
-def _fast_limits(s: SignalInfo) -> tuple[float, float]:
+def fast_limits(s: SignalInfo) -> tuple[float, float]:
     """The physical interval in which rounding provably stays within range and bits; empty if none is found."""
     tolerance = abs(s.scale) * 1e-6
     low = -math.inf if s.minimum is None else s.minimum - tolerance
@@ -226,11 +249,11 @@ def _encode_expression(s: SignalInfo, value: str) -> str:
 
 
 def _flat_encode(length: int, signals: Sequence[SignalInfo]) -> list[str]:
-    names = _parameters(signals)
+    names = parameters(signals)
     words = {False: ["0"], True: ["0"]}
     checks = []
     for s, name in zip(signals, names, strict=True):
-        low, high = _fast_limits(s)
+        low, high = fast_limits(s)
         checks.append(f"{low!r} <= {name} <= {high!r}")
         bits = _encode_expression(s, name)
         words[s.big_endian].append(f"{bits} << {s.shift}" if s.shift else bits)

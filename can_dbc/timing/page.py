@@ -87,7 +87,8 @@ class InputAge(msgspec.Struct):
 class Facts(msgspec.Struct, frozen=True):
     """Everything but the histograms; times on CLOCK_MONOTONIC.
 
-    ``missed`` counts skipped periods, ``late`` ticks that began more than two periods late.
+    ``missed`` counts skipped periods, ``late`` ticks that began more than two periods late.  ``tick``: the
+    interpreter, or compiled modules and their build.
     """
 
     pid: int
@@ -104,6 +105,7 @@ class Facts(msgspec.Struct, frozen=True):
     inputs: Mapping[str, InputAge]
     longest_ns: tuple[int, ...]
     total_ns: tuple[int, ...]
+    tick: str = "interpreter"
 
 
 @dataclass(frozen=True, slots=True)

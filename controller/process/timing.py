@@ -19,6 +19,7 @@ from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import STAGES, BusCounters, Facts, InputAge, ProcessCounters, TimingWriter
 from controller.bus_io.message_state import MessageState
 from controller.step import Controller
+from runtime.compiled import running
 
 PUBLISH_NS: Final = 1_000_000_000
 _LAPS: Final = ("receive", "decode", "estimate", "supervise", "control", "encode", "send", "record")
@@ -30,8 +31,8 @@ class LoopTiming:
 
     __slots__ = (
         "_ages", "_at", "_begin_ns", "_clock_ns", "_cpu_begin_ns", "_cpu_ns", "_encoders", "_inputs", "_laps",
-        "_last_ns", "_previous_sync_ns", "_sync_ns", "_writer", "cpu", "durations", "publish_ns", "sample_to_command",
-        "started_ns", "sync", "tick", "wake",
+        "_last_ns", "_previous_sync_ns", "_sync_ns", "_tick", "_writer", "cpu", "durations", "publish_ns",
+        "sample_to_command", "started_ns", "sync", "tick", "wake",
     )  # fmt: skip
 
     def __init__(
@@ -52,6 +53,7 @@ class LoopTiming:
             state for state in controller.crane_inputs.encoders if state is not None
         )
         self._writer = writer
+        self._tick = str(running())
         self._clock_ns, self._cpu_ns = clock_ns, cpu_ns
         self.started_ns = clock_ns()
         self.publish_ns = self._at = self._begin_ns = self._last_ns = self._cpu_begin_ns = 0
@@ -130,6 +132,7 @@ class LoopTiming:
             inputs={name: age for (name, _), age in zip(self._inputs, self._ages, strict=True)},
             longest_ns=tuple([self.durations[name].longest_ns for name in STAGES]),
             total_ns=tuple([self.durations[name].total_ns for name in STAGES]),
+            tick=self._tick,
         )
         self._writer.publish(facts, self.durations)
 

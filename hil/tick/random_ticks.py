@@ -52,8 +52,9 @@ class RandomTicks:
         rng = self._random
         choice = rng.randrange(6)
         if choice < 3:
-            name = "machine_frames_in" if tick.machine_frames_in and rng.random() < 0.5 else "frames_in"
-            return replace(tick, **{name: self._changed_frames(list(getattr(tick, name)), tick.now_ns)})
+            if tick.machine_frames_in and rng.random() < 0.5:
+                return replace(tick, machine_frames_in=self._changed_frames(list(tick.machine_frames_in), tick.now_ns))
+            return replace(tick, frames_in=self._changed_frames(list(tick.frames_in), tick.now_ns))
         if choice == 3:
             late_ns = rng.choice((rng.randrange(5_000_000), rng.randrange(80_000_000), -rng.randrange(1000)))
             return replace(tick, late_ns=late_ns, missed_ticks=tick.missed_ticks + rng.randrange(3))
@@ -63,7 +64,7 @@ class RandomTicks:
                 refused=tick.bus.refused + rng.randrange(2), errors=tick.bus.errors + rng.randrange(3),
                 recoveries=tick.bus.recoveries + rng.randrange(2),
             )  # fmt: skip
-            return replace(tick, **{rng.choice(("bus", "machine_bus")): bus})
+            return replace(tick, bus=bus) if rng.random() < 0.5 else replace(tick, machine_bus=bus)
         return replace(tick, datagrams=self._changed_datagrams(list(tick.datagrams), tick.now_ns))
 
     def _changed_frames(self, frames: list[Frame], now_ns: int) -> tuple[Frame, ...]:

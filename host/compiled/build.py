@@ -25,7 +25,9 @@ from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any, Final
 
-from host.compiled.modules import MODULES
+from can_dbc.dbc.ahead_of_time import module_source
+from can_dbc.dbc.codec import SHIPPED, load
+from host.compiled.modules import CODECS_MODULE, GENERATOR, MODULES, file_of
 from host.exit_codes import CommandFailed, ExitCode
 from runtime import compiled
 
@@ -79,6 +81,9 @@ def _build(root: Path, folder: Path, progress: Progress) -> str:
                 shutil.copyfile(path, copy)
         shutil.copyfile(root / "host" / "__init__.py", tree / "host" / "__init__.py")
         sources = {str(path): compiled.hash_of(tree / path) for path in needed_sources(tree)}
+        progress("generating the codecs")
+        codecs = [codec for name in SHIPPED for codec in load(name).messages.values()]
+        (tree / file_of(CODECS_MODULE)).write_text(module_source(codecs))
         _run_compiler(tree, made, progress)
         suffix = EXTENSION_SUFFIXES[0]
         files = {
@@ -104,7 +109,7 @@ def needed_sources(tree: Path) -> list[Path]:
     The compiler takes types and constants from modules that are imported only.
     """
     found: dict[Path, None] = {}
-    waiting = [Path(*module.split(".")).with_suffix(".py") for module in MODULES]
+    waiting = [file_of(module) for module in (*MODULES, GENERATOR)]
     while waiting:
         path = waiting.pop()
         if path in found:

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, Final
 
-from host.compiled.modules import MODULES
+from host.compiled.modules import CODECS_MODULE, MODULES, file_of
 
 _MYPY_CONFIG: Final = "[mypy]\npython_version = 3.11\nfollow_imports = silent\nignore_missing_imports = True\n"
 _COMPILER_OPTIONS: Final = ("-ffp-contract=off",)
@@ -24,7 +24,8 @@ def extensions() -> list[Any]:
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder, "mypy.ini")
         config.write_text(_MYPY_CONFIG)
-        files = [module.replace(".", "/") + ".py" for module in MODULES]
+        modules = (*MODULES, CODECS_MODULE) if file_of(CODECS_MODULE).is_file() else MODULES
+        files = [str(file_of(module)) for module in modules]
         made: list[Any] = mypycify(["--config-file", str(config), *files], opt_level="3", debug_level="0")
     for extension in made:
         extension.extra_compile_args = [*extension.extra_compile_args, *_COMPILER_OPTIONS]

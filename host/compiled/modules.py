@@ -8,8 +8,12 @@ no fault of the compiler is in both.  Standard library only.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Final
 
+CODECS_MODULE: Final = "can_dbc.dbc.compiled_codecs"
+"""Generated for a build from the shipped databases (`can_dbc.dbc.ahead_of_time`); not in the sources."""
+GENERATOR: Final = "can_dbc.dbc.ahead_of_time"
 MODULES: Final = (
     "can_dbc.messages.crane",
     "can_dbc.messages.datagrams",
@@ -69,3 +73,8 @@ MODULES: Final = (
     "machine.geometry.kinematics",
     "machine.geometry.sag",
 )
+
+
+def file_of(module: str) -> Path:
+    """The source file of a module below the root of the sources."""
+    return Path(*module.split(".")).with_suffix(".py")

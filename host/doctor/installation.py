@@ -1,4 +1,4 @@
-"""Checks the installation: Python, packages, profiles, buses, vcan lab, directories, ports.
+"""Checks the installation: Python, packages, the compiled tick, profiles, buses, vcan lab, directories, ports.
 
 Reads the running system.  Only what prevents every run is a FAULT: a missing package, a profile that does not load.
 Packages and versions come from the metadata of the distribution.
@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import socket
+import subprocess
 import sys
 from collections.abc import Iterator
 from importlib import metadata
@@ -38,7 +39,7 @@ MIN_FREE_MB: Final = 1000
 
 def examine() -> tuple[Finding, ...]:
     """All findings, in the order in which to correct them."""
-    return (python(), *packages(), *profiles(), *buses(), vcan_lab(), kernel_of_lab(), *places(), ports())
+    return (python(), *packages(), tick(), *profiles(), *buses(), vcan_lab(), kernel_of_lab(), *places(), ports())
 
 
 def python() -> Finding:
@@ -84,6 +85,19 @@ def _missing(need: Requirement) -> str:
     except metadata.PackageNotFoundError:
         return need.name
     return "" if need.specifier.contains(there, prereleases=True) else f"{need.name} {need.specifier} (is {there})"
+
+
+def tick() -> Finding:
+    """Whether the controller would run a compiled tick, asked in a process of its own as `python -m controller`."""
+    program = "from runtime.compiled import activate; found = activate(); print(found, found.reason, sep='|')"
+    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout.strip()
+    running, _, reason = answer.partition("|")
+    if running.startswith("compiled"):
+        return fine("tick", running)
+    return Finding(
+        "tick", Severity.ADVICE, f"runs on the interpreter: {reason or 'unknown'}",
+        "less than half the time for every tick", ("timberhand compile",),
+    )  # fmt: skip
 
 
 def profiles() -> Iterator[Finding]:

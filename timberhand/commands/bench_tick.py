@@ -61,11 +61,12 @@ def tick(
         else:
             rows = [compare.compare_cost(place, ticks, rounds, progress) for place in places]
             reached = all(_good(row) for row in rows)
-    result = {"environment": compare.environment() | {"build": key}, "reached": reached, "recordings": rows}
+    environment = compare.environment() | {"build": key}
+    result = {"environment": environment, "reached": reached, "recordings": rows}
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     else:
-        typer.echo("  ".join(f"{name} {value}" for name, value in result["environment"].items()))
+        typer.echo("  ".join(f"{name} {value}" for name, value in environment.items()))
         for row in rows:
             _show_random(row) if random else _show_cost(row)
     if not reached:

@@ -67,7 +67,7 @@ def _timing(timing: Timing, before: Timing | None, silent: bool) -> list[Rendera
     head = Text.assemble(
         "controller ", (facts.mode, MODE_STYLES.get(facts.mode, "bold")),
         f", {1e9 / facts.period_ns:.0f} Hz for {duration((facts.written_ns - facts.started_ns) * 1e-9)}",
-        f", process {facts.pid}",
+        f", process {facts.pid}, tick: {facts.tick}",
     )  # fmt: skip
     parts: list[RenderableType] = [head, Text(facts.words)]
     if silent:

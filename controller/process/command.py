@@ -1,0 +1,212 @@
+"""The command line of the controller process, and the process from its configuration to its exit code.
+
+Prints its addresses and what the system refused on stderr, and one JSON line with its timing on stdout at the end;
+while it runs, its timing is in shared memory (`can_dbc.timing.page`).  Exit codes: 0 ended by SIGTERM, 2 usage, 3
+configuration, 4 no bus or port at the start, 5 ended in a latched fault, 130 SIGINT.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import socket
+import sys
+from pathlib import Path
+from typing import Final
+
+from can_dbc.bus.base import Bus, BusError
+from can_dbc.bus.factory import default_address, open_bus
+from can_dbc.bus.filters import FilterItem
+from can_dbc.dbc.codec import DbcError
+from can_dbc.dbc.codec import load as read_dbc
+from can_dbc.messages.udp_address import address_argument
+from can_dbc.timing.page import METRIC_KEYS, STAGES, TimingWriter, default_path
+from controller.config import ConfigError, Settings, load
+from controller.process.loop import Loop
+from controller.process.realtime import make_sleep, prepare, stop_garbage_collection
+from controller.process.timing import LoopTiming
+from controller.process.warm_up import warm_up
+from controller.step import Controller
+from machine.status.faults import describe
+from machine.status.modes import Mode
+from runtime.allocator import keep_memory
+from runtime.compiled import running
+
+PRIORITY: Final = 80
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    made = argparse.ArgumentParser(
+        prog="python -m controller",
+        description="Closes the joint and grapple loops of the machine over CAN.",
+        epilog="example: python -m controller --profile palms_471 --bus crane0=socketcan:can0 "
+        "--setpoint-port 5005 --report 127.0.0.1:5006",
+    )
+    made.add_argument("--profile", required=True, help="shipped profile name or TOML file")
+    made.add_argument("--bus", type=bus_address, action="append", default=[], metavar="NAME=ADDRESS",
+                      help="address of crane0 and, on a machine with a carrier, of mach0")  # fmt: skip
+    made.add_argument("--setpoint-port", type=int, required=True, help="UDP port on 127.0.0.1; 0 chooses a free one")
+    made.add_argument("--report", type=address_argument, action="append", default=[], metavar="HOST:PORT",
+                      help="receiver of state reports; may be given more than once")  # fmt: skip
+    made.add_argument("--record", type=address_argument, metavar="HOST:PORT", help="receiver of every tick's record")
+    made.add_argument("--rate", type=int, default=0, metavar="HZ", help="control rate; default: the profile's")
+    made.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
+    made.add_argument("--cpu", type=int, help="processor to run on; use only an isolated one")
+    made.add_argument("--spin-us", type=int, default=0, metavar="US",
+                      help="poll the clock for the last US before a wake-up; on a processor of its own")  # fmt: skip
+    made.add_argument("--dma-latency", action="store_true", help="keep the processors out of deep sleep states")
+    made.add_argument("--sync-lead-us", type=int, metavar="US", help="SYNC before the tick; default: 0.6 periods")
+    made.add_argument("--timing", type=Path, metavar="FILE", help="file of the timing page; default: in shared memory")
+    made.add_argument("--no-realtime", action="store_true", help="do not request FIFO scheduling and locked memory")
+    made.add_argument("--interpreter", action="store_true", help="do not use the compiled tick")
+    return made
+
+
+def bus_address(text: str) -> tuple[str, str]:
+    """Parse NAME=ADDRESS; raises ArgumentTypeError."""
+    name, _, where = text.partition("=")
+    if name not in ("crane0", "mach0") or not where:
+        raise argparse.ArgumentTypeError(f"{text}: write NAME=ADDRESS, as in crane0=socketcan:can0")
+    return name, where
+
+
+def listen(port: int) -> socket.socket:
+    """Open the setpoint socket, on loopback only; raises BusError."""
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        made.bind(("127.0.0.1", port))
+    except (OSError, OverflowError) as error:
+        made.close()
+        sentence = f"UDP port {port} cannot be used ({error}); end the process that uses it or choose another port."
+        raise BusError("udp.port-in-use", sentence) from error
+    made.setblocking(False)
+    return made
+
+
+def settings_of(options: argparse.Namespace) -> Settings:
+    """The validated configuration of a command line; raises ConfigError."""
+    key = None
+    if options.key_file is not None:
+        try:
+            key = options.key_file.read_bytes().strip()
+        except OSError as error:
+            raise ConfigError(
+                "config.key-unreadable", f"{options.key_file}: the key cannot be read: {error.strerror}."
+            ) from error
+        if len(key) < 16:
+            raise ConfigError(
+                "config.key-short", f"{options.key_file}: a key of {len(key)} bytes is too short; use at least 16."
+            )
+    return load(options.profile, options.rate, key)
+
+
+def addresses(settings: Settings, given: dict[str, str]) -> dict[str, str]:
+    """Name -> address of the machine's buses in the loop's order; raises ConfigError."""
+    profile = settings.profile
+    wanted = [name for name in (profile.crane_bus, profile.machine_bus) if name]
+    for name in given:
+        if name not in wanted:
+            raise ConfigError(
+                "config.no-such-bus",
+                f"{profile.name} has no bus {name}, only {' and '.join(wanted)}; leave --bus {name} out.",
+            )
+    return {name: given.get(name) or default_address(name) for name in wanted}
+
+
+def open_buses(where: dict[str, str], controller: Controller) -> list[Bus]:
+    """Open all buses or none, each with the filter of the controller's inputs; raises BusError."""
+    wanted: list[list[FilterItem]] = [[*controller.crane_inputs.filters()]]
+    if controller.carrier_bus is not None:
+        wanted.append(controller.carrier_bus.inputs.filters())
+    opened: list[Bus] = []
+    try:
+        for address, filters in zip(where.values(), wanted, strict=True):
+            opened.append(open_bus(address, filters=filters, tx_queue=32))
+    except BusError:
+        for bus in opened:
+            bus.close()
+        raise
+    return opened
+
+
+def timing_writer(path: Path | None) -> TimingWriter | None:
+    """The timing page; without one the controller runs as well, and reports that on stderr."""
+    path = path or default_path()
+    try:
+        return TimingWriter(path)
+    except OSError as error:
+        sys.stderr.write(f"controller: not granted: timing page {path}: {error.strerror}\n")
+        return None
+
+
+def summary(loop: Loop) -> str:
+    """Statistics of the loop as one JSON line."""
+    supervisor = loop.controller.supervisor
+    return json.dumps(
+        {
+            "ticks": loop.ticks, "missed": loop.missed, "late": supervisor.late,
+            "timing": {METRIC_KEYS[name]: loop.timing.durations[name].summary() for name in STAGES},
+            "unsent": loop.unsent, "unrecorded": loop.unrecorded,
+            "mode": supervisor.mode.name, "reason": supervisor.reason.name, "tick": str(running()),
+        }
+    )  # fmt: skip
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the controller; returns the exit code."""
+    made = parser()
+    options = made.parse_args(arguments)
+    keep_memory()
+    try:
+        settings = settings_of(options)
+        database = read_dbc("crane")
+        warm_up(settings, Controller(settings, database))
+        controller = Controller(settings, database)
+        lead_ns = settings.sync_lead_ns if options.sync_lead_us is None else options.sync_lead_us * 1000
+        if not 0 <= lead_ns < settings.period_ns:
+            raise ConfigError(
+                "config.sync-lead", f"--sync-lead-us {options.sync_lead_us}: the lead must be shorter than the period."
+            )
+        where = addresses(settings, dict(options.bus))
+        buses = open_buses(where, controller)
+        setpoints = listen(options.setpoint_port)
+    except (ConfigError, DbcError) as error:
+        sys.stderr.write(f"controller: {error}\n")
+        return 3
+    except BusError as error:
+        sys.stderr.write(f"controller: {error}\n")
+        return 4
+    timing = LoopTiming(controller, timing_writer(options.timing))
+    loop = Loop(
+        controller, buses, setpoints, options.report, options.record, timing, settings.period_ns, lead_ns,
+        sleep=make_sleep(options.spin_us * 1000),
+    )  # fmt: skip
+    ended: list[int] = []
+
+    def end(number: int, _frame: object) -> None:
+        ended.append(number)
+        loop.stop()
+
+    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGINT, end)
+    shown = " and ".join(f"{name}={address}" for name, address in where.items())
+    sys.stderr.write(
+        f"controller: {settings.profile.name} at {settings.rate_hz} Hz on {shown}, "
+        f"setpoints on 127.0.0.1:{setpoints.getsockname()[1]}; tick: {running()}\n"
+    )
+    if not options.no_realtime:
+        for refusal in prepare(PRIORITY, options.cpu, options.dma_latency):
+            sys.stderr.write(f"controller: not granted: {refusal}\n")
+    stop_garbage_collection()
+    try:
+        loop.run()
+    finally:
+        loop.close()
+    sys.stdout.write(summary(loop) + "\n")
+    supervisor = controller.supervisor
+    if supervisor.mode is Mode.FAULT:
+        sys.stderr.write(f"controller: {describe(supervisor.reason, supervisor.detail)}\n")
+        return 5
+    return 130 if signal.SIGINT in ended else 0
