@@ -130,7 +130,7 @@ class CraneState:
             self._recent.popleft()
 
     def _drawing(self, r: StateReport) -> dict[str, Any]:
-        kin, tongs = self._profile.kinematics, self._profile.grapple.tongs
+        kin, jaws = self._profile.kinematics, self._profile.grapple.jaws
         q = r.position
         if joint(self._profile, Joint.ROT).encoder is None:  # drawn at its reference
             reference = r.reference[Joint.ROT]
@@ -138,15 +138,15 @@ class CraneState:
         if not all(map(math.isfinite, q)):
             return {"points": None, "reference_points": None}
         opening = r.opening_pct if math.isfinite(r.opening_pct) else 100.0
-        angle = grapple.jaw_angle_from_opening_pct(tongs, opening)
+        angle = grapple.jaw_angle_from_opening_pct(jaws, opening)
         ghost = all(map(math.isfinite, r.reference))
         return {
             "points": _points(kinematics.chain_points(kin, q)),
             "reference_points": _points(kinematics.chain_points(kin, r.reference)) if ghost else None,
             "jaws": {
                 "yaw_rad": round(grapple.grapple_yaw(self._profile, q), 4),
-                "half_gap_m": round(grapple.half_gap_m(tongs, angle), 4),
-                "tip_below_m": round(grapple.tip_below_pin_m(tongs, angle), 4),
+                "half_gap_m": round(grapple.half_gap_m(jaws, angle), 4),
+                "tip_below_m": round(grapple.tip_below_pin_m(jaws, angle), 4),
             },
         }
 

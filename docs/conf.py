@@ -2,7 +2,7 @@
 
 project = "timberhand"
 author = "the timberhand developers"
-copyright = "the timberhand developers, Apache-2.0"  # noqa: A001 (Sphinx's name)
+copyright = "the timberhand developers, Apache-2.0"
 
 extensions = ["myst_parser", "sphinx_copybutton", "sphinxcontrib.mermaid"]
 source_suffix = {".md": "markdown"}

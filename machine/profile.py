@@ -162,7 +162,7 @@ class Grapple(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     open_time_s: float
     hold_pressure_bar: float
     opening_sensor: bool
-    tongs: JawTable
+    jaws: JawTable = msgspec.field(name="tongs")
 
 
 class Bunk(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

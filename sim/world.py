@@ -257,7 +257,7 @@ class World:
     @property
     def opening(self) -> float:
         """Grapple opening, 1 = fully open."""
-        return max(0.0, min(1.0, 1.0 - self.jaw_angle_rad / self.profile.grapple.tongs.angle_rad[-1]))
+        return max(0.0, min(1.0, 1.0 - self.jaw_angle_rad / self.profile.grapple.jaws.angle_rad[-1]))
 
     def link_poses(self) -> dict[str, Pose]:
         """Frames of all links in the world."""

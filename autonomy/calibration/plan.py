@@ -81,7 +81,7 @@ def free_range(spec: JointSpec) -> tuple[float, float]:
 def clear_height_m(profile: Profile) -> float:
     """Lowest height of the hanger pin at which the open grapple passes over everything, m."""
     top = max(profile.workspace.ground_z_m, profile.bunk.floor_z_m + profile.bunk.stake_height_m)
-    return top + max(profile.grapple.tongs.tip_below_pin_m) + TIP_CLEARANCE_M
+    return top + max(profile.grapple.jaws.tip_below_pin_m) + TIP_CLEARANCE_M
 
 
 def required_range(spec: JointSpec) -> float:

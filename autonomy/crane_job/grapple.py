@@ -91,15 +91,15 @@ def has_released(profile: Profile, report: StateReport, grasp: Grasp, opening_s:
     if grasp.others:
         angle = 0.0  # logs beside each other reach farther out
     if isfinite(report.opening_pct):
-        return report.opening_pct >= min(opening_pct_from_jaw_angle(grapple.tongs, angle), _OPEN_FROM_PCT)
-    turned = max(_ASSUMED_GRIP_RAD - angle, 0.0) / grapple.tongs.angle_rad[-1]
+        return report.opening_pct >= min(opening_pct_from_jaw_angle(grapple.jaws, angle), _OPEN_FROM_PCT)
+    turned = max(_ASSUMED_GRIP_RAD - angle, 0.0) / grapple.jaws.angle_rad[-1]
     return opening_s > _VALVE_DELAY_S + _SLOW_OPENING_FACTOR * turned * grapple.open_time_s
 
 
 def is_between_stakes(arm: Arm, bunk: Bunk, q: Sequence[float]) -> bool:
     """Whether open jaws are so low over a bunk that opening them further would stir its load."""
     pose, top_m = arm.pose(q), bunk.floor_z_m + bunk.stake_height_m
-    return is_over_bunk(bunk, *arm.xy(pose)) and pose.z_m < top_m + tip_below_pin_m(arm.profile.grapple.tongs, 0.0)
+    return is_over_bunk(bunk, *arm.xy(pose)) and pose.z_m < top_m + tip_below_pin_m(arm.profile.grapple.jaws, 0.0)
 
 
 def equivalent_closing_s(profile: Profile, report: StateReport) -> float:
@@ -107,8 +107,8 @@ def equivalent_closing_s(profile: Profile, report: StateReport) -> float:
     opening = report.opening_pct
     if not isfinite(opening):
         return opening
-    tongs = profile.grapple.tongs
-    return jaw_angle_from_opening_pct(tongs, opening) / tongs.angle_rad[-1] * profile.grapple.close_time_s
+    jaws = profile.grapple.jaws
+    return jaw_angle_from_opening_pct(jaws, opening) / jaws.angle_rad[-1] * profile.grapple.close_time_s
 
 
 class GrappleSequence:
@@ -186,8 +186,8 @@ class GrappleSequence:
 
     def _gap_m(self) -> float:
         """Gap between the tips, m; 0 without a sensor."""
-        opening, tongs = self._inbox.report.opening_pct, self._profile.grapple.tongs
-        return 2.0 * half_gap_m(tongs, jaw_angle_from_opening_pct(tongs, opening)) if isfinite(opening) else 0.0
+        opening, jaws = self._inbox.report.opening_pct, self._profile.grapple.jaws
+        return 2.0 * half_gap_m(jaws, jaw_angle_from_opening_pct(jaws, opening)) if isfinite(opening) else 0.0
 
     @property
     def empty(self) -> bool:

@@ -52,7 +52,7 @@ def is_between_jaws(arm: Arm, log: LogObservation, pin: Pose) -> bool:
     along_m = min(max(along_m, -0.5 * log.length_m), 0.5 * log.length_m)
     below_m = pin.z_m - c[2] - along_m * a[2]
     aside_m = hypot(c[0] + along_m * a[0] - x, c[1] + along_m * a[1] - y)
-    return aside_m < 0.5 * log.diameter_m and 0.0 < below_m < lowest_tip_below_pin_m(arm.profile.grapple.tongs)
+    return aside_m < 0.5 * log.diameter_m and 0.0 < below_m < lowest_tip_below_pin_m(arm.profile.grapple.jaws)
 
 
 def is_at_target(job: CraneJob, target: Bunk, log: LogObservation) -> bool:

@@ -49,14 +49,14 @@ def travel_height_m(profile: Profile) -> float:
     """Height of the pin at which a held log passes over the stakes, m."""
     bunk = profile.bunk
     top = bunk.floor_z_m + bunk.stake_height_m
-    return top + lowest_tip_below_pin_m(profile.grapple.tongs) + TRAVEL_CLEARANCE_M
+    return top + lowest_tip_below_pin_m(profile.grapple.jaws) + TRAVEL_CLEARANCE_M
 
 
 def retreat_height_m(profile: Profile) -> float:
     """Height of the pin at which the open grapple is clear of the stakes, m."""
     bunk = profile.bunk
     top = bunk.floor_z_m + bunk.stake_height_m
-    return top + tip_below_pin_m(profile.grapple.tongs, 0.0) + RETREAT_CLEARANCE_M
+    return top + tip_below_pin_m(profile.grapple.jaws, 0.0) + RETREAT_CLEARANCE_M
 
 
 def approach_length_m(profile: Profile, log: LogObservation) -> float:
@@ -69,7 +69,7 @@ def hover_height_m(profile: Profile, grasp: Grasp) -> float:
     over = grasp.support_z_m + HOVER_CLEARANCE_M
     if grasp.top_z_m is not None:
         over = max(over, grasp.top_z_m + PASS_CLEARANCE_M)
-    return over + tip_below_pin_m(profile.grapple.tongs, 0.0)
+    return over + tip_below_pin_m(profile.grapple.jaws, 0.0)
 
 
 def known_ground_m(profile: Profile) -> float:
@@ -79,8 +79,8 @@ def known_ground_m(profile: Profile) -> float:
 
 def release_angle_rad(profile: Profile, thickest_m: float) -> float:
     """Jaw angle [rad] at which the tips are clear of a log that lies between them."""
-    tongs = profile.grapple.tongs
-    return float(np.interp(thickest_m / 2 + RELEASE_SIDE_CLEARANCE_M, tongs.half_gap_m[::-1], tongs.angle_rad[::-1]))
+    jaws = profile.grapple.jaws
+    return float(np.interp(thickest_m / 2 + RELEASE_SIDE_CLEARANCE_M, jaws.half_gap_m[::-1], jaws.angle_rad[::-1]))
 
 
 def tip_clearance_m(diameter_m: float) -> float:
@@ -95,20 +95,20 @@ def closing_height_curve(profile: Profile, support_z_m: float, diameter_m: float
     The tips first sweep deeper and then rise while the jaws turn.  The pin keeps them ``tip_clearance_m`` above the
     support until they touch the log; from then on it stands still.
     """
-    times, sweep = _sweep(profile.grapple.tongs, profile.grapple.close_time_s, diameter_m)
+    times, sweep = _sweep(profile.grapple.jaws, profile.grapple.close_time_s, diameter_m)
     height = support_z_m + tip_clearance_m(diameter_m) + sweep
     return lambda time_s: float(np.interp(time_s, times, height))
 
 
 @lru_cache(maxsize=64)
-def _sweep(tongs: JawTable, close_time_s: float, diameter_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _sweep(jaws: JawTable, close_time_s: float, diameter_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Times [s] and the depth of closing tips below the pin then [m]; cached, as logs repeat."""
-    rate = tongs.angle_rad[-1] / close_time_s
-    meet = float(np.interp(_CONTACT_SHARE * diameter_m, tongs.half_gap_m[::-1], tongs.angle_rad[::-1]))
+    rate = jaws.angle_rad[-1] / close_time_s
+    meet = float(np.interp(_CONTACT_SHARE * diameter_m, jaws.half_gap_m[::-1], jaws.angle_rad[::-1]))
     half = _SMOOTH_S / 2
     grid = np.arange(-half, meet / rate + _SMOOTH_S, _STEP_S)
     angles = np.linspace(0.0, meet, 200)
-    depth = np.interp(angles, tongs.angle_rad, tongs.tip_below_pin_m)
+    depth = np.interp(angles, jaws.angle_rad, jaws.tip_below_pin_m)
     padded = np.maximum(np.arange(grid[0] - half, grid[-1] + half + _STEP_S / 2, _STEP_S), half)[:, None]
     early, late = (np.searchsorted(angles, rate * (padded + lead)) for lead in (_FALL_LEAD_S, _RISE_LEAD_S))
     at = np.arange(len(angles))

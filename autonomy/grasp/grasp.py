@@ -67,6 +67,6 @@ def restricted_to(arm: Arm, grasp: Grasp, held: Sequence[int]) -> Grasp:
 def hangs_below(arm: Arm, log: LogObservation, pin: Pose) -> bool:
     """Whether the log hangs below a pin: horizontally near it, and as high as the jaws can hold it."""
     x, y = arm.xy(pin)
-    reach = lowest_tip_below_pin_m(arm.profile.grapple.tongs) + 0.3
+    reach = lowest_tip_below_pin_m(arm.profile.grapple.jaws) + 0.3
     near = hypot(log.center_m[0] - x, log.center_m[1] - y) < log.length_m / 2
     return near and log.center_m[2] > pin.z_m - reach

@@ -63,7 +63,7 @@ class Jaws:
 
 def jaws_of(profile: Profile) -> Jaws:
     """The grapple of a profile; the pivots follow from its table of tip positions."""
-    table = profile.grapple.tongs
+    table = profile.grapple.jaws
     angle, gap = np.array(table.angle_rad), np.array(table.half_gap_m)
     down = table.tip_below_pin_m[0] - pin_to_jaw_pivot_m(profile.kinematics)
     columns = np.stack([np.ones_like(angle), np.cos(angle)], axis=1)

@@ -53,7 +53,7 @@ def plan_place(
         raise BunkFull(
             "grasp.bunk-full", f"the bunk is full: log {grasp.log.id} would lie above the stakes; empty the bunk"
         )
-    low = rest.support_z_m + RELEASE_CLEARANCE_M + lowest_tip_below_pin_m(profile.grapple.tongs)
+    low = rest.support_z_m + RELEASE_CLEARANCE_M + lowest_tip_below_pin_m(profile.grapple.jaws)
     # The jaws open at the place itself, which is free of stakes; a log gripped off its centre shifts them only as far
     # as it would stick out of the bunk.
     out_m = max(0.0, abs(grasp.along_m) + grasp.log.length_m / 2 - bunk.length_m / 2)

@@ -272,7 +272,7 @@ def swept_capsules(
     # The stick reaches back behind its pin no farther than its radius; the telescope ends at the hanger.
     yaw = q[:, Joint.SLEW] + q[:, Joint.ROT] + grapple_yaw(profile, [0.0] * len(Joint))
     opening = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(n)])
-    jaws = profile.grapple.tongs
+    jaws = profile.grapple.jaws
     pivot = pin - np.array([0.0, 0.0, pin_to_jaw_pivot_m(kin)])
     parts: list[tuple[str, np.ndarray, np.ndarray, float, bool]] = [
         ("boom", foot, elbow, BOOM_RADIUS_M, False),

@@ -52,7 +52,7 @@ class GroundTruthObserver:
         self._arm, self._limits = Arm(profile), full_limits(profile)
         k = profile.kinematics
         pin_to_rotator = k.hanger_to_fork_m + k.fork_to_rotator_m
-        self._tips_m = tip_below_pin_m(profile.grapple.tongs, 0.0)
+        self._tips_m = tip_below_pin_m(profile.grapple.jaws, 0.0)
         self._below_m = self._tips_m - pin_to_rotator
         self._phase: Phase | None = None
         self._activity: Activity | None = None

@@ -128,7 +128,7 @@ class Driver:
 
         The grapple is open before.  Returns the telescope position of the motion.
         """
-        jaws = self.world.profile.grapple.tongs
+        jaws = self.world.profile.grapple.jaws
         floor = ground_m + CLEARANCE_M
         low = floor + tip_below_pin_m(jaws, 0.0)
         top = max(hover_m, lift_to_m, floor + lowest_tip_below_pin_m(jaws))
@@ -150,7 +150,7 @@ class Driver:
         The tips stay ``floor_m`` above the base: closed tips are lowered to this height, and while they open and sweep
         lower the pin rises, so that the load is laid down and not dropped.
         """
-        jaws = self.world.profile.grapple.tongs
+        jaws = self.world.profile.grapple.jaws
         low = floor_m + tip_below_pin_m(jaws, self.world.jaw_angle_rad)
         ext = self.extension_for(x, y, low, carry_m)
         above = self.pose((x, y, carry_m), ext)
@@ -163,7 +163,7 @@ class Driver:
         self.line((x, y, z), (x, y, carry_m), ext)
 
     def _open_while_raising(self, x: float, y: float, z: float, floor: float, ext: float) -> float:
-        jaws = self.world.profile.grapple.tongs
+        jaws = self.world.profile.grapple.jaws
         self.grapple = OPENING
         for _ in range(round(CLOSE_LIMIT_S / STEP_S)):
             angle = self.world.jaw_angle_rad
@@ -177,7 +177,7 @@ class Driver:
 
     def _close_while_raising(self, x: float, y: float, z: float, floor: float, ext: float) -> float:
         """Close until the jaws stop on a load; the tips sweep lower, so the pin rises meanwhile."""
-        world, jaws = self.world, self.world.profile.grapple.tongs
+        world, jaws = self.world, self.world.profile.grapple.jaws
         self.grapple = -0.7
         still_s = 0.0
         for _ in range(round(CLOSE_LIMIT_S / STEP_S)):

@@ -77,7 +77,7 @@ def shift(job: Job) -> dict[str, Any]:
 
 def _lay_down(world: World, driver: Driver, rng: random.Random) -> None:
     """Lay the load down at a random place of the pick area in a random direction."""
-    space, jaws = world.profile.workspace, world.profile.grapple.tongs
+    space, jaws = world.profile.workspace, world.profile.grapple.jaws
     tips = lowest_tip_below_pin_m(jaws)
     while True:
         x, y = (c + rng.uniform(-1.0, 1.0) * space.pick_half_size_m for c in space.pick_center_m)

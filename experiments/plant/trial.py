@@ -118,7 +118,7 @@ def pick_logs(
 
     The aim is off by ``across_m``, ``turned_rad`` and the noise of ``rng`` (None: no noise).
     """
-    tips = lowest_tip_below_pin_m(world.profile.grapple.tongs)
+    tips = lowest_tip_below_pin_m(world.profile.grapple.jaws)
     x, y, yaw, ground = _aim(world, driver, rng, across_m, logs or world.log_bodies.states())
     top = ground + LIFT_HEIGHT_M + tips if lift_to_m is None else lift_to_m
     driver.pick(x, y, yaw + turned_rad, ground + HOVER_M + tips, ground, top)
@@ -127,7 +127,7 @@ def pick_logs(
 def over_stakes_m(world: World) -> float:
     """Height of the pin [m] at which a load clears the stakes."""
     bunk = world.profile.bunk
-    return bunk.floor_z_m + bunk.stake_height_m + OVER_STAKES_M + lowest_tip_below_pin_m(world.profile.grapple.tongs)
+    return bunk.floor_z_m + bunk.stake_height_m + OVER_STAKES_M + lowest_tip_below_pin_m(world.profile.grapple.jaws)
 
 
 def unload(world: World, driver: Driver, logs: Sequence[LogState]) -> None:
@@ -171,7 +171,7 @@ def _aim(
     if rng is not None:
         noise = (rng.gauss(0.0, AIM_M), rng.gauss(0.0, AIM_M), rng.gauss(0.0, AIM_RAD))
         side *= rng.choice((-1.0, 1.0))
-    tips = lowest_tip_below_pin_m(world.profile.grapple.tongs)
+    tips = lowest_tip_below_pin_m(world.profile.grapple.jaws)
     for offset in (side, -side):
         at = (x - offset * math.sin(yaw) + noise[0], y + offset * math.cos(yaw) + noise[1])
         try:

@@ -101,6 +101,7 @@ def run(options: Options, console: Console) -> Result:
             **surroundings,
             "host_verdict": "quiet enough" if metrics["host_verdict"] else "inconclusive",
             "modes": "; ".join(slow.modes + fast.modes),
+            "tick": compared[-1].end.tick,
             **{f"open: {name}": why for name, why in found.inconclusive.items()},
         },
         limits=limits_of(METRICS),
@@ -134,7 +135,8 @@ def setting(result: Result) -> str:
         f"{plan.quiet_s:.0f} s, loaded ones {plan.loaded} x {plan.loaded_s:.0f} s; `{FIXED_CRANE}` at 1 kHz, "
         f"{plan.fast} of {plan.fast_s:.0f} s each. Host: {e['processor']}, {e['cpus']} cores, hypervisor: "
         f"{e['hypervisor']}, kernel {e['kernel']}, preemption {e['preemption']}, clock {e['clock']}, governor "
-        f"{e['governor']}, isolated processors {e['isolated']}, Python {e['python']}. {quiet}"
+        f"{e['governor']}, isolated processors {e['isolated']}, Python {e['python']}, tick: "
+        f"{e.get('tick', 'interpreter')}. {quiet}"
     )
 
 

@@ -177,6 +177,7 @@ def run(options: Options, console: Console) -> Result:
             "rate_hz": str(profile.rate_hz),
             "lab": lab(),
             "modes": "; ".join(modes),
+            "tick": readings[-1].facts.tick,
         },
         limits=limits_of(METRICS),
         missed=found.missed,

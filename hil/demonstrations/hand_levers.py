@@ -80,7 +80,7 @@ def script(profile: Profile, seed: int, targets: int, standing: Sequence[float])
     rng, arm, bunk, ground = random.Random(seed), Arm(profile), profile.bunk, profile.workspace.ground_z_m
     high = travel_height_m(profile)
     over_bunk = arm.compact_pose_above(
-        *bunk.center_m, bunk.floor_z_m + lowest_tip_below_pin_m(profile.grapple.tongs) + 0.3, high
+        *bunk.center_m, bunk.floor_z_m + lowest_tip_below_pin_m(profile.grapple.jaws) + 0.3, high
     )
     shown: list[DemonstrationMotion] = []
     here = arm.pose(standing)
@@ -89,7 +89,7 @@ def script(profile: Profile, seed: int, targets: int, standing: Sequence[float])
         side = -1.0 if number % 2 and profile.carrier is not None else 1.0
         x, y = cx + rng.uniform(-0.8, 0.8), side * (cy + rng.uniform(-0.8, 0.8))
         try:
-            log = arm.compact_pose_above(x, y, ground + profile.grapple.tongs.tip_below_pin_m[0] + OVER_LOG_M, high)
+            log = arm.compact_pose_above(x, y, ground + profile.grapple.jaws.tip_below_pin_m[0] + OVER_LOG_M, high)
             shown.append(_motion(arm, here, log, high, rng))
             shown.append(_motion(arm, log, over_bunk, high, rng))
             here = over_bunk

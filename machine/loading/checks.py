@@ -234,7 +234,7 @@ def _imu_problems(profile: Profile, imu: Imu) -> Iterator[Problem]:
 
 
 def _grapple_problems(profile: Profile) -> Iterator[Problem]:
-    jaws, path = profile.grapple.tongs, "grapple.tongs"
+    jaws, path = profile.grapple.jaws, "grapple.tongs"
     rows = len(jaws.angle_rad)
     for key in ("half_gap_m", "tip_below_pin_m"):
         given = len(getattr(jaws, key))

@@ -138,9 +138,9 @@ def _build_struct(kind: type[msgspec.Struct], value: Any, path: str, problems: l
     found = len(problems)
     dot = f"{path}." if path else ""
     fields = msgspec.structs.fields(kind)
-    names = tuple(field.name for field in fields)
-    absent = [f for f in fields if f.name not in value]
-    missing = [f.name for f in absent if f.required and types.NoneType not in get_args(f.type)]
+    names = tuple(field.encode_name for field in fields)
+    absent = [f for f in fields if f.encode_name not in value]
+    missing = [f.encode_name for f in absent if f.required and types.NoneType not in get_args(f.type)]
     for key in value:
         if key not in names:
             problems.append(_unknown_key(dot, key, names))
@@ -148,7 +148,8 @@ def _build_struct(kind: type[msgspec.Struct], value: Any, path: str, problems: l
     problems += [
         Problem("profile.missing-key", f"{dot}{name}", "missing") for name in missing if _stem(name) not in stems
     ]
-    parts = {f.name: _build(f.type, value[f.name], dot + f.name, problems) for f in fields if f.name in value}
+    keys = {f.encode_name: f for f in fields if f.encode_name in value}
+    parts = {f.name: _build(f.type, value[key], dot + key, problems) for key, f in keys.items()}
     parts |= {f.name: None for f in absent if f.required}
     return kind(**parts) if len(problems) == found else None
 

@@ -180,9 +180,9 @@ _SLIPS: Final = {
 def out_of_range(struct: msgspec.Struct, path: str) -> Iterator[Problem]:
     """The problem of every number that its table refuses, of a profile or of a part at the key path ``path``."""
     ranges = _RANGES.get(type(struct), {})
-    for name in struct.__struct_fields__:
+    for name, key in zip(struct.__struct_fields__, struct.__struct_encode_fields__, strict=True):
         value: Any = getattr(struct, name)
-        where = f"{path}{name}"
+        where = f"{path}{key}"
         if isinstance(value, msgspec.Struct):
             yield from out_of_range(value, f"{where}.")
         elif isinstance(value, dict):

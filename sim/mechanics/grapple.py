@@ -43,7 +43,7 @@ def jaw_geometry(profile: Profile) -> JawGeometry:
 
     half gap = x + out cos(a) - down sin(a), tip below pivot = out sin(a) + down cos(a).
     """
-    k, table = profile.kinematics, profile.grapple.tongs
+    k, table = profile.kinematics, profile.grapple.jaws
     hanging = k.hanger_to_fork_m + k.fork_to_rotator_m + k.rotator_to_tong_pivot_m
     rows: list[tuple[tuple[float, float, float], float]] = []
     for a, gap, below in zip(table.angle_rad, table.half_gap_m, table.tip_below_pin_m, strict=True):

@@ -17,14 +17,14 @@ from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, SpoolTest, StateReport
 from can_dbc.messages.datagrams import decode
-from machine.sensing.encoder import counts_from_position
 from machine.geometry.grapple import grapple_yaw
-from machine.joints import JOINTS, Joint
-from machine.sensing.weighing import empty_moment_nm, lever_share
-from machine.loading.profile_file import load_profile, profile_hash
-from machine.status.modes import Mode
-from machine.profile import Profile, Sag, joint
 from machine.geometry.sag import true_pin
+from machine.joints import JOINTS, Joint
+from machine.loading.profile_file import load_profile, profile_hash
+from machine.profile import Profile, Sag, joint
+from machine.sensing.encoder import counts_from_position
+from machine.sensing.weighing import empty_moment_nm, lever_share
+from machine.status.modes import Mode
 
 DATABASE = load("crane")
 STEP_S = 0.01

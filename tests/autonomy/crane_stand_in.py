@@ -17,11 +17,11 @@ from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
 from can_dbc.messages.datagrams import decode
 from machine.geometry.grapple import grapple_yaw, half_gap_m, opening_pct_from_jaw_angle, tip_below_pin_m
+from machine.geometry.sag import true_pin
 from machine.joints import JOINTS
 from machine.loading.profile_file import profile_hash
-from machine.status.modes import Mode
 from machine.profile import Profile, joint
-from machine.geometry.sag import true_pin
+from machine.status.modes import Mode
 
 GROUND_LOG = LogObservation(0, (-1.8, 4.4, -1.29), (0.6, 0.8, 0.0), 2.6, 0.2)
 HOME = (0.0, 0.75, -1.6, 0.30, 0.0)
@@ -61,7 +61,7 @@ class StandIn:
 
     def report(self) -> StateReport:
         """What the controller says now."""
-        opening = opening_pct_from_jaw_angle(self.profile.grapple.tongs, self.tong_rad)
+        opening = opening_pct_from_jaw_angle(self.profile.grapple.jaws, self.tong_rad)
         state = 5 if self.gripped else 0
         sequence = self.setpoint.sequence if self.setpoint else 0
         return StateReport(
@@ -144,7 +144,7 @@ class StandIn:
 
     def _grapple(self, command: GrappleCommand) -> None:
         grapple = self.profile.grapple
-        full = grapple.tongs.angle_rad[-1]
+        full = grapple.jaws.angle_rad[-1]
         step_s = TICK_NS * 1e-9
         if command is GrappleCommand.OPEN:
             self.gripped = False
@@ -160,7 +160,7 @@ class StandIn:
 
     def _grip(self) -> None:
         x, y, z = self.pin()
-        tip_z = z - tip_below_pin_m(self.profile.grapple.tongs, self.tong_rad)
+        tip_z = z - tip_below_pin_m(self.profile.grapple.jaws, self.tong_rad)
         for log in self.logs:
             dx, dy = x - log.center_m[0], y - log.center_m[1]
             along = dx * log.axis[0] + dy * log.axis[1]
@@ -217,10 +217,10 @@ def log_ends(log: LogObservation) -> list[tuple[float, ...]]:
 
 def tips(profile: Profile, moment: Moment) -> list[tuple[float, float, float]]:
     """The two tong tips of the hanging grapple, base frame."""
-    gap = half_gap_m(profile.grapple.tongs, moment.tong_rad)
+    gap = half_gap_m(profile.grapple.jaws, moment.tong_rad)
     yaw = grapple_yaw(profile, moment.q)
     x, y, z = moment.pin
-    z -= tip_below_pin_m(profile.grapple.tongs, moment.tong_rad)
+    z -= tip_below_pin_m(profile.grapple.jaws, moment.tong_rad)
     return [(x + s * gap * cos(yaw), y + s * gap * sin(yaw), z) for s in (-1, 1)]
 
 

@@ -9,10 +9,10 @@ from math import hypot, pi
 
 import numpy as np
 
-from autonomy.motion.obstacles import HeldLog, CollisionScene, swept_capsules
+from autonomy.motion.obstacles import CollisionScene, HeldLog, swept_capsules
 from autonomy.motion.trajectory import Trajectory
-from machine.joints import JOINTS
 from machine.geometry.kinematics import pin_position
+from machine.joints import JOINTS
 from machine.profile import Profile, joint
 
 STEP_S = 0.005

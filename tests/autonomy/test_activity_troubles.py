@@ -94,7 +94,7 @@ def test_a_held_log_that_is_listed_twice_is_no_obstacle() -> None:
 def test_only_what_lies_in_closed_jaws_is_between_them() -> None:
     arm = Arm(PROFILE)
     x, y, z = GROUND_LOG.center_m
-    pin = arm.pose_above(x, y, z + lowest_tip_below_pin_m(PROFILE.grapple.tongs) - 0.1, 2.0)
+    pin = arm.pose_above(x, y, z + lowest_tip_below_pin_m(PROFILE.grapple.jaws) - 0.1, 2.0)
     assert is_between_jaws(arm, GROUND_LOG, pin)
     assert not is_between_jaws(arm, GROUND_LOG, pin.at_height(pin.z_m + 0.15)), "it lies under them"
     upright = replace(GROUND_LOG, axis=(0.0, 0.0, 1.0))

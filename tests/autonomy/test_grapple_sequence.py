@@ -26,7 +26,7 @@ PILE = Bunk((0.4, -2.9), 0.0, 3.0, 2.6, -1.4, 1.5)
 
 @pytest.mark.parametrize("bunk", [AORO.bunk, PILE])
 def test_jaws_are_between_the_stakes_until_the_open_tips_are_above_them(bunk: Bunk) -> None:
-    top = bunk.floor_z_m + bunk.stake_height_m + tip_below_pin_m(AORO.grapple.tongs, 0.0)
+    top = bunk.floor_z_m + bunk.stake_height_m + tip_below_pin_m(AORO.grapple.jaws, 0.0)
     high = travel_height_m(AORO)
     for above_m, among in ((-0.3, True), (-0.05, True), (0.05, False), (0.3, False)):
         q = ARM.joints(np.array([ARM.pose_above(*bunk.center_m, top + above_m, high)]))[0].tolist()
@@ -55,7 +55,7 @@ def test_jaws_stall_wide_by_what_they_should_hold(
 ) -> None:
     logs = [LogObservation(i, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, d) for i, d in enumerate(diameters_m)]
     grasp = Grasp(logs[0], Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, tuple(logs[1:]))
-    assert tongs_at(opening_pct).is_stalled_wide(grasp, climbs) is wide
+    assert sequence_at(opening_pct).is_stalled_wide(grasp, climbs) is wide
 
 
 @pytest.mark.parametrize(
@@ -74,14 +74,14 @@ def test_jaws_tell_that_they_have_missed(
 ) -> None:
     log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, diameter_m)
     grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0, extracts=drawn)
-    assert tongs_at(opening_pct, state).has_missed(grasp) is missed
+    assert sequence_at(opening_pct, state).has_missed(grasp) is missed
 
 
 @pytest.mark.parametrize(
     ("state", "load_kg", "nothing"), [(4, 2.0, True), (4, 15.0, False), (5, 2.0, False), (4, nan, False)]
 )
 def test_closed_jaws_that_weigh_nothing_hold_nothing(state: int, load_kg: float, nothing: bool) -> None:
-    assert tongs_at(0.0, state, load_kg).holds_nothing is nothing
+    assert sequence_at(0.0, state, load_kg).holds_nothing is nothing
 
 
 @pytest.mark.parametrize(
@@ -95,28 +95,34 @@ def test_closed_jaws_that_weigh_nothing_hold_nothing(state: int, load_kg: float,
     ],
 )
 def test_opening_jaws_that_bear_a_load_push(loads_kg: tuple[float, ...], pushed: bool) -> None:
-    tongs = tongs_at(nan)
+    sequence = sequence_at(nan)
     log = LogObservation(0, (0.0, 4.0, -1.0), (1.0, 0.0, 0.0), 2.6, 0.25)
     grasp = Grasp(log, Pose(0.0, 4.0, 0.0, 0.0, 0.0), -1.2, 0.0)
     for load_kg, command in zip(loads_kg, ["HOLD", *["OPEN"] * 4], strict=False):
-        tongs._inbox.report.load_kg = load_kg
-        tongs.apply(GrappleCommand[command], 0.05)
-    assert tongs.is_obstructed is pushed
+        sequence._inbox.report.load_kg = load_kg
+        sequence.apply(GrappleCommand[command], 0.05)
+    assert sequence.is_obstructed is pushed
     if pushed:
-        tongs.release(0.05)
-        assert tongs.command is GrappleCommand.CLOSE and tongs.is_obstructed and not tongs.has_released(grasp, 10.0)
-        tongs._inbox.report.load_kg = 90.0
+        sequence.release(0.05)
+        assert (
+            sequence.command is GrappleCommand.CLOSE
+            and sequence.is_obstructed
+            and not sequence.has_released(grasp, 10.0)
+        )
+        sequence._inbox.report.load_kg = 90.0
         for _ in range(10):
-            tongs.release(0.05)
-        assert tongs.command is GrappleCommand.NEUTRAL and not tongs.has_released(grasp, 10.0), "the crane still swings"
+            sequence.release(0.05)
+        assert sequence.command is GrappleCommand.NEUTRAL and not sequence.has_released(grasp, 10.0), (
+            "the crane still swings"
+        )
         for _ in range(10):
-            tongs.release(0.05)
-        assert tongs.has_released(grasp, 0.3)
-    tongs.apply(GrappleCommand.CLOSE, 0.05)
-    assert not tongs.is_obstructed
+            sequence.release(0.05)
+        assert sequence.has_released(grasp, 0.3)
+    sequence.apply(GrappleCommand.CLOSE, 0.05)
+    assert not sequence.is_obstructed
 
 
-def tongs_at(opening_pct: float, state: int = 5, load_kg: float = nan) -> GrappleSequence:
+def sequence_at(opening_pct: float, state: int = 5, load_kg: float = nan) -> GrappleSequence:
     """Tongs by what is reported of them."""
     report = SimpleNamespace(opening_pct=opening_pct, grapple_state=state, load_kg=load_kg)
     return GrappleSequence(load_profile("palms_471"), SimpleNamespace(report=report))

@@ -27,7 +27,7 @@ from tests.codes import coded
 
 PROFILE = load_profile("palms_471")
 ARM = Arm(PROFILE)
-TONGS = PROFILE.grapple.tongs
+JAWS = PROFILE.grapple.jaws
 GROUND = PROFILE.workspace.ground_z_m
 BUNK = PROFILE.bunk
 
@@ -74,7 +74,7 @@ def test_every_log_of_the_pick_area_has_a_grasp_and_a_place(log: LogObservation)
     assert abs(place.rot_rad - grasp.pose.rot_rad) <= pi / 2 + 1e-9
     for pose in (grasp.pose, place):
         ARM.joints(np.array([pose, pose.at_height(travel_height_m(PROFILE))]))  # raises when out of reach
-    assert hover_height_m(PROFILE, grasp) - tip_below_pin_m(TONGS, 0.0) > GROUND + log.diameter_m + 0.1
+    assert hover_height_m(PROFILE, grasp) - tip_below_pin_m(JAWS, 0.0) > GROUND + log.diameter_m + 0.1
 
 
 @settings(max_examples=50, deadline=None)
@@ -83,12 +83,12 @@ def test_the_tips_sweep_between_the_ground_and_the_middle_of_the_log(
     pace: float, diameter: float, delay_s: float
 ) -> None:
     height = closing_height_curve(PROFILE, GROUND, diameter)
-    rate = TONGS.angle_rad[-1] / PROFILE.grapple.close_time_s
+    rate = JAWS.angle_rad[-1] / PROFILE.grapple.close_time_s
     tips = []
     for t in np.arange(0.0, 3.5, 0.01):
-        angle = min(rate * pace * t, TONGS.angle_rad[-1])
-        z = height(max(t - delay_s, 0.0)) - tip_below_pin_m(TONGS, angle) - GROUND
-        tips.append((half_gap_m(TONGS, angle), z))
+        angle = min(rate * pace * t, JAWS.angle_rad[-1])
+        z = height(max(t - delay_s, 0.0)) - tip_below_pin_m(JAWS, angle) - GROUND
+        tips.append((half_gap_m(JAWS, angle), z))
     assert tips[0][1] < 0.2
     assert min(tip for gap, tip in tips if gap > diameter / 2) > 0.012
     assert max(tip for gap, tip in tips if 0.3 * diameter < gap < 0.5 * diameter) < 0.45 * diameter
@@ -163,7 +163,7 @@ def test_the_top_log_comes_first_then_the_nearest_and_never_one_in_the_bunk() ->
 
 def test_a_place_is_above_what_is_in_the_bunk_until_the_bunk_is_full() -> None:
     grasp = plan_single_log_grasp(ARM, GROUND_LOG, 0.0)
-    deepest = lowest_tip_below_pin_m(TONGS)
+    deepest = lowest_tip_below_pin_m(JAWS)
     empty = plan_place(ARM, CraneJob(), grasp, [GROUND_LOG])
     assert 0.04 < empty.z_m - deepest - BUNK.floor_z_m < 0.1
     half = plan_place(ARM, CraneJob(), grasp, layer(-0.5))

@@ -3,12 +3,12 @@
 import math
 
 import numpy as np
-from tests.training.drawn_logs import ground_depth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autonomy.perception.segmentation.ground_plane import height_over_plane
 from machine.geometry.optics import Intrinsics
+from tests.training.drawn_logs import ground_depth
 
 PIN = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
 

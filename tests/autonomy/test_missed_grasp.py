@@ -171,7 +171,7 @@ def test_extracting_jaws_go_in_beside_the_log_before_they_close() -> None:
         crane = Pinching(PROFILE, pair_of)
         planner = lambda request, d=draws: replace(extracting(request), extracts=d)  # noqa: E731
         crane.until(Activity(PROFILE, profile_hash(PROFILE), grasp_selector=PlannerSelection(planner)), Phase.CLOSE)
-        tip = crane.pin()[2] - tip_below_pin_m(PROFILE.grapple.tongs, crane.tong_rad)
+        tip = crane.pin()[2] - tip_below_pin_m(PROFILE.grapple.jaws, crane.tong_rad)
         over[draws] = tip - GROUND
     assert 0.02 < over[True] < 0.1, "under the middle of the log, and over the ground"
     assert over[False] > 0.15, "they sweep deeper as they close"

@@ -193,7 +193,7 @@ def test_a_proposal_becomes_a_grasp_of_several_logs() -> None:
     grasp = PlannerSelection(SamplingPlanner())(ARM, CraneJob(), small_pile(), 0.0, 0.0)
     assert {o.id for o in grasp.logs} == {0, 1, 2} and grasp.is_bundle and grasp.thinnest_m == 0.2
     top = GROUND + small_pile()[2].center_m[2] - GROUND + 0.1
-    assert hover_height_m(PROFILE, grasp) - tip_below_pin_m(PROFILE.grapple.tongs, 0.0) > top
+    assert hover_height_m(PROFILE, grasp) - tip_below_pin_m(PROFILE.grapple.jaws, 0.0) > top
     rest = restricted_to(ARM, grasp, [2])
     assert rest.log.id == 2 and rest.others == () and abs(rest.along_m) < 0.2
     assert restricted_to(ARM, grasp, [0, 1, 2]) is grasp

@@ -32,7 +32,7 @@ class Heap(StandIn):
         return tuple(measured(log) if self.measures else log for log in self.logs)
 
     def _grapple(self, command: GrappleCommand) -> None:
-        tip_m = self.pin()[2] - tip_below_pin_m(self.profile.grapple.tongs, self.tong_rad)
+        tip_m = self.pin()[2] - tip_below_pin_m(self.profile.grapple.jaws, self.tong_rad)
         if command is GrappleCommand.CLOSE and self.tong_rad >= STALL_RAD and tip_m < self.shoulder_m:
             self.gripped = True
             self.tong_rad += self.gives_rad

@@ -29,7 +29,9 @@ class StandIn:
     noise: float = 2e-4
     count: float = 3.8e-4
 
-    def run(self, joint: Joint, side: int, kind: str, program: SpoolProgram, start: float, seed: int = 0) -> SpoolTestRecord:
+    def run(
+        self, joint: Joint, side: int, kind: str, program: SpoolProgram, start: float, seed: int = 0
+    ) -> SpoolTestRecord:
         """What the bus would have said while the program ran."""
         h = GRID_S / FINE_FACTOR
         steps = int((LEAD_S + program.duration_s + TAIL_S) / h)

@@ -48,7 +48,8 @@ def problems(path: Path) -> list[str]:
     if path.suffix == ".md":
         return found  # the links of pages are checked by the site's build
     if "tmp_path" not in text:
-        found += [f"{page} does not exist" for page in PAGE.findall(text) if "NAME" not in page and not (ROOT / page).is_file()]
+        pages = [page for page in PAGE.findall(text) if "NAME" not in page]
+        found += [f"{page} does not exist" for page in pages if not (ROOT / page).is_file()]
     for cited in SECTIONS.finditer(text):
         for number in re.findall(r"\d[\d.]*\d|\d", cited["numbers"] + cited["more"]):
             if not has_section(cited["page"], number):

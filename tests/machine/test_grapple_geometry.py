@@ -24,7 +24,7 @@ from machine.geometry.kinematics import Unreachable, pin_position
 from machine.loading.profile_file import load_profile
 
 PALMS = load_profile("palms_471")
-TONGS = PALMS.grapple.tongs
+TONGS = PALMS.grapple.jaws
 ROT = PALMS.joints["rot"]
 angles = st.floats(-10.0, 10.0)
 
@@ -113,7 +113,7 @@ def cr250_tip(tong_rad: float) -> tuple[float, float]:
 
 
 def test_the_table_of_the_cr250_is_one_rigid_jaw_that_opens_1_40_m():
-    tongs = load_profile("aoro_fc8").grapple.tongs
+    tongs = load_profile("aoro_fc8").grapple.jaws
     for angle in tongs.angle_rad:
         gap, depth = cr250_tip(angle)
         assert half_gap_m(tongs, angle) == pytest.approx(gap, abs=6e-4)

@@ -90,7 +90,7 @@ class Driver:
 
     def tip_below_pin(self, angle: float) -> float:
         """Jaw tips below the hanger pin [m] at a jaw angle, from the profile's table."""
-        table = self.w.profile.grapple.tongs
+        table = self.w.profile.grapple.jaws
         pairs = list(zip(table.angle_rad, table.tip_below_pin_m, strict=True))
         for (a0, z0), (a1, z1) in pairwise(pairs):
             if angle <= a1:

@@ -63,7 +63,7 @@ def test_slew_zero_points_forward_and_positive_pitch_lifts(world):
 
 
 def test_jaw_tips_follow_the_profile_table(world):
-    table, p = world.profile.grapple.tongs, world.client
+    table, p = world.profile.grapple.jaws, world.client
     base = p.invertTransform(*world.base_pose())
     reach = {"slew": 0.0, "lift": 0.6, "tilt": -1.2, "ext": 0.5, "rot": 0.0, "fork": 0.0}
     pose(world, **reach, tong_left=0.0, tong_right=0.0)

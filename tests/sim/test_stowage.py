@@ -108,7 +108,7 @@ def test_a_falling_log_wakes_the_load_and_is_stowed_with_it(world):
 @pytest.mark.parametrize(("above_m", "stowed"), [(0.1, False), (0.6, True)])
 def test_a_load_below_open_jaws_stays_awake(above_m, stowed):
     x, y = PROFILE.bunk.center_m
-    hanging = PROFILE.grapple.tongs.tip_below_pin_m[0]
+    hanging = PROFILE.grapple.jaws.tip_below_pin_m[0]
     slew, lift, tilt, ext = solve(PROFILE, x, y, PROFILE.bunk.floor_z_m + 0.35 + above_m + hanging)
     world = laden(home={"slew": slew, "lift": lift, "tilt": tilt, "ext": ext})
     go(world, 1.5)
