@@ -25,9 +25,7 @@ _NOT_VALID: Final = 0x8000_0000
 class EmulatedNode(CanopenSlave):
     """A node with heartbeat and SDO server; with ``starts`` it becomes operational by itself."""
 
-    def __init__(
-        self, node: int, objects: Objects, starts: bool, writable: Set[tuple[int, int]] = frozenset()
-    ) -> None:
+    def __init__(self, node: int, objects: Objects, starts: bool, writable: Set[tuple[int, int]] = frozenset()) -> None:
         super().__init__(node, objects, writable)
         self._initial = dict(self.objects)
         self._starts = starts

@@ -164,7 +164,12 @@ class Loop:
         if now_ns >= self.timing.publish_ns:
             supervisor = self.controller.supervisor
             self.timing.publish(
-                now_ns, self._period_ns, self.missed, supervisor.late, supervisor.mode.name, self.status_text(),
+                now_ns,
+                self._period_ns,
+                self.missed,
+                supervisor.late,
+                supervisor.mode.name,
+                self.status_text(),
                 self.buses,
             )
 

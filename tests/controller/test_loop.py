@@ -16,9 +16,9 @@ from can_dbc.messages.udp_address import address_argument
 from can_dbc.messages.vehicle import Driving
 from can_dbc.protocols.canopen import SYNC_ID
 from can_dbc.timing.page import TimingWriter, read_timing
-from controller.process.command import bus_address, listen, main, parser
 from controller.carrier.vehicle import Vehicle
 from controller.config import ConfigError, load
+from controller.process.command import bus_address, listen, main, parser
 from controller.process.loop import Loop
 from controller.process.realtime import make_sleep, sleep_until
 from controller.process.timing import LoopTiming
