@@ -8,7 +8,7 @@ fields over 48 bits) stay with `codegen`, and so does everything unusual in the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 from can_dbc.dbc.codec import MessageCodec
@@ -102,9 +102,23 @@ def _receive_lines(codec: MessageCodec) -> list[str]:
         *lines,
         f"        if {' and '.join(checks)}:",
         f"            return {values}",
+        *_sentinel_lines(signals),
         f"        found: tuple[Any, ...] = self._slow_receive(({raws}))",
         "        return found",
     ]
+
+
+def _sentinel_lines(signals: Sequence[SignalInfo]) -> list[str]:
+    """A frame whose values are in range or not available, the usual reason to leave the fast path."""
+    checks, values = [], []
+    for i, s in enumerate(signals):
+        raw = f"r{i}"
+        absent = " or ".join(f"{raw} == {value}" for value in sorted(s.sentinels))
+        checks.append(f"({absent + ' or ' if absent else ''}{s.raw_low} <= {raw} <= {s.raw_high})")
+        values.append(f"None if {absent} else {_physical(s, raw)}" if absent else _physical(s, raw))
+    if not any(s.sentinels for s in signals):
+        return []
+    return [f"        if {' and '.join(checks)}:", f"            return ({', '.join(values)},)"]
 
 
 def _physical(s: SignalInfo, raw: str) -> str:

@@ -61,7 +61,10 @@ def recorded(place: Path, limit: int) -> tuple[Settings, list[TickRecord]]:
 
 
 def cost(place: Path, limit: int) -> dict[str, Any]:
-    """Replay with warm and with evicted caches: quantiles of time and of processor time [us], and differing ticks."""
+    """Replay with warm and with evicted caches: quantiles of time and of processor time [us], and differing ticks.
+
+    The cost of the stopwatch itself is subtracted.
+    """
     settings, ticks = recorded(place, limit)
     evicted = bytearray(eviction_bytes())
     lines = bytes(len(evicted) // CACHE_LINE_BYTES)
@@ -86,18 +89,31 @@ def _timed(settings: Settings, ticks: list[TickRecord], between: Callable[[], No
     controller, inputs = Controller(settings), Inputs()
     wall, cpu = [], []
     differing = 0
+    timer_wall, timer_cpu = _timer_cost(between)
     for tick in ticks:
         restore_inputs(inputs, tick)
         between()
         cpu_begin, begin = time.thread_time_ns(), time.perf_counter_ns()
         outputs = step(controller, inputs, tick.now_ns)
         end, cpu_end = time.perf_counter_ns(), time.thread_time_ns()
-        wall.append(end - begin)
-        cpu.append(cpu_end - cpu_begin)
+        wall.append(end - begin - timer_wall)
+        cpu.append(cpu_end - cpu_begin - timer_cpu)
         differing += transmitted(outputs) != (
             tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report
         )  # fmt: skip
     return {"differing": differing, **_quantiles("", wall), **_quantiles("cpu_", cpu)}
+
+
+def _timer_cost(between: Callable[[], None]) -> tuple[int, int]:
+    """Median of what the stopwatch itself takes with these caches, time and processor time [ns]."""
+    wall, cpu = [], []
+    for _ in range(101):
+        between()
+        cpu_begin, begin = time.thread_time_ns(), time.perf_counter_ns()
+        end, cpu_end = time.perf_counter_ns(), time.thread_time_ns()
+        wall.append(end - begin)
+        cpu.append(cpu_end - cpu_begin)
+    return sorted(wall)[50], sorted(cpu)[50]
 
 
 def _quantiles(prefix: str, durations_ns: list[int]) -> dict[str, float]:

@@ -68,6 +68,7 @@ MODULES: Final = (
     "controller.supervisor",
     "controller.tick",
     "controller.transitions",
+    "machine.geometry.carrier",
     "machine.sensing.encoder",
     "machine.sensing.weighing",
     "machine.geometry.kinematics",
