@@ -29,6 +29,7 @@ from host.compiled.build import check_tools, compile_tick
 from host.exit_codes import CommandFailed
 from runtime.compiled import SWITCH
 
+pytestmark = pytest.mark.computed
 DATABASES = load("crane"), load("machine"), load("gnss")
 
 
