@@ -57,11 +57,11 @@ def source_root() -> Path:
 
 
 def builds_folder(root: Path | None = None) -> Path:
-    """Where builds lie: in the checkout, or in the user's cache when the sources are installed."""
+    """Where builds lie: beside the sources, so that whoever may change the one may change the other."""
     root = root or source_root()
     if (root / "pyproject.toml").is_file():
         return root / "build" / "compiled"
-    return Path.home() / ".cache" / "timberhand" / "compiled"
+    return root / "timberhand_compiled"
 
 
 def platform_tag() -> str:
