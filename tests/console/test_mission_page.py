@@ -128,7 +128,7 @@ def test_mission_and_vehicle_are_shown_as_text(stage: Stage, browser: Browser) -
         "missed-grasps": "2",
         "known": "1",
         "driven": "42 m",
-        "given-up": "Log 9 is left: log 9 was missed 3 times.",
+        "given-up": "Log 9 given up: log 9 was missed 3 times.",
     }
     for element, words in told.items():
         assert browser.text(element) == words, element
