@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -58,14 +59,13 @@ class OpenVinoNet:
             raise NetworkError("network.bad-precision", f"precision {precision!r} is none of {', '.join(PRECISIONS)}")
         self.network = network
         self.shape = shape
-        core = _openvino().Core()
         settings = {
             "INFERENCE_NUM_THREADS": 1,
             "NUM_STREAMS": 1,
             "ENABLE_CPU_PINNING": False,
             "INFERENCE_PRECISION_HINT": precision,
         }
-        self._request = core.compile_model(_model(network, arrays, shape), "CPU", settings).create_infer_request()
+        self._request = _core().compile_model(_model(network, arrays, shape), "CPU", settings).create_infer_request()
 
     def __call__(self, images: np.ndarray) -> dict[str, np.ndarray]:
         """Every output by name, (N, C, H, W) float32; the caller owns the arrays.
@@ -88,6 +88,17 @@ def _openvino() -> Any:
     import openvino
 
     return openvino
+
+
+@cache
+def _core() -> Any:
+    """The process's one core.
+
+    Each core makes the thread's alternate signal stack its own and restores the one before when it ends
+    (openvinotoolkit/openvino pull request 11894).  Of two cores the second would restore the stack of the first, which
+    is unmapped by then, and the next signal would kill the process.
+    """
+    return _openvino().Core()
 
 
 def _model(network: Network, arrays: Arrays, shape: tuple[int, int, int, int]) -> Any:
