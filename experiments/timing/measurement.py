@@ -46,26 +46,29 @@ class MeasurementWindow:
         return self.end.missed - self.begin.missed
 
 
-def measure(testbed: TimingTestbed, seconds: float, directory: Path) -> MeasurementWindow:
+def measure(testbed: TimingTestbed, seconds: float, directory: Path, with_cyclictest: bool = True) -> MeasurementWindow:
     """Measure one window of this length, plus one or two seconds.
 
-    cyclictest starts before the window and ends after it, so that it sees every stall of the host within.
+    cyclictest starts before the window and ends after it, so that it sees every stall of the host within.  Without it
+    its histogram is empty.
     """
     report = directory / "cyclictest.json"
     report.unlink(missing_ok=True)
     period_ns = testbed.setting.period_ns
-    reference_loops.start_cyclictest(testbed.helpers, testbed.cpu, period_ns, testbed.stamp_ns, report)
-    testbed.wait(reference_loops.START_S)
+    if with_cyclictest:
+        reference_loops.start_cyclictest(testbed.helpers, testbed.cpu, period_ns, testbed.stamp_ns, report)
+        testbed.wait(reference_loops.START_S)
     first, begin = host_activity.sample(), testbed.fresh_timing()
     reference_loops.start_sleep_loop(testbed.helpers, period_ns, seconds, testbed.cpu)
     output = testbed.await_end("sleep-loop", seconds + GRACE_S)
     end, last = testbed.fresh_timing(), host_activity.sample()
-    testbed.end_helper("cyclictest")
+    if with_cyclictest:
+        testbed.end_helper("cyclictest")
     return MeasurementWindow(
         begin=begin.facts,
         end=end.facts,
         durations=between(begin, end),
-        cyclictest=reference_loops.read_cyclictest(report.read_text()),
+        cyclictest=reference_loops.read_cyclictest(report.read_text()) if with_cyclictest else Durations(),
         sleep_loop=reference_loops.read_sleep_loop(output),
         host=host_activity.between(first, last),
     )

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import json
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from timberhand.commands.options import JsonOption
+
+
+class LoopbackBus(StrEnum):
+    """The bus of the measurement."""
+
+    AUTO = "auto"
+    VCAN = "vcan"
+    WIRE = "wire"
 
 
 def doctor(
@@ -20,6 +29,17 @@ def doctor(
         typer.Option(min=0, metavar="N", help="Processor of the controller (default: from the settings)."),
     ] = None,
     as_json: JsonOption = False,
+    report: Annotated[
+        bool, typer.Option("--report", help="Measure the control loop here and write a report to send.")
+    ] = False,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="With --report: the file to write.")] = Path(
+        "real-time-report.md"
+    ),
+    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, help="With --report: time to measure.")] = 60.0,
+    bus: Annotated[
+        LoopbackBus, typer.Option(help="With --report: the loopback bus; auto is vcan where it exists and is up.")
+    ] = LoopbackBus.AUTO,
+    profile: Annotated[str, typer.Option(help="With --report: the machine to emulate.")] = "aoro_fc8",
 ) -> None:
     """Check this installation and, with --rt, this computer's real-time settings.
 
@@ -31,10 +51,9 @@ def doctor(
       timberhand doctor
 
       timberhand doctor --rt --cpu 3
-    """
-    import shutil
-    import subprocess
 
+      sudo timberhand doctor --rt --report
+    """
     from rich.console import Console
 
     from host.doctor import facts, installation, timing
@@ -42,13 +61,12 @@ def doctor(
     from host.doctor.show import conclusion, show
     from host.exit_codes import ExitCode
 
+    if report:
+        _report(out, seconds, bus, profile)
+        return
     groups = {"installation": installation.examine()}
     if rt:
-        links = "[]"
-        if ip := shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin"):
-            answer = subprocess.run([ip, "-details", "-statistics", "-json", "link"], capture_output=True, text=True)
-            links = answer.stdout or links
-        groups["timing"] = timing.evaluate(facts.read(Path("/"), links, cpu))
+        groups["timing"] = timing.evaluate(facts.read(Path("/"), _links(), cpu))
     every = [finding for group in groups.values() for finding in group]
     if as_json:
         print(json.dumps({name: [f.document() for f in group] for name, group in groups.items()}, indent=2))
@@ -58,3 +76,78 @@ def doctor(
             show(console, f"timberhand {name}", group)
         console.print(conclusion(every))
     raise typer.Exit(ExitCode.CONFIGURATION if any(f.severity is Severity.FAULT for f in every) else ExitCode.OK)
+
+
+def _links() -> str:
+    """The interfaces by ip(8); none without it."""
+    import shutil
+    import subprocess
+
+    ip = shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin")
+    if ip is None:
+        return "[]"
+    answer = subprocess.run([ip, "-details", "-statistics", "-json", "link"], capture_output=True, text=True)
+    return answer.stdout or "[]"
+
+
+def _report(out: Path, seconds: float, bus: LoopbackBus, profile: str) -> None:
+    """Measure and write the report; exit code 6 for an unfit computer, 3 when the report cannot be written."""
+    import platform
+    import tempfile
+
+    from rich.console import Console
+
+    from experiments.timing.fitness import Verdict
+    from experiments.timing.fitness_measurement import loopback_bus, measure_computer
+    from experiments.timing.fitness_report import data_of, text_of
+    from experiments.timing.testbed import cores
+    from host.doctor import computer, facts, timing
+    from host.exit_codes import CommandFailed, ExitCode
+
+    try:
+        out.touch()
+    except OSError as error:
+        raise CommandFailed(
+            "doctor.no-report",
+            f"the report {out} cannot be written: {error.strerror}; use --out",
+            ExitCode.CONFIGURATION,
+        ) from None
+    cpu = cores()[0]
+    found = facts.read(Path("/"), _links(), cpu)
+    machine = computer.read(Path("/"), platform.version(), cpu)
+    chosen = loopback_bus(profile) if bus is LoopbackBus.AUTO else bus.value
+    console = Console(highlight=False)
+    with tempfile.TemporaryDirectory(prefix="timberhand-report-") as place, console.status("") as status:
+        try:
+            measured = measure_computer(
+                found, profile, chosen, seconds, Path(place), lambda step: status.update(f"real-time report: {step}")
+            )
+        except CommandFailed as failure:
+            data = data_of(found, machine, timing.evaluate(found), f"the measurement failed: {failure}", _private())
+        else:
+            data = data_of(found, machine, timing.evaluate(found), measured, _private())
+    out.write_text(text_of(data))
+    for judged in data["judgements"]:
+        console.print(f"{judged['verdict']:>12}  {judged['topic']}: {judged['sentence']}", soft_wrap=True)
+        if judged["advice"]:
+            console.print(f"{'':12}  -> {judged['advice']}", soft_wrap=True)
+    console.print(
+        f"Verdict: {data['verdict']}. The report is in {out}; it holds no names and no paths.", soft_wrap=True
+    )
+    raise typer.Exit(ExitCode.FIGURE_MISSED if data["verdict"] == Verdict.UNFIT else ExitCode.OK)
+
+
+def _private() -> frozenset[str]:
+    """The names that a report must not hold."""
+    import contextlib
+    import os
+    import platform
+    import pwd
+
+    from experiments.timing.fitness_report import private_words
+
+    users = [os.environ.get(name, "") for name in ("USER", "LOGNAME", "SUDO_USER")]
+    with contextlib.suppress(KeyError):  # no entry in the user database
+        users.append(pwd.getpwuid(os.getuid()).pw_name)
+    host = platform.node()
+    return private_words(host, host.partition(".")[0], *users)

@@ -1,0 +1,141 @@
+"""The report of a computer's real-time fitness as one Markdown file with its data as JSON inside; pure.
+
+It is made to be sent, so it holds nothing private: every text passes `without_private`, which removes names of host and
+user and paths that are not the system's own.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+from experiments.timing.fitness import Judgement, Verdict, disturbances, judge, overall
+from experiments.timing.fitness_measurement import Measured
+from host.doctor.computer import Computer
+from host.doctor.facts import UNLIMITED, Facts
+from host.doctor.finding import Finding, Severity
+
+REMOVED: Final = "(removed)"
+_SYSTEM: Final = r"etc|proc|sys|dev"
+_PATH: Final = re.compile(rf"(?<![\w.:/])/(?!(?:{_SYSTEM})\b)\w[^\s'\"`,;)|]*/[^\s'\"`,;)|]*")
+_COMMON: Final = frozenset({"root", "localhost", ""})
+VERSION: Final = 1
+
+
+def private_words(*words: str) -> frozenset[str]:
+    """Words to remove from a report, for example names of host and user; common ones say nothing and stay."""
+    return frozenset(words) - _COMMON
+
+
+def without_private(value: Any, words: Iterable[str]) -> Any:
+    """The same plain value; in every text ``words`` and paths outside the system's own folders are removed."""
+    if isinstance(value, str):
+        text = _PATH.sub(REMOVED, value)
+        for word in sorted(words, key=len, reverse=True):
+            text = re.sub(rf"(?<!\w){re.escape(word)}(?!\w)", REMOVED, text)
+        return text
+    if isinstance(value, Mapping):
+        return {str(key): without_private(inner, words) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_private(inner, words) for inner in value]
+    if isinstance(value, frozenset | set):
+        return sorted(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def data_of(
+    facts: Facts, computer: Computer, findings: Sequence[Finding], measured: Measured | str, words: Iterable[str]
+) -> dict[str, Any]:
+    """The data of a report; ``measured`` is a sentence when the measurement failed, ``words`` are removed."""
+    if isinstance(measured, str):
+        advice = "correct what the sentence and the settings below say, and measure again; else send this report"
+        judged: tuple[Judgement, ...] = (Judgement("run", Verdict.UNFIT, measured, advice),)
+        more: dict[str, Any] = {"measured": None, "disturbed": []}
+    else:
+        judged = judge(measured.figures)
+        more = {"measured": asdict(measured), "disturbed": disturbances(measured.figures)}
+    settings = asdict(facts)
+    settings["links"] = [asdict(link) for link in facts.links]
+    data = {
+        "report": VERSION, "verdict": overall(judged).value, "judgements": [asdict(j) for j in judged], **more,
+        "computer": asdict(computer), "settings": settings, "findings": [f.document() for f in findings],
+    }  # fmt: skip
+    found: dict[str, Any] = without_private(data, words)
+    return found
+
+
+def text_of(data: dict[str, Any]) -> str:
+    """The report of these data."""
+    lines = ["# Real-time report", "", f"Verdict: **{data['verdict']}**.", ""]
+    if data["disturbed"]:
+        lines += [f"The computer was disturbed: {'; '.join(data['disturbed'])}.", ""]
+    lines += ["| topic | verdict | found | what to do |", "|---|---|---|---|"]
+    for j in data["judgements"]:
+        lines.append(f"| {j['topic']} | **{j['verdict']}** | {_cell(j['sentence'])} | {_cell(j['advice'])} |")
+    lines += ["", "## Computer", "", "| fact | value |", "|---|---|"]
+    lines += [f"| {name} | {_cell(value)} |" for name, value in _facts(data).items()]
+    lines += ["", "## Settings to change, the most useful first", ""]
+    wanted = [f for f in data["findings"] if f["severity"] != Severity.FINE.name.lower()]
+    for f in wanted:
+        lines.append(f"- {f['what']}: {f['sentence']}; gain: {f['gain']}")
+        lines += [f"  - `{command}`" for command in f["commands"]]
+    lines += [] if wanted else ["None."]
+    lines += ["", "## Data", "", "```json", json.dumps(data, indent=1), "```", ""]
+    return "\n".join(lines)
+
+
+def read_data(text: str) -> dict[str, Any]:
+    """The data inside a report; raises ValueError when there are none."""
+    found = re.search(r"^```json\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    if found is None:
+        raise ValueError("this is not a real-time report: it holds no JSON")
+    data: dict[str, Any] = json.loads(found[1])
+    return data
+
+
+def _facts(data: dict[str, Any]) -> dict[str, object]:
+    c, s, m = data["computer"], data["settings"], data["measured"]
+    shown: dict[str, object] = {
+        "processor": f"{c['processor']}, {c['processors']} of them, {c['memory_mb']} MB of memory",
+        "kernel": f"{s['release']}, {c['kernel_version']}; preemption: {s['preemption'] or 'unknown'}",
+        "hardware": s["machine"] or "real",
+        "governor": ", ".join(sorted(set(s["governors"].values()))) or "none reported",
+        "clock source": s["clock_source"] or "unknown",
+        "isolated processors": _list(s["isolated"]),
+        "without timer tick": _list(s["tickless"]),
+        "boot words": " ".join(c["boot_words"]) or "none",
+        "interrupts": f"{len(c['interrupts'])} of {c['interrupts_all']} may use the controller's processor; new ones "
+                      f"use mask {c['new_interrupts'] or 'unknown'}; irqbalance: {'yes' if s['irqbalance'] else 'no'}",
+        "limits": f"rtprio {_limit(s['rtprio_limit'])}, memlock {_limit(s['memlock_limit'])}; throttling "
+                  f"{s['rt_runtime_us']} of {s['rt_period_us']} us",
+        "idle states": ", ".join(f"{i['name']} {i['latency_us']} us" for i in s["idle"] if not i["disabled"]) or "none",
+    }  # fmt: skip
+    if m:
+        f = m["figures"]
+        busiest = sorted(m["interrupts"].items(), key=lambda item: -item[1])[:6]
+        shown |= {
+            "measured": f"{f['seconds']:.0f} s of {m['profile']} on {m['bus']}, processor {m['cpu']}, {m['tick']}",
+            "granted": f"SCHED_FIFO {'yes' if f['fifo'] else 'no'}, {f['locked_kb']} kB of memory locked",
+            "steal": f"{f['steal_ms']:.0f} ms",
+            "interrupts meanwhile": ", ".join(f"{name} {n}" for name, n in busiest) or "none counted",
+            "stops": ", ".join(m["stop_reasons"]) or "none",
+        }
+    return shown
+
+
+def _cell(value: object) -> str:
+    return str(value).replace("|", "\\|").replace("\n", " ")
+
+
+def _list(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers)) or "none"
+
+
+def _limit(value: int | None) -> str:
+    return "unknown" if value is None else "unlimited" if value == UNLIMITED else str(value)
