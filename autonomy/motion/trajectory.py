@@ -17,6 +17,7 @@ from scipy.interpolate import CubicSpline
 from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.motion.time_law import MIN_DURATION_S, PathGeometry, swing_free_law
+from machine.geometry.kinematics import Unreachable
 from machine.joints import Joint
 
 STEP_S: Final = 0.02
@@ -28,6 +29,11 @@ _RISE_LEFT_M: Final = 0.12
 _APPROACH_LEFT_M: Final = 0.35
 """Horizontal distance that may be left when a grapple begins to descend."""
 _TOLERANCE: Final = 1e-6
+_MAX_FURTHER_STRETCH: Final = 2.0
+"""A motion that needs more than this beyond its first stretch cannot be slowed."""
+_STRETCH_TOLERANCE: Final = 0.004
+"""A stretched motion may exceed a limit of `Arm` by this share (accelerations by twice as much): they leave 1 % at
+least to the machine's own."""
 _MAX_SLOPE, _MAX_CURVATURE = 2.1875, 7.5132
 """Greatest slope and curvature of `smooth_progress`."""
 
@@ -187,10 +193,25 @@ def within_limits(
     """A motion of ``end_s``, or longer if the arm's limits (or these ``accelerations``) require it.
 
     ``sampled(duration_s)`` gives its joint vectors (n, 5) every ``STEP_S``, from rest to rest.
+
+    Raises:
+        machine.geometry.kinematics.Unreachable: no duration keeps the motion within the limits.
     """
-    q = sampled(end_s)
-    load = _time_stretch(arm, q, arm.acceleration if accelerations is None else accelerations)
-    return _sampled_trajectory(q if load <= 1.0 else sampled(load * end_s))
+    accelerations = arm.acceleration if accelerations is None else accelerations
+    q, duration_s = sampled(end_s), end_s
+    load = _time_stretch(arm, q, accelerations)
+    if load <= 1.0:
+        return _sampled_trajectory(q)
+    # The slower motion is sampled elsewhere on its path and may need a little more: it is checked again.
+    stretched_s = load * duration_s
+    longest_s = _MAX_FURTHER_STRETCH * stretched_s
+    while stretched_s <= longest_s:
+        q, duration_s = sampled(stretched_s), stretched_s
+        load = _time_stretch(arm, q, accelerations)
+        if load <= 1.0 + _STRETCH_TOLERANCE:
+            return _sampled_trajectory(q)
+        stretched_s = max(load * duration_s, duration_s + STEP_S)
+    raise Unreachable("no duration keeps the motion within the limits of the joints", "motion.over-limits")
 
 
 def _time_stretch(arm: Arm, position: np.ndarray, accelerations: np.ndarray) -> float:

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from autonomy.motion.arm import Arm
 from autonomy.motion.pose import Pose
 from autonomy.motion.time_law import SWING_RAD, PathGeometry, swing_free_law
-from autonomy.motion.trajectory import STEP_S, Trajectory, straight_line
-from machine.geometry.kinematics import pin_position
+from autonomy.motion.trajectory import STEP_S, Trajectory, straight_line, within_limits
+from machine.geometry.kinematics import Unreachable, pin_position
 from machine.joints import JOINTS
 from machine.loading.profile_file import load_profile
 from machine.profile import Profile, joint
+from tests.codes import coded
 
 GRAVITY_M_S2 = 9.81
 FINE_S = 0.004
@@ -122,6 +123,25 @@ def test_any_straight_motion_keeps_limits_and_swing(name: str, slew: float, near
     assert_within_limits(crane.profile, motion)
     assert crane.arm.pose(motion.goal) == pytest.approx(goal, abs=1e-6)
     assert max(swing_left_rad(crane.profile, motion, p) for p in (1.53, 1.75, 2.05)) < 1.2 * SWING_RAD
+
+
+def test_a_short_motion_that_needs_a_second_stretch_keeps_its_limits() -> None:
+    crane = FORWARDER
+    turn = crane.profile.kinematics.theta1_offset_rad
+    reach = np.cos(turn), np.sin(turn)
+    start = crane.arm.pose_above(*(4.171785896742758 * c for c in reach), 1.2, 1.2)
+    goal = crane.arm.pose_above(*(4.203125 * c for c in reach), 1.158203125, 1.158203125)
+    assert_within_limits(crane.profile, straight_line(crane.arm, start, goal))
+
+
+def test_a_motion_that_no_duration_slows_is_refused() -> None:
+    def sampled(duration_s: float) -> np.ndarray:
+        q = np.zeros((int(duration_s / STEP_S) + 2, len(JOINTS)))
+        q[len(q) // 2, 0] = 0.5
+        return q
+
+    with pytest.raises(Unreachable, check=coded("motion.over-limits")):
+        within_limits(FORWARDER.arm, sampled, 1.0)
 
 
 def test_equal_paths_have_equal_laws_and_a_point_has_none() -> None:
