@@ -106,17 +106,17 @@ class RouteDriver:
         points = _points(plane, places)
         self.along_m, self._last, self._ended, self._landing_drive = 0.0, None, False, None
         self._to_come = len(points)
+        by, back = ([], []) if left is None else (_points(plane, left.by), _points(plane, left.at or ()))
+        if not points and (self.as_paper_b or not (back or by)):
+            self._left, self._ended = RouteRemainder(0, ended=True), True
+            return
         if self.as_paper_b:
             candidates = [Waypoint(p.latitude_deg, p.longitude_deg) for p in places]
             self._active = WaypointDrive(self._carrier, candidates, self._speed)
             self.length_m = sum(math.dist(a, b) for a, b in pairwise([(location.x_m, location.y_m), *points]))
             return
-        by, back = ([], []) if left is None else (_points(plane, left.by), _points(plane, left.at or ()))
-        if back or by or points:
-            self._plan_return(location, back, by, points, turn=left is not None or not self._new)
-            self._new = False
-        else:
-            self._ended = True
+        self._plan_return(location, back, by, points, turn=left is not None or not self._new)
+        self._new = False
 
     def restart(self) -> None:
         """Restart the route from its first waypoint."""

@@ -223,6 +223,19 @@ def test_a_finished_route_is_not_driven_again() -> None:
     assert manager.state is State.DONE and machine.driven_m < 0.1
 
 
+@pytest.mark.parametrize("table", [PAPER_B, OURS], ids=["paper_b", "ours"])
+def test_a_route_without_waypoints_left_is_at_its_end(table) -> None:
+    told = listed_mission(lie=())
+    progress = Checkpoint(mission="", tally=Tally(), left=RouteRemainder(0))
+    manager = ActivityManager(PROFILE, profile_hash(PROFILE), told, table, progress=progress)
+    manager.auto()
+    machine = Forwarder(PROFILE, PLANE, [], (49.0, 0.0, 0.0))
+    machine.run(manager, ended)
+    assert manager.state is State.DONE and machine.driven_m < 0.1
+    left = manager.progress().left
+    assert left is not None and left.ended, "another planner does not drive the route again"
+
+
 def test_a_machine_interrupted_while_returning_keeps_its_extra_places() -> None:
     told = ForwardingMission("test", (place(10.0, 0.0), place(60.0, 0.0)))
     left = RouteRemainder(1, (place(-6.0, 0.0), place(0.0, 0.0)), (place(30.0, 6.0),))
