@@ -185,7 +185,7 @@ def _sizes(mission: ForwardingMission) -> Iterator[Finding]:
     )
     for name, found in bearings:
         for i, bearing in enumerate(found):
-            if bearing is not None and not -360.0 <= bearing <= 360.0:
+            if bearing is not None and not 0.0 <= bearing <= 360.0:
                 key = (name, i)
                 yield Finding(
                     key, "mission.bearing-range",

@@ -188,6 +188,7 @@ def test_invalid_parts_of_geojson(data: bytes, code: str) -> None:
         ({"length_m": 3.0, "diameter_m": 250.0}, "log-size"),
         ({"length_m": 0.5, "diameter_m": 0.6}, "log-shape"),
         ({"bearing_deg": 400.0}, "bearing-range"),
+        ({"bearing_deg": -1.0}, "bearing-range"),
         ({"sigma_m": -1.0}, "sigma-range"),
     ],
 )
