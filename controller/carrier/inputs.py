@@ -17,11 +17,8 @@ from controller.carrier.address_claim import FORMATS, AddressClaim
 from machine.status.stale_inputs import CARRIER_BIT
 
 _NEEDED: Final = ("VehStat", "ArmHeightA", "ArmHeightB")
-_ENGINE: Final = ("EEC1", "CCVS", "DM1")
-_GNSS: Final = (
-    "PositionRapidUpdate", "VesselHeading", "RateOfTurn", "Attitude", "CogSogRapidUpdate", "GnssPositionData",
-    "SystemTime",
-)  # fmt: skip
+_ENGINE: Final = "EEC1"
+_GNSS: Final = ("PositionRapidUpdate", "VesselHeading", "RateOfTurn", "CogSogRapidUpdate", "GnssPositionData")
 _OWN_MESSAGES: Final = ("VehCmd", "ArmCmdA", "ArmCmdB", "CtrlAlive")
 
 
@@ -33,10 +30,9 @@ class CarrierInputs:
         self.vehicle, self.arms_a, self.arms_b = needed = tuple(
             MessageState(machine.message(name), CARRIER_BIT, machine=True) for name in _NEEDED
         )
-        helpful = [MessageState(machine.message(name), CARRIER_BIT, watched=False, machine=True) for name in _ENGINE]
+        helpful = [MessageState(machine.message(_ENGINE), CARRIER_BIT, watched=False, machine=True)]
         helpful += [MessageState(gnss.message(name), CARRIER_BIT, watched=False, machine=True) for name in _GNSS]
-        self.engine, self.vehicle_speed, self.trouble, self.position, self.heading, *more = helpful
-        self.rate_of_turn, self.attitude, self.course, self.fix, self.time = more
+        self.engine, self.position, self.heading, self.rate_of_turn, self.course, self.fix = helpful
         self.needed = needed
         self._helpful = tuple(helpful)
         self.messages = (*needed, *helpful)
