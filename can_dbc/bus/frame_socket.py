@@ -9,11 +9,12 @@ from __future__ import annotations
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from can_dbc.bus.batch import Batch, Outbox, enlarge_receive_buffer
 from can_dbc.bus.hardware_clock import HardwareClock
+from can_dbc.bus.receive_clock import ReceiveClock
 from can_dbc.frame import ERROR, Frame
 
 CAN_FRAME: Final = struct.Struct("=IB3x8s")
@@ -40,12 +41,13 @@ _SECOND_NS: Final = 1_000_000_000
 class FrameSocket:
     """The fast path of one non-blocking socket, which it owns.
 
-    Stamps are the kernel's (taken in the receive interrupt), converted from CLOCK_REALTIME to CLOCK_MONOTONIC with the
-    offset at each call; they are never in the future.  Stamps of an adapter are preferred
-    (`can_dbc.bus.hardware_clock`).  `dropped` counts the frames for which the socket's receive buffer had no room.
+    Stamps are the kernel's (taken in the receive interrupt), converted from CLOCK_REALTIME to CLOCK_MONOTONIC so that
+    setting the former does no harm (`can_dbc.bus.receive_clock`); they are never in the future.  Stamps of an adapter
+    are preferred (`can_dbc.bus.hardware_clock`).  `dropped` counts the frames for which the socket's receive buffer had
+    no room.
     """
 
-    __slots__ = ("_batch", "_clock", "_counted", "_outbox", "dropped", "sock")
+    __slots__ = ("_adapter_clock", "_batch", "_clock", "_counted", "_outbox", "dropped", "sock")
 
     def __init__(self, sock: socket.socket, buffer_bytes: int = RECEIVE_BUFFER_BYTES) -> None:
         sock.setblocking(False)
@@ -57,7 +59,8 @@ class FrameSocket:
         self._counted = 0
         self._batch = Batch(CAN_FRAME.size, _CONTROL_BYTES)
         self._outbox = Outbox(CAN_FRAME.size)
-        self._clock = HardwareClock()
+        self._clock = ReceiveClock(time.monotonic_ns())
+        self._adapter_clock = HardwareClock()
 
     def receive(self, frames: list[Frame], limit: int, note_error: Callable[[int, bytes], bool]) -> None:
         """Appends the waiting frames, at most `limit`; one system call unless more than a full batch waits.
@@ -65,26 +68,23 @@ class FrameSocket:
         Error frames go to `note_error`; if it reports a recovery of the node, the frames appended before are removed.
         Raises OSError if the link is lost.
         """
-        batch, first = self._batch, len(frames)
+        batch, clock, first = self._batch, self._clock, len(frames)
         new, append = tuple.__new__, frames.append  # Frame(...) costs half as much again
         for _ in range(max(1, limit // batch.count)):
             waiting = batch.receive(self.sock.fileno())
             if not waiting:
                 return
-            now_ns = time.monotonic_ns()
-            offset_ns = now_ns - time.time_ns()
+            clock.begin(time.monotonic_ns(), time.time_ns())
             datagrams = CAN_FRAME.iter_unpack(batch.data[: waiting * CAN_FRAME.size])
-            for (seconds, nanoseconds), (key, length, data) in zip(self._stamps(waiting), datagrams, strict=True):
+            for stamp_ns, (key, length, data) in zip(self._stamps(waiting), datagrams, strict=True):
                 if key & ERROR:
                     if note_error(key, data):
                         del frames[first:]
                     continue
-                stamp_ns = seconds * _SECOND_NS + nanoseconds + offset_ns
-                if stamp_ns > now_ns:  # a clock set back since the arrival must not make a frame look newer
-                    stamp_ns = now_ns
                 append(new(Frame, (stamp_ns, key, data if length == 8 else data[:length])))
             self._count_dropped(waiting)
             if waiting < batch.count:
+                clock.emptied()
                 return
 
     def send(self, frames: Sequence[tuple[int, bytes]]) -> int:
@@ -109,20 +109,28 @@ class FrameSocket:
     def close(self) -> None:
         self.sock.close()
 
-    def _stamps(self, waiting: int) -> Iterable[tuple[int, int]]:
-        """Seconds and nanoseconds of each frame."""
-        control = self._batch.control[: waiting * _CONTROL_BYTES]
+    def _stamps(self, waiting: int) -> Iterator[int]:
+        """Receive time [ns] of each frame."""
+        control, clock = self._batch.control[: waiting * _CONTROL_BYTES], self._clock
         if _KIND.unpack_from(control, 32)[0] == _SO_TIMESTAMPING:
-            return self._hardware_stamps(control)
-        return _SOFTWARE.iter_unpack(control)
+            yield from self._adapter_stamps(control)
+            return
+        since_ns, now_ns, offset_ns = clock.since_ns, clock.now_ns, clock.offset_ns
+        for seconds, nanoseconds in _SOFTWARE.iter_unpack(control):
+            wall_ns = seconds * _SECOND_NS + nanoseconds
+            stamp_ns = wall_ns + offset_ns
+            yield stamp_ns if since_ns <= stamp_ns <= now_ns else clock.doubtful_ns(wall_ns)
 
-    def _hardware_stamps(self, control: memoryview) -> Iterator[tuple[int, int]]:
+    def _adapter_stamps(self, control: memoryview) -> Iterator[int]:
+        clock = self._clock
         for seconds, nanoseconds, kind, own_seconds, own_nanoseconds in _HARDWARE.iter_unpack(control):
-            if kind != _SO_TIMESTAMPING or not own_seconds + own_nanoseconds:
-                yield seconds, nanoseconds
-            else:
-                own_ns = own_seconds * _SECOND_NS + own_nanoseconds
-                yield 0, self._clock.stamp_ns(own_ns, seconds * _SECOND_NS + nanoseconds)
+            wall_ns = seconds * _SECOND_NS + nanoseconds
+            stamp_ns = wall_ns + clock.offset_ns
+            if not clock.since_ns <= stamp_ns <= clock.now_ns:
+                stamp_ns = clock.doubtful_ns(wall_ns)
+            if kind == _SO_TIMESTAMPING and own_seconds + own_nanoseconds:
+                stamp_ns = self._adapter_clock.stamp_ns(own_seconds * _SECOND_NS + own_nanoseconds, stamp_ns)
+            yield stamp_ns
 
     def _count_dropped(self, waiting: int) -> None:
         """The last frame carries the count of all frames lost before it; it is 32 bits wide and wraps."""

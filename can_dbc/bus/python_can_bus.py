@@ -1,12 +1,14 @@
 """Any python-can interface as a `Bus`: for adapters without a SocketCAN driver, and for tests.
 
-python-can stamps in wall-clock seconds or in the adapter's own time; a stamp more than a second away from now is
-assumed to be of the adapter and is replaced by the time of the drain.
+python-can stamps in wall-clock seconds or in the adapter's own time.  The former are converted as those of the kernel
+(`can_dbc.bus.receive_clock`); a stamp that is more than a second away from now, in either direction, is assumed to be
+of the adapter and is replaced by the time of the drain.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Sequence
 from typing import Final
@@ -15,9 +17,10 @@ import can
 
 from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusError, BusState
 from can_dbc.bus.filters import Filter
+from can_dbc.bus.receive_clock import ReceiveClock
 from can_dbc.frame import ERROR, EXTENDED, REMOTE, Frame, identifier
 
-_PLAUSIBLE_AGE_NS: Final = 1_000_000_000
+_PLAUSIBLE_NS: Final = 1_000_000_000
 _FAILURES: Final = (can.CanError, OSError, ValueError, ImportError)
 
 
@@ -27,6 +30,7 @@ class PythonCanBus(BaseBus):
     def __init__(self, interface: str, channel: str, wanted: Filter | None = None, receive_own: bool = False) -> None:
         super().__init__(channel)
         self._interface, self._wanted, self._receive_own = interface, wanted, receive_own
+        self._clock = ReceiveClock(time.monotonic_ns())
         try:
             self._can = self._open()
         except _FAILURES as error:
@@ -62,7 +66,7 @@ class PythonCanBus(BaseBus):
 
     def _receive(self, frames: list[Frame]) -> None:
         stats, wanted, first = self.stats, self._wanted, len(frames)
-        offset_ns = time.monotonic_ns() - time.time_ns()
+        clock = self._clock
         for _ in range(DRAIN_LIMIT):
             try:
                 message = self._can.recv(timeout=0)
@@ -70,6 +74,8 @@ class PythonCanBus(BaseBus):
                 stats.enter(BusState.DOWN)
                 return
             if message is None:
+                clock.begin(time.monotonic_ns(), time.time_ns())
+                clock.emptied()
                 return
             if message.is_error_frame:
                 if stats.note_error(message.arbitration_id, bytes(message.data).ljust(8, b"\0")):
@@ -77,11 +83,18 @@ class PythonCanBus(BaseBus):
                 continue
             key = key_of(message)
             if wanted is None or key in wanted:
-                now_ns = time.monotonic_ns()
-                stamp_ns = min(int(message.timestamp * 1e9) + offset_ns, now_ns)
-                if now_ns - stamp_ns > _PLAUSIBLE_AGE_NS:
-                    stamp_ns = now_ns
-                frames.append(Frame(stamp_ns, key, payload_of(message)))
+                frames.append(Frame(self._stamp_ns(message.timestamp), key, payload_of(message)))
+
+    def _stamp_ns(self, stamp_s: float) -> int:
+        clock = self._clock
+        clock.begin(time.monotonic_ns(), time.time_ns())
+        if not math.isfinite(stamp_s):
+            return clock.now_ns
+        wall_ns = int(stamp_s * 1e9)
+        stamp_ns = wall_ns + clock.offset_ns
+        if clock.since_ns <= stamp_ns <= clock.now_ns:
+            return stamp_ns
+        return clock.doubtful_ns(wall_ns) if abs(stamp_ns - clock.now_ns) <= _PLAUSIBLE_NS else clock.now_ns
 
     def _open(self) -> can.BusABC:
         return can.Bus(interface=self._interface, channel=self.name, receive_own_messages=self._receive_own)

@@ -13,10 +13,13 @@ from hypothesis import strategies as st
 
 from can_dbc.bus.base import ERR_BUSOFF, ERR_RESTARTED, BusStats
 from can_dbc.bus.batch import Batch
+from can_dbc.bus.factory import open_bus
 from can_dbc.bus.filters import Filter
 from can_dbc.bus.frame_socket import CAN_FRAME, FrameSocket
 from can_dbc.bus.hardware_clock import DRIFT_PPM, HardwareClock
+from can_dbc.bus.receive_clock import ReceiveClock
 from can_dbc.frame import ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK, Frame
+from can_dbc.messages.tick_record import BusReading, TickRecord, decode, encode
 
 LIMIT = 1024
 SO_TIMESTAMPNS, SO_TIMESTAMPING, SO_RXQ_OVFL = 35, 37, 40
@@ -167,15 +170,88 @@ def test_lost_frames_are_counted_over_the_wrap(
 
 def test_stamps_of_an_adapter_are_used(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two frames a millisecond apart on the bus; the interrupt of the second came 300 us late."""
+    time.sleep(0.011)  # a socket has no frames that are older than itself
     now_ns = time.time_ns() - 10_000_000
     controls = [control_data(now_ns, 77_000_000_000), control_data(now_ns + 1_300_000, 77_001_000_000)]
     first, second = deliver(pair, monkeypatch, controls)
     assert second.stamp_ns - first.stamp_ns == pytest.approx(1_000_000, abs=1_000_000 * DRIFT_PPM // 1_000_000)
 
 
-def test_a_clock_set_back_gives_no_stamp_in_the_future(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    (frame,) = deliver(pair, monkeypatch, [control_data(time.time_ns() + 10_000_000_000)])
-    assert frame.stamp_ns <= time.monotonic_ns()
+HOUR_NS = 3_600 * 10**9
+
+
+@pytest.mark.parametrize("adapter", [False, True])
+@pytest.mark.parametrize("step_ns", [-HOUR_NS * 10**5, -HOUR_NS, -(10**8), 10**8, HOUR_NS, HOUR_NS * 10**5])
+def test_setting_the_wall_clock_changes_no_receive_time(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch, step_ns: int, adapter: bool
+) -> None:
+    """Two frames wait while the clock is set, between them; the larger steps exceed the time since boot."""
+    hardware_ns = 77 * 10**9 if adapter else None
+    deliver(pair, monkeypatch, [control_data(time.time_ns(), hardware_ns)])
+    arrived_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+    time.sleep(0.002)
+    monkeypatch.setattr(time, "time_ns", lambda: time.monotonic_ns() - arrived_ns + wall_ns + step_ns)
+    later = None if hardware_ns is None else hardware_ns + 2_000_000
+    before, after = deliver(
+        pair, monkeypatch, [control_data(wall_ns, hardware_ns), control_data(wall_ns + step_ns + 1_000_000, later)]
+    )
+    slack_ns = 200_000 if not adapter else 2_000_000
+    assert before.stamp_ns == pytest.approx(arrived_ns, abs=slack_ns)
+    assert after.stamp_ns == pytest.approx(arrived_ns + 1_000_000, abs=slack_ns)
+    (next_one,) = deliver(pair, monkeypatch, [control_data(time.time_ns())])
+    assert time.monotonic_ns() - next_one.stamp_ns < 2_000_000
+
+
+@pytest.mark.parametrize("wall_ns", [0, 1, 2**62, -(2**62)])
+def test_a_senseless_stamp_makes_a_frame_as_old_as_it_can_be_and_never_negative(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch, wall_ns: int
+) -> None:
+    opened_ns = pair.link._clock.since_ns
+    (frame,) = deliver(pair, monkeypatch, [control_data(wall_ns)])
+    assert frame.stamp_ns == opened_ns
+    record = TickRecord(1, 0, 0, 0, BusReading(), BusReading(), [frame], [], [], [], [], b"")
+    assert list(decode(encode(record)).frames_in) == [frame]
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 20_000_000), st.integers(0, 6), st.integers(-(10**15), 10**15)), max_size=40),
+    st.integers(0, 10**15),
+)
+def test_a_receive_time_lies_between_the_last_empty_queue_and_now(
+    drains: list[tuple[int, int, int]], epoch_ns: int
+) -> None:
+    """Whatever the wall clock does; and where it does nothing, the time is the true one."""
+    now_ns = 10**9
+    clock, wall_offset_ns, drained_ns = ReceiveClock(now_ns), epoch_ns, [now_ns, now_ns]
+    for gap_ns, frames, step_ns in drains:
+        stamps = [(now_ns + gap_ns * k // 7, wall_offset_ns) for k in range(frames)]
+        wall_offset_ns += step_ns
+        now_ns += gap_ns
+        clock.begin(now_ns, now_ns + wall_offset_ns)
+        for true_ns, offset_ns in stamps:
+            wall_ns = true_ns + offset_ns
+            stamp_ns = wall_ns + clock.offset_ns
+            if not clock.since_ns <= stamp_ns <= clock.now_ns:
+                stamp_ns = clock.doubtful_ns(wall_ns)
+            assert drained_ns[-2] <= stamp_ns <= now_ns
+            assert step_ns or stamp_ns == true_ns
+        clock.emptied()
+        drained_ns.append(now_ns)
+
+
+def test_an_adapter_of_python_can_is_stamped_within_its_drain(monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_bus("virtual:steps") as bus, open_bus("virtual:steps") as other:
+        for step_ns in (HOUR_NS, -HOUR_NS, 500_000_000, -500_000_000):
+            real = time.time_ns
+            before_ns = time.monotonic_ns()
+            other.send(0x181, bytes(8))
+            monkeypatch.setattr(time, "time_ns", lambda real=real, step_ns=step_ns: real() + step_ns)
+            frames: list[Frame] = []
+            bus.drain(frames)
+            (frame,) = frames
+            assert before_ns - 50_000_000 <= frame.stamp_ns <= time.monotonic_ns()
+            frames.clear()
+            bus.drain(frames)
 
 
 @given(

@@ -1,0 +1,36 @@
+"""Receive times on the monotonic clock from stamps of the wall clock, whatever is done to the wall clock.
+
+The kernel stamps a frame by the wall clock, which NTP, a GNSS receiver or a person may set at any moment.  A frame that
+waited while the clock was set carries the old time and meets the new offset.  Two facts bound its true time: a frame
+that is taken now came before now, and after the last moment at which the queue was empty.  A stamp outside is converted
+with the offset of that moment, and if this does not fit either, the frame counts as being as old as it can be.  So a
+clock that is set may make a frame look older by a drain or two, but never fresh, hours old or older than the socket.
+"""
+
+from __future__ import annotations
+
+
+class ReceiveClock:
+    """Converts the stamps of one queue.  After `begin`, ``stamp + offset_ns`` is right if it lies between ``since_ns``
+    and ``now_ns``; else `doubtful_ns` decides.
+    """
+
+    __slots__ = ("_offset_when_empty_ns", "_previous_ns", "now_ns", "offset_ns", "since_ns")
+
+    def __init__(self, now_ns: int) -> None:
+        self.now_ns = self.since_ns = self._previous_ns = now_ns
+        self.offset_ns = self._offset_when_empty_ns = 0
+
+    def begin(self, now_ns: int, wall_ns: int) -> None:
+        """Frames were taken; both clocks [ns], read after that."""
+        self._previous_ns, self.now_ns = self.now_ns, now_ns
+        self.offset_ns = now_ns - wall_ns
+
+    def emptied(self) -> None:
+        """The queue was found empty between the last two calls of `begin`: later frames came after the former."""
+        self.since_ns, self._offset_when_empty_ns = self._previous_ns, self.offset_ns
+
+    def doubtful_ns(self, stamp_ns: int) -> int:
+        """Receive time [ns] of a frame whose wall-clock stamp does not fit the present offset."""
+        before_ns = stamp_ns + self._offset_when_empty_ns
+        return before_ns if self.since_ns <= before_ns <= self.now_ns else self.since_ns
