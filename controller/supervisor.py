@@ -31,9 +31,12 @@ RAMP_NS: Final = 60_000_000
 RANGE_MARGIN_UNITS: Final = 0.05
 """How far beyond the profile's range [rad, m] a joint may be before it counts as outside."""
 MAX_ECHO_TICKS: Final = 4
-"""The valve node's echo may stay the same for this many ticks."""
+MAX_ECHO_NS: Final = 20_000_000
+"""The valve node's echo may stay the same for this many ticks and for this long, whatever the rate."""
 DEGRADE_NS: Final = 1_000_000_000
 LATE_PERIODS: Final = 2
+LATE_NS: Final = 10_000_000
+"""A tick is late when it is later than both; what a machine can bear does not depend on the rate of its loop."""
 LATE_LIMIT_COUNT: Final = 3
 LATE_WINDOW_NS: Final = 1_000_000_000
 STALLED_NS: Final = 50_000_000
@@ -115,7 +118,7 @@ class Supervisor:
         self._degraded_until_ns = 0
         self._late_stamps = [-LATE_WINDOW_NS] * LATE_LIMIT_COUNT
         self.late = 0
-        """Ticks that began more than `LATE_PERIODS` late."""
+        """Ticks that began more than `LATE_PERIODS` and `LATE_NS` late."""
         self._echo: Any = None
         self._echo_ticks = 0
         self._reset_pressed = True
@@ -219,7 +222,7 @@ class Supervisor:
                 self._check_stale()
             self._check_values()
             self._collect(*self.crane_inputs.nodes.worst_finding(now_ns))
-            self._check_echo()
+            self._check_echo(period_ns)
             if carrier is not None:
                 self._check_carrier(carrier)
         self._check_lateness(late_ns, period_ns, now_ns)
@@ -269,8 +272,9 @@ class Supervisor:
             self.worst, self.worst_detail = reason, detail
 
     def _check_lateness(self, late_ns: int, period_ns: int, now_ns: int) -> None:
-        """A tick later than two periods slows the machine; three within a second, or one beyond 50 ms, stop it."""
-        if late_ns <= LATE_PERIODS * period_ns:
+        """A tick later than two periods and 10 ms slows the machine; three within a second, or one beyond 50 ms, stop
+        it."""
+        if late_ns <= LATE_PERIODS * period_ns or late_ns <= LATE_NS:
             return
         stamps = self._late_stamps
         stamps[self.late % LATE_LIMIT_COUNT] = now_ns
@@ -349,10 +353,10 @@ class Supervisor:
             return Reason.GNSS_LOST
         return Reason.ENGINE_LOST if carrier.engine.values is None else Reason.NONE
 
-    def _check_echo(self) -> None:
+    def _check_echo(self, period_ns: int) -> None:
         """The valve node echoes the counter of the last accepted command; it must change."""
         echo = self.crane_inputs.valve_b.get("EchoCounter")
         self._echo_ticks = 0 if echo != self._echo else self._echo_ticks + 1
         self._echo = echo
-        if self._echo_ticks > MAX_ECHO_TICKS:
+        if self._echo_ticks > MAX_ECHO_TICKS and self._echo_ticks * period_ns > MAX_ECHO_NS:
             self._collect(Reason.VALVE_ECHO_STUCK)

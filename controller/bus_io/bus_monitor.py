@@ -14,6 +14,8 @@ from can_dbc.messages.tick_record import BusReading
 from machine.status.reasons import Reason
 
 SEND_REFUSAL_LIMIT_TICKS: Final = 3
+SEND_REFUSAL_LIMIT_NS: Final = 10_000_000
+"""A bus that refuses frames in this many ticks in a row, over this time or longer, is not usable."""
 RECOVERY_LIMIT_COUNT: Final = 3
 RECOVERY_WINDOW_NS: Final = 60_000_000_000
 _OFF: Final = int(BusState.OFF)
@@ -29,6 +31,7 @@ class BusMonitor:
         "_recoveries",
         "_recovery_count",
         "_refused",
+        "_refusing_since_ns",
         "_refusing_ticks",
         "_unusable_until_ns",
         "frames_lost",
@@ -46,6 +49,7 @@ class BusMonitor:
         self.recovered = False
         """The bus came back from OFF or DOWN since the last tick."""
         self._dropped = self._refused = self._refusing_ticks = self._recoveries = self._recovery_count = 0
+        self._refusing_since_ns = 0
         self._recovered_ns = [-RECOVERY_WINDOW_NS] * RECOVERY_LIMIT_COUNT
         self._unusable_until_ns = 0
 
@@ -55,6 +59,8 @@ class BusMonitor:
         self.frames_lost = self.recovered or reading.dropped != self._dropped
         self._dropped = reading.dropped
         if reading.refused > self._refused:
+            if not self._refusing_ticks:
+                self._refusing_since_ns = now_ns
             self._refusing_ticks += 1
         elif sent:
             self._refusing_ticks = 0
@@ -66,7 +72,10 @@ class BusMonitor:
             self.reason = Reason.BUS_DOWN
         elif state == _OFF or self.recovered:  # it may come and go between two ticks
             self.reason = Reason.BUS_OFF
-        elif self._refusing_ticks >= SEND_REFUSAL_LIMIT_TICKS:
+        elif (
+            self._refusing_ticks >= SEND_REFUSAL_LIMIT_TICKS
+            and now_ns - self._refusing_since_ns >= SEND_REFUSAL_LIMIT_NS
+        ):
             self.reason = Reason.SEND_REFUSED
         else:
             self.reason = Reason.BUS_PASSIVE if state == _PASSIVE else Reason.NONE

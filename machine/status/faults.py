@@ -211,7 +211,7 @@ FAULTS: Final[dict[Reason, Fault]] = {
         Reaction.DEGRADE,
         5,
         _N,
-        "The control loop was late by more than two periods; half speed",
+        "The control loop was late by more than two periods and 10 ms; half speed",
         "Free the processor; see docs/how-to/real-time.md.",
     ),
     Reason.LOOP_STALLED: Fault(

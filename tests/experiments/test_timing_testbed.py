@@ -11,10 +11,13 @@ import pytest
 from msgspec import structs
 from typer.testing import CliRunner
 
+from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import CraneSetpoint, StateReport
 from can_dbc.messages.datagrams import decode
+from can_dbc.messages.tick_record import BusReading
 from can_dbc.timing.page import Facts, ProcessCounters
+from controller.bus_io.bus_monitor import BusMonitor
 from controller.config import load as settings_of
 from controller.guard.__main__ import build, profile_path
 from controller.process.tick_recording import record
@@ -103,6 +106,43 @@ def test_the_emulated_machine_is_armed_moves_and_never_stops(profile, rate_hz, s
     totals = bench.observer.totals()
     assert totals["records"] == seconds * rate_hz
     assert not any(totals[name] for name in ("records_lost", "records_unreadable", "gaps", "damaged", "unanswered"))
+
+
+@pytest.mark.parametrize(("lost_ms", "mode"), [(15, Mode.ACTIVE), (23, Mode.STOP)])
+def test_at_1_khz_the_valve_nodes_echo_may_stand_as_long_as_at_200_hz(lost_ms, mode):
+    bench = Virtual("palms_471", 1000)
+    while not bench.modes or bench.modes[-1][0] != Mode.ACTIVE:
+        bench.tick()
+    commands = {load("crane").message(name).key for name in ("ValveCmdA", "ValveCmdB")}
+    for _ in range(lost_ms):
+        bench.received = [(bus, frame) for bus, frame in bench.received if frame.key not in commands]
+        bench.tick()
+    for _ in range(5):
+        bench.tick()
+    supervisor = bench.controller.supervisor
+    assert (supervisor.mode, supervisor.reason) == (
+        mode,
+        Reason.NONE if mode is Mode.ACTIVE else Reason.VALVE_ECHO_STUCK,
+    )
+
+
+@pytest.mark.parametrize(("late_ms", "reason"), [(9, Reason.NONE), (11, Reason.LOOP_LATE)])
+def test_at_1_khz_a_tick_is_late_when_it_would_be_at_200_hz(late_ms, reason):
+    bench = Virtual("palms_471", 1000)
+    while not bench.modes or bench.modes[-1][0] != Mode.ACTIVE:
+        bench.tick()
+    bench.inputs.late_ns = late_ms * 1_000_000
+    bench.tick()
+    supervisor = bench.controller.supervisor
+    assert (supervisor.mode, supervisor.reason) == (Mode.ACTIVE, reason)
+
+
+def test_at_1_khz_a_bus_may_refuse_frames_as_long_as_at_200_hz():
+    monitor, reading = BusMonitor(0), BusReading()
+    for ms in range(12):
+        reading.refused += 1
+        monitor.update(reading, True, ms * 1_000_000)
+        assert monitor.reason == (Reason.SEND_REFUSED if ms >= 10 else Reason.NONE)
 
 
 def test_a_joint_follows_its_valve_through_dead_time_and_dead_band():
