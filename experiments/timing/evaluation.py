@@ -18,6 +18,7 @@ import numpy as np
 from can_dbc.timing.durations import BINS, Durations, edge_ns
 from experiments.common.result import Metric
 from experiments.timing.measurement import MeasurementWindow, pooled
+from experiments.timing.metrics import METRICS
 
 QUIET_LONGEST_SHARE: Final = 0.2
 """Longest lateness of cyclictest in a quiet window, as a share of the period."""
@@ -31,6 +32,13 @@ MIN_RATIO_CYCLES: Final = 10_000
 MIN_MISS_CYCLES: Final = 100_000
 MIN_STEADY_TICKS: Final = 10_000
 MIN_CPU_TICKS: Final = 1_000
+COST_WINDOW_SHARE: Final = 0.25
+"""Share of the windows in which the processor time of a tick is judged: the quietest."""
+STILL_P99_NS: Final = 100_000
+"""Lateness of cyclictest at p99 [ns] up to which a window shows the processor time of a tick; beyond it other work has
+replaced the tick's data in the caches, or the hypervisor's time counts as the thread's."""
+STILL_PRESSURE: Final = 0.3
+"""Share of time in which a process waits for a processor; the testbed itself causes about half of it."""
 RESAMPLE_COUNT: Final = 400
 EDGES_NS: Final = np.array([0, *(edge_ns(i) for i in range(BINS))], float)
 
@@ -50,6 +58,21 @@ def compared_windows(windows: Sequence[MeasurementWindow]) -> tuple[list[Measure
     good = [w for w in windows if quiet(w)]
     enough = len(good) >= QUIET_WINDOW_SHARE * len(windows)
     return (good, True) if enough and good else (list(windows), False)
+
+
+def quietest_windows(windows: Sequence[MeasurementWindow]) -> list[MeasurementWindow]:
+    """The quietest quarter, at least one, by cyclictest's p99 alone: the controller's own times choose nothing."""
+    ordered = sorted(windows, key=lambda w: (w.cyclictest.quantile_ns(0.99), w.host.steal_ms))
+    return ordered[: max(1, math.ceil(COST_WINDOW_SHARE * len(ordered)))]
+
+
+def still(window: MeasurementWindow) -> bool:
+    """Whether the host left the processor and its caches alone, as far as cyclictest, steal and pressure tell."""
+    return (
+        window.cyclictest.quantile_ns(0.99) <= STILL_P99_NS
+        and window.host.steal_ms <= QUIET_STEAL_SHARE * 1e3 * window.host.seconds
+        and (window.host.pressure or 0.0) <= STILL_PRESSURE
+    )
 
 
 def quantile_us(bins: np.ndarray, share: float, longest_ns: float) -> float:
@@ -98,8 +121,6 @@ def process_metrics(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
     span = max(1, windows[-1].end.ticks - windows[0].begin.ticks)
     frames = sum(b.received + b.sent for b in windows[-1].end.buses)
     frames -= sum(b.received + b.sent for b in windows[0].begin.buses)
-    lost = sum(b.dropped + b.refused for b in windows[-1].end.buses)
-    lost -= sum(b.dropped + b.refused for b in windows[0].begin.buses)
     return {
         "ticks": float(ticks),
         "page_faults": float(last.minor_faults + last.major_faults - first.minor_faults - first.major_faults),
@@ -110,7 +131,6 @@ def process_metrics(windows: Sequence[MeasurementWindow]) -> dict[str, float]:
         "involuntary_switches_per_tick": (last.involuntary_switches - first.involuntary_switches) / span,
         "cpu_share": (last.cpu_ns - first.cpu_ns) / (windows[-1].end.written_ns - windows[0].begin.written_ns),
         "frames_per_s": frames / ((windows[-1].end.written_ns - windows[0].begin.written_ns) * 1e-9),
-        "frames_lost": float(lost),
     }
 
 
@@ -184,9 +204,19 @@ def undecided(metrics: Mapping[str, float]) -> dict[str, str]:
     for name in ("page_faults", "gc_runs", "allocated_blocks_growth"):
         if ticks < MIN_STEADY_TICKS and metrics[name] <= 0.0:
             found[name] = f"{ticks:.0f} ticks are too few; at least {MIN_STEADY_TICKS} are needed"
-    for name, count in (("tick_cpu_p99_us", ticks), ("tick1k_cpu_p99_us", metrics.get("ticks_1k", 0.0))):
+    cost = (("tick_cpu_p50_us", ticks), ("tick_cpu_p99_us", ticks), ("tick1k_cpu_p99_us", metrics.get("ticks_1k", 0.0)))
+    for name, count in cost:
+        most = next(m.most for m in METRICS if m.name == name) or math.inf
         if count < MIN_CPU_TICKS:
             found[name] = f"{count:.0f} ticks are too few; at least {MIN_CPU_TICKS} are needed"
+        elif metrics[name] > most and not metrics[f"{name.partition('_p')[0]}_host_still"]:
+            found[name] = "even the quietest windows were noisy, and noise adds to the processor time"
+    for name in ("frames_lost", "stops"):
+        if metrics.get(name) and not metrics[f"{name}_unexplained"]:
+            found[name] = (
+                f"the host withheld a processor for up to {metrics['stall_max_ms']:.0f} ms; a witness saw a stall "
+                "before each of them"
+            )
     if not metrics["host_verdict"] and metrics.get("sample_to_command_p99_us", 0.0) > metrics["period_us"]:
         found["sample_to_command_p99_us"] = noisy
     for end in ("", "_1k"):

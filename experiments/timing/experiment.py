@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,6 +16,8 @@ from experiments.common.registry import Options
 from experiments.common.result import Result, commit, environment, limits_of
 from experiments.common.result_page import Page, publish
 from experiments.timing import evaluation, host_activity, plots, reference_loops
+from experiments.timing.instructions import INSTRUCTIONS, count, open_counter
+from experiments.timing.losses import Loss, Stall, Stop, sentences, stall_before_stop, stall_of_loss
 from experiments.timing.measurement import MeasurementWindow, load, measure, pooled, system_calls
 from experiments.timing.metrics import CONCLUSION, INTRODUCTION, METRICS, SECTIONS
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
@@ -65,6 +69,13 @@ class Measured:
     calls: tuple[dict[str, int], float] | None
     stops: int
     modes: list[str]
+    stop_events: Sequence[Stop] = ()
+    losses: Sequence[Loss] = ()
+    stalls: Sequence[Stall] = ()
+    instructions: float = math.nan
+    """Instructions of the controller's thread per period over the quiet windows; NaN if the host does not count."""
+    others: Mapping[str, float] = field(default_factory=dict)
+    """Counters of emulated machine and observer over the whole measurement."""
 
 
 def run(options: Options, console: Console) -> Result:
@@ -85,7 +96,7 @@ def run(options: Options, console: Console) -> Result:
     fast_setting = TestbedConfig(crane, FAST_HZ, bitrates=(("crane0", FAST_BITRATE),))
     fast = measure_testbed(fast_setting, plan, options.out / "fast", console)
     metrics, compared = gather(slow, fast)
-    metrics |= frame_costs(options.quick, console)
+    metrics |= frame_costs(options.quick, console) | compiled_ratios(options.quick, console)
     found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
     surroundings = host_activity.describe()
     result = Result(
@@ -100,7 +111,12 @@ def run(options: Options, console: Console) -> Result:
             **environment(),
             **surroundings,
             "host_verdict": "quiet enough" if metrics["host_verdict"] else "inconclusive",
-            "modes": "; ".join(slow.modes + fast.modes),
+            "events": "; ".join(
+                f"{hz} Hz: {text}"
+                for hz, found in ((200, slow), (FAST_HZ, fast))
+                for text in sentences(found.stop_events, found.losses, found.stalls)
+            ),
+            "instructions": "counted" if "tick_instructions" in metrics else "not counted by this host",
             "tick": compared[-1].end.tick,
             **{f"open: {name}": why for name, why in found.inconclusive.items()},
         },
@@ -162,14 +178,36 @@ def measure_testbed(setting: TestbedConfig, plan: Plan, directory: Path, console
 
         with TimingTestbed(setting, directory) as testbed:
             testbed.wait(plan.warm_s)
+            before = _counters(testbed)
+            counter = open_counter(testbed.family.children["controller"].process.pid, INSTRUCTIONS)
+            executed = count(counter) if counter is not None else 0
             quiet = windows("quiet", n, seconds)
+            instructions = math.nan
+            if counter is not None:
+                passed = quiet[-1].end.ticks - quiet[0].begin.ticks
+                instructions = (count(counter) - executed) / max(1, passed)
+                os.close(counter)
             with load(testbed, 2 * loaded * (loaded_s + OVERHEAD_S) + 60.0):
                 pressed = windows("loaded", loaded, loaded_s)
-            calls, stops, modes = None, testbed.stops, list(testbed.modes)  # because tracing may stop the machine
+            testbed.wait(1.0)  # for the last words of every process
+            # Read now, because tracing may stop the machine.
+            calls, stops, modes = None, len(testbed.stop_events), list(testbed.modes)
+            events = list(testbed.stop_events), list(testbed.losses), list(testbed.stalls)
+            others = {name: value - before[name] for name, value in _counters(testbed).items()}
             if slow:
                 status.update(f"timing: {what}: counting system calls")
                 calls = system_calls(testbed, plan.trace_s, directory)
-            return Measured(quiet, pressed, calls, stops, modes)
+            return Measured(quiet, pressed, calls, stops, modes, *events, instructions, others)
+
+
+def _counters(testbed: TimingTestbed) -> dict[str, float]:
+    """Frames and records that someone other than the controller has lost so far."""
+    machine, observer = testbed.status.get("machine", {}), testbed.status.get("observer", {})
+    return {
+        "machine_frames_lost": float(machine.get("refused_frames", 0) + machine.get("dropped_frames", 0)),
+        "machine_stalls": float(machine.get("stalls", 0)),
+        "records_lost": float(observer.get("records_lost", 0) + observer.get("records_unreadable", 0)),
+    }
 
 
 def _last(done: Sequence[MeasurementWindow]) -> str:
@@ -185,9 +223,13 @@ def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[Measu
     compared, enough = evaluation.compared_windows(slow.quiet)
     metrics = evaluation.process_metrics(slow.quiet) | evaluation.host_metrics(slow.quiet, enough)
     metrics["period_us"] = slow.quiet[0].end.period_ns / 1e3
-    for stage in ("cpu", "tick"):
-        name = "tick_cpu" if stage == "cpu" else "tick"
-        metrics |= evaluation.spread_us(name, pooled([w.durations[stage] for w in compared]))
+    metrics |= evaluation.spread_us("tick", pooled([w.durations["tick"] for w in compared]))
+    for name, windows in (("tick_cpu", slow.quiet), ("tick1k_cpu", fast.quiet)):
+        judged = evaluation.quietest_windows(windows)
+        metrics |= evaluation.spread_us(name, pooled([w.durations["cpu"] for w in judged]))
+        everywhere = evaluation.spread_us(name, pooled([w.durations["cpu"] for w in windows]))
+        metrics |= {k.replace("cpu_", "cpu_all_"): v for k, v in everywhere.items()}
+        metrics[f"{name}_host_still"] = float(all(map(evaluation.still, judged)))
     metrics |= evaluation.spread_us("sample_to_command", pooled([w.durations["sample_to_command"] for w in compared]))
     metrics |= evaluation.wakeups("", compared)
     ours, theirs = [w.durations["wake"] for w in compared], [w.cyclictest for w in compared]
@@ -197,13 +239,55 @@ def gather(slow: Measured, fast: Measured) -> tuple[dict[str, float], list[Measu
     metrics["missed"] = float(sum(w.missed for w in compared))
     metrics["missed_everywhere"] = float(sum(w.missed for w in slow.quiet))
     metrics |= _renamed(evaluation.wakeups("", slow.loaded), "_", "_loaded_", 1) | loaded("", slow.loaded)
-    metrics["stops"] = float(slow.stops + fast.stops)
+    metrics |= event_metrics(slow, fast)
+    if not math.isnan(slow.instructions):
+        metrics["tick_instructions"] = slow.instructions
     metrics |= system_call_metrics(slow.calls)
-    metrics |= evaluation.spread_us("tick1k_cpu", pooled([w.durations["cpu"] for w in fast.quiet]))
     metrics |= _renamed(evaluation.wakeups("", fast.quiet), "_", "1k_", 1) | loaded("_1k", fast.loaded)
     metrics["ticks_1k"] = float(sum(w.ticks for w in fast.quiet))
     metrics["missed_1k"] = float(sum(w.missed for w in fast.quiet))
     return metrics, compared
+
+
+def event_metrics(slow: Measured, fast: Measured) -> dict[str, float]:
+    """Stops and losses of both testbeds, and how many of them no stall of the host explains."""
+    both = (slow, fast)
+    lost = sum(x.frames for m in both for x in m.losses)
+    explained = sum(x.frames for m in both for x in m.losses if stall_of_loss(x, m.stalls))
+    stops = sum(m.stops for m in both)
+    caused = sum(stall_before_stop(s, m.stalls) is not None for m in both for s in m.stop_events)
+    stalls = [stall for m in both for stall in m.stalls]
+    metrics = {
+        "frames_lost": float(lost),
+        "frames_lost_unexplained": float(lost - explained),
+        "stops": float(stops),
+        "stops_unexplained": float(stops - caused),
+        "stalls": float(len(stalls)),
+        "stall_max_ms": max((s.length_ns for s in stalls), default=0) / 1e6,
+    }
+    for name in ("machine_frames_lost", "machine_stalls", "records_lost"):
+        metrics[name] = float(sum(m.others.get(name, 0.0) for m in both))
+    return metrics
+
+
+def compiled_ratios(quick: bool, console: Console) -> dict[str, float]:
+    """How many times as fast the compiled tick is, caches cold and hot: the smaller ratio of the kept recordings.
+
+    NaN if there is no compiled tick or no recording.
+    """
+    from hil.tick import compare
+
+    names = ("compiled_ratio_cold", "compiled_ratio_hot")
+    with console.status("timing: interpreter and compiled tick") as status, tempfile.TemporaryDirectory() as folder:
+        try:
+            compare.need_build()
+            places = compare.kept_recordings(Path(folder))
+        except CommandFailed as error:
+            console.print(f"timing: no ratio: {error}", highlight=False, soft_wrap=True)
+            return dict.fromkeys(names, math.nan)
+        ticks, rounds = (300, 1) if quick else (2000, 3)
+        rows = [compare.compare_cost(place, ticks, rounds, status.update) for place in places]
+    return {name: float(min(row[name] for row in rows)) for name in names}
 
 
 def _renamed(metrics: Mapping[str, float], old: str, new: str, count: int) -> dict[str, float]:

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from can_dbc.bus.factory import VCAN_NAMES
-from can_dbc.timing.page import Timing, TimingRefused, read_timing
+from can_dbc.timing.page import Facts, Timing, TimingRefused, read_timing
+from experiments.timing.losses import Loss, Stall, Stop, losses_between
 from hil.harness.processes import ProcessGroup, free_udp_ports
 from hil.wire.bitrates import BITRATES
 from host.exit_codes import CommandFailed, ExitCode
@@ -26,9 +27,11 @@ from machine.loading.profile_file import load_profile
 from machine.status.reasons import Reason
 
 HOST: Final = "127.0.0.1"
-PRIORITY: Final = {"wire": 60, "machine": 50, "setpoints": 30, "observer": 20}
+PRIORITY: Final = {"wire": 60, "machine": 50, "setpoints": 30, "observer": 20, "witness": 90, "witness-controller": 79}
 HARNESS_PRIORITY: Final = 10
 """SCHED_FIFO: emulated hardware must answer like hardware; setpoint source and observer are not measured."""
+WITNESS_US: Final = {"witness": 2000, "witness-controller": 5000}
+"""Periods of the witnesses; beside the controller it wakes below it and seldom, so that it does not disturb it."""
 END_ORDER: Final = ("setpoints", "controller", "guard", "observer", "machine", "wire")
 START_S: Final = 60.0
 ACTIVE_S: Final = 60.0
@@ -63,7 +66,8 @@ class TimingTestbed:
     """A running testbed.
 
     ``helpers`` are processes that run beside it for a while (`experiments.timing.reference_loops`).  ``status`` holds
-    the newest message of each process, ``modes`` every change of mode, ``stop_reasons`` why the machine stopped.
+    the newest message of each process, ``modes`` every change of mode, ``stop_reasons`` why the machine stopped;
+    ``stop_events``, ``losses`` and ``stalls`` what happened when.
     """
 
     def __init__(self, setting: TestbedConfig, directory: Path) -> None:
@@ -72,6 +76,11 @@ class TimingTestbed:
         self.status: dict[str, dict[str, Any]] = {}
         self.modes: list[str] = []
         self.stop_reasons: set[Reason] = set()
+        self.stop_events: list[Stop] = []
+        self.losses: list[Loss] = []
+        self.stalls: list[Stall] = []
+        self._facts: Facts | None = None
+        self._was = ""
         directory.mkdir(parents=True, exist_ok=True)
         where = MEMORY if MEMORY.is_dir() else None
         self._private = Path(tempfile.mkdtemp(prefix="timberhand-timing-", dir=where))
@@ -109,6 +118,10 @@ class TimingTestbed:
         if not vcan:
             rates = dict(s.bitrates)
             self._start("wire", "hil.wire.daemon", *(x for n in names for x in ("--bus", f"{n}:{rates[n]}")))
+        for name, cpu in (("witness", min(self.others)), ("witness-controller", self.cpu)):
+            if name == "witness" or self.cpu not in self.others:
+                self._start(name, "experiments.timing.stall_witness", "--period-us", WITNESS_US[name])
+                os.sched_setaffinity(self.family.children[name].process.pid, {cpu})
         cycle_us = min(5000, s.period_ns // 1000)
         self._start(
             "machine", "experiments.timing.emulated_machine", "--profile", s.profile, *buses, "--cycle-us", cycle_us
@@ -160,10 +173,16 @@ class TimingTestbed:
         gone = self.family.dead()
         for name, message in self.family.messages():
             self.status[name] = self.status.get(name, {}) | message
+            if "stall_ns" in message:
+                cpu = min(self.others) if name == "witness" else self.cpu
+                self.stalls.append(Stall(cpu, message["end_ns"], message["stall_ns"]))
             if name == "setpoints" and message.get("event") == "mode":
                 self.modes.append(f"{message['mode']}: {message['why']}")
                 if message["mode"] in ("STOP", "FAULT"):
+                    if self._was not in ("STOP", "FAULT"):
+                        self.stop_events.append(Stop(message["stamp_ns"], Reason(message["reason"]), message["why"]))
                     self.stop_reasons.add(Reason(message["reason"]))
+                self._was = message["mode"]
         if gone is not None:
             code = gone.process.returncode
             known = ExitCode(code) if code in set(ExitCode) and code else ExitCode.SAFETY_STOP
@@ -187,11 +206,15 @@ class TimingTestbed:
         return int(self.status["setpoints"]["stamp_ns"])
 
     def timing(self) -> Timing:
-        """The controller's timing page now; raises CommandFailed when there is none."""
+        """The controller's timing page now, its losses noted; raises CommandFailed when there is none."""
         try:
-            return read_timing(self.page)
+            now = read_timing(self.page)
         except TimingRefused as error:
             raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from None
+        if self._facts is not None:
+            self.losses += losses_between(self._facts, now.facts)
+        self._facts = now.facts
+        return now
 
     def fresh_timing(self) -> Timing:
         """The next timing page that the controller writes; it writes one per second."""

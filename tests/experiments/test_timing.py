@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from collections.abc import Sequence
 
 import pytest
+from msgspec import structs
 
 from can_dbc.dbc.codec import load
 from can_dbc.protocols.e2e import Sender
 from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import STAGES, BusCounters, Facts, ProcessCounters
-from experiments.timing import evaluation, experiment, host_activity, reference_loops
+from experiments.timing import evaluation, experiment, host_activity, instructions, losses, reference_loops
 from experiments.timing.continuity import Continuity
 from experiments.timing.host_activity import HostActivity
 from experiments.timing.measurement import MeasurementWindow, pooled
 from experiments.timing.metrics import METRICS, SECTIONS
 from experiments.timing.reference_loops import SleepLoopReport
+from machine.status.reasons import Reason
 
 PERIOD_NS = 5_000_000
 
@@ -45,9 +49,10 @@ def window(
     missed: int = 0,
     steal_ms: float = 0.0,
     faults: int = 0,
+    cpu_us: float = 100.0,
 ) -> MeasurementWindow:
     """``ticks`` wake-ups that cycle through ``late``, and as many of cyclictest's."""
-    durations = {name: histogram(300.0, times=ticks) for name in STAGES}
+    durations = {name: histogram(cpu_us, times=ticks) for name in STAGES}
     durations["wake"] = histogram(*late, times=max(1, ticks // len(late)))
     return MeasurementWindow(
         facts(at),
@@ -217,6 +222,63 @@ def test_missed_deadlines_under_load_are_compared_with_the_sleep_loop(ours, plai
     assert outcome == ("missed" if name in found.missed else "inconclusive" if name in found.inconclusive else "met")
 
 
+def test_the_cost_of_a_tick_is_judged_in_the_quietest_windows_whatever_it_is_there():
+    noisy = [window(theirs=[400.0], cpu_us=500.0, at=2000 * i) for i in range(6)]
+    good = [window(theirs=[30.0], cpu_us=170.0), window(theirs=[20.0], cpu_us=180.0)]
+    metrics = metrics_of([*noisy, *good], [window()])
+    assert metrics["tick_cpu_p50_us"] == pytest.approx(175.0, abs=10.0) and metrics["tick_cpu_all_p50_us"] > 450.0
+    assert "tick_cpu_p50_us" in evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics)).missed
+
+
+def test_a_costly_tick_on_a_noisy_host_is_inconclusive_and_a_cheap_one_counts():
+    costly = metrics_of([window(theirs=[400.0], cpu_us=500.0)], [window()])
+    found = evaluation.evaluate(METRICS, costly, evaluation.undecided(costly))
+    assert {"tick_cpu_p50_us", "tick_cpu_p99_us"} <= found.inconclusive.keys()
+    cheap = metrics_of([window(theirs=[400.0])], [window()])
+    found = evaluation.evaluate(METRICS, cheap, evaluation.undecided(cheap))
+    assert not {"tick_cpu_p50_us", "tick_cpu_p99_us"} & ({*found.missed} | found.inconclusive.keys())
+
+
+def outcome_of(stalls: list[losses.Stall]) -> tuple[dict[str, float], evaluation.Evaluation]:
+    """One stop and 36 refused frames at 10 s, with these stalls."""
+    before, after = facts(1800), facts(2000)
+    bus = structs.replace(after.buses[0], refused=36)
+    lost = losses.losses_between(before, structs.replace(after, buses=(bus,)))
+    stop = losses.Stop(10_000_000_000, Reason.ESTOP_LOST, "gone")
+    quiet, none = [window()], experiment.Measured([window()], [window()], None, 0, [])
+    slow = experiment.Measured(quiet, [window()], None, 1, [], [stop], lost, stalls)
+    metrics = experiment.gather(slow, none)[0]
+    return metrics, evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
+
+
+def test_a_loss_and_a_stop_are_explained_by_a_stall_that_a_witness_saw_just_before():
+    metrics, found = outcome_of([losses.Stall(0, 9_950_000_000, 90_000_000)])
+    assert (metrics["frames_lost"], metrics["frames_lost_unexplained"]) == (36.0, 0.0)
+    assert (metrics["stops"], metrics["stops_unexplained"]) == (1.0, 0.0)
+    assert {"frames_lost", "stops"} <= found.inconclusive.keys() and "frames_lost" not in found.missed
+
+
+@pytest.mark.parametrize("stalls", [[], [losses.Stall(0, 5_000_000_000, 90_000_000)],
+                                    [losses.Stall(0, 9_950_000_000, 6_000_000)]])  # fmt: skip
+def test_a_loss_without_a_stall_long_enough_and_near_enough_counts(stalls):
+    metrics, found = outcome_of(stalls)
+    assert metrics["frames_lost_unexplained"] == 36.0 and metrics["stops_unexplained"] == 1.0
+    assert {"frames_lost", "frames_lost_unexplained", "stops", "stops_unexplained"} <= {*found.missed}
+
+
+def test_the_kernel_counts_what_a_thread_executes():
+    descriptor = instructions.open_counter(os.getpid(), instructions.TASK_CLOCK)
+    if descriptor is None:
+        pytest.skip("this host does not let us count")
+    try:
+        before, began_ns = instructions.count(descriptor), time.thread_time_ns()
+        sum(range(300_000))
+        counted, passed_ns = instructions.count(descriptor) - before, time.thread_time_ns() - began_ns
+    finally:
+        os.close(descriptor)
+    assert counted == pytest.approx(passed_ns, rel=0.2)
+
+
 def test_a_metric_without_a_value_is_inconclusive():
     metrics = metrics_of([window()], [window()]) | experiment.system_call_metrics(None)
     found = evaluation.evaluate(METRICS, metrics, evaluation.undecided(metrics))
@@ -226,12 +288,13 @@ def test_a_metric_without_a_value_is_inconclusive():
 def test_all_metric_names_exist():
     metrics = metrics_of([window()], [window()])
     frames = {"rx_decode_us", "rx_decode_pythoncan_us"}  # from receive_cost
+    bench = {"compiled_ratio_cold", "compiled_ratio_hot", "tick_instructions"}  # from hil.tick; only where counted
     assert set(metrics) >= {
         "tick_cpu_p50_us", "tick_cpu_p99_us", "tick1k_cpu_p99_us", "wakeup_p50_ratio", "wakeup_p99_ratio", "missed",
         "missed_loaded", "missed_loaded_plain", "sample_to_command_p99_us", "page_faults", "gc_runs", "host_verdict",
         "missed_1k", "syscalls_per_tick", "voluntary_switches_per_tick", "steal_ms", "cyclictest_p99_us",
     }  # fmt: skip
-    assert {f.name for f in METRICS} <= set(metrics) | frames | {"stops"}
+    assert {f.name for f in METRICS} <= set(metrics) | frames | bench
     assert len({f.name for f in METRICS}) == len(METRICS)
     assert len({file for s in SECTIONS for file, _ in s.plots}) == 4
 
