@@ -69,6 +69,10 @@ EXPERIMENTS: Final = {
         "loaded.",
         "experiments.timing.experiment",
     ),
+    "rates": Entry(
+        "Does the whole forwarder run at 1 kHz? Cost against frames and joints, cranes on one processor.",
+        "experiments.timing.rates",
+    ),
     "plc": Entry(
         "Does a PLC between crane0 and the valves work as well? Both roles compared with CAN: logs, accuracy, latency.",
         "experiments.plc.experiment",

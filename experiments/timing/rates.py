@@ -1,0 +1,365 @@
+"""The rates experiment: the whole forwarder at 1 kHz, cost against frames and joints, cranes on one processor.
+
+The controller runs on the timing testbed at several rates, with the limits and gains of its profile.  How many
+controllers one processor carries at 200 Hz is measured with recorded inputs (`experiments.timing.replayed_crane`),
+because no computer of this size could emulate as many machines beside them.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from rich.console import Console
+
+from experiments.common.registry import Options
+from experiments.common.result import Metric, Result, commit, environment, limits_of
+from experiments.common.result_page import Page, Section, publish
+from experiments.timing import evaluation, host_activity
+from experiments.timing.losses import Loss, Stall, Stop, sentences, stall_before_stop, stall_of_loss
+from experiments.timing.measurement import between
+from experiments.timing.testbed import TestbedConfig, TimingTestbed, cores
+from hil.harness.processes import ProcessGroup
+from hil.tick.compare import kept_recordings
+from host.exit_codes import CommandFailed, ExitCode
+from machine.joints import JOINTS
+from machine.loading.profile_file import load_profile
+from runtime.plot_style import MOSS, OIL, RUST, STEEL, sheet
+
+MACHINES: Final = ("palms_471", "aoro_fc8")
+FORWARDER: Final = "aoro_fc8"
+RATES_HZ: Final = (100, 200, 500, 1000)
+BITRATES: Final = (("crane0", 4_000_000), ("mach0", 250_000))
+"""A CAN bus of 1 Mbit/s carries the traffic of crane0 up to 400 Hz; at 1 kHz the wire stands in for a faster one."""
+CARRIER_FUNCTIONS: Final = 8
+"""Articulation, drive and six swing arms."""
+MAX_CRANES: Final = 16
+MISSED_SHARE: Final = 0.001
+"""Share of the periods that may be missed before a processor carries too many controllers."""
+REPLAY_TICKS: Final = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class RatePoint:
+    """One machine at one rate: what its controller cost, and what was lost or stopped."""
+
+    machine: str
+    rate_hz: int
+    cpu_share: float
+    frames_per_s: float
+    cpu_p50_us: float
+    cpu_p99_us: float
+    ticks: int
+    missed: int
+    stops: Sequence[Stop]
+    losses: Sequence[Loss]
+    stalls: Sequence[Stall]
+    tick: str
+
+
+@dataclass(frozen=True, slots=True)
+class CranePoint:
+    """Controllers of one machine on one processor: periods run and missed, cost of all per period [us]."""
+
+    machine: str
+    cranes: int
+    ticks: int
+    missed: int
+    differing: int
+    cpu_us: float
+    period_us: float
+
+    @property
+    def carried(self) -> bool:
+        """Whether the processor kept every deadline but a few."""
+        return self.missed <= MISSED_SHARE * self.ticks
+
+    @property
+    def functions(self) -> int:
+        """Functions that all of them move."""
+        return self.cranes * functions_of(self.machine)
+
+
+def functions_of(machine: str) -> int:
+    """Functions of a machine: its joints, the grapple, and on a carrier articulation, drive and swing arms."""
+    return len(JOINTS) + 1 + (CARRIER_FUNCTIONS if load_profile(machine).carrier else 0)
+
+
+def run(options: Options, console: Console) -> Result:
+    """Run the experiment; write ``options.out`` and, if requested, the docs."""
+    seconds, rates, ticks = (3.0, (200, 1000), 400) if options.quick else (10.0, RATES_HZ, REPLAY_TICKS)
+    options.out.mkdir(parents=True, exist_ok=True)
+    points = []
+    with console.status("rates: starting") as status:
+        for machine in MACHINES:
+            for rate_hz in rates:
+                status.update(f"rates: {machine} at {rate_hz} Hz")
+                points.append(measure_rate(machine, rate_hz, seconds, options.out / f"{machine}-{rate_hz}"))
+        status.update("rates: controllers on one processor")
+        cranes = measure_cranes(ticks, options.out / "cranes", 2 if options.quick else MAX_CRANES)
+    metrics = gather(points, cranes)
+    found = evaluation.evaluate(METRICS, metrics, undecided(metrics, points))
+    rows = [f"{p.machine} {p.rate_hz} Hz: {text}" for p in points for text in sentences(p.stops, p.losses, p.stalls)]
+    result = Result(
+        experiment="rates",
+        commit=commit(),
+        profile=FORWARDER,
+        seed=options.seed,
+        trials=len(points),
+        metrics=metrics,
+        paper={},
+        environment={
+            **environment(),
+            **host_activity.describe(),
+            "tick": points[-1].tick,
+            "events": "; ".join(rows),
+            **{f"open: {name}": why for name, why in found.inconclusive.items()},
+        },
+        limits=limits_of(METRICS),
+        missed=found.missed,
+        inconclusive=tuple(found.inconclusive),
+    )
+    draw(points, cranes, options.out / "rates.png")
+    publish(result, page_of(result, {}), options, console)
+    return result
+
+
+def measure_rate(machine: str, rate_hz: int, seconds: float, directory: Path) -> RatePoint:
+    """Measure one machine at one rate."""
+    with TimingTestbed(TestbedConfig(machine, rate_hz, bitrates=BITRATES), directory) as testbed:
+        testbed.wait(2.0)
+        begin = testbed.fresh_timing()
+        testbed.wait(seconds)
+        end = testbed.fresh_timing()
+        testbed.wait(0.5)
+        events = list(testbed.stop_events), list(testbed.losses), list(testbed.stalls)
+    cpu = evaluation.spread_us("cpu", between(begin, end)["cpu"])
+    passed_s = (end.facts.written_ns - begin.facts.written_ns) * 1e-9
+    frames = sum(b.received + b.sent for b in end.facts.buses) - sum(b.received + b.sent for b in begin.facts.buses)
+    used_ns = end.facts.process.cpu_ns - begin.facts.process.cpu_ns
+    return RatePoint(
+        machine, rate_hz, used_ns * 1e-9 / passed_s, frames / passed_s, cpu["cpu_p50_us"], cpu["cpu_p99_us"],
+        end.facts.ticks - begin.facts.ticks, end.facts.missed - begin.facts.missed, *events, end.facts.tick,
+    )  # fmt: skip
+
+
+def measure_cranes(ticks: int, directory: Path, most: int) -> list[CranePoint]:
+    """More and more controllers of each kept recording on one processor, up to the first number that it cannot carry.
+
+    A number that fails is tried once more, because a stall of the host looks the same.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    points = []
+    with tempfile.TemporaryDirectory() as folder:
+        for recording in kept_recordings(Path(folder)):
+            for cranes in range(1, most + 1):
+                tries = [run_cranes(recording, cranes, ticks, directory)]
+                if not tries[0].carried:
+                    tries.append(run_cranes(recording, cranes, ticks, directory))
+                points.append(min(tries, key=lambda point: point.missed))
+                if not points[-1].carried:
+                    break
+    return points
+
+
+def run_cranes(recording: Path, cranes: int, ticks: int, directory: Path) -> CranePoint:
+    """Run so many controllers on the testbed's last processor, their ticks spread over the period."""
+    cpu, _ = cores()
+    family = ProcessGroup(directory)
+    outputs: dict[str, dict[str, Any]] = {}
+    period_ns = 5_000_000
+    start_ns = time.monotonic_ns() + round((2.0 + 1.5 * cranes) * 1e9)
+    try:
+        for k in range(cranes):
+            family.start(
+                f"crane-{k}", "experiments.timing.replayed_crane", recording, "--ticks", ticks, "--cpu", cpu,
+                "--start-at", start_ns + k * period_ns // cranes,
+            )  # fmt: skip
+        limit = time.monotonic() + 60.0 + 3.0 * cranes + 3.0 * ticks * period_ns * 1e-9
+        while len(outputs) < cranes:
+            for name, message in family.messages():
+                if "cpu_us" in message:
+                    outputs[name] = message
+            dead = family.dead()
+            if time.monotonic() > limit or (dead is not None and dead.process.returncode):
+                why = "the time is up" if dead is None else dead.complaint()
+                raise CommandFailed("rates.replay-failed", f"{cranes} controllers: {why}", ExitCode.CONFIGURATION)
+            time.sleep(0.05)
+    finally:
+        family.stop_all(())
+    found = list(outputs.values())
+    return CranePoint(
+        machine_of(recording), cranes, sum(x["ticks"] for x in found), sum(x["missed"] for x in found),
+        sum(x["differing"] for x in found), sum(x["cpu_us"] for x in found), found[0]["period_us"],
+    )  # fmt: skip
+
+
+def machine_of(recording: Path) -> str:
+    """The machine of a kept recording."""
+    from hil.replay.recording import files_of, manifest_of
+
+    return Path(manifest_of(files_of(recording)).profile).stem
+
+
+def fit(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float]:
+    """Slope and intercept of the straight line, and its largest residual as a share of the largest value."""
+    if len(x) < 2:
+        return math.nan, math.nan, math.nan
+    slope, intercept = np.polyfit(x, y, 1)
+    residual = np.abs(np.array(y) - (slope * np.array(x) + intercept)).max()
+    return float(slope), float(intercept), float(residual / max(y))
+
+
+def gather(points: Sequence[RatePoint], cranes: Sequence[CranePoint]) -> dict[str, float]:
+    """All metrics."""
+    fast = next(p for p in points if p.machine == FORWARDER and p.rate_hz == max(q.rate_hz for q in points))
+    metrics = {
+        "forwarder1k_frames_per_s": fast.frames_per_s,
+        "forwarder1k_cpu_p50_us": fast.cpu_p50_us,
+        "forwarder1k_cpu_p99_us": fast.cpu_p99_us,
+        "forwarder1k_cpu_share": fast.cpu_share,
+        "forwarder1k_ticks": float(fast.ticks),
+        "forwarder1k_missed": float(fast.missed),
+        "frames_lost": float(sum(x.frames for p in points for x in p.losses)),
+        "frames_lost_unexplained": float(
+            sum(x.frames for p in points for x in p.losses if stall_of_loss(x, p.stalls) is None)
+        ),
+        "stops": float(sum(len(p.stops) for p in points)),
+        "stops_unexplained": float(sum(stall_before_stop(s, p.stalls) is None for p in points for s in p.stops)),
+        "differing_ticks": float(sum(c.differing for c in cranes)),
+    }
+    for machine in MACHINES:
+        mine = [p for p in points if p.machine == machine]
+        slope, intercept, residual = fit([p.frames_per_s for p in mine], [p.cpu_share for p in mine])
+        metrics |= {f"{machine}_frame_us": slope * 1e6, f"{machine}_rest_share": intercept}
+        metrics[f"{machine}_frame_residual"] = residual
+        metrics |= {f"{machine}_{p.rate_hz}_cpu_share": p.cpu_share for p in mine}
+        metrics |= {f"{machine}_{p.rate_hz}_frames_per_s": p.frames_per_s for p in mine}
+        carried = [c for c in cranes if c.machine == machine and c.carried]
+        metrics[f"{machine}_cranes"] = float(max((c.cranes for c in carried), default=0))
+        slow = next((p for p in mine if p.rate_hz == 200), None)
+        metrics[f"{machine}_cranes_bound"] = math.floor(0.95 / slow.cpu_share) if slow else math.nan
+    kept = [c for c in cranes if c.carried]
+    slope, intercept, residual = fit([float(c.functions) for c in kept], [c.cpu_us for c in kept])
+    return metrics | {"function_us": slope, "function_residual": residual}
+
+
+def undecided(metrics: Mapping[str, float], points: Sequence[RatePoint]) -> dict[str, str]:
+    """The metrics that this run cannot decide, with the reason."""
+    found = {}
+    stalled = any(s.length_ns >= 10_000_000 for p in points for s in p.stalls)
+    for name in ("frames_lost", "stops"):
+        if metrics[name] and not metrics[f"{name}_unexplained"]:
+            found[name] = "the host withheld a processor before each of them"
+    for name in ("palms_471_frame_residual", "aoro_fc8_frame_residual", "function_residual"):
+        if metrics[name] > MAX_RESIDUAL and stalled:
+            found[name] = "the host stalled during the measurement"
+    return found
+
+
+MAX_RESIDUAL: Final = 0.1
+FAST: Final = Section(
+    "The forwarder at 1 kHz",
+    "Crane and carrier on both buses with the limits and gains of the profile, which are per second and not per tick. "
+    "The wire carries crane0 at 4 Mbit/s, because the frames of a millisecond do not fit on a CAN bus of 1 Mbit/s.",
+    (
+        Metric("forwarder1k_frames_per_s", "Frames received and sent, both buses", "1/s", "The controller's counters."),
+        Metric("forwarder1k_cpu_p50_us", "CPU time of a tick, median", "us", "The thread's own clock."),
+        Metric("forwarder1k_cpu_p99_us", "CPU time of a tick, p99", "us", "As for the median."),
+        Metric("forwarder1k_cpu_share", "CPU load of the controller", "%", "getrusage.", scale=100.0),
+        Metric("forwarder1k_ticks", "Ticks", "", "Executed."),
+        Metric("forwarder1k_missed", "Missed periods", "", "The host's stalls included."),
+        Metric("frames_lost", "Frames refused or lost, all machines and rates", "", "The controller's own counters.",
+               most=0.0),
+        Metric("frames_lost_unexplained", "Lost frames without a stall of the host", "", "By the witness.", most=0.0),
+        Metric("stops", "Stops, all machines and rates", "", "By the controller's reports.", most=0.0),
+        Metric("stops_unexplained", "Stops without a stall of the host", "", "By the witness.", most=0.0),
+    ),
+    (("rates.png", "CPU load against frames per second, and CPU time per period against the functions moved; lines: "
+      "least squares."),),
+)  # fmt: skip
+COST: Final = Section(
+    "Cost against frames and joints",
+    "Both are straight lines: a frame and a function cost the same whether there are few or many. The load against "
+    "frames is measured live at 100 to 1000 Hz, so that its slope contains the ticks that carry the frames. The cost "
+    "against functions is that of several controllers at 200 Hz on one processor.",
+    (
+        Metric("palms_471_frame_us", "Fixed crane: CPU time per frame", "us", "Slope of the line."),
+        Metric("palms_471_frame_residual", "Fixed crane: largest residual", "%", "Of the largest load.",
+               most=MAX_RESIDUAL, scale=100.0),
+        Metric("aoro_fc8_frame_us", "Forwarder: CPU time per frame", "us", "Slope of the line."),
+        Metric("aoro_fc8_frame_residual", "Forwarder: largest residual", "%", "Of the largest load.",
+               most=MAX_RESIDUAL, scale=100.0),
+        Metric("function_us", "CPU time per function and period", "us", "Slope of the line, both machines."),
+        Metric("function_residual", "Functions: largest residual", "%", "Of the largest cost.", most=MAX_RESIDUAL,
+               scale=100.0),
+    ),
+)  # fmt: skip
+CRANES: Final = Section(
+    "Cranes on one processor",
+    "Controllers with SCHED_FIFO on one processor, each at 200 Hz on recorded inputs, with the system calls of the "
+    "loop on sockets of its own; their ticks are spread over the period. A number counts as carried when at most one "
+    "period in a thousand is missed. The bound divides 95 % of a processor by the load of one live controller.",
+    (
+        Metric("palms_471_cranes", "Fixed cranes carried", "", "Measured, at most 16."),
+        Metric("palms_471_cranes_bound", "Fixed cranes by the bound", "", "From the live load at 200 Hz."),
+        Metric("aoro_fc8_cranes", "Forwarders carried", "", "Measured, at most 16."),
+        Metric("aoro_fc8_cranes_bound", "Forwarders by the bound", "", "From the live load at 200 Hz."),
+        Metric("differing_ticks", "Ticks whose outputs differ from the recording", "", "All controllers.", most=0.0),
+    ),
+)  # fmt: skip
+SECTIONS: Final = (FAST, COST, CRANES)
+METRICS: Final = tuple(m for section in SECTIONS for m in section.metrics)
+CONCLUSION: Final = (
+    "The whole forwarder runs at 1 kHz with {forwarder1k_cpu_share} of one processor and {forwarder1k_cpu_p50_us} for "
+    "a tick in the median.",
+    "At 200 Hz one processor carries {palms_471_cranes} fixed cranes or {aoro_fc8_cranes} forwarders.",
+)
+INTRODUCTION: Final = (
+    "The measured controller is the process that runs on the machine, on the testbed of the [timing "
+    "experiment](timing.md): guard, emulated machine and wire bus beside it, every control law active."
+)
+
+
+def page_of(result: Result, trials: Mapping[str, Any]) -> Page:
+    """The result page."""
+    e = result.environment
+    setting = (
+        f"Commit `{result.commit}`. Host: {e['processor']}, {e['cpus']} cores, kernel {e['kernel']}, Python "
+        f"{e['python']}, tick: {e['tick']}."
+    )
+    return Page("Rates experiment", CONCLUSION, INTRODUCTION, SECTIONS, setting)
+
+
+def draw(points: Sequence[RatePoint], cranes: Sequence[CranePoint], path: Path) -> None:
+    """Both lines."""
+    with sheet(path, 2, height=3.4) as axes:
+        for machine, colour in zip(MACHINES, (OIL, MOSS), strict=True):
+            mine = [p for p in points if p.machine == machine]
+            _line(axes[0], [p.frames_per_s for p in mine], [100 * p.cpu_share for p in mine], colour, machine)
+            kept = [c for c in cranes if c.machine == machine and c.carried]
+            axes[1].plot([c.functions for c in kept], [c.cpu_us for c in kept], "o", color=colour, label=machine)
+        kept = [c for c in cranes if c.carried]
+        _line(axes[1], [float(c.functions) for c in kept], [c.cpu_us for c in kept], STEEL, "", marker="")
+        axes[1].axhline(5000.0, color=RUST, ls="--", lw=0.8)
+        axes[0].set_xlabel("frames per second")
+        axes[0].set_ylabel("CPU load [%]")
+        axes[1].set_xlabel("functions on one processor at 200 Hz")
+        axes[1].set_ylabel("CPU time per period [us]")
+        for axis in axes:
+            axis.legend()
+
+
+def _line(axis: Any, x: Sequence[float], y: Sequence[float], colour: str, label: str, marker: str = "o") -> None:
+    if marker:
+        axis.plot(x, y, marker, color=colour, label=label)
+    slope, intercept, _ = fit(x, y)
+    if math.isfinite(slope):
+        ends = np.array([min(x), max(x)])
+        axis.plot(ends, slope * ends + intercept, color=colour, lw=1)

@@ -1,0 +1,130 @@
+"""One controller in real time on recorded inputs: ``python -m experiments.timing.replayed_crane RECORDING --cpu 1``.
+
+It shows how many controllers one processor carries, where no computer could emulate as many machines.  Every period it
+makes the system calls of the controller's loop on sockets of its own (both buses, setpoints, record), and runs the tick
+on the recorded inputs, so that every tick must come out as it was recorded.  The stand-in for the machine, which fills
+the sockets and empties them, runs on the same processor outside the measured tick: the count of controllers that fit
+is therefore a little too small, never too large.
+
+``--start-at NS`` is the first deadline (CLOCK_MONOTONIC).  At the end it prints one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import json
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+
+from runtime.compiled import activate, running
+
+activate()
+
+from can_dbc.bus.frame_socket import FrameSocket  # noqa: E402
+from can_dbc.frame import Frame, RawFrame  # noqa: E402
+from can_dbc.timing.durations import Durations  # noqa: E402
+from controller.process.realtime import prepare, sleep_until  # noqa: E402
+from controller.process.tick_recording import record, restore_inputs, transmitted  # noqa: E402
+from controller.step import Controller, step  # noqa: E402
+from controller.tick import Inputs  # noqa: E402
+from hil.replay.recording import files_of, manifest_of  # noqa: E402
+from hil.replay.replay import recorded_ticks, settings_for  # noqa: E402
+
+PRIORITY = 80
+
+
+class BusPair:
+    """A bus whose far end is in this process."""
+
+    def __init__(self) -> None:
+        near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.near, self._far = FrameSocket(near), FrameSocket(far)
+        self._frames: list[Frame] = []
+
+    def exchange(self, frames: Sequence[Frame]) -> None:
+        """Take what was sent, and offer the frames of the next tick."""
+        self._frames.clear()
+        self._far.receive(self._frames, 1024, lambda _key, _data: False)
+        self._far.send([(key, data) for _, key, data in frames])
+
+    def receive(self) -> None:
+        """Receive as the controller does; the tick then runs on the recorded stamps."""
+        self._frames.clear()
+        self.near.receive(self._frames, 1024, lambda _key, _data: False)
+
+    def send(self, frames: Sequence[RawFrame]) -> None:
+        """Send as the controller does."""
+        if frames:
+            self.near.send(frames)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.timing.replayed_crane")
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("--ticks", type=int, default=2000)
+    parser.add_argument("--cpu", type=int, required=True)
+    parser.add_argument(
+        "--start-at", type=int, default=0, metavar="NS", help="first deadline; 0: half a second from now"
+    )
+    options = parser.parse_args(arguments)
+    files = files_of(options.recording)
+    ticks = list(islice(recorded_ticks(files), options.ticks))
+    settings = settings_for(manifest_of(files), ticks[:64], None, None)
+    controller, inputs, buses = Controller(settings), Inputs(), (BusPair(), BusPair())
+    sink = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sink.bind(("127.0.0.1", 0))
+    setpoints = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    setpoints.setblocking(False)
+    address, period_ns, cpu, missed, differing = sink.getsockname(), settings.period_ns, Durations(), 0, 0
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    refusals = prepare(PRIORITY, options.cpu)
+    print("ready", flush=True)
+    deadline_ns = options.start_at or time.monotonic_ns() + 500_000_000
+    process_ns = 0
+    for tick in ticks:
+        buses[0].exchange(tick.frames_in)
+        buses[1].exchange(tick.machine_frames_in)
+        sleep_until(deadline_ns)
+        late_ns = time.monotonic_ns() - deadline_ns
+        begin_ns = time.thread_time_ns()
+        for bus in buses:
+            bus.receive()
+        with contextlib.suppress(OSError):  # nothing waits
+            setpoints.recv(2048)
+        restore_inputs(inputs, tick)
+        outputs = step(controller, inputs, tick.now_ns)
+        buses[0].send(outputs.frames)
+        buses[1].send(outputs.machine_frames)
+        setpoints.sendto(record(inputs, outputs, tick.now_ns), address)
+        spent_ns = time.thread_time_ns() - begin_ns
+        cpu.add(spent_ns)
+        process_ns += spent_ns
+        sink.recv(65_536)
+        made = transmitted(outputs)
+        differing += made != (tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report)
+        missed += late_ns >= period_ns
+        deadline_ns += period_ns * (1 + max(0, late_ns // period_ns))
+    print(
+        json.dumps(
+            {
+                "ticks": len(ticks), "missed": missed, "differing": differing, "cpu_us": process_ns / len(ticks) / 1e3,
+                "total_us": time.process_time_ns() / 1e3, "cpu_p99_us": cpu.quantile_ns(0.99) / 1e3,
+                "period_us": period_ns / 1e3, "tick": str(running()), "refused": refusals,
+            }
+        ),
+        flush=True,
+    )  # fmt: skip
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
