@@ -65,6 +65,12 @@ def between(first: Sample, last: Sample) -> HostActivity:
     return HostActivity(seconds, last.steal_ms - first.steal_ms, waited, last.load)
 
 
+def cpu_s(pid: int) -> float:
+    """Processor time of a process so far [s]; 0 once it has ended."""
+    words = _read(f"/proc/{pid}/stat").rpartition(")")[2].split()
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK") if words else 0.0
+
+
 def describe() -> dict[str, str]:
     """Kernel, preemption model, frequency governor, isolated processors and hypervisor."""
     return {

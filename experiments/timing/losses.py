@@ -22,6 +22,11 @@ LOSING_STALL_NS: Final = 25_000_000
 """No transmit queue (32 frames) overflows in a shorter one, with up to one frame per millisecond."""
 
 
+OWN_SHARE: Final = 0.85
+"""Load by real-time processes near which Linux withholds the processor from them: 50 ms of every second at 95 %
+(sched_rt_runtime_us, and the fair server of newer kernels).  Such a stall is ours and explains nothing away."""
+
+
 @dataclass(frozen=True, slots=True)
 class Stall:
     """A processor stood still for ``length_ns`` until ``end_ns`` (CLOCK_MONOTONIC)."""
@@ -29,6 +34,13 @@ class Stall:
     cpu: int
     end_ns: int
     length_ns: int
+    own_share: float = 0.0
+    """Load of the testbed's own real-time processes on that processor at the time."""
+
+    @property
+    def by_the_host(self) -> bool:
+        """Whether it was not the testbed itself that filled the processor."""
+        return self.own_share < OWN_SHARE
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,17 +79,21 @@ def losses_between(before: Facts, after: Facts) -> list[Loss]:
 
 
 def stall_before_stop(stop: Stop, stalls: Sequence[Stall]) -> Stall | None:
-    """The longest stall that can have caused a stop."""
+    """The longest stall of the host that can have caused a stop."""
     return _longest(stalls, stop.at_ns - REACH_NS, stop.at_ns + STALL_NS, STALL_NS)
 
 
 def stall_of_loss(loss: Loss, stalls: Sequence[Stall]) -> Stall | None:
-    """The longest stall that can have caused a loss."""
+    """The longest stall of the host that can have caused a loss."""
     return _longest(stalls, loss.from_ns - REACH_NS, loss.to_ns + STALL_NS, LOSING_STALL_NS)
 
 
 def _longest(stalls: Sequence[Stall], from_ns: int, to_ns: int, least_ns: int) -> Stall | None:
-    fitting = [s for s in stalls if from_ns <= s.end_ns and s.end_ns - s.length_ns <= to_ns and s.length_ns >= least_ns]
+    fitting = [
+        s
+        for s in stalls
+        if s.by_the_host and from_ns <= s.end_ns and s.end_ns - s.length_ns <= to_ns and s.length_ns >= least_ns
+    ]
     return max(fitting, key=lambda stall: stall.length_ns, default=None)
 
 

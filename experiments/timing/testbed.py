@@ -12,13 +12,15 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, Self
 
 from can_dbc.bus.factory import VCAN_NAMES
 from can_dbc.timing.page import Facts, Timing, TimingRefused, read_timing
+from experiments.timing import host_activity
 from experiments.timing.losses import Loss, Stall, Stop, losses_between
 from hil.harness.processes import ProcessGroup, free_udp_ports
 from hil.wire.bitrates import BITRATES
@@ -27,10 +29,13 @@ from machine.loading.profile_file import load_profile
 from machine.status.reasons import Reason
 
 HOST: Final = "127.0.0.1"
-PRIORITY: Final = {"wire": 60, "machine": 50, "setpoints": 30, "observer": 20, "witness": 90, "witness-controller": 79}
+PRIORITY: Final = {"wire": 60, "machine": 50, "setpoints": 30, "witness": 90, "witness-controller": 79}
+OBSERVER_NICENESS: Final = -20
 HARNESS_PRIORITY: Final = 10
 """SCHED_FIFO: emulated hardware must answer like hardware; setpoint source and observer are not measured."""
-WITNESS_US: Final = {"witness": 2000, "witness-controller": 5000}
+BUS_CORE: Final = ("wire", "machine", "setpoints", "guard", "witness")
+"""Real-time processes that share one processor; beyond 95 % of it Linux gives 50 ms of every second to others."""
+WITNESS_US: Final = {"witness": 5000, "witness-controller": 5000}
 """Periods of the witnesses; beside the controller it wakes below it and seldom, so that it does not disturb it."""
 END_ORDER: Final = ("setpoints", "controller", "guard", "observer", "machine", "wire")
 START_S: Final = 60.0
@@ -62,6 +67,24 @@ def cores() -> tuple[int, set[int]]:
     return available[-1], set(available[:-1]) or {available[-1]}
 
 
+class OwnLoad:
+    """Share of a processor that processes used: the largest of the last few seconds."""
+
+    def __init__(self) -> None:
+        self._seen: list[tuple[float, float]] = []
+
+    def update(self, pids: Sequence[int]) -> None:
+        """Read their processor times; at most twice a second."""
+        now_s = time.monotonic()
+        if not self._seen or now_s - self._seen[-1][0] >= 0.5:
+            self._seen = [*self._seen[-6:], (now_s, sum(map(host_activity.cpu_s, pids)))]
+
+    @property
+    def share(self) -> float:
+        """1.0 is a whole processor."""
+        return max(((b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(self._seen)), default=0.0)
+
+
 class TimingTestbed:
     """A running testbed.
 
@@ -81,6 +104,7 @@ class TimingTestbed:
         self.stalls: list[Stall] = []
         self._facts: Facts | None = None
         self._was = ""
+        self._load = OwnLoad()
         directory.mkdir(parents=True, exist_ok=True)
         where = MEMORY if MEMORY.is_dir() else None
         self._private = Path(tempfile.mkdtemp(prefix="timberhand-timing-", dir=where))
@@ -145,7 +169,10 @@ class TimingTestbed:
     def _start(self, name: str, module: str, *arguments: object) -> None:
         child = self.family.start(name, module, *arguments)
         self.family.await_message(name, "ready", START_S)
-        self.family.set_fifo_priority(name, PRIORITY[name])
+        if name in PRIORITY:
+            self.family.set_fifo_priority(name, PRIORITY[name])
+        else:  # it only reads what the kernel buffers for seconds
+            self.family.set_niceness(name, OBSERVER_NICENESS)
         self._elsewhere(child.process.pid)
 
     def _elsewhere(self, pid: int) -> None:
@@ -171,11 +198,13 @@ class TimingTestbed:
             CommandFailed: one of them has ended.
         """
         gone = self.family.dead()
+        self._load.update([c.process.pid for n, c in self.family.children.items() if n in BUS_CORE])
         for name, message in self.family.messages():
             self.status[name] = self.status.get(name, {}) | message
             if "stall_ns" in message:
                 cpu = min(self.others) if name == "witness" else self.cpu
-                self.stalls.append(Stall(cpu, message["end_ns"], message["stall_ns"]))
+                own = self._load.share if name == "witness" else 0.0
+                self.stalls.append(Stall(cpu, message["end_ns"], message["stall_ns"], own))
             if name == "setpoints" and message.get("event") == "mode":
                 self.modes.append(f"{message['mode']}: {message['why']}")
                 if message["mode"] in ("STOP", "FAULT"):
