@@ -1,6 +1,5 @@
-"""The loop: deadlines, skipped periods, datagrams, records, shutdown; with a bus in memory and a scripted clock."""
+"""The loop: deadlines, skipped periods, datagrams, records, warm-up; with a bus in memory and a scripted clock."""
 
-import json
 import socket
 
 import pytest
@@ -12,20 +11,17 @@ from can_dbc.frame import Frame
 from can_dbc.messages import tick_record
 from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
-from can_dbc.messages.udp_address import address_argument
 from can_dbc.messages.vehicle import Driving
 from can_dbc.protocols.canopen import SYNC_ID
 from can_dbc.timing.page import TimingWriter, read_timing
 from controller.carrier.vehicle import Vehicle
-from controller.config import ConfigError, load
-from controller.process.command import bus_address, listen, main, parser
+from controller.config import load
 from controller.process.loop import Loop
 from controller.process.realtime import make_sleep, sleep_until
 from controller.process.timing import LoopTiming
 from controller.process.warm_up import NullBus, warm_up
 from controller.step import Controller
 from machine.status.reasons import Reason
-from tests.codes import coded
 from tests.controller.bench import DATABASE, MS, SETTINGS, Bench, T
 
 LEAD = SETTINGS.sync_lead_ns
@@ -306,81 +302,6 @@ def test_warm_up_runs_every_code_path(profile, monkeypatch):
     assert controller.gate.refused > 100, "invalid datagrams were refused"
     assert len(worked) > 100 and (not controller.vehicle or driven == {Driving.DRIVING, Driving.BRAKING})
     assert not controller.vehicle or controller.vehicle.gate.sequence, "a drive setpoint was accepted"
-
-
-def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):
-    assert main(["--profile", "nowhere", "--setpoint-port", "0", "--bus", "crane0=wire:none"]) == 3
-    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--bus", "crane0=wire:none"]) == 4
-    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--rate", "7"]) == 3
-    key = tmp_path / "key"
-    key.write_bytes(b"short")
-    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--key-file", str(key)]) == 3
-    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--key-file", str(key) + "x"]) == 3
-    for arguments in (["--bus", "x=wire:x"], ["--report", "nowhere"], ["--guard-not-needed"]):
-        with pytest.raises(SystemExit) as stopped:
-            main(["--profile", "palms_471", "--setpoint-port", "0", *arguments])
-        assert stopped.value.code == 2
-    palms = ["--profile", "palms_471", "--setpoint-port", "0", "--bus", "crane0=virtual:start"]
-    assert main([*palms, "--bus", "mach0=virtual:x"]) == 3
-    assert main([*palms, "--sync-lead-us", "5000"]) == 3
-    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("controller: ")]
-    assert len(errors) == 7
-
-
-def test_busy_port_is_one_sentence_and_exit_4(capsys, udp):
-    port = udp[0].getsockname()[1]
-    arguments = ["--profile", "palms_471", "--setpoint-port", str(port), "--bus", "crane0=virtual:busy"]
-    assert main(arguments) == 4
-    assert f"UDP port {port} cannot be used" in capsys.readouterr().err
-
-
-def test_setpoint_socket_is_on_loopback_only():
-    with listen(0) as made:
-        assert made.getsockname()[0] == "127.0.0.1"
-
-
-def test_addresses_and_settings():
-    assert address_argument("127.0.0.1:5006") == ("127.0.0.1", 5006)
-    assert bus_address("mach0=wire:mach0") == ("mach0", "wire:mach0")
-    assert parser().parse_args(["--profile", "x", "--setpoint-port", "1"]).report == []
-    assert load("palms_471", 100).period_ns == 10 * MS
-    with pytest.raises(ConfigError, check=coded("config.rate")):
-        load("palms_471", 2000)
-
-
-@pytest.mark.slow  # a worker of a parallel run died of its signal once: it runs in the pass that is one process
-def test_main_runs_and_ends_by_signal(capsys, monkeypatch):
-    """A short run on an in-memory bus, with SIGTERM after some ticks."""
-    import signal
-
-    from controller.process import loop as loop_module
-
-    ticks = []
-    original = loop_module.Loop.tick
-
-    def tick(self, now_ns, late_ns):
-        if isinstance(self.buses[0], NullBus):
-            return original(self, now_ns, late_ns)
-        ticks.append(now_ns)
-        if len(ticks) == 5:
-            signal.raise_signal(signal.SIGTERM)
-        return original(self, now_ns, late_ns)
-
-    handlers = {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGINT)}
-    monkeypatch.setattr(loop_module.Loop, "tick", tick)
-    arguments = ["--profile", "palms_471", "--setpoint-port", "0", "--bus", "crane0=virtual:life", "--no-realtime"]
-    try:
-        assert main(arguments) == 0
-    finally:
-        import gc
-
-        gc.unfreeze()
-        gc.enable()
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    captured = capsys.readouterr()
-    assert json.loads(captured.out)["ticks"] == 5
-    assert "palms_471 at 200 Hz on crane0=virtual:life" in captured.err
 
 
 @pytest.mark.parametrize("profile", ["palms_471", "aoro_fc8"])

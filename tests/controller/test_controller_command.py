@@ -1,0 +1,100 @@
+"""The controller's command: start errors with their exit codes, addresses, and one run from start to signal."""
+
+import json
+import socket
+
+import pytest
+
+from can_dbc.messages.udp_address import address_argument
+from controller.config import ConfigError, load
+from controller.process.command import bus_address, listen, main, parser
+from controller.process.warm_up import NullBus
+from tests.codes import coded
+from tests.controller.bench import MS
+
+
+@pytest.fixture
+def udp():
+    made = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3)]
+    for s in made:
+        s.bind(("127.0.0.1", 0))
+        s.settimeout(2)
+    made[0].setblocking(False)
+    yield made
+    for s in made:
+        s.close()
+
+
+def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):
+    assert main(["--profile", "nowhere", "--setpoint-port", "0", "--bus", "crane0=wire:none"]) == 3
+    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--bus", "crane0=wire:none"]) == 4
+    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--rate", "7"]) == 3
+    key = tmp_path / "key"
+    key.write_bytes(b"short")
+    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--key-file", str(key)]) == 3
+    assert main(["--profile", "palms_471", "--setpoint-port", "0", "--key-file", str(key) + "x"]) == 3
+    for arguments in (["--bus", "x=wire:x"], ["--report", "nowhere"], ["--guard-not-needed"]):
+        with pytest.raises(SystemExit) as stopped:
+            main(["--profile", "palms_471", "--setpoint-port", "0", *arguments])
+        assert stopped.value.code == 2
+    palms = ["--profile", "palms_471", "--setpoint-port", "0", "--bus", "crane0=virtual:start"]
+    assert main([*palms, "--bus", "mach0=virtual:x"]) == 3
+    assert main([*palms, "--sync-lead-us", "5000"]) == 3
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("controller: ")]
+    assert len(errors) == 7
+
+
+def test_busy_port_is_one_sentence_and_exit_4(capsys, udp):
+    port = udp[0].getsockname()[1]
+    arguments = ["--profile", "palms_471", "--setpoint-port", str(port), "--bus", "crane0=virtual:busy"]
+    assert main(arguments) == 4
+    assert f"UDP port {port} cannot be used" in capsys.readouterr().err
+
+
+def test_setpoint_socket_is_on_loopback_only():
+    with listen(0) as made:
+        assert made.getsockname()[0] == "127.0.0.1"
+
+
+def test_addresses_and_settings():
+    assert address_argument("127.0.0.1:5006") == ("127.0.0.1", 5006)
+    assert bus_address("mach0=wire:mach0") == ("mach0", "wire:mach0")
+    assert parser().parse_args(["--profile", "x", "--setpoint-port", "1"]).report == []
+    assert load("palms_471", 100).period_ns == 10 * MS
+    with pytest.raises(ConfigError, check=coded("config.rate")):
+        load("palms_471", 2000)
+
+
+@pytest.mark.slow  # a worker of a parallel run died of its signal once: it runs in the pass that is one process
+def test_main_runs_and_ends_by_signal(capsys, monkeypatch):
+    """A short run on an in-memory bus, with SIGTERM after some ticks."""
+    import signal
+
+    from controller.process import loop as loop_module
+
+    ticks = []
+    original = loop_module.Loop.tick
+
+    def tick(self, now_ns, late_ns):
+        if isinstance(self.buses[0], NullBus):
+            return original(self, now_ns, late_ns)
+        ticks.append(now_ns)
+        if len(ticks) == 5:
+            signal.raise_signal(signal.SIGTERM)
+        return original(self, now_ns, late_ns)
+
+    handlers = {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGINT)}
+    monkeypatch.setattr(loop_module.Loop, "tick", tick)
+    arguments = ["--profile", "palms_471", "--setpoint-port", "0", "--bus", "crane0=virtual:life", "--no-realtime"]
+    try:
+        assert main(arguments) == 0
+    finally:
+        import gc
+
+        gc.unfreeze()
+        gc.enable()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["ticks"] == 5
+    assert "palms_471 at 200 Hz on crane0=virtual:life" in captured.err
