@@ -7,9 +7,10 @@ set -eu
 
 # user-mode-linux, gcc, libc6-dev: the vcan lab where the kernel has no CAN; can-utils, iproute2: looking at
 # buses; rt-tests: cyclictest, to which the timing figures are compared; systemd, udev, python3-venv: the service lab;
-# mbpoll, libmodbus5: Modbus clients that are not ours; chromium: looking at the console's page.
+# qemu-system-x86, cpio: the real-time lab; mbpoll, libmodbus5: Modbus clients that are not ours; chromium: looking at
+# the console's page.
 # For the scripts: shellcheck.
-wanted=${*:-user-mode-linux gcc libc6-dev can-utils iproute2 rt-tests stress-ng strace systemd udev python3-venv mbpoll libmodbus5 chromium shellcheck}
+wanted=${*:-user-mode-linux gcc libc6-dev can-utils iproute2 rt-tests stress-ng strace systemd udev python3-venv qemu-system-x86 cpio mbpoll libmodbus5 chromium shellcheck}
 
 if ! command -v apt-get >/dev/null; then
     echo "packages: no apt-get here; these Debian packages are used if present: $wanted" >&2

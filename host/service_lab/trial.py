@@ -122,9 +122,9 @@ def run_trial(ending: Ending, pilot: Pilot) -> dict[str, Any]:
         "moving_until_then": not stop or pilot.mode_when_disarmed is Mode.ACTIVE,
         "opening_pct": opening_pct,
         "ended_ms": (gone_ns - began_ns) * 1e-6 if gone else None,
-        "neutral_ms": _after(pilot, began_ns, lambda v: v.state in MOVING),
-        "no_flow_ms": _after(pilot, began_ns, lambda v: v.opening_pct > pilot.deadband_pct),
-        "shut_ms": _after(pilot, began_ns, lambda v: v.opening_pct > SHUT_PCT),
+        "neutral_ms": time_after(pilot, began_ns, lambda v: v.state in MOVING),
+        "no_flow_ms": time_after(pilot, began_ns, lambda v: v.opening_pct > pilot.deadband_pct),
+        "shut_ms": time_after(pilot, began_ns, lambda v: v.opening_pct > SHUT_PCT),
         "stood_still_ms": pilot.stood_still_ms(began_ns - 10_000_000, began_ns + 200_000_000),
         "feedback": [
             (round((v.stamp_ns - began_ns) * 1e-6, 1), v.state, round(v.opening_pct, 1))
@@ -168,7 +168,7 @@ def was_disturbed(figures: dict[str, Any]) -> bool:
     return bool(figures["stood_still_ms"] > STILL_MS)
 
 
-def _after(pilot: Pilot, began_ns: int, moving: Callable[[Valve], bool]) -> float:
+def time_after(pilot: Pilot, began_ns: int, moving: Callable[[Valve], bool]) -> float:
     """Time from ``began_ns`` to the first feedback after the last motion [ms]."""
     last_ns = max((v.stamp_ns for v in pilot.valves if moving(v)), default=began_ns)
     return next((max(v.stamp_ns - began_ns, 0) * 1e-6 for v in pilot.valves if v.stamp_ns > last_ns), float("inf"))
