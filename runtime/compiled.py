@@ -141,13 +141,19 @@ def activate(root: Path | None = None, folder: Path | None = None) -> Running:
     return _running
 
 
+def stay_interpreted(root: Path | None = None) -> None:
+    """Serve sources from now on, also in a wheel with extension modules beside them; call it before other imports."""
+    root = root or source_root()
+    if beside := _beside(root):
+        sources = {name: root.joinpath(*name.split(".")).with_suffix(".py") for name in beside}
+        sys.meta_path.insert(0, _Finder(sources))
+
+
 def _activated(root: Path, folder: Path | None) -> Running:
-    beside = _beside(root)
     if os.environ.get(SWITCH) == "0":
-        if beside:
-            sources = {name: root.joinpath(*name.split(".")).with_suffix(".py") for name in beside}
-            sys.meta_path.insert(0, _Finder(sources))
+        stay_interpreted(root)
         return Running("interpreter", reason=f"{SWITCH}=0")
+    beside = _beside(root)
     if beside:
         return Running("compiled", "installed")
     build, reason = find_build(root, folder)

@@ -12,7 +12,6 @@ import errno
 import os
 import socket
 import struct
-from collections.abc import Iterator
 from typing import Final
 
 _SO_RCVBUFFORCE: Final = 33
@@ -62,10 +61,11 @@ class Batch(_Buffers):
 
     def receive(self, descriptor: int) -> int:
         """Receives at most ``count`` waiting datagrams without blocking; 0 if none waits.  Raises OSError otherwise."""
-        if self._used:  # the kernel overwrites the offered sizes with the received ones
-            self._headers[: self._used * _HEADER.size] = self._fresh[: self._used * _HEADER.size]
-            self.control[: self._used * self.ancillary] = self._zeros[: self._used * self.ancillary]
-            self._used = 0
+        used = self._used
+        if used and self.ancillary:  # the kernel overwrites the offered sizes of control data with the received ones
+            self._headers[: used * _HEADER.size] = self._fresh[: used * _HEADER.size]
+            self.control[: used * self.ancillary] = self._zeros[: used * self.ancillary]
+        self._used = 0
         received: int = _recvmmsg(descriptor, self._address, self.count, socket.MSG_DONTWAIT, None)
         if received >= 0:
             self._used = received
@@ -75,9 +75,14 @@ class Batch(_Buffers):
             return 0
         raise OSError(code, os.strerror(code))
 
-    def lengths(self) -> Iterator[int]:
+    def length(self, i: int) -> int:
+        """Size in bytes of datagram i of the last `receive`."""
+        found: int = _LENGTH.unpack_from(self._headers, i * _HEADER.size)[0]
+        return found
+
+    def lengths(self) -> list[int]:
         """Size in bytes of each datagram of the last `receive`."""
-        return (length for (length,) in _LENGTH.iter_unpack(self._headers[: self._used * _HEADER.size]))
+        return [self.length(i) for i in range(self._used)]
 
 
 class Outbox(_Buffers):

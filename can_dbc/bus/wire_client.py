@@ -14,7 +14,6 @@ import json
 import os
 import select
 import socket
-import struct
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -24,16 +23,10 @@ from typing import Any, Final
 from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusError, BusState
 from can_dbc.bus.batch import Batch
 from can_dbc.bus.filters import Filter
-from can_dbc.frame import ERROR, Frame
+from can_dbc.bus.wire_records import RECORD, RECORD_BYTES, pack, unpack
+from can_dbc.frame import Frame
 
-RECORD: Final = struct.Struct("=IB3x8sQHHI")
-"""key, length, data: struct can_frame; end-of-frame time [ns, CLOCK_MONOTONIC]; flags; done; dropped."""
-_RECEIVED: Final = struct.Struct("=IB3x8sQH6x")
-"""A record without the counters; those of the last record of a packet are enough."""
-_COUNTERS: Final = struct.Struct("=26xHI")
 CONTROL: Final = 1
-STATUS: Final = 2
-"""Flag of a record without a frame: counters only."""
 DISCARD: Final = 4
 MAX_BATCH_RECORDS: Final = 64
 """Most records in one packet."""
@@ -100,15 +93,12 @@ class WireClient(BaseBus):
                 self._read(self._backlog, 0)
                 self._bound_backlog()
             room = self._tx_queue - self.pending if stats.state < BusState.OFF else 0
-            records = []
-            for key, data in frames[sent : sent + min(room, MAX_BATCH_RECORDS)]:
-                if len(data) > 8:
-                    break
-                records.append(RECORD.pack(key, len(data), data, 0, 0, 0, 0))
-            if not records or not self._post(b"".join(records)):
+            packet = pack(frames, sent, max(0, min(room, MAX_BATCH_RECORDS)))
+            if not packet or not self._post(packet):
                 break
-            self._accepted += len(records)
-            sent += len(records)
+            count = len(packet) // RECORD_BYTES
+            self._accepted += count
+            sent += count
         stats.sent += sent
         stats.refused += len(frames) - sent
         return sent
@@ -137,32 +127,21 @@ class WireClient(BaseBus):
     def _read(self, frames: list[Frame], first: int) -> None:
         """Appends the frames waiting in the socket; at a recovery removes all from `first` on."""
         stats, batch = self.stats, self._batch
-        new, append = tuple.__new__, frames.append
         for _ in range(DRAIN_LIMIT // batch.count):
             try:
                 waiting = batch.receive(self._sock.fileno())
             except OSError:
                 stats.enter(BusState.DOWN)
                 return
-            at = 0
-            for size in batch.lengths():
-                if not size:  # the daemon has ended
-                    stats.enter(BusState.DOWN)
-                    return
-                for key, length, data, stamp_ns, flags in _RECEIVED.iter_unpack(batch.data[at : at + size]):
-                    if flags & STATUS:
-                        continue
-                    if key & ERROR:
-                        recovered = stats.note_error(key, data)
-                        if not self._error_frames:
-                            if recovered:
-                                del frames[first:]
-                            continue
-                    append(new(Frame, (stamp_ns, key, data if length == 8 else data[:length])))
-                self._done, dropped = _COUNTERS.unpack_from(batch.data, at + size - RECORD.size)
-                stats.dropped += (dropped - self._dropped) & 0xFFFF_FFFF
-                self._dropped = dropped
-                at += batch.size
+            if not waiting:
+                return
+            counters = unpack(batch, waiting, frames, first, stats, self._error_frames)
+            if counters is None:
+                stats.enter(BusState.DOWN)
+                return
+            self._done, dropped = counters
+            stats.dropped += (dropped - self._dropped) & 0xFFFF_FFFF
+            self._dropped = dropped
             if waiting < batch.count or len(frames) - first >= DRAIN_LIMIT:
                 return
 

@@ -6,6 +6,11 @@ configuration, 4 no bus at the start, 130 SIGINT.
 
 from __future__ import annotations
 
+from runtime.compiled import stay_interpreted
+
+if __name__ == "__main__":  # before the buses are imported: no fault of the compiler may be in guard and controller
+    stay_interpreted()
+
 import argparse
 import signal
 import sys

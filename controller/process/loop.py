@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from can_dbc.bus.base import Bus
+from can_dbc.bus.batch import Batch
 from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, sleep_until
 from controller.process.tick_recording import record
@@ -63,6 +64,7 @@ class Loop:
         self._period_ns, self._sync_lead_ns = period_ns, sync_lead_ns
         self._clock_ns, self._sleep = clock_ns, sleep
         self._inputs = Inputs()
+        self._waiting = Batch(DATAGRAM_BYTES, count=MAX_DATAGRAMS)
         self._notifier = Notifier(self.status_text, notify)
         self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sender.setblocking(False)
@@ -147,11 +149,14 @@ class Loop:
 
     def _receive_datagrams(self, datagrams: list[bytes]) -> None:
         datagrams.clear()
-        for _ in range(MAX_DATAGRAMS):
-            try:
-                datagrams.append(self.setpoints.recv(DATAGRAM_BYTES))
-            except OSError:  # nothing waits, or an earlier report met a closed port
-                return
+        batch = self._waiting
+        try:
+            count = batch.receive(self.setpoints.fileno())
+        except OSError:
+            return
+        for i in range(count):
+            at = i * DATAGRAM_BYTES
+            datagrams.append(batch.data[at : at + batch.length(i)].tobytes())
 
     def _report_and_record(self, inputs: Inputs, outputs: Outputs, now_ns: int) -> None:
         """Send reports and the tick's record, and publish the timing page once a second."""

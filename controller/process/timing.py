@@ -30,9 +30,9 @@ class LoopTiming:
     """Stopwatch of the loop.  In a tick call `begin`, `lap` after each stage, `command_sent`, `end`."""
 
     __slots__ = (
-        "_ages", "_at", "_begin_ns", "_clock_ns", "_cpu_begin_ns", "_cpu_ns", "_encoders", "_inputs", "_laps",
-        "_last_ns", "_previous_sync_ns", "_sync_ns", "_tick", "_writer", "cpu", "durations", "publish_ns",
-        "sample_to_command", "started_ns", "sync", "tick", "wake",
+        "_at", "_begin_ns", "_clock_ns", "_cpu_begin_ns", "_cpu_ns", "_encoders", "_inputs", "_laps", "_last_ns",
+        "_longest_ns", "_newest_ns", "_previous_sync_ns", "_process", "_states", "_sync_ns", "_tick", "_ticks",
+        "_uses", "_writer", "cpu", "durations", "publish_ns", "sample_to_command", "started_ns", "sync", "tick", "wake",
     )  # fmt: skip
 
     def __init__(
@@ -48,12 +48,15 @@ class LoopTiming:
         )
         self._laps = [self.durations[name] for name in _LAPS]
         self._inputs = controller.inputs_in_use
-        self._ages = [InputAge() for _ in self._inputs]
+        self._states: list[MessageState] = [state for _, state in self._inputs]
+        # Ages of the inputs by place: numbers in lists, because an attribute of `InputAge` is found by its name.
+        self._newest_ns, self._longest_ns, self._uses = ([0] * len(self._states) for _ in range(3))
         self._encoders: tuple[MessageState, ...] = tuple(
             state for state in controller.crane_inputs.encoders if state is not None
         )
         self._writer = writer
-        self._tick = str(running())
+        self._process = ProcessReader()
+        self._tick, self._ticks = str(running()), 0
         self._clock_ns, self._cpu_ns = clock_ns, cpu_ns
         self.started_ns = clock_ns()
         self.publish_ns = self._at = self._begin_ns = self._last_ns = self._cpu_begin_ns = 0
@@ -96,14 +99,15 @@ class LoopTiming:
 
     def end(self) -> int:
         """A tick ends; returns its duration."""
-        begin_ns, ages = self._begin_ns, self._ages
-        for i, (_, state) in enumerate(self._inputs):
+        begin_ns, newest_ns, longest_ns, uses = self._begin_ns, self._newest_ns, self._longest_ns, self._uses
+        for i, state in enumerate(self._states):
             if state.fresh:
-                age, age_ns = ages[i], begin_ns - state.stamp_ns
-                age.newest_ns = age_ns
-                age.count += 1
-                if age_ns > age.longest_ns:
-                    age.longest_ns = age_ns
+                age_ns = begin_ns - state.stamp_ns
+                newest_ns[i] = age_ns
+                uses[i] += 1
+                if age_ns > longest_ns[i]:
+                    longest_ns[i] = age_ns
+        self._ticks += 1
         self.lap()
         duration_ns = self._last_ns - begin_ns
         self.tick.add(duration_ns)
@@ -122,14 +126,17 @@ class LoopTiming:
             started_ns=self.started_ns,
             written_ns=now_ns,
             period_ns=period_ns,
-            ticks=self.tick.count,
+            ticks=self._ticks,
             missed=missed,
             late=late,
             mode=mode,
             words=status,
             buses=tuple([_bus_counters(bus) for bus in buses]),
-            process=_process_counters(),
-            inputs={name: age for (name, _), age in zip(self._inputs, self._ages, strict=True)},
+            process=self._process.read(),
+            inputs={
+                name: InputAge(self._newest_ns[i], self._longest_ns[i], self._uses[i])
+                for i, (name, _) in enumerate(self._inputs)
+            },
             longest_ns=tuple([self.durations[name].longest_ns for name in STAGES]),
             total_ns=tuple([self.durations[name].total_ns for name in STAGES]),
             tick=self._tick,
@@ -138,6 +145,7 @@ class LoopTiming:
 
     def close(self) -> None:
         """Remove the page."""
+        self._process.close()
         if self._writer is not None:
             self._writer.close()
 
@@ -150,17 +158,31 @@ def _bus_counters(bus: Bus) -> BusCounters:
     )  # fmt: skip
 
 
-def _process_counters() -> ProcessCounters:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    with open("/proc/self/statm", "rb") as statm:
-        resident_pages = int(statm.read().split()[1])
-    return ProcessCounters(
-        cpu_ns=round((used.ru_utime + used.ru_stime) * 1e9),
-        minor_faults=used.ru_minflt,
-        major_faults=used.ru_majflt,
-        voluntary_switches=used.ru_nvcsw,
-        involuntary_switches=used.ru_nivcsw,
-        gc_runs=sum(generation["collections"] for generation in gc.get_stats()),
-        allocated_blocks=sys.getallocatedblocks(),
-        resident_kb=resident_pages * _PAGE_KB,
-    )
+class ProcessReader:
+    """Reads the system's counters of this process, with two system calls."""
+
+    __slots__ = ("_statm",)
+
+    def __init__(self) -> None:
+        self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
+
+    def read(self) -> ProcessCounters:
+        """The counters now."""
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        resident_pages = int(os.pread(self._statm, 128, 0).split()[1])
+        return ProcessCounters(
+            cpu_ns=round((used.ru_utime + used.ru_stime) * 1e9),
+            minor_faults=used.ru_minflt,
+            major_faults=used.ru_majflt,
+            voluntary_switches=used.ru_nvcsw,
+            involuntary_switches=used.ru_nivcsw,
+            gc_runs=sum([generation["collections"] for generation in gc.get_stats()]),
+            allocated_blocks=sys.getallocatedblocks(),
+            resident_kb=resident_pages * _PAGE_KB,
+        )
+
+    def close(self) -> None:
+        """Close the descriptor; may be called twice."""
+        if self._statm >= 0:
+            os.close(self._statm)
+            self._statm = -1

@@ -18,7 +18,8 @@ from typing import Any, Final
 
 from can_dbc.bus.base import BusError, BusState
 from can_dbc.bus.socketcan import SocketCanBus
-from can_dbc.bus.wire_client import CONTROL, DISCARD, MAX_BATCH_RECORDS, MAX_CONTROL_BYTES, RECORD, STATUS
+from can_dbc.bus.wire_client import CONTROL, DISCARD, MAX_BATCH_RECORDS, MAX_CONTROL_BYTES
+from can_dbc.bus.wire_records import RECORD, STATUS
 from can_dbc.frame import Frame
 from hil.wire.core import WireCore
 from hil.wire.faults import Fault

@@ -1,9 +1,9 @@
 """The modules that are compiled ahead of time: what runs in every tick of the controller.
 
 The one list, for `timberhand compile` and for a compiled wheel (setup.py).  A module belongs here when it runs in the
-tick, names no ``__file__``, and has no class that interpreted code subclasses.  Left out: modules on ctypes and msgspec
-(buses, timing page, profile), which mypyc does not make faster, and the guard, which stays on the interpreter so that
-no fault of the compiler is in both.  Standard library only.
+tick, names no ``__file__``, and has no class that interpreted code subclasses.  Left out: modules on msgspec (timing
+page, profile) and the classes of the buses, which mypyc does not make faster, and the guard, which stays on the
+interpreter so that no fault of the compiler is in both (`runtime.compiled.stay_interpreted`).  Standard library only.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ CODECS_MODULE: Final = "can_dbc.dbc.compiled_codecs"
 """Generated for a build from the shipped databases (`can_dbc.dbc.ahead_of_time`); not in the sources."""
 GENERATOR: Final = "can_dbc.dbc.ahead_of_time"
 MODULES: Final = (
+    "can_dbc.bus.batch",
+    "can_dbc.bus.reconnector",
+    "can_dbc.bus.wire_records",
     "can_dbc.messages.crane",
     "can_dbc.messages.datagrams",
     "can_dbc.messages.envelope",
@@ -58,6 +61,7 @@ MODULES: Final = (
     "controller.laws.sway",
     "controller.laws.time_scaling",
     "controller.laws.valve_map",
+    "controller.process.bus_link",
     "controller.process.loop",
     "controller.process.tick_recording",
     "controller.process.timing",

@@ -1,5 +1,6 @@
 """The loop: deadlines, skipped periods, datagrams, records, warm-up; with a bus in memory and a scripted clock."""
 
+import os
 import socket
 
 import pytest
@@ -16,9 +17,9 @@ from can_dbc.protocols.canopen import SYNC_ID
 from can_dbc.timing.page import TimingWriter, read_timing
 from controller.carrier.vehicle import Vehicle
 from controller.config import load
-from controller.process.loop import Loop
+from controller.process.loop import DATAGRAM_BYTES, MAX_DATAGRAMS, Loop
 from controller.process.realtime import make_sleep, sleep_until
-from controller.process.timing import LoopTiming
+from controller.process.timing import LoopTiming, ProcessReader
 from controller.process.warm_up import NullBus, warm_up
 from controller.step import Controller
 from machine.status.reasons import Reason
@@ -165,6 +166,31 @@ def test_records_hold_frames_datagrams_outputs_and_reports(udp):
     report = decode(udp[1].recv(2048))
     assert isinstance(report, StateReport) and report.refused == 1
     assert report.refusal == Reason.DATAGRAM_LENGTH
+
+
+def test_a_flood_of_datagrams_is_taken_in_order_sixteen_in_a_tick(udp):
+    loop = build(udp, Clock())
+    sent = [b"%d" % i for i in range(20)] + [b"x" * (DATAGRAM_BYTES + 9)]
+    for data in sent:
+        udp[1].sendto(data, udp[0].getsockname())
+    taken = []
+    for i, wanted in enumerate((MAX_DATAGRAMS, 5, 0)):
+        loop.tick(10**9 + i * T, 0)
+        taken.append(tick_record.decode(udp[2].recv(65535)).datagrams)
+        assert len(taken[-1]) == wanted
+    assert [*taken[0], *taken[1]] == [*sent[:-1], b"x" * DATAGRAM_BYTES], "what is longer is cut and refused by its CRC"
+
+
+def test_process_counters_follow_the_process_on_one_descriptor():
+    open_before = set(os.listdir("/proc/self/fd"))
+    reader = ProcessReader()
+    first = reader.read()
+    kept = [bytearray(1 << 20) for _ in range(8)]
+    second = reader.read()
+    assert second.resident_kb >= first.resident_kb + 4096 and second.minor_faults > first.minor_faults
+    reader.close()
+    reader.close()
+    assert len(kept) == 8 and set(os.listdir("/proc/self/fd")) == open_before
 
 
 @pytest.mark.parametrize("how", ["stop", "exception"])

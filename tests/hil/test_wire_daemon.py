@@ -18,7 +18,8 @@ import pytest
 
 from can_dbc.bus.base import BusError, BusState
 from can_dbc.bus.factory import kernel_has_can, open_bus
-from can_dbc.bus.wire_client import CONTROL, RECORD, control, wire_directory
+from can_dbc.bus.wire_client import CONTROL, control, wire_directory
+from can_dbc.bus.wire_records import RECORD
 from can_dbc.frame import ERROR, EXTENDED, Frame
 from hil.wire.faults import Fault, Kind
 from hil.wire.launch import wire_daemon

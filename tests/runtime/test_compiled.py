@@ -91,6 +91,17 @@ def test_the_switch_keeps_the_interpreter(root: Path, tmp_path: Path, monkeypatc
     assert compiled.activate(root, tmp_path / "builds").kind == "interpreter"
 
 
+def test_the_guard_reads_sources_where_extension_modules_lie_beside_them(root: Path) -> None:
+    suffix = compiled.EXTENSION_SUFFIXES[0]
+    (root / "controller").mkdir()
+    for name in ("controller/step", "runtime/served_module"):
+        (root / f"{name}{suffix}").write_bytes(b"not an extension module")
+    compiled.stay_interpreted(root)
+    assert importlib.import_module("runtime.served_module").ORIGIN == "interpreter"
+    text = (compiled.source_root() / "controller" / "guard" / "__main__.py").read_text()
+    assert text.index("    stay_interpreted()") < text.index("from can_dbc"), "before the buses are imported"
+
+
 def test_a_module_that_was_imported_before_refuses_the_build(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
