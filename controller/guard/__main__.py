@@ -65,15 +65,13 @@ def run(guard: Guard, bus: Bus, ended: list[int], notifier: Notifier) -> None:
 
 
 def _status_text(guard: Guard, bus: Bus) -> str:
-    enabled = "enabled" if guard.enabled else "not enabled"
-    return f"Valves {enabled}: {guard.verdict.name}. The bus is {bus.stats.state.name}."
+    return f"Valves {'' if guard.enabled else 'not '}enabled: {guard.verdict.name}. The bus is {bus.stats.state.name}."
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the guard; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m controller.guard",
-        description="Checks the traffic on the crane bus and enables the valves.",
+        prog="python -m controller.guard", description="Checks the traffic on the crane bus and enables the valves."
     )
     parser.add_argument("--profile", required=True, help="shipped profile name or TOML file")
     parser.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="address of the crane bus")
@@ -90,16 +88,12 @@ def main(arguments: list[str] | None = None) -> int:
         guard = build(profile_path(options.profile))
         with open_bus(address or default_address("crane0"), filters=guard.keys) as bus:
             if not options.no_realtime:
-                for refusal in prepare(PRIORITY):
-                    sys.stderr.write(f"guard: not granted: {refusal}\n")
+                sys.stderr.writelines(f"guard: not granted: {refusal}\n" for refusal in prepare(PRIORITY))
             stop_garbage_collection()
             run(guard, bus, ended, Notifier(lambda: _status_text(guard, bus)))
-    except GuardConfigError as error:
+    except (GuardConfigError, BusError) as error:
         sys.stderr.write(f"guard: {error}\n")
-        return 3
-    except BusError as error:
-        sys.stderr.write(f"guard: {error}\n")
-        return 4
+        return 3 if isinstance(error, GuardConfigError) else 4
     return 130 if signal.SIGINT in ended else 0
 
 
