@@ -12,7 +12,6 @@ sends neutral commands and a last status.
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import time
 from collections.abc import Callable, Sequence
@@ -179,6 +178,7 @@ class Loop:
             )
 
     def _send(self, data: bytes, address: Address) -> bool:
-        with contextlib.suppress(OSError):
+        try:
             return self._sender.sendto(data, address) == len(data)
-        return False
+        except OSError:
+            return False
