@@ -2,7 +2,7 @@
 
 A loss is the growth of a counter of the controller between two of its timing pages; a stop is a change of mode to STOP
 or FAULT.  Both are explained by a stall that a witness saw (`experiments.timing.stall_witness`) shortly before: within
-the slowest detection of a fault, 250 ms for a heartbeat, and for a loss within the second between two pages.
+the slowest detection of a fault, and for a loss within the second between two pages.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from machine.status.reasons import Reason
 
 STALL_NS: Final = 10_000_000
 """A stall of two periods at 200 Hz is long enough to lose a tick, and with it to stop a machine."""
-REACH_NS: Final = 300_000_000
-"""The slowest detection of a fault, with the period of the reports."""
+REACH_NS: Final = 450_000_000
+"""The slowest detection of a fault (a lease of 350 ms), with the period of setpoints and reports."""
 LOSING_STALL_NS: Final = 25_000_000
 """No transmit queue (32 frames) overflows in a shorter one, with up to one frame per millisecond."""
 

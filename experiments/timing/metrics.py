@@ -141,7 +141,7 @@ LOADED: Final = Section(
                "200 Hz and 1 kHz, quiet and loaded; the supervisor stops a machine whose inputs or loop are late.",
                most=0.0),
         Metric("stops_unexplained", "Stops without a stall of the host", "",
-               "No witness saw a stall of 10 ms or more in the 0.3 s before.", most=0.0),
+               "No witness saw a stall of 10 ms or more in the 0.45 s before.", most=0.0),
     ),
 )  # fmt: skip
 LATENCY: Final = Section(
