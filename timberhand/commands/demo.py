@@ -19,7 +19,7 @@ from timberhand.commands.options import (
     SummaryOption,
     TruthOption,
 )
-from timberhand.commands.runs import Backend, BusOption, enter_lab, new_directory
+from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
 
 
 class PlcRole(StrEnum):
@@ -42,6 +42,7 @@ def demo(
     ] = False,
     seed: Annotated[int, typer.Option(help="Chooses the log and its pose.")] = 1,
     bus: BusOption = Backend.AUTO,
+    clock: ClockOption = ClockChoice.AUTO,
     profile: ProfileOption = "palms_471",
     truth: TruthOption = "nominal",
     out: Annotated[
@@ -84,7 +85,7 @@ def demo(
     from machine.loading.profile_file import ProfileError, load_profile
 
     if not lockstep:
-        enter_lab(bus)
+        enter_lab(bus, clock)
     try:
         cameras = load_profile(profile).cameras
     except ProfileError as error:

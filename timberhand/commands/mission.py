@@ -18,7 +18,7 @@ from timberhand.commands.options import (
     SummaryOption,
     TruthOption,
 )
-from timberhand.commands.runs import Backend, BusOption, enter_lab, new_directory
+from timberhand.commands.runs import Backend, BusOption, ClockChoice, ClockOption, enter_lab, new_directory
 
 app = typer.Typer(no_args_is_help=True, help="Run a forwarding mission; document the activity manager.")
 
@@ -67,6 +67,7 @@ def run(
         Path | None, typer.Option(help="Directory of the recording (default: a new one below runs/).")
     ] = None,
     bus: BusOption = Backend.AUTO,
+    clock: ClockOption = ClockChoice.AUTO,
     console: PageOption = True,
     console_port: PagePortOption = 8471,
     max_stops: MaxStopsOption = 20,
@@ -95,7 +96,7 @@ def run(
     from machine.loading.profile_file import ProfileError, load_profile
 
     if not lockstep:
-        enter_lab(bus)
+        enter_lab(bus, clock)
     try:
         machine = load_profile(profile)
         carrier = machine.carrier

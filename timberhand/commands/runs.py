@@ -26,12 +26,45 @@ BusOption = Annotated[
 ]
 
 
-def enter_lab(bus: Backend) -> None:
-    """For vcan outside the lab: run this command again inside it, and exit with its code."""
+class ClockChoice(StrEnum):
+    """The clock of a live run in user-mode Linux."""
+
+    AUTO = "auto"
+    REAL = "real"
+    SIMULATED = "simulated"
+
+
+ClockOption = Annotated[
+    ClockChoice,
+    typer.Option(
+        "--clock",
+        help="With --bus vcan in user-mode Linux: real time, simulated time (`make lab-kernel`), or the one that this "
+        "host is quiet enough for.",
+    ),
+]
+
+
+def enter_lab(bus: Backend, clock: ClockChoice = ClockChoice.AUTO) -> None:
+    """For vcan outside the lab: run this command again inside it, and exit with its code.
+
+    Where that is user-mode Linux, the clock is chosen by the processor time that the host leaves, and announced.
+    """
     if bus is Backend.VCAN and "TIMBERHAND_LAB" not in os.environ:
         from host.vcan_lab.__main__ import vcan
 
-        vcan([sys.executable, "-m", "timberhand", *_without_page(sys.argv[1:])])
+        simulated = clock is ClockChoice.SIMULATED or (clock is ClockChoice.AUTO and _simulates())
+        vcan([sys.executable, "-m", "timberhand", *_without_page(sys.argv[1:])], time_travel=simulated)
+
+
+def _simulates() -> bool:
+    """Whether the lab runs in simulated time; announced on stderr.  False where the lab is not user-mode Linux."""
+    from host.vcan_lab.clock import clock_here
+
+    chosen = clock_here()
+    if chosen is None:
+        return False
+    sys.stderr.write(f"vcan lab: {chosen.kind} time: {chosen.reason}\n")
+    return chosen.kind == "simulated"
 
 
 def _without_page(arguments: list[str]) -> list[str]:

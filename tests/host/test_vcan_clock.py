@@ -1,0 +1,97 @@
+"""The clock of a live run in user-mode Linux: measured, chosen, announced."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any
+
+import pytest
+
+import host.vcan_lab.__main__ as lab_command
+from host.vcan_lab import choose, clock, lab_kernel
+from host.vcan_lab.choose import Method
+from host.vcan_lab.clock import MAX_GAP_NS, MAX_LOST_SHARE, LostTime, choose_clock
+from timberhand.commands.runs import Backend, ClockChoice, enter_lab
+
+QUIET = LostTime(0.01, 2_000_000, 0.0)
+KERNEL = "/cache/linux"
+
+
+@pytest.mark.parametrize(
+    ("lost", "kernel", "kind", "enough"),
+    [
+        (QUIET, KERNEL, "real", True),
+        (QUIET, None, "real", True),
+        (LostTime(MAX_LOST_SHARE + 0.01, 2_000_000, 0.0), KERNEL, "simulated", True),
+        (LostTime(0.02, MAX_GAP_NS + 1, 0.02), KERNEL, "simulated", True),
+        (LostTime(0.5, 60_000_000, 0.4), None, "real", False),
+    ],
+)
+def test_a_host_that_takes_too_much_gets_simulated_time(
+    lost: LostTime, kernel: str | None, kind: str, enough: bool
+) -> None:
+    chosen = choose_clock(lost, kernel)
+    assert (chosen.kind, chosen.enough) == (kind, enough)
+    assert lost.words() in chosen.reason
+    assert enough or lab_kernel.MISSING in chosen.reason
+
+
+def test_the_probe_sees_a_processor_that_others_use() -> None:
+    alone = clock.measure(0.3)
+    assert 0.0 <= alone.share < 1.0 and alone.longest_ns >= 0
+    last = max(os.sched_getaffinity(0))
+    rivals = []
+    try:
+        for _ in range(3):
+            pid = os.fork()
+            if pid == 0:
+                os.setsid()
+                os.sched_setaffinity(0, {last})
+                os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1)) if os.geteuid() == 0 else None
+                while True:
+                    pass
+            rivals.append(pid)
+        assert clock.measure(0.5).share > alone.share
+    finally:
+        for pid in rivals:
+            os.kill(pid, 9)
+            os.waitpid(pid, 0)
+
+
+@pytest.mark.parametrize(
+    ("choice", "lost", "simulated"),
+    [
+        (ClockChoice.AUTO, QUIET, False),
+        (ClockChoice.AUTO, LostTime(0.4, 1, 0.0), True),
+        (ClockChoice.REAL, LostTime(0.4, 1, 0.0), False),
+        (ClockChoice.SIMULATED, QUIET, True),
+    ],
+)
+def test_the_command_enters_the_lab_with_that_clock_and_says_so(
+    choice: ClockChoice, lost: LostTime, simulated: bool, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    entered: list[tuple[list[str], dict[str, Any]]] = []
+    monkeypatch.delenv("TIMBERHAND_LAB", raising=False)
+    monkeypatch.setattr(sys, "argv", ["timberhand", "demo", "--bus", "vcan"])
+    monkeypatch.setattr(lab_command, "vcan", lambda words, **more: entered.append((words, more)))
+    monkeypatch.setattr(choose, "choose", lambda *_: Method("uml", "no CAN", "linux.uml"))
+    monkeypatch.setattr(lab_kernel, "find", lambda _: KERNEL)
+    monkeypatch.setattr(clock, "measure", lambda: lost)
+    enter_lab(Backend.VCAN, choice)
+    assert [more for _, more in entered] == [{"time_travel": simulated}]
+    said = capsys.readouterr().err
+    kind = "simulated" if simulated else "real"
+    assert said.startswith(f"vcan lab: {kind} time: ") if choice is ClockChoice.AUTO else said == ""
+
+
+def test_a_kernel_with_vcan_keeps_its_own_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entered: list[dict[str, Any]] = []
+    monkeypatch.delenv("TIMBERHAND_LAB", raising=False)
+    monkeypatch.setattr(lab_command, "vcan", lambda words, **more: entered.append(more))
+    monkeypatch.setattr(choose, "choose", lambda *_: Method("existing", "up"))
+    enter_lab(Backend.VCAN)
+    assert entered == [{"time_travel": False}] and capsys.readouterr().err == ""
