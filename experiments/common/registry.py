@@ -73,6 +73,10 @@ EXPERIMENTS: Final = {
         "Does the whole forwarder run at 1 kHz? Cost against frames and joints, cranes on one processor.",
         "experiments.timing.rates",
     ),
+    "vcan": Entry(
+        "Are live runs on SocketCAN quiet? Demos and missions in a row, with the clock of each and the host's steal.",
+        "experiments.vcan.experiment",
+    ),
     "plc": Entry(
         "Does a PLC between crane0 and the valves work as well? Both roles compared with CAN: logs, accuracy, latency.",
         "experiments.plc.experiment",
