@@ -50,6 +50,7 @@ from can_dbc.messages.crane import StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.vehicle import VehicleReport
 from machine.profile import Profile
+from runtime.errors import Problem
 
 MAX_OUTSIDE_M: Final = 0.5
 """Farther outside a fence than any error of receiver or path follower: the mission fails."""
@@ -92,7 +93,8 @@ class ActivityManager:
     ) -> None:
         assert profile.carrier is not None and not (uses_memory and progress)
         self.resumed = progress is not None
-        self.state, self.paused, self.failure = State.IDLE, "the controller has not reported", ""
+        self.state, self.paused = State.IDLE, "the controller has not reported"
+        self._failure: Problem | None = None
         self.changes: deque[Transition] = deque(maxlen=HISTORY_LENGTH)
         self.single_step = False
         """Every transition waits for `next_step`."""
@@ -122,6 +124,16 @@ class ActivityManager:
         self._target = TargetLog(self.world, self.route, self.load)
         self._events = EventConditions(self.world, self.route, self.load, self._target, self._crane)
         self._route_begun = self._unloaded = False
+
+    @property
+    def failure(self) -> str:
+        """Why the mission failed; empty while it has not."""
+        return self._failure.sentence if self._failure else ""
+
+    @property
+    def failure_code(self) -> str | None:
+        """The code of ``failure``."""
+        return self._failure.code if self._failure else None
 
     @property
     def activity(self) -> Activity | None:
@@ -180,7 +192,7 @@ class ActivityManager:
     def abort(self, reason: str) -> None:
         """Fail the mission; crane and machine stop smoothly."""
         if self.state not in FINAL_STATES:
-            self._fail(reason)
+            self._fail(Problem("mission.aborted", reason))
 
     # ------------------------------------------------------------------ one step
     def step(
@@ -226,20 +238,24 @@ class ActivityManager:
     def _off(self) -> str:
         return "the mode switch is at Idle" if not self._auto and self.state not in FINAL_STATES | {State.IDLE} else ""
 
-    def _danger(self) -> str:
-        """Why a driving machine must stop; empty while it may drive."""
+    def _danger(self) -> Problem | None:
+        """Why a driving machine must stop; None while it may drive."""
         if (outside_fence_m := self.world.outside_fence_m) > MAX_OUTSIDE_M:
-            return (
-                f"the machine is {outside_fence_m:.1f} m outside its fence; drive it back by hand and check the route"
+            return Problem(
+                "mission.outside-fence",
+                f"the machine is {outside_fence_m:.1f} m outside its fence; drive it back by hand and check the route",
             )
         if not self.route.as_paper_b and (log := self.world.log_before_wheel()) is not None:
-            return f"log {log.number} lies in front of a wheel; remove it or route the machine round it"
-        return ""
+            return Problem(
+                "mission.log-before-wheel",
+                f"log {log.number} lies in front of a wheel; remove it or route the machine round it",
+            )
+        return None
 
     def _proceed(self, now_ns: int) -> None:
         """Fail, time out, or take the transition of the first event that has occurred."""
         if self._navigator.phase is Phase.STOPPED and RULES[self.state].drives:
-            self._fail(self._navigator.reason)
+            self._fail(Problem("mission.carrier-stopped", self._navigator.reason))
             return
         if RULES[self.state].drives and (danger := self._danger()):
             self._fail(danger)
@@ -270,7 +286,7 @@ class ActivityManager:
             self._route_begun = False
         state = next_state(self._table, self.state, event)
         if state is State.FAILED:
-            self._fail(RULES[self.state].timeout_reason)
+            self._fail(Problem("mission.timeout", RULES[self.state].timeout_reason))
         else:
             self._enter(state, now_ns)
         self.changes.append(Transition(now_ns, event, state))
@@ -319,7 +335,7 @@ class ActivityManager:
             elif self._unloaded:
                 self.route.rejoin(here)
         except PathRefused as error:
-            self._fail(f"the route cannot be driven: {error}")
+            self._fail(Problem(error.code, f"the route cannot be driven: {error}"))
             return
         self._unloaded = False
         if self.route.ended:  # there is no route left to return to
@@ -328,10 +344,10 @@ class ActivityManager:
             self._target.clear()
         self.route.drive_on(None if state is State.SEARCH or self.route.as_paper_b else self._target.stop_m)
 
-    def _fail(self, reason: str) -> None:
-        self.failure, self.state = reason, State.FAILED
+    def _fail(self, failure: Problem) -> None:
+        self._failure, self.state = failure, State.FAILED
         self.route.halt()
-        self._crane.abort(reason)
+        self._crane.abort(failure.sentence)
 
     # ------------------------------------------------------------------ sending
     def _send(

@@ -26,6 +26,7 @@ from autonomy.perception.log_list.observation import LogObservation
 from can_dbc.messages.crane import StateReport
 from machine.joints import N_JOINTS
 from machine.profile import Profile
+from runtime.errors import Problem
 
 MAX_STOPS: Final = 3
 """A grasp is given up after the controller has stopped the crane this many times."""
@@ -56,8 +57,8 @@ class CraneExecutor:
         as_paper_b: bool,
     ) -> None:
         self.job: Activity | None = None
-        self.failure = ""
-        """Why the mission cannot continue; empty while it can."""
+        self.failure: Problem | None = None
+        """Why the mission cannot continue; None while it can."""
         self._profile, self._hash = profile, profile_hash
         self._world, self._load = world, load
         self._selector, self._unloading_selector, self._motions = selector, unloading_selector, motions
@@ -164,7 +165,7 @@ class CraneExecutor:
             return False
         self._failures = self._failures + 1 if self._load.book_unloaded(job) else 0
         if self._failures >= MAX_FAILURES:
-            self.failure = f"unloading: {job.failure}"
+            self.failure = Problem("mission.unloading-failed", f"unloading: {job.failure}")
         self._end(job)
         return True
 
@@ -174,7 +175,9 @@ class CraneExecutor:
         if job is None or not job.idle:
             return False
         if job.failure is not None:
-            self.failure = f"the crane cannot be brought over the bunk: {job.failure}"
+            self.failure = Problem(
+                "mission.crane-not-stowed", f"the crane cannot be brought over the bunk: {job.failure}"
+            )
         self._end(job)
         return not self.failure
 

@@ -62,7 +62,7 @@ def test_a_machine_outside_its_fence_stops(keep_out: bool) -> None:
     corners = tuple(place(x, y) for x, y in ((reach[0], -9.0), (reach[1], -9.0), (reach[1], 9.0), (reach[0], 9.0)))
     forwarder, manager = begin((), fences=(Fence(corners, keep_out),))
     forwarder.run(manager, ended)
-    assert manager.state is State.FAILED and manager.world.outside_fence_m > MAX_OUTSIDE_M
+    assert manager.failure_code == "mission.outside-fence" and manager.world.outside_fence_m > MAX_OUTSIDE_M
     for _ in range(60):
         forwarder.step(manager)
     assert forwarder.speed_m_s == 0.0 and 16.4 < forwarder.x_m < 17.6
@@ -73,9 +73,9 @@ def test_a_machine_stops_before_a_log_in_its_wheel_path(y_m: float, yaw: float, 
     forwarder, manager = begin(((1, 15.0, y_m, yaw),), end_m=20.0)
     forwarder.run(manager, ended)
     if not hit:  # it passes below the machine, between the wheels
-        assert "log 1" not in manager.failure
+        assert manager.failure_code != "mission.log-before-wheel"
         return
-    assert manager.state is State.FAILED and manager.failure.startswith("log 1 ")
+    assert manager.state is State.FAILED and manager.failure_code == "mission.log-before-wheel"
     for _ in range(60):
         forwarder.step(manager)
     assert forwarder.speed_m_s == 0.0 and forwarder.x_m + CARRIER.wheel_radius_m < 15.0
@@ -194,6 +194,7 @@ def test_abort_fails_the_mission_with_its_reason_and_stops_the_machine() -> None
         forwarder.step(manager)
     assert manager.state is State.FAILED and manager.failure == "the supervisor wants it"
     assert forwarder.speed_m_s == 0.0
+    assert manager.failure_code == "mission.aborted"
     manager.abort("again")
     assert manager.failure == "the supervisor wants it"
 
@@ -203,7 +204,7 @@ def test_swing_arms_that_do_not_move_time_out() -> None:
     while not ended(manager):
         forwarder.step(manager)
         forwarder.heights_m = [0.1] * 4
-    assert manager.failure == RULES[State.RAISE].timeout_reason
+    assert (manager.failure_code, manager.failure) == ("mission.timeout", RULES[State.RAISE].timeout_reason)
     assert forwarder.crane.now_ns - 5_000_000_000 < 40e9
 
 
@@ -214,7 +215,7 @@ def test_wheels_that_do_not_turn_fail_the_mission() -> None:
         forwarder.speed_m_s = 0.0
         forwarder.step(manager)
         forwarder.x_m = 0.0
-    assert manager.state is State.FAILED and manager.failure
+    assert manager.state is State.FAILED and manager.failure_code == "mission.carrier-stopped"
 
 
 @whole
@@ -306,7 +307,7 @@ def test_a_landing_without_room_fails_the_mission() -> None:
     manager.tally.on_board = 1
     manager.route.drive_to_landing = refuse  # type: ignore[method-assign]
     forwarder.run(manager, ended)
-    assert manager.failure.endswith(": no room")
+    assert manager.failure_code == "path.none"
 
 
 def refuse(*_: object) -> None:
