@@ -36,8 +36,8 @@ ROOT: Final = Path(__file__).parents[2]
 
 def build(profile: Path, dbc: Path = ROOT / "can_dbc" / "crane.dbc") -> Guard:
     """Build a guard for a profile file; raises GuardConfigError."""
-    axes = read_envelope(profile)
-    return Guard(axes, read_layouts(dbc, [*MESSAGES, *(axis.message for axis in axes if axis.message)]))
+    axes, period_ns = read_envelope(profile)
+    return Guard(axes, read_layouts(dbc, [*MESSAGES, *(axis.message for axis in axes if axis.message)]), period_ns)
 
 
 def profile_path(name: str) -> Path:

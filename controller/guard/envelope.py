@@ -1,6 +1,7 @@
 """Limits of a machine, read from the profile (TOML) by the guard itself.
 
-Output: one `Axis` per joint with its command signal, its encoder and its limits, in the units of the profile.
+Output: one `Axis` per joint with its command signal, its encoder and its limits, in the units of the profile, and the
+period of the commands.
 """
 
 from __future__ import annotations
@@ -32,16 +33,19 @@ class Axis(NamedTuple):
     unit: float
 
 
-def read_envelope(path: Path) -> tuple[Axis, ...]:
-    """Read the axes of a profile file; raises GuardConfigError."""
+def read_envelope(path: Path) -> tuple[tuple[Axis, ...], int]:
+    """Read the axes and the period of the commands [ns] of a profile file; raises GuardConfigError."""
     try:
         profile = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise GuardConfigError("guard.profile-unreadable", f"{path}: unreadable profile: {error}.") from error
     try:
-        return tuple(_axis(i, profile["joints"][name]) for i, name in enumerate(JOINT_NAMES))
+        axes = tuple(_axis(i, profile["joints"][name]) for i, name in enumerate(JOINT_NAMES))
+        return axes, 1_000_000_000 // int(profile["rate_hz"])
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise GuardConfigError("guard.profile-incomplete", f"{path}: a joint is incomplete: {error!r}.") from error
+        raise GuardConfigError(
+            "guard.profile-incomplete", f"{path}: a joint or the rate is incomplete: {error!r}."
+        ) from error
 
 
 def _axis(number: int, joint: dict[str, Any]) -> Axis:

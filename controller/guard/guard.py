@@ -2,7 +2,8 @@
 
 It watches the valve commands, whoever sends them, and everything that they depend on, by its own rules and its own
 decoding.  GuardStat goes out every 10 ms, and at once when the verdict changes; ``Enable`` is 0xA only while no rule is
-broken.  After a broken rule the enable returns when the rules hold and the commands have been neutral for 200 ms.
+broken.  It returns when the rules hold and the commands have been neutral for 200 ms.  A broken rule of `LATCHING`
+needs a person before that: the reset button of the safety module, pressed after the cause is gone, and nothing else.
 Neutral commands are always allowed.  The guard never commands: silent or dead, it stops the machine by absence.
 """
 
@@ -31,7 +32,15 @@ NO_AXIS: Final = 15
 GRAPPLE_AXIS, AUX_AXIS = 5, 6
 _NEUTRAL, _SPOOL = 0, 2
 _GRAPPLE_OPENS, _GRAPPLE_CLOSES = 1, 2
-_MIN_GOOD_COUNT, _MAX_BAD_COUNT, _MAX_COUNTER_STEP = 2, 1, 2
+_RELEASED, _PRESSED = 1, 1
+_MIN_GOOD_COUNT, _MAX_COUNTER_STEP = 2, 2
+_SHORT_WINDOW, _MAX_BAD_IN_SHORT = (1 << 5) - 1, 1
+_LONG_WINDOW, _MAX_BAD_IN_LONG = (1 << 100) - 1, 2
+"""Frames with a wrong checksum that are tolerated among the last 5 and among the last 100."""
+MAX_DELAY_NS: Final = 40_000_000
+"""A command is refused when it comes this much later than its counter and the period say."""
+DELAY_FORGIVEN_PER_S: Final = 0.02
+"""How fast a lasting delay is forgiven: clocks differ, and a controller may skip a tick."""
 MESSAGES: Final = ("ValveCmdA", "ValveCmdB", "EstopStat", "GuardStat")
 
 
@@ -39,26 +48,25 @@ class Verdict(IntEnum):
     """The broken rule; the number of ``GuardStat.Verdict``."""
 
     GOOD = 0
-    NO_COMMAND = 1
-    """A valve command is missing or too old."""
-    CORRUPT = 2
-    """A command with a wrong checksum, counter or length."""
-    OTHER_GUARD = 3
-    """Another node sends the guard's frames."""
-    RANGE = 4
-    """A command out of its range, of an unknown mode, or for a function that does not exist."""
-    RATE = 5
-    """A command that grows faster than the machine may."""
-    NOT_ARMED = 6
-    """A motion is commanded without the arm key."""
-    ESTOP = 7
-    """The emergency stop is pressed, inconsistent, or not received."""
-    ENCODER = 8
-    """A motion is commanded for a joint whose encoder is silent."""
-    OUTSIDE = 9
-    """A motion further out is commanded for a joint outside its range."""
-    CALMING = 10
-    """No rule is broken, but not for long enough."""
+    NO_COMMAND = 1  # a valve command is missing or too old
+    CORRUPT = 2  # too many commands with a wrong checksum or length
+    OTHER_GUARD = 3  # another node sends the guard's frames
+    RANGE = 4  # a command out of its range, of an unknown mode, or for a function that does not exist
+    RATE = 5  # a command that grows faster than the machine may
+    NOT_ARMED = 6  # a motion is commanded without the arm key
+    ESTOP = 7  # the emergency stop is pressed, or its channels differ
+    ENCODER = 8  # a motion is commanded for a joint whose encoder is silent
+    OUTSIDE = 9  # a motion further out is commanded for a joint outside its range
+    CALMING = 10  # no rule is broken, but not for long enough
+    STALE = 11  # commands come late, or some are missing in between
+    ESTOP_LOST = 12  # the emergency stop is not received
+    LATCHED = 13  # no rule is broken, but nobody has pressed reset since one of `LATCHING` was
+
+
+LATCHING: Final = frozenset(
+    (Verdict.CORRUPT, Verdict.OTHER_GUARD, Verdict.RANGE, Verdict.RATE, Verdict.NOT_ARMED, Verdict.ESTOP)
+) | {Verdict.OUTSIDE}
+"""Rules whose violation is something heard, not silence: only a person allows motion again."""
 
 
 def _crc_table() -> bytes:
@@ -83,48 +91,50 @@ def checksum(data: bytes, data_id: int) -> int:
 
 
 class FrameEffect(IntEnum):
-    """Effect of a received frame on its stream."""
+    """Effect of a received frame on its stream; the greater ones break trust."""
 
     NONE = 0
     NEW_WORD = 1
-    BROKEN = 2
+    GAP = 2
+    CORRUPT = 3
 
 
 class WatchedMessage:
     """One protected message: its newest good word, its time, and whether its stream is trusted."""
 
-    __slots__ = ("_bad", "_good", "counter", "layout", "stamp_ns", "trusted", "word")
+    __slots__ = ("_bad", "_good", "counter", "layout", "stamp_ns", "steps", "trusted", "word")
 
     def __init__(self, layout: Layout) -> None:
         if not layout.data_ids or not layout.timeout_ns:
             raise GuardConfigError("guard.message-unprotected", "crane.dbc: a message lacks Data IDs or a time-out.")
         self.layout = layout
-        self.word = self.stamp_ns = 0
+        self.word = self.stamp_ns = self.steps = 0
         self.counter = -1
         self.trusted = False
-        self._good = self._bad = 0
+        self._good = self._bad = 0  # good frames in a row; bad ones among the last hundred, as bits
 
     def receive(self, frame: Frame, now_ns: int) -> FrameEffect:
         """Check a frame, and keep its word when the stream is trusted."""
         data, layout = frame.data, self.layout
+        self.old(frame.stamp_ns)  # after a silence the stream begins anew: that is no corruption
         if len(data) != layout.length or checksum(data, layout.data_ids[data[1] & 0xF]) != data[0]:
-            self._bad += 1
+            bad = self._bad = (self._bad << 1 | 1) & _LONG_WINDOW
             self._good = 0
-            if self._bad > _MAX_BAD_COUNT:
-                self.trusted = False
-                return FrameEffect.BROKEN
-            return FrameEffect.NONE
+            if (bad & _SHORT_WINDOW).bit_count() <= _MAX_BAD_IN_SHORT and bad.bit_count() <= _MAX_BAD_IN_LONG:
+                return FrameEffect.NONE
+            self.trusted = False
+            return FrameEffect.CORRUPT
         counter = data[1] & 0xF
-        step = (counter - self.counter) & 0xF if self.counter >= 0 else 1
+        self.steps = (counter - self.counter) & 0xF if self.counter >= 0 else 1
         self.counter = counter
-        if step == 0:  # a repeated frame only grows older
+        if self.steps == 0:  # a repeated frame only grows older
             return FrameEffect.NONE
-        self._bad = 0
-        broken = step > _MAX_COUNTER_STEP and self.trusted
-        self._good = 1 if step > _MAX_COUNTER_STEP else self._good + 1
+        self._bad = self._bad << 1 & _LONG_WINDOW
+        broken = self.steps > _MAX_COUNTER_STEP and self.trusted
+        self._good = 1 if self.steps > _MAX_COUNTER_STEP else self._good + 1
         self.trusted = not broken and (self.trusted or self._good >= _MIN_GOOD_COUNT)
         if not self.trusted:
-            return FrameEffect.BROKEN if broken else FrameEffect.NONE
+            return FrameEffect.GAP if broken else FrameEffect.NONE
         self.word = int.from_bytes(data, "little")
         self.stamp_ns = min(frame.stamp_ns, now_ns)
         return FrameEffect.NEW_WORD
@@ -140,6 +150,27 @@ class WatchedMessage:
     def raw(self, name: str) -> int:
         """Raw value of a signal in the newest good frame."""
         return self.layout.fields[name].raw(self.word)
+
+
+class Punctuality:
+    """How late commands come, from their number: one for each period, and the most punctual one sets the scale.
+
+    A transmit queue that a busy bus holds up delivers commands in order, complete, with good checksums, and old.
+    """
+
+    __slots__ = ("_due_ns", "_last_ns", "_period_ns")
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._due_ns = self._last_ns = 0
+
+    def late(self, stamp_ns: int, steps: int, silence_ns: int) -> bool:
+        """Whether a command is too late that came at ``stamp_ns``, ``steps`` after the one before."""
+        gap_ns = stamp_ns - self._last_ns
+        self._last_ns = stamp_ns
+        due_ns = self._due_ns + steps * self._period_ns + int(gap_ns * DELAY_FORGIVEN_PER_S)
+        self._due_ns = stamp_ns if gap_ns > silence_ns else min(due_ns, stamp_ns)
+        return stamp_ns - self._due_ns > MAX_DELAY_NS
 
 
 class CommandedAxis:
@@ -208,11 +239,11 @@ class Guard:
 
     __slots__ = (
         "_a", "_b", "_calm_ns", "_changed", "_commands", "_commands_a", "_commands_b", "_counter", "_estop",
-        "_grapple_field", "_heartbeat_ns", "_joints", "_layout", "_status_ns", "_watches", "axis", "events",
-        "verdict",
+        "_grapple_field", "_heartbeat_ns", "_joints", "_latched", "_layout", "_punctuality", "_reset_seen",
+        "_status_ns", "_watches", "axis", "events", "verdict",
     )  # fmt: skip
 
-    def __init__(self, axes: tuple[Axis, ...], layouts: dict[str, Layout]) -> None:
+    def __init__(self, axes: tuple[Axis, ...], layouts: dict[str, Layout], period_ns: int) -> None:
         self._a, self._b, self._estop = (WatchedMessage(layouts[name]) for name in MESSAGES[:3])
         self._layout = layouts["GuardStat"]
         self._watches = {watch.layout.key: watch for watch in (self._a, self._b, self._estop)}
@@ -231,17 +262,21 @@ class Guard:
         self._changed = True
         self._counter = 0
         self._calm_ns = self._status_ns = self._heartbeat_ns = 0
+        self._latched, self._reset_seen = False, True  # a button that is down already is no edge
+        self._punctuality = {watch: Punctuality(period_ns) for watch in (self._a, self._b)}
 
     def step(self, now_ns: int, frames: list[Frame]) -> list[tuple[int, bytes]]:
         """Check the frames since the last call (any period up to 10 ms); returns the frames to send."""
         verdict, axis = Verdict.GOOD, NO_AXIS
+        pressed = False
         for frame in frames:
             found, where = self._receive(frame, now_ns)
-            if verdict is Verdict.GOOD:
+            if verdict is Verdict.GOOD or (found in LATCHING and verdict not in LATCHING):
                 verdict, axis = found, where
+            pressed = self._reset_pressed() or pressed
         if verdict is Verdict.GOOD:
             verdict, axis = self._check_state(now_ns)
-        self._settle(verdict, axis, now_ns)
+        self._settle(verdict, axis, pressed, now_ns)
         out: list[tuple[int, bytes]] = []
         if self._changed or now_ns >= self._status_ns:
             late = now_ns - self._status_ns >= STATUS_NS
@@ -274,22 +309,34 @@ class Guard:
             return Verdict.GOOD, NO_AXIS
         before_ns = watch.stamp_ns
         effect = watch.receive(frame, now_ns)
-        if effect is FrameEffect.BROKEN:
-            return (Verdict.ESTOP if watch is self._estop else Verdict.CORRUPT), NO_AXIS
+        if effect is FrameEffect.GAP:
+            return (Verdict.ESTOP_LOST if watch is self._estop else Verdict.STALE), NO_AXIS
+        if effect is FrameEffect.CORRUPT:
+            return (Verdict.ESTOP_LOST if watch is self._estop else Verdict.CORRUPT), NO_AXIS
         if watch is self._estop or effect is FrameEffect.NONE:
             return Verdict.GOOD, NO_AXIS
+        late = self._punctuality[watch].late(watch.stamp_ns, watch.steps, watch.layout.timeout_ns)
         elapsed_s = (watch.stamp_ns - before_ns) * 1e-9
         for command in self._commands_a if watch is self._a else self._commands_b:
             verdict = command.receive(watch.word, elapsed_s)
             if verdict is not Verdict.GOOD:
                 return verdict, command.axis.number
-        return Verdict.GOOD, NO_AXIS
+        return (Verdict.STALE if late else Verdict.GOOD), NO_AXIS
+
+    def _reset_pressed(self) -> bool:
+        """Whether the reset button went down, as the safety module itself reports it."""
+        before = self._reset_seen
+        self._reset_seen = not self._estop.trusted or self._estop.raw("ResetReq") == _PRESSED
+        return self._reset_seen and not before and self._estop.trusted
 
     def _check_state(self, now_ns: int) -> tuple[Verdict, int]:
         """Check the rules on the present state; only a command that moves something can break those on joints."""
         estop_old = self._estop.old(now_ns)
         a_old, b_old = self._a.old(now_ns), self._b.old(now_ns)
-        if estop_old or self._estop.raw("ChannelA") != 1 or self._estop.raw("ChannelB") != 1:
+        if estop_old:
+            self._reset_seen = True
+            return Verdict.ESTOP_LOST, NO_AXIS
+        if self._estop.raw("ChannelA") != _RELEASED or self._estop.raw("ChannelB") != _RELEASED:
             return Verdict.ESTOP, NO_AXIS
         if a_old or b_old:
             return Verdict.NO_COMMAND, NO_AXIS
@@ -322,15 +369,19 @@ class Guard:
             return False
         return self._b.raw("Grapple") == 0 and all(command.percent == 0.0 for command in self._commands)
 
-    def _settle(self, verdict: Verdict, axis: int, now_ns: int) -> None:
-        """A broken rule counts at once; the return needs a while of neutral commands."""
+    def _settle(self, verdict: Verdict, axis: int, pressed: bool, now_ns: int) -> None:
+        """A broken rule counts at once; the return needs a while of neutral commands, and a person if it latches."""
         if verdict is not Verdict.GOOD:
             self._calm_ns = now_ns + CALM_NS
+            self._latched = self._latched or verdict in LATCHING
         elif self.verdict is not Verdict.GOOD:
-            if not self._neutral():
+            neutral = self._neutral()
+            if not neutral:
                 self._calm_ns = now_ns + CALM_NS
-            if now_ns < self._calm_ns:
-                verdict = Verdict.CALMING
+            if self._latched:
+                self._latched = not (pressed and neutral)
+            if self._latched or now_ns < self._calm_ns:
+                verdict = Verdict.LATCHED if self._latched else Verdict.CALMING
         if verdict is not self.verdict:
             self.events = (self.events + 1) & 0xFF
             self._changed = True

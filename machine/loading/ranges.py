@@ -143,7 +143,7 @@ _RANGES: Final[dict[type[msgspec.Struct], dict[str, Range]]] = {
         "arm_rate_limit_m_s": (0.005, 1.0, "m/s"),
         "arm_in_band_m": (0.001, 0.2, "m"),
         "articulation_limit_rad": (0.05, 1.2, "rad"),
-        "articulation_rate_limit_rad_s": (0.01, 1.5, "rad/s"),
+        "articulation_rate_limit_rad_s": (0.01, 1.0, "rad/s"),
         "articulation_lag_s": (0.0, 2.0, "s"),
         "heading_kp_1_s": (0.05, 20.0, "1/s"),
         "cruise_speed_m_s": (0.05, 5.0, "m/s"),

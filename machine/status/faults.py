@@ -79,7 +79,11 @@ FAULTS: Final[dict[Reason, Fault]] = {
     ),
     Reason.GUARD_LOST: Fault(Reaction.CUT, 60, _N, "The guard is no longer received", "Start the guard, then reset."),
     Reason.GUARD_REFUSES: Fault(
-        Reaction.CUT, 20, _N, "The guard withdrew its enable", "Read the guard's verdict, then reset and arm."
+        Reaction.CUT,
+        20,
+        _N,
+        "The guard withdrew its enable",
+        "Read the guard's verdict, press reset on the safety module, then arm.",
     ),
     Reason.ENCODER_LOST: Fault(
         Reaction.RAMP, 20, _J, "The encoder of {} is no longer received", "Check its cable, then reset and arm."
