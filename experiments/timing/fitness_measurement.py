@@ -13,6 +13,7 @@ from typing import Final
 from can_dbc.bus.factory import VCAN_NAMES
 from experiments.timing import evaluation
 from experiments.timing.fitness import Figures
+from experiments.timing.losses import losses_between
 from experiments.timing.measurement import MeasurementWindow, measure, pooled
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
 from host.doctor import computer
@@ -118,7 +119,7 @@ def figures_of(
         reference_max_us=beside["reference_max_us"],
         tick_p50_us=cost["tick_p50_us"],
         tick_p99_us=cost["tick_p99_us"],
-        frames_lost=round(process["frames_lost"]),
+        frames_lost=sum(loss.frames for loss in losses_between(windows[0].begin, windows[-1].end)),
         page_faults=round(process["page_faults"]),
         gc_runs=round(process["gc_runs"]),
         stops=stops,
