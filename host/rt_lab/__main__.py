@@ -32,9 +32,6 @@ def rt_lab(
     accel: Annotated[
         Accelerator, typer.Option(help="tcg emulates and runs anywhere; kvm is faster where it works.")
     ] = Accelerator.TCG,
-    report: Annotated[
-        bool, typer.Option("--report", help="Also measure with doctor --rt --report there; some minutes more.")
-    ] = False,
     timeout: Annotated[float, typer.Option(metavar="S", min=1.0, help="Give up after this time.")] = 600.0,
 ) -> None:
     """Check the control loop on Debian's PREEMPT_RT kernel, in qemu.
@@ -53,9 +50,7 @@ def rt_lab(
     from host.rt_lab.host import evaluate, run
 
     try:
-        result = run(
-            kernel, accel.value, report, timeout, lambda line: print(f"rt lab: {line}", file=sys.stderr, flush=True)
-        )
+        result = run(kernel, accel.value, timeout, lambda line: print(f"rt lab: {line}", file=sys.stderr, flush=True))
     except LabError as error:
         print(f"rt lab: {error} [{error.code}]", file=sys.stderr)
         raise typer.Exit(ExitCode.BUS) from None

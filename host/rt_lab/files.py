@@ -44,9 +44,8 @@ print(json.dumps({"files": files, "maps": sorted(maps), "stdlib": sysconfig.get_
 """
 
 
-def make_archive(work: Path, modules: Iterable[Path], report: bool) -> Path:
-    """The archive that the kernel unpacks as its file system; ``modules`` lie below ``work/kernel``;
-    ``report`` is an order to the guest.
+def make_archive(work: Path, modules: Iterable[Path]) -> Path:
+    """The archive that the kernel unpacks as its file system; ``modules`` lie below ``work/kernel``.
 
     Raises:
         LabError: the modules cannot be imported here, or cpio fails.
@@ -69,7 +68,7 @@ def make_archive(work: Path, modules: Iterable[Path], report: bool) -> Path:
         shutil.copy(module, target)
     (own / "init").write_text(f"#!{found['python']} -SB\n" + GUEST.read_text())
     (own / "init").chmod(0o755)
-    order = {"python": found["python"], "path": [str(CHECKOUT), found["site"]], "report": report}
+    order = {"python": found["python"], "path": [str(CHECKOUT), found["site"]]}
     (own / "order.json").write_text(json.dumps(order))
     names = sorted({str(p).lstrip("/") for f in files for p in (f, *f.parents) if p != Path("/")})
     mine = sorted(str(p.relative_to(own)) for p in own.rglob("*"))

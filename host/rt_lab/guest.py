@@ -1,6 +1,6 @@
 """First process of the guest: runs the checks on the real-time kernel, prints the result, powers off.
 
-``/order.json`` holds the paths of Python and the checkout, and whether to make the report.  Started without
+``/order.json`` holds the paths of Python and the checkout.  Started without
 site-packages, so our own modules are imported after the path is set.
 """
 
@@ -30,8 +30,6 @@ TICKS_S = 2.0
 AFTER_KILL_S = 0.6
 CYCLES = 300
 RUNTIME = Path("/run/timberhand")
-REPORT = RUNTIME / "report.md"
-REPORT_S = 4
 _POWER_OFF = 0x4321_FEDC
 _SYS_FINIT_MODULE = 313
 libc = ctypes.CDLL(None, use_errno=True)
@@ -51,8 +49,6 @@ def main() -> None:
         result["realtime"] = Path("/sys/kernel/realtime").read_text().strip()
         result |= reference_loop()
         result |= control_loop(Path(order["path"][0]))
-        if order["report"]:
-            result |= {"report_status": None} | real_time_report(Path(order["path"][0]))
     except Exception as error:  # noqa: BLE001  the first process reports every error
         result["error"] = f"{type(error).__name__}: {error}"
     for said in sorted(RUNTIME.glob("*.err")):
@@ -141,26 +137,6 @@ def control_loop(checkout: Path) -> dict[str, Any]:
         process.send_signal(signal.SIGTERM)
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(30)
-    return found
-
-
-def real_time_report(checkout: Path) -> dict[str, Any]:
-    """The report that a user would send, made on this kernel."""
-    command = [
-        sys.executable, "-m", "timberhand", "doctor", "--rt", "--report", "--seconds", str(REPORT_S),
-        "--profile", PROFILE, "--bus", "auto", "--out", str(REPORT),
-    ]  # fmt: skip
-    step("measuring for the report")
-    with open(RUNTIME / "doctor.err", "wb") as err:
-        done = subprocess.run(command, cwd=checkout, stdin=subprocess.DEVNULL, stdout=err, stderr=err, check=False)
-    data = json.loads(REPORT.read_text().partition("```json\n")[2].partition("\n```")[0])
-    found = {"report_status": done.returncode, "report_verdict": data["verdict"],
-             "report_preemption": data["settings"]["preemption"]}  # fmt: skip
-    if measured := data["measured"]:
-        figures = measured["figures"]
-        found |= {"report_bus": measured["bus"], "report_ticks": figures["ticks"], "report_fifo": figures["fifo"],
-                  "report_missed": figures["missed"], "report_reference": figures["reference"]}  # fmt: skip
-    step(f"the report says: {found}")
     return found
 
 

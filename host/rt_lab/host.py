@@ -29,10 +29,6 @@ EXPECTED: Final[dict[str, Any]] = {
     "realtime": "1", "guard_ready": True, "controller_ready": True, "standby": True, "controller_policy": "fifo 80",
     "guard_policy": "fifo 85", "refused": [], "cyclictest_status": 0,
 }  # fmt: skip
-REPORT: Final[dict[str, Any]] = {
-    "report_preemption": "rt", "report_bus": "vcan", "report_fifo": True, "report_reference": "cyclictest",
-}  # fmt: skip
-"""Expected with the real-time report."""
 POSITIVE: Final = ("controller_locked_kb", "guard_locked_kb", "frames", "ticks", "cyclictest_cycles", "opening_pct")
 
 
@@ -46,10 +42,8 @@ def missing() -> str | None:
     return None
 
 
-def run(
-    package: Path | None, accelerator: str, report: bool, timeout_s: float, show: Callable[[str], None]
-) -> dict[str, Any]:
-    """Boot the guest and return its result; with ``report`` it also makes the real-time report.
+def run(package: Path | None, accelerator: str, timeout_s: float, show: Callable[[str], None]) -> dict[str, Any]:
+    """Boot the guest and return its result.
 
     Raises:
         LabError: it cannot run here, or gives no result.
@@ -60,7 +54,7 @@ def run(
     with tempfile.TemporaryDirectory(prefix="timberhand-rt-") as place:
         work = Path(place)
         kernel, modules = unpack(package or kernel_package(show), work / "kernel")
-        archive = make_archive(work, modules, report)
+        archive = make_archive(work, modules)
         size_mb = archive.stat().st_size >> 20
         show(f"booting {kernel.name} with {size_mb} MB of files")
         result = _boot(kernel, archive, accelerator, timeout_s, show)
@@ -72,8 +66,7 @@ def evaluate(result: dict[str, Any]) -> list[str]:
     faults = [f"the guest reports: {result['error']}"] if "error" in result else []
     if "PREEMPT_RT" not in result.get("kernel", ""):
         faults.append(f"the kernel is not PREEMPT_RT: {result.get('kernel', 'unknown')}")
-    wanted = EXPECTED | (REPORT if "report_status" in result else {})
-    faults += [f"{k} is {result.get(k)}, not {v}" for k, v in wanted.items() if result.get(k) != v]
+    faults += [f"{k} is {result.get(k)}, not {v}" for k, v in EXPECTED.items() if result.get(k) != v]
     faults += [f"{k} is {result.get(k)}" for k in POSITIVE if not result.get(k)]
     neutral_ms = result.get("neutral_ms")
     if neutral_ms is None or neutral_ms > NEUTRAL_MS:

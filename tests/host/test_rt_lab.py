@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from host.rt_lab import guest, package
-from host.rt_lab.host import EXPECTED, POSITIVE, REPORT, evaluate, missing
+from host.rt_lab.host import EXPECTED, POSITIVE, evaluate, missing
 from host.vcan_lab.spec import LabError
 from tests.codes import coded
 
@@ -59,13 +59,6 @@ def test_a_good_result_has_no_fault() -> None:
 def test_each_check_can_fail(name: str, value: object) -> None:
     faults = evaluate(GOOD | {name: value})
     assert len(faults) == 1 and str(value) in faults[0]
-
-
-def test_a_report_is_checked_where_one_was_made() -> None:
-    made = GOOD | REPORT | {"report_status": 6}
-    assert evaluate(made) == []
-    assert len(evaluate(made | {"report_preemption": "full"})) == 1
-    assert len(evaluate(GOOD | {"report_status": 3})) == len(REPORT)
 
 
 def test_a_package_without_a_kernel_is_refused(tmp_path: Path) -> None:
