@@ -95,11 +95,11 @@ def mismatch(manifest: dict[str, Any], root: Path) -> str:
 
 
 def find_build(root: Path | None = None, folder: Path | None = None) -> tuple[Build | None, str]:
-    """The build for the sources below ``root``, or None and the reason."""
+    """The build for the sources below ``root``, or None and the reason, which names the newest build."""
     root = root or source_root()
     folder = folder or builds_folder(root)
     reason = "no build"
-    for path in sorted(folder.glob(f"*/{MANIFEST}")):
+    for path in sorted(folder.glob(f"*/{MANIFEST}"), key=_age_key):
         try:
             manifest = json.loads(path.read_text())
             problem = mismatch(manifest, root)
@@ -114,8 +114,19 @@ def find_build(root: Path | None = None, folder: Path | None = None) -> tuple[Bu
     return None, reason
 
 
+def _age_key(manifest: Path) -> tuple[int, str]:
+    """Sorts the oldest manifest first."""
+    try:
+        return manifest.stat().st_mtime_ns, str(manifest)
+    except OSError:
+        return 0, str(manifest)
+
+
 class _Finder(importlib.abc.MetaPathFinder):
-    """Serves modules by full name from the given files, before the path is searched."""
+    """Serves modules by full name from the given files, before the path is searched.
+
+    A name whose file is missing is no module: the generated codecs exist in compiled form only.
+    """
 
     def __init__(self, files: dict[str, Path]) -> None:
         self._files = files
@@ -124,7 +135,11 @@ class _Finder(importlib.abc.MetaPathFinder):
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         file = self._files.get(fullname)
-        return None if file is None else importlib.util.spec_from_file_location(fullname, file)
+        if file is None:
+            return None
+        if not file.is_file():
+            raise ModuleNotFoundError(f"{fullname} exists in compiled form only", name=fullname)
+        return importlib.util.spec_from_file_location(fullname, file)
 
 
 _running = Running("interpreter", reason="not activated")

@@ -12,11 +12,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from hil.tick.worker import eviction_bytes
+from hil.tick import worker
+from hil.tick.ratio import compared
+from hil.tick.release import Release
 from host.exit_codes import CommandFailed, ExitCode
 from runtime.compiled import SWITCH, find_build, source_root
 
 SIDES: Final = {"interpreter": "0", "compiled": "1"}
+CACHES: Final = ("hot", "cold")
+MIN_RATIO: Final = 2.0
+"""Cost on the interpreter over that of the compiled tick, at least."""
+MIN_RELEASE_RATIO: Final = 0.9
+"""Cost of the release over that of this tick, at least: it may become a tenth slower, not more."""
 Progress = Callable[[str], None]
 
 
@@ -53,57 +60,70 @@ def need_build() -> str:
     return build.key
 
 
-def compare_cost(recording: Path, ticks: int, rounds: int, progress: Progress) -> dict[str, Any]:
-    """Cost of each side from the quietest of ``rounds`` turns (A B A B), and the ratios of the medians.
+def compare_cost(
+    recording: Path, ticks: int, rounds: int, progress: Progress, against: Release | None = None
+) -> dict[str, Any]:
+    """Cost of each side over interleaved rounds (A B C A B C), and the ratios of the same rounds.
 
-    Other load on the computer only ever adds time, so that the smallest of several medians is nearest to the truth.
+    A side's figures are those of its quietest turn, because other load only ever adds time.  A ratio is the median
+    over the rounds with its interval, because the sides of one round run one after the other on the same host.
     """
-    turns: dict[str, list[dict[str, Any]]] = {side: [] for side in SIDES}
+    names = [*SIDES, "release"] if against else list(SIDES)
+    turns: dict[str, list[dict[str, Any]]] = {side: [] for side in names}
     for turn in range(rounds):
-        for side in SIDES:
+        for side in names:
             progress(f"{recording.parent.name}: {side}, turn {turn + 1} of {rounds}")
-            turns[side].append(json.loads(_run(side, "cost", recording, ticks).splitlines()[-1]))
-    sides = {
-        side: {
-            "tick": found[0]["tick"],
-            "differing": sum(turn[caches]["differing"] for turn in found for caches in ("hot", "cold")),
-            **{
-                caches: {name: min(turn[caches][name] for turn in found) for name in found[0][caches] if "_us" in name}
-                for caches in ("hot", "cold")
-            },
-        }
-        for side, found in turns.items()
+            folder = against.folder if against and side == "release" else None
+            turns[side].append(json.loads(_run(side, folder, "cost", recording, ticks).splitlines()[-1]))
+    comparisons = [("compiled_ratio", "interpreter", "compiled", MIN_RATIO)]
+    if against:
+        comparisons.append(("release_ratio", "release", "compiled", MIN_RELEASE_RATIO))
+    ratios = {
+        f"{name}_{caches}": compared(
+            *([turn[caches]["cpu_p50_us"] for turn in turns[side]] for side in (slow, fast)), at_least
+        )
+        for name, slow, fast, at_least in comparisons
+        for caches in CACHES
     }
-    slow, fast = sides["interpreter"], sides["compiled"]
     return {
-        "recording": recording.parent.name,
-        "ticks": turns["interpreter"][0]["ticks"],
-        **sides,
-        "compiled_ratio_hot": round(slow["hot"]["cpu_p50_us"] / fast["hot"]["cpu_p50_us"], 2),
-        "compiled_ratio_cold": round(slow["cold"]["cpu_p50_us"] / fast["cold"]["cpu_p50_us"], 2),
+        "recording": recording.parent.name, "ticks": turns["interpreter"][0]["ticks"],
+        **{side: _quietest(found) for side, found in turns.items()},
+        **{name: found["ratio"] for name, found in ratios.items()}, "ratios": ratios,
+    }  # fmt: skip
+
+
+def _quietest(turns: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "tick": turns[0]["tick"],
+        "differing": sum(turn[caches]["differing"] for turn in turns for caches in CACHES),
+        "instructions_p50": turns[0]["hot"].get("instructions_p50"),
+        **{
+            caches: {name: min(turn[caches][name] for turn in turns) for name in turns[0][caches] if "_us" in name}
+            for caches in CACHES
+        },
     }
 
 
 def compare_random(recording: Path, seed: int, ticks: int, progress: Progress) -> dict[str, Any]:
     """Run the same random ticks on both sides at once; ends at the first pass whose digests differ."""
-    workers = {side: _start(side, "random", recording, seed, ticks) for side in SIDES}
+    processes = {side: _start(side, None, "random", recording, seed, ticks) for side in SIDES}
     agreed: dict[str, Any] = {"ticks": 0, "modes": []}
     differs_after = None
     try:
-        for a, b in zip(*(_lines(worker) for worker in workers.values()), strict=False):
+        for a, b in zip(*(_lines(process) for process in processes.values()), strict=False):
             if a != b:
                 differs_after = agreed["ticks"]
                 break
             agreed = a
             progress(f"{recording.parent.name}: {a['ticks']} of {ticks} random ticks agree")
         if differs_after is None:
-            for side, worker in workers.items():
-                if worker.wait() or agreed["ticks"] < ticks:
+            for side, process in processes.items():
+                if process.wait() or agreed["ticks"] < ticks:
                     raise CommandFailed("tick.worker", f"the side on the {side} ended early", ExitCode.CONFIGURATION)
     finally:
-        for worker in workers.values():
-            worker.kill()
-            worker.wait()
+        for process in processes.values():
+            process.kill()
+            process.wait()
     return {
         "recording": recording.parent.name, "seed": seed, "ticks": agreed["ticks"], "modes": agreed["modes"],
         "differs_after": differs_after,
@@ -121,28 +141,32 @@ def environment() -> dict[str, Any]:
     return {
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
-        "cpus": os.cpu_count(), "mypy": mypy, "evicted_mb": eviction_bytes() >> 20,
+        "cpus": os.cpu_count(), "mypy": mypy, "evicted_mb": worker.eviction_bytes() >> 20,
     }  # fmt: skip
 
 
-def _start(side: str, *arguments: object) -> subprocess.Popen[str]:
+def _start(side: str, folder: Path | None, *arguments: object) -> subprocess.Popen[str]:
+    """A worker of this program, which judges the packages below ``folder``, by default its own."""
     return subprocess.Popen(
-        [sys.executable, "-m", "hil.tick.worker", *map(str, arguments)],
+        [sys.executable, "-P", worker.__file__, *map(str, arguments)],
         stdout=subprocess.PIPE,
         text=True,
-        env={**os.environ, SWITCH: SIDES[side], "OMP_NUM_THREADS": "1"},
-    )
+        env={
+            **os.environ, SWITCH: SIDES.get(side, "1"), "OMP_NUM_THREADS": "1",
+            "PYTHONPATH": str(folder or source_root()),
+        },
+    )  # fmt: skip
 
 
-def _run(side: str, *arguments: object) -> str:
-    with _start(side, *arguments) as worker:
-        answer = worker.stdout.read() if worker.stdout else ""
-    if worker.returncode:
+def _run(side: str, folder: Path | None, *arguments: object) -> str:
+    with _start(side, folder, *arguments) as process:
+        answer = process.stdout.read() if process.stdout else ""
+    if process.returncode:
         raise CommandFailed("tick.worker", f"the side on the {side} failed; see above", ExitCode.CONFIGURATION)
     return answer
 
 
-def _lines(worker: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
-    assert worker.stdout is not None
-    for line in worker.stdout:
+def _lines(process: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
+    assert process.stdout is not None
+    for line in process.stdout:
         yield json.loads(line)

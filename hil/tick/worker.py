@@ -1,8 +1,9 @@
 """One side of a comparison: ``python -m hil.tick.worker``, on the compiled tick unless ``TIMBERHAND_COMPILED=0``.
 
-``cost RECORDING TICKS`` replays a recording twice, hot and cold, and prints one JSON object.  ``random RECORDING SEED
-TICKS`` runs random ticks and prints a digest of all outputs after every pass.  ``pipe PROFILE`` reads tick records,
-each behind its length (u32), and answers each with the digest of its outputs.
+``cost RECORDING TICKS`` replays a recording twice, hot and cold, and prints one JSON object.  ``replay RECORDING``
+prints how many ticks differ from it; exit status 1 if one does.  ``random RECORDING SEED TICKS`` runs random ticks and
+prints a digest of all outputs after every pass.  ``pipe PROFILE`` reads tick records, each behind its length (u32), and
+answers each with the digest of its outputs.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import gc
 import hashlib
 import json
+import platform
 import struct
 import sys
 import time
@@ -19,6 +21,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from runtime.compiled import activate, running
+
+try:
+    from hil.tick.instructions import open_counter
+except ImportError:  # judging a release that has no such module
+
+    def open_counter() -> None:
+        """No counter."""
+
 
 if TYPE_CHECKING:
     from can_dbc.messages.tick_record import TickRecord
@@ -81,27 +91,51 @@ def cost(place: Path, limit: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def replayed(place: Path) -> dict[str, Any]:
+    """What runs the tick here, and how many ticks give other bytes than the recording."""
+    from controller.process.tick_recording import restore_inputs, transmitted
+    from controller.step import Controller, step
+    from controller.tick import Inputs
+
+    settings, ticks = recorded(place, 0)
+    controller, inputs, differing = Controller(settings), Inputs(), 0
+    for tick in ticks:
+        restore_inputs(inputs, tick)
+        made = transmitted(step(controller, inputs, tick.now_ns))
+        differing += made != (tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report)
+    return {"tick": str(running()), "machine": platform.machine(), "ticks": len(ticks), "differing": differing}
+
+
 def _timed(settings: Settings, ticks: list[TickRecord], between: Callable[[], None]) -> dict[str, Any]:
     from controller.process.tick_recording import restore_inputs, transmitted
     from controller.step import Controller, step
     from controller.tick import Inputs
 
     controller, inputs = Controller(settings), Inputs()
-    wall, cpu = [], []
+    wall, cpu, counts = [], [], []
     differing = 0
     timer_wall, timer_cpu = _timer_cost(between)
+    counter = open_counter()
     for tick in ticks:
         restore_inputs(inputs, tick)
         between()
+        counted = counter.read() if counter else 0
         cpu_begin, begin = time.thread_time_ns(), time.perf_counter_ns()
         outputs = step(controller, inputs, tick.now_ns)
         end, cpu_end = time.perf_counter_ns(), time.thread_time_ns()
+        if counter:
+            counts.append(counter.read() - counted)
         wall.append(end - begin - timer_wall)
         cpu.append(cpu_end - cpu_begin - timer_cpu)
         differing += transmitted(outputs) != (
             tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report
         )  # fmt: skip
-    return {"differing": differing, **_quantiles("", wall), **_quantiles("cpu_", cpu)}
+    if counter:
+        counter.close()
+    return {
+        "differing": differing, "instructions_p50": sorted(counts)[len(counts) // 2] if counts else None,
+        **_quantiles("", wall), **_quantiles("cpu_", cpu),
+    }  # fmt: skip
 
 
 def _timer_cost(between: Callable[[], None]) -> tuple[int, int]:
@@ -175,6 +209,10 @@ def main(arguments: list[str]) -> int:
     command, *rest = arguments
     if command == "cost":
         print(json.dumps(cost(Path(rest[0]), int(rest[1]))))
+    elif command == "replay":
+        found = replayed(Path(rest[0]))
+        print(json.dumps(found))
+        return 1 if found["differing"] else 0
     elif command == "random":
         random_ticks(Path(rest[0]), int(rest[1]), int(rest[2]))
     else:

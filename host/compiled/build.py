@@ -6,7 +6,6 @@ rename.  Of two builders at once the second waits and finds the work done.
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import fcntl
 import importlib.util
@@ -25,9 +24,8 @@ from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any, Final
 
-from can_dbc.dbc.ahead_of_time import module_source
-from can_dbc.dbc.codec import SHIPPED, load
-from host.compiled.modules import CODECS_MODULE, GENERATOR, MODULES, file_of
+from host.compiled.modules import MODULES
+from host.compiled.tree import make_tree, needed_sources
 from host.exit_codes import CommandFailed, ExitCode
 from runtime import compiled
 
@@ -73,17 +71,9 @@ def _build(root: Path, folder: Path, progress: Progress) -> str:
     with tempfile.TemporaryDirectory(prefix=".work-", dir=folder) as work_folder:
         work = Path(work_folder)
         tree, made = work / "tree", work / "made"
-        progress("copying the sources")
-        for package in (*compiled.PACKAGES, "host/compiled"):
-            for path in (root / package).rglob("*.py"):
-                copy = tree / path.relative_to(root)
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(path, copy)
-        shutil.copyfile(root / "host" / "__init__.py", tree / "host" / "__init__.py")
+        progress("copying the sources, generating the codecs")
+        make_tree(root, tree)
         sources = {str(path): compiled.hash_of(tree / path) for path in needed_sources(tree)}
-        progress("generating the codecs")
-        codecs = [codec for name in SHIPPED for codec in load(name).messages.values()]
-        (tree / file_of(CODECS_MODULE)).write_text(module_source(codecs))
         _run_compiler(tree, made, progress)
         suffix = EXTENSION_SUFFIXES[0]
         files = {
@@ -101,28 +91,6 @@ def _build(root: Path, folder: Path, progress: Progress) -> str:
         made.rename(target)
     progress(f"ready: {key}")
     return key
-
-
-def needed_sources(tree: Path) -> list[Path]:
-    """The source files that determine a build: those of `MODULES`, and what they import from our packages.
-
-    The compiler takes types and constants from modules that are imported only.
-    """
-    found: dict[Path, None] = {}
-    waiting = [file_of(module) for module in (*MODULES, GENERATOR)]
-    while waiting:
-        path = waiting.pop()
-        if path in found:
-            continue
-        found[path] = None
-        for node in ast.walk(ast.parse((tree / path).read_bytes())):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom) and node.module:
-                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            for name in names:
-                place = Path(*name.split("."))
-                waiting += [p for p in (place.with_suffix(".py"), place / "__init__.py") if (tree / p).is_file()]
-    return sorted(found)
 
 
 def _run_compiler(tree: Path, made: Path, progress: Progress) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from host.compiled import build
 from host.compiled.modules import MODULES
+from host.compiled.tree import needed_sources
 from host.exit_codes import CommandFailed, ExitCode
 from tests.codes import coded
 
@@ -22,7 +23,7 @@ def test_every_compiled_module_exists_once_in_order_and_knows_no_file_of_its_own
 
 
 def test_a_build_depends_on_the_modules_and_on_what_they_import() -> None:
-    needed = {str(path) for path in build.needed_sources(ROOT)}
+    needed = {str(path) for path in needed_sources(ROOT)}
     assert {"controller/step.py", "machine/profile.py", "can_dbc/frame.py"} <= needed
     assert not any(path.startswith(("controller/guard", "controller/plc")) for path in needed)
 

@@ -1,0 +1,44 @@
+#!/bin/sh
+# Replay recordings on the arm64 wheel, in emulation: deploy/arm64/replay.sh WHEEL [RECORDING...]
+# Prints one line of JSON for each recording: what ran the tick, the machine, the ticks, and how many differ from the
+# recording; without one, those that are kept with the tests. Exit status 1 when a byte differs, 3 when a tool is missing.
+set -eu
+
+wheel=$(realpath "$1")
+shift
+cd "$(dirname "$0")/../.."
+python=${PYTHON:-.venv/bin/python}
+work=$PWD/build/arm64
+root=$work/root
+
+command -v qemu-aarch64-static >/dev/null || {
+    echo "arm64: qemu-aarch64-static is missing: sh deploy/debian_packages.sh qemu-user-static" >&2
+    exit 3
+}
+[ -f "$root/.complete" ] || { echo "arm64: no Python for arm64 yet: sh deploy/arm64/build.sh" >&2; exit 3; }
+
+if [ ! -f "$work/site/.complete" ]; then
+    "$python" -m pip --disable-pip-version-check --quiet install --target "$work/site" --only-binary=:all: \
+        --platform manylinux2014_aarch64 --platform manylinux_2_28_aarch64 --python-version 3.11 --implementation cp \
+        -c constraints.txt python-can cantools canopen msgspec mcap packaging >&2 || {
+        echo "arm64: the packages for arm64 cannot be fetched" >&2
+        exit 3
+    }
+    touch "$work/site/.complete"
+fi
+rm -rf "$work/installed"
+"$python" -m zipfile -e "$wheel" "$work/installed"
+if [ $# -eq 0 ]; then
+    for name in palms aoro; do
+        mkdir -p "$work/$name"
+        xz -dc "tests/recordings/$name.mcap.xz" >"$work/$name/run.mcap"
+        set -- "$@" "$work/$name/run.mcap"
+    done
+fi
+cd "$work"
+status=0
+for recording; do
+    qemu-aarch64-static -L "$root" -E PYTHONPATH="$work/installed:$work/site" \
+        "$root/usr/bin/python3.11" -m hil.tick.worker replay "$recording" || status=1
+done
+exit $status
