@@ -7,10 +7,10 @@ export OPENBLAS_NUM_THREADS := 1
 # Kept bytecode halves pytest's collection (25 s to 13 s of CPU per worker); an environment may forbid it, this one does not.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup wheel demo test check lint docs bench soak lab-kernel clean
+.PHONY: help setup wheel wheel-arm64 demo test check lint docs bench soak lab-kernel clean
 
 help:  ## show this list
-	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F':.*## ' '/^[a-z0-9-]+:.*## /{printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(VENV)/.ready: pyproject.toml constraints.txt deploy/setup.sh
 	@PYTHON=$(PYTHON) sh deploy/setup.sh $(VENV)
@@ -21,6 +21,10 @@ setup: $(VENV)/.ready  ## create the virtual environment; compiles the tick in t
 
 wheel: setup  ## a wheel for this platform with the compiled tick, in dist/
 	@TIMBERHAND_COMPILE=1 $(BIN)/python -m pip wheel --no-deps --no-build-isolation -w dist .
+
+wheel-arm64: setup  ## the same for arm64, cross-compiled
+	@sh deploy/debian_packages.sh gcc-aarch64-linux-gnu libc6-dev-arm64-cross
+	@sh deploy/arm64/build.sh dist
 
 demo: setup  ## a log goes from the ground into the bunk over CAN; ARGS="--lockstep", ARGS="--bus vcan", ...
 	@$(BIN)/timberhand demo $(ARGS)

@@ -27,7 +27,8 @@ from controller.config import load
 from controller.step import Controller, step
 from controller.tick import Inputs
 outputs = step(Controller(load("palms_471")), Inputs(), 10**9)
-print(compiled.running().kind, len(outputs.frames), outputs.sync[1].hex())
+from can_dbc.dbc.codegen import AHEAD_OF_TIME
+print(compiled.running().kind, bool(AHEAD_OF_TIME), len(outputs.frames), outputs.sync[1].hex())
 """
 
 
@@ -70,6 +71,6 @@ def test_the_compiled_wheel_runs_compiled_and_the_switch_turns_it_off(tmp_path: 
         pytest.skip(str(missing))
     wheel, target = install(tmp_path, "1")
     assert "none-any" not in wheel.name
-    kind, *outputs = answer(target)
-    assert kind == "compiled"
-    assert answer(target, **{SWITCH: "0"}) == ["interpreter", *outputs]
+    kind, codecs, *outputs = answer(target)
+    assert (kind, codecs) == ("compiled", "True")
+    assert answer(target, **{SWITCH: "0"}) == ["interpreter", "False", *outputs]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,9 +35,9 @@ def clean(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     sys.modules.pop("runtime.served_module", None)
 
 
-def make_build(root: Path, folder: Path, **changes: object) -> Path:
+def make_build(root: Path, folder: Path, key: str = "0123456789abcdef", **changes: object) -> Path:
     """A build whose compiled module is a Python file that says so."""
-    build = folder / "0123456789abcdef"
+    build = folder / key
     build.mkdir(parents=True)
     (build / "served.py").write_text("ORIGIN = 'compiled'\n")
     source = "runtime/served_module.py"
@@ -67,6 +68,19 @@ def test_one_changed_source_file_refuses_the_whole_build_and_is_named(root: Path
     running = compiled.activate(root, tmp_path / "builds")
     assert running.kind == "interpreter" and "runtime/served_module.py" in running.reason
     assert sys.meta_path == finders
+
+
+def test_of_several_builds_that_do_not_fit_the_newest_is_named(root: Path, tmp_path: Path) -> None:
+    for age, key in enumerate(("b", "c", "a")):
+        made = make_build(root, tmp_path / "builds", key, platform=f"platform {key}")
+        os.utime(made / compiled.MANIFEST, ns=(0, 10**18 - age * 10**9))
+    assert "build b: it was made for platform b" in compiled.find_build(root, tmp_path / "builds")[1]
+
+
+def test_a_served_name_without_a_file_is_no_module(root: Path, tmp_path: Path) -> None:
+    sys.meta_path.insert(0, compiled._Finder({"runtime.served_module": tmp_path / "missing.py"}))
+    with pytest.raises(ModuleNotFoundError, match="compiled form only"):
+        importlib.import_module("runtime.served_module")
 
 
 def test_a_removed_source_file_refuses_the_build(root: Path, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,19 +12,20 @@ from timberhand.commands.options import JsonOption
 if TYPE_CHECKING:
     from hil.tick.compare import Progress
 
-MIN_RATIO: Final = 2.0
-
 
 def tick(
     recordings: Annotated[
         list[Path] | None,
         typer.Argument(metavar="[RECORDING]...", help="Runs, or their run.mcap (default: those kept with the tests)."),
     ] = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Turns of each side; the quietest counts.")] = 3,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of all sides; fewer than 6 decide nothing.")] = 7,
     ticks: Annotated[int, typer.Option(min=0, help="Only the first TICKS of a recording; 0: all.")] = 2000,
     random: Annotated[
         int, typer.Option("--random", min=0, metavar="TICKS", help="Compare the bytes of TICKS random ticks instead.")
     ] = 0,
+    against: Annotated[
+        str, typer.Option(metavar="REF|WHEEL", help="A tag, commit or wheel as third side (default: the newest tag).")
+    ] = "",
     seed: Annotated[int, typer.Option(help="Seed of the random ticks.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -32,13 +33,19 @@ def tick(
 
     Cost is the processor time of one tick without the bus, hot (replayed at
     once) and cold (caches evicted before each tick, as after 5 ms of other
-    work). Exit code 6 when a byte differs or a ratio is below 2.
+    work), and the instructions of one tick where the host counts them. A ratio
+    is the median over the rounds, with its 95 % interval; "inconclusive" when
+    the interval holds the limit. The last release, or --against, is compiled
+    in build/against and judged in the same rounds. Exit code 6 when a byte
+    differs or a ratio is missed.
 
     [bold]Examples[/bold]
 
       timberhand bench tick
 
-      timberhand bench tick runs/demo-1 --rounds 5
+      timberhand bench tick runs/demo-1 --rounds 9
+
+      timberhand bench tick --against HEAD~20
 
       timberhand bench tick --random 1000000
     """
@@ -46,7 +53,7 @@ def tick(
     import sys
     import tempfile
 
-    from hil.tick import compare
+    from hil.tick import compare, release
     from host.exit_codes import ExitCode
 
     def progress(text: str) -> None:
@@ -59,7 +66,11 @@ def tick(
             rows = _random(places, seed, random, progress)
             reached = all(row["differs_after"] is None for row in rows)
         else:
-            rows = [compare.compare_cost(place, ticks, rounds, progress) for place in places]
+            wanted = against or release.newest_tag()
+            other = release.release(wanted, progress) if wanted else None
+            if other is None:
+                progress("no release to compare with: there is no tag, and no --against")
+            rows = [compare.compare_cost(place, ticks, rounds, progress, other) for place in places]
             reached = all(_good(row) for row in rows)
     environment = compare.environment() | {"build": key}
     result = {"environment": environment, "reached": reached, "recordings": rows}
@@ -80,18 +91,25 @@ def _random(places: list[Path], seed: int, ticks: int, progress: Progress) -> li
 
 
 def _good(row: dict[str, Any]) -> bool:
-    ratios = row["compiled_ratio_hot"], row["compiled_ratio_cold"]
-    return min(ratios) >= MIN_RATIO and not row["interpreter"]["differing"] and not row["compiled"]["differing"]
+    missed = any(found["verdict"] == "missed" for found in row["ratios"].values())
+    return not missed and not row["interpreter"]["differing"] and not row["compiled"]["differing"]
 
 
 def _show_cost(row: dict[str, Any]) -> None:
     typer.echo(f"{row['recording']}: {row['ticks']} ticks, processor time of a tick p50 / p99")
-    for side in ("interpreter", "compiled"):
-        found = row[side]
-        figures = (f"{c} {found[c]['cpu_p50_us']:.0f} / {found[c]['cpu_p99_us']:.0f} us" for c in ("hot", "cold"))
-        typer.echo(f"  {side:12} {'   '.join(figures)}   {found['differing']} ticks differ from the recording")
-    hot, cold = row["compiled_ratio_hot"], row["compiled_ratio_cold"]
-    typer.echo(f"  compiled is {hot:.2f} times as fast hot, {cold:.2f} times cold (needed {MIN_RATIO:.0f})")
+    for side in ("interpreter", "compiled", "release"):
+        if side in row:
+            found = row[side]
+            figures = (f"{c} {found[c]['cpu_p50_us']:.0f} / {found[c]['cpu_p99_us']:.0f} us" for c in ("hot", "cold"))
+            count = found["instructions_p50"]
+            counted = f"{count} instructions" if count else "instructions not counted here"
+            typer.echo(f"  {side:12} {'   '.join(figures)}   {counted}   {found['differing']} ticks differ")
+    for name, found in row["ratios"].items():
+        high = "" if found["high"] is None else f"{found['high']:.2f}"
+        typer.echo(
+            f"  {name:20} {found['ratio']:.2f} ({found['low']:.2f} to {high}), at least {found['at_least']}: "
+            f"{found['verdict']}"
+        )
 
 
 def _show_random(row: dict[str, Any]) -> None:

@@ -1,0 +1,93 @@
+"""The judge of `timberhand bench tick`: intervals and verdicts, the counter of instructions, and the other release."""
+
+from __future__ import annotations
+
+import math
+import random
+import statistics
+import subprocess
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from hil.tick import release
+from hil.tick.instructions import Counter
+from hil.tick.ratio import compared, median_interval, verdict
+from host.exit_codes import CommandFailed
+from tests.codes import coded
+
+SOFTWARE, TASK_CLOCK = 1, 1
+
+
+def test_the_interval_holds_the_median_as_often_as_it_says() -> None:
+    rng = random.Random(1)
+    held = 0
+    for _ in range(2000):
+        low, high = median_interval([math.exp(rng.gauss(0, 1)) for _ in range(9)])
+        held += low <= 1.0 <= high
+    assert 0.95 <= held / 2000 < 0.985
+
+
+@pytest.mark.parametrize("n", range(6))
+def test_fewer_than_six_rounds_bound_nothing(n: int) -> None:
+    assert median_interval([3.0] * n) == (0.0, math.inf)
+
+
+def test_six_rounds_give_their_range_and_one_wild_round_of_nine_does_not_count() -> None:
+    assert median_interval([6.0, 1.0, 2.0, 3.0, 4.0, 5.0]) == (1.0, 6.0)
+    assert median_interval([1000.0, *[2.0] * 8]) == (2.0, 2.0)
+
+
+def test_a_limit_inside_the_interval_is_inconclusive() -> None:
+    assert [verdict(interval, 2.0) for interval in ((2.0, 3.0), (1.0, 1.9), (1.9, 2.1), (0.0, math.inf))] == [
+        "reached", "missed", "inconclusive", "inconclusive"
+    ]  # fmt: skip
+
+
+def test_ratios_are_those_of_the_same_round() -> None:
+    slow, fast = [10.0, 20.0, 40.0, 10.0, 20.0, 40.0], [5.0, 10.0, 20.0, 5.0, 10.0, 20.0]
+    found = compared(slow, fast, 2.0)
+    assert (found["ratio"], found["low"], found["high"], found["verdict"]) == (2.0, 2.0, 2.0, "reached")
+    assert statistics.median(slow) / statistics.median(fast) == 2.0
+
+
+def test_the_counter_counts_this_threads_events() -> None:
+    try:
+        counter = Counter(SOFTWARE, TASK_CLOCK)
+    except OSError as refused:
+        pytest.skip(f"perf_event_open: {refused}")
+    before = counter.read()
+    sum(range(200_000))
+    assert counter.read() > before
+    counter.close()
+
+
+def test_an_unknown_release_is_refused_by_name() -> None:
+    for wanted in ("no-such-tag", "missing.whl"):
+        with pytest.raises(CommandFailed, check=coded("tick.against")) as refused:
+            release.release(wanted, print)
+        assert wanted in str(refused.value)
+
+
+def test_a_wheel_is_unpacked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(release, "source_root", lambda: tmp_path)
+    with zipfile.ZipFile(tmp_path / "a.whl", "w") as wheel:
+        wheel.writestr("controller/step.py", "")
+    first = release.release(str(tmp_path / "a.whl"), print)
+    assert first.name == "a.whl" and (first.folder / "controller" / "step.py").is_file()
+    assert release.release(str(tmp_path / "a.whl"), print) == first
+    assert [path.name for path in (tmp_path / "build" / "against").iterdir()] == [first.folder.name]
+
+
+def test_the_newest_tag_is_the_last_release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(release, "source_root", lambda: tmp_path)
+    assert release.newest_tag() == ""
+    git = ["git", "-c", "user.name=n", "-c", "user.email=e"]
+    subprocess.run([*git, "init", "-q"], cwd=tmp_path, check=True)
+    for tag in ("v2", "v1"):
+        stamp = {"v2": "2026-01-01T00:00:00Z", "v1": "2026-01-02T00:00:00Z"}[tag]
+        environment = {"GIT_COMMITTER_DATE": stamp, "GIT_AUTHOR_DATE": stamp, "PATH": "/usr/bin:/bin"}
+        subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", tag], cwd=tmp_path, env=environment, check=True)
+        subprocess.run(["git", "tag", tag], cwd=tmp_path, check=True)
+    assert release.newest_tag() == "v1"
