@@ -78,10 +78,13 @@ def compare_cost(
     comparisons = [("compiled_ratio", "interpreter", "compiled", MIN_RATIO)]
     if against:
         comparisons.append(("release_ratio", "release", "compiled", MIN_RELEASE_RATIO))
+    medians = {
+        (side, caches): [float(turn[caches]["cpu_p50_us"]) for turn in found]
+        for side, found in turns.items()
+        for caches in CACHES
+    }
     ratios = {
-        f"{name}_{caches}": compared(
-            *([turn[caches]["cpu_p50_us"] for turn in turns[side]] for side in (slow, fast)), at_least
-        )
+        f"{name}_{caches}": compared(medians[slow, caches], medians[fast, caches], at_least)
         for name, slow, fast, at_least in comparisons
         for caches in CACHES
     }

@@ -22,17 +22,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runtime.compiled import activate, running
 
-try:
-    from hil.tick.instructions import open_counter
-except ImportError:  # judging a release that has no such module
-
-    def open_counter() -> None:
-        """No counter."""
-
-
 if TYPE_CHECKING:
     from can_dbc.messages.tick_record import TickRecord
     from controller.config import Settings
+    from hil.tick.instructions import Counter
 
 WARM_TICKS: Final = 200
 CACHE_LINE_BYTES: Final = 64
@@ -115,7 +108,7 @@ def _timed(settings: Settings, ticks: list[TickRecord], between: Callable[[], No
     wall, cpu, counts = [], [], []
     differing = 0
     timer_wall, timer_cpu = _timer_cost(between)
-    counter = open_counter()
+    counter = _counter()
     for tick in ticks:
         restore_inputs(inputs, tick)
         between()
@@ -136,6 +129,15 @@ def _timed(settings: Settings, ticks: list[TickRecord], between: Callable[[], No
         "differing": differing, "instructions_p50": sorted(counts)[len(counts) // 2] if counts else None,
         **_quantiles("", wall), **_quantiles("cpu_", cpu),
     }  # fmt: skip
+
+
+def _counter() -> Counter | None:
+    """A counter of instructions; None where the host, or the release that is judged, has none."""
+    try:
+        from hil.tick.instructions import open_counter
+    except ImportError:
+        return None
+    return open_counter()
 
 
 def _timer_cost(between: Callable[[], None]) -> tuple[int, int]:
