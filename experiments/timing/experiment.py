@@ -16,11 +16,11 @@ from experiments.common.registry import Options
 from experiments.common.result import Result, commit, environment, limits_of
 from experiments.common.result_page import Page, publish
 from experiments.timing import evaluation, host_activity, plots, reference_loops
-from experiments.timing.instructions import INSTRUCTIONS, count, open_counter
 from experiments.timing.losses import Loss, Stall, Stop, sentences, stall_before_stop, stall_of_loss
 from experiments.timing.measurement import MeasurementWindow, load, measure, pooled, system_calls
 from experiments.timing.metrics import CONCLUSION, INTRODUCTION, METRICS, SECTIONS
 from experiments.timing.testbed import TestbedConfig, TimingTestbed
+from hil.tick.instructions import INSTRUCTIONS, count, open_counter
 from host.exit_codes import CommandFailed, ExitCode
 from machine.loading.profile_file import load_profile
 

@@ -16,6 +16,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -25,7 +26,6 @@ from runtime.compiled import activate, running
 if TYPE_CHECKING:
     from can_dbc.messages.tick_record import TickRecord
     from controller.config import Settings
-    from hil.tick.instructions import Counter
 
 WARM_TICKS: Final = 200
 CACHE_LINE_BYTES: Final = 64
@@ -112,32 +112,31 @@ def _timed(settings: Settings, ticks: list[TickRecord], between: Callable[[], No
     for tick in ticks:
         restore_inputs(inputs, tick)
         between()
-        counted = counter.read() if counter else 0
+        counted = counter() if counter else 0
         cpu_begin, begin = time.thread_time_ns(), time.perf_counter_ns()
         outputs = step(controller, inputs, tick.now_ns)
         end, cpu_end = time.perf_counter_ns(), time.thread_time_ns()
         if counter:
-            counts.append(counter.read() - counted)
+            counts.append(counter() - counted)
         wall.append(end - begin - timer_wall)
         cpu.append(cpu_end - cpu_begin - timer_cpu)
         differing += transmitted(outputs) != (
             tick.frames_out, tick.machine_frames_out, tick.report, tick.vehicle_report
         )  # fmt: skip
-    if counter:
-        counter.close()
     return {
         "differing": differing, "instructions_p50": sorted(counts)[len(counts) // 2] if counts else None,
         **_quantiles("", wall), **_quantiles("cpu_", cpu),
     }  # fmt: skip
 
 
-def _counter() -> Counter | None:
-    """A counter of instructions; None where the host, or the release that is judged, has none."""
+def _counter() -> Callable[[], int] | None:
+    """Reads the instructions of this thread; None where the host, or the release that is judged, counts none."""
     try:
-        from hil.tick.instructions import open_counter
+        from hil.tick.instructions import INSTRUCTIONS, count, open_counter
     except ImportError:
         return None
-    return open_counter()
+    descriptor = open_counter(0, INSTRUCTIONS)
+    return None if descriptor is None else partial(count, descriptor)
 
 
 def _timer_cost(between: Callable[[], None]) -> tuple[int, int]:

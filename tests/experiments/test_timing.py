@@ -14,12 +14,13 @@ from can_dbc.dbc.codec import load
 from can_dbc.protocols.e2e import Sender
 from can_dbc.timing.durations import Durations
 from can_dbc.timing.page import STAGES, BusCounters, Facts, ProcessCounters
-from experiments.timing import evaluation, experiment, host_activity, instructions, losses, reference_loops
+from experiments.timing import evaluation, experiment, host_activity, losses, reference_loops
 from experiments.timing.continuity import Continuity
 from experiments.timing.host_activity import HostActivity
 from experiments.timing.measurement import MeasurementWindow, pooled
 from experiments.timing.metrics import METRICS, SECTIONS
 from experiments.timing.reference_loops import SleepLoopReport
+from hil.tick import instructions
 from machine.status.reasons import Reason
 
 PERIOD_NS = 5_000_000

@@ -1,4 +1,4 @@
-"""The judge of `timberhand bench tick`: intervals and verdicts, the counter of instructions, and the other release."""
+"""The judge of `timberhand bench tick`: intervals and verdicts, and the other release."""
 
 from __future__ import annotations
 
@@ -12,12 +12,9 @@ from pathlib import Path
 import pytest
 
 from hil.tick import release
-from hil.tick.instructions import Counter
 from hil.tick.ratio import compared, median_interval, verdict
 from host.exit_codes import CommandFailed
 from tests.codes import coded
-
-SOFTWARE, TASK_CLOCK = 1, 1
 
 
 def test_the_interval_holds_the_median_as_often_as_it_says() -> None:
@@ -50,17 +47,6 @@ def test_ratios_are_those_of_the_same_round() -> None:
     found = compared(slow, fast, 2.0)
     assert (found["ratio"], found["low"], found["high"], found["verdict"]) == (2.0, 2.0, 2.0, "reached")
     assert statistics.median(slow) / statistics.median(fast) == 2.0
-
-
-def test_the_counter_counts_this_threads_events() -> None:
-    try:
-        counter = Counter(SOFTWARE, TASK_CLOCK)
-    except OSError as refused:
-        pytest.skip(f"perf_event_open: {refused}")
-    before = counter.read()
-    sum(range(200_000))
-    assert counter.read() > before
-    counter.close()
 
 
 def test_an_unknown_release_is_refused_by_name() -> None:
