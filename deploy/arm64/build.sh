@@ -38,8 +38,8 @@ Dir::Etc::sourceparts "/dev/null";
 END
     export APT_CONFIG="$work/apt/apt.conf"
     (cd "$work/apt/archives" && apt-get -qq update && apt-get -qq download python3.11-minimal libpython3.11-minimal \
-        libpython3.11-stdlib libpython3.11-dev libc6 libgcc-s1 libstdc++6 libexpat1 zlib1g libssl3 libffi8 libbz2-1.0 libsqlite3-0 \
-        liblzma5 libuuid1) >&2 || { echo "arm64: Debian's packages for arm64 cannot be fetched" >&2; exit 3; }
+        libpython3.11-stdlib libpython3.11-dev libc6 libgcc-s1 libstdc++6 libexpat1 zlib1g libssl3 libffi8 \
+        libbz2-1.0 libsqlite3-0 liblzma5 libuuid1) >&2 || { echo "arm64: Debian's packages for arm64 cannot be fetched" >&2; exit 3; }
     for package in "$work"/apt/archives/*.deb; do dpkg-deb -x "$package" "$root"; done
     touch "$root/.complete"
 fi
