@@ -88,4 +88,4 @@ def metrics_of(results: Mapping[str, Result]) -> Iterator[tuple[str, Result, Met
         module = import_module(EXPERIMENTS[name].module)
         for metric in module.page_of(result, {}).metrics:
             if metric.name in result.metrics:
-                yield name, result, metric
+                yield name, result, result.as_judged(metric)

@@ -13,7 +13,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
@@ -77,6 +77,11 @@ class Result:
     limits: dict[str, tuple[float | None, float | None]] = field(default_factory=dict)
     missed: tuple[str, ...] = ()
     inconclusive: tuple[str, ...] = ()
+
+    def as_judged(self, metric: Metric) -> Metric:
+        """The metric with the limits against which this result was evaluated; those of today may differ."""
+        least, most = self.limits.get(metric.name, (None, None))
+        return replace(metric, least=least, most=most)
 
     def interval_text(self, metric: Metric) -> str:
         """The interval of a rate with its number of trials; empty for other metrics."""

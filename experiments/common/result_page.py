@@ -88,7 +88,7 @@ def markdown(result: Result, page: Page) -> str:
     for section in page.sections:
         out += [f"## {section.title}", ""]
         out += [section.text, ""] if section.text else []
-        shown = [m for m in section.metrics if m.name in result.metrics]
+        shown = [result.as_judged(m) for m in section.metrics if m.name in result.metrics]
         out += ["| metric | measured | limit | |", "|---|---|---|---|"] if shown else []
         for m in shown:
             value = m.text(result.metrics[m.name]) + result.interval_text(m)
@@ -126,7 +126,7 @@ def limits_sentence(result: Result, metrics: Iterable[Metric]) -> str:
     total, missed, unsure = len(result.limits), len(result.missed), len(result.inconclusive)
     if not total:
         return ""
-    by_name = {m.name: m for m in metrics}
+    by_name = {m.name: result.as_judged(m) for m in metrics}
     parts = [{1: "The limit is met.", 2: "Both limits are met."}.get(total, f"All {total} limits are met.")]
     if missed or unsure:
         parts = [f"{total - missed - unsure} of {total} limits are met."]
@@ -161,7 +161,7 @@ def _state(metric: Metric, result: Result) -> str:
 def show(result: Result, sections: Sequence[Section], console: Console) -> None:
     """Print the metrics as a list."""
     for section in sections:
-        shown = [m for m in section.metrics if m.name in result.metrics]
+        shown = [result.as_judged(m) for m in section.metrics if m.name in result.metrics]
         if shown:
             console.print(f"\n[bold]{section.title}[/bold]", highlight=False)
         for m in shown:

@@ -226,4 +226,4 @@ def test_the_guard_lives_with_a_bus_and_without_one(systemd: Systemd, state: Bus
     run_guard(guard, bus, ended, Notifier(lambda: f"{guard.verdict.name} {bus.stats.state.name}"))
     *others, last = systemd.heard()
     assert last == {"STOPPING": "1", "STATUS": "Ending."}
-    assert others[0] == {"READY": "1", "WATCHDOG": "1", "STATUS": f"ESTOP {state.name}"}
+    assert others[0] == {"READY": "1", "WATCHDOG": "1", "STATUS": f"ESTOP_LOST {state.name}"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -14,7 +15,7 @@ from rich.console import Console
 from experiments.common import pool
 from experiments.common.pool import Checkpoint, Job
 from experiments.common.registry import Options
-from experiments.common.result import ROOT, Metric, Result, evaluate, rate, wilson
+from experiments.common.result import ROOT, Metric, Result, evaluate, limits_of, rate, wilson
 from experiments.common.result_page import Page, Section, markdown
 from experiments.common.trials import LOCKSTEP_SOURCES, SOURCES, check_truth, checkpoint, source_hash
 from experiments.plant.signals import ringing
@@ -169,7 +170,9 @@ def test_a_decay_without_oscillation_has_no_frequency():
 
 def made(metrics: dict[str, float], missed: tuple[str, ...] = ()) -> Result:
     environment = dict.fromkeys(("processor", "cpus", "machine", "python", "pybullet", "numba", "truth"), "x")
-    return Result("thing", "abc", "palms_471", 1, 5, metrics, {"speed": 3.0}, environment, missed=missed)
+    return Result(
+        "thing", "abc", "palms_471", 1, 5, metrics, {"speed": 3.0}, environment, limits_of((SPEED, SHARE)), missed
+    )
 
 
 def test_result_json_is_flat_and_without_nan(tmp_path):
@@ -188,6 +191,14 @@ def test_the_page_shows_conclusion_and_plot_first_and_then_the_table():
     assert "| How often | 5% (0.9 to 23.6, n = 20) | at most 2 | **missed** |" in text
     places = [text.index(part) for part in ("It moves at", "![A plot.]", "## Method", "| How fast", "![Another.]")]
     assert places == sorted(places) and text.count("a.png") == 1
+
+
+def test_a_page_shows_the_limits_against_which_its_result_was_judged():
+    result = replace(made({"x": 3.0, "y": 4.0}), limits={"x": (None, 5.0)})
+    today = (Metric("x", "X", "us", "", most=2.0), Metric("y", "Y", "us", "", most=1.0))
+    text = markdown(result, Page("T", (), "", (Section("S", "", today),)))
+    assert "| X | 3 us | at most 5 | met |" in text
+    assert "| Y | 4 us |  |  |" in text, "a limit that came later has not judged this result"
 
 
 def test_every_source_of_a_fingerprint_exists_and_a_missing_one_does_not_fail():
