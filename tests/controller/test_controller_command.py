@@ -1,7 +1,6 @@
 """The controller's command: start errors with their exit codes, addresses, and one run from start to signal."""
 
 import json
-import socket
 
 import pytest
 
@@ -11,18 +10,6 @@ from controller.process.command import bus_address, listen, main, parser
 from controller.process.warm_up import NullBus
 from tests.codes import coded
 from tests.controller.bench import MS
-
-
-@pytest.fixture
-def udp():
-    made = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3)]
-    for s in made:
-        s.bind(("127.0.0.1", 0))
-        s.settimeout(2)
-    made[0].setblocking(False)
-    yield made
-    for s in made:
-        s.close()
 
 
 def test_start_errors_have_their_code_and_one_sentence(capsys, tmp_path):

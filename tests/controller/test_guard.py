@@ -5,67 +5,30 @@ import random
 from pathlib import Path
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import OperatorAction
 from can_dbc.protocols.e2e import Sender, crc8
-from controller.guard.__main__ import build, main, profile_path
+from controller.guard.__main__ import build, main
 from controller.guard.envelope import read_envelope
-from controller.guard.guard import CALM_NS, LATCHING, Guard, Verdict, checksum
+from controller.guard.guard import CALM_NS, Guard, Verdict, checksum
 from controller.guard.layout import GuardConfigError, read_layouts
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 from tests.codes import coded
 from tests.controller.bench import DATABASE, MS, Bench, T, count_until
-
-PROFILE = profile_path("palms_471")
-CENTRE = 8192
-GOOD_A = {"Mode": 0}
-GOOD_B = {"ArmKey": 0xA}
-MOVING = {"Mode": 2, "Slew": 13.0}
-
-
-class Traffic:
-    """Frames on a bus, for the guard alone."""
-
-    def __init__(self) -> None:
-        self.guard = build(PROFILE)
-        self.now_ns = 10**9
-        self.senders = {n: Sender(m.data_ids) for n, m in DATABASE.messages.items() if m.data_ids}
-        self.a, self.b, self.estop = dict(GOOD_A), dict(GOOD_B), {"ChannelA": 1, "ChannelB": 1}
-        self.encoder = {"EncSlew": CENTRE, "EncLift": CENTRE, "EncTilt": CENTRE, "EncExt": 100_000, "EncRot": CENTRE}
-        self.dropped: set[str] = set()
-        self.extra: list[Frame] = []
-        self.stamp = 0
-        self.status: list[dict] = []
-        self.sent: list[tuple[int, bytes]] = []
-
-    def frame(self, name, values):
-        codec = DATABASE.message(name)
-        data = codec.encode(*(values.get(s.name, 0) for s in codec.signals))
-        return Frame(self.now_ns, codec.key, self.senders[name].protect(data) if codec.data_ids else data)
-
-    def tick(self, n=1):
-        for _ in range(n):
-            self.now_ns += T
-            self.stamp = (self.stamp + 5000) & 0xFFFF
-            wanted = {"ValveCmdA": self.a, "ValveCmdB": self.b, "EstopStat": self.estop}
-            wanted |= {e: {"Position": p, "TimeStamp": self.stamp} for e, p in self.encoder.items()}
-            frames = [self.frame(n, v) for n, v in wanted.items() if n not in self.dropped]
-            self.sent = self.guard.step(self.now_ns, frames + self.extra)
-            self.extra = []
-            for key, data in self.sent:
-                if key == 0x1FD:
-                    codec = DATABASE.message("GuardStat")
-                    self.status.append(codec.named(codec.receive(data)))
-        return self.guard.verdict
-
-    def good(self):
-        self.tick(60)
-        assert self.guard.verdict is Verdict.GOOD
-        return self
+from tests.controller.guard_traffic import (
+    BROKEN,
+    MOVING,
+    PROFILE,
+    Traffic,
+    encoder_frozen,
+    encoder_gone,
+    outside,
+    spoil,
+)
 
 
 def test_enables_after_200_ms_without_a_broken_rule():
@@ -89,54 +52,6 @@ def test_first_heartbeat_is_the_boot_up_frame():
     assert (0x77D, b"\x00") in traffic.sent
     traffic.tick(20)
     assert (0x77D, b"\x05") in traffic.sent
-
-
-def change(**fields):
-    def apply(traffic):
-        for name, value in fields.items():
-            getattr(traffic, name).update(value)
-
-    return apply
-
-
-def encoder_gone(traffic):
-    traffic.a.update(MOVING)
-    traffic.dropped.add("EncTilt")
-
-
-def encoder_frozen(traffic):
-    traffic.a.update(MOVING)
-    traffic.tick(1)
-    traffic.dropped.add("EncTilt")
-    codec = DATABASE.message("EncTilt")
-    for _ in range(25):
-        traffic.extra.append(Frame(traffic.now_ns, codec.key, codec.encode(CENTRE, 7, 0)))
-        traffic.tick(1)
-
-
-def outside(traffic):
-    traffic.encoder["EncSlew"] = CENTRE + int(1.85 / 3.835e-4)
-    traffic.a.update(MOVING)
-
-
-BROKEN = {
-    "command A gone": (Verdict.NO_COMMAND, 15, 60, lambda t: t.dropped.add("ValveCmdA")),
-    "command B gone": (Verdict.NO_COMMAND, 15, 60, lambda t: t.dropped.add("ValveCmdB")),
-    "not armed": (Verdict.NOT_ARMED, 15, 10, change(a=MOVING, b={"ArmKey": 0})),
-    "rotator not armed": (Verdict.NOT_ARMED, 15, 10, change(b={"Rot": 11.0, "ArmKey": 0})),
-    "grapple not armed": (Verdict.NOT_ARMED, 15, 10, change(b={"Grapple": 100.0, "ArmKey": 0})),
-    "nearly armed": (Verdict.NOT_ARMED, 15, 10, change(a=MOVING, b={"ArmKey": 0xB})),
-    "unknown mode": (Verdict.RANGE, 15, 10, change(a={"Mode": 1})),
-    "auxiliary": (Verdict.RANGE, 6, 10, change(b={"Aux": 1.0})),
-    "value not available": (Verdict.RANGE, 1, 10, change(a={"Mode": 2, "Lift": None})),
-    "grapple not available": (Verdict.RANGE, 5, 10, change(b={"Grapple": None})),
-    "too fast a change": (Verdict.RATE, 2, 10, change(a={"Mode": 2, "Tilt": 80.0})),
-    "estop pressed": (Verdict.ESTOP, 15, 10, change(estop={"ChannelA": 0, "ChannelB": 0})),
-    "estop channel in error": (Verdict.ESTOP, 15, 10, change(estop={"ChannelB": 2})),
-    "estop gone": (Verdict.ESTOP_LOST, 15, 40, lambda t: t.dropped.add("EstopStat")),
-    "encoder gone": (Verdict.ENCODER, 2, 100, encoder_gone),
-    "outside": (Verdict.OUTSIDE, 0, 10, outside),
-}
 
 
 @pytest.mark.parametrize("name", BROKEN)
@@ -244,13 +159,6 @@ def play_on_a_fresh_guard(pattern, message):
     return broken
 
 
-def spoil(traffic, message):
-    """The next frame of a message has a wrong checksum."""
-    traffic.dropped.add(message)
-    frame = traffic.frame(message, traffic.a if message == "ValveCmdA" else traffic.b)
-    traffic.extra.append(Frame(frame.stamp_ns, frame.key, bytes([frame.data[0] ^ 1]) + frame.data[1:]))
-
-
 def test_lost_frames_in_a_row_and_a_second_controller_break_trust():
     traffic = Traffic().good()
     traffic.senders["ValveCmdA"].counter += 3
@@ -310,13 +218,6 @@ def test_another_guard(key):
     assert traffic.tick() is Verdict.OTHER_GUARD
 
 
-def press_reset(traffic, ticks=4):
-    traffic.estop["ResetReq"] = 1
-    traffic.tick(ticks)
-    traffic.estop["ResetReq"] = 0
-    return traffic.tick()
-
-
 def test_enable_returns_after_a_silence_and_200_ms_of_neutral_commands():
     traffic = Traffic().good()
     traffic.dropped.add("ValveCmdB")
@@ -327,130 +228,6 @@ def test_enable_returns_after_a_silence_and_200_ms_of_neutral_commands():
     traffic.a.update({"Mode": 0, "Slew": 0.0})
     k = count_until(traffic.tick, lambda: traffic.guard.verdict is Verdict.GOOD)
     assert abs(k * T - CALM_NS) <= 2 * T
-
-
-def other_guard(traffic):
-    traffic.extra.append(Frame(traffic.now_ns, 0x1FD, bytes(8)))
-
-
-def corrupt(traffic):
-    for _ in range(2):
-        spoil(traffic, "ValveCmdA")
-
-
-LATCHED = {name: case for name, case in BROKEN.items() if case[0] in LATCHING}
-LATCHED |= {
-    "other guard": (Verdict.OTHER_GUARD, 15, 10, other_guard),
-    "corrupt": (Verdict.CORRUPT, 15, 10, corrupt),
-}
-
-
-def test_every_rule_that_latches_is_tried():
-    assert {case[0] for case in LATCHED.values()} == LATCHING
-
-
-@pytest.mark.parametrize("name", LATCHED)
-def test_it_never_enables_again_by_itself(name):
-    """The cause is gone and all commands are neutral; only the button of the safety module lets it enable again."""
-    traffic = Traffic().good()
-    a, b, estop, encoder = dict(traffic.a), dict(traffic.b), dict(traffic.estop), dict(traffic.encoder)
-    LATCHED[name][3](traffic)
-    traffic.tick(5)
-    assert not traffic.guard.enabled
-    press_reset(traffic)
-    pressed_too_early = traffic.guard.verdict
-    traffic.a, traffic.b, traffic.estop, traffic.encoder = a, b, estop, encoder
-    traffic.dropped.clear()
-    if name not in ("other guard", "corrupt"):  # these two are over at once
-        assert pressed_too_early is not Verdict.CALMING
-        assert traffic.tick(2000) is Verdict.LATCHED
-    traffic.tick(10)
-    press_reset(traffic)
-    assert count_until(traffic.tick, lambda: traffic.guard.enabled) * T <= CALM_NS + 2 * T
-
-
-def test_a_button_that_is_held_a_moving_command_and_a_lost_module_give_no_reset():
-    traffic = Traffic().good()
-    traffic.estop["ResetReq"] = 1
-    traffic.tick(5)
-    traffic.estop["ChannelA"] = 0
-    traffic.tick(5)
-    traffic.estop["ChannelA"] = 1
-    assert traffic.tick(100) is Verdict.LATCHED, "held since before"
-    traffic.dropped.add("EstopStat")
-    traffic.tick(20)
-    traffic.dropped.clear()
-    assert traffic.tick(100) is Verdict.LATCHED, "the module was away, and its button is still down"
-    traffic.estop["ResetReq"] = 0
-    traffic.a.update(MOVING)
-    assert press_reset(traffic) is Verdict.LATCHED, "a motion is commanded"
-    traffic.a = dict(GOOD_A)
-    assert press_reset(traffic) is Verdict.CALMING
-    assert traffic.tick(60) is Verdict.GOOD
-
-
-values = st.sampled_from([-100.0, -13.0, 0.0, 13.0, 100.0, None])
-lies = st.fixed_dictionaries(
-    {
-        "a": st.fixed_dictionaries(
-            {"Mode": st.integers(0, 3)} | dict.fromkeys(("Slew", "Lift", "Tilt", "Ext"), values)
-        ),
-        "b": st.fixed_dictionaries(
-            {
-                "ArmKey": st.sampled_from([0, 0xA, 0xB]), "Rot": values, "Grapple": values, "Aux": values,
-                "GrappleMode": st.integers(0, 3), "MaxFlow": st.sampled_from([0.0, 100.0]),
-            }
-        ),
-        "ticks": st.integers(1, 70),
-        "channels": st.sampled_from([(1, 1)] * 6 + [(0, 0), (1, 0), (2, 1)]),
-        "reset": st.booleans(),
-        "slew_counts": st.sampled_from([CENTRE] * 3 + [CENTRE - 5200, CENTRE + 5200]),
-        "gone": st.sampled_from([set()] * 5 + [{"EncLift"}, {"EstopStat"}, {"ValveCmdA"}]),
-        "skip": st.sampled_from([0, 0, 0, 1, 2, 7]),
-    }
-)  # fmt: skip
-NEUTRAL_LIE = {"a": dict(GOOD_A), "b": dict(GOOD_B), "ticks": 60, "channels": (1, 1), "reset": False,
-               "slew_counts": CENTRE, "gone": set(), "skip": 0}  # fmt: skip
-
-
-@given(st.lists(st.one_of(lies, st.just(NEUTRAL_LIE)), max_size=12))
-@example([NEUTRAL_LIE, NEUTRAL_LIE | {"channels": (0, 0)}, NEUTRAL_LIE, NEUTRAL_LIE])
-@settings(max_examples=150, deadline=None)
-def test_a_controller_that_lies_in_every_field_moves_nothing_outside_the_promise(episodes):
-    """What the valve node would do is judged from the sent values alone, by rules written here."""
-    traffic, stopped, before, since_encoder = Traffic(), False, True, 0
-    for lie in episodes:
-        traffic.a, traffic.b = dict(lie["a"]), dict(lie["b"])
-        a, b = lie["channels"]
-        traffic.estop = {"ChannelA": a, "ChannelB": b, "ResetReq": int(lie["reset"])}
-        traffic.encoder["EncSlew"] = lie["slew_counts"]
-        traffic.dropped = set(lie["gone"])
-        traffic.senders["ValveCmdA"].counter += lie["skip"]
-        for k in range(lie["ticks"]):
-            traffic.tick()
-            seen = "EstopStat" not in traffic.dropped
-            stopped |= seen and (a, b) != (1, 1) and k >= 3
-            if seen and lie["reset"] and not before and (a, b) == (1, 1):
-                stopped = False
-            before = lie["reset"] if seen else True
-            since_encoder = since_encoder + 1 if "EncLift" in traffic.dropped else 0
-            if not traffic.guard.enabled or k < 3:
-                continue
-            assert not stopped, "the emergency stop was pressed, and nobody has reset it since"
-            assert (a, b) == (1, 1) or not seen
-            functions = {
-                **{n: lie["a"].get(n) or 0.0 for n in ("Slew", "Lift", "Tilt", "Ext")},
-                "Rot": lie["b"].get("Rot"),
-            }
-            spools = {n: v for n, v in functions.items() if v} if lie["a"]["Mode"] == 2 else {}
-            if "ValveCmdA" in traffic.dropped or lie["skip"] > 1:
-                continue  # the node has no such command
-            assert not lie["b"].get("Aux") and None not in {**lie["a"], **lie["b"]}.values()
-            moves = spools or lie["b"].get("GrappleMode") in (1, 2)
-            assert not moves or lie["b"]["ArmKey"] == 0xA
-            assert not spools or since_encoder * T <= 100 * MS
-            side = (lie["slew_counts"] > CENTRE) - (lie["slew_counts"] < CENTRE)
-            assert side * spools.get("Slew", 0.0) <= 0.0, "driven further out"
 
 
 def test_own_checksum_and_layout_agree_with_the_codecs():

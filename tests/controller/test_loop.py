@@ -1,7 +1,6 @@
 """The loop: deadlines, skipped periods, datagrams, records, warm-up; with a bus in memory and a scripted clock."""
 
 import os
-import socket
 
 import pytest
 
@@ -75,18 +74,6 @@ class Clock:
         self.deadlines.append(deadline_ns)
         late_ns = self.lateness.pop(0) if self.lateness else 0
         self.now_ns = max(self.now_ns, deadline_ns) + late_ns
-
-
-@pytest.fixture
-def udp():
-    made = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3)]
-    for s in made:
-        s.bind(("127.0.0.1", 0))
-        s.settimeout(2)
-    made[0].setblocking(False)
-    yield made
-    for s in made:
-        s.close()
 
 
 def build(udp, clock, bus=None, page=None):

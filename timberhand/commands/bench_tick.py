@@ -105,11 +105,9 @@ def _show_cost(row: dict[str, Any]) -> None:
             counted = f"{count} instructions" if count else "instructions not counted here"
             typer.echo(f"  {side:12} {'   '.join(figures)}   {counted}   {found['differing']} ticks differ")
     for name, found in row["ratios"].items():
-        high = "" if found["high"] is None else f"{found['high']:.2f}"
-        typer.echo(
-            f"  {name:20} {found['ratio']:.2f} ({found['low']:.2f} to {high}), at least {found['at_least']}: "
-            f"{found['verdict']}"
-        )
+        few = found["high"] is None
+        interval = "fewer than 6 rounds give no interval" if few else f"{found['low']:.2f} to {found['high']:.2f}"
+        typer.echo(f"  {name:20} {found['ratio']:.2f} ({interval}), at least {found['at_least']}: {found['verdict']}")
 
 
 def _show_random(row: dict[str, Any]) -> None:
