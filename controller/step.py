@@ -28,6 +28,7 @@ from controller.crane.outputs import CraneWriter
 from controller.crane.startup import Startup, check_nodes
 from controller.estimation.joint_estimator import JointEstimator
 from controller.estimation.motion_monitor import MotionMonitor
+from controller.estimation.sensed_joint import SensedJoint
 from controller.requests.gate import RequestGate
 from controller.requests.setpoint_gate import RequestRefused
 from controller.state_report import StateReporter
@@ -36,10 +37,12 @@ from controller.tick import Inputs, Outputs
 from controller.transitions import OPERATING, Event
 from machine.joints import JOINTS
 from machine.profile import joint
-from machine.sensing.encoder import position_from_counts
 from machine.status.modes import Mode
 from machine.status.reasons import Reason
 
+# A constant of the module is found faster than a member of an enumeration, in every tick.
+_NONE: Final = Reason.NONE
+_ACTIVE: Final = Mode.ACTIVE
 HALF_SPEED_SHARE: Final = 0.5
 MAX_ELAPSED_PERIODS: Final = 4
 """After a pause the laws count at most this many periods."""
@@ -55,7 +58,7 @@ class Controller:
     """
 
     __slots__ = (
-        "_encoder_specs", "_last_ns", "_reporter", "_settings", "carrier_bus", "crane", "crane_bus_monitor",
+        "_last_ns", "_receive_sdo", "_reporter", "_sensed", "_settings", "carrier_bus", "crane", "crane_bus_monitor",
         "crane_inputs", "estimators", "gate", "inputs_in_use", "motion_monitors", "outputs", "startup", "supervisor",
         "vehicle", "writer",
     )  # fmt: skip
@@ -75,7 +78,6 @@ class Controller:
         check_nodes(database, profile)
         period_s = settings.period_ns * 1e-9
         self._settings = settings
-        self._encoder_specs = [s.encoder for s in specs]
         self.crane_inputs = CraneInputs(database, profile)
         self.crane_bus_monitor = BusMonitor(0)
         carrier, articulation = profile.carrier, self.crane_inputs.articulation
@@ -83,7 +85,13 @@ class Controller:
         """None on a fixed base, as is ``carrier_bus``."""
         self.carrier_bus = self.vehicle.bus if self.vehicle else None
         self.startup = Startup(profile)
+        self._receive_sdo = self.startup.receive
         self.estimators = [JointEstimator(s, period_s) for s in specs]
+        self._sensed = [
+            SensedJoint(state, s.encoder, estimator)
+            for state, s, estimator in zip(self.crane_inputs.encoders, specs, self.estimators, strict=True)
+            if state is not None and s.encoder is not None
+        ]
         self.supervisor = Supervisor(
             profile, self.crane_inputs, self.crane_bus_monitor, self.carrier_bus, self.estimators, self.startup
         )
@@ -119,7 +127,7 @@ class Controller:
         if monitor.recovered:
             received.forget()
             self.startup.restart()
-        received.decode([] if monitor.frames_lost else inputs.frames, now_ns, self.startup.receive)
+        received.decode([] if monitor.frames_lost else inputs.frames, now_ns, self._receive_sdo)
         for number in received.nodes.booted:
             self.startup.node_booted(number)
         if bus is not None:
@@ -129,15 +137,10 @@ class Controller:
 
     def estimate(self, elapsed_ns: int, now_ns: int) -> None:
         """Estimate joint positions and velocities, the load, and the carrier's pose."""
-        for j, (state, spec) in enumerate(zip(self.crane_inputs.encoders, self._encoder_specs, strict=True)):
-            estimator = self.estimators[j]
+        for estimator in self.estimators:
             estimator.predict(now_ns)
-            if state is None or spec is None:
-                continue
-            if state.fresh:
-                estimator.update(position_from_counts(spec, state.get("Position")), state.stamp_ns)
-            elif state.values is None:
-                estimator.reset()
+        for sensed in self._sensed:
+            sensed.update()
         self.crane.estimate_load(now_ns)
         if self.vehicle is not None:
             self.vehicle.estimate(elapsed_ns, now_ns)
@@ -146,7 +149,7 @@ class Controller:
 
     def reference(self, now_ns: int) -> None:
         """Compute the crane's reference of this tick."""
-        self.crane.update_reference(self.supervisor.mode is Mode.ACTIVE, self._speed_cap, now_ns)
+        self.crane.update_reference(self.supervisor.mode is _ACTIVE, self._speed_cap, now_ns)
 
     @property
     def _speed_cap(self) -> float:
@@ -172,7 +175,7 @@ class Controller:
                     self._apply_operator_action(message, now_ns)
             except RequestRefused as refused:
                 self.gate.count_refusal(refused.reason, refused.detail, now_ns)
-        if self.supervisor.mode is Mode.ACTIVE and self._refused_too_often(now_ns):
+        if self.supervisor.mode is _ACTIVE and self._refused_too_often(now_ns):
             self.supervisor.react_to(Reason.SETPOINTS_REFUSED, 0, now_ns)
         if self.supervisor.reset_button_pressed():
             self.supervisor.request_reset(now_ns)
@@ -187,7 +190,7 @@ class Controller:
             supervisor.request_reset(now_ns)
         else:
             reason, detail = supervisor.request_arm(now_ns)
-            if reason is not Reason.NONE:
+            if reason is not _NONE:
                 raise RequestRefused(reason, detail)
             self.gate.start_session()
             if self.vehicle is not None:
@@ -248,17 +251,17 @@ class Controller:
         """Check inputs, leases, a running spool test, the carrier and the joints; update the mode."""
         supervisor, period_ns = self.supervisor, self._settings.period_ns
         supervisor.supervise(inputs.late_ns, period_ns, now_ns)
-        if supervisor.mode is Mode.ACTIVE:
+        if supervisor.mode is _ACTIVE:
             self._check_leases(now_ns)
         run = self.crane.spool_run
-        if supervisor.mode is Mode.ACTIVE and run.running:
+        if supervisor.mode is _ACTIVE and run.running:
             tested = self.estimators[run.function]
             reason = run.check(tested.position, tested.velocity, self._speed_cap, now_ns)
-            if reason is not Reason.NONE:
+            if reason is not _NONE:
                 supervisor.react_to(reason, run.function, now_ns)
         if self.vehicle is not None:
             reason, detail = self.vehicle.check(supervisor.armed, now_ns)
-            if reason is not Reason.NONE:
+            if reason is not _NONE:
                 supervisor.react_to(reason, detail, now_ns)
         monitored = supervisor.mode in OPERATING
         for j, monitor in enumerate(self.motion_monitors):
@@ -267,7 +270,7 @@ class Controller:
                 monitor.reset()
                 continue
             reason = monitor.step(self.crane.commands[j], estimator.velocity)
-            if reason is not Reason.NONE:
+            if reason is not _NONE:
                 supervisor.react_to(reason, j, now_ns)
                 monitored = supervisor.mode in OPERATING
 
@@ -292,7 +295,7 @@ class Controller:
     def control(self, elapsed_ns: int, now_ns: int) -> None:
         """Run the laws while ACTIVE; fade the last command during a stop's ramp; otherwise command neutral."""
         supervisor = self.supervisor
-        active, ramping = supervisor.mode is Mode.ACTIVE, supervisor.ramping
+        active, ramping = supervisor.mode is _ACTIVE, supervisor.ramping
         self.crane.control(active, self._ramp_share(now_ns), ramping, self._speed_cap, now_ns, elapsed_ns)
         vehicle = self.vehicle
         if vehicle is not None:
@@ -316,7 +319,7 @@ class Controller:
         frames.clear()
         moving = crane.leased or supervisor.ramping
         writer.commands(crane.spools_pct, crane.grapple.spool_pct, crane.grapple.mode, moving, supervisor.armed, frames)
-        rates = crane.governor.lead_velocity if supervisor.mode is Mode.ACTIVE else crane.commands
+        rates = crane.governor.lead_velocity if supervisor.mode is _ACTIVE else crane.commands
         writer.references(self.reference_position, rates, moving, frames)
         self._reporter.note_timing(inputs.late_ns, inputs.tick_ns)
         if writer.status_due(now_ns):

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from controller.bus_io.bus_monitor import BusMonitor
+from controller.bus_io.message_state import Signal
 from controller.carrier.bus import CarrierBus
 from controller.carrier.inputs import CarrierInputs
 from controller.crane.inputs import CraneInputs
@@ -25,6 +26,11 @@ from machine.status.faults import FAULTS
 from machine.status.modes import Mode
 from machine.status.reasons import Reaction, Reason
 
+# A constant of the module is found faster than a member of an enumeration, in every tick.
+_NONE: Final = Reason.NONE
+_BOOT: Final = Mode.BOOT
+_ACTIVE: Final = Mode.ACTIVE
+_STOP: Final = Mode.STOP
 _WAITING: Final = (Mode.BOOT, Mode.STANDBY)
 RAMP_NS: Final = 60_000_000
 """Ramp of an R1: with the slowest detection before it (20 ms), neutral well within 100 ms of the loss."""
@@ -56,14 +62,24 @@ class Supervisor:
         "_alarms",
         "_axes",
         "_bus_monitors",
+        "_channel_a",
+        "_channel_b",
         "_degraded_until_ns",
         "_echo",
+        "_echo_counter",
         "_echo_ticks",
+        "_enable",
+        "_heading",
         "_late_stamps",
+        "_latitude",
+        "_person",
+        "_plc_faults",
+        "_reset_button",
         "_reset_pressed",
         "_slow_end_ns",
         "_startup",
         "_stop_ramp_ns",
+        "_valve_state",
         "carrier_inputs",
         "coast_ns",
         "crane_inputs",
@@ -90,6 +106,15 @@ class Supervisor:
     ) -> None:
         self.crane_inputs = inputs
         self.carrier_inputs = carrier_bus.inputs if carrier_bus is not None else None
+        self._enable, self._person, self._reset_button, self._channel_a, self._channel_b = (
+            Signal(inputs.guard, "Enable"), Signal(inputs.estop, "Person"), Signal(inputs.estop, "ResetReq"),
+            Signal(inputs.estop, "ChannelA"), Signal(inputs.estop, "ChannelB"),
+        )  # fmt: skip
+        self._valve_state, self._echo_counter = Signal(inputs.valve_a, "State"), Signal(inputs.valve_b, "EchoCounter")
+        self._plc_faults = Signal(inputs.plc, "FaultBits")
+        carrier = self.carrier_inputs
+        self._latitude = Signal(carrier.position, "Latitude") if carrier is not None else None
+        self._heading = Signal(carrier.heading, "Heading") if carrier is not None else None
         self._bus_monitors = (crane_monitor,) if carrier_bus is None else (crane_monitor, carrier_bus.monitor)
         self._startup = startup
         sensed = [*inputs.encoders, inputs.articulation]
@@ -131,7 +156,7 @@ class Supervisor:
     @property
     def ramping(self) -> bool:
         """Whether the machine is still slowing down."""
-        return self.mode is Mode.STOP and self.ramp_ns > 0
+        return self.mode is _STOP and self.ramp_ns > 0
 
     def apply(self, event: Event, reason: Reason, detail: int, now_ns: int) -> bool:
         """Change the mode by the table; True when it changed.  ``reason`` is kept as the cause."""
@@ -187,9 +212,9 @@ class Supervisor:
         carrier = self.carrier_inputs
         if any(state.values is None for state in received.needed) or (carrier is not None and carrier.stale_mask):
             return Reason.INPUT_MISSING, 0
-        if received.guard.get("Enable") != _ENABLED:
+        if self._enable.value() != _ENABLED:
             return Reason.GUARD_NOT_READY, 0
-        if received.valve_a.get("State") == _VALVE_FAULT:
+        if self._valve_state.value() == _VALVE_FAULT:
             return Reason.VALVE_NODE_NOT_READY, 0
         absent = received.nodes.not_ready(now_ns)
         if absent:
@@ -197,7 +222,7 @@ class Supervisor:
         for monitor in self._bus_monitors:
             if not monitor.usable(now_ns):
                 return Reason.BUS_UNSTABLE, monitor.number
-        self.worst, self.worst_detail = Reason.NONE, 0
+        self.worst, self.worst_detail = _NONE, 0
         self._check_values()
         self._collect(*received.nodes.worst_finding(now_ns))
         if carrier is not None:
@@ -208,7 +233,7 @@ class Supervisor:
     def supervise(self, late_ns: int, period_ns: int, now_ns: int) -> None:
         """Check everything once, then react to the worst finding."""
         carrier = self.carrier_inputs
-        self.worst, self.worst_detail = Reason.NONE, 0
+        self.worst, self.worst_detail = _NONE, 0
         for monitor in self._bus_monitors:
             if monitor.reason:
                 self._collect(monitor.reason, monitor.number)
@@ -221,13 +246,14 @@ class Supervisor:
             if self.crane_inputs.stale_mask:
                 self._check_stale()
             self._check_values()
-            self._collect(*self.crane_inputs.nodes.worst_finding(now_ns))
+            reason, node = self.crane_inputs.nodes.worst_finding(now_ns)
+            self._collect(reason, node)
             self._check_echo(period_ns)
             if carrier is not None:
                 self._check_carrier(carrier)
         self._check_lateness(late_ns, period_ns, now_ns)
         self._react(now_ns)
-        if self.mode is Mode.BOOT and self._startup.complete:
+        if self.mode is _BOOT and self._startup.complete:
             self.apply(Event.BOOTED, Reason.NONE, 0, now_ns)
         if self.ramping and now_ns >= (self._slow_end_ns if self.coast_ns else self.ramp_end_ns):
             self.ramp_ns = 0
@@ -235,7 +261,7 @@ class Supervisor:
                 self.apply(Event.LATCHED, self.reason, self.detail, now_ns)
         if self.mode in _WAITING:
             self.reason, self.detail = self.arming_blocker(now_ns)
-            if self.reason is Reason.NONE:
+            if self.reason is _NONE:
                 self.reason = self._advisory()
         elif self.mode in OPERATING and not self.half_speed:
             self.reason, self.detail = self._advisory(), 0
@@ -260,7 +286,7 @@ class Supervisor:
 
     def reset_button_pressed(self) -> bool:
         """Whether the reset button of the safety module went down in this tick."""
-        pressed = self.crane_inputs.estop.get("ResetReq")
+        pressed = self._reset_button.value()
         if pressed is None:
             return False
         before, self._reset_pressed = self._reset_pressed, pressed == _YES
@@ -283,14 +309,12 @@ class Supervisor:
         self._collect(Reason.LOOP_STALLED if stalled else Reason.LOOP_LATE)
 
     def _estop_released(self) -> bool:
-        estop = self.crane_inputs.estop
-        return bool(estop.get("ChannelA") == _RELEASED and estop.get("ChannelB") == _RELEASED)
+        return bool(self._channel_a.value() == _RELEASED and self._channel_b.value() == _RELEASED)
 
     def _check_estop(self) -> None:
-        estop = self.crane_inputs.estop
-        if estop.values is None or self._estop_released():
+        if self.crane_inputs.estop.values is None or self._estop_released():
             return
-        channels = (estop.get("ChannelA"), estop.get("ChannelB"))
+        channels = (self._channel_a.value(), self._channel_b.value())
         known = all(channel in (_RELEASED, _PRESSED) for channel in channels)
         self._collect(Reason.ESTOP_PRESSED if known else Reason.ESTOP_CHANNELS)
 
@@ -315,14 +339,14 @@ class Supervisor:
     def _check_values(self) -> None:
         """Values that are known and bad; a stale value is not checked here."""
         received = self.crane_inputs
-        if received.guard.values is not None and received.guard.get("Enable") != _ENABLED:
+        if received.guard.values is not None and self._enable.value() != _ENABLED:
             self._collect(Reason.GUARD_REFUSES)
-        if received.estop.get("Person") == _YES:
+        if self._person.value() == _YES:
             self._collect(Reason.PERSON_IN_ZONE)
-        state = received.valve_a.get("State")
-        if state == _VALVE_FAULT or (state == _VALVE_PILOT_OFF and self.mode is Mode.ACTIVE):
+        state = self._valve_state.value()
+        if state == _VALVE_FAULT or (state == _VALVE_PILOT_OFF and self.mode is _ACTIVE):
             self._collect(Reason.VALVE_NODE_FAULT)
-        if received.plc.get("FaultBits"):
+        if self._plc_faults.value():
             self._collect(Reason.PLC_FAULT)
         for place, encoder, alarm in self._alarms:
             values = encoder.values
@@ -346,16 +370,16 @@ class Supervisor:
 
     def _advisory(self) -> Reason:
         """A loss to report although the machine may work."""
-        carrier = self.carrier_inputs
-        if carrier is None:
-            return Reason.NONE
-        if carrier.position.get("Latitude") is None or carrier.heading.get("Heading") is None:
+        carrier, latitude, heading = self.carrier_inputs, self._latitude, self._heading
+        if carrier is None or latitude is None or heading is None:
+            return _NONE
+        if latitude.value() is None or heading.value() is None:
             return Reason.GNSS_LOST
-        return Reason.ENGINE_LOST if carrier.engine.values is None else Reason.NONE
+        return Reason.ENGINE_LOST if carrier.engine.values is None else _NONE
 
     def _check_echo(self, period_ns: int) -> None:
         """The valve node echoes the counter of the last accepted command; it must change."""
-        echo = self.crane_inputs.valve_b.get("EchoCounter")
+        echo = self._echo_counter.value()
         self._echo_ticks = 0 if echo != self._echo else self._echo_ticks + 1
         self._echo = echo
         if self._echo_ticks > MAX_ECHO_TICKS and self._echo_ticks * period_ns > MAX_ECHO_NS:

@@ -82,29 +82,83 @@ class TickRecord:
     vehicle_report: bytes = b""
 
 
+class RecordWriter:
+    """Writes one record after the other into the same memory, so that a tick allocates next to nothing."""
+
+    __slots__ = ("_buffer", "_view")
+
+    def __init__(self) -> None:
+        self._buffer = bytearray(MAX_BYTES)
+        self._view = memoryview(self._buffer)
+
+    def write(
+        self,
+        now_ns: int,
+        late_ns: int,
+        tick_ns: int,
+        missed_ticks: int,
+        bus: BusReading,
+        machine_bus: BusReading,
+        frames_in: Sequence[Frame],
+        machine_frames_in: Sequence[Frame],
+        datagrams: Sequence[bytes],
+        frames_out: Sequence[tuple[int, bytes]],
+        machine_frames_out: Sequence[tuple[int, bytes]],
+        report: bytes,
+        vehicle_report: bytes,
+    ) -> memoryview:
+        """The bytes of a tick (the fields of `TickRecord`), valid until the next call.
+
+        Raises:
+            RecordRefused: it does not fit into a datagram.
+        """
+        buffer, n_in, n_out = self._buffer, len(frames_in) + len(machine_frames_in), len(frames_out)
+        n_out += len(machine_frames_out)
+        size = _HEAD.size + n_in * _IN.size + n_out * _OUT.size + len(report) + len(vehicle_report) + _CRC.size
+        for datagram in datagrams:
+            size += _LENGTH.size + len(datagram)
+        if size > MAX_BYTES:
+            raise RecordRefused("tick-record.too-long", f"the tick's record of {size} bytes fits no datagram")
+        _HEAD.pack_into(
+            buffer, 0, MAGIC, VERSION, n_in, len(datagrams), n_out, len(report), now_ns, late_ns, tick_ns, missed_ticks,
+            bus.state, bus.dropped, bus.refused, bus.errors, bus.recoveries,
+            machine_bus.state, machine_bus.dropped, machine_bus.refused, machine_bus.errors, machine_bus.recoveries,
+        )  # fmt: skip
+        at = _HEAD.size
+        for stamp_ns, key, data in frames_in:
+            _IN.pack_into(buffer, at, stamp_ns, key, 0, len(data), data)
+            at += _IN.size
+        for stamp_ns, key, data in machine_frames_in:
+            _IN.pack_into(buffer, at, stamp_ns, key, 1, len(data), data)
+            at += _IN.size
+        for datagram in datagrams:
+            _LENGTH.pack_into(buffer, at, len(datagram))
+            at = self._append(datagram, at + _LENGTH.size)
+        for key, data in frames_out:
+            _OUT.pack_into(buffer, at, key, 0, len(data), data)
+            at += _OUT.size
+        for key, data in machine_frames_out:
+            _OUT.pack_into(buffer, at, key, 1, len(data), data)
+            at += _OUT.size
+        at = self._append(vehicle_report, self._append(report, at))
+        _CRC.pack_into(buffer, at, zlib.crc32(self._view[:at]))
+        return self._view[:size]
+
+    def _append(self, data: bytes, at: int) -> int:
+        end = at + len(data)
+        self._view[at:end] = data
+        return end
+
+
 def encode(tick: TickRecord) -> bytes:
-    """The bytes of a tick."""
-    a, b = tick.bus, tick.machine_bus
-    pack_in, pack_out, pack_length = _IN.pack, _OUT.pack, _LENGTH.pack
-    parts = [
-        _HEAD.pack(
-            MAGIC, VERSION, len(tick.frames_in) + len(tick.machine_frames_in), len(tick.datagrams),
-            len(tick.frames_out) + len(tick.machine_frames_out), len(tick.report),
-            tick.now_ns, tick.late_ns, tick.tick_ns, tick.missed_ticks,
-            a.state, a.dropped, a.refused, a.errors, a.recoveries,
-            b.state, b.dropped, b.refused, b.errors, b.recoveries,
+    """The bytes of a tick; raises RecordRefused when they do not fit into a datagram."""
+    return bytes(
+        RecordWriter().write(
+            tick.now_ns, tick.late_ns, tick.tick_ns, tick.missed_ticks, tick.bus, tick.machine_bus, tick.frames_in,
+            tick.machine_frames_in, tick.datagrams, tick.frames_out, tick.machine_frames_out, tick.report,
+            tick.vehicle_report,
         )
-    ]  # fmt: skip
-    parts += [pack_in(stamp, key, 0, len(data), data) for stamp, key, data in tick.frames_in]
-    parts += [pack_in(stamp, key, 1, len(data), data) for stamp, key, data in tick.machine_frames_in]
-    for datagram in tick.datagrams:
-        parts.append(pack_length(len(datagram)))
-        parts.append(datagram)
-    parts += [pack_out(key, 0, len(data), data) for key, data in tick.frames_out]
-    parts += [pack_out(key, 1, len(data), data) for key, data in tick.machine_frames_out]
-    parts += [tick.report, tick.vehicle_report]
-    body = b"".join(parts)
-    return body + _CRC.pack(zlib.crc32(body))
+    )  # fmt: skip
 
 
 def decode(data: bytes) -> TickRecord:

@@ -20,6 +20,7 @@ RECOVERY_LIMIT_COUNT: Final = 3
 RECOVERY_WINDOW_NS: Final = 60_000_000_000
 _OFF: Final = int(BusState.OFF)
 _PASSIVE: Final = int(BusState.PASSIVE)
+_NONE: Final = Reason.NONE
 
 
 class BusMonitor:
@@ -78,7 +79,7 @@ class BusMonitor:
         ):
             self.reason = Reason.SEND_REFUSED
         else:
-            self.reason = Reason.BUS_PASSIVE if state == _PASSIVE else Reason.NONE
+            self.reason = Reason.BUS_PASSIVE if state == _PASSIVE else _NONE
 
     def usable(self, now_ns: int) -> bool:
         """Whether the machine may be armed on this bus."""

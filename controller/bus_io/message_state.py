@@ -20,6 +20,21 @@ NEUTRAL_WITHIN_NS: Final = 100_000_000
 _MAX_TIMEOUT_NS: Final = NEUTRAL_WITHIN_NS - 10_000_000
 
 
+class Signal:
+    """One signal of a message, found once: a name costs a tick more than its value."""
+
+    __slots__ = ("_place", "_state")
+
+    def __init__(self, state: MessageState, name: str) -> None:
+        """Raises KeyError if the message has no such signal."""
+        self._state, self._place = state, state.codec.index[name]
+
+    def value(self) -> Any:
+        """The value now; None when the message is unknown or stale, or the signal not available."""
+        values = self._state.values
+        return None if values is None else values[self._place]
+
+
 class MessageState:
     """One message; ``values`` is None before the first good frame and when they are stale."""
 
@@ -68,7 +83,7 @@ class MessageState:
         """Check a frame and keep its values when they are good."""
         stamp_ns, _, data = frame
         checker = self._checker
-        if checker is not None and not checker.check(data).usable:
+        if checker is not None and not checker.accepts(data):
             self.refused += 1
             if not checker.trusted:
                 self.values = None

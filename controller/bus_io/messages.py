@@ -12,6 +12,8 @@ from machine.status.modes import Mode
 from machine.status.reasons import Reaction, Reason
 
 ARM_KEY: Final = 0xA
+_STOP: Final = Mode.STOP
+_FAULT: Final = Mode.FAULT
 _RUN: Final = 0
 _DEGRADED: Final = 1
 _CONTROLLED_STOP: Final = 2
@@ -66,8 +68,8 @@ class ProtectedMessage:
 
 def safe_state(mode: Mode, reason: Reason, half_speed: bool) -> int:
     """The safety state in `CtrlStatus` and `CtrlAlive`."""
-    if mode is Mode.STOP:
+    if mode is _STOP:
         return _CONTROLLED_STOP
-    if mode is Mode.FAULT:
+    if mode is _FAULT:
         return _SAFE_STOP if FAULTS[reason].reaction is Reaction.CUT else _CONTROLLED_STOP
     return _DEGRADED if half_speed else _RUN

@@ -14,14 +14,15 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from controller.bus_io.message_state import or_nan
+from controller.bus_io.message_state import Signal, or_nan
 from controller.carrier.inputs import CarrierInputs
 from controller.estimation.joint_estimator import JointEstimator
 from controller.laws.heading import east_north_m
-from machine.geometry.carrier import heading_rate_rad_s
+from machine.geometry.carrier import ARMS, heading_rate_rad_s
 from machine.profile import Carrier
 from machine.status.reasons import Reason
 
+N_ARMS: Final = len(ARMS)
 MAX_JUMP_M: Final = 1.0
 """A position this far from the odometry stops the carrier at once, ..."""
 MAX_REPEATED_JUMP_M: Final = 0.4
@@ -39,6 +40,7 @@ MAX_BEND_RAD: Final = 1.2
 """No articulation bends further; an encoder value beyond it is not an angle."""
 MAGNETIC_REFERENCE: Final = 1
 """VesselHeading.Reference."""
+_NONE: Final = Reason.NONE
 RTK_METHODS: Final = (4, 5)
 """Methods of PGN 129029 that are good enough to drive to a waypoint: RTK fixed and float."""
 
@@ -47,7 +49,9 @@ class DeadReckoning:
     """``yaw_rad`` of the front half and the front axle's position, NaN while unknown; ``finding`` of this tick."""
 
     __slots__ = (
-        "_against", "_axle_m", "_carrier", "_frozen", "_heading_off", "_heading_rad", "_inputs", "_position_off",
+        "_against", "_arms", "_axle_m", "_carrier", "_frozen", "_heading", "_heading_off", "_heading_rad",
+        "_inputs", "_latitude", "_longitude", "_method", "_middle_m", "_pitch", "_position_off", "_reference", "_roll",
+        "_speed",
         "east_m", "finding", "heights_m", "latitude_deg", "longitude_deg", "north_m", "speed_m_s", "steering",
         "tilt_rad", "yaw_rad", "yaw_rate_rad_s",
     )  # fmt: skip
@@ -56,10 +60,18 @@ class DeadReckoning:
         self._carrier = carrier
         self._inputs = inputs
         self.steering = steering
+        self._speed, self._roll, self._pitch = (
+            Signal(inputs.vehicle, "Speed"), Signal(inputs.arms_b, "Roll"), Signal(inputs.arms_b, "Pitch")
+        )  # fmt: skip
+        self._arms = [Signal(inputs.arms_a, f"Arm{i + 1}") for i in range(N_ARMS)]
+        self._heading, self._reference = Signal(inputs.heading, "Heading"), Signal(inputs.heading, "Reference")
+        self._latitude, self._longitude = Signal(inputs.position, "Latitude"), Signal(inputs.position, "Longitude")
+        self._method = Signal(inputs.fix, "Method")
+        self._middle_m = 0.5 * carrier.arm_travel_m
         x, y, z = carrier.antenna_main_m
         self._axle_m = (carrier.front_axle_m - x, -y, z)
         """The front axle ahead and left of the antenna, and the antenna above the arms' pivots."""
-        self.heights_m = [math.nan] * 4
+        self.heights_m = [math.nan] * N_ARMS
         self.speed_m_s = self.yaw_rate_rad_s = math.nan
         self.tilt_rad = (math.nan, math.nan)
         """Roll, + right side down, and pitch, + nose up, of the rear half."""
@@ -80,14 +92,13 @@ class DeadReckoning:
     @property
     def fix(self) -> int:
         """Method of the position's solution, 0 while unknown."""
-        return int(self._inputs.fix.get("Method") or 0)
+        return int(self._method.value() or 0)
 
     @property
     def heading_rad(self) -> float | None:
         """As received, clockwise from true north; None while unknown or when it refers to magnetic north."""
-        state = self._inputs.heading
-        heading: float | None = state.get("Heading")
-        return None if state.get("Reference") == MAGNETIC_REFERENCE else heading
+        heading: float | None = self._heading.value()
+        return None if self._reference.value() == MAGNETIC_REFERENCE else heading
 
     def offset_m(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """(east, north) [m] from the front axle to a geodetic position; NaN while its own position is unknown."""
@@ -99,8 +110,8 @@ class DeadReckoning:
     def step(self, elapsed_s: float) -> None:
         """One tick, after frames are decoded and the articulation is estimated."""
         inputs, steering = self._inputs, self.steering
-        self.finding = Reason.NONE
-        self._update_carrier(inputs)
+        self.finding = _NONE
+        self._update_carrier()
         speed = self.speed_m_s
         bend = min(max(steering.position, -MAX_BEND_RAD), MAX_BEND_RAD)
         self.yaw_rate_rad_s = heading_rate_rad_s(self._carrier, speed, bend, steering.velocity)
@@ -112,15 +123,14 @@ class DeadReckoning:
         self._update_position(inputs)
         self._update_course(inputs)
 
-    def _update_carrier(self, inputs: CarrierInputs) -> None:
-        self.speed_m_s = or_nan(inputs.vehicle.get("Speed"))
-        roll, pitch = inputs.arms_b.get("Roll"), inputs.arms_b.get("Pitch")
+    def _update_carrier(self) -> None:
+        self.speed_m_s = or_nan(self._speed.value())
+        roll, pitch = self._roll.value(), self._pitch.value()
         unknown = roll is None or pitch is None
         self.tilt_rad = (math.nan, math.nan) if unknown else (math.radians(roll), math.radians(pitch))
-        middle, arms = 0.5 * self._carrier.arm_travel_m, inputs.arms_a
-        for i, name in enumerate(("Arm1", "Arm2", "Arm3", "Arm4")):
-            height = arms.get(name)
-            self.heights_m[i] = math.nan if height is None else 1e-3 * height + middle
+        for i in range(N_ARMS):
+            height = self._arms[i].value()
+            self.heights_m[i] = math.nan if height is None else 1e-3 * height + self._middle_m
 
     def _update_heading(self, inputs: CarrierInputs) -> None:
         heading = self.heading_rad
@@ -140,7 +150,7 @@ class DeadReckoning:
 
     def _update_position(self, inputs: CarrierInputs) -> None:
         state = inputs.position
-        latitude, longitude = state.get("Latitude"), state.get("Longitude")
+        latitude, longitude = self._latitude.value(), self._longitude.value()
         if latitude is None or longitude is None:
             self._forget_position()
         elif state.fresh and self.yaw_rad == self.yaw_rad:

@@ -63,14 +63,14 @@ class CarrierInputs:
         self.foreign = False
         for state in self.messages:
             state.fresh = False
-        by_key, by_pgn = self._by_key.get, self._by_pgn.get
+        by_key, by_pgn = self._by_key, self._by_pgn
         for frame in frames:
             key = frame[1]
-            found = by_key(key)
+            found = by_key.get(key)
             if found is not None:
                 found.receive(frame, now_ns)
                 continue
-            found = by_pgn(key & PDU2_MASK)
+            found = by_pgn.get(key & PDU2_MASK)
             if found is not None:
                 if found.codec.length > 8:
                     self._receive_part(found, frame, now_ns)

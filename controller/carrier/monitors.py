@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from controller.bus_io.message_state import Signal
 from controller.carrier.dead_reckoning import RTK_METHODS, DeadReckoning
 from controller.carrier.inputs import CarrierInputs
 from controller.estimation.joint_estimator import TrackedJoint
@@ -42,6 +43,7 @@ ARM_MOVED_M: Final = 0.01
 COMMAND_DELAY_S: Final = 0.04
 """At most this much is added to the steering valve's dead time by VehCmd's period and the vehicle node."""
 _ARMS_FAULT: Final = 3
+_NONE: Final = Reason.NONE
 _STEERING_REASONS: Final = {
     Reason.NONE: Reason.NONE,
     Reason.JOINT_STUCK: Reason.STEERING_STUCK,
@@ -54,14 +56,16 @@ class VehicleMonitor:
     """`step` returns the (reason, detail) of an armed carrier's fault, (NONE, 0) without one."""
 
     __slots__ = (
-        "_arm_from_m", "_arm_since_ns", "_carrier", "_disagree_ns", "_inputs", "_overspeed_ns", "_recent_command_m_s",
-        "_reckoning", "_steering", "_stuck_ns", "_tilt_ns",
+        "_arm_from_m", "_arm_since_ns", "_arms_state", "_articulation", "_carrier", "_disagree_ns", "_fault",
+        "_overspeed_ns", "_recent_command_m_s", "_reckoning", "_steering", "_stuck_ns", "_tilt_ns",
     )  # fmt: skip
 
     def __init__(
         self, carrier: Carrier, inputs: CarrierInputs, reckoning: DeadReckoning, steering: TrackedJoint, period_s: float
     ) -> None:
-        self._carrier, self._inputs, self._reckoning = carrier, inputs, reckoning
+        self._carrier, self._reckoning = carrier, reckoning
+        self._fault, self._articulation = Signal(inputs.vehicle, "Fault"), Signal(inputs.vehicle, "Articulation")
+        self._arms_state = Signal(inputs.arms_a, "State")
         self._steering = MotionMonitor(steering, period_s, COMMAND_DELAY_S, max(LATE_LAG_S, carrier.articulation_lag_s))
         self._arm_from_m, self._arm_since_ns = [0.0] * N_ARMS, [0] * N_ARMS
         self.reset(0)
@@ -76,10 +80,10 @@ class VehicleMonitor:
 
     def ready(self, waypoint: bool) -> Reason:
         """The reason that prevents driving now, to a waypoint or by articulation angles, or NONE."""
-        inputs, reckoning = self._inputs, self._reckoning
-        if inputs.vehicle.get("Fault"):
+        reckoning = self._reckoning
+        if self._fault.value():
             return Reason.CARRIER_FAULT
-        if inputs.arms_a.get("State") == _ARMS_FAULT:
+        if self._arms_state.value() == _ARMS_FAULT:
             return Reason.ARMS_FAULT
         if self._tilted():
             return Reason.TILTED
@@ -108,15 +112,15 @@ class VehicleMonitor:
             self._steering.reset()
             for i in range(N_ARMS):
                 self._arm_since_ns[i] = now_ns
-            return Reason.NONE, 0
-        inputs, reckoning = self._inputs, self._reckoning
+            return _NONE, 0
+        reckoning = self._reckoning
         if reckoning.steering.jumped:
             return Reason.ENCODER_JUMP, ARTICULATION
         if abs(reckoning.steering.position) > self._carrier.articulation_limit_rad + BEND_MARGIN_RAD:
             return Reason.POSITION_OUTSIDE, ARTICULATION
-        if inputs.vehicle.get("Fault"):
+        if self._fault.value():
             return Reason.CARRIER_FAULT, 0
-        if inputs.arms_a.get("State") == _ARMS_FAULT:
+        if self._arms_state.value() == _ARMS_FAULT:
             return Reason.ARMS_FAULT, 0
         if self._disagrees(now_ns):
             return Reason.STEERING_DISAGREES, 0
@@ -161,7 +165,7 @@ class VehicleMonitor:
         return now_ns - self._stuck_ns >= STUCK_NS
 
     def _disagrees(self, now_ns: int) -> bool:
-        theirs = self._inputs.vehicle.get("Articulation")
+        theirs = self._articulation.value()
         if theirs is None or not abs(theirs - self._reckoning.steering.position) > DISAGREE_RAD:
             self._disagree_ns = now_ns
         return now_ns - self._disagree_ns >= DISAGREE_NS
@@ -176,4 +180,4 @@ class VehicleMonitor:
                 self._arm_since_ns[i], self._arm_from_m[i] = now_ns, height
             elif now_ns - self._arm_since_ns[i] >= ARM_STUCK_NS:
                 return Reason.ARM_STUCK, i
-        return Reason.NONE, 0
+        return _NONE, 0

@@ -7,7 +7,6 @@ controller.  After another node won the address nothing is sent, and the carrier
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 from can_dbc.dbc.codec import Database
@@ -22,22 +21,34 @@ COMMAND_NS: Final = 20_000_000
 ALIVE_NS: Final = 100_000_000
 
 
-@dataclass(frozen=True, slots=True)
 class CarrierCommand:
     """The carrier's command; the default stands with the brake on and holds the heights.
+
+    It is made in every tick while the carrier drives, and no dataclass, whose frozen fields take a call each.
 
     A positive articulation rate bends left; arms are front left, front right, rear left, rear right, and + raises the
     frame.  A float valve connects the two arms of its axle; the arm controller refuses both at once.
     """
 
-    moving: bool = False
-    """Sets the arm key: without it the carrier brakes and the arms hold, whatever the other values."""
-    articulation_rate_rad_s: float = 0.0
-    speed_m_s: float = 0.0
-    brake_pct: float = 100.0
-    arm_spools_pct: tuple[float, ...] = (0.0,) * len(ARMS)
-    float_front: bool = False
-    float_rear: bool = False
+    __slots__ = (
+        "arm_spools_pct", "articulation_rate_rad_s", "brake_pct", "float_front", "float_rear", "moving", "speed_m_s",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        moving: bool = False,
+        articulation_rate_rad_s: float = 0.0,
+        speed_m_s: float = 0.0,
+        brake_pct: float = 100.0,
+        arm_spools_pct: tuple[float, ...] = (0.0,) * len(ARMS),
+        float_front: bool = False,
+        float_rear: bool = False,
+    ) -> None:
+        self.moving = moving
+        """Sets the arm key: without it the carrier brakes and the arms hold, whatever the other values."""
+        self.articulation_rate_rad_s, self.speed_m_s, self.brake_pct = articulation_rate_rad_s, speed_m_s, brake_pct
+        self.arm_spools_pct = arm_spools_pct
+        self.float_front, self.float_rear = float_front, float_rear
 
 
 STANDING: Final = CarrierCommand()
@@ -74,8 +85,9 @@ class CarrierWriter:
     def commands(self, command: CarrierCommand, frames: list[RawFrame]) -> None:
         """Append VehCmd, ArmCmdA and ArmCmdB."""
         key = ARM_KEY if command.moving else 0
-        motion = (command.articulation_rate_rad_s, command.speed_m_s, command.brake_pct)
-        frames.append(self._drive.frame_with(key, *motion))
+        frames.append(
+            self._drive.frame_with(key, command.articulation_rate_rad_s, command.speed_m_s, command.brake_pct)
+        )
         frames.append(self._arms_a.frame_with(key, *command.arm_spools_pct))
         frames.append(self._arms_b.frame_with(key, command.float_front, command.float_rear))
 

@@ -24,12 +24,12 @@ from controller.carrier.monitors import VehicleMonitor
 from controller.carrier.outputs import STANDING, CarrierCommand
 from controller.config import Settings
 from controller.estimation.joint_estimator import JointEstimator
+from controller.estimation.sensed_joint import SensedJoint
 from controller.laws.drive import DriveLaw
 from controller.laws.heading import AngleLaw, SteeringLimits, WaypointLaw
 from controller.laws.suspension import Suspension
 from controller.requests.setpoint_gate import RequestRefused, SetpointGate
 from machine.profile import Carrier, CarrierValve, Encoder
-from machine.sensing.encoder import position_from_counts
 from machine.status.reasons import Reason, pack
 
 MAX_CREEP_M_S: Final = 0.1
@@ -59,8 +59,8 @@ class Vehicle:
     """All state of the carrier; `estimate`, `check` and `control` once per tick, in this gate."""
 
     __slots__ = (
-        "_angle", "_articulation", "_carrier", "_elapsed_s", "_inputs", "_lease_end_ns", "_report_due",
-        "_report_sequence", "_settings", "_waypoint", "arms", "bus", "drive", "driving", "estimator", "gate",
+        "_angle", "_carrier", "_elapsed_s", "_inputs", "_lease_end_ns", "_report_due",
+        "_report_sequence", "_sensed", "_settings", "_waypoint", "arms", "bus", "drive", "driving", "estimator", "gate",
         "monitor", "reckoning", "setpoint", "steering",
     )  # fmt: skip
 
@@ -74,10 +74,11 @@ class Vehicle:
         """``articulation`` is its encoder's message on crane0; raises ConfigError."""
         period_s = settings.period_ns * 1e-9
         self.bus = CarrierBus(databases)
-        self._carrier, self._articulation = carrier, articulation
+        self._carrier = carrier
         rate = carrier.articulation_rate_limit_rad_s
         spec = SteeringJoint(carrier.articulation_encoder, carrier.steer_valve, rate, rate / carrier.articulation_lag_s)
         self.estimator = JointEstimator(spec, period_s)
+        self._sensed = SensedJoint(articulation, carrier.articulation_encoder, self.estimator)
         self.reckoning = DeadReckoning(carrier, self.bus.inputs, self.estimator)
         self.monitor = VehicleMonitor(carrier, self.bus.inputs, self.reckoning, spec, period_s)
         self.gate = SetpointGate(settings.profile, settings.profile_hash)
@@ -99,13 +100,8 @@ class Vehicle:
     def estimate(self, elapsed_ns: int, now_ns: int) -> None:
         """Estimate articulation, position and heading at ``now_ns``."""
         self._elapsed_s = elapsed_ns * 1e-9
-        state, estimator = self._articulation, self.estimator
-        estimator.predict(now_ns)
-        if state.fresh:
-            counts = state.get("Position")
-            estimator.update(position_from_counts(self._carrier.articulation_encoder, counts), state.stamp_ns)
-        elif state.values is None:
-            estimator.reset()
+        self.estimator.predict(now_ns)
+        self._sensed.update()
         self.reckoning.step(self._elapsed_s)
 
     @property
@@ -224,7 +220,7 @@ class Vehicle:
         self._steer(m, rolls, now_ns)
         floats = (m.float_front and rolls, m.float_rear and rolls)
         self.arms.step(m.heights_m, reckoning.heights_m, m.level, reckoning.tilt_rad, floats, cap, elapsed_s)
-        self._command(*floats)
+        self._command(floats[0], floats[1])
 
     def _steer(self, m: DriveSetpoint, rolls: bool, now_ns: int) -> None:
         angle, elapsed_s = self.estimator.position, self._elapsed_s

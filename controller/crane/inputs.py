@@ -73,10 +73,10 @@ class CraneInputs:
             state.fresh = False
         nodes = self.nodes
         nodes.begin_tick()
-        find, own = self._by_key.get, self._own
+        by_key, own = self._by_key, self._own
         for frame in frames:
             key = frame[1]
-            found = find(key)
+            found = by_key.get(key)
             if found is not None:
                 found.receive(frame, now_ns)
             elif key in own:

@@ -20,6 +20,9 @@ SAFETY_NODES: Final = (CraneNode.SAFETY_MODULE, CraneNode.VALVES, CraneNode.GUAR
 
 HEARTBEAT_TIMEOUT_NS: Final = 250_000_000
 _COMMUNICATION_LIMIT_COUNT: Final = 3
+_NONE: Final = Reason.NONE
+_LOST: Final = Presence.LOST
+_OPERATIONAL: Final = NodeState.OPERATIONAL
 _COMMUNICATION_WINDOW_NS: Final = 10_000_000_000
 
 
@@ -107,22 +110,22 @@ class NodeMonitor:
         return self._finding
 
     def _worst(self, now_ns: int) -> tuple[Reason, int]:
-        worst, detail = Reason.NONE, 0
+        worst, detail = _NONE, 0
         for number, node in self.by_number.items():
             for reason in (self._absence(number, node, now_ns), _own_report(node)):
-                if FAULTS[reason].reaction > FAULTS[worst].reaction:
+                if reason and FAULTS[reason].reaction > FAULTS[worst].reaction:
                     worst, detail = reason, number
         return worst, detail
 
     def _absence(self, number: int, node: NodeHealth, now_ns: int) -> Reason:
         helper = number in PRESSURE_NODES
-        if self._heartbeats.presence(number, now_ns) is Presence.LOST:
+        if self._heartbeats.presence(number, now_ns) is _LOST:
             if helper:
                 return Reason.PRESSURE_NODE_LOST
             return Reason.SAFETY_NODE_LOST if number in SAFETY_NODES else Reason.ENCODER_NODE_LOST
-        state = self._heartbeats.states.get(number, NodeState.OPERATIONAL)
-        restarted = not helper and (node.booted or state != NodeState.OPERATIONAL)
-        return Reason.NODE_RESTARTED if restarted else Reason.NONE
+        state = self._heartbeats.states.get(number, _OPERATIONAL)
+        restarted = not helper and (node.booted or state != _OPERATIONAL)
+        return Reason.NODE_RESTARTED if restarted else _NONE
 
     def _note_boot(self, number: int) -> None:
         node, boots = self.by_number[number], self._heartbeats.boots[number]
@@ -155,4 +158,4 @@ def _own_report(node: NodeHealth) -> Reason:
     """What a node reports about itself."""
     if node.emergency:
         return Reason.EMERGENCY_MESSAGE
-    return Reason.EMERGENCY_WARNING if node.warning else Reason.NONE
+    return Reason.EMERGENCY_WARNING if node.warning else _NONE

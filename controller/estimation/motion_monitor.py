@@ -34,6 +34,7 @@ _OVERSPEED_SHARE: Final = 0.25
 """Share of the speed limit by which a joint may be faster than its command: pendulum, ringing, ..."""
 _OVERSPEED_GAIN: Final = 0.3
 """... and share of the command: the valve's gain."""
+_NONE: Final = Reason.NONE
 _REVERSAL_SHARE: Final = 0.1
 """From this share of the speed limit on, motion against the command is reversal and not runaway."""
 
@@ -106,4 +107,4 @@ class MotionMonitor:
             return Reason.JOINT_STUCK
         if self._overspeed > _RUNAWAY_S * limit:
             return Reason.JOINT_RUNAWAY
-        return Reason.NONE
+        return _NONE

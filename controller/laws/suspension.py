@@ -114,7 +114,7 @@ class Suspension:
         speed limit.
         """
         levelling, travel_m = self.levelling, self._c.arm_travel_m
-        levelling.step(level, *tilt_rad, elapsed_s)
+        levelling.step(level, tilt_rad[0], tilt_rad[1], elapsed_s)
         self._limit_corrections(wanted_m, travel_m)
         for i in range(N_ARMS):
             corrected = wanted_m[i] + _LEFT[i] * levelling.roll_m + _FRONT[i] * levelling.pitch_m

@@ -32,8 +32,11 @@ from machine.status.faults import describe
 from machine.status.modes import Mode
 from runtime.allocator import keep_memory
 from runtime.compiled import running
+from runtime.huge_pages import collapse_heap
 
 PRIORITY: Final = 80
+TX_QUEUE_FRAMES: Final = 32
+"""Own frames that may wait for a bus; more are refused."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -123,7 +126,7 @@ def open_buses(where: dict[str, str], controller: Controller) -> list[Bus]:
     opened: list[Bus] = []
     try:
         for address, filters in zip(where.values(), wanted, strict=True):
-            opened.append(open_bus(address, filters=filters, tx_queue=32))
+            opened.append(open_bus(address, filters=filters, tx_queue=TX_QUEUE_FRAMES))
     except BusError:
         for bus in opened:
             bus.close()
@@ -199,6 +202,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not options.no_realtime:
         for refusal in prepare(PRIORITY, options.cpu, options.dma_latency):
             sys.stderr.write(f"controller: not granted: {refusal}\n")
+        sys.stderr.write(f"controller: {collapse_heap() >> 20} MiB of memory on huge pages\n")
     stop_garbage_collection()
     try:
         loop.run()

@@ -19,9 +19,10 @@ from typing import Final
 
 from can_dbc.bus.base import Bus
 from can_dbc.bus.batch import Batch
+from can_dbc.messages.tick_record import RecordRefused, RecordWriter
 from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, sleep_until
-from controller.process.tick_recording import record
+from controller.process.tick_recording import write
 from controller.process.timing import LoopTiming
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
@@ -63,6 +64,7 @@ class Loop:
         self._period_ns, self._sync_lead_ns = period_ns, sync_lead_ns
         self._clock_ns, self._sleep = clock_ns, sleep
         self._inputs = Inputs()
+        self._writer = RecordWriter()
         self._waiting = Batch(DATAGRAM_BYTES, count=MAX_DATAGRAMS)
         self._notifier = Notifier(self.status_text, notify)
         self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -164,7 +166,11 @@ class Loop:
                 for address in self._reports:
                     self.unsent += not self._send(report, address)
         if self._record is not None:
-            self.unrecorded += not self._send(record(inputs, outputs, now_ns), self._record)
+            try:
+                sent = self._send(write(self._writer, inputs, outputs, now_ns), self._record)
+            except RecordRefused:
+                sent = False
+            self.unrecorded += not sent
         if now_ns >= self.timing.publish_ns:
             supervisor = self.controller.supervisor
             self.timing.publish(
@@ -177,7 +183,7 @@ class Loop:
                 self.buses,
             )
 
-    def _send(self, data: bytes, address: Address) -> bool:
+    def _send(self, data: bytes | memoryview, address: Address) -> bool:
         try:
             return self._sender.sendto(data, address) == len(data)
         except OSError:

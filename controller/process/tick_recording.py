@@ -8,21 +8,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 from can_dbc.frame import RawFrame
-from can_dbc.messages import tick_record
-from can_dbc.messages.tick_record import TickRecord
+from can_dbc.messages.tick_record import RecordWriter, TickRecord
 from controller.tick import Inputs, Outputs
 
 
-def record(inputs: Inputs, outputs: Outputs, now_ns: int) -> bytes:
-    """Encode the record of the tick that was just run."""
-    frames, machine_frames, report, vehicle_report = transmitted(outputs)
-    return tick_record.encode(
-        TickRecord(
-            now_ns, inputs.late_ns, inputs.tick_ns, inputs.missed_ticks, inputs.bus, inputs.machine_bus,
-            inputs.frames, inputs.machine_frames, inputs.datagrams, frames, machine_frames, report,
-            vehicle_report,
-        )
+def write(writer: RecordWriter, inputs: Inputs, outputs: Outputs, now_ns: int) -> memoryview:
+    """Write the record of the tick that was just run; it is valid until the writer's next one."""
+    return writer.write(
+        now_ns, inputs.late_ns, inputs.tick_ns, inputs.missed_ticks, inputs.bus, inputs.machine_bus,
+        inputs.frames, inputs.machine_frames, inputs.datagrams, (*outputs.frames, outputs.sync),
+        outputs.machine_frames, outputs.report or b"", outputs.vehicle_report or b"",
     )  # fmt: skip
+
+
+def record(inputs: Inputs, outputs: Outputs, now_ns: int) -> bytes:
+    """The record of the tick that was just run, to keep."""
+    return bytes(write(RecordWriter(), inputs, outputs, now_ns))
 
 
 def restore_inputs(inputs: Inputs, tick: TickRecord) -> None:

@@ -76,7 +76,8 @@ class SetpointGate:
 
     def refused_too_often(self, now_ns: int) -> bool:
         """Whether the last three refusals lie within one second."""
-        return now_ns - min(self._refused_ns) < REFUSED_WINDOW_NS
+        oldest_ns = self._refused_ns[self.refused % REFUSED_LIMIT_COUNT]
+        return now_ns - oldest_ns < REFUSED_WINDOW_NS
 
     def check(self, setpoint: LeasedSetpoint, now_ns: int, late_ns: int) -> None:
         """Check profile, order, age and lease of a setpoint.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from can_dbc.timing.page import Facts
+from controller.process.command import TX_QUEUE_FRAMES
 from machine.status.reasons import Reason
 
 STALL_NS: Final = 10_000_000
@@ -19,8 +20,7 @@ STALL_NS: Final = 10_000_000
 REACH_NS: Final = 450_000_000
 """The slowest detection of a fault (a lease of 350 ms), with the period of setpoints and reports."""
 LOSING_STALL_NS: Final = 25_000_000
-"""No transmit queue (32 frames) overflows in a shorter one, with up to one frame per millisecond."""
-
+"""A stall of this length loses frames at any rate, a shorter one if the transmit queue overflows in it."""
 
 OWN_SHARE: Final = 0.85
 """Load by real-time processes near which Linux withholds the processor from them: 50 ms of every second at 95 %
@@ -61,6 +61,16 @@ class Loss:
     bus: str
     refused: int
     dropped: int
+    sent: int = 0
+    """Frames that the bus accepted in this time."""
+
+    @property
+    def least_stall_ns(self) -> int:
+        """The shortest stall that loses frames: until the transmit queue is full, at the rate of this time."""
+        if not self.refused:
+            return LOSING_STALL_NS
+        offered = self.sent + self.refused
+        return min(LOSING_STALL_NS, TX_QUEUE_FRAMES * (self.to_ns - self.from_ns) // offered)
 
     @property
     def frames(self) -> int:
@@ -74,7 +84,8 @@ def losses_between(before: Facts, after: Facts) -> list[Loss]:
     for old, new in zip(before.buses, after.buses, strict=True):
         refused, dropped = new.refused - old.refused, new.dropped - old.dropped
         if refused or dropped:
-            found.append(Loss(before.written_ns, after.written_ns, new.name, refused, dropped))
+            sent = new.sent - old.sent
+            found.append(Loss(before.written_ns, after.written_ns, new.name, refused, dropped, sent))
     return found
 
 
@@ -85,7 +96,7 @@ def stall_before_stop(stop: Stop, stalls: Sequence[Stall]) -> Stall | None:
 
 def stall_of_loss(loss: Loss, stalls: Sequence[Stall]) -> Stall | None:
     """The longest stall of the host that can have caused a loss."""
-    return _longest(stalls, loss.from_ns - REACH_NS, loss.to_ns + STALL_NS, LOSING_STALL_NS)
+    return _longest(stalls, loss.from_ns - REACH_NS, loss.to_ns + STALL_NS, loss.least_stall_ns)
 
 
 def _longest(stalls: Sequence[Stall], from_ns: int, to_ns: int, least_ns: int) -> Stall | None:

@@ -60,7 +60,7 @@ OWN: Final = Section(
         Metric("frames_lost", "Frames refused by a bus or lost before they were read", "",
                "The controller's own counters, 200 Hz and 1 kHz, quiet and loaded.", most=0.0),
         Metric("frames_lost_unexplained", "Lost frames without a stall of the host", "",
-               "No witness saw a stall of 25 ms or more before.", most=0.0),
+               "No witness saw a stall before that is long enough to fill the transmit queue, or of 25 ms.", most=0.0),
         Metric("machine_frames_lost", "Frames lost by the emulated machine", "", "Its own counters."),
         Metric("records_lost", "Tick records lost on the way to the observer", "", "By their nominal times."),
         Metric("stalls", "Stalls of a processor that a witness saw", "", "5 ms or longer, whole measurement."),

@@ -50,6 +50,7 @@ MODULES: Final = (
     "controller.estimation.joint_estimator",
     "controller.estimation.load_estimator",
     "controller.estimation.motion_monitor",
+    "controller.estimation.sensed_joint",
     "controller.laws.crane",
     "controller.laws.drive",
     "controller.laws.end_positioning",

@@ -10,13 +10,29 @@ from __future__ import annotations
 from machine.profile import Encoder
 
 
+class EncoderScale:
+    """`position_from_counts` of one encoder, with its numbers at hand for every tick."""
+
+    __slots__ = ("_direction", "_half", "_total", "_unit_per_count", "_zero")
+
+    def __init__(self, encoder: Encoder) -> None:
+        self._zero, self._direction, self._unit_per_count = (
+            encoder.zero_counts, encoder.direction, encoder.unit_per_count
+        )  # fmt: skip
+        self._total = encoder.total_counts if encoder.kind == "rotary" else 0
+        self._half = self._total // 2
+
+    def position(self, counts: int) -> float:
+        """Joint position [rad, m for a linear encoder] of a raw position value."""
+        delta = counts - self._zero
+        if self._total:
+            delta = (delta + self._half) % self._total - self._half
+        return self._direction * delta * self._unit_per_count
+
+
 def position_from_counts(encoder: Encoder, counts: int) -> float:
     """Joint position [rad, m for a linear encoder] of a raw position value."""
-    delta = counts - encoder.zero_counts
-    if encoder.kind == "rotary":
-        half = encoder.total_counts // 2
-        delta = (delta + half) % encoder.total_counts - half
-    return encoder.direction * delta * encoder.unit_per_count
+    return EncoderScale(encoder).position(counts)
 
 
 def counts_from_position(encoder: Encoder, position: float) -> int:

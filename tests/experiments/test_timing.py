@@ -274,6 +274,14 @@ def test_a_loss_without_a_stall_long_enough_and_near_enough_counts(stalls):
     assert {"frames_lost", "frames_lost_unexplained", "stops", "stops_unexplained"} <= {*found.missed}
 
 
+@pytest.mark.parametrize(("sent", "explained"), [(800, False), (4000, True)])
+def test_a_short_stall_explains_refused_frames_only_where_it_fills_the_transmit_queue(sent, explained):
+    """32 frames wait for a bus: 40 ms at 800 frames per second, 8 ms at 4000."""
+    lost = losses.Loss(9_000_000_000, 10_000_000_000, "crane0", refused=5, dropped=0, sent=sent)
+    stall = losses.Stall(0, 9_950_000_000, 15_000_000)
+    assert (losses.stall_of_loss(lost, [stall]) is stall) is explained
+
+
 def test_the_kernel_counts_what_a_thread_executes():
     descriptor = instructions.open_counter(os.getpid(), instructions.TASK_CLOCK)
     if descriptor is None:

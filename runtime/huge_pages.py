@@ -1,0 +1,48 @@
+"""Puts the memory of a finished process on huge pages.
+
+A tick that wakes after 5 ms of other work finds neither its data nor their addresses in the processor: each page of
+4 KiB that it touches costs a walk through the page tables, on a virtual machine through two of them.  On pages of
+2 MiB a few walks serve the whole heap.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Final
+
+_MADV_COLLAPSE: Final = 25
+"""linux/mman.h, from Linux 6.1; Python's mmap module does not name it."""
+_HUGE_PAGE_BYTES: Final = Path("/sys/kernel/mm/transparent_hugepage/hpage_pmd_size")
+_MAPS: Final = Path("/proc/self/maps")
+
+
+def collapse_heap() -> int:
+    """Copy the heap onto huge pages once; returns how many bytes lie on them, 0 where the kernel has none.
+
+    Call it when everything is allocated: it takes tens of milliseconds, and what is allocated later may lie on small
+    pages.  Contents and addresses stay.  Source: madvise(2), MADV_COLLAPSE.
+    """
+    try:
+        size = int(_HUGE_PAGE_BYTES.read_text())
+        places = list(huge_places(_MAPS.read_text().splitlines(), size))
+    except (OSError, ValueError):
+        return 0
+    libc = ctypes.CDLL(None)
+    libc.madvise.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+    # One call for each page: where the kernel finds none free, the others are still worth it.
+    return sum(size for place in places if libc.madvise(place, size, _MADV_COLLAPSE) == 0)
+
+
+def huge_places(maps: Iterable[str], size: int) -> Iterator[int]:
+    """Addresses of the huge pages of ``size`` bytes that fit into the process's own writable memory.
+
+    ``maps``: lines of /proc/PID/maps (proc_pid_maps(5)).  Left out are files, stacks and what cannot be written.
+    """
+    for line in maps:
+        addresses, flags, _, _, inode, *name = line.split(maxsplit=5)
+        if flags[1:] != "w-p" or inode != "0" or (name and name[0] != "[heap]"):
+            continue
+        first, last = (int(part, 16) for part in addresses.split("-"))
+        yield from range(-(-first // size) * size, last // size * size - size + 1, size)
