@@ -60,6 +60,10 @@ class BusState(IntEnum):
     """The link is down or unplugged, or the wire daemon has ended."""
 
 
+_DOWN: Final = BusState.DOWN
+"""A module's constant is found faster than an enumeration's member, and `BaseBus.drain` runs in every tick."""
+
+
 @dataclass(slots=True)
 class BusStats:
     """Counters since opening, and the state of the own node; one object per bus, updated in place."""
@@ -176,7 +180,7 @@ class BaseBus:
 
     def drain(self, frames: list[Frame]) -> int:
         stats = self.stats
-        if stats.state is BusState.DOWN:
+        if stats.state is _DOWN:
             return 0
         before = len(frames)
         self._receive(frames)

@@ -19,19 +19,22 @@ _libc: Final = ctypes.CDLL(None, use_errno=True)
 _recvmmsg, _sendmmsg = _libc.recvmmsg, _libc.sendmmsg
 _IOVEC: Final = struct.Struct("@PN")
 _HEADER: Final = struct.Struct("@PI4xPNPNi4xI4x")  # struct mmsghdr: name, its length, iovec, control, flags, length
-_LENGTH: Final = struct.Struct("@56xI4x")  # the same bytes, the length of the datagram alone
+_HEADER_WORDS: Final = _HEADER.size // 4
+_LENGTH_WORD: Final = 14
+"""Place of the datagram's length in the header as 32-bit words."""
 
 
 class _Buffers:
     """``count`` message headers that point at ``size`` bytes of data and ``ancillary`` bytes of control data each."""
 
-    __slots__ = ("_address", "_headers", "_keep", "ancillary", "control", "count", "data", "size")
+    __slots__ = ("_address", "_headers", "_keep", "_words", "ancillary", "control", "count", "data", "size")
 
     def __init__(self, size: int, ancillary: int, count: int) -> None:
         self.size, self.ancillary, self.count = size, ancillary, count
         self.data = memoryview(bytearray(size * count))
         self.control = memoryview(bytearray(max(ancillary * count, 1)))
         iovecs, self._headers = bytearray(_IOVEC.size * count), memoryview(bytearray(_HEADER.size * count))
+        self._words = self._headers.cast("I")
         buffers = (self.data, self.control, iovecs, self._headers)
         views = [ctypes.c_char.from_buffer(buffer) for buffer in buffers]
         self._keep = views, iovecs
@@ -77,7 +80,7 @@ class Batch(_Buffers):
 
     def length(self, i: int) -> int:
         """Size in bytes of datagram i of the last `receive`."""
-        found: int = _LENGTH.unpack_from(self._headers, i * _HEADER.size)[0]
+        found: int = self._words[i * _HEADER_WORDS + _LENGTH_WORD]
         return found
 
     def lengths(self) -> list[int]:

@@ -9,6 +9,7 @@ from can_dbc.bus.base import Bus, BusState
 FIRST_RETRY_NS: Final = 200_000_000
 """Time from the loss of a link to the first attempt."""
 RETRY_PERIOD_NS: Final = 500_000_000
+_DOWN: Final = BusState.DOWN
 
 
 class Reconnector:
@@ -22,7 +23,7 @@ class Reconnector:
 
     def watch(self, now_ns: int) -> None:
         """To be called once per cycle; cheap while the bus is up."""
-        if self._bus.stats.state is not BusState.DOWN:
+        if self._bus.stats.state is not _DOWN:
             self._try_ns = 0
         elif not self._try_ns:
             self._try_ns = now_ns + FIRST_RETRY_NS

@@ -20,10 +20,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from can_dbc.bus.base import DRAIN_LIMIT, BaseBus, BusError, BusState
+from can_dbc.bus.base import BaseBus, BusError, BusState
 from can_dbc.bus.batch import Batch
 from can_dbc.bus.filters import Filter
-from can_dbc.bus.wire_records import RECORD, RECORD_BYTES, pack, unpack
+from can_dbc.bus.wire_records import RECORD, RECORD_BYTES, pack, read
 from can_dbc.frame import Frame
 
 CONTROL: Final = 1
@@ -37,6 +37,8 @@ _MAX_PACKETS: Final = 16
 _OPEN_TIMEOUT_S: Final = 2.0
 _REOPEN_TIMEOUT_S: Final = 0.002
 _MAX_BACKLOG_FRAMES: Final = 4096
+_OFF: Final = BusState.OFF
+_DOWN: Final = BusState.DOWN
 
 
 def wire_directory() -> Path:
@@ -89,10 +91,10 @@ class WireClient(BaseBus):
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> int:
         stats, sent = self.stats, 0
         while sent < len(frames):
-            if self.pending + len(frames) - sent > self._tx_queue and stats.state is not BusState.DOWN:
+            if self.pending + len(frames) - sent > self._tx_queue and stats.state is not _DOWN:
                 self._read(self._backlog, 0)
                 self._bound_backlog()
-            room = self._tx_queue - self.pending if stats.state < BusState.OFF else 0
+            room = self._tx_queue - self.pending if stats.state < _OFF else 0
             packet = pack(frames, sent, max(0, min(room, MAX_BATCH_RECORDS)))
             if not packet or not self._post(packet):
                 break
@@ -126,24 +128,16 @@ class WireClient(BaseBus):
 
     def _read(self, frames: list[Frame], first: int) -> None:
         """Appends the frames waiting in the socket; at a recovery removes all from `first` on."""
-        stats, batch = self.stats, self._batch
-        for _ in range(DRAIN_LIMIT // batch.count):
-            try:
-                waiting = batch.receive(self._sock.fileno())
-            except OSError:
-                stats.enter(BusState.DOWN)
-                return
-            if not waiting:
-                return
-            counters = unpack(batch, waiting, frames, first, stats, self._error_frames)
-            if counters is None:
-                stats.enter(BusState.DOWN)
-                return
-            self._done, dropped = counters
+        stats = self.stats
+        counters = read(self._batch, self._sock.fileno(), frames, first, stats, self._error_frames)
+        if counters is None:
+            stats.enter(BusState.DOWN)
+            return
+        done, dropped = counters
+        if done >= 0:
+            self._done = done
             stats.dropped += (dropped - self._dropped) & 0xFFFF_FFFF
             self._dropped = dropped
-            if waiting < batch.count or len(frames) - first >= DRAIN_LIMIT:
-                return
 
     def _bound_backlog(self) -> None:
         """Bounds the backlog of a client that only sends."""

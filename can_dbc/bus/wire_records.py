@@ -6,7 +6,7 @@ import struct
 from collections.abc import Sequence
 from typing import Final
 
-from can_dbc.bus.base import BusStats
+from can_dbc.bus.base import DRAIN_LIMIT, BusStats
 from can_dbc.bus.batch import Batch
 from can_dbc.frame import ERROR, Frame
 
@@ -20,32 +20,53 @@ _RECEIVED: Final = struct.Struct("=IB3x8sQH6x")
 _COUNTERS: Final = struct.Struct("=26xHI")
 
 
-def unpack(
-    batch: Batch, packets: int, frames: list[Frame], first: int, stats: BusStats, error_frames: bool
+def read(
+    batch: Batch, descriptor: int, frames: list[Frame], first: int, stats: BusStats, error_frames: bool
 ) -> tuple[int, int] | None:
-    """Append the frames of the packets in ``batch``; returns the counters done and dropped of the last record.
+    """Append the frames that wait in a socket, at most about `DRAIN_LIMIT` behind ``first``.
 
+    Returns the counters done and dropped of the last record, (-1, 0) if none waited, None if the daemon has ended.
     Error frames change ``stats`` and are appended only if ``error_frames``; otherwise a recovery removes all frames
-    from ``first`` on.  None: the daemon has ended.
+    from ``first`` on.
     """
-    data, done, dropped = batch.data, 0, 0
-    for i in range(packets):
-        at, size = i * batch.size, batch.length(i)
-        if not size:
+    counters = (-1, 0)
+    for _ in range(DRAIN_LIMIT // batch.count):
+        try:
+            packets = batch.receive(descriptor)
+        except OSError:
             return None
-        for key, length, payload, stamp_ns, flags in _RECEIVED.iter_unpack(data[at : at + size]):
-            if flags & STATUS:
+        end = 0
+        for i in range(packets):
+            size = batch.length(i)
+            if not size:
+                return None
+            end = i * batch.size + size
+            _unpack(batch.data, end - size, end, frames, first, stats, error_frames)
+        if end:
+            done, dropped = _COUNTERS.unpack_from(batch.data, end - RECORD_BYTES)
+            counters = (done, dropped)
+        if packets < batch.count or len(frames) - first >= DRAIN_LIMIT:
+            break
+    return counters
+
+
+def _unpack(
+    data: memoryview, at: int, end: int, frames: list[Frame], first: int, stats: BusStats, error_frames: bool
+) -> None:
+    """Append the frames of the records in ``data`` from ``at`` to ``end``."""
+    while at < end:
+        key, length, payload, stamp_ns, flags = _RECEIVED.unpack_from(data, at)
+        at += RECORD_BYTES
+        if flags & STATUS:
+            continue
+        if key & ERROR:
+            recovered = stats.note_error(key, payload)
+            if not error_frames:
+                if recovered:
+                    del frames[first:]
                 continue
-            if key & ERROR:
-                recovered = stats.note_error(key, payload)
-                if not error_frames:
-                    if recovered:
-                        del frames[first:]
-                    continue
-            # Frame(...) costs half as much again
-            frames.append(tuple.__new__(Frame, (stamp_ns, key, payload if length == 8 else payload[:length])))
-        done, dropped = _COUNTERS.unpack_from(data, at + size - RECORD_BYTES)
-    return done, dropped
+        # Frame(...) costs half as much again
+        frames.append(tuple.__new__(Frame, (stamp_ns, key, payload if length == 8 else payload[:length])))
 
 
 def pack(frames: Sequence[tuple[int, bytes]], first: int, most: int) -> bytes:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from can_dbc.messages.envelope import Common, DatagramFault, DatagramRefused, finite
 
@@ -33,6 +33,10 @@ class GrappleCommand(IntEnum):
     HOLD = 3
 
 
+_GRAPPLE_COMMANDS: Final = tuple(GrappleCommand)
+"""By number: calling an enumeration costs the tick more than the rest of a setpoint's head."""
+
+
 class OperatorAction(IntEnum):
     """Requests of an operator to the controller; each one is an edge, not a level."""
 
@@ -42,9 +46,11 @@ class OperatorAction(IntEnum):
     RESET = 4
 
 
-@dataclass(frozen=True, slots=True)
-class Knot:
-    """Joint positions and velocities (rad, m; per second; ``Joint`` order) at ``after_ns`` past the stamp."""
+class Knot(NamedTuple):
+    """Joint positions and velocities (rad, m; per second; ``Joint`` order) at ``after_ns`` past the stamp.
+
+    A tuple, because a setpoint has up to 16 of them and the tick that accepts it makes them all.
+    """
 
     after_ns: int
     position: tuple[float, ...]
@@ -164,14 +170,20 @@ def crane_from(common: Common, body: bytes) -> CraneSetpoint:
         raise DatagramRefused(DatagramFault.LENGTH)
     if not 1 <= n_knots <= MAX_KNOTS or final > 1:
         raise DatagramRefused(DatagramFault.VALUE)
-    knots = []
+    if grapple >= len(_GRAPPLE_COMMANDS):
+        raise DatagramRefused(DatagramFault.VALUE)
+    knots: list[Knot] = []
+    before_us = -1
     for i in range(n_knots):
-        after_us, *values = _KNOT.unpack_from(body, _CRANE.size + i * _KNOT.size)
-        numbers = finite(tuple(values))
-        knots.append(Knot(after_us * 1000, numbers[:N_AXES], numbers[N_AXES:]))
-        if i and knots[i].after_ns <= knots[i - 1].after_ns:
+        values: tuple[Any, ...] = _KNOT.unpack_from(body, _CRANE.size + i * _KNOT.size)
+        finite(values)
+        after_us = values[0]
+        if after_us <= before_us:
             raise DatagramRefused(DatagramFault.VALUE)
-    return CraneSetpoint(*common, lease_us * 1000, GrappleCommand(grapple), bool(final), tuple(knots))
+        before_us = after_us
+        # Knot(...) costs three times as much
+        knots.append(tuple.__new__(Knot, (after_us * 1000, values[1 : N_AXES + 1], values[N_AXES + 1 :])))
+    return CraneSetpoint(*common, lease_us * 1000, _GRAPPLE_COMMANDS[grapple], bool(final), tuple(knots))
 
 
 def spool_from(common: Common, body: bytes) -> SpoolTest:

@@ -32,6 +32,10 @@ class Steering(IntEnum):
     """A requested articulation angle."""
 
 
+_STEERINGS: Final = tuple(Steering)
+"""By number, as in `can_dbc.messages.crane`."""
+
+
 class Driving(IntEnum):
     """State of the vehicle."""
 
@@ -128,11 +132,12 @@ def drive_from(common: Common, body: bytes) -> DriveSetpoint:
     lease_us, steering, flags, latitude, longitude, angle, rate, speed, *heights = _DRIVE.unpack(body)
     if flags & ~_FLAGS:
         raise ValueError("unknown flags")
-    mode = Steering(steering)
+    if steering >= len(_STEERINGS):
+        raise ValueError("unknown steering")
     finite((latitude, longitude, angle, rate, speed, *heights))
     h1, h2, h3, h4 = heights
     return DriveSetpoint(
-        *common, lease_us * 1000, mode, latitude, longitude, angle, rate, speed, (h1, h2, h3, h4),
+        *common, lease_us * 1000, _STEERINGS[steering], latitude, longitude, angle, rate, speed, (h1, h2, h3, h4),
         bool(flags & _FLOAT_FRONT), bool(flags & _FLOAT_REAR), bool(flags & _LEVEL),
     )  # fmt: skip
 

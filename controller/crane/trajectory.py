@@ -34,11 +34,11 @@ class Trajectory:
     def load(self, setpoint: CraneSetpoint) -> None:
         """Copy the knots of a decoded setpoint (1 to 16, times strictly growing)."""
         self._n = len(setpoint.knots)
-        for i, knot in enumerate(setpoint.knots):
-            self._times_ns[i] = setpoint.stamp_ns + knot.after_ns
+        for i, (after_ns, position, velocity) in enumerate(setpoint.knots):
+            self._times_ns[i] = setpoint.stamp_ns + after_ns
             for joint in range(N_JOINTS):
-                self._position[i * N_JOINTS + joint] = knot.position[joint]
-                self._velocity[i * N_JOINTS + joint] = knot.velocity[joint]
+                self._position[i * N_JOINTS + joint] = position[joint]
+                self._velocity[i * N_JOINTS + joint] = velocity[joint]
 
     def extend(self, newer: Trajectory, from_ns: int) -> None:
         """Continue as ``newer`` from its first knot; keeps the knots before that and not before ``from_ns``."""

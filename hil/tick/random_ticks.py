@@ -131,8 +131,7 @@ class RandomTicks:
             return data[:at] + bytes((rng.randrange(256),)) + data[at + 1 :]
         size = rng.choice((1e-6, 1e-3, 0.05, 1.0))
         knots = tuple(
-            replace(
-                knot,
+            knot._replace(
                 position=tuple(value + rng.gauss(0.0, size) for value in knot.position),
                 velocity=tuple(value + rng.gauss(0.0, size) for value in knot.velocity),
             )

@@ -1,5 +1,6 @@
 """The loop: deadlines, skipped periods, datagrams, records, warm-up; with a bus in memory and a scripted clock."""
 
+import contextlib
 import os
 
 import pytest
@@ -280,7 +281,11 @@ def test_flood_of_datagrams_does_not_delay_the_tick(udp):
     for _ in range(40):
         udp[1].sendto(command, udp[0].getsockname())
     loop.tick(10**9, 0)
-    assert len(loop._inputs.datagrams) == 16
+    left = 0
+    with contextlib.suppress(BlockingIOError):
+        while udp[0].recv(2048):
+            left += 1
+    assert left == 40 - 16
 
 
 def test_sleep_until_returns_for_the_past_and_reaches_the_future():
