@@ -174,8 +174,12 @@ class HeartbeatMonitor:
 
     def next_loss_ns(self) -> int:
         """The time until which every node seen so far stays ALIVE without further heartbeats."""
-        timeouts_ns = self._timeouts_ns
-        return min((seen_ns + timeouts_ns[node] for node, seen_ns in self._seen_ns.items()), default=0)
+        timeouts_ns, first_ns = self._timeouts_ns, 0
+        for node, seen_ns in self._seen_ns.items():
+            loss_ns = seen_ns + timeouts_ns[node]
+            if not first_ns or loss_ns < first_ns:
+                first_ns = loss_ns
+        return first_ns
 
     def missing(self, now_ns: int) -> tuple[int, ...]:
         """Nodes that are LOST or NEVER_SEEN."""

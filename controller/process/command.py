@@ -175,17 +175,17 @@ def main(arguments: list[str] | None = None) -> int:
         where = addresses(settings, dict(options.bus))
         buses = open_buses(where, controller)
         setpoints = listen(options.setpoint_port)
+        timing = LoopTiming(controller, timing_writer(options.timing))
+        loop = Loop(
+            controller, buses, setpoints, options.report, options.record, timing, settings.period_ns, lead_ns,
+            sleep=make_sleep(options.spin_us * 1000),
+        )  # fmt: skip
     except (ConfigError, DbcError) as error:
         sys.stderr.write(f"controller: {error}\n")
         return 3
     except BusError as error:
         sys.stderr.write(f"controller: {error}\n")
         return 4
-    timing = LoopTiming(controller, timing_writer(options.timing))
-    loop = Loop(
-        controller, buses, setpoints, options.report, options.record, timing, settings.period_ns, lead_ns,
-        sleep=make_sleep(options.spin_us * 1000),
-    )  # fmt: skip
     ended: list[int] = []
 
     def end(number: int, _frame: object) -> None:

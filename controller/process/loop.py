@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from can_dbc.bus.base import Bus
+from can_dbc.bus.base import Bus, BusError
 from can_dbc.bus.batch import Batch
 from can_dbc.messages.tick_record import RecordRefused, RecordWriter
 from controller.process.bus_link import BusLink
@@ -59,16 +59,14 @@ class Loop:
         self.stopping = False
         self._crane, *more = (BusLink(bus) for bus in buses)
         self._machine = more[0] if more else None
-        self._reports = tuple(reports)
-        self._record = record
+        self._reports = [_connected(address) for address in reports]
+        self._record = _connected(record) if record is not None else None
         self._period_ns, self._sync_lead_ns = period_ns, sync_lead_ns
         self._clock_ns, self._sleep = clock_ns, sleep
         self._inputs = Inputs()
         self._writer = RecordWriter()
         self._waiting = Batch(DATAGRAM_BYTES, count=MAX_DATAGRAMS)
         self._notifier = Notifier(self.status_text, notify)
-        self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sender.setblocking(False)
 
     def stop(self) -> None:
         """Request the end; the running tick is completed."""
@@ -146,7 +144,9 @@ class Loop:
 
     def close(self) -> None:
         """Close the sockets, the buses and the timing page."""
-        self._sender.close()
+        for sender in (*self._reports, self._record):
+            if sender is not None:
+                sender.close()
         self.setpoints.close()
         for bus in self.buses:
             bus.close()
@@ -167,11 +167,11 @@ class Loop:
         """Send reports and the tick's record, and publish the timing page once a second."""
         for report in (outputs.report, outputs.vehicle_report):
             if report is not None:
-                for address in self._reports:
-                    self.unsent += not self._send(report, address)
+                for receiver in self._reports:
+                    self.unsent += not _send(receiver, report)
         if self._record is not None:
             try:
-                sent = self._send(write(self._writer, inputs, outputs, now_ns), self._record)
+                sent = _send(self._record, write(self._writer, inputs, outputs, now_ns))
             except RecordRefused:
                 sent = False
             self.unrecorded += not sent
@@ -187,8 +187,28 @@ class Loop:
                 self.buses,
             )
 
-    def _send(self, data: bytes | memoryview, address: Address) -> bool:
-        try:
-            return self._sender.sendto(data, address) == len(data)
-        except OSError:
-            return False
+
+def _connected(address: Address) -> socket.socket:
+    """A socket that never blocks and sends to one address: the kernel looks for its way once and not in every tick.
+
+    Raises:
+        BusError: there is no way to the address.
+    """
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.setblocking(False)
+    try:
+        made.connect(address)
+    except OSError as error:
+        made.close()
+        where = f"{address[0]}:{address[1]}"
+        sentence = f"Nothing can be sent to {where} ({error}); check --report and --record, or the network."
+        raise BusError("udp.unreachable", sentence) from error
+    return made
+
+
+def _send(receiver: socket.socket, data: bytes | memoryview) -> bool:
+    """Whether the system took a datagram; not while nobody listens."""
+    try:
+        return receiver.send(data) == len(data)
+    except OSError:
+        return False

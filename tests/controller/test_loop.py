@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from can_dbc.bus.base import BusState
+from can_dbc.bus.base import BusError, BusState
 from can_dbc.bus.filters import Filter
 from can_dbc.bus.reconnector import FIRST_RETRY_NS, RETRY_PERIOD_NS
 from can_dbc.frame import Frame
@@ -23,6 +23,7 @@ from controller.process.timing import LoopTiming, ProcessReader
 from controller.process.warm_up import NullBus, warm_up
 from controller.step import Controller
 from machine.status.reasons import Reason
+from tests.codes import coded
 from tests.controller.bench import DATABASE, MS, SETTINGS, Bench, T
 
 LEAD = SETTINGS.sync_lead_ns
@@ -77,13 +78,13 @@ class Clock:
         self.now_ns = max(self.now_ns, deadline_ns) + late_ns
 
 
-def build(udp, clock, bus=None, page=None):
-    setpoints, reports, record = udp
+def build(udp, clock, bus=None, page=None, record=None):
+    setpoints, reports, recorder = udp
     controller = Controller(SETTINGS, DATABASE)
     timing = LoopTiming(controller, TimingWriter(page) if page else None, clock.time, clock.time)
     return Loop(
-        controller, [bus or MemoryBus()], setpoints, [reports.getsockname()], record.getsockname(), timing, T, LEAD,
-        clock.time, clock.sleep,
+        controller, [bus or MemoryBus()], setpoints, [reports.getsockname()], record or recorder.getsockname(), timing,
+        T, LEAD, clock.time, clock.sleep,
     )  # fmt: skip
 
 
@@ -286,6 +287,21 @@ def test_flood_of_datagrams_does_not_delay_the_tick(udp):
         while udp[0].recv(2048):
             left += 1
     assert left == 40 - 16
+
+
+def test_reports_that_nobody_receives_are_counted(udp):
+    loop = build(udp, Clock())
+    for receiver in udp[1:]:
+        receiver.close()  # the port answers that nobody listens, and the next datagram meets that answer
+    for k in range(20):
+        loop.tick(10**9 + k * T, 0)
+    assert loop.unsent > 0 and loop.unrecorded > 0
+    loop.close()
+
+
+def test_an_address_without_a_way_to_it_is_named(udp):
+    with pytest.raises(BusError, match=r"255.255.255.255:5006", check=coded("udp.unreachable")):
+        build(udp, Clock(), record=("255.255.255.255", 5006))
 
 
 def test_sleep_until_returns_for_the_past_and_reaches_the_future():
