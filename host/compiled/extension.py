@@ -20,7 +20,11 @@ _CONTRACT_OFF: Final = "-ffp-contract=off"
 """No fused multiply-add, which some processors' compilers use unasked: results stay those of the interpreter."""
 COLD_PATHS: Final = Path("host", "compiled", "cold_paths.h")
 HOT_FUNCTIONS: Final = Path("host", "compiled", "hot_functions.txt")
-"""C names of the functions that a tick calls, one a line; made by `hil.tick.hot_functions`."""
+"""C names of the functions that `step` calls, one a line; made by `hil.tick.hot_functions`."""
+_LOOP_MODULES: Final = (
+    "batch", "bus_link", "durations", "loop", "reconnector", "tick_record", "tick_recording", "timing", "wire_records",
+)
+"""Modules around `step`: what a tick calls of them it calls on every bus, which no replay has."""
 _PROTOTYPE: Final = re.compile(r"^(?:extern )?\w[\w *]*?\b(CPy(?:Def|Py)_\w+)\(.*\);$", re.MULTILINE)
 _AT_START: Final = ("_____top_level__", "_coroutine_setup")
 
@@ -36,9 +40,9 @@ def extensions(tree: Path) -> list[Any]:
         config.write_text(_MYPY_CONFIG)
         made: list[Any] = mypycify(["--config-file", str(config), *files], opt_level="2", debug_level="0")
     _place_functions(tree)
-    # Hidden: calls inside the library are direct, without a table that has to be fetched as well.
+    # Hidden, no table: calls inside the library are direct, those of the interpreter fetch one address and no code.
     for extension in made:
-        options = [_CONTRACT_OFF, "-fvisibility=hidden"]
+        options = [_CONTRACT_OFF, "-fvisibility=hidden", "-fno-plt"]
         if extension.name.endswith("__mypyc"):  # the one that holds all code; the others are a stub each
             options += ["-include", str(tree / COLD_PATHS)]
         extension.sources = [str(tree / source) for source in extension.sources]
@@ -55,9 +59,10 @@ def _place_functions(tree: Path) -> None:
     hot = set((tree / HOT_FUNCTIONS).read_text().split())
 
     def placed(found: re.Match[str]) -> str:
-        if found[1] in hot:
-            return f"__attribute__((hot)) {found[0]}"
-        return f"__attribute__((cold)) {found[0]}" if found[1].endswith(_AT_START) else found[0]
+        if found[1].endswith(_AT_START):
+            return f"__attribute__((cold)) {found[0]}"
+        called = found[1] in hot or found[1].split("___")[0].partition("_")[2] in _LOOP_MODULES
+        return f"__attribute__((hot)) {found[0]}" if called else found[0]
 
     for header in (tree / "build").glob("__native*.h"):
         header.write_text(_PROTOTYPE.sub(placed, header.read_text()))
