@@ -28,6 +28,7 @@ from can_dbc.bus.batch import enlarge_receive_buffer
 from can_dbc.bus.factory import open_bus
 from can_dbc.bus.reconnector import Reconnector
 from can_dbc.frame import Frame
+from can_dbc.messages.record_ring import RingReader, default_path
 from can_dbc.timing.page import Timing, TimingRefused, read_timing
 from machine.loading.profile_file import ProfileError, load_profile
 from recorder.manifest import describe
@@ -51,14 +52,15 @@ class InputCollector:
     """
 
     def __init__(
-        self, buses: dict[str, Bus], ticks: socket.socket, reports: socket.socket, timing: Path | None = None
+        self, buses: dict[str, Bus], ticks: RingReader, reports: socket.socket, timing: Path | None = None
     ) -> None:
         self.items: queue.Queue[Item | None] = queue.Queue(QUEUE_ITEMS)
         self.dropped = 0
         self._buses = tuple(buses.values())
         self.wake, self._ask = socket.socketpair()
         self._receivers = [self._frames_of(name, bus) for name, bus in buses.items()]
-        self._receivers += [self._datagrams(kind, sock) for kind, sock in (("tick", ticks), ("report", reports))]
+        self._ticks = ticks
+        self._receivers += [self._tick_records, self._datagrams("report", reports)]
         self._receivers += [self._timing_page(timing)] if timing else []
 
     def run(self) -> None:
@@ -76,8 +78,8 @@ class InputCollector:
 
     @property
     def lost(self) -> int:
-        """Frames and records lost because the kernel's buffer or the queue was full."""
-        return self.dropped + sum(bus.stats.dropped for bus in self._buses)
+        """Frames and records lost because the kernel's buffer, the ring or the queue was full."""
+        return self.dropped + self._ticks.lost + sum(bus.stats.dropped for bus in self._buses)
 
     def _put(self, item: Item, count: int) -> None:
         try:
@@ -120,6 +122,10 @@ class InputCollector:
                     self._put(("timing", "", timing), 1)
 
         return receive
+
+    def _tick_records(self) -> None:
+        for record in self._ticks.read():
+            self._put(("tick", "", record), 1)
 
     def _datagrams(self, kind: str, sock: socket.socket) -> Callable[[], None]:
         def receive() -> None:
@@ -190,7 +196,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="NAME=ADDRESS",
         help="bus to record, for example crane0=wire:crane0",
     )
-    parser.add_argument("--tick-port", type=int, required=True, help="UDP port of the controller's tick records")
+    parser.add_argument(
+        "--ticks", type=Path, metavar="FILE", help="ring of the controller's tick records; default: in shared memory"
+    )
     parser.add_argument("--report-port", type=int, required=True, help="UDP port of the controller's state reports")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file")
     parser.add_argument(
@@ -207,7 +215,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in addresses:
             if name not in known:
                 parser.error(f"--bus {name}: the buses of {profile.name} are {', '.join(filter(None, known))}")
-        ticks, reports = udp_socket(a.tick_port), udp_socket(a.report_port)
+        ticks, reports = RingReader(a.ticks or default_path()), udp_socket(a.report_port)
         buses = {name: open_bus(address) for name, address in addresses.items()}
         key = a.key_file.read_bytes().strip() if a.key_file else None
         recorder = Recorder(a.out, profile, describe(profile, tuple(addresses), a.seed, live=True), key, not a.no_sync)
@@ -229,6 +237,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sys.stdout.flush()
     inputs.run()
     writer.join()
+    ticks.close()
     for bus in buses.values():
         bus.close()
     return 0

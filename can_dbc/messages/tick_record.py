@@ -8,7 +8,7 @@ Little-endian; bus 0 is crane0, bus 1 is mach0::
     frames in: (stamp u64, key u32, bus u8, length u8, data 8) | datagrams: (length u16, bytes)
     frames out: (key u32, bus u8, length u8, data 8) | report | vehicle report, all that is left | CRC-32
 
-The controller sends one UDP datagram per tick; ``decode`` refuses a damaged one as a whole.
+The controller writes one per tick (`can_dbc.messages.record_ring`); ``decode`` refuses a damaged one as a whole.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from runtime.errors import CodedError
 MAGIC: Final = 0x52544854  # "THTR"
 VERSION: Final = 2
 MAX_BYTES: Final = 65_000
-"""Most bytes of a record: the capacity of one UDP datagram."""
+"""Most bytes of a record: a tick of two full buses and 16 datagrams has less."""
 
 _VERSION: Final = struct.Struct("<IH")
 _HEAD: Final = struct.Struct("<I5HQqQQ" + "HQQQQ" * 2)
@@ -110,7 +110,7 @@ class RecordWriter:
         """The bytes of a tick (the fields of `TickRecord`), valid until the next call.
 
         Raises:
-            RecordRefused: it does not fit into a datagram.
+            RecordRefused: it is longer than `MAX_BYTES`.
         """
         buffer, n_in, n_out = self._buffer, len(frames_in) + len(machine_frames_in), len(frames_out)
         n_out += len(machine_frames_out)
@@ -118,7 +118,7 @@ class RecordWriter:
         for datagram in datagrams:
             size += _LENGTH.size + len(datagram)
         if size > MAX_BYTES:
-            raise RecordRefused("tick-record.too-long", f"the tick's record of {size} bytes fits no datagram")
+            raise RecordRefused("tick-record.too-long", f"the tick's record of {size} bytes is too long")
         _HEAD.pack_into(
             buffer, 0, MAGIC, VERSION, n_in, len(datagrams), n_out, len(report), now_ns, late_ns, tick_ns, missed_ticks,
             bus.state, bus.dropped, bus.refused, bus.errors, bus.recoveries,
@@ -151,7 +151,7 @@ class RecordWriter:
 
 
 def encode(tick: TickRecord) -> bytes:
-    """The bytes of a tick; raises RecordRefused when they do not fit into a datagram."""
+    """The bytes of a tick; raises RecordRefused when they are more than `MAX_BYTES`."""
     return bytes(
         RecordWriter().write(
             tick.now_ns, tick.late_ns, tick.tick_ns, tick.missed_ticks, tick.bus, tick.machine_bus, tick.frames_in,

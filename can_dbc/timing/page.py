@@ -8,8 +8,6 @@ blocks the writer.
 
 from __future__ import annotations
 
-import contextlib
-import mmap
 import os
 import struct
 import time
@@ -22,6 +20,7 @@ import msgspec
 
 from can_dbc.timing.durations import BINS, Durations
 from runtime.errors import CodedError
+from runtime.shared_file import SharedFile, shared_path
 
 STAGES: Final = (
     "wake", "sync", "tick", "cpu", "receive", "decode", "estimate", "supervise", "control", "encode", "send", "record",
@@ -129,30 +128,18 @@ class Timing:
 
 
 def default_path() -> Path:
-    """Path of the page: in ``RUNTIME_DIRECTORY`` (set by systemd), else in this user's directory in /dev/shm."""
-    runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
-    return Path(runtime or f"/dev/shm/timberhand-{os.getuid()}") / "controller.timing"
+    """Path of the controller's page."""
+    return shared_path("controller.timing")
 
 
 class TimingWriter:
     """Owns the page at ``path``; raises OSError if it cannot be created.  Everyone may read it; it holds no secret."""
 
-    __slots__ = ("_inode", "_map", "_path", "_sequence")
+    __slots__ = ("_file", "_map", "_sequence")
 
     def __init__(self, path: Path) -> None:
-        path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-        # A new file each time: a reader of a former process's page keeps its mapping.
-        with contextlib.suppress(FileNotFoundError):
-            path.unlink()
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        try:
-            os.fchmod(descriptor, 0o644)  # independent of the umask
-            os.posix_fallocate(descriptor, 0, _SIZE)  # no page fault and no full file system at the first write
-            self._map = mmap.mmap(descriptor, _SIZE)
-            self._inode = os.fstat(descriptor).st_ino
-        finally:
-            os.close(descriptor)
-        self._path = path
+        self._file = SharedFile(path, _SIZE)
+        self._map = self._file.map
         self._sequence = 0
         _HEAD.pack_into(self._map, 0, _MAGIC, _VERSION, 0, 0)
 
@@ -174,10 +161,7 @@ class TimingWriter:
 
     def close(self) -> None:
         """Removes the page, unless another process owns it by now; may be called twice."""
-        with contextlib.suppress(OSError):
-            if self._path.stat().st_ino == self._inode:
-                self._path.unlink()
-        self._map.close()
+        self._file.close()
 
 
 def read_timing(path: Path | None = None) -> Timing:

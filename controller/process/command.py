@@ -20,6 +20,8 @@ from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.bus.filters import FilterItem
 from can_dbc.dbc.codec import DbcError
 from can_dbc.dbc.codec import load as read_dbc
+from can_dbc.messages.record_ring import RecordRing
+from can_dbc.messages.record_ring import default_path as ring_path
 from can_dbc.messages.udp_address import address_argument
 from can_dbc.timing.page import METRIC_KEYS, STAGES, TimingWriter, default_path
 from controller.config import ConfigError, Settings, load
@@ -53,7 +55,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--setpoint-port", type=int, required=True, help="UDP port on 127.0.0.1; 0 chooses a free one")
     made.add_argument("--report", type=address_argument, action="append", default=[], metavar="HOST:PORT",
                       help="receiver of state reports; may be given more than once")  # fmt: skip
-    made.add_argument("--record", type=address_argument, metavar="HOST:PORT", help="receiver of every tick's record")
+    made.add_argument("--record", type=Path, metavar="FILE",
+                      help="ring of tick records in shared memory; default: beside the timing page")  # fmt: skip
     made.add_argument("--rate", type=int, default=0, metavar="HZ", help="control rate; default: the profile's")
     made.add_argument("--key-file", type=Path, help="file with the key that authenticates datagrams")
     made.add_argument("--cpu", type=int, help="processor to run on; use only an isolated one")
@@ -144,6 +147,16 @@ def timing_writer(path: Path | None) -> TimingWriter | None:
         return None
 
 
+def record_ring(path: Path | None) -> RecordRing | None:
+    """The ring of tick records; without one the controller runs as well, and reports that on stderr."""
+    path = path or ring_path()
+    try:
+        return RecordRing(path)
+    except OSError as error:
+        sys.stderr.write(f"controller: not granted: tick records {path}: {error.strerror}\n")
+        return None
+
+
 def summary(loop: Loop) -> str:
     """Statistics of the loop as one JSON line."""
     supervisor = loop.controller.supervisor
@@ -177,8 +190,8 @@ def main(arguments: list[str] | None = None) -> int:
         setpoints = listen(options.setpoint_port)
         timing = LoopTiming(controller, timing_writer(options.timing))
         loop = Loop(
-            controller, buses, setpoints, options.report, options.record, timing, settings.period_ns, lead_ns,
-            sleep=make_sleep(options.spin_us * 1000),
+            controller, buses, setpoints, options.report, record_ring(options.record), timing, settings.period_ns,
+            lead_ns, sleep=make_sleep(options.spin_us * 1000),
         )  # fmt: skip
     except (ConfigError, DbcError) as error:
         sys.stderr.write(f"controller: {error}\n")

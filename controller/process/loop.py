@@ -19,6 +19,7 @@ from typing import Final
 
 from can_dbc.bus.base import Bus, BusError
 from can_dbc.bus.batch import Batch
+from can_dbc.messages.record_ring import RecordRing
 from can_dbc.messages.tick_record import RecordRefused, RecordWriter
 from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, sleep_until
@@ -43,7 +44,7 @@ class Loop:
         buses: Sequence[Bus],
         setpoints: socket.socket,
         reports: Sequence[Address],
-        record: Address | None,
+        record: RecordRing | None,
         timing: LoopTiming,
         period_ns: int,
         sync_lead_ns: int,
@@ -60,7 +61,7 @@ class Loop:
         self._crane, *more = (BusLink(bus) for bus in buses)
         self._machine = more[0] if more else None
         self._reports = [_connected(address) for address in reports]
-        self._record = _connected(record) if record is not None else None
+        self._record = record
         self._period_ns, self._sync_lead_ns = period_ns, sync_lead_ns
         self._clock_ns, self._sleep = clock_ns, sleep
         self._inputs = Inputs()
@@ -144,9 +145,10 @@ class Loop:
 
     def close(self) -> None:
         """Close the sockets, the buses and the timing page."""
-        for sender in (*self._reports, self._record):
-            if sender is not None:
-                sender.close()
+        for receiver in self._reports:
+            receiver.close()
+        if self._record is not None:
+            self._record.close()
         self.setpoints.close()
         for bus in self.buses:
             bus.close()
@@ -171,10 +173,9 @@ class Loop:
                     self.unsent += not _send(receiver, report)
         if self._record is not None:
             try:
-                sent = _send(self._record, write(self._writer, inputs, outputs, now_ns))
+                self._record.append(write(self._writer, inputs, outputs, now_ns))
             except RecordRefused:
-                sent = False
-            self.unrecorded += not sent
+                self.unrecorded += 1
         if now_ns >= self.timing.publish_ns:
             supervisor = self.controller.supervisor
             self.timing.publish(
@@ -201,12 +202,12 @@ def _connected(address: Address) -> socket.socket:
     except OSError as error:
         made.close()
         where = f"{address[0]}:{address[1]}"
-        sentence = f"Nothing can be sent to {where} ({error}); check --report and --record, or the network."
+        sentence = f"Nothing can be sent to {where} ({error}); check --report, or the network."
         raise BusError("udp.unreachable", sentence) from error
     return made
 
 
-def _send(receiver: socket.socket, data: bytes | memoryview) -> bool:
+def _send(receiver: socket.socket, data: bytes) -> bool:
     """Whether the system took a datagram; not while nobody listens."""
     try:
         return receiver.send(data) == len(data)

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import itertools
 import socket
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 from can_dbc.bus.base import BaseBus
@@ -18,6 +20,7 @@ from can_dbc.dbc.codec import MessageCodec
 from can_dbc.frame import Frame, RawFrame
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import Datagram, encode
+from can_dbc.messages.record_ring import RecordRing
 from can_dbc.messages.vehicle import DriveSetpoint, Steering
 from can_dbc.protocols.e2e import Sender
 from can_dbc.protocols.nmea2000 import fast_packet
@@ -33,6 +36,7 @@ TICKS: Final = 400
 VALUES: Final = {"GnssPositionData": {"Method": 4}, "EncArtic": {"Position": 8192}}
 """Values that are not zero, because a drive setpoint needs them: an RTK fix, and a straight carrier."""
 _LEASE_NS: Final = 100_000_000
+_MEMORY: Final = Path("/dev/shm")
 
 
 class NullBus(BaseBus):
@@ -98,6 +102,7 @@ def warm_up(settings: Settings, controller: Controller) -> None:
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner,
+        tempfile.TemporaryDirectory(dir=_MEMORY if _MEMORY.is_dir() else None) as folder,
     ):
         receiver.bind(("127.0.0.1", 0))
         planner.bind(("127.0.0.1", 0))
@@ -105,8 +110,8 @@ def warm_up(settings: Settings, controller: Controller) -> None:
         clock = itertools.count(1_000_000_000, 1_000)
         address = receiver.getsockname()
         loop = Loop(
-            controller, buses, planner, [address], address, LoopTiming(controller), settings.period_ns,
-            settings.sync_lead_ns, clock.__next__, lambda _deadline_ns: None, notify="",
+            controller, buses, planner, [address], RecordRing(Path(folder, "ticks")), LoopTiming(controller),
+            settings.period_ns, settings.sync_lead_ns, clock.__next__, lambda _deadline_ns: None, notify="",
         )  # fmt: skip
         _run_ticks(loop, settings, crane, machine, planner.getsockname())
         loop.shut_down()

@@ -1,22 +1,22 @@
 """Checks the controller's tick records for missing data: ``python -m experiments.timing.bus_observer``.
 
-Input: UDP datagrams with tick records.  It checks the frames that the controller received and sent
-(`experiments.timing.continuity`), and that no record is missing apart from missed periods.  It prints its totals once a
-second as a JSON line.  Exit codes: 0 stopped by SIGTERM or SIGINT, 2 usage, 3 profile.
+Input: the ring of tick records (`can_dbc.messages.record_ring`), polled.  It checks the frames that the controller
+received and sent (`experiments.timing.continuity`), and that no record is missing apart from missed periods.  It prints
+its totals once a second as a JSON line.  Exit codes: 0 stopped by SIGTERM or SIGINT, 2 usage, 3 profile.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import gc
 import json
 import signal
-import socket
 import sys
 import time
+from pathlib import Path
 from typing import Final
 
+from can_dbc.messages.record_ring import RingReader
 from can_dbc.messages.tick_record import RecordRefused, TickRecord, decode
 from can_dbc.protocols.canopen import SYNC_ID
 from experiments.timing.continuity import Continuity, databases
@@ -24,9 +24,8 @@ from machine.loading.profile_file import ProfileError, load_profile
 from machine.profile import Profile
 
 PRINT_PERIOD_NS: Final = 1_000_000_000
-BUFFER_BYTES: Final = 4 << 20
-SO_RCVBUFFORCE: Final = 33
-"""socket(7): as root it exceeds the limit of the system."""
+POLL_PERIOD_S: Final = 0.05
+"""A fortieth of what the ring holds at 1 kHz."""
 
 
 class BusObserver:
@@ -44,7 +43,7 @@ class BusObserver:
         self.records = self.lost = self.unreadable = 0
 
     def add(self, data: bytes) -> None:
-        """Add one datagram."""
+        """Add one record."""
         try:
             record = decode(data)
         except RecordRefused:
@@ -92,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--profile", required=True)
     parser.add_argument("--rate", required=True, type=int, metavar="HZ")
-    parser.add_argument("--port", required=True, type=int, help="UDP port of the tick records")
+    parser.add_argument("--ticks", required=True, type=Path, help="ring of the tick records")
     options = parser.parse_args(arguments)
     try:
         observer = BusObserver(load_profile(options.profile), 1_000_000_000 // options.rate)
@@ -102,23 +101,21 @@ def main(arguments: list[str] | None = None) -> int:
     ended: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda which, _frame: ended.append(which))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
-        with contextlib.suppress(OSError):
-            link.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
-        link.bind(("127.0.0.1", options.port))
-        link.settimeout(0.1)
-        gc.collect()
-        gc.freeze()
-        print("ready", flush=True)
-        next_print_ns = 0
-        while not ended:
-            with contextlib.suppress(TimeoutError):
-                observer.add(link.recv(65_536))
-            now_ns = time.monotonic_ns()
-            if now_ns >= next_print_ns:
-                next_print_ns = now_ns + PRINT_PERIOD_NS
-                print(json.dumps(observer.totals()), flush=True)
+    ring = RingReader(options.ticks)
+    gc.collect()
+    gc.freeze()
+    print("ready", flush=True)
+    next_print_ns = 0
+    while not ended:
+        time.sleep(POLL_PERIOD_S)
+        for record in ring.read():
+            observer.add(record)
+        now_ns = time.monotonic_ns()
+        if now_ns >= next_print_ns:
+            next_print_ns = now_ns + PRINT_PERIOD_NS
+            print(json.dumps(observer.totals()), flush=True)
     print(json.dumps(observer.totals()), flush=True)
+    ring.close()
     return 0
 
 

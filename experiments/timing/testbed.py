@@ -138,7 +138,8 @@ class TimingTestbed:
         addresses = {n: f"socketcan:{VCAN_NAMES[n]}" if vcan else f"wire:{n}" for n in names}
         buses = [x for n, address in addresses.items() for x in ("--bus", f"{n}={address}")]
         crane = ("--bus", f"{profile.crane_bus}={addresses[profile.crane_bus]}")
-        control, reports, ticks = free_udp_ports(3)
+        control, reports = free_udp_ports(2)
+        ticks = self._private / "controller.ticks"
         if not vcan:
             rates = dict(s.bitrates)
             self._start("wire", "hil.wire.daemon", *(x for n in names for x in ("--bus", f"{n}:{rates[n]}")))
@@ -155,13 +156,13 @@ class TimingTestbed:
             "--controller", f"{HOST}:{control}", "--report-port", reports,
         )  # fmt: skip
         self._start(
-            "observer", "experiments.timing.bus_observer", "--profile", s.profile, "--rate", s.rate_hz, "--port", ticks
+            "observer", "experiments.timing.bus_observer", "--profile", s.profile, "--rate", s.rate_hz, "--ticks", ticks
         )
         guard = self.family.start("guard", "controller.guard", "--profile", s.profile, *crane)
         self._elsewhere(guard.process.pid)
         self.family.start(
             "controller", "controller", "--profile", s.profile, *buses, "--setpoint-port", control,
-            "--report", f"{HOST}:{reports}", "--record", f"{HOST}:{ticks}", "--rate", s.rate_hz, "--timing", self.page,
+            "--report", f"{HOST}:{reports}", "--record", ticks, "--rate", s.rate_hz, "--timing", self.page,
             *(("--cpu", self.cpu) if self.cpu not in self.others else ()), *s.arguments,
         )  # fmt: skip
         self._await_motion()
@@ -171,7 +172,7 @@ class TimingTestbed:
         self.family.await_message(name, "ready", START_S)
         if name in PRIORITY:
             self.family.set_fifo_priority(name, PRIORITY[name])
-        else:  # it only reads what the kernel buffers for seconds
+        else:  # it only reads what the ring holds for seconds
             self.family.set_niceness(name, OBSERVER_NICENESS)
         self._elsewhere(child.process.pid)
 

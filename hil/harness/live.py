@@ -35,7 +35,7 @@ from machine.status.modes import Mode
 Outcome = TypeVar("Outcome")
 HOST: Final = "127.0.0.1"
 END_ORDER: Final = ("autonomy", "controller", "guard", "console", "detector", "plc", "sim", "recorder", "wire")
-PORTS: Final = ("control", "planner", "orders", "page", "ticks", "reports", "sim", "pictures")
+PORTS: Final = ("control", "planner", "orders", "page", "reports", "sim", "pictures")
 START_S: Final = 60.0
 POLL_S: Final = 0.1
 PLANNER_END_S: Final = 10.0
@@ -103,7 +103,8 @@ class LiveRun(ABC, Generic[Outcome]):
         self._processes = ProcessGroup(options.directory)
         self._profile = ("--profile", options.profile_name)
         # In memory, and private to this run.
-        self._timing = ("--timing", default_path().with_name(f"live-{os.getpid()}.timing"))
+        page = default_path().with_name(f"live-{os.getpid()}.timing")
+        self._timing, self._ticks = ("--timing", page), page.with_suffix(".ticks")
         self._report: StateReport | None = None
         self._first: StateReport | None = None
         self._failure = self._grasp = ""
@@ -161,7 +162,7 @@ class LiveRun(ABC, Generic[Outcome]):
         self._start(
             "recorder", "recorder", *self._profile, *bus, "--out", options.directory, "--seed", options.seed,
             "--no-sync",
-            "--tick-port", ports["ticks"], "--report-port", ports["reports"], *self._timing,
+            "--ticks", self._ticks, "--report-port", ports["reports"], *self._timing,
         )  # fmt: skip
         self._processes.await_message("recorder", "ready", START_S)
         self._processes.set_fifo_priority("recorder", RECORDER_PRIORITY)
@@ -222,7 +223,7 @@ class LiveRun(ABC, Generic[Outcome]):
         listeners += [ports["page"]] if self._options.console_port else []
         self._start(
             "controller", "controller", *self._profile, *bus, "--setpoint-port", ports["control"],
-            "--record", f"{HOST}:{ports['ticks']}", *self._timing,
+            "--record", self._ticks, *self._timing,
             *(x for port in listeners for x in ("--report", f"{HOST}:{port}")),
         )  # fmt: skip
 

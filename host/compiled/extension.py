@@ -22,7 +22,16 @@ COLD_PATHS: Final = Path("host", "compiled", "cold_paths.h")
 HOT_FUNCTIONS: Final = Path("host", "compiled", "hot_functions.txt")
 """C names of the functions that `step` calls, one a line; made by `hil.tick.hot_functions`."""
 _LOOP_MODULES: Final = (
-    "batch", "bus_link", "durations", "loop", "reconnector", "tick_record", "tick_recording", "timing", "wire_records",
+    "batch",
+    "bus_link",
+    "durations",
+    "loop",
+    "reconnector",
+    "record_ring",
+    "tick_record",
+    "tick_recording",
+    "timing",
+    "wire_records",
 )
 """Modules around `step`: what a tick calls of them it calls on every bus, which no replay has."""
 _PROTOTYPE: Final = re.compile(r"^(?:extern )?\w[\w *]*?\b(CPy(?:Def|Py)_\w+)\(.*\);$", re.MULTILINE)

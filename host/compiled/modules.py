@@ -21,6 +21,7 @@ MODULES: Final = (
     "can_dbc.messages.crane",
     "can_dbc.messages.datagrams",
     "can_dbc.messages.envelope",
+    "can_dbc.messages.record_ring",
     "can_dbc.messages.tick_record",
     "can_dbc.messages.vehicle",
     "can_dbc.protocols.canopen",

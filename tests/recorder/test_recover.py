@@ -20,6 +20,7 @@ from mcap.reader import make_reader
 
 from can_dbc.bus.factory import open_bus
 from can_dbc.messages import tick_record
+from can_dbc.messages.record_ring import RecordRing, RingReader
 from can_dbc.timing.page import TimingWriter
 from recorder import manifest as manifests
 from recorder.__main__ import FLUSH_PERIOD_S, InputCollector, udp_socket, write_all
@@ -127,14 +128,14 @@ class Process:
     """``python -m recorder`` on a private python-can bus of this machine, and a sender of ticks."""
 
     def __init__(self, out):
-        self.out, self.port = out, free_port()
+        self.out, self.ticks = out, out / "controller.ticks"
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "recorder", "--out", out, "--tick-port", str(self.port), "--report-port",
+            [sys.executable, "-m", "recorder", "--out", out, "--ticks", str(self.ticks), "--report-port",
              str(free_port()), "--bus", "crane0=virtual:recorder-test"],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert "ready" in self.process.stdout.readline()
-        self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.ring = RecordRing(self.ticks)
         self.sent = []
 
     def send(self, seconds):
@@ -144,7 +145,7 @@ class Process:
             now = time.monotonic_ns()
             quiet = tick_record.BusReading()
             data = tick_record.encode(tick_record.TickRecord(now, 0, 0, 0, quiet, quiet, (), (), (), (), (), b""))
-            self.sender.sendto(data, ("127.0.0.1", self.port))
+            self.ring.append(data)
             self.sent.append(data)
             time.sleep(T_NS / 1e9)
 
@@ -159,7 +160,7 @@ class Process:
             self.process.wait()
         self.process.stdout.close()
         self.process.stderr.close()
-        self.sender.close()
+        self.ring.close()
 
 
 @pytest.fixture
@@ -187,7 +188,7 @@ def test_a_killed_recorder_loses_only_the_last_moment(live, tmp_path):
 
 def test_the_collector_records_what_is_on_a_bus(tmp_path):
     with open_bus("virtual:collector-test") as mine, open_bus("virtual:collector-test") as plant:
-        inputs = InputCollector({"crane0": mine}, udp_socket(0), udp_socket(0))
+        inputs = InputCollector({"crane0": mine}, RingReader(tmp_path / "controller.ticks"), udp_socket(0))
         recorder = Recorder(tmp_path, PROFILE, manifest(live=True))
         writer = threading.Thread(target=write_all, args=(recorder, inputs))
         writer.start()
@@ -208,7 +209,7 @@ def test_the_collector_records_what_is_on_a_bus(tmp_path):
 
 def test_frames_that_the_kernel_dropped_are_reported_once(tmp_path, capfd):
     with open_bus("virtual:collector-loses") as bus:
-        inputs = InputCollector({"crane0": bus}, udp_socket(0), udp_socket(0))
+        inputs = InputCollector({"crane0": bus}, RingReader(tmp_path / "controller.ticks"), udp_socket(0))
         receive = inputs._receivers[0]
         receive()
         assert not capfd.readouterr().err
@@ -224,7 +225,7 @@ def test_frames_that_the_kernel_dropped_are_reported_once(tmp_path, capfd):
 def test_the_collector_receives_each_state_of_the_timing_page_once(timing, tmp_path, monkeypatch):
     monkeypatch.setattr("recorder.__main__.TIMING_PERIOD_S", 0.0)
     page = tmp_path / "controller.timing"
-    inputs = InputCollector({}, udp_socket(0), udp_socket(0), page)
+    inputs = InputCollector({}, RingReader(tmp_path / "controller.ticks"), udp_socket(0), page)
     *_, receive = inputs._receivers
     receive()
     assert inputs.items.empty(), "no controller yet"
@@ -240,7 +241,7 @@ def test_the_collector_receives_each_state_of_the_timing_page_once(timing, tmp_p
 
 
 def test_records_that_do_not_fit_into_the_queue_are_counted(tmp_path, capfd):
-    inputs = InputCollector({}, udp_socket(0), udp_socket(0))
+    inputs = InputCollector({}, RingReader(tmp_path / "controller.ticks"), udp_socket(0))
     inputs.items = queue.Queue(2)
     for k in range(5):
         inputs._put(("tick", "", tick(k)), 1)
@@ -274,7 +275,7 @@ def test_a_stopped_recorder_leaves_complete_files(live, tmp_path, number):
 def test_unusable_arguments_are_reported_at_once(tmp_path, code, arguments):
     arguments = [str(tmp_path) if a == "OUT" else a for a in arguments]
     done = subprocess.run(
-        [sys.executable, "-m", "recorder", "--tick-port", "0", "--report-port", "0", *arguments],
+        [sys.executable, "-m", "recorder", "--report-port", "0", *arguments],
         capture_output=True, text=True, timeout=30, env={**os.environ, "COLUMNS": "200"},
     )  # fmt: skip
     assert done.returncode == code and "Traceback" not in done.stderr

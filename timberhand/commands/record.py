@@ -16,9 +16,11 @@ def record(
         list[str] | None,
         typer.Option(help="NAME=ADDRESS of a bus; may be repeated (default: the buses of the profile)."),
     ] = None,
-    tick_port: Annotated[int, typer.Option(help="UDP port of the controller's tick records.")] = 8473,
     report_port: Annotated[int, typer.Option(help="UDP port of the controller's state reports.")] = 8474,
     profile: ProfileOption = "palms_471",
+    ticks: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Ring of the controller's tick records in shared memory.")
+    ] = None,
     timing: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Timing page of the controller, recorded once per second.")
     ] = None,
@@ -45,7 +47,7 @@ def record(
         raise CommandFailed.from_error(error, ExitCode.CONFIGURATION) from error
     except BusError as error:
         raise CommandFailed.from_error(error, ExitCode.BUS) from error
-    arguments = ["--out", str(out), "--tick-port", str(tick_port), "--report-port", str(report_port)]
+    arguments = ["--out", str(out), "--report-port", str(report_port), *(("--ticks", str(ticks)) if ticks else ())]
     arguments += ["--timing", str(timing)] if timing else []
     code = main([*arguments, "--profile", profile, *(x for b in buses for x in ("--bus", b))])
     raise typer.Exit(code)

@@ -1,0 +1,43 @@
+"""A file in shared memory that one process writes and any other may read."""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+from pathlib import Path
+
+
+def shared_path(name: str) -> Path:
+    """Path of a shared file: in ``RUNTIME_DIRECTORY`` (set by systemd), else in this user's directory in /dev/shm."""
+    runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    return Path(runtime or f"/dev/shm/timberhand-{os.getuid()}") / name
+
+
+class SharedFile:
+    """Owns the file at ``path``, ``size`` bytes of zeros in ``map``.  Everyone may read it; it must hold no secret."""
+
+    __slots__ = ("_inode", "_path", "map")
+
+    def __init__(self, path: Path, size: int) -> None:
+        """Raises OSError if it cannot be created."""
+        path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
+        # A new file each time: a reader of a former process's file keeps its mapping.
+        with contextlib.suppress(FileNotFoundError):
+            path.unlink()
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        try:
+            os.fchmod(descriptor, 0o644)  # independent of the umask
+            os.posix_fallocate(descriptor, 0, size)  # no page fault and no full file system at the first write
+            self.map = mmap.mmap(descriptor, size)
+            self._inode = os.fstat(descriptor).st_ino
+        finally:
+            os.close(descriptor)
+        self._path = path
+
+    def close(self) -> None:
+        """Removes the file, unless another process owns it by now; may be called twice."""
+        with contextlib.suppress(OSError):
+            if self._path.stat().st_ino == self._inode:
+                self._path.unlink()
+        self.map.close()

@@ -1,0 +1,115 @@
+"""The ring of tick records: order, wrap-around, a slow reader, a restarted writer, two processes at once."""
+
+import os
+import select
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from can_dbc.messages import record_ring
+from can_dbc.messages.record_ring import HEAD_BYTES, RecordRing, RingReader
+
+SMALL = 4096
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setattr(record_ring, "CAPACITY_BYTES", SMALL)
+
+
+@given(st.lists(st.lists(st.binary(max_size=600), max_size=4), max_size=30))
+@settings(max_examples=60, deadline=None)
+def test_a_reader_that_keeps_up_gets_every_record_in_order(tmp_path_factory, turns):
+    path = tmp_path_factory.mktemp("ring") / "ticks"
+    before, record_ring.CAPACITY_BYTES = record_ring.CAPACITY_BYTES, SMALL
+    try:
+        reader, ring = RingReader(path), RecordRing(path)
+        for records in turns:
+            for record in records:
+                ring.append(record)
+            assert reader.read() == records
+        assert reader.lost == 0
+        reader.close()
+        ring.close()
+    finally:
+        record_ring.CAPACITY_BYTES = before
+
+
+def test_a_slow_reader_loses_records_and_counts_them(small, tmp_path):
+    reader, ring = RingReader(tmp_path / "ticks"), RecordRing(tmp_path / "ticks")
+    ring.append(b"first")
+    assert reader.read() == [b"first"]
+    for k in range(1000):
+        ring.append(b"%04d" % k)
+    assert reader.read() == []  # the whole ring was overwritten: nothing in it is certain
+    ring.append(b"next")
+    assert reader.read() == [b"next"] and reader.lost == 1000
+    reader.close()
+    ring.close()
+
+
+def test_a_ring_that_is_there_is_read_from_now_on_and_a_new_one_from_its_beginning(tmp_path):
+    path = tmp_path / "ticks"
+    first = RecordRing(path)
+    first.append(b"before")
+    reader = RingReader(path)
+    first.append(b"after")
+    assert reader.read() == [b"after"] and reader.lost == 0
+    second = RecordRing(path)  # a restarted controller, before the old one removed its ring
+    first.close()
+    second.append(b"new")
+    assert reader.read() == [] and reader.read() == [b"new"] and reader.lost == 0
+    assert path.exists()
+    second.close()
+    assert not path.exists()
+    reader.close()
+
+
+def test_a_file_that_is_no_ring_is_not_read(tmp_path):
+    (tmp_path / "ticks").write_bytes(bytes(HEAD_BYTES + SMALL))
+    reader = RingReader(tmp_path / "ticks")
+    assert reader.read() == []
+    reader.close()
+
+
+def test_two_processes_at_full_speed_agree_on_every_record_that_arrives(tmp_path):
+    """The writer overtakes the reader again and again; what is read is whole, in order, and the rest is counted."""
+    path = tmp_path / "ticks"
+    script = (
+        "import sys\nfrom pathlib import Path\nfrom can_dbc.messages.record_ring import RecordRing\n"
+        "ring = RecordRing(Path(sys.argv[1]))\nprint('ready', flush=True)\nsys.stdin.readline()\n"
+        "for k in range(200_000):\n    ring.append(k.to_bytes(4, 'little') * (1 + k % 200))\n"
+        "print('done', flush=True)\nsys.stdin.readline()\nring.append(b'last')\n"
+        "print('ended', flush=True)\nsys.stdin.readline()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    ) as writer:  # fmt: skip
+        assert "ready" in writer.stdout.readline()
+        reader = RingReader(path)
+        writer.stdin.write("\n")
+        writer.stdin.flush()
+        numbers = []
+
+        def read():
+            for record in reader.read():
+                k = int.from_bytes(record[:4], "little")
+                assert record in (b"last", k.to_bytes(4, "little") * (1 + k % 200))
+                numbers.append(k if record != b"last" else 200_000)
+
+        while not select.select([writer.stdout], [], [], 0.0)[0]:
+            read()
+        read()  # nothing may come for a while: the last record follows then
+        for line in ("done", "ended"):
+            assert line in writer.stdout.readline()
+            read()
+            writer.stdin.write("\n")
+            writer.stdin.flush()
+    assert numbers[-1] == 200_000
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) + reader.lost == 200_001
+    reader.close()
