@@ -1,9 +1,10 @@
 """One side of a comparison: ``python -m hil.tick.worker``, on the compiled tick unless ``TIMBERHAND_COMPILED=0``.
 
-``cost RECORDING TICKS`` replays a recording twice, hot and cold, and prints one JSON object.  ``replay RECORDING``
-prints the digest of all outputs and how many ticks differ from it.  ``random RECORDING SEED TICKS`` runs random ticks
-and prints a digest of all outputs after every pass.  ``pipe PROFILE`` reads tick records, each behind its length (u32),
-and answers each with the digest of its outputs.
+``cost RECORDING TICKS`` replays a recording twice, hot and cold, and prints one JSON object.
+``counted RECORDING TICKS`` replays it once with evicted caches, for valgrind (`hil.tick.counted`).  ``replay
+RECORDING`` prints the digest of all outputs and how many ticks differ from it.  ``random RECORDING SEED TICKS`` runs
+random ticks and prints a digest of all outputs after every pass.  ``pipe PROFILE`` reads tick records, each behind its
+length (u32), and answers each with the digest of its outputs.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 WARM_TICKS: Final = 200
 CACHE_LINE_BYTES: Final = 64
 MIN_EVICTION_BYTES: Final = 24 << 20
+COUNTED_CACHE_BYTES: Final = 2 << 20
+"""Last level of the processor that valgrind simulates."""
 
 
 def eviction_bytes() -> int:
@@ -84,6 +87,26 @@ def cost(place: Path, limit: int) -> dict[str, Any]:
         "tick": str(running()), "ticks": len(ticks), "hot": _timed(settings, ticks, lambda: None),
         "cold": _timed(settings, ticks, evict),
     }  # fmt: skip
+
+
+def counted(place: Path, limit: int) -> dict[str, Any]:
+    """Replay with evicted caches of a simulated processor; the number of ticks."""
+    from controller.process.tick_recording import restore_inputs
+    from controller.step import Controller, step
+    from controller.tick import Inputs
+
+    settings, ticks = recorded(place, limit)
+    evicted = bytearray(3 * COUNTED_CACHE_BYTES)
+    lines = bytes(len(evicted) // CACHE_LINE_BYTES)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    controller, inputs = Controller(settings), Inputs()
+    for tick in ticks:
+        restore_inputs(inputs, tick)
+        evicted[::CACHE_LINE_BYTES] = lines
+        step(controller, inputs, tick.now_ns)
+    return {"tick": str(running()), "counted": len(ticks)}
 
 
 def replayed(place: Path) -> dict[str, Any]:
@@ -224,6 +247,8 @@ def main(arguments: list[str]) -> int:
     command, *rest = arguments
     if command == "cost":
         print(json.dumps(cost(Path(rest[0]), int(rest[1]))))
+    elif command == "counted":
+        print(json.dumps(counted(Path(rest[0]), int(rest[1]))))
     elif command == "replay":
         print(json.dumps(replayed(Path(rest[0]))))
     elif command == "random":

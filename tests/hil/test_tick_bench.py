@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.tick import release
+from hil.tick import counted, release
 from hil.tick.ratio import compared, median_interval, verdict
 from host.exit_codes import CommandFailed
 from tests.codes import coded
@@ -77,3 +77,13 @@ def test_the_newest_tag_is_the_last_release(tmp_path: Path, monkeypatch: pytest.
         subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", tag], cwd=tmp_path, env=environment, check=True)
         subprocess.run(["git", "tag", tag], cwd=tmp_path, check=True)
     assert release.newest_tag() == "v1"
+
+
+def test_what_valgrind_counted_is_told_for_one_tick():
+    told = "==7== Events    : Ir Dr Dw I1mr D1mr D1mw ILmr DLmr DLmw\n==7== Collected : 2000 5 5 5 5 5 100 60 40\n"
+    found = counted._per_tick('{"tick": "compiled x", "counted": 20}', told)
+    assert found == {"ticks": 20, "instructions": 100, "code_lines": 5, "read_lines": 3, "written_lines": 2}
+    with pytest.raises(CommandFailed, check=coded("tick.not-counted")):
+        counted._per_tick('{"tick": "interpreter", "counted": 20}', told.replace("2000", "0"))
+    with pytest.raises(CommandFailed, check=coded("tick.not-counted")):
+        counted._per_tick("", "valgrind: command not found")

@@ -26,6 +26,10 @@ def tick(
     against: Annotated[
         str, typer.Option(metavar="REF|WHEEL", help="A tag, commit or wheel as third side (default: the newest tag).")
     ] = "",
+    counted: Annotated[
+        bool,
+        typer.Option("--count", help="Count what a compiled tick executes and touches, with valgrind, instead."),
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the random ticks.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -35,7 +39,9 @@ def tick(
     once) and cold (caches evicted before each tick, as after 5 ms of other
     work), and the instructions of one tick where the host counts them. A ratio
     is the median over the rounds, with its 95 % interval; "inconclusive" when
-    the interval holds the limit. The last release, or --against, is compiled
+    the interval holds the limit. --count needs a minute, no quiet host, and
+    tells the same each time: what a tick executes, and how many cache lines it
+    touches. The last release, or --against, is compiled
     in build/against and judged in the same rounds. Exit code 6 when a byte
     differs or a ratio is missed.
 
@@ -48,6 +54,8 @@ def tick(
       timberhand bench tick --against HEAD~20
 
       timberhand bench tick --random 1000000
+
+      timberhand bench tick --count --ticks 600
     """
     import json
     import sys
@@ -65,6 +73,9 @@ def tick(
         if random:
             rows = _random(places, seed, random, progress)
             reached = all(row["differs_after"] is None for row in rows)
+        elif counted:
+            rows = [_counted(place, ticks, Path(folder), progress) for place in places]
+            reached = True
         else:
             wanted = against or release.newest_tag()
             other = release.release(wanted, progress) if wanted else None
@@ -79,7 +90,7 @@ def tick(
     else:
         typer.echo("  ".join(f"{name} {value}" for name, value in environment.items()))
         for row in rows:
-            _show_random(row) if random else _show_cost(row)
+            (_show_random if random else _show_count if counted else _show_cost)(row)
     if not reached:
         raise typer.Exit(ExitCode.FIGURE_MISSED)
 
@@ -88,6 +99,13 @@ def _random(places: list[Path], seed: int, ticks: int, progress: Progress) -> li
     from hil.tick.compare import compare_random
 
     return [compare_random(place, seed, -(-ticks // len(places)), progress) for place in places]
+
+
+def _counted(place: Path, ticks: int, folder: Path, progress: Progress) -> dict[str, Any]:
+    from hil.tick.counted import count
+
+    progress(f"{place.parent.name}: counting")
+    return count(place, ticks, folder)
 
 
 def _good(row: dict[str, Any]) -> bool:
@@ -108,6 +126,15 @@ def _show_cost(row: dict[str, Any]) -> None:
         few = found["high"] is None
         interval = "fewer than 6 rounds give no interval" if few else f"{found['low']:.2f} to {found['high']:.2f}"
         typer.echo(f"  {name:20} {found['ratio']:.2f} ({interval}), at least {found['at_least']}: {found['verdict']}")
+
+
+def _show_count(row: dict[str, Any]) -> None:
+    lines = row["code_lines"] + row["read_lines"] + row["written_lines"]
+    typer.echo(
+        f"{row['recording']}: {row['instructions']} instructions and {lines} cache lines a tick "
+        f"({row['code_lines']} of code, {row['read_lines']} read, {row['written_lines']} written), "
+        f"mean of {row['ticks']}"
+    )
 
 
 def _show_random(row: dict[str, Any]) -> None:
