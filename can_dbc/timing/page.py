@@ -76,11 +76,13 @@ class ProcessCounters(msgspec.Struct, frozen=True):
 
 
 class InputAge(msgspec.Struct):
-    """Age of an input when a tick used it: newest and longest; ``count`` is the number of uses."""
+    """Age of an input when a tick used it: newest and longest; ``count`` is the number of uses, ``refused`` that of
+    frames with a wrong length, checksum, counter or value."""
 
     newest_ns: int = 0
     longest_ns: int = 0
     count: int = 0
+    refused: int = 0
 
 
 class Facts(msgspec.Struct, frozen=True):

@@ -134,8 +134,8 @@ class LoopTiming:
             buses=tuple([_bus_counters(bus) for bus in buses]),
             process=self._process.read(),
             inputs={
-                name: InputAge(self._newest_ns[i], self._longest_ns[i], self._uses[i])
-                for i, (name, _) in enumerate(self._inputs)
+                name: InputAge(self._newest_ns[i], self._longest_ns[i], self._uses[i], state.refused)
+                for i, (name, state) in enumerate(self._inputs)
             },
             longest_ns=tuple([self.durations[name].longest_ns for name in STAGES]),
             total_ns=tuple([self.durations[name].total_ns for name in STAGES]),

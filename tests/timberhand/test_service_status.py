@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from can_dbc.timing.page import Timing, TimingWriter
+from can_dbc.timing.page import InputAge, Timing, TimingWriter
 from host.exit_codes import CommandFailed
 from timberhand.cli import app
 from timberhand.service_status import status
@@ -111,6 +111,13 @@ def test_the_oldest_input_comes_first_and_one_never_received_is_named(timing: Ti
     text = shown(Status((), timing(), ()), 80)
     assert text.index("Input6") < text.index("Input5") < text.index("Input3")
     assert "Input2" not in text and "3 younger ones" in text and "never received: Never" in text
+
+
+def test_refused_frames_are_shown_with_the_worst_first(timing: Timings) -> None:
+    inputs = {"EncSlew": InputAge(1, 1, 9, 3), "EstopStat": InputAge(1, 1, 9, 17), "EncLift": InputAge(1, 1, 9)}
+    text = " ".join(shown(Status((), timing(inputs=inputs), ()), 100).split())
+    assert "refused frames (length, checksum, counter or value): EstopStat 17, EncSlew 3" in text
+    assert "refused frames" not in shown(Status((), timing(), ()), 100)
 
 
 def test_an_old_page_says_so(timing: Timings) -> None:

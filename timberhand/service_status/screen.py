@@ -127,10 +127,15 @@ def _inputs(facts: Facts) -> RenderableType:
         table.add_row(name, f"{age.newest_ns * 1e-6:.1f}", f"{age.longest_ns * 1e-6:.1f}", number(age.count))
     if len(used) > INPUT_COUNT:
         table.add_row(Text(f"{len(used) - INPUT_COUNT} younger ones", style="dim"))
+    refused = [(name, age.refused) for name, age in facts.inputs.items() if age.refused]
+    told: list[RenderableType] = [table]
+    if refused:
+        counts = ", ".join(f"{name} {number(count)}" for name, count in sorted(refused, key=lambda item: -item[1]))
+        told.append(Text(f"refused frames (length, checksum, counter or value): {counts}", style="yellow"))
     silent = sorted(name for name, age in facts.inputs.items() if not age.count)
-    if not silent:
-        return table
-    return Group(table, Text(f"never received: {', '.join(silent)}", style="yellow"))
+    if silent:
+        told.append(Text(f"never received: {', '.join(silent)}", style="yellow"))
+    return Group(*told)
 
 
 def _buses(facts: Facts) -> Table:
