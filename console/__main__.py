@@ -37,7 +37,7 @@ def serve(
     port: int,
     report_port: int,
     profile: str,
-    controller: str | None = None,
+    operator: Path | None = None,
     planner: str | None = None,
     scene: str | None = None,
     bind: str = "127.0.0.1",
@@ -65,7 +65,7 @@ def serve(
     console = Console(
         profile=machine,
         profile_hash=profile_hash(machine),
-        controller=_address(controller, "--controller"),
+        operator=operator,
         planner=_address(planner, "--planner"),
         scene=_address(scene, "--scene"),
         key=key,
@@ -135,9 +135,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--plant", metavar="HOST:PORT", help="request port of a simulated plant to show instead")
     parser.add_argument("--profile", default="palms_471", help="shipped name or TOML file")
     parser.add_argument(
-        "--controller",
-        metavar="HOST:PORT",
-        help="controller that receives operator commands; without it the page is read-only",
+        "--operator",
+        type=Path,
+        metavar="FILE",
+        help="the controller's socket for operator commands; without it the page is read-only",
     )
     parser.add_argument(
         "--planner", metavar="HOST:PORT", help="planner that receives mission commands (its --order-port)"
@@ -161,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             port=a.port,
             report_port=a.report_port,
             profile=a.profile,
-            controller=a.controller,
+            operator=a.operator,
             planner=a.planner,
             scene=a.scene,
             bind=a.bind,

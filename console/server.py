@@ -32,6 +32,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from autonomy.perception.log_list.datagrams import LogListError, decode_logs, encode_request
+from can_dbc.messages import operator_link
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.mission import MissionAction, MissionCommand, encode_mission_command
@@ -52,12 +53,12 @@ Address = tuple[str, int]
 class Console:
     """Configuration and state of the console.
 
-    ``controller`` None: the page is read-only; ``planner`` None: it sends no mission commands.
+    ``operator`` None: the page is read-only; ``planner`` None: it sends no mission commands.
     """
 
     profile: Profile
     profile_hash: int
-    controller: Address | None = None
+    operator: Path | None = None
     scene: Address | None = None
     key: bytes | None = None
     reports: socket.socket | None = None
@@ -77,9 +78,9 @@ class Console:
         Raises:
             OSError: it cannot be sent.
         """
-        assert self.controller is not None
+        assert self.operator is not None
         message = OperatorCommand(self._next(), self.profile_hash, self.clock(), action)
-        _send(encode(message, self.key), self.controller)
+        operator_link.send(encode(message, self.key), self.operator)
 
     def mission_command(self, action: MissionAction) -> None:
         """Send one mission command to the planner.
@@ -98,7 +99,7 @@ class Console:
 
     def state_for(self, peer: str | None) -> dict[str, Any]:
         """The page's state and the permissions of the viewer at ``peer``."""
-        can = self.controller is not None
+        can = self.operator is not None
         return {
             **self.crane_state.state(self.clock()),
             "may_stop": can,
@@ -150,12 +151,12 @@ def _not_local(name: str) -> Response:
     return PlainTextResponse(f"{name} is accepted only from the machine that runs the console.", 403)
 
 
-def _respond(send: Callable[[], None], who: str, where: Address) -> Response:
+def _respond(send: Callable[[], None], who: str, where: str) -> Response:
     """Send, and report an unreachable receiver."""
     try:
         send()
     except OSError as error:
-        return PlainTextResponse(f"The {who} at {where[0]}:{where[1]} cannot be reached: {error.strerror}.", 502)
+        return PlainTextResponse(f"The {who} at {where} cannot be reached: {error.strerror}.", 502)
     return Response(status_code=204)
 
 
@@ -203,12 +204,12 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
         name = request.path_params["action"].upper()
         if name not in OperatorAction.__members__:
             return PlainTextResponse(f"Unknown command {name}.", 404)
-        if console.controller is None:
-            return PlainTextResponse("This console is read-only; start it with --controller HOST:PORT.", 409)
+        if console.operator is None:
+            return PlainTextResponse("This console is read-only; start it with --operator FILE.", 409)
         peer = request.client.host if request.client else None
         if name != "STOP" and not is_loopback(peer):
             return _not_local(name)
-        return _respond(lambda: console.command(OperatorAction[name]), "controller", console.controller)
+        return _respond(lambda: console.command(OperatorAction[name]), "controller", str(console.operator))
 
     async def mission(request: Request) -> Response:
         name = request.path_params["order"].upper().replace("-", "_")
@@ -218,7 +219,8 @@ def create_app(console: Console, allow_hosts: Collection[str] = ()) -> Starlette
             return PlainTextResponse("This console sends no mission commands; start it with --planner HOST:PORT.", 409)
         if not is_loopback(request.client.host if request.client else None):
             return _not_local(name)
-        return _respond(lambda: console.mission_command(MissionAction[name]), "planner", console.planner)
+        host, port = console.planner
+        return _respond(lambda: console.mission_command(MissionAction[name]), "planner", f"{host}:{port}")
 
     async def ws(socket: WebSocket) -> None:
         await socket.accept()

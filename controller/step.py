@@ -159,26 +159,31 @@ class Controller:
     # -- accept
 
     def accept(self, inputs: Inputs, now_ns: int) -> None:
-        """Accept or refuse every datagram, and handle the reset button."""
+        """Accept or refuse every datagram, the operator's first, and handle the reset button."""
         # After a skip the nominal time is less than one period behind the clock, however long the stall was.
         late_ns = min(max(inputs.late_ns, 0), self._settings.period_ns)
+        for data in inputs.operator:
+            self._accept(data, True, now_ns, late_ns)
         for data in inputs.datagrams:
-            try:
-                message = self.gate.accept(data, now_ns, late_ns)
-                if isinstance(message, CraneSetpoint):
-                    self._accept_crane_setpoint(message, now_ns)
-                elif isinstance(message, SpoolTest):
-                    self._accept_spool_test(message, now_ns)
-                elif isinstance(message, DriveSetpoint):
-                    self._accept_drive_setpoint(message, now_ns, late_ns)
-                else:
-                    self._apply_operator_action(message, now_ns)
-            except RequestRefused as refused:
-                self.gate.count_refusal(refused.reason, refused.detail, now_ns)
+            self._accept(data, False, now_ns, late_ns)
         if self.supervisor.mode is _ACTIVE and self._refused_too_often(now_ns):
             self.supervisor.react_to(Reason.SETPOINTS_REFUSED, 0, now_ns)
         if self.supervisor.reset_button_pressed():
             self.supervisor.request_reset(now_ns)
+
+    def _accept(self, data: bytes, operator: bool, now_ns: int, late_ns: int) -> None:
+        try:
+            message = self.gate.accept(data, now_ns, late_ns, operator)
+            if isinstance(message, CraneSetpoint):
+                self._accept_crane_setpoint(message, now_ns)
+            elif isinstance(message, SpoolTest):
+                self._accept_spool_test(message, now_ns)
+            elif isinstance(message, DriveSetpoint):
+                self._accept_drive_setpoint(message, now_ns, late_ns)
+            else:
+                self._apply_operator_action(message, now_ns)
+        except RequestRefused as refused:
+            self.gate.count_refusal(refused.reason, refused.detail, now_ns)
 
     def _apply_operator_action(self, action: OperatorAction, now_ns: int) -> None:
         supervisor = self.supervisor

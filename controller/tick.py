@@ -23,7 +23,10 @@ class Inputs:
     machine_frames: list[Frame] = field(default_factory=list)
     bus: BusReading = field(default_factory=BusReading)
     machine_bus: BusReading = field(default_factory=BusReading)
+    operator: list[bytes] = field(default_factory=list)
+    """Datagrams of persons who may arm (`controller.requests.operator_socket`); they are heard before the others."""
     datagrams: list[bytes] = field(default_factory=list)
+    """Datagrams of anyone else: setpoints, and STOP."""
     late_ns: int = 0
     missed_ticks: int = 0
     tick_ns: int = 0

@@ -90,6 +90,11 @@ def unsealed(data: bytes, key: bytes | None) -> tuple[int, Common, bytes]:
     return kind, (sequence, profile_hash, stamp_ns), signed[_HEADER.size :]
 
 
+def is_operator_command(data: bytes) -> bool:
+    """Whether a datagram says that it is an operator's command; nothing of it is checked."""
+    return len(data) >= _HEADER.size and _HEADER.unpack_from(data)[2] == Kind.OPERATOR
+
+
 def _mac(data: bytes, key: bytes) -> bytes:
     return hmac.digest(key, data, hashlib.sha256)[:MAC_BYTES]
 

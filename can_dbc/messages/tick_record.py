@@ -5,7 +5,8 @@ Little-endian; bus 0 is crane0, bus 1 is mach0::
     magic u32 | version u16 | frames in u16 | datagrams u16 | frames out u16 | report bytes u16
     now u64 ns | late i64 ns | tick u64 ns | missed u64
     two readings: (state u16, dropped u64, refused u64, errors u64, recoveries u64)
-    frames in: (stamp u64, key u32, bus u8, length u8, data 8) | datagrams: (length u16, bytes)
+    frames in: (stamp u64, key u32, bus u8, length u8, data 8)
+    | datagrams: (length u16, and `OPERATOR` where an operator sent it, bytes), the operator's first
     frames out: (key u32, bus u8, length u8, data 8) | report | vehicle report, all that is left | CRC-32
 
 The controller writes one per tick (`can_dbc.messages.record_ring`); ``decode`` refuses a damaged one as a whole.
@@ -21,10 +22,15 @@ from typing import Final
 
 from can_dbc.bus.base import BusStats
 from can_dbc.frame import Frame
+from can_dbc.messages.envelope import is_operator_command
 from runtime.errors import CodedError
 
 MAGIC: Final = 0x52544854  # "THTR"
-VERSION: Final = 2
+VERSION: Final = 3
+_WITHOUT_OPERATOR: Final = 2
+"""Version of the records in which operators and planners sent to one socket: the kind tells whose a datagram was."""
+OPERATOR: Final = 0x8000
+"""Bit of a datagram's length: an operator sent it."""
 MAX_BYTES: Final = 65_000
 """Most bytes of a record: a tick of two full buses and 16 datagrams has less."""
 
@@ -80,6 +86,8 @@ class TickRecord:
     machine_frames_out: Sequence[tuple[int, bytes]]
     report: bytes
     vehicle_report: bytes = b""
+    operator: Sequence[bytes] = ()
+    """Datagrams of operators; ``datagrams`` are the others."""
 
 
 class RecordWriter:
@@ -106,6 +114,7 @@ class RecordWriter:
         machine_frames_out: Sequence[tuple[int, bytes]],
         report: bytes,
         vehicle_report: bytes,
+        operator: Sequence[bytes],
     ) -> memoryview:
         """The bytes of a tick (the fields of `TickRecord`), valid until the next call.
 
@@ -115,12 +124,13 @@ class RecordWriter:
         buffer, n_in, n_out = self._buffer, len(frames_in) + len(machine_frames_in), len(frames_out)
         n_out += len(machine_frames_out)
         size = _HEAD.size + n_in * _IN.size + n_out * _OUT.size + len(report) + len(vehicle_report) + _CRC.size
-        for datagram in datagrams:
+        n_datagrams = len(operator) + len(datagrams)
+        for datagram in (*operator, *datagrams):
             size += _LENGTH.size + len(datagram)
         if size > MAX_BYTES:
             raise RecordRefused("tick-record.too-long", f"the tick's record of {size} bytes is too long")
         _HEAD.pack_into(
-            buffer, 0, MAGIC, VERSION, n_in, len(datagrams), n_out, len(report), now_ns, late_ns, tick_ns, missed_ticks,
+            buffer, 0, MAGIC, VERSION, n_in, n_datagrams, n_out, len(report), now_ns, late_ns, tick_ns, missed_ticks,
             bus.state, bus.dropped, bus.refused, bus.errors, bus.recoveries,
             machine_bus.state, machine_bus.dropped, machine_bus.refused, machine_bus.errors, machine_bus.recoveries,
         )  # fmt: skip
@@ -131,6 +141,9 @@ class RecordWriter:
         for stamp_ns, key, data in machine_frames_in:
             _IN.pack_into(buffer, at, stamp_ns, key, 1, len(data), data)
             at += _IN.size
+        for datagram in operator:
+            _LENGTH.pack_into(buffer, at, len(datagram) | OPERATOR)
+            at = self._append(datagram, at + _LENGTH.size)
         for datagram in datagrams:
             _LENGTH.pack_into(buffer, at, len(datagram))
             at = self._append(datagram, at + _LENGTH.size)
@@ -156,7 +169,7 @@ def encode(tick: TickRecord) -> bytes:
         RecordWriter().write(
             tick.now_ns, tick.late_ns, tick.tick_ns, tick.missed_ticks, tick.bus, tick.machine_bus, tick.frames_in,
             tick.machine_frames_in, tick.datagrams, tick.frames_out, tick.machine_frames_out, tick.report,
-            tick.vehicle_report,
+            tick.vehicle_report, tick.operator,
         )
     )  # fmt: skip
 
@@ -170,14 +183,15 @@ def decode(data: bytes) -> TickRecord:
     magic, version = _VERSION.unpack_from(data)
     if magic != MAGIC:
         raise RecordRefused("tick-record.magic", "the bytes are not a tick record")
-    if version != VERSION:
+    if version not in (VERSION, _WITHOUT_OPERATOR):
         raise RecordRefused(
             "tick-record.version", f"the tick record has version {version}, this release reads version {VERSION}"
         )
     end = len(data) - _CRC.size
     frames_in: tuple[list[Frame], list[Frame]] = ([], [])
     frames_out: tuple[list[tuple[int, bytes]], list[tuple[int, bytes]]] = ([], [])
-    datagrams = []
+    operator: list[bytes] = []
+    datagrams: list[bytes] = []
     try:
         _, _, n_in, n_datagrams, n_out, n_report, now_ns, late_ns, tick_ns, missed, *counters = _HEAD.unpack_from(data)
         at = _HEAD.size
@@ -187,8 +201,11 @@ def decode(data: bytes) -> TickRecord:
             at += _IN.size
         for _ in range(n_datagrams):
             (length,) = _LENGTH.unpack_from(data, at)
+            pressed, length = length & OPERATOR, length & ~OPERATOR
             at += _LENGTH.size + length
-            datagrams.append(data[at - length : at])
+            datagram = data[at - length : at]
+            pressed = pressed or (version == _WITHOUT_OPERATOR and is_operator_command(datagram))
+            (operator if pressed else datagrams).append(datagram)
         for _ in range(n_out):
             key, bus, length, payload = _OUT.unpack_from(data, at)
             frames_out[bus].append((key, payload[:length]))
@@ -200,5 +217,5 @@ def decode(data: bytes) -> TickRecord:
     return TickRecord(
         now_ns, late_ns, tick_ns, missed, BusReading(*counters[:5]), BusReading(*counters[5:]),
         tuple(frames_in[0]), tuple(frames_in[1]), tuple(datagrams), tuple(frames_out[0]), tuple(frames_out[1]),
-        data[at : at + n_report], data[at + n_report : end],
+        data[at : at + n_report], data[at + n_report : end], tuple(operator),
     )  # fmt: skip

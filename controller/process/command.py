@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import pwd
 import signal
 import socket
 import sys
@@ -20,6 +21,7 @@ from can_dbc.bus.factory import default_address, open_bus
 from can_dbc.bus.filters import FilterItem
 from can_dbc.dbc.codec import DbcError
 from can_dbc.dbc.codec import load as read_dbc
+from can_dbc.messages.operator_link import default_path as operator_path
 from can_dbc.messages.record_ring import RecordRing
 from can_dbc.messages.record_ring import default_path as ring_path
 from can_dbc.messages.udp_address import address_argument
@@ -29,6 +31,7 @@ from controller.process.loop import Loop
 from controller.process.realtime import make_sleep, prepare, stop_garbage_collection
 from controller.process.timing import LoopTiming
 from controller.process.warm_up import warm_up
+from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller
 from machine.status.faults import describe
 from machine.status.modes import Mode
@@ -53,6 +56,10 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--bus", type=bus_address, action="append", default=[], metavar="NAME=ADDRESS",
                       help="address of crane0 and, on a machine with a carrier, of mach0")  # fmt: skip
     made.add_argument("--setpoint-port", type=int, required=True, help="UDP port on 127.0.0.1; 0 chooses a free one")
+    made.add_argument("--operator", type=Path, metavar="FILE",
+                      help="Unix socket for the operator's commands; default: beside the timing page")  # fmt: skip
+    made.add_argument("--operator-user", action="append", default=[], metavar="NAME",
+                      help="user who may arm, besides root and its own; may be given more than once")  # fmt: skip
     made.add_argument("--report", type=address_argument, action="append", default=[], metavar="HOST:PORT",
                       help="receiver of state reports; may be given more than once")  # fmt: skip
     made.add_argument("--record", type=Path, metavar="FILE",
@@ -76,6 +83,24 @@ def bus_address(text: str) -> tuple[str, str]:
     if name not in ("crane0", "mach0") or not where:
         raise argparse.ArgumentTypeError(f"{text}: write NAME=ADDRESS, as in crane0=socketcan:can0")
     return name, where
+
+
+def user_number(name: str) -> int:
+    """The number of a user; raises ConfigError."""
+    try:
+        return pwd.getpwnam(name).pw_uid
+    except KeyError:
+        sentence = f"--operator-user {name}: there is no such user on this computer; create it, or name another."
+        raise ConfigError("config.no-such-user", sentence) from None
+
+
+def operator_socket(path: Path, users: frozenset[int]) -> OperatorSocket:
+    """Open the operators' socket; raises BusError."""
+    try:
+        return OperatorSocket(path, users)
+    except OSError as error:
+        sentence = f"The operator's socket {path} cannot be made ({error.strerror}); choose another with --operator."
+        raise BusError("operator.socket", sentence) from error
 
 
 def listen(port: int) -> socket.socket:
@@ -188,10 +213,12 @@ def main(arguments: list[str] | None = None) -> int:
         where = addresses(settings, dict(options.bus))
         buses = open_buses(where, controller)
         setpoints = listen(options.setpoint_port)
+        users = frozenset(map(user_number, options.operator_user))
+        operator = operator_socket(options.operator or operator_path(), users)
         timing = LoopTiming(controller, timing_writer(options.timing))
         loop = Loop(
-            controller, buses, setpoints, options.report, record_ring(options.record), timing, settings.period_ns,
-            lead_ns, sleep=make_sleep(options.spin_us * 1000),
+            controller, buses, setpoints, operator, options.report, record_ring(options.record), timing,
+            settings.period_ns, lead_ns, sleep=make_sleep(options.spin_us * 1000),
         )  # fmt: skip
     except (ConfigError, DbcError) as error:
         sys.stderr.write(f"controller: {error}\n")

@@ -25,6 +25,7 @@ from controller.process.bus_link import BusLink
 from controller.process.realtime import Notifier, sleep_until
 from controller.process.tick_recording import write
 from controller.process.timing import LoopTiming
+from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
 from machine.status.faults import describe
@@ -43,6 +44,7 @@ class Loop:
         controller: Controller,
         buses: Sequence[Bus],
         setpoints: socket.socket,
+        operator: OperatorSocket | None,
         reports: Sequence[Address],
         record: RecordRing | None,
         timing: LoopTiming,
@@ -54,7 +56,7 @@ class Loop:
     ) -> None:
         self.controller = controller
         self.buses = tuple(buses)
-        self.setpoints = setpoints
+        self.setpoints, self.operator = setpoints, operator
         self.timing = timing
         self.ticks = self.missed = self.unsent = self.unrecorded = 0
         self.stopping = False
@@ -106,7 +108,7 @@ class Loop:
         self._crane.receive(inputs.frames, inputs.bus)
         if machine is not None:
             machine.receive(inputs.machine_frames, inputs.machine_bus)
-        self._receive_datagrams(inputs.datagrams)
+        self._receive_datagrams(inputs)
         inputs.late_ns, inputs.missed_ticks = late_ns, self.missed
         timing.lap()
         outputs = step(self.controller, inputs, now_ns, timing.lap)
@@ -122,6 +124,7 @@ class Loop:
         # Freed now, while they are in the processor's cache, and not at the beginning of the next tick.
         inputs.frames.clear()
         inputs.machine_frames.clear()
+        inputs.operator.clear()
         inputs.datagrams.clear()
         inputs.tick_ns = timing.end()
         self.ticks += 1
@@ -150,12 +153,19 @@ class Loop:
         if self._record is not None:
             self._record.close()
         self.setpoints.close()
+        if self.operator is not None:
+            self.operator.close()
         for bus in self.buses:
             bus.close()
         self.timing.close()
 
-    def _receive_datagrams(self, datagrams: list[bytes]) -> None:
+    def _receive_datagrams(self, inputs: Inputs) -> None:
+        """The operator's commands, and the setpoints that fit into a tick."""
+        datagrams = inputs.datagrams
+        inputs.operator.clear()
         datagrams.clear()
+        if self.operator is not None:
+            self.operator.receive(inputs.operator, datagrams)
         batch = self._waiting
         try:
             count = batch.receive(self.setpoints.fileno())

@@ -18,6 +18,7 @@ def write(writer: RecordWriter, inputs: Inputs, outputs: Outputs, now_ns: int) -
         now_ns, inputs.late_ns, inputs.tick_ns, inputs.missed_ticks, inputs.bus, inputs.machine_bus,
         inputs.frames, inputs.machine_frames, inputs.datagrams, (*outputs.frames, outputs.sync),
         outputs.machine_frames, outputs.report or b"", outputs.vehicle_report or b"",
+        inputs.operator,
     )  # fmt: skip
 
 
@@ -29,7 +30,7 @@ def record(inputs: Inputs, outputs: Outputs, now_ns: int) -> bytes:
 def restore_inputs(inputs: Inputs, tick: TickRecord) -> None:
     """Fill ``inputs`` from a recorded tick; the record is not changed."""
     inputs.frames[:], inputs.machine_frames[:] = tick.frames_in, tick.machine_frames_in
-    inputs.datagrams[:] = tick.datagrams
+    inputs.operator[:], inputs.datagrams[:] = tick.operator, tick.datagrams
     inputs.late_ns, inputs.missed_ticks, inputs.tick_ns = tick.late_ns, tick.missed_ticks, tick.tick_ns
     inputs.bus, inputs.machine_bus = replace(tick.bus), replace(tick.machine_bus)
 

@@ -18,6 +18,7 @@ from typing import Final
 from can_dbc.bus.base import BaseBus
 from can_dbc.dbc.codec import MessageCodec
 from can_dbc.frame import Frame, RawFrame
+from can_dbc.messages import operator_link
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, OperatorCommand
 from can_dbc.messages.datagrams import Datagram, encode
 from can_dbc.messages.record_ring import RecordRing
@@ -27,6 +28,7 @@ from can_dbc.protocols.nmea2000 import fast_packet
 from controller.config import Settings
 from controller.process.loop import Loop
 from controller.process.timing import LoopTiming
+from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller
 from machine.joints import JOINTS
 from machine.profile import joint
@@ -109,16 +111,20 @@ def warm_up(settings: Settings, controller: Controller) -> None:
         planner.setblocking(False)
         clock = itertools.count(1_000_000_000, 1_000)
         address = receiver.getsockname()
+        operator = Path(folder, "operator")
         loop = Loop(
-            controller, buses, planner, [address], RecordRing(Path(folder, "ticks")), LoopTiming(controller),
-            settings.period_ns, settings.sync_lead_ns, clock.__next__, lambda _deadline_ns: None, notify="",
+            controller, buses, planner, OperatorSocket(operator), [address], RecordRing(Path(folder, "ticks")),
+            LoopTiming(controller), settings.period_ns, settings.sync_lead_ns, clock.__next__,
+            lambda _deadline_ns: None, notify="",
         )  # fmt: skip
-        _run_ticks(loop, settings, crane, machine, planner.getsockname())
+        _run_ticks(loop, settings, crane, machine, planner.getsockname(), operator)
         loop.shut_down()
         loop.close()
 
 
-def _run_ticks(loop: Loop, settings: Settings, crane: NullBus, machine: NullBus, planner: tuple[str, int]) -> None:
+def _run_ticks(
+    loop: Loop, settings: Settings, crane: NullBus, machine: NullBus, planner: tuple[str, int], operator: Path
+) -> None:
     controller, period_ns = loop.controller, settings.period_ns
     sources = [
         (machine if state.machine else crane, _MessageSource(state.codec)) for _, state in controller.inputs_in_use
@@ -142,7 +148,9 @@ def _run_ticks(loop: Loop, settings: Settings, crane: NullBus, machine: NullBus,
                 )  # fmt: skip
                 messages = [crane_setpoint, drive] if k % 8 == 0 else []
             else:
-                messages = [OperatorCommand(*stamp, tuple(OperatorAction)[k % len(OperatorAction)])]
+                messages = []
+                pressed = OperatorCommand(*stamp, tuple(OperatorAction)[k % len(OperatorAction)])
+                operator_link.send(encode(pressed, settings.key), operator)
             for message in messages:
                 sender.sendto(encode(message, settings.key), planner)
             sender.sendto(b"invalid", planner)

@@ -3,7 +3,7 @@
 Every datagram is a request, refused whole with a `Reason` or passed on; nothing is corrected.  Checked here: form (CRC,
 length, version, finite numbers, by the codec), profile, age, order and lease.  The motion of a crane setpoint is
 checked by `controller.crane.trajectory_check`, that of a drive setpoint by `controller.carrier.vehicle`.  An operator's
-STOP is accepted whatever profile, age or order it carries.
+STOP is accepted whatever profile, age or order it carries, and from anyone; any other action only from an operator.
 """
 
 from __future__ import annotations
@@ -33,11 +33,12 @@ class RequestGate(SetpointGate):
         self._operator_stamp_ns = self._operator_sequence = -1
 
     def accept(
-        self, data: bytes, now_ns: int, late_ns: int
+        self, data: bytes, now_ns: int, late_ns: int, operator: bool = False
     ) -> CraneSetpoint | SpoolTest | DriveSetpoint | OperatorAction:
         """The setpoint or operator action in a datagram, checked for form, profile, age and order.
 
-        Order and lease of a drive setpoint are checked by the vehicle.
+        ``operator``: it came from a person who may arm, and is no setpoint.  Order and lease of a drive setpoint are
+        checked by the vehicle.
 
         Raises:
             RequestRefused: the datagram does not pass.
@@ -48,8 +49,12 @@ class RequestGate(SetpointGate):
             raise RequestRefused(Reason(100 + error.fault)) from None
         if isinstance(message, OperatorCommand):
             if message.action is not OperatorAction.STOP:
+                if not operator:
+                    raise RequestRefused(Reason.NO_AUTHORITY)
                 self._check_operator(message, now_ns + late_ns)
             return message.action
+        if operator:
+            raise RequestRefused(Reason.DATAGRAM_KIND)
         if isinstance(message, DriveSetpoint):
             if not self._drives:
                 raise RequestRefused(Reason.CANNOT_DRIVE)

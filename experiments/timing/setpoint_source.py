@@ -10,6 +10,7 @@ usage, 3 profile.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import json
 import math
@@ -18,8 +19,10 @@ import socket
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
+from can_dbc.messages import operator_link
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, StateReport
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused
@@ -115,6 +118,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--profile", required=True)
     parser.add_argument("--controller", required=True, type=address_argument, metavar="HOST:PORT")
+    parser.add_argument("--operator", required=True, type=Path, metavar="FILE")
     parser.add_argument("--report-port", required=True, type=int)
     options = parser.parse_args(arguments)
     try:
@@ -131,11 +135,13 @@ def main(arguments: list[str] | None = None) -> int:
         gc.collect()
         gc.freeze()
         print("ready", flush=True)
-        _serve(source, link, options.controller, ended)
+        _serve(source, link, options.controller, options.operator, ended)
     return 0
 
 
-def _serve(source: SetpointSource, link: socket.socket, controller: tuple[str, int], ended: list[int]) -> None:
+def _serve(
+    source: SetpointSource, link: socket.socket, controller: tuple[str, int], operator: Path, ended: list[int]
+) -> None:
     send_ns = next_print_ns = 0
     mode = -1
     while not ended:
@@ -145,7 +151,8 @@ def _serve(source: SetpointSource, link: socket.socket, controller: tuple[str, i
             message = None
         if isinstance(message, StateReport):
             if press := source.receive(message):
-                link.sendto(press, controller)
+                with contextlib.suppress(OSError):  # it has ended
+                    operator_link.send(press, operator)
             if message.mode != mode:
                 mode = message.mode
                 _print(source, event="mode", why=describe(message.reason), reason=message.reason & REASON_MASK)

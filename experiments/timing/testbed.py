@@ -139,7 +139,7 @@ class TimingTestbed:
         buses = [x for n, address in addresses.items() for x in ("--bus", f"{n}={address}")]
         crane = ("--bus", f"{profile.crane_bus}={addresses[profile.crane_bus]}")
         control, reports = free_udp_ports(2)
-        ticks = self._private / "controller.ticks"
+        ticks, operators = (self._private / f"controller.{kind}" for kind in ("ticks", "operator"))
         if not vcan:
             rates = dict(s.bitrates)
             self._start("wire", "hil.wire.daemon", *(x for n in names for x in ("--bus", f"{n}:{rates[n]}")))
@@ -153,7 +153,7 @@ class TimingTestbed:
         )
         self._start(
             "setpoints", "experiments.timing.setpoint_source", "--profile", s.profile,
-            "--controller", f"{HOST}:{control}", "--report-port", reports,
+            "--controller", f"{HOST}:{control}", "--operator", operators, "--report-port", reports,
         )  # fmt: skip
         self._start(
             "observer", "experiments.timing.bus_observer", "--profile", s.profile, "--rate", s.rate_hz, "--ticks", ticks
@@ -162,7 +162,8 @@ class TimingTestbed:
         self._elsewhere(guard.process.pid)
         self.family.start(
             "controller", "controller", "--profile", s.profile, *buses, "--setpoint-port", control,
-            "--report", f"{HOST}:{reports}", "--record", ticks, "--rate", s.rate_hz, "--timing", self.page,
+            "--report", f"{HOST}:{reports}", "--record", ticks, "--operator", operators, "--rate", s.rate_hz,
+            "--timing", self.page,
             *(("--cpu", self.cpu) if self.cpu not in self.others else ()), *s.arguments,
         )  # fmt: skip
         self._await_motion()

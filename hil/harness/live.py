@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
 from can_dbc.bus.factory import VCAN_NAMES, kernel_has_can
-from can_dbc.messages import datagrams
+from can_dbc.messages import datagrams, operator_link
 from can_dbc.messages.crane import OperatorAction, StateReport
 from can_dbc.messages.envelope import DatagramRefused
 from can_dbc.timing.page import default_path
@@ -105,6 +105,7 @@ class LiveRun(ABC, Generic[Outcome]):
         # In memory, and private to this run.
         page = default_path().with_name(f"live-{os.getpid()}.timing")
         self._timing, self._ticks = ("--timing", page), page.with_suffix(".ticks")
+        self._operators = page.with_suffix(".operator")
         self._report: StateReport | None = None
         self._first: StateReport | None = None
         self._failure = self._grasp = ""
@@ -193,7 +194,7 @@ class LiveRun(ABC, Generic[Outcome]):
         if self._options.console_port:
             self._start(
                 "console", "console", *self._profile, "--port", self._options.console_port,
-                "--report-port", ports["page"], "--controller", control, "--planner", f"{HOST}:{ports['orders']}",
+                "--report-port", ports["page"], "--operator", self._operators, "--planner", f"{HOST}:{ports['orders']}",
                 "--scene", scene, *self._timing,
             )  # fmt: skip
             url = self._processes.await_message("console", "url", START_S)["url"]
@@ -223,7 +224,7 @@ class LiveRun(ABC, Generic[Outcome]):
         listeners += [ports["page"]] if self._options.console_port else []
         self._start(
             "controller", "controller", *self._profile, *bus, "--setpoint-port", ports["control"],
-            "--record", self._ticks, *self._timing,
+            "--operator", self._operators, "--record", self._ticks, *self._timing,
             *(x for port in listeners for x in ("--report", f"{HOST}:{port}")),
         )  # fmt: skip
 
@@ -239,7 +240,7 @@ class LiveRun(ABC, Generic[Outcome]):
         while not (self._done or self._failure or self._operator.gave_up):
             if time.monotonic() > limit:
                 self._failure = f"not done within {self._options.limit_s:.0f} s"
-            self._receive(ports["control"])
+            self._receive()
             if time.monotonic() < poll_s:
                 continue
             poll_s = time.monotonic() + POLL_S
@@ -267,7 +268,7 @@ class LiveRun(ABC, Generic[Outcome]):
                 return
             self._processes.selector.select(POLL_S)
 
-    def _receive(self, control_port: int) -> None:
+    def _receive(self) -> None:
         try:
             message = datagrams.decode(self._socket.recv(2048))
         except (TimeoutError, DatagramRefused):
@@ -281,7 +282,7 @@ class LiveRun(ABC, Generic[Outcome]):
         self._report = message
         self._display.report(message)
         if press := self._operator.step(message):
-            self._socket.sendto(press, (HOST, control_port))
+            operator_link.send(press, self._operators)
 
     def _show_mode(self, report: StateReport) -> None:
         mode = Mode(report.mode)

@@ -97,6 +97,8 @@ class Lockstep:
         self._controller = Controller(settings)
         self._guard = guard
         self._inputs = Inputs()
+        self._pressed: list[bytes] = []
+        """The operator's commands on their way, as ``_datagrams`` are the planner's."""
         self._datagrams: list[bytes] = []
         self._plant_buses = {core.name: InProcessBus(core, "plant", tx_queue=64) for core in self._cores}
         self._crane, *more = (BusLink(InProcessBus(core, "controller")) for core in self._cores)
@@ -129,7 +131,8 @@ class Lockstep:
         self._crane.receive(inputs.frames, inputs.bus)
         if machine is not None:
             machine.receive(inputs.machine_frames, inputs.machine_bus)
-        inputs.datagrams[:] = self._datagrams
+        inputs.operator[:], inputs.datagrams[:] = self._pressed, self._datagrams
+        self._pressed.clear()
         self._datagrams.clear()
         outputs = step(self._controller, inputs, self.now_ns)
         self.ticks += 1
@@ -150,7 +153,7 @@ class Lockstep:
             for hook in self._observer.on_report:
                 hook(report)
             if press := self.operator.step(report):
-                self._datagrams.append(press)
+                self._pressed.append(press)
         if outputs.vehicle_report is not None:
             vehicle = datagrams.decode(outputs.vehicle_report, self._settings.key)
             assert isinstance(vehicle, VehicleReport)

@@ -65,6 +65,8 @@ class RandomTicks:
                 recoveries=tick.bus.recoveries + rng.randrange(2),
             )  # fmt: skip
             return replace(tick, bus=bus) if rng.random() < 0.5 else replace(tick, machine_bus=bus)
+        if rng.random() < 0.3:
+            return replace(tick, operator=self._changed_datagrams(list(tick.operator), tick.now_ns))
         return replace(tick, datagrams=self._changed_datagrams(list(tick.datagrams), tick.now_ns))
 
     def _changed_frames(self, frames: list[Frame], now_ns: int) -> tuple[Frame, ...]:

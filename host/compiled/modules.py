@@ -68,6 +68,7 @@ MODULES: Final = (
     "controller.process.tick_recording",
     "controller.process.timing",
     "controller.requests.gate",
+    "controller.requests.operator_socket",
     "controller.requests.setpoint_gate",
     "controller.state_report",
     "controller.step",

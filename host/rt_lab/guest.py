@@ -103,14 +103,24 @@ def control_loop(checkout: Path) -> dict[str, Any]:
     if not await_text(nodes, RUNTIME / "experiments.timing.emulated_machine.out", "ready"):
         raise TimeoutError("the emulated nodes do not start")
     os.sched_setscheduler(nodes.pid, os.SCHED_FIFO, os.sched_param(NODES_PRIORITY))
-    page = RUNTIME / "controller.timing"
+    page, operator = RUNTIME / "controller.timing", RUNTIME / "controller.operator"
     guard, guard_ready = start(checkout, "controller.guard", *bus)
     controller, controller_ready = start(
-        checkout, "controller", *bus, "--setpoint-port", SETPOINTS, "--report", f"127.0.0.1:{REPORTS}", "--timing", page
+        checkout,
+        "controller",
+        *bus,
+        "--setpoint-port",
+        SETPOINTS,
+        "--report",
+        f"127.0.0.1:{REPORTS}",
+        "--timing",
+        page,
+        "--operator",
+        operator,
     )
     found: dict[str, Any] = {"guard_ready": await_ready(guard_ready), "controller_ready": await_ready(controller_ready)}
     step(f"guard and controller are ready: {found}")
-    pilot = Pilot(PROFILE, SETPOINTS, REPORTS, f"socketcan:{LINKS[0]}")
+    pilot = Pilot(PROFILE, SETPOINTS, operator, REPORTS, f"socketcan:{LINKS[0]}")
     found["standby"] = pilot.until(lambda: pilot.report and Mode(pilot.report.mode) is Mode.STANDBY, WAIT_S)
     pilot.until(lambda: False, TICKS_S)
     for name, process in (("controller", controller), ("guard", guard)):

@@ -27,6 +27,7 @@ from recorder.recorder import TIMING
 
 PROGRAM: Final = "/opt/timberhand/bin/timberhand"
 CONF: Final = Path("/etc/timberhand/timberhand.conf")
+OPERATORS: Final = Path("/run/timberhand/controller.operator")
 SERVICES: Final = ("controller", "guard", "recorder", "autonomy", "console")
 FIFO: Final = {"controller": 80, "guard": 85}
 READY_S: Final = 2.0
@@ -334,7 +335,7 @@ def run(check: Check, order: dict[str, str]) -> None:
     inspect(check, f"http://127.0.0.1:{conf['CONSOLE_PORT']}/")
     check_status_command(check)
     systemctl("stop", "timberhand-autonomy.service")  # the pilot replaces the planner
-    pilot = Pilot(conf["PROFILE"], int(conf["SETPOINT_PORT"]), int(conf["PLANNER_PORT"]), conf["CRANE_BUS"])
+    pilot = Pilot(conf["PROFILE"], int(conf["SETPOINT_PORT"]), OPERATORS, int(conf["PLANNER_PORT"]), conf["CRANE_BUS"])
     os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PILOT_PRIORITY))
     end_services(check, pilot)
     buses_lost(check, pilot, plant_port)

@@ -6,16 +6,19 @@ this process, stood still meanwhile, so that trials with gaps prove nothing.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import socket
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from can_dbc.bus.factory import open_bus
 from can_dbc.bus.reconnector import Reconnector
 from can_dbc.dbc import codec
 from can_dbc.frame import Frame
+from can_dbc.messages import operator_link
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.envelope import DatagramRefused
@@ -43,7 +46,9 @@ class Valve(NamedTuple):
 class Pilot:
     """`until` runs the loop; ``valves``, ``modes`` and ``gaps`` hold the observations since `clear`."""
 
-    def __init__(self, profile_name: str, setpoint_port: int, report_port: int, bus_address: str) -> None:
+    def __init__(
+        self, profile_name: str, setpoint_port: int, operator: Path, report_port: int, bus_address: str
+    ) -> None:
         profile = load_profile(profile_name)
         self.deadband_pct = min(
             min(joint(profile, j).valve.deadband_plus_pct, joint(profile, j).valve.deadband_minus_pct)
@@ -58,7 +63,7 @@ class Pilot:
         self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._link.bind(("127.0.0.1", report_port))
         self._link.setblocking(False)
-        self._controller = ("127.0.0.1", setpoint_port)
+        self._controller, self._operator = ("127.0.0.1", setpoint_port), operator
         self._numbers = itertools.count(1)
         self._begin: tuple[int, tuple[float, ...]] | None = None
         self._sign = 1.0
@@ -81,7 +86,8 @@ class Pilot:
     def press(self, action: OperatorAction) -> None:
         """Press a button of the operator."""
         now_ns = time.monotonic_ns()
-        self._send(encode(OperatorCommand(next(self._numbers), self._hash, now_ns, action)))
+        with contextlib.suppress(OSError):  # no controller now
+            operator_link.send(encode(OperatorCommand(next(self._numbers), self._hash, now_ns, action)), self._operator)
 
     def swing(self) -> None:
         """Start to slew the crane slowly from its present position towards the far side."""

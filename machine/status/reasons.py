@@ -154,6 +154,7 @@ class Reason(IntEnum):
     FLOAT_BOTH = 128
     CRANE_MOVES = 129
     CARRIER_MOVES = 130
+    NO_AUTHORITY = 131
 
 
 class Fault(NamedTuple):

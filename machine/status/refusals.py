@@ -81,4 +81,11 @@ REFUSALS: Final[dict[Reason, Fault]] = {
         "A crane setpoint was refused: the machine is driving",
         "Move the crane when the machine stands still.",
     ),
+    Reason.NO_AUTHORITY: Fault(
+        Reaction.REFUSE,
+        10,
+        _N,
+        "Only an operator may arm, disarm or reset",
+        "Send it through the operator's socket, as a user that the controller was told (--operator-user).",
+    ),
 }

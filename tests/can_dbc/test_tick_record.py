@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from can_dbc.bus.base import BusState, BusStats
 from can_dbc.frame import Frame
+from can_dbc.messages import datagrams
+from can_dbc.messages.crane import OperatorAction, OperatorCommand
 from can_dbc.messages.tick_record import BusReading, RecordRefused, TickRecord, decode, encode
 from tests.codes import coded
 
@@ -23,7 +25,7 @@ ticks = st.builds(
     TickRecord,
     u64, st.integers(-(2**63), 2**63 - 1), u64, u64, readings, readings, frames_in, frames_in,
     st.lists(st.binary(max_size=99), max_size=3).map(tuple), frames_out, frames_out, st.binary(max_size=300),
-    st.binary(max_size=300),
+    st.binary(max_size=300), st.lists(st.binary(max_size=99), max_size=3).map(tuple),
 )  # fmt: skip
 
 
@@ -59,6 +61,16 @@ def test_arbitrary_bytes_are_refused(data):
 
 def sealed(body: bytes) -> bytes:
     return body + struct.pack("<I", zlib.crc32(body))
+
+
+def test_in_a_record_of_version_2_the_kind_tells_whose_a_datagram_was():
+    command = datagrams.encode(OperatorCommand(1, 2, 3, OperatorAction.ARM))
+    tick = TickRecord(1, 0, 0, 0, BusReading(), BusReading(), (), (), (b"hello", command), (), (), b"")
+    body = bytearray(encode(tick)[:-4])
+    assert decode(sealed(bytes(body))).datagrams == (b"hello", command), "today the record itself tells"
+    body[4] = 2
+    old = decode(sealed(bytes(body)))
+    assert (old.datagrams, old.operator) == ((b"hello",), (command,))
 
 
 def test_a_record_of_version_1_is_refused_by_its_number():

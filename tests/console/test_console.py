@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from starlette.testclient import TestClient
@@ -61,8 +62,17 @@ def controller_socket():
 
 
 @pytest.fixture
-def console(controller_socket):
-    return Console(PROFILE, profile_hash(PROFILE), controller_socket.getsockname(), clock=lambda: 10**10)
+def operator_socket(tmp_path):
+    """The controller's end of the operator's commands."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as s:
+        s.bind(str(tmp_path / "operator"))
+        s.settimeout(5)
+        yield s
+
+
+@pytest.fixture
+def console(operator_socket):
+    return Console(PROFILE, profile_hash(PROFILE), Path(operator_socket.getsockname()), clock=lambda: 10**10)
 
 
 def client_of(console, peer="127.0.0.1", **options):
@@ -127,44 +137,44 @@ def test_allowed_host_is_served(console):
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:9999", "null"])
-def test_foreign_origin_is_refused(client, controller_socket, origin):
+def test_foreign_origin_is_refused(client, operator_socket, origin):
     with (
         pytest.raises(WebSocketDisconnect),
         client.websocket_connect("ws://127.0.0.1:8471/ws", headers={"origin": origin}),
     ):
         pass
     assert client.post("/api/operator/arm", headers={"origin": origin}).status_code == 403
-    controller_socket.settimeout(0.05)
+    operator_socket.settimeout(0.05)
     with pytest.raises(TimeoutError):
-        controller_socket.recv(100)
+        operator_socket.recv(100)
 
 
 @pytest.mark.parametrize("action", list(OperatorAction))
-def test_command_sends_its_datagram(client, controller_socket, action):
+def test_command_sends_its_datagram(client, operator_socket, action):
     answer = client.post(f"/api/operator/{action.name.lower()}", headers={"origin": HERE})
     assert answer.status_code == 204
-    message = decode(controller_socket.recv(100))
+    message = decode(operator_socket.recv(100))
     assert isinstance(message, OperatorCommand)
     assert (message.action, message.profile_hash) == (action, profile_hash(PROFILE))
 
 
-def test_command_sequence_grows(client, controller_socket):
+def test_command_sequence_grows(client, operator_socket):
     for _ in range(3):
         client.post("/api/operator/stop")
-    sequences = [decode(controller_socket.recv(100)).sequence for _ in range(3)]
+    sequences = [decode(operator_socket.recv(100)).sequence for _ in range(3)]
     assert sequences == sorted(set(sequences))
 
 
-def test_command_is_authenticated_with_a_key(console, controller_socket):
-    keyed = Console(PROFILE, 1, controller_socket.getsockname(), key=b"secret")
+def test_command_is_authenticated_with_a_key(console, operator_socket):
+    keyed = Console(PROFILE, 1, Path(operator_socket.getsockname()), key=b"secret")
     client_of(keyed).post("/api/operator/stop")
-    assert decode(controller_socket.recv(100), b"secret").action is OperatorAction.STOP
+    assert decode(operator_socket.recv(100), b"secret").action is OperatorAction.STOP
 
 
-def test_stop_from_another_machine_is_sent_but_arm_is_refused(console, controller_socket):
+def test_stop_from_another_machine_is_sent_but_arm_is_refused(console, operator_socket):
     client = client_of(console, peer="192.0.2.7")
     assert client.post("/api/operator/stop").status_code == 204
-    assert decode(controller_socket.recv(100)).action is OperatorAction.STOP
+    assert decode(operator_socket.recv(100)).action is OperatorAction.STOP
     for action in ("arm", "disarm", "reset"):
         assert client.post(f"/api/operator/{action}").status_code == 403
     assert client.get("/api/state").json()["may_command"] is False
@@ -175,10 +185,10 @@ def test_command_by_get_or_unknown_is_refused(client):
     assert client.post("/api/operator/launch").status_code == 404
 
 
-def test_an_unreachable_controller_is_reported(console, controller_socket):
-    controller_socket.close()
+def test_an_unreachable_controller_is_reported(console, operator_socket):
+    operator_socket.close()
     answer = client_of(console).post("/api/operator/stop")
-    assert answer.status_code == 502 and "127.0.0.1" in answer.text
+    assert answer.status_code == 502 and str(console.operator) in answer.text
 
 
 def test_a_console_without_a_controller_is_read_only():
@@ -352,7 +362,7 @@ def test_start_errors_are_one_sentence_with_an_exit_code():
             (4, "--port", busy, "--report-port", 0),
             (4, "--port", 0, "--report-port", port),
             (3, "--port", 0, "--report-port", 0, "--profile", "palms"),
-            (2, "--port", 0, "--report-port", 0, "--controller", "nowhere"),
+            (2, "--port", 0, "--report-port", 0, "--planner", "nowhere"),
         ]
         for code, *arguments in cases:
             done = run_console(*arguments)

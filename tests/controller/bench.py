@@ -16,6 +16,7 @@ from can_dbc.dbc.codec import load
 from can_dbc.frame import Frame
 from can_dbc.messages.crane import CraneSetpoint, GrappleCommand, Knot, OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
+from can_dbc.messages.envelope import is_operator_command
 from can_dbc.messages.vehicle import VehicleReport
 from can_dbc.protocols.canopen import (
     SDO_TO_CLIENT,
@@ -164,12 +165,18 @@ class Bench:
     # -- environment
 
     def tick(self, datagrams: Iterable[bytes] = (), **measured: int) -> Outputs:
+        """One period; commands come from an operator, everything else from the planner."""
+        given = list(datagrams)
+        commands = [d for d in given if is_operator_command(d)]
+        return self.tick_with([d for d in given if d not in commands], commands, **measured)
+
+    def tick_with(self, planner: Iterable[bytes] = (), operator: Iterable[bytes] = (), **measured: int) -> Outputs:
         """One period: the frames answered to the last SYNC reach the controller, which then steps."""
         self.now_ns += T
         stamp = self.now_ns - T + 1 * MS
         self.inputs.frames = [Frame(stamp, key, data) for key, data in self._answers()]
         self.inputs.machine_frames = [Frame(stamp, key, data) for key, data in self._machine_answers()]
-        self.inputs.datagrams = list(datagrams)
+        self.inputs.operator, self.inputs.datagrams = list(operator), list(planner)
         self.inputs.late_ns = measured.pop("late_ns", 0)
         for name, value in measured.items():  # bus_state, machine_bus_refused and so on go into the readings
             which, of_bus, counter = name.partition("bus_")

@@ -9,6 +9,7 @@ from can_dbc.bus.base import BusError, BusState
 from can_dbc.bus.filters import Filter
 from can_dbc.bus.reconnector import FIRST_RETRY_NS, RETRY_PERIOD_NS
 from can_dbc.frame import Frame
+from can_dbc.messages import operator_link
 from can_dbc.messages.crane import OperatorAction, OperatorCommand, StateReport
 from can_dbc.messages.datagrams import decode, encode
 from can_dbc.messages.vehicle import Driving
@@ -20,6 +21,7 @@ from controller.process.loop import DATAGRAM_BYTES, MAX_DATAGRAMS, Loop
 from controller.process.realtime import make_sleep, sleep_until
 from controller.process.timing import LoopTiming, ProcessReader
 from controller.process.warm_up import NullBus, warm_up
+from controller.requests.operator_socket import OperatorSocket
 from controller.step import Controller
 from machine.status.reasons import Reason
 from tests.codes import coded
@@ -77,13 +79,13 @@ class Clock:
         self.now_ns = max(self.now_ns, deadline_ns) + late_ns
 
 
-def build(udp, clock, bus=None, page=None, reports=None):
+def build(udp, clock, bus=None, page=None, reports=None, operator=None):
     setpoints, receiver, records = udp
     controller = Controller(SETTINGS, DATABASE)
     timing = LoopTiming(controller, TimingWriter(page) if page else None, clock.time, clock.time)
     return Loop(
-        controller, [bus or MemoryBus()], setpoints, [reports or receiver.getsockname()], records.ring, timing, T,
-        LEAD, clock.time, clock.sleep,
+        controller, [bus or MemoryBus()], setpoints, operator, [reports or receiver.getsockname()], records.ring,
+        timing, T, LEAD, clock.time, clock.sleep,
     )  # fmt: skip
 
 
@@ -286,6 +288,20 @@ def test_flood_of_datagrams_does_not_delay_the_tick(udp):
         while udp[0].recv(2048):
             left += 1
     assert left == 40 - 16
+
+
+def test_an_operators_stop_waits_behind_no_setpoint(udp, tmp_path):
+    """A flood on the setpoint port fills it; the operator's command is heard in the next tick all the same."""
+    operator = OperatorSocket(tmp_path / "operator")
+    loop = build(udp, Clock(), operator=operator)
+    for _ in range(400):
+        udp[1].sendto(b"flood", udp[0].getsockname())
+    stop = encode(OperatorCommand(1, SETTINGS.profile_hash, 10**9, OperatorAction.STOP))
+    operator_link.send(stop, tmp_path / "operator")
+    loop.tick(10**9, 0)
+    (record,) = udp[2].read()
+    assert record.operator == (stop,) and record.datagrams == (b"flood",) * MAX_DATAGRAMS
+    loop.close()
 
 
 def test_reports_that_nobody_receives_are_counted(udp):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.messages.crane import StateReport
+from can_dbc.messages.crane import OperatorAction, StateReport
 from can_dbc.messages.datagrams import encode
 from can_dbc.messages.envelope import DatagramFault
 from can_dbc.messages.vehicle import DriveSetpoint, Steering
@@ -67,6 +67,7 @@ BAD = {
                       False, False))),
     "a report": (Reason.DATAGRAM_KIND, 0, lambda b: encode(StateReport(
         1, HASH, b.now_ns, 2, 0, 0, 0, 0, 0, 0, (0.0,) * 5, (0.0,) * 5, (0.0,) * 5, 0.0, 0.0, 0.0, 0, 0, 0, 0))),
+    "arm by a planner": (Reason.NO_AUTHORITY, 0, lambda b: b.operator(OperatorAction.ARM)),
     "truncated": (Reason.DATAGRAM_CRC, 0, lambda b: b.hold()[:-1]),
     "short": (Reason.DATAGRAM_LENGTH, 0, lambda b: b"\x54"),
     "no magic": (Reason.DATAGRAM_MAGIC, 0, lambda b: b"?" + b.hold()[1:]),
@@ -88,7 +89,7 @@ def test_setpoint_is_refused_with_its_reason_and_nothing_moves(name):
     bench.run(2)
     before = bench.controller.gate.refused
     lease_end = bench.controller.crane.lease_end_ns
-    bench.tick([make(bench)])
+    bench.tick_with([make(bench)])
     gate = bench.controller.gate
     assert (gate.refusal, gate.detail, gate.refused) == (reason, detail, before + 1)
     assert bench.controller.crane.lease_end_ns == lease_end and bench.mode is Mode.ACTIVE

@@ -56,10 +56,11 @@ class Run:
             time.sleep(0.01)
         bus = ("--profile", PROFILE, "--bus", f"crane0={BUS}")
         self.start("guard", sys.executable, "-m", "controller.guard", *bus)
-        self.pilot = Pilot(PROFILE, SETPOINTS, REPORTS, BUS)
+        self.pilot = Pilot(PROFILE, SETPOINTS, directory / "operator", REPORTS, BUS)
         self.start(
             "controller", sys.executable, "-m", "controller", *bus, "--setpoint-port", str(SETPOINTS),
             "--report", f"127.0.0.1:{REPORTS}", "--timing", str(directory / "timing"),
+            "--operator", str(directory / "operator"),
         )  # fmt: skip
 
     def start(self, name: str, *command: str, out: str = "") -> None:

@@ -14,9 +14,9 @@ def console(
     port: Annotated[int, typer.Option(help="Port of the page.")] = 8471,
     report_port: Annotated[int, typer.Option(help="UDP port that receives the controller's state reports.")] = 8472,
     profile: ProfileOption = "palms_471",
-    controller: Annotated[
-        str | None,
-        typer.Option(metavar="HOST:PORT", help="Setpoint port of the controller; without it the page is read-only."),
+    operator: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The controller's socket for operators; without it the page is read-only."),
     ] = None,
     planner: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Operator command port of the planner (its --order-port).")
@@ -39,7 +39,7 @@ def console(
 
     [bold]Examples[/bold]
 
-      timberhand console --report-port 8472 --controller 127.0.0.1:8470
+      timberhand console --report-port 8472 --operator /run/timberhand/controller.operator
     """
     from console.__main__ import StartError, serve
     from host.exit_codes import CommandFailed, ExitCode
@@ -49,7 +49,7 @@ def console(
             port=port,
             report_port=report_port,
             profile=profile,
-            controller=controller,
+            operator=operator,
             planner=planner,
             scene=scene,
             bind=bind,
