@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import pytest
 
@@ -22,11 +24,11 @@ SEND_AS = (
 
 
 @pytest.fixture
-def path(tmp_path):
-    """A place that any user may reach."""
-    for folder in (tmp_path, *tmp_path.parents[:2]):
-        folder.chmod(0o755)
-    return tmp_path / "operator"
+def path():
+    """A place that any user may reach, as pytest's own are not."""
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o755)
+        yield Path(name, "operator")
 
 
 def received(operator):

@@ -57,6 +57,7 @@ class Virtual:
         self.received: list[tuple[str, Frame]] = []
         self.for_guard: list[Frame] = []
         self.datagrams: list[bytes] = []
+        self.pressed: list[bytes] = []
         self.modes: list[tuple[int, int]] = []
 
     def tick(self) -> None:
@@ -73,6 +74,7 @@ class Virtual:
             guarded = self.guard.step(self.now_ns, self.for_guard)
             self.for_guard = []
         inputs.frames += [Frame(self.now_ns, key, data) for key, data in guarded]
+        inputs.operator[:], self.pressed = self.pressed, []
         inputs.datagrams[:], self.datagrams = self.datagrams, []
         outputs = step(self.controller, inputs, self.now_ns)
         self.observer.add(record(inputs, outputs, self.now_ns))
@@ -84,7 +86,7 @@ class Virtual:
             assert isinstance(report, StateReport)
             if not self.modes or self.modes[-1][0] != report.mode:
                 self.modes.append((report.mode, report.reason))
-            self.datagrams += [d for d in (self.source.receive(report),) if d]
+            self.pressed += [d for d in (self.source.receive(report),) if d]
         if self.now_ns % 50_000_000 < self.period_ns:
             self.datagrams += [d for d in (self.source.setpoint(self.now_ns),) if d]
 
