@@ -30,8 +30,8 @@ from machine.loading.profile_file import load_profile
 class Frozen(live.LiveMission):
     at_s = None
 
-    def _receive(self, port):
-        super()._receive(port)
+    def _receive(self):
+        super()._receive()
         now, planner = time.monotonic(), self._processes.children.get("autonomy")
         if self._states and self._states[-1][1] == "SEARCH" and self.at_s is None and self._seconds > 4.0:
             self.at_s = now
