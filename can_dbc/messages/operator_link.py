@@ -1,7 +1,7 @@
-"""The operator's way to the controller: a Unix datagram socket on which the kernel says who sent.
+"""The operator's way to the controller: a Unix datagram socket of its own, apart from the planner's port.
 
-ARM, DISARM and RESET are heard only there, from the users that the controller was told; STOP is heard there before
-anything else, whatever waits on the setpoint port.  The controller's side is `controller.requests.operator_socket`.
+ARM, DISARM and RESET are heard only there; STOP is heard there before anything else, whatever waits on the setpoint
+port.  The controller's side is `controller.requests.operator_socket`.
 """
 
 from __future__ import annotations

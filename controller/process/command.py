@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import pwd
 import signal
 import socket
 import sys
@@ -58,8 +57,6 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--setpoint-port", type=int, required=True, help="UDP port on 127.0.0.1; 0 chooses a free one")
     made.add_argument("--operator", type=Path, metavar="FILE",
                       help="Unix socket for the operator's commands; default: beside the timing page")  # fmt: skip
-    made.add_argument("--operator-user", action="append", default=[], metavar="NAME",
-                      help="user who may arm, besides root and its own; may be given more than once")  # fmt: skip
     made.add_argument("--report", type=address_argument, action="append", default=[], metavar="HOST:PORT",
                       help="receiver of state reports; may be given more than once")  # fmt: skip
     made.add_argument("--record", type=Path, metavar="FILE",
@@ -85,19 +82,10 @@ def bus_address(text: str) -> tuple[str, str]:
     return name, where
 
 
-def user_number(name: str) -> int:
-    """The number of a user; raises ConfigError."""
-    try:
-        return pwd.getpwnam(name).pw_uid
-    except KeyError:
-        sentence = f"--operator-user {name}: there is no such user on this computer; create it, or name another."
-        raise ConfigError("config.no-such-user", sentence) from None
-
-
-def operator_socket(path: Path, users: frozenset[int]) -> OperatorSocket:
+def operator_socket(path: Path) -> OperatorSocket:
     """Open the operators' socket; raises BusError."""
     try:
-        return OperatorSocket(path, users)
+        return OperatorSocket(path)
     except OSError as error:
         sentence = f"The operator's socket {path} cannot be made ({error.strerror}); choose another with --operator."
         raise BusError("operator.socket", sentence) from error
@@ -213,8 +201,7 @@ def main(arguments: list[str] | None = None) -> int:
         where = addresses(settings, dict(options.bus))
         buses = open_buses(where, controller)
         setpoints = listen(options.setpoint_port)
-        users = frozenset(map(user_number, options.operator_user))
-        operator = operator_socket(options.operator or operator_path(), users)
+        operator = operator_socket(options.operator or operator_path())
         timing = LoopTiming(controller, timing_writer(options.timing))
         loop = Loop(
             controller, buses, setpoints, operator, options.report, record_ring(options.record), timing,

@@ -165,7 +165,7 @@ class Loop:
         inputs.operator.clear()
         datagrams.clear()
         if self.operator is not None:
-            self.operator.receive(inputs.operator, datagrams)
+            self.operator.receive(inputs.operator)
         batch = self._waiting
         try:
             count = batch.receive(self.setpoints.fileno())

@@ -1,55 +1,46 @@
-"""The controller's socket for operators: a Unix datagram socket whose senders the kernel names (unix(7), SO_PASSCRED).
+"""The controller's socket for operators: a Unix datagram socket, so that the file system decides who may arm.
 
-Every datagram comes with the user that sent it.  Those of a user who may arm are the operator's; those of anyone else
-have no more authority than a setpoint: STOP is heard, everything else refused and counted.
+Only its owner, its group and root can send there (unix(7): a sender needs write permission); as a service it lies in a
+folder that only the group ``timberhand-operator`` can enter.  No planner can arm, and none can fill its queue.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
-import struct
 from pathlib import Path
 from typing import Final
 
 from can_dbc.bus.batch import Batch
 
-MAX_COMMANDS: Final = 8
-"""Commands received in one tick."""
+MAX_COMMANDS: Final = 16
+"""Commands received in one tick: more than the queue of a Unix socket holds."""
 COMMAND_BYTES: Final = 256
-_CREDENTIALS: Final = struct.Struct("@Nii3i")
-"""struct cmsghdr (length, level, type) and struct ucred (process, user, group)."""
-_ANCILLARY_BYTES: Final = socket.CMSG_SPACE(12)
 
 
 class OperatorSocket:
-    """Bound at ``path``; ``users`` are the numbers of the users that may arm, root and the own one always among them.
+    """Bound at ``path``, for its owner and group; raises OSError if it cannot be bound."""
 
-    Raises OSError if it cannot be bound.
-    """
+    __slots__ = ("_batch", "_inode", "_path", "_sock")
 
-    __slots__ = ("_batch", "_inode", "_path", "_sock", "_users")
-
-    def __init__(self, path: Path, users: frozenset[int] = frozenset()) -> None:
+    def __init__(self, path: Path) -> None:
         path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):
             path.unlink()  # left by a process that was killed
         self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
             self._sock.setblocking(False)
-            self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
             self._sock.bind(str(path))
-            path.chmod(0o666)  # anyone may stop the machine; who may arm it is decided by the sender's user
+            path.chmod(0o660)  # independent of the umask
             self._inode = path.stat().st_ino
         except OSError:
             self._sock.close()
             raise
-        self._path, self._users = path, users | {0, os.getuid()}
-        self._batch = Batch(COMMAND_BYTES, _ANCILLARY_BYTES, MAX_COMMANDS)
+        self._path = path
+        self._batch = Batch(COMMAND_BYTES, count=MAX_COMMANDS)
 
-    def receive(self, commands: list[bytes], others: list[bytes]) -> None:
-        """Append the waiting datagrams: those of operators to ``commands``, the rest to ``others``."""
+    def receive(self, commands: list[bytes]) -> None:
+        """Append the waiting datagrams."""
         batch = self._batch
         try:
             count = batch.receive(self._sock.fileno())
@@ -57,10 +48,7 @@ class OperatorSocket:
             return
         for i in range(count):
             at = i * COMMAND_BYTES
-            data = batch.data[at : at + batch.length(i)].tobytes()
-            length, level, kind, _, user, _ = _CREDENTIALS.unpack_from(batch.control, i * _ANCILLARY_BYTES)
-            known = length and level == socket.SOL_SOCKET and kind == socket.SCM_CREDENTIALS
-            (commands if known and user in self._users else others).append(data)
+            commands.append(batch.data[at : at + batch.length(i)].tobytes())
 
     def close(self) -> None:
         """Remove the socket, unless another process owns its path by now."""

@@ -68,6 +68,10 @@ def run(words: Sequence[str]) -> tuple[str, str, int]:
             process.terminate()  # the lab forwards it; killed, the lab would go on beside the next run
             told, said = process.communicate()
             return told, said, 124
+        except BaseException:  # Ctrl-C that reached this process alone
+            process.terminate()
+            process.wait()
+            raise
         return told, said, process.returncode
 
 

@@ -27,7 +27,7 @@ from recorder.recorder import TIMING
 
 PROGRAM: Final = "/opt/timberhand/bin/timberhand"
 CONF: Final = Path("/etc/timberhand/timberhand.conf")
-OPERATORS: Final = Path("/run/timberhand/controller.operator")
+OPERATORS: Final = Path("/run/timberhand-operator/controller")
 SERVICES: Final = ("controller", "guard", "recorder", "autonomy", "console")
 FIFO: Final = {"controller": 80, "guard": 85}
 READY_S: Final = 2.0
@@ -205,6 +205,18 @@ def has_timing(recording: Path) -> bool:
     return bool(frames) and any(isinstance(found, Stored) for found in scan(recording, {TIMING}))
 
 
+def authority(check: Check, page: str) -> None:
+    """The page reaches the controller as an operator; the planner's user cannot even see the socket."""
+    origin = page.rstrip("/")
+    request = urllib.request.Request(f"{origin}/api/operator/stop", method="POST", headers={"Origin": origin})
+    with urllib.request.urlopen(request, timeout=10.0) as answer:
+        check.expect(answer.status == 204, f"the page's STOP was answered {answer.status}")
+    send = f"import socket; socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(b'x', '{OPERATORS}')"
+    command = ("setpriv", "--reuid", "timberhand-planner", "--regid", "timberhand-planner", "--init-groups")
+    done = subprocess.run([*command, sys.executable, "-c", send], capture_output=True, text=True)
+    check.expect("PermissionError" in done.stderr, f"the planner's user sent a command: {done.stderr[-300:]}")
+
+
 def inspect(check: Check, page: str) -> None:
     """All services run with the rights and priorities of their units, and the machine is not armed."""
     wait_for_work(check, page)
@@ -227,6 +239,7 @@ def inspect(check: Check, page: str) -> None:
         check.step(f"{name}: {facts}, {state['StatusText']!r}")
         refused = [line for line in journal(unit) if "not granted" in line]
         check.expect(not refused, f"{unit}: {refused}")
+    authority(check, page)
     bridge = show("timberhand-plc.service", "ActiveState", "Result")
     check.expect(bridge == {"ActiveState": "inactive", "Result": "exec-condition"}, f"the PLC bridge is {bridge}")
     memory = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())

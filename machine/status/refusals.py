@@ -86,6 +86,6 @@ REFUSALS: Final[dict[Reason, Fault]] = {
         10,
         _N,
         "Only an operator may arm, disarm or reset",
-        "Send it through the operator's socket, as a user that the controller was told (--operator-user).",
+        "Send it through the operator's socket, as a user of its group.",
     ),
 }

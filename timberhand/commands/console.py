@@ -39,7 +39,7 @@ def console(
 
     [bold]Examples[/bold]
 
-      timberhand console --report-port 8472 --operator /run/timberhand/controller.operator
+      timberhand console --report-port 8472 --operator /run/timberhand-operator/controller
     """
     from console.__main__ import StartError, serve
     from host.exit_codes import CommandFailed, ExitCode
