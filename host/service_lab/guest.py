@@ -27,6 +27,7 @@ from recorder.recorder import TIMING
 
 PROGRAM: Final = "/opt/timberhand/bin/timberhand"
 CONF: Final = Path("/etc/timberhand/timberhand.conf")
+AUTHORITY_S: Final = 10.0
 OPERATORS: Final = Path("/run/timberhand-operator/controller")
 SERVICES: Final = ("controller", "guard", "recorder", "autonomy", "console")
 FIFO: Final = {"controller": 80, "guard": 85}
@@ -208,9 +209,16 @@ def has_timing(recording: Path) -> bool:
 def authority(check: Check, page: str) -> None:
     """The page reaches the controller as an operator; the planner's user cannot even see the socket."""
     origin = page.rstrip("/")
-    request = urllib.request.Request(f"{origin}/api/operator/stop", method="POST", headers={"Origin": origin})
-    with urllib.request.urlopen(request, timeout=10.0) as answer:
-        check.expect(answer.status == 204, f"the page's STOP was answered {answer.status}")
+    for action, mode in (("stop", "STOP. "), ("reset", "STANDBY. ")):
+        request = urllib.request.Request(f"{origin}/api/operator/{action}", method="POST", headers={"Origin": origin})
+        with urllib.request.urlopen(request, timeout=10.0) as answer:
+            check.expect(answer.status == 204, f"the page's {action} was answered {answer.status}")
+        limit = time.monotonic() + AUTHORITY_S
+        while not (status := show(trial.CONTROLLER, "StatusText")["StatusText"]).startswith(mode):
+            if time.monotonic() > limit:
+                check.expect(False, f"after the page's {action} the controller's status is {status!r}")
+                break
+            time.sleep(0.2)
     send = f"import socket; socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(b'x', '{OPERATORS}')"
     command = ("setpriv", "--reuid", "timberhand-planner", "--regid", "timberhand-planner", "--init-groups")
     done = subprocess.run([*command, sys.executable, "-c", send], capture_output=True, text=True)
