@@ -31,8 +31,8 @@ _WITHOUT_OPERATOR: Final = 2
 """Version of the records in which operators and planners sent to one socket: the kind tells whose a datagram was."""
 OPERATOR: Final = 0x8000
 """Bit of a datagram's length: an operator sent it."""
-MAX_BYTES: Final = 65_000
-"""Most bytes of a record: a tick of two full buses and 16 datagrams has less."""
+MAX_BYTES: Final = 100_000
+"""Most bytes of a record: a tick that drains two full buses and 16 of the longest datagrams has less."""
 
 _VERSION: Final = struct.Struct("<IH")
 _HEAD: Final = struct.Struct("<I5HQqQQ" + "HQQQQ" * 2)

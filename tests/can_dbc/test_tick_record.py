@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.bus.base import BusState, BusStats
+from can_dbc.bus.base import DRAIN_LIMIT, BusState, BusStats
 from can_dbc.frame import Frame
 from can_dbc.messages import datagrams
 from can_dbc.messages.crane import OperatorAction, OperatorCommand
@@ -61,6 +61,17 @@ def test_arbitrary_bytes_are_refused(data):
 
 def sealed(body: bytes) -> bytes:
     return body + struct.pack("<I", zlib.crc32(body))
+
+
+def test_the_fullest_tick_fits():
+    """As many frames as a drain returns from each bus, and both sockets' datagrams at their longest."""
+    frames = [Frame(1, 2, bytes(8))] * DRAIN_LIMIT
+    sent = [(3, bytes(8))] * 64
+    long, pressed = [bytes(2048)] * 16, [bytes(256)] * 16
+    quiet = BusReading()
+    tick = TickRecord(1, 0, 0, 0, quiet, quiet, frames, frames, long, sent, sent, bytes(400), bytes(400), pressed)
+    found = decode(encode(tick))
+    assert len(found.frames_in) == len(found.machine_frames_in) == DRAIN_LIMIT and len(found.datagrams) == 16
 
 
 def test_in_a_record_of_version_2_the_kind_tells_whose_a_datagram_was():
