@@ -34,9 +34,11 @@ PRIORITY: Final = 85
 ROOT: Final = Path(__file__).parents[2]
 
 
-def build(profile: Path, dbc: Path = ROOT / "can_dbc" / "crane.dbc") -> Guard:
-    """Build a guard for a profile file; raises GuardConfigError."""
+def build(profile: Path, dbc: Path = ROOT / "can_dbc" / "crane.dbc", rate_hz: int = 0) -> Guard:
+    """Build a guard for a profile file and commands at ``rate_hz`` (0: the profile's); raises GuardConfigError."""
     axes, period_ns = read_envelope(profile)
+    if rate_hz:
+        period_ns = 1_000_000_000 // rate_hz
     return Guard(axes, read_layouts(dbc, [*MESSAGES, *(axis.message for axis in axes if axis.message)]), period_ns)
 
 
@@ -75,17 +77,20 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--profile", required=True, help="shipped profile name or TOML file")
     parser.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="address of the crane bus")
+    parser.add_argument("--rate", type=int, default=0, metavar="HZ", help="the controller's, if not the profile's")
     parser.add_argument("--no-realtime", action="store_true", help="do not request FIFO scheduling and locked memory")
     options = parser.parse_args(arguments)
     name, _, address = options.bus.partition("=")
     if options.bus and (name != "crane0" or not address):
         parser.error(f"--bus {options.bus}: write crane0=ADDRESS, as in crane0=socketcan:can0")
+    if options.rate < 0:
+        parser.error(f"--rate {options.rate}: write the controller's rate in Hz, as in 200")
     keep_memory()
     ended: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda which, _frame: ended.append(which))
     try:
-        guard = build(profile_path(options.profile))
+        guard = build(profile_path(options.profile), rate_hz=options.rate)
         with open_bus(address or default_address("crane0"), filters=guard.keys) as bus:
             if not options.no_realtime:
                 sys.stderr.writelines(f"guard: not granted: {refusal}\n" for refusal in prepare(PRIORITY))

@@ -159,7 +159,7 @@ class TimingTestbed:
         self._start(
             "observer", "experiments.timing.bus_observer", "--profile", s.profile, "--rate", s.rate_hz, "--ticks", ticks
         )
-        guard = self.family.start("guard", "controller.guard", "--profile", s.profile, *crane)
+        guard = self.family.start("guard", "controller.guard", "--profile", s.profile, *crane, "--rate", s.rate_hz)
         self._elsewhere(guard.process.pid)
         self.family.start(
             "controller", "controller", "--profile", s.profile, *buses, "--setpoint-port", control,

@@ -211,6 +211,19 @@ def test_punctual_commands_pass(delays_ms, skipped):
     assert set(commands_with_delays(delays_ms, skipped)[:-3]) == {Verdict.GOOD}
 
 
+@pytest.mark.parametrize(("rate_hz", "late"), [(100, False), (0, True)])
+def test_a_controller_at_another_rate_is_late_unless_the_guard_knows(rate_hz, late):
+    """Commands every 10 ms, in order and complete, on a machine whose profile says 5 ms."""
+    traffic = Traffic()
+    traffic.guard = build(PROFILE, rate_hz=rate_hz)
+    traffic.good()
+    found = set()
+    for k in range(60):
+        traffic.dropped = {"ValveCmdA", "ValveCmdB"} if k % 2 else set()
+        found.add(traffic.tick())
+    assert (Verdict.STALE in found) is late
+
+
 @pytest.mark.parametrize("key", [0x1FD, 0x77D])
 def test_another_guard(key):
     traffic = Traffic().good()
