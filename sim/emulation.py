@@ -59,6 +59,8 @@ class EmulatedMachine(ABC):
 
     ``vehicle_node``, ``arms``, ``engine`` and ``gnss`` are None on a machine without carrier, ``imu`` where the profile
     has none.  ``cycle_ns`` is the period of the valve node's feedback and of the fast pressures.
+    ``stuck_open`` is a fault: valves of `FUNCTIONS` whose amplifier drives them to -1..1 whatever the node commands;
+    without pilot pressure their springs close them.
     """
 
     def __init__(
@@ -72,6 +74,7 @@ class EmulatedMachine(ABC):
     ) -> None:
         self.profile = profile
         self._surroundings = world
+        self.stuck_open: dict[str, float] = {}
         self._step_ns, self._sense_steps = step_ns, max(1, SENSE_NS // step_ns)
         self._time_ns: int | None = None
         self._steps = 0
@@ -180,8 +183,12 @@ class EmulatedMachine(ABC):
 
     def _spools(self, now_ns: int) -> list[float]:
         """Commands of the nodes to the valves in this step, -1..1: `FUNCTIONS`, then steering and `ARMS`."""
+        self.estop.decide(now_ns)
         self.valve.decide(now_ns)
         commands = [u / 100.0 for u in self.valve.outputs_pct]
+        if self.estop.pilot_on:
+            for name, position in self.stuck_open.items():
+                commands[FUNCTIONS.index(name)] = position
         if self.vehicle_node is not None and self.arms is not None:
             self.vehicle_node.decide(now_ns)
             self.arms.decide(now_ns)
@@ -261,6 +268,7 @@ class EmulatedMachine(ABC):
                 device.receive_sdo(key, data)
         self._encoder_bus.receive(key, data, now_ns)
         self.valve.receive(key, data, now_ns)
+        self.estop.receive(key, data, now_ns)
 
     def _deliver_machine(self, key: int, data: bytes, now_ns: int) -> None:
         for node in self._machine_nodes:

@@ -84,7 +84,7 @@ class Plant(EmulatedMachine):
             self._float((self.arms.float_front, self.arms.float_rear))
             drive = Drive(self.vehicle_node.drive_m_s, self.vehicle_node.brake)
         held = self._levers.held(now_ns)
-        if held and self.estop.pilot_on and not self._commanded():
+        if held and self.estop.relay_on and not self._commanded():
             if DRIVE in held and self.profile.carrier is not None:
                 drive = Drive(held.pop(DRIVE) * self.profile.carrier.cruise_speed_m_s)
             for name, position in held.items():

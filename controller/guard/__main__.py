@@ -1,7 +1,7 @@
-"""The guard process: ``python -m controller.guard --profile FILE --bus crane0=ADDRESS``.
+"""The guard process: ``python -m controller.guard --profile FILE --bus crane0=ADDRESS [--bus mach0=ADDRESS]``.
 
-Every 5 ms: receive, check, send.  A lost bus is reopened when it is back.  Exit codes: 0 ended by SIGTERM, 3
-configuration, 4 no bus at the start, 130 SIGINT.
+Every 5 ms: receive from both buses, check, send.  A lost bus is reopened when it is back.  Exit codes: 0 ended by
+SIGTERM, 3 configuration, 4 no bus at the start, 130 SIGINT.
 """
 
 from __future__ import annotations
@@ -15,14 +15,17 @@ import argparse
 import signal
 import sys
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
 from can_dbc.bus.base import Bus, BusError
 from can_dbc.bus.factory import default_address, open_bus
-from can_dbc.frame import Frame
+from can_dbc.frame import EXTENDED, Frame, RawFrame
 from can_dbc.messages.tick_record import BusReading
-from controller.guard.envelope import read_envelope
+from controller.guard import carrier
+from controller.guard.envelope import SHIPPED, read_envelope
 from controller.guard.guard import MESSAGES, Guard
 from controller.guard.layout import GuardConfigError, read_layouts
 from controller.process.bus_link import BusLink
@@ -31,58 +34,77 @@ from runtime.allocator import keep_memory
 
 PERIOD_NS: Final = 5_000_000
 PRIORITY: Final = 85
-ROOT: Final = Path(__file__).parents[2]
+DATABASES: Final = Path(__file__).parents[2] / "can_dbc"
+BUSES: Final = ("crane0", "mach0")
 
 
-def build(profile: Path, dbc: Path = ROOT / "can_dbc" / "crane.dbc", rate_hz: int = 0) -> Guard:
+def build(profile: Path, databases: Path = DATABASES, rate_hz: int = 0) -> Guard:
     """Build a guard for a profile file and commands at ``rate_hz`` (0: the profile's); raises GuardConfigError."""
-    axes, period_ns = read_envelope(profile)
+    envelope = read_envelope(profile)
     if rate_hz:
-        period_ns = 1_000_000_000 // rate_hz
-    return Guard(axes, read_layouts(dbc, [*MESSAGES, *(axis.message for axis in axes if axis.message)]), period_ns)
+        envelope = envelope._replace(period_ns=1_000_000_000 // rate_hz)
+    encoders = [axis.message for axis in envelope.axes if axis.message]
+    layouts = read_layouts(databases / "crane.dbc", [*MESSAGES, *encoders])
+    if envelope.carrier is not None:
+        layouts |= read_layouts(databases / "machine.dbc", list(carrier.MESSAGES))
+    return Guard(envelope, layouts)
 
 
 def profile_path(name: str) -> Path:
     """Path of a shipped profile by its name, else ``name`` as a path."""
-    shipped = ROOT / "machine" / f"{name}.toml"
+    shipped = SHIPPED / f"{name}.toml"
     return shipped if shipped.is_file() else Path(name)
 
 
-def run(guard: Guard, bus: Bus, ended: list[int], notifier: Notifier) -> None:
-    """Run until a signal number is in ``ended``."""
+def split(frames: list[RawFrame]) -> tuple[list[RawFrame], list[RawFrame]]:
+    """The guard's frames for crane0 (11-bit identifiers) and for mach0 (29 bits)."""
+    return [f for f in frames if not f[0] & EXTENDED], [f for f in frames if f[0] & EXTENDED]
+
+
+def run(guard: Guard, buses: list[Bus], ended: list[int], notifier: Notifier) -> None:
+    """Run until a signal number is in ``ended``; ``buses`` are crane0, and mach0 where the machine has one."""
     frames: list[Frame] = []
-    link, reading = BusLink(bus), BusReading()
+    received: list[Frame] = []
+    links = [(BusLink(bus), BusReading()) for bus in buses]
     deadline_ns = time.monotonic_ns() + PERIOD_NS
     while not ended:
         sleep_until(deadline_ns)
         late_ns = time.monotonic_ns() - deadline_ns
         if late_ns >= PERIOD_NS:
             deadline_ns += late_ns // PERIOD_NS * PERIOD_NS
-        link.receive(frames, reading)
-        link.send(guard.step(deadline_ns, frames))
-        link.watch(deadline_ns)
+        frames.clear()
+        for link, reading in links:
+            link.receive(received, reading)
+            frames += received
+        for (link, _), out in zip(links, split(guard.step(deadline_ns, frames)), strict=False):
+            link.send(out)
+            link.watch(deadline_ns)
         notifier.tick_done(deadline_ns, late_ns < PERIOD_NS)
         deadline_ns += PERIOD_NS
     notifier.stopping()
 
 
-def _status_text(guard: Guard, bus: Bus) -> str:
-    return f"Valves {'' if guard.enabled else 'not '}enabled: {guard.verdict.name}. The bus is {bus.stats.state.name}."
+def _status_text(guard: Guard, buses: list[Bus]) -> Callable[[], str]:
+    def text() -> str:
+        states = " and ".join(bus.stats.state.name for bus in buses)
+        return f"Valves {'' if guard.enabled else 'not '}enabled: {guard.verdict.name}. The bus is {states}."
+
+    return text
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the guard; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m controller.guard", description="Checks the traffic on the crane bus and enables the valves."
+        prog="python -m controller.guard", description="Checks the traffic on the buses and enables the machine."
     )
     parser.add_argument("--profile", required=True, help="shipped profile name or TOML file")
-    parser.add_argument("--bus", default="", metavar="crane0=ADDRESS", help="address of the crane bus")
+    parser.add_argument("--bus", action="append", default=[], metavar="NAME=ADDRESS", help="address of crane0 or mach0")
     parser.add_argument("--rate", type=int, default=0, metavar="HZ", help="the controller's, if not the profile's")
     parser.add_argument("--no-realtime", action="store_true", help="do not request FIFO scheduling and locked memory")
     options = parser.parse_args(arguments)
-    name, _, address = options.bus.partition("=")
-    if options.bus and (name != "crane0" or not address):
-        parser.error(f"--bus {options.bus}: write crane0=ADDRESS, as in crane0=socketcan:can0")
+    addresses = {name: address for name, _, address in (text.partition("=") for text in options.bus)}
+    if not addresses.keys() <= set(BUSES) or not all(addresses.values()):
+        parser.error(f"--bus {' '.join(options.bus)}: write crane0=ADDRESS, as in crane0=socketcan:can0, or mach0=...")
     if options.rate < 0:
         parser.error(f"--rate {options.rate}: write the controller's rate in Hz, as in 200")
     keep_memory()
@@ -91,11 +113,16 @@ def main(arguments: list[str] | None = None) -> int:
         signal.signal(number, lambda which, _frame: ended.append(which))
     try:
         guard = build(profile_path(options.profile), rate_hz=options.rate)
-        with open_bus(address or default_address("crane0"), filters=guard.keys) as bus:
+        with ExitStack() as opened:
+            buses = [
+                opened.enter_context(open_bus(addresses.get(name) or default_address(name), filters=keys))
+                for name, keys in zip(BUSES, guard.keys_of_buses, strict=True)
+                if keys
+            ]
             if not options.no_realtime:
                 sys.stderr.writelines(f"guard: not granted: {refusal}\n" for refusal in prepare(PRIORITY))
             stop_garbage_collection()
-            run(guard, bus, ended, Notifier(lambda: _status_text(guard, bus)))
+            run(guard, buses, ended, Notifier(_status_text(guard, buses)))
     except (GuardConfigError, BusError) as error:
         sys.stderr.write(f"guard: {error}\n")
         return 3 if isinstance(error, GuardConfigError) else 4

@@ -1,11 +1,13 @@
-"""Limits of a machine, read from the profile (TOML) by the guard itself.
+"""Limits of a machine for the guard, from a file of its own that is sealed with a digest and that calibration leaves.
 
-Output: one `Axis` per joint with its command signal, its encoder and its limits, in the units of the profile, and the
-period of the commands.
+The envelope file has ranges, speeds, geometry and forbidden boxes.  From the profile the guard takes only what
+calibration finds: dead-bands, full speeds and zero counts of the encoders, and the names of the signals.  A profile
+whose ranges or speeds exceed the envelope stops the start.
 """
 
 from __future__ import annotations
 
+import hashlib
 import tomllib
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -15,40 +17,123 @@ from controller.guard.layout import GuardConfigError
 JOINT_NAMES: Final = ("slew", "lift", "tilt", "ext", "rot")
 RATE_FACTOR: Final = 6.0
 """A command may change this many times faster than the acceleration limit; the controller stays below (4)."""
+SEAL: Final = b"# sha256: "
+"""The last line of an envelope file: this, and the digest of everything before it."""
+SHIPPED: Final = Path(__file__).parents[2] / "machine"
+Corner = tuple[float, float, float]
 
 
 class Axis(NamedTuple):
-    """One joint: command, encoder (message name empty without one) and limits [rad or m; % and %/s]."""
+    """One joint: command, encoder (message name empty without one) and limits [rad or m, per second; % and %/s]."""
 
     number: int
     signal: str
     sign: int
     deadband_pct: float
+    full_speed: float
     rate_pct_s: float
     lower: float
     upper: float
+    speed_limit: float
     message: str
     total_counts: int
     zero_counts: int
     unit: float
 
 
-def read_envelope(path: Path) -> tuple[tuple[Axis, ...], int]:
-    """Read the axes and the period of the commands [ns] of a profile file; raises GuardConfigError."""
+class Kinematics(NamedTuple):
+    """The crane in its vertical plane [m, rad]: boom pin from the base; boom; telescope axis off the stick pin; stick
+    at extension 0; the angles at which joint angles are zero."""
+
+    boom_pin_z_m: float
+    boom_pin_r_m: float
+    plane_offset_rad: float
+    boom_m: float
+    boom_offset_rad: float
+    telescope_offset_m: float
+    stick_offset_rad: float
+    stick_m: float
+
+
+class CarrierLimits(NamedTuple):
+    """Limits of the carrier [m/s, m/s^2, rad, rad/s]."""
+
+    speed_limit_m_s: float
+    drive_acceleration_m_s2: float
+    articulation_limit_rad: float
+    articulation_rate_limit_rad_s: float
+
+
+class Envelope(NamedTuple):
+    """What a machine may do; ``carrier`` is None on a fixed base, ``boxes`` are (lowest, highest) corners."""
+
+    axes: tuple[Axis, ...]
+    period_ns: int
+    kinematics: Kinematics
+    ground_m: float
+    boxes: tuple[tuple[Corner, Corner], ...]
+    carrier: CarrierLimits | None
+
+
+def digest(body: bytes) -> bytes:
+    """The digest of an envelope file without its last line."""
+    return hashlib.sha256(body).hexdigest().encode()
+
+
+def read_envelope(path: Path) -> Envelope:
+    """Read a profile file and the envelope of its machine; raises GuardConfigError."""
     try:
         profile = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise GuardConfigError("guard.profile-unreadable", f"{path}: unreadable profile: {error}.") from error
     try:
-        axes = tuple(_axis(i, profile["joints"][name]) for i, name in enumerate(JOINT_NAMES))
-        return axes, 1_000_000_000 // int(profile["rate_hz"])
+        limits = _sealed(_find(path, str(profile["name"])))
+        _compare(path, profile, limits)
+        axes = tuple(_axis(i, profile["joints"][n], limits["joints"][n]) for i, n in enumerate(JOINT_NAMES))
+        boxes = tuple((tuple(box["low_m"]), tuple(box["high_m"])) for box in limits.get("boxes", ()))
+        carrier = CarrierLimits(**limits["carrier"]) if "machine_bus" in profile else None
+        geometry, ground_m = Kinematics(**limits["kinematics"]), float(limits["ground_m"])
+        return Envelope(axes, 1_000_000_000 // int(profile["rate_hz"]), geometry, ground_m, boxes, carrier)
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise GuardConfigError(
-            "guard.profile-incomplete", f"{path}: a joint or the rate is incomplete: {error!r}."
+            "guard.profile-incomplete", f"{path} or its envelope: a joint or the rate is incomplete: {error!r}."
         ) from error
 
 
-def _axis(number: int, joint: dict[str, Any]) -> Axis:
+def _find(profile: Path, machine: str) -> Path:
+    """The envelope beside the profile, else the shipped one of the machine."""
+    beside = profile.with_name(f"{machine}.envelope.toml")
+    return beside if beside.is_file() else SHIPPED / beside.name
+
+
+def _sealed(path: Path) -> dict[str, Any]:
+    try:
+        body, _, seal = path.read_bytes().rpartition(SEAL)
+    except OSError as error:
+        raise GuardConfigError("guard.envelope-missing", f"{path}: no envelope: {error.strerror}.") from error
+    if seal.strip() != digest(body):
+        raise GuardConfigError(
+            "guard.envelope-damaged",
+            f"{path}: the digest does not match; check every limit, then run python -m controller.guard.seal {path}.",
+        )
+    return tomllib.loads(body.decode())
+
+
+def _compare(path: Path, profile: dict[str, Any], limits: dict[str, Any]) -> None:
+    """Refuse a profile that allows more than the envelope: every limit that is in both, by its name."""
+    pairs = [(f"joints.{name}", profile["joints"][name], limits["joints"][name]) for name in JOINT_NAMES]
+    if "machine_bus" in profile:
+        pairs.append(("carrier", profile["carrier"], limits["carrier"]))
+    for place, mine, most in pairs:
+        for key, limit in most.items():
+            if mine[key] < limit if key == "lower" else mine[key] > limit:
+                raise GuardConfigError(
+                    "guard.profile-exceeds-envelope",
+                    f"{path}: {place}.{key} is {mine[key]:g}, and the envelope allows {limit:g}; reduce it.",
+                )
+
+
+def _axis(number: int, joint: dict[str, Any], limits: dict[str, float]) -> Axis:
     valve, encoder = joint["valve"], joint.get("encoder")
     slowest = min(valve["full_speed_plus"], valve["full_speed_minus"])
     linear = encoder is not None and encoder["kind"] == "linear"
@@ -57,9 +142,11 @@ def _axis(number: int, joint: dict[str, Any]) -> Axis:
         signal=str(valve["signal"]),
         sign=int(valve["sign"]),
         deadband_pct=float(min(valve["deadband_plus_pct"], valve["deadband_minus_pct"])),
-        rate_pct_s=100.0 * RATE_FACTOR * float(joint["acceleration_limit"]) / float(slowest),
-        lower=float(joint["lower"]),
-        upper=float(joint["upper"]),
+        full_speed=float(max(valve["full_speed_plus"], valve["full_speed_minus"])),
+        rate_pct_s=100.0 * RATE_FACTOR * limits["acceleration_limit"] / float(slowest),
+        lower=limits["lower"],
+        upper=limits["upper"],
+        speed_limit=limits["speed_limit"],
         message=str(encoder["message"]) if encoder else "",
         total_counts=0 if encoder is None or linear else int(encoder["total_counts"]),
         zero_counts=int(encoder["zero_counts"]) if encoder else 0,

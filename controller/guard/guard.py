@@ -1,323 +1,169 @@
 """The guard's checks: pure ``step(now_ns, frames) -> frames``, no allocation that lasts.
 
-It watches the valve commands, whoever sends them, and everything that they depend on, by its own rules and its own
-decoding.  GuardStat goes out every 10 ms, and at once when the verdict changes; ``Enable`` is 0xA only while no rule is
-broken.  It returns when the rules hold and the commands have been neutral for 200 ms.  A broken rule of `LATCHING`
-needs a person before that: the reset button of the safety module, pressed after the cause is gone, and nothing else.
-Neutral commands are always allowed.  The guard never commands: silent or dead, it stops the machine by absence.
+It watches the commands on both buses, whoever sends them, and everything that they depend on, by its own rules and its
+own decoding.  A frame with an 11-bit identifier belongs to crane0, one with 29 bits to mach0.  GuardStat goes out every
+10 ms and GuardAlive every 20 ms, and at once when the verdict changes; ``Enable`` is 0xA only while no rule is broken.
+It returns when the rules hold and the commands have been neutral for 200 ms.  A broken rule of `LATCHING` needs a
+person before that: the reset button of the safety module, pressed after the cause is gone, and nothing else.  Until
+then, and while the commands are silent, GuardPilot switches the pilot supply off.  Neutral commands are always allowed.
+The guard never commands: silent or dead, it stops the machine by absence.
+
+When several rules are broken, the verdict is the first of: what a frame violates (one of `LATCHING` first), the
+emergency stop, motion that nobody commands, missing commands, the carrier, and the rules on a commanded crane.
 """
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Final
 
-from can_dbc.frame import Frame
-from controller.guard.envelope import Axis
-from controller.guard.layout import Field, GuardConfigError, Layout
+from can_dbc.frame import EXTENDED, Frame, RawFrame
+from controller.guard import carrier as mach0
+from controller.guard.envelope import Envelope
+from controller.guard.joints import CommandedAxis, MeasuredJoint
+from controller.guard.layout import GuardConfigError, Layout
+from controller.guard.motion import MotionWatch
+from controller.guard.reach import Reach
+from controller.guard.stream import FrameEffect, Punctuality, SentMessage, WatchedMessage
+from controller.guard.verdicts import AUX_AXIS, FINE, GRAPPLE_AXIS, LATCHING, NO_AXIS, Finding, Verdict
 
 GUARD_NODE: Final = 0x7D
 HEARTBEAT_KEY: Final = 0x700 + GUARD_NODE
-ENABLE, ARM_KEY = 0xA, 0xA
+ENABLE, SUPPLY, ARM_KEY = 0xA, 0xA, 0xA
 STATUS_NS: Final = 10_000_000
+ALIVE_NS: Final = 20_000_000
 HEARTBEAT_NS: Final = 100_000_000
 CALM_NS: Final = 200_000_000
-ENCODER_TIMEOUT_NS: Final = 90_000_000
-"""The controller stops on a lost encoder within 100 ms; the guard enforces it."""
+SILENCE_NS: Final = 300_000_000
+"""The pilot supply goes off when commands have been missing for this long."""
+PERSON_NS: Final = 300_000_000
+PERSON_CARRIER_NS: Final = 2_200_000_000
+"""A person in the zone: the controller stops the crane in 150 ms, and the carrier with a ramp of 1 m/s^2."""
+AGREE_NS: Final = 200_000_000
+"""A controller that says that it has stopped ramps the spools to neutral in 150 ms."""
+HELD_PCT: Final = 30.0
+"""Past the dead-band; an opening below this holds a joint in place while the carrier drives."""
 RANGE_MARGIN_UNITS: Final = 0.08
 """How far outside its range [rad, m] a joint may still be driven outward."""
-RATE_CREDIT_S: Final = 0.04
-RATE_SLACK_PCT: Final = 3.0
-NO_AXIS: Final = 15
-GRAPPLE_AXIS, AUX_AXIS = 5, 6
+GRAPPLE_DEADBAND_PCT: Final = 10.0
 _NEUTRAL, _SPOOL = 0, 2
 _GRAPPLE_OPENS, _GRAPPLE_CLOSES = 1, 2
-_RELEASED, _PRESSED = 1, 1
-_MIN_GOOD_COUNT, _MAX_COUNTER_STEP = 2, 2
-_SHORT_WINDOW, _MAX_BAD_IN_SHORT = (1 << 5) - 1, 1
-_LONG_WINDOW, _MAX_BAD_IN_LONG = (1 << 100) - 1, 2
-"""Frames with a wrong checksum that are tolerated among the last 5 and among the last 100."""
-MAX_DELAY_NS: Final = 40_000_000
-"""A command is refused when it comes this much later than its counter and the period say."""
-DELAY_FORGIVEN_PER_S: Final = 0.02
-"""How fast a lasting delay is forgiven: clocks differ, and a controller may skip a tick."""
-MESSAGES: Final = ("ValveCmdA", "ValveCmdB", "EstopStat", "GuardStat")
-
-
-class Verdict(IntEnum):
-    """The broken rule; the number of ``GuardStat.Verdict``."""
-
-    GOOD = 0
-    NO_COMMAND = 1  # a valve command is missing or too old
-    CORRUPT = 2  # too many commands with a wrong checksum or length
-    OTHER_GUARD = 3  # another node sends the guard's frames
-    RANGE = 4  # a command out of its range, of an unknown mode, or for a function that does not exist
-    RATE = 5  # a command that grows faster than the machine may
-    NOT_ARMED = 6  # a motion is commanded without the arm key
-    ESTOP = 7  # the emergency stop is pressed, or its channels differ
-    ENCODER = 8  # a motion is commanded for a joint whose encoder is silent
-    OUTSIDE = 9  # a motion further out is commanded for a joint outside its range
-    CALMING = 10  # no rule is broken, but not for long enough
-    STALE = 11  # commands come late, or some are missing in between
-    ESTOP_LOST = 12  # the emergency stop is not received
-    LATCHED = 13  # no rule is broken, but nobody has pressed reset since one of `LATCHING` was
-
-
-LATCHING: Final = frozenset(
-    (Verdict.CORRUPT, Verdict.OTHER_GUARD, Verdict.RANGE, Verdict.RATE, Verdict.NOT_ARMED, Verdict.ESTOP)
-) | {Verdict.OUTSIDE}
-"""Rules whose violation is something heard, not silence: only a person allows motion again."""
-
-
-def _crc_table() -> bytes:
-    table = bytearray(256)
-    for i in range(256):
-        crc = i
-        for _ in range(8):
-            crc = (crc << 1 & 0xFF) ^ (0x2F if crc & 0x80 else 0)
-        table[i] = crc
-    return bytes(table)
-
-
-_CRC: Final = _crc_table()
-
-
-def checksum(data: bytes, data_id: int) -> int:
-    """CRC-8H2F of a frame from byte 1 on and its Data ID (AUTOSAR E2E Profile 2)."""
-    crc = 0xFF
-    for i in range(1, len(data)):
-        crc = _CRC[crc ^ data[i]]
-    return _CRC[crc ^ data_id] ^ 0xFF
-
-
-class FrameEffect(IntEnum):
-    """Effect of a received frame on its stream; the greater ones break trust."""
-
-    NONE = 0
-    NEW_WORD = 1
-    GAP = 2
-    CORRUPT = 3
-
-
-class WatchedMessage:
-    """One protected message: its newest good word, its time, and whether its stream is trusted."""
-
-    __slots__ = ("_bad", "_good", "counter", "layout", "stamp_ns", "steps", "trusted", "word")
-
-    def __init__(self, layout: Layout) -> None:
-        if not layout.data_ids or not layout.timeout_ns:
-            raise GuardConfigError("guard.message-unprotected", "crane.dbc: a message lacks Data IDs or a time-out.")
-        self.layout = layout
-        self.word = self.stamp_ns = self.steps = 0
-        self.counter = -1
-        self.trusted = False
-        self._good = self._bad = 0  # good frames in a row; bad ones among the last hundred, as bits
-
-    def receive(self, frame: Frame, now_ns: int) -> FrameEffect:
-        """Check a frame, and keep its word when the stream is trusted."""
-        data, layout = frame.data, self.layout
-        self.old(frame.stamp_ns)  # after a silence the stream begins anew: that is no corruption
-        if len(data) != layout.length or checksum(data, layout.data_ids[data[1] & 0xF]) != data[0]:
-            bad = self._bad = (self._bad << 1 | 1) & _LONG_WINDOW
-            self._good = 0
-            if (bad & _SHORT_WINDOW).bit_count() <= _MAX_BAD_IN_SHORT and bad.bit_count() <= _MAX_BAD_IN_LONG:
-                return FrameEffect.NONE
-            self.trusted = False
-            return FrameEffect.CORRUPT
-        counter = data[1] & 0xF
-        self.steps = (counter - self.counter) & 0xF if self.counter >= 0 else 1
-        self.counter = counter
-        if self.steps == 0:  # a repeated frame only grows older
-            return FrameEffect.NONE
-        self._bad = self._bad << 1 & _LONG_WINDOW
-        broken = self.steps > _MAX_COUNTER_STEP and self.trusted
-        self._good = 1 if self.steps > _MAX_COUNTER_STEP else self._good + 1
-        self.trusted = not broken and (self.trusted or self._good >= _MIN_GOOD_COUNT)
-        if not self.trusted:
-            return FrameEffect.GAP if broken else FrameEffect.NONE
-        self.word = int.from_bytes(data, "little")
-        self.stamp_ns = min(frame.stamp_ns, now_ns)
-        return FrameEffect.NEW_WORD
-
-    def old(self, now_ns: int) -> bool:
-        """Whether no trusted frame came within the time-out; then the stream must qualify again."""
-        if self.trusted and now_ns - self.stamp_ns <= self.layout.timeout_ns:
-            return False
-        if self.trusted:
-            self.trusted, self._good, self.counter = False, 0, -1
-        return True
-
-    def raw(self, name: str) -> int:
-        """Raw value of a signal in the newest good frame."""
-        return self.layout.fields[name].raw(self.word)
-
-
-class Punctuality:
-    """How late commands come, from their number: one for each period, and the most punctual one sets the scale.
-
-    A transmit queue that a busy bus holds up delivers commands in order, complete, with good checksums, and old.
-    """
-
-    __slots__ = ("_due_ns", "_last_ns", "_period_ns")
-
-    def __init__(self, period_ns: int) -> None:
-        self._period_ns = period_ns
-        self._due_ns = self._last_ns = 0
-
-    def late(self, stamp_ns: int, steps: int, silence_ns: int) -> bool:
-        """Whether a command is too late that came at ``stamp_ns``, ``steps`` after the one before."""
-        gap_ns = stamp_ns - self._last_ns
-        self._last_ns = stamp_ns
-        due_ns = self._due_ns + steps * self._period_ns + int(gap_ns * DELAY_FORGIVEN_PER_S)
-        self._due_ns = stamp_ns if gap_ns > silence_ns else min(due_ns, stamp_ns)
-        return stamp_ns - self._due_ns > MAX_DELAY_NS
-
-
-class CommandedAxis:
-    """One commanded axis: its field, the last opening past the dead-band, and its rate credit."""
-
-    __slots__ = ("_credit", "_deadband", "_field", "_last", "_max_credit", "_rate", "axis", "percent")
-
-    def __init__(self, axis: Axis, field: Field) -> None:
-        self.axis = axis
-        self._field = field
-        self._deadband = axis.deadband_pct
-        self._rate = axis.rate_pct_s
-        self._max_credit = self._credit = axis.rate_pct_s * RATE_CREDIT_S + RATE_SLACK_PCT
-        self._last = 0.0
-        self.percent = 0.0
-
-    def receive(self, word: int, elapsed_s: float) -> Verdict:
-        """Check the value in a new command frame that came ``elapsed_s`` after the last one."""
-        raw = self._field.raw(word)
-        if not self._field.inside(raw):
-            return Verdict.RANGE
-        self.percent = raw * self._field.scale
-        size = max(0.0, abs(self.percent) - self._deadband) * 100.0 / (100.0 - self._deadband)
-        opening = size if self.percent > 0.0 else -size
-        # Closing costs nothing; growth on the side of the command uses credit.
-        growth = size if opening * self._last <= 0.0 else max(0.0, size - abs(self._last))
-        self._last = opening
-        self._credit = min(self._max_credit, self._credit + self._rate * elapsed_s) - growth
-        if self._credit < 0.0:
-            self._credit = 0.0
-            return Verdict.RATE
-        return Verdict.GOOD
-
-
-class MeasuredJoint:
-    """The measured position of one joint."""
-
-    __slots__ = ("_alive", "_at", "axis", "layout", "position", "stamp_ns")
-
-    def __init__(self, axis: Axis, layout: Layout) -> None:
-        self.axis, self.layout = axis, layout
-        self.position = 0.0
-        self.stamp_ns = -ENCODER_TIMEOUT_NS
-        self._at = layout.fields.get("TimeStamp")
-        self._alive = -1
-
-    def receive(self, frame: Frame, now_ns: int) -> None:
-        """Use an encoder frame; one of a rotary encoder counts only when its time stamp has changed."""
-        if len(frame.data) != self.layout.length:
-            return
-        word = int.from_bytes(frame.data, "little")
-        if self._at is not None:
-            before, self._alive = self._alive, self._at.raw(word)
-            if before == self._alive:
-                return
-        axis = self.axis
-        offset = self.layout.fields["Position"].raw(word) - axis.zero_counts
-        if axis.total_counts:
-            offset = (offset + axis.total_counts // 2) % axis.total_counts - axis.total_counts // 2
-        self.position = offset * axis.unit
-        self.stamp_ns = min(frame.stamp_ns, now_ns)
+_GRAPPLE_SIDE: Final = (0.0, 1.0, -1.0, -1.0)
+"""Side of the grapple's spool by GrappleMode: neutral, opens, closes, holds."""
+_RELEASED, _PRESSED, _YES = 1, 1, 1
+_OPERATING: Final = (2, 3)
+"""CtrlStatus.Mode: armed, run."""
+MESSAGES: Final = (
+    "ValveCmdA", "ValveCmdB", "EstopStat", "CtrlStatus", "ValveFbA", "ValveFbB", "GuardStat", "GuardPilot",
+)  # fmt: skip
 
 
 class Guard:
     """All state of the guard; `step` is its whole behaviour."""
 
     __slots__ = (
-        "_a", "_b", "_calm_ns", "_changed", "_commands", "_commands_a", "_commands_b", "_counter", "_estop",
-        "_grapple_field", "_heartbeat_ns", "_joints", "_latched", "_layout", "_punctuality", "_reset_seen",
-        "_status_ns", "_watches", "axis", "events", "verdict",
+        "_a", "_agreed_ns", "_b", "_calm_ns", "_carrier", "_clear_ns", "_commands", "_commands_of", "_estop",
+        "_feedback", "_grapple_field", "_heard_ns", "_heartbeat_ns", "_joints", "_latched", "_motion", "_now_ns",
+        "_own_keys", "_punctuality", "_reach", "_reset_seen", "_sent", "_status", "_supply", "_watches", "axis",
+        "events", "verdict",
     )  # fmt: skip
 
-    def __init__(self, axes: tuple[Axis, ...], layouts: dict[str, Layout], period_ns: int) -> None:
-        self._a, self._b, self._estop = (WatchedMessage(layouts[name]) for name in MESSAGES[:3])
-        self._layout = layouts["GuardStat"]
-        self._watches = {watch.layout.key: watch for watch in (self._a, self._b, self._estop)}
-        sensed = [MeasuredJoint(axis, layouts[axis.message]) for axis in axes if axis.message]
-        self._joints = {joint.layout.key: joint for joint in sensed}
+    def __init__(self, envelope: Envelope, layouts: dict[str, Layout]) -> None:
+        axes = envelope.axes
+        self._a, self._b = (WatchedMessage(layouts[n], Verdict.STALE, Verdict.CORRUPT) for n in MESSAGES[:2])
+        self._estop = WatchedMessage(layouts["EstopStat"], Verdict.ESTOP_LOST, Verdict.ESTOP_LOST)
+        self._status, *self._feedback = (WatchedMessage(layouts[name]) for name in MESSAGES[3:6])
+        self._carrier = mach0.Carrier(envelope.carrier, layouts) if envelope.carrier else None
+        watched = [self._a, self._b, self._estop, self._status, *self._feedback]
+        sent = [("GuardStat", STATUS_NS), ("GuardPilot", STATUS_NS)]
+        self._punctuality = {watch: Punctuality(envelope.period_ns) for watch in watched[:2]}
+        if self._carrier is not None:
+            watched += [*self._carrier.commands, self._carrier.state]
+            sent.append(("GuardAlive", ALIVE_NS))
+            self._punctuality |= {watch: Punctuality(mach0.COMMAND_NS) for watch in self._carrier.commands}
+        self._watches = {watch.layout.key: watch for watch in watched}
+        self._sent = [SentMessage(layouts[name], period_ns) for name, period_ns in sent]
+        self._own_keys = (*(message.layout.key for message in self._sent), HEARTBEAT_KEY)
+        sensed = {axis.number: MeasuredJoint(axis, layouts[axis.message]) for axis in axes if axis.message}
+        self._joints = {joint.layout.key: joint for joint in sensed.values()}
         fields_a, fields_b = layouts["ValveCmdA"].fields, layouts["ValveCmdB"].fields
         missing = [axis.signal for axis in axes if axis.signal not in fields_a and axis.signal not in fields_b]
         if missing:
             raise GuardConfigError("guard.no-command-signal", f"crane.dbc: no valve command is called {missing[0]}.")
         self._commands = [CommandedAxis(axis, (fields_a | fields_b)[axis.signal]) for axis in axes]
-        self._commands_a = [c for c in self._commands if c.axis.signal in fields_a]
-        self._commands_b = [c for c in self._commands if c.axis.signal in fields_b]
+        self._commands_of = {
+            self._a: [c for c in self._commands if c.axis.signal in fields_a],
+            self._b: [c for c in self._commands if c.axis.signal in fields_b],
+        }
+        self._motion: list[tuple[WatchedMessage, MotionWatch]] = []
+        spools = [(axis.number, axis.signal, axis.deadband_pct) for axis in axes]
+        for number, signal, deadband_pct in (*spools, (GRAPPLE_AXIS, "Grapple", GRAPPLE_DEADBAND_PCT)):
+            feedback = next(m for m in self._feedback if f"Spool{signal}" in m.layout.fields)
+            field = feedback.layout.fields[f"Spool{signal}"]
+            self._motion.append((feedback, MotionWatch(number, field, deadband_pct, sensed.get(number))))
+        self._reach = Reach(envelope)
         self._grapple_field = fields_b["Grapple"]
         self.verdict, self.axis = Verdict.NO_COMMAND, NO_AXIS
         self.events = 0
-        self._changed = True
-        self._counter = 0
-        self._calm_ns = self._status_ns = self._heartbeat_ns = 0
+        self._supply = False
+        self._now_ns = self._calm_ns = self._heartbeat_ns = 0
+        self._heard_ns = -SILENCE_NS - 1
+        self._clear_ns = self._agreed_ns = 0
         self._latched, self._reset_seen = False, True  # a button that is down already is no edge
-        self._punctuality = {watch: Punctuality(period_ns) for watch in (self._a, self._b)}
 
-    def step(self, now_ns: int, frames: list[Frame]) -> list[tuple[int, bytes]]:
+    def step(self, now_ns: int, frames: list[Frame]) -> list[RawFrame]:
         """Check the frames since the last call (any period up to 10 ms); returns the frames to send."""
-        verdict, axis = Verdict.GOOD, NO_AXIS
-        pressed = False
+        elapsed_s, self._now_ns = min(now_ns - self._now_ns, STATUS_NS) * 1e-9, now_ns
+        (verdict, axis), pressed = FINE, False
         for frame in frames:
             found, where = self._receive(frame, now_ns)
             if verdict is Verdict.GOOD or (found in LATCHING and verdict not in LATCHING):
                 verdict, axis = found, where
             pressed = self._reset_pressed() or pressed
-        if verdict is Verdict.GOOD:
-            verdict, axis = self._check_state(now_ns)
-        self._settle(verdict, axis, pressed, now_ns)
-        out: list[tuple[int, bytes]] = []
-        if self._changed or now_ns >= self._status_ns:
-            late = now_ns - self._status_ns >= STATUS_NS
-            self._status_ns = now_ns + STATUS_NS if late or self._changed else self._status_ns + STATUS_NS
-            self._changed = False
-            out.append((self._layout.key, self._status()))
+        state = self._check_state(now_ns, elapsed_s)
+        if verdict is Verdict.GOOD or (state[0] in LATCHING and verdict not in LATCHING):
+            verdict, axis = state
+        changed = self._settle(verdict, axis, pressed, now_ns)
+        values = {
+            "Enable": ENABLE if self.enabled else 0, "Supply": SUPPLY if self._supply else 0, "Verdict": self.verdict,
+            "FaultAxis": self.axis, "SeenCounter": max(self._a.counter, 0), "EventCount": self.events,
+        }  # fmt: skip
+        out = [message.frame(values) for message in self._sent if message.due(now_ns, changed)]
         if now_ns >= self._heartbeat_ns:
             out.append((HEARTBEAT_KEY, b"\x05" if self._heartbeat_ns else b"\x00"))
             self._heartbeat_ns = now_ns + HEARTBEAT_NS
         return out
 
     @property
-    def keys(self) -> tuple[int, ...]:
-        """Keys of the frames to receive: the watched ones, and the guard's own, which no other node may send."""
-        return (*self._watches, *self._joints, self._layout.key, HEARTBEAT_KEY)
+    def keys_of_buses(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Keys to receive from crane0 and from mach0: the watched ones, and the guard's own, which nobody may send."""
+        keys = (*self._watches, *self._joints, *self._own_keys)
+        return tuple(k for k in keys if not k & EXTENDED), tuple(k for k in keys if k & EXTENDED)
 
     @property
     def enabled(self) -> bool:
         """Whether the machine may move."""
         return self.verdict is Verdict.GOOD
 
-    def _receive(self, frame: Frame, now_ns: int) -> tuple[Verdict, int]:
+    def _receive(self, frame: Frame, now_ns: int) -> Finding:
         watch = self._watches.get(frame.key)
         if watch is None:
             joint = self._joints.get(frame.key)
             if joint is not None:
                 joint.receive(frame, now_ns)
-            elif frame.key in (self._layout.key, HEARTBEAT_KEY):
-                return Verdict.OTHER_GUARD, NO_AXIS
-            return Verdict.GOOD, NO_AXIS
+            return (Verdict.OTHER_GUARD, NO_AXIS) if frame.key in self._own_keys else FINE
         before_ns = watch.stamp_ns
         effect = watch.receive(frame, now_ns)
-        if effect is FrameEffect.GAP:
-            return (Verdict.ESTOP_LOST if watch is self._estop else Verdict.STALE), NO_AXIS
-        if effect is FrameEffect.CORRUPT:
-            return (Verdict.ESTOP_LOST if watch is self._estop else Verdict.CORRUPT), NO_AXIS
-        if watch is self._estop or effect is FrameEffect.NONE:
-            return Verdict.GOOD, NO_AXIS
+        if effect >= FrameEffect.GAP:
+            return watch.breaks[effect - FrameEffect.GAP], NO_AXIS
+        if effect is FrameEffect.NONE or watch not in self._punctuality:
+            return FINE
         late = self._punctuality[watch].late(watch.stamp_ns, watch.steps, watch.layout.timeout_ns)
         elapsed_s = (watch.stamp_ns - before_ns) * 1e-9
-        for command in self._commands_a if watch is self._a else self._commands_b:
+        if watch not in self._commands_of:
+            assert self._carrier is not None
+            found = self._carrier.receive(watch, elapsed_s)
+            return (Verdict.STALE, NO_AXIS) if late and found is FINE else found
+        for command in self._commands_of[watch]:
             verdict = command.receive(watch.word, elapsed_s)
             if verdict is not Verdict.GOOD:
                 return verdict, command.axis.number
@@ -329,16 +175,23 @@ class Guard:
         self._reset_seen = not self._estop.trusted or self._estop.raw("ResetReq") == _PRESSED
         return self._reset_seen and not before and self._estop.trusted
 
-    def _check_state(self, now_ns: int) -> tuple[Verdict, int]:
-        """Check the rules on the present state; only a command that moves something can break those on joints."""
-        estop_old = self._estop.old(now_ns)
-        a_old, b_old = self._a.old(now_ns), self._b.old(now_ns)
+    def _check_state(self, now_ns: int, elapsed_s: float) -> Finding:
+        """Check the rules on the present state, in the order of the module's docstring."""
+        estop_old, a_old, b_old = (watch.old(now_ns) for watch in (self._estop, self._a, self._b))
+        heard = not a_old and not b_old
+        if heard:
+            self._heard_ns = now_ns
+        motion = self._check_motion(heard, now_ns, elapsed_s)
+        neutral = self._neutral()
+        carrier = FINE if self._carrier is None else self._carrier.check(heard and self._crane_moves(), now_ns)
         if estop_old:
             self._reset_seen = True
             return Verdict.ESTOP_LOST, NO_AXIS
         if self._estop.raw("ChannelA") != _RELEASED or self._estop.raw("ChannelB") != _RELEASED:
             return Verdict.ESTOP, NO_AXIS
-        if a_old or b_old:
+        if motion is not FINE:
+            return motion
+        if not heard:
             return Verdict.NO_COMMAND, NO_AXIS
         if self._a.raw("Mode") not in (_NEUTRAL, _SPOOL):
             return Verdict.RANGE, NO_AXIS
@@ -346,53 +199,78 @@ class Guard:
             return Verdict.RANGE, AUX_AXIS
         if not self._grapple_field.inside(self._b.raw("Grapple")):
             return Verdict.RANGE, GRAPPLE_AXIS
-        if self._neutral():
-            return Verdict.GOOD, NO_AXIS
+        if self._estop.raw("Person") != _YES:
+            self._clear_ns = now_ns
+        if carrier is not FINE:
+            return carrier
+        if self._carrier is not None and self._carrier.driven and now_ns - self._clear_ns > PERSON_CARRIER_NS:
+            return Verdict.PERSON, mach0.DRIVE_AXIS
+        if neutral or (not self._status.old(now_ns) and self._status.raw("Mode") in _OPERATING):
+            self._agreed_ns = now_ns
+        return FINE if neutral else self._check_commanded(now_ns)
+
+    def _check_motion(self, heard: bool, now_ns: int, elapsed_s: float) -> Finding:
+        """Motion that nobody commands; the valve node obeys only what is heard, and in its mode."""
+        words = {message: None if message.old(now_ns) else message.word for message in self._feedback}
+        follows = heard and self._a.raw("Mode") == _SPOOL
+        first = FINE
+        for feedback, watch in self._motion:
+            if watch.number == GRAPPLE_AXIS:
+                command = _GRAPPLE_SIDE[self._b.raw("GrappleMode")] if heard else 0.0
+            else:
+                command = self._commands[watch.number].percent if follows else 0.0
+            found = watch.check(command, words[feedback], now_ns, elapsed_s)
+            first = found if first is FINE else first
+        return first
+
+    def _check_commanded(self, now_ns: int) -> Finding:
+        """Rules on a crane that is commanded to move."""
         if self._b.raw("ArmKey") != ARM_KEY:
             return Verdict.NOT_ARMED, NO_AXIS
-        return self._check_joints(now_ns)
-
-    def _check_joints(self, now_ns: int) -> tuple[Verdict, int]:
+        if now_ns - self._clear_ns > PERSON_NS:
+            return Verdict.PERSON, NO_AXIS
+        if now_ns - self._agreed_ns > AGREE_NS:
+            return Verdict.DISAGREE, NO_AXIS
         for joint in self._joints.values():
             number = joint.axis.number
-            if now_ns - joint.stamp_ns > ENCODER_TIMEOUT_NS:
+            if joint.silent(now_ns):
                 return Verdict.ENCODER, number
             outward = self._commands[number].percent * joint.axis.sign
             above = joint.position > joint.axis.upper + RANGE_MARGIN_UNITS and outward > 0.0
             below = joint.position < joint.axis.lower - RANGE_MARGIN_UNITS and outward < 0.0
             if above or below:
                 return Verdict.OUTSIDE, number
-        return Verdict.GOOD, NO_AXIS
+        at = [joint.position for joint in self._joints.values() if joint.axis.number < 4]
+        deeper = len(at) == 4 and self._reach.deeper(at, [command.speed for command in self._commands[:4]])
+        return (Verdict.REACH, NO_AXIS) if deeper else FINE
 
     def _neutral(self) -> bool:
         if self._b.raw("GrappleMode") in (_GRAPPLE_OPENS, _GRAPPLE_CLOSES):  # these move at full flow by themselves
             return False
         return self._b.raw("Grapple") == 0 and all(command.percent == 0.0 for command in self._commands)
 
-    def _settle(self, verdict: Verdict, axis: int, pressed: bool, now_ns: int) -> None:
-        """A broken rule counts at once; the return needs a while of neutral commands, and a person if it latches."""
+    def _crane_moves(self) -> bool:
+        return any(abs(command.opening) > HELD_PCT for command in self._commands)
+
+    def _settle(self, verdict: Verdict, axis: int, pressed: bool, now_ns: int) -> bool:
+        """A broken rule counts at once; the return needs a while of neutral commands, and a person if it latches.
+
+        Returns whether there is something new to tell.
+        """
         if verdict is not Verdict.GOOD:
             self._calm_ns = now_ns + CALM_NS
             self._latched = self._latched or verdict in LATCHING
         elif self.verdict is not Verdict.GOOD:
-            neutral = self._neutral()
+            neutral = self._neutral() and not (self._carrier and (self._carrier.driven or self._carrier.raised))
             if not neutral:
                 self._calm_ns = now_ns + CALM_NS
             if self._latched:
                 self._latched = not (pressed and neutral)
             if self._latched or now_ns < self._calm_ns:
                 verdict = Verdict.LATCHED if self._latched else Verdict.CALMING
+        supply = not self._latched and now_ns - self._heard_ns <= SILENCE_NS
+        changed = verdict is not self.verdict or supply != self._supply
         if verdict is not self.verdict:
             self.events = (self.events + 1) & 0xFF
-            self._changed = True
-        self.verdict, self.axis = verdict, axis
-
-    def _status(self) -> bytes:
-        fields = self._layout.fields
-        counter, self._counter = self._counter, (self._counter + 1) & 0xF
-        word = fields["Counter"].put(counter) | fields["Verdict"].put(self.verdict)
-        word |= fields["Enable"].put(ENABLE if self.enabled else 0)
-        word |= fields["FaultAxis"].put(self.axis) | fields["SeenCounter"].put(max(self._a.counter, 0))
-        word |= fields["EventCount"].put(self.events)
-        data = word.to_bytes(self._layout.length, "little")
-        return bytes((checksum(data, self._layout.data_ids[counter]),)) + data[1:]
+        self.verdict, self.axis, self._supply = verdict, axis, supply
+        return changed

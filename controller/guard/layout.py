@@ -1,16 +1,13 @@
-"""The guard's own parser of ``crane.dbc``, by regular expression: it shares no fault with the codecs.
+"""The guard's own parser of ``crane.dbc`` and ``machine.dbc``, by regular expression, with no fault of the codecs.
 
-It reads only what the guard needs: identifier, length, Data IDs, time-out and the bits of little-endian signals.
-Anything missing or of another form stops the start with `GuardConfigError`.
+It reads only what the guard needs: identifier (a key as in `can_dbc.frame`), length, Data IDs, time-out and the bits
+of little-endian signals.  Anything missing or of another form stops the start with `GuardConfigError`.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Final
-
-_EXTENDED: Final = 1 << 31
 
 
 class GuardConfigError(Exception):
@@ -69,8 +66,6 @@ def _layout(text: str, name: str, path: Path) -> Layout:
     if head is None:
         raise GuardConfigError("guard.message-missing", f"{path}: message {name} is missing; use the shipped DBC.")
     number = int(head[1])
-    if number >= _EXTENDED:
-        raise GuardConfigError("guard.extended-identifier", f"{path}: {name} needs an 11-bit identifier.")
     fields = {}
     for line in head[3].splitlines():
         match = re.match(r" SG_ (\w+) : (\d+)\|(\d+)@1([+-]) \(([^,]+),([^)]+)\) \[([^|]+)\|([^\]]+)\]", line)

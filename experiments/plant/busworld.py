@@ -29,11 +29,11 @@ class BusWorld:
     def __init__(self, plant: Plant) -> None:
         self.plant, self._world = plant, plant.world
         crane, machine = load("crane"), load("machine")
-        self._valve_a, self._valve_b, self._guard = (
-            ProtectedMessage(crane, name) for name in ("ValveCmdA", "ValveCmdB", "GuardStat")
+        self._valve_a, self._valve_b, self._guard, self._pilot = (
+            ProtectedMessage(crane, name) for name in ("ValveCmdA", "ValveCmdB", "GuardStat", "GuardPilot")
         )
-        self._vehicle, self._arms_a, self._arms_b = (
-            ProtectedMessage(machine, name) for name in ("VehCmd", "ArmCmdA", "ArmCmdB")
+        self._vehicle, self._arms_a, self._arms_b, self._alive = (
+            ProtectedMessage(machine, name) for name in ("VehCmd", "ArmCmdA", "ArmCmdB", "GuardAlive")
         )
         self.now_ns, self._steps, self._sync = 1_000_000_000, 0, 1
         self.sent = self.received = 0
@@ -60,6 +60,7 @@ class BusWorld:
         self._sync = self._sync % 240 + 1
         return [
             self._guard.frame(ARM_KEY, 0, 0, 0, 0),
+            self._pilot.frame(ARM_KEY, 0, 0),
             self._valve_a.frame(MODE_SPOOL, pct["slew"], pct["lift"], pct["tilt"], pct["ext"]),
             self._valve_b.frame(ARM_KEY, pct["rot"], abs(grapple), 0.0, grapple_mode, 0, 100.0),
             sync_frame(self._sync),
@@ -70,6 +71,7 @@ class BusWorld:
         brake = 100.0 if drive.brake else 0.0
         arms = (pct[name] for name in ("arm_fl", "arm_fr", "arm_rl", "arm_rr"))
         return [
+            self._alive.frame(ARM_KEY, 0, 0, 0),
             self._vehicle.frame(ARM_KEY, articulation_rad_s, drive.speed_m_s, brake),
             self._arms_a.frame(ARM_KEY, *arms),
             self._arms_b.frame(ARM_KEY, 0, 0),

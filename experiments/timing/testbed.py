@@ -138,7 +138,6 @@ class TimingTestbed:
         vcan = s.bus == "vcan"
         addresses = {n: f"socketcan:{VCAN_NAMES[n]}" if vcan else f"wire:{n}" for n in names}
         buses = [x for n, address in addresses.items() for x in ("--bus", f"{n}={address}")]
-        crane = ("--bus", f"{profile.crane_bus}={addresses[profile.crane_bus]}")
         control, reports = free_udp_ports(2)
         ticks, operators = (self._private / f"controller.{kind}" for kind in ("ticks", "operator"))
         if not vcan:
@@ -159,7 +158,7 @@ class TimingTestbed:
         self._start(
             "observer", "experiments.timing.bus_observer", "--profile", s.profile, "--rate", s.rate_hz, "--ticks", ticks
         )
-        guard = self.family.start("guard", "controller.guard", "--profile", s.profile, *crane, "--rate", s.rate_hz)
+        guard = self.family.start("guard", "controller.guard", "--profile", s.profile, *buses, "--rate", s.rate_hz)
         self._elsewhere(guard.process.pid)
         self.family.start(
             "controller", "controller", "--profile", s.profile, *buses, "--setpoint-port", control,

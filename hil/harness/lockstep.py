@@ -18,6 +18,7 @@ from can_dbc.messages import datagrams
 from can_dbc.messages.crane import StateReport
 from can_dbc.messages.vehicle import VehicleReport
 from controller.config import Settings
+from controller.guard.__main__ import split
 from controller.guard.guard import Guard
 from controller.process.bus_link import BusLink
 from controller.process.tick_recording import record
@@ -103,7 +104,8 @@ class Lockstep:
         self._plant_buses = {core.name: InProcessBus(core, "plant", tx_queue=64) for core in self._cores}
         self._crane, *more = (BusLink(InProcessBus(core, "controller")) for core in self._cores)
         self._machine = more[0] if self._controller.carrier_bus and more else None
-        self._guard_bus = InProcessBus(self.core, "guard")
+        keys = guard.keys_of_buses
+        self._guard_buses = [InProcessBus(c, "guard", filters=k) for c, k in zip(self._cores, keys, strict=False)]
         self._listeners = [InProcessBus(core, "recorder") for core in self._cores]
         self._next_tick_ns = START_NS
         self._sync: RawFrame | None = None
@@ -125,8 +127,9 @@ class Lockstep:
             self._tick()
 
     def _tick(self) -> None:
-        for key, data in self._guard.step(self.now_ns, _drained(self._guard_bus)):
-            self._guard_bus.send(key, data)
+        heard = [frame for bus in self._guard_buses for frame in _drained(bus)]
+        for bus, frames in zip(self._guard_buses, split(self._guard.step(self.now_ns, heard)), strict=False):
+            bus.send_all(frames)
         inputs, machine = self._inputs, self._machine
         self._crane.receive(inputs.frames, inputs.bus)
         if machine is not None:

@@ -48,7 +48,7 @@ class ProfileError(CodedError, ValueError):
 
 def shipped_profiles() -> tuple[str, ...]:
     """Names of the profiles that come with the package."""
-    return tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
+    return tuple(sorted(path.stem for path in _FOLDER.glob("*.toml") if "." not in path.stem))  # no envelopes
 
 
 def load_profile(name_or_path: str | Path) -> Profile:

@@ -1,9 +1,9 @@
 """The swing-arm controller (source address 30h): spool commands of the four arms and the two float valves.
 
-The spools follow ArmCmdA and the float valves ArmCmdB while both (E2E valid, ArmKey 0xA) are at most 100 ms old and
-the emergency stop is released.  Otherwise the arms hold: spools neutral, float valves closed.  A loss while active,
-and a command that opens both float valves (which would let the machine roll), are a fault until fresh frames disarm.
-The node reports the heights on which the controller closes its loop.
+The spools follow ArmCmdA and the float valves ArmCmdB while both (E2E valid, ArmKey 0xA) and GuardAlive (Enable 0xA)
+are at most 100 ms old and the emergency stop is released.  Otherwise the arms hold: spools neutral, float valves
+closed.  A loss while active, and a command that opens both float valves (which would let the machine roll), are a
+fault until fresh frames disarm.  The node reports the heights on which the controller closes its loop.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sim.nodes.messages import ARM_KEY, MS, PeriodicTimer, ProtectedInput, Prote
 
 ADDRESS = 0x30
 SUSPENSION_FUNCTION = 21  # J1939 NAME function of a suspension system controller
-COMMAND_NS = 100 * MS
+COMMAND_NS = GUARD_NS = 100 * MS
 CYCLE_NS = 20 * MS
 ARM_COUNT = 4
 
@@ -41,7 +41,8 @@ class ArmNode(J1939Node):
         super().__init__(ADDRESS, SUSPENSION_FUNCTION, machine, outbox)
         self._pilot_on = pilot_on
         self._a, self._b = ProtectedInput(machine, "ArmCmdA"), ProtectedInput(machine, "ArmCmdB")
-        self._inputs = {i.key: i for i in (self._a, self._b)}
+        self._guard = ProtectedInput(machine, "GuardAlive")
+        self._inputs = {i.key: i for i in (self._a, self._b, self._guard)}
         self._height_a, self._height_b = (
             ProtectedMessage(machine, "ArmHeightA"),
             ProtectedMessage(machine, "ArmHeightB"),
@@ -60,15 +61,15 @@ class ArmNode(J1939Node):
         source = self._inputs.get(key)
         if source is None:
             super().receive(key, data, now_ns)
-        elif source.accept(data, now_ns) and source.get("ArmKey") != ARM_KEY:
+        elif source.accept(data, now_ns) and source is not self._guard and source.get("ArmKey") != ARM_KEY:
             self.state = ArmState.HOLD
 
     def decide(self, now_ns: int) -> None:
         """Set the outputs for this physics step."""
         a, b = self._a, self._b
-        ready = (
-            a.fresh(now_ns, COMMAND_NS) and b.fresh(now_ns, COMMAND_NS) and self._pilot_on() and not self.address_lost
-        )
+        guarded = self._guard.fresh(now_ns, GUARD_NS) and self._guard.get("Enable") == ARM_KEY
+        commanded = a.fresh(now_ns, COMMAND_NS) and b.fresh(now_ns, COMMAND_NS)
+        ready = commanded and guarded and self._pilot_on() and not self.address_lost
         armed = a.get("ArmKey") == b.get("ArmKey") == ARM_KEY
         front, rear = b.get("FloatFront") == 1, b.get("FloatRear") == 1
         if (self.state is ArmState.ACTIVE and not ready) or (ready and armed and front and rear):

@@ -15,9 +15,10 @@ from can_dbc.protocols.canopen_slave import HEARTBEAT_MS, CanopenSlave
 from machine.crane_nodes import CraneNode
 from sim.hydraulics.layout import PA_PER_BAR
 from sim.nodes import Outbox
-from sim.nodes.messages import MS, PeriodicTimer, ProtectedMessage
+from sim.nodes.messages import ARM_KEY, MS, PeriodicTimer, ProtectedInput, ProtectedMessage
 
 HEARTBEAT_NS = HEARTBEAT_MS * MS
+GUARD_NS = 50 * MS
 
 
 class Device(CanopenSlave):
@@ -57,9 +58,10 @@ class Device(CanopenSlave):
 
 
 class EstopBox(Device):
-    """Safety module: two channels, reset button, hard-wired pilot supply.
+    """Safety module: two channels, reset button, and the pilot supply: hard-wired relay and guard in series.
 
-    ``press``, ``release`` and ``reset`` are its buttons.
+    ``press``, ``release`` and ``reset`` are its buttons.  `receive` takes GuardPilot; a machine whose guard does not
+    switch the supply (behind a PLC) never calls `decide`.
     """
 
     RESET_PULSE_NS = 200 * MS
@@ -73,12 +75,27 @@ class EstopBox(Device):
         self._source = self._events = 0
         self._reset_until_ns: int | None = None
         self._wants_reset = self._changed = False
-        self.pilot_on = True
+        self.relay_on = self.guard_on = True
+        self._guard = ProtectedInput(database, "GuardPilot")
 
     @property
     def channels(self) -> tuple[int, int]:
         """The two contacts: 1 closed (released), 0 open (pressed)."""
         return self._channels
+
+    @property
+    def pilot_on(self) -> bool:
+        """Whether the pilot supply valve is open."""
+        return self.relay_on and self.guard_on
+
+    def receive(self, key: int, data: bytes, now_ns: int) -> None:
+        """A frame of the guard; others are ignored."""
+        if key == self._guard.key:
+            self._guard.accept(data, now_ns)
+
+    def decide(self, now_ns: int) -> None:
+        """Switch the pilot supply for this physics step."""
+        self.guard_on = self._guard.fresh(now_ns, GUARD_NS) and self._guard.get("Supply") == ARM_KEY
 
     @property
     def reset_pressed(self) -> bool:
@@ -87,7 +104,7 @@ class EstopBox(Device):
 
     def press(self) -> None:
         """Both contacts open; the pilot supply drops at once and stays off until ``reset``."""
-        self._channels, self._source, self.pilot_on = (0, 0), 1, False
+        self._channels, self._source, self.relay_on = (0, 0), 1, False
         self._event()
 
     def release(self) -> None:
@@ -99,7 +116,7 @@ class EstopBox(Device):
         """Press the reset button: with the stop released the pilot supply returns."""
         self._wants_reset = True
         if self._channels == (1, 1):
-            self._source, self.pilot_on = 0, True
+            self._source, self.relay_on = 0, True
         self._event()
 
     def _event(self) -> None:

@@ -1,8 +1,9 @@
 """The vehicle controller (source address 03h): receives VehCmd, drives, steers and brakes; without it the brake is on.
 
-It follows only while VehCmd (E2E valid, ArmKey 0xA, every value available) is at most 100 ms old and the emergency
-stop is released.  Otherwise the brake is on and the steering spool neutral, at once; a loss while driving remains a
-fault until a fresh frame disarms.  The node's own dead-band map turns the articulation rate into a spool command.
+It follows only while VehCmd (E2E valid, ArmKey 0xA, every value available) and GuardAlive (Enable 0xA) are at most
+100 ms old and the emergency stop is released.  Otherwise the brake is on and the steering spool neutral, at once; a
+loss while driving remains a fault until a fresh frame disarms.  The node's own dead-band map turns the articulation
+rate into a spool command.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from sim.nodes.messages import ARM_KEY, MS, PeriodicTimer, ProtectedInput, Prote
 
 ADDRESS = 0x03
 DRIVE_FUNCTION = 23  # J1939 NAME function of a propulsion controller
-COMMAND_NS = 100 * MS
+COMMAND_NS = GUARD_NS = 100 * MS
 CYCLE_NS = 20 * MS
 STANDSTILL_M_S = 0.02
 MIN_RATE_RAD_S = 5e-4
@@ -30,6 +31,7 @@ class VehicleFault(IntEnum):
     NONE = 0
     COMMAND_TIMEOUT = 1
     SAFETY_STOP = 2
+    GUARD_MISSING = 3
 
 
 class Gear(IntEnum):
@@ -60,6 +62,7 @@ class VehicleNode(J1939Node):
         super().__init__(ADDRESS, DRIVE_FUNCTION, machine, outbox)
         self._carrier, self._pilot_on = carrier, pilot_on
         self._command = ProtectedInput(machine, "VehCmd")
+        self._guard = ProtectedInput(machine, "GuardAlive")
         self._stat = ProtectedMessage(machine, "VehStat")
         self._period = PeriodicTimer(CYCLE_NS)
         self.speed_m_s = self.articulation_rad = 0.0
@@ -71,7 +74,9 @@ class VehicleNode(J1939Node):
         self.drive_m_s, self.brake, self.steer = 0.0, True, 0.0
 
     def receive(self, key: int, data: bytes, now_ns: int) -> None:
-        if key != self._command.key:
+        if key == self._guard.key:
+            self._guard.accept(data, now_ns)
+        elif key != self._command.key:
             super().receive(key, data, now_ns)
         elif self._command.accept(data, now_ns) and self._command.get("ArmKey") != ARM_KEY:
             self.fault = VehicleFault.NONE
@@ -80,15 +85,19 @@ class VehicleNode(J1939Node):
         """Set the outputs for this physics step."""
         command = self._command
         fresh = command.fresh(now_ns, COMMAND_NS)
+        guarded = self._guard.fresh(now_ns, GUARD_NS) and self._guard.get("Enable") == ARM_KEY
         if not self._pilot_on():
             self.fault = VehicleFault.SAFETY_STOP
         elif self.active and not fresh:
             self.fault = VehicleFault.COMMAND_TIMEOUT
+        elif self.active and not guarded:
+            self.fault = VehicleFault.GUARD_MISSING
         values = command.values
         self.active = (
             not self.fault
             and not self.address_lost
             and fresh
+            and guarded
             and values is not None
             and None not in values
             and command.get("ArmKey") == ARM_KEY

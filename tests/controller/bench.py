@@ -30,6 +30,7 @@ from can_dbc.protocols.canopen import (
 from can_dbc.protocols.e2e import Sender
 from can_dbc.protocols.nmea2000 import frames as packet
 from controller.config import load as load_settings
+from controller.guard.__main__ import split
 from controller.laws.valve_map import ValveMap
 from controller.step import Controller, step
 from controller.tick import Inputs, Outputs
@@ -188,9 +189,11 @@ class Bench:
         self._apply_crane_frames(outputs)
         self._apply_carrier_frames(outputs)
         if self.guard is not None:
-            frames = [frame for frame in self.inputs.frames if frame.key not in (0x1FD, 0x77D)]
+            frames = [frame for frame in self.inputs.frames if frame.key not in (0x1FD, 0x2FD, 0x77D)]
             frames += [Frame(self.now_ns, key, data) for key, data in outputs.frames]
-            self.pending += self.guard.step(self.now_ns, frames)
+            frames += self.inputs.machine_frames
+            frames += [Frame(self.now_ns, key, data) for key, data in outputs.machine_frames]
+            self.pending += split(self.guard.step(self.now_ns, frames))[0]
         if outputs.report is not None:
             report = decode(outputs.report, self.settings.key)
             assert isinstance(report, StateReport)

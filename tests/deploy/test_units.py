@@ -174,7 +174,7 @@ def test_the_plc_bridge_is_off_unless_configured() -> None:
 
 
 def test_the_machine_bus_is_one_setting() -> None:
-    for name in ("controller", "recorder"):
+    for name in ("controller", "guard", "recorder"):
         unit = DEPLOY / f"units/timberhand-{name}.service"
         assert [word for word in words(unit) if "mach0" in word] == []
         given = words(unit, MACHINE_BUS="socketcan:mach0")

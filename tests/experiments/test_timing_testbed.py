@@ -19,7 +19,7 @@ from can_dbc.messages.tick_record import BusReading
 from can_dbc.timing.page import Facts, ProcessCounters
 from controller.bus_io.bus_monitor import BusMonitor
 from controller.config import load as settings_of
-from controller.guard.__main__ import build, profile_path
+from controller.guard.__main__ import build, profile_path, split
 from controller.process.tick_recording import record
 from controller.step import Controller, step
 from controller.tick import Inputs
@@ -67,11 +67,11 @@ class Virtual:
         inputs = self.inputs
         inputs.frames[:] = [Frame(self.now_ns, key, data) for bus, key, data in sent if bus == crane]
         inputs.machine_frames[:] = [Frame(self.now_ns, key, data) for bus, key, data in sent if bus == machine]
-        self.for_guard += inputs.frames
-        self.received, guarded = [], []
+        self.for_guard += inputs.frames + inputs.machine_frames
+        self.received, guarded, alive = [], [], []
         if self.now_ns >= self.guard_ns:
             self.guard_ns = self.now_ns + 5_000_000
-            guarded = self.guard.step(self.now_ns, self.for_guard)
+            guarded, alive = split(self.guard.step(self.now_ns, self.for_guard))
             self.for_guard = []
         inputs.frames += [Frame(self.now_ns, key, data) for key, data in guarded]
         inputs.operator[:], self.pressed = self.pressed, []
@@ -79,8 +79,8 @@ class Virtual:
         outputs = step(self.controller, inputs, self.now_ns)
         self.observer.add(record(inputs, outputs, self.now_ns))
         self.received = [(crane, Frame(self.now_ns, *wire)) for wire in (*outputs.frames, outputs.sync, *guarded)]
-        self.received += [(machine or "", Frame(self.now_ns, *wire)) for wire in outputs.machine_frames]
-        self.for_guard += [Frame(self.now_ns, *wire) for wire in outputs.frames]
+        self.received += [(machine or "", Frame(self.now_ns, *wire)) for wire in (*outputs.machine_frames, *alive)]
+        self.for_guard += [Frame(self.now_ns, *wire) for wire in (*outputs.frames, *outputs.machine_frames)]
         if outputs.report is not None:
             report = decode(outputs.report)
             assert isinstance(report, StateReport)

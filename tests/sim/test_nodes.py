@@ -38,7 +38,8 @@ class Bench:
     def __init__(self, seed: int = 0) -> None:
         self.plant = Plant(PROFILE, seed)
         self.now_ns = START_NS
-        self._senders = {n: Sender(CRANE.message(n).data_ids) for n in ("ValveCmdA", "ValveCmdB", "GuardStat")}
+        names = ("ValveCmdA", "ValveCmdB", "GuardStat", "GuardPilot")
+        self._senders = {n: Sender(CRANE.message(n).data_ids) for n in names}
         self.sent: list[tuple[int, bytes]] = []
         self.exchange([])
 
@@ -53,10 +54,13 @@ class Bench:
         codec = CRANE.message(name)
         return codec.key, self._senders[name].protect(codec.encode(0, 0, *values))
 
-    def cycle(self, n: int = 1, spools=(0.0,) * 4, arm=0xA, guard=0xA, grapple=(0.0, 0), commands=True, sync=True):
+    def cycle(
+        self, n: int = 1, spools=(0.0,) * 4, arm=0xA, guard=0xA, grapple=(0.0, 0), commands=True, sync=True, pilot=0xA
+    ):
         out = []
         for _ in range(n):
             frames = [self.message("GuardStat", guard, 0, 15, 0, 0)] if guard is not None else []
+            frames += [self.message("GuardPilot", pilot, 0, 0)] if pilot is not None else []
             if commands:
                 frames.append(self.message("ValveCmdA", 2, *spools))
                 frames.append(self.message("ValveCmdB", arm, 0.0, grapple[0], 0.0, grapple[1], 1, 100.0))
@@ -236,6 +240,23 @@ def test_the_valve_goes_neutral_without_commands_and_needs_a_new_arming(bench, l
     assert bench.last("ValveFbA")["State"] == ValveState.NEUTRAL
     bench.cycle(20, **moving)
     assert bench.last("ValveFbA")["State"] == ValveState.ACTIVE
+
+
+@pytest.mark.parametrize("pilot", [None, 0, 0xB])
+def test_the_guard_switches_the_pilot_supply(bench, pilot):
+    """By its own frame: without it, or when it says anything but on, the valves have no pilot pressure."""
+    moving = {"spools": (60.0, 0.0, 0.0, 0.0)}
+    bench.cycle(60, **moving)
+    assert bench.last("EstopStat")["PilotSupply"] == 1
+    bench.cycle(11 if pilot is None else 1, pilot=pilot, **moving)
+    assert not bench.plant.estop.pilot_on and bench.plant.valve.outputs_pct == [0.0] * 6
+    bench.cycle(2, pilot=pilot, **moving)
+    stat = bench.last("EstopStat")
+    assert (stat["ChannelA"], stat["PilotSupply"], stat["PilotPress"]) == (1, 0, 0.0)
+    assert bench.last("ValveFbA")["State"] == ValveState.PILOT_OFF
+    bench.cycle(2, arm=0)
+    bench.cycle(10, **moving)
+    assert bench.last("ValveFbA")["State"] == ValveState.ACTIVE, "it comes back with the frame"
 
 
 def test_the_ramp_to_neutral_takes_sixty_milliseconds(bench):

@@ -55,16 +55,25 @@ class Bench:
         return bus, codec.key, self._senders[name].protect(codec.encode(0, 0, *values))
 
     def cycle(
-        self, n=1, drive=(0.0, 0.0, 0.0), arms=(0.0,) * 4, floats=(0, 0), crane=(0.0,) * 4, grapple=None, key=0xA
+        self,
+        n=1,
+        drive=(0.0, 0.0, 0.0),
+        arms=(0.0,) * 4,
+        floats=(0, 0),
+        crane=(0.0,) * 4,
+        grapple=None,
+        key=0xA,
+        guard=0xA,
     ):
         for _ in range(n):
-            frames = []
+            frames = [self.message("GuardAlive", guard, 0, 15, 0)] if guard is not None else []
             if drive is not None:
                 frames.append(self.message("VehCmd", key, *drive))
             if arms is not None:
                 frames += [self.message("ArmCmdA", key, *arms), self.message("ArmCmdB", key, *floats)]
             for _ in range(4):
                 frames.append(self.message("GuardStat", 0xA, 0, 15, 0, 0))
+                frames.append(self.message("GuardPilot", 0xA, 0, 0))
                 frames.append(self.message("ValveCmdA", 2, *crane))
                 flow, mode = grapple or (0.0, 0)
                 frames.append(self.message("ValveCmdB", key, 0.0, flow, 0.0, mode, 1, 100.0))
@@ -159,6 +168,23 @@ def test_the_emergency_stop_stops_crane_carrier_and_arms(bench):
     bench.plant.estop.reset()
     bench.cycle(10, **moving)
     assert node.brake
+    bench.cycle(2, key=0)
+    bench.cycle(30, **moving)
+    assert bench.plant.vehicle().speed_m_s > 0.1
+
+
+@pytest.mark.parametrize("guard", [None, 0, 0xB])
+def test_carrier_and_arms_stop_without_the_guard_and_need_a_new_arming(bench, guard):
+    moving = {"drive": (0.1, 0.5, 0.0), "arms": (20.0,) * 4}
+    bench.cycle(75, **moving)
+    node, arms = bench.plant.vehicle_node, bench.plant.arms
+    assert not node.brake and arms.spools[0] > 0.0
+    bench.cycle(6 if guard is None else 1, guard=guard, **moving)
+    assert node.brake and node.steer == 0.0 and arms.spools == [0.0] * 4
+    bench.cycle(2, guard=guard, **moving)
+    assert bench.last("VehStat")["Fault"] == 3 and bench.last("ArmHeightA")["State"] == 3
+    bench.cycle(10, **moving)
+    assert node.brake, "the fault remains until a frame disarms"
     bench.cycle(2, key=0)
     bench.cycle(30, **moving)
     assert bench.plant.vehicle().speed_m_s > 0.1

@@ -235,7 +235,8 @@ def test_a_controller_that_wakes_late_skips_ticks_and_restarts_disarmed(run: Rec
 def test_without_the_guard_valves_and_controller_are_neutral_within_60_ms(run: Recording) -> None:
     killed_ns = run.page["guard_killed"]
     silent_ns = run.last("GuardStat", killed_ns)
-    assert run.first("ValveFbA", killed_ns, lambda a: a["State"] == ValveState.RAMP) - silent_ns > GUARD_NS
+    closes = (ValveState.RAMP, ValveState.PILOT_OFF)  # enable and pilot supply are lost together
+    assert run.first("ValveFbA", killed_ns, lambda a: a["State"] in closes) - silent_ns > GUARD_NS
     assert run.first("ValveCmdA", killed_ns, neutral) - silent_ns <= GUARD_NS + PERIOD_NS + CODE_NS
     assert run.reason(Mode.FAULT, killed_ns) is Reason.GUARD_LOST
 

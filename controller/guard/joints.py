@@ -1,0 +1,96 @@
+"""The crane's functions as the guard sees them: what is commanded, and where the joint is."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from can_dbc.frame import Frame
+from controller.guard.envelope import Axis
+from controller.guard.layout import Field, Layout
+from controller.guard.verdicts import Verdict
+
+ENCODER_TIMEOUT_NS: Final = 90_000_000
+"""The controller stops on a lost encoder within 100 ms; the guard enforces it."""
+RATE_CREDIT_S: Final = 0.04
+RATE_SLACK_PCT: Final = 3.0
+
+
+class RateCredit:
+    """Limits how fast the size of a command grows [%, %/s]; closing costs nothing."""
+
+    __slots__ = ("_credit", "_last", "_most", "_rate")
+
+    def __init__(self, rate_pct_s: float) -> None:
+        self._rate = rate_pct_s
+        self._most = self._credit = rate_pct_s * RATE_CREDIT_S + RATE_SLACK_PCT
+        self._last = 0.0
+
+    def spent(self, percent: float, elapsed_s: float) -> bool:
+        """Whether a command that came ``elapsed_s`` after the last one has grown faster than allowed."""
+        size, last = abs(percent), self._last
+        growth = size if percent * last <= 0.0 else max(0.0, size - abs(last))
+        self._last = percent
+        credit = min(self._most, self._credit + self._rate * elapsed_s) - growth
+        self._credit = max(0.0, credit)
+        return credit < 0.0
+
+
+class CommandedAxis:
+    """One commanded axis: ``percent`` of the spool, and ``opening``, the part of it past the dead-band."""
+
+    __slots__ = ("_credit", "_deadband", "_field", "axis", "opening", "percent")
+
+    def __init__(self, axis: Axis, field: Field) -> None:
+        self.axis = axis
+        self._field = field
+        self._deadband = axis.deadband_pct
+        self._credit = RateCredit(axis.rate_pct_s)
+        self.percent = self.opening = 0.0
+
+    def receive(self, word: int, elapsed_s: float) -> Verdict:
+        """Check the value in a new command frame that came ``elapsed_s`` after the last one."""
+        raw = self._field.raw(word)
+        if not self._field.inside(raw):
+            return Verdict.RANGE
+        self.percent = raw * self._field.scale
+        size = max(0.0, abs(self.percent) - self._deadband) * 100.0 / (100.0 - self._deadband)
+        self.opening = size if self.percent > 0.0 else -size
+        return Verdict.RATE if self._credit.spent(self.opening, elapsed_s) else Verdict.GOOD
+
+    @property
+    def speed(self) -> float:
+        """The speed that the command asks of the joint [rad/s, m/s]."""
+        return self.opening * 0.01 * self.axis.full_speed * self.axis.sign
+
+
+class MeasuredJoint:
+    """The measured position of one joint."""
+
+    __slots__ = ("_alive", "_at", "axis", "layout", "position", "stamp_ns")
+
+    def __init__(self, axis: Axis, layout: Layout) -> None:
+        self.axis, self.layout = axis, layout
+        self.position = 0.0
+        self.stamp_ns = -ENCODER_TIMEOUT_NS
+        self._at = layout.fields.get("TimeStamp")
+        self._alive = -1
+
+    def receive(self, frame: Frame, now_ns: int) -> None:
+        """Use an encoder frame; one of a rotary encoder counts only when its time stamp has changed."""
+        if len(frame.data) != self.layout.length:
+            return
+        word = int.from_bytes(frame.data, "little")
+        if self._at is not None:
+            before, self._alive = self._alive, self._at.raw(word)
+            if before == self._alive:
+                return
+        axis = self.axis
+        offset = self.layout.fields["Position"].raw(word) - axis.zero_counts
+        if axis.total_counts:
+            offset = (offset + axis.total_counts // 2) % axis.total_counts - axis.total_counts // 2
+        self.position = offset * axis.unit
+        self.stamp_ns = min(frame.stamp_ns, now_ns)
+
+    def silent(self, now_ns: int) -> bool:
+        """Whether its encoder has been silent for too long to move the joint."""
+        return now_ns - self.stamp_ns > ENCODER_TIMEOUT_NS

@@ -1,0 +1,61 @@
+"""Motion that nobody commands: a spool that is open, or a joint that moves, in every mode and at every speed.
+
+A spool counts as open beyond its dead-band, where oil begins to flow, on a side that was not commanded for
+`SPOOL_NS`.  A joint whose command has been neutral for `REST_NS` may not leave its place by more than
+`MOVED_UNITS`: about 40 times an encoder's noise (3.5e-4 to 5e-4 rad), and more than the oil's springiness under a
+swinging load.  The place follows the joint by `CREEP_SHARE` of its speed limit, since cylinders leak.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from controller.guard.joints import MeasuredJoint
+from controller.guard.layout import Field
+from controller.guard.verdicts import FINE, Finding, Verdict
+
+SPOOL_NS: Final = 250_000_000
+"""A spool closes within this time of its command: 120 ms of dead time at most, and from full opening into the
+dead-band two lags of 40 ms."""
+REST_NS: Final = 500_000_000
+MOVED_UNITS: Final = 0.02
+"""[rad, m]"""
+CREEP_SHARE: Final = 0.05
+MOVED_STEPS: Final = 3
+"""Steps of the guard in a row for which a joint must be away: one sample that jumps is an encoder's fault."""
+
+
+class MotionWatch:
+    """One function: its spool's feedback ``field``, and its joint if an encoder measures it."""
+
+    __slots__ = ("_away", "_creep_s", "_deadband", "_field", "_joint", "_opened_ns", "_place", "number")
+
+    def __init__(self, number: int, field: Field, deadband_pct: float, joint: MeasuredJoint | None = None) -> None:
+        self.number = number
+        self._field, self._deadband, self._joint = field, deadband_pct, joint
+        self._creep_s = CREEP_SHARE * joint.axis.speed_limit if joint is not None else 0.0
+        self._opened_ns = [0, 0]  # when it was last commanded to the minus and to the plus side
+        self._place: float | None = None  # not known yet
+        self._away = 0
+
+    def check(self, command: float, feedback_word: int | None, now_ns: int, elapsed_s: float) -> Finding:
+        """One step; ``command`` is what the valve node may follow now, ``feedback_word`` None when it is not known."""
+        opened_ns = self._opened_ns
+        if command != 0.0:
+            opened_ns[command > 0.0] = now_ns
+        if feedback_word is not None:
+            raw = self._field.raw(feedback_word)
+            spool_pct = raw * self._field.scale
+            uncommanded = now_ns - opened_ns[spool_pct > 0.0] > SPOOL_NS
+            if uncommanded and abs(spool_pct) > self._deadband and self._field.inside(raw):
+                return Verdict.SPOOL, self.number
+        joint = self._joint
+        if joint is None:
+            return FINE
+        if self._place is None or now_ns - max(opened_ns) <= REST_NS or joint.silent(now_ns):
+            self._place, self._away = None if joint.silent(now_ns) else joint.position, 0
+            return FINE
+        creep = self._creep_s * elapsed_s
+        self._place += min(max(joint.position - self._place, -creep), creep)
+        self._away = self._away + 1 if abs(joint.position - self._place) > MOVED_UNITS else 0
+        return (Verdict.MOVING, self.number) if self._away >= MOVED_STEPS else FINE

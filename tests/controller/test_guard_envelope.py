@@ -1,0 +1,86 @@
+"""The guard's envelope file: sealed, apart from the profile, and never exceeded by it."""
+
+import pytest
+
+from controller.guard import seal
+from controller.guard.__main__ import build
+from controller.guard.envelope import SHIPPED, read_envelope
+from controller.guard.layout import GuardConfigError
+from machine.loading.profile_file import shipped_profiles
+from tests.codes import coded
+from tests.controller.guard_traffic import PROFILE
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A profile with its envelope beside it."""
+    profile, envelope = tmp_path / "calibrated.toml", tmp_path / "palms_471.envelope.toml"
+    profile.write_text(PROFILE.read_text())
+    envelope.write_text((SHIPPED / envelope.name).read_text())
+    return profile, envelope
+
+
+@pytest.mark.parametrize("name", shipped_profiles())
+def test_every_shipped_profile_has_a_sealed_envelope(name):
+    envelope = read_envelope(SHIPPED / f"{name}.toml")
+    assert len(envelope.axes) == 5 and (envelope.carrier is not None) == (name == "aoro_fc8")
+    assert envelope.boxes
+
+
+def test_the_envelope_beside_the_profile_counts(files):
+    profile, envelope = files
+    text = envelope.read_text().replace("ground_m = -1.39", "ground_m = -0.5")
+    envelope.write_text(text)
+    with pytest.raises(GuardConfigError, check=coded("guard.envelope-damaged")):
+        build(profile)
+    assert seal.main([str(envelope)]) == 0
+    assert read_envelope(profile).ground_m == -0.5
+    assert envelope.read_text().count("sha256") == 1
+    assert seal.main([str(envelope)]) == 0, "once more changes nothing"
+    assert read_envelope(profile).ground_m == -0.5
+
+
+def test_any_changed_byte_stops_the_start(files):
+    profile, envelope = files
+    good = envelope.read_bytes()
+    for at in range(0, len(good) - 1, 97):
+        envelope.write_bytes(good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :])
+        with pytest.raises(GuardConfigError):
+            build(profile)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("upper = 1.74533 ", "upper = 1.75 "),
+        ("lower = -0.383972 ", "lower = -0.4 "),
+        ("speed_limit = 0.28 ", "speed_limit = 0.3 "),
+        ("acceleration_limit = 0.45 ", "acceleration_limit = 0.5 "),
+    ],
+)
+def test_a_profile_that_allows_more_is_refused(files, old, new):
+    profile, _ = files
+    text = profile.read_text()
+    assert old in text
+    profile.write_text(text.replace(old, new))
+    with pytest.raises(GuardConfigError, check=coded("guard.profile-exceeds-envelope")):
+        build(profile)
+
+
+def test_what_calibration_finds_is_taken_from_the_profile(files):
+    profile, _ = files
+    text = profile.read_text().replace("deadband_plus_pct = 12.0", "deadband_plus_pct = 9.0", 1)
+    profile.write_text(
+        text.replace("zero_counts = 8192 ", "zero_counts = 8100 ", 1).replace("upper = 1.74533", "upper = 1.7")
+    )
+    slew = read_envelope(profile).axes[0]
+    assert (slew.deadband_pct, slew.zero_counts, slew.upper) == (9.0, 8100, 1.74533)
+
+
+def test_a_machine_without_an_envelope_does_not_start(files, capsys):
+    profile, _ = files
+    profile.write_text(profile.read_text().replace('name = "palms_471"', 'name = "unknown"'))
+    with pytest.raises(GuardConfigError, check=coded("guard.envelope-missing")):
+        build(profile)
+    assert seal.main([str(profile.with_name("none"))]) == 3
+    assert "none" in capsys.readouterr().err

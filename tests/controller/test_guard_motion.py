@@ -1,0 +1,172 @@
+"""Motion that nobody commands, and the pilot supply: the guard's own frame GuardPilot."""
+
+import pytest
+
+from controller.guard.envelope import read_envelope
+from controller.guard.motion import SPOOL_NS
+from controller.guard.reach import Reach
+from controller.guard.verdicts import Verdict
+from machine.geometry.kinematics import pin_position
+from machine.loading.profile_file import load_profile
+from tests.controller.bench import MS, T, count_until
+from tests.controller.guard_traffic import CENTRE, MOVING, PROFILE, Traffic, press_reset
+
+RAD = 3.835e-4
+
+
+def test_a_spool_that_closes_in_time_passes_and_one_that_stays_open_does_not():
+    traffic = Traffic().good()
+    for pct in range(60):
+        traffic.a = {"Mode": 2, "Slew": float(pct)}
+        traffic.valve_a = {"SpoolSlew": float(pct)}
+        assert traffic.tick() is Verdict.GOOD
+    traffic.a = {"Mode": 0}
+    k = count_until(traffic.tick, lambda: not traffic.guard.enabled)
+    assert (traffic.guard.verdict, traffic.guard.axis) == (Verdict.SPOOL, 0)
+    assert abs(k * T - SPOOL_NS) <= 2 * T
+    traffic = Traffic().good()
+    traffic.valve_a = {"SpoolSlew": 9.0}
+    assert traffic.tick(100) is Verdict.GOOD, "inside its dead-band no oil flows"
+
+
+def test_a_spool_open_against_its_command():
+    traffic = Traffic().good()
+    traffic.a, traffic.valve_a = dict(MOVING), {"SpoolSlew": 13.0}
+    assert traffic.tick(100) is Verdict.GOOD
+    traffic.valve_a = {"SpoolSlew": -13.0}
+    assert traffic.tick(2) is Verdict.SPOOL
+
+
+def test_values_in_neutral_mode_excuse_no_spool():
+    """The valve node ignores spool values in neutral mode, so they command nothing."""
+    traffic = Traffic().good()
+    traffic.a, traffic.valve_a = {"Mode": 0, "Slew": 13.0}, {"SpoolSlew": 40.0}
+    assert traffic.tick(2) is Verdict.SPOOL
+
+
+def test_the_held_grapple_may_not_open():
+    traffic = Traffic().good()
+    traffic.b["GrappleMode"], traffic.valve_b = 3, {"SpoolGrapple": -20.0}
+    assert traffic.tick(100) is Verdict.GOOD
+    traffic.valve_b = {"SpoolGrapple": 20.0}
+    assert traffic.tick(2) is Verdict.SPOOL
+
+
+def slide(traffic, rad_s, ticks, name="EncLift"):
+    """Move a joint that nobody commands."""
+    start = traffic.encoder[name]
+    for k in range(ticks):
+        traffic.encoder[name] = start + round(rad_s * (k + 1) * T * 1e-9 / RAD)
+        if traffic.tick() is not Verdict.GOOD:
+            return k + 1
+    return 0
+
+
+@pytest.mark.parametrize("mode", [1, 3])
+@pytest.mark.parametrize("share", [0.2, 0.5, 1.0])
+def test_a_joint_that_moves_at_any_speed_without_a_command_is_found(share, mode):
+    """Far below 25 % of the speed limit too, armed or not, after at most 0.03 rad."""
+    traffic = Traffic().good()
+    traffic.controller["Mode"] = mode
+    traffic.tick(100)
+    speed = 0.15 * share
+    k = slide(traffic, speed, 400)
+    assert (traffic.guard.verdict, traffic.guard.axis) == (Verdict.MOVING, 1)
+    assert k * T * 1e-9 * speed < 0.03
+
+
+def test_creep_noise_and_one_sample_that_jumps_pass():
+    traffic = Traffic().good()
+    traffic.tick(100)
+    assert slide(traffic, 0.006, 1000) == 0, "a cylinder that leaks"
+    for k in range(100):
+        traffic.encoder["EncSlew"] = CENTRE + (20 if k % 10 == 0 else (-3, 3, 0)[k % 3])
+        traffic.encoder["EncTilt"] = CENTRE + (500 if k % 20 == 0 else 0)
+        assert traffic.tick() is Verdict.GOOD
+
+
+def test_a_joint_may_come_to_rest_after_its_command():
+    traffic = Traffic().good()
+    traffic.a = dict(MOVING)
+    traffic.tick(40)
+    traffic.a = {"Mode": 0}
+    assert slide(traffic, 0.2, 90, "EncSlew") == 0
+    traffic.encoder["EncSlew"] -= 10
+    assert traffic.tick(200) is Verdict.GOOD
+
+
+def supply(traffic):
+    return traffic.pilot[-1]["Supply"]
+
+
+def test_the_pilot_supply_is_on_with_commands_and_goes_off_after_300_ms_of_silence():
+    traffic = Traffic()
+    traffic.dropped |= {"ValveCmdA"}
+    traffic.tick(60)
+    assert supply(traffic) == 0, "nobody has commanded yet"
+    traffic.dropped.clear()
+    traffic.tick(60)
+    assert supply(traffic) == 0xA
+    n = len(traffic.pilot)
+    traffic.tick(100)
+    assert len(traffic.pilot) - n == 50, "every 10 ms"
+    traffic.dropped.add("ValveCmdB")
+    k = count_until(traffic.tick, lambda: supply(traffic) == 0)
+    assert 300 * MS < k * T <= 365 * MS
+    traffic.dropped.clear()
+    traffic.tick(4)
+    assert supply(traffic) == 0xA, "silence does not latch"
+
+
+def test_a_latching_verdict_switches_the_supply_off_until_a_person_resets():
+    traffic = Traffic().good()
+    traffic.valve_a = {"SpoolLift": 30.0}
+    traffic.tick()
+    assert supply(traffic) == 0 and traffic.pilot[-1]["Verdict"] == Verdict.SPOOL, "at once"
+    traffic.valve_a = {}
+    traffic.tick(200)
+    assert supply(traffic) == 0
+    press_reset(traffic)
+    assert supply(traffic) == 0xA
+
+
+def test_what_does_not_latch_leaves_the_supply_on():
+    traffic = Traffic().good()
+    traffic.dropped.add("EstopStat")
+    assert traffic.tick(20) is Verdict.ESTOP_LOST
+    assert supply(traffic) == 0xA
+
+
+@pytest.mark.parametrize("machine", ["palms_471", "aoro_fc8"])
+def test_own_kinematics_agree_with_the_planners(machine):
+    profile, reach = load_profile(machine), Reach(read_envelope(PROFILE.with_name(f"{machine}.toml")))
+    for q in ((0.0, 0.5, -1.2, 0.6), (-1.4, -0.2, -0.4, 1.7), (1.1, 1.2, -2.5, 0.2)):
+        assert reach.pin(*q) == pytest.approx(pin_position(profile.kinematics, (*q, 0.0)), abs=1e-6)
+
+
+def test_the_pin_may_leave_a_forbidden_place_and_not_go_deeper():
+    traffic = Traffic()
+    traffic.encoder |= {"EncLift": CENTRE - round(0.38 / RAD), "EncTilt": CENTRE - round(0.6 / RAD)}
+    traffic.good()
+    traffic.a = {"Mode": 2, "Lift": 13.0}
+    assert traffic.tick(20) is Verdict.GOOD
+    traffic.a = {"Mode": 2, "Slew": 13.0}
+    assert traffic.tick(20) is Verdict.GOOD, "no deeper"
+    traffic.a = {"Mode": 2, "Ext": 13.0}
+    assert traffic.tick() is Verdict.REACH
+
+
+def test_the_pin_may_not_enter_a_box():
+    """Folded above the column, and lowered on to it: the depth counts along the nearest face."""
+    reach = Reach(read_envelope(PROFILE))
+    outside = [0.0, 1.3, -3.05, 0.13]
+    r = (reach.pin(*outside)[0] ** 2 + reach.pin(*outside)[1] ** 2) ** 0.5
+    assert reach.depth_m(outside) == pytest.approx(-1.0, abs=1.5) and r > 0.0
+    inside = next(
+        [0.0, lift / 100.0, tilt / 100.0, 0.13]
+        for lift in range(130, -38, -4)
+        for tilt in range(-305, 0, 4)
+        if reach.depth_m([0.0, lift / 100.0, tilt / 100.0, 0.13]) > 0.05
+    )
+    x, y, z = reach.pin(*inside)
+    assert (abs(x) < 0.4 and abs(y) < 0.4 and z < 1.2) or z < -1.39

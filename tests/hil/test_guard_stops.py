@@ -1,0 +1,70 @@
+"""A valve that sticks open: the guard alone stops the crane by the pilot supply, with the real plant and real bytes."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from controller.config import load as load_settings
+from controller.guard.__main__ import build, profile_path
+from controller.guard.verdicts import Verdict
+from hil.harness.lockstep import Lockstep, Observer
+from hil.harness.operator import Operator
+from sim.plant import Plant
+
+pytestmark = [pytest.mark.slow, pytest.mark.computed]
+SETTINGS = load_settings("palms_471")
+VALVE_NS = 250_000_000
+"""Dead time and lag of a valve that closes, and the oil behind it."""
+
+
+class Idle:
+    """A planner that wants nothing."""
+
+    def step(self, now_ns, report, logs):
+        return None
+
+
+class Nobody(Operator):
+    """An operator who presses nothing: the controller stays in STANDBY."""
+
+    def step(self, report):
+        return None
+
+
+@pytest.fixture
+def system():
+    plant = Plant(SETTINGS.profile, seed=3, logs=0)
+    operator = Nobody(SETTINGS.profile_hash, lambda *_: None)
+    run = Lockstep(SETTINGS, build(profile_path("palms_471")), plant, Idle(), operator, Observer())
+    while run.now_ns < 4_000_000_000:
+        run.advance()
+    assert run._guard.enabled and plant.estop.pilot_on
+    yield run
+    plant.close()
+
+
+@pytest.mark.parametrize(("function", "position"), [("slew", 0.35), ("lift", -0.5), ("ext", 0.4)])
+def test_a_valve_that_sticks_open_is_stopped_by_the_guard_alone(system, function, position):
+    plant, begin, began_ns = system.plant, system.plant.tip(), system.now_ns
+    plant.stuck_open[function] = position
+    moved_ns = refused_ns = still_ns = 0
+    before = begin
+    while system.now_ns < began_ns + 2_000_000_000:
+        system.advance()
+        tip = plant.tip()
+        speed_m_s = math.dist(tip, before) / 1.25e-3
+        before = tip
+        spool = abs(plant.world.hydraulics.spools[function])
+        moved_ns = moved_ns or (system.now_ns if spool > 0.12 else 0)
+        refused_ns = refused_ns or (0 if system._guard.enabled else system.now_ns)
+        still_ns = system.now_ns if speed_m_s > 0.03 else still_ns
+    assert system._guard.verdict is Verdict.SPOOL
+    assert not plant.estop.pilot_on
+    assert 0 < moved_ns <= refused_ns <= moved_ns + 30_000_000
+    assert refused_ns <= began_ns + 150_000_000, "catalogue, case 17"
+    assert still_ns <= refused_ns + VALVE_NS
+    travel_m = math.dist(plant.tip(), begin)
+    assert 0.005 < travel_m < 0.20
+    assert abs(plant.world.hydraulics.spools[function]) < 0.02
