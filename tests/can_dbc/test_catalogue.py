@@ -58,6 +58,7 @@ CATALOGUE = [
         "GuardStat", 0x1FD, 8, 10, 50,
         {"Crc": 0, "Counter": 8, "Enable": 12, "Verdict": 16, "FaultAxis": 24, "SeenCounter": 28, "EventCount": 32},
     ),
+    ("GuardPilot", 0x2FD, 8, 10, 50, {"Crc": 0, "Counter": 8, "Supply": 12, "Verdict": 16, "EventCount": 32}),
     (
         "ValveCmdA", 0x210, 8, 5, 50,
         {"Crc": 0, "Counter": 8, "Mode": 12, "Slew": 16, "Lift": 28, "Tilt": 40, "Ext": 52},
@@ -89,8 +90,8 @@ CATALOGUE = [
 ]  # fmt: skip
 MACHINE_IDS = {
     "ArmHeightA": 0x0CFF2030, "ArmHeightB": 0x0CFF2130, "VehStat": 0x0CFF2203, "VehCmd": 0x0CFF2327,
-    "ArmCmdA": 0x0CFF2827, "ArmCmdB": 0x0CFF2927, "CtrlAlive": 0x18FF2F27, "EEC1": 0x0CF00400,
-    "CCVS": 0x18FEF100, "DM1": 0x18FECA00, "AddressClaim": 0x18EEFF27,
+    "ArmCmdA": 0x0CFF2827, "ArmCmdB": 0x0CFF2927, "GuardAlive": 0x0CFF2A28, "CtrlAlive": 0x18FF2F27,
+    "EEC1": 0x0CF00400, "CCVS": 0x18FEF100, "DM1": 0x18FECA00, "AddressClaim": 0x18EEFF27,
     "Request": 0x18EAFF27,
 }  # fmt: skip
 
@@ -158,7 +159,7 @@ def test_physical_units() -> None:
 
 def test_data_ids_distinguish_messages() -> None:
     lists = [m.data_ids for m in chain(CRANE.messages.values(), MACHINE.messages.values()) if m.data_ids]
-    assert len(lists) == 23
+    assert len(lists) == 25
     for counter in range(16):
         assert len({ids[counter] for ids in lists}) == len(lists)
 

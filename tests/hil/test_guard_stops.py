@@ -15,8 +15,9 @@ from sim.plant import Plant
 
 pytestmark = [pytest.mark.slow, pytest.mark.computed]
 SETTINGS = load_settings("palms_471")
-VALVE_NS = 250_000_000
-"""Dead time and lag of a valve that closes, and the oil behind it."""
+VALVE_NS = 150_000_000
+"""Dead time and lag of a valve that closes."""
+DEADBAND = 0.12
 
 
 class Idle:
@@ -49,22 +50,22 @@ def system():
 def test_a_valve_that_sticks_open_is_stopped_by_the_guard_alone(system, function, position):
     plant, begin, began_ns = system.plant, system.plant.tip(), system.now_ns
     plant.stuck_open[function] = position
-    moved_ns = refused_ns = still_ns = 0
-    before = begin
+    moved_ns = refused_ns = open_ns = 0
+    verdict, travel_m = Verdict.GOOD, 0.0
     while system.now_ns < began_ns + 2_000_000_000:
         system.advance()
-        tip = plant.tip()
-        speed_m_s = math.dist(tip, before) / 1.25e-3
-        before = tip
+        travel_m = max(travel_m, math.dist(plant.tip(), begin))
         spool = abs(plant.world.hydraulics.spools[function])
-        moved_ns = moved_ns or (system.now_ns if spool > 0.12 else 0)
-        refused_ns = refused_ns or (0 if system._guard.enabled else system.now_ns)
-        still_ns = system.now_ns if speed_m_s > 0.03 else still_ns
-    assert system._guard.verdict is Verdict.SPOOL
+        if spool > DEADBAND:
+            moved_ns, open_ns = moved_ns or system.now_ns, system.now_ns
+        if not refused_ns and not system._guard.enabled:
+            refused_ns, verdict = system.now_ns, system._guard.verdict
+    assert verdict is Verdict.SPOOL and system._guard.verdict is Verdict.LATCHED
     assert not plant.estop.pilot_on
     assert 0 < moved_ns <= refused_ns <= moved_ns + 30_000_000
     assert refused_ns <= began_ns + 150_000_000, "catalogue, case 17"
-    assert still_ns <= refused_ns + VALVE_NS
-    travel_m = math.dist(plant.tip(), begin)
-    assert 0.005 < travel_m < 0.20
-    assert abs(plant.world.hydraulics.spools[function]) < 0.02
+    print(f"\n{function} {position}: refused {(refused_ns - began_ns) * 1e-6:.1f} ms, open until "
+          f"{(open_ns - began_ns) * 1e-6:.1f} ms, travel {travel_m:.3f} m")
+    assert open_ns <= refused_ns + VALVE_NS
+    assert 0.005 < travel_m < 0.20, "catalogue, case 17"
+    assert spool < 0.02
