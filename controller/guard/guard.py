@@ -24,7 +24,9 @@ from controller.guard.layout import GuardConfigError, Layout
 from controller.guard.motion import MotionWatch
 from controller.guard.reach import Reach
 from controller.guard.stream import FrameEffect, Punctuality, SentMessage, WatchedMessage
-from controller.guard.verdicts import AUX_AXIS, FINE, GRAPPLE_AXIS, LATCHING, NO_AXIS, Finding, Verdict
+from controller.guard.verdicts import (
+    AUX_AXIS, DRIVE_AXIS, FINE, GRAPPLE_AXIS, LATCHING, NO_AXIS, Finding, Verdict,
+)  # fmt: skip
 
 GUARD_NODE: Final = 0x7D
 HEARTBEAT_KEY: Final = 0x700 + GUARD_NODE
@@ -204,7 +206,7 @@ class Guard:
         if carrier is not FINE:
             return carrier
         if self._carrier is not None and self._carrier.driven and now_ns - self._clear_ns > PERSON_CARRIER_NS:
-            return Verdict.PERSON, mach0.DRIVE_AXIS
+            return Verdict.PERSON, DRIVE_AXIS
         if neutral or (not self._status.old(now_ns) and self._status.raw("Mode") in _OPERATING):
             self._agreed_ns = now_ns
         return FINE if neutral else self._check_commanded(now_ns)

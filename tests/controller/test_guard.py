@@ -351,7 +351,9 @@ def test_what_judges_has_at_most_600_lines_of_code():
         prose = [n for n in ast.walk(tree) if isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant)]
         explained = {k for n in prose for k in range(n.lineno, (n.end_lineno or n.lineno) + 1)}
         lines = enumerate(path.read_text().splitlines(), 1)
-        code[path.stem in start] += sum(k not in explained and bool(t := line.strip()) and t[0] != "#" for k, line in lines)
+        code[path.stem in start] += sum(
+            k not in explained and bool(t := line.strip()) and t[0] != "#" for k, line in lines
+        )
     assert code[False] <= 600 and code[True] <= 300
     assert Guard.__slots__
 

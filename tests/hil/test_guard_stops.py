@@ -64,8 +64,6 @@ def test_a_valve_that_sticks_open_is_stopped_by_the_guard_alone(system, function
     assert not plant.estop.pilot_on
     assert 0 < moved_ns <= refused_ns <= moved_ns + 30_000_000
     assert refused_ns <= began_ns + 150_000_000, "catalogue, case 17"
-    print(f"\n{function} {position}: refused {(refused_ns - began_ns) * 1e-6:.1f} ms, open until "
-          f"{(open_ns - began_ns) * 1e-6:.1f} ms, travel {travel_m:.3f} m")
     assert open_ns <= refused_ns + VALVE_NS
     assert 0.005 < travel_m < 0.20, "catalogue, case 17"
     assert spool < 0.02
