@@ -25,7 +25,14 @@ from controller.guard.motion import MotionWatch
 from controller.guard.reach import Reach
 from controller.guard.stream import FrameEffect, Punctuality, SentMessage, WatchedMessage
 from controller.guard.verdicts import (
-    AUX_AXIS, DRIVE_AXIS, FINE, GRAPPLE_AXIS, LATCHING, NO_AXIS, Finding, Verdict,
+    AUX_AXIS,
+    DRIVE_AXIS,
+    FINE,
+    GRAPPLE_AXIS,
+    LATCHING,
+    NO_AXIS,
+    Finding,
+    Verdict,
 )  # fmt: skip
 
 GUARD_NODE: Final = 0x7D
